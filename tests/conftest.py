@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import io
 import os
 import signal
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 from hypothesis import settings
@@ -17,6 +19,9 @@ from cheap_keys import choose_costs, pytest_sessionstart  # noqa: F401  hook
 from child_coverage import count_or_not
 from same_draws import begin_draws, draw_the_same, pytest_fixture_setup  # noqa: F401  hook
 from skip_policy import pytest_make_collect_report, pytest_runtest_makereport  # noqa: F401  hooks
+
+if TYPE_CHECKING:
+    from cli.said import Run
 
 # What hypothesis makes up is the same in every run of CI, so that a failure comes with the change that made
 # it; on other machines it goes on searching. How long an example takes depends on what else a machine does.
@@ -36,6 +41,28 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
     begin_draws(item)
     choose_costs(item)
     count_or_not(item)
+
+
+@pytest.fixture(name="keyss")
+def _keyss(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Run:
+    """Runs the command line in this process, without a key in the environment and without a terminal."""
+    from cli.said import Said
+    from keyss.cli import main
+
+    monkeypatch.delenv("KEYSS_KEY", raising=False)
+    monkeypatch.delenv("KEYSS_DEBUG", raising=False)
+    monkeypatch.setenv("COLUMNS", "120")
+    monkeypatch.setattr("sys.stdin", io.StringIO())
+
+    def run(*arguments: object) -> Said:
+        capsys.readouterr()
+        try:
+            status = main([str(argument) for argument in arguments])
+        except SystemExit as end:
+            status = int(end.code or 0)
+        return Said(status, *capsys.readouterr())
+
+    return run
 
 
 @pytest.fixture(scope="session")

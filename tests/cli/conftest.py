@@ -1,36 +1,15 @@
-"""Fixtures of the command line: runs of it, and a small world to run it in."""
+"""A small world to run the command line in."""
 
 from __future__ import annotations
 
-import io
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from cli.said import SMALL, Said
+from cli.said import SMALL
 from files.scene_files import write_blender, write_nerfstudio
 from keyss.cli import main
 from shared import made_once
-
-
-@pytest.fixture
-def keyss(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Callable[..., Said]:
-    """Runs the command line in this process, without a key in the environment and without a terminal."""
-    monkeypatch.delenv("KEYSS_KEY", raising=False)
-    monkeypatch.delenv("KEYSS_DEBUG", raising=False)
-    monkeypatch.setenv("COLUMNS", "120")
-    monkeypatch.setattr("sys.stdin", io.StringIO())
-
-    def run(*arguments: object) -> Said:
-        capsys.readouterr()
-        try:
-            status = main([str(argument) for argument in arguments])
-        except SystemExit as end:
-            status = int(end.code or 0)
-        return Said(status, *capsys.readouterr())
-
-    return run
 
 
 @pytest.fixture(scope="session")

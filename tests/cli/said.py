@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
+from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
 
 import cheap_keys
 from keyss.cli import commands
@@ -35,13 +36,15 @@ COMMANDS = list(commands.MODULES)
 PROGRAM = [sys.executable, "-c", cheap_keys.PROGRAM]
 
 
-@dataclass(frozen=True)
-class Said:
+class Said(NamedTuple):
     """What a run of the command line came to."""
 
     status: int
     out: str
     err: str
+
+
+Run = Callable[..., Said]  # of the fixture `keyss`
 
 
 def listing(folder: Path) -> dict[str, int]:

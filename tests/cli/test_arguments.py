@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 import keyss as library
-from cli.said import METRICS, Said, assert_refused
+from cli.said import METRICS, Run, assert_refused
 from keyss import CarryOptions, KeyssOptions
 from keyss.fitting import PRESETS
 from tiny_scenes import random_gaussians
@@ -29,9 +28,7 @@ class TestArguments:
         monkeypatch.setattr(library, "hide", hide)
         return calls
 
-    def test_secrets_and_keys_pair_up_in_order(
-        self, keyss: Callable[..., Said], hidden: list[Any], tmp_path: Path
-    ) -> None:
+    def test_secrets_and_keys_pair_up_in_order(self, keyss: Run, hidden: list[Any], tmp_path: Path) -> None:
         for name in "bc":
             (tmp_path / f"{name}.txt").write_text(f"key of {name}")
         said = keyss(
@@ -56,7 +53,7 @@ class TestArguments:
         ]
 
     def test_options_override_the_preset(
-        self, keyss: Callable[..., Said], hidden: list[Any], monkeypatch: pytest.MonkeyPatch
+        self, keyss: Run, hidden: list[Any], monkeypatch: pytest.MonkeyPatch
     ) -> None:
         monkeypatch.setenv("KEYSS_KEY", "k")
         said = keyss(
@@ -86,7 +83,7 @@ class TestArguments:
         }
 
     def test_by_default_the_preset_stays_as_it_is(
-        self, keyss: Callable[..., Said], hidden: list[Any], monkeypatch: pytest.MonkeyPatch
+        self, keyss: Run, hidden: list[Any], monkeypatch: pytest.MonkeyPatch
     ) -> None:
         monkeypatch.setenv("KEYSS_KEY", "k")
         assert keyss("hide", "--cover", "A", "--secret", "B", "-o", "out").status == 0
@@ -95,7 +92,7 @@ class TestArguments:
         assert hidden[1][1]["method"] == KeyssOptions()
 
     def test_options_of_a_method_reach_it(
-        self, keyss: Callable[..., Said], hidden: list[Any], monkeypatch: pytest.MonkeyPatch
+        self, keyss: Run, hidden: list[Any], monkeypatch: pytest.MonkeyPatch
     ) -> None:
         monkeypatch.setenv("KEYSS_KEY", "k")
         scenes = ("hide", "--cover", "A", "--secret", "B", "-o", "out")
@@ -121,7 +118,7 @@ class TestArguments:
     )
     def test_what_makes_no_sense_is_refused(
         self,
-        keyss: Callable[..., Said],
+        keyss: Run,
         hidden: list[Any],
         monkeypatch: pytest.MonkeyPatch,
         extra: tuple[object, ...],
@@ -143,7 +140,7 @@ class TestArguments:
     )
     def test_what_has_no_effect_is_refused(
         self,
-        keyss: Callable[..., Said],
+        keyss: Run,
         hidden: list[Any],
         monkeypatch: pytest.MonkeyPatch,
         extra: tuple[object, ...],
@@ -158,5 +155,5 @@ class TestArguments:
         assert keyss(*carry, "--cover", "a.ply", "--secret", "B").status == 0
         assert keyss("hide", "-o", "out", *extra, "--cover", "a.ply", "--secret", "b.ply").status == 0
 
-    def test_hide_needs_a_secret(self, keyss: Callable[..., Said], hidden: list[Any]) -> None:
+    def test_hide_needs_a_secret(self, keyss: Run, hidden: list[Any]) -> None:
         assert keyss("hide", "--cover", "A", "-o", "out").status == 2

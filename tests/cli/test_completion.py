@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import shutil
 import subprocess
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from cli.said import COMMANDS, Said
+from cli.said import COMMANDS, Run
 from keyss.fitting import PRESETS
-
-Run = Callable[..., Said]
 
 
 @pytest.fixture(scope="module")

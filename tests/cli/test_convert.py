@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import subprocess
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -13,14 +12,13 @@ import torch
 
 import keyss as package
 from channels.low_bits.trained_like import trained_like
-from cli.said import PROGRAM, Said, assert_refused
+from cli.said import PROGRAM, Run, assert_refused
 from keyss.files import read_model, write_model
 from tiny_scenes import random_gaussians
 
 VECTORS = Path(__file__).parents[1] / "vectors"
 CARRIED = VECTORS / "carried.ply"
 COUNT = 400
-Run = Callable[..., Said]
 
 
 @pytest.fixture(scope="module")
@@ -135,9 +133,7 @@ def test_from_python(files: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("mode", [0o600, 0o644])
-def test_others_can_read_what_is_made_of_what_they_can_read(
-    keyss: Callable[..., Said], tmp_path: Path, mode: int
-) -> None:
+def test_others_can_read_what_is_made_of_what_they_can_read(keyss: Run, tmp_path: Path, mode: int) -> None:
     write_model(tmp_path / "m.ply", random_gaussians(50))
     (tmp_path / "m.ply").chmod(mode)
     assert keyss("convert", tmp_path / "m.ply", tmp_path / "m.spz").status == 0

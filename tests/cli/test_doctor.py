@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 import tomllib
-from collections.abc import Callable
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -14,12 +13,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from cli.said import Said
+from cli.said import Run, Said
 from keyss import __version__, rendering
 from keyss.cli import doctor
 from keyss.core import Camera, Gaussians
-
-Run = Callable[..., Said]
 
 
 def states(said: Said) -> dict[str, str]:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from cli.said import SMALL, Said, assert_refused, listing
+from cli.said import SMALL, Run, assert_refused, listing
 from files.scene_files import photo, save, write_colmap
 
 STEGO = "hidden/publish/stego.ply"
@@ -204,9 +204,7 @@ ERRORS: dict[str, tuple[int, str, Callable[[Path], list[object]]]] = {
 
 
 @pytest.mark.parametrize("name", ERRORS)
-def test_errors_are_a_line_and_leave_nothing(
-    keyss: Callable[..., Said], world: Path, tmp_path: Path, name: str
-) -> None:
+def test_errors_are_a_line_and_leave_nothing(keyss: Run, world: Path, tmp_path: Path, name: str) -> None:
     status, words, prepare = ERRORS[name]
     shutil.copytree(world, tmp_path, dirs_exist_ok=True)
     arguments = prepare(tmp_path)
@@ -216,7 +214,7 @@ def test_errors_are_a_line_and_leave_nothing(
 
 
 def test_a_full_disk_is_a_line_and_leaves_nothing(
-    keyss: Callable[..., Said], world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    keyss: Run, world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def full(descriptor: int) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
@@ -241,7 +239,7 @@ class TestUnexpectedErrors:
         return fail_with
 
     def test_ours_are_a_line_that_asks_for_a_report(
-        self, keyss: Callable[..., Said], failing: Callable[[BaseException], None]
+        self, keyss: Run, failing: Callable[[BaseException], None]
     ) -> None:
         failing(ValueError("first\nsecond\x1b[31m"))
         said = keyss("info", "x")
@@ -249,10 +247,7 @@ class TestUnexpectedErrors:
         assert "KEYSS_DEBUG=1" in said.err
 
     def test_ours_come_through_for_whoever_debugs(
-        self,
-        keyss: Callable[..., Said],
-        failing: Callable[[BaseException], None],
-        monkeypatch: pytest.MonkeyPatch,
+        self, keyss: Run, failing: Callable[[BaseException], None], monkeypatch: pytest.MonkeyPatch
     ) -> None:
         failing(ValueError("boom"))
         monkeypatch.setenv("KEYSS_DEBUG", "1")
@@ -270,7 +265,7 @@ class TestUnexpectedErrors:
     )
     def test_the_machines_are_explained(
         self,
-        keyss: Callable[..., Said],
+        keyss: Run,
         failing: Callable[[BaseException], None],
         error: BaseException,
         status: int,

@@ -5,12 +5,12 @@ from __future__ import annotations
 import ast
 import re
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from cli.said import Said
+from cli.said import Run
 from keyss.cli import flags
 from keyss.core import KeyssWarning, UsageError
 
@@ -79,7 +79,7 @@ class TestWarnings:
         monkeypatch.setattr("keyss.runs.describe.info", info)
 
     @pytest.mark.usefixtures("warning")
-    def test_ours_are_a_line_each_once(self, keyss: Callable[..., Said]) -> None:
+    def test_ours_are_a_line_each_once(self, keyss: Run) -> None:
         assert keyss("info", "x").err.splitlines() == [
             "keyss: warning: no. 1 --overwrite",
             "keyss: warning: no. 2 --overwrite",
@@ -87,7 +87,7 @@ class TestWarnings:
         ]
 
     @pytest.mark.usefixtures("warning")
-    def test_nothing_of_it_stays(self, keyss: Callable[..., Said]) -> None:
+    def test_nothing_of_it_stays(self, keyss: Run) -> None:
         before = warnings.showwarning
         keyss("info", "x")
         assert warnings.showwarning is before

@@ -5,12 +5,11 @@ from __future__ import annotations
 import re
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from cli.said import COMMANDS, Said
+from cli.said import COMMANDS, Run, Said
 from keyss import __version__
 from keyss.audits import PARTS
 from keyss.files import write_model
@@ -38,7 +37,7 @@ assert not loaded("info", other) & {"numba", "scipy", "keyss.methods"}  # unpack
 
 
 class TestHelp:
-    def test_fits_on_a_page_with_a_line_for_each_command(self, keyss: Callable[..., Said]) -> None:
+    def test_fits_on_a_page_with_a_line_for_each_command(self, keyss: Run) -> None:
         said = keyss("--help")
         assert (said.status, said.err) == (0, "")
         lines = said.out.splitlines()
@@ -48,14 +47,14 @@ class TestHelp:
         assert len(COMMANDS) == 17
 
     @pytest.mark.parametrize("command", COMMANDS)
-    def test_shows_an_example(self, keyss: Callable[..., Said], command: str) -> None:
+    def test_shows_an_example(self, keyss: Run, command: str) -> None:
         said = keyss(command, "--help")
         assert said.status == 0
         assert f"example: keyss {command}" in said.out
         assert "default: None" not in said.out
 
     @pytest.mark.parametrize("command", COMMANDS)
-    def test_no_option_is_accepted_and_ignored(self, keyss: Callable[..., Said], command: str) -> None:
+    def test_no_option_is_accepted_and_ignored(self, keyss: Run, command: str) -> None:
         out = keyss(command, "--help").out
         random = {"fit", "hide", "audit", "compare", "reproduce", "demo"}
         assert ("--seed" in out) == (command in random)
@@ -65,12 +64,12 @@ class TestHelp:
         assert "nothing here" not in out
 
     @pytest.mark.parametrize("command", ["fit", "hide"])
-    def test_shows_the_options_of_training(self, keyss: Callable[..., Said], command: str) -> None:
+    def test_shows_the_options_of_training(self, keyss: Run, command: str) -> None:
         out = keyss(command, "--help").out
         for option in ("preset", "iterations", "max-gaussians", "width", "background", "resume", "overwrite"):
             assert f"--{option}" in out
 
-    def test_of_hide_shows_first_what_a_first_user_needs(self, keyss: Callable[..., Said]) -> None:
+    def test_of_hide_shows_first_what_a_first_user_needs(self, keyss: Run) -> None:
         _, first, *groups = re.split(r"^ .*options +$", keyss("hide", "--help").out, flags=re.MULTILINE)
         assert re.findall(r"^  (?:-o FOLDER, )?--([a-z-]+)", first, re.MULTILINE) == [
             *("cover", "secret", "secret-file", "key-file", "publish", "out", "method", "preset"),
@@ -78,25 +77,25 @@ class TestHelp:
         ]
         assert len(groups) == 5
 
-    def test_offers_the_presets_there_are(self, keyss: Callable[..., Said]) -> None:
+    def test_offers_the_presets_there_are(self, keyss: Run) -> None:
         assert f"--preset {{{','.join(FIT_PRESETS)}}}" in keyss("fit", "--help").out
         for name in registry.METHODS:
             said = keyss("hide", "--method", name, "--help").out
             assert f"--preset {{{','.join(FIT_PRESETS)}}}" in said
             assert "(default: default)" in said
 
-    def test_says_what_the_presets_come_to(self, keyss: Callable[..., Said]) -> None:
+    def test_says_what_the_presets_come_to(self, keyss: Run) -> None:
         for command in ("fit", "hide"):
             said = "".join(keyss(command, "--help").out.replace("│", " ").split())
             for name, fit in FIT_PRESETS.items():
                 assert f"{name}{fit.iterations:,}and{fit.max_gaussians:,}" in said
 
-    def test_offers_the_parts_of_an_audit_there_are(self, keyss: Callable[..., Said]) -> None:
+    def test_offers_the_parts_of_an_audit_there_are(self, keyss: Run) -> None:
         said = " ".join(keyss("audit", "--help").out.replace("│", " ").split())
         assert f"{', '.join(PARTS)}; repeat for more" in said
 
     @pytest.mark.parametrize("method", ["carry"])
-    def test_of_hide_is_as_it_was(self, keyss: Callable[..., Said], method: str) -> None:
+    def test_of_hide_is_as_it_was(self, keyss: Run, method: str) -> None:
         """Names, defaults and sentences of all options; `hide_METHOD_help.txt` is what is meant."""
         meant = Path(__file__).with_name(f"hide_{method}_help.txt").read_text(encoding="utf-8")
         said = keyss("hide", "--method", method, "--help").out
@@ -113,20 +112,20 @@ class TestHelp:
         )
 
     @pytest.mark.parametrize("arguments", [("--version",), ("-V",)])
-    def test_of_the_version(self, keyss: Callable[..., Said], arguments: tuple[str, ...]) -> None:
+    def test_of_the_version(self, keyss: Run, arguments: tuple[str, ...]) -> None:
         assert keyss(*arguments) == Said(0, f"{__version__}\n", "")
 
-    def test_comes_without_being_asked_for(self, keyss: Callable[..., Said]) -> None:
+    def test_comes_without_being_asked_for(self, keyss: Run) -> None:
         assert keyss() == keyss("--help")
 
-    def test_an_unknown_method_names_those_there_are(self, keyss: Callable[..., Said]) -> None:
+    def test_an_unknown_method_names_those_there_are(self, keyss: Run) -> None:
         said = keyss("hide", "--method", "none", "--cover", "A", "--secret", "B", "-o", "out")
         assert said.status == 2
         assert "keyss" in said.err
         assert "carry" in said.err
 
     @pytest.mark.parametrize("arguments", [("frobnicate",), ("fit",), ("info", "x", "--nonsense")])
-    def test_wrong_usage_exits_with_2(self, keyss: Callable[..., Said], arguments: tuple[str, ...]) -> None:
+    def test_wrong_usage_exits_with_2(self, keyss: Run, arguments: tuple[str, ...]) -> None:
         said = keyss(*arguments)
         assert said.status == 2
         assert said.out == ""

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
 from pathlib import Path
 
-from cli.said import Said, assert_refused
+from cli.said import Run, assert_refused
 from keyss.keys import MasterKey, read_key_file
 
 MASTER = "q7Rv2LxT9bWm4KzDq7Rv2L"
 
 
 class TestKeygen:
-    def test_prints_a_key_and_nothing_else(self, keyss: Callable[..., Said]) -> None:
+    def test_prints_a_key_and_nothing_else(self, keyss: Run) -> None:
         said = keyss("keygen")
         assert said.status == 0
         assert said.err == ""
@@ -24,14 +23,12 @@ class TestKeygen:
         assert key.isalnum()
         assert keyss("keygen").out != said.out
 
-    def test_bits(self, keyss: Callable[..., Said]) -> None:
+    def test_bits(self, keyss: Run) -> None:
         assert len(keyss("keygen", "--bits", 128).out) == 22 + 1
         assert_refused(keyss("keygen", "--bits", 0), 2, "--bits")
         assert_refused(keyss("keygen", "--bits", 10_000), 2, "1 to 1024")
 
-    def test_the_key_of_an_asset_follows_from_the_master_key(
-        self, keyss: Callable[..., Said], tmp_path: Path
-    ) -> None:
+    def test_the_key_of_an_asset_follows_from_the_master_key(self, keyss: Run, tmp_path: Path) -> None:
         master = tmp_path / "master.txt"
         master.touch(mode=0o600)
         master.write_text(MASTER + "\n")
@@ -47,9 +44,7 @@ class TestKeygen:
         assert_refused(keyss(*asset), 2, "--master-key-file")
         assert_refused(keyss(*asset, "--master-key-file", master, "--bits", 9), 2, "--bits")
 
-    def test_a_key_file_is_its_owners_and_never_replaced(
-        self, keyss: Callable[..., Said], tmp_path: Path
-    ) -> None:
+    def test_a_key_file_is_its_owners_and_never_replaced(self, keyss: Run, tmp_path: Path) -> None:
         path = tmp_path / "key.txt"
         umask = os.umask(0o022)
         try:
@@ -69,6 +64,6 @@ class TestKeygen:
         assert_refused(keyss("keygen", "-o", tmp_path / "none" / "key"), 5, "No such file")
         assert {each.name for each in tmp_path.iterdir()} == {"key.txt", "link"}
 
-    def test_takes_no_seed(self, keyss: Callable[..., Said]) -> None:
+    def test_takes_no_seed(self, keyss: Run) -> None:
         """A key that can be drawn again is no secret."""
         assert keyss("keygen", "--seed", 1).status == 2

@@ -7,12 +7,11 @@ import json
 import os
 import shutil
 import subprocess
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from cli.said import COMMANDS, PROGRAM, Said
+from cli.said import COMMANDS, PROGRAM, Run
 from keyss.cli import characters, main
 from keyss.files import read_model
 
@@ -105,9 +104,7 @@ def test_help_and_errors_in_any_encoding(encoding: str) -> None:
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_help_is_made_of_characters_with_a_likeness_in_ascii(
-    keyss: Callable[..., Said], command: str
-) -> None:
+def test_help_is_made_of_characters_with_a_likeness_in_ascii(keyss: Run, command: str) -> None:
     said = keyss(command, "--help").out
     assert said.encode("ascii", characters.REPLACING).count(b"?") == said.count("?")
 
@@ -135,7 +132,7 @@ def test_numbers_in_a_locale_without_characters(world: Path, tmp_path: Path) -> 
 
 @pytest.mark.parametrize("encoding", ["ascii", "cp437"])
 def test_json_is_json_in_any_encoding(
-    keyss: Callable[..., Said], world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, encoding: str
+    keyss: Run, world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, encoding: str
 ) -> None:
     shutil.copytree(world / "b", tmp_path / "ä鍵")
     stream = io.TextIOWrapper(io.BytesIO(), encoding, characters.REPLACING)

@@ -15,8 +15,7 @@ import pytest
 
 from channels.codes.published import codes_of, model_of
 from channels.low_bits.trained_like import trained_like
-from cli.said import PROGRAM, Said, assert_refused, listing
-from keyss import Secret, hide
+from cli.said import PROGRAM, Run, Said, assert_refused, listing
 from keyss.channels import LOW_BITS, CodesCover, Payload, base
 from keyss.channels.colours import salts
 from keyss.channels.low_bits import cells
@@ -28,7 +27,6 @@ from keyss.methods.records import whole
 from keyss.methods.records.opening import COUNT
 
 KEY = "q7Rv2LxT9bWm4KzD"
-Run = Callable[..., Said]
 
 
 def carried(cover: Gaussians, secret: Gaussians, claimed: int) -> Gaussians:
@@ -274,16 +272,6 @@ class TestVerify:
             assert "pruning by opacity" in said.err
         said = keyss("verify", files / "plain.ply", "--key-file", files / "key")
         assert_refused(said, 3, "opens nothing")
-
-
-def test_a_key_file_means_the_same_in_python(keyss: Run, files: Path, tmp_path: Path) -> None:
-    key_file, out = tmp_path / "key.txt", tmp_path / "letter.txt"
-    assert keyss("keygen", "-o", key_file).status == 0
-    letter = Secret(file=b"dear you", key=key_file.read_text())
-    hide(files / "plain.ply", [letter], out=tmp_path / "run")
-    stego = tmp_path / "run" / "publish" / "stego.ply"
-    assert keyss("reveal", stego, "--key-file", key_file, "-o", out).status == 0
-    assert out.read_text() == "dear you"
 
 
 def test_a_run_is_not_replaced_by_what_is_made_of_it(keyss: Run, files: Path, tmp_path: Path) -> None:

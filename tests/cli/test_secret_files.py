@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import stat
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -13,7 +12,7 @@ from hypothesis import given, strategies as st
 import keyss as library
 from channels.colours.made import cover
 from channels.low_bits.trained_like import trained_like
-from cli.said import Said, assert_refused, listing
+from cli.said import Run, assert_refused, listing
 from keyss import write_model
 from keyss.channels import Payload, pack_payload, unpack_payload
 from keyss.cli import main
@@ -21,7 +20,6 @@ from keyss.core import InputError, UsageError
 from keyss.methods import HiddenFile
 from methods.carry.carried import embed
 
-Keyss = Callable[..., Said]
 KEYS = ("q7Rv2LxT9bWm4KzD", "W2mz8Qe5TnYc6LkA")
 
 
@@ -45,7 +43,7 @@ def _arguments(folder: Path, out: Path) -> list[object]:
     return ["hide", "--cover", folder / "cover.ply", *files, *keys, "-o", out]
 
 
-def test_files_come_back_byte_for_byte(keyss: Keyss, folder: Path, tmp_path: Path) -> None:
+def test_files_come_back_byte_for_byte(keyss: Run, folder: Path, tmp_path: Path) -> None:
     stego = folder / "out" / "publish" / "stego.ply"
     assert stego.stat().st_size == (folder / "cover.ply").stat().st_size
     for index, name in enumerate(("letter.pdf", "empty")):
@@ -57,9 +55,7 @@ def test_files_come_back_byte_for_byte(keyss: Keyss, folder: Path, tmp_path: Pat
         assert stat.S_IMODE(out.stat().st_mode) == 0o600
 
 
-def test_what_does_not_go_together_is_refused(
-    keyss: Keyss, folder: Path, world: Path, tmp_path: Path
-) -> None:
+def test_what_does_not_go_together_is_refused(keyss: Run, folder: Path, world: Path, tmp_path: Path) -> None:
     out, back = tmp_path / "out", tmp_path / "back"
     hide = _arguments(folder, out)
     assert_refused(keyss(*hide, "--secret", folder / "cover.ply"), 2, "leave out --secret")
@@ -88,7 +84,7 @@ def test_a_file_too_large_for_its_cover_is_told_what_would_do(tmp_path: Path) ->
 
 
 def test_published_anywhere_a_file_opens_from_what_it_was_converted_to(
-    keyss: Keyss, folder: Path, tmp_path: Path
+    keyss: Run, folder: Path, tmp_path: Path
 ) -> None:
     write_model(tmp_path / "cover.ply", cover(6000))
     (tmp_path / "note.txt").write_text("Meet me at the golden knot. " * 20)

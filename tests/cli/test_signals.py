@@ -7,12 +7,11 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from cli.said import PROGRAM, Said, assert_refused, listing
+from cli.said import PROGRAM, Run, assert_refused, listing
 
 pytestmark = pytest.mark.counted
 
@@ -190,7 +189,7 @@ def test_a_signal_after_all_is_done_changes_nothing() -> None:
 
 @pytest.mark.parametrize("signum", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_saves_training_and_resume_ends_in_the_same_files(
-    keyss: Callable[..., Said], world: Path, tmp_path: Path, signum: signal.Signals
+    keyss: Run, world: Path, tmp_path: Path, signum: signal.Signals
 ) -> None:
     small = ("--max-gaussians", 100, "--device", "cpu")
 

@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
 
 import pytest
 
-from cli.said import COMMANDS, Said, assert_refused
+from cli.said import COMMANDS, Run, assert_refused
 from keyss.cli import commands, flags
-
-Run = Callable[..., Said]
 
 
 @pytest.mark.parametrize(

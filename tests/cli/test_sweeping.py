@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
-from cli.said import Said
+from cli.said import Run
 from many.fakes import real_spec
 
 
-def test_a_dry_run_estimates_every_cell_and_writes_nothing(
-    keyss: Callable[..., Said], tmp_path: Path
-) -> None:
+def test_a_dry_run_estimates_every_cell_and_writes_nothing(keyss: Run, tmp_path: Path) -> None:
     spec, out = real_spec(tmp_path, 2), tmp_path / "out"
     before = sorted(tmp_path.rglob("*"))
     said = keyss("sweep", spec, "-o", out, "--dry-run")
@@ -21,7 +18,7 @@ def test_a_dry_run_estimates_every_cell_and_writes_nothing(
     assert sorted(tmp_path.rglob("*")) == before
 
 
-def test_cells_that_cannot_work_are_named_beforehand(keyss: Callable[..., Said], tmp_path: Path) -> None:
+def test_cells_that_cannot_work_are_named_beforehand(keyss: Run, tmp_path: Path) -> None:
     spec = real_spec(tmp_path, 1)
     (tmp_path / "a.ply").write_text("ply, but no model")
     said = keyss("sweep", spec, "-o", tmp_path / "out", "--dry-run")

@@ -4,18 +4,15 @@ from __future__ import annotations
 
 import stat
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from cli.said import SMALL, Said, assert_refused
+from cli.said import SMALL, Run, assert_refused
 from files.scene_files import write_nerfstudio
 from keyss.cli import reporting
 from keyss.files import read_model
 from keyss.fitting.reporting import SeveralReporter
-
-Run = Callable[..., Said]
 
 
 @pytest.fixture

@@ -6,17 +6,15 @@ import os
 import signal
 import socket
 import subprocess
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 
-from cli.said import PROGRAM, SMALL, Said, assert_refused
+from cli.said import PROGRAM, SMALL, Run, assert_refused
 
 pytestmark = pytest.mark.counted
-
-Command = Callable[..., Said]
 
 
 def environment(rank: int, port: int) -> Mapping[str, str]:
@@ -47,7 +45,7 @@ def two(*arguments: object) -> Iterator[list[subprocess.Popen[str]]]:
 
 
 def test_where_one_process_is_killed_the_first_saves_and_one_process_goes_on(
-    keyss: Command, world: Path, tmp_path: Path
+    keyss: Run, world: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "fit"
     command = ("fit", world / "a", "-o", out, *SMALL, "--iterations", 900)
@@ -92,7 +90,7 @@ def second_of_two(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("second_of_two")
-def test_other_processes_say_only_what_the_first_cannot_know(keyss: Command, tmp_path: Path) -> None:
+def test_other_processes_say_only_what_the_first_cannot_know(keyss: Run, tmp_path: Path) -> None:
     said = keyss("fit", tmp_path / "none", "-o", tmp_path / "out", "--preset", "nonsense")
     assert (said.status, said.out, said.err) == (2, "", "")
     said = keyss("hide", "--batch", tmp_path / "a.csv", "-o", tmp_path / "out")
@@ -100,7 +98,7 @@ def test_other_processes_say_only_what_the_first_cannot_know(keyss: Command, tmp
 
 
 def test_commands_that_do_not_train_are_refused(
-    keyss: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    keyss: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name, value in environment(0, 1).items():
         monkeypatch.setenv(name, value)

@@ -5,13 +5,13 @@ from __future__ import annotations
 import os
 import shutil
 import stat
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from channels.low_bits.trained_like import trained_like
-from cli.said import SMALL, Said
+from cli.said import SMALL, Run, Said
 from files.scene_files import write_blender, write_nerfstudio
 from keyss.demo import OPTIONS, run_demo
 from keyss.files import write_model
@@ -37,7 +37,7 @@ def mine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, umask: None) -> Path:
     return tmp_path
 
 
-def tour(keyss: Callable[..., Said]) -> None:
+def tour(keyss: Run) -> None:
     """Every verb, into the working folder."""
 
     def done(line: str) -> Said:
@@ -78,7 +78,7 @@ def published(folder: Path) -> set[str]:
 PUBLISHED = {"hidden/publish/stego.ply", "carried/publish/stego.ply"}
 
 
-def test_only_what_is_to_be_published_is_readable_by_others(keyss: Callable[..., Said], mine: Path) -> None:
+def test_only_what_is_to_be_published_is_readable_by_others(keyss: Run, mine: Path) -> None:
     tour(keyss)
     for own in ("a", "b"):
         assert readable_by_others(mine / own)  # the umask is one under which that means something
@@ -106,7 +106,7 @@ def test_only_what_is_to_be_published_is_readable_by_others(keyss: Callable[...,
 
 
 def test_nor_does_the_demo_show_more(
-    keyss: Callable[..., Said], tmp_path: Path, umask: None, monkeypatch: pytest.MonkeyPatch
+    keyss: Run, tmp_path: Path, umask: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A demo of a few steps on small photos."""
     small = {"options": OPTIONS.with_fit(iterations=20, max_gaussians=1500), "width": 32}

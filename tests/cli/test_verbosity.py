@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from cli.said import SMALL, Said
+from cli.said import SMALL, Run, Said
 from files.scene_files import write_nerfstudio
 from keyss import progress
-
-Run = Callable[..., Said]
 
 
 @pytest.fixture

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -14,7 +13,7 @@ import pytest
 import torch
 
 import keyss as library
-from cli.said import Said, assert_refused
+from cli.said import Run, assert_refused
 from files.scene_files import write_nerfstudio
 from keyss import load_scene, write_model
 from keyss.api import filming
@@ -22,7 +21,6 @@ from keyss.core import Camera, Gaussians, UsageError
 from keyss.rendering import around, circle, look_at, middle_and_radius, render
 from tiny_scenes import random_gaussians
 
-Run = Callable[..., Said]
 Frames = list[npt.NDArray[np.uint8]]
 
 

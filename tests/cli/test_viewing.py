@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
-from cli.said import Said, assert_refused
+from cli.said import Run, assert_refused
 from keyss.core import Gaussians
 from keyss.files import read_model, write_model
 from tiny_scenes import random_gaussians
 
 
-def test_what_is_no_model_is_refused(keyss: Callable[..., Said], tmp_path: Path) -> None:
+def test_what_is_no_model_is_refused(keyss: Run, tmp_path: Path) -> None:
     (tmp_path / "model.txt").write_text("not a model")
     (tmp_path / "text.ply").write_text("ply\nformat ascii 1.0\nelement vertex 1\nend_header\n")
     for command in (["view"], ["view", "-o", str(tmp_path / "page.html")]):
@@ -24,9 +23,7 @@ def test_what_is_no_model_is_refused(keyss: Callable[..., Said], tmp_path: Path)
     assert_refused(keyss("view", str(tmp_path / "model.txt"), "--port", "70000"), 2, "--port")
 
 
-def test_what_the_page_does_not_read_is_converted_and_said(
-    keyss: Callable[..., Said], tmp_path: Path
-) -> None:
+def test_what_the_page_does_not_read_is_converted_and_said(keyss: Run, tmp_path: Path) -> None:
     text = write_in_text(tmp_path / "text.ply", random_gaussians(5))
     gltf = tmp_path / "scene.glb"
     write_model(gltf, random_gaussians(5))
@@ -47,7 +44,7 @@ def write_in_text(path: Path, model: Gaussians) -> Path:
     return path
 
 
-def test_a_page_is_written_and_not_over_another(keyss: Callable[..., Said], tmp_path: Path) -> None:
+def test_a_page_is_written_and_not_over_another(keyss: Run, tmp_path: Path) -> None:
     write_model(tmp_path / "model.ply", random_gaussians(5))
     out = tmp_path / "page.html"
     said = keyss("view", tmp_path / "model.ply", "-o", out)

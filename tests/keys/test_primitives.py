@@ -13,7 +13,6 @@ from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305
 from cryptography.hazmat.primitives.ciphers.algorithms import ChaCha20
 from cryptography.hazmat.primitives.hashes import SHA256
 from cryptography.hazmat.primitives.kdf.hkdf import HKDFExpand
-from cryptography.hazmat.primitives.keywrap import InvalidUnwrap, aes_key_unwrap, aes_key_wrap
 
 
 def test_argon2id_rfc_9106_section_5_3() -> None:
@@ -85,29 +84,12 @@ def test_chacha20_rfc_8439_section_2_4_2() -> None:
     assert stream.hex() == "6e2e359a2568f98041ba0728dd0d6981"
 
 
-def test_key_wrap_rfc_3394_section_4_6() -> None:
-    wrapping, key = bytes(range(32)), bytes.fromhex("00112233445566778899aabbccddeeff") + bytes(range(16))
-    wrapped = bytes.fromhex(
-        "28c9f404c4b810f4cbccb35cfb87f8263f5786e2d80ed326cbc7f0e71a99f43bfb988b9b7a02dd21"
-    )
-    assert aes_key_wrap(wrapping, key) == wrapped
-    assert aes_key_unwrap(wrapping, wrapped) == key
-    with pytest.raises(InvalidUnwrap):
-        aes_key_unwrap(wrapping, wrapped[:-1] + b"\0")
-
-
 def test_blake2b_rfc_7693_appendix_a() -> None:
     expected = (
         "ba80a53f981c4d0d6a2797b69f12f6e94c212f14685ac4b74b12bb6fdbffa2d1"
         "7d87c5392aab792dc252d5de4533cc9518d38aa8dbf1925ab92386edd4009923"
     )
     assert hashlib.blake2b(b"abc").hexdigest() == expected
-
-
-def test_keyed_blake2b_of_the_reference_implementation() -> None:
-    """The first of the known answers of blake2b (blake2-kat): the empty message, key 00 to 3f."""
-    got = hashlib.blake2b(b"", key=bytes(range(64))).hexdigest()
-    assert got.startswith("10ebb67700b1868efb4417987acf4690ae9d972fb7a590c2f02871799aaa4786")
 
 
 def test_reedsolo_uses_the_field_that_ours_is_compared_in() -> None:

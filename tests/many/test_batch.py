@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 import keyss as library
-from cli.conftest import keyss  # noqa: F401  fixture
-from cli.said import Said
+from cli.said import Run
 from keyss import CarryOptions
 from keyss.core import InputError, KeyssWarning, OutputError, WrongKeyError
 from keyss.keys import MasterKey
@@ -165,9 +163,7 @@ def test_a_name_that_no_file_can_have_does_not_stop_the_others(folder: Path) -> 
 
 @pytest.mark.counted
 def test_the_key_of_an_asset_opens_it_and_no_other(
-    tmp_path: Path,
-    keyss: Callable[..., Said],  # noqa: F811
-    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path, keyss: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Through the real worker and the command line."""
     monkeypatch.setattr(processes, "WORKER", REAL)
@@ -195,10 +191,7 @@ def test_the_key_of_an_asset_opens_it_and_no_other(
     assert (out / "private").stat().st_mode & 0o077 == 0
 
 
-def test_the_command_line_says_what_failed_and_ends_with_a_status(
-    folder: Path,
-    keyss: Callable[..., Said],  # noqa: F811
-) -> None:
+def test_the_command_line_says_what_failed_and_ends_with_a_status(folder: Path, keyss: Run) -> None:
     manifest(folder, rows(3, {0, 1}))
     arguments = ["hide", "--batch", folder / "assets.csv", "--method", "carry", "-o", folder / "out"]
     said = keyss(*arguments, "--master-key-file", folder / "master.txt", "--jobs", 1)

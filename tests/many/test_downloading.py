@@ -6,15 +6,14 @@ import io
 import sys
 import threading
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import pytest
 
-from cli.conftest import keyss as keyss
-from cli.said import Said
+from cli.said import Run
 from files.scene_files import WIDTH, photo, save, write_colmap
 from keyss.core import BackendError, InputError
 from keyss.many import scenes
@@ -95,7 +94,7 @@ def test_without_pooch_one_sentence_says_what_to_install(
         scenes.download(["garden"], tmp_path)
 
 
-def test_the_command_says_what_cannot_be(keyss: Callable[..., Said], tmp_path: Path) -> None:
+def test_the_command_says_what_cannot_be(keyss: Run, tmp_path: Path) -> None:
     full = ("reproduce", "single", "--data", tmp_path / "data", "-o", tmp_path / "out")
     both = keyss(*full, "--download", "--dry-run")
     assert (both.status, "--download" in both.err) == (2, True)

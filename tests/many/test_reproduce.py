@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 
-from cli.conftest import keyss as keyss
-from cli.said import Said, listing
+from cli.said import Run, listing
 from keyss import Gaussians, read_model, reproduce
 from keyss.core import InputError
 from keyss.many import Forecast, Reproduction, measures, performing, reproducing
@@ -91,7 +89,7 @@ def test_what_is_done_is_not_done_again(
 
 
 def test_a_run_that_fails_is_said_and_the_others_go_on(
-    out: Path, folders: list[Path], monkeypatch: pytest.MonkeyPatch, keyss: Callable[..., Said]
+    out: Path, folders: list[Path], monkeypatch: pytest.MonkeyPatch, keyss: Run
 ) -> None:
     def failing(*arguments: object, **more: object) -> None:
         raise InputError("not today")
@@ -107,7 +105,7 @@ def test_a_run_that_fails_is_said_and_the_others_go_on(
     assert "not today" in said.out
 
 
-def test_the_command(keyss: Callable[..., Said], out: Path, folders: list[Path], tmp_path: Path) -> None:
+def test_the_command(keyss: Run, out: Path, folders: list[Path], tmp_path: Path) -> None:
     said = keyss("reproduce", "pruning", *folders, *FLAGS, "-o", out)
     assert said.status == 0, said.err
     assert "25% random, secret" in said.out

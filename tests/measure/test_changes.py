@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from channels.low_bits.trained_like import trained_like
-from keyss.core import BackendError, Gaussians, Scene, UsageError
+from keyss.core import BackendError, Gaussians, Scene, UsageError, same_bits
 from keyss.fitting import mean_psnr
 from keyss.measure import (
     Change,
@@ -32,12 +32,6 @@ from measure.opened import Whole
 from tiny_scenes import random_gaussians, tiny_scene
 
 NOISY = ("position", "log scale", "quaternion", "logit opacity", "colour", "harmonics")
-
-
-def same(a: Gaussians, b: Gaussians) -> bool:
-    return all(
-        torch.equal(value, other) for value, other in zip(vars(a).values(), vars(b).values(), strict=True)
-    )
 
 
 def parts(model: Gaussians) -> dict[str, torch.Tensor]:
@@ -63,8 +57,8 @@ def test_random_pruning_removes_the_share_and_keeps_the_order(share: float) -> N
     assert len(left) == max(1, round(200 * (1 - share)))
     place = torch.cdist(left.means, model.means).argmin(1)
     assert (place.diff() > 0).all()
-    assert same(left, model[place])
-    assert same(left, random_pruning(share, seed=3)(model))
+    assert same_bits(left, model[place])
+    assert same_bits(left, random_pruning(share, seed=3)(model))
     if len(left) > 1:
         assert not torch.equal(left.means, random_pruning(share, seed=4)(model).means)
 
@@ -88,7 +82,7 @@ def test_pruning_by_opacity_removes_the_lowest() -> None:
     model = random_gaussians(200)
     left = opacity_pruning(0.15)(model)
     assert torch.equal(left.opacity_logits.sort().values, model.opacity_logits.sort().values[30:])
-    assert same(left, model[model.opacity_logits >= left.opacity_logits.min()])
+    assert same_bits(left, model[model.opacity_logits >= left.opacity_logits.min()])
 
 
 @pytest.mark.parametrize("prune", [random_pruning, opacity_pruning])
@@ -114,8 +108,8 @@ def test_noise_has_the_standard_deviation_and_touches_nothing_else(attribute: st
         near = slice(0, -50)
         assert float(added[near].std()) == pytest.approx(0.1 * known, rel=0.03)
         assert abs(float(added[near].mean())) < 0.003 * known
-    assert same(changed, noise(attribute, 0.1, seed=1)(model))
-    assert not same(changed, noise(attribute, 0.1, seed=2)(model))
+    assert same_bits(changed, noise(attribute, 0.1, seed=1)(model))
+    assert not same_bits(changed, noise(attribute, 0.1, seed=2)(model))
     with pytest.raises(UsageError, match="expected one of position"):
         noise("rotation", 0.1)
 
@@ -169,7 +163,7 @@ def planted() -> tuple[Gaussians, torch.Tensor]:
 def test_purification_removes_what_is_not_seen_and_nothing_else(scene: Scene) -> None:
     model, invisible = planted()
     purified = purification(scene, steps=0)(model)
-    assert same(purified, model[~invisible])
+    assert same_bits(purified, model[~invisible])
     assert mean_psnr(purified, scene.test, scene.background) == pytest.approx(
         mean_psnr(model, scene.test, scene.background), abs=1e-3
     )
@@ -196,9 +190,9 @@ def test_training_on_repairs_what_photos_show_and_leaves_what_they_do_not(scene:
     tuned = fine_tuning(scene, steps=60)(spoilt)
     before, after = (mean_psnr(each, scene.train, scene.background) for each in (spoilt, tuned))
     assert after > before + 3
-    assert same(tuned[invisible], spoilt[invisible])
-    assert same(tuned, fine_tuning(scene, steps=60)(spoilt))
-    assert same(fine_tuning(scene, steps=0)(spoilt), spoilt)
+    assert same_bits(tuned[invisible], spoilt[invisible])
+    assert same_bits(tuned, fine_tuning(scene, steps=60)(spoilt))
+    assert same_bits(fine_tuning(scene, steps=0)(spoilt), spoilt)
 
 
 # --- conversions -----------------------------------------------------------------------------------------
@@ -229,7 +223,7 @@ def test_gsply_compresses_in_chunks_of_their_own_range() -> None:
     assert sorted(nearest.tolist()) == list(range(256))
     steps = (model.means.amax(0) - model.means.amin(0)) / torch.tensor([2047.0, 1023.0, 2047.0])
     assert ((back.means - model.means[nearest]).abs() <= 0.51 * steps).all()
-    assert same(back, by("compressed .ply", "gsply").change()(model))
+    assert same_bits(back, by("compressed .ply", "gsply").change()(model))
 
 
 @pytest.mark.parametrize("format", ["compressed .ply", ".spz", ".splat", ".sog"])

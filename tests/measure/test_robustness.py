@@ -14,7 +14,7 @@ import keyss
 from channels.low_bits.trained_like import trained_like
 from keyss import CarryOptions
 from keyss.channels import LOW_BITS
-from keyss.core import Gaussians, KeyssWarning, Scene, Similarity, UsageError, WrongKeyError
+from keyss.core import Gaussians, KeyssWarning, Scene, Similarity, UsageError, WrongKeyError, same_bits
 from keyss.fitting import mean_psnr
 from keyss.measure import (
     ChangedQuality,
@@ -125,12 +125,6 @@ def opener(stego: Gaussians) -> Opened:
     return open_model(stego, KEY)
 
 
-def same(a: Gaussians, b: Gaussians) -> bool:
-    return all(
-        torch.equal(value, other) for value, other in zip(vars(a).values(), vars(b).values(), strict=True)
-    )
-
-
 @pytest.fixture(scope="module")
 def pair() -> tuple[list[Scene], list[Gaussians]]:
     scenes, _ = three_scenes()
@@ -147,7 +141,7 @@ def test_a_refitted_secret_without_low_bits(
     )
     hidden = hide_scenes(scenes, [KEY], config, plains=models)
     revealed = keyss.reveal(hidden.stego, KEY).gaussians
-    assert same(reveal_changed(opener, hidden.stego), revealed)
+    assert same_bits(reveal_changed(opener, hidden.stego), revealed)
 
     changes = [random_pruning(0.1), half_floats(), purification(scenes[0], steps=0)]
     _, pruned, rounded, purified = measure_robustness(

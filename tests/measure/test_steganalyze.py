@@ -6,34 +6,23 @@ import csv
 import math
 import os
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from keyss.cli import main
+from cli.said import Run
 from keyss.core import InputError, UsageError
 from keyss.measure import csv_bytes, score_file, steganalyze
 from measure.test_stegexpose import smooth, with_payload
 
-Run = Callable[..., tuple[int, str, str]]
-
 
 @pytest.fixture
-def run(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Run:
-    """`keyss steganalyze ...`: exit status, output, errors."""
-    monkeypatch.setenv("COLUMNS", "120")
-
-    def run(*arguments: object) -> tuple[int, str, str]:
-        capsys.readouterr()
-        try:
-            status = main(["steganalyze", *map(str, arguments)])
-        except SystemExit as end:
-            status = int(end.code or 0)
-        return (status, *capsys.readouterr())
-
-    return run
+def run(keyss: Run) -> Run:
+    """`keyss steganalyze ...`."""
+    return partial(keyss, "steganalyze")
 
 
 @pytest.fixture
@@ -125,14 +114,6 @@ def test_a_folder_without_images_is_one_sentence(
     assert words in errors.splitlines()[-1]
     assert "Traceback" not in errors
     assert not (tmp_path / "scores.csv").exists()
-
-
-def test_help_shows_an_example(run: Run) -> None:
-    status, said, _ = run("--help")
-    assert status == 0
-    assert "example: keyss steganalyze images/ --csv scores.csv" in said
-    for option in ("--csv", "--threshold", "--overwrite"):
-        assert option in said
 
 
 def test_file_names_may_hold_anything(run: Run, tmp_path: Path) -> None:

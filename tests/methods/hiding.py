@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 
 from fitting.test_plain import InterruptAt
-from keyss.core import Gaussians, InputError, Interrupted, KeyssWarning, Scene, Similarity
+from keyss.core import Gaussians, InputError, Interrupted, KeyssWarning, Scene, Similarity, same_bits
 from keyss.fitting import Reporter, mean_psnr
 from keyss.methods import Context, MethodOptions, Opened, Source, registry, with_plain_models
 from tiny_scenes import random_gaussians, tiny_scene
@@ -55,25 +56,28 @@ def hide_scenes(
     return Hidden(stego.gaussians, stego.opened)
 
 
-def check_resumes(options: MethodOptions, checkpoints: Path, stage: str) -> None:
-    """Check that a run interrupted in a plain fit, and then in `stage`, resumes to the same bits.
+def check_resumes(
+    options: MethodOptions, checkpoints: Path, stage: str, plains: Sequence[Gaussians] | None = None
+) -> None:
+    """Check that a run interrupted in a plain fit, unless `plains` are given, and in `stage` resumes.
 
-    A run with other options does not resume it.
+    It ends in the same bits. A run with other options does not resume it.
     """
     scenes, keys = three_scenes()[0][:2], ["a key"]
 
     def run(resume: bool, interrupt: InterruptAt | None = None) -> Hidden:
-        return hide_scenes(scenes, keys, options, checkpoints=checkpoints, resume=resume, reporter=interrupt)
+        kept: dict[str, Any] = {"checkpoints": checkpoints, "resume": resume, "reporter": interrupt}
+        return hide_scenes(scenes, keys, options, plains=plains, **kept)
 
-    whole = hide_scenes(scenes, keys, options)
+    whole = hide_scenes(scenes, keys, options, plains=plains)
     with pytest.raises(Interrupted):
-        run(False, InterruptAt(17, "plain model of the secret"))
+        run(False, InterruptAt(17, stage if plains else "plain model of the secret"))
     with pytest.raises(Interrupted):
         run(True, InterruptAt(23, stage))
-    assert same(run(True).stego, whole.stego)
+    assert same_bits(run(True).stego, whole.stego)
     changed = options.with_fit(sh0_rate=1e-3)
     with pytest.raises(InputError, match="other settings"):
-        hide_scenes(scenes, keys, changed, checkpoints=checkpoints, resume=True)
+        hide_scenes(scenes, keys, changed, plains=plains, checkpoints=checkpoints, resume=True)
 
 
 def moved(scene: Scene, frame: Similarity) -> Scene:
@@ -105,7 +109,3 @@ def three_scenes() -> tuple[list[Scene], list[Gaussians]]:
 def psnr_in(model: Gaussians, scene: Scene) -> float:
     """Mean PSNR of the model on the test views of a scene."""
     return mean_psnr(model, scene.test, scene.background)
-
-
-def same(a: Gaussians, b: Gaussians) -> bool:
-    return all(torch.equal(getattr(a, f.name), getattr(b, f.name)) for f in fields(Gaussians))

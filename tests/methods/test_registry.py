@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
@@ -15,9 +14,9 @@ import torch
 
 import keyss
 from channels.low_bits.trained_like import trained_like
+from cli.said import Run, assert_refused
 from keyss import Gaussians, Secret
 from keyss.channels import LOW_BITS, Content, Payload
-from keyss.cli import main
 from keyss.core import InputError, UsageError, WrongKeyError
 from keyss.methods import (
     Capabilities,
@@ -134,31 +133,37 @@ def test_from_python(models: tuple[Path, Path], tmp_path: Path) -> None:
 
 
 def test_from_the_command_line(
-    models: tuple[Path, Path],
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
+    keyss: Run, models: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("sys.stdin", io.StringIO())
     monkeypatch.setenv("KEYSS_KEY", KEY)
-    monkeypatch.setenv("COLUMNS", "120")
-    with pytest.raises(SystemExit):
-        main(["hide", "--method", "whole", "--help"])
-    said = capsys.readouterr().out
+    said = keyss("hide", "--method", "whole", "--help").out
     assert "--most N" in said
     assert "whole: embed the floats themselves" in " ".join(said.split())
-    hide = ["hide", "--method", "whole", "--cover", str(models[0]), "--secret", str(models[1])]
-    run = str(tmp_path / "run")
-    assert main([*hide, "--width", "24", "--most", "59", "-o", run]) == 2
-    assert "expected at most 59" in capsys.readouterr().err
-    assert main([*hide, "--width", "24", "--most", "60", "-o", run]) == 0
-    assert "floats: 840" in capsys.readouterr().out
-    config = json.loads((tmp_path / "run" / "private" / "config.json").read_text())
+    run = tmp_path / "run"
+    hide = [
+        "hide",
+        "--method",
+        "whole",
+        "--cover",
+        models[0],
+        "--secret",
+        models[1],
+        "--width",
+        24,
+        "-o",
+        run,
+    ]
+    assert_refused(keyss(*hide, "--most", 59), 2, "expected at most 59")
+    said = keyss(*hide, "--most", 60)
+    assert said.status == 0
+    assert "floats: 840" in said.out
+    config = json.loads((run / "private" / "config.json").read_text())
     assert (config["method"], config["options"]["most"]) == ("whole", 60)
-    assert main(["evaluate", run]) == 0
-    assert main(["reveal", f"{run}/publish/stego.ply", "-o", str(tmp_path / "revealed.ply")]) == 0
-    assert main(["info", run]) == 0
-    assert "whole" in capsys.readouterr().out
+    assert keyss("evaluate", run).status == 0
+    assert keyss("reveal", run / "publish" / "stego.ply", "-o", tmp_path / "revealed.ply").status == 0
+    said = keyss("info", run)
+    assert said.status == 0
+    assert "whole" in said.out
 
 
 def test_a_method_that_this_program_does_not_have_is_named(

@@ -111,17 +111,6 @@ def test_only_wanted_gradients_are_made() -> None:
     assert not meta["means2d"].requires_grad
 
 
-def test_features_are_drawn_like_colours() -> None:
-    scene = random_scene(sh_degree=None, channels=5)
-    leaves = {name: leaf.detach() for name, leaf in scene.leaves().items()}
-    images, alphas, _ = scene.draw(leaves)
-    for chosen in ([0, 1, 2], [2, 3, 4], [1]):
-        some = {name: leaves[name][:, chosen] for name in ("colors", "backgrounds")}
-        some_images, same_alphas, _ = scene.draw({**leaves, **some})
-        torch.testing.assert_close(some_images, images[..., chosen], rtol=0, atol=1e-6)
-        torch.testing.assert_close(same_alphas, alphas, rtol=0, atol=1e-6)
-
-
 def test_alpha_alone_has_gradients() -> None:
     scene = random_scene()
     leaves = scene.leaves()

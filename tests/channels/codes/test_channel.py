@@ -29,15 +29,6 @@ def encrypted_bytes(data: bytes) -> int:
 
 
 @EVERY
-def test_a_file_opens_with_each_of_its_keys(suffix: str) -> None:
-    secrets = [("first key", Payload("carry", b"one" * 400)), ("second key", Payload("keyss", b"two"))]
-    file = there_and_back(suffix, CodesCover.of(codes_of(suffix)).embed(secrets).codes)
-    assert [opened(file, each) for each, _ in secrets] == [payload.data for _, payload in secrets]
-    with pytest.raises(WrongKeyError):
-        opened(file, "third key")
-
-
-@EVERY
 @settings(max_examples=12, deadline=None)
 @given(data=st.data())
 def test_any_payloads_of_any_sizes(suffix: str, data: st.DataObject) -> None:

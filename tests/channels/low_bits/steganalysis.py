@@ -60,50 +60,18 @@ def _pairs_of_values(numbers: npt.NDArray[np.uint32]) -> float:
     return float((((counts[:, 0] - expected) ** 2) / expected).mean())
 
 
-def parts(gaussians: Gaussians, depth: int) -> list[Gaussians]:
-    """2^depth spatially disjoint parts of equal size, cut at medians along the longest axis."""
-    if depth == 0:
-        return [gaussians]
-    axis = int((gaussians.means.quantile(0.9, 0) - gaussians.means.quantile(0.1, 0)).argmax())
-    order = gaussians.means[:, axis].argsort()
-    half = len(order) // 2
-    return parts(gaussians[order[:half]], depth - 1) + parts(gaussians[order[half:]], depth - 1)
-
-
 def held_out_auc(
     x: Numbers, y: npt.NDArray[np.int64], groups: npt.NDArray[np.int64], trees: int = 300
 ) -> dict[str, float]:
     """AUC of two classifiers on groups (scenes) that they were not trained on."""
-    found = held_out_scores(x, y, groups, trees)
-    return {name: float(roc_auc_score(y, scores)) for name, scores in found.items()}
-
-
-def held_out_scores(
-    x: Numbers, y: npt.NDArray[np.int64], groups: npt.NDArray[np.int64], trees: int = 300
-) -> dict[str, Numbers]:
-    """[N] probabilities of being embedded, from two classifiers trained on the other groups."""
     result = {}
     for name, make in (
         ("logistic", lambda: make_pipeline(StandardScaler(), LogisticRegression(C=0.01, max_iter=2000))),
         ("forest", lambda: RandomForestClassifier(trees, min_samples_leaf=2, random_state=0)),
     ):
-        scores = np.zeros(len(y))
+        scores = np.zeros(len(y))  # probabilities of being embedded
         for group in np.unique(groups):
             test = groups == group
             scores[test] = make().fit(x[~test], y[~test]).predict_proba(x[test])[:, 1]
-        result[name] = scores
+        result[name] = float(roc_auc_score(y, scores))
     return result
-
-
-def standard_error(
-    scores: Numbers, y: npt.NDArray[np.int64], models: npt.NDArray[np.int64], draws: int = 1000
-) -> float:
-    """Of the AUC: whole models are drawn again (bootstrap), for parts of one are not independent."""
-    random = np.random.default_rng(0)
-    rows = [np.flatnonzero(models == model) for model in np.unique(models)]
-    aucs = []
-    while len(aucs) < draws:
-        drawn = np.concatenate([rows[model] for model in random.integers(len(rows), size=len(rows))])
-        if 0 < y[drawn].sum() < len(drawn):
-            aucs.append(roc_auc_score(y[drawn], scores[drawn]))
-    return float(np.std(aucs))

@@ -1,14 +1,16 @@
-"""A known answer: the carried model of `tests/vectors` comes out the same, whatever becomes of the code."""
+"""A known answer: what `tests/vectors` carries comes out the same ever after, and for its key only."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 
-from keyss.core import WrongKeyError
+from keyss.core import Gaussians, WrongKeyError
 from keyss.files import read_model
 from methods.carry.carried import extract
 
@@ -31,3 +33,23 @@ def test_a_carried_model_opens() -> None:
 def test_to_its_key_only() -> None:
     with pytest.raises(WrongKeyError):
         extract(STEGO, VECTOR["wrong"])
+
+
+def _moved(stego: Gaussians) -> Gaussians:
+    return replace(stego, means=stego.means + 0.01)
+
+
+def _quantised(stego: Gaussians) -> Gaussians:
+    return stego.map(lambda values: values.half().float())
+
+
+@pytest.mark.parametrize("change", [_moved, _quantised, lambda stego: stego.with_sh_degree(2)])
+def test_what_was_changed_opens_no_more(change: Callable[[Gaussians], Gaussians]) -> None:
+    with pytest.raises(WrongKeyError, match="opens nothing"):
+        extract(change(STEGO), VECTOR["key"])
+
+
+def test_what_is_left_of_it_opens() -> None:
+    order = torch.randperm(len(STEGO), generator=torch.Generator().manual_seed(0))
+    carried = extract(STEGO[order[:360]], VECTOR["key"])
+    assert 4 <= len(carried.gaussians) <= carried.count == VECTOR["count"]

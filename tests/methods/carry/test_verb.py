@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import io
 import json
-import re
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,9 +11,9 @@ import torch
 
 import keyss
 from channels.low_bits.trained_like import trained_like
+from cli.said import Run
 from keyss import CarryOptions, FitConfig, Secret
 from keyss.channels import LOW_BITS
-from keyss.cli import main
 from keyss.core import InputError, UsageError, WrongKeyError
 from keyss.files import read_model, write_model
 from keyss.methods import most_visible, record_request
@@ -40,22 +37,13 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def run(
-    files: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> Callable[..., tuple[int, str, str]]:
-    monkeypatch.setenv("COLUMNS", "120")
-    monkeypatch.setattr("sys.stdin", io.StringIO())
+def run(files: Path, keyss: Run, monkeypatch: pytest.MonkeyPatch) -> Run:
+    """The command line in the folder of the files."""
     monkeypatch.chdir(files)
-
-    def call(*arguments: object) -> tuple[int, str, str]:
-        capsys.readouterr()
-        status = main([str(argument) for argument in arguments])
-        return (status, *capsys.readouterr())
-
-    return call
+    return keyss
 
 
-def test_hide_and_reveal_files(run: Callable[..., tuple[int, str, str]], tmp_path: Path) -> None:
+def test_hide_and_reveal_files(run: Run, tmp_path: Path) -> None:
     status, out, err = run(*HIDE, "--cover", "cover.ply", "--secret", "secret.ply", "-o", tmp_path / "out")
     assert (status, err) == (0, "")
     assert "900" in out
@@ -85,9 +73,7 @@ def test_hide_and_reveal_files(run: Callable[..., tuple[int, str, str]], tmp_pat
     assert KEY not in "".join(path.read_text() for path in (tmp_path / "out").rglob("*.json"))
 
 
-def test_too_large_secrets_are_refused_or_pruned(
-    run: Callable[..., tuple[int, str, str]], tmp_path: Path
-) -> None:
+def test_too_large_secrets_are_refused_or_pruned(run: Run, tmp_path: Path) -> None:
     hide = (*HIDE, "--cover", "cover.ply", "--secret", "large.ply")
     status, _, err = run(*hide, "-o", tmp_path / "out", "--refit", "never")
     assert status == 2
@@ -103,9 +89,7 @@ def test_too_large_secrets_are_refused_or_pruned(
     assert 10 < metrics["against_plain"][1]["psnr"] < 60
 
 
-def test_a_cover_without_any_room_names_what_works_and_not_what_was_given(
-    run: Callable[..., tuple[int, str, str]], tmp_path: Path
-) -> None:
+def test_a_cover_without_any_room_names_what_works_and_not_what_was_given(run: Run, tmp_path: Path) -> None:
     write_model(tmp_path / "tiny.ply", trained_like(100))
     for flags in ((), ("--prune-to-fit",), ("--refit=never",)):
         scenes = ("--cover", tmp_path / "tiny.ply", "--secret", "secret.ply")
@@ -114,17 +98,6 @@ def test_a_cover_without_any_room_names_what_works_and_not_what_was_given(
         assert "--publish any" in err
         assert "there is room" not in err
         assert not (tmp_path / "out").exists()
-
-
-def test_one_key_for_two_secrets_is_refused_before_any_work(
-    run: Callable[..., tuple[int, str, str]], tmp_path: Path
-) -> None:
-    hide = ("hide", "--method", "carry", "--cover", "cover.ply", "-o", tmp_path / "out")
-    secrets = ("--secret", "secret.ply", "--key-file", "key", "--secret", "secret.ply", "--key-file", "key")
-    status, out, err = run(*hide, *secrets)
-    assert (status, out) == (2, "")
-    assert "secrets 1 and 2 have the same key" in err
-    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(
@@ -138,26 +111,13 @@ def test_one_key_for_two_secrets_is_refused_before_any_work(
     ],
 )
 def test_options_of_the_other_method_are_refused(
-    run: Callable[..., tuple[int, str, str]], tmp_path: Path, arguments: tuple[str, ...], having: str
+    run: Run, tmp_path: Path, arguments: tuple[str, ...], having: str
 ) -> None:
     hide = ("hide", "--cover", "cover.ply", "--secret", "secret.ply", "--key-file", "key")
     status, _, err = run(*hide, "-o", tmp_path / "out", *arguments)
     assert status == 2
     assert f"an option of --method {having}; " in err
     assert not (tmp_path / "out").exists()
-
-
-def test_dithering_says_what_it_costs(
-    run: Callable[..., tuple[int, str, str]], files: Path, tmp_path: Path
-) -> None:
-    write_model(tmp_path / "coarse.ply", read_model(files / "cover.ply").map(lambda v: (v * 64).round() / 64))
-    hide = (*HIDE, "--cover", tmp_path / "coarse.ply", "--secret", "secret.ply", "-o", tmp_path / "out")
-    status, _, err = run(*hide)
-    assert status == 4
-    assert "--dither makes room" in err
-    status, out, _ = run(*hide, "--dither")
-    assert status == 0
-    assert "PSNR to the plain models: cover " in out
 
 
 def test_from_photos_a_model_is_fitted_first_and_photos_judge(tmp_path: Path) -> None:
@@ -201,9 +161,7 @@ def test_a_given_model_of_a_scene_is_used() -> None:
         keyss.reveal(result.stego, "wrong")
 
 
-def test_a_pruned_secret_that_is_not_recognised_is_refused(
-    run: Callable[..., tuple[int, str, str]], tmp_path: Path
-) -> None:
+def test_a_pruned_secret_that_is_not_recognised_is_refused(run: Run, tmp_path: Path) -> None:
     hide = (*HIDE, "--cover", "cover.ply", "--secret", "large.ply", "--publish", "spz", "--prune-to-fit")
     status, out, err = run(*hide, "-o", tmp_path / "out")
     assert status == 7
@@ -211,23 +169,6 @@ def test_a_pruned_secret_that_is_not_recognised_is_refused(
     status, out, _ = run(*hide, "-o", tmp_path / "out", "--min-psnr", 0)
     assert status == 0
     assert "of 6,000 Gaussians, " in out
-
-
-@pytest.mark.parametrize("unit", [False, True])
-def test_the_degree_that_a_refusal_names_works(
-    run: Callable[..., tuple[int, str, str]], tmp_path: Path, unit: bool
-) -> None:
-    cover = trained_like(3000, sh_degree=0)
-    if unit:
-        cover = replace(cover, quats=torch.nn.functional.normalize(cover.quats, dim=1))
-    write_model(tmp_path / "flat.ply", cover)
-    hide = (*HIDE, "--cover", tmp_path / "flat.ply", "--secret", "secret.ply", "-o", tmp_path / "out")
-    status, _, err = run(*hide)
-    assert status == 2
-    (degree,) = re.findall(r"--sh-degree (\d)", err)
-    status, out, _ = run(*hide, "--sh-degree", degree, "--prune-to-fit", "--min-psnr", 0)
-    assert status == 0
-    assert "of 900 Gaussians, " in out
 
 
 def test_pruning_keeps_what_is_visible() -> None:

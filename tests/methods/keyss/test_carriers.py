@@ -11,15 +11,14 @@ import pytest
 import torch
 
 from channels.low_bits.trained_like import trained_like
-from fitting.test_plain import InterruptAt
 from keyss import Gaussians, KeyssOptions, WrongKeyError, read_model
 from keyss.channels import LOW_BITS, Payload
-from keyss.core import InputError, Interrupted, Similarity, UsageError
+from keyss.core import InputError, Similarity, UsageError, same_bits
 from keyss.keys import random_embeddings
 from keyss.measure import search_embeddings
 from keyss.methods import PlacedScene, RowSecret, registry
 from keyss.methods.keyss.rows import PAYLOAD_BYTES, carrying, encrypt_rows, row_kinds, secret_tables
-from methods.hiding import Hidden, hide_scenes, psnr_in, same, three_scenes
+from methods.hiding import Hidden, check_resumes, hide_scenes, psnr_in, three_scenes
 from methods.keyss.hiding import EMBEDDINGS, FIT, KEYS, cover_with_zeros, written
 from tiny_scenes import random_gaussians
 
@@ -51,7 +50,7 @@ def test_rows_open_in_any_order_and_after_pruning_and_low_bits() -> None:
     whole = secret.decode(stego, secret.embedding)
     assert len(whole) == secret.count
     embedded = LOW_BITS.prepare(stego).embed([("key", Payload("keyss", b"else"))], entropy=bytes(32))
-    assert same(secret.decode(embedded, secret.embedding), whole)
+    assert same_bits(secret.decode(embedded, secret.embedding), whole)
     chosen = torch.randperm(len(stego), generator=torch.Generator().manual_seed(0))[:500]
     some = secret.decode(stego[chosen], secret.embedding)
     rows = {row.numpy().tobytes() for row in whole.means}
@@ -88,7 +87,7 @@ def test_the_cover_keeps_signs_exponents_leading_bits_and_zeros() -> None:
     before, after = (model.sh[:, 1:].numpy().view(np.uint32) >> 21 for model in (cover, stego))
     assert np.array_equal(before, after)
     assert torch.equal(cover.sh == 0, stego.sh == 0)
-    assert same(replace(stego, sh=cover.sh), cover)
+    assert same_bits(replace(stego, sh=cover.sh), cover)
 
 
 def test_what_rows_say_is_uniform() -> None:
@@ -165,22 +164,8 @@ def test_a_row_has_room_for_two_secrets_and_no_more() -> None:
 
 
 def test_an_interrupted_training_resumes_to_the_same_result(tmp_path: Path) -> None:
-    scenes, models = three_scenes()
     options = replace(OPTIONS, fit=replace(FIT, iterations=40, grow_every=5))
-    whole = hide_scenes(scenes[:2], KEYS[:1], options, plains=models[:2])
-    for resume in (False, True):
-        with pytest.raises(Interrupted):
-            hide_scenes(
-                scenes[:2],
-                KEYS[:1],
-                options,
-                plains=models[:2],
-                checkpoints=tmp_path,
-                resume=resume,
-                reporter=InterruptAt(13 + 20 * resume, "hide"),
-            )
-    resumed = hide_scenes(scenes[:2], KEYS[:1], options, plains=models[:2], checkpoints=tmp_path, resume=True)
-    assert same(resumed.stego, whole.stego)
+    check_resumes(options, tmp_path, "hide", three_scenes()[1][:2])
 
 
 def test_a_cover_without_harmonics_is_refused() -> None:

@@ -12,7 +12,7 @@ import torch
 
 from keyss import FitConfig, Gaussians, KeyssOptions, WrongKeyError
 from keyss.channels import is_appended
-from keyss.core import InputError, KeyssWarning, UsageError
+from keyss.core import InputError, KeyssWarning, UsageError, same_bits
 from keyss.core.similarity import Similarity
 from keyss.fitting import make_optimizers, to_parameters
 from keyss.fitting.density import combine_densification
@@ -22,7 +22,7 @@ from keyss.methods.keyss import method
 from keyss.methods.keyss.designs.network import EvenGrowth, possibly_seen
 from keyss.rendering import render, render_with_meta
 from keyss.rendering.orbit import orbit
-from methods.hiding import Hidden, check_resumes, hide_scenes, psnr_in, same, three_scenes
+from methods.hiding import Hidden, check_resumes, hide_scenes, psnr_in, three_scenes
 from methods.keyss.hiding import KEYS, OPTIONS, PUBLISHED, SMALL
 from tiny_scenes import random_gaussians, tiny_scene
 
@@ -80,7 +80,7 @@ def test_appended_gaussians_are_not_decoded(hidden: Hidden) -> None:
     own = hidden.stego[~is_appended(hidden.stego)]
     assert len(own) < len(hidden.stego) - 1000
     for secret in hidden.opened:
-        assert same(secret.reveal(hidden.stego), secret.reveal(own))
+        assert same_bits(secret.reveal(hidden.stego), secret.reveal(own))
         assert secret.remains(secret.reveal(hidden.stego)).whole
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ import pytest
 import torch
 
 import keyss
+from cli.said import Run, assert_refused
 from keyss import FitConfig, Secret
 from keyss.audits import audit
 from keyss.cli import main
@@ -131,26 +131,23 @@ def test_damage_is_told(made: Made, tmp_path: Path, at: int) -> None:
     assert key is None  # a changed number is another number, where nothing is sealed
 
 
-def test_the_command_line(
-    made: Made, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("sys.stdin", io.StringIO())
-    monkeypatch.delenv("KEYSS_KEY", raising=False)
+def test_the_command_line(keyss: Run, made: Made, tmp_path: Path) -> None:
     key = tmp_path / "key.txt"
     key.touch(0o600)
     key.write_text(KEY)
-    given = ["--key-file", str(key)] if made.keys else []
-    assert main(["evaluate", str(made.out), *given]) == 0
-    assert f"{made.result.metrics.secrets[0].psnr:.2f}" in capsys.readouterr().out
+    given = ["--key-file", key] if made.keys else []
+    said = keyss("evaluate", made.out, *given)
+    assert said.status == 0
+    assert f"{made.result.metrics.secrets[0].psnr:.2f}" in said.out
     models = registry.get(made.name).capabilities.models
-    out = str(tmp_path / ("a.ply" if models else "a.3dgs.safetensors"))
-    stego = str(stego_in(made.out))
-    assert main(["reveal", stego, "--handed", str(made.handed), *given, "-o", out]) == 0
-    assert main(["info", out]) == 0
-    assert main(["info", str(made.out)]) == 0
-    assert made.name in capsys.readouterr().out
-    assert main(["reveal", stego, "--handed", stego, "-o", str(tmp_path / "b.ply")]) == 4
-    assert "handed over" in capsys.readouterr().err
+    out = tmp_path / ("a.ply" if models else "a.3dgs.safetensors")
+    stego = stego_in(made.out)
+    assert keyss("reveal", stego, "--handed", made.handed, *given, "-o", out).status == 0
+    assert keyss("info", out).status == 0
+    said = keyss("info", made.out)
+    assert said.status == 0
+    assert made.name in said.out
+    assert_refused(keyss("reveal", stego, "--handed", stego, "-o", tmp_path / "b.ply"), 4, "handed over")
 
 
 def test_a_key_for_what_has_none_and_what_it_cannot_do_are_refused(folders: tuple[Path, Path]) -> None:
@@ -198,7 +195,7 @@ def test_an_interrupted_training_goes_on_bit_for_bit(name: str) -> None:
     assert whole.evaluate() == resumed.evaluate()
 
 
-def test_audits_measure_what_there_is(made: Made, capsys: pytest.CaptureFixture[str]) -> None:
+def test_audits_measure_what_there_is(made: Made) -> None:
     if made.name not in ("3dgs-decoder", "gs-hider"):  # the others are 3DGS models throughout
         return
     standard = registry.get(made.name).capabilities.standard
