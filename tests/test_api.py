@@ -22,7 +22,7 @@ from keyss import CarryOptions, FitConfig, Secret
 from keyss.cli import main
 from keyss.core import InputError, OutputError, Scene, UsageError, WrongKeyError
 from keyss.runs import STEGO, read_config
-from tiny_scenes import HEIGHT, WIDTH, random_gaussians, tiny_scene
+from tiny_scenes import HEIGHT, WIDTH, random_gaussians
 
 CONFIG = CarryOptions(
     fit=FitConfig(iterations=60, max_gaussians=300, grow_start=0.2, grow_every=20, evaluate_every=0, seed=0),
@@ -46,12 +46,6 @@ def write_nerfstudio(folder: Path, scene: Scene) -> Path:
     data = {"w": WIDTH, "h": HEIGHT, **intrinsics, "frames": frames}
     (folder / "transforms.json").write_text(json.dumps(data))
     return folder
-
-
-@pytest.fixture(scope="module")
-def folders(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    root = tmp_path_factory.mktemp("scenes")
-    return write_nerfstudio(root / "a", tiny_scene(0)), write_nerfstudio(root / "b", tiny_scene(1))
 
 
 @pytest.fixture(scope="module")

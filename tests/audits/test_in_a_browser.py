@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import re
 import select
-import shutil
 import socket
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,17 +14,14 @@ from PIL import Image
 
 from audits.audited import found_in, run_with
 from keyss.audits import audit
+from viewer.browser import PATIENCE, PROGRAM
 
 playwright = pytest.importorskip("playwright.sync_api", reason="needs playwright: pip install playwright")
 
-NAMES = ("chromium-headless-shell", "chromium", "google-chrome", "chromium-browser")
-PROGRAM = next((path for name in NAMES if (path := shutil.which(name))), None)
-pytestmark = pytest.mark.skipif(PROGRAM is None, reason=f"none of {', '.join(NAMES)} on PATH")
+pytestmark = pytest.mark.skipif(PROGRAM is None, reason="no Chromium on PATH")
 
-SWITCHES = ["--no-sandbox", "--disable-dev-shm-usage"]
 RED, GREEN, BLUE = (220, 30, 30), (30, 160, 60), (30, 60, 220)
 SLIDER = ".stage input >> nth=0"
-PATIENCE = 60_000  # milliseconds for any one answer: other work may share the machine
 
 
 @pytest.fixture(scope="module")
@@ -38,14 +34,6 @@ def report(run_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
         Image.new("RGB", (40, 30), colour).save(run / "private" / "audit" / items[label])
     audit(run, report_only=True)
     return run / "private" / "report.html"
-
-
-@pytest.fixture(scope="module")
-def chromium() -> Iterator[playwright.Browser]:
-    with playwright.sync_playwright() as started:
-        browser = started.chromium.launch(executable_path=PROGRAM, args=SWITCHES, timeout=PATIENCE)
-        yield browser
-        browser.close()
 
 
 @pytest.fixture

@@ -6,8 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from cli.said import SMALL
-from files.scene_files import write_blender, write_nerfstudio
+from cli.said import SMALL, write_key, write_world
 from keyss.cli import main
 from shared import made_once
 
@@ -19,20 +18,6 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def _make_world(folder: Path) -> None:
-    write_blender(folder / "a", count=3, channels=3)
-    write_nerfstudio(folder / "b", count=4)
-    (folder / "key.txt").write_text("q7Rv2LxT9bWm4KzD\n")
-    (folder / "key.txt").chmod(0o600)
-    (folder / "wrong.txt").write_text("fedcba9876543210\n")
-    arguments = [
-        "--publish",
-        "any",
-        "--cover",
-        folder / "a",
-        "--secret",
-        folder / "b",
-        "--key-file",
-        folder / "key.txt",
-    ]
-    status = main(["hide", *map(str, arguments), "-o", str(folder / "hidden"), *SMALL])
-    assert status == 0
+    write_key(write_world(folder) / "wrong.txt", "fedcba9876543210")
+    scenes = ("--cover", folder / "a", "--secret", folder / "b", "--key-file", folder / "key.txt")
+    assert main(["hide", "--publish", "any", *map(str, scenes), "-o", str(folder / "hidden"), *SMALL]) == 0

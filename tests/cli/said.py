@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import cheap_keys
+from files.scene_files import write_blender, write_nerfstudio
 from keyss.cli import commands
 from keyss.fitting import ImageQuality
 from keyss.measure import BaselineQuality, RenderFidelity
@@ -45,6 +46,21 @@ class Said(NamedTuple):
 
 
 Run = Callable[..., Said]  # of the fixture `keyss`
+
+
+def write_key(path: Path, key: str = "q7Rv2LxT9bWm4KzD") -> Path:
+    """A file that nobody else can read."""
+    path.touch(0o600)
+    path.write_text(f"{key}\n")
+    return path
+
+
+def write_world(folder: Path) -> Path:
+    """Scenes `a` and `b`, and `key.txt`."""
+    write_blender(folder / "a", count=3, channels=3)
+    write_nerfstudio(folder / "b", count=4)
+    write_key(folder / "key.txt")
+    return folder
 
 
 def listing(folder: Path) -> dict[str, int]:

@@ -18,7 +18,8 @@ class TestArguments:
     """What reaches the functions."""
 
     @pytest.fixture
-    def hidden(self, monkeypatch: pytest.MonkeyPatch) -> list[tuple[tuple[Any, ...], dict[str, Any]]]:
+    def hidden(self, keyss: Run, monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+        """Arguments of each call of `keyss.hide`."""
         calls: list[tuple[tuple[Any, ...], dict[str, Any]]] = []
 
         def hide(*args: Any, **kwargs: Any) -> library.HideResult:
@@ -26,6 +27,7 @@ class TestArguments:
             return library.HideResult(random_gaussians(1), METRICS)
 
         monkeypatch.setattr(library, "hide", hide)
+        monkeypatch.setenv("KEYSS_KEY", "k")
         return calls
 
     def test_secrets_and_keys_pair_up_in_order(self, keyss: Run, hidden: list[Any], tmp_path: Path) -> None:
@@ -33,16 +35,8 @@ class TestArguments:
             (tmp_path / f"{name}.txt").write_text(f"key of {name}")
         said = keyss(
             *("hide", "--cover", "A", "-o", "out", "--secret", "B", "--key-file", tmp_path / "b.txt"),
-            *(
-                "--secret",
-                "C",
-                "--key-file",
-                tmp_path / "c.txt",
-                "--secret-model",
-                "mb",
-                "--secret-model",
-                "mc",
-            ),
+            *("--secret", "C", "--key-file", tmp_path / "c.txt"),
+            *("--secret-model", "mb", "--secret-model", "mc"),
         )
         assert said.status == 0, said.err
         (cover, secrets), _ = hidden[0]
@@ -52,10 +46,7 @@ class TestArguments:
             library.Secret(Path("C"), "key of c", Path("mc")),
         ]
 
-    def test_options_override_the_preset(
-        self, keyss: Run, hidden: list[Any], monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        monkeypatch.setenv("KEYSS_KEY", "k")
+    def test_options_override_the_preset(self, keyss: Run, hidden: list[Any]) -> None:
         said = keyss(
             *("hide", "--cover", "A", "--secret", "B", "-o", "out", "--preset", "quick", "--iterations", 7),
             *("--max-gaussians", 80, "--seed", 9, "--method", "keyss", "--design", "mlp", "--mask", "xyz,sc"),
@@ -82,19 +73,13 @@ class TestArguments:
             "resume": True,
         }
 
-    def test_by_default_the_preset_stays_as_it_is(
-        self, keyss: Run, hidden: list[Any], monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        monkeypatch.setenv("KEYSS_KEY", "k")
+    def test_by_default_the_preset_stays_as_it_is(self, keyss: Run, hidden: list[Any]) -> None:
         assert keyss("hide", "--cover", "A", "--secret", "B", "-o", "out").status == 0
         assert hidden[0][1]["method"] == CarryOptions()
         assert keyss("hide", "--method", "keyss", "--cover", "A", "--secret", "B", "-o", "out").status == 0
         assert hidden[1][1]["method"] == KeyssOptions()
 
-    def test_options_of_a_method_reach_it(
-        self, keyss: Run, hidden: list[Any], monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        monkeypatch.setenv("KEYSS_KEY", "k")
+    def test_options_of_a_method_reach_it(self, keyss: Run, hidden: list[Any]) -> None:
         scenes = ("hide", "--cover", "A", "--secret", "B", "-o", "out")
         clip = ("--key-encoder", "clip", "--clip-model", "C")
         assert keyss(*scenes, "--method", "keyss", "--design", "published", *clip).status == 0
@@ -117,14 +102,8 @@ class TestArguments:
         ],
     )
     def test_what_makes_no_sense_is_refused(
-        self,
-        keyss: Run,
-        hidden: list[Any],
-        monkeypatch: pytest.MonkeyPatch,
-        extra: tuple[object, ...],
-        words: str,
+        self, keyss: Run, hidden: list[Any], extra: tuple[object, ...], words: str
     ) -> None:
-        monkeypatch.setenv("KEYSS_KEY", "k")
         assert_refused(keyss("hide", "--cover", "A", "--secret", "B", "-o", "out", *extra), 2, words)
         assert hidden == []
 
@@ -139,14 +118,8 @@ class TestArguments:
         ],
     )
     def test_what_has_no_effect_is_refused(
-        self,
-        keyss: Run,
-        hidden: list[Any],
-        monkeypatch: pytest.MonkeyPatch,
-        extra: tuple[object, ...],
-        words: str,
+        self, keyss: Run, hidden: list[Any], extra: tuple[object, ...], words: str
     ) -> None:
-        monkeypatch.setenv("KEYSS_KEY", "k")
         carry = ("hide", "--refit", "never", "-o", "out", *extra)
         assert_refused(keyss(*carry, "--cover", "a.ply", "--secret", "b.ply"), 2, words)
         models = ("--cover-model", "a.ply", "--secret-model", "b.ply")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import subprocess
 from pathlib import Path
 
@@ -12,7 +11,7 @@ import torch
 
 import keyss as package
 from channels.low_bits.trained_like import trained_like
-from cli.said import PROGRAM, Run, assert_refused
+from cli.said import PROGRAM, Run, assert_refused, write_key
 from keyss.files import read_model, write_model
 from tiny_scenes import random_gaussians
 
@@ -25,10 +24,8 @@ COUNT = 400
 def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """`key`, which opens carried.ply, `other`, which does not, and a plain model in several formats."""
     folder = tmp_path_factory.mktemp("convert")
-    (folder / "key").write_text(json.loads((VECTORS / "carried.json").read_text())["key"])
-    (folder / "other").write_text("q7Rv2LxT9bWm4KzD")
-    for name in ("key", "other"):
-        os.chmod(folder / name, 0o600)
+    write_key(folder / "key", json.loads((VECTORS / "carried.json").read_text())["key"])
+    write_key(folder / "other")
     for suffix in ("ply", "spz", "sog", "compressed.ply", "glb", "splat"):
         write_model(folder / f"plain.{suffix}", random_gaussians(COUNT))
     return folder

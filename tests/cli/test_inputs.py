@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from cli.said import SMALL, Run, Said, assert_refused, listing
+from cli.said import SMALL, Run, Said, assert_refused, listing, write_key
 from files.scene_files import (
     write_blender,
     write_colmap,
@@ -70,11 +70,9 @@ def test_what_is_no_run_is_not_evaluated(keyss: Run, world: Path, path: str) -> 
 
 
 FOREIGN = {
-    "scene.lcc": (b"{}", "an LCC model", "splat-transform"),
     "scene.gltf": (b"{}", "a glTF file with its data beside it", "export a .glb"),
     "scene.csv": (b"x,y,z\n0,0,0\n", "a table", "export a .ply"),
     "photo.jpg": (b"\xff\xd8\xff\xe0", "a picture", "poses"),
-    "archive": (b"7z\xbc\xaf\x27\x1c" * 9, "an archive", "unpack"),
 }
 
 
@@ -136,29 +134,17 @@ def open_folder() -> Iterator[Path]:
 def test_an_unreadable_scene_is_an_input_that_cannot_be_read(
     keyss: Run, open_folder: Path, closed: str
 ) -> None:
-    scene = write_colmap(open_folder / "scene")
+    scene, key = write_colmap(open_folder / "scene"), ("--key-file", write_key(open_folder / "key"))
     (scene / closed).chmod(0)
     commands = (
         ("fit", scene, "-o", open_folder / "out"),
         ("info", scene),
-        (
-            "hide",
-            "--cover",
-            scene,
-            "--secret",
-            scene,
-            "--key-file",
-            open_folder / "key",
-            "-o",
-            open_folder / "out",
-        ),
-        ("evaluate", scene, "--key-file", open_folder / "key"),
+        ("hide", "--cover", scene, "--secret", scene, *key, "-o", open_folder / "out"),
+        ("evaluate", scene, *key),
     )
-    (open_folder / "key").write_text("q7Rv2LxT9bWm4KzD")
     for command in commands:
-        keyss(
-            *[open_folder / "nowhere" if each is scene else each for each in command]
-        )  # imports all it needs
+        # Imports all it needs.
+        keyss(*[open_folder / "nowhere" if each is scene else each for each in command])
         with unprivileged():
             said = keyss(*command)
         assert_refused(said, 4, str(scene))
@@ -170,11 +156,11 @@ def test_a_run_of_somebody_else_s_is_an_input_that_cannot_be_read(
     keyss: Run, world: Path, open_folder: Path
 ) -> None:
     run = shutil.copytree(world / "hidden", open_folder / "run")
-    (open_folder / "key").write_text("q7Rv2LxT9bWm4KzD")
-    keyss("evaluate", open_folder / "nowhere", *("--key-file", open_folder / "key"))  # imports all it needs
+    key = ("--key-file", write_key(open_folder / "key"))
+    keyss("evaluate", open_folder / "nowhere", *key)  # imports all it needs
     (run / "private").chmod(0)
     with unprivileged():
-        said = keyss("evaluate", run, "--key-file", open_folder / "key")
+        said = keyss("evaluate", run, *key)
     (run / "private").chmod(0o700)
     assert_refused(said, 4, f"{run}: cannot be read: Permission denied")
 

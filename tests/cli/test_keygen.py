@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from cli.said import Run, assert_refused
+from cli.said import Run, assert_refused, write_key
 from keyss.keys import MasterKey, read_key_file
 
 MASTER = "q7Rv2LxT9bWm4KzDq7Rv2L"
@@ -29,9 +29,7 @@ class TestKeygen:
         assert_refused(keyss("keygen", "--bits", 10_000), 2, "1 to 1024")
 
     def test_the_key_of_an_asset_follows_from_the_master_key(self, keyss: Run, tmp_path: Path) -> None:
-        master = tmp_path / "master.txt"
-        master.touch(mode=0o600)
-        master.write_text(MASTER + "\n")
+        master = write_key(tmp_path / "master.txt", MASTER)
         expected = MasterKey(MASTER).key_of("statue-7")
         asset = ("keygen", "--asset", "statue-7")
         assert keyss(*asset, "--master-key-file", master).out == f"{expected}\n"

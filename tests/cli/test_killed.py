@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from cli.said import PROGRAM
+from cli.said import PROGRAM, write_world
 
 SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
 SIZE = (
@@ -122,14 +122,7 @@ def result_of(command: Command, out: Path, run: Path) -> list[object]:
 @pytest.fixture(scope="module")
 def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two scenes and a key."""
-    from files.scene_files import write_blender, write_nerfstudio
-
-    folder = tmp_path_factory.mktemp("killed")
-    write_blender(folder / "a", count=3, channels=3)
-    write_nerfstudio(folder / "b", count=4)
-    (folder / "key.txt").write_text("q7Rv2LxT9bWm4KzD\n")
-    (folder / "key.txt").chmod(0o600)
-    return folder
+    return write_world(tmp_path_factory.mktemp("killed"))
 
 
 class Undisturbed:

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from channels.low_bits.trained_like import trained_like
-from cli.said import SMALL, Run, assert_refused
+from cli.said import SMALL, Run, assert_refused, write_key
 from keyss.files import read_model, write_model
 
 
@@ -33,8 +33,7 @@ def models(tmp_path: Path) -> Path:
     """A cover and a secret as files."""
     write_model(tmp_path / "cover.ply", trained_like(3000))
     write_model(tmp_path / "secret.ply", trained_like(1500, 1))
-    (tmp_path / "key.txt").write_text("q7Rv2LxT9bWm4KzD\n")
-    (tmp_path / "key.txt").chmod(0o600)
+    write_key(tmp_path / "key.txt")
     return tmp_path
 
 

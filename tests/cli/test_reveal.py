@@ -15,7 +15,7 @@ import pytest
 
 from channels.codes.published import codes_of, model_of
 from channels.low_bits.trained_like import trained_like
-from cli.said import PROGRAM, Run, Said, assert_refused, listing
+from cli.said import PROGRAM, Run, Said, assert_refused, listing, write_key
 from keyss.channels import LOW_BITS, CodesCover, Payload, base
 from keyss.channels.colours import salts
 from keyss.channels.low_bits import cells
@@ -42,8 +42,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Keys `key` and `other`; models of which 500 of 500, 1,000 and 12,000 Gaussians are left."""
     folder = tmp_path_factory.mktemp("files")
     for name, key in (("key", KEY), ("other", KEY[::-1])):
-        (folder / name).write_text(key)
-        (folder / name).chmod(0o600)
+        write_key(folder / name, key)
     cover, secret = trained_like(1500), trained_like(500, 1)
     write_model(folder / "plain.ply", cover)
     for name, claimed in (("whole", 500), ("half", 1000), ("few", 12_000)):

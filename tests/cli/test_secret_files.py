@@ -12,7 +12,7 @@ from hypothesis import given, strategies as st
 import keyss as library
 from channels.colours.made import cover
 from channels.low_bits.trained_like import trained_like
-from cli.said import Run, assert_refused, listing
+from cli.said import Run, assert_refused, listing, write_key
 from keyss import write_model
 from keyss.channels import Payload, pack_payload, unpack_payload
 from keyss.cli import main
@@ -31,8 +31,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (made / "letter.pdf").write_bytes(os.urandom(3000))
     (made / "empty").write_bytes(b"")
     for index, key in enumerate(KEYS):
-        (made / f"key{index}").write_text(key)
-        (made / f"key{index}").chmod(0o600)
+        write_key(made / f"key{index}", key)
     assert main([str(each) for each in _arguments(made, made / "out")]) == 0
     return made
 

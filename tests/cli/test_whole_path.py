@@ -47,14 +47,11 @@ class TestTheWholePath:
         assert json.loads((out / "private" / "metrics.json").read_text())["width"] == 8
 
     def test_a_decoy_looks_like_a_success(self, keyss: Run, world: Path, tmp_path: Path) -> None:
-        (tmp_path / "a.txt").write_text((world / "key.txt").read_text())
-        (tmp_path / "b.txt").write_text((world / "wrong.txt").read_text())
+        stego = world / "hidden" / "publish" / "stego.ply"
         said = []
-        for name in "ab":
-            (tmp_path / f"{name}.txt").chmod(0o600)
-            key, out = tmp_path / f"{name}.txt", tmp_path / f"{name}.ply"
-            stego = world / "hidden" / "publish" / "stego.ply"
-            said.append(keyss("reveal", stego, "--key-file", key, "--decoy", "-o", out))
+        for name, key in (("a", "key.txt"), ("b", "wrong.txt")):
+            out = tmp_path / f"{name}.ply"
+            said.append(keyss("reveal", stego, "--key-file", world / key, "--decoy", "-o", out))
         right, wrong = said
         assert right.status == 0
         assert wrong == Said(0, right.out.replace("a.ply", "b.ply"), right.err)

@@ -14,16 +14,8 @@ from keyss.core import InputError, OutputError, UsageError
 from keyss.fitting import PRESETS
 from keyss.many import Forecast, comparing, performing, running
 from keyss.methods import Bound, registry
-from test_api import write_nerfstudio
-from tiny_scenes import tiny_scene
 
 SMALL = ["--iterations", "60", "--max-gaussians", "150", "--seed", "3"]
-
-
-@pytest.fixture(scope="module")
-def folders(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    root = tmp_path_factory.mktemp("scenes")
-    return write_nerfstudio(root / "a", tiny_scene(0)), write_nerfstudio(root / "b", tiny_scene(1))
 
 
 def test_a_table_a_picture_and_a_second_start(

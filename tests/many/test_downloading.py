@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import io
 import sys
-import threading
 import zipfile
 from collections.abc import Iterator
-from functools import partial
-from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import pytest
@@ -17,11 +14,7 @@ from cli.said import Run
 from files.scene_files import WIDTH, photo, save, write_colmap
 from keyss.core import BackendError, InputError
 from keyss.many import scenes
-
-
-class Quiet(SimpleHTTPRequestHandler):
-    def log_message(self, format: str, *args: object) -> None:
-        pass
+from serving import serving
 
 
 @pytest.fixture
@@ -38,12 +31,9 @@ def server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
             for path in folder.rglob("*"):
                 archive.write(path, Path("some", path.relative_to(tmp_path / "originals")))
         archive.writestr("some/garden/images_4/../../../../evil", "evil")
-    with ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=served)) as found:
-        threading.Thread(target=found.serve_forever, daemon=True).start()
-        url = f"http://127.0.0.1:{found.server_address[1]}/scenes.zip"
-        monkeypatch.setattr(scenes, "SOURCES", {url: ("some/garden", "some/stump")})
+    with serving(served) as address:
+        monkeypatch.setattr(scenes, "SOURCES", {f"{address}scenes.zip": ("some/garden", "some/stump")})
         yield served
-        found.shutdown()
 
 
 def test_every_scene_of_the_paper_has_one_source() -> None:

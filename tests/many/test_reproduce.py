@@ -14,21 +14,14 @@ from keyss import Gaussians, read_model, reproduce
 from keyss.core import InputError
 from keyss.many import Forecast, Reproduction, measures, performing, reproducing
 from keyss.measure import opacity_pruning, random_pruning
-from test_api import write_nerfstudio
-from tiny_scenes import random_gaussians, tiny_scene
+from tiny_scenes import random_gaussians
 
 SIZES = {"iterations": 20, "max_gaussians": 150}
 FLAGS = ("--iterations", 20, "--max-gaussians", 150, "--most", 1, "--seed", 5)
 
 
 @pytest.fixture(scope="module")
-def folders(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    root = tmp_path_factory.mktemp("scenes")
-    return [write_nerfstudio(root / name, tiny_scene(index)) for index, name in enumerate("ab")]
-
-
-@pytest.fixture(scope="module")
-def out(folders: list[Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+def out(folders: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with the table "pruning", which others use the run of."""
     folder = tmp_path_factory.mktemp("tables") / "paper"
     with pytest.warns(UserWarning, match="too small to carry"):
@@ -36,7 +29,7 @@ def out(folders: list[Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def run(table: str, folders: list[Path], out: Path, **options: Any) -> Reproduction:
+def run(table: str, folders: tuple[Path, Path], out: Path, **options: Any) -> Reproduction:
     found = reproduce(table, folders, most=1, seed=5, out=out, **SIZES, **options)
     assert isinstance(found, Reproduction)
     return found
@@ -67,7 +60,7 @@ def test_a_table_lies_beside_the_papers(out: Path) -> None:
 
 
 def test_what_is_done_is_not_done_again(
-    out: Path, folders: list[Path], monkeypatch: pytest.MonkeyPatch
+    out: Path, folders: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     before = listing(out / "cells")
 
@@ -89,7 +82,7 @@ def test_what_is_done_is_not_done_again(
 
 
 def test_a_run_that_fails_is_said_and_the_others_go_on(
-    out: Path, folders: list[Path], monkeypatch: pytest.MonkeyPatch, keyss: Run
+    out: Path, folders: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch, keyss: Run
 ) -> None:
     def failing(*arguments: object, **more: object) -> None:
         raise InputError("not today")
@@ -105,7 +98,7 @@ def test_a_run_that_fails_is_said_and_the_others_go_on(
     assert "not today" in said.out
 
 
-def test_the_command(keyss: Run, out: Path, folders: list[Path], tmp_path: Path) -> None:
+def test_the_command(keyss: Run, out: Path, folders: tuple[Path, Path], tmp_path: Path) -> None:
     said = keyss("reproduce", "pruning", *folders, *FLAGS, "-o", out)
     assert said.status == 0, said.err
     assert "25% random, secret" in said.out
@@ -125,7 +118,7 @@ def test_the_command(keyss: Run, out: Path, folders: list[Path], tmp_path: Path)
 
 
 def test_the_papers_scenes_have_its_sizes_and_pairs(
-    folders: list[Path], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    folders: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setattr(reproducing, "link", lambda data, name, folder: folders[name < "c"])
     found = reproduce("multi", data=tmp_path, most=2, out=tmp_path / "out", dry_run=True)

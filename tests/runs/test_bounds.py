@@ -13,17 +13,10 @@ from keyss import CarryOptions, FitConfig, Secret
 from keyss.fitting import PRESETS, PlainRun, plain
 from keyss.methods import Bound, Training, registry
 from keyss.runs import HideMetrics
-from test_api import write_nerfstudio
 from tiny_scenes import tiny_scene
 
 FIT = FitConfig(iterations=40, max_gaussians=300, grow_every=20, evaluate_every=0, seed=0)
 KEY = "a key of many characters: 93hXmQ2"
-
-
-@pytest.fixture(scope="module")
-def folders(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    root = tmp_path_factory.mktemp("scenes")
-    return write_nerfstudio(root / "a", tiny_scene(0)), write_nerfstudio(root / "b", tiny_scene(1))
 
 
 def drawn(monkeypatch: pytest.MonkeyPatch) -> dict[str, int]:

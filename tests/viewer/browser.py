@@ -9,11 +9,13 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qs
 
 import numpy as np
+import pytest
 import torch
 from PIL import Image
 
@@ -29,9 +31,11 @@ SWITCHES = [
     *("--no-sandbox", "--disable-dev-shm-usage", "--disable-background-networking"),
     *("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"),
 ]
+IN_CHROMIUM = [pytest.mark.argon2, pytest.mark.skipif(PROGRAM is None, reason="no Chromium on PATH")]
 PATIENCE = 120_000  # milliseconds for any one answer: other work may share the machine
 WIDTH, HEIGHT = 400, 300
 POSE = "#eye=1.5,-1.2,-6&target=0.2,0.1,0"
+CLOSE = 25.0  # dB on the canvas
 Picture = np.ndarray[Any, np.dtype[np.float64]]
 
 
@@ -118,6 +122,31 @@ class Visit:
         )
         self.settle()
         return milliseconds
+
+    def finds_nothing(self, key: str) -> None:
+        """Assert that a key changes nothing that can be seen."""
+        before = self.picture()
+        self.try_key(key)
+        assert np.abs(self.picture() - before).mean() < 0.01 * 255
+        assert self.page.locator("#revealed").is_hidden()
+        assert self.page.locator("#progress").is_hidden()
+        assert self.page.locator("[role=status]").inner_text() == ""
+        assert self.page.locator("#problem").inner_text() == ""
+
+    def takes_as_long_for_each(self, *keys: str) -> None:
+        """Assert that the search takes as long for one key as for another.
+
+        Each takes as long as those before it or longer; other work on the machine makes single ones longer.
+        """
+        times = [self.try_key(key) for key in keys]
+        assert min(abs(later / earlier - 1) for earlier, later in pairwise(times)) < 0.1, times
+
+    def saved(self, button: str, path: Path) -> str:
+        """Save what a button downloads; its suggested name."""
+        with self.page.expect_download() as download:
+            self.page.click(button)
+        download.value.save_as(path)
+        return str(download.value.suggested_filename)
 
 
 @contextmanager

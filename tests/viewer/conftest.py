@@ -1,4 +1,4 @@
-"""Chromium for a module of tests, and a new tab for each test."""
+"""A new tab of Chromium for each test."""
 
 from __future__ import annotations
 
@@ -7,16 +7,7 @@ from typing import Any
 
 import pytest
 
-from viewer.browser import PATIENCE, PROGRAM, SWITCHES, Visit, visit
-
-
-@pytest.fixture(scope="module")
-def chromium() -> Iterator[Any]:
-    playwright = pytest.importorskip("playwright.sync_api", reason="needs playwright")
-    with playwright.sync_playwright() as started:
-        browser = started.chromium.launch(executable_path=PROGRAM, args=SWITCHES, timeout=PATIENCE)
-        yield browser
-        browser.close()
+from viewer.browser import Visit, visit
 
 
 @pytest.fixture

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import functools
 import shutil
 import subprocess
-import threading
 from collections.abc import Iterator
-from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +13,9 @@ import pytest
 
 from files.formats.examples import model_of
 from keyss.files import read_model, write_model
-from viewer.browser import PATIENCE, PROGRAM, ROOT, SWITCHES, WEB
+from serving import serving
+from viewer.browser import PATIENCE, PROGRAM, ROOT, WEB
 
-playwright = pytest.importorskip("playwright.sync_api", reason="needs playwright: pip install playwright")
 pytestmark = [
     pytest.mark.skipif(PROGRAM is None, reason="no Chromium on PATH"),
     pytest.mark.skipif(shutil.which("node") is None, reason="no node on PATH"),
@@ -28,11 +25,6 @@ pytestmark = [
 FORMATS = ("ply", "compressed.ply", "sog", "spz")
 WITH_A_SECRET = "carried.ply"
 HALF = 2e-3  # spark keeps positions in half precision
-
-
-class _Quiet(SimpleHTTPRequestHandler):
-    def log_message(self, format: str, *args: object) -> None:
-        pass
 
 
 @pytest.fixture(scope="module")
@@ -57,20 +49,12 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def page(folder: Path) -> Iterator[Any]:
-    server = ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(_Quiet, directory=str(folder)))
-    thread = threading.Thread(target=server.serve_forever)
-    thread.start()
-    with playwright.sync_playwright() as started:
-        browser = started.chromium.launch(executable_path=PROGRAM, args=SWITCHES, timeout=PATIENCE)
-        page = browser.new_page()
-        page.set_default_timeout(PATIENCE)
-        page.goto(f"http://127.0.0.1:{server.server_port}/")
+def page(chromium: Any, folder: Path) -> Iterator[Any]:
+    page = chromium.new_page()
+    page.set_default_timeout(PATIENCE)
+    with serving(folder) as address:
+        page.goto(address)
         yield page
-        browser.close()
-    server.shutdown()
-    thread.join()
-    server.server_close()
 
 
 @pytest.mark.parametrize(

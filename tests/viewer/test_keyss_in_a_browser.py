@@ -4,16 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import pytest
 import torch
 
 import keyss
 from keyss.files import read_model
 from keyss.viewer import export_html
-from viewer.browser import PROGRAM, Visit
+from viewer.browser import IN_CHROMIUM, Visit
 
-pytest.importorskip("playwright.sync_api", reason="needs playwright: pip install playwright")
-pytestmark = [pytest.mark.argon2, pytest.mark.skipif(PROGRAM is None, reason="no Chromium on PATH")]
+pytestmark = IN_CHROMIUM
 
 VECTOR, KEY = Path(__file__).parents[1] / "vectors" / "keyss.ply", "correct horse battery staple"
 
@@ -22,9 +20,7 @@ def test_the_page_decodes_what_keyss_reveals(tab: Visit, tmp_path: Path) -> None
     (page,) = export_html(VECTOR, tmp_path / "page.html")
     tab.goto(page.as_uri())
     tab.try_key(KEY)
-    with tab.page.expect_download() as download:
-        tab.page.click("#download")
-    download.value.save_as(tmp_path / "secret.ply")
+    tab.saved("#download", tmp_path / "secret.ply")
     found, expected = read_model(tmp_path / "secret.ply"), keyss.reveal(VECTOR, KEY).gaussians
     assert len(found) == len(expected)
     for name in ("means", "quats", "log_scales", "opacity_logits", "sh"):

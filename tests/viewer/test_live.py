@@ -24,7 +24,7 @@ from keyss.fitting.reporting import ModelReporter, of_secret
 from keyss.viewer import LiveTraining
 from keyss.viewer.live import EVERY
 from tiny_scenes import random_gaussians
-from viewer.browser import PATIENCE, PROGRAM, SWITCHES, visit
+from viewer.browser import PROGRAM, Visit
 
 
 class Clock:
@@ -152,44 +152,25 @@ def test_a_diverged_training_has_no_file(training: LiveTraining) -> None:
 
 
 @pytest.mark.skipif(PROGRAM is None, reason="no Chromium on PATH")
-def test_a_fit_is_seen_while_it_goes_on(tmp_path: Path) -> None:
-    playwright = pytest.importorskip("playwright.sync_api", reason="pip install playwright")
-    write_nerfstudio(tmp_path / "scene", count=4)
-    command = [
-        *KEYSS,
-        "fit",
-        tmp_path / "scene",
-        "-o",
-        tmp_path / "out",
-        *SMALL[4:],
-        "--live",
-        "--iterations",
-        100_000,
-    ]
-    with (
-        subprocess.Popen([*map(str, command)], stdout=subprocess.PIPE, text=True) as process,
-        playwright.sync_playwright() as started,
-    ):
+def test_a_fit_is_seen_while_it_goes_on(tab: Visit, tmp_path: Path) -> None:
+    scene = write_nerfstudio(tmp_path / "scene", count=4)
+    command = [*KEYSS, "fit", scene, "-o", tmp_path / "out", *SMALL[4:], "--live", "--iterations", 100_000]
+    with subprocess.Popen([*map(str, command)], stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         line = process.stdout.readline()
         found = re.match(r"(http://127\.0\.0\.1:[0-9]+/[\w-]+/) shows the training", line)
         assert found, line
-        browser = started.chromium.launch(executable_path=PROGRAM, args=SWITCHES, timeout=PATIENCE)
-        with visit(browser) as tab:
-            tab.goto(found[1])
-            status = "document.getElementById('status').textContent"
-            tab.page.wait_for_function(f"() => /^fit scene: step [0-9,]+ of 100,000, /.test({status})")
-            assert tab.page.locator("#form").is_hidden()
-            first = tab.page.evaluate(status)
-            tab.page.wait_for_function(f"before => {status} !== before", arg=first)
-            models = [url for url in tab.requests if url.endswith(".ply")]
-            assert set(models) == {f"{found[1]}live/published.ply"}
-            assert all(url.startswith((found[1], f"blob:{found[1][:20]}")) for url in tab.requests), (
-                tab.requests
-            )
-            process.terminate()
-            assert process.wait(60) == 143  # as without a page
-            tab.page.wait_for_function(f"() => {status}.endsWith('The training has ended.')")
-            # That the page asks on for a while is known to the browser's console only.
-            tab.complaints[:] = [each for each in tab.complaints if "ERR_CONNECTION_REFUSED" not in each]
-        browser.close()
+        tab.goto(found[1])
+        status = "document.getElementById('status').textContent"
+        tab.page.wait_for_function(f"() => /^fit scene: step [0-9,]+ of 100,000, /.test({status})")
+        assert tab.page.locator("#form").is_hidden()
+        first = tab.page.evaluate(status)
+        tab.page.wait_for_function(f"before => {status} !== before", arg=first)
+        models = [url for url in tab.requests if url.endswith(".ply")]
+        assert set(models) == {f"{found[1]}live/published.ply"}
+        assert all(url.startswith((found[1], f"blob:{found[1][:20]}")) for url in tab.requests), tab.requests
+        process.terminate()
+        assert process.wait(60) == 143  # as without a page
+        tab.page.wait_for_function(f"() => {status}.endsWith('The training has ended.')")
+        # That the page asks on for a while is known to the browser's console only.
+        tab.complaints[:] = [each for each in tab.complaints if "ERR_CONNECTION_REFUSED" not in each]

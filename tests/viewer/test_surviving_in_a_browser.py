@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from keyss.channels import channel_for
@@ -14,13 +12,11 @@ from keyss.files import read_model, write_model
 from keyss.methods import HiddenFile, embed_models
 from keyss.viewer import export_html
 from measure.lifelike import lifelike
-from viewer.browser import POSE, PROGRAM, Visit, drawn, made, psnr
+from viewer.browser import CLOSE, IN_CHROMIUM, POSE, Visit, drawn, made, psnr
 
-pytest.importorskip("playwright.sync_api", reason="needs playwright: pip install playwright")
-pytestmark = [pytest.mark.argon2, pytest.mark.skipif(PROGRAM is None, reason="no Chromium on PATH")]
+pytestmark = IN_CHROMIUM
 
 KEY = "the first key"
-CLOSE = 25.0  # dB on the canvas
 SUFFIXES = (".ply", ".spz", ".sog")
 
 
@@ -51,18 +47,12 @@ def test_the_key_opens_the_scene_and_a_wrong_one_nothing(
     tab.goto(page.as_uri() + POSE)
     cover = tab.picture()
     assert psnr(cover, drawn(read_model(stego), POSE)) > CLOSE
-    tab.try_key("another key")
-    assert np.abs(tab.picture() - cover).mean() < 0.01 * 255
-    assert tab.page.locator("#revealed").is_hidden()
-    assert tab.page.locator("#progress").is_hidden()
-    assert tab.page.locator("[role=status]").inner_text() == tab.page.locator("#problem").inner_text() == ""
+    tab.finds_nothing("another key")
     tab.try_key(KEY)
     tab.at(POSE)
     shown = tab.picture()
     assert psnr(shown, drawn(secret, POSE)) > CLOSE > psnr(shown, cover)
-    with tab.page.expect_download() as download:
-        tab.page.click("#download")
-    download.value.save_as(folder / "secret.ply")
+    tab.saved("#download", folder / "secret.ply")
     assert read_model(folder / "secret.ply").digest() == revealed.digest()
 
 
@@ -101,6 +91,4 @@ def test_a_file_in_colours_is_saved_and_all_keys_look_alike(tab: Visit, tmp_path
 def test_a_wrong_key_takes_as_long_as_a_right_one(tab: Visit, published: tuple[Path, Gaussians]) -> None:
     folder, _ = published
     tab.goto(export_html(folder / "stego.spz", folder / "timed.html")[0].as_uri())
-    # Each as long as those before it or longer; other work on the machine makes single ones longer.
-    times = [tab.try_key(key) for key in ("wrong", KEY, "wrong again", KEY, "and again")]
-    assert min(abs(later / earlier - 1) for earlier, later in pairwise(times)) < 0.1, times
+    tab.takes_as_long_for_each("wrong", KEY, "wrong again", KEY, "and again")

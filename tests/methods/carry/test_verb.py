@@ -11,7 +11,7 @@ import torch
 
 import keyss
 from channels.low_bits.trained_like import trained_like
-from cli.said import Run
+from cli.said import Run, write_key
 from keyss import CarryOptions, FitConfig, Secret
 from keyss.channels import LOW_BITS
 from keyss.core import InputError, UsageError, WrongKeyError
@@ -29,10 +29,8 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_model(folder / "cover.ply", trained_like(2500))
     write_model(folder / "secret.ply", trained_like(900, 1))
     write_model(folder / "large.ply", trained_like(6000, 2))
-    (folder / "key").write_text(KEY)
-    (folder / "other").write_text(KEY + "4")
-    for name in ("key", "other"):
-        (folder / name).chmod(0o600)
+    write_key(folder / "key", KEY)
+    write_key(folder / "other", KEY + "4")
     return folder
 
 

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 import keyss
-from cli.said import Run, assert_refused
+from cli.said import Run, assert_refused, write_key
 from keyss import FitConfig, Secret
 from keyss.audits import audit
 from keyss.cli import main
@@ -19,7 +19,6 @@ from keyss.fitting import State
 from keyss.methods import JointTraining, PeerOptions, PlacedScene, registry
 from keyss.runs import stego_in
 from keyss.runs.files import handed_names
-from test_api import write_nerfstudio
 from tiny_scenes import random_gaussians, tiny_scene
 
 FIT = FitConfig(iterations=120, max_gaussians=300, sh_degree=1, grow_every=30, evaluate_every=60, seed=0)
@@ -53,12 +52,6 @@ class Made:
     @property
     def handed(self) -> Path:
         return self.out / handed_names(1)[0]
-
-
-@pytest.fixture(scope="module")
-def folders(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    root = tmp_path_factory.mktemp("scenes")
-    return write_nerfstudio(root / "a", tiny_scene(0)), write_nerfstudio(root / "b", tiny_scene(1))
 
 
 @pytest.fixture(scope="module", params=PEERS)
@@ -132,10 +125,7 @@ def test_damage_is_told(made: Made, tmp_path: Path, at: int) -> None:
 
 
 def test_the_command_line(keyss: Run, made: Made, tmp_path: Path) -> None:
-    key = tmp_path / "key.txt"
-    key.touch(0o600)
-    key.write_text(KEY)
-    given = ["--key-file", key] if made.keys else []
+    given = ["--key-file", write_key(tmp_path / "key.txt", KEY)] if made.keys else []
     said = keyss("evaluate", made.out, *given)
     assert said.status == 0
     assert f"{made.result.metrics.secrets[0].psnr:.2f}" in said.out
