@@ -79,15 +79,20 @@ def run_with(run: Path, folder: Path, data: object) -> Path:
 
 
 def changed(data: dict[str, Any], *changes: tuple[str, Any]) -> Audit:
-    """The record with other values at places such as "images.secrets.0.mean.psnr"."""
+    """The record with other values, as of `put`."""
     data = copy.deepcopy(data)
+    put(data, *changes)
+    return msgspec.convert(data, Audit)
+
+
+def put(data: dict[str, Any], *changes: tuple[str, Any]) -> None:
+    """Put other values at places such as "images.secrets.0.mean.psnr"."""
     for place, value in changes:
         *path, last = (int(step) if step.isdigit() else step for step in place.split("."))
         at: Any = data
         for step in path:
             at = at[step]
         at[last] = value
-    return msgspec.convert(data, Audit)
 
 
 def with_all_texts(value: Any, text: str, keep: Callable[[str], bool]) -> Any:

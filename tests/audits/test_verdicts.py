@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from audits.audited import changed
+from audits.audited import changed, put
 from keyss.audits import Audit, Verdict, headline, verdicts
 
 Data = dict[str, Any]
@@ -67,12 +67,7 @@ def fine(data: Data) -> Data:
         pruned = (row["attack"], row["strength"]) == ("random pruning", 0.25)
         for each in [row["cover"], *row["secrets"]] if row["cover"] else ():
             each["loss"] = 2.5 if pruned else each["loss"]
-    for place, value in ALL_FINE:
-        *path, last = (int(step) if step.isdigit() else step for step in place.split("."))
-        at: Any = data
-        for step in path:
-            at = at[step]
-        at[last] = value
+    put(data, *ALL_FINE)
     return data
 
 

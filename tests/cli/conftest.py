@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from cli.said import SMALL, write_key, write_world
+from files.scene_files import write_nerfstudio
 from keyss.cli import main
 from shared import made_once
 
@@ -21,3 +22,9 @@ def _make_world(folder: Path) -> None:
     write_key(write_world(folder) / "wrong.txt", "fedcba9876543210")
     scenes = ("--cover", folder / "a", "--secret", folder / "b", "--key-file", folder / "key.txt")
     assert main(["hide", "--publish", "any", *map(str, scenes), "-o", str(folder / "hidden"), *SMALL]) == 0
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Path:
+    """A scene beside which results may lie."""
+    return write_nerfstudio(tmp_path / "b", count=4)

@@ -18,18 +18,7 @@ import pytest
 from cli.said import PROGRAM, write_world
 
 SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
-SIZE = (
-    "--preset",
-    "quick",
-    "--iterations",
-    "150",
-    "--max-gaussians",
-    "100",
-    "--device",
-    "cpu",
-    "--seed",
-    "0",
-)
+SIZE = "--preset quick --iterations 150 --max-gaussians 100 --device cpu --seed 0"
 UNFINISHED = ("unfinished", "lock", "checkpoint")  # in names of what may not be left
 
 
@@ -37,56 +26,30 @@ UNFINISHED = ("unfinished", "lock", "checkpoint")  # in names of what may not be
 class Command:
     """A command that is disturbed; OUT and RUN in its arguments stand for what it writes and works in."""
 
-    arguments: tuple[str, ...]
+    arguments: str
     again: str  # option with which it is repeated
     in_run: bool = False  # works in a copy of what `hide` comes to
     results: tuple[str, ...] = field(default=())  # files that must be the same to the byte
     numbers: tuple[str, ...] = field(default=())  # JSON that must be the same but for seconds
 
 
+SCENES = "--cover a --secret b --key-file key.txt"
 COMMANDS: Mapping[str, Command] = {
-    "fit": Command(
-        ("fit", "a", "-o", "OUT", *SIZE), "--resume", results=("model.ply", "private/config.json")
-    ),
+    "fit": Command(f"fit a -o OUT {SIZE}", "--resume", results=("model.ply", "private/config.json")),
     "hide": Command(
-        (
-            "hide",
-            "--cover",
-            "a",
-            "--secret",
-            "b",
-            "--key-file",
-            "key.txt",
-            "--publish",
-            "any",
-            "--min-psnr=0",
-            "-o",
-            "OUT",
-            *SIZE,
-        ),
+        f"hide {SCENES} --publish any --min-psnr=0 -o OUT {SIZE}",
         "--resume",
         results=("publish/stego.ply", "private/cover.ply", "private/secret-1.ply"),
         numbers=("private/metrics.json",),
     ),
     "audit": Command(
-        (
-            "audit",
-            "RUN",
-            "--key-file",
-            "key.txt",
-            "--controls",
-            "2",
-            "--only",
-            "parameters",
-            "--device",
-            "cpu",
-        ),
+        "audit RUN --key-file key.txt --controls 2 --only parameters --device cpu",
         "--resume",
         in_run=True,
         numbers=("private/audit/audit.json",),
     ),
     "reveal": Command(
-        ("reveal", "RUN/publish/stego.ply", "--key-file", "key.txt", "-o", "OUT", "--device", "cpu"),
+        "reveal RUN/publish/stego.ply --key-file key.txt -o OUT --device cpu",
         "--overwrite",
         in_run=True,
         results=("",),
@@ -155,7 +118,9 @@ def prepared(folder: Path, name: str, which: str) -> tuple[Path, Path, list[str]
     out, run = place / ("out.ply" if name == "reveal" else "out"), place / "run"
     if COMMANDS[name].in_run:
         shutil.copytree(folder / "hide-undisturbed" / "out", run)
-    parts = [part.replace("OUT", str(out)).replace("RUN", str(run)) for part in COMMANDS[name].arguments]
+    parts = [
+        part.replace("OUT", str(out)).replace("RUN", str(run)) for part in COMMANDS[name].arguments.split()
+    ]
     return out, run, parts
 
 

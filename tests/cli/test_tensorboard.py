@@ -9,16 +9,9 @@ from pathlib import Path
 import pytest
 
 from cli.said import SMALL, Run, assert_refused
-from files.scene_files import write_nerfstudio
 from keyss.cli import reporting
 from keyss.files import read_model
 from keyss.fitting.reporting import SeveralReporter
-
-
-@pytest.fixture
-def scene(tmp_path: Path) -> Path:
-    write_nerfstudio(tmp_path / "b", count=4)
-    return tmp_path / "b"
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of TensorBoard's own

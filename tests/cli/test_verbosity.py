@@ -8,14 +8,7 @@ from pathlib import Path
 import pytest
 
 from cli.said import SMALL, Run, Said
-from files.scene_files import write_nerfstudio
 from keyss import progress
-
-
-@pytest.fixture
-def scene(tmp_path: Path) -> Path:
-    write_nerfstudio(tmp_path / "b", count=4)
-    return tmp_path / "b"
 
 
 def fit(keyss: Run, scene: Path, *more: object) -> Said:

@@ -15,20 +15,10 @@ from hypothesis import HealthCheck, given, settings, strategies as st
 from keyss.core import Gaussians, InputError, OutputError, same_bits
 from keyss.files import read_model, write_model
 from keyss.files.ply_rows import OPACITY_LOGIT_BOUND
+from tiny_scenes import random_gaussians
 
 Transform = Callable[..., Path]
 FIELDS = ("means", "quats", "log_scales", "opacity_logits", "sh")
-
-
-def random_gaussians(n: int, degree: int, seed: int = 0) -> Gaussians:
-    generator = torch.Generator().manual_seed(seed)
-
-    def normal(*shape: int) -> torch.Tensor:
-        return torch.randn(*shape, generator=generator)
-
-    return Gaussians(
-        normal(n, 3), normal(n, 4), normal(n, 3) - 4, 2 * normal(n), 0.3 * normal(n, (degree + 1) ** 2, 3)
-    )
 
 
 def names_of(degree: int, *, normals: bool = True) -> list[str]:
@@ -81,7 +71,7 @@ def ply_bytes(
 def model(tmp_path: Path) -> Path:
     """A small valid model of degree 1, as written by us."""
     path = tmp_path / "model.ply"
-    write_model(path, random_gaussians(5, 1))
+    write_model(path, random_gaussians(5, sh_degree=1))
     return path
 
 
@@ -89,7 +79,7 @@ def model(tmp_path: Path) -> Path:
 
 
 def test_layout_is_inrias(tmp_path: Path) -> None:
-    gaussians = random_gaussians(7, 3)
+    gaussians = random_gaussians(7, sh_degree=3)
     write_model(tmp_path / "a.ply", gaussians)
     expected = {name: columns_of(gaussians)[name] for name in names_of(3)}
     assert len(expected) == 62
@@ -97,7 +87,7 @@ def test_layout_is_inrias(tmp_path: Path) -> None:
 
 
 def test_bytes_depend_on_values_only(tmp_path: Path) -> None:
-    gaussians = random_gaussians(9, 2)
+    gaussians = random_gaussians(9, sh_degree=2)
     write_model(tmp_path / "a.ply", gaussians)
     strided = gaussians.map(lambda t: torch.stack([t, t], dim=-1)[..., 0].requires_grad_())
     write_model(tmp_path / "b.ply", strided)
@@ -105,7 +95,7 @@ def test_bytes_depend_on_values_only(tmp_path: Path) -> None:
 
 
 def test_refuses_to_write_what_it_would_not_read(tmp_path: Path) -> None:
-    gaussians = random_gaussians(3, 0)
+    gaussians = random_gaussians(3, sh_degree=0)
     with pytest.raises(OutputError, match="no Gaussians"):
         write_model(tmp_path / "a.ply", gaussians[:0])
     gaussians.means[1, 2] = torch.nan
@@ -137,7 +127,7 @@ def test_round_trip_is_bit_exact(tmp_path: Path, data: st.DataObject, n: int, de
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_reads_by_name(tmp_path: Path, form: str, degree: int) -> None:
     """Any order, no normals, and properties of every size in between."""
-    gaussians = random_gaussians(6, degree)
+    gaussians = random_gaussians(6, sh_degree=degree)
     columns = columns_of(gaussians)
     names = names_of(degree, normals=False)
     np.random.default_rng(degree).shuffle(names)
@@ -150,7 +140,7 @@ def test_reads_by_name(tmp_path: Path, form: str, degree: int) -> None:
 
 
 def test_reads_what_is_longer_than_one_chunk(tmp_path: Path) -> None:
-    gaussians = random_gaussians(12_345, 3)
+    gaussians = random_gaussians(12_345, sh_degree=3)
     write_model(tmp_path / "a.ply", gaussians)
     assert same_bits(read_model(tmp_path / "a.ply"), gaussians)
 
@@ -166,7 +156,7 @@ def test_ignores_comments_other_elements_and_trailing_bytes(model: Path) -> None
 
 
 def test_infinite_opacity_is_clamped(tmp_path: Path) -> None:
-    gaussians = random_gaussians(3, 0)
+    gaussians = random_gaussians(3, sh_degree=0)
     columns = columns_of(gaussians)
     columns["opacity"] = np.array([np.inf, -np.inf, 40.0])
     (tmp_path / "a.ply").write_bytes(ply_bytes(columns))
@@ -185,7 +175,7 @@ def test_infinite_opacity_is_clamped(tmp_path: Path) -> None:
     ],
 )
 def test_other_values_must_be_finite(tmp_path: Path, name: str, value: float, kind: str) -> None:
-    columns = columns_of(random_gaussians(4, 1))
+    columns = columns_of(random_gaussians(4, sh_degree=1))
     columns[name] = np.array([0.0, value, value, 0.0])
     (tmp_path / "a.ply").write_bytes(ply_bytes(columns, kinds={name: kind}))
     with pytest.raises(InputError, match=rf"among 4 Gaussians: {name} in 2$"):
@@ -239,7 +229,7 @@ def test_refuses(tmp_path: Path, case: str) -> None:
 @pytest.mark.parametrize("form", ["binary_little_endian", "ascii"])
 @pytest.mark.parametrize("count", ["6", "1000000000000", "999999999999999999"])
 def test_count_is_checked_against_the_size(tmp_path: Path, form: str, count: str) -> None:
-    data = ply_bytes(columns_of(random_gaussians(5, 1)), form=form)
+    data = ply_bytes(columns_of(random_gaussians(5, sh_degree=1)), form=form)
     if form == "ascii":  # so short that even the smallest excess cannot fit
         head, _ = data.split(b"end_header\n")
         data = head + b"end_header\n" + b"1 " * 140
@@ -264,14 +254,16 @@ def test_no_gaussians(model: Path) -> None:
 
 @pytest.mark.parametrize("tail", [b"", b"word"])
 def test_broken_ascii(tmp_path: Path, tail: bytes) -> None:
-    head, body = ply_bytes(columns_of(random_gaussians(5, 0)), form="ascii").split(b"end_header\n")
+    head, body = ply_bytes(columns_of(random_gaussians(5, sh_degree=0)), form="ascii").split(b"end_header\n")
     (tmp_path / "a.ply").write_bytes(head + b"end_header\n" + body.rsplit(b" ", 1)[0] + b" " + tail)
     with pytest.raises(InputError, match="cut short or hold something not a number"):
         read_model(tmp_path / "a.ply")
 
 
 def test_ascii_in_one_line_takes_no_more_memory_than_in_lines(tmp_path: Path) -> None:
-    head, body = ply_bytes(columns_of(random_gaussians(6000, 3)), form="ascii").split(b"end_header\n")
+    head, body = ply_bytes(columns_of(random_gaussians(6000, sh_degree=3)), form="ascii").split(
+        b"end_header\n"
+    )
     peaks = []
     for separator in (b"\n", b" "):
         (tmp_path / "a.ply").write_bytes(head + b"end_header\n" + body.replace(b"\n", separator))
@@ -283,7 +275,7 @@ def test_ascii_in_one_line_takes_no_more_memory_than_in_lines(tmp_path: Path) ->
 
 
 def test_one_number_without_end(tmp_path: Path) -> None:
-    head = ply_bytes(columns_of(random_gaussians(5, 0)), form="ascii").split(b"end_header\n")[0]
+    head = ply_bytes(columns_of(random_gaussians(5, sh_degree=0)), form="ascii").split(b"end_header\n")[0]
     (tmp_path / "a.ply").write_bytes(head + b"end_header\n" + b"1" * 3_000_000)
     with pytest.raises(InputError, match="not a number"):
         read_model(tmp_path / "a.ply")
@@ -302,7 +294,7 @@ def test_truncation_anywhere(model: Path) -> None:
 
 @pytest.mark.parametrize("form", ["binary_little_endian", "ascii"])
 def test_flipped_bytes_in_the_header(tmp_path: Path, form: str) -> None:
-    data = ply_bytes(columns_of(random_gaussians(5, 1)), form=form)
+    data = ply_bytes(columns_of(random_gaussians(5, sh_degree=1)), form=form)
     body = data.index(b"end_header\n") + len(b"end_header\n")
     rng = np.random.default_rng(0)
     path = tmp_path / "a.ply"
@@ -346,7 +338,7 @@ def test_real_models(real_data: Path, tmp_path: Path, name: str, count: int, deg
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_gsply_reads_ours(tmp_path: Path, degree: int) -> None:
-    gaussians = random_gaussians(50, degree)
+    gaussians = random_gaussians(50, sh_degree=degree)
     write_model(tmp_path / "a.ply", gaussians)
     theirs = gsply.plyread(tmp_path / "a.ply")
     assert np.array_equal(theirs.means, gaussians.means.numpy())
@@ -359,7 +351,7 @@ def test_gsply_reads_ours(tmp_path: Path, degree: int) -> None:
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_we_read_gsply(tmp_path: Path, degree: int) -> None:
-    gaussians = random_gaussians(50, degree)
+    gaussians = random_gaussians(50, sh_degree=degree)
     rest = gaussians.sh[:, 1:].numpy() if degree else None
     gsply.plywrite(
         tmp_path / "a.ply",
@@ -375,14 +367,14 @@ def test_we_read_gsply(tmp_path: Path, degree: int) -> None:
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_splat_transform_copies_ours(splat_transform: Transform, tmp_path: Path, degree: int) -> None:
-    gaussians = random_gaussians(40, degree)
+    gaussians = random_gaussians(40, sh_degree=degree)
     write_model(tmp_path / "in.ply", gaussians)
     copy = splat_transform(tmp_path / "in.ply", tmp_path / "out.ply")
     assert same_bits(read_model(copy), gaussians)
 
 
 def test_splat_transform_converts_ours(splat_transform: Transform, tmp_path: Path) -> None:
-    gaussians = random_gaussians(40, 3)
+    gaussians = random_gaussians(40, sh_degree=3)
     write_model(tmp_path / "in.ply", gaussians)
     table = splat_transform(tmp_path / "in.ply", tmp_path / "out.csv").read_text().splitlines()
     header, first = table[0].split(","), [float(cell) for cell in table[1].split(",")]

@@ -17,6 +17,7 @@ from torch import Tensor
 from keyss.core import UsageError
 from keyss.rendering import rasterization
 from rendering.clear_cut import clear_cut
+from rendering.dense_reference import rotation_matrices
 from rendering.scenes import CAMERAS, DIFFERENTIABLE, Scene, random_scene
 
 # NaN, infinities, zeros, denormal, small, huge and largest numbers, and one that is as usual.
@@ -196,23 +197,11 @@ def test_the_order_of_the_gaussians_does_not_matter(seed: int, colors: Any) -> N
         assert (tensor - expected).abs().max() <= 1e-6 * scale, name
 
 
-def rotation(quaternion: Tensor) -> Tensor:
-    w, x, y, z = quaternion.tolist()
-    return torch.tensor(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ],
-        dtype=torch.float64,
-    )
-
-
 def moved(scene: Scene, generator: torch.Generator) -> dict[str, Tensor]:
     """The scene and its cameras after one and the same rigid motion."""
     w, *v = torch.nn.functional.normalize(torch.randn(4, generator=generator, dtype=torch.float64), dim=0)
     vector = torch.stack(v)
-    turn = rotation(torch.stack([w, *v]))
+    turn = rotation_matrices(torch.stack([w, *v]))[0]
     motion = torch.eye(4, dtype=torch.float64)
     motion[:3, :3] = turn
     motion[:3, 3] = torch.randn(3, generator=generator)

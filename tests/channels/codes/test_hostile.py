@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 from channels.codes.published import FORMATS, codes_of, opened, written
-from files.formats.examples import random_compressed, random_sog, random_spz
+from files.formats.examples import KINDS, random_codes
 from keyss.channels import CodesCover, Payload
 from keyss.channels.codes.layout import Header, Zones, find_header
 from keyss.core import InputError, UsageError, WrongKeyError
@@ -21,16 +21,10 @@ EVERY = pytest.mark.parametrize("suffix", FORMATS)
 
 
 @settings(max_examples=60, deadline=None)
-@given(seed=st.integers(0, 10_000), kind=st.sampled_from(["spz", "old spz", "sog", "compressed"]))
+@given(seed=st.integers(0, 10_000), kind=st.sampled_from(KINDS))
 def test_random_codes_open_nothing(seed: int, kind: str) -> None:
     rng = np.random.default_rng(seed)
-    count = int(rng.integers(1, 4000))
-    codes = {
-        "spz": lambda: random_spz(rng, 3, count, 3),
-        "old spz": lambda: random_spz(rng, 2, count, 0),
-        "sog": lambda: random_sog(rng, count, 3),
-        "compressed": lambda: random_compressed(rng, count, 3),
-    }[kind]()
+    codes = random_codes(kind, rng, int(rng.integers(1, 4000)), 3)
     with pytest.raises(WrongKeyError):
         opened(codes)
     try:

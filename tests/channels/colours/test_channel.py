@@ -44,14 +44,6 @@ def stego(prepared: ColoursCover, payload: bytes) -> Gaussians:
     return embed(prepared, [("a", payload)], entropy=ENTROPY)
 
 
-def test_text_keys_open_what_they_were_given(prepared: ColoursCover) -> None:
-    """All the way from the text; other tests begin with what it becomes."""
-    stego = embed(prepared, [("Rosebud, 1941", b"snow")], entropy=ENTROPY)
-    assert extract(stego, "Rosebud, 1941") == b"snow"
-    with pytest.raises(WrongKeyError):
-        extract(stego, "Rosebud, 1942")
-
-
 @settings(max_examples=8, deadline=None)
 @given(share=st.floats(0, 1), seed=st.integers(0, 2**32))
 def test_every_size_up_to_capacity_comes_back(prepared: ColoursCover, share: float, seed: int) -> None:

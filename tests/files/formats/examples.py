@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import fields, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -95,3 +96,13 @@ def random_compressed(rng: np.random.Generator, count: int, k: int) -> Compresse
         alphas=rng.integers(0, 256, count).astype(np.uint8),
         sh=rng.integers(0, 256, (count, k, 3)).astype(np.uint8),
     )
+
+
+KINDS = ("spz 2", "spz 3", "spz 4", "sog", "compressed")
+
+
+def random_codes(kind: str, rng: np.random.Generator, count: int, k: int) -> Any:
+    """Of one of KINDS: a format, and the version of an SPZ."""
+    if kind.startswith("spz"):
+        return random_spz(rng, int(kind[-1]), count, k)
+    return random_sog(rng, count, k) if kind == "sog" else random_compressed(rng, count, k)

@@ -10,14 +10,7 @@ import torch
 from hypothesis import given, settings, strategies as st
 from sklearn.cluster import KMeans
 
-from files.formats.examples import (
-    assert_close,
-    is_finite,
-    model_of,
-    random_compressed,
-    random_sog,
-    random_spz,
-)
+from files.formats.examples import KINDS, assert_close, is_finite, model_of, random_codes, random_spz
 from keyss.core import Gaussians, OutputError, Similarity
 from keyss.files.formats.codebooks import codebook_of, nearest, palette_of
 from keyss.files.formats.common import from_smallest_three, morton_order, smallest_three, unit
@@ -28,29 +21,12 @@ from keyss.files.formats.spz import SpzCodes
 SEEDS, COUNTS, DEGREES = st.integers(0, 2**32 - 1), st.integers(1, 300), st.sampled_from([0, 3, 8, 15])
 
 
-@settings(max_examples=60, deadline=None)
-@given(SEEDS, st.sampled_from([2, 3, 4]), COUNTS, DEGREES)
-def test_spz_inverts(seed: int, version: int, count: int, k: int) -> None:
-    codes = random_spz(np.random.default_rng(seed), version, count, k)
-    again = SpzCodes.parse(codes.serialise())
-    assert again == codes
-    assert is_finite(again.dequantise())
-
-
-@settings(max_examples=40, deadline=None)
+@pytest.mark.parametrize("kind", KINDS)
+@settings(max_examples=30, deadline=None)
 @given(SEEDS, COUNTS, DEGREES)
-def test_compressed_ply_inverts(seed: int, count: int, k: int) -> None:
-    codes = random_compressed(np.random.default_rng(seed), count, k)
-    again = CompressedPlyCodes.parse(codes.serialise())
-    assert again == codes
-    assert is_finite(again.dequantise())
-
-
-@settings(max_examples=40, deadline=None)
-@given(SEEDS, COUNTS, DEGREES)
-def test_sog_inverts(seed: int, count: int, k: int) -> None:
-    codes = random_sog(np.random.default_rng(seed), count, k)
-    again = SogCodes.parse(codes.serialise())
+def test_parsing_inverts_serialising(kind: str, seed: int, count: int, k: int) -> None:
+    codes = random_codes(kind, np.random.default_rng(seed), count, k)
+    again = type(codes).parse(codes.serialise())
     assert again == codes
     assert is_finite(again.dequantise())
 
