@@ -63,20 +63,6 @@ class TestHelp:
         assert ("--device {auto,cpu,cuda}" in out) == (command in computing)
         assert "nothing here" not in out
 
-    @pytest.mark.parametrize("command", ["fit", "hide"])
-    def test_shows_the_options_of_training(self, keyss: Run, command: str) -> None:
-        out = keyss(command, "--help").out
-        for option in ("preset", "iterations", "max-gaussians", "width", "background", "resume", "overwrite"):
-            assert f"--{option}" in out
-
-    def test_of_hide_shows_first_what_a_first_user_needs(self, keyss: Run) -> None:
-        _, first, *groups = re.split(r"^ .*options +$", keyss("hide", "--help").out, flags=re.MULTILINE)
-        assert re.findall(r"^  (?:-o FOLDER, )?--([a-z-]+)", first, re.MULTILINE) == [
-            *("cover", "secret", "secret-file", "key-file", "publish", "out", "method", "preset"),
-            *("dry-run", "resume", "overwrite", "device"),
-        ]
-        assert len(groups) == 5
-
     def test_offers_the_presets_there_are(self, keyss: Run) -> None:
         assert f"--preset {{{','.join(FIT_PRESETS)}}}" in keyss("fit", "--help").out
         for name in registry.METHODS:

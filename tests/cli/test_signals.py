@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from cli.said import PROGRAM, Run, assert_refused, listing
+from cli.said import PROGRAM, Run, Said, assert_refused, listing
 
 pytestmark = pytest.mark.counted
 
@@ -87,6 +87,13 @@ def test_signals_at_random_moments(world: Path, tmp_path: Path, command: str) ->
         assert not [name for name in listing(folder) if name.endswith(".unfinished")]
 
 
+def _ended(program: str, *arguments: str) -> Said:
+    """What a program in Python comes to."""
+    command = [sys.executable, "-c", program, *arguments]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    return Said(done.returncode, done.stdout, done.stderr)
+
+
 LOADING = """
 import os, signal, sys, types
 class Loading:
@@ -109,9 +116,7 @@ def test_ctrl_c_in_the_middle_of_an_import(world: Path, module: str) -> None:
     """Where it comes up as an exception, torch is loaded half, and crashes when it is loaded again."""
     stego, key = next((world / "hidden").rglob("stego.ply")), world / "key.txt"
     verify = ["verify", str(stego), "--key-file", str(key)]  # loads as much as any command
-    command = [sys.executable, "-c", LOADING.format(module=module), *verify]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
-    assert (done.returncode, done.stdout, done.stderr) == (130, "", "keyss: interrupted\n")
+    assert _ended(LOADING.format(module=module), *verify) == Said(130, "", "keyss: interrupted\n")
 
 
 FIRST = """
@@ -127,12 +132,9 @@ import keyss
 
 
 def test_ctrl_c_before_anything_is_loaded() -> None:
-    command = [sys.executable, "-c", FIRST.format(name="/usr/bin/keyss")]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
-    assert (done.returncode, done.stdout, done.stderr) == (130, "", "keyss: interrupted\n")
-    command[2] = FIRST.format(name="other")  # a program that imports keyss keeps its own handling
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
-    assert "KeyboardInterrupt" in done.stderr
+    assert _ended(FIRST.format(name="/usr/bin/keyss")) == Said(130, "", "keyss: interrupted\n")
+    # A program that imports keyss keeps its own handling.
+    assert "KeyboardInterrupt" in _ended(FIRST.format(name="other")).err
 
 
 IN_A_COMMAND = """
@@ -146,7 +148,6 @@ main()
 """
 
 
-@pytest.mark.counted
 @pytest.mark.parametrize(
     ("body", "said"),
     [
@@ -162,29 +163,22 @@ main()
 def test_ctrl_c_inside_a_command(body: str, said: str) -> None:
     alarm = "signal.signal(signal.SIGALRM, lambda *_: os.kill(os.getpid(), signal.SIGINT)); signal.alarm(1)"
     program = IN_A_COMMAND.format(body=f"{alarm}\n    {body}")
-    command = [sys.executable, "-c", program]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
-    assert (done.returncode, done.stdout, done.stderr) == (130, said, "keyss: interrupted\n")
+    assert _ended(program) == Said(130, said, "keyss: interrupted\n")
 
 
-@pytest.mark.counted
 def test_what_is_ignored_stays_ignored() -> None:
     """As `nohup` and scripts have it that run a command in the background."""
     program = IN_A_COMMAND.format(body="[os.kill(os.getpid(), s) for s in (2, 1)]; sys.exit(0)")
     ignoring = (
         f"import os, signal; signal.signal(2, signal.SIG_IGN); signal.signal(1, signal.SIG_IGN)\n{program}"
     )
-    command = [sys.executable, "-c", ignoring]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
-    assert (done.returncode, done.stderr) == (0, "")
+    assert _ended(ignoring) == Said(0, "", "")
 
 
 def test_a_signal_after_all_is_done_changes_nothing() -> None:
     late = "import atexit; atexit.register(lambda: os.kill(os.getpid(), signal.SIGINT))"
     program = IN_A_COMMAND.format(body=f"{late}; sys.exit(0)")
-    command = [sys.executable, "-c", program]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
-    assert (done.returncode, done.stderr) == (0, "")
+    assert _ended(program) == Said(0, "", "")
 
 
 @pytest.mark.parametrize("signum", [signal.SIGINT, signal.SIGTERM])

@@ -202,15 +202,6 @@ def test_every_truncation_is_an_input_error(tmp_path: Path, name: str) -> None:
         read_colmap(tmp_path)
 
 
-def test_truncated_points_of_a_real_scene(real_data: Path, tmp_path: Path) -> None:
-    data = (real_data / "fox" / "sparse" / "0" / "points3D.bin").read_bytes()
-    folder = write_colmap(tmp_path)
-    for length in np.random.default_rng(0).integers(0, len(data), 20):
-        (folder / "sparse" / "0" / "points3D.bin").write_bytes(data[:length])
-        with pytest.raises(InputError, match=r"points3D\.bin.*(truncated|number)"):
-            read_colmap(folder)
-
-
 @pytest.mark.parametrize("suffix", [".bin", ".txt"])
 @pytest.mark.parametrize("kind", ["cameras", "images", "points3D"])
 def test_damage_gives_an_input_error_or_a_scene(tmp_path: Path, kind: str, suffix: str) -> None:

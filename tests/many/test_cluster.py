@@ -48,19 +48,11 @@ def test_with_killed_workers_and_drivers_it_ends_as_if_nothing_had_happened(tmp_
         assert (tmp_path / "out" / name).read_bytes() == (tmp_path / "calm" / name).read_bytes()
 
 
-def test_without_ray_one_sentence_says_what_to_install(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(("package", "ray"), [("ray", "local"), ("yaml", None)])
+def test_without_a_package_one_sentence_says_what_to_install(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, package: str, ray: str | None
 ) -> None:
-    monkeypatch.setitem(sys.modules, "ray", None)
+    monkeypatch.setitem(sys.modules, package, None)
     spec = write_spec(tmp_path, ["a.ply"], seeds=1)
     with pytest.raises(BackendError, match=r"pip install 'keyss\[sweep\]'"):
-        run(spec, tmp_path / "out", jobs=1, ray="local")
-
-
-def test_without_yaml_one_sentence_says_what_to_install(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(sys.modules, "yaml", None)
-    spec = write_spec(tmp_path, ["a.ply"], seeds=1)
-    with pytest.raises(BackendError, match=r"pip install 'keyss\[sweep\]'"):
-        run(spec, tmp_path / "out", jobs=1)
+        run(spec, tmp_path / "out", jobs=1, ray=ray)

@@ -8,8 +8,9 @@ from dataclasses import replace
 
 import torch
 import torch.nn.functional as F
+from scipy.spatial.transform import Rotation
 
-from keyss.core import SH_C0, Gaussians
+from keyss.core import SH_C0, Gaussians, Similarity
 
 
 def lifelike(count: int, seed: int = 0) -> Gaussians:
@@ -69,6 +70,13 @@ def rescaled_quaternions(model: Gaussians) -> Gaussians:
     """Lengths times 0.5 to 2, which changes nothing that is drawn."""
     factors = 0.5 + 1.5 * torch.rand(len(model), 1, generator=torch.Generator().manual_seed(9))
     return replace(model, quats=model.quats * factors)
+
+
+def turned(scale: float) -> Callable[[Gaussians], Gaussians]:
+    """Another frame: rotated, moved and scaled."""
+    rotation = torch.from_numpy(Rotation.from_euler("xyz", [0.3, 1.1, -2.0]).as_matrix())
+    move = torch.tensor([30.0, -2.0, 5.0], dtype=torch.float64)
+    return Similarity(scale, rotation, move).apply_gaussians
 
 
 # Each change, and the attributes that it is a change of.

@@ -79,24 +79,6 @@ def test_without_cameras_there_are_no_images_and_all_gradients_are_zero() -> Non
         assert (results[f"gradient of {name}"] == 0).all(), name
 
 
-def test_several_cameras_are_the_sum_of_single_ones() -> None:
-    scene = random_scene(cameras=2)
-    together = scene.leaves()
-    images, _, meta = scene.draw(together)
-    images.square().sum().backward()
-    apart = scene.leaves()
-    for c in range(2):
-        camera = {name: getattr(scene, name).float()[c : c + 1] for name in ("viewmats", "Ks")}
-        background = {"backgrounds": apart["backgrounds"][c : c + 1]}
-        image, _, single = scene.draw({**apart, **background}, **camera)
-        image.square().sum().backward()
-        assert torch.equal(image[0], images[c])
-        assert torch.equal(single["radii"][0], meta["radii"][c])
-        assert torch.equal(single["means2d"].grad[0], meta["means2d"].grad[c])
-    for name, leaf in together.items():
-        torch.testing.assert_close(leaf.grad, apart[name].grad, rtol=1e-5, atol=1e-5)
-
-
 def test_only_wanted_gradients_are_made() -> None:
     scene = random_scene()
     for wanted in DIFFERENTIABLE:

@@ -23,24 +23,18 @@ from keyss.fitting import Reporter, SilentReporter
 from keyss.fitting.reporting import ModelReporter, of_secret
 from keyss.viewer import LiveTraining
 from keyss.viewer.live import EVERY
+from test_progress import Timer
 from tiny_scenes import random_gaussians
 from viewer.browser import PROGRAM, Visit
 
 
-class Clock:
-    now = 100.0
-
-    def __call__(self) -> float:
-        return self.now
+@pytest.fixture
+def clock() -> Timer:
+    return Timer()
 
 
 @pytest.fixture
-def clock() -> Clock:
-    return Clock()
-
-
-@pytest.fixture
-def training(clock: Clock) -> Iterator[LiveTraining]:
+def training(clock: Timer) -> Iterator[LiveTraining]:
     with LiveTraining(timer=clock) as found:
         yield found
 
@@ -80,7 +74,7 @@ def stepped(reporter: Reporter, iteration: int, model: Callable[[], Gaussians]) 
 
 
 def test_a_model_is_copied_only_while_somebody_watches_and_not_too_often(
-    training: LiveTraining, clock: Clock
+    training: LiveTraining, clock: Timer
 ) -> None:
     model, reporter = Copies(), training.reporter(SilentReporter())
     reporter.start("fit garden", 100, 0)

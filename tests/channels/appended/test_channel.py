@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings, strategies as st
-from scipy.spatial.transform import Rotation
 
 from keyss.channels import APPENDED, AppendedReader, Payload
 from keyss.channels.appended import pilots
@@ -22,14 +21,14 @@ from keyss.core import (
     InputError,
     KeyssError,
     KeyssWarning,
-    Similarity,
     UsageError,
     WrongKeyError,
 )
 from keyss.files import read_model, write_model
 from keyss.measure import cropping, fewer_harmonics, half_floats, random_pruning
 from keyss.rendering import psnr_between
-from measure.lifelike import lifelike
+from measure.lifelike import lifelike, turned
+from measure.stealth.careless import shuffled
 
 KEY, ENTROPY = "Rosebud, 1941", bytes(range(32))
 DATA = np.random.default_rng(0).bytes(9000)
@@ -90,7 +89,7 @@ def test_a_note_among_many_faint_gaussians_of_the_cover(scale: float) -> None:
     cover = replace(cover, opacity_logits=torch.where(faint, -5.5, cover.opacity_logits))
     for seed in range(4):
         stego = embedded(cover, [(KEY, Payload("file", b"a note"))], entropy=bytes([seed] * 32))
-        assert opened(_turned(scale)(stego)) == b"a note"
+        assert opened(turned(scale)(stego)) == b"a note"
 
 
 @pytest.mark.parametrize("moved", [False, True], ids=["random", "pilots"])
@@ -157,12 +156,6 @@ def test_words_look_random(stego: Gaussians, cover: Gaussians) -> None:
     assert np.abs(together).max() < 6 * deviation
 
 
-def _turned(scale: float) -> Change:
-    rotation = torch.from_numpy(Rotation.from_euler("xyz", [0.3, 1.1, -2.0]).as_matrix())
-    move = torch.tensor([30.0, -2.0, 5.0], dtype=torch.float64)
-    return Similarity(scale, rotation, move).apply_gaussians
-
-
 def _half_turns(model: Gaussians) -> Gaussians:
     """Half a turn of each ellipsoid about one of its own axes, which leaves it as it is."""
     w, x, y, z = model.quats.unbind(1)
@@ -173,21 +166,17 @@ def _half_turns(model: Gaussians) -> Gaussians:
     )
 
 
-def _shuffled(model: Gaussians) -> Gaussians:
-    return model[torch.randperm(len(model), generator=torch.Generator().manual_seed(1))]
-
-
 CHANGES: dict[str, Change] = {
-    "reordered": _shuffled,
-    "rotated and moved": _turned(1.0),
-    "scaled": _turned(0.37),
-    "scaled up": _turned(41.0),
+    "reordered": shuffled,
+    "rotated and moved": turned(1.0),
+    "scaled": turned(0.37),
+    "scaled up": turned(41.0),
     "half turns": _half_turns,
     "without harmonics": fewer_harmonics(0),
     "half floats": half_floats(),
     "a quarter removed": random_pruning(0.25, 3),
     "another scene beside it": lambda model: Gaussians.cat([lifelike(3000, 5), model]),
-    "all of it together": lambda model: random_pruning(0.2, 3)(_shuffled(_turned(2.2)(_half_turns(model)))),
+    "all of it together": lambda model: random_pruning(0.2, 3)(shuffled(turned(2.2)(_half_turns(model)))),
 }
 
 
@@ -198,7 +187,7 @@ def test_it_opens_after(name: str, stego: Gaussians) -> None:
 
 @pytest.mark.parametrize("suffix", [".spz", ".sog", ".compressed.ply", ".splat", ".glb"])
 def test_it_opens_from_every_format(suffix: str, stego: Gaussians, tmp_path: Path) -> None:
-    write_model(tmp_path / f"a{suffix}", _turned(1.3)(stego))
+    write_model(tmp_path / f"a{suffix}", turned(1.3)(stego))
     assert opened(read_model(tmp_path / f"a{suffix}")) == DATA
 
 

@@ -14,16 +14,17 @@ import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings, strategies as st
-from scipy.spatial.transform import Rotation
 
 from channels.colours.made import PACKED, cover, embed, extract
 from keyss.channels import COLOURS, Colours, ColoursCover, ColoursReader, Fountain
 from keyss.channels.colours.carriers import CELL, Numbers
 from keyss.channels.colours.header import FILE_KEY_BYTES, Header, Index, read_header
 from keyss.channels.colours.salts import Salts
-from keyss.core import Gaussians, InputError, KeyssError, KeyssWarning, Similarity, UsageError, WrongKeyError
+from keyss.core import Gaussians, InputError, KeyssError, KeyssWarning, UsageError, WrongKeyError
 from keyss.measure import converters, cropping, half_floats, noise, opacity_pruning, random_pruning
 from keyss.rendering import psnr_between
+from measure.lifelike import turned
+from measure.stealth.careless import shuffled
 
 ENTROPY = bytes(range(32))
 STRENGTH = 45.0
@@ -128,22 +129,12 @@ def _spz(model: Gaussians) -> Gaussians:
     return next(each for each in converters() if (each.format, each.tool) == (".spz", "gsply"))(model)
 
 
-def _turned(scale: float) -> Callable[[Gaussians], Gaussians]:
-    rotation = torch.from_numpy(Rotation.from_euler("xyz", [0.3, 1.1, -2.0]).as_matrix())
-    move = torch.tensor([3.0, -2.0, 5.0], dtype=torch.float64)
-    return Similarity(scale, rotation, move).apply_gaussians
-
-
-def _shuffled(model: Gaussians) -> Gaussians:
-    return model[torch.randperm(len(model), generator=torch.Generator().manual_seed(1))]
-
-
 CHANGES: dict[str, Callable[[Gaussians], Gaussians]] = {
     "nothing": lambda model: model,
     "spz": _spz,
-    "spz, order and a quarter": lambda model: random_pruning(0.25, 3)(_shuffled(_spz(model))),
-    "rotation and translation": _turned(1.0),
-    "scaling": _turned(1.37),
+    "spz, order and a quarter": lambda model: random_pruning(0.25, 3)(shuffled(_spz(model))),
+    "rotation and translation": turned(1.0),
+    "scaling": turned(1.37),
     "half floats": half_floats(),
     "noise on colour": noise("colour", 0.005),
     "noise on log scales": noise("log scale", 0.005),
@@ -162,7 +153,7 @@ HARDER: dict[str, Callable[[Gaussians], Gaussians]] = {
     "another half": cropping(2),
     "a random half": random_pruning(0.5),
     "without the faintest": opacity_pruning(0.25),
-    "scaling before spz": lambda model: _spz(_turned(0.4)(model)),
+    "scaling before spz": lambda model: _spz(turned(0.4)(model)),
     "another scene beside it": lambda model: Gaussians.cat([cover(2000, seed=5), model]),
 }
 
