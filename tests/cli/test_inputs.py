@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from cli.said import SMALL, Run, Said, assert_refused, listing, write_key
+from cli.said import SMALL, Run, Said, assert_refused, listing
 from files.scene_files import (
     write_blender,
     write_colmap,
@@ -124,9 +124,10 @@ def unprivileged() -> Iterator[None]:
 
 @pytest.fixture
 def open_folder() -> Iterator[Path]:
-    """A folder that everybody may enter, as `tmp_path` is not."""
+    """A folder that everybody may enter, as `tmp_path` is not, with a key that everybody may read."""
     with tempfile.TemporaryDirectory() as folder:
         os.chmod(folder, 0o755)
+        (Path(folder) / "key").write_text("q7Rv2LxT9bWm4KzD")
         yield Path(folder)
 
 
@@ -134,7 +135,7 @@ def open_folder() -> Iterator[Path]:
 def test_an_unreadable_scene_is_an_input_that_cannot_be_read(
     keyss: Run, open_folder: Path, closed: str
 ) -> None:
-    scene, key = write_colmap(open_folder / "scene"), ("--key-file", write_key(open_folder / "key"))
+    scene, key = write_colmap(open_folder / "scene"), ("--key-file", open_folder / "key")
     (scene / closed).chmod(0)
     commands = (
         ("fit", scene, "-o", open_folder / "out"),
@@ -156,7 +157,7 @@ def test_a_run_of_somebody_else_s_is_an_input_that_cannot_be_read(
     keyss: Run, world: Path, open_folder: Path
 ) -> None:
     run = shutil.copytree(world / "hidden", open_folder / "run")
-    key = ("--key-file", write_key(open_folder / "key"))
+    key = ("--key-file", open_folder / "key")
     keyss("evaluate", open_folder / "nowhere", *key)  # imports all it needs
     (run / "private").chmod(0)
     with unprivileged():
