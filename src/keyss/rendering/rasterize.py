@@ -112,9 +112,8 @@ def rasterization(
         np.float32(eps2d),
         sh_count=0 if sh_degree is None else (sh_degree + 1) ** 2,
     )
-    images, alphas, meta = rasterize_on_cpu(
-        settings, **{name: tensor.float().contiguous() for name, tensor in tensors.items()}
-    )
+    names = ("viewmats", "Ks", "backgrounds", "means", "quats", "scales", "opacities", "colors")
+    images, alphas, meta = rasterize_on_cpu(settings, *(tensors[each].float().contiguous() for each in names))
     meta.update(
         width=settings.width,
         height=settings.height,

@@ -76,20 +76,16 @@ class Rendering:
 
 def rasterize(
     settings: Settings,
-    means: Tensor,  # [N, 3]
-    quats: Tensor,  # [N, 4]
-    scales: Tensor,  # [N, 3]
-    opacities: Tensor,  # [N]
-    colors: Tensor,  # [N, K, 3] SH coefficients; [N, 1, D] where settings.sh_count is 0
     viewmats: Tensor,  # [C, 4, 4]
     Ks: Tensor,  # [C, 3, 3]
     backgrounds: Tensor,  # [C, D]
+    *gaussians: Tensor,  # see `GaussianArrays`
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """Render float32 contiguous CPU tensors. Returns images [C, H, W, D], alphas [C, H, W, 1] and meta."""
-    cameras, count = len(viewmats), len(means)
+    cameras, count = len(viewmats), len(gaussians[0])
     means2d = _empty(cameras, count, 2)
     # means2d is an input of the Function, which fills it and returns dL/d(means2d) as its gradient.
-    geometry = (means, quats, scales, opacities)
+    *geometry, _ = gaussians
     means2d.requires_grad_(torch.is_grad_enabled() and any(tensor.requires_grad for tensor in geometry))
     meta: dict[str, Any] = {
         "means2d": means2d,
@@ -97,7 +93,7 @@ def rasterize(
         "radii": _empty(cameras, count, 2, dtype=np.int32),
     }
     images, alphas = _Rasterize.apply(  # type: ignore[no-untyped-call]
-        means, quats, scales, opacities, colors, backgrounds, means2d, viewmats, Ks, settings, meta
+        settings, meta, viewmats, Ks, backgrounds, means2d, *gaussians
     )
     return images, alphas, meta
 
@@ -106,29 +102,24 @@ class _Rasterize(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any,
-        means: Tensor,
-        quats: Tensor,
-        scales: Tensor,
-        opacities: Tensor,
-        colors: Tensor,
-        backgrounds: Tensor,
-        means2d: Tensor,
-        viewmats: Tensor,
-        Ks: Tensor,
         settings: Settings,
         meta: dict[str, Any],
+        viewmats: Tensor,
+        Ks: Tensor,
+        backgrounds: Tensor,
+        means2d: Tensor,
+        *gaussians: Tensor,
     ) -> tuple[Tensor, Tensor]:
         announce_compilation()
         shape = (len(viewmats), settings.height, settings.width)
         images = _empty(*shape, backgrounds.shape[1])
         alphas = _empty(*shape, 1)
         transmittances = _empty(*shape)  # 1 - alphas, but exact where alpha is nearly 1
-        tensors = (means, quats, scales, opacities, colors)
-        gaussians = GaussianArrays(*(tensor.detach().numpy() for tensor in tensors))
+        arrays = GaussianArrays(*(tensor.detach().numpy() for tensor in gaussians))
         renderings = []
         for c in range(len(viewmats)):
             rendering = _render(
-                gaussians,
+                arrays,
                 _camera_array(viewmats[c], Ks[c]),
                 settings,
                 backgrounds[c].detach().numpy(),
@@ -142,7 +133,7 @@ class _Rasterize(torch.autograd.Function):
             )
             if any(ctx.needs_input_grad):
                 renderings.append(rendering)
-        ctx.save_for_backward(means, quats, scales, opacities, colors, images, transmittances)
+        ctx.save_for_backward(*gaussians, images, transmittances)
         ctx.means2d = means2d
         ctx.renderings = renderings
         ctx.settings = settings
@@ -162,7 +153,7 @@ class _Rasterize(torch.autograd.Function):
             alphas_gradient = torch.zeros_like(transmittances)
         images_gradient = images_gradient.contiguous()
         alphas_gradient = alphas_gradient.reshape(transmittances.shape).contiguous()
-        need_colors, need_background = ctx.needs_input_grad[4:6]
+        need_background, need_colors = ctx.needs_input_grad[4], ctx.needs_input_grad[-1]
 
         shapes = [tuple(tensor.shape) for tensor in (*gaussians, ctx.means2d)]
         if not need_colors:
@@ -194,7 +185,7 @@ class _Rasterize(torch.autograd.Function):
             # Unlike torch's sum, numpy's does not depend on the number of threads.
             weighted = (images_gradient.double() * transmittances.double()[..., None]).numpy()
             backgrounds_gradient = torch.from_numpy(weighted.sum((1, 2))).float()
-        returned = (*gradients, backgrounds_gradient, means2d_gradient, None, None, None, None)
+        returned = (None, None, None, None, backgrounds_gradient, means2d_gradient, *gradients)
         return tuple(
             gradient if needed else None
             for gradient, needed in zip(returned, ctx.needs_input_grad, strict=True)

@@ -189,29 +189,8 @@ def fused_multiply_add(typingctx, a, b, c):
     return types.float32(types.float32, types.float32, types.float32), codegen
 
 
-@intrinsic
-def splat(typingctx, scalar):
-    """The vector with `scalar` in every lane."""
-
-    def codegen(context, builder, signature, arguments):
-        return _splat(builder, arguments[0])
-
-    return float32x8(types.float32), codegen
-
-
-@intrinsic
-def ramp(typingctx, start):
-    """(start, start + 1, ... start + 7)."""
-
-    def codegen(context, builder, signature, arguments):
-        steps = ir.Constant(VECTOR, [float(i) for i in range(8)])
-        return builder.fadd(_splat(builder, arguments[0]), steps)
-
-    return float32x8(types.float32), codegen
-
-
-def _lanewise(build):
-    """An intrinsic that `build` makes of vectors; numbers among its arguments are in every lane."""
+def _of_vectors(build):
+    """The intrinsic that `build` makes of vectors; numbers among its arguments become vectors of them."""
 
     def function(typingctx, *operands):
         def codegen(context, builder, signature, arguments):
@@ -232,23 +211,52 @@ def _called(name, builder, a):
     return builder.call(_llvm_function(builder, name, VECTOR, [VECTOR]), [a])
 
 
-def _with_sign(builder, a):
+multiply_add = _of_vectors(_multiply_add)  # a * b + c, one instruction where the CPU has it
+divide = _of_vectors(lambda builder, a, b: builder.fdiv(a, b))
+select_ge = _of_vectors(partial(_selected, ">="))  # (a, b, yes, no): `yes` where a >= b, else `no`
+select_gt = _of_vectors(partial(_selected, ">"))
+select_le = _of_vectors(partial(_selected, "<="))
+minimum = _of_vectors(lambda builder, a, b: _selected("<", builder, a, b, a, b))
+maximum = _of_vectors(lambda builder, a, b: _selected(">", builder, a, b, a, b))
+square_root = _of_vectors(partial(_called, "llvm.sqrt.v8f32"))
+floor8 = _of_vectors(partial(_called, "llvm.floor.v8f32"))
+ceil8 = _of_vectors(partial(_called, "llvm.ceil.v8f32"))
+absolute = _of_vectors(partial(_called, "llvm.fabs.v8f32"))
+
+
+@_of_vectors
+def splat(builder, a):
+    """The vector with `a` in every lane."""
+    return a
+
+
+@_of_vectors
+def ramp(builder, start):
+    """(start, start + 1, ... start + 7)."""
+    return builder.fadd(start, ir.Constant(VECTOR, [float(i) for i in range(8)]))
+
+
+@_of_vectors
+def negative_abs(builder, a):
+    """-|a|."""
     bits = builder.or_(builder.bitcast(a, INT_VECTOR), ir.Constant(INT_VECTOR, [-(1 << 31)] * 8))
     return builder.bitcast(bits, VECTOR)
 
 
-multiply_add = _lanewise(_multiply_add)  # a * b + c, one instruction where the CPU has it
-divide = _lanewise(lambda builder, a, b: builder.fdiv(a, b))
-select_ge = _lanewise(partial(_selected, ">="))  # (a, b, yes, no): `yes` where a >= b, else `no`
-select_gt = _lanewise(partial(_selected, ">"))
-select_le = _lanewise(partial(_selected, "<="))
-minimum = _lanewise(lambda builder, a, b: _selected("<", builder, a, b, a, b))
-maximum = _lanewise(lambda builder, a, b: _selected(">", builder, a, b, a, b))
-square_root = _lanewise(partial(_called, "llvm.sqrt.v8f32"))
-floor8 = _lanewise(partial(_called, "llvm.floor.v8f32"))
-ceil8 = _lanewise(partial(_called, "llvm.ceil.v8f32"))
-absolute = _lanewise(partial(_called, "llvm.fabs.v8f32"))
-negative_abs = _lanewise(_with_sign)
+@_of_vectors
+def sum_lanes_of_8(builder, a0, a1, a2, a3, a4, a5, a6, a7):
+    """The vector whose lane i is the sum of the lanes of a_i: 7 steps instead of 8 times 3."""
+
+    def add_neighbours(a, b):
+        even = shuffle(builder, a, b, [0, 2, 8, 10, 4, 6, 12, 14])
+        odd = shuffle(builder, a, b, [1, 3, 9, 11, 5, 7, 13, 15])
+        return builder.fadd(even, odd)
+
+    low = add_neighbours(add_neighbours(a0, a1), add_neighbours(a2, a3))
+    high = add_neighbours(add_neighbours(a4, a5), add_neighbours(a6, a7))
+    left = shuffle(builder, low, high, [0, 1, 2, 3, 8, 9, 10, 11])
+    right = shuffle(builder, low, high, [4, 5, 6, 7, 12, 13, 14, 15])
+    return builder.fadd(left, right)
 
 
 @intrinsic
@@ -274,25 +282,6 @@ def sum_lanes(typingctx, a):
         return builder.extract_element(value, INT(0))
 
     return types.float32(float32x8), codegen
-
-
-@intrinsic
-def sum_lanes_of_8(typingctx, a0, a1, a2, a3, a4, a5, a6, a7):
-    """The vector whose lane i is the sum of the lanes of a_i: 7 steps instead of 8 times 3."""
-
-    def codegen(context, builder, signature, arguments):
-        def add_neighbours(a, b):
-            even = shuffle(builder, a, b, [0, 2, 8, 10, 4, 6, 12, 14])
-            odd = shuffle(builder, a, b, [1, 3, 9, 11, 5, 7, 13, 15])
-            return builder.fadd(even, odd)
-
-        pairs = [add_neighbours(arguments[i], arguments[i + 1]) for i in range(0, 8, 2)]
-        low, high = add_neighbours(*pairs[:2]), add_neighbours(*pairs[2:])
-        left = shuffle(builder, low, high, [0, 1, 2, 3, 8, 9, 10, 11])
-        right = shuffle(builder, low, high, [4, 5, 6, 7, 12, 13, 14, 15])
-        return builder.fadd(left, right)
-
-    return float32x8(*[float32x8] * 8), codegen
 
 
 @intrinsic
@@ -355,7 +344,7 @@ def _exponential(power):
         result = builder.bitcast(builder.add(builder.bitcast(result, INT_VECTOR), shift), VECTOR)
         return _selected(">", builder, x, _constant(lowest), result, _constant(0.0))
 
-    return _lanewise(build)
+    return _of_vectors(build)
 
 
 exp = _exponential(0)  # e^x for x < 87, and 0 below -87; the relative error is about 1e-7 (1 + |x|)
