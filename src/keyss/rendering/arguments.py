@@ -15,6 +15,9 @@ MAX_CHANNELS = 32
 CAMERA_MAX = 1e12  # in viewmats and Ks, so that products do not overflow
 FOCAL_LENGTH_MIN = 1e-6  # pixels
 
+_BATCHES = "batch dimensions are not supported"
+_NO_CAMERAS = "colors are the same for every camera"
+
 # Arguments of gsplat that only say how it computes.
 IGNORED = frozenset(("packed", "tile_size", "channel_chunk", "segmented"))
 # Arguments of gsplat that must have their default.
@@ -54,14 +57,12 @@ def check_arguments(
         if not isinstance(tensor, Tensor):
             raise ValueError(f"{name}: expected a torch tensor, got {type(tensor).__name__}")
     means, viewmats, Ks = tensors["means"], tensors["viewmats"], tensors["Ks"]
-    for name, shape in (("means", "[N, 3]"), ("viewmats", "[C, 4, 4]")):
-        _check_dimensions(name, tensors[name], shape, "batch dimensions are not supported")
+    _check_shape("means", means, "N", 3, reason_for_more=_BATCHES)
+    _check_shape("viewmats", viewmats, "C", 4, 4, reason_for_more=_BATCHES)
     count, cameras = len(means), len(viewmats)
-    _check_shape("means", means, count, 3)
     _check_shape("quats", tensors["quats"], count, 4)
     _check_shape("scales", tensors["scales"], count, 3)
     _check_shape("opacities", tensors["opacities"], count)
-    _check_shape("viewmats", viewmats, cameras, 4, 4)
     _check_shape("Ks", Ks, cameras, 3, 3)
     _check_colors(tensors["colors"], count, sh_degree)
     if "backgrounds" in tensors:
@@ -101,10 +102,8 @@ def _check_others(others: Mapping[str, Any]) -> None:
 
 
 def _check_colors(colors: Tensor, count: int, sh_degree: int | None) -> None:
-    reason = "colors are the same for every camera"
     if sh_degree is None:
-        _check_dimensions("colors", colors, f"[{count}, D]", reason)
-        _check_shape("colors", colors, count, colors.shape[1])
+        _check_shape("colors", colors, count, "D", reason_for_more=_NO_CAMERAS)
         if not 1 <= colors.shape[1] <= MAX_CHANNELS:
             raise UsageError(f"colors: 1 to {MAX_CHANNELS} channels are supported, got {list(colors.shape)}")
         return
@@ -112,22 +111,12 @@ def _check_colors(colors: Tensor, count: int, sh_degree: int | None) -> None:
         raise UsageError("sh_degree: spherical harmonics up to degree 3 are supported, got degree 4")
     if sh_degree not in (0, 1, 2, 3):
         raise ValueError(f"sh_degree: expected 0, 1, 2, 3 or None, got {sh_degree!r}")
-    _check_dimensions("colors", colors, f"[{count}, K, 3]", reason)
-    _check_shape("colors", colors, count, colors.shape[1], 3)
+    _check_shape("colors", colors, count, "K", 3, reason_for_more=_NO_CAMERAS)
     if colors.shape[1] < (sh_degree + 1) ** 2:
         raise ValueError(
             f"colors: sh_degree {sh_degree} needs at least {(sh_degree + 1) ** 2} coefficients, "
             f"got {list(colors.shape)}"
         )
-
-
-def _check_dimensions(name: str, tensor: Tensor, shape: str, reason_for_more: str) -> None:
-    """Raise UsageError for more dimensions than in `shape`, which gsplat allows, ValueError for fewer."""
-    expected = f"{name}: expected shape {shape}, got {list(tensor.shape)}"
-    if tensor.dim() > shape.count(",") + 1:
-        raise UsageError(f"{expected}: {reason_for_more}")
-    if tensor.dim() < shape.count(",") + 1:
-        raise ValueError(expected)
 
 
 def _check_cameras(viewmats: Tensor, Ks: Tensor, backgrounds: Tensor | None) -> None:
@@ -149,6 +138,14 @@ def _check_cameras(viewmats: Tensor, Ks: Tensor, backgrounds: Tensor | None) -> 
         )
 
 
-def _check_shape(name: str, tensor: Tensor, *shape: int) -> None:
-    if tuple(tensor.shape) != shape:
-        raise ValueError(f"{name}: expected shape {list(shape)}, got {list(tensor.shape)}")
+def _check_shape(name: str, tensor: Tensor, *shape: int | str, reason_for_more: str | None = None) -> None:
+    """Raise ValueError for another shape; letters stand for any size.
+
+    With a reason, raise UsageError for more dimensions, which gsplat allows.
+    """
+    expected = f"{name}: expected shape [{', '.join(map(str, shape))}], got {list(tensor.shape)}"
+    if reason_for_more is not None and tensor.dim() > len(shape):
+        raise UsageError(f"{expected}: {reason_for_more}")
+    pairs = zip(shape, tensor.shape, strict=False)
+    if tensor.dim() != len(shape) or any(isinstance(own, int) and own != size for own, size in pairs):
+        raise ValueError(expected)
