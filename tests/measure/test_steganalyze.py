@@ -15,7 +15,7 @@ from PIL import Image
 
 from cli.said import Run
 from keyss.core import InputError, UsageError
-from keyss.measure import csv_bytes, score_file, steganalyze
+from keyss.measure import csv_bytes, read_pixels, score_image, steganalyze
 from measure.test_stegexpose import smooth, with_payload
 
 
@@ -56,7 +56,7 @@ def test_the_table_has_the_columns_of_the_original_and_the_size_of_the_secret(
     assert ",".join(tiny.values()) == "a.png,NaN,null,null,NaN,NaN,false,0"
     assert (full["file"], full["flagged"]) == ("b.png", "true")
     assert (clean["file"], clean["flagged"]) == ("c.bmp", "false")
-    scores = score_file(folder / "c.bmp")
+    scores = score_image(read_pixels(folder / "c.bmp"))
     assert float(clean["rs"]) == scores.rs
     assert float(clean["fusion"]) == scores.fusion
     third = scores.fusion * (folder / "c.bmp").stat().st_size / 3

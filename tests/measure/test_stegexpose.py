@@ -16,7 +16,7 @@ from scipy.stats import chi2
 
 from keyss.core import InputError, UsageError
 from keyss.files import images
-from keyss.measure import Scores, lsb_detectors, read_pixels, score_file, score_image
+from keyss.measure import Scores, lsb_detectors, read_pixels, score_image
 from measure import stegexpose_literal as literal
 
 DETECTORS = ("primary_sets", "chi_square", "sample_pairs", "rs")
@@ -56,7 +56,7 @@ class TestAgainstTheOriginal:
             expected = list(csv.DictReader(file))
         assert len(expected) == 34
         for row in expected:
-            scores = score_file(folder / row["file"])
+            scores = score_image(read_pixels(folder / row["file"]))
             for name in (*DETECTORS, "fusion"):
                 score = getattr(scores, name)
                 if row[name] == "null":
@@ -263,10 +263,10 @@ class TestDecoding:
         Image.fromarray(smooth()).save(tmp_path / "a.png")
         (tmp_path / "a.png").write_bytes((tmp_path / "a.png").read_bytes()[:5000])
         with pytest.raises(InputError, match="cannot be decoded"):
-            score_file(tmp_path / "a.png")
+            score_image(read_pixels(tmp_path / "a.png"))
 
     def test_what_is_too_large_is_refused(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         Image.fromarray(self.COLOURS).save(tmp_path / "a.png")
         monkeypatch.setattr(images, "_MAX_PIXELS", 34)
         with pytest.raises(InputError, match="at most 34 pixels, found 7x5"):
-            score_file(tmp_path / "a.png")
+            score_image(read_pixels(tmp_path / "a.png"))

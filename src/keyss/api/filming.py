@@ -19,8 +19,7 @@ from keyss.files.video import check_video, write_video
 from keyss.fitting.reporting import Reporter, SilentReporter
 from keyss.rendering import Backend, render, resolve_device
 from keyss.rendering.arguments import MAX_SIDE
-from keyss.rendering.orbit import IMAGE_SIZE
-from keyss.rendering.paths import around, circle
+from keyss.rendering.orbit import IMAGE_SIZE, around, circle
 from keyss.runs.sources import PathLike, as_model, as_scene
 
 FPS = 25

@@ -2,7 +2,7 @@
 
 *fine*: within the limit. *visible*: without the key it may be visible that something is hidden, or what.
 *missed*: nothing is visible, but the quality is lower than it should be.
-All limits are here, except those of leaks, which are in `keyss.measure.leaks.scores`.
+All limits are here, except those of leaks, which are in `keyss.measure.leaks.looking`.
 """
 
 from __future__ import annotations
@@ -14,8 +14,7 @@ from typing import Literal
 from keyss.audits.numbers import decibel, difference, number, numbered, significant, times
 from keyss.audits.record import Audit
 from keyss.measure.auc import Auc
-from keyss.measure.leaks.looking import AttackResult
-from keyss.measure.leaks.scores import GRADIENT_LIMIT, PSNR_LIMIT, SSIM_LIMIT
+from keyss.measure.leaks.looking import GRADIENT_LIMIT, PSNR_LIMIT, SSIM_LIMIT, AttackResult
 
 QUALITY_LOSS = 1.0  # dB of cover or secret below the plain model of the same scene
 INVISIBLE = 45.0  # dB: a higher PSNR makes no visible difference

@@ -21,13 +21,14 @@ from .leaks.attacks import (
     search_embeddings as search_embeddings,
     with_the_key as with_the_key,
 )
-from .leaks.looking import AttackResult as AttackResult, look_for_secret as look_for_secret
-from .leaks.scores import (
+from .leaks.looking import (
+    AttackResult as AttackResult,
     LeakScores as LeakScores,
     coarse as coarse,
     fit_colours as fit_colours,
     gradient_correlation as gradient_correlation,
     leak_scores as leak_scores,
+    look_for_secret as look_for_secret,
 )
 from .robustness.changes import (
     Change as Change,
@@ -69,7 +70,6 @@ from .stegexpose import (
     StegExposeAuc as StegExposeAuc,
     csv_bytes as csv_bytes,
     read_pixels as read_pixels,
-    score_file as score_file,
     score_image as score_image,
     steganalyze as steganalyze,
     stegexpose_auc as stegexpose_auc,

@@ -56,11 +56,6 @@ def score_image(image: NDArray[np.uint8]) -> Scores:
     return Scores(**scores, fusion=sum(available) / len(available) if available else math.nan)
 
 
-def score_file(path: Path | str) -> Scores:
-    """`score_image` of a file, decoded as the original does (`read_pixels`). Raises InputError."""
-    return score_image(read_pixels(path))
-
-
 def read_pixels(path: Path | str) -> NDArray[np.uint8]:
     """[H, W, 3] of an image file as Java's ImageIO decodes it.
 
@@ -203,7 +198,7 @@ def _files(folder: Path) -> list[Path]:
 
 
 def _row(path: Path, threshold: float) -> Row:
-    scores = score_file(path)
+    scores = score_image(read_pixels(path))
     fusion = next(iter(_present([scores.fusion])), 0.0)
     return Row(path.name, scores, fusion > threshold, math.floor(fusion * path.stat().st_size / 3 + 0.5))
 

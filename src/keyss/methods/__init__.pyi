@@ -10,6 +10,11 @@ from .base import (
 from .carry.options import CarryOptions as CarryOptions
 from .carry.refit import most_contributing as most_contributing
 from .carry.room import RecordRoom as RecordRoom, SecretSize as SecretSize, of_degree as of_degree
+from .combined import (
+    CombinedPoses as CombinedPoses,
+    PlacedScene as PlacedScene,
+    divided as divided,
+)
 from .decoy import Decoy as Decoy
 from .dither import dither_model as dither_model
 from .joint import JointTraining as JointTraining
@@ -32,8 +37,6 @@ from .opened import (
 )
 from .peers.method import PeerOptions as PeerOptions
 from .plain_models import Bound as Bound, with_plain_models as with_plain_models
-from .points import divided as divided
-from .poses import CombinedPoses as CombinedPoses, PlacedScene as PlacedScene
 from .records.embedding import (
     embed_models as embed_models,
     encode_all as encode_all,

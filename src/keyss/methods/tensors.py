@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import msgspec
 import safetensors
@@ -14,36 +14,11 @@ import torch
 from torch import Tensor
 
 from keyss.core.errors import InputError, UsageError
-from keyss.core.similarity import Similarity
 
 _ENTRY = "keyss"
 # What reading a damaged header or damaged tensors can raise.
 _LIBRARY_ERRORS = (safetensors.SafetensorError, msgspec.MsgspecError)
-_DAMAGE = (*_LIBRARY_ERRORS, KeyError, TypeError, ValueError, RuntimeError, UsageError)
-
-_Three = tuple[float, float, float]
-
-
-@dataclass(frozen=True)
-class FrameRecord:
-    """A `Similarity` in a header."""
-
-    scale: float
-    rotation: tuple[_Three, _Three, _Three]
-    translation: _Three
-
-    @staticmethod
-    def of(frame: Similarity) -> FrameRecord:
-        values = {"rotation": frame.rotation.tolist(), "translation": frame.translation.tolist()}
-        return msgspec.convert({"scale": frame.scale, **values}, FrameRecord)
-
-    @property
-    def similarity(self) -> Similarity:
-        """The similarity. Raises ValueError if these numbers are none."""
-        rotation, translation = (
-            torch.tensor(values, dtype=torch.float64) for values in (self.rotation, self.translation)
-        )
-        return Similarity(self.scale, rotation, translation)
+_DAMAGE = (*_LIBRARY_ERRORS, KeyError, TypeError, ValueError, OverflowError, RuntimeError, UsageError)
 
 
 @dataclass(frozen=True)
@@ -60,7 +35,7 @@ HeaderT = TypeVar("HeaderT", bound=Header)
 def pack_tensors(tensors: Mapping[str, Tensor], header: Header) -> bytes:
     """The same tensors and header give the same bytes."""
     kept = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
-    return safetensors.torch.save(kept, {_ENTRY: msgspec.json.encode(header).decode()})
+    return safetensors.torch.save(kept, {_ENTRY: _encoded(header).decode()})
 
 
 def unpack_tensors(
@@ -79,12 +54,21 @@ def unpack_tensors(
         raise ValueError(f"format {found.format[:40]!r}")
     if found.version != version:
         raise InputError(f"secret of version {found.version}; this program reads version {version}")
-    header = msgspec.json.decode(text, type=kind)
-    if msgspec.json.encode(header) != text:
+    header = msgspec.json.decode(text, type=kind, dec_hook=_tensor)
+    if _encoded(header) != text:
         raise ValueError("its header has more or other fields")
     if not all(value.isfinite().all() for value in tensors.values()):
         raise ValueError("expected finite numbers")
     return header, tensors
+
+
+def _encoded(header: Header) -> bytes:
+    return msgspec.json.encode(header, enc_hook=Tensor.tolist)
+
+
+def _tensor(kind: type, numbers: Any) -> Tensor:
+    """A field of a `Similarity` in a header."""
+    return torch.tensor(numbers, dtype=torch.float64)
 
 
 @contextmanager

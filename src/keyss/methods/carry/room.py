@@ -23,10 +23,11 @@ from keyss.core.errors import InputError, KeyssError, UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.keys.derivation import expand
 from keyss.methods.carry.options import CarryOptions
+from keyss.methods.combined import divided
 from keyss.methods.dither import dither_model, loosened, raised
-from keyss.methods.points import divided
 from keyss.methods.records.embedding import largest_degree, record_request, shares
-from keyss.methods.records.precision import least_bytes, most_visible, pruned
+from keyss.methods.records.precision import most_visible, pruned
+from keyss.methods.records.whole import encode
 from keyss.rendering.difference import Viewpoints
 
 _BITS_PER_GAUSSIAN = 130  # of the payload of a secret that is not fitted yet
@@ -54,7 +55,7 @@ class SecretSize:
     @cached_property
     def payload_bytes(self) -> int:
         """Bytes of the secret as a payload."""
-        return self.count * _BITS_PER_GAUSSIAN // 8 if self.model is None else least_bytes(self.model)
+        return self.count * _BITS_PER_GAUSSIAN // 8 if self.model is None else len(encode(self.model))
 
 
 def _check_not_tiny(
@@ -184,7 +185,7 @@ class WholeRoom:
 
     def prune(self, models: Sequence[Gaussians], viewpoints: Sequence[Viewpoints]) -> list[Gaussians]:
         """See `RecordRoom.prune`; the SH degree is the one that renders most like the model."""
-        rooms = shares(self.room, [least_bytes(model) for model in models])
+        rooms = shares(self.room, [len(encode(model)) for model in models])
         return [pruned(*each) for each in zip(models, rooms, viewpoints, strict=True)]
 
     def appended(self, secrets: Sequence[SecretSize]) -> int:

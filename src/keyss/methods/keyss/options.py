@@ -8,7 +8,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from keyss.core.errors import UsageError
 from keyss.methods.base import CommandLineOption
-from keyss.methods.joint_options import JointOptions
+from keyss.methods.joint import JointOptions
 from keyss.methods.keyss.decoder import Mask, parse_mask
 from keyss.methods.keyss.designs.base import Design
 from keyss.methods.keyss.designs.carriers import CARRIERS

@@ -38,7 +38,7 @@ from keyss.keys.derivation import EMBEDDING_SIZE, expand, stream
 from keyss.methods.opened import Frame, Remains
 from keyss.methods.records.quantise import Codec
 from keyss.methods.records.table import Table
-from keyss.methods.tensors import FrameRecord, Header, damage_refused, pack_tensors, unpack_tensors
+from keyss.methods.tensors import Header, damage_refused, pack_tensors, unpack_tensors
 
 NAME = "keyss"
 FORMAT, VERSION = "keyss-secret", 9
@@ -59,7 +59,7 @@ Rows = npt.NDArray[np.int64]
 class _Header(Header):
     """msgspec holds it to these types and bounds."""
 
-    frame: FrameRecord
+    frame: Similarity
     secret: Annotated[int, Meta(ge=0, le=8)]  # which share of a row's bytes it has
     secrets: Annotated[int, Meta(ge=1, le=9)]  # that share them
     count: Annotated[int, Meta(ge=1, le=2**31)]
@@ -82,7 +82,7 @@ class RowSecret:
     def payload(self) -> Payload:
         """What a channel carries; the same secret gives the same bytes."""
         numbers = self.secret, self.secrets, self.count, self.visibility
-        header = _Header(FORMAT, VERSION, FrameRecord.of(self.frame), *numbers)
+        header = _Header(FORMAT, VERSION, self.frame, *numbers)
         tensors = {"embedding": self.embedding}
         for index, codec in enumerate(self.codecs):
             tensors[f"codec.{index}"] = torch.frombuffer(bytearray(codec.pack()), dtype=torch.uint8)
@@ -104,9 +104,8 @@ class RowSecret:
             if any(each.dtype != torch.uint8 for each in packed):
                 raise ValueError("expected bytes")
             codecs = tuple(Codec.unpack(each.numpy().tobytes()) for each in packed)
-            frame = header.frame.similarity
         numbers = header.secret, header.secrets, header.count, header.visibility
-        return RowSecret(embedding, codecs, frame, *numbers, content.chunks)
+        return RowSecret(embedding, codecs, header.frame, *numbers, content.chunks)
 
     def reveal(self, stego: Gaussians, *, frame: Frame = "secret", force: bool = False) -> Gaussians:
         """A model that needs no decoder and no cover; see `Opened.reveal`.

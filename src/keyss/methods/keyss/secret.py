@@ -28,7 +28,7 @@ from keyss.methods.keyss import rows
 from keyss.methods.keyss.decoder import Decoder, DecoderShape, parse_mask
 from keyss.methods.keyss.rows import RowSecret
 from keyss.methods.opened import Frame, Remains
-from keyss.methods.tensors import FrameRecord, Header, damage_refused, pack_tensors, unpack_tensors
+from keyss.methods.tensors import Header, damage_refused, pack_tensors, unpack_tensors
 
 NAME = "keyss"
 FORMAT, VERSION = "keyss-secret", 8
@@ -45,7 +45,7 @@ class _Header(Header):
     """msgspec holds it to these types and bounds."""
 
     shape: DecoderShape
-    frame: FrameRecord
+    frame: Similarity
     count: Annotated[int, Meta(ge=0, le=2**31)]
 
 
@@ -61,7 +61,7 @@ class HiddenSecret:
 
     def payload(self) -> Payload:
         """What a channel carries; the same secret gives the same bytes."""
-        header = _Header(FORMAT, VERSION, self.decoder.shape, FrameRecord.of(self.frame), self.count)
+        header = _Header(FORMAT, VERSION, self.decoder.shape, self.frame, self.count)
         halved = {name for name, _ in self.decoder.named_parameters()}
         tensors = {
             _WEIGHTS + name: value.half() if name in halved else value
@@ -85,8 +85,8 @@ class HiddenSecret:
                 raise ValueError(f"expected up to {ANCHORS} anchors, got shape {list(anchors.shape)}")
             decoder = Decoder(header.shape)
             decoder.load_state_dict({name.removeprefix(_WEIGHTS): value for name, value in tensors.items()})
-            frame = header.frame.similarity
-        return HiddenSecret(decoder.requires_grad_(False), frame, anchors, header.count, content.chunks)
+        numbers = header.count, content.chunks
+        return HiddenSecret(decoder.requires_grad_(False), header.frame, anchors, *numbers)
 
     @torch.no_grad()
     def reveal(self, stego: Gaussians, *, frame: Frame = "secret", force: bool = False) -> Gaussians:

@@ -8,8 +8,7 @@ from typing import ClassVar
 
 from keyss.core.gaussians import Gaussians
 from keyss.methods.base import Capabilities, Context, Plan, Source, Stego, Training
-from keyss.methods.peers.method import Peer, PeerOptions
-from keyss.methods.peers.payload import HandedTensors, Show
+from keyss.methods.peers.method import HandedTensors, Peer, PeerOptions, Show
 
 _NAMES = tuple(each.name for each in fields(Gaussians))
 

@@ -15,11 +15,9 @@ from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Camera
 from keyss.fitting.parameters import to_gaussians
 from keyss.methods.base import Capabilities
-from keyss.methods.joint import Picture
-from keyss.methods.joint_options import Scenes
-from keyss.methods.peers.method import Peer, PeerOptions, PeerTraining
+from keyss.methods.joint import Picture, Scenes
+from keyss.methods.peers.method import HandedTensors, Peer, PeerOptions, PeerTraining, Show
 from keyss.methods.peers.networks import Convolutions, network_of, network_tensors, weights_of
-from keyss.methods.peers.payload import HandedTensors, Show
 from keyss.rendering import decode_picture
 
 

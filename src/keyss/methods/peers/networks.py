@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from keyss.core.decoded import PictureNetwork
-from keyss.methods.peers.payload import HandedTensors
+from keyss.methods.peers.method import HandedTensors
 
 WIDTH, LAYERS = 64, 5
 

@@ -15,8 +15,7 @@ from keyss.core.scene import Camera
 from keyss.fitting.parameters import make_optimizers, to_gaussians
 from keyss.methods.base import Capabilities
 from keyss.methods.joint import Picture
-from keyss.methods.peers.method import Peer, PeerOptions, PeerTraining
-from keyss.methods.peers.payload import HandedTensors, Show
+from keyss.methods.peers.method import HandedTensors, Peer, PeerOptions, PeerTraining, Show
 
 _NAMES = ("sh", "secret_sh")  # parameters with the colours of the cover and of the secret
 

@@ -39,8 +39,7 @@ from keyss.fitting.ranks import here
 from keyss.keys.derivation import stream
 from keyss.methods.base import Capabilities
 from keyss.methods.joint import Picture
-from keyss.methods.peers.method import Peer, PeerOptions, PeerTraining
-from keyss.methods.peers.payload import HandedTensors, Show
+from keyss.methods.peers.method import HandedTensors, Peer, PeerOptions, PeerTraining, Show
 
 COVER_BITS = (8, 10, 12, 14)  # low bits in use, of the 23 of a mantissa, by degree
 SECRET_BITS = (16, 13, 11, 10)  # of a coefficient if there is room for all, by degree

@@ -23,9 +23,10 @@ from keyss.channels import (
 from keyss.core.gaussians import Gaussians
 from keyss.methods.base import Stego
 from keyss.methods.records.opening import COUNT, unpack
-from keyss.methods.records.precision import fitted, least_bytes, most_visible_rows
+from keyss.methods.records.precision import fitted, most_visible_rows
 from keyss.methods.records.quantise import Codec
 from keyss.methods.records.table import Table
+from keyss.methods.records.whole import encode
 from keyss.rendering.difference import Viewpoints
 
 METHOD = "carry"  # the method that opens what is embedded
@@ -109,7 +110,7 @@ def shares(room: Room, needed: Sequence[int]) -> list[int]:
 def _payloads(
     cover: PreparedCover, models: Sequence[Gaussians], viewpoints: Sequence[Viewpoints]
 ) -> list[Payload]:
-    rooms = shares(cover, [least_bytes(model) for model in models])
+    rooms = shares(cover, [len(encode(model)) for model in models])
     return [
         Payload(METHOD, fitted(model, room, short=cover.grows, viewpoints=views))
         for model, room, views in zip(models, rooms, viewpoints, strict=True)

@@ -48,17 +48,12 @@ def good_enough(model: Gaussians, viewpoints: Viewpoints | None = None) -> Preci
     return precision
 
 
-def least_bytes(model: Gaussians) -> int:
-    """Bytes of the encoding with the usual precision; a secret that needs more than there are is pruned."""
-    return len(encode(model))
-
-
 def pruned(model: Gaussians, room: int, viewpoints: Viewpoints | None = None) -> Gaussians:
     """All of `model` if it fits into `room` bytes, else its most visible Gaussians.
 
     These are of the SH degree that renders most like the model. Raises UsageError if nothing fits.
     """
-    if least_bytes(model) <= room:
+    if len(encode(model)) <= room:
         return model
     degrees = range(model.sh_degree + 1)
     candidates = [found for each in degrees if (found := _pruned(model.with_sh_degree(each), room))]
@@ -114,7 +109,7 @@ def _pruned(model: Gaussians, room: int) -> Gaussians | None:
     count = len(model)
     while count > 0:
         kept = most_visible(model, count)
-        size = least_bytes(kept)
+        size = len(encode(kept))
         if size <= room:
             return kept
         count = min(count - 1, int(0.995 * count * room / size))

@@ -11,10 +11,10 @@ import torch
 from torch import Tensor
 
 from keyss.core.gaussians import Gaussians
+from keyss.methods.combined import PlacedScene
 from keyss.methods.joint import JointTraining
 from keyss.methods.keyss.rows import RowSecret
 from keyss.methods.keyss.secret import HiddenSecret
-from keyss.methods.poses import PlacedScene
 
 if TYPE_CHECKING:
     from keyss.methods.keyss.options import KeyssOptions

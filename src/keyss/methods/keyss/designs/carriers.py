@@ -33,6 +33,7 @@ from keyss.fitting.parameters import (
     to_parameters,
 )
 from keyss.fitting.plain import without_faint
+from keyss.methods.combined import combined_points
 from keyss.methods.joint import Picture
 from keyss.methods.keyss.designs.base import Design, DesignTraining
 from keyss.methods.keyss.rows import (
@@ -43,7 +44,6 @@ from keyss.methods.keyss.rows import (
     secret_tables,
     visibility,
 )
-from keyss.methods.points import combined_points
 from keyss.methods.records.quantise import Codec
 from keyss.rendering.view import contributions
 

@@ -1,4 +1,4 @@
-"""Combined camera poses (KeySS, section 3.4): what each scene looks like from every training pose.
+"""Combined points and camera poses (KeySS, section 3.4): the start of a joint training, and its targets.
 
 The target of a scene is its photo where there is one for the pose, and elsewhere a render of its plain 3DGS
 model. Everything is in the cover's frame.
@@ -15,7 +15,9 @@ from torch import Tensor
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Camera, Scene, View
 from keyss.core.similarity import Similarity
+from keyss.fitting.config import FitConfig
 from keyss.fitting.losses import Target
+from keyss.fitting.parameters import initial_gaussians, initial_points
 from keyss.rendering import render
 
 CACHE_BYTES = 2 << 30
@@ -43,6 +45,27 @@ class PlacedScene:
 
 def _moved(view: View, frame: Similarity) -> View:
     return View(frame.apply_camera(view.camera), view.image)
+
+
+def combined_points(scenes: Sequence[Scene], fit: FitConfig, generator: torch.Generator) -> Gaussians:
+    """Gaussians at the points of all scenes, in equal shares of the cap as far as there are points."""
+    clouds = [initial_points(scene, fit.max_gaussians, generator) for scene in scenes]
+    counts = divided([len(points) for points, _ in clouds], fit.max_gaussians)
+    parts = [
+        initial_gaussians(points, colors, fit.sh_degree, share, generator)
+        for (points, colors), share in zip(clouds, counts, strict=True)
+    ]
+    return Gaussians.cat(parts)
+
+
+def divided(available: Sequence[int], total: int) -> list[int]:
+    """`total` items in equal shares, each at most what is `available`; the others share the rest."""
+    shares = [0] * len(available)
+    left = total
+    for done, index in enumerate(sorted(range(len(available)), key=lambda i: available[i])):
+        shares[index] = min(available[index], left // (len(available) - done))
+        left -= shares[index]
+    return shares
 
 
 class CombinedPoses:
