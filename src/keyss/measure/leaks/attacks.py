@@ -74,7 +74,7 @@ def file_attacks(cover: Scene, *, cover_views: int = 32, seed: int = 0) -> list[
         Attack(
             "inverted opacities",
             "Opacities o become 1 - o, of Gaussians below an opacity alone or of all.",
-            partial(_faint, _inverted, and_all=True),
+            partial(_faint, lambda m: replace(m, opacity_logits=-m.opacity_logits), and_all=True),
         ),
         Attack(
             "least contribution",
@@ -195,11 +195,6 @@ def _rescaled(model: Gaussians) -> Gaussians:
     return replace(model, opacity_logits=scaled.logit().to(model.opacity_logits))
 
 
-def _inverted(model: Gaussians) -> Gaussians:
-    """Opacities o become 1 - o."""
-    return replace(model, opacity_logits=-model.opacity_logits)
-
-
 def _faint(change: Callable[[Gaussians], Gaussians], model: Gaussians, *, and_all: bool = False) -> Variants:
     """Change the Gaussians below each threshold alone, and optionally the whole model."""
     for threshold in THRESHOLDS:
@@ -236,18 +231,17 @@ def _quaternion_length(model: Gaussians) -> Tensor:
     return length
 
 
-def _scale(model: Gaussians) -> Tensor:
-    """[N] natural logarithm of the geometric mean."""
-    return model.log_scales.mean(dim=1)
-
-
 def _sh_energy(model: Gaussians) -> Tensor:
     """[N] natural logarithm of the sum of squares of the harmonics above the constant one."""
     energy: Tensor = model.sh[:, 1:].square().sum((1, 2)).clamp_min(_MIN_LENGTH).log()
     return energy
 
 
-ATTRIBUTES = {"quaternion length": _quaternion_length, "scale": _scale, "SH energy": _sh_energy}
+ATTRIBUTES: dict[str, Callable[[Gaussians], Tensor]] = {
+    "quaternion length": _quaternion_length,
+    "scale": lambda model: model.log_scales.mean(dim=1),
+    "SH energy": _sh_energy,
+}
 
 
 def _outliers(attribute: str, model: Gaussians) -> Variants:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -45,26 +46,29 @@ class Change:
 
 def random_pruning(share: float, seed: int = 0) -> Change:
     """Remove a share of the Gaussians, in [0, 1), at random (KeySS, supplement: pruning)."""
-    _check_share(share)
 
-    def apply(model: Gaussians) -> Gaussians:
-        order = torch.randperm(len(model), generator=_generator("pruning", seed))
-        return model[order[_removed(share, model) :].sort().values.to(model.device)]
+    def order(model: Gaussians) -> Tensor:
+        return torch.randperm(len(model), generator=_generator("pruning", seed)).to(model.device)
 
-    sentence = f"A random {share:.0%} of the Gaussians are removed."
-    return Change("random pruning", share, "share removed", sentence, apply)
+    return _pruning("random pruning", share, f"A random {share:.0%} of the Gaussians are removed.", order)
 
 
 def opacity_pruning(share: float) -> Change:
     """Remove the share of the Gaussians, in [0, 1), whose opacity is lowest (KeySS, supplement: pruning)."""
-    _check_share(share)
+    sentence = f"The {share:.0%} of the Gaussians with the lowest opacity are removed."
+    return _pruning("pruning by opacity", share, sentence, lambda m: m.opacity_logits.argsort(stable=True))
+
+
+def _pruning(attack: str, share: float, sentence: str, order: Callable[[Gaussians], Tensor]) -> Change:
+    """Remove the first `share` of the Gaussians in an order; at least one stays."""
+    if not 0 <= share < 1:
+        raise UsageError(f"pruning: expected a share of 0 or more and less than 1, got {share}")
 
     def apply(model: Gaussians) -> Gaussians:
-        order = model.opacity_logits.argsort(stable=True)
-        return model[order[_removed(share, model) :].sort().values]
+        removed = min(round(share * len(model)), len(model) - 1)
+        return model[order(model)[removed:].sort().values]
 
-    sentence = f"The {share:.0%} of the Gaussians with the lowest opacity are removed."
-    return Change("pruning by opacity", share, "share removed", sentence, apply)
+    return Change(attack, share, "share removed", sentence, apply)
 
 
 def noise(attribute: str, strength: float, seed: int = 0) -> Change:
@@ -113,31 +117,28 @@ def cropping(seed: int = 0) -> Change:
 
 def fewer_harmonics(degree: int) -> Change:
     """Drop the spherical harmonics above a degree, 0 to 3."""
-
-    def apply(model: Gaussians) -> Gaussians:
-        return model.with_sh_degree(min(degree, model.sh_degree))
-
     sentence = f"Spherical harmonics above degree {degree} are dropped."
-    return Change("fewer harmonics", degree, "degree left", sentence, apply)
+    return Change(
+        "fewer harmonics",
+        degree,
+        "degree left",
+        sentence,
+        lambda m: m.with_sh_degree(min(degree, m.sh_degree)),
+    )
 
 
 def half_floats() -> Change:
     """Round every number to half precision (IEEE 754 binary16) and back."""
-
-    def apply(model: Gaussians) -> Gaussians:
-        return model.map(lambda values: values.half().float())
-
-    return Change("half floats", 16, "bits a number", "Every number is rounded to half precision.", apply)
+    sentence = "Every number is rounded to half precision."
+    return Change("half floats", 16, "bits a number", sentence, lambda m: m.map(lambda x: x.half().float()))
 
 
 def fine_tuning(cover: Scene, steps: int = 500, seed: int = 0) -> Change:
     """Continue training on the cover's photos, as plain 3DGS without density control."""
-
-    def apply(model: Gaussians) -> Gaussians:
-        return refined(model, cover, steps, seed)
-
     sentence = f"Training continues on the cover's photos for {steps} steps."
-    return Change("fine-tuning", steps, "steps", sentence, apply)
+    return Change(
+        "fine-tuning", steps, "steps", sentence, partial(refined, scene=cover, steps=steps, seed=seed)
+    )
 
 
 def purification(cover: Scene, given_up: float = 0.0, steps: int = 300, seed: int = 0) -> Change:
@@ -197,13 +198,3 @@ def _generator(use: str, seed: int) -> torch.Generator:
     """
     digest = hashlib.sha256(f"keyss/robustness/{use} {seed}".encode()).digest()
     return torch.Generator().manual_seed(int.from_bytes(digest[:8], "little") >> 1)
-
-
-def _check_share(share: float) -> None:
-    if not 0 <= share < 1:
-        raise UsageError(f"pruning: expected a share of 0 or more and less than 1, got {share}")
-
-
-def _removed(share: float, model: Gaussians) -> int:
-    """The number of Gaussians to remove: at least one stays."""
-    return min(round(share * len(model)), len(model) - 1)

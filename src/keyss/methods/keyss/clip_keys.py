@@ -7,13 +7,13 @@ embeddings. Revealing needs no CLIP: the encrypted payload contains the embeddin
 
 from __future__ import annotations
 
-from importlib import import_module
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
 from keyss.core.errors import BackendError, UsageError
+from keyss.core.extras import import_extra
 from keyss.keys.derivation import EMBEDDING_SIZE, unit_vector
 from keyss.keys.key_file import normalized_key
 
@@ -28,12 +28,7 @@ class ClipKeys:
     """
 
     def __init__(self, model: str | Path = MODEL) -> None:
-        try:
-            transformers = import_module("transformers")
-        except ImportError as error:
-            raise BackendError(
-                f"keys encoded by CLIP need the package transformers (pip install 'keyss[clip]'): {error}"
-            ) from error
+        transformers = import_extra("transformers", "clip", "encode keys with CLIP")
         try:
             self._tokenizer = transformers.CLIPTokenizer.from_pretrained(str(model), local_files_only=True)
             self._text = transformers.CLIPTextModel.from_pretrained(str(model), local_files_only=True).eval()
