@@ -17,9 +17,9 @@ from files.scene_files import write_blender, write_nerfstudio
 from keyss.channels import LOW_BITS
 from keyss.cli import commands, flags, main
 from keyss.core import KeyssError
-from keyss.fitting import SilentReporter
 from keyss.keys import DerivedKey
 from keyss.methods import registry
+from keyss.progress import Reporter
 
 KEY = "q7Rv2LxT9bWm4KzD"
 SPELLINGS = [
@@ -29,7 +29,7 @@ SPELLINGS = [
 ]
 
 
-class _CtrlC(SilentReporter):
+class _CtrlC(Reporter):
     """Presses it in the middle of hiding."""
 
     hiding = False

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from typing import Any
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, Task, TextColumn
@@ -12,73 +13,86 @@ from rich.table import Column
 level = 0  # -1: silent, 1: more often; set by the command line
 
 
+class Reporter:
+    """Displays the progress of trainings; this one displays nothing."""
+
+    loss_every = 0  # steps between two losses among the numbers; 0: none, since reading it slows a GPU down
+    several = False  # whether it can display several trainings at once, with ten updates a second of each
+
+    def start(self, title: str, iterations: int, iteration: int) -> None:
+        """A training begins; a resumed one has done `iteration` of its `iterations` steps."""
+
+    def update(self, iteration: int, gaussians: int, numbers: dict[str, float]) -> None:
+        """`iteration` steps are done; `gaussians` is 0 and `numbers` empty if unknown."""
+
+    def look(self, model: Callable[[], Any]) -> None:
+        """A step is done; `model` returns the present Gaussians, whose tensors later steps change."""
+
+    def note(self, line: str) -> None:
+        """Display a line before the training begins."""
+
+    def finish(self) -> None:
+        """The training has ended or was interrupted."""
+
+    def of_secret(self) -> Reporter:
+        """A reporter for the training of a secret."""
+        return self
+
+    def beside(self) -> Reporter:
+        """A reporter for one more training at the same time, if it can display `several`."""
+        return self
+
+
 def reporter(console: Console | None = None) -> ProgressLines:
     """A reporter for `console`, by default the standard error stream."""
     console = console or Console(stderr=True, quiet=level < 0)
     return ProgressLines(console, None if level < 1 or console.is_terminal else 1.0)
 
 
-class _Bars:
-    """The lines of all running trainings, in one block: a terminal displays one block at a time."""
-
-    def __init__(self) -> None:
-        self.progress: Progress | None = None
-        self.open = 0
-
-    def add(self, make: Callable[[], Progress]) -> Progress:
-        """The block for one more line; a new one if there is none."""
-        if self.progress is None:
-            self.progress = make()
-            self.progress.start()
-        self.open += 1
-        return self.progress
-
-    def close(self) -> None:
-        """End a line; the last one ends the block."""
-        self.open -= 1
-        if self.open == 0 and self.progress is not None:
-            self.progress.stop()
-            self.progress = None
-
-
-class ProgressLines:
-    """A `Reporter` on a task of rich, which estimates recent speed and remaining time.
+class ProgressLines(Reporter):
+    """A reporter on a task of rich, which estimates recent speed and remaining time.
 
     In a terminal, one line is redrawn every 0.25 seconds; elsewhere, for logs, a line is printed every 10
     seconds. `every` changes this. Lines are redrawn by `update`, not by a thread, which would take cores from
-    training.
+    training. A terminal displays one block at a time: that of `first` has the lines of all running trainings.
     """
 
-    loss_every = 0
+    several = True
 
     def __init__(
         self,
         console: Console,
         every: float | None = None,
         timer: Callable[[], float] = time.monotonic,
-        bars: _Bars | None = None,
+        first: ProgressLines | None = None,
     ) -> None:
         self.console = console
         self.live = console.is_terminal
         self.every = (0.25 if self.live else 10.0) if every is None else every
         self.timer = timer
-        self.bars = bars or _Bars()
+        self.first = first or self
+        self.block: Progress | None = None
+        self.open = 0  # lines of the block
         self.task: Task | None = None
 
     def beside(self) -> ProgressLines:
         """A reporter for another training at the same time: in a terminal, the line below."""
-        return ProgressLines(self.console, self.every, self.timer, self.bars)
+        return ProgressLines(self.console, self.every, self.timer, self.first)
 
     def start(self, title: str, iterations: int, iteration: int) -> None:
-        self.progress = self.bars.add(self._block)
+        if self.first.block is None:
+            self.first.block = self._new_block()
+            self.first.block.start()
+        self.first.open += 1
+        self.progress = self.first.block
         number = self.progress.add_task(title, total=iterations, completed=iteration, facts="starting")
         self.task = next(task for task in self.progress.tasks if task.id == number)
         self.displayed, self.numbers = self.timer(), ""
         if not self.live:
             where = f", continuing at {iteration}" if iteration else ""
-            self._say(f"{title}: {iterations} steps{where}")
+            self.note(f"{title}: {iterations} steps{where}")
 
-    def _block(self) -> Progress:
+    def _new_block(self) -> Progress:
         return Progress(
             TextColumn("{task.description}", markup=False),
             BarColumn(bar_width=12),
@@ -105,10 +119,7 @@ class ProgressLines:
         facts = _joined(f"{task.speed:.1f} it/s, {left} left" if task.speed else "starting", self.numbers)
         self.progress.update(task.id, facts=facts, refresh=True)
         if not self.live:
-            self._say(f"{task.description}: {iteration}/{task.total}, {facts}")
-
-    def note(self, line: str) -> None:
-        self._say(line)
+            self.note(f"{task.description}: {iteration}/{task.total}, {facts}")
 
     def finish(self) -> None:
         task, self.task = self.task, None
@@ -116,12 +127,15 @@ class ProgressLines:
             return
         duration = f"in {clock(task.elapsed or 0)}"
         self.progress.update(task.id, facts=_joined(duration, self.numbers), refresh=True)
-        self.bars.close()
+        self.first.open -= 1
+        if self.first.open == 0:
+            self.progress.stop()
+            self.first.block = None
         if not self.live:
             how = "done" if task.finished else f"stopped at {task.completed}"
-            self._say(_joined(f"{task.description}: {how} {duration}", self.numbers))
+            self.note(_joined(f"{task.description}: {how} {duration}", self.numbers))
 
-    def _say(self, line: str) -> None:
+    def note(self, line: str) -> None:
         self.console.print(line, markup=False, highlight=False, soft_wrap=True)
 
 

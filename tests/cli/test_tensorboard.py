@@ -11,7 +11,7 @@ import pytest
 from cli.said import SMALL, Run, assert_refused
 from keyss.cli import reporting
 from keyss.files import read_model
-from keyss.fitting.reporting import SeveralReporter
+from keyss.progress import Reporter
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of TensorBoard's own
@@ -38,8 +38,8 @@ def test_losses_come_back(keyss: Run, scene: Path) -> None:
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
 def test_two_trainings_at_the_same_time_have_a_run_each(tmp_path: Path) -> None:
     events = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
-    cover = reporting.tensorboard_reporter(tmp_path)
-    assert isinstance(cover, SeveralReporter)
+    cover = reporting.TensorBoardReporter(tmp_path, Reporter())
+    assert cover.several
     secret = cover.beside()
     for title, each in (("cover", cover), ("secret", secret)):
         each.start(title, 10, 0)

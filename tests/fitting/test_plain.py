@@ -12,13 +12,13 @@ from keyss.core import Gaussians, InputError, Interrupted, UsageError
 from keyss.fitting import (
     FitConfig,
     PlainRun,
-    SilentReporter,
     fit_scene,
     load_checkpoint,
     mean_psnr,
     save_checkpoint,
     steps_done,
 )
+from keyss.progress import Reporter
 from tiny_scenes import tiny_scene
 
 CONFIG = FitConfig(
@@ -31,7 +31,7 @@ def _same(a: Gaussians, b: Gaussians) -> bool:
     return all(torch.equal(getattr(a, name), getattr(b, name)) for name in names)
 
 
-class InterruptAt(SilentReporter):
+class InterruptAt(Reporter):
     """Presses Ctrl-C at one iteration, of the training whose title begins with `stage`."""
 
     def __init__(self, iteration: int, stage: str = "") -> None:

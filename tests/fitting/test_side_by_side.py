@@ -18,7 +18,8 @@ import torch
 
 from keyss import FitConfig, KeyssOptions, Secret, hide
 from keyss.core import Gaussians, InputError, Interrupted, KeyssWarning, OtherProcessError, same_bits
-from keyss.fitting import Fit, SilentReporter, fit_scenes, side_by_side, steps_done
+from keyss.fitting import Fit, fit_scenes, side_by_side, steps_done
+from keyss.progress import Reporter
 from other_processes import command_of, descendants, until
 from tiny_scenes import tiny_scene
 
@@ -30,8 +31,10 @@ ENDLESS = replace(CONFIG, iterations=10**6, evaluate_every=0)
 CPU = torch.device("cpu")
 
 
-class Recorder(SilentReporter):
+class Recorder(Reporter):
     """Records all calls, and acts once, when all trainings have begun and one has reached step `at`."""
+
+    several = True
 
     def __init__(self, at: int = -1, loss_every: int = 0, count: int = 2) -> None:
         self.at, self.loss_every, self.count = at, loss_every, count
@@ -304,7 +307,7 @@ def test_fits_run_one_after_the_other_if_the_reporter_displays_one(
 ) -> None:
     """As with `--live`, whose page displays one training."""
     monkeypatch.setattr(side_by_side, "_fit_in_processes", None)
-    models = fit_scenes([replace(fit, reporter=SilentReporter()) for fit in fits_of(None, CONFIG)])
+    models = fit_scenes([replace(fit, reporter=Reporter()) for fit in fits_of(None, CONFIG)])
     assert len(models) == 2
 
 

@@ -13,8 +13,9 @@ import torch
 
 from fitting.test_plain import InterruptAt
 from keyss.core import Gaussians, InputError, Interrupted, KeyssWarning, Scene, Similarity, same_bits
-from keyss.fitting import Reporter, mean_psnr
+from keyss.fitting import mean_psnr
 from keyss.methods import Context, MethodOptions, Opened, Source, registry, with_plain_models
+from keyss.progress import Reporter
 from tiny_scenes import random_gaussians, tiny_scene
 
 

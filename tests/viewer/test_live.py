@@ -19,8 +19,7 @@ from cli.said import PROGRAM as KEYSS, SMALL
 from files.scene_files import write_nerfstudio
 from keyss.core import Gaussians
 from keyss.files import model_of_bytes
-from keyss.fitting import Reporter, SilentReporter
-from keyss.fitting.reporting import ModelReporter, of_secret
+from keyss.progress import Reporter
 from keyss.viewer import LiveTraining
 from keyss.viewer.live import EVERY
 from test_progress import Timer
@@ -69,14 +68,13 @@ class Copies:
 
 def stepped(reporter: Reporter, iteration: int, model: Callable[[], Gaussians]) -> None:
     reporter.update(iteration, 5, {"PSNR": 20.0, "loss": 0.1})
-    assert isinstance(reporter, ModelReporter)
     reporter.look(model)
 
 
 def test_a_model_is_copied_only_while_somebody_watches_and_not_too_often(
     training: LiveTraining, clock: Timer
 ) -> None:
-    model, reporter = Copies(), training.reporter(SilentReporter())
+    model, reporter = Copies(), training.reporter(Reporter())
     reporter.start("fit garden", 100, 0)
     for step in range(1, 10):
         clock.now += 1
@@ -105,7 +103,7 @@ def test_a_model_is_copied_only_while_somebody_watches_and_not_too_often(
 
 
 def test_a_copy_stays_as_it_was(training: LiveTraining) -> None:
-    model, reporter = Copies(), training.reporter(SilentReporter())
+    model, reporter = Copies(), training.reporter(Reporter())
     reporter.start("fit", 1, 0)
     stepped(reporter, 1, model)
     expected = model.model.digest()
@@ -117,9 +115,8 @@ def test_a_copy_stays_as_it_was(training: LiveTraining) -> None:
 
 
 def test_a_secret_is_not_taken_for_what_is_published(training: LiveTraining) -> None:
-    reporter = training.reporter(SilentReporter())
-    hidden = of_secret(reporter)
-    assert hidden is not None
+    reporter = training.reporter(Reporter())
+    hidden = reporter.of_secret()
     model = Copies()
     hidden.start("plain model of the secret", 1, 0)
     stepped(hidden, 1, model)
@@ -137,7 +134,7 @@ def test_nobody_gets_anything_without_the_address(training: LiveTraining) -> Non
 
 
 def test_a_diverged_training_has_no_file(training: LiveTraining) -> None:
-    model, reporter = Copies(), training.reporter(SilentReporter())
+    model, reporter = Copies(), training.reporter(Reporter())
     model.model = replace(model.model, means=model.model.means * float("nan"))
     reporter.start("fit", 1, 0)
     stepped(reporter, 1, model)

@@ -16,7 +16,7 @@ from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Camera, Scene, ViewOptions, checked_background
 from keyss.files.atomic import check_not_an_input, check_output_file
 from keyss.files.video import check_video, write_video
-from keyss.fitting.reporting import Reporter, SilentReporter
+from keyss.progress import Reporter
 from keyss.rendering import Backend, render, resolve_device
 from keyss.rendering.arguments import MAX_SIDE
 from keyss.rendering.orbit import IMAGE_SIZE, around, circle
@@ -61,7 +61,7 @@ def write_film(
         color = scene.background
         paths = [[_even(camera) for camera in around([view.camera for view in scene.views], count)]]
         paths *= len(models)
-    reporter = reporter or SilentReporter()
+    reporter = reporter or Reporter()
     reporter.start(f"video {Path(out).name}", count, 0)
     try:
         write_video(out, _frames(models, paths, color.to(target), reporter), FPS)

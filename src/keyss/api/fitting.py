@@ -13,7 +13,7 @@ from keyss.fitting.config import FitConfig
 from keyss.fitting.image_metrics import quality
 from keyss.fitting.plain import FitResult, fit_scene
 from keyss.fitting.ranks import here
-from keyss.fitting.reporting import Reporter
+from keyss.progress import Reporter
 from keyss.rendering import Backend, resolve_device
 from keyss.runs.config import FitRunConfig
 from keyss.runs.files import CONFIG, METRICS, MODEL, writers

@@ -23,7 +23,6 @@ from keyss.core.scene import Scene, ViewOptions
 from keyss.files.models import is_model_path, read_model
 from keyss.fitting.image_metrics import quality
 from keyss.fitting.ranks import here
-from keyss.fitting.reporting import Reporter
 from keyss.keys import DerivedKey
 from keyss.keys.derivation import SALT_BYTES
 from keyss.measure.hiding import RenderFidelity, Shown, measure_hiding, show
@@ -32,6 +31,7 @@ from keyss.methods.handed import pack
 from keyss.methods.opened import Opened
 from keyss.methods.plain_models import Bound, fit_bounds, with_plain_models
 from keyss.methods.registry import DEFAULT, open_handed, open_model
+from keyss.progress import Reporter
 from keyss.rendering import Backend, resolve_device
 from keyss.rendering.orbit import is_model
 from keyss.runs.config import RunConfig, secret_ids

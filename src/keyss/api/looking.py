@@ -15,9 +15,9 @@ from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene, View, ViewOptions
 from keyss.files.images import png_bytes
-from keyss.fitting.reporting import Reporter
 from keyss.measure.hiding import WRONG_KEYS, measure_hiding
 from keyss.measure.images import renders_of
+from keyss.progress import Reporter
 from keyss.rendering import Backend, resolve_device
 from keyss.runs.files import METRICS, writers
 from keyss.runs.folder import RunFolder, write_again

@@ -15,7 +15,7 @@ from keyss.core.errors import InputError
 from keyss.files.atomic import write_bytes
 from keyss.files.images import png_bytes
 from keyss.files.reading import read_file
-from keyss.fitting.reporting import Reporter
+from keyss.progress import Reporter
 from keyss.runs.records import write_record
 
 T = TypeVar("T")

@@ -29,8 +29,8 @@ from keyss.audits.record import (
 from keyss.audits.subject import AuditSubject, subject_of
 from keyss.core import Interrupted, KeyssWarning, UsageError, import_extra, signal_of
 from keyss.files.atomic import write_bytes
-from keyss.fitting import Reporter, SilentReporter
 from keyss.methods import registry
+from keyss.progress import Reporter
 from keyss.rendering import Backend, resolve_device
 from keyss.runs.files import REPORT, writers
 from keyss.runs.folder import CHECKPOINTS, RunFolder, read_manifest, write_again
@@ -77,7 +77,7 @@ def audit(
         raise UsageError(f"no such part of an audit: {', '.join(unknown)}; there are {', '.join(PARTS)}")
     for module in EXTRA:
         import_extra(module, "audit", "audit a run")
-    started, reporter = time.monotonic(), reporter or SilentReporter()
+    started, reporter = time.monotonic(), reporter or Reporter()
     opened = open_run(run, keys)
     standard = registry.get(opened.config.method).capabilities.standard
     if impossible := sorted(set(only) & OF_3DGS_MODELS) if not standard else []:

@@ -16,8 +16,8 @@ from keyss.core.scene import Scene
 from keyss.files.models import read_model, write_model
 from keyss.fitting.config import FitConfig
 from keyss.fitting.plain import fit_scene
-from keyss.fitting.reporting import Reporter
 from keyss.measure.hiding import in_cover
+from keyss.progress import Reporter
 from keyss.runs.files import CONTROLS
 from keyss.runs.folder import RunFolder
 from keyss.runs.opening import HidingRun

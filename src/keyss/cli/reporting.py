@@ -6,15 +6,12 @@ import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from keyss.cli.arguments import Training
 from keyss.cli.ranks import answers
 from keyss.core.extras import import_extra
-
-if TYPE_CHECKING:
-    from keyss.fitting.reporting import Reporter
-    from keyss.progress import ProgressLines
+from keyss.progress import Reporter, reporter as lines
 
 FOLDER = "private/tensorboard"  # of a run, since its losses may tell about a secret
 
@@ -25,9 +22,9 @@ def reporting(out: Path, scene: Path, asked: Training) -> Iterator[Reporter]:
 
     Raises BackendError if TensorBoard is not installed, OutputError if the page cannot be served.
     """
-    from keyss import progress
-
-    reporter: Reporter = tensorboard_reporter(out) if asked.tensorboard else progress.reporter()
+    reporter: Reporter = lines()
+    if asked.tensorboard:
+        reporter = TensorBoardReporter(out, reporter)
     if not (asked.live and answers()):
         yield reporter
         return
@@ -39,31 +36,26 @@ def reporting(out: Path, scene: Path, asked: Training) -> Iterator[Reporter]:
         yield page.reporter(reporter)
 
 
-def tensorboard_reporter(out: Path) -> TensorBoardReporter:
-    """Progress lines and TensorBoard's event files. Raises BackendError if TensorBoard is not installed."""
-    from keyss import progress
-
-    writer = import_extra("torch.utils.tensorboard.writer", "tensorboard", "use --tensorboard").SummaryWriter
-    return TensorBoardReporter(progress.reporter(), out / FOLDER, writer)
-
-
-class TensorBoardReporter:
-    """Reports to `lines` and to event files in `folder`, where each training has a subfolder.
+class TensorBoardReporter(Reporter):
+    """Reports to `lines` and to event files in the run's folder `out`, where each training has a subfolder.
 
     Files are opened when a training starts, since the run's folder exists by then, and closed at its end.
+    Raises BackendError if TensorBoard is not installed.
     """
 
     loss_every = 10  # steps
+    several = True
 
-    def __init__(self, lines: ProgressLines, folder: Path, writer: Any) -> None:
-        self.lines, self.folder, self.writer = lines, folder, writer
+    def __init__(self, out: Path, lines: Reporter) -> None:
+        module = import_extra("torch.utils.tensorboard.writer", "tensorboard", "use --tensorboard")
+        self.out, self.lines, self.writer = out, lines, module.SummaryWriter
         self.open: Any = None
         self.last: dict[str, float] = {}
 
     def start(self, title: str, iterations: int, iteration: int) -> None:
         self.lines.start(title, iterations, iteration)
         name = re.sub(r"[^\w-]+", "_", title).strip("_")[:80]
-        self.open, self.last = self.writer(str(self.folder / name), purge_step=iteration or None), {}
+        self.open, self.last = self.writer(str(self.out / FOLDER / name), purge_step=iteration or None), {}
 
     def update(self, iteration: int, gaussians: int, numbers: dict[str, float]) -> None:
         measured = {name: value for name, value in numbers.items() if name != "loss"}
@@ -79,7 +71,7 @@ class TensorBoardReporter:
                 self.open.add_scalar(name, value, iteration)
 
     def beside(self) -> TensorBoardReporter:
-        return TensorBoardReporter(self.lines.beside(), self.folder, self.writer)
+        return TensorBoardReporter(self.out, self.lines.beside())
 
     def note(self, line: str) -> None:
         self.lines.note(line)

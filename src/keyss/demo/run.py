@@ -14,9 +14,10 @@ import keyss
 from keyss.core import Gaussians, Interrupted, Scene, WrongKeyError
 from keyss.files import load_scene
 from keyss.files.atomic import public_mode
-from keyss.fitting import FitConfig, Reporter, mean_psnr
+from keyss.fitting import FitConfig, mean_psnr
 from keyss.many.sheet import contact_sheet
 from keyss.methods import CarryOptions
+from keyss.progress import Reporter
 from keyss.rendering import Backend, resolve_device
 from keyss.runs.files import STEGO, plain_names, writers
 from keyss.runs.folder import RunFolder, clear

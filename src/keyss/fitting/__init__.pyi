@@ -41,6 +41,5 @@ from .plain import (
     fit_scene as fit_scene,
 )
 from .ranks import Ranks as Ranks, here as here, joined as joined
-from .reporting import Reporter as Reporter, SilentReporter as SilentReporter
 from .sampling import Shuffle as Shuffle, own_randomness as own_randomness
 from .side_by_side import Fit as Fit, fit_scenes as fit_scenes

@@ -19,8 +19,8 @@ from keyss.core.errors import InputError, Interrupted, KeyssWarning, OtherProces
 from keyss.fitting.checkpoint import State, load_checkpoint, pack_state, save_checkpoint, unpack_state
 from keyss.fitting.config import FitConfig
 from keyss.fitting.ranks import here
-from keyss.fitting.reporting import Modelled, ModelReporter, Reporter, SilentReporter
 from keyss.fitting.sampling import own_randomness
+from keyss.progress import Reporter
 
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
@@ -90,7 +90,7 @@ def train(
     ranks, evaluate_every = here(), config.evaluate_every
     if not ranks.first:
         checkpoint, reporter, evaluate_every = None, None, 0
-    reporter = reporter or SilentReporter()
+    reporter = reporter or Reporter()
     if _threads.spinning and torch.get_num_threads() > 1:
         warnings.warn(_SPINNING, KeyssWarning, stacklevel=2)
 
@@ -107,8 +107,7 @@ def train(
         saved = time.monotonic()
         numbers: dict[str, float] = {}
         before = None  # the state before a step that needs other processes
-        look = reporter.look if isinstance(reporter, ModelReporter) else None
-        model = run.gaussians if isinstance(run, Modelled) else None
+        model = getattr(run, "gaussians", None)  # runs without one have no model to display
         reporter.start(title, run.iterations, run.iteration)
         try:
             while run.iteration < run.iterations:
@@ -120,8 +119,8 @@ def train(
                 with_loss = reporter.loss_every and run.iteration % reporter.loss_every == 0
                 loss = {"loss": float(run.loss)} if with_loss else {}
                 reporter.update(run.iteration, len(run), numbers | loss)
-                if look and model:
-                    look(model)
+                if model is not None:
+                    reporter.look(model)
                 if signum := ranks.agree(interrupted() or 0, len(run)):
                     save(_state(run))
                     raise Interrupted(checkpoint, run.iteration, signal.Signals(signum))

@@ -26,8 +26,8 @@ from keyss.fitting.parameters import (
     to_parameters,
 )
 from keyss.fitting.ranks import here
-from keyss.fitting.reporting import Reporter
 from keyss.fitting.sampling import Shuffle
+from keyss.progress import Reporter
 from keyss.rendering import render_with_meta
 
 REFIT_SETTLE = 0.5  # share of a refit over which it settles

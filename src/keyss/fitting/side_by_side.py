@@ -30,7 +30,7 @@ from keyss.fitting.config import FitConfig
 from keyss.fitting.loop import ENDING, REMEDY, deferred
 from keyss.fitting.plain import fit_scene
 from keyss.fitting.ranks import here
-from keyss.fitting.reporting import Reporter, SeveralReporter, SilentReporter
+from keyss.progress import Reporter
 
 MIN_STEPS = 1000  # shorter trainings are not worth the two seconds that a process takes to start
 POLL = 0.1  # seconds between checks for signals, and between two progress reports of one process
@@ -60,7 +60,7 @@ def fit_scenes(
     process can be started. On Ctrl-C and on errors, running fits save their checkpoints. Raises
     OtherProcessError if a process is killed.
     """
-    followed = all(fit.reporter is None or isinstance(fit.reporter, SeveralReporter) for fit in fits)
+    followed = all(fit.reporter is None or fit.reporter.several for fit in fits)
     if followed and (size := at_once(fits, torch.device(device))) > 1:
         try:
             return _fit_in_processes(fits, size, resume)
@@ -169,8 +169,8 @@ class _Worker:
             except OSError as error:
                 self.connection.close()
                 raise _NoProcessError(error) from error
-        self.reporter = fit.reporter or SilentReporter()
-        if not first and isinstance(self.reporter, SeveralReporter):
+        self.reporter = fit.reporter or Reporter()
+        if not first:
             self.reporter = self.reporter.beside()
         self.reporter.start(fit.title, fit.config.iterations, steps_done(fit.checkpoint) if resume else 0)
 

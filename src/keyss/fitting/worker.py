@@ -18,11 +18,11 @@ from multiprocessing.connection import Connection
 from keyss._processes import end_with_parent
 from keyss.core.errors import Interrupted, signal_of
 from keyss.fitting import loop
-from keyss.fitting.reporting import SilentReporter
 from keyss.fitting.side_by_side import POLL, Fit, fitted
+from keyss.progress import Reporter
 
 
-class _Sender(SilentReporter):
+class _Sender(Reporter):
     """Sends progress, at most ten times a second unless numbers change."""
 
     def __init__(self, connection: Connection, loss_every: int) -> None:

@@ -13,7 +13,6 @@ from keyss.core.errors import UsageError
 from keyss.core.scene import ViewOptions
 from keyss.files.atomic import write_bytes
 from keyss.fitting.config import PRESETS, FitConfig
-from keyss.fitting.reporting import Reporter
 from keyss.many.comparison import ComparedMethod, Comparison, comparison_text
 from keyss.many.folder import CellFolder, Forecast
 from keyss.many.performing import keys_of
@@ -21,7 +20,7 @@ from keyss.many.running import Outcome
 from keyss.many.sheet import comparison_sheet
 from keyss.methods import registry
 from keyss.methods.base import MethodOptions
-from keyss.progress import reporter as default_reporter
+from keyss.progress import Reporter, reporter as default_reporter
 from keyss.rendering import Backend
 from keyss.rendering.orbit import is_model
 from keyss.runs.opening import HidingRun, open_run

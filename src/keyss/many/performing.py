@@ -18,7 +18,6 @@ from keyss.api.hiding import hide
 from keyss.audits import PARTS, audit
 from keyss.core.errors import InputError, UsageError
 from keyss.fitting.config import FitConfig
-from keyss.fitting.reporting import Reporter
 from keyss.keys.key_file import read_key_file
 from keyss.keys.master import MasterKey
 from keyss.many.cell import RUN, Cell, Result, failure_of, result_of
@@ -26,7 +25,7 @@ from keyss.many.measures import MEASURES, Subject
 from keyss.methods import registry
 from keyss.methods.base import MethodOptions, Plan, role_of
 from keyss.methods.plain_models import plain_stage
-from keyss.progress import reporter as default_reporter
+from keyss.progress import Reporter, reporter as default_reporter
 from keyss.rendering import Backend, resolve_device
 from keyss.runs.files import METRICS, MODEL, stego_in
 from keyss.runs.folder import Manifest, read_manifest

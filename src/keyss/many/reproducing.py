@@ -17,14 +17,13 @@ from keyss.core.errors import UsageError
 from keyss.core.nearest import did_you_mean
 from keyss.core.scene import ViewOptions
 from keyss.files.atomic import write_bytes
-from keyss.fitting.reporting import Reporter
 from keyss.many.cell import result_of
 from keyss.many.folder import CellFolder, Forecast
 from keyss.many.paper import PAPER, Group, Reproduction, Run, figure_rows, judged, reproduction_text
 from keyss.many.scenes import BENCHMARK, download as download_scenes, link
 from keyss.methods import registry
 from keyss.methods.base import MethodOptions
-from keyss.progress import reporter as default_reporter
+from keyss.progress import Reporter, reporter as default_reporter
 from keyss.rendering import Backend
 from keyss.rendering.orbit import is_model
 from keyss.runs.records import write_record

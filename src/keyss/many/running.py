@@ -17,7 +17,6 @@ from keyss import progress
 from keyss._processes import how_it_ended
 from keyss.core.errors import OutputError
 from keyss.files.atomic import lock, write_bytes
-from keyss.fitting.reporting import Reporter
 from keyss.keys.generation import generate_key
 from keyss.keys.key_file import read_key_file
 from keyss.keys.master import MasterKey
@@ -25,7 +24,7 @@ from keyss.many.cell import CELL, FAILED, LOG, Cell, Failure, Result, failure_of
 from keyss.many.cluster import Cluster
 from keyss.many.processes import Processes, Resources
 from keyss.many.worker import REFUSED, attempt
-from keyss.progress import clock
+from keyss.progress import Reporter, clock
 from keyss.runs.folder import check_not_published
 from keyss.runs.records import record_bytes
 

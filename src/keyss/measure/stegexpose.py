@@ -19,9 +19,9 @@ from PIL import Image
 
 from keyss.core.errors import InputError, UsageError
 from keyss.files.images import open_image
-from keyss.fitting.reporting import Reporter, SilentReporter
 from keyss.measure.auc import Auc, auc_between
 from keyss.measure.lsb_detectors import chi_square, primary_sets, rs, sample_pairs
+from keyss.progress import Reporter
 
 THRESHOLD = 0.2  # the original's
 # In the order of the original's table.
@@ -159,7 +159,7 @@ def steganalyze(
     paths = _files(folder)
     rows: list[Row] = []
     skipped: list[str] = []
-    reporter = reporter or SilentReporter()
+    reporter = reporter or Reporter()
     reporter.start(f"steganalyze {folder}", len(paths), 0)
     try:
         for done, path in enumerate(paths, start=1):

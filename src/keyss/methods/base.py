@@ -19,8 +19,8 @@ from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
 from keyss.fitting.config import PRESETS, FitConfig
-from keyss.fitting.reporting import Reporter
 from keyss.methods.opened import Opened
+from keyss.progress import Reporter
 
 
 @dataclass(frozen=True)

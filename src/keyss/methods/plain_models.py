@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
 from keyss.fitting.config import FitConfig
-from keyss.fitting.reporting import of_secret
 from keyss.fitting.side_by_side import Fit, fit_scenes
 from keyss.methods.base import Context, Source, Training, role_of
 
@@ -83,7 +82,7 @@ def _fit_all(
                 context.checkpoints / f"{kind.split()[0]}-{index}.safetensors"
                 if context.checkpoints
                 else None,
-                context.reporter if index == 0 else of_secret(context.reporter),
+                context.reporter if index == 0 else context.reporter and context.reporter.of_secret(),
             )
             for index, (scene, config) in fits.items()
         ],

@@ -20,7 +20,7 @@ from typing import Any, BinaryIO, Literal, Self
 from keyss.core.errors import KeyssError
 from keyss.core.gaussians import Gaussians
 from keyss.files.models import model_bytes
-from keyss.fitting.reporting import Reporter
+from keyss.progress import Reporter
 from keyss.viewer.page import served_page
 from keyss.viewer.serving import PageServer
 
@@ -129,16 +129,13 @@ class LiveTraining:
         return opened
 
 
-class LiveReporter:
+class LiveReporter(Reporter):
     """Passes everything on to `reporter`, and shows progress and model on the page."""
 
     def __init__(self, training: LiveTraining, reporter: Reporter, side: Side) -> None:
         self._training, self._reporter, self._side = training, reporter, side
         self._title, self._iterations = "", 0
-
-    @property
-    def loss_every(self) -> int:
-        return self._reporter.loss_every
+        self.loss_every = reporter.loss_every
 
     def start(self, title: str, iterations: int, iteration: int) -> None:
         self._reporter.start(title, iterations, iteration)

@@ -9,7 +9,6 @@ from keyss.core.scene import Scene
 from keyss.fitting.config import FitConfig
 from keyss.fitting.image_metrics import subsample_views
 from keyss.fitting.plain import fit_scene
-from keyss.fitting.reporting import of_secret
 from keyss.methods.base import Context
 from keyss.rendering import contributions
 
@@ -44,7 +43,7 @@ def refitted(
         if context.checkpoints
         else None,
         resume=context.resume,
-        reporter=of_secret(context.reporter),
+        reporter=context.reporter and context.reporter.of_secret(),
     ).gaussians
 
 
