@@ -66,6 +66,7 @@ from keyss.methods import (  # noqa: E402  # noqa: E402
     RowSecret,
     choose_anchors,
 )
+from keyss.methods.keyss.rows import visibility  # noqa: E402
 from keyss.methods.records import whole  # noqa: E402
 from keyss.methods.records.embedding import METHOD  # noqa: E402
 from keyss.methods.records.opening import unpack  # noqa: E402
@@ -120,8 +121,13 @@ def revealed(name: str, key: str) -> dict[str, Any]:
         return found | {"payload": hashlib.sha256(content.data).hexdigest()}
     secret = unpack(content)
     model = secret.reveal(stego)
-    found |= {"count": len(model), "hidden": secret.count, "sha256": digests(model)}
-    if len(model) < secret.count:  # by single precision, in which processors differ in the last bit
+    return found | shown(model, secret.count, len(model) < secret.count)
+
+
+def shown(model: Gaussians, hidden: int, compensated: bool) -> dict[str, Any]:
+    """SHA-256 of float32 columns; opacities that make up for lost Gaussians as numbers."""
+    found: dict[str, Any] = {"count": len(model), "hidden": hidden, "sha256": digests(model)}
+    if compensated:  # by single precision, in which processors differ in the last bit
         del found["sha256"]["opacity_logits"]
         found["opacity_logits"] = [round(each, 6) for each in model.opacity_logits.tolist()]
     return found
@@ -282,14 +288,30 @@ def write_keyss() -> None:
 
 
 def write_carriers() -> None:
-    """Rows of a secret of the design `carriers`, some without blue harmonics, and what they reveal."""
+    """Rows of secrets of the design `carriers`, some without blue harmonics, and what they reveal.
+
+    The second file has two secrets in frames of their own; some rows of the first of them were lost.
+    """
     stego, (secret,), _ = written(count=50, rows=60)
     write_model(FOLDER / "carriers.ply", stego)
-    payload = secret.payload().data
-    model = RowSecret.of(Payload("keyss", payload)).reveal(stego)
-    rows = {each.name: getattr(model[::9], each.name).flatten().tolist() for each in fields(Gaussians)}
-    found = {"payload": payload.hex(), "count": len(model), "rows": rows}
+    payloads = [("carriers.ply", secret.payload().data)]
+    stego, secrets, models = written(secrets=2, count=50, rows=60)
+    write_model(FOLDER / "carriers-two.ply", stego)
+    for lost, own, model in zip((1.5, 0.5), secrets, models, strict=True):
+        moved = replace(own, frame=some_frame(), visibility=lost * visibility(model))
+        payloads.append(("carriers-two.ply", moved.payload().data))
+    found = [
+        {"file": name, "payload": payload.hex()} | carried(payload, read_model(FOLDER / name))
+        for name, payload in payloads
+    ]
     (FOLDER / "carriers.json").write_text(json.dumps(found, indent=1) + "\n")
+
+
+def carried(payload: bytes, stego: Gaussians) -> dict[str, Any]:
+    """What the rows of a payload reveal: SHA-256 of float32 columns."""
+    secret = RowSecret.of(Payload("keyss", payload))
+    model = secret.reveal(stego)
+    return shown(model, secret.count, visibility(secret.decode(stego, secret.embedding)) < secret.visibility)
 
 
 def decoder_of(shape: DecoderShape, stego: Gaussians) -> HiddenSecret:
@@ -299,9 +321,13 @@ def decoder_of(shape: DecoderShape, stego: Gaussians) -> HiddenSecret:
     decoder.prepare(stego.with_sh_degree(shape.sh_degree), random_embeddings(1, generator)[0])
     for weights in decoder.network.parameters():
         torch.nn.init.normal_(weights, std=0.3, generator=generator)
+    return HiddenSecret(decoder.requires_grad_(False), some_frame(), choose_anchors(stego, generator), 600)
+
+
+def some_frame() -> Similarity:
+    """Moved, turned and scaled."""
     turn = torch.from_numpy(Rotation.from_rotvec([0.4, -1.1, 2.0]).as_matrix())
-    frame = Similarity(0.8, turn, torch.tensor([1.0, -2.0, 0.5], dtype=torch.float64))
-    return HiddenSecret(decoder.requires_grad_(False), frame, choose_anchors(stego, generator), 600)
+    return Similarity(0.8, turn, torch.tensor([1.0, -2.0, 0.5], dtype=torch.float64))
 
 
 def decoded(payload: bytes, stego: Gaussians) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 import { createHash } from 'node:crypto';
 import { readFileSync } from 'node:fs';
 import { WebPCodec } from '@playcanvas/splat-transform';
+import { expect } from 'vitest';
 import type { Gaussians } from '../src/core/gaussians.ts';
 import { readModel, type ReadModel } from '../src/files/models.ts';
 import { readSog } from '../src/files/sog.ts';
@@ -31,6 +32,26 @@ export function digest(values: Float32Array | Uint8Array): string {
 export function columns({ means, quats, logScales, opacityLogits, sh }: Gaussians): Record<string, string> {
   const found = { means, quats, log_scales: logScales, opacity_logits: opacityLogits, sh };
   return Object.fromEntries(Object.entries(found).map(([name, values]) => [name, digest(values)]));
+}
+
+/** What Python reveals: SHA-256 of columns, or numbers of opacities that make up for lost Gaussians. */
+export interface Shown {
+  readonly count?: number;
+  readonly hidden?: number;
+  readonly opacity_logits?: number[]; // by single precision, in which processors differ
+  readonly sha256?: Record<string, string>;
+}
+
+export function expectRevealed(secret: { gaussians: Gaussians; hidden: number }, expected: Shown): void {
+  expect([secret.gaussians.count, secret.hidden]).toEqual([expected.count, expected.hidden]);
+  const found = columns(secret.gaussians);
+  if (expected.opacity_logits) {
+    delete found.opacity_logits;
+    secret.gaussians.opacityLogits.forEach((value, row) => {
+      expect(value).toBeCloseTo(expected.opacity_logits![row], 4);
+    });
+  }
+  expect(found).toEqual(expected.sha256);
 }
 
 export function hex(text: string): Uint8Array {

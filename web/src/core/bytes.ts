@@ -34,6 +34,15 @@ export function halfFloat(bits: number): number {
   return sign * (exponent ? 2 ** (exponent - 15) * (1 + fraction / 1024) : (2 ** -14 * fraction) / 1024);
 }
 
+/** Rows of a table with `width` numbers in each, in this order. */
+export function rowsOf<T extends Uint8Array | Int16Array | Float32Array | Float64Array>(
+  table: T, rows: ArrayLike<number>, width: number,
+): T {
+  const found = new (table.constructor as new (size: number) => T)(rows.length * width);
+  for (let to = 0; to < rows.length; to++) found.set(table.subarray(rows[to] * width, (rows[to] + 1) * width), to * width);
+  return found;
+}
+
 /** 0 of no values. */
 export function median(values: Float64Array): number {
   if (!values.length) return 0;

@@ -1,3 +1,5 @@
+import { rowsOf } from './bytes.ts';
+
 /** N Gaussians in the raw parameterisation of the 3DGS .ply, all float32. */
 export interface Gaussians {
   readonly count: number;
@@ -50,13 +52,15 @@ export function withDegree(gaussians: Gaussians, shDegree: number): Gaussians {
 export function selected(gaussians: Gaussians, rows: ArrayLike<number>): Gaussians {
   const found = emptyGaussians(rows.length, gaussians.shDegree);
   for (const column of COLUMNS) {
-    const width = gaussians[column].length / Math.max(1, gaussians.count);
-    for (let to = 0; to < rows.length; to++) {
-      const from = rows[to] * width;
-      found[column].set(gaussians[column].subarray(from, from + width), to * width);
-    }
+    found[column].set(rowsOf(gaussians[column], rows, gaussians[column].length / Math.max(1, gaussians.count)));
   }
   return found;
+}
+
+/** Those of which `keep` is true, in their order. */
+export function where(gaussians: Gaussians, keep: (row: number) => boolean): Gaussians {
+  const rows = [...Array(gaussians.count).keys()].filter(keep);
+  return rows.length === gaussians.count ? gaussians : selected(gaussians, rows);
 }
 
 export function opacity(logit: number): number {
@@ -70,7 +74,6 @@ export function mostVisible(gaussians: Gaussians, count: number): Gaussians {
     return opacity(gaussians.opacityLogits[row]) * Math.exp(a + b + c - Math.min(a, b, c));
   });
   const least = Float32Array.from(visibility).sort()[Math.max(0, gaussians.count - count)];
-  const rows: number[] = [];
-  for (let row = 0; row < gaussians.count && rows.length < count; row++) if (visibility[row] >= least) rows.push(row);
-  return selected(gaussians, rows);
+  let left = count;
+  return where(gaussians, (row) => visibility[row] >= least && left-- > 0);
 }

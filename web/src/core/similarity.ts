@@ -17,10 +17,8 @@ export function inverse({ scale, rotation: r, translation: t }: Similarity): Sim
 export function isSimilarity({ scale, rotation: r, translation }: Similarity): boolean {
   const rows = [0, 3, 6].map((at) => r.slice(at, at + 3));
   const off = rows.flatMap((a, i) => rows.map((b, j) => Math.abs(dot(a, b) - Number(i === j))));
-  const turn = dot(rows[0], [
-    r[4] * r[8] - r[5] * r[7], r[5] * r[6] - r[3] * r[8], r[3] * r[7] - r[4] * r[6],
-  ]);
-  return [scale, ...r, ...translation].every(Number.isFinite) && scale > 0 && Math.max(...off) <= 1e-6 && turn > 0;
+  const turns = dot(rows[0], cross(rows[1], rows[2])) > 0;
+  return [scale, ...r, ...translation].every(Number.isFinite) && scale > 0 && Math.max(...off) <= 1e-6 && turns;
 }
 
 /** Where it takes a point [3]. */
@@ -60,8 +58,12 @@ function times(m: readonly number[], v: ArrayLike<number>): number[] {
   return [0, 3, 6].map((at) => m[at] * v[0] + m[at + 1] * v[1] + m[at + 2] * v[2]);
 }
 
-function dot(a: readonly number[], b: readonly number[]): number {
+export function dot(a: readonly number[], b: readonly number[]): number {
   return a.reduce((sum, each, at) => sum + each * b[at], 0);
+}
+
+export function cross(a: readonly number[], b: readonly number[]): [number, number, number] {
+  return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
 }
 
 /** [9] by rows, of a quaternion wxyz of length 1. */

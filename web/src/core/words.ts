@@ -55,7 +55,7 @@ export function namesakes(words: Words): Uint32Array {
 }
 
 /** Replaces the word at `at` by its hash, the finaliser of splitmix64 (Steele et al. 2014), which anybody can compute. */
-export function mixAt(words: Words, at: number): void {
+function mixAt(words: Words, at: number): void {
   let low = words[2 * at] + 0x7f4a7c15;
   let high = (words[2 * at + 1] + 0x9e3779b9 + (low > 0xffffffff ? 1 : 0)) >>> 0;
   low >>>= 0;
@@ -69,6 +69,16 @@ export function mixAt(words: Words, at: number): void {
   }
   words[2 * at] = low ^ ((low >>> 31) | (high << 1));
   words[2 * at + 1] = high ^ (high >>> 31);
+}
+
+const SCRATCH = new Uint32Array(2);
+
+/** The same of one word; the next call replaces what it gives. */
+export function mix(low: number, high = 0): Words {
+  SCRATCH[0] = low;
+  SCRATCH[1] = high;
+  mixAt(SCRATCH, 0);
+  return SCRATCH;
 }
 
 /** The same for all of them, which are replaced; returns them. */

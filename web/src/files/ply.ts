@@ -5,10 +5,15 @@ import { coefficients, COLUMNS, emptyGaussians, type Gaussians } from '../core/g
 
 const MAX_HEADER_BYTES = 65536;
 const OPACITY_LOGIT_BOUND = 16; // in the place of infinities
-const SIZES: Record<string, number> = {
-  char: 1, int8: 1, uchar: 1, uint8: 1, short: 2, int16: 2, ushort: 2, uint16: 2,
-  int: 4, int32: 4, uint: 4, uint32: 4, float: 4, float32: 4, double: 8, float64: 8,
-};
+
+/** Of a type by either of its names the bytes that it takes, and what reads it. */
+const TYPES = new Map(([
+  ['char', 'int8', 1, 'Int8'], ['uchar', 'uint8', 1, 'Uint8'], ['short', 'int16', 2, 'Int16'], ['ushort', 'uint16', 2, 'Uint16'],
+  ['int', 'int32', 4, 'Int32'], ['uint', 'uint32', 4, 'Uint32'], ['float', 'float32', 4, 'Float32'],
+  ['double', 'float64', 8, 'Float64'],
+] as const).flatMap(([old, name, size, type]) => {
+  return [old, name].map((each: string) => [each, { size, read: `get${type}` }] as const);
+}));
 
 interface Property {
   readonly name: string;
@@ -42,9 +47,9 @@ export function plyHeader(bytes: Uint8Array): PlyHeader {
     if (words[0] === 'format' && !format) format = words[1];
     else if (words[0] === 'element' && /^[0-9]{1,15}$/.test(words[2] ?? '')) {
       elements.push({ name: words[1], count: Number(words[2]), properties: [], stride: 0 });
-    } else if (words[0] === 'property' && words.length === 3 && last && words[1] in SIZES) {
+    } else if (words[0] === 'property' && words.length === 3 && last && TYPES.has(words[1])) {
       last.properties.push({ name: words[2], type: words[1], offset: last.stride });
-      last.stride += SIZES[words[1]];
+      last.stride += TYPES.get(words[1])!.size;
     } else if (!['', 'comment', 'obj_info'].includes(words[0])) throw notWhole();
   }
   if (!['binary_little_endian', 'binary_big_endian'].includes(format)) {
@@ -64,25 +69,12 @@ export function plyHeader(bytes: Uint8Array): PlyHeader {
 export function column(bytes: Uint8Array, header: PlyHeader, element: Element, name: string): Float64Array | null {
   const property = element.properties.find((each) => each.name === name);
   if (property === undefined) return null;
-  const read = reader(viewOf(bytes), property.type, header.littleEndian);
+  const [view, { read }] = [viewOf(bytes), TYPES.get(property.type)!];
   const values = new Float64Array(element.count);
   for (let row = 0; row < element.count; row++) {
-    values[row] = read(element.start + row * element.stride + property.offset);
+    values[row] = view[read](element.start + row * element.stride + property.offset, header.littleEndian);
   }
   return values;
-}
-
-function reader(view: DataView, type: string, little: boolean): (at: number) => number {
-  switch (type) {
-    case 'char': case 'int8': return (at) => view.getInt8(at);
-    case 'uchar': case 'uint8': return (at) => view.getUint8(at);
-    case 'short': case 'int16': return (at) => view.getInt16(at, little);
-    case 'ushort': case 'uint16': return (at) => view.getUint16(at, little);
-    case 'int': case 'int32': return (at) => view.getInt32(at, little);
-    case 'uint': case 'uint32': return (at) => view.getUint32(at, little);
-    case 'float': case 'float32': return (at) => view.getFloat32(at, little);
-    default: return (at) => view.getFloat64(at, little);
-  }
 }
 
 /** A model. Raises InputError for anything that is not a whole, finite 3DGS model. */

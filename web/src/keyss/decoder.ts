@@ -59,9 +59,10 @@ export class Decoder {
         numbers('key', KEY_NUMBERS).values);
       added.forEach((value, at) => (first.bias[at] += (shape.normalised ? 1 : KEY_GAIN) * value));
     }
+    const widths = { op: 1, ro: 4, sc: 3, xyz: 3, sh: 3 * coefficients(shape.shDegree) };
     const branches = shape.mask.map((name) => [name, [
       layer(`branches.${name}.0`, shape.branch, narrow),
-      layer(`branches.${name}.2`, channels(name, shape.shDegree), shape.branch),
+      layer(`branches.${name}.2`, widths[name], shape.branch),
     ]] as const);
     const constants = {
       center: numbers('network.center', 3).values, extent: numbers('network.extent').values,
@@ -142,10 +143,6 @@ function shapeOf(described: Record<string, unknown>): Shape {
 /** Numbers of a Gaussian. */
 function attributesOf(shDegree: number): number {
   return 11 + 3 * coefficients(shDegree);
-}
-
-function channels(name: Attribute, shDegree: number): number {
-  return { op: 1, ro: 4, sc: 3, xyz: 3, sh: 3 * coefficients(shDegree) }[name];
 }
 
 /** Position, opacity, rotation, scales, harmonics. */

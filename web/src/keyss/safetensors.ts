@@ -12,9 +12,9 @@ export interface Tensors {
   readonly tensors: ReadonlyMap<string, Tensor>;
 }
 
-const SIZES: Record<string, number> = { F16: 2, F32: 4 };
+const SIZES: Record<string, number> = { U8: 1, F16: 2, F32: 4 };
 
-/** Tensors of half or single precision. Raises InputError for anything else, and for numbers that are not finite. */
+/** Tensors of bytes, half or single precision. Raises InputError for anything else, and for numbers that are not finite. */
 export function readTensors(data: Uint8Array): Tensors {
   if (data.length < 8) throw damaged();
   const size = Number(viewOf(data).getBigUint64(0, true));
@@ -55,10 +55,8 @@ function tensorOf(described: Record<string, unknown>, data: Uint8Array): Tensor 
   const fits = width && Number.isInteger(start) && start >= 0 && end <= data.length && end - start === width * count;
   if (!fits || !shape.every((each) => Number.isInteger(each) && each >= 0)) throw damaged();
   const view = viewOf(data.subarray(start, end));
-  const values = new Float32Array(count);
-  for (let at = 0; at < count; at++) {
-    values[at] = width === 2 ? halfFloat(view.getUint16(2 * at, true)) : view.getFloat32(4 * at, true);
-  }
+  const read = (at: number): number => (width === 4 ? view.getFloat32(4 * at, true) : halfFloat(view.getUint16(2 * at, true)));
+  const values = width === 1 ? Float32Array.from(data.subarray(start, end)) : new Float32Array(count).map((_, at) => read(at));
   if (!values.every(Number.isFinite)) throw damaged();
   return { shape, values };
 }

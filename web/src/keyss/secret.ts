@@ -1,13 +1,15 @@
-/** A secret of the method keyss, whose key opens a decoder; `keyss.methods.keyss.secret` in Python. */
-import { damaged, InputError, otherVersion } from '../core/errors.ts';
-import { type Gaussians, opacity, selected } from '../core/gaussians.ts';
+/** A secret of the method keyss, of either version; `keyss.methods.keyss.secret` in Python. */
+import { changed, damaged, otherVersion } from '../core/errors.ts';
+import { type Gaussians, opacity, where } from '../core/gaussians.ts';
 import { inverse, isSimilarity, moved, type Similarity } from '../core/similarity.ts';
 import { ascii } from '../core/bytes.ts';
 import { compensated } from '../records/compensation.ts';
 import { Decoder } from './decoder.ts';
+import { decodeRows } from './rows.ts';
 import { numbersOf, objectOf, parsed, readTensors } from './safetensors.ts';
 
-const [FORMAT, VERSION] = ['keyss-secret', 8];
+const FORMAT = 'keyss-secret';
+const [NETWORK, ROWS] = [8, 9]; // versions: by a decoder, or row by row
 const [MAX_ANCHORS, ANCHORS_NEEDED, ANCHOR_TOLERANCE] = [64, 0.25, 1e-6];
 const MAX_COUNT = 2 ** 31;
 const DRAWN_OPACITY = Math.fround(1 / 255);
@@ -19,16 +21,20 @@ export function decodeKeyss(payload: Uint8Array, stego: Gaussians): { gaussians:
   const read = readTensors(payload);
   const header = objectOf(parsed(ascii(String(read.metadata.keyss))));
   if (header.format !== FORMAT) throw damaged();
-  if (header.version !== VERSION) throw otherVersion();
+  if (header.version !== NETWORK && header.version !== ROWS) throw otherVersion();
   const count = header.count as number;
   if (!Number.isInteger(count) || count < 0 || count > MAX_COUNT) throw damaged();
   const frame = frameOf(objectOf(header.frame));
-  checkAnchors(read.tensors.get('anchors'), stego);
-  const own = rowsWhere(stego, (row) => stego.opacityLogits[row] !== APPENDED_LOGIT);
-  const decoded = Decoder.of(header.shape, read).decode(own);
-  const drawn = rowsWhere(decoded, (row) => Math.fround(opacity(decoded.opacityLogits[row])) >= DRAWN_OPACITY);
-  const left = drawn.count ? compensated(drawn, count) : decoded;
+  const own = where(stego, (row) => stego.opacityLogits[row] !== APPENDED_LOGIT);
+  if (header.version === NETWORK) checkAnchors(read.tensors.get('anchors'), stego);
+  const left = header.version === ROWS ? decodeRows(header, read, own) : drawn(Decoder.of(header.shape, read).decode(own), count);
   return { gaussians: moved(inverse(frame), left), hidden: count };
+}
+
+/** Without what is never drawn, unless that is all, making up for what was lost of `count` Gaussians. */
+function drawn(decoded: Gaussians, count: number): Gaussians {
+  const found = where(decoded, (row) => Math.fround(opacity(decoded.opacityLogits[row])) >= DRAWN_OPACITY);
+  return found.count ? compensated(found, count) : decoded;
 }
 
 function frameOf(described: Record<string, unknown>): Similarity {
@@ -62,10 +68,5 @@ function checkAnchors(anchors: { shape: readonly number[]; values: Float32Array 
       }
     }
   }
-  if (found < ANCHORS_NEEDED * count) throw new InputError('The model was moved or rounded since its secret was trained.');
-}
-
-function rowsWhere(model: Gaussians, keep: (row: number) => boolean): Gaussians {
-  const rows = Array.from({ length: model.count }, (_, row) => row).filter(keep);
-  return rows.length === model.count ? model : selected(model, rows);
+  if (found < ANCHORS_NEEDED * count) throw changed();
 }

@@ -51,7 +51,7 @@ export class Controls {
     if (before === undefined) return;
     const [dx, dy] = [event.clientX - before.x, event.clientY - before.y];
     if (this.pointers.size === 2) this.pinched(event, dx, dy, height);
-    else if (event.shiftKey || event.buttons & 6) this.slide(-dx / height, -dy / height);
+    else if (event.shiftKey || event.buttons & 6) this.fly(-dx / height, -dy / height, 0);
     else if (this.flying) this.look(-dx * TURN, -dy * TURN);
     else this.orbit(dx * TURN, dy * TURN);
     this.pointers.set(event.pointerId, { x: event.clientX, y: event.clientY });
@@ -62,7 +62,7 @@ export class Controls {
     const own = this.pointers.get(event.pointerId)!;
     const span = (x: number, y: number): number => Math.max(1, Math.hypot(x - other.x, y - other.y));
     this.zoom(span(own.x, own.y) / span(event.clientX, event.clientY));
-    this.slide(-dx / (2 * height), -dy / (2 * height));
+    this.fly(-dx / (2 * height), -dy / (2 * height), 0);
   }
 
   private pressed(event: KeyboardEvent): void {
@@ -110,10 +110,6 @@ export class Controls {
     const bounded = Math.min(Math.max(distance * factor, NEAREST), FURTHEST);
     if (this.flying) this.fly(0, 0, 1 - factor);
     else this.setPose({ ...this.pose, eye: add(target, offset, bounded / distance) });
-  }
-
-  private slide(right: number, down: number): void {
-    this.fly(right, down, 0);
   }
 
   /** By shares of the distance of what the camera looks at. */

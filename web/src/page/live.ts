@@ -30,12 +30,12 @@ export async function watch(address: string, audience: Audience): Promise<void> 
   let state: State | null = null;
   for (let failures = 0; failures < PATIENCE; ) {
     try {
-      state = JSON.parse(new TextDecoder().decode(await fetched(at(address)))) as State;
+      state = JSON.parse(new TextDecoder().decode(await fetched(address))) as State;
       failures = 0;
       audience.tell(textOf(state));
       for (const side of SIDES) {
         if (state.versions[side] <= shown[side]) continue;
-        const ply = await fetched(at(`${address}/${side}.ply`));
+        const ply = await fetched(`${address}/${side}.ply`);
         await audience.trained(side, ply, titles[side] !== state.title);
         shown[side] = state.versions[side];
         titles[side] = state.title;
@@ -46,10 +46,6 @@ export async function watch(address: string, audience: Audience): Promise<void> 
     await new Promise((resolve) => setTimeout(resolve, AGAIN));
   }
   audience.tell(`${state ? `${textOf(state)} ` : ''}The training has ended.`);
-}
-
-function at(address: string): URL {
-  return new URL(address, document.baseURI);
 }
 
 function textOf({ title, iteration, iterations, gaussians, numbers }: State): string {

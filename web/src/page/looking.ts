@@ -1,5 +1,5 @@
 /** What anybody sees without a key: the published model, filtered and coloured by its numbers, as the panel says. */
-import { emptyGaussians, type Gaussians, opacity, selected } from '../core/gaussians.ts';
+import { emptyGaussians, type Gaussians, opacity, where } from '../core/gaussians.ts';
 import { page } from './elements.ts';
 import { count } from './panel.ts';
 
@@ -29,8 +29,7 @@ export function listenToLooks(changed: () => void): void {
 export function looked(model: Gaussians): Gaussians {
   const [threshold, below] = [Number(page.threshold.value), page.faint.checked];
   const opacities = model.opacityLogits.map(opacity);
-  const rows = [...opacities.keys()].filter((row) => opacities[row] < threshold === below);
-  let found = rows.length < model.count ? selected(model, rows) : model;
+  let found = where(model, (row) => opacities[row] < threshold === below);
   if (page.colouring.value !== COLOURINGS[0]) found = coloured(found, page.colouring.value);
   if (page.opaque.checked) found = { ...found, opacityLogits: found.opacityLogits.map(() => OPAQUE_LOGIT) };
   const faint = opacities.filter((each) => each < MIN_DRAWN).length;

@@ -115,7 +115,7 @@ class Page {
   }
 
   private async trained(side: TrainedSide, ply: Uint8Array, anew: boolean): Promise<void> {
-    const { model } = await this.opener.look(ply, `${side}.ply`);
+    const { model } = await this.opener.load(ply, `${side}.ply`, true);
     if (model === undefined) return;
     if (side === 'published') {
       this.published = model;

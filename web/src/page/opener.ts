@@ -22,14 +22,9 @@ export class Opener {
     };
   }
 
-  /** The model in a file; keys are tried on it from now on. */
-  load(bytes: Uint8Array, name: string): Promise<Answer> {
-    return this.ask({ id: this.next++, bytes, name }, [bytes.buffer as ArrayBuffer]);
-  }
-
-  /** The model in a file that nobody has a key for. */
-  look(bytes: Uint8Array, name: string): Promise<Answer> {
-    return this.ask({ id: this.next++, bytes, name, keyless: true }, [bytes.buffer as ArrayBuffer]);
+  /** The model in a file; unless it is `keyless`, keys are tried on it from now on. */
+  load(bytes: Uint8Array, name: string, keyless = false): Promise<Answer> {
+    return this.ask({ id: this.next++, bytes, name, keyless }, [bytes.buffer as ArrayBuffer]);
   }
 
   /** What a key opens; in colours, too, where these are to be looked through. */

@@ -1,5 +1,6 @@
 /** Where the camera is, what it looks at, and which way is up. */
 import { type Gaussians, opacity } from '../core/gaussians.ts';
+import { cross, dot } from '../core/similarity.ts';
 
 export type Vector = readonly [number, number, number];
 
@@ -31,10 +32,6 @@ export const add = (a: Vector, b: Vector, scale = 1): Vector => [
 ];
 export const difference = (a: Vector, b: Vector): Vector => add(a, b, -1);
 export const length = (a: Vector): number => Math.hypot(...a);
-export const cross = (a: Vector, b: Vector): Vector => [
-  a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0],
-];
-export const dot = (a: Vector, b: Vector): number => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 export const unit = (a: Vector): Vector => add([0, 0, 0], a, 1 / Math.max(length(a), 1e-12));
 
 /** Unit vectors of the camera: right, down (OpenCV's y) and forward. */

@@ -22,7 +22,7 @@ export function givenModel(): Source | null {
 }
 
 /** Raises an error for what is not there, or on another host. */
-export async function fetched(url: URL): Promise<Uint8Array> {
+export async function fetched(url: URL | string): Promise<Uint8Array> {
   const response = await fetch(url, { credentials: 'omit' });
   if (!response.ok) throw new Error(String(response.status));
   return new Uint8Array(await response.arrayBuffer());

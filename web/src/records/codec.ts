@@ -81,17 +81,15 @@ export class Codec {
     return Math.ceil(this.layout.reduce((sum, [columns, bits]) => sum + columns * bits, 0) / 8);
   }
 
-  /** The Gaussians of records, whatever bytes they are. */
-  decode(records: readonly Uint8Array[]): Gaussians {
+  /** Writes the Gaussians of records, whatever bytes they are, into the rows from `first` on, which it returns. */
+  decode(records: readonly Uint8Array[], to = emptyGaussians(records.length, this.shDegree), first = 0): Gaussians {
     const { layout } = this;
-    const columns = layout.reduce((sum, [count]) => sum + count, 0);
-    const codes = new Uint32Array(columns);
-    const found = emptyGaussians(records.length, this.shDegree);
+    const codes = new Uint32Array(layout.reduce((sum, [count]) => sum + count, 0));
     records.forEach((record, row) => {
       unpackCodes(record, layout, codes);
-      this.put(found, row, codes);
+      this.put(to, first + row, codes);
     });
-    return found;
+    return to;
   }
 
   /** Writes the Gaussian of these codes, one for each column of the layout, into a row; further harmonics stay. */

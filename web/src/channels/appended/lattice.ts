@@ -2,7 +2,7 @@
  * Words of 84 bits that lie in faint Gaussians, after a format has rounded them (docs/channels.md);
  * `keyss.channels.appended.lattice` on the other side.
  */
-import { COLUMNS, type Gaussians, opacity, selected, withDegree } from '../../core/gaussians.ts';
+import { COLUMNS, type Gaussians, opacity, where, withDegree } from '../../core/gaussians.ts';
 import { moved, type Similarity } from '../../core/similarity.ts';
 import type { Words } from '../../core/words.ts';
 
@@ -14,16 +14,14 @@ const [FARTHEST, MAX_SHIFTS] = [1 << 12, 500]; // steps of log scales: that are 
 
 /** The Gaussians that are as faint as appended ones, without harmonics. */
 export function candidates(model: Gaussians): Gaussians {
-  const rows: number[] = [];
-  for (let row = 0; row < model.count; row++) {
+  const faint = where(model, (row) => {
     const own = opacity(model.opacityLogits[row]);
-    const finite = (column: (typeof COLUMNS)[number]): boolean => {
+    return own > FAINTEST && own < STRONGEST && COLUMNS.every((column) => {
       const width = model[column].length / model.count;
       return model[column].subarray(width * row, width * (row + 1)).every(Number.isFinite);
-    };
-    if (own > FAINTEST && own < STRONGEST && COLUMNS.every(finite)) rows.push(row);
-  }
-  return withDegree(selected(model, rows), 0);
+    });
+  });
+  return withDegree(faint, 0);
 }
 
 /** [N, 3] the nearest lattice points of colours. */

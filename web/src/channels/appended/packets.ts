@@ -1,7 +1,7 @@
 /** Packets: 6 bytes, and which ones they are, in words of 84 bits; `keyss.channels.appended.packets` on the other side. */
 import { ecb } from '@noble/ciphers/aes.js';
 import { mostFrequent } from '../../core/bytes.ts';
-import { mixAt } from '../../core/words.ts';
+import { mix } from '../../core/words.ts';
 import type { Codewords } from '../reed_solomon.ts';
 
 const PACKET_BYTES = 6;
@@ -44,14 +44,11 @@ export function readPackets(key: Uint8Array, { count, blocks, tags }: TaggedWord
   if (!count) return found;
   const encrypted = ecb(key, { disablePadding: true }).encrypt(blocks); // as a pseudorandom function
   const view = new DataView(encrypted.buffer, encrypted.byteOffset);
-  const state = new Uint32Array(2);
   for (let row = 0; row < count; row++) {
     const [high, low] = [view.getUint32(16 * row), view.getUint32(16 * row + 4)]; // of which 36 bits are the mask
     const tag = tags[2 * row] ^ ((high << 4) | (low >>> 28));
     const number = (((tags[2 * row + 1] ^ (high >>> 28)) << 16) | (tag >>> 16)) >>> 0;
-    [state[0], state[1]] = [number, 0];
-    mixAt(state, 0);
-    if (state[1] >>> 16 === (tag & 0xffff)) found.push([number, blocks.subarray(16 * row, 16 * row + PACKET_BYTES)]);
+    if (mix(number)[1] >>> 16 === (tag & 0xffff)) found.push([number, blocks.subarray(16 * row, 16 * row + PACKET_BYTES)]);
   }
   return found;
 }

@@ -1,7 +1,7 @@
 /** Pilots: appended Gaussians that everybody can read; `keyss.channels.appended.pilots` on the other side. */
-import { mostFrequent } from '../../core/bytes.ts';
+import { mostFrequent, rowsOf } from '../../core/bytes.ts';
 import { movedPoint, type Similarity } from '../../core/similarity.ts';
-import { mixAt, type Words } from '../../core/words.ts';
+import { mix, type Words } from '../../core/words.ts';
 import { SALT_BYTES } from '../../keys/derivation.ts';
 import { fittedSimilarity } from './fitting.ts';
 import { POSITION_BITS } from './lattice.ts';
@@ -22,24 +22,12 @@ export interface Found {
   readonly salt: Uint8Array;
 }
 
-/** How many of `invariants` [N] are those of pilots. */
-export function countPilots(invariants: Words): number {
-  let found = 0;
-  for (let row = 0; row < invariants.length >> 1; row++) found += Number(isPilot(invariants, row));
-  return found;
-}
-
 /** What the pilots among candidates tell: `invariants` [N] as they were read, `means` [N, 3] in the world. */
 export function readPilots(invariants: Words, means: Float32Array): Found | null {
-  const own: number[] = [];
-  for (let row = 0; row < invariants.length >> 1; row++) if (isPilot(invariants, row)) own.push(row);
+  const own = pilotsOf(invariants);
   if (own.length < AGREE) return null;
-  const there = new Float64Array(3 * own.length);
-  const expected = new Float64Array(3 * own.length);
-  own.forEach((row, to) => {
-    there.set(means.subarray(3 * row, 3 * row + 3), 3 * to);
-    expected.set(placeOf(invariants, row), 3 * to);
-  });
+  const there = rowsOf(means, own, 3);
+  const expected = Float64Array.from(own.flatMap((row) => placeOf(invariants, row)));
   const sample = Math.min(own.length, SAMPLE);
   const some = Array.from({ length: sample }, (_, at) => Math.floor((at * own.length) / sample));
   const draw = drawing(sample);
@@ -57,7 +45,7 @@ export function readPilots(invariants: Words, means: Float32Array): Found | null
 
 /** Which pilots `among` all come to lie where they should by the similarity of the chosen ones. */
 function agreeing(
-  there: Float64Array, expected: Float64Array, chosen: number[], among: Iterable<number>,
+  there: Float32Array, expected: Float64Array, chosen: number[], among: Iterable<number>,
 ): number[] {
   const found: number[] = [];
   const similarity = fittedSimilarity(there, expected, chosen);
@@ -71,24 +59,17 @@ function agreeing(
 
 /** Numbers below `count` that are drawn at random, the same ones every time. */
 function drawing(count: number): () => number {
-  const state = new Uint32Array(2);
   let drawn = 0;
-  return () => {
-    [state[0], state[1]] = [++drawn, 0];
-    mixAt(state, 0);
-    return Math.floor((state[1] / 2 ** 32) * count);
-  };
+  return () => Math.floor((mix(++drawn)[1] / 2 ** 32) * count);
 }
 
 /** What most pilots say of each part; null where one has nobody left. */
 function saltOf(invariants: Words, rows: number[]): Uint8Array | null {
   const parts = Array.from({ length: PARTS }, (): number[] => []);
-  const state = new Uint32Array(2);
   for (const row of rows) {
     const [low, high] = [invariants[2 * row], invariants[2 * row + 1]];
-    [state[0], state[1]] = [(low & 0x3ffff) ^ PUBLIC_LOW, PUBLIC_HIGH]; // of the scales
-    mixAt(state, 0);
-    const said = (((high << 14) | (low >>> 18)) ^ (state[1] >>> 11)) >>> RANDOM_BITS; // 21 bits, whitened
+    const mask = mix((low & 0x3ffff) ^ PUBLIC_LOW, PUBLIC_HIGH)[1] >>> 11; // of the scales
+    const said = (((high << 14) | (low >>> 18)) ^ mask) >>> RANDOM_BITS; // 21 bits, whitened
     parts[said >>> 16].push(said & 0xffff);
   }
   const salt = new Uint8Array(SALT_BYTES);
@@ -100,19 +81,20 @@ function saltOf(invariants: Words, rows: number[]): Uint8Array | null {
   return salt;
 }
 
-const scratch = new Uint32Array(2);
+/** The rows of `invariants` [N] that are those of pilots. */
+export function pilotsOf(invariants: Words): number[] {
+  const rows: number[] = [];
+  for (let row = 0; row < invariants.length >> 1; row++) if (publicHash(invariants, row)[0] % ONE_IN === 0) rows.push(row);
+  return rows;
+}
 
-function isPilot(invariants: Words, row: number): boolean {
-  scratch[0] = invariants[2 * row] ^ PUBLIC_LOW;
-  scratch[1] = invariants[2 * row + 1] ^ PUBLIC_HIGH;
-  mixAt(scratch, 0);
-  return scratch[0] % ONE_IN === 0;
+function publicHash(invariants: Words, row: number): Words {
+  return mix(invariants[2 * row] ^ PUBLIC_LOW, invariants[2 * row + 1] ^ PUBLIC_HIGH);
 }
 
 /** Where a pilot lies in the own frame: by a hash of its invariants. */
 function placeOf(invariants: Words, row: number): number[] {
-  isPilot(invariants, row);
-  mixAt(scratch, 0);
-  const high = scratch[1];
-  return [high >>> 22, (high >>> 12) & 1023, (high >>> 2) & 1023].map((each) => (each + 0.5) / 2 ** POSITION_BITS);
+  const [low, high] = publicHash(invariants, row);
+  const place = mix(low, high)[1];
+  return [place >>> 22, (place >>> 12) & 1023, (place >>> 2) & 1023].map((each) => (each + 0.5) / 2 ** POSITION_BITS);
 }

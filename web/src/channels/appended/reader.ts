@@ -1,5 +1,5 @@
 /** Secrets in appended Gaussians (docs/channels.md); `keyss.channels.appended.channel` on the other side. */
-import { ascii } from '../../core/bytes.ts';
+import { ascii, rowsOf } from '../../core/bytes.ts';
 import type { Gaussians } from '../../core/gaussians.ts';
 import { type Derive, expand } from '../../keys/derivation.ts';
 import { decrypted } from '../../keys/encryption.ts';
@@ -11,7 +11,7 @@ import {
   allShifts, candidates, coloursOf, inOwnFrame, invariantsOf, likelyShifts, scalesAt, scaleSteps,
 } from './lattice.ts';
 import { codewordsOf, readHeader, readPackets, type TaggedWords, wordsOfPoints } from './packets.ts';
-import { countPilots, type Found, LEAST, ONE_IN, readPilots } from './pilots.ts';
+import { type Found, LEAST, ONE_IN, pilotsOf, readPilots } from './pilots.ts';
 
 // Gaussians in which pilots are counted; places of the lattice that are tried then, with so many deviations more of
 // them than by chance.
@@ -59,12 +59,11 @@ export class AppendedReader implements Reader {
 function shiftsWithPilots(steps: Float64Array, colours: Uint8Array): number[] {
   const count = Math.min(SAMPLE, steps.length / 3);
   const every = steps.length / 3 / count;
-  const rows = Array.from({ length: count }, (_, at) => 3 * Math.floor(at * every));
-  const few = Float64Array.from(rows.flatMap((at) => [...steps.subarray(at, at + 3)]));
-  const own = Uint8Array.from(rows.flatMap((at) => [...colours.subarray(at, at + 3)]));
+  const rows = Array.from({ length: count }, (_, at) => Math.floor(at * every));
+  const [few, own] = [rowsOf(steps, rows, 3), rowsOf(colours, rows, 3)];
   const byChance = count / ONE_IN;
   return allShifts(few)
-    .map((shift) => ({ shift, pilots: countPilots(invariantsOf(own, scalesAt(few, shift))) }))
+    .map((shift) => ({ shift, pilots: pilotsOf(invariantsOf(own, scalesAt(few, shift))).length }))
     .filter(({ pilots }) => pilots > byChance + NOT_BY_CHANCE * Math.sqrt(byChance))
     .sort((a, b) => b.pilots - a.pilots)
     .slice(0, TRIED)

@@ -2,8 +2,8 @@
  * Which numbers of a model carry something, and by what else of the model they are known again;
  * `keyss.channels.colours.carriers` on the other side.
  */
-import { median } from '../../core/bytes.ts';
-import { coefficients, type Gaussians, opacity } from '../../core/gaussians.ts';
+import { median, rowsOf } from '../../core/bytes.ts';
+import { type Gaussians, opacity, where, withDegree } from '../../core/gaussians.ts';
 
 export const [SCALE_STEP, COLOUR_STEP, OPACITY_STEP] = [1 / 16, 1 / 38.25, 1 / 255]; // of 8-bit formats
 export const CELL = 0.25; // of a log scale
@@ -25,22 +25,18 @@ export interface Numbers {
 }
 
 export function numbersOf(model: Gaussians): Numbers {
-  const width = 3 * coefficients(model.shDegree);
-  const opacities = Float64Array.from(model.opacityLogits, (logit) => Math.fround(opacity(logit)));
-  const rows: number[] = [];
-  for (let row = 0; row < model.count; row++) {
+  const bare = withDegree(model, 0);
+  const seen = where(bare, (row) => {
     let sum = 0; // finite where all are
-    for (let axis = 0; axis < 3; axis++) sum += model.logScales[3 * row + axis] + model.sh[width * row + axis];
-    if (Number.isFinite(sum) && opacities[row] > MIN_OPACITY) rows.push(row);
-  }
-  const [logScales, colours] = [new Float64Array(3 * rows.length), new Float64Array(3 * rows.length)];
-  rows.forEach((row, to) => {
-    logScales.set(model.logScales.subarray(3 * row, 3 * row + 3), 3 * to);
-    colours.set(model.sh.subarray(width * row, width * row + 3), 3 * to);
+    for (let axis = 0; axis < 3; axis++) sum += bare.logScales[3 * row + axis] + bare.sh[3 * row + axis];
+    return Number.isFinite(sum) && Math.fround(opacity(bare.opacityLogits[row])) > MIN_OPACITY;
   });
-  const sizes = Float64Array.from(rows, (_, at) => (logScales[3 * at] + logScales[3 * at + 1] + logScales[3 * at + 2]) / 3);
-  const own = Float64Array.from(rows, (row) => opacities[row]);
-  return { count: rows.length, size: median(sizes), logScales, opacities: own, colours };
+  const [logScales, colours] = [Float64Array.from(seen.logScales), Float64Array.from(seen.sh)];
+  const sizes = Float64Array.from({ length: seen.count }, (_, row) => {
+    return (logScales[3 * row] + logScales[3 * row + 1] + logScales[3 * row + 2]) / 3;
+  });
+  const opacities = Float64Array.from(seen.opacityLogits, (logit) => Math.fround(opacity(logit)));
+  return { count: seen.count, size: median(sizes), logScales, opacities, colours };
 }
 
 /** C Gaussians as a reader sees them. */
@@ -90,17 +86,9 @@ export function shifted(carriers: Carriers, cells: number): Carriers {
 
 /** The carriers of these rows. */
 export function chosen({ names, doubt, values }: Carriers, rows: ArrayLike<number>): Carriers {
-  const found = {
-    count: rows.length,
-    names: new Int16Array(NAME * rows.length),
-    doubt: Float64Array.from(rows, (row) => doubt[row]),
-    values: new Float64Array(2 * rows.length),
+  return {
+    count: rows.length, names: rowsOf(names, rows, NAME), doubt: rowsOf(doubt, rows, 1), values: rowsOf(values, rows, 2),
   };
-  for (let to = 0; to < rows.length; to++) {
-    found.names.set(names.subarray(NAME * rows[to], NAME * (rows[to] + 1)), NAME * to);
-    found.values.set(values.subarray(2 * rows[to], 2 * rows[to] + 2), 2 * to);
-  }
-  return found;
 }
 
 /** How much a change of colour shows, from the name: log of area times squared opacity. */

@@ -2,7 +2,7 @@
  * A rateless code, read softly: any bits of it, in any order, some of them wrong, give the data back (Shokrollahi 2006;
  * Etesami and Shokrollahi 2006). `keyss.channels.colours.fountain` on the other side.
  */
-import { mixAt, mixed, sortingOrder, type Words } from '../../core/words.ts';
+import { mix, mixed, sortingOrder, type Words } from '../../core/words.ts';
 
 /** Shares of code bits that are sums of so many. */
 type Degrees = readonly (readonly [number, number])[];
@@ -130,12 +130,9 @@ function equations(seeds: Words, length: number, degrees: Degrees, more?: Equati
   for (const [, share] of degrees) bounds.push((bounds.at(-1) ?? 0) + share);
   bounds.pop();
   const starts = new Uint32Array(count + (more ? more.starts.length : 1));
-  const scratch = new Uint32Array(2);
   for (let row = 0; row < count; row++) {
-    scratch[0] = seeds[2 * row];
-    scratch[1] = seeds[2 * row + 1];
-    mixAt(scratch, 0);
-    const uniform = (scratch[1] * 2 ** 32 + scratch[0]) / 2 ** 64;
+    const found = mix(seeds[2 * row], seeds[2 * row + 1]);
+    const uniform = (found[1] * 2 ** 32 + found[0]) / 2 ** 64;
     let chosen = 0;
     while (chosen < bounds.length && bounds[chosen] <= uniform) chosen++;
     starts[row + 1] = starts[row] + most[chosen];
@@ -148,10 +145,7 @@ function equations(seeds: Words, length: number, degrees: Degrees, more?: Equati
       low += RANK_LOW;
       high = (high + RANK_HIGH + (low > 0xffffffff ? 1 : 0)) >>> 0;
       low >>>= 0;
-      scratch[0] = seeds[2 * row] ^ low;
-      scratch[1] = seeds[2 * row + 1] ^ high;
-      mixAt(scratch, 0);
-      members[at] = scaled(scratch[1], length);
+      members[at] = scaled(mix(seeds[2 * row] ^ low, seeds[2 * row + 1] ^ high)[1], length);
     }
   }
   if (more) {

@@ -6,7 +6,7 @@ import { chacha20 } from '@noble/ciphers/chacha.js';
 import { hmac } from '@noble/hashes/hmac.js';
 import { sha256 } from '@noble/hashes/sha2.js';
 import { ascii } from '../../core/bytes.ts';
-import { mixAt, runs, sortingOrder, type Words, wordsOf } from '../../core/words.ts';
+import { mix, runs, sortingOrder, type Words, wordsOf } from '../../core/words.ts';
 import { expand } from '../../keys/derivation.ts';
 import { type Carriers, chosen } from './carriers.ts';
 import { Fountain, NOISY } from './fountain.ts';
@@ -240,12 +240,7 @@ function agreement(hints: Float64Array): number {
   return hints.reduce((sum, hint) => sum + Math.log1p(Math.max(-0.99, hint)), 0);
 }
 
-const scratch = new Uint32Array(2);
-
 /** Whether the code bit with this seed is encrypted by a one. */
 function isPadded(seeds: Words, at: number): boolean {
-  scratch[0] = seeds[2 * at] ^ PAD_LOW;
-  scratch[1] = seeds[2 * at + 1] ^ PAD_HIGH;
-  mixAt(scratch, 0);
-  return scratch[1] >>> 31 === 1;
+  return mix(seeds[2 * at] ^ PAD_LOW, seeds[2 * at + 1] ^ PAD_HIGH)[1] >>> 31 === 1;
 }

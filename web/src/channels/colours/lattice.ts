@@ -3,7 +3,7 @@
  * `keyss.channels.colours.lattice` on the other side.
  */
 import { ecb } from '@noble/ciphers/aes.js';
-import { mixAt, type Words, wordsOf } from '../../core/words.ts';
+import { mix, type Words, wordsOf } from '../../core/words.ts';
 import { expand } from '../../keys/derivation.ts';
 import { type Carriers, impact } from './carriers.ts';
 
@@ -25,15 +25,11 @@ export function bitCounts({ count, names }: Carriers, level: number, depth: numb
 /** [B] the seeds of all bits of Gaussians, for the fountain; `numbers` [C]: of `rank`; `bits` [C]: of each number. */
 export function seedsOf(numbers: Words, bits: Uint8Array): Words {
   const found = new Uint32Array(2 * COLUMNS * sum(bits));
-  const order = new Uint32Array(2);
   let to = 0;
   bits.forEach((count, row) => {
     for (let bit = 1; bit <= COLUMNS * count; bit++, to++) {
-      [order[0], order[1]] = [bit, 0];
-      mixAt(order, 0);
-      found[2 * to] = numbers[2 * row] ^ order[0];
-      found[2 * to + 1] = numbers[2 * row + 1] ^ order[1];
-      mixAt(found, to);
+      const [low, high] = mix(bit);
+      found.set(mix(numbers[2 * row] ^ low, numbers[2 * row + 1] ^ high), 2 * to);
     }
   });
   return found;

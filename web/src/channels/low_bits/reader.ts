@@ -4,7 +4,7 @@
  * A key that opens nothing makes the same passes over all cells as one that opens a secret, and all salts are always
  * tried, so that how long it takes tells next to nothing.
  */
-import { ascii, bytesKey } from '../../core/bytes.ts';
+import { ascii, bytesKey, rowsOf } from '../../core/bytes.ts';
 import { damaged, tooMuchLost } from '../../core/errors.ts';
 import { type Gaussians, selected } from '../../core/gaussians.ts';
 import { type Derive, expand } from '../../keys/derivation.ts';
@@ -124,10 +124,3 @@ function firstOfEach(names: Uint8Array, low: Uint8Array, width: number): number[
   }
   return rows;
 }
-
-function rowsOf(table: Uint8Array, rows: number[], width: number): Uint8Array {
-  const found = new Uint8Array(rows.length * width);
-  rows.forEach((row, index) => found.set(table.subarray(row * width, (row + 1) * width), index * width));
-  return found;
-}
-
