@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from keyss.many import processes
+from keyss.many import engines
 from many.fakes import fake
 
 
 @pytest.fixture(autouse=True)
 def _fake_worker(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(processes, "WORKER", fake())
+    monkeypatch.setattr(engines, "WORKER", fake())

@@ -68,9 +68,9 @@ import argon2.low_level, cheap_keys
 argon2.low_level.hash_secret_raw = cheap_keys.hash_secret_raw
 from many.fakes import REAL, fake
 from keyss.core import BackendError
-from keyss.many import processes, sweep
+from keyss.many import engines, sweep
 kind = sys.argv[4]
-processes.WORKER = REAL if kind == "real" else fake(0.15)
+engines.WORKER = REAL if kind == "real" else fake(0.15)
 ray = "local" if kind == "ray" else None
 try:
     sweep(sys.argv[1], sys.argv[2], master_key_file=sys.argv[3], jobs=2, ray=ray)

@@ -13,7 +13,7 @@ from cli.said import Run
 from keyss import CarryOptions
 from keyss.core import InputError, KeyssWarning, OutputError, WrongKeyError
 from keyss.keys import MasterKey
-from keyss.many import ManyResult, assets, cell, hide_batch, processes
+from keyss.many import ManyResult, assets, cell, engines, hide_batch
 from many.fakes import REAL
 from tiny_scenes import random_gaussians
 
@@ -166,7 +166,7 @@ def test_the_key_of_an_asset_opens_it_and_no_other(
     tmp_path: Path, keyss: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Through the real worker and the command line."""
-    monkeypatch.setattr(processes, "WORKER", REAL)
+    monkeypatch.setattr(engines, "WORKER", REAL)
     library.write_model(tmp_path / "a.ply", random_gaussians(300, seed=0))
     library.write_model(tmp_path / "secret.ply", random_gaussians(40, seed=1))
     (tmp_path / "letter.txt").write_text("for your eyes only")

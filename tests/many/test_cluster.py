@@ -25,7 +25,7 @@ def test_a_local_cluster_does_the_same_cells_with_the_same_bytes(tmp_path: Path)
     here = run(spec, tmp_path / "here", master_key_file=master, jobs=1)
     there = run(spec, tmp_path / "there", master_key_file=master, jobs=1, ray="local")
     assert [each.result for each in there.outcomes] == [each.result for each in here.outcomes]
-    assert [each.failure for each in there.outcomes] == [each.failure for each in here.outcomes]
+    assert [each.error for each in there.outcomes] == [each.error for each in here.outcomes]
     for name in here.tables:
         assert (tmp_path / "here" / name).read_bytes() == (tmp_path / "there" / name).read_bytes()
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
 
 import msgspec
@@ -22,10 +21,6 @@ def tree(folder: Path) -> dict[str, bytes]:
     return {name: data for name, data in files.items() if not name.endswith(MANIFEST)}
 
 
-def content(data: bytes) -> Callable[[Path], None]:
-    return partial(write_bytes, data=data)
-
-
 def failing(error: BaseException) -> Callable[[Path], None]:
     def write(path: Path) -> None:
         path.write_bytes(b"a part")
@@ -38,16 +33,16 @@ def make(path: Path, stage: str = "hide", files: dict[str, bytes] | None = None,
     folder = RunFolder(path, stage, **how)  # type: ignore[arg-type]
     with folder.work():
         names = {"publish/stego.ply": b"1", "private/cover.ply": b"2"} if files is None else files
-        folder.write({name: content(data) for name, data in names.items()})
+        folder.write(names)
 
 
 def interrupt(path: Path, arguments: dict[str, object], stage: str = "hide", **how: bool) -> None:
     """Leaves a checkpoint."""
     folder = RunFolder(path, stage, arguments, **how)
-    writers = {"publish/stego.ply": content(b"half"), "x": failing(KeyboardInterrupt())}
+    contents = {"publish/stego.ply": b"half", "x": failing(KeyboardInterrupt())}
     with pytest.raises(KeyboardInterrupt), folder.work():  # noqa: PT012
         write_bytes(folder.checkpoints / "fit", b"state")
-        folder.write(writers)
+        folder.write(contents)
 
 
 @contextmanager
@@ -64,7 +59,7 @@ def test_all_files_appear_and_only_what_is_published_can_be_read(tmp_path: Path)
     assert list(tmp_path.iterdir()) == []
     with umask(0o022), folder.work():
         (folder.checkpoints / "fit").touch()
-        folder.write({"publish/stego.ply": content(b"1"), "private/cover.ply": content(b"2")})
+        folder.write({"publish/stego.ply": b"1", "private/cover.ply": b"2"})
         assert tree(tmp_path).keys().isdisjoint({"a/run/publish/stego.ply"})
     assert tree(folder.path) == {"publish/stego.ply": b"1", "private/cover.ply": b"2"}
     modes = {str(p.relative_to(folder.path)): p.stat().st_mode & 0o777 for p in folder.path.rglob("*")}
@@ -91,7 +86,7 @@ def test_none_appears_when_one_fails(
     before = tree(tmp_path), read_manifest(path)
     folder = RunFolder(path, "hide", overwrite=there)
     with pytest.raises(raised), folder.work():
-        folder.write({"publish/stego.ply": content(b"new"), "y": failing(error)})
+        folder.write({"publish/stego.ply": b"new", "y": failing(error)})
     assert (tree(tmp_path), read_manifest(path)) == before
     assert path.exists() == there
 
@@ -178,7 +173,7 @@ def test_an_interrupted_run_resumes_with_the_same_arguments_only(tmp_path: Path)
     assert 0 < first < folder.earlier_seconds
     with folder.work():
         assert (folder.checkpoints / "fit").read_bytes() == b"state"
-        folder.write({"publish/stego.ply": content(b"whole")})
+        folder.write({"publish/stego.ply": b"whole"})
     assert tree(tmp_path) == {"publish/stego.ply": b"whole"}
 
 
@@ -197,7 +192,7 @@ def test_starting_anew_drops_checkpoints_and_keeps_results_until_the_end(tmp_pat
     folder = RunFolder(tmp_path, "hide", {"width": 2}, overwrite=True)
     with folder.work():
         assert not list(folder.checkpoints.iterdir())
-        folder.write({"publish/stego.ply": content(b"new")})
+        folder.write({"publish/stego.ply": b"new"})
     assert tree(tmp_path) == {"publish/stego.ply": b"new"}
 
 
@@ -213,18 +208,18 @@ def test_two_processes_are_not_at_work_in_one_folder(tmp_path: Path) -> None:
         with pytest.raises(OutputError, match=f"process {os.getpid()} is at work"):
             RunFolder(tmp_path, "hide", overwrite=True)
         with pytest.raises(OutputError, match="at work"):
-            write_again(tmp_path, "hide", "private/metrics.json", content(b"1"))
+            write_again(tmp_path, "hide", "private/metrics.json", b"1")
     assert (tmp_path / MANIFEST).exists()
 
 
 def test_a_replaced_file_stays_in_the_manifest(tmp_path: Path) -> None:
     make(tmp_path)
-    write_again(tmp_path, "audit", "private/report.html", content(b"1"))
-    write_again(tmp_path, "audit", "private/report.html", content(b"2"))
+    write_again(tmp_path, "audit", "private/report.html", b"1")
+    write_again(tmp_path, "audit", "private/report.html", b"2")
     assert tree(tmp_path)["private/report.html"] == b"2"
     (tmp_path / "private" / "mine").write_bytes(b"mine")
     with pytest.raises(OutputError, match="in the way"):
-        write_again(tmp_path, "audit", "private/mine", content(b"3"))
+        write_again(tmp_path, "audit", "private/mine", b"3")
     make(tmp_path, files={"publish/stego.ply": b"new"}, overwrite=True)
     assert tree(tmp_path) == {"publish/stego.ply": b"new", "private/mine": b"mine"}
 

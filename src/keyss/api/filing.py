@@ -15,7 +15,7 @@ from keyss.files.reading import read_file
 from keyss.keys.encryption import MAX_PAYLOAD_BYTES
 from keyss.methods.opened import HiddenFile
 from keyss.rendering.difference import psnr_between
-from keyss.runs.files import STEGOS, stego_name, writers
+from keyss.runs.files import STEGOS, stego_name
 from keyss.runs.folder import RunFolder
 from keyss.runs.sources import PathLike, as_3dgs_model
 
@@ -42,7 +42,7 @@ def hide_files(
     stego = channel_for(publish, channel).prepare(model).embed(payloads)
     with folder.work() if folder else nullcontext():
         name = stego_name(stego)
-        there = folder.write(writers({name: stego})) if folder else None
+        there = folder.write({name: stego}) if folder else None
         as_read = read_model(there / name) if there else stego
         if [HiddenFile.of(open_content(as_read, key)) for key in keys] != hidden:
             raise RuntimeError("the hidden files do not open again from the published file")

@@ -16,7 +16,7 @@ from keyss.fitting.ranks import here
 from keyss.progress import Reporter
 from keyss.rendering import Backend, resolve_device
 from keyss.runs.config import FitRunConfig
-from keyss.runs.files import CONFIG, METRICS, MODEL, writers
+from keyss.runs.files import CONFIG, METRICS, MODEL
 from keyss.runs.folder import RunFolder
 from keyss.runs.metrics import FitMetrics
 from keyss.runs.planning import in_a_line, plan_fit, worth_planning
@@ -86,5 +86,5 @@ def fit(
                 width=loaded.train[0].camera.width,
                 seed=config.known_seed,
             )
-            folder.write(writers({MODEL: result.gaussians, CONFIG: settings, METRICS: metrics}))
+            folder.write({MODEL: result.gaussians, CONFIG: settings, METRICS: metrics})
     return result

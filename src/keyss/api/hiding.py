@@ -44,7 +44,6 @@ from keyss.runs.files import (
     handed_names,
     plain_names,
     stego_name,
-    writers,
 )
 from keyss.runs.folder import RunFolder
 from keyss.runs.metrics import FitMetrics, HideMetrics
@@ -211,7 +210,7 @@ def hide(
             made = dict(zip(plain_names(len(secrets)), plain, strict=True))
             made |= {bound_names(len(secrets))[index]: model for index, model in longer.items()}
             settings = replace(settings, options=options, payloads=payloads)
-            folder.write(writers({**made, CONFIG: settings, METRICS: metrics}))
+            folder.write({**made, CONFIG: settings, METRICS: metrics})
     if ranks.count > 1:
         text = json.dumps(asdict(metrics) if ranks.first else None)  # keeps NaN
         metrics = msgspec.convert(json.loads(ranks.from_first(text.encode())), HideMetrics)
@@ -244,7 +243,7 @@ def _as_read(stego: Stego, keys: Sequence[str], folder: RunFolder | None) -> lis
     model, handed = stego.gaussians, _handed_files(stego.handed, keys)
     if folder:
         name = stego_name(model)
-        model = read_model(folder.write(writers({name: model, **handed})) / name)
+        model = read_model(folder.write({name: model, **handed}) / name)
     opened: Sequence[Opened]
     if handed:
         opened = [open_handed(data, key or None) for data, key in zip(handed.values(), keys, strict=True)]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -19,11 +18,10 @@ from keyss.measure.hiding import WRONG_KEYS, measure_hiding
 from keyss.measure.images import renders_of
 from keyss.progress import Reporter
 from keyss.rendering import Backend, resolve_device
-from keyss.runs.files import METRICS, writers
+from keyss.runs.files import METRICS
 from keyss.runs.folder import RunFolder, write_again
 from keyss.runs.metrics import HideMetrics
 from keyss.runs.opening import open_run
-from keyss.runs.records import write_record
 from keyss.runs.sources import Background, PathLike, as_model, as_scene
 
 Split = Literal["test", "train", "all"]
@@ -81,7 +79,7 @@ def render(
     pictures = renders_of(gaussians, scene, splits[split])
     if folder:
         with folder.work():
-            folder.write(writers({name: png_bytes(image) for name, image in pictures}))
+            folder.write({name: png_bytes(image) for name, image in pictures})
     return pictures
 
 
@@ -117,5 +115,5 @@ def evaluate(
         seed=opened.metrics.seed if seed is None else seed,
     )
     metrics = replace(opened.metrics, **vars(measured))
-    write_again(opened.folder, "hide", METRICS, partial(write_record, record=metrics))
+    write_again(opened.folder, "hide", METRICS, metrics)
     return metrics

@@ -9,7 +9,6 @@ import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from functools import partial
 from importlib.metadata import version as version_of
 from pathlib import Path
 
@@ -28,11 +27,10 @@ from keyss.audits.record import (
 )
 from keyss.audits.subject import AuditSubject, subject_of
 from keyss.core import Interrupted, KeyssWarning, UsageError, import_extra, signal_of
-from keyss.files.atomic import write_bytes
 from keyss.methods import registry
 from keyss.progress import Reporter
 from keyss.rendering import Backend, resolve_device
-from keyss.runs.files import REPORT, writers
+from keyss.runs.files import REPORT
 from keyss.runs.folder import CHECKPOINTS, RunFolder, read_manifest, write_again
 from keyss.runs.opening import HidingRun, open_run
 from keyss.runs.sources import PathLike
@@ -122,8 +120,8 @@ def audit(
             f"{AUDIT_FOLDER}/{PICTURES}/{path.name}": path.read_bytes()
             for path in partial_audit.pictures.glob("*.png")
         }
-        there = folder.write(writers({f"{AUDIT_FOLDER}/{AUDIT_FILE}": result, **pictures}))
-        folder.write(writers({REPORT: report_bytes(result, there)}))
+        there = folder.write({f"{AUDIT_FOLDER}/{AUDIT_FILE}": result, **pictures})
+        folder.write({REPORT: report_bytes(result, there)})
     return result
 
 
@@ -157,7 +155,7 @@ def _report(run: Path) -> Audit:
             KeyssWarning,
             stacklevel=2,
         )
-    write_again(run, "audit", REPORT, partial(write_bytes, data=report_bytes(result, place)))
+    write_again(run, "audit", REPORT, report_bytes(result, place))
     return result
 
 

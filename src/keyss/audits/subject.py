@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 from dataclasses import asdict, dataclass, replace
-from functools import partial
 from pathlib import Path
 
 import torch
@@ -13,7 +12,7 @@ import torch
 from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
-from keyss.files.models import read_model, write_model
+from keyss.files.models import read_model
 from keyss.fitting.config import FitConfig
 from keyss.fitting.plain import fit_scene
 from keyss.measure.hiding import in_cover
@@ -102,6 +101,6 @@ def _plain_model(
         resume=True,
         reporter=reporter,
     )
-    folder.keep("controls", model, partial(write_model, model=result.gaussians))
+    folder.keep("controls", model, result.gaussians)
     checkpoint.unlink(missing_ok=True)
     return result.gaussians

@@ -240,7 +240,7 @@ def _size(count: int) -> str:
 
 def print_forecast(found: Forecast, jobs: int | None = None) -> None:
     """The cells of a dry run, with estimates for those that are not done."""
-    from keyss.many.processes import Resources
+    from keyss.many.engines import Resources
 
     rows = []
     for each in found.cells:

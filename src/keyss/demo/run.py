@@ -19,7 +19,7 @@ from keyss.many.sheet import contact_sheet
 from keyss.methods import CarryOptions
 from keyss.progress import Reporter
 from keyss.rendering import Backend, resolve_device
-from keyss.runs.files import STEGO, plain_names, writers
+from keyss.runs.files import STEGO, plain_names
 from keyss.runs.folder import RunFolder, clear
 from keyss.runs.metrics import HideMetrics
 from keyss.viewer.page import page_with
@@ -63,7 +63,7 @@ def run_demo(
         with scenes.work():
             paths = [path for which in (COVER, SECRET) for path in sorted((FOLDER / which).rglob("*"))]
             photos = {f"{SCENES}/{path.relative_to(FOLDER)}": path for path in paths if path.is_file()}
-            scenes.write(writers({name: path.read_bytes() for name, path in photos.items()}))
+            scenes.write({name: path.read_bytes() for name, path in photos.items()})
         cover, secret = (load_scene(out / SCENES / which, width=width) for which in (COVER, SECRET))
         key = f"demo-key-{seed}"
         keyss.hide(
@@ -82,14 +82,14 @@ def run_demo(
         with results.work():
             revealed = keyss.reveal(out / STEGO, key, device=device).gaussians
             refused = sum(_is_refused(out / STEGO, wrong, device) for wrong in WRONG_KEYS)
-            there = results.write(writers({WEB: _for_the_web(out, cover, secret, key, device)}))
+            there = results.write({WEB: _for_the_web(out, cover, secret, key, device)})
             converted = keyss.reveal(there / WEB, key, device=device).gaussians
             picture = io.BytesIO()
             comparison = _comparison(out, revealed, converted, cover, secret, metrics, device)
             comparison.save(picture, "PNG", optimize=True)
             viewer = page_with((out / STEGO).read_bytes(), Path(STEGO).name, up="z")
             files = {SECRET_PLY: revealed, COMPARISON: picture.getvalue(), KEY: f"{key}\n".encode()}
-            results.write(writers(files | {VIEWER: viewer}))
+            results.write(files | {VIEWER: viewer})
         (out / VIEWER).chmod(public_mode())  # it holds the published model
         return DemoResult(metrics, refused)
     except BaseException as error:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import csv
 import hashlib
-import io
 import os
 import warnings
 from collections import Counter
@@ -21,7 +19,7 @@ from keyss.files.atomic import write_bytes
 from keyss.keys.derivation import SALT_BYTES, DerivedKey
 from keyss.keys.key_file import read_key_file
 from keyss.many.assets import Asset, read_assets
-from keyss.many.cell import CELL, RESULT, Cell, Failure
+from keyss.many.cell import CELL, RESULT, Cell
 from keyss.many.running import (
     CELLS,
     PRIVATE,
@@ -32,6 +30,7 @@ from keyss.many.running import (
     run_cells,
     settle_master_key,
 )
+from keyss.many.tables import csv_bytes
 from keyss.methods import registry
 from keyss.methods.base import MethodOptions
 from keyss.rendering import Backend
@@ -97,8 +96,7 @@ def hide_batch(
             try:
                 cells.append((_cell(asset, out, folder, master, common, overwrite), folder))
             except KeyssError as error:
-                failure = Failure(status=error.exit_status, message=str(error))
-                found[asset.out] = Outcome(asset.out, folder, None, failure)
+                found[asset.out] = Outcome(asset.out, folder, None, str(error))
         ended = run_cells(f"batch of {len(assets)} assets", cells, jobs=jobs, ray=ray, retries=retries)
         found |= {each.name: each for each in ended}
         outcomes = [found[asset.out] for asset in assets]
@@ -148,14 +146,12 @@ def _key_check(key: str, identity: str) -> str:
 
 
 def _summary(out: Path, outcomes: Sequence[Outcome]) -> bytes:
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["out", "state", "published", "sha256", "error"])
+    rows = []
     for each in outcomes:
-        if each.result is None:
-            writer.writerow([each.name, "failed", "", "", each.error])
-        else:
+        row = {"out": each.name, "state": "failed", "published": "", "sha256": "", "error": each.error or ""}
+        if each.result is not None:
             published = os.path.normpath(each.folder / each.result.published)
-            row = [each.name, "done", os.path.relpath(published, out), each.result.sha256, ""]
-            writer.writerow(row)
-    return text.getvalue().encode("utf-8", "backslashreplace")
+            row |= {"state": "done", "published": os.path.relpath(published, out)}
+            row |= {"sha256": each.result.sha256}
+        rows.append(row)
+    return csv_bytes(rows)

@@ -126,8 +126,7 @@ class Result:
 class Failure:
     """The reason to refuse a cell."""
 
-    version: int = 1
-    status: int  # exit status of the command line for this error
+    version: int = 2
     message: str
 
 
@@ -144,9 +143,11 @@ def result_of(folder: Path, measures: tuple[str, ...] = ()) -> Result | None:
     return result if (folder / result.published).exists() and {*measures} <= {*result.measures} else None
 
 
-def failure_of(folder: Path) -> Failure | None:
-    """The failure of a cell that was refused."""
-    return read_record(folder / FAILED, Failure) if (folder / FAILED).exists() else None
+def error_of(folder: Path) -> str:
+    """The reason for a missing result."""
+    if (folder / FAILED).exists():
+        return read_record(folder / FAILED, Failure).message
+    return f"its process died repeatedly; see {folder / LOG}"
 
 
 @cache

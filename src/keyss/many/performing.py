@@ -20,7 +20,7 @@ from keyss.core.errors import InputError, UsageError
 from keyss.fitting.config import FitConfig
 from keyss.keys.key_file import read_key_file
 from keyss.keys.master import MasterKey
-from keyss.many.cell import RUN, Cell, Result, failure_of, result_of
+from keyss.many.cell import RUN, Cell, Result, error_of, result_of
 from keyss.many.measures import MEASURES, Subject
 from keyss.methods import registry
 from keyss.methods.base import MethodOptions, Plan, role_of
@@ -124,8 +124,7 @@ def _model(folder: Path, path: str) -> Path:
     """The path of a plain model, given or of another cell. Raises InputError if that cell failed."""
     place = _place(folder, path)
     if not os.path.isabs(path) and not place.exists():
-        failure = failure_of(folder.parent / Path(path).parts[1])
-        raise InputError(failure.message if failure else f"{place}: the plain model was not fitted")
+        raise InputError(error_of(folder.parent / Path(path).parts[1]))
     return place
 
 

@@ -7,7 +7,6 @@ from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
 from rich.console import Console
@@ -20,10 +19,9 @@ from keyss.files.atomic import lock, write_bytes
 from keyss.keys.generation import generate_key
 from keyss.keys.key_file import read_key_file
 from keyss.keys.master import MasterKey
-from keyss.many.cell import CELL, FAILED, LOG, Cell, Failure, Result, failure_of, result_of
-from keyss.many.cluster import Cluster
-from keyss.many.processes import Processes, Resources
-from keyss.many.worker import REFUSED, attempt
+from keyss.many.cell import CELL, FAILED, LOG, Cell, Result, error_of, result_of
+from keyss.many.engines import Cluster, Engine, InThisProcess, Processes, Resources
+from keyss.many.worker import REFUSED
 from keyss.progress import Reporter, clock
 from keyss.runs.folder import check_not_published
 from keyss.runs.records import record_bytes
@@ -43,16 +41,8 @@ class Outcome:
     name: str
     folder: Path
     result: Result | None  # None: it failed
-    failure: Failure | None
+    error: str | None  # the reason for a missing result
     skipped: bool = False  # was done before
-
-    @property
-    def error(self) -> str | None:
-        """The reason for a missing result."""
-        if self.result is not None:
-            return None
-        died = f"its process died repeatedly; see {self.folder / LOG}"
-        return self.failure.message if self.failure else died
 
 
 @dataclass(frozen=True)
@@ -65,27 +55,6 @@ class ManyResult:
     @property
     def failed(self) -> tuple[Outcome, ...]:
         return tuple(each for each in self.outcomes if each.result is None)
-
-
-class InThisProcess:
-    """Runs one cell after the other, with a reporter."""
-
-    jobs, closed = 1, False
-
-    def __init__(self, reporter: Reporter) -> None:
-        self.reporter = reporter
-
-    def attempt(self, name: str, folder: Path, memory: int) -> int:
-        """As `Processes.attempt`."""
-        from keyss.many.performing import perform
-
-        return attempt(folder, partial(perform, reporter=self.reporter), log=False)
-
-    def close(self) -> None:
-        pass
-
-
-Engine = Processes | Cluster | InThisProcess
 
 
 @contextmanager
@@ -159,16 +128,12 @@ def run_cells(
             _Run(title, len(every), len(every) - len(due), engine, retries).do(due)
         finally:
             engine.close()
-    return [
-        Outcome(
-            cell.name,
-            folder,
-            result or result_of(folder, cell.measures),
-            failure_of(folder),
-            result is not None,
-        )
-        for (cell, folder), result in zip(every, before, strict=True)
-    ]
+    outcomes = []
+    for (cell, folder), skipped in zip(every, before, strict=True):
+        result = skipped or result_of(folder, cell.measures)
+        error = error_of(folder) if result is None else None
+        outcomes.append(Outcome(cell.name, folder, result, error, skipped is not None))
+    return outcomes
 
 
 class _Run:
@@ -222,8 +187,7 @@ class _Run:
             if status == 0:
                 return self._end(f"{cell.name}: done in {clock(time.monotonic() - since)}")
             if status == REFUSED:
-                failure = failure_of(folder)
-                return self._end(f"{cell.name}: failed: {failure.message if failure else 'unknown'}")
+                return self._end(f"{cell.name}: failed: {error_of(folder)}")
             if number < self.retries:
                 self._say(f"{cell.name}: its process died ({how}): it is tried again")
         self._end(f"{cell.name}: its process died ({how}): given up; see {folder / LOG}")

@@ -82,8 +82,8 @@ def write_tables(out: Path, cells: Sequence[CellNumbers]) -> list[str]:
         for cell in cells
         for measure, value in sorted(cell.numbers.items())
     ]
-    write_bytes(out / "results.csv", _csv(results))
-    write_bytes(out / "cells.csv", _csv(rows))
+    write_bytes(out / "results.csv", csv_bytes(results))
+    write_bytes(out / "cells.csv", csv_bytes(rows))
     written = ["results.csv", "cells.csv"]
     try:
         write_bytes(out / "results.parquet", _parquet(results))
@@ -99,14 +99,15 @@ def markdown_rows(rows: Sequence[Sequence[str]]) -> list[str]:
     return [f"| {line} |" for line in lines]
 
 
-def _csv(rows: Sequence[Mapping[str, Any]]) -> bytes:
+def csv_bytes(rows: Sequence[Mapping[str, Any]]) -> bytes:
+    """Rows by the names of columns, which are those of the first; NaN is empty."""
     text = io.StringIO()
     if rows:
         writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
         writer.writeheader()
         for row in rows:
             writer.writerow({name: _shown(value) for name, value in row.items()})
-    return text.getvalue().encode()
+    return text.getvalue().encode("utf-8", "backslashreplace")
 
 
 def _parquet(rows: Sequence[Mapping[str, Any]]) -> bytes:

@@ -60,7 +60,7 @@ def attempt(folder: Path, perform: Callable[[Cell, Path], Result], *, log: bool 
             result = perform(cell, folder)
         except KeyssError as error:
             say(f"error: {error}")
-            write_bytes(folder / FAILED, record_bytes(Failure(status=error.exit_status, message=str(error))))
+            write_bytes(folder / FAILED, record_bytes(Failure(message=str(error))))
             return REFUSED
         write_bytes(folder / RESULT, record_bytes(result))
         say(f"done in {result.seconds:.1f} s")

@@ -1,21 +1,17 @@
-"""Names of the files in a folder of results, and writers for them."""
+"""Names of the files in a folder of results."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
 
 from keyss.channels import SUFFIXES, suffix_of
 from keyss.core.decoded import DecodedGaussians
 from keyss.core.errors import InputError
 from keyss.core.gaussians import Gaussians
-from keyss.files.atomic import write_bytes
-from keyss.files.models import DECODED_SUFFIX, write_model
+from keyss.files.models import DECODED_SUFFIX
 from keyss.methods.handed import SUFFIX
 from keyss.runs.folder import PRIVATE, PUBLISH
-from keyss.runs.records import record_bytes
 
 STEGO = f"{PUBLISH}/stego.ply"
 # In any format.
@@ -85,15 +81,3 @@ def bound_names(secrets: int) -> list[str]:
 def handed_names(secrets: int) -> list[str]:
     """Files to hand over for the secrets, with methods that need them."""
     return [f"{HANDED}/secret-{index}{SUFFIX}" for index in range(1, secrets + 1)]
-
-
-def writers(contents: Mapping[str, Any]) -> dict[str, Callable[[Path], None]]:
-    """Writers for `RunFolder.write` of models, bytes and records, by name."""
-    return {name: _writer(content) for name, content in contents.items()}
-
-
-def _writer(content: Any) -> Callable[[Path], None]:
-    if isinstance(content, Gaussians):
-        return lambda path: write_model(path, content)
-    data = content if isinstance(content, bytes) else record_bytes(content)
-    return lambda path: write_bytes(path, data)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 import shutil
 import time
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
@@ -20,7 +20,9 @@ import msgspec
 
 from keyss._version import __version__
 from keyss.core.errors import InputError, OutputError, UsageError
-from keyss.files.atomic import check_not_an_input, held_by, lock, public_mode
+from keyss.core.gaussians import Gaussians
+from keyss.files.atomic import check_not_an_input, held_by, lock, public_mode, write_bytes
+from keyss.files.models import write_model
 from keyss.runs.records import read_record, write_record
 
 PUBLISH, PRIVATE = "publish", "private"
@@ -172,27 +174,28 @@ class RunFolder:
             folder.mkdir(exist_ok=True, mode=0o700)
         return folder
 
-    def write(self, writers: Mapping[str, Callable[[Path], None]]) -> Path:
-        """Call each writer with a path to write a file or a folder to; returns the folder that holds them.
+    def write(self, contents: Mapping[str, Any]) -> Path:
+        """Write models, bytes and records, or call functions with a path; returns the folder that holds them.
 
-        Names are paths in the run's folder, where the files appear at the end. Raises OutputError.
+        Names are paths in the run's folder, where the files appear at the end. A function may write a folder.
+        Raises OutputError.
         """
         staging = self.path / _STAGING
         with _os_errors(self.path):
-            for name, write in writers.items():
+            for name, content in contents.items():
                 _refuse_foreign(self.path, name)
                 _make_parents(self.path, f"{_STAGING}/{name}")
-                write(staging / name)
+                _write(staging / name, content)
                 written = [staging / name]
                 if written[0].is_dir():
                     written = sorted(path for path in written[0].rglob("*") if path.is_file())
                 self._names += [str(path.relative_to(staging)) for path in written]
         return staging
 
-    def keep(self, stage: str, name: str, write: Callable[[Path], None]) -> None:
+    def keep(self, stage: str, name: str, content: Any) -> None:
         """Write a file of another stage, which stays even if this stage fails. Raises OutputError."""
         with _os_errors(self.path):
-            _write_listed(self.path, stage, name, write)
+            _write_listed(self.path, stage, name, content)
 
     def _finish(self) -> None:
         manifest = read_manifest(self.path)
@@ -264,12 +267,12 @@ def clear(folder: Path) -> None:
         _remove_empty(folder)
 
 
-def write_again(folder: Path, stage: str, name: str, write: Callable[[Path], None]) -> None:
+def write_again(folder: Path, stage: str, name: str, content: Any) -> None:
     """Replace a file of a finished stage. Raises OutputError, also if a process is at work in the folder."""
     with _os_errors(folder):
         _make_private(folder)
         with lock(folder / _LOCK):
-            _write_listed(folder, stage, name, write)
+            _write_listed(folder, stage, name, content)
 
 
 def read_manifest(folder: Path) -> Manifest:
@@ -313,7 +316,19 @@ def _drop_unfinished(folder: Path, manifest: Manifest) -> None:
         shutil.rmtree(folder / name, ignore_errors=True)
 
 
-def _write_listed(folder: Path, stage: str, name: str, write: Callable[[Path], None]) -> None:
+def _write(path: Path, content: Any) -> None:
+    """Write a model, bytes or a record, or let a function write."""
+    if callable(content):
+        content(path)
+    elif isinstance(content, Gaussians):
+        write_model(path, content)
+    elif isinstance(content, bytes):
+        write_bytes(path, content)
+    else:
+        write_record(path, content)
+
+
+def _write_listed(folder: Path, stage: str, name: str, content: Any) -> None:
     """Write a file, and list it in the manifest first."""
     _refuse_foreign(folder, name)
     manifest = read_manifest(folder)
@@ -321,7 +336,7 @@ def _write_listed(folder: Path, stage: str, name: str, write: Callable[[Path], N
         files = {**manifest.files, stage: (*manifest.files.get(stage, ()), name)}
         write_record(folder / MANIFEST, replace(manifest, files=files))
     _make_parents(folder, name)
-    write(folder / name)
+    _write(folder / name, content)
 
 
 def _make_private(folder: Path) -> None:
