@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from cli.said import COMMANDS, PROGRAM, Run
-from keyss.cli import characters, main
+from keyss.cli import main, process
 from keyss.files import read_model
 
 NARROW = ["ascii", "cp1252", *(pytest.param(name, marks=pytest.mark.slow) for name in ("latin-1", "cp437"))]
@@ -106,14 +106,14 @@ def test_help_and_errors_in_any_encoding(encoding: str) -> None:
 @pytest.mark.parametrize("command", COMMANDS)
 def test_help_is_made_of_characters_with_a_likeness_in_ascii(keyss: Run, command: str) -> None:
     said = keyss(command, "--help").out
-    assert said.encode("ascii", characters.REPLACING).count(b"?") == said.count("?")
+    assert said.encode("ascii", process.REPLACING).count(b"?") == said.count("?")
 
 
 def test_what_cannot_be_shown_is_replaced() -> None:
-    assert "╭ • 7 ≤ 8…".encode("ascii", characters.REPLACING) == b"+ * 7 <= 8..."
-    assert "ä鍵".encode("cp1252", characters.REPLACING) == b"\xe4?"
+    assert "╭ • 7 ≤ 8…".encode("ascii", process.REPLACING) == b"+ * 7 <= 8..."
+    assert "ä鍵".encode("cp1252", process.REPLACING) == b"\xe4?"
     assert (
-        os.fsdecode(b"\xff.ply").encode("utf-8", characters.REPLACING) == b"\xff.ply"
+        os.fsdecode(b"\xff.ply").encode("utf-8", process.REPLACING) == b"\xff.ply"
     )  # a file's name as it is
 
 
@@ -135,7 +135,7 @@ def test_json_is_json_in_any_encoding(
     keyss: Run, world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, encoding: str
 ) -> None:
     shutil.copytree(world / "b", tmp_path / "ä鍵")
-    stream = io.TextIOWrapper(io.BytesIO(), encoding, characters.REPLACING)
+    stream = io.TextIOWrapper(io.BytesIO(), encoding, process.REPLACING)
     monkeypatch.setattr("sys.stdout", stream)
     assert main(["info", str(tmp_path / "ä鍵"), "--json"]) == 0
     assert json.loads(stream.buffer.getvalue().decode(encoding))["name"] == "ä鍵"  # type: ignore[attr-defined]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
+import time
 import warnings
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
@@ -13,7 +14,6 @@ from typing import Any
 from keyss import __version__
 from keyss.cli import ranks
 from keyss.cli.flags import as_flags, options_of
-from keyss.cli.verbosity import verbosity
 from keyss.core.errors import (
     BackendError,
     Interrupted,
@@ -29,6 +29,7 @@ BROKEN_PIPE = 141  # 128 + SIGPIPE, as a shell counts
 OUT_OF_MEMORY = 8
 INTERNAL_ERROR = 70  # EX_SOFTWARE
 NO_ROOM = OutputError.exit_status
+_LEVELS = {"-q": -1, "--quiet": -1, "-v": 1, "--verbose": 1}
 _KEY_OPTIONS = ("--key", "--keys", "--password", "--passphrase")  # that people may expect
 
 
@@ -41,7 +42,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     options: set[str] = set()  # of the command, by their names in Python
     try:
-        with ranks.only_first_prints(), _warnings_as_lines(options), verbosity(arguments) as asked:
+        with ranks.only_first_prints(), _warnings_as_lines(options), _verbosity(arguments) as asked:
             try:
                 _run(asked or ["--help"], options)
             finally:
@@ -154,6 +155,41 @@ def _warnings_as_lines(options: Collection[str]) -> Iterator[None]:
 
         warnings.showwarning = show
         yield
+
+
+@contextmanager
+def _verbosity(arguments: Sequence[str]) -> Iterator[list[str]]:
+    """`arguments` without -q and -v. With -v, prints time and memory unless the context ends by an error."""
+    asked = [_LEVELS[word] for word in arguments if word in _LEVELS]
+    if not asked:  # without importing what shows progress
+        yield list(arguments)
+        return
+
+    from keyss import progress
+
+    before, start = progress.level, time.monotonic()
+    progress.level = asked[-1]
+    try:
+        yield [word for word in arguments if word not in _LEVELS]
+        if progress.level > 0:
+            print(f"keyss: done in {time.monotonic() - start:.1f} s{_memory()}", file=sys.stderr)
+    finally:
+        progress.level = before
+
+
+def _memory() -> str:
+    """The peak memory of this process and of the largest one that it started, if the system knows."""
+    try:
+        import resource
+    except ImportError:
+        return ""
+    unit = 1 if sys.platform == "darwin" else 1024
+    own, others = (
+        f"{resource.getrusage(whose).ru_maxrss * unit / 1e6:,.0f} MB"
+        for whose in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
+    )
+    besides = f", and {others} in another process" if others != "0 MB" else ""
+    return f", with at most {own} of memory{besides}"
 
 
 def _interrupt_behind(error: BaseException | None) -> KeyboardInterrupt | None:

@@ -8,6 +8,7 @@ This module imports little, installs signal handlers before anything else is imp
 from __future__ import annotations
 
 import atexit
+import codecs
 import io
 import os
 import signal
@@ -18,6 +19,23 @@ from typing import Any, NoReturn
 _SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP")  # Windows has no SIGHUP
 _IMPORTING = "<frozen importlib._bootstrap>"
 _CLEAR_LINE = b"\r\x1b[K\x1b[?25h"  # and show the cursor, which progress lines hide
+REPLACING = "keyss.replacing"  # a handler of encoding errors
+# For characters that an output cannot encode, such as one in ASCII or an old code page.
+_PLAIN = {
+    **dict.fromkeys("•·×", "*"),
+    **dict.fromkeys("─━╸╺╴╶—–−", "-"),
+    **dict.fromkeys("│┃╎", "|"),
+    **dict.fromkeys("╭╮╰╯┌┐└┘├┤┬┴┼", "+"),
+    **dict.fromkeys("‘’", "'"),
+    **dict.fromkeys("“”", '"'),
+    "…": "...",
+    "≤": "<=",
+    "≥": ">=",
+    "±": "+-",
+    "≈": "~",
+    "→": "->",
+    "\N{NO-BREAK SPACE}": " ",
+}
 
 
 def main() -> NoReturn:
@@ -117,6 +135,17 @@ def prepare_streams() -> None:
         sys.stdout = open(1, "w", closefd=False)  # noqa: SIM115
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
-            from keyss.cli.characters import REPLACING
-
             stream.reconfigure(errors=REPLACING)
+
+
+def _replace(error: UnicodeError) -> tuple[str | bytes, int]:
+    """A similar character or `?`; undecodable bytes of a file name stay as they are."""
+    if not isinstance(error, UnicodeEncodeError):
+        raise error
+    first = error.object[error.start]
+    if "\udc80" <= first <= "\udcff":
+        return bytes([ord(first) - 0xDC00]), error.start + 1
+    return _PLAIN.get(first, "?"), error.start + 1
+
+
+codecs.register_error(REPLACING, _replace)

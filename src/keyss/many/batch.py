@@ -22,7 +22,6 @@ from keyss.many.assets import Asset, read_assets
 from keyss.many.cell import CELL, RESULT, Cell
 from keyss.many.running import (
     CELLS,
-    PRIVATE,
     RETRIES,
     ManyResult,
     Outcome,
@@ -35,6 +34,7 @@ from keyss.methods import registry
 from keyss.methods.base import MethodOptions
 from keyss.rendering import Backend
 from keyss.rendering.orbit import is_model
+from keyss.runs.folder import PRIVATE
 from keyss.runs.records import read_record
 from keyss.runs.sources import PathLike
 

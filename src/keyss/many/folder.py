@@ -106,22 +106,18 @@ class CellFolder:
 
     def forecast(self) -> Forecast:
         """The plan of each cell. Writes nothing."""
-        plans: dict[str, CellPlan] = {}
+        known: dict[str, CellPlan] = {}  # of cells that differ in seeds only
         found = []
         for place, cell in self.cells.items():
             own = CellPlan(cell.name, place.name, result_of(place, cell.measures) is not None)
             if not own.done:
                 fit = {**cell.options, **cell.options.get("fit", {}), "fit": None, "seed": None}
                 alike = repr((cell.inputs, cell.method, fit))
-                if alike not in plans:
-                    plans[alike] = _planned(cell, place, own)
-                own = replace(plans[alike], name=own.name, id=own.id)
+                try:
+                    planned = known.get(alike) or replace(own, plan=plan_of(cell, place))
+                except KeyssError as error:
+                    planned = replace(own, refused=str(error))
+                known[alike] = planned
+                own = replace(planned, name=own.name, id=own.id)
             found.append(own)
         return Forecast(tuple(found))
-
-
-def _planned(cell: Cell, place: Path, own: CellPlan) -> CellPlan:
-    try:
-        return replace(own, plan=plan_of(cell, place))
-    except KeyssError as error:
-        return replace(own, refused=str(error))

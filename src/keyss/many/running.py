@@ -23,10 +23,10 @@ from keyss.many.cell import CELL, FAILED, LOG, Cell, Result, error_of, result_of
 from keyss.many.engines import Cluster, Engine, InThisProcess, Processes, Resources
 from keyss.many.worker import REFUSED
 from keyss.progress import Reporter, clock
-from keyss.runs.folder import check_not_published
+from keyss.runs.folder import PRIVATE, check_not_published, make_private
 from keyss.runs.records import record_bytes
 
-PRIVATE, CELLS = "private", "cells"
+CELLS = "cells"
 MASTER_KEY = f"{PRIVATE}/master-key.txt"
 RETRIES = 2  # of a cell whose process died
 _CHECK = f"{PRIVATE}/master-key-check.txt"
@@ -71,15 +71,6 @@ def claimed(out: Path, mode: int = 0o700) -> Iterator[None]:
     make_private(out / PRIVATE)
     with lock(out / PRIVATE / "lock"):
         yield
-
-
-def make_private(folder: Path) -> None:
-    """Create a folder that only its owner can read. Raises OutputError."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True, mode=0o700)
-        folder.chmod(0o700)
-    except OSError as error:
-        raise OutputError(f"cannot write {folder}: {error.strerror}") from error
 
 
 def settle_master_key(out: Path, given: Path | None) -> None:

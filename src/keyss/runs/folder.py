@@ -146,7 +146,7 @@ class RunFolder:
         try:
             with _os_errors(self.path):
                 self.path.mkdir(parents=True, exist_ok=True)
-                _make_private(self.path)
+            make_private(self.path / PRIVATE)
             with lock(self.path / _LOCK):
                 manifest = read_manifest(self.path)  # again: from now on, no other process changes it
                 if not self._resumes:
@@ -269,10 +269,9 @@ def clear(folder: Path) -> None:
 
 def write_again(folder: Path, stage: str, name: str, content: Any) -> None:
     """Replace a file of a finished stage. Raises OutputError, also if a process is at work in the folder."""
-    with _os_errors(folder):
-        _make_private(folder)
-        with lock(folder / _LOCK):
-            _write_listed(folder, stage, name, content)
+    make_private(folder / PRIVATE)
+    with _os_errors(folder), lock(folder / _LOCK):
+        _write_listed(folder, stage, name, content)
 
 
 def read_manifest(folder: Path) -> Manifest:
@@ -339,10 +338,11 @@ def _write_listed(folder: Path, stage: str, name: str, content: Any) -> None:
     _write(folder / name, content)
 
 
-def _make_private(folder: Path) -> None:
-    """Make `private/`, or take away the access of others to it."""
-    (folder / PRIVATE).mkdir(mode=0o700, exist_ok=True)
-    (folder / PRIVATE).chmod(0o700)
+def make_private(folder: Path) -> None:
+    """Make a folder, or take away the access of others to it. Raises OutputError."""
+    with _os_errors(folder):
+        folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+        folder.chmod(0o700)
 
 
 def _make_parents(folder: Path, name: str) -> None:
