@@ -16,7 +16,7 @@ import torch
 from keyss.api.asking import HideResult, Secret, method_for, sources_of
 from keyss.api.filing import hide_files
 from keyss.api.together import begun, together
-from keyss.channels import AnyChannel, Payload, Publish
+from keyss.channels import AnyChannel, Publish
 from keyss.core.errors import QualityError, UsageError
 from keyss.core.gaussians import Gaussians, same_bits
 from keyss.core.scene import Scene, ViewOptions
@@ -232,21 +232,17 @@ def _entropy(keys: Sequence[str], options: MethodOptions, plain: Sequence[Gaussi
     return hashlib.sha256(b"".join(hashlib.sha256(each).digest() for each in parts)).digest()
 
 
-def _handed_files(payloads: Sequence[Payload], keys: Sequence[str]) -> dict[str, bytes]:
-    """The files to hand over, by their names in the run's folder."""
-    packed = [pack(payload, key or None) for payload, key in zip(payloads, keys, strict=bool(payloads))]
-    return dict(zip(handed_names(len(packed)), packed, strict=True))
-
-
 def _as_read(stego: Stego, keys: Sequence[str], folder: RunFolder | None) -> list[Gaussians]:
     """The stego model and the secrets, from the files that are given away."""
-    model, handed = stego.gaussians, _handed_files(stego.handed, keys)
+    model, given = stego.gaussians, bool(stego.handed)
+    packed = [pack(payload, key or None) for payload, key in zip(stego.handed, keys, strict=given)]
     if folder:
+        handed = dict(zip(handed_names(len(packed)), packed, strict=True))
         name = stego_name(model)
         model = read_model(folder.write({name: model, **handed}) / name)
     opened: Sequence[Opened]
-    if handed:
-        opened = [open_handed(data, key or None) for data, key in zip(handed.values(), keys, strict=True)]
+    if packed:
+        opened = [open_handed(data, key or None) for data, key in zip(packed, keys, strict=True)]
     elif stego.verified and same_bits(model, stego.gaussians):
         opened = stego.opened  # the same bits were opened before
     else:

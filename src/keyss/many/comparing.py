@@ -70,7 +70,9 @@ def compare(
     if is_model(cover) or is_model(secret):
         raise UsageError("comparing takes scenes, folders of photos: models have none to compare with")
     chosen = {name: _named(name) for name in methods or EVERY}
-    fit = _budget(next(iter(chosen.values())).fit, iterations, max_gaussians, seed)
+    sizes = {"iterations": iterations, "max_gaussians": max_gaussians}
+    asked = {name: size for name, size in sizes.items() if size is not None}
+    fit = replace(next(iter(chosen.values())).fit, seed=seed, **asked)
     scenes = [os.path.realpath(cover), os.path.realpath(secret)]
     folder = CellFolder(Path(out), common={"views": ViewOptions(width), "device": device})
     places = _places(folder, scenes, chosen, fit)
@@ -124,12 +126,6 @@ def _places(
         models = [folder.plain(*each) for each in zip(scenes, plain, strict=True)]
         found[name] = folder.hiding(name, scenes, options, models, measures=MEASURES, controls=controls)
     return found
-
-
-def _budget(fit: FitConfig, iterations: int | None, max_gaussians: int | None, seed: int) -> FitConfig:
-    """Raises UsageError."""
-    given = {"iterations": iterations, "max_gaussians": max_gaussians, "seed": seed}
-    return replace(fit, **{name: each for name, each in given.items() if each is not None})
 
 
 def _named(text: str) -> MethodOptions:
