@@ -27,7 +27,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
 from keyss import read_model, write_model
 from channels.low_bits.trained_like import trained_like
-from keyss.channels import LOW_BITS, usable_carriers
+from keyss.channels import LowBitsRoom, usable_carriers
 from keyss.core import Gaussians, KeyssError, Scene
 from keyss.core.pruning_compensation import compensate_pruning
 from keyss.files.scenes import load_scene
@@ -65,7 +65,7 @@ def _capacities() -> None:
     print("Gaussians that fit in 100,000 carriers, by SH degree of the secret (0, 1, 2, 3):")
     for degree in range(4):
         fits = [
-            LOW_BITS.room(100_000, degree).record_capacity([record_request(1, other)]) for other in range(4)
+            LowBitsRoom.of(100_000, degree).record_capacity([record_request(1, other)]) for other in range(4)
         ]
         print(f"  cover of degree {degree}: " + ", ".join(f"{number:,}" for number in fits))
 

@@ -76,18 +76,18 @@ def rows(cover: tuple[str, Gaussians], secret: tuple[str, Gaussians], data: Path
         model = in_morton_order(cover[1])
         untouched = format_.quantise(model).dequantise()
         start = time.monotonic()
-        room = CodesChannel(name).prepare(cover[1])
-        left = room.capacity - room.overhead
+        prepared = CodesChannel(name).prepare(cover[1])
+        left = prepared.room.capacity - prepared.room.overhead
         kept = pruned(own, left)
         encoded = fitted(kept, left)
-        stego = room.embed([(KEY, Payload("carry", encoded))])
+        stego = prepared.embed([(KEY, Payload("carry", encoded))])
         file = stego.codes.serialise()
         hiding = time.monotonic() - start
         start = time.monotonic()
         opened = whole.decode(CodesReader.of(format_.parse(file)).open(KEY).data)
         revealing = time.monotonic() - start
-        bits = 8 * room.size / len(model)
-        most = room.size * 8 / (8 * len(whole.encode(kept)) / len(kept)) / len(model)
+        bits = 8 * prepared.size / len(model)
+        most = prepared.size * 8 / (8 * len(whole.encode(kept)) / len(kept)) / len(model)
         in_format = format_.quantise(in_morton_order(kept)).dequantise()
         numbers = [
             *(against_photos(each, scenes[0]) for each in (untouched, stego)),
@@ -114,7 +114,7 @@ def attributes(name: str, model: Gaussians) -> None:
             free = [each & one for each, one in zip(cover.free, own, strict=True)]
             bits = sum(each.room for each, one in zip(cover.fields, own, strict=True) if one) / len(model)
             # Others may not change: too few are free to hold anything, so the bits that are get noise.
-            noise = np.random.default_rng(0).integers(0, 2, cover.room.bits).astype(np.uint8)
+            noise = np.random.default_rng(0).integers(0, 2, cover.zones.bits).astype(np.uint8)
             changed = replace(cover, codes=replace(cover, free=free)._written(noise, os.urandom(32))).cover
             found.append(f"{attribute} {bits:.1f} bits {psnr_between(untouched, changed):.1f} dB")
         print(f"{name}, {format_name}: {', '.join(found)}", flush=True)
@@ -130,7 +130,7 @@ def files(folder: Path, format_name: str, models: list[str]) -> None:
         plain, stego = (
             folder / f"{Path(path).stem}-{kind}{SUFFIXES[format_name]}" for kind in ("plain", "stego")
         )
-        payload = Payload("carry", os.urandom(cover.capacity * 9 // 10))
+        payload = Payload("carry", os.urandom(cover.room.capacity * 9 // 10))
         write_model(plain, read_model(path))
         write_model(stego, cover.embed([(KEY, payload)]))
         found.append(f"{scene}={plain}:{stego}")

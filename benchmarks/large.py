@@ -133,12 +133,12 @@ def _step(step: str, folder: Path, options: argparse.Namespace) -> None:
             prepared = LOW_BITS.prepare(cover)
             if options.prune:
                 secret = most_visible(
-                    secret, prepared.record_capacity([record_request(hidden, secret.sh_degree)])
+                    secret, prepared.cells.record_capacity([record_request(hidden, secret.sh_degree)])
                 )
         else:
             prepared = options.place.prepare(cover)
             if options.prune:
-                secret = pruned(secret, prepared.capacity - prepared.overhead)
+                secret = pruned(secret, prepared.room.capacity - prepared.room.overhead)
         write_model(published, embed_models(prepared, [KEY], [secret]).gaussians)
     else:
         revealed = reveal_model(read_model(published), KEY, device=torch.device("cpu")).gaussians

@@ -169,7 +169,7 @@ def test_pruning_a_carried_model_costs_what_it_must() -> None:
     """A Gaussian of the secret is lost with its carrier, unless there is a copy on another."""
     cover, secret, share = trained_like(3000), trained_like(1200, seed=1), 0.25
     stego = embed(cover, [(KEY, secret)])
-    (layout,) = LOW_BITS.prepare(cover).plan_records([record_request(1200, 3)])
+    (layout,) = LOW_BITS.prepare(cover).cells.plan_records([record_request(1200, 3)])
     expected = (1200 - layout.copies) * (1 - share) + layout.copies * (1 - share**2)
     left = reveal_changed(opener, random_pruning(share)(stego))
     assert abs(len(left) - expected) < 5 * (1200 * share * (1 - share)) ** 0.5

@@ -13,7 +13,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -90,42 +90,26 @@ def unpack_method(packed: bytes) -> str:
     return packed[:METHOD_BYTES].rstrip(b"\0").decode("ascii")
 
 
-class Room(Protocol):
+@dataclass(frozen=True)
+class Room:
     """How much fits into a cover: exact for a prepared one, estimated for one not fitted yet."""
 
-    @property
-    def carriers(self) -> int:
-        """Gaussians that can carry something."""
-
-    @property
-    def capacity(self) -> int:
-        """Bytes of all payloads together."""
-
-    @property
-    def overhead(self) -> int:
-        """Bytes that a payload takes beside its data, at most."""
-
-    @property
-    def grows(self) -> bool:
-        """True if the model grows with the hidden data, which should be short then."""
+    carriers: int  # Gaussians that can carry something
+    capacity: int  # bytes of all payloads together
+    overhead: int  # bytes that a payload takes beside its data, at most
+    grows: bool = False  # True if the model grows with the hidden data, which should be short then
 
 
-@dataclass(frozen=True)
-class RoomEstimate:
-    """The room in a cover that is not fitted yet."""
-
-    carriers: int
-    capacity: int
-    overhead: int
-    grows: bool = False
-
-
-class PreparedCover(Room, Protocol):
+class PreparedCover(Protocol):
     """A cover whose room in a channel is known before anything else runs."""
 
     @property
     def cover(self) -> Gaussians:
         """The cover."""
+
+    @property
+    def room(self) -> Room:
+        """The room for payloads."""
 
     def embed(self, contents: Sequence[tuple[str, Content]], *, entropy: bytes | None = None) -> Gaussians:
         """The cover with one (key, content) for each secret in it; all contents are payloads, or records.
@@ -164,37 +148,22 @@ class SaltedReader(ABC):
         raise WrongKeyError()
 
 
-class Channel(Protocol):
+class Channel(ABC):
     """A place for bits in a model."""
 
-    @property
-    def name(self) -> str:
-        """`low_bits`, `codes`, `appended` or `colours`."""
+    name: ClassVar[str]  # `low_bits`, `codes`, `appended` or `colours`
+    place: str  # in messages: "low bits", "codes of the spz file" and so on
+    survives: ClassVar[bool] = False  # secrets survive other formats; else the file is passed on unchanged
+    grows: ClassVar[bool] = False  # see `Room`
+    records: ClassVar[bool] = False  # the channel carries records
 
-    @property
-    def place(self) -> str:
-        """The place in messages: "low bits", "codes of the spz file" and so on."""
-
-    @property
-    def survives(self) -> bool:
-        """True if secrets survive conversion to other formats; else the file is passed on unchanged."""
-
-    @property
-    def grows(self) -> bool:
-        """See `Room`."""
-
-    @property
-    def records(self) -> bool:
-        """True if the channel carries records."""
-
+    @abstractmethod
     def prepare(self, cover: Gaussians) -> PreparedCover:
         """Find the carriers. Raises InputError for a cover without room, or none that is unseen.
 
         Raises OutputError for a cover that the format of the published file does not hold.
         """
 
+    @abstractmethod
     def room(self, gaussians: int, sh_degree: int) -> Room:
         """About what fits into a cover with so many Gaussians that can carry something."""
-
-    def reader(self, stego: Gaussians) -> Reader | None:
-        """The reader of a model; None where nothing can be stored."""

@@ -55,23 +55,23 @@ def _readers(stego: Gaussians) -> Iterator[Reader]:
     for reader in (_exact, _appended):
         if own := reader(stego):
             yield own
-    from keyss.channels.colours.channel import COLOURS
+    from keyss.channels.colours.reading import ColoursReader
 
-    yield COLOURS.reader(stego)
+    yield ColoursReader.of(stego)
 
 
 def _exact(stego: Gaussians) -> SaltedReader | None:
     """The reader of bits that only the very file has: codes of a coded file, else low bits."""
     if isinstance(stego, CodedGaussians):
-        from keyss.channels.codes.channel import CodesChannel
+        from keyss.channels.codes.channel import CodesReader
 
-        return CodesChannel("spz").reader(stego)  # of codes of any format
-    from keyss.channels.low_bits.channel import LOW_BITS
+        return CodesReader.of(stego.codes)
+    from keyss.channels.low_bits.reading import LowBitsReader
 
-    return LOW_BITS.reader(stego)
+    return LowBitsReader.of(stego)
 
 
 def _appended(stego: Gaussians) -> SaltedReader | None:
-    from keyss.channels.appended.channel import APPENDED
+    from keyss.channels.appended.channel import AppendedReader
 
-    return APPENDED.reader(stego)
+    return AppendedReader.of(stego)

@@ -33,7 +33,8 @@ def encrypted_bytes(data: bytes) -> int:
 @given(data=st.data())
 def test_any_payloads_of_any_sizes(suffix: str, data: st.DataObject) -> None:
     cover = CodesCover.of(codes_of(suffix, 3000))
-    sizes = data.draw(st.lists(st.integers(0, cover.capacity // 4), min_size=1, max_size=cover.room.slots))
+    some = st.integers(0, cover.room.capacity // 4)
+    sizes = data.draw(st.lists(some, min_size=1, max_size=cover.zones.slots))
     rng = np.random.default_rng(data.draw(st.integers(0, 99)))
     payloads = [rng.bytes(size) for size in sizes]
     fits = sum(map(encrypted_bytes, payloads)) <= cover.size
@@ -127,7 +128,7 @@ def test_equal_inputs_give_equal_files_and_others_no_salt_in_common(suffix: str)
 def test_damage_is_told_from_a_wrong_key(suffix: str) -> None:
     """But for the few bits that hold salt and slots, or nothing."""
     cover = CodesCover.of(codes_of(suffix))
-    data = np.random.default_rng(0).bytes(cover.capacity * 9 // 10)
+    data = np.random.default_rng(0).bytes(cover.room.capacity * 9 // 10)
     file = written(cover, data)
     damaged = 0
     for row in range(0, 6000, 400):
@@ -149,7 +150,7 @@ def test_equal_keys_no_secrets_and_too_many() -> None:
         with pytest.raises(UsageError, match="each with its own"):
             cover.embed(secrets)
     with pytest.raises(UsageError, match="secrets, got"):
-        cover.embed([(str(i), payload) for i in range(cover.room.slots + 1)])
+        cover.embed([(str(i), payload) for i in range(cover.zones.slots + 1)])
     with pytest.raises(ValueError, match="32 bytes"):
         cover.embed([("key", payload)], entropy=b"short")
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from keyss.channels import COLOURS, Payload, PreparedCover
+from keyss.channels import COLOURS, ColoursReader, Payload, PreparedCover
 from keyss.core import Gaussians
 from measure.lifelike import lifelike
 
@@ -24,7 +24,7 @@ def embed(
 
 
 def extract(stego: Gaussians, key: str) -> bytes:
-    reader = COLOURS.reader(stego)
+    reader = ColoursReader.of(stego)
     assert reader is not None
     content = reader.open(key)
     assert isinstance(content, Payload)

@@ -37,7 +37,7 @@ def embed_contents(
 
 
 def extract(stego: Gaussians, key: str) -> bytes:
-    return _data(LOW_BITS.reader(stego).open(key))
+    return _data(LowBitsReader.of(stego).open(key))
 
 
 def extract_derived(stego: Gaussians | LowBitsReader, key: DerivedKey) -> bytes:

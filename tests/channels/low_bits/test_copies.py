@@ -17,7 +17,7 @@ KEY = "the right key"
 
 def _carried(cover: Gaussians, count: int) -> Gaussians:
     prepared = LOW_BITS.prepare(cover)
-    (plan,) = prepared.plan_records([RecordRequest(count, 33, 10)])
+    (plan,) = prepared.cells.plan_records([RecordRequest(count, 33, 10)])
     data = torch.randint(256, (count, plan.record_bytes), dtype=torch.uint8).numpy()
     records = Records("test", bytes(10), data, plan, torch.arange(plan.copies).numpy())
     return embed_contents(prepared, [(keys(1), records)])

@@ -23,7 +23,7 @@ def _seen(own: int, others: Sequence[int], draw: int) -> dict[str, float]:
     """What the holder of the first key sees."""
     prepared = LOW_BITS.prepare(trained_like(COVER, seed=draw))
     counts = [own, *others]
-    plans = prepared.plan_records([RecordRequest(count, 20, HEADER) for count in counts])
+    plans = prepared.cells.plan_records([RecordRequest(count, 20, HEADER) for count in counts])
     contents = []
     for index, (count, plan) in enumerate(zip(counts, plans, strict=True)):
         data = np.frombuffer(os.urandom(count * plan.record_bytes), np.uint8).reshape(count, -1)

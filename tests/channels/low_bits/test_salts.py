@@ -11,7 +11,7 @@ import torch
 
 from channels.low_bits.payloads import embed, embed_derived, extract_derived
 from channels.low_bits.trained_like import keys, trained_like
-from keyss.channels import LOW_BITS, LowBitsReader, identities, read_low_bits, salt_rows, usable_carriers
+from keyss.channels import LowBitsReader, identities, read_low_bits, salt_rows, usable_carriers
 from keyss.core import Gaussians, InputError, KeyssWarning, WrongKeyError
 
 
@@ -60,11 +60,11 @@ def test_a_cover_with_stale_salts_opens_from_what_pruning_leaves() -> None:
     cover = planted(1)
     with pytest.warns(KeyssWarning, match="decoy"):
         stego = embed(cover, [("a key", b"secret")], os.urandom(32))
-    reader = LOW_BITS.reader(stego)
+    reader = LowBitsReader.of(stego)
     assert reader.open("a key").data == b"secret"  # type: ignore[union-attr]
     order = torch.randperm(len(stego), generator=torch.Generator().manual_seed(1))
     pruned = stego[order[: len(stego) * 3 // 4]]
-    assert LOW_BITS.reader(pruned).open("a key").data == b"secret"  # type: ignore[union-attr]
+    assert LowBitsReader.of(pruned).open("a key").data == b"secret"  # type: ignore[union-attr]
 
 
 def test_salts_of_ordinary_models_are_fresh() -> None:

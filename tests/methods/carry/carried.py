@@ -31,7 +31,7 @@ def embed_derived(
 
 
 def extract(stego: Gaussians, key: str) -> CarriedSecret:
-    return unpack(LOW_BITS.reader(stego).open(key))
+    return unpack(LowBitsReader.of(stego).open(key))
 
 
 def extract_derived(reader: LowBitsReader, key: DerivedKey) -> CarriedSecret:

@@ -7,7 +7,15 @@ import pytest
 import torch
 
 from channels.low_bits.trained_like import keys, trained_like
-from keyss.channels import LOW_BITS, LowBitsReader, identities, read_low_bits, salt_rows, usable_carriers
+from keyss.channels import (
+    LOW_BITS,
+    LowBitsReader,
+    LowBitsRoom,
+    identities,
+    read_low_bits,
+    salt_rows,
+    usable_carriers,
+)
 from keyss.channels.low_bits.parameters import key_cipher
 from keyss.core import Gaussians, InputError, KeyssWarning, UsageError, WrongKeyError, same_bits
 from keyss.keys import DerivedKey
@@ -151,7 +159,7 @@ def test_shuffling_changes_nothing_and_pruning_loses_one_for_one(
     carried = extract_derived(LowBitsReader.of(pruned), salt_of(pruned, own, stego))
     assert rows_of(carried.gaussians) <= whole
     assert carried.count == len(secret)
-    copies = LOW_BITS.prepare(cover).plan_records([record_request(1200, 3)])[0].copies
+    copies = LOW_BITS.prepare(cover).cells.plan_records([record_request(1200, 3)])[0].copies
     assert 0 < copies <= 300
     expected = 0.75 * (len(secret) - copies) + (1 - 0.25**2) * copies
     assert len(carried.gaussians) == pytest.approx(expected, abs=4 * (0.19 * 1200) ** 0.5)
@@ -166,7 +174,7 @@ def test_cropping_to_half_leaves_half_of_the_secret_everywhere(
     half = stego[stego.means[:, axis] > stego.means[:, axis].median()]
     found = extract_derived(LowBitsReader.of(half), salt_of(half, own, stego)).gaussians
     # Carriers are drawn at random: half of those that are there once is left, and 3 in 4 of those twice.
-    copies = LOW_BITS.prepare(cover).plan_records([record_request(len(secret), 3)])[0].copies
+    copies = LOW_BITS.prepare(cover).cells.plan_records([record_request(len(secret), 3)])[0].copies
     expected = 0.5 * (len(secret) - copies) + 0.75 * copies
     assert len(found) == pytest.approx(expected, abs=4 * (0.25 * len(secret)) ** 0.5)
     assert found.means[:, axis].median() == pytest.approx(float(secret.means[:, axis].median()), abs=0.4)
@@ -228,7 +236,7 @@ def test_too_much_pruning_is_said_to_the_holder_of_the_key_only(cover: Gaussians
 
 def test_layouts_follow_from_a_secret_s_own_size() -> None:
     """Whole carriers up to a fifth of them, halves above; others do not change that while there is room."""
-    room = LOW_BITS.room(90_000, 3)
+    room = LowBitsRoom.of(90_000, 3)
     left = 90_000 - 4 * room.header_carriers(record_request(1, 3).header_bytes)
     small, middle, large = (record_request(count, 3) for count in (16_000, 40_000, 85_000))
     alone = [room.plan_records([each])[0] for each in (small, middle, large)]
@@ -255,20 +263,20 @@ def test_layouts_follow_from_a_secret_s_own_size() -> None:
 
 def test_too_large_a_secret_is_refused_with_the_number_that_fits(cover: Gaussians) -> None:
     prepared = LOW_BITS.prepare(cover)
-    header = LOW_BITS.room(prepared.carriers, 3).header_carriers(record_request(1, 3).header_bytes)
-    fits = 2 * (prepared.carriers - header)
+    header = LowBitsRoom.of(prepared.cells.carriers, 3).header_carriers(record_request(1, 3).header_bytes)
+    fits = 2 * (prepared.cells.carriers - header)
     too_large, small = trained_like(8000, 5), trained_like(500, 6)
-    assert prepared.record_capacity([record_request(8000, 3)]) == fits
+    assert prepared.cells.record_capacity([record_request(8000, 3)]) == fits
     with pytest.raises(UsageError, match=rf"8,000 Gaussians are too many.*{fits:,} would fit"):
         encode_all(prepared, [too_large])
-    place = RecordRoom(len(cover), 3, LOW_BITS.room(prepared.carriers, 3))
+    place = RecordRoom(len(cover), 3, LowBitsRoom.of(prepared.cells.carriers, 3))
     assert place.sizes([SecretSize.of(too_large)]) == [(fits, 3)]
     assert encode_all(prepared, [too_large[:fits]])[0].plan.cells_per_carrier == 2
     kept = place.sizes([SecretSize.of(small), SecretSize.of(too_large)])
     assert kept[0] == (500, 3)
     assert encode_all(prepared, [small, too_large[: kept[1][0]]])
     with pytest.raises(UsageError, match="too small"):
-        RecordRoom(200, 3, LOW_BITS.room(200, 3)).sizes([SecretSize.of(too_large)])
+        RecordRoom(200, 3, LowBitsRoom.of(200, 3)).sizes([SecretSize.of(too_large)])
     assert Table.floor(3).total <= 264
 
 

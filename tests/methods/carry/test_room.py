@@ -12,7 +12,7 @@ import torch
 import keyss
 from channels.low_bits.trained_like import trained_like
 from keyss import CarryOptions, Gaussians, Secret
-from keyss.channels import LOW_BITS, usable_carriers
+from keyss.channels import LowBitsRoom, usable_carriers
 from keyss.core import InputError, KeyssWarning, UsageError
 from keyss.fitting import mean_psnr
 from keyss.methods import Context, RecordRoom, SecretSize, Source, of_degree, registry
@@ -112,7 +112,7 @@ def test_the_cover_keeps_all_but_low_bits_unless_they_are_not_random(quantised: 
 
 
 def test_secrets_get_what_fits_and_no_more_than_they_have() -> None:
-    room = RecordRoom(2000, 3, LOW_BITS.room(1800, 3))
+    room = RecordRoom(2000, 3, LowBitsRoom.of(1800, 3))
     (first, _), (second, _) = room.sizes([SecretSize(1500, 3), SecretSize(9000, 3)])
     # Two records to a Gaussian that carries something, less headers.
     assert 2000 < first + second < 3600
@@ -136,7 +136,7 @@ def test_secrets_that_get_less_because_of_others_are_warned_of() -> None:
 
 @pytest.mark.parametrize(("degree", "expected"), [(1, 0), (2, 3), (3, 3)])
 def test_harmonics_that_a_record_has_room_for(degree: int, expected: int) -> None:
-    assert RecordRoom(2000, degree, LOW_BITS.room(1800, degree)).max_secret_degree == expected
+    assert RecordRoom(2000, degree, LowBitsRoom.of(1800, degree)).max_secret_degree == expected
 
 
 def test_a_secret_loses_harmonics_that_the_cover_has_no_room_for() -> None:

@@ -76,7 +76,7 @@ def test_too_large_secrets_are_refused_or_pruned(run: Run, tmp_path: Path) -> No
     status, _, err = run(*hide, "-o", tmp_path / "out", "--refit", "never")
     assert status == 2
     cover = LOW_BITS.prepare(read_model("cover.ply"))
-    fits = cover.record_capacity([record_request(6000, 3)])
+    fits = cover.cells.record_capacity([record_request(6000, 3)])
     assert 4000 < fits < 4800
     assert f"there is room for {fits:,} of degree 3; --prune-to-fit" in err
     assert not (tmp_path / "out").exists()

@@ -35,7 +35,7 @@ from keyss.channels.appended.lattice import (
     to_gaussians,
 )
 from keyss.channels.appended.packets import NUMBER_BITS, PACKET_BYTES
-from keyss.channels.base import METHOD_BYTES, Content, Payload, RoomEstimate, SaltedReader
+from keyss.channels.base import METHOD_BYTES, Channel, Content, Payload, Room, SaltedReader
 from keyss.channels.payloads import check_keys, pack_payload, randomness, unpack_payload
 from keyss.channels.reed_solomon import MAX_CHUNKS, Codewords
 from keyss.core.errors import KeyssWarning, UsageError, WrongKeyError
@@ -61,28 +61,24 @@ _NOTICED = (
 )
 
 
-class Appended:
+class Appended(Channel):
     """The channel; see `keyss.channels.base.Channel`."""
 
     name = "appended"
     place = "appended Gaussians"
     survives = True
     grows = True
-    records = False
 
     def prepare(self, cover: Gaussians) -> AppendedCover:
         return AppendedCover(cover)
 
-    def room(self, gaussians: int, sh_degree: int) -> RoomEstimate:
-        return RoomEstimate(gaussians, MAX_BYTES, _OVERHEAD, grows=True)
+    def room(self, gaussians: int, sh_degree: int) -> Room:
+        return Room(gaussians, MAX_BYTES, _OVERHEAD, grows=True)
 
     def appended(self, size: int) -> int:
         """Gaussians that a payload of `size` compressed bytes takes, alone in a model."""
         own = packets.HEADERS + _codewords_for(size).chunks
         return own + pilots.count_for(own)
-
-    def reader(self, stego: Gaussians) -> AppendedReader | None:
-        return AppendedReader.of(stego)
 
 
 APPENDED = Appended()
@@ -93,13 +89,10 @@ class AppendedCover:
     """Any cover; see `keyss.channels.base.PreparedCover`."""
 
     cover: Gaussians
-    capacity = MAX_BYTES
-    overhead = _OVERHEAD
-    grows = True
 
     @property
-    def carriers(self) -> int:
-        return len(self.cover)
+    def room(self) -> Room:
+        return APPENDED.room(len(self.cover), self.cover.sh_degree)
 
     def embed(self, contents: Sequence[tuple[str, Content]], *, entropy: bytes | None = None) -> Gaussians:
         """The cover with Gaussians after its own. Warns where there is more than one secret."""

@@ -16,7 +16,7 @@ from functools import cached_property
 
 import numpy as np
 
-from keyss.channels.base import Content, Payload, RoomEstimate, SaltedReader
+from keyss.channels.base import Channel, Content, Payload, Room, SaltedReader
 from keyss.channels.codes import syndromes
 from keyss.channels.codes.fields import FORMATS, Field, Flags, Levels, carrying
 from keyss.channels.codes.kept import changeable
@@ -48,32 +48,22 @@ _LAST_BITS = {"spz": 29, "sog": 32, "compressed-ply": 26}  # of the levels of a 
 _OVERHEAD = 128  # bytes of a payload beside its data, at most
 
 
-@dataclass(frozen=True)
-class CodesChannel:
-    """The channel in the codes of one format; see `keyss.channels.base.Channel`."""
-
-    format: str  # spz, sog or compressed-ply
+class CodesChannel(Channel):
+    """The channel in the codes of one format, `spz`, `sog` or `compressed-ply`."""
 
     name = "codes"
-    survives = False
-    grows = False
-    records = False
 
-    @property
-    def place(self) -> str:
-        return f"codes of the {self.format} file"
+    def __init__(self, format: str) -> None:
+        self.format = format
+        self.place = f"codes of the {format} file"
 
     def prepare(self, cover: Gaussians) -> CodesCover:
         """The room in the codes of a model; a model read from a file of this format keeps its codes."""
         return CodesCover.of(FORMATS[self.format].of(cover))
 
-    def room(self, gaussians: int, sh_degree: int) -> RoomEstimate:
+    def room(self, gaussians: int, sh_degree: int) -> Room:
         slots = Zones(gaussians * _LAST_BITS[self.format]).slots
-        return RoomEstimate(gaussians, gaussians * _BITS_PER_GAUSSIAN // 8 if slots else 0, _OVERHEAD)
-
-    def reader(self, stego: Gaussians) -> CodesReader | None:
-        """The reader of codes of any format."""
-        return CodesReader.of(stego.codes) if isinstance(stego, CodedGaussians) else None
+        return Room(gaussians, gaussians * _BITS_PER_GAUSSIAN // 8 if slots else 0, _OVERHEAD)
 
 
 @dataclass(frozen=True)
@@ -83,23 +73,21 @@ class CodesCover:
     codes: Codes  # in the order in which bits are counted
     fields: list[Field]
     free: list[Flags]  # of each field, which levels may be changed
-    overhead = _OVERHEAD
-    grows = False
 
     @staticmethod
     def of(codes: Codes) -> CodesCover:
         """Raises InputError for codes without room."""
         ordered, fields = in_counted_order(codes)
         cover = CodesCover(ordered, fields, changeable(ordered, fields, _digest(codes)))
-        if not cover.room.slots or cover.rate < ZONE_RATE:
+        if not cover.zones.slots or cover.rate < ZONE_RATE:
             raise InputError(
-                f"a model of {cover.carriers:,} Gaussians has no room for secrets in the codes of "
+                f"a model of {len(fields[0].levels):,} Gaussians has no room for secrets in the codes of "
                 f"{codes.name} files"
             )
         return cover
 
     @property
-    def room(self) -> Zones:
+    def zones(self) -> Zones:
         return _zones(self.fields)
 
     @cached_property
@@ -116,18 +104,20 @@ class CodesCover:
     @property
     def size(self) -> int:
         """Bytes of all encrypted secrets together, at most."""
-        return self.room.data_blocks * self.rate // 8
+        return self.zones.data_blocks * self.rate // 8
 
-    @property
-    def capacity(self) -> int:
-        return int(self.size * (1 - 2**-10))  # data that are compressed already get longer by less
+    @cached_property
+    def room(self) -> Room:
+        compressible = int(self.size * (1 - 2**-10))  # data that are compressed already get longer by less
+        return Room(self._count, compressible, _OVERHEAD)
 
     @property
     def cover(self) -> CodedGaussians:
         return CodedGaussians.of(self.codes)
 
     @property
-    def carriers(self) -> int:
+    def _count(self) -> int:
+        """Gaussians."""
         return len(self.fields[0].levels)
 
     def embed(
@@ -150,18 +140,18 @@ class CodesCover:
         self, secrets: Sequence[tuple[DerivedKey, bytes]], salt: bytes, entropy: bytes
     ) -> Codes | None:
         """None where, once in a hundred times, a block has too few bits that may change."""
-        room, sizes = self.room, [compressed_size(packed) + OVERHEAD for _, packed in secrets]
-        if len(secrets) > room.slots:
-            raise UsageError(f"this cover has room for {room.slots} secrets, got {len(secrets)}")
+        zones, sizes = self.zones, [compressed_size(packed) + OVERHEAD for _, packed in secrets]
+        if len(secrets) > zones.slots:
+            raise UsageError(f"this cover has room for {zones.slots} secrets, got {len(secrets)}")
         if sum(sizes) > self.size:
             raise UsageError(
-                f"the secrets take {sum(sizes):,} bytes, and this cover of {self.carriers:,} Gaussians has "
+                f"the secrets take {sum(sizes):,} bytes, and this cover of {self._count:,} Gaussians has "
                 f"room for {self.size:,}"
             )
-        zone = bytearray(salt + stream(entropy, "codes/slots", room.slots * SLOT_BYTES))
-        data = _noise(entropy, "codes/noise", room.data_blocks * self.rate)
+        zone = bytearray(salt + stream(entropy, "codes/slots", zones.slots * SLOT_BYTES))
+        data = _noise(entropy, "codes/noise", zones.data_blocks * self.rate)
         starts = _starts(sizes, len(data), entropy)
-        slots = random_order(entropy, "codes/slot-order", room.slots).tolist()
+        slots = random_order(entropy, "codes/slot-order", zones.slots).tolist()
         for (key, packed), size, start, slot in zip(secrets, sizes, starts, slots, strict=False):
             at = SALT_BYTES + slot * SLOT_BYTES
             zone[at : at + SLOT_BYTES] = Header(self.rate, start, size).encrypt(key, slot)
@@ -170,16 +160,16 @@ class CodesCover:
         bits = self._solved(to_bits(bytes(zone)), data, salt, entropy)
         if bits is None:
             return None
-        within = random_fractions(entropy, "codes/file-order", 3 * self.carriers).reshape(-1, 3) - 0.5
+        within = random_fractions(entropy, "codes/file-order", 3 * self._count).reshape(-1, 3) - 0.5
         sorted_again: Codes = in_file_order(self._written(bits, entropy), within)
         return sorted_again
 
     def _solved(self, zone: Bits, data: Bits, salt: bytes, entropy: bytes) -> Bits | None:
         """The last bits of all levels; those that may change are random."""
-        bits = np.where(self.dry, _noise(entropy, "codes/free", self.room.bits), last_bits(self.fields))
+        bits = np.where(self.dry, _noise(entropy, "codes/free", self.zones.bits), last_bits(self.fields))
         zone = np.append(zone, _noise(entropy, "codes/zone", -len(zone) % ZONE_RATE))
         matrices = _zone_matrix(), _data_matrix(salt, self.rate)
-        for places, message, rows in zip(self.room.places(salt), (zone, data), matrices, strict=True):
+        for places, message, rows in zip(self.zones.places(salt), (zone, data), matrices, strict=True):
             solved = syndromes.write(bits[places], self.dry[places], message, rows)
             if solved is None:
                 return None

@@ -54,12 +54,9 @@ class Capacity:
     strength: float  # dB PSNR that views keep
     measured: dict[tuple[int, int], float] = field(default_factory=dict, compare=False)  # see `cost`
 
-    def bytes(self, depth: int, *, likely: bool = False) -> int:
-        """The largest packed payload with up to `depth` bits in a number; 0 if none fits.
-
-        `likely`: only where a new value leaves a number as likely as it was, at depth 1.
-        """
-        room = self._room(self._level(depth), depth, likely) if len(self.own) else 0.0
+    def bytes(self, depth: int) -> int:
+        """The largest packed payload with up to `depth` bits in a number; 0 if none fits."""
+        room = self._room(self._level(depth), depth) if len(self.own) else 0.0
         largest = max((bucket_bytes(each) for each in range(256) if bucket_bytes(each) <= room), default=0)
         return max(0, largest - OVERHEAD - _INCOMPRESSIBLE)
 

@@ -12,12 +12,13 @@ import math
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
 import torch
 
-from keyss.channels.base import METHOD_BYTES, Content, RoomEstimate
+from keyss.channels.base import METHOD_BYTES, Channel, Content, Room
 from keyss.channels.colours.capacity import Capacity, Layout, bucket_of
 from keyss.channels.colours.carriers import Doubles, Numbers
 from keyss.channels.colours.fountain import Fountain
@@ -35,7 +36,7 @@ from keyss.channels.colours.header import (
     written_header,
 )
 from keyss.channels.colours.lattice import MAX_BITS, seeds, write
-from keyss.channels.colours.reading import ASSOCIATED, ColoursReader
+from keyss.channels.colours.reading import ASSOCIATED
 from keyss.channels.colours.salts import SALTS, Salts, renewed, steady
 from keyss.channels.payloads import NOTICED, check_keys, pack_payload, randomness
 from keyss.core.errors import InputError, KeyssWarning, UsageError
@@ -52,7 +53,7 @@ _OVERHEAD = METHOD_BYTES + 1  # bytes of a payload beside its data, at most
 
 
 @dataclass(frozen=True)
-class Colours:
+class Colours(Channel):
     """The channel; see `keyss.channels.base.Channel`. Raises UsageError for a `strength` of 0 dB or less."""
 
     strength: float = 45.0  # dB PSNR that views of a model keep at least, compared with those of the cover
@@ -60,8 +61,6 @@ class Colours:
     name = "colours"
     place = "colours"
     survives = True
-    grows = False
-    records = False
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.strength) and self.strength > 0):
@@ -70,12 +69,9 @@ class Colours:
     def prepare(self, cover: Gaussians) -> ColoursCover:
         return ColoursCover(Capacity(cover, Numbers.of(cover), self.strength))
 
-    def room(self, gaussians: int, sh_degree: int) -> RoomEstimate:
+    def room(self, gaussians: int, sh_degree: int) -> Room:
         capacity = gaussians * _BITS_PER_GAUSSIAN // 8 - _HEADERS
-        return RoomEstimate(gaussians, max(0, capacity), _OVERHEAD)
-
-    def reader(self, stego: Gaussians) -> ColoursReader:
-        return ColoursReader(Numbers.of(stego))
+        return Room(gaussians, max(0, capacity), _OVERHEAD)
 
 
 COLOURS = Colours()
@@ -89,34 +85,22 @@ class ColoursCover:
     is a limit.
     """
 
-    room: Capacity
-    overhead = _OVERHEAD
-    grows = False
+    capacity: Capacity
 
     @property
     def cover(self) -> Gaussians:
-        return self.room.model
+        return self.capacity.model
 
-    @property
-    def carriers(self) -> int:
-        return len(self.room.own)
-
-    @property
-    def capacity(self) -> int:
-        """Bytes of one payload."""
-        return self.room.bytes(MAX_BITS)
-
-    @property
-    def unseen_capacity(self) -> int:
-        """Bytes of one payload that leaves all numbers as likely as they were, and is hard to detect."""
-        return self.room.bytes(1, likely=True)
+    @cached_property
+    def room(self) -> Room:
+        return Room(len(self.capacity.own), self.capacity.bytes(MAX_BITS), _OVERHEAD)
 
     def embed(self, contents: Sequence[tuple[str, Content]], *, entropy: bytes | None = None) -> Gaussians:
         """See `PreparedCover`. Raises InputError for a model that can carry nothing, too."""
         payloads = [pack_payload(content) for _, content in contents]
         secret = randomness(entropy, *payloads)
         random = np.random.default_rng(np.frombuffer(stream(secret, "colours/random", 32), np.uint32))
-        numbers = renewed(self.room.numbers, random)
+        numbers = renewed(self.capacity.numbers, random)
         salts = Salts.of(numbers)
         if len(salts.salts) < SALTS:
             raise InputError(_TOO_FEW)
@@ -134,20 +118,20 @@ class ColoursCover:
         for lower in range(_LOWER + 1):  # what headers and salts cost is known only now
             headers = self._headers(layouts, sizes, secret, lower)[: len(writings)]
             stego = self._written(numbers, salts, writings, headers, likely, random)
-            if psnr_between(self.cover, stego) >= self.room.strength:
+            if psnr_between(self.cover, stego) >= self.capacity.strength:
                 break
         return stego
 
     def _layouts(self, sizes: Sequence[int]) -> list[Layout]:
         """Of each payload."""
-        alone = [self.room.layout([size]) for size in sizes]
+        alone = [self.capacity.layout([size]) for size in sizes]
         layouts = [own for own in alone if own is not None]
         noticed = len(sizes) > UNNOTICED
         if len(layouts) < len(sizes) or sum(own.shares[0] for own in layouts) > SHARES:
-            together = self.room.layout(sizes)
+            together = self.capacity.layout(sizes)
             if together is None:
                 raise UsageError(
-                    f"expected payloads of {self.capacity:,} bytes in all, as this model holds at this "
+                    f"expected payloads of {self.room.capacity:,} bytes in all, as this model holds at this "
                     f"`strength`, got {sum(sizes) - OVERHEAD * len(sizes):,} bytes in {len(sizes)}"
                 )
             layouts = [replace(together, shares=(share,)) for share in together.shares]
@@ -193,19 +177,19 @@ class ColoursCover:
         Of those that are `likely` only as much as leaves the model as likely as it was; all of a header
         where salts are so few after rounding that it would be lost with gaps.
         """
-        carriers = replace(self.room.carriers, values=numbers.colours[:, 1:])
+        carriers = replace(self.capacity.carriers, values=numbers.colours[:, 1:])
         values = carriers.values.copy()
         free = np.zeros(len(carriers), bool)
-        free[self.room.own_rows] = True
+        free[self.capacity.own_rows] = True
         free[salts.rows] = False
-        free &= ~self.room.alone
+        free &= ~self.capacity.alone
         gaps = steady(numbers)
         index, own = Index(carriers), [header.own(carriers) for header in headers]
         holds, chosen = free.copy(), np.zeros(len(carriers), bool)  # written where that is likely
         for header, writing in zip(headers, writings, strict=True):
             for secret in writing.secrets:
                 holds[index.rows(secret, header.kind)] = False
-        admission = [self.room.admission if each else 1.0 for each in likely]
+        admission = [self.capacity.admission if each else 1.0 for each in likely]
         idle = [
             1 - share * float(holds[each].mean()) if each.any() else 0.0
             for each, share in zip(own, admission, strict=True)
@@ -236,17 +220,17 @@ class ColoursCover:
 
         `chosen` [C]: carriers that change only where the new colour is as likely as the old one.
         """
-        before = self.room.numbers.colours
+        before = self.capacity.numbers.colours
         new = before.copy()
         for column in range(1, 3):
             changed = np.flatnonzero(values[:, column - 1] != before[:, column])
-            rows = self.room.numbers.rows[changed]
-            new[changed, column] = self.room.quiet.fitted(rows, column, values[changed, column - 1])
+            rows = self.capacity.numbers.rows[changed]
+            new[changed, column] = self.capacity.quiet.fitted(rows, column, values[changed, column - 1])
         if chosen.any():
             base = np.where(chosen[:, None], before, new)
-            new[:, 1:] = np.where(self.room.likeness.admitted(base, new, random), new[:, 1:], base[:, 1:])
+            new[:, 1:] = np.where(self.capacity.likeness.admitted(base, new, random), new[:, 1:], base[:, 1:])
         sh = self.cover.sh.detach().clone()
-        own = torch.from_numpy(self.room.numbers.rows).to(sh.device)
+        own = torch.from_numpy(self.capacity.numbers.rows).to(sh.device)
         sh[own, 0, 1:] = torch.from_numpy(new[:, 1:]).to(sh)
         return replace(self.cover.detach(), sh=sh)
 

@@ -30,6 +30,7 @@ from keyss.channels.colours.salts import Salts
 from keyss.channels.payloads import unpack_payload
 from keyss.channels.reed_solomon import LOST
 from keyss.core.errors import InputError, WrongKeyError
+from keyss.core.gaussians import Gaussians
 from keyss.keys.encryption import decrypt
 
 ASSOCIATED = b"keyss/v1/colours"  # authenticated with a payload
@@ -51,6 +52,10 @@ class ColoursReader:
     """A model as a reader sees it."""
 
     numbers: Numbers
+
+    @staticmethod
+    def of(model: Gaussians) -> ColoursReader:
+        return ColoursReader(Numbers.of(model))
 
     def open(self, key: str) -> Payload:
         """See `keyss.channels.base.Reader`.

@@ -33,18 +33,16 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from keyss.channels.base import SALTS_TRIED, Bytes, Content, RecordPlan, RecordRequest
+from keyss.channels.base import SALTS_TRIED, Bytes, Channel, Content, Room
 from keyss.channels.low_bits.bits import (
     Flags,
     Layout,
     Rows,
-    bytes_per_gaussian,
     identities,
     read_low_bits,
     write_low_bits,
 )
 from keyss.channels.low_bits.layout import LowBitsRoom
-from keyss.channels.low_bits.reading import LowBitsReader
 from keyss.channels.low_bits.salts import salt, salt_rows
 from keyss.channels.low_bits.usable import check_usable, usable_carriers
 from keyss.channels.low_bits.writing import Writer, digest
@@ -60,13 +58,11 @@ _FIRST_IS_STALE = (
 )
 
 
-class LowBits:
+class LowBits(Channel):
     """The channel; see `keyss.channels.base.Channel`."""
 
     name = "low_bits"
     place = "low bits"
-    survives = False
-    grows = False
     records = True
 
     def __init__(self) -> None:
@@ -90,11 +86,8 @@ class LowBits:
             found = self._found[cover] = versions, usable, names, rows
         return LowBitsCover(cover, layout, *found[1:])
 
-    def room(self, gaussians: int, sh_degree: int) -> LowBitsRoom:
-        return LowBitsRoom(gaussians, bytes_per_gaussian(sh_degree))
-
-    def reader(self, stego: Gaussians) -> LowBitsReader:
-        return LowBitsReader.of(stego)
+    def room(self, gaussians: int, sh_degree: int) -> Room:
+        return LowBitsRoom.of(gaussians, sh_degree).for_payloads()
 
 
 LOW_BITS = LowBits()
@@ -109,21 +102,15 @@ class LowBitsCover:
     usable: Flags  # [N]
     names: Bytes  # [N, 16] identities
     salt_rows: Rows  # [S] in the order of salts
-    overhead, grows = LowBitsRoom.overhead, LowBitsRoom.grows
 
     @property
-    def carriers(self) -> int:
-        return len(self._rows)
+    def room(self) -> Room:
+        return self.cells.for_payloads()
 
     @property
-    def capacity(self) -> int:
-        return self._room.capacity
-
-    def record_capacity(self, requests: Sequence[RecordRequest]) -> int:
-        return self._room.record_capacity(requests)
-
-    def plan_records(self, requests: Sequence[RecordRequest]) -> list[RecordPlan]:
-        return self._room.plan_records(requests)
+    def cells(self) -> LowBitsRoom:
+        """The room for records."""
+        return LowBitsRoom(len(self._rows), self.layout.width)
 
     def embed(self, contents: Sequence[tuple[str, Content]], *, entropy: bytes | None = None) -> Gaussians:
         """See `PreparedCover`. Takes 1.6 s for each secret for key derivation.
@@ -163,10 +150,6 @@ class LowBitsCover:
         carriers = self.usable.copy()
         carriers[self.salt_rows] = False
         return np.flatnonzero(carriers)
-
-    @property
-    def _room(self) -> LowBitsRoom:
-        return LowBitsRoom(self.carriers, self.layout.width)
 
     def _salts(self, entropy: bytes) -> tuple[Bytes, list[bytes]]:
         """New low bits [F, B] of the Gaussians of fresh salts, and all salts with them."""

@@ -25,7 +25,7 @@ from bisect import bisect_left
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from keyss.channels.base import RecordPlan, RecordRequest
+from keyss.channels.base import RecordPlan, RecordRequest, Room
 from keyss.channels.low_bits.bits import bytes_per_gaussian
 from keyss.channels.low_bits.cells import TAG_BYTES
 from keyss.channels.low_bits.spread import NUMBER_BYTES, codewords_for, largest_payload
@@ -59,17 +59,17 @@ class PayloadPlan:
 
 @dataclass(frozen=True)
 class LowBitsRoom:
-    """The room in carriers of `width` bytes each; see `keyss.channels.base.Room`."""
+    """The room in carriers of `width` bytes each."""
 
     carriers: int
     width: int
 
-    overhead = SMALLEST_BUCKET
-    grows = False
+    @staticmethod
+    def of(carriers: int, sh_degree: int) -> LowBitsRoom:
+        return LowBitsRoom(carriers, bytes_per_gaussian(sh_degree))
 
-    @property
-    def capacity(self) -> int:
-        return self.payload_capacity(1)
+    def for_payloads(self) -> Room:
+        return Room(self.carriers, self.payload_capacity(1), SMALLEST_BUCKET)
 
     @property
     def part_bytes(self) -> int:
@@ -244,6 +244,6 @@ class LowBitsRoom:
 def check_payload_fits(compressed: int, gaussians: int, secrets: int, sh_degree: int) -> None:
     """Raise UsageError if `compressed` bytes for each secret will hardly fit into a model to be trained."""
     size = encrypted_size(compressed)
-    room = LowBitsRoom(int(gaussians * TYPICAL_SHARE), bytes_per_gaussian(sh_degree))
+    room = LowBitsRoom.of(int(gaussians * TYPICAL_SHARE), sh_degree)
     if room.payload_capacity(secrets) < size:
         raise UsageError(room.too_small(gaussians, "Gaussians", size, secrets))

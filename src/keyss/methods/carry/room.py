@@ -104,8 +104,7 @@ class RecordRoom:
         if cover is None:
             return RecordRoom(count, degree, LowBitsRoom(int(TYPICAL_SHARE * count), layout.width))
         prepared = _prepared(cover, expand(entropy, "carry/dither", 32) if options.dither else None)
-        room = LowBitsRoom(prepared.carriers, prepared.layout.width)
-        return RecordRoom(len(cover), degree, room, prepared)
+        return RecordRoom(len(cover), degree, prepared.cells, prepared)
 
     @property
     def cover(self) -> Gaussians | None:
@@ -170,7 +169,7 @@ class WholeRoom:
         if cover.sh_degree > degree:
             cover = cover.with_sh_degree(degree)
         prepared = channel.prepare(cover)
-        return WholeRoom(len(cover), cover.sh_degree, channel, prepared, cover, prepared)
+        return WholeRoom(len(cover), cover.sh_degree, channel, prepared.room, cover, prepared)
 
     def sizes(self, secrets: Sequence[SecretSize]) -> list[tuple[int, int]]:
         """See `RecordRoom.sizes`; an estimate for secrets that do not fit."""

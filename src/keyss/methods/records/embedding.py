@@ -49,16 +49,19 @@ def embed_models(
     if isinstance(cover, LowBitsCover):
         contents = encode_all(cover, models)
         requests = [record_request(len(model), model.sh_degree) for model in models]
-        details: dict[str, Any] = {"carriers": cover.carriers, "capacity": cover.record_capacity(requests)}
+        details: dict[str, Any] = {
+            "carriers": cover.cells.carriers,
+            "capacity": cover.cells.record_capacity(requests),
+        }
     else:
         contents = payloads = _payloads(cover, models, viewpoints or [*map(Viewpoints.around, models)])
         details = {
             "secret_bytes": [len(each.data) for each in payloads],
             "sh_degrees": [each.sh_degree for each in models],
         }
-        if not cover.grows:
-            details["capacity_bytes"] = cover.capacity
-            details["capacity_bits_per_gaussian"] = round(8 * cover.capacity / len(cover.cover), 2)
+        if not cover.room.grows:
+            details["capacity_bytes"] = cover.room.capacity
+            details["capacity_bits_per_gaussian"] = round(8 * cover.room.capacity / len(cover.cover), 2)
     stego = cover.embed(list(zip(keys, contents, strict=True)), entropy=entropy)
     opened = tuple(unpack(open_content(stego, key)) for key in keys)
     if [len(each.gaussians) for each in opened] != list(map(len, models)):
@@ -69,7 +72,7 @@ def embed_models(
 
 def encode_all(cover: LowBitsCover, models: Sequence[Gaussians]) -> list[Records]:
     """The records of all models, as precise as they fit into `cover` together. Raises UsageError if not."""
-    plans = cover.plan_records([record_request(len(model), model.sh_degree) for model in models])
+    plans = cover.cells.plan_records([record_request(len(model), model.sh_degree) for model in models])
     found = []
     for model, plan in zip(models, plans, strict=True):
         table = Table.of_size(8 * plan.record_bytes, model.sh_degree)
@@ -110,8 +113,8 @@ def shares(room: Room, needed: Sequence[int]) -> list[int]:
 def _payloads(
     cover: PreparedCover, models: Sequence[Gaussians], viewpoints: Sequence[Viewpoints]
 ) -> list[Payload]:
-    rooms = shares(cover, [len(encode(model)) for model in models])
+    rooms = shares(cover.room, [len(encode(model)) for model in models])
     return [
-        Payload(METHOD, fitted(model, room, short=cover.grows, viewpoints=views))
+        Payload(METHOD, fitted(model, room, short=cover.room.grows, viewpoints=views))
         for model, room, views in zip(models, rooms, viewpoints, strict=True)
     ]
