@@ -15,14 +15,10 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import ClassVar, Protocol
 
-import numpy as np
-import numpy.typing as npt
-
+from keyss.core.arrays import Bytes, Integers
 from keyss.core.errors import WrongKeyError
 from keyss.core.gaussians import Gaussians
 from keyss.keys.derivation import DerivedKey
-
-Bytes = npt.NDArray[np.uint8]
 
 METHOD_BYTES = 15  # of the name of a method in files
 SALTS_TRIED = 4  # of a model half of whose Gaussians were changed, 15 of 16 then open
@@ -66,7 +62,7 @@ class Records:
     records: Bytes  # [R, size]
     plan: RecordPlan  # as the channel gave it
     # [C] indices of records that are embedded a second time, because losing them costs most; empty when read.
-    copied: npt.NDArray[np.int64]
+    copied: Integers
 
 
 Content = Payload | Records

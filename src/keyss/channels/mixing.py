@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-import numpy.typing as npt
 from cryptography.hazmat.primitives.ciphers import Cipher
 from cryptography.hazmat.primitives.ciphers.algorithms import AES
 from cryptography.hazmat.primitives.ciphers.modes import ECB
 
+from keyss.core.arrays import Bytes, Doubles, Integers, Numbers, Words
 from keyss.keys.derivation import stream
-
-Words = npt.NDArray[np.uint64]
 
 
 def mixed(words: Words) -> Words:
@@ -20,11 +16,10 @@ def mixed(words: Words) -> Words:
     state = words.astype(np.uint64) + np.uint64(0x9E3779B97F4A7C15)
     state = (state ^ state >> np.uint64(30)) * np.uint64(0xBF58476D1CE4E5B9)
     state = (state ^ state >> np.uint64(27)) * np.uint64(0x94D049BB133111EB)
-    result: Words = state ^ state >> np.uint64(31)
-    return result
+    return state ^ state >> np.uint64(31)
 
 
-def row_hashes(rows: npt.NDArray[Any]) -> Words:
+def row_hashes(rows: Numbers) -> Words:
     """[N] a hash of each row of integers [N, C]: equal for equal rows, and for others hardly ever."""
     found = np.zeros(len(rows), np.uint64)
     for column in rows.T:
@@ -33,7 +28,7 @@ def row_hashes(rows: npt.NDArray[Any]) -> Words:
     return found
 
 
-def encrypted_blocks(key: bytes, blocks: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
+def encrypted_blocks(key: bytes, blocks: Bytes) -> Bytes:
     """[..., 16] every block through AES-256: a pseudo-random permutation, not a mode of operation."""
     plain = np.ascontiguousarray(blocks)
     encrypted = np.empty(plain.size + 15, np.uint8)  # the library wants room for one more block
@@ -46,13 +41,12 @@ def random_words(secret: bytes, label: str, count: int) -> Words:
     return np.frombuffer(stream(secret, label, 8 * count), "<u8")
 
 
-def random_order(secret: bytes, label: str, count: int) -> npt.NDArray[np.int64]:
+def random_order(secret: bytes, label: str, count: int) -> Integers:
     """[count] the numbers from 0 on in an order that follows from a secret."""
     return random_words(secret, label, count).argsort(kind="stable")
 
 
-def random_fractions(secret: bytes, label: str, count: int) -> npt.NDArray[np.float64]:
+def random_fractions(secret: bytes, label: str, count: int) -> Doubles:
     """[count] uniform numbers between 0 and 1, without the ends."""
     words = random_words(secret, label, count) >> np.uint64(12)
-    found: npt.NDArray[np.float64] = (words.astype(np.float64) + 0.5) / 2.0**52
-    return found
+    return (words.astype(np.float64) + 0.5) / 2.0**52

@@ -13,15 +13,13 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-import numpy.typing as npt
 
+from keyss.core.arrays import Bytes, Integers
 from keyss.core.errors import InputError
 
 MAX_CHUNKS = 255  # of one codeword
 LOST = "the key is right, but too much of the model was lost or changed since something was hidden in it"
 _POLYNOMIAL = 0x11D
-
-Bytes = npt.NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
@@ -54,7 +52,7 @@ class Codewords:
         rows = np.frombuffer(data.ljust(self.size, b"\0"), np.uint8).reshape(self.k, -1)
         return encode(rows, self.n).reshape(-1, self.width)
 
-    def decode(self, numbers: npt.NDArray[np.int64], chunks: Bytes) -> bytes:
+    def decode(self, numbers: Integers, chunks: Bytes) -> bytes:
         """The data from chunks [C, width] with `numbers` [C], in any order.
 
         Different chunks with one number are left out: one of them is there by chance. Raises InputError if
@@ -73,7 +71,7 @@ class Codewords:
             raise InputError(f"{LOST}: {left:,} of {self.chunks:,} chunks are left")
         return data.tobytes()
 
-    def _decoded(self, numbers: npt.NDArray[np.int64], chunks: Bytes) -> Bytes | None:
+    def _decoded(self, numbers: Integers, chunks: Bytes) -> Bytes | None:
         data = np.empty((self.k, self.count, self.width), np.uint8)
         rows, codewords = np.divmod(numbers, self.count)
         for codeword in range(self.count):

@@ -17,9 +17,9 @@ from pathlib import Path, PureWindowsPath
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from keyss.core.arrays import Doubles, Numbers
 from keyss.core.errors import InputError, KeyssWarning
 from keyss.files.layout import (
     MAX_COORDINATE,
@@ -39,7 +39,7 @@ MODEL_PLACES = ("sparse/0", "sparse", ".", "colmap/sparse/0")
 _IMAGE_FOLDERS = ("images", "images_2", "images_4", "images_8")
 
 _T = TypeVar("_T")
-_Image = tuple[str, int, NDArray[np.float64]]  # name, camera id, [4, 4] world to camera
+_Image = tuple[str, int, Doubles]  # name, camera id, [4, 4] world to camera
 
 # Parameters in file order. The fisheye models with fewer coefficients are OPENCV_FISHEYE with zeros.
 _PARAMETERS = {
@@ -181,7 +181,7 @@ class _Records:
             raise InputError(f"{self.path}: expected the end of the file, found {self.left} bytes more")
 
 
-def _viewmat(where: str, pose: Sequence[float]) -> NDArray[np.float64]:
+def _viewmat(where: str, pose: Sequence[float]) -> Doubles:
     """[4, 4] from a quaternion wxyz of any length and a translation, both from world to camera."""
     *quaternion, x, y, z = pose
     if not 1e-8 < math.hypot(*quaternion) < math.inf:
@@ -245,7 +245,7 @@ def _points(path: Path, read: Callable[[Path], PointCloud]) -> PointCloud:
     return points
 
 
-def _sorted_points(path: Path, ids: NDArray[Any], xyz: NDArray[Any], rgb: NDArray[Any]) -> PointCloud:
+def _sorted_points(path: Path, ids: Numbers, xyz: Numbers, rgb: Numbers) -> PointCloud:
     order = np.argsort(ids, kind="stable")
     return PointCloud.checked(path, xyz[order].astype(np.float64), rgb[order].astype(np.uint8))
 

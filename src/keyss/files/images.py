@@ -8,10 +8,10 @@ from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
+from keyss.core.arrays import Bytes, Floats
 from keyss.core.errors import InputError
 from keyss.core.scene import Camera
 
@@ -60,7 +60,7 @@ def is_turned(path: Path) -> bool:
         return image.getexif().get(0x0112, 1) in (5, 6, 7, 8)
 
 
-def read_image(path: Path, background: NDArray[np.float32]) -> NDArray[np.uint8]:
+def read_image(path: Path, background: Floats) -> Bytes:
     """[H, W, 3] sRGB of an image file, composited over `background` ([3] in [0, 1]).
 
     16 bits are scaled to 8; palettes, grey and CMYK are converted. Raises InputError as `open_image` does,
@@ -75,7 +75,7 @@ def read_image(path: Path, background: NDArray[np.float32]) -> NDArray[np.uint8]
             raise InputError(f"{path}: expected an image, but it cannot be decoded: {error}") from error
 
 
-def shrink(image: NDArray[np.uint8], width: int, height: int) -> NDArray[np.uint8]:
+def shrink(image: Bytes, width: int, height: int) -> Bytes:
     """Shrink an image to [height, width, 3] by area averaging."""
     import cv2  # slow to import, and models do not need it
 
@@ -103,7 +103,7 @@ def png_bytes(image: Tensor) -> bytes:
     return bytes(cv2.imencode(".png", image.numpy()[:, :, ::-1])[1].tobytes())
 
 
-def _to_rgb(image: Image.Image, background: NDArray[np.float32]) -> NDArray[np.uint8]:
+def _to_rgb(image: Image.Image, background: Floats) -> Bytes:
     if image.mode.startswith("I"):  # 16-bit grey, which Pillow would clip instead of scale
         grey = np.asarray(image, dtype=np.float64).clip(0, 65535)
         return np.repeat(np.rint(grey / 257).astype(np.uint8)[:, :, None], 3, axis=2)

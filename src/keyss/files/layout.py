@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from keyss.core.arrays import Bytes, Doubles, Floats
 from keyss.core.errors import InputError, KeyssWarning
 from keyss.files.lens import Lens
 
@@ -23,7 +23,7 @@ class Photo:
 
     path: Path
     name: str
-    viewmat: NDArray[np.float64]  # [4, 4] world to camera, OpenCV axes, a rigid motion
+    viewmat: Doubles  # [4, 4] world to camera, OpenCV axes, a rigid motion
     lens: Lens
 
 
@@ -31,11 +31,11 @@ class Photo:
 class PointCloud:
     """Positions and sRGB colours."""
 
-    xyz: NDArray[np.float32]  # [P, 3]
-    rgb: NDArray[np.uint8]  # [P, 3]
+    xyz: Floats  # [P, 3]
+    rgb: Bytes  # [P, 3]
 
     @staticmethod
-    def checked(where: Path, xyz: NDArray[np.float64], rgb: NDArray[np.uint8]) -> PointCloud:
+    def checked(where: Path, xyz: Doubles, rgb: Bytes) -> PointCloud:
         """The points as float32. Raises InputError if a coordinate is not finite or beyond 1e15."""
         bad = ~(np.abs(xyz) <= MAX_COORDINATE).all(axis=1)
         if bad.any():

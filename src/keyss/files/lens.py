@@ -11,8 +11,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from keyss.core.arrays import Bytes, Doubles, Floats
 from keyss.core.errors import InputError
 
 MAX_SIDE = 32_000  # pixels; OpenCV's remap addresses sources with signed 16-bit integers
@@ -39,7 +39,7 @@ class Lens:
         return not self.fisheye and not any(self.distortion)
 
     @property
-    def K(self) -> NDArray[np.float64]:
+    def K(self) -> Doubles:
         """[3, 3] pixels."""
         return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]], dtype=np.float64)
 
@@ -97,10 +97,10 @@ class Undistortion:
     """Resamples photos of a distorted lens into those of a pinhole lens of the same size."""
 
     pinhole: Lens
-    map_x: NDArray[np.float32]  # [H, W] OpenCV column in the distorted photo, per pixel of the new one
-    map_y: NDArray[np.float32]  # [H, W] OpenCV row
+    map_x: Floats  # [H, W] OpenCV column in the distorted photo, per pixel of the new one
+    map_y: Floats  # [H, W] OpenCV row
 
-    def __call__(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    def __call__(self, image: Bytes) -> Bytes:
         """[H, W, 3] undistorted, sampled bilinearly."""
         import cv2  # slow to import, and models do not need it
 
@@ -132,13 +132,11 @@ def undistortion(lens: Lens, where: str) -> Undistortion:
     return Undistortion(pinhole, *_source_coordinates(lens, _opencv_K(pinhole), (lens.width, lens.height)))
 
 
-def _opencv_K(lens: Lens) -> NDArray[np.float64]:
+def _opencv_K(lens: Lens) -> Doubles:
     return lens.K - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
 
 
-def _source_coordinates(
-    lens: Lens, new_K: NDArray[np.float64], size: tuple[int, int]
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _source_coordinates(lens: Lens, new_K: Doubles, size: tuple[int, int]) -> tuple[Floats, Floats]:
     """The positions in the photo of the pixels of a pinhole image with `new_K`, in OpenCV's coordinates."""
     import cv2
 

@@ -10,10 +10,10 @@ from __future__ import annotations
 from typing import BinaryIO
 
 import numpy as np
-import numpy.typing as npt
 import torch
 
 from keyss.core import Gaussians, OutputError
+from keyss.core.arrays import Floats
 from keyss.files.ply_rows import finite_rows, model_names, read_model_rows
 from keyss.files.ply_table import ply_header
 
@@ -36,7 +36,7 @@ def write_ply(model: Gaussians, file: BinaryIO) -> None:
         file.write(rows.astype("<f4", copy=False).data)
 
 
-def _rows(part: Gaussians) -> npt.NDArray[np.float32]:
+def _rows(part: Gaussians) -> Floats:
     """[N, 14 + 3 K] of some Gaussians, in the order of the file."""
     n, k = part.sh.shape[:2]
     rows = np.zeros((n, 14 + 3 * k), np.float32)

@@ -13,8 +13,9 @@ from typing import BinaryIO
 
 import numpy as np
 
+from keyss.core.arrays import Floats
 from keyss.core.errors import InputError, KeyssError
-from keyss.files.ply_table import MAX_HEADER_BYTES, Rows, Vertices, read_vertices
+from keyss.files.ply_table import MAX_HEADER_BYTES, Vertices, read_vertices
 from keyss.files.reading import open_input
 
 # Replaces an infinite opacity logit, which converters write for opacities of 0 and 1. A larger bound would
@@ -35,7 +36,7 @@ def has_packed_header(file: BinaryIO) -> bool:
     return b" packed_position" in header
 
 
-def read_rows(path: Path) -> tuple[list[str], Rows]:
+def read_rows(path: Path) -> tuple[list[str], Floats]:
     """Names and values [N, len(names)] of a model's properties in the order of `model_names`.
 
     Raises InputError if it is not a complete, finite 3DGS model in binary or ascii PLY.
@@ -51,7 +52,7 @@ def read_model_rows(file: BinaryIO) -> Vertices:
     return replace(vertices, blocks=finite_rows(vertices.blocks, vertices.names, InputError))
 
 
-def finite_rows(blocks: Iterable[Rows], names: list[str], error: type[KeyssError]) -> Iterator[Rows]:
+def finite_rows(blocks: Iterable[Floats], names: list[str], error: type[KeyssError]) -> Iterator[Floats]:
     """The blocks with infinite opacity logits clamped in place to +-OPACITY_LOGIT_BOUND.
 
     At the end raises `error` if there were no rows or if other values were not finite.

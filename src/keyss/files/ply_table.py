@@ -17,13 +17,13 @@ from typing import TYPE_CHECKING, BinaryIO
 import numpy as np
 import numpy.typing as npt
 
+from keyss.core.arrays import Floats
 from keyss.core.errors import InputError
 from keyss.files.reading import open_input
 
 if TYPE_CHECKING:
     from keyss.files.layout import PointCloud
 
-Rows = npt.NDArray[np.float32]
 
 MAX_HEADER_BYTES = 64 * 1024
 _MAX_HEADER_LINES = 1000
@@ -47,9 +47,9 @@ class Vertices:
 
     names: list[str]
     count: int
-    blocks: Iterator[Rows]  # [n, len(names)] each; `count` rows in all; they may be changed
+    blocks: Iterator[Floats]  # [n, len(names)] each; `count` rows in all; they may be changed
 
-    def rows(self) -> Rows:
+    def rows(self) -> Floats:
         """[count, len(names)] all rows."""
         rows = np.empty((self.count, len(self.names)), np.float32)
         start = 0
@@ -213,7 +213,7 @@ def _check_size(file: BinaryIO, needed: int, vertex: _Element) -> None:
         )
 
 
-def _binary_blocks(file: BinaryIO, byte_order: str, vertex: _Element, columns: list[int]) -> Iterator[Rows]:
+def _binary_blocks(file: BinaryIO, byte_order: str, vertex: _Element, columns: list[int]) -> Iterator[Floats]:
     dtype = np.dtype([(name, byte_order + code) for name, code in vertex.properties.items()])
     is_float32 = set(vertex.properties.values()) == {"f4"}
     names = [list(vertex.properties)[column] for column in columns]
@@ -234,7 +234,7 @@ def _binary_blocks(file: BinaryIO, byte_order: str, vertex: _Element, columns: l
         yield rows
 
 
-def _ascii_blocks(file: BinaryIO, skipped: int, vertex: _Element, columns: list[int]) -> Iterator[Rows]:
+def _ascii_blocks(file: BinaryIO, skipped: int, vertex: _Element, columns: list[int]) -> Iterator[Floats]:
     """Rows in text, after `skipped` values. Only the order of the values matters, not the lines."""
     width = len(vertex.properties)
     step = max(1, _CHUNK_BYTES // (8 * max(1, width)))

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
+from keyss.core.arrays import Floats
 from keyss.core.errors import InputError, UsageError
 from keyss.core.scene import Camera, Scene, View, checked_background
 from keyss.files.colmap import MODEL_PLACES, colmap_model_folder, read_colmap
@@ -107,7 +107,7 @@ def _read_layout(folder: Path, skip_missing: bool) -> SceneLayout:
 def _view(
     photo: Photo,
     width: int | None,
-    background: NDArray[np.float32],
+    background: Floats,
     undistortions: Callable[[Lens, str], Undistortion],
 ) -> View:
     pixels = read_image(photo.path, background)

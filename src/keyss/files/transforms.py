@@ -11,8 +11,8 @@ from typing import Annotated, Any
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
+from keyss.core.arrays import Doubles
 from keyss.core.errors import InputError, KeyssWarning
 from keyss.files.images import probe_image
 from keyss.files.layout import (
@@ -176,7 +176,7 @@ def _image_name(path: Path, file_path: str) -> str:
     return name + next(extensions, "")
 
 
-def _viewmat(where: str, values: NDArray[np.float64]) -> NDArray[np.float64]:
+def _viewmat(where: str, values: Doubles) -> Doubles:
     """[4, 4] world to camera in OpenCV axes from an OpenGL camera-to-world matrix [3 or 4, 4]."""
     if len(values) == 4 and not np.allclose(values[3], [0, 0, 0, 1], atol=1e-4):
         raise InputError(f"{where}: expected a `transform_matrix` that ends in 0 0 0 1, found {values[3]}")

@@ -9,9 +9,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import numpy.typing as npt
-
+from keyss.core.arrays import Bytes
 from keyss.core.errors import BackendError, UsageError
 from keyss.files.atomic import write_bytes
 
@@ -26,7 +24,7 @@ def check_video(path: Path | str) -> None:
     _av()
 
 
-def write_video(path: Path | str, frames: Iterator[npt.NDArray[np.uint8]], fps: int) -> int:
+def write_video(path: Path | str, frames: Iterator[Bytes], fps: int) -> int:
     """Atomically write frames [H, W, 3] of one even size at `fps` per second; returns their number.
 
     Encodes H.264 if this build of FFmpeg has it, else MPEG-4, in sRGB with 4:2:0 subsampling.

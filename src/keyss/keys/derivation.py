@@ -9,7 +9,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from argon2.exceptions import HashingError
 from argon2.low_level import Type, hash_secret_raw
@@ -19,6 +18,7 @@ from cryptography.hazmat.primitives.hashes import SHA256
 from cryptography.hazmat.primitives.kdf.hkdf import HKDFExpand
 from torch import Tensor
 
+from keyss.core.arrays import Bytes
 from keyss.core.errors import InputError
 from keyss.keys.key_file import normalized_key
 
@@ -41,7 +41,7 @@ def stream(secret: bytes, label: str, length: int) -> bytes:
     return data.tobytes()
 
 
-def fill(secret: bytes, label: str, data: npt.NDArray[np.uint8]) -> None:
+def fill(secret: bytes, label: str, data: Bytes) -> None:
     """Overwrite contiguous `data` with the bytes of `stream`."""
     encryptor = Cipher(ChaCha20(expand(secret, label, 32), bytes(16)), mode=None).encryptor()
     flat, zeros = data.reshape(-1).data, bytes(_STREAM_BLOCK)

@@ -19,6 +19,7 @@ from channels.low_bits.trained_like import UNNATURAL, keys, trained_like
 from keyss.channels import (
     LOW_BITS,
     LowBitsReader,
+    LowBitsRoom,
     base,
     check_payload_fits,
     identities,
@@ -244,8 +245,8 @@ def test_models_too_small_are_refused_with_the_number_that_would_do() -> None:
 
 
 def test_capacity_grows_with_the_model_and_is_kept_to() -> None:
-    rooms = [LOW_BITS.room(carriers, 3) for carriers in (100, 500, 1000, 5000, 20_000, 200_000)]
-    sizes = [room.capacity for room in rooms]
+    rooms = [LowBitsRoom.of(carriers, 3) for carriers in (100, 500, 1000, 5000, 20_000, 200_000)]
+    sizes = [room.for_payloads().capacity for room in rooms]
     assert sizes == sorted(sizes)
     assert sizes[0] == 0
     assert sizes[-1] / 200_000 > 38

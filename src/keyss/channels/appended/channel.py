@@ -19,10 +19,7 @@ import torch
 
 from keyss.channels.appended import packets, pilots
 from keyss.channels.appended.lattice import (
-    Bits,
     Cube,
-    Doubles,
-    Points,
     all_shifts,
     colours_of,
     in_own_frame,
@@ -38,6 +35,7 @@ from keyss.channels.appended.packets import NUMBER_BITS, PACKET_BYTES
 from keyss.channels.base import METHOD_BYTES, Channel, Content, Payload, Room, SaltedReader
 from keyss.channels.payloads import check_keys, pack_payload, randomness, unpack_payload
 from keyss.channels.reed_solomon import MAX_CHUNKS, Codewords
+from keyss.core.arrays import Bits, Doubles, Integers
 from keyss.core.errors import KeyssWarning, UsageError, WrongKeyError
 from keyss.core.gaussians import Gaussians
 from keyss.keys.derivation import SALT_BYTES, DerivedKey, expand, stream
@@ -128,7 +126,7 @@ class AppendedReader(SaltedReader):
         colours, steps = colours_of(faint), scale_steps(faint)
         few = np.random.default_rng(0).permutation(len(faint))[:_SAMPLE]
         for shifts in (likely_shifts(steps), _shifts_with_pilots(steps[few], colours[few])):
-            best: tuple[pilots.Found, Points] | None = None
+            best: tuple[pilots.Found, Integers] | None = None
             for shift in shifts:
                 scales = scales_at(steps, shift)
                 found = pilots.read(invariants_of(colours, scales), faint.means.double().numpy())
@@ -174,7 +172,7 @@ def _codewords(count: int, data: int) -> Codewords:
     return Codewords(count, min(length, MAX_CHUNKS), data, PACKET_BYTES)
 
 
-def _shifts_with_pilots(steps: Doubles, colours: Points) -> Iterator[float]:
+def _shifts_with_pilots(steps: Doubles, colours: Integers) -> Iterator[float]:
     """The places where the lattice of log scales may begin with most pilots among the Gaussians."""
     shifts = all_shifts(steps)
     counts = np.array([pilots.count(invariants_of(colours, scales_at(steps, each))) for each in shifts])

@@ -16,17 +16,12 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from keyss.core.arrays import Bits, Doubles, Flags, Integers, Words
 from keyss.core.gaussians import DRAWN_OPACITY, Gaussians
 from keyss.core.similarity import Similarity
-
-Bits = npt.NDArray[np.uint8]
-Doubles = npt.NDArray[np.float64]
-Words = npt.NDArray[np.uint64]
-Points = npt.NDArray[np.int64]  # of lattices
 
 COLOUR_BITS, SCALE_BITS, POSITION_BITS, TURN_BITS = 7, 6, 10, 5
 INVARIANT_BITS = 3 * (COLOUR_BITS + SCALE_BITS)
@@ -43,10 +38,10 @@ _TURNS_REACH = 0.5  # x, y and z are below it, so that w is never smaller
 _FARTHEST, _MAX_SHIFTS = 1 << 12, 500  # steps of log scales: that are looked at, and that are tried
 
 
-def is_candidate(model: Gaussians) -> npt.NDArray[np.bool_]:
+def is_candidate(model: Gaussians) -> Flags:
     """[N] which Gaussians are as faint as appended ones."""
     opacities = model.opacities.detach().cpu().numpy()
-    found: npt.NDArray[np.bool_] = (opacities > _FAINTEST) & (opacities < _STRONGEST)
+    found: Flags = (opacities > _FAINTEST) & (opacities < _STRONGEST)
     for values in (model.means, model.quats, model.log_scales, model.sh):
         found &= np.isfinite(values.detach().cpu().numpy()).reshape(len(found), -1).all(axis=1)
     return found
@@ -64,7 +59,7 @@ def is_appended(model: Gaussians) -> Tensor:
 class Cube:
     """Where appended Gaussians lie: the own frame's unit cube in the world."""
 
-    centre: npt.NDArray[np.float64]  # [3]
+    centre: Doubles  # [3]
     size: float
 
     @staticmethod
@@ -105,7 +100,7 @@ def to_gaussians(words: Bits, cube: Cube, sh_degree: int) -> Gaussians:
     return cube.to_world().apply_gaussians(own)
 
 
-def colours_of(model: Gaussians) -> Points:
+def colours_of(model: Gaussians) -> Integers:
     """[N, 3] the nearest lattice points of colours."""
     colours = model.sh[:, 0].detach().cpu().double().numpy()
     return _nearest(colours / _COLOUR_STEP + 2 ** (COLOUR_BITS - 1) - 0.5, COLOUR_BITS)
@@ -116,7 +111,7 @@ def scale_steps(model: Gaussians) -> Doubles:
     return model.log_scales.detach().cpu().double().numpy() / _SCALE_STEP
 
 
-def scales_at(steps: Doubles, shift: float) -> Points:
+def scales_at(steps: Doubles, shift: float) -> Integers:
     """[N, 3] the nearest lattice points of log scales, of a lattice that begins at `shift`."""
     return _nearest(steps - shift, SCALE_BITS)
 
@@ -141,7 +136,7 @@ def all_shifts(steps: Doubles) -> Doubles:
     return np.arange(low - 2 ** (SCALE_BITS - 1), max(most, low), 0.25)
 
 
-def in_own_frame(model: Gaussians, to_own: Similarity) -> Points:
+def in_own_frame(model: Gaussians, to_own: Similarity) -> Integers:
     """[N, 6] the nearest lattice points of positions and turns; `to_own`: from the world."""
     own = to_own.apply_gaussians(model.with_sh_degree(0))
     positions = own.means.double().numpy() * 2**POSITION_BITS - 0.5
@@ -150,7 +145,7 @@ def in_own_frame(model: Gaussians, to_own: Similarity) -> Points:
     return np.concatenate([_nearest(positions, POSITION_BITS), _nearest(turns, TURN_BITS)], axis=1)
 
 
-def joined(colours: Points, scales: Points, others: Points) -> Bits:
+def joined(colours: Integers, scales: Integers, others: Integers) -> Bits:
     """[N, WORD_BITS] words of colours and scales [N, 3] and of positions and turns [N, 6]."""
     parts = [
         (colours, COLOUR_BITS),
@@ -162,19 +157,17 @@ def joined(colours: Points, scales: Points, others: Points) -> Bits:
     return np.concatenate(bits, axis=1)
 
 
-def invariants_of(colours: Points, scales: Points) -> Words:
+def invariants_of(colours: Integers, scales: Integers) -> Words:
     """[N] the first INVARIANT_BITS of words of colours and scales [N, 3]."""
     of_colours = colours @ (1 << COLOUR_BITS * np.arange(3)[::-1])
     of_scales = scales @ (1 << SCALE_BITS * np.arange(3)[::-1])
-    found: Words = (of_colours << 3 * SCALE_BITS | of_scales).astype(np.uint64)
-    return found
+    return (of_colours << 3 * SCALE_BITS | of_scales).astype(np.uint64)
 
 
 def number(bits: Bits) -> Words:
     """[N] the numbers of bits [N, B], B at most 64, the highest bit first."""
     powers = np.uint64(1) << np.arange(bits.shape[1], dtype=np.uint64)[::-1]
-    found: Words = bits.astype(np.uint64) @ powers
-    return found
+    return bits.astype(np.uint64) @ powers
 
 
 def bits_of(numbers: Words, count: int) -> Bits:
@@ -207,5 +200,5 @@ def _split(words: Bits) -> list[Doubles]:
     return fields
 
 
-def _nearest(steps: Doubles, bits: int) -> Points:
+def _nearest(steps: Doubles, bits: int) -> Integers:
     return np.rint(steps).clip(0, 2**bits - 1).astype(np.int64)

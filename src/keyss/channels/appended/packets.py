@@ -10,12 +10,10 @@ from __future__ import annotations
 from collections import Counter
 
 import numpy as np
-import numpy.typing as npt
 
-from keyss.channels.appended.lattice import WORD_BITS, Bits, Words, bits_of, number
+from keyss.channels.appended.lattice import WORD_BITS, bits_of, number
 from keyss.channels.mixing import encrypted_blocks, mixed
-
-Bytes = npt.NDArray[np.uint8]
+from keyss.core.arrays import Bits, Bytes, Words
 
 PACKET_BYTES = 6
 NUMBER_BITS = 20
@@ -55,8 +53,7 @@ def read_header(key: bytes, words: Bits) -> int | None:
 
 def _checks(numbers: Words) -> Words:
     """[N] what tells that a number was read as it was written."""
-    checks: Words = mixed(numbers) >> np.uint64(64 - _CHECK_BITS)
-    return checks
+    return mixed(numbers) >> np.uint64(64 - _CHECK_BITS)
 
 
 def _masks(key: bytes, data: Bytes) -> Words:
@@ -64,5 +61,4 @@ def _masks(key: bytes, data: Bytes) -> Words:
     blocks = np.zeros((len(data), 16), np.uint8)
     blocks[:, :PACKET_BYTES] = data
     shift = np.uint64(64 - NUMBER_BITS - _CHECK_BITS)
-    masks: Words = encrypted_blocks(key, blocks).view(">u8")[:, 0].astype(np.uint64) >> shift
-    return masks
+    return encrypted_blocks(key, blocks).view(">u8")[:, 0].astype(np.uint64) >> shift

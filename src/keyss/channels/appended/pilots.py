@@ -12,7 +12,6 @@ from collections import Counter
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 import torch
 
 from keyss.channels.appended.lattice import (
@@ -21,12 +20,10 @@ from keyss.channels.appended.lattice import (
     POSITION_BITS,
     SCALE_BITS,
     TURN_BITS,
-    Bits,
-    Doubles,
-    Words,
     bits_of,
 )
 from keyss.channels.mixing import mixed
+from keyss.core.arrays import Bits, Doubles, Flags, Integers, Words
 from keyss.core.similarity import Similarity
 from keyss.keys.derivation import SALT_BYTES
 
@@ -39,8 +36,6 @@ _RANDOM_BITS = 3 * COLOUR_BITS - 3 - _PART_BITS  # beside the part of the salt a
 _TRIES, _AGREE = 300, 12  # of three pilots; that have to agree
 _SAMPLE = 1024  # pilots that are tried first, so that many that disagree cost no more than few
 _NEAR = 1.5 / 2**POSITION_BITS  # in the own frame
-
-Rows = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -118,15 +113,15 @@ def read(invariants: Words, means: Doubles) -> Found | None:
 
 
 def _agreeing(
-    there: Doubles, expected: Doubles, chosen: Rows, among: Rows | slice = slice(None)
-) -> npt.NDArray[np.bool_]:
+    there: Doubles, expected: Doubles, chosen: Integers, among: Integers | slice = slice(None)
+) -> Flags:
     """Which pilots `among` [P] come to lie where they should by the similarity of the chosen ones."""
     moved = _similarity(there[chosen], expected[chosen])
     there, expected = there[among], expected[among]
     if moved is None:
         return np.zeros(len(there), bool)
     off = moved.apply_points(torch.from_numpy(there)).numpy() - expected
-    near: npt.NDArray[np.bool_] = (np.abs(off) < _NEAR).all(axis=1)
+    near: Flags = (np.abs(off) < _NEAR).all(axis=1)
     return near
 
 
@@ -162,12 +157,11 @@ def _salt(invariants: Words) -> bytes | None:
     return b"".join(each.most_common(1)[0][0].to_bytes(2, "big") for each in votes)
 
 
-def _is_pilot(invariants: Words) -> npt.NDArray[np.bool_]:
-    pilot: npt.NDArray[np.bool_] = mixed(invariants ^ _PUBLIC) & np.uint64(ONE_IN - 1) == 0
+def _is_pilot(invariants: Words) -> Flags:
+    pilot: Flags = mixed(invariants ^ _PUBLIC) & np.uint64(ONE_IN - 1) == 0
     return pilot
 
 
 def _whitening(scales: Words) -> Words:
     """[N] 21 bits that make the colours of pilots look random."""
-    bits: Words = mixed(scales ^ _PUBLIC) >> np.uint64(64 - 3 * COLOUR_BITS)
-    return bits
+    return mixed(scales ^ _PUBLIC) >> np.uint64(64 - 3 * COLOUR_BITS)

@@ -18,22 +18,14 @@ import numpy as np
 
 from keyss.channels.base import Channel, Content, Payload, Room, SaltedReader
 from keyss.channels.codes import syndromes
-from keyss.channels.codes.fields import FORMATS, Field, Flags, Levels, carrying
+from keyss.channels.codes.fields import FORMATS, Field, Levels, carrying
 from keyss.channels.codes.kept import changeable
-from keyss.channels.codes.layout import (
-    SLOT_BYTES,
-    ZONE_RATE,
-    Header,
-    Order,
-    Zones,
-    find_header,
-    to_bits,
-    to_bytes,
-)
+from keyss.channels.codes.layout import SLOT_BYTES, ZONE_RATE, Header, Zones, find_header, to_bits, to_bytes
 from keyss.channels.codes.order import in_counted_order, in_file_order
-from keyss.channels.codes.syndromes import Bits, rate_of
+from keyss.channels.codes.syndromes import rate_of
 from keyss.channels.mixing import random_fractions, random_order, random_words
 from keyss.channels.payloads import check_keys, pack_payload, randomness, unpack_payload
+from keyss.core.arrays import Bits, Flags, Integers, Words
 from keyss.core.errors import InputError, UsageError, WrongKeyError
 from keyss.core.gaussians import Gaussians
 from keyss.files.formats.common import CodedGaussians, Codes
@@ -238,15 +230,15 @@ def last_bits(fields: Sequence[Field]) -> Bits:
     return np.concatenate([each.read() for each in fields])
 
 
-def _zone_matrix() -> syndromes.Words:
+def _zone_matrix() -> Words:
     return syndromes.matrix(bytes(SALT_BYTES), ZONE_RATE)
 
 
-def _data_matrix(salt: bytes, rate: int) -> syndromes.Words:
+def _data_matrix(salt: bytes, rate: int) -> Words:
     return syndromes.matrix(salt + bytes(16), rate)
 
 
-def _range(count: int, start: int, size: int) -> Order:
+def _range(count: int, start: int, size: int) -> Integers:
     """`size` bytes from bit `start` on, of `count` bits that continue at the start."""
     return (start + np.arange(8 * size)) % count
 

@@ -19,14 +19,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from keyss.core.arrays import Bytes, Doubles, Flags, Integers, Numbers
 from keyss.files.formats.common import Codes
 from keyss.files.formats.compressed_ply import CHUNK, CompressedPlyCodes
 from keyss.files.formats.sog import SogCodes
 from keyss.files.formats.spz import SpzCodes
 
 Levels = npt.NDArray[np.int32]
-Flags = npt.NDArray[np.bool_]
-Doubles = npt.NDArray[np.float64]
 
 MAX_BITS = 10
 _SHARE = -3.0  # 2 to this: the range of what is written, in sizes of the Gaussian
@@ -50,7 +49,7 @@ class Field:
         """Bits of all levels together."""
         return int(self.bits.sum())
 
-    def read(self) -> npt.NDArray[np.uint8]:
+    def read(self) -> Bytes:
         """[room] the last bits of all levels, the lowest first."""
         bits = self.levels[:, None] >> np.arange(MAX_BITS, dtype=np.int32) & 1
         return bits[self._places()].astype(np.uint8)
@@ -60,7 +59,7 @@ class Field:
         """[N] by how many levels `with_bits` moves each at most."""
         return (1 << self.bits) // 2
 
-    def with_bits(self, bits: npt.NDArray[np.uint8], ties: Doubles) -> Levels:
+    def with_bits(self, bits: Bytes, ties: Doubles) -> Levels:
         """[N] the nearest levels from which `read` gives `bits` [room].
 
         `ties` [N] in [-0.5, 0.5]: which of two equally near ones is taken.
@@ -73,8 +72,7 @@ class Field:
         return matched
 
     def _places(self) -> Flags:
-        found: Flags = np.arange(MAX_BITS) < self.bits[:, None]
-        return found
+        return np.arange(MAX_BITS) < self.bits[:, None]
 
 
 @dataclass(frozen=True)
@@ -92,7 +90,7 @@ def carrying(codes: Codes) -> Carrying:
     return _CARRYING[type(codes)]
 
 
-def sog_distances(codes: SogCodes, levels: npt.NDArray[Any]) -> npt.NDArray[np.int64]:
+def sog_distances(codes: SogCodes, levels: Numbers) -> Integers:
     """[N, 3] by how many powers of 2 a .sog's steps are larger at these levels of positions than at 0."""
     extent = np.where(codes.maxs > codes.mins, codes.maxs - codes.mins, 1.0)
     logs = np.abs(codes.mins + extent * (levels / 65535))  # of 1 + a coordinate
@@ -153,7 +151,7 @@ _CARRYING: dict[type[Codes], Carrying] = {
 FORMATS = {each.name: each for each in _CARRYING}
 
 
-def _middle(values: npt.NDArray[Any]) -> Doubles:
+def _middle(values: Numbers) -> Doubles:
     """[N] the second of the three numbers of each row, by size."""
     return np.sort(values.astype(np.float64), axis=1)[:, 1]
 
@@ -170,7 +168,7 @@ def _fitting(logs: Doubles) -> Levels:
     return np.floor(np.nan_to_num(logs)).clip(0, MAX_BITS).astype(np.int32)
 
 
-def _fields(name: str, levels: npt.NDArray[Any], bits: Levels | int) -> list[Field]:
+def _fields(name: str, levels: Numbers, bits: Levels | int) -> list[Field]:
     """A field of each column [N, C]."""
     own = levels.astype(np.int32)
     each_column = zip(own.T, np.broadcast_to(np.int32(bits), own.shape).T, strict=True)

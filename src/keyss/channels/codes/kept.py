@@ -7,11 +7,11 @@ would pile up. The randomness follows from the cover, which only the writer has.
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from keyss.channels.codes.fields import Doubles, Field, Flags, Levels, carrying, sog_distances
+from keyss.channels.codes.fields import Field, Levels, carrying, sog_distances
 from keyss.channels.mixing import random_fractions
+from keyss.core.arrays import Doubles, Flags, Integers
 from keyss.files.formats.common import Codes
 from keyss.files.formats.compressed_ply import CompressedPlyCodes
 from keyss.files.formats.sog import SogCodes
@@ -26,8 +26,6 @@ _ROUGH = 0.25  # by how much more often levels may be equal than near each other
 _EQUAL = 0.02  # as a share of the Gaussians
 _DEVIATIONS = 6
 _LEANING = 0.02  # of the last bits to 0 or to 1
-
-Integers = npt.NDArray[np.int64]
 
 
 def changeable(codes: Codes, fields: list[Field], secret: bytes) -> list[Flags]:

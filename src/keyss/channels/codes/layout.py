@@ -15,11 +15,11 @@ import struct
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from cryptography.exceptions import InvalidTag
 from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305
 
-from keyss.channels.codes.syndromes import BLOCK, Bits
+from keyss.channels.codes.syndromes import BLOCK
+from keyss.core.arrays import Bits, Integers
 from keyss.core.errors import InputError
 from keyss.keys.derivation import SALT_BYTES, DerivedKey, stream
 
@@ -30,8 +30,6 @@ _MIN_SHARE, _SHARE = 1 / 4, 1 / 32  # of all bits: for MIN_SLOTS, for more slots
 _HEADER = struct.Struct("<BHIIx")  # version, bits that a block holds, first bit, bytes of data
 SLOT_BYTES = _HEADER.size + 16
 _ASSOCIATED = b"keyss/v1/codes"
-
-Order = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -73,12 +71,12 @@ class Zones:
     def data_blocks(self) -> int:
         return (self.bits - self.zone_bits) // BLOCK
 
-    def zone_places(self) -> tuple[Order, Order]:
+    def zone_places(self) -> tuple[Integers, Integers]:
         """The bits of salt and slots, and all others."""
         zone, others = np.split(_order(bytes(SALT_BYTES), self.bits), [self.zone_bits])
         return zone, others
 
-    def places(self, salt: bytes) -> tuple[Order, Order]:
+    def places(self, salt: bytes) -> tuple[Integers, Integers]:
         """The bits of salt and slots, and those of data, in the order in which blocks take them."""
         zone, others = self.zone_places()
         return zone, others[_order(salt, len(others))][: self.data_blocks * BLOCK]
@@ -109,7 +107,7 @@ def find_header(zone: bytes, key: DerivedKey, room: Zones) -> Header | None:
     return Header(rate, first, size)
 
 
-def _order(salt: bytes, count: int) -> Order:
+def _order(salt: bytes, count: int) -> Integers:
     """[count] a random order that `salt` determines."""
     numbers = np.frombuffer(stream(salt + bytes(16), "codes/order", 8 * count), "<u8")
     # Sorted with their numbers in the lower half: the same on all machines, and faster than `argsort`.

@@ -10,14 +10,12 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from keyss.channels.codes.fields import Field, Flags, carrying, sog_distances
+from keyss.channels.codes.fields import Field, carrying, sog_distances
 from keyss.channels.mixing import row_hashes
-from keyss.files.formats.common import Codes, Floats, morton_order
+from keyss.core.arrays import Doubles, Flags, Floats, Integers
+from keyss.files.formats.common import Codes, morton_order
 from keyss.files.formats.sog import SogCodes
-
-Rows = npt.NDArray[np.intp]
 
 _SOG_ARRAYS = ("positions", "largest", "rotations", "scales", "colors", "alphas", "labels")
 
@@ -35,7 +33,7 @@ def in_counted_order(codes: Codes) -> tuple[Any, list[Field]]:
     return codes, [replace(each, bits=np.where(alike, 0, each.bits)) for each in fields]
 
 
-def in_file_order(codes: Codes, within: npt.NDArray[np.float64]) -> Any:
+def in_file_order(codes: Codes, within: Doubles) -> Any:
     """The codes as a writer of the format sorts them.
 
     It sorts before it rounds, so that a few neighbours seem to be out of order. `within` [N, 3], random in
@@ -49,11 +47,11 @@ def in_file_order(codes: Codes, within: npt.NDArray[np.float64]) -> Any:
     return _taken(codes, morton_order(means))
 
 
-def _taken(codes: SogCodes, rows: Rows) -> SogCodes:
+def _taken(codes: SogCodes, rows: Integers) -> SogCodes:
     return replace(codes, **{name: getattr(codes, name)[rows] for name in _SOG_ARRAYS})
 
 
-def _sog_order(codes: SogCodes) -> tuple[Rows, Flags]:
+def _sog_order(codes: SogCodes) -> tuple[Integers, Flags]:
     """The rows [N] by hashes of codes that are not written, and which of them, in that order, share one.
 
     Where two hashes are equal by chance, a little room is lost.

@@ -8,8 +8,8 @@ bits as it has dry ones, less the few that random matrices lack in rank.
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
+from keyss.core.arrays import Bits, Words
 from keyss.keys.derivation import stream
 from keyss.rendering.cpu.jit import kernel
 
@@ -18,9 +18,6 @@ _WORDS = BLOCK // 64
 _DEVIATIONS = 4.5  # of the number of dry bits of a block below its mean: one block in 300,000 has fewer
 _SPARE = 10  # dry bits beyond the rate: one matrix in 1000 lacks as much in rank
 _AT_ONCE = 1024  # blocks
-
-Bits = npt.NDArray[np.uint8]  # each 0 or 1
-Words = npt.NDArray[np.uint64]
 
 
 def rate_of(dry: float) -> int:

@@ -16,13 +16,13 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
-import numpy.typing as npt
 
-from keyss.channels.colours.carriers import CELL, Carriers, Doubles, Numbers
+from keyss.channels.colours.carriers import CELL, Carriers, Numbers
 from keyss.channels.colours.header import SHARES, UNNOTICED, Kind, bucket_bytes
 from keyss.channels.colours.lattice import COLUMNS, LEVELS, MAX_BITS, SPACING, bit_counts
 from keyss.channels.colours.likeness import Likeness
 from keyss.channels.colours.quiet import Quiet
+from keyss.core.arrays import Doubles, Flags, Integers
 from keyss.core.gaussians import Gaussians
 from keyss.keys.encryption import OVERHEAD
 from keyss.rendering.difference import psnr_between
@@ -128,7 +128,7 @@ class Capacity:
         return self.numbers.carriers(float(np.round(self.numbers.size / CELL) * CELL))
 
     @cached_property
-    def own_rows(self) -> npt.NDArray[np.int64]:
+    def own_rows(self) -> Integers:
         """[D] the carriers that are written, or left alone."""
         return self.carriers.one_of_each()
 
@@ -141,7 +141,7 @@ class Capacity:
         return Quiet(self.model)
 
     @cached_property
-    def alone(self) -> npt.NDArray[np.bool_]:
+    def alone(self) -> Flags:
         """[C] carriers that are left alone."""
         return self.quiet.left_alone()[self.numbers.rows]
 

@@ -19,6 +19,7 @@ import numpy.typing as npt
 from torch import Tensor
 
 from keyss.channels.mixing import row_hashes
+from keyss.core.arrays import Doubles, Flags, Integers
 from keyss.core.gaussians import Gaussians
 
 SCALE_STEP, COLOUR_STEP, OPACITY_STEP = 1 / 16, 1 / 38.25, 1 / 255  # of 8-bit formats
@@ -30,7 +31,6 @@ _SCALE_NOISE, COLOUR_NOISE, OPACITY_NOISE = 0.018, 0.009, 0.004
 _SCALE_ROUNDED = SCALE_STEP / 2  # where borders lie elsewhere, by `.spz` as well
 _CELLS = 30_000  # on either side of zero: what fits into 16 bits
 
-Doubles = npt.NDArray[np.float64]
 Names = npt.NDArray[np.int16]
 
 
@@ -38,7 +38,7 @@ Names = npt.NDArray[np.int16]
 class Numbers:
     """The numbers of the C Gaussians that can carry something."""
 
-    rows: npt.NDArray[np.int64]  # [C] of the model
+    rows: Integers  # [C] of the model
     log_scales: Doubles  # [C, 3]
     opacities: Doubles  # [C]
     colours: Doubles  # [C, 3] constant coefficients
@@ -88,7 +88,7 @@ class Numbers:
 class Carriers:
     """C Gaussians as writer and reader see them."""
 
-    rows: npt.NDArray[np.int64]  # [C] of the model
+    rows: Integers  # [C] of the model
     names: Names  # [C, 5] numbers of cells: log scales, opacity, red
     doubt: Doubles  # [C] chance that the name is not what it was when it was written
     values: Doubles  # [C, 2] green and blue
@@ -96,7 +96,7 @@ class Carriers:
     def __len__(self) -> int:
         return len(self.rows)
 
-    def __getitem__(self, which: npt.NDArray[np.int64] | npt.NDArray[np.bool_]) -> Carriers:
+    def __getitem__(self, which: Integers | Flags) -> Carriers:
         return Carriers(self.rows[which], self.names[which], self.doubt[which], self.values[which])
 
     def shifted(self, cells: int) -> Carriers:
@@ -112,12 +112,12 @@ class Carriers:
         impact: Doubles = log_scales[:, 1] + log_scales[:, 2] + 2 * np.log(opacities.clip(1e-3))
         return impact
 
-    def namesakes(self) -> npt.NDArray[np.int64]:
+    def namesakes(self) -> Integers:
         """[C] how many carriers have the same name, itself included."""
         _, inverse, counts = np.unique(row_hashes(self.names), return_inverse=True, return_counts=True)
         return counts[inverse].astype(np.int64)
 
-    def one_of_each(self) -> npt.NDArray[np.int64]:
+    def one_of_each(self) -> Integers:
         """[D] the carrier of each name that is least in doubt: only this one is written."""
         order = np.argsort(self.doubt, kind="stable")
         _, first = np.unique(row_hashes(self.names)[order], return_index=True)
@@ -134,5 +134,4 @@ def _cells(values: Doubles, steps: int, noise: float) -> tuple[Names, Doubles]:
 
 
 def _doubles(values: Tensor) -> Doubles:
-    numbers: Doubles = values.detach().cpu().numpy().astype(np.float64)
-    return numbers
+    return values.detach().cpu().numpy().astype(np.float64)

@@ -15,12 +15,11 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-import numpy.typing as npt
 import torch
 
 from keyss.channels.base import METHOD_BYTES, Channel, Content, Room
 from keyss.channels.colours.capacity import Capacity, Layout, bucket_of
-from keyss.channels.colours.carriers import Doubles, Numbers
+from keyss.channels.colours.carriers import Numbers
 from keyss.channels.colours.fountain import Fountain
 from keyss.channels.colours.header import (
     FILE_KEY_BYTES,
@@ -39,6 +38,7 @@ from keyss.channels.colours.lattice import MAX_BITS, seeds, write
 from keyss.channels.colours.reading import ASSOCIATED
 from keyss.channels.colours.salts import SALTS, Salts, renewed, steady
 from keyss.channels.payloads import NOTICED, check_keys, pack_payload, randomness
+from keyss.core.arrays import Doubles, Flags
 from keyss.core.errors import InputError, KeyssWarning, UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.keys.derivation import MASTER_BYTES, expand, stream
@@ -213,9 +213,7 @@ class ColoursCover:
                 values[rows], chosen[rows] = write(key, carriers[rows], counts, bits), some
         return self._with_colours(values, chosen, random)
 
-    def _with_colours(
-        self, values: Doubles, chosen: npt.NDArray[np.bool_], random: np.random.Generator
-    ) -> Gaussians:
+    def _with_colours(self, values: Doubles, chosen: Flags, random: np.random.Generator) -> Gaussians:
         """The model with another green and blue [C, 2] of its carriers; those that are equal stay.
 
         `chosen` [C]: carriers that change only where the new colour is as likely as the old one.

@@ -17,7 +17,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from keyss.channels.mixing import Words, mixed
+from keyss.channels.mixing import mixed
+from keyss.core.arrays import Bits, Floats, Integers, Words
 from keyss.rendering.cpu.jit import kernel
 
 # Shares of code bits that are sums of 1, 2, ... intermediate bits (Shokrollahi 2006, table I, k = 65,536),
@@ -34,9 +35,6 @@ _MAX = 30.0  # of any message
 _SETTLED = 3
 _RANK = np.uint64(0xD1B54A32D192ED03)
 _BLOCK = 1 << 16  # equations at a time
-
-Bits = npt.NDArray[np.uint8]
-Ratios = npt.NDArray[np.float32]
 
 
 @dataclass(frozen=True)
@@ -75,12 +73,12 @@ class Fountain:
         starts, members = equations(seeds, self.length, self.degrees)
         return (np.add.reduceat(every[members], starts[:-1]) & 1).astype(np.uint8)
 
-    def decode(self, seeds: Words, ratios: Ratios, rounds: int) -> tuple[Bits, bool]:
+    def decode(self, seeds: Words, ratios: Floats, rounds: int) -> tuple[Bits, bool]:
         """The likeliest data [size], and whether all checks hold; see `likeliest`."""
         every, done = self.likeliest(seeds, ratios, rounds)
         return every[: self.size], done
 
-    def likeliest(self, seeds: Words, ratios: Ratios, rounds: int) -> tuple[Bits, bool]:
+    def likeliest(self, seeds: Words, ratios: Floats, rounds: int) -> tuple[Bits, bool]:
         """The likeliest intermediate bits [length], and whether all checks hold.
 
         `ratios` [n]: natural logarithms of P(0) / P(1) of the code bits of `seeds` [n]. Takes at most
@@ -97,7 +95,7 @@ class Fountain:
 
 def equations(
     seeds: Words, length: int, degrees: tuple[tuple[int, float], ...] = _RAPTOR
-) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int32]]:
+) -> tuple[Integers, npt.NDArray[np.int32]]:
     """[n + 1] where each equation starts among the members, and the members, numbers below `length`.
 
     A member that is drawn twice cancels itself, in writing as in reading.
@@ -120,7 +118,7 @@ def equations(
 
 
 @lru_cache(maxsize=4)
-def _parity_checks(size: int, parity: int) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int32]]:
+def _parity_checks(size: int, parity: int) -> tuple[Integers, npt.NDArray[np.int32]]:
     """[parity + 1] starts, and members: data bits, the parity bit of the check and the one before it."""
     times = np.arange(size * _REPEATS)
     # Every data bit in _REPEATS checks, all checks nearly equally often.

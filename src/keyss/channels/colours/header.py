@@ -19,23 +19,13 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
-import numpy.typing as npt
 
-from keyss.channels.colours.carriers import Carriers, Doubles, Names
-from keyss.channels.colours.fountain import NOISY, Bits, Fountain
-from keyss.channels.colours.lattice import (
-    COLUMNS,
-    MAX_BITS,
-    Counts,
-    bit_counts,
-    dithers,
-    rank,
-    read,
-    seeds,
-    write,
-)
+from keyss.channels.colours.carriers import Carriers, Names
+from keyss.channels.colours.fountain import NOISY, Fountain
+from keyss.channels.colours.lattice import COLUMNS, MAX_BITS, bit_counts, dithers, rank, read, seeds, write
 from keyss.channels.colours.salts import SALTS
-from keyss.channels.mixing import Words, mixed
+from keyss.channels.mixing import mixed
+from keyss.core.arrays import Bits, Doubles, Flags, Integers, Words
 from keyss.keys.derivation import SALT_BYTES, DerivedKey, expand, stream
 
 FILE_KEY_BYTES = 5
@@ -74,7 +64,7 @@ class Kind:
         """Share of so many carriers that the headers of one secret take."""
         return 1 - math.exp(-SALTS * self.places / max(1, carriers))
 
-    def bits(self, carriers: int) -> Counts:
+    def bits(self, carriers: int) -> Integers:
         """[C] bits of each of their numbers."""
         return np.full(carriers, self.depth)
 
@@ -103,15 +93,14 @@ class Header:
     def kind(self) -> Kind:
         return Kind.of(self.depth)
 
-    def bits(self, carriers: Carriers) -> Counts:
+    def bits(self, carriers: Carriers) -> Integers:
         """[C] bits of the payload in each number."""
         return bit_counts(carriers, self.level, self.depth)
 
-    def own(self, carriers: Carriers) -> npt.NDArray[np.bool_]:
+    def own(self, carriers: Carriers) -> Flags:
         """[C] which carriers the payload has, by a hash of their names that holders of keys know."""
         part = rank(self.partition, "partition", carriers.names) % np.uint64(SHARES)
-        own: npt.NDArray[np.bool_] = (part >= self.first) & (part <= self.last)
-        return own
+        return (part >= self.first) & (part <= self.last)
 
     def pack(self, check: bytes) -> Bits:
         """The bits of a header; `check`: a secret that recognises it."""
@@ -151,14 +140,13 @@ class Index:
         """How many names there are."""
         return len(self._rows)
 
-    def rows(self, secret: bytes, kind: Kind) -> npt.NDArray[np.int64]:
+    def rows(self, secret: bytes, kind: Kind) -> Integers:
         """[places] a carrier with each name that this secret's header is in."""
         return self._rows[self._places(secret, kind.places, 0)]
 
-    def _places(self, secret: bytes, count: int, behind: int) -> npt.NDArray[np.int64]:
+    def _places(self, secret: bytes, count: int, behind: int) -> Integers:
         points = np.frombuffer(stream(secret, "colours/places", 8 * count), "<u8")
-        places: npt.NDArray[np.int64] = (np.searchsorted(self._hashes, points) + behind) % len(self)
-        return places
+        return (np.searchsorted(self._hashes, points) + behind) % len(self)
 
     def parts(
         self, secrets: Sequence[bytes], kind: Kind, view: Sequence[float], count: int | None = None
@@ -204,8 +192,8 @@ class Parts:
 
 
 def written_header(
-    header: Header, check: bytes, secret: bytes, index: Index, carriers: Carriers, free: npt.NDArray[np.bool_]
-) -> tuple[npt.NDArray[np.int64], Doubles]:
+    header: Header, check: bytes, secret: bytes, index: Index, carriers: Carriers, free: Flags
+) -> tuple[Integers, Doubles]:
     """[P] those of the carriers that are `free` [C] which hold a header, and [P, 2] their new values."""
     kind = header.kind
     own = index.rows(secret, kind)

@@ -14,11 +14,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import numpy.typing as npt
 
-from keyss.channels.colours.carriers import Carriers, Doubles, Names
-from keyss.channels.colours.fountain import Bits, Ratios
-from keyss.channels.mixing import Words, encrypted_blocks, mixed
+from keyss.channels.colours.carriers import Carriers, Names
+from keyss.channels.mixing import encrypted_blocks, mixed
+from keyss.core.arrays import Bits, Doubles, Floats, Integers, Words
 from keyss.keys.derivation import expand
 
 COLUMNS = 2  # numbers of a Gaussian that are written
@@ -31,23 +30,21 @@ _NOISE = 0.23  # standard deviation of a format's rounding, in spacings
 _BLOCK = 16
 _POINTS = np.array([-1.0, 0.0, 1.0, 2.0])  # that a number may have come from, from the one below on
 
-Counts = npt.NDArray[np.int64]
 
-
-def bit_counts(carriers: Carriers, level: int, depth: int) -> Counts:
+def bit_counts(carriers: Carriers, level: int, depth: int) -> Integers:
     """[C] bits of each of a carrier's numbers: at most `depth`, and more at a higher level (below LEVELS)."""
     bits = np.floor((level - _MIDDLE) / 4 - carriers.impact / _BIT)
     return bits.clip(0, depth).astype(np.int64)
 
 
-def seeds(secret: bytes, label: str, names: Names, bits: Counts) -> Words:
+def seeds(secret: bytes, label: str, names: Names, bits: Integers) -> Words:
     """[B] the seeds of all bits of Gaussians with these names, for `Fountain`; `bits` [C]: of each number."""
     counts = COLUMNS * bits
     order = np.arange(1, counts.sum() + 1) - np.repeat(np.cumsum(counts) - counts, counts)
     return mixed(np.repeat(rank(secret, label, names), counts) ^ mixed(order.astype(np.uint64)))
 
 
-def write(secret: bytes, carriers: Carriers, bits: Counts, code: Bits) -> Doubles:
+def write(secret: bytes, carriers: Carriers, bits: Integers, code: Bits) -> Doubles:
     """[C, 2] new values that carry the bits `code` [B], `bits` [C] in each number."""
     counts = np.repeat(bits, COLUMNS)
     label, first = np.zeros(len(counts), np.int64), np.cumsum(counts) - counts
@@ -60,7 +57,7 @@ def write(secret: bytes, carriers: Carriers, bits: Counts, code: Bits) -> Double
     return np.where(counts > 0, nearest, values).reshape(-1, COLUMNS)
 
 
-def read(dither: Doubles, carriers: Carriers, bits: Counts, doubt: Doubles) -> Ratios:
+def read(dither: Doubles, carriers: Carriers, bits: Integers, doubt: Doubles) -> Floats:
     """[B] logarithms of P(0) / P(1) of each bit, of which each number has `bits` [C].
 
     `dither` [C, 2]: of `dithers`. `doubt` [C]: the chance that a carrier holds something else.
@@ -84,8 +81,7 @@ def read(dither: Doubles, carriers: Carriers, bits: Counts, doubt: Doubles) -> R
 
 def dithers(secret: bytes, names: Names) -> Doubles:
     """[C, 2] numbers in [0, 1)."""
-    dither: Doubles = (_random(secret, "dither", names) >> np.uint64(11)) / 2.0**53
-    return dither
+    return (_random(secret, "dither", names) >> np.uint64(11)) / 2.0**53
 
 
 def rank(secret: bytes, label: str, names: Names) -> Words:
@@ -101,7 +97,7 @@ def _random(secret: bytes, label: str, names: Names) -> Words:
     return encrypted_blocks(key, blocks.view(np.uint8)).view("<u8").astype(np.uint64)
 
 
-def _ungray(code: Counts) -> Counts:
+def _ungray(code: Integers) -> Integers:
     """The number whose Gray code, number xor half of it, is `code` (up to 8 bits)."""
     for shift in (1, 2, 4):
         code = code ^ code >> shift

@@ -16,10 +16,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from keyss.channels.colours.carriers import Doubles
+from keyss.core.arrays import Doubles, Flags, Integers
 
 _NEIGHBOURS = 3  # in space
 _SIZES = (3e-6, 3e-4, 0.002, 0.008, 0.03, 0.12)  # of differences in colour, below which all count as the same
@@ -29,25 +28,22 @@ _LEARNED_FROM = 5_000  # Gaussians
 _RIDGE, _STEPS = 3.0, 8  # of Newton's method
 _BATCHES = 16  # of numbers that are decided at a time, as if none were another's neighbour
 
-Rows = npt.NDArray[np.int64]
-Flags = npt.NDArray[np.bool_]
-
 
 @dataclass(frozen=True)
 class _Pairs:
     """Each Gaussian with others of one kind, in both directions."""
 
-    starts: Rows  # [N + 1]
-    others: Rows  # [P]
+    starts: Integers  # [N + 1]
+    others: Integers  # [P]
 
     @staticmethod
-    def of(one: Rows, other: Rows, count: int) -> _Pairs:
+    def of(one: Integers, other: Integers, count: int) -> _Pairs:
         both = np.stack([np.concatenate([one, other]), np.concatenate([other, one])], axis=1)
         both = np.unique(both[both[:, 0] != both[:, 1]], axis=0)
         starts = np.concatenate([[0], np.cumsum(np.bincount(both[:, 0], minlength=count))])
         return _Pairs(starts.astype(np.int64), both[:, 1])
 
-    def around(self, rows: Rows) -> tuple[Rows, Rows]:
+    def around(self, rows: Integers) -> tuple[Integers, Integers]:
         """[p] which of the rows [R], and [p] what is paired with it."""
         counts = self.starts[rows + 1] - self.starts[rows]
         which = np.repeat(np.arange(len(rows)), counts)
@@ -93,22 +89,21 @@ class Likeness:
                 admitted[fine, column - 1] = True
         return admitted
 
-    def _log_ratio(self, colours: Doubles, rows: Rows, column: int, new: Doubles) -> Doubles:
+    def _log_ratio(self, colours: Doubles, rows: Integers, column: int, new: Doubles) -> Doubles:
         """[R] logarithm of p(new) / p(old) of one number of each row, where all others stay."""
         around = [pairs.around(rows) for pairs in self.pairs]
         after = _features(self.usual, colours, rows, column, new, around)
         before = _features(self.usual, colours, rows, column, colours[rows, column], around)
-        ratio: Doubles = (after - before) @ self.weights[column - 1]
-        return ratio
+        return (after - before) @ self.weights[column - 1]
 
 
 def _features(
     usual: Doubles,
     colours: Doubles,
-    rows: Rows,
+    rows: Integers,
     column: int,
     values: Doubles,
-    around: list[tuple[Rows, Rows]],
+    around: list[tuple[Integers, Integers]],
 ) -> Doubles:
     """[R, F] of rows whose number in this column is `values` [R]."""
     another = 3 - column
@@ -157,11 +152,10 @@ def _usual(colours: Doubles, every: tuple[_Pairs, ...]) -> Doubles:
     return found
 
 
-def _sums(which: Rows, values: Doubles, count: int) -> Doubles:
+def _sums(which: Integers, values: Doubles, count: int) -> Doubles:
     """[count] of the values [p] of each."""
     return np.bincount(which, values, count).astype(np.float64)
 
 
 def _log(apart: Doubles, size: float) -> Doubles:
-    found: Doubles = np.log(apart * apart + size * size) / 2
-    return found
+    return np.log(apart * apart + size * size) / 2

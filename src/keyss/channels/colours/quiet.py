@@ -6,16 +6,14 @@ Readers need not know: a number that was left alone reads as lost.
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
 from keyss.channels.colours.lattice import SPACING
+from keyss.core.arrays import Doubles, Flags, Floats, Integers
 from keyss.core.gaussians import Gaussians
 
 _ROUNDED = 0.25  # share of repeated colours from which on a model is a rounded one
 _LOW = np.uint32(1023)  # bits of a float that stay
 _SHORT = np.uint32((1 << 20) - 1)  # a number whose last bits are all zero was typed, not trained
-
-Floats = npt.NDArray[np.float32]
 
 
 class Quiet:
@@ -29,7 +27,7 @@ class Quiet:
         self._rounded = bool(len(repeated)) and float(repeated.mean()) > _ROUNDED
         self._repeated = repeated.any(axis=1)
 
-    def left_alone(self) -> npt.NDArray[np.bool_]:
+    def left_alone(self) -> Flags:
         """[N] Gaussians with a colour that is repeated, typed, or equal in two channels.
 
         None of a rounded model, where all are repeated. Colours that are nearly equal are not left alone:
@@ -38,11 +36,11 @@ class Quiet:
         if self._rounded or not len(self._colours):
             return np.zeros(len(self._colours), bool)
         typed = ((self._colours.view(np.uint32) & _SHORT) == 0).any(axis=1)
-        alone: npt.NDArray[np.bool_] = self._repeated | typed
+        alone: Flags = self._repeated | typed
         alone |= (self._colours == np.roll(self._colours, 1, axis=1)).any(axis=1)
         return alone
 
-    def fitted(self, rows: npt.NDArray[np.int64], column: int, new: npt.NDArray[np.float64]) -> Floats:
+    def fitted(self, rows: Integers, column: int, new: Doubles) -> Floats:
         """[R] `new` values of a column as this model would have them.
 
         In a rounded model: the nearest value that it has, if a reader reads the same from it. In others: with
@@ -53,8 +51,7 @@ class Quiet:
             above = np.searchsorted(values, new).clip(1, len(values) - 1) if len(values) > 1 else 0
             below = values[np.maximum(above - 1, 0)]
             nearest = np.where(new - below < values[above] - new, below, values[above])
-            close: Floats = np.where(np.abs(nearest - new) <= SPACING / 2, nearest, new).astype(np.float32)
-            return close
+            return np.where(np.abs(nearest - new) <= SPACING / 2, nearest, new).astype(np.float32)
         bits = new.astype(np.float32).view(np.uint32) & ~_LOW | old.view(np.uint32) & _LOW
         same: Floats = bits.view(np.float32)
         return same

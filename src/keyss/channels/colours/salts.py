@@ -24,10 +24,10 @@ from keyss.channels.colours.carriers import (
     OPACITY_NOISE,
     OPACITY_STEP,
     SCALE_STEP,
-    Doubles,
     Numbers,
 )
 from keyss.channels.colours.lattice import rank
+from keyss.core.arrays import Doubles, Integers
 from keyss.keys.derivation import SALT_BYTES
 
 SALTS = 16  # at most; after rounding and random pruning of a quarter, 5 to 12 of them are left
@@ -48,7 +48,7 @@ _PUBLIC = hashlib.sha256(_LABEL).digest()
 class Salts:
     """The listed Gaussians."""
 
-    rows: npt.NDArray[np.int64]  # [S] of `Numbers`
+    rows: Integers  # [S] of `Numbers`
     salts: list[bytes]
 
     @staticmethod

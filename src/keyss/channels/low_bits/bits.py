@@ -20,9 +20,9 @@ from dataclasses import dataclass
 from hashlib import blake2b
 
 import numpy as np
-import numpy.typing as npt
 import torch
 
+from keyss.core.arrays import Bytes, Doubles, Integers, Words32
 from keyss.core.gaussians import Gaussians
 from keyss.rendering.cpu.parallel import in_blocks
 
@@ -36,11 +36,6 @@ UNIT_TOLERANCE = 1e-4  # of a length that is known without the low bits, to 2e-5
 IDENTITY_BYTES = 16
 _PERSON = b"keyss/identity"
 BLOCK = 1 << 13  # Gaussians that a thread takes at a time
-
-Words = npt.NDArray[np.uint32]
-Bytes = npt.NDArray[np.uint8]
-Flags = npt.NDArray[np.bool_]
-Rows = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -63,13 +58,13 @@ class Layout:
         return GEOMETRY - 4 * (not self.quats) + _sh_count(self.sh_degree) * 3 // 2
 
     @property
-    def columns(self) -> npt.NDArray[np.int64]:
+    def columns(self) -> Integers:
         """[F'] the fields in use, of those that `used_words` has."""
         every = np.arange(GEOMETRY + _sh_count(self.sh_degree))
         return every if self.quats else np.delete(every, QUATS)
 
     @property
-    def mask(self) -> Words:
+    def mask(self) -> Words32:
         """[F] the bits in use of all fields that `used_words` has."""
         bits = [GEOMETRY_BITS] * GEOMETRY + [SH_BITS] * _sh_count(self.sh_degree)
         mask = np.array([((1 << count) - 1) << UNUSED_BITS for count in bits], np.uint32)
@@ -78,7 +73,7 @@ class Layout:
         return mask
 
     @property
-    def shifts(self) -> Words:
+    def shifts(self) -> Words32:
         """[F] by which a word is shifted so that the bits in use, and those below them, are gone."""
         return np.array([int(each).bit_length() for each in self.mask], np.uint32)
 
@@ -88,12 +83,12 @@ def bytes_per_gaussian(sh_degree: int) -> int:
     return Layout(sh_degree).width
 
 
-def coarse_lengths(quats: Words) -> npt.NDArray[np.float64]:
+def coarse_lengths(quats: Words32) -> Doubles:
     """[N] of quaternions [N, 4] with the middle of all low bits that they could have."""
     low = np.uint32((1 << UNUSED_BITS + GEOMETRY_BITS) - 1)
     with np.errstate(over="ignore", invalid="ignore"):
         middle = (quats & ~low | (low + 1) >> 1).view(np.float32).astype(np.float64)
-        lengths: npt.NDArray[np.float64] = np.sqrt((middle * middle).sum(axis=1))
+        lengths: Doubles = np.sqrt((middle * middle).sum(axis=1))
     return lengths
 
 
@@ -134,7 +129,9 @@ def read_low_bits(gaussians: Gaussians, layout: Layout | None = None) -> Bytes:
     return packed
 
 
-def write_low_bits(gaussians: Gaussians, layout: Layout, parts: Iterable[tuple[Rows, Bytes]]) -> Gaussians:
+def write_low_bits(
+    gaussians: Gaussians, layout: Layout, parts: Iterable[tuple[Integers, Bytes]]
+) -> Gaussians:
     """The same Gaussians with other low bits: for each part [R, B] in the rows [R], which are different ones.
 
     Where a Gaussian's bits are no whole number of bytes, the last half byte stays as it is.
@@ -147,7 +144,7 @@ def write_low_bits(gaussians: Gaussians, layout: Layout, parts: Iterable[tuple[R
 
     for rows, data in parts:
 
-        def write(start: int, stop: int, rows: Rows = rows, data: Bytes = data) -> None:
+        def write(start: int, stop: int, rows: Integers = rows, data: Bytes = data) -> None:
             own, new, first = rows[start:stop], _unpacked(data[start:stop], layout), 0
             for field in fields:
                 columns = slice(first, first := first + field.shape[1])
@@ -157,7 +154,7 @@ def write_low_bits(gaussians: Gaussians, layout: Layout, parts: Iterable[tuple[R
     return written.to(gaussians.device)
 
 
-def used_words(gaussians: Gaussians) -> Words:
+def used_words(gaussians: Gaussians) -> Words32:
     """[N, F] bit patterns of scales, quaternions, opacity and harmonics above the constant ones; a copy."""
     return np.concatenate([_words(values) for values in _used_fields(gaussians)], axis=1)
 
@@ -166,7 +163,7 @@ def _used_fields(gaussians: Gaussians) -> tuple[torch.Tensor, ...]:
     return gaussians.log_scales, gaussians.quats, gaussians.opacity_logits, gaussians.sh[:, 1:]
 
 
-def _unpacked(data: Bytes, layout: Layout) -> Words:
+def _unpacked(data: Bytes, layout: Layout) -> Words32:
     """[N, F] the words whose low bits are bytes [N, B], zeros where a byte or a field is not in use."""
     count = _sh_count(layout.sh_degree)
     before = len(layout.columns) - count
@@ -184,7 +181,7 @@ def _sh_count(sh_degree: int) -> int:
     return 3 * ((sh_degree + 1) ** 2 - 1)
 
 
-def _words(values: torch.Tensor) -> Words:
+def _words(values: torch.Tensor) -> Words32:
     """[N, C] bit patterns: the tensor's own memory where it is contiguous and on the CPU."""
     width = math.prod(values.shape[1:])
     flat = values.detach().to("cpu", torch.float32).reshape(len(values), width).contiguous()

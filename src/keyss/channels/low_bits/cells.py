@@ -21,18 +21,15 @@ primitive is the library's.
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
 from keyss.channels.mixing import encrypted_blocks
+from keyss.core.arrays import Bytes, Flags, Integers
 from keyss.keys.derivation import expand
 from keyss.rendering.cpu.parallel import in_blocks
 
 TAG_BYTES = 4
 _BLOCK = 16
 _CELLS = 1 << 13  # at a time: what is made of them stays in the cache
-
-Bytes = npt.NDArray[np.uint8]
-Flags = npt.NDArray[np.bool_]
 
 
 class CellCipher:
@@ -49,7 +46,7 @@ class CellCipher:
         """Bytes of tag and data."""
         return TAG_BYTES + self.size
 
-    def encrypt(self, identities: Bytes, data: Bytes, slots: npt.NDArray[np.int64] | int = 0) -> Bytes:
+    def encrypt(self, identities: Bytes, data: Bytes, slots: Integers | int = 0) -> Bytes:
         """[N, cell_bytes] cells of `data` [N, size] for identities [N, 16].
 
         `slots` [N], or one for all: the number of the cell in its Gaussian.

@@ -29,24 +29,17 @@ from functools import cached_property
 from weakref import WeakKeyDictionary
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from keyss.channels.base import SALTS_TRIED, Bytes, Channel, Content, Room
-from keyss.channels.low_bits.bits import (
-    Flags,
-    Layout,
-    Rows,
-    identities,
-    read_low_bits,
-    write_low_bits,
-)
+from keyss.channels.base import SALTS_TRIED, Channel, Content, Room
+from keyss.channels.low_bits.bits import Layout, identities, read_low_bits, write_low_bits
 from keyss.channels.low_bits.layout import LowBitsRoom
 from keyss.channels.low_bits.salts import salt, salt_rows
 from keyss.channels.low_bits.usable import check_usable, usable_carriers
 from keyss.channels.low_bits.writing import Writer, digest
 from keyss.channels.payloads import check_keys, randomness
+from keyss.core.arrays import Bytes, Flags, Integers
 from keyss.core.errors import InputError, KeyssWarning
 from keyss.core.gaussians import Gaussians
 from keyss.keys.derivation import DerivedKey, stream
@@ -67,7 +60,9 @@ class LowBits(Channel):
 
     def __init__(self) -> None:
         # By cover, while it lives and does not change: (versions, usable, names, rows of salts).
-        self._found: WeakKeyDictionary[Gaussians, tuple[list[int], Flags, Bytes, Rows]] = WeakKeyDictionary()
+        self._found: WeakKeyDictionary[Gaussians, tuple[list[int], Flags, Bytes, Integers]] = (
+            WeakKeyDictionary()
+        )
 
     def prepare(self, cover: Gaussians) -> LowBitsCover:
         """See `Channel`. Raises InputError for low bits that are not random, and for stale salts."""
@@ -101,7 +96,7 @@ class LowBitsCover:
     layout: Layout
     usable: Flags  # [N]
     names: Bytes  # [N, 16] identities
-    salt_rows: Rows  # [S] in the order of salts
+    salt_rows: Integers  # [S] in the order of salts
 
     @property
     def room(self) -> Room:
@@ -140,12 +135,12 @@ class LowBitsCover:
         return write_low_bits(self.cover, self.layout, parts)
 
     @cached_property
-    def fresh_salts(self) -> Rows:
+    def fresh_salts(self) -> Integers:
         """[F] the numbers of the salts whose Gaussians get new bits."""
         return np.flatnonzero(self.usable[self.salt_rows])
 
     @cached_property
-    def _rows(self) -> npt.NDArray[np.int64]:
+    def _rows(self) -> Integers:
         """[C] the carriers."""
         carriers = self.usable.copy()
         carriers[self.salt_rows] = False

@@ -19,7 +19,8 @@ distance of what they were from uniform bits. The least exponent that is used bo
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
+
+from keyss.core.arrays import Doubles, Integers, Words32
 
 MAX_ZEROS = 12  # that are counted: more are rare, or a short number
 EXPONENTS = 256
@@ -30,11 +31,8 @@ _STEP = 0.25  # octave, to which the limit is found
 _LARGEST = 4  # octaves of the scale below the median number: steps of a sixteenth would never converge
 _ROUNDED = np.concatenate([[0.0], 2.0 ** np.arange(-20, 20.5, 0.5)])  # t in units of the smallest exponent
 
-Counts = npt.NDArray[np.int64]
-Numbers = npt.NDArray[np.float64]
 
-
-def count_trailing_zeros(words: npt.NDArray[np.uint32]) -> Counts:
+def count_trailing_zeros(words: Words32) -> Integers:
     """[EXPONENTS, MAX_ZEROS + 1] how many of the numbers [...] have which exponent and trailing zeros."""
     stopped = words.ravel() | np.uint32(1 << MAX_ZEROS)
     lowest = (stopped & (~stopped + np.uint32(1))).astype(np.float32)  # a power of two
@@ -44,7 +42,7 @@ def count_trailing_zeros(words: npt.NDArray[np.uint32]) -> Counts:
     return flat.reshape(EXPONENTS, MAX_ZEROS + 1)
 
 
-def least_exponent(counts: Counts, share: float) -> int:
+def least_exponent(counts: Integers, share: float) -> int:
     """The least exponent e so that even numbers from e on give away at most `share`.
 
     `counts`: of `count_trailing_zeros`. `share`: of the squared separation (d') of two files, one as it was
@@ -61,7 +59,7 @@ def least_exponent(counts: Counts, share: float) -> int:
     return int(present[enough[0]]) if len(enough) else int(present[-1]) + 1
 
 
-def _confidence_limit(counts: Numbers, exponents: npt.NDArray[np.int64]) -> float:
+def _confidence_limit(counts: Doubles, exponents: Integers) -> float:
     """Of s, from above, for counts [E, MAX_ZEROS + 1] of the numbers of `exponents` [E].
 
     Where too few small numbers are there to tell, s is no larger than steps can be.
@@ -79,16 +77,16 @@ def _confidence_limit(counts: Numbers, exponents: npt.NDArray[np.int64]) -> floa
     return min(limit, float(exponents[np.searchsorted(numbers, numbers[-1] / 2)]) - _LARGEST)
 
 
-def _forced(exponents: npt.NDArray[np.int64], scale: float) -> Numbers:
+def _forced(exponents: Integers, scale: float) -> Doubles:
     """[E, MAX_ZEROS + 1] F(z): the probability that z zeros or more are forced."""
     zeros = np.arange(MAX_ZEROS + 1)
     steps = exponents[:, None] + zeros - 1.0 - scale
-    forced: Numbers = np.exp(-(2.0 ** steps.clip(-60, 10)))
+    forced: Doubles = np.exp(-(2.0 ** steps.clip(-60, 10)))
     forced[:, 0] = 1
     return forced
 
 
-def _zeros(forced: Numbers) -> Numbers:
+def _zeros(forced: Doubles) -> Doubles:
     """[E, MAX_ZEROS + 1] how likely z trailing zeros are where F(z) are forced; the last: or more."""
     exactly = forced - np.append(forced[:, 1:], np.zeros((len(forced), 1)), axis=1)
     at_least = np.zeros_like(forced)
@@ -97,11 +95,10 @@ def _zeros(forced: Numbers) -> Numbers:
     for z in range(1, forced.shape[1]):
         below = (below + exactly[:, z - 1]) / 2
         at_least[:, z] = below + forced[:, z]
-    result: Numbers = at_least - np.append(at_least[:, 1:], np.zeros((len(forced), 1)), axis=1)
-    return result
+    return at_least - np.append(at_least[:, 1:], np.zeros((len(forced), 1)), axis=1)
 
 
-def _log_likelihood(counts: Numbers, exponents: npt.NDArray[np.int64], scale: float) -> float:
+def _log_likelihood(counts: Doubles, exponents: Integers, scale: float) -> float:
     """Of counts [E, MAX_ZEROS + 1], with the best probability of rounding to even."""
     chances = _zeros(_forced(exponents, scale)).clip(1e-12)
     even = 1 - chances[:, 0]
@@ -113,11 +110,11 @@ def _log_likelihood(counts: Numbers, exponents: npt.NDArray[np.int64], scale: fl
     return inside + float(outside.max())
 
 
-def _distance(exponents: npt.NDArray[np.int64], scale: float) -> Numbers:
+def _distance(exponents: Integers, scale: float) -> Doubles:
     """[E] chi-square distance of the other bits of an even number from uniform ones."""
     chances = _zeros(_forced(exponents, scale))[:, 1:]
     given = chances / chances.sum(axis=1, keepdims=True)
     uniform = 0.5 ** np.arange(1, MAX_ZEROS + 1)
     uniform[-1] *= 2
-    result: Numbers = ((given - uniform) ** 2 / uniform).sum(axis=1)
+    result: Doubles = ((given - uniform) ** 2 / uniform).sum(axis=1)
     return result

@@ -9,20 +9,11 @@ from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 import torch
 
-from keyss.channels.base import (
-    SALTS_TRIED,
-    Bytes,
-    Content,
-    Payload,
-    RecordPlan,
-    Records,
-    SaltedReader,
-)
+from keyss.channels.base import SALTS_TRIED, Content, Payload, RecordPlan, Records, SaltedReader
 from keyss.channels.low_bits import parameters
-from keyss.channels.low_bits.bits import Flags, Layout, identities, read_low_bits
+from keyss.channels.low_bits.bits import Layout, identities, read_low_bits
 from keyss.channels.low_bits.cells import CellCipher
 from keyss.channels.low_bits.layout import DATA_KEY_BYTES, LowBitsRoom
 from keyss.channels.low_bits.parameters import Parameters, key_cipher, parameter_cipher
@@ -30,6 +21,7 @@ from keyss.channels.low_bits.salts import salt, salt_rows
 from keyss.channels.low_bits.spread import split_numbers
 from keyss.channels.low_bits.usable import repeated
 from keyss.channels.low_bits.writing import ASSOCIATED, payload_key
+from keyss.core.arrays import Bytes, Flags, Integers
 from keyss.core.errors import InputError, KeyssWarning, WrongKeyError
 from keyss.core.gaussians import Gaussians
 from keyss.keys.derivation import DerivedKey
@@ -138,7 +130,7 @@ class LowBitsReader(SaltedReader):
         return rows
 
 
-def _first_of_each(names: Bytes, low: Bytes) -> npt.NDArray[np.int64]:
+def _first_of_each(names: Bytes, low: Bytes) -> Integers:
     """[M] rows of identities `names` [N, 16] and `low` bits [N, B], equal ones only once."""
     doubtful = np.flatnonzero(repeated(names.view("<u8")[:, 0]))
     if not len(doubtful):

@@ -11,7 +11,6 @@ from __future__ import annotations
 import hashlib
 
 import numpy as np
-import numpy.typing as npt
 import torch
 
 from keyss.channels.low_bits.bits import (
@@ -19,7 +18,6 @@ from keyss.channels.low_bits.bits import (
     GEOMETRY,
     QUATS,
     UNIT_TOLERANCE,
-    Bytes,
     Layout,
     coarse_lengths,
     read_low_bits,
@@ -27,6 +25,7 @@ from keyss.channels.low_bits.bits import (
 )
 from keyss.channels.low_bits.layout import SALTS
 from keyss.channels.low_bits.usable import exponents, near_equal
+from keyss.core.arrays import Bytes, Integers, Words
 from keyss.core.gaussians import Gaussians
 from keyss.keys.derivation import SALT_BYTES
 from keyss.rendering.cpu.parallel import in_blocks
@@ -38,7 +37,7 @@ _MANTISSA = np.uint32((1 << 23) - 1)
 
 def salt_rows(
     gaussians: Gaussians, names: Bytes, low: Bytes | None = None, layout: Layout | None = None
-) -> npt.NDArray[np.int64]:
+) -> Integers:
     """[SALTS or less] the Gaussians, the first first, of identities `names` [N, 16].
 
     `low` [N, B]: their low bits, where they are known.
@@ -64,15 +63,13 @@ def salt(identity: Bytes, low: Bytes) -> bytes:
     return hashlib.sha256(_LABEL + identity.tobytes() + low.tobytes()).digest()[:SALT_BYTES]
 
 
-def _keys(
-    gaussians: Gaussians, names: Bytes, layout: Layout, coincidences: bool = True
-) -> npt.NDArray[np.uint64]:
+def _keys(gaussians: Gaussians, names: Bytes, layout: Layout, coincidences: bool = True) -> Words:
     """[N] what salts are sorted by: 9 bits of rank, 55 of the identity."""
     ranks = _ranks(gaussians, layout, coincidences)
     return ranks << np.uint64(55) | names[:, :8].copy().view(">u8")[:, 0].astype(np.uint64) >> np.uint64(9)
 
 
-def _ranks(gaussians: Gaussians, layout: Layout, coincidences: bool = True) -> npt.NDArray[np.uint64]:
+def _ranks(gaussians: Gaussians, layout: Layout, coincidences: bool = True) -> Words:
     """[N] 0 to 511: 256 for what may well be left alone, and less the larger the least harmonic is.
 
     Without `coincidences` what nearly equal numbers tell is left out.
@@ -80,7 +77,7 @@ def _ranks(gaussians: Gaussians, layout: Layout, coincidences: bool = True) -> n
     columns = layout.columns
     stays = layout.mask[columns] | np.uint32(1)
 
-    def ranked(start: int, stop: int) -> npt.NDArray[np.uint64]:
+    def ranked(start: int, stop: int) -> Words:
         used = used_words(gaussians[start:stop])
         chosen = used[:, columns]
         large = exponents(chosen)
@@ -90,7 +87,7 @@ def _ranks(gaussians: Gaussians, layout: Layout, coincidences: bool = True) -> n
         if layout.quats:
             doubtful |= np.abs(coarse_lengths(used[:, QUATS]) - 1) < UNIT_TOLERANCE
         harmonics = exponents(used[:, GEOMETRY:]) if used.shape[1] > GEOMETRY else large
-        rank: npt.NDArray[np.uint64] = (255 - harmonics.min(axis=1) + 256 * doubtful).astype(np.uint64)
+        rank: Words = (255 - harmonics.min(axis=1) + 256 * doubtful).astype(np.uint64)
         return rank
 
     return np.concatenate([np.zeros(0, np.uint64), *in_blocks(ranked, len(gaussians), BLOCK)])

@@ -10,10 +10,9 @@ from __future__ import annotations
 from functools import lru_cache
 
 import numpy as np
-import numpy.typing as npt
 
-from keyss.channels.base import Bytes
 from keyss.channels.reed_solomon import MAX_CHUNKS, Codewords
+from keyss.core.arrays import Bytes, Integers
 
 REMOVAL = 0.25  # share of the Gaussians that may be removed at random
 FAILURE = 1e-7  # probability that a payload is lost all the same
@@ -45,9 +44,9 @@ def numbered_chunks(codewords: Codewords, data: bytes, cells: int) -> Bytes:
     return np.concatenate([numbers.view(np.uint8).reshape(-1, 4)[:, :NUMBER_BYTES], chunks], axis=1)
 
 
-def split_numbers(chunks: Bytes) -> tuple[npt.NDArray[np.int64], Bytes]:
+def split_numbers(chunks: Bytes) -> tuple[Integers, Bytes]:
     """The numbers [C] and the data [C, width] of numbered chunks."""
-    numbers: npt.NDArray[np.int64] = chunks[:, :NUMBER_BYTES] @ np.array([1, 1 << 8, 1 << 16])
+    numbers: Integers = chunks[:, :NUMBER_BYTES] @ np.array([1, 1 << 8, 1 << 16])
     return numbers, chunks[:, NUMBER_BYTES:]
 
 

@@ -25,7 +25,6 @@ import math
 from itertools import combinations
 
 import numpy as np
-import numpy.typing as npt
 import torch
 
 from keyss.channels.low_bits.bits import (
@@ -34,16 +33,14 @@ from keyss.channels.low_bits.bits import (
     QUATS,
     UNIT_TOLERANCE,
     UNUSED_BITS,
-    Bytes,
-    Flags,
     Layout,
-    Words,
     coarse_lengths,
     identities,
     used_words,
 )
-from keyss.channels.low_bits.predictability import Counts, count_trailing_zeros, least_exponent
+from keyss.channels.low_bits.predictability import count_trailing_zeros, least_exponent
 from keyss.channels.mixing import row_hashes
+from keyss.core.arrays import Bytes, Doubles, Flags, Integers, Words, Words32
 from keyss.core.errors import InputError
 from keyss.core.gaussians import Gaussians
 from keyss.rendering.cpu.parallel import in_blocks
@@ -90,7 +87,7 @@ def usable_carriers(gaussians: Gaussians, names: Bytes | None = None, layout: La
     usable, short = _apart(gaussians, layout, identities(gaussians, layout) if names is None else names)
     frequent = _frequent_values(gaussians)
 
-    def judge(start: int, stop: int) -> Counts:
+    def judge(start: int, stop: int) -> Integers:
         used, own = used_words(gaussians[start:stop]), usable[start:stop]
         own &= _are_measured(used, layout, frequent, short) & ~near_equal(used, layout)
         if layout.quats:
@@ -136,7 +133,7 @@ def check_usable(gaussians: Gaussians, usable: Flags, layout: Layout | None = No
             )
 
 
-def chance_of_bits(words: Words, bits: int) -> float:
+def chance_of_bits(words: Words32, bits: int) -> float:
     """The probability of bits 1 to `bits` - 1 of words [...] if all of them are uniform.
 
     Exactly, of the most unlikely one given exponent, last bit and the bit below it; times their number.
@@ -145,7 +142,7 @@ def chance_of_bits(words: Words, bits: int) -> float:
 
     flat = words.ravel()
     context = exponents(flat).astype(np.int64) << 2 | (flat & 1).astype(np.int64) << 1
-    chances: list[npt.NDArray[np.float64]] = []
+    chances: list[Doubles] = []
     for bit in range(UNUSED_BITS, bits):
         below = (flat >> np.uint32(bit - 1) & 1).astype(np.int64) if bit > 1 else 0
         times = np.bincount(context | below, minlength=1024)
@@ -157,12 +154,12 @@ def chance_of_bits(words: Words, bits: int) -> float:
     return min(1.0, float(every.min() * len(every)))
 
 
-def exponents(words: Words) -> npt.NDArray[np.uint8]:
+def exponents(words: Words32) -> Bytes:
     """[...] the biased binary exponents."""
     return (words >> np.uint32(23) & np.uint32(255)).astype(np.uint8)
 
 
-def near_equal(used: Words, layout: Layout) -> Flags:
+def near_equal(used: Words32, layout: Layout) -> Flags:
     """[N] whether two scales, two components of a quaternion or two channels of a colour are nearly equal.
 
     Or two pairs of one colour's harmonics, next to each other by size, equal. By chance some 4 % of all
@@ -179,7 +176,7 @@ def near_equal(used: Words, layout: Layout) -> Flags:
     return near
 
 
-def repeated(values: npt.NDArray[np.uint64]) -> Flags:
+def repeated(values: Words) -> Flags:
     """[N] which of the values [N] occur at least twice."""
     ordered = np.sort(values)
     again = ordered[1:][ordered[1:] == ordered[:-1]]
@@ -189,7 +186,7 @@ def repeated(values: npt.NDArray[np.uint64]) -> Flags:
     return result
 
 
-def _are_measured(used: Words, layout: Layout, frequent: list[Words], short: bool) -> Flags:
+def _are_measured(used: Words32, layout: Layout, frequent: list[Words32], short: bool) -> Flags:
     """[N] whether no number in use is subnormal, frequent or a saturated opacity, and few have many zeros.
 
     If `short`, none has.
@@ -207,7 +204,7 @@ def _are_measured(used: Words, layout: Layout, frequent: list[Words], short: boo
     return measured
 
 
-def _have_unit_length(used: Words) -> Flags:
+def _have_unit_length(used: Words32) -> Flags:
     """[N] which quaternions have unit length, and could have it with any low bits."""
     words = np.ascontiguousarray(used[:, QUATS])
     near = np.abs(coarse_lengths(words) - 1) < UNIT_TOLERANCE
@@ -242,7 +239,7 @@ def _apart(gaussians: Gaussians, layout: Layout, names: Bytes) -> tuple[Flags, b
     return apart, short > expected + 5 * (expected + 1) ** 0.5
 
 
-def _frequent_values(gaussians: Gaussians) -> list[Words]:
+def _frequent_values(gaussians: Gaussians) -> list[Words32]:
     """For each group of fields [V] the values that occur more often than is likely, in ascending order."""
     frequent = []
     for field in (gaussians.log_scales, gaussians.quats, gaussians.opacity_logits, gaussians.sh[:, 1:]):

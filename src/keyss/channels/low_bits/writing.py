@@ -7,10 +7,9 @@ import warnings
 from collections.abc import Sequence
 
 import numpy as np
-import numpy.typing as npt
 from numpy.lib.stride_tricks import as_strided
 
-from keyss.channels.base import Bytes, Content, Payload, RecordPlan, RecordRequest, Records
+from keyss.channels.base import Content, Payload, RecordPlan, RecordRequest, Records
 from keyss.channels.low_bits.cells import CellCipher
 from keyss.channels.low_bits.layout import DATA_KEY_BYTES, KEY_COPIES, LowBitsRoom, PayloadPlan
 from keyss.channels.low_bits.parameters import (
@@ -24,6 +23,7 @@ from keyss.channels.low_bits.parameters import (
 from keyss.channels.low_bits.spread import numbered_chunks
 from keyss.channels.mixing import random_order
 from keyss.channels.payloads import NOTICED
+from keyss.core.arrays import Bytes, Integers
 from keyss.core.errors import KeyssWarning
 from keyss.keys.derivation import DerivedKey, expand, fill
 from keyss.keys.encryption import compressed_size, encrypt, encrypted_size
@@ -31,8 +31,6 @@ from keyss.rendering.cpu.parallel import in_blocks
 
 ASSOCIATED = b"keyss/v1/low-bits"  # authenticated with a payload
 _BLOCK = 1 << 13  # records at a time
-
-Rows = npt.NDArray[np.int64]
 
 
 class Writer:
@@ -126,7 +124,7 @@ class Writer:
             own, carriers = carriers[: counts[index]], carriers[counts[index] :]
             self._place(index, contents[index], own, np.zeros(len(own), np.int64))
 
-    def _place(self, index: int, content: Records, rows: Rows, slots: Rows) -> None:
+    def _place(self, index: int, content: Records, rows: Integers, slots: Integers) -> None:
         """Records, then copies, in the cells `slots` [R] of the carriers `rows` [R]."""
         count, width = content.plan.cells_per_carrier, self._room.width
         cells = as_strided(self.table, (len(self.table), count, width // count), (width, width // count, 1))
@@ -136,7 +134,7 @@ class Writer:
         self._place_some(index, "copy", copies, cells, rows[split:], slots[split:])
 
     def _place_some(
-        self, index: int, label: str, records: Bytes, cells: Bytes, rows: Rows, slots: Rows
+        self, index: int, label: str, records: Bytes, cells: Bytes, rows: Integers, slots: Integers
     ) -> None:
         """`records` [R, size] in `cells` [carriers, slots, bytes]."""
         cipher = CellCipher(self._data_key(index), label, records.shape[1])

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from keyss.files.formats.common import Bytes, Floats, Shorts
+from keyss.core.arrays import Bytes, Floats, Shorts
 
 SIZE = 256  # numbers of a codebook
 _ROUNDS = 50

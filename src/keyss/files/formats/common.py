@@ -7,17 +7,12 @@ from dataclasses import fields, replace
 from typing import Any, ClassVar, Self
 
 import numpy as np
-import numpy.typing as npt
 import torch
 
+from keyss.core.arrays import Bytes, Doubles, Floats, Integers, Numbers, Words
 from keyss.core.errors import InputError, OutputError
 from keyss.core.gaussians import SH_C0, Gaussians
 from keyss.files.ply_rows import OPACITY_LOGIT_BOUND
-
-Bytes = npt.NDArray[np.uint8]
-Shorts = npt.NDArray[np.uint16]
-Floats = npt.NDArray[np.float32]
-Doubles = npt.NDArray[np.float64]
 
 # A packed file may announce more Gaussians than this only if it has a byte for each: published models take at
 # least 7 bytes per Gaussian.
@@ -130,12 +125,12 @@ def check_sh_degree(degree: int) -> int:
 
 
 def gaussians_of(
-    means: npt.NDArray[Any],
-    quats: npt.NDArray[Any],
-    log_scales: npt.NDArray[Any],
-    opacities: npt.NDArray[Any],
-    colors: npt.NDArray[Any],
-    rest: npt.NDArray[Any],
+    means: Numbers,
+    quats: Numbers,
+    log_scales: Numbers,
+    opacities: Numbers,
+    colors: Numbers,
+    rest: Numbers,
 ) -> Gaussians:
     """A model from arrays: `opacities` in [0, 1]; `colors` [N, 3] are f_dc, `rest` [N, K - 1, 3] the others.
 
@@ -178,7 +173,7 @@ def arrays_of(model: Gaussians) -> tuple[Floats, Doubles, Floats, Doubles, Float
     return means, unit(quats), log_scales, opacities, sh[:, 0], sh[:, 1:]
 
 
-def _logits(opacities: npt.NDArray[Any]) -> Doubles:
+def _logits(opacities: Numbers) -> Doubles:
     """Opacity logits of opacities in [0, 1], clipped to +-OPACITY_LOGIT_BOUND."""
     values = np.asarray(opacities, dtype=np.float64)
     with np.errstate(divide="ignore"):
@@ -186,13 +181,12 @@ def _logits(opacities: npt.NDArray[Any]) -> Doubles:
     return found.clip(-OPACITY_LOGIT_BOUND, OPACITY_LOGIT_BOUND)
 
 
-def rounded(values: npt.NDArray[Any]) -> Doubles:
+def rounded(values: Numbers) -> Doubles:
     """`values` rounded to integers, halves away from 0, like C's `round`."""
-    integers: Doubles = np.copysign(np.floor(np.abs(values) + 0.5), values)
-    return integers
+    return np.copysign(np.floor(np.abs(values) + 0.5), values)
 
 
-def to_bytes(values: npt.NDArray[Any], maximum: int = 255) -> npt.NDArray[Any]:
+def to_bytes(values: Numbers, maximum: int = 255) -> Numbers:
     """`values` rounded and clipped to 0 to `maximum`, as uint8 or, above 255, uint16."""
     kind = np.uint8 if maximum < 256 else np.uint16
     return rounded(values).clip(0, maximum).astype(kind)
@@ -203,12 +197,12 @@ def colour_bytes(f_dc: Floats) -> Bytes:
     return to_bytes((0.5 + SH_C0 * f_dc.astype(np.float64)) * 255)
 
 
-def f_dc_of(colors: npt.NDArray[Any]) -> Doubles:
+def f_dc_of(colors: Numbers) -> Doubles:
     """f_dc of colours in [0, 1]."""
     return (np.asarray(colors, dtype=np.float64) - 0.5) / SH_C0
 
 
-def log_scales_of(scales: npt.NDArray[Any]) -> Doubles:
+def log_scales_of(scales: Numbers) -> Doubles:
     """Logarithms of scales: 0 counts as the smallest normal number; NaN for negative scales."""
     with np.errstate(invalid="ignore"):
         values = np.asarray(scales, dtype=np.float64)
@@ -221,7 +215,7 @@ def scales_of(log_scales: Floats) -> Floats:
     return np.exp(log_scales.astype(np.float64)).clip(0, np.finfo(np.float32).max).astype(np.float32)
 
 
-def unit(quats: npt.NDArray[Any]) -> Doubles:
+def unit(quats: Numbers) -> Doubles:
     """[N, 4] normalised quaternions; zero becomes (1, 0, 0, 0), as in renderers."""
     values = quats.astype(np.float64)
     length = np.linalg.norm(values, axis=1, keepdims=True)
@@ -258,7 +252,7 @@ def in_morton_order(model: Gaussians) -> Gaussians:
     return model[torch.from_numpy(morton_order(model.means.numpy()))]
 
 
-def morton_order(means: Floats) -> npt.NDArray[np.intp]:
+def morton_order(means: Floats) -> Integers:
     """[N] indices that sort positions along a Z-order curve."""
     low, high = means.min(axis=0).astype(np.float64), means.max(axis=0).astype(np.float64)
     extent = np.where(high > low, high - low, 1.0)
@@ -269,7 +263,7 @@ def morton_order(means: Floats) -> npt.NDArray[np.intp]:
     return np.argsort(key, kind="stable")
 
 
-def _spread(values: npt.NDArray[np.uint64]) -> npt.NDArray[np.uint64]:
+def _spread(values: Words) -> Words:
     """The lowest 21 bits of `values` with two zero bits between neighbours."""
     values = values & np.uint64(0x1FFFFF)
     for shift, mask in (

@@ -15,14 +15,11 @@ from typing import Any, Self
 import numpy as np
 import numpy.typing as npt
 
+from keyss.core.arrays import Bytes, Doubles, Floats, Numbers, Shorts, Words32
 from keyss.core.errors import InputError
 from keyss.core.gaussians import SH_C0, Gaussians
 from keyss.files.formats.common import (
-    Bytes,
     Codes,
-    Doubles,
-    Floats,
-    Shorts,
     arrays_of,
     f_dc_of,
     from_smallest_three,
@@ -167,17 +164,17 @@ def _harmonics(table: npt.NDArray[np.void] | None, n: int) -> Bytes:
     return np.ascontiguousarray(table).view(np.uint8).reshape(n, 3, -1).transpose(0, 2, 1).copy()
 
 
-def _fields(packed: npt.NDArray[Any], bits: tuple[int, int, int]) -> npt.NDArray[np.uint32]:
+def _fields(packed: Numbers, bits: tuple[int, int, int]) -> Words32:
     """[N, 3] three bit fields of `packed` [N]; the last field has the lowest bits."""
     shifts = np.array([bits[1] + bits[2], bits[2], 0], dtype=np.uint32)
     masks = np.array([2**each - 1 for each in bits], dtype=np.uint32)
     return packed[:, None] >> shifts & masks
 
 
-def _joined(values: npt.NDArray[Any], bits: tuple[int, int, int]) -> npt.NDArray[np.uint32]:
+def _joined(values: Numbers, bits: tuple[int, int, int]) -> Words32:
     """[N] integers from their bit fields, the inverse of `_fields`."""
     shifts = np.array([bits[1] + bits[2], bits[2], 0], dtype=np.uint32)
-    fields: npt.NDArray[np.uint32] = np.bitwise_or.reduce(values.astype(np.uint32) << shifts, axis=1)
+    fields: Words32 = np.bitwise_or.reduce(values.astype(np.uint32) << shifts, axis=1)
     return fields
 
 

@@ -21,11 +21,11 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
+from keyss.core.arrays import Doubles
 from keyss.core.errors import InputError
 from keyss.core.gaussians import Gaussians
 from keyss.core.similarity import Similarity
 from keyss.files.formats.common import (
-    Doubles,
     arrays_of,
     colour_bytes,
     gaussians_of,

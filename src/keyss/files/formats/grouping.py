@@ -7,11 +7,8 @@ from typing import Any
 
 import numba
 import numpy as np
-import numpy.typing as npt
 
-from keyss.files.formats.common import Doubles
-
-Integers = npt.NDArray[np.int64]
+from keyss.core.arrays import Doubles, Integers
 
 
 def groups(points: Doubles, size: int) -> tuple[Integers, Integers]:

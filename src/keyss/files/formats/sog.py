@@ -7,22 +7,18 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Self
 
 import msgspec
 import numpy as np
-import numpy.typing as npt
 
+from keyss.core.arrays import Bytes, Doubles, Floats, Numbers, Shorts
 from keyss.core.errors import InputError
 from keyss.core.gaussians import Gaussians
 from keyss.files.formats import sog_bundle as bundle
 from keyss.files.formats.codebooks import SIZE, codebook_of, nearest, palette_of
 from keyss.files.formats.common import (
-    Bytes,
     Codes,
-    Doubles,
-    Floats,
-    Shorts,
     arrays_of,
     check_count,
     check_sh_degree,
@@ -183,7 +179,7 @@ class SogCodes(Codes):
             palette[self.labels],
         )
 
-    def positions_at(self, levels: npt.NDArray[Any]) -> Doubles:
+    def positions_at(self, levels: Numbers) -> Doubles:
         """[N, 3] world positions for the codes `levels`, 0 to 65535, which may be fractional."""
         extent = np.where(self.maxs == self.mins, 1.0, self.maxs - self.mins)
         logs = self.mins + extent * (levels / _MAX_POSITION)
@@ -213,7 +209,7 @@ def _joined(low: Bytes, high: Bytes) -> Shorts:
     return low.astype(np.uint16) | (high.astype(np.uint16) << np.uint16(8))
 
 
-def _rgba(colors: npt.NDArray[Any], alpha: Bytes | None = None) -> Bytes:
+def _rgba(colors: Numbers, alpha: Bytes | None = None) -> Bytes:
     """[M, 4] pixels from colours [M, 3], 0 to 255, and an alpha [M], by default 255."""
     found = np.full((len(colors), 4), 255, np.uint8)
     found[:, :3] = colors

@@ -13,8 +13,9 @@ import msgspec
 import numpy as np
 from PIL import Image
 
+from keyss.core.arrays import Bytes
 from keyss.core.errors import InputError
-from keyss.files.formats.common import Bytes, reason
+from keyss.files.formats.common import reason
 
 _MAX_META_BYTES = 1 << 20
 _MAX_MEMBERS = 64

@@ -12,13 +12,11 @@ from typing import Self
 import numpy as np
 import numpy.typing as npt
 
+from keyss.core.arrays import Bytes, Floats, Shorts
 from keyss.core.errors import OutputError
 from keyss.core.gaussians import Gaussians
 from keyss.files.formats.common import (
-    Bytes,
     Codes,
-    Floats,
-    Shorts,
     arrays_of,
     from_smallest_three,
     gaussians_of,

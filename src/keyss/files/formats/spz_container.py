@@ -12,8 +12,9 @@ from itertools import pairwise
 import numpy as np
 import zstandard
 
+from keyss.core.arrays import Bytes
 from keyss.core.errors import InputError
-from keyss.files.formats.common import Bytes, check_count, check_sh_degree, reason
+from keyss.files.formats.common import check_count, check_sh_degree, reason
 
 GZIP, NGSP = b"\x1f\x8b", b"NGSP"
 EXTENSIONS = 2  # flag: the file has extensions

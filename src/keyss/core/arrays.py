@@ -1,0 +1,19 @@
+"""NumPy arrays by the kind of their elements; comments and docstrings give their shapes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+Flags = npt.NDArray[np.bool_]
+Bits = npt.NDArray[np.uint8]  # each 0 or 1
+Bytes = npt.NDArray[np.uint8]
+Shorts = npt.NDArray[np.uint16]
+Words32 = npt.NDArray[np.uint32]
+Words = npt.NDArray[np.uint64]
+Integers = npt.NDArray[np.int64]
+Floats = npt.NDArray[np.float32]
+Doubles = npt.NDArray[np.float64]
+Numbers = npt.NDArray[Any]  # of any kind
