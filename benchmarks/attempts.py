@@ -44,7 +44,7 @@ def main() -> None:
     decoder = Decoder(DecoderShape()).requires_grad_(False)
     decoder.prepare(plain, random_embeddings(1, generator)[0])
     anchors = choose_anchors(plain, generator)
-    secret = HiddenSecret(decoder, Similarity.identity(), anchors)
+    secret = HiddenSecret(decoder, Similarity(), anchors)
     contents = [(right, secret.payload())]
     files = {
         "low bits": LOW_BITS.prepare(plain).embed(contents),

@@ -76,7 +76,7 @@ def measured(options: argparse.Namespace, names: Sequence[str], seed: int, desig
             plains[scene.name, part], took = plain(options.results.parent, scene, cut, options.width)
             seconds += took if part == 1 else 0
     cameras = [[view.camera for view in scene.train] for scene in scenes]
-    frames = [Similarity.identity(), *(align(each, cameras[0]) for each in cameras[1:])]
+    frames = [Similarity(), *(align(each, cameras[0]) for each in cameras[1:])]
     placed = [
         PlacedScene.of(scene, plains[scene.name, 1], frame)
         for scene, frame in zip(scenes, frames, strict=True)

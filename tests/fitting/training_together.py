@@ -68,7 +68,7 @@ def trained(name: str, fit: FitConfig, device: str = "cpu", **options: Any) -> T
 def _placed() -> list[PlacedScene]:
     scenes = [tiny_scene(0), tiny_scene(1)]
     models = [random_gaussians(seed=seed, sh_degree=1) for seed in (0, 1)]
-    return [PlacedScene.of(*each, Similarity.identity()) for each in zip(scenes, models, strict=True)]
+    return [PlacedScene.of(*each, Similarity()) for each in zip(scenes, models, strict=True)]
 
 
 def main(folder: Path, device: str) -> None:

@@ -16,7 +16,7 @@ _ROTATION_TOLERANCE = 1e-6
 
 @dataclass(frozen=True)
 class Similarity:
-    """x -> scale * rotation @ x + translation, held in float64 on the CPU.
+    """x -> scale * rotation @ x + translation, held in float64 on the CPU; by default the identity.
 
     Raises ValueError if a value is not finite, `scale` is not positive, or `rotation` is not a rotation
     (orthonormal with determinant +1, to 1e-6).
@@ -44,10 +44,6 @@ class Similarity:
         object.__setattr__(self, "scale", float(self.scale))
         object.__setattr__(self, "rotation", rotation)
         object.__setattr__(self, "translation", translation)
-
-    @staticmethod
-    def identity() -> Similarity:
-        return Similarity()
 
     def inverse(self) -> Similarity:
         """The transform that undoes this one."""

@@ -5,12 +5,12 @@ from __future__ import annotations
 import io
 from collections.abc import Iterator
 from fractions import Fraction
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 from keyss.core.arrays import Bytes
-from keyss.core.errors import BackendError, UsageError
+from keyss.core.errors import UsageError
+from keyss.core.extras import import_extra
 from keyss.files.atomic import write_bytes
 
 SUFFIX = ".mp4"
@@ -21,7 +21,7 @@ def check_video(path: Path | str) -> None:
     """Raise UsageError if a path does not end in .mp4, BackendError if PyAV is not installed."""
     if Path(path).suffix.lower() != SUFFIX:
         raise UsageError(f"cannot write a video as {path}: expected a name that ends in {SUFFIX}")
-    _av()
+    import_extra("av", "video", "write videos")
 
 
 def write_video(path: Path | str, frames: Iterator[Bytes], fps: int) -> int:
@@ -29,7 +29,7 @@ def write_video(path: Path | str, frames: Iterator[Bytes], fps: int) -> int:
 
     Encodes H.264 if this build of FFmpeg has it, else MPEG-4, in sRGB with 4:2:0 subsampling.
     """
-    av = _av()
+    av = import_extra("av", "video", "write videos")
     data, count = io.BytesIO(), 0
     with av.open(data, "w", format="mp4") as container:
         stream = None
@@ -50,10 +50,3 @@ def _stream(av: Any, container: Any, fps: int, width: int, height: int) -> Any:
     stream = container.add_stream(codec, rate=Fraction(fps), options=options)
     stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
     return stream
-
-
-def _av() -> Any:
-    try:
-        return import_module("av")
-    except ImportError as error:
-        raise BackendError(f"videos need the package av (pip install 'keyss[video]'): {error}") from error

@@ -298,7 +298,7 @@ def train_jointly(
     """
     sources = [cover, *secrets]
     cameras = [[view.camera for view in source.scene.train] for source in sources]
-    frames = [Similarity.identity(), *(align(each, cameras[0]) for each in cameras[1:])]
+    frames = [Similarity(), *(align(each, cameras[0]) for each in cameras[1:])]
     run = begin(
         [PlacedScene.of(each.scene, each.model, at) for each, at in zip(sources, frames, strict=True)]
     )

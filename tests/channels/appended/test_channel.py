@@ -14,13 +14,14 @@ from hypothesis import given, settings, strategies as st
 
 from keyss.channels import APPENDED, AppendedReader, Payload
 from keyss.channels.appended import pilots
-from keyss.channels.appended.lattice import WORD_BITS, Cube, to_gaussians
+from keyss.channels.appended.lattice import WORD_BITS, to_gaussians
 from keyss.core import (
     DRAWN_OPACITY,
     Gaussians,
     InputError,
     KeyssError,
     KeyssWarning,
+    Similarity,
     UsageError,
     WrongKeyError,
 )
@@ -98,7 +99,7 @@ def test_many_faint_gaussians_that_do_not_agree_cost_little(moved: bool) -> None
     words = random.integers(0, 2, (100_000, WORD_BITS)).astype(np.uint8)
     if moved:
         words = pilots.write(bytes(16), 100_000, random)
-    faint = to_gaussians(words, Cube(np.zeros(3), 1.0), 0)
+    faint = to_gaussians(words, Similarity(translation=torch.full((3,), -0.5)), 0)
     faint = replace(faint, means=torch.rand(len(faint), 3))
     began = time.process_time()
     assert AppendedReader.of(faint) is None

@@ -64,7 +64,7 @@ def written(
         RowSecret(
             EMBEDDINGS[i],
             tuple(Codec.fit(model.with_sh_degree(table.sh_degree), table) for table in tables),
-            Similarity.identity(),
+            Similarity(),
             i,
             secrets,
             count,

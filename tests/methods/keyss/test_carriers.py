@@ -191,7 +191,7 @@ def test_rows_are_in_the_order_in_which_plain_3dgs_makes_them() -> None:
     """Its own points first, and what grew later at the end."""
     scenes, models = three_scenes()
     both = zip(scenes[:2], models[:2], strict=True)
-    placed = [PlacedScene.of(scene, model, Similarity.identity()) for scene, model in both]
+    placed = [PlacedScene.of(scene, model, Similarity()) for scene, model in both]
     run = OPTIONS.settings.training(placed, [EMBEDDINGS[0]], OPTIONS, torch.device("cpu"))
     start = run.scene_gaussians(0).detach().means.clone()
     for _ in range(120):

@@ -108,7 +108,7 @@ def test_targets_are_photos_where_there_are_and_renders_elsewhere() -> None:
     scenes, models = three_scenes()
     frame = Similarity(0.5, torch.eye(3, dtype=torch.float64), torch.ones(3, dtype=torch.float64))
     placed = [
-        PlacedScene.of(scenes[0], models[0], Similarity.identity()),
+        PlacedScene.of(scenes[0], models[0], Similarity()),
         PlacedScene.of(scenes[1], models[1], frame),
     ]
     poses = CombinedPoses(placed, torch.device("cpu"))
@@ -143,10 +143,7 @@ def test_points_poses_and_densification_can_be_of_some_scenes_only(which: Any) -
     scenes, models = three_scenes()
     fit = replace(OPTIONS.fit, iterations=12, grow_every=4)
     config = replace(PUBLISHED, fit=fit, points=which, poses=which, densification=which)
-    placed = [
-        PlacedScene.of(scene, model, Similarity.identity())
-        for scene, model in zip(scenes, models, strict=True)
-    ]
+    placed = [PlacedScene.of(scene, model, Similarity()) for scene, model in zip(scenes, models, strict=True)]
     embeddings = list(random_embeddings(2, torch.Generator()))
     run = config.settings.training(placed, embeddings, config, torch.device("cpu"))
     owners = {pose[0] for _ in range(30) for pose in run._draw_poses()}

@@ -166,7 +166,7 @@ def test_what_a_network_draws_is_no_cover(made: Made, folders: tuple[Path, Path]
 def test_an_interrupted_training_goes_on_bit_for_bit(name: str) -> None:
     """All state is in checkpoints: parameters that a peer adds, networks, moments, the order of poses."""
     scenes = [tiny_scene(0), tiny_scene(1)]
-    placed = [PlacedScene.of(scene, random_gaussians(50), Similarity.identity()) for scene in scenes]
+    placed = [PlacedScene.of(scene, random_gaussians(50), Similarity()) for scene in scenes]
     method: Any = registry.get(name)
     whole, resumed = (method.training(placed, options_of(name), torch.device("cpu")) for _ in range(2))
 

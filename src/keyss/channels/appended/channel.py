@@ -19,7 +19,6 @@ import torch
 
 from keyss.channels.appended import packets, pilots
 from keyss.channels.appended.lattice import (
-    Cube,
     all_shifts,
     colours_of,
     in_own_frame,
@@ -27,6 +26,7 @@ from keyss.channels.appended.lattice import (
     is_candidate,
     joined,
     likely_shifts,
+    own_frame,
     scale_steps,
     scales_at,
     to_gaussians,
@@ -106,7 +106,7 @@ class AppendedCover:
         words.append(pilots.write(salt, pilots.count_for(sum(map(len, words))), random))
         every = np.concatenate(words)[random.permutation(sum(map(len, words)))]
         model = self.cover.detach().to("cpu")
-        return Gaussians.cat([model, to_gaussians(every, Cube.around(model), model.sh_degree)])
+        return Gaussians.cat([model, to_gaussians(every, own_frame(model), model.sh_degree)])
 
 
 @dataclass(frozen=True)

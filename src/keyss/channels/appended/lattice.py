@@ -13,7 +13,6 @@ Opacity is just above 1/255, below which rasterizers draw nothing; 8 bits keep i
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -55,40 +54,22 @@ def is_appended(model: Gaussians) -> Tensor:
     return model.opacity_logits == float(np.float32(_LOGIT))
 
 
-@dataclass(frozen=True)
-class Cube:
-    """Where appended Gaussians lie: the own frame's unit cube in the world."""
-
-    centre: Doubles  # [3]
-    size: float
-
-    @staticmethod
-    def around(model: Gaussians) -> Cube:
-        """As large as most of the model."""
-        means = model.means.detach().cpu().double().numpy()
-        means = means[np.isfinite(means).all(axis=1)]
-        if not len(means):
-            return Cube(np.zeros(3), 1.0)
-        low, high = np.quantile(means, [0.05, 0.95], axis=0)
-        size = float((high - low).max())
-        return Cube((low + high) / 2, size if 0 < size < math.inf else 1.0)
-
-    def to_world(self) -> Similarity:
-        """From the own frame, in which the cube reaches from 0 to 1."""
-        corner = torch.from_numpy(self.centre - self.size / 2)
-        return Similarity(self.size, torch.eye(3, dtype=torch.float64), corner)
-
-    @property
-    def least_log_scale(self) -> float:
-        """Log scale of the smallest Gaussians in the own frame."""
-        return max(_SMALL, _MIN_LOG_SCALE - math.log(self.size))
+def own_frame(model: Gaussians) -> Similarity:
+    """From the own frame to the world: its unit cube becomes as large as most of the model."""
+    means = model.means.detach().cpu().double().numpy()
+    means = means[np.isfinite(means).all(axis=1)]
+    low, high = np.quantile(means, [0.05, 0.95], axis=0) if len(means) else np.zeros((2, 3))
+    size = float((high - low).max())
+    size = size if 0 < size < math.inf else 1.0
+    return Similarity(size, translation=torch.from_numpy((low + high) / 2 - size / 2))
 
 
-def to_gaussians(words: Bits, cube: Cube, sh_degree: int) -> Gaussians:
-    """N Gaussians of words [N, WORD_BITS]."""
+def to_gaussians(words: Bits, to_world: Similarity, sh_degree: int) -> Gaussians:
+    """N Gaussians of words [N, WORD_BITS]; `to_world`: of `own_frame`."""
+    least_log_scale = max(_SMALL, _MIN_LOG_SCALE - math.log(to_world.scale))
     fields = _split(words)
     colours = (fields[0] + 0.5) * _COLOUR_STEP - _COLOUR_STEP * 2 ** (COLOUR_BITS - 1)
-    scales = fields[1] * _SCALE_STEP + cube.least_log_scale
+    scales = fields[1] * _SCALE_STEP + least_log_scale
     positions = (fields[2] + 0.5) / 2**POSITION_BITS
     parts = (fields[3] + 0.5) / 2**TURN_BITS * 2 * _TURNS_REACH - _TURNS_REACH
     w = np.sqrt(1 - np.square(parts).sum(axis=1, keepdims=True))
@@ -97,7 +78,7 @@ def to_gaussians(words: Bits, cube: Cube, sh_degree: int) -> Gaussians:
     logits = np.full(len(words), _LOGIT)
     numbers = (positions, np.concatenate([w, parts], axis=1), scales, logits, sh)
     own = Gaussians(*(torch.from_numpy(each).float() for each in numbers))
-    return cube.to_world().apply_gaussians(own)
+    return to_world.apply_gaussians(own)
 
 
 def colours_of(model: Gaussians) -> Integers:

@@ -217,7 +217,7 @@ class NetworkDesign(Design):
 
     def payload_bytes(self, sh_degree: int, secrets: int) -> int:
         decoder = Decoder(self.shape(sh_degree))
-        return len(HiddenSecret(decoder, Similarity.identity(), torch.rand(ANCHORS, 3)).payload().data)
+        return len(HiddenSecret(decoder, Similarity(), torch.rand(ANCHORS, 3)).payload().data)
 
     def weights(self, sh_degree: int, secrets: int) -> float:
         wrong = 1 / self.incorrect_every if self.conditioning == "bias" else 0.0
