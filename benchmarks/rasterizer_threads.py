@@ -33,7 +33,7 @@ import numpy as np
 import torch
 
 THREADS = (1, 2, 4, 8, 16, 32)
-_WHOLE = ("sort_by_depth", "share_bounds", "offsets_from_counts")  # not divided into pieces
+_WHOLE = ("sort_by_depth",)  # not divided into pieces
 _ENDS = {"blend": 9, "blend_backward": 5}  # which argument holds the last entries of tiles
 
 

@@ -97,19 +97,6 @@ def sort_by_depth(depths, order, spare_order, keys, spare_keys):
     return count
 
 
-@kernel
-def share_bounds(order, tile_bounds, starts):
-    """Set starts[w] to the sum of tile_bounds over the shares before w, and the last entry to the total."""
-    shares = starts.shape[0] - 1
-    count = order.shape[0]
-    total = 0
-    for share in range(shares):
-        starts[share] = total
-        for r in range(share * count // shares, (share + 1) * count // shares):
-            total += at(tile_bounds, at(order, r))
-    starts[shares] = total
-
-
 @inlined
 def _measure_columns(footprints, g, height, first_column, spans, place):
     """The rows of pixels that the ellipse alpha >= 1/255 covers in 8 columns of tiles.
@@ -198,26 +185,8 @@ def list_pairs(counter, footprints, order, tile_columns, height, starts, tiles, 
 
 
 @kernel
-def offsets_from_counts(cursors, tile_starts, slot_counts, first_slots):
-    """Turn counts into starts; for the cursors, in place. Returns the number of pairs."""
-    total = 0
-    for tile in range(cursors.shape[1]):
-        tile_starts[tile] = total
-        for share in range(cursors.shape[0]):
-            here = cursors[share, tile]
-            cursors[share, tile] = total
-            total += here
-    tile_starts[cursors.shape[1]] = total
-    slot = 0
-    for i in range(first_slots.shape[0]):
-        put(first_slots, i, np.int32(slot))
-        slot += at(slot_counts, i)
-    return total
-
-
-@kernel
 def sort_pairs(counter, order, starts, tiles, rows, slot_counts, first_slots, cursors, entries, entry_slots):
-    """Sort the pairs of `list_pairs` into tiles, starting at the cursors of `offsets_from_counts`.
+    """Sort the pairs of `list_pairs` into tiles, starting at the cursors.
 
     An entry is a Gaussian and, shifted by `layout.ENTRY_ROWS_SHIFT`, its rows. entry_slots gets the slots, of
     which Gaussian i has slot_counts[i] from first_slots[i]; if it is empty, first_slots is not read.

@@ -228,9 +228,9 @@ def _render(
     order = order[:visible]
 
     shares = 4 * torch.get_num_threads() if torch.get_num_threads() > 1 else 1
-    starts = memory.empty((shares + 1,), np.int64)
-    binning.share_bounds(order, slot_counts, starts)
-    max_pairs = int(starts[-1])
+    bounds = np.append(0, np.cumsum(slot_counts[order], dtype=np.int64))
+    starts = bounds[np.arange(shares + 1) * visible // shares]
+    max_pairs = int(bounds[-1])
     if max_pairs >= MAX_PAIRS:
         raise BackendError(
             f"{visible} Gaussians cover {max_pairs} tiles together, more than the CPU rasterizer can list "
@@ -243,9 +243,12 @@ def _render(
         binning.list_pairs, footprints, order, columns, height, starts, tiles, rows_of_pairs, slot_counts,
         cursors,
     )  # fmt: skip
-    tile_starts = memory.empty((columns * rows + 1,), np.int64)
-    first_slots = memory.empty((count if for_backward else 0,), np.int32)
-    pairs = binning.offsets_from_counts(cursors, tile_starts, slot_counts, first_slots)
+    counts = cursors.T.ravel()
+    ends_of_counts = np.cumsum(counts)
+    cursors[:] = (ends_of_counts - counts).reshape(-1, shares).T  # from counts to starts
+    tile_starts = np.append(cursors[0], ends_of_counts[-1])
+    first_slots = np.cumsum(slot_counts, dtype=np.int32) - slot_counts
+    pairs = int(tile_starts[-1])
     entries = memory.empty((pairs,), np.int64)
     entry_slots = memory.empty((pairs if for_backward else 0,), np.int32)
     run(
