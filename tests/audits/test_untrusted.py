@@ -9,11 +9,11 @@ import pytest
 from hypothesis import given, strategies as st
 
 from audits.pages import Parsed
-from keyss.audits import page as page_module, read_audit, untrusted
+from keyss.audits import page as page_module, read_audit
 from keyss.core import InputError
 
-AuditPictures, check_bounds, clean = untrusted.AuditPictures, untrusted.check_bounds, untrusted.clean
-prose = page_module.prose
+AuditPictures, check_bounds = page_module.AuditPictures, page_module.check_bounds
+clean, prose = page_module.clean, page_module.prose
 
 
 @pytest.fixture
@@ -46,7 +46,7 @@ def test_numbers_and_lists_have_bounds(monkeypatch: pytest.MonkeyPatch) -> None:
             check_bounds({"seeds": (1, huge)})
     with pytest.raises(InputError, match=r"audit\.a\.b: expected a number"):
         check_bounds({"a": {"b": 1e16}})
-    monkeypatch.setattr(untrusted, "_MAX_ENTRIES", 2)
+    monkeypatch.setattr(page_module, "_MAX_ENTRIES", 2)
     check_bounds({"seeds": (1, 2)})
     with pytest.raises(InputError, match="at most 2 entries, found 3"):
         check_bounds({"seeds": (1, 2, 3)})
@@ -122,7 +122,7 @@ def test_only_png_files_are_pictures(run: Path) -> None:
 
 def test_pictures_have_a_limit_together(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     size = (run / "private" / "audit" / "pictures" / "photo.png").stat().st_size
-    monkeypatch.setattr(untrusted, "_MAX_PICTURES", 2 * size)
+    monkeypatch.setattr(page_module, "_MAX_PICTURES", 2 * size)
     pictures = AuditPictures(run)
     for _ in range(2):
         pictures.read("pictures/photo.png")

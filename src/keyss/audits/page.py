@@ -1,10 +1,14 @@
-"""The report: one HTML file that opens from disk and, by its own policy, loads nothing."""
+"""The report: one HTML file that opens from disk and, by its own policy, loads nothing.
+
+The texts, the images and the size of an audit are untrusted.
+"""
 
 from __future__ import annotations
 
 import hashlib
 from base64 import b64encode
 from collections.abc import Sequence
+from dataclasses import dataclass, fields, is_dataclass
 from importlib.resources import files
 from pathlib import Path, PurePath
 from typing import TYPE_CHECKING
@@ -14,10 +18,11 @@ from markupsafe import Markup
 
 from keyss.audits import numbers
 from keyss.audits.parts import OF_3DGS_MODELS
-from keyss.audits.record import Audit, ModelImages
+from keyss.audits.record import AUDIT_FOLDER, Audit, ModelImages
 from keyss.audits.summary import auc_text, headline, verdicts, worst_leak
-from keyss.audits.untrusted import AuditPictures, check_bounds, clean
 from keyss.core import InputError, import_extra
+from keyss.files.images import probe_image
+from keyss.files.reading import read_file
 from keyss.measure.images import ImageComparison
 
 if TYPE_CHECKING:
@@ -27,6 +32,12 @@ _STYLES = ("page.css", "pictures.css", "print.css")
 _AUDIT = "`keyss audit RUN --key-file KEY` measures it"
 _EVALUATE = "`keyss evaluate RUN --key-file KEY` measures it, and a new audit includes it"
 _NO_MODEL = "the method does not publish a 3DGS model"
+_MAX_PICTURE = 32 * 2**20
+_MAX_PICTURES = 256 * 2**20  # of all together, for browsers
+_MAX_ENTRIES = 10_000
+_MAX_NUMBER = 1e15
+_MAX_TEXT = 1_000
+_PNG = b"\x89PNG\r\n\x1a\n"
 # By field of `Audit`, in the order of the page: the id of the section and its title.
 _PARTS = {
     "images": ("images", "Against the test views"),
@@ -159,3 +170,64 @@ def _not_measured(audit: Audit) -> list[str]:
 
 def _asset(name: str) -> str:
     return files("keyss.audits").joinpath("assets", name).read_text(encoding="utf-8")
+
+
+def check_bounds(value: object, place: str = "audit") -> None:
+    """Raise InputError for a list of more than 10,000 entries or a number beyond 1e15 in a record."""
+    entries: dict[object, object] = {}
+    if is_dataclass(value):
+        entries = {f".{each.name}": getattr(value, each.name) for each in fields(value)}
+    elif isinstance(value, dict):
+        entries = {f".{clean(str(name))}": item for name, item in value.items()}
+    elif isinstance(value, list | tuple):
+        entries = {f"[{index}]": item for index, item in enumerate(value)}
+    elif isinstance(value, int | float) and abs(value) > _MAX_NUMBER:
+        raise InputError(f"{place}: expected a number of at most {_MAX_NUMBER:g} in size")
+    if len(entries) > _MAX_ENTRIES:
+        raise InputError(f"{place}: expected at most {_MAX_ENTRIES:,} entries, found {len(entries):,}")
+    for name, item in entries.items():
+        check_bounds(item, f"{place}{name}")
+
+
+def clean(text: str) -> str:
+    """One line of at most 1,000 printable characters: no control or bidirectional characters."""
+    text = text[: _MAX_TEXT - 1] + "…" if len(text) > _MAX_TEXT else text
+    return "".join(
+        c if c.isprintable() else " " if c.isspace() else "\N{REPLACEMENT CHARACTER}" for c in text
+    )
+
+
+@dataclass(frozen=True)
+class EmbeddedPicture:
+    """A picture inside a page."""
+
+    width: int  # pixels
+    height: int
+    url: str  # data:
+
+
+class AuditPictures:
+    """The pictures of an audit: PNG files in its folder."""
+
+    def __init__(self, run: Path) -> None:
+        self._folder = run / AUDIT_FOLDER
+        self._left = _MAX_PICTURES
+
+    def read(self, name: str) -> EmbeddedPicture:
+        """Read a picture that the audit names.
+
+        Raises InputError if it is outside the audit's folder, missing, not a PNG or too large.
+        """
+        try:
+            folder = self._folder.resolve()
+            path = (folder / name).resolve()
+        except (OSError, RuntimeError, ValueError) as error:  # loops of links, invalid names
+            raise InputError(f"expected the name of a picture, found {name!r}") from error
+        if not path.is_relative_to(folder):
+            raise InputError(f"expected a picture in {self._folder}, found {name!r}")
+        data = read_file(path, min(_MAX_PICTURE, self._left))
+        if not data.startswith(_PNG):
+            raise InputError(f"{path}: expected a PNG picture")
+        width, height, _ = probe_image(path)
+        self._left -= len(data)
+        return EmbeddedPicture(width, height, "data:image/png;base64," + b64encode(data).decode())

@@ -106,17 +106,13 @@ def _wrong_keys(audit: Audit) -> Iterator[Verdict]:
     if audit.wrong_key is None:
         return
     pairs = zip(audit.wrong_key.vs_secrets, audit.chance_level, strict=False)
-    best = max(
-        ((psnr.max, chance) for psnr, chance in pairs), key=lambda pair: pair[0] - pair[1], default=None
-    )
-    if best is not None:
-        psnr, chance = best
-        value, beside = (
-            f"{decibel(psnr)}, best of {audit.wrong_key.keys:,}",
-            f"{decibel(chance)}, chance level",
-        )
+    found = [(psnr.max - chance, psnr.max, chance) for psnr, chance in pairs]
+    if found:
+        more, psnr, chance = max(found)
+        value = f"{decibel(psnr)}, best of {audit.wrong_key.keys:,}"
+        beside = f"{decibel(chance)}, chance level"
         limit = f"at most {decibel(WRONG_KEY, 1)} more"
-        yield Verdict("wrong keys", value, beside, limit, _word(psnr - chance <= WRONG_KEY), "wrong-keys")
+        yield Verdict("wrong keys", value, beside, limit, _word(more <= WRONG_KEY), "wrong-keys")
 
 
 def _leaks(audit: Audit) -> Iterator[Verdict]:

@@ -151,21 +151,19 @@ def _wrong_keys(
 ) -> WrongKeys | None:
     """PSNRs of decoded models under wrong embeddings; None without decoders."""
     embeddings = random_embeddings(count, torch.Generator().manual_seed(seed))
-    vs_cover: list[list[float]] = []
-    vs_secrets: list[list[float]] = []
-    for secret, scene in zip(opened, secrets, strict=True):
-        if secret.decode is None:
-            continue
-        vs_cover.append([])
-        vs_secrets.append([])
-        for embedding in embeddings:  # one model at a time: they are large
-            decoded = secret.decode(stego, embedding)
-            vs_cover[-1].append(_psnr(decoded, cover))
-            vs_secrets[-1].append(_psnr(decoded, scene))
-    if not vs_cover:
+    keyed = [
+        (each.decode, scene) for each, scene in zip(opened, secrets, strict=True) if each.decode is not None
+    ]
+    if not keyed:
         return None
+    vs_cover, vs_secrets = [], []
+    for decode, scene in keyed:
+        models = (decode(stego, embedding) for embedding in embeddings)  # one at a time: they are large
+        psnrs = [(_psnr(model, cover), _psnr(model, scene)) for model in models]
+        vs_cover.append([of_cover for of_cover, _ in psnrs])
+        vs_secrets.append(_range([of_secret for _, of_secret in psnrs]))
     means = [fmean(psnrs) for psnrs in zip(*vs_cover, strict=True)]
-    return WrongKeys(count, _range(means), tuple(map(_range, vs_secrets)))
+    return WrongKeys(count, _range(means), tuple(vs_secrets))
 
 
 @torch.no_grad()
