@@ -122,7 +122,6 @@ class JointTraining(ABC):
         common_poses: float,  # share of steps that render all scenes from one pose
         network_rate: float = 0.0,  # of AdamW, decays to 5 % of it
         weight_decay: float = 0.0,
-        freeze: bool = False,  # at the cap nothing is pruned
     ) -> None:
         fit = options.fit
         self.options, self.device, self.scenes = options, device, scenes
@@ -157,7 +156,7 @@ class JointTraining(ABC):
         # Without networks, the optimiser still needs a parameter.
         weights = list(self.networks.parameters()) or [torch.nn.Parameter(torch.zeros(1))]
         self.network_optimizer = torch.optim.AdamW(weights, lr=network_rate, weight_decay=weight_decay)
-        self.strategy = self.density_control(freeze)
+        self.strategy = self.density_control()
         self.density: dict[str, Any] = self.strategy.initialize_state(self.extent)
 
     def start(self) -> Gaussians:
@@ -167,9 +166,9 @@ class JointTraining(ABC):
             [self.scenes[index].scene for index in chosen], self.options.fit, self.generator
         )
 
-    def density_control(self, freeze: bool) -> CappedStrategy:
-        """What clones, splits and prunes; `freeze`: at the cap nothing is pruned."""
-        return CappedStrategy(self.options.fit, self.opacity_for_pruning, freeze=freeze)
+    def density_control(self) -> CappedStrategy:
+        """What clones, splits and prunes."""
+        return CappedStrategy(self.options.fit, self.opacity_for_pruning)
 
     @abstractmethod
     def prepare(self, start: Gaussians) -> None:

@@ -43,20 +43,15 @@ class CarriedSecret:
 
 
 def unpack(content: Content) -> CarriedSecret:
-    """The Gaussians that are left. Raises InputError for damage."""
-    if isinstance(content, Records):
-        return decode(content)
-    gaussians = whole.decode(content.data, content.carriers)
-    return CarriedSecret(gaussians, len(gaussians), round(8 * len(content.data) / len(gaussians)))
-
-
-def decode(records: Records) -> CarriedSecret:
-    """The secret of records in any order; some may be lost. Raises InputError for damage."""
-    if len(records.header) < COUNT.size:
+    """The Gaussians that are left, of records in any order. Raises InputError for damage."""
+    if not isinstance(content, Records):
+        gaussians = whole.decode(content.data, content.carriers)
+        return CarriedSecret(gaussians, len(gaussians), round(8 * len(content.data) / len(gaussians)))
+    if len(content.header) < COUNT.size:
         raise InputError("the hidden parameters are damaged: they are too short")
-    (count,) = COUNT.unpack_from(records.header)
-    codec = Codec.unpack(records.header[COUNT.size :])
-    expected, found = codec.table.record_bytes, records.records.shape[1]
+    (count,) = COUNT.unpack_from(content.header)
+    codec = Codec.unpack(content.header[COUNT.size :])
+    expected, found = codec.table.record_bytes, content.records.shape[1]
     if found != expected:
         raise InputError(f"the hidden parameters are damaged: records of {found} bytes, expected {expected}")
-    return CarriedSecret(codec.decode(records.records), count, codec.table.total)
+    return CarriedSecret(codec.decode(content.records), count, codec.table.total)

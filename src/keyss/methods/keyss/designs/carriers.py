@@ -81,7 +81,7 @@ class CarriersTraining(DesignTraining):
                 self.parameters[f"{scene}/{name}"] = values
                 self.optimizers[f"{scene}/{name}"] = optimizers[name]
 
-    def density_control(self, freeze: bool) -> CappedStrategy:
+    def density_control(self) -> CappedStrategy:
         return DeadPlaces(self.options.fit, [placed.scene.extent for placed in self.scenes], self.generator)
 
     def step(self) -> None:

@@ -82,11 +82,11 @@ class NetworkTraining(DesignTraining):
         loss = photometric_loss(picture.image, self.poses.target(0, *pose), fit.ssim_weight)
         return settings.incorrect_weight * settings.incorrect_every * len(self.decoders) * loss
 
-    def density_control(self, freeze: bool) -> CappedStrategy:
-        even = self.design.growth == "even" and len(self.growing) == len(self.scenes)
-        if not even:
-            return super().density_control(freeze)
-        return EvenGrowth(self.options.fit, self.opacities, len(self.scenes))
+    def density_control(self) -> CappedStrategy:
+        if self.design.growth == "even" and len(self.growing) == len(self.scenes):
+            return EvenGrowth(self.options.fit, self.opacities, len(self.scenes))
+        freeze = self.design.at_cap == "freeze"
+        return CappedStrategy(self.options.fit, self.opacity_for_pruning, freeze=freeze)
 
     @torch.no_grad()
     def opacity_for_pruning(self) -> Tensor:
@@ -204,11 +204,7 @@ class NetworkDesign(Design):
 
     @property
     def joint(self) -> dict[str, Any]:
-        return {
-            "network_rate": self.decoder_rate,
-            "weight_decay": self.weight_decay,
-            "freeze": self.at_cap == "freeze",
-        }
+        return {"network_rate": self.decoder_rate, "weight_decay": self.weight_decay}
 
     def shape(self, sh_degree: int) -> DecoderShape:
         """Kind and sizes of the decoders."""
