@@ -48,6 +48,16 @@ def write_nerfstudio(folder: Path, scene: Scene) -> Path:
     return folder
 
 
+def psnr_of_pictures(model: Path, scene: Path) -> float:
+    """Mean over test views of a scene."""
+    pictures = dict(keyss.render(model, scene))
+    errors = [
+        (pictures[view.camera.name.replace("/", "_")].float() - view.image.float()).square().mean() / 255**2
+        for view in keyss.load_scene(scene).test
+    ]
+    return float(-10 * torch.stack(errors).log10().mean())
+
+
 @pytest.fixture(scope="module")
 def run(folders: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("runs") / "hidden"
@@ -110,14 +120,8 @@ def test_metrics_are_of_what_reveal_writes(run: Path, folders: tuple[Path, Path]
     again = keyss.read_model(tmp_path / "secret.ply")
     assert torch.equal(secret.means, again.means)
     assert torch.equal(secret.sh, again.sh)
-    pictures = dict(keyss.render(tmp_path / "secret.ply", folders[1]))
-    scene = keyss.load_scene(folders[1])
-    errors = [
-        (pictures[view.camera.name.replace("/", "_")].float() - view.image.float()).square().mean() / 255**2
-        for view in scene.test
-    ]
-    psnr = float(-10 * torch.log10(torch.stack(errors)).mean())
     metrics = json.loads((run / "private" / "metrics.json").read_text())
+    psnr = psnr_of_pictures(tmp_path / "secret.ply", folders[1])
     assert psnr == pytest.approx(metrics["secrets"][0]["psnr"], abs=0.1)
 
 

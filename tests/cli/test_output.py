@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from cli.said import COMMANDS, PROGRAM, Run
+from cli.said import COMMANDS, PROGRAM, SMALL, Run
 from keyss.cli import main, process
 from keyss.files import read_model
 
@@ -85,8 +85,7 @@ def test_an_error_has_its_status_where_nobody_can_be_told(redirection: str, stat
 
 
 def test_progress_that_cannot_be_shown_stops_nothing(world: Path, tmp_path: Path) -> None:
-    small = ("--iterations", 20, "--max-gaussians", 100, "--device", "cpu")
-    done = shell("2>/dev/full", "fit", world / "b", "-o", tmp_path / "out", *small)
+    done = shell("2>/dev/full", "fit", world / "b", "-o", tmp_path / "out", *SMALL[2:])
     assert done.returncode == 0
     assert b"PSNR" in done.stdout
 
@@ -120,8 +119,7 @@ def test_what_cannot_be_shown_is_replaced() -> None:
 def test_numbers_in_a_locale_without_characters(world: Path, tmp_path: Path) -> None:
     """`fit` and `info`, progress included, where Python's own UTF-8 is switched off."""
     plain = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
-    small = ("--iterations", 20, "--max-gaussians", 100, "--device", "cpu")
-    done = shell("", "fit", world / "b", "-o", tmp_path / "ä鍵", *small, **plain)
+    done = shell("", "fit", world / "b", "-o", tmp_path / "ä鍵", *SMALL[2:], **plain)
     assert done.returncode == 0, done.stderr
     assert done.stderr.startswith(b"fit b: 20 steps")
     assert os.fsencode(tmp_path / "ä鍵" / "model.ply") in done.stdout  # a path comes out as it went in

@@ -78,9 +78,5 @@ def test_a_dry_run_prints_the_whole_and_writes_nothing(keyss: Run, world: Path, 
     said = keyss("hide", *scenes, "-o", tmp_path / "out", *SMALL, "--dry-run")  # so few have no room
     assert_refused(said, 2, "--publish any has room")
     assert listing(tmp_path) == {}
-
-
-def test_a_degree_of_zero_is_one(keyss: Run, world: Path, tmp_path: Path) -> None:
-    scenes = ("--cover", world / "a", "--secret", world / "b", "--key-file", world / "key.txt")
     said = keyss("hide", *scenes, "-o", tmp_path / "out", *SMALL, "--sh-degree", 0, "--dry-run")
-    assert_refused(said, 2, "--sh-degree 1 makes room")
+    assert_refused(said, 2, "--sh-degree 1 makes room")  # a degree of zero is one that was given

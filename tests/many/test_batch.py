@@ -96,7 +96,8 @@ def check_batch(folder: Path, count: int, broken: set[int]) -> None:
         assert (folder / "out" / f"asset-{index}" / "publish" / "stego.ply").exists()
 
 
-def test_a_cover_that_is_published_twice_is_warned_of(folder: Path) -> None:
+def test_a_cover_that_is_published_twice_is_warned_of(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(processes, "WORKER", ("false",))
     manifest(folder, HEAD + "a.ply,secret.ply,x\nb.ply,secret.ply,y\na.ply,secret.ply,z\n")
     with pytest.warns(KeyssWarning, match=r"1 of the covers \(a.ply\) are published more than once"):
         hide(folder)

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 import scipy.stats
 
+from cli.said import Run
 from keyss.core import InputError, OutputError
 from keyss.many import Forecast, ManyResult, cell, engines, spec, sweep, tables
 from keyss.runs import MANIFEST
@@ -258,18 +259,26 @@ def test_real_cells_that_were_killed_have_the_bytes_of_undisturbed_ones(
         assert (tmp_path / "out" / name).read_bytes() == (tmp_path / "calm" / name).read_bytes()
 
 
-def test_a_dry_run_writes_nothing_and_names_what_cannot_work(tmp_path: Path) -> None:
-    spec = real_spec(tmp_path, 2)
-    found = sweep(spec, tmp_path / "out", dry_run=True)
+def test_a_dry_run_writes_nothing_and_names_what_cannot_work(keyss: Run, tmp_path: Path) -> None:
+    spec, out = real_spec(tmp_path, 2), tmp_path / "out"
+    before = sorted(tmp_path.rglob("*"))
+    found = sweep(spec, out, dry_run=True)
     assert isinstance(found, Forecast)
     assert len(found.cells) == len(found.plans) == 2
     assert all(each.seconds > 0 and each.memory_bytes > 10**8 for each in found.plans)
-    (tmp_path / "a.ply").write_text("no model")
+    said = keyss("sweep", spec, "-o", out, "--dry-run")
+    assert said.status == 0, said
+    assert "2 cells, 2 to do: about " in said.out
+    assert "nothing was written." in said.out
+    (tmp_path / "a.ply").write_text("ply, but no model")
     cell.checksum.cache_clear()
-    found = sweep(spec, tmp_path / "out", dry_run=True)
+    found = sweep(spec, out, dry_run=True)
     assert isinstance(found, Forecast)
     assert all(each.refused for each in found.cells)
-    assert not (tmp_path / "out").exists()
+    said = keyss("sweep", spec, "-o", out, "--dry-run")
+    assert "cannot work" in said.out
+    assert "2 cells, 0 to do" in said.out
+    assert sorted(tmp_path.rglob("*")) == before
 
 
 @pytest.mark.counted

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -48,22 +49,11 @@ def test_what_was_made_in_memory_opens_there(publish: str) -> None:
 
 @EVERY
 def test_too_large_secrets_are_refused_or_pruned(publish: str) -> None:
-    cover, secret = model_of(2500), model_of(1500, 1)
+    cover, asked = model_of(2500), [keyss.Secret(model_of(1500, 1), "key one")]
+    pruning = CarryOptions(publish=publish, prune_to_fit=True)  # type: ignore[arg-type]
     with pytest.raises(UsageError, match=r"room for .*prune_to_fit"):
-        keyss.hide(
-            cover,
-            [keyss.Secret(secret, "key one")],
-            method=CarryOptions(publish=publish, refit="never"),  # type: ignore[arg-type]
-            width=32,
-            min_psnr=0,
-        )
-    hidden = keyss.hide(
-        cover,
-        [keyss.Secret(secret, "key one")],
-        method=CarryOptions(publish=publish, prune_to_fit=True),  # type: ignore[arg-type]
-        width=32,
-        min_psnr=0,
-    )
+        keyss.hide(cover, asked, method=replace(pruning, prune_to_fit=False, refit="never"), width=32)
+    hidden = keyss.hide(cover, asked, method=pruning, width=32, min_psnr=0)
     assert 250 < hidden.metrics.secret_gaussians[0] < 1000
 
 

@@ -19,6 +19,7 @@ from keyss.fitting import State
 from keyss.methods import JointTraining, PeerOptions, PlacedScene, registry
 from keyss.runs import stego_in
 from keyss.runs.files import handed_names
+from test_api import psnr_of_pictures
 from tiny_scenes import random_gaussians, tiny_scene
 
 FIT = FitConfig(iterations=120, max_gaussians=300, sh_degree=1, grow_every=30, evaluate_every=60, seed=0)
@@ -86,13 +87,7 @@ def test_both_files_show_the_secret(made: Made, folders: tuple[Path, Path], tmp_
     key = KEY if capabilities.keys else None
     keyss.reveal(stego, key, handed=made.handed, out=out)
     assert isinstance(keyss.read_model(out), DecodedGaussians) != capabilities.models
-    scene = keyss.load_scene(folders[1])
-    pictures = dict(keyss.render(out, folders[1]))
-    errors = [
-        (pictures[view.camera.name.replace("/", "_")].float() - view.image.float()).square().mean() / 255**2
-        for view in scene.test
-    ]
-    psnr = float(-10 * torch.stack(errors).log10().mean())
+    psnr = psnr_of_pictures(out, folders[1])
     assert psnr == pytest.approx(made.result.metrics.secrets[0].psnr, abs=0.1)
     if not capabilities.models:
         with pytest.raises(UsageError, match="network"):
