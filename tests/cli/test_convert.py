@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import subprocess
 from pathlib import Path
 
@@ -13,18 +12,19 @@ import keyss as package
 from channels.low_bits.trained_like import trained_like
 from cli.said import PROGRAM, Run, assert_refused, write_key
 from keyss.files import read_model, write_model
+from methods.carry.carried import embed
 from tiny_scenes import random_gaussians
 
-VECTORS = Path(__file__).parents[1] / "vectors"
-CARRIED = VECTORS / "carried.ply"
 COUNT = 400
+KEY = "W2mz8Qe5TnYc6LkA"
 
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """`key`, which opens carried.ply, `other`, which does not, and a plain model in several formats."""
     folder = tmp_path_factory.mktemp("convert")
-    write_key(folder / "key", json.loads((VECTORS / "carried.json").read_text())["key"])
+    write_model(folder / "carried.ply", embed(trained_like(1500), [(KEY, trained_like(COUNT, 1))]))
+    write_key(folder / "key", KEY)
     write_key(folder / "other")
     for suffix in ("ply", "spz", "sog", "compressed.ply", "glb", "splat"):
         write_model(folder / f"plain.{suffix}", random_gaussians(COUNT))
@@ -61,24 +61,24 @@ def test_every_verb_that_takes_models_takes_each_format(keyss: Run, files: Path,
     assert list(out.iterdir())
 
 
-@pytest.mark.argon2
 def test_a_secret_is_not_destroyed_unasked(keyss: Run, files: Path, tmp_path: Path) -> None:
     key = ("--key-file", files / "key")
     out = tmp_path / "out.spz"
-    refused = keyss("convert", CARRIED, out, *key)
+    refused = keyss("convert", files / "carried.ply", out, *key)
     assert_refused(refused, 7, "Gaussians would be left in")
     assert "nothing was written; --force writes it anyway" in refused.err
     assert not out.exists()
-    assert "is lost: 0 Gaussians are left" in keyss("convert", CARRIED, out, *key, "--dry-run").out
+    assert (
+        "is lost: 0 Gaussians are left" in keyss("convert", files / "carried.ply", out, *key, "--dry-run").out
+    )
     assert not out.exists()
-    assert keyss("convert", CARRIED, out, *key, "--force").status == 0
+    assert keyss("convert", files / "carried.ply", out, *key, "--force").status == 0
     assert out.exists()
 
 
-@pytest.mark.argon2
 def test_a_secret_survives_from_ply_to_ply(keyss: Run, files: Path, tmp_path: Path) -> None:
     out = tmp_path / "out.ply"
-    said = keyss("convert", CARRIED, out, "--key-file", files / "key")
+    said = keyss("convert", files / "carried.ply", out, "--key-file", files / "key")
     assert said.status == 0
     assert "Gaussians, survives" in said.out
     assert keyss("reveal", out, "--key-file", files / "key", "-o", tmp_path / "secret.ply").status == 0
@@ -97,7 +97,7 @@ def test_a_hidden_file_is_not_destroyed_unasked(keyss: Run, files: Path, tmp_pat
 
 
 def test_a_key_that_opens_nothing(keyss: Run, files: Path, tmp_path: Path) -> None:
-    said = keyss("convert", CARRIED, tmp_path / "o.ply", "--key-file", files / "other")
+    said = keyss("convert", files / "carried.ply", tmp_path / "o.ply", "--key-file", files / "other")
     assert_refused(said, 3, "opens nothing here")
 
 

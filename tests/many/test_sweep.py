@@ -217,7 +217,7 @@ def test_keys_follow_from_one_master_key_and_stay_private(tmp_path: Path) -> Non
 def test_two_sweeps_do_not_work_in_one_folder(tmp_path: Path) -> None:
     spec = write_spec(tmp_path, ["a.ply"], seeds=1)
     out = tmp_path / "out"
-    program = [sys.executable, "-c", DRIVER.replace("fake(0.15)", "fake(30)")]
+    program = [sys.executable, "-c", DRIVER.replace("fake(0.5)", "fake(30)")]
     with subprocess.Popen([*program, spec, out, tmp_path / "master.txt", "fake"]) as driver:
         until(lambda: any(out.glob("cells/*/log.txt")))
         with pytest.raises(OutputError, match=f"process {driver.pid} is at work"):
@@ -284,11 +284,10 @@ def test_a_dry_run_writes_nothing_and_names_what_cannot_work(keyss: Run, tmp_pat
 @pytest.mark.counted
 def test_scenes_are_fitted_once_for_all_cells(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(engines, "WORKER", REAL)
-    for index, name in enumerate("ab"):
-        write_nerfstudio(tmp_path / name, tiny_scene(index))
+    write_nerfstudio(tmp_path / "a", tiny_scene())
     spec = spec_of(
         tmp_path,
-        "pairs: [{cover: a, secrets: [b]}, {cover: b, secrets: [a]}]\n"
+        "pairs: [{cover: a, secrets: [a]}]\n"
         "methods:\n"
         "  - {method: carry, options: {publish: any, fit.iterations: 20, fit.max_gaussians: 150}}\n"
         "  - {method: carry, name: dithered,\n"
@@ -296,10 +295,10 @@ def test_scenes_are_fitted_once_for_all_cells(tmp_path: Path, monkeypatch: pytes
         "bound: true\n",
     )
     found = run(spec, tmp_path / "out", jobs=1)
-    assert [each.error for each in found.outcomes] == [None] * 4
-    # Each scene once as a cover and once, with twice the steps, as a secret.
-    assert len(list((tmp_path / "out" / "cells").iterdir())) == 4 + 4
-    assert len(list((tmp_path / "out").glob("cells/*/run/model.ply"))) == 4
+    assert [each.error for each in found.outcomes] == [None] * 2
+    # Once as a cover and once, with twice the steps, as a secret.
+    assert len(list((tmp_path / "out" / "cells").iterdir())) == 2 + 2
+    assert len(list((tmp_path / "out").glob("cells/*/run/model.ply"))) == 2
     for each in found.outcomes:
         assert each.result is not None
         numbers = each.result.numbers
