@@ -62,17 +62,15 @@ def test_every_verb_that_takes_models_takes_each_format(keyss: Run, files: Path,
 
 
 def test_a_secret_is_not_destroyed_unasked(keyss: Run, files: Path, tmp_path: Path) -> None:
-    key = ("--key-file", files / "key")
     out = tmp_path / "out.spz"
-    refused = keyss("convert", files / "carried.ply", out, *key)
+    convert = ("convert", files / "carried.ply", out, "--key-file", files / "key")
+    refused = keyss(*convert)
     assert_refused(refused, 7, "Gaussians would be left in")
     assert "nothing was written; --force writes it anyway" in refused.err
     assert not out.exists()
-    assert (
-        "is lost: 0 Gaussians are left" in keyss("convert", files / "carried.ply", out, *key, "--dry-run").out
-    )
+    assert "is lost: 0 Gaussians are left" in keyss(*convert, "--dry-run").out
     assert not out.exists()
-    assert keyss("convert", files / "carried.ply", out, *key, "--force").status == 0
+    assert keyss(*convert, "--force").status == 0
     assert out.exists()
 
 
