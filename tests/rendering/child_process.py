@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import hashlib
+import os
+import subprocess
+import sys
 from collections.abc import Sequence
+from pathlib import Path
 
 import torch
 
-import keyss  # noqa: F401  before torch starts its threads: see keyss._threads
+import keyss  # before torch starts its threads: see keyss._threads
 from rendering.scenes import Scene, random_scene
 
 
@@ -36,3 +40,18 @@ def check_on_generic_processor(names: Sequence[str]) -> str:
         check(SCENES[name]())
     _, processor, features = cpu_target.target_context.codegen().magic_tuple()
     return f"{processor} {features}".strip()
+
+
+SOURCE = Path(keyss.__file__).parents[1]
+
+
+def python(code: str, source: Path = SOURCE, **environment: str) -> subprocess.CompletedProcess[str]:
+    """Run code that imports keyss from a folder."""
+    return subprocess.run(
+        [sys.executable, "-c", code],
+        env={**os.environ, "PYTHONPATH": str(source), **environment},
+        capture_output=True,
+        text=True,
+        timeout=600,
+        check=False,
+    )

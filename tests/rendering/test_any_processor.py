@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import subprocess
 import sys
 from pathlib import Path
 
@@ -21,15 +20,12 @@ def test_images_and_gradients_without_avx2() -> None:
     program = (
         f"from rendering.child_process import check_on_generic_processor as check; print(check({SCENES!r}))"
     )
-    environment = {
-        **os.environ,
-        "NUMBA_CPU_NAME": "generic",
-        "NUMBA_CPU_FEATURES": "",
-        "NUMBA_CACHE_DIR": str(cache.parent / "generic"),
-        "PYTHONPATH": os.pathsep.join([str(Path(child_process.__file__).parents[1]), *sys.path]),
-    }
-    done = subprocess.run(
-        [sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=False
+    done = child_process.python(
+        program,
+        NUMBA_CPU_NAME="generic",
+        NUMBA_CPU_FEATURES="",
+        NUMBA_CACHE_DIR=str(cache.parent / "generic"),
+        PYTHONPATH=os.pathsep.join([str(Path(child_process.__file__).parents[1]), *sys.path]),
     )
     assert done.returncode == 0, done.stderr[-3000:]
     assert done.stdout.split() == ["generic"]

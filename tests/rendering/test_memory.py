@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import gc
-import os
-import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-import keyss
 from keyss.rendering.cpu import memory
+from rendering.child_process import python
 
 
 @pytest.fixture(autouse=True)
@@ -80,14 +77,7 @@ print(draw(1_000_000, 1600, 1066))
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 def test_a_million_gaussians_need_no_more_than_4_gib() -> None:
-    done = subprocess.run(
-        [sys.executable, "-c", DRAW_A_MILLION],
-        env={**os.environ, "PYTHONPATH": str(Path(keyss.__file__).parents[1])},
-        capture_output=True,
-        text=True,
-        timeout=600,
-        check=False,
-    )
+    done = python(DRAW_A_MILLION)
     assert done.returncode == 0, done.stderr
     growth = int(done.stdout)
     print(f"peak resident memory grew by {growth / 2**30:.2f} GiB")

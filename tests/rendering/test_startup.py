@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import os
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
-import keyss
+from rendering.child_process import SOURCE, python
 
 DRAW = """
 import torch
@@ -36,22 +33,8 @@ print(*[name for name, kernel in kernels.items() if kernel.signatures])
 """
 
 
-def python(code: str, source: Path, **environment: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-c", code],
-        env={**os.environ, "PYTHONPATH": str(source), **environment},
-        capture_output=True,
-        text=True,
-        timeout=300,
-        check=False,
-    )
-
-
-SOURCE = Path(keyss.__file__).parents[1]
-
-
 def test_importing_compiles_nothing(tmp_path: Path) -> None:
-    done = python(LIST_COMPILED, SOURCE, NUMBA_CACHE_DIR=str(tmp_path))
+    done = python(LIST_COMPILED, NUMBA_CACHE_DIR=str(tmp_path))
     assert done.returncode == 0, done.stderr
     assert done.stdout.strip() == done.stderr == ""
     assert [path for path in tmp_path.rglob("*") if path.is_file()] == []
@@ -73,7 +56,7 @@ def test_drawing_needs_no_place_for_the_cache(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_the_first_drawing_announces_that_it_compiles_and_the_next_one_does_not(tmp_path: Path) -> None:
     for times in (1, 0):
-        done = python(DRAW, SOURCE, NUMBA_CACHE_DIR=str(tmp_path))
+        done = python(DRAW, NUMBA_CACHE_DIR=str(tmp_path))
         assert done.returncode == 0, done.stderr
         assert done.stderr.count("compiling the CPU rasterizer") == done.stderr.count("\n") == times
     assert list(tmp_path.rglob("*.nbi"))

@@ -91,4 +91,4 @@ def test_a_file_in_colours_is_saved_and_all_keys_look_alike(tab: Visit, tmp_path
 def test_a_wrong_key_takes_as_long_as_a_right_one(tab: Visit, published: tuple[Path, Gaussians]) -> None:
     folder, _ = published
     tab.goto(export_html(folder / "stego.spz", folder / "timed.html")[0].as_uri())
-    tab.takes_as_long_for_each("wrong", KEY, "wrong again", KEY, "and again")
+    tab.takes_as_long_for_each("wrong", KEY, "wrong again", KEY)

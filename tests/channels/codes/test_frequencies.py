@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import numpy.typing as npt
 import pytest
@@ -11,7 +13,13 @@ from channels.codes.published import FORMATS, codes_of, written
 from keyss.channels import CodesCover, CodesReader, Field, in_counted_order
 
 COUNT = 30_000
-EVERY = pytest.mark.parametrize("suffix", FORMATS)
+
+
+@pytest.fixture(scope="module", params=FORMATS)
+def file(request: pytest.FixtureRequest) -> tuple[str, CodesCover, Any]:
+    """Its suffix, the cover, and the codes with something in them."""
+    cover = CodesCover.of(codes_of(request.param, COUNT))
+    return request.param, cover, written(cover, b"x" * 5000)
 
 
 def pairs_of_values(levels: npt.NDArray[np.int32]) -> float:
@@ -23,11 +31,9 @@ def pairs_of_values(levels: npt.NDArray[np.int32]) -> float:
     return float(stats.chi2.sf(((counts[:, 0] - expected) ** 2 / expected).sum(), len(counts) - 1))
 
 
-@EVERY
-def test_written_bits_are_uniform(suffix: str) -> None:
-    cover = CodesCover.of(codes_of(suffix, COUNT))
-    bits = CodesReader.of(written(cover, b"x" * 5000)).bits
-    values = np.packbits(bits[cover.dry == 1])
+def test_written_bits_are_uniform(file: tuple[str, CodesCover, Any]) -> None:
+    _, cover, codes = file
+    values = np.packbits(CodesReader.of(codes).bits[cover.dry == 1])
     assert stats.chisquare(np.bincount(values, minlength=256)).pvalue > 1e-4
 
 
@@ -43,11 +49,10 @@ def test_pairs_of_values_find_overwriting_and_not_matching() -> None:
     assert max(pairs_of_values(levels), pairs_of_values(found)) < 1e-9 < 1e-3 < pairs_of_values(overwritten)
 
 
-@EVERY
-def test_columns_look_like_those_of_the_untouched_file(suffix: str) -> None:
+def test_columns_look_like_those_of_the_untouched_file(file: tuple[str, CodesCover, Any]) -> None:
     """Frequencies of levels, in bins of a few, by a test of two samples of which each is random."""
-    cover = CodesCover.of(codes_of(suffix, COUNT))
-    _, after = in_counted_order(written(cover, b"x" * 5000))
+    suffix, cover, codes = file
+    _, after = in_counted_order(codes)
     other = in_counted_order(codes_of(suffix, COUNT, seed=1))[1]
     for old, new, null in zip(cover.fields, after, other, strict=True):
         plain, stego, fresh = (each.levels for each in (old, new, null))
@@ -58,10 +63,9 @@ def test_columns_look_like_those_of_the_untouched_file(suffix: str) -> None:
         assert moved < natural, (new.name, new.column, moved, natural, size)
 
 
-@EVERY
-def test_ends_of_ranges_stay(suffix: str) -> None:
-    cover = CodesCover.of(codes_of(suffix, COUNT))
-    _, after = in_counted_order(written(cover, b"x" * 5000))
+def test_ends_of_ranges_stay(file: tuple[str, CodesCover, Any]) -> None:
+    _, cover, codes = file
+    _, after = in_counted_order(codes)
     for old, new in zip(cover.fields, after, strict=True):
         if old.name == "rotations":
             continue  # whose ends are those of the format
