@@ -13,26 +13,28 @@ from pathlib import Path
 import msgspec
 import torch
 
-from keyss.api.asking import HideResult, Secret, method_for, sources_of
-from keyss.api.filing import hide_files
+from keyss.api.asking import HideResult, Secret, check_keys, method_for, sources_of
 from keyss.api.together import begun, together
-from keyss.channels import AnyChannel, Publish
+from keyss.channels import AnyChannel, Publish, channel_for, open_content
 from keyss.core.errors import QualityError, UsageError
 from keyss.core.gaussians import Gaussians, same_bits
 from keyss.core.scene import Scene, ViewOptions
 from keyss.files.models import is_model_path, read_model
+from keyss.files.reading import read_file
 from keyss.fitting.image_metrics import quality
 from keyss.fitting.ranks import here
 from keyss.keys import DerivedKey
 from keyss.keys.derivation import SALT_BYTES
+from keyss.keys.encryption import MAX_PAYLOAD_BYTES
 from keyss.measure.hiding import RenderFidelity, Shown, measure_hiding, show
 from keyss.methods.base import Context, MethodOptions, Source, Stego
 from keyss.methods.handed import pack
-from keyss.methods.opened import Opened
+from keyss.methods.opened import HiddenFile, Opened
 from keyss.methods.plain_models import Bound, fit_bounds, with_plain_models
 from keyss.methods.registry import DEFAULT, open_handed, open_model
 from keyss.progress import Reporter
 from keyss.rendering import Backend, resolve_device
+from keyss.rendering.difference import psnr_between
 from keyss.rendering.orbit import is_model
 from keyss.runs.config import RunConfig, secret_ids
 from keyss.runs.files import (
@@ -49,7 +51,7 @@ from keyss.runs.folder import RunFolder
 from keyss.runs.metrics import FitMetrics, HideMetrics
 from keyss.runs.planning import check_disk, in_a_line, plan_hiding, worth_planning
 from keyss.runs.records import read_record, record_bytes
-from keyss.runs.sources import Background, PathLike, as_scene, path_of
+from keyss.runs.sources import Background, PathLike, as_3dgs_model, as_scene, path_of
 
 MIN_PSNR = 20.0  # dB to the plain model; below it, renders show something else
 MIN_PRUNED_PSNR = 25.0  # the same for secrets that lost Gaussians without a refit
@@ -108,7 +110,7 @@ def hide(
                 raise UsageError(f"hiding files does not use `{name}`: leave it out")
         if isinstance(cover, Scene):
             raise UsageError("hiding files needs a model as the cover; `keyss.fit` makes one from photos")
-        return hide_files(
+        return _hide_files(
             cover,
             secrets,
             publish=publish or "ply",
@@ -215,6 +217,45 @@ def hide(
         text = json.dumps(asdict(metrics) if ranks.first else None)  # keeps NaN
         metrics = msgspec.convert(json.loads(ranks.from_first(text.encode())), HideMetrics)
     return HideResult(stego.gaussians, metrics)
+
+
+def _hide_files(
+    cover: PathLike | Gaussians,
+    secrets: Sequence[Secret],
+    *,
+    publish: Publish,
+    channel: AnyChannel,
+    out: PathLike | None,
+    overwrite: bool,
+) -> HideResult:
+    """`hide` of files. Opens them again from what was written, as a reader does."""
+    check_keys([each.key for each in secrets])
+    folder = None
+    if out is not None:
+        read = [cover, *(each.file for each in secrets)]
+        inputs = [Path(each) for each in read if isinstance(each, str | Path)]
+        folder = RunFolder(out, "hide files", writes=STEGOS, inputs=inputs, overwrite=overwrite)
+    hidden, model = [_hidden_file(each) for each in secrets], as_3dgs_model(cover, "the cover")
+    keys = [each.key for each in secrets]
+    payloads = [(key, each.payload()) for key, each in zip(keys, hidden, strict=True)]
+    stego = channel_for(publish, channel).prepare(model).embed(payloads)
+    with folder.work() if folder else nullcontext():
+        name = stego_name(stego)
+        there = folder.write({name: stego}) if folder else None
+        as_read = read_model(there / name) if there else stego
+        if [HiddenFile.of(open_content(as_read, key)) for key in keys] != hidden:
+            raise RuntimeError("the hidden files do not open again from the published file")
+    return HideResult(stego, psnr=psnr_between(model, stego))
+
+
+def _hidden_file(secret: Secret) -> HiddenFile:
+    """Raises InputError for a file that is missing or too large to be hidden, UsageError for no file."""
+    if secret.file is None or secret.scene is not None or secret.model is not None:
+        raise UsageError("expected secrets that are all files, or all scenes: hide the others by themselves")
+    if isinstance(secret.file, bytes):
+        return HiddenFile(secret.name, secret.file)
+    path = Path(secret.file)
+    return HiddenFile(secret.name or path.name, read_file(path, MAX_PAYLOAD_BYTES))
 
 
 def _key_checks(keys: Sequence[str], settings: RunConfig[MethodOptions]) -> list[str]:
