@@ -16,11 +16,6 @@ export function logit(byte: number): number {
   return Math.max(-OPACITY_LOGIT_BOUND, Math.min(OPACITY_LOGIT_BOUND, found));
 }
 
-/** Of a colour of `byte` 255ths. */
-export function constantHarmonic(byte: number): number {
-  return (byte / 255 - 0.5) / SH_C0;
-}
-
 /** Of a scale; that of 0 is that of the smallest normal number, of negative ones NaN. */
 export function logScale(scale: number): number {
   return Math.log(scale === 0 ? MIN_SCALE : scale);

@@ -2,7 +2,7 @@
 import { viewOf } from '../core/bytes.ts';
 import { damaged } from '../core/errors.ts';
 import { emptyGaussians, type Gaussians } from '../core/gaussians.ts';
-import { constantHarmonic, logit, logScale, unitQuat } from './coded.ts';
+import { logit, logScale, SH_C0, unitQuat } from './coded.ts';
 import { checkedFinite } from './ply.ts';
 
 const ROW = 32; // bytes: mean and scale in floats, red, green, blue, opacity and the quaternion in bytes
@@ -16,7 +16,7 @@ export function readSplat(bytes: Uint8Array): Gaussians {
     for (let axis = 0; axis < 3; axis++) {
       model.means[3 * row + axis] = view.getFloat32(at + 4 * axis, true);
       model.logScales[3 * row + axis] = logScale(view.getFloat32(at + 12 + 4 * axis, true));
-      model.sh[3 * row + axis] = constantHarmonic(bytes[at + 24 + axis]);
+      model.sh[3 * row + axis] = (bytes[at + 24 + axis] / 255 - 0.5) / SH_C0;
     }
     model.opacityLogits[row] = logit(bytes[at + 27]);
     const [w, x, y, z] = bytes.subarray(at + 28, at + ROW);

@@ -9,7 +9,7 @@ function all<T extends HTMLElement>() {
 export const page = {
   ...all()('main', 'border', 'drop', 'controls', 'status', 'problem', 'facts', 'revealed', 'count'),
   ...all<HTMLInputElement>()('file', 'colours', 'key', 'wipe', 'threshold', 'faint', 'opaque'),
-  ...all<HTMLButtonElement>()('more', 'show', 'open', 'fly', 'home', 'snapshot', 'download', 'close'),
+  ...all<HTMLButtonElement>()('more', 'show', 'open', 'fly', 'home', 'snapshot', 'download', 'close', 'save'),
   ...all<HTMLSelectElement>()('up', 'colouring'),
   ...all<HTMLCanvasElement>()('picture'),
   ...all<HTMLFormElement>()('form'),

@@ -145,10 +145,12 @@ class Page {
     this.searched(0);
     const { model, file } = await this.opener.unlock(key, page.colours.checked);
     if (attempt === this.attempts) this.searched(1); // else the next attempt has begun
-    if (file) {
+    if (file && own === this.loads) {
       const name = file.name.replace(/[^\p{L}\p{N} ._-]/gu, '_') || 'file';
-      save(name, new Blob([file.data as BlobPart]));
-      this.say(`A hidden file is saved: ${name}`);
+      page.save.textContent = `Save ${name} (${count(file.data.length)} bytes)`;
+      page.save.onclick = () => save(name, new Blob([file.data as BlobPart]));
+      page.save.hidden = false;
+      this.say('A file is hidden here.');
     }
     if (model && own === this.loads) {
       this.reveal(model);
@@ -179,7 +181,6 @@ class Page {
     this.split(0);
     page.revealed.hidden = false;
     this.controls.setPose(pose);
-    this.writeAddress();
   }
 
   private closeSecret(): void {
@@ -193,7 +194,7 @@ class Page {
 
   private hideSecret(): void {
     this.secret = null;
-    page.revealed.hidden = true;
+    page.revealed.hidden = page.save.hidden = true;
     this.viewer.show(null, 'right');
     placeBorder(null);
   }
@@ -224,10 +225,11 @@ class Page {
     this.addressTimer = window.setTimeout(() => this.writeAddress(), ADDRESS_AFTER);
   }
 
+  /** Not while a secret is shown: a pose in its coordinates would tell of it to whoever gets the address. */
   private writeAddress(): void {
     clearTimeout(this.addressTimer);
     const hash = poseToHash(this.pose);
-    if (this.published && !EMBEDDED && location.hash !== hash) history.replaceState(null, '', hash);
+    if (this.published && !this.secret && !EMBEDDED && location.hash !== hash) history.replaceState(null, '', hash);
   }
 
   private showPublished(): void {

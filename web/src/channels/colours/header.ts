@@ -10,7 +10,7 @@ import { mix, runs, sortingOrder, type Words, wordsOf } from '../../core/words.t
 import { expand } from '../../keys/derivation.ts';
 import { type Carriers, chosen } from './carriers.ts';
 import { Fountain, NOISY } from './fountain.ts';
-import { COLUMNS, dithers, MAX_BITS, rank, readBits, seedsOf } from './lattice.ts';
+import { COLUMNS, dithers, MAX_BITS, rank, readBits, seedsOf, sum } from './lattice.ts';
 
 export const FILE_KEY_BYTES = 5;
 export const SHARES = 256; // parts of the carriers, of which a payload has some
@@ -102,7 +102,6 @@ export function readHeader(
 /** How far what lies under these secrets agrees with the header: 0 by chance. */
 export function headerAgreement(header: Header, secrets: readonly Uint8Array[], index: Index): number {
   if (!index.size) return 0;
-  const sum = (values: Float64Array): number => values.reduce((before, each) => before + each, 0);
   return index.parts(secrets, kindOf(header), USUAL).reduce((before, { seeds, hints, pilots }) => {
     return before + sum(pilots) + sum(signed(hints, fountain.encode(header.bits, seeds)));
   }, 0);

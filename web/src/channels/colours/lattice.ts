@@ -62,9 +62,10 @@ export function readBits(dither: Float64Array, { values }: Carriers, bits: Uint8
   return found;
 }
 
-/** The sum of counts. */
-export function sum(counts: Uint8Array): number {
-  return counts.reduce((before, each) => before + each, 0);
+export function sum(values: Uint8Array | Float64Array): number {
+  let found = 0;
+  for (const each of values) found += each;
+  return found;
 }
 
 /** [C, 2] numbers in [0, 1) that only the secret tells. */
