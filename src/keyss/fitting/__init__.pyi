@@ -31,7 +31,6 @@ from .parameters import (
     initial_gaussians as initial_gaussians,
     initial_points as initial_points,
     make_optimizers as make_optimizers,
-    set_rates as set_rates,
     to_gaussians as to_gaussians,
     to_parameters as to_parameters,
 )
@@ -42,4 +41,5 @@ from .plain import (
 )
 from .ranks import Ranks as Ranks, here as here, joined as joined
 from .sampling import Shuffle as Shuffle, own_randomness as own_randomness
+from .schedule import Schedule as Schedule
 from .side_by_side import Fit as Fit, fit_scenes as fit_scenes

@@ -18,17 +18,25 @@ from keyss.rendering.cpu.jit import kernel
 from keyss.rendering.cpu.simd8 import fetch_add, fused_multiply_add
 
 NUMBERS_PER_JOB = 8192
+_UNSCALED = torch.empty(0)
 
 
 @kernel
 def _adam(
-    counter: Any, parameter: Any, gradient: Any, mean: Any, square: Any, rates: Any, constants: Any
+    counter: Any,
+    parameter: Any,
+    gradient: Any,
+    mean: Any,
+    square: Any,
+    rates: Any,
+    scales: Any,
+    constants: Any,
 ) -> None:
     """Adam's step, in place, on `parameter`, `mean` and `square`; these and `gradient` are flat: [N * W].
 
     With constants (mean_share, square_share, root, eps): mean += mean_share (gradient - mean), square +=
     square_share (gradient^2 - square), and parameter -= rates (mean / (root sqrt(square) + eps)), with
-    `rates` [W] for the numbers of a row.
+    `rates` [W] for the numbers of a row, times `scales` [N] for each row; an empty one means 1.
     """
     mean_share, square_share, root, eps = constants
     width = len(rates)
@@ -40,6 +48,10 @@ def _adam(
         first = fetch_add(counter, 0, 1) * size
         if first >= len(parameter):
             break
+        if len(scales):
+            for row in range(first // width, min(first + size, len(parameter)) // width):
+                for i in range(width):
+                    steps[row * width - first + i] = rates[i] * scales[row]
         p = parameter[first : first + size]
         g = gradient[first : first + size]
         m = mean[first : first + size]
@@ -66,7 +78,7 @@ class RowAdam(torch.optim.Adam):
     """torch's Adam (Kingma and Ba 2015) with an optional `lr_scale` in each param group.
 
     `lr_scale` is a tensor that broadcasts to a row of the parameters ([16, 1] for [N, 16, 3]) and multiplies
-    the learning rate. State and the options `betas`, `eps` and `fused` are torch's. On a CPU, results do not
+    the learning rate; `scale_rows` does so for each row. State and the options `betas`, `eps` and `fused` are torch's. On a CPU, results do not
     depend on the number of threads.
     """
 
@@ -84,19 +96,44 @@ class RowAdam(torch.optim.Adam):
                 self._step_on_cpu(parameter, group)
             return
         # Take torch's step at the full rate, then undo the excess.
-        scaled = [group for group in self.param_groups if "lr_scale" in group]
-        before = [[parameter.clone() for parameter in group["params"]] for group in scaled]
+        scales = [self._scale(parameter, group) for parameter, group in pairs]
+        before = [
+            None if scale is None else parameter.clone() for (parameter, _), scale in zip(pairs, scales)
+        ]
         super().step()
-        for group, olds in zip(scaled, before, strict=True):
-            for parameter, old in zip(group["params"], olds, strict=True):
-                parameter.lerp_(old, (1 - group["lr_scale"].to(parameter)).expand_as(parameter))
+        for (parameter, _), old, scale in zip(pairs, before, scales, strict=True):
+            if scale is not None:
+                parameter.lerp_(old, (1 - scale).expand_as(parameter))
 
-    def _step_on_cpu(self, parameter: Tensor, group: dict[str, Any]) -> None:
-        state = self.state[parameter]
+    def scale_rows(self, scale: Tensor) -> None:
+        """Multiply the learning rate of each row by `scale` [N], until the next call.
+
+        It is part of the state: densification keeps it for rows that stay, and gives new ones 0.
+        """
+        group = self.param_groups[0]
+        (parameter,) = group["params"]
+        self._initialized(parameter, group)["row_scale"] = scale.to(parameter).contiguous()
+
+    def _scale(self, parameter: Tensor, group: dict[str, Any]) -> Tensor | None:
+        """The factor on the learning rate, broadcastable to the parameter; None: 1 everywhere."""
+        scale: Tensor | None = group["lr_scale"].to(parameter) if "lr_scale" in group else None
+        rows = self.state[parameter].get("row_scale")
+        if rows is None:
+            return scale
+        rows = rows.view(-1, *[1] * (parameter.dim() - 1))
+        return rows if scale is None else rows * scale
+
+    def _initialized(self, parameter: Tensor, group: dict[str, Any]) -> dict[str, Any]:
+        """The state of a parameter, which is torch's before the first step if there is none."""
+        state: dict[str, Any] = self.state[parameter]
         if not state:
-            state["step"] = torch.tensor(0.0)
+            state["step"] = torch.tensor(0.0, device=parameter.device if group["fused"] else None)
             state["exp_avg"] = torch.zeros_like(parameter)
             state["exp_avg_sq"] = torch.zeros_like(parameter)
+        return state
+
+    def _step_on_cpu(self, parameter: Tensor, group: dict[str, Any]) -> None:
+        state = self._initialized(parameter, group)
         state["step"] += 1
         step = int(state["step"])
         beta1, beta2 = group["betas"]
@@ -105,6 +142,6 @@ class RowAdam(torch.optim.Adam):
             rates *= group["lr_scale"]
         assert parameter.grad is not None
         tensors = (parameter, parameter.grad.contiguous(), state["exp_avg"], state["exp_avg_sq"], rates)
-        flat = (tensor.view(-1).numpy() for tensor in tensors)
+        flat = [tensor.view(-1).numpy() for tensor in (*tensors, state.get("row_scale", _UNSCALED))]
         constants = (1 - beta1, 1 - beta2, (1 - beta2**step) ** -0.5, group["eps"])
         parallel.run(_adam, *flat, tuple(map(np.float32, constants)))

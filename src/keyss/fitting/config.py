@@ -37,13 +37,16 @@ class FitConfig:
     sh0_rate: float = 2.5e-3
     shN_rate: float = 1.25e-4
 
+    # Factor on these rates at the start of a run, see `fitting.schedule`; None: by the number of steps.
+    boost: float | None = None
+
     # Share of the run, at its end, over which all rates decay to a tenth: at constant rates, Gaussians jitter
     # around their optimum. Only models that do not grow gain by it (docs/lessons.md).
     settle: float = 0.0
 
-    grow_start: float = 1 / 6  # densification starts here, or at 500 iterations if that is earlier
+    grow_start: float = 0.1  # densification starts here, or at 500 iterations if that is earlier
     grow_stop: float = 0.6
-    grow_every: int = 100
+    grow_every: int | None = None  # steps; None: a thirtieth of the run, at most 100
     grow_gradient: float = 2e-4  # mean screen-space gradient norm above which a Gaussian is cloned or split
     prune_opacity: float = 5e-3
 
@@ -59,9 +62,10 @@ class FitConfig:
             ("sh_degree", 0, 3),
             ("ssim_weight", 0, 1),
             ("settle", 0, 1),
+            ("boost", 1, 100),
         ):
             value = getattr(self, name)
-            if not low <= value <= high:
+            if value is not None and not low <= value <= high:
                 raise UsageError(f"`{name}`: expected {low} to {high}, got {value}")
         if self.seed is not None and not 0 <= self.seed <= MAX_SEED:
             raise UsageError(f"`seed`: expected 0 to {MAX_SEED}, got {self.seed}")
@@ -83,6 +87,11 @@ class FitConfig:
         """A seed for one part of a run, which does not reveal the seeds of other parts."""
         digest = hashlib.sha256(f"keyss/v1/seed {self.known_seed} {use}".encode()).digest()
         return int.from_bytes(digest[:8], "little") & MAX_SEED
+
+    @property
+    def refine_every(self) -> int:
+        """Steps between two rounds of densification."""
+        return self.grow_every or min(100, max(1, self.iterations // 30))
 
     def sh_degree_at(self, iteration: int) -> int:
         """SH degree in use, which rises every 1,000 iterations or every sixth of a shorter run."""

@@ -44,7 +44,7 @@ class CappedStrategy(DefaultStrategy):  # type: ignore[misc]
             grow_grad2d=config.grow_gradient,
             refine_start_iter=min(500, int(config.iterations * config.grow_start)),
             refine_stop_iter=int(config.iterations * config.grow_stop),
-            refine_every=config.grow_every,
+            refine_every=config.refine_every,
             reset_every=10**9,  # gsplat 1.5 never resets anyway: `step % reset_every == 0 & step > 0`
         )
         self.max_gaussians = config.max_gaussians

@@ -20,7 +20,6 @@ from keyss.fitting.adam import RowAdam
 from keyss.fitting.config import FitConfig
 
 INITIAL_OPACITY = 0.1
-LAST_RATE = 0.1  # share of the rates at the end of a run that settles
 # Names of parameters, in the order of the fields of `Gaussians`.
 _NAMES = ("means", "quats", "scales", "opacities", "sh")
 
@@ -58,18 +57,6 @@ def make_optimizers(parameters: Parameters, config: FitConfig, extent: float) ->
         name: RowAdam([{"params": [parameters[name]], **group}], eps=1e-15, fused=fused)
         for name, group in groups.items()
     }
-
-
-def set_rates(optimizers: Optimizers, progress: float, settle: float = 0.0) -> None:
-    """Set the learning rates at `progress`, in [0, 1], of a run.
-
-    The rate of positions decays to 1 % (3DGS), the others to a tenth over the last share `settle` of the run.
-    """
-    late = LAST_RATE ** max(0.0, 1 - (1 - progress) / settle) if settle else 1.0
-    for name, optimizer in optimizers.items():
-        group = optimizer.param_groups[0]
-        initial = group.setdefault("initial_lr", group["lr"])
-        group["lr"] = initial * (0.01**progress if name == "means" else late)
 
 
 def initial_gaussians(

@@ -21,12 +21,12 @@ from keyss.fitting.parameters import (
     initial_gaussians,
     initial_points,
     make_optimizers,
-    set_rates,
     to_gaussians,
     to_parameters,
 )
 from keyss.fitting.ranks import here
 from keyss.fitting.sampling import Shuffle
+from keyss.fitting.schedule import Schedule
 from keyss.progress import Reporter
 from keyss.rendering import render_with_meta
 
@@ -65,6 +65,7 @@ class PlainRun:
             model = initial_gaussians(points, colors, config.sh_degree, config.max_gaussians, self.generator)
         self.parameters = to_parameters(model, device)
         self.optimizers = make_optimizers(self.parameters, config, scene.extent)
+        self.schedule = Schedule(config, [view.camera for view in self.views], scene.extent)
         self.strategy = CappedStrategy(config)
         self.density: dict[str, Any] = self.strategy.initialize_state(scene.extent)
         self.shuffle = Shuffle(len(self.views), self.generator)
@@ -86,7 +87,7 @@ class PlainRun:
 
         trained = self.parameters.values()
         self.loss, info = self.strategy.backward(views, loss_at, trained, self.parameters)
-        set_rates(self.optimizers, self.iteration / config.iterations, config.settle)
+        self.schedule.set(self.optimizers, self.iteration)
         for optimizer in self.optimizers.values():
             optimizer.step()
             optimizer.zero_grad(set_to_none=True)
@@ -134,7 +135,7 @@ def fit_scene(
     config, inputs = (config or FitConfig()).seeded(), {"scene": scene.digest()}
     if model is not None:
         rates = {name: rate * value for name, value in vars(config).items() if name.endswith("_rate")}
-        config = replace(config, sh_degree=model.sh_degree, settle=REFIT_SETTLE, **rates)
+        config = replace(config, sh_degree=model.sh_degree, settle=REFIT_SETTLE, boost=1.0, **rates)
         inputs["model"] = model.digest()
     run = PlainRun(scene, config, torch.device(device), model)
     fingerprint = {**inputs, "config": asdict(config)}

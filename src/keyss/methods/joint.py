@@ -26,9 +26,10 @@ from keyss.fitting.density import CappedStrategy, Rendered
 from keyss.fitting.image_metrics import psnr, subsample_views
 from keyss.fitting.loop import train
 from keyss.fitting.losses import photometric_loss
-from keyss.fitting.parameters import make_optimizers, set_rates, to_parameters
+from keyss.fitting.parameters import make_optimizers, to_parameters
 from keyss.fitting.ranks import here
 from keyss.fitting.sampling import Shuffle, own_randomness
+from keyss.fitting.schedule import Schedule
 from keyss.methods.base import (
     Context,
     MethodOptions,
@@ -145,6 +146,8 @@ class JointTraining(ABC):
             Shuffle(len(placed.scene.train), order) for placed, order in zip(scenes, self.orders, strict=True)
         ]
         self.extent = scenes[0].scene.extent
+        cameras = [view.camera for placed in scenes for view in placed.scene.train]
+        self.schedule = Schedule(fit, cameras, self.extent)
 
         start = self.start()
         self.parameters = to_parameters(start, device)
@@ -249,7 +252,7 @@ class JointTraining(ABC):
 
     def _set_rates(self) -> None:
         progress = self.iteration / self.iterations
-        set_rates(self.optimizers, progress)
+        self.schedule.set(self.optimizers, self.iteration)
         risen = min(1.0, self.iteration / self.warm_up) if self.warm_up else 1.0
         self.network_optimizer.param_groups[0]["lr"] = self.network_rate * risen * 0.05**progress
 

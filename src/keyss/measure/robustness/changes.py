@@ -20,8 +20,9 @@ from keyss.core.scene import Scene
 from keyss.fitting.config import FitConfig
 from keyss.fitting.image_metrics import subsample_views
 from keyss.fitting.losses import Target, photometric_loss
-from keyss.fitting.parameters import make_optimizers, set_rates, to_gaussians, to_parameters
+from keyss.fitting.parameters import make_optimizers, to_gaussians, to_parameters
 from keyss.fitting.sampling import Shuffle
+from keyss.fitting.schedule import Schedule
 from keyss.rendering import contributions, render
 
 _FIELDS = {"position": "means", "log scale": "log_scales", "quaternion": "quats"}
@@ -174,9 +175,10 @@ def unused(model: Gaussians, cover: Scene, given_up: float = 0.0) -> Tensor:
 
 def refined(model: Gaussians, scene: Scene, steps: int, seed: int = 0) -> Gaussians:
     """`model` after `steps` steps of plain 3DGS on the training views, at the rates of such a run."""
-    config = FitConfig(iterations=max(steps, 1))
+    config = FitConfig(iterations=max(steps, 1), boost=1.0)
     parameters = to_parameters(model, model.device)
     optimizers = make_optimizers(parameters, config, scene.extent)
+    schedule = Schedule(config, [view.camera for view in scene.train], scene.extent)
     background = scene.background.to(model.device)
     shuffle = Shuffle(len(scene.train), torch.Generator().manual_seed(seed))
     for step in range(1, steps + 1):
@@ -184,7 +186,7 @@ def refined(model: Gaussians, scene: Scene, steps: int, seed: int = 0) -> Gaussi
         image = render(to_gaussians(parameters), view.camera, background)
         target = Target.of(view.image.to(model.device))
         photometric_loss(image, target, config.ssim_weight).backward()
-        set_rates(optimizers, step / config.iterations)
+        schedule.set(optimizers, step)
         for optimizer in optimizers.values():
             optimizer.step()
             optimizer.zero_grad(set_to_none=True)

@@ -28,11 +28,11 @@ from keyss.fitting.parameters import (
     Optimizers,
     Parameters,
     make_optimizers,
-    set_rates,
     to_gaussians,
     to_parameters,
 )
 from keyss.fitting.plain import without_faint
+from keyss.fitting.schedule import Schedule
 from keyss.methods.combined import combined_points
 from keyss.methods.joint import Picture
 from keyss.methods.keyss.designs.base import Design, DesignTraining
@@ -74,6 +74,10 @@ class CarriersTraining(DesignTraining):
 
     def prepare(self, start: Gaussians) -> None:
         fit = self.options.fit
+        self.schedules = [
+            Schedule(fit, [view.camera for view in placed.scene.train], placed.scene.extent)
+            for placed in self.scenes
+        ]
         for scene, placed in enumerate(self.scenes[1:], 1):
             secret = to_parameters(self._filled(scene, self.tables[0].sh_degree), self.device)
             optimizers = make_optimizers(secret, fit, placed.scene.extent)
@@ -104,9 +108,8 @@ class CarriersTraining(DesignTraining):
         return to_gaussians(numbers_of(self.parameters, scene))
 
     def _set_rates(self) -> None:
-        super()._set_rates()
-        for scene in range(1, len(self.scenes)):
-            set_rates(numbers_of(self.optimizers, scene), self.iteration / self.iterations)
+        for scene, schedule in enumerate(self.schedules):
+            schedule.set(numbers_of(self.optimizers, scene), self.iteration)
 
     def publish(self, entropy: bytes) -> tuple[Gaussians, list[RowSecret]]:
         least = self.options.fit.prune_opacity

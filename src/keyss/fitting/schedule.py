@@ -1,0 +1,79 @@
+"""Learning rates over the steps of a run.
+
+The rates of 3DGS are made for 30,000 steps, and are too small for fewer. Shorter runs start with larger ones,
+which fall to those of 3DGS (benchmarks/recipe.py compares them).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from keyss.core.scene import Camera, camera_positions
+from keyss.fitting.config import FitConfig
+from keyss.fitting.parameters import Optimizers
+
+LAST_RATE = 0.1  # share of the rates at the end of a run that settles
+_FULL_STEPS = 30_000
+_MAX_BOOST = 5.0
+_BOOST_GROWTH = 0.473  # exponent: 1,000 steps have the maximum
+_BOOSTED = 0.6  # share of a run with constant, larger rates
+_EXPONENTS = {"means": 7 / 4, "opacities": 2 / 3}  # of the boost; 1 for other attributes
+_CAMERAS = 32  # from which distances are measured
+_FOCAL = 1.15  # focal length, for a picture of area 1, at which rates are those of 3DGS; 47 degrees
+
+
+class Schedule:
+    """Sets the learning rates of the optimisers of `make_optimizers` before each step of a run.
+
+    Positions: the rate of 3DGS, which decays to 1 % over the run, times `boost` ** (7/4). With a boost, the
+    rate is proportional to the distance from the nearest camera over its focal length, not to the scene's
+    extent: a step moves near and far Gaussians equally on the screen. Otherwise objects close to the cameras
+    and cameras with a narrow field of view would lose up to 10 dB.
+
+    Other attributes: constant at the rate of 3DGS times `boost` (opacities: `boost` ** (2/3)) for 60 % of the
+    run, then decaying to the rate of 3DGS, and over the last share `settle` of the run to a tenth.
+    """
+
+    def __init__(self, config: FitConfig, cameras: Sequence[Camera], extent: float) -> None:
+        self.config, self.extent = config, extent
+        self.boost = boost_of(config)
+        chosen = cameras[:: -(-len(cameras) // _CAMERAS)]
+        self.positions = camera_positions(chosen)  # [C, 3]
+        focals = [float(each.K[0, 0] * each.K[1, 1]) / (each.width * each.height) for each in chosen]
+        self.zooms = torch.tensor(focals).sqrt() / _FOCAL  # [C]
+
+    def set(self, optimizers: Optimizers, iteration: int) -> None:
+        """Set the rates of step `iteration`, the first of which is 1."""
+        config = self.config
+        progress = iteration / config.iterations
+        boosted = min(1.0, (1 - progress) / (1 - _BOOSTED))
+        settled = LAST_RATE ** max(0.0, 1 - (1 - progress) / config.settle) if config.settle else 1.0
+        for name, optimizer in optimizers.items():
+            group = optimizer.param_groups[0]
+            initial = group.setdefault("initial_lr", group["lr"])
+            factor = self.boost ** _EXPONENTS.get(name, 1.0)
+            if name == "means":
+                group["lr"] = initial * factor * 0.01**progress
+            else:
+                group["lr"] = initial * factor**boosted * settled
+        # Densification, which adds rows without a scale, happens after steps that are multiples.
+        if self.boost > 1 and (iteration - 1) % config.refine_every == 0:
+            means = optimizers["means"].param_groups[0]["params"][0].detach()
+            optimizers["means"].scale_rows(self.pixel_sizes(means) / self.extent)
+
+    def pixel_sizes(self, means: Tensor) -> Tensor:
+        """[N] in proportion to the size of a pixel at each of `means` [N, 3], for the nearest camera.
+
+        In world units; it is the distance for cameras of 47 degrees.
+        """
+        return (torch.cdist(means, self.positions.to(means)) / self.zooms.to(means)).amin(1)
+
+
+def boost_of(config: FitConfig) -> float:
+    """The factor on rates at the start of a run: 5 for 1,000 steps and fewer, 1 for 30,000 and more."""
+    if config.boost is not None:
+        return config.boost
+    return float(min(_MAX_BOOST, max(1.0, (_FULL_STEPS / config.iterations) ** _BOOST_GROWTH)))
