@@ -26,7 +26,7 @@ from keyss.viewer.page import page_with
 
 COVER, SECRET = "tea-table", "golden-knot"
 FOLDER = Path(__file__).parent / "scenes"  # each 48 photos of 160 x 120, their cameras, and 3,000 points
-OPTIONS = CarryOptions(fit=FitConfig(iterations=1200, max_gaussians=10_000, evaluate_every=400))
+OPTIONS = CarryOptions(fit=FitConfig(iterations=400, max_gaussians=10_000, evaluate_every=100))
 WRONG_KEYS = ("open sesame", "0000000000000000", "Demo-key")
 SECRET_PLY, WEB, COMPARISON, KEY, SCENES = "secret.ply", "web.spz", "comparison.png", "key.txt", "scenes"
 VIEWER = "index.html"

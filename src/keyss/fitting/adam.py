@@ -78,8 +78,8 @@ class RowAdam(torch.optim.Adam):
     """torch's Adam (Kingma and Ba 2015) with an optional `lr_scale` in each param group.
 
     `lr_scale` is a tensor that broadcasts to a row of the parameters ([16, 1] for [N, 16, 3]) and multiplies
-    the learning rate; `scale_rows` does so for each row. State and the options `betas`, `eps` and `fused` are torch's. On a CPU, results do not
-    depend on the number of threads.
+    the learning rate; `scale_rows` gives each row a factor. State and the options `betas`, `eps` and `fused`
+    are torch's. On a CPU, results do not depend on the number of threads.
     """
 
     add_param_group = _as_written("add_param_group")
@@ -98,7 +98,8 @@ class RowAdam(torch.optim.Adam):
         # Take torch's step at the full rate, then undo the excess.
         scales = [self._scale(parameter, group) for parameter, group in pairs]
         before = [
-            None if scale is None else parameter.clone() for (parameter, _), scale in zip(pairs, scales)
+            None if scale is None else parameter.clone()
+            for (parameter, _), scale in zip(pairs, scales, strict=True)
         ]
         super().step()
         for (parameter, _), old, scale in zip(pairs, before, scales, strict=True):
@@ -117,7 +118,7 @@ class RowAdam(torch.optim.Adam):
     def _scale(self, parameter: Tensor, group: dict[str, Any]) -> Tensor | None:
         """The factor on the learning rate, broadcastable to the parameter; None: 1 everywhere."""
         scale: Tensor | None = group["lr_scale"].to(parameter) if "lr_scale" in group else None
-        rows = self.state[parameter].get("row_scale")
+        rows: Tensor | None = self.state[parameter].get("row_scale")
         if rows is None:
             return scale
         rows = rows.view(-1, *[1] * (parameter.dim() - 1))

@@ -20,7 +20,7 @@ class FitConfig:
     and settle as 30,000 do.
     """
 
-    iterations: int = 3000
+    iterations: int = 1000
     max_gaussians: int = 30_000  # cap
     sh_degree: int = 3
     ssim_weight: float = 0.2  # lambda of the photometric loss
@@ -99,7 +99,7 @@ class FitConfig:
 
 
 PRESETS: dict[str, FitConfig] = {
-    "quick": FitConfig(iterations=1000, max_gaussians=10_000),
+    "quick": FitConfig(iterations=350, max_gaussians=10_000),
     "default": FitConfig(),
     "full": FitConfig(iterations=30_000, max_gaussians=500_000, grow_start=1 / 60, grow_stop=0.5),
 }

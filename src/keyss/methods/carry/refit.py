@@ -9,6 +9,7 @@ from keyss.core.scene import Scene
 from keyss.fitting.config import FitConfig
 from keyss.fitting.image_metrics import subsample_views
 from keyss.fitting.plain import fit_scene
+from keyss.fitting.schedule import boost_of
 from keyss.methods.base import Context
 from keyss.rendering import contributions
 
@@ -36,7 +37,7 @@ def refitted(
         # A refit must not depend on the other secrets.
         replace(fit, seed=fit.seed_of(name)),
         model=most_contributing(secret, scene, count),
-        rate=1.0 if photos else _MODEL_RATE,
+        rate=boost_of(fit) if photos else _MODEL_RATE,
         device=context.device,
         title=f"refit of the {name}",
         checkpoint=context.checkpoints / f"{name.replace(' ', '-')}.safetensors"
