@@ -12,6 +12,7 @@ compiled.
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import subprocess
 import sys
@@ -44,17 +45,18 @@ def main() -> None:
     parser.add_argument("--fits", action="store_true")
     parser.add_argument("--width", type=int, default=200)
     parser.add_argument("--max-gaussians", type=int, default=20_000)
-    parser.add_argument("--iterations", type=int, default=3000)
+    parser.add_argument("--iterations", type=int, help="by default, each commit's own")
     parser.add_argument("--threads", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--repeats", type=int, default=2)
     options = parser.parse_args()
-    if options.fits and options.iterations < MIN_STEPS:
+    if options.fits and (options.iterations or MIN_STEPS) < MIN_STEPS:
         parser.error(f"--fits: fewer than {MIN_STEPS} steps are not done side by side")
     with tempfile.TemporaryDirectory() as name:
         found = hidings(options, Path(name))
         if options.fits:
             found |= fits(options)
-    print(f"{options.iterations} steps, {options.threads} thread(s); the least of {options.repeats}\n")
+    steps = f"{options.iterations} steps" if options.iterations else "each commit's own number of steps"
+    print(f"{steps}, {options.threads} thread(s); the least of {options.repeats}\n")
     print("| | seconds | processor seconds |\n| --- | --- | --- |")
     for what, times in found.items():
         print(f"| {what} | {min(each[0] for each in times):.1f} | {min(each[1] for each in times):.1f} |")
@@ -73,15 +75,24 @@ def hidings(options: argparse.Namespace, folder: Path) -> dict[str, list[Times]]
             timed(tree, [*job, *few], options.threads)
         for number in range(options.repeats):
             for what, tree in trees.items():
-                command = [*job, "--iterations", options.iterations, "-o", folder / f"{number}, {what}"]
-                found.setdefault(what, []).append(timed(tree, command, options.threads))
+                out = folder / f"{number}, {what}"
+                steps = ["--iterations", options.iterations] if options.iterations else []
+                found.setdefault(what, []).append(timed(tree, [*job, *steps, "-o", out], options.threads))
+                print(f"{what}: {decibels(out)}", flush=True)
     return found
+
+
+def decibels(run: Path) -> str:
+    """PSNR of the cover and the secret of a hiding."""
+    metrics = json.loads((run / "metrics.json").read_text())
+    cover, secret = metrics["cover"]["psnr"], metrics["secrets"][0]["psnr"]
+    return f"cover {cover:.2f} dB, secret {secret:.2f} dB"
 
 
 def fits(options: argparse.Namespace) -> dict[str, list[Times]]:
     """The plain models of both scenes, in this process and in two, with as many threads in all."""
     torch.set_num_threads(options.threads)
-    config = FitConfig(iterations=options.iterations, max_gaussians=options.max_gaussians, seed=0)
+    config = FitConfig(iterations=options.iterations or MIN_STEPS, max_gaussians=options.max_gaussians, seed=0)
     scenes = [load_scene(each, width=options.width) for each in (options.cover, options.secret)]
     both = [Fit(scene, config, scene.name) for scene in scenes]
     found: dict[str, list[Times]] = {"fits, one after the other": [], "fits, side by side": []}
