@@ -92,7 +92,9 @@ def decibels(run: Path) -> str:
 def fits(options: argparse.Namespace) -> dict[str, list[Times]]:
     """The plain models of both scenes, in this process and in two, with as many threads in all."""
     torch.set_num_threads(options.threads)
-    config = FitConfig(iterations=options.iterations or MIN_STEPS, max_gaussians=options.max_gaussians, seed=0)
+    config = FitConfig(
+        iterations=options.iterations or MIN_STEPS, max_gaussians=options.max_gaussians, seed=0
+    )
     scenes = [load_scene(each, width=options.width) for each in (options.cover, options.secret)]
     both = [Fit(scene, config, scene.name) for scene in scenes]
     found: dict[str, list[Times]] = {"fits, one after the other": [], "fits, side by side": []}

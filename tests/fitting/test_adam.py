@@ -62,6 +62,21 @@ def test_each_number_of_a_row_has_its_rate(dtype: torch.dtype) -> None:
         assert (ours[:, part] - theirs).abs().max() < 1e-6
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_each_row_has_its_factor(dtype: torch.dtype) -> None:
+    start, gradients = torch.rand(3001, 3, dtype=torch.float64), _gradients((3001, 3), 20)
+    factors = 2 * torch.rand(3001, dtype=torch.float64)
+
+    def scaled(parameter: torch.nn.Parameter) -> RowAdam:
+        optimizer = RowAdam([parameter], lr=RATE, eps=EPS)
+        optimizer.scale_rows(factors)
+        return optimizer
+
+    ours = _run(scaled, start.to(dtype), gradients)
+    whole = _run(lambda p: torch.optim.Adam([p], lr=RATE, eps=EPS), start, gradients)
+    assert (ours - (start + factors[:, None] * (whole - start))).abs().max() < 2e-6
+
+
 def test_one_thread_or_many_give_the_same_bits() -> None:
     start, gradients = torch.rand(9001, 16, 3), _gradients((9001, 16, 3), 3)
     results = []

@@ -30,8 +30,8 @@ KeyFiles = Annotated[
 Preset = Annotated[
     Literal["quick", "default", "full"],
     arg(
-        help="Training steps and maximum number of Gaussians of each model: quick 1,000 and 10,000; default "
-        "3,000 and 30,000; full 30,000 and 500,000."
+        help="Training steps and maximum number of Gaussians of each model: quick 350 and 10,000; default "
+        "1,000 and 30,000; full 30,000 and 500,000."
     ),
 ]
 Width = Annotated[int | None, optional("PIXELS", "Downscale wider photos to this width.")]

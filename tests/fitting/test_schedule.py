@@ -1,0 +1,97 @@
+"""Rates of 3DGS in long runs, larger ones in short runs, and positions that move in units of pixels."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from keyss.core import Camera, Scene, View
+from keyss.fitting import FitConfig, Optimizers, PlainRun, Schedule, make_optimizers, to_parameters
+from tiny_scenes import random_gaussians, tiny_scene
+
+RATES = {"means": 1.6e-4, "quats": 1e-3, "scales": 5e-3, "opacities": 5e-2, "sh": 2.5e-3}
+EXTENT = 4.0
+
+
+def _cameras(zoom: float = 1.15) -> list[Camera]:
+    """At (0, 0, -1) and (0, 0, -5); `zoom` is the focal length for a picture of area 1."""
+    K = torch.tensor([[20 * zoom, 0, 10], [0, 20 * zoom, 20], [0, 0, 1]])
+    poses = [torch.eye(4), torch.eye(4)]
+    for pose, z in zip(poses, (1.0, 5.0), strict=True):
+        pose[2, 3] = z
+    return [Camera(pose, K, 10, 40) for pose in poses]
+
+
+def _rates(config: FitConfig, iteration: int, means: Tensor | None = None) -> tuple[dict, Optimizers]:
+    model = random_gaussians(5)
+    model = model if means is None else replace(model, means=means)
+    optimizers = make_optimizers(to_parameters(model, torch.device("cpu")), config, EXTENT)
+    Schedule(config, _cameras(), EXTENT).set(optimizers, iteration)
+    return {name: each.param_groups[0]["lr"] for name, each in optimizers.items()}, optimizers
+
+
+@pytest.mark.parametrize("config", [FitConfig(iterations=30_000), FitConfig(iterations=900, boost=1.0)])
+@pytest.mark.parametrize("progress", [0.0, 0.5, 1.0])
+def test_long_runs_have_the_rates_of_3dgs(config: FitConfig, progress: float) -> None:
+    found, optimizers = _rates(config, round(progress * config.iterations))
+    expected = RATES | {"means": EXTENT * RATES["means"] * 0.01**progress}
+    assert found == pytest.approx(expected)
+    assert not optimizers["means"].state
+
+
+def test_short_runs_start_with_larger_rates_and_end_with_those_of_3dgs() -> None:
+    config = FitConfig(iterations=1000)
+    start, _ = _rates(config, 0)
+    ratios = {"means": EXTENT * 5**1.75, "quats": 5, "scales": 5, "opacities": 5 ** (2 / 3), "sh": 5}
+    assert {name: start[name] / RATES[name] for name in RATES} == pytest.approx(ratios, rel=1e-2)
+    end, _ = _rates(config, 1000)
+    assert {name: end[name] for name in ratios if name != "means"} == pytest.approx(
+        {name: rate for name, rate in RATES.items() if name != "means"}
+    )
+
+
+def test_boosts_fall_with_the_number_of_steps() -> None:
+    boosts = [Schedule(FitConfig(iterations=n), _cameras(), EXTENT).boost for n in (10, 1000, 3000, 29_000)]
+    assert boosts == sorted(boosts, reverse=True)
+    assert boosts[1] == pytest.approx(5, rel=1e-2)
+    assert boosts[3] > 1
+
+
+def test_positions_move_in_proportion_to_a_pixel_of_the_nearest_camera() -> None:
+    depths = torch.tensor([-0.9, 0.0, 1.0, 100.0, -3.1])
+    means = torch.stack([torch.zeros(5), torch.zeros(5), depths], 1)
+    _, optimizers = _rates(FitConfig(iterations=1000), 1, means)
+    (state,) = optimizers["means"].state.values()
+    distances = torch.tensor([0.1, 1.0, 2.0, 101.0, 1.9])
+    assert torch.allclose(state["row_scale"], distances / EXTENT, atol=1e-5)
+    config = FitConfig(iterations=1000)
+    narrow = Schedule(config, _cameras(zoom=2.3), EXTENT).pixel_sizes(means)
+    assert torch.allclose(narrow, distances / 2, atol=1e-5)
+
+
+def _scaled(scene: Scene, factor: float) -> Scene:
+    def moved(view: View) -> View:
+        pose = view.camera.viewmat.clone()
+        pose[:3, 3] *= factor
+        return replace(view, camera=replace(view.camera, viewmat=pose))
+
+    views = {"train": tuple(map(moved, scene.train)), "test": tuple(map(moved, scene.test))}
+    return replace(scene, points=factor * scene.points, **views)
+
+
+def test_units_of_length_do_not_matter() -> None:
+    """Powers of two change no rounding: the same steps, in other units."""
+    config = FitConfig(iterations=30, max_gaussians=200, grow_start=0.2, grow_every=5, seed=0)
+    models = []
+    for factor in (1.0, 1024.0):
+        run = PlainRun(_scaled(tiny_scene(), factor), config, torch.device("cpu"))
+        for _ in range(12):
+            run.step()
+        models.append(run.gaussians())
+    assert len(models[0]) == len(models[1])
+    # Only Adam's epsilon has a unit, which tiny gradients notice.
+    errors = (1024 * models[0].means - models[1].means).abs() / 1024
+    assert errors.quantile(0.9) < 1e-4
