@@ -84,7 +84,7 @@ def hidings(options: argparse.Namespace, folder: Path) -> dict[str, list[Times]]
 
 def decibels(run: Path) -> str:
     """PSNR of the cover and the secret of a hiding."""
-    metrics = json.loads((run / "metrics.json").read_text())
+    metrics = json.loads(next(run.rglob("metrics.json")).read_text())
     cover, secret = metrics["cover"]["psnr"], metrics["secrets"][0]["psnr"]
     return f"cover {cover:.2f} dB, secret {secret:.2f} dB"
 
