@@ -112,7 +112,7 @@ def test_rates_settle_to_a_tenth(monkeypatch: pytest.MonkeyPatch) -> None:
         rates.append(self.optimizers["opacities"].param_groups[0]["lr"])
 
     monkeypatch.setattr(PlainRun, "step", watched)
-    plain.fit_scene(tiny_scene(0), replace(FIT, settle=0.25))
+    plain.fit_scene(tiny_scene(0), replace(FIT, settle=0.25, boost=1.0))
     assert rates[:30] == [FIT.opacities_rate] * 30
     assert rates[30] < rates[29]
     assert rates[-1] == pytest.approx(0.1 * FIT.opacities_rate)

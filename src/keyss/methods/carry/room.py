@@ -30,7 +30,7 @@ from keyss.methods.records.precision import most_visible, pruned
 from keyss.methods.records.whole import encode
 from keyss.rendering.difference import Viewpoints
 
-_BITS_PER_GAUSSIAN = 130  # of the payload of a secret that is not fitted yet
+_BITS_PER_GAUSSIAN = 160  # of the payload of a secret that is not fitted yet
 _TINY = 16  # Gaussians; fewer are no secret
 _ANY = '`publish="any"` has room for all'
 
