@@ -97,7 +97,7 @@ def test_nothing_that_is_written_or_said_holds_the_key(
 
 def test_no_command_takes_a_key_as_an_argument() -> None:
     asked = [(name, []) for name in commands.MODULES] + [
-        ("hide", ["--method", name]) for name in registry.METHODS
+        ("hide", ["--method", name, "-o", "out"]) for name in registry.METHODS
     ]
     for name, arguments in asked:
         options = flags.options_of(commands.to_parse(name, arguments))

@@ -18,8 +18,11 @@ class TestArguments:
     """What reaches the functions."""
 
     @pytest.fixture
-    def hidden(self, keyss: Run, monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+    def hidden(self, keyss: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[Any]:
         """Arguments of each call of `keyss.hide`."""
+        monkeypatch.chdir(tmp_path)
+        for name in ("A", "B", "C", "a.ply", "b.ply", "m.ply", "mb", "mc", "x", "y"):
+            Path(name).touch()
         calls: list[tuple[tuple[Any, ...], dict[str, Any]]] = []
 
         def hide(*args: Any, **kwargs: Any) -> library.HideResult:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import errno
 import os
 import shutil
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -243,3 +245,35 @@ class TestUnexpectedErrors:
     ) -> None:
         failing(error)
         assert_refused(keyss("info", "x"), status, words)
+
+
+WITHOUT_TORCH = """
+import sys
+from keyss.cli import main
+try:
+    status = main()
+except SystemExit as end:
+    status = end.code
+sys.exit("torch was imported" if "torch" in sys.modules else status)
+"""
+
+
+@pytest.mark.parametrize(
+    ("command", "status"),
+    [
+        ("hide nowhere.ply other.ply -o x", 2),
+        ("hide --method keyss --masc xyz -o x", 2),
+        ("hide --cover nowhere.ply --secret other.ply -o x", 4),
+        *(
+            (f"{each} -o x", 4)
+            for each in ("fit nowhere", "reveal nowhere", "view nowhere", "render nowhere")
+        ),
+        *((f"{each} nowhere", 4) for each in ("verify", "evaluate", "audit", "info")),
+        ("convert nowhere x.ply", 4),
+        ("compare --cover nowhere --secret nowhere -o x", 4),
+    ],
+)
+def test_what_needs_no_torch_is_refused_without(tmp_path: Path, command: str, status: int) -> None:
+    words = [sys.executable, "-c", WITHOUT_TORCH, *command.split()]
+    done = subprocess.run(words, capture_output=True, cwd=tmp_path, check=False)
+    assert done.returncode == status, done.stderr

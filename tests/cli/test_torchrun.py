@@ -93,6 +93,7 @@ def second_of_two(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_other_processes_say_only_what_the_first_cannot_know(keyss: Run, tmp_path: Path) -> None:
     said = keyss("fit", tmp_path / "none", "-o", tmp_path / "out", "--preset", "nonsense")
     assert (said.status, said.out, said.err) == (2, "", "")
+    (tmp_path / "a.csv").touch()
     said = keyss("hide", "--batch", tmp_path / "a.csv", "-o", tmp_path / "out")
     assert (said.status, said.out, said.err) == (2, "", "")
 
@@ -103,7 +104,8 @@ def test_commands_that_do_not_train_are_refused(
     for name, value in environment(0, 1).items():
         monkeypatch.setenv(name, value)
     assert_refused(keyss("info", tmp_path / "model.ply"), 2, "start `keyss info` without it")
-    for given in (("--batch", "a.csv"), ("--secret-file", "a", "--cover", "b.ply")):
+    (tmp_path / "a.ply").touch()
+    for given in (("--batch", tmp_path), ("--secret-file", tmp_path, "--cover", tmp_path / "a.ply")):
         assert_refused(keyss("hide", *given, "-o", tmp_path), 2, "torchrun is for")
     scenes = ("--cover", tmp_path, "--secret", tmp_path, "-o", tmp_path / "out")
     assert_refused(keyss("hide", *scenes), 2, "no key")

@@ -200,9 +200,9 @@ def test_the_command_line_says_what_failed_and_ends_with_a_status(folder: Path, 
     assert "1 of 3 assets are done" in said.out
     assert "failed: asset-1: cannot read" in said.out
     assert said.err.rstrip().endswith("error: 2 of 3 assets failed")
-    for wrong in (["--cover", "a.ply"], ["--key-file", "k"], ["--resume"], ["--dry-run"]):
+    for wrong in (["--cover", folder], ["--key-file", folder / "master.txt"], ["--resume"], ["--dry-run"]):
         said = keyss(*arguments, *wrong)
         assert said.status == 2
         assert wrong[0] in said.err
-    assert "--jobs is for many" in keyss("hide", "--cover", "a", "--jobs", 1, "-o", "x").err
-    assert "--cover SCENE" in keyss("hide", "--secret", "a", "-o", "x").err
+    assert "--jobs is for many" in keyss("hide", "--cover", folder, "--jobs", 1, "-o", "x").err
+    assert "--cover SCENE" in keyss("hide", "--secret", folder, "-o", "x").err

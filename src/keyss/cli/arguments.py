@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -96,6 +97,15 @@ def given(options: Any) -> list[str]:
 def flag(name: str) -> str:
     """`--max-gaussians` for `max_gaussians`."""
     return f"--{name.replace('_', '-')}"
+
+
+def check_there(*paths: Path | None, expected: str = "a file or folder") -> None:
+    """Raise InputError for an input that does not exist, before torch is loaded; - is the standard input."""
+    from keyss.core.errors import InputError
+
+    for path in paths:
+        if path is not None and str(path) != "-" and not os.path.lexists(path):
+            raise InputError(f"{path}: expected {expected}, but there is no such file")
 
 
 def checked_seed(seed: int, highest: int = 2**32 - 1) -> int:

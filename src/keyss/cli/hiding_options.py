@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from argparse import ArgumentParser
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import field, fields, make_dataclass, replace
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
+import tyro
 from tyro.conf import OmitArgPrefixes, arg
 
-from keyss.cli.arguments import flag, optional, switch
+from keyss.cli.arguments import check_there, flag, optional, switch
 from keyss.cli.hiding import HideArguments, hide
 
 if TYPE_CHECKING:
@@ -27,18 +28,38 @@ def with_options_of_method(arguments: Sequence[str]) -> Callable[..., None]:
     chooser = ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
     chooser.add_argument("--method", nargs="?")
     asked = chooser.parse_known_args(arguments)[0].method
-    method = registry.get(asked if asked in registry.METHODS else registry.DEFAULT)
-    flags = {name: _flags(registry.get(name)) for name in registry.METHODS}
+    name = asked if asked in registry.METHODS else registry.DEFAULT
+    flags = {each: set(map(flag, modules.own)) for each, modules in registry.METHODS.items()}
     for argument in arguments:
         given = argument.partition("=")[0].replace("_", "-")
-        having = [name for name in flags if given in flags[name]]
-        if having and method.name not in having:
-            known = ", ".join(sorted(flags[method.name])) or "none"
+        having = [each for each in flags if given in flags[each]]
+        if having and name not in having:
+            known = ", ".join(sorted(flags[name])) or "none"
             raise UsageError(
-                f"{given} is an option of --method {' and '.join(having)}; --method {method.name} has: "
-                f"{known}"
+                f"{given} is an option of --method {' and '.join(having)}; --method {name} has: {known}"
             )
-    return _parsed_as(_arguments_of(method))
+    if arguments and not {"-h", "--help"} & set(arguments):
+        _check_without_torch(name, arguments)
+    method = registry.get(name)
+    summaries = "; ".join(f"{each}: {registry.get(each).summary}" for each in registry.METHODS)
+    return _parsed_as(_arguments_of(name, f"{summaries}.", map(_own_field, own_options(method).items())))
+
+
+def _check_without_torch(name: str, arguments: Sequence[str]) -> None:
+    """Refuse wrong options and missing files before torch is loaded, which takes longer than all else.
+
+    Raises InputError, and SystemExit as argument parsers do.
+    """
+    from keyss.methods.registry import METHODS
+
+    own = [
+        (each, bool, field(default=False)) if kind is bool else (each, str | None, field(default=None))
+        for each, kind in METHODS[name].own.items()
+    ]
+    config = (tyro.conf.FlagCreatePairsOff,)
+    asked = tyro.cli(_arguments_of(name, "", own), prog="keyss hide", args=arguments, config=config)
+    check_there(asked.cover, asked.details.cover_model, asked.batch.batch, asked.batch.master_key_file)
+    check_there(*asked.secret, *asked.secret_file, *asked.key_file, *asked.details.secret_model)
 
 
 def _parsed_as(kind: type[HideArguments]) -> Callable[..., None]:
@@ -50,17 +71,18 @@ def _parsed_as(kind: type[HideArguments]) -> Callable[..., None]:
     return command
 
 
-def _arguments_of(method: Method) -> type[HideArguments]:
-    """`HideArguments` with the methods, and the method's own options as a group."""
-    from keyss.methods import registry
+def _arguments_of(
+    name: str, methods_help: str, own_fields: Iterable[tuple[str, Any, Any]]
+) -> type[HideArguments]:
+    """`HideArguments` with the methods, and the own options of the method `name` as a group."""
+    from keyss.methods.registry import METHODS
 
-    summaries = "; ".join(f"{name}: {registry.get(name).summary}" for name in registry.METHODS)
-    methods: Any = Annotated[Literal[tuple(registry.METHODS)], arg(help=f"{summaries}.")]
-    own = make_dataclass("Own", map(_own_field, own_options(method).items()), frozen=True, kw_only=True)
-    own.__doc__ = f"Options that only the method {method.name} has."
+    methods: Any = Annotated[Literal[tuple(METHODS)], arg(help=methods_help)]
+    own = make_dataclass("Own", own_fields, frozen=True, kw_only=True)
+    own.__doc__ = f"Options that only the method {name} has."
     changed: list[tuple[str, Any, Any]] = [
-        ("method", methods, field(default=method.name)),
-        ("own", Annotated[own, arg(name=method.name), OmitArgPrefixes], field(default=own())),
+        ("method", methods, field(default=name)),
+        ("own", Annotated[own, arg(name=name), OmitArgPrefixes], field(default=own())),
     ]
     return make_dataclass("Arguments", changed, bases=(HideArguments,), frozen=True, kw_only=True)
 
@@ -85,7 +107,3 @@ def own_options(method: Method) -> dict[str, tuple[Any, CommandLineOption]]:
         for extra in getattr(hints[each.name], "__metadata__", ())
         if isinstance(extra, CommandLineOption)
     }
-
-
-def _flags(method: Method) -> set[str]:
-    return set(map(flag, own_options(method)))

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from keyss.cli.arguments import PHOTOS, Device, Overwrite, Photos, optional, switch
+from keyss.cli.arguments import PHOTOS, Device, Overwrite, Photos, check_there, optional, switch
 
 
 def view(
@@ -39,6 +39,7 @@ def view(
 
     example: keyss view runs/hidden/publish/stego.ply -o page.html
     """
+    check_there(model)
     from keyss.core.errors import UsageError
     from keyss.viewer import ModelServer, export_html
 
@@ -84,6 +85,7 @@ def render(
 
     example: keyss render stego.ply --wipe secret.ply --cameras SCENE_A --video video.mp4
     """
+    check_there(model, cameras)
     import keyss
     from keyss.core.errors import UsageError
 

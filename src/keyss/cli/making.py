@@ -17,6 +17,7 @@ from keyss.cli.arguments import (
     Preset,
     Resume,
     Training,
+    check_there,
     checked_seed,
     optional,
     switch,
@@ -75,6 +76,7 @@ def fit(
 
     example: keyss fit SCENE -o runs/cover --live
     """
+    check_there(scene)
     from dataclasses import replace
 
     import keyss
@@ -171,6 +173,7 @@ def convert(
 
     example: keyss convert stego.ply stego.sog --key-file key.txt --dry-run
     """
+    check_there(model, *key_file)
     import sys
 
     import keyss

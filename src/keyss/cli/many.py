@@ -16,6 +16,7 @@ from keyss.cli.arguments import (
     OutFolder,
     Ray,
     Width,
+    check_there,
     optional,
     switch,
 )
@@ -49,6 +50,7 @@ def compare(
 
     example: keyss compare --cover SCENE_A --secret SCENE_B --quick -o runs/compared
     """
+    check_there(cover, secret)
     import keyss
     from keyss.cli.tables import print_files, print_forecast, print_table
     from keyss.core.errors import InputError

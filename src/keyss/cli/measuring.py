@@ -7,9 +7,19 @@ from typing import Annotated, Literal, get_args
 
 from tyro.conf import Positional, UseAppendAction, arg
 
-from keyss.cli.arguments import Device, KeyFiles, Overwrite, Resume, checked_seed, optional, switch
+from keyss.cli.arguments import (
+    Device,
+    KeyFiles,
+    Overwrite,
+    Resume,
+    check_there,
+    checked_seed,
+    optional,
+    switch,
+)
 
 PartName = Literal["images", "parameters", "stealth", "stegexpose", "leaks", "robustness", "speed"]
+_A_RUN = "the folder of a run, as `keyss hide` writes it"
 Run = Annotated[Positional[Path], arg(metavar="RUN", help="Result folder of `keyss hide`.")]
 
 
@@ -31,6 +41,7 @@ def evaluate(
 
     example: keyss evaluate runs/hidden --key-file key.txt
     """
+    check_there(run, expected=_A_RUN)
     import keyss
     from keyss.cli.keys import keys_of_run
     from keyss.cli.tables import print_files, print_hiding
@@ -66,6 +77,7 @@ def audit(
 
     example: keyss audit runs/hidden --report-only
     """
+    check_there(run, expected=_A_RUN)
     import keyss
     from keyss.cli.keys import keys_of_run
     from keyss.cli.tables import print_files, print_verdicts

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, UseAppendAction, arg
 
-from keyss.cli.arguments import Device, Overwrite, optional, switch
+from keyss.cli.arguments import Device, Overwrite, check_there, optional, switch
 
 
 def reveal(
@@ -44,6 +44,7 @@ def reveal(
 
     example: keyss reveal - --key-file key.txt -o - < stego.ply > secret.ply
     """
+    check_there(stego, handed, *key_file)
     import keyss
     from keyss.cli.keys import keys
     from keyss.files.streams import is_standard
@@ -86,6 +87,7 @@ def verify(
 
     example: keyss verify stego.ply --key-file key.txt
     """
+    check_there(model, key_file)
     from msgspec import to_builtins
 
     import keyss

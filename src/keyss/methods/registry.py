@@ -1,4 +1,4 @@
-"""All methods, each entered with one line and loaded when it is needed."""
+"""All methods, each entered once and loaded when it is needed, as is torch."""
 
 from __future__ import annotations
 
@@ -6,15 +6,13 @@ from collections.abc import Callable
 from importlib import import_module
 from typing import TYPE_CHECKING, NamedTuple
 
-from keyss.channels import Content, open_content, quick_attempt
 from keyss.core.errors import InputError, UsageError, WrongKeyError
-from keyss.core.gaussians import Gaussians
-from keyss.methods import handed
-from keyss.methods.decoy import Decoy
-from keyss.methods.opened import FILE, HiddenFile, Opened, OpensAFileError
 
 if TYPE_CHECKING:
+    from keyss.channels import Content
+    from keyss.core.gaussians import Gaussians
     from keyss.methods.base import Method, MethodOptions
+    from keyss.methods.opened import Opened
 
 
 class Modules(NamedTuple):
@@ -22,15 +20,24 @@ class Modules(NamedTuple):
 
     hiding: str  # has METHOD, a `keyss.methods.base.Method`
     opening: str  # has `unpack`, from the content of a channel or a handed-over file to an `Opened`
+    own: dict[str, type]  # options that only it has on the command line, which are bool or take a value
 
 
 _ROOM = "keyss.methods"
 DEFAULT = "carry"
 METHODS = {
-    "carry": Modules(f"{_ROOM}.carry.method", f"{_ROOM}.records.opening"),
-    "keyss": Modules(f"{_ROOM}.keyss.method", f"{_ROOM}.keyss.secret"),
+    "carry": Modules(
+        f"{_ROOM}.carry.method",
+        f"{_ROOM}.records.opening",
+        {"refit": str, "prune_to_fit": bool, "dither": bool, "sh_degree": str},
+    ),
+    "keyss": Modules(
+        f"{_ROOM}.keyss.method",
+        f"{_ROOM}.keyss.secret",
+        {"design": str, "mask": str, "key_encoder": str, "clip_model": str},
+    ),
     **{
-        name: Modules(f"{_ROOM}.peers.{module}", f"{_ROOM}.peers.{module}")
+        name: Modules(f"{_ROOM}.peers.{module}", f"{_ROOM}.peers.{module}", {"common_poses": str})
         for name, module in {
             "3dgs": "bound",
             "3dgs-sh": "sh",
@@ -64,6 +71,9 @@ def open_model(stego: Gaussians, key: str, *, decoy: bool = False) -> Opened:
     With `decoy`, a key that opens nothing gets a `Decoy`, and only one salt is tried: with more, a wrong key
     would take longer than a right one. Otherwise raises WrongKeyError. Raises InputError for damage.
     """
+    from keyss.channels import open_content, quick_attempt
+    from keyss.methods.decoy import Decoy
+
     if not decoy:
         return _unpacked(open_content(stego, key))
     attempt = quick_attempt(stego, key)
@@ -79,10 +89,14 @@ def open_handed(data: bytes, key: str | None) -> Opened:
 
     Raises WrongKeyError, InputError, and UsageError for a key missing or unneeded.
     """
+    from keyss.methods import handed
+
     return _unpacked(handed.unpack(data, key))
 
 
 def _unpacked(content: Content) -> Opened:
+    from keyss.methods.opened import FILE, HiddenFile, OpensAFileError
+
     name = content.method
     if name == FILE:
         raise OpensAFileError(HiddenFile.of(content))
