@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from keyss.measure.stealth.words import Floats, Ints
+from keyss.measure.stealth.statistic import Floats, Ints
 
 import numpy as np
 

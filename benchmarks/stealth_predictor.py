@@ -11,8 +11,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from keyss.core import Gaussians
-from keyss.measure.stealth.statistic import NOTHING, Statistic, normal
-from keyss.measure.stealth.words import Bits, Flags, Floats, Ints, Words, ulps
+from keyss.measure.stealth.statistic import NOTHING, Bits, Flags, Floats, Ints, Statistic, Words, normal, ulps
 
 import numpy as np
 from scipy.spatial import cKDTree

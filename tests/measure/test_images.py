@@ -17,9 +17,9 @@ import torch
 from scipy.ndimage import gaussian_filter
 
 from keyss.core import InputError
-from keyss.files import images
+from keyss.files import images as pictures
 from keyss.fitting import Target, ssim
-from keyss.measure import compare_images, lpips
+from keyss.measure import compare_images, images
 from tiny_scenes import ring_cameras
 
 Pixels = npt.NDArray[np.uint8]
@@ -100,14 +100,14 @@ def test_what_does_not_match_is_refused() -> None:
 
 @pytest.fixture
 def forgotten_weights() -> Iterator[None]:
-    lpips._weights.cache_clear()
+    images._weights.cache_clear()
     yield
-    lpips._weights.cache_clear()
+    images._weights.cache_clear()
 
 
 @pytest.mark.usefixtures("forgotten_weights")
 def test_it_is_said_how_to_get_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(lpips, "find_spec", lambda name: None)
+    monkeypatch.setattr(images, "find_spec", lambda name: None)
     found = compare_images([("x", _picture())], [("x", _picture())])
     assert found.mean.lpips_alex is None
     assert found.views["x"] == found.mean
@@ -129,7 +129,7 @@ def test_other_weights_are_refused_and_never_unpickled(
     (tmp_path / "weights").mkdir()
     (tmp_path / "weights" / "alexnet.ckpt").write_bytes(pickle.dumps(_Trap(tmp_path / "sprung")))
     package = SimpleNamespace(origin=str(tmp_path / "__init__.py"))
-    monkeypatch.setattr(lpips, "find_spec", lambda name: package)
+    monkeypatch.setattr(images, "find_spec", lambda name: package)
     found = compare_images([("x", _picture())], [("x", _picture())])
     assert "other weights" in str(found.missing)
     assert not (tmp_path / "sprung").exists()
@@ -148,7 +148,7 @@ def test_lpips_is_that_of_its_authors(monkeypatch: pytest.MonkeyPatch) -> None:
 
     The first of these are as everybody prints them who loads torchvision's AlexNet.
     """
-    convolutions, _ = lpips._weights()
+    convolutions, _ = images._weights()
     published = torch.tensor([1.1864e-01, 9.4069e-02, 9.5435e-02])
     torch.testing.assert_close(convolutions[0][0][0, 0, 0, :3], published, rtol=1e-4, atol=0)
 
@@ -175,5 +175,5 @@ def test_lpips_is_that_of_its_authors(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_every_picture_has_a_file_of_its_own() -> None:
     camera = ring_cameras(1)[0]
     names = ["a/b.png", "a_b.jpg", "c.png", "a_b-2.png"]
-    found = images.picture_names(replace(camera, name=name) for name in names)
+    found = pictures.picture_names(replace(camera, name=name) for name in names)
     assert found == ["a_b.png", "a_b-2.png", "c.png", "a_b-2-2.png"]

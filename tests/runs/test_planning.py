@@ -18,7 +18,7 @@ from keyss import CarryOptions, FitConfig, KeyssOptions, Secret
 from keyss.core import OutputError
 from keyss.files import write_model
 from keyss.methods import Decoder, DesignName, registry
-from keyss.methods.peers.networks import Convolutions, weights_of
+from keyss.methods.peers.decoder import Convolutions, weights_of
 from tiny_scenes import tiny_scene
 
 KEY = "a key of many characters: 93hXmQ2"

@@ -17,7 +17,7 @@ from keyss.files.models import (
     model_bytes,
     model_of_bytes,
 )
-from keyss.files.streams import is_standard, write_standard_output
+from keyss.files.reading import is_standard, write_standard_output
 from keyss.rendering import Backend, resolve_device
 from keyss.rendering.difference import psnr_between
 from keyss.runs.folder import check_not_published

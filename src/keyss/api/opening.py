@@ -11,7 +11,7 @@ from keyss.core.errors import KeyssWarning, UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.files.atomic import check_not_an_input, check_output_file, write_bytes
 from keyss.files.models import check_model_output, is_model_path, write_model
-from keyss.files.streams import is_standard
+from keyss.files.reading import is_standard
 from keyss.methods.opened import Frame, HiddenFile, OpensAFileError
 from keyss.rendering import Backend, resolve_device
 from keyss.runs.folder import check_not_published
@@ -46,7 +46,7 @@ def reveal(
 
     `out` (a file) gets the secret: a scene if the name is that of a model (.ply, .spz, ...), else a file.
     Raises WrongKeyError for a key that opens nothing (with `decoy` the cover is revealed instead, see
-    `keyss.methods.decoy`), and InputError for a damaged file and where less than a tenth of the secret is
+    `keyss.methods.opened`), and InputError for a damaged file and where less than a tenth of the secret is
     left. Warns (KeyssWarning) where more than a hundredth is missing.
     """
     target = resolve_device(device)

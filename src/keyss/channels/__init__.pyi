@@ -11,7 +11,9 @@ from .base import (
     Records as Records,
     Room as Room,
     pack_method as pack_method,
+    pack_payload as pack_payload,
     unpack_method as unpack_method,
+    unpack_payload as unpack_payload,
 )
 from .codes.channel import (
     CodesChannel as CodesChannel,
@@ -20,7 +22,7 @@ from .codes.channel import (
     last_bits as last_bits,
 )
 from .codes.fields import Field as Field
-from .codes.order import in_counted_order as in_counted_order
+from .codes.kept import in_counted_order as in_counted_order
 from .colours.channel import COLOURS as COLOURS, Colours as Colours, ColoursCover as ColoursCover
 from .colours.fountain import Fountain as Fountain
 from .colours.reading import ColoursReader as ColoursReader
@@ -33,26 +35,26 @@ from .low_bits.bits import (
 )
 from .low_bits.cells import CellCipher as CellCipher
 from .low_bits.channel import LOW_BITS as LOW_BITS, LowBitsCover as LowBitsCover
+from .low_bits.contents import LowBitsReader as LowBitsReader
 from .low_bits.layout import (
     TYPICAL_SHARE as TYPICAL_SHARE,
     LowBitsRoom as LowBitsRoom,
     check_payload_fits as check_payload_fits,
 )
 from .low_bits.parameters import key_cipher as key_cipher
-from .low_bits.reading import LowBitsReader as LowBitsReader
 from .low_bits.salts import salt_rows as salt_rows
 from .low_bits.usable import (
     chance_of_bits as chance_of_bits,
     check_usable as check_usable,
     usable_carriers as usable_carriers,
 )
-from .opening import open_content as open_content, quick_attempt as quick_attempt
-from .payloads import pack_payload as pack_payload, unpack_payload as unpack_payload
 from .publishing import (
     SUFFIXES as SUFFIXES,
     AnyChannel as AnyChannel,
     Publish as Publish,
     channel_for as channel_for,
+    open_content as open_content,
+    quick_attempt as quick_attempt,
     suffix_of as suffix_of,
 )
 from .reed_solomon import Codewords as Codewords

@@ -4,11 +4,13 @@ A channel does not interpret its bits. Every channel carries *payloads*: bytes t
 all. Low bits carry *records* too: many small pieces of one size that are found one by one, so that a model
 that lost Gaussians has lost as many records and no more.
 
-The place of publication determines the channel of a hiding (`publishing`); readers try them all (`opening`).
+The place of publication determines the channel of a hiding (`publishing`); readers try them all.
 """
 
 from __future__ import annotations
 
+import hashlib
+import os
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
@@ -16,12 +18,16 @@ from dataclasses import dataclass, field
 from typing import ClassVar, Protocol
 
 from keyss.core.arrays import Bytes, Integers
-from keyss.core.errors import WrongKeyError
+from keyss.core.errors import InputError, UsageError, WrongKeyError
 from keyss.core.gaussians import Gaussians
 from keyss.keys.derivation import DerivedKey
 
 METHOD_BYTES = 15  # of the name of a method in files
 SALTS_TRIED = 4  # of a model half of whose Gaussians were changed, 15 of 16 then open
+NOTICED = (
+    "the secrets are too large, or too many, to lie in this cover as each would alone: whoever holds one of "
+    "the keys can notice that there are other secrets"
+)
 
 
 @dataclass(frozen=True)
@@ -163,3 +169,39 @@ class Channel(ABC):
     @abstractmethod
     def room(self, gaussians: int, sh_degree: int) -> Room:
         """About what fits into a cover with so many Gaussians that can carry something."""
+
+
+def pack_payload(content: Content) -> bytes:
+    """The name of the method, a zero, the data. Raises TypeError for records."""
+    if not isinstance(content, Payload):
+        raise TypeError("expected a payload: this channel carries no records")
+    return check_method(content.method) + b"\0" + content.data
+
+
+def unpack_payload(packed: bytes) -> Payload:
+    """The payload of `pack_payload`. Raises InputError for anything else."""
+    name, zero, data = packed.partition(b"\0")
+    try:
+        check_method(name.decode("ascii"))
+    except ValueError as error:
+        raise InputError("the hidden data are damaged: they begin with no name of a method") from error
+    if not zero:
+        raise InputError("the hidden data are damaged: they are not whole")
+    return Payload(name.decode("ascii"), data)
+
+
+def randomness(entropy: bytes | None, *parts: bytes) -> bytes:
+    """32 bytes that depend on `entropy` and on all hidden data: no two files share what is derived from them.
+
+    `entropy`: at least 32 bytes that nobody else can know; None takes the system's.
+    """
+    entropy = os.urandom(32) if entropy is None else entropy
+    if len(entropy) < 32:
+        raise ValueError(f"expected at least 32 bytes of entropy, got {len(entropy)}")
+    return hashlib.sha256(b"".join(hashlib.sha256(part).digest() for part in (entropy, *parts))).digest()
+
+
+def check_keys(verifiers: Sequence[bytes]) -> None:
+    """Raise UsageError unless there is a key, and no two are equal."""
+    if not verifiers or len(set(verifiers)) < len(verifiers):
+        raise UsageError("two secrets have the same key: expected at least one secret, each with its own")

@@ -21,9 +21,9 @@ from keyss.core.errors import (
     KeyssWarning,
     OutputError,
     UsageError,
+    nearest,
     signal_of,
 )
-from keyss.core.nearest import nearest
 
 BROKEN_PIPE = 141  # 128 + SIGPIPE, as a shell counts
 OUT_OF_MEMORY = 8

@@ -179,7 +179,7 @@ def convert(
     import keyss
     from keyss.cli.keys import given_keys
     from keyss.cli.tables import print_conversion
-    from keyss.files.streams import is_standard
+    from keyss.files.reading import is_standard
 
     found = keyss.convert(
         model,

@@ -47,7 +47,7 @@ def reveal(
     check_there(stego, handed, *key_file)
     import keyss
     from keyss.cli.keys import keys
-    from keyss.files.streams import is_standard
+    from keyss.files.reading import is_standard
     from keyss.runs.revealing import is_sealed
 
     key: str | None = None

@@ -10,7 +10,7 @@ from typing import Any
 
 from keyss.cli.arguments import Training
 from keyss.cli.ranks import answers
-from keyss.core.extras import import_extra
+from keyss.core.errors import import_extra
 from keyss.progress import Reporter, reporter as lines
 
 FOLDER = "private/tensorboard"  # of a run, since its losses may tell about a secret

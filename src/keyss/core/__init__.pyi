@@ -1,5 +1,4 @@
 from .alignment import align as align, up_direction as up_direction
-from .colour import OPPONENT as OPPONENT
 from .decoded import DecodedGaussians as DecodedGaussians, PictureNetwork as PictureNetwork
 from .errors import (
     BackendError as BackendError,
@@ -12,11 +11,12 @@ from .errors import (
     QualityError as QualityError,
     UsageError as UsageError,
     WrongKeyError as WrongKeyError,
+    import_extra as import_extra,
     signal_of as signal_of,
 )
-from .extras import import_extra as import_extra
 from .gaussians import (
     DRAWN_OPACITY as DRAWN_OPACITY,
+    OPPONENT as OPPONENT,
     SH_C0 as SH_C0,
     Gaussians as Gaussians,
     same_bits as same_bits,

@@ -8,12 +8,18 @@ prints one line without a traceback.
 from __future__ import annotations
 
 import signal
+from collections.abc import Collection
+from difflib import get_close_matches
+from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 OPENS_NOTHING = (
     "this key opens nothing here: it may be another key or misspelt; the model may have changed since it was "
     "published (converted or quantised, moved, scaled, pruned, edited or trained on); or nothing is hidden"
 )
+_PACKAGES = {"ot": "pot", "sklearn": "scikit-learn", "yaml": "pyyaml"}  # by module, if the names differ
+MAX_LENGTH = 100  # characters of a word that is compared
 
 
 class KeyssError(Exception):
@@ -86,3 +92,30 @@ class Interrupted(KeyboardInterrupt):
 def signal_of(interrupt: KeyboardInterrupt) -> signal.Signals:
     """The signal of an interrupt, by default that of Ctrl-C."""
     return signal.Signals(interrupt.args[0]) if interrupt.args else signal.SIGINT
+
+
+def import_extra(module: str, extra: str, purpose: str) -> Any:
+    """Import a module of an optional package; `purpose` is for example "write films".
+
+    Raises BackendError, which names the package and the extra, if it cannot be imported.
+    """
+    try:
+        return import_module(module)
+    except ImportError as error:
+        package = _PACKAGES.get(module.partition(".")[0], module)
+        raise BackendError(
+            f"to {purpose}, install {package}: pip install 'keyss[{extra}]' ({error})"
+        ) from error
+
+
+def nearest(word: str, known: Collection[str]) -> str | None:
+    """The most similar of the `known` names, None if none is similar."""
+    short = [name for name in sorted(known) if len(name) <= MAX_LENGTH]
+    matches = get_close_matches(word, short, n=1, cutoff=0.7) if len(word) <= MAX_LENGTH else []
+    return matches[0] if matches else None
+
+
+def did_you_mean(word: str, known: Collection[str]) -> str:
+    """The end of a message about a misspelt name: a suggestion, else all `known` names."""
+    near = nearest(word, known)
+    return f"did you mean {near}?" if near else f"expected one of {', '.join(sorted(known))}"

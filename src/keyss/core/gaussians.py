@@ -6,9 +6,14 @@ import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
+# [3, 3] float64, orthonormal. The rows are brightness, red minus green, and both minus blue (van de Sande et
+# al. 2010, "Evaluating Color Descriptors for Object and Scene Recognition"). `values @ OPPONENT.T` transforms
+# values [..., 3], `@ OPPONENT` is the inverse.
+OPPONENT = np.array([[1, 1, 1], [1, -1, 0], [1, 1, -2]]) / np.sqrt([[3], [2], [6]])
 SH_C0 = 0.28209479177387814  # the constant SH basis function
 DRAWN_OPACITY = 1 / 255  # 3DGS rasterizers skip Gaussians below it
 # Beyond these values, projecting a Gaussian overflows in single precision, and it is not rendered.

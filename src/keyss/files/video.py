@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from keyss.core.arrays import Bytes
-from keyss.core.errors import UsageError
-from keyss.core.extras import import_extra
+from keyss.core.errors import UsageError, import_extra
 from keyss.files.atomic import write_bytes
 
 SUFFIX = ".mp4"

@@ -17,8 +17,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
-from keyss.core.errors import InputError
-from keyss.core.nearest import did_you_mean
+from keyss.core.errors import InputError, did_you_mean
 from keyss.files.reading import read_text
 
 MAX_BYTES = 64 << 20

@@ -20,8 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from keyss._processes import available_memory, command, environment, usable_cores
-from keyss.core.errors import BackendError, UsageError
-from keyss.core.extras import import_extra
+from keyss.core.errors import BackendError, UsageError, import_extra
 from keyss.many.cell import LOG
 from keyss.many.worker import attempt
 from keyss.progress import Reporter

@@ -19,8 +19,7 @@ from keyss.audits import PARTS
 from keyss.audits.run import EXTRA
 from keyss.channels import is_appended
 from keyss.core.decoded import DecodedGaussians
-from keyss.core.errors import InputError, UsageError
-from keyss.core.extras import import_extra
+from keyss.core.errors import InputError, UsageError, import_extra
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene, ViewOptions
 from keyss.files.models import read_model

@@ -13,8 +13,7 @@ from typing import Any
 
 import msgspec
 
-from keyss.core.errors import UsageError
-from keyss.core.nearest import did_you_mean
+from keyss.core.errors import UsageError, did_you_mean
 from keyss.core.scene import ViewOptions
 from keyss.files.atomic import write_bytes
 from keyss.many.cell import result_of

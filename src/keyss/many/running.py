@@ -16,9 +16,8 @@ from keyss import progress
 from keyss._processes import how_it_ended
 from keyss.core.errors import OutputError
 from keyss.files.atomic import lock, write_bytes
-from keyss.keys.generation import generate_key
 from keyss.keys.key_file import read_key_file
-from keyss.keys.master import MasterKey
+from keyss.keys.master import MasterKey, generate_key
 from keyss.many.cell import CELL, FAILED, LOG, Cell, Result, error_of, result_of
 from keyss.many.engines import Cluster, Engine, InThisProcess, Processes, Resources
 from keyss.many.worker import REFUSED

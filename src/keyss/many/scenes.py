@@ -7,8 +7,7 @@ import zlib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
-from keyss.core.errors import InputError, OutputError
-from keyss.core.extras import import_extra
+from keyss.core.errors import InputError, OutputError, import_extra
 from keyss.files.colmap import MODEL_PLACES, colmap_model_folder, read_colmap
 
 TEST_EVERY = 8

@@ -30,9 +30,7 @@ import msgspec
 from msgspec import Meta
 
 from keyss.audits import PARTS
-from keyss.core.errors import InputError, KeyssError
-from keyss.core.extras import import_extra
-from keyss.core.nearest import did_you_mean
+from keyss.core.errors import InputError, KeyssError, did_you_mean, import_extra
 from keyss.core.scene import ViewOptions
 from keyss.files.reading import read_text
 from keyss.fitting.config import MAX_SEED, PRESETS, FitConfig

@@ -14,8 +14,7 @@ from typing import Any
 
 from scipy.stats import t as student
 
-from keyss.core.errors import BackendError
-from keyss.core.extras import import_extra
+from keyss.core.errors import BackendError, import_extra
 from keyss.files.atomic import write_bytes
 
 CONFIDENCE = 0.95

@@ -7,18 +7,20 @@ from .base import (
     Stego as Stego,
     Training as Training,
 )
-from .carry.options import CarryOptions as CarryOptions
 from .carry.refit import most_contributing as most_contributing
-from .carry.room import RecordRoom as RecordRoom, SecretSize as SecretSize, of_degree as of_degree
+from .carry.room import (
+    CarryOptions as CarryOptions,
+    RecordRoom as RecordRoom,
+    SecretSize as SecretSize,
+    of_degree as of_degree,
+)
 from .combined import (
     CombinedPoses as CombinedPoses,
     PlacedScene as PlacedScene,
     divided as divided,
 )
-from .decoy import Decoy as Decoy
 from .dither import dither_model as dither_model
 from .joint import JointTraining as JointTraining
-from .keyss.clip_keys import ClipKeys as ClipKeys
 from .keyss.decoder import (
     ATTRIBUTES as ATTRIBUTES,
     Decoder as Decoder,
@@ -26,10 +28,12 @@ from .keyss.decoder import (
     parse_mask as parse_mask,
 )
 from .keyss.designs.carriers import CarriersTraining as CarriersTraining
+from .keyss.method import ClipKeys as ClipKeys
 from .keyss.options import DesignName as DesignName, KeyssOptions as KeyssOptions
 from .keyss.rows import RowSecret as RowSecret
 from .keyss.secret import HiddenSecret as HiddenSecret, choose_anchors as choose_anchors
 from .opened import (
+    Decoy as Decoy,
     Frame as Frame,
     HiddenFile as HiddenFile,
     Opened as Opened,
@@ -42,7 +46,7 @@ from .records.embedding import (
     encode_all as encode_all,
     record_request as record_request,
 )
-from .records.lines import Line as Line
+from .records.lines import Line as Line, Table as Table
 from .records.opening import CarriedSecret as CarriedSecret, unpack as unpack
 from .records.precision import (
     fitted as fitted,
@@ -51,5 +55,4 @@ from .records.precision import (
     pruned as pruned,
 )
 from .records.quantise import Codec as Codec, outliers as outliers
-from .records.table import Table as Table
 from .registry import open_model as open_model

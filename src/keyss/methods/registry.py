@@ -66,13 +66,13 @@ def of_options(options: MethodOptions) -> Method:
 
 
 def open_model(stego: Gaussians, key: str, *, decoy: bool = False) -> Opened:
-    """The secret that `key` opens in a model (see `keyss.channels.opening`).
+    """The secret that `key` opens in a model (see `keyss.channels.publishing`).
 
     With `decoy`, a key that opens nothing gets a `Decoy`, and only one salt is tried: with more, a wrong key
     would take longer than a right one. Otherwise raises WrongKeyError. Raises InputError for damage.
     """
     from keyss.channels import open_content, quick_attempt
-    from keyss.methods.decoy import Decoy
+    from keyss.methods.opened import Decoy
 
     if not decoy:
         return _unpacked(open_content(stego, key))

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from keyss.core.errors import InputError
 from keyss.files.foreign import what_it_is
-from keyss.files.streams import is_standard
+from keyss.files.reading import is_standard
 
 if TYPE_CHECKING:
     from keyss.core.scene import Scene

@@ -13,8 +13,7 @@ from typing import BinaryIO
 from urllib.parse import quote, unquote, urlsplit
 
 from keyss.core.errors import OutputError
-from keyss.viewer.page import SCRIPT, STYLE, asset, served_page, served_policy
-from keyss.viewer.showing import readable
+from keyss.viewer.page import SCRIPT, STYLE, asset, readable, served_page, served_policy
 
 LOCALHOST = "127.0.0.1"
 _LOCAL_NAMES = {"127.0.0.1", "localhost", "::1"}

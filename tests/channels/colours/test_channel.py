@@ -17,9 +17,8 @@ from hypothesis import given, settings, strategies as st
 
 from channels.colours.made import PACKED, cover, embed, extract
 from keyss.channels import COLOURS, Colours, ColoursCover, ColoursReader, Fountain
-from keyss.channels.colours.carriers import CELL, Numbers
+from keyss.channels.colours.carriers import CELL, Numbers, Salts
 from keyss.channels.colours.header import FILE_KEY_BYTES, Header, Index, read_header
-from keyss.channels.colours.salts import Salts
 from keyss.core import Gaussians, InputError, KeyssError, KeyssWarning, UsageError, WrongKeyError
 from keyss.measure import converters, cropping, half_floats, noise, opacity_pruning, random_pruning
 from keyss.rendering import psnr_between

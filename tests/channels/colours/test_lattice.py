@@ -12,8 +12,7 @@ from scipy.stats import kstest
 
 from channels.colours.made import cover
 from keyss.channels.colours import lattice
-from keyss.channels.colours.carriers import CELL, Carriers, Numbers
-from keyss.channels.colours.salts import SALTS, Salts, renewed
+from keyss.channels.colours.carriers import CELL, SALTS, Carriers, Numbers, Salts, renewed
 from keyss.core import Gaussians
 
 SECRET = bytes(range(16))

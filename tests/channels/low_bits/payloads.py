@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from keyss.channels import LOW_BITS, Content, LowBitsCover, LowBitsReader, Payload
-from keyss.channels.low_bits.writing import digest
-from keyss.channels.payloads import randomness
+from keyss.channels.base import randomness
+from keyss.channels.low_bits.contents import digest
 from keyss.core import Gaussians
 from keyss.keys import DerivedKey
 

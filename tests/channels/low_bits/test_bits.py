@@ -14,8 +14,8 @@ from hypothesis.extra import numpy as arrays
 from channels.low_bits.trained_like import trained_like
 from keyss.channels import Layout, identities, read_low_bits, used_words, write_low_bits
 from keyss.channels.low_bits import salts
+from keyss.channels.low_bits.contents import _are_among
 from keyss.channels.low_bits.layout import SALTS
-from keyss.channels.low_bits.reading import _are_among
 from keyss.channels.low_bits.usable import repeated
 from keyss.core import Gaussians
 from keyss.rendering.cpu.parallel import in_blocks

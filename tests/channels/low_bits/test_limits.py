@@ -14,7 +14,7 @@ import pytest
 from channels.low_bits.payloads import embed_contents
 from channels.low_bits.trained_like import keys, trained_like
 from keyss.channels import LOW_BITS, Codewords, LowBitsReader, Payload
-from keyss.channels.low_bits import spread, writing
+from keyss.channels.low_bits import contents, layout
 from keyss.channels.low_bits.parameters import PAYLOAD, RECORDS, Parameters, pack_codewords
 from keyss.channels.reed_solomon import MAX_CHUNKS
 from keyss.core import Gaussians, InputError
@@ -47,7 +47,7 @@ def test_payloads_that_compress_too_well_come_out_all_the_same(size: int) -> Non
 
 
 def test_as_many_blocks_as_there_can_be_take_no_memory() -> None:
-    most = Codewords(spread.MAX_CODEWORDS, MAX_CHUNKS, MAX_CHUNKS, 66)
+    most = Codewords(layout.MAX_CODEWORDS, MAX_CHUNKS, MAX_CHUNKS, 66)
     with at_most(1), pytest.raises(InputError, match="too much of the model was lost"):
         most.decode(np.arange(100), np.zeros((100, 66), np.uint8))
 
@@ -61,7 +61,7 @@ def cover() -> Gaussians:
     "hostile",
     [
         Parameters(
-            PAYLOAD, "carry", b"", 1, 71, pack_codewords(10**9, Codewords(spread.MAX_CODEWORDS, 255, 255, 68))
+            PAYLOAD, "carry", b"", 1, 71, pack_codewords(10**9, Codewords(layout.MAX_CODEWORDS, 255, 255, 68))
         ),
         Parameters(PAYLOAD, "carry", b"", 1, 71, pack_codewords(69, Codewords(1, 255, 1, 68))),
         Parameters(PAYLOAD, "carry", b"", 1, 71, b"too short"),
@@ -75,7 +75,7 @@ def cover() -> Gaussians:
 def test_hostile_parameters_end_in_a_sentence(
     cover: Gaussians, hostile: Parameters, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(writing, "Parameters", lambda *_: hostile)
+    monkeypatch.setattr(contents, "Parameters", lambda *_: hostile)
     stego = embed_contents(LOW_BITS.prepare(cover), [(keys(), Payload("carry", b"x"))])
     reader = LowBitsReader.of(stego)
     with at_most(10), pytest.raises(InputError, match=r"the key is right|are damaged"):

@@ -12,9 +12,9 @@ from scipy.stats import ks_2samp
 
 from channels.low_bits.trained_like import keys
 from keyss.channels import CellCipher, Content, LowBitsRoom, Payload, RecordRequest, Records, key_cipher
+from keyss.channels.low_bits.contents import Writer
 from keyss.channels.low_bits.layout import SALTS
 from keyss.channels.low_bits.parameters import parameter_cipher, unpack
-from keyss.channels.low_bits.writing import Writer
 from keyss.core import KeyssWarning
 
 CARRIERS, WIDTH = 3000, 75

@@ -14,7 +14,7 @@ import zstandard
 
 from channels.codes.published import model_of
 from keyss.core import Camera, Gaussians, InputError, Scene, UsageError, View
-from keyss.core.colour import OPPONENT
+from keyss.core.gaussians import OPPONENT
 from keyss.methods import Table, fitted, good_enough, pruned
 from keyss.methods.records import whole
 from keyss.rendering import Viewpoints, psnr_between

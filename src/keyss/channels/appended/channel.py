@@ -32,8 +32,18 @@ from keyss.channels.appended.lattice import (
     to_gaussians,
 )
 from keyss.channels.appended.packets import NUMBER_BITS, PACKET_BYTES
-from keyss.channels.base import METHOD_BYTES, Channel, Content, Payload, Room, SaltedReader
-from keyss.channels.payloads import check_keys, pack_payload, randomness, unpack_payload
+from keyss.channels.base import (
+    METHOD_BYTES,
+    Channel,
+    Content,
+    Payload,
+    Room,
+    SaltedReader,
+    check_keys,
+    pack_payload,
+    randomness,
+    unpack_payload,
+)
 from keyss.channels.reed_solomon import MAX_CHUNKS, Codewords
 from keyss.core.arrays import Bits, Doubles, Integers
 from keyss.core.errors import KeyssWarning, UsageError, WrongKeyError

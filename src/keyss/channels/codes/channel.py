@@ -16,15 +16,23 @@ from functools import cached_property
 
 import numpy as np
 
-from keyss.channels.base import Channel, Content, Payload, Room, SaltedReader
+from keyss.channels.base import (
+    Channel,
+    Content,
+    Payload,
+    Room,
+    SaltedReader,
+    check_keys,
+    pack_payload,
+    randomness,
+    unpack_payload,
+)
 from keyss.channels.codes import syndromes
 from keyss.channels.codes.fields import FORMATS, Field, Levels, carrying
-from keyss.channels.codes.kept import changeable
+from keyss.channels.codes.kept import changeable, in_counted_order, in_file_order
 from keyss.channels.codes.layout import SLOT_BYTES, ZONE_RATE, Header, Zones, find_header, to_bits, to_bytes
-from keyss.channels.codes.order import in_counted_order, in_file_order
 from keyss.channels.codes.syndromes import rate_of
 from keyss.channels.mixing import random_fractions, random_order, random_words
-from keyss.channels.payloads import check_keys, pack_payload, randomness, unpack_payload
 from keyss.core.arrays import Bits, Flags, Integers, Words
 from keyss.core.errors import InputError, UsageError, WrongKeyError
 from keyss.core.gaussians import Gaussians

@@ -8,30 +8,55 @@ and none depends on the model's position, rotation or order.
 Borders of cells are the borders between two roundings of 8-bit formats (`.spz`: log scales in sixteenths,
 colours in steps of 1 / 38.25; opacities in 255ths nearly everywhere), so that rounding moves no number across
 one. `Carriers.doubt` is the chance that another format or another change has done so.
+
+Some Gaussians serve as the salt of Argon2id: found in a rounded model, and new in every file. *Listed*
+Gaussians have the least public hashes of the cells of red, opacity and the ratios of scales, among those
+whose numbers are so far inside of their cells that no format moves them out. Half of them are faint, so that
+a new colour is hardly visible; the others are still there when the faintest were removed. Writing changes
+none of these numbers.
+
+A salt is a hash of the cells of one listed Gaussian, green and blue included. A writer makes all salts new by
+moving green and blue of the listed ones by whole cells, each uniformly by -3 to 3: two files of one model
+share each salt with a chance of 1/49.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import hashlib
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 from torch import Tensor
 
-from keyss.channels.mixing import row_hashes
-from keyss.core.arrays import Doubles, Flags, Integers
+from keyss.channels.mixing import encrypted_blocks, row_hashes
+from keyss.core.arrays import Doubles, Flags, Integers, Words
 from keyss.core.gaussians import Gaussians
+from keyss.keys.derivation import SALT_BYTES, expand
 
 SCALE_STEP, COLOUR_STEP, OPACITY_STEP = 1 / 16, 1 / 38.25, 1 / 255  # of 8-bit formats
 CELL = 0.25  # of a log scale
-_SCALE_STEPS, _COLOUR_STEPS, _OPACITY_STEPS = 4, 5, 16  # that make a cell
+_SCALE_STEPS, _RATIO_STEPS, _COLOUR_STEPS, _OPACITY_STEPS = 4, 8, 5, 16  # that make a cell
 _MIN_OPACITY = 2.5 / 255  # formats keep the colour of nothing less
 # What formats move these numbers by, at most (`.spz` aside, see above): half widths of uniform noise.
 _SCALE_NOISE, COLOUR_NOISE, OPACITY_NOISE = 0.018, 0.009, 0.004
 _SCALE_ROUNDED = SCALE_STEP / 2  # where borders lie elsewhere, by `.spz` as well
+_NAME_BYTES = 16  # one block of AES
 _CELLS = 30_000  # on either side of zero: what fits into 16 bits
 
 Names = npt.NDArray[np.int16]
+
+SALTS = 16  # at most; after rounding and random pruning of a quarter, 5 to 12 of them are left
+_ENOUGH = 12  # that rounding leaves: of fewer, too few are left after pruning for headers with gaps
+_BANDS = (0.08, 0.4, 1.01)  # of opacity, from each of which half of them are
+_MAX_MOVED = 3  # cells
+# Rounding a number leaves it in its cell, whose borders are borders of rounding too; a ratio moves by a step.
+_NOISE = np.array([OPACITY_NOISE / OPACITY_STEP] + [1.0] * 2 + [COLOUR_NOISE / COLOUR_STEP] * 3)
+_STEPS = np.array([_OPACITY_STEPS] + [_RATIO_STEPS] * 2 + [_COLOUR_STEPS] * 3)
+_CELL = _COLOUR_STEPS * COLOUR_STEP
+_UNCHANGED = 4  # of these numbers: opacity, ratios and red
+_LABEL = b"keyss/v1/colours-salt"
+_PUBLIC = hashlib.sha256(_LABEL).digest()
 
 
 @dataclass(frozen=True)
@@ -124,6 +149,19 @@ class Carriers:
         return np.sort(order[first])
 
 
+def rank(secret: bytes, label: str, names: Names) -> Words:
+    """[C] a number for each name [C, k], k at most 8; equal for equal names."""
+    return random_pairs(secret, label, names)[:, 0]
+
+
+def random_pairs(secret: bytes, label: str, names: Names) -> Words:
+    """[C, 2] 64 bits each, pseudo-random without the secret: AES-256 of the names."""
+    blocks = np.zeros((len(names), _NAME_BYTES // 2), "<i2")
+    blocks[:, : names.shape[1]] = names
+    key = expand(secret, f"colours/{label}", 32)
+    return encrypted_blocks(key, blocks.view(np.uint8)).view("<u8").astype(np.uint64)
+
+
 def _cells(values: Doubles, steps: int, noise: float) -> tuple[Names, Doubles]:
     """Cells of `steps` steps each, of values [C, k] in steps, and the chances of having left them."""
     cells = np.floor(values / steps)
@@ -135,3 +173,61 @@ def _cells(values: Doubles, steps: int, noise: float) -> tuple[Names, Doubles]:
 
 def _doubles(values: Tensor) -> Doubles:
     return values.detach().cpu().numpy().astype(np.float64)
+
+
+@dataclass(frozen=True)
+class Salts:
+    """The listed Gaussians."""
+
+    rows: Integers  # [S] of `Numbers`
+    salts: list[bytes]
+
+    @staticmethod
+    def of(numbers: Numbers) -> Salts:
+        cells, outward = _salt_cells(numbers)
+        stable = np.flatnonzero(outward[:, :_UNCHANGED].max(axis=1) < 1)
+        band = np.searchsorted(_BANDS, numbers.opacities[stable]) - 1
+        listed = []
+        for index in range(len(_BANDS) - 1):
+            own = stable[band == index]
+            _, first = np.unique(rank(_PUBLIC, "salt", cells[own, :_UNCHANGED]), return_index=True)
+            listed.append(own[first[: SALTS // (len(_BANDS) - 1)]])  # in ascending order; equal ones once
+        rows = np.concatenate(listed)
+        return Salts(rows, list(dict.fromkeys(_salt(cells[row]) for row in rows)))
+
+
+def steady(numbers: Numbers) -> bool:
+    """True if rounding leaves so many salts that a header can do without some numbers."""
+    kept = set(Salts.of(numbers).salts) & set(Salts.of(numbers.rounded()).salts)
+    return len(kept) >= _ENOUGH
+
+
+def renewed(numbers: Numbers, random: np.random.Generator) -> Numbers:
+    """The numbers with another green and blue of listed Gaussians, so that all salts are new."""
+    rows, colours = Salts.of(numbers).rows, numbers.colours.copy()
+    colours[rows, 1:] += random.integers(-_MAX_MOVED, _MAX_MOVED + 1, (len(rows), 2)) * _CELL
+    return replace(numbers, colours=colours)
+
+
+def _salt(cells: Names) -> bytes:
+    """SALT_BYTES of the cells [6] of one Gaussian."""
+    return hashlib.sha256(_LABEL + cells.astype("<i2").tobytes()).digest()[:SALT_BYTES]
+
+
+def _salt_cells(numbers: Numbers) -> tuple[Names, Doubles]:
+    """[C, 6] cells of opacity, two ratios, red, green and blue, and how far out the numbers lie.
+
+    Zero is the middle of a cell; above one, a format may move the number out of it.
+    """
+    steps = np.concatenate(
+        [
+            numbers.opacities[:, None] / OPACITY_STEP - 0.5,
+            np.diff(numbers.log_scales, axis=1) / SCALE_STEP - 0.5,
+            numbers.colours / COLOUR_STEP,
+        ],
+        axis=1,
+    )
+    places = (steps / _STEPS).clip(-_CELLS, _CELLS)
+    cells = np.floor(places)
+    outward: Doubles = np.abs(places - cells - 0.5) / (0.5 - _NOISE / _STEPS)
+    return cells.astype(np.int16), outward

@@ -2,7 +2,7 @@
 
 A payload is encrypted and authenticated (ChaCha20-Poly1305), made into code bits (`fountain`), and written
 into colours (`lattice`) of Gaussians that are identified by their other numbers (`carriers`). A *header*
-under a few *salts* tells how it is read; see `header` and `salts`. Nothing in the model tells how many
+under a few *salts* tells how it is read; see `header` and `carriers`. Nothing in the model tells how many
 secrets there are, or that there are any.
 """
 
@@ -17,9 +17,18 @@ from functools import cached_property
 import numpy as np
 import torch
 
-from keyss.channels.base import METHOD_BYTES, Channel, Content, Room
+from keyss.channels.base import (
+    METHOD_BYTES,
+    NOTICED,
+    Channel,
+    Content,
+    Room,
+    check_keys,
+    pack_payload,
+    randomness,
+)
 from keyss.channels.colours.capacity import Capacity, Layout, bucket_of
-from keyss.channels.colours.carriers import Numbers
+from keyss.channels.colours.carriers import SALTS, Numbers, Salts, renewed, steady
 from keyss.channels.colours.fountain import Fountain
 from keyss.channels.colours.header import (
     FILE_KEY_BYTES,
@@ -36,8 +45,6 @@ from keyss.channels.colours.header import (
 )
 from keyss.channels.colours.lattice import MAX_BITS, seeds, write
 from keyss.channels.colours.reading import ASSOCIATED
-from keyss.channels.colours.salts import SALTS, Salts, renewed, steady
-from keyss.channels.payloads import NOTICED, check_keys, pack_payload, randomness
 from keyss.core.arrays import Doubles, Flags
 from keyss.core.errors import InputError, KeyssWarning, UsageError
 from keyss.core.gaussians import Gaussians

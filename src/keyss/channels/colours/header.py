@@ -20,10 +20,9 @@ from functools import cache
 
 import numpy as np
 
-from keyss.channels.colours.carriers import Carriers, Names
+from keyss.channels.colours.carriers import SALTS, Carriers, Names, rank
 from keyss.channels.colours.fountain import NOISY, Fountain
-from keyss.channels.colours.lattice import COLUMNS, MAX_BITS, bit_counts, dithers, rank, read, seeds, write
-from keyss.channels.colours.salts import SALTS
+from keyss.channels.colours.lattice import COLUMNS, MAX_BITS, bit_counts, dithers, read, seeds, write
 from keyss.channels.mixing import mixed
 from keyss.core.arrays import Bits, Doubles, Flags, Integers, Words
 from keyss.keys.derivation import SALT_BYTES, DerivedKey, expand, stream

@@ -15,10 +15,9 @@ import math
 
 import numpy as np
 
-from keyss.channels.colours.carriers import Carriers, Names
-from keyss.channels.mixing import encrypted_blocks, mixed
+from keyss.channels.colours.carriers import Carriers, Names, random_pairs, rank
+from keyss.channels.mixing import mixed
 from keyss.core.arrays import Bits, Doubles, Floats, Integers, Words
-from keyss.keys.derivation import expand
 
 COLUMNS = 2  # numbers of a Gaussian that are written
 MAX_BITS = 5  # of a number
@@ -27,7 +26,6 @@ LEVELS = 64
 _BIT = math.log(4)  # of impact; a level is a quarter of a bit
 _MIDDLE = 24  # level at which an impact of zero carries nothing any more
 _NOISE = 0.23  # standard deviation of a format's rounding, in spacings
-_BLOCK = 16
 _POINTS = np.array([-1.0, 0.0, 1.0, 2.0])  # that a number may have come from, from the one below on
 
 
@@ -81,20 +79,7 @@ def read(dither: Doubles, carriers: Carriers, bits: Integers, doubt: Doubles) ->
 
 def dithers(secret: bytes, names: Names) -> Doubles:
     """[C, 2] numbers in [0, 1)."""
-    return (_random(secret, "dither", names) >> np.uint64(11)) / 2.0**53
-
-
-def rank(secret: bytes, label: str, names: Names) -> Words:
-    """[C] a number for each name [C, k], k at most 8; equal for equal names."""
-    return _random(secret, label, names)[:, 0]
-
-
-def _random(secret: bytes, label: str, names: Names) -> Words:
-    """[C, 2] 64 bits each, pseudo-random without the secret: AES-256 of the names."""
-    blocks = np.zeros((len(names), _BLOCK // 2), "<i2")
-    blocks[:, : names.shape[1]] = names
-    key = expand(secret, f"colours/{label}", 32)
-    return encrypted_blocks(key, blocks.view(np.uint8)).view("<u8").astype(np.uint64)
+    return (random_pairs(secret, "dither", names) >> np.uint64(11)) / 2.0**53
 
 
 def _ungray(code: Integers) -> Integers:

@@ -8,8 +8,8 @@ from operator import itemgetter
 
 import numpy as np
 
-from keyss.channels.base import Payload
-from keyss.channels.colours.carriers import CELL, Carriers, Numbers
+from keyss.channels.base import Payload, unpack_payload
+from keyss.channels.colours.carriers import CELL, Carriers, Numbers, Salts
 from keyss.channels.colours.fountain import Fountain
 from keyss.channels.colours.header import (
     FILE_KEY_BYTES,
@@ -26,8 +26,6 @@ from keyss.channels.colours.header import (
     read_header,
 )
 from keyss.channels.colours.lattice import COLUMNS, LEVELS, dithers, read, seeds
-from keyss.channels.colours.salts import Salts
-from keyss.channels.payloads import unpack_payload
 from keyss.channels.reed_solomon import LOST
 from keyss.core.errors import InputError, WrongKeyError
 from keyss.core.gaussians import Gaussians

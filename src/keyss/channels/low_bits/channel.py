@@ -10,7 +10,7 @@ Gaussian and keeps those whose tag fits.
 - *Key cells*, encrypted under the key and a salt, hold the secret's data key.
 - *Parameter cells*, encrypted under the data key, tell how the rest is read (see `parameters`).
 - *Records* are encrypted under the data key too; the numbered chunks of an encrypted payload are records (see
-  `spread`). Other records need no number: shuffling and cropping are harmless, and a removed carrier takes
+  `layout`). Other records need no number: shuffling and cropping are harmless, and a removed carrier takes
   only its own record with it. *Copies* of some have another label; they count where the record is gone.
 
 All of it lies in random carriers (see `layout`), and every usable one gets new low bits, noise if nothing
@@ -32,13 +32,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from keyss.channels.base import SALTS_TRIED, Channel, Content, Room
+from keyss.channels.base import SALTS_TRIED, Channel, Content, Room, check_keys, randomness
 from keyss.channels.low_bits.bits import Layout, identities, read_low_bits, write_low_bits
+from keyss.channels.low_bits.contents import Writer, digest
 from keyss.channels.low_bits.layout import LowBitsRoom
 from keyss.channels.low_bits.salts import salt, salt_rows
 from keyss.channels.low_bits.usable import check_usable, usable_carriers
-from keyss.channels.low_bits.writing import Writer, digest
-from keyss.channels.payloads import check_keys, randomness
 from keyss.core.arrays import Bytes, Flags, Integers
 from keyss.core.errors import InputError, KeyssWarning
 from keyss.core.gaussians import Gaussians

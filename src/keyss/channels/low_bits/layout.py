@@ -16,6 +16,12 @@ quarters).
 Carriers for the headers of four secrets are set aside, whether there are so many or not. Secrets that do not
 fit like that get what there is, without copies or in smaller cells, and the holder of one key can notice the
 others.
+
+How an encrypted payload is cut into numbered chunks, with redundancy.
+
+Chunks are coded with Reed-Solomon so that the loss of a quarter of all Gaussians, whichever they are, leaves
+enough of every codeword. A payload fills all cells that it gets: those that it does not need become
+redundancy, and the number of cells tells nothing.
 """
 
 from __future__ import annotations
@@ -24,12 +30,15 @@ import math
 from bisect import bisect_left
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
 
 from keyss.channels.base import RecordPlan, RecordRequest, Room
 from keyss.channels.low_bits.bits import bytes_per_gaussian
 from keyss.channels.low_bits.cells import TAG_BYTES
-from keyss.channels.low_bits.spread import NUMBER_BYTES, codewords_for, largest_payload
-from keyss.channels.reed_solomon import Codewords
+from keyss.channels.reed_solomon import MAX_CHUNKS, Codewords
+from keyss.core.arrays import Bytes, Integers
 from keyss.core.errors import UsageError
 from keyss.keys.encryption import SMALLEST_BUCKET, encrypted_size
 
@@ -46,6 +55,10 @@ TYPICAL_SHARE = 0.75  # Gaussians whose low bits are random, of a trained model;
 _TYPICAL_HEADER = 168  # bytes that the methods' own headers take at most
 _MAX_SET_ASIDE = 1 / 3  # of the carriers, for headers of secrets that there may not be
 _DEVIATIONS = 6  # by which carriers that are left untouched may be fewer than expected
+REMOVAL = 0.25  # share of the Gaussians that may be removed at random
+FAILURE = 1e-7  # probability that a payload is lost all the same
+NUMBER_BYTES = 3  # of a chunk
+MAX_CODEWORDS = (1 << 8 * NUMBER_BYTES) // MAX_CHUNKS
 
 
 @dataclass(frozen=True)
@@ -247,3 +260,48 @@ def check_payload_fits(compressed: int, gaussians: int, secrets: int, sh_degree:
     room = LowBitsRoom.of(int(gaussians * TYPICAL_SHARE), sh_degree)
     if room.payload_capacity(secrets) < size:
         raise UsageError(room.too_small(gaussians, "Gaussians", size, secrets))
+
+
+def codewords_for(cells: int, chunk: int, size: int) -> Codewords | None:
+    """The most redundant way to spread `size` bytes over cells with `chunk` bytes each; None: not safe."""
+    if cells < 1 or chunk < 1:
+        return None
+    count, n = _shape(cells)
+    k = max(1, -(-size // (chunk * count)))
+    return Codewords(count, n, k, chunk) if k <= _most_data(n, count) else None
+
+
+def largest_payload(cells: int, chunk: int) -> int:
+    """The most bytes for which there are `codewords_for` so many cells."""
+    if cells < 1 or chunk < 1:
+        return 0
+    count, n = _shape(cells)
+    return count * _most_data(n, count) * chunk
+
+
+def numbered_chunks(codewords: Codewords, data: bytes, cells: int) -> Bytes:
+    """[cells, NUMBER_BYTES + width] numbered chunks; those that are left over repeat the first ones."""
+    numbers = np.arange(cells, dtype="<u4") % codewords.chunks
+    chunks = codewords.encode(data)[numbers]
+    return np.concatenate([numbers.view(np.uint8).reshape(-1, 4)[:, :NUMBER_BYTES], chunks], axis=1)
+
+
+def split_numbers(chunks: Bytes) -> tuple[Integers, Bytes]:
+    """The numbers [C] and the data [C, width] of numbered chunks."""
+    numbers: Integers = chunks[:, :NUMBER_BYTES] @ np.array([1, 1 << 8, 1 << 16])
+    return numbers, chunks[:, NUMBER_BYTES:]
+
+
+def _shape(cells: int) -> tuple[int, int]:
+    """How many codewords of which length."""
+    count = min(-(-cells // MAX_CHUNKS), MAX_CODEWORDS)
+    return count, min(cells // count, MAX_CHUNKS)
+
+
+@lru_cache(maxsize=1024)
+def _most_data(n: int, count: int) -> int:
+    """The largest k with which all codewords survive removal with probability 1 - FAILURE; 0 if none."""
+    from scipy.special import bdtrc  # takes long to load
+
+    data = np.arange(1, n + 1)
+    return int(data[bdtrc(n - data, n, REMOVAL) * count < FAILURE].max(initial=0))

@@ -17,8 +17,15 @@ import numpy as np
 
 from keyss.channels.base import pack_method, unpack_method
 from keyss.channels.low_bits.cells import TAG_BYTES, CellCipher
-from keyss.channels.low_bits.layout import DATA_KEY_BYTES, MAX_CELLS, PARAMETER_COPIES, PREFIX_BYTES, SALTS
-from keyss.channels.low_bits.spread import MAX_CODEWORDS, NUMBER_BYTES
+from keyss.channels.low_bits.layout import (
+    DATA_KEY_BYTES,
+    MAX_CELLS,
+    MAX_CODEWORDS,
+    NUMBER_BYTES,
+    PARAMETER_COPIES,
+    PREFIX_BYTES,
+    SALTS,
+)
 from keyss.channels.reed_solomon import LOST, Codewords
 from keyss.core.arrays import Bytes
 from keyss.core.errors import InputError

@@ -9,8 +9,19 @@ from __future__ import annotations
 import numpy as np
 
 from keyss.core.gaussians import Gaussians
-from keyss.measure.stealth.statistic import NOTHING, Statistic, dispersion, normal, share
-from keyss.measure.stealth.words import ATTRIBUTES, MAGNITUDES, MANTISSA, Bits, Flags, Words
+from keyss.measure.stealth.statistic import (
+    ATTRIBUTES,
+    MAGNITUDES,
+    MANTISSA,
+    NOTHING,
+    Bits,
+    Flags,
+    Statistic,
+    Words,
+    dispersion,
+    normal,
+    share,
+)
 
 RANGES = {"0": (0, 1), "1-3": (1, 4), "4-8": (4, 9), "9-12": (9, 13)}
 _BITS = 14  # from the last one on

@@ -13,8 +13,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from keyss.core.gaussians import Gaussians
-from keyss.measure.stealth.statistic import Statistic
-from keyss.measure.stealth.words import Floats, Ints, Words, doubles
+from keyss.measure.stealth.statistic import Floats, Ints, Statistic, Words, doubles
 
 _QUANTILES = (0.05, 0.1, 0.25, 0.5, 0.9)
 _CHANNELS = {"green": 1, "blue": 2}

@@ -14,7 +14,7 @@ from scipy.stats import ks_2samp, spearmanr
 
 from keyss.core.gaussians import Gaussians
 from keyss.measure.stealth.opacities import INVISIBLE
-from keyss.measure.stealth.words import Floats, Words, doubles
+from keyss.measure.stealth.statistic import Floats, Words, doubles
 
 MAX_GAUSSIANS = 20_000  # of each model
 _QUERIES = 4000  # rows whose nearest ones are searched

@@ -5,8 +5,17 @@ from __future__ import annotations
 import numpy as np
 
 from keyss.core.gaussians import Gaussians
-from keyss.measure.stealth.statistic import Statistic, excess, more_than_smooth, portion
-from keyss.measure.stealth.words import ATTRIBUTES, Bits, Floats, Words, doubles
+from keyss.measure.stealth.statistic import (
+    ATTRIBUTES,
+    Bits,
+    Floats,
+    Statistic,
+    Words,
+    doubles,
+    excess,
+    more_than_smooth,
+    portion,
+)
 from keyss.measure.two_sample import space_cells
 
 _UNIT = 5e-7  # error of a length normalised in float32

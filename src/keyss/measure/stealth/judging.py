@@ -9,16 +9,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from keyss.core import Gaussians, UsageError
-from keyss.measure.stealth.agreement import agreement
+from keyss.measure.stealth.agreement import agreement, coincidences
 from keyss.measure.stealth.bits import bits
-from keyss.measure.stealth.coincidences import coincidences
 from keyss.measure.stealth.colours import colours
 from keyss.measure.stealth.confirmation import candidate_scores, changed_low_bits
 from keyss.measure.stealth.invariants import invariants
 from keyss.measure.stealth.opacities import invisible_modes, opacities
 from keyss.measure.stealth.order import order
-from keyss.measure.stealth.statistic import Statistic
-from keyss.measure.stealth.words import Words
+from keyss.measure.stealth.statistic import Statistic, Words
 
 # Detectors by kind: functions of a model and its bit patterns that give statistics by name.
 KINDS: dict[str, Callable[[Gaussians, Words], dict[str, Statistic]]] = {

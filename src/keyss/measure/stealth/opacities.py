@@ -6,8 +6,7 @@ import numpy as np
 from scipy.signal import find_peaks
 
 from keyss.core.gaussians import Gaussians
-from keyss.measure.stealth.statistic import Statistic, portion
-from keyss.measure.stealth.words import Floats, Words, doubles
+from keyss.measure.stealth.statistic import Floats, Statistic, Words, doubles, portion
 
 INVISIBLE = -5.6  # logits below are never rendered
 _SHARES = {

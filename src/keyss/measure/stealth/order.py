@@ -9,8 +9,7 @@ from scipy.spatial import cKDTree
 from scipy.stats import ks_2samp, rankdata
 
 from keyss.core.gaussians import Gaussians
-from keyss.measure.stealth.statistic import Statistic, normal, portion
-from keyss.measure.stealth.words import Floats, Words, doubles
+from keyss.measure.stealth.statistic import Floats, Statistic, Words, doubles, normal, portion
 
 _KS_SPREAD = 0.2603  # standard deviation of Kolmogorov's distribution
 _NEAR = 1e-5  # of the model's size

@@ -9,9 +9,8 @@ from typing import Any
 
 from keyss.core.errors import KeyssWarning, UsageError
 from keyss.methods.base import Capabilities, Context, Plan, Source, Stego, role_of
-from keyss.methods.carry.options import CarryOptions
 from keyss.methods.carry.refit import MODEL_ITERATIONS, refitted
-from keyss.methods.carry.room import SecretSize, WholeRoom, room_for
+from keyss.methods.carry.room import CarryOptions, SecretSize, WholeRoom, room_for
 from keyss.methods.records.embedding import embed_models
 from keyss.methods.records.quantise import out_of_range
 from keyss.rendering.difference import Viewpoints, psnr_between

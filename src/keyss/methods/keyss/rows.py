@@ -36,8 +36,8 @@ from keyss.core.pruning_compensation import compensate_pruning
 from keyss.core.similarity import Similarity
 from keyss.keys.derivation import EMBEDDING_SIZE, expand, stream
 from keyss.methods.opened import Frame, Remains
+from keyss.methods.records.lines import Table
 from keyss.methods.records.quantise import Codec
-from keyss.methods.records.table import Table
 from keyss.methods.tensors import Header, damage_refused, pack_tensors, unpack_tensors
 
 NAME = "keyss"

@@ -19,8 +19,8 @@ from keyss.core.gaussians import SH_C0, Gaussians
 from keyss.core.scene import Camera
 from keyss.methods.base import Capabilities
 from keyss.methods.joint import Picture
+from keyss.methods.peers.decoder import Convolutions, network_of, network_tensors, weights_of
 from keyss.methods.peers.method import HandedTensors, Peer, PeerOptions, PeerTraining, Show
-from keyss.methods.peers.networks import Convolutions, network_of, network_tensors, weights_of
 from keyss.rendering import decode_picture, render_features
 
 FEATURES = 16

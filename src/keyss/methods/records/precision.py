@@ -12,7 +12,7 @@ import torch
 from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.files.formats.common import in_morton_order
-from keyss.methods.records.table import Table
+from keyss.methods.records.lines import Table
 from keyss.methods.records.whole import MAX_BITS, USUAL_BITS, Precision, decode, encode
 from keyss.rendering.difference import Viewpoints, psnr_between
 

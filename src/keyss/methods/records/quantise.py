@@ -26,11 +26,12 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from keyss.core.colour import OPPONENT
 from keyss.core.errors import InputError
-from keyss.core.gaussians import MAX_COORDINATE, MAX_LOG_SCALE, Gaussians
+from keyss.core.gaussians import MAX_COORDINATE, MAX_LOG_SCALE, OPPONENT, Gaussians
 from keyss.files.formats.common import from_smallest_three, smallest_three, unit
 from keyss.methods.records.lines import (
+    BANDS,
+    CHROMA_FEWER,
     COLOUR,
     EVEN,
     HARMONIC,
@@ -41,10 +42,10 @@ from keyss.methods.records.lines import (
     Kind,
     Line,
     Mask,
+    Table,
     fit_line,
     neighbourhood,
 )
-from keyss.methods.records.table import BANDS, CHROMA_FEWER, Table
 
 Bytes = npt.NDArray[np.uint8]
 

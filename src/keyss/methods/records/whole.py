@@ -27,13 +27,11 @@ import numpy.typing as npt
 import torch
 import zstandard
 
-from keyss.core.colour import OPPONENT
 from keyss.core.errors import InputError
-from keyss.core.gaussians import Gaussians
+from keyss.core.gaussians import OPPONENT, Gaussians
 from keyss.files.formats.common import in_morton_order
-from keyss.methods.records.lines import Codes
+from keyss.methods.records.lines import Codes, Table
 from keyss.methods.records.quantise import Bytes, Codec
-from keyss.methods.records.table import Table
 
 _ALWAYS = 1 << 16  # Gaussians, whatever announces them
 _LEAST_BYTES = 2  # of each Gaussian in larger models
