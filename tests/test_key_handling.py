@@ -71,7 +71,7 @@ def test_nothing_that_is_written_or_said_holds_the_key(
     scenes = ["--cover", str(folder / "a"), "--secret", str(folder / "b"), "--publish", "any", "-o", str(run)]
     size = ["--preset", "quick", "--iterations", "20", "--max-gaussians", "100", "--device", "cpu"]
     with monkeypatch.context() as patch:
-        patch.setattr("keyss.progress.reporter", _CtrlC)
+        patch.setattr("keyss.cli.reporting.lines", _CtrlC)
         assert main(["hide", *scenes, *key, *size]) == 130
     checkpoints = list(_files(run / "private" / "checkpoint"))
     assert len(checkpoints) >= 2
