@@ -29,7 +29,7 @@ from keyss import read_model, write_model
 from channels.low_bits.trained_like import trained_like
 from keyss.channels import LowBitsRoom, usable_carriers
 from keyss.core import Gaussians, KeyssError, Scene
-from keyss.core.pruning_compensation import compensate_pruning
+from keyss.core.gaussians import compensate_pruning
 from keyss.files.scenes import load_scene
 from keyss.fitting.image_metrics import mean_psnr
 from keyss.methods import record_request

@@ -23,7 +23,7 @@ from typing import Any
 import keyss  # noqa: F401  before torch, see `ruff.toml`
 from keyss import FitConfig, Gaussians, KeyssOptions, read_model, write_model
 from keyss.core import Scene, Similarity
-from keyss.core.alignment import align
+from keyss.core.similarity import align
 from keyss.files.scenes import load_scene
 from keyss.fitting import PlainRun, load_checkpoint, mean_psnr, save_checkpoint
 from keyss.keys import random_embeddings

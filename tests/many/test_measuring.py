@@ -72,7 +72,7 @@ def losses(stego: Gaussians, scenes: list[Any], opens: Any, standard: bool = Tru
 
 
 def test_a_secret_that_does_not_open_is_lost(scenes: list[Any], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("keyss.measure.robustness.conversions.find_splat_transform", lambda: "/no/such/tool")
+    monkeypatch.setattr("keyss.measure.robustness.survival.find_splat_transform", lambda: "/no/such/tool")
     stego, secret = random_gaussians(150, 0), random_gaussians(150, 1)
 
     def unchanged_only(model: Gaussians) -> Gaussians:

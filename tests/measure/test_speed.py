@@ -135,7 +135,7 @@ def test_readers_that_are_absent_say_so(tmp_path: Path, monkeypatch: pytest.Monk
     def missing(name: str) -> Any:
         raise ImportError(name)
 
-    monkeypatch.setattr("keyss.measure.robustness.conversions.import_module", missing)
+    monkeypatch.setattr("keyss.measure.robustness.survival.import_module", missing)
     monkeypatch.setenv("KEYSS_SPLAT_TRANSFORM", str(tmp_path / "nowhere"))
     write_model(tmp_path / "a.ply", random_gaussians(4))
     found = readers(tmp_path / "a.ply")

@@ -15,7 +15,7 @@ from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Camera, Scene, ViewOptions, checked_background
 from keyss.files.atomic import check_not_an_input, check_output_file
-from keyss.files.video import check_video, write_video
+from keyss.files.images import check_video, write_video
 from keyss.progress import Reporter
 from keyss.rendering import Backend, render, resolve_device
 from keyss.rendering.arguments import MAX_SIDE

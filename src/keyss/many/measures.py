@@ -25,8 +25,7 @@ from keyss.core.scene import Scene, ViewOptions
 from keyss.files.models import read_model
 from keyss.measure.images import renders_of, steganalysed
 from keyss.measure.robustness.changes import Change, opacity_pruning, purification, random_pruning
-from keyss.measure.robustness.conversions import converters
-from keyss.measure.robustness.survival import measure_robustness
+from keyss.measure.robustness.survival import converters, measure_robustness
 from keyss.measure.sinkhorn import composite_score, sinkhorn_3d
 from keyss.measure.speed import RenderTime, readers, render_time
 from keyss.measure.stealth.judging import judge

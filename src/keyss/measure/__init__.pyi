@@ -41,18 +41,16 @@ from .robustness.changes import (
     purification as purification,
     random_pruning as random_pruning,
 )
-from .robustness.conversions import (
-    Converter as Converter,
-    converters as converters,
-    find_splat_transform as find_splat_transform,
-    transform as transform,
-)
 from .robustness.survival import (
     ChangedQuality as ChangedQuality,
     ChangeResult as ChangeResult,
+    Converter as Converter,
+    converters as converters,
     default_changes as default_changes,
+    find_splat_transform as find_splat_transform,
     measure_robustness as measure_robustness,
     reveal_changed as reveal_changed,
+    transform as transform,
 )
 from .sinkhorn import composite_score as composite_score, sinkhorn_3d as sinkhorn_3d
 from .speed import (

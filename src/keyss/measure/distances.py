@@ -13,12 +13,10 @@ from itertools import combinations
 from statistics import fmean
 
 import numpy as np
-import numpy.typing as npt
 
 from keyss.core import Gaussians, UsageError, import_extra
+from keyss.core.arrays import Floats
 from keyss.measure.two_sample import features
-
-Floats = npt.NDArray[np.float32]
 
 SLICES = 32
 MAX_GAUSSIANS = 100_000  # of each model; larger ones are subsampled

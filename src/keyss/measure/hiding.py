@@ -8,10 +8,10 @@ from statistics import fmean
 
 import torch
 
-from keyss.core.alignment import align
 from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
+from keyss.core.similarity import align
 from keyss.fitting.image_metrics import (
     ImageQuality,
     mean_psnr,

@@ -18,13 +18,13 @@ from statistics import fmean
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import torch
 import torch.nn.functional as F
 from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
 from keyss.core import BackendError, Gaussians, InputError, KeyssError, Scene, View
+from keyss.core.arrays import Bytes, Doubles
 from keyss.files.images import picture_names
 from keyss.fitting.image_metrics import psnr, subsample_views
 from keyss.rendering import render
@@ -38,9 +38,7 @@ _SIZES, _STRIDES, _PADDINGS = (11, 5, 3, 3, 3), (4, 1, 1, 1, 1), (2, 2, 1, 1, 1)
 _POOLED_BEFORE = (1, 2)
 _MEAN, _SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)  # for images in [-1, 1]
 
-Pixels = npt.NDArray[np.uint8]
-Doubles = npt.NDArray[np.float64]
-Images = Sequence[tuple[str, Tensor | Pixels]]  # names and uint8 [H, W, 3]
+Images = Sequence[tuple[str, Tensor | Bytes]]  # names and uint8 [H, W, 3]
 
 STEGANALYSED_VIEWS = 64
 RADIUS = 5  # SSIM's 11 x 11 window
@@ -136,7 +134,7 @@ def compare_images(reference: Images, other: Images) -> ImageComparison:
     return ImageComparison(views, ImageScores(*means), missing)
 
 
-def _unit_range(name: str, *pair: Tensor | Pixels) -> list[Tensor]:
+def _unit_range(name: str, *pair: Tensor | Bytes) -> list[Tensor]:
     """Two images as float64 [H, W, 3] in [0, 1]."""
     a, b = map(np.asarray, pair)
     for image in (a, b):

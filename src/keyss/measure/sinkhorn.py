@@ -11,15 +11,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from torch import Tensor
 
 from keyss.core import Gaussians, UsageError, import_extra
+from keyss.core.arrays import Doubles
 
 BINS = 100
 REGULARISATION = 0.01
-
-Doubles = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -19,8 +19,7 @@ from keyss.core.scene import Scene
 from keyss.files.models import DECODED_SUFFIX, read_model, write_model
 from keyss.files.ply_rows import is_compressed
 from keyss.fitting.image_metrics import subsample_views
-from keyss.measure.robustness.conversions import find_package, transform
-from keyss.measure.robustness.survival import Opener, reveal_changed
+from keyss.measure.robustness.survival import Opener, find_package, reveal_changed, transform
 from keyss.rendering import render
 
 

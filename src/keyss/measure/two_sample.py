@@ -17,6 +17,7 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from keyss.core import SH_C0, Gaussians, UsageError, import_extra
+from keyss.core.arrays import Floats
 from keyss.files.ply_rows import OPACITY_LOGIT_BOUND
 from keyss.measure.auc import Auc, delong
 
@@ -25,7 +26,6 @@ FOLDS = 5
 _CELLS = 8  # along each axis
 _TREES, _LEAVES = 50, 16
 
-Floats = npt.NDArray[np.float32]
 Ints = npt.NDArray[np.intp]
 
 

@@ -12,10 +12,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 import torch
 
 from keyss.channels import chance_of_bits
+from keyss.core.arrays import Doubles, Flags, Floats
 from keyss.core.gaussians import Gaussians
 from keyss.keys.derivation import stream
 
@@ -27,8 +27,6 @@ _SAMPLE = 20_000  # Gaussians
 _UNIT = 1e-5  # the largest difference between 1 and the length of a unit quaternion
 _FAINT = 1e-3  # standard deviation of new harmonics
 _LOOSE = {"log_scales": 0.01, "quats": 0.01, "opacity_logits": 0.01, "sh": _FAINT}  # standard deviations
-
-Floats = npt.NDArray[np.float32]
 
 
 def dither_model(model: Gaussians, entropy: bytes) -> Gaussians:
@@ -68,7 +66,7 @@ def raised(model: Gaussians, sh_degree: int, entropy: bytes) -> Gaussians:
     return replace(model, sh=torch.cat([model.sh, noise.to(model.sh)], dim=1))
 
 
-def loosened(model: Gaussians, usable: npt.NDArray[np.bool_], entropy: bytes) -> Gaussians:
+def loosened(model: Gaussians, usable: Flags, entropy: bytes) -> Gaussians:
     """`model` with small noise on the numbers of all Gaussians that are not `usable` [N]; positions stay.
 
     After few steps of training, many Gaussians still have equal scales, grey colours or no harmonics, so that
@@ -102,7 +100,7 @@ def _is_natural(values: Floats) -> bool:
     return chance_of_bits(words, _BITS) > _CHANCE
 
 
-def _dithered(values: Floats, noise: npt.NDArray[np.float64]) -> Floats:
+def _dithered(values: Floats, noise: Doubles) -> Floats:
     """`values` moved by `noise` in [-1, 1] times half of the distance to the nearest other value."""
     unique, inverse = np.unique(values.astype(np.float64), return_inverse=True)
     if len(unique) < 2:

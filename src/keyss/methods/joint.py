@@ -15,11 +15,10 @@ from typing import Any, Literal, TypeVar
 import torch
 from torch import Tensor
 
-from keyss.core.alignment import align
 from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Camera
-from keyss.core.similarity import Similarity
+from keyss.core.similarity import Similarity, align
 from keyss.fitting.adam import RowAdam
 from keyss.fitting.checkpoint import State, pack_model, pack_network, unpack_model, unpack_network
 from keyss.fitting.density import CappedStrategy, Rendered

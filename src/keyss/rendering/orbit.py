@@ -10,10 +10,10 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from keyss.core.alignment import up_direction
 from keyss.core.errors import UsageError
 from keyss.core.gaussians import SH_C0, Gaussians
 from keyss.core.scene import Camera, Scene, View, camera_positions, checked_background, focus_point
+from keyss.core.similarity import up_direction
 from keyss.files.models import is_model_path
 from keyss.rendering.arguments import MAX_SIDE
 from keyss.rendering.view import render

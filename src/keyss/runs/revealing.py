@@ -14,7 +14,7 @@ from keyss.methods import handed as handing, registry
 from keyss.methods.opened import Frame, HiddenFile, Opened, OpensAFileError, Remains
 from keyss.runs.sources import PathLike
 
-# Pruning compensation makes up for the loss of nine tenths at most (`keyss.core.pruning_compensation`): with
+# Pruning compensation makes up for the loss of nine tenths at most (`keyss.core.gaussians`): with
 # less left, renders become emptier and emptier.
 MIN_LEFT = 0.1
 # A loss that is compensated.

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from scipy.stats import ks_2samp, spearmanr
 
 from keyss.core.gaussians import Gaussians
-from keyss.measure.stealth.opacities import INVISIBLE
+from keyss.measure.stealth.colours import INVISIBLE
 from keyss.measure.stealth.statistic import Floats, Words, doubles
 
 MAX_GAUSSIANS = 20_000  # of each model

@@ -11,10 +11,9 @@ import numpy as np
 from keyss.core import Gaussians, UsageError
 from keyss.measure.stealth.agreement import agreement, coincidences
 from keyss.measure.stealth.bits import bits
-from keyss.measure.stealth.colours import colours
+from keyss.measure.stealth.colours import colours, invisible_modes, opacities
 from keyss.measure.stealth.confirmation import candidate_scores, changed_low_bits
 from keyss.measure.stealth.invariants import invariants
-from keyss.measure.stealth.opacities import invisible_modes, opacities
 from keyss.measure.stealth.order import order
 from keyss.measure.stealth.statistic import Statistic, Words
 

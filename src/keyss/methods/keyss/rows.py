@@ -30,9 +30,9 @@ from torch import Tensor
 
 from keyss.channels import Content, Payload, identities, is_appended
 from keyss.channels.low_bits.cells import TAG_BYTES, CellCipher
+from keyss.core.arrays import Bytes, Integers, Words32
 from keyss.core.errors import InputError, UsageError
-from keyss.core.gaussians import Gaussians
-from keyss.core.pruning_compensation import compensate_pruning
+from keyss.core.gaussians import Gaussians, compensate_pruning
 from keyss.core.similarity import Similarity
 from keyss.keys.derivation import EMBEDDING_SIZE, expand, stream
 from keyss.methods.opened import Frame, Remains
@@ -49,10 +49,6 @@ BITS = 7  # of a carrier
 SHIFT = np.uint32(13)  # bits of a harmonic below its carrier
 _COARSEST = Table.short()  # the coarsest Gaussian
 _FEWEST = 500  # carriers that a tilt is measured on
-
-Bytes = npt.NDArray[np.uint8]
-Words = npt.NDArray[np.uint32]
-Rows = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -174,7 +170,7 @@ def share(carriers: int, secrets: int) -> int:
 class RowKind:
     """Rows of a model with equally many carriers in use."""
 
-    rows: Rows  # [R]
+    rows: Integers  # [R]
     columns: npt.NDArray[np.int64]  # [R, carriers] their first harmonics that are not zero
 
     @property
@@ -202,7 +198,7 @@ class RowKind:
         harmonics = torch.from_numpy(words.view(np.float32)).view_as(model.sh[:, 1:])
         return replace(model, sh=torch.cat([model.sh[:, :1], harmonics], dim=1))
 
-    def _words(self, model: Gaussians) -> Words:
+    def _words(self, model: Gaussians) -> Words32:
         return words_of(model)[self.rows[:, None], self.columns]
 
 
@@ -296,7 +292,7 @@ def visibility(gaussians: Gaussians) -> float:
     return float(gaussians.opacities.double().sum())
 
 
-def words_of(gaussians: Gaussians) -> Words:
+def words_of(gaussians: Gaussians) -> Words32:
     """[N, K] bit patterns of the harmonics above the constant one; a copy."""
     harmonics = gaussians.sh[:, 1:].detach().cpu().reshape(len(gaussians), -1)
     return harmonics.contiguous().numpy().copy().view(np.uint32)

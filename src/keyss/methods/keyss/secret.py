@@ -21,8 +21,7 @@ from torch import Tensor
 
 from keyss.channels import Content, Payload, is_appended
 from keyss.core.errors import InputError
-from keyss.core.gaussians import DRAWN_OPACITY, Gaussians
-from keyss.core.pruning_compensation import compensate_pruning
+from keyss.core.gaussians import DRAWN_OPACITY, Gaussians, compensate_pruning
 from keyss.core.similarity import Similarity
 from keyss.methods.keyss import rows
 from keyss.methods.keyss.decoder import Decoder, DecoderShape, parse_mask

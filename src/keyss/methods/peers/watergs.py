@@ -25,11 +25,11 @@ from itertools import pairwise
 from typing import ClassVar
 
 import numpy as np
-import numpy.typing as npt
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from keyss.core.arrays import Bits, Words32
 from keyss.core.errors import InputError, UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Camera
@@ -48,9 +48,6 @@ _FIT_STEPS = 200  # that fit the autoencoder to the secret's own opacities
 _RANGE = 0.999  # quantile of the coefficients above degree 0 at which they are clipped
 _BLOCK = 1 << 14  # Gaussians at a time
 _CIPHER_BYTES = 32
-
-Words = npt.NDArray[np.uint32]
-Bits = npt.NDArray[np.uint8]
 
 
 def graded_bits(degree: int) -> tuple[int, ...]:
@@ -124,7 +121,7 @@ def read_bits(stego: Tensor, ranges: Tensor, cipher: bytes) -> Tensor:
     return torch.from_numpy(found)
 
 
-def _codes(secret: Tensor, ranges: Tensor, sizes: Sequence[int]) -> Words:
+def _codes(secret: Tensor, ranges: Tensor, sizes: Sequence[int]) -> Words32:
     """[n, K, 3] coefficients as codes of `sizes` bits by degree."""
     codes = np.empty(secret.shape, np.uint32)
     for index in range(codes.shape[1]):

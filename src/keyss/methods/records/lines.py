@@ -7,11 +7,8 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
-Floats = npt.NDArray[np.float64]
-Codes = npt.NDArray[np.uint32]
-Mask = npt.NDArray[np.bool_]
+from keyss.core.arrays import Doubles, Flags, Words32
 
 _TAIL = 0.05  # share of the numbers that is ignored on each side when the extent of the bulk is measured
 _EVEN_MARGIN = 0.75  # on an evenly spaced line, widths of the bulk between it and the first outlier
@@ -57,28 +54,28 @@ class Line:
         if self.spread > 0 and (reach > 60 or self.spread * np.sinh(reach) > _FURTHEST):
             raise ValueError(f"no such line: {self}")
 
-    def encode(self, values: Floats, bits: int, outlier: Mask | None = None) -> Codes:
+    def encode(self, values: Doubles, bits: int, outlier: Flags | None = None) -> Words32:
         """The nearest codes of `values` [N, C], clipped at the ends; `outlier` [N]: use the far reach."""
         return self.codes(self.positions(values), bits, outlier)
 
-    def positions(self, values: Floats) -> Floats:
+    def positions(self, values: Doubles) -> Doubles:
         """The positions of `values`, whatever the reach."""
-        offset: Floats = values - self.centre
+        offset: Doubles = values - self.centre
         return np.arcsinh(offset / self.spread) if self.spread > 0 else offset
 
-    def codes(self, positions: Floats, bits: int, outlier: Mask | None = None) -> Codes:
+    def codes(self, positions: Doubles, bits: int, outlier: Flags | None = None) -> Words32:
         """`encode` of values at these positions."""
         last = (1 << bits) - 1
         codes = np.rint((positions / self._reaches(outlier) + 1) * (last / 2)).clip(0, last)
         return codes.astype(np.uint32)
 
-    def decode(self, codes: Codes, bits: int, outlier: Mask | None = None) -> Floats:
+    def decode(self, codes: Words32, bits: int, outlier: Flags | None = None) -> Doubles:
         """The values that `codes` [N, C] stand for; see `encode`."""
         positions = (codes.astype(np.float64) * (2 / ((1 << bits) - 1)) - 1) * self._reaches(outlier)
-        offset: Floats = np.sinh(positions) * self.spread if self.spread > 0 else positions
+        offset: Doubles = np.sinh(positions) * self.spread if self.spread > 0 else positions
         return offset + self.centre
 
-    def _reaches(self, outlier: Mask | None) -> Floats | float:
+    def _reaches(self, outlier: Flags | None) -> Doubles | float:
         return self.reach if outlier is None else np.where(outlier, self.far_reach, self.reach)[:, None]
 
 
@@ -94,7 +91,7 @@ EVEN, POSITION = Kind(even=True), Kind()
 COLOUR, HARMONIC = Kind(clips=True), Kind(clips=True, centred=True)
 
 
-def neighbourhood(values: Floats, kind: Kind) -> tuple[float, float]:
+def neighbourhood(values: Doubles, kind: Kind) -> tuple[float, float]:
     """The least and the largest number that is no outlier of `values`.
 
     Quantiles measure the bulk. Fewer than `_TAIL` of the values, whatever they are, cannot move these beyond
@@ -111,7 +108,7 @@ def neighbourhood(values: Floats, kind: Kind) -> tuple[float, float]:
     return centre - reach, centre + reach
 
 
-def fit_line(kind: Kind, bits: int, values: Floats, outliers: Floats) -> Line:
+def fit_line(kind: Kind, bits: int, values: Doubles, outliers: Doubles) -> Line:
     """The line for `values` [N, C] of the bulk, with a far reach for `outliers` [O, C]; there may be none."""
     if kind.even:
         centre, spread = (float(values.min()) + float(values.max())) / 2, 0.0
@@ -125,7 +122,7 @@ def fit_line(kind: Kind, bits: int, values: Floats, outliers: Floats) -> Line:
     return replace(line, far_reach=_reach_of(line, _furthest(line, outliers)))
 
 
-def _best_line(whole: Line, bits: int, values: Floats) -> Line:
+def _best_line(whole: Line, bits: int, values: Doubles) -> Line:
     """The line with the least error among some with other spreads that reach as far as `whole` or less."""
     sample = values[:: max(1, values.size // _SAMPLE)].ravel()
     furthest = _furthest(whole, values) or 1.0
@@ -143,7 +140,7 @@ def _best_line(whole: Line, bits: int, values: Floats) -> Line:
     return best
 
 
-def _furthest(line: Line, values: Floats) -> float:
+def _furthest(line: Line, values: Doubles) -> float:
     """The largest distance from the centre; 0 where there are no values."""
     return float(np.abs(values - line.centre).max(initial=0.0))
 

@@ -8,8 +8,7 @@ from dataclasses import dataclass
 
 from keyss.channels.base import Content, Records
 from keyss.core.errors import InputError, UsageError
-from keyss.core.gaussians import Gaussians
-from keyss.core.pruning_compensation import compensate_pruning
+from keyss.core.gaussians import Gaussians, compensate_pruning
 from keyss.methods.opened import Frame, Remains
 from keyss.methods.records import whole
 from keyss.methods.records.quantise import Codec

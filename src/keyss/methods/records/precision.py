@@ -5,10 +5,9 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
-import numpy as np
-import numpy.typing as npt
 import torch
 
+from keyss.core.arrays import Integers
 from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.files.formats.common import in_morton_order
@@ -91,7 +90,7 @@ def most_visible(gaussians: Gaussians, count: int) -> Gaussians:
     return gaussians[torch.from_numpy(most_visible_rows(gaussians, count))]
 
 
-def most_visible_rows(gaussians: Gaussians, count: int) -> npt.NDArray[np.int64]:
+def most_visible_rows(gaussians: Gaussians, count: int) -> Integers:
     """[count] indices of the Gaussians with the largest opacity times size, in ascending order.
 
     Size is the square root of the cross-section, and no more than that of a typical large Gaussian:
@@ -100,7 +99,7 @@ def most_visible_rows(gaussians: Gaussians, count: int) -> npt.NDArray[np.int64]
     size = gaussians.log_scales.sort(dim=1).values[:, 1:].mean(1)  # log, of the larger two axes
     at_most = size.kthvalue(int(0.9 * len(size)) + 1).values
     visibility = gaussians.opacities * size.clamp_max(at_most).exp()
-    rows: npt.NDArray[np.int64] = visibility.topk(count).indices.sort().values.numpy()
+    rows: Integers = visibility.topk(count).indices.sort().values.numpy()
     return rows
 
 

@@ -23,9 +23,9 @@ from collections.abc import Iterator, Sequence
 from dataclasses import astuple, dataclass
 
 import numpy as np
-import numpy.typing as npt
 import torch
 
+from keyss.core.arrays import Bytes, Doubles, Flags, Words32
 from keyss.core.errors import InputError
 from keyss.core.gaussians import MAX_COORDINATE, MAX_LOG_SCALE, OPPONENT, Gaussians
 from keyss.files.formats.common import from_smallest_three, smallest_three, unit
@@ -37,17 +37,12 @@ from keyss.methods.records.lines import (
     HARMONIC,
     LINE,
     POSITION,
-    Codes,
-    Floats,
     Kind,
     Line,
-    Mask,
     Table,
     fit_line,
     neighbourhood,
 )
-
-Bytes = npt.NDArray[np.uint8]
 
 MAX_LOGIT = 16.0  # beyond it the float32 sigmoid is exactly 0 or 1
 _MAX_HARMONIC = 1e6  # beyond it a colour is black or white wherever it is rendered at all
@@ -74,7 +69,7 @@ class Codec:
         every = zip(kinds, _bits(table), _numbers(gaussians), strict=True)
         return Codec(table, tuple(fit_line(kind, bits, x[~outlier], x[outlier]) for kind, bits, x in every))
 
-    def codes(self, gaussians: Gaussians) -> list[Codes]:
+    def codes(self, gaussians: Gaussians) -> list[Words32]:
         """Codes [N, columns] for each entry of `table.layout`."""
         outlier = outliers(gaussians)
         quats = _doubles(gaussians.quats)
@@ -88,7 +83,7 @@ class Codec:
         every = zip(self.lines, _bits(self.table), _numbers(gaussians), strict=True)
         return columns + [line.encode(values, bits, outlier) for line, bits, values in every]
 
-    def gaussians(self, codes: Sequence[Codes]) -> Gaussians:
+    def gaussians(self, codes: Sequence[Words32]) -> Gaussians:
         """The Gaussians of `codes`: finite float32, whatever the codes are."""
         outlier, left_out, three, *columns = codes
         every = zip(self.lines, _bits(self.table), columns, strict=True)
@@ -153,7 +148,7 @@ class Codec:
         return Codec(table, lines)
 
 
-def outliers(gaussians: Gaussians) -> Mask:
+def outliers(gaussians: Gaussians) -> Flags:
     """[N] which Gaussians have a number far outside of the bulk; none if that would be all."""
     found, every = np.zeros(len(gaussians), bool), max(1, len(gaussians) // _SAMPLE)
     for kind, values in zip(_kinds(gaussians.sh_degree), _numbers(gaussians), strict=True):
@@ -180,7 +175,7 @@ def _bits(table: Table) -> list[int]:
     return [means, means, means, log_scales, opacity, *harmonics]
 
 
-def _numbers(gaussians: Gaussians) -> Iterator[Floats]:
+def _numbers(gaussians: Gaussians) -> Iterator[Doubles]:
     """[N, count] the numbers of each line.
 
     A Gaussian whose numbers overflow is never rendered: it becomes transparent, because its clamped numbers
@@ -200,12 +195,12 @@ def _numbers(gaussians: Gaussians) -> Iterator[Floats]:
         first += count
 
 
-def _whole_quats(largest: Codes, three: Floats) -> Floats:
+def _whole_quats(largest: Words32, three: Doubles) -> Doubles:
     """[N, 4] unit quaternions, also for codes that no quaternion has."""
     quats = from_smallest_three(largest[:, 0].astype(np.uint8), three)
     quats /= np.linalg.norm(quats, axis=1, keepdims=True).clip(0.5)
     return quats
 
 
-def _doubles(values: torch.Tensor) -> Floats:
+def _doubles(values: torch.Tensor) -> Doubles:
     return values.detach().cpu().numpy().astype(np.float64)

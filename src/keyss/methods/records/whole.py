@@ -27,11 +27,12 @@ import numpy.typing as npt
 import torch
 import zstandard
 
+from keyss.core.arrays import Bytes, Doubles, Integers, Words32
 from keyss.core.errors import InputError
 from keyss.core.gaussians import OPPONENT, Gaussians
 from keyss.files.formats.common import in_morton_order
-from keyss.methods.records.lines import Codes, Table
-from keyss.methods.records.quantise import Bytes, Codec
+from keyss.methods.records.lines import Table
+from keyss.methods.records.quantise import Codec
 
 _ALWAYS = 1 << 16  # Gaussians, whatever announces them
 _LEAST_BYTES = 2  # of each Gaussian in larger models
@@ -170,25 +171,23 @@ def _from_harmonics(codes: npt.NDArray[np.int8], plain: Gaussians, step: float) 
     return torch.from_numpy(rows)
 
 
-def _finer(plain: Gaussians) -> npt.NDArray[np.int64]:
+def _finer(plain: Gaussians) -> Integers:
     """[N] half octaves by which each Gaussian's steps are finer than those of the median one."""
     scales = np.sort(plain.log_scales.numpy().astype(np.float64), axis=1)
     logits = plain.opacity_logits.numpy().astype(np.float64)
     seen = scales[:, 2] + scales[:, 1] + 2 * np.minimum(logits, 0)  # nearly the logarithm of the opacity
     middle = np.sort(seen)[(len(seen) - 1) // 2]
-    found: npt.NDArray[np.int64] = np.floor((seen - middle) * _PER_OCTAVE + 0.5).astype(np.int64)
+    found: Integers = np.floor((seen - middle) * _PER_OCTAVE + 0.5).astype(np.int64)
     return found.clip(-_FINER, _FINER)
 
 
-def _steps(step: float, finer: npt.NDArray[np.int64]) -> npt.NDArray[np.float64]:
+def _steps(step: float, finer: Integers) -> Doubles:
     """[N] steps, exact products of `step`, a power of two and the square root of two or one."""
-    steps: npt.NDArray[np.float64] = (
-        step * np.where(finer % 2, math.sqrt(2), 1.0) * 2.0 ** -((finer + 1) // 2)
-    )
+    steps: Doubles = step * np.where(finer % 2, math.sqrt(2), 1.0) * 2.0 ** -((finer + 1) // 2)
     return steps
 
 
-def _planes(codes: Codes, bits: int, index: int) -> Sequence[bytes]:
+def _planes(codes: Words32, bits: int, index: int) -> Sequence[bytes]:
     """The lowest bytes of each column of codes [N, C], then the higher ones; differences of positions."""
     if index in _POSITIONS:
         codes = codes.copy()
@@ -198,7 +197,7 @@ def _planes(codes: Codes, bits: int, index: int) -> Sequence[bytes]:
     return [(column >> np.uint32(shift)).astype(np.uint8).tobytes() for column in codes.T for shift in shifts]
 
 
-def _from_planes(planes: Bytes, bits: int, index: int) -> Codes:
+def _from_planes(planes: Bytes, bits: int, index: int) -> Words32:
     """[N, C] codes from planes [C, bytes, N]; the inverse of `_planes`."""
     codes = np.zeros((planes.shape[2], planes.shape[0]), np.uint32)
     for plane in range(planes.shape[1]):
