@@ -16,7 +16,7 @@ MAX_VIEWS = 10**4  # of a step
 class FitConfig:
     """Plain 3DGS (Kerbl et al. 2023, section 5 and appendix), with a schedule in fractions of the run.
 
-    The original has absolute step numbers. With fractions, 3,000 iterations grow, reach the full SH degree
+    The original has absolute step numbers. With fractions, 1,000 iterations grow, reach the full SH degree
     and settle as 30,000 do.
     """
 
