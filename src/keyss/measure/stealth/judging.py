@@ -13,8 +13,7 @@ from keyss.measure.stealth.agreement import agreement, coincidences
 from keyss.measure.stealth.bits import bits
 from keyss.measure.stealth.colours import colours, invisible_modes, opacities
 from keyss.measure.stealth.confirmation import candidate_scores, changed_low_bits
-from keyss.measure.stealth.invariants import invariants
-from keyss.measure.stealth.order import order
+from keyss.measure.stealth.invariants import invariants, order
 from keyss.measure.stealth.statistic import Statistic, Words
 
 # Detectors by kind: functions of a model and its bit patterns that give statistics by name.
