@@ -15,7 +15,7 @@ import pytest
 from channels.low_bits.trained_like import trained_like
 from files.scene_files import write_blender, write_nerfstudio
 from keyss.channels import LowBitsReader
-from keyss.cli import commands, flags, main
+from keyss.cli import commands, entry, main
 from keyss.core import KeyssError
 from keyss.keys import DerivedKey
 from keyss.methods import registry
@@ -100,7 +100,7 @@ def test_no_command_takes_a_key_as_an_argument() -> None:
         ("hide", ["--method", name, "-o", "out"]) for name in registry.METHODS
     ]
     for name, arguments in asked:
-        options = flags.options_of(commands.to_parse(name, arguments))
+        options = entry.options_of(commands.to_parse(name, arguments))
         keys = {name: hint for name, hint in options.items() if "key" in name}
         for name in keys.keys() - {"wrong_keys", "key_encoder"}:
             assert "Path" in str(keys[name]), name

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from cli.said import Run
-from keyss.cli import flags
+from keyss.cli import entry
 from keyss.core import KeyssWarning, UsageError
 
 SOURCE = Path(__file__).parents[2] / "src" / "keyss"
@@ -39,7 +39,7 @@ QUOTED = re.compile(r"`keyss [^`]*`|(pip|npm) install [^,)]*")
     ],
 )
 def test_arguments_become_flags(message: str, said: str) -> None:
-    assert flags.as_flags(message, OPTIONS) == said
+    assert entry.as_flags(message, OPTIONS) == said
 
 
 def _strings(tree: ast.Module) -> Iterator[tuple[int, str]]:

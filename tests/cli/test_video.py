@@ -16,7 +16,7 @@ import keyss as library
 from cli.said import Run, assert_refused
 from files.scene_files import write_nerfstudio
 from keyss import load_scene, write_model
-from keyss.api import filming
+from keyss.api import looking
 from keyss.core import Camera, Gaussians, UsageError
 from keyss.rendering import around, circle, look_at, middle_and_radius, render
 from tiny_scenes import random_gaussians
@@ -144,10 +144,10 @@ def test_around_stays_where_cameras_were() -> None:
 
 def test_wipes() -> None:
     black, grey = np.zeros((4, 10, 3), np.uint8), np.full((4, 10, 3), 99, np.uint8)
-    assert (filming.wiped(black, grey, 0) == 0).all()
-    assert (filming.wiped(black, grey, 1) == 99).all()
-    assert filming.wiped(black, grey, 0.5)[0, :, 0].tolist() == [99] * 4 + [255] * 2 + [0] * 4
-    assert [filming.shown(time) for time in (0, 0.5, 1)] == [0, 1, 0]
+    assert (looking.wiped(black, grey, 0) == 0).all()
+    assert (looking.wiped(black, grey, 1) == 99).all()
+    assert looking.wiped(black, grey, 0.5)[0, :, 0].tolist() == [99] * 4 + [255] * 2 + [0] * 4
+    assert [looking.shown(time) for time in (0, 0.5, 1)] == [0, 1, 0]
 
 
 @pytest.mark.parametrize(
@@ -195,7 +195,7 @@ def test_an_interrupted_film_leaves_nothing(
     def interrupted(*given: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("keyss.api.filming.render", interrupted)
+    monkeypatch.setattr("keyss.api.looking.render_view", interrupted)
     with pytest.raises(KeyboardInterrupt):
         library.render(files / "a.ply", video=tmp_path / "a.mp4", width=32)
     assert list(tmp_path.iterdir()) == []

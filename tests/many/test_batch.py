@@ -13,7 +13,7 @@ from cli.said import Run
 from keyss import CarryOptions
 from keyss.core import InputError, KeyssWarning, OutputError, WrongKeyError
 from keyss.keys import MasterKey
-from keyss.many import ManyResult, assets, cell, engines, hide_batch
+from keyss.many import ManyResult, batch, cell, engines, hide_batch
 from many.fakes import REAL
 from tiny_scenes import random_gaussians
 
@@ -56,13 +56,13 @@ def manifest(folder: Path, text: str) -> Path:
 )
 def test_what_is_wrong_in_a_table_is_said_with_its_line(folder: Path, text: str, words: str) -> None:
     with pytest.raises(InputError) as caught:
-        assets.read_assets(manifest(folder, text), master=True)
+        batch.read_assets(manifest(folder, text), master=True)
     assert words in str(caught.value)
 
 
 def test_without_a_master_key_every_row_names_a_key_file(folder: Path) -> None:
     with pytest.raises(InputError, match="expected a column key_file"):
-        assets.read_assets(manifest(folder, HEAD + "a.ply,secret.ply,x\n"), master=False)
+        batch.read_assets(manifest(folder, HEAD + "a.ply,secret.ply,x\n"), master=False)
 
 
 def hide(folder: Path, **options: Any) -> ManyResult:

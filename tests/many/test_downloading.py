@@ -13,7 +13,7 @@ import pytest
 from cli.said import Run
 from files.scene_files import WIDTH, photo, save, write_colmap
 from keyss.core import BackendError, InputError
-from keyss.many import scenes
+from keyss.many import reproducing
 from serving import serving
 
 
@@ -32,28 +32,28 @@ def server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
                 archive.write(path, Path("some", path.relative_to(tmp_path / "originals")))
         archive.writestr("some/garden/images_4/../../../../evil", "evil")
     with serving(served) as address:
-        monkeypatch.setattr(scenes, "SOURCES", {f"{address}scenes.zip": ("some/garden", "some/stump")})
+        monkeypatch.setattr(reproducing, "SOURCES", {f"{address}scenes.zip": ("some/garden", "some/stump")})
         yield served
 
 
 def test_every_scene_of_the_paper_has_one_source() -> None:
-    every = [folder.rpartition("/")[2] for folders in scenes.SOURCES.values() for folder in folders]
-    assert sorted(every) == sorted(scenes.BENCHMARK)
-    assert all(url.startswith("https://") for url in scenes.SOURCES)
+    every = [folder.rpartition("/")[2] for folders in reproducing.SOURCES.values() for folder in folders]
+    assert sorted(every) == sorted(reproducing.BENCHMARK)
+    assert all(url.startswith("https://") for url in reproducing.SOURCES)
 
 
 def test_only_what_is_needed_is_unpacked(server: Path, tmp_path: Path) -> None:
     data = tmp_path / "data"
-    scenes.download(["garden"], data)
+    reproducing.download_scenes(["garden"], data)
     assert {path.name for path in data.iterdir()} == {"archives", "garden"}
     assert {path.name for path in (data / "garden").iterdir()} == {"images_4", "sparse"}
     for path in (data / "garden").rglob("*.*"):
         original = tmp_path / "originals" / path.relative_to(data)
         assert path.read_bytes() == original.read_bytes()
     (server / "scenes.zip").unlink()
-    scenes.download(["garden", "stump"], data)  # the other one, from the archive that is there
+    reproducing.download_scenes(["garden", "stump"], data)  # the other one, from the archive that is there
     assert (data / "stump" / "images_4").is_dir()
-    scenes.download(["garden", "stump"], data)  # nothing is missing
+    reproducing.download_scenes(["garden", "stump"], data)  # nothing is missing
     assert not list(tmp_path.rglob("evil"))
 
 
@@ -61,18 +61,18 @@ def test_what_cannot_be_fetched_or_unpacked_is_said(server: Path, tmp_path: Path
     archive = (server / "scenes.zip").read_bytes()
     (server / "scenes.zip").unlink()
     with pytest.raises(InputError, match="404"):
-        scenes.download(["garden"], tmp_path / "data")
+        reproducing.download_scenes(["garden"], tmp_path / "data")
     for damaged in (archive[:-100], b"<html>not found</html>"):
         (server / "scenes.zip").write_bytes(damaged)
         with pytest.raises(InputError, match="remove it to fetch it again"):
-            scenes.download(["garden"], tmp_path / "data")
+            reproducing.download_scenes(["garden"], tmp_path / "data")
         (tmp_path / "data" / "archives" / "scenes.zip").unlink()
     other = io.BytesIO()
     with zipfile.ZipFile(other, "w") as file:
         file.writestr("flowers.txt", "elsewhere")
     (server / "scenes.zip").write_bytes(other.getvalue())
     with pytest.raises(InputError, match="cannot be fetched or unpacked"):
-        scenes.download(["garden"], tmp_path / "data")
+        reproducing.download_scenes(["garden"], tmp_path / "data")
     assert not (tmp_path / "data" / "garden").exists()
 
 
@@ -81,7 +81,7 @@ def test_without_pooch_one_sentence_says_what_to_install(
 ) -> None:
     monkeypatch.setitem(sys.modules, "pooch", None)
     with pytest.raises(BackendError, match=r"pip install 'keyss\[reproduce\]'"):
-        scenes.download(["garden"], tmp_path)
+        reproducing.download_scenes(["garden"], tmp_path)
 
 
 def test_the_command_says_what_cannot_be(keyss: Run, tmp_path: Path) -> None:

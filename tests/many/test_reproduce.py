@@ -120,7 +120,7 @@ def test_the_command(keyss: Run, out: Path, folders: tuple[Path, Path], tmp_path
 def test_the_papers_scenes_have_its_sizes_and_pairs(
     folders: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(reproducing, "link", lambda data, name, folder: folders[name < "c"])
+    monkeypatch.setattr(reproducing, "link_scene", lambda data, name, folder: folders[name < "c"])
     found = reproduce("multi", data=tmp_path, most=2, out=tmp_path / "out", dry_run=True)
     assert isinstance(found, Forecast)
     assert {each.name.partition(", ")[2] for each in found.cells} >= {"bicycle-bonsai-room"}

@@ -9,7 +9,7 @@ import pytest
 from files.scene_files import WIDTH, photo, save, write_colmap
 from keyss import load_scene, reproduce
 from keyss.core import InputError, UsageError
-from keyss.many import paper, reproducing, scenes
+from keyss.many import paper, reproducing
 
 SHRUNK = WIDTH // 4
 
@@ -22,9 +22,9 @@ def test_every_scene_hides_the_next() -> None:
 
 def test_the_papers_scenes_are_those_of_its_tables() -> None:
     pairs, triples = paper.PAPER.pairs, paper.PAPER.triples
-    assert tuple(scenes.BENCHMARK) == (*(cover for cover, _ in pairs), "playroom")
-    assert {name for pair in pairs for name in pair} == set(scenes.BENCHMARK)
-    assert {name for triple in triples for name in triple} <= set(scenes.BENCHMARK)
+    assert tuple(reproducing.BENCHMARK) == (*(cover for cover, _ in pairs), "playroom")
+    assert {name for pair in pairs for name in pair} == set(reproducing.BENCHMARK)
+    assert {name for triple in triples for name in triple} <= set(reproducing.BENCHMARK)
 
 
 @pytest.mark.parametrize(
@@ -59,27 +59,27 @@ def benchmark(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     folder = write_colmap(tmp_path / "data" / "garden", count=9)
     for path in (folder / "images").iterdir():
         save(folder / "images_4" / path.name, photo(0, size=(SHRUNK, 2)))
-    monkeypatch.setattr(scenes, "BENCHMARK", {"garden": (9, "images_4")})
+    monkeypatch.setattr(reproducing, "BENCHMARK", {"garden": (9, "images_4")})
     return tmp_path / "data"
 
 
 def test_a_benchmark_scene_is_linked(benchmark: Path, tmp_path: Path) -> None:
-    scene = load_scene(scenes.link(benchmark, "garden", tmp_path / "links"))
+    scene = load_scene(reproducing.link_scene(benchmark, "garden", tmp_path / "links"))
     assert scene.train[0].camera.width == SHRUNK  # not those of full size
     assert (len(scene.train), len(scene.test)) == (7, 2)
-    scenes.link(benchmark, "garden", tmp_path / "links")  # again
+    reproducing.link_scene(benchmark, "garden", tmp_path / "links")  # again
 
 
 def test_what_is_not_the_benchmark_is_said(
     benchmark: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with pytest.raises(InputError, match="expected a folder garden"):
-        scenes.link(tmp_path, "garden", tmp_path / "links")
+        reproducing.link_scene(tmp_path, "garden", tmp_path / "links")
     images = benchmark / "garden" / "images_4"
     images.rename(images.with_name("images_8"))
     with pytest.raises(InputError, match="images_4"):
-        scenes.link(benchmark, "garden", tmp_path / "links")
+        reproducing.link_scene(benchmark, "garden", tmp_path / "links")
     images.with_name("images_8").rename(images)
-    monkeypatch.setattr(scenes, "BENCHMARK", {"garden": (10, "images_4")})
+    monkeypatch.setattr(reproducing, "BENCHMARK", {"garden": (10, "images_4")})
     with pytest.raises(InputError, match="expected 10 photos in the COLMAP model"):
-        scenes.link(benchmark, "garden", tmp_path / "links")
+        reproducing.link_scene(benchmark, "garden", tmp_path / "links")

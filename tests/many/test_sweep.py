@@ -18,7 +18,7 @@ import scipy.stats
 
 from cli.said import Run
 from keyss.core import InputError, OutputError
-from keyss.many import Forecast, ManyResult, cell, engines, spec, sweep, tables
+from keyss.many import Forecast, ManyResult, cell, engines, sweep, sweeping, tables
 from keyss.runs import MANIFEST
 from many.fakes import DRIVER, REAL, fake, real_spec, training_spec, write_spec
 from many.killing import kill_until_done, results
@@ -56,7 +56,7 @@ def spec_of(folder: Path, text: str) -> Path:
 
 def test_a_grid_is_every_choice_with_every_other(files: Path) -> None:
     path = spec_of(files, GOOD)
-    found = list(spec.variants(path, spec.read_spec(path)))
+    found = list(sweeping.variants(path, sweeping.read_spec(path)))
     chosen = [(each.options.sh_degree, each.options.fit.iterations) for each in found]  # type: ignore[attr-defined]
     assert chosen == [(1, 10), (1, 20), (3, 10), (3, 20)]
     assert all(each.options.fit.max_gaussians == 10_000 for each in found)  # of the preset
@@ -99,7 +99,7 @@ def test_what_is_wrong_in_a_specification_is_said_before_anything_runs(
 
 def test_deeply_nested_yaml_is_refused(files: Path) -> None:
     with pytest.raises(InputError):
-        spec.read_spec(spec_of(files, "pairs: " + "[" * 100_000))
+        sweeping.read_spec(spec_of(files, "pairs: " + "[" * 100_000))
 
 
 @pytest.mark.counted

@@ -17,7 +17,7 @@ from channels.low_bits.trained_like import trained_like
 from cli.said import Run, assert_refused
 from keyss import Gaussians, Secret
 from keyss.channels import LOW_BITS, Content, Payload
-from keyss.cli.hiding_options import own_options
+from keyss.cli.hiding import own_options
 from keyss.core import InputError, UsageError, WrongKeyError
 from keyss.methods import (
     Capabilities,

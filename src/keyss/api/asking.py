@@ -14,8 +14,8 @@ from keyss.keys import normalized_key
 from keyss.methods import registry
 from keyss.methods.base import Method, MethodOptions, Plan, Source
 from keyss.rendering.orbit import is_model
-from keyss.runs.metrics import HideMetrics
-from keyss.runs.sources import PathLike, as_3dgs_model, path_of
+from keyss.runs.config import HideMetrics
+from keyss.runs.files import PathLike, as_3dgs_model, path_of
 
 _READERS = 2  # threads that read files
 

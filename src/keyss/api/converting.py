@@ -20,9 +20,9 @@ from keyss.files.models import (
 from keyss.files.reading import is_standard, write_standard_output
 from keyss.rendering import Backend, resolve_device
 from keyss.rendering.difference import psnr_between
+from keyss.runs.files import PathLike, as_model
 from keyss.runs.folder import check_not_published
 from keyss.runs.revealing import reveal_any
-from keyss.runs.sources import PathLike, as_model
 
 # A secret with a smaller share of its Gaussians left counts as lost.
 _KEPT = 0.99

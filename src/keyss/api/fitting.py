@@ -1,26 +1,62 @@
-"""`fit`: a plain 3DGS model of a scene."""
+"""`fit`: a plain 3DGS model of a scene, trained by one process or by those of torchrun together."""
 
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from contextlib import nullcontext
-from dataclasses import asdict
+from dataclasses import asdict, replace
+from functools import wraps
 from pathlib import Path
+from typing import ParamSpec, TypeVar
 
-from keyss.api.together import begun, together
+import msgspec
+
 from keyss.core.scene import Scene, ViewOptions
 from keyss.fitting.config import FitConfig
 from keyss.fitting.image_metrics import quality
 from keyss.fitting.plain import FitResult, fit_scene
-from keyss.fitting.ranks import here
+from keyss.fitting.ranks import here, joined
 from keyss.progress import Reporter
 from keyss.rendering import Backend, resolve_device
-from keyss.runs.config import FitRunConfig
-from keyss.runs.files import CONFIG, METRICS, MODEL
-from keyss.runs.folder import RunFolder
-from keyss.runs.metrics import FitMetrics
+from keyss.runs.config import FitMetrics, FitRunConfig
+from keyss.runs.files import CONFIG, METRICS, MODEL, Background, PathLike, as_scene, path_of
+from keyss.runs.folder import RunFolder, recorded_number
 from keyss.runs.planning import in_a_line, plan_fit, worth_planning
-from keyss.runs.sources import Background, PathLike, as_scene, path_of
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+def together(verb: Callable[P, R]) -> Callable[P, R]:
+    """Let all processes of torchrun join in `verb`, which takes `device`."""
+
+    @wraps(verb)
+    def joining(*arguments: P.args, **options: P.kwargs) -> R:
+        with joined(str(options.get("device", "auto"))):
+            return verb(*arguments, **options)
+
+    return joining
+
+
+def begun(config: FitConfig, interrupted: Path | None, *names: str) -> FitConfig:
+    """`config` with a seed and a number of views, the same in all processes.
+
+    A resumed run takes them from the `interrupted` run's folder, in whose arguments its config is found by
+    `names`. Otherwise the default is a random seed, and one view for each process. Raises UsageError if the
+    views cannot be divided evenly.
+    """
+    ranks = here()
+    if interrupted is not None and ranks.first:
+        config = config.seeded(recorded_number(interrupted, *names, "seed"))
+        if config.views_per_step is None:
+            views = recorded_number(interrupted, *names, "views_per_step")
+            config = replace(config, views_per_step=views)
+    config = config.seeded()
+    if ranks.count == 1:
+        return config
+    config = replace(config, views_per_step=ranks.views(config.views_per_step))
+    return msgspec.json.decode(ranks.from_first(msgspec.json.encode(config)), type=FitConfig)
 
 
 @together

@@ -14,7 +14,7 @@ import msgspec
 import torch
 
 from keyss.api.asking import HideResult, Secret, check_keys, method_for, sources_of
-from keyss.api.together import begun, together
+from keyss.api.fitting import begun, together
 from keyss.channels import AnyChannel, Publish, channel_for, open_content
 from keyss.core.errors import QualityError, UsageError
 from keyss.core.gaussians import Gaussians, same_bits
@@ -36,22 +36,25 @@ from keyss.progress import Reporter
 from keyss.rendering import Backend, resolve_device
 from keyss.rendering.difference import psnr_between
 from keyss.rendering.orbit import is_model
-from keyss.runs.config import RunConfig, secret_ids
+from keyss.runs.config import FitMetrics, HideMetrics, RunConfig, secret_ids
 from keyss.runs.files import (
     CONFIG,
     METRICS,
     MODEL,
     STEGOS,
+    Background,
+    PathLike,
+    as_3dgs_model,
+    as_scene,
     bound_names,
     handed_names,
+    path_of,
     plain_names,
     stego_name,
 )
 from keyss.runs.folder import RunFolder
-from keyss.runs.metrics import FitMetrics, HideMetrics
 from keyss.runs.planning import check_disk, in_a_line, plan_hiding, worth_planning
 from keyss.runs.records import read_record, record_bytes
-from keyss.runs.sources import Background, PathLike, as_3dgs_model, as_scene, path_of
 
 MIN_PSNR = 20.0  # dB to the plain model; below it, renders show something else
 MIN_PRUNED_PSNR = 25.0  # the same for secrets that lost Gaussians without a refit

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import warnings
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from keyss.channels import open_content
 from keyss.core.errors import KeyssWarning, UsageError
@@ -14,12 +13,16 @@ from keyss.files.models import check_model_output, is_model_path, write_model
 from keyss.files.reading import is_standard
 from keyss.methods.opened import Frame, HiddenFile, OpensAFileError
 from keyss.rendering import Backend, resolve_device
+from keyss.runs.files import PathLike, as_model
 from keyss.runs.folder import check_not_published
-from keyss.runs.revealing import Revealed, reveal_model, revealed_file
-from keyss.runs.sources import PathLike, as_model
-
-if TYPE_CHECKING:
-    from keyss.runs.verifying import Verification
+from keyss.runs.revealing import (
+    Revealed,
+    Verification,
+    check_model,
+    check_secret,
+    reveal_model,
+    revealed_file,
+)
 
 
 def reveal(
@@ -101,8 +104,6 @@ def verify(
     Without a key, the result does not tell whether something is hidden. Raises InputError for a file that is
     not a whole and finite model, WrongKeyError for a key that opens nothing.
     """
-    from keyss.runs.verifying import Verification, check_model, check_secret  # which renders
-
     target = resolve_device(device)
     name = "model" if isinstance(model, Gaussians) else str(model)
     gaussians = as_model(model)

@@ -1,27 +1,43 @@
-"""The parts of an audit: what each measures, and against which baseline or control."""
+"""The parts of an audit: what each takes, what it measures, and against which baseline or control."""
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
+from pathlib import Path
 from statistics import fmean
-from typing import Any
+from typing import Any, Generic, TypeVar
 
+import msgspec
+import torch
 from torch import Tensor
 
 from keyss.audits.numbers import numbered
-from keyss.audits.progress import PartProgress, PartResult
 from keyss.audits.record import (
+    AUDIT_FILE,
+    AUDIT_FOLDER,
     PICTURES,
+    Audit,
     ImagesResult,
     ModelImages,
     ParametersResult,
     RendersResult,
+    read_audit,
 )
-from keyss.audits.subject import AuditSubject
-from keyss.files.images import picture_names
+from keyss.core.errors import InputError, UsageError
+from keyss.core.gaussians import Gaussians
+from keyss.core.scene import Scene
+from keyss.files.atomic import write_bytes
+from keyss.files.images import picture_names, png_bytes
+from keyss.files.models import read_model
+from keyss.files.reading import read_file
+from keyss.fitting.config import FitConfig
+from keyss.fitting.plain import fit_scene
 from keyss.measure.distances import against_controls
+from keyss.measure.hiding import in_cover
 from keyss.measure.images import compare_images, photos_of, renders_of, steganalysed
 from keyss.measure.leaks.attacks import decoder_attack, file_attacks, with_the_key
 from keyss.measure.leaks.looking import AttackResult, look_for_secret
@@ -31,9 +47,152 @@ from keyss.measure.speed import SpeedResult, measure_speed
 from keyss.measure.stealth.judging import StealthResult, judge
 from keyss.measure.stegexpose import stegexpose_auc
 from keyss.measure.two_sample import auc_beside_controls
-from keyss.runs.files import stego_in
+from keyss.progress import Reporter
+from keyss.runs.files import CONTROLS, as_model, stego_in
+from keyss.runs.folder import RunFolder
+from keyss.runs.opening import HidingRun
+from keyss.runs.records import write_record
 
+T = TypeVar("T")
 PICTURED_VIEWS = 3
+
+
+@dataclass(frozen=True)
+class AuditSubject:
+    """The input of the parts of an audit; models on `device`."""
+
+    run: HidingRun
+    scenes: tuple[Scene, ...]  # the cover, then the secrets, each in its own frame
+    in_cover: tuple[Scene, ...]  # the secrets with their test cameras in the cover's frame
+    stego: Gaussians
+    revealed: tuple[Gaussians, ...]  # the secrets, in their own frames
+    original: Gaussians  # plain model of the cover
+    baselines: tuple[Gaussians | None, ...]  # plain models of the secrets, if there are any
+    controls: tuple[Gaussians, ...]  # plain models of the cover from other seeds
+    seeds: tuple[int, ...]  # of the controls
+    device: torch.device
+
+
+def subject_of(
+    run: HidingRun,
+    original: Path | str | None,
+    controls: int,
+    seed: int,
+    device: torch.device,
+    reporter: Reporter,
+    folder: RunFolder,
+) -> AuditSubject:
+    """Read, reveal and fit what the audit needs; plain models are kept in the run's `folder` for reuse.
+
+    `original`: a plain model of the cover, by default the run's own. `controls`: how many to train, from
+    seeds derived from the run's own and `seed`. Raises UsageError without a plain model of the cover.
+    """
+    scenes = run.scenes()
+    plain, *_ = run.plain_models()
+    _, *baselines = run.baselines()
+    if original is not None:
+        plain = as_model(original)
+    if plain is None:
+        raise UsageError(f"{run.folder} has no plain model of the cover to compare with: give `original`")
+    stego = run.stego.to(device)
+    config = run.config.options.fit
+    if original is not None or run.config.models_given[0]:  # its size is not the run's
+        config = replace(config, max_gaussians=max(len(plain), 16))
+    seeds = tuple(run.config.options.fit.seed_of(f"control {seed + index}") for index in range(controls))
+    return AuditSubject(
+        run=run,
+        scenes=tuple(scenes),
+        in_cover=tuple(in_cover(*pair, scenes[0]) for pair in zip(run.opened, scenes[1:], strict=True)),
+        stego=stego,
+        revealed=tuple(secret.reveal(stego).to(device) for secret in run.opened),
+        original=plain.to(device),
+        baselines=tuple(None if model is None else model.to(device) for model in baselines),
+        controls=tuple(
+            _plain_model(scenes[0], replace(config, seed=own), folder, device, reporter).to(device)
+            for own in seeds
+        ),
+        seeds=seeds,
+        device=device,
+    )
+
+
+def _plain_model(
+    scene: Scene, config: FitConfig, folder: RunFolder, device: torch.device, reporter: Reporter
+) -> Gaussians:
+    """A plain model of a scene, from the run's folder if it was fitted there before."""
+    made_of = json.dumps({"scene": scene.digest(), "config": asdict(config)}, sort_keys=True)
+    name = f"seed-{config.seed}-{hashlib.sha256(made_of.encode()).hexdigest()[:12]}"
+    model = f"{CONTROLS}/{name}.ply"
+    if (folder.path / model).exists():
+        return read_model(folder.path / model)
+    checkpoint = folder.checkpoints / f"{name}.safetensors"
+    result = fit_scene(
+        scene,
+        config,
+        device=device,
+        title=f"plain model of the cover, seed {config.seed}",
+        checkpoint=checkpoint,
+        resume=True,
+        reporter=reporter,
+    )
+    folder.keep("controls", model, result.gaussians)
+    checkpoint.unlink(missing_ok=True)
+    return result.gaussians
+
+
+@dataclass(frozen=True)
+class PartResult(Generic[T]):
+    """The result of one part of an audit."""
+
+    section: T  # of `Audit`
+    pictures: dict[str, Tensor] = field(default_factory=dict)  # [H, W, 3] uint8 by file name
+
+
+class PartialAudit:
+    """The audit so far, with its pictures, in a folder laid out as a run's; for the same `inputs` only."""
+
+    def __init__(self, folder: Path, begun: Audit, inputs: dict[str, object]) -> None:
+        self.folder, self.audit = folder, begun
+        self.file = folder / AUDIT_FOLDER / AUDIT_FILE
+        self.pictures = self.file.parent / PICTURES
+        digest = hashlib.sha256(msgspec.json.encode(inputs, order="sorted")).digest()
+        path = folder / "inputs.sha256"
+        if not path.exists():
+            write_bytes(path, digest)
+        elif read_file(path, len(digest)) != digest:
+            raise InputError(
+                f"{folder}: belongs to an audit with other settings or inputs: "
+                "give the same ones, or start again with `overwrite=True`"
+            )
+        if self.file.exists():
+            self.audit = replace(read_audit(folder), run=begun.run)
+
+    def add(self, part: str, result: PartResult[Any]) -> None:
+        self.pictures.mkdir(parents=True, exist_ok=True)
+        for name, picture in result.pictures.items():
+            write_bytes(self.pictures / name, png_bytes(picture))
+        write_record(self.file, replace(self.audit, **{part: result.section}))
+        self.audit = read_audit(self.folder)
+
+
+class PartProgress:
+    """Progress of one part: call it with the numbers of items done and of all."""
+
+    def __init__(self, reporter: Reporter, title: str) -> None:
+        self._reporter, self._title, self._total = reporter, title, 0
+
+    def __call__(self, done: int, total: int) -> None:
+        if not self._total:
+            self._reporter.start(self._title, total, 0)
+        self._total = total
+        self._reporter.update(done, 0, {})
+
+    def finish(self, complete: bool) -> None:
+        if self._total:
+            if complete:
+                self._reporter.update(self._total, 0, {})
+            self._reporter.finish()
+
 
 AuditPart = Callable[[AuditSubject, int, PartProgress], PartResult[Any]]
 

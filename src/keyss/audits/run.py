@@ -15,8 +15,7 @@ from pathlib import Path
 import msgspec
 
 from keyss._version import __version__
-from keyss.audits.parts import OF_3DGS_MODELS, PARTS
-from keyss.audits.progress import PartialAudit, PartProgress
+from keyss.audits.parts import OF_3DGS_MODELS, PARTS, AuditSubject, PartialAudit, PartProgress, subject_of
 from keyss.audits.record import (
     AUDIT_FILE,
     AUDIT_FOLDER,
@@ -25,15 +24,13 @@ from keyss.audits.record import (
     AuditedRun,
     read_audit,
 )
-from keyss.audits.subject import AuditSubject, subject_of
 from keyss.core import Interrupted, KeyssWarning, UsageError, import_extra, signal_of
 from keyss.methods import registry
 from keyss.progress import Reporter
 from keyss.rendering import Backend, resolve_device
-from keyss.runs.files import REPORT
+from keyss.runs.files import REPORT, PathLike
 from keyss.runs.folder import CHECKPOINTS, RunFolder, read_manifest, write_again
 from keyss.runs.opening import HidingRun, open_run
-from keyss.runs.sources import PathLike
 
 _LIBRARIES = ("torch", "numpy", "scipy", "scikit-learn", "pot", "gsplat", "numba")
 EXTRA = ("jinja2", "ot", "sklearn")

@@ -46,7 +46,7 @@ def command(name: str) -> Callable[..., None]:
 def to_parse(name: str, arguments: Sequence[str]) -> Callable[..., None]:
     """The function of a command as it is parsed: `hide` has the options of the method in `arguments`."""
     if name == "hide":
-        from keyss.cli.hiding_options import with_options_of_method
+        from keyss.cli.hiding import with_options_of_method
 
         return with_options_of_method(arguments)
     return command(name)

@@ -2,23 +2,26 @@
 
 from __future__ import annotations
 
+import inspect
 import os
+import re
 import signal
 import sys
 import time
 import warnings
-from collections.abc import Collection, Iterator, Sequence
-from contextlib import contextmanager
-from typing import Any
+from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from dataclasses import is_dataclass
+from typing import Any, get_type_hints
 
 from keyss import __version__
-from keyss.cli import ranks
-from keyss.cli.flags import as_flags, options_of
+from keyss._torchrun import processes, rank
 from keyss.core.errors import (
     BackendError,
     Interrupted,
     KeyssError,
     KeyssWarning,
+    OtherProcessError,
     OutputError,
     UsageError,
     nearest,
@@ -31,6 +34,16 @@ INTERNAL_ERROR = 70  # EX_SOFTWARE
 NO_ROOM = OutputError.exit_status
 _LEVELS = {"-q": -1, "--quiet": -1, "-v": 1, "--verbose": 1}
 _KEY_OPTIONS = ("--key", "--keys", "--password", "--passphrase")  # that people may expect
+# Between backticks: `overwrite=True`, `method="carry", dither=True`, `sh_degree`.
+_VALUE = r"""(?:"[^"`]*"|'[^'`]*'|[\w.+-]+)"""
+_ASSIGNMENT = rf"([A-Za-z_]\w*)=({_VALUE})"
+_ASSIGNMENTS = re.compile(rf"`({_ASSIGNMENT}(?:, ?{_ASSIGNMENT})*)`")
+_NAME = re.compile(r"`([a-z_]\w*)`")
+
+# Arguments whose flags have another name.
+_RENAMED = {"key": "key-file", "keys": "key-file", "secrets": "secret", "model": "secret-model"}
+_RENAMED |= {"download_scenes": "download"}
+COMMANDS = ("fit", "hide")  # that train
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -42,7 +55,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     options: set[str] = set()  # of the command, by their names in Python
     try:
-        with ranks.only_first_prints(), _warnings_as_lines(options), _verbosity(arguments) as asked:
+        with only_first_prints(), _warnings_as_lines(options), _verbosity(arguments) as asked:
             try:
                 _run(asked or ["--help"], options)
             finally:
@@ -56,8 +69,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         status, message = explain(_interrupt_behind(error) or error)
         if status == INTERNAL_ERROR and os.environ.get("KEYSS_DEBUG") == "1":
             raise
-        if ranks.prints(error):
-            print(f"keyss: {ranks.prefix()}{_one_line(as_flags(message, options))}", file=sys.stderr)
+        if prints(error):
+            print(f"keyss: {prefix()}{_one_line(as_flags(message, options))}", file=sys.stderr)
         return status
 
 
@@ -67,7 +80,7 @@ def _run(arguments: list[str], options: set[str]) -> None:
     if arguments in (["--version"], ["-V"]):  # without importing what parses arguments, which takes longer
         print(__version__)
         return
-    ranks.check_command(name)
+    check_command(name)
 
     import tyro
 
@@ -217,3 +230,80 @@ def _is_out_of_memory(error: BaseException) -> bool:
 def _one_line(message: str) -> str:
     """`message` without line breaks and control characters, which file names may contain."""
     return " ".join("".join(c if c.isprintable() else " " for c in message).split())
+
+
+def as_flags(message: str, options: Collection[str]) -> str:
+    """`message` with flags in place of the arguments that it names between backticks.
+
+    Names without a value are replaced only if they are in `options`, since they may be anything else.
+    """
+
+    def assignments(found: re.Match[str]) -> str:
+        return " ".join(_flag(name, value) for name, value in re.findall(_ASSIGNMENT, found[1]))
+
+    def name(found: re.Match[str]) -> str:
+        known = found[1] in options or _RENAMED.get(found[1], "").replace("-", "_") in options
+        return _flag(found[1], "True") if known else found[0]
+
+    return _NAME.sub(name, _ASSIGNMENTS.sub(assignments, message))
+
+
+def _flag(name: str, value: str) -> str:
+    flag = f"--{_RENAMED.get(name, name.replace('_', '-'))}"
+    match value:
+        case "True":
+            return flag
+        case "False" | "None":
+            return f"no {flag}"
+    return f"{flag} {value.strip(chr(34) + chr(39))}"
+
+
+def options_of(command: Callable[..., Any]) -> dict[str, Any]:
+    """The options of a command with their types, those of groups included."""
+    found: dict[str, Any] = {}
+    for each in inspect.signature(command, eval_str=True).parameters.values():
+        if is_dataclass(group := getattr(each.annotation, "__origin__", each.annotation)):
+            found |= _options_of_group(group)
+        elif each.kind is each.KEYWORD_ONLY:
+            found[each.name.rstrip("_")] = each.annotation
+    return found
+
+
+def _options_of_group(group: Any) -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    for name, hint in get_type_hints(group, include_extras=True).items():
+        nested = getattr(hint, "__origin__", hint)
+        found |= _options_of_group(nested) if is_dataclass(nested) else {name: hint}
+    return found
+
+
+def answers() -> bool:
+    """True in the first process, or the only one."""
+    return rank() == 0
+
+
+@contextmanager
+def only_first_prints() -> Iterator[None]:
+    """Silences the standard streams of all processes but the first."""
+    if answers():
+        yield
+        return
+    with open(os.devnull, "w") as nowhere, redirect_stdout(nowhere), redirect_stderr(nowhere):
+        yield
+
+
+def prints(error: BaseException) -> bool:
+    """True if this process prints `error`: only the first prints errors that all of them raise."""
+    return answers() or not isinstance(error, UsageError | OtherProcessError | KeyboardInterrupt)
+
+
+def prefix() -> str:
+    """The name of this process in messages, if it is not the first."""
+    return "" if answers() else f"process {rank() + 1} of {processes()}: "
+
+
+def check_command(command: str, *, trains: bool | None = None) -> None:
+    """Raise UsageError for a command that does not train, in several processes."""
+    trains = command.startswith("-") or command in COMMANDS if trains is None else trains
+    if processes() > 1 and not trains:
+        raise UsageError(f"torchrun is for `keyss fit` and `keyss hide`: start `keyss {command}` without it")

@@ -92,7 +92,7 @@ def render(
     if video is not None:
         if out is not None or split != "test":
             raise UsageError("--video writes no images: leave out -o and --split")
-        from keyss.api.filming import frame_count
+        from keyss.api.looking import frame_count
         from keyss.progress import reporter
 
         keyss.render(

@@ -80,12 +80,12 @@ def fit(
     from dataclasses import replace
 
     import keyss
-    from keyss.cli.ranks import answers
+    from keyss.cli.entry import answers
     from keyss.cli.reporting import reporting
     from keyss.cli.tables import print_files, print_fit
     from keyss.fitting.config import PRESETS
+    from keyss.runs.config import FitMetrics
     from keyss.runs.files import METRICS
-    from keyss.runs.metrics import FitMetrics
     from keyss.runs.records import read_record
 
     with reporting(out, scene, training) as reporter:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from keyss.cli.arguments import Training
-from keyss.cli.ranks import answers
+from keyss.cli.entry import answers
 from keyss.core.errors import import_extra
 from keyss.progress import Reporter, reporter as lines
 

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from keyss.many import Forecast, ManyResult
     from keyss.measure.stegexpose import Steganalysis
     from keyss.methods.base import Plan
-    from keyss.runs.metrics import FitMetrics, HideMetrics
+    from keyss.runs.config import FitMetrics, HideMetrics
 
 
 _HEADS = ("PSNR", "SSIM", "bound", "loss", "start", "Gaussians", "plain's", "steps")

@@ -6,22 +6,21 @@ import io
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
 from PIL import Image
 
 import keyss
 from keyss.core import Gaussians, Interrupted, Scene, WrongKeyError
+from keyss.core.arrays import Bytes
 from keyss.files import load_scene
 from keyss.files.atomic import public_mode
 from keyss.fitting import FitConfig, mean_psnr
-from keyss.many.sheet import contact_sheet
+from keyss.many.comparing import contact_sheet
 from keyss.methods import CarryOptions
 from keyss.progress import Reporter
 from keyss.rendering import Backend, resolve_device
+from keyss.runs.config import HideMetrics
 from keyss.runs.files import STEGO, plain_names
 from keyss.runs.folder import RunFolder, clear
-from keyss.runs.metrics import HideMetrics
 from keyss.viewer.page import page_with
 
 COVER, SECRET = "tea-table", "golden-knot"
@@ -135,10 +134,10 @@ def _comparison(
     count = len(cover.test)
     rows = sorted({count // 6, count // 2, count - 1 - count // 6})
 
-    def photos(scene: Scene) -> list[NDArray[np.uint8]]:
+    def photos(scene: Scene) -> list[Bytes]:
         return [scene.test[row].image.numpy() for row in rows]
 
-    def renders(model: Path | Gaussians, scene: Scene) -> list[NDArray[np.uint8]]:
+    def renders(model: Path | Gaussians, scene: Scene) -> list[Bytes]:
         images = keyss.render(model, scene, device=device)
         return [images[row][1].numpy() for row in rows]
 

@@ -3,7 +3,7 @@
 A *cell* is a plain fit, or a hiding and its measures, in a folder of its own (`keyss.many.cell`). Cells run
 in processes of this machine, on a cluster, or in this process (`keyss.many.running`); a cell that is done is
 never run again. A sweep (YAML), a batch (CSV), a comparison of methods and a table of the paper add cells to
-a folder (`keyss.many.folder`), and make tables of their numbers.
+a folder (`keyss.many.running`), and make tables of their numbers.
 """
 
 import lazy_loader

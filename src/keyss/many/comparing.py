@@ -1,31 +1,37 @@
-"""`compare`: methods side by side, on the same scenes and with the same budget."""
+"""`compare`: methods side by side, on the same scenes and with the same budget, in two tables."""
 
 from __future__ import annotations
 
 import io
+import math
 import os
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+from keyss._version import __version__
+from keyss.core.arrays import Bytes
 from keyss.core.errors import UsageError
 from keyss.core.scene import ViewOptions
 from keyss.files.atomic import write_bytes
 from keyss.fitting.config import PRESETS, FitConfig
-from keyss.many.comparison import ComparedMethod, Comparison, comparison_text
-from keyss.many.folder import CellFolder, Forecast
+from keyss.many.measures import CONVERSIONS
 from keyss.many.performing import keys_of
-from keyss.many.running import Outcome
-from keyss.many.sheet import comparison_sheet
+from keyss.many.running import CellFolder, Forecast, Outcome
+from keyss.many.tables import markdown_rows
+from keyss.measure.images import renders_of
 from keyss.methods import registry
 from keyss.methods.base import MethodOptions
 from keyss.progress import Reporter, reporter as default_reporter
-from keyss.rendering import Backend
+from keyss.rendering import Backend, resolve_device
 from keyss.rendering.orbit import is_model
+from keyss.runs.files import PathLike
 from keyss.runs.opening import HidingRun, open_run
 from keyss.runs.records import write_record
-from keyss.runs.sources import PathLike
 
 RECORD, TABLE, PICTURE = "comparison.json", "comparison.md", "comparison.png"
 MEASURES = ("files", "pictures", "secrecy", "survival")
@@ -39,6 +45,19 @@ EVERY = tuple(
 )
 
 OptionsT = TypeVar("OptionsT", bound=MethodOptions)
+_LEGEND = (
+    "Test views: photos that were not trained on. Steps: those in which cover and secret were rendered, in "
+    "total. 3dgs is the bound: plain 3DGS of as many Gaussians and as many training steps. Picture: the time "
+    "of one of the cover and of the secret, and its ratio to that of plain 3DGS. Seconds: of hiding, after "
+    "plain models.",
+    "Wrong keys: PSNR in dB of what they show against the cover, and at most against the secret; in brackets "
+    "that of the published model itself against the secret. Classifier and StegExpose: area under the ROC "
+    "curve against plain models of the cover from other seeds, 0.5 where they cannot be told apart. p: of "
+    "the file's least likely statistic beside those. In brackets the same of a plain model of the cover.",
+    "Pruned of a random quarter, converted and back, purified (as by GSPure): change of cover and secret in "
+    "dB. Lost: the secret does not open any more.",
+)
+Picture = Bytes  # [H, W, 3]
 
 
 def compare(
@@ -151,3 +170,213 @@ def _row(name: str, outcome: Outcome, folder: CellFolder) -> ComparedMethod:
 def _opened(folder: CellFolder, place: Path) -> HidingRun:
     cell = folder.cells[place]
     return open_run(place / cell.run, [key for key in keys_of(cell) if key])
+
+
+@dataclass(frozen=True, kw_only=True)
+class ComparedMethod:
+    """One method; `error` is the reason for a missing result."""
+
+    name: str  # METHOD, METHOD:PRESET or METHOD:VARIANT
+    run: str | None = None  # the folder of its run, relative to that of the comparison
+    error: str | None = None
+    keys: bool = True
+    max_secrets: int = 1
+    numbers: dict[str, float] = field(default_factory=dict)  # see `keyss.many.cell.Result`
+    notes: dict[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Comparison:
+    """`comparison.json`."""
+
+    version: int = 3
+    keyss: str = __version__
+    arguments: dict[str, Any]
+    methods: tuple[ComparedMethod, ...] = ()
+
+
+Column = Callable[[ComparedMethod], str]
+
+
+def comparison_tables(found: Comparison) -> dict[str, list[list[str]]]:
+    """Rows of text by title, the heads first: fidelity and cost, secrecy and survival.
+
+    Methods that failed have no row.
+    """
+    rows = [each for each in found.methods if each.error is None]
+    return {
+        title: [
+            [head.rstrip() for head in columns],
+            *([shown(row) for shown in columns.values()] for row in rows),
+        ]
+        for title, columns in (("Fidelity and cost", _FIDELITY), ("Secrecy and survival", _SECRECY))
+    }
+
+
+def comparison_notes(comparison: Comparison) -> list[str]:
+    """A sentence for each method that failed, and for each reason to skip a measure; the legend."""
+    failures = [f"{row.name}: not possible: {row.error}" for row in comparison.methods if row.error]
+    reasons: dict[str, list[str]] = {}
+    for row in comparison.methods:
+        for measure, reason in row.notes.items():
+            reasons.setdefault(f"{measure.partition('.')[2]}: {reason}", []).append(row.name)
+    skipped = [f"not tried ({', '.join(names)}): {reason}" for reason, names in reasons.items()]
+    return [*failures, *skipped, *_LEGEND]
+
+
+def comparison_text(comparison: Comparison) -> str:
+    """Both tables and the notes in Markdown."""
+    lines = []
+    for title, rows in comparison_tables(comparison).items():
+        lines += [f"## {title}", "", *markdown_rows(rows), ""]
+    lines += [f"- {note}" for note in comparison_notes(comparison)]
+    return "\n".join(lines) + "\n"
+
+
+def _number(name: str, form: str) -> Column:
+    """The number of this name, formatted; nothing where it was not measured."""
+    return lambda each: f"{each.numbers[name]:{form}}" if name in each.numbers else ""
+
+
+def _bytes(name: str) -> Column:
+    return lambda each: f"{each.numbers[name] / 1e6:,.2f} MB" if each.numbers[name] else "nothing"
+
+
+def _picture(each: ComparedMethod) -> str:
+    times = [(each.numbers[f"pictures.{role}.{what}"] for what in ("seconds", "ratio")) for role in _ROLES]
+    return ", ".join(f"{1000 * seconds:.0f} ({ratio:.1f}x)" for seconds, ratio in times)
+
+
+def _steps(each: ComparedMethod) -> str:
+    found = [each.numbers.get(f"steps.{index}") for index in (1, 2)]
+    return ", ".join("unknown" if steps is None else f"{steps:,.0f}" for steps in found)
+
+
+def _wrong_keys(each: ComparedMethod) -> str:
+    names = ("wrong_key.vs_cover.mean", "wrong_key.vs_secrets.1.max", "chance_level.1")
+    shown = [each.numbers[name] for name in names if name in each.numbers]
+    if len(shown) == len(names):
+        return "{:.1f}, {:.1f} ({:.1f})".format(*shown)
+    return "open nothing" if each.keys else "no keys"
+
+
+def _standard(each: ComparedMethod) -> str:
+    """Measured with third-party readers, not the method's claim."""
+    tried, load = (int(each.numbers[f"files.{name}"]) for name in ("readers", "readers that load"))
+    word = "yes" if load == tried else "no"
+    return f"{word}, {load} of {tried} readers" if tried else "not tried"
+
+
+def _beside(name: str, shown: Callable[[float], str]) -> Column:
+    """A number of the published model, and in brackets that of a plain one."""
+
+    def column(each: ComparedMethod) -> str:
+        own, plain = (each.numbers.get(f"secrecy.{name}{end}") for end in ("", "_plain"))
+        if own is None:
+            return "no 3DGS"
+        return shown(own) if plain is None else f"{shown(own)} ({shown(plain)})"
+
+    return column
+
+
+def _area(value: float) -> str:
+    return f"{value:.2f}"
+
+
+def _probability(value: float) -> str:
+    return "<1e-16" if value < 1e-16 else f"{value:.1g}"
+
+
+def _survived(change: str) -> Column:
+    def column(each: ComparedMethod) -> str:
+        cover, secret = (each.numbers.get(f"survival.{change}.{role}") for role in _ROLES)
+        if cover is None:
+            return "not tried"
+        return f"{_gained(cover)}, {'lost' if secret is None else _gained(secret)}"
+
+    return column
+
+
+def _gained(loss: float) -> str:
+    """In decibels, without -0.0."""
+    return f"{0.0 - round(loss, 1):+.1f}"
+
+
+_ROLES = ("cover", "secret")
+_FIDELITY: dict[str, Column] = {
+    "method": lambda each: each.name,
+    "cover": _number("cover.psnr", ".2f"),
+    "SSIM": _number("cover.ssim", ".3f"),
+    "secret": _number("secrets.1.psnr", ".2f"),
+    "SSIM ": _number("secrets.1.ssim", ".3f"),
+    "published": _bytes("files.published"),
+    "handed over": _bytes("files.handed"),
+    "picture, ms": _picture,
+    "seconds": _number("seconds", ".0f"),
+    "steps": _steps,
+}
+_SECRECY: dict[str, Column] = {
+    "method": lambda each: each.name,
+    "keys": lambda each: "yes" if each.keys else "no",
+    "secrets": lambda each: f"{each.max_secrets}",
+    "wrong keys": _wrong_keys,
+    "standard .ply": _standard,
+    "classifier": _beside("classifier", _area),
+    "p": _beside("stealth", _probability),
+    "StegExpose": _beside("stegexpose", _area),
+    **{name: _survived(name) for name in ("pruned", *(each[0] for each in CONVERSIONS), "purified")},
+}
+
+
+def comparison_sheet(runs: Mapping[str, HidingRun], device: Backend) -> Image.Image:
+    """A row for each method: cover, secret and its error (times 4) from the middle test camera."""
+    target = resolve_device(device)
+    rows: dict[str, Sequence[Picture]] = {}
+    for name, run in runs.items():
+        stego = run.stego.to(target)
+        models = [stego, run.opened[0].reveal(stego).to(target)]
+        photos, renders = [], []
+        for scene, model in zip(run.scenes(train_pictures=False), models, strict=True):
+            view = scene.test[len(scene.test) // 2]
+            photos.append(view.image.numpy())
+            renders.append(renders_of(model, scene, [view])[0][1].numpy())
+        error = np.abs(photos[1].astype(int) - renders[1]).clip(0, 63).astype(np.uint8) * 4
+        rows.setdefault("photos", [*photos, np.zeros_like(error)])
+        rows[name] = [*renders, error]
+    return contact_sheet(["cover", "secret", "error of the secret, x4"], rows)
+
+
+def contact_sheet(
+    heads: Sequence[str], rows: Mapping[str, Sequence[Picture]], cell: int = 200
+) -> Image.Image:
+    """Rows of pictures, each `cell` pixels high, beside the names of the rows and below heads."""
+    gap, font = cell // 40, ImageFont.load_default(cell // 14)
+    scaled = [
+        [
+            Image.fromarray(each).resize((max(1, round(each.shape[1] * cell / each.shape[0])), cell))
+            for each in pictures
+        ]
+        for pictures in rows.values()
+    ]
+    label = max(math.ceil(font.getlength(name)) for name in rows) + gap
+    lines = 1 + max(head.count("\n") for head in heads)
+    top = gap + lines * (cell // 8)
+    widths = [
+        max(
+            *(math.ceil(font.getlength(line)) for line in ["", *head.split("\n")]),
+            *(each.width for each in column),
+        )
+        for head, column in zip(heads, zip(*scaled, strict=True), strict=True)
+    ]
+    starts = [label + gap + sum(widths[:index]) + gap * index for index in range(len(widths))]
+    size = starts[-1] + widths[-1] + gap, top + (cell + gap) * len(rows)
+    sheet = Image.new("RGB", size, "white")
+    draw = ImageDraw.Draw(sheet)
+    for x, head in zip(starts, heads, strict=True):
+        draw.multiline_text((x, gap), head, fill=(20, 20, 20), font=font)
+    for number, (name, pictures) in enumerate(zip(rows, scaled, strict=True)):
+        y = top + (cell + gap) * number
+        draw.text((gap, y + gap), name, fill=(20, 20, 20), font=font)
+        for x, picture in zip(starts, pictures, strict=True):
+            sheet.paste(picture, (x, y))
+    return sheet

@@ -12,12 +12,10 @@ from functools import cached_property, lru_cache
 from pathlib import Path
 from statistics import fmean
 
-import numpy as np
-from numpy.typing import NDArray
-
 from keyss.audits import PARTS
 from keyss.audits.run import EXTRA
 from keyss.channels import is_appended
+from keyss.core.arrays import Bytes
 from keyss.core.decoded import DecodedGaussians
 from keyss.core.errors import InputError, UsageError, import_extra
 from keyss.core.gaussians import Gaussians
@@ -33,9 +31,8 @@ from keyss.measure.stegexpose import stegexpose_auc
 from keyss.measure.two_sample import two_sample_auc
 from keyss.methods import registry
 from keyss.rendering import Backend, resolve_device
-from keyss.runs.files import HANDED, stego_in
+from keyss.runs.files import HANDED, as_scene, stego_in
 from keyss.runs.opening import HidingRun
-from keyss.runs.sources import as_scene
 
 Numbers = dict[str, float | str]
 
@@ -233,11 +230,11 @@ class PlainCovers:
         return self.judged(self.models[0], True)
 
     @cached_property
-    def plain_pictures(self) -> list[NDArray[np.uint8]]:
+    def plain_pictures(self) -> list[Bytes]:
         """Those of the first control."""
         return self.pictures(self.models[1])
 
-    def pictures(self, model: Gaussians) -> list[NDArray[np.uint8]]:
+    def pictures(self, model: Gaussians) -> list[Bytes]:
         """Renders of a model that StegExpose looks at."""
         views = steganalysed(self.scene.views)
         return [image.numpy() for _, image in renders_of(model, self.scene, views)]

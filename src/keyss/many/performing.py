@@ -27,13 +27,12 @@ from keyss.methods.base import MethodOptions, Plan, role_of
 from keyss.methods.plain_models import plain_stage
 from keyss.progress import Reporter, reporter as default_reporter
 from keyss.rendering import Backend, resolve_device
-from keyss.runs.files import METRICS, MODEL, stego_in
+from keyss.runs.config import FitMetrics, HideMetrics
+from keyss.runs.files import METRICS, MODEL, as_scene, stego_in
 from keyss.runs.folder import Manifest, read_manifest
-from keyss.runs.metrics import FitMetrics, HideMetrics
 from keyss.runs.opening import open_run
 from keyss.runs.planning import plan_fit
 from keyss.runs.records import read_record
-from keyss.runs.sources import as_scene
 
 
 def perform(cell: Cell, folder: Path, reporter: Reporter | None = None) -> Result:

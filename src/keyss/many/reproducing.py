@@ -1,11 +1,13 @@
-"""`reproduce`: a table of the paper, run again and shown beside its figures."""
+"""`reproduce`: a table of the paper, run again on its scenes or others, and shown beside its figures."""
 
 from __future__ import annotations
 
 import os
 import re
 import tempfile
-from collections.abc import Mapping, Sequence
+import zipfile
+import zlib
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import product
 from pathlib import Path
 from statistics import fmean
@@ -13,23 +15,102 @@ from typing import Any
 
 import msgspec
 
-from keyss.core.errors import UsageError, did_you_mean
+from keyss.core.errors import InputError, OutputError, UsageError, did_you_mean, import_extra
 from keyss.core.scene import ViewOptions
 from keyss.files.atomic import write_bytes
+from keyss.files.colmap import MODEL_PLACES, colmap_model_folder, read_colmap
 from keyss.many.cell import result_of
-from keyss.many.folder import CellFolder, Forecast
 from keyss.many.paper import PAPER, Group, Reproduction, Run, figure_rows, judged, reproduction_text
-from keyss.many.scenes import BENCHMARK, download as download_scenes, link
+from keyss.many.running import CellFolder, Forecast
 from keyss.methods import registry
 from keyss.methods.base import MethodOptions
 from keyss.progress import Reporter, reporter as default_reporter
 from keyss.rendering import Backend
 from keyss.rendering.orbit import is_model
+from keyss.runs.files import PathLike
 from keyss.runs.records import write_record
-from keyss.runs.sources import PathLike
 
+TEST_EVERY = 8
+
+# Number of photos, and the folder of those that count: a quarter of their size outdoors, half indoors.
+BENCHMARK: Mapping[str, tuple[int, str]] = {
+    "bicycle": (194, "images_4"),
+    "bonsai": (292, "images_2"),
+    "room": (311, "images_2"),
+    "flowers": (173, "images_4"),
+    "treehill": (141, "images_4"),
+    "garden": (185, "images_4"),
+    "stump": (125, "images_4"),
+    "counter": (240, "images_2"),
+    "kitchen": (279, "images_2"),
+    "playroom": (225, "images"),
+}
+_REFRAW = "https://storage.googleapis.com/gresearch/refraw360"
+_INRIA = "https://repo-sam.inria.fr/fungraph/3d-gaussian-splatting/datasets/input"
+# Archives, and the folder of each scene in them: Mip-NeRF 360 from its authors, and Deep Blending from those
+# of 3DGS. No checksums are published.
+SOURCES: Mapping[str, tuple[str, ...]] = {
+    f"{_REFRAW}/360_v2.zip": ("bicycle", "bonsai", "counter", "garden", "kitchen", "room", "stump"),
+    f"{_REFRAW}/360_extra_scenes.zip": ("flowers", "treehill"),
+    f"{_INRIA}/tandt_db.zip": ("db/playroom",),
+}
 SMALL = {"iterations": 1000, "max_gaussians": 9000, "width": 120}
 SSIM_WEIGHT = 0.5  # of the loss, for plain models too
+
+
+def download_scenes(names: Iterable[str], data: Path) -> None:
+    """Fetch those of the scenes that are missing in `data`, with the photos that count.
+
+    Archives stay in `data/archives`. Raises InputError for what cannot be fetched or unpacked, BackendError
+    without pooch.
+    """
+    pooch = import_extra("pooch", "reproduce", "download scenes")
+    missing = {name for name in names if not (data / name).exists()}
+    archives = data / "archives"
+    for url, folders in SOURCES.items():
+        wanted = {name: folder for folder in folders if (name := folder.rpartition("/")[2]) in missing}
+        parts = {name: ("sparse/0", BENCHMARK[name][1]) for name in wanted}
+        members = [f"{folder}/{part}" for name, folder in wanted.items() for part in parts[name]]
+        file = url.rpartition("/")[2]
+        if not wanted:
+            continue
+        try:
+            unzip = pooch.Unzip(members, extract_dir="unpacked")
+            pooch.retrieve(url, None, file, path=archives, processor=unzip, progressbar=True)
+            for name, folder in wanted.items():
+                (archives / "unpacked" / folder).rename(data / name)
+        except (OSError, ValueError, zipfile.BadZipFile, zlib.error) as error:
+            advice = f"if {archives / file} is there, remove it to fetch it again"
+            raise InputError(f"{url}: cannot be fetched or unpacked: {error}; {advice}") from error
+
+
+def link_scene(data: Path, name: str, folder: Path) -> Path:
+    """A scene of the paper in `folder`, with links to the photos that count.
+
+    Raises InputError where they are missing, or not as many as the paper's; OutputError.
+    """
+    (photos, images), scene, source = BENCHMARK[name], folder / name, data / name
+    model = next((place for place in MODEL_PLACES if colmap_model_folder(source, (place,))), None)
+    if model is None or not (source / images).is_dir():
+        raise InputError(
+            f"{data}: expected a folder {name} with {images} and a COLMAP model, a scene of Mip-NeRF 360 (or "
+            "playroom, of Deep Blending), found none; `download=True` fetches it"
+        )
+    try:
+        scene.mkdir(parents=True, exist_ok=True)
+        for place, target in (("sparse", source / model), (images, source / images)):
+            if not (scene / place).is_symlink():
+                (scene / place).symlink_to(target.resolve())
+    except OSError as error:
+        raise OutputError(f"cannot write to {scene}: {error.strerror}") from error
+    layout = read_colmap(scene)
+    counted = len(layout.train) + len(layout.test), len(layout.test)
+    if counted != (photos, -(-photos // TEST_EVERY)):
+        raise InputError(
+            f"{source}: expected {photos} photos in the COLMAP model, every {TEST_EVERY}th for testing, "
+            f"found {counted[0]}, {counted[1]} for testing"
+        )
+    return scene
 
 
 def reproduce(
@@ -86,7 +167,7 @@ def reproduce(
             if download:
                 download_scenes(names, Path(data))
             links = Path(os.path.realpath(temporary)) if dry_run else folder.out.absolute() / "scenes"
-            paths = {name: str(link(Path(data), name, links)) for name in names}
+            paths = {name: str(link_scene(Path(data), name, links)) for name in names}
         places: dict[Path, str] = {}
         for group, (name, run) in product(groups, spec.runs.items()):
             sources = [paths[scene] for scene in group[: run.secrets + 1]]

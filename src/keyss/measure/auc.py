@@ -7,14 +7,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from keyss.core import UsageError
+from keyss.core.arrays import Doubles
 
 _Z = 1.959963984540054  # standard normal quantile of 0.975
 
 Score = float | None
-Doubles = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

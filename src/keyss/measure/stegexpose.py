@@ -14,9 +14,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image
 
+from keyss.core.arrays import Bytes
 from keyss.core.errors import InputError, UsageError
 from keyss.files.images import open_image
 from keyss.measure.auc import Auc, auc_between
@@ -44,7 +44,7 @@ class Scores:
     fusion: float | None  # records store NaN as None
 
 
-def score_image(image: NDArray[np.uint8]) -> Scores:
+def score_image(image: Bytes) -> Scores:
     """Scores of an image [H, W, 3] uint8. Raises UsageError for another shape or type."""
     if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3 or 0 in image.shape:
         raise UsageError(f"expected an image [H, W, 3] of uint8, got {list(image.shape)} of {image.dtype}")
@@ -56,7 +56,7 @@ def score_image(image: NDArray[np.uint8]) -> Scores:
     return Scores(**scores, fusion=sum(available) / len(available) if available else math.nan)
 
 
-def read_pixels(path: Path | str) -> NDArray[np.uint8]:
+def read_pixels(path: Path | str) -> Bytes:
     """[H, W, 3] of an image file as Java's ImageIO decodes it.
 
     Transparency is ignored, not blended. Grey of 8 and 16 bits counts as linear light and gets the sRGB
@@ -73,7 +73,7 @@ def read_pixels(path: Path | str) -> NDArray[np.uint8]:
             ) from error
 
 
-def _decode(image: Image.Image) -> NDArray[np.uint8]:
+def _decode(image: Image.Image) -> Bytes:
     if image.mode.startswith("I"):
         light = np.asarray(image, dtype=np.float64).clip(0, 65535) / 65535
     elif image.mode in ("L", "LA") and image.format != "BMP":  # a grey BMP has a palette
@@ -96,9 +96,7 @@ class StegExposeAuc:
     detectors: dict[str, float | None]  # AUC of each detector; None if it accepts none of the images
 
 
-def stegexpose_auc(
-    plain_images: Sequence[NDArray[np.uint8]], stego_images: Sequence[NDArray[np.uint8]]
-) -> StegExposeAuc:
+def stegexpose_auc(plain_images: Sequence[Bytes], stego_images: Sequence[Bytes]) -> StegExposeAuc:
     """StegExpose on renders of the same views by a plain and by a stego model, [H, W, 3] uint8 each.
 
     Chi Square needs about 87,700 pixels, Sample Pairs even sizes. On a renderer's output an AUC near 0.5 is

@@ -1,5 +1,7 @@
 from .config import (
+    FitMetrics as FitMetrics,
     FitRunConfig as FitRunConfig,
+    HideMetrics as HideMetrics,
     RunConfig as RunConfig,
     read_config as read_config,
     secret_ids as secret_ids,
@@ -22,7 +24,6 @@ from .folder import (
     read_manifest as read_manifest,
     write_again as write_again,
 )
-from .metrics import FitMetrics as FitMetrics, HideMetrics as HideMetrics
 from .opening import HidingRun as HidingRun, open_run as open_run
 from .records import read_record as read_record, record_bytes as record_bytes, write_record as write_record
 from .revealing import Revealed as Revealed, reveal_model as reveal_model

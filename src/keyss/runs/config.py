@@ -1,10 +1,10 @@
-"""`config.json`: the arguments of a run, from which later commands load its scenes again."""
+"""`config.json` and `metrics.json`: the arguments of a run, to load its scenes again, and its results."""
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
@@ -12,6 +12,8 @@ from keyss._version import __version__
 from keyss.core.errors import InputError
 from keyss.core.scene import ViewOptions
 from keyss.fitting.config import FitConfig
+from keyss.fitting.image_metrics import ImageQuality
+from keyss.measure.hiding import HidingQuality, RenderFidelity
 from keyss.methods import registry
 from keyss.methods.base import MethodOptions
 from keyss.methods.opened import Opened
@@ -63,3 +65,37 @@ def secret_ids(seed: int, opened: Iterable[Opened]) -> tuple[str, ...]:
     """Names of the secrets in a run of this seed; the same secret has another name in every run."""
     texts = (f"keyss/v1/secret {seed} {secret.fingerprint()}" for secret in opened)
     return tuple(hashlib.sha256(text.encode()).hexdigest()[:16] for text in texts)
+
+
+@dataclass(frozen=True, kw_only=True)
+class HideMetrics(HidingQuality):
+    """Results of a hiding: PSNRs in dB and SSIMs on test views, measured through the written files."""
+
+    version: int = 1
+    keyss: str = __version__  # the program that wrote it
+    method: str
+    gaussians: int  # of the stego model
+    photos: tuple[bool, ...]  # of the cover and the secrets; False: test views are renders of a given model
+    secret_gaussians: tuple[int, ...]  # of the revealed secrets
+    iterations: int  # of the method's own training, 0 without one
+    # Training steps of the cover and of each secret, those of the plain model included if it was trained on;
+    # None: unknown, since the plain model was given.
+    steps: tuple[int | None, ...] = ()
+    seconds: float  # of the whole run, interrupted parts included
+    width: int  # pixels of the cover's test views
+    seed: int
+    against_plain: tuple[RenderFidelity, ...]  # cover, then secrets, opened from the written files
+    details: Mapping[str, Any] = field(default_factory=dict)  # further numbers of the method
+
+
+@dataclass(frozen=True, kw_only=True)
+class FitMetrics(ImageQuality):
+    """Results of a plain fit on the test views."""
+
+    version: int = 1
+    keyss: str = __version__
+    gaussians: int
+    iterations: int
+    seconds: float  # of the whole run, interrupted parts included
+    width: int  # pixels of the photos
+    seed: int

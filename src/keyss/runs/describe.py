@@ -16,7 +16,7 @@ from keyss.files.reading import is_standard
 
 if TYPE_CHECKING:
     from keyss.core.scene import Scene
-    from keyss.runs.metrics import FitMetrics, HideMetrics
+    from keyss.runs.config import FitMetrics, HideMetrics
 
 Corner = tuple[float, ...]  # [3] world units
 
@@ -75,8 +75,8 @@ def info(path: str | Path) -> RunInfo | ModelInfo | SceneInfo:
 
 def _folder_info(path: Path) -> RunInfo | SceneInfo:
     from keyss.files.scenes import load_scene
+    from keyss.runs.config import FitMetrics, HideMetrics
     from keyss.runs.files import METRICS, MODEL, stego_in
-    from keyss.runs.metrics import FitMetrics, HideMetrics
     from keyss.runs.records import read_record
 
     if stego_in(path).exists():

@@ -14,20 +14,20 @@ from keyss.methods import registry
 from keyss.methods.base import MethodOptions
 from keyss.methods.opened import Opened
 from keyss.rendering.orbit import is_model
-from keyss.runs.config import RunConfig, read_config, secret_ids
+from keyss.runs.config import HideMetrics, RunConfig, read_config, secret_ids
 from keyss.runs.files import (
     CONFIG,
     METRICS,
+    PathLike,
+    as_scene,
     bound_names,
     handed_names,
     plain_names,
     run_folder,
     stego_in,
 )
-from keyss.runs.metrics import HideMetrics
 from keyss.runs.records import read_record
 from keyss.runs.revealing import read_handed
-from keyss.runs.sources import PathLike, as_scene
 
 
 @dataclass(frozen=True)
