@@ -16,7 +16,7 @@ import torch
 from keyss.api.asking import HideResult, Secret, check_keys, method_for, sources_of
 from keyss.api.fitting import begun, together
 from keyss.channels import AnyChannel, Publish, channel_for, open_content
-from keyss.core.errors import QualityError, UsageError
+from keyss.core.errors import InputError, QualityError, UsageError
 from keyss.core.gaussians import Gaussians, same_bits
 from keyss.core.scene import Scene, ViewOptions
 from keyss.files.models import is_model_path, read_model
@@ -241,7 +241,13 @@ def _hide_files(
     hidden, model = [_hidden_file(each) for each in secrets], as_3dgs_model(cover, "the cover")
     keys = [each.key for each in secrets]
     payloads = [(key, each.payload()) for key, each in zip(keys, hidden, strict=True)]
-    stego = channel_for(publish, channel).prepare(model).embed(payloads)
+    place = channel_for(publish, channel)
+    try:
+        stego = place.prepare(model).embed(payloads)
+    except (InputError, UsageError) as error:
+        if (publish, channel) == ("any", "appended"):
+            raise
+        raise type(error)(f'{error}; `publish="any", channel="appended"` has room for all') from error
     with folder.work() if folder else nullcontext():
         name = stego_name(stego)
         there = folder.write({name: stego}) if folder else None

@@ -138,8 +138,8 @@ class ColoursCover:
             together = self.capacity.layout(sizes)
             if together is None:
                 raise UsageError(
-                    f"expected payloads of {self.room.capacity:,} bytes in all, as this model holds at this "
-                    f"`strength`, got {sum(sizes) - OVERHEAD * len(sizes):,} bytes in {len(sizes)}"
+                    f"the colours of this model hold {self.room.capacity:,} bytes in all, and the secrets "
+                    f"take {sum(sizes) - OVERHEAD * len(sizes):,}"
                 )
             layouts = [replace(together, shares=(share,)) for share in together.shares]
             noticed = len(sizes) > 1
