@@ -15,9 +15,12 @@ from tiny_scenes import random_gaussians
 def test_what_is_no_model_is_refused(keyss: Run, tmp_path: Path) -> None:
     (tmp_path / "model.txt").write_text("not a model")
     (tmp_path / "text.ply").write_text("ply\nformat ascii 1.0\nelement vertex 1\nend_header\n")
+    write_model(tmp_path / "cut.ply", random_gaussians(5))
+    (tmp_path / "cut.ply").write_bytes((tmp_path / "cut.ply").read_bytes()[:-1])
     for command in (["view"], ["view", "-o", str(tmp_path / "page.html")]):
         assert_refused(keyss(*command, str(tmp_path / "model.txt")), 4, "expected a 3DGS model")
         assert_refused(keyss(*command, str(tmp_path / "text.ply")), 4, "not a 3DGS model")
+        assert_refused(keyss(*command, str(tmp_path / "cut.ply")), 4, "not a whole .ply file")
         assert_refused(keyss(*command, str(tmp_path / "nowhere.ply")), 4, "no such file")
         assert_refused(keyss(*command, str(tmp_path)), 4, "found a folder")
     assert_refused(keyss("view", str(tmp_path / "model.txt"), "--port", "70000"), 2, "--port")

@@ -20,6 +20,8 @@ from urllib.parse import quote
 
 from keyss.core.errors import InputError, KeyssWarning, OutputError, UsageError
 from keyss.files.atomic import check_not_an_input, check_output_file, mode_like, write_bytes
+from keyss.files.ply_rows import has_packed_header, read_model_rows
+from keyss.files.reading import open_input
 
 SCRIPT, STYLE, LICENCES, INDEX = "viewer.js", "viewer.css", "licences.txt", "index.html"
 MAX_IN_ONE_FILE = 64 << 20  # bytes of a model; browsers limit text to 512 MiB and parse it slowly
@@ -145,7 +147,8 @@ class Readable:
 def readable(model: Path) -> Readable:
     """The model's file if the page reads its format, else a lossless conversion, with a KeyssWarning.
 
-    Only a file that is converted is parsed here. Raises InputError if it is not a valid model.
+    Only a file that is converted is parsed wholly here. Raises InputError if it is not a valid model, and
+    for a .ply whose end is missing.
     """
     try:
         with model.open("rb") as file:
@@ -154,6 +157,10 @@ def readable(model: Path) -> Readable:
     except OSError:
         header, size = b"", 0  # read_model raises the InputError
     if _is_readable(model.name, header):
+        if header.startswith(b"ply"):
+            with open_input(model) as file:
+                if not has_packed_header(file):
+                    read_model_rows(file)  # checks header and size, and reads no rows yet
         return Readable(model.name, lambda: model.open("rb"), size)
 
     from keyss.files import read_model  # imports torch, which the page itself does not need
