@@ -7,7 +7,7 @@ from .base import (
     Stego as Stego,
     Training as Training,
 )
-from .carry.refit import most_contributing as most_contributing
+from .carry.method import most_contributing as most_contributing
 from .carry.room import (
     CarryOptions as CarryOptions,
     RecordRoom as RecordRoom,

@@ -8,13 +8,22 @@ from dataclasses import replace
 from typing import Any
 
 from keyss.core.errors import KeyssWarning, UsageError
+from keyss.core.gaussians import Gaussians
+from keyss.core.scene import Scene
+from keyss.fitting.config import FitConfig
+from keyss.fitting.image_metrics import subsample_views
+from keyss.fitting.plain import fit_scene
+from keyss.fitting.schedule import boost_of
 from keyss.methods.base import Capabilities, Context, Plan, Source, Stego, role_of
-from keyss.methods.carry.refit import MODEL_ITERATIONS, refitted
 from keyss.methods.carry.room import CarryOptions, SecretSize, WholeRoom, room_for
 from keyss.methods.records.embedding import embed_models
 from keyss.methods.records.quantise import out_of_range
+from keyss.rendering import contributions
 from keyss.rendering.difference import Viewpoints, psnr_between
 
+# Without photos, the start is nearly right: the largest number of steps, and a factor on the rates.
+_MODEL_ITERATIONS, _MODEL_RATE = 400, 0.1
+_SELECTION_VIEWS = 64
 _FEWER = (
     "beside the others, secrets are left fewer Gaussians than each could have alone: who holds one of the "
     "keys can notice that there are other secrets"
@@ -58,7 +67,7 @@ class CarryMethod:
             warnings.warn(_FEWER, KeyssWarning, stacklevel=2)
         steps = [
             options.iterations
-            or (options.fit.iterations if secret.photos else min(options.fit.iterations, MODEL_ITERATIONS))
+            or (options.fit.iterations if secret.photos else min(options.fit.iterations, _MODEL_ITERATIONS))
             for secret in secrets
         ]
         return replace(options, refits=tuple(n if c else 0 for n, c in zip(steps, cut, strict=True)))
@@ -162,3 +171,41 @@ def _check_fit(secrets: Sequence[SecretSize], sizes: Sequence[tuple[int, int]], 
 
 
 METHOD = CarryMethod()
+
+
+def refitted(
+    secret: Gaussians,
+    scene: Scene,
+    count: int,
+    fit: FitConfig,
+    context: Context,
+    *,
+    photos: bool,
+    name: str,
+) -> Gaussians:
+    """Train the `count` Gaussians of `secret` that contribute most.
+
+    Raises Interrupted on Ctrl-C, InputError for a checkpoint of another run.
+    """
+    return fit_scene(
+        scene,
+        # A refit must not depend on the other secrets.
+        replace(fit, seed=fit.seed_of(name)),
+        model=most_contributing(secret, scene, count),
+        rate=boost_of(fit) if photos else _MODEL_RATE,
+        device=context.device,
+        title=f"refit of the {name}",
+        checkpoint=context.checkpoints / f"{name.replace(' ', '-')}.safetensors"
+        if context.checkpoints
+        else None,
+        resume=context.resume,
+        reporter=context.reporter and context.reporter.of_secret(),
+    ).gaussians
+
+
+def most_contributing(plain: Gaussians, scene: Scene, count: int) -> Gaussians:
+    """The `count` Gaussians with the largest blending weights in the training views, in their order."""
+    if count >= len(plain):
+        return plain
+    cameras = [view.camera for view in subsample_views(scene.train, _SELECTION_VIEWS)]
+    return plain[contributions(plain, cameras).topk(count).indices.sort().values]
