@@ -1,4 +1,4 @@
-"""The whole file, from a real audit, from parts of it, and from hostile ones."""
+"""The whole file, from a real audit, from parts of it, and from hostile ones; its numbers as texts."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import base64
 import contextlib
 import hashlib
 import json
+import math
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,7 +17,7 @@ from hypothesis import HealthCheck, given, settings, strategies as st
 
 from audits.audited import found_in, run_with, with_all_texts
 from audits.pages import Parsed
-from keyss.audits import audit
+from keyss.audits import audit, numbers
 from keyss.core import InputError, OutputError
 
 SECTIONS = [
@@ -255,3 +256,38 @@ def test_any_other_value_anywhere_is_refused_or_harmless(
     run = run_with(run_folder, tmp_path, changed)
     with contextlib.suppress(InputError):
         harmless(parsed(run))
+
+
+@pytest.mark.parametrize(
+    ("value", "digits", "text"),
+    [
+        (27.2715, 2, "27.27"),
+        (-0.5, 1, "−0.5"),
+        (-0.001, 2, "0.00"),
+        (12345, 0, "12,345"),
+        (1e12, 2, "1.00e+12"),
+        (math.inf, 2, "∞"),
+        (-math.inf, 2, "−∞"),
+        (None, 2, "–"),
+        (math.nan, 2, "–"),
+    ],
+)
+def test_number(value: float | None, digits: int, text: str) -> None:
+    assert numbers.number(value, digits) == text
+
+
+def test_a_difference_has_its_sign_unless_it_rounds_to_nothing() -> None:
+    texts = [numbers.difference(value) for value in (0.42, -0.42, 0.0, 0.001, -0.001, None)]
+    assert texts == ["+0.42", "−0.42", "0.00", "0.00", "0.00", "–"]
+
+
+def test_units() -> None:
+    assert [numbers.bytes_text(v) for v in (999, 1500, 4961530)] == ["999 B", "1.5 kB", "4.96 MB"]
+    assert [numbers.seconds_text(v) for v in (0.0214, 3.14, 612, 9000)] == [
+        "0.0214 s",
+        "3.1 s",
+        "10.2 min",
+        "2.5 h",
+    ]
+    assert [numbers.times(v) for v in (1.124, 84.2, None)] == ["1.12×", "84×", "–"]
+    assert numbers.significant(0.004) == "0.00400"

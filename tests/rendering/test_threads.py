@@ -1,8 +1,10 @@
-"""Results do not depend on threads and processes, and torch's number of threads is respected."""
+"""Results do not depend on threads and processes; torch's threads are counted, and idle ones do not spin."""
 
 from __future__ import annotations
 
 import multiprocessing
+import os
+import subprocess
 import sys
 import threading
 from collections.abc import Iterator
@@ -14,9 +16,12 @@ import torch
 from torch import Tensor
 
 import rasterizer_threads
+from keyss import FitConfig, _threads, fit
+from keyss.core import KeyssWarning
 from keyss.rendering.cpu import parallel
 from rendering.child_process import digest, digest_on_threads
 from rendering.scenes import Scene, random_scene
+from tiny_scenes import tiny_scene
 
 PATIENCE = 120  # seconds until something hangs: far more than a busy machine needs
 
@@ -172,3 +177,23 @@ def test_the_next_piece_goes_to_who_is_free_first() -> None:
     assert rasterizer_threads.makespan([3, 1, 1, 1], 2) == 3
     assert rasterizer_threads.makespan([1, 1, 1, 3], 2) == 4
     assert rasterizer_threads.makespan([1, 2], 8) == 2
+
+
+@pytest.mark.parametrize(
+    ("imports", "spinning"), [("torch, keyss", True), ("keyss, torch", False), ("torch", None)]
+)
+def test_spinning_idle_threads_of_torch_are_detected(imports: str, spinning: bool | None) -> None:
+    """A choice of the user is not reported."""
+    environment = {name: value for name, value in os.environ.items() if name != "OMP_WAIT_POLICY"}
+    if spinning is None:
+        environment["OMP_WAIT_POLICY"] = "active"
+    code = f"import {imports}; from keyss import _threads; print(_threads.spinning)"
+    found = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
+    assert found.stdout.strip() == str(bool(spinning))
+
+
+def test_training_warns_of_spinning_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(_threads, "spinning", True)
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
+    with pytest.warns(KeyssWarning, match="import keyss first"):
+        fit(tiny_scene(0), config=FitConfig(iterations=1, max_gaussians=50, seed=0))

@@ -1,4 +1,4 @@
-"""Bytes in a model and out again, after what becomes of published models."""
+"""Bytes in a model and out again, after what becomes of published models, and for no other key."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from hypothesis import given, settings, strategies as st
 
 from channels.colours.made import PACKED, cover, embed, extract
 from keyss.channels import COLOURS, Colours, ColoursCover, ColoursReader, Fountain
+from keyss.channels.colours import header, reading
 from keyss.channels.colours.carriers import CELL, Numbers, Salts
 from keyss.channels.colours.header import FILE_KEY_BYTES, Header, Index, read_header
 from keyss.core import Gaussians, InputError, KeyssError, KeyssWarning, UsageError, WrongKeyError
@@ -331,3 +332,24 @@ def test_a_wrong_key_does_the_work_of_a_right_one(stego: Gaussians, monkeypatch:
     with pytest.raises(WrongKeyError):
         extract(stego, "b")
     assert looks[0] == right
+
+
+def test_false_acceptance_is_rarer_than_two_to_the_minus_64(monkeypatch: pytest.MonkeyPatch) -> None:
+    """By the bound of RFC 8439's Poly1305, 8 blocks / 2^106 for each forgery that is tried, for the largest
+    payload there can be, and as often as a reader tries to decrypt.
+    """
+    stego = embed(cover(6000), [("a", b"x")], entropy=bytes(32))
+    sizes, decrypt = [], reading.decrypt
+
+    def counted(data_key: bytes, encrypted: bytes, associated: bytes) -> bytes:
+        sizes.append(len(encrypted))
+        decrypt(data_key, encrypted, associated) if len(sizes) == 1 else None
+        raise InputError("so that all is tried that ever is")
+
+    monkeypatch.setattr(reading, "decrypt", counted)
+    for name in "ab":
+        with pytest.raises(Exception, match="the key is right" if name == "a" else "opens nothing"):
+            extract(stego, name)
+    assert 1 <= len(sizes) <= 4
+    largest = max(header.bucket_bytes(bucket) for bucket in range(256))
+    assert math.log2(len(sizes) * 8 * (largest / 16) / 2**106) < -64

@@ -1,4 +1,4 @@
-"""Which secrets are refitted, for how long, and what a refit keeps."""
+"""Which secrets are refitted, for how long, what a refit keeps, and what a refitted cover shows."""
 
 from __future__ import annotations
 
@@ -12,8 +12,9 @@ from hypothesis import given, strategies as st
 
 import keyss
 from channels.low_bits.trained_like import trained_like
-from keyss import CarryOptions, FitConfig, Gaussians, Secret
-from keyss.core import KeyssWarning, UsageError
+from keyss import CarryOptions, FitConfig, Secret
+from keyss.channels import identities
+from keyss.core import Gaussians, KeyssWarning, Scene, UsageError
 from keyss.methods import Source, Training, divided, most_contributing, registry
 from methods.hiding import check_resumes, hide_scenes, psnr_in, three_scenes
 from tiny_scenes import random_gaussians, tiny_scene
@@ -137,3 +138,42 @@ def test_shares_use_all_there_is_and_no_more(available: list[int], total: int) -
     assert sum(shares) == min(total, sum(available))
     unfilled = [share for share, n in zip(shares, available, strict=True) if share < n]
     assert max(unfilled, default=0) - min(unfilled, default=0) <= 1
+
+
+@pytest.fixture(scope="module")
+def pair() -> tuple[list[Scene], list[Gaussians]]:
+    scenes, _ = three_scenes()
+    return [scenes[0], scenes[2]], [random_gaussians(1500, seed=0), random_gaussians(200, seed=2)]
+
+
+def _file(pair: tuple[list[Scene], list[Gaussians]], iterations: int) -> Gaussians:
+    fit = replace(TINY, iterations=iterations, max_gaussians=2000)
+    return hide_scenes(pair[0], ["a key"], CarryOptions(fit=fit, refit="always"), plains=pair[1]).stego
+
+
+def test_there_are_no_transparent_gaussians_but_its_own(pair: tuple[list[Scene], list[Gaussians]]) -> None:
+    stego = _file(pair, 20)
+    assert len(stego) <= len(pair[1][0])
+    assert float(stego.opacities.min()) >= TINY.prune_opacity
+
+
+def test_rows_are_the_covers_in_its_own_order(pair: tuple[list[Scene], list[Gaussians]]) -> None:
+    """Any other order would be told from a fit's, in which what came later stands later."""
+    stego, plain = _file(pair, 2), pair[1][0]
+    own = torch.cdist(stego.sh.flatten(1), plain.sh.flatten(1)).argmin(1)
+    assert (own.diff() > 0).all()
+
+
+def test_what_the_cover_becomes_does_not_depend_on_the_secret_or_the_key(
+    pair: tuple[list[Scene], list[Gaussians]],
+) -> None:
+    """But for low bits: whoever asks what the file says of the secret asks of those only."""
+    scenes, models = pair
+    config = CarryOptions(fit=replace(TINY, iterations=30, max_gaussians=2000), refit="always")
+    others = [scenes[0], tiny_scene(5, views=11, distance=3.0)]
+    one = hide_scenes(scenes, ["a key"], config, plains=models).stego
+    two = hide_scenes(others, ["k"], config, plains=[models[0], random_gaussians(900, seed=5)]).stego
+    assert torch.equal(one.means, two.means)
+    assert torch.equal(one.sh[:, 0], two.sh[:, 0])
+    assert [row.tobytes() for row in identities(one)] == [row.tobytes() for row in identities(two)]
+    assert not torch.equal(one.quats, two.quats)

@@ -1,0 +1,61 @@
+"""Models, extents of scenes, opponent colours, and compensation of lost Gaussians."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from keyss.core import OPPONENT, compensate_pruning
+from tiny_scenes import random_gaussians, tiny_scene
+
+
+def test_a_model_is_described_in_a_line() -> None:
+    assert repr(random_gaussians(1500, sh_degree=2)) == "<1,500 Gaussians of SH degree 2 on cpu>"
+
+
+def test_a_single_training_photo_has_an_extent_by_which_gaussians_can_move() -> None:
+    scene = tiny_scene()
+    alone = replace(scene, train=scene.train[:1])
+    centre = torch.linalg.inv(alone.train[0].camera.viewmat.double())[:3, 3]
+    points = torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]])
+    seen = replace(alone, points=points, colors=torch.zeros(2, 3, dtype=torch.uint8))
+    assert seen.extent == pytest.approx(1.1 * float(centre.norm()), rel=1e-5)
+    assert replace(alone, points=points[:0]).extent > 0
+
+
+def test_opponent_colours_are_orthonormal_and_greys_have_no_differences() -> None:
+    assert OPPONENT.dtype == np.float64
+    np.testing.assert_allclose(OPPONENT @ OPPONENT.T, np.eye(3), atol=1e-15)
+    greys = np.linspace(-2, 2, 9)[:, None] * np.ones(3)
+    apart = greys @ OPPONENT.T
+    np.testing.assert_allclose(apart[:, 0], np.sqrt(3) * greys[:, 0])
+    np.testing.assert_allclose(apart[:, 1:], 0, atol=1e-15)
+    np.testing.assert_allclose(apart @ OPPONENT, greys, atol=1e-15)
+
+
+@pytest.mark.parametrize(("left", "count"), [(1000, 1000), (995, 1000), (10, 0)])
+def test_small_losses_change_nothing(left: int, count: int) -> None:
+    model = random_gaussians(left)
+    assert compensate_pruning(model, count) is model
+
+
+@pytest.mark.parametrize("share", [0.25, 0.5, 0.8])
+def test_transmittances_become_their_roots_and_sizes_grow(share: float) -> None:
+    model = random_gaussians(200)
+    found = compensate_pruning(model, round(200 / share))
+    expected = 1 - (1 - model.opacities.double()) ** (1 / share)
+    torch.testing.assert_close(found.opacities.double(), expected, rtol=0, atol=1e-5)
+    torch.testing.assert_close(found.log_scales, model.log_scales + 0.25 * math.log(1 / share))
+    assert (found.means is model.means, found.quats is model.quats, found.sh is model.sh) == (True,) * 3
+
+
+@pytest.mark.parametrize("logit", [-80.0, 0.0, 80.0])
+def test_compensated_models_stay_finite(logit: float) -> None:
+    model = replace(random_gaussians(5), opacity_logits=torch.full((5,), logit))
+    found = compensate_pruning(model, 10**9)
+    assert found.opacity_logits.isfinite().all()
+    assert found.log_scales.isfinite().all()
