@@ -7,6 +7,7 @@ import shutil
 import struct
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pycolmap
@@ -233,55 +234,46 @@ def test_absurd_counts_are_refused_before_allocating(tmp_path: Path, name: str, 
         read_colmap(tmp_path)
 
 
-def two_images(*last: bytes) -> bytes:
-    return counted(image_bytes(1, "00.png"), *last)
+def second_image(name: str, **fields: Any) -> dict[str, bytes]:
+    """Two images; the fields are of the second."""
+    return {"images": counted(image_bytes(1, "00.png"), image_bytes(2, name, **fields))}
+
+
+def one_camera(**fields: Any) -> dict[str, bytes]:
+    """One camera with these fields."""
+    return {"cameras": counted(camera_bytes(**fields))}
 
 
 @pytest.mark.parametrize(
     ("replaced", "message"),
     [
-        (
-            {"images": two_images(image_bytes(2, "01.png", quaternion=(0, 0, 0, 0)))},
-            "image 2: expected a rotation",
-        ),
-        (
-            {"images": two_images(image_bytes(2, "01.png", quaternion=(math.nan, 0, 0, 1)))},
-            "expected a rotation",
-        ),
-        ({"images": two_images(image_bytes(2, "01.png", quaternion=(1e308,) * 4))}, "expected a rotation"),
-        (
-            {"images": two_images(image_bytes(2, "01.png", translation=(0, math.inf, 0)))},
-            "finite translation",
-        ),
-        ({"images": two_images(image_bytes(2, "01.png", translation=(0, 1e300, 0)))}, "finite translation"),
-        ({"images": two_images(image_bytes(2, "01.png", camera_id=5))}, "camera 5, which does not exist"),
-        ({"images": two_images(image_bytes(2, "00.png"))}, "'00.png' twice"),
-        ({"images": two_images(image_bytes(2, "x" * 5000))}, "image name of up to 4095 bytes"),
-        (
-            {"images": two_images(image_bytes(2, "missing.png"))},
-            r"1 of 2 photos are missing: missing\.png;",
-        ),
-        ({"images": two_images(image_bytes(2, "../images/01.png"))}, "inside images/"),
-        ({"images": two_images(image_bytes(2, "a\\..\\01.png"))}, "inside images/"),
-        ({"images": two_images(image_bytes(2, "/etc/passwd"))}, "inside images/"),
-        ({"images": two_images(image_bytes(2, "C:\\01.png"))}, "inside images/"),
-        ({"images": two_images(image_bytes(2, "a\nb"))}, "inside images/"),
-        ({"images": two_images(image_bytes(2, ""))}, "inside images/"),
-        ({"images": two_images()}, "at least 2 posed images"),
+        (second_image("01.png", quaternion=(0, 0, 0, 0)), "image 2: expected a rotation"),
+        (second_image("01.png", quaternion=(math.nan, 0, 0, 1)), "expected a rotation"),
+        (second_image("01.png", quaternion=(1e308,) * 4), "expected a rotation"),
+        (second_image("01.png", translation=(0, math.inf, 0)), "finite translation"),
+        (second_image("01.png", translation=(0, 1e300, 0)), "finite translation"),
+        (second_image("01.png", camera_id=5), "camera 5, which does not exist"),
+        (second_image("00.png"), "'00.png' twice"),
+        (second_image("x" * 5000), "image name of up to 4095 bytes"),
+        (second_image("missing.png"), r"1 of 2 photos are missing: missing\.png;"),
+        (second_image("../images/01.png"), "inside images/"),
+        (second_image("a\\..\\01.png"), "inside images/"),
+        (second_image("/etc/passwd"), "inside images/"),
+        (second_image("C:\\01.png"), "inside images/"),
+        (second_image("a\nb"), "inside images/"),
+        (second_image(""), "inside images/"),
+        ({"images": counted(image_bytes(1, "00.png"))}, "at least 2 posed images"),
         ({"images": counted()}, "at least 2 posed images"),
         ({"cameras": counted(camera_bytes(), camera_bytes())}, "id 1 twice"),
-        (
-            {"cameras": counted(camera_bytes(model=7, params=(1, 1, 6, 4, 0.1)))},
-            "camera model FOV is not supported",
-        ),
-        ({"cameras": counted(camera_bytes(model=-1))}, "camera model number -1 is not supported"),
-        ({"cameras": counted(camera_bytes(params=(-1, 1, 6, 4)))}, "focal lengths"),
-        ({"cameras": counted(camera_bytes(params=(math.nan, 1, 6, 4)))}, "focal lengths"),
-        ({"cameras": counted(camera_bytes(params=(9, 9, math.inf, 4)))}, "principal point"),
-        ({"cameras": counted(camera_bytes(model=2, params=(9, 6, 4, math.nan)))}, "coefficients.*k1=nan"),
-        ({"cameras": counted(camera_bytes(model=2, params=(9, 6, 4, -50)))}, "cannot be undone"),
-        ({"cameras": counted(camera_bytes(width=0))}, "found 0x8"),
-        ({"cameras": counted(camera_bytes(height=2**60))}, "image size"),
+        (one_camera(model=7, params=(1, 1, 6, 4, 0.1)), "camera model FOV is not supported"),
+        (one_camera(model=-1), "camera model number -1 is not supported"),
+        (one_camera(params=(-1, 1, 6, 4)), "focal lengths"),
+        (one_camera(params=(math.nan, 1, 6, 4)), "focal lengths"),
+        (one_camera(params=(9, 9, math.inf, 4)), "principal point"),
+        (one_camera(model=2, params=(9, 6, 4, math.nan)), "coefficients.*k1=nan"),
+        (one_camera(model=2, params=(9, 6, 4, -50)), "cannot be undone"),
+        (one_camera(width=0), "found 0x8"),
+        (one_camera(height=2**60), "image size"),
         ({"points3D": counted(point_bytes(1, (0, math.nan, 0)))}, "expected finite points"),
         ({"points3D": counted(point_bytes(1, (0, 1e200, 0)))}, "expected finite points"),
     ],

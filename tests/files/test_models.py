@@ -1,4 +1,4 @@
-"""The choice of a model format, and new formats."""
+"""The choice of a model format, new formats, and `info` on models."""
 
 from __future__ import annotations
 

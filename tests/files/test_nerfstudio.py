@@ -22,6 +22,8 @@ from keyss.files.lens import undistortion
 from keyss.files.ply_table import read_point_cloud
 from keyss.files.transforms import read_nerfstudio
 
+FRAMES = [f"images/frame_{i:05}.png" for i in range(10)]
+
 
 def test_intrinsics_of_the_file_and_of_a_frame(tmp_path: Path) -> None:
     write_nerfstudio(tmp_path / "desk")
@@ -41,14 +43,9 @@ def test_intrinsics_of_the_file_and_of_a_frame(tmp_path: Path) -> None:
 def test_focal_lengths_from_angles_and_sizes_from_photos(tmp_path: Path) -> None:
     angle = 2 * np.arctan(0.5)
     cut = {"w": None, "h": None, "fl_x": None, "fl_y": None, "cx": None, "cy": None}
-    camera = load_scene(write_nerfstudio(tmp_path, camera_angle_x=angle, **cut)).train[0].camera
-    np.testing.assert_allclose(camera.K, [[12, 0, 6], [0, 12, 4], [0, 0, 1]], rtol=1e-6)
-    camera = (
-        load_scene(write_nerfstudio(tmp_path, camera_angle_x=angle, camera_angle_y=angle, **cut))
-        .train[0]
-        .camera
-    )
-    np.testing.assert_allclose(camera.K, [[12, 0, 6], [0, 8, 4], [0, 0, 1]], rtol=1e-6)
+    for angles, fl_y in (({}, 12), ({"camera_angle_y": angle}, 8)):
+        scene = load_scene(write_nerfstudio(tmp_path, camera_angle_x=angle, **angles, **cut))
+        np.testing.assert_allclose(scene.train[0].camera.K, [[12, 0, 6], [0, fl_y, 4], [0, 0, 1]], rtol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -86,57 +83,45 @@ def names(folder: Path) -> tuple[list[str], list[str]]:
 
 
 def test_splits(tmp_path: Path) -> None:
-    path = [f"images/frame_{i:05}.png" for i in range(10)]
     assert names(write_nerfstudio(tmp_path, 10)) == ([*"1234567", "9"], ["0", "8"])
-    both = {"train_filenames": path[:3], "test_filenames": ["./" + path[5]]}
+    both = {"train_filenames": FRAMES[:3], "test_filenames": ["./" + FRAMES[5]]}
     assert names(write_nerfstudio(tmp_path, 10, **both)) == (["0", "1", "2"], ["5"])
-    validation = {"train_filenames": path[:3], "test_filenames": [], "val_filenames": path[6:8]}
+    validation = {"train_filenames": FRAMES[:3], "test_filenames": [], "val_filenames": FRAMES[6:8]}
     assert names(write_nerfstudio(tmp_path, 10, **validation)) == (["0", "1", "2"], ["6", "7"])
-    assert names(write_nerfstudio(tmp_path, 4, train_filenames=path[:3])) == (["0", "1", "2"], ["3"])
-    assert names(write_nerfstudio(tmp_path, 4, test_filenames=path[:3])) == (["3"], ["0", "1", "2"])
+    assert names(write_nerfstudio(tmp_path, 4, train_filenames=FRAMES[:3])) == (["0", "1", "2"], ["3"])
+    assert names(write_nerfstudio(tmp_path, 4, test_filenames=FRAMES[:3])) == (["3"], ["0", "1", "2"])
 
 
 @pytest.mark.parametrize("others", [{}, {"test_filenames": [], "val_filenames": []}])
 def test_every_eighth_photo_is_for_testing_where_all_are_for_training(
     tmp_path: Path, others: dict[str, object]
 ) -> None:
-    everything = [f"images/frame_{i:05}.png" for i in range(10)]
-    folder = write_nerfstudio(tmp_path, 10, train_filenames=everything, **others)
+    folder = write_nerfstudio(tmp_path, 10, train_filenames=FRAMES, **others)
     with pytest.warns(KeyssWarning, match="`train_filenames` has all photos; every 8th"):
         assert names(folder) == ([*"1234567", "9"], ["0", "8"])
 
 
 def test_a_split_holds_for_the_photos_that_are_left(tmp_path: Path) -> None:
-    path = [f"images/frame_{i:05}.png" for i in range(6)]
-    folder = write_nerfstudio(tmp_path, 6, train_filenames=path[:4])
-    for gone in (path[0], path[4]):
+    folder = write_nerfstudio(tmp_path, 6, train_filenames=FRAMES[:4])
+    for gone in (FRAMES[0], FRAMES[4]):
         (folder / gone).unlink()
     with pytest.warns(KeyssWarning, match=r"2 of 6 .* images/frame_00000.png, images/frame_00004.png$"):
         layout = read_nerfstudio(folder, skip_missing=True)
-    assert [p.name for p in layout.train] == path[1:4]
-    assert [p.name for p in layout.test] == path[5:]
+    assert [p.name for p in layout.train] == FRAMES[1:4]
+    assert [p.name for p in layout.test] == FRAMES[5:6]
 
 
 @pytest.mark.parametrize(
     ("extra", "message"),
     [
-        (
-            {"train_filenames": "images/frame_00000.png"},
-            r"Expected `array.*`, got `str` - at `\$\.train_filenames`",
-        ),
+        ({"train_filenames": FRAMES[0]}, r"Expected `array.*`, got `str` - at `\$\.train_filenames`"),
         ({"train_filenames": [3]}, r"Expected `str`, got `int` - at `\$\.train_filenames\[0\]`"),
         (
             {"train_filenames": ["images/none.png"]},
             "expected lists of frames, found 'images/none.png', which",
         ),
-        (
-            {"train_filenames": ["images/frame_00000.png"], "test_filenames": ["images/frame_00000.png"]},
-            "found 'images/frame_00000.png' in both",
-        ),
-        (
-            {"test_filenames": [f"images/frame_0000{i}.png" for i in range(3)]},
-            "at least one image to train on",
-        ),
+        ({"train_filenames": FRAMES[:1], "test_filenames": FRAMES[:1]}, f"found '{FRAMES[0]}' in both"),
+        ({"test_filenames": FRAMES[:3]}, "at least one image to train on"),
         ({"camera_model": "EQUIRECTANGULAR"}, "'EQUIRECTANGULAR' is not supported"),
         ({"camera_model": 5}, r"Expected `str.*`, got `int` - at `\$\.camera_model`"),
         ({"camera_model": ["OPENCV"]}, r"Expected `str.*`, got `array` - at `\$\.camera_model`"),
@@ -163,16 +148,7 @@ def test_what_is_wrong_is_named(tmp_path: Path, extra: dict[str, object], messag
 
 @pytest.mark.parametrize(
     "file_path",
-    [
-        "/etc/hostname",
-        "../../x.png",
-        "images/../../../x.png",
-        "C:/x.png",
-        "..\\..\\x.png",
-        "a\0b",
-        "..",
-        "",
-    ],
+    ["/etc/hostname", "../../x.png", "images/../../../x.png", "C:/x.png", "..\\..\\x.png", "a\0b", "..", ""],
 )
 def test_paths_that_leave_are_refused(tmp_path: Path, file_path: str) -> None:
     with pytest.raises(InputError, match="expected paths in the scene's folder or its parent"):

@@ -1,4 +1,4 @@
-"""Attacks find planted secrets by what sets them apart, and nothing in plain models."""
+"""Attacks find planted secrets and nothing in plain models; scores of leaks against known answers."""
 
 from __future__ import annotations
 

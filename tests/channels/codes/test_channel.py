@@ -1,4 +1,4 @@
-"""What is written into the codes of a file comes out of the very file with its key, and with no other."""
+"""What is written into the codes of a file comes out of it with its key alone, and what must stay stays."""
 
 from __future__ import annotations
 

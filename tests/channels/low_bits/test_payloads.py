@@ -1,4 +1,4 @@
-"""Payloads in a model's low bits: what they survive, who can read them, and what can be seen of them."""
+"""Payloads in low bits: what they survive, who can read them, what can be seen, and copies of a file."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The peers: each hides, is measured, and opens again from the files that are given away."""
+"""The peers: each hides, is measured, and opens again from the published files; bits of Splats in Splats."""
 
 from __future__ import annotations
 
