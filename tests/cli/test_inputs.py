@@ -13,11 +13,7 @@ from pathlib import Path
 import pytest
 
 from cli.said import SMALL, Run, Said, assert_refused, listing
-from files.scene_files import (
-    write_blender,
-    write_colmap,
-    write_nerfstudio,
-)
+from files.scene_files import write_blender, write_colmap, write_nerfstudio
 
 
 def key(folder: Path) -> tuple[str, Path]:

@@ -13,12 +13,7 @@ from scipy.stats import wasserstein_distance
 
 from keyss.core import Gaussians, UsageError
 from keyss.measure import against_controls, attribute_distances, distances, features
-from measure.lifelike import (
-    CHANGES,
-    doubled_scales,
-    lifelike,
-    stronger_harmonics,
-)
+from measure.lifelike import CHANGES, doubled_scales, lifelike, stronger_harmonics
 
 MODEL = lifelike(3000)
 

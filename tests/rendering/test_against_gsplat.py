@@ -9,11 +9,7 @@ from collections.abc import Callable
 
 import pytest
 import torch
-from gsplat.cuda._torch_impl import (
-    _fully_fused_projection,
-    _quat_scale_to_covar_preci,
-    _spherical_harmonics,
-)
+from gsplat.cuda._torch_impl import _fully_fused_projection, _quat_scale_to_covar_preci, _spherical_harmonics
 from torch import Tensor
 
 from keyss.rendering import rasterization

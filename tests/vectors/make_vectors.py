@@ -32,12 +32,7 @@ from scipy.spatial.transform import Rotation  # noqa: E402
 
 from channels.codes import published as codes_examples  # noqa: E402
 from channels.low_bits.trained_like import trained_like  # noqa: E402
-from files.formats.examples import (  # noqa: E402
-    model_of,
-    random_compressed,
-    random_sog,
-    random_spz,
-)
+from files.formats.examples import model_of, random_compressed, random_sog, random_spz  # noqa: E402
 from keyss.channels import (  # noqa: E402
     LOW_BITS,
     SUFFIXES,

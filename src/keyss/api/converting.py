@@ -11,12 +11,7 @@ import torch
 from keyss.core.errors import InputError, QualityError, UsageError, WrongKeyError
 from keyss.core.gaussians import Gaussians
 from keyss.files.atomic import mode_like, write_bytes
-from keyss.files.models import (
-    check_model_output,
-    keeps_low_bits,
-    model_bytes,
-    model_of_bytes,
-)
+from keyss.files.models import check_model_output, keeps_low_bits, model_bytes, model_of_bytes
 from keyss.files.reading import is_standard, write_standard_output
 from keyss.rendering import Backend, resolve_device
 from keyss.rendering.difference import psnr_between

@@ -16,14 +16,7 @@ import msgspec
 
 from keyss._version import __version__
 from keyss.audits.parts import OF_3DGS_MODELS, PARTS, AuditSubject, PartialAudit, PartProgress, subject_of
-from keyss.audits.record import (
-    AUDIT_FILE,
-    AUDIT_FOLDER,
-    PICTURES,
-    Audit,
-    AuditedRun,
-    read_audit,
-)
+from keyss.audits.record import AUDIT_FILE, AUDIT_FOLDER, PICTURES, Audit, AuditedRun, read_audit
 from keyss.core import Interrupted, KeyssWarning, UsageError, import_extra, signal_of
 from keyss.methods import registry
 from keyss.progress import Reporter

@@ -34,11 +34,7 @@ from .parameters import (
     to_gaussians as to_gaussians,
     to_parameters as to_parameters,
 )
-from .plain import (
-    FitResult as FitResult,
-    PlainRun as PlainRun,
-    fit_scene as fit_scene,
-)
+from .plain import FitResult as FitResult, PlainRun as PlainRun, fit_scene as fit_scene
 from .ranks import Ranks as Ranks, here as here, joined as joined
 from .sampling import Shuffle as Shuffle, own_randomness as own_randomness
 from .schedule import Schedule as Schedule

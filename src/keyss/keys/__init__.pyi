@@ -1,13 +1,10 @@
 from .derivation import DerivedKey as DerivedKey, random_embeddings as random_embeddings
-from .key_file import normalized_key as normalized_key, read_key_file as read_key_file
-from .master import (
+from .key_file import (
     ALPHABET as ALPHABET,
-    MasterKey as MasterKey,
     generate_key as generate_key,
     length_for as length_for,
+    normalized_key as normalized_key,
+    read_key_file as read_key_file,
 )
-from .strength import (
-    ENOUGH_BITS as ENOUGH_BITS,
-    key_strength_bits as key_strength_bits,
-    weakness as weakness,
-)
+from .master import MasterKey as MasterKey
+from .strength import ENOUGH_BITS as ENOUGH_BITS, key_strength_bits as key_strength_bits, weakness as weakness

@@ -1,14 +1,19 @@
-"""What counts as a key, and the files that hold one."""
+"""What counts as a key, random keys, and the files that hold one."""
 
 from __future__ import annotations
 
+import math
 import os
+import secrets
+import string
 import unicodedata
 from pathlib import Path
 
 from keyss.core.errors import InputError, OutputError, UsageError
 
 MAX_KEY_BYTES = 4096
+ALPHABET = string.ascii_letters + string.digits
+KEY_LENGTH = 22  # characters of 5.95 bits: 131 bits
 _SPACES = "\t\n\v\f\r \u1680\u2028\u2029\ufeff"  # those of JavaScript's `trim`; NFKC replaces the others
 
 
@@ -62,3 +67,18 @@ def write_new_key(path: Path, key: str) -> None:
         if isinstance(error, OSError):
             raise OutputError(f"cannot write {path}: {error.strerror}") from error
         raise
+
+
+def generate_key(length: int = 16) -> str:
+    """A random alphanumeric key of the system's random source: 5.95 bits per character.
+
+    Raises UsageError for a length outside 1 to 1024.
+    """
+    if not 1 <= length <= 1024:
+        raise UsageError(f"a key has 1 to 1024 characters, not {length}")
+    return "".join(secrets.choice(ALPHABET) for _ in range(length))
+
+
+def length_for(bits: int) -> int:
+    """Length for which `generate_key` reaches `bits`."""
+    return math.ceil(bits / math.log2(len(ALPHABET)))

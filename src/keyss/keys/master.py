@@ -1,4 +1,4 @@
-"""Random keys, and master keys: one key derives the keys of many named assets.
+"""Master keys: one key derives the keys of many named assets.
 
 The master key goes through Argon2id with a fixed salt, so the master key and a name suffice to open an asset,
 and guessing the master key from a derived key is as slow as guessing any key. HKDF-Expand (RFC 5869) then
@@ -9,33 +9,14 @@ allows guesses in advance: use a key of `keyss keygen` as a master key, not a pa
 from __future__ import annotations
 
 import hashlib
-import math
-import secrets
-import string
 import unicodedata
 
 from keyss.core.errors import UsageError
 from keyss.keys.derivation import SALT_BYTES, DerivedKey
+from keyss.keys.key_file import ALPHABET, KEY_LENGTH
 
-ALPHABET = string.ascii_letters + string.digits
-KEY_LENGTH = 22  # characters of 5.95 bits: 131 bits
 _SALT = hashlib.sha256(b"keyss/v1/master").digest()[:SALT_BYTES]
 _MAX_NAME_BYTES = 4096
-
-
-def generate_key(length: int = 16) -> str:
-    """A random alphanumeric key of the system's random source: 5.95 bits per character.
-
-    Raises UsageError for a length outside 1 to 1024.
-    """
-    if not 1 <= length <= 1024:
-        raise UsageError(f"a key has 1 to 1024 characters, not {length}")
-    return "".join(secrets.choice(ALPHABET) for _ in range(length))
-
-
-def length_for(bits: int) -> int:
-    """Length for which `generate_key` reaches `bits`."""
-    return math.ceil(bits / math.log2(len(ALPHABET)))
 
 
 class MasterKey:

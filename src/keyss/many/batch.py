@@ -33,15 +33,7 @@ from keyss.files.reading import read_text
 from keyss.keys.derivation import SALT_BYTES, DerivedKey
 from keyss.keys.key_file import read_key_file
 from keyss.many.cell import CELL, RESULT, Cell
-from keyss.many.running import (
-    CELLS,
-    RETRIES,
-    ManyResult,
-    Outcome,
-    claimed,
-    run_cells,
-    settle_master_key,
-)
+from keyss.many.running import CELLS, RETRIES, ManyResult, Outcome, claimed, run_cells, settle_master_key
 from keyss.many.tables import csv_bytes
 from keyss.methods import registry
 from keyss.methods.base import MethodOptions

@@ -19,8 +19,8 @@ from keyss._processes import how_it_ended
 from keyss.core.errors import KeyssError, OutputError
 from keyss.files.atomic import lock, write_bytes
 from keyss.fitting.config import FitConfig
-from keyss.keys.key_file import read_key_file
-from keyss.keys.master import MasterKey, generate_key
+from keyss.keys.key_file import KEY_LENGTH, generate_key, read_key_file
+from keyss.keys.master import MasterKey
 from keyss.many.cell import CELL, FAILED, LOG, Cell, Result, error_of, model_of, result_of
 from keyss.many.engines import Cluster, Engine, InThisProcess, Processes, Resources
 from keyss.many.measures import check_extras
@@ -86,7 +86,7 @@ def settle_master_key(out: Path, given: Path | None) -> None:
     """
     own = out / MASTER_KEY
     if given is None and not own.exists():
-        write_bytes(own, f"{generate_key(22)}\n".encode())
+        write_bytes(own, f"{generate_key(KEY_LENGTH)}\n".encode())
     check = MasterKey(read_key_file(given or own)).check()
     kept = out / _CHECK
     if not kept.exists():

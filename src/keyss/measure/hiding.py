@@ -12,13 +12,7 @@ from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
 from keyss.core.similarity import align
-from keyss.fitting.image_metrics import (
-    ImageQuality,
-    mean_psnr,
-    mean_quality,
-    subsample_views,
-    view_quality,
-)
+from keyss.fitting.image_metrics import ImageQuality, mean_psnr, mean_quality, subsample_views, view_quality
 from keyss.keys import random_embeddings
 from keyss.methods.opened import Opened
 from keyss.rendering import render

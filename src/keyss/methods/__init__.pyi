@@ -14,11 +14,7 @@ from .carry.room import (
     SecretSize as SecretSize,
     of_degree as of_degree,
 )
-from .combined import (
-    CombinedPoses as CombinedPoses,
-    PlacedScene as PlacedScene,
-    divided as divided,
-)
+from .combined import CombinedPoses as CombinedPoses, PlacedScene as PlacedScene, divided as divided
 from .dither import dither_model as dither_model
 from .joint import JointTraining as JointTraining
 from .keyss.decoder import (

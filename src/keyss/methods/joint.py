@@ -29,15 +29,7 @@ from keyss.fitting.parameters import make_optimizers, to_parameters
 from keyss.fitting.ranks import here
 from keyss.fitting.sampling import Shuffle, own_randomness
 from keyss.fitting.schedule import Schedule
-from keyss.methods.base import (
-    Context,
-    MethodOptions,
-    Plan,
-    Source,
-    Training,
-    check_above_zero,
-    role_of,
-)
+from keyss.methods.base import Context, MethodOptions, Plan, Source, Training, check_above_zero, role_of
 from keyss.methods.combined import CombinedPoses, PlacedScene, combined_points
 from keyss.rendering import render_with_meta
 

@@ -33,8 +33,7 @@ from keyss.channels import (
 from keyss.channels.low_bits import cells
 from keyss.core import Gaussians, InputError, KeyssWarning, UsageError, WrongKeyError, same_bits
 from keyss.files import read_model, write_model
-from keyss.keys import DerivedKey, generate_key
-from keyss.keys.master import ALPHABET
+from keyss.keys import ALPHABET, DerivedKey, generate_key
 from keyss.rendering import render
 from tiny_scenes import ring_cameras
 

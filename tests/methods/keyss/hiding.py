@@ -11,15 +11,7 @@ from channels.low_bits.trained_like import trained_like
 from keyss import FitConfig, Gaussians, KeyssOptions
 from keyss.core.similarity import Similarity
 from keyss.keys import random_embeddings
-from keyss.methods import (
-    ATTRIBUTES,
-    Codec,
-    Decoder,
-    DecoderShape,
-    HiddenSecret,
-    RowSecret,
-    choose_anchors,
-)
+from keyss.methods import ATTRIBUTES, Codec, Decoder, DecoderShape, HiddenSecret, RowSecret, choose_anchors
 from keyss.methods.keyss.rows import encrypt_rows, secret_tables
 
 FIT = FitConfig(iterations=80, max_gaussians=600, grow_start=0.2, grow_every=20, evaluate_every=0, seed=0)

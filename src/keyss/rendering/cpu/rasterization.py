@@ -11,14 +11,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from keyss.core import BackendError
-from keyss.rendering.cpu import (
-    binning,
-    blending,
-    blending_backward,
-    memory,
-    projection,
-    projection_backward,
-)
+from keyss.rendering.cpu import binning, blending, blending_backward, memory, projection, projection_backward
 from keyss.rendering.cpu.jit import announce_compilation
 from keyss.rendering.cpu.layout import CAMERA, FX, MOMENTS, PACKED, POSITION, TILE_HEIGHT, TILE_WIDTH, TX
 from keyss.rendering.cpu.memory import Array

@@ -24,13 +24,7 @@ from keyss.core.scene import Camera
 from keyss.fitting.config import FitConfig
 from keyss.fitting.density import CappedStrategy, Rendered
 from keyss.fitting.image_metrics import subsample_views
-from keyss.fitting.parameters import (
-    Optimizers,
-    Parameters,
-    make_optimizers,
-    to_gaussians,
-    to_parameters,
-)
+from keyss.fitting.parameters import Optimizers, Parameters, make_optimizers, to_gaussians, to_parameters
 from keyss.fitting.plain import without_faint
 from keyss.fitting.schedule import Schedule
 from keyss.methods.combined import combined_points
