@@ -31,7 +31,7 @@ def demo(
     device: Device = "auto",
     seed: Annotated[int, arg(metavar="N", help="Seed of all random numbers, the demo's key included.")] = 0,
 ) -> None:
-    """Hide one made-up scene in another and open it again, in about two minutes.
+    """Hide one made-up scene in another and open it again, in about a minute.
 
     Both are compared with plain 3DGS of as many Gaussians and as many training steps.
 

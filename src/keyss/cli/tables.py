@@ -164,7 +164,7 @@ def _explanations(metrics: HideMetrics, names: Sequence[str], heads: Sequence[st
         strict=True,
     )
     for name, count, before, each in kept:
-        of = "" if before is None else f" of {before:,}"
+        of = f" of {before:,}" if before and before >= count else ""
         lines.append(f"The {name} kept {count:,}{of} Gaussians, {each.psnr:.1f} dB.")
     return lines
 

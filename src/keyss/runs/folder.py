@@ -129,7 +129,10 @@ class RunFolder:
                 f"{self.path} holds an interrupted run of another kind ({running.stage}, not {self.stage})"
             )
         if running.arguments != self.arguments:
-            changes = _differences(running.arguments, self.arguments, "; ", ": ")
+            before = running.arguments | {"keys": self.arguments.get("keys")}
+            if before == self.arguments or "keys" not in self.arguments:  # verifiers depend on the others
+                before = running.arguments
+            changes = _differences(before, self.arguments, "; ", ": ")
             raise OutputError(
                 f"{self.path} holds an interrupted run with other arguments ({changes}): give the same ones, "
                 "or start anew with `overwrite=True`"
