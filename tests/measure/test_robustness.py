@@ -137,7 +137,7 @@ def test_a_refitted_secret_without_low_bits(
 ) -> None:
     scenes, models = pair
     config = CarryOptions(
-        fit=replace(TINY, iterations=5, max_gaussians=2000), publish=publish, refit="always"
+        fit=replace(TINY, iterations=5, max_gaussians=2000, boost=1.0), publish=publish, refit="always"
     )
     hidden = hide_scenes(scenes, [KEY], config, plains=models)
     revealed = keyss.reveal(hidden.stego, KEY).gaussians

@@ -85,8 +85,12 @@ class Visit:
         self.page.wait_for_selector("main[data-picture=settled]")
 
     def at(self, pose: str) -> None:
-        """Move the camera there."""
-        self.page.evaluate("pose => { location.hash = pose }", pose)
+        """Move the camera there, also if the address has that pose already: it never has a secret's."""
+        self.page.evaluate(
+            "pose => { location.hash = pose;"
+            " dispatchEvent(new HashChangeEvent('hashchange', { newURL: location.href })) }",
+            pose,
+        )
 
     def picture(self) -> Picture:
         """[H, W, 3] 0 to 255 what is on the canvas once it does not change any more."""

@@ -207,7 +207,7 @@ def test_rows_are_in_the_order_in_which_plain_3dgs_makes_them() -> None:
 def test_scenes_share_poses_where_options_ask_for_it() -> None:
     scenes, models = three_scenes()
     both = zip(scenes[:2], models[:2], strict=True)
-    placed = [PlacedScene.of(scene, model, Similarity.identity()) for scene, model in both]
+    placed = [PlacedScene.of(scene, model, Similarity()) for scene, model in both]
     options = replace(OPTIONS, common_poses=1.0)
     run = options.settings.training(placed, [EMBEDDINGS[0]], options, torch.device("cpu"))
     assert all(len(set(run._draw_poses())) == 1 for _ in range(10))
