@@ -45,6 +45,7 @@ def main() -> None:
     parser.add_argument("--fits", action="store_true")
     parser.add_argument("--width", type=int, default=200)
     parser.add_argument("--max-gaussians", type=int, default=20_000)
+    parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--iterations", type=int, help="by default, each commit's own")
     parser.add_argument("--threads", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--repeats", type=int, default=2)
@@ -93,7 +94,7 @@ def fits(options: argparse.Namespace) -> dict[str, list[Times]]:
     """The plain models of both scenes, in this process and in two, with as many threads in all."""
     torch.set_num_threads(options.threads)
     config = FitConfig(
-        iterations=options.iterations or MIN_STEPS, max_gaussians=options.max_gaussians, seed=0
+        iterations=options.iterations or MIN_STEPS, max_gaussians=options.max_gaussians, seed=options.seed
     )
     scenes = [load_scene(each, width=options.width) for each in (options.cover, options.secret)]
     both = [Fit(scene, config, scene.name) for scene in scenes]
@@ -109,7 +110,7 @@ def fits(options: argparse.Namespace) -> dict[str, list[Times]]:
 
 
 def sizes(options: argparse.Namespace) -> Command:
-    return ["--width", options.width, "--max-gaussians", options.max_gaussians, "--seed", 0]
+    return ["--width", options.width, "--max-gaussians", options.max_gaussians, "--seed", options.seed]
 
 
 @contextmanager
