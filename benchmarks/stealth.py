@@ -1,7 +1,7 @@
 """How well the attacks of `keyss.measure.stealth` tell files that hide something, on models that you have.
 
     python benchmarks/stealth.py bonsai=a.ply bonsai=b.ply fox=c.ply ...  # plain, of three scenes or more
-    python benchmarks/stealth.py ... --learned bonsai=stego.ply:secret.ply  # stego files, secrets' own models
+    python benchmarks/stealth.py ... --refitted bonsai=stego.ply:secret.ply  # stego files, secrets' models
     python benchmarks/stealth.py --pairs bonsai=plain.ply:stego.ply ...     # files made by something else
     python benchmarks/stealth.py ... --rounded   # models as trainers leave them that round steps
     python benchmarks/stealth.py ... --quick     # two random parts of each model, no predictor, no candidates
@@ -55,7 +55,7 @@ SHOWN = 8  # single statistics in the table
 class File:
     """One file to be judged; `pair` names the plain model that it was made from."""
 
-    kind: str  # "plain", "carried", "sealed", "learned" or "given"
+    kind: str  # "plain", "carried", "sealed", "refitted" or "given"
     scene: str
     pair: str
     model: Gaussians
@@ -80,8 +80,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     with ProcessPoolExecutor(options.workers, get_context("fork"), initializer=_one_thread) as pool:
         files = [file for made in pool.map(_make, _jobs(options)) for file in made]
         print(f"{len(files)} files after {time.monotonic() - started:.0f} s", file=sys.stderr)
-        for scene, path, secret in map(_named, options.learned):
-            files.append(File("learned", scene, path, read_model(path), secret))
+        for scene, path, secret in map(_named, options.refitted):
+            files.append(File("refitted", scene, path, read_model(path), secret))
         pieces = [(file, name, piece) for file in files for name, piece in _pieces(file, options.quick)]
         rows = list(pool.map(_statistics, [piece for _, _, piece in pieces], chunksize=4))
         print(f"{len(rows)} pieces after {time.monotonic() - started:.0f} s", file=sys.stderr)
@@ -107,7 +107,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 def _arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("plain", nargs="*", metavar="SCENE=FILE")
-    parser.add_argument("--learned", nargs="*", default=[], metavar="SCENE=FILE:SECRET")
+    parser.add_argument("--refitted", nargs="*", default=[], metavar="SCENE=FILE:SECRET")
     parser.add_argument("--pairs", nargs="*", default=[], metavar="SCENE=PLAIN:STEGO")
     parser.add_argument("--rounded", action="store_true")
     parser.add_argument("--quick", action="store_true")
@@ -228,7 +228,8 @@ def _detections(
                 for (file, name, _), row in zip(pieces, rows, strict=True)
                 if name == piece
                 and (
-                    file.kind == kind or (file.kind == "plain" and (kind == "learned" or file.pair in paired))
+                    file.kind == kind
+                    or (file.kind == "plain" and (kind == "refitted" or file.pair in paired))
                 )
             ]
             if len({file.scene for file, _ in own}) < 3 or len({file.kind for file, _ in own}) < 2:
@@ -252,7 +253,7 @@ def _detections(
 def _confirmations(pool: ProcessPoolExecutor, files: Sequence[File]) -> dict[str, dict[str, float]]:
     """By kind and score, how often the true candidate is ranked above another one."""
     found = {}
-    for kind in ("carried", "learned"):
+    for kind in ("carried", "refitted"):
         own = [file for file in files if file.kind == kind and file.secret]
         own = own[:: max(1, -(-len(own) // CANDIDATES))]
         paths = list(dict.fromkeys(file.secret for file in own))
