@@ -9,7 +9,7 @@ NOTHING = "–"
 
 
 def number(value: float | None, digits: int = 3) -> str:
-    """With a fixed number of decimals; very large numbers as powers of ten."""
+    """`value` with a fixed number of decimals; very large numbers as powers of ten."""
     if value is None or math.isnan(value):
         return NOTHING
     if math.isinf(value):
@@ -19,14 +19,14 @@ def number(value: float | None, digits: int = 3) -> str:
 
 
 def significant(value: float | None) -> str:
-    """With three significant digits."""
+    """`value` with three significant digits."""
     if value is None or not math.isfinite(value) or value == 0:
         return number(value, 0)
     return f"{value:#.3g}".replace("-", MINUS)
 
 
 def difference(value: float | None, digits: int = 2) -> str:
-    """With its sign."""
+    """`value` with its sign."""
     text = number(value, digits)
     return f"+{text}" if value is not None and value > 0 and text.strip("0.,") else text
 

@@ -52,7 +52,7 @@ class RecordRequest:
 
 @dataclass(frozen=True)
 class RecordPlan:
-    """What the channel offers for a `RecordRequest`."""
+    """The channel's answer to a `RecordRequest`."""
 
     record_bytes: int  # the largest size of a record
     copies: int  # the most records that may be embedded a second time

@@ -63,7 +63,7 @@ def open_content(stego: Gaussians, key: str) -> Content:
 
 @dataclass(frozen=True)
 class Attempt:
-    """A key under the likeliest salt, and what it opens there."""
+    """A key under the likeliest salt, and the content that it opens."""
 
     key: DerivedKey
     content: Content | None

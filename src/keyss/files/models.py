@@ -54,7 +54,7 @@ class ModelFormat:
 
 
 def _format(name: str) -> Any:
-    """What reads and writes a format, imported on first use since some import slow libraries."""
+    """The module or class of a format, imported on first use since some import slow libraries."""
     return pkgutil.resolve_name(f"keyss.files.formats.{name}")
 
 

@@ -35,7 +35,7 @@ def expand(secret: bytes, label: str, length: int) -> bytes:
 
 
 def stream(secret: bytes, label: str, length: int) -> bytes:
-    """As `expand`, for any length: the key stream of ChaCha20 (RFC 8439) under a derived key."""
+    """`expand` for any length: the key stream of ChaCha20 (RFC 8439) under a derived key."""
     data = np.empty(length, np.uint8)
     fill(secret, label, data)
     return data.tobytes()
@@ -52,7 +52,7 @@ def fill(secret: bytes, label: str, data: Bytes) -> None:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class DerivedKey:
-    """What a key becomes under a salt, and the values that follow from it.
+    """A key after Argon2id with one salt, and the values that follow from it.
 
     Labels in use: "embedding" (conditions the decoder), "verifier" (compares keys), "low-bits/key" (encrypts
     the data key in low bits), "writer" (randomness of hiding), "decoy", and those of the other channels.

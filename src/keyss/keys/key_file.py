@@ -1,4 +1,4 @@
-"""What counts as a key, random keys, and the files that hold one."""
+"""Normalisation of keys, random keys, and key files."""
 
 from __future__ import annotations
 

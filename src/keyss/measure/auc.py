@@ -58,10 +58,10 @@ def delong(negatives: Doubles, positives: Doubles) -> tuple[float, float]:
 
 
 def _interval(auc: float, variance: float, pairs: int) -> tuple[float, float]:
-    """By DeLong's variance on the logit scale (Pepe 2003).
+    """The 95 % interval by DeLong's variance on the logit scale (Pepe 2003).
 
-    There is no variance if a class is a single image or the classes do not overlap. Then the interval is that
-    of k independent pairs, one image of each class, all in order: 0.025^(1/k) remains possible.
+    The variance is 0 if a class is a single image or the classes do not overlap. Then the interval is that of
+    `pairs` independent pairs, all in order: an AUC of 0.025^(1 / pairs) remains possible.
     """
     from scipy.special import expit, logit
 

@@ -102,7 +102,7 @@ def _directions(generator: np.random.Generator, size: int) -> Floats:
 
 
 def _mean(distances: Floats, units: Floats) -> float:
-    """Over the rows with a range."""
+    """The mean over the rows with a range."""
     return float(distances[units > 0].mean()) if (units > 0).any() else 0.0
 
 

@@ -147,7 +147,7 @@ def _unit_range(name: str, *pair: Tensor | Bytes) -> list[Tensor]:
 
 
 def _ssim(a: Doubles, b: Doubles) -> tuple[float, float]:
-    """With zero padding, and without the border."""
+    """SSIM with zero padding, and without the border."""
     blur = partial(gaussian_filter, sigma=1.5, mode="constant", radius=RADIUS, axes=(0, 1))
     c1, c2 = 0.01**2, 0.03**2
     mean_a, mean_b = blur(a), blur(b)

@@ -138,7 +138,7 @@ class Steganalysis:
 
     @property
     def mean_fusion(self) -> float | None:
-        """Over the images that have one."""
+        """The mean over the images that have one."""
         fusions = _present(row.scores.fusion for row in self.rows)
         return sum(fusions) / len(fusions) if fusions else None
 

@@ -83,7 +83,7 @@ class CombinedPoses:
         return self.scenes[owner].scene.train[index].camera
 
     def target(self, scene: int, owner: int, index: int) -> Target:
-        """What `scene` looks like from training pose `index` of `owner`."""
+        """The target of `scene` at training pose `index` of `owner`."""
         own = self.scenes[owner].scene.train[index].image
         return Target.of((own if scene == owner else self._render(scene, owner, index)).to(self.device))
 

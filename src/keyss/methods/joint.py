@@ -77,7 +77,7 @@ class JointOptions(MethodOptions):
             )
 
     def joint_plan(self, secrets: int, *, gaussian_weights: float = 0.0, pixel_weights: float = 0.0) -> Plan:
-        """As many Gaussians as a plain model has show all scenes. `*_weights`: see `Plan`."""
+        """The plan where all scenes share as many Gaussians as a plain model has. `*_weights`: see `Plan`."""
         fit = self.fit
         return Plan(
             gaussians=fit.max_gaussians,
@@ -161,7 +161,7 @@ class JointTraining(ABC):
         )
 
     def density_control(self) -> CappedStrategy:
-        """What clones, splits and prunes."""
+        """The strategy that clones, splits and prunes."""
         return CappedStrategy(self.options.fit, self.opacity_for_pruning)
 
     @abstractmethod
@@ -213,7 +213,7 @@ class JointTraining(ABC):
         self.strategy.step_post_backward(self.parameters, self.optimizers, self.density, self.iteration, info)
 
     def extras(self) -> Sequence[Any]:
-        """What a view's loss needs beside poses, one for each of `views_per_step`, on every rank the same."""
+        """Further inputs of the loss of each of `views_per_step` views, the same on every rank."""
         return [None] * self.views_per_step
 
     def loss_at(self, poses: Sequence[Pose], extra: Any) -> tuple[Tensor, list[Rendered]]:

@@ -1,8 +1,8 @@
-"""Packets: 6 bytes, and which ones they are, in words that look random without the key.
+"""Packets: 6 bytes and their number, in words that look random without the key.
 
-A word is 48 bits of data and 36 bits of tag: a number of 20 bits and 16 bits of its hash, encrypted by the
-mask that AES-256 makes of the data under the packets' key. Whoever has it sees which words are packets (one
-in 65,536 others passes), and their numbers. Data of a secret are encrypted before they come here.
+A word is 48 bits of data and 36 bits of tag: a number of 20 bits and 16 bits of its hash, masked with the
+AES-256 encryption of the data under the packets' key. The key tells which words are packets (one in 65,536
+others passes), and their numbers. The data of a secret are encrypted before they come here.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def read(key: bytes, words: Bits) -> tuple[Words, Bytes]:
 
 
 def write_header(key: bytes, value: int, random: np.random.Generator) -> Bits:
-    """[HEADERS, WORD_BITS] words that tell a number of NUMBER_BITS to whoever has the key."""
+    """[HEADERS, WORD_BITS] words that tell the holder of the key a number of NUMBER_BITS."""
     data = random.integers(0, 256, (HEADERS, PACKET_BYTES), np.uint8)
     return write(key, np.full(HEADERS, value, np.uint64), data)
 
@@ -52,7 +52,7 @@ def read_header(key: bytes, words: Bits) -> int | None:
 
 
 def _checks(numbers: Words) -> Words:
-    """[N] what tells that a number was read as it was written."""
+    """[N] the check bits of numbers."""
     return mixed(numbers) >> np.uint64(64 - _CHECK_BITS)
 
 

@@ -1,9 +1,9 @@
 """Pilots: appended Gaussians that everybody can read. They tell the salt, and where the own frame is.
 
-By a public hash of their 39 bits that nothing moves, one word in 64 is a pilot, and of those that are
-written more. The hash gives a pilot's position and turn in the own frame as well; so, however a model was
-moved, turned and scaled, the similarity that most pilots agree on leads back to it (RANSAC, Fischler and
-Bolles 1981; least squares by Umeyama 1991).
+A public hash of the 39 bits that no similarity changes decides whether a word is a pilot: one random word in
+64 is, and some are written. The hash also gives a pilot's position and rotation in the own frame. However a
+model was moved, rotated and scaled, the similarity that most pilots agree on leads back to that frame
+(RANSAC, Fischler and Bolles 1981; least squares by Umeyama 1991).
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ from keyss.keys.derivation import SALT_BYTES
 
 MIN = 128  # pilots of a model
 SHARE = 1 / 16  # of the other appended Gaussians
-_PUBLIC = np.uint64(0x6B65797373_617070)  # what tells this hash from others
-ONE_IN = 64  # words is a pilot by chance
+_PUBLIC = np.uint64(0x6B65797373_617070)  # distinguishes this hash from others
+ONE_IN = 64  # one in so many random words is a pilot
 _PART_BITS, _PARTS = 16, SALT_BYTES // 2
 _RANDOM_BITS = 3 * COLOUR_BITS - 3 - _PART_BITS  # beside the part of the salt and its number
 _TRIES, _AGREE = 300, 12  # of three pilots; that have to agree
@@ -40,7 +40,7 @@ _NEAR = 1.5 / 2**POSITION_BITS  # in the own frame
 
 @dataclass(frozen=True)
 class Found:
-    """What pilots tell."""
+    """The common result of all pilots."""
 
     to_own: Similarity  # from the world to the own frame
     agreeing: int  # pilots
@@ -79,9 +79,9 @@ def count(invariants: Words) -> int:
 
 
 def read(invariants: Words, means: Doubles) -> Found | None:
-    """What the pilots among candidates tell: `invariants` [N] as they were read, `means` [N, 3] in the world.
+    """The result of the pilots among candidates: `invariants` [N] as read, `means` [N, 3] in the world.
 
-    None where too few agree.
+    None if too few agree.
     """
     random = np.random.default_rng(0)
     own = np.flatnonzero(_is_pilot(invariants))

@@ -1,10 +1,10 @@
 """Secrets in the last bits of the codes of a final .spz, .sog or compressed .ply.
 
-The file is passed on byte for byte, so values are exact and nothing is redundant. `fields` says which numbers
-carry, `kept` which of these are left alone, `syndromes` how readers do without knowing that, `layout` where
-everything lies. Every other bit is random: files with one secret and with many look alike. All randomness
-comes from `entropy`, mixed with the cover and all payloads, so that no two files share a salt; encryption
-keys derive from key and salt, so that no key stream is used twice.
+The file is passed on byte for byte, so values are exact and nothing is redundant. `fields` chooses the
+numbers that carry bits, `kept` those that are left alone, `syndromes` lets readers do without that list, and
+`layout` assigns places. Every other bit is random: files with one secret and with many look alike. All
+randomness comes from `entropy`, mixed with the cover and all payloads, so that no two files share a salt;
+encryption keys derive from key and salt, so that no key stream is used twice.
 """
 
 from __future__ import annotations
@@ -139,7 +139,7 @@ class CodesCover:
     def _embedded(
         self, secrets: Sequence[tuple[DerivedKey, bytes]], salt: bytes, entropy: bytes
     ) -> Codes | None:
-        """None where, once in a hundred times, a block has too few bits that may change."""
+        """None if a block has too few bits that may change, which happens once in a hundred times."""
         zones, sizes = self.zones, [compressed_size(packed) + OVERHEAD for _, packed in secrets]
         if len(secrets) > zones.slots:
             raise UsageError(f"this cover has room for {zones.slots} secrets, got {len(secrets)}")

@@ -28,8 +28,8 @@ from keyss.files.formats.spz import SpzCodes
 Levels = npt.NDArray[np.int32]
 
 MAX_BITS = 10
-_SHARE = -3.0  # 2 to this: the range of what is written, in sizes of the Gaussian
-_LOG_SCALE = -4.0  # 2 to this: the range of what is written in log scales
+_SHARE = -3.0  # log2 of the range of written positions, in sizes of the Gaussian
+_LOG_SCALE = -4.0  # log2 of the range of written log scales
 _SIGN, _MAGNITUDE = 512, 511  # of the rotations of an SPZ of version 3 or newer
 _LOG2_E = 1.4426950408889634
 _VECTOR = np.array([2047, 1023, 2047])  # largest levels of x, y, z in a compressed .ply
@@ -77,7 +77,7 @@ class Field:
 
 @dataclass(frozen=True)
 class Carrying:
-    """How codes of one format carry."""
+    """How the codes of one format carry bits."""
 
     fields: Callable[[Any], list[Field]]
     with_levels: Callable[[Any, Mapping[str, Levels]], Any]  # codes with new levels of some fields
@@ -86,7 +86,7 @@ class Carrying:
 
 
 def carrying(codes: Codes) -> Carrying:
-    """How these codes carry."""
+    """How the format of these codes carries bits."""
     return _CARRYING[type(codes)]
 
 
@@ -136,7 +136,7 @@ def _compressed_ply_fields(codes: CompressedPlyCodes) -> list[Field]:
 
 
 def _replaced(codes: Any, levels: Mapping[str, Levels]) -> Any:
-    """`codes` with levels that are codes."""
+    """`codes` with new levels, in formats whose levels are the codes themselves."""
     old = {name: getattr(codes, name) for name in levels}
     return replace(
         codes, **{name: levels[name].reshape(each.shape).astype(each.dtype) for name, each in old.items()}
@@ -164,7 +164,7 @@ def _log2(values: Doubles) -> Doubles:
 
 
 def _fitting(logs: Doubles) -> Levels:
-    """How many bits of levels span 2 to the `logs` at most."""
+    """The number of bits of levels that span at most 2 ** `logs`."""
     return np.floor(np.nan_to_num(logs)).clip(0, MAX_BITS).astype(np.int32)
 
 

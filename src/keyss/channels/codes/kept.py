@@ -28,7 +28,7 @@ from keyss.files.formats.sog import SogCodes
 # Clones lie nearer to each other, and there are more of them than by chance.
 _CLONES = 1 / 8
 _NEIGHBOURS = 4  # of a Gaussian, among which its clones are
-_RAMP = 3  # width of the ramp before a limit, in ranges of what is written
+_RAMP = 3  # width of the ramp before a limit, in ranges of written levels
 _NEAR = 8  # levels away, whose frequencies are compared
 _ROUGH = 0.25  # by how much more often levels may be equal than near each other
 _EQUAL = 0.02  # as a share of the Gaussians
@@ -53,11 +53,11 @@ def changeable(codes: Codes, fields: list[Field], secret: bytes) -> list[Flags]:
 
 
 def _alone(codes: Codes, fields: list[Field], random: Doubles) -> Flags:
-    """[N] which Gaussians are no clones, some of which training moves apart slowly.
+    """[N] which Gaussians are no clones.
 
-    There are more near pairs than by chance, and changes would move them apart: the share of those that
-    change grows smoothly with the distance in sizes of the Gaussian. A Gaussian that has a written attribute
-    in common with a neighbour never changes.
+    Training moves clones apart slowly, so there are more near pairs than by chance, and changes would move
+    them further: the share of those that change grows smoothly with the distance in sizes of the Gaussian. A
+    Gaussian that has a written attribute in common with a neighbour never changes.
     """
     model = codes.dequantise()
     means, log_scales = (each.double().numpy() for each in (model.means, model.log_scales))

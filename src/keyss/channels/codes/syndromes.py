@@ -1,8 +1,8 @@
 """Wet paper codes (Fridrich, Goljan, Lisonek and Soukal 2005): some bits must stay, no reader knows which.
 
-What is written is not the bits but, of each block of BLOCK of them, their product with a random matrix modulo
-2. Whoever writes solves for the bits that may change ("dry"); whoever reads multiplies. A block holds as many
-bits as it has dry ones, less the few that random matrices lack in rank.
+A block of BLOCK bits holds their product with a random matrix, modulo 2. The writer solves for the bits that
+may change ("dry"); the reader multiplies. A block holds as many bits as it has dry ones, less the few that
+random matrices lack in rank.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ def matrix(seed: bytes, rate: int) -> Words:
 
 
 def read(bits: Bits, rows: Words) -> Bits:
-    """[B rate] what blocks [B BLOCK] hold."""
+    """[B rate] the message in blocks [B BLOCK]."""
     return _product(bits.reshape(-1, BLOCK), _unpacked(rows).T).reshape(-1)
 
 
 def write(bits: Bits, dry: Bits, message: Bits, rows: Words) -> Bits | None:
-    """[B BLOCK] `bits`, of which `dry` ones are changed until `read` gives the `message` [B rate].
+    """[B BLOCK] `bits` with `dry` ones changed so that `read` gives the `message` [B rate].
 
-    All solutions are alike, if dry bits are random before. None where a block has too few of them.
+    All solutions are equally likely if dry bits were random. None if a block has too few of them.
 
     One elimination for all blocks: with as many columns of the matrix P as it has rows, and the others F,
     changes are x_P = P^-1 wanted + P^-1 F x_F. A block then needs an x_F by which x_P is 0 where bits stay.
@@ -74,7 +74,7 @@ def _unpacked(rows: Words) -> Bits:
 
 @kernel
 def _eliminated(rows):  # type: ignore[no-untyped-def]
-    """`rows` reduced, so that in column pivots[i] only row i is 1; what made them so; the pivots, or -1."""
+    """`rows` reduced, so that in column pivots[i] only row i is 1; the row operations; the pivots, or -1."""
     rate, words = rows.shape
     own, made = rows.copy(), np.zeros((rate, -(-rate // 64)), np.uint64)
     pivots = np.full(rate, -1)

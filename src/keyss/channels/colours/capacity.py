@@ -1,7 +1,7 @@
-"""How much a model holds, and where a payload goes: it should show and cost as little as possible.
+"""How much a model holds, and where a payload goes, so that it shows and costs as little as possible.
 
-The variance that writing adds gives a payload away. It is least for each byte with one bit in each number
-(depth 1). So a payload gets a share of the carriers at that depth, as large as it needs; one that needs more
+The variance that writing adds gives a payload away. Per byte, it is least with one bit in each number (depth
+1). So a payload gets as large a share of the carriers as it needs at that depth. A payload that needs more
 gets all carriers, and the least depth and level that hold it.
 
 A payload that is small enough is written only where that leaves the model as likely as it was (`likeness`).
@@ -30,8 +30,8 @@ from keyss.rendering.difference import psnr_between
 
 _RATE = 0.42  # data bits for each bit of information that is expected to be read
 _GARBAGE = 0.02  # share of carriers whose name has changed although it seemed safe
-_COMFORTABLE = 0.8  # of the capacity of a share: the less, the more may be lost
-_ROBUST = 0.5  # the same of a payload that shows anyway
+_COMFORTABLE = 0.8  # how full a share may be; the rest makes up for losses
+_ROBUST = 0.5  # the same for a payload that shows anyway
 SPREAD = 0.5  # dB by which writing may cost more than `Capacity.cost`
 _INCOMPRESSIBLE = 11  # bytes by which zlib lengthens data that it cannot compress
 _ROUNDED = 0.25  # share of repeated colours from which on a model is a rounded one
@@ -51,7 +51,7 @@ class Layout:
 
 @dataclass(frozen=True)
 class Capacity:
-    """What a model holds."""
+    """The capacity of a model."""
 
     model: Gaussians
     numbers: Numbers
@@ -65,7 +65,7 @@ class Capacity:
         return max(0, largest - OVERHEAD - _INCOMPRESSIBLE)
 
     def layout(self, sizes: Sequence[int]) -> Layout | None:
-        """For encrypted payloads of these sizes in bytes; None where they do not fit."""
+        """The layout of encrypted payloads of these sizes in bytes; None if they do not fit."""
         level = self._level(1)
         for likely in (True, False):
             for comfort in (_COMFORTABLE, 1.0):
@@ -122,7 +122,7 @@ class Capacity:
         return tuple(max(1, math.ceil(SHARES * min(1e6, size / room))) for size in buckets)
 
     def _room(self, level: int, depth: int, likely: bool = False) -> float:
-        """Bytes that all carriers hold."""
+        """The number of bytes that all carriers hold."""
         information = self._information(self.admission if likely else 1.0)
         bits = COLUMNS * float((bit_counts(self.own, level, depth) * information).sum())
         return _RATE * (1 - self._headers(depth)) * bits / 8
@@ -155,7 +155,7 @@ class Capacity:
 
     @cached_property
     def likeness(self) -> Likeness:
-        """Of the C carriers, for changes as writing makes them."""
+        """The likeness of the C carriers, for changes as writing makes them."""
         means = self.model.means.detach().cpu().double().numpy()[self.numbers.rows]
         return Likeness.of(self.numbers.colours, np.nan_to_num(means).clip(-1e15, 1e15), self._example)
 

@@ -5,7 +5,7 @@ numbers that survive every format, changes of these cost least. A Gaussian is id
 cells in which its three log scales, its opacity and its red coefficient lie. Writing changes none of these,
 and none depends on the model's position, rotation or order.
 
-Borders of cells are the borders between two roundings of 8-bit formats (`.spz`: log scales in sixteenths,
+Borders of cells are borders between rounded values of 8-bit formats (`.spz`: log scales in sixteenths,
 colours in steps of 1 / 38.25; opacities in 255ths nearly everywhere), so that rounding moves no number across
 one. `Carriers.doubt` is the chance that another format or another change has done so.
 
@@ -36,7 +36,7 @@ from keyss.keys.derivation import SALT_BYTES, expand
 
 SCALE_STEP, COLOUR_STEP, OPACITY_STEP = 1 / 16, 1 / 38.25, 1 / 255  # of 8-bit formats
 CELL = 0.25  # of a log scale
-_SCALE_STEPS, _RATIO_STEPS, _COLOUR_STEPS, _OPACITY_STEPS = 4, 8, 5, 16  # that make a cell
+_SCALE_STEPS, _RATIO_STEPS, _COLOUR_STEPS, _OPACITY_STEPS = 4, 8, 5, 16  # steps of a cell
 _MIN_OPACITY = 2.5 / 255  # formats keep the colour of nothing less
 # What formats move these numbers by, at most (`.spz` aside, see above): half widths of uniform noise.
 _SCALE_NOISE, COLOUR_NOISE, OPACITY_NOISE = 0.018, 0.009, 0.004
@@ -48,7 +48,7 @@ Names = npt.NDArray[np.int16]
 
 SALTS = 16  # at most; after rounding and random pruning of a quarter, 5 to 12 of them are left
 _ENOUGH = 12  # that rounding leaves: of fewer, too few are left after pruning for headers with gaps
-_BANDS = (0.08, 0.4, 1.01)  # of opacity, from each of which half of them are
+_BANDS = (0.08, 0.4, 1.01)  # limits of two bands of opacity, with half of the salts each
 _MAX_MOVED = 3  # cells
 # Rounding a number leaves it in its cell, whose borders are borders of rounding too; a ratio moves by a step.
 _NOISE = np.array([OPACITY_NOISE / OPACITY_STEP] + [1.0] * 2 + [COLOUR_NOISE / COLOUR_STEP] * 3)
@@ -78,7 +78,7 @@ class Numbers:
         return Numbers(rows, log_scales[rows], opacities[rows], colours[rows])
 
     def rounded(self) -> Numbers:
-        """As `.spz` leaves them."""
+        """The numbers as `.spz` rounds them."""
         return Numbers(
             self.rows,
             np.round(self.log_scales / SCALE_STEP) * SCALE_STEP,
@@ -115,7 +115,7 @@ class Carriers:
 
     rows: Integers  # [C] of the model
     names: Names  # [C, 5] numbers of cells: log scales, opacity, red
-    doubt: Doubles  # [C] chance that the name is not what it was when it was written
+    doubt: Doubles  # [C] chance that the name has changed since it was written
     values: Doubles  # [C, 2] green and blue
 
     def __len__(self) -> int:
@@ -125,7 +125,7 @@ class Carriers:
         return Carriers(self.rows[which], self.names[which], self.doubt[which], self.values[which])
 
     def shifted(self, cells: int) -> Carriers:
-        """As with an offset that is larger by so many cells."""
+        """The carriers under an offset that is larger by so many cells."""
         moved = self.names - np.array([cells] * 3 + [0] * 2, np.int16)
         return Carriers(self.rows, moved, self.doubt, self.values)
 

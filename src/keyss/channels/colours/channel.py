@@ -130,7 +130,7 @@ class ColoursCover:
         return stego
 
     def _layouts(self, sizes: Sequence[int]) -> list[Layout]:
-        """Of each payload."""
+        """The layout of each payload."""
         alone = [self.capacity.layout([size]) for size in sizes]
         layouts = [own for own in alone if own is not None]
         noticed = len(sizes) > UNNOTICED
@@ -150,7 +150,7 @@ class ColoursCover:
     def _headers(
         self, layouts: Sequence[Layout], sizes: Sequence[int], secret: bytes, lower: int
     ) -> list[Header]:
-        """Of each payload, and of decoys without a key, which look the same."""
+        """The header of each payload, and of decoys without a key, which look the same."""
         partition = expand(secret, "colours/partition", 2)
         headers, first = [], 0
         for index in range(max(len(layouts), UNNOTICED)):
@@ -181,8 +181,8 @@ class ColoursCover:
     ) -> Gaussians:
         """The model with new salts, headers for all `writings`, and payloads of those that have one.
 
-        Of those that are `likely` only as much as leaves the model as likely as it was; all of a header
-        where salts are so few after rounding that it would be lost with gaps.
+        Of `likely` ones, only numbers that leave the model as likely as it was are written, but all of a
+        header if so few salts survive rounding that a header with gaps would be lost.
         """
         carriers = replace(self.capacity.carriers, values=numbers.colours[:, 1:])
         values = carriers.values.copy()
@@ -242,7 +242,7 @@ class ColoursCover:
 
 @dataclass(frozen=True)
 class _Writing:
-    """What is written for one key."""
+    """The data to be written for one key."""
 
     static: bytes  # the key without a salt of the file
     secrets: tuple[bytes, ...]  # the key under each salt

@@ -27,7 +27,7 @@ _RAPTOR = (
     *((1, 0.020), (2, 0.486), (3, 0.163), (4, 0.072), (5, 0.081), (8, 0.055), (9, 0.037), (19, 0.055)),
     (65, 0.031),
 )
-# For a few hundred bits of which most code bits are lost or wrong: found by trying.
+# For a few hundred data bits if most code bits are lost or wrong; found by experiment.
 NOISY = ((1, 0.15), (2, 0.50), (3, 0.25), (4, 0.10))
 _REPEATS = 4  # parity checks that each data bit takes part in
 _SURE = 25.0  # log-likelihood ratio of what is known

@@ -4,9 +4,9 @@ There is a *header* under each of a few salts, and all are equal. So they are pa
 and are read together: one salt's Gaussians replace the lost ones of another. *Pilots*, a few known bits of
 each part, tell which salts were lost.
 
-The key chooses the Gaussians of a part by numbers that are compared with a public hash of each name: the next
-one above counts (consistent hashing, Karger et al. 1997). A lost Gaussian costs its own place and no other,
-and places are found in a sorted list, so that a wrong key costs next to nothing.
+The key chooses the Gaussians of a part by random numbers: each stands for the name with the next larger
+public hash (consistent hashing, Karger et al. 1997). A lost Gaussian costs its own place and no other, and
+places are found in a sorted list, so that a wrong key costs next to nothing.
 """
 
 from __future__ import annotations
@@ -111,7 +111,7 @@ class Header:
 
     @staticmethod
     def unpack(bits: Bits, check: bytes) -> Header | None:
-        """None for anything else; by chance one of 2^16 others is taken for a header, and opens nothing."""
+        """None for other bits; one in 2^16 of them is taken for a header by chance, and opens nothing."""
         data = np.packbits(bits).tobytes()
         plain, tag = data[:-_CHECK_BYTES], data[-_CHECK_BYTES:]
         if not hmac.compare_digest(tag, _check(check, plain)):
@@ -150,7 +150,7 @@ class Index:
     def parts(
         self, secrets: Sequence[bytes], kind: Kind, view: Sequence[float], count: int | None = None
     ) -> Parts:
-        """What the first `count` Gaussians of each salt hold, if it is one; by default all of them."""
+        """The bits in the first `count` Gaussians of each salt, by default in all of them."""
         count = kind.places if count is None else count
         every, hints = [], []
         for behind, sure in enumerate(view):
@@ -253,7 +253,7 @@ def derived(key: str, salts: Sequence[bytes]) -> tuple[bytes, tuple[bytes, ...]]
     """`key` without a salt of the file, and under each; takes about 0.1 s for each.
 
     The salts make every guess cost Argon2id anew for each file. The other secret makes up for the few bytes
-    of a header: whoever does not know the key has to guess both.
+    of a header: an attacker has to guess both.
     """
     secrets = [DerivedKey.of(key, salt).expand("colours/header", 32) for salt in salts]
     return DerivedKey.of(key, _STATIC_SALT).expand("colours/static", 32), tuple(secrets)
@@ -274,7 +274,7 @@ def _seeds(kind: Kind, secret: bytes, names: Names) -> Words:
 
 
 def _pads(words: Words) -> Bits:
-    """[B] bits by which the code is encrypted."""
+    """[B] bits that encrypt the code."""
     return (mixed(words ^ _PAD) >> np.uint64(63)).astype(np.uint8)
 
 

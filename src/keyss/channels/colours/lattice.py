@@ -56,7 +56,7 @@ def write(secret: bytes, carriers: Carriers, bits: Integers, code: Bits) -> Doub
 
 
 def read(dither: Doubles, carriers: Carriers, bits: Integers, doubt: Doubles) -> Floats:
-    """[B] logarithms of P(0) / P(1) of each bit, of which each number has `bits` [C].
+    """[B] logarithms of P(0) / P(1) of all bits; each number of a carrier has `bits` [C].
 
     `dither` [C, 2]: of `dithers`. `doubt` [C]: the chance that a carrier holds something else.
     """

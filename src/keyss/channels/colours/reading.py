@@ -40,7 +40,7 @@ _CELLS_AROUND = (0, 1, -1, 2, -2, 3, -3, 4, -4)  # where a writer may have had i
 _CELLS_SCALED = (0, 1, -1)  # in a model that was scaled
 _ALIGNMENTS = 7  # of borders of cells: in a model that was scaled names are wrong by a fifth at most
 _BEST = 3  # of all these, that are looked at more closely
-# What a key that opens nothing looks for.
+# The header that a key that opens nothing looks for.
 _NOTHING = Header(bytes(FILE_KEY_BYTES), bytes(2), LEVELS - 1, 1, 0, SHARES // 4 - 1, 64, 0)
 _REFINED = ((0.02, 0.004), (0.004, 0.001))  # where offsets are looked for once a header is found
 
@@ -75,10 +75,10 @@ class ColoursReader:
             for header in headers or [_NOTHING]
             for offset, index in zip(best, indices, strict=True)
         ]
-        if not headers:  # about the work that there is where there is something
+        if not headers:  # takes about as long as reading a payload
             _payload(_NOTHING, static, self.numbers.carriers(0.0), _CHANGED, _ROUNDS // 4)
             raise WrongKeyError()
-        # One attempt in 2^16 makes a header up, and the right one can be read where names are wrong.
+        # One attempt in 2^16 finds a false header, and a right one can be read under wrong names.
         _, header, offset = max(agreements, key=itemgetter(0))
         carriers = self._refined(header, check, secrets, offset)
         free = np.ones(len(carriers), bool)
@@ -116,7 +116,7 @@ class ColoursReader:
 def _payload(
     header: Header, static: bytes, carriers: Carriers, changed: float, rounds: int = _ROUNDS
 ) -> bytes | None:
-    """What the header's data key decrypts, or None."""
+    """The payload that the header's data key decrypts, or None."""
     own = carriers[header.own(carriers)]
     size, key, counts = bucket_bytes(header.bucket), data_key(static, header), header.bits(own)
     if not len(own) or 8 * size > _MAX_RATE * COLUMNS * counts.sum():

@@ -132,7 +132,7 @@ def search_embeddings(
 ) -> Tensor:
     """[restarts, 64] unit vectors for which the decoder seems to show another scene, the best first.
 
-    In the published scheme the key is a vector that enters the decoder's first layers. Whoever has the
+    In the published scheme the key is a vector that enters the decoder's first layers. An attacker with the
     network can search for the vector that exchanges most Gaussians, without knowing the secret: gradient
     ascent from random starts on the mean change of the opacities, less `balance` times the change of their
     mean. Making some Gaussians visible and as many others invisible replaces one scene by another; only

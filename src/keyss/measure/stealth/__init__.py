@@ -1,1 +1,1 @@
-"""Attacks of somebody who has read the source, but has no key: is something hidden, what, and how many?"""
+"""Attacks with the source code, but no key: is something hidden, what, and how many secrets?"""

@@ -44,7 +44,7 @@ class JudgedStatistic:
 
 @dataclass(frozen=True)
 class StealthResult:
-    """What an attacker with the source code, but no key, finds in the file alone."""
+    """The findings of an attacker with the source code, but no key, in the file alone."""
 
     statistics: tuple[JudgedStatistic, ...]  # the least likely first
     least: float  # minimum of the p-values, corrected for their number

@@ -171,7 +171,7 @@ class Peer:
         return options
 
     def plan(self, sources: Sequence[Source], options: PeerOptions) -> Plan:
-        """As many Gaussians as a plain model show both scenes."""
+        """Both scenes share as many Gaussians as a plain model has."""
         return options.joint_plan(1, pixel_weights=self.pixel_weights)
 
     def hide(self, cover: Source, secrets: Sequence[Source], options: PeerOptions, context: Context) -> Stego:
