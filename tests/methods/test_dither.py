@@ -10,7 +10,7 @@ import torch
 
 from channels.low_bits.trained_like import keys, trained_like
 from keyss.channels import LOW_BITS, LowBitsReader
-from keyss.core import Gaussians, InputError, same_bits
+from keyss.core import Gaussians, UsageError, same_bits
 from keyss.methods import dither_model
 from keyss.rendering import psnr_between
 from methods.carry.carried import embed_derived, extract_derived
@@ -40,7 +40,7 @@ def test_quantised_models_can_carry_again_and_would_be_rounded_back(
     model: Gaussians, change: Callable[[torch.Tensor], torch.Tensor]
 ) -> None:
     coarse = model.map(change)
-    with pytest.raises(InputError, match="low bits"):
+    with pytest.raises(UsageError, match="low bits"):
         LOW_BITS.prepare(coarse)
     fine = dither_model(coarse, ENTROPY)
     assert LOW_BITS.prepare(fine).usable.mean() > 0.9
@@ -56,7 +56,7 @@ def test_quantised_models_can_carry_again_and_would_be_rounded_back(
 
 def test_an_added_offset_is_noticed_and_dithered(model: Gaussians) -> None:
     moved = Gaussians(model.means, model.quats, _added(model.log_scales), model.opacity_logits, model.sh)
-    with pytest.raises(InputError, match="random low bits"):
+    with pytest.raises(UsageError, match="random low bits"):
         LOW_BITS.prepare(moved)
     fine = dither_model(moved, ENTROPY)
     assert torch.equal(fine.quats, moved.quats)

@@ -16,7 +16,7 @@ import torch
 from keyss.api.asking import HideResult, Secret, check_keys, method_for, sources_of
 from keyss.api.fitting import begun, together
 from keyss.channels import AnyChannel, Publish, channel_for, open_content
-from keyss.core.errors import InputError, QualityError, UsageError
+from keyss.core.errors import QualityError, UsageError
 from keyss.core.gaussians import Gaussians, same_bits
 from keyss.core.scene import Scene, ViewOptions
 from keyss.files.models import is_model_path, read_model
@@ -244,10 +244,10 @@ def _hide_files(
     place = channel_for(publish, channel)
     try:
         stego = place.prepare(model).embed(payloads)
-    except (InputError, UsageError) as error:
+    except UsageError as error:
         if (publish, channel) == ("any", "appended"):
             raise
-        raise type(error)(f'{error}; `publish="any", channel="appended"` has room for all') from error
+        raise UsageError(f'{error}; `publish="any", channel="appended"` has room for all') from error
     with folder.work() if folder else nullcontext():
         name = stego_name(stego)
         there = folder.write({name: stego}) if folder else None

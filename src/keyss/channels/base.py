@@ -161,7 +161,7 @@ class Channel(ABC):
 
     @abstractmethod
     def prepare(self, cover: Gaussians) -> PreparedCover:
-        """Find the carriers. Raises InputError for a cover without room, or none that is unseen.
+        """Find the carriers. Raises UsageError for a cover without room, or none that is unseen.
 
         Raises OutputError for a cover that the format of the published file does not hold.
         """

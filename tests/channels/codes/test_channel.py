@@ -158,7 +158,7 @@ def test_equal_keys_no_secrets_and_too_many() -> None:
 
 @EVERY
 def test_small_models_have_no_room(suffix: str) -> None:
-    with pytest.raises(InputError, match="no room"):
+    with pytest.raises(UsageError, match="no room"):
         CodesCover.of(codes_of(suffix, 300))
     with pytest.raises(WrongKeyError):
         opened(codes_of(suffix, 300))

@@ -263,7 +263,7 @@ def test_capacity_grows_with_the_model_and_is_kept_to() -> None:
 def test_models_without_random_low_bits_are_refused(
     change: Callable[[Gaussians], Gaussians], plain: Gaussians
 ) -> None:
-    with pytest.raises(InputError, match="low bits"):
+    with pytest.raises(UsageError, match="low bits"):
         embed_derived(change(plain), [(keys(), b"x")])
 
 

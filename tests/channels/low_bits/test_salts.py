@@ -12,7 +12,7 @@ import torch
 from channels.low_bits.payloads import embed, embed_derived, extract_derived
 from channels.low_bits.trained_like import keys, trained_like
 from keyss.channels import LowBitsReader, identities, read_low_bits, salt_rows, usable_carriers
-from keyss.core import Gaussians, InputError, KeyssWarning, WrongKeyError
+from keyss.core import Gaussians, KeyssWarning, UsageError, WrongKeyError
 
 
 def planted(pairs: int, seed: int = 3) -> Gaussians:
@@ -33,7 +33,7 @@ def salts_of(model: Gaussians) -> list[bytes]:
 
 @pytest.mark.parametrize("pairs", [5, 12])
 def test_covers_with_many_predictable_salts_are_refused(pairs: int) -> None:
-    with pytest.raises(InputError, match=r"salts of this model cannot be renewed.*another cover"):
+    with pytest.raises(UsageError, match=r"salts of this cover cannot be renewed.*another cover"):
         embed_derived(planted(pairs), [(keys(), b"secret")])
 
 

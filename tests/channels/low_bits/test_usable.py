@@ -14,7 +14,7 @@ from keyss.channels import LOW_BITS, LowBitsReader, chance_of_bits, read_low_bit
 from keyss.channels.low_bits.bits import Layout, used_words, write_low_bits
 from keyss.channels.low_bits.predictability import count_trailing_zeros, least_exponent
 from keyss.channels.low_bits.usable import GIVEN_AWAY, check_usable
-from keyss.core import Gaussians, InputError, same_bits
+from keyss.core import Gaussians, UsageError, same_bits
 
 STEP = 2.0**-12  # scale of the last steps of the optimiser that rounds them
 MODELS = 16
@@ -111,7 +111,7 @@ def test_bits_that_depend_on_each_other_are_refused() -> None:
     model = trained_like(4000, 2)
     words = model.sh.numpy().view(np.uint32)
     words ^= (words & 1) << 9 ^ (words >> 9 & 1) << 9  # bit 9 is bit 0
-    with pytest.raises(InputError, match=r"low bits of (f_rest|harmonics) are not random"):
+    with pytest.raises(UsageError, match=r"low bits of (f_rest|harmonics) are not random"):
         LOW_BITS.prepare(model)
     usable = np.ones(4000, bool)
     check_usable(trained_like(4000, 2), usable)

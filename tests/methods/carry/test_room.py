@@ -13,7 +13,7 @@ import keyss
 from channels.low_bits.trained_like import trained_like
 from keyss import CarryOptions, Gaussians, Secret
 from keyss.channels import LowBitsRoom, usable_carriers
-from keyss.core import InputError, KeyssWarning, UsageError
+from keyss.core import KeyssWarning, UsageError
 from keyss.fitting import mean_psnr
 from keyss.methods import Context, RecordRoom, SecretSize, Source, of_degree, registry
 from keyss.rendering import scene_of_model
@@ -39,7 +39,7 @@ def _unit(model: Gaussians) -> Gaussians:
 def test_quantised_covers_get_random_low_bits_when_asked_for(degree: int) -> None:
     model, secret = trained_like(2000, sh_degree=degree).map(_steps), trained_like(300, 1, 0)
     assert usable_carriers(model).mean() < 0.1
-    with pytest.raises(InputError, match=r"`dither=True` makes room.*`publish=.any.`"):
+    with pytest.raises(UsageError, match=r"`dither=True` makes room.*`publish=.any.`"):
         _prepare(CarryOptions(), model, secret)
     prepared = RecordRoom.of(model, _prepare(CarryOptions(dither=True), model, secret)).prepared
     assert prepared is not None
@@ -90,7 +90,7 @@ def test_what_training_will_not_make_random_is_refused() -> None:
         model.opacity_logits,
         model.sh[:, :, :1].repeat(1, 1, 3),
     )
-    with pytest.raises(InputError, match=r"random low bits.*`publish=.any.`"):
+    with pytest.raises(UsageError, match=r"random low bits.*`publish=.any.`"):
         _prepare(CarryOptions(), grey, grey)
     _prepare(CarryOptions(), trained_like(8000), grey)
     _prepare(CarryOptions(publish="any"), grey, grey)

@@ -76,12 +76,12 @@ class CodesCover:
 
     @staticmethod
     def of(codes: Codes) -> CodesCover:
-        """Raises InputError for codes without room."""
+        """Raises UsageError for codes without room."""
         ordered, fields = in_counted_order(codes)
         cover = CodesCover(ordered, fields, changeable(ordered, fields, _digest(codes)))
         if not cover.zones.slots or cover.rate < ZONE_RATE:
-            raise InputError(
-                f"a model of {len(fields[0].levels):,} Gaussians has no room for secrets in the codes of "
+            raise UsageError(
+                f"a cover of {len(fields[0].levels):,} Gaussians has no room for secrets in the codes of "
                 f"{codes.name} files"
             )
         return cover

@@ -46,13 +46,13 @@ from keyss.channels.colours.header import (
 from keyss.channels.colours.lattice import MAX_BITS, seeds, write
 from keyss.channels.colours.reading import ASSOCIATED
 from keyss.core.arrays import Doubles, Flags
-from keyss.core.errors import InputError, KeyssWarning, UsageError
+from keyss.core.errors import KeyssWarning, UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.keys.derivation import MASTER_BYTES, expand, stream
 from keyss.keys.encryption import OVERHEAD, compressed_size, encrypt
 from keyss.rendering.difference import psnr_between
 
-_TOO_FEW = "this model has too few Gaussians to hide anything that survives other formats"
+_TOO_FEW = "this cover has too few Gaussians to hide anything that survives other formats"
 _LOWER = 3  # levels, each a quarter of a bit, by which a payload may lie lower than planned
 _BITS_PER_GAUSSIAN = 1  # of room, about, beside headers
 _HEADERS = 100  # bytes, about
@@ -103,14 +103,14 @@ class ColoursCover:
         return Room(len(self.capacity.own), self.capacity.bytes(MAX_BITS), _OVERHEAD)
 
     def embed(self, contents: Sequence[tuple[str, Content]], *, entropy: bytes | None = None) -> Gaussians:
-        """See `PreparedCover`. Raises InputError for a model that can carry nothing, too."""
+        """See `PreparedCover`. Raises UsageError for a model that can carry nothing, too."""
         payloads = [pack_payload(content) for _, content in contents]
         secret = randomness(entropy, *payloads)
         random = np.random.default_rng(np.frombuffer(stream(secret, "colours/random", 32), np.uint32))
         numbers = renewed(self.capacity.numbers, random)
         salts = Salts.of(numbers)
         if len(salts.salts) < SALTS:
-            raise InputError(_TOO_FEW)
+            raise UsageError(_TOO_FEW)
         sizes = [compressed_size(payload) + OVERHEAD for payload in payloads]
         layouts = self._layouts(sizes)
         writings = [
@@ -138,7 +138,7 @@ class ColoursCover:
             together = self.capacity.layout(sizes)
             if together is None:
                 raise UsageError(
-                    f"the colours of this model hold {self.room.capacity:,} bytes in all, and the secrets "
+                    f"the colours of this cover hold {self.room.capacity:,} bytes in all, and the secrets "
                     f"take {sum(sizes) - OVERHEAD * len(sizes):,}"
                 )
             layouts = [replace(together, shares=(share,)) for share in together.shares]

@@ -39,7 +39,7 @@ from keyss.channels.low_bits.layout import LowBitsRoom
 from keyss.channels.low_bits.salts import salt, salt_rows
 from keyss.channels.low_bits.usable import check_usable, usable_carriers
 from keyss.core.arrays import Bytes, Flags, Integers
-from keyss.core.errors import InputError, KeyssWarning
+from keyss.core.errors import KeyssWarning, UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.keys.derivation import DerivedKey, stream
 from keyss.rendering.cpu.parallel import in_blocks
@@ -64,7 +64,7 @@ class LowBits(Channel):
         )
 
     def prepare(self, cover: Gaussians) -> LowBitsCover:
-        """See `Channel`. Raises InputError for low bits that are not random, and for stale salts."""
+        """See `Channel`. Raises UsageError for low bits that are not random, and for stale salts."""
         layout, versions = Layout.of(cover), _versions(cover)
         if (found := self._found.get(cover)) is None or found[0] != versions:
             names = identities(cover, layout)
@@ -73,8 +73,8 @@ class LowBits(Channel):
             rows = salt_rows(cover, names, layout=layout)
             stale = int((~usable[rows]).sum())
             if stale >= SALTS_TRIED:
-                raise InputError(
-                    f"{stale} of the {len(rows)} salts of this model cannot be renewed, and whoever made it "
+                raise UsageError(
+                    f"{stale} of the {len(rows)} salts of this cover cannot be renewed, and whoever made it "
                     'could try keys in advance; choose another cover, or `publish="any"`'
                 )
             found = self._found[cover] = versions, usable, names, rows

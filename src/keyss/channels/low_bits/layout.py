@@ -163,7 +163,7 @@ class LowBitsRoom:
         """The message for payloads of `size` bytes that do not fit; `count` and `what` describe the model."""
         if self.record_bytes(1) <= NUMBER_BYTES:
             return (
-                f"a model whose Gaussians hold {self.width} bytes has no room for anything in its low bits: "
+                f"a cover whose Gaussians hold {self.width} bytes has no room for anything in its low bits: "
                 "there are 8 at SH degree 0, 21 at degree 1, and 4 less where quaternions have unit length"
             )
         need = bisect_left(
@@ -174,7 +174,7 @@ class LowBitsRoom:
         rounded = math.ceil(need / 10**digits) * 10**digits
         each = "" if secrets == 1 else f" for each of {secrets} secrets"
         return (
-            f"a model of {count:,} {what} is too small to carry {size:,} bytes{each} in its low bits; "
+            f"a cover of {count:,} {what} is too small to carry {size:,} bytes{each} in its low bits; "
             f"{rounded:,} Gaussians would do"
         )
 

@@ -41,7 +41,7 @@ from keyss.channels.low_bits.bits import (
 from keyss.channels.low_bits.predictability import count_trailing_zeros, least_exponent
 from keyss.channels.mixing import row_hashes
 from keyss.core.arrays import Bytes, Doubles, Flags, Integers, Words, Words32
-from keyss.core.errors import InputError
+from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.rendering.cpu.parallel import in_blocks
 
@@ -111,23 +111,23 @@ def usable_carriers(gaussians: Gaussians, names: Bytes | None = None, layout: La
 
 
 def check_usable(gaussians: Gaussians, usable: Flags, layout: Layout | None = None) -> None:
-    """Raise InputError unless half of the Gaussians are `usable` [N], and their low bits uniform.
+    """Raise UsageError unless half of the Gaussians are `usable` [N], and their low bits uniform.
 
     Tested on at most 20,000 Gaussians: see `chance_of_bits`.
     """
     share = float(usable.mean()) if len(usable) else 0.0
     if share < MIN_USABLE:
-        raise InputError(
-            f"only {share:.0%} of the Gaussians have random low bits; the others hold short, repeated or "
-            "predictable values: the model was quantised or hardly trained, and new bits could be noticed"
+        raise UsageError(
+            f"only {share:.0%} of the cover's Gaussians have random low bits; the others hold short, "
+            "repeated or predictable values: it was quantised or hardly trained, and new bits could be noticed"
         )
     layout, rows = layout or Layout.of(gaussians), np.flatnonzero(usable)
     used = used_words(gaussians[torch.from_numpy(rows[:: max(1, len(rows) // _SAMPLE)])])
     for name, group in _GROUPS.items():
         bits = int(layout.mask[group][:1].max(initial=0)).bit_length()
         if bits and used[:, group].size and (chance := chance_of_bits(used[:, group], bits)) < _CHANCE:
-            raise InputError(
-                f"the low bits of {name} are not random in this model (by chance that happens with p = "
+            raise UsageError(
+                f"the low bits of {name} are not random in this cover (by chance that happens with p = "
                 f"{chance:.0e}), and nothing can be hidden in them: it was quantised, scaled or moved after "
                 "its training"
             )

@@ -112,7 +112,7 @@ class CarryMethod:
     ) -> Stego:
         """Refit the secrets that need it, embed all, and open each again as its reader will.
 
-        Raises UsageError and InputError for a cover without room, Interrupted on Ctrl-C, and InputError for a
+        Raises UsageError for a cover without room, Interrupted on Ctrl-C, and InputError for a
         checkpoint of another run.
         """
         room = room_for(cover.model, options, context.entropy)

@@ -20,7 +20,7 @@ from keyss.channels import (
     usable_carriers,
 )
 from keyss.channels.low_bits.bits import Layout
-from keyss.core.errors import InputError, KeyssError, UsageError
+from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.fitting.config import FitConfig
 from keyss.keys.derivation import expand
@@ -149,13 +149,12 @@ class RecordRoom:
     def of(cover: Gaussians | None, options: CarryOptions, entropy: bytes | None = None) -> RecordRoom:
         """The room in `cover` as it is embedded into: with harmonics and low bits that `options` ask for.
 
-        Raises UsageError for Gaussians without room for a record, InputError for low bits that are not
-        random.
+        Raises UsageError for Gaussians without room for a record, and for low bits that are not random.
         """
         try:
             return RecordRoom._of(cover, options, os.urandom(32) if entropy is None else entropy)
-        except KeyssError as error:
-            raise type(error)(f"{error}; {_ways(cover, options)}") from error
+        except UsageError as error:
+            raise UsageError(f"{error}; {_ways(cover, options)}") from error
 
     @staticmethod
     def _of(cover: Gaussians | None, options: CarryOptions, entropy: bytes) -> RecordRoom:
@@ -165,7 +164,7 @@ class RecordRoom:
         layout = Layout(degree) if cover is None else Layout.of(cover)
         if largest_degree(LowBitsRoom(0, layout.width).record_bytes(1)) is None:
             unit = "" if layout.quats else " with unit quaternions"
-            raise UsageError(f"a model of SH degree {degree}{unit} has no room for anything in its low bits")
+            raise UsageError(f"a cover of SH degree {degree}{unit} has no room for anything in its low bits")
         if cover is None:
             return RecordRoom(count, degree, LowBitsRoom(int(TYPICAL_SHARE * count), layout.width))
         prepared = _prepared(cover, expand(entropy, "carry/dither", 32) if options.dither else None)
@@ -227,7 +226,7 @@ class WholeRoom:
 
     @staticmethod
     def of(cover: Gaussians | None, options: CarryOptions) -> WholeRoom:
-        """The room in `cover`. Raises InputError for a cover without room."""
+        """The room in `cover`. Raises UsageError for a cover without room."""
         degree, count, channel = options.fit.sh_degree, options.fit.max_gaussians, options.place
         if cover is None:
             return WholeRoom(count, degree, channel, channel.room(count, degree))
@@ -264,7 +263,7 @@ def room_for(
 ) -> RecordRoom | WholeRoom:
     """The room in a cover, or about that in one that is not fitted yet.
 
-    Raises UsageError and InputError for a cover without room.
+    Raises UsageError for a cover without room.
     """
     return RecordRoom.of(cover, options, entropy) if options.place.records else WholeRoom.of(cover, options)
 
@@ -278,7 +277,7 @@ def _ways(cover: Gaussians | None, options: CarryOptions) -> str:
             changed = options if degree is None else options.with_fit(sh_degree=degree)
             try:
                 RecordRoom._of(cover, replace(changed, dither=dither or options.dither), entropy)
-            except KeyssError:
+            except UsageError:
                 continue
             asked = [f"sh_degree={degree}"] * (degree is not None) + ["dither=True"] * dither
             return f"`{', '.join(asked)}` makes room, {_ANY}"
@@ -286,16 +285,16 @@ def _ways(cover: Gaussians | None, options: CarryOptions) -> str:
 
 
 def _prepared(cover: Gaussians, entropy: bytes | None) -> LowBitsCover:
-    """The cover as it is, or dithered from `entropy`. Raises InputError for low bits that are not random."""
+    """The cover as it is, or dithered from `entropy`. Raises UsageError for low bits that are not random."""
     try:
         return LOW_BITS.prepare(cover)
-    except InputError:
+    except UsageError:
         if entropy is None:
             raise
     cover = dither_model(cover, entropy)
     try:
         return LOW_BITS.prepare(cover)
-    except InputError:
+    except UsageError:
         return LOW_BITS.prepare(loosened(cover, usable_carriers(cover), entropy))
 
 
