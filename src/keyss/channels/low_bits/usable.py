@@ -119,7 +119,7 @@ def check_usable(gaussians: Gaussians, usable: Flags, layout: Layout | None = No
     if share < MIN_USABLE:
         raise UsageError(
             f"only {share:.0%} of the cover's Gaussians have random low bits; the others hold short, "
-            "repeated or predictable values: it was quantised or hardly trained, and new bits could be noticed"
+            "repeated or predictable values: it was quantised or hardly trained, and new bits would be seen"
         )
     layout, rows = layout or Layout.of(gaussians), np.flatnonzero(usable)
     used = used_words(gaussians[torch.from_numpy(rows[:: max(1, len(rows) // _SAMPLE)])])
