@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from typing import Any
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, Task, TextColumn
 from rich.table import Column
+from rich.text import Text
 
 level = 0  # -1: silent, 1: more often; set by the command line
 
@@ -137,6 +139,11 @@ class ProgressLines(Reporter):
 
     def note(self, line: str) -> None:
         self.console.print(line, markup=False, highlight=False, soft_wrap=True)
+
+
+def waiting(what: str) -> AbstractContextManager[Any]:
+    """While the context is open, a terminal displays `what` beside a moving sign."""
+    return Console(stderr=True, quiet=level < 0).status(Text(what), refresh_per_second=4)
 
 
 def about(seconds: float) -> str:

@@ -30,7 +30,7 @@ METRICS = HideMetrics(
     width=100,
     seed=0,
     against_plain=(RenderFidelity(32.0, 8.0), RenderFidelity(31.0, 9.0)),
-    details={"carriers": 1000, "bits_per_gaussian": [568, 600]},
+    details={"capacity": 1000, "bits_per_gaussian": [568, 600]},
 )
 SMALL = ("--preset", "quick", "--iterations", "20", "--max-gaussians", "100", "--device", "cpu")
 COMMANDS = list(commands.MODULES)

@@ -46,7 +46,7 @@ def test_says_what_it_costs(keyss: Run, files: Path, tmp_path: Path, suffix: str
             assert first.endswith("renders unchanged")
         else:
             assert 25 < float(first.split("renders at ")[1].split()[0]) < 100
-        assert others == ["this format destroys low bits; give --key-file to check a secret in them"]
+        assert others == ["a secret in low bits would be lost; --key-file checks that a secret survives"]
     assert len(read_model(out)) == COUNT
 
 

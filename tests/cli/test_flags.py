@@ -31,7 +31,6 @@ QUOTED = re.compile(r"`keyss [^`]*`|(pip|npm) install [^,)]*")
         ("`decoy=False`", "no --decoy"),
         ("give `sh_degree`, `publish`", "give --sh-degree, --publish"),
         ("`key`, `secrets` and `model`", "--key-file, --secret and --secret-model"),
-        ("`download_scenes` fetches it", "--download fetches it"),
         # What is no option of the command stays, whatever it is.
         ("`chmod 600` and `f_dc_0` and `reporter`", "`chmod 600` and `f_dc_0` and `reporter`"),
         ("`keyss keygen -o FILE`", "`keyss keygen -o FILE`"),

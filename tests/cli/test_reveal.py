@@ -60,6 +60,22 @@ def reveal(keyss: Run, files: Path, tmp_path: Path) -> Run:
     return run
 
 
+def test_an_output_that_cannot_be_written_is_refused_before_the_work(
+    reveal: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(os, "access", lambda *asked: False)
+    assert_refused(reveal("whole.ply", key="other"), 5, "nothing can be written in")
+
+
+def test_runs_and_checks_are_described_in_words(keyss: Run, world: Path) -> None:
+    said = keyss("info", world / "hidden").out
+    assert "hiding by the method carry" in said and "_" not in said.replace(str(world), "")
+    assert keyss("verify", world / "hidden/publish/stego.ply", "--key-file", world / "key.txt").out.endswith(
+        "complete\n"
+    )
+    assert_refused(keyss("info", world), 4, f"name one of {world / 'hidden'}")
+
+
 def test_many_gaussians_in_a_small_file_are_refused(keyss: Run, files: Path, tmp_path: Path) -> None:
     hostile = Payload("carry", whole.encode(Gaussians.cat([model_of(1, sh_degree=3)] * (1 << 17))))
     write_model(tmp_path / "stego.spz", CodesCover.of(codes_of(".spz")).embed([(KEY, hostile)]))

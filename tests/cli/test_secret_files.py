@@ -58,7 +58,10 @@ def test_what_does_not_go_together_is_refused(keyss: Run, folder: Path, world: P
     out, back = tmp_path / "out", tmp_path / "back"
     hide = _arguments(folder, out)
     assert_refused(keyss(*hide, "--secret", folder / "cover.ply"), 2, "leave out --secret")
-    assert_refused(keyss(*hide, "--dry-run"), 2, "leave out --dry-run")
+    planned = keyss(*hide, "--dry-run")
+    assert (planned.status, planned.out.splitlines()[-1]) == (0, "Dry run: nothing was written.")
+    letter = (*_arguments(folder, out)[:3], "--secret", folder / "letter.pdf", *hide[-6:])
+    assert_refused(keyss(*letter), 4, "--secret-file hides any file")
     for flag, value in (("--min-psnr", 60), ("--seed", 0), ("--width", 100), ("--sh-degree", 1)):
         assert_refused(keyss(*hide, flag, value), 2, f"leave out {flag}")
     photos = ("hide", "--cover", world / "a", "--secret-file", folder / "empty", "-o", out)

@@ -17,6 +17,8 @@ from keyss.cli import commands, entry
         (("Hide",), "did you mean `keyss hide`?"),
         (("--quiet", "inof", "x"), "did you mean `keyss info`?"),
         (("frobnicate",), "see `keyss --help`"),
+        (("convert", "a.ply", "-o", "b.spz"), "name OUT after IN"),
+        (("audit", "run", "-o", "x"), "the run's folder"),
     ],
 )
 def test_a_misspelt_command(keyss: Run, arguments: tuple[str, ...], meant: str) -> None:

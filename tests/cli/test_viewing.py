@@ -17,6 +17,10 @@ def test_what_is_no_model_is_refused(keyss: Run, tmp_path: Path) -> None:
     (tmp_path / "text.ply").write_text("ply\nformat ascii 1.0\nelement vertex 1\nend_header\n")
     write_model(tmp_path / "cut.ply", random_gaussians(5))
     (tmp_path / "cut.ply").write_bytes((tmp_path / "cut.ply").read_bytes()[:-1])
+    for name in ("cut.spz", "cut.sog", "cut.splat", "cut.compressed.ply"):
+        write_model(tmp_path / name, random_gaussians(5))
+        (tmp_path / name).write_bytes((tmp_path / name).read_bytes()[:-1])
+        assert_refused(keyss("view", tmp_path / name, "-o", tmp_path / "page.html"), 4, "not a whole")
     for command in (["view"], ["view", "-o", str(tmp_path / "page.html")]):
         assert_refused(keyss(*command, str(tmp_path / "model.txt")), 4, "expected a 3DGS model")
         assert_refused(keyss(*command, str(tmp_path / "text.ply")), 4, "not a 3DGS model")

@@ -199,6 +199,7 @@ def test_the_command_line_says_what_failed_and_ends_with_a_status(folder: Path, 
     assert said.status == 4
     assert "1 of 3 assets are done" in said.out
     assert "failed: asset-1: cannot read" in said.out
+    assert "cannot read" not in said.err  # once is enough
     assert said.err.rstrip().endswith("error: 2 of 3 assets failed")
     for wrong in (["--cover", folder], ["--key-file", folder / "master.txt"], ["--resume"], ["--dry-run"]):
         said = keyss(*arguments, *wrong)

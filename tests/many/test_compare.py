@@ -33,7 +33,7 @@ def test_a_table_a_picture_and_a_second_start(
     assert "carry: not possible" in capsys.readouterr().err  # so small a cover has no room
     assert main([*command, "--dry-run"]) == 0
     assert not out.exists()
-    assert "8 cells, 7 to do" in capsys.readouterr().out  # four plain models and three methods
+    assert "8 runs, 7 to do" in capsys.readouterr().out  # four plain models and three methods
     assert main([*command, "--methods", "3dgs,3dgs-sh"]) == 0
     before = {path: path.stat().st_mtime_ns for path in out.rglob("result.json")}
     assert len(before) == 4 + 2

@@ -277,7 +277,7 @@ def test_a_dry_run_writes_nothing_and_names_what_cannot_work(keyss: Run, tmp_pat
     assert all(each.refused for each in found.cells)
     said = keyss("sweep", spec, "-o", out, "--dry-run")
     assert "cannot work" in said.out
-    assert "2 cells, 0 to do" in said.out
+    assert "2 runs, 0 to do" in said.out
     assert sorted(tmp_path.rglob("*")) == before
 
 

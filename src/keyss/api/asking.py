@@ -9,13 +9,13 @@ from itertools import combinations
 
 from keyss.core.errors import UsageError
 from keyss.core.gaussians import DRAWN_OPACITY, Gaussians
-from keyss.core.scene import Scene
+from keyss.core.scene import Scene, ViewOptions
 from keyss.keys import normalized_key
 from keyss.methods import registry
 from keyss.methods.base import Method, MethodOptions, Plan, Source
 from keyss.rendering.orbit import is_model
 from keyss.runs.config import HideMetrics
-from keyss.runs.files import PathLike, as_3dgs_model, path_of
+from keyss.runs.files import PathLike, as_3dgs_model, as_scene, path_of
 
 _READERS = 2  # threads that read files
 
@@ -70,11 +70,15 @@ def method_for(chosen: str | MethodOptions, secrets: Sequence[Secret]) -> tuple[
 
 
 def sources_of(
-    cover: PathLike | Scene | Gaussians, cover_model: PathLike | Gaussians | None, secrets: Sequence[Secret]
+    sources: Sequence[PathLike | Scene | Gaussians],
+    models: Sequence[PathLike | Gaussians | None],
+    keys: Sequence[str],
+    views: ViewOptions,
 ) -> list[Source]:
-    """The cover and the secrets, with plain models that are given or that they are. Raises UsageError."""
-    sources = [cover, *(secret.source for secret in secrets)]
-    models = [cover_model, *(secret.model for secret in secrets)]
+    """The cover and the secrets, with their photos, and plain models that are given or that they are.
+
+    `keys`: of the secrets. Raises UsageError and InputError.
+    """
     asked: list[tuple[PathLike | Gaussians | None, bool]] = []  # models, and whether there are photos
     for index, (source, model) in enumerate(zip(sources, models, strict=True)):
         photos = isinstance(source, Scene) or not is_model(source)
@@ -89,9 +93,9 @@ def sources_of(
     # Large files take seconds each, most of them outside of Python's lock.
     with ThreadPoolExecutor(_READERS) as readers:
         found = readers.map(_drawable, [model for model, _ in asked], names)
-        keys = ["", *(secret.key for secret in secrets)]
         return [
-            Source(model, photos, key) for model, (_, photos), key in zip(found, asked, keys, strict=True)
+            Source(model, photos, key, as_scene(source, views) if photos else None)
+            for source, model, (_, photos), key in zip(sources, found, asked, ["", *keys], strict=True)
         ]
 
 

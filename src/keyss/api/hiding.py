@@ -15,7 +15,7 @@ import torch
 
 from keyss.api.asking import HideResult, Secret, check_keys, method_for, sources_of
 from keyss.api.fitting import begun, together
-from keyss.channels import AnyChannel, Publish, channel_for, open_content
+from keyss.channels import AnyChannel, Channel, Publish, channel_for, open_content
 from keyss.core.errors import QualityError, UsageError
 from keyss.core.gaussians import Gaussians, same_bits
 from keyss.core.scene import Scene, ViewOptions
@@ -99,7 +99,8 @@ def hide(
     threads.
 
     `bound`: fit plain 3DGS of as many Gaussians and training steps to compare with; otherwise `metrics.json`
-    says which baselines had fewer steps. `dry_run`: check arguments, and return only the plan.
+    says which baselines had fewer steps. `dry_run`: check arguments, and return only the plan; of
+    files, the PSNR.
 
     At the end the published file is opened with the keys, and rendered beside the plain models. If a PSNR is
     below `min_psnr` (dB; below 25, for secrets that were pruned without a refit, unless `min_psnr` is below
@@ -108,19 +109,14 @@ def hide(
     Raises other KeyssErrors too, and Interrupted on Ctrl-C.
     """
     if any(secret.file is not None for secret in secrets):
-        for name, value in {"dry_run": dry_run, "resume": resume, "bound": bound}.items():
+        for name, value in {"resume": resume, "bound": bound}.items():
             if value:
                 raise UsageError(f"hiding files does not use `{name}`: leave it out")
-        if isinstance(cover, Scene):
-            raise UsageError("hiding files needs a model as the cover; `keyss.fit` makes one from photos")
-        return _hide_files(
-            cover,
-            secrets,
-            publish=publish or "ply",
-            channel=channel or "colours",
-            out=out,
-            overwrite=overwrite,
-        )
+        if isinstance(cover, Scene) or not is_model(cover):
+            raise UsageError("hiding a file needs a model as the cover; `keyss fit` makes one from photos")
+        where = channel_for(publish or "ply", channel or "colours")
+        found = _hide_files(cover, secrets, where, None if dry_run else out, overwrite)
+        return replace(found, stego=None) if dry_run else found
     if out is not None and is_model_path(out):
         raise UsageError(
             f"{out}: expected the name of a folder; the format of the model in it follows from `publish`"
@@ -164,7 +160,7 @@ def hide(
             resume=resume,
         )
         began -= folder.earlier_seconds
-    sources = sources_of(cover, cover_model, secrets)
+    sources = sources_of(given, models, keys, settings.views)
     options = chosen.prepare(sources, options)
     configs = options.fits(len(sources))
     plain_steps = [
@@ -175,15 +171,9 @@ def hide(
         check_disk(place, options, sources)
     trains = not dry_run and (options.trains or any(each.given is None for each in sources))
     sources = [
-        replace(
-            each,
-            loaded=as_scene(
-                source,
-                settings.views,
-                train_pictures=trains,
-                model=None if each.photos else each.given,
-            ),
-        )
+        each
+        if each.photos
+        else replace(each, loaded=as_scene(source, settings.views, train_pictures=trains, model=each.given))
         for source, each in zip(given, sources, strict=True)
     ]
     if dry_run:
@@ -225,9 +215,7 @@ def hide(
 def _hide_files(
     cover: PathLike | Gaussians,
     secrets: Sequence[Secret],
-    *,
-    publish: Publish,
-    channel: AnyChannel,
+    place: Channel,
     out: PathLike | None,
     overwrite: bool,
 ) -> HideResult:
@@ -241,11 +229,10 @@ def _hide_files(
     hidden, model = [_hidden_file(each) for each in secrets], as_3dgs_model(cover, "the cover")
     keys = [each.key for each in secrets]
     payloads = [(key, each.payload()) for key, each in zip(keys, hidden, strict=True)]
-    place = channel_for(publish, channel)
     try:
         stego = place.prepare(model).embed(payloads)
     except UsageError as error:
-        if (publish, channel) == ("any", "appended"):
+        if place.grows:
             raise
         raise UsageError(f'{error}; `publish="any", channel="appended"` has room for all') from error
     with folder.work() if folder else nullcontext():

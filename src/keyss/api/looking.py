@@ -65,17 +65,7 @@ def render(
     """
     views = ViewOptions.of(width, background, skip_missing)
     if video is not None:
-        write_film(
-            model,
-            video,
-            cameras,
-            views,
-            wipe=wipe,
-            seconds=seconds,
-            device=device,
-            overwrite=overwrite,
-            reporter=reporter,
-        )
+        _write_film(model, video, cameras, views, wipe, seconds, device, overwrite, reporter)
         return []
     if cameras is None:
         raise UsageError("images need `cameras`, a scene; without one, only a `video` can be rendered")
@@ -128,12 +118,11 @@ def evaluate(
     return metrics
 
 
-def write_film(
+def _write_film(
     model: PathLike | Gaussians,
     out: PathLike,
     cameras: PathLike | Scene | None,
     views: ViewOptions,
-    *,
     wipe: PathLike | Gaussians | None,
     seconds: float,
     device: Backend,

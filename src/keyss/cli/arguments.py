@@ -36,7 +36,9 @@ Preset = Annotated[
     ),
 ]
 Width = Annotated[int | None, optional("PIXELS", "Downscale wider photos to this width.")]
-Iterations = Annotated[int | None, optional("N", "Training steps.", "the preset's")]
+Iterations = Annotated[
+    int | None, optional("N", "Training steps of a model, and of a refit.", "the preset's")
+]
 MaxGaussians = Annotated[int | None, optional("N", "Maximum number of Gaussians of a model.", "the preset's")]
 Jobs = Annotated[
     int | None, optional("N", "Parallel jobs, which share the cores.", "as cores and memory allow")
@@ -108,10 +110,10 @@ def check_there(*paths: Path | None, expected: str = "a file or folder") -> None
             raise InputError(f"{path}: expected {expected}, but there is no such file")
 
 
-def checked_seed(seed: int, highest: int = 2**32 - 1) -> int:
+def checked_seed(seed: int) -> int:
     """`seed`, if every generator takes it. Raises UsageError."""
     from keyss.core.errors import UsageError
 
-    if not 0 <= seed <= highest:
-        raise UsageError(f"--seed: expected 0 to {highest}, got {seed}")
+    if not 0 <= seed < 1 << 32:
+        raise UsageError(f"--seed: expected 0 to {(1 << 32) - 1}, got {seed}")
     return seed

@@ -42,7 +42,6 @@ _NAME = re.compile(r"`([a-z_]\w*)`")
 
 # Arguments whose flags have another name.
 _RENAMED = {"key": "key-file", "keys": "key-file", "secrets": "secret", "model": "secret-model"}
-_RENAMED |= {"download_scenes": "download"}
 COMMANDS = ("fit", "hide")  # that train
 
 
@@ -103,6 +102,9 @@ def _run(arguments: list[str], options: set[str]) -> None:
         )
     command = commands.to_parse(name, rest)
     options.update(options_of(command))
+    if "out" not in options and {"-o", "--out"} & {word.partition("=")[0] for word in rest}:
+        where = "name OUT after IN" if name == "convert" else "results go into the run's folder, if anywhere"
+        raise UsageError(f"`keyss {name}` has no option -o: {where}; see `keyss {name} --help`")
     tyro.cli(command, prog=f"keyss {name}", args=rest, config=(tyro.conf.FlagCreatePairsOff,))
 
 
@@ -263,17 +265,17 @@ def options_of(command: Callable[..., Any]) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for each in inspect.signature(command, eval_str=True).parameters.values():
         if is_dataclass(group := getattr(each.annotation, "__origin__", each.annotation)):
-            found |= _options_of_group(group)
+            found |= options_of_group(group)
         elif each.kind is each.KEYWORD_ONLY:
             found[each.name.rstrip("_")] = each.annotation
     return found
 
 
-def _options_of_group(group: Any) -> dict[str, Any]:
+def options_of_group(group: Any) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for name, hint in get_type_hints(group, include_extras=True).items():
         nested = getattr(hint, "__origin__", hint)
-        found |= _options_of_group(nested) if is_dataclass(nested) else {name: hint}
+        found |= options_of_group(nested) if is_dataclass(nested) else {name: hint}
     return found
 
 

@@ -6,6 +6,7 @@ import sys
 from argparse import ArgumentParser
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, fields, make_dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
@@ -223,9 +224,15 @@ def _hide_scenes(asked: HideArguments, cover: Path) -> None:
 def _secrets(asked: HideArguments, method: Method) -> list[Any]:
     """The scenes to hide, with their keys and models."""
     import keyss
-    from keyss.core.errors import UsageError
+    from keyss.core.errors import InputError, UsageError
+    from keyss.files.foreign import what_it_is
+    from keyss.files.models import is_model_path
 
     count, models = len(asked.secret), asked.details.secret_model
+    for each in asked.secret:
+        if each.is_file() and not is_model_path(each):
+            found = f"{each}: expected a scene folder or a model, found {what_it_is(each)}"
+            raise InputError(f"{found}; --secret-file hides any file")
     if models and len(models) != count:
         raise UsageError(
             f"expected no --secret-model or one for each of {count} secret(s), got {len(models)}"
@@ -283,17 +290,10 @@ def _hide_files(asked: HideArguments, cover: Path) -> None:
     from keyss.channels import channel_for
     from keyss.cli.entry import check_command
     from keyss.cli.tables import print_files
-    from keyss.core.errors import UsageError
-    from keyss.rendering.orbit import is_model
     from keyss.runs.files import STEGOS
 
     check_command("hide --secret-file", trains=False)
-    _refuse(asked, "--secret-file", "cover secret_file key_file publish out overwrite device channel")
-    if not is_model(cover):
-        raise UsageError(
-            f"--secret-file needs a model as the cover, and {cover} is none; `keyss fit` makes one from "
-            "photos"
-        )
+    _refuse(asked, "--secret-file", "cover secret_file key_file publish out overwrite device channel dry_run")
     files, keys = asked.secret_file, _keys(asked, len(asked.secret_file))
     channel = asked.details.channel or "colours"
     result = keyss.hide(
@@ -303,10 +303,15 @@ def _hide_files(asked: HideArguments, cover: Path) -> None:
         channel=channel,
         out=asked.out,
         overwrite=asked.overwrite,
+        dry_run=asked.dry_run,
     )
     for file in files:
-        print(f"{file.name}: {file.stat().st_size:,} bytes, revealed again from the published file")
+        what = "which fit" if asked.dry_run else "revealed again from the published file"
+        print(f"{file.name}: {file.stat().st_size:,} bytes, {what}")
     print(f"PSNR between renders of the cover before and after: {result.psnr:.0f} dB")
+    if asked.dry_run:
+        print("Dry run: nothing was written.")
+        return
     print_files(
         asked.out, dict.fromkeys(STEGOS, _HOW_TO_PUBLISH[channel_for(asked.publish, channel).survives])
     )
@@ -314,7 +319,7 @@ def _hide_files(asked: HideArguments, cover: Path) -> None:
 
 def _hide_batch(asked: HideArguments, table: Path) -> None:
     import keyss
-    from keyss.cli.entry import check_command
+    from keyss.cli.entry import as_flags, check_command, options_of_group
     from keyss.cli.keys import key_of_file, warn_of_weak_keys
     from keyss.cli.tables import print_files, print_outcome
     from keyss.methods import registry
@@ -341,7 +346,7 @@ def _hide_batch(asked: HideArguments, table: Path) -> None:
     if skipped := sum(each.skipped for each in result.outcomes):
         print(f"{skipped} of {len(result.outcomes)} assets were done before")
     print_files(asked.out, {"private/batch.csv": "the outcome of each asset"})
-    print_outcome(result, "assets")
+    print_outcome(result, "assets", partial(as_flags, options=options_of_group(type(asked))))
 
 
 def _refuse(asked: HideArguments, mode: str, used: str, own: Sequence[str] = ()) -> None:
@@ -350,7 +355,8 @@ def _refuse(asked: HideArguments, mode: str, used: str, own: Sequence[str] = ())
 
     names = {flag.removeprefix("--").replace("-", "_"): flag for flag in given(asked)}
     if unused := [flag for name, flag in names.items() if name not in (*used.split(), *own)]:
-        raise UsageError(f"{mode} does not use {unused[0]}: leave out {unused[0]}")
+        instead = ", or give the cover and the secret of one row" * (unused[0] == "--dry-run")
+        raise UsageError(f"{mode} does not use {unused[0]}: leave out {unused[0]}{instead}")
 
 
 def with_options_of_method(arguments: Sequence[str]) -> Callable[..., None]:

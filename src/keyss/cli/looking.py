@@ -130,13 +130,7 @@ def info(
 
     example: keyss info runs/hidden/publish/stego.ply
     """
-    from msgspec import to_builtins
-
-    from keyss.cli.tables import print_facts, print_json
+    from keyss.cli.tables import print_info, print_json
     from keyss.runs.describe import info as describe
 
-    facts = describe(path)
-    if json_:
-        print_json(facts)
-    else:
-        print_facts(to_builtins(facts))
+    (print_json if json_ else print_info)(describe(path))

@@ -180,14 +180,16 @@ def convert(
     from keyss.cli.keys import given_keys
     from keyss.cli.tables import print_conversion
     from keyss.files.reading import is_standard
+    from keyss.progress import waiting
 
-    found = keyss.convert(
-        model,
-        out,
-        given_keys(key_file),
-        force=force,
-        dry_run=dry_run,
-        overwrite=overwrite,
-        device=device,
-    )
+    with waiting(f"converting {model.name}"):
+        found = keyss.convert(
+            model,
+            out,
+            given_keys(key_file),
+            force=force,
+            dry_run=dry_run,
+            overwrite=overwrite,
+            device=device,
+        )
     print_conversion(str(out), found, dry_run=dry_run, file=sys.stderr if is_standard(out) else sys.stdout)

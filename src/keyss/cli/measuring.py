@@ -132,10 +132,6 @@ def steganalyze(
     print_steganalysis(found)
     print(f"{csv}: {len(found.rows)} image{'' if len(found.rows) == 1 else 's'}")
     if found.skipped:
-        print(f"keyss: skipped unreadable images: {_listed(found.skipped)}", file=sys.stderr)
-
-
-def _listed(names: list[str], limit: int = 5) -> str:
-    """The first names, quoted because file names may hold anything, and how many more there are."""
-    rest = f" and {len(names) - limit} more" if len(names) > limit else ""
-    return ", ".join(map(repr, names[:limit])) + rest
+        # Quoted, because names of files may hold anything.
+        names = ", ".join(map(repr, found.skipped[:5])) + ", ..." * (len(found.skipped) > 5)
+        print(f"keyss: skipped {len(found.skipped)} unreadable images: {names}", file=sys.stderr)

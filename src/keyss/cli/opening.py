@@ -48,22 +48,24 @@ def reveal(
     import keyss
     from keyss.cli.keys import keys
     from keyss.files.reading import is_standard
+    from keyss.progress import waiting
     from keyss.runs.revealing import is_sealed
 
     key: str | None = None
     if handed is None or key_file or is_sealed(handed):
         (key,) = keys(key_file, 1)
-    revealed = keyss.reveal(
-        stego,
-        key,
-        handed=handed,
-        frame=frame,
-        decoy=decoy,
-        force=force,
-        device=device,
-        out=out,
-        overwrite=overwrite,
-    )
+    with waiting(f"opening {stego.name}"):
+        revealed = keyss.reveal(
+            stego,
+            key,
+            handed=handed,
+            frame=frame,
+            decoy=decoy,
+            force=force,
+            device=device,
+            out=out,
+            overwrite=overwrite,
+        )
     if revealed.file is not None:
         print(f"{out}: {revealed.file.name!r}, {len(revealed.file.data):,} bytes")
         return
@@ -88,19 +90,15 @@ def verify(
     example: keyss verify stego.ply --key-file key.txt
     """
     check_there(model, key_file)
-    from msgspec import to_builtins
-
     import keyss
     from keyss.cli.keys import given_keys
-    from keyss.cli.tables import print_facts, print_json
+    from keyss.cli.tables import print_json, print_verification
     from keyss.core.errors import InputError
+    from keyss.progress import waiting
 
     key = next(iter(given_keys([key_file] if key_file else [])), None)
-    found = keyss.verify(model, key, device=device)
-    if json_:
-        print_json(found)
-    else:
-        facts = to_builtins(found)
-        print_facts(facts if found.secret else facts | {"secret": "not checked, as no key was given"})
+    with waiting(f"checking {model.name}"):
+        found = keyss.verify(model, key, device=device)
+    (print_json if json_ else print_verification)(found)
     if found.problems:
         raise InputError(f"{model}: {'; '.join(found.problems)}")

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TextIO
+from typing import TYPE_CHECKING, TextIO
 
 from rich.cells import cell_len
 from rich.console import Console as RichConsole
@@ -14,7 +14,7 @@ from rich.table import Table
 from rich.text import Text
 
 from keyss.core.errors import InputError
-from keyss.progress import about
+from keyss.progress import about, clock
 from keyss.runs.records import record_bytes
 
 if TYPE_CHECKING:
@@ -24,9 +24,11 @@ if TYPE_CHECKING:
     from keyss.measure.stegexpose import Steganalysis
     from keyss.methods.base import Plan
     from keyss.runs.config import FitMetrics, HideMetrics
+    from keyss.runs.describe import ModelInfo, RunInfo, SceneInfo
+    from keyss.runs.revealing import Verification
 
 
-_HEADS = ("PSNR", "SSIM", "bound", "loss", "start", "Gaussians", "plain's", "steps")
+_HEADS = ("PSNR", "SSIM", "bound", "loss", "start", "Gaussians", "in plain model", "steps")
 
 
 class Console(RichConsole):
@@ -53,8 +55,9 @@ def print_hiding(metrics: HideMetrics, console: Console | None = None) -> None:
     print_table([views, *heads], table, console=console)
     for line in _explanations(metrics, names, heads):
         console.print(line, highlight=False, markup=False)
-    for name, value in metrics.details.items():
-        console.print(f"{name.replace('_', ' ')}: {_text(value)}", highlight=False, markup=False)
+    for name, unit in {"capacity": "Gaussians", "capacity_bytes": "bytes"}.items():
+        if name in metrics.details:
+            console.print(f"Room in the cover: {metrics.details[name]:,} {unit}.", highlight=False)
 
 
 def _scene_rows(metrics: HideMetrics) -> list[dict[str, str]]:
@@ -83,7 +86,7 @@ def _scene_rows(metrics: HideMetrics) -> list[dict[str, str]]:
         elif plain is not None:
             row["start"] = f"{plain.psnr:.2f}"
         if plain_size and _sizes_differ(metrics):
-            row["plain's"] = f"{plain_size:,}"
+            row["in plain model"] = f"{plain_size:,}"
         rows.append(row)
     return rows
 
@@ -194,9 +197,37 @@ def print_verdicts(audit: Audit) -> None:
     Console().print(headline(lines), highlight=False)
 
 
-def print_facts(facts: Mapping[str, Any]) -> None:
-    """Names and values, a nested one per line: `points.count`."""
-    _print_columns(_flat(facts))
+def print_info(found: RunInfo | ModelInfo | SceneInfo) -> None:
+    """What `keyss info` tells."""
+    from keyss.runs.config import HideMetrics
+    from keyss.runs.describe import RunInfo
+
+    if not isinstance(found, RunInfo):
+        facts = {name.replace("_", " "): value for name, value in vars(found).items()}
+        _print_columns([(name, _text(value)) for name, value in facts.items()])
+        return
+    metrics = found.metrics
+    how = f" by the method {metrics.method}" if isinstance(metrics, HideMetrics) else ""
+    # Without separators, a seed can be given to --seed.
+    print(f"{found.path}: {found.kind}{how}, made in {clock(metrics.seconds)} with --seed {metrics.seed}")
+    if isinstance(metrics, HideMetrics):
+        print_hiding(metrics)
+    else:
+        print_fit(metrics)
+
+
+def print_verification(found: Verification) -> None:
+    """What `keyss verify` found, in words."""
+    model, secret = found.model, found.secret
+    problems = "; ".join(model.problems) or "sound"
+    rows = [("model", f"{model.gaussians:,} Gaussians of SH degree {model.sh_degree}: {problems}")]
+    if secret is None:
+        rows.append(("secret", "not checked, as no key was given"))
+    else:
+        of = f" of {secret.hidden:,}" if secret.hidden else ""
+        left = "; ".join(secret.problems) or "complete"
+        rows.append(("secret", f"{secret.found:,}{of} Gaussians: {left}"))
+    _print_columns(rows)
 
 
 def print_conversion(out: str, found: Conversion, *, dry_run: bool, file: TextIO) -> None:
@@ -208,18 +239,20 @@ def print_conversion(out: str, found: Conversion, *, dry_run: bool, file: TextIO
         which = "the secret" if len(found.secrets) == 1 else f"the secret of key {number}"
         state = "survives" if secret.kept else f"is lost: {secret.after:,} {secret.unit} are left"
         print(f"{which}, {secret.before:,} {secret.unit}, {state}", file=file)
-    if not found.secrets and not found.keeps_low_bits:
-        print("this format destroys low bits; give --key-file to check a secret in them", file=file)
+    from keyss.channels import AppendedReader  # imports torch
+
+    if not found.secrets and not found.keeps_low_bits and AppendedReader.of(found.gaussians) is None:
+        print("a secret in low bits would be lost; --key-file checks that a secret survives", file=file)
     if dry_run:
         print("dry run: nothing was written", file=file)
 
 
-def print_outcome(result: ManyResult, what: str) -> None:
-    """The number of cells that are done, and errors. Raises InputError if any cell failed."""
+def print_outcome(result: ManyResult, what: str, as_said: Callable[[str], str] = str) -> None:
+    """The number of cells that are done, and errors `as_said`. Raises InputError if any cell failed."""
     failed, count = result.failed, len(result.outcomes)
     print(f"{count - len(failed)} of {count} {what} are done")
     for each in failed:
-        print(f"failed: {each.name}: {each.error}")
+        print(f"failed: {each.name}: {as_said(each.error or '')}")
     if failed:
         raise InputError(f"{len(failed)} of {count} {what} failed")
 
@@ -247,16 +280,16 @@ def print_forecast(found: Forecast, jobs: int | None = None) -> None:
         time, memory = "done" if each.done else "cannot work", ""
         if each.plan is not None:
             time, memory = about(each.plan.seconds), f"{each.plan.memory_bytes / 1e9:.1f} GB"
-        rows.append((each.id[:12], each.name, time, memory))
-    print_table(("cell", "name", "time, about", "memory"), rows, texts=2)
+        rows.append((each.name, time, memory))
+    print_table(("run", "time, about", "memory"), rows)
     for each in found.cells:
         if each.refused:
             print(f"{each.name}: {each.refused}")
     resources = Resources.divided(jobs, max((each.memory_bytes for each in found.plans), default=1))
     print(
-        f"{len(found.cells)} cell{'s' * (len(found.cells) != 1)}, {len(found.plans)} to do: about "
-        f"{about(sum(each.seconds for each in found.plans))} on this machine if all its cores are at work; "
-        f"{resources.jobs} at once with {resources.threads} thread(s) each"
+        f"{len(found.cells)} run{'s' * (len(found.cells) != 1)}, {len(found.plans)} to do: about "
+        f"{about(sum(each.seconds for each in found.plans))} with all cores of this machine,\n"
+        f"{resources.jobs} at once, each with {resources.threads} thread{'s' * (resources.threads != 1)}."
     )
     print("Dry run: nothing was written. Times are rough.")
 
@@ -299,19 +332,6 @@ def print_table(
     for row in rows:
         table.add_row(*map(Text, row))
     console.print(table)
-
-
-def _flat(facts: Mapping[str, Any], prefix: str = "") -> list[tuple[str, str]]:
-    rows: list[tuple[str, str]] = []
-    for name, value in facts.items():
-        if isinstance(value, list | tuple) and value and isinstance(value[0], Mapping):
-            value = {str(index): item for index, item in enumerate(value, start=1)}
-        if isinstance(value, Mapping):
-            rows += _flat(value, f"{prefix}{name}.")
-        else:
-            # Without separators, a seed can be given to --seed.
-            rows.append((prefix + name, str(value) if name == "seed" else _text(value)))
-    return rows
 
 
 def _text(value: object) -> str:

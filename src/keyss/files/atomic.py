@@ -69,17 +69,16 @@ def mode_like(source: Path) -> int:
 
 
 @contextmanager
-def lock(path: Path, folder: Path | None = None) -> Iterator[None]:
+def lock(path: Path) -> Iterator[None]:
     """Hold the lock file `path`, which contains our process id, and remove it afterwards.
 
-    The system releases the lock if the process dies. `folder` is the locked folder that messages name, by
-    default the parent of the file's folder. Raises OutputError when another process holds the lock, or the
-    system refuses.
+    The system releases the lock if the process dies. Raises OutputError, which names the parent of the
+    file's folder, when another process holds the lock, or the system refuses.
     """
     try:
         descriptor = _open_locked(path)
     except BlockingIOError as error:
-        where = folder or path.parent.parent
+        where = path.parent.parent
         raise OutputError(f"{where}: process {_pid(path)} is at work in this folder") from error
     except OSError as error:
         raise OutputError(f"cannot write {path}: {error.strerror}") from error
@@ -124,6 +123,8 @@ def check_output_file(path: Path | str, overwrite: bool) -> Path:
         raise OutputError(f"{path} exists: choose another name, or `overwrite=True` to replace it")
     if not path.parent.is_dir():
         raise OutputError(f"cannot write {path}: there is no folder {path.parent}")
+    if not os.access(path.parent, os.W_OK):
+        raise OutputError(f"cannot write {path}: nothing can be written in {path.parent}")
     return path
 
 

@@ -26,7 +26,7 @@ from typing import Any
 
 import msgspec
 
-from keyss.core.errors import InputError, KeyssError, KeyssWarning, OutputError, UsageError, did_you_mean
+from keyss.core.errors import InputError, KeyssError, KeyssWarning, OutputError, did_you_mean
 from keyss.core.scene import ViewOptions
 from keyss.files.atomic import write_bytes
 from keyss.files.reading import read_text
@@ -217,9 +217,7 @@ def hide_batch(
 def _cell(
     asset: Asset, out: Path, folder: Path, master: Path | None, common: Mapping[str, Any], overwrite: bool
 ) -> Cell:
-    """The asset's cell. Raises InputError, OutputError and UsageError where it must not begin."""
-    if asset.secret_file is not None and not is_model(asset.cover):
-        raise UsageError(f"{asset.cover}: files are hidden in models, and this is not the name of one")
+    """The asset's cell. Raises InputError and OutputError where it must not begin."""
     place = out / asset.out
     cell = Cell(
         name=asset.out,

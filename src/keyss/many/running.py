@@ -184,7 +184,7 @@ class _Run:
             if status == 0:
                 return self._end(f"{cell.name}: done in {clock(time.monotonic() - since)}")
             if status == REFUSED:
-                return self._end(f"{cell.name}: failed: {error_of(folder)}")
+                return self._end(f"{cell.name}: failed")
             if number < self.retries:
                 self._say(f"{cell.name}: its process died ({how}): it is tried again")
         self._end(f"{cell.name}: its process died ({how}): given up; see {folder / LOG}")

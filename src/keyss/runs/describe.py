@@ -15,9 +15,9 @@ from keyss.files.foreign import what_it_is
 from keyss.files.reading import is_standard
 
 if TYPE_CHECKING:
-    from keyss.core.scene import Scene
     from keyss.runs.config import FitMetrics, HideMetrics
 
+_NAMED = 10  # runs in a message
 Corner = tuple[float, ...]  # [3] world units
 
 
@@ -64,9 +64,7 @@ def info(path: str | Path) -> RunInfo | ModelInfo | SceneInfo:
     """
     path = Path(path)
     try:
-        if is_standard(path):
-            return _model_info(path)
-        if not path.exists():
+        if not (is_standard(path) or path.exists()):
             raise InputError(f"{path}: no such file or folder")
         return _folder_info(path) if path.is_dir() else _model_info(path)
     except OSError as error:
@@ -76,14 +74,28 @@ def info(path: str | Path) -> RunInfo | ModelInfo | SceneInfo:
 def _folder_info(path: Path) -> RunInfo | SceneInfo:
     from keyss.files.scenes import load_scene
     from keyss.runs.config import FitMetrics, HideMetrics
-    from keyss.runs.files import METRICS, MODEL, stego_in
+    from keyss.runs.files import METRICS, MODEL, is_run, stego_in
     from keyss.runs.records import read_record
 
     if stego_in(path).exists():
         return RunInfo("hiding", str(path), read_record(path / METRICS, HideMetrics))
     if (path / MODEL).exists():
         return RunInfo("plain model", str(path), read_record(path / METRICS, FitMetrics))
-    return _scene_info(load_scene(path, skip_missing=True))
+    if runs := sorted(each for each in path.iterdir() if is_run(each)):
+        named = ", ".join(map(str, runs[:_NAMED])) + f" and {len(runs) - _NAMED} more" * (len(runs) > _NAMED)
+        raise InputError(f"{path} is not a run, but a folder of runs: name one of {named}")
+    scene = load_scene(path, skip_missing=True)
+    camera = scene.train[0].camera
+    return SceneInfo(
+        kind="scene",
+        name=scene.name,
+        train_views=len(scene.train),
+        test_views=len(scene.test),
+        image_size=(camera.width, camera.height),
+        points=len(scene.points),
+        extent=round(scene.extent, 4),
+        background=_rounded(scene.background),
+    )
 
 
 def _model_info(path: Path) -> ModelInfo:
@@ -123,20 +135,6 @@ def _ply_rows(path: Path) -> tuple[Any, Any, int] | None:
             return None
     names, rows = read_rows(path)
     return rows[:, :3], rows[:, names.index("opacity")], round(((len(names) - 11) // 3) ** 0.5) - 1
-
-
-def _scene_info(scene: Scene) -> SceneInfo:
-    camera = scene.train[0].camera
-    return SceneInfo(
-        kind="scene",
-        name=scene.name,
-        train_views=len(scene.train),
-        test_views=len(scene.test),
-        image_size=(camera.width, camera.height),
-        points=len(scene.points),
-        extent=round(scene.extent, 4),
-        background=_rounded(scene.background),
-    )
 
 
 def _rounded(values: Iterable[Any]) -> tuple[float, ...]:

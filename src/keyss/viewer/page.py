@@ -18,9 +18,10 @@ from pathlib import Path
 from typing import BinaryIO
 from urllib.parse import quote
 
+import keyss.files  # imports torch when it reads a model, which the page itself does not need
 from keyss.core.errors import InputError, KeyssWarning, OutputError, UsageError
 from keyss.files.atomic import check_not_an_input, check_output_file, mode_like, write_bytes
-from keyss.files.ply_rows import has_packed_header, read_model_rows
+from keyss.files.ply_rows import is_compressed, read_model_rows
 from keyss.files.reading import open_input
 
 SCRIPT, STYLE, LICENCES, INDEX = "viewer.js", "viewer.css", "licences.txt", "index.html"
@@ -147,8 +148,7 @@ class Readable:
 def readable(model: Path) -> Readable:
     """The model's file if the page reads its format, else a lossless conversion, with a KeyssWarning.
 
-    Only a file that is converted is parsed wholly here. Raises InputError if it is not a valid model, and
-    for a .ply whose end is missing.
+    Raises InputError if it is not a whole model.
     """
     try:
         with model.open("rb") as file:
@@ -157,16 +157,16 @@ def readable(model: Path) -> Readable:
     except OSError:
         header, size = b"", 0  # read_model raises the InputError
     if _is_readable(model.name, header):
-        if header.startswith(b"ply"):
+        if header.startswith(b"ply") and not is_compressed(model):
             with open_input(model) as file:
-                if not has_packed_header(file):
-                    read_model_rows(file)  # checks header and size, and reads no rows yet
+                read_model_rows(file)  # checks header and size, and reads no rows
+        else:
+            keyss.files.read_model(model)
         return Readable(model.name, lambda: model.open("rb"), size)
 
-    from keyss.files import read_model  # imports torch, which the page itself does not need
     from keyss.files.models import model_bytes
 
-    gaussians = read_model(model)
+    gaussians = keyss.files.read_model(model)
     name, kind = f"{model.stem}.ply", f"a {model.suffix}"
     if header.startswith(b"ply"):
         kind = "a .ply in text"
