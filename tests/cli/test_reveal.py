@@ -69,10 +69,10 @@ def test_an_output_that_cannot_be_written_is_refused_before_the_work(
 
 def test_runs_and_checks_are_described_in_words(keyss: Run, world: Path) -> None:
     said = keyss("info", world / "hidden").out
-    assert "hiding by the method carry" in said and "_" not in said.replace(str(world), "")
-    assert keyss("verify", world / "hidden/publish/stego.ply", "--key-file", world / "key.txt").out.endswith(
-        "complete\n"
-    )
+    assert "hiding by the method carry" in said
+    assert "_" not in said.replace(str(world), "")
+    said = keyss("verify", world / "hidden/publish/stego.ply", "--key-file", world / "key.txt").out
+    assert said.endswith("complete\n")
     assert_refused(keyss("info", world), 4, f"name one of {world / 'hidden'}")
 
 
@@ -220,7 +220,7 @@ class TestStreams:
 
         monkeypatch.setattr(type(sys.stdout), "isatty", lambda self: True)
         said = keyss("reveal", files / "whole.ply", "--key-file", files / "key", "-o", "-")
-        assert_refused(said, 2, "terminal")
+        assert (said.status, "terminal" in said.err, said.out) == (2, True, "")
 
 
 class TestVerify:
@@ -235,7 +235,7 @@ class TestVerify:
         assert facts[0] == facts[1]
         assert facts[0]["secret"] is None
         assert facts[0]["model"]["gaussians"] == 1500
-        assert "secret                  not checked" in keyss("verify", files / "whole.ply").out
+        assert "secret  not checked" in keyss("verify", files / "whole.ply").out
 
     @pytest.mark.parametrize(
         ("change", "words"),
@@ -260,7 +260,7 @@ class TestVerify:
         said = keyss("verify", tmp_path / "m.ply")
         assert said.status == 4
         assert words in said.err
-        assert "model.gaussians" in said.out
+        assert "Gaussians of SH degree" in said.out
 
     @pytest.mark.parametrize("where", ["file", "environment"])
     def test_a_secret_that_is_whole(

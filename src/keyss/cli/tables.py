@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from keyss.runs.revealing import Verification
 
 
-_HEADS = ("PSNR", "SSIM", "bound", "loss", "start", "Gaussians", "in plain model", "steps")
+_HEADS = ("PSNR", "SSIM", "bound", "loss", "start", "Gaussians", "plain", "steps")
 
 
 class Console(RichConsole):
@@ -86,7 +86,7 @@ def _scene_rows(metrics: HideMetrics) -> list[dict[str, str]]:
         elif plain is not None:
             row["start"] = f"{plain.psnr:.2f}"
         if plain_size and _sizes_differ(metrics):
-            row["in plain model"] = f"{plain_size:,}"
+            row["plain"] = f"{plain_size:,}"
         rows.append(row)
     return rows
 
@@ -134,6 +134,8 @@ def _explanations(metrics: HideMetrics, names: Sequence[str], heads: Sequence[st
     size = "as many Gaussians"
     if _sizes_differ(metrics):
         size = "its own number of Gaussians" if _sizes_differ(metrics, 0.02) else "about as many Gaussians"
+    if "plain" in heads:
+        lines.append("Plain: Gaussians of the plain model.")
     if "bound" in heads:
         lines.append(f"Bound: PSNR of plain 3DGS of {size} and as many training steps.")
     if "start" in heads:
@@ -199,13 +201,13 @@ def print_verdicts(audit: Audit) -> None:
 
 def print_info(found: RunInfo | ModelInfo | SceneInfo) -> None:
     """What `keyss info` tells."""
-    from keyss.runs.config import HideMetrics
     from keyss.runs.describe import RunInfo
 
     if not isinstance(found, RunInfo):
-        facts = {name.replace("_", " "): value for name, value in vars(found).items()}
-        _print_columns([(name, _text(value)) for name, value in facts.items()])
+        _print_columns([(name.replace("_", " "), _text(value)) for name, value in vars(found).items()])
         return
+    from keyss.runs.config import HideMetrics
+
     metrics = found.metrics
     how = f" by the method {metrics.method}" if isinstance(metrics, HideMetrics) else ""
     # Without separators, a seed can be given to --seed.
@@ -218,16 +220,13 @@ def print_info(found: RunInfo | ModelInfo | SceneInfo) -> None:
 
 def print_verification(found: Verification) -> None:
     """What `keyss verify` found, in words."""
-    model, secret = found.model, found.secret
+    model, secret, what = found.model, found.secret, "not checked, as no key was given"
     problems = "; ".join(model.problems) or "sound"
-    rows = [("model", f"{model.gaussians:,} Gaussians of SH degree {model.sh_degree}: {problems}")]
-    if secret is None:
-        rows.append(("secret", "not checked, as no key was given"))
-    else:
+    if secret is not None:
         of = f" of {secret.hidden:,}" if secret.hidden else ""
-        left = "; ".join(secret.problems) or "complete"
-        rows.append(("secret", f"{secret.found:,}{of} Gaussians: {left}"))
-    _print_columns(rows)
+        what = f"{secret.found:,}{of} Gaussians: {'; '.join(secret.problems) or 'complete'}"
+    about_model = f"{model.gaussians:,} Gaussians of SH degree {model.sh_degree}: {problems}"
+    _print_columns([("model", about_model), ("secret", what)])
 
 
 def print_conversion(out: str, found: Conversion, *, dry_run: bool, file: TextIO) -> None:
