@@ -268,7 +268,7 @@ def test_a_dry_run_writes_nothing_and_names_what_cannot_work(keyss: Run, tmp_pat
     assert all(each.seconds > 0 and each.memory_bytes > 10**8 for each in found.plans)
     said = keyss("sweep", spec, "-o", out, "--dry-run")
     assert said.status == 0, said
-    assert "2 cells, 2 to do: about " in said.out
+    assert "2 runs, 2 to do: about " in said.out
     assert "nothing was written." in said.out
     (tmp_path / "a.ply").write_text("ply, but no model")
     cell.checksum.cache_clear()

@@ -14,7 +14,7 @@ from channels.low_bits.trained_like import trained_like
 from cli.said import Run, write_key
 from keyss import CarryOptions, FitConfig, Secret
 from keyss.channels import LOW_BITS
-from keyss.core import InputError, UsageError, WrongKeyError
+from keyss.core import UsageError, WrongKeyError
 from keyss.files import read_model, write_model
 from keyss.methods import most_visible, record_request
 from tiny_scenes import random_gaussians, tiny_scene
@@ -45,7 +45,7 @@ def test_hide_and_reveal_files(run: Run, tmp_path: Path) -> None:
     status, out, err = run(*HIDE, "--cover", "cover.ply", "--secret", "secret.ply", "-o", tmp_path / "out")
     assert (status, err) == (0, "")
     assert "900" in out
-    assert "carriers: " in out
+    assert "Room in the cover: " in out
     names = {str(path.relative_to(tmp_path / "out")) for path in (tmp_path / "out").rglob("*.*")}
     assert names == {
         "publish/stego.ply",
@@ -182,7 +182,7 @@ def test_what_cannot_work_is_refused_before_anything_is_fitted(tmp_path: Path) -
     """A scene without a model would be fitted for minutes, though the cover has no room."""
     coarse = trained_like(1500).map(lambda v: (v * 64).round() / 64)
     secret = Secret(tiny_scene(1), KEY)
-    with pytest.raises(InputError, match="`dither=True`"):
+    with pytest.raises(UsageError, match="`dither=True`"):
         keyss.hide(coarse, [secret], method="carry", out=tmp_path / "run")
     flat = random_gaussians(1500, sh_degree=0)
     model = Secret(tiny_scene(1), KEY, random_gaussians(100, sh_degree=3))
