@@ -47,8 +47,8 @@ from keyss.channels.low_bits.parameters import (
 )
 from keyss.channels.low_bits.salts import salt, salt_rows
 from keyss.channels.low_bits.usable import repeated
-from keyss.channels.mixing import random_order
-from keyss.core.arrays import Bytes, Flags, Integers
+from keyss.channels.mixing import random_order, row_hashes
+from keyss.core.arrays import Bytes, Flags, Integers, Words
 from keyss.core.errors import InputError, KeyssWarning, WrongKeyError
 from keyss.core.gaussians import Gaussians
 from keyss.keys.derivation import DerivedKey, expand, fill
@@ -300,5 +300,17 @@ def _first_of_each(names: Bytes, low: Bytes) -> Integers:
 
 def _are_among(rows: Bytes, others: Bytes) -> Flags:
     """[R] which of the rows [R, C] are there among the others [O, C]."""
-    known = {each.tobytes() for each in rows}.intersection(each.tobytes() for each in others)
-    return np.fromiter((each.tobytes() in known for each in rows), bool, len(rows))
+    if not len(others):
+        return np.zeros(len(rows), bool)
+    wanted, known = _hashes(rows), _hashes(others)
+    order = known.argsort()
+    found = order[np.searchsorted(known, wanted, sorter=order).clip(max=len(known) - 1)]
+    among: Flags = (others[found] == rows).all(axis=1)
+    return among
+
+
+def _hashes(rows: Bytes) -> Words:
+    """[R] of bytes [R, C]."""
+    words = np.zeros((len(rows), -(-rows.shape[1] // 8) * 8), np.uint8)
+    words[:, : rows.shape[1]] = rows
+    return row_hashes(words.view(np.uint64))

@@ -244,8 +244,8 @@ def _frequent_values(gaussians: Gaussians) -> list[Words32]:
     frequent = []
     for field in (gaussians.log_scales, gaussians.quats, gaussians.opacity_logits, gaussians.sh[:, 1:]):
         words = field.detach().to("cpu", torch.float32).numpy().view(np.uint32)
-        values, counts = np.unique(words, return_counts=True)
-        frequent.append(values[counts >= _unlikely_copies(words.size)])
+        ordered, further = np.sort(words, axis=None), _unlikely_copies(words.size) - 1
+        frequent.append(np.unique(ordered[further:][ordered[further:] == ordered[:-further]]))
     return frequent
 
 

@@ -33,6 +33,9 @@ _NUMBERS = (3, 3, 3, 1, *(3 * count for count in BANDS))
 _FLOOR = (15, 8, 8, 7, 8, 4, 4, 4)
 
 
+Extent = tuple[float, float]  # the least and the largest of some numbers
+
+
 @dataclass(frozen=True)
 class Line:
     """Codes 0 .. 2^bits - 1 for evenly spaced positions from -reach to reach.
@@ -108,24 +111,24 @@ def neighbourhood(values: Doubles, kind: Kind) -> tuple[float, float]:
     return centre - reach, centre + reach
 
 
-def fit_line(kind: Kind, bits: int, values: Doubles, outliers: Doubles) -> Line:
-    """The line for `values` [N, C] of the bulk, with a far reach for `outliers` [O, C]; there may be none."""
+def fit_line(kind: Kind, bits: int, sample: Doubles, bulk: Extent, outliers: Extent) -> Line:
+    """The line for the bulk, of which `sample` [N, C] is a part, with a far reach for the outliers."""
     if kind.even:
-        centre, spread = (float(values.min()) + float(values.max())) / 2, 0.0
+        centre, spread = sum(bulk) / 2, 0.0
     else:
-        centre = 0.0 if kind.centred else float(np.median(values))
-        spread = max(float(np.abs(values - centre).mean()), _MIN_SPREAD)
+        centre = 0.0 if kind.centred else float(np.median(sample))
+        spread = max(float(np.abs(sample - centre).mean()), _MIN_SPREAD)
     line = Line(float(np.float32(centre)), float(np.float32(spread)), 1, 1)
-    line = replace(line, reach=_reach_of(line, _furthest(line, values)))
+    line = replace(line, reach=_reach_of(line, _furthest(line, bulk)))
     if kind.clips:
-        line = _best_line(line, bits, values)
+        line = _best_line(line, bits, sample, bulk)
     return replace(line, far_reach=_reach_of(line, _furthest(line, outliers)))
 
 
-def _best_line(whole: Line, bits: int, values: Doubles) -> Line:
+def _best_line(whole: Line, bits: int, values: Doubles, bulk: Extent) -> Line:
     """The line with the least error among some with other spreads that reach as far as `whole` or less."""
     sample = values[:: max(1, values.size // _SAMPLE)].ravel()
-    furthest = _furthest(whole, values) or 1.0
+    furthest = _furthest(whole, bulk) or 1.0
     best, least = whole, np.inf
     for scale in (0.5, 1.0, 2.0, 4.0):
         line = replace(whole, spread=float(np.float32(scale * whole.spread)))
@@ -140,9 +143,15 @@ def _best_line(whole: Line, bits: int, values: Doubles) -> Line:
     return best
 
 
-def _furthest(line: Line, values: Doubles) -> float:
+def extent_of(values: Doubles) -> Extent:
+    """The least and the largest of `values`; infinity and minus infinity where there are none."""
+    return float(values.min(initial=np.inf)), float(values.max(initial=-np.inf))
+
+
+def _furthest(line: Line, extent: Extent) -> float:
     """The largest distance from the centre; 0 where there are no values."""
-    return float(np.abs(values - line.centre).max(initial=0.0))
+    least, largest = extent
+    return max(line.centre - least, largest - line.centre, 0.0)
 
 
 def _reach_of(line: Line, distance: float) -> float:

@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterator, Sequence
-from dataclasses import astuple, dataclass
+from dataclasses import astuple, dataclass, fields
 
 import numpy as np
 import torch
@@ -37,18 +37,21 @@ from keyss.methods.records.lines import (
     HARMONIC,
     LINE,
     POSITION,
+    Extent,
     Kind,
     Line,
     Table,
+    extent_of,
     fit_line,
     neighbourhood,
 )
+from keyss.rendering.cpu.parallel import in_blocks
 
 MAX_LOGIT = 16.0  # beyond it the float32 sigmoid is exactly 0 or 1
 _MAX_HARMONIC = 1e6  # beyond it a colour is black or white wherever it is rendered at all
 _MIN_LENGTH = 1e-12  # of quaternions: a shorter one turns nothing
-_SAMPLE = 20_000  # Gaussians that tell which numbers are outliers
-_CHUNK = 1 << 14  # Gaussians that are packed at a time, because every bit takes a byte meanwhile
+_SAMPLE = 20_000  # Gaussians that tell which numbers are outliers, and that lines are fitted to
+_BLOCK = 1 << 12  # Gaussians at a time: their numbers stay in the cache, and every bit takes a byte meanwhile
 _TABLE_BYTES = 8  # one for each number of bits, 0 for a band of harmonics that is not there
 _QUAT_LINE = Line(0, 0, 0.5**0.5, 0.5**0.5)  # of the three smaller components
 
@@ -65,13 +68,29 @@ class Codec:
         """The lines that suit `gaussians`, which have the SH degree of the table."""
         if table.sh_degree != gaussians.sh_degree:
             raise ValueError(f"SH degree {gaussians.sh_degree}, but the table is for {table.sh_degree}")
-        outlier, kinds = outliers(gaussians), _kinds(table.sh_degree)
-        every = zip(kinds, _bits(table), _numbers(gaussians), strict=True)
-        return Codec(table, tuple(fit_line(kind, bits, x[~outlier], x[outlier]) for kind, bits, x in every))
+        outlier, every = outliers(gaussians), _sampled(len(gaussians))
 
-    def codes(self, gaussians: Gaussians) -> list[Words32]:
-        """Codes [N, columns] for each entry of `table.layout`."""
-        outlier = outliers(gaussians)
+        def extents(start: int, stop: int) -> list[list[Extent]]:
+            own, parts = outlier[start:stop], _numbers(gaussians[start:stop])
+            return [[extent_of(values[~own]), extent_of(values[own])] for values in parts]
+
+        found = np.array(in_blocks(extents, len(gaussians), _BLOCK))  # [blocks, lines, 2, 2]
+        least, largest = found[..., 0].min(axis=0), found[..., 1].max(axis=0)
+        sample = _numbers(gaussians[::every])
+        lines = [
+            fit_line(kind, bits, values[~outlier[::every]], *zip(low, high, strict=True))
+            for kind, bits, values, low, high in zip(
+                _kinds(table.sh_degree), _bits(table), sample, least, largest, strict=True
+            )
+        ]
+        return Codec(table, tuple(lines))
+
+    def codes(self, gaussians: Gaussians, outlier: Flags | None = None) -> list[Words32]:
+        """Codes [N, columns] for each entry of `table.layout`.
+
+        `outlier` [N]: the `outliers`, where they are known.
+        """
+        outlier = outliers(gaussians) if outlier is None else outlier
         quats = _doubles(gaussians.quats)
         quats[np.linalg.norm(quats, axis=1) <= _MIN_LENGTH] = 0
         left_out, three = smallest_three(unit(quats))
@@ -92,7 +111,8 @@ class Codec:
         bands = []
         for brightness, differences in zip(colours[::2], colours[1::2], strict=True):
             pairs = differences.reshape(*brightness.shape, 2)
-            bands.append(np.concatenate([brightness[:, :, None], pairs], axis=2) @ OPPONENT)
+            rotated = np.concatenate([brightness[:, :, None], pairs], axis=2).reshape(-1, 3)
+            bands.append((rotated @ OPPONENT).reshape(*brightness.shape, 3))
         quats = _whole_quats(left_out, _QUAT_LINE.decode(three, self.table.bits[2]))
         tensors = (np.concatenate([x, y, z], 1), quats, scales, opacities[:, 0], np.concatenate(bands, 1))
         return Gaussians(*(torch.from_numpy(each.astype(np.float32)) for each in tensors))
@@ -102,27 +122,37 @@ class Codec:
 
         The bits left over are zero.
         """
-        columns, parts = self.codes(gaussians), []
-        for start in range(0, len(gaussians), _CHUNK):
-            bits = []
+        outlier = outliers(gaussians)
+        records = np.empty((len(gaussians), self.table.record_bytes), np.uint8)
+
+        def encode(start: int, stop: int) -> None:
+            columns, bits = self.codes(gaussians[start:stop], outlier[start:stop]), []
             for codes, (_, count) in zip(columns, self.table.layout, strict=True):
                 shifts = np.arange(count - 1, -1, -1, dtype=np.uint32)
-                part = codes[start : start + _CHUNK, :, None] >> shifts & 1
-                bits.append(part.astype(np.uint8).reshape(len(part), -1))
-            parts.append(np.packbits(np.concatenate(bits, axis=1), axis=1))
-        return np.concatenate(parts)
+                bits.append((codes[:, :, None] >> shifts & 1).astype(np.uint8).reshape(len(codes), -1))
+            records[start:stop] = np.packbits(np.concatenate(bits, axis=1), axis=1)
+
+        in_blocks(encode, len(gaussians), _BLOCK)
+        return records
 
     def decode(self, records: Bytes) -> Gaussians:
         """The Gaussians of records [N, record_bytes], whatever bytes they are."""
-        layout = self.table.layout
+        layout, k = self.table.layout, (self.table.sh_degree + 1) ** 2
         ends = np.cumsum([columns * bits for columns, bits in layout])
-        found = [np.zeros((len(records), columns), np.uint32) for columns, _ in layout]
-        for start in range(0, len(records), _CHUNK):
-            part = np.split(np.unpackbits(records[start : start + _CHUNK], axis=1), ends, axis=1)
-            for codes, unread, (columns, bits) in zip(found, part, layout, strict=False):
-                powers = np.uint32(1) << np.arange(bits, dtype=np.uint32)[::-1]
-                codes[start : start + _CHUNK] = unread.reshape(-1, columns, bits) @ powers
-        return self.gaussians(found)
+        whole = Gaussians(*(torch.empty(len(records), *shape) for shape in ((3,), (4,), (3,), (), (k, 3))))
+
+        def decode(start: int, stop: int) -> None:
+            parts = np.split(np.unpackbits(records[start:stop], axis=1), ends, axis=1)
+            codes = [
+                unread.reshape(-1, columns, bits) @ (np.uint32(1) << np.arange(bits, dtype=np.uint32)[::-1])
+                for unread, (columns, bits) in zip(parts, layout, strict=False)
+            ]
+            part = self.gaussians(codes)
+            for field in fields(Gaussians):
+                getattr(whole, field.name)[start:stop] = getattr(part, field.name)
+
+        in_blocks(decode, len(records), _BLOCK)
+        return whole
 
     def pack(self) -> bytes:
         """The codec itself: 92 to 164 bytes."""
@@ -150,10 +180,17 @@ class Codec:
 
 def outliers(gaussians: Gaussians) -> Flags:
     """[N] which Gaussians have a number far outside of the bulk; none if that would be all."""
-    found, every = np.zeros(len(gaussians), bool), max(1, len(gaussians) // _SAMPLE)
-    for kind, values in zip(_kinds(gaussians.sh_degree), _numbers(gaussians), strict=True):
-        least, largest = neighbourhood(values[::every], kind)
-        found |= ((values < least) | (values > largest)).any(axis=1)
+    found = np.zeros(len(gaussians), bool)
+    sample = _numbers(gaussians[:: _sampled(len(gaussians))])
+    ends = [
+        neighbourhood(values, kind) for kind, values in zip(_kinds(gaussians.sh_degree), sample, strict=True)
+    ]
+
+    def judge(start: int, stop: int) -> None:
+        for values, (least, largest) in zip(_numbers(gaussians[start:stop]), ends, strict=True):
+            found[start:stop] |= ((values < least) | (values > largest)).any(axis=1)
+
+    in_blocks(judge, len(gaussians), _BLOCK)
     return found if not found.all() else ~found
 
 
@@ -161,6 +198,11 @@ def out_of_range(gaussians: Gaussians) -> int:
     """The number of Gaussians with a number that a record clamps, and that no rendering depends on."""
     beyond = gaussians.overflow | (gaussians.log_scales < -MAX_LOG_SCALE).any(1)
     return int((beyond | (gaussians.sh.abs() > _MAX_HARMONIC).flatten(1).any(1)).sum())
+
+
+def _sampled(count: int) -> int:
+    """Every how many of so many Gaussians the lines are fitted to."""
+    return max(1, count // _SAMPLE)
 
 
 def _kinds(sh_degree: int) -> list[Kind]:
@@ -189,7 +231,7 @@ def _numbers(gaussians: Gaussians) -> Iterator[Doubles]:
     first = 0
     for count in BANDS[: gaussians.sh_degree + 1]:
         harmonics = gaussians.sh[:, first : first + count].clamp(-_MAX_HARMONIC, _MAX_HARMONIC)
-        rotated = _doubles(harmonics) @ OPPONENT.T
+        rotated = (_doubles(harmonics).reshape(-1, 3) @ OPPONENT.T).reshape(-1, count, 3)
         yield rotated[:, :, 0]
         yield rotated[:, :, 1:].reshape(len(rotated), -1)
         first += count
