@@ -72,3 +72,11 @@ def test_one_huge_gaussian_is_not_all_that_cameras_look_at(place: float, log_sca
     found, reach = middle_and_radius(changed)
     torch.testing.assert_close(found, middle, atol=0.1 * radius, rtol=0)
     assert reach == pytest.approx(radius, rel=0.1)
+
+
+def test_large_models_have_two_test_views(monkeypatch: pytest.MonkeyPatch) -> None:
+    model = random_gaussians(20)
+    assert len(scene_of_model(model, "m", size=8, train_pictures=False).test) == 8
+    monkeypatch.setattr("keyss.rendering.orbit._LARGE", 20)
+    scene = scene_of_model(model, "m", size=8, train_pictures=False)
+    assert (len(scene.test), len(scene.views)) == (2, VIEWS)

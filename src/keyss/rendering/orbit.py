@@ -24,7 +24,7 @@ FIELD_OF_VIEW = 50.0  # degrees
 MAX_ELEVATION = 60.0  # degrees, up and down
 # Distances of successive cameras, relative to that from which the whole model is visible.
 DISTANCES = (1.0, 0.75, 1.0, 0.5)
-TEST_EVERY = 12
+TEST_EVERY, _LARGE = 12, 500_000  # views; Gaussians whose renders take long
 _QUANTILE, _MAX_RATIO = 0.95, 10.0  # weights are clamped to this multiple of this quantile
 _SAMPLE = 200_000  # Gaussians from which `middle_and_radius` is computed
 ELEVATION = 20.0  # degrees
@@ -46,18 +46,19 @@ def scene_of_model(
     background: Tensor | Sequence[float] | None = None,
     train_pictures: bool = True,
 ) -> Scene:
-    """A scene of renders of `model`, size x size, from the cameras of `orbit`; every twelfth is a test view.
+    """A scene of renders of `model`, size x size, from the cameras of `orbit`.
 
-    Without `train_pictures`, only the test views are rendered; the images of the others are [0, 0, 3].
-    Raises UsageError for a `size` or `background` out of range.
+    Every twelfth is a test view; from 500,000 Gaussians on, only two are. Without `train_pictures`, only test
+    views are rendered; the images of the others are [0, 0, 3]. Raises UsageError for a `size` or `background`
+    out of range.
     """
     size = IMAGE_SIZE if size is None else size
     if not 1 <= size <= MAX_SIDE:
         raise UsageError(f"expected a width of 1 to {MAX_SIDE:,} pixels for renders of a model, got {size:,}")
     background = torch.zeros(3) if background is None else checked_background(background)
-    views = []
+    views, every = [], TEST_EVERY if len(model) < _LARGE else VIEWS // 2
     for index, camera in enumerate(orbit(model, size)):
-        test = index % TEST_EVERY == 0
+        test = index % every == 0
         if test or train_pictures:
             image = render(model, camera, background.to(model.device)).clamp(0, 1).cpu()
             views.append(View(camera, (image * 255).round().to(torch.uint8), image if test else None))
@@ -66,8 +67,8 @@ def scene_of_model(
     colors = ((model.sh[:, 0] * SH_C0 + 0.5).clamp(0, 1) * 255).round().to(torch.uint8)
     return Scene(
         name,
-        train=tuple(view for index, view in enumerate(views) if index % TEST_EVERY),
-        test=tuple(views[::TEST_EVERY]),
+        train=tuple(view for index, view in enumerate(views) if index % every),
+        test=tuple(views[::every]),
         points=model.means.cpu(),
         colors=colors.cpu(),
         background=background.cpu(),

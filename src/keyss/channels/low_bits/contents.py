@@ -48,7 +48,7 @@ from keyss.channels.low_bits.parameters import (
 from keyss.channels.low_bits.salts import salt, salt_rows
 from keyss.channels.low_bits.usable import repeated
 from keyss.channels.mixing import random_order, row_hashes
-from keyss.core.arrays import Bytes, Flags, Integers, Words
+from keyss.core.arrays import Bytes, Flags, Integers
 from keyss.core.errors import InputError, KeyssWarning, WrongKeyError
 from keyss.core.gaussians import Gaussians
 from keyss.keys.derivation import DerivedKey, expand, fill
@@ -280,12 +280,8 @@ class LowBitsReader(SaltedReader):
         ]
         if cells == 1:
             return found[0][1]
-        fits = np.stack([each for each, _ in found], axis=1)
-        places = np.cumsum(fits).reshape(fits.shape) - 1
-        rows = np.empty((int(places[-1, -1]) + 1 if fits.size else 0, cipher.size), np.uint8)
-        for slot, (fit, data) in enumerate(found):
-            rows[places[fit, slot]] = data
-        return rows
+        order = np.concatenate([np.flatnonzero(fits) for fits, _ in found]).argsort(kind="stable")
+        return np.concatenate([data for _, data in found])[order]
 
 
 def _first_of_each(names: Bytes, low: Bytes) -> Integers:
@@ -299,18 +295,7 @@ def _first_of_each(names: Bytes, low: Bytes) -> Integers:
 
 
 def _are_among(rows: Bytes, others: Bytes) -> Flags:
-    """[R] which of the rows [R, C] are there among the others [O, C]."""
-    if not len(others):
-        return np.zeros(len(rows), bool)
-    wanted, known = _hashes(rows), _hashes(others)
-    order = known.argsort()
-    found = order[np.searchsorted(known, wanted, sorter=order).clip(max=len(known) - 1)]
-    among: Flags = (others[found] == rows).all(axis=1)
-    return among
-
-
-def _hashes(rows: Bytes) -> Words:
-    """[R] of bytes [R, C]."""
-    words = np.zeros((len(rows), -(-rows.shape[1] // 8) * 8), np.uint8)
-    words[:, : rows.shape[1]] = rows
-    return row_hashes(words.view(np.uint64))
+    """[R] which of the rows [R, C] are there among the others [O, C], by their hashes."""
+    padded = (np.pad(each, ((0, 0), (0, -each.shape[1] % 8))) for each in (rows, others))
+    wanted, known = (row_hashes(each.view(np.uint64)) for each in padded)
+    return np.isin(wanted, known)

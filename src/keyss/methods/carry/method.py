@@ -144,11 +144,7 @@ class CarryMethod:
             viewpoints=viewpoints,
             entropy=context.entropy,
         )
-        return replace(
-            stego,
-            iterations=max(options.refits),
-            details={**details, **stego.details},
-        )
+        return replace(stego, iterations=max(options.refits), details={**details, **stego.details})
 
 
 def _secret_sizes(secrets: Sequence[Source], options: CarryOptions) -> list[SecretSize]:

@@ -33,9 +33,6 @@ _NUMBERS = (3, 3, 3, 1, *(3 * count for count in BANDS))
 _FLOOR = (15, 8, 8, 7, 8, 4, 4, 4)
 
 
-Extent = tuple[float, float]  # the least and the largest of some numbers
-
-
 @dataclass(frozen=True)
 class Line:
     """Codes 0 .. 2^bits - 1 for evenly spaced positions from -reach to reach.
@@ -111,10 +108,13 @@ def neighbourhood(values: Doubles, kind: Kind) -> tuple[float, float]:
     return centre - reach, centre + reach
 
 
-def fit_line(kind: Kind, bits: int, sample: Doubles, bulk: Extent, outliers: Extent) -> Line:
-    """The line for the bulk, of which `sample` [N, C] is a part, with a far reach for the outliers."""
+def fit_line(kind: Kind, bits: int, sample: Doubles, bulk: Doubles, outliers: Doubles) -> Line:
+    """The line for the bulk, of which `sample` [N, C] is a part, with a far reach for the outliers.
+
+    `bulk` and `outliers` [2]: their least and their largest number, infinities where there are none.
+    """
     if kind.even:
-        centre, spread = sum(bulk) / 2, 0.0
+        centre, spread = float(bulk.sum()) / 2, 0.0
     else:
         centre = 0.0 if kind.centred else float(np.median(sample))
         spread = max(float(np.abs(sample - centre).mean()), _MIN_SPREAD)
@@ -125,7 +125,7 @@ def fit_line(kind: Kind, bits: int, sample: Doubles, bulk: Extent, outliers: Ext
     return replace(line, far_reach=_reach_of(line, _furthest(line, outliers)))
 
 
-def _best_line(whole: Line, bits: int, values: Doubles, bulk: Extent) -> Line:
+def _best_line(whole: Line, bits: int, values: Doubles, bulk: Doubles) -> Line:
     """The line with the least error among some with other spreads that reach as far as `whole` or less."""
     sample = values[:: max(1, values.size // _SAMPLE)].ravel()
     furthest = _furthest(whole, bulk) or 1.0
@@ -143,15 +143,9 @@ def _best_line(whole: Line, bits: int, values: Doubles, bulk: Extent) -> Line:
     return best
 
 
-def extent_of(values: Doubles) -> Extent:
-    """The least and the largest of `values`; infinity and minus infinity where there are none."""
-    return float(values.min(initial=np.inf)), float(values.max(initial=-np.inf))
-
-
-def _furthest(line: Line, extent: Extent) -> float:
+def _furthest(line: Line, extent: Doubles) -> float:
     """The largest distance from the centre; 0 where there are no values."""
-    least, largest = extent
-    return max(line.centre - least, largest - line.centre, 0.0)
+    return max(0.0, line.centre - float(extent[0]), float(extent[1]) - line.centre)
 
 
 def _reach_of(line: Line, distance: float) -> float:

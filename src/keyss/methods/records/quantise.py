@@ -37,11 +37,9 @@ from keyss.methods.records.lines import (
     HARMONIC,
     LINE,
     POSITION,
-    Extent,
     Kind,
     Line,
     Table,
-    extent_of,
     fit_line,
     neighbourhood,
 )
@@ -68,29 +66,11 @@ class Codec:
         """The lines that suit `gaussians`, which have the SH degree of the table."""
         if table.sh_degree != gaussians.sh_degree:
             raise ValueError(f"SH degree {gaussians.sh_degree}, but the table is for {table.sh_degree}")
-        outlier, every = outliers(gaussians), _sampled(len(gaussians))
+        every = zip(_kinds(table.sh_degree), _bits(table), _bulk(gaussians)[1], strict=True)
+        return Codec(table, tuple(fit_line(kind, bits, *line) for kind, bits, line in every))
 
-        def extents(start: int, stop: int) -> list[list[Extent]]:
-            own, parts = outlier[start:stop], _numbers(gaussians[start:stop])
-            return [[extent_of(values[~own]), extent_of(values[own])] for values in parts]
-
-        found = np.array(in_blocks(extents, len(gaussians), _BLOCK))  # [blocks, lines, 2, 2]
-        least, largest = found[..., 0].min(axis=0), found[..., 1].max(axis=0)
-        sample = _numbers(gaussians[::every])
-        lines = [
-            fit_line(kind, bits, values[~outlier[::every]], *zip(low, high, strict=True))
-            for kind, bits, values, low, high in zip(
-                _kinds(table.sh_degree), _bits(table), sample, least, largest, strict=True
-            )
-        ]
-        return Codec(table, tuple(lines))
-
-    def codes(self, gaussians: Gaussians, outlier: Flags | None = None) -> list[Words32]:
-        """Codes [N, columns] for each entry of `table.layout`.
-
-        `outlier` [N]: the `outliers`, where they are known.
-        """
-        outlier = outliers(gaussians) if outlier is None else outlier
+    def codes(self, gaussians: Gaussians, outlier: Flags) -> list[Words32]:
+        """Codes [N, columns] for each entry of `table.layout`; `outlier` [N]: their `outliers`."""
         quats = _doubles(gaussians.quats)
         quats[np.linalg.norm(quats, axis=1) <= _MIN_LENGTH] = 0
         left_out, three = smallest_three(unit(quats))
@@ -126,10 +106,11 @@ class Codec:
         records = np.empty((len(gaussians), self.table.record_bytes), np.uint8)
 
         def encode(start: int, stop: int) -> None:
-            columns, bits = self.codes(gaussians[start:stop], outlier[start:stop]), []
+            bits = []
+            columns = self.codes(gaussians[start:stop], outlier[start:stop])
             for codes, (_, count) in zip(columns, self.table.layout, strict=True):
-                shifts = np.arange(count - 1, -1, -1, dtype=np.uint32)
-                bits.append((codes[:, :, None] >> shifts & 1).astype(np.uint8).reshape(len(codes), -1))
+                part = codes[:, :, None] >> np.arange(count - 1, -1, -1, dtype=np.uint32) & 1
+                bits.append(part.astype(np.uint8).reshape(len(part), -1))
             records[start:stop] = np.packbits(np.concatenate(bits, axis=1), axis=1)
 
         in_blocks(encode, len(gaussians), _BLOCK)
@@ -138,16 +119,16 @@ class Codec:
     def decode(self, records: Bytes) -> Gaussians:
         """The Gaussians of records [N, record_bytes], whatever bytes they are."""
         layout, k = self.table.layout, (self.table.sh_degree + 1) ** 2
-        ends = np.cumsum([columns * bits for columns, bits in layout])
+        bits = np.array([bits for columns, bits in layout for _ in range(columns)])
+        first, shift = np.divmod(np.cumsum(bits) - bits, 8)  # byte and bit at which each code begins
+        ends = np.cumsum([columns for columns, _ in layout])[:-1]
         whole = Gaussians(*(torch.empty(len(records), *shape) for shape in ((3,), (4,), (3,), (), (k, 3))))
 
         def decode(start: int, stop: int) -> None:
-            parts = np.split(np.unpackbits(records[start:stop], axis=1), ends, axis=1)
-            codes = [
-                unread.reshape(-1, columns, bits) @ (np.uint32(1) << np.arange(bits, dtype=np.uint32)[::-1])
-                for unread, (columns, bits) in zip(parts, layout, strict=False)
-            ]
-            part = self.gaussians(codes)
+            padded = np.pad(records[start:stop], ((0, 0), (0, 3)))
+            words = padded.take(first[:, None] + np.arange(4), axis=1).view(">u4")[:, :, 0].astype(np.uint32)
+            codes = words << shift.astype(np.uint32) >> (32 - bits).astype(np.uint32)
+            part = self.gaussians(np.split(codes, ends, axis=1))
             for field in fields(Gaussians):
                 getattr(whole, field.name)[start:stop] = getattr(part, field.name)
 
@@ -180,29 +161,32 @@ class Codec:
 
 def outliers(gaussians: Gaussians) -> Flags:
     """[N] which Gaussians have a number far outside of the bulk; none if that would be all."""
-    found = np.zeros(len(gaussians), bool)
-    sample = _numbers(gaussians[:: _sampled(len(gaussians))])
-    ends = [
-        neighbourhood(values, kind) for kind, values in zip(_kinds(gaussians.sh_degree), sample, strict=True)
-    ]
+    return _bulk(gaussians)[0]
 
-    def judge(start: int, stop: int) -> None:
-        for values, (least, largest) in zip(_numbers(gaussians[start:stop]), ends, strict=True):
-            found[start:stop] |= ((values < least) | (values > largest)).any(axis=1)
 
-    in_blocks(judge, len(gaussians), _BLOCK)
-    return found if not found.all() else ~found
+def _bulk(gaussians: Gaussians) -> tuple[Flags, list[tuple[Doubles, Doubles, Doubles]]]:
+    """The `outliers` [N]; for each line a sample of the bulk's numbers, and extents of bulk and outliers."""
+    found, every = np.zeros(len(gaussians), bool), max(1, len(gaussians) // _SAMPLE)
+    sample = list(_numbers(gaussians[::every]))
+    ends = list(map(neighbourhood, sample, _kinds(gaussians.sh_degree)))
+
+    def judge(start: int, stop: int) -> list[list[tuple[float, float]]]:
+        numbers, own = list(_numbers(gaussians[start:stop])), found[start:stop]
+        for values, (least, largest) in zip(numbers, ends, strict=True):
+            own |= ((values < least) | (values > largest)).any(axis=1)
+        parts = ((values[~own], values[own]) for values in numbers)
+        return [[(x.min(initial=np.inf), -x.max(initial=-np.inf)) for x in each] for each in parts]
+
+    extents = np.min(in_blocks(judge, len(gaussians), _BLOCK), axis=0) * (1, -1)  # [lines, 2, 2]
+    if found.all():
+        found, extents = ~found, extents[:, ::-1]
+    return found, [(x[~found[::every]], *each) for x, each in zip(sample, extents, strict=True)]
 
 
 def out_of_range(gaussians: Gaussians) -> int:
     """The number of Gaussians with a number that a record clamps, and that no rendering depends on."""
     beyond = gaussians.overflow | (gaussians.log_scales < -MAX_LOG_SCALE).any(1)
     return int((beyond | (gaussians.sh.abs() > _MAX_HARMONIC).flatten(1).any(1)).sum())
-
-
-def _sampled(count: int) -> int:
-    """Every how many of so many Gaussians the lines are fitted to."""
-    return max(1, count // _SAMPLE)
 
 
 def _kinds(sh_degree: int) -> list[Kind]:

@@ -32,7 +32,7 @@ from keyss.core.errors import InputError
 from keyss.core.gaussians import OPPONENT, Gaussians
 from keyss.files.formats.common import in_morton_order
 from keyss.methods.records.lines import Table
-from keyss.methods.records.quantise import Codec
+from keyss.methods.records.quantise import Codec, outliers
 
 _ALWAYS = 1 << 16  # Gaussians, whatever announces them
 _LEAST_BYTES = 2  # of each Gaussian in larger models
@@ -71,7 +71,7 @@ def encode(model: Gaussians, precision: Precision | None = None) -> bytes:
     model = in_morton_order(model)
     plain = model.with_sh_degree(0)
     codec = Codec.fit(plain, table)
-    columns = codec.codes(plain)
+    columns = codec.codes(plain, outliers(plain))
     planes: list[bytes] = []
     for index, (codes, (_, bits)) in enumerate(zip(columns, table.layout, strict=True)):
         planes += _planes(codes, bits, index)

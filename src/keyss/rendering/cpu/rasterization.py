@@ -130,20 +130,13 @@ class _Rasterize(torch.autograd.Function):
         ctx.means2d = means2d
         ctx.renderings = renderings
         ctx.settings = settings
-        ctx.set_materialize_grads(False)
         return images, alphas
 
     @staticmethod
     @once_differentiable
-    def backward(
-        ctx: Any, images_gradient: Tensor | None, alphas_gradient: Tensor | None
-    ) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, images_gradient: Tensor, alphas_gradient: Tensor) -> tuple[Tensor | None, ...]:
         *gaussians, images, transmittances = ctx.saved_tensors
         settings: Settings = ctx.settings
-        if images_gradient is None:
-            images_gradient = torch.zeros_like(images)
-        if alphas_gradient is None:
-            alphas_gradient = torch.zeros_like(transmittances)
         images_gradient = images_gradient.contiguous()
         alphas_gradient = alphas_gradient.reshape(transmittances.shape).contiguous()
         need_background, need_colors = ctx.needs_input_grad[4], ctx.needs_input_grad[-1]
@@ -255,15 +248,7 @@ def _render(
         transmittance, ends,
     )  # fmt: skip
     return Rendering(
-        camera,
-        footprints,
-        used_features,
-        first_slots,
-        slot_counts,
-        tile_starts,
-        entries,
-        entry_slots,
-        ends,
+        camera, footprints, used_features, first_slots, slot_counts, tile_starts, entries, entry_slots, ends
     )
 
 
