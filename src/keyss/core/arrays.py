@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 Flags = npt.NDArray[np.bool_]
 Bits = npt.NDArray[np.uint8]  # each 0 or 1
@@ -17,3 +20,9 @@ Integers = npt.NDArray[np.int64]
 Floats = npt.NDArray[np.float32]
 Doubles = npt.NDArray[np.float64]
 Numbers = npt.NDArray[Any]  # of any kind
+
+
+def doubles(values: Tensor) -> Doubles:
+    """A tensor on any device as an array of its shape."""
+    found: Doubles = values.detach().cpu().double().numpy()
+    return found

@@ -14,6 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaincc
 
+from keyss.core.arrays import Bytes, Doubles, Integers
+
 _SAMPLES = 1024  # per block of chi-square
 _MIN_BLOCKS = 256  # the original program fails with fewer
 _FREEDOM = 127  # of the test; there are 128 terms
@@ -21,11 +23,11 @@ _AT_ONCE = 4096  # blocks whose histograms are in memory together
 _ROWS = 128  # origins of RS's blocks in memory together; even, so that disjoint blocks stay disjoint
 
 Plane = NDArray[np.int16]  # [H, W]
-Counts = NDArray[np.int64]  # [2, 2]: under F1 and under F-1, the number of regular and of singular blocks
+Counts = Integers  # [2, 2]: under F1 and under F-1, the number of regular and of singular blocks
 Number = np.float64
 
 
-def chi_square(image: NDArray[np.uint8]) -> float | None:
+def chi_square(image: Bytes) -> float | None:
     """Mean p-value over the first 1024, 2048, ... samples of [H, W, 3], in [0, 1].
 
     Samples are in order of rows, red green blue. None for images of less than about 87,700 pixels. Not
@@ -49,17 +51,17 @@ def chi_square(image: NDArray[np.uint8]) -> float | None:
     return total / blocks
 
 
-def _p_values(histograms: NDArray[np.int64]) -> NDArray[np.float64]:
+def _p_values(histograms: Integers) -> Doubles:
     """[N] p-values of [N, 256] histograms, none of whose bins is empty."""
     observed = histograms[:, 0::2].astype(np.float64)
     expected = ((histograms[:, 0::2] + histograms[:, 1::2]) // 2).astype(np.float64)
     expected *= (observed.sum(1) / expected.sum(1))[:, None]
     statistic = ((observed - expected) ** 2 / expected).sum(1)
-    p_values: NDArray[np.float64] = gammaincc(_FREEDOM / 2, statistic / 2)
+    p_values: Doubles = gammaincc(_FREEDOM / 2, statistic / 2)
     return p_values
 
 
-def primary_sets(image: NDArray[np.uint8]) -> float:
+def primary_sets(image: Bytes) -> float:
     """Embedding rate in the red channel of [H, W, 3], from horizontal pairs; unbounded.
 
     NaN if the equation has no real root: rare for clean photos, usual for full payloads.
@@ -70,7 +72,7 @@ def primary_sets(image: NDArray[np.uint8]) -> float:
         return float((-b - np.sqrt(discriminant)) / (2 * a))
 
 
-def sample_pairs(image: NDArray[np.uint8]) -> float | None:
+def sample_pairs(image: Bytes) -> float | None:
     """Mean embedding rate over the channels of [H, W, 3], from horizontal and vertical pairs; unbounded.
 
     None if width or height is odd, for which the original program fails.
@@ -102,7 +104,7 @@ def _equation(pairs: int, y: int, z: int, w: int) -> tuple[Number, Number, Numbe
     return a, b, c, b * b - 4 * a * c
 
 
-def _horizontal_pairs(plane: NDArray[np.uint8]) -> NDArray[np.int64]:
+def _horizontal_pairs(plane: Bytes) -> Integers:
     """[5] counts over the disjoint pairs (0, 1), (2, 3), ... in each row of [H, W], by kind.
 
     All; y: u > v for even v, u < v for odd v; z: u = v; w: u and v differ only in the last bit; and w of
@@ -115,7 +117,7 @@ def _horizontal_pairs(plane: NDArray[np.uint8]) -> NDArray[np.int64]:
     return np.array([u.size, *map(np.count_nonzero, kinds)])
 
 
-def rs(image: NDArray[np.uint8]) -> float:
+def rs(image: Bytes) -> float:
     """Embedding rate in [H, W, 3], the mean over channels and over overlapping and disjoint 2x2 blocks.
 
     Unbounded; NaN for images without a block.
@@ -127,7 +129,7 @@ def rs(image: NDArray[np.uint8]) -> float:
     return float((rates[0].sum() / 3 + rates[1].sum() / 3) / 2)
 
 
-def _count_image(plane: NDArray[np.uint8]) -> NDArray[np.int64]:
+def _count_image(plane: Bytes) -> Integers:
     """[2, 2, 2, 2]: of overlapping and of disjoint blocks, the `Counts` of the image and of its flip."""
     counts = np.zeros((2, 2, 2, 2), dtype=np.int64)
     for start in range(0, plane.shape[0] - 1, _ROWS):
@@ -137,7 +139,7 @@ def _count_image(plane: NDArray[np.uint8]) -> NDArray[np.int64]:
     return counts
 
 
-def _count_strip(pixels: Plane) -> NDArray[np.int64]:
+def _count_strip(pixels: Plane) -> Integers:
     """[2, 2, 2]: of overlapping and of disjoint blocks, the `Counts`."""
     counts = np.zeros((2, 2, 2), dtype=np.int64)
     across, down = np.abs(pixels[:, :-1] - pixels[:, 1:]), np.abs(pixels[:-1] - pixels[1:])

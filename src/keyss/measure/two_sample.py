@@ -10,14 +10,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from statistics import fmean
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from keyss.core import SH_C0, Gaussians, UsageError, import_extra
-from keyss.core.arrays import Floats
+from keyss.core.arrays import Doubles, Flags, Floats, Integers, Numbers
 from keyss.files.ply_rows import OPACITY_LOGIT_BOUND
 from keyss.measure.auc import Auc, delong
 
@@ -25,8 +23,6 @@ MIN_GAUSSIANS, MAX_GAUSSIANS = 100, 10_000  # of each model
 FOLDS = 5
 _CELLS = 8  # along each axis
 _TREES, _LEAVES = 50, 16
-
-Ints = npt.NDArray[np.intp]
 
 
 @dataclass(frozen=True)
@@ -116,24 +112,21 @@ def features(gaussians: Gaussians, *, limit: int | None = None, seed: int = 0) -
     return {name: values.astype(np.float32) for name, values in columns.items()}
 
 
-def space_cells(positions: npt.NDArray[np.floating[Any]], per_axis: int) -> npt.NDArray[np.intp]:
+def space_cells(positions: Numbers, per_axis: int) -> Integers:
     """[N] index of the cell of each position [N, 3]; cells lie between quantiles of the coordinates."""
     cuts = np.quantile(positions, np.arange(1, per_axis) / per_axis, axis=0)
     index = [np.searchsorted(cuts[:, axis], positions[:, axis]) for axis in range(3)]
-    cells: npt.NDArray[np.intp] = np.ravel_multi_index(index, (per_axis,) * 3)
-    return cells
+    return np.ravel_multi_index(index, (per_axis,) * 3)
 
 
-def _folds(positions: npt.NDArray[np.float32], seed: int) -> Ints:
+def _folds(positions: Floats, seed: int) -> Integers:
     """[N] the fold of each Gaussian; each cell of space has a random one."""
     _, cell = np.unique(space_cells(positions, _CELLS), return_inverse=True)
-    folds: Ints = np.random.default_rng(seed).permutation(cell.max() + 1)[cell] % FOLDS
+    folds: Integers = np.random.default_rng(seed).permutation(cell.max() + 1)[cell] % FOLDS
     return folds
 
 
-def _held_out(
-    values: npt.NDArray[np.float32], is_b: npt.NDArray[np.bool_], held_out: npt.NDArray[np.bool_], seed: int
-) -> tuple[float, float]:
+def _held_out(values: Floats, is_b: Flags, held_out: Flags, seed: int) -> tuple[float, float]:
     """AUC on held-out Gaussians of trees trained on the others, and its variance."""
     ensemble = import_extra("sklearn.ensemble", "audit", "train classifiers")
     threadpoolctl = import_extra("threadpoolctl", "audit", "train classifiers")
@@ -146,7 +139,7 @@ def _held_out(
     return delong(scores[~is_b[held_out]], scores[is_b[held_out]])
 
 
-def _elongation(quats: Floats, log_scales: Floats) -> npt.NDArray[np.float64]:
+def _elongation(quats: Floats, log_scales: Floats) -> Doubles:
     """[N, 6] direction and amount of each Gaussian's elongation: see `features`."""
     xyzw = quats[:, [1, 2, 3, 0]].astype(np.float64)
     xyzw[~xyzw.any(axis=1), 3] = 1  # a zero quaternion means no rotation
@@ -155,5 +148,5 @@ def _elongation(quats: Floats, log_scales: Floats) -> npt.NDArray[np.float64]:
     lengths -= lengths.mean(axis=1, keepdims=True)
     tensors = np.einsum("nij,nj,nkj->nik", axes, lengths, axes)
     i, j = np.triu_indices(3)
-    entries: npt.NDArray[np.float64] = tensors[:, i, j] * np.where(i == j, 1, np.sqrt(2))
+    entries: Doubles = tensors[:, i, j] * np.where(i == j, 1, np.sqrt(2))
     return entries

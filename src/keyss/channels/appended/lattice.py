@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from keyss.core.arrays import Bits, Doubles, Flags, Integers, Words
+from keyss.core.arrays import Bits, Doubles, Flags, Integers, Words, doubles
 from keyss.core.gaussians import DRAWN_OPACITY, Gaussians
 from keyss.core.similarity import Similarity
 
@@ -56,7 +56,7 @@ def is_appended(model: Gaussians) -> Tensor:
 
 def own_frame(model: Gaussians) -> Similarity:
     """From the own frame to the world: its unit cube becomes as large as most of the model."""
-    means = model.means.detach().cpu().double().numpy()
+    means = doubles(model.means)
     means = means[np.isfinite(means).all(axis=1)]
     low, high = np.quantile(means, [0.05, 0.95], axis=0) if len(means) else np.zeros((2, 3))
     size = float((high - low).max())
@@ -83,13 +83,13 @@ def to_gaussians(words: Bits, to_world: Similarity, sh_degree: int) -> Gaussians
 
 def colours_of(model: Gaussians) -> Integers:
     """[N, 3] the nearest lattice points of colours."""
-    colours = model.sh[:, 0].detach().cpu().double().numpy()
+    colours = doubles(model.sh[:, 0])
     return _nearest(colours / _COLOUR_STEP + 2 ** (COLOUR_BITS - 1) - 0.5, COLOUR_BITS)
 
 
 def scale_steps(model: Gaussians) -> Doubles:
     """[N, 3] log scales in steps of their lattice, which lies anywhere: see `likely_shifts`."""
-    return model.log_scales.detach().cpu().double().numpy() / _SCALE_STEP
+    return doubles(model.log_scales) / _SCALE_STEP
 
 
 def scales_at(steps: Doubles, shift: float) -> Integers:

@@ -23,7 +23,7 @@ from keyss.channels.colours.carriers import CELL, Carriers, Numbers
 from keyss.channels.colours.header import SHARES, UNNOTICED, Kind, bucket_bytes
 from keyss.channels.colours.lattice import COLUMNS, LEVELS, MAX_BITS, SPACING, bit_counts
 from keyss.channels.colours.likeness import Likeness
-from keyss.core.arrays import Doubles, Flags, Floats, Integers
+from keyss.core.arrays import Doubles, Flags, Floats, Integers, doubles
 from keyss.core.gaussians import Gaussians
 from keyss.keys.encryption import OVERHEAD
 from keyss.rendering.difference import psnr_between
@@ -156,7 +156,7 @@ class Capacity:
     @cached_property
     def likeness(self) -> Likeness:
         """The likeness of the C carriers, for changes as writing makes them."""
-        means = self.model.means.detach().cpu().double().numpy()[self.numbers.rows]
+        means = doubles(self.model.means)[self.numbers.rows]
         return Likeness.of(self.numbers.colours, np.nan_to_num(means).clip(-1e15, 1e15), self._example)
 
     @cached_property

@@ -27,10 +27,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
-from torch import Tensor
 
 from keyss.channels.mixing import encrypted_blocks, row_hashes
-from keyss.core.arrays import Doubles, Flags, Integers, Words
+from keyss.core.arrays import Doubles, Flags, Integers, Words, doubles
 from keyss.core.gaussians import Gaussians
 from keyss.keys.derivation import SALT_BYTES, expand
 
@@ -71,8 +70,8 @@ class Numbers:
     @staticmethod
     def of(model: Gaussians) -> Numbers:
         """The visible and finite Gaussians."""
-        log_scales, colours = _doubles(model.log_scales), _doubles(model.sh[:, 0])
-        opacities = _doubles(model.opacities)
+        log_scales, colours = doubles(model.log_scales), doubles(model.sh[:, 0])
+        opacities = doubles(model.opacities)
         fine = np.isfinite(log_scales).all(axis=1) & np.isfinite(colours).all(axis=1)
         rows = np.flatnonzero(fine & (opacities > _MIN_OPACITY))
         return Numbers(rows, log_scales[rows], opacities[rows], colours[rows])
@@ -169,10 +168,6 @@ def _cells(values: Doubles, steps: int, noise: float) -> tuple[Names, Doubles]:
     nearest = np.minimum(inside, steps - inside)
     doubt = ((noise - nearest) / (2 * noise)).clip(0, 0.5)
     return cells.clip(-_CELLS, _CELLS).astype(np.int16), doubt
-
-
-def _doubles(values: Tensor) -> Doubles:
-    return values.detach().cpu().numpy().astype(np.float64)
 
 
 @dataclass(frozen=True)

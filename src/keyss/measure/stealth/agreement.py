@@ -17,16 +17,12 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from keyss.channels import usable_carriers
+from keyss.core.arrays import Doubles, Flags, Integers, Words32, doubles
 from keyss.core.gaussians import Gaussians
 from keyss.measure.stealth.statistic import (
     ATTRIBUTES,
-    Bits,
-    Flags,
-    Floats,
-    Ints,
+    BitPatterns,
     Statistic,
-    Words,
-    doubles,
     excess,
     more_than_smooth,
     portion,
@@ -46,7 +42,7 @@ _NEAREST = 16
 _SATURATED = 16.0  # logit
 
 
-def agreement(model: Gaussians, words: Words) -> dict[str, Statistic]:
+def agreement(model: Gaussians, words: BitPatterns) -> dict[str, Statistic]:
     """Shares of pairs with close low bits among those with equal high bits, and of pairs slightly apart.
 
     The exact null of the first is independent low bits. Pairs slightly apart beyond a smooth density were
@@ -68,7 +64,7 @@ def agreement(model: Gaussians, words: Words) -> dict[str, Statistic]:
     return statistics
 
 
-def _of_pairs(one: Bits, other: Bits) -> dict[str, Statistic]:
+def _of_pairs(one: Words32, other: Words32) -> dict[str, Statistic]:
     apart = ulps(one, other)
     same_high = (one >> _LOW) == (other >> _LOW)
     equal = apart == 0
@@ -84,14 +80,14 @@ def _of_pairs(one: Bits, other: Bits) -> dict[str, Statistic]:
     }
 
 
-def _misses(apart: Ints) -> Statistic:
+def _misses(apart: Integers) -> Statistic:
     """Unequal pairs less than _MOVED apart, beyond the number expected from pairs further apart."""
     inside = int(((apart > 0) & (apart < _MOVED)).sum())
     around = int(((apart >= _MOVED) & (apart < _AROUND)).sum())
     return more_than_smooth(inside, max(around, 1) * _MOVED / (_AROUND - _MOVED), len(apart))
 
 
-def _within(words: Words, attributes: tuple[int, ...]) -> Iterator[tuple[Bits, Bits]]:
+def _within(words: BitPatterns, attributes: tuple[int, ...]) -> Iterator[tuple[Words32, Words32]]:
     """Pairs of numbers of one Gaussian, within a coefficient's channels or an attribute, without signs."""
     for attribute in attributes:
         own = words.bits[:, words.of_attribute(attribute)] & np.uint32(0x7FFFFFFF)
@@ -104,7 +100,7 @@ def _within(words: Words, attributes: tuple[int, ...]) -> Iterator[tuple[Bits, B
                 yield groups[:, :, first].ravel(), groups[:, :, second].ravel()
 
 
-def nearest_pairs(positions: Floats, neighbours: int) -> Ints:
+def nearest_pairs(positions: Doubles, neighbours: int) -> Integers:
     """[P, 2] each Gaussian and its nearest `neighbours`, every pair once."""
     count = min(neighbours + 1, len(positions))
     _, near = cKDTree(positions).query(positions, k=count)
@@ -114,7 +110,7 @@ def nearest_pairs(positions: Floats, neighbours: int) -> Ints:
     return np.unique(pairs, axis=0)
 
 
-def _sharers(words: Words) -> Ints:
+def _sharers(words: BitPatterns) -> Integers:
     """[P, 2] Gaussians with an equal number in a field, adjacent in the order of that field."""
     pairs = [np.zeros((0, 2), np.int64)]
     for field in range(3, words.bits.shape[1]):
@@ -126,7 +122,7 @@ def _sharers(words: Words) -> Ints:
     return np.unique(np.sort(np.concatenate(pairs), axis=1), axis=0)
 
 
-def coincidences(model: Gaussians, words: Words) -> dict[str, Statistic]:
+def coincidences(model: Gaussians, words: BitPatterns) -> dict[str, Statistic]:
     """Equal low bits among pairs with equal high bits, over those expected by chance."""
     return {
         name: excess(equal, pairs, 2.0**-bits)
@@ -134,7 +130,7 @@ def coincidences(model: Gaussians, words: Words) -> dict[str, Statistic]:
     }
 
 
-def count_coincidences(model: Gaussians, words: Words) -> dict[str, tuple[int, int, int]]:
+def count_coincidences(model: Gaussians, words: BitPatterns) -> dict[str, tuple[int, int, int]]:
     """By name: pairs with equal low bits, pairs with equal high bits, and the number of low bits.
 
     Of all pairs and of neighbours in space, with a usable Gaussian; then of neighbours that are saturated,
@@ -162,7 +158,7 @@ def count_coincidences(model: Gaussians, words: Words) -> dict[str, tuple[int, i
     return counts
 
 
-def _columns(words: Words) -> Iterator[tuple[str, int, int]]:
+def _columns(words: BitPatterns) -> Iterator[tuple[str, int, int]]:
     """Name, number and written bits of each column; the harmonics of a channel have one name."""
     for index, attribute in enumerate(ATTRIBUTES):
         if attribute in _WRITTEN:
@@ -171,7 +167,7 @@ def _columns(words: Words) -> Iterator[tuple[str, int, int]]:
                 yield name, int(column), _WRITTEN[attribute]
 
 
-def _agreeing(kept: np.ndarray) -> Ints:
+def _agreeing(kept: np.ndarray) -> Integers:
     """[P, 2] rows whose `kept` bits [N] agree, near each other in the order of these."""
     order = np.argsort(kept, kind="stable")
     pairs = [np.zeros((0, 2), np.int64)]

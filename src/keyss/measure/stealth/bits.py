@@ -1,4 +1,4 @@
-"""Bits of mantissas that are not random, given everything else that an attacker sees.
+"""Words32 of mantissas that are not random, given everything else that an attacker sees.
 
 By attribute, magnitude and position of the bit; given the bit below; and numbers that contradict themselves:
 training that leaves a zero in the last bit leaves zeros above it too, embedding does not.
@@ -8,16 +8,15 @@ from __future__ import annotations
 
 import numpy as np
 
+from keyss.core.arrays import Flags, Words32
 from keyss.core.gaussians import Gaussians
 from keyss.measure.stealth.statistic import (
     ATTRIBUTES,
     MAGNITUDES,
     MANTISSA,
     NOTHING,
-    Bits,
-    Flags,
+    BitPatterns,
     Statistic,
-    Words,
     dispersion,
     normal,
     share,
@@ -29,7 +28,7 @@ _HARMONICS = ATTRIBUTES.index("sh1")
 _MIN_COUNT = 64  # numbers of a stratum
 
 
-def bits(model: Gaussians, words: Words) -> dict[str, Statistic]:
+def bits(model: Gaussians, words: BitPatterns) -> dict[str, Statistic]:
     """Statistics of single numbers, by attribute and magnitude; nulls are exact: fair, independent bits."""
     statistics: dict[str, Statistic] = {}
     for index, attribute in enumerate(ATTRIBUTES):
@@ -50,7 +49,7 @@ def bits(model: Gaussians, words: Words) -> dict[str, Statistic]:
     return statistics | _beside_tiny(words)
 
 
-def _of_values(values: Bits) -> dict[str, Statistic]:
+def _of_values(values: Words32) -> dict[str, Statistic]:
     """Shares of ones, of trailing zeros, and of zeros in bits 1 to 3 above a zero against above a one."""
     statistics = {}
     for name, (low, high) in RANGES.items():
@@ -75,7 +74,7 @@ def _difference(one: Flags, other: Flags, expected: float) -> Statistic:
     return normal(float(one.mean() - other.mean()), error)
 
 
-def _strata(values: Bits) -> Statistic:
+def _strata(values: Words32) -> Statistic:
     """Chi-square of the ones by exponent, position of the bit and the bit below."""
     total, degrees = 0.0, 0
     exponent = (values >> MANTISSA & 255).astype(np.int64)
@@ -89,7 +88,7 @@ def _strata(values: Bits) -> Statistic:
     return dispersion(total, degrees)
 
 
-def _bytes(values: Bits) -> Statistic:
+def _bytes(values: Words32) -> Statistic:
     """Chi-square of the bytes from bit 1 and from bit 5 on."""
     if len(values) < 1024:
         return NOTHING
@@ -100,7 +99,7 @@ def _bytes(values: Bits) -> Statistic:
     return dispersion(total, 2 * 255)
 
 
-def _together(values: Bits, chosen: Flags) -> Statistic:
+def _together(values: Words32, chosen: Flags) -> Statistic:
     """Variance over Gaussians of the number of small harmonics with three zeros above the last bit."""
     zeros = ((values & np.uint32(14) == 0) & chosen).sum(axis=1)
     trials = chosen.sum(axis=1)
@@ -114,7 +113,7 @@ def _together(values: Bits, chosen: Flags) -> Statistic:
     return normal(float(z2.mean() - 1), error)
 
 
-def _beside_tiny(words: Words) -> dict[str, Statistic]:
+def _beside_tiny(words: BitPatterns) -> dict[str, Statistic]:
     """Ones in the harmonics of Gaussians with a tiny harmonic, and of the others."""
     harmonics = words.attribute >= _HARMONICS
     tiny = (words.trained & (words.exponent < MAGNITUDES["tiny"][1]))[:, harmonics].any(axis=1)

@@ -13,8 +13,9 @@ import numpy as np
 from scipy.signal import find_peaks
 from scipy.spatial import cKDTree
 
+from keyss.core.arrays import Doubles, Integers, doubles
 from keyss.core.gaussians import Gaussians
-from keyss.measure.stealth.statistic import Floats, Ints, Statistic, Words, doubles, portion
+from keyss.measure.stealth.statistic import BitPatterns, Statistic, portion
 
 _QUANTILES = (0.05, 0.1, 0.25, 0.5, 0.9)
 _CHANNELS = {"green": 1, "blue": 2}
@@ -38,7 +39,7 @@ _MIN_GAUSSIANS = 30  # of a mode
 _DIP = 0.5  # of the lower of two modes: the density must fall to this between them
 
 
-def colours(model: Gaussians, words: Words) -> dict[str, Statistic]:
+def colours(model: Gaussians, words: BitPatterns) -> dict[str, Statistic]:
     """Logarithms of ratios of differences; 0 if green or blue vary as red does."""
     values = np.nan_to_num(doubles(model.sh[:, 0]))
     statistics: dict[str, Statistic] = {}
@@ -74,19 +75,19 @@ def colours(model: Gaussians, words: Words) -> dict[str, Statistic]:
 _BETWEEN = (("red", "green", 0, 1), ("red", "blue", 0, 2), ("green", "blue", 1, 2))
 
 
-def _parts(model: Gaussians) -> Iterator[tuple[str, Ints]]:
+def _parts(model: Gaussians) -> Iterator[tuple[str, Integers]]:
     """Quarters of the rows by the visibility of a colour change: area times squared opacity."""
     scales = model.log_scales.detach().cpu().double().sort(dim=1).values[:, 1:].sum(dim=1)
     shown = (scales + 2 * model.opacities.detach().cpu().double().clamp_min(1e-6).log()).numpy()
     yield from zip(_PARTS, np.array_split(np.argsort(-np.nan_to_num(shown), kind="stable"), 4), strict=True)
 
 
-def _ratio(one: Floats, other: Floats, quantile: float) -> Statistic:
+def _ratio(one: Doubles, other: Doubles, quantile: float) -> Statistic:
     first, second = np.quantile(one, quantile), np.quantile(other, quantile)
     return Statistic(float(np.log((first + _TINY) / (second + _TINY))))
 
 
-def opacities(model: Gaussians, words: Words) -> dict[str, Statistic]:
+def opacities(model: Gaussians, words: BitPatterns) -> dict[str, Statistic]:
     """Shares by opacity, and differences between faint Gaussians and the others."""
     logits = doubles(model.opacity_logits)
     statistics = {
@@ -110,7 +111,7 @@ def invisible_modes(model: Gaussians) -> list[float]:
     return _modes(logits[logits < INVISIBLE])
 
 
-def _modes(logits: Floats) -> list[float]:
+def _modes(logits: Doubles) -> list[float]:
     """Separate peaks of the density of opacity logits [N]."""
     if len(logits) < _MIN_GAUSSIANS:
         return []
@@ -127,7 +128,7 @@ def _modes(logits: Floats) -> list[float]:
     return [float(edges[at - 1] + _STEP / 2) for at in peaks[separate]]
 
 
-def _shapes(model: Gaussians) -> dict[str, Floats]:
+def _shapes(model: Gaussians) -> dict[str, Doubles]:
     scales = doubles(model.log_scales)
     ordered = np.sort(scales, axis=1)
     lengths = model.quats.detach().cpu().double().norm(dim=1).numpy()

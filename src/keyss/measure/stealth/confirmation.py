@@ -8,13 +8,13 @@ hold something else.
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial import cKDTree
 from scipy.stats import ks_2samp, spearmanr
 
+from keyss.core.arrays import Doubles, Numbers, doubles
 from keyss.core.gaussians import Gaussians
 from keyss.measure.stealth.colours import INVISIBLE
-from keyss.measure.stealth.statistic import Floats, Words, doubles
+from keyss.measure.stealth.statistic import BitPatterns
 
 MAX_GAUSSIANS = 20_000  # of each model
 _QUERIES = 4000  # rows whose nearest ones are searched
@@ -46,9 +46,9 @@ def candidate_scores(file: Gaussians, candidate: Gaussians) -> dict[str, float]:
 def changed_low_bits(file: Gaussians, other: Gaussians) -> float:
     """Share of the Gaussians that `other` has too, but with other low bits."""
     own, theirs = (_high_rows(each, slice(None)) for each in (file, other))
-    whole = [{row.tobytes() for row in Words.of(each).bits} for each in (file, other)]
+    whole = [{row.tobytes() for row in BitPatterns.of(each).bits} for each in (file, other)]
     shared = np.isin(own, theirs)
-    rows = Words.of(file).bits[shared]
+    rows = BitPatterns.of(file).bits[shared]
     same = sum(row.tobytes() in whole[1] for row in rows)
     return float((len(rows) - same) / max(len(file), 1))
 
@@ -69,7 +69,7 @@ def _parts(file: Gaussians) -> dict[str, Gaussians]:
     return {name: part if len(part) >= _MIN_COUNT else file for name, part in parts.items()}
 
 
-def _energies(model: Gaussians) -> Floats:
+def _energies(model: Gaussians) -> Doubles:
     """[N, 3 degree] logarithms of the energy of each band and channel, invariant to rotation."""
     columns = [
         model.sh[:, band**2 : (band + 1) ** 2].detach().cpu().double().square().sum(1)
@@ -78,7 +78,7 @@ def _energies(model: Gaussians) -> Floats:
     return np.log(np.concatenate([each.numpy() for each in columns], axis=1) + 1e-12)
 
 
-def _by_rows(own: Floats, theirs: Floats) -> dict[str, float]:
+def _by_rows(own: Doubles, theirs: Doubles) -> dict[str, float]:
     """Nearest rows: the share that matches, distances of the best, and correlation of their order."""
     count = min(len(own), len(theirs))
     at_ends = max(
@@ -101,15 +101,15 @@ def _by_rows(own: Floats, theirs: Floats) -> dict[str, float]:
     }
 
 
-def _correlation(one: npt.NDArray[np.generic], other: npt.NDArray[np.generic]) -> float:
+def _correlation(one: Numbers, other: Numbers) -> float:
     if len(one) < _MIN_COUNT or len(np.unique(one)) < 2 or len(np.unique(other)) < 2:
         return 0.0
     return float(np.nan_to_num(spearmanr(one, other).statistic))
 
 
-def _high_rows(model: Gaussians, columns: slice) -> npt.NDArray[np.void]:
+def _high_rows(model: Gaussians, columns: slice) -> Numbers:
     """[N] the high bits of each row as one value."""
-    high = np.ascontiguousarray(Words.of(model).bits[:, columns] >> _LOW)
+    high = np.ascontiguousarray(BitPatterns.of(model).bits[:, columns] >> _LOW)
     return high.view(f"V{4 * high.shape[1]}")[:, 0]
 
 
@@ -123,7 +123,7 @@ def _identity(file: Gaussians, candidate: Gaussians) -> float:
     return max(shares)
 
 
-def _marginals(model: Gaussians) -> dict[str, Floats]:
+def _marginals(model: Gaussians) -> dict[str, Doubles]:
     """Quantities that do not depend on the frame: shapes, energies, colours."""
     scales = np.sort(doubles(model.log_scales), axis=1)
     marginals = {
@@ -137,12 +137,12 @@ def _marginals(model: Gaussians) -> dict[str, Floats]:
     return marginals
 
 
-def _extent(model: Gaussians) -> Floats:
+def _extent(model: Gaussians) -> Doubles:
     """[2] ratios of the standard deviations along the principal axes, invariant to similarities."""
     means = doubles(model.means)
     middle = means[
         np.linalg.norm(means - np.median(means, axis=0), axis=1).argsort()[: int(0.9 * len(means)) + 2]
     ]
     values = np.sqrt(np.linalg.eigvalsh(np.cov(middle.T)).clip(1e-12))
-    ratios: Floats = values[:2] / values[2]
+    ratios: Doubles = values[:2] / values[2]
     return ratios

@@ -11,14 +11,12 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.stats import ks_2samp, rankdata
 
+from keyss.core.arrays import Doubles, Words32, doubles
 from keyss.core.gaussians import Gaussians
 from keyss.measure.stealth.statistic import (
     ATTRIBUTES,
-    Bits,
-    Floats,
+    BitPatterns,
     Statistic,
-    Words,
-    doubles,
     excess,
     more_than_smooth,
     normal,
@@ -37,7 +35,7 @@ _KS_SPREAD = 0.2603  # standard deviation of Kolmogorov's distribution
 _NEAR = 1e-5  # of the model's size
 
 
-def invariants(model: Gaussians, words: Words) -> dict[str, Statistic]:
+def invariants(model: Gaussians, words: BitPatterns) -> dict[str, Statistic]:
     """Unit quaternions in the whole file and in parts of it, repeated values, clusters, short numbers."""
     statistics = _lengths(model)
     for index, attribute in enumerate(ATTRIBUTES):
@@ -82,13 +80,13 @@ def _lengths(model: Gaussians) -> dict[str, Statistic]:
     return statistics
 
 
-def _repeated(values: Bits) -> int:
+def _repeated(values: Words32) -> int:
     """Number of values that are not unique."""
     _, counts = np.unique(values, return_counts=True)
     return int(counts[counts > 1].sum())
 
 
-def _clusters(values: Floats) -> tuple[int, int]:
+def _clusters(values: Doubles) -> tuple[int, int]:
     """Number of gaps between sorted values that are far smaller than their neighbours, and of all gaps.
 
     For a smooth density, gaps over their mean are exponential: one in a hundred is below 0.01.
@@ -103,7 +101,7 @@ def _clusters(values: Floats) -> tuple[int, int]:
     return int((gaps < _CLUSTERED * around).sum()), len(gaps)
 
 
-def order(model: Gaussians, words: Words) -> dict[str, Statistic]:
+def order(model: Gaussians, words: BitPatterns) -> dict[str, Statistic]:
     """Correlations of the content of rows with their number, and halves against each other; null: any order.
 
     Plain models have an order too, given by density control: compared with controls, a shuffled file is as
@@ -131,7 +129,7 @@ def order(model: Gaussians, words: Words) -> dict[str, Statistic]:
     return statistics
 
 
-def _columns(model: Gaussians) -> dict[str, Floats]:
+def _columns(model: Gaussians) -> dict[str, Doubles]:
     """[N] the content of each Gaussian by name."""
     positions = model.means.detach().cpu().double()
     contents = {f"position {axis}": positions[:, index] for index, axis in enumerate("xyz")}

@@ -14,10 +14,10 @@ from keyss.measure.stealth.bits import bits
 from keyss.measure.stealth.colours import colours, invisible_modes, opacities
 from keyss.measure.stealth.confirmation import candidate_scores, changed_low_bits
 from keyss.measure.stealth.invariants import invariants, order
-from keyss.measure.stealth.statistic import Statistic, Words
+from keyss.measure.stealth.statistic import BitPatterns, Statistic
 
 # Detectors by kind: functions of a model and its bit patterns that give statistics by name.
-KINDS: dict[str, Callable[[Gaussians, Words], dict[str, Statistic]]] = {
+KINDS: dict[str, Callable[[Gaussians, BitPatterns], dict[str, Statistic]]] = {
     "bits": bits,
     "agreement": agreement,
     "coincidences": coincidences,
@@ -67,7 +67,7 @@ def stealth_statistics(model: Gaussians) -> dict[str, Statistic]:
 
     Takes half a second for 10,000 Gaussians.
     """
-    words = Words.of(model)
+    words = BitPatterns.of(model)
     return {
         f"{kind}: {name}": statistic
         for kind, detect in KINDS.items()

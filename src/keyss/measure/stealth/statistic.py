@@ -7,10 +7,9 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-import numpy.typing as npt
 from scipy.special import bdtrc, chdtrc, ndtr, pdtrc
-from torch import Tensor
 
+from keyss.core.arrays import Flags, Integers, Words32
 from keyss.core.gaussians import Gaussians
 
 ATTRIBUTES = ("position", "scale", "rotation", "opacity", "colour", "sh1", "sh2", "sh3")
@@ -20,29 +19,24 @@ MAGNITUDES = {"tiny": (-126, -15), "small": (-15, -13), "middling": (-13, -9), "
 # A number that ends in this many zeros was not trained; embedding does not change it.
 _SHORT = np.uint32((1 << 20) - 1)
 
-Floats = npt.NDArray[np.float64]
-Bits = npt.NDArray[np.uint32]
-Ints = npt.NDArray[np.int64]
-Flags = npt.NDArray[np.bool_]
-
 
 @dataclass(frozen=True)
-class Words:
+class BitPatterns:
     """The floats of N Gaussians as bit patterns, F to each."""
 
-    bits: Bits  # [N, F]
-    attribute: Ints  # [F] index into ATTRIBUTES
+    bits: Words32  # [N, F]
+    attribute: Integers  # [F] index into ATTRIBUTES
 
     @staticmethod
-    def of(model: Gaussians) -> Words:
+    def of(model: Gaussians) -> BitPatterns:
         fields = [model.means, model.log_scales, model.quats, model.opacity_logits[:, None]]
         fields += [model.sh[:, band**2 : (band + 1) ** 2].flatten(1) for band in range(model.sh_degree + 1)]
         parts = [each.detach().cpu().float().contiguous().numpy().view(np.uint32) for each in fields]
         attribute = np.repeat(np.arange(len(parts)), [part.shape[1] for part in parts])
-        return Words(np.concatenate(parts, axis=1), attribute)
+        return BitPatterns(np.concatenate(parts, axis=1), attribute)
 
     @cached_property
-    def exponent(self) -> Ints:
+    def exponent(self) -> Integers:
         """[N, F] binary exponents, -127 for zero."""
         return (self.bits >> MANTISSA & 255).astype(np.int64) - 127
 
@@ -58,13 +52,7 @@ class Words:
         return slice(int(columns[0]), int(columns[-1]) + 1) if len(columns) else slice(0, 0)
 
 
-def doubles(values: Tensor) -> Floats:
-    """A tensor as float64 on the CPU."""
-    result: Floats = values.detach().cpu().double().numpy()
-    return result
-
-
-def ulps(one: Bits, other: Bits) -> Ints:
+def ulps(one: Words32, other: Words32) -> Integers:
     """Steps of the last bit between numbers; 2^31 if their signs differ."""
     a, b = (each & 0x7FFFFFFF for each in (one, other))
     apart = np.abs(a.astype(np.int64) - b.astype(np.int64))
