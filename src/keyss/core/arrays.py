@@ -24,5 +24,4 @@ Numbers = npt.NDArray[Any]  # of any kind
 
 def doubles(values: Tensor) -> Doubles:
     """A tensor on any device as an array of its shape."""
-    found: Doubles = values.detach().cpu().double().numpy()
-    return found
+    return values.detach().cpu().double().numpy()

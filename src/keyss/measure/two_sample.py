@@ -122,8 +122,7 @@ def space_cells(positions: Numbers, per_axis: int) -> Integers:
 def _folds(positions: Floats, seed: int) -> Integers:
     """[N] the fold of each Gaussian; each cell of space has a random one."""
     _, cell = np.unique(space_cells(positions, _CELLS), return_inverse=True)
-    folds: Integers = np.random.default_rng(seed).permutation(cell.max() + 1)[cell] % FOLDS
-    return folds
+    return np.random.default_rng(seed).permutation(cell.max() + 1)[cell] % FOLDS
 
 
 def _held_out(values: Floats, is_b: Flags, held_out: Flags, seed: int) -> tuple[float, float]:

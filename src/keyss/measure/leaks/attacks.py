@@ -149,8 +149,7 @@ def search_embeddings(
 
     def exchanged(direction: Tensor) -> Tensor:
         change = decode(part, F.normalize(direction, dim=0)).opacities - part.opacities
-        score: Tensor = change.abs().mean() - balance * change.mean().abs()
-        return score
+        return change.abs().mean() - balance * change.mean().abs()
 
     starts = random_embeddings(restarts, generator)
     if not exchanged(starts[0].to(stego.device).requires_grad_()).requires_grad:
@@ -233,8 +232,7 @@ def _quaternion_length(model: Gaussians) -> Tensor:
 
 def _sh_energy(model: Gaussians) -> Tensor:
     """[N] natural logarithm of the sum of squares of the harmonics above the constant one."""
-    energy: Tensor = model.sh[:, 1:].square().sum((1, 2)).clamp_min(_MIN_LENGTH).log()
-    return energy
+    return model.sh[:, 1:].square().sum((1, 2)).clamp_min(_MIN_LENGTH).log()
 
 
 ATTRIBUTES: dict[str, Callable[[Gaussians], Tensor]] = {
