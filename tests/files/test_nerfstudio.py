@@ -138,7 +138,7 @@ def test_a_split_holds_for_the_photos_that_are_left(tmp_path: Path) -> None:
         ({"frames": None}, "missing required field `frames`"),
         ({"frames": [1]}, r"Expected `object`, got `int` - at `\$\.frames\[0\]`"),
         ({"ply_file_path": 3}, r"Expected `str.*`, got `int` - at `\$\.ply_file_path`"),
-        ({"ply_file_path": "none.ply"}, "none.ply: expected a file, but there is no such file"),
+        ({"ply_file_path": "none.ply"}, "none.ply: expected a file, found nothing"),
     ],
 )
 def test_what_is_wrong_is_named(tmp_path: Path, extra: dict[str, object], message: str) -> None:

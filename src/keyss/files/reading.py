@@ -20,25 +20,21 @@ def open_input(path: Path) -> Iterator[BinaryIO]:
     """Open a regular file. Any OSError or InputError in the block becomes an InputError that names it."""
     try:
         if not path.is_file():  # opening a pipe could block for ever
-            raise InputError("expected a file, but there is no such file")
+            raise InputError(f"expected a file, found {'a folder' if path.is_dir() else 'nothing'}")
         with path.open("rb") as file:
             yield file
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
     except OSError as error:
-        raise InputError(f"cannot read {path}: {error.strerror or error}") from error
+        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
 
 
 def read_file(path: Path, limit: int | None = None) -> bytes:
     """The bytes of a regular file. Raises InputError if it is missing, unreadable or over `limit` bytes."""
-    try:
-        if not path.is_file():
-            raise InputError(f"{path}: expected a file, found {'a folder' if path.is_dir() else 'nothing'}")
+    with open_input(path) as file:
         if limit is not None and path.stat().st_size > limit:
-            raise InputError(f"{path}: expected at most {limit:,} bytes, found {path.stat().st_size:,}")
-        return path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+            raise InputError(f"expected at most {limit:,} bytes, found {path.stat().st_size:,}")
+        return file.read()
 
 
 def read_text(path: Path, limit: int | None = None) -> str:
@@ -56,8 +52,8 @@ def is_standard(path: Path | str) -> bool:
     return str(path) == STANDARD
 
 
-def read_standard_input(limit: int = MAX_BYTES) -> bytes:
-    """All of standard input. Raises InputError for a terminal and for more than `limit` bytes."""
+def read_standard_input() -> bytes:
+    """All of standard input. Raises InputError for a terminal and for more than MAX_BYTES."""
     stream = getattr(sys.stdin, "buffer", None)
     if stream is None or stream.isatty():
         state = "closed" if stream is None else "a terminal"
@@ -66,8 +62,8 @@ def read_standard_input(limit: int = MAX_BYTES) -> bytes:
     try:
         while part := stream.read(_CHUNK_BYTES):
             data += part
-            if len(data) > limit:
-                raise InputError(f"standard input: expected at most {limit:,} bytes, found more")
+            if len(data) > MAX_BYTES:
+                raise InputError(f"standard input: expected at most {MAX_BYTES:,} bytes, found more")
     except OSError as error:
         raise InputError(f"cannot read standard input: {error.strerror or error}") from error
     return bytes(data)

@@ -180,7 +180,8 @@ def csv_bytes(rows: Sequence[Row]) -> bytes:
     writer.writerow(["file", *DETECTORS, "fusion", "flagged", "secret_bytes"])
     for row in rows:
         scores = asdict(row.scores)
-        cells = [_spelled(scores[name]) for name in (*DETECTORS, "fusion")]
+        numbers = [scores[name] for name in (*DETECTORS, "fusion")]
+        cells = ["null" if each is None else "NaN" if math.isnan(each) else repr(each) for each in numbers]
         writer.writerow([row.file, *cells, str(row.flagged).lower(), row.secret_bytes])
     return text.getvalue().encode(errors="surrogateescape")  # file names may be any bytes
 
@@ -199,10 +200,6 @@ def _row(path: Path, threshold: float) -> Row:
     scores = score_image(read_pixels(path))
     fusion = next(iter(_present([scores.fusion])), 0.0)
     return Row(path.name, scores, fusion > threshold, math.floor(fusion * path.stat().st_size / 3 + 0.5))
-
-
-def _spelled(score: float | None) -> str:
-    return "null" if score is None else "NaN" if math.isnan(score) else repr(score)
 
 
 def _present(scores: Iterable[float | None]) -> list[float]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import msgspec
 import safetensors
@@ -54,7 +54,10 @@ def unpack_tensors(
         raise ValueError(f"format {found.format[:40]!r}")
     if found.version != version:
         raise InputError(f"secret of version {found.version}; this program reads version {version}")
-    header = msgspec.json.decode(text, type=kind, dec_hook=_tensor)
+    # The only fields with a type that msgspec does not know are those of a `Similarity`.
+    header = msgspec.json.decode(
+        text, type=kind, dec_hook=lambda _, numbers: torch.tensor(numbers, dtype=torch.float64)
+    )
     if _encoded(header) != text:
         raise ValueError("its header has more or other fields")
     if not all(value.isfinite().all() for value in tensors.values()):
@@ -64,11 +67,6 @@ def unpack_tensors(
 
 def _encoded(header: Header) -> bytes:
     return msgspec.json.encode(header, enc_hook=Tensor.tolist)
-
-
-def _tensor(kind: type, numbers: Any) -> Tensor:
-    """A field of a `Similarity` in a header."""
-    return torch.tensor(numbers, dtype=torch.float64)
 
 
 @contextmanager

@@ -151,9 +151,10 @@ class AppendedReader(SaltedReader):
     def extract(self, key: DerivedKey) -> Payload:
         """`open` after key derivation."""
         header = packets.read_header(key.expand("appended/header", 32), self.words)
-        codewords = None if header is None else _codewords_of(header)
-        if codewords is None:
+        count, k = divmod(header or 0, 1 << _DATA_BITS)
+        if not (0 < count <= _MAX_CODEWORDS and 0 < k <= _MAX_DATA):
             raise WrongKeyError()
+        codewords = _codewords(count, k)
         numbers, data = packets.read(key.expand("appended/packets", 32), self.words)
         encrypted = codewords.decode(numbers.astype(np.int64), data)
         return unpack_payload(decrypt(key.expand("appended/data", 32), encrypted, _ASSOCIATED))
@@ -166,12 +167,6 @@ def _codewords_for(size: int) -> Codewords:
     if count > _MAX_CODEWORDS:
         raise UsageError(f"the secret takes {size:,} bytes, and {MAX_BYTES:,} can be appended")
     return _codewords(count, -(-needed // count))
-
-
-def _codewords_of(header: int) -> Codewords | None:
-    """The codewords that a header tells; None for impossible ones."""
-    count, data = divmod(header, 1 << _DATA_BITS)
-    return _codewords(count, data) if 0 < count <= _MAX_CODEWORDS and 0 < data <= _MAX_DATA else None
 
 
 def _codewords(count: int, data: int) -> Codewords:

@@ -83,18 +83,16 @@ class Likeness:
         for index in range(_BATCHES):
             for column in (1, 2):
                 rows = np.flatnonzero((batch == index) & changed[:, column])
-                ratio = self._log_ratio(colours, rows, column, new[rows, column])
+                around = [pairs.around(rows) for pairs in self.pairs]
+                before, after = (
+                    _features(self.usual, colours, rows, column, values[rows, column], around)
+                    for values in (colours, new)
+                )
+                ratio = (after - before) @ self.weights[column - 1]  # log of p(new) / p(old)
                 fine = rows[np.log(random.uniform(1e-300, 1, len(rows))) < ratio]
                 colours[fine, column] = new[fine, column]
                 admitted[fine, column - 1] = True
         return admitted
-
-    def _log_ratio(self, colours: Doubles, rows: Integers, column: int, new: Doubles) -> Doubles:
-        """[R] logarithm of p(new) / p(old) of one number of each row, where all others stay."""
-        around = [pairs.around(rows) for pairs in self.pairs]
-        after = _features(self.usual, colours, rows, column, new, around)
-        before = _features(self.usual, colours, rows, column, colours[rows, column], around)
-        return (after - before) @ self.weights[column - 1]
 
 
 def _features(

@@ -62,8 +62,6 @@ def nearest(codebook: Floats, values: Floats) -> Bytes:
 
 def palette_of(vectors: Floats, size: int) -> tuple[Floats, Shorts]:
     """A palette [P, D] of at most `size` (up to 65,536) vectors for `vectors` [N, D], and labels [N]."""
-    from keyss.files.formats.codebooks import groups  # numba takes a second to import
-
     with np.errstate(over="ignore"):
         centred = np.nan_to_num(vectors - vectors.mean(axis=0, dtype=np.float64).astype(np.float32))
     sample = centred[:: max(1, len(centred) // _SAMPLE)].astype(np.float64)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import fields, replace
-from typing import Any, ClassVar, Self
+from typing import ClassVar, Self
 
 import numpy as np
 import torch
@@ -70,7 +70,8 @@ class Codes(ABC):
         if type(other) is not type(self):
             return NotImplemented
         names = [each.name for each in fields(self)]  # type: ignore[arg-type]
-        return all(_same(getattr(self, name), getattr(other, name)) for name in names)
+        pairs = ((np.asarray(getattr(self, name)), np.asarray(getattr(other, name))) for name in names)
+        return all(a.dtype == b.dtype and np.array_equal(a, b) for a, b in pairs)
 
     __hash__ = None  # type: ignore[assignment]
 
@@ -96,12 +97,6 @@ class CodedGaussians(Gaussians):
     def to(self, device: torch.device | str) -> Gaussians:
         moved = super().to(device)
         return CodedGaussians.of(self.codes, moved) if hasattr(self, "codes") else moved  # after `replace`
-
-
-def _same(a: Any, b: Any) -> bool:
-    if isinstance(a, np.ndarray):
-        return a.dtype == b.dtype and np.array_equal(a, b)
-    return bool(a == b)
 
 
 def reason(error: Exception) -> str:

@@ -28,6 +28,7 @@ GRADIENT_LIMIT = 0.1  # correlation of coarse gradients with the photos', above 
 COARSE = 64  # pixels of the longer side: shapes that are slightly misplaced still match
 
 _GAP = 4  # pixels between the parts of a picture
+_VIEWS = 8  # from which attacks look
 
 
 @dataclass(frozen=True)
@@ -138,14 +139,12 @@ def look_for_secret(
     controls: Sequence[Gaussians],
     secret: Scene,
     attacks: Sequence[Attack],
-    *,
-    max_views: int = 8,
 ) -> tuple[list[AttackResult], dict[str, Tensor]]:
     """How well attacks show the secret, from its own test cameras, against its photos.
 
     The strictest assumption: the attacker looks from where the secret was photographed. `controls` are plain
     models of the cover; `secret` has its test cameras in the cover's frame (`keyss.measure.in_cover`), of
-    which at most `max_views` are used. Images are uint8 [H, W, 3] by the attack's name: its best variant on
+    which at most 8 are used. Images are uint8 [H, W, 3] by the attack's name: its best variant on
     the stego model and on the first control, from the first test camera, and the photo. Raises UsageError
     without a control or without test views.
     """
@@ -153,7 +152,7 @@ def look_for_secret(
         raise UsageError("leaks: expected at least one plain model of the cover to compare with")
     if not secret.test:
         raise UsageError(f"leaks: the scene {secret.name} has no test views")
-    views = subsample_views(secret.test, max_views)
+    views = subsample_views(secret.test, _VIEWS)
 
     def look(attack: Attack, model: Gaussians) -> dict[str, tuple[LeakScores, Tensor]]:
         """Scores of all variants of an attack, and pictures [H, W, 3] uint8 from the first view."""

@@ -27,7 +27,9 @@ _MIN_COUNT = 50
 def candidate_scores(file: Gaussians, candidate: Gaussians) -> dict[str, float]:
     """Scores by name. Models may differ in size and SH degree; the order of rows matters."""
     degree = min(file.sh_degree, candidate.sh_degree)
-    file, candidate = (_thinned(each.with_sh_degree(degree)) for each in (file, candidate))
+    file, candidate = (
+        each.with_sh_degree(degree)[:: max(1, -(-len(each) // MAX_GAUSSIANS))] for each in (file, candidate)
+    )
     parts = _parts(file)
     scores = {"identical high bits": _identity(file, candidate)}
     if degree:
@@ -51,10 +53,6 @@ def changed_low_bits(file: Gaussians, other: Gaussians) -> float:
     rows = BitPatterns.of(file).bits[shared]
     same = sum(row.tobytes() in whole[1] for row in rows)
     return float((len(rows) - same) / max(len(file), 1))
-
-
-def _thinned(model: Gaussians) -> Gaussians:
-    return model[:: max(1, -(-len(model) // MAX_GAUSSIANS))]
 
 
 def _parts(file: Gaussians) -> dict[str, Gaussians]:
