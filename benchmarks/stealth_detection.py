@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from keyss.measure.stealth.statistic import Floats, Ints
+from keyss.core.arrays import Doubles, Integers
 
 import numpy as np
 
@@ -36,10 +36,10 @@ class Examples:
     """Files, or one part of each; those of one `model` are the same, plain and with something in it."""
 
     names: tuple[str, ...]  # of statistics
-    values: Floats  # [E, S], NaN where there was too little to count
-    hidden: Ints  # [E] 0 plain, 1 with something in it
-    scene: Ints  # [E]
-    model: Ints  # [E]
+    values: Doubles  # [E, S], NaN where there was too little to count
+    hidden: Integers  # [E] 0 plain, 1 with something in it
+    scene: Integers  # [E]
+    model: Integers  # [E]
 
     @staticmethod
     def of(
@@ -111,7 +111,7 @@ def learned_detectors(examples: Examples, *, seed: int = 0) -> list[Detection]:
     return found
 
 
-def areas(scores: Floats, hidden: Ints, scene: Ints) -> Floats:
+def areas(scores: Doubles, hidden: Integers, scene: Integers) -> Doubles:
     """[S] areas under the ROC curves of scores [E, S], ties counting half: means over scenes.
 
     Each scene's files are compared with each other only. Over all together, scores of scenes that learned
@@ -128,11 +128,11 @@ def areas(scores: Floats, hidden: Ints, scene: Ints) -> Floats:
             above = ranks[own == 1].sum(axis=0) - positives * (positives + 1) / 2
             total += len(own) * above / (positives * negatives)
             weights += len(own)
-    found: Floats = total / max(weights, 1)
+    found: Doubles = total / max(weights, 1)
     return found
 
 
-def confirmed(scores: Floats, true: Sequence[int]) -> float:
+def confirmed(scores: Doubles, true: Sequence[int]) -> float:
     """How often the true candidate is ranked above another one, ties counting half; 0.5 is chance.
 
     `scores` [F, C] of files and candidates, `true` [F] the candidate in each file. Each candidate's scores
@@ -153,14 +153,14 @@ def confirmed(scores: Floats, true: Sequence[int]) -> float:
     return float(np.mean(above))
 
 
-def _pooled(scores: Floats, examples: Examples) -> Floats:
+def _pooled(scores: Doubles, examples: Examples) -> Doubles:
     return areas(scores, examples.hidden, np.zeros_like(examples.scene))
 
 
-def _ranks(values: Floats) -> Floats:
+def _ranks(values: Doubles) -> Doubles:
     from scipy.stats import rankdata
 
-    ranks: Floats = rankdata(values, axis=0)
+    ranks: Doubles = rankdata(values, axis=0)
     return ranks
 
 
@@ -168,8 +168,8 @@ def _ranks(values: Floats) -> Floats:
 class _HeldOut:
     """Each scene's statistics as whoever knows the other scenes sees them."""
 
-    centred: Floats  # [E, S] values less the median of the other scenes
-    folds: tuple[tuple[Ints, Ints, Floats], ...]  # of each scene: its examples, the others, ranks of these
+    centred: Doubles  # [E, S] values less the median of the other scenes
+    folds: tuple[tuple[Integers, Integers, Doubles], ...]  # of each scene: its examples, the others, ranks of these
 
     @staticmethod
     def of(examples: Examples) -> _HeldOut:
@@ -183,7 +183,7 @@ class _HeldOut:
             folds.append((np.flatnonzero(held), np.flatnonzero(~held), ranks))
         return _HeldOut(centred, tuple(folds))
 
-    def scores(self, hidden: Ints) -> Floats:
+    def scores(self, hidden: Integers) -> Doubles:
         """[E, S] with the sign that files with something in them have in the other scenes."""
         signed = np.empty_like(self.centred)
         for held, others, ranks in self.folds:
@@ -192,13 +192,13 @@ class _HeldOut:
         return signed
 
 
-def _lean(ranks: Floats, hidden: Ints) -> Floats:
+def _lean(ranks: Doubles, hidden: Integers) -> Doubles:
     """[S] how much higher statistics rank where something is hidden."""
-    found: Floats = ranks[hidden == 1].mean(axis=0) - ranks[hidden == 0].mean(axis=0)
+    found: Doubles = ranks[hidden == 1].mean(axis=0) - ranks[hidden == 0].mean(axis=0)
     return found
 
 
-def _errors(scores: Floats, examples: Examples) -> Floats:
+def _errors(scores: Doubles, examples: Examples) -> Doubles:
     """[S] standard errors of areas: whole models are drawn again, scene by scene."""
     random = np.random.default_rng(0)
     rows = [np.flatnonzero(examples.model == model) for model in np.unique(examples.model)]
@@ -209,5 +209,5 @@ def _errors(scores: Floats, examples: Examples) -> Floats:
         chosen = np.concatenate([random.choice(own, len(own)) for own in strata])
         drawn = np.concatenate([rows[index] for index in chosen])
         found.append(areas(scores[drawn], examples.hidden[drawn], examples.scene[drawn]))
-    errors: Floats = np.std(found, axis=0)
+    errors: Doubles = np.std(found, axis=0)
     return errors
