@@ -17,7 +17,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 from channels.low_bits.payloads import embed_derived
 from channels.low_bits.trained_like import keys
 from keyss.measure.stealth.agreement import count_coincidences
-from keyss.measure.stealth.statistic import Words
+from keyss.measure.stealth.statistic import BitPatterns
 
 
 def main(paths: list[str]) -> None:
@@ -27,7 +27,7 @@ def main(paths: list[str]) -> None:
     for path in paths:
         plain = read_model(path)
         for kind, model in (("plain", plain), ("embedded", embed_derived(plain, [(keys(), bytes(4000))]))):
-            for name, (same, pairs, bits) in count_coincidences(model, Words.of(model)).items():
+            for name, (same, pairs, bits) in count_coincidences(model, BitPatterns.of(model)).items():
                 equal[name, kind] += same
                 if kind == "plain":
                     agreeing[name] += pairs

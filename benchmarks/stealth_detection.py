@@ -169,7 +169,8 @@ class _HeldOut:
     """Each scene's statistics as whoever knows the other scenes sees them."""
 
     centred: Doubles  # [E, S] values less the median of the other scenes
-    folds: tuple[tuple[Integers, Integers, Doubles], ...]  # of each scene: its examples, the others, ranks of these
+    # Of each scene: its examples, the others, and ranks of these.
+    folds: tuple[tuple[Integers, Integers, Doubles], ...]
 
     @staticmethod
     def of(examples: Examples) -> _HeldOut:

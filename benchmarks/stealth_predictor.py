@@ -11,7 +11,8 @@ from collections.abc import Sequence
 from typing import Any
 
 from keyss.core import Gaussians
-from keyss.measure.stealth.statistic import NOTHING, Bits, Flags, Floats, Ints, Statistic, Words, normal, ulps
+from keyss.core.arrays import Doubles, Flags, Integers, Words32
+from keyss.measure.stealth.statistic import NOTHING, BitPatterns, Statistic, normal, ulps
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -40,7 +41,7 @@ class BitPredictor:
         return BitPredictor.of_samples(samples, seed=seed)
 
     @staticmethod
-    def of_samples(samples: Sequence[tuple[Floats, Ints]], *, seed: int = 0) -> BitPredictor:
+    def of_samples(samples: Sequence[tuple[Doubles, Integers]], *, seed: int = 0) -> BitPredictor:
         """From `sample`s, which several folds can share."""
         from sklearn.ensemble import HistGradientBoostingClassifier  # slow to import
 
@@ -58,7 +59,7 @@ class BitPredictor:
         """How well the bits of a file are predicted; see `of_sample`."""
         return self.of_sample(*sample(model, ROWS, seed))
 
-    def of_sample(self, seen: Floats, bits: Ints) -> dict[str, Statistic]:
+    def of_sample(self, seen: Doubles, bits: Integers) -> dict[str, Statistic]:
         """Gain in log-likelihood per bit, and agreement with predictions as a share of what they promise.
 
         Agreement is 1 where the file is as plain models are and 0 where its bits are random; null: 0.
@@ -79,16 +80,16 @@ class BitPredictor:
         return {name: each for name, each in found.items() if not np.isnan(each.value)}
 
 
-def _agreement(lean: Floats, came: Floats) -> Statistic:
+def _agreement(lean: Doubles, came: Doubles) -> Statistic:
     promised = float((2 * lean**2).sum())
     if len(lean) < _MIN_COUNT or promised == 0:
         return NOTHING
     return normal(float((lean * came * 2).sum()) / promised, float((lean**2).sum()) ** 0.5 / promised)
 
 
-def sample(model: Gaussians, rows: int, seed: int) -> tuple[Floats, Ints]:
+def sample(model: Gaussians, rows: int, seed: int) -> tuple[Doubles, Integers]:
     """[R, features] and [R] bits: of the smallest numbers, of those with the nearest likes, and of any."""
-    words = Words.of(model)
+    words = BitPatterns.of(model)
     random = np.random.default_rng(seed)
     beside, distance = _likes(words, model)
     # What occurs again and again is a multiple of a learning rate, which everybody leaves alone.
@@ -107,7 +108,7 @@ def sample(model: Gaussians, rows: int, seed: int) -> tuple[Floats, Ints]:
     return _seen(words, at, bit, beside, distance), (words.bits.ravel()[at] >> bit & 1).astype(np.int64)
 
 
-def _seen(words: Words, at: Ints, bit: Ints, beside: Bits, distance: Floats) -> Floats:
+def _seen(words: BitPatterns, at: Integers, bit: Integers, beside: Words32, distance: Doubles) -> Doubles:
     """[R, features] of numbers `at` (flat indices) and their bits."""
     own, width = words.bits.ravel()[at], words.bits.shape[1]
     row, field = at // width, at % width
@@ -127,14 +128,14 @@ def _seen(words: Words, at: Ints, bit: Ints, beside: Bits, distance: Floats) -> 
     return np.stack([np.asarray(each, np.float64) for each in columns], axis=1)
 
 
-def _repeated(bits: Bits) -> Flags:
+def _repeated(bits: Words32) -> Flags:
     """[N, F] which numbers occur again and again, whatever their sign."""
     _, inverse, times = np.unique(bits & _UNSIGNED, return_inverse=True, return_counts=True)
     found: Flags = (times > _OFTEN)[inverse].reshape(bits.shape)
     return found
 
 
-def _likes(words: Words, model: Gaussians) -> tuple[Bits, Floats]:
+def _likes(words: BitPatterns, model: Gaussians) -> tuple[Words32, Doubles]:
     """[L, N, F] numbers that may be alike, and [L, N, F] base-2 logarithms of their distance in last bits.
 
     The nearest of the other channels or axes of the same Gaussian, and the same field of the nearest
