@@ -125,7 +125,7 @@ def test_plans_count_the_weights_of_the_networks() -> None:
             continue
         shape = KeyssOptions(design=design).settings.shape(3)
         key = 64 * shape.hidden[0] if shape.conditioning == "bias" else 0
-        assert shape.weights == _weights(Decoder(shape)) - key
+        assert shape.network_weights == _weights(Decoder(shape)) - key
 
 
 def _weights(network: torch.nn.Module) -> int:

@@ -47,15 +47,22 @@ def _moved(view: View, frame: Similarity) -> View:
     return View(frame.apply_camera(view.camera), view.image)
 
 
-def combined_points(scenes: Sequence[Scene], fit: FitConfig, generator: torch.Generator) -> Gaussians:
-    """Gaussians at the points of all scenes, in equal shares of the cap as far as there are points."""
+def combined_points(
+    scenes: Sequence[Scene], fit: FitConfig, generator: torch.Generator, apart: float = 0.0
+) -> Gaussians:
+    """Gaussians at the points of all scenes, in equal shares of the cap as far as there are points.
+
+    Opacities of each scene are `apart` (logits) from those of the scene before it, and fainter.
+    """
     clouds = [initial_points(scene, fit.max_gaussians, generator) for scene in scenes]
     counts = divided([len(points) for points, _ in clouds], fit.max_gaussians)
     parts = [
         initial_gaussians(points, colors, fit.sh_degree, share, generator)
         for (points, colors), share in zip(clouds, counts, strict=True)
     ]
-    return Gaussians.cat(parts)
+    return Gaussians.cat(
+        [replace(part, opacity_logits=part.opacity_logits - i * apart) for i, part in enumerate(parts)]
+    )
 
 
 def divided(available: Sequence[int], total: int) -> list[int]:

@@ -34,8 +34,6 @@ from keyss.methods.combined import CombinedPoses, PlacedScene, combined_points
 from keyss.rendering import render_with_meta
 
 Pose = tuple[int, int]  # a scene and the index of its training view
-
-
 Scenes = Literal["both", "cover", "secret"]  # "both": all scenes, also with several secrets
 
 
@@ -103,6 +101,7 @@ class Picture:
 class JointTraining(ABC):
     """See `keyss.fitting.loop.TrainingRun`. All scenes are in the cover's frame, the cover comes first."""
 
+    apart = 0.0  # logits between the opacities of two scenes at the start
     warm_up = 0  # steps in which the networks' rate rises to its value
 
     def __init__(
@@ -157,7 +156,7 @@ class JointTraining(ABC):
         """The Gaussians that training starts with: the sparse points of the scenes that options name."""
         chosen = chosen_scenes(self.options.points, len(self.scenes))
         return combined_points(
-            [self.scenes[index].scene for index in chosen], self.options.fit, self.generator
+            [self.scenes[index].scene for index in chosen], self.options.fit, self.generator, self.apart
         )
 
     def density_control(self) -> CappedStrategy:

@@ -160,8 +160,6 @@ def test_an_interrupted_training_resumes_to_the_same_result(tmp_path: Path, opti
 def test_settings_that_contradict_each_other_are_refused() -> None:
     with pytest.raises(UsageError, match="bit for bit"):
         KeyssOptions(publish="any")
-    with pytest.raises(UsageError, match="incorrect_every"):
-        KeyssOptions(design="mlp", incorrect_every=0)
     with pytest.raises(UsageError, match="common_poses"):
         KeyssOptions(design="mlp", poses="cover")
     KeyssOptions(poses="cover", design="published")
@@ -227,6 +225,35 @@ def test_free_places_go_to_the_scene_that_has_fewer_gaussians() -> None:
     growth._grow_gs(parameters, make_optimizers(parameters, FitConfig(), 1.0), state, 1)
     assert torch.equal(parameters["means"][60:], model.means[:10])
     assert state["grad2d"].shape == (70, 2)
+
+
+def test_at_the_cap_what_no_scene_shows_makes_room() -> None:
+    model = replace(random_gaussians(60), log_scales=torch.full((60, 3), -9.0))
+    opacities = torch.tensor([[0.9, 0.0], [0.0, 0.9], [0.01, 0.04]]).repeat_interleave(20, 0)
+    growth = EvenGrowth(FitConfig(max_gaussians=60), lambda: opacities, 2)
+    parameters = to_parameters(model, torch.device("cpu"))
+    state = growth.initialize_state(1.0) | {"grad2d": opacities.clone(), "count": torch.ones(60, 2)}
+    growth._grow_gs(parameters, make_optimizers(parameters, FitConfig(), 1.0), state, 1)
+    assert torch.equal(parameters["means"][:40], model.means[:40])
+    for scene in (model.means[:20], model.means[20:40]):
+        assert int((parameters["means"][40:, None] == scene).all(2).any(1).sum()) == 10
+
+
+@pytest.mark.parametrize("change", [{}, {"conditioning": "bias"}, {"mask": ("sc",)}, {"points": "cover"}])
+def test_scenes_start_apart_where_decoders_can_tell_them(change: dict[str, Any]) -> None:
+    """Each decoder shows its secret's points, as plain 3DGS starts with them, and nothing else."""
+    scenes, models = three_scenes()
+    options = replace(OPTIONS, common_poses=1.0, **change)
+    placed = [PlacedScene.of(scene, model, Similarity()) for scene, model in zip(scenes, models, strict=True)]
+    embeddings = list(random_embeddings(2, torch.Generator()))
+    opacities = options.settings.training(placed, embeddings, options, torch.device("cpu")).opacities()
+    if change:
+        assert torch.allclose(opacities, torch.tensor(0.1))
+    else:
+        shown = opacities > 1e-6
+        assert torch.allclose(opacities[shown], torch.tensor(0.1), atol=1e-3)
+        assert shown.sum(1).eq(1).all()
+        assert shown.sum(0).min() > len(shown) / 4
 
 
 @pytest.mark.parametrize("slack", [0.0, 0.5])

@@ -34,9 +34,12 @@ CHANNELS = {"op": 1, "ro": 4, "sc": 3, "xyz": 3}  # sh: three per coefficient
 # natural logarithms of scale, scene extents, SH coefficients.
 RESIDUAL_UNITS = {"op": 5.0, "ro": 1.0, "sc": 1.0, "xyz": 0.1, "sh": 0.5}
 KEY_GAIN = 3.0  # with it a unit vector moves the first layer as much as the attributes do
-# Cosines between an embedding and the decoder's own: the gate is shut below the first and open above the
-# second. Two random unit vectors of 64 numbers are that close once in 10^10 times.
-GATE_SHUT, GATE_OPEN = 0.7, 0.9
+# The gate is open from this cosine between an embedding and the decoder's own. Two random unit vectors of 64
+# numbers are that close less than once in 10^10 times.
+GATE = 0.8
+# Logits between the opacities of two scenes at the start. Those that matter are from -5 (0.7 %) to 6
+# (99.8 %): what one scene draws is too faint in the others.
+APART = 15.0
 
 Width = Annotated[int, Meta(ge=1, le=4096)]  # bounds for what is read from files
 
@@ -76,7 +79,7 @@ class DecoderShape:
         return 4 * (self.inputs_size + sum(self.hidden) + len(self.mask) * self.branch)
 
     @property
-    def weights(self) -> int:
+    def network_weights(self) -> int:
         """Weights of the network without a key's, biases not counted."""
         common = self.inputs_size * self.hidden[0] + self.hidden[0] * self.hidden[1]
         return common + sum(self.branch * (self.hidden[1] + self.channels(each)) for each in self.mask)
@@ -107,25 +110,13 @@ class Decoder(nn.Module):
 
     def forward(self, gaussians: Gaussians, embedding: Tensor, whole: Gaussians | None = None) -> Gaussians:
         """Decode `gaussians`, some or by default all of those of the model `whole`, with the embedding."""
-        gate = self._gate(embedding)
-        if gate == 0:
+        # With a gate an honest mistake shows nothing, at no cost. Neither conditioning protects a secret:
+        # whoever has the decoder has `key`, and the white-box attack (`keyss.measure`) undoes a bias.
+        cosine = F.cosine_similarity(embedding.detach(), self.key, dim=0)
+        if self.shape.conditioning == "gate" and cosine < GATE:
             return gaussians
         residuals = self.network(gaussians, embedding, whole or gaussians)
-        if gate < 1:
-            residuals = {name: gate * residual for name, residual in residuals.items()}
         return add_residuals(gaussians, residuals, self.network.extent)
-
-    def _gate(self, embedding: Tensor) -> float:
-        """1 for the decoder's own key, 0 for every other, whatever the weights are.
-
-        With it an honest mistake shows nothing, at no cost. It does not protect the secret: whoever has the
-        decoder has `key`. The encryption of the decoder does. A decoder conditioned by a bias learns the
-        difference instead, and the white-box attack (`keyss.measure`) undoes that.
-        """
-        if self.shape.conditioning == "bias":
-            return 1.0
-        cosine = float(F.cosine_similarity(embedding.detach(), self.key, dim=0))
-        return min(1.0, max(0.0, (cosine - GATE_SHUT) / (GATE_OPEN - GATE_SHUT)))
 
 
 class Network(nn.Module):
@@ -175,6 +166,24 @@ class Network(nn.Module):
         self.offset.copy_(attributes.mean(0))
         # The SH of a fresh model are zeros: the floor keeps later values in range.
         self.spread.copy_(attributes.std(0, correction=0).clamp_min(0.1))
+
+    @torch.no_grad()
+    def separate(self, opaque: float, scene: int) -> None:
+        """Start by showing those Gaussians alone that are `scene` times APART fainter than a logit `opaque`.
+
+        The residual of their opacities is `scene` times APART. It falls to -APART for more opaque Gaussians:
+        the first two units of each layer are how far an opacity lies above where the fall begins and ends.
+        """
+        knots = opaque - APART * (scene - self.offset.new_tensor([0.375, 0.625]))
+        third, last = (each for each in self.branches["op"].children() if isinstance(each, nn.Linear))
+        for layer in (self.first, self.second, third):
+            layer.weight[:2] = torch.eye(2, layer.in_features)
+            layer.bias[:2] = 0.0
+        self.first.weight[:2] = 0.0
+        self.first.weight[:2, 3] = self.spread[3]
+        self.first.bias[:2] = self.offset[3] - knots
+        last.bias[0] = scene * APART / RESIDUAL_UNITS["op"]
+        last.weight[0, :2] = self.offset.new_tensor([-4.0, 4.0]) * (scene + 1) / RESIDUAL_UNITS["op"]
 
     def forward(self, gaussians: Gaussians, embedding: Tensor, whole: Gaussians) -> dict[str, Tensor]:
         normalised = self.shape.inputs == "normalised"

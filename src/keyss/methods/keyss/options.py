@@ -70,11 +70,9 @@ class KeyssOptions(JointOptions):
     decoder_rate: float | None = None
     common_poses: float | None = None
     incorrect_weight: float | None = None
-    incorrect_every: int | None = None
     ssim_weight: float | None = None
-    at_cap: Literal["wait", "freeze"] | None = None
+    at_cap: Literal["even", "wait", "freeze"] | None = None
     prune_by: Literal["all", "cover"] | None = None
-    growth: Literal["largest", "even"] | None = None
     pruned_steps: float | None = None
 
     def __post_init__(self) -> None:

@@ -7,14 +7,14 @@ Conditioning: a bias of the network's first layer, and a loss of wrong keys; or 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any, Literal
 
 import numpy as np
 import torch
+from gsplat.strategy.ops import remove
 from torch import Tensor
 
-from keyss.core.errors import UsageError
 from keyss.core.gaussians import DRAWN_OPACITY, Gaussians
 from keyss.core.scene import Camera
 from keyss.core.similarity import Similarity
@@ -25,7 +25,7 @@ from keyss.fitting.parameters import Optimizers, Parameters, to_gaussians
 from keyss.keys.derivation import random_embeddings, stream
 from keyss.methods.base import check_above_zero
 from keyss.methods.joint import Picture, Pose
-from keyss.methods.keyss.decoder import Decoder, DecoderShape, Mask
+from keyss.methods.keyss.decoder import APART, Decoder, DecoderShape
 from keyss.methods.keyss.designs.base import Design, DesignTraining
 from keyss.methods.keyss.secret import ANCHORS, HiddenSecret, choose_anchors
 
@@ -39,12 +39,21 @@ class NetworkTraining(DesignTraining):
     warm_up = 100
     design: NetworkDesign
 
+    def start(self) -> Gaussians:
+        # Without a gate, a wrong key would show the secret that its decoder starts with.
+        design, points = self.design, self.options.points
+        chosen = (design.conditioning, design.inputs, points) == ("gate", "standardised", "both")
+        self.apart = APART if chosen and "op" in design.mask else 0.0
+        return super().start()
+
     def prepare(self, start: Gaussians) -> None:
         # One for each secret: whoever opens one of them has no network that knows another.
         shape = self.design.shape(self.options.fit.sh_degree)
         self.decoders = [Decoder(shape) for _ in self.embeddings]
-        for decoder, embedding in zip(self.decoders, self.embeddings, strict=True):
+        for scene, (decoder, embedding) in enumerate(zip(self.decoders, self.embeddings, strict=True), 1):
             decoder.prepare(start, embedding)
+            if self.apart:
+                decoder.network.separate(float(start.opacity_logits.max()), scene)
         self.networks.extend(self.decoders)
 
     def draw(self, scenes: Sequence[int], camera: Camera, sh_degree: int) -> list[Picture]:
@@ -60,33 +69,28 @@ class NetworkTraining(DesignTraining):
 
     def extras(self) -> Sequence[Tensor | None]:
         """Embeddings [64] of wrong keys; a gate needs none."""
-        settings = self.design
-        if settings.conditioning == "gate" or self.iteration % settings.incorrect_every:
+        if self.design.conditioning == "gate":
             return super().extras()
         return [random_embeddings(1, self.generator)[0].to(self.device) for _ in range(self.views_per_step)]
 
     def loss_at(self, poses: Sequence[Pose], extra: Tensor | None) -> tuple[Tensor, list[Rendered]]:
         total, drawn = super().loss_at(poses, extra)
-        if extra is not None:
-            total = total + self._incorrect_loss(poses[0], extra)
-        return total, drawn
-
-    def _incorrect_loss(self, pose: Pose, embedding: Tensor) -> Tensor:
-        """The cover is right already: only the decoders learn from wrong keys, in turns."""
-        settings, fit = self.design, self.options.fit
-        cover, camera = self.gaussians(), self.poses.camera(*pose)
-        decoder = self.decoders[self.iteration // settings.incorrect_every % len(self.decoders)]
+        if extra is None:
+            return total, drawn
+        # The cover is right already: only the decoders learn from wrong keys, in turns.
+        fit, cover, camera = self.options.fit, self.gaussians(), self.poses.camera(*poses[0])
+        decoder = self.decoders[self.iteration % len(self.decoders)]
         part = cover[possibly_seen(cover, camera, _SLACK * self.extent)]
-        wrong = decoder(part, embedding, cover)
-        picture = self.render(wrong, 0, camera, fit.sh_degree_at(self.iteration))
-        loss = photometric_loss(picture.image, self.poses.target(0, *pose), fit.ssim_weight)
-        return settings.incorrect_weight * settings.incorrect_every * len(self.decoders) * loss
+        picture = self.render(decoder(part, extra, cover), 0, camera, fit.sh_degree_at(self.iteration))
+        loss = photometric_loss(picture.image, self.poses.target(0, *poses[0]), fit.ssim_weight)
+        return total + self.design.incorrect_weight * len(self.decoders) * loss, drawn
 
     def density_control(self) -> CappedStrategy:
-        if self.design.growth == "even" and len(self.growing) == len(self.scenes):
+        if self.design.at_cap == "even" and len(self.growing) == len(self.scenes):
             return EvenGrowth(self.options.fit, self.opacities, len(self.scenes))
-        freeze = self.design.at_cap == "freeze"
-        return CappedStrategy(self.options.fit, self.opacity_for_pruning, freeze=freeze)
+        return CappedStrategy(
+            self.options.fit, self.opacity_for_pruning, freeze=self.design.at_cap == "freeze"
+        )
 
     @torch.no_grad()
     def opacity_for_pruning(self) -> Tensor:
@@ -120,7 +124,8 @@ class NetworkTraining(DesignTraining):
 class EvenGrowth(CappedStrategy):
     """Density control that gives free places to the scenes that have fewer Gaussians than their share.
 
-    By the largest gradients, a scene with more detail takes nearly all of them.
+    By the largest gradients, a scene with more detail takes nearly all of them. At the cap, Gaussians that no
+    scene shows make room.
     """
 
     def __init__(self, fit: FitConfig, opacities: Callable[[], Tensor], scenes: int) -> None:
@@ -134,9 +139,12 @@ class EvenGrowth(CappedStrategy):
     def _grow_gs(
         self, params: Parameters, optimizers: Optimizers, state: dict[str, Any], step: int
     ) -> tuple[int, int]:
+        visible = self.opacities() > _VISIBLE  # [N, S]
+        shown = visible.any(1)
+        if len(visible) >= self.max_gaussians and shown.any():
+            remove(params=params, optimizers=optimizers, state=state, mask=~shown)
         gradients = state["grad2d"] / state["count"].clamp_min(1)  # [N, S]
-        visible = (self.opacities() > _VISIBLE).sum(0)
-        missing = (self.max_gaussians / self.scenes - visible).clamp_min(0)
+        missing = (self.max_gaussians / self.scenes - visible.sum(0)).clamp_min(0)
         room = max(0, self.max_gaussians - len(gradients))
         shares = (room * missing / missing.sum().clamp_min(1e-9)).long().tolist()
         chosen = torch.zeros(len(gradients), dtype=torch.bool, device=gradients.device)
@@ -158,49 +166,32 @@ def possibly_seen(gaussians: Gaussians, camera: Camera, slack: float) -> Tensor:
     A Gaussian is left out when a ball of 3 standard deviations around it, widened by `slack` (world units, by
     what the decoder may move it), lies outside the frustum, widened by a tenth.
     """
-    viewmat, intrinsics = camera.viewmat.to(gaussians.device), camera.K
-    x, y, z = (gaussians.means @ viewmat[:3, :3].T + viewmat[:3, 3]).unbind(1)
-    radius = 3 * gaussians.scales.amax(1) + slack
-    depth = z + radius
-    fx, fy, cx, cy = (float(intrinsics[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
-    half_width = max(cx, camera.width - cx) / fx
-    half_height = max(cy, camera.height - cy) / fy
-    seen = (
-        (depth > 0.01)
-        & (x.abs() - radius < 1.1 * half_width * depth)
-        & (y.abs() - radius < 1.1 * half_height * depth)
-    )
-    return seen.nonzero()[:, 0]
+    viewmat, centre = camera.viewmat.to(gaussians.device), camera.K[:2, 2]
+    opposite = centre.new_tensor([camera.width, camera.height]) - centre
+    slopes = (torch.maximum(centre, opposite) / camera.K.diagonal()[:2]).to(viewmat)  # of the frustum's sides
+    means = gaussians.means @ viewmat[:3, :3].T + viewmat[:3, 3]
+    radius = 3 * gaussians.scales.amax(1, keepdim=True) + slack
+    depth = means[:, 2:] + radius
+    seen = (depth > 0.01) & (means[:, :2].abs() - radius < 1.1 * slopes * depth)
+    return seen.all(1).nonzero()[:, 0]
 
 
 @dataclass(frozen=True, kw_only=True)
-class NetworkDesign(Design):
-    """Raises UsageError for settings that do not work."""
+class NetworkDesign(DecoderShape, Design):
+    """The decoders' shape, for any `sh_degree`, and more. Raises UsageError for settings that do not work."""
 
     training = NetworkTraining
 
-    # The decoder, see `DecoderShape`.
-    mask: Mask = ("op",)
-    conditioning: Literal["gate", "bias"] = "gate"
-    hidden: tuple[int, int] = (64, 64)
-    branch: int = 32
-    frequencies: int = 6
-    inputs: Literal["standardised", "normalised"] = "standardised"
-    residuals: Literal["signed", "one-sided"] = "signed"
     decoder_rate: float = 1e-3  # of AdamW, decays to 5 % of it
     weight_decay: float = 1e-4  # of the decoders
     incorrect_weight: float = 0.05  # beta_incorrect: wrong keys against the cover; a gate needs none
-    incorrect_every: int = 4  # steps between two wrong keys; the weight is multiplied by it
-    # At the cap, Gaussians that ask for growth wait until others are pruned; "freeze": none are.
-    at_cap: Literal["wait", "freeze"] = "wait"
+    # Who gets free places: scenes with fewer Gaussians than their share, or the largest gradients of all
+    # scenes, which wait at the cap until others are pruned; "freeze": none are.
+    at_cap: Literal["even", "wait", "freeze"] = "even"
     prune_by: Literal["all", "cover"] = "all"  # scenes in which an opaque Gaussian is spared
-    # Who gets free places: the largest gradients of all scenes, or the scenes with the fewest Gaussians.
-    growth: Literal["largest", "even"] = "even"
 
     def __post_init__(self) -> None:
         check_above_zero(self, "decoder_rate")
-        if self.incorrect_every < 1:
-            raise UsageError(f"`incorrect_every`: expected at least 1, got {self.incorrect_every}")
 
     @property
     def joint(self) -> dict[str, Any]:
@@ -208,7 +199,7 @@ class NetworkDesign(Design):
 
     def shape(self, sh_degree: int) -> DecoderShape:
         """Kind and sizes of the decoders."""
-        own = {name: getattr(self, name) for name in vars(DecoderShape()) if hasattr(self, name)}
+        own = {field.name: getattr(self, field.name) for field in fields(DecoderShape)}
         return DecoderShape(**own | {"sh_degree": sh_degree})
 
     def payload_bytes(self, sh_degree: int, secrets: int) -> int:
@@ -216,8 +207,7 @@ class NetworkDesign(Design):
         return len(HiddenSecret(decoder, Similarity(), torch.rand(ANCHORS, 3)).payload().data)
 
     def weights(self, sh_degree: int, secrets: int) -> float:
-        wrong = 1 / self.incorrect_every if self.conditioning == "bias" else 0.0
-        return (secrets + wrong) * self.shape(sh_degree).weights
+        return (secrets + (self.conditioning == "bias")) * self.shape(sh_degree).network_weights
 
 
 # The paper's architecture with inputs, rates, poses and conditioning that work at small scale.
@@ -234,9 +224,8 @@ PUBLISHED = NetworkDesign(
     decoder_rate=5e-5,
     common_poses=1.0,
     incorrect_weight=0.01,
-    incorrect_every=1,
     ssim_weight=0.5,
-    growth="largest",
+    at_cap="wait",
 )
 
 # The authors' program, where it differs from the paper's text.
