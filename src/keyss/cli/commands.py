@@ -53,7 +53,7 @@ def to_parse(name: str, arguments: Sequence[str]) -> Callable[..., None]:
 
 
 def help_page() -> str:
-    """What `keyss --help` prints: a line for each command."""
+    """The text of `keyss --help`: a line for each command."""
     lines = []
     for group, names in GROUPS.items():
         lines += ["", f"{group}:"]

@@ -45,8 +45,8 @@ def compare(
     """Hide a scene by each method with the same budget, and tabulate the results.
 
     The budget is a number of Gaussians, and of training steps for each scene. The method 3dgs is the bound:
-    plain 3DGS with that budget. A method asked for by name must be possible with it; of all methods, those
-    that are not are listed. Run the same command again to resume.
+    plain 3DGS with that budget. Methods that are not possible with it are listed, and are an error if
+    `--methods` names them. Run the same command again to resume.
 
     example: keyss compare --cover SCENE_A --secret SCENE_B --quick -o runs/compared
     """
@@ -94,7 +94,7 @@ def reproduce(
         Positional[tuple[Path, ...]],
         arg(
             metavar="[SCENE ...]",
-            help="Scenes, each of which hides the next one.",
+            help="Scenes; each hides the next one.",
             help_behavior_hint="",
         ),
     ] = (),
@@ -112,14 +112,14 @@ def reproduce(
         UseAppendAction[tuple[str, ...]],
         optional(
             "COVER,SECRET",
-            "Names of a scene and of what it hides, for multi COVER,SECRET,SECRET; repeat for more.",
+            "Names of a cover and its secret, for multi COVER,SECRET,SECRET; repeat for more.",
             "each hides the next; with --data as published",
         ),
     ] = (),
     most: Annotated[int | None, optional("N", "Run only the first N pairs.", "all")] = None,
     out: OutFolder,
     download: Annotated[
-        bool, switch("Download scenes that are missing in --data from their authors, up to 12.5 GB.")
+        bool, switch("Download scenes that are missing in --data from their authors, up to 13 GB.")
     ] = False,
     dry_run: DryRun = False,
     iterations: Annotated[int | None, optional("N", "Training steps.", "see --data")] = None,

@@ -200,7 +200,7 @@ def print_verdicts(audit: Audit) -> None:
 
 
 def print_info(found: RunInfo | ModelInfo | SceneInfo) -> None:
-    """What `keyss info` tells."""
+    """Print the description of `keyss info`."""
     from keyss.runs.describe import RunInfo
 
     if not isinstance(found, RunInfo):
@@ -219,7 +219,7 @@ def print_info(found: RunInfo | ModelInfo | SceneInfo) -> None:
 
 
 def print_verification(found: Verification) -> None:
-    """What `keyss verify` found, in words."""
+    """Print the findings of `keyss verify`."""
     model, secret, what = found.model, found.secret, "not checked, as no key was given"
     problems = "; ".join(model.problems) or "sound"
     if secret is not None:

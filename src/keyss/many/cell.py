@@ -173,7 +173,7 @@ def checksum(path: str) -> str:
 
 
 def _files_below(folder: str, above: tuple[str, ...] = ()) -> Iterator[str]:
-    """In the order of their names. Raises OSError."""
+    """The files in `folder` and its subfolders, in the order of their names. Raises OSError."""
     real = os.path.realpath(folder)
     if real in above:
         raise InputError(f"{folder} leads into itself")

@@ -298,7 +298,7 @@ def _survived(change: str) -> Column:
 
 
 def _gained(loss: float) -> str:
-    """In decibels, without -0.0."""
+    """The gain in decibels, without -0.0."""
     return f"{0.0 - round(loss, 1):+.1f}"
 
 

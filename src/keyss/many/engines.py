@@ -1,4 +1,4 @@
-"""What runs cells: this process, others of this machine, or those of a cluster.
+"""Engines that run cells: in this process, in others of this machine, or on a cluster.
 
 On a cluster Ray starts processes where cores and memory are free. Folders and inputs must be reachable under
 the same paths from every node, as on a shared file system, and its locks (flock) must hold between nodes. Ray
@@ -114,7 +114,7 @@ class Cluster:
         self.remote = self.ray.remote(max_retries=0)(_attempt)
 
     def attempt(self, name: str, folder: Path, memory: int) -> int:
-        """As `Processes.attempt`. Raises ConnectionError where the worker or its node is gone."""
+        """See `Processes.attempt`. Raises ConnectionError if the worker or its node is gone."""
         threads = self.resources.threads
         reserved = {} if self.local else {"memory": memory}
         chosen = self.remote.options(num_cpus=threads, name=name, **reserved)
@@ -145,7 +145,7 @@ class InThisProcess:
         self.reporter = reporter
 
     def attempt(self, name: str, folder: Path, memory: int) -> int:
-        """As `Processes.attempt`."""
+        """See `Processes.attempt`."""
         from keyss.many.performing import perform
 
         return attempt(folder, partial(perform, reporter=self.reporter), log=False)

@@ -157,7 +157,7 @@ def judged(claim: Claim, figures: Measured) -> JudgedClaim:
 
 
 def _held(part: str, figures: Measured) -> Iterator[bool | None]:
-    """For each run that the part compares with, True if it holds; None without a figure."""
+    """Whether the part holds for each run that it compares with; None without a figure."""
     match = _PART.fullmatch(part)
     assert match is not None, part
     run, limit = match["run"], float(match["limit"])

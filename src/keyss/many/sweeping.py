@@ -1,6 +1,6 @@
 """`sweep`: the cells of a specification, and the tables of their results.
 
-The file of a sweep tells which pairs, methods, options and seeds, as YAML:
+The file of a sweep lists pairs, methods, options and seeds, as YAML:
 
     pairs:
       - cover: scenes/bonsai
@@ -10,7 +10,7 @@ The file of a sweep tells which pairs, methods, options and seeds, as YAML:
         options: {prune_to_fit: true}
       - method: keyss
         preset: quick
-        grid: {sh_degree: [1, 3], fit.iterations: [500, 1000]}
+        grid: {design: [published, mlp], fit.iterations: [500, 1000]}
     seeds: [0, 1, 2]
 
 Everything is checked before anything runs: names of fields, types, options of methods, and that files exist.
@@ -154,7 +154,7 @@ def _yaml(path: Path) -> Any:
 
 
 def _suggestion(message: str) -> str:
-    """For the message of a ValidationError about an unknown name: the nearest known one."""
+    """The end of a message about an unknown field: the nearest known name."""
     if field := re.search(r"unknown field `(.+?)`", message):
         kinds = (SweepSpec, Pair, MethodSpec)
         return f"; {did_you_mean(field[1], [name for kind in kinds for name in kind.__struct_fields__])}"

@@ -141,7 +141,7 @@ def as_model(source: PathLike | Gaussians) -> Gaussians:
 
 
 def as_3dgs_model(source: PathLike | Gaussians, what: str) -> Gaussians:
-    """As `as_model`. Raises UsageError if the model is rendered by a network."""
+    """`as_model`, but raises UsageError if the model is rendered by a network."""
     model = as_model(source)
     if isinstance(model, DecodedGaussians):
         raise UsageError(f"expected a 3DGS model, but {what}'s model is rendered by a network")

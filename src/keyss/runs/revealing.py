@@ -68,7 +68,7 @@ def reveal_model(
     force: bool = False,
     handed: PathLike | None = None,
 ) -> Revealed:
-    """What `key` opens in a stego model, however little is left; see `keyss.reveal`, also for errors."""
+    """The secret that `key` opens in a stego model, however little is left; raises as `keyss.reveal` does."""
     if handed is not None:
         if decoy:
             raise UsageError("files that are handed over have no decoys: leave out `decoy=True`")

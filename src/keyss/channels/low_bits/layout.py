@@ -17,11 +17,9 @@ Carriers for the headers of four secrets are set aside, whether there are so man
 fit like that get what there is, without copies or in smaller cells, and the holder of one key can notice the
 others.
 
-How an encrypted payload is cut into numbered chunks, with redundancy.
-
-Chunks are coded with Reed-Solomon so that the loss of a quarter of all Gaussians, whichever they are, leaves
-enough of every codeword. A payload fills all cells that it gets: those that it does not need become
-redundancy, and the number of cells tells nothing.
+An encrypted payload is cut into numbered chunks, coded with Reed-Solomon so that the loss of a quarter of all
+Gaussians, whichever they are, leaves enough of every codeword. A payload fills all cells that it gets: those
+that it does not need become redundancy, and the number of cells tells nothing.
 """
 
 from __future__ import annotations
@@ -293,7 +291,7 @@ def split_numbers(chunks: Bytes) -> tuple[Integers, Bytes]:
 
 
 def _shape(cells: int) -> tuple[int, int]:
-    """How many codewords of which length."""
+    """The number of codewords and their length."""
     count = min(-(-cells // MAX_CHUNKS), MAX_CODEWORDS)
     return count, min(cells // count, MAX_CHUNKS)
 

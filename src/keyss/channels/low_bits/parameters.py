@@ -50,7 +50,7 @@ def parameter_cipher(data_key: bytes, width: int) -> CellCipher:
 
 @dataclass(frozen=True)
 class Parameters:
-    """Of records of `record_bytes`, `cells` of which divide a carrier."""
+    """The parameters of records of `record_bytes`; a carrier holds `cells` of them."""
 
     service: int
     method: str

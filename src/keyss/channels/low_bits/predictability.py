@@ -2,18 +2,18 @@
 
 An optimiser that rounds its step before subtracting it leaves numbers on the grid of the larger ones that
 they came from: a number that the last step brought near zero has as many trailing zeros as it is smaller than
-that step. Steps are about exponentially distributed, for Adam bounds them: with the scale 2^(s + 1) of a
+that step. Steps are about exponentially distributed, because Adam bounds them: with the scale 2^(s + 1) of a
 group of fields, a number of binary exponent e has at least z zeros forced upon it with the probability
 
     F(z) = exp(-2^(e + z - 1 - s)), z >= 1
 
 Beside it the last bit alone is forced to zero with the probability min(1, t 2^-e), by rounding to even. Bits
-above those forced are uniform. Hence the number of trailing zeros tells all that there is to be told, and for
-an odd number there is nothing. Both were measured on models that were trained with either rounding.
+above those forced are uniform. Hence only the number of trailing zeros carries information, and odd numbers
+carry none. Both were measured on models that were trained with either rounding.
 
-From the counts of trailing zeros a confidence limit of s follows. From it follows what somebody knows of the
-bits that embedding replaces who knows the trainer, and sees the bit that is never replaced: the chi-square
-distance of what they were from uniform bits. The least exponent that is used bounds it.
+From the counts of trailing zeros a confidence limit of s follows. It limits how well an attacker who knows
+the trainer, and sees the bit that is never replaced, can predict the replaced bits: the chi-square distance
+of the former bits from uniform ones. The least exponent that is used bounds this distance.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ def least_exponent(counts: Integers, share: float) -> int:
 
 
 def _confidence_limit(counts: Doubles, exponents: Integers) -> float:
-    """Of s, from above, for counts [E, MAX_ZEROS + 1] of the numbers of `exponents` [E].
+    """The upper confidence limit of s for counts [E, MAX_ZEROS + 1] of the numbers of `exponents` [E].
 
     Where too few small numbers are there to tell, s is no larger than steps can be.
     """
@@ -99,7 +99,7 @@ def _zeros(forced: Doubles) -> Doubles:
 
 
 def _log_likelihood(counts: Doubles, exponents: Integers, scale: float) -> float:
-    """Of counts [E, MAX_ZEROS + 1], with the best probability of rounding to even."""
+    """The log-likelihood of counts [E, MAX_ZEROS + 1], with the best probability of rounding to even."""
     chances = _zeros(_forced(exponents, scale)).clip(1e-12)
     even = 1 - chances[:, 0]
     inside = float((counts[:, 1:] * np.log(chances[:, 1:] / even[:, None])).sum())

@@ -103,7 +103,7 @@ class KeyssMethod:
         return options
 
     def plan(self, sources: Sequence[Source], options: KeyssOptions) -> Plan:
-        """As many Gaussians as a plain model has show all scenes."""
+        """All scenes share as many Gaussians as a plain model has."""
         secrets = len(sources) - 1
         weights = options.settings.weights(options.fit.sh_degree, secrets)
         return options.joint_plan(secrets, gaussian_weights=weights)

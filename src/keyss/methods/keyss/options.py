@@ -95,7 +95,7 @@ class KeyssOptions(JointOptions):
 
     @property
     def settings(self) -> Any:
-        """The `Design` with what these options override. Raises UsageError for what it does not have."""
+        """The `Design` with the settings that these options override. Raises UsageError for unknown ones."""
         chosen = _DESIGNS[self.design]
         own = [each.name for each in fields(self) if each.default is None and each.name not in _OTHERS]
         given = {name: getattr(self, name) for name in own if getattr(self, name) is not None}

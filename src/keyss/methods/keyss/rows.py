@@ -76,7 +76,7 @@ class RowSecret:
     chunks: tuple[int, int] | None = None  # see `Payload`; not part of what is packed
 
     def payload(self) -> Payload:
-        """What a channel carries; the same secret gives the same bytes."""
+        """The payload for a channel; the same secret gives the same bytes."""
         numbers = self.secret, self.secrets, self.count, self.visibility
         header = _Header(FORMAT, VERSION, self.frame, *numbers)
         tensors = {"embedding": self.embedding}
@@ -119,7 +119,7 @@ class RowSecret:
         return decoded if frame == "cover" else self.frame.inverse().apply_gaussians(decoded)
 
     def decode(self, stego: Gaussians, embedding: Tensor) -> Gaussians:
-        """What `stego` shows for an embedding [64]: the secret, or itself where no row opens."""
+        """The secret in `stego` for an embedding [64], or `stego` itself if no row opens."""
         opened = self._opened(stego, embedding)
         return stego if opened is None else opened
 

@@ -1,4 +1,4 @@
-"""A secret of KeySS: what it reveals of a stego model, and its bytes, the payload.
+"""A secret of the designs with a network: revealing it, and its bytes, the payload.
 
 The payload holds the decoder (a network's weights in half precision, all constants in single) with the
 embedding that it belongs to, the similarity from the secret's own frame, and *anchors*: positions of some
@@ -50,7 +50,7 @@ class _Header(Header):
 
 @dataclass(frozen=True)
 class HiddenSecret:
-    """Everything beside the stego model that reveals one secret; see `keyss.methods.base.Opened`."""
+    """Everything beside the stego model that reveals one secret; see `keyss.methods.opened.Opened`."""
 
     decoder: Decoder
     frame: Similarity  # from the secret's own frame into the cover's
@@ -59,7 +59,7 @@ class HiddenSecret:
     chunks: tuple[int, int] | None = None  # see `Payload`; not part of what is packed
 
     def payload(self) -> Payload:
-        """What a channel carries; the same secret gives the same bytes."""
+        """The payload for a channel; the same secret gives the same bytes."""
         header = _Header(FORMAT, VERSION, self.decoder.shape, self.frame, self.count)
         halved = {name for name, _ in self.decoder.named_parameters()}
         tensors = {
@@ -102,7 +102,7 @@ class HiddenSecret:
         return decoded if frame == "cover" else self.frame.inverse().apply_gaussians(decoded)
 
     def decode(self, stego: Gaussians, embedding: Tensor) -> Gaussians:
-        """What the decoder makes of `stego` for an embedding [64]; see `Opened.decode`.
+        """The decoder's output for `stego` and an embedding [64]; see `Opened.decode`.
 
         Appended Gaussians are left out: they came after the training.
         """
@@ -115,7 +115,7 @@ class HiddenSecret:
         return Gaussians.cat([decoder(stego[at : at + step], embedding, stego) for at in starts])
 
     def remains(self, revealed: Gaussians) -> Remains:
-        """None where nothing of what was revealed is ever drawn."""
+        """See `Opened.remains`; Gaussians that are never drawn do not count."""
         found = int((revealed.opacities >= DRAWN_OPACITY).sum())
         return Remains(found, self.count, self.chunks, _SLACK)
 

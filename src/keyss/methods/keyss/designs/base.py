@@ -1,4 +1,4 @@
-"""What a design of KeySS is: settings, a training, and what reveals a secret."""
+"""The base of KeySS's designs: settings, and a training whose result is published."""
 
 from __future__ import annotations
 

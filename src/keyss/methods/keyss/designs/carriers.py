@@ -135,10 +135,10 @@ class CarriersTraining(DesignTraining):
 
 
 def arranged(model: Gaussians, weights: Tensor, counts: Sequence[int]) -> list[Gaussians]:
-    """The Gaussians for each kind of rows, of which there are so many, the most important ones first.
+    """The Gaussians for the `counts` rows of each kind, the most important ones first.
 
-    What contributes much and is opaque is kept longest. Rows of a later kind, which have less room, get those
-    whose harmonics matter least.
+    Opaque Gaussians that contribute much are kept longest. Rows of a later kind, which have less room, get
+    those whose harmonics matter least.
     """
     order = (weights * model.opacities).argsort(descending=True, stable=True)[: sum(counts)]
     harmonics = (model.sh[:, 1:].square().mean((1, 2)).sqrt() * weights)[order]
