@@ -46,7 +46,7 @@ from keyss.channels.low_bits.parameters import (
     parameter_cipher,
 )
 from keyss.channels.low_bits.salts import salt, salt_rows
-from keyss.channels.low_bits.usable import repeated
+from keyss.channels.low_bits.usable import among, repeated
 from keyss.channels.mixing import random_order, row_hashes
 from keyss.core.arrays import Bytes, Flags, Integers
 from keyss.core.errors import InputError, KeyssWarning, WrongKeyError
@@ -298,4 +298,4 @@ def _are_among(rows: Bytes, others: Bytes) -> Flags:
     """[R] which of the rows [R, C] are there among the others [O, C], by their hashes."""
     padded = (np.pad(each, ((0, 0), (0, -each.shape[1] % 8))) for each in (rows, others))
     wanted, known = (row_hashes(each.view(np.uint64)) for each in padded)
-    return np.isin(wanted, known)
+    return among(wanted, np.sort(known))
