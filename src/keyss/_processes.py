@@ -6,6 +6,7 @@ process ends.
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 import site
@@ -24,6 +25,9 @@ _KEY = "KEYSS_KEY"  # not passed on
 _STARTED = "KEYSS_STARTED_BY_KEYSS"
 _ROOT = str(Path(__file__).parents[1])  # the folder that contains keyss
 _CGROUPS = Path("/sys/fs/cgroup")
+
+if _STARTED in os.environ:
+    gc.set_threshold(700, 10, 1000)  # as in `keyss.cli.process`
 
 
 def can_start() -> bool:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import atexit
 import codecs
+import gc
 import io
 import os
 import signal
@@ -57,6 +58,7 @@ class _Process:
                 signal.signal(signum, self.on_signal)
         sys.unraisablehook = self.on_unraisable
         prepare_streams()
+        gc.set_threshold(700, 10, 1000)  # going through what libraries leave takes a quarter of loading them
         try:
             self.running = True
             from keyss.cli.entry import main

@@ -39,15 +39,11 @@ class Viewpoints:
 def psnr_between(before: Gaussians, after: Gaussians, viewpoints: Viewpoints | None = None) -> float:
     """PSNR in dB between renders of two models, at most 120; by default from around the first."""
     views = viewpoints or Viewpoints.around(before)
-    errors = [
-        (_render(before, camera, views) - _render(after, camera, views)).square().mean()
-        for camera in views.cameras
-    ]
+    errors, background = [], views.background.to(before.device)
+    for camera in views.cameras:
+        one, other = (render(model, camera, background).clamp(0, 1) for model in (before, after))
+        errors.append((one - other).square().mean())
     return float(-10 * torch.log10(torch.stack(errors).mean().clamp_min(1e-12)))
-
-
-def _render(model: Gaussians, camera: Camera, views: Viewpoints) -> Tensor:
-    return render(model, camera, views.background.to(model.device)).clamp(0, 1)
 
 
 def _shrunk(camera: Camera) -> Camera:

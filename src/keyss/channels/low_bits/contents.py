@@ -278,8 +278,6 @@ class LowBitsReader(SaltedReader):
             cipher.decrypt(self.identities, self.low[:, slot * size : (slot + 1) * size], slot)
             for slot in range(cells)
         ]
-        if cells == 1:
-            return found[0][1]
         order = np.concatenate([np.flatnonzero(fits) for fits, _ in found]).argsort(kind="stable")
         return np.concatenate([data for _, data in found])[order]
 

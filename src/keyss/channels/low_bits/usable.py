@@ -40,7 +40,7 @@ from keyss.channels.low_bits.bits import (
 )
 from keyss.channels.low_bits.predictability import count_trailing_zeros, least_exponent
 from keyss.channels.mixing import row_hashes
-from keyss.core.arrays import Bytes, Doubles, Flags, Integers, Words, Words32
+from keyss.core.arrays import Bytes, Doubles, Flags, Integers, Numbers, Words, Words32
 from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.rendering.cpu.parallel import in_blocks
@@ -182,10 +182,10 @@ def repeated(values: Words) -> Flags:
     return among(values, ordered[1:][ordered[1:] == ordered[:-1]])
 
 
-def among(values: Words, ordered: Words) -> Flags:
-    """[N] which of the values [N] are among others in ascending order; faster than `np.isin`."""
+def among(values: Numbers, ordered: Numbers) -> Flags:
+    """[...] which of the values [...] are among others in ascending order; faster than `np.isin`."""
     if not len(ordered):
-        return np.zeros(len(values), bool)
+        return np.zeros(values.shape, bool)
     result: Flags = ordered[np.searchsorted(ordered, values).clip(max=len(ordered) - 1)] == values
     return result
 
@@ -201,8 +201,7 @@ def _are_measured(used: Words32, layout: Layout, frequent: list[Words32], short:
     if short:
         fine &= (used & _SHORT) != 0
     for group, values in zip(_GROUPS.values(), frequent, strict=True):
-        if len(values):
-            fine[:, group] &= ~np.isin(used[:, group], values)
+        fine[:, group] &= ~among(used[:, group], values)
     zeros = ((used & _ZEROS) == 0)[:, layout.columns].sum(axis=1)
     measured: Flags = fine[:, layout.columns].all(axis=1) & (zeros < _ZERO_FIELDS)
     return measured
