@@ -106,7 +106,8 @@ def measured(options: argparse.Namespace, names: Sequence[str], seed: int, desig
             found[f"{role} bound{suffix}"] = mean_psnr(plains[scene.name, part], scene.test, scene.background)
     found["cover"], found["published"] = psnr(stego, 0), len(stego)
     if design == "carriers":
-        found["statistic"] = noticed(run.scene_gaussians(0).detach(), stego)
+        in_order = run.density["born"].argsort(stable=True)
+        found["statistic"] = noticed(run.scene_gaussians(0).detach()[in_order], stego)
     pruned = opacity_pruning(0.25).apply(stego)
     found["cover pruned"] = psnr(pruned, 0)
     wrong = random_embeddings(WRONG_KEYS, torch.Generator().manual_seed(99))
@@ -127,9 +128,8 @@ def noticed(cover: Gaussians, stego: Gaussians) -> float:
 
     Between the published model and its Gaussians before anything was written into their harmonics.
     """
-    cover = cover[cover.opacities >= FitConfig().prune_opacity]
-    shuffled = cover[torch.randperm(len(cover), generator=torch.Generator().manual_seed(0))]
-    before, after = stealth_statistics(shuffled), stealth_statistics(stego)
+    before = stealth_statistics(cover[cover.opacities >= FitConfig().prune_opacity])
+    after = stealth_statistics(stego)
     return max(
         abs(each.value - before[name].value) / each.error
         for name, each in after.items()

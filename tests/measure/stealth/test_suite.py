@@ -62,6 +62,15 @@ def test_new_low_bits_where_they_were_not_random(name: str, natural: Callable[[i
     assert z(name, model, natural(2)) < 4.5
 
 
+def test_new_middle_bits_where_channels_were_alike() -> None:
+    name, noise = "agreement: within a quarter of an octave, channels", torch.Generator().manual_seed(0)
+    model = plain(1)
+    sh = model.sh[:, :, :1] * torch.exp(0.1 * torch.randn(model.sh.shape, generator=noise))
+    model = dataclasses.replace(model, sh=sh)
+    assert p(name, model) < 1e-20
+    assert p(name, overwritten(model, bits=20)) > 1e-4
+
+
 def test_low_bits_that_were_random_stay_so() -> None:
     """The control of the test above: the same change, where there was nothing to destroy."""
     model = plain(1)

@@ -12,6 +12,7 @@ Gaussians alone. The null of pairs with a usable Gaussian is exact: independent 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import combinations
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -21,15 +22,18 @@ from keyss.core.arrays import Doubles, Flags, Integers, Words32, doubles
 from keyss.core.gaussians import Gaussians
 from keyss.measure.stealth.statistic import (
     ATTRIBUTES,
+    NOTHING,
     BitPatterns,
     Statistic,
     excess,
     more_than_smooth,
+    normal,
     portion,
     ulps,
 )
 
 _LOW = 13  # bits that may have been replaced
+_QUARTER, _MANY = 21, 1000  # lowest bit that quarters of octaves differ in; pairs of numbers
 _CLOSE = 1 << 5  # steps of the last bit
 _NEIGHBOURS = 3
 # Embedding moves a number by at most this many steps of its last bit.
@@ -77,7 +81,17 @@ def _of_pairs(one: Words32, other: Words32) -> dict[str, Statistic]:
         "equal low bits": excess(int(equal[same_high].sum()), int(same_high.sum()), 1 / size),
         "near misses": _misses(apart),
         "equal": portion(float(equal.sum()), len(equal)),
+        "within a quarter of an octave": _within_quarters(one, other),
     }
+
+
+def _within_quarters(one: Words32, other: Words32) -> Statistic:
+    """Correlation of the next 8 bits where exponents and the two leading bits agree; 0 if these are new."""
+    both = (one >> _QUARTER == other >> _QUARTER) & (one > 0) & (other > 0)
+    if both.sum() < _MANY:
+        return NOTHING
+    covariance = np.cov(*((words[both] >> _LOW & 255).astype(np.float64) for words in (one, other)))
+    return normal(12 * float(covariance[0, 1]) / (1 << 16), float(both.sum()) ** -0.5)
 
 
 def _misses(apart: Integers) -> Statistic:
@@ -95,9 +109,8 @@ def _within(words: BitPatterns, attributes: tuple[int, ...]) -> Iterator[tuple[W
             continue
         width = 4 if attribute == 2 else 3
         groups = own.reshape(len(own), -1, width)
-        for first in range(width):
-            for second in range(first + 1, width):
-                yield groups[:, :, first].ravel(), groups[:, :, second].ravel()
+        for first, second in combinations(range(width), 2):
+            yield groups[:, :, first].ravel(), groups[:, :, second].ravel()
 
 
 def nearest_pairs(positions: Doubles, neighbours: int) -> Integers:

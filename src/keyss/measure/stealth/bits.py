@@ -1,4 +1,4 @@
-"""Words32 of mantissas that are not random, given everything else that an attacker sees.
+"""Bits of mantissas that are not random, given everything else that an attacker sees.
 
 By attribute, magnitude and position of the bit; given the bit below; and numbers that contradict themselves:
 training that leaves a zero in the last bit leaves zeros above it too, embedding does not.
@@ -46,7 +46,11 @@ def bits(model: Gaussians, words: BitPatterns) -> dict[str, Statistic]:
         statistics |= {f"{name}, {magnitude} harmonics": each for name, each in _of_values(values).items()}
     small = trained & (exponent < MAGNITUDES["middling"][1])
     statistics["zeros together in a Gaussian"] = _together(own, small)
-    return statistics | _beside_tiny(words)
+    tiny = (trained & (exponent < MAGNITUDES["tiny"][1])).any(axis=1)
+    for name, rows in (("with", tiny), ("without", ~tiny)):
+        found = _of_values(own[rows][trained[rows]])["ones in bits 1-3"]
+        statistics[f"Gaussians with tiny harmonics, ones in bits 1-3 {name}"] = found
+    return statistics
 
 
 def _of_values(values: Words32) -> dict[str, Statistic]:
@@ -111,15 +115,3 @@ def _together(values: Words32, chosen: Flags) -> Statistic:
     variance = 2 + 1 / (trials[rows] * 7 / 64) - 6 / trials[rows]
     error = float(np.sqrt(variance.sum()) / rows.sum())
     return normal(float(z2.mean() - 1), error)
-
-
-def _beside_tiny(words: BitPatterns) -> dict[str, Statistic]:
-    """Ones in the harmonics of Gaussians with a tiny harmonic, and of the others."""
-    harmonics = words.attribute >= _HARMONICS
-    tiny = (words.trained & (words.exponent < MAGNITUDES["tiny"][1]))[:, harmonics].any(axis=1)
-    statistics = {}
-    for name, rows in (("with", tiny), ("without", ~tiny)):
-        values = words.bits[rows][:, harmonics][words.trained[rows][:, harmonics]]
-        ones = sum(int((values >> bit & 1).sum()) for bit in range(1, 4))
-        statistics[f"Gaussians with tiny harmonics, ones in bits 1-3 {name}"] = share(ones, 3 * len(values))
-    return statistics

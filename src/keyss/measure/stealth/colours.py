@@ -96,7 +96,7 @@ def opacities(model: Gaussians, words: BitPatterns) -> dict[str, Statistic]:
     }
     statistics["modes of faint opacities"] = Statistic(float(len(_modes(logits[logits < _FAINT]))))
     faint = logits < _FAINT
-    for name, values in _shapes(model).items():
+    for name, values in shapes_of(model).items():
         few = min(faint.sum(), (~faint).sum()) < _MIN_GAUSSIANS
         parted = np.nan if few else float(np.median(values[faint]) - np.median(values[~faint]))
         statistics[f"faint against opaque, {name}"] = Statistic(parted)
@@ -128,7 +128,8 @@ def _modes(logits: Doubles) -> list[float]:
     return [float(edges[at - 1] + _STEP / 2) for at in peaks[separate]]
 
 
-def _shapes(model: Gaussians) -> dict[str, Doubles]:
+def shapes_of(model: Gaussians) -> dict[str, Doubles]:
+    """[N] size, shape and energies of each Gaussian by name."""
     scales = doubles(model.log_scales)
     ordered = np.sort(scales, axis=1)
     lengths = model.quats.detach().cpu().double().norm(dim=1).numpy()

@@ -13,7 +13,7 @@ from scipy.stats import ks_2samp, spearmanr
 
 from keyss.core.arrays import Doubles, Numbers, doubles
 from keyss.core.gaussians import Gaussians
-from keyss.measure.stealth.colours import INVISIBLE
+from keyss.measure.stealth.colours import INVISIBLE, shapes_of
 from keyss.measure.stealth.statistic import BitPatterns
 
 MAX_GAUSSIANS = 20_000  # of each model
@@ -47,12 +47,10 @@ def candidate_scores(file: Gaussians, candidate: Gaussians) -> dict[str, float]:
 
 def changed_low_bits(file: Gaussians, other: Gaussians) -> float:
     """Share of the Gaussians that `other` has too, but with other low bits."""
-    own, theirs = (_high_rows(each, slice(None)) for each in (file, other))
-    whole = [{row.tobytes() for row in BitPatterns.of(each).bits} for each in (file, other)]
-    shared = np.isin(own, theirs)
-    rows = BitPatterns.of(file).bits[shared]
-    same = sum(row.tobytes() in whole[1] for row in rows)
-    return float((len(rows) - same) / max(len(file), 1))
+    shared, same = (
+        np.isin(_high_rows(file, slice(None), low), _high_rows(other, slice(None), low)) for low in (_LOW, 0)
+    )
+    return float((shared & ~same).sum() / max(len(file), 1))
 
 
 def _parts(file: Gaussians) -> dict[str, Gaussians]:
@@ -105,9 +103,9 @@ def _correlation(one: Numbers, other: Numbers) -> float:
     return float(np.nan_to_num(spearmanr(one, other).statistic))
 
 
-def _high_rows(model: Gaussians, columns: slice) -> Numbers:
-    """[N] the high bits of each row as one value."""
-    high = np.ascontiguousarray(BitPatterns.of(model).bits[:, columns] >> _LOW)
+def _high_rows(model: Gaussians, columns: slice, low: int = _LOW) -> Numbers:
+    """[N] the bits above the `low` lowest of each row as one value."""
+    high = np.ascontiguousarray(BitPatterns.of(model).bits[:, columns] >> low)
     return high.view(f"V{4 * high.shape[1]}")[:, 0]
 
 
@@ -123,13 +121,9 @@ def _identity(file: Gaussians, candidate: Gaussians) -> float:
 
 def _marginals(model: Gaussians) -> dict[str, Doubles]:
     """Quantities that do not depend on the frame: shapes, energies, colours."""
-    scales = np.sort(doubles(model.log_scales), axis=1)
-    marginals = {
-        "flatness": scales[:, 1] - scales[:, 0],
-        "elongation": scales[:, 2] - scales[:, 1],
-        "brightness": model.sh[:, 0].detach().cpu().double().mean(1).numpy(),
-        "length": model.quats.detach().cpu().double().norm(dim=1).numpy(),
-    }
+    shapes = shapes_of(model) | {"brightness": doubles(model.sh[:, 0]).mean(1)}
+    kept = "flatness", "elongation", "brightness", "length of quaternions"
+    marginals = {name: shapes[name] for name in kept}
     if model.sh_degree:
         marginals |= {f"energy {index}": column for index, column in enumerate(_energies(model).T)}
     return marginals

@@ -6,9 +6,10 @@ payload. The carriers of a row are a cell (`keyss.channels.low_bits.cells`) unde
 embedding alone; its tag tells whether the embedding opens it. So rows may be pruned or reordered, the
 embedding of another key opens none and shows the cover, and the payload without the embedding shows nothing.
 
-A carrier b stands for min(b, 255 - b). Which of the two is written makes carriers as unevenly distributed as
-those of the cover are: the harmonics of a trained model become rarer with size, also within a quarter of an
-octave, and by how much follows from how large they are in their row (see `_tilts`).
+A carrier b stands for min(b, 255 - b). Which of the two is written keeps what others tell of it: harmonics
+of a trained model become rarer with size, also within a quarter of an octave, and those of three channels are
+alike. Mostly the carrier stays in the half of its quarter that the cover's is in; the rest follows from means
+of the cover's harmonics (see `_halves`).
 
 Harmonics that are exactly zero, such as those of a saturated colour, stay zero. A row with few of them has
 room for a Gaussian with all harmonics, a row with more for one without, and the others are left alone.
@@ -30,7 +31,7 @@ from torch import Tensor
 
 from keyss.channels import Content, Payload, identities, is_appended
 from keyss.channels.low_bits.cells import TAG_BYTES, CellCipher
-from keyss.core.arrays import Bytes, Integers, Words32
+from keyss.core.arrays import Bytes, Doubles, Integers, Words32
 from keyss.core.errors import InputError, UsageError
 from keyss.core.gaussians import Gaussians, compensate_pruning
 from keyss.core.similarity import Similarity
@@ -48,7 +49,9 @@ KINDS = (40, 24)  # of rows: carriers that are used where at least so many harmo
 BITS = 7  # of a carrier
 SHIFT = np.uint32(13)  # bits of a harmonic below its carrier
 _COARSEST = Table.short()  # the coarsest Gaussian
-_FEWEST = 500  # carriers that a tilt is measured on
+_FEW = 50  # harmonics of a class whose mean is trusted by half
+_COPIED = 0.7  # at most, of the chance that a carrier stays in the half of its quarter that the cover's is in
+_APART = (-768, -256, -64, 64, 256, 768)  # 256ths of a quarter of an octave between two channels: limits
 
 
 @dataclass(frozen=True)
@@ -131,8 +134,10 @@ class RowSecret:
         for codec, kind in zip(self.codecs, row_kinds(own), strict=False):
             cell, size = _cipher(embedding, codec), share(kind.carriers, self.secrets)
             if cell.cell_bytes <= size and len(kind.rows):
-                data = kind.read(own)[:, self.secret * size :]
-                fits, records = cell.decrypt(names(own)[kind.rows], data, self.secret)
+                every = names(own)[kind.rows]
+                fits, records = cell.decrypt(every, kind.read(own)[:, self.secret * size :], self.secret)
+                _, first = np.unique(every[fits], axis=0, return_index=True)  # copies of a row count once
+                records = records[np.sort(first)]
                 found += [codec.decode(records).with_sh_degree(sh_degree)] if fits.any() else []
         return Gaussians.cat(found).to(stego.device) if found else None
 
@@ -170,36 +175,37 @@ def share(carriers: int, secrets: int) -> int:
 class RowKind:
     """Rows of a model with equally many carriers in use."""
 
+    carriers: int
     rows: Integers  # [R]
     columns: npt.NDArray[np.int64]  # [R, carriers] their first harmonics that are not zero
 
-    @property
-    def carriers(self) -> int:
-        return int(self.columns.shape[1])
-
     def read(self, model: Gaussians) -> Bytes:
         """[R, bytes] what the carriers say."""
-        carriers = (self._words(model) >> SHIFT & np.uint32(255)).astype(np.uint8)
+        words = words_of(model)[self.rows[:, None], self.columns]
+        carriers = (words >> SHIFT & np.uint32(255)).astype(np.uint8)
         folded = np.where(carriers < 128, carriers, 255 - carriers)
         bits = np.unpackbits(folded[:, :, None], axis=2)[:, :, 1:]
         return np.packbits(bits.reshape(len(bits), self.carriers * BITS), axis=1)
 
-    def write(self, model: Gaussians, data: Bytes, noise: npt.NDArray[np.float64]) -> Gaussians:
-        """The same with other carriers; `noise` [R, carriers] in [0, 1) decides between two for each."""
-        bits = np.unpackbits(data, axis=1)[:, : self.carriers * BITS]
-        bits = bits.reshape(len(bits), self.carriers, BITS)
-        folded = np.packbits(np.pad(bits, ((0, 0), (0, 0), (1, 0))), axis=2)[:, :, 0]
-        middle = (folded + 0.5) / 128 - 1
-        upper = noise < (1 - _tilts(model, self) * middle) / 2
-        carriers = np.where(upper, 255 - folded, folded).astype(np.uint32)
+    def write(self, model: Gaussians, data: Bytes, noise: Doubles) -> Gaussians:
+        """The same with other carriers; `noise` [R, harmonics] in [0, 1) decides between two for each."""
+        bits = np.unpackbits(data, axis=1)[:, : self.carriers * BITS].reshape(len(data), -1, BITS)
         words = words_of(model)
-        own = self._words(model) & ~np.uint32(255 << 13) | carriers << SHIFT
-        words[self.rows[:, None], self.columns] = own
+        cover = words[self.rows]
+        folded, used = np.zeros(cover.shape, np.uint32), np.zeros(cover.shape, bool)
+        np.put_along_axis(folded, self.columns, bits @ (1 << np.arange(BITS)[::-1]), axis=1)
+        np.put_along_axis(used, self.columns, True, axis=1)
+        written = cover.copy()
+        for channel in range(3):
+            part = np.s_[:, channel::3]
+            far = (127.5 - folded[part]) / 256  # from the middle
+            own, expected = _halves(cover, written, channel)
+            upper = noise[part] < 0.5 + 6 * far * expected + np.minimum(4 * far, _COPIED) * own
+            carriers = np.where(upper, 255 - folded[part], folded[part]) << SHIFT
+            written[part] = np.where(used[part], cover[part] & ~np.uint32(255 << 13) | carriers, cover[part])
+        words[self.rows] = written
         harmonics = torch.from_numpy(words.view(np.float32)).view_as(model.sh[:, 1:])
         return replace(model, sh=torch.cat([model.sh[:, :1], harmonics], dim=1))
-
-    def _words(self, model: Gaussians) -> Words32:
-        return words_of(model)[self.rows[:, None], self.columns]
 
 
 def row_kinds(model: Gaussians) -> list[RowKind]:
@@ -210,7 +216,7 @@ def row_kinds(model: Gaussians) -> list[RowKind]:
     found, most = [], usable.max(initial=0) + 1
     for carriers in _carriers(model.sh_degree):
         rows = np.flatnonzero((usable >= carriers) & (usable < most))
-        found.append(RowKind(rows, order[rows, :carriers]))
+        found.append(RowKind(carriers, rows, order[rows, :carriers]))
         most = carriers
     return found
 
@@ -230,7 +236,7 @@ def carrying(cover: Gaussians) -> list[RowKind]:
     for kind in row_kinds(cover):
         chosen = apart[kind.rows]
         ranks = by_opacity.argsort()[kind.rows[chosen]].argsort()
-        found.append(RowKind(kind.rows[chosen][ranks], kind.columns[chosen][ranks]))
+        found.append(RowKind(kind.carriers, kind.rows[chosen][ranks], kind.columns[chosen][ranks]))
     return found
 
 
@@ -238,21 +244,39 @@ def _carriers(sh_degree: int) -> list[int]:
     return [each for each in KINDS if each <= 3 * ((sh_degree + 1) ** 2 - 1)]
 
 
-def _tilts(model: Gaussians, kind: RowKind) -> npt.NDArray[np.float64]:
-    """[R, carriers] slopes of the density of carriers, from -1 to 1, as they are in `model`.
+def _halves(cover: Words32, written: Words32, channel: int) -> tuple[Doubles, Doubles]:
+    """[R, K] in which half of its quarter of an octave a channel's harmonics are, and where they should be.
 
-    Harmonics are classed by how many quarters of an octave they are above the median of their row.
+    The cover's own half, -0.5 or 0.5, less what is expected in `cover` [R, 3 K], and the place, -0.5 to 0.5,
+    that is expected in `written` [R, 3 K]. What is expected is the mean of a class in the cover.
     """
-    words = words_of(model)[kind.rows]
+    places = ((cover[:, channel::3] >> SHIFT & np.uint32(255)) + 0.5) / 256 - 0.5
+    own, expected = np.sign(places) / 2, np.zeros(places.shape)
+    for before, after in zip(_classes(cover, channel), _classes(written, channel), strict=True):
+        count = max(before.max(), after.max()) + 1
+        sums = np.bincount(before.ravel(), places.ravel(), minlength=count)
+        means = sums / (np.bincount(before.ravel(), minlength=count) + _FEW)
+        places, own = places - means[before], own - 1.5 * means[before]
+        expected += means[after]
+    return own, expected
+
+
+def _classes(words: Words32, channel: int) -> tuple[Integers, Integers]:
+    """[R, K] two classes of each harmonic of a channel, by what is known before it is written.
+
+    By how many quarters of an octave it is above the median of its row; and by that and where the other two
+    channels are: of one that is written later, the middle of its quarter is known.
+    """
     quarters = (words >> np.uint32(21) & np.uint32(1023)).astype(np.int64)
-    above = quarters - np.median(quarters, axis=1, keepdims=True).astype(np.int64)
-    classes = np.take_along_axis(above, kind.columns, 1).clip(-20, 20) + 20
-    carriers = np.take_along_axis(words >> SHIFT & np.uint32(255), kind.columns, 1)
-    counts = np.bincount(classes.ravel(), minlength=41)
-    sums = np.bincount(classes.ravel(), ((carriers + 0.5) / 256 - 0.5).ravel(), minlength=41)
-    slopes = np.where(counts >= _FEWEST, 6 * sums / np.maximum(counts, 1), 0.0).clip(-1, 1)
-    own: npt.NDArray[np.float64] = slopes[classes]
-    return own
+    own = quarters[:, channel::3]
+    above = own - np.median(quarters, axis=1, keepdims=True).astype(np.int64)
+    every = above.clip(-8, 8) // 2 + 4
+    for other in {0, 1, 2} - {channel}:
+        carriers = (words[:, other::3] >> SHIFT & np.uint32(255)).astype(np.int64)
+        apart = (quarters[:, other::3] - own) * 256 + (carriers if other < channel else 128) - 128
+        opposite = ((words[:, other::3] ^ words[:, channel::3]) >> np.uint32(31)).astype(np.int64)
+        every = (every * 7 + np.searchsorted(_APART, apart)) * 2 + opposite
+    return above.clip(-20, 20) + 20, every
 
 
 def encrypt_rows(
@@ -267,9 +291,9 @@ def encrypt_rows(
         count, size = len(kind.rows), kind.carriers * BITS // 8
         if not count:
             continue
-        random = stream(entropy, f"carriers/{index}", count * (size + 4 * kind.carriers))
+        random = stream(entropy, f"carriers/{index}", count * (size + 12 * (len(cover.sh[0]) - 1)))
         data = np.frombuffer(random[: count * size], np.uint8).reshape(count, size).copy()
-        coins = np.frombuffer(random[count * size :], "<u4").reshape(count, kind.carriers) / 2**32
+        coins = np.frombuffer(random[count * size :], "<u4").reshape(count, -1) / 2**32
         for secret, model in zip(secrets, models, strict=True):
             if index < len(secret.codecs):
                 codec, start = secret.codecs[index], secret.secret * share(kind.carriers, secret.secrets)

@@ -45,6 +45,7 @@ PRUNED_SHARE = 0.25  # of each scene's Gaussians, the faintest, in steps that re
 T = TypeVar("T")
 
 _EMPTY = -8.0  # opacity logit of a place without a Gaussian
+_FILLING = 5  # last steps of density control, which fill places that nothing asks for
 _VIEWS = 64  # that tell how much a Gaussian of a secret contributes
 
 
@@ -168,8 +169,8 @@ def numbers_of(parameters: dict[str, T], scene: int) -> dict[str, T]:
 class DeadPlaces(CappedStrategy):
     """Density control of rows whose number stays: what is pruned becomes a place for what grows.
 
-    Thresholds and times are those of plain 3DGS. Places that nothing asks for are divided among the steps
-    that are left, so that in the end none is empty: a row without a Gaussian of the cover could carry none.
+    Thresholds and times are those of plain 3DGS. Places that nothing asks for are divided among the last
+    steps, so that in the end none is empty: a row without a Gaussian of the cover could carry none.
     """
 
     def __init__(self, fit: FitConfig, extents: Sequence[float], generator: torch.Generator) -> None:
@@ -177,9 +178,9 @@ class DeadPlaces(CappedStrategy):
         self.extents, self.generator = extents, generator
 
     def initialize_state(self, scene_scale: float = 1.0) -> dict[str, Any]:
-        """`born`: [N] the step of the cover's Gaussian in each row."""
+        """`born`: [N] the place that plain 3DGS gives the cover's Gaussian in each row."""
         state: dict[str, Any] = super().initialize_state(scene_scale)
-        return state | {"born": torch.zeros(self.max_gaussians)}
+        return state | {"born": torch.arange(self.max_gaussians)}
 
     def combined(self, renders: Sequence[Rendered], count: int) -> dict[str, Any]:
         return self.by_scene(renders, count, len(self.extents), dim=0)
@@ -201,10 +202,12 @@ class DeadPlaces(CappedStrategy):
             return
         left = (self.refine_stop_iter - 1 - step) // self.refine_every + 1
         gradients = state["grad2d"] / state["count"].clamp_min(1)
-        for scene, extent in enumerate(self.extents):
-            grown = self._grow(numbers_of(params, scene), optimizers, scene, gradients[scene], extent, left)
+        born = state["born"]
+        for scene in range(len(self.extents)):
+            own = numbers_of(params, scene)
+            grown = self._grow(own, optimizers, scene, gradients[scene], left, born).to(born.device)
             if scene == 0:
-                state["born"][grown.to(state["born"].device)] = step
+                born[grown] = born.max() + 1 + torch.arange(len(grown), device=born.device)
         state["grad2d"], state["count"] = None, None
 
     def _grow(
@@ -213,12 +216,13 @@ class DeadPlaces(CappedStrategy):
         optimizers: Optimizers,
         scene: int,
         gradients: Tensor,  # [N]
-        extent: float,
         left: int,
+        born: Tensor,  # [N]
     ) -> Tensor:
         """Clone small Gaussians and split large ones into dead places, the largest gradients first.
 
-        Returns the rows of new Gaussians.
+        Returns the rows of new Gaussians in the order in which plain 3DGS appends them: clones, then the one
+        and the other part of what was split, each in the order in which the Gaussians were `born`.
         """
         model = to_gaussians(params).detach()
         dead = model.opacities < self.prune_opa
@@ -226,10 +230,12 @@ class DeadPlaces(CappedStrategy):
         gradients = gradients.masked_fill(dead, 0)
         asking = int((gradients > self.grow_grad2d).sum())
         alive = len(dead) - len(places)
-        count = min(len(places), alive, max(asking, math.ceil(len(places) / left)))
+        filling = math.ceil(len(places) / left) if left <= _FILLING else 0
+        count = min(len(places), alive, max(asking, filling))
         source, target = gradients.topk(count).indices, places[:count]
+        source = source[born.to(source.device)[source].argsort()]
         part = model[source]
-        large = part.scales.amax(1) > self.grow_scale3d * extent
+        large = part.scales.amax(1) > self.grow_scale3d * self.extents[scene]
         noise = torch.randn(2, count, 3, generator=self.generator).to(large.device)
         offsets = noise * part.scales * large[:, None]
         rotations = normalized_quat_to_rotmat(F.normalize(part.quats, dim=1))
@@ -244,7 +250,7 @@ class DeadPlaces(CappedStrategy):
                 for key, moment in optimizers[full].state[parameter].items():
                     if key != "step":
                         moment[rows[fresh]] = 0
-        return torch.cat([source[large], target])
+        return torch.cat([target[~large], source[large], target[large]])
 
 
 @dataclass(frozen=True, kw_only=True)
