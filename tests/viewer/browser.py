@@ -33,7 +33,8 @@ SWITCHES = [
 ]
 IN_CHROMIUM = [pytest.mark.argon2, pytest.mark.skipif(PROGRAM is None, reason="no Chromium on PATH")]
 PATIENCE = 120_000  # milliseconds for any one answer: other work may share the machine
-WIDTH, HEIGHT = 400, 300
+WIDTH, HEIGHT = 400, 300  # of the canvas, beside the panel
+PANEL = 340
 POSE = "#eye=1.5,-1.2,-6&target=0.2,0.1,0"
 CLOSE = 25.0  # dB on the canvas
 Picture = np.ndarray[Any, np.dtype[np.float64]]
@@ -108,7 +109,7 @@ class Visit:
         return np.asarray(Image.open(io.BytesIO(before)).convert("RGB")).astype(np.float64)
 
     def try_key(self, key: str) -> float:
-        """Milliseconds that the search took; returns when what it found is shown."""
+        """Milliseconds that the quick search took; returns when what the searches found is shown."""
         self.page.fill("#key", key)
         milliseconds = float(
             self.page.evaluate(
@@ -125,6 +126,8 @@ class Visit:
             )
         )
         self.settle()
+        self.page.wait_for_selector("main[data-searching='']")
+        self.settle()
         return milliseconds
 
     def finds_nothing(self, key: str) -> None:
@@ -134,7 +137,7 @@ class Visit:
         assert np.abs(self.picture() - before).mean() < 0.01 * 255
         assert self.page.locator("#revealed").is_hidden()
         assert self.page.locator("#progress").is_hidden()
-        assert self.page.locator("[role=status]").inner_text() == ""
+        assert self.page.locator("[role=status]").inner_text() == "Key tried."
         assert self.page.locator("#problem").inner_text() == ""
 
     def takes_as_long_for_each(self, *keys: str) -> None:
@@ -156,7 +159,7 @@ class Visit:
 @contextmanager
 def visit(browser: Any) -> Iterator[Visit]:
     """A new tab, which must not log errors."""
-    page = browser.new_page(viewport={"width": WIDTH, "height": HEIGHT})
+    page = browser.new_page(viewport={"width": PANEL + WIDTH, "height": HEIGHT})
     page.set_default_timeout(PATIENCE)
     found = Visit(page)
     page.on("console", lambda each: found.complaints.append(each.text) if each.type == "error" else None)

@@ -61,9 +61,6 @@ def test_a_file_in_colours_is_saved_and_all_keys_look_alike(tab: Visit, tmp_path
     room = channel_for("any", "colours").prepare(lifelike(6000, 0).with_sh_degree(0))
     write_model(tmp_path / "stego.spz", room.embed([(KEY, note.payload())], entropy=bytes(32)))
     tab.goto(export_html(tmp_path / "stego.spz", tmp_path / "page.html")[0].as_uri())
-    tab.try_key(KEY)
-    assert tab.page.locator("[role=status]").inner_text() == ""  # not looked for yet
-    tab.page.check("#colours")
     seen = []
     for key in ("another key", KEY):
         tab.page.evaluate(

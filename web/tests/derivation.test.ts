@@ -1,5 +1,5 @@
 import { expect, test } from 'vitest';
-import { expand, master } from '../src/keys/derivation.ts';
+import { expand, master } from '../src/keys/keys.ts';
 import { hex, jsonVector } from './vectors.ts';
 
 interface Vector {

@@ -1,6 +1,6 @@
 import { expect, test } from 'vitest';
 import { readModel } from '../src/files/models.ts';
-import { openZip } from '../src/files/zip.ts';
+import { openZip } from '../src/files/packed.ts';
 import { columns, jsonVector, modelOf, vector } from './vectors.ts';
 
 const PUBLISHED = jsonVector<Record<string, Record<string, string>>>('published.json');

@@ -3,7 +3,7 @@ import { CellCipher } from '../src/channels/low_bits/cells.ts';
 import { LowBitsReader } from '../src/channels/low_bits/reader.ts';
 import { selected } from '../src/core/gaussians.ts';
 import { readPly, writePly } from '../src/files/ply.ts';
-import { decrypted } from '../src/keys/encryption.ts';
+import { decrypted } from '../src/keys/keys.ts';
 import { secretOf } from '../src/records/secret.ts';
 import { digest, hex, jsonVector, vector } from './vectors.ts';
 

@@ -16,7 +16,8 @@ const REVEALED = jsonVector<Revealed[]>('revealed.json');
 
 /** In the first channel in which it opens something: to look into all of them would take ten times as long. */
 async function opened(stego: ReadModel, key: string): Promise<Content | null> {
-  for (const reader of preparedFor(stego)(true).readers) {
+  const channels = preparedFor(stego);
+  for (const reader of [...channels(false).readers, ...channels(true).readers]) {
     const content = await reader.open(key);
     if (content !== null) return content;
   }

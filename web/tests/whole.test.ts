@@ -1,5 +1,5 @@
 import { expect, test } from 'vitest';
-import { unpackedZstd } from '../src/core/unpacking.ts';
+import { unpackedZstd } from '../src/core/bytes.ts';
 import { decodeWhole } from '../src/records/whole.ts';
 import { columns, digest, hex, jsonVector } from './vectors.ts';
 

@@ -26,9 +26,19 @@ def view(
     host: Annotated[
         str, arg(metavar="ADDRESS", help="Address to serve on; 0.0.0.0 lets other machines connect.")
     ] = "127.0.0.1",
+    pose: Annotated[
+        str | None,
+        optional(
+            "POSE",
+            "First view, as the page's address has it after the #.",
+            "that of the scene's photos, or all that is visible",
+        ),
+    ] = None,
     up: Annotated[
-        Literal["-y", "z", "y"], arg(help="Initial up direction: -y as in COLMAP, z as in Blender.")
-    ] = "-y",
+        Literal["-y", "z", "y", "-z", "x", "-x"] | None,
+        optional("AXIS", "Up axis: -y as in COLMAP, z as in Blender.", "found from the model"),
+    ] = None,
+    title: Annotated[str | None, optional("TEXT", "Title of the page.", "the file's name")] = None,
     overwrite: Overwrite = False,
 ) -> None:
     """Show a published model in a browser, on a page where a key can be typed.
@@ -41,12 +51,14 @@ def view(
     """
     check_there(model)
     from keyss.core.errors import UsageError
-    from keyss.viewer import ModelServer, export_html
+    from keyss.viewer import ModelServer, export_html, look_of_model
 
+    given = {"pose": pose, "up": up, "title": title}
+    look = look_of_model(model) | {name: value for name, value in given.items() if value}
     if out is not None:
         if port or host != "127.0.0.1":
             raise UsageError("--port and --host are for serving: leave them out with -o")
-        written = export_html(model, out, up=up, overwrite=overwrite)
+        written = export_html(model, out, look=look, overwrite=overwrite)
         size = sum(path.stat().st_size for path in written) / 1e6
         what = "opens in any browser" if len(written) == 1 else f"{len(written)} files for a web server"
         print(f"{out}: {size:.1f} MB; {what}")
@@ -55,7 +67,7 @@ def view(
         raise UsageError("--overwrite is for -o: leave it out")
     if not 0 <= port < 1 << 16:
         raise UsageError(f"--port: expected 0 to {(1 << 16) - 1}, got {port}")
-    server = ModelServer(model, host, port, up)
+    server = ModelServer(model, host, port, look)
     who = "only this machine" if host in ("127.0.0.1", "localhost", "::1") else f"all who can reach {host}"
     print(f"{server.address} shows {model} to {who}; press Ctrl-C to stop", flush=True)
     server.run()
@@ -89,33 +101,21 @@ def render(
     import keyss
     from keyss.core.errors import UsageError
 
-    if video is not None:
-        if out is not None or split != "test":
-            raise UsageError("--video writes no images: leave out -o and --split")
-        from keyss.api.looking import frame_count
-        from keyss.progress import reporter
+    from keyss.api.looking import frame_count
+    from keyss.progress import reporter
 
-        keyss.render(
-            model,
-            cameras,
-            **vars(photos),
-            video=video,
-            wipe=wipe,
-            seconds=seconds,
-            device=device,
-            overwrite=overwrite,
-            reporter=reporter(),
-        )
-        print(f"{video}: {frame_count(seconds)} frames")
-        return
-    if cameras is None or out is None:
+    if video is not None and (out is not None or split != "test"):
+        raise UsageError("--video writes no images: leave out -o and --split")
+    if video is None and (cameras is None or out is None):
         raise UsageError("images need --cameras SCENE and -o FOLDER; a video needs --video FILE")
-    if wipe is not None or seconds != 8.0:
+    if video is None and (wipe is not None or seconds != 8.0):
         raise UsageError("--wipe and --seconds are for videos: give --video FILE")
+    film = {"video": video, "wipe": wipe, "seconds": seconds, "reporter": reporter()}
     images = keyss.render(
-        model, cameras, split=split, **vars(photos), device=device, out=out, overwrite=overwrite
+        model, cameras, split=split, **vars(photos), **film, device=device, out=out, overwrite=overwrite
     )
-    print(f"{out}: {len(images)} image{'' if len(images) == 1 else 's'}")
+    wrote = f"{len(images)} image{'' if len(images) == 1 else 's'}"
+    print(f"{video}: {frame_count(seconds)} frames" if video else f"{out}: {wrote}")
 
 
 def info(

@@ -28,10 +28,10 @@ def reporting(out: Path, scene: Path, asked: Training) -> Iterator[Reporter]:
     if not (asked.live and answers()):
         yield reporter
         return
-    from keyss.files.layout import usual_up
     from keyss.viewer.live import LiveTraining
+    from keyss.viewer.look import look_of_scene
 
-    with LiveTraining(usual_up(scene)) as page:
+    with LiveTraining(look_of_scene(scene)) as page:
         print(f"{page.address} shows the training; only this machine can open it", flush=True)
         yield page.reporter(reporter)
 

@@ -21,6 +21,7 @@ from keyss.rendering import Backend, resolve_device
 from keyss.runs.config import HideMetrics
 from keyss.runs.files import STEGO, plain_names
 from keyss.runs.folder import RunFolder, clear
+from keyss.viewer.look import look_of_scene
 from keyss.viewer.page import page_with
 
 COVER, SECRET = "tea-table", "golden-knot"
@@ -86,7 +87,8 @@ def run_demo(
             picture = io.BytesIO()
             comparison = _comparison(out, revealed, converted, cover, secret, metrics, device)
             comparison.save(picture, "PNG", optimize=True)
-            viewer = page_with((out / STEGO).read_bytes(), Path(STEGO).name, up="z")
+            look = look_of_scene(out / SCENES / COVER)
+            viewer = page_with((out / STEGO).read_bytes(), Path(STEGO).name, look)
             files = {SECRET_PLY: revealed, COMPARISON: picture.getvalue(), KEY: f"{key}\n".encode()}
             results.write(files | {VIEWER: viewer})
         (out / VIEWER).chmod(public_mode())  # it holds the published model

@@ -6,7 +6,6 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
@@ -54,12 +53,6 @@ class SceneLayout:
     train: tuple[Photo, ...]
     test: tuple[Photo, ...]
     points: PointCloud = NO_POINTS
-
-
-def usual_up(path: Path | str) -> Literal["-y", "z"]:
-    """The up direction by the convention of a scene's layout, for models that of COLMAP."""
-    names = ("transforms_train.json", "transforms.json")  # Blender, Nerfstudio
-    return "z" if any((Path(path) / name).is_file() for name in names) else "-y"
 
 
 def hold_out(where: Path, photos: Sequence[Photo]) -> tuple[tuple[Photo, ...], tuple[Photo, ...]]:

@@ -58,7 +58,7 @@ def load_scene(
         raise UsageError(f"expected a width of at least 1 pixel, got {width}")
     behind = None if background is None else checked_background(background)
     folder = Path(path)
-    layout = _read_layout(folder, skip_missing)
+    layout = read_layout(folder, skip_missing)
     for part, purpose in ((layout.train, "to train on"), (layout.test, "to test on")):
         if not part:
             raise InputError(f"{folder}: expected at least one image {purpose}, found none")
@@ -82,7 +82,8 @@ def load_scene(
     )
 
 
-def _read_layout(folder: Path, skip_missing: bool) -> SceneLayout:
+def read_layout(folder: Path, skip_missing: bool) -> SceneLayout:
+    """The photos and cameras of a scene, of which no image is decoded. Raises InputError."""
     try:
         if not folder.is_dir():
             found = what_it_is(folder) if folder.exists() else "nothing there"

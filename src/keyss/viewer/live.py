@@ -21,6 +21,7 @@ from keyss.core.errors import KeyssError
 from keyss.core.gaussians import Gaussians
 from keyss.files.models import model_bytes
 from keyss.progress import Reporter
+from keyss.viewer.look import Look
 from keyss.viewer.page import served_page
 from keyss.viewer.serving import PageServer
 
@@ -43,13 +44,13 @@ class _Copy:
 class LiveTraining:
     """A context that serves the page of a training on a thread of its own."""
 
-    def __init__(self, up: str = "-y", timer: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, look: Look | None = None, timer: Callable[[], float] = time.monotonic) -> None:
         """Raises OutputError."""
         contents = {_STATE: ("application/json", self._state)}
         for side in ("published", "secret"):
             contents[f"{_STATE}/{side}.ply"] = ("application/octet-stream", self._opens(side))
         folder = f"/{secrets.token_urlsafe(16)}/"
-        self._server = PageServer(served_page("keyss-live", _STATE, up), contents, folder=folder)
+        self._server = PageServer(served_page("keyss-live", _STATE, look or {}), contents, folder=folder)
         self._thread = threading.Thread(target=self._server.run, daemon=True)
         self._timer = timer
         self._progress: dict[str, Any] = {}

@@ -23,6 +23,7 @@ from keyss.core.errors import InputError, KeyssWarning, OutputError, UsageError
 from keyss.files.atomic import check_not_an_input, check_output_file, mode_like, write_bytes
 from keyss.files.ply_rows import is_compressed, read_model_rows
 from keyss.files.reading import open_input
+from keyss.viewer.look import Look
 
 SCRIPT, STYLE, LICENCES, INDEX = "viewer.js", "viewer.css", "licences.txt", "index.html"
 MAX_IN_ONE_FILE = 64 << 20  # bytes of a model; browsers limit text to 512 MiB and parse it slowly
@@ -41,7 +42,7 @@ def served_policy() -> str:
     return f"default-src {_SELF}; {scripts}; img-src {_SELF} blob: data:; {_NOTHING}"
 
 
-def served_page(kind: str, url: str, up: str = "-y") -> bytes:
+def served_page(kind: str, url: str, look: Look) -> bytes:
     """The page with style and script beside it.
 
     `url` is a model's for the kind "keyss-model", that of the JSON of `LiveTraining` for "keyss-live".
@@ -51,12 +52,12 @@ def served_page(kind: str, url: str, up: str = "-y") -> bytes:
         style=f'<link rel="stylesheet" href="{STYLE}">',
         model=f'<meta name="{kind}" content="{html.escape(url)}">',
         script=f'<script src="{SCRIPT}"></script>',
-        up=up,
+        look=look,
     )
 
 
-def page_with(model: bytes, name: str, up: str = "-y") -> bytes:
-    """A self-contained page with the `model`; it shows `name`. `up` is "-y", "z" or "y"."""
+def page_with(model: bytes, name: str, look: Look) -> bytes:
+    """A self-contained page with the `model`; it shows `name`."""
     style, script = asset(STYLE).decode(), asset(SCRIPT).decode()
     data = f'<script id="model" type="application/octet-stream" data-name="{html.escape(name)}">'
     scripts = f"script-src {_hash(script)} {_WASM}; worker-src blob:"
@@ -67,22 +68,22 @@ def page_with(model: bytes, name: str, up: str = "-y") -> bytes:
         style=f"<style>{style}</style>",
         model=data + b64encode(model).decode() + "</script>",
         script=f"<!-- {licences} -->\n<script>{script}</script>",
-        up=up,
+        look=look,
     )
 
 
 def export_html(
-    model: Path | str, out: Path | str, *, up: str = "-y", overwrite: bool = False
+    model: Path | str, out: Path | str, *, look: Look | None = None, overwrite: bool = False
 ) -> tuple[Path, ...]:
     """Write the viewer with the published `model`: one file if `out` ends in .html, else a folder.
 
-    The file opens from disk; a folder, for larger models, needs a web server. `up`: "-y" as in COLMAP's
-    scenes, "z" or "y". A model in a format that the page does not read is converted, with a KeyssWarning.
+    The file opens from disk; a folder, for larger models, needs a web server. `look`: see `look_of_model`.
+    A model in a format that the page does not read is converted, with a KeyssWarning.
     Others can read what is written if they can read `model`. Returns the paths written. Raises UsageError
     for a model that is too large, InputError if it is not a model, OutputError.
     """
     model, out = Path(model), Path(out)
-    file = readable(model)
+    file, look = readable(model), look or {}
     if file.size > MAX_BYTES:
         raise UsageError(f"{model} has {file.size:,} bytes, more than the {MAX_BYTES:,} that a page loads")
     try:
@@ -98,9 +99,9 @@ def export_html(
                 "name an output folder instead, and put it on a web server"
             )
         check_not_an_input(out, [model])
-        write_bytes(check_output_file(out, overwrite), page_with(data, file.name, up), mode)
+        write_bytes(check_output_file(out, overwrite), page_with(data, file.name, look), mode)
         return (out,)
-    contents = {INDEX: served_page("keyss-model", quote(file.name), up), file.name: data}
+    contents = {INDEX: served_page("keyss-model", quote(file.name), look), file.name: data}
     contents |= {name: asset(name) for name in (SCRIPT, STYLE, LICENCES)}
     if len(contents) < 5:
         raise UsageError(f"{model} has the name of a file of the viewer: rename it")
@@ -121,9 +122,10 @@ def asset(name: str) -> bytes:
     return files("keyss.viewer").joinpath("assets", name).read_bytes()
 
 
-def _page(*, policy: str, up: str, **parts: str) -> bytes:
+def _page(*, policy: str, look: Look, **parts: str) -> bytes:
     """`page.html` with its placeholders replaced."""
-    page = asset("page.html").decode().replace('data-up="-y"', f'data-up="{html.escape(up)}"')
+    shown = "".join(f' data-{name}="{html.escape(value)}"' for name, value in look.items())
+    page = asset("page.html").decode().replace('<main id="main"', f'<main id="main"{shown}')
     parts["policy"] = f'<meta http-equiv="Content-Security-Policy" content="{html.escape(policy)}">'
     for name, part in parts.items():
         before, placeholder, after = page.partition(f"<!--{name}-->")

@@ -13,6 +13,7 @@ from typing import BinaryIO
 from urllib.parse import quote, unquote, urlsplit
 
 from keyss.core.errors import OutputError
+from keyss.viewer.look import Look
 from keyss.viewer.page import SCRIPT, STYLE, asset, readable, served_page, served_policy
 
 LOCALHOST = "127.0.0.1"
@@ -72,13 +73,15 @@ class PageServer:
 class ModelServer(PageServer):
     """Serves the page and one model."""
 
-    def __init__(self, model: Path | str, host: str = LOCALHOST, port: int = 0, up: str = "-y") -> None:
+    def __init__(
+        self, model: Path | str, host: str = LOCALHOST, port: int = 0, look: Look | None = None
+    ) -> None:
         """`port` 0 takes any free port. Warns (KeyssWarning) if the model is converted for the page.
 
         Raises InputError if `model` is not a model, OutputError if the port is in use.
         """
         file = readable(Path(model))
-        page = served_page("keyss-model", f"model/{quote(file.name)}", up)
+        page = served_page("keyss-model", f"model/{quote(file.name)}", look or {})
         super().__init__(page, {f"model/{file.name}": ("application/octet-stream", file.open)}, host, port)
 
 

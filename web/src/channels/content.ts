@@ -1,5 +1,7 @@
 /** What every channel of a model gives. */
-import type { Derive } from '../keys/derivation.ts';
+import { bytesKey } from '../core/bytes.ts';
+import { damaged } from '../core/errors.ts';
+import type { Derive } from '../keys/keys.ts';
 
 /** Small pieces of one size that are found one by one. */
 export interface Records {
@@ -25,4 +27,14 @@ export interface Reader {
 
   /** What `key` opens, null for nothing. Raises InputError for damage. */
   open(key: string, derive?: Derive): Promise<Content | null>;
+}
+
+const METHOD_BYTES = 15;
+
+/** Of the method's name, a zero, the data; `keyss.channels.payloads` on the other side. */
+export function unpackPayload(packed: Uint8Array): Payload {
+  const length = packed.indexOf(0);
+  const name = packed.subarray(0, length);
+  if (length < 1 || length > METHOD_BYTES || name.some((each) => each > 127)) throw damaged();
+  return { service: 'payload', method: bytesKey(name), data: packed.slice(length + 1) };
 }

@@ -2,23 +2,23 @@
  * Opening with a key, in whichever channel of a model the secret lies; `keyss.channels.opening` on the other side.
  *
  * All channels are looked through for every key, also when one of them has opened already: how long it takes tells
- * neither whether a key opens something nor where. Colours are looked through when that is asked for, with whatever key:
- * they take four times as long as all others together.
+ * neither whether a key opens something nor where. Colours come second, with whatever key: they take four times as long as
+ * all others together.
  */
 import type { ReadModel } from '../files/models.ts';
-import type { Derive } from '../keys/derivation.ts';
+import type { Derive } from '../keys/keys.ts';
 import { AppendedReader } from './appended/reader.ts';
 import { CodesReader } from './codes/reader.ts';
 import { ColoursReader } from './colours/reader.ts';
 import type { Content, Reader } from './content.ts';
 import { LowBitsReader } from './low_bits/reader.ts';
 
-/** A model's channels, prepared for any number of keys; with `colours`, as soon as that is asked for, these too. */
-export function preparedFor(model: ReadModel): (colours: boolean) => Channels {
+/** A model's channels, prepared for any number of keys: those that are quick to search, and what is left. */
+export function preparedFor(model: ReadModel): (thorough: boolean) => Channels {
   const exact = model.codes ? CodesReader.of(model.codes) : LowBitsReader.of(model);
   const quick = [exact, AppendedReader.of(model)].filter((each) => each !== null);
-  let all: Reader[] | null = null;
-  return (colours) => new Channels(colours ? (all ??= [...quick, ColoursReader.of(model)]) : quick);
+  let colours: Reader | null = null;
+  return (thorough) => new Channels(thorough ? [(colours ??= ColoursReader.of(model))] : quick);
 }
 
 /** Several channels, of which the first one that opens counts. */

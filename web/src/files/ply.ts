@@ -50,7 +50,8 @@ export function plyHeader(bytes: Uint8Array): PlyHeader {
     } else if (words[0] === 'property' && words.length === 3 && last && TYPES.has(words[1])) {
       last.properties.push({ name: words[2], type: words[1], offset: last.stride });
       last.stride += TYPES.get(words[1])!.size;
-    } else if (!['', 'comment', 'obj_info'].includes(words[0])) throw notWhole();
+    } else if (words[1] === 'list') throw noModel(); // a mesh
+    else if (!['', 'comment', 'obj_info'].includes(words[0])) throw notWhole();
   }
   if (!['binary_little_endian', 'binary_big_endian'].includes(format)) {
     throw new InputError('This .ply is not a binary one.');

@@ -3,8 +3,7 @@ import { damaged, InputError } from '../core/errors.ts';
 import { coefficients, emptyGaussians, type Gaussians } from '../core/gaussians.ts';
 import { fromSmallestThree, holds, logit } from './coded.ts';
 import { checkedFinite } from './ply.ts';
-import { browserPixels, type Pixels } from './webp.ts';
-import { openZip } from './zip.ts';
+import { browserPixels, openZip, type Pixels } from './packed.ts';
 
 export const FINEST = 65535; // a position's largest code
 export const LARGEST = 252; // of the fourth byte of a quaternion: w, x, y or z is not stored

@@ -1,9 +1,8 @@
 /** Reader of SPZ, versions 2 to 4; `keyss.files.formats.spz` on the other side. */
 import { decompress } from 'fzstd';
-import { viewOf } from '../core/bytes.ts';
+import { unpacked, viewOf } from '../core/bytes.ts';
 import { damaged, InputError } from '../core/errors.ts';
 import { coefficients, emptyGaussians, type Gaussians } from '../core/gaussians.ts';
-import { unpacked } from '../core/unpacking.ts';
 import { fromSmallestThree, holds, logit } from './coded.ts';
 
 const LEGACY_BYTES = 16;
@@ -68,11 +67,8 @@ function header(bytes: Uint8Array, versions: number[], size: number): Header & {
   return { version, count, shDegree, fractionalBits, sizes };
 }
 
-function codesOf({ version, count, shDegree, fractionalBits }: Header, sections: Uint8Array[]): SpzCodes {
-  const [positions, alphas, colours, scales, rotations, harmonics] = sections;
-  return {
-    kind: 'spz', version, count, shDegree, fractionalBits, positions, alphas, colours, scales, rotations, harmonics,
-  };
+function codesOf(header: Header, [positions, alphas, colours, scales, rotations, harmonics]: Uint8Array[]): SpzCodes {
+  return { kind: 'spz', ...header, positions, alphas, colours, scales, rotations, harmonics };
 }
 
 async function legacy(bytes: Uint8Array): Promise<SpzCodes> {

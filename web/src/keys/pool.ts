@@ -1,5 +1,5 @@
 /** Deriving many keys: one after the other, or several side by side. */
-import { type Derive, master } from './derivation.ts';
+import { type Derive, master } from './keys.ts';
 
 /** `derive` for one key after the other, however many are asked for at once: each takes 64 MiB. */
 export function oneByOne(derive: Derive): Derive {

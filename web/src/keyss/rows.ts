@@ -4,10 +4,9 @@ import { fieldsOf, IDENTITY_BYTES, identities } from '../channels/low_bits/bits.
 import { CellCipher } from '../channels/low_bits/cells.ts';
 import { rowsOf } from '../core/bytes.ts';
 import { changed, damaged } from '../core/errors.ts';
-import { emptyGaussians, type Gaussians, opacity, withDegree } from '../core/gaussians.ts';
-import { expand } from '../keys/derivation.ts';
+import { compensated, emptyGaussians, type Gaussians, opacity, withDegree } from '../core/gaussians.ts';
+import { expand } from '../keys/keys.ts';
 import { Codec } from '../records/codec.ts';
-import { compensated } from '../records/compensation.ts';
 import type { Tensors } from './safetensors.ts';
 
 const KINDS = [40, 24]; // of rows: carriers that are used where at least so many harmonics are not zero

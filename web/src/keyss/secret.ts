@@ -1,9 +1,8 @@
 /** A secret of the method keyss, of either version; `keyss.methods.keyss.secret` in Python. */
 import { changed, damaged, otherVersion } from '../core/errors.ts';
-import { type Gaussians, opacity, where } from '../core/gaussians.ts';
+import { compensated, type Gaussians, opacity, where } from '../core/gaussians.ts';
 import { inverse, isSimilarity, moved, type Similarity } from '../core/similarity.ts';
 import { ascii } from '../core/bytes.ts';
-import { compensated } from '../records/compensation.ts';
 import { Decoder } from './decoder.ts';
 import { decodeRows } from './rows.ts';
 import { numbersOf, objectOf, parsed, readTensors } from './safetensors.ts';

@@ -7,15 +7,10 @@ const KEY_STEP = 0.06; // of the distance for each press
 const KEY_ZOOM = 1.1;
 const [NEAREST, FURTHEST] = [1e-4, 1e5];
 
-interface Pointer {
-  x: number;
-  y: number;
-}
-
 export class Controls {
   flying = false;
   touched = false; // whether somebody moved the camera
-  private readonly pointers = new Map<number, Pointer>();
+  private readonly pointers = new Map<number, { x: number; y: number }>();
 
   /** `moved` is told of every new pose; `home` gives the first one again. */
   constructor(
@@ -36,7 +31,8 @@ export class Controls {
     canvas.addEventListener('wheel', (event) => {
       event.preventDefault();
       this.touched = true;
-      this.zoom(Math.exp(event.deltaY * 0.001));
+      // Browsers give a pinch on a trackpad as a wheel with Ctrl, and some give lines in the place of pixels.
+      this.zoom(Math.exp(event.deltaY * (event.ctrlKey ? 0.01 : 0.001) * (event.deltaMode ? 16 : 1)));
     }, { passive: false });
     canvas.addEventListener('keydown', (event) => this.pressed(event));
   }
@@ -52,8 +48,7 @@ export class Controls {
     const [dx, dy] = [event.clientX - before.x, event.clientY - before.y];
     if (this.pointers.size === 2) this.pinched(event, dx, dy, height);
     else if (event.shiftKey || event.buttons & 6) this.fly(-dx / height, -dy / height, 0);
-    else if (this.flying) this.look(-dx * TURN, -dy * TURN);
-    else this.orbit(dx * TURN, dy * TURN);
+    else this.turn(dx * TURN, (this.flying ? -dy : dy) * TURN);
     this.pointers.set(event.pointerId, { x: event.clientX, y: event.clientY });
   }
 
@@ -67,14 +62,11 @@ export class Controls {
 
   private pressed(event: KeyboardEvent): void {
     if (event.ctrlKey || event.metaKey || event.altKey) return;
-    // Around a thing, an arrow moves the camera; in flight it turns the head.
-    const turn = (azimuth: number, elevation: number): void =>
-      this.flying ? this.look(-azimuth, elevation) : this.orbit(azimuth, elevation);
     const actions: Record<string, () => void> = {
-      ArrowLeft: () => turn(KEY_TURN, 0),
-      ArrowRight: () => turn(-KEY_TURN, 0),
-      ArrowUp: () => turn(0, KEY_TURN),
-      ArrowDown: () => turn(0, -KEY_TURN),
+      ArrowLeft: () => this.turn(KEY_TURN, 0),
+      ArrowRight: () => this.turn(-KEY_TURN, 0),
+      ArrowUp: () => this.turn(0, KEY_TURN),
+      ArrowDown: () => this.turn(0, -KEY_TURN),
       w: () => this.fly(0, 0, KEY_STEP),
       s: () => this.fly(0, 0, -KEY_STEP),
       a: () => this.fly(-KEY_STEP, 0, 0),
@@ -93,14 +85,11 @@ export class Controls {
     action();
   }
 
-  private orbit(azimuth: number, elevation: number): void {
+  /** Around what the camera looks at; in flight, of the head. */
+  private turn(azimuth: number, elevation: number): void {
     const { eye, target, up } = this.pose;
-    this.setPose({ eye: add(target, turned(difference(eye, target), up, azimuth, elevation)), target, up });
-  }
-
-  private look(azimuth: number, elevation: number): void {
-    const { eye, target, up } = this.pose;
-    this.setPose({ eye, target: add(eye, turned(difference(target, eye), up, -azimuth, elevation)), up });
+    if (this.flying) this.setPose({ eye, target: add(eye, turned(difference(target, eye), up, azimuth, elevation)), up });
+    else this.setPose({ eye: add(target, turned(difference(eye, target), up, azimuth, elevation)), target, up });
   }
 
   private zoom(factor: number): void {

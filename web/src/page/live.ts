@@ -16,15 +16,12 @@ interface State {
   readonly versions: Record<TrainedSide, number>; // 0: not there
 }
 
-export interface Audience {
-  /** A newer model; `anew`: the first one of a training. Resolves when it can be seen. */
-  trained(side: TrainedSide, ply: Uint8Array, anew: boolean): Promise<void>;
-  /** How far it is. */
-  tell(text: string): void;
-}
-
-/** Resolves when the training has ended. */
-export async function watch(address: string, audience: Audience): Promise<void> {
+/**
+ * Resolves when the training has ended. `tell`: how far it is; `trained`: a newer model can be seen; `anew`: the first one.
+ */
+export async function watch(
+  address: string, tell: (text: string) => void, trained: (side: TrainedSide, ply: Uint8Array, anew: boolean) => Promise<void>,
+): Promise<void> {
   const shown: Record<TrainedSide, number> = { published: 0, secret: 0 };
   const titles: Partial<Record<TrainedSide, string>> = {};
   let state: State | null = null;
@@ -32,11 +29,11 @@ export async function watch(address: string, audience: Audience): Promise<void> 
     try {
       state = JSON.parse(new TextDecoder().decode(await fetched(address))) as State;
       failures = 0;
-      audience.tell(textOf(state));
+      tell(textOf(state));
       for (const side of SIDES) {
         if (state.versions[side] <= shown[side]) continue;
         const ply = await fetched(`${address}/${side}.ply`);
-        await audience.trained(side, ply, titles[side] !== state.title);
+        await trained(side, ply, titles[side] !== state.title);
         shown[side] = state.versions[side];
         titles[side] = state.title;
       }
@@ -45,7 +42,7 @@ export async function watch(address: string, audience: Audience): Promise<void> 
     }
     await new Promise((resolve) => setTimeout(resolve, AGAIN));
   }
-  audience.tell(`${state ? `${textOf(state)} ` : ''}The training has ended.`);
+  tell(`${state ? `${textOf(state)} ` : ''}The training has ended.`);
 }
 
 function textOf({ title, iteration, iterations, gaussians, numbers }: State): string {

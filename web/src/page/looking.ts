@@ -1,9 +1,7 @@
 /** What anybody sees without a key: the published model, filtered and coloured by its numbers, as the panel says. */
 import { emptyGaussians, type Gaussians, opacity, where } from '../core/gaussians.ts';
-import { page } from './elements.ts';
-import { count } from './panel.ts';
+import { count, page } from './panel.ts';
 
-export const COLOURINGS = ['as it is', 'opacity', 'size', 'elongation', 'rotation', 'low bits'] as const;
 const OPAQUE_LOGIT = 3;
 const SH_C0 = 0.28209479177387814;
 const FAINT = 0.1; // opacity below which Gaussians are called faint, unless another threshold is chosen
@@ -30,7 +28,7 @@ export function looked(model: Gaussians): Gaussians {
   const [threshold, below] = [Number(page.threshold.value), page.faint.checked];
   const opacities = model.opacityLogits.map(opacity);
   let found = where(model, (row) => opacities[row] < threshold === below);
-  if (page.colouring.value !== COLOURINGS[0]) found = coloured(found, page.colouring.value);
+  if (page.colouring.value !== 'as it is') found = coloured(found, page.colouring.value);
   if (page.opaque.checked) found = { ...found, opacityLogits: found.opacityLogits.map(() => OPAQUE_LOGIT) };
   const faint = opacities.filter((each) => each < MIN_DRAWN).length;
   page.count.textContent =

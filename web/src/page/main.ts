@@ -2,34 +2,42 @@
 import type { Gaussians } from '../core/gaussians.ts';
 import { writePly } from '../files/ply.ts';
 import { Controls } from './controls.ts';
-import { page } from './elements.ts';
 import { type TrainedSide, watch } from './live.ts';
-import { COLOURINGS, listenToLooks, looked } from './looking.ts';
+import { listenToLooks, looked } from './looking.ts';
 import { Opener } from './opener.ts';
-import { count, placeBorder, preparePanel, save, showKey } from './panel.ts';
-import { alike, firstPose, type Pose, poseOfHash, poseToHash, UPS, upOf } from './pose.ts';
+import { count, page, placeBorder, preparePanel, save, showKey } from './panel.ts';
+import {
+  add, alike, axes, FIELD_OF_VIEW, firstPose, picked, type Pose, poseOfHash, poseToHash, rolled, UPS, upName, type Vector,
+} from './pose.ts';
 import { givenModel } from './sources.ts';
 import { Viewer } from './viewer.ts';
 
 const ADDRESS_AFTER = 400; // milliseconds after the last movement
 const MAX_BYTES = 2 ** 31;
-const EMBEDDED = location.protocol === 'about:'; // in another page, which has the address to itself
+const NO_WEBGL = "Your browser doesn't support WebGL 2, which is needed to show the model.";
+const INTERRUPTED = 'The browser interrupted graphics. The picture comes back by itself; if not, reload the page.';
 
 class Page {
   private name = 'model';
   private published: Gaussians | null = null;
   private secret: Gaussians | null = null;
-  private readonly opener = new Opener((share) => this.searched(share));
+  private readonly opener = new Opener((share) => {
+    if (share < 1) page.progress.value = share;
+    else this.searches('');
+  });
   private readonly controls: Controls;
-  private pose: Pose = { eye: [0, 0, -1], target: [0, 0, 0], up: upOf(page.main.dataset.up) };
+  private pose: Pose = { eye: [0, 0, -1], target: [0, 0, 0], up: UPS['-y'] };
+  private readonly homes = new WeakMap<Gaussians, Pose>(); // the first poses
+  private roll = 0; // degrees, of the slider
   private addressTimer = 0;
-  private loads = 0;
-  private attempts = 0;
+  private asked = location.hash; // by whoever opened the page; later ones are written by the page itself
+  private work = 0; // loads and attempts so far: what another one has followed is dropped
 
-  constructor(private readonly viewer: Viewer) {
+  /** Without a viewer keys can be tried, and nothing is drawn. */
+  constructor(private readonly viewer: Viewer | null) {
     this.controls = new Controls(page.picture, this.pose, (pose) => this.moved(pose), () => this.firstPose());
-    page.up.value = this.pose.up;
     this.listen();
+    page.drawn.disabled = page.wipe.disabled = viewer === null;
   }
 
   private listen(): void {
@@ -42,10 +50,17 @@ class Page {
       this.controls.flying = !this.controls.flying;
       page.fly.setAttribute('aria-pressed', String(this.controls.flying));
     });
-    page.up.addEventListener('input', () => {
-      this.pose = { ...this.pose, up: upOf(page.up.value) };
-      this.controls.setPose(this.firstPose());
+    page.up.addEventListener('input', () => this.controls.setPose(this.firstPose(UPS[page.up.value])));
+    page.roll.addEventListener('input', () => {
+      const before = this.roll;
+      this.roll = Number(page.roll.value);
+      this.controls.setPose(rolled(this.pose, ((this.roll - before) * Math.PI) / 180));
     });
+    page.background.addEventListener('input', () => this.viewer?.setBackground(page.background.value));
+    page.picture.addEventListener('webglcontextlost', () => this.say(INTERRUPTED));
+    page.picture.addEventListener('webglcontextrestored', () => this.say(''));
+    page.picture.addEventListener('dblclick', (event) => this.lookAt(event));
+    page.stop.addEventListener('click', () => this.opener.stop());
     page.home.addEventListener('click', () => this.controls.setPose(this.firstPose()));
     page.snapshot.addEventListener('click', () => void this.snapshot());
     page.download.addEventListener('click', () => {
@@ -53,12 +68,15 @@ class Page {
     });
     page.close.addEventListener('click', () => this.closeSecret());
     page.wipe.addEventListener('input', () => this.split(Number(page.wipe.value) / 100));
+    if (page.main.dataset.background) page.background.value = page.main.dataset.background;
+    this.viewer?.setBackground(page.background.value);
     listenToLooks(() => {
       this.showPublished();
       if (this.secret) this.split(1); // it is the published one that is looked at
     });
     window.addEventListener('hashchange', ({ newURL }) => {
-      const pose = poseOfHash(new URL(newURL).hash); // that of now may be one that was written meanwhile
+      this.asked = new URL(newURL).hash; // that of now may be one that was written meanwhile
+      const pose = poseOfHash(this.asked);
       if (pose) this.controls.setPose(pose);
     });
   }
@@ -70,35 +88,31 @@ class Page {
     const source = givenModel();
     if (source === null) return this.say('Open a file, or drop one here.');
     this.say('Loading …');
-    let bytes: Uint8Array;
-    try {
-      bytes = await source.bytes();
-    } catch {
-      return this.fail('The file in the address could not be loaded.');
-    }
-    return this.load(bytes, source.name);
+    const bytes = await source.bytes().catch(() => null);
+    return bytes ? this.load(bytes, source.name) : this.fail('The file in the address could not be loaded.');
   }
 
   private async openFile(file: File): Promise<void> {
     if (page.main.dataset.live !== undefined) return;
     if (file.size > MAX_BYTES) return this.fail('This file is larger than 2 GiB.');
+    for (const given of ['pose', 'camera', 'up', 'title']) delete page.main.dataset[given]; // were the first file's
     return this.load(new Uint8Array(await file.arrayBuffer()), file.name);
   }
 
   private async load(bytes: Uint8Array, name: string): Promise<void> {
-    const own = ++this.loads;
+    const own = this.begun();
     this.say('Reading …');
-    page.problem.textContent = '';
-    const { model, error } = await this.opener.load(bytes, name);
-    if (own !== this.loads) return;
+    page.problem.textContent = this.viewer ? '' : NO_WEBGL;
+    const { model, error } = await this.opener.ask({ bytes, name }, [bytes.buffer]);
+    if (own !== this.work) return;
     if (model === undefined) return this.fail(error ?? 'This file cannot be read.');
-    [this.name, this.published] = [name, model];
+    [this.name, this.published] = [page.main.dataset.title ?? name, model];
     this.hideSecret();
     page.open.disabled = page.key.disabled = false;
     page.facts.textContent = `${this.name}\n${count(model.count)} Gaussians, SH degree ${model.shDegree}`;
-    document.title = `${name} · keyss viewer`;
+    document.title = `${this.name} · keyss viewer`;
     this.showPublished();
-    this.controls.setPose((!EMBEDDED && poseOfHash(location.hash)) || this.firstPose());
+    this.controls.setPose(poseOfHash(this.asked) ?? poseOfHash(page.main.dataset.pose ?? '') ?? this.firstPose());
     await this.picture();
     this.say('');
   }
@@ -108,21 +122,18 @@ class Page {
     page.main.dataset.live = '';
     document.title = 'keyss, training';
     page.facts.textContent = 'A training, as it is now';
-    await watch(address, {
-      tell: (text) => this.say(text),
-      trained: async (side, ply, anew) => this.trained(side, ply, anew),
-    });
+    await watch(address, (text) => this.say(text), (side, ply, anew) => this.trained(side, ply, anew));
   }
 
   private async trained(side: TrainedSide, ply: Uint8Array, anew: boolean): Promise<void> {
-    const { model } = await this.opener.load(ply, `${side}.ply`, true);
+    const { model } = await this.opener.ask({ bytes: ply, keyless: true }, [ply.buffer]);
     if (model === undefined) return;
     if (side === 'published') {
       this.published = model;
       this.showPublished();
     } else {
       this.secret = model;
-      this.viewer.show(model, 'right');
+      this.viewer?.show(model, 'right');
       if (page.revealed.hidden) this.split(0);
       page.revealed.hidden = this.published === null; // nothing to wipe with
     }
@@ -133,58 +144,69 @@ class Page {
   }
 
   /**
-   * A key that opens nothing changes nothing, and nothing is said about it. The search makes the same passes for every
-   * key, and the form is ready again when it ends: how long decoding and rendering a secret take is not part of it.
+   * A key that opens nothing changes nothing, and one line is said after every key. The form is ready again when the
+   * quick search ends, before a secret is decoded and rendered; the thorough one follows by itself, for every key.
    */
   private async unlock(): Promise<void> {
-    const [key, own] = [page.key.value, this.loads];
+    const key = page.key.value;
     if (!key || this.published === null || page.open.disabled) return;
-    const attempt = ++this.attempts;
-    delete page.main.dataset.picture;
-    this.say('Trying the key …');
-    this.searched(0);
-    const { model, file } = await this.opener.unlock(key, page.colours.checked);
-    if (attempt === this.attempts) this.searched(1); // else the next attempt has begun
-    if (file && own === this.loads) {
-      const name = file.name.replace(/[^\p{L}\p{N} ._-]/gu, '_') || 'file';
-      page.save.textContent = `Save ${name} (${count(file.data.length)} bytes)`;
-      page.save.onclick = () => save(name, new Blob([file.data as BlobPart]));
-      page.save.hidden = false;
-      this.say('A file is hidden here.');
+    const own = this.begun();
+    let said = 'Key tried.';
+    for (const search of ['quick', 'thorough'] as const) {
+      this.searches(search);
+      this.say(search === 'quick' ? 'Trying the key …' : `${said} Searching more thoroughly …`);
+      delete page.main.dataset.picture;
+      const { model, file, stopped } = await this.opener.ask({ key, thorough: search === 'thorough' });
+      if (own !== this.work) return;
+      this.searches('');
+      if (file) said += this.offer(file);
+      if (model) said += this.reveal(model);
+      this.say(stopped ? `${said} Search stopped.` : said);
+      await this.picture();
+      if (own !== this.work) return;
     }
-    if (model && own === this.loads) {
-      this.reveal(model);
-      this.say(`The secret is shown: ${count(model.count)} Gaussians.`);
-    }
-    await this.picture();
   }
 
-  /** The share of the channels that an attempt has searched, 0 to 1. */
-  private searched(share: number): void {
-    const ends = share === 1;
-    if (ends && !page.open.disabled) return;
-    page.open.disabled = !ends;
-    page.main.setAttribute('aria-busy', String(!ends));
-    page.progress.value = share;
-    page.progress.hidden = ends;
-    if (!ends) return;
+  /** A new piece of work, which ends the search that goes on. */
+  private begun(): number {
+    this.opener.stop();
+    this.searches('');
+    return ++this.work;
+  }
+
+  private searches(search: 'quick' | 'thorough' | ''): void {
+    const isBusy = search === 'quick';
+    page.main.dataset.searching = search;
+    page.progress.value = 0;
+    if (isBusy === page.open.disabled || this.published === null) return;
+    page.open.disabled = isBusy;
+    page.main.setAttribute('aria-busy', String(isBusy));
+    if (isBusy) return;
     page.key.value = '';
     showKey(false);
-    this.say('');
+  }
+
+  private offer(file: { name: string; data: Uint8Array }): string {
+    const name = file.name.replace(/[^\p{L}\p{N} ._-]/gu, '_') || 'file';
+    page.save.textContent = `Save ${name} (${count(file.data.length)} bytes)`;
+    page.save.onclick = () => save(name, new Blob([file.data as BlobPart]));
+    page.save.hidden = false;
+    return ' It reveals a file.';
   }
 
   /** Seen as what was there before was. */
-  private reveal(model: Gaussians): void {
-    const pose = alike(this.pose, this.secret ?? this.published ?? model, model);
+  private reveal(model: Gaussians): string {
+    const pose = this.likewise(this.pose, this.secret ?? this.published ?? model, model);
     this.secret = model;
-    this.viewer.show(model, 'right');
+    this.viewer?.show(model, 'right');
     this.split(0);
     page.revealed.hidden = false;
     this.controls.setPose(pose);
+    return ` It reveals a model of ${count(model.count)} Gaussians.`;
   }
 
   private closeSecret(): void {
-    const pose = this.secret && this.published ? alike(this.pose, this.secret, this.published) : this.pose;
+    const pose = this.secret && this.published ? this.likewise(this.pose, this.secret, this.published) : this.pose;
     this.hideSecret();
     this.controls.setPose(pose);
     this.writeAddress();
@@ -195,32 +217,62 @@ class Page {
   private hideSecret(): void {
     this.secret = null;
     page.revealed.hidden = page.save.hidden = true;
-    this.viewer.show(null, 'right');
+    this.viewer?.show(null, 'right');
     placeBorder(null);
   }
 
   /** How much of the width shows the published model, beside the secret: 0 to 1. */
   private split(share: number): void {
     page.wipe.value = String(100 * share);
-    this.viewer.setSplit(share);
+    this.viewer?.setSplit(share);
     placeBorder(share);
   }
 
   private async snapshot(): Promise<void> {
-    save(`${this.name.replace(/\.\w+$/, '') || 'view'}.png`, await this.viewer.snapshot());
+    const picture = await this.viewer?.snapshot();
+    if (picture) save(`${this.name.replace(/\.\w+$/, '') || 'view'}.png`, picture);
   }
 
-  private firstPose(): Pose {
+  /** Of the model that is shown: anew, since the window's size or the way up may be others. */
+  private firstPose(up?: Vector): Pose {
+    page.roll.value = String((this.roll = 0));
     const model = this.secret ?? this.published;
-    const aspect = page.picture.clientWidth / Math.max(1, page.picture.clientHeight);
-    return model ? firstPose(model, this.pose.up, aspect || 1) : this.pose;
+    if (model === null) return this.pose;
+    this.homes.delete(model);
+    return this.home(model, up);
+  }
+
+  /** A model's first pose; that of the published one from the side of the cameras that it was made with. */
+  private home(model: Gaussians, up?: Vector): Pose {
+    const { camera, up: given } = page.main.dataset;
+    const aspect = page.picture.clientWidth / Math.max(1, page.picture.clientHeight) || 1;
+    const isOwn = model === this.published;
+    const captured = isOwn && !up && !given ? poseOfHash(camera ?? '') : null;
+    const found = this.homes.get(model) ?? firstPose(model, aspect, up ?? (isOwn ? UPS[given ?? ''] : undefined), captured);
+    this.homes.set(model, found);
+    return found;
+  }
+
+  private likewise(pose: Pose, from: Gaussians, to: Gaussians): Pose {
+    return from === to ? pose : alike(pose, this.home(from), this.home(to));
+  }
+
+  /** Turns the camera to what was clicked, which it goes around from now on. */
+  private lookAt({ offsetX, offsetY }: MouseEvent): void {
+    const { clientWidth: width, clientHeight: height } = page.picture;
+    const { right, down, forward } = axes(this.pose);
+    const scale = (2 * Math.tan((FIELD_OF_VIEW * Math.PI) / 360)) / height;
+    const ray = add(add(forward, right, (offsetX - width / 2) * scale), down, (offsetY - height / 2) * scale);
+    const model = this.secret ?? this.published;
+    const target = model && picked(model, this.pose.eye, ray);
+    if (target) this.controls.setPose({ ...this.pose, target });
   }
 
   private moved(pose: Pose): void {
     this.pose = pose;
-    page.up.value = pose.up;
-    if (this.secret) this.viewer.setPose(pose, 'right');
-    this.viewer.setPose(this.secret && this.published ? alike(pose, this.secret, this.published) : pose);
+    page.up.value = upName(pose.up) ?? '';
+    if (this.secret) this.viewer?.setPose(pose, 'right');
+    this.viewer?.setPose(this.secret && this.published ? this.likewise(pose, this.secret, this.published) : pose);
     clearTimeout(this.addressTimer);
     this.addressTimer = window.setTimeout(() => this.writeAddress(), ADDRESS_AFTER);
   }
@@ -229,18 +281,18 @@ class Page {
   private writeAddress(): void {
     clearTimeout(this.addressTimer);
     const hash = poseToHash(this.pose);
-    if (this.published && !this.secret && !EMBEDDED && location.hash !== hash) history.replaceState(null, '', hash);
+    if (this.published && !this.secret && location.hash !== hash) history.replaceState(null, '', hash);
   }
 
   private showPublished(): void {
     if (this.published === null) return;
     const model = looked(this.published);
-    this.viewer.show(model.count ? model : null);
+    this.viewer?.show(model.count ? model : null);
   }
 
   private async picture(): Promise<void> {
     delete page.main.dataset.picture;
-    await this.viewer.settled();
+    await this.viewer?.settled();
     page.main.dataset.picture = 'settled';
   }
 
@@ -255,15 +307,8 @@ class Page {
 }
 
 async function main(): Promise<void> {
-  for (const colouring of COLOURINGS) page.colouring.add(new Option(colouring));
-  for (const up of UPS) page.up.add(new Option(up));
-  let viewer: Viewer;
-  try {
-    viewer = await Viewer.on(page.picture);
-  } catch {
-    page.problem.textContent = 'This browser has no WebGL 2, without which nothing can be drawn.';
-    return;
-  }
+  const viewer = await Viewer.on(page.picture).catch(() => null);
+  page.problem.textContent = viewer ? '' : NO_WEBGL;
   await new Page(viewer).start();
 }
 

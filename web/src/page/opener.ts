@@ -1,20 +1,20 @@
 /** The worker that reads files and tries keys, as functions. */
 import WORKER from 'source:../worker.ts';
 import { started } from '../keys/pool.ts';
-import type { Answer, Question } from '../protocol.ts';
+import type { Answer, Question } from '../worker.ts';
 
 export class Opener {
-  private readonly worker: Worker;
+  private readonly worker = started(WORKER);
   private readonly waiting = new Map<number, (answer: Answer) => void>();
   private next = 0;
 
   /** `onProgress` gets the share of an attempt that is done, 0 to 1, at the same times for every key. */
   constructor(private readonly onProgress: (share: number) => void) {
-    this.worker = started(WORKER);
     this.worker.onmessage = ({ data }: MessageEvent<Answer>) => {
-      if (data.progress !== undefined) return this.onProgress(data.progress);
-      this.waiting.get(data.id)?.(data);
+      const resolve = this.waiting.get(data.id);
+      if (resolve && data.progress !== undefined) return this.onProgress(data.progress);
       this.waiting.delete(data.id);
+      resolve?.(data);
     };
     this.worker.onerror = () => {
       for (const [id, resolve] of this.waiting) resolve({ id, error: 'This file cannot be read.' });
@@ -22,20 +22,18 @@ export class Opener {
     };
   }
 
-  /** The model in a file; unless it is `keyless`, keys are tried on it from now on. */
-  load(bytes: Uint8Array, name: string, keyless = false): Promise<Answer> {
-    return this.ask({ id: this.next++, bytes, name, keyless }, [bytes.buffer as ArrayBuffer]);
-  }
-
-  /** What a key opens; in colours, too, where these are to be looked through. */
-  unlock(key: string, colours: boolean): Promise<Answer> {
-    return this.ask({ id: this.next++, key, colours });
-  }
-
-  private ask(question: Question, moved: Transferable[] = []): Promise<Answer> {
+  /** The model in a file, or what a key opens. `moved`: memory that the worker takes over. */
+  ask(question: Question, moved: Transferable[] = []): Promise<Answer> {
     return new Promise((resolve) => {
-      this.waiting.set(question.id, resolve);
-      this.worker.postMessage(question, moved);
+      this.waiting.set(this.next, resolve);
+      this.worker.postMessage({ ...question, id: this.next++ }, moved);
     });
+  }
+
+  /** Ends what goes on. */
+  stop(): void {
+    this.worker.postMessage({ stop: true } satisfies Question);
+    for (const [id, resolve] of this.waiting) resolve({ id, stopped: true });
+    this.waiting.clear();
   }
 }

@@ -1,12 +1,29 @@
-/** What the panel does by itself: folding, showing the key as it is typed, taking a file that is dropped. */
-import { page } from './elements.ts';
+/** What index.html has, by name, and what it does by itself: showing the key, taking a file that is dropped. */
+
+/** The elements of one kind. */
+function all<T extends HTMLElement>() {
+  return <Name extends string>(...names: Name[]) =>
+    Object.fromEntries(names.map((name) => [name, document.getElementById(name)])) as Record<Name, T>;
+}
+
+export const page = {
+  ...all()('main', 'border', 'drop', 'status', 'problem', 'facts', 'revealed', 'count'),
+  ...all<HTMLInputElement>()('file', 'key', 'wipe', 'threshold', 'faint', 'opaque', 'roll', 'background'),
+  ...all<HTMLButtonElement>()('show', 'open', 'stop', 'fly', 'home', 'snapshot', 'download', 'close', 'save'),
+  ...all<HTMLSelectElement>()('up', 'colouring'),
+  ...all<HTMLCanvasElement>()('picture'),
+  ...all<HTMLFormElement>()('form'),
+  ...all<HTMLProgressElement>()('progress'),
+  ...all<HTMLOutputElement>()('shown'),
+  ...all<HTMLFieldSetElement>()('drawn'),
+  ...all<HTMLDetailsElement>()('controls'),
+};
 
 const NARROW = '(max-width: 600px)'; // where the panel would cover the scene
 
 /** `opened` gets files that are chosen or dropped. */
 export function preparePanel(opened: (file: File) => void): void {
-  fold(window.matchMedia(NARROW).matches);
-  page.more.addEventListener('click', () => fold(page.more.getAttribute('aria-expanded') === 'true'));
+  page.controls.open = !window.matchMedia(NARROW).matches;
   page.show.addEventListener('click', () => showKey(page.key.type === 'password'));
   page.file.addEventListener('change', () => {
     const file = page.file.files?.[0];
@@ -26,12 +43,6 @@ export function preparePanel(opened: (file: File) => void): void {
     const file = event.dataTransfer?.files[0];
     if (file) opened(file);
   });
-}
-
-function fold(folded: boolean): void {
-  page.controls.hidden = folded;
-  page.more.textContent = folded ? 'More' : 'Less';
-  page.more.setAttribute('aria-expanded', String(!folded));
 }
 
 export function showKey(shown: boolean): void {

@@ -4,80 +4,86 @@ import { cross, dot } from '../core/similarity.ts';
 
 export type Vector = readonly [number, number, number];
 
-/** -y as captures made with COLMAP have it, z as those of Blender. */
-export const UPS = ['-y', 'z', 'y'] as const;
-export type Up = (typeof UPS)[number];
-
 export interface Pose {
   readonly eye: Vector;
   readonly target: Vector;
-  readonly up: Up;
+  readonly up: Vector; // of length 1
 }
 
-// For each: two horizontal directions of which the cross product is up, the way up, and the side of the first pose.
-const FRAMES: Record<Up, { a: Vector; b: Vector; up: Vector; front: Vector }> = {
-  '-y': { a: [1, 0, 0], b: [0, 0, 1], up: [0, -1, 0], front: [0, 0, -1] },
-  z: { a: [1, 0, 0], b: [0, 1, 0], up: [0, 0, 1], front: [0, -1, 0] },
-  y: { a: [0, 0, 1], b: [1, 0, 0], up: [0, 1, 0], front: [0, 0, 1] },
+/** -y as captures made with COLMAP have it, z as those of Blender. */
+export const UPS: Record<string, Vector> = {
+  '-y': [0, -1, 0], z: [0, 0, 1], y: [0, 1, 0], '-z': [0, 0, -1], x: [1, 0, 0], '-x': [-1, 0, 0],
 };
 
 export const FIELD_OF_VIEW = 50; // degrees, vertical
-const SAMPLE = 20_000; // Gaussians that the first pose is found by
-const AWAY = 3; // times the radius of the nearer half
-const HEIGHT = 0.35; // of the first pose, as the sine of its elevation
-export const STEEPEST = (85 * Math.PI) / 180;
+const SAMPLE = 8_000; // Gaussians that the first pose is found by
+const HEIGHT = 0.2; // of the first pose, as the sine of its elevation
+const [MOST, ALL] = [0.93, 0.995]; // shares of the visible Gaussians: in the first picture, and if that costs little
+const LITTLE = 1.15; // of the distance
+const FURTHEST = 2.5; // times the distance of the cameras that took the photos
+const MARGIN = 0.94; // of half the picture
+const NEAR = 0.01; // from a ray, by the depth
+const STEEPEST = (85 * Math.PI) / 180;
 
 export const add = (a: Vector, b: Vector, scale = 1): Vector => [
   a[0] + scale * b[0], a[1] + scale * b[1], a[2] + scale * b[2],
 ];
 export const difference = (a: Vector, b: Vector): Vector => add(a, b, -1);
 export const length = (a: Vector): number => Math.hypot(...a);
-export const unit = (a: Vector): Vector => add([0, 0, 0], a, 1 / Math.max(length(a), 1e-12));
+const unit = (a: Vector): Vector => add([0, 0, 0], a, 1 / Math.max(length(a), 1e-12));
+const combined = (shares: readonly number[], [a, b, c]: readonly Vector[]): Vector =>
+  add(add(add([0, 0, 0], a, shares[0]), b, shares[1]), c, shares[2]);
 
 /** Unit vectors of the camera: right, down (OpenCV's y) and forward. */
 export function axes({ eye, target, up }: Pose): { right: Vector; down: Vector; forward: Vector } {
   const forward = unit(difference(target, eye));
-  const right = unit(cross(forward, FRAMES[up].up));
+  const right = unit(cross(forward, up));
   return { right, down: cross(forward, right), forward };
 }
 
 /**
- * From where the detail of a model is in view: inside of the background that captures have around them, and
- * further away where the picture is higher than wide. `aspect`: its width by its height.
+ * From where nearly all that is visible of a model is in view, and its middle in the middle. `aspect`: the picture's
+ * width by its height. With the pose of the cameras that `captured` it, it is seen from their side and upright as they
+ * saw it, and not from much further away: what is all around a room is not worth seeing the room from outside.
  */
-export function firstPose(model: Gaussians, up: Up, aspect = 1): Pose {
-  const { middle, radius } = framing(model);
-  const flat = Math.sqrt(1 - HEIGHT * HEIGHT);
-  const away = add(add([0, 0, 0], FRAMES[up].up, HEIGHT), FRAMES[up].front, flat);
-  return { eye: add(middle, away, (AWAY * radius) / Math.min(1, aspect)), target: middle, up };
-}
-
-const framings = new WeakMap<Gaussians, ReturnType<typeof middleAndRadius>>();
-
-function framing(model: Gaussians): ReturnType<typeof middleAndRadius> {
-  const known = framings.get(model) ?? middleAndRadius(model);
-  framings.set(model, known);
-  return known;
-}
-
-/** The pose that shows the second model as `pose` shows the first, which has coordinates of its own. */
-export function alike(pose: Pose, from: Gaussians, to: Gaussians): Pose {
-  const [a, b] = [framing(from), framing(to)];
-  const scale = b.radius / a.radius;
-  const place = (point: Vector): Vector => add(b.middle, difference(point, a.middle), scale);
-  return { eye: place(pose.eye), target: place(pose.target), up: pose.up };
-}
-
-/** Where half of the Gaussians lie, of a sample; each counts by its opacity, since large ones are background. */
-function middleAndRadius(model: Gaussians): { middle: Vector; radius: number } {
+export function firstPose(model: Gaussians, aspect: number, up?: Vector, captured?: Pose | null): Pose {
   const step = Math.max(1, Math.ceil(model.count / SAMPLE));
-  const rows: number[] = [];
-  for (let row = 0; row < model.count; row += step) rows.push(row);
+  const rows = Array.from({ length: Math.ceil(model.count / step) }, (_, index) => index * step);
   const weights = rows.map((row) => opacity(model.opacityLogits[row]));
-  const means = rows.map((row): Vector => [model.means[3 * row], model.means[3 * row + 1], model.means[3 * row + 2]]);
-  const middle = [0, 1, 2].map((axis) => quantile(means.map((each) => each[axis]), weights, 0.5)) as unknown as Vector;
-  const radius = quantile(means.map((each) => length(difference(each, middle))), weights, 0.5);
-  return { middle, radius: Math.max(radius, 1e-6) };
+  const above = up ?? UPS[isZUp(model, rows, weights) ? 'z' : '-y'];
+  const front: Vector = above[1] ? [0, 0, above[1]] : [0, -1, 0];
+  const away = add(add([0, 0, 0], above, HEIGHT), front, Math.sqrt(1 - HEIGHT * HEIGHT));
+  const pose = captured ?? { eye: away, target: [0, 0, 0] as Vector, up: above };
+  const { right, down, forward } = axes(pose);
+  const basis = [right, down, forward];
+  const places = basis.map((axis) => rows.map((row) => dot(axis, [...model.means.subarray(3 * row, 3 * row + 3)])));
+  const middle = places.map((values, axis) => captured ? dot(basis[axis], captured.target)
+    : (quantile(values, weights, 1 - ALL) + quantile(values, weights, ALL)) / 2);
+  // The distance at which each Gaussian is at the edge of the picture.
+  const half = MARGIN * Math.tan((FIELD_OF_VIEW * Math.PI) / 360);
+  const distances = rows.map((_, index) => {
+    const [x, y, z] = places.map((values, axis) => values[index] - middle[axis]);
+    return Math.max(Math.abs(x) / aspect, Math.abs(y)) / half - z;
+  });
+  const [most, all] = [MOST, ALL].map((share) => quantile(distances, weights, share));
+  const furthest = captured ? FURTHEST * length(difference(captured.eye, captured.target)) : Infinity;
+  const distance = Math.max(1e-6, Math.min(all, LITTLE * most, furthest));
+  const target = combined(middle, basis);
+  return { eye: add(target, forward, -distance), target, up: pose.up };
+}
+
+const [SLABS, DOMINANT] = [40, 0.1]; // across the most of a model, and the share that lies on a floor
+
+/** Whether Gaussians lie on a floor across z, as in scenes of Blender, rather than across y. */
+function isZUp(model: Gaussians, rows: number[], weights: number[]): boolean {
+  const [y, z] = [1, 2].map((axis) => {
+    const places = rows.map((row) => model.means[3 * row + axis]);
+    const [low, high] = [1 - MOST, MOST].map((share) => quantile(places, weights, share));
+    const slabs = new Float64Array(2 * SLABS);
+    places.forEach((place, index) => (slabs[Math.floor(((place - low) / (high - low || 1) + 0.5) * SLABS)] += weights[index]));
+    return Math.max(...slabs) / weights.reduce((sum, each) => sum + each, 0);
+  });
+  return z > DOMINANT && z > 2 * y;
 }
 
 function quantile(values: number[], weights: number[], share: number): number {
@@ -91,21 +97,51 @@ function quantile(values: number[], weights: number[], share: number): number {
   return values[order.at(-1) ?? 0] ?? 0;
 }
 
-/** An offset turned about the vertical axis, and towards it as far as it may; angles in radians. */
-export function turned(offset: Vector, up: Up, azimuth: number, elevation: number): Vector {
-  const distance = length(offset);
-  const frame = FRAMES[up];
-  const around = Math.atan2(dot(offset, frame.b), dot(offset, frame.a)) + azimuth;
-  const height = Math.asin(Math.max(-1, Math.min(1, dot(offset, frame.up) / distance))) + elevation;
-  const bounded = Math.max(-STEEPEST, Math.min(STEEPEST, height));
-  const flat = add(add([0, 0, 0], frame.a, Math.cos(around)), frame.b, Math.sin(around));
-  return add(add([0, 0, 0], flat, Math.cos(bounded) * distance), frame.up, Math.sin(bounded) * distance);
+/** The pose that is to `to` as `pose` is to `from`: another model has coordinates of its own. */
+export function alike(pose: Pose, from: Pose, to: Pose): Pose {
+  const basis = (each: Pose): Vector[] => [axes(each).right, each.up, cross(axes(each).right, each.up)];
+  const [before, after] = [basis(from), basis(to)];
+  const turn = (vector: Vector): Vector => combined(before.map((axis) => dot(axis, vector)), after);
+  const [a, b] = [from, to].map(({ eye, target }) => length(difference(eye, target)));
+  const place = (point: Vector): Vector => add(to.target, turn(difference(point, from.target)), b / a);
+  return { eye: place(pose.eye), target: place(pose.target), up: turn(pose.up) };
 }
 
-/** `#eye=x,y,z&target=x,y,z`, with `&up=z` where up is not -y, and back; null for anything else. */
+/** An offset turned about the vertical axis, and towards it as far as it may; angles in radians. */
+export function turned(offset: Vector, up: Vector, azimuth: number, elevation: number): Vector {
+  const distance = length(offset);
+  const sine = dot(offset, up) / distance;
+  const bounded = Math.max(-STEEPEST, Math.min(STEEPEST, Math.asin(Math.max(-1, Math.min(1, sine))) + elevation));
+  const flat = unit(add(offset, up, -sine * distance));
+  const [cosine, side] = [Math.cos(bounded) * distance, cross(up, flat)];
+  return combined([cosine * Math.cos(azimuth), cosine * Math.sin(azimuth), Math.sin(bounded) * distance], [flat, side, up]);
+}
+
+/** The camera turned about its own axis, clockwise by so many radians; its way up comes along. */
+export function rolled(pose: Pose, angle: number): Pose {
+  const { right, down } = axes(pose);
+  return { ...pose, up: add(add([0, 0, 0], right, Math.sin(angle)), down, -Math.cos(angle)) };
+}
+
+/** The place in a model that is seen along a ray from the eye, null for none: the nearest one that hides much. */
+export function picked(model: Gaussians, eye: Vector, ray: Vector): Vector | null {
+  let [found, nearest]: [Vector | null, number] = [null, Infinity];
+  const direction = unit(ray);
+  for (let row = 0; row < model.count; row++) {
+    if (model.opacityLogits[row] < 0) continue;
+    const offset: Vector = [0, 1, 2].map((axis) => model.means[3 * row + axis] - eye[axis]) as unknown as Vector;
+    const depth = dot(offset, direction);
+    if (depth <= 0 || depth > nearest || length(add(offset, direction, -depth)) > NEAR * depth) continue;
+    [found, nearest] = [add(eye, direction, depth), depth];
+  }
+  return found;
+}
+
+/** `#eye=x,y,z&target=x,y,z`, with `&up=z` or `&up=x,y,z` where up is not -y, and back; null for anything else. */
 export function poseToHash(pose: Pose): string {
   const text = (values: Vector): string => values.map((each) => Number(each.toPrecision(6))).join(',');
-  return `#eye=${text(pose.eye)}&target=${text(pose.target)}${pose.up === '-y' ? '' : `&up=${pose.up}`}`;
+  const up = upName(pose.up) ?? text(pose.up);
+  return `#eye=${text(pose.eye)}&target=${text(pose.target)}${up === '-y' ? '' : `&up=${up}`}`;
 }
 
 export function poseOfHash(hash: string): Pose | null {
@@ -114,12 +150,12 @@ export function poseOfHash(hash: string): Pose | null {
     const numbers = (found.get(name) ?? '').split(',').map((each) => (each.trim() ? Number(each) : NaN));
     return numbers.length === 3 && numbers.every((each) => Math.abs(each) < 1e6) ? (numbers as unknown as Vector) : null;
   };
-  const [eye, target] = [vector('eye'), vector('target')];
-  const up = upOf(found.get('up'));
+  const [eye, target, asked] = [vector('eye'), vector('target'), vector('up')];
+  const up = asked && length(asked) > 1e-3 ? unit(asked) : (UPS[found.get('up') ?? '-y'] ?? UPS['-y']);
   return eye && target && length(difference(eye, target)) > 1e-9 ? { eye, target, up } : null;
 }
 
-/** -y for whatever is no way up. */
-export function upOf(text: string | null | undefined): Up {
-  return UPS.find((each) => each === text) ?? '-y';
+/** The axis of the world that a way up is, undefined for a tilted one. */
+export function upName(up: Vector): string | undefined {
+  return Object.keys(UPS).find((name) => dot(UPS[name], up) > 1 - 1e-9);
 }

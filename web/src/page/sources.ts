@@ -18,7 +18,8 @@ export function givenModel(): Source | null {
   const address = asked ?? beside;
   if (!address) return null;
   const url = new URL(address, document.baseURI);
-  return { name: nameIn(url), bytes: () => fetched(url) };
+  const named = url.pathname.split('/').pop()!.replaceAll('+', '%2B');
+  return { name: new URLSearchParams(`name=${named}`).get('name') || 'model', bytes: () => fetched(url) };
 }
 
 /** Raises an error for what is not there, or on another host. */
@@ -26,15 +27,6 @@ export async function fetched(url: URL | string): Promise<Uint8Array> {
   const response = await fetch(url, { credentials: 'omit' });
   if (!response.ok) throw new Error(String(response.status));
   return new Uint8Array(await response.arrayBuffer());
-}
-
-function nameIn(url: URL): string {
-  const name = url.pathname.split('/').pop() || 'model';
-  try {
-    return decodeURIComponent(name);
-  } catch {
-    return name; // no escape at all
-  }
 }
 
 function bytesOfBase64(text: string): Uint8Array {

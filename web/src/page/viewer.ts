@@ -1,11 +1,11 @@
 /** The picture: PlayCanvas draws one model, or two of them side by side. */
 import {
   AppBase, AppOptions, CameraComponentSystem, Color, createGraphicsDevice, Entity, GAMMA_SRGB, GSplatComponentSystem,
-  GSplatData, GSplatResource, Layer, Mat4, Quat, RESOLUTION_FIXED, TONEMAP_NONE, Vec4,
+  GSplatData, GSplatResource, Layer, RESOLUTION_FIXED, TONEMAP_NONE, Vec3, Vec4,
 } from 'playcanvas';
 import { type Gaussians, mostVisible } from '../core/gaussians.ts';
 import { plyColumns } from '../files/ply.ts';
-import { axes, FIELD_OF_VIEW, type Pose } from './pose.ts';
+import { FIELD_OF_VIEW, type Pose } from './pose.ts';
 
 const NEAREST = 1e-3; // of the distance of what the camera looks at
 const FURTHEST = 1e4;
@@ -52,6 +52,7 @@ export class Viewer {
       if (this.drawing) this.afterFrame();
     });
     app.on('update', () => this.rest());
+    app.graphicsDevice.on('devicerestored', () => this.restored());
     app.start();
     new ResizeObserver(() => this.resize()).observe(canvas);
     this.resize();
@@ -91,6 +92,18 @@ export class Viewer {
     this.touch();
   }
 
+  /** Everything that the graphics card held is gone. */
+  private restored(): void {
+    this.inFlight = false;
+    for (const side of ['left', 'right'] as const) this.show(this.halves[side].model, side);
+  }
+
+  /** `colour`: as #rrggbb. */
+  setBackground(colour: string): void {
+    for (const { camera } of Object.values(this.halves)) camera.camera!.clearColor = new Color().fromString(colour);
+    this.touch();
+  }
+
   private splats(model: Gaussians, layer: Layer): Entity {
     const entity = new Entity();
     entity.addComponent('gsplat', { layers: [layer.id] });
@@ -109,15 +122,10 @@ export class Viewer {
   }
 
   setPose(pose: Pose, side: Side = 'left'): void {
-    const { right, down, forward } = axes(pose);
-    const matrix = new Mat4();
-    matrix.set([
-      ...right, 0, -down[0], -down[1], -down[2], 0, -forward[0], -forward[1], -forward[2], 0, ...pose.eye, 1,
-    ]);
     const distance = Math.hypot(...pose.eye.map((each, axis) => each - pose.target[axis]));
     const { camera } = this.halves[side];
     camera.setPosition(...pose.eye);
-    camera.setRotation(new Quat().setFromMat4(matrix));
+    camera.lookAt(new Vec3(...pose.target), new Vec3(...pose.up));
     camera.camera!.nearClip = NEAREST * distance;
     camera.camera!.farClip = FURTHEST * distance;
     if (this.slow) this.setScale(COARSE);

@@ -2,10 +2,9 @@
 import { damaged } from '../core/errors.ts';
 import type { Content } from '../channels/content.ts';
 import { viewOf } from '../core/bytes.ts';
-import type { Gaussians } from '../core/gaussians.ts';
+import { compensated, type Gaussians } from '../core/gaussians.ts';
 import { decodeKeyss } from '../keyss/secret.ts';
 import { Codec } from './codec.ts';
-import { compensated } from './compensation.ts';
 import { decodeWhole } from './whole.ts';
 
 const WHOLE = 'carry'; // the method of models that are hidden whole, whoever trained them

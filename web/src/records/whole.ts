@@ -1,8 +1,7 @@
 /** A model as one string of bytes; `keyss.methods.records.whole` on the other side. */
-import { viewOf } from '../core/bytes.ts';
+import { unpackedZstd, viewOf } from '../core/bytes.ts';
 import { damaged } from '../core/errors.ts';
 import { coefficients, emptyGaussians, type Gaussians } from '../core/gaussians.ts';
-import { unpackedZstd } from '../core/unpacking.ts';
 import { Codec, type Layout, putColours } from './codec.ts';
 
 const ALWAYS = 1 << 16; // Gaussians, whatever announces them

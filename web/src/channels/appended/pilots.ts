@@ -2,7 +2,7 @@
 import { mostFrequent, rowsOf } from '../../core/bytes.ts';
 import { movedPoint, type Similarity } from '../../core/similarity.ts';
 import { mix, type Words } from '../../core/words.ts';
-import { SALT_BYTES } from '../../keys/derivation.ts';
+import { SALT_BYTES } from '../../keys/keys.ts';
 import { fittedSimilarity } from './fitting.ts';
 import { POSITION_BITS } from './lattice.ts';
 

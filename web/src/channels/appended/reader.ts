@@ -1,11 +1,9 @@
 /** Secrets in appended Gaussians (docs/channels.md); `keyss.channels.appended.channel` on the other side. */
 import { ascii, rowsOf } from '../../core/bytes.ts';
 import type { Gaussians } from '../../core/gaussians.ts';
-import { type Derive, expand } from '../../keys/derivation.ts';
-import { decrypted } from '../../keys/encryption.ts';
+import { decrypted, type Derive, expand } from '../../keys/keys.ts';
 import { here } from '../../keys/pool.ts';
-import type { Payload, Reader } from '../content.ts';
-import { unpackPayload } from '../packing.ts';
+import { type Payload, type Reader, unpackPayload } from '../content.ts';
 import { decoded } from '../reed_solomon.ts';
 import {
   allShifts, candidates, coloursOf, inOwnFrame, invariantsOf, likelyShifts, scalesAt, scaleSteps,

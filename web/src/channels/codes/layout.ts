@@ -2,7 +2,7 @@
 import { chacha20poly1305 } from '@noble/ciphers/chacha.js';
 import { ascii, viewOf } from '../../core/bytes.ts';
 import { damaged, otherVersion } from '../../core/errors.ts';
-import { expand, SALT_BYTES, streamWords } from '../../keys/derivation.ts';
+import { expand, SALT_BYTES, streamWords } from '../../keys/keys.ts';
 import { sortingOrder } from '../../core/words.ts';
 import { BLOCK } from './syndromes.ts';
 

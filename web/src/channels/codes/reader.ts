@@ -6,11 +6,9 @@
  */
 import { ascii } from '../../core/bytes.ts';
 import type { Codes } from '../../files/models.ts';
-import { type Derive, expand, SALT_BYTES } from '../../keys/derivation.ts';
-import { decrypted } from '../../keys/encryption.ts';
+import { decrypted, type Derive, expand, SALT_BYTES } from '../../keys/keys.ts';
 import { here } from '../../keys/pool.ts';
-import type { Content, Reader } from '../content.ts';
-import { unpackPayload } from '../packing.ts';
+import { type Content, type Reader, unpackPayload } from '../content.ts';
 import { lastBits } from './fields.ts';
 import { findHeader, order, Room, ZONE_RATE } from './layout.ts';
 import { BLOCK, bytesOf, matrix, products } from './syndromes.ts';

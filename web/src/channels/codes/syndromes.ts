@@ -2,7 +2,7 @@
  * Wet paper codes, as their reader sees them (Fridrich, Goljan, Lisonek and Soukal 2005): what is written is, of each
  * block of bits, the product with a random matrix modulo 2; `keyss.channels.codes.syndromes` on the other side.
  */
-import { streamWords } from '../../keys/derivation.ts';
+import { streamWords } from '../../keys/keys.ts';
 
 export const BLOCK = 1024;
 const WORDS = BLOCK / 32;

@@ -7,7 +7,7 @@ import { hmac } from '@noble/hashes/hmac.js';
 import { sha256 } from '@noble/hashes/sha2.js';
 import { ascii } from '../../core/bytes.ts';
 import { mix, runs, sortingOrder, type Words, wordsOf } from '../../core/words.ts';
-import { expand } from '../../keys/derivation.ts';
+import { expand } from '../../keys/keys.ts';
 import { type Carriers, chosen } from './carriers.ts';
 import { Fountain, NOISY } from './fountain.ts';
 import { COLUMNS, dithers, MAX_BITS, rank, readBits, seedsOf, sum } from './lattice.ts';

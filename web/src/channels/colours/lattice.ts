@@ -4,7 +4,7 @@
  */
 import { ecb } from '@noble/ciphers/aes.js';
 import { mix, type Words, wordsOf } from '../../core/words.ts';
-import { expand } from '../../keys/derivation.ts';
+import { expand } from '../../keys/keys.ts';
 import { type Carriers, impact } from './carriers.ts';
 
 export const COLUMNS = 2; // numbers of a Gaussian that are written

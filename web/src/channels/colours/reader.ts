@@ -7,18 +7,16 @@ import { ascii, joined } from '../../core/bytes.ts';
 import { InputError, tooMuchLost } from '../../core/errors.ts';
 import type { Gaussians } from '../../core/gaussians.ts';
 import { namesakes } from '../../core/words.ts';
-import { type Derive, expand, SALT_BYTES } from '../../keys/derivation.ts';
-import { decrypted } from '../../keys/encryption.ts';
+import { decrypted, type Derive, expand, SALT_BYTES } from '../../keys/keys.ts';
 import { here } from '../../keys/pool.ts';
-import type { Payload, Reader } from '../content.ts';
-import { unpackPayload } from '../packing.ts';
+import { type Payload, type Reader, unpackPayload } from '../content.ts';
 import { type Carriers, carriersOf, CELL, chosen, type Numbers, numbersOf, shifted } from './carriers.ts';
 import { Fountain } from './fountain.ts';
 import {
-  bucketBytes, FILE_KEY_BYTES, type Header, HEADER_BYTES, headerAgreement, IDLE, Index, kindOf, ownRows, packBits, readHeader,
-  SHARES, VIEWS,
+  bucketBytes, type Header, headerAgreement, IDLE, Index, kindOf, ownRows, packBits, readHeader,
+  VIEWS,
 } from './header.ts';
-import { bitCounts, COLUMNS, dithers, LEVELS, rank, readBits, seedsOf, sum } from './lattice.ts';
+import { bitCounts, COLUMNS, dithers, rank, readBits, seedsOf, sum } from './lattice.ts';
 import { saltsOf } from './salts.ts';
 
 const ASSOCIATED = ascii('keyss/v1/colours');
@@ -32,13 +30,6 @@ const CELLS_SCALED = [0, 1, -1]; // in a model that was scaled
 const ALIGNMENTS = 7; // of borders of cells
 const BEST = 3; // of all these, that are looked at more closely
 const REFINED = [[0.02, 0.004], [0.004, 0.001]]; // where it is looked for once a header is found
-
-/** What a key becomes: without a salt of the file, and with each. */
-interface Derived {
-  readonly fixed: Uint8Array;
-  readonly secrets: readonly Uint8Array[];
-  readonly check: Uint8Array; // what recognises headers
-}
 
 /** The colours of a model, prepared for any number of keys. */
 export class ColoursReader implements Reader {
@@ -58,13 +49,7 @@ export class ColoursReader implements Reader {
     const masters = await Promise.all([STATIC_SALT, ...this.salts].map((salt) => derive(key, salt)));
     const fixed = expand(masters[0], 'colours/static', 32);
     const secrets = masters.slice(1).map((each) => expand(each, 'colours/header', 32));
-    const data = await this.read({ fixed, secrets, check: expand(fixed, 'colours/check', 32) });
-    return data && unpackPayload(data);
-  }
-
-  /** The payload that a derived key opens; a key that opens nothing makes about the work of one that does. */
-  async read(derived: Derived): Promise<Uint8Array | null> {
-    const { secrets, check } = derived;
+    const check = expand(fixed, 'colours/check', 32);
     const promises: { offset: number; promise: number }[] = [];
     for (const [offset, index] of this.indices()) promises.push({ offset, promise: index.promise(secrets) });
     promises.sort((a, b) => b.promise - a.promise || b.offset - a.offset);
@@ -77,24 +62,21 @@ export class ColoursReader implements Reader {
       }
     }
     // An attempt makes a header up by chance, 2^-16, and the right one can be read where names are wrong.
-    let [header, offset, most] = [NOTHING, 0, -Infinity];
-    for (const each of found.size ? found.values() : [NOTHING]) {
+    let [header, offset, most]: [Header | null, number, number] = [null, 0, -Infinity];
+    for (const each of found.values()) {
       for (const place of best) {
         const agreement = headerAgreement(each, secrets, place.index);
         if (agreement > most) [header, offset, most] = [each, place.offset, agreement];
       }
     }
-    if (found.size === 0) {
-      await payload(NOTHING, derived.fixed, carriersOf(this.numbers, 0), CHANGED[0], ROUNDS / 4);
-      return null;
-    }
+    if (header === null) return null;
     const carriers = this.refined(header, secrets, offset);
     const index = new Index(carriers);
     const taken = new Set(secrets.flatMap((each) => [...index.rows(each, kindOf(header))]));
     const free = chosen(carriers, Uint32Array.from({ length: carriers.count }, (_, row) => row).filter((row) => !taken.has(row)));
     for (const changed of CHANGED) {
-      const data = await payload(header, derived.fixed, free, changed, ROUNDS);
-      if (data !== null) return data;
+      const data = await payload(header, fixed, free, changed, ROUNDS);
+      if (data !== null) return unpackPayload(data);
     }
     throw tooMuchLost();
   }
@@ -128,19 +110,6 @@ export class ColoursReader implements Reader {
     return carriersOf(this.numbers, offset);
   }
 }
-
-/** What a key that opens nothing looks for. */
-const NOTHING: Header = {
-  fileKey: new Uint8Array(FILE_KEY_BYTES),
-  partition: new Uint8Array(2),
-  level: LEVELS - 1,
-  depth: 1,
-  first: 0,
-  last: SHARES / 4 - 1,
-  bucket: 64,
-  idle: 0,
-  bits: new Uint8Array(8 * HEADER_BYTES),
-};
 
 /** What the header's data key decrypts, or null. */
 async function payload(

@@ -2,7 +2,7 @@
 import { sha256 } from '@noble/hashes/sha2.js';
 import { ascii, bytesKey, joined } from '../../core/bytes.ts';
 import { runs, sortingOrder } from '../../core/words.ts';
-import { SALT_BYTES } from '../../keys/derivation.ts';
+import { SALT_BYTES } from '../../keys/keys.ts';
 import { COLOUR_NOISE, COLOUR_STEP, NAME, type Numbers, OPACITY_NOISE, OPACITY_STEP, SCALE_STEP } from './carriers.ts';
 import { rank } from './lattice.ts';
 

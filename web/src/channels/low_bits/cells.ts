@@ -1,6 +1,6 @@
 /** Cells: a few bytes of each Gaussian, recognisable with the key and noise without; see docs/format.md, "Cells". */
 import { ecb } from '@noble/ciphers/aes.js';
-import { expand } from '../../keys/derivation.ts';
+import { expand } from '../../keys/keys.ts';
 
 export const TAG_BYTES = 4;
 const BLOCK = 16; // of AES, and an identity

@@ -7,8 +7,7 @@
 import { ascii, bytesKey, rowsOf } from '../../core/bytes.ts';
 import { damaged, tooMuchLost } from '../../core/errors.ts';
 import { type Gaussians, selected } from '../../core/gaussians.ts';
-import { type Derive, expand } from '../../keys/derivation.ts';
-import { decrypted } from '../../keys/encryption.ts';
+import { decrypted, type Derive, expand } from '../../keys/keys.ts';
 import { here } from '../../keys/pool.ts';
 import type { Content, Reader } from '../content.ts';
 import { decoded } from '../reed_solomon.ts';

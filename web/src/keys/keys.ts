@@ -1,13 +1,14 @@
 /**
  * From what a person types to derived keys, as docs/format.md has it: Argon2id (RFC 9106) of the key in NFKC and
- * without surrounding white space, then HKDF-Expand with SHA-256 (RFC 5869) with a label for each use.
+ * without surrounding white space, then HKDF-Expand with SHA-256 (RFC 5869) with a label for each use; and what they
+ * decrypt. `keyss.keys` on the other side.
  */
-import { chacha20 } from '@noble/ciphers/chacha.js';
+import { chacha20, chacha20poly1305 } from '@noble/ciphers/chacha.js';
 import { hmac } from '@noble/hashes/hmac.js';
 import { sha256 } from '@noble/hashes/sha2.js';
 import { argon2id } from 'hash-wasm';
-import { ascii, joined, viewOf } from '../core/bytes.ts';
-import { InputError } from '../core/errors.ts';
+import { ascii, joined, unpacked, viewOf } from '../core/bytes.ts';
+import { damaged, InputError } from '../core/errors.ts';
 
 export const SALT_BYTES = 16;
 const MAX_KEY_BYTES = 4096;
@@ -59,4 +60,23 @@ export function streamWords(
     const end = Math.min(AT_ONCE / 4, count - at);
     for (let index = 0; index < end; index++) take(view.getUint32(4 * index, true), at + index);
   }
+}
+
+const MAX_PAYLOAD_BYTES = 64 << 20;
+const [MAX_RATIO, SMALL_PAYLOAD] = [16, 1 << 20]; // n bytes become MAX_RATIO n + SMALL_PAYLOAD at most
+
+/** The inverse of `keyss.keys.encryption.encrypt`. Raises InputError when anything is not as it left it. */
+export async function decrypted(
+  dataKey: Uint8Array, encrypted: Uint8Array, associated: Uint8Array,
+): Promise<Uint8Array> {
+  let plain: Uint8Array;
+  try {
+    plain = chacha20poly1305(expand(dataKey, 'payload', 32), new Uint8Array(12), associated).decrypt(encrypted);
+  } catch {
+    throw damaged();
+  }
+  const length = plain.length >= 4 ? viewOf(plain).getUint32(0, true) : plain.length;
+  if (4 + length > plain.length) throw damaged();
+  const most = Math.min(MAX_PAYLOAD_BYTES, MAX_RATIO * length + SMALL_PAYLOAD);
+  return unpacked(plain.subarray(4, 4 + length), 'deflate', most);
 }

@@ -1,0 +1,49 @@
+"""What the page shows at first: a model from the side from which its photos were taken."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from keyss.core.errors import InputError
+from keyss.core.scene import Camera, focus_point
+from keyss.core.similarity import up_direction
+from keyss.files.images import probe_image
+from keyss.files.scenes import read_layout
+from keyss.rendering.orbit import around
+from keyss.runs.files import CONFIG, is_run
+
+# By name: `pose`, as the page's address has it ("eye=X,Y,Z&target=X,Y,Z", and "&up=z" or "&up=X,Y,Z");
+# `camera`, the same for a camera of the photos, of which the page takes side and tilt; `up`, an axis ("-y");
+# `background`, "#rrggbb"; `title`. The page itself finds what is missing.
+Look = dict[str, str]
+
+
+def look_of_model(model: Path) -> Look:
+    """As its scene was photographed if the model lies in a run and the scene is still there."""
+    run = next((parent for parent in model.absolute().parents[:2] if is_run(parent)), None)
+    try:
+        config = json.loads((run / CONFIG).read_bytes()) if run else {}
+        return look_of_scene(Path(config.get("cover") or config.get("scene") or ""))
+    except (OSError, ValueError):
+        return {}
+
+
+def look_of_scene(scene: Path) -> Look:
+    """From the middle of the cameras' arc, at their median height; empty for other paths than a scene's."""
+    try:
+        layout = read_layout(scene, skip_missing=True)
+        is_white = probe_image(layout.train[0].path)[2]  # as in `load_scene`
+    except InputError:
+        return {}
+    poses = [torch.from_numpy(photo.viewmat.astype(np.float32)) for photo in layout.train]
+    cameras = [Camera(pose, torch.eye(3), 1, 1, str(index)) for index, pose in enumerate(poses)]
+    middle = around(cameras, 4)[1]  # on an arc, the path goes to the end and back
+    up = up_direction(cameras)
+    up = -middle.viewmat[1, :3] if up is None else up
+    vectors = {"eye": middle.position, "target": focus_point(cameras), "up": up}
+    texts = [f"{name}={','.join(f'{each:.6g}' for each in v.tolist())}" for name, v in vectors.items()]
+    return {"camera": "&".join(texts), "background": "#ffffff" if is_white else "#000000"}
