@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
@@ -26,14 +26,7 @@ def view(
     host: Annotated[
         str, arg(metavar="ADDRESS", help="Address to serve on; 0.0.0.0 lets other machines connect.")
     ] = "127.0.0.1",
-    pose: Annotated[
-        str | None,
-        optional(
-            "POSE",
-            "First view, as the page's address has it after the #.",
-            "that of the scene's photos, or all that is visible",
-        ),
-    ] = None,
+    pose: Annotated[str | None, optional("POSE", "First view, as in the page's address.", "found")] = None,
     up: Annotated[
         Literal["-y", "z", "y", "-z", "x", "-x"] | None,
         optional("AXIS", "Up axis: -y as in COLMAP, z as in Blender.", "found from the model"),
@@ -99,9 +92,8 @@ def render(
     """
     check_there(model, cameras)
     import keyss
-    from keyss.core.errors import UsageError
-
     from keyss.api.looking import frame_count
+    from keyss.core.errors import UsageError
     from keyss.progress import reporter
 
     if video is not None and (out is not None or split != "test"):
@@ -110,7 +102,7 @@ def render(
         raise UsageError("images need --cameras SCENE and -o FOLDER; a video needs --video FILE")
     if video is None and (wipe is not None or seconds != 8.0):
         raise UsageError("--wipe and --seconds are for videos: give --video FILE")
-    film = {"video": video, "wipe": wipe, "seconds": seconds, "reporter": reporter()}
+    film: dict[str, Any] = {"video": video, "wipe": wipe, "seconds": seconds, "reporter": reporter()}
     images = keyss.render(
         model, cameras, split=split, **vars(photos), **film, device=device, out=out, overwrite=overwrite
     )
