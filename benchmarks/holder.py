@@ -49,7 +49,7 @@ class Job:
     index: int
     scene: str
     cover: str
-    others: tuple[str, ...]  # models of which secrets are made
+    others: tuple[str, ...]  # models to make secrets of
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -2,9 +2,9 @@
 
 Kernels draw their pieces of work from a counter (`keyss.rendering.cpu.parallel`). Here one thread does all
 pieces of a scene, and the time of each is taken, in seconds of the thread's own processor time. Then they are
-dealt out to T threads as the counter would: the next piece to whoever is free first. What comes out is a
-bound: memory that threads share, caches and the waking of threads cost nothing in it. It needs no such number
-of cores.
+dealt out to T threads as the counter would: the next piece to the thread that is free first. What comes out
+is a bound: memory that threads share, caches and the waking of threads cost nothing in it. It needs no such
+number of cores.
 
 Pieces of the two blending kernels, runs of tiles, are timed one by one. Those of the other kernels are taken
 to cost what their Gaussians (`project`) or their pairs with tiles (`list_pairs`, `sort_pairs`) are of the

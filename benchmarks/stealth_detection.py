@@ -166,7 +166,7 @@ def _ranks(values: Doubles) -> Doubles:
 
 @dataclass(frozen=True)
 class _HeldOut:
-    """Each scene's statistics as whoever knows the other scenes sees them."""
+    """Each scene's statistics as seen by an attacker who knows the other scenes."""
 
     centred: Doubles  # [E, S] values less the median of the other scenes
     # Of each scene: its examples, the others, and ranks of these.

@@ -43,6 +43,14 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
     count_or_not(item)
 
 
+@pytest.fixture
+def umask() -> Iterator[None]:
+    """The usual umask, under which new files are readable by everybody; a test may set another."""
+    before = os.umask(0o022)
+    yield
+    os.umask(before)
+
+
 @pytest.fixture(name="keyss")
 def _keyss(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Run:
     """Runs the command line in this process, without a key in the environment and without a terminal."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 from cli.said import Run, assert_refused, write_key
@@ -42,13 +41,11 @@ class TestKeygen:
         assert_refused(keyss(*asset), 2, "--master-key-file")
         assert_refused(keyss(*asset, "--master-key-file", master, "--bits", 9), 2, "--bits")
 
-    def test_a_key_file_is_its_owners_and_never_replaced(self, keyss: Run, tmp_path: Path) -> None:
+    def test_a_key_file_is_its_owners_and_never_replaced(
+        self, keyss: Run, tmp_path: Path, umask: None
+    ) -> None:
         path = tmp_path / "key.txt"
-        umask = os.umask(0o022)
-        try:
-            said = keyss("keygen", "-o", path)
-        finally:
-            os.umask(umask)
+        said = keyss("keygen", "-o", path)
         key = read_key_file(path)
         assert (said.status, said.err) == (0, "")
         assert str(path) in said.out

@@ -39,7 +39,7 @@ def carried(cover: Gaussians, secret: Gaussians, claimed: int) -> Gaussians:
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Keys `key` and `other`; models of which 500 of 500, 1,000 and 12,000 Gaussians are left."""
+    """Keys `key` and `other`; models with 500 Gaussians left of 500, 1,000 and 12,000."""
     folder = tmp_path_factory.mktemp("files")
     for name, key in (("key", KEY), ("other", KEY[::-1])):
         write_key(folder / name, key)

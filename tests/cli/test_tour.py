@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 import stat
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -15,14 +13,6 @@ from cli.said import SMALL, Run, Said
 from files.scene_files import write_blender, write_nerfstudio
 from keyss.demo import OPTIONS, run_demo
 from keyss.files import write_model
-
-
-@pytest.fixture
-def umask() -> Iterator[None]:
-    """The usual one: new files are readable by everybody."""
-    before = os.umask(0o022)
-    yield
-    os.umask(before)
 
 
 @pytest.fixture

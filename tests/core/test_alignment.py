@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings, strategies as st
-from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from core.test_similarity import random_similarity
 from keyss.core import Camera, Similarity, align, camera_positions, focus_point, up_direction
 
 
@@ -36,12 +36,6 @@ def ring(seed: int, turn: float, count: int = 30, height: float = 0.6, target: f
         wobble = 0.1 * rng.normal(size=3)
         cameras.append(looking_at(position, wobble + np.array([0, 0, target]), np.array([0.0, 0.0, 1.0])))
     return cameras
-
-
-def random_similarity(seed: int) -> Similarity:
-    rng = np.random.default_rng(seed)
-    rotation = torch.from_numpy(Rotation.random(None, rng).as_matrix())
-    return Similarity(float(np.exp(rng.normal())), rotation, torch.from_numpy(rng.normal(size=3)))
 
 
 def mean_distance(cameras: list[Camera]) -> float:

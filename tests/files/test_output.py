@@ -45,12 +45,9 @@ def child(program: str, path: Path) -> Iterator[subprocess.Popen[str]]:
         process.kill()
 
 
-def test_only_the_owner_may_read_what_is_written(tmp_path: Path) -> None:
-    old = os.umask(0)
-    try:
-        write_bytes(tmp_path / "x", b"1")
-    finally:
-        os.umask(old)
+def test_only_the_owner_may_read_what_is_written(tmp_path: Path, umask: None) -> None:
+    os.umask(0)
+    write_bytes(tmp_path / "x", b"1")
     assert (tmp_path / "x").stat().st_mode & 0o777 == 0o600
 
 

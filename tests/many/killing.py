@@ -1,4 +1,4 @@
-"""Sweeps of which processes are killed at random moments, and then the same command again."""
+"""Sweeps whose processes are killed at random moments, and then the same command again."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def kill_until_done(
     longest: float,
     chosen: Callable[[str], bool] = lambda command: True,
 ) -> list[str]:
-    """Runs a sweep of which so many processes are killed, then the same command once more.
+    """Runs a sweep, kills so many of its processes, then the same command once more.
 
     No result may change once it is there, and no cell may say twice that it is done. `longest`: between two
     kills, in seconds. `chosen`: whether a process with this command may be killed, beside the driver. The

@@ -61,7 +61,7 @@ def scenes() -> list[Any]:
 
 
 def losses(stego: Gaussians, scenes: list[Any], opens: Any, standard: bool = True) -> dict[str, Any]:
-    """What `survival` gives of a run of which a secret opens so."""
+    """The result of `survival` for a run whose secret opens so."""
     run = SimpleNamespace(
         stego=stego,
         openers=[lambda stego: SimpleNamespace(frame=None, reveal=lambda stego, force=False: opens(stego))],

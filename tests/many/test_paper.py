@@ -49,7 +49,7 @@ def test_averages_are_those_that_the_paper_prints() -> None:
 def test_sums_and_scores_follow_from_the_other_figures() -> None:
     for mask, figures in published("masks").items():
         cover, secret, mean, distance, score = (value or 0.0 for value in figures.values())
-        # The distance is printed with three digits, of which half a unit is 0.026 of the score.
+        # The distance is printed with three digits; half a unit of the last is 0.026 of the score.
         assert (cover + secret) * (1 - distance) == pytest.approx(score, abs=0.03), mask
         assert (cover + secret) / 2 == pytest.approx(mean, abs=1e-6), mask
     for mask, breakdown in published("sinkhorn").items():

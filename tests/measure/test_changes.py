@@ -150,7 +150,7 @@ def scene() -> Scene:
 
 
 def planted() -> tuple[Gaussians, torch.Tensor]:
-    """The scene's model among others of which no photo shows anything, and which those are."""
+    """The scene's model among Gaussians that no photo shows, and which those are."""
     seen = random_gaussians(seed=0)
     transparent = replace(random_gaussians(30, seed=1), opacity_logits=torch.full((30,), -8.0))
     elsewhere = replace(random_gaussians(20, seed=2), means=torch.tensor([0, 0, 90.0]).repeat(20, 1))

@@ -45,7 +45,7 @@ def test_arrays_may_be_empty() -> None:
     assert memory.empty((0, 16), np.float32).shape == (0, 16)
 
 
-# A million Gaussians as in fitted scenes, of which nearly all are seen. A few are drawn before, so that what
+# A million Gaussians as in fitted scenes, nearly all of them visible. A few are drawn before, so that what
 # the compiler takes is not counted.
 DRAW_A_MILLION = """
 import math, resource, torch

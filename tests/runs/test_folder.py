@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 
 import msgspec
@@ -45,19 +44,10 @@ def interrupt(path: Path, arguments: dict[str, object], stage: str = "hide", **h
         folder.write(contents)
 
 
-@contextmanager
-def umask(mask: int) -> Iterator[None]:
-    old = os.umask(mask)
-    try:
-        yield
-    finally:
-        os.umask(old)
-
-
-def test_all_files_appear_and_only_what_is_published_can_be_read(tmp_path: Path) -> None:
+def test_all_files_appear_and_only_what_is_published_can_be_read(tmp_path: Path, umask: None) -> None:
     folder = RunFolder(tmp_path / "a" / "run", "hide")
     assert list(tmp_path.iterdir()) == []
-    with umask(0o022), folder.work():
+    with folder.work():
         (folder.checkpoints / "fit").touch()
         folder.write({"publish/stego.ply": b"1", "private/cover.ply": b"2"})
         assert tree(tmp_path).keys().isdisjoint({"a/run/publish/stego.ply"})

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import stat
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,6 +18,8 @@ from keyss.core import Interrupted
 from keyss.methods import CarriedSecret, MethodOptions
 from keyss.runs import secret_ids
 
+pytestmark = pytest.mark.usefixtures("umask")
+
 KEY = "a key of many characters: 93hXmQ2"
 FIT = FitConfig(iterations=4, max_gaussians=1600, evaluate_every=0)
 METHODS = {
@@ -30,14 +30,6 @@ METHODS = {
     ),
     "carry": CarryOptions(fit=FIT),
 }
-
-
-@pytest.fixture(autouse=True)
-def umask() -> Iterator[None]:
-    """The usual umask, which lets everybody read files."""
-    before = os.umask(0o022)
-    yield
-    os.umask(before)
 
 
 def _hide(folder: Path, options: MethodOptions, **how: object) -> Path:

@@ -239,7 +239,7 @@ def write_whole() -> None:
     far = trained_like(40, 8, 0)
     far.means[3, 1] = -1e5  # an outlier
     seen = trained_like(40, 9, 3)
-    seen.log_scales[2] += 8  # of which harmonics are as fine as they get, and of the next as coarse
+    seen.log_scales[2] += 8  # its harmonics are as fine as they get, and those of the next as coarse
     seen.opacity_logits[3] = -14
     models = [seen, far, trained_like(10, 10, 1)[:1]]
     encoded = [whole.encode(each) for each in models]

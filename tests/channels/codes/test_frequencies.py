@@ -50,7 +50,7 @@ def test_pairs_of_values_find_overwriting_and_not_matching() -> None:
 
 
 def test_columns_look_like_those_of_the_untouched_file(file: tuple[str, CodesCover, Any]) -> None:
-    """Frequencies of levels, in bins of a few, by a test of two samples of which each is random."""
+    """Frequencies of levels, in bins of a few, by a test of two random samples."""
     suffix, cover, codes = file
     _, after = in_counted_order(codes)
     other = in_counted_order(codes_of(suffix, COUNT, seed=1))[1]

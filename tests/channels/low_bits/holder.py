@@ -1,6 +1,6 @@
 """What the holder of one key sees of a file: which cells open, and where they lie.
 
-Not only what a reader hands out: whoever has the key and the source can try every cell.
+Not only what a reader returns: the holder of a key and of the source can try every cell.
 """
 
 from __future__ import annotations

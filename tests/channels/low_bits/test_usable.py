@@ -181,7 +181,7 @@ def test_a_cover_that_was_changed_in_place_is_looked_at_again() -> None:
 
 
 def test_saturated_opacities_stay_as_they_are() -> None:
-    """Logits whose sigmoid has no gradient stay equal in clones of which everything else was trained."""
+    """Logits whose sigmoid has no gradient stay equal in clones whose other numbers were trained."""
     model = trained_like(2000, 3)
     model.opacity_logits[:200] = torch.linspace(16.0001, 19, 200) * 1.0001
     model.opacity_logits[200:400] = -model.opacity_logits[:200]

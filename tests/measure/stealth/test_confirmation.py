@@ -51,7 +51,7 @@ def test_identical_high_bits_confirm() -> None:
 
 
 def test_carried_secrets_are_not_confirmed() -> None:
-    """Nearly chance for each score: 24 cases of which half are right."""
+    """Nearly chance for each score: half of 24 cases are right."""
     candidates = [plain(10 + index, 700) for index in range(SECRETS)]
     covers = [plain(index) for index in range(SECRETS)]
     before = [

@@ -21,7 +21,7 @@ export function preparedFor(model: ReadModel): (thorough: boolean) => Channels {
   return (thorough) => new Channels(thorough ? [(colours ??= ColoursReader.of(model))] : quick);
 }
 
-/** Several channels, of which the first one that opens counts. */
+/** Several channels; the first one that opens counts. */
 export class Channels implements Reader {
   constructor(readonly readers: readonly Reader[]) {}
 

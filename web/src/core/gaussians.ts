@@ -57,7 +57,7 @@ export function selected(gaussians: Gaussians, rows: ArrayLike<number>): Gaussia
   return found;
 }
 
-/** Those of which `keep` is true, in their order. */
+/** The Gaussians for which `keep` is true, in their order. */
 export function where(gaussians: Gaussians, keep: (row: number) => boolean): Gaussians {
   const rows = [...Array(gaussians.count).keys()].filter(keep);
   return rows.length === gaussians.count ? gaussians : selected(gaussians, rows);

@@ -40,7 +40,7 @@ export class Codec {
     private readonly far: readonly Line[], // with the reach that outliers have
   ) {}
 
-  /** From a header, of which what follows is ignored. Raises InputError. */
+  /** From the start of a header; the rest is ignored. Raises InputError. */
   static unpack(data: Uint8Array): Codec {
     if (data.length < TABLE_BYTES) throw damaged();
     let count = TABLE_BYTES;

@@ -100,7 +100,7 @@ export function inOwnFrame(faint: Gaussians, toOwn: Similarity): Uint16Array {
 const ORDER = [[0, 1, 2, 3], [1, 0, 3, 2], [2, 3, 0, 1], [3, 2, 1, 0]]; // of q, q i, q j, q k
 const SIGNS = [[1, 1, 1, 1], [-1, 1, 1, -1], [-1, -1, 1, 1], [-1, 1, -1, 1]];
 
-/** The unit quaternion wxyz of the same ellipsoid of which w is the largest part: half a turn about an axis is nothing. */
+/** The unit quaternion wxyz of the same ellipsoid whose largest part is w: half a turn about an axis is nothing. */
 function withLargestW(quat: number[]): number[] {
   const length = Math.max(1e-30, Math.hypot(...quat));
   const largest = [0, 1, 2, 3].reduce((a, b) => (Math.abs(quat[b]) > Math.abs(quat[a]) ? b : a));

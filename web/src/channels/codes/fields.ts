@@ -94,7 +94,7 @@ function middle(a: number, b: number, c: number): number {
   return Math.max(Math.min(a, b), Math.min(Math.max(a, b), c));
 }
 
-/** How many bits of levels span 2 to `log` at most; NaN, of which bytes make 0, for NaN. */
+/** The number of bits of levels that span at most 2 ** `log`; NaN, which becomes 0 as a byte, for NaN. */
 function fitting(log: number): number {
   return Math.min(Math.max(Math.floor(log), 0), MAX_BITS);
 }

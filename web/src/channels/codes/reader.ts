@@ -15,7 +15,7 @@ import { BLOCK, bytesOf, matrix, products } from './syndromes.ts';
 
 const ASSOCIATED = ascii('keyss/v1/codes/data');
 const USUAL_RATE = 800; // of a key that opens nothing
-const MAX_BITS = 2 ** 30; // of which more would take more memory than tabs have
+const MAX_BITS = 2 ** 30; // more would take more memory than tabs have
 
 export class CodesReader implements Reader {
   readonly derivations = 1;

@@ -14,7 +14,7 @@ export function matrix(seed: Uint8Array, rate: number): Uint32Array {
   return found;
 }
 
-/** What blocks hold: [B, BLOCK / 32], of which the first bits are those of as many rows as there are. */
+/** The messages in blocks: [B, BLOCK / 32]; the first bits of each are used, one for each row. */
 export function products(bits: Uint8Array, places: Uint32Array, rows: Uint32Array): Uint32Array {
   const [blocks, rate] = [Math.floor(places.length / BLOCK), rows.length / WORDS];
   const found = new Uint32Array(blocks * WORDS);

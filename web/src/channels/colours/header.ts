@@ -13,7 +13,7 @@ import { Fountain, NOISY } from './fountain.ts';
 import { COLUMNS, dithers, MAX_BITS, rank, readBits, seedsOf, sum } from './lattice.ts';
 
 export const FILE_KEY_BYTES = 5;
-export const SHARES = 256; // parts of the carriers, of which a payload has some
+export const SHARES = 256; // parts of the carriers; a payload has some of them
 export const IDLE = 1 / 32; // unit of the share of carriers that were left alone
 const PARTITION_BYTES = 2;
 const CHECK_BYTES = 2;

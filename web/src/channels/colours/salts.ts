@@ -7,7 +7,7 @@ import { COLOUR_NOISE, COLOUR_STEP, NAME, type Numbers, OPACITY_NOISE, OPACITY_S
 import { rank } from './lattice.ts';
 
 const SALTS = 16; // at most
-const BANDS = [0.08, 0.4, 1.01]; // of opacity, from each of which half of them are
+const BANDS = [0.08, 0.4, 1.01]; // limits of two bands of opacity, with half of the salts each
 const STEPS = [16, 8, 8, 5, 5, 5]; // of opacity, two ratios of scales, red, green and blue that make a cell
 const NOISE = [
   OPACITY_NOISE / OPACITY_STEP, 1, 1,

@@ -12,7 +12,7 @@ const MAX_CHUNKS = 255;
 const MAX_CODEWORDS = Math.floor((1 << 24) / MAX_CHUNKS);
 export const NUMBER_BYTES = 3; // of a chunk of a payload
 
-/** Of records, `cells` of which divide a carrier. */
+/** The parameters of records; a carrier holds `cells` of them. */
 export interface Parameters {
   readonly isPayload: boolean; // whose records are numbered chunks
   readonly method: string;
