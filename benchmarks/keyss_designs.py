@@ -29,6 +29,7 @@ from keyss.fitting import PlainRun, load_checkpoint, mean_psnr, save_checkpoint
 from keyss.keys import random_embeddings
 from keyss.measure import opacity_pruning, stealth_statistics
 from keyss.methods import PlacedScene
+from keyss.rendering import Viewpoints, psnr_between
 
 import torch
 
@@ -110,6 +111,9 @@ def measured(options: argparse.Namespace, names: Sequence[str], seed: int, desig
         found["statistic"] = noticed(run.scene_gaussians(0).detach()[in_order], stego)
     pruned = opacity_pruning(0.25).apply(stego)
     found["cover pruned"] = psnr(pruned, 0)
+    for name, model in (("", stego), (" bound", plains[names[0], 1])):
+        seen = psnr_between(model, opacity_pruning(0.25).apply(model), Viewpoints.of(scenes[0]))
+        found[f"seen when pruned{name}"] = seen
     wrong = random_embeddings(WRONG_KEYS, torch.Generator().manual_seed(99))
     for index, secret in enumerate(secrets, 1):
         found[f"secret {index}"] = psnr(secret.reveal(stego, frame="cover"), index)
