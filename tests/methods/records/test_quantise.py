@@ -134,3 +134,16 @@ def test_lines_that_could_give_numbers_out_of_bounds_are_refused(
     for reaches in ((reach, 1), (1, reach)):
         with pytest.raises(ValueError, match="no such line"):
             Line(centre, spread, *reaches)
+
+
+def test_lines_of_a_sample_reach_the_furthest_number_of_all_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("keyss.methods.records.quantise._SAMPLE", 100)
+    model = trained_like(9000, 0)
+    codec, usual = Codec.fit(model, Table.floor(3)), ~outliers(model)
+    for values, line in zip(model.means.double().numpy().T, codec.lines[:3], strict=True):
+        assert np.abs(line.positions(values[usual])).max() <= line.reach
+        assert np.abs(line.positions(values)).max() <= max(line.reach, line.far_reach)
+    records = codec.encode(model)
+    back, part = codec.decode(records), codec.decode(records[5000:])
+    assert torch.equal(back.sh[5000:], part.sh)
+    assert torch.equal(back.quats[5000:], part.quats)
