@@ -1,0 +1,95 @@
+import { expect, test } from 'vitest';
+import { emptyGaussians, type Gaussians } from '../src/core/gaussians.ts';
+import { dot } from '../src/core/similarity.ts';
+import {
+  add, alike, axes, difference, FIELD_OF_VIEW, firstPose, length, picked, poseOfHash, poseToHash, rolled, turned, UPS, upName,
+  type Vector,
+} from '../src/page/pose.ts';
+
+/** 4,000 opaque Gaussians in a box around a middle, or on its floor across an axis. */
+function box(middle: Vector, size: Vector, floor?: number): Gaussians {
+  const model = emptyGaussians(4000, 0);
+  model.opacityLogits.fill(3);
+  for (let row = 0; row < model.count; row++) {
+    for (let axis = 0; axis < 3; axis++) {
+      const share = ((row + 1) * [0.7548776662, 0.5698402909, 0.4301597090][axis]) % 1;
+      const onFloor = axis === floor && row % 2 === 0;
+      model.means[3 * row + axis] = middle[axis] + (onFloor ? -0.5 : share - 0.5) * size[axis];
+    }
+  }
+  return model;
+}
+
+function shareInView(model: Gaussians, pose: ReturnType<typeof firstPose>, aspect: number): number {
+  const { right, down, forward } = axes(pose);
+  const half = Math.tan((FIELD_OF_VIEW * Math.PI) / 360);
+  let inside = 0;
+  for (let row = 0; row < model.count; row++) {
+    const offset = difference([...model.means.subarray(3 * row, 3 * row + 3)] as unknown as Vector, pose.eye);
+    const depth = dot(offset, forward);
+    inside += Number(Math.abs(dot(offset, right)) < half * aspect * depth && Math.abs(dot(offset, down)) < half * depth);
+  }
+  return inside / model.count;
+}
+
+test.each([[0.5], [1], [1.6]])('the first pose has a model in view whose picture is %f times as wide as high', (aspect) => {
+  for (const size of [[1, 1, 1], [9, 1, 1], [1, 9, 1], [1, 1, 9]] as Vector[]) {
+    const model = box([5, -3, 8], size);
+    const pose = firstPose(model, aspect);
+    expect(shareInView(model, pose, aspect)).toBeGreaterThan(0.97);
+    expect(length(difference(pose.target, [5, -3, 8]))).toBeLessThan(0.3);
+  }
+});
+
+test('a floor across z has z up, and a way up that is asked for counts more', () => {
+  expect(upName(firstPose(box([0, 0, 0], [1, 1, 1], 2), 1).up)).toBe('z');
+  expect(upName(firstPose(box([0, 0, 0], [1, 1, 1], 1), 1).up)).toBe('-y');
+  for (const [name, up] of Object.entries(UPS)) expect(upName(firstPose(box([0, 0, 0], [1, 1, 1], 2), 1, up).up)).toBe(name);
+});
+
+test('the camera of the photos gives side and tilt, and bounds the distance', () => {
+  const up: Vector = [0.6, -0.8, 0];
+  const captured = { eye: [0, 0, -2] as Vector, target: [0, 0, 0] as Vector, up };
+  const pose = firstPose(box([0, 0, 0], [100, 100, 100]), 1, undefined, captured);
+  expect(pose.up).toEqual(up);
+  expect(length(difference(pose.eye, [0, 0, -5]))).toBeLessThan(1e-9);
+});
+
+test('an address gives the pose back that it was made of', () => {
+  for (const up of [...Object.values(UPS), [0.6, -0.8, 0] as Vector]) {
+    const pose = { eye: [1.5, -2.25, 1e-3] as Vector, target: [0.125, 3, -400] as Vector, up };
+    expect(poseOfHash(poseToHash(pose))).toEqual(pose);
+  }
+  expect(poseToHash({ eye: [1, 2, 3], target: [0, 0, 0], up: UPS['-y'] })).toBe('#eye=1,2,3&target=0,0,0');
+  expect(poseOfHash('#eye=1,2,3&target=0,0,0&up=sideways')?.up).toEqual(UPS['-y']);
+  for (const wrong of ['', '#', '#eye=1,2,3', '#eye=1,2,3&target=1,2,3', '#eye=1,2&target=0,0,0', '#eye=1,2,1e9&target=0,0,0']) {
+    expect(poseOfHash(wrong)).toBeNull();
+  }
+});
+
+test('another model is seen as the first one is', () => {
+  const [from, to] = [firstPose(box([0, 0, 0], [1, 1, 1]), 1), firstPose(box([7, 7, 7], [3, 3, 3], 2), 1)];
+  const same = alike(from, from, to);
+  for (const part of ['eye', 'target', 'up'] as const) expect(length(difference(same[part], to[part]))).toBeLessThan(1e-6);
+  const elsewhere = { ...from, eye: add(from.eye, [0.3, -0.2, 0.5]) };
+  const back = alike(alike(elsewhere, from, to), to, from);
+  for (const part of ['eye', 'target', 'up'] as const) expect(length(difference(back[part], elsewhere[part]))).toBeLessThan(1e-6);
+});
+
+test('turning keeps the distance and stops before it is above, rolling keeps the view', () => {
+  const offset = turned([0, 0, -4], UPS['-y'], 1, 10);
+  expect(length(offset)).toBeCloseTo(4);
+  expect(dot(offset, UPS['-y'])).toBeLessThan(4);
+  const pose = { eye: [0, 0, -4] as Vector, target: [0, 0, 0] as Vector, up: UPS['-y'] };
+  const right = rolled(pose, Math.PI / 2);
+  expect(length(difference(right.up, axes(pose).right))).toBeLessThan(1e-9);
+  expect(axes(right).forward).toEqual(axes(pose).forward);
+});
+
+test('a click finds the nearest Gaussian on its ray', () => {
+  const model = emptyGaussians(3, 0);
+  model.means.set([0, 0, 5, 0, 0, 2, 1, 0, 1]);
+  model.opacityLogits.set([3, 3, 3]);
+  expect(picked(model, [0, 0, 0], [0, 0, 3])).toEqual([0, 0, 2]);
+  expect(picked(model, [0, 0, 0], [0, 1, 0])).toBeNull();
+});
