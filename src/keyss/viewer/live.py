@@ -30,6 +30,8 @@ EVERY = 3.0  # minimum seconds between two copies
 _COST = 50  # a copy is followed by a pause of this many times its duration
 _WATCHED = 15.0  # seconds for which a request counts as somebody watching
 _STATE = "live"
+# `numbers` are in decibels, by name.
+_NO_PROGRESS: dict[str, Any] = {"title": "", "iteration": 0, "iterations": 0, "gaussians": 0, "numbers": {}}
 
 
 @dataclass
@@ -53,12 +55,11 @@ class LiveTraining:
         self._server = PageServer(served_page("keyss-live", _STATE, look or {}), contents, folder=folder)
         self._thread = threading.Thread(target=self._server.run, daemon=True)
         self._timer = timer
-        self._progress: dict[str, Any] = {}
+        self._progress = _NO_PROGRESS
         self._copies: dict[str, _Copy] = {}
         self._requested = self._copied = -float("inf")
         self._pause = EVERY
         self._version = 0
-        self.progress()
 
     @property
     def address(self) -> str:
@@ -79,22 +80,9 @@ class LiveTraining:
         """A reporter that updates the page and passes everything on to `reporter`."""
         return LiveReporter(self, reporter, "published")
 
-    def progress(
-        self,
-        title: str = "",
-        iteration: int = 0,
-        iterations: int = 0,
-        gaussians: int = 0,
-        numbers: dict[str, float] | None = None,
-    ) -> None:
-        """Set what the page shows beside the model."""
-        self._progress = {
-            "title": title,
-            "iteration": iteration,
-            "iterations": iterations,
-            "gaussians": gaussians,
-            "numbers": numbers or {},
-        }
+    def progress(self, **shown: Any) -> None:
+        """Set what the page shows beside the model: the names of `_NO_PROGRESS`."""
+        self._progress = _NO_PROGRESS | shown
 
     def look(self, side: Side, model: Callable[[], Gaussians]) -> None:
         """Copy the model if somebody watches and a copy is due, and always after the last step."""
@@ -135,18 +123,18 @@ class LiveReporter(Reporter):
 
     def __init__(self, training: LiveTraining, reporter: Reporter, side: Side) -> None:
         self._training, self._reporter, self._side = training, reporter, side
-        self._title, self._iterations = "", 0
+        self._known: dict[str, Any] = {}
         self.loss_every = reporter.loss_every
 
     def start(self, title: str, iterations: int, iteration: int) -> None:
         self._reporter.start(title, iterations, iteration)
-        self._title, self._iterations = title, iterations
-        self._training.progress(title, iteration, iterations)
+        self._known = {"title": title, "iterations": iterations}
+        self._training.progress(**self._known, iteration=iteration)
 
     def update(self, iteration: int, gaussians: int, numbers: dict[str, float]) -> None:
         self._reporter.update(iteration, gaussians, numbers)
         decibels = {name: value for name, value in numbers.items() if name != "loss"}
-        self._training.progress(self._title, iteration, self._iterations, gaussians, decibels)
+        self._training.progress(**self._known, iteration=iteration, gaussians=gaussians, numbers=decibels)
 
     def look(self, model: Callable[[], Gaussians]) -> None:
         self._training.look(self._side, model)
