@@ -162,7 +162,10 @@ def steganalyze(
     try:
         for done, path in enumerate(paths, start=1):
             try:
-                rows.append(_row(path, threshold))
+                scores = score_image(read_pixels(path))
+                fusion = next(iter(_present([scores.fusion])), 0.0)
+                size = math.floor(fusion * path.stat().st_size / 3 + 0.5)
+                rows.append(Row(path.name, scores, fusion > threshold, size))
             except InputError:
                 skipped.append(path.name)
             reporter.update(done, 0, {})
@@ -194,12 +197,6 @@ def _files(folder: Path) -> list[Path]:
     if not paths:
         raise InputError(f"{folder}: expected images, but there are no files in it")
     return paths
-
-
-def _row(path: Path, threshold: float) -> Row:
-    scores = score_image(read_pixels(path))
-    fusion = next(iter(_present([scores.fusion])), 0.0)
-    return Row(path.name, scores, fusion > threshold, math.floor(fusion * path.stat().st_size / 3 + 0.5))
 
 
 def _present(scores: Iterable[float | None]) -> list[float]:

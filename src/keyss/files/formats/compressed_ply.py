@@ -91,7 +91,6 @@ class CompressedPlyCodes(Codes):
         )
 
     def serialise(self) -> bytes:
-        """See `Codes`."""
         n, k = self.sh.shape[:2]
         packed = np.empty((n, 4), dtype="<u4")
         packed[:, 0] = _joined(self.positions, _VECTOR)
@@ -109,7 +108,6 @@ class CompressedPlyCodes(Codes):
 
     @classmethod
     def quantise(cls, model: Gaussians) -> Self:
-        """See `Codes`."""
         means, quats, log_scales, opacities, f_dc, rest = arrays_of(model)
         colors = f_dc.astype(np.float64) * SH_C0 + 0.5
         parts = [means.astype(np.float64), log_scales.astype(np.float64), colors]
@@ -132,7 +130,6 @@ class CompressedPlyCodes(Codes):
         )
 
     def dequantise(self) -> Gaussians:
-        """See `Codes`."""
         bounds = self.bounds.astype(np.float64).repeat(CHUNK, axis=0)[: len(self)].reshape(-1, 3, 2, 3)
         steps = 2.0 ** np.array(_VECTOR) - 1
         rotations = (self.rotations / 1023 - 0.5) * np.sqrt(2)

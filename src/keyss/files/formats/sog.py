@@ -101,7 +101,6 @@ class SogCodes(Codes):
         )
 
     def serialise(self) -> bytes:
-        """See `Codes`."""
         n, (p, k) = len(self), self.palette.shape[:2]
         images = {
             "means_l.webp": _rgba(self.positions & 255),
@@ -167,7 +166,6 @@ class SogCodes(Codes):
         )
 
     def dequantise(self) -> Gaussians:
-        """See `Codes`."""
         rotations = (self.rotations / 255 * 2 - 1) * np.sqrt(0.5)
         palette = self.sh_codebook[self.palette] if self.palette.size else np.empty((1, 0, 3), np.float32)
         return gaussians_of(

@@ -264,7 +264,6 @@ class SpzCodes(Codes):
         )
 
     def dequantise(self) -> Gaussians:
-        """See `Codes`."""
         means = np.ldexp(self.positions.astype(np.float64), -self.fractional_bits) * _MEAN_SIGNS
         if self.version == 2:
             xyz = self.rotations / 127.5 - 1

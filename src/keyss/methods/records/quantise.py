@@ -25,7 +25,7 @@ from dataclasses import astuple, dataclass, fields
 import numpy as np
 import torch
 
-from keyss.core.arrays import Bytes, Doubles, Flags, Words32
+from keyss.core.arrays import Bytes, Doubles, Flags, Words32, doubles
 from keyss.core.errors import InputError
 from keyss.core.gaussians import MAX_COORDINATE, MAX_LOG_SCALE, OPPONENT, Gaussians
 from keyss.files.formats.common import from_smallest_three, smallest_three, unit
@@ -71,7 +71,7 @@ class Codec:
 
     def codes(self, gaussians: Gaussians, outlier: Flags) -> list[Words32]:
         """Codes [N, columns] for each entry of `table.layout`; `outlier` [N]: their `outliers`."""
-        quats = _doubles(gaussians.quats)
+        quats = doubles(gaussians.quats)
         quats[np.linalg.norm(quats, axis=1) <= _MIN_LENGTH] = 0
         left_out, three = smallest_three(unit(quats))
         columns = [
@@ -207,15 +207,15 @@ def _numbers(gaussians: Gaussians) -> Iterator[Doubles]:
     A Gaussian whose numbers overflow is never rendered: it becomes transparent, because its clamped numbers
     would be rendered.
     """
-    positions = _doubles(gaussians.means.clamp(-MAX_COORDINATE, MAX_COORDINATE))
+    positions = doubles(gaussians.means.clamp(-MAX_COORDINATE, MAX_COORDINATE))
     yield from np.split(positions, 3, axis=1)
-    yield _doubles(gaussians.log_scales.clamp(-MAX_LOG_SCALE, MAX_LOG_SCALE))
+    yield doubles(gaussians.log_scales.clamp(-MAX_LOG_SCALE, MAX_LOG_SCALE))
     logits = gaussians.opacity_logits.masked_fill(gaussians.overflow, -MAX_LOGIT)
-    yield _doubles(logits.clamp(-MAX_LOGIT, MAX_LOGIT))[:, None]
+    yield doubles(logits.clamp(-MAX_LOGIT, MAX_LOGIT))[:, None]
     first = 0
     for count in BANDS[: gaussians.sh_degree + 1]:
         harmonics = gaussians.sh[:, first : first + count].clamp(-_MAX_HARMONIC, _MAX_HARMONIC)
-        rotated = (_doubles(harmonics).reshape(-1, 3) @ OPPONENT.T).reshape(-1, count, 3)
+        rotated = (doubles(harmonics).reshape(-1, 3) @ OPPONENT.T).reshape(-1, count, 3)
         yield rotated[:, :, 0]
         yield rotated[:, :, 1:].reshape(len(rotated), -1)
         first += count
@@ -226,7 +226,3 @@ def _whole_quats(largest: Words32, three: Doubles) -> Doubles:
     quats = from_smallest_three(largest[:, 0].astype(np.uint8), three)
     quats /= np.linalg.norm(quats, axis=1, keepdims=True).clip(0.5)
     return quats
-
-
-def _doubles(values: torch.Tensor) -> Doubles:
-    return values.detach().cpu().numpy().astype(np.float64)
