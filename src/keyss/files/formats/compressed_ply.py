@@ -111,11 +111,12 @@ class CompressedPlyCodes(Codes):
         means, quats, log_scales, opacities, f_dc, rest = arrays_of(model)
         colors = f_dc.astype(np.float64) * SH_C0 + 0.5
         parts = [means.astype(np.float64), log_scales.astype(np.float64), colors]
-        bounds = np.concatenate([_bounds(each) for each in parts], axis=1)
+        starts, ends = np.arange(0, len(model), CHUNK), (np.minimum, np.maximum)
+        bounds = np.concatenate([end.reduceat(each, starts) for each in parts for end in ends], axis=1)
         bounds[:, 6:12] = bounds[:, 6:12].clip(-_SCALE_LIMIT, _SCALE_LIMIT)
         bounds = bounds.astype(np.float32)
-        ends = bounds.astype(np.float64).repeat(CHUNK, axis=0)[: len(model)].reshape(-1, 3, 2, 3)
-        position, scale, color = (_share(ends[:, i], values) for i, values in enumerate(parts))
+        between = bounds.astype(np.float64).repeat(CHUNK, axis=0)[: len(model)].reshape(-1, 3, 2, 3)
+        position, scale, color = (_share(between[:, i], values) for i, values in enumerate(parts))
         largest, others = smallest_three(quats)
         steps = 2.0 ** np.array(_VECTOR) - 1
         return cls(
@@ -178,13 +179,6 @@ def _joined(values: Numbers, bits: tuple[int, int, int]) -> Words32:
 def _between(ends: Doubles, share: Doubles) -> Doubles:
     """[N, 3] linear interpolation at `share` [N, 3] between `ends` [N, 2, 3]."""
     return ends[:, 0] * (1 - share) + ends[:, 1] * share
-
-
-def _bounds(values: Doubles) -> Doubles:
-    """[C, 6] minimum and maximum of each coordinate in each chunk of `values` [N, 3]."""
-    starts = np.arange(0, len(values), CHUNK)
-    both = [ufunc.reduceat(values, starts, axis=0) for ufunc in (np.minimum, np.maximum)]
-    return np.concatenate(both, axis=1)
 
 
 def _share(ends: Doubles, values: Doubles) -> Doubles:

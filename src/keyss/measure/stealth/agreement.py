@@ -73,13 +73,16 @@ def _of_pairs(one: Words32, other: Words32) -> dict[str, Statistic]:
     same_high = (one >> _LOW) == (other >> _LOW)
     equal = apart == 0
     size = 1 << _LOW
+    inside = int(((apart > 0) & (apart < _MOVED)).sum())
+    around = int(((apart >= _MOVED) & (apart < _AROUND)).sum())
     near = (2 * _CLOSE - 1) * size - _CLOSE * (_CLOSE - 1)  # ordered pairs closer than _CLOSE
     return {
         "close low bits": excess(
             int((apart[same_high] < _CLOSE).sum()), int(same_high.sum()), near / size**2
         ),
         "equal low bits": excess(int(equal[same_high].sum()), int(same_high.sum()), 1 / size),
-        "near misses": _misses(apart),
+        # Unequal pairs less than _MOVED apart, beyond the number expected from pairs further apart.
+        "near misses": more_than_smooth(inside, max(around, 1) * _MOVED / (_AROUND - _MOVED), len(apart)),
         "equal": portion(float(equal.sum()), len(equal)),
         "within a quarter of an octave": _within_quarters(one, other),
     }
@@ -92,13 +95,6 @@ def _within_quarters(one: Words32, other: Words32) -> Statistic:
         return NOTHING
     covariance = np.cov(*((words[both] >> _LOW & 255).astype(np.float64) for words in (one, other)))
     return normal(12 * float(covariance[0, 1]) / (1 << 16), float(both.sum()) ** -0.5)
-
-
-def _misses(apart: Integers) -> Statistic:
-    """Unequal pairs less than _MOVED apart, beyond the number expected from pairs further apart."""
-    inside = int(((apart > 0) & (apart < _MOVED)).sum())
-    around = int(((apart >= _MOVED) & (apart < _AROUND)).sum())
-    return more_than_smooth(inside, max(around, 1) * _MOVED / (_AROUND - _MOVED), len(apart))
 
 
 def _within(words: BitPatterns, attributes: tuple[int, ...]) -> Iterator[tuple[Words32, Words32]]:
