@@ -120,7 +120,10 @@ class ColoursCover:
         check_keys([each.check for each in writings])
         # With more than one bit there is no room for another secret that would not be noticed.
         if layouts[0].depth == 1:
-            writings += [_Writing.of_nobody(secret, index) for index in range(len(contents), UNNOTICED)]
+            for index in range(len(contents), UNNOTICED):  # of nobody
+                labels = [f"colours/nobody/{index}/{each}" for each in range(SALTS + 1)]
+                static, *others = (expand(secret, label, MASTER_BYTES) for label in labels)
+                writings.append(_Writing(static, tuple(others), None))
         likely = [layouts[min(index, len(layouts) - 1)].likely for index in range(len(writings))]
         for lower in range(_LOWER + 1):  # what headers and salts cost is known only now
             headers = self._headers(layouts, sizes, secret, lower)[: len(writings)]
@@ -251,8 +254,3 @@ class _Writing:
     @property
     def check(self) -> bytes:
         return check_secret(self.static)
-
-    @staticmethod
-    def of_nobody(secret: bytes, index: int) -> _Writing:
-        every = [expand(secret, f"colours/nobody/{index}/{each}", MASTER_BYTES) for each in range(SALTS + 1)]
-        return _Writing(every[0], tuple(every[1:]), None)
