@@ -158,7 +158,8 @@ def readable(model: Path) -> Readable:
             size = file.seek(0, 2)
     except OSError:
         header, size = b"", 0  # read_model raises the InputError
-    if _is_readable(model.name, header):
+    is_text = header.startswith(b"ply") and b"\nformat ascii" in header.partition(b"end_header")[0]
+    if header and not is_text and (header.startswith(_MAGIC) or model.name.lower().endswith(".splat")):
         if header.startswith(b"ply") and not is_compressed(model):
             with open_input(model) as file:
                 read_model_rows(file)  # checks header and size, and reads no rows
@@ -169,9 +170,7 @@ def readable(model: Path) -> Readable:
     from keyss.files.models import model_bytes
 
     gaussians = keyss.files.read_model(model)
-    name, kind = f"{model.stem}.ply", f"a {model.suffix}"
-    if header.startswith(b"ply"):
-        kind = "a .ply in text"
+    name, kind = f"{model.stem}.ply", "a .ply in text" if is_text else f"a {model.suffix}"
     data = model_bytes(name, gaussians)
     warnings.warn(
         f"{model}: the page does not read {kind}; it shows a lossless copy, {name}",
@@ -179,10 +178,3 @@ def readable(model: Path) -> Readable:
         stacklevel=3,
     )
     return Readable(name, lambda: BytesIO(data), len(data))
-
-
-def _is_readable(name: str, start: bytes) -> bool:
-    """True if the page reads the format of a file with this name and these first bytes."""
-    if start.startswith(b"ply"):
-        return b"\nformat ascii" not in start[:_MAX_HEADER].partition(b"end_header")[0]
-    return start.startswith(_MAGIC) or bool(start and name.lower().endswith(".splat"))
