@@ -13,9 +13,11 @@ from channels.low_bits.trained_like import trained_like
 from keyss import Gaussians, KeyssOptions, WrongKeyError
 from keyss.channels import LOW_BITS, Payload
 from keyss.core import InputError, Similarity, UsageError, same_bits
+from keyss.fitting.parameters import make_optimizers, to_parameters
 from keyss.keys import random_embeddings
 from keyss.measure import search_embeddings, stealth_statistics
 from keyss.methods import PlacedScene, RowSecret, registry
+from keyss.methods.keyss.designs.carriers import DeadPlaces
 from keyss.methods.keyss.rows import PAYLOAD_BYTES, carrying, encrypt_rows, row_kinds, secret_tables
 from methods.hiding import Hidden, check_resumes, hide_scenes, psnr_in, three_scenes
 from methods.keyss.hiding import EMBEDDINGS, FIT, KEYS, cover_with_zeros, written
@@ -226,6 +228,19 @@ def test_rows_are_in_the_order_in_which_plain_3dgs_makes_them() -> None:
     old = ~fresh & (run.scene_gaussians(0).opacities >= OPTIONS.fit.prune_opacity)
     assert torch.equal(stego.means[: int(old.sum())], run.scene_gaussians(0).detach().means[old])
     assert not torch.equal(stego.means[: int(old.sum())], start[old])
+
+
+def test_clones_come_before_both_parts_of_splits_each_in_the_order_of_their_sources() -> None:
+    fit = replace(FIT, max_gaussians=100)
+    model = trained_like(12)
+    logits = torch.cat([torch.zeros(6), torch.full((6,), -8.0)])  # six places
+    large = torch.tensor([False] * 3 + [True] * 9)[:, None]
+    scales = torch.where(large, 0.0, -9.0).expand(12, 3).clone()
+    params = to_parameters(replace(model, opacity_logits=logits, log_scales=scales), torch.device("cpu"))
+    density = DeadPlaces(fit, [1.0], torch.Generator().manual_seed(0))
+    born = torch.arange(12).flip(0)
+    grown = density._grow(params, make_optimizers(params, fit, 1.0), 0, torch.ones(12), 1, born)
+    assert grown.tolist() == [9, 10, 11, 5, 4, 3, 6, 7, 8]
 
 
 def test_scenes_share_poses_where_options_ask_for_it() -> None:

@@ -37,7 +37,6 @@ def bits(model: Gaussians, words: BitPatterns) -> dict[str, Statistic]:
         if len(own):
             statistics |= {f"{name}, {attribute}": each for name, each in _of_values(own).items()}
             statistics[f"strata of {attribute}"] = _strata(own)
-            statistics[f"bytes of {attribute}"] = _bytes(own)
     harmonics = words.attribute >= _HARMONICS
     own, trained = words.bits[:, harmonics], words.trained[:, harmonics]
     exponent = words.exponent[:, harmonics]
@@ -90,17 +89,6 @@ def _strata(values: Words32) -> Statistic:
         total += float(((ones - count / 2) ** 2 / np.maximum(count / 4, 1))[enough].sum())
         degrees += int(enough.sum())
     return dispersion(total, degrees)
-
-
-def _bytes(values: Words32) -> Statistic:
-    """Chi-square of the bytes from bit 1 and from bit 5 on."""
-    if len(values) < 1024:
-        return NOTHING
-    total = 0.0
-    for shift in (1, 5):
-        counts = np.bincount(values >> shift & 255, minlength=256)
-        total += float(((counts - len(values) / 256) ** 2).sum() * 256 / len(values))
-    return dispersion(total, 2 * 255)
 
 
 def _together(values: Words32, chosen: Flags) -> Statistic:
