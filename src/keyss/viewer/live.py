@@ -29,6 +29,7 @@ Side = Literal["published", "secret"]
 EVERY = 3.0  # minimum seconds between two copies
 _COST = 50  # a copy is followed by a pause of this many times its duration
 _WATCHED = 15.0  # seconds for which a request counts as somebody watching
+_LAST = 5.0  # seconds for which the result is offered at most
 _STATE = "live"
 # `numbers` are in decibels, by name.
 _NO_PROGRESS: dict[str, Any] = {"title": "", "iteration": 0, "iterations": 0, "gaussians": 0, "numbers": {}}
@@ -73,8 +74,17 @@ class LiveTraining:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        # The page asks every 2 s: let it fetch the result before it is gone.
+        deadline = time.monotonic() + _LAST
+        while kind is None and time.monotonic() < deadline and self._is_unseen():
+            time.sleep(0.1)
         self._server.close()
         self._thread.join()
+
+    def _is_unseen(self) -> bool:
+        """True if somebody watches who has not got the newest copies yet."""
+        watched = self._timer() - self._requested < _WATCHED
+        return watched and any(copy.ply is None for copy in self._copies.values())
 
     def reporter(self, reporter: Reporter) -> LiveReporter:
         """A reporter that updates the page and passes everything on to `reporter`."""
