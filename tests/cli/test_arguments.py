@@ -21,7 +21,9 @@ class TestArguments:
     def hidden(self, keyss: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[Any]:
         """Arguments of each call of `keyss.hide`."""
         monkeypatch.chdir(tmp_path)
-        for name in ("A", "B", "C", "a.ply", "b.ply", "m.ply", "mb", "mc", "x", "y"):
+        for name in ("A", "B", "C"):
+            Path(name).mkdir()
+        for name in ("a.ply", "b.ply", "m.ply", "mb", "mc", "x", "y"):
             Path(name).touch()
         calls: list[tuple[tuple[Any, ...], dict[str, Any]]] = []
 

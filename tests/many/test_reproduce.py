@@ -106,8 +106,9 @@ def test_the_command(keyss: Run, out: Path, folders: tuple[Path, Path], tmp_path
     planned = keyss("reproduce", "sinkhorn", *folders, *FLAGS, "--dry-run", "-o", tmp_path / "new")
     assert planned.status == 0, planned.err
     assert not (tmp_path / "new").exists()
-    assert [line.split()[1].strip(",") for line in planned.out.splitlines()[1:6]] == [
-        *("plain", "plain", "op", "op,ro", "op,ro,sc,xyz"),
+    assert [line.split("  ")[0] for line in planned.out.splitlines()[1:6]] == [
+        *(f"plain model of {scene}, 20 steps, seed 5" for scene in "ab"),
+        *(f"{mask}, a-b" for mask in ("op", "op,ro", "op,ro,sc,xyz")),
     ]
     assert "5 to do" in planned.out
     assert keyss("reproduce", "single", folders[0], "-o", tmp_path / "new").status == 2
