@@ -109,6 +109,8 @@ def measured(options: argparse.Namespace, names: Sequence[str], seed: int, desig
     if design == "carriers":
         in_order = run.density["born"].argsort(stable=True)
         found["statistic"] = noticed(run.scene_gaussians(0).detach()[in_order], stego)
+        for index in range(1, len(scenes)):  # before rows and quantisation cost anything
+            found[f"secret {index} trained"] = psnr(run.scene_gaussians(index).detach(), index)
     pruned = opacity_pruning(0.25).apply(stego)
     found["cover pruned"] = psnr(pruned, 0)
     for name, model in (("", stego), (" bound", plains[names[0], 1])):
