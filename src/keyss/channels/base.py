@@ -1,8 +1,8 @@
 """The protocol of all channels: places in a published model where bits are stored and found with a key.
 
 A channel does not interpret its bits. Every channel carries *payloads*: bytes that come out whole or not at
-all. Low bits carry *records* too: many small pieces of one size that are found one by one, so that a model
-that lost Gaussians has lost as many records and no more.
+all. Low bits carry *records* too: many small pieces of one size that are found one by one. A model that
+lost Gaussians has lost as many records and no more.
 
 The place of publication determines the channel of a hiding (`publishing`); readers try them all.
 """
@@ -23,7 +23,7 @@ from keyss.core.gaussians import Gaussians
 from keyss.keys.derivation import DerivedKey
 
 METHOD_BYTES = 15  # of the name of a method in files
-SALTS_TRIED = 4  # of a model half of whose Gaussians were changed, 15 of 16 then open
+SALTS_TRIED = 4  # with half of the Gaussians changed, 15 of 16 models still open
 NOTICED = (
     "the secrets are too large, or too many, to lie in this cover as each would alone: whoever holds one of "
     "the keys can notice that there are other secrets"
@@ -36,7 +36,7 @@ class Payload:
 
     method: str  # 1 to METHOD_BYTES ASCII characters
     data: bytes
-    # Of a payload that was cut into chunks: those that were read and those that were written.
+    # For a payload that was cut into chunks: the number read and the number written.
     chunks: tuple[int, int] | None = field(default=None, compare=False)
     carriers: int | None = field(default=None, compare=False)  # Gaussians of the model that it was read from
 
@@ -61,7 +61,7 @@ class RecordPlan:
 
 @dataclass(frozen=True)
 class Records:
-    """Pieces of one size that come out one by one, in any order."""
+    """Pieces of one size that are found one by one, in any order."""
 
     method: str  # 1 to METHOD_BYTES ASCII characters
     header: bytes  # what the method needs to read them; comes out whole or not at all
@@ -114,11 +114,11 @@ class PreparedCover(Protocol):
         """The room for payloads."""
 
     def embed(self, contents: Sequence[tuple[str, Content]], *, entropy: bytes | None = None) -> Gaussians:
-        """The cover with one (key, content) for each secret in it; all contents are payloads, or records.
+        """Embed one (key, content) for each secret; all contents are payloads, or all are records.
 
-        `entropy`: at least 32 bytes that nobody else can know, from which all randomness is derived; by
-        default the system's. Raises UsageError for equal keys and for contents that do not fit. Warns
-        (KeyssWarning) where the holder of one key can notice that there are other secrets.
+        `entropy`: at least 32 secret bytes from which all randomness is derived; by default the system's.
+        Raises UsageError for equal keys and for contents that do not fit. Warns (KeyssWarning) where the
+        holder of one key can notice that there are other secrets.
         """
 
 
@@ -161,14 +161,14 @@ class Channel(ABC):
 
     @abstractmethod
     def prepare(self, cover: Gaussians) -> PreparedCover:
-        """Find the carriers. Raises UsageError for a cover without room, or none that is unseen.
+        """Find the carriers. Raises UsageError for a cover without room, or where a change would be seen.
 
         Raises OutputError for a cover that the format of the published file does not hold.
         """
 
     @abstractmethod
     def room(self, gaussians: int, sh_degree: int) -> Room:
-        """About what fits into a cover with so many Gaussians that can carry something."""
+        """An estimate of what fits into a cover with so many Gaussians that can carry something."""
 
 
 def pack_payload(content: Content) -> bytes:
@@ -184,16 +184,16 @@ def unpack_payload(packed: bytes) -> Payload:
     try:
         check_method(name.decode("ascii"))
     except ValueError as error:
-        raise InputError("the hidden data are damaged: they begin with no name of a method") from error
+        raise InputError("the hidden data are damaged: they do not begin with a method's name") from error
     if not zero:
-        raise InputError("the hidden data are damaged: they are not whole")
+        raise InputError("the hidden data are damaged: they are incomplete")
     return Payload(name.decode("ascii"), data)
 
 
 def randomness(entropy: bytes | None, *parts: bytes) -> bytes:
-    """32 bytes that depend on `entropy` and on all hidden data: no two files share what is derived from them.
+    """32 bytes that depend on `entropy` and on all hidden data, so that no two files share derived values.
 
-    `entropy`: at least 32 bytes that nobody else can know; None takes the system's.
+    `entropy`: at least 32 secret bytes; None: the system's.
     """
     entropy = os.urandom(32) if entropy is None else entropy
     if len(entropy) < 32:

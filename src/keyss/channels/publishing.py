@@ -75,7 +75,7 @@ def quick_attempt(stego: Gaussians, key: str) -> Attempt | None:
 
     Raises InputError for damage.
     """
-    appended = _appended(stego)  # everybody sees that they are there
+    appended = _appended(stego)  # visible in the file, so trying them only if they exist reveals nothing
     reader = appended or _exact(stego)
     if reader is None or not reader.salts:
         return None
@@ -101,7 +101,7 @@ def _readers(stego: Gaussians) -> Iterator[Reader]:
 
 
 def _exact(stego: Gaussians) -> SaltedReader | None:
-    """The reader of bits that only the very file has: codes of a coded file, else low bits."""
+    """The reader of bits that only the unchanged file has: codes of a coded file, else low bits."""
     if isinstance(stego, CodedGaussians):
         from keyss.channels.codes.channel import CodesReader
 

@@ -18,7 +18,7 @@ from keyss.core.arrays import Bytes, Integers
 from keyss.core.errors import InputError
 
 MAX_CHUNKS = 255  # of one codeword
-LOST = "the key is right, but too much of the model was lost or changed since something was hidden in it"
+LOST = "the key is right, but too much of the model was lost or changed since the secret was hidden in it"
 _POLYNOMIAL = 0x11D
 
 

@@ -65,7 +65,7 @@ class Context:
     checkpoints: Path | None = None  # folder for the state of interrupted trainings
     resume: bool = False
     reporter: Reporter | None = None
-    # 32 bytes that nobody else can know, which make a run repeatable to the byte; None: the system's.
+    # 32 secret bytes from which all randomness is derived: equal ones give equal files. None: the system's.
     entropy: bytes | None = field(default=None, repr=False)
 
 

@@ -3,8 +3,8 @@
 If a property has few different values, as after 8 or 16 bits, or low bits that are not uniform, as after an
 added offset, each value is moved by a random amount below half of the distance to the nearest other value:
 less than the format's own precision, which would round it back. The values are then spread around the steps
-of the format. Trained values are not: an expert sees the difference, but not whether the low bits
-carry anything.
+of the format. Trained values are spread differently: an expert sees that the model was dithered, but not
+whether its low bits carry anything.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _LOOSE = {"log_scales": 0.01, "quats": 0.01, "opacity_logits": 0.01, "sh": _FAIN
 def dither_model(model: Gaussians, entropy: bytes) -> Gaussians:
     """`model` with new low bits where they are not random; positions and constant colours stay.
 
-    `entropy`: 32 bytes that nobody else knows. Properties with a single value stay unchanged, and so do
+    `entropy`: 32 secret bytes. Properties with a single value stay unchanged, and so do
     quaternions of unit length, which is known exactly: see `keyss.channels.low_bits.bits`.
     """
     changed = {}

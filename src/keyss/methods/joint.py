@@ -199,7 +199,7 @@ class JointTraining(ABC):
 
     def step(self) -> None:
         self.iteration += 1
-        poses = [self._draw_poses() for _ in range(self.views_per_step)]
+        poses = [self._sample_poses() for _ in range(self.views_per_step)]
         views = list(zip(poses, self.extras(), strict=True))
         trained = (*self.parameters.values(), *self.networks.parameters())
         self.loss, info = self.strategy.backward(
@@ -232,8 +232,8 @@ class JointTraining(ABC):
                     drawn[id(picture.meta)] = (picture.meta, picture.indices, weight)
         return total, list(drawn.values())
 
-    def _draw_poses(self) -> list[Pose]:
-        """The training pose that each scene is rendered from."""
+    def _sample_poses(self) -> list[Pose]:
+        """The training pose that each scene is rendered from in this step."""
         count = len(self.scenes)
         if float(torch.rand((), generator=self.generator)) < self.common_poses:
             owner = self.owners[self.owner_order.sample()]

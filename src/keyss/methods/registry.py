@@ -68,8 +68,8 @@ def of_options(options: MethodOptions) -> Method:
 def open_model(stego: Gaussians, key: str, *, decoy: bool = False) -> Opened:
     """The secret that `key` opens in a model (see `keyss.channels.publishing`).
 
-    With `decoy`, a key that opens nothing gets a `Decoy`, and only one salt is tried: with more, a wrong key
-    would take longer than a right one. Otherwise raises WrongKeyError. Raises InputError for damage.
+    With `decoy`, only one salt is tried, because otherwise a wrong key would take longer than a right one. A
+    key that opens nothing then gives a `Decoy`, else raises WrongKeyError. Raises InputError for damage.
     """
     from keyss.channels import open_content, quick_attempt
     from keyss.methods.opened import Decoy

@@ -249,5 +249,5 @@ def test_scenes_share_poses_where_options_ask_for_it() -> None:
     placed = [PlacedScene.of(scene, model, Similarity()) for scene, model in both]
     options = replace(OPTIONS, common_poses=1.0)
     run = options.settings.training(placed, [EMBEDDINGS[0]], options, torch.device("cpu"))
-    assert all(len(set(run._draw_poses())) == 1 for _ in range(10))
+    assert all(len(set(run._sample_poses())) == 1 for _ in range(10))
     run.step()

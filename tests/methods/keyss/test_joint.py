@@ -146,7 +146,7 @@ def test_points_poses_and_densification_can_be_of_some_scenes_only(which: Any) -
     placed = [PlacedScene.of(scene, model, Similarity()) for scene, model in zip(scenes, models, strict=True)]
     embeddings = list(random_embeddings(2, torch.Generator()))
     run = config.settings.training(placed, embeddings, config, torch.device("cpu"))
-    owners = {pose[0] for _ in range(30) for pose in run._draw_poses()}
+    owners = {pose[0] for _ in range(30) for pose in run._sample_poses()}
     assert owners == ({0} if which == "cover" else {1, 2})
     run.step()
 

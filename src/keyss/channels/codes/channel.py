@@ -108,7 +108,7 @@ class CodesCover:
 
     @cached_property
     def room(self) -> Room:
-        compressible = int(self.size * (1 - 2**-10))  # data that are compressed already get longer by less
+        compressible = int(self.size * (1 - 2**-10))  # incompressible data grow by less than that
         return Room(self._count, compressible, _OVERHEAD)
 
     @property

@@ -110,7 +110,7 @@ def _turnable(codes: Codes, fields: list[Field], random: Doubles) -> Flags:
 
 
 def _is_natural(levels: Levels) -> bool:
-    """True if matching does not show: few Gaussians share a level, and levels lie on no lattice.
+    """True if matching leaves no trace: few Gaussians share a level, and levels lie on no lattice.
 
     Equal levels are not much more frequent than neighbouring ones, nor even more than odd ones.
     """

@@ -5,8 +5,8 @@
 
 How blocks hold bits is in `syndromes`. A *slot* is a header encrypted under the key and the salt, or noise.
 The header tells where the key's data begin, their length, and how many bits a block holds. Data are a range
-that may continue at the start; everything else is noise. The number of slots follows from the room. So a key
-tells where its own data lie, and nothing else.
+that may wrap around; everything else is noise. The number of slots follows from the room. So a key reveals
+where its own data are, and nothing else.
 """
 
 from __future__ import annotations
@@ -103,7 +103,7 @@ def find_header(zone: bytes, key: DerivedKey, room: Zones) -> Header | None:
         raise InputError(f"hidden secret of version {version}; this program reads version {VERSION}")
     data_bits = room.data_blocks * rate
     if not (rate <= BLOCK and 0 < 8 * size <= data_bits and first < data_bits):
-        raise InputError("the hidden parameters are damaged: they name more than there is")
+        raise InputError("the hidden parameters are damaged: the data they describe exceed the file")
     return Header(rate, first, size)
 
 

@@ -1,4 +1,4 @@
-"""Wet paper codes (Fridrich, Goljan, Lisonek and Soukal 2005): some bits must stay, no reader knows which.
+"""Wet paper codes (Fridrich, Goljan, Lisonek and Soukal 2005): some bits must stay, unknown to the reader.
 
 A block of BLOCK bits holds their product with a random matrix, modulo 2. The writer solves for the bits that
 may change ("dry"); the reader multiplies. A block holds as many bits as it has dry ones, less the few that

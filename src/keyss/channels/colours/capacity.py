@@ -1,8 +1,8 @@
-"""How much a model holds, and where a payload goes, so that it shows and costs as little as possible.
+"""The capacity of a model, and where a payload goes to be least visible and least detectable.
 
-The variance that writing adds gives a payload away. Per byte, it is least with one bit in each number (depth
-1). So a payload gets as large a share of the carriers as it needs at that depth. A payload that needs more
-gets all carriers, and the least depth and level that hold it.
+A payload is detected by the variance that writing adds. Per byte, that is least with one bit in each number
+(depth 1). So a payload gets as large a share of the carriers as it needs at that depth. A payload that needs
+more gets all carriers, and the least depth and level that hold it.
 
 A payload that is small enough is written only where that leaves the model as likely as it was (`likeness`).
 
@@ -29,9 +29,9 @@ from keyss.keys.encryption import OVERHEAD
 from keyss.rendering.difference import psnr_between
 
 _RATE = 0.42  # data bits for each bit of information that is expected to be read
-_GARBAGE = 0.02  # share of carriers whose name has changed although it seemed safe
+_GARBAGE = 0.02  # share of carriers whose name changes although it seemed stable
 _COMFORTABLE = 0.8  # how full a share may be; the rest makes up for losses
-_ROBUST = 0.5  # the same for a payload that shows anyway
+_ROBUST = 0.5  # the same for a payload that is detectable anyway
 SPREAD = 0.5  # dB by which writing may cost more than `Capacity.cost`
 _INCOMPRESSIBLE = 11  # bytes by which zlib lengthens data that it cannot compress
 _ROUNDED = 0.25  # share of repeated colours from which on a model is a rounded one

@@ -52,7 +52,7 @@ from keyss.keys.derivation import MASTER_BYTES, expand, stream
 from keyss.keys.encryption import OVERHEAD, compressed_size, encrypt
 from keyss.rendering.difference import psnr_between
 
-_TOO_FEW = "this cover has too few Gaussians to hide anything that survives other formats"
+_TOO_FEW = "this cover has too few Gaussians to hide anything in colours that would survive other formats"
 _LOWER = 3  # levels, each a quarter of a bit, by which a payload may lie lower than planned
 _BITS_PER_GAUSSIAN = 1  # of room, about, beside headers
 _HEADERS = 100  # bytes, about
@@ -118,14 +118,14 @@ class ColoursCover:
             for (key, _), payload in zip(contents, payloads, strict=True)
         ]
         check_keys([each.check for each in writings])
-        # With more than one bit there is no room for another secret that would not be noticed.
+        # With more than one bit in a number, another secret would be noticed.
         if layouts[0].depth == 1:
             for index in range(len(contents), UNNOTICED):  # of nobody
                 labels = [f"colours/nobody/{index}/{each}" for each in range(SALTS + 1)]
                 static, *others = (expand(secret, label, MASTER_BYTES) for label in labels)
                 writings.append(_Writing(static, tuple(others), None))
         likely = [layouts[min(index, len(layouts) - 1)].likely for index in range(len(writings))]
-        for lower in range(_LOWER + 1):  # what headers and salts cost is known only now
+        for lower in range(_LOWER + 1):  # the cost of headers and salts is known only now
             headers = self._headers(layouts, sizes, secret, lower)[: len(writings)]
             stego = self._written(numbers, salts, writings, headers, likely, random)
             if psnr_between(self.cover, stego) >= self.capacity.strength:

@@ -75,7 +75,7 @@ class ColoursReader:
             for header in headers or [_NOTHING]
             for offset, index in zip(best, indices, strict=True)
         ]
-        if not headers:  # takes about as long as reading a payload
+        if not headers:  # take about as long as for reading a payload
             _payload(_NOTHING, static, self.numbers.carriers(0.0), _CHANGED, _ROUNDS // 4)
             raise WrongKeyError()
         # One attempt in 2^16 finds a false header, and a right one can be read under wrong names.

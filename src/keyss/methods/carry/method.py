@@ -25,8 +25,8 @@ from keyss.rendering.difference import Viewpoints, psnr_between
 _MODEL_ITERATIONS, _MODEL_RATE = 400, 0.1
 _SELECTION_VIEWS = 64
 _FEWER = (
-    "beside the others, secrets are left fewer Gaussians than each could have alone: who holds one of the "
-    "keys can notice that there are other secrets"
+    "the secrets share the room, and each has fewer Gaussians than it could have alone: whoever has one of "
+    "the keys can notice that there are other secrets"
 )
 
 

@@ -33,7 +33,7 @@ from keyss.methods.records.whole import encode
 from keyss.rendering.difference import Viewpoints
 
 _BITS_PER_GAUSSIAN = 160  # of the payload of a secret that is not fitted yet
-_TINY = 16  # Gaussians; fewer are no secret
+_TINY = 16  # Gaussians; a secret is not cut down to fewer
 _ANY = '`publish="any"` has room for all'
 
 
@@ -91,7 +91,7 @@ class CarryOptions(MethodOptions):
         return (Training(), *map(Training, self.refits or (0,) * (scenes - 1)))
 
     def for_fitted_cover(self) -> Self:
-        """Low bits of channels that need random ones; after few steps those of a fit may not be."""
+        """Dithered where the channel needs random low bits: a fit of few steps may not have them."""
         return replace(self, dither=True) if self.place.records else self
 
     def with_fit(self, **changes: Any) -> Self:
@@ -102,7 +102,7 @@ class CarryOptions(MethodOptions):
 
 @dataclass(frozen=True)
 class SecretSize:
-    """The size of a secret; of one that is not fitted yet the largest that it may get."""
+    """The size of a secret, or the largest that it may get if it is not fitted yet."""
 
     count: int
     sh_degree: int
@@ -126,7 +126,7 @@ class SecretSize:
 def _check_not_tiny(
     counts: Sequence[int], secrets: Sequence[SecretSize], cover: int, place: str, more_room: str
 ) -> None:
-    """Raise UsageError if so few Gaussians of a secret fit into a cover of `cover` that they are none."""
+    """Raise UsageError if fewer than _TINY Gaussians of a secret fit into a cover of `cover` Gaussians."""
     if any(count < min(_TINY, secret.count) for count, secret in zip(counts, secrets, strict=True)):
         raise UsageError(
             f"a cover of {cover:,} Gaussians is too small to hide {len(secrets)} "
@@ -136,7 +136,7 @@ def _check_not_tiny(
 
 @dataclass(frozen=True)
 class RecordRoom:
-    """The room for records in low bits: of a prepared cover, or about that of one not fitted yet."""
+    """The room for records in low bits: exact for a prepared cover, estimated for one not fitted yet."""
 
     gaussians: int  # of the cover
     sh_degree: int  # of the cover
@@ -147,7 +147,7 @@ class RecordRoom:
 
     @staticmethod
     def of(cover: Gaussians | None, options: CarryOptions, entropy: bytes | None = None) -> RecordRoom:
-        """The room in `cover` as it is embedded into: with harmonics and low bits that `options` ask for.
+        """The room in `cover` once it has the harmonics and low bits that `options` ask for.
 
         Raises UsageError for Gaussians without room for a record, and for low bits that are not random.
         """
@@ -190,7 +190,7 @@ class RecordRoom:
         requests = [record_request(*size) for size in zip(counts, degrees, strict=True)]
         capacity = self.room.record_capacity(requests)
         if sum(counts) > capacity:
-            # No key should tell whether there are other secrets, unless that leaves one of them nothing.
+            # A key must not reveal whether there are other secrets, unless that leaves one of them no room.
             largest = max(request.least_bytes for request in requests)
             share = self.room.unnoticed_records(largest, len(secrets)) if len(secrets) > 1 else 0
             counts = [min(count, share) for count in counts] if share else divided(counts, capacity)
@@ -212,7 +212,7 @@ class RecordRoom:
 
 @dataclass(frozen=True)
 class WholeRoom:
-    """The room for payloads: of a prepared cover, or about that of one not fitted yet."""
+    """The room for payloads: exact for a prepared cover, estimated for one not fitted yet."""
 
     gaussians: int  # of the cover
     sh_degree: int  # of the published model
@@ -261,7 +261,7 @@ class WholeRoom:
 def room_for(
     cover: Gaussians | None, options: CarryOptions, entropy: bytes | None = None
 ) -> RecordRoom | WholeRoom:
-    """The room in a cover, or about that in one that is not fitted yet.
+    """The room in a cover: exact for one that is fitted, otherwise estimated.
 
     Raises UsageError for a cover without room.
     """
@@ -269,7 +269,7 @@ def room_for(
 
 
 def _ways(cover: Gaussians | None, options: CarryOptions) -> str:
-    """The fewest changes of the options that give `cover` room in its low bits, and what always works."""
+    """For messages: the smallest change of the options that gives `cover` room, and what always works."""
     entropy = os.urandom(32)
     degrees = [degree for degree in (1, 2) if degree > options.fit.sh_degree]
     for degree in (None, *degrees):
@@ -299,7 +299,7 @@ def _prepared(cover: Gaussians, entropy: bytes | None) -> LowBitsCover:
 
 
 def of_degree(model: Gaussians, sh_degree: int, entropy: bytes) -> Gaussians:
-    """`model` with harmonics of `sh_degree`; those that it does not have are too small to be seen."""
+    """`model` with harmonics of `sh_degree`; added ones are too small to be seen."""
     if model.sh_degree > sh_degree:
         return model.with_sh_degree(sh_degree)
     return raised(model, sh_degree, expand(entropy, "carry/raised", 32))

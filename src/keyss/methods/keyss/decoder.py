@@ -37,8 +37,8 @@ KEY_GAIN = 3.0  # with it a unit vector moves the first layer as much as the att
 # The gate is open from this cosine between an embedding and the decoder's own. Two random unit vectors of 64
 # numbers are that close less than once in 10^10 times.
 GATE = 0.8
-# Logits between the opacities of two scenes at the start. Those that matter are from -5 (0.7 %) to 6
-# (99.8 %): what one scene draws is too faint in the others.
+# Difference of opacity logits between two scenes at the start. Logits that matter range from -5 (0.7 %) to 6
+# (99.8 %), so Gaussians that one scene shows are too faint in the others.
 APART = 15.0
 
 Width = Annotated[int, Meta(ge=1, le=4096)]  # bounds for what is read from files
@@ -75,7 +75,7 @@ class DecoderShape:
 
     @property
     def numbers(self) -> int:
-        """Numbers that decoding one Gaussian takes at most, a few times over."""
+        """Upper bound of the floats held while one Gaussian is decoded, up to a factor of a few."""
         return 4 * (self.inputs_size + sum(self.hidden) + len(self.mask) * self.branch)
 
     @property
@@ -110,7 +110,7 @@ class Decoder(nn.Module):
 
     def forward(self, gaussians: Gaussians, embedding: Tensor, whole: Gaussians | None = None) -> Gaussians:
         """Decode `gaussians`, some or by default all of those of the model `whole`, with the embedding."""
-        # With a gate an honest mistake shows nothing, at no cost. Neither conditioning protects a secret:
+        # With a gate, a mistyped key shows the cover without any loss for it. Neither protects a secret:
         # whoever has the decoder has `key`, and the white-box attack (`keyss.measure`) undoes a bias.
         cosine = F.cosine_similarity(embedding.detach(), self.key, dim=0)
         if self.shape.conditioning == "gate" and cosine < GATE:
@@ -169,10 +169,10 @@ class Network(nn.Module):
 
     @torch.no_grad()
     def separate(self, opaque: float, scene: int) -> None:
-        """Start by showing those Gaussians alone that are `scene` times APART fainter than a logit `opaque`.
+        """Initially show only Gaussians that are `scene` times APART fainter than a logit `opaque`.
 
-        The residual of their opacities is `scene` times APART. It falls to -APART for more opaque Gaussians:
-        the first two units of each layer are how far an opacity lies above where the fall begins and ends.
+        Their opacities get a residual of `scene` times APART, which falls to -APART for more opaque ones.
+        The first two units of each layer hold how far an opacity is above the start and the end of that fall.
         """
         knots = opaque - APART * (scene - self.offset.new_tensor([0.375, 0.625]))
         third, last = (each for each in self.branches["op"].children() if isinstance(each, nn.Linear))

@@ -35,7 +35,7 @@ from keyss.methods.keyss.options import KeyssOptions
 from keyss.methods.keyss.secret import unpack
 
 MODEL = "openai/clip-vit-large-patch14"  # ViT-L/14, the paper's
-_APPENDED = "the secrets lie in appended Gaussians instead, and everybody can see that they are there"
+_APPENDED = "the secrets lie in appended Gaussians instead, which everybody can see in the file"
 
 
 class ClipKeys:

@@ -1,15 +1,15 @@
 """A secret of the design `carriers`: row by row in the harmonics of a model, under the key's embedding.
 
 Of a harmonic above the constant one, sign, exponent and the two leading bits of the mantissa are the cover's.
-The next 8 bits, a *carrier*, say 7 bits of the secret. The 13 below belong to the low bits, which hold the
+The next 8 bits, a *carrier*, encode 7 bits of the secret. The 13 below belong to the low bits, which hold the
 payload. The carriers of a row are a cell (`keyss.channels.low_bits.cells`) under a key that follows from the
 embedding alone; its tag tells whether the embedding opens it. So rows may be pruned or reordered, the
 embedding of another key opens none and shows the cover, and the payload without the embedding shows nothing.
 
-A carrier b stands for min(b, 255 - b). Which of the two is written keeps what others tell of it: harmonics
-of a trained model become rarer with size, also within a quarter of an octave, and those of three channels are
-alike. Mostly the carrier stays in the half of its quarter that the cover's is in; the rest follows from means
-of the cover's harmonics (see `_halves`).
+A carrier b stands for min(b, 255 - b). Which of the two is written preserves the statistics of trained
+harmonics: they become rarer with size, also within a quarter of an octave, and those of the three channels
+are alike. Mostly the carrier stays in the same half of its quarter; otherwise means of the cover's harmonics
+decide (see `_halves`).
 
 Harmonics that are exactly zero, such as those of a saturated colour, stay zero. A row with few of them has
 room for a Gaussian with all harmonics, a row with more for one without, and the others are left alone.
@@ -180,7 +180,7 @@ class RowKind:
     columns: npt.NDArray[np.int64]  # [R, carriers] their first harmonics that are not zero
 
     def read(self, model: Gaussians) -> Bytes:
-        """[R, bytes] what the carriers say."""
+        """[R, bytes] the bytes in the carriers."""
         words = words_of(model)[self.rows[:, None], self.columns]
         carriers = (words >> SHIFT & np.uint32(255)).astype(np.uint8)
         folded = np.where(carriers < 128, carriers, 255 - carriers)
@@ -222,10 +222,10 @@ def row_kinds(model: Gaussians) -> list[RowKind]:
 
 
 def carrying(cover: Gaussians) -> list[RowKind]:
-    """The rows of each kind that can be written without equal values being missed, the opaque ones first.
+    """The rows of each kind that no attacker can find by missing repetitions, the opaque ones first.
 
-    Clones that training hardly moved apart agree in harmonics, such as those of a saturated colour: here in
-    three in a row of one colour, in all bits above the low ones.
+    Clones that training hardly moved apart have equal harmonics, such as those of a saturated colour, and new
+    carriers would make them differ. Rows that share three successive harmonics of a channel are left out.
     """
     words = (words_of(cover) >> SHIFT).astype(np.uint64)
     windows = words[:, :-6] << np.uint64(38) | words[:, 3:-3] << np.uint64(19) | words[:, 6:]
@@ -245,10 +245,10 @@ def _carriers(sh_degree: int) -> list[int]:
 
 
 def _halves(cover: Words32, written: Words32, channel: int) -> tuple[Doubles, Doubles]:
-    """[R, K] in which half of its quarter of an octave a channel's harmonics are, and where they should be.
+    """[R, K] the half of its quarter of an octave that each harmonic of a channel is in, and should be in.
 
-    The cover's own half, -0.5 or 0.5, less what is expected in `cover` [R, 3 K], and the place, -0.5 to 0.5,
-    that is expected in `written` [R, 3 K]. What is expected is the mean of a class in the cover.
+    First: the cover's own half, -0.5 or 0.5, minus the place expected in `cover` [R, 3 K]. Second: the place,
+    -0.5 to 0.5, expected in `written` [R, 3 K]. The expected place is the mean of a class in the cover.
     """
     places = ((cover[:, channel::3] >> SHIFT & np.uint32(255)) + 0.5) / 256 - 0.5
     own, expected = np.sign(places) / 2, np.zeros(places.shape)
@@ -262,10 +262,10 @@ def _halves(cover: Words32, written: Words32, channel: int) -> tuple[Doubles, Do
 
 
 def _classes(words: Words32, channel: int) -> tuple[Integers, Integers]:
-    """[R, K] two classes of each harmonic of a channel, by what is known before it is written.
+    """[R, K] two classes of each harmonic of a channel, from numbers that are known before it is written.
 
-    By how many quarters of an octave it is above the median of its row; and by that and where the other two
-    channels are: of one that is written later, the middle of its quarter is known.
+    First: how many quarters of an octave it is above the median of its row. Second: that, and where the other
+    two channels are; for a channel that is written later, only the middle of its quarter is known.
     """
     quarters = (words >> np.uint32(21) & np.uint32(1023)).astype(np.int64)
     own = quarters[:, channel::3]

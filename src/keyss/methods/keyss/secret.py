@@ -35,7 +35,7 @@ ANCHORS = 64
 ANCHORS_NEEDED = 0.25  # share that must be found again
 ANCHOR_TOLERANCE = 1e-6  # of the model's size
 _DECODED_NUMBERS = 1 << 23  # held at a time: 32 MiB, whatever sizes a file gives its decoder
-_SLACK = 0.01  # share of the Gaussians that rounding may take across the limit of what is drawn
+_SLACK = 0.01  # share of the Gaussians that rounding may make visible or invisible
 _WEIGHTS = "decoder."
 
 
@@ -89,7 +89,7 @@ class HiddenSecret:
 
     @torch.no_grad()
     def reveal(self, stego: Gaussians, *, frame: Frame = "secret", force: bool = False) -> Gaussians:
-        """A model that needs no decoder and no cover, without what is never drawn; see `Opened.reveal`.
+        """A model that needs no decoder and no cover, without invisible Gaussians; see `Opened.reveal`.
 
         If Gaussians were lost, the others make up for them.
         """
@@ -115,7 +115,7 @@ class HiddenSecret:
         return Gaussians.cat([decoder(stego[at : at + step], embedding, stego) for at in starts])
 
     def remains(self, revealed: Gaussians) -> Remains:
-        """See `Opened.remains`; Gaussians that are never drawn do not count."""
+        """See `Opened.remains`; Gaussians that are never rendered do not count."""
         found = int((revealed.opacities >= DRAWN_OPACITY).sum())
         return Remains(found, self.count, self.chunks, _SLACK)
 

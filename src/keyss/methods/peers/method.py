@@ -86,7 +86,7 @@ class HandedSecret:
         if rows is not None and len(stego) != rows:
             raise InputError(
                 f"expected the {rows:,} Gaussians that were published, in their order, got {len(stego):,}: "
-                "what was handed over belongs to them one by one"
+                "each row of the handed-over file belongs to one of them"
             )
         if frame == "cover" and self.frame is None:
             raise UsageError('this secret never was in the cover\'s frame: leave out `frame="cover"`')

@@ -94,9 +94,9 @@ COLOUR, HARMONIC = Kind(clips=True), Kind(clips=True, centred=True)
 def neighbourhood(values: Doubles, kind: Kind) -> tuple[float, float]:
     """The least and the largest number that is no outlier of `values`.
 
-    Quantiles measure the bulk. Fewer than `_TAIL` of the values, whatever they are, cannot move these beyond
-    the others. So they make an evenly spaced line at most 2.5 times (the bulk and two margins) as long as the
-    others alone need, and each number as much less precise.
+    Quantiles measure the bulk, and fewer than `_TAIL` of the values, whatever they are, cannot move these
+    beyond the others. Such values therefore lengthen an evenly spaced line at most 2.5 times (the bulk and
+    two margins), and make each number less precise by the same factor.
     """
     if kind.even:
         low = float(np.quantile(values, _TAIL, method="higher"))

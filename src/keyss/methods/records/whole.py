@@ -34,7 +34,7 @@ from keyss.files.formats.common import in_morton_order
 from keyss.methods.records.lines import Table
 from keyss.methods.records.quantise import Codec, outliers
 
-_ALWAYS = 1 << 16  # Gaussians, whatever announces them
+_ALWAYS = 1 << 16  # Gaussians that any payload may announce
 _LEAST_BYTES = 2  # of each Gaussian in larger models
 USUAL_BITS, MAX_BITS = 110, 143  # of all but harmonics: about 48 and 60 dB
 _HEAD = struct.Struct("<IBf")

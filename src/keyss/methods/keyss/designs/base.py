@@ -42,7 +42,7 @@ class DesignTraining(JointTraining):
     def publish(self, entropy: bytes) -> tuple[Gaussians, Sequence[HiddenSecret | RowSecret]]:
         """The published model before its low bits, and what reveals each secret, on the CPU.
 
-        `entropy`: 32 bytes that nobody else can know, from which all that is random is derived.
+        `entropy`: 32 secret bytes from which all randomness is derived.
         """
 
 

@@ -2,8 +2,8 @@
 
 A row has the cover's 59 numbers, and for each secret those of one of its Gaussians, which publication writes
 into the spare bits of the row's harmonics (`rows`). Start: each scene has the whole cap, as plain 3DGS does.
-Density: a place that is dead in one scene takes a clone or a split of what that scene asks for; the rest of
-the row stays. Conditioning: the key's embedding decrypts rows, so nothing has to be learned of wrong keys.
+Density: where a scene's Gaussian in a row is pruned, a clone or split of the same scene replaces it; the
+row's other Gaussians stay. Conditioning: the key's embedding decrypts rows, so wrong keys need no loss.
 """
 
 from __future__ import annotations
@@ -45,8 +45,8 @@ PRUNED_SHARE = 0.25  # of each scene's Gaussians, the faintest, in steps that re
 T = TypeVar("T")
 
 _EMPTY = -8.0  # opacity logit of a place without a Gaussian
-_FILLING = 5  # last steps of density control, which fill places that nothing asks for
-_VIEWS = 64  # that tell how much a Gaussian of a secret contributes
+_FILLING = 5  # last steps of density control, which fill the places that are still empty
+_VIEWS = 64  # in which the contribution of each Gaussian of a secret is measured
 
 
 class CarriersTraining(DesignTraining):
@@ -99,7 +99,7 @@ class CarriersTraining(DesignTraining):
         ]
 
     def scene_gaussians(self, scene: int) -> Gaussians:
-        """[N] what the rows are in a scene, attached to their graph."""
+        """[N] the Gaussian of a scene in each row, attached to the graph."""
         return to_gaussians(numbers_of(self.parameters, scene))
 
     def _set_rates(self) -> None:
@@ -157,7 +157,7 @@ def without_faintest(model: Gaussians, least: float) -> Gaussians:
 
 
 def numbers_of(parameters: dict[str, T], scene: int) -> dict[str, T]:
-    """A scene's own among the numbers of the rows."""
+    """Those parameters of the rows that belong to a scene."""
     own = str(scene) if scene else ""
     return {
         name.rpartition("/")[2]: values
@@ -167,10 +167,10 @@ def numbers_of(parameters: dict[str, T], scene: int) -> dict[str, T]:
 
 
 class DeadPlaces(CappedStrategy):
-    """Density control of rows whose number stays: what is pruned becomes a place for what grows.
+    """Density control with a fixed number of rows: clones and splits take the places of pruned Gaussians.
 
-    Thresholds and times are those of plain 3DGS. Places that nothing asks for are divided among the last
-    steps, so that in the end none is empty: a row without a Gaussian of the cover could carry none.
+    Thresholds and times are those of plain 3DGS. The last steps also fill the places that are still empty, an
+    equal part each, because a row without a Gaussian of the cover cannot carry one of a secret.
     """
 
     def __init__(self, fit: FitConfig, extents: Sequence[float], generator: torch.Generator) -> None:
@@ -221,8 +221,8 @@ class DeadPlaces(CappedStrategy):
     ) -> Tensor:
         """Clone small Gaussians and split large ones into dead places, the largest gradients first.
 
-        Returns the rows of new Gaussians in the order in which plain 3DGS appends them: clones, then the one
-        and the other part of what was split, each in the order in which the Gaussians were `born`.
+        Returns the rows of new Gaussians in the order in which plain 3DGS appends them: clones, then the
+        first and the second halves of splits, each in the order of `born`.
         """
         model = to_gaussians(params).detach()
         dead = model.opacities < self.prune_opa
@@ -259,8 +259,8 @@ class CarriersDesign(Design):
 
     training = CarriersTraining
 
-    # Share of the steps after density control that render without the faintest quarter of each scene: what
-    # pruning then costs, against a share of faint Gaussians that plain models do not have.
+    # Share of the steps after density control that render without the faintest quarter of each scene. With
+    # more, pruning costs less, but the model has more faint Gaussians than plain ones have.
     pruned_steps: float = 0.3
 
     def __post_init__(self) -> None:

@@ -47,7 +47,7 @@ class NetworkTraining(DesignTraining):
         return super().start()
 
     def prepare(self, start: Gaussians) -> None:
-        # One for each secret: whoever opens one of them has no network that knows another.
+        # A network for each secret: whoever opens one secret has no network trained on another.
         shape = self.design.shape(self.options.fit.sh_degree)
         self.decoders = [Decoder(shape) for _ in self.embeddings]
         for scene, (decoder, embedding) in enumerate(zip(self.decoders, self.embeddings, strict=True), 1):
@@ -124,8 +124,8 @@ class NetworkTraining(DesignTraining):
 class EvenGrowth(CappedStrategy):
     """Density control that gives free places to the scenes that have fewer Gaussians than their share.
 
-    By the largest gradients, a scene with more detail takes nearly all of them. At the cap, Gaussians that no
-    scene shows make room.
+    If the largest gradients decided, a scene with more detail would take nearly all places. At the cap,
+    Gaussians that are invisible in every scene are removed first.
     """
 
     def __init__(self, fit: FitConfig, opacities: Callable[[], Tensor], scenes: int) -> None:
