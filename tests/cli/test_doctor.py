@@ -39,7 +39,7 @@ def test_a_device_that_is_not_there(keyss: Run) -> None:
     said = keyss("doctor", "--device", "cuda", "--json")
     assert said.status == 6
     assert states(said)["test frame"] == "broken"
-    assert "keyss: error: required components do not work: test frame" in said.err
+    assert "keyss: error: required components are broken: test frame" in said.err
 
 
 @pytest.mark.parametrize(("where", "factor"), [("middle", 0.999), ("corner", 0.0)])

@@ -64,14 +64,14 @@ def test_what_cannot_be_fetched_or_unpacked_is_said(server: Path, tmp_path: Path
         reproducing.download_scenes(["garden"], tmp_path / "data")
     for damaged in (archive[:-100], b"<html>not found</html>"):
         (server / "scenes.zip").write_bytes(damaged)
-        with pytest.raises(InputError, match="remove it to fetch it again"):
+        with pytest.raises(InputError, match="remove it to download it again"):
             reproducing.download_scenes(["garden"], tmp_path / "data")
         (tmp_path / "data" / "archives" / "scenes.zip").unlink()
     other = io.BytesIO()
     with zipfile.ZipFile(other, "w") as file:
         file.writestr("flowers.txt", "elsewhere")
     (server / "scenes.zip").write_bytes(other.getvalue())
-    with pytest.raises(InputError, match="cannot be fetched or unpacked"):
+    with pytest.raises(InputError, match="cannot be downloaded or unpacked"):
         reproducing.download_scenes(["garden"], tmp_path / "data")
     assert not (tmp_path / "data" / "garden").exists()
 

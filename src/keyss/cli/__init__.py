@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """See `keyss.cli.entry.main`, which is loaded here: Ctrl-C must be provided for before that."""
+    """See `keyss.cli.entry.main`, which is imported late: handlers of Ctrl-C have to be installed first."""
     from keyss.cli.entry import main
 
     return main(arguments)

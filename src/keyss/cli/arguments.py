@@ -11,7 +11,7 @@ from tyro.conf import UseAppendAction, arg
 
 
 def optional(metavar: str, help: str, default: str = "", aliases: list[str] | None = None) -> Any:
-    """An option whose default is None or empty. `default`: what to show as such, if anything."""
+    """An option whose default is None or empty; the help shows `default` instead."""
     hint = f"(default: {default})" if default else ""
     return arg(metavar=metavar, help=help, help_behavior_hint=hint, aliases=aliases)
 

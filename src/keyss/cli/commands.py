@@ -44,7 +44,7 @@ def command(name: str) -> Callable[..., None]:
 
 
 def to_parse(name: str, arguments: Sequence[str]) -> Callable[..., None]:
-    """The function of a command as it is parsed: `hide` has the options of the method in `arguments`."""
+    """The function that is parsed: for `hide`, with the options of the method named in `arguments`."""
     if name == "hide":
         from keyss.cli.hiding import with_options_of_method
 

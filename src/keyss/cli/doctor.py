@@ -63,7 +63,7 @@ def doctor(
         for name, (state, text) in results.items():
             print(f"{state:<7}  {name:<{width}}  {text}")
     if broken := [name for name, (state, _) in results.items() if state == "broken"]:
-        raise BackendError(f"required components do not work: {', '.join(broken)} (see above)")
+        raise BackendError(f"required components are broken: {', '.join(broken)} (see above)")
 
 
 def _result(name: str, check: Callable[[], str]) -> tuple[str, str]:

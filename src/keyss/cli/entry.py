@@ -61,7 +61,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 _flush()
         return 0
     except BrokenPipeError:
-        # The interpreter must not try to flush what is still buffered.
+        # The interpreter must not try to flush the buffer again.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return BROKEN_PIPE
     except (Exception, KeyboardInterrupt) as error:
@@ -76,7 +76,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _run(arguments: list[str], options: set[str]) -> None:
     """Run the command that `arguments` name; its options are added to `options`."""
     name, *rest = arguments
-    if arguments in (["--version"], ["-V"]):  # without importing what parses arguments, which takes longer
+    if arguments in (["--version"], ["-V"]):  # before the slow import of the argument parser
         print(__version__)
         return
     check_command(name)
@@ -97,13 +97,13 @@ def _run(arguments: list[str], options: set[str]) -> None:
         raise UsageError(f"there is no command {name!r}: {hint}")
     if any(word.partition("=")[0] in _KEY_OPTIONS for word in rest):  # the parser would print its value
         raise UsageError(
-            "no option takes a key itself, as others can see arguments: give --key-file FILE, set KEYSS_KEY, "
+            "a key cannot be an argument, which other users could see: give --key-file FILE, set KEYSS_KEY, "
             "or type it at the prompt"
         )
     command = commands.to_parse(name, rest)
     options.update(options_of(command))
     if "out" not in options and {"-o", "--out"} & {word.partition("=")[0] for word in rest}:
-        where = "name OUT after IN" if name == "convert" else "results go into the run's folder, if anywhere"
+        where = "name OUT after IN" if name == "convert" else "results go into the folder of the run, if any"
         raise UsageError(f"`keyss {name}` has no option -o: {where}; see `keyss {name} --help`")
     tyro.cli(command, prog=f"keyss {name}", args=rest, config=(tyro.conf.FlagCreatePairsOff,))
 
@@ -139,7 +139,7 @@ def explain(error: BaseException) -> tuple[int, str]:
             return 128 + signum, word
         case _ if _is_out_of_memory(error):
             return OUT_OF_MEMORY, (
-                "error: there is too little memory for this; smaller models and images "
+                "error: out of memory; smaller models and images "
                 f"(`width`, `max_gaussians`) need less ({type(error).__name__}: {error})"
             )
         case ModuleNotFoundError():
@@ -176,7 +176,7 @@ def _warnings_as_lines(options: Collection[str]) -> Iterator[None]:
 def _verbosity(arguments: Sequence[str]) -> Iterator[list[str]]:
     """`arguments` without -q and -v. With -v, prints time and memory unless the context ends by an error."""
     asked = [_LEVELS[word] for word in arguments if word in _LEVELS]
-    if not asked:  # without importing what shows progress
+    if not asked:  # avoids importing the progress module
         yield list(arguments)
         return
 
@@ -300,7 +300,7 @@ def prints(error: BaseException) -> bool:
 
 
 def prefix() -> str:
-    """The name of this process in messages, if it is not the first."""
+    """The prefix of messages from processes other than the first."""
     return "" if answers() else f"process {rank() + 1} of {processes()}: "
 
 

@@ -171,7 +171,7 @@ def _hide_scenes(asked: HideArguments, cover: Path) -> None:
     if idle and not options.may_train:
         raise UsageError(
             f"{idle}: nothing is trained, as models of all scenes are given and --method {options.method} "
-            "without refits only hides them: leave out such options"
+            "does not refit them: leave out such options"
         )
     described: dict[str, Any] = vars(asked.photos) | {
         "method": options,
@@ -251,7 +251,7 @@ def _keys(asked: HideArguments, count: int) -> list[str]:
 
 
 def _idle_without_training(asked: HideArguments, cover: Path) -> str:
-    """The given options that only matter in a training, if models of all scenes are given; else nothing."""
+    """The given options that only affect training, if models of all scenes are given; otherwise empty."""
     from keyss.rendering.orbit import is_model
 
     sources = [asked.details.cover_model or cover, *(asked.details.secret_model or asked.secret)]
@@ -272,7 +272,7 @@ def _warn_of_idle(idle: str, steps: int) -> None:
 
 
 def _method_options(asked: HideArguments, method: Method) -> MethodOptions:
-    """The preset, with the options of the command line instead of its own."""
+    """The preset, overridden by the options of the command line."""
     known = own_options(method)
     changes = {
         name: parse(value) if (parse := known[name][1].parse) else value
@@ -388,7 +388,7 @@ def with_options_of_method(arguments: Sequence[str]) -> Callable[..., None]:
 
 
 def _check_without_torch(name: str, arguments: Sequence[str]) -> None:
-    """Refuse wrong options and missing files before torch is loaded, which takes longer than all else.
+    """Refuse wrong options and missing files before torch is imported, the slowest part of the start.
 
     Raises InputError, and SystemExit as argument parsers do.
     """

@@ -38,7 +38,7 @@ def keys(files: Sequence[Path], count: int, *, confirm: bool = False) -> list[st
 
 
 def given_keys(files: Sequence[Path]) -> list[str]:
-    """The keys in `files`, else that in the environment, else none: for commands that work without a key."""
+    """The keys in `files`, else the one in the environment, else none: for commands with optional keys."""
     if files or VARIABLE not in os.environ:
         return [key_of_file(path) for path in files]
     try:

@@ -1,4 +1,4 @@
-"""The commands that show models: in a browser, as pictures, as a video, as facts."""
+"""The commands that show models: `view`, `render` and `info`."""
 
 from __future__ import annotations
 

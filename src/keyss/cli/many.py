@@ -45,7 +45,7 @@ def compare(
     """Hide a scene by each method with the same budget, and tabulate the results.
 
     The budget is a number of Gaussians, and of training steps for each scene. The method 3dgs is the bound:
-    plain 3DGS with that budget. Methods that are not possible with it are listed, and are an error if
+    plain 3DGS with that budget. Methods that cannot run with it are listed, and are an error if
     `--methods` names them. Run the same command again to resume.
 
     example: keyss compare --cover SCENE_A --secret SCENE_B --quick -o runs/compared

@@ -1,4 +1,4 @@
-"""The commands that measure: how well something is hidden, and what gives it away."""
+"""The commands that measure: `evaluate`, `audit` and `steganalyze`."""
 
 from __future__ import annotations
 

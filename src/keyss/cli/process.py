@@ -1,8 +1,8 @@
 """The process of the command line: signals, standard streams, exit.
 
-Python turns Ctrl-C into an exception at any point. In the middle of an import that prints a traceback, or
-worse: native libraries such as torch's crash when half of them is loaded, also at the interpreter's shutdown.
-This module imports little, installs signal handlers before anything else is imported, and exits by itself.
+Python raises an exception at any point on Ctrl-C. During an import this prints a traceback, or crashes native
+libraries such as torch's that are half loaded, also at the interpreter's shutdown. Therefore this module
+imports little, installs signal handlers before anything else is imported, and ends the process itself.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class _Process:
                 signal.signal(signum, self.on_signal)
         sys.unraisablehook = self.on_unraisable
         prepare_streams()
-        gc.set_threshold(700, 10, 1000)  # going through what libraries leave takes a quarter of loading them
+        gc.set_threshold(700, 10, 1000)  # full collections would take a quarter of the time to import torch
         try:
             self.running = True
             from keyss.cli.entry import main
@@ -85,7 +85,7 @@ class _Process:
         raise KeyboardInterrupt(signum)
 
     def on_unraisable(self, unraisable: Any) -> None:
-        """Python drops exceptions in some places, such as callbacks of native code."""
+        """Handle interrupts that Python only reports, such as those in callbacks of native code."""
         if self.received is not None and isinstance(unraisable.exc_value, KeyboardInterrupt):
             self.end(self.received)
         sys.__unraisablehook__(unraisable)
@@ -120,8 +120,8 @@ class _Unfailing(io.FileIO):
 def prepare_streams() -> None:
     """Make sure that the standard streams are open and accept every character.
 
-    A closed stream is opened on the null device, or else the next file that is opened would get its number,
-    and messages would end up in a result.
+    A closed stream is opened on the null device. Otherwise the next opened file would get its descriptor, and
+    messages would be written into a result.
     """
     for number in range(3):
         try:

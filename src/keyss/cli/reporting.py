@@ -13,7 +13,7 @@ from keyss.cli.entry import answers
 from keyss.core.errors import import_extra
 from keyss.progress import Reporter, reporter as lines
 
-FOLDER = "private/tensorboard"  # of a run, since its losses may tell about a secret
+FOLDER = "private/tensorboard"  # of a run: losses may reveal something about a secret
 
 
 @contextmanager

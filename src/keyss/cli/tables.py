@@ -1,4 +1,4 @@
-"""The output of commands that are done."""
+"""What commands print at their end."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ _HEADS = ("PSNR", "SSIM", "bound", "loss", "start", "Gaussians", "plain", "steps
 
 
 class Console(RichConsole):
-    """Leaves broken pipes to the entry point."""
+    """Passes broken pipes on to the entry point."""
 
     def on_broken_pipe(self) -> None:
         raise  # the BrokenPipeError that is being handled
 
 
 def print_hiding(metrics: HideMetrics, console: Console | None = None) -> None:
-    """The numbers of a hiding: a row for each scene beside its baseline, wrong keys, the method's own."""
+    """The measurements of a hiding: a row for each scene with its bound, wrong keys, and the room."""
     names = ["cover", "secret"]
     if len(metrics.secrets) > 1:
         names = ["cover", *(f"secret {number}" for number, _ in enumerate(metrics.secrets, start=1))]
@@ -77,7 +77,7 @@ def _scene_rows(metrics: HideMetrics) -> list[dict[str, str]]:
     ):
         row = {"PSNR": f"{own.psnr:.2f}", "SSIM": f"{own.ssim:.3f}"}
         row["Gaussians"] = f"{size:,}"
-        if not photos:  # the test views are renders of the given model, which is no bound of training
+        if not photos:  # the test views are renders of the given model, so there is no bound
             plain = steps = None
         if steps is not None:
             row["steps"] = f"{steps:,}"

@@ -1,9 +1,9 @@
 """Many runs: one engine and four kinds of specification.
 
 A *cell* is a plain fit, or a hiding and its measures, in a folder of its own (`keyss.many.cell`). Cells run
-in processes of this machine, on a cluster, or in this process (`keyss.many.running`); a cell that is done is
-never run again. A sweep (YAML), a batch (CSV), a comparison of methods and a table of the paper add cells to
-a folder (`keyss.many.running`), and make tables of their numbers.
+in processes of this machine, on a cluster, or in this process (`keyss.many.running`), and never run again
+once they are done. A sweep (YAML), a batch (CSV), a comparison of methods and a table of the paper each add
+cells to a folder and tabulate the results.
 """
 
 import lazy_loader

@@ -98,7 +98,7 @@ def _check_heads(path: Path, heads: list[str], master: bool) -> None:
         if head not in COLUMNS:
             raise InputError(f"{path}: no column is called {head[:60]!r}; {did_you_mean(head, COLUMNS)}")
     if len(set(heads)) < len(heads):
-        raise InputError(f"{path}: a column is there twice")
+        raise InputError(f"{path}: two columns have the same name")
     needed = {"cover", "out"} | (set() if master else {"key_file"})
     if missing := sorted(needed - set(heads)):
         more = "; keys come from it or from `master_key_file`" if "key_file" in missing else ""
@@ -111,7 +111,7 @@ def _check_heads(path: Path, heads: list[str], master: bool) -> None:
 
 def _check_apart(path: Path, assets: Sequence[Asset]) -> None:
     """Raise InputError for a folder of results that is that of another asset, or lies in it."""
-    # File systems may take two spellings for one.
+    # File systems may treat two spellings as the same name.
     places = [PurePosixPath(unicodedata.normalize("NFC", each.out).casefold()) for each in assets]
     lines: dict[PurePosixPath, int] = {}
     for asset, place in zip(assets, places, strict=True):
@@ -240,7 +240,7 @@ def _cell(
         raise OutputError(f"cannot write {place}: {error.strerror}") from error
     if before is None or before.id != cell.id:
         if there and not overwrite:
-            what = "is there, and not from this batch"
+            what = "exists, and is not from this batch"
             what = what if before is None else "was made with another key, or from other inputs or options"
             raise OutputError(f"{place} {what}: `overwrite=True` replaces what keyss wrote there")
         (folder / RESULT).unlink(missing_ok=True)
@@ -248,7 +248,7 @@ def _cell(
 
 
 def _key_check(key: str, identity: str) -> str:
-    """Recognises the key of a cell; a guess costs as much as one at the published file."""
+    """A value that recognises the key of a cell; testing a guess costs as much as at the published file."""
     salt = hashlib.sha256(b"keyss/v1/batch" + identity.encode()).digest()[:SALT_BYTES]
     return DerivedKey.of(key, salt).verifier().hex()
 

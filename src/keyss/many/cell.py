@@ -35,7 +35,7 @@ from keyss.runs.records import read_record
 CELL, RESULT, FAILED, LOG, LOCK, RUN = (
     *("cell.json", "result.json", "failed.json", "log.txt", "lock", "run"),
 )
-# Code that does not affect results, except the measures.
+# Folders whose code does not affect results; the measures in `many` do.
 _OUTSIDE, _MEASURES = ("cli", "demo", "many", "viewer"), ("many", "measures.py")
 
 
@@ -109,7 +109,7 @@ class Cell:
 
 @dataclass(frozen=True, kw_only=True)
 class Result:
-    """The outcome of a cell."""
+    """The measured numbers of a finished cell: `result.json`."""
 
     version: int = 2
     keyss: str = __version__
@@ -124,7 +124,7 @@ class Result:
 
 @dataclass(frozen=True, kw_only=True)
 class Failure:
-    """The reason to refuse a cell."""
+    """Why a cell was refused: `failed.json`."""
 
     version: int = 2
     message: str
@@ -144,7 +144,7 @@ def result_of(folder: Path, measures: tuple[str, ...] = ()) -> Result | None:
 
 
 def error_of(folder: Path) -> str:
-    """The reason for a missing result."""
+    """Why there is no result."""
     if (folder / FAILED).exists():
         return read_record(folder / FAILED, Failure).message
     return f"its process died repeatedly; see {folder / LOG}"

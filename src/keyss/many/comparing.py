@@ -55,7 +55,7 @@ _LEGEND = (
     "curve against plain models of the cover from other seeds, 0.5 where they cannot be told apart. p: of "
     "the file's least likely statistic beside those. In brackets the same of a plain model of the cover.",
     "Pruned of a random quarter, converted and back, purified (as by GSPure): change of cover and secret in "
-    "dB. Lost: the secret does not open any more.",
+    "dB. Lost: the secret no longer opens.",
 )
 Picture = Bytes  # [H, W, 3]
 
@@ -268,7 +268,7 @@ def _standard(each: ComparedMethod) -> str:
 
 
 def _beside(name: str, shown: Callable[[float], str]) -> Column:
-    """A number of the published model, and in brackets that of a plain one."""
+    """A number of the published model, and in brackets the same for a plain one."""
 
     def column(each: ComparedMethod) -> str:
         own, plain = (each.numbers.get(f"secrecy.{name}{end}") for end in ("", "_plain"))

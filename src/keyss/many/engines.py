@@ -108,7 +108,7 @@ class Cluster:
         )
         try:
             self.ray.init(log_to_driver=False, configure_logging=False, **options)
-        except Exception as error:  # Ray has no class of its own for what happens while it starts
+        except Exception as error:  # Ray raises many kinds of errors while it connects
             raise BackendError(f"cannot reach a Ray cluster at {address}: {error}") from error
         # Retried by `run_cells`, which reports it.
         self.remote = self.ray.remote(max_retries=0)(_attempt)
@@ -166,8 +166,8 @@ def start(folder: Path, threads: int, worker: Sequence[str]) -> subprocess.Popen
             stdout=log,
             stderr=log,
             env=environment(threads),
-            # Ctrl-C in a terminal reaches only this process, which passes on one signal: a second one would
-            # interrupt the saving.
+            # Ctrl-C in a terminal reaches only this process, which forwards a single signal, because a second
+            # one would interrupt saving.
             start_new_session=True,
         )
 

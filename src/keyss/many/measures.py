@@ -1,6 +1,6 @@
 """Measures of a finished hiding that `compare` and `reproduce` ask for, beside those of `hide` and `audit`.
 
-Each is a function from a run to numbers by name; a text in place of a number is the reason to skip it.
+Each is a function from a run to numbers by name. A string in place of a number says why it was skipped.
 """
 
 from __future__ import annotations
@@ -114,9 +114,9 @@ def rendering(subject: Subject) -> Numbers:
 
 
 def secrecy(subject: Subject) -> Numbers:
-    """How well the published model, and the plain model of its seed, pass for plain models of other seeds.
+    """How well detectors separate the published model, and the plain one of its seed, from other seeds'.
 
-    Without a 3DGS model only its pictures are judged.
+    If no 3DGS model is published, only pictures are judged.
     """
     config = subject.run.config
     covers = _covers(subject.controls, config.cover or "", config.views, subject.backend)
@@ -127,12 +127,12 @@ def secrecy(subject: Subject) -> Numbers:
 def survival(subject: Subject) -> Numbers:
     """Loss in dB of cover and secret by pruning, conversion and purification.
 
-    A secret that does not open any more has none.
+    A secret that no longer opens has no number.
     """
     changes = trials(subject.scenes[0])
     found: Numbers = {}
     if not subject.standard:
-        reason = "it is for 3DGS models, and none is published"
+        reason = "needs a 3DGS model, and this method publishes none"
         found |= {name: reason for name in changes if name != "pruned"}
         changes = {"pruned": changes["pruned"]}
     cover, *others = subject.scenes
@@ -211,7 +211,7 @@ class PlainCovers:
     models: Sequence[Gaussians]  # at least three, on the device: the one to compare with, then controls
 
     def judged(self, model: Gaussians, standard: bool) -> dict[str, float]:
-        """A model beside the controls; unless it is `standard`, only its pictures.
+        """A model against the controls; unless it is `standard`, only its pictures.
 
         The mean AUC of trees that separate its Gaussians from those of the controls, the lowest p-value of
         its statistics, corrected for their number, and the AUC of StegExpose on its pictures.
@@ -226,7 +226,7 @@ class PlainCovers:
 
     @cached_property
     def own(self) -> dict[str, float]:
-        """The plain model to compare with, beside the controls."""
+        """The plain model against the controls."""
         return self.judged(self.models[0], True)
 
     @cached_property

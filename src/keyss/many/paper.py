@@ -1,4 +1,4 @@
-"""The tables of the KeySS paper (`paper.toml`: runs, published figures, claims) beside measured figures."""
+"""The tables of the KeySS paper: runs, published figures and claims (`paper.toml`), and measured figures."""
 
 from __future__ import annotations
 

@@ -32,7 +32,7 @@ from keyss.runs.records import write_record
 
 TEST_EVERY = 8
 
-# Number of photos, and the folder of those that count: a quarter of their size outdoors, half indoors.
+# Number of photos, and the folder that the paper uses: a quarter of the size outdoors, half of it indoors.
 BENCHMARK: Mapping[str, tuple[int, str]] = {
     "bicycle": (194, "images_4"),
     "bonsai": (292, "images_2"),
@@ -59,10 +59,10 @@ SSIM_WEIGHT = 0.5  # of the loss, for plain models too
 
 
 def download_scenes(names: Iterable[str], data: Path) -> None:
-    """Fetch those of the scenes that are missing in `data`, with the photos that count.
+    """Download those of the scenes that are missing in `data`, with the photos that the paper uses.
 
-    Archives stay in `data/archives`. Raises InputError for what cannot be fetched or unpacked, BackendError
-    without pooch.
+    Archives stay in `data/archives`. Raises InputError for a failed download or a damaged archive, and
+    BackendError without pooch.
     """
     pooch = import_extra("pooch", "reproduce", "download scenes")
     missing = {name for name in names if not (data / name).exists()}
@@ -80,12 +80,12 @@ def download_scenes(names: Iterable[str], data: Path) -> None:
             for name, folder in wanted.items():
                 (archives / "unpacked" / folder).rename(data / name)
         except (OSError, ValueError, zipfile.BadZipFile, zlib.error) as error:
-            advice = f"if {archives / file} is there, remove it to fetch it again"
-            raise InputError(f"{url}: cannot be fetched or unpacked: {error}; {advice}") from error
+            advice = f"if {archives / file} exists, remove it to download it again"
+            raise InputError(f"{url}: cannot be downloaded or unpacked: {error}; {advice}") from error
 
 
 def link_scene(data: Path, name: str, folder: Path) -> Path:
-    """A scene of the paper in `folder`, with links to the photos that count.
+    """A scene of the paper in `folder`, with links to the photos that the paper uses.
 
     Raises InputError where they are missing, or not as many as the paper's; OutputError.
     """
@@ -94,7 +94,7 @@ def link_scene(data: Path, name: str, folder: Path) -> Path:
     if model is None or not (source / images).is_dir():
         raise InputError(
             f"{data}: expected a folder {name} with {images} and a COLMAP model, a scene of Mip-NeRF 360 (or "
-            "playroom, of Deep Blending), found none; `download=True` fetches it"
+            "playroom, of Deep Blending), found none; `download=True` downloads it"
         )
     try:
         scene.mkdir(parents=True, exist_ok=True)
@@ -243,7 +243,7 @@ def groups_of(
 
 def _numbers(numbers: Mapping[str, float]) -> dict[str, float]:
     """The numbers of a cell, by the names of the paper's figures."""
-    measures = ("pruning.", "rendering.", "sinkhorn.")  # name theirs as the paper does
+    measures = ("pruning.", "rendering.", "sinkhorn.")  # whose numbers have the paper's names
     figures = {name.partition(".")[2]: value for name, value in numbers.items() if name.startswith(measures)}
     secrets = [value for name, value in numbers.items() if re.fullmatch(r"secrets\.\d+\.psnr", name)]
     figures |= {f"secret {number}": psnr for number, psnr in enumerate(secrets, start=1)}

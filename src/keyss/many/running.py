@@ -117,7 +117,7 @@ def run_cells(
     due = [each for each, result in zip(every, before, strict=True) if result is None]
     for cell, folder in due:
         make_private(folder)
-        (folder / FAILED).unlink(missing_ok=True)  # the next attempt says why
+        (folder / FAILED).unlink(missing_ok=True)  # the next attempt writes its own reason
         write_bytes(folder / CELL, record_bytes(cell))
     if due:
         engine = InThisProcess(reporter) if reporter else _engine(due, jobs, ray)
@@ -138,7 +138,7 @@ class _Run:
 
     def __init__(self, title: str, total: int, skipped: int, engine: Engine, retries: int) -> None:
         console = Console(stderr=True, quiet=progress.level < 0)
-        # A reporter in this process draws itself.
+        # A reporter in this process prints its own progress.
         shown = console.is_terminal and not isinstance(engine, InThisProcess)
         columns = (TextColumn("{task.description}", markup=False), BarColumn(), TimeElapsedColumn())
         self.bars = Progress(*columns, console=console, disable=not shown)
@@ -186,8 +186,8 @@ class _Run:
             if status == REFUSED:
                 return self._end(f"{cell.name}: failed")
             if number < self.retries:
-                self._say(f"{cell.name}: its process died ({how}): it is tried again")
-        self._end(f"{cell.name}: its process died ({how}): given up; see {folder / LOG}")
+                self._say(f"{cell.name}: its process died ({how}); retrying")
+        self._end(f"{cell.name}: its process died ({how}); giving up, see {folder / LOG}")
 
     def _end(self, line: str) -> None:
         self.ended += 1
@@ -206,7 +206,7 @@ def _engine(due: Sequence[tuple[Cell, Path]], jobs: int | None, ray: str | None)
 
 
 def _memory(cell: Cell) -> int:
-    """A rough estimate of the memory in bytes of a cell's process."""
+    """A rough estimate of the memory of a cell's process, in bytes."""
     paths = (Path(each) for each in cell.inputs)
     return _BASE_BYTES + _MODEL_COPIES * sum(each.stat().st_size for each in paths if each.is_file())
 

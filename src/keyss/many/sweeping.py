@@ -68,13 +68,13 @@ class Pair(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
 
 
 class MethodSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A method, and those of its options that differ from the preset's."""
+    """A method, and options that override its preset."""
 
     method: Literal[tuple(registry.METHODS)]  # type: ignore[valid-type]
     name: str | None = None
     preset: Literal[tuple(PRESETS)] = "default"  # type: ignore[valid-type]
     options: dict[str, Any] = {}
-    grid: dict[str, Annotated[list[Any], _AT_LEAST_ONE]] = {}  # values of options, each with each
+    grid: dict[str, Annotated[list[Any], _AT_LEAST_ONE]] = {}  # values of options, in all combinations
 
     @property
     def label(self) -> str:
@@ -127,7 +127,7 @@ def read_spec(path: Path) -> SweepSpec:
 
 
 def variants(path: Path, spec: SweepSpec) -> Iterator[Variant]:
-    """Every method with every choice of its grid. Raises InputError for invalid options."""
+    """Every method with every combination of its grid. Raises InputError for invalid options."""
     for index, entry in enumerate(spec.methods):
         preset = registry.get(entry.method).options.preset(entry.preset)
         for values in product(*entry.grid.values()):
@@ -186,7 +186,7 @@ def _options(where: str, preset: MethodOptions, given: Mapping[str, Any]) -> Met
 
 
 def _check_values(path: Path, spec: SweepSpec) -> None:
-    """Raise InputError for what types cannot state."""
+    """Raise InputError for constraints that types cannot express."""
     if len(set(spec.seeds)) < len(spec.seeds):
         raise InputError(f"{path}: seeds: expected different ones, got one twice")
     _check_labels(f"{path}: pairs", [pair.label for pair in spec.pairs])

@@ -1,8 +1,8 @@
 """The process that runs one cell: `python -m keyss.many.worker FOLDER`.
 
 It ends with its parent, which holds the other end of its standard input. A cell is done when
-`result.json` is there. Only the holder of the cell's lock writes it, after checking that there is none: two
-processes that were started for one cell do it once.
+`result.json` exists. Only the holder of the cell's lock writes it, after checking that there is none, so a
+cell runs only once even if two processes were started for it.
 """
 
 from __future__ import annotations
