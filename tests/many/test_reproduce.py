@@ -17,7 +17,7 @@ from keyss.measure import opacity_pruning, random_pruning
 from tiny_scenes import random_gaussians
 
 SIZES = {"iterations": 20, "max_gaussians": 150}
-FLAGS = ("--iterations", 20, "--max-gaussians", 150, "--most", 1, "--seed", 5)
+FLAGS = ("--iterations", 20, "--max-gaussians", 150, "--pairs", "a,b", "--seed", 5)
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +30,7 @@ def out(folders: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory) ->
 
 
 def run(table: str, folders: tuple[Path, Path], out: Path, **options: Any) -> Reproduction:
-    found = reproduce(table, folders, most=1, seed=5, out=out, **SIZES, **options)
+    found = reproduce(table, folders, pairs=["a,b"], seed=5, out=out, **SIZES, **options)
     assert isinstance(found, Reproduction)
     return found
 
@@ -71,12 +71,12 @@ def test_what_is_done_is_not_done_again(
     monkeypatch.setattr(performing, "fit", refused)
     assert not run("pruning", folders, out).failures
     assert listing(out / "cells") == before
-    found = reproduce("pruning", folders, most=1, seed=5, out=out, **SIZES, dry_run=True)  # type: ignore[arg-type]
+    found = reproduce("pruning", folders, pairs=["a,b"], seed=5, out=out, **SIZES, dry_run=True)  # type: ignore[arg-type]
     assert isinstance(found, Forecast)
     assert all(each.done for each in found.cells)
     monkeypatch.undo()
     with pytest.warns(UserWarning, match="too small to carry"):
-        other = reproduce("pruning", folders, most=1, seed=6, out=out, **SIZES, dry_run=True)  # type: ignore[arg-type]
+        other = reproduce("pruning", folders, pairs=["a,b"], seed=6, out=out, **SIZES, dry_run=True)  # type: ignore[arg-type]
     assert isinstance(other, Forecast)
     assert not any(each.done for each in other.cells)
 
@@ -122,7 +122,9 @@ def test_the_papers_scenes_have_its_sizes_and_pairs(
     folders: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setattr(reproducing, "link_scene", lambda data, name, folder: folders[name < "c"])
-    found = reproduce("multi", data=tmp_path, most=2, out=tmp_path / "out", dry_run=True)
+    found = reproduce(
+        "multi", data=tmp_path, pairs=["bicycle,bonsai,room"], out=tmp_path / "out", dry_run=True
+    )
     assert isinstance(found, Forecast)
     assert {each.name.partition(", ")[2] for each in found.cells} >= {"bicycle-bonsai-room"}
     assert {each.plan.stages[0].steps for each in found.cells if each.plan} == {30_000}

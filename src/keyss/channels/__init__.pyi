@@ -6,7 +6,6 @@ from .base import (
     Content as Content,
     Payload as Payload,
     PreparedCover as PreparedCover,
-    RecordPlan as RecordPlan,
     RecordRequest as RecordRequest,
     Records as Records,
     Room as Room,
@@ -43,11 +42,7 @@ from .low_bits.layout import (
 )
 from .low_bits.parameters import key_cipher as key_cipher
 from .low_bits.salts import salt_rows as salt_rows
-from .low_bits.usable import (
-    chance_of_bits as chance_of_bits,
-    check_usable as check_usable,
-    usable_carriers as usable_carriers,
-)
+from .low_bits.usable import chance_of_bits as chance_of_bits, usable_carriers as usable_carriers
 from .publishing import (
     SUFFIXES as SUFFIXES,
     AnyChannel as AnyChannel,

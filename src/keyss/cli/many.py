@@ -116,7 +116,6 @@ def reproduce(
             "each hides the next; with --data as published",
         ),
     ] = (),
-    most: Annotated[int | None, optional("N", "Run only the first N pairs.", "all")] = None,
     out: OutFolder,
     download: Annotated[
         bool, switch("Download scenes that are missing in --data from their authors, up to 13 GB.")
@@ -156,7 +155,6 @@ def reproduce(
         data=data,
         download=download,
         pairs=pairs,
-        most=most,
         iterations=iterations,
         max_gaussians=max_gaussians,
         width=width,
@@ -220,7 +218,6 @@ def sweep(
         return
     described = {
         "results.csv": "means over seeds, with 95 % confidence intervals",
-        "results.parquet": "the same",
         "cells.csv": "the numbers of each cell",
         "private/master-key.txt": "the key from which those of the cells are derived",
     }

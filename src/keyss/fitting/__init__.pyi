@@ -6,11 +6,7 @@ from .checkpoint import (
     steps_done as steps_done,
 )
 from .config import PRESETS as PRESETS, FitConfig as FitConfig
-from .density import (
-    CappedStrategy as CappedStrategy,
-    Rendered as Rendered,
-    combine_densification as combine_densification,
-)
+from .density import CappedStrategy as CappedStrategy
 from .image_metrics import (
     ImageQuality as ImageQuality,
     mean_psnr as mean_psnr,
@@ -28,14 +24,11 @@ from .losses import (
 from .parameters import (
     Optimizers as Optimizers,
     Parameters as Parameters,
-    initial_gaussians as initial_gaussians,
-    initial_points as initial_points,
     make_optimizers as make_optimizers,
-    to_gaussians as to_gaussians,
     to_parameters as to_parameters,
 )
 from .plain import FitResult as FitResult, PlainRun as PlainRun, fit_scene as fit_scene
 from .ranks import Ranks as Ranks, here as here, joined as joined
-from .sampling import Shuffle as Shuffle, own_randomness as own_randomness
+from .sampling import own_randomness as own_randomness
 from .schedule import Schedule as Schedule
 from .side_by_side import Fit as Fit, fit_scenes as fit_scenes

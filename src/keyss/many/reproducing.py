@@ -120,7 +120,6 @@ def reproduce(
     data: PathLike | None = None,
     download: bool = False,
     pairs: Sequence[str] = (),
-    most: int | None = None,
     iterations: int | None = None,
     max_gaussians: int | None = None,
     width: int | None = None,
@@ -136,7 +135,7 @@ def reproduce(
     width unless others are given. With `data` they are the paper's in that folder, Mip-NeRF 360 and playroom
     of Deep Blending, with its 30,000 steps and 500,000 Gaussians; `download` fetches those that are missing.
     `pairs`: which hide which, as "COVER,SECRET" or "COVER,SECRET,SECRET" by the names of their folders; by
-    default each hides the next, and the paper's as published. `most`: only so many of these.
+    default each hides the next, and the paper's as published.
 
     `out` (a folder) gets `TABLE.json` and `TABLE.md`, and the cells, which tables in one folder share. Cells
     that are done are skipped. `dry_run`: only return their plans. The result lists runs that failed.
@@ -144,15 +143,14 @@ def reproduce(
     """
     if table not in PAPER.tables:
         raise UsageError(f"no table is called {table!r}; {did_you_mean(table, PAPER.tables)}")
-    for name, value in (("most", most), ("width", width)):
-        if value is not None and value < 1:
-            raise UsageError(f"`{name}`: expected at least 1, got {value}")
+    if width is not None and width < 1:
+        raise UsageError(f"`width`: expected at least 1, got {width}")
     spec = PAPER.tables[table]
     paths = _paths(scenes) if data is None else dict.fromkeys(BENCHMARK, "")
     if data is not None and scenes:
         raise UsageError("`data` takes the paper's scenes: leave out the others")
     default = spec.groups if data is not None else None
-    groups = groups_of(list(paths), spec.secrets, pairs, default)[:most]
+    groups = groups_of(list(paths), spec.secrets, pairs, default)
     given = {"iterations": iterations, "max_gaussians": max_gaussians, "width": width}
     small = SMALL if data is None else {}
     sizes = {name: small.get(name) if value is None else value for name, value in given.items()}

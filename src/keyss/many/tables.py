@@ -14,7 +14,6 @@ from typing import Any
 
 from scipy.stats import t as student
 
-from keyss.core.errors import BackendError, import_extra
 from keyss.files.atomic import write_bytes
 
 CONFIDENCE = 0.95
@@ -69,7 +68,7 @@ def half_interval(values: Sequence[float]) -> float:
 
 
 def write_tables(out: Path, cells: Sequence[CellNumbers]) -> list[str]:
-    """`results.csv`, `cells.csv`, and `results.parquet` where pyarrow is installed; their names.
+    """`results.csv` and `cells.csv`; returns their names.
 
     Equal results are equal files. Raises OutputError.
     """
@@ -83,12 +82,7 @@ def write_tables(out: Path, cells: Sequence[CellNumbers]) -> list[str]:
     ]
     write_bytes(out / "results.csv", csv_bytes(results))
     write_bytes(out / "cells.csv", csv_bytes(rows))
-    written = ["results.csv", "cells.csv"]
-    try:
-        write_bytes(out / "results.parquet", _parquet(results))
-    except BackendError:
-        return written
-    return [*written, "results.parquet"]
+    return ["results.csv", "cells.csv"]
 
 
 def markdown_rows(rows: Sequence[Sequence[str]]) -> list[str]:
@@ -107,14 +101,6 @@ def csv_bytes(rows: Sequence[Mapping[str, Any]]) -> bytes:
         for row in rows:
             writer.writerow({name: _shown(value) for name, value in row.items()})
     return text.getvalue().encode("utf-8", "backslashreplace")
-
-
-def _parquet(rows: Sequence[Mapping[str, Any]]) -> bytes:
-    parquet = import_extra("pyarrow.parquet", "sweep", "write Parquet")
-    pyarrow = import_extra("pyarrow", "sweep", "write Parquet")
-    buffer = io.BytesIO()
-    parquet.write_table(pyarrow.Table.from_pylist([dict(row) for row in rows]), buffer)
-    return buffer.getvalue()
 
 
 def _shown(value: Any) -> str:

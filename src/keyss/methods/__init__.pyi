@@ -23,7 +23,6 @@ from .keyss.decoder import (
     DecoderShape as DecoderShape,
     parse_mask as parse_mask,
 )
-from .keyss.designs.carriers import CarriersTraining as CarriersTraining
 from .keyss.method import ClipKeys as ClipKeys
 from .keyss.options import DesignName as DesignName, KeyssOptions as KeyssOptions
 from .keyss.rows import RowSecret as RowSecret

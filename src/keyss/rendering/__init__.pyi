@@ -5,7 +5,6 @@ from .orbit import (
     VIEWS as VIEWS,
     around as around,
     circle as circle,
-    is_model as is_model,
     look_at as look_at,
     middle_and_radius as middle_and_radius,
     scene_of_model as scene_of_model,
