@@ -75,7 +75,7 @@ def sources_of(
     keys: Sequence[str],
     views: ViewOptions,
 ) -> list[Source]:
-    """The cover and the secrets, with their photos, and plain models that are given or that they are.
+    """The cover and the secrets with their photos and plain models; a model given as a scene is its own.
 
     `keys`: of the secrets. Raises UsageError and InputError.
     """

@@ -25,7 +25,7 @@ from keyss.keys.derivation import DerivedKey
 METHOD_BYTES = 15  # of the name of a method in files
 SALTS_TRIED = 4  # with half of the Gaussians changed, 15 of 16 models still open
 NOTICED = (
-    "the secrets are too large, or too many, to lie in this cover as each would alone: whoever holds one of "
+    "the secrets are too large, or too many, to be placed independently of each other: whoever holds one of "
     "the keys can notice that there are other secrets"
 )
 

@@ -58,8 +58,8 @@ from keyss.rendering.cpu.parallel import in_blocks
 ASSOCIATED = b"keyss/v1/low-bits"  # authenticated with a payload
 _BLOCK = 1 << 13  # records at a time
 _TWO_SECRETS = (
-    "this key opens two secrets, because the model was merged from two files: the first one comes out, and "
-    "the second one opens from its own file"
+    "this key opens two secrets, because the model was merged from two files: this is the first; reveal the "
+    "second from its own file"
 )
 
 

@@ -117,7 +117,7 @@ class LowBitsRoom:
         return plans if self.lie_as_alone(plans, requests) else self._tight(requests)
 
     def lie_as_alone(self, plans: Sequence[RecordPlan], requests: Sequence[RecordRequest]) -> bool:
-        """True if records so planned lie as each secret's would alone."""
+        """True if each secret's records are placed as they would be without the others."""
         if list(map(self._alone, requests)) != list(plans):
             return False
         counts = [request.count + plan.copies for plan, request in zip(plans, requests, strict=True)]
@@ -129,14 +129,14 @@ class LowBitsRoom:
         return max(0, left) * self._most_cells(max(request.least_bytes for request in requests))
 
     def unnoticed_records(self, least_bytes: int, secrets: int) -> int:
-        """Records of `least_bytes` that each of so many secrets may have so that all lie as alone; or 0."""
+        """The most records of `least_bytes` for each secret that are placed as without the others; or 0."""
         if secrets > UNNOTICED or not self._classes():
             return 0
         cells = self._most_cells(least_bytes)
         return cells * self._shared // (1 << (secrets - 1).bit_length())
 
     def plan_payloads(self, sizes: Sequence[int]) -> tuple[list[PayloadPlan], bool]:
-        """A plan for each encrypted payload of so many bytes, and whether they lie as alone.
+        """A plan for each encrypted payload of so many bytes; whether each is placed as without the others.
 
         Raises UsageError with the number of carriers that would do.
         """
@@ -178,7 +178,7 @@ class LowBitsRoom:
 
     @property
     def _shared(self) -> int:
-        """Carriers that the headers leave where secrets lie as alone."""
+        """Carriers that the headers leave where each secret is placed as without the others."""
         return self.carriers - self.set_aside((), as_alone=True)
 
     def _classes(self) -> list[tuple[int, int]]:
@@ -213,7 +213,7 @@ class LowBitsRoom:
         return None
 
     def _payload_cells(self, secrets: int) -> int:
-        """Whole carriers for each of so many payloads where they do not lie as alone."""
+        """Whole carriers for each of so many payloads that do not fit as they would without the others."""
         return (self.carriers - secrets * self.header_carriers(_TYPICAL_HEADER)) // secrets
 
     def _fit(self, cells_per_carrier: Sequence[int], counts: Sequence[int]) -> bool:

@@ -125,11 +125,10 @@ def check_usable(gaussians: Gaussians, usable: Flags, layout: Layout | None = No
     used = used_words(gaussians[torch.from_numpy(rows[:: max(1, len(rows) // _SAMPLE)])])
     for name, group in _GROUPS.items():
         bits = int(layout.mask[group][:1].max(initial=0)).bit_length()
-        if bits and used[:, group].size and (chance := chance_of_bits(used[:, group], bits)) < _CHANCE:
+        if bits and used[:, group].size and chance_of_bits(used[:, group], bits) < _CHANCE:
             raise UsageError(
-                f"the low bits of {name} are not random in this cover (by chance that happens with p = "
-                f"{chance:.0e}), and nothing can be hidden in them: it was quantised, scaled or moved after "
-                "its training"
+                f"the low bits of {name} in this cover are not random (p < {_CHANCE:g}), and nothing can be "
+                "hidden in them: the cover was quantised, scaled or moved after its training"
             )
 
 
