@@ -39,7 +39,7 @@ def test_stages_and_sizes_of_a_run_from_photos(tmp_path: Path) -> None:
     ]
     assert [stage.steps for stage in plan.stages if stage.steps] == [60, 60, 60, 60]
     assert (plan.gaussians, plan.sh_degree) == (400, 3)
-    assert plan.capacity < plan.asked == 800
+    assert plan.capacity < plan.secret_gaussians == 800
     assert plan.free_bytes is not None
     assert list(tmp_path.iterdir()) == []
 
@@ -85,7 +85,7 @@ def test_the_capacity_is_the_number_of_hidden_gaussians(tmp_path: Path) -> None:
     result = keyss.hide(
         cover, [Secret(secret, KEY)], method=CarryOptions(prune_to_fit=True), width=24, min_psnr=0
     )
-    assert (plan.asked, plan.capacity) == (6000, *result.metrics.secret_gaussians)
+    assert (plan.secret_gaussians, plan.capacity) == (6000, *result.metrics.secret_gaussians)
     assert [stage.steps for stage in plan.stages] == [0] * len(plan.stages)
 
 

@@ -79,7 +79,7 @@ def sources_of(
 
     `keys`: of the secrets. Raises UsageError and InputError.
     """
-    asked: list[tuple[PathLike | Gaussians | None, bool]] = []  # models, and whether there are photos
+    given: list[tuple[PathLike | Gaussians | None, bool]] = []  # models, and whether there are photos
     for index, (source, model) in enumerate(zip(sources, models, strict=True)):
         photos = isinstance(source, Scene) or not is_model(source)
         if not photos:
@@ -88,14 +88,14 @@ def sources_of(
                 what = "a source in memory" if isinstance(source, Gaussians) else source
                 raise UsageError(f"{what} is a model itself: leave out `{argument}`")
             model = source  # type: ignore[assignment]
-        asked.append((model, photos))
-    names = ["the cover"] + ["the secret"] * (len(asked) - 1)
+        given.append((model, photos))
+    names = ["the cover"] + ["the secret"] * (len(given) - 1)
     # Large files take seconds each, most of them outside of Python's lock.
     with ThreadPoolExecutor(_READERS) as readers:
-        found = readers.map(_drawable, [model for model, _ in asked], names)
+        found = readers.map(_drawable, [model for model, _ in given], names)
         return [
             Source(model, photos, key, as_scene(source, views) if photos else None)
-            for source, model, (_, photos), key in zip(sources, found, asked, ["", *keys], strict=True)
+            for source, model, (_, photos), key in zip(sources, found, given, ["", *keys], strict=True)
         ]
 
 

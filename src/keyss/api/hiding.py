@@ -146,13 +146,13 @@ def hide(
     folder = None
     place = None if out is None else Path(out)
     if place is not None and ranks.first and not dry_run:
-        told = asdict(settings) | {"models": [m and path_of(m) for m in models]}
-        told |= {"bound": True} if bound else {}
-        told["keys"] = _key_checks(keys, settings)
+        arguments = asdict(settings) | {"models": [m and path_of(m) for m in models]}
+        arguments |= {"bound": True} if bound else {}
+        arguments["keys"] = _key_checks(keys, settings)
         folder = RunFolder(
             place,
             "hide",
-            told,
+            arguments,
             onto=("scenes",),
             writes=(*STEGOS, CONFIG),
             inputs=[Path(each) for each in (*given, *models) if isinstance(each, str | Path)],

@@ -77,8 +77,8 @@ class Training:
 
     def schedule(self) -> dict[str, int]:
         """The fields of `FitConfig` that are given."""
-        asked = {"iterations": self.iterations, "max_gaussians": self.max_gaussians, "seed": self.seed}
-        return {name: value for name, value in asked.items() if value is not None}
+        fields = {"iterations": self.iterations, "max_gaussians": self.max_gaussians, "seed": self.seed}
+        return {name: value for name, value in fields.items() if value is not None}
 
 
 PHOTOS, TRAINING = Photos(), Training()

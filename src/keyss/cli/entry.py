@@ -54,9 +54,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     options: set[str] = set()  # of the command, by their names in Python
     try:
-        with only_first_prints(), _warnings_as_lines(options), _verbosity(arguments) as asked:
+        with only_first_prints(), _warnings_as_lines(options), _verbosity(arguments) as words:
             try:
-                _run(asked or ["--help"], options)
+                _run(words or ["--help"], options)
             finally:
                 _flush()
         return 0
@@ -175,15 +175,15 @@ def _warnings_as_lines(options: Collection[str]) -> Iterator[None]:
 @contextmanager
 def _verbosity(arguments: Sequence[str]) -> Iterator[list[str]]:
     """`arguments` without -q and -v. With -v, prints time and memory unless the context ends by an error."""
-    asked = [_LEVELS[word] for word in arguments if word in _LEVELS]
-    if not asked:  # avoids importing the progress module
+    levels = [_LEVELS[word] for word in arguments if word in _LEVELS]
+    if not levels:  # avoids importing the progress module
         yield list(arguments)
         return
 
     from keyss import progress
 
     before, start = progress.level, time.monotonic()
-    progress.level = asked[-1]
+    progress.level = levels[-1]
     try:
         yield [word for word in arguments if word not in _LEVELS]
         if progress.level > 0:

@@ -126,7 +126,7 @@ class HideArguments:
     own: Any  # options of the method alone
 
 
-def hide(asked: HideArguments) -> None:
+def hide(args: HideArguments) -> None:
     """Hide secrets in a cover, each under its own key.
 
     Each method has options of its own: see `keyss hide --method METHOD --help`.
@@ -139,24 +139,24 @@ def hide(asked: HideArguments) -> None:
 
     example: keyss hide --batch assets.csv --method carry --master-key-file master.txt -o runs/assets
     """
-    if asked.batch.batch is not None:
-        _hide_batch(asked, asked.batch.batch)
+    if args.batch.batch is not None:
+        _hide_batch(args, args.batch.batch)
         return
     from keyss.core.errors import UsageError
 
-    if asked.cover is None:
+    if args.cover is None:
         raise UsageError("no cover: give --cover SCENE, or --batch CSV for many hidings")
-    if only_for_many := given(asked.batch):
+    if only_for_many := given(args.batch):
         raise UsageError(f"{only_for_many[0]} is for many hidings: give --batch CSV, or leave it out")
-    if asked.secret_file:
-        _hide_files(asked, asked.cover)
-    elif asked.secret:
-        _hide_scenes(asked, asked.cover)
+    if args.secret_file:
+        _hide_files(args, args.cover)
+    elif args.secret:
+        _hide_scenes(args, args.cover)
     else:
         raise UsageError("no secret: give --secret SCENE or --secret-file FILE, one for each secret")
 
 
-def _hide_scenes(asked: HideArguments, cover: Path) -> None:
+def _hide_scenes(args: HideArguments, cover: Path) -> None:
     import keyss
     from keyss.cli.entry import answers
     from keyss.cli.reporting import reporting
@@ -165,34 +165,34 @@ def _hide_scenes(asked: HideArguments, cover: Path) -> None:
     from keyss.methods import registry
     from keyss.runs.files import HANDED, STEGOS
 
-    method = registry.get(asked.method)
-    options, secrets = _method_options(asked, method), _secrets(asked, method)
-    idle = _idle_without_training(asked, cover)
+    method = registry.get(args.method)
+    options, secrets = _method_options(args, method), _secrets(args, method)
+    idle = _idle_without_training(args, cover)
     if idle and not options.may_train:
         raise UsageError(
             f"{idle}: nothing is trained, as models of all scenes are given and --method {options.method} "
             "does not refit them: leave out such options"
         )
-    described: dict[str, Any] = vars(asked.photos) | {
+    described: dict[str, Any] = vars(args.photos) | {
         "method": options,
-        "cover_model": asked.details.cover_model,
-        "bound": asked.details.bound,
-        "device": asked.device,
-        "out": asked.out,
+        "cover_model": args.details.cover_model,
+        "bound": args.details.bound,
+        "device": args.device,
+        "out": args.out,
     }
-    if asked.dry_run:
+    if args.dry_run:
         plan = keyss.hide(cover, secrets, dry_run=True, **described).plan
         assert plan is not None
         print_plan(plan)
         _warn_of_idle(idle, sum(stage.steps for stage in plan.stages))
         return
-    with reporting(asked.out, cover, asked.training) as reporter:
+    with reporting(args.out, cover, args.training) as reporter:
         result = keyss.hide(
             cover,
             secrets,
-            min_psnr=asked.details.min_psnr,
-            overwrite=asked.overwrite,
-            resume=asked.resume,
+            min_psnr=args.details.min_psnr,
+            overwrite=args.overwrite,
+            resume=args.resume,
             reporter=reporter,
             **described,
         )
@@ -204,7 +204,7 @@ def _hide_scenes(asked: HideArguments, cover: Path) -> None:
     what = "the cover with the secret in it" if options.trains or method.capabilities.keys else "the cover"
     how = _HOW_TO_PUBLISH[options.place.survives]
     print_files(
-        asked.out,
+        args.out,
         {
             **dict.fromkeys(STEGOS, f"{how}: {what}"),
             HANDED: "hand this over to whoever may see the secret: `keyss reveal --handed`",
@@ -221,15 +221,15 @@ def _hide_scenes(asked: HideArguments, cover: Path) -> None:
     )
 
 
-def _secrets(asked: HideArguments, method: Method) -> list[Any]:
+def _secrets(args: HideArguments, method: Method) -> list[Any]:
     """The scenes to hide, with their keys and models."""
     import keyss
     from keyss.core.errors import InputError, UsageError
     from keyss.files.foreign import what_it_is
     from keyss.files.models import is_model_path
 
-    count, models = len(asked.secret), asked.details.secret_model
-    for each in asked.secret:
+    count, models = len(args.secret), args.details.secret_model
+    for each in args.secret:
         if each.is_file() and not is_model_path(each):
             found = f"{each}: expected a scene folder or a model, found {what_it_is(each)}"
             raise InputError(f"{found}; --secret-file hides any file")
@@ -237,28 +237,28 @@ def _secrets(asked: HideArguments, method: Method) -> list[Any]:
         raise UsageError(
             f"expected no --secret-model or one for each of {count} secret(s), got {len(models)}"
         )
-    keys = _keys(asked, count) if method.capabilities.keys or asked.key_file else [""] * count
-    with_models = zip(asked.secret, keys, models or (None,) * count, strict=True)
+    keys = _keys(args, count) if method.capabilities.keys or args.key_file else [""] * count
+    with_models = zip(args.secret, keys, models or (None,) * count, strict=True)
     return [keyss.Secret(scene, key, model) for scene, key, model in with_models]
 
 
-def _keys(asked: HideArguments, count: int) -> list[str]:
+def _keys(args: HideArguments, count: int) -> list[str]:
     from keyss.cli.keys import keys, warn_of_weak_keys
 
-    found = keys(asked.key_file, count, confirm=True)
+    found = keys(args.key_file, count, confirm=True)
     warn_of_weak_keys(found)
     return found
 
 
-def _idle_without_training(asked: HideArguments, cover: Path) -> str:
+def _idle_without_training(args: HideArguments, cover: Path) -> str:
     """The given options that only affect training, if models of all scenes are given; otherwise empty."""
     from keyss.rendering.orbit import is_model
 
-    sources = [asked.details.cover_model or cover, *(asked.details.secret_model or asked.secret)]
+    sources = [args.details.cover_model or cover, *(args.details.secret_model or args.secret)]
     if not all(map(is_model, sources)):
         return ""
-    preset = ["--preset"] if asked.preset != "default" else []
-    flags = (flag for flag in given(asked.training) if flag in ("--iterations", "--max-gaussians", "--live"))
+    preset = ["--preset"] if args.preset != "default" else []
+    flags = (flag for flag in given(args.training) if flag in ("--iterations", "--max-gaussians", "--live"))
     return " and ".join([*preset, *flags])
 
 
@@ -271,21 +271,21 @@ def _warn_of_idle(idle: str, steps: int) -> None:
         )
 
 
-def _method_options(asked: HideArguments, method: Method) -> MethodOptions:
+def _method_options(args: HideArguments, method: Method) -> MethodOptions:
     """The preset, overridden by the options of the command line."""
     known = own_options(method)
     changes = {
         name: parse(value) if (parse := known[name][1].parse) else value
-        for name, value in vars(asked.own).items()
+        for name, value in vars(args.own).items()
         if value is not None and value is not False
     }
-    changes |= {"publish": asked.publish}
-    changes |= {"channel": asked.details.channel} if asked.details.channel else {}
-    options = replace(method.options.preset(asked.preset), **changes)
-    return options.with_fit(**asked.training.schedule())
+    changes |= {"publish": args.publish}
+    changes |= {"channel": args.details.channel} if args.details.channel else {}
+    options = replace(method.options.preset(args.preset), **changes)
+    return options.with_fit(**args.training.schedule())
 
 
-def _hide_files(asked: HideArguments, cover: Path) -> None:
+def _hide_files(args: HideArguments, cover: Path) -> None:
     import keyss
     from keyss.channels import channel_for
     from keyss.cli.entry import check_command
@@ -293,31 +293,29 @@ def _hide_files(asked: HideArguments, cover: Path) -> None:
     from keyss.runs.files import STEGOS
 
     check_command("hide --secret-file", trains=False)
-    _refuse(asked, "--secret-file", "cover secret_file key_file publish out overwrite device channel dry_run")
-    files, keys = asked.secret_file, _keys(asked, len(asked.secret_file))
-    channel = asked.details.channel or "colours"
+    _refuse(args, "--secret-file", "cover secret_file key_file publish out overwrite device channel dry_run")
+    files, keys = args.secret_file, _keys(args, len(args.secret_file))
+    channel = args.details.channel or "colours"
     result = keyss.hide(
         cover,
         [keyss.Secret(file=file, key=key) for file, key in zip(files, keys, strict=True)],
-        publish=asked.publish,
+        publish=args.publish,
         channel=channel,
-        out=asked.out,
-        overwrite=asked.overwrite,
-        dry_run=asked.dry_run,
+        out=args.out,
+        overwrite=args.overwrite,
+        dry_run=args.dry_run,
     )
     for file in files:
-        what = "which fit" if asked.dry_run else "revealed again from the published file"
+        what = "which fit" if args.dry_run else "revealed again from the published file"
         print(f"{file.name}: {file.stat().st_size:,} bytes, {what}")
     print(f"PSNR between renders of the cover before and after: {result.psnr:.0f} dB")
-    if asked.dry_run:
+    if args.dry_run:
         print("Dry run: nothing was written.")
         return
-    print_files(
-        asked.out, dict.fromkeys(STEGOS, _HOW_TO_PUBLISH[channel_for(asked.publish, channel).survives])
-    )
+    print_files(args.out, dict.fromkeys(STEGOS, _HOW_TO_PUBLISH[channel_for(args.publish, channel).survives]))
 
 
-def _hide_batch(asked: HideArguments, table: Path) -> None:
+def _hide_batch(args: HideArguments, table: Path) -> None:
     import keyss
     from keyss.cli.entry import as_flags, check_command, options_of_group
     from keyss.cli.keys import key_of_file, warn_of_weak_keys
@@ -325,35 +323,35 @@ def _hide_batch(asked: HideArguments, table: Path) -> None:
     from keyss.methods import registry
 
     check_command("hide --batch", trains=False)
-    method, batch = registry.get(asked.method), asked.batch
+    method, batch = registry.get(args.method), args.batch
     used = "batch master_key_file jobs ray out publish channel preset overwrite device min_psnr"
     used += " width background skip_missing iterations max_gaussians seed"
-    _refuse(asked, "--batch", used, vars(asked.own))
+    _refuse(args, "--batch", used, vars(args.own))
     if batch.master_key_file is not None:
         warn_of_weak_keys([key_of_file(batch.master_key_file)])
     result = keyss.hide_batch(
         table,
-        asked.out,
-        method=_method_options(asked, method),
+        args.out,
+        method=_method_options(args, method),
         master_key_file=batch.master_key_file,
-        **vars(asked.photos),
-        min_psnr=asked.details.min_psnr,
-        device=asked.device,
+        **vars(args.photos),
+        min_psnr=args.details.min_psnr,
+        device=args.device,
         jobs=batch.jobs,
         ray=batch.ray,
-        overwrite=asked.overwrite,
+        overwrite=args.overwrite,
     )
     if skipped := sum(each.skipped for each in result.outcomes):
         print(f"{skipped} of {len(result.outcomes)} assets were done before")
-    print_files(asked.out, {"private/batch.csv": "the outcome of each asset"})
-    print_outcome(result, "assets", partial(as_flags, options=options_of_group(type(asked))))
+    print_files(args.out, {"private/batch.csv": "the outcome of each asset"})
+    print_outcome(result, "assets", partial(as_flags, options=options_of_group(type(args))))
 
 
-def _refuse(asked: HideArguments, mode: str, used: str, own: Sequence[str] = ()) -> None:
+def _refuse(args: HideArguments, mode: str, used: str, own: Sequence[str] = ()) -> None:
     """Raise UsageError for a given option that `mode` does not use."""
     from keyss.core.errors import UsageError
 
-    names = {flag.removeprefix("--").replace("-", "_"): flag for flag in given(asked)}
+    names = {flag.removeprefix("--").replace("-", "_"): flag for flag in given(args)}
     if unused := [flag for name, flag in names.items() if name not in (*used.split(), *own)]:
         instead = ", or give the cover and the secret of one row" * (unused[0] == "--dry-run")
         raise UsageError(f"{mode} does not use {unused[0]}: leave out {unused[0]}{instead}")
@@ -369,8 +367,8 @@ def with_options_of_method(arguments: Sequence[str]) -> Callable[..., None]:
 
     chooser = ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
     chooser.add_argument("--method", nargs="?")
-    asked = chooser.parse_known_args(arguments)[0].method
-    name = asked if asked in registry.METHODS else registry.DEFAULT
+    args = chooser.parse_known_args(arguments)[0].method
+    name = args if args in registry.METHODS else registry.DEFAULT
     flags = {each: set(map(flag, modules.own)) for each, modules in registry.METHODS.items()}
     for argument in arguments:
         given = argument.partition("=")[0].replace("_", "-")
@@ -399,16 +397,16 @@ def _check_without_torch(name: str, arguments: Sequence[str]) -> None:
         for each, kind in METHODS[name].own.items()
     ]
     config = (tyro.conf.FlagCreatePairsOff,)
-    asked = tyro.cli(_arguments_of(name, "", own), prog="keyss hide", args=arguments, config=config)
-    check_there(asked.cover, asked.details.cover_model, asked.batch.batch, asked.batch.master_key_file)
-    check_there(*asked.secret, *asked.secret_file, *asked.key_file, *asked.details.secret_model)
+    args = tyro.cli(_arguments_of(name, "", own), prog="keyss hide", args=arguments, config=config)
+    check_there(args.cover, args.details.cover_model, args.batch.batch, args.batch.master_key_file)
+    check_there(*args.secret, *args.secret_file, *args.key_file, *args.details.secret_model)
 
 
 def _parsed_as(kind: type[HideArguments]) -> Callable[..., None]:
-    def command(asked: HideArguments) -> None:
-        hide(asked)
+    def command(args: HideArguments) -> None:
+        hide(args)
 
-    command.__annotations__ = {"asked": Annotated[kind, arg(name="")], "return": None}
+    command.__annotations__ = {"args": Annotated[kind, arg(name="")], "return": None}
     command.__name__, command.__doc__ = "hide", hide.__doc__
     return command
 

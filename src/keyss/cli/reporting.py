@@ -17,15 +17,15 @@ FOLDER = "private/tensorboard"  # of a run: losses may reveal something about a 
 
 
 @contextmanager
-def reporting(out: Path, scene: Path, asked: Training) -> Iterator[Reporter]:
+def reporting(out: Path, scene: Path, training: Training) -> Iterator[Reporter]:
     """The reporter of `fit` and `hide`. With --live, a page shows the training while the context is open.
 
     Raises BackendError if TensorBoard is not installed, OutputError if the page cannot be served.
     """
     reporter: Reporter = lines()
-    if asked.tensorboard:
+    if training.tensorboard:
         reporter = TensorBoardReporter(out, reporter)
-    if not (asked.live and answers()):
+    if not (training.live and answers()):
         yield reporter
         return
     from keyss.viewer.live import LiveTraining

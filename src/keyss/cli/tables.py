@@ -114,7 +114,7 @@ def print_plan(plan: Plan) -> None:
     _print_columns(
         [
             ("method", plan.method),
-            ("room", f"{plan.capacity:,} of the secrets' {plan.asked:,} Gaussians"),
+            ("room", f"{plan.capacity:,} of the secrets' {plan.secret_gaussians:,} Gaussians"),
             (
                 "published",
                 f"up to {plan.gaussians:,} Gaussians of SH degree {plan.sh_degree}, "

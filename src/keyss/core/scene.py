@@ -44,7 +44,7 @@ class View:
 
     camera: Camera
     image: Tensor  # [H, W, 3] uint8 sRGB
-    drawn: Tensor | None = None  # [H, W, 3] in [0, 1]: the render before rounding, if it is not a photo
+    unrounded: Tensor | None = None  # [H, W, 3] in [0, 1]: the render itself, if the image is not a photo
 
 
 @dataclass(frozen=True)

@@ -87,7 +87,7 @@ def at_once(fits: Sequence[Fit], device: torch.device) -> int:
 
 def process_bytes(fit: Fit) -> int:
     """Rough memory of the process of a fit."""
-    images = [image for view in fit.scene.views for image in (view.image, view.drawn) if image is not None]
+    images = [each for view in fit.scene.views for each in (view.image, view.unrounded) if each is not None]
     numbers = fit.config.max_gaussians * (11 + 3 * (fit.config.sh_degree + 1) ** 2)
     return _PROCESS_BYTES + sum(image.nbytes for image in images) + 4 * _COPIES * numbers
 

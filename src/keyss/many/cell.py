@@ -103,8 +103,8 @@ class Cell:
             master_key_file=None,
             key_names=(),
         )
-        told = {"cell": made_of, "code": code_version()}
-        return hashlib.sha256(b"keyss/v1/cell" + msgspec.json.encode(told, order="sorted")).hexdigest()
+        identity = {"cell": made_of, "code": code_version()}
+        return hashlib.sha256(b"keyss/v1/cell" + msgspec.json.encode(identity, order="sorted")).hexdigest()
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -90,8 +90,8 @@ def compare(
         raise UsageError("comparing takes scenes, folders of photos: models have none to compare with")
     chosen = {name: _named(name) for name in methods or EVERY}
     sizes = {"iterations": iterations, "max_gaussians": max_gaussians}
-    asked = {name: size for name, size in sizes.items() if size is not None}
-    fit = replace(next(iter(chosen.values())).fit, seed=seed, **asked)
+    given = {name: size for name, size in sizes.items() if size is not None}
+    fit = replace(next(iter(chosen.values())).fit, seed=seed, **given)
     scenes = [os.path.realpath(cover), os.path.realpath(secret)]
     folder = CellFolder(Path(out), common={"views": ViewOptions(width), "device": device})
     places = _places(folder, scenes, chosen, fit)
@@ -104,10 +104,10 @@ def compare(
         if dry_run:
             return forecast
     outcomes = folder.run(f"comparison of {len(places)} methods", reporter=reporter or default_reporter())
-    told = {"cover": scenes[0], "secret": scenes[1], "iterations": fit.iterations}
-    told |= {"max_gaussians": fit.max_gaussians, "width": width, "seed": seed}
+    arguments = {"cover": scenes[0], "secret": scenes[1], "iterations": fit.iterations}
+    arguments |= {"max_gaussians": fit.max_gaussians, "width": width, "seed": seed}
     rows = [_row(name, outcomes[place], folder) for name, place in places.items()]
-    found = Comparison(arguments=told, methods=tuple(rows))
+    found = Comparison(arguments=arguments, methods=tuple(rows))
     write_record(folder.out / RECORD, found)
     write_bytes(folder.out / TABLE, comparison_text(found).encode())
     runs = {name: _opened(folder, place) for name, place in places.items() if outcomes[place].result}

@@ -178,8 +178,8 @@ def show(model: Gaussians, plain: Gaussians | None, scene: Scene, *, of_plain: b
         qualities.append(view_quality(image, photo))
         if plain is None:
             continue
-        if of_plain and view.drawn is not None:
-            expected = view.drawn.to(model.device)
+        if of_plain and view.unrounded is not None:
+            expected = view.unrounded.to(model.device)
         else:
             expected = render(plain, view.camera, background).clamp(0, 1)
         plains.append(view_quality(expected, photo))

@@ -186,10 +186,10 @@ class Plan:
 
     gaussians: int  # of the published model
     sh_degree: int  # of the published model
-    asked: int  # Gaussians of all secrets together
+    secret_gaussians: int  # of all secrets together
     capacity: int  # Gaussians of the secrets that fit
     steps: int = 0  # of the method's own training
-    drawn: tuple[int, ...] = ()  # Gaussians of the cover and of each secret that a step renders
+    rendered: tuple[int, ...] = ()  # Gaussians of the cover and of each secret in a step
     gaussian_weights: float = 0.0  # of the networks that a step evaluates for each Gaussian
     pixel_weights: float = 0.0  # of the networks that a step evaluates for each rendered pixel
     notes: tuple[str, ...] = ()  # what the options cost, a sentence each

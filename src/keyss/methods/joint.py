@@ -80,10 +80,10 @@ class JointOptions(MethodOptions):
         return Plan(
             gaussians=fit.max_gaussians,
             sh_degree=fit.sh_degree,
-            asked=secrets * fit.max_gaussians,
+            secret_gaussians=secrets * fit.max_gaussians,
             capacity=fit.max_gaussians,
             steps=fit.iterations,
-            drawn=(fit.max_gaussians,) * (1 + secrets),
+            rendered=(fit.max_gaussians,) * (1 + secrets),
             gaussian_weights=gaussian_weights,
             pixel_weights=pixel_weights,
         )
@@ -219,7 +219,7 @@ class JointTraining(ABC):
         """The weighted losses of all scenes, each at its pose, and the renders that density control uses."""
         fit = self.options.fit
         total = torch.zeros((), device=self.device)
-        drawn: dict[int, Rendered] = {}  # scenes may share a render
+        renders: dict[int, Rendered] = {}  # scenes may share a render
         for pose in dict.fromkeys(poses):
             scenes = [scene for scene, own in enumerate(poses) if own == pose]
             pictures = self.draw(scenes, self.poses.camera(*pose), fit.sh_degree_at(self.iteration))
@@ -227,10 +227,10 @@ class JointTraining(ABC):
                 target, weight = self.poses.target(scene, *pose), self.weights[scene]
                 total = total + weight * photometric_loss(picture.image, target, fit.ssim_weight)
                 if scene in self.growing:
-                    shared = drawn.get(id(picture.meta))
+                    shared = renders.get(id(picture.meta))
                     weight += shared[2] if shared else 0.0
-                    drawn[id(picture.meta)] = (picture.meta, picture.indices, weight)
-        return total, list(drawn.values())
+                    renders[id(picture.meta)] = (picture.meta, picture.indices, weight)
+        return total, list(renders.values())
 
     def _sample_poses(self) -> list[Pose]:
         """The training pose that each scene is rendered from in this step."""

@@ -58,11 +58,11 @@ def plan_hiding(
             bounds.append(_fit_stage(f"bound of the {role}", longer.config(fit), source.scene, size, device))
     if plan.steps:
         step = sum(
-            _step_seconds(device, drawn, source.scene, plan)
-            for source, drawn in zip(sources, plan.drawn, strict=True)
-            if drawn
+            _step_seconds(device, rendered, source.scene, plan)
+            for source, rendered in zip(sources, plan.rendered, strict=True)
+            if rendered
         )
-        stages.append(Stage("hiding", plan.steps, sum(plan.drawn), plan.steps * _views(fit) * step))
+        stages.append(Stage("hiding", plan.steps, sum(plan.rendered), plan.steps * _views(fit) * step))
     measuring = sum(
         _RENDERS * len(source.scene.test) * _step_seconds(device, size, source.scene) / 3
         for source, size in zip(sources, sizes, strict=True)
@@ -88,7 +88,7 @@ def plan_fit(scene: Scene, config: FitConfig, device: torch.device) -> Plan:
     return Plan(
         gaussians=gaussians,
         sh_degree=degree,
-        asked=0,
+        secret_gaussians=0,
         capacity=0,
         steps=config.iterations,
         stages=(_fit_stage("fit", config, scene, gaussians, device),),

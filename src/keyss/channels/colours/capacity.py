@@ -32,7 +32,7 @@ _RATE = 0.42  # data bits for each bit of information that is expected to be rea
 _GARBAGE = 0.02  # share of carriers whose name changes although it seemed stable
 _COMFORTABLE = 0.8  # how full a share may be; the rest makes up for losses
 _ROBUST = 0.5  # the same for a payload that is detectable anyway
-SPREAD = 0.5  # dB by which writing may cost more than `Capacity.cost`
+SPREAD = 0.5  # dB by which a file may stay below `Capacity.psnr`
 _INCOMPRESSIBLE = 11  # bytes by which zlib lengthens data that it cannot compress
 _ROUNDED = 0.25  # share of repeated colours from which on a model is a rounded one
 _LOW = np.uint32(1023)  # bits of a float that stay
@@ -56,7 +56,7 @@ class Capacity:
     model: Gaussians
     numbers: Numbers
     strength: float  # dB PSNR that views keep
-    measured: dict[tuple[int, int], float] = field(default_factory=dict, compare=False)  # see `cost`
+    measured: dict[tuple[int, int], float] = field(default_factory=dict, compare=False)  # see `psnr`
 
     def bytes(self, depth: int) -> int:
         """The largest packed payload with up to `depth` bits in a number; 0 if none fits."""
@@ -76,13 +76,13 @@ class Capacity:
             for depth in range(2, MAX_BITS + 1):
                 level = self._least_level(sizes, depth, comfort)
                 shares = self._shares(sizes, level, depth, comfort)
-                if sum(shares) <= SHARES and self.cost(level, depth) >= self.strength + SPREAD:
+                if sum(shares) <= SHARES and self.psnr(level, depth) >= self.strength + SPREAD:
                     return Layout(level, depth, _stretched(shares))
         level = self._level(MAX_BITS)
         shares = self._shares(sizes, level, MAX_BITS, 1.0)
         return Layout(level, MAX_BITS, _stretched(shares)) if sum(shares) <= SHARES else None
 
-    def cost(self, level: int, depth: int) -> float:
+    def psnr(self, level: int, depth: int) -> float:
         """PSNR in dB that views keep beside a payload in all carriers and its headers."""
         if (level, depth) not in self.measured:
             random, bits = np.random.default_rng(0), bit_counts(self.own, level, depth)
@@ -97,14 +97,14 @@ class Capacity:
         return self.measured[level, depth]
 
     def _level(self, depth: int) -> int:
-        """The highest level of this depth that costs no more than `strength` allows, or the lowest one."""
+        """The highest level of this depth whose PSNR is at least `strength`, or the lowest one."""
 
-        def costs_more(level: int) -> bool:
-            return self.cost(level, depth) < self.strength + SPREAD
+        def is_below(level: int) -> bool:
+            return self.psnr(level, depth) < self.strength + SPREAD
 
-        if not costs_more(LEVELS - 1):  # as mostly at depth 1
+        if not is_below(LEVELS - 1):  # as mostly at depth 1
             return LEVELS - 1
-        return max(0, bisect_left(range(LEVELS), True, key=costs_more) - 1)
+        return max(0, bisect_left(range(LEVELS), True, key=is_below) - 1)
 
     def _least_level(self, sizes: Sequence[int], depth: int, comfort: float) -> int:
         """The lowest level of this depth that holds payloads of these sizes, or the highest of all."""

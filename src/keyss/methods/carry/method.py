@@ -96,14 +96,14 @@ class CarryMethod:
             how = "about" if room.prepared is None else "exactly"
             notes.append(f"the {room.channel.place} have room for {how} {room.room.capacity:,} bytes")
         counts = [count for count, _ in sizes]
-        drawn = (count if steps else 0 for steps, count in zip(options.refits, counts, strict=True))
+        rendered = (count if steps else 0 for steps, count in zip(options.refits, counts, strict=True))
         return Plan(
             gaussians=room.gaussians + appended,
             sh_degree=room.sh_degree,
-            asked=sum(secret.count for secret in secret_sizes),
+            secret_gaussians=sum(secret.count for secret in secret_sizes),
             capacity=sum(counts),
             steps=max(options.refits),
-            drawn=(0, *drawn),
+            rendered=(0, *rendered),
             notes=tuple(notes),
         )
 

@@ -279,8 +279,8 @@ def _ways(cover: Gaussians | None, options: CarryOptions) -> str:
                 RecordRoom._of(cover, replace(changed, dither=dither or options.dither), entropy)
             except UsageError:
                 continue
-            asked = [f"sh_degree={degree}"] * (degree is not None) + ["dither=True"] * dither
-            return f"`{', '.join(asked)}` makes room, {_ANY}"
+            changes = [f"sh_degree={degree}"] * (degree is not None) + ["dither=True"] * dither
+            return f"`{', '.join(changes)}` makes room, {_ANY}"
     return _ANY
 
 

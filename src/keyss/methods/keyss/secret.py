@@ -96,8 +96,8 @@ class HiddenSecret:
         if not force:
             self.check_unchanged(stego)
         decoded = self.decode(stego, self.embedding)
-        if (drawn := decoded.opacities >= DRAWN_OPACITY).any():
-            decoded = compensate_pruning(decoded[drawn], self.count)
+        if (visible := decoded.opacities >= DRAWN_OPACITY).any():
+            decoded = compensate_pruning(decoded[visible], self.count)
         decoded = decoded.to("cpu")
         return decoded if frame == "cover" else self.frame.inverse().apply_gaussians(decoded)
 

@@ -33,7 +33,7 @@ class BoundMethod(Peer):
         fit = options.fit
         cover, secret = (fit.max_gaussians if each.given is None else len(each.given) for each in sources)
         degree = fit.sh_degree if sources[0].given is None else sources[0].given.sh_degree
-        return Plan(gaussians=cover, sh_degree=degree, asked=secret, capacity=secret)
+        return Plan(gaussians=cover, sh_degree=degree, secret_gaussians=secret, capacity=secret)
 
     def hide(self, cover: Source, secrets: Sequence[Source], options: PeerOptions, context: Context) -> Stego:
         """Hand the secret's model over."""

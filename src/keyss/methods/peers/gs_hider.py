@@ -41,9 +41,9 @@ class GsHiderTraining(PeerTraining):
     def draw(self, scenes: Sequence[int], camera: Camera, sh_degree: int) -> list[Picture]:
         """All images come from one render of the features."""
         background = torch.zeros(FEATURES, device=self.device)
-        drawn, meta = render_features(self.gaussians(), self.parameters["features"], camera, background)
+        image, meta = render_features(self.gaussians(), self.parameters["features"], camera, background)
         networks = (self.decoders[scene].network(background) for scene in scenes)
-        return [Picture(decode_picture(drawn, network), meta) for network in networks]
+        return [Picture(decode_picture(image, network), meta) for network in networks]
 
     def gaussians(self) -> Gaussians:
         """[N] without colours."""

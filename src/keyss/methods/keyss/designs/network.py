@@ -74,16 +74,16 @@ class NetworkTraining(DesignTraining):
         return [random_embeddings(1, self.generator)[0].to(self.device) for _ in range(self.views_per_step)]
 
     def loss_at(self, poses: Sequence[Pose], extra: Tensor | None) -> tuple[Tensor, list[Rendered]]:
-        total, drawn = super().loss_at(poses, extra)
+        total, renders = super().loss_at(poses, extra)
         if extra is None:
-            return total, drawn
+            return total, renders
         # The cover is right already: only the decoders learn from wrong keys, in turns.
         fit, cover, camera = self.options.fit, self.gaussians(), self.poses.camera(*poses[0])
         decoder = self.decoders[self.iteration % len(self.decoders)]
         part = cover[possibly_seen(cover, camera, _SLACK * self.extent)]
         picture = self.render(decoder(part, extra, cover), 0, camera, fit.sh_degree_at(self.iteration))
         loss = photometric_loss(picture.image, self.poses.target(0, *poses[0]), fit.ssim_weight)
-        return total + self.design.incorrect_weight * len(self.decoders) * loss, drawn
+        return total + self.design.incorrect_weight * len(self.decoders) * loss, renders
 
     def density_control(self) -> CappedStrategy:
         if self.design.at_cap == "even" and len(self.growing) == len(self.scenes):
@@ -116,8 +116,8 @@ class NetworkTraining(DesignTraining):
         secrets = []
         for decoder, placed in zip(self.decoders, self.scenes[1:], strict=True):
             secret = HiddenSecret(decoder.to("cpu").requires_grad_(False), placed.frame, anchors)
-            drawn = secret.decode(stego, secret.embedding).opacities >= DRAWN_OPACITY
-            secrets.append(replace(secret, count=int(drawn.sum())))
+            visible = secret.decode(stego, secret.embedding).opacities >= DRAWN_OPACITY
+            secrets.append(replace(secret, count=int(visible.sum())))
         return stego, secrets
 
 
