@@ -229,8 +229,8 @@ class TestUnexpectedErrors:
     @pytest.mark.parametrize(
         ("error", "status", "words"),
         [
-            (MemoryError(), 8, "too little memory"),
-            (RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried"), 8, "too little memory"),
+            (MemoryError(), 8, "out of memory"),
+            (RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried"), 8, "out of memory"),
             (OSError(errno.ENOSPC, "No space left on device", "/x/y"), 5, "/x/y: No space left"),
             (KeyboardInterrupt(), 130, "interrupted"),
         ],

@@ -69,7 +69,7 @@ class WholeMethod:
 
     name = "whole"
     summary = "embed the floats themselves"
-    most_secrets = 1
+    max_secrets = 1
     capabilities = Capabilities()
     options = WholeOptions
 

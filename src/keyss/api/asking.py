@@ -55,9 +55,9 @@ def method_for(chosen: str | MethodOptions, secrets: Sequence[Secret]) -> tuple[
     else:
         method = registry.get(chosen)
         options = method.options()
-    if not 1 <= len(secrets) <= method.most_secrets:
+    if not 1 <= len(secrets) <= method.max_secrets:
         raise UsageError(
-            f"expected 1 to {method.most_secrets} secrets for the method {method.name}, got {len(secrets)}"
+            f"expected 1 to {method.max_secrets} secrets for the method {method.name}, got {len(secrets)}"
         )
     keys = [secret.key for secret in secrets]
     if method.capabilities.keys:

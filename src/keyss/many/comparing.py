@@ -159,7 +159,7 @@ def _named(text: str) -> MethodOptions:
 
 def _row(name: str, outcome: Outcome, folder: CellFolder) -> ComparedMethod:
     method = registry.get(folder.cells[outcome.folder].method)
-    row = ComparedMethod(name=name, keys=method.capabilities.keys, max_secrets=method.most_secrets)
+    row = ComparedMethod(name=name, keys=method.capabilities.keys, max_secrets=method.max_secrets)
     if outcome.result is None:
         return replace(row, error=outcome.error)
     run = outcome.folder / folder.cells[outcome.folder].run

@@ -198,7 +198,7 @@ def _check_values(path: Path, spec: SweepSpec) -> None:
     count = len(spec.pairs) * len(spec.seeds) * choices
     if count > MAX_CELLS:
         raise InputError(f"{path}: expected at most {MAX_CELLS:,} cells, got {count:,}")
-    most = min(registry.get(entry.method).most_secrets for entry in spec.methods)
+    most = min(registry.get(entry.method).max_secrets for entry in spec.methods)
     for index, pair in enumerate(spec.pairs):
         where, secrets, models = f"{path}: pairs[{index}]", len(pair.secrets), len(pair.secret_models)
         if secrets > most:

@@ -211,7 +211,7 @@ class Method(Protocol):
 
     name: str  # that of its options
     summary: str  # one line that continues the name
-    most_secrets: int  # in one model
+    max_secrets: int  # in one model
     capabilities: Capabilities
     options: type[MethodOptions]
 

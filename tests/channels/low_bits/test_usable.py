@@ -111,7 +111,7 @@ def test_bits_that_depend_on_each_other_are_refused() -> None:
     model = trained_like(4000, 2)
     words = model.sh.numpy().view(np.uint32)
     words ^= (words & 1) << 9 ^ (words >> 9 & 1) << 9  # bit 9 is bit 0
-    with pytest.raises(UsageError, match=r"low bits of (f_rest|harmonics) are not random"):
+    with pytest.raises(UsageError, match=r"low bits of (f_rest|harmonics) in this cover are not random"):
         LOW_BITS.prepare(model)
     usable = np.ones(4000, bool)
     check_usable(trained_like(4000, 2), usable)

@@ -35,7 +35,7 @@ class CarryMethod:
 
     name = CarryOptions.method
     summary = "the secrets' Gaussians, encrypted in the cover's"
-    most_secrets = 256
+    max_secrets = 256
     capabilities = Capabilities()
     options = CarryOptions
 

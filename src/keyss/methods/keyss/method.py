@@ -82,7 +82,7 @@ class KeyssMethod:
 
     name = KeyssOptions.method
     summary = "train one model and a decoder for each key jointly, as the paper does"
-    most_secrets = 9
+    max_secrets = 9
     capabilities = Capabilities()
     options = KeyssOptions
 

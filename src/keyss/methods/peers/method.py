@@ -160,7 +160,7 @@ class Peer:
     open: Callable[[HandedTensors], Show]  # raises InputError and ValueError for damage
     training: type[PeerTraining] | None = None  # None: `hide` is another
     pixel_weights: int = 0  # see `Plan`
-    most_secrets: int = 1
+    max_secrets: int = 1
 
     @property
     def name(self) -> str:

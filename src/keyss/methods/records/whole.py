@@ -35,7 +35,7 @@ from keyss.methods.records.lines import Table
 from keyss.methods.records.quantise import Codec, outliers
 
 _ALWAYS = 1 << 16  # Gaussians that any payload may announce
-_LEAST_BYTES = 2  # of each Gaussian in larger models
+_MIN_BYTES = 2  # of each Gaussian in larger models
 USUAL_BITS, MAX_BITS = 110, 143  # of all but harmonics: about 48 and 60 dB
 _HEAD = struct.Struct("<IBf")
 _STEP, _HALVED = 0.06, 20  # of harmonics at the usual bits; with so many more bits it is half as large
@@ -93,7 +93,7 @@ def decode(data: bytes, carriers: int | None = None) -> Gaussians:
         raise InputError(
             f"the hidden secret is damaged: it announces {count:,} Gaussians of SH degree {sh_degree}"
         )
-    largest = len(data) // _LEAST_BYTES
+    largest = len(data) // _MIN_BYTES
     if count > max(_ALWAYS, largest if carriers is None else min(largest, carriers)):
         held_by = f"{len(data):,} bytes" + ("" if carriers is None else f" in {carriers:,} Gaussians")
         raise InputError(
