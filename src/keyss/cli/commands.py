@@ -33,7 +33,7 @@ Hide a 3D Gaussian Splatting scene inside another one and open it only with a ke
 
 A key is read from --key-file, from the environment variable KEYSS_KEY, or from a prompt.
 Exit status: 0 done, 2 wrong usage, 3 wrong key, 4 unreadable input, 5 unwritable output,
-6 missing backend, 7 failed quality check, 8 too little memory, 70 internal error,
+6 missing backend, 7 failed quality check, 8 out of memory, 70 internal error,
 130 interrupted, 141 broken pipe, 143 terminated."""
 
 
