@@ -24,7 +24,7 @@ FLAGS = ("--iterations", 20, "--max-gaussians", 150, "--pairs", "a,b", "--seed",
 def out(folders: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with the table "pruning", which others use the run of."""
     folder = tmp_path_factory.mktemp("tables") / "paper"
-    with pytest.warns(UserWarning, match="too small to carry"):
+    with pytest.warns(UserWarning, match="secrets lie in appended Gaussians"):
         run("pruning", folders, folder)
     return folder
 
@@ -75,7 +75,7 @@ def test_what_is_done_is_not_done_again(
     assert isinstance(found, Forecast)
     assert all(each.done for each in found.cells)
     monkeypatch.undo()
-    with pytest.warns(UserWarning, match="too small to carry"):
+    with pytest.warns(UserWarning, match="secrets lie in appended Gaussians"):
         other = reproduce("pruning", folders, pairs=["a,b"], seed=6, out=out, **SIZES, dry_run=True)  # type: ignore[arg-type]
     assert isinstance(other, Forecast)
     assert not any(each.done for each in other.cells)
