@@ -86,6 +86,7 @@ def test_metrics_have_their_shape(run: Path) -> None:
         *("photos", "against_plain"),
         *(
             "secret_gaussians",
+            "secret_degrees",
             "iterations",
             "steps",
             "seconds",

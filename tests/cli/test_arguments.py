@@ -71,7 +71,7 @@ class TestArguments:
             "skip_missing": False,
             "cover_model": Path("m.ply"),
             "bound": False,
-            "min_psnr": 20.0,
+            "min_psnr": None,
             "device": "cpu",
             "out": Path("out"),
             "overwrite": False,

@@ -20,7 +20,9 @@ def test_below_the_limit_nothing_is_published_and_a_lower_limit_needs_no_trainin
     hide = ["hide", *scenes, "--publish", "any", "-o", tmp_path / "run", *SMALL]
     said = keyss(*hide, "--min-psnr", 90)
     assert said.status == 7
-    assert "below 90 dB: nothing was published; --min-psnr sets the limit" in said.err
+    assert (
+        "below 90 dB: nothing was published; a lower --min-psnr publishes it, and --resume skips" in said.err
+    )
     assert {path.name for path in (tmp_path / "run").iterdir()} == {"private"}
     said = keyss(*hide, "--min-psnr", 0, "--resume")
     assert said.status == 0
@@ -81,7 +83,18 @@ def test_a_secret_that_comes_back_empty_is_not_published(
 
     monkeypatch.setattr(CarriedSecret, "reveal", empty)
     assert_refused(keyss(*_carry(models, "--min-psnr", 1)), 7, "empty renders")
+    assert_refused(
+        keyss(*_carry(models, "--min-psnr", "nan")), 2, "--min-psnr: expected a number of dB, got nan"
+    )
     assert not (models / "run").exists()
+
+
+def test_what_renders_to_nothing_is_not_hidden(keyss: Run, models: Path) -> None:
+    """Where renders of a tiny model are empty, equal renders prove nothing."""
+    model = read_model(models / "cover.ply")
+    tiny = replace(model, means=model.means * 1e-6, log_scales=model.log_scales - 14)
+    write_model(models / "cover.ply", tiny)
+    assert_refused(keyss(*_carry(models)), 7, "the plain model of the cover shows nothing")
 
 
 @pytest.mark.parametrize(("which", "who"), [("cover.ply", "the cover"), ("secret.ply", "the secret")])

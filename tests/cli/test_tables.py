@@ -93,8 +93,8 @@ class TestNumbers:
 
     def test_what_is_left_of_a_secret_is_said(self) -> None:
         baseline = replace(METRICS.baseline, gaussians=(10, 8406))
-        rows = self.table(replace(METRICS, baseline=baseline, secret_gaussians=(2480,)))
-        assert ["The secret kept 2,480 of 8,406 Gaussians, 31.0 dB."] in rows
+        fewer = replace(METRICS, baseline=baseline, secret_gaussians=(2480,), secret_degrees=((0, 3),))
+        assert ["The secret kept 2,480 of 8,406 Gaussians, SH degree 0 of 3, 31.0 dB."] in self.table(fewer)
 
     def test_a_baseline_of_another_size_has_its_number_of_gaussians_beside_it(self) -> None:
         baseline = replace(METRICS.baseline, gaussians=(152_746, None))

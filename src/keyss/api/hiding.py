@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
@@ -58,6 +59,7 @@ from keyss.runs.records import read_record, record_bytes
 
 MIN_PSNR = 20.0  # dB to the plain model; below it, renders show something else
 MIN_PRUNED_PSNR = 25.0  # the same for secrets that lost Gaussians without a refit
+_EMPTY = 119.0  # of empty renders to the plain model: it shows nothing either
 _BETTER_THAN_NOTHING, _GOOD = 3.0, 40.0  # dB; empty renders of dark or small objects can have a high PSNR
 
 
@@ -74,7 +76,7 @@ def hide(
     skip_missing: bool = False,
     cover_model: PathLike | Gaussians | None = None,
     bound: bool = False,
-    min_psnr: float = MIN_PSNR,
+    min_psnr: float | None = None,
     device: Backend = "auto",
     out: PathLike | None = None,
     overwrite: bool = False,
@@ -103,9 +105,8 @@ def hide(
     files, the PSNR.
 
     At the end the published file is opened with the keys, and rendered beside the plain models. If a PSNR is
-    below `min_psnr` (dB; below 25, for secrets that were pruned without a refit, unless `min_psnr` is below
-    20), or no better than that of empty pictures, nothing is published, and QualityError is raised;
-    checkpoints stay. Of several processes of torchrun the first one writes, measures and reports.
+    below `min_psnr` (dB; by default 20, and 25 for secrets that were pruned without a refit), or no better
+    than that of empty pictures, nothing is published, and QualityError is raised; checkpoints stay. Of several processes of torchrun the first one writes, measures and reports.
     Raises other KeyssErrors too, and Interrupted on Ctrl-C.
     """
     if any(secret.file is not None for secret in secrets):
@@ -121,6 +122,8 @@ def hide(
         raise UsageError(
             f"{out}: expected the name of a folder; the format of the model in it follows from `publish`"
         )
+    if min_psnr is not None and not math.isfinite(min_psnr):
+        raise UsageError(f"`min_psnr`: expected a number of dB, got {min_psnr}")
     chosen, options = method_for(method, secrets)
     if publish or channel:
         options = replace(options, publish=publish or options.publish, channel=channel or options.channel)
@@ -194,8 +197,8 @@ def hide(
                 show(model.to(target), each.model.to(target), each.scene, of_plain=not each.photos)
                 for model, each in zip(read, sources, strict=True)
             ]
-            pruned = [len(model) < len(each.model) for model, each in zip(read, sources, strict=True)]
-            _check_quality(shown, min_psnr, [each and not options.trains for each in pruned])
+            sizes = [(len(model), len(each.model)) for model, each in zip(read, sources, strict=True)]
+            _check_quality(shown, min_psnr, sizes, refits=options.trains, resumable=trains)
         bounds = list(map(Bound.of, options.training(len(sources)), plain_steps))
         longer = _fit_bounds(bounds, sources, stego, options, context) if bound else {}
         if ranks.first:
@@ -287,21 +290,35 @@ def _as_read(stego: Stego, keys: Sequence[str], folder: RunFolder | None) -> lis
     return [model, *(each.reveal(model) for each in opened)]
 
 
-def _check_quality(shown: Sequence[Shown], min_psnr: float, pruned: Sequence[bool]) -> None:
-    """Raise QualityError if the cover or a secret is too far from its plain model."""
-    for index, each in enumerate(_fidelity(shown)):
+def _check_quality(
+    shown: Sequence[Shown],
+    min_psnr: float | None,
+    sizes: Sequence[tuple[int, int]],
+    *,
+    refits: bool,
+    resumable: bool,
+) -> None:
+    """Raise QualityError if the cover or a secret is too far from its plain model.
+
+    `sizes`: Gaussians of each and of its plain model.
+    """
+    again = ", and `resume=True` skips the training that is done" if resumable else ""
+    for index, (each, (count, before)) in enumerate(zip(_fidelity(shown), sizes, strict=True)):
         who = "the cover" if index == 0 else "the secret" if len(shown) == 2 else f"secret {index}"
-        limit = max(min_psnr, MIN_PRUNED_PSNR) if pruned[index] and min_psnr >= MIN_PSNR else min_psnr
+        least = MIN_PRUNED_PSNR if count < before and not refits else MIN_PSNR
+        limit = least if min_psnr is None else min_psnr
+        if each.nothing > _EMPTY and limit > 0:
+            raise QualityError(f"the plain model of {who} shows nothing: its renders are empty")
+        kept = f" with {count:,} of {before:,} Gaussians" if count < before else ""
         if each.psnr < limit:
             raise QualityError(
-                f"{who} is at {each.psnr:.1f} dB PSNR to its plain model, below {limit:g} dB: nothing was "
-                "published; `min_psnr` sets the limit, and `resume=True` skips the training that is done"
+                f"{who}{kept} is at {each.psnr:.1f} dB PSNR to its plain model, below {limit:g} dB: nothing "
+                f"was published; a lower `min_psnr` publishes it{again}"
             )
-        if min_psnr > 0 and each.psnr < min(each.nothing + _BETTER_THAN_NOTHING, _GOOD):
+        if limit > 0 and each.psnr < min(each.nothing + _BETTER_THAN_NOTHING, _GOOD):
             raise QualityError(
-                f"{who} is at {each.psnr:.1f} dB PSNR to its plain model, and empty renders are at "
-                f"{each.nothing:.1f} dB: nothing was published; `min_psnr=0` publishes it anyway, and "
-                "`resume=True` skips the training that is done"
+                f"{who}{kept} is at {each.psnr:.1f} dB PSNR to its plain model, and empty renders are at "
+                f"{each.nothing:.1f} dB: nothing was published; `min_psnr=0` publishes it anyway{again}"
             )
 
 
@@ -349,6 +366,7 @@ def _measured(
 ) -> HideMetrics:
     """The measurements of a hiding."""
     scenes = [each.scene for each in sources]
+    secrets = [each.reveal(stego.gaussians) for each in stego.opened]
     beside_bounds = list(shown)
     for index, model in longer.items():
         scene = scenes[index]
@@ -369,7 +387,11 @@ def _measured(
         method=options.method,
         gaussians=len(stego.gaussians),
         photos=tuple(each.photos for each in sources),
-        secret_gaussians=tuple(len(each.reveal(stego.gaussians)) for each in stego.opened),
+        secret_gaussians=tuple(map(len, secrets)),
+        secret_degrees=tuple(
+            (each.sh_degree, source.model.sh_degree)
+            for each, source in zip(secrets, sources[1:], strict=True)
+        ),
         iterations=stego.iterations,
         steps=tuple(each.steps for each in bounds),
         seconds=round(time.monotonic() - began, 1),

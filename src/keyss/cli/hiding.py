@@ -51,13 +51,13 @@ class Details:
         optional("FILE", "Plain 3DGS model of a secret of photos, one for each secret.", "fitted"),
     ] = ()
     min_psnr: Annotated[
-        float,
-        arg(
-            metavar="DB",
-            help="Fail if cover or secret is further from its plain model than this. Pruned secrets need "
-            "25 dB, unless this is below 20.",
+        float | None,
+        optional(
+            "DB",
+            "Fail if cover or secret is further from its plain model than this.",
+            "20, and 25 for secrets that were pruned without a refit",
         ),
-    ] = 20.0
+    ] = None
     bound: Annotated[
         bool,
         switch("Also fit plain 3DGS of as many Gaussians and steps to compare with; takes twice as long."),

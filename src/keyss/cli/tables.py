@@ -165,12 +165,14 @@ def _explanations(metrics: HideMetrics, names: Sequence[str], heads: Sequence[st
         names[1:],
         metrics.secret_gaussians,
         metrics.baseline.gaussians[1:],
+        metrics.secret_degrees or [(0, 0)] * len(metrics.secrets),
         metrics.against_plain[1:],
         strict=True,
     )
-    for name, count, before, each in kept:
+    for name, count, before, (degree, full), each in kept:
         of = f" of {before:,}" if before and before >= count else ""
-        lines.append(f"The {name} kept {count:,}{of} Gaussians, {each.psnr:.1f} dB.")
+        cut = f", SH degree {degree} of {full}" if degree < full else ""
+        lines.append(f"The {name} kept {count:,}{of} Gaussians{cut}, {each.psnr:.1f} dB.")
     return lines
 
 

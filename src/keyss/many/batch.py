@@ -160,7 +160,7 @@ def hide_batch(
     width: int | None = None,
     background: tuple[float, float, float] | None = None,
     skip_missing: bool = False,
-    min_psnr: float = 20.0,
+    min_psnr: float | None = None,
     device: Backend = "auto",
     jobs: int | None = None,
     ray: str | None = None,

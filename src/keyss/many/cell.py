@@ -58,7 +58,7 @@ class Cell:
     method: str = ""
     options: dict[str, Any]  # all of the method's, or of the fit
     views: ViewOptions = field(default_factory=ViewOptions)
-    min_psnr: float = 0.0
+    min_psnr: float | None = 0.0
     bound: bool = False
     device: str = "auto"
     measures: tuple[str, ...] = ()  # beyond those of `keyss hide`

@@ -77,6 +77,7 @@ class HideMetrics(HidingQuality):
     gaussians: int  # of the stego model
     photos: tuple[bool, ...]  # of the cover and the secrets; False: test views are renders of a given model
     secret_gaussians: tuple[int, ...]  # of the revealed secrets
+    secret_degrees: tuple[tuple[int, int], ...] = ()  # SH degrees of them, and of their plain models
     iterations: int  # of the method's own training, 0 without one
     # Training steps of the cover and of each secret, those of the plain model included if it was trained on;
     # None: unknown, since the plain model was given.

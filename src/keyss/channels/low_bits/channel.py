@@ -75,7 +75,7 @@ class LowBits(Channel):
             if stale >= SALTS_TRIED:
                 raise UsageError(
                     f"{stale} of the {len(rows)} salts of this cover cannot be renewed, and whoever made it "
-                    'could try keys in advance; choose another cover, or `publish="any"`'
+                    "could try keys in advance"
                 )
             found = self._found[cover] = versions, usable, names, rows
         return LowBitsCover(cover, layout, *found[1:])

@@ -33,6 +33,7 @@ from keyss.methods.records.whole import encode
 from keyss.rendering.difference import Viewpoints
 
 _BITS_PER_GAUSSIAN = 160  # of the payload of a secret that is not fitted yet
+_DRAWS = 3  # of new low bits: in covers of few bits, one in five has stale salts or bits that seem not random
 _TINY = 16  # Gaussians; a secret is not cut down to fewer
 _ANY = '`publish="any"` has room for all'
 
@@ -273,13 +274,16 @@ def _ways(cover: Gaussians | None, options: CarryOptions) -> str:
     entropy = os.urandom(32)
     degrees = [degree for degree in (1, 2) if degree > options.fit.sh_degree]
     for degree in (None, *degrees):
-        for dither in (False, True):
+        for dither in (False, True)[options.dither :]:
+            if degree is None and dither == options.dither:
+                continue  # what was refused
             changed = options if degree is None else options.with_fit(sh_degree=degree)
             try:
-                RecordRoom._of(cover, replace(changed, dither=dither or options.dither), entropy)
+                RecordRoom._of(cover, replace(changed, dither=dither), entropy)
             except UsageError:
                 continue
-            changes = [f"sh_degree={degree}"] * (degree is not None) + ["dither=True"] * dither
+            changes = [f"sh_degree={degree}"] * (degree is not None)
+            changes += ["dither=True"] * (dither and not options.dither)
             return f"`{', '.join(changes)}` makes room, {_ANY}"
     return _ANY
 
@@ -288,14 +292,22 @@ def _prepared(cover: Gaussians, entropy: bytes | None) -> LowBitsCover:
     """The cover as it is, or dithered from `entropy`. Raises UsageError for low bits that are not random."""
     try:
         return LOW_BITS.prepare(cover)
-    except UsageError:
+    except UsageError as error:
         if entropy is None:
             raise
-    cover = dither_model(cover, entropy)
-    try:
-        return LOW_BITS.prepare(cover)
-    except UsageError:
-        return LOW_BITS.prepare(loosened(cover, usable_carriers(cover), entropy))
+        refused = error
+    for draw in range(_DRAWS):
+        noise = expand(entropy, f"carry/draw/{draw}", 32)
+        dithered = dither_model(cover, noise)
+        try:
+            return LOW_BITS.prepare(dithered)
+        except UsageError:
+            pass
+        try:
+            return LOW_BITS.prepare(loosened(dithered, usable_carriers(dithered), noise))
+        except UsageError as error:
+            refused = error
+    raise refused
 
 
 def of_degree(model: Gaussians, sh_degree: int, entropy: bytes) -> Gaussians:
