@@ -97,7 +97,7 @@ def test_nothing_that_is_written_or_said_holds_the_key(
 
 def test_no_command_takes_a_key_as_an_argument() -> None:
     asked = [(name, []) for name in commands.MODULES] + [
-        ("hide", ["--method", name, "-o", "out"]) for name in registry.METHODS
+        ("hide", ["--method", name, "--help"]) for name in registry.METHODS
     ]
     for name, arguments in asked:
         options = entry.options_of(commands.to_parse(name, arguments))
@@ -106,7 +106,7 @@ def test_no_command_takes_a_key_as_an_argument() -> None:
             assert "Path" in str(keys[name]), name
 
 
-@pytest.mark.parametrize("option", [["--key", KEY], [f"--key={KEY}"], ["--password", KEY]])
+@pytest.mark.parametrize("option", [["--key", KEY], [f"--key={KEY}"], ["-k", KEY]])
 @pytest.mark.parametrize("command", [["reveal", "stego.ply", "-o", "out.ply"], ["hide", "-o", "out"]])
 def test_a_key_among_the_arguments_is_refused_and_not_repeated(
     capsys: pytest.CaptureFixture[str], command: list[str], option: list[str]

@@ -9,7 +9,7 @@ from .audits.run import audit as audit
 from .core import Gaussians as Gaussians, KeyssError as KeyssError, WrongKeyError as WrongKeyError
 from .files import load_scene as load_scene, read_model as read_model, write_model as write_model
 from .fitting import FitConfig as FitConfig
-from .keys import generate_key as generate_key
+from .keys import generate_key as generate_key, read_key as read_key
 from .many.batch import hide_batch as hide_batch
 from .many.comparing import compare as compare
 from .many.reproducing import reproduce as reproduce

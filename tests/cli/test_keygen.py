@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from cli.said import Run, assert_refused, write_key
-from keyss.keys import MasterKey, read_key_file
+from keyss.keys import MasterKey, read_key
 
 MASTER = "q7Rv2LxT9bWm4KzDq7Rv2L"
 
@@ -46,14 +46,14 @@ class TestKeygen:
     ) -> None:
         path = tmp_path / "key.txt"
         said = keyss("keygen", "-o", path)
-        key = read_key_file(path)
+        key = read_key(path)
         assert (said.status, said.err) == (0, "")
         assert str(path) in said.out
         assert key not in said.out
         assert len(key) == 16
         assert path.stat().st_mode & 0o777 == 0o600
         assert_refused(keyss("keygen", "-o", path), 5, "never replaced")
-        assert read_key_file(path) == key
+        assert read_key(path) == key
         path.with_name("link").symlink_to(tmp_path / "elsewhere")
         assert_refused(keyss("keygen", "-o", tmp_path / "link"), 5, "never replaced")
         assert_refused(keyss("keygen", "-o", tmp_path / "none" / "key"), 5, "No such file")

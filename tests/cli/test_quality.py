@@ -20,9 +20,8 @@ def test_below_the_limit_nothing_is_published_and_a_lower_limit_needs_no_trainin
     hide = ["hide", *scenes, "--publish", "any", "-o", tmp_path / "run", *SMALL]
     said = keyss(*hide, "--min-psnr", 90)
     assert said.status == 7
-    assert (
-        "below 90 dB: nothing was published; a lower --min-psnr publishes it, and --resume skips" in said.err
-    )
+    assert "below 90 dB: nothing was published; a lower --min-psnr" in said.err
+    assert "--resume skips the training" in said.err
     assert {path.name for path in (tmp_path / "run").iterdir()} == {"private"}
     said = keyss(*hide, "--min-psnr", 0, "--resume")
     assert said.status == 0
@@ -83,9 +82,7 @@ def test_a_secret_that_comes_back_empty_is_not_published(
 
     monkeypatch.setattr(CarriedSecret, "reveal", empty)
     assert_refused(keyss(*_carry(models, "--min-psnr", 1)), 7, "empty renders")
-    assert_refused(
-        keyss(*_carry(models, "--min-psnr", "nan")), 2, "--min-psnr: expected a number of dB, got nan"
-    )
+    assert_refused(keyss(*_carry(models, "--min-psnr", "nan")), 2, "--min-psnr: expected a number of dB")
     assert not (models / "run").exists()
 
 

@@ -133,7 +133,7 @@ def test_a_split_holds_for_the_photos_that_are_left(tmp_path: Path) -> None:
         ({"w": "12"}, r"Expected `float.*`, got `str` - at `\$\.w`"),
         ({"h": 0}, "image size"),
         ({"h": 9}, "found 12x8"),
-        ({"frames": []}, r"length >= 1 - at `\$\.frames`"),
+        ({"frames": []}, "expected posed frames, found none"),
         ({"frames": {"a": 1}}, r"Expected `array`, got `object` - at `\$\.frames`"),
         ({"frames": None}, "missing required field `frames`"),
         ({"frames": [1]}, r"Expected `object`, got `int` - at `\$\.frames\[0\]`"),

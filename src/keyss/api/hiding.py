@@ -106,7 +106,8 @@ def hide(
 
     At the end the published file is opened with the keys, and rendered beside the plain models. If a PSNR is
     below `min_psnr` (dB; by default 20, and 25 for secrets that were pruned without a refit), or no better
-    than that of empty pictures, nothing is published, and QualityError is raised; checkpoints stay. Of several processes of torchrun the first one writes, measures and reports.
+    than that of empty pictures, nothing is published, and QualityError is raised; checkpoints stay. Of
+    several processes of torchrun the first one writes, measures and reports.
     Raises other KeyssErrors too, and Interrupted on Ctrl-C.
     """
     if any(secret.file is not None for secret in secrets):

@@ -142,18 +142,8 @@ def hide(args: HideArguments) -> None:
     if args.batch.batch is not None:
         _hide_batch(args, args.batch.batch)
         return
-    from keyss.core.errors import UsageError
-
-    if args.cover is None:
-        raise UsageError("no cover: give --cover SCENE, or --batch CSV for many hidings")
-    if only_for_many := given(args.batch):
-        raise UsageError(f"{only_for_many[0]} is for many hidings: give --batch CSV, or leave it out")
-    if args.secret_file:
-        _hide_files(args, args.cover)
-    elif args.secret:
-        _hide_scenes(args, args.cover)
-    else:
-        raise UsageError("no secret: give --secret SCENE or --secret-file FILE, one for each secret")
+    assert args.cover is not None  # see `_check_without_torch`
+    (_hide_files if args.secret_file else _hide_scenes)(args, args.cover)
 
 
 def _hide_scenes(args: HideArguments, cover: Path) -> None:
@@ -388,8 +378,12 @@ def with_options_of_method(arguments: Sequence[str]) -> Callable[..., None]:
 def _check_without_torch(name: str, arguments: Sequence[str]) -> None:
     """Refuse wrong options and missing files before torch is imported, the slowest part of the start.
 
-    Raises InputError, and SystemExit as argument parsers do.
+    Raises UsageError and InputError, and SystemExit as argument parsers do.
     """
+    from keyss.cli.entry import as_flags
+    from keyss.cli.keys import check_number
+    from keyss.core.errors import UsageError
+    from keyss.fitting import FitConfig
     from keyss.methods.registry import METHODS
 
     own = [
@@ -400,6 +394,19 @@ def _check_without_torch(name: str, arguments: Sequence[str]) -> None:
     args = tyro.cli(_arguments_of(name, "", own), prog="keyss hide", args=arguments, config=config)
     check_there(args.cover, args.details.cover_model, args.batch.batch, args.batch.master_key_file)
     check_there(*args.secret, *args.secret_file, *args.key_file, *args.details.secret_model)
+    try:
+        FitConfig(**args.training.schedule())
+    except UsageError as error:
+        raise UsageError(as_flags(str(error), args.training.schedule())) from error
+    if args.batch.batch is not None:
+        return
+    if args.cover is None:
+        raise UsageError("no cover: give --cover SCENE, or --batch CSV for many hidings")
+    if only_for_many := given(args.batch):
+        raise UsageError(f"{only_for_many[0]} is for many hidings: give --batch CSV, or leave it out")
+    if not (secrets := args.secret_file or args.secret):
+        raise UsageError("no secret: give --secret SCENE or --secret-file FILE, one for each secret")
+    check_number(args.key_file, len(secrets))
 
 
 def _parsed_as(kind: type[HideArguments]) -> Callable[..., None]:

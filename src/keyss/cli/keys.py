@@ -11,7 +11,7 @@ from pathlib import Path
 
 from keyss._torchrun import processes
 from keyss.core.errors import UsageError
-from keyss.keys.key_file import normalized_key, read_key_file
+from keyss.keys.key_file import normalized_key, read_key
 
 VARIABLE = "KEYSS_KEY"
 
@@ -22,9 +22,7 @@ def keys(files: Sequence[Path], count: int, *, confirm: bool = False) -> list[st
     `confirm`: prompt twice, for keys to hide with. Raises UsageError if the numbers differ or there is no
     terminal for a prompt, InputError for a file without a key.
     """
-    if files and len(files) != count:
-        expected = "one --key-file" if count == 1 else f"one --key-file for each of {count} secrets"
-        raise UsageError(f"expected {expected}, got {len(files)}")
+    check_number(files, count)
     if files or VARIABLE in os.environ:
         given = given_keys(files)
         if len(given) != count:
@@ -35,6 +33,13 @@ def keys(files: Sequence[Path], count: int, *, confirm: bool = False) -> list[st
     if not sys.stdin.isatty() or processes() > 1:
         raise UsageError(f"no key: give --key-file FILE, set {VARIABLE}, or run in a terminal for a prompt")
     return [_prompted(f"Key {i + 1} of {count}" if count > 1 else "Key", confirm) for i in range(count)]
+
+
+def check_number(files: Sequence[Path], count: int) -> None:
+    """Raise UsageError unless there is a key file for each of `count` secrets, or none at all."""
+    if files and len(files) != count:
+        expected = "one --key-file" if count == 1 else f"one --key-file for each of {count} secrets"
+        raise UsageError(f"expected {expected}, got {len(files)}")
 
 
 def given_keys(files: Sequence[Path]) -> list[str]:
@@ -70,7 +75,7 @@ def warn_of_weak_keys(chosen: Sequence[str]) -> None:
 
 def key_of_file(path: Path) -> str:
     """The key in a file; warns if others can read it. Raises InputError for a file without a key."""
-    key = read_key_file(path)
+    key = read_key(path)
     mode = path.stat().st_mode
     if os.name == "posix" and stat.S_ISREG(mode) and mode & (stat.S_IRGRP | stat.S_IROTH):
         print(

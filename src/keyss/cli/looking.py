@@ -91,10 +91,7 @@ def render(
     example: keyss render stego.ply --wipe secret.ply --cameras SCENE_A --video video.mp4
     """
     check_there(model, cameras)
-    import keyss
-    from keyss.api.looking import frame_count
     from keyss.core.errors import UsageError
-    from keyss.progress import reporter
 
     if video is not None and (out is not None or split != "test"):
         raise UsageError("--video writes no images: leave out -o and --split")
@@ -102,6 +99,11 @@ def render(
         raise UsageError("images need --cameras SCENE and -o FOLDER; a video needs --video FILE")
     if video is None and (wipe is not None or seconds != 8.0):
         raise UsageError("--wipe and --seconds are for videos: give --video FILE")
+
+    import keyss
+    from keyss.api.looking import frame_count
+    from keyss.progress import reporter
+
     film: dict[str, Any] = {"video": video, "wipe": wipe, "seconds": seconds, "reporter": reporter()}
     images = keyss.render(
         model, cameras, split=split, **vars(photos), **film, device=device, out=out, overwrite=overwrite

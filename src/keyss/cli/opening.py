@@ -47,13 +47,14 @@ def reveal(
     check_there(stego, handed, *key_file)
     import keyss
     from keyss.cli.keys import keys
-    from keyss.files.reading import is_standard
-    from keyss.progress import waiting
-    from keyss.runs.revealing import is_sealed
 
     key: str | None = None
-    if handed is None or key_file or is_sealed(handed):
+    if handed is None or key_file or _is_sealed(handed):
         (key,) = keys(key_file, 1)
+
+    from keyss.files.reading import is_standard
+    from keyss.progress import waiting
+
     with waiting(f"opening {stego.name}"):
         revealed = keyss.reveal(
             stego,
@@ -72,6 +73,12 @@ def reveal(
     remains = revealed.remains
     of = f" of {remains.hidden:,}" if remains.hidden else ""
     print(f"{out}: {remains.found:,}{of} Gaussians", file=sys.stderr if is_standard(out) else sys.stdout)
+
+
+def _is_sealed(handed: Path) -> bool:
+    from keyss.runs.revealing import is_sealed  # imports torch
+
+    return is_sealed(handed)
 
 
 def verify(

@@ -62,7 +62,7 @@ class _Frame(_Intrinsics, kw_only=True):
 
 
 class _Transforms(_Intrinsics, kw_only=True):
-    frames: Annotated[list[_Frame], msgspec.Meta(min_length=1)]
+    frames: list[_Frame]
     ply_file_path: str | None = None
     train_filenames: list[str] | None = None
     test_filenames: list[str] | None = None
@@ -120,6 +120,8 @@ def _read(path: Path, skip_missing: bool) -> _Posed:
         meta = msgspec.json.decode(read_text(path, _MAX_JSON_BYTES), type=_Transforms)
     except (msgspec.MsgspecError, RecursionError) as error:
         raise InputError(f"{path}: expected JSON with posed frames: {error}") from error
+    if not meta.frames:
+        raise InputError(f"{path}: expected posed frames, found none")
     names = [_image_name(path, frame.file_path) for frame in meta.frames]
     missing = {name for name in names if not (path.parent / name).exists()}
     leave_out_missing(path, len(names), sorted(missing), skip_missing)

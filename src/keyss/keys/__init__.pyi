@@ -4,7 +4,7 @@ from .key_file import (
     generate_key as generate_key,
     length_for as length_for,
     normalized_key as normalized_key,
-    read_key_file as read_key_file,
+    read_key as read_key,
 )
 from .master import MasterKey as MasterKey
 from .strength import ENOUGH_BITS as ENOUGH_BITS, key_strength_bits as key_strength_bits, weakness as weakness

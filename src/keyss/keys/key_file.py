@@ -35,8 +35,9 @@ def normalized_key(text: str) -> str:
     return key
 
 
-def read_key_file(path: Path) -> str:
-    """The key in a file. Raises InputError for a file without a key."""
+def read_key(path: str | Path) -> str:
+    """The key in a file, as the command line reads it. Raises InputError for a file without a key."""
+    path = Path(path)
     try:
         with path.open("rb") as file:
             data = file.read(2 * MAX_KEY_BYTES)

@@ -31,7 +31,7 @@ from keyss.core.scene import ViewOptions
 from keyss.files.atomic import write_bytes
 from keyss.files.reading import read_text
 from keyss.keys.derivation import SALT_BYTES, DerivedKey
-from keyss.keys.key_file import read_key_file
+from keyss.keys.key_file import read_key
 from keyss.many.cell import CELL, RESULT, Cell
 from keyss.many.running import CELLS, RETRIES, ManyResult, Outcome, claimed, run_cells, settle_master_key
 from keyss.many.tables import csv_bytes
@@ -180,7 +180,7 @@ def hide_batch(
     master = None if master_key_file is None else Path(master_key_file).absolute()
     assets, out = read_assets(Path(manifest), master=master is not None), Path(out)
     if master is not None:
-        read_key_file(master)
+        read_key(master)
     covers = Counter(os.path.realpath(asset.cover) for asset in assets if is_model(asset.cover))
     if again := [cover for cover, times in covers.items() if times > 1]:
         warnings.warn(
@@ -231,7 +231,7 @@ def _cell(
         **common,
     )
     identity = cell.identity
-    check = "" if asset.key_file is None else _key_check(read_key_file(asset.key_file), identity)
+    check = "" if asset.key_file is None else _key_check(read_key(asset.key_file), identity)
     cell = replace(cell, id=f"{identity}{check}")
     try:
         there = place.is_file() or (place.is_dir() and any(place.iterdir()))

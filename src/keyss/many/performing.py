@@ -18,7 +18,7 @@ from keyss.api.hiding import hide
 from keyss.audits import PARTS, audit
 from keyss.core.errors import InputError, UsageError
 from keyss.fitting.config import FitConfig
-from keyss.keys.key_file import read_key_file
+from keyss.keys.key_file import read_key
 from keyss.keys.master import MasterKey
 from keyss.many.cell import RUN, Cell, Result, error_of, result_of
 from keyss.many.measures import MEASURES, Subject
@@ -94,8 +94,8 @@ def keys_of(cell: Cell) -> list[str]:
     if cell.secrets and not registry.get(cell.method).capabilities.keys:
         return [""] * len(cell.secrets)
     if cell.master_key_file is None:
-        return [read_key_file(Path(each)) for each in cell.key_files]
-    master = MasterKey(read_key_file(Path(cell.master_key_file)))
+        return [read_key(Path(each)) for each in cell.key_files]
+    master = MasterKey(read_key(Path(cell.master_key_file)))
     return [master.key_of(each) for each in cell.key_names]
 
 

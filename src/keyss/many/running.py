@@ -19,7 +19,7 @@ from keyss._processes import how_it_ended
 from keyss.core.errors import KeyssError, OutputError
 from keyss.files.atomic import lock, write_bytes
 from keyss.fitting.config import FitConfig
-from keyss.keys.key_file import KEY_LENGTH, generate_key, read_key_file
+from keyss.keys.key_file import KEY_LENGTH, generate_key, read_key
 from keyss.keys.master import MasterKey
 from keyss.many.cell import CELL, FAILED, LOG, Cell, Result, error_of, model_of, result_of
 from keyss.many.engines import Cluster, Engine, InThisProcess, Processes, Resources
@@ -87,11 +87,11 @@ def settle_master_key(out: Path, given: Path | None) -> None:
     own = out / MASTER_KEY
     if given is None and not own.exists():
         write_bytes(own, f"{generate_key(KEY_LENGTH)}\n".encode())
-    check = MasterKey(read_key_file(given or own)).check()
+    check = MasterKey(read_key(given or own)).check()
     kept = out / _CHECK
     if not kept.exists():
         write_bytes(kept, check.encode())
-    elif read_key_file(kept) != check:
+    elif read_key(kept) != check:
         raise OutputError(
             f"{out} holds results with keys of another master key: give the same `master_key_file`, or "
             "choose another folder"

@@ -36,7 +36,7 @@ from keyss.core.errors import InputError, KeyssError, did_you_mean, import_extra
 from keyss.core.scene import ViewOptions
 from keyss.files.reading import read_text
 from keyss.fitting.config import MAX_SEED, PRESETS, FitConfig
-from keyss.keys.key_file import read_key_file
+from keyss.keys.key_file import read_key
 from keyss.many.running import RETRIES, CellFolder, Forecast, ManyResult, Outcome
 from keyss.many.tables import CellNumbers, write_tables
 from keyss.methods import registry
@@ -256,7 +256,7 @@ def sweep(
     found = read_spec(path)
     master = None if master_key_file is None else Path(master_key_file).absolute()
     if master is not None:
-        read_key_file(master)
+        read_key(master)
     folder = CellFolder(Path(out), master, found.common)
     rows = _rows(path, found, folder)
     if dry_run:

@@ -279,8 +279,10 @@ def _ways(cover: Gaussians | None, options: CarryOptions) -> str:
                 continue  # what was refused
             changed = options if degree is None else options.with_fit(sh_degree=degree)
             try:
-                RecordRoom._of(cover, replace(changed, dither=dither), entropy)
+                room = RecordRoom._of(cover, replace(changed, dither=dither), entropy)
             except UsageError:
+                continue
+            if not room.room.carriers:
                 continue
             changes = [f"sh_degree={degree}"] * (degree is not None)
             changes += ["dither=True"] * (dither and not options.dither)
