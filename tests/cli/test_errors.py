@@ -270,11 +270,8 @@ sys.exit("torch was imported" if "torch" in sys.modules else status)
         ),
         *((f"{each} nowhere", 4) for each in ("verify", "evaluate", "audit", "info")),
         ("convert nowhere x.ply", 4),
-        ("hide --cover . -o x", 2),
-        ("hide --cover . --secret . --secret . --key-file . -o x", 2),
         ("hide --cover . --secret . --seed -1 -o x", 2),
-        ("render . -o x", 2),
-        ("reveal . -o x.ply", 2),
+        *((f"{each} . -o x", 2) for each in ("render", "reveal", "hide --cover")),
         ("compare --cover nowhere --secret nowhere -o x", 4),
     ],
 )

@@ -59,8 +59,8 @@ from keyss.runs.records import read_record, record_bytes
 
 MIN_PSNR = 20.0  # dB to the plain model; below it, renders show something else
 MIN_PRUNED_PSNR = 25.0  # the same for secrets that lost Gaussians without a refit
-_EMPTY = 119.0  # of empty renders to the plain model: it shows nothing either
-_BETTER_THAN_NOTHING, _GOOD = 3.0, 40.0  # dB; empty renders of dark or small objects can have a high PSNR
+# dB; empty renders of dark or small objects can have a high PSNR, and of invisible ones the highest
+_BETTER_THAN_NOTHING, _GOOD, _EMPTY = 3.0, 40.0, 119.0
 
 
 @together
@@ -199,7 +199,8 @@ def hide(
                 for model, each in zip(read, sources, strict=True)
             ]
             sizes = [(len(model), len(each.model)) for model, each in zip(read, sources, strict=True)]
-            _check_quality(shown, min_psnr, sizes, refits=options.trains, resumable=trains)
+            again = ", and `resume=True` skips the training that is done" * trains
+            _check_quality(shown, min_psnr, sizes, options.trains, again)
         bounds = list(map(Bound.of, options.training(len(sources)), plain_steps))
         longer = _fit_bounds(bounds, sources, stego, options, context) if bound else {}
         if ranks.first:
@@ -292,34 +293,28 @@ def _as_read(stego: Stego, keys: Sequence[str], folder: RunFolder | None) -> lis
 
 
 def _check_quality(
-    shown: Sequence[Shown],
-    min_psnr: float | None,
-    sizes: Sequence[tuple[int, int]],
-    *,
-    refits: bool,
-    resumable: bool,
+    shown: Sequence[Shown], min_psnr: float | None, sizes: Sequence[tuple[int, int]], refits: bool, again: str
 ) -> None:
     """Raise QualityError if the cover or a secret is too far from its plain model.
 
-    `sizes`: Gaussians of each and of its plain model.
+    `sizes`: Gaussians of each and of its plain model. `again`: of the message, what `resume` does.
     """
-    again = ", and `resume=True` skips the training that is done" if resumable else ""
     for index, (each, (count, before)) in enumerate(zip(_fidelity(shown), sizes, strict=True)):
         who = "the cover" if index == 0 else "the secret" if len(shown) == 2 else f"secret {index}"
         least = MIN_PRUNED_PSNR if count < before and not refits else MIN_PSNR
         limit = least if min_psnr is None else min_psnr
-        if each.nothing > _EMPTY and limit > 0:
-            raise QualityError(f"the plain model of {who} shows nothing: its renders are empty")
         kept = f" with {count:,} of {before:,} Gaussians" if count < before else ""
+        found = f"{who}{kept} is at {each.psnr:.1f} dB PSNR to its plain model"
         if each.psnr < limit:
             raise QualityError(
-                f"{who}{kept} is at {each.psnr:.1f} dB PSNR to its plain model, below {limit:g} dB: nothing "
-                f"was published; a lower `min_psnr` publishes it{again}"
+                f"{found}, below {limit:g} dB: nothing was published; a lower `min_psnr` publishes it{again}"
             )
-        if limit > 0 and each.psnr < min(each.nothing + _BETTER_THAN_NOTHING, _GOOD):
+        if limit > 0 and (
+            each.psnr < min(each.nothing + _BETTER_THAN_NOTHING, _GOOD) or each.nothing > _EMPTY
+        ):
             raise QualityError(
-                f"{who}{kept} is at {each.psnr:.1f} dB PSNR to its plain model, and empty renders are at "
-                f"{each.nothing:.1f} dB: nothing was published; `min_psnr=0` publishes it anyway{again}"
+                f"{found}, and empty renders are at {each.nothing:.1f} dB: nothing was published; "
+                f"`min_psnr=0` publishes it anyway{again}"
             )
 
 

@@ -33,8 +33,7 @@ OUT_OF_MEMORY = 8
 INTERNAL_ERROR = 70  # EX_SOFTWARE
 NO_ROOM = OutputError.exit_status
 _LEVELS = {"-q": -1, "--quiet": -1, "-v": 1, "--verbose": 1}
-# That people may expect.
-_KEY_OPTIONS = ("-k", "-p", "--key", "--keys", "--pass", "--password", "--passphrase")
+_KEY_OPTIONS = ("-k", "-p", "--key", "--keys", "--password", "--passphrase")  # that people may expect
 # Between backticks: `overwrite=True`, `method="carry", dither=True`, `sh_degree`.
 _VALUE = r"""(?:"[^"`]*"|'[^'`]*'|[\w.+-]+)"""
 _ASSIGNMENT = rf"([A-Za-z_]\w*)=({_VALUE})"

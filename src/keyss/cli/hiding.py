@@ -381,7 +381,6 @@ def _check_without_torch(name: str, arguments: Sequence[str]) -> None:
     Raises UsageError and InputError, and SystemExit as argument parsers do.
     """
     from keyss.cli.entry import as_flags
-    from keyss.cli.keys import check_number
     from keyss.core.errors import UsageError
     from keyss.fitting import FitConfig
     from keyss.methods.registry import METHODS
@@ -404,9 +403,8 @@ def _check_without_torch(name: str, arguments: Sequence[str]) -> None:
         raise UsageError("no cover: give --cover SCENE, or --batch CSV for many hidings")
     if only_for_many := given(args.batch):
         raise UsageError(f"{only_for_many[0]} is for many hidings: give --batch CSV, or leave it out")
-    if not (secrets := args.secret_file or args.secret):
+    if not (args.secret_file or args.secret):
         raise UsageError("no secret: give --secret SCENE or --secret-file FILE, one for each secret")
-    check_number(args.key_file, len(secrets))
 
 
 def _parsed_as(kind: type[HideArguments]) -> Callable[..., None]:

@@ -22,7 +22,9 @@ def keys(files: Sequence[Path], count: int, *, confirm: bool = False) -> list[st
     `confirm`: prompt twice, for keys to hide with. Raises UsageError if the numbers differ or there is no
     terminal for a prompt, InputError for a file without a key.
     """
-    check_number(files, count)
+    if files and len(files) != count:
+        expected = "one --key-file" if count == 1 else f"one --key-file for each of {count} secrets"
+        raise UsageError(f"expected {expected}, got {len(files)}")
     if files or VARIABLE in os.environ:
         given = given_keys(files)
         if len(given) != count:
@@ -33,13 +35,6 @@ def keys(files: Sequence[Path], count: int, *, confirm: bool = False) -> list[st
     if not sys.stdin.isatty() or processes() > 1:
         raise UsageError(f"no key: give --key-file FILE, set {VARIABLE}, or run in a terminal for a prompt")
     return [_prompted(f"Key {i + 1} of {count}" if count > 1 else "Key", confirm) for i in range(count)]
-
-
-def check_number(files: Sequence[Path], count: int) -> None:
-    """Raise UsageError unless there is a key file for each of `count` secrets, or none at all."""
-    if files and len(files) != count:
-        expected = "one --key-file" if count == 1 else f"one --key-file for each of {count} secrets"
-        raise UsageError(f"expected {expected}, got {len(files)}")
 
 
 def given_keys(files: Sequence[Path]) -> list[str]:

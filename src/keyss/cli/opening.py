@@ -49,9 +49,10 @@ def reveal(
     from keyss.cli.keys import keys
 
     key: str | None = None
-    if handed is None or key_file or _is_sealed(handed):
+    if handed is not None:
+        from keyss.runs.revealing import is_sealed  # imports torch
+    if handed is None or key_file or is_sealed(handed):
         (key,) = keys(key_file, 1)
-
     from keyss.files.reading import is_standard
     from keyss.progress import waiting
 
@@ -73,12 +74,6 @@ def reveal(
     remains = revealed.remains
     of = f" of {remains.hidden:,}" if remains.hidden else ""
     print(f"{out}: {remains.found:,}{of} Gaussians", file=sys.stderr if is_standard(out) else sys.stdout)
-
-
-def _is_sealed(handed: Path) -> bool:
-    from keyss.runs.revealing import is_sealed  # imports torch
-
-    return is_sealed(handed)
 
 
 def verify(

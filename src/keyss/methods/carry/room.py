@@ -274,19 +274,17 @@ def _ways(cover: Gaussians | None, options: CarryOptions) -> str:
     entropy = os.urandom(32)
     degrees = [degree for degree in (1, 2) if degree > options.fit.sh_degree]
     for degree in (None, *degrees):
-        for dither in (False, True)[options.dither :]:
-            if degree is None and dither == options.dither:
+        for dither in (False, True):
+            if degree is None and dither <= options.dither:
                 continue  # what was refused
             changed = options if degree is None else options.with_fit(sh_degree=degree)
             try:
-                room = RecordRoom._of(cover, replace(changed, dither=dither), entropy)
+                room = RecordRoom._of(cover, replace(changed, dither=dither or options.dither), entropy)
             except UsageError:
                 continue
-            if not room.room.carriers:
-                continue
-            changes = [f"sh_degree={degree}"] * (degree is not None)
-            changes += ["dither=True"] * (dither and not options.dither)
-            return f"`{', '.join(changes)}` makes room, {_ANY}"
+            if room.room.carriers:
+                changes = [f"sh_degree={degree}"] * (degree is not None) + ["dither=True"] * dither
+                return f"`{', '.join(changes)}` makes room, {_ANY}"
     return _ANY
 
 
