@@ -99,7 +99,6 @@ def render(
         raise UsageError("images need --cameras SCENE and -o FOLDER; a video needs --video FILE")
     if video is None and (wipe is not None or seconds != 8.0):
         raise UsageError("--wipe and --seconds are for videos: give --video FILE")
-
     import keyss
     from keyss.api.looking import frame_count
     from keyss.progress import reporter
