@@ -20,7 +20,7 @@ import zstandard
 from PIL import Image
 
 from files.formats.examples import model_of
-from keyss.core import InputError
+from keyss.core import Gaussians, InputError
 from keyss.files import model_bytes, model_of_bytes, read_model, write_model
 from keyss.files.formats.spz import SpzCodes
 from mutations import attempt, damaged, examples
@@ -79,6 +79,12 @@ def test_counts_that_are_too_large(count: int) -> None:
     refused(
         "a.glb", with_json(lambda gltf: gltf["accessors"][0].update(count=count)), "exceeds its buffer view"
     )
+
+
+@pytest.mark.parametrize(("count", "size"), [(140_000, 0), (500_000, 900_000)])
+def test_counts_that_few_bytes_hold(count: int, size: int) -> None:
+    """Zeros compress to next to nothing, and a file may be padded."""
+    refused("a.spz", legacy_spz(count, bytes(20 * count)).ljust(size, b"\0"), "it announces")
 
 
 def test_no_gaussians_at_all() -> None:
@@ -215,8 +221,8 @@ def test_scales_of_zero_and_below() -> None:
 # --- glTF ------------------------------------------------------------------------------------------------
 
 
-def with_json(change: Callable[[dict], object]) -> bytes:
-    data = model_bytes("a.glb", MODEL)
+def with_json(change: Callable[[dict], object], model: Gaussians = MODEL) -> bytes:
+    data = model_bytes("a.glb", model)
     (size,) = struct.unpack_from("<I", data, 12)
     document = json.loads(data[20 : 20 + size])
     change(document)
@@ -257,6 +263,16 @@ def test_a_gltf_that_repeats_its_gaussians() -> None:
     refused("a.glb", with_json(change), "over and over", limit=32 * MEGABYTE)
 
 
+def test_a_gltf_whose_attributes_are_the_same_bytes() -> None:
+    def change(gltf: dict) -> None:
+        size = gltf["buffers"][0]["byteLength"]
+        gltf["bufferViews"] = [{"buffer": 0, "byteLength": size}]
+        for each in gltf["accessors"]:
+            each |= {"bufferView": 0, "count": size // 16, "componentType": 5121, "normalized": True}
+
+    refused("a.glb", with_json(change, model_of(60, 3)), "over and over")
+
+
 def test_nodes_move_gaussians() -> None:
     def change(gltf: dict) -> None:
         gltf["nodes"] = [{"children": [1], "translation": [1, 2, 3]}, {"mesh": 0, "scale": [2, 2, 2]}]
@@ -278,7 +294,7 @@ def test_deep_json_is_no_problem(tmp_path: Path) -> None:
 
 
 def test_a_large_sparse_model_is_believed(tmp_path: Path) -> None:
-    """Up to 262,144 equal Gaussians may be compressed to any size."""
+    """Up to 131,072 equal Gaussians may be compressed to any size."""
     model = MODEL[torch.zeros(100_000, dtype=torch.long)]
     write_model(tmp_path / "a.spz", replace(model))
     assert len(read_model(tmp_path / "a.spz")) == 100_000
