@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,11 +15,13 @@ from fitting.test_plain import InterruptAt
 from keyss import CarryOptions, FitConfig, Gaussians, KeyssOptions, Secret
 from keyss.channels import is_appended
 from keyss.core import Interrupted, OutputError
+from keyss.keys import derivation
 from keyss.methods import MethodOptions
 from tiny_scenes import tiny_scene
 
 FIT = FitConfig(iterations=20, max_gaussians=300, grow_start=0.2, grow_every=5, evaluate_every=0)
 KEY = "a key of many characters: 93hXmQ2"
+JOINT = KeyssOptions(design="mlp", fit=FIT, hidden=(8, 8), branch=8)
 METHODS = [CarryOptions(fit=FIT, publish="any", refit="always"), CarryOptions(fit=FIT)]
 
 
@@ -52,6 +55,28 @@ def test_two_hidings_of_the_same_inputs_have_no_rotation_in_common(options: Meth
 def test_hidings_with_one_seed_have_all_rotations_in_common() -> None:
     one, two = (_rotations(_hidden(METHODS[1].with_fit(seed=7))) for _ in range(2))
     assert one == two
+
+
+@pytest.mark.filterwarnings("ignore:.*appended Gaussians")
+@pytest.mark.parametrize("options", [METHODS[1], JOINT], ids=["carry", "keyss"])
+def test_hidings_with_one_seed_have_no_salt_in_common(
+    options: MethodOptions, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Else one table of Argon2id, made in advance, would serve all files of that seed and cover."""
+    salts: list[set[bytes]] = []
+    argon2id = derivation.hash_secret_raw
+
+    def noted(secret: bytes, salt: bytes, **costs: Any) -> bytes:
+        salts[-1].add(salt)
+        return argon2id(secret, salt, **costs)
+
+    monkeypatch.setattr(derivation, "hash_secret_raw", noted)
+    for scene in (1, 2):
+        salts.append(set())
+        secret = Secret(tiny_scene(scene), KEY)
+        keyss.hide(tiny_scene(0), [secret], method=options.with_fit(seed=7), min_psnr=0)
+    assert salts[0]
+    assert not salts[0] & salts[1]
 
 
 def test_two_fits_have_no_rotation_in_common() -> None:
@@ -88,17 +113,16 @@ def test_a_resumed_fit_keeps_its_seed(tmp_path: Path, given: int | None) -> None
 @pytest.mark.parametrize("stage", ["plain model", "hide"])
 def test_a_resumed_hiding_keeps_its_seed(tmp_path: Path, stage: str) -> None:
     """The files are equal to those of an uninterrupted run, to the byte."""
-    joint = KeyssOptions(design="mlp", fit=FIT, hidden=(8, 8), branch=8)
     scenes, run = (tiny_scene(0), [Secret(tiny_scene(1), KEY)]), tmp_path / "run"
     with pytest.raises(Interrupted):
-        keyss.hide(*scenes, method=joint, min_psnr=0, out=run, reporter=InterruptAt(10, stage))
+        keyss.hide(*scenes, method=JOINT, min_psnr=0, out=run, reporter=InterruptAt(10, stage))
     seed = _interrupted_seed(run, "options", "fit", "seed")
-    keyss.hide(*scenes, method=joint, min_psnr=0, out=run, resume=True)
+    keyss.hide(*scenes, method=JOINT, min_psnr=0, out=run, resume=True)
     metrics, config = (
         json.loads((run / "private" / f"{name}.json").read_text()) for name in ("metrics", "config")
     )
     assert metrics["seed"] == config["options"]["fit"]["seed"] == seed
-    whole = replace(joint, fit=replace(joint.fit, seed=seed))
+    whole = replace(JOINT, fit=replace(JOINT.fit, seed=seed))
     keyss.hide(*scenes, method=whole, min_psnr=0, out=tmp_path / "whole")
     for name in ("publish/stego.ply", "private/cover.ply", "private/secret-1.ply"):
         assert (run / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
