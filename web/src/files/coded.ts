@@ -3,8 +3,7 @@
 export const SH_C0 = 0.28209479177387814;
 const OPACITY_LOGIT_BOUND = 16;
 const MIN_SCALE = 2 ** -126;
-const SMALL_COUNT = 1 << 17;
-const LEAST_BYTES = 6; // of each Gaussian in larger files
+const [SMALL_COUNT, LEAST_BYTES] = [1 << 17, 6]; // so many bytes of each Gaussian where there are more
 
 /** Gaussians that `size` packed bytes can hold at most. */
 export function mostHeld(size: number): number {

@@ -5,11 +5,9 @@ import { damaged, InputError } from '../core/errors.ts';
 import { coefficients, emptyGaussians, type Gaussians } from '../core/gaussians.ts';
 import { fromSmallestThree, holds, logit, mostHeld } from './coded.ts';
 
-const LEGACY_BYTES = 16;
-const HEADER_BYTES = 32;
+const [LEGACY_BYTES, HEADER_BYTES] = [16, 32];
 const MAX_EXTENSION_BYTES = 1 << 20;
-const MAX_UNPACKED = 2 ** 31;
-const GAUSSIAN_BYTES = 65; // unpacked, at most
+const [MAX_UNPACKED, GAUSSIAN_BYTES] = [2 ** 31, 65];
 const MAGNITUDE = 511;
 // Signs of the harmonics of degrees 1 to 3 where y and z change theirs: SPZ has y up, a .ply y down.
 const SH_SIGNS = [-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1];
