@@ -93,8 +93,7 @@ def test_no_gaussians_at_all() -> None:
 def test_a_gzip_bomb() -> None:
     bomb = legacy_spz(1000, bytes(200 * MEGABYTE))
     refused("a.spz", bomb, "found more than was announced", limit=20 * MEGABYTE)
-    padded = legacy_spz(140_000, bytes(20 * 140_000)).ljust(800_000, b"\0")
-    refused("a.spz", padded, "it announces 140,000 Gaussians, more than 800,000 bytes hold")
+    refused("a.spz", legacy_spz(140_000, bytes(20 * 140_000)).ljust(800_000, b"\0"), "it announces 140,000")
 
 
 def test_a_zstd_bomb() -> None:
@@ -251,22 +250,19 @@ def test_a_gltf_that_lies(change: Callable[[dict], object], words: str) -> None:
     refused("a.glb", with_json(change), words)
 
 
-def test_a_gltf_that_repeats_its_gaussians() -> None:
-    def change(gltf: dict) -> None:
+def test_a_gltf_that_repeats_its_gaussians_or_their_bytes() -> None:
+    def with_nodes(gltf: dict) -> None:
         gltf["nodes"] = [{"mesh": 0}] * 20_000
         gltf["scenes"][0]["nodes"] = list(range(20_000))
 
-    refused("a.glb", with_json(change), "over and over", limit=32 * MEGABYTE)
-
-
-def test_a_gltf_whose_attributes_are_the_same_bytes() -> None:
-    def change(gltf: dict) -> None:
+    def with_shared_bytes(gltf: dict) -> None:
         size = gltf["buffers"][0]["byteLength"]
         gltf["bufferViews"] = [{"buffer": 0, "byteLength": size}]
         for each in gltf["accessors"]:
             each |= {"bufferView": 0, "count": size // 16, "componentType": 5121, "normalized": True}
 
-    refused("a.glb", with_json(change, model_of(60, 3)), "over and over")
+    refused("a.glb", with_json(with_nodes), "over and over", limit=32 * MEGABYTE)
+    refused("a.glb", with_json(with_shared_bytes, model_of(60, 3)), "over and over")
 
 
 def test_nodes_move_gaussians() -> None:
