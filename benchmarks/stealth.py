@@ -40,6 +40,7 @@ from channels.low_bits.payloads import embed_derived
 from channels.low_bits.trained_like import keys, rounded
 from keyss.core import Gaussians, UsageError
 from keyss.measure import candidate_scores, stealth_statistics
+from keyss.methods.carry.room import CarryOptions, RecordRoom
 from methods.carry import carried
 from stealth_detection import Detection, Examples, confirmed, learned_detectors, single_detectors
 from stealth_predictor import BitPredictor, sample
@@ -152,7 +153,8 @@ def _make(job: Job) -> list[File]:
     if job.rounded:
         cover = rounded(cover, job.index)
     made = [File("plain", job.scene, job.path, cover)]
-    secret = carried.pruned_to_fit(cover, read_model(job.secret))
+    room = RecordRoom.of(cover, CarryOptions().with_fit(sh_degree=cover.sh_degree))
+    (secret,) = room.prune([read_model(job.secret)], [])
     stego = carried.embed_derived(cover, [(keys(2 * job.index), secret)], os.urandom(32))
     made.append(File("carried", job.scene, job.path, stego, job.secret))
     with suppress(UsageError):  # a small model has no room for a payload

@@ -266,11 +266,15 @@ def _key_checks(keys: Sequence[str], settings: RunConfig[MethodOptions]) -> list
 
 
 def _entropy(keys: Sequence[str], options: MethodOptions, plain: Sequence[Gaussians]) -> bytes:
-    """32 bytes that follow from keys, options and models, and that cannot be guessed without the keys."""
-    seed = options.fit.known_seed
-    salt = hashlib.sha256(f"keyss/v1/repeat {seed}".encode()).digest()[:SALT_BYTES]
+    """32 bytes that follow from keys, options and models, and that cannot be guessed without the keys.
+
+    The salt depends on all models, so that no table of keys can be made before the secrets are known.
+    """
+    models = [model.digest().encode() for model in plain]
+    repeated = b" ".join([f"keyss/v1/repeat {options.fit.known_seed}".encode(), *models])
+    salt = hashlib.sha256(repeated).digest()[:SALT_BYTES]
     parts = [DerivedKey.of(key, salt).expand("writer", 32) for key in keys if key]
-    parts += [record_bytes(options), *(model.digest().encode() for model in plain)]
+    parts += [record_bytes(options), *models]
     return hashlib.sha256(b"".join(hashlib.sha256(each).digest() for each in parts)).digest()
 
 

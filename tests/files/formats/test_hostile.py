@@ -20,7 +20,7 @@ import zstandard
 from PIL import Image
 
 from files.formats.examples import model_of
-from keyss.core import InputError
+from keyss.core import Gaussians, InputError
 from keyss.files import model_bytes, model_of_bytes, read_model, write_model
 from keyss.files.formats.spz import SpzCodes
 from mutations import attempt, damaged, examples
@@ -93,6 +93,7 @@ def test_no_gaussians_at_all() -> None:
 def test_a_gzip_bomb() -> None:
     bomb = legacy_spz(1000, bytes(200 * MEGABYTE))
     refused("a.spz", bomb, "found more than was announced", limit=20 * MEGABYTE)
+    refused("a.spz", legacy_spz(140_000, bytes(20 * 140_000)).ljust(800_000, b"\0"), "it announces 140,000")
 
 
 def test_a_zstd_bomb() -> None:
@@ -215,8 +216,8 @@ def test_scales_of_zero_and_below() -> None:
 # --- glTF ------------------------------------------------------------------------------------------------
 
 
-def with_json(change: Callable[[dict], object]) -> bytes:
-    data = model_bytes("a.glb", MODEL)
+def with_json(change: Callable[[dict], object], model: Gaussians = MODEL) -> bytes:
+    data = model_bytes("a.glb", model)
     (size,) = struct.unpack_from("<I", data, 12)
     document = json.loads(data[20 : 20 + size])
     change(document)
@@ -249,12 +250,19 @@ def test_a_gltf_that_lies(change: Callable[[dict], object], words: str) -> None:
     refused("a.glb", with_json(change), words)
 
 
-def test_a_gltf_that_repeats_its_gaussians() -> None:
-    def change(gltf: dict) -> None:
+def test_a_gltf_that_repeats_its_gaussians_or_their_bytes() -> None:
+    def with_nodes(gltf: dict) -> None:
         gltf["nodes"] = [{"mesh": 0}] * 20_000
         gltf["scenes"][0]["nodes"] = list(range(20_000))
 
-    refused("a.glb", with_json(change), "over and over", limit=32 * MEGABYTE)
+    def with_shared_bytes(gltf: dict) -> None:
+        size = gltf["buffers"][0]["byteLength"]
+        gltf["bufferViews"] = [{"buffer": 0, "byteLength": size}]
+        for each in gltf["accessors"]:
+            each |= {"bufferView": 0, "count": size // 16, "componentType": 5121, "normalized": True}
+
+    refused("a.glb", with_json(with_nodes), "over and over", limit=32 * MEGABYTE)
+    refused("a.glb", with_json(with_shared_bytes, model_of(60, 3)), "over and over")
 
 
 def test_nodes_move_gaussians() -> None:
@@ -278,7 +286,7 @@ def test_deep_json_is_no_problem(tmp_path: Path) -> None:
 
 
 def test_a_large_sparse_model_is_believed(tmp_path: Path) -> None:
-    """Up to 262,144 equal Gaussians may be compressed to any size."""
+    """Up to 131,072 equal Gaussians may be compressed to any size."""
     model = MODEL[torch.zeros(100_000, dtype=torch.long)]
     write_model(tmp_path / "a.spz", replace(model))
     assert len(read_model(tmp_path / "a.spz")) == 100_000

@@ -3,11 +3,16 @@
 export const SH_C0 = 0.28209479177387814;
 const OPACITY_LOGIT_BOUND = 16;
 const MIN_SCALE = 2 ** -126;
-const SMALL_COUNT = 1 << 18; // more Gaussians than this have to take a byte each
+const [SMALL_COUNT, LEAST_BYTES] = [1 << 17, 6]; // so many bytes of each Gaussian where there are more
+
+/** Gaussians that `size` packed bytes can hold at most. */
+export function mostHeld(size: number): number {
+  return Math.max(SMALL_COUNT, Math.floor(size / LEAST_BYTES));
+}
 
 /** Whether `size` packed bytes can hold `count` Gaussians, at least one. */
 export function holds(size: number, count: number): boolean {
-  return Number.isInteger(count) && count >= 1 && count <= Math.max(SMALL_COUNT, size);
+  return Number.isInteger(count) && count >= 1 && count <= mostHeld(size);
 }
 
 /** Of an opacity of `byte` 255ths; 0 and 255 have finite ones as well. */

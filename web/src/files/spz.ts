@@ -3,12 +3,11 @@ import { decompress } from 'fzstd';
 import { unpacked, viewOf } from '../core/bytes.ts';
 import { damaged, InputError } from '../core/errors.ts';
 import { coefficients, emptyGaussians, type Gaussians } from '../core/gaussians.ts';
-import { fromSmallestThree, holds, logit } from './coded.ts';
+import { fromSmallestThree, holds, logit, mostHeld } from './coded.ts';
 
-const LEGACY_BYTES = 16;
-const HEADER_BYTES = 32;
+const [LEGACY_BYTES, HEADER_BYTES] = [16, 32];
 const MAX_EXTENSION_BYTES = 1 << 20;
-const MAX_UNPACKED = 2 ** 31;
+const [MAX_UNPACKED, GAUSSIAN_BYTES] = [2 ** 31, 65];
 const MAGNITUDE = 511;
 // Signs of the harmonics of degrees 1 to 3 where y and z change theirs: SPZ has y up, a .ply y down.
 const SH_SIGNS = [-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1];
@@ -72,7 +71,7 @@ function codesOf(header: Header, [positions, alphas, colours, scales, rotations,
 }
 
 async function legacy(bytes: Uint8Array): Promise<SpzCodes> {
-  const most = Math.min(MAX_UNPACKED, 64 * Math.max(bytes.length, 1 << 18)) + MAX_EXTENSION_BYTES;
+  const most = Math.min(MAX_UNPACKED, GAUSSIAN_BYTES * mostHeld(bytes.length)) + MAX_EXTENSION_BYTES;
   const data = await unpacked(bytes, 'gzip', most);
   const found = header(data, [2, 3], bytes.length);
   const parts: Uint8Array[] = [];

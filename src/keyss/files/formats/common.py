@@ -14,9 +14,9 @@ from keyss.core.errors import InputError, OutputError
 from keyss.core.gaussians import SH_C0, Gaussians
 from keyss.files.ply_rows import OPACITY_LOGIT_BOUND
 
-# A packed file may announce more Gaussians than this only if it has a byte for each: published models take at
-# least 7 bytes per Gaussian.
-SMALL_COUNT = 1 << 18
+# A packed file may announce more Gaussians than this only if it has LEAST_BYTES for each: published models
+# take at least 7.
+SMALL_COUNT, LEAST_BYTES = 1 << 17, 6
 _MORTON_BITS = 21  # per axis
 
 
@@ -108,7 +108,7 @@ def check_count(count: int, size: int) -> None:
     """Raise InputError if a packed file of `size` bytes cannot hold `count` Gaussians, or holds none."""
     if count < 1:
         raise InputError("it holds no Gaussians")
-    if count > max(SMALL_COUNT, size):
+    if count > max(SMALL_COUNT, size // LEAST_BYTES):
         raise InputError(f"it announces {count:,} Gaussians, more than {size:,} bytes hold")
 
 
@@ -131,8 +131,10 @@ def gaussians_of(
 
     Raises InputError for values that are not finite in single precision.
     """
-    parts = (means, quats, log_scales, _logits(opacities), np.concatenate([colors[:, None], rest], axis=1))
     with np.errstate(over="ignore", invalid="ignore"):
+        sh = np.empty((len(rest), 1 + rest.shape[1], 3), np.float32)
+        sh[:, 0], sh[:, 1:] = colors, rest
+        parts = (means, quats, log_scales, _logits(opacities), sh)
         model = Gaussians(*(torch.from_numpy(np.require(each, np.float32, ["C", "W"])) for each in parts))
     wrong = [each.name for each in fields(model) if not bool(getattr(model, each.name).isfinite().all())]
     if wrong:

@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Iterator
+from dataclasses import fields
 from typing import Any
 
 import msgspec
@@ -21,7 +22,7 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from keyss.core.arrays import Doubles
+from keyss.core.arrays import Doubles, Numbers
 from keyss.core.errors import InputError
 from keyss.core.gaussians import Gaussians
 from keyss.core.similarity import Similarity
@@ -46,7 +47,7 @@ _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 _TURN = (0.0, 0.0, 1.0, 0.0)  # 180 degrees about z, xyzw
 _MAX_DEPTH = 64  # of nested nodes
 _MAX_PARTS = 64  # primitives with Gaussians
-_MIN_BYTES = 16  # per Gaussian
+_AGAIN = "damaged glTF: the same Gaussians over and over"
 
 
 class _Accessor(msgspec.Struct, omit_defaults=True):
@@ -111,15 +112,15 @@ def read(data: bytes) -> Gaussians:
     """
     document, binary = _chunks(data)
     parts: list[Gaussians] = []
-    room = len(data) // _MIN_BYTES  # Gaussians, counted once for each node that shows them
+    room = len(data)  # numbers, each of which takes a byte or more; counted once for each node
     for to_scene, mesh in _placed(document):
         for primitive in mesh.primitives:
             if EXTENSION not in primitive.extensions:
                 continue
-            model = _gaussians(document, primitive, binary)
-            room -= len(model)
-            if room < 0 or len(parts) == _MAX_PARTS:
-                raise InputError("damaged glTF: the same Gaussians over and over")
+            if len(parts) == _MAX_PARTS:
+                raise InputError(_AGAIN)
+            model = _gaussians(document, primitive, binary, room)
+            room -= sum(getattr(model, each.name).numel() for each in fields(model))
             parts.append(_moved(model, to_scene))
     if not parts:
         raise InputError(f"a glTF file without Gaussians: nothing in its scene has {EXTENSION}")
@@ -243,19 +244,21 @@ def _transform(node: _Node) -> Doubles:
     return transform
 
 
-def _gaussians(document: _Document, primitive: _Primitive, binary: bytes) -> Gaussians:
-    """The Gaussians of a primitive, in its own coordinates."""
+def _gaussians(document: _Document, primitive: _Primitive, binary: bytes, room: int) -> Gaussians:
+    """The Gaussians of a primitive, in its own coordinates, if they have at most `room` numbers."""
     if "extensions" in primitive.extensions[EXTENSION]:
         raise InputError("its Gaussians are compressed by another glTF extension, which keyss does not read")
 
-    def attribute(name: str, width: int) -> Doubles:
+    def attribute(name: str, width: int) -> Numbers:
         if name not in primitive.attributes:
             raise InputError(f"damaged glTF: its Gaussians have no {name}")
         return _values(document, primitive.attributes[name], width, binary)
 
     degree = max(d for d in range(4) if d == 0 or f"{EXTENSION}:SH_DEGREE_{d}_COEF_0" in primitive.attributes)
-    sh = [attribute(name, 3) for name in _coefficients(degree)]
     means = attribute("POSITION", 3)
+    if len(means) * (11 + 3 * (degree + 1) ** 2) > room:
+        raise InputError(_AGAIN)
+    sh = [attribute(name, 3) for name in _coefficients(degree)]
     quats = attribute(f"{EXTENSION}:ROTATION", 4)
     scales = attribute(f"{EXTENSION}:SCALE", 3)
     alphas = attribute(f"{EXTENSION}:OPACITY", 1)[:, 0]
@@ -268,7 +271,7 @@ def _gaussians(document: _Document, primitive: _Primitive, binary: bytes) -> Gau
     return gaussians_of(means, wxyz, log_scales_of(scales), alphas, sh[0], rest)
 
 
-def _values(document: _Document, index: int, width: int, binary: bytes) -> Doubles:
+def _values(document: _Document, index: int, width: int, binary: bytes) -> Numbers:
     """[N, width] the values of an accessor into the binary chunk."""
     if not 0 <= index < len(document.accessors):
         raise InputError("damaged glTF: it names an accessor that is not there")
@@ -292,10 +295,10 @@ def _values(document: _Document, index: int, width: int, binary: bytes) -> Doubl
     if accessor.count == 0:
         return np.empty((0, width))
     values = np.ndarray((accessor.count, width), dtype, binary, start, (stride, dtype.itemsize))
+    if dtype.kind == "f":
+        return values.astype(np.float32)
     numbers = values.astype(np.float64)
-    if accessor.normalized and dtype.kind != "f":
-        numbers = np.maximum(numbers / np.iinfo(dtype).max, -1.0)
-    return numbers
+    return np.maximum(numbers / np.iinfo(dtype).max, -1.0) if accessor.normalized else numbers
 
 
 def _moved(model: Gaussians, to_scene: Doubles) -> Gaussians:

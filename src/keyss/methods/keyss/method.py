@@ -11,7 +11,6 @@ CLIP: the encrypted payload contains the embedding.
 
 from __future__ import annotations
 
-import hashlib
 import os
 import warnings
 from collections.abc import Callable, Sequence
@@ -24,9 +23,8 @@ from torch import Tensor
 
 from keyss.channels import APPENDED, LOW_BITS, check_payload_fits
 from keyss.core.errors import BackendError, KeyssError, KeyssWarning, UsageError, import_extra
-from keyss.core.scene import Scene
 from keyss.keys import DerivedKey
-from keyss.keys.derivation import EMBEDDING_SIZE, SALT_BYTES, unit_vector
+from keyss.keys.derivation import EMBEDDING_SIZE, SALT_BYTES, expand, unit_vector
 from keyss.keys.key_file import normalized_key
 from keyss.methods.base import Capabilities, Context, Plan, Source, Stego
 from keyss.methods.joint import train_jointly
@@ -116,9 +114,9 @@ class KeyssMethod:
         Raises Interrupted on Ctrl-C, and InputError for a checkpoint of another run.
         """
         keys = [each.key for each in secrets]
-        encoder = encoder_of(options)
+        encoder, entropy = encoder_of(options), context.entropy or os.urandom(32)
         if encoder is None:
-            salt = training_salt(cover.scene, options.fit.known_seed)
+            salt = expand(entropy, "keyss/embedding-salt", SALT_BYTES)
             embeddings = [DerivedKey.of(key, salt).embedding() for key in keys]
         else:
             embeddings = [encoder(key) for key in keys]
@@ -126,7 +124,7 @@ class KeyssMethod:
         run = train_jointly(
             lambda placed: training(placed, embeddings, options, context.device), cover, secrets, context
         )
-        return _embedded(run, keys, context.entropy or os.urandom(32))
+        return _embedded(run, keys, entropy)
 
 
 def _embedded(run: DesignTraining, keys: Sequence[str], entropy: bytes) -> Stego:
@@ -152,14 +150,6 @@ def encoder_of(options: KeyssOptions) -> Callable[[str], Tensor] | None:
     if options.key_encoder == "argon2":
         return None
     return _clip_keys(options.clip_model or MODEL)
-
-
-def training_salt(cover: Scene, seed: int) -> bytes:
-    """A salt that is the same when a run is repeated, and differs between covers and between seeds.
-
-    A salt has to be unique, not secret: derived from public inputs, it makes runs repeatable.
-    """
-    return hashlib.sha256(f"keyss/v1/salt {seed} {cover.digest()}".encode()).digest()[:SALT_BYTES]
 
 
 METHOD = KeyssMethod()
