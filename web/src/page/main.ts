@@ -1,6 +1,7 @@
 /** The page: a published model, a field for a key, and what the key opens. */
 import type { Gaussians } from '../core/gaussians.ts';
 import { writePly } from '../files/ply.ts';
+import type { HiddenFile } from '../records/file.ts';
 import { Controls } from './controls.ts';
 import { type TrainedSide, watch } from './live.ts';
 import { listenToLooks, looked } from './looking.ts';
@@ -186,10 +187,10 @@ class Page {
     showKey(false);
   }
 
-  private offer(file: { name: string; data: Uint8Array }): string {
+  private offer(file: HiddenFile): string {
     const name = file.name.replace(/[^\p{L}\p{N} ._-]/gu, '_') || 'file';
-    page.save.textContent = `Save ${name} (${count(file.data.length)} bytes)`;
-    page.save.onclick = () => save(name, new Blob([file.data as BlobPart]));
+    page.save.textContent = `Save ${name} (${count(file.bytes.length)} bytes)`;
+    page.save.onclick = () => save(name, new Blob([file.bytes as BlobPart]));
     page.save.hidden = false;
     return ' It reveals a file.';
   }
