@@ -2,7 +2,7 @@
  * Builds the page: node build.mjs [FOLDER]
  *
  * page.html, a template whose comments <!--policy-->, <!--style-->, <!--model--> and <!--script--> `keyss.viewer` fills;
- * viewer.js; viewer.css; licences.txt. The same sources give the same bytes.
+ * viewer.js; viewer.css; embed.js, a custom element for other sites; licences.txt. The same sources give the same bytes.
  *
  * Or the package keyss-reader: node build.mjs --reader [FOLDER]; `npm pack` in the folder makes an archive of it.
  */
@@ -66,6 +66,7 @@ async function buildPage(out) {
   const script = await bundled('src/page/main.ts', { plugins: [workers] });
   mkdirSync(out, { recursive: true });
   writeFileSync(join(out, 'viewer.js'), script);
+  writeFileSync(join(out, 'embed.js'), await bundled('src/embed.ts'));
   writeFileSync(join(out, 'viewer.css'), readFileSync(join(HERE, 'src/page/style.css'), 'utf8'));
   writeFileSync(join(out, 'page.html'), readFileSync(join(HERE, 'src/page/index.html'), 'utf8'));
   writeFileSync(join(out, 'licences.txt'), licences());
