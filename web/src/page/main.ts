@@ -335,10 +335,11 @@ class Page {
 
 async function main(): Promise<void> {
   page.main.dataset.panel = asked.panel;
-  if (asked.panel === 'key') page.keying.open = true;
   const viewer = await Viewer.on(page.picture).catch(() => null);
   page.problem.textContent = viewer ? '' : NO_WEBGL;
-  await new Page(viewer).start();
+  const shown = new Page(viewer);
+  if (asked.panel === 'key') page.keying.open = true; // which is folded on phones else
+  await shown.start();
 }
 
 void main();
