@@ -7,6 +7,7 @@
 #   make test-oldest   the fast tests with the oldest versions that pyproject.toml declares, in .venv-oldest
 #   make coverage      the fast tests, and which lines they reach
 #   make web           build the viewer of web/ into src/keyss/viewer/assets (needs node, which its users do not)
+#   make reader        the viewer's reader as an npm package, in out/keyss-reader
 #   make test-web      the viewer: types, its reader against the vectors, and end to end in headless Chromium
 #   make docs          the documentation as a site, in site/
 #   make pictures      the pictures of the documents, from the demo
@@ -48,7 +49,7 @@ test coverage: export OMP_NUM_THREADS = 1
 # Where it is set, each of the hundreds of processes that tests start compiles all of keyss.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test web test-web test-web-units test-real test-slow test-cuda test-oldest test-oldest-quick coverage \
+.PHONY: demo test web reader test-web test-web-units test-real test-slow test-cuda test-oldest test-oldest-quick coverage \
   lint format docs pictures venv clean \
   benchmark-check benchmark-baseline benchmark-rasterizer
 
@@ -75,6 +76,10 @@ test-oldest-quick: $(OLDEST_DEV)
 
 web: $(WEB_MODULES)
 	npm --prefix web run --silent build
+
+reader: $(WEB_MODULES)
+	npm --prefix web run --silent build -- --reader
+	cd out/keyss-reader && npm pack --silent
 
 test-web-units: $(WEB_MODULES)
 	npm --prefix web run --silent check

@@ -61,7 +61,7 @@ def test_one_file_has_everything_in_it_and_may_ask_nobody(model: Path, tmp_path:
 def test_a_folder_for_a_web_server(model: Path, tmp_path: Path) -> None:
     written = export_html(model, tmp_path / "site")
     names = {path.name for path in written}
-    assert names == {"index.html", "viewer.js", "viewer.css", "licences.txt", model.name}
+    assert names == {"index.html", "viewer.js", "viewer.css", "embed.js", "licences.txt", model.name}
     assert (tmp_path / "site" / model.name).read_bytes() == model.read_bytes()
     assert 'name="keyss-model" content="a%20model%20%26%20%3Cmore%3E.ply"' in written[0].read_text()
     with pytest.raises(OutputError, match="exists"):

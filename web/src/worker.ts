@@ -1,12 +1,13 @@
 /** What takes time: files into models, and what keys open in them. Nothing of it outlives the page. */
 import { InputError } from './core/errors.ts';
 import DERIVE from 'source:./derive.ts';
-import type { Content, Reader } from './channels/content.ts';
+import type { Reader } from './channels/content.ts';
 import { preparedFor } from './channels/opening.ts';
 import { buffersOf, type Gaussians } from './core/gaussians.ts';
 import { readModel } from './files/models.ts';
 import type { Derive } from './keys/keys.ts';
 import { derivedBy, inTurn, oneByOne, started } from './keys/pool.ts';
+import { fileOf, type HiddenFile } from './records/file.ts';
 import { secretOf } from './records/secret.ts';
 
 /** Bytes of a file to be read, or a key to be tried on the one before. */
@@ -23,7 +24,7 @@ export interface Question {
 export interface Answer {
   readonly id: number;
   readonly model?: Gaussians;
-  readonly file?: { readonly name: string; readonly data: Uint8Array };
+  readonly file?: HiddenFile;
   readonly error?: string; // one sentence
   readonly stopped?: boolean; // a search, before its end
   readonly progress?: number; // 0 to 1: not the answer yet, and the same for every key
@@ -62,7 +63,7 @@ async function unlock(id: number, key: string, thorough: boolean): Promise<void>
   answer({ id, progress: 1 }); // before the secret is decoded, which wrong keys have no part in
   const model = content && stego && secretOf(content, stego)?.gaussians;
   if (model) answer({ id, model }, buffersOf(model));
-  else answer({ id, file: content ? fileOf(content) : undefined });
+  else answer({ id, file: (content && fileOf(content)) ?? undefined });
 }
 
 /** `derive`, telling the page how many of so many keys have been derived. */
@@ -73,14 +74,6 @@ function counted(id: number, all: number): Derive {
     answer({ id, progress: ++done / (all + 1) }); // what comes after takes as long as one more
     return found;
   };
-}
-
-/** A hidden file: its name, which is to be shown and never to be taken as a path, and its bytes. */
-function fileOf(content: Content): { name: string; data: Uint8Array } | undefined {
-  if (content.service !== 'payload' || content.method !== 'file') return undefined;
-  const size = content.data[0];
-  const name = new TextDecoder().decode(content.data.subarray(1, 1 + size));
-  return { name, data: content.data.slice(1 + size) };
 }
 
 self.onmessage = async ({ data }: MessageEvent<Question>) => {

@@ -53,6 +53,8 @@ test('the camera of the photos gives side and tilt, and bounds the distance', ()
   const pose = firstPose(box([0, 0, 0], [100, 100, 100]), 1, undefined, captured);
   expect(pose.up).toEqual(up);
   expect(length(difference(pose.eye, [0, 0, -5]))).toBeLessThan(1e-9);
+  const portrait = firstPose(box([0, 0, 0], [100, 100, 100]), 0.5, undefined, captured);
+  expect(length(difference(portrait.eye, [0, 0, -10]))).toBeLessThan(1e-9);
 });
 
 test('an address gives the pose back that it was made of', () => {

@@ -5,7 +5,6 @@ import { WebPCodec } from '@playcanvas/splat-transform';
 import { expect } from 'vitest';
 import type { Gaussians } from '../src/core/gaussians.ts';
 import { readModel, type ReadModel } from '../src/files/models.ts';
-import { readSog } from '../src/files/sog.ts';
 
 const FOLDER = new URL('../../tests/vectors/', import.meta.url);
 
@@ -17,11 +16,13 @@ export function jsonVector<T>(name: string): T {
   return JSON.parse(new TextDecoder().decode(vector(name))) as T;
 }
 
-/** The model in a file; the images of a .sog, which browsers decode otherwise, by another program's decoder. */
-export async function modelOf(name: string): Promise<ReadModel> {
-  if (!name.endsWith('.sog')) return readModel(vector(name), name);
-  const codec = await WebPCodec.create();
-  return readSog(vector(name), async (data, count) => codec.decodeRGBA(data).rgba.slice(0, 4 * count));
+/** Lossless WebP by another program's decoder: those of browsers are not here. */
+export async function decodeWebP(webp: Uint8Array): Promise<Uint8Array> {
+  return (await WebPCodec.create()).decodeRGBA(webp).rgba;
+}
+
+export function modelOf(name: string): Promise<ReadModel> {
+  return readModel(vector(name), name, decodeWebP);
 }
 
 export function digest(values: Float32Array | Uint8Array): string {

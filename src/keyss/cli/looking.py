@@ -32,11 +32,18 @@ def view(
         optional("AXIS", "Up axis: -y as in COLMAP, z as in Blender.", "found from the model"),
     ] = None,
     title: Annotated[str | None, optional("TEXT", "Title of the page.", "the file's name")] = None,
+    allow_host: Annotated[
+        str | None, optional("ORIGIN", "Host of models that addresses of the page may name.", "none")
+    ] = None,
+    embed_in: Annotated[
+        str | None,
+        optional("ORIGIN", "Site that frames the page and is told when a key opens something.", "none"),
+    ] = None,
     overwrite: Overwrite = False,
 ) -> None:
     """Show a published model in a browser, on a page where a key can be typed.
 
-    The page makes no network requests, and keys never leave the browser.
+    Keys never leave the browser, and the page makes no requests to others than --allow-host.
 
     example: keyss view runs/hidden/publish/stego.ply
 
@@ -46,7 +53,7 @@ def view(
     from keyss.core.errors import UsageError
     from keyss.viewer import ModelServer, export_html, look_of_model
 
-    given = {"pose": pose, "up": up, "title": title}
+    given = {"pose": pose, "up": up, "title": title, "host": allow_host, "embedder": embed_in}
     look = look_of_model(model) | {name: value for name, value in given.items() if value}
     if out is not None:
         if port or host != "127.0.0.1":
@@ -56,8 +63,8 @@ def view(
         what = "opens in any browser" if len(written) == 1 else f"{len(written)} files for a web server"
         print(f"{out}: {size:.1f} MB; {what}")
         return
-    if overwrite:
-        raise UsageError("--overwrite is for -o: leave it out")
+    if overwrite or allow_host or embed_in:
+        raise UsageError("--overwrite, --allow-host and --embed-in are for -o: leave them out")
     if not 0 <= port < 1 << 16:
         raise UsageError(f"--port: expected 0 to {(1 << 16) - 1}, got {port}")
     server = ModelServer(model, host, port, look)

@@ -18,7 +18,8 @@ from keyss.runs.files import CONFIG, is_run
 
 # By name: `pose`, as the page's address has it ("eye=X,Y,Z&target=X,Y,Z", and "&up=z" or "&up=X,Y,Z");
 # `camera`, the same for a camera of the photos, of which the page takes side and tilt; `up`, an axis ("-y");
-# `background`, "#rrggbb"; `title`. The page itself finds what is missing.
+# `background`, "#rrggbb"; `title`; `host`, an origin from which the page may load models and pictures;
+# `embedder`, that of a site that frames the page and is told what happens. The page finds what is missing.
 Look = dict[str, str]
 
 

@@ -1,13 +1,14 @@
 """The viewer as files: one self-contained page, or a folder for a static host.
 
-The content security policy of the page allows no other host, and that of a self-contained page not even its
-own. The page contains the published model and no secret.
+The content security policy of the page allows no other host than `Look` names, and that of a self-contained
+page not even its own. The page contains the published model and no secret.
 """
 
 from __future__ import annotations
 
 import hashlib
 import html
+import re
 import warnings
 from base64 import b64encode
 from collections.abc import Callable
@@ -26,6 +27,7 @@ from keyss.files.reading import open_input
 from keyss.viewer.look import Look
 
 SCRIPT, STYLE, LICENCES, INDEX = "viewer.js", "viewer.css", "licences.txt", "index.html"
+EMBED = "embed.js"  # an element for other sites
 MAX_IN_ONE_FILE = 64 << 20  # bytes of a model; browsers limit text to 512 MiB and parse it slowly
 MAX_BYTES = 2 << 30
 # Argon2id is WebAssembly. Workers and saved pictures come from blobs that the page makes itself.
@@ -34,6 +36,7 @@ _NOTHING = "object-src 'none'; base-uri 'none'; form-action 'none'"
 # The page recognises formats by their first bytes, and .splat, which has no signature, by its name.
 _MAGIC = (b"ply", b"NGSP", b"\x1f\x8b", b"PK\x03\x04")
 _MAX_HEADER = 64 << 10  # bytes of a .ply
+_ORIGIN = re.compile(r"https?://[A-Za-z0-9.-]+(:[0-9]+)?")
 
 
 def served_policy() -> str:
@@ -78,12 +81,16 @@ def export_html(
     """Write the viewer with the published `model`: one file if `out` ends in .html, else a folder.
 
     The file opens from disk; a folder, for larger models, needs a web server. `look`: see `look_of_model`.
-    A model in a format that the page does not read is converted, with a KeyssWarning.
+    A model in a format that the page does not read is converted, with a KeyssWarning. A folder has an element
+    for other sites, embed.js.
     Others can read what is written if they can read `model`. Returns the paths written. Raises UsageError
     for a model that is too large, InputError if it is not a model, OutputError.
     """
     model, out = Path(model), Path(out)
     file, look = readable(model), look or {}
+    for origin in (look[name] for name in ("host", "embedder") if name in look):
+        if not _ORIGIN.fullmatch(origin):
+            raise UsageError(f"expected an origin such as https://www.example.com, got {origin}")
     if file.size > MAX_BYTES:
         raise UsageError(f"{model} has {file.size:,} bytes, more than the {MAX_BYTES:,} that a page loads")
     try:
@@ -102,8 +109,8 @@ def export_html(
         write_bytes(check_output_file(out, overwrite), page_with(data, file.name, look), mode)
         return (out,)
     contents = {INDEX: served_page("keyss-model", quote(file.name), look), file.name: data}
-    contents |= {name: asset(name) for name in (SCRIPT, STYLE, LICENCES)}
-    if len(contents) < 5:
+    contents |= {name: asset(name) for name in (SCRIPT, STYLE, LICENCES, EMBED)}
+    if len(contents) < 6:
         raise UsageError(f"{model} has the name of a file of the viewer: rename it")
     try:
         out.mkdir(parents=True, exist_ok=True)
@@ -126,6 +133,9 @@ def _page(*, policy: str, look: Look, **parts: str) -> bytes:
     """`page.html` with its placeholders replaced."""
     shown = "".join(f' data-{name}="{html.escape(value)}"' for name, value in look.items())
     page = asset("page.html").decode().replace('<main id="main"', f'<main id="main"{shown}')
+    if host := look.get("host"):
+        own = policy.split(";")[0].removeprefix("default-src ").replace("'none'", "")
+        policy = policy.replace("img-src", f"connect-src {own} {host}; img-src {host}")
     parts["policy"] = f'<meta http-equiv="Content-Security-Policy" content="{html.escape(policy)}">'
     for name, part in parts.items():
         before, placeholder, after = page.partition(f"<!--{name}-->")

@@ -2,6 +2,7 @@
 import { InputError } from '../core/errors.ts';
 import type { Gaussians } from '../core/gaussians.ts';
 import { type CompressedPlyCodes, isCompressed, readCompressedPly } from './compressed_ply.ts';
+import type { Decode } from './packed.ts';
 import { plyHeader, readPly } from './ply.ts';
 import { readSog, type SogCodes } from './sog.ts';
 import { readSplat } from './splat.ts';
@@ -15,15 +16,15 @@ export interface ReadModel extends Gaussians {
   readonly codes?: Codes;
 }
 
-/** Raises InputError for a file that is none of them, or damaged. */
-export async function readModel(bytes: Uint8Array, name = ''): Promise<ReadModel> {
+/** `decode`: what decodes the images of a .sog. Raises InputError for a file that is none of them, or damaged. */
+export async function readModel(bytes: Uint8Array, name = '', decode?: Decode): Promise<ReadModel> {
   const start = [...bytes.subarray(0, 4)].map((byte) => String.fromCharCode(byte)).join('');
   if (start.startsWith('ply')) {
     const header = plyHeader(bytes);
     return isCompressed(header) ? readCompressedPly(bytes, header) : readPly(bytes);
   }
   if (start === 'NGSP' || start.startsWith('\x1f\x8b')) return readSpz(bytes);
-  if (start === 'PK\x03\x04') return readSog(bytes);
+  if (start === 'PK\x03\x04') return readSog(bytes, decode);
   if (/\.splat$/i.test(name)) return readSplat(bytes);
   throw new InputError('This is not a file of a 3D Gaussian Splatting model that this page can read.');
 }

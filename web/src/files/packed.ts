@@ -3,7 +3,7 @@
  * exactly, because they are never multiplied by their alpha.
  */
 import { unpacked, viewOf } from '../core/bytes.ts';
-import { damaged } from '../core/errors.ts';
+import { damaged, InputError } from '../core/errors.ts';
 
 const [END, CENTRAL, LOCAL] = [0x06054b50, 0x02014b50, 0x04034b50];
 const MAX_MEMBERS = 64;
@@ -45,36 +45,48 @@ export function openZip(bytes: Uint8Array): (name: string) => Promise<Uint8Array
 
 const SMALL_IMAGE = 1 << 16; // pixels; larger ones may have four times the pixels that are needed
 
+/** All pixels of a lossless WebP: RGBA by rows, not multiplied by alpha. */
+export type Decode = (webp: Uint8Array) => Promise<Uint8Array>;
+
 /** [count, 4] RGBA of the first pixels; `width`: what it has to have. Raises InputError. */
 export type Pixels = (data: Uint8Array, count: number, width?: number) => Promise<Uint8Array>;
 
-export const browserPixels: Pixels = async (data, count, width) => {
-  const [w, h] = sizeOf(data);
-  const fits = w * h >= count && (width === undefined || w === width);
-  if (!fits || w * h > Math.max(SMALL_IMAGE, 4 * count)) throw damaged();
+export function pixelsBy(decode: Decode): Pixels {
+  return async (data, count, width) => {
+    const [w, h] = sizeOf(data);
+    const fits = w * h >= count && (width === undefined || w === width);
+    if (!fits || w * h > Math.max(SMALL_IMAGE, 4 * count)) throw damaged();
+    const pixels = await decode(data);
+    if (pixels.length !== 4 * w * h) throw damaged();
+    return pixels.subarray(0, 4 * count);
+  };
+}
+
+export const inBrowser: Decode = async (webp) => {
+  if (typeof OffscreenCanvas === 'undefined') throw new InputError('This .sog has images, which only browsers decode.');
   let image: ImageBitmap;
   try {
-    image = await createImageBitmap(new Blob([data as BlobPart], { type: 'image/webp' }), {
+    image = await createImageBitmap(new Blob([webp as BlobPart], { type: 'image/webp' }), {
       premultiplyAlpha: 'none', colorSpaceConversion: 'none',
     });
   } catch {
     throw damaged();
   }
   const gl = new OffscreenCanvas(1, 1).getContext('webgl2');
-  if (gl === null || image.width !== w || image.height !== h) throw damaged();
+  if (gl === null) throw damaged();
   gl.pixelStorei(gl.UNPACK_PREMULTIPLY_ALPHA_WEBGL, false);
   gl.pixelStorei(gl.UNPACK_COLORSPACE_CONVERSION_WEBGL, gl.NONE);
   gl.bindTexture(gl.TEXTURE_2D, gl.createTexture());
   gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA, gl.RGBA, gl.UNSIGNED_BYTE, image);
   gl.bindFramebuffer(gl.FRAMEBUFFER, gl.createFramebuffer());
   gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, gl.getParameter(gl.TEXTURE_BINDING_2D), 0);
-  const pixels = new Uint8Array(4 * w * h);
-  gl.readPixels(0, 0, w, h, gl.RGBA, gl.UNSIGNED_BYTE, pixels);
+  const pixels = new Uint8Array(4 * image.width * image.height);
+  gl.readPixels(0, 0, image.width, image.height, gl.RGBA, gl.UNSIGNED_BYTE, pixels);
   const failed = gl.getError() !== gl.NO_ERROR;
   image.close();
   gl.getExtension('WEBGL_lose_context')?.loseContext();
   if (failed) throw damaged();
-  return pixels.subarray(0, 4 * count);
+  return pixels;
 };
 
 /** Width and height of the header. Raises InputError for what is no lossless WebP. */

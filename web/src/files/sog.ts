@@ -3,7 +3,7 @@ import { damaged, InputError } from '../core/errors.ts';
 import { coefficients, emptyGaussians, type Gaussians } from '../core/gaussians.ts';
 import { fromSmallestThree, holds, logit } from './coded.ts';
 import { checkedFinite } from './ply.ts';
-import { browserPixels, openZip, type Pixels } from './packed.ts';
+import { type Decode, inBrowser, openZip, type Pixels, pixelsBy } from './packed.ts';
 
 export const FINEST = 65535; // a position's largest code
 export const LARGEST = 252; // of the fourth byte of a quaternion: w, x, y or z is not stored
@@ -40,9 +40,9 @@ export interface SogCodes {
 }
 
 export async function readSog(
-  bytes: Uint8Array, pixels: Pixels = browserPixels,
+  bytes: Uint8Array, decode: Decode = inBrowser,
 ): Promise<Gaussians & { readonly codes: SogCodes }> {
-  const codes = await parsed(bytes, pixels);
+  const codes = await parsed(bytes, pixelsBy(decode));
   return { ...checkedFinite(dequantised(codes)), codes };
 }
 

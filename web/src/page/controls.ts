@@ -5,11 +5,14 @@ const TURN = 0.005; // radians for each pixel
 const KEY_TURN = 0.08; // radians for each press of an arrow key
 const KEY_STEP = 0.06; // of the distance for each press
 const KEY_ZOOM = 1.1;
+const ROTATION = 0.0003; // radians for each millisecond
 const [NEAREST, FURTHEST] = [1e-4, 1e5];
 
 export class Controls {
   flying = false;
   touched = false; // whether somebody moved the camera
+  rotating = (_: boolean): void => undefined; // is told whether it goes around by itself
+  private turning = 0; // the animation frame in which it will
   private readonly pointers = new Map<number, { x: number; y: number }>();
 
   /** `moved` is told of every new pose; `home` gives the first one again. */
@@ -20,7 +23,7 @@ export class Controls {
     canvas.style.touchAction = 'none';
     canvas.addEventListener('pointerdown', (event) => {
       canvas.setPointerCapture(event.pointerId);
-      this.touched = true;
+      this.touch();
       this.pointers.set(event.pointerId, { x: event.clientX, y: event.clientY });
     });
     canvas.addEventListener('pointermove', (event) => this.dragged(event, canvas.clientHeight));
@@ -30,7 +33,7 @@ export class Controls {
     canvas.addEventListener('contextmenu', (event) => event.preventDefault());
     canvas.addEventListener('wheel', (event) => {
       event.preventDefault();
-      this.touched = true;
+      this.touch();
       // Browsers give a pinch on a trackpad as a wheel with Ctrl, and some give lines in the place of pixels.
       this.zoom(Math.exp(event.deltaY * (event.ctrlKey ? 0.01 : 0.001) * (event.deltaMode ? 16 : 1)));
     }, { passive: false });
@@ -40,6 +43,28 @@ export class Controls {
   setPose(pose: Pose): void {
     this.pose = pose;
     this.moved(pose);
+  }
+
+  /** Goes around by itself until somebody moves the camera. */
+  rotate(on: boolean): void {
+    cancelAnimationFrame(this.turning);
+    let before = performance.now();
+    const step = (now: number): void => {
+      this.turn((now - before) * ROTATION, 0);
+      before = now;
+      this.turning = requestAnimationFrame(step);
+    };
+    this.turning = on ? requestAnimationFrame(step) : 0;
+    this.rotating(on);
+  }
+
+  get isRotating(): boolean {
+    return this.turning !== 0;
+  }
+
+  private touch(): void {
+    this.touched = true;
+    if (this.isRotating) this.rotate(false);
   }
 
   private dragged(event: PointerEvent, height: number): void {
@@ -81,7 +106,7 @@ export class Controls {
     const action = actions[event.key.length === 1 ? event.key.toLowerCase() : event.key];
     if (action === undefined) return;
     event.preventDefault();
-    this.touched = true;
+    this.touch();
     action();
   }
 

@@ -1,7 +1,9 @@
 /** The page: a published model, a field for a key, and what the key opens. */
 import type { Gaussians } from '../core/gaussians.ts';
 import { writePly } from '../files/ply.ts';
+import type { HiddenFile } from '../records/file.ts';
 import { Controls } from './controls.ts';
+import { asked, tell } from './embedding.ts';
 import { type TrainedSide, watch } from './live.ts';
 import { listenToLooks, looked } from './looking.ts';
 import { Opener } from './opener.ts';
@@ -56,6 +58,16 @@ class Page {
       this.roll = Number(page.roll.value);
       this.controls.setPose(rolled(this.pose, ((this.roll - before) * Math.PI) / 180));
     });
+    this.controls.rotating = (on) => page.rotate.setAttribute('aria-pressed', String(on));
+    page.rotate.addEventListener('click', () => this.controls.rotate(!this.controls.isRotating));
+    page.link.hidden = !navigator.clipboard;
+    page.link.addEventListener('click', () => void this.copyLink());
+    page.border.addEventListener('pointerdown', ({ pointerId }) => page.border.setPointerCapture(pointerId));
+    page.border.addEventListener('pointermove', ({ pointerId, clientX }) => {
+      if (!page.border.hasPointerCapture(pointerId)) return;
+      const { left, width } = page.view.getBoundingClientRect();
+      this.split(Math.max(0.01, Math.min(0.99, (clientX - left) / width)));
+    });
     page.background.addEventListener('input', () => this.viewer?.setBackground(page.background.value));
     page.picture.addEventListener('webglcontextlost', () => this.say(INTERRUPTED));
     page.picture.addEventListener('webglcontextrestored', () => this.say(''));
@@ -87,8 +99,10 @@ class Page {
     if (live) return this.watch(live);
     const source = givenModel();
     if (source === null) return this.say('Open a file, or drop one here.');
+    if (asked.poster) page.poster.src = asked.poster;
+    page.poster.hidden = !asked.poster;
     this.say('Loading …');
-    const bytes = await source.bytes().catch(() => null);
+    const bytes = await source.bytes((share) => this.say(`Loading … ${Math.floor(100 * share)} %`)).catch(() => null);
     return bytes ? this.load(bytes, source.name) : this.fail('The file in the address could not be loaded.');
   }
 
@@ -106,7 +120,7 @@ class Page {
     const { model, error } = await this.opener.ask({ bytes, name }, [bytes.buffer]);
     if (own !== this.work) return;
     if (model === undefined) return this.fail(error ?? 'This file cannot be read.');
-    [this.name, this.published] = [page.main.dataset.title ?? name, model];
+    [this.name, this.published] = [(this.work === 1 && asked.title) || (page.main.dataset.title ?? name), model];
     this.hideSecret();
     page.open.disabled = page.key.disabled = false;
     page.facts.textContent = `${this.name}\n${count(model.count)} Gaussians, SH degree ${model.shDegree}`;
@@ -115,6 +129,9 @@ class Page {
     this.controls.setPose(poseOfHash(this.asked) ?? poseOfHash(page.main.dataset.pose ?? '') ?? this.firstPose());
     await this.picture();
     this.say('');
+    page.poster.hidden = true;
+    tell({ event: 'load', gaussians: model.count });
+    this.controls.rotate(asked.autorotate && !window.matchMedia('(prefers-reduced-motion: reduce)').matches);
   }
 
   /** The models of a training as they are now, and no field for keys. */
@@ -151,6 +168,8 @@ class Page {
     const key = page.key.value;
     if (!key || this.published === null || page.open.disabled) return;
     const own = this.begun();
+    this.controls.rotate(false);
+    this.writeAddress(); // now, so that it is the same whatever the key opens
     let said = 'Key tried.';
     for (const search of ['quick', 'thorough'] as const) {
       this.searches(search);
@@ -159,6 +178,8 @@ class Page {
       const { model, file, stopped } = await this.opener.ask({ key, thorough: search === 'thorough' });
       if (own !== this.work) return;
       this.searches('');
+      if (search === 'quick') tell({ event: 'key-tried' });
+      if (file || model) tell({ event: 'opened', kind: file ? 'file' : 'model' });
       if (file) said += this.offer(file);
       if (model) said += this.reveal(model);
       this.say(stopped ? `${said} Search stopped.` : said);
@@ -186,10 +207,10 @@ class Page {
     showKey(false);
   }
 
-  private offer(file: { name: string; data: Uint8Array }): string {
+  private offer(file: HiddenFile): string {
     const name = file.name.replace(/[^\p{L}\p{N} ._-]/gu, '_') || 'file';
-    page.save.textContent = `Save ${name} (${count(file.data.length)} bytes)`;
-    page.save.onclick = () => save(name, new Blob([file.data as BlobPart]));
+    page.save.textContent = `Save ${name} (${count(file.bytes.length)} bytes)`;
+    page.save.onclick = () => save(name, new Blob([file.bytes as BlobPart]));
     page.save.hidden = false;
     return ' It reveals a file.';
   }
@@ -229,8 +250,14 @@ class Page {
   }
 
   private async snapshot(): Promise<void> {
+    this.controls.rotate(false); // there is no picture at rest else
     const picture = await this.viewer?.snapshot();
     if (picture) save(`${this.name.replace(/\.\w+$/, '') || 'view'}.png`, picture);
+  }
+
+  private async copyLink(): Promise<void> {
+    this.writeAddress();
+    await navigator.clipboard.writeText(location.href).then(() => this.say('Link copied.'), () => this.say(location.href));
   }
 
   /** Of the model that is shown: anew, since the window's size or the way up may be others. */
@@ -307,9 +334,12 @@ class Page {
 }
 
 async function main(): Promise<void> {
+  page.main.dataset.panel = asked.panel;
   const viewer = await Viewer.on(page.picture).catch(() => null);
   page.problem.textContent = viewer ? '' : NO_WEBGL;
-  await new Page(viewer).start();
+  const shown = new Page(viewer);
+  if (asked.panel === 'key') page.keying.open = true; // which is folded on phones else
+  await shown.start();
 }
 
 void main();

@@ -7,23 +7,28 @@ function all<T extends HTMLElement>() {
 }
 
 export const page = {
-  ...all()('main', 'border', 'drop', 'status', 'problem', 'facts', 'revealed', 'count'),
+  ...all()('main', 'border', 'drop', 'view', 'status', 'problem', 'facts', 'revealed', 'count'),
   ...all<HTMLInputElement>()('file', 'key', 'wipe', 'threshold', 'faint', 'opaque', 'roll', 'background'),
-  ...all<HTMLButtonElement>()('show', 'open', 'stop', 'fly', 'home', 'snapshot', 'download', 'close', 'save'),
+  ...all<HTMLButtonElement>()('show', 'open', 'stop', 'fly', 'home', 'snapshot', 'download', 'close', 'save', 'rotate', 'fullscreen', 'link'),
   ...all<HTMLSelectElement>()('up', 'colouring'),
   ...all<HTMLCanvasElement>()('picture'),
   ...all<HTMLFormElement>()('form'),
   ...all<HTMLProgressElement>()('progress'),
   ...all<HTMLOutputElement>()('shown'),
   ...all<HTMLFieldSetElement>()('drawn'),
-  ...all<HTMLDetailsElement>()('controls'),
+  ...all<HTMLDetailsElement>()('controls', 'keying'),
+  ...all<HTMLImageElement>()('poster'),
 };
 
 const NARROW = '(max-width: 600px)'; // where the panel would cover the scene
 
 /** `opened` gets files that are chosen or dropped. */
 export function preparePanel(opened: (file: File) => void): void {
-  page.controls.open = !window.matchMedia(NARROW).matches;
+  page.controls.open = page.keying.open = !window.matchMedia(NARROW).matches;
+  page.fullscreen.hidden = !document.fullscreenEnabled;
+  page.fullscreen.addEventListener('click', () => {
+    void (document.fullscreenElement ? document.exitFullscreen() : page.main.requestFullscreen());
+  });
   page.show.addEventListener('click', () => showKey(page.key.type === 'password'));
   page.file.addEventListener('change', () => {
     const file = page.file.files?.[0];

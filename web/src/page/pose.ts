@@ -66,7 +66,8 @@ export function firstPose(model: Gaussians, aspect: number, up?: Vector, capture
     return Math.max(Math.abs(x) / aspect, Math.abs(y)) / half - z;
   });
   const [most, all] = [MOST, ALL].map((share) => quantile(distances, weights, share));
-  const furthest = captured ? FURTHEST * length(difference(captured.eye, captured.target)) : Infinity;
+  const captureDistance = captured ? length(difference(captured.eye, captured.target)) : Infinity;
+  const furthest = (FURTHEST * captureDistance) / Math.min(1, aspect); // a narrow picture shows less from there
   const distance = Math.max(1e-6, Math.min(all, LITTLE * most, furthest));
   const target = combined(middle, basis);
   return { eye: add(target, forward, -distance), target, up: pose.up };

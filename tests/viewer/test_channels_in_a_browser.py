@@ -1,0 +1,104 @@
+"""Secrets of every channel, in pages that open from disk, end to end in headless Chromium."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+import keyss
+from keyss.channels import LOW_BITS, SUFFIXES, channel_for
+from keyss.files import read_model, write_model
+from keyss.methods import HiddenFile, embed_models
+from keyss.viewer import export_html
+from measure.lifelike import lifelike
+from methods.keyss.hiding import written
+from viewer.browser import CLOSE, IN_CHROMIUM, POSE, Visit, drawn, made, psnr
+
+pytestmark = IN_CHROMIUM
+
+KEYS = ("the first key", "ein zweiter Schlüssel")
+PUBLISHED = {"ply": "ply"} | {suffix.removeprefix("."): publish for publish, suffix in SUFFIXES.items()}
+ROWS = "rows.ply"  # of the method keyss, in low bits
+KINDS = (*PUBLISHED, "appended.ply", "appended.spz", "appended.sog", ROWS)
+
+
+def keys_of(kind: str) -> tuple[str, ...]:
+    return KEYS if kind in PUBLISHED else KEYS[:1]
+
+
+@pytest.fixture(scope="module")
+def published(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
+    """Gives the published model of a kind."""
+    folder = tmp_path_factory.mktemp("published")
+
+    @cache
+    def stego(kind: str) -> Path:
+        if kind == ROWS:
+            cover, (secret,), _ = written(count=1400, rows=1600)
+            model = LOW_BITS.prepare(cover).embed([(KEYS[0], secret.payload())], entropy=bytes(32))
+        else:
+            channel = channel_for(PUBLISHED[kind]) if kind in PUBLISHED else channel_for("any", "appended")  # type: ignore[arg-type]
+            keys, secrets = keys_of(kind), [made(100, seed).with_sh_degree(1) for seed in (1, 2)]
+            model = embed_models(
+                channel.prepare(made(4000, 0)), keys, secrets[: len(keys)], entropy=bytes(32)
+            ).gaussians
+        write_model(folder / f"stego.{kind}", model)
+        return folder / f"stego.{kind}"
+
+    return stego
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_keys_open_what_keyss_reveals_and_a_wrong_one_nothing(
+    tab: Visit, published: Callable[[str], Path], tmp_path: Path, kind: str
+) -> None:
+    stego = published(kind)
+    tab.goto(export_html(stego, tmp_path / "page.html")[0].as_uri() + POSE)
+    cover = tab.picture()
+    assert psnr(cover, drawn(read_model(stego), POSE)) > CLOSE
+    tab.finds_nothing("another key")
+    for key in keys_of(kind):
+        revealed = keyss.reveal(stego, key).gaussians
+        tab.try_key(key)
+        tab.at(POSE)
+        shown = tab.picture()
+        assert psnr(shown, drawn(revealed, POSE)) > CLOSE > psnr(shown, cover)
+        tab.saved("#download", tmp_path / "secret.ply")
+        assert read_model(tmp_path / "secret.ply").digest() == revealed.digest()
+    assert all(url.startswith(("file:", "blob:null/")) for url in tab.requests), tab.requests
+
+
+def test_a_file_in_colours_is_saved_and_all_keys_look_alike(tab: Visit, tmp_path: Path) -> None:
+    note = HiddenFile("a note.txt", b"Written at noon, read at night.\n")
+    room = channel_for("any", "colours").prepare(lifelike(6000, 0).with_sh_degree(0))
+    write_model(tmp_path / "stego.spz", room.embed([(KEYS[0], note.payload())], entropy=bytes(32)))
+    tab.goto(export_html(tmp_path / "stego.spz", tmp_path / "page.html")[0].as_uri())
+    seen = []
+    for key in ("another key", KEYS[0]):
+        tab.page.evaluate(
+            """() => {
+                const [seen, shown] = [window.seen = [], document.getElementById('progress')];
+                const observer = new MutationObserver(() => seen.push(shown.value));
+                observer.observe(shown, { attributeFilter: ['value'] });
+            }"""
+        )
+        tab.try_key(key)
+        assert tab.page.locator("#save").is_visible() == (key == KEYS[0])
+        seen.append(list(dict.fromkeys(tab.page.evaluate("window.seen"))))
+    assert seen[0] == seen[1]
+    assert len(seen[0]) > 17
+    assert tab.page.locator("#save").inner_text() == f"Save a note.txt ({len(note.data)} bytes)"
+    assert tab.saved("#save", tmp_path / "note.txt") == note.name
+    assert (tmp_path / "note.txt").read_bytes() == note.data
+
+
+@pytest.mark.alone
+@pytest.mark.parametrize("kind", ["ply", "spz", "appended.spz", ROWS])
+def test_a_wrong_key_takes_as_long_as_a_right_one(
+    tab: Visit, published: Callable[[str], Path], tmp_path: Path, kind: str
+) -> None:
+    tab.goto(export_html(published(kind), tmp_path / "page.html")[0].as_uri())
+    tab.takes_as_long_for_each("wrong", KEYS[0], "wrong again", KEYS[0], "and again")

@@ -1,0 +1,20 @@
+/** The form of both examples: `show` gets the address of a .ply of the model that the key opened in stego.ply. */
+export function openingForm(show) {
+  const [form, status] = [document.querySelector('form'), document.querySelector('output')];
+  const worker = new Worker('worker.js', { type: 'module' });
+  worker.onmessage = async ({ data: { share, found, error } }) => {
+    if (share !== undefined) {
+      status.value = `${Math.round(100 * share)} %`;
+    } else if (found?.kind === 'model') {
+      await show(URL.createObjectURL(new Blob([found.ply])));
+      status.value = `${found.gaussians} Gaussians`;
+    } else {
+      status.value = error ?? 'Key tried.';
+    }
+  };
+  form.onsubmit = async (event) => {
+    event.preventDefault();
+    const bytes = new Uint8Array(await (await fetch('stego.ply')).arrayBuffer());
+    worker.postMessage({ bytes, key: form.elements.key.value });
+  };
+}

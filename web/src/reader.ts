@@ -1,0 +1,39 @@
+/** The package `keyss-reader`: what a key opens in a published model, without the page; its types stand in web/reader. */
+import type { Reveal } from '../reader/index.d.ts';
+import { preparedFor } from './channels/opening.ts';
+import { readModel } from './files/models.ts';
+import { writePly } from './files/ply.ts';
+import { type Derive, keyBytes, master } from './keys/keys.ts';
+import { oneByOne } from './keys/pool.ts';
+import { fileOf } from './records/file.ts';
+import { secretOf } from './records/secret.ts';
+
+const QUICK = 0.2; // of the progress: colours, which come second, take four times as long as all else
+
+export const reveal: Reveal = async (bytes, key, { name, decodeWebP, signal, onProgress } = {}) => {
+  keyBytes(key); // refuses what is no key
+  signal?.throwIfAborted();
+  const stego = await readModel(bytes, name, decodeWebP);
+  const channels = preparedFor(stego);
+  for (const [thorough, from, to] of [[false, 0, QUICK], [true, QUICK, 1]] as const) {
+    const reader = channels(thorough);
+    let done = 0;
+    const derive: Derive = oneByOne(async (...asked) => {
+      await new Promise((resolve) => setTimeout(resolve, 0)); // other events have their turn, an abort too
+      signal?.throwIfAborted();
+      const found = await master(...asked);
+      onProgress?.(from + ((to - from) * ++done) / reader.derivations);
+      return found;
+    });
+    const content = await reader.open(key, derive);
+    signal?.throwIfAborted();
+    if (content === null) continue;
+    onProgress?.(1);
+    const file = fileOf(content);
+    if (file) return { kind: 'file', ...file };
+    const secret = secretOf(content, stego);
+    if (secret) return { kind: 'model', ply: writePly(secret.gaussians), gaussians: secret.gaussians.count };
+  }
+  onProgress?.(1);
+  return null;
+};
