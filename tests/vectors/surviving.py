@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -30,8 +31,8 @@ def write_surviving(folder: Path, keys: tuple[str, str]) -> None:
     ply, spz, one, moved = (folder / name for name in NAMES)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", KeyssWarning)  # of more secrets than one
-        model = with_appended(keys)
-    write_model(ply, model)
+        write_model(ply, with_appended(keys))
+    model = with_appended(keys[:1])
     rows = torch.randperm(len(model), generator=torch.Generator().manual_seed(21))
     write_model(spz, elsewhere(model[rows[: 9 * len(rows) // 10]]))
     cover = lifelike(4000, 22).with_sh_degree(0)
@@ -42,15 +43,12 @@ def write_surviving(folder: Path, keys: tuple[str, str]) -> None:
     write_model(moved, elsewhere(small.embed([(keys[0], secret)], entropy=bytes(32))))
 
 
-def with_appended(keys: tuple[str, str]) -> Gaussians:
+def with_appended(keys: Sequence[str]) -> Gaussians:
     """Among as many faint Gaussians of its own: places of lattices are not plain to see."""
     cover = trained_like(120, 23, 0)
     cover = replace(cover, opacity_logits=torch.where(torch.arange(120) % 2 == 0, -5.5, 2.0))
-    secrets = [
-        (keys[0], Payload(METHOD, whole.encode(trained_like(40, 24, 1)))),
-        (keys[1], NOTE.payload()),
-    ]
-    return APPENDED.prepare(cover).embed(secrets, entropy=bytes(32))
+    payloads = [Payload(METHOD, whole.encode(trained_like(40, 24, 1))), NOTE.payload()]
+    return APPENDED.prepare(cover).embed(list(zip(keys, payloads, strict=False)), entropy=bytes(32))
 
 
 def elsewhere(model: Gaussians) -> Gaussians:

@@ -43,7 +43,7 @@ def test_what_published_files_hold(name: str) -> None:
     assert digests(read_model(FOLDER / name)) == PUBLISHED[name]
 
 
-@pytest.mark.parametrize("expected", WHOLE["models"], ids=lambda each: f"{len(each['data']) // 2} bytes")
+@pytest.mark.parametrize("expected", WHOLE, ids=lambda each: f"{len(each['data']) // 2} bytes")
 def test_what_whole_models_hold(expected: dict[str, Any]) -> None:
     assert digests(whole.decode(bytes.fromhex(expected["data"]))) == expected["sha256"]
 

@@ -182,7 +182,8 @@ def hide(
     ]
     if dry_run:
         return HideResult(plan=plan_hiding(chosen, options, sources, target, place, bound=bound))
-    if reporter and ranks.first and trains and not resume and worth_planning(options.fit):
+    long = (trains and worth_planning(options.fit)) or options.place.grows
+    if reporter and ranks.first and not resume and long:
         planned = plan_hiding(chosen, options, sources, target, place, bound=bound)
         reporter.note(f"hide: {in_a_line(planned)}")
     with folder.work() if folder else nullcontext():

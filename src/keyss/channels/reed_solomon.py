@@ -3,14 +3,16 @@
 A systematic code of length n <= 255 with the generator polynomial (x - 1)(x - a)...(x - a^(n-k-1)), a = 2,
 over the field of the polynomial x^8 + x^4 + x^3 + x^2 + 1: the same codewords, byte for byte, as `reedsolo`
 makes. That library codes one codeword of bytes at a time and takes minutes for the payload of a model; here
-a chunk is a row of an array, and all its bytes are coded at once. Every chunk carries its number and a tag,
-so that the lost rows are known: there are no errors to locate, only a linear system to solve.
+a chunk is a row of an array, and all its bytes are coded at once. Every chunk carries its number, so that the
+lost rows are known. Where tags are so short that some chunks are there by chance, they are found by trying:
+the codeword through k chunks that are right agrees with all others that are, every other one with hardly any.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import chain
 
 import numpy as np
 
@@ -18,6 +20,7 @@ from keyss.core.arrays import Bytes, Integers
 from keyss.core.errors import InputError
 
 MAX_CHUNKS = 255  # of one codeword
+_TRIES = 2000  # of k chunks, in all codewords together
 LOST = "the key is right, but too much of the model was lost or changed since the secret was hidden in it"
 _POLYNOMIAL = 0x11D
 
@@ -52,11 +55,11 @@ class Codewords:
         rows = np.frombuffer(data.ljust(self.size, b"\0"), np.uint8).reshape(self.k, -1)
         return encode(rows, self.n).reshape(-1, self.width)
 
-    def decode(self, numbers: Integers, chunks: Bytes) -> bytes:
+    def decode(self, numbers: Integers, chunks: Bytes, *, errors: bool = False) -> bytes:
         """The data from chunks [C, width] with `numbers` [C], in any order.
 
-        Different chunks with one number are left out: one of them is there by chance. Raises InputError if
-        too few are left.
+        Different chunks with one number are left out: one of them is there by chance. `errors`: so may be
+        others. Raises InputError if too few are left.
         """
         inside = numbers < self.chunks
         own, first, of_own = np.unique(numbers[inside], return_index=True, return_inverse=True)
@@ -66,20 +69,26 @@ class Codewords:
             chosen = chunks[first]
             sure = np.ones(left, bool)
             sure[of_own[(chunks != chosen[of_own]).any(axis=1)]] = False
-            data = self._decoded(own[sure], chosen[sure])
+            data = self._decoded(own[sure], chosen[sure], errors)
         if data is None:
             raise InputError(f"{LOST}: {left:,} of {self.chunks:,} chunks are left")
         return data.tobytes()
 
-    def _decoded(self, numbers: Integers, chunks: Bytes) -> Bytes | None:
+    def _decoded(self, numbers: Integers, chunks: Bytes, errors: bool) -> Bytes | None:
         data = np.empty((self.k, self.count, self.width), np.uint8)
         rows, codewords = np.divmod(numbers, self.count)
+        random, tries = np.random.default_rng(0), iter(range(_TRIES))
         for codeword in range(self.count):
-            own = codewords == codeword
-            decoded = decode(dict(zip(rows[own].tolist(), chunks[own], strict=True)), self.k, self.n)
-            if decoded is None:
-                return None
-            data[:, codeword] = decoded
+            own = some = np.flatnonzero(codewords == codeword)
+            for _ in chain((0,), tries):
+                decoded = decode(dict(zip(rows[some].tolist(), chunks[some], strict=True)), self.k, self.n)
+                if decoded is None:
+                    return None
+                data[:, codeword] = decoded
+                wrong = 0 if not errors else (encode(decoded, self.n)[rows[own]] != chunks[own]).any(1).sum()
+                if 2 * wrong <= len(own) - self.k:  # no other codeword agrees with as many
+                    break
+                some = random.choice(own, self.k, replace=False)
         return data
 
 

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import torch
 
+from keyss.channels import Publish
 from keyss.core.errors import OutputError
 from keyss.core.scene import Scene
 from keyss.fitting.config import FitConfig
@@ -28,6 +29,8 @@ _KEY_SECONDS = 3.0  # for each secret: deriving its key for every salt, and open
 _RENDERS = 6  # of each test view, to measure
 _STATE_COPIES = 3  # numbers in a checkpoint for each number of a model: itself and two moments
 _MAX_APPENDED = 7  # Gaussians that hold one Gaussian of a secret of SH degree 3
+# About the most bytes of a packed Gaussian without harmonics, and of each of these.
+_PACKED = {"spz": (15, 0.3), "sog": (18, 0.7), "compressed-ply": (16.3, 1)}
 _OTHER_BYTES = 4 << 20  # JSON files, locks, and the overhead of the file system
 
 
@@ -74,7 +77,7 @@ def plan_hiding(
         plan,
         method=method.name,
         stages=tuple(stages),
-        file_bytes=_file_bytes(plan.gaussians, plan.sh_degree),
+        file_bytes=_file_bytes(plan.gaussians, plan.sh_degree, options.publish),
         disk_bytes=_disk_bytes(options, sources),
         free_bytes=None if out is None else _free_bytes(out),
         memory_bytes=_memory_bytes(plan.gaussians, plan.sh_degree, trains),
@@ -104,9 +107,10 @@ def worth_planning(config: FitConfig) -> bool:
 
 
 def in_a_line(plan: Plan) -> str:
-    """Time, memory and disk of a run."""
+    """Size of the published file, time, memory and disk of a run."""
     return (
-        f"about {about(plan.seconds)}, {plan.memory_bytes / 1e9:.1f} GB of memory, up to "
+        f"a file of up to {plan.file_bytes / 1e6:,.1f} MB, about {about(plan.seconds)}, "
+        f"{plan.memory_bytes / 1e9:.1f} GB of memory, up to "
         f"{plan.disk_bytes / 1e6:,.0f} MB of disk"
     )
 
@@ -186,6 +190,9 @@ def _floats(sh_degree: int) -> int:
     return 11 + 3 * (sh_degree + 1) ** 2
 
 
-def _file_bytes(gaussians: int, sh_degree: int) -> int:
-    """Size of a PLY file, which has normals too."""
-    return 4 * gaussians * (3 + _floats(sh_degree)) + 2048
+def _file_bytes(gaussians: int, sh_degree: int, publish: Publish = "ply") -> int:
+    """Size of a model's file: of a `.ply`, which has normals too, exactly; else about the most."""
+    if publish not in _PACKED:
+        return 4 * gaussians * (3 + _floats(sh_degree)) + 2048
+    without, harmonic = _PACKED[publish]
+    return round(gaussians * (without + harmonic * (_floats(sh_degree) - _floats(0)))) + 2048

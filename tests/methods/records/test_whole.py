@@ -10,7 +10,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-import zstandard
 
 from channels.codes.published import model_of
 from keyss.core import Camera, Gaussians, InputError, Scene, UsageError, View
@@ -29,8 +28,8 @@ def _scene(cameras: Sequence[Camera]) -> Scene:
 def test_a_whole_model_comes_back_as_its_records_would() -> None:
     model = model_of(3000, sh_degree=2)
     sizes, psnrs = [], []
-    for bits in (97, whole.USUAL_BITS, 123, whole.MAX_BITS):
-        data = whole.encode(model, whole.Precision.of_size(bits))
+    for octaves in (-1, 0, 1, 2):
+        data = whole.encode(model, whole.Precision.usual(model).finer(octaves))
         opened = whole.decode(data)
         assert len(opened) == 3000
         sizes.append(len(data))
@@ -65,25 +64,21 @@ def test_a_few_bytes_that_announce_many_gaussians_are_refused_before_they_are_un
     data = whole.encode(model_of(500))
     with pytest.raises(InputError, match="more than"):
         whole.decode((1 << 20).to_bytes(4, "little") + data[4:])
-    padding = (1 << 22) * b"\0\0\0"  # blocks that hold nothing, which channels compress to kilobytes
+    padding = (1 << 22) * b"\0\0\0"  # which channels compress to kilobytes
     with pytest.raises(InputError, match=r"more than .* in 6,000 Gaussians hold"):
-        whole.decode((1 << 20).to_bytes(4, "little") + data[4:101] + padding + data[101:], 6000)
-    block = bytes([0b011 | 0xF8, 0xFF, 0xFF, 7])  # 2 MiB of one byte
-    with pytest.raises(InputError, match="damaged"):
-        whole.decode((1 << 17).to_bytes(4, "little") + data[4 : -len(block)] + 1000 * block)
+        whole.decode((1 << 20).to_bytes(4, "little") + data[4:] + padding, 6000)
 
 
 @pytest.mark.parametrize("seed", range(12))
 def test_hostile_payloads_take_little_memory(seed: int) -> None:
     random = np.random.default_rng(seed)
     count = int(random.choice([1 << 16, (1 << 16) + 1, 1 << 20, 1 << 22, (1 << 32) - 1]))
-    head = bytearray(whole.encode(model_of(500))[:101])
+    head = bytearray(whole.encode(model_of(500))[:49])
     head[:5] = count.to_bytes(4, "little") + bytes([int(random.integers(4))])
-    zeros = zstandard.ZstdCompressor(19).compress(bytes(70 * min(count, 1 << 22)))
     padding = int(random.choice([0, 1 << 20, 3 << 22])) * b"\0"
     tracemalloc.start()
     with suppress(InputError):
-        whole.decode(bytes(head) + padding + zeros[9:], 6000)
+        whole.decode(bytes(head) + padding, 6000)
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert peak < len(padding) + (200 << 20)
@@ -108,7 +103,8 @@ def test_harmonics_are_rounded_to_steps_that_are_finer_for_what_covers_more() ->
     scales = model.log_scales - 2.0 * small[:, None]
     model = replace(model, log_scales=scales)
     step = 0.03
-    found = whole.decode(whole.encode(model, whole.Precision(whole.Precision.of_size(110).table, step)))
+    precision = replace(whole.Precision.usual(model), harmonics=step)
+    found = whole.decode(whole.encode(model, precision))
     error = (found.sh - model.sh)[:, 1:].double().numpy() @ OPPONENT.T
     largest = np.abs(error).reshape(2000, -1).max(axis=1)
     seen = (scales.sort(dim=1).values[:, 1:].sum(1) + 2 * model.opacity_logits.clamp(max=0)).double().numpy()

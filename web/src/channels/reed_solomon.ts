@@ -1,5 +1,8 @@
 /** Reed-Solomon over GF(256) for erasures; see docs/format.md, "A payload". */
 import { tooMuchLost } from '../core/errors.ts';
+import { mix } from '../core/words.ts';
+
+const TRIES = 2000; // of k chunks, in all codewords together
 
 const POWERS = new Uint8Array(510);
 const LOGARITHMS = new Uint8Array(256);
@@ -33,8 +36,13 @@ export interface Codewords {
   readonly width: number;
 }
 
-/** The data from numbered chunks in any order. Raises InputError where too few are left. */
-export function decoded({ count, n, k, width }: Codewords, chunks: Iterable<readonly [number, Uint8Array]>): Uint8Array {
+/**
+ * The data from numbered chunks in any order. `errors`: some may be there by chance. Raises InputError where too few are
+ * left.
+ */
+export function decoded(
+  { count, n, k, width }: Codewords, chunks: Iterable<readonly [number, Uint8Array]>, errors = false,
+): Uint8Array {
   const left = new Map<number, Uint8Array | null>(); // null: of different chunks with one number, one is there by chance
   for (const [number, chunk] of chunks) {
     const other = left.get(number);
@@ -43,17 +51,38 @@ export function decoded({ count, n, k, width }: Codewords, chunks: Iterable<read
   }
   if (left.size < count * k) throw tooMuchLost(); // before there is memory for that many
   const data = new Uint8Array(count * k * width);
+  let tries = errors ? TRIES : 0;
   for (let codeword = 0; codeword < count; codeword++) {
     const rows = new Map<number, Uint8Array>();
     for (let row = 0; row < n; row++) {
       const chunk = left.get(row * count + codeword);
       if (chunk) rows.set(row, chunk);
     }
-    const found = decodeCodeword(rows, k, n);
+    let found = decodeCodeword(rows, k, n);
+    // No other codeword has as many chunks that agree as one that at most half of those beyond k disagree with.
+    while (found && tries > 0 && disagreeing(found, rows, n) > (rows.size - k) / 2) {
+      const order = new Map([...rows.keys()].map((row) => [row, mix(row, tries)[1]]));
+      const some = [...rows].sort(([a], [b]) => order.get(a)! - order.get(b)!).slice(0, k);
+      found = decodeCodeword(new Map(some), k, n);
+      tries--;
+    }
     if (found === null) throw tooMuchLost();
     found.forEach((row, index) => data.set(row, (index * count + codeword) * width));
   }
   return data;
+}
+
+/** How many rows are not those of the codeword of some data. */
+function disagreeing(data: Uint8Array[], rows: Map<number, Uint8Array>, n: number): number {
+  const matrix = parityMatrix(data.length, n);
+  let found = 0;
+  for (const [index, row] of rows) {
+    const left = row.slice();
+    if (index < data.length) addMultiple(left, 1, data[index]);
+    else data.forEach((own, column) => addMultiple(left, matrix[index - data.length][column], own));
+    if (left.some((each) => each !== 0)) found++;
+  }
+  return found;
 }
 
 /** The k data rows from any k rows of a codeword of n, by their number; null if there are fewer. */
@@ -89,8 +118,11 @@ function decodeCodeword(rows: Map<number, Uint8Array>, k: number, n: number): Ui
   return data;
 }
 
+let latest = { k: 0, n: 0, matrix: [] as Uint8Array[] };
+
 /** [n - k][k]: column i is x^(n-1-i) modulo the generator polynomial. */
 function parityMatrix(k: number, n: number): Uint8Array[] {
+  if (latest.k === k && latest.n === n) return latest.matrix;
   const size = n - k;
   let generator = new Uint8Array(size + 1); // of the highest power first
   generator[0] = 1;
@@ -108,5 +140,6 @@ function parityMatrix(k: number, n: number): Uint8Array[] {
     for (let at = 0; at < size; at++) next[at] = (remainder[at + 1] ?? 0) ^ product(lead, generator[at + 1]);
     remainder = next;
   }
+  latest = { k, n, matrix };
   return matrix;
 }

@@ -1,15 +1,20 @@
 /** A model as one string of bytes; `keyss.methods.records.whole` on the other side. */
-import { unpackedZstd, viewOf } from '../core/bytes.ts';
+import { viewOf } from '../core/bytes.ts';
 import { damaged } from '../core/errors.ts';
 import { coefficients, emptyGaussians, type Gaussians } from '../core/gaussians.ts';
-import { Codec, type Layout, putColours } from './codec.ts';
+import { putColours } from './codec.ts';
+import { decodeTable } from './entropy.ts';
 
 const ALWAYS = 1 << 16; // Gaussians, whatever announces them
 const MIN_BYTES = 2; // of each Gaussian in larger models
-const HEAD_BYTES = 9; // Gaussians (4), SH degree (1), step of harmonics (4)
+const HEAD_BYTES = 49; // Gaussians (4), SH degree (1), centres (20), steps (24)
+const [MAX_CENTRE, MAX_STEP] = [1e30, 1e6];
+const DIFFERENCE = 1.5; // steps of differences of constant colours, in those of their brightness
 const PER_OCTAVE = 0.5 / Math.LN2; // half octaves of the step
 const FINER = 6; // half octaves by which a step is finer or coarser, at most
-const [FIRST_POSITION, AFTER_POSITIONS] = [3, 6]; // among the parts of a layout
+const LEAST_W = 1 / 16; // its square
+// Of x, y, z, log scales, opacity, colours and quaternion; harmonics have two more groups and no shares.
+const [SHARES, GROUPS] = [[8, 8, 8, 2, 2, 2, 2, 6, 6, 6, 0, 0, 0], [0, 0, 0, 1, 1, 1, 2, 3, 4, 4, 5, 5, 5]];
 
 /**
  * The model, read from a model of `carriers` Gaussians. Raises InputError for damage. Above 2^16 Gaussians, each takes
@@ -18,61 +23,42 @@ const [FIRST_POSITION, AFTER_POSITIONS] = [3, 6]; // among the parts of a layout
 export function decodeWhole(data: Uint8Array, carriers: number): Gaussians {
   if (data.length < HEAD_BYTES) throw damaged();
   const view = viewOf(data);
-  const [count, shDegree, step] = [view.getUint32(0, true), data[4], view.getFloat32(5, true)];
-  const codec = Codec.unpack(data.subarray(HEAD_BYTES));
+  const [count, shDegree] = [view.getUint32(0, true), data[4]];
+  const numbers = Array.from({ length: 11 }, (_, at) => view.getFloat32(5 + 4 * at, true));
+  const [centres, steps] = [numbers.slice(0, 5), numbers.slice(5)];
   const largest = Math.max(ALWAYS, Math.min(Math.floor(data.length / MIN_BYTES), carriers));
-  const possible = count > 0 && count <= largest && shDegree <= 3 && step > 0 && step < 1;
-  if (!possible || codec.shDegree !== 0) throw damaged();
-  const { layout } = codec;
-  const own = layout.reduce((sum, [columns, bits]) => sum + columns * Math.ceil(bits / 8), 0);
-  const harmonics = coefficients(shDegree) - 1;
-  const packed = data.subarray(HEAD_BYTES + Codec.packedSize(0));
-  const planes = unpackedZstd(packed, count * (own + 3 * harmonics));
-  const found = emptyGaussians(count, shDegree);
-  const columns = columnsOf(planes, layout, count);
-  const codes = new Uint32Array(columns.length);
-  for (let row = 0; row < count; row++) {
-    for (let column = 0; column < codes.length; column++) codes[column] = columns[column][row];
-    codec.put(found, row, codes);
+  const centred = centres.every((each) => Math.abs(each) < MAX_CENTRE);
+  const bounded = centred && steps.every((each) => each > 0 && each <= MAX_STEP);
+  if (!(count > 0 && count <= largest && shDegree <= 3 && bounded)) throw damaged();
+  const k = coefficients(shDegree);
+  const [shares, groups] = [[...SHARES], [...GROUPS]];
+  for (let each = 1; each < k; each++) {
+    shares.push(0, 0, 0);
+    groups.push(6, 7, 7);
   }
-  putHarmonics(found, new Int8Array(planes.buffer, own * count), step);
-  return found;
-}
-
-/** Codes [N] of each column: planes hold the lowest bytes of a column, then the higher ones. */
-function columnsOf(planes: Uint8Array, layout: Layout, count: number): Uint32Array[] {
-  const found: Uint32Array[] = [];
-  let at = 0;
-  layout.forEach(([columns, bits], index) => {
-    const mask = 2 ** bits - 1;
-    for (let column = 0; column < columns; column++) {
-      const codes = new Uint32Array(count);
-      for (let shift = 0; shift < bits; shift += 8) {
-        for (let row = 0; row < count; row++) codes[row] |= planes[at++] << shift;
-      }
-      if (index >= FIRST_POSITION && index < AFTER_POSITIONS) { // the differences from one to the next
-        for (let row = 1; row < count; row++) codes[row] += codes[row - 1];
-      }
-      for (let row = 0; row < count; row++) codes[row] &= mask;
-      found.push(codes);
+  const table = decodeTable(data.subarray(HEAD_BYTES), count, shares, groups);
+  const found = emptyGaussians(count, shDegree);
+  const [means, scales, opacity, colours, quats, harmonics] = steps;
+  for (let row = 0; row < count; row++) {
+    for (let axis = 0; axis < 3; axis++) {
+      found.means[3 * row + axis] = table[axis][row] * means + centres[axis];
+      found.logScales[3 * row + axis] = table[3 + axis][row] * scales + centres[3];
+    }
+    found.opacityLogits[row] = table[6][row] * opacity + centres[4];
+  }
+  finerSteps(found).forEach((finer, row) => {
+    const scale = (step: number): number => step * (finer % 2 ? Math.SQRT2 : 1) * 2 ** -Math.floor((finer + 1) / 2);
+    const [x, y, z] = [10, 11, 12].map((column) => table[column][row] * scale(quats));
+    found.quats.set([Math.sqrt(Math.max(1 - (x * x + y * y + z * z), LEAST_W)), x, y, z], 4 * row);
+    const own = scale(harmonics);
+    for (let each = 0; each < k; each++) {
+      const first = each ? 10 + 3 * each : 7;
+      const [bright, different] = each ? [own, own] : [colours, colours * DIFFERENCE];
+      const [a, b, c] = [table[first][row] * bright, table[first + 1][row] * different, table[first + 2][row] * different];
+      putColours(found.sh, 3 * (k * row + each), a, b, c);
     }
   });
   return found;
-}
-
-/** `codes` [K - 1, 3, N]: of each coefficient above degree 0 brightness and two differences, equal steps together. */
-function putHarmonics(to: Gaussians, codes: Int8Array, step: number): void {
-  const { count, shDegree, sh } = to;
-  const k = coefficients(shDegree);
-  const finer = finerSteps(to);
-  const rows = Array.from(finer.keys()).sort((a, b) => finer[a] - finer[b]); // equal ones stay in their order
-  for (let each = 1; each < k; each++) {
-    const [a, b, c] = [0, 1, 2].map((value) => codes.subarray(count * (3 * (each - 1) + value)));
-    rows.forEach((row, at) => {
-      const own = step * (finer[row] % 2 ? Math.SQRT2 : 1) * 2 ** -Math.floor((finer[row] + 1) / 2);
-      putColours(sh, 3 * (k * row + each), a[at] * own, b[at] * own, c[at] * own);
-    });
-  }
 }
 
 /** [N] half octaves by which the steps of each Gaussian are finer than those of the middle one, by area and opacity. */

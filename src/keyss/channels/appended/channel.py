@@ -3,7 +3,7 @@
 They survive every publication format, and moving, rotating and scaling of the whole model. Everybody sees
 that they are there; reading them takes the key. A payload is encrypted as a whole (ChaCha20-Poly1305 under a
 key that Argon2id gives with the file's salt), cut into packets, and given parity by Reed-Solomon in codewords
-of at most 255 packets, any 150 of which suffice. Every packet is a Gaussian. A header tells how many
+of at most 255 packets, any 159 of which suffice. Every packet is a Gaussian. A header tells how many
 codewords there are and how many of their packets hold data.
 """
 
@@ -21,6 +21,7 @@ from keyss.channels.appended import packets, pilots
 from keyss.channels.appended.lattice import (
     all_shifts,
     colours_of,
+    in_order,
     in_own_frame,
     invariants_of,
     is_candidate,
@@ -31,7 +32,6 @@ from keyss.channels.appended.lattice import (
     scales_at,
     to_gaussians,
 )
-from keyss.channels.appended.packets import NUMBER_BITS, PACKET_BYTES
 from keyss.channels.base import (
     METHOD_BYTES,
     Channel,
@@ -52,11 +52,13 @@ from keyss.keys.derivation import SALT_BYTES, DerivedKey, expand, stream
 from keyss.keys.encryption import OVERHEAD, compressed_size, decrypt, encrypt
 
 _DATA_BITS = 8  # of a header: packets of a codeword that hold data
-_MAX_DATA = 150
-_MAX_CODEWORDS = min(1 << NUMBER_BITS - _DATA_BITS, (1 << NUMBER_BITS) // MAX_CHUNKS) - 1
+_MAX_DATA = 159
+_MAX_CODEWORDS = (1 << packets.HEADER_BITS - _DATA_BITS) - 1
 # A quarter of the packets may be lost, and some of the others garbled, with so many deviations more.
-_LEFT, _DEVIATIONS = 0.72, 4.5
-MAX_BYTES = _MAX_CODEWORDS * _MAX_DATA * PACKET_BYTES - OVERHEAD - METHOD_BYTES
+_LEFT, _DEVIATIONS = 0.74, 4.2
+# Bytes of a packet: the longer its tag, the fewer words of others pass for packets.
+_WIDE, _NARROW, _WIDE_CODEWORDS = 8, 7, 512
+MAX_BYTES = _MAX_CODEWORDS * _MAX_DATA * _NARROW - OVERHEAD - METHOD_BYTES
 _OVERHEAD = 128  # bytes of a payload beside its data, at most
 
 # Gaussians in which pilots are counted; places of the lattice that are tried then, with so many deviations
@@ -85,7 +87,7 @@ class Appended(Channel):
 
     def appended(self, size: int) -> int:
         """Gaussians that a payload of `size` compressed bytes takes, alone in a model."""
-        own = packets.HEADERS + _codewords_for(size).chunks
+        own = packets.HEADERS + _codewords_for(size, alone=True).chunks
         return own + pilots.count_for(own)
 
 
@@ -112,9 +114,10 @@ class AppendedCover:
         check_keys([key.verifier() for key in keys])
         if len(keys) > 1:
             warnings.warn(_NOTICED, KeyssWarning, stacklevel=2)
-        words = [_words(*each, random) for each in zip(keys, packed, strict=True)]
+        alone = len(keys) == 1
+        words = [_words(*each, alone, random) for each in zip(keys, packed, strict=True)]
         words.append(pilots.write(salt, pilots.count_for(sum(map(len, words))), random))
-        every = np.concatenate(words)[random.permutation(sum(map(len, words)))]
+        every = in_order(np.concatenate(words))
         model = self.cover.detach().to("cpu")
         return Gaussians.cat([model, to_gaussians(every, own_frame(model), model.sh_degree)])
 
@@ -150,31 +153,32 @@ class AppendedReader(SaltedReader):
 
     def extract(self, key: DerivedKey) -> Payload:
         """`open` after key derivation."""
-        header = packets.read_header(key.expand("appended/header", 32), self.words)
-        count, k = divmod(header or 0, 1 << _DATA_BITS)
-        if not (0 < count <= _MAX_CODEWORDS and 0 < k <= _MAX_DATA):
-            raise WrongKeyError()
-        codewords = _codewords(count, k)
-        numbers, data = packets.read(key.expand("appended/packets", 32), self.words)
-        encrypted = codewords.decode(numbers.astype(np.int64), data)
-        return unpack_payload(decrypt(key.expand("appended/data", 32), encrypted, _ASSOCIATED))
+        for width in (_WIDE, _NARROW):
+            header = packets.read_header(key.expand(f"appended/header/{width}", 32), self.words, width)
+            count, k = divmod(header or 0, 1 << _DATA_BITS)
+            if count > 0 and 0 < k <= _MAX_DATA:
+                numbers, data = packets.read(key.expand("appended/packets", 32), self.words, width)
+                encrypted = _codewords(count, k, width).decode(numbers.astype(np.int64), data, errors=True)
+                return unpack_payload(decrypt(key.expand("appended/data", 32), encrypted, _ASSOCIATED))
+        raise WrongKeyError()
 
 
-def _codewords_for(size: int) -> Codewords:
+def _codewords_for(size: int, alone: bool) -> Codewords:
     """The codewords of `size` bytes of compressed payload. Raises UsageError for more than fit."""
-    needed = -(-(size + OVERHEAD) // PACKET_BYTES)
-    count = -(-needed // _MAX_DATA)
-    if count > _MAX_CODEWORDS:
-        raise UsageError(f"the secret takes {size:,} bytes, and {MAX_BYTES:,} can be appended")
-    return _codewords(count, -(-needed // count))
+    for width, most in ((_WIDE, _WIDE_CODEWORDS * alone), (_NARROW, _MAX_CODEWORDS)):
+        needed = -(-(size + OVERHEAD) // width)
+        count = -(-needed // _MAX_DATA)
+        if count <= most:
+            return _codewords(count, -(-needed // count), width)
+    raise UsageError(f"the secret takes {size:,} bytes, and {MAX_BYTES:,} can be appended")
 
 
-def _codewords(count: int, data: int) -> Codewords:
+def _codewords(count: int, data: int, width: int) -> Codewords:
     """Codewords so long that enough of their packets are left."""
     length = data
     while length * _LEFT - _DEVIATIONS * math.sqrt(length * _LEFT * (1 - _LEFT)) < data:
         length += 1
-    return Codewords(count, min(length, MAX_CHUNKS), data, PACKET_BYTES)
+    return Codewords(count, min(length, MAX_CHUNKS), data, width)
 
 
 def _shifts_with_pilots(steps: Doubles, colours: Integers) -> Iterator[float]:
@@ -187,15 +191,16 @@ def _shifts_with_pilots(steps: Doubles, colours: Integers) -> Iterator[float]:
             yield float(shifts[index])
 
 
-def _words(key: DerivedKey, packed: bytes, random: np.random.Generator) -> Bits:
-    """[N, WORD_BITS] header and packets of one secret."""
-    codewords = _codewords_for(compressed_size(packed))
+def _words(key: DerivedKey, packed: bytes, alone: bool, random: np.random.Generator) -> Bits:
+    """[N, WORD_BITS] header and packets of one secret; `alone`: there is no other."""
+    codewords = _codewords_for(compressed_size(packed), alone)
+    width = codewords.width
     encrypted = encrypt(key.expand("appended/data", 32), packed, _ASSOCIATED, size=codewords.size)
     header = codewords.count << _DATA_BITS | codewords.k
     numbers = np.arange(codewords.chunks, dtype=np.uint64)
     return np.concatenate(
         [
-            packets.write_header(key.expand("appended/header", 32), header, random),
+            packets.write_header(key.expand(f"appended/header/{width}", 32), header, width, random),
             packets.write(key.expand("appended/packets", 32), numbers, codewords.encode(encrypted)),
         ]
     )

@@ -21,6 +21,7 @@ from torch import Tensor
 from keyss.core.arrays import Bits, Doubles, Flags, Integers, Words, doubles
 from keyss.core.gaussians import DRAWN_OPACITY, Gaussians
 from keyss.core.similarity import Similarity
+from keyss.files.formats.common import with_largest_w
 
 COLOUR_BITS, SCALE_BITS, POSITION_BITS, TURN_BITS = 7, 6, 10, 5
 INVARIANT_BITS = 3 * (COLOUR_BITS + SCALE_BITS)
@@ -55,13 +56,22 @@ def is_appended(model: Gaussians) -> Tensor:
 
 
 def own_frame(model: Gaussians) -> Similarity:
-    """From the own frame to the world: its unit cube becomes as large as most of the model."""
+    """From the own frame to the world: its unit cube becomes about as large as most of the model.
+
+    Size and place are such that coordinates of lattice points have few digits, which `.spz` packs better.
+    """
     means = doubles(model.means)
     means = means[np.isfinite(means).all(axis=1)]
     low, high = np.quantile(means, [0.05, 0.95], axis=0) if len(means) else np.zeros((2, 3))
     size = float((high - low).max())
-    size = size if 0 < size < math.inf else 1.0
-    return Similarity(size, translation=torch.from_numpy((low + high) / 2 - size / 2))
+    size = 2.0 ** round(math.log2(size)) if 0 < size < math.inf else 1.0
+    step = size / 2**POSITION_BITS
+    return Similarity(size, translation=torch.from_numpy(np.rint((low + high - size) / 2 / step) * step))
+
+
+def in_order(words: Bits) -> Bits:
+    """`words` by their positions, x first, which `.spz` packs better than any other order."""
+    return words[np.lexsort(words[:, INVARIANT_BITS : INVARIANT_BITS + 3 * POSITION_BITS].T[::-1])]
 
 
 def to_gaussians(words: Bits, to_world: Similarity, sh_degree: int) -> Gaussians:
@@ -121,7 +131,7 @@ def in_own_frame(model: Gaussians, to_own: Similarity) -> Integers:
     """[N, 6] the nearest lattice points of positions and turns; `to_own`: from the world."""
     own = to_own.apply_gaussians(model.with_sh_degree(0))
     positions = own.means.double().numpy() * 2**POSITION_BITS - 0.5
-    parts = _with_largest_w(own.quats.double().numpy())[:, 1:]
+    parts = with_largest_w(own.quats.double().numpy())[:, 1:]
     turns = (parts + _TURNS_REACH) / (2 * _TURNS_REACH) * 2**TURN_BITS - 0.5
     return np.concatenate([_nearest(positions, POSITION_BITS), _nearest(turns, TURN_BITS)], axis=1)
 
@@ -155,20 +165,6 @@ def bits_of(numbers: Words, count: int) -> Bits:
     """[N, count] the inverse of `number`."""
     shifts = np.arange(count, dtype=np.uint64)[::-1]
     return (numbers[:, None] >> shifts & np.uint64(1)).astype(np.uint8)
-
-
-def _with_largest_w(quats: Doubles) -> Doubles:
-    """[N, 4] unit quaternions of the same ellipsoids, wxyz, whose largest part is w.
-
-    Half a turn about one of its axes leaves an ellipsoid as it is, and some programs add one.
-    """
-    quats = quats / np.linalg.norm(quats, axis=1, keepdims=True).clip(1e-30)
-    largest = np.abs(quats).argmax(axis=1)
-    order = np.array([[0, 1, 2, 3], [1, 0, 3, 2], [2, 3, 0, 1], [3, 2, 1, 0]])  # of q, q i, q j, q k
-    signs = np.array([[1, 1, 1, 1], [-1, 1, 1, -1], [-1, -1, 1, 1], [-1, 1, -1, 1]])
-    turned = np.take_along_axis(quats, order[largest], 1) * signs[largest]
-    found: Doubles = turned * np.where(turned[:, :1] < 0, -1.0, 1.0)
-    return found
 
 
 def _split(words: Bits) -> list[Doubles]:

@@ -1,64 +1,53 @@
-"""Packets: 6 bytes and their number, in words that look random without the key.
+"""Packets: some bytes and their number, in words that look random without the key.
 
-A word is 48 bits of data and 36 bits of tag: a number of 20 bits and 16 bits of its hash, masked with the
-AES-256 encryption of the data under the packets' key. The key tells which words are packets (one in 65,536
-others passes), and their numbers. The data of a secret are encrypted before they come here.
+A word is the data, of 7 or 8 bytes, and a tag: the packet's number in all bits that are left, masked with the
+AES-256 encryption of the data under the packets' key. Under the right key packets have the numbers that there
+are, and other words hardly ever; the few that do are found by the code over all packets. The data of a secret
+are encrypted before they come here.
 """
 
 from __future__ import annotations
 
-from collections import Counter
-
 import numpy as np
 
 from keyss.channels.appended.lattice import WORD_BITS, bits_of, number
-from keyss.channels.mixing import encrypted_blocks, mixed
+from keyss.channels.mixing import encrypted_blocks
 from keyss.core.arrays import Bits, Bytes, Words
 
-PACKET_BYTES = 6
-NUMBER_BITS = 20
 HEADERS = 40  # copies of a header
-_DATA_BITS = 8 * PACKET_BYTES
-_CHECK_BITS = WORD_BITS - _DATA_BITS - NUMBER_BITS
-_AGREEING_HEADERS = 3  # one or two may be there by chance
+HEADER_BITS = 20
+_AGREEING_HEADERS = 12  # fewer may agree by chance among a million words
 
 
 def write(key: bytes, numbers: Words, data: Bytes) -> Bits:
-    """[N, WORD_BITS] words of packets with `numbers` [N] and `data` [N, PACKET_BYTES]; a key of 32 bytes."""
-    tags = _masks(key, data) ^ (numbers << np.uint64(_CHECK_BITS) | _checks(numbers))
-    return np.concatenate([np.unpackbits(data, axis=1), bits_of(tags, NUMBER_BITS + _CHECK_BITS)], axis=1)
+    """[N, WORD_BITS] words of packets with `numbers` [N] and `data` [N, width]; a key of 32 bytes."""
+    tag_bits = WORD_BITS - 8 * data.shape[1]
+    tags = bits_of(_masks(key, data, tag_bits) ^ numbers, tag_bits)
+    return np.concatenate([np.unpackbits(data, axis=1), tags], axis=1)
 
 
-def read(key: bytes, words: Bits) -> tuple[Words, Bytes]:
-    """Numbers [P] and data [P, PACKET_BYTES] of the packets among words [N, WORD_BITS]."""
-    data = np.packbits(words[:, :_DATA_BITS], axis=1)
-    tags = number(words[:, _DATA_BITS:]) ^ _masks(key, data)
-    numbers = tags >> np.uint64(_CHECK_BITS)
-    own = tags & np.uint64((1 << _CHECK_BITS) - 1) == _checks(numbers)
-    return numbers[own], data[own]
+def read(key: bytes, words: Bits, width: int) -> tuple[Words, Bytes]:
+    """Numbers [N] and data [N, width] of words [N, WORD_BITS] as if all were packets."""
+    data = np.packbits(words[:, : 8 * width], axis=1)
+    tags = words[:, 8 * width :]
+    return number(tags) ^ _masks(key, data, tags.shape[1]), data
 
 
-def write_header(key: bytes, value: int, random: np.random.Generator) -> Bits:
-    """[HEADERS, WORD_BITS] words that tell the holder of the key a number of NUMBER_BITS."""
-    data = random.integers(0, 256, (HEADERS, PACKET_BYTES), np.uint8)
+def write_header(key: bytes, value: int, width: int, random: np.random.Generator) -> Bits:
+    """[HEADERS, WORD_BITS] words that tell the holder of the key a number of HEADER_BITS."""
+    data = random.integers(0, 256, (HEADERS, width), np.uint8)
     return write(key, np.full(HEADERS, value, np.uint64), data)
 
 
-def read_header(key: bytes, words: Bits) -> int | None:
+def read_header(key: bytes, words: Bits, width: int) -> int | None:
     """The number that most headers tell; None where there are too few."""
-    votes = Counter(read(key, words)[0].tolist())
-    value, count = votes.most_common(1)[0] if votes else (0, 0)
-    return value if count >= _AGREEING_HEADERS else None
+    numbers, _ = read(key, words, width)
+    votes = np.bincount(numbers[numbers < 1 << HEADER_BITS].astype(np.int64), minlength=1)
+    return int(votes.argmax()) if votes.max() >= _AGREEING_HEADERS else None
 
 
-def _checks(numbers: Words) -> Words:
-    """[N] the check bits of numbers."""
-    return mixed(numbers) >> np.uint64(64 - _CHECK_BITS)
-
-
-def _masks(key: bytes, data: Bytes) -> Words:
+def _masks(key: bytes, data: Bytes, bits: int) -> Words:
     """[N] the masks of tags."""
     blocks = np.zeros((len(data), 16), np.uint8)
-    blocks[:, :PACKET_BYTES] = data
-    shift = np.uint64(64 - NUMBER_BITS - _CHECK_BITS)
-    return encrypted_blocks(key, blocks).view(">u8")[:, 0].astype(np.uint64) >> shift
+    blocks[:, : data.shape[1]] = data
+    return encrypted_blocks(key, blocks).view(">u8")[:, 0].astype(np.uint64) >> np.uint64(64 - bits)

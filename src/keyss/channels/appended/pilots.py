@@ -28,7 +28,7 @@ from keyss.core.similarity import Similarity
 from keyss.keys.derivation import SALT_BYTES
 
 MIN = 128  # pilots of a model
-SHARE = 1 / 16  # of the other appended Gaussians
+SHARE = 1 / 32  # of the other appended Gaussians
 _PUBLIC = np.uint64(0x6B65797373_617070)  # distinguishes this hash from others
 ONE_IN = 64  # one in so many random words is a pilot
 _PART_BITS, _PARTS = 16, SALT_BYTES // 2

@@ -221,6 +221,20 @@ def unit(quats: Numbers) -> Doubles:
     return found
 
 
+def with_largest_w(quats: Doubles) -> Doubles:
+    """[N, 4] unit quaternions of the same ellipsoids, wxyz, whose largest part is w.
+
+    Half a turn about one of its axes leaves an ellipsoid as it is, and some programs add one.
+    """
+    quats = quats / np.linalg.norm(quats, axis=1, keepdims=True).clip(1e-30)
+    largest = np.abs(quats).argmax(axis=1)
+    order = np.array([[0, 1, 2, 3], [1, 0, 3, 2], [2, 3, 0, 1], [3, 2, 1, 0]])  # of q, q i, q j, q k
+    signs = np.array([[1, 1, 1, 1], [-1, 1, 1, -1], [-1, -1, 1, 1], [-1, 1, -1, 1]])
+    turned = np.take_along_axis(quats, order[largest], 1) * signs[largest]
+    found: Doubles = turned * np.where(turned[:, :1] < 0, -1.0, 1.0)
+    return found
+
+
 def smallest_three(quats: Doubles) -> tuple[Bytes, Doubles]:
     """The index of the largest component [N] of unit quaternions [N, 4], and the others [N, 3] in order.
 

@@ -11,39 +11,43 @@ from keyss.core.arrays import Integers
 from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.files.formats.common import in_morton_order
-from keyss.methods.records.lines import Table
-from keyss.methods.records.whole import MAX_BITS, USUAL_BITS, Precision, decode, encode
+from keyss.methods.records.whole import Precision, decode, encode
 from keyss.rendering.difference import Viewpoints, psnr_between
 
 _GOOD_ENOUGH = 44.0  # dB of renders against those of the model: photos at 30 dB lose 0.2
-# PSNR of each attribute alone, until they are good enough together, and what is added to it: more for
-# opacities, which are one number of a Gaussian instead of three, and less for harmonics, which are many.
-_GOALS, _BIT = range(47, 61), 6.02  # dB
-_ATTRIBUTES, _SHARES = ("means", "log_scales", "quats", "opacity_logits"), (0, 0, 0, 4.8, 0, -8)
-_FEWEST, _MAX = (8, 4, 4, 4, 4), 20  # bits
+_ATTRIBUTES = ("means", "log_scales", "opacity_logits", "colours", "quats", "harmonics")
+# Shares of the squared error: the counts of numbers, of harmonics those that are not zero. At the least
+# total, a finer step costs each attribute as many bits for what it gains.
+_SHARES = (3, 3, 1, 3, 3, 18)
+_TRIES, _CLOSE, _BIT = 6, 0.15, 6.02  # dB
 _COARSEST = 0.1  # step of harmonics: from afar, where renders are compared, their errors do not show
+_FINEST = 2.0  # octaves below the usual steps: about 58 dB
+_BITS_OF_OCTAVE = 13  # of a Gaussian, harmonics not counted
 
 
 def good_enough(model: Gaussians, viewpoints: Viewpoints | None = None) -> Precision:
     """The coarsest precision whose renders are good enough, estimated with few renders.
 
-    The cost of each attribute alone is measured once, and one bit is 6 dB. The total is least when the
-    squared error of each attribute is in proportion to its count of numbers.
+    The cost of each attribute alone is measured once; then all steps are scaled together.
     """
-    table, step = Precision.of_size(Table.short().total)
-    rough = decode(encode(model, Precision(table, step)))
+    rough = Precision.usual(model).finer(-1)
     model = in_morton_order(model)
-    constant = replace(model, sh=torch.cat([rough.sh[:, :1], model.sh[:, 1:]], 1))
-    harmonics = replace(model, sh=torch.cat([model.sh[:, :1], rough.sh[:, 1:]], 1))
-    changed = [replace(model, **{name: getattr(rough, name)}) for name in _ATTRIBUTES]
-    psnrs = [psnr_between(model, each, viewpoints) for each in (*changed, constant, harmonics)]
-    for goal in _GOALS:
-        missing = [goal + more - each for more, each in zip(_SHARES, psnrs, strict=True)]
-        bits = (each + math.ceil(dB / _BIT) for each, dB in zip(table.bits, missing, strict=False))
-        found = Table(tuple(min(max(each, least), _MAX) for each, least in zip(bits, _FEWEST, strict=True)))
-        precision = Precision(found, min(_COARSEST, step * 10 ** (-missing[-1] / 20)))
-        if psnr_between(model, decode(encode(model, precision)), viewpoints) >= _GOOD_ENOUGH:
+    other = decode(encode(model, rough))
+    constant = replace(model, sh=torch.cat([other.sh[:, :1], model.sh[:, 1:]], 1))
+    harmonics = replace(model, sh=torch.cat([model.sh[:, :1], other.sh[:, 1:]], 1))
+    changed = {"colours": constant, "harmonics": harmonics}
+    steps = []
+    for name, step, share in zip(_ATTRIBUTES, rough.steps, _SHARES, strict=True):
+        one = changed.get(name) or replace(model, **{name: getattr(other, name)})
+        goal = _GOOD_ENOUGH - 10 * math.log10(share / sum(_SHARES))
+        coarsest = _COARSEST if name == "harmonics" else 2 * step
+        steps.append(min(step * 10 ** ((psnr_between(model, one, viewpoints) - goal) / 20), coarsest))
+    precision = Precision(*steps)
+    for _ in range(_TRIES):
+        more = psnr_between(model, decode(encode(model, precision)), viewpoints) - _GOOD_ENOUGH
+        if 0 <= more < _CLOSE:
             break
+        precision = precision.finer((_CLOSE / 2 - more) / _BIT)
     return precision
 
 
@@ -75,11 +79,12 @@ def fitted(
         raise UsageError(
             f"a secret of {len(model):,} Gaussians takes {len(usual):,} bytes, and there is room for {room:,}"
         )
-    more = 8 * (room - len(usual)) // len(model)
-    for bits in range(min(MAX_BITS, USUAL_BITS + more), USUAL_BITS, -2):
-        data = encode(model, Precision.of_size(bits))
+    octaves = min(_FINEST, 8 * (room - len(usual)) / len(model) / _BITS_OF_OCTAVE)
+    while octaves > 0:
+        data = encode(model, Precision.usual(model).finer(octaves))
         if len(data) <= room:
             return data
+        octaves -= 0.125
     return usual
 
 

@@ -79,7 +79,7 @@ class Codec:
             left_out[:, None].astype(np.uint32),
             _QUAT_LINE.encode(three, self.table.bits[2]),
         ]
-        every = zip(self.lines, _bits(self.table), _numbers(gaussians), strict=True)
+        every = zip(self.lines, _bits(self.table), numbers_of(gaussians), strict=True)
         return columns + [line.encode(values, bits, outlier) for line, bits, values in every]
 
     def gaussians(self, codes: Sequence[Words32]) -> Gaussians:
@@ -167,11 +167,11 @@ def outliers(gaussians: Gaussians) -> Flags:
 def _bulk(gaussians: Gaussians) -> tuple[Flags, list[tuple[Doubles, Doubles, Doubles]]]:
     """The `outliers` [N]; for each line a sample of the bulk's numbers, and extents of bulk and outliers."""
     found, every = np.zeros(len(gaussians), bool), max(1, len(gaussians) // _SAMPLE)
-    sample = list(_numbers(gaussians[::every]))
+    sample = list(numbers_of(gaussians[::every]))
     ends = list(map(neighbourhood, sample, _kinds(gaussians.sh_degree)))
 
     def judge(start: int, stop: int) -> list[list[tuple[float, float]]]:
-        numbers, own = list(_numbers(gaussians[start:stop])), found[start:stop]
+        numbers, own = list(numbers_of(gaussians[start:stop])), found[start:stop]
         for values, (least, largest) in zip(numbers, ends, strict=True):
             own |= ((values < least) | (values > largest)).any(axis=1)
         parts = ((values[~own], values[own]) for values in numbers)
@@ -201,7 +201,7 @@ def _bits(table: Table) -> list[int]:
     return [means, means, means, log_scales, opacity, *harmonics]
 
 
-def _numbers(gaussians: Gaussians) -> Iterator[Doubles]:
+def numbers_of(gaussians: Gaussians) -> Iterator[Doubles]:
     """[N, count] the numbers of each line.
 
     A Gaussian whose numbers overflow is never rendered: it becomes transparent, because its clamped numbers

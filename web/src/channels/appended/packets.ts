@@ -1,69 +1,66 @@
-/** Packets: 6 bytes, and which ones they are, in words of 84 bits; `keyss.channels.appended.packets` on the other side. */
+/** Packets: some bytes and their number in words of 84 bits; `keyss.channels.appended.packets` on the other side. */
 import { ecb } from '@noble/ciphers/aes.js';
-import { mostFrequent } from '../../core/bytes.ts';
-import { mix } from '../../core/words.ts';
 import type { Codewords } from '../reed_solomon.ts';
 
-const PACKET_BYTES = 6;
-const NUMBER_BITS = 20;
+export const WIDTHS = [8, 7]; // bytes of a packet
 const DATA_BITS = 8; // of a header: packets of a codeword that hold data
-const MAX_DATA = 150;
+const HEADER_BITS = 20;
+const WORD_BYTES = 11;
+const MAX_DATA = 159;
 const MAX_CHUNKS = 255;
-const MAX_CODEWORDS = Math.min(1 << (NUMBER_BITS - DATA_BITS), Math.floor((1 << NUMBER_BITS) / MAX_CHUNKS)) - 1;
-const [LEFT, DEVIATIONS] = [0.72, 4.5]; // of packets that may be relied upon
-const AGREEING_HEADERS = 3; // one or two may be there by chance
+const [LEFT, DEVIATIONS] = [0.74, 4.2]; // of packets that may be relied upon
+const AGREEING_HEADERS = 12; // fewer may agree by chance among a million words
 
-/** N words: 48 bits of data, and 36 of tag. */
+/** N words: bytes, of which the first are data, and a tag in the rest. */
 export interface TaggedWords {
   readonly count: number;
-  readonly blocks: Uint8Array; // [N, 16] data, and zeros up to a block of AES
-  readonly tags: Uint32Array; // [N, 2] the low 32 bits, and the others
+  readonly bytes: Uint8Array; // [N, 11] whose last four bits are zero
 }
 
 /** Words of colours, scales [N, 3] and positions and turns [N, 6]. */
 export function wordsOfPoints(colours: Uint8Array, scales: Uint8Array, others: Uint16Array): TaggedWords {
   const count = colours.length / 3;
-  const [blocks, tags] = [new Uint8Array(16 * count), new Uint32Array(2 * count)];
-  const view = new DataView(blocks.buffer);
+  const bytes = new Uint8Array(WORD_BYTES * count);
+  const view = new DataView(bytes.buffer);
   for (let row = 0; row < count; row++) {
     const [r, g, b] = colours.subarray(3 * row, 3 * row + 3);
     const [u, v, w] = scales.subarray(3 * row, 3 * row + 3);
     const [x, y, z, i, j, k] = others.subarray(6 * row, 6 * row + 6);
-    // 7 + 7 + 7 + 6 + 5 bits, then 1 + 6 + 9: the last bit of x belongs to the tag.
-    view.setUint32(16 * row, (r << 25) | (g << 18) | (b << 11) | (u << 5) | (v >> 1));
-    view.setUint16(16 * row + 4, ((v & 1) << 15) | (w << 9) | (x >> 1));
-    tags[2 * row] = (y << 25) | (z << 15) | (i << 10) | (j << 5) | k;
-    tags[2 * row + 1] = ((x & 1) << 3) | (y >> 7);
+    const at = WORD_BYTES * row;
+    // 7 + 7 + 7 + 6 + 5 bits, then 1 + 6 + 10 + 10 + 5, then 5 + 5 + 5 + 1 and 4.
+    view.setUint32(at, (r << 25) | (g << 18) | (b << 11) | (u << 5) | (v >> 1));
+    view.setUint32(at + 4, ((v & 1) << 31) | (w << 25) | (x << 15) | (y << 5) | (z >> 5));
+    view.setUint16(at + 8, ((z & 31) << 11) | (i << 6) | (j << 1) | (k >> 4));
+    bytes[at + 10] = (k & 15) << 4;
   }
-  return { count, blocks, tags };
+  return { count, bytes };
 }
 
-/** The number of each packet among the words, and its data. */
-export function readPackets(key: Uint8Array, { count, blocks, tags }: TaggedWords): [number, Uint8Array][] {
+/** The number of each word, as if all were packets, and its data. */
+export function readPackets(key: Uint8Array, { count, bytes }: TaggedWords, width: number): [number, Uint8Array][] {
   const found: [number, Uint8Array][] = [];
   if (!count) return found;
+  const blocks = new Uint8Array(16 * count);
+  for (let row = 0; row < count; row++) blocks.set(bytes.subarray(WORD_BYTES * row, WORD_BYTES * row + width), 16 * row);
   const encrypted = ecb(key, { disablePadding: true }).encrypt(blocks); // as a pseudorandom function
-  const view = new DataView(encrypted.buffer, encrypted.byteOffset);
   for (let row = 0; row < count; row++) {
-    const [high, low] = [view.getUint32(16 * row), view.getUint32(16 * row + 4)]; // of which 36 bits are the mask
-    const tag = tags[2 * row] ^ ((high << 4) | (low >>> 28));
-    const number = (((tags[2 * row + 1] ^ (high >>> 28)) << 16) | (tag >>> 16)) >>> 0;
-    if (mix(number)[1] >>> 16 === (tag & 0xffff)) found.push([number, blocks.subarray(16 * row, 16 * row + PACKET_BYTES)]);
+    let tag = 0;
+    for (let byte = 0; byte < WORD_BYTES - width; byte++) {
+      tag = (tag << 8) | (bytes[WORD_BYTES * row + width + byte] ^ encrypted[16 * row + byte]);
+    }
+    found.push([tag >>> 4, blocks.subarray(16 * row, 16 * row + width)]);
   }
   return found;
 }
 
-/** The number that most headers tell; null where there are too few. */
-export function readHeader(key: Uint8Array, words: TaggedWords): number | null {
-  const [value, count] = mostFrequent(readPackets(key, words).map(([number]) => number)) ?? [0, 0];
-  return count >= AGREEING_HEADERS ? value : null;
-}
-
-/** The codewords of a payload; null where no writer would have written this header. */
-export function codewordsOf(header: number): Codewords | null {
+/** The codewords that most headers tell; null where too few agree, or where no writer would have written them. */
+export function readHeader(key: Uint8Array, words: TaggedWords, width: number): Codewords | null {
+  const votes = new Uint32Array(1 << HEADER_BITS);
+  for (const [number] of readPackets(key, words, width)) if (number < votes.length) votes[number]++;
+  const header = votes.reduce((best, each, value) => (each > votes[best] ? value : best), 0);
   const [count, k] = [header >> DATA_BITS, header & ((1 << DATA_BITS) - 1)];
-  if (!(count > 0 && count <= MAX_CODEWORDS && k > 0 && k <= MAX_DATA)) return null;
+  if (!(votes[header] >= AGREEING_HEADERS && count > 0 && k > 0 && k <= MAX_DATA)) return null;
   let n = k;
   while (n * LEFT - DEVIATIONS * Math.sqrt(n * LEFT * (1 - LEFT)) < k) n++;
-  return { count, n: Math.min(n, MAX_CHUNKS), k, width: PACKET_BYTES };
+  return { count, n: Math.min(n, MAX_CHUNKS), k, width };
 }

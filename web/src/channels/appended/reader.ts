@@ -8,7 +8,7 @@ import { decoded } from '../reed_solomon.ts';
 import {
   allShifts, candidates, coloursOf, inOwnFrame, invariantsOf, likelyShifts, scalesAt, scaleSteps,
 } from './lattice.ts';
-import { codewordsOf, readHeader, readPackets, type TaggedWords, wordsOfPoints } from './packets.ts';
+import { readHeader, readPackets, type TaggedWords, WIDTHS, wordsOfPoints } from './packets.ts';
 import { type Found, LEAST, ONE_IN, pilotsOf, readPilots } from './pilots.ts';
 
 // Gaussians in which pilots are counted; places of the lattice that are tried then, with so many deviations more of
@@ -45,11 +45,14 @@ export class AppendedReader implements Reader {
   /** What `key` opens, null for nothing. Raises InputError where too much was lost or changed. */
   async open(key: string, derive: Derive = here): Promise<Payload | null> {
     const secret = await derive(key, this.salt);
-    const [headers, packets, data] = ['header', 'packets', 'data'].map((use) => expand(secret, `appended/${use}`, 32));
-    const header = readHeader(headers, this.words);
-    const codewords = header === null ? null : codewordsOf(header);
-    const found = readPackets(packets, this.words); // also by a key that opens nothing
-    return codewords && unpackPayload(await decrypted(data, decoded(codewords, found), ASSOCIATED));
+    for (const width of WIDTHS) {
+      const codewords = readHeader(expand(secret, `appended/header/${width}`, 32), this.words, width);
+      if (codewords === null) continue;
+      const packets = readPackets(expand(secret, 'appended/packets', 32), this.words, width);
+      const encrypted = decoded(codewords, packets, true);
+      return unpackPayload(await decrypted(expand(secret, 'appended/data', 32), encrypted, ASSOCIATED));
+    }
+    return null;
   }
 }
 
