@@ -44,7 +44,7 @@ class TestHelp:
         assert len(lines) <= 45
         assert max(map(len, lines)) <= 100
         assert [line.split()[0] for line in lines if re.match(r"  [a-z]+ ", line)] == COMMANDS
-        assert len(COMMANDS) == 17
+        assert len(COMMANDS) == 16
 
     @pytest.mark.parametrize("command", COMMANDS)
     def test_shows_an_example(self, keyss: Run, command: str) -> None:

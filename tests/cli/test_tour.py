@@ -47,7 +47,6 @@ def tour(keyss: Run) -> None:
         done(f"evaluate {run} --key-file key.txt")
         done(f"info {run}/publish/stego.ply")
     done("render hidden.ply --cameras b -o images --split all")
-    done("steganalyze images --csv scores.csv")
     done("audit hidden --key-file key.txt --only parameters --controls 2 --device cpu")
     done("audit hidden --report-only")
     done("info hidden --json")

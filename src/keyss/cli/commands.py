@@ -13,7 +13,7 @@ GROUPS = {
     "make": {"demo": "making", "fit": "making", "hide": "hiding", "keygen": "making", "convert": "making"},
     "open": {"reveal": "opening", "verify": "opening"},
     "look": {"view": "looking", "render": "looking", "info": "looking"},
-    "measure": {"evaluate": "measuring", "audit": "measuring", "steganalyze": "measuring"},
+    "measure": {"evaluate": "measuring", "audit": "measuring"},
     "many": {"compare": "many", "reproduce": "many", "sweep": "many"},
     "check": {"doctor": "doctor"},
 }

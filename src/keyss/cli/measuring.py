@@ -1,4 +1,4 @@
-"""The commands that measure: `evaluate`, `audit` and `steganalyze`."""
+"""The commands that measure: `evaluate` and `audit`."""
 
 from __future__ import annotations
 
@@ -106,32 +106,3 @@ def audit(
             "private/audit/audit.json": "the measurements",
         },
     )
-
-
-def steganalyze(
-    folder: Annotated[Positional[Path], arg(metavar="FOLDER", help="Folder of images, preferably PNG.")],
-    *,
-    csv: Annotated[Path, arg(metavar="FILE", help="Table to write, one row per image.")],
-    threshold: Annotated[float, arg(metavar="T", help="Flag images with a higher fused score.")] = 0.2,
-    overwrite: Overwrite = False,
-) -> None:
-    """Detect LSB replacement in images, with the scores of StegExpose.
-
-    example: keyss steganalyze images/ --csv scores.csv
-    """
-    import sys
-
-    from keyss.cli.tables import print_steganalysis
-    from keyss.files.atomic import check_output_file, write_bytes
-    from keyss.measure.stegexpose import csv_bytes, steganalyze as analyze
-    from keyss.progress import reporter
-
-    check_output_file(csv, overwrite)
-    found = analyze(folder, threshold, reporter())
-    write_bytes(csv, csv_bytes(found.rows))
-    print_steganalysis(found)
-    print(f"{csv}: {len(found.rows)} image{'' if len(found.rows) == 1 else 's'}")
-    if found.skipped:
-        # Quoted, because names of files may hold anything.
-        names = ", ".join(map(repr, found.skipped[:5])) + ", ..." * (len(found.skipped) > 5)
-        print(f"keyss: skipped {len(found.skipped)} unreadable images: {names}", file=sys.stderr)

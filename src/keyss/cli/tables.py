@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from keyss.api.converting import Conversion
     from keyss.audits import Audit
     from keyss.many import Forecast, ManyResult
-    from keyss.measure.stegexpose import Steganalysis
     from keyss.methods.base import Plan
     from keyss.runs.config import FitMetrics, HideMetrics
     from keyss.runs.describe import ModelInfo, RunInfo, SceneInfo
@@ -181,14 +180,6 @@ def print_fit(metrics: FitMetrics) -> None:
     quality = (f"{metrics.psnr:.2f}", f"{metrics.ssim:.3f}")
     sizes = (f"{metrics.gaussians:,}", f"{metrics.iterations:,}", f"{metrics.seconds:.0f}")
     print_table(("PSNR", "SSIM", "Gaussians", "iterations", "seconds"), [(*quality, *sizes)], texts=0)
-
-
-def print_steganalysis(found: Steganalysis) -> None:
-    """The number of images, and of those flagged as stego images."""
-    mean = found.mean_fusion
-    flagged = sum(row.flagged for row in found.rows)
-    row = (f"{len(found.rows):,}", f"{flagged:,}", "none" if mean is None else f"{mean:.4f}")
-    print_table(("images", "flagged", "mean fusion"), [row], texts=0)
 
 
 def print_verdicts(audit: Audit) -> None:

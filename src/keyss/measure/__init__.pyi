@@ -66,10 +66,8 @@ from .stealth.judging import judge as judge, stealth_statistics as stealth_stati
 from .stegexpose import (
     Scores as Scores,
     StegExposeAuc as StegExposeAuc,
-    csv_bytes as csv_bytes,
     read_pixels as read_pixels,
     score_image as score_image,
-    steganalyze as steganalyze,
     stegexpose_auc as stegexpose_auc,
 )
 from .two_sample import (

@@ -1,4 +1,4 @@
-"""StegExpose (2014): four detectors of LSB replacement in 8-bit images, their mean, and whole folders.
+"""StegExpose (2014): four detectors of LSB replacement in 8-bit images, and their mean.
 
 An independent implementation that reproduces the original's scores, quirks included. On a renderer's output
 an AUC near 0.5 is expected: nothing replaces the last bits of pixels.
@@ -6,11 +6,9 @@ an AUC near 0.5 is expected: nothing replaces the last bits of pixels.
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -21,9 +19,7 @@ from keyss.core.errors import InputError, UsageError
 from keyss.files.images import open_image
 from keyss.measure.auc import Auc, auc_between
 from keyss.measure.lsb_detectors import chi_square, primary_sets, rs, sample_pairs
-from keyss.progress import Reporter
 
-THRESHOLD = 0.2  # the original's
 # In the order of the original's table.
 DETECTORS = {"primary_sets": primary_sets, "chi_square": chi_square, "sample_pairs": sample_pairs, "rs": rs}
 
@@ -117,86 +113,6 @@ def stegexpose_auc(plain_images: Sequence[Bytes], stego_images: Sequence[Bytes])
         detectors[name] = auc_between(negatives, positives).auc if answers else None
     fused = ([scores.fusion for scores in group] for group in (plain, stego))
     return StegExposeAuc(plain, stego, auc_between(*fused), detectors)
-
-
-@dataclass(frozen=True)
-class Row:
-    """One image: its file name, its scores, and the verdict."""
-
-    file: str
-    scores: Scores
-    flagged: bool  # fusion above the threshold
-    secret_bytes: int  # estimated size of the secret: fusion x size of the file / 3
-
-
-@dataclass(frozen=True)
-class Steganalysis:
-    """The images of a folder by name, and the names of the files that were skipped."""
-
-    rows: list[Row]
-    skipped: list[str]
-
-    @property
-    def mean_fusion(self) -> float | None:
-        """The mean over the images that have one."""
-        fusions = _present(row.scores.fusion for row in self.rows)
-        return sum(fusions) / len(fusions) if fusions else None
-
-
-def steganalyze(
-    folder: Path | str, threshold: float = THRESHOLD, reporter: Reporter | None = None
-) -> Steganalysis:
-    """Scores of all images in `folder`, sorted by name; subfolders are ignored.
-
-    Unreadable files are skipped and listed in the result. Raises InputError if there is no readable image,
-    and UsageError for a threshold outside of [0, 1].
-    """
-    folder = Path(folder)
-    if not 0 <= threshold <= 1:
-        raise UsageError(f"expected a threshold from 0 to 1, got {threshold:g}")
-    paths = _files(folder)
-    rows: list[Row] = []
-    skipped: list[str] = []
-    reporter = reporter or Reporter()
-    reporter.start(f"steganalyze {folder}", len(paths), 0)
-    try:
-        for done, path in enumerate(paths, start=1):
-            try:
-                scores = score_image(read_pixels(path))
-                fusion = next(iter(_present([scores.fusion])), 0.0)
-                size = math.floor(fusion * path.stat().st_size / 3 + 0.5)
-                rows.append(Row(path.name, scores, fusion > threshold, size))
-            except InputError:
-                skipped.append(path.name)
-            reporter.update(done, 0, {})
-    finally:
-        reporter.finish()
-    if not rows:
-        raise InputError(f"{folder}: expected images, but none of its files can be read as one")
-    return Steganalysis(rows, skipped)
-
-
-def csv_bytes(rows: Sequence[Row]) -> bytes:
-    """A table in UTF-8: `null` if a detector does not accept the image, `NaN` if it has no solution."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["file", *DETECTORS, "fusion", "flagged", "secret_bytes"])
-    for row in rows:
-        scores = asdict(row.scores)
-        numbers = [scores[name] for name in (*DETECTORS, "fusion")]
-        cells = ["null" if each is None else "NaN" if math.isnan(each) else repr(each) for each in numbers]
-        writer.writerow([row.file, *cells, str(row.flagged).lower(), row.secret_bytes])
-    return text.getvalue().encode(errors="surrogateescape")  # file names may be any bytes
-
-
-def _files(folder: Path) -> list[Path]:
-    try:
-        paths = sorted(path for path in folder.iterdir() if path.is_file())
-    except OSError as error:
-        raise InputError(f"{folder}: expected a folder of images: {error.strerror}") from error
-    if not paths:
-        raise InputError(f"{folder}: expected images, but there are no files in it")
-    return paths
 
 
 def _present(scores: Iterable[float | None]) -> list[float]:
