@@ -45,7 +45,7 @@ def test_long_runs_have_the_rates_of_3dgs(config: FitConfig, progress: float) ->
 def test_short_runs_start_with_larger_rates_and_end_with_those_of_3dgs() -> None:
     config = FitConfig(iterations=1000)
     start, _ = _rates(config, 0)
-    ratios = {"means": EXTENT * 5**1.75, "quats": 5, "scales": 5, "opacities": 5 ** (2 / 3), "sh": 5}
+    ratios = {"means": EXTENT * 5**1.75, "quats": 5, "scales": 5, "opacities": 5 ** (1 / 4), "sh": 5}
     assert {name: start[name] / RATES[name] for name in RATES} == pytest.approx(ratios, rel=1e-2)
     end, _ = _rates(config, 1000)
     assert {name: end[name] for name in ratios if name != "means"} == pytest.approx(
@@ -70,3 +70,18 @@ def test_positions_move_in_proportion_to_a_pixel_of_the_nearest_camera() -> None
     config = FitConfig(iterations=1000)
     narrow = Schedule(config, _cameras(zoom=2.3), EXTENT).pixel_sizes(means)
     assert torch.allclose(narrow, distances / 2, atol=1e-5)
+
+
+def test_what_fills_the_nearest_view_grows_as_in_3dgs() -> None:
+    """At a distance of 1; the sizes are half, twice, ten and a hundred times the limit of a twentieth."""
+    config, model = FitConfig(iterations=1000), random_gaussians(4)
+    sizes = torch.tensor([0.025, 0.1, 0.5, 5.0])
+    thin = torch.stack([sizes.log(), torch.full((4,), -9.0), torch.full((4,), -9.0)], 1)
+    model = replace(model, means=torch.zeros(4, 3), log_scales=thin)
+    optimizers = make_optimizers(to_parameters(model, torch.device("cpu")), config, EXTENT)
+    Schedule(config, _cameras(), EXTENT).set(optimizers, 1)
+    found = {name: each["row_scale"] for name in optimizers for each in optimizers[name].state.values()}
+    assert found.keys() == {"means", "scales", "opacities"}
+    assert torch.allclose(found["scales"], torch.tensor([1, 0.5, 0.2, 0.2]), atol=2e-3)
+    least = 5**-0.25
+    assert torch.allclose(found["opacities"], torch.tensor([1, least, least, least]), atol=2e-3)

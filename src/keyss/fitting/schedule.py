@@ -20,7 +20,8 @@ _FULL_STEPS = 30_000
 _MAX_BOOST = 5.0
 _BOOST_GROWTH = 0.473  # exponent: 1,000 steps have the maximum
 _BOOSTED = 0.6  # share of a run with constant, larger rates
-_EXPONENTS = {"means": 7 / 4, "opacities": 2 / 3}  # of the boost; 1 for other attributes
+_EXPONENTS = {"means": 7 / 4, "opacities": 1 / 4}  # of the boost; 1 for other attributes
+_LARGE = 0.05  # size over distance from the nearest camera, from which a Gaussian's boost is less
 _CAMERAS = 32  # from which distances are measured
 _FOCAL = 1.15  # focal length, for a picture of area 1, at which rates are those of 3DGS; 47 degrees
 
@@ -33,8 +34,10 @@ class Schedule:
     extent: a step moves near and far Gaussians equally on the screen. Otherwise objects close to the cameras
     and cameras with a narrow field of view would lose up to 10 dB.
 
-    Other attributes: constant at the rate of 3DGS times `boost` (opacities: `boost` ** (2/3)) for 60 % of the
-    run, then decaying to the rate of 3DGS, and over the last share `settle` of the run to a tenth.
+    Other attributes: constant at the rate of 3DGS times `boost` (opacities: `boost` ** (1/4)) for 60 % of the
+    run, then decaying to the rate of 3DGS, and over the last share `settle` of the run to a tenth. The boost
+    of scales and opacities is less the larger a Gaussian is in the nearest view: otherwise Gaussians near the
+    cameras grow until each fills a training view, and test views lose up to 7 dB.
     """
 
     def __init__(self, config: FitConfig, cameras: Sequence[Camera], extent: float) -> None:
@@ -61,8 +64,15 @@ class Schedule:
                 group["lr"] = initial * factor**boosted * settled
         # Densification, which adds rows without a scale, happens after steps that are multiples.
         if self.boost > 1 and (iteration - 1) % config.refine_every == 0:
-            means = optimizers["means"].param_groups[0]["params"][0].detach()
-            optimizers["means"].scale_rows(self.pixel_sizes(means) / self.extent)
+            means, log_scales = (
+                optimizers[name].param_groups[0]["params"][0].detach() for name in ("means", "scales")
+            )
+            pixels = self.pixel_sizes(means)
+            optimizers["means"].scale_rows(pixels / self.extent)
+            small = _LARGE * pixels / log_scales.amax(1).exp()
+            for name in ("scales", "opacities"):
+                least = self.boost ** -_EXPONENTS.get(name, 1.0)
+                optimizers[name].scale_rows(small.clamp(least, 1.0))
 
     def pixel_sizes(self, means: Tensor) -> Tensor:
         """[N] in proportion to the size of a pixel at each of `means` [N, 3], for the nearest camera.
