@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 from itertools import product
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
+from PIL import Image
 from scipy.stats import chi2
 
 Pixels = list[list[int]]  # one channel, by rows
@@ -140,3 +142,22 @@ def divided(a: float, b: float) -> float:
     """As Java divides: by zero too, whose sign counts."""
     with np.errstate(all="ignore"):
         return float(np.float64(a) / np.float64(b))
+
+
+def read_pixels(path: Path) -> npt.NDArray[np.uint8]:
+    """[H, W, 3] of an image file as Java's ImageIO decodes it.
+
+    Transparency is ignored, not blended. Grey of 8 and 16 bits counts as linear light and gets the sRGB
+    curve, which turns 256 levels into 183. Colours of 16 bits keep their upper byte, which may be off by 1.
+    """
+    image = Image.open(path)
+    if image.mode.startswith("I"):
+        light = np.asarray(image, dtype=np.float64).clip(0, 65535) / 65535
+    elif image.mode in ("L", "LA") and image.format != "BMP":  # a grey BMP has a palette
+        light = np.asarray(image.getchannel(0)) / 255
+    else:
+        image.load()
+        image.info.pop("transparency", None)  # avoids a warning by Pillow
+        return np.array(image.convert("RGB"), dtype=np.uint8)
+    encoded = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)  # IEC 61966-2-1
+    return np.repeat(np.rint(255 * encoded).astype(np.uint8)[:, :, None], 3, axis=2)

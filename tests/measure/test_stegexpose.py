@@ -11,12 +11,10 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 from hypothesis import given, settings, strategies as st
-from PIL import Image
 from scipy.stats import chi2
 
-from keyss.core import InputError, UsageError
-from keyss.files import images
-from keyss.measure import Scores, lsb_detectors, read_pixels, score_image
+from keyss.core import UsageError
+from keyss.measure import Scores, lsb_detectors, score_image
 from measure import stegexpose_literal as literal
 
 DETECTORS = ("primary_sets", "chi_square", "sample_pairs", "rs")
@@ -56,7 +54,7 @@ class TestAgainstTheOriginal:
             expected = list(csv.DictReader(file))
         assert len(expected) == 34
         for row in expected:
-            scores = score_image(read_pixels(folder / row["file"]))
+            scores = score_image(literal.read_pixels(folder / row["file"]))
             for name in (*DETECTORS, "fusion"):
                 score = getattr(scores, name)
                 if row[name] == "null":
@@ -200,73 +198,3 @@ class TestPayloads:
 def test_other_arrays_are_refused(image: npt.NDArray[np.uint8]) -> None:
     with pytest.raises(UsageError, match="uint8"):
         score_image(image)
-
-
-class TestDecoding:
-    COLOURS = np.random.default_rng(2).integers(0, 256, (5, 7, 4), dtype=np.uint8)
-
-    def test_alpha_is_ignored(self, tmp_path: Path) -> None:
-        pixels = self.COLOURS.copy()
-        pixels[0, :, 3] = 0
-        Image.fromarray(pixels).save(tmp_path / "a.png")
-        assert (read_pixels(tmp_path / "a.png") == pixels[:, :, :3]).all()
-
-    def test_a_transparent_colour_is_ignored(self, tmp_path: Path) -> None:
-        Image.fromarray(self.COLOURS[:, :, :3]).save(
-            tmp_path / "a.png", transparency=tuple(map(int, self.COLOURS[0, 0, :3]))
-        )
-        with Image.open(tmp_path / "a.png") as image:
-            assert "transparency" in image.info
-        assert (read_pixels(tmp_path / "a.png") == self.COLOURS[:, :, :3]).all()
-
-    @pytest.mark.parametrize("transparency", [None, 1, b"\x00\x40\xff"])
-    def test_palettes(self, tmp_path: Path, transparency: int | bytes | None) -> None:
-        image = Image.fromarray(np.array([[0, 1, 2]], dtype=np.uint8), mode="P")
-        image.putpalette([9, 8, 7, 200, 100, 0, 1, 2, 3])
-        options = {} if transparency is None else {"transparency": transparency}
-        image.save(tmp_path / "a.png", **options)
-        assert read_pixels(tmp_path / "a.png").tolist() == [[[9, 8, 7], [200, 100, 0], [1, 2, 3]]]
-
-    def test_one_bit(self, tmp_path: Path) -> None:
-        Image.fromarray(np.array([[False, True]])).save(tmp_path / "a.png")
-        assert read_pixels(tmp_path / "a.png").tolist() == [[[0, 0, 0], [255, 255, 255]]]
-
-    @pytest.mark.parametrize("suffix", ["png", "tiff"])
-    def test_grey_gets_the_curve_of_srgb(self, tmp_path: Path, suffix: str) -> None:
-        levels = np.arange(256, dtype=np.uint8)[None]
-        Image.fromarray(levels).save(tmp_path / f"a.{suffix}")
-        found = read_pixels(tmp_path / f"a.{suffix}")
-        assert found[0, :5, 0].tolist() == [0, 13, 22, 28, 34]
-        assert found[0, -1].tolist() == [255, 255, 255]
-        assert len(np.unique(found)) == 183
-
-    def test_grey_with_alpha_and_of_16_bits_gets_the_same(self, tmp_path: Path) -> None:
-        levels = np.arange(256, dtype=np.uint8)[None]
-        Image.fromarray(levels).save(tmp_path / "plain.png")
-        Image.fromarray(np.stack([levels, levels[:, ::-1]], axis=2), mode="LA").save(tmp_path / "alpha.png")
-        Image.fromarray(levels.astype(np.uint16) * 257).save(tmp_path / "deep.png")
-        expected = read_pixels(tmp_path / "plain.png")
-        assert (read_pixels(tmp_path / "alpha.png") == expected).all()
-        assert (read_pixels(tmp_path / "deep.png") == expected).all()
-
-    def test_a_bmp_has_a_palette_even_where_it_is_grey(self, tmp_path: Path) -> None:
-        levels = np.arange(256, dtype=np.uint8)[None]
-        Image.fromarray(levels).save(tmp_path / "a.bmp")
-        assert (read_pixels(tmp_path / "a.bmp") == levels[:, :, None]).all()
-
-    def test_what_is_no_image_is_refused(self, tmp_path: Path) -> None:
-        with pytest.raises(InputError, match="no such file"):
-            read_pixels(tmp_path / "a.png")
-        (tmp_path / "a.png").write_bytes(b"no image")
-        with pytest.raises(InputError, match="cannot be read"):
-            read_pixels(tmp_path / "a.png")
-        Image.fromarray(smooth()).save(tmp_path / "a.png")
-        (tmp_path / "a.png").write_bytes((tmp_path / "a.png").read_bytes()[:5000])
-        with pytest.raises(InputError, match="cannot be decoded"):
-            score_image(read_pixels(tmp_path / "a.png"))
-
-    def test_what_is_too_large_is_refused(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        Image.fromarray(self.COLOURS).save(tmp_path / "a.png")
-        monkeypatch.setattr(images, "_MAX_PIXELS", 34)
-        with pytest.raises(InputError, match="at most 34 pixels, found 7x5"):
-            score_image(read_pixels(tmp_path / "a.png"))

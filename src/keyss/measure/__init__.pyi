@@ -66,7 +66,6 @@ from .stealth.judging import judge as judge, stealth_statistics as stealth_stati
 from .stegexpose import (
     Scores as Scores,
     StegExposeAuc as StegExposeAuc,
-    read_pixels as read_pixels,
     score_image as score_image,
     stegexpose_auc as stegexpose_auc,
 )

@@ -9,14 +9,11 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
-from PIL import Image
 
 from keyss.core.arrays import Bytes
-from keyss.core.errors import InputError, UsageError
-from keyss.files.images import open_image
+from keyss.core.errors import UsageError
 from keyss.measure.auc import Auc, auc_between
 from keyss.measure.lsb_detectors import chi_square, primary_sets, rs, sample_pairs
 
@@ -50,36 +47,6 @@ def score_image(image: Bytes) -> Scores:
         scores[name] = score if score is None or math.isnan(score) else min(abs(score), 1.0)
     available = _present(scores.values())
     return Scores(**scores, fusion=sum(available) / len(available) if available else math.nan)
-
-
-def read_pixels(path: Path | str) -> Bytes:
-    """[H, W, 3] of an image file as Java's ImageIO decodes it.
-
-    Transparency is ignored, not blended. Grey of 8 and 16 bits counts as linear light and gets the sRGB
-    curve, which turns 256 levels into 183. Colours of 16 bits keep their upper byte, which may be off by 1.
-    Raises InputError for files that cannot be read and for more than 89 million pixels.
-    """
-    path = Path(path)
-    with open_image(path) as image:
-        try:
-            return _decode(image)
-        except Exception as error:  # Pillow's decoders raise nearly anything on broken bytes
-            raise InputError(
-                f"{path}: expected an image, but its pixels cannot be decoded: {error}"
-            ) from error
-
-
-def _decode(image: Image.Image) -> Bytes:
-    if image.mode.startswith("I"):
-        light = np.asarray(image, dtype=np.float64).clip(0, 65535) / 65535
-    elif image.mode in ("L", "LA") and image.format != "BMP":  # a grey BMP has a palette
-        light = np.asarray(image.getchannel(0)) / 255
-    else:
-        image.load()
-        image.info.pop("transparency", None)  # avoids a warning by Pillow
-        return np.array(image.convert("RGB"), dtype=np.uint8)
-    encoded = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)  # IEC 61966-2-1
-    return np.repeat(np.rint(255 * encoded).astype(np.uint8)[:, :, None], 3, axis=2)
 
 
 @dataclass(frozen=True)
