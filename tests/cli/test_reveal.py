@@ -77,7 +77,8 @@ def test_runs_and_checks_are_described_in_words(keyss: Run, world: Path) -> None
 
 
 def test_many_gaussians_in_a_small_file_are_refused(keyss: Run, files: Path, tmp_path: Path) -> None:
-    hostile = Payload("carry", whole.encode(Gaussians.cat([model_of(1, sh_degree=3)] * (1 << 17))))
+    data = whole.encode(model_of(100, sh_degree=0))
+    hostile = Payload("carry", (1 << 17).to_bytes(4, "little") + data[4:])
     write_model(tmp_path / "stego.spz", CodesCover.of(codes_of(".spz")).embed([(KEY, hostile)]))
     for command, *out in (("reveal", "-o", tmp_path / "s.ply"), ("verify",)):
         said = keyss(command, tmp_path / "stego.spz", "--key-file", files / "key", *out)

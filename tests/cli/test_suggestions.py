@@ -18,7 +18,7 @@ from keyss.cli import commands, entry
         (("--quiet", "inof", "x"), "did you mean `keyss info`?"),
         (("frobnicate",), "see `keyss --help`"),
         (("convert", "a.ply", "-o", "b.spz"), "name OUT after IN"),
-        (("audit", "run", "-o", "x"), "the run's folder"),
+        (("audit", "run", "-o", "x"), "results go into the folder of the run"),
     ],
 )
 def test_a_misspelt_command(keyss: Run, arguments: tuple[str, ...], meant: str) -> None:

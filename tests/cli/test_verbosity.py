@@ -45,7 +45,7 @@ class TestEstimate:
     def soon_long(self, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr("keyss.runs.planning._LONG", 20)
 
-    WORDS = r"about \d+ s, \d\.\d GB of memory, up to \d+ MB of disk"
+    WORDS = r"a file of up to \d+\.\d MB, about \d+ s, \d\.\d GB of memory, up to \d+ MB of disk"
 
     def test_of_fit(self, keyss: Run, scene: Path) -> None:
         said = fit(keyss, scene)

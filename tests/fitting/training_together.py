@@ -20,7 +20,7 @@ from tiny_scenes import random_gaussians, tiny_scene
 SEED = 3
 # Densified at 20 and 30 of 50 steps; WaterGS trains its autoencoder from step 35 on.
 FIT = FitConfig(
-    iterations=50, max_gaussians=600, sh_degree=1, grow_start=0.2, grow_stop=0.7, grow_every=10, seed=SEED
+    iterations=50, max_gaussians=999, sh_degree=1, grow_start=0.2, grow_stop=0.7, grow_every=10, seed=SEED
 )
 
 

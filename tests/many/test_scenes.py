@@ -39,7 +39,6 @@ def test_the_papers_scenes_are_those_of_its_tables() -> None:
         ({"table": "single", "scenes": ["a", "b"], "pairs": ["a,c"]}, "no scene is called 'c'"),
         ({"table": "single", "scenes": ["a", "b"], "pairs": ["a"]}, "a cover and 1 secret"),
         ({"table": "multi", "scenes": ["a", "b", "c"], "pairs": ["a,b,b"]}, "different names"),
-        ({"table": "single", "scenes": ["a", "b"], "most": 0}, "`most`"),
         ({"table": "single", "scenes": ["a", "b"], "iterations": 0}, "`iterations`"),
         ({"table": "single", "scenes": ["a.ply", "b"]}, "models have none"),
     ],

@@ -183,10 +183,10 @@ def hide(
     if dry_run:
         return HideResult(plan=plan_hiding(chosen, options, sources, target, place, bound=bound))
     long = (trains and worth_planning(options.fit)) or options.place.grows
-    if reporter and ranks.first and not resume and long:
-        planned = plan_hiding(chosen, options, sources, target, place, bound=bound)
-        reporter.note(f"hide: {in_a_line(planned)}")
     with folder.work() if folder else nullcontext():
+        if reporter and ranks.first and not resume and long:
+            planned = plan_hiding(chosen, options, sources, target, place, bound=bound)
+            reporter.note(f"hide: {in_a_line(planned)}")
         context = Context(target, folder.checkpoints if folder and trains else None, resume, reporter)
         sources = with_plain_models(sources, configs, context)
         plain = [each.model for each in sources]
