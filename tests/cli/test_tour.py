@@ -81,7 +81,7 @@ def test_only_what_is_to_be_published_is_readable_by_others(keyss: Run, mine: Pa
         assert stat.S_IMODE(path.stat().st_mode) == 0o700
     for name in ("audit/audit.json", "report.html", "metrics.json", "config.json", "secret-1.ply"):
         assert (mine / "hidden" / "private" / name).is_file()
-    results = {"plain", "hidden", "carried", "hidden.ply", "carried.ply", "images", "scores.csv"}
+    results = {"plain", "hidden", "carried", "hidden.ply", "carried.ply", "images"}
     assert {path.name for path in mine.iterdir()} == {"key.txt", *results}
 
 
