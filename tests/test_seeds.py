@@ -52,6 +52,11 @@ def test_two_hidings_of_the_same_inputs_have_no_rotation_in_common(options: Meth
     assert not one & two
 
 
+def test_hidings_with_one_seed_have_all_rotations_in_common() -> None:
+    one, two = (_rotations(_hidden(METHODS[1].with_fit(seed=7))) for _ in range(2))
+    assert one == two
+
+
 @pytest.mark.filterwarnings("ignore:.*appended Gaussians")
 @pytest.mark.parametrize("options", [METHODS[1], JOINT], ids=["carry", "keyss"])
 def test_hidings_with_one_seed_have_no_salt_in_common(options: MethodOptions) -> None:
