@@ -111,9 +111,6 @@ def test_an_interrupted_audit_goes_on_after_what_it_has(
 def test_an_interrupt_between_parts_says_how_to_resume(
     run: Path, calls: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def interrupted(*_: object) -> None:
-        raise KeyboardInterrupt
-
     with monkeypatch.context() as patched:
         patched.setattr("keyss.audits.page.report_bytes", interrupted)
         with pytest.raises(Interrupted) as caught:
@@ -121,6 +118,21 @@ def test_an_interrupt_between_parts_says_how_to_resume(
     assert caught.value.checkpoint is not None
     audit(run, [KEY], controls=2, resume=True)
     assert calls == ["speed", "leaks"]
+
+
+def test_an_interrupt_before_the_first_part_is_told_so(
+    run: Path, calls: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("keyss.audits.run.PARTS", {"speed": interrupted})
+    with pytest.raises(Interrupted):
+        audit(run, [KEY], controls=2)
+    assert main(["audit", str(run), "--report-only"]) == 4
+    said = capsys.readouterr().err
+    assert "the audit was interrupted before there was anything to report: --resume with the same" in said
+
+
+def interrupted(*_: object) -> None:
+    raise KeyboardInterrupt
 
 
 def test_results_are_not_replaced_by_accident(run: Path, calls: list[str]) -> None:

@@ -17,7 +17,7 @@ import msgspec
 from keyss._version import __version__
 from keyss.audits.parts import OF_3DGS_MODELS, PARTS, AuditSubject, PartialAudit, PartProgress, subject_of
 from keyss.audits.record import AUDIT_FILE, AUDIT_FOLDER, PICTURES, Audit, AuditedRun, read_audit
-from keyss.core import Interrupted, KeyssWarning, UsageError, import_extra, signal_of
+from keyss.core import InputError, Interrupted, KeyssWarning, UsageError, import_extra, signal_of
 from keyss.methods import registry
 from keyss.progress import Reporter
 from keyss.rendering import Backend, resolve_device
@@ -133,10 +133,15 @@ def _report(run: Path) -> Audit:
     from keyss.audits.page import report_bytes
 
     record = f"{AUDIT_FOLDER}/{AUDIT_FILE}"
-    interrupted = not (run / record).exists() and (run / CHECKPOINTS / record).exists()
-    place = run / CHECKPOINTS if interrupted else run
+    running = None if (run / record).exists() else read_manifest(run).running
+    if running and not (run / CHECKPOINTS / record).exists():
+        raise InputError(
+            f"{run}: the {running.stage} was interrupted before there was anything to report: `resume=True` "
+            "with the same arguments continues it"
+        )
+    place = run / CHECKPOINTS if running else run
     result = read_audit(place)
-    if interrupted and (running := read_manifest(run).running):
+    if running:
         parts = _chosen(running.arguments["only"], result.run.standard)
         missing = [name for name in parts if getattr(result, name) is None]
         warnings.warn(

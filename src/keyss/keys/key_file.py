@@ -7,9 +7,10 @@ import os
 import secrets
 import string
 import unicodedata
+import warnings
 from pathlib import Path
 
-from keyss.core.errors import InputError, OutputError, UsageError
+from keyss.core.errors import InputError, KeyssWarning, OutputError, UsageError
 
 MAX_KEY_BYTES = 4096
 ALPHABET = string.ascii_letters + string.digits
@@ -20,12 +21,16 @@ _SPACES = "\t\n\v\f\r \u1680\u2028\u2029\ufeff"  # those of JavaScript's `trim`;
 def normalized_key(text: str) -> str:
     """The key in `text`: Unicode's form NFKC without surrounding white space.
 
-    Everything that takes a key applies this, so a final newline or a byte order mark never counts. Raises
-    UsageError for a key that is empty, longer than 4096 bytes, or not UTF-8; the message omits the key.
+    Everything that takes a key applies this, so a final newline or a byte order mark never counts. Warns of
+    other white space that it drops. Raises UsageError for a key that is empty, longer than 4096 bytes, or not
+    UTF-8; the message omits the key.
     """
-    key = unicodedata.normalize("NFKC", text).strip(_SPACES)
+    form = unicodedata.normalize("NFKC", text)
+    key = form.strip(_SPACES)
     if not key:
         raise UsageError("the key is empty")
+    if form.removeprefix("\ufeff").removesuffix("\n").removesuffix("\r") != key:
+        warnings.warn("white space around the key does not count", KeyssWarning, stacklevel=3)
     try:
         size = len(key.encode())
     except UnicodeEncodeError:

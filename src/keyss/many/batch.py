@@ -184,8 +184,9 @@ def hide_batch(
     covers = Counter(os.path.realpath(asset.cover) for asset in assets if is_model(asset.cover))
     if again := [cover for cover, times in covers.items() if times > 1]:
         warnings.warn(
-            f"{len(again)} of the covers ({Path(again[0]).name}) are published more than once: comparing two "
-            "published files of one cover shows that both hide something; give each asset a cover of its own",
+            f"{len(again)} of the covers ({Path(again[0]).name}) are published more than once. Each file "
+            "gets low bits of its own, but comparing two shows that both hide something: give each asset a "
+            "cover of its own if others may have both",
             KeyssWarning,
             stacklevel=2,
         )
