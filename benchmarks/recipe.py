@@ -1,7 +1,7 @@
 """Short fits with large rates against 3DGS's rates: PSNR on test photos and processor time of training.
 
     python benchmarks/recipe.py ../shared/data                      # the default of 1,000 steps against 3,000
-    python benchmarks/recipe.py ../shared/data --steps 350 --against 1000 --gaussians 10000 --width 200
+    python benchmarks/recipe.py ../shared/data --steps 500 --against 1000 --gaussians 10000 --width 200
 
 Scenes are the folders of photos in DATA, and rings of cameras around the models in DATA/splats; all of them
 also in hard variants (`VARIANTS`): cropped to the other orientation, in other units, with few photos, without

@@ -120,7 +120,7 @@ def test_one_budget_and_one_process_for_a_folder(folders: tuple[Path, Path], tmp
     """Without numbers the budget is that of the first method's preset."""
     found = compare(*folders, methods=["carry:quick", "3dgs"], out=tmp_path / "out", dry_run=True)
     assert isinstance(found, Forecast)
-    assert {each.name.partition(", ")[2] for each in found.cells} >= {"350 steps, seed 0"}
+    assert {each.name.partition(", ")[2] for each in found.cells} >= {"500 steps, seed 0"}
     with running.claimed(tmp_path / "out"), pytest.raises(OutputError, match="is at work"):
         compare(*folders, methods=["carry:quick"], out=tmp_path / "out")
 

@@ -31,7 +31,7 @@ KeyFiles = Annotated[
 Preset = Annotated[
     Literal["quick", "default", "full"],
     arg(
-        help="Training steps and maximum number of Gaussians of each model: quick 350 and 10,000; default "
+        help="Training steps and maximum number of Gaussians of each model: quick 500 and 10,000; default "
         "1,000 and 30,000; full 30,000 and 500,000."
     ),
 ]

@@ -99,7 +99,7 @@ class FitConfig:
 
 
 PRESETS: dict[str, FitConfig] = {
-    "quick": FitConfig(iterations=350, max_gaussians=10_000),
+    "quick": FitConfig(iterations=500, max_gaussians=10_000),
     "default": FitConfig(),
     "full": FitConfig(iterations=30_000, max_gaussians=500_000, grow_start=1 / 60, grow_stop=0.5),
 }
