@@ -75,5 +75,6 @@ def test_short_fits_of_two_photos_end_in_models_that_carry(keyss: Run, world: Pa
     scenes = ("--cover", world / "a", "--secret", world / "b", "--key-file", "key.txt")
     said = keyss("hide", *scenes, *few, "-o", "run")
     assert said.status == 0, said.err
+    assert "refit of the secret" in said.err  # the cover got half as many Gaussians
     assert "The secret kept" in said.out
     assert keyss("verify", "run/publish/stego.ply", "--key-file", "key.txt").status == 0

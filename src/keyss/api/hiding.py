@@ -6,6 +6,7 @@ import hashlib
 import json
 import math
 import time
+import warnings
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import asdict, replace
@@ -17,7 +18,7 @@ import torch
 from keyss.api.asking import HideResult, Secret, check_keys, method_for, sources_of
 from keyss.api.fitting import begun, together
 from keyss.channels import AnyChannel, Channel, Publish, channel_for, open_content
-from keyss.core.errors import QualityError, UsageError
+from keyss.core.errors import KeyssWarning, QualityError, UsageError
 from keyss.core.gaussians import Gaussians, same_bits
 from keyss.core.scene import Scene, ViewOptions
 from keyss.files.models import is_model_path, read_model
@@ -189,6 +190,10 @@ def hide(
             reporter.note(f"hide: {in_a_line(planned)}")
         context = Context(target, folder.checkpoints if folder and trains else None, resume, reporter)
         sources = with_plain_models(sources, configs, context)
+        if any(each.given is None for each in sources):
+            with warnings.catch_warnings():  # they were given before
+                warnings.simplefilter("ignore", KeyssWarning)
+                options = chosen.prepare([replace(each, given=each.model) for each in sources], options)
         plain = [each.model for each in sources]
         context = replace(context, entropy=ranks.from_first(_entropy(keys, options, plain)))
         stego = chosen.hide(sources[0], sources[1:], options, context)

@@ -216,7 +216,7 @@ class Method(Protocol):
     options: type[MethodOptions]
 
     def prepare(self, sources: Sequence[Source], options: Any) -> Any:
-        """The options completed for these scenes, the cover first.
+        """The options completed for these scenes, the cover first; again with fitted models as given ones.
 
         Raises UsageError and InputError for what cannot work, before anything is trained.
         """

@@ -41,7 +41,7 @@ class CarryMethod:
     options = CarryOptions
 
     def prepare(self, sources: Sequence[Source], options: CarryOptions) -> CarryOptions:
-        """Decides which secrets are refitted.
+        """Decides which secrets are refitted; after the fits, those too that a small cover leaves no room.
 
         Refuses a given cover without room, and given secrets that neither fit nor may be changed. Secrets
         that are fitted first are made to fit.
@@ -53,7 +53,7 @@ class CarryMethod:
         options = options.with_fit(sh_degree=degree)
         if cover.given is None:
             options = options.for_fitted_cover()
-        room = room_for(cover.given, options)
+        room = room_for(cover.given, options, bytes(32))  # all ranks decide alike; it is not published
         options = replace(options, max_secret_degree=room.max_secret_degree)
         secret_sizes = _secret_sizes(secrets, options)
         sizes = room.sizes(secret_sizes)
@@ -61,7 +61,7 @@ class CarryMethod:
         if options.refit == "always":
             cut = [True] * len(cut)
         elif options.prune_to_fit or options.refit == "never":
-            if not options.prune_to_fit:
+            if not options.prune_to_fit and not options.refits:
                 _check_fit(secret_sizes, sizes, room.more_room)
             cut = [False] * len(cut)
         elif any(cut) and sizes != [room.sizes([secret])[0] for secret in secret_sizes]:
@@ -71,7 +71,10 @@ class CarryMethod:
             or (options.fit.iterations if secret.photos else min(options.fit.iterations, _MODEL_ITERATIONS))
             for secret in secrets
         ]
-        return replace(options, refits=tuple(n if c else 0 for n, c in zip(steps, cut, strict=True)))
+        planned = options.refits or (0,) * len(cut)  # of the first call
+        return replace(
+            options, refits=tuple(p or (n if c else 0) for p, n, c in zip(planned, steps, cut, strict=True))
+        )
 
     def plan(self, sources: Sequence[Source], options: CarryOptions) -> Plan:
         """The room in the cover before refits; notes tell what the cover and the secrets lose."""
