@@ -33,7 +33,7 @@ from .low_bits.bits import (
     write_low_bits as write_low_bits,
 )
 from .low_bits.cells import CellCipher as CellCipher
-from .low_bits.channel import LOW_BITS as LOW_BITS, LowBitsCover as LowBitsCover
+from .low_bits.channel import LOW_BITS as LOW_BITS, Embedded as Embedded, LowBitsCover as LowBitsCover
 from .low_bits.contents import LowBitsReader as LowBitsReader
 from .low_bits.layout import (
     TYPICAL_SHARE as TYPICAL_SHARE,

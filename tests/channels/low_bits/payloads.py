@@ -33,7 +33,7 @@ def embed_contents(
     """With a key under each salt, stale ones too."""
     mixed = randomness(entropy, *(digest(content) for _, content in secrets))
     fresh = [([keys[i] for i in prepared.fresh_salts], content) for keys, content in secrets]
-    return prepared.embed_derived(fresh, mixed)
+    return prepared.embed_derived(fresh, mixed).gaussians
 
 
 def extract(stego: Gaussians, key: str) -> bytes:

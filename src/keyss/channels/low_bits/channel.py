@@ -88,6 +88,20 @@ LOW_BITS = LowBits()
 
 
 @dataclass(frozen=True)
+class Embedded:
+    """A stego model, and where in it everything lies."""
+
+    gaussians: Gaussians
+    places: list[tuple[Integers, Integers]]  # of each content: [R] the Gaussian and the cell of each record
+    others: Integers  # [H] Gaussians of salts and headers
+
+    def part(self, count: int) -> Integers:
+        """About `count` Gaussians, or all, in their order: enough to open the content of their records."""
+        spaced = np.arange(0, len(self.gaussians), max(1, len(self.gaussians) // count))
+        return np.union1d(spaced, self.others)
+
+
+@dataclass(frozen=True)
 class LowBitsCover:
     """A cover and which of its Gaussians can be written; see `keyss.channels.base.PreparedCover`."""
 
@@ -107,7 +121,11 @@ class LowBitsCover:
         return LowBitsRoom(len(self._rows), self.layout.width)
 
     def embed(self, contents: Sequence[tuple[str, Content]], *, entropy: bytes | None = None) -> Gaussians:
-        """See `PreparedCover`. Takes 1.6 s for each secret for key derivation.
+        """See `PreparedCover`. Takes 1.6 s for each secret for key derivation. Warns as `place` does."""
+        return self.place(contents, entropy).gaussians
+
+    def place(self, contents: Sequence[tuple[str, Content]], entropy: bytes | None) -> Embedded:
+        """`embed`, with the places.
 
         Warns (KeyssWarning) if `decoy=True`, which tries the first salt alone, will not open the model.
         """
@@ -121,8 +139,8 @@ class LowBitsCover:
 
     def embed_derived(
         self, contents: Sequence[tuple[Sequence[DerivedKey], Content]], entropy: bytes
-    ) -> Gaussians:
-        """`embed` after key derivation: for each secret its key under each of the `fresh_salts`.
+    ) -> Embedded:
+        """`place` after key derivation: for each secret its key under each of the `fresh_salts`.
 
         `entropy`: of `randomness`, for no other file.
         """
@@ -130,8 +148,13 @@ class LowBitsCover:
         fresh, salts = self._salts(entropy)
         writer = Writer(self.names[self._rows], self.layout.width, entropy, bytes(each[0] for each in salts))
         writer.write(contents)
-        parts = [(self.salt_rows[self.fresh_salts], fresh), (self._rows[writer.order], writer.table)]
-        return write_low_bits(self.cover, self.layout, parts)
+        rows = self._rows[writer.order]
+        parts = [(self.salt_rows[self.fresh_salts], fresh), (rows, writer.table)]
+        return Embedded(
+            write_low_bits(self.cover, self.layout, parts),
+            [(rows[own], slots) for _, (own, slots) in sorted(writer.places.items())],
+            np.concatenate([self.salt_rows, rows[: writer.headers]]),
+        )
 
     @cached_property
     def fresh_salts(self) -> Integers:

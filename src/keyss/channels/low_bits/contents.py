@@ -76,7 +76,8 @@ class Writer:
         self._names = names[self.order]
         self.table = np.empty((len(names), width), np.uint8)
         fill(entropy, "low-bits/noise", self.table)
-        self._next = 0  # carrier that is not in use yet
+        self.headers = 0  # carriers of headers, which are the first
+        self.places: dict[int, tuple[Integers, Integers]] = {}  # of each content: its carriers and cells
 
     def write(self, contents: Sequence[tuple[Sequence[DerivedKey], Content]]) -> None:
         """Headers in the first carriers, records in the others. Raises UsageError for too large payloads.
@@ -128,9 +129,9 @@ class Writer:
 
     def _whole(self, cipher: CellCipher, data: Bytes) -> None:
         """A carrier for each row of `data`; what a cell does not need of it stays noise."""
-        rows = slice(self._next, self._next + len(data))
+        rows = slice(self.headers, self.headers + len(data))
         self.table[rows, : cipher.cell_bytes] = cipher.encrypt(self._names[rows], data)
-        self._next += len(data)
+        self.headers += len(data)
 
     def _place_all(self, contents: Sequence[Records], headers: int) -> None:
         """Records that divide carriers in random cells of all carriers, as each secret's would alone.
@@ -159,6 +160,7 @@ class Writer:
         count, width = content.plan.cells_per_carrier, self._room.width
         cells = as_strided(self.table, (len(self.table), count, width // count), (width, width // count, 1))
         split = len(content.records)
+        self.places[index] = rows[:split], slots[:split]
         self._place_some(index, "record", content.records, cells, rows[:split], slots[:split])
         copies = content.records[content.copied]
         self._place_some(index, "copy", copies, cells, rows[split:], slots[split:])

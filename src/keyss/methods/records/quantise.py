@@ -25,9 +25,9 @@ from dataclasses import astuple, dataclass, fields
 import numpy as np
 import torch
 
-from keyss.core.arrays import Bytes, Doubles, Flags, Words32, doubles
+from keyss.core.arrays import Bytes, Doubles, Flags, Integers, Words32, doubles
 from keyss.core.errors import InputError
-from keyss.core.gaussians import MAX_COORDINATE, MAX_LOG_SCALE, OPPONENT, Gaussians
+from keyss.core.gaussians import MAX_COORDINATE, MAX_LOG_SCALE, OPPONENT, Gaussians, largest
 from keyss.files.formats.common import from_smallest_three, smallest_three, unit
 from keyss.methods.records.lines import (
     BANDS,
@@ -64,10 +64,16 @@ class Codec:
     @staticmethod
     def fit(gaussians: Gaussians, table: Table) -> Codec:
         """The lines that suit `gaussians`, which have the SH degree of the table."""
+        return Codec.and_outliers(gaussians, table)[0]
+
+    @staticmethod
+    def and_outliers(gaussians: Gaussians, table: Table) -> tuple[Codec, Flags]:
+        """`fit`, and the `outliers` [N]."""
         if table.sh_degree != gaussians.sh_degree:
             raise ValueError(f"SH degree {gaussians.sh_degree}, but the table is for {table.sh_degree}")
-        every = zip(_kinds(table.sh_degree), _bits(table), _bulk(gaussians)[1], strict=True)
-        return Codec(table, tuple(fit_line(kind, bits, *line) for kind, bits, line in every))
+        found, parts = _bulk(gaussians)
+        every = zip(_kinds(table.sh_degree), _bits(table), parts, strict=True)
+        return Codec(table, tuple(fit_line(kind, bits, *line) for kind, bits, line in every)), found
 
     def codes(self, gaussians: Gaussians, outlier: Flags) -> list[Words32]:
         """Codes [N, columns] for each entry of `table.layout`; `outlier` [N]: their `outliers`."""
@@ -97,37 +103,43 @@ class Codec:
         tensors = (np.concatenate([x, y, z], 1), quats, scales, opacities[:, 0], np.concatenate(bands, 1))
         return Gaussians(*(torch.from_numpy(each.astype(np.float32)) for each in tensors))
 
-    def encode(self, gaussians: Gaussians) -> Bytes:
+    def encode(self, gaussians: Gaussians, outlier: Flags | None = None) -> Bytes:
         """[N, record_bytes] the records of N Gaussians: codes one after the other, the highest bit first.
 
-        The bits left over are zero.
+        The bits left over are zero. `outlier` [N]: their `outliers`, where they are known.
         """
-        outlier = outliers(gaussians)
+        outlier = outliers(gaussians) if outlier is None else outlier
+        bits, first, shift = self._places()
         records = np.empty((len(gaussians), self.table.record_bytes), np.uint8)
 
         def encode(start: int, stop: int) -> None:
-            bits = []
-            columns = self.codes(gaussians[start:stop], outlier[start:stop])
-            for codes, (_, count) in zip(columns, self.table.layout, strict=True):
-                part = codes[:, :, None] >> np.arange(count - 1, -1, -1, dtype=np.uint32) & 1
-                bits.append(part.astype(np.uint8).reshape(len(part), -1))
-            records[start:stop] = np.packbits(np.concatenate(bits, axis=1), axis=1)
+            columns = np.concatenate(self.codes(gaussians[start:stop], outlier[start:stop]), axis=1)
+            words = columns << (32 - bits - shift)  # from the highest bit of the byte that each begins in
+            found = np.zeros((self.table.record_bytes, stop - start), np.uint8)
+            for word, at, stops in zip(np.ascontiguousarray(words.T), first, shift + bits, strict=True):
+                for byte in range(-(-int(stops) // 8)):
+                    found[at + byte] |= (word >> np.uint32(24 - 8 * byte)).astype(np.uint8)
+            records[start:stop] = found.T
 
         in_blocks(encode, len(gaussians), _BLOCK)
         return records
 
+    def _places(self) -> tuple[Words32, Integers, Words32]:
+        """Bits of each code of a record; the byte in which each begins, and at which of its bits."""
+        bits = np.array([bits for columns, bits in self.table.layout for _ in range(columns)], np.uint32)
+        first, shift = np.divmod(np.cumsum(bits) - bits, 8)
+        return bits, first.astype(np.int64), shift.astype(np.uint32)
+
     def decode(self, records: Bytes) -> Gaussians:
         """The Gaussians of records [N, record_bytes], whatever bytes they are."""
-        layout, k = self.table.layout, (self.table.sh_degree + 1) ** 2
-        bits = np.array([bits for columns, bits in layout for _ in range(columns)])
-        first, shift = np.divmod(np.cumsum(bits) - bits, 8)  # byte and bit at which each code begins
-        ends = np.cumsum([columns for columns, _ in layout])[:-1]
+        k, (bits, first, shift) = (self.table.sh_degree + 1) ** 2, self._places()
+        ends = np.cumsum([columns for columns, _ in self.table.layout])[:-1]
         whole = Gaussians(*(torch.empty(len(records), *shape) for shape in ((3,), (4,), (3,), (), (k, 3))))
 
         def decode(start: int, stop: int) -> None:
             padded = np.pad(records[start:stop], ((0, 0), (0, 3)))
             words = padded.take(first[:, None] + np.arange(4), axis=1).view(">u4")[:, :, 0].astype(np.uint32)
-            codes = words << shift.astype(np.uint32) >> (32 - bits).astype(np.uint32)
+            codes = words << shift >> 32 - bits
             part = self.gaussians(np.split(codes, ends, axis=1))
             for field in fields(Gaussians):
                 getattr(whole, field.name)[start:stop] = getattr(part, field.name)
@@ -186,7 +198,9 @@ def _bulk(gaussians: Gaussians) -> tuple[Flags, list[tuple[Doubles, Doubles, Dou
 def out_of_range(gaussians: Gaussians) -> int:
     """The number of Gaussians with a number that a record clamps, and that no rendering depends on."""
     beyond = gaussians.overflow | (gaussians.log_scales < -MAX_LOG_SCALE).any(1)
-    return int((beyond | (gaussians.sh.abs() > _MAX_HARMONIC).flatten(1).any(1)).sum())
+    if largest(gaussians.sh) > _MAX_HARMONIC:
+        beyond |= (gaussians.sh.abs() > _MAX_HARMONIC).flatten(1).any(1)
+    return int(beyond.sum())
 
 
 def _kinds(sh_degree: int) -> list[Kind]:
