@@ -66,7 +66,7 @@ class Gaussians:
     def overflow(self) -> Tensor:
         """[N] bool, True for Gaussians that rasterizers skip because their values are too large."""
         limits = (MAX_COORDINATE, MAX_LENGTH / 2, MAX_LOG_SCALE, math.inf, MAX_COLOUR / 2)
-        if all(largest(getattr(self, f.name)) <= at for f, at in zip(fields(self), limits, strict=True)):
+        if all(magnitude(getattr(self, f.name)) <= at for f, at in zip(fields(self), limits, strict=True)):
             return torch.zeros(len(self), dtype=torch.bool, device=self.device)  # of nearly every model
         far = ~(self.means.abs() <= MAX_COORDINATE).all(1)
         large = ~(self.log_scales <= MAX_LOG_SCALE).all(1)
@@ -123,7 +123,7 @@ class Gaussians:
         return Gaussians(*(torch.cat([getattr(p, f.name) for p in parts]) for f in fields(Gaussians)))
 
 
-def largest(values: Tensor) -> float:
+def magnitude(values: Tensor) -> float:
     """The largest absolute value of a tensor; NaN if there is one in it, 0 of nothing."""
     least, most = values.aminmax() if values.numel() else (values.new_zeros(()), values.new_zeros(()))
     return float(torch.maximum(-least, most))

@@ -11,7 +11,6 @@ from dataclasses import fields
 from typing import Any
 
 import torch
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from keyss.core.gaussians import SH_C0, Gaussians
@@ -72,6 +71,8 @@ def initial_gaussians(
     count = len(points)
     coordinates = points.double().numpy()
     neighbours = min(4, count)
+    from scipy.spatial import cKDTree  # slow to import, and only a start from points needs it
+
     distances = cKDTree(coordinates).query(coordinates, k=neighbours)[0].reshape(count, neighbours)
     spacing = torch.from_numpy(distances[:, 1:]).square().mean(1).sqrt() if count > 1 else torch.ones(1)
     sh = torch.zeros(count, (sh_degree + 1) ** 2, 3)

@@ -69,7 +69,7 @@ def embed_models(
         if not cover.room.grows:
             details["capacity_bytes"] = cover.room.capacity
             details["capacity_bits_per_gaussian"] = round(8 * cover.room.capacity / len(cover.cover), 2)
-    keyed = list(zip(keys, contents, strict=True))
+    keyed: list[tuple[str, Content]] = list(zip(keys, contents, strict=True))
     if isinstance(cover, LowBitsCover):
         placed = cover.place(keyed, entropy)
         stego, opened = placed.gaussians, _opened(placed, keys, encoded)

@@ -27,7 +27,7 @@ import torch
 
 from keyss.core.arrays import Bytes, Doubles, Flags, Integers, Words32, doubles
 from keyss.core.errors import InputError
-from keyss.core.gaussians import MAX_COORDINATE, MAX_LOG_SCALE, OPPONENT, Gaussians, largest
+from keyss.core.gaussians import MAX_COORDINATE, MAX_LOG_SCALE, OPPONENT, Gaussians, magnitude
 from keyss.files.formats.common import from_smallest_three, smallest_three, unit
 from keyss.methods.records.lines import (
     BANDS,
@@ -198,7 +198,7 @@ def _bulk(gaussians: Gaussians) -> tuple[Flags, list[tuple[Doubles, Doubles, Dou
 def out_of_range(gaussians: Gaussians) -> int:
     """The number of Gaussians with a number that a record clamps, and that no rendering depends on."""
     beyond = gaussians.overflow | (gaussians.log_scales < -MAX_LOG_SCALE).any(1)
-    if largest(gaussians.sh) > _MAX_HARMONIC:
+    if magnitude(gaussians.sh) > _MAX_HARMONIC:
         beyond |= (gaussians.sh.abs() > _MAX_HARMONIC).flatten(1).any(1)
     return int(beyond.sum())
 
