@@ -75,7 +75,6 @@ _EXACT = 1e-6  # of the length of a unit quaternion in single precision
 # Sets of equal values that there may be by chance: they are left alone, and embedding makes as many again.
 _SETS_BY_CHANCE = 0.1
 _SAMPLE = 20_000  # Gaussians whose bits are tested
-_COUNTED = 250_000  # Gaussians whose values are counted
 _CHANCE = 1e-6  # that a model with uniform bits is refused
 
 
@@ -243,11 +242,8 @@ def _apart(gaussians: Gaussians, layout: Layout, names: Bytes) -> tuple[Flags, b
 
 
 def _frequent_values(gaussians: Gaussians) -> list[Words32]:
-    """For each group of fields [V] the values that occur more often than is likely, in ascending order.
-
-    Of large models in a part, where values that occur a few dozen times are not found.
-    """
-    gaussians, frequent = gaussians[:: max(1, len(gaussians) // _COUNTED)], []
+    """For each group of fields [V] the values that occur more often than is likely, in ascending order."""
+    frequent = []
     for field in (gaussians.log_scales, gaussians.quats, gaussians.opacity_logits, gaussians.sh[:, 1:]):
         words = field.detach().to("cpu", torch.float32).numpy().view(np.uint32)
         ordered, further = np.sort(words, axis=None), _unlikely_copies(words.size) - 1
