@@ -337,7 +337,7 @@ def test_copies_count_once(cover: Gaussians) -> None:
 
 def test_a_key_that_opens_two_secrets_says_so(cover: Gaussians) -> None:
     """Where two files under one key were merged."""
-    first, second = embed(cover, [(KEY, b"first")]), embed(trained_like(1500, 5), [(KEY, b"second")])
+    first, second = embed(cover, [(KEY, b"first")]), embed(trained_like(1500, 9), [(KEY, b"second")])
     with pytest.warns(KeyssWarning, match="opens two secrets"):
         assert extract(Gaussians.cat([first, second]), KEY) in (b"first", b"second")
 
