@@ -9,7 +9,7 @@ import type { Words } from '../../core/words.ts';
 export const [COLOUR_BITS, SCALE_BITS, POSITION_BITS, TURN_BITS] = [7, 6, 10, 5];
 const [FAINTEST, STRONGEST] = [0.4 / 255, 1.6 / 255]; // after rounding
 const [COLOUR_STEP, SCALE_STEP] = [0.0275, 0.08];
-const TURNS_REACH = 0.5; // x, y and z of quaternions are below it, so that w is never smaller
+const TURNS_REACH = (256 / 511) * Math.SQRT1_2; // x, y and z of quaternions are below it, so that w is never smaller
 const [FARTHEST, MAX_SHIFTS] = [1 << 12, 500]; // steps of log scales: that are looked at, and that are tried
 
 /** The Gaussians that are as faint as appended ones, without harmonics. */
