@@ -1,5 +1,6 @@
 import { expect, test } from 'vitest';
 import { readModel } from '../src/files/models.ts';
+import { column, plyHeader } from '../src/files/ply.ts';
 import { openZip } from '../src/files/packed.ts';
 import { columns, jsonVector, modelOf, vector } from './vectors.ts';
 
@@ -26,6 +27,19 @@ test.each(HERE)('%s cut short or garbled ends in one sentence', async (name) => 
 
 test('a .splat is known by its name only', async () => {
   await expect(readModel(vector('published.splat'))).rejects.toThrow(/^This is not a file of a 3D Gaussian Splatting model/);
+});
+
+test('a .ply of text is what the binary one is, bit for bit', async () => {
+  const bytes = vector('carried.ply');
+  const header = plyHeader(bytes);
+  const [vertex] = header.elements;
+  const values = vertex.properties.map(({ name }) => column(bytes, header, vertex, name)!);
+  const rows = Array.from({ length: vertex.count }, (_, row) => values.map((each) => each[row]).join(' ')).join('\r\n');
+  const head = new TextDecoder('latin1').decode(bytes.subarray(0, vertex.start)).replace('binary_little_endian', 'ascii');
+  const text = (body: string): Uint8Array => new TextEncoder().encode(head + body);
+  expect(columns(await readModel(text(rows)))).toEqual(columns(await readModel(bytes)));
+  await expect(readModel(text(rows.slice(0, -40)))).rejects.toThrow('This is not a whole .ply file.');
+  await expect(readModel(text(rows.replace(/\d/, 'x')))).rejects.toThrow('This file holds numbers that are not finite.');
 });
 
 test('the files of an archive', async () => {

@@ -68,8 +68,8 @@ def test_a_cover_without_harmonics_gets_the_degree_that_its_refusal_names(
     stego = registry.get("carry").hide(sources[0], sources[1:], options, context)
     (opened,) = stego.opened
     assert stego.gaussians.sh_degree == planned.sh_degree == degree
-    # New harmonics are random, and how many of their low bits can be used varies.
-    assert len(opened.reveal(stego.gaussians)) == pytest.approx(planned.capacity, rel=0.01)
+    # New harmonics are random, and how many of their low bits can be used varies, by 0.7 % (one sigma).
+    assert len(opened.reveal(stego.gaussians)) == pytest.approx(planned.capacity, rel=0.04)
     assert planned.capacity > 3000
     assert _prepare(CarryOptions(publish="any"), cover, secret).fit.sh_degree == 0
 

@@ -3,7 +3,7 @@ import { InputError } from '../core/errors.ts';
 import type { Gaussians } from '../core/gaussians.ts';
 import { type CompressedPlyCodes, isCompressed, readCompressedPly } from './compressed_ply.ts';
 import type { Decode } from './packed.ts';
-import { plyHeader, readPly } from './ply.ts';
+import { binaryPly, plyHeader, readPly } from './ply.ts';
 import { readSog, type SogCodes } from './sog.ts';
 import { readSplat } from './splat.ts';
 import { readSpz, type SpzCodes } from './spz.ts';
@@ -20,8 +20,9 @@ export interface ReadModel extends Gaussians {
 export async function readModel(bytes: Uint8Array, name = '', decode?: Decode): Promise<ReadModel> {
   const start = [...bytes.subarray(0, 4)].map((byte) => String.fromCharCode(byte)).join('');
   if (start.startsWith('ply')) {
-    const header = plyHeader(bytes);
-    return isCompressed(header) ? readCompressedPly(bytes, header) : readPly(bytes);
+    const file = binaryPly(bytes);
+    const header = plyHeader(file);
+    return isCompressed(header) ? readCompressedPly(file, header) : readPly(file);
   }
   if (start === 'NGSP' || start.startsWith('\x1f\x8b')) return readSpz(bytes);
   if (start === 'PK\x03\x04') return readSog(bytes, decode);

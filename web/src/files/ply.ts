@@ -4,6 +4,7 @@ import { InputError } from '../core/errors.ts';
 import { coefficients, COLUMNS, emptyGaussians, type Gaussians } from '../core/gaussians.ts';
 
 const MAX_HEADER_BYTES = 65536;
+const [SPACE, MAX_DIGITS] = [32, 100]; // of text
 const OPACITY_LOGIT_BOUND = 16; // in the place of infinities
 
 /** Of a type by either of its names the bytes that it takes, and what reads it. */
@@ -39,31 +40,52 @@ export function plyHeader(bytes: Uint8Array): PlyHeader {
   const text = new TextDecoder('latin1').decode(bytes.subarray(0, MAX_HEADER_BYTES));
   const end = /(^|\n)end_header\r?\n/.exec(text);
   if (!/^ply\r?\n/.test(text) || end === null) throw notWhole();
-  const elements: { name: string; count: number; properties: Property[]; stride: number }[] = [];
-  let format = '';
-  for (const line of text.slice(0, end.index).split(/\r?\n/).slice(1)) {
-    const words = line.trim().split(/\s+/);
-    const last = elements.at(-1);
-    if (words[0] === 'format' && !format) format = words[1];
-    else if (words[0] === 'element' && /^[0-9]{1,15}$/.test(words[2] ?? '')) {
-      elements.push({ name: words[1], count: Number(words[2]), properties: [], stride: 0 });
-    } else if (words[0] === 'property' && words.length === 3 && last && TYPES.has(words[1])) {
-      last.properties.push({ name: words[2], type: words[1], offset: last.stride });
-      last.stride += TYPES.get(words[1])!.size;
-    } else if (words[1] === 'list') throw noModel(); // a mesh
-    else if (!['', 'comment', 'obj_info'].includes(words[0])) throw notWhole();
-  }
-  if (!['binary_little_endian', 'binary_big_endian'].includes(format)) {
-    throw new InputError('This .ply is not a binary one.');
-  }
+  const format = /\nformat (\S+)/.exec(text)?.[1] ?? '';
+  if (!['binary_little_endian', 'binary_big_endian'].includes(format)) throw notWhole();
   let start = end.index + end[0].length;
-  const placed = elements.map((each) => {
+  const placed = elementsOf(text.slice(0, end.index)).map((each) => {
     const element = { ...each, start };
     start += each.count * each.stride;
     return element;
   });
   if (start > bytes.length) throw notWhole();
   return { littleEndian: format === 'binary_little_endian', elements: placed };
+}
+
+/** The elements of a header. Raises InputError. */
+function elementsOf(header: string): Omit<Element, 'start'>[] {
+  const elements: { name: string; count: number; properties: Property[]; stride: number }[] = [];
+  for (const line of header.split(/\r?\n/).slice(1)) {
+    const words = line.trim().split(/\s+/);
+    const last = elements.at(-1);
+    if (words[0] === 'element' && /^[0-9]{1,15}$/.test(words[2] ?? '')) {
+      elements.push({ name: words[1], count: Number(words[2]), properties: [], stride: 0 });
+    } else if (words[0] === 'property' && words.length === 3 && last && TYPES.has(words[1])) {
+      last.properties.push({ name: words[2], type: words[1], offset: last.stride });
+      last.stride += TYPES.get(words[1])!.size;
+    } else if (words[1] === 'list') throw noModel(); // a mesh
+    else if (!['', 'comment', 'obj_info', 'format', 'end_header'].includes(words[0])) throw notWhole();
+  }
+  return elements;
+}
+
+/** A text .ply as a binary one, of doubles; any other file as it is. Raises InputError for one that is cut short. */
+export function binaryPly(bytes: Uint8Array): Uint8Array {
+  const text = new TextDecoder('latin1').decode(bytes.subarray(0, MAX_HEADER_BYTES));
+  const header = /^ply\r?\n(?:comment.*\n)*format ascii [^]*?\nend_header\r?\n/.exec(text)?.[0];
+  if (header === undefined) return bytes;
+  const numbers = elementsOf(header).reduce((sum, each) => sum + each.count * each.properties.length, 0);
+  if (2 * numbers - 1 > bytes.length - header.length) throw notWhole(); // each takes a digit and a separator
+  const values = new DataView(new ArrayBuffer(8 * numbers));
+  for (let index = 0, at = header.length; index < numbers; index++) {
+    while (bytes[at] <= SPACE) at++;
+    const start = at;
+    while (bytes[at] > SPACE) at++;
+    if (at === start || at - start > MAX_DIGITS) throw notWhole();
+    values.setFloat64(8 * index, Number(String.fromCharCode(...bytes.subarray(start, at))), true);
+  }
+  const binary = header.replace(/\nformat ascii/, '\nformat binary_little_endian').replace(/(\nproperty )\S+/g, '$1double');
+  return joined(ascii(binary), new Uint8Array(values.buffer));
 }
 
 /** Numbers of one property of all rows. */

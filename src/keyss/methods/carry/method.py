@@ -24,7 +24,7 @@ from keyss.rendering.difference import Viewpoints, psnr_between
 # Without photos, the start is nearly right: the largest number of steps, and a factor on the rates.
 _MODEL_ITERATIONS, _MODEL_RATE = 400, 0.1
 _SELECTION_VIEWS = 64
-_SPZ_BYTES = 13  # of an appended Gaussian
+_SPZ_BYTES = 12  # of an appended Gaussian
 _FEWER = (
     "the secrets share the room, and each has fewer Gaussians than it could have alone: whoever has one of "
     "the keys can notice that there are other secrets"
