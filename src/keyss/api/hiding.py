@@ -187,7 +187,8 @@ def hide(
     with folder.work() if folder else nullcontext():
         if reporter and ranks.first and not resume and long:
             planned = plan_hiding(chosen, options, sources, target, place, bound=bound)
-            reporter.note(f"hide: {in_a_line(planned)}")
+            for line in (f"hide: {in_a_line(planned)}", *planned.notes):
+                reporter.note(line)
         context = Context(target, folder.checkpoints if folder and trains else None, resume, reporter)
         sources = with_plain_models(sources, configs, context)
         if any(each.given is None for each in sources):

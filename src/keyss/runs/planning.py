@@ -31,6 +31,7 @@ _STATE_COPIES = 3  # numbers in a checkpoint for each number of a model: itself 
 _MAX_APPENDED = 7  # Gaussians that hold one Gaussian of a secret of SH degree 3
 # About the most bytes of a packed Gaussian without harmonics, and of each of these.
 _PACKED = {"spz": (15, 0.3), "sog": (18, 0.7), "compressed-ply": (16.3, 1)}
+_PACKED_APPENDED = {"spz": 12, "sog": 15, "compressed-ply": 61.3}  # bytes
 _OTHER_BYTES = 4 << 20  # JSON files, locks, and the overhead of the file system
 
 
@@ -73,8 +74,16 @@ def plan_hiding(
     measuring += _KEY_SECONDS * (count - 1)
     stages += [*bounds, Stage("encrypting, opening, measuring", 0, plan.gaussians, measuring)]
     trains = options.trains or any(source.given is None for source in sources)
+    notes = plan.notes
+    if options.place.grows:
+        packed = (
+            (_file_bytes(sizes[0], plan.sh_degree, each) + (plan.gaussians - sizes[0]) * appended) / 1e6
+            for each, appended in _PACKED_APPENDED.items()
+        )
+        notes += ("at most {:,.1f} MB as .spz, {:,.1f} as .sog, {:,.1f} as compressed .ply".format(*packed),)
     return replace(
         plan,
+        notes=notes,
         method=method.name,
         stages=tuple(stages),
         file_bytes=_file_bytes(plan.gaussians, plan.sh_degree, options.publish),

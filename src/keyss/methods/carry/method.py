@@ -24,7 +24,6 @@ from keyss.rendering.difference import Viewpoints, psnr_between
 # Without photos, the start is nearly right: the largest number of steps, and a factor on the rates.
 _MODEL_ITERATIONS, _MODEL_RATE = 400, 0.1
 _SELECTION_VIEWS = 64
-_SPZ_BYTES = 12  # of an appended Gaussian
 _FEWER = (
     "the secrets share the room, and each has fewer Gaussians than it could have alone: whoever has one of "
     "the keys can notice that there are other secrets"
@@ -94,9 +93,8 @@ class CarryMethod:
                 )
         if appended:
             notes.append(
-                f"about {appended:,} invisible Gaussians are appended to the cover's {room.gaussians:,}, "
-                f"{appended * _SPZ_BYTES / 1e6:,.1f} MB as .spz; fewer Gaussians or a lower SH degree of a "
-                "secret take less"
+                f"about {appended:,} invisible Gaussians are appended to the cover's {room.gaussians:,}; fewer "
+                "Gaussians or a lower SH degree of a secret take less"
             )
         elif isinstance(room, WholeRoom):
             how = "about" if room.prepared is None else "exactly"
