@@ -18,7 +18,7 @@ from keyss.fitting.parameters import Optimizers
 LAST_RATE = 0.1  # share of the rates at the end of a run that settles
 _FULL_STEPS = 30_000
 _MAX_BOOST = 5.0
-_BOOST_GROWTH = 0.473  # exponent: 1,000 steps have the maximum
+_BOOST_GROWTH = 0.54  # exponent: 1,500 steps and fewer have the maximum
 _BOOSTED = 0.6  # share of a run with constant, larger rates
 _EXPONENTS = {"means": 7 / 4, "opacities": 1 / 4}  # of the boost; 1 for other attributes
 _LARGE = 0.05  # size over distance from the nearest camera, from which a Gaussian's boost is less
@@ -83,7 +83,7 @@ class Schedule:
 
 
 def boost_of(config: FitConfig) -> float:
-    """The factor on rates at the start of a run: 5 for 1,000 steps and fewer, 1 for 30,000 and more."""
+    """The factor on rates at the start of a run: 5 for 1,500 steps and fewer, 1 for 30,000 and more."""
     if config.boost is not None:
         return config.boost
     return float(min(_MAX_BOOST, max(1.0, (_FULL_STEPS / config.iterations) ** _BOOST_GROWTH)))
