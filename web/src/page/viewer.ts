@@ -12,6 +12,7 @@ const FURTHEST = 1e4;
 const SLOW = 120; // milliseconds of a frame beyond which pictures in motion are coarser
 const COARSE = 0.5; // of the resolution, then
 const COARSE_COUNT = 15_000; // and so many Gaussians at most, those that are seen most
+const LARGE = 100_000; // Gaussians of models that are coarse at first: all of them take seconds
 const POLL = 4; // milliseconds
 const AT_REST = 250; // milliseconds without a change after which pictures are fine
 const ASLEEP = 500; // milliseconds without a frame after which the engine has no more to do
@@ -22,7 +23,7 @@ interface Half {
   readonly camera: Entity;
   model: Gaussians | null;
   splats: Entity | null;
-  coarse: Entity | null; // few of its Gaussians, made when they are needed
+  coarse: Entity | null; // few of its Gaussians
 }
 
 export class Viewer {
@@ -78,16 +79,16 @@ export class Viewer {
   /** Shows a model, or nothing, on one side; the right side is hidden while it has none. */
   show(model: Gaussians | null, side: Side = 'left'): void {
     const half = this.halves[side];
-    const before = [half.splats, half.coarse];
-    half.model = model;
-    half.coarse = null;
-    half.splats = model && this.splats(model, half.layer);
-    for (const entity of before) {
+    for (const entity of [half.splats, half.coarse]) {
       if (!entity) continue;
       const old = (entity.gsplat as unknown as { resource: GSplatResource }).resource;
       entity.destroy();
       old.destroy();
     }
+    half.model = model;
+    half.splats = half.coarse = null;
+    if (model && model.count > LARGE) this.setScale(COARSE);
+    this.place(half);
     this.layOut();
     this.touch();
   }
@@ -167,7 +168,7 @@ export class Viewer {
 
   private layOut(): void {
     const { left, right } = this.halves;
-    const share = right.splats ? this.split : 1;
+    const share = right.model ? this.split : 1;
     left.camera.camera!.scissorRect = new Vec4(0, 0, share, 1);
     right.camera.camera!.scissorRect = new Vec4(share, 0, 1 - share, 1);
     left.camera.enabled = share > 0;
@@ -209,13 +210,19 @@ export class Viewer {
   private setScale(scale: number): void {
     if (scale === this.scale) return;
     this.scale = scale;
-    for (const half of Object.values(this.halves)) {
-      if (half.model === null || half.model.count <= COARSE_COUNT) continue;
-      half.coarse ??= this.splats(mostVisible(half.model, COARSE_COUNT), half.layer);
-      half.coarse.enabled = scale < 1;
-      half.splats!.enabled = scale === 1;
-    }
+    for (const half of Object.values(this.halves)) this.place(half);
     this.resize();
+  }
+
+  /** The Gaussians that belong to the resolution of now; they are made when they are needed first. */
+  private place(half: Half): void {
+    const { model, layer } = half;
+    if (model === null) return;
+    const coarse = this.scale < 1 && model.count > COARSE_COUNT;
+    if (coarse) half.coarse ??= this.splats(mostVisible(model, COARSE_COUNT), layer);
+    else half.splats ??= this.splats(model, layer);
+    if (half.coarse) half.coarse.enabled = coarse;
+    if (half.splats) half.splats.enabled = !coarse;
   }
 
   /** The next frame is drawn when this one is: else a slow GPU would have a queue of them, and lag behind. */
