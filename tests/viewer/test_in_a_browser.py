@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+import torch
 
 from cli.said import PROGRAM as KEYSS
 from keyss.core import Gaussians
@@ -172,8 +173,9 @@ def test_looking_saving_and_wiping(
     tab.page.wait_for_function("() => !document.getElementById('count').textContent.startsWith('4,000 of')")
     assert psnr(tab.picture(), plain) < 40
     tab.page.fill("#threshold", "0")
-    tab.page.select_option("#colouring", "low bits")
-    assert psnr(tab.picture(), plain) < CLOSE
+    for colouring in ("low bits", "constant colour"):
+        tab.page.select_option("#colouring", colouring)
+        assert psnr(tab.picture(), plain) < CLOSE
     tab.page.select_option("#colouring", "as it is")
     tab.try_key(KEYS[0])
     tab.saved("#download", tmp_path / "secret.ply")
@@ -193,6 +195,24 @@ def test_looking_saving_and_wiping(
     tab.page.click("#close")
     assert tab.page.locator("#revealed").is_hidden()
     assert psnr(tab.picture()[:, : border - 2], published) > 40  # from where it was seen beside the secret
+
+
+def test_a_drag_that_is_let_go_in_motion_glides(tab: Visit, page_file: Path) -> None:
+    """Unless the visitor prefers less motion: then the camera stops at once."""
+    turns = []
+    for motion in ("reduce", "no-preference"):
+        tab.page.emulate_media(reduced_motion=motion)
+        tab.page.goto("about:blank")
+        tab.goto(page_file.as_uri() + POSE)
+        before = camera_of(POSE).viewmat
+        tab.page.mouse.move(500, 150)
+        tab.page.mouse.down()
+        tab.page.mouse.move(560, 150, steps=6)
+        tab.page.mouse.up()
+        tab.page.wait_for_timeout(1500)
+        after = camera_of(tab.page.evaluate("location.hash")).viewmat
+        turns.append(float(torch.linalg.norm(after[:3, :3] - before[:3, :3])))
+    assert turns[1] > 1.1 * turns[0] > 0
 
 
 def test_a_file_can_be_dropped(tab: Visit, page_file: Path) -> None:

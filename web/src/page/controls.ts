@@ -6,13 +6,16 @@ const KEY_TURN = 0.08; // radians for each press of an arrow key
 const KEY_STEP = 0.06; // of the distance for each press
 const KEY_ZOOM = 1.1;
 const ROTATION = 0.0003; // radians for each millisecond
+const [GLIDE, RELEASED, STILL] = [150, 50, 1e-5]; // milliseconds to a third of the speed; since a movement; radians for each
 const [NEAREST, FURTHEST] = [1e-4, 1e5];
 
 export class Controls {
   flying = false;
   touched = false; // whether somebody moved the camera
   rotating = (_: boolean): void => undefined; // is told whether it goes around by itself
-  private turning = 0; // the animation frame in which it will
+  isRotating = false;
+  private turning = 0; // the next animation frame
+  private dragging = { azimuth: 0, elevation: 0, at: 0 }; // radians for each millisecond, of the last movement
   private readonly pointers = new Map<number, { x: number; y: number }>();
 
   /** `moved` is told of every new pose; `home` gives the first one again. */
@@ -28,7 +31,9 @@ export class Controls {
     });
     canvas.addEventListener('pointermove', (event) => this.dragged(event, canvas.clientHeight));
     for (const name of ['pointerup', 'pointercancel'] as const) {
-      canvas.addEventListener(name, (event) => this.pointers.delete(event.pointerId));
+      canvas.addEventListener(name, (event) => {
+        if (this.pointers.delete(event.pointerId) && !this.pointers.size) this.glide();
+      });
     }
     canvas.addEventListener('contextmenu', (event) => event.preventDefault());
     canvas.addEventListener('wheel', (event) => {
@@ -47,23 +52,41 @@ export class Controls {
 
   /** Goes around by itself until somebody moves the camera. */
   rotate(on: boolean): void {
-    cancelAnimationFrame(this.turning);
-    let before = performance.now();
-    const step = (now: number): void => {
-      this.turn((now - before) * ROTATION, 0);
-      before = now;
-      this.turning = requestAnimationFrame(step);
-    };
-    this.turning = on ? requestAnimationFrame(step) : 0;
+    this.animate((passed) => {
+      this.turn(passed * ROTATION, 0);
+      return on;
+    }, on);
+    this.isRotating = on;
     this.rotating(on);
   }
 
-  get isRotating(): boolean {
-    return this.turning !== 0;
+  /** A drag that was let go in motion goes on for a moment. */
+  private glide(): void {
+    const { azimuth, elevation, at } = this.dragging;
+    if (performance.now() - at > RELEASED || window.matchMedia('(prefers-reduced-motion: reduce)').matches) return;
+    let share = 1;
+    this.animate((passed) => {
+      share *= Math.exp(-passed / GLIDE);
+      this.turn(passed * share * azimuth, passed * share * elevation);
+      return share * Math.hypot(azimuth, elevation) > STILL;
+    });
+  }
+
+  /** Calls `step` with the milliseconds since the last frame until it says that it is done, or another one starts. */
+  private animate(step: (passed: number) => boolean, on = true): void {
+    cancelAnimationFrame(this.turning);
+    let before = performance.now();
+    const next = (now: number): void => {
+      const goesOn = step(Math.max(0, now - before));
+      before = now;
+      if (goesOn) this.turning = requestAnimationFrame(next);
+    };
+    if (on) this.turning = requestAnimationFrame(next);
   }
 
   private touch(): void {
     this.touched = true;
+    cancelAnimationFrame(this.turning);
     if (this.isRotating) this.rotate(false);
   }
 
@@ -73,7 +96,12 @@ export class Controls {
     const [dx, dy] = [event.clientX - before.x, event.clientY - before.y];
     if (this.pointers.size === 2) this.pinched(event, dx, dy, height);
     else if (event.shiftKey || event.buttons & 6) this.fly(-dx / height, -dy / height, 0);
-    else this.turn(dx * TURN, (this.flying ? -dy : dy) * TURN);
+    else {
+      const [azimuth, elevation] = [dx * TURN, (this.flying ? -dy : dy) * TURN];
+      const passed = Math.max(1, event.timeStamp - this.dragging.at);
+      this.dragging = { azimuth: azimuth / passed, elevation: elevation / passed, at: event.timeStamp };
+      this.turn(azimuth, elevation);
+    }
     this.pointers.set(event.pointerId, { x: event.clientX, y: event.clientY });
   }
 

@@ -28,12 +28,20 @@ export function looked(model: Gaussians): Gaussians {
   const [threshold, below] = [Number(page.threshold.value), page.faint.checked];
   const opacities = model.opacityLogits.map(opacity);
   let found = where(model, (row) => opacities[row] < threshold === below);
-  if (page.colouring.value !== 'as it is') found = coloured(found, page.colouring.value);
+  if (page.colouring.value === 'constant colour') found = withoutHarmonics(found);
+  else if (page.colouring.value !== 'as it is') found = coloured(found, page.colouring.value);
   if (page.opaque.checked) found = { ...found, opacityLogits: found.opacityLogits.map(() => OPAQUE_LOGIT) };
   const faint = opacities.filter((each) => each < MIN_DRAWN).length;
   page.count.textContent =
     `${count(found.count)} of ${count(model.count)} Gaussians shown; ${count(faint)} are too faint to be drawn`;
   return found;
+}
+
+/** The same Gaussians, which look alike from everywhere. */
+function withoutHarmonics(model: Gaussians): Gaussians {
+  const width = model.sh.length / model.count;
+  const sh = new Float32Array(3 * model.count).map((_, at) => model.sh[Math.floor(at / 3) * width + (at % 3)]);
+  return { ...model, shDegree: 0, sh };
 }
 
 /** The same Gaussians, from blue over green to yellow by a number of theirs. */
