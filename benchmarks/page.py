@@ -1,6 +1,7 @@
 """How long the viewer's page takes in headless Chromium without a GPU: the table of docs/viewer.md.
 
     python benchmarks/page.py [--count 100000] [--runs 3]
+    python benchmarks/page.py --pairs COVER.ply:SECRET.ply ... [--runs 4]  # times of right and wrong keys
 
 A model of so many Gaussians of SH degree 3, as large as those of models of as many are, that carries a secret
 of nine tenths as many of degree 0, in one page from disk: seconds to the first picture; frames per second
@@ -12,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import random
 import sys
 import tempfile
 import time
@@ -55,8 +57,8 @@ def sized(count: int, seed: int) -> Gaussians:
     """
     model = made(count, seed)
     generator = torch.Generator().manual_seed(seed)
-    random = torch.randn(count, 3, generator=generator, dtype=torch.float64)  # random in all bits
-    return replace(model, log_scales=(math.log(0.006 * float(model.means.std())) + 1.5 * random).float())
+    normal = torch.randn(count, 3, generator=generator, dtype=torch.float64)  # random in all bits
+    return replace(model, log_scales=(math.log(0.006 * float(model.means.std())) + 1.5 * normal).float())
 
 
 def page_of(count: int, folder: Path) -> Path:
@@ -77,11 +79,41 @@ def memory(tab: Visit) -> float:
     return float(used["usedSize"] + used.get("backingStorageSize", 0)) / 2**20
 
 
+def key_times(pairs: list[str], runs: int) -> None:
+    """For each pair the seconds of `runs` right and as many wrong keys, in random order."""
+    overlapping, order = 0, random.Random(0)
+    with tempfile.TemporaryDirectory() as name, sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=PROGRAM, args=SWITCHES)
+        for number, pair in enumerate(pairs):
+            folder = Path(name) / str(number)
+            cover, secret = pair.split(":")
+            method = CarryOptions(prune_to_fit=True, dither=True)
+            keyss.hide(
+                cover, [keyss.Secret(secret, KEY)], method=method, width=32, min_psnr=0, out=folder / "run"
+            )
+            page = export_html(folder / "run/publish/stego.ply", folder / "page.html")[0]
+            times: dict[str, list[float]] = {KEY: [], "another key": []}
+            keys = runs * list(times)
+            order.shuffle(keys)
+            with visit(browser) as tab:
+                tab.goto(page.as_uri())
+                tab.try_key("the first key compiles")
+                for key in keys:
+                    times[key].append(tab.try_key(key) / 1000)
+            (low, high), (least, most) = ((min(each), max(each)) for each in times.values())
+            overlapping += low <= most and least <= high
+            print(f"{pair}: right {low:.2f} to {high:.2f} s, wrong {least:.2f} to {most:.2f} s", flush=True)
+    print(f"{overlapping} of {len(pairs)} overlap")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--count", type=int, default=100_000)
+    parser.add_argument("--pairs", nargs="*", metavar="COVER:SECRET")
     parser.add_argument("--runs", type=int, default=3)
     asked = parser.parse_args()
+    if asked.pairs:
+        return key_times(asked.pairs, asked.runs)
     with tempfile.TemporaryDirectory() as folder, sync_playwright() as playwright:
         page = page_of(asked.count, Path(folder))
         print(f"one page of {page.stat().st_size / 1e6:.1f} MB", flush=True)

@@ -30,8 +30,12 @@ _RENDERS = 6  # of each test view, to measure
 _STATE_COPIES = 3  # numbers in a checkpoint for each number of a model: itself and two moments
 _MAX_APPENDED = 7  # Gaussians that hold one Gaussian of a secret of SH degree 3
 # About the most bytes of a packed Gaussian without harmonics, and of each of these.
-_PACKED = {"spz": (15, 0.3), "sog": (18, 0.7), "compressed-ply": (16.3, 1)}
-_PACKED_APPENDED = {"spz": 12, "sog": 15, "compressed-ply": 61.3}  # bytes
+_PACKED: dict[Publish, tuple[float, float]] = {
+    "spz": (15, 0.3),
+    "sog": (18, 0.7),
+    "compressed-ply": (16.3, 1),
+}
+_PACKED_APPENDED: dict[Publish, float] = {"spz": 12, "sog": 15, "compressed-ply": 61.3}  # bytes
 _OTHER_BYTES = 4 << 20  # JSON files, locks, and the overhead of the file system
 
 

@@ -34,7 +34,7 @@ _COLOUR_STEP = 0.0275  # twice what formats move constant colours by, and a litt
 _SCALE_STEP = 0.08  # the same for log scales
 _MIN_LOG_SCALE = -9.9  # of `.spz`, whose least is -10
 _SMALL = -9.0  # log scales of the smallest, beside that of the cube
-# x, y and z are below it, so that w is never smaller. Steps are 16 of those of `.spz`, which packs them better.
+# x, y and z are below it, so that w is never smaller. A step is 16 of `.spz`, which packs that better.
 _TURNS_REACH = 256 / 511 * 0.5**0.5
 _FARTHEST, _MAX_SHIFTS = 1 << 12, 500  # steps of log scales: that are looked at, and that are tried
 

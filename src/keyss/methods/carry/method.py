@@ -93,8 +93,8 @@ class CarryMethod:
                 )
         if appended:
             notes.append(
-                f"about {appended:,} invisible Gaussians are appended to the cover's {room.gaussians:,}; fewer "
-                "Gaussians or a lower SH degree of a secret take less"
+                f"about {appended:,} invisible Gaussians are appended to the cover's {room.gaussians:,}; "
+                "fewer Gaussians or a lower SH degree of a secret take less"
             )
         elif isinstance(room, WholeRoom):
             how = "about" if room.prepared is None else "exactly"
