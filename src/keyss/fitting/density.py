@@ -13,11 +13,15 @@ from torch import Tensor
 from keyss.fitting.config import FitConfig
 from keyss.fitting.parameters import Optimizers, Parameters
 from keyss.fitting.ranks import here
+from keyss.fitting.schedule import boost_of
 
 T = TypeVar("T")
 
 # The meta of a render, the indices of its Gaussians (None: all), and the weight of its loss.
 Rendered = tuple[dict[str, Any], Tensor | None, float]
+
+# Of a boost: larger rates make larger gradients, and models that stay below the cap would grow too much.
+_BOOSTED_GRADIENT = 0.3
 
 # Sums of DefaultStrategy over steps: norms of screen-space gradients [N], and numbers of renders [N].
 _STATISTICS = ("grad2d", "count")
@@ -41,7 +45,7 @@ class CappedStrategy(DefaultStrategy):  # type: ignore[misc]
     ) -> None:
         super().__init__(
             prune_opa=config.prune_opacity,
-            grow_grad2d=config.grow_gradient,
+            grow_grad2d=config.grow_gradient * max(1.0, _BOOSTED_GRADIENT * boost_of(config)),
             refine_start_iter=min(500, int(config.iterations * config.grow_start)),
             refine_stop_iter=int(config.iterations * config.grow_stop),
             refine_every=config.refine_every,
