@@ -6,7 +6,7 @@ const KEY_TURN = 0.08; // radians for each press of an arrow key
 const KEY_STEP = 0.06; // of the distance for each press
 const KEY_ZOOM = 1.1;
 const ROTATION = 0.0003; // radians for each millisecond
-const [GLIDE, RELEASED, STILL] = [150, 50, 1e-5]; // milliseconds to a third of the speed; since a movement; radians for each
+const [GLIDE, RELEASED, STILL] = [150, 80, 1e-5]; // milliseconds to a third of the speed; since a movement; radians for each
 const [NEAREST, FURTHEST] = [1e-4, 1e5];
 
 export class Controls {
