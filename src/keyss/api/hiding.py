@@ -192,7 +192,7 @@ def hide(
         context = Context(target, folder.checkpoints if folder and trains else None, resume, reporter)
         sources = with_plain_models(sources, configs, context)
         if any(each.given is None for each in sources):
-            with warnings.catch_warnings():  # they were given before
+            with warnings.catch_warnings():  # the first call has given them
                 warnings.simplefilter("ignore", KeyssWarning)
                 options = chosen.prepare([replace(each, given=each.model) for each in sources], options)
         plain = [each.model for each in sources]

@@ -47,7 +47,8 @@ class FitConfig:
     grow_start: float = 0.1  # densification starts here, or at 500 iterations if that is earlier
     grow_stop: float = 0.6
     grow_every: int | None = None  # steps; None: a thirtieth of the run, at most 100
-    grow_gradient: float = 2e-4  # mean screen-space gradient norm above which a Gaussian is cloned or split
+    # Mean screen-space gradient norm above which a Gaussian is cloned or split; a boost makes it larger.
+    grow_gradient: float = 2e-4
     prune_opacity: float = 5e-3
 
     evaluate_every: int = 500

@@ -65,14 +65,14 @@ def initial_gaussians(
 
     points [P, 3] and colors [P, 3] uint8; `limit` of them are sampled if there are more.
     """
+    from scipy.spatial import cKDTree  # slow to import, and only a start from points needs it
+
     if len(points) > limit:
         chosen = torch.randperm(len(points), generator=generator)[:limit].sort().values
         points, colors = points[chosen], colors[chosen]
     count = len(points)
     coordinates = points.double().numpy()
     neighbours = min(4, count)
-    from scipy.spatial import cKDTree  # slow to import, and only a start from points needs it
-
     distances = cKDTree(coordinates).query(coordinates, k=neighbours)[0].reshape(count, neighbours)
     spacing = torch.from_numpy(distances[:, 1:]).square().mean(1).sqrt() if count > 1 else torch.ones(1)
     sh = torch.zeros(count, (sh_degree + 1) ** 2, 3)

@@ -216,8 +216,9 @@ class Method(Protocol):
     options: type[MethodOptions]
 
     def prepare(self, sources: Sequence[Source], options: Any) -> Any:
-        """The options completed for these scenes, the cover first; again with fitted models as given ones.
+        """The options completed for these scenes, the cover first.
 
+        Called again once the plain models are fitted, with these as the given ones.
         Raises UsageError and InputError for what cannot work, before anything is trained.
         """
 

@@ -6,7 +6,7 @@ const KEY_TURN = 0.08; // radians for each press of an arrow key
 const KEY_STEP = 0.06; // of the distance for each press
 const KEY_ZOOM = 1.1;
 const ROTATION = 0.0003; // radians for each millisecond
-const [GLIDE, RELEASED, STILL] = [150, 80, 1e-5]; // milliseconds to a third of the speed; since a movement; radians for each
+const [GLIDE, RELEASED, STILL] = [150, 80, 1e-5]; // ms to a third of the speed; ms since a movement; radians for each ms
 const [NEAREST, FURTHEST] = [1e-4, 1e5];
 
 export class Controls {
@@ -52,10 +52,13 @@ export class Controls {
 
   /** Goes around by itself until somebody moves the camera. */
   rotate(on: boolean): void {
-    this.animate((passed) => {
-      this.turn(passed * ROTATION, 0);
-      return on;
-    }, on);
+    cancelAnimationFrame(this.turning);
+    if (on) {
+      this.animate((passed) => {
+        this.turn(passed * ROTATION, 0);
+        return true;
+      });
+    }
     this.isRotating = on;
     this.rotating(on);
   }
@@ -72,16 +75,16 @@ export class Controls {
     });
   }
 
-  /** Calls `step` with the milliseconds since the last frame until it says that it is done, or another one starts. */
-  private animate(step: (passed: number) => boolean, on = true): void {
+  /** Calls `step` with the milliseconds since the last frame until it returns false. */
+  private animate(step: (passed: number) => boolean): void {
     cancelAnimationFrame(this.turning);
     let before = performance.now();
     const next = (now: number): void => {
-      const goesOn = step(Math.max(0, now - before));
+      const more = step(Math.max(0, now - before));
       before = now;
-      if (goesOn) this.turning = requestAnimationFrame(next);
+      if (more) this.turning = requestAnimationFrame(next);
     };
-    if (on) this.turning = requestAnimationFrame(next);
+    this.turning = requestAnimationFrame(next);
   }
 
   private touch(): void {

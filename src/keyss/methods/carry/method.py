@@ -24,6 +24,7 @@ from keyss.rendering.difference import Viewpoints, psnr_between
 # Without photos, the start is nearly right: the largest number of steps, and a factor on the rates.
 _MODEL_ITERATIONS, _MODEL_RATE = 400, 0.1
 _SELECTION_VIEWS = 64
+_PLANNED = bytes(32)  # entropy of room that is only measured: every rank, and the plan, find the same
 _FEWER = (
     "the secrets share the room, and each has fewer Gaussians than it could have alone: whoever has one of "
     "the keys can notice that there are other secrets"
@@ -40,7 +41,7 @@ class CarryMethod:
     options = CarryOptions
 
     def prepare(self, sources: Sequence[Source], options: CarryOptions) -> CarryOptions:
-        """Decides which secrets are refitted; after the fits, those too that a small cover leaves no room.
+        """Decides which secrets are refitted: after the fits also those for which the cover is too small.
 
         Refuses a given cover without room, and given secrets that neither fit nor may be changed. Secrets
         that are fitted first are made to fit.
@@ -52,7 +53,7 @@ class CarryMethod:
         options = options.with_fit(sh_degree=degree)
         if cover.given is None:
             options = options.for_fitted_cover()
-        room = room_for(cover.given, options, bytes(32))  # all ranks decide alike; it is not published
+        room = room_for(cover.given, options, _PLANNED)
         options = replace(options, max_secret_degree=room.max_secret_degree)
         secret_sizes = _secret_sizes(secrets, options)
         sizes = room.sizes(secret_sizes)
@@ -78,7 +79,7 @@ class CarryMethod:
     def plan(self, sources: Sequence[Source], options: CarryOptions) -> Plan:
         """The room in the cover before refits; notes tell what the cover and the secrets lose."""
         cover, *secrets = sources
-        room, secret_sizes = room_for(cover.given, options), _secret_sizes(secrets, options)
+        room, secret_sizes = room_for(cover.given, options, _PLANNED), _secret_sizes(secrets, options)
         sizes = room.sizes(secret_sizes)
         appended, notes = room.appended(secret_sizes), []
         if cover.given is not None and room.cover is not None and room.cover is not cover.given:
