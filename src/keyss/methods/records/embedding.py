@@ -83,7 +83,7 @@ def embed_models(
 
 
 def _opened(placed: Embedded, keys: Sequence[str], contents: Sequence[Records]) -> list[CarriedSecret]:
-    """What the keys open. Raises RuntimeError if that is not what was embedded."""
+    """The secret that each key reveals. Raises RuntimeError if one differs from what was embedded."""
     rows, found = placed.part(_OPENED), []
     part = placed.gaussians[torch.from_numpy(rows)]
     for key, content, (own, cells) in zip(keys, contents, placed.places, strict=True):
