@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 
 import pytest
-import reedsolo
 from argon2.low_level import Type, core as argon2_core, ffi as argon2_ffi, hash_secret_raw, lib as argon2_lib
 from cryptography.exceptions import InvalidTag
 from cryptography.hazmat.primitives.ciphers import Cipher
@@ -90,7 +89,3 @@ def test_blake2b_rfc_7693_appendix_a() -> None:
         "7d87c5392aab792dc252d5de4533cc9518d38aa8dbf1925ab92386edd4009923"
     )
     assert hashlib.blake2b(b"abc").hexdigest() == expected
-
-
-def test_reedsolo_uses_the_field_that_ours_is_compared_in() -> None:
-    assert bytes(reedsolo.RSCodec(4).encode(b"\1"))[0] == 1

@@ -1,28 +1,31 @@
-"""Reed-Solomon over GF(256) for erasures: any k of n chunks give the data back.
+"""Reed-Solomon over GF(2^16): any k of n chunks give the data back (Reed and Solomon 1960).
 
-A systematic code of length n <= 255 with the generator polynomial (x - 1)(x - a)...(x - a^(n-k-1)), a = 2,
-over the field of the polynomial x^8 + x^4 + x^3 + x^2 + 1: the same codewords, byte for byte, as `reedsolo`
-makes. That library codes one codeword of bytes at a time and takes minutes for the payload of a model; here
-a chunk is a row of an array, and all its bytes are coded at once. Every chunk carries its number, so that the
-lost rows are known. Where tags are so short that some chunks are there by chance, they are found by trying:
-the codeword through k chunks that are right agrees with all others that are, every other one with hardly any.
+A chunk is a row of symbols of 16 bits, the higher byte first. The symbols of one column are values of one
+polynomial of degree below k, in chunk i at the field element i + 1, and the first k chunks are the data: what
+is missing follows by Lagrange's interpolation. The field has the polynomial x^16 + x^12 + x^3 + x + 1. A
+library would code one column at a time, symbol by symbol, and takes minutes for the payload of a model.
+
+Every chunk carries its number, so that the lost ones are known. Where some chunks are there by chance, they
+are located as errors: two chunks more than k for each of them.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
-from itertools import chain
 
 import numpy as np
 
-from keyss.core.arrays import Bytes, Integers
+from keyss.core.arrays import Bytes, Flags, Integers, Shorts
 from keyss.core.errors import InputError
 
-MAX_CHUNKS = 255  # of one codeword
-_TRIES = 2000  # of k chunks, in all codewords together
+MAX_CHUNKS = (1 << 16) - 1  # of one codeword
+SYMBOL_BYTES = 2
 LOST = "the key is right, but too much of the model was lost or changed since the secret was hidden in it"
-_POLYNOMIAL = 0x11D
+_POLYNOMIAL = 0x1100B
+_ORDER = (1 << 16) - 1  # of the generator 2
+_ZERO = 4 * _ORDER  # stands for the logarithm of 0: its sums with others are exponents of 0
+_AT_ONCE = 1 << 18  # products
+_MAX_ERRORS = 128  # of a codeword that are looked for
 
 
 @dataclass(frozen=True)
@@ -38,7 +41,7 @@ class Codewords:
     width: int
 
     def __post_init__(self) -> None:
-        if not (self.count >= 1 and 1 <= self.k <= self.n <= MAX_CHUNKS):
+        if not (self.count >= 1 and 1 <= self.k <= self.n <= MAX_CHUNKS and self.width % SYMBOL_BYTES == 0):
             raise ValueError(f"impossible codewords: {self}")
 
     @property
@@ -77,102 +80,135 @@ class Codewords:
     def _decoded(self, numbers: Integers, chunks: Bytes, errors: bool) -> Bytes | None:
         data = np.empty((self.k, self.count, self.width), np.uint8)
         rows, codewords = np.divmod(numbers, self.count)
-        random, tries = np.random.default_rng(0), iter(range(_TRIES))
         for codeword in range(self.count):
-            own = some = np.flatnonzero(codewords == codeword)
-            for _ in chain((0,), tries):
-                decoded = decode(dict(zip(rows[some].tolist(), chunks[some], strict=True)), self.k, self.n)
-                if decoded is None:
-                    return None
-                data[:, codeword] = decoded
-                wrong = 0 if not errors else (encode(decoded, self.n)[rows[own]] != chunks[own]).any(1).sum()
-                if 2 * wrong <= len(own) - self.k:  # no other codeword agrees with as many
-                    break
-                some = random.choice(own, self.k, replace=False)
+            own = codewords == codeword
+            decoded = decode(rows[own], chunks[own], self.k, errors=errors)
+            if decoded is None:
+                return None
+            data[:, codeword] = decoded
         return data
-
-
-def _tables() -> tuple[Bytes, list[int], list[int]]:
-    """[256, 256] products; exponentials of 2; logarithms."""
-    powers, logarithms = [0] * 510, [0] * 256
-    value = 1
-    for exponent in range(255):
-        powers[exponent] = powers[exponent + 255] = value
-        logarithms[value] = exponent
-        value = value << 1 ^ (_POLYNOMIAL if value & 128 else 0)
-    product = np.zeros((256, 256), np.uint8)
-    for a in range(1, 256):
-        product[a, 1:] = [powers[logarithms[a] + logarithms[b]] for b in range(1, 256)]
-    return product, powers, logarithms
-
-
-_PRODUCT, _POWERS, _LOGARITHMS = _tables()
 
 
 def encode(data: Bytes, n: int) -> Bytes:
-    """[n, width] of data [k, width]: the k rows, then n - k rows of parity. 1 <= k <= n <= 255."""
+    """[n, width] of data [k, width], width even: the k rows, then n - k rows of parity. 1 <= k <= n < 2^16."""
     k = len(data)
     if not 1 <= k <= n <= MAX_CHUNKS:
         raise ValueError(f"expected 1 <= k <= n <= {MAX_CHUNKS}, got k = {k}, n = {n}")
-    return np.concatenate([data, _times(_parity_matrix(k, n), data)])
+    return np.concatenate([data, _interpolated(np.arange(k), data, np.arange(k, n))])
 
 
-def decode(rows: dict[int, Bytes], k: int, n: int) -> Bytes | None:
-    """The data [k, width] from any k rows of a codeword of n, by their number; None if there are fewer."""
+def decode(numbers: Integers, rows: Bytes, k: int, *, errors: bool = False) -> Bytes | None:
+    """The data [k, width] from rows [C, width] of one codeword with different `numbers` [C].
+
+    `errors`: some of the rows may be those of other codewords. None if too few are left.
+    """
+    if errors and len(rows) > k:
+        right = _are_right(numbers, rows, k)
+        numbers, rows = numbers[right], rows[right]
     if len(rows) < k:
         return None
-    width = len(next(iter(rows.values())))
-    data = np.zeros((k, width), np.uint8)
-    known = [index for index in range(k) if index in rows]
-    lost = [index for index in range(k) if index not in rows]
-    for index in known:
-        data[index] = rows[index]
-    if not lost:
-        return data
-    parity = [index for index in sorted(rows) if index >= k][: len(lost)]
-    matrix = _parity_matrix(k, n)[[index - k for index in parity]]
-    right = np.stack([rows[index] for index in parity]) ^ _times(matrix[:, known], data[known])
-    data[lost] = _solve(matrix[:, lost], right)
+    order = np.argsort(numbers)[:k]  # data first
+    numbers, rows = numbers[order], rows[order]
+    data = np.empty((k, rows.shape[1]), np.uint8)
+    known = numbers < k
+    data[numbers[known]] = rows[known]
+    lost = np.setdiff1d(np.arange(k), numbers)
+    data[lost] = _interpolated(numbers, rows, lost)
     return data
 
 
-@lru_cache(maxsize=8)
-def _parity_matrix(k: int, n: int) -> Bytes:
-    """[n - k, k] so that parity = matrix x data: column i is x^(n-1-i) modulo the generator polynomial."""
-    size = n - k
-    generator = np.zeros(size + 1, np.uint8)  # of the highest power first
-    generator[0] = 1
-    for exponent in range(size):
-        generator[1:] ^= _PRODUCT[_POWERS[exponent]][generator[:-1]]
-    matrix = np.zeros((size, k), np.uint8)
-    if size == 0:
-        return matrix
-    remainder = generator[1:].copy()  # x^size modulo the generator
-    for column in range(k - 1, -1, -1):
-        matrix[:, column] = remainder
-        lead = remainder[0]
-        remainder = np.append(remainder[1:], np.uint8(0)) ^ _PRODUCT[lead][generator[1:]]
-    return matrix
+def _tables() -> tuple[Shorts, Integers]:
+    """Powers of 2, with zeros from `_ZERO` - `_ORDER` on; logarithms [2^16]."""
+    powers = np.zeros(_ZERO + 3 * _ORDER, np.uint16)
+    logarithms = np.full(1 << 16, _ZERO)
+    value = 1
+    for exponent in range(_ORDER):
+        powers[exponent : _ZERO - _ORDER : _ORDER] = value
+        logarithms[value] = exponent
+        value = value << 1 ^ (_POLYNOMIAL if value >> 15 else 0)
+    return powers, logarithms
 
 
-def _times(matrix: Bytes, rows: Bytes) -> Bytes:
-    """The matrix product [a, b] x [b, width] over the field."""
-    result = np.zeros((len(matrix), rows.shape[1]), np.uint8)
-    for index in range(matrix.shape[1]):
-        result ^= _PRODUCT[matrix[:, index, None], rows[index]]
-    return result
+_POWERS, _LOGARITHMS = _tables()
 
 
-def _solve(matrix: Bytes, right: Bytes) -> Bytes:
-    """x of matrix x = right for an invertible square matrix: Gauss-Jordan elimination."""
-    size = len(matrix)
-    work = np.concatenate([matrix, right], axis=1)
-    for column in range(size):
-        pivot = column + int(np.flatnonzero(work[column:, column])[0])
-        work[[column, pivot]] = work[[pivot, column]]
-        inverse = _POWERS[255 - _LOGARITHMS[work[column, column]]]
-        work[column] = _PRODUCT[inverse][work[column]]
-        factors = work[:, column].copy()
-        factors[column] = 0
-        work ^= _PRODUCT[factors[:, None], work[column]]
-    return work[:, size:]
+def _interpolated(numbers: Integers, rows: Bytes, wanted: Integers) -> Bytes:
+    """Rows [W, width] of the numbers `wanted` [W], from as many rows [k, width] as determine them.
+
+    At x it is the sum over all points a with a value v of P(x) v / ((x - a) P'(a)), P(x) the product of all
+    x - a, and P'(a) that of a and the other points.
+    """
+    found = np.zeros((len(wanted), rows.shape[1] // SYMBOL_BYTES), np.uint16)
+    if len(wanted):
+        points, at = numbers + 1, wanted + 1
+        values = _scaled(rows, -_products(points, points))
+        outside = _products(at, points)
+        step = max(1, _AT_ONCE // values.size)
+        for low in range(0, len(at), step):
+            some = slice(low, low + step)
+            factors = outside[some, None] + _ORDER - _LOGARITHMS[at[some, None] ^ points]
+            found[some] = np.bitwise_xor.reduce(_POWERS[factors[..., None] + values], axis=1)
+    return found.astype(">u2").view(np.uint8)
+
+
+def _scaled(rows: Bytes, logarithms: Integers) -> Integers:
+    """[C, width / 2] logarithms of the symbols of rows [C, width] times factors of `logarithms` [C]."""
+    symbols = _LOGARITHMS[np.ascontiguousarray(rows).view(">u2")]
+    return np.where(symbols == _ZERO, _ZERO, (symbols + logarithms[:, None]) % _ORDER)
+
+
+def _products(at: Integers, points: Integers) -> Integers:
+    """[A] logarithms of the products of the differences to `points` [P] other than itself."""
+    logarithms = _LOGARITHMS.copy()
+    logarithms[0] = 0
+    step = max(1, _AT_ONCE // len(points))
+    parts = [logarithms[at[low : low + step, None] ^ points].sum(axis=1) for low in range(0, len(at), step)]
+    return np.concatenate(parts) % _ORDER
+
+
+def _are_right(numbers: Integers, rows: Bytes, k: int) -> Flags:
+    """[C] which rows [C, width] belong to the codeword that most do; more than k.
+
+    The sums of v a^t / P'(a), t = 0, 1, ... (see `_interpolated`) over all rows vanish for a codeword as long
+    as t < C - k. From those that do not, the shortest linear recurrence gives the points in error (Massey
+    1969). Where there are too many errors, none is found.
+    """
+    points = numbers + 1
+    values = _scaled(rows, -_products(points, points))
+    mixed = np.bitwise_xor.reduce(_POWERS[values + np.arange(values.shape[1])], axis=1)  # of all columns
+    terms, powers = _LOGARITHMS[mixed], _LOGARITHMS[points]
+    times = np.arange(min(len(rows) - k, 2 * _MAX_ERRORS))[:, None]
+    sums = np.bitwise_xor.reduce(_POWERS[terms + times * powers % _ORDER], axis=1)
+    locator = _recurrence(sums.tolist()) if sums.any() else [1]
+    values_of = np.zeros(len(rows), np.uint16)  # the locator at 1 / a
+    for power, coefficient in enumerate(locator):
+        values_of ^= _POWERS[_LOGARITHMS[coefficient] + -power * powers % _ORDER]
+    right: Flags = values_of != 0
+    return right
+
+
+def _recurrence(sums: list[int]) -> list[int]:
+    """Coefficients, 1 first, of the shortest linear recurrence of a sequence (Berlekamp-Massey)."""
+    found, before, length, since, scale = [1], [1], 0, 1, 1
+    for index in range(len(sums)):
+        discrepancy = 0
+        for each, coefficient in enumerate(found[: length + 1]):
+            discrepancy ^= _product(coefficient, sums[index - each])
+        if discrepancy == 0:
+            since += 1
+            continue
+        factor = _product(discrepancy, int(_POWERS[_ORDER - _LOGARITHMS[scale]]))
+        shifted = [0] * since + [_product(factor, each) for each in before]
+        longer = max(len(found), len(shifted))
+        kept, found = found, [
+            a ^ b for a, b in zip(found + [0] * (longer - len(found)), shifted + [0] * (longer - len(shifted)))
+        ]
+        if 2 * length <= index:
+            length, before, scale, since = index + 1 - length, kept, discrepancy, 1
+        else:
+            since += 1
+    return found
+
+
+def _product(a: int, b: int) -> int:
+    return int(_POWERS[_LOGARITHMS[a] + _LOGARITHMS[b]])

@@ -1,39 +1,37 @@
-/** Reed-Solomon over GF(256) for erasures; see docs/format.md, "A payload". */
+/** Reed-Solomon over GF(2^16), with lost and wrong chunks; `keyss.channels.reed_solomon` on the other side. */
 import { tooMuchLost } from '../core/errors.ts';
-import { mix } from '../core/words.ts';
 
-const TRIES = 2000; // of k chunks, in all codewords together
+const ORDER = 65535; // of the generator 2
+const ZERO = 4 * ORDER; // stands for the logarithm of 0: its sums with others are exponents of 0
+const MAX_ERRORS = 128; // of a codeword that are looked for
 
-const POWERS = new Uint8Array(510);
-const LOGARITHMS = new Uint8Array(256);
-for (let exponent = 0, value = 1; exponent < 255; exponent++) {
-  POWERS[exponent] = POWERS[exponent + 255] = value;
+const POWERS = new Uint16Array(ZERO + 3 * ORDER);
+const LOGARITHMS = new Uint32Array(ORDER + 1).fill(ZERO);
+for (let exponent = 0, value = 1; exponent < ORDER; exponent++) {
+  for (let at = exponent; at < ZERO - ORDER; at += ORDER) POWERS[at] = value;
   LOGARITHMS[value] = exponent;
-  value = (value << 1) ^ (value & 128 ? 0x11d : 0);
+  value = (value << 1) ^ (value >> 15 ? 0x1100b : 0);
 }
 
 function product(a: number, b: number): number {
-  return a && b ? POWERS[LOGARITHMS[a] + LOGARITHMS[b]] : 0;
-}
-
-/** `to` += factor x `from`, over the field. */
-function addMultiple(to: Uint8Array, factor: number, from: Uint8Array): void {
-  if (!factor) return;
-  const logarithm = LOGARITHMS[factor];
-  for (let at = 0; at < to.length; at++) {
-    if (from[at]) to[at] ^= POWERS[logarithm + LOGARITHMS[from[at]]];
-  }
+  return POWERS[LOGARITHMS[a] + LOGARITHMS[b]];
 }
 
 /**
- * Data in `count` codewords of `n` chunks of `width` bytes, any `k` of which give a codeword back. Chunk i of codeword c
- * has the number i x `count` + c.
+ * Data in `count` codewords of `n` chunks of `width` bytes, an even number, any `k` of which give a codeword back. Chunk
+ * i of codeword c has the number i x `count` + c.
  */
 export interface Codewords {
   readonly count: number;
   readonly n: number;
   readonly k: number;
   readonly width: number;
+}
+
+/** A chunk of a codeword: values of polynomials at the field element `point`. */
+interface Chunk {
+  readonly point: number;
+  readonly bytes: Uint8Array;
 }
 
 /**
@@ -51,95 +49,101 @@ export function decoded(
   }
   if (left.size < count * k) throw tooMuchLost(); // before there is memory for that many
   const data = new Uint8Array(count * k * width);
-  let tries = errors ? TRIES : 0;
   for (let codeword = 0; codeword < count; codeword++) {
-    const rows = new Map<number, Uint8Array>();
+    let own: Chunk[] = [];
     for (let row = 0; row < n; row++) {
-      const chunk = left.get(row * count + codeword);
-      if (chunk) rows.set(row, chunk);
+      const bytes = left.get(row * count + codeword);
+      if (bytes) own.push({ point: row + 1, bytes });
     }
-    let found = decodeCodeword(rows, k, n);
-    // No other codeword has as many chunks that agree as one that at most half of those beyond k disagree with.
-    while (found && tries > 0 && disagreeing(found, rows, n) > (rows.size - k) / 2) {
-      const order = new Map([...rows.keys()].map((row) => [row, mix(row, tries)[1]]));
-      const some = [...rows].sort(([a], [b]) => order.get(a)! - order.get(b)!).slice(0, k);
-      found = decodeCodeword(new Map(some), k, n);
-      tries--;
-    }
-    if (found === null) throw tooMuchLost();
-    found.forEach((row, index) => data.set(row, (index * count + codeword) * width));
+    if (errors && own.length > k) own = rightOf(own, k);
+    if (own.length < k) throw tooMuchLost();
+    own = own.slice(0, k);
+    const put = (point: number, row: Uint8Array) => data.set(row, ((point - 1) * count + codeword) * width);
+    const known = new Set(own.map(({ point }) => point));
+    own.filter(({ point }) => point <= k).forEach(({ point, bytes }) => put(point, bytes));
+    const lost = Array.from({ length: k }, (_, row) => row + 1).filter((point) => !known.has(point));
+    if (lost.length) interpolated(own, lost).forEach((row, index) => put(lost[index], row));
   }
   return data;
 }
 
-/** How many rows are not those of the codeword of some data. */
-function disagreeing(data: Uint8Array[], rows: Map<number, Uint8Array>, n: number): number {
-  const matrix = parityMatrix(data.length, n);
-  let found = 0;
-  for (const [index, row] of rows) {
-    const left = row.slice();
-    if (index < data.length) addMultiple(left, 1, data[index]);
-    else data.forEach((own, column) => addMultiple(left, matrix[index - data.length][column], own));
-    if (left.some((each) => each !== 0)) found++;
-  }
+/** What as many chunks as determine the polynomials make of them at other points. */
+function interpolated(chunks: Chunk[], wanted: number[]): Uint8Array[] {
+  const [points, values] = [chunks.map(({ point }) => point), scaled(chunks)];
+  const columns = values.length / points.length;
+  const outside = logarithmsOfProducts(wanted, points);
+  return wanted.map((at, index) => {
+    const sums = new Uint16Array(columns);
+    points.forEach((point, row) => {
+      const factor = outside[index] + ORDER - LOGARITHMS[at ^ point];
+      for (let column = 0; column < columns; column++) sums[column] ^= POWERS[factor + values[row * columns + column]];
+    });
+    return Uint8Array.from({ length: 2 * columns }, (_, byte) => (sums[byte >> 1] >> (byte & 1 ? 0 : 8)) & 255);
+  });
+}
+
+/** [C, columns] logarithms of the chunks' symbols, each divided by the differences of its point to all others. */
+function scaled(chunks: Chunk[]): Uint32Array {
+  const points = chunks.map(({ point }) => point);
+  const columns = chunks[0].bytes.length / 2;
+  const found = new Uint32Array(chunks.length * columns);
+  const divisors = logarithmsOfProducts(points, points);
+  chunks.forEach(({ bytes }, row) => {
+    for (let column = 0; column < columns; column++) {
+      const own = LOGARITHMS[(bytes[2 * column] << 8) | bytes[2 * column + 1]];
+      found[row * columns + column] = own === ZERO ? ZERO : (own + ORDER - divisors[row]) % ORDER;
+    }
+  });
   return found;
 }
 
-/** The k data rows from any k rows of a codeword of n, by their number; null if there are fewer. */
-function decodeCodeword(rows: Map<number, Uint8Array>, k: number, n: number): Uint8Array[] | null {
-  if (rows.size < k) return null;
-  const data: Uint8Array[] = Array.from({ length: k }, (_, index) => rows.get(index)!);
-  const lost = [...data.keys()].filter((index) => data[index] === undefined);
-  if (!lost.length) return data;
-  const matrix = parityMatrix(k, n);
-  const parity = [...rows.keys()].filter((index) => index >= k).sort((a, b) => a - b).slice(0, lost.length);
-  const work = parity.map((index) => {
-    const coefficients = matrix[index - k];
-    const right = rows.get(index)!.slice();
-    for (let column = 0; column < k; column++) {
-      if (data[column] !== undefined) addMultiple(right, coefficients[column], data[column]);
-    }
-    return { left: Uint8Array.from(lost, (column) => coefficients[column]), right };
+/** Logarithms of the products of the differences to all `points` but itself. */
+function logarithmsOfProducts(at: number[], points: number[]): Uint32Array {
+  const others = Uint16Array.from(points);
+  return Uint32Array.from(at, (own) => {
+    let sum = 0; // exact: at most 2^16 logarithms of 2^16
+    for (const each of others) if (each !== own) sum += LOGARITHMS[own ^ each];
+    return sum % ORDER;
   });
-  for (let column = 0; column < lost.length; column++) {
-    const pivot = work.findIndex((row, index) => index >= column && row.left[column]);
-    [work[column], work[pivot]] = [work[pivot], work[column]];
-    const inverse = POWERS[255 - LOGARITHMS[work[column].left[column]]];
-    work[column].left = work[column].left.map((value) => product(value, inverse));
-    work[column].right = work[column].right.map((value) => product(value, inverse));
-    for (const row of work) {
-      const factor = row.left[column];
-      if (row === work[column] || !factor) continue;
-      addMultiple(row.left, factor, work[column].left);
-      addMultiple(row.right, factor, work[column].right);
-    }
-  }
-  lost.forEach((index, row) => (data[index] = work[row].right));
-  return data;
 }
 
-let latest = { k: 0, n: 0, matrix: [] as Uint8Array[] };
+/** Of more than k chunks those that belong to the codeword that most do; none where too many do not. */
+function rightOf(chunks: Chunk[], k: number): Chunk[] {
+  const values = scaled(chunks);
+  const columns = values.length / chunks.length;
+  const terms = chunks.map((_, row) => {
+    let sum = 0;
+    for (let column = 0; column < columns; column++) sum ^= POWERS[values[row * columns + column] + column];
+    return LOGARITHMS[sum];
+  });
+  const powers = chunks.map(({ point }) => LOGARITHMS[point]);
+  const sums = Array.from({ length: Math.min(chunks.length - k, 2 * MAX_ERRORS) }, (_, time) =>
+    powers.reduce((sum, power, row) => sum ^ POWERS[terms[row] + ((time * power) % ORDER)], 0),
+  );
+  const locator = sums.some((each) => each !== 0) ? recurrence(sums) : [1];
+  return chunks.filter((_, row) => {
+    const inverse = ORDER - powers[row];
+    return locator.reduce((sum, each, power) => sum ^ POWERS[LOGARITHMS[each] + ((power * inverse) % ORDER)], 0) !== 0;
+  });
+}
 
-/** [n - k][k]: column i is x^(n-1-i) modulo the generator polynomial. */
-function parityMatrix(k: number, n: number): Uint8Array[] {
-  if (latest.k === k && latest.n === n) return latest.matrix;
-  const size = n - k;
-  let generator = new Uint8Array(size + 1); // of the highest power first
-  generator[0] = 1;
-  for (let exponent = 0; exponent < size; exponent++) {
-    const next = generator.slice();
-    for (let at = 1; at <= size; at++) next[at] ^= product(POWERS[exponent], generator[at - 1]);
-    generator = next;
+/** Coefficients, 1 first, of the shortest linear recurrence of a sequence (Berlekamp-Massey). */
+function recurrence(sums: number[]): number[] {
+  let [found, before, length, since, scale] = [[1], [1], 0, 1, 1];
+  for (let index = 0; index < sums.length; index++) {
+    const discrepancy = found
+      .slice(0, length + 1)
+      .reduce((sum, each, back) => sum ^ product(each, sums[index - back]), 0);
+    if (discrepancy === 0) {
+      since++;
+      continue;
+    }
+    const factor = product(discrepancy, POWERS[ORDER - LOGARITHMS[scale]]);
+    const shifted = [...new Array<number>(since).fill(0), ...before.map((each) => product(factor, each))];
+    const kept = found;
+    found = Array.from({ length: Math.max(found.length, shifted.length) }, (_, at) => (kept[at] ?? 0) ^ (shifted[at] ?? 0));
+    if (2 * length <= index) [length, before, scale, since] = [index + 1 - length, kept, discrepancy, 1];
+    else since++;
   }
-  const matrix = Array.from({ length: size }, () => new Uint8Array(k));
-  let remainder = generator.slice(1);
-  for (let column = k - 1; column >= 0; column--) {
-    matrix.forEach((row, index) => (row[column] = remainder[index]));
-    const lead = remainder[0];
-    const next = new Uint8Array(size);
-    for (let at = 0; at < size; at++) next[at] = (remainder[at + 1] ?? 0) ^ product(lead, generator[at + 1]);
-    remainder = next;
-  }
-  latest = { k, n, matrix };
-  return matrix;
+  return found;
 }

@@ -3,8 +3,8 @@
 They survive every publication format, and moving, rotating and scaling of the whole model. Everybody sees
 that they are there; reading them takes the key. A payload is encrypted as a whole (ChaCha20-Poly1305 under a
 key that Argon2id gives with the file's salt), cut into packets, and given parity by Reed-Solomon in codewords
-of at most 255 packets, any 159 of which suffice. Every packet is a Gaussian. A header tells how many
-codewords there are and how many of their packets hold data.
+of at most 4096 packets, any 2913 of which suffice. Every packet is a Gaussian. A header tells how many of
+them hold data.
 """
 
 from __future__ import annotations
@@ -44,21 +44,20 @@ from keyss.channels.base import (
     randomness,
     unpack_payload,
 )
-from keyss.channels.reed_solomon import MAX_CHUNKS, Codewords
+from keyss.channels.reed_solomon import Codewords
 from keyss.core.arrays import Bits, Doubles, Integers
 from keyss.core.errors import KeyssWarning, UsageError, WrongKeyError
 from keyss.core.gaussians import Gaussians
 from keyss.keys.derivation import SALT_BYTES, DerivedKey, expand, stream
 from keyss.keys.encryption import OVERHEAD, compressed_size, decrypt, encrypt
 
-_DATA_BITS = 8  # of a header: packets of a codeword that hold data
-_MAX_DATA = 159
-_MAX_CODEWORDS = (1 << packets.HEADER_BITS - _DATA_BITS) - 1
-# A quarter of the packets may be lost, and some of the others garbled, with so many deviations more.
-_LEFT, _DEVIATIONS = 0.74, 4.2
+# A quarter of the packets may be lost, and some of the others garbled, with so many deviations more. Longer
+# codewords need fewer packets and more time: these are of 4096.
+_LEFT, _DEVIATIONS, _MAX_DATA = 0.74, 4.2, 2913
 # Bytes of a packet: the longer its tag, the fewer words of others pass for packets.
-_WIDE, _NARROW, _WIDE_CODEWORDS = 8, 7, 512
-MAX_BYTES = _MAX_CODEWORDS * _MAX_DATA * _NARROW - OVERHEAD - METHOD_BYTES
+_WIDE, _NARROW, _WIDE_PACKETS = 8, 6, 90_000
+_MAX_PACKETS = 1_000_000  # of data; a header tells up to 2^20
+MAX_BYTES = _MAX_PACKETS * _NARROW - OVERHEAD - METHOD_BYTES
 _OVERHEAD = 128  # bytes of a payload beside its data, at most
 
 # Gaussians in which pilots are counted; places of the lattice that are tried then, with so many deviations
@@ -155,30 +154,29 @@ class AppendedReader(SaltedReader):
         """`open` after key derivation."""
         for width in (_WIDE, _NARROW):
             header = packets.read_header(key.expand(f"appended/header/{width}", 32), self.words, width)
-            count, k = divmod(header or 0, 1 << _DATA_BITS)
-            if count > 0 and 0 < k <= _MAX_DATA:
+            if header:
                 numbers, data = packets.read(key.expand("appended/packets", 32), self.words, width)
-                encrypted = _codewords(count, k, width).decode(numbers.astype(np.int64), data, errors=True)
+                encrypted = _codewords(header, width).decode(numbers.astype(np.int64), data, errors=True)
                 return unpack_payload(decrypt(key.expand("appended/data", 32), encrypted, _ASSOCIATED))
         raise WrongKeyError()
 
 
 def _codewords_for(size: int, alone: bool) -> Codewords:
     """The codewords of `size` bytes of compressed payload. Raises UsageError for more than fit."""
-    for width, most in ((_WIDE, _WIDE_CODEWORDS * alone), (_NARROW, _MAX_CODEWORDS)):
+    for width, most in ((_WIDE, _WIDE_PACKETS * alone), (_NARROW, _MAX_PACKETS)):
         needed = -(-(size + OVERHEAD) // width)
-        count = -(-needed // _MAX_DATA)
-        if count <= most:
-            return _codewords(count, -(-needed // count), width)
+        if needed <= most:
+            return _codewords(needed, width)
     raise UsageError(f"the secret takes {size:,} bytes, and {MAX_BYTES:,} can be appended")
 
 
-def _codewords(count: int, data: int, width: int) -> Codewords:
-    """Codewords so long that enough of their packets are left."""
-    length = data
+def _codewords(needed: int, width: int) -> Codewords:
+    """Codewords for `needed` packets of data, so long that enough of their packets are left."""
+    count = -(-needed // _MAX_DATA)
+    length = data = -(-needed // count)
     while length * _LEFT - _DEVIATIONS * math.sqrt(length * _LEFT * (1 - _LEFT)) < data:
         length += 1
-    return Codewords(count, min(length, MAX_CHUNKS), data, width)
+    return Codewords(count, length, data, width)
 
 
 def _shifts_with_pilots(steps: Doubles, colours: Integers) -> Iterator[float]:
@@ -194,13 +192,12 @@ def _shifts_with_pilots(steps: Doubles, colours: Integers) -> Iterator[float]:
 def _words(key: DerivedKey, packed: bytes, alone: bool, random: np.random.Generator) -> Bits:
     """[N, WORD_BITS] header and packets of one secret; `alone`: there is no other."""
     codewords = _codewords_for(compressed_size(packed), alone)
-    width = codewords.width
+    width, needed = codewords.width, codewords.count * codewords.k
     encrypted = encrypt(key.expand("appended/data", 32), packed, _ASSOCIATED, size=codewords.size)
-    header = codewords.count << _DATA_BITS | codewords.k
     numbers = np.arange(codewords.chunks, dtype=np.uint64)
     return np.concatenate(
         [
-            packets.write_header(key.expand(f"appended/header/{width}", 32), header, width, random),
+            packets.write_header(key.expand(f"appended/header/{width}", 32), needed, width, random),
             packets.write(key.expand("appended/packets", 32), numbers, codewords.encode(encrypted)),
         ]
     )

@@ -35,7 +35,7 @@ import numpy as np
 from keyss.channels.base import RecordPlan, RecordRequest, Room
 from keyss.channels.low_bits.bits import bytes_per_gaussian
 from keyss.channels.low_bits.cells import TAG_BYTES
-from keyss.channels.reed_solomon import MAX_CHUNKS, Codewords
+from keyss.channels.reed_solomon import SYMBOL_BYTES, Codewords
 from keyss.core.arrays import Bytes, Integers
 from keyss.core.errors import UsageError
 from keyss.keys.encryption import SMALLEST_BUCKET, encrypted_size
@@ -56,6 +56,7 @@ _DEVIATIONS = 6  # by which carriers that are left untouched may be fewer than e
 REMOVAL = 0.25  # share of the Gaussians that may be removed at random
 FAILURE = 1e-7  # probability that a payload is lost all the same
 NUMBER_BYTES = 3  # of a chunk
+MAX_CHUNKS = 1024  # of a codeword: longer ones hold a little more and take longer
 MAX_CODEWORDS = (1 << 8 * NUMBER_BYTES) // MAX_CHUNKS
 
 
@@ -147,7 +148,7 @@ class LowBitsRoom:
             return plans, True
         cells, plans = self._payload_cells(len(sizes)), []
         for size in sizes:
-            codewords = codewords_for(cells, self.record_bytes(1) - NUMBER_BYTES, size)
+            codewords = codewords_for(cells, self._chunk_bytes(1), size)
             if codewords is None:
                 raise UsageError(self.too_small(self.carriers, "usable Gaussians", size, len(sizes)))
             plans.append(PayloadPlan(1, cells, codewords))
@@ -155,11 +156,11 @@ class LowBitsRoom:
 
     def payload_capacity(self, secrets: int) -> int:
         """Bytes of encrypted payload for each of `secrets`; may be 0."""
-        return largest_payload(self._payload_cells(secrets), self.record_bytes(1) - NUMBER_BYTES)
+        return largest_payload(self._payload_cells(secrets), self._chunk_bytes(1))
 
     def too_small(self, count: int, what: str, size: int, secrets: int) -> str:
         """The message for payloads of `size` bytes that do not fit; `count` and `what` describe the model."""
-        if self.record_bytes(1) <= NUMBER_BYTES:
+        if self._chunk_bytes(1) <= 0:
             return (
                 f"a cover whose Gaussians hold {self.width} bytes has no room for anything in its low bits: "
                 "there are 8 at SH degree 0, 21 at degree 1, and 4 less where quaternions have unit length"
@@ -175,6 +176,10 @@ class LowBitsRoom:
             f"a cover of {count:,} {what} is too small to carry {size:,} bytes{each} in its low bits; "
             f"{rounded:,} Gaussians would do"
         )
+
+    def _chunk_bytes(self, cells: int) -> int:
+        """Bytes of a payload's chunk, whole symbols; 0 or less where nothing fits."""
+        return (self.record_bytes(cells) - NUMBER_BYTES) // SYMBOL_BYTES * SYMBOL_BYTES
 
     @property
     def _shared(self) -> int:
@@ -207,7 +212,7 @@ class LowBitsRoom:
 
     def _payload_alone(self, size: int) -> PayloadPlan | None:
         for cells, room in self._classes():
-            codewords = codewords_for(room, self.record_bytes(cells) - NUMBER_BYTES, size)
+            codewords = codewords_for(room, self._chunk_bytes(cells), size)
             if codewords is not None:
                 return PayloadPlan(cells, room, codewords)
         return None

@@ -20,6 +20,7 @@ from keyss.channels.low_bits.cells import TAG_BYTES, CellCipher
 from keyss.channels.low_bits.layout import (
     DATA_KEY_BYTES,
     MAX_CELLS,
+    MAX_CHUNKS,
     MAX_CODEWORDS,
     NUMBER_BYTES,
     PARAMETER_COPIES,
@@ -35,7 +36,7 @@ VERSION = 3
 MAX_HEADER_BYTES = 4096
 PAYLOAD, RECORDS = 1, 2  # services
 _PREFIX = struct.Struct(f"<BB15s{SALTS}sBHH")
-_PAYLOAD = struct.Struct("<IIBB")  # bytes of the encrypted payload, codewords, chunks of one, data chunks
+_PAYLOAD = struct.Struct("<IIHH")  # bytes of the encrypted payload, codewords, chunks of one, data chunks
 
 
 def key_cipher(key: DerivedKey) -> CellCipher:
@@ -113,7 +114,7 @@ def unpack_codewords(header: bytes, record_bytes: int) -> tuple[int, Codewords]:
     try:
         size, count, n, k = _PAYLOAD.unpack(header)
         codewords = Codewords(count, n, k, record_bytes - NUMBER_BYTES)
-        if count > MAX_CODEWORDS or not 0 < size <= codewords.size:
+        if codewords.chunks > MAX_CODEWORDS * MAX_CHUNKS or not 0 < size <= codewords.size:
             raise ValueError(f"{size} bytes in {codewords}")
     except (ValueError, struct.error) as error:
         raise InputError(f"the hidden parameters are damaged: {error}") from error

@@ -2,12 +2,10 @@
 import { ecb } from '@noble/ciphers/aes.js';
 import type { Codewords } from '../reed_solomon.ts';
 
-export const WIDTHS = [8, 7]; // bytes of a packet
-const DATA_BITS = 8; // of a header: packets of a codeword that hold data
+export const WIDTHS = [8, 6]; // bytes of a packet
 const HEADER_BITS = 20;
 const WORD_BYTES = 11;
-const MAX_DATA = 159;
-const MAX_CHUNKS = 255;
+const MAX_DATA = 2913; // packets of a codeword
 const [LEFT, DEVIATIONS] = [0.74, 4.2]; // of packets that may be relied upon
 const AGREEING_HEADERS = 12; // fewer may agree by chance among a million words
 
@@ -46,21 +44,22 @@ export function readPackets(key: Uint8Array, { count, bytes }: TaggedWords, widt
   for (let row = 0; row < count; row++) {
     let tag = 0;
     for (let byte = 0; byte < WORD_BYTES - width; byte++) {
-      tag = (tag << 8) | (bytes[WORD_BYTES * row + width + byte] ^ encrypted[16 * row + byte]);
+      tag = 256 * tag + (bytes[WORD_BYTES * row + width + byte] ^ encrypted[16 * row + byte]); // may pass 2^32
     }
-    found.push([tag >>> 4, blocks.subarray(16 * row, 16 * row + width)]);
+    found.push([Math.floor(tag / 16), blocks.subarray(16 * row, 16 * row + width)]);
   }
   return found;
 }
 
-/** The codewords that most headers tell; null where too few agree, or where no writer would have written them. */
+/** The codewords that most headers tell; null where too few agree. */
 export function readHeader(key: Uint8Array, words: TaggedWords, width: number): Codewords | null {
   const votes = new Uint32Array(1 << HEADER_BITS);
   for (const [number] of readPackets(key, words, width)) if (number < votes.length) votes[number]++;
   const header = votes.reduce((best, each, value) => (each > votes[best] ? value : best), 0);
-  const [count, k] = [header >> DATA_BITS, header & ((1 << DATA_BITS) - 1)];
-  if (!(votes[header] >= AGREEING_HEADERS && count > 0 && k > 0 && k <= MAX_DATA)) return null;
+  if (!(votes[header] >= AGREEING_HEADERS && header > 0)) return null;
+  const count = Math.ceil(header / MAX_DATA);
+  const k = Math.ceil(header / count);
   let n = k;
   while (n * LEFT - DEVIATIONS * Math.sqrt(n * LEFT * (1 - LEFT)) < k) n++;
-  return { count, n: Math.min(n, MAX_CHUNKS), k, width };
+  return { count, n, k, width };
 }

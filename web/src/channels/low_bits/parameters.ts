@@ -8,8 +8,7 @@ const PREFIX_BYTES = 34;
 const NUMBERS = 29; // where cells, bytes of a record and bytes of the header begin
 const MAX_CELLS = 4;
 const MAX_HEADER_BYTES = 4096;
-const MAX_CHUNKS = 255;
-const MAX_CODEWORDS = Math.floor((1 << 24) / MAX_CHUNKS);
+const MAX_CHUNKS = 1 << 24; // of all codewords
 export const NUMBER_BYTES = 3; // of a chunk of a payload
 
 /** The parameters of records; a carrier holds `cells` of them. */
@@ -40,10 +39,11 @@ export function unpackParameters(parts: Uint8Array[]): Parameters {
 
 /** Bytes of the encrypted payload, and its codewords, from the header of a payload. Raises InputError. */
 export function unpackCodewords({ header, recordBytes }: Parameters): [number, Codewords] {
-  if (header.length !== 10) throw damaged();
-  const [size, count] = [viewOf(header).getUint32(0, true), viewOf(header).getUint32(4, true)];
-  const [n, k, width] = [header[8], header[9], recordBytes - NUMBER_BYTES];
-  const possible = count >= 1 && count <= MAX_CODEWORDS && k >= 1 && k <= n;
+  if (header.length !== 12) throw damaged();
+  const view = viewOf(header);
+  const [size, count] = [view.getUint32(0, true), view.getUint32(4, true)];
+  const [n, k, width] = [view.getUint16(8, true), view.getUint16(10, true), recordBytes - NUMBER_BYTES];
+  const possible = count >= 1 && count * n <= MAX_CHUNKS && k >= 1 && k <= n && width % 2 === 0;
   if (!possible || size < 1 || size > count * k * width) throw damaged();
   return [size, { count, n, k, width }];
 }

@@ -1,0 +1,77 @@
+"""Codewords, with the field arithmetic of `reedsolo` as the oracle."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import reedsolo
+from hypothesis import given, settings, strategies as st
+
+from keyss.channels import reed_solomon
+from keyss.channels.reed_solomon import Codewords
+from keyss.core import InputError
+
+
+def _data(k: int, width: int = 6, seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).integers(0, 256, (k, width), dtype=np.uint8)
+
+
+@pytest.mark.parametrize(("k", "n"), [(1, 2), (2, 3), (10, 20), (60, 90), (7, 255)])
+def test_codewords_are_values_of_polynomials(k: int, n: int) -> None:
+    reedsolo.init_tables(prim=0x1100B, generator=2, c_exp=16)
+    coefficients = np.random.default_rng(k).integers(0, 1 << 16, (3, k)).tolist()
+    values = [[reedsolo.gf_poly_eval(each, x) for each in coefficients] for x in range(1, n + 1)]
+    expected = np.array(values, ">u2").view(np.uint8)
+    assert np.array_equal(reed_solomon.encode(expected[:k], n), expected)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(1, 40), st.integers(0, 40), st.integers(0, 2**32 - 1))
+def test_any_k_of_n_give_the_data_back_and_fewer_do_not(k: int, parity: int, seed: int) -> None:
+    data = _data(k, seed=seed)
+    coded = reed_solomon.encode(data, k + parity)
+    order = np.random.default_rng(seed).permutation(k + parity)
+    got = reed_solomon.decode(order[:k], coded[order[:k]], k)
+    assert got is not None
+    assert np.array_equal(got, data)
+    assert reed_solomon.decode(order[: k - 1], coded[order[: k - 1]], k) is None
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(1, 40), st.integers(0, 12), st.integers(0, 20), st.integers(0, 2**32 - 1))
+def test_an_error_costs_two_chunks(k: int, wrong: int, lost: int, seed: int) -> None:
+    random = np.random.default_rng(seed)
+    data = _data(k, seed=seed)
+    coded = reed_solomon.encode(data, k + 2 * wrong + lost)
+    left = random.permutation(len(coded))[lost:]
+    rows = coded[left]
+    rows[:wrong] ^= random.integers(1, 256, (wrong, rows.shape[1]), np.uint8)
+    got = reed_solomon.decode(left, rows, k, errors=True)
+    assert got is not None
+    assert np.array_equal(got, data)
+
+
+def test_long_codewords_with_losses_and_errors() -> None:
+    random = np.random.default_rng(5)
+    codewords = Codewords(2, 4096, 2913, 8)
+    data = random.bytes(codewords.size)
+    chunks = codewords.encode(data)
+    numbers = random.permutation(codewords.chunks)[: round(0.75 * codewords.chunks)]
+    left = chunks[numbers]
+    left[:60] = random.integers(0, 256, (60, 8))
+    assert codewords.decode(numbers, left) != data
+    assert codewords.decode(numbers, left, errors=True) == data
+    twice = np.concatenate([numbers, numbers[60:100]]), np.concatenate([left, left[:40]])
+    assert codewords.decode(*twice, errors=True) == data  # both of two that differ are left out
+    with pytest.raises(InputError, match="5,000 of 8,192 chunks are left"):
+        codewords.decode(numbers[:5000], left[:5000], errors=True)
+
+
+@pytest.mark.parametrize(("k", "n"), [(0, 3), (4, 3), (10, 1 << 16)])
+def test_sizes_out_of_range_are_refused(k: int, n: int) -> None:
+    with pytest.raises(ValueError, match="expected"):
+        reed_solomon.encode(_data(k), n)
+    with pytest.raises(ValueError, match="impossible"):
+        Codewords(1, n, k, 8)
+    with pytest.raises(ValueError, match="impossible"):
+        Codewords(1, 3, 2, 7)
