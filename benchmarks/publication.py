@@ -6,7 +6,8 @@ RUN: a folder of `keyss hide --publish any` with one secret. For each program an
 is converted, and so is the cover's plain model; the secret is revealed from the converted file alone. PSNR in
 dB against the test photos.
 
-pip install gsply npm install --no-save @playcanvas/splat-transform@2.7.1   (or KEYSS_SPLAT_TRANSFORM)
+    pip install gsply
+    npm install --no-save @playcanvas/splat-transform@2.7.1   (or KEYSS_SPLAT_TRANSFORM)
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ def row(run: HidingRun, name: str, converter: Converter | None) -> str:
     except KeyssError as error:
         revealed = f"lost ({type(error).__name__})"
     covers = [against_photos(each, cover) for each in (plain, stego)]
-    sizes = f"{untouched / 1e6:.2f} / {size / 1e6:.2f}" if size else ""
+    sizes = f"{untouched / 1e6:.2f} / {size / 1e6:.2f} ({size / untouched:.2f})" if size else ""
     return f"| {name} | {sizes} | {covers[0]:.2f} / {covers[1]:.2f} | {revealed} |"
 
 
@@ -61,7 +62,10 @@ def main() -> None:
     plain = [len(each) for each in run.plain_models() if each is not None]
     own = [len(each.reveal(run.stego)) for each in run.opened]
     print(f"{asked.run.name}: {len(run.stego):,} Gaussians, cover {plain[0]:,}, secret {own[0]:,}\n")
-    print("| what | MB, plain / published | cover, plain / published (dB) | secret (dB) |")
+    plain_secret = run.plain_models()[1]
+    if plain_secret is not None:
+        print(f"plain secret: {against_photos(plain_secret, run.scenes(train_pictures=False)[1]):.2f} dB\n")
+    print("| what | MB, plain / published (ratio) | cover, plain / published (dB) | secret (dB) |")
     print("| --- | --- | --- | --- |")
     print(row(run, "`.ply`, as published", None), flush=True)
     for converter in converters(asked.sog_iterations):

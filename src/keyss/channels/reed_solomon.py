@@ -12,6 +12,7 @@ are located as errors: two chunks more than k for each of them.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import zip_longest
 
 import numpy as np
 
@@ -90,7 +91,7 @@ class Codewords:
 
 
 def encode(data: Bytes, n: int) -> Bytes:
-    """[n, width] of data [k, width], width even: the k rows, then n - k rows of parity. 1 <= k <= n < 2^16."""
+    """[n, width] of data [k, width], width even: k rows, then n - k of parity. 1 <= k <= n < 2^16."""
     k = len(data)
     if not 1 <= k <= n <= MAX_CHUNKS:
         raise ValueError(f"expected 1 <= k <= n <= {MAX_CHUNKS}, got k = {k}, n = {n}")
@@ -199,10 +200,7 @@ def _recurrence(sums: list[int]) -> list[int]:
             continue
         factor = _product(discrepancy, int(_POWERS[_ORDER - _LOGARITHMS[scale]]))
         shifted = [0] * since + [_product(factor, each) for each in before]
-        longer = max(len(found), len(shifted))
-        kept, found = found, [
-            a ^ b for a, b in zip(found + [0] * (longer - len(found)), shifted + [0] * (longer - len(shifted)))
-        ]
+        kept, found = found, [a ^ b for a, b in zip_longest(found, shifted, fillvalue=0)]
         if 2 * length <= index:
             length, before, scale, since = index + 1 - length, kept, discrepancy, 1
         else:

@@ -61,7 +61,12 @@ def cover() -> Gaussians:
     "hostile",
     [
         Parameters(
-            PAYLOAD, "carry", b"", 1, 71, pack_codewords(10**9, Codewords(layout.MAX_CODEWORDS, 1024, 1024, 68))
+            PAYLOAD,
+            "carry",
+            b"",
+            1,
+            71,
+            pack_codewords(10**9, Codewords(layout.MAX_CODEWORDS, 1024, 999, 68)),
         ),
         Parameters(PAYLOAD, "carry", b"", 1, 71, pack_codewords(69, Codewords(1, 255, 1, 68))),
         Parameters(PAYLOAD, "carry", b"", 1, 71, b"too short"),

@@ -71,9 +71,9 @@ def own_frame(model: Gaussians) -> Similarity:
 
 
 def in_order(words: Bits) -> Bits:
-    """`words` by x, then by y from its lowest bit on: `.spz` packs runs of equal bytes."""
-    x, y = (INVARIANT_BITS + np.arange(2)[:, None] * POSITION_BITS + np.arange(POSITION_BITS)).tolist()
-    return words[np.lexsort(words[:, [*y, *x[::-1]]].T)]
+    """`words` by the z of their turns, then y, then x: `.spz` packs runs of equal rotations."""
+    turns = words[:, -3 * TURN_BITS :].reshape(-1, 3, TURN_BITS)[:, ::-1]  # the highest bit of z first
+    return words[np.lexsort(turns.reshape(len(words), -1).T[::-1])]
 
 
 def to_gaussians(words: Bits, to_world: Similarity, sh_degree: int) -> Gaussians:
