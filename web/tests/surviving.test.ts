@@ -11,19 +11,10 @@ import { movedPoint } from '../src/core/similarity.ts';
 import { mixed, namesakes, sortingOrder } from '../src/core/words.ts';
 import { type Derive, expand } from '../src/keys/keys.ts';
 import { here, inTurn, oneByOne } from '../src/keys/pool.ts';
-import { digest, hex, jsonVector, modelOf } from './vectors.ts';
+import { digest, hex, jsonVector, modelOf, random } from './vectors.ts';
 
 const OPENED = jsonVector<{ file: string; key: string; payload?: string }[]>('revealed.json');
 const NOTE = OPENED.find((each) => each.file === 'colours.spz')!;
-
-/** Numbers in [0, 1) that are the same every time. */
-function random(seed: number): () => number {
-  const state = new Uint32Array(2);
-  return () => {
-    [state[0], state[1]] = [++seed, 99];
-    return mixed(state)[1] / 2 ** 32;
-  };
-}
 
 /** Rows of a model in another order, of which a share is left. */
 function some(model: Gaussians, share: number, seed: number): Gaussians {

@@ -4,6 +4,7 @@ import { readFileSync } from 'node:fs';
 import { WebPCodec } from '@playcanvas/splat-transform';
 import { expect } from 'vitest';
 import type { Gaussians } from '../src/core/gaussians.ts';
+import { mixed } from '../src/core/words.ts';
 import { readModel, type ReadModel } from '../src/files/models.ts';
 
 const FOLDER = new URL('../../tests/vectors/', import.meta.url);
@@ -57,4 +58,13 @@ export function expectRevealed(secret: { gaussians: Gaussians; hidden: number },
 
 export function hex(text: string): Uint8Array {
   return new Uint8Array(Buffer.from(text, 'hex'));
+}
+
+/** Numbers in [0, 1) that are the same every time. */
+export function random(seed: number): () => number {
+  const state = new Uint32Array(2);
+  return () => {
+    [state[0], state[1]] = [++seed, 99];
+    return mixed(state)[1] / 2 ** 32;
+  };
 }

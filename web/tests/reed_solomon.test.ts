@@ -1,0 +1,37 @@
+/** Codewords made with slow arithmetic, with losses and errors. */
+import { expect, test } from 'vitest';
+import { decoded } from '../src/channels/reed_solomon.ts';
+import { random } from './vectors.ts';
+
+function product(a: number, b: number): number {
+  let sum = 0;
+  for (let bit = 15; bit >= 0; bit--) sum = (sum << 1) ^ (sum & 0x8000 ? 0x1100b : 0) ^ ((b >> bit) & 1 ? a : 0);
+  return sum;
+}
+
+/** Chunk i of n, of two columns: values at i + 1 of polynomials with random coefficients. */
+function chunksOf(n: number, k: number, draw: () => number): Uint8Array[] {
+  const polynomials = [0, 1].map(() => Array.from({ length: k }, () => Math.floor(65536 * draw())));
+  return Array.from({ length: n }, (_, row) => {
+    const values = polynomials.map((each) => each.reduce((value, coefficient) => product(value, row + 1) ^ coefficient, 0));
+    return Uint8Array.from(values.flatMap((value) => [value >> 8, value & 255]));
+  });
+}
+
+test.each([[1, 9, 3, 2], [12, 40, 9, 10], [100, 180, 20, 40], [30, 30, 0, 0]])(
+  '%i of %i chunks, %i of them wrong and %i lost',
+  (k, n, wrong, lost) => {
+    const draw = random(k);
+    const two = [chunksOf(n, k, draw), chunksOf(n, k, draw)];
+    const numbered = two.flatMap((chunks, codeword) =>
+      chunks.map((chunk, row): [number, Uint8Array] => [2 * row + codeword, chunk]).slice(codeword ? 0 : lost),
+    );
+    const seen = numbered.map(([number, chunk], at): [number, Uint8Array] => [
+      number, at < wrong ? chunk.map((each) => each ^ 77) : chunk,
+    ]);
+    const data = decoded({ count: 2, n, k, width: 4 }, seen.reverse(), wrong > 0);
+    const expected = Array.from({ length: k }, (_, row) => two.map((chunks) => [...chunks[row]])).flat(2);
+    expect([...data]).toEqual(expected);
+    if (lost) expect(() => decoded({ count: 2, n, k, width: 4 }, seen.slice(0, 2 * k - 1))).toThrow(/^The key is right/);
+  },
+);
