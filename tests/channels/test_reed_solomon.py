@@ -31,10 +31,10 @@ def test_any_k_of_n_give_the_data_back_and_fewer_do_not(k: int, parity: int, see
     data = _data(k, seed=seed)
     coded = reed_solomon.encode(data, k + parity)
     order = np.random.default_rng(seed).permutation(k + parity)
-    got = reed_solomon.decode(order[:k], coded[order[:k]], k)
+    got = reed_solomon.decode(order[:k], coded[order[:k]], k, len(order))
     assert got is not None
     assert np.array_equal(got, data)
-    assert reed_solomon.decode(order[: k - 1], coded[order[: k - 1]], k) is None
+    assert reed_solomon.decode(order[: k - 1], coded[order[: k - 1]], k, len(order)) is None
 
 
 @settings(max_examples=60, deadline=None)
@@ -46,14 +46,14 @@ def test_an_error_costs_two_chunks(k: int, wrong: int, lost: int, seed: int) -> 
     left = random.permutation(len(coded))[lost:]
     rows = coded[left]
     rows[:wrong] ^= random.integers(1, 256, (wrong, rows.shape[1]), np.uint8)
-    got = reed_solomon.decode(left, rows, k, errors=True)
+    got = reed_solomon.decode(left, rows, k, len(coded), errors=True)
     assert got is not None
     assert np.array_equal(got, data)
 
 
 def test_long_codewords_with_losses_and_errors() -> None:
     random = np.random.default_rng(5)
-    codewords = Codewords(2, 4096, 2913, 8)
+    codewords = Codewords(2, 8192, 5895, 8)
     data = random.bytes(codewords.size)
     chunks = codewords.encode(data)
     numbers = random.permutation(codewords.chunks)[: round(0.75 * codewords.chunks)]
@@ -63,11 +63,11 @@ def test_long_codewords_with_losses_and_errors() -> None:
     assert codewords.decode(numbers, left, errors=True) == data
     twice = np.concatenate([numbers, numbers[60:100]]), np.concatenate([left, left[:40]])
     assert codewords.decode(*twice, errors=True) == data  # both of two that differ are left out
-    with pytest.raises(InputError, match="5,000 of 8,192 chunks are left"):
-        codewords.decode(numbers[:5000], left[:5000], errors=True)
+    with pytest.raises(InputError, match="9,000 of 16,384 chunks are left"):
+        codewords.decode(numbers[:9000], left[:9000], errors=True)
 
 
-@pytest.mark.parametrize(("k", "n"), [(0, 3), (4, 3), (10, 1 << 16)])
+@pytest.mark.parametrize(("k", "n"), [(0, 3), (4, 3), (10, 8193)])
 def test_sizes_out_of_range_are_refused(k: int, n: int) -> None:
     with pytest.raises(ValueError, match="expected"):
         reed_solomon.encode(_data(k), n)

@@ -12,6 +12,7 @@ are located as errors: two chunks more than k for each of them.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import zip_longest
 
 import numpy as np
@@ -19,7 +20,7 @@ import numpy as np
 from keyss.core.arrays import Bytes, Flags, Integers, Shorts
 from keyss.core.errors import InputError
 
-MAX_CHUNKS = (1 << 16) - 1  # of one codeword
+MAX_CHUNKS = 1 << 13  # of one codeword: the field has room for more, which would take long
 SYMBOL_BYTES = 2
 LOST = "the key is right, but too much of the model was lost or changed since the secret was hidden in it"
 _POLYNOMIAL = 0x1100B
@@ -83,7 +84,7 @@ class Codewords:
         rows, codewords = np.divmod(numbers, self.count)
         for codeword in range(self.count):
             own = codewords == codeword
-            decoded = decode(rows[own], chunks[own], self.k, errors=errors)
+            decoded = decode(rows[own], chunks[own], self.k, self.n, errors=errors)
             if decoded is None:
                 return None
             data[:, codeword] = decoded
@@ -91,20 +92,20 @@ class Codewords:
 
 
 def encode(data: Bytes, n: int) -> Bytes:
-    """[n, width] of data [k, width], width even: k rows, then n - k of parity. 1 <= k <= n < 2^16."""
+    """[n, width] of data [k, width], width even: k rows, then n - k of parity; k <= n <= 8192."""
     k = len(data)
     if not 1 <= k <= n <= MAX_CHUNKS:
         raise ValueError(f"expected 1 <= k <= n <= {MAX_CHUNKS}, got k = {k}, n = {n}")
-    return np.concatenate([data, _interpolated(np.arange(k), data, np.arange(k, n))])
+    return np.concatenate([data, _interpolated(np.arange(k), data, np.arange(k, n), k)])
 
 
-def decode(numbers: Integers, rows: Bytes, k: int, *, errors: bool = False) -> Bytes | None:
-    """The data [k, width] from rows [C, width] of one codeword with different `numbers` [C].
+def decode(numbers: Integers, rows: Bytes, k: int, n: int, *, errors: bool = False) -> Bytes | None:
+    """The data [k, width] from rows [C, width] of a codeword of n with different `numbers` [C].
 
     `errors`: some of the rows may be those of other codewords. None if too few are left.
     """
     if errors and len(rows) > k:
-        right = _are_right(numbers, rows, k)
+        right = _are_right(numbers, rows, k, n)
         numbers, rows = numbers[right], rows[right]
     if len(rows) < k:
         return None
@@ -114,7 +115,7 @@ def decode(numbers: Integers, rows: Bytes, k: int, *, errors: bool = False) -> B
     known = numbers < k
     data[numbers[known]] = rows[known]
     lost = np.setdiff1d(np.arange(k), numbers)
-    data[lost] = _interpolated(numbers, rows, lost)
+    data[lost] = _interpolated(numbers, rows, lost, n)
     return data
 
 
@@ -133,8 +134,10 @@ def _tables() -> tuple[Shorts, Integers]:
 _POWERS, _LOGARITHMS = _tables()
 
 
-def _interpolated(numbers: Integers, rows: Bytes, wanted: Integers) -> Bytes:
+def _interpolated(numbers: Integers, rows: Bytes, wanted: Integers, n: int) -> Bytes:
     """Rows [W, width] of the numbers `wanted` [W], from as many rows [k, width] as determine them.
+
+    `n`: more than any of the `numbers` [k].
 
     At x it is the sum over all points a with a value v of P(x) v / ((x - a) P'(a)), P(x) the product of all
     x - a, and P'(a) that of a and the other points.
@@ -142,7 +145,7 @@ def _interpolated(numbers: Integers, rows: Bytes, wanted: Integers) -> Bytes:
     found = np.zeros((len(wanted), rows.shape[1] // SYMBOL_BYTES), np.uint16)
     if len(wanted):
         points, at = numbers + 1, wanted + 1
-        values = _scaled(rows, -_products(points, points))
+        values = _scaled(rows, -_own_products(numbers, n))
         outside = _products(at, points)
         step = max(1, _AT_ONCE // values.size)
         for low in range(0, len(at), step):
@@ -158,16 +161,29 @@ def _scaled(rows: Bytes, logarithms: Integers) -> Integers:
     return np.where(symbols == _ZERO, _ZERO, (symbols + logarithms[:, None]) % _ORDER)
 
 
+def _own_products(numbers: Integers, n: int) -> Integers:
+    """[C] `_products` of the points of `numbers` [C] below n among themselves: of few that are missing."""
+    missing = np.setdiff1d(np.arange(n), numbers)
+    return (_all_products(n)[numbers] - _products(numbers + 1, missing + 1)) % _ORDER
+
+
+@lru_cache(maxsize=4)
+def _all_products(n: int) -> Integers:
+    """[n] `_products` of the first n points among themselves."""
+    points = np.arange(1, n + 1)
+    return _products(points, points)
+
+
 def _products(at: Integers, points: Integers) -> Integers:
     """[A] logarithms of the products of the differences to `points` [P] other than itself."""
     logarithms = _LOGARITHMS.copy()
     logarithms[0] = 0
-    step = max(1, _AT_ONCE // len(points))
+    step = max(1, _AT_ONCE // max(1, len(points)))
     parts = [logarithms[at[low : low + step, None] ^ points].sum(axis=1) for low in range(0, len(at), step)]
     return np.concatenate(parts) % _ORDER
 
 
-def _are_right(numbers: Integers, rows: Bytes, k: int) -> Flags:
+def _are_right(numbers: Integers, rows: Bytes, k: int, n: int) -> Flags:
     """[C] which rows [C, width] belong to the codeword that most do; more than k.
 
     The sums of v a^t / P'(a), t = 0, 1, ... (see `_interpolated`) over all rows vanish for a codeword as long
@@ -175,7 +191,7 @@ def _are_right(numbers: Integers, rows: Bytes, k: int) -> Flags:
     1969). Where there are too many errors, none is found.
     """
     points = numbers + 1
-    values = _scaled(rows, -_products(points, points))
+    values = _scaled(rows, -_own_products(numbers, n))
     mixed = np.bitwise_xor.reduce(_POWERS[values + np.arange(values.shape[1])], axis=1)  # of all columns
     terms, powers = _LOGARITHMS[mixed], _LOGARITHMS[points]
     times = np.arange(min(len(rows) - k, 2 * _MAX_ERRORS))[:, None]

@@ -55,21 +55,21 @@ export function decoded(
       const bytes = left.get(row * count + codeword);
       if (bytes) own.push({ point: row + 1, bytes });
     }
-    if (errors && own.length > k) own = rightOf(own, k);
+    if (errors && own.length > k) own = rightOf(own, k, n);
     if (own.length < k) throw tooMuchLost();
     own = own.slice(0, k);
     const put = (point: number, row: Uint8Array) => data.set(row, ((point - 1) * count + codeword) * width);
     const known = new Set(own.map(({ point }) => point));
     own.filter(({ point }) => point <= k).forEach(({ point, bytes }) => put(point, bytes));
     const lost = Array.from({ length: k }, (_, row) => row + 1).filter((point) => !known.has(point));
-    if (lost.length) interpolated(own, lost).forEach((row, index) => put(lost[index], row));
+    if (lost.length) interpolated(own, lost, n).forEach((row, index) => put(lost[index], row));
   }
   return data;
 }
 
-/** What as many chunks as determine the polynomials make of them at other points. */
-function interpolated(chunks: Chunk[], wanted: number[]): Uint8Array[] {
-  const [points, values] = [chunks.map(({ point }) => point), scaled(chunks)];
+/** What as many chunks of a codeword of n as determine the polynomials make of them at other points. */
+function interpolated(chunks: Chunk[], wanted: number[], n: number): Uint8Array[] {
+  const [points, values] = [chunks.map(({ point }) => point), scaled(chunks, n)];
   const columns = values.length / points.length;
   const outside = logarithmsOfProducts(wanted, points);
   return wanted.map((at, index) => {
@@ -83,18 +83,30 @@ function interpolated(chunks: Chunk[], wanted: number[]): Uint8Array[] {
 }
 
 /** [C, columns] logarithms of the chunks' symbols, each divided by the differences of its point to all others. */
-function scaled(chunks: Chunk[]): Uint32Array {
+function scaled(chunks: Chunk[], n: number): Uint32Array {
   const points = chunks.map(({ point }) => point);
   const columns = chunks[0].bytes.length / 2;
   const found = new Uint32Array(chunks.length * columns);
-  const divisors = logarithmsOfProducts(points, points);
+  const [whole, own] = [productsOfAll(n), new Set(points)]; // divided by those of few that are missing
+  const missing = logarithmsOfProducts(points, whole.points.filter((point) => !own.has(point)));
   chunks.forEach(({ bytes }, row) => {
     for (let column = 0; column < columns; column++) {
-      const own = LOGARITHMS[(bytes[2 * column] << 8) | bytes[2 * column + 1]];
-      found[row * columns + column] = own === ZERO ? ZERO : (own + ORDER - divisors[row]) % ORDER;
+      const symbol = LOGARITHMS[(bytes[2 * column] << 8) | bytes[2 * column + 1]];
+      found[row * columns + column] = symbol === ZERO ? ZERO : (symbol + missing[row] + ORDER - whole.logarithms[points[row] - 1]) % ORDER;
     }
   });
   return found;
+}
+
+let latest: { points: number[]; logarithms: Uint32Array } = { points: [], logarithms: new Uint32Array(0) };
+
+/** All points of a codeword of n, and `logarithmsOfProducts` of them. */
+function productsOfAll(n: number): typeof latest {
+  if (latest.points.length !== n) {
+    const points = Array.from({ length: n }, (_, row) => row + 1);
+    latest = { points, logarithms: logarithmsOfProducts(points, points) };
+  }
+  return latest;
 }
 
 /** Logarithms of the products of the differences to all `points` but itself. */
@@ -108,8 +120,8 @@ function logarithmsOfProducts(at: number[], points: number[]): Uint32Array {
 }
 
 /** Of more than k chunks those that belong to the codeword that most do; none where too many do not. */
-function rightOf(chunks: Chunk[], k: number): Chunk[] {
-  const values = scaled(chunks);
+function rightOf(chunks: Chunk[], k: number, n: number): Chunk[] {
+  const values = scaled(chunks, n);
   const columns = values.length / chunks.length;
   const terms = chunks.map((_, row) => {
     let sum = 0;

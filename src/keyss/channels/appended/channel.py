@@ -3,7 +3,7 @@
 They survive every publication format, and moving, rotating and scaling of the whole model. Everybody sees
 that they are there; reading them takes the key. A payload is encrypted as a whole (ChaCha20-Poly1305 under a
 key that Argon2id gives with the file's salt), cut into packets, and given parity by Reed-Solomon in codewords
-of at most 4096 packets, any 2913 of which suffice. Every packet is a Gaussian. A header tells how many of
+of at most 8192 packets, any 5895 of which suffice. Every packet is a Gaussian. A header tells how many of
 them hold data.
 """
 
@@ -52,8 +52,8 @@ from keyss.keys.derivation import SALT_BYTES, DerivedKey, expand, stream
 from keyss.keys.encryption import OVERHEAD, compressed_size, decrypt, encrypt
 
 # A quarter of the packets may be lost, and some of the others garbled, with so many deviations more. Longer
-# codewords need fewer packets and more time: these are of 4096.
-_LEFT, _DEVIATIONS, _MAX_DATA = 0.74, 4.2, 2913
+# codewords need fewer packets and more time: these are of 8192.
+_LEFT, _DEVIATIONS, _MAX_DATA = 0.74, 4.2, 5895
 # Bytes of a packet: the longer its tag, the fewer words of others pass for packets.
 _WIDE, _NARROW, _WIDE_PACKETS = 8, 6, 90_000
 _MAX_PACKETS = 1_000_000  # of data; a header tells up to 2^20

@@ -5,7 +5,7 @@ import type { Codewords } from '../reed_solomon.ts';
 export const WIDTHS = [8, 6]; // bytes of a packet
 const HEADER_BITS = 20;
 const WORD_BYTES = 11;
-const MAX_DATA = 2913; // packets of a codeword
+const MAX_DATA = 5895; // packets of a codeword
 const [LEFT, DEVIATIONS] = [0.74, 4.2]; // of packets that may be relied upon
 const AGREEING_HEADERS = 12; // fewer may agree by chance among a million words
 

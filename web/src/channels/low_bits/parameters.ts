@@ -8,7 +8,7 @@ const PREFIX_BYTES = 34;
 const NUMBERS = 29; // where cells, bytes of a record and bytes of the header begin
 const MAX_CELLS = 4;
 const MAX_HEADER_BYTES = 4096;
-const MAX_CHUNKS = 1 << 24; // of all codewords
+const [MAX_LENGTH, MAX_CHUNKS] = [1 << 13, 1 << 24]; // of one codeword, of all
 export const NUMBER_BYTES = 3; // of a chunk of a payload
 
 /** The parameters of records; a carrier holds `cells` of them. */
@@ -43,7 +43,7 @@ export function unpackCodewords({ header, recordBytes }: Parameters): [number, C
   const view = viewOf(header);
   const [size, count] = [view.getUint32(0, true), view.getUint32(4, true)];
   const [n, k, width] = [view.getUint16(8, true), view.getUint16(10, true), recordBytes - NUMBER_BYTES];
-  const possible = count >= 1 && count * n <= MAX_CHUNKS && k >= 1 && k <= n && width % 2 === 0;
+  const possible = count >= 1 && count * n <= MAX_CHUNKS && k >= 1 && k <= n && n <= MAX_LENGTH && width % 2 === 0;
   if (!possible || size < 1 || size > count * k * width) throw damaged();
   return [size, { count, n, k, width }];
 }
