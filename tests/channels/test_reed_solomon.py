@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from functools import reduce
+from operator import xor
+
 import numpy as np
 import pytest
 import reedsolo
@@ -49,6 +52,16 @@ def test_an_error_costs_two_chunks(k: int, wrong: int, lost: int, seed: int) -> 
     got = reed_solomon.decode(left, rows, k, len(coded), errors=True)
     assert got is not None
     assert np.array_equal(got, data)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(st.sampled_from([0, 1, 7]), min_size=1, max_size=8))
+def test_recurrences_hold(sums: list[int]) -> None:
+    reedsolo.init_tables(prim=0x1100B, generator=2, c_exp=16)
+    found = reed_solomon._recurrence(sums)
+    for index in range(len(found) - 1, len(sums)):
+        products = (reedsolo.gf_mul(each, sums[index - back]) for back, each in enumerate(found))
+        assert reduce(xor, products) == 0
 
 
 def test_long_codewords_with_losses_and_errors() -> None:

@@ -121,7 +121,7 @@ def decode(numbers: Integers, rows: Bytes, k: int, n: int, *, errors: bool = Fal
 
 def _tables() -> tuple[Shorts, Integers]:
     """Powers of 2, with zeros from `_ZERO` - `_ORDER` on; logarithms [2^16]."""
-    powers = np.zeros(_ZERO + 3 * _ORDER, np.uint16)
+    powers = np.zeros(2 * _ZERO + 1, np.uint16)
     logarithms = np.full(1 << 16, _ZERO)
     value = 1
     for exponent in range(_ORDER):

@@ -5,7 +5,7 @@ const ORDER = 65535; // of the generator 2
 const ZERO = 4 * ORDER; // stands for the logarithm of 0: its sums with others are exponents of 0
 const MAX_ERRORS = 128; // of a codeword that are looked for
 
-const POWERS = new Uint16Array(ZERO + 3 * ORDER);
+const POWERS = new Uint16Array(2 * ZERO + 1);
 const LOGARITHMS = new Uint32Array(ORDER + 1).fill(ZERO);
 for (let exponent = 0, value = 1; exponent < ORDER; exponent++) {
   for (let at = exponent; at < ZERO - ORDER; at += ORDER) POWERS[at] = value;
