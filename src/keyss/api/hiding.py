@@ -95,7 +95,7 @@ def hide(
     conversion, which is the channel "appended" (more Gaussians, which are visible in the file) or "colours"
     (less room). `width`, `background`, `skip_missing`: see `load_scene`.
 
-    `out` (a folder) gets `publish/` with the stego model, and `private/` with plain models, `config.json`,
+    `out` (a folder) gets `publish/` with the stego model, and `private/` with fitted models, `config.json`,
     `metrics.json`, the files to hand over for methods that need them (`keyss.methods.handed`), and
     checkpoints, from which `resume` continues. Without a seed in the options' `fit` the run uses a random
     one, which `config.json` records. With one, the same arguments give the same bytes on a CPU with as many
@@ -214,7 +214,11 @@ def hide(
             metrics = _measured(stego, sources, options, shown, target, bounds, plain_steps, longer, began)
         if folder:
             payloads = secret_ids(options.fit.known_seed, stego.opened)
-            made = dict(zip(plain_names(len(secrets)), plain, strict=True))
+            made = {
+                name: model
+                for name, model, source in zip(plain_names(len(secrets)), plain, given, strict=True)
+                if isinstance(source, Scene | Gaussians) or not is_model(source)  # the file itself is one
+            }
             made |= {bound_names(len(secrets))[index]: model for index, model in longer.items()}
             settings = replace(settings, options=options, payloads=payloads)
             folder.write({**made, CONFIG: settings, METRICS: metrics})

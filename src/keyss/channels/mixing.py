@@ -7,6 +7,7 @@ from cryptography.hazmat.primitives.ciphers import Cipher
 from cryptography.hazmat.primitives.ciphers.algorithms import AES
 from cryptography.hazmat.primitives.ciphers.modes import ECB
 
+from keyss.channels.low_bits.kernels import hash_rows
 from keyss.core.arrays import Bytes, Doubles, Integers, Numbers, Words
 from keyss.keys.derivation import stream
 
@@ -21,10 +22,8 @@ def mixed(words: Words) -> Words:
 
 def row_hashes(rows: Numbers) -> Words:
     """[N] a hash of each row of integers [N, C]: equal for equal rows, and for others hardly ever."""
-    found = np.zeros(len(rows), np.uint64)
-    for column in rows.T:
-        found = (found ^ column.astype(np.uint64)) * np.uint64(0x9E3779B97F4A7C15)
-        found ^= found >> np.uint64(29)
+    found = np.empty(len(rows), np.uint64)
+    hash_rows(rows, found)
     return found
 
 

@@ -106,7 +106,7 @@ class Gaussians:
         """SHA-256 over all values: equal for equal content only."""
         state = hashlib.sha256(f"{len(self)} {self.sh_degree}".encode())
         for field in fields(self):
-            state.update(getattr(self, field.name).detach().cpu().contiguous().numpy().tobytes())
+            state.update(getattr(self, field.name).detach().cpu().contiguous().numpy().data)
         return state.hexdigest()
 
     def with_sh_degree(self, degree: int) -> Gaussians:

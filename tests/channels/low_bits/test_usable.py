@@ -77,7 +77,7 @@ def test_little_is_left_alone_where_nothing_is_given_away(rounded: list[Gaussian
 def test_what_is_given_away_keeps_to_its_share(step: float) -> None:
     """By the true probabilities of trailing zeros, which the limit is to be safe for."""
     words = np.concatenate([used_words(rounded_like(4000, seed, step))[:, 8:] for seed in (1, 2)])
-    counts = count_trailing_zeros(words)
+    counts = count_trailing_zeros(words, np.ones(len(words), bool))
     least = least_exponent(counts, GIVEN_AWAY)
     exponents = np.arange(256)
     # A step is larger than 2^(e + 2) with this probability: then bits 0 and 1 of a number are zero.
@@ -89,8 +89,8 @@ def test_what_is_given_away_keeps_to_its_share(step: float) -> None:
 
 
 def test_trailing_zeros_are_counted_by_exponent() -> None:
-    words = np.array([0.75, 1.0 + 2**-23, 1.0 + 2**-20, -(2.0 + 2**-10), 3.0], np.float32).view(np.uint32)
-    counts = count_trailing_zeros(words)
+    numbers = np.array([[0.75], [1.0 + 2**-23], [1.0 + 2**-20], [-(2.0 + 2**-10)], [3.0], [5.0]], np.float32)
+    counts = count_trailing_zeros(numbers.view(np.uint32), np.arange(6) < 5)
     assert counts.sum() == 5
     assert counts[126, 12] == counts[127, 0] == counts[127, 3] == 1
     assert counts[128, 12] == 2  # 12 or more

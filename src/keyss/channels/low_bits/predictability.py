@@ -20,10 +20,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from keyss.core.arrays import Doubles, Integers, Words32
+from keyss.channels.low_bits.kernels import count_zeros
+from keyss.core.arrays import Doubles, Flags, Integers, Words32
 
 MAX_ZEROS = 12  # that are counted: more are rare, or a short number
 EXPONENTS = 256
+_NUMBERS = np.arange(1 << MAX_ZEROS, dtype=np.uint32)[:, None] | np.uint32(1 << MAX_ZEROS)
+_ZEROS = (_NUMBERS >> np.arange(MAX_ZEROS + 1, dtype=np.uint32) & 1).argmax(axis=1)  # [4096], trailing
 # Of the log-likelihood below its maximum, at the confidence limit: one-sided, one in 200 at worst.
 _DROP = 3.3
 _MARGIN = 8  # octaves beyond the numbers' own in which the scale is looked for
@@ -32,14 +35,14 @@ _LARGEST = 4  # octaves of the scale below the median number: steps of a sixteen
 _ROUNDED = np.concatenate([[0.0], 2.0 ** np.arange(-20, 20.5, 0.5)])  # t in units of the smallest exponent
 
 
-def count_trailing_zeros(words: Words32) -> Integers:
-    """[EXPONENTS, MAX_ZEROS + 1] how many of the numbers [...] have which exponent and trailing zeros."""
-    stopped = words.ravel() | np.uint32(1 << MAX_ZEROS)
-    lowest = (stopped & (~stopped + np.uint32(1))).astype(np.float32)  # a power of two
-    zeros = (lowest.view(np.uint32) >> np.uint32(23)).astype(np.int64) - 127
-    exponents = (words.ravel() >> np.uint32(23) & np.uint32(255)).astype(np.int64)
-    flat = np.bincount(exponents * (MAX_ZEROS + 1) + zeros, minlength=EXPONENTS * (MAX_ZEROS + 1))
-    return flat.reshape(EXPONENTS, MAX_ZEROS + 1)
+def count_trailing_zeros(words: Words32, chosen: Flags) -> Integers:
+    """[EXPONENTS, MAX_ZEROS + 1] how many numbers have which exponent and trailing zeros.
+
+    Of `words` [N, C] those of the `chosen` rows [N].
+    """
+    counts = np.zeros((EXPONENTS, MAX_ZEROS + 1), np.int64)
+    count_zeros(words, chosen, _ZEROS, counts)
+    return counts
 
 
 def least_exponent(counts: Integers, share: float) -> int:

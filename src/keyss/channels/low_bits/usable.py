@@ -22,7 +22,6 @@ would be noticed.
 from __future__ import annotations
 
 import math
-from itertools import combinations
 
 import numpy as np
 import torch
@@ -38,6 +37,7 @@ from keyss.channels.low_bits.bits import (
     identities,
     used_words,
 )
+from keyss.channels.low_bits.kernels import fill_buckets, find_equal, find_full, find_near
 from keyss.channels.low_bits.predictability import count_trailing_zeros, least_exponent
 from keyss.channels.mixing import row_hashes
 from keyss.core.arrays import Bytes, Doubles, Flags, Integers, Numbers, Words, Words32
@@ -85,14 +85,14 @@ def usable_carriers(gaussians: Gaussians, names: Bytes | None = None, layout: La
     """
     layout = layout or Layout.of(gaussians)
     usable, short = _apart(gaussians, layout, identities(gaussians, layout) if names is None else names)
-    frequent = _frequent_values(gaussians)
+    often = _frequent_values(gaussians)
 
     def judge(start: int, stop: int) -> Integers:
         used, own = used_words(gaussians[start:stop]), usable[start:stop]
-        own &= _are_measured(used, layout, frequent, short) & ~near_equal(used, layout)
+        own &= _are_measured(used, layout, often, short) & ~near_equal(used, layout)
         if layout.quats:
             own &= ~_have_unit_length(used)
-        return np.stack([count_trailing_zeros(used[own][:, group]) for group in _GROUPS.values()])
+        return np.stack([count_trailing_zeros(used[:, group], own) for group in _GROUPS.values()])
 
     parts = in_blocks(judge, len(gaussians), BLOCK)
     if not parts:
@@ -164,21 +164,31 @@ def near_equal(used: Words32, layout: Layout) -> Flags:
     Or two pairs of one colour's harmonics, next to each other by size, equal. By chance some 4 % of all
     Gaussians are. `used` [N, F]: of `used_words`.
     """
-    high = ((used & np.uint32(0x7FFFFFFF)) >> layout.shifts).astype(np.int32)
-    harmonics = high[:, GEOMETRY:].reshape(len(used), -1, 3)
-    near = np.zeros(len(used), bool)
-    for values in (high[:, None, 0:3], harmonics, *([high[:, None, QUATS]] if layout.quats else [])):
-        for a, b in combinations(range(values.shape[2]), 2):
-            near |= (np.abs(values[:, :, a] - values[:, :, b]) <= 1).any(axis=1)
-    ordered = np.sort(harmonics.transpose(0, 2, 1), axis=2)
-    near |= (ordered[:, :, 1:] == ordered[:, :, :-1]).sum(axis=(1, 2)) >= _EQUAL_HARMONICS
+    near, shifts = np.zeros(len(used), bool), layout.shifts
+    find_near(used[:, 0:3], shifts[0:3], 0, 3, near)
+    if layout.quats:
+        find_near(used[:, QUATS], shifts[QUATS], 0, 4, near)
+    find_near(used, shifts, GEOMETRY, 3, near)
+    find_equal(used, shifts, GEOMETRY, _EQUAL_HARMONICS, near)
     return near
+
+
+def frequent(words: Numbers, times: int) -> Numbers:
+    """[V] which values at least `times` of the unsigned integers [N, C] have, in ascending order.
+
+    Only what shares a bucket with so many others is sorted, which takes a third of the time.
+    """
+    shift = 64 - (4 * words.size // times).bit_length()
+    counts, found, most = np.zeros(1 << 64 - shift, np.uint8), np.empty(words.shape, bool), min(times, 255)
+    fill_buckets(words, shift, counts)
+    in_blocks(lambda a, b: find_full(words[a:b], shift, counts, most, found[a:b]), len(words), BLOCK)
+    ordered, further = np.sort(words[found]), times - 1
+    return np.unique(ordered[further:][ordered[further:] == ordered[: len(ordered) - further]])
 
 
 def repeated(values: Words) -> Flags:
     """[N] which of the values [N] occur at least twice."""
-    ordered = np.sort(values)
-    return among(values, ordered[1:][ordered[1:] == ordered[:-1]])
+    return among(values, frequent(values[:, None], 2))
 
 
 def among(values: Numbers, ordered: Numbers) -> Flags:
@@ -189,7 +199,7 @@ def among(values: Numbers, ordered: Numbers) -> Flags:
     return result
 
 
-def _are_measured(used: Words32, layout: Layout, frequent: list[Words32], short: bool) -> Flags:
+def _are_measured(used: Words32, layout: Layout, often: list[Words32], short: bool) -> Flags:
     """[N] whether no number in use is subnormal, frequent or a saturated opacity, and few have many zeros.
 
     If `short`, none has.
@@ -199,7 +209,7 @@ def _are_measured(used: Words32, layout: Layout, frequent: list[Words32], short:
     fine[:, _OPACITY] &= ~((used[:, _OPACITY] >= _SATURATED[0]) & (used[:, _OPACITY] < _SATURATED[1]))
     if short:
         fine &= (used & _SHORT) != 0
-    for group, values in zip(_GROUPS.values(), frequent, strict=True):
+    for group, values in zip(_GROUPS.values(), often, strict=True):
         fine[:, group] &= ~among(used[:, group], values)
     zeros = ((used & _ZEROS) == 0)[:, layout.columns].sum(axis=1)
     measured: Flags = fine[:, layout.columns].all(axis=1) & (zeros < _ZERO_FIELDS)
@@ -243,12 +253,12 @@ def _apart(gaussians: Gaussians, layout: Layout, names: Bytes) -> tuple[Flags, b
 
 def _frequent_values(gaussians: Gaussians) -> list[Words32]:
     """For each group of fields [V] the values that occur more often than is likely, in ascending order."""
-    frequent = []
-    for field in (gaussians.log_scales, gaussians.quats, gaussians.opacity_logits, gaussians.sh[:, 1:]):
-        words = field.detach().to("cpu", torch.float32).numpy().view(np.uint32)
-        ordered, further = np.sort(words, axis=None), _unlikely_copies(words.size) - 1
-        frequent.append(np.unique(ordered[further:][ordered[further:] == ordered[:-further]]))
-    return frequent
+    fields = (gaussians.log_scales, gaussians.quats, gaussians.opacity_logits, gaussians.sh[:, 1:])
+    every = [field.detach().to("cpu", torch.float32).numpy().view(np.uint32) for field in fields]
+    return [
+        frequent(words.reshape(len(words), math.prod(words.shape[1:])), _unlikely_copies(words.size))
+        for words in every
+    ]
 
 
 def _unlikely_copies(count: int) -> int:
