@@ -10,13 +10,13 @@ import torch
 from torch import Tensor
 
 from keyss.core.gaussians import Gaussians
-from keyss.core.scene import Scene, View
+from keyss.core.scene import Scene
 from keyss.fitting.checkpoint import State, pack_model, unpack_model
 from keyss.fitting.config import FitConfig
 from keyss.fitting.density import CappedStrategy, Rendered
 from keyss.fitting.image_metrics import mean_psnr, subsample_views
 from keyss.fitting.loop import train
-from keyss.fitting.losses import Target, photometric_loss
+from keyss.fitting.losses import Targets, photometric_loss
 from keyss.fitting.parameters import (
     initial_gaussians,
     initial_points,
@@ -69,24 +69,25 @@ class PlainRun:
         self.strategy = CappedStrategy(config)
         self.density: dict[str, Any] = self.strategy.initialize_state(scene.extent)
         self.shuffle = Shuffle(len(self.views), self.generator)
+        self.targets = Targets()
 
     def __len__(self) -> int:
         return len(self.parameters["means"])
 
     def step(self) -> None:
         config = self.config
-        views = [self.views[self.shuffle.sample()] for _ in range(self.views_per_step)]
+        chosen = [self.shuffle.sample() for _ in range(self.views_per_step)]
         self.iteration += 1
         degree = config.sh_degree_at(self.iteration) if self.grows else config.sh_degree
 
-        def loss_at(view: View) -> tuple[Tensor, list[Rendered]]:
-            model = to_gaussians(self.parameters)
+        def loss_at(index: int) -> tuple[Tensor, list[Rendered]]:
+            view, model = self.views[index], to_gaussians(self.parameters)
             image, meta = render_with_meta(model, view.camera, self.background, sh_degree=degree)
-            loss = photometric_loss(image, Target.of(view.image.to(self.device)), config.ssim_weight)
-            return loss, [(meta, None, 1.0)]
+            target = self.targets.of(index, lambda: view.image.to(self.device))
+            return photometric_loss(image, target, config.ssim_weight), [(meta, None, 1.0)]
 
         trained = self.parameters.values()
-        self.loss, info = self.strategy.backward(views, loss_at, trained, self.parameters)
+        self.loss, info = self.strategy.backward(chosen, loss_at, trained, self.parameters)
         self.schedule.set(self.optimizers, self.iteration)
         for optimizer in self.optimizers.values():
             optimizer.step()

@@ -16,7 +16,7 @@ from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Camera, Scene, View
 from keyss.core.similarity import Similarity
 from keyss.fitting.config import FitConfig
-from keyss.fitting.losses import Target
+from keyss.fitting.losses import Target, Targets
 from keyss.fitting.parameters import initial_gaussians, initial_points
 from keyss.rendering import render
 
@@ -84,6 +84,7 @@ class CombinedPoses:
         self.plains = [placed.plain.to(device) for placed in scenes]
         self._rendered: dict[tuple[int, int, int], Tensor] = {}
         self._bytes = 0
+        self._targets = Targets()
 
     def camera(self, owner: int, index: int) -> Camera:
         """Training pose `index` of scene `owner`."""
@@ -92,7 +93,11 @@ class CombinedPoses:
     def target(self, scene: int, owner: int, index: int) -> Target:
         """The target of `scene` at training pose `index` of `owner`."""
         own = self.scenes[owner].scene.train[index].image
-        return Target.of((own if scene == owner else self._render(scene, owner, index)).to(self.device))
+
+        def image() -> Tensor:
+            return (own if scene == owner else self._render(scene, owner, index)).to(self.device)
+
+        return self._targets.of((scene, owner, index), image)
 
     def _render(self, scene: int, owner: int, index: int) -> Tensor:
         """Rendered once, kept as 8-bit pixels like the photos while they fit into CACHE_BYTES."""
