@@ -296,7 +296,7 @@ def test_scenes_are_fitted_once_for_all_cells(tmp_path: Path, monkeypatch: pytes
     )
     found = run(spec, tmp_path / "out", jobs=1)
     assert [each.error for each in found.outcomes] == [None] * 2
-    # Once as a cover and once, with twice the steps, as a secret.
+    # Once as a cover and once, with more steps, as a secret.
     assert len(list((tmp_path / "out" / "cells").iterdir())) == 2 + 2
     assert len(list((tmp_path / "out").glob("cells/*/run/model.ply"))) == 2
     for each in found.outcomes:

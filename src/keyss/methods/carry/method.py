@@ -15,7 +15,7 @@ from keyss.fitting.image_metrics import subsample_views
 from keyss.fitting.plain import fit_scene
 from keyss.fitting.schedule import boost_of
 from keyss.methods.base import Capabilities, Context, Plan, Source, Stego, role_of
-from keyss.methods.carry.room import CarryOptions, SecretSize, WholeRoom, room_for
+from keyss.methods.carry.room import REFIT, CarryOptions, SecretSize, WholeRoom, room_for
 from keyss.methods.records.embedding import embed_models
 from keyss.methods.records.quantise import out_of_range
 from keyss.rendering import contributions
@@ -66,14 +66,15 @@ class CarryMethod:
             cut = [False] * len(cut)
         elif any(cut) and sizes != [room.sizes([secret])[0] for secret in secret_sizes]:
             warnings.warn(_FEWER, KeyssWarning, stacklevel=2)
-        steps = [
+        steps = round(REFIT * options.fit.iterations)
+        refits = [
             options.iterations
-            or (options.fit.iterations if secret.photos else min(options.fit.iterations, _MODEL_ITERATIONS))
+            or (steps if secret.photos else min(options.fit.iterations, _MODEL_ITERATIONS))
             for secret in secrets
         ]
         planned = options.refits or (0,) * len(cut)  # of the first call
         return replace(
-            options, refits=tuple(p or (n if c else 0) for p, n, c in zip(planned, steps, cut, strict=True))
+            options, refits=tuple(p or (n if c else 0) for p, n, c in zip(planned, refits, cut, strict=True))
         )
 
     def plan(self, sources: Sequence[Source], options: CarryOptions) -> Plan:

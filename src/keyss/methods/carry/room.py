@@ -32,6 +32,7 @@ from keyss.methods.records.precision import most_visible, pruned
 from keyss.methods.records.whole import encode
 from keyss.rendering.difference import Viewpoints
 
+REFIT = 1.25  # steps of a refit to photos for each of a fit: with as many, secrets lose 0.1 dB
 _BITS_PER_GAUSSIAN = 150  # of the payload of a secret that is not fitted yet
 _DRAWS = 3  # of new low bits: in covers of few bits, one in five has stale salts or bits that seem not random
 _TINY = 16  # Gaussians; a secret is not cut down to fewer
@@ -40,7 +41,7 @@ _ANY = '`publish="any"` has room for all'
 
 @dataclass(frozen=True, kw_only=True)
 class CarryOptions(MethodOptions):
-    """Options of carrying; `fit` is that of plain models, and those of secrets get twice the steps."""
+    """Options of carrying; `fit` is that of plain models, of which secrets get REFIT more steps."""
 
     method: ClassVar[str] = "carry"
 
@@ -61,7 +62,7 @@ class CarryOptions(MethodOptions):
             "Degree of the published model's spherical harmonics, 0 to 3.", metavar="N", default="the cover's"
         ),
     ] = None
-    iterations: int | None = None  # of a refit; None: those of `fit`, and fewer without photos
+    iterations: int | None = None  # of a refit; None: REFIT for each of `fit`, and fewer without photos
 
     # Set by `prepare`: the highest SH degree of secrets, and steps of the refit of each secret, 0 for those
     # that are carried as they are.
@@ -79,10 +80,11 @@ class CarryOptions(MethodOptions):
         return self.refit != "never" and not self.prune_to_fit
 
     def fits(self, scenes: int) -> list[FitConfig]:
-        """Secrets get twice the steps if no refit follows, and no more harmonics than can be carried."""
+        """Secrets get the steps of a refit if none follows, and no more harmonics than can be carried."""
         degree = min(self.fit.sh_degree, self.max_secret_degree)
+        alone = round((1 + REFIT) * self.fit.iterations)
         of_secrets = [
-            replace(self.fit, sh_degree=degree, iterations=self.fit.iterations * (1 if steps else 2))
+            replace(self.fit, sh_degree=degree, iterations=self.fit.iterations if steps else alone)
             for steps in self.refits or (0,) * (scenes - 1)
         ]
         return [self.fit, *of_secrets]
