@@ -68,8 +68,7 @@ class CarryMethod:
             warnings.warn(_FEWER, KeyssWarning, stacklevel=2)
         steps = round(REFIT * options.fit.iterations)
         refits = [
-            options.iterations
-            or (steps if secret.photos else min(options.fit.iterations, _MODEL_ITERATIONS))
+            options.iterations or (steps if secret.photos else min(options.fit.iterations, _MODEL_ITERATIONS))
             for secret in secrets
         ]
         planned = options.refits or (0,) * len(cut)  # of the first call

@@ -21,6 +21,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterator, Sequence
 from dataclasses import astuple, dataclass, fields
+from typing import Any
 
 import numpy as np
 import torch
@@ -43,13 +44,14 @@ from keyss.methods.records.lines import (
     fit_line,
     neighbourhood,
 )
+from keyss.rendering.cpu.jit import kernel
 from keyss.rendering.cpu.parallel import in_blocks
 
 MAX_LOGIT = 16.0  # beyond it the float32 sigmoid is exactly 0 or 1
 _MAX_HARMONIC = 1e6  # beyond it a colour is black or white wherever it is rendered at all
 _MIN_LENGTH = 1e-12  # of quaternions: a shorter one turns nothing
 _SAMPLE = 20_000  # Gaussians that tell which numbers are outliers, and that lines are fitted to
-_BLOCK = 1 << 12  # Gaussians at a time: their numbers stay in the cache, and every bit takes a byte meanwhile
+_BLOCK = 1 << 12  # Gaussians at a time: their numbers stay in the cache
 _TABLE_BYTES = 8  # one for each number of bits, 0 for a band of harmonics that is not there
 _QUAT_LINE = Line(0, 0, 0.5**0.5, 0.5**0.5)  # of the three smaller components
 
@@ -109,37 +111,28 @@ class Codec:
         The bits left over are zero. `outlier` [N]: their `outliers`, where they are known.
         """
         outlier = outliers(gaussians) if outlier is None else outlier
-        bits, first, shift = self._places()
-        records = np.empty((len(gaussians), self.table.record_bytes), np.uint8)
+        bits, records = self._code_bits(), np.zeros((len(gaussians), self.table.record_bytes), np.uint8)
 
         def encode(start: int, stop: int) -> None:
-            columns = np.concatenate(self.codes(gaussians[start:stop], outlier[start:stop]), axis=1)
-            words = columns << (32 - bits - shift)  # from the highest bit of the byte that each begins in
-            found = np.zeros((self.table.record_bytes, stop - start), np.uint8)
-            for word, at, stops in zip(np.ascontiguousarray(words.T), first, shift + bits, strict=True):
-                for byte in range(-(-int(stops) // 8)):
-                    found[at + byte] |= (word >> np.uint32(24 - 8 * byte)).astype(np.uint8)
-            records[start:stop] = found.T
+            codes = np.concatenate(self.codes(gaussians[start:stop], outlier[start:stop]), axis=1)
+            _pack(codes, bits, records[start:stop])
 
         in_blocks(encode, len(gaussians), _BLOCK)
         return records
 
-    def _places(self) -> tuple[Words32, Integers, Words32]:
-        """Bits of each code of a record; the byte in which each begins, and at which of its bits."""
-        bits = np.array([bits for columns, bits in self.table.layout for _ in range(columns)], np.uint32)
-        first, shift = np.divmod(np.cumsum(bits) - bits, 8)
-        return bits, first.astype(np.int64), shift.astype(np.uint32)
+    def _code_bits(self) -> Integers:
+        """[C] bits of each code of a record."""
+        return np.array([bits for columns, bits in self.table.layout for _ in range(columns)])
 
     def decode(self, records: Bytes) -> Gaussians:
         """The Gaussians of records [N, record_bytes], whatever bytes they are."""
-        k, (bits, first, shift) = (self.table.sh_degree + 1) ** 2, self._places()
+        k, bits = (self.table.sh_degree + 1) ** 2, self._code_bits()
         ends = np.cumsum([columns for columns, _ in self.table.layout])[:-1]
         whole = Gaussians(*(torch.empty(len(records), *shape) for shape in ((3,), (4,), (3,), (), (k, 3))))
 
         def decode(start: int, stop: int) -> None:
-            padded = np.pad(records[start:stop], ((0, 0), (0, 3)))
-            words = padded.take(first[:, None] + np.arange(4), axis=1).view(">u4")[:, :, 0].astype(np.uint32)
-            codes = words << shift >> 32 - bits
+            codes = np.empty((stop - start, len(bits)), np.uint32)
+            _unpack(records[start:stop], bits, codes)
             part = self.gaussians(np.split(codes, ends, axis=1))
             for field in fields(Gaussians):
                 getattr(whole, field.name)[start:stop] = getattr(part, field.name)
@@ -169,6 +162,36 @@ class Codec:
         if len(lines) != 7 + 2 * table.sh_degree:
             raise InputError("the hidden parameters are damaged: they are too short")
         return Codec(table, lines)
+
+
+@kernel
+def _pack(codes: Any, bits: Any, records: Any) -> None:
+    """Write the codes [N, C] of `bits` [C] into `records` [N, bytes], which are zero."""
+    for i in range(len(codes)):
+        held, count, at = np.uint64(0), 0, 0  # the lowest `count` bits that are held are not written yet
+        for j in range(len(bits)):
+            held = held << np.uint64(bits[j]) | np.uint64(codes[i, j])
+            count += bits[j]
+            while count >= 8:
+                count -= 8
+                records[i, at] = held >> np.uint64(count) & np.uint64(255)
+                at += 1
+        if count:
+            records[i, at] = held << np.uint64(8 - count) & np.uint64(255)
+
+
+@kernel
+def _unpack(records: Any, bits: Any, codes: Any) -> None:
+    """The inverse of `_pack`."""
+    for i in range(len(codes)):
+        held, count, at = np.uint64(0), 0, 0
+        for j in range(len(bits)):
+            while count < bits[j]:
+                held = held << np.uint64(8) | np.uint64(records[i, at])
+                count += 8
+                at += 1
+            count -= bits[j]
+            codes[i, j] = held >> np.uint64(count) & (np.uint64(1) << np.uint64(bits[j])) - np.uint64(1)
 
 
 def outliers(gaussians: Gaussians) -> Flags:
