@@ -103,7 +103,7 @@ def test_metrics_have_their_shape(run: Path) -> None:
     assert metrics["photos"] == [True, True]
     assert metrics["wrong_key"] is None  # there is no decoder that a wrong one could be tried on
     assert len(metrics["chance_level"]) == 1
-    assert metrics["iterations"] == 75
+    assert metrics["iterations"] == 69
     assert metrics["width"] == WIDTH
 
 
@@ -305,7 +305,7 @@ def test_python_and_command_line_write_the_same(tmp_path: Path, monkeypatch: pyt
 
 def test_configurations_come_back_with_their_method_s_options(run: Path, tmp_path: Path) -> None:
     config = read_config(run / "private" / "config.json")
-    assert config.options == replace(ANY, refits=(75,))
+    assert config.options == replace(ANY, refits=(69,))
     assert config.method == "carry"
     for old, new, words in (
         ('"carry"', '"none"', "method 'none'"),

@@ -50,7 +50,7 @@ def test_too_large_models_are_refitted_for_a_short_time_without_photos() -> None
     cover, small, large = trained_like(2500), trained_like(300, 1), trained_like(6000, 2)
     options = CarryOptions(fit=FIT)
     assert _prepared(options, _given(cover), _given(large)).refits == (400,)
-    assert _prepared(options, _given(cover), _given(large, photos=True)).refits == (1250,)
+    assert _prepared(options, _given(cover), _given(large, photos=True)).refits == (1150,)
     with pytest.warns(KeyssWarning, match="other secrets"):
         assert _prepared(options, _given(cover), _given(small), _given(large)).refits == (0, 400)
     asked = options.with_fit(iterations=900)
@@ -80,7 +80,7 @@ def test_from_photos_a_secret_is_fitted_for_the_steps_of_a_refit_too(publish: st
     options = CarryOptions(fit=FIT, publish=publish)  # type: ignore[arg-type]
     found = _prepared(options, *[PHOTOS] * (1 + secrets))
     assert found.refits == (0,) * secrets
-    assert [each.iterations for each in found.fits(1 + secrets)] == [1000, *[2250] * secrets]
+    assert [each.iterations for each in found.fits(1 + secrets)] == [1000, *[2150] * secrets]
     assert found.training(1 + secrets) == (Training(),) * (1 + secrets)
 
 
@@ -90,9 +90,9 @@ def test_where_room_is_short_secrets_are_refitted(publish: str, secrets: int) ->
     warned = pytest.warns(KeyssWarning, match="other secrets") if secrets > 1 else nullcontext()
     with warned:
         found = _prepared(options, *[PHOTOS] * (1 + secrets))
-    assert found.refits == (1250,) * secrets
+    assert found.refits == (1150,) * secrets
     assert [each.iterations for each in found.fits(1 + secrets)] == [1000] * (1 + secrets)
-    assert found.training(1 + secrets) == (Training(), *[Training(1250)] * secrets)
+    assert found.training(1 + secrets) == (Training(), *[Training(1150)] * secrets)
 
 
 def test_harmonics_of_fitted_models_follow_the_cover() -> None:

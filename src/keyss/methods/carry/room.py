@@ -32,7 +32,7 @@ from keyss.methods.records.precision import most_visible, pruned
 from keyss.methods.records.whole import encode
 from keyss.rendering.difference import Viewpoints
 
-REFIT = 1.25  # steps of a refit to photos for each of a fit: with as many, secrets lose 0.1 dB
+REFIT = 1.15  # steps of a refit to photos for each of a fit: with as many, secrets lose 0.15 dB
 _BITS_PER_GAUSSIAN = 150  # of the payload of a secret that is not fitted yet
 _DRAWS = 3  # of new low bits: in covers of few bits, one in five has stale salts or bits that seem not random
 _TINY = 16  # Gaussians; a secret is not cut down to fewer
