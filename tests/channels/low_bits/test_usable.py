@@ -7,10 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from hypothesis import given, strategies as st
 
 from channels.low_bits.payloads import embed_derived
 from channels.low_bits.trained_like import keys, trained_like
 from keyss.channels import LOW_BITS, LowBitsReader, chance_of_bits, read_low_bits, usable_carriers
+from keyss.channels.low_bits import usable
 from keyss.channels.low_bits.bits import Layout, used_words, write_low_bits
 from keyss.channels.low_bits.predictability import count_trailing_zeros, least_exponent
 from keyss.channels.low_bits.usable import GIVEN_AWAY, check_usable
@@ -94,6 +96,18 @@ def test_trailing_zeros_are_counted_by_exponent() -> None:
     assert counts.sum() == 5
     assert counts[126, 12] == counts[127, 0] == counts[127, 3] == 1
     assert counts[128, 12] == 2  # 12 or more
+
+
+@pytest.mark.parametrize("few", [0, 1 << 20])
+@given(st.lists(st.integers(0, 40), max_size=90), st.integers(1, 5), st.sampled_from([np.uint32, np.uint64]))
+def test_frequent_values_are_those_that_counting_finds(
+    few: int, values: list[int], times: int, kind: type
+) -> None:
+    words = np.array(values, kind)[:, None]
+    found, counts = np.unique(words, return_counts=True)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(usable, "_FEW_WORDS", few)
+        assert np.array_equal(usable.frequent(words, times), found[counts >= times])
 
 
 def test_the_chance_of_uniform_bits_is_one_and_that_of_others_is_small() -> None:

@@ -44,38 +44,34 @@ def find_full(words, shift, counts, times, found):
 
 
 @kernel
-def find_near(words, shifts, first, step, found):
-    """Set `found` [N] where two of `step` words next to each other agree but for their low bits, or nearly.
+def find_near(words, shifts, groups, colours, most, found):
+    """`found` [N]: whether two words of a group nearly agree, or `most` pairs of words of one colour agree.
 
-    `words` [N, C], from column `first` on in groups of `step`; `shifts` [C]: their low bits.
+    Both but for the low bits of `words` [N, C], which are shifted away by `shifts` [C]. `groups` [G, 2]: the
+    first column of each and how many there are. From column `colours` on, harmonics of three colours take
+    turns: each three are a group, too.
     """
+    count = (words.shape[1] - colours) // 3
+    high = np.empty(words.shape[1], np.int64)
+    by_colour = np.empty((3, count), np.int64)  # so that the innermost loop is one of vectors
     for i in range(len(words)):
-        for group in range(first, words.shape[1] - step + 1, step):
-            for a in range(group, group + step):
-                for b in range(a + 1, group + step):
-                    one = np.int64((words[i, a] & _MAGNITUDE) >> shifts[a])
-                    other = np.int64((words[i, b] & _MAGNITUDE) >> shifts[b])
-                    if abs(one - other) <= 1:
-                        found[i] = True
-
-
-@kernel
-def find_equal(words, shifts, first, most, found):
-    """Set `found` [N] where `most` pairs of words of one colour agree but for their low bits.
-
-    `words` [N, C]: those of three colours take turns from column `first` on.
-    """
-    count = (words.shape[1] - first) // 3
-    high = np.empty((3, count), np.uint32)  # so that the innermost loop is one of vectors
-    for i in range(len(words)):
-        for j in range(3 * count):
-            high[j % 3, j // 3] = (words[i, first + j] & _MAGNITUDE) >> shifts[first + j]
+        near = False
+        for j in range(len(high)):
+            high[j] = (words[i, j] & _MAGNITUDE) >> shifts[j]
+        for g in range(len(groups)):
+            for a in range(groups[g, 0], groups[g, 0] + groups[g, 1]):
+                for b in range(a + 1, groups[g, 0] + groups[g, 1]):
+                    near |= abs(high[a] - high[b]) <= 1
+        for j in range(count):
+            red, green, blue = high[colours + 3 * j : colours + 3 * j + 3]
+            near |= abs(red - green) <= 1 or abs(red - blue) <= 1 or abs(green - blue) <= 1
+            by_colour[0, j], by_colour[1, j], by_colour[2, j] = red, green, blue
         equal = 0
         for colour in range(3):
             for b in range(count):
                 for a in range(b):
-                    equal += high[colour, a] == high[colour, b]
-        found[i] |= equal >= most
+                    equal += by_colour[colour, a] == by_colour[colour, b]
+        found[i] = near or equal >= most
 
 
 @kernel

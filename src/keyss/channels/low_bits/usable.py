@@ -37,7 +37,7 @@ from keyss.channels.low_bits.bits import (
     identities,
     used_words,
 )
-from keyss.channels.low_bits.kernels import fill_buckets, find_equal, find_full, find_near
+from keyss.channels.low_bits.kernels import fill_buckets, find_full, find_near
 from keyss.channels.low_bits.predictability import count_trailing_zeros, least_exponent
 from keyss.channels.mixing import row_hashes
 from keyss.core.arrays import Bytes, Doubles, Flags, Integers, Numbers, Words, Words32
@@ -64,6 +64,7 @@ _SHORT = np.uint32((1 << _SHORT_BITS) - 1)
 # A Gaussian is no measurement when so many of its values have 12 zeros; by chance one in three million is.
 _ZEROS, _ZERO_FIELDS = np.uint32((1 << 12) - 1), 3
 _EQUAL_HARMONICS = 2
+_FEW_WORDS = 1 << 20  # which are sorted as quickly as kernels are loaded
 
 _OPACITY = 7
 # Bit patterns of logits from 16 on. The sigmoid is 1 from 16.64 on, but only the exponent surely stays.
@@ -164,25 +165,24 @@ def near_equal(used: Words32, layout: Layout) -> Flags:
     Or two pairs of one colour's harmonics, next to each other by size, equal. By chance some 4 % of all
     Gaussians are. `used` [N, F]: of `used_words`.
     """
-    near, shifts = np.zeros(len(used), bool), layout.shifts
-    find_near(used[:, 0:3], shifts[0:3], 0, 3, near)
-    if layout.quats:
-        find_near(used[:, QUATS], shifts[QUATS], 0, 4, near)
-    find_near(used, shifts, GEOMETRY, 3, near)
-    find_equal(used, shifts, GEOMETRY, _EQUAL_HARMONICS, near)
+    near = np.empty(len(used), bool)
+    groups = np.array([[0, 3], [QUATS.start, 4 if layout.quats else 0]])
+    find_near(used, layout.shifts, groups, GEOMETRY, _EQUAL_HARMONICS, near)
     return near
 
 
 def frequent(words: Numbers, times: int) -> Numbers:
     """[V] which values at least `times` of the unsigned integers [N, C] have, in ascending order.
 
-    Only what shares a bucket with so many others is sorted, which takes a third of the time.
+    Of many, only what shares a bucket with so many others is sorted, which takes a third of the time.
     """
-    shift = 64 - (4 * words.size // times).bit_length()
-    counts, found, most = np.zeros(1 << 64 - shift, np.uint8), np.empty(words.shape, bool), min(times, 255)
-    fill_buckets(words, shift, counts)
-    in_blocks(lambda a, b: find_full(words[a:b], shift, counts, most, found[a:b]), len(words), BLOCK)
-    ordered, further = np.sort(words[found]), times - 1
+    if words.size > _FEW_WORDS:
+        shift, most = 64 - (1 + 4 * words.size // times).bit_length(), min(times, 255)
+        counts, found = np.zeros(1 << 64 - shift, np.uint8), np.empty(words.shape, bool)
+        fill_buckets(words, shift, counts)
+        in_blocks(lambda a, b: find_full(words[a:b], shift, counts, most, found[a:b]), len(words), BLOCK)
+        words = words[found]
+    ordered, further = np.sort(words, axis=None), times - 1
     return np.unique(ordered[further:][ordered[further:] == ordered[: len(ordered) - further]])
 
 
