@@ -1,21 +1,14 @@
-"""What carrying costs and holds: time, memory, capacity, and decibels for models that you have.
+"""What carrying holds and costs: capacities, and decibels for models that you have. Times: `large.py`.
 
-    python benchmarks/carry.py                      # 100,000 in 100,000 made-up Gaussians, capacities
-    python benchmarks/carry.py --large              # also 2 million in 2 million: time and peak memory
-    python benchmarks/carry.py --models FOLDER      # every .ply in it as a cover, and as a secret in the next
-    python benchmarks/carry.py --photos SCENE=MODEL.ply SCENE=MODEL.ply    # each in the other, against photos
-
-Each timing runs in a process of its own, from files to files, key derivation included and imports left out.
+python benchmarks/carry.py                      # capacities
+python benchmarks/carry.py --models FOLDER      # every .ply in it as a cover, and as a secret in the next
+python benchmarks/carry.py --photos SCENE=MODEL.ply SCENE=MODEL.ply    # each in the other, against photos
 """
 
 from __future__ import annotations
 
 import argparse
-import resource
-import subprocess
 import sys
-import tempfile
-import time
 from itertools import permutations
 from pathlib import Path
 
@@ -25,8 +18,7 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
-from keyss import read_model, write_model
-from channels.low_bits.trained_like import trained_like
+from keyss import read_model
 from keyss.channels import LowBitsRoom, usable_carriers
 from keyss.core import Gaussians, KeyssError, Scene
 from keyss.core.gaussians import compensate_pruning
@@ -43,18 +35,11 @@ REMOVED = 0.25
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--large", action="store_true")
     parser.add_argument("--models", type=Path)
     parser.add_argument("--photos", nargs="+", default=[])
     parser.add_argument("--width", type=int, default=200)
-    parser.add_argument("--step", nargs=3, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
-    if arguments.step:
-        _step(arguments.step[0], Path(arguments.step[1]), int(arguments.step[2]))
-        return
     _capacities()
-    for count in (100_000, 2_000_000) if arguments.large else (100_000,):
-        _timed(count)
     if arguments.models:
         _models(sorted(arguments.models.rglob("*.ply")))
     if arguments.photos:
@@ -68,30 +53,6 @@ def _capacities() -> None:
             LowBitsRoom.of(100_000, degree).record_capacity([record_request(1, other)]) for other in range(4)
         ]
         print(f"  cover of degree {degree}: " + ", ".join(f"{number:,}" for number in fits))
-
-
-def _timed(count: int) -> None:
-    with tempfile.TemporaryDirectory() as folder:
-        for step in ("make", "hide", "reveal"):
-            subprocess.run([sys.executable, __file__, "--step", step, folder, str(count)], check=True)
-
-
-def _step(step: str, folder: Path, count: int) -> None:
-    if step == "make":
-        for name, seed in (("cover", 0), ("secret", 1)):
-            write_model(folder / f"{name}.ply", trained_like(count, seed))
-        return
-    start = time.perf_counter()
-    if step == "hide":
-        stego = embed(read_model(folder / "cover.ply"), [(KEY, read_model(folder / "secret.ply"))])
-        write_model(folder / "stego.ply", stego)
-    else:
-        carried = extract(read_model(folder / "stego.ply"), KEY)
-        write_model(folder / "revealed.ply", carried.gaussians)
-        assert len(carried.gaussians) == count
-    seconds = time.perf_counter() - start
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024**2  # KiB on Linux
-    print(f"{step} {count:,} in {count:,}: {seconds:.2f} s, at most {peak:.2f} GiB", flush=True)
 
 
 def _models(paths: list[Path]) -> None:
