@@ -198,7 +198,7 @@ def _hide_scenes(args: HideArguments, cover: Path) -> None:
         {
             **dict.fromkeys(STEGOS, f"{how}: {what}"),
             HANDED: "hand this over to whoever may see the secret: `keyss reveal --handed`",
-            "private": "keep this private, or delete it: plain models, measurements, configuration",
+            "private": "keep this private, or delete it: measurements, configuration, fitted models",
         },
     )
     if not method.capabilities.keys:
