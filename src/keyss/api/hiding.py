@@ -8,6 +8,7 @@ import math
 import time
 import warnings
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -281,7 +282,8 @@ def _entropy(keys: Sequence[str], options: MethodOptions, plain: Sequence[Gaussi
 
     The salt depends on all models, so that no table of keys can be made before the secrets are known.
     """
-    models = [model.digest().encode() for model in plain]
+    with ThreadPoolExecutor(len(plain)) as workers:
+        models = [digest.encode() for digest in workers.map(Gaussians.digest, plain)]
     repeated = b" ".join([f"keyss/v1/repeat {options.fit.known_seed}".encode(), *models])
     salt = hashlib.sha256(repeated).digest()[:SALT_BYTES]
     parts = [DerivedKey.of(key, salt).expand("writer", 32) for key in keys if key]

@@ -33,11 +33,11 @@ import torch
 from torch import Tensor
 
 from keyss.channels.base import SALTS_TRIED, Channel, Content, Room, check_keys, randomness
-from keyss.channels.low_bits.bits import Layout, identities, read_low_bits, write_low_bits
+from keyss.channels.low_bits.bits import Layout, read_low_bits, write_low_bits
 from keyss.channels.low_bits.contents import Writer, digest
 from keyss.channels.low_bits.layout import LowBitsRoom
 from keyss.channels.low_bits.salts import salt, salt_rows
-from keyss.channels.low_bits.usable import check_usable, usable_carriers
+from keyss.channels.low_bits.usable import check_usable, named_carriers
 from keyss.core.arrays import Bytes, Flags, Integers
 from keyss.core.errors import KeyssWarning, UsageError
 from keyss.core.gaussians import Gaussians
@@ -67,8 +67,7 @@ class LowBits(Channel):
         """See `Channel`. Raises UsageError for low bits that are not random, and for stale salts."""
         layout, versions = Layout.of(cover), _versions(cover)
         if (found := self._found.get(cover)) is None or found[0] != versions:
-            names = identities(cover, layout)
-            usable = usable_carriers(cover, names, layout)
+            usable, names = named_carriers(cover, layout)
             check_usable(cover, usable, layout)
             rows = salt_rows(cover, names, layout=layout)
             stale = int((~usable[rows]).sum())

@@ -22,6 +22,7 @@ would be noticed.
 from __future__ import annotations
 
 import math
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import torch
@@ -79,14 +80,18 @@ _SAMPLE = 20_000  # Gaussians whose bits are tested
 _CHANCE = 1e-6  # that a model with uniform bits is refused
 
 
-def usable_carriers(gaussians: Gaussians, names: Bytes | None = None, layout: Layout | None = None) -> Flags:
-    """[N] which Gaussians have low bits that look like those of trained values, and can be replaced.
+def usable_carriers(gaussians: Gaussians) -> Flags:
+    """[N] which Gaussians have low bits that look like those of trained values, and can be replaced."""
+    return named_carriers(gaussians, Layout.of(gaussians))[0]
 
-    `names` [N, 16]: their identities, where they are known.
-    """
-    layout = layout or Layout.of(gaussians)
-    usable, short = _apart(gaussians, layout, identities(gaussians, layout) if names is None else names)
-    often = _frequent_values(gaussians)
+
+def named_carriers(gaussians: Gaussians, layout: Layout) -> tuple[Flags, Bytes]:
+    """`usable_carriers` [N], and all `identities` [N, 16]."""
+    with ThreadPoolExecutor(1) as helper:
+        counting = helper.submit(_frequent_values, gaussians)  # most of which is done without Python's lock
+        names = identities(gaussians, layout)
+        often = counting.result()
+    usable, short = _apart(gaussians, layout, names)
 
     def judge(start: int, stop: int) -> Integers:
         used, own = used_words(gaussians[start:stop]), usable[start:stop]
@@ -97,7 +102,7 @@ def usable_carriers(gaussians: Gaussians, names: Bytes | None = None, layout: La
 
     parts = in_blocks(judge, len(gaussians), BLOCK)
     if not parts:
-        return usable
+        return usable, names
     least = [least_exponent(counts, GIVEN_AWAY / len(_GROUPS)) for counts in np.sum(parts, axis=0)]
 
     def leave_small(start: int, stop: int) -> None:
@@ -108,7 +113,7 @@ def usable_carriers(gaussians: Gaussians, names: Bytes | None = None, layout: La
                 usable[start:stop] &= ~((exponents(values) < bound) & (values & 1 == 0)).any(axis=1)
 
     in_blocks(leave_small, len(gaussians), BLOCK)
-    return usable
+    return usable, names
 
 
 def check_usable(gaussians: Gaussians, usable: Flags, layout: Layout | None = None) -> None:
