@@ -10,7 +10,7 @@ three more blurs of pointwise derivatives.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,6 +18,8 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
+
+from keyss.core.scene import View
 
 # Cached kernels would miss changes in other files: they use only these, see `rendering.cpu.jit`.
 from keyss.rendering.cpu import memory, parallel
@@ -47,8 +49,7 @@ def _blur(planes: Tensor) -> Tensor:
 class Target:
     """A target image and its SSIM statistics."""
 
-    image: Tensor  # [H, W, 3] in [0, 1]
-    planes: Tensor  # [3, H, W], the same values
+    planes: Tensor  # [3, H, W] in [0, 1]
     mean: Tensor  # [3, H, W] local mean
     variance: Tensor  # [3, H, W] local variance
 
@@ -65,21 +66,31 @@ class Target:
         else:
             blurred = _blur(stacked)
         mean, square = blurred.chunk(2)
-        return Target(image, planes, mean, square - mean * mean)
+        return Target(planes, mean, square - mean * mean)
+
+    @property
+    def image(self) -> Tensor:
+        """[H, W, 3] the image."""
+        return self.planes.permute(1, 2, 0)
 
 
 class Targets:
-    """The targets of a training, which keeps what fits into TARGET_BYTES: making one takes 5 % of a step."""
+    """The targets of a training, of which it keeps TARGET_BYTES: making one takes 5 to 8 % of a step."""
 
     def __init__(self) -> None:
         self._kept: dict[Hashable, Target] = {}
         self._left = TARGET_BYTES
 
+    @staticmethod
+    def most_bytes(views: Iterable[View]) -> int:
+        """Bytes that the targets of `views` take."""
+        return min(TARGET_BYTES, sum(12 * view.image.numel() for view in views))
+
     def of(self, key: Hashable, image: Callable[[], Tensor]) -> Target:
         """The target of an `image` that is always the same for a key."""
         if (target := self._kept.get(key)) is None:
             target = Target.of(image())
-            needed = 16 * target.planes.numel()  # four tensors of float32
+            needed = 12 * target.planes.numel()  # three tensors of float32
             if needed <= self._left:
                 self._kept[key] = target
                 self._left -= needed

@@ -28,6 +28,7 @@ from keyss.core.scene import Scene
 from keyss.fitting.checkpoint import steps_done
 from keyss.fitting.config import FitConfig
 from keyss.fitting.loop import ENDING, REMEDY, deferred
+from keyss.fitting.losses import Targets
 from keyss.fitting.plain import fit_scene
 from keyss.fitting.ranks import here
 from keyss.progress import Reporter
@@ -89,7 +90,8 @@ def process_bytes(fit: Fit) -> int:
     """Rough memory of the process of a fit."""
     images = [each for view in fit.scene.views for each in (view.image, view.unrounded) if each is not None]
     numbers = fit.config.max_gaussians * (11 + 3 * (fit.config.sh_degree + 1) ** 2)
-    return _PROCESS_BYTES + sum(image.nbytes for image in images) + 4 * _COPIES * numbers
+    pictures = sum(image.nbytes for image in images) + Targets.most_bytes(fit.scene.train)
+    return _PROCESS_BYTES + pictures + 4 * _COPIES * numbers
 
 
 def fitted(fit: Fit, device: torch.device | str, resume: bool) -> Gaussians:

@@ -19,6 +19,7 @@ from keyss.channels import Publish
 from keyss.core.errors import OutputError
 from keyss.core.scene import Scene
 from keyss.fitting.config import FitConfig
+from keyss.fitting.losses import Targets
 from keyss.fitting.ranks import here
 from keyss.methods.base import Method, MethodOptions, Plan, Source, Stage, role_of
 from keyss.methods.plain_models import Bound, plain_stage
@@ -93,7 +94,8 @@ def plan_hiding(
         file_bytes=_file_bytes(plan.gaussians, plan.sh_degree, options.publish),
         disk_bytes=_disk_bytes(options, sources),
         free_bytes=None if out is None else _free_bytes(out),
-        memory_bytes=_memory_bytes(plan.gaussians, plan.sh_degree, trains),
+        memory_bytes=_memory_bytes(plan.gaussians, plan.sh_degree, trains)
+        + max(Targets.most_bytes(source.scene.train) for source in sources) * trains,
     )
 
 
@@ -110,7 +112,7 @@ def plan_fit(scene: Scene, config: FitConfig, device: torch.device) -> Plan:
         stages=(_fit_stage("fit", config, scene, gaussians, device),),
         file_bytes=file_bytes,
         disk_bytes=(1 + 2 * _STATE_COPIES) * file_bytes + _OTHER_BYTES,
-        memory_bytes=_memory_bytes(gaussians, degree, trains=True),
+        memory_bytes=_memory_bytes(gaussians, degree, trains=True) + Targets.most_bytes(scene.train),
     )
 
 
