@@ -25,7 +25,7 @@ def test_below_the_limit_nothing_is_published_and_a_lower_limit_needs_no_trainin
     assert {path.name for path in (tmp_path / "run").iterdir()} == {"private"}
     said = keyss(*hide, "--min-psnr", 0, "--resume")
     assert said.status == 0
-    assert "plain model of the secret (b): 40 steps, continuing at 40" in said.err
+    assert "plain model of the secret (b): 43 steps, continuing at 43" in said.err
     assert (tmp_path / "run" / "publish" / "stego.ply").exists()
 
 

@@ -35,7 +35,7 @@ def test_it_leaves_everything_there_is_to_look_at(run: tuple[Path, demo.DemoResu
         *("publish", "private", "scenes", "secret.ply", "web.spz", "comparison.png", "key.txt", "index.html"),
     }
     assert result.refused == len(demo.WRONG_KEYS)
-    assert result.metrics.baseline.steps == result.metrics.steps == (30, 60)
+    assert result.metrics.baseline.steps == result.metrics.steps == (30, 64)
     assert all(result.metrics.baseline.equal)
     assert result.metrics == read_record(out / "private" / "metrics.json", HideMetrics)
     assert (out / "key.txt").read_text() == "demo-key-3\n"

@@ -188,7 +188,7 @@ def frequent(words: Numbers, times: int) -> Numbers:
         in_blocks(lambda a, b: find_full(words[a:b], shift, counts, most, found[a:b]), len(words), BLOCK)
         words = words[found]
     ordered, further = np.sort(words, axis=None), times - 1
-    return np.unique(ordered[further:][ordered[further:] == ordered[: len(ordered) - further]])
+    return np.unique(ordered[further:][ordered[further:] == ordered[: max(0, len(ordered) - further)]])
 
 
 def repeated(values: Words) -> Flags:
