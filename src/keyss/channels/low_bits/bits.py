@@ -48,8 +48,9 @@ class Layout:
     @staticmethod
     def of(gaussians: Gaussians) -> Layout:
         """Without quaternions where half of them or more have unit length."""
-        lengths = coarse_lengths(_words(gaussians.quats))
-        away = float(np.median(np.abs(lengths - 1))) if len(lengths) else 1.0
+        words = _words(gaussians.quats)
+        lengths = in_blocks(lambda start, stop: coarse_lengths(words[start:stop]), len(words), BLOCK)
+        away = float(np.median(np.abs(np.concatenate(lengths) - 1))) if lengths else 1.0
         return Layout(gaussians.sh_degree, away > UNIT_TOLERANCE)
 
     @property
@@ -99,10 +100,11 @@ def identities(gaussians: Gaussians, layout: Layout | None = None) -> Bytes:
     for start in range(0, len(gaussians), BLOCK):
         own = gaussians[start : start + BLOCK]
         data = np.concatenate([_words(own.means), used_words(own) & stays], axis=1).astype("<u4").tobytes()
-        hashes += [
+        each = (
             blake2b(data[at : at + size], digest_size=IDENTITY_BYTES, person=_PERSON).digest()
             for at in range(0, len(data), size)
-        ]
+        )
+        hashes.append(b"".join(each))
     return np.frombuffer(b"".join(hashes), np.uint8).reshape(-1, IDENTITY_BYTES)
 
 

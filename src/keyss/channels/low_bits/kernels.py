@@ -36,11 +36,12 @@ def fill_buckets(words, shift, counts):
 
 
 @kernel
-def find_full(words, shift, counts, times, found):
-    """`found` [N, C]: whether the bucket of each of `words` [N, C] has at least `times` words."""
+def find_full(words, shift, full, found):
+    """`found` [N, C]: whether the bucket of each of `words` [N, C] is `full`, of which each has a bit."""
     for i in range(len(words)):
         for j in range(words.shape[1]):
-            found[i, j] = counts[np.uint64(words[i, j]) * _ODD >> np.uint64(shift)] >= times
+            at = np.uint64(words[i, j]) * _ODD >> np.uint64(shift)
+            found[i, j] = full[at >> np.uint64(3)] >> np.uint8(at & np.uint64(7)) & np.uint8(1)
 
 
 @kernel

@@ -182,11 +182,18 @@ def frequent(words: Numbers, times: int) -> Numbers:
     Of many, only what shares a bucket with so many others is sorted, which takes a third of the time.
     """
     if words.size > _FEW_WORDS:
-        shift, most = 64 - (1 + 4 * words.size // times).bit_length(), min(times, 255)
-        counts, found = np.zeros(1 << 64 - shift, np.uint8), np.empty(words.shape, bool)
+        # So many that few are full by chance: for each value 6 where two count, less than 1 from a dozen on.
+        shift = 64 - (24 * words.size // (times * min(times, 12))).bit_length()
+        counts = np.zeros(1 << 64 - shift, np.uint8)
         fill_buckets(words, shift, counts)
-        in_blocks(lambda a, b: find_full(words[a:b], shift, counts, most, found[a:b]), len(words), BLOCK)
-        words = words[found]
+        full = np.packbits(counts >= min(times, 255), bitorder="little")
+
+        def some(start: int, stop: int) -> Numbers:
+            found = np.empty(words[start:stop].shape, bool)
+            find_full(words[start:stop], shift, full, found)
+            return words[start:stop][found]
+
+        words = np.concatenate(in_blocks(some, len(words), BLOCK))
     ordered, further = np.sort(words, axis=None), times - 1
     return np.unique(ordered[further:][ordered[further:] == ordered[: max(0, len(ordered) - further)]])
 
@@ -243,12 +250,15 @@ def _apart(gaussians: Gaussians, layout: Layout, names: Bytes) -> tuple[Flags, b
     keys = np.empty((len(together) + 1, len(gaussians)), np.uint64)
     keys[-1] = names.view("<u8")[:, 0]
 
+    stays, used_fields = ~layout.mask & ~np.uint32(1), np.isin(np.arange(len(layout.mask)), layout.columns)
+
     def hash_some(start: int, stop: int) -> int:
         used = used_words(gaussians[start:stop])
-        high = used & ~layout.mask & ~np.uint32(1)
+        high = used & stays
         for key, columns in zip(keys, together, strict=False):
             key[start:stop] = row_hashes(high[:, columns])
-        return int(((used & _SHORT == 0) & (exponents(used) > 0))[:, layout.columns].sum())
+        rows, fields = np.nonzero(used & _SHORT == 0)  # few
+        return int(np.count_nonzero(used_fields[fields] & (exponents(used[rows, fields]) > 0)))
 
     short = sum(in_blocks(hash_some, len(gaussians), BLOCK))
     apart = ~np.logical_or.reduce(in_blocks(lambda index, _: repeated(keys[index]), len(keys), 1))
