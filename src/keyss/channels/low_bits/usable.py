@@ -183,7 +183,7 @@ def frequent(words: Numbers, times: int) -> Numbers:
     """
     if words.size > _FEW_WORDS:
         # So many that few are full by chance: for each value 6 where two count, less than 1 from a dozen on.
-        shift = 64 - (24 * words.size // (times * min(times, 12))).bit_length()
+        shift = 64 - (1 + 24 * words.size // (times * min(times, 12))).bit_length()
         counts = np.zeros(1 << 64 - shift, np.uint8)
         fill_buckets(words, shift, counts)
         full = np.packbits(counts >= min(times, 255), bitorder="little")
