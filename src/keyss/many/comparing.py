@@ -243,8 +243,9 @@ def _bytes(name: str) -> Column:
 
 
 def _picture(each: ComparedMethod) -> str:
-    times = [(each.numbers[f"pictures.{role}.{what}"] for what in ("seconds", "ratio")) for role in _ROLES]
-    return ", ".join(f"{1000 * seconds:.0f} ({ratio:.1f}x)" for seconds, ratio in times)
+    names = [f"pictures.{role}" for role in _ROLES]
+    times = [(1e3 * each.numbers[f"{name}.seconds"], each.numbers[f"{name}.ratio"]) for name in names]
+    return ", ".join(f"{milliseconds:.0f} ({ratio:.1f}x)" for milliseconds, ratio in times)
 
 
 def _steps(each: ComparedMethod) -> str:
