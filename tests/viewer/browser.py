@@ -143,15 +143,10 @@ class Visit:
     def takes_as_long_for_each(self, *keys: str) -> None:
         """Assert that the search takes as long for one key as for another.
 
-        Each takes as long as those before it or longer; other work on the machine makes single ones longer,
-        and if it lasts, all: then they are timed again.
+        Each takes as long as those before it or longer; other work on the machine makes single ones longer.
         """
-        times: list[float] = []
-        for _ in range(2):
-            times = [self.try_key(key) for key in keys]
-            if min(abs(later / earlier - 1) for earlier, later in pairwise(times)) < 0.1:
-                return
-        raise AssertionError(times)
+        times = [self.try_key(key) for key in keys]
+        assert min(abs(later / earlier - 1) for earlier, later in pairwise(times)) < 0.1, times
 
     def saved(self, button: str, path: Path) -> str:
         """Save what a button downloads; its suggested name."""
