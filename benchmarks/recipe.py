@@ -17,7 +17,9 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import permutations
 from pathlib import Path
+from statistics import mean
 from typing import Any
 
 import keyss  # noqa: F401  before torch, see `ruff.toml`
@@ -73,6 +75,17 @@ def main() -> None:
         f"{len(chosen)} fits: gain {sum(gains) / len(gains):+.2f} dB in the mean, {gains[0]:+.2f} at worst; "
         f"time {sum(row['time'] for row in chosen) / len(chosen):.2f}"
     )
+    by_seed(chosen)
+
+
+def by_seed(rows: list[dict[str, Any]]) -> None:
+    """Print what seeds alone change: means of scenes, and 3DGS's rates against themselves."""
+    every = [[row for row in rows if row["scene"] == name] for name in sorted({row["scene"] for row in rows})]
+    means = [(mean(row["gain"] for row in own), own[0]["scene"]) for own in every]
+    print(f"lowest mean of a scene: {min(means)[0]:+.2f} dB ({min(means)[1]})")
+    pairs = [b["3dgs"] - a["3dgs"] for own in every for a, b in permutations(own, 2)]
+    below, ours = sum(each < -1 for each in pairs), sum(row["gain"] < -1 for row in rows)
+    print(f"more than 1 dB below: {ours} of {len(rows)}; 3DGS's with another seed {below} of {len(pairs)}")
 
 
 def fitted(scene: Scene, config: FitConfig) -> tuple[float, float]:

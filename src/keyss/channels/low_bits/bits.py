@@ -184,7 +184,6 @@ def _sh_count(sh_degree: int) -> int:
 
 
 def _words(values: torch.Tensor) -> Words32:
-    """[N, C] bit patterns: the tensor's own memory where it is contiguous and on the CPU."""
-    width = math.prod(values.shape[1:])
-    flat = values.detach().to("cpu", torch.float32).reshape(len(values), width).contiguous()
+    """[N, C] bit patterns: of a tensor on the CPU whose rows are contiguous its own memory."""
+    flat = values.detach().to("cpu", torch.float32).reshape(len(values), math.prod(values.shape[1:]))
     return flat.numpy().view(np.uint32)
