@@ -75,7 +75,8 @@ def main() -> None:
         f"{len(chosen)} fits: gain {sum(gains) / len(gains):+.2f} dB in the mean, {gains[0]:+.2f} at worst; "
         f"time {sum(row['time'] for row in chosen) / len(chosen):.2f}"
     )
-    by_seed(chosen)
+    if len(options.seeds) > 1:
+        by_seed(chosen)
 
 
 def by_seed(rows: list[dict[str, Any]]) -> None:
