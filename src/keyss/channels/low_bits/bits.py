@@ -22,6 +22,7 @@ from hashlib import blake2b
 import numpy as np
 import torch
 
+from keyss.channels.low_bits.kernels import pack_harmonics, unpack_harmonics
 from keyss.core.arrays import Bytes, Doubles, Integers, Words32
 from keyss.core.gaussians import Gaussians
 from keyss.rendering.cpu.parallel import in_blocks
@@ -31,6 +32,7 @@ GEOMETRY = len(FIELDS)  # fields of a Gaussian before the spherical harmonics
 QUATS = slice(3, 7)  # of these
 GEOMETRY_BITS, SH_BITS = 8, 12
 UNUSED_BITS = 1  # below them
+_UNUSED, _BYTE = np.uint32(UNUSED_BITS), np.uint32((1 << GEOMETRY_BITS) - 1)
 UNIT_TOLERANCE = 1e-4  # of a length that is known without the low bits, to 2e-5 on average
 
 IDENTITY_BYTES = 16
@@ -114,18 +116,14 @@ def read_low_bits(gaussians: Gaussians, layout: Layout | None = None) -> Bytes:
     8 bits of each field before the harmonics are a byte; two times 12 bits of harmonics are three.
     """
     layout = layout or Layout.of(gaussians)
-    columns, harmonics = layout.columns, _sh_count(layout.sh_degree)
-    before = len(columns) - harmonics
+    fields, harmonics = _written_fields(gaussians, layout)
     packed = np.empty((len(gaussians), layout.width), np.uint8)
 
     def pack(start: int, stop: int) -> None:
-        low = (used_words(gaussians[start:stop])[:, columns] & layout.mask[columns]) >> np.uint32(UNUSED_BITS)
-        first, second = low[:, before::2], low[:, before + 1 :: 2]
-        packed[start:stop, :before] = low[:, :before]
-        packed[start:stop, before::3] = first >> 4
-        whole = second.shape[1]
-        packed[start:stop, before + 1 :: 3] = (first[:, :whole] & 15) << 4 | second >> 8
-        packed[start:stop, before + 2 :: 3] = second & 255
+        own, first = packed[start:stop], 0
+        for field in fields:
+            own[:, first : (first := first + field.shape[1])] = field[start:stop] >> _UNUSED & _BYTE
+        pack_harmonics(harmonics[start:stop], _UNUSED, own[:, first:])
 
     in_blocks(pack, len(gaussians), BLOCK)
     return packed
@@ -139,18 +137,16 @@ def write_low_bits(
     Where a Gaussian's bits are no whole number of bytes, the last half byte stays as it is.
     """
     written = gaussians.detach().to("cpu").map(torch.Tensor.contiguous).map(torch.clone)
-    *geometry, _ = _used_fields(written)
-    fields, mask = [*map(_words, geometry), _words(written.sh)[:, 3:]], layout.mask
-    if _sh_count(layout.sh_degree) % 2:
-        mask[-1] &= ~np.uint32(15 << UNUSED_BITS)
+    fields, harmonics = _written_fields(written, layout)
 
     for rows, data in parts:
 
         def write(start: int, stop: int, rows: Integers = rows, data: Bytes = data) -> None:
-            own, new, first = rows[start:stop], _unpacked(data[start:stop], layout), 0
+            own, new, first = rows[start:stop], data[start:stop], 0
             for field in fields:
-                columns = slice(first, first := first + field.shape[1])
-                field[own] = field[own] & ~mask[columns] | new[:, columns] & mask[columns]
+                low = new[:, first : (first := first + field.shape[1])].astype(np.uint32)
+                field[own] = field[own] & ~(_BYTE << _UNUSED) | low << _UNUSED
+            unpack_harmonics(new[:, first:], _UNUSED, own, harmonics)
 
         in_blocks(write, len(rows), BLOCK)
     return written.to(gaussians.device)
@@ -165,17 +161,10 @@ def _used_fields(gaussians: Gaussians) -> tuple[torch.Tensor, ...]:
     return gaussians.log_scales, gaussians.quats, gaussians.opacity_logits, gaussians.sh[:, 1:]
 
 
-def _unpacked(data: Bytes, layout: Layout) -> Words32:
-    """[N, F] the words whose low bits are bytes [N, B], zeros where a byte or a field is not in use."""
-    count = _sh_count(layout.sh_degree)
-    before = len(layout.columns) - count
-    padded = np.zeros((len(data), -(-count // 2) * 3), np.uint32)
-    padded[:, : data.shape[1] - before] = data[:, before:]
-    a, b, c = padded[:, 0::3], padded[:, 1::3], padded[:, 2::3]
-    harmonics = np.stack([a << 4 | b >> 4, (b & 15) << 8 | c], axis=2).reshape(len(data), -1)[:, :count]
-    words = np.zeros((len(data), GEOMETRY + count), np.uint32)
-    words[:, layout.columns] = np.concatenate([data[:, :before], harmonics], axis=1) << np.uint32(UNUSED_BITS)
-    return words
+def _written_fields(gaussians: Gaussians, layout: Layout) -> tuple[list[Words32], Words32]:
+    """The bit patterns of scales, of quaternions if in use, and of opacities; then those of harmonics."""
+    *geometry, harmonics = map(_words, _used_fields(gaussians))
+    return [each for each in geometry if layout.quats or each.shape[1] != 4], harmonics
 
 
 def _sh_count(sh_degree: int) -> int:

@@ -18,9 +18,10 @@ are clamped.
 
 from __future__ import annotations
 
+import math
 import struct
-from collections.abc import Iterator, Sequence
-from dataclasses import astuple, dataclass, fields
+from collections.abc import Iterator
+from dataclasses import astuple, dataclass
 from typing import Any
 
 import numpy as np
@@ -29,7 +30,7 @@ import torch
 from keyss.core.arrays import Bytes, Doubles, Flags, Integers, Words32, doubles
 from keyss.core.errors import InputError
 from keyss.core.gaussians import MAX_COORDINATE, MAX_LOG_SCALE, OPPONENT, Gaussians, magnitude
-from keyss.files.formats.common import from_smallest_three, smallest_three, unit
+from keyss.files.formats.common import smallest_three, unit
 from keyss.methods.records.lines import (
     BANDS,
     CHROMA_FEWER,
@@ -51,6 +52,7 @@ MAX_LOGIT = 16.0  # beyond it the float32 sigmoid is exactly 0 or 1
 _MAX_HARMONIC = 1e6  # beyond it a colour is black or white wherever it is rendered at all
 _MIN_LENGTH = 1e-12  # of quaternions: a shorter one turns nothing
 _SAMPLE = 20_000  # Gaussians that tell which numbers are outliers, and that lines are fitted to
+_TABLE_BITS = 14  # of codes whose numbers are looked up, which is faster than `sinh`
 _BLOCK = 1 << 12  # Gaussians at a time: their numbers stay in the cache
 _TABLE_BYTES = 8  # one for each number of bits, 0 for a band of harmonics that is not there
 _QUAT_LINE = Line(0, 0, 0.5**0.5, 0.5**0.5)  # of the three smaller components
@@ -90,21 +92,6 @@ class Codec:
         every = zip(self.lines, _bits(self.table), numbers_of(gaussians), strict=True)
         return columns + [line.encode(values, bits, outlier) for line, bits, values in every]
 
-    def gaussians(self, codes: Sequence[Words32]) -> Gaussians:
-        """The Gaussians of `codes`: finite float32, whatever the codes are."""
-        outlier, left_out, three, *columns = codes
-        every = zip(self.lines, _bits(self.table), columns, strict=True)
-        numbers = [line.decode(own, bits, outlier[:, 0] > 0) for line, bits, own in every]
-        x, y, z, scales, opacities, *colours = numbers
-        bands = []
-        for brightness, differences in zip(colours[::2], colours[1::2], strict=True):
-            pairs = differences.reshape(*brightness.shape, 2)
-            rotated = np.concatenate([brightness[:, :, None], pairs], axis=2).reshape(-1, 3)
-            bands.append((rotated @ OPPONENT).reshape(*brightness.shape, 3))
-        quats = _whole_quats(left_out, _QUAT_LINE.decode(three, self.table.bits[2]))
-        tensors = (np.concatenate([x, y, z], 1), quats, scales, opacities[:, 0], np.concatenate(bands, 1))
-        return Gaussians(*(torch.from_numpy(each.astype(np.float32)) for each in tensors))
-
     def encode(self, gaussians: Gaussians, outlier: Flags | None = None) -> Bytes:
         """[N, record_bytes] the records of N Gaussians: codes one after the other, the highest bit first.
 
@@ -125,20 +112,31 @@ class Codec:
         return np.array([bits for columns, bits in self.table.layout for _ in range(columns)])
 
     def decode(self, records: Bytes) -> Gaussians:
-        """The Gaussians of records [N, record_bytes], whatever bytes they are."""
-        k, bits = (self.table.sh_degree + 1) ** 2, self._code_bits()
-        ends = np.cumsum([columns for columns, _ in self.table.layout])[:-1]
-        whole = Gaussians(*(torch.empty(len(records), *shape) for shape in ((3,), (4,), (3,), (), (k, 3))))
+        """The Gaussians of records [N, record_bytes]: finite float32, whatever bytes they are."""
+        k = (self.table.sh_degree + 1) ** 2
+        fields = [np.empty((len(records), *shape), np.float32) for shape in ((3,), (4,), (3,), (), (k, 3))]
+        bits, tables = self._code_bits(), self._tables()
 
         def decode(start: int, stop: int) -> None:
-            codes = np.empty((stop - start, len(bits)), np.uint32)
-            _unpack(records[start:stop], bits, codes)
-            part = self.gaussians(np.split(codes, ends, axis=1))
-            for field in fields(Gaussians):
-                getattr(whole, field.name)[start:stop] = getattr(part, field.name)
+            _decode(records[start:stop], bits, *tables, OPPONENT, *(each[start:stop] for each in fields))
 
         in_blocks(decode, len(records), _BLOCK)
-        return whole
+        return Gaussians(*map(torch.from_numpy, fields))
+
+    def _tables(self) -> tuple[Doubles, Integers, Doubles]:
+        """The numbers of all codes with few bits, of the bulk and then of outliers; [C] where those of each
+        code start, -1 for more bits; and [C, 4] the line of each."""
+        numbers, starts, lines, size = [np.zeros(0)], [-1, -1], [_QUAT_LINE] * 2, 0
+        for line, (columns, bits) in zip((_QUAT_LINE, *self.lines), self.table.layout[2:], strict=True):
+            few = bits <= _TABLE_BITS
+            starts += [size if few else -1] * columns
+            lines += [line] * columns
+            if few:
+                every_code = np.arange(1 << bits, dtype=np.uint32)[:, None]
+                for far in (False, True):
+                    numbers.append(line.decode(every_code, bits, np.full(len(every_code), far))[:, 0])
+                size += 2 << bits
+        return np.concatenate(numbers), np.array(starts), np.array([astuple(each) for each in lines])
 
     def pack(self) -> bytes:
         """The codec itself: 92 to 164 bytes."""
@@ -181,17 +179,58 @@ def _pack(codes: Any, bits: Any, records: Any) -> None:
 
 
 @kernel
-def _unpack(records: Any, bits: Any, codes: Any) -> None:
-    """The inverse of `_pack`."""
-    for i in range(len(codes)):
+def _decode(
+    records: Any,
+    bits: Any,
+    numbers: Any,
+    starts: Any,
+    lines: Any,
+    opponent: Any,
+    means: Any,
+    quats: Any,
+    log_scales: Any,
+    opacity_logits: Any,
+    sh: Any,
+) -> None:
+    """The inverse of `_pack` into the fields of Gaussians; `numbers`, `starts`, `lines`: of `_tables`."""
+    values = np.empty(len(bits))
+    for i in range(len(records)):
         held, count, at = np.uint64(0), 0, 0
+        outlier, left_out = np.int64(0), np.int64(0)
         for j in range(len(bits)):
             while count < bits[j]:
                 held = held << np.uint64(8) | np.uint64(records[i, at])
                 count += 8
                 at += 1
             count -= bits[j]
-            codes[i, j] = held >> np.uint64(count) & (np.uint64(1) << np.uint64(bits[j])) - np.uint64(1)
+            code = np.int64(held >> np.uint64(count) & (np.uint64(1) << np.uint64(bits[j])) - np.uint64(1))
+            if j == 0:
+                outlier = code
+            elif j == 1:
+                left_out = code
+            elif starts[j] >= 0:
+                values[j] = numbers[starts[j] + (outlier << bits[j]) + code]
+            else:
+                centre, spread, reach, far_reach = lines[j]
+                step = 2 / ((1 << bits[j]) - 1)
+                position = (code * step - 1) * (far_reach if outlier else reach)
+                values[j] = (math.sinh(position) * spread if spread > 0 else position) + centre
+        squares = 0.0
+        for j in range(3):
+            squares += values[2 + j] ** 2
+            means[i, j], log_scales[i, j] = values[5 + j], values[8 + j]
+        opacity_logits[i] = values[11]
+        length = max(1.0, math.sqrt(squares))  # codes that no quaternion has
+        for j in range(3):
+            quats[i, j + (j >= left_out)] = values[2 + j] / length
+        quats[i, left_out] = math.sqrt(max(0.0, 1 - squares))
+        j, first, band = 12, 0, 1
+        while first < sh.shape[1]:
+            for k in range(band):
+                brightness, a, b = values[j + k], values[j + band + 2 * k], values[j + band + 2 * k + 1]
+                for c in range(3):
+                    sh[i, first + k, c] = brightness * opponent[0, c] + a * opponent[1, c] + b * opponent[2, c]
+            j, first, band = j + 3 * band, first + band, band + 2
 
 
 def outliers(gaussians: Gaussians) -> Flags:
@@ -257,9 +296,3 @@ def numbers_of(gaussians: Gaussians) -> Iterator[Doubles]:
         yield rotated[:, :, 1:].reshape(len(rotated), -1)
         first += count
 
-
-def _whole_quats(largest: Words32, three: Doubles) -> Doubles:
-    """[N, 4] unit quaternions, also for codes that no quaternion has."""
-    quats = from_smallest_three(largest[:, 0].astype(np.uint8), three)
-    quats /= np.linalg.norm(quats, axis=1, keepdims=True).clip(0.5)
-    return quats
