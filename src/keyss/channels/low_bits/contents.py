@@ -233,9 +233,9 @@ class LowBitsReader(SaltedReader):
         room = LowBitsRoom(0, self._width)
         if room.part_bytes == 0:
             raise WrongKeyError()
-        votes = Counter(row.tobytes() for row in self._decrypt(key_cipher(key))).most_common(1)
+        votes = Counter(row.tobytes() for row in self._decrypt(key_cipher(key))[0]).most_common(1)
         data_key = votes[0][0] if votes else key.expand("low-bits/none", DATA_KEY_BYTES)
-        parts = self._decrypt(parameter_cipher(data_key, self._width))
+        parts, _ = self._decrypt(parameter_cipher(data_key, self._width))
         if not len(parts):  # by chance the tag of a key cell fits once in 2^32
             self._decrypt(CellCipher(data_key, "record", room.record_bytes(1)))
             raise WrongKeyError()
@@ -245,7 +245,7 @@ class LowBitsReader(SaltedReader):
         room = LowBitsRoom(0, self._width).record_bytes(found.cells)
         if not 0 < found.record_bytes <= room:
             raise InputError("the hidden parameters are damaged: records larger than their cells")
-        records = self._decrypt(CellCipher(data_key, "record", found.record_bytes), found.cells)
+        records, full = self._decrypt(CellCipher(data_key, "record", found.record_bytes), found.cells)
         if found.service == parameters.PAYLOAD:
             size, codewords = parameters.unpack_codewords(found.header, found.record_bytes)
             numbers, chunks = split_numbers(records)
@@ -253,7 +253,7 @@ class LowBitsReader(SaltedReader):
             left = len(np.unique(numbers[numbers < codewords.chunks]))
             data = decrypt(payload_key(data_key), encrypted, ASSOCIATED)
             return Payload(found.method, data, (left, codewords.chunks))
-        copies = self._decrypt(CellCipher(data_key, "copy", found.record_bytes), found.cells)
+        copies, _ = self._decrypt(CellCipher(data_key, "copy", found.record_bytes), found.cells, full)
         records = np.concatenate([records, copies[~_are_among(copies, records)]])
         if not len(records):
             raise InputError("the key is right, but nothing is left of what it opens")
@@ -273,15 +273,20 @@ class LowBitsReader(SaltedReader):
     def _width(self) -> int:
         return int(self.low.shape[1])
 
-    def _decrypt(self, cipher: CellCipher, cells: int = 1) -> Bytes:
-        """[M, size] the data that fit in any of the `cells` of each carrier, in the order of carriers."""
-        size = self._width // cells
-        found = [
-            cipher.decrypt(self.identities, self.low[:, slot * size : (slot + 1) * size], slot)
-            for slot in range(cells)
-        ]
-        order = np.concatenate([np.flatnonzero(fits) for fits, _ in found]).argsort(kind="stable")
-        return np.concatenate([data for _, data in found])[order]
+    def _decrypt(self, cipher: CellCipher, cells: int = 1, full: Flags | None = None) -> tuple[Bytes, Flags]:
+        """[M, size] the data that fit in any of the `cells` of each carrier, in the order of carriers.
+
+        Then [cells, N] which cells these are. `full`: of such a call, cells that need not be tried again.
+        """
+        size, found = self._width // cells, []
+        fitting = np.zeros((cells, len(self.low)), bool)
+        for slot, fits in enumerate(fitting):
+            rows: slice | Integers = slice(None) if full is None else np.flatnonzero(~full[slot])
+            own = self.low[rows, slot * size : (slot + 1) * size]
+            fits[rows], data = cipher.decrypt(self.identities[rows], own, slot)
+            found.append(data)
+        order = np.concatenate([*map(np.flatnonzero, fitting)]).argsort(kind="stable")
+        return np.concatenate(found)[order], fitting
 
 
 def _first_of_each(names: Bytes, low: Bytes) -> Integers:
@@ -296,6 +301,5 @@ def _first_of_each(names: Bytes, low: Bytes) -> Integers:
 
 def _are_among(rows: Bytes, others: Bytes) -> Flags:
     """[R] which of the rows [R, C] are there among the others [O, C], by their hashes."""
-    padded = (np.pad(each, ((0, 0), (0, -each.shape[1] % 8))) for each in (rows, others))
-    wanted, known = (row_hashes(each.view(np.uint64)) for each in padded)
+    wanted, known = map(row_hashes, (rows, others))
     return among(wanted, np.sort(known))

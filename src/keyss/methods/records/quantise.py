@@ -227,9 +227,9 @@ def _decode(
         j, first, band = 12, 0, 1
         while first < sh.shape[1]:
             for k in range(band):
-                brightness, a, b = values[j + k], values[j + band + 2 * k], values[j + band + 2 * k + 1]
+                bright, a, b = values[j + k], values[j + band + 2 * k], values[j + band + 2 * k + 1]
                 for c in range(3):
-                    sh[i, first + k, c] = brightness * opponent[0, c] + a * opponent[1, c] + b * opponent[2, c]
+                    sh[i, first + k, c] = bright * opponent[0, c] + a * opponent[1, c] + b * opponent[2, c]
             j, first, band = j + 3 * band, first + band, band + 2
 
 
@@ -295,4 +295,3 @@ def numbers_of(gaussians: Gaussians) -> Iterator[Doubles]:
         yield rotated[:, :, 0]
         yield rotated[:, :, 1:].reshape(len(rotated), -1)
         first += count
-
