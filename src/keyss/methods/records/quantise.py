@@ -20,7 +20,6 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Iterator
 from dataclasses import astuple, dataclass
 from typing import Any
 
@@ -241,11 +240,11 @@ def outliers(gaussians: Gaussians) -> Flags:
 def _bulk(gaussians: Gaussians) -> tuple[Flags, list[tuple[Doubles, Doubles, Doubles]]]:
     """The `outliers` [N]; for each line a sample of the bulk's numbers, and extents of bulk and outliers."""
     found, every = np.zeros(len(gaussians), bool), max(1, len(gaussians) // _SAMPLE)
-    sample = list(numbers_of(gaussians[::every]))
+    sample = numbers_of(gaussians[::every])
     ends = list(map(neighbourhood, sample, _kinds(gaussians.sh_degree)))
 
     def judge(start: int, stop: int) -> list[list[tuple[float, float]]]:
-        numbers, own = list(numbers_of(gaussians[start:stop])), found[start:stop]
+        numbers, own = numbers_of(gaussians[start:stop]), found[start:stop]
         for values, (least, largest) in zip(numbers, ends, strict=True):
             own |= ((values < least) | (values > largest)).any(axis=1)
         parts = ((values[~own], values[own]) for values in numbers)
@@ -277,21 +276,39 @@ def _bits(table: Table) -> list[int]:
     return [means, means, means, log_scales, opacity, *harmonics]
 
 
-def numbers_of(gaussians: Gaussians) -> Iterator[Doubles]:
+def numbers_of(gaussians: Gaussians) -> list[Doubles]:
     """[N, count] the numbers of each line.
 
     A Gaussian whose numbers overflow is never rendered: it becomes transparent, because its clamped numbers
     would be rendered.
     """
-    positions = doubles(gaussians.means.clamp(-MAX_COORDINATE, MAX_COORDINATE))
-    yield from np.split(positions, 3, axis=1)
-    yield doubles(gaussians.log_scales.clamp(-MAX_LOG_SCALE, MAX_LOG_SCALE))
-    logits = gaussians.opacity_logits.masked_fill(gaussians.overflow, -MAX_LOGIT)
-    yield doubles(logits.clamp(-MAX_LOGIT, MAX_LOGIT))[:, None]
-    first = 0
-    for count in BANDS[: gaussians.sh_degree + 1]:
-        harmonics = gaussians.sh[:, first : first + count].clamp(-_MAX_HARMONIC, _MAX_HARMONIC)
-        rotated = (doubles(harmonics).reshape(-1, 3) @ OPPONENT.T).reshape(-1, count, 3)
-        yield rotated[:, :, 0]
-        yield rotated[:, :, 1:].reshape(len(rotated), -1)
-        first += count
+    own = gaussians.detach().to("cpu")
+    fields = (own.means, own.log_scales, own.opacity_logits, own.sh, own.overflow)
+    found = np.empty((len(own), 7 + 3 * own.sh.shape[1]))
+    _find_numbers(*(np.ascontiguousarray(each.numpy()) for each in fields), OPPONENT, found)
+    counts = [1, 1, 1, 3, 1, *(each * count for count in BANDS[: own.sh_degree + 1] for each in (1, 2))]
+    return np.split(found, np.cumsum(counts)[:-1], axis=1)
+
+
+@kernel
+def _find_numbers(
+    means: Any, log_scales: Any, opacity_logits: Any, sh: Any, overflow: Any, opponent: Any, found: Any
+) -> None:
+    """`found` [N, 7 + 3 K]: the numbers of all lines, clamped."""
+    for i in range(len(found)):
+        for j in range(3):
+            found[i, j] = min(max(means[i, j], -MAX_COORDINATE), MAX_COORDINATE)
+            found[i, 3 + j] = min(max(log_scales[i, j], -MAX_LOG_SCALE), MAX_LOG_SCALE)
+        found[i, 6] = -MAX_LOGIT if overflow[i] else min(max(opacity_logits[i], -MAX_LOGIT), MAX_LOGIT)
+        j, first, band = 7, 0, 1
+        while first < sh.shape[1]:
+            for k in range(band):
+                bright, a, b = 0.0, 0.0, 0.0
+                for c in range(3):
+                    value = min(max(sh[i, first + k, c], -_MAX_HARMONIC), _MAX_HARMONIC)
+                    bright += value * opponent[0, c]
+                    a += value * opponent[1, c]
+                    b += value * opponent[2, c]
+                found[i, j + k] = bright
+                found[i, j + band + 2 * k], found[i, j + band + 2 * k + 1] = a, b
+            j, first, band = j + 3 * band, first + band, band + 2
