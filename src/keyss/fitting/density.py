@@ -21,7 +21,7 @@ T = TypeVar("T")
 Rendered = tuple[dict[str, Any], Tensor | None, float]
 
 # Of a boost: larger rates make larger gradients, and models that stay below the cap would grow too much.
-_BOOSTED_GRADIENT = 0.3
+_BOOSTED_GRADIENT = 0.45
 
 # Sums of DefaultStrategy over steps: norms of screen-space gradients [N], and numbers of renders [N].
 _STATISTICS = ("grad2d", "count")
