@@ -18,7 +18,7 @@ import pytest
 from cli.said import PROGRAM, write_world
 
 SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
-SIZE = "--preset quick --iterations 150 --max-gaussians 120 --device cpu --seed 0"
+SIZE = "--preset quick --iterations 150 --max-gaussians 240 --device cpu --seed 0"
 UNFINISHED = ("unfinished", "lock", "checkpoint")  # in names of what may not be left
 
 
