@@ -105,6 +105,8 @@ def main() -> None:
         few = [*_arguments(options), "--count", "2000"]
         for step in ("make", "copy", "hide", "reveal"):  # everything is compiled then
             _run([sys.executable, __file__, "--step", step, str(small), *few])
+        if options.commands:
+            _run([sys.executable, "-c", LEAST, str(small)])
         _run([sys.executable, __file__, "--step", "make", name, *_arguments(options)])
         steps = [step for step in STEPS if step != "least" or options.commands]
         found = {step: _fastest(step, folder, options) for step in steps}

@@ -123,8 +123,9 @@ class Codec:
         return Gaussians(*map(torch.from_numpy, fields))
 
     def _tables(self) -> tuple[Doubles, Integers, Doubles]:
-        """The numbers of all codes with few bits, of the bulk and then of outliers; [C] where those of each
-        code start, -1 for more bits; and [C, 4] the line of each."""
+        """What `_decode` takes: the numbers of all codes with few bits, of the bulk and then of outliers; [C]
+        where those of each code start, -1 for more bits; and [C, 4] the line of each.
+        """
         numbers, starts, lines, size = [np.zeros(0)], [-1, -1], [_QUAT_LINE] * 2, 0
         for line, (columns, bits) in zip((_QUAT_LINE, *self.lines), self.table.layout[2:], strict=True):
             few = bits <= _TABLE_BITS
@@ -191,7 +192,11 @@ def _decode(
     opacity_logits: Any,
     sh: Any,
 ) -> None:
-    """The inverse of `_pack` into the fields of Gaussians; `numbers`, `starts`, `lines`: of `_tables`."""
+    """The inverse of `_pack` into the fields of Gaussians; `numbers`, `starts`, `lines`: of `_tables`.
+
+    A record has the codes of `Codec.codes`: outlier, left out, three of the quaternion, three of the
+    position, three scales, opacity; then of each band the brightness and two differences of each harmonic.
+    """
     values = np.empty(len(bits))
     for i in range(len(records)):
         held, count, at = np.uint64(0), 0, 0
