@@ -1,3 +1,4 @@
+from .clip import ClipKeys as ClipKeys
 from .derivation import DerivedKey as DerivedKey, random_embeddings as random_embeddings
 from .key_file import (
     ALPHABET as ALPHABET,

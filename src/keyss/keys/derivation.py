@@ -101,6 +101,6 @@ def unit_vector(normal: Tensor) -> Tensor:
     return (normal / length).float()
 
 
-def random_embeddings(count: int, generator: torch.Generator) -> Tensor:
-    """[count, 64] embeddings of random keys: independent uniform unit vectors."""
-    return unit_vector(torch.randn(count, EMBEDDING_SIZE, generator=generator, dtype=torch.float64))
+def random_embeddings(count: int, generator: torch.Generator, size: int = EMBEDDING_SIZE) -> Tensor:
+    """[count, size] embeddings of random keys: independent uniform unit vectors."""
+    return unit_vector(torch.randn(count, size, generator=generator, dtype=torch.float64))

@@ -6,6 +6,7 @@ from .base import (
     Source as Source,
     Stego as Stego,
     Training as Training,
+    divided as divided,
 )
 from .carry.method import most_contributing as most_contributing
 from .carry.room import (
@@ -14,19 +15,23 @@ from .carry.room import (
     SecretSize as SecretSize,
     of_degree as of_degree,
 )
-from .combined import CombinedPoses as CombinedPoses, PlacedScene as PlacedScene, divided as divided
 from .dither import dither_model as dither_model
-from .joint import JointTraining as JointTraining
+from .keyss.combined import CombinedPoses as CombinedPoses, PlacedScene as PlacedScene
 from .keyss.decoder import (
     ATTRIBUTES as ATTRIBUTES,
     Decoder as Decoder,
     DecoderShape as DecoderShape,
     parse_mask as parse_mask,
 )
-from .keyss.method import ClipKeys as ClipKeys
-from .keyss.options import DesignName as DesignName, KeyssOptions as KeyssOptions
-from .keyss.rows import RowSecret as RowSecret
-from .keyss.secret import HiddenSecret as HiddenSecret, choose_anchors as choose_anchors
+from .keyss.latent import LatentDecoder as LatentDecoder
+from .keyss.options import (
+    DESIGNS as DESIGNS,
+    Design as Design,
+    DesignName as DesignName,
+    KeyssOptions as KeyssOptions,
+)
+from .keyss.secret import DECODERS as DECODERS, KeyssSecret as KeyssSecret, choose_anchors as choose_anchors
+from .keyss.training import KeyssTraining as KeyssTraining
 from .opened import (
     Decoy as Decoy,
     Frame as Frame,

@@ -166,6 +166,31 @@ class MethodOptions:
         """The same with changed fields of `fit`."""
         return replace(self, fit=replace(self.fit, **changes))
 
+    def joint_plan(self, secrets: int, *, gaussian_weights: float = 0.0, pixel_weights: float = 0.0) -> Plan:
+        """The plan of methods that train all scenes together, with as many Gaussians as a plain model has.
+
+        `*_weights`: see `Plan`.
+        """
+        fit = self.fit
+        return Plan(
+            gaussians=fit.max_gaussians,
+            sh_degree=fit.sh_degree,
+            secret_gaussians=secrets * fit.max_gaussians,
+            capacity=fit.max_gaussians,
+            steps=fit.iterations,
+            rendered=(fit.max_gaussians,) * (1 + secrets),
+            gaussian_weights=gaussian_weights,
+            pixel_weights=pixel_weights,
+        )
+
+    def check_published_exactly(self) -> None:
+        """Raise UsageError where a jointly trained model would be published in a lossy form."""
+        if self.publish != "ply":
+            raise UsageError(
+                f'`publish="{self.publish}"`: this method needs the published model bit for bit: leave it '
+                'out, or use `method="carry"`'
+            )
+
 
 @dataclass(frozen=True)
 class Stage:
@@ -230,6 +255,16 @@ class Method(Protocol):
 
         Raises KeyssError and its children, Interrupted.
         """
+
+
+def divided(available: Sequence[int], total: int) -> list[int]:
+    """`total` items in equal shares, each at most what is `available`; the others share the rest."""
+    shares = [0] * len(available)
+    left = total
+    for done, index in enumerate(sorted(range(len(available)), key=lambda i: available[i])):
+        shares[index] = min(available[index], left // (len(available) - done))
+        left -= shares[index]
+    return shares
 
 
 def role_of(index: int, scenes: int) -> str:

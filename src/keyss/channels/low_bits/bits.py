@@ -46,6 +46,7 @@ class Layout:
 
     sh_degree: int
     quats: bool = True
+    written_degree: int | None = None  # of the harmonics whose low bits are read and written; None: all
 
     @staticmethod
     def of(gaussians: Gaussians) -> Layout:
@@ -58,7 +59,12 @@ class Layout:
     @property
     def width(self) -> int:
         """Whole bytes that the low bits of one Gaussian hold."""
-        return GEOMETRY - 4 * (not self.quats) + _sh_count(self.sh_degree) * 3 // 2
+        return GEOMETRY - 4 * (not self.quats) + self.harmonics * 3 // 2
+
+    @property
+    def harmonics(self) -> int:
+        """Fields of spherical harmonics that are read and written."""
+        return _sh_count(self.sh_degree if self.written_degree is None else self.written_degree)
 
     @property
     def columns(self) -> Integers:
@@ -164,7 +170,8 @@ def _used_fields(gaussians: Gaussians) -> tuple[torch.Tensor, ...]:
 def _written_fields(gaussians: Gaussians, layout: Layout) -> tuple[list[Words32], Words32]:
     """The bit patterns of scales, of quaternions if in use, and of opacities; then those of harmonics."""
     *geometry, harmonics = map(_words, _used_fields(gaussians))
-    return [each for each in geometry if layout.quats or each.shape[1] != 4], harmonics
+    kept = [each for each in geometry if layout.quats or each.shape[1] != 4]
+    return kept, harmonics[:, : layout.harmonics]
 
 
 def _sh_count(sh_degree: int) -> int:

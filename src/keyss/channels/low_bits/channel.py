@@ -24,7 +24,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from weakref import WeakKeyDictionary
 
@@ -63,8 +63,11 @@ class LowBits(Channel):
             WeakKeyDictionary()
         )
 
-    def prepare(self, cover: Gaussians) -> LowBitsCover:
-        """See `Channel`. Raises UsageError for low bits that are not random, and for stale salts."""
+    def prepare(self, cover: Gaussians, *, sh_degree: int | None = None) -> LowBitsCover:
+        """See `Channel`. Raises UsageError for low bits that are not random, and for stale salts.
+
+        `sh_degree`: 1 if harmonics of higher degrees must stay as they are, to the bit.
+        """
         layout, versions = Layout.of(cover), _versions(cover)
         if (found := self._found.get(cover)) is None or found[0] != versions:
             usable, names = named_carriers(cover, layout)
@@ -77,6 +80,8 @@ class LowBits(Channel):
                     "could try keys in advance"
                 )
             found = self._found[cover] = versions, usable, names, rows
+        if sh_degree is not None:
+            layout = replace(layout, written_degree=min(sh_degree, layout.sh_degree))
         return LowBitsCover(cover, layout, *found[1:])
 
     def room(self, gaussians: int, sh_degree: int) -> Room:
@@ -171,8 +176,9 @@ class LowBitsCover:
         """New low bits [F, B] of the Gaussians of fresh salts, and all salts with them."""
         noise = stream(entropy, "low-bits/salts", len(self.fresh_salts) * self.layout.width)
         fresh = np.frombuffer(noise, np.uint8).reshape(len(self.fresh_salts), self.layout.width)
-        low = read_low_bits(self.cover[torch.from_numpy(self.salt_rows)], self.layout)
-        low[self.fresh_salts] = fresh
+        whole = replace(self.layout, written_degree=None)
+        low = read_low_bits(self.cover[torch.from_numpy(self.salt_rows)], whole)
+        low[self.fresh_salts, : self.layout.width] = fresh
         return fresh, [salt(*each) for each in zip(self.names[self.salt_rows], low, strict=True)]
 
 

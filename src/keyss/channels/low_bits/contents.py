@@ -10,7 +10,7 @@ import warnings
 from collections import Counter
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -200,6 +200,7 @@ class LowBitsReader(SaltedReader):
     identities: Bytes  # [N, 16]
     low: Bytes  # [N, B] low bits
     salts: Sequence[bytes]
+    narrow: int  # bytes of `low` before the harmonics above degree 1, which some secrets leave as they are
 
     @staticmethod
     def of(stego: Gaussians) -> LowBitsReader:
@@ -209,14 +210,15 @@ class LowBitsReader(SaltedReader):
         if len(rows) < len(names):
             stego, names, low = stego[torch.from_numpy(rows)], names[rows], low[rows]
         salts = [salt(names[row], low[row]) for row in salt_rows(stego, names, low, layout)]
-        return LowBitsReader(names, low, salts)
+        narrow = replace(layout, written_degree=min(1, layout.sh_degree)).width
+        return LowBitsReader(names, low, salts, narrow)
 
     def open(self, key: str) -> Content:
         """See `Reader`. Warns (KeyssWarning) if the key opens two secrets, as where two files were merged."""
         for derived in self.keys(key):
             with suppress(WrongKeyError):
-                data_key, found = self._parameters(derived)
-                content = self._content(data_key, found)
+                data_key, found, width = self._parameters(derived)
+                content = self._content(data_key, found, width)
                 self._warn_of_another(key, data_key, found.salts)
                 return content
         raise WrongKeyError()
@@ -228,24 +230,28 @@ class LowBitsReader(SaltedReader):
         """
         return self._content(*self._parameters(key))
 
-    def _parameters(self, key: DerivedKey) -> tuple[bytes, Parameters]:
-        """The data key and the parameters."""
-        room = LowBitsRoom(0, self._width)
-        if room.part_bytes == 0:
+    def _parameters(self, key: DerivedKey) -> tuple[bytes, Parameters, int]:
+        """The data key, the parameters, and the bytes of a carrier."""
+        whole = self.low.shape[1]
+        if LowBitsRoom(0, whole).part_bytes == 0:
             raise WrongKeyError()
-        votes = Counter(row.tobytes() for row in self._decrypt(key_cipher(key))[0]).most_common(1)
+        votes = Counter(row.tobytes() for row in self._decrypt(key_cipher(key), whole)[0]).most_common(1)
         data_key = votes[0][0] if votes else key.expand("low-bits/none", DATA_KEY_BYTES)
-        parts, _ = self._decrypt(parameter_cipher(data_key, self._width))
-        if not len(parts):  # by chance the tag of a key cell fits once in 2^32
-            self._decrypt(CellCipher(data_key, "record", room.record_bytes(1)))
-            raise WrongKeyError()
-        return data_key, parameters.unpack(parts)
+        for width in dict.fromkeys((whole, self.narrow)):
+            if LowBitsRoom(0, width).part_bytes:
+                parts, _ = self._decrypt(parameter_cipher(data_key, width), width)
+                if len(parts):
+                    return data_key, parameters.unpack(parts), width
+        # By chance the tag of a key cell fits once in 2^32.
+        self._decrypt(CellCipher(data_key, "record", LowBitsRoom(0, whole).record_bytes(1)), whole)
+        raise WrongKeyError()
 
-    def _content(self, data_key: bytes, found: Parameters) -> Content:
-        room = LowBitsRoom(0, self._width).record_bytes(found.cells)
+    def _content(self, data_key: bytes, found: Parameters, width: int) -> Content:
+        room = LowBitsRoom(0, width).record_bytes(found.cells)
         if not 0 < found.record_bytes <= room:
             raise InputError("the hidden parameters are damaged: records larger than their cells")
-        records, full = self._decrypt(CellCipher(data_key, "record", found.record_bytes), found.cells)
+        cipher = CellCipher(data_key, "record", found.record_bytes)
+        records, full = self._decrypt(cipher, width, found.cells)
         if found.service == parameters.PAYLOAD:
             size, codewords = parameters.unpack_codewords(found.header, found.record_bytes)
             numbers, chunks = split_numbers(records)
@@ -253,7 +259,8 @@ class LowBitsReader(SaltedReader):
             left = len(np.unique(numbers[numbers < codewords.chunks]))
             data = decrypt(payload_key(data_key), encrypted, ASSOCIATED)
             return Payload(found.method, data, (left, codewords.chunks))
-        copies, _ = self._decrypt(CellCipher(data_key, "copy", found.record_bytes), found.cells, full)
+        cipher = CellCipher(data_key, "copy", found.record_bytes)
+        copies, _ = self._decrypt(cipher, width, found.cells, full)
         records = np.concatenate([records, copies[~_are_among(copies, records)]])
         if not len(records):
             raise InputError("the key is right, but nothing is left of what it opens")
@@ -269,16 +276,15 @@ class LowBitsReader(SaltedReader):
                     warnings.warn(_TWO_SECRETS, KeyssWarning, stacklevel=3)
                     return
 
-    @property
-    def _width(self) -> int:
-        return int(self.low.shape[1])
-
-    def _decrypt(self, cipher: CellCipher, cells: int = 1, full: Flags | None = None) -> tuple[Bytes, Flags]:
+    def _decrypt(
+        self, cipher: CellCipher, width: int, cells: int = 1, full: Flags | None = None
+    ) -> tuple[Bytes, Flags]:
         """[M, size] the data that fit in any of the `cells` of each carrier, in the order of carriers.
 
-        Then [cells, N] which cells these are. `full`: of such a call, cells that need not be tried again.
+        Then [cells, N] which cells these are. `width`: bytes of a carrier. `full`: of such a call, cells that
+        need not be tried again.
         """
-        size, found = self._width // cells, []
+        size, found = width // cells, []
         fitting = np.zeros((cells, len(self.low)), bool)
         for slot, fits in enumerate(fitting):
             rows: slice | Integers = slice(None) if full is None else np.flatnonzero(~full[slot])

@@ -24,8 +24,7 @@ from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.fitting.config import FitConfig
 from keyss.keys.derivation import expand
-from keyss.methods.base import CommandLineOption, MethodOptions, Training
-from keyss.methods.combined import divided
+from keyss.methods.base import CommandLineOption, MethodOptions, Training, divided
 from keyss.methods.dither import dither_model, loosened, raised
 from keyss.methods.records.embedding import largest_degree, record_request, shares
 from keyss.methods.records.precision import most_visible, pruned

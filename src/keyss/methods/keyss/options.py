@@ -1,51 +1,107 @@
-"""The options of KeySS, with the paper's names where it has them."""
+"""The configuration of KeySS, with the paper's symbols and values, and its named designs."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
-from typing import Annotated, Any, ClassVar, Literal
+from dataclasses import dataclass, replace
+from typing import Annotated, ClassVar, Literal, get_args
 
-from keyss.core.errors import UsageError
-from keyss.methods.base import CommandLineOption
-from keyss.methods.joint import JointOptions
-from keyss.methods.keyss.decoder import Mask, parse_mask
-from keyss.methods.keyss.designs.base import Design
-from keyss.methods.keyss.designs.carriers import CARRIERS
-from keyss.methods.keyss.designs.network import MLP, PUBLISHED, RELEASED
+from keyss.core.errors import UsageError, did_you_mean
+from keyss.methods.base import CommandLineOption, MethodOptions, Training, check_above_zero
+from keyss.methods.keyss.decoder import ATTRIBUTES, DecoderShape, Mask, parse_mask
 
-DesignName = Literal["carriers", "mlp", "published", "released"]
-
-_DESIGNS: dict[DesignName, Design] = {
-    "carriers": CARRIERS,
-    "mlp": MLP,
-    "published": PUBLISHED,
-    "released": RELEASED,
-}
-_OTHERS = ("clip_model",)  # options that are None by default and no setting of a design
+Scenes = Literal["both", "cover", "secret"]  # "both": all scenes, also with several secrets
 
 
 @dataclass(frozen=True, kw_only=True)
-class KeyssOptions(JointOptions):
-    """The joint training of the published model and its decoders (KeySS, section 3.4).
+class Design:
+    """Every choice of a joint training; the defaults are the paper's (sections 3.4 and 4.1, appendix B)."""
 
-    `fit` has its length, its size and the rates of Gaussians. The fields that `Design` has too are None for
-    the design's own value.
-    """
+    name: str
+    decoder: DecoderShape  # D of equations 3 and 6, with theta of equation 8
+    # lambda_cover = lambda_secret = lambda_incorrect of equations 4, 5 and 7, also for plain models; None:
+    # that of the fit.
+    ssim_weight: float | None = 0.5
+    beta_cover: float = 0.5  # equation 11
+    beta_secret: float = 0.5  # of each secret
+    beta_incorrect: float = 0.01  # 0: no wrong keys in training
+    points: Scenes = "both"  # scenes whose sparse points start the model (combined SfM points)
+    poses: Scenes = "both"  # scenes whose training poses are used (combined camera poses)
+    densification: Scenes = "both"  # scenes whose gradients ask for growth (combined densification)
+    # Share of the steps that render all scenes from one pose; in the others each scene has its own photo.
+    common_poses: float = 1.0
+    decoder_rate: float = 5e-5  # of AdamW, decays to 5 % of it; the paper gives none: their program's
+    weight_decay: float = 1e-4  # their program's
+    # Ours: share of the steps after density control that render without the faintest quarter of each scene.
+    pruned_steps: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Raise UsageError for values out of range."""
+        check_above_zero(self, "beta_cover", "beta_secret", "decoder_rate")
+        for name in ("common_poses", "pruned_steps", "beta_incorrect"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise UsageError(f"`{name}`: expected 0 to 1, got {getattr(self, name)}")
+        if self.poses != "both" and self.common_poses < 1:
+            raise UsageError(
+                "`poses` of some scenes only needs `common_poses=1`: all scenes are rendered from them"
+            )
+
+
+DesignName = Literal["latent", "published", "released"]
+
+_PUBLISHED = Design(name="published", decoder=DecoderShape(mask=("op", "ro", "sc", "xyz")))
+DESIGNS: dict[str, Design] = {
+    # Ours: a linear decoder, and latent numbers in the cover's harmonics; see `latent`.
+    "latent": Design(
+        name="latent",
+        decoder=DecoderShape(kind="latent", mask=ATTRIBUTES),
+        ssim_weight=None,
+        beta_incorrect=0.0,  # wrong keys open no row
+        common_poses=0.0,
+        decoder_rate=1e-3,
+        weight_decay=0.0,
+        pruned_steps=0.3,
+    ),
+    # The paper's text.
+    "published": _PUBLISHED,
+    # The authors' program, where it differs from the text or the text says nothing; docs/keyss.md lists it.
+    "released": replace(
+        _PUBLISHED,
+        name="released",
+        ssim_weight=0.2,
+        decoder=replace(_PUBLISHED.decoder, released=True, branch=128),
+    ),
+}
+
+
+def parse_design(text: str) -> DesignName:
+    """The name of a design. Raises UsageError."""
+    for name in get_args(DesignName):
+        if text == name:
+            return name  # type: ignore[no-any-return]
+    raise UsageError(f"design {text!r}: expected one of {', '.join(DESIGNS)}; {did_you_mean(text, DESIGNS)}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class KeyssOptions(MethodOptions):
+    """A design, and how keys become vectors; `fit` has the training's length, size and rates of Gaussians."""
 
     method: ClassVar[str] = "keyss"
 
     design: Annotated[
-        DesignName,
+        Design | DesignName,
         CommandLineOption(
-            "carriers: rows that are a Gaussian of each scene; mlp: the paper's architecture with inputs, "
-            "rates and poses that work; published: the paper's text; released: the authors' program."
+            "latent: a linear decoder, encrypted latents, near plain 3DGS; published: the paper's text; "
+            "released: the authors' program.",
+            metavar="{latent,published,released}",
+            default="latent",
+            parse=parse_design,
         ),
-    ] = "carriers"
-    mask: Annotated[  # theta
+    ] = "latent"
+    mask: Annotated[
         Mask | None,
         CommandLineOption(
-            "Attributes that the decoder changes, some of these.",
+            "Attributes that the decoder may change (theta), comma-separated.",
             metavar="op,ro,sc,xyz,sh",
             default="the design's",
             parse=parse_mask,
@@ -53,60 +109,42 @@ class KeyssOptions(JointOptions):
     ] = None
     key_encoder: Annotated[
         Literal["argon2", "clip"],
-        CommandLineOption("What conditions the decoder; the encryption always uses Argon2id's key."),
+        CommandLineOption("Turns keys into vectors for the decoder; encryption always uses Argon2id."),
     ] = "argon2"
     clip_model: Annotated[
         str | None,
         CommandLineOption("CLIP for --key-encoder clip.", metavar="FOLDER", default="ViT-L/14 in the cache"),
     ] = None
 
-    weight_decay: float | None = None
-    conditioning: Literal["gate", "bias"] | None = None
-    hidden: tuple[int, int] | None = None
-    branch: int | None = None
-    frequencies: int | None = None
-    inputs: Literal["standardised", "normalised"] | None = None
-    residuals: Literal["signed", "one-sided"] | None = None
-    decoder_rate: float | None = None
-    common_poses: float | None = None
-    incorrect_weight: float | None = None
-    ssim_weight: float | None = None
-    at_cap: Literal["even", "wait", "freeze"] | None = None
-    prune_by: Literal["all", "cover"] | None = None
-    pruned_steps: float | None = None
-
     def __post_init__(self) -> None:
         super().__post_init__()
-        settings = self.settings
+        latent = self.configuration.decoder.kind == "latent"
+        self.check_published_exactly()
         if self.clip_model is not None and self.key_encoder != "clip":
+            raise UsageError('`clip_model` needs `key_encoder="clip"`')
+        if self.key_encoder == "clip" and latent:
             raise UsageError(
-                '`clip_model` is for the key encoder clip: leave it out or set `key_encoder="clip"`'
+                '`key_encoder="clip"`: the design latent encrypts with the key\'s vector, and CLIP is no key '
+                "derivation; use another design"
             )
-        self.check_poses(settings.common_poses)
-        if self.key_encoder == "clip" and not hasattr(settings, "mask"):
-            raise UsageError(
-                f'`key_encoder="clip"`: the embedding encrypts in the design {self.design}, and CLIP is no '
-                "key derivation; use a design with a network"
-            )
-        if (self.points, self.densification) != ("both", "both") and not hasattr(settings, "mask"):
-            raise UsageError(
-                f"`points` and `densification`: in the design {self.design} each scene has its own"
-            )
+        if latent and self.configuration.decoder.mask != ATTRIBUTES:
+            raise UsageError("`mask`: the design latent decodes all attributes; use another design")
 
     @property
-    def settings(self) -> Any:
-        """The `Design` with the settings that these options override. Raises UsageError for unknown ones."""
-        chosen = _DESIGNS[self.design]
-        own = [each.name for each in fields(self) if each.default is None and each.name not in _OTHERS]
-        given = {name: getattr(self, name) for name in own if getattr(self, name) is not None}
-        if foreign := [name for name in given if not hasattr(chosen, name)]:
-            raise UsageError(
-                f"`{foreign[0]}`: the design {self.design} has no such setting: leave it out or set another "
-                "`design`"
-            )
-        return replace(chosen, **given)
+    def configuration(self) -> Design:
+        """The design in full, with the given mask. Raises UsageError for the name of none."""
+        design = self.design
+        if isinstance(design, str):
+            design = DESIGNS[parse_design(design)]
+        if self.mask is None:
+            return design
+        return replace(design, decoder=replace(design.decoder, mask=parse_mask(",".join(self.mask))))
+
+    def training(self, scenes: int) -> tuple[Training, ...]:
+        """Every step renders all scenes."""
+        return (Training(self.fit.iterations, continues=False),) * scenes
 
     @classmethod
     def variants(cls) -> Mapping[str, KeyssOptions]:
-        """KeySS as published."""
+        """The paper's text."""
         return {"published": KeyssOptions(design="published")}

@@ -19,7 +19,8 @@ from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Camera
 from keyss.fitting.parameters import to_gaussians
 from keyss.methods.base import Capabilities
-from keyss.methods.joint import Picture, Scenes
+from keyss.methods.keyss.options import Scenes
+from keyss.methods.keyss.training import Picture
 from keyss.methods.peers.method import HandedTensors, Peer, PeerOptions, PeerTraining, Show
 from keyss.rendering import decode_picture
 
@@ -66,19 +67,19 @@ class DecoderTraining(PeerTraining):
     """The training of plain Gaussians and a network."""
 
     def prepare(self, start: Gaussians) -> None:
-        self.decoder = Convolutions(3)
-        self.networks.append(self.decoder)
+        self.network = Convolutions(3)
+        self.networks.append(self.network)
 
     def draw(self, scenes: Sequence[int], camera: Camera, sh_degree: int) -> list[Picture]:
         """The cover is rendered with its background; the network turns that into the secret's image."""
         cover = self.render(to_gaussians(self.parameters), 0, camera, sh_degree)
-        network = self.decoder.network(self.backgrounds[0])
+        network = self.network.network(self.backgrounds[0])
         return [
             Picture(decode_picture(cover.image, network), cover.meta) if scene else cover for scene in scenes
         ]
 
-    def publish(self) -> tuple[Gaussians, HandedTensors]:
-        network = self.decoder.network(self.backgrounds[0])
+    def result(self) -> tuple[Gaussians, HandedTensors]:
+        network = self.network.network(self.backgrounds[0])
         stego = to_gaussians(self.parameters).detach()[self.visible()].to("cpu")
         return stego, HandedTensors(network_tensors(network), self.frame)
 
@@ -89,7 +90,7 @@ class DecoderOptions(PeerOptions):
 
     method: ClassVar[str] = "3dgs-decoder"
 
-    points: Scenes = "cover"
+    points: ClassVar[Scenes] = "cover"
 
 
 def _open(handed: HandedTensors) -> Show:

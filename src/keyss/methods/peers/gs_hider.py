@@ -18,7 +18,7 @@ from keyss.core.errors import InputError
 from keyss.core.gaussians import SH_C0, Gaussians
 from keyss.core.scene import Camera
 from keyss.methods.base import Capabilities
-from keyss.methods.joint import Picture
+from keyss.methods.keyss.training import Picture
 from keyss.methods.peers.decoder import Convolutions, network_of, network_tensors, weights_of
 from keyss.methods.peers.method import HandedTensors, Peer, PeerOptions, PeerTraining, Show
 from keyss.rendering import decode_picture, render_features
@@ -51,7 +51,7 @@ class GsHiderTraining(PeerTraining):
         sh = torch.zeros(len(self), 1, 3, device=self.device)
         return Gaussians(own["means"], own["quats"], own["scales"], own["opacities"], sh)
 
-    def publish(self) -> tuple[Gaussians, HandedTensors]:
+    def result(self) -> tuple[Gaussians, HandedTensors]:
         visible = self.visible()
         background = torch.zeros(FEATURES, device=self.device)
         cover, secret = (

@@ -6,7 +6,7 @@ import hashlib
 from abc import abstractmethod
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 import torch
 from torch import Tensor
@@ -14,10 +14,24 @@ from torch import Tensor
 from keyss.channels import Content, Payload
 from keyss.core.errors import InputError, UsageError
 from keyss.core.gaussians import Gaussians
+from keyss.core.scene import Camera
 from keyss.core.similarity import Similarity
-from keyss.methods.base import Capabilities, CommandLineOption, Context, Plan, Source, Stego, check_above_zero
-from keyss.methods.combined import PlacedScene
-from keyss.methods.joint import JointOptions, JointTraining, train_jointly
+from keyss.fitting.adam import RowAdam
+from keyss.methods.base import (
+    Capabilities,
+    CommandLineOption,
+    Context,
+    MethodOptions,
+    Plan,
+    Source,
+    Stego,
+    Training,
+    check_above_zero,
+)
+from keyss.methods.keyss.combined import PlacedScene
+from keyss.methods.keyss.decoder import DecoderShape
+from keyss.methods.keyss.options import Design, Scenes
+from keyss.methods.keyss.training import KeyssTraining, Picture
 from keyss.methods.opened import Frame, Remains
 from keyss.methods.tensors import Header, damage_refused, pack_tensors, unpack_tensors
 
@@ -105,11 +119,14 @@ class HandedSecret:
 
 
 @dataclass(frozen=True, kw_only=True)
-class PeerOptions(JointOptions):
+class PeerOptions(MethodOptions):
     """Options of all peers: the joint training is as long and has as many Gaussians as plain models.
 
-    Each peer has its own class, by which its options are recognised.
+    It combines poses, points and densification as KeySS's does. Each peer has its own class, by which its
+    options are recognised.
     """
+
+    points: ClassVar[Scenes] = "both"  # scenes whose sparse points start the model
 
     common_poses: Annotated[
         float,
@@ -123,21 +140,63 @@ class PeerOptions(JointOptions):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_above_zero(self, "network_rate")
-        self.check_poses(self.common_poses)
+        self.check_published_exactly()
+        _ = self.design  # raises for values out of range
+
+    @property
+    def design(self) -> Design:
+        """The configuration of the joint training, which has no decoder of Gaussians and no keys."""
+        return Design(
+            name=self.method,
+            decoder=DecoderShape(),
+            ssim_weight=None,
+            beta_incorrect=0.0,
+            points=self.points,
+            common_poses=self.common_poses,
+            decoder_rate=self.network_rate,
+            weight_decay=0.0,
+        )
+
+    def training(self, scenes: int) -> tuple[Training, ...]:
+        """Every step renders all scenes."""
+        return (Training(self.fit.iterations, continues=False),) * scenes
 
 
-class PeerTraining(JointTraining):
-    """The joint training with the options of peers."""
+class PeerTraining(KeyssTraining):
+    """The joint training of a peer: `prepare` adds what it trains, `draw` renders scenes."""
 
     options: PeerOptions
 
     def __init__(self, scenes: Sequence[PlacedScene], options: PeerOptions, device: torch.device) -> None:
-        poses, rate = options.common_poses, options.network_rate
-        super().__init__(scenes, options, device, common_poses=poses, network_rate=rate)
+        super().__init__(scenes, [], options, options.design, device)
 
     @abstractmethod
-    def publish(self) -> tuple[Gaussians, HandedTensors]:
+    def prepare(self, start: Gaussians) -> None:
+        """Add parameters (`add`) and networks (`networks`); their random numbers are the run's own."""
+
+    @abstractmethod
+    def draw(self, scenes: Sequence[int], camera: Camera, sh_degree: int) -> list[Picture]:
+        """Render some scenes, in that order; they may share a render."""
+
+    @abstractmethod
+    def result(self) -> tuple[Gaussians, HandedTensors]:
         """The published model, on the CPU, and the tensors to hand over, after the training."""
+
+    def add(self, name: str, values: Tensor, optimizer: RowAdam | float) -> None:
+        """Add a parameter [N, ...] of the Gaussians, with its optimiser or a rate for a new one."""
+        self.parameters[name] = parameter = torch.nn.Parameter(values.to(self.device).contiguous())
+        if isinstance(optimizer, RowAdam):
+            optimizer.param_groups[0]["params"] = [parameter]
+            self.optimizers[name] = optimizer
+        else:
+            fused = self.device.type == "cuda"
+            self.optimizers[name] = RowAdam(
+                [{"params": [parameter], "lr": optimizer}], eps=1e-15, fused=fused
+            )
+
+    def opacity_for_pruning(self) -> Tensor:
+        """[N] how visible each Gaussian is in the scene that shows it most."""
+        return self.parameters["opacities"].detach().sigmoid()
 
     @property
     def frame(self) -> Similarity:
@@ -178,8 +237,10 @@ class Peer:
         """Train both scenes together. Raises Interrupted, and InputError for another run's checkpoint."""
         training = self.training
         assert training is not None
-        run = train_jointly(lambda placed: training(placed, options, context.device), cover, secrets, context)
-        return self.stego(*run.publish(), run.iterations)
+        sources = [cover, *secrets]
+        run = training(PlacedScene.all_of(sources), options, context.device)
+        run.train(sources, context)
+        return self.stego(*run.result(), run.iterations)
 
     def stego(self, published: Gaussians, handed: HandedTensors, iterations: int = 0) -> Stego:
         """The result of hiding, opened from the payload that is handed over."""

@@ -14,7 +14,7 @@ from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Camera
 from keyss.fitting.parameters import make_optimizers, to_gaussians
 from keyss.methods.base import Capabilities
-from keyss.methods.joint import Picture
+from keyss.methods.keyss.training import Picture
 from keyss.methods.peers.method import HandedTensors, Peer, PeerOptions, PeerTraining, Show
 
 _NAMES = ("sh", "secret_sh")  # parameters with the colours of the cover and of the secret
@@ -33,7 +33,7 @@ class ShTraining(PeerTraining):
         models = [replace(model, sh=self.parameters[_NAMES[scene]]) for scene in scenes]
         return [self.render(*each, camera, sh_degree) for each in zip(models, scenes, strict=True)]
 
-    def publish(self) -> tuple[Gaussians, HandedTensors]:
+    def result(self) -> tuple[Gaussians, HandedTensors]:
         visible, secret_sh = self.visible(), self.parameters[_NAMES[1]].detach()
         stego = to_gaussians(self.parameters).detach()[visible].to("cpu")
         return stego, HandedTensors({_NAMES[1]: secret_sh[visible]}, self.frame, rows=len(stego))

@@ -38,7 +38,7 @@ from keyss.fitting.parameters import make_optimizers, to_gaussians
 from keyss.fitting.ranks import here
 from keyss.keys.derivation import stream
 from keyss.methods.base import Capabilities
-from keyss.methods.joint import Picture
+from keyss.methods.keyss.training import Picture
 from keyss.methods.peers.method import HandedTensors, Peer, PeerOptions, PeerTraining, Show
 
 COVER_BITS = (8, 10, 12, 14)  # low bits in use, of the 23 of a mantissa, by degree
@@ -214,7 +214,7 @@ class WaterGsTraining(PeerTraining):
         adam.zero_grad()
         here().share(self.mapping.parameters())
 
-    def publish(self) -> tuple[Gaussians, HandedTensors]:
+    def result(self) -> tuple[Gaussians, HandedTensors]:
         """Publishes all Gaussians, because the autoencoder depends on their order."""
         cover = to_gaussians(self.parameters).detach().to("cpu")
         secret_sh = self.parameters["secret_sh"].detach().cpu()

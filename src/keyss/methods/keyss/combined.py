@@ -1,7 +1,7 @@
-"""Combined points and camera poses (KeySS, section 3.4): the start of a joint training, and its targets.
+"""Combined camera poses and combined SfM points (KeySS, section 3.4).
 
-The target of a scene is its photo where there is one for the pose, and elsewhere a render of its plain 3DGS
-model. Everything is in the cover's frame.
+Every training pose of every scene supervises all scenes. The target is a scene's photo where there is one for
+the pose, and elsewhere a render of its plain 3DGS model. Everything is in the cover's frame.
 """
 
 from __future__ import annotations
@@ -14,10 +14,11 @@ from torch import Tensor
 
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Camera, Scene, View
-from keyss.core.similarity import Similarity
+from keyss.core.similarity import Similarity, align
 from keyss.fitting.config import FitConfig
 from keyss.fitting.losses import Target, Targets
 from keyss.fitting.parameters import initial_gaussians, initial_points
+from keyss.methods.base import Source, divided
 from keyss.rendering import render
 
 CACHE_BYTES = 2 << 30
@@ -34,53 +35,38 @@ class PlacedScene:
     @staticmethod
     def of(scene: Scene, plain: Gaussians, frame: Similarity) -> PlacedScene:
         """Move a scene and its plain model, both in the scene's own frame, by `frame`."""
-        moved = replace(
-            scene,
-            train=tuple(_moved(view, frame) for view in scene.train),
-            test=tuple(_moved(view, frame) for view in scene.test),
-            points=frame.apply_points(scene.points),
-        )
-        return PlacedScene(moved, frame.apply_gaussians(plain), frame)
+
+        def moved(views: Sequence[View]) -> tuple[View, ...]:
+            return tuple(View(frame.apply_camera(view.camera), view.image) for view in views)
+
+        points = frame.apply_points(scene.points)
+        placed = replace(scene, train=moved(scene.train), test=moved(scene.test), points=points)
+        return PlacedScene(placed, frame.apply_gaussians(plain), frame)
+
+    @staticmethod
+    def all_of(sources: Sequence[Source]) -> list[PlacedScene]:
+        """The cover, then the secrets, whose cameras are aligned with the cover's (ours; see `align`)."""
+        cameras = [[view.camera for view in source.scene.train] for source in sources]
+        frames = [Similarity(), *(align(each, cameras[0]) for each in cameras[1:])]
+        return [PlacedScene.of(each.scene, each.model, at) for each, at in zip(sources, frames, strict=True)]
 
 
-def _moved(view: View, frame: Similarity) -> View:
-    return View(frame.apply_camera(view.camera), view.image)
-
-
-def combined_points(
-    scenes: Sequence[Scene], fit: FitConfig, generator: torch.Generator, apart: float = 0.0
-) -> Gaussians:
-    """Gaussians at the points of all scenes, in equal shares of the cap as far as there are points.
-
-    Opacities of each scene are `apart` (logits) from those of the scene before it, and fainter.
-    """
+def combined_points(scenes: Sequence[Scene], fit: FitConfig, generator: torch.Generator) -> Gaussians:
+    """Gaussians at the points of all scenes, in equal shares of the cap as far as there are points."""
     clouds = [initial_points(scene, fit.max_gaussians, generator) for scene in scenes]
     counts = divided([len(points) for points, _ in clouds], fit.max_gaussians)
     parts = [
         initial_gaussians(points, colors, fit.sh_degree, share, generator)
         for (points, colors), share in zip(clouds, counts, strict=True)
     ]
-    return Gaussians.cat(
-        [replace(part, opacity_logits=part.opacity_logits - i * apart) for i, part in enumerate(parts)]
-    )
-
-
-def divided(available: Sequence[int], total: int) -> list[int]:
-    """`total` items in equal shares, each at most what is `available`; the others share the rest."""
-    shares = [0] * len(available)
-    left = total
-    for done, index in enumerate(sorted(range(len(available)), key=lambda i: available[i])):
-        shares[index] = min(available[index], left // (len(available) - done))
-        left -= shares[index]
-    return shares
+    return Gaussians.cat(parts)
 
 
 class CombinedPoses:
     """All training poses of all scenes, and every scene's target at each of them."""
 
     def __init__(self, scenes: Sequence[PlacedScene], device: torch.device) -> None:
-        self.scenes = scenes
-        self.device = device
+        self.scenes, self.device = scenes, device
         self.plains = [placed.plain.to(device) for placed in scenes]
         self._rendered: dict[tuple[int, int, int], Tensor] = {}
         self._bytes = 0

@@ -1,0 +1,145 @@
+"""Real numbers in the harmonics of a model, in the directions that matter least to it.
+
+Every Gaussian holds a *rank* in (0, 1) in each of R directions. What is written is the number of that rank
+among those that a plain model has there, given the Gaussian's other harmonics: if ranks are uniform, each
+number has the spread that it would have in a plain model, Gaussian by Gaussian. Harmonics up to KEPT_DEGREE
+stay as they are, so that their low bits are free.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from keyss.channels.low_bits.bits import identities
+from keyss.channels.low_bits.cells import CellCipher
+from keyss.core.arrays import Bytes, Doubles, Flags
+from keyss.core.errors import InputError
+from keyss.core.gaussians import Gaussians
+
+KEPT_DEGREE = 1
+# Probabilities of the quantiles that describe a distribution; close to each other at the ends.
+RANKS = np.concatenate([[0.0], 1 / (1 + np.exp(-np.linspace(-7, 7, 31))), [1.0]])
+_ROUNDING = 1e-10  # share of a row's squares that rounding alone leaves in directions without anything
+
+
+def harmonics_above(sh_degree: int) -> int:
+    """H, the numbers of the harmonics above KEPT_DEGREE, of three colours."""
+    return max(0, 3 * ((sh_degree + 1) ** 2 - (KEPT_DEGREE + 1) ** 2))
+
+
+def high_harmonics(model: Gaussians) -> Doubles:
+    """[N, H] the harmonics above KEPT_DEGREE."""
+    return model.sh[:, (KEPT_DEGREE + 1) ** 2 :].detach().flatten(1).cpu().double().numpy()
+
+
+def with_high_harmonics(model: Gaussians, harmonics: Doubles) -> Gaussians:
+    """`model` with other harmonics [N, H] above KEPT_DEGREE."""
+    high = torch.from_numpy(harmonics).to(model.sh).view(len(model), -1, 3)
+    return replace(model, sh=torch.cat([model.sh[:, : (KEPT_DEGREE + 1) ** 2], high], dim=1))
+
+
+def row_names(model: Gaussians) -> Bytes:
+    """[N, 16] the identity of each Gaussian, which neither harmonics nor new low bits change."""
+    return identities(model.with_sh_degree(0))
+
+
+def pads(secret: bytes, names: Bytes, count: int) -> Doubles:
+    """[N, count] in [0, 1): a pseudo-random function of a secret and the identity of a Gaussian."""
+    size = 4 * count
+    stream = CellCipher(secret, "pad", size).encrypt(names, np.zeros((len(names), size), np.uint8))
+    return np.ascontiguousarray(stream[:, -size:]).view("<u4") / 2.0**32
+
+
+class Harmonics(nn.Module):
+    """R directions, and what plain models have in them."""
+
+    directions: Tensor  # [H, R] orthonormal
+    slopes: Tensor  # [2, R] number j spreads like exp(a + b log(root mean square of what is before it))
+    quantiles: Tensor  # [R, 33] of a number over its spread, at RANKS
+
+    def __init__(self, width: int, count: int) -> None:
+        super().__init__()
+        self.register_buffer("directions", torch.zeros(width, count))
+        self.register_buffer("slopes", torch.zeros(2, count))
+        self.register_buffer("quantiles", torch.linspace(-1, 1, len(RANKS)).repeat(count, 1))
+
+    def fit(self, plain: Gaussians) -> Tensor:
+        """Learn all from a plain model; returns [H, H - R] the directions that stay as they are.
+
+        Raises InputError for a model that has hardly any harmonics.
+        """
+        harmonics = high_harmonics(plain)
+        chosen = (harmonics != 0).any(axis=1)
+        if chosen.sum() < len(RANKS):
+            raise InputError(
+                "hardly any Gaussian of the cover's plain model has harmonics above degree 1, which hide the "
+                'secret: train longer, or use `method="carry"`'
+            )
+        harmonics = harmonics[chosen]
+        weighted = harmonics * plain.opacities.double().numpy()[chosen, None]
+        vectors = np.linalg.eigh(weighted.T @ weighted)[1]
+        count = self.directions.shape[1]
+        self.directions.copy_(torch.from_numpy(vectors[:, :count]))
+        written, power = self._split(harmonics)
+        for j, column in enumerate(written.T):
+            seen = (power > 0) & (column != 0)
+            before, own = np.log(self._level(power[seen], j)), np.log(np.abs(column[seen]))
+            slope = np.cov(before, own)[0, 1] / max(float(np.var(before, ddof=1)), 1e-12)
+            self.slopes[:, j] = torch.tensor([own.mean() - slope * before.mean(), slope])
+            self.quantiles[j] = increasing(np.quantile(column[seen] / self._spread(power[seen], j), RANKS))
+            power = power + column**2
+        return torch.from_numpy(vectors[:, count:]).float()
+
+    def write(self, harmonics: Doubles, ranks: Doubles) -> Doubles:
+        """[N, H] harmonics [N, H] with numbers of the `ranks` [N, R] in the directions.
+
+        Rows without anything in other directions, because no view ever showed them, stay as they are.
+        """
+        directions = self.directions.double().numpy()
+        kept = harmonics - (harmonics @ directions) @ directions.T
+        power = (kept**2).sum(axis=1)
+        alive, written = power > 0, np.zeros_like(ranks)
+        power = np.where(alive, power, 1.0)
+        for j, own in enumerate(ranks.T):
+            value = np.interp(own, RANKS, self.quantiles[j].double().numpy())
+            written[:, j] = value * self._spread(power, j)
+            power = power + written[:, j] ** 2
+        return np.where(alive[:, None], kept + written @ directions.T, harmonics)
+
+    def read(self, harmonics: Doubles) -> tuple[Doubles, Flags]:
+        """[N, R] the ranks that `write` wrote into [N, H]; [N] which rows have any."""
+        written, power = self._split(harmonics)
+        alive, ranks = power > 0, np.empty_like(written)
+        power = np.where(alive, power, 1.0)
+        for j, column in enumerate(written.T):
+            relative = column / self._spread(power, j)
+            ranks[:, j] = np.interp(relative, self.quantiles[j].double().numpy(), RANKS)
+            power = power + column**2
+        return ranks, alive
+
+    def _split(self, harmonics: Doubles) -> tuple[Doubles, Doubles]:
+        """[N, R] the numbers in the directions; [N] the squares of the rest, summed."""
+        directions = self.directions.double().numpy()
+        written = harmonics @ directions
+        power = ((harmonics - written @ directions.T) ** 2).sum(axis=1)
+        return written, np.where(power > _ROUNDING * (harmonics**2).sum(axis=1), power, 0.0)
+
+    def _level(self, power: Doubles, j: int) -> Doubles:
+        """[N] the root mean square of the numbers before number j, from their sum of squares."""
+        width, count = self.directions.shape
+        return np.sqrt(power / (width - count + j))
+
+    def _spread(self, power: Doubles, j: int) -> Doubles:
+        offset, slope = self.slopes[:, j].double().numpy()
+        spread: Doubles = np.exp(offset + slope * np.log(self._level(power, j)))
+        return spread
+
+
+def increasing(values: Doubles) -> Tensor:
+    """float32 of sorted `values` [33], made strictly increasing."""
+    span = max(float(np.ptp(values)), float(np.abs(values).max()), 1e-6)
+    return torch.from_numpy(values + span * 1e-5 * np.arange(len(values))).float()

@@ -1,0 +1,109 @@
+"""Ours: density control with a fixed number of rows, each of which is a Gaussian of every scene."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, TypeVar
+
+import torch
+import torch.nn.functional as F
+from gsplat.utils import normalized_quat_to_rotmat
+from torch import Tensor
+
+from keyss.fitting.config import FitConfig
+from keyss.fitting.density import CappedStrategy, Rendered
+from keyss.fitting.parameters import Optimizers, Parameters
+
+EMPTY = -8.0  # opacity logit of a place without a Gaussian
+_FILLING = 5  # last steps of density control, which fill the places that are still empty
+T = TypeVar("T")
+
+
+def of_scene(named: dict[str, T], scene: int) -> dict[str, T]:
+    """Those that belong to a scene: `means` to the cover, `1/means` to secret 1."""
+    own = str(scene) if scene else ""
+    return {name.rpartition("/")[2]: value for name, value in named.items() if name.rpartition("/")[0] == own}
+
+
+class FixedRows(CappedStrategy):
+    """Density control in which clones and splits take the places of pruned Gaussians, for each scene.
+
+    Thresholds and times are those of plain 3DGS. The last steps also fill the places that are still empty, an
+    equal part each, because a row without a Gaussian of the cover cannot have one of a secret.
+    """
+
+    def __init__(self, fit: FitConfig, extents: Sequence[float], generator: torch.Generator) -> None:
+        super().__init__(fit)
+        self.extents, self.generator = extents, generator
+
+    def initialize_state(self, scene_scale: float = 1.0) -> dict[str, Any]:
+        """`born`: [N] the place that plain 3DGS gives the cover's Gaussian in each row."""
+        state: dict[str, Any] = super().initialize_state(scene_scale)
+        return state | {"born": torch.arange(self.max_gaussians)}
+
+    def combined(self, renders: Sequence[Rendered], count: int) -> dict[str, Any]:
+        return self.by_scene(renders, count, len(self.extents), dim=0)
+
+    @torch.no_grad()
+    def step_post_backward(
+        self,
+        params: Parameters,
+        optimizers: Optimizers,
+        state: dict[str, Any],
+        step: int,
+        info: dict[str, Any],
+        packed: bool = False,
+    ) -> None:
+        if step >= self.refine_stop_iter:
+            return
+        self._update_state(params, state, info)
+        if step <= self.refine_start_iter or step % self.refine_every:
+            return
+        left = (self.refine_stop_iter - 1 - step) // self.refine_every + 1
+        gradients, born = state["grad2d"] / state["count"].clamp_min(1), state["born"]
+        for scene in range(len(self.extents)):
+            own = of_scene(params, scene), of_scene(optimizers, scene)
+            grown = self.grow(*own, scene, gradients[scene], left, born).to(born.device)
+            if scene == 0:
+                born[grown] = born.max() + 1 + torch.arange(len(grown), device=born.device)
+        state["grad2d"], state["count"] = None, None
+
+    def grow(
+        self,
+        params: Parameters,
+        optimizers: Optimizers,
+        scene: int,
+        gradients: Tensor,  # [N]
+        left: int,
+        born: Tensor,  # [N]
+    ) -> Tensor:
+        """Clone small Gaussians and split large ones into dead places, the largest gradients first.
+
+        Returns the rows of new Gaussians in the order in which plain 3DGS appends them: clones, then the
+        first and the second halves of splits, each in the order of `born`.
+        """
+        dead = params["opacities"].detach().sigmoid() < self.prune_opa
+        places = dead.nonzero()[:, 0]
+        gradients = gradients.masked_fill(dead, 0)
+        asking = int((gradients > self.grow_grad2d).sum())
+        alive = len(dead) - len(places)
+        filling = math.ceil(len(places) / left) if left <= _FILLING else 0
+        count = min(len(places), alive, max(asking, filling))
+        source, target = gradients.topk(count).indices, places[:count]
+        source = source[born.to(source.device)[source].argsort()]
+        values = {name: parameter.detach()[source] for name, parameter in params.items()}
+        large = values["scales"].exp().amax(1) > self.grow_scale3d * self.extents[scene]
+        noise = torch.randn(2, count, 3, generator=self.generator).to(large.device)
+        offsets = noise * values["scales"].exp() * large[:, None]
+        rotations = normalized_quat_to_rotmat(F.normalize(values["quats"], dim=1))
+        offsets = torch.einsum("nij,bnj->bni", rotations, offsets)
+        values["scales"] = values["scales"] - math.log(1.6) * large[:, None]
+        every = torch.ones_like(large)
+        for rows, offset, fresh in ((source, offsets[0], large), (target, offsets[1], every)):
+            for name, parameter in params.items():
+                parameter.data[rows] = values[name] + offset if name == "means" else values[name]
+                for key, moment in optimizers[name].state[parameter].items():
+                    if key != "step":
+                        moment[rows[fresh]] = 0
+        return torch.cat([target[~large], source[large], target[large]])

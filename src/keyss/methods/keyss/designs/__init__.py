@@ -1,1 +1,0 @@
-"""The designs of KeySS; `base` is what a design has to be."""

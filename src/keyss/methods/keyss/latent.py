@@ -1,0 +1,163 @@
+"""Ours: the decoder of the design `latent`, which is linear, and the encryption of what it decodes.
+
+Every row of the published model is a Gaussian of the cover, and its harmonics hold the *latents* of a
+Gaussian of each secret (`keyss.channels.harmonics`): opacity, rotation, scale, position, constant colour, and
+a code, from which a trained basis makes the harmonics.
+
+Latents are encrypted by a stream cipher on real numbers: a latent becomes its rank in (0, 1/4), a pad in
+[0, 1) that follows from the key and the row is added modulo 1, and that is the rank that is written. Whatever
+the latents are, it is uniform. A row belongs to a key if all its latents come out in (0, 1/4): another key
+opens no row and shows the cover.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from typing import Any
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from keyss.channels.harmonics import (
+    RANKS,
+    Harmonics,
+    harmonics_above,
+    high_harmonics,
+    increasing,
+    pads,
+    row_names,
+)
+from keyss.core.arrays import Bytes, Doubles, Flags
+from keyss.core.errors import UsageError
+from keyss.core.gaussians import Gaussians
+from keyss.keys.derivation import expand
+from keyss.methods.keyss.decoder import Decoder, DecoderShape
+
+OWN = 13  # latents without the code: opacity 1, rotation 3, log scales 3, position 3, constant colour 3
+MOST = 24  # latents of a secret: more cost the cover more than they give the secret
+LEAST_KEPT = 2  # directions that stay the cover's, by which the spread of a row is known
+SHARE = 4  # a latent takes 1 / SHARE of the circle: a foreign row passes once in SHARE ** latents times
+GUARD = 1 / 256  # at both ends of that share, for rounding
+NONCE_BYTES = 16
+
+
+def latents_of(sh_degree: int, secrets: int) -> int:
+    """D, the latents of each of so many secrets. Raises UsageError where a row has no room."""
+    count = min(MOST, (harmonics_above(sh_degree) - LEAST_KEPT) // secrets)
+    if count < OWN:
+        raise UsageError(
+            f"SH degree {sh_degree} with {secrets} secrets: the harmonics of a Gaussian have no room for one "
+            "of each; use a higher degree, fewer secrets, or `method='carry'`"
+        )
+    return count
+
+
+class LatentDecoder(Decoder):
+    """D for one secret of those that share the rows."""
+
+    knots: Tensor  # [D, 33] quantiles of the secret's latents, at RANKS
+    nonce: Tensor  # [16] bytes that follow from the secret, so that no pad serves two
+
+    def __init__(self, shape: DecoderShape) -> None:
+        nn.Module.__init__(self)
+        self.shape, count = shape, latents_of(shape.sh_degree, shape.secrets)
+        if shape.secret >= shape.secrets:
+            raise ValueError(f"secret {shape.secret} of {shape.secrets}")
+        self.place = Harmonics(harmonics_above(shape.sh_degree), count * shape.secrets)
+        self.basis = nn.Parameter(torch.zeros(count - OWN, 3 * ((shape.sh_degree + 1) ** 2 - 1)))
+        self.register_buffer("knots", torch.linspace(-1, 1, len(RANKS)).repeat(count, 1))
+        self.register_buffer("nonce", torch.zeros(NONCE_BYTES, dtype=torch.uint8))
+
+    @property
+    def own(self) -> slice:
+        """The directions of this secret."""
+        count = len(self.knots)
+        return slice(self.shape.secret * count, (self.shape.secret + 1) * count)
+
+    def forward(self, cover: Gaussians, key: Tensor, whole: Gaussians | None = None) -> Gaussians:
+        """The secret's Gaussians in the rows that belong to `key`; `cover` itself if there are none."""
+        names, (ranks, alive) = row_names(cover), self.place.read(high_harmonics(cover))
+        latents, fits = self.decrypt(ranks[alive][:, self.own], key, names[alive])
+        if not fits.any():
+            return cover
+        _, first = np.unique(names[alive][fits], axis=0, return_index=True)  # copies of a row count once
+        return self.to_gaussians(torch.from_numpy(latents[np.sort(first)]).to(self.basis))
+
+    @torch.no_grad()
+    def decode(self, stego: Gaussians, key: Tensor) -> Gaussians:
+        return self(stego, key)  # type: ignore[no-any-return]
+
+    def fit_secret(self, latents: Doubles) -> None:
+        """Learn the quantiles of latents [N, D], and a nonce that no other secret has."""
+        for j, column in enumerate(latents.T):
+            self.knots[j] = increasing(np.quantile(column, RANKS))
+        digest = hashlib.sha256(np.ascontiguousarray(latents).tobytes()).digest()[:NONCE_BYTES]
+        self.nonce.copy_(torch.frombuffer(bytearray(digest), dtype=torch.uint8))
+
+    def encrypt(self, latents: Doubles, key: Tensor, names: Bytes) -> Doubles:
+        """[N, D] ranks in [0, 1) for latents [N, D] in rows with the identities `names` [N, 16]."""
+        knots = self.knots.double().numpy()
+        ranks = np.stack([np.interp(*each, RANKS) for each in zip(latents.T, knots, strict=True)], axis=1)
+        inside: Doubles = (GUARD + (1 - 2 * GUARD) * ranks) / SHARE
+        return (inside + self._pads(key, names)) % 1
+
+    def decrypt(self, ranks: Doubles, key: Tensor, names: Bytes) -> tuple[Doubles, Flags]:
+        """[M, D] the latents in the rows that belong to `key`; [N] which these are."""
+        inside = SHARE * ((ranks - self._pads(key, names)) % 1)
+        fits: Flags = np.all(inside <= 1, axis=1)
+        own = ((inside[fits] - GUARD) / (1 - 2 * GUARD)).clip(0, 1)
+        knots = self.knots.double().cpu().numpy()
+        return np.stack([np.interp(x, RANKS, y) for x, y in zip(own.T, knots, strict=True)], axis=1), fits
+
+    def _pads(self, key: Tensor, names: Bytes) -> Doubles:
+        seed = key.detach().cpu().numpy().astype("<f4").tobytes() + self.nonce.cpu().numpy().tobytes()
+        return pads(expand(hashlib.sha256(seed).digest(), "latents", 32), names, len(self.knots))
+
+    def to_latents(self, model: Gaussians, colours: Tensor) -> Tensor:
+        """[N, D] the latents of Gaussians whose harmonics are `self.colours(colours)`."""
+        quats = F.normalize(model.quats, dim=1)
+        rotation = quats[:, 1:] * torch.where(quats[:, :1] < 0, -1.0, 1.0)
+        opacity = model.opacity_logits[:, None]
+        return torch.cat([opacity, rotation, model.log_scales, model.means, colours], dim=1)
+
+    def colours(self, rows: Tensor) -> Tensor:
+        """[N, K, 3] harmonics of rows [N, 3 + C]: constant colours, and a code that the basis multiplies."""
+        return Colours.apply(rows, self.basis, None)  # type: ignore[no-any-return,no-untyped-call]
+
+    def to_gaussians(self, latents: Tensor) -> Gaussians:
+        """The Gaussians of latents [N, D]."""
+        opacity, rotation, scales, means, colours = latents.split([1, 3, 3, 3, 3 + len(self.basis)], dim=1)
+        first = (1 - rotation.square().sum(1, keepdim=True)).clamp_min(0).sqrt()
+        quats = torch.cat([first, rotation], dim=1)
+        return Gaussians(means, quats, scales, opacity[:, 0], self.colours(colours))
+
+
+class Colours(torch.autograd.Function):
+    """[N, K, 3] harmonics of rows [N, W]: the first numbers as they are, the others times `basis` [C, H].
+
+    `noise` [N, H] is added to the product. In one pass, where torch's own operations take four.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, rows: Tensor, basis: Tensor, noise: Tensor | None) -> Tensor:
+        ctx.save_for_backward(rows, basis)
+        first = rows.shape[1] - len(basis)
+        sh = rows.new_empty(len(rows), first + basis.shape[1])
+        sh[:, :first] = rows[:, :first]
+        if noise is None:
+            torch.mm(rows[:, first:], basis, out=sh[:, first:])
+        else:
+            torch.addmm(noise, rows[:, first:], basis, out=sh[:, first:])
+        return sh.view(len(rows), -1, 3)
+
+    @staticmethod
+    def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor, Tensor | None, None]:
+        rows, basis = ctx.saved_tensors
+        first, upstream = rows.shape[1] - len(basis), upstream.reshape(len(rows), -1)
+        gradient = torch.empty_like(rows)
+        gradient[:, :first] = upstream[:, :first]
+        torch.mm(upstream[:, first:], basis.T, out=gradient[:, first:])
+        of_basis = rows[:, first:].T @ upstream[:, first:] if ctx.needs_input_grad[1] else None
+        return gradient, of_basis, None

@@ -1,0 +1,199 @@
+"""Ours: the training of the design `latent`. Every row of the model is a Gaussian of each scene.
+
+Each scene starts from its own points with the whole cap, has its own views and its own density control, as
+plain 3DGS does. The cover trains with numbers like those that will be written in place of the latents, the
+secrets with harmonics that the decoder makes of a code. Adam's moments are those of latents before
+encryption: with moments of what is written, secrets lose 1.1 dB. Wrong keys open no row and need no loss.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from keyss.channels.harmonics import KEPT_DEGREE, high_harmonics, row_names, with_high_harmonics
+from keyss.core.errors import InputError
+from keyss.core.gaussians import Gaussians
+from keyss.core.scene import Camera
+from keyss.fitting.adam import RowAdam
+from keyss.fitting.density import CappedStrategy
+from keyss.fitting.image_metrics import subsample_views
+from keyss.fitting.parameters import make_optimizers, to_parameters
+from keyss.fitting.plain import without_faint
+from keyss.fitting.rows import EMPTY, FixedRows, of_scene
+from keyss.fitting.schedule import Schedule
+from keyss.keys.derivation import stream
+from keyss.methods.keyss.combined import combined_points
+from keyss.methods.keyss.latent import Colours, LatentDecoder
+from keyss.methods.keyss.secret import KeyssSecret, choose_anchors, visibility
+from keyss.methods.keyss.training import KeyssTraining, Picture
+from keyss.rendering.view import contributions
+
+PRUNED_SHARE = 0.25  # of the published rows, the faintest, which `Design.pruned_steps` render without
+BASIS_SIZE = 2.0  # length of the vectors of the first basis
+NOISE_STEPS, WORTH_STEPS = 50, 100  # after which the noise, and what is pruned, is chosen anew
+VIEWS, FEW_VIEWS = 64, 16  # in which contributions are measured for publishing, and in training
+_LOW = 3 * (KEPT_DEGREE + 1) ** 2  # numbers of the cover's colours that are harmonics, not a code
+
+
+class LatentTraining(KeyssTraining):
+    """See `KeyssTraining`. Parameters of secret s have names like `s/means`; `sh` are codes of colours."""
+
+    decoders: list[LatentDecoder]
+    pruned = False  # whether a step renders what pruning leaves
+
+    def start(self) -> Gaussians:
+        return self.filled(0)
+
+    def filled(self, scene: int) -> Gaussians:
+        """A scene's sparse points, as plain 3DGS starts, and empty places up to the cap."""
+        model = combined_points([self.scenes[scene].scene], self.fit, self.generator)
+        rest = model[torch.arange(self.fit.max_gaussians - len(model)) % len(model)]
+        rest = replace(rest, opacity_logits=torch.full((len(rest),), EMPTY))
+        return Gaussians.cat([model, rest])
+
+    def prepare(self, start: Gaussians) -> None:
+        fit, count = self.fit, len(self.keys)
+        shape = self.design.decoder.sized(fit.sh_degree, len(self.keys[0]), count)
+        self.decoders = [LatentDecoder(replace(shape, secret=secret)) for secret in range(count)]
+        self.kept = self.decoders[0].place.fit(self.scenes[0].plain).T.contiguous().to(self.device)
+        place = self.decoders[0].place.state_dict()
+        for decoder, placed in zip(self.decoders, self.scenes[1:], strict=True):
+            decoder.place.load_state_dict(place)
+            decoder.basis.data.copy_(first_basis(placed.plain, *decoder.basis.shape))
+        self.networks.extend(self.decoders)
+        self.schedules = []
+        for scene, placed in enumerate(self.scenes):
+            cameras = [view.camera for view in placed.scene.train]
+            self.schedules.append(Schedule(fit, cameras, placed.scene.extent))
+            own = to_parameters(self.filled(scene) if scene else start, self.device)
+            optimizers = make_optimizers(own, fit, placed.scene.extent)
+            first, coded = (3, len(self.decoders[scene - 1].basis)) if scene else (_LOW, len(self.kept))
+            # A number of a code moves as far as all the harmonics that it stands for.
+            rates = torch.full((first + coded,), fit.shN_rate, device=self.device)
+            rates[:3] = fit.sh0_rate
+            rates[first:] *= (own["sh"][0].numel() - first) / max(1, coded)
+            rows = torch.zeros(len(own["sh"]), first + coded, device=self.device)
+            rows[:, :3] = own["sh"].detach()[:, 0]
+            own["sh"] = torch.nn.Parameter(rows)
+            group = {"params": [own["sh"]], "lr": 1.0, "lr_scale": rates}
+            optimizers["sh"] = RowAdam([group], eps=1e-15, fused=self.device.type == "cuda")
+            prefix = f"{scene}/" if scene else ""
+            self.parameters |= {prefix + name: values for name, values in own.items()}
+            self.optimizers |= {prefix + name: optimizers[name] for name in own}
+
+    def density_control(self) -> CappedStrategy:
+        return FixedRows(self.fit, [placed.scene.extent for placed in self.scenes], self.generator)
+
+    def step(self) -> None:
+        grown = self.iteration >= self.strategy.refine_stop_iter
+        self.pruned = grown and float(torch.rand((), generator=self.generator)) < self.design.pruned_steps
+        if self.iteration % NOISE_STEPS == 0:
+            self.draw_noise()
+        if self.pruned and ("kept.0" not in self.density or self.iteration % WORTH_STEPS == 0):
+            self.choose_kept()
+        super().step()
+        self.pruned = False
+
+    @torch.no_grad()
+    def draw_noise(self) -> None:
+        """Numbers as a plain model has them in place of the latents, the same in a run that is resumed."""
+        clean = high_harmonics(self.gaussians_of(0, None))
+        own = np.random.default_rng(self.fit.seed_of(f"noise {self.iteration}"))
+        place = self.decoders[0].place
+        written = place.write(clean, own.random((len(clean), place.directions.shape[1])))
+        self.density["noise"] = torch.from_numpy(written - clean).float().to(self.device)
+
+    @torch.no_grad()
+    def choose_kept(self) -> None:
+        """[N] what is left of each scene when the faintest PRUNED_SHARE of the published file is removed."""
+        cover = self.gaussians_of(0, None)
+        alive = cover.opacities >= self.fit.prune_opacity
+        faintest = cover.opacity_logits.masked_fill(~alive, -math.inf).argsort()
+        kept = alive.clone()
+        kept[faintest[: int((~alive).sum()) + int(PRUNED_SHARE * int(alive.sum()))]] = False
+        self.density["kept.0"] = kept
+        # Rows without harmonics hide nothing.
+        left = int((kept & (cover.sh[:, (KEPT_DEGREE + 1) ** 2 :] != 0).flatten(1).any(1)).sum())
+        for scene in range(1, len(self.scenes)):
+            worth = self.worth(self.gaussians_of(scene), scene, FEW_VIEWS)
+            best = torch.zeros_like(kept)
+            best[worth.argsort(descending=True, stable=True)[:left]] = True
+            self.density[f"kept.{scene}"] = best
+
+    def worth(self, model: Gaussians, scene: int, views: int) -> Tensor:
+        """[N] what each Gaussian of a secret adds to views of its scene."""
+        cameras = [view.camera for view in subsample_views(self.scenes[scene].scene.train, views)]
+        return contributions(model, cameras) * model.opacities
+
+    def gaussians_of(self, scene: int, noise: Tensor | None = None) -> Gaussians:
+        """[N] the Gaussians of a scene, attached to the graph; `noise` in place of the latents."""
+        own = of_scene(self.parameters, scene)
+        basis = self.decoders[scene - 1].basis if scene else self.kept
+        sh = Colours.apply(own["sh"], basis, noise)  # type: ignore[no-untyped-call]
+        return Gaussians(own["means"], own["quats"], own["scales"], own["opacities"], sh)
+
+    def cover(self) -> Gaussians:
+        return self.gaussians_of(0, self.density.get("noise"))
+
+    def draw(self, scenes: Sequence[int], camera: Camera, sh_degree: int) -> list[Picture]:
+        pictures = []
+        for scene in scenes:
+            model = self.gaussians_of(scene) if scene else self.cover()
+            if self.pruned:
+                logits = model.opacity_logits.where(self.density[f"kept.{scene}"], -20.0)
+                model = replace(model, opacity_logits=logits)
+            pictures.append(self.render(model, scene, camera, sh_degree))
+        return pictures
+
+    @torch.no_grad()
+    def publish(self, entropy: bytes) -> tuple[Gaussians, list[KeyssSecret]]:
+        least, place = self.fit.prune_opacity, self.decoders[0].place.to("cpu")
+        # The rows in the order of plain 3DGS, which appends what grows.
+        born = self.density["born"].cpu().argsort(stable=True)
+        cover = without_faint(self.gaussians_of(0, None).detach().to("cpu")[born], least)
+        names, high = row_names(cover), high_harmonics(cover)
+        _, index, counts = np.unique(names, axis=0, return_inverse=True, return_counts=True)
+        free = np.flatnonzero((counts[index.reshape(-1)] == 1) & (high != 0).any(axis=1))
+        if not len(free):
+            raise InputError(
+                "no Gaussian of the cover has harmonics to hide one of a secret: train longer, or use "
+                '`method="carry"`'
+            )
+        # Opaque rows are kept longest, and get what contributes most.
+        rows = free[np.argsort(-cover.opacity_logits.numpy()[free], kind="stable")]
+        count = place.directions.shape[1]
+        words = np.frombuffer(stream(entropy, "latents", 8 * len(cover) * count), "<u8")
+        ranks = ((words >> np.uint64(11)) / 2.0**53).reshape(len(cover), count)
+        for scene, key in enumerate(self.keys, 1):
+            decoder = self.decoders[scene - 1].to("cpu").requires_grad_(False)
+            model = self.gaussians_of(scene).detach().to("cpu")
+            alive = (model.opacities >= least).nonzero()[:, 0]
+            worth = self.worth(model[alive], scene, VIEWS)
+            chosen = alive[worth.argsort(descending=True, stable=True)[: len(rows)]]
+            colours = self.parameters[f"{scene}/sh"].detach().to("cpu")[chosen]
+            latents = decoder.to_latents(model[chosen], colours).double().numpy()
+            decoder.fit_secret(latents)
+            own = rows[: len(chosen)]
+            ranks[own, decoder.own] = decoder.encrypt(latents, key, names[own])
+        stego = with_high_harmonics(cover, place.write(high, ranks))
+        # Training makes do without the faintest rows: only what is lost beyond them has to be made up for.
+        opaque = stego[stego.opacities.argsort()[int(PRUNED_SHARE * len(stego)) :]]
+        anchors, secrets = choose_anchors(stego, self.fit.known_seed), []
+        for decoder, key, placed in zip(self.decoders, self.keys, self.scenes[1:], strict=True):
+            found = visibility(decoder.decode(stego, key))[0], visibility(decoder.decode(opaque, key))[1]
+            secrets.append(KeyssSecret(decoder, key.cpu(), placed.frame, anchors, *found))
+        return stego, secrets
+
+
+def first_basis(plain: Gaussians, count: int, width: int) -> Tensor:
+    """[count, width] the directions in which the harmonics of a plain model vary most."""
+    harmonics = plain.sh[:, 1:].flatten(1) * plain.opacities[:, None]
+    vectors = torch.linalg.eigh(harmonics.T @ harmonics)[1]
+    basis: Tensor = BASIS_SIZE * vectors.flip(1)[:, :count].T
+    return basis.contiguous()
