@@ -283,7 +283,7 @@ def leaks(
         progress(index, len(subject.in_cover))
         attacks = file_attacks(subject.scenes[0], seed=seed)
         if opened.decode is not None:
-            attacks.append(decoder_attack(opened.decode, seed=seed))
+            attacks.append(decoder_attack(opened.decode, opened.key_size, seed=seed))
             attacks.append(with_the_key(partial(opened.reveal, frame="cover", force=True)))
         rows, shown = look_for_secret(subject.stego, subject.controls, secret, attacks)
         files = [f"leak-{index + 1}-{number:02}.png" for number in range(1, len(rows) + 1)]

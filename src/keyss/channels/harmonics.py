@@ -135,7 +135,7 @@ class Harmonics(nn.Module):
 
     def _spread(self, power: Doubles, j: int) -> Doubles:
         offset, slope = self.slopes[:, j].double().numpy()
-        spread: Doubles = np.exp(offset + slope * np.log(self._level(power, j)))
+        spread: Doubles = np.exp(np.clip(offset + slope * np.log(self._level(power, j)), -80, 80))
         return spread
 
 

@@ -7,6 +7,7 @@ similar vectors. Revealing needs no CLIP: the encrypted payload contains the vec
 
 from __future__ import annotations
 
+import string
 from functools import lru_cache
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from torch import Tensor
 from keyss.core.errors import BackendError, UsageError, import_extra
 from keyss.keys.key_file import normalized_key
 
+_CHARACTERS = string.ascii_letters + string.digits
 MODEL = "openai/clip-vit-large-patch14"  # ViT-L/14 (section 4.1)
 
 
@@ -48,6 +50,11 @@ class ClipKeys:
         if tokens["input_ids"].shape[1] > most:
             raise UsageError(f"the key is too long for CLIP: expected at most {most - 2} tokens")
         return self._text(**tokens).last_hidden_state[0].mean(0)  # type: ignore[no-any-return]
+
+    def random(self, generator: torch.Generator) -> Tensor:
+        """The vector of a random key of 16 alphanumeric characters (section 4.1)."""
+        chosen = torch.randint(len(_CHARACTERS), (16,), generator=generator)
+        return self("".join(_CHARACTERS[int(each)] for each in chosen))
 
 
 clip_keys = lru_cache(maxsize=1)(ClipKeys)  # a large model that preparing and hiding share

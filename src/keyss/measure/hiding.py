@@ -144,14 +144,16 @@ def _wrong_keys(
     seed: int,
 ) -> WrongKeys | None:
     """PSNRs of decoded models under wrong embeddings; None without decoders."""
-    embeddings = random_embeddings(count, torch.Generator().manual_seed(seed))
     keyed = [
-        (each.decode, scene) for each, scene in zip(opened, secrets, strict=True) if each.decode is not None
+        (each.decode, each.key_size, scene)
+        for each, scene in zip(opened, secrets, strict=True)
+        if each.decode is not None
     ]
     if not keyed:
         return None
     vs_cover, vs_secrets = [], []
-    for decode, scene in keyed:
+    for decode, size, scene in keyed:
+        embeddings = random_embeddings(count, torch.Generator().manual_seed(seed), size)
         models = (decode(stego, embedding) for embedding in embeddings)  # one at a time: they are large
         psnrs = [(_psnr(model, cover), _psnr(model, scene)) for model in models]
         vs_cover.append([of_cover for of_cover, _ in psnrs])

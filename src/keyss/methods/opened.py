@@ -54,11 +54,15 @@ class Opened(Protocol):
 
     @property
     def decode(self) -> Callable[[Gaussians, Tensor], Gaussians] | None:
-        """The decoder, from a stego model and an embedding [64] to Gaussians in the cover's frame.
+        """The decoder, from a stego model and a key's vector [`key_size`] to Gaussians in the cover's frame.
 
-        The white-box attack follows its gradient in the embedding. None if keys condition no decoder: then a
+        The white-box attack follows its gradient in the vector. None if keys condition no decoder: then a
         wrong key shows nothing at all.
         """
+
+    @property
+    def key_size(self) -> int:
+        """Numbers of a key's vector; 0 without a decoder."""
 
     def reveal(self, stego: Gaussians, *, frame: Frame = "secret", force: bool = False) -> Gaussians:
         """The secret as a model of its own, on the CPU; `force`: even from a changed model.
@@ -122,6 +126,7 @@ class Decoy:
     changes: torch.Tensor  # [_KNOTS] of opacity logits
     appended: bool = False  # True if the model has appended Gaussians, which are left out
     decode: None = None
+    key_size: int = 0
 
     @staticmethod
     def of(stego: Gaussians, key: DerivedKey, *, appended: bool = False) -> Decoy:

@@ -6,13 +6,13 @@ from dataclasses import replace
 from typing import Any
 
 import torch
+from keyss.methods.keyss.rows import encrypt_rows, secret_tables
 
 from channels.low_bits.trained_like import trained_like
 from keyss import FitConfig, Gaussians, KeyssOptions
 from keyss.core.similarity import Similarity
 from keyss.keys import random_embeddings
 from keyss.methods import ATTRIBUTES, Codec, Decoder, DecoderShape, HiddenSecret, RowSecret, choose_anchors
-from keyss.methods.keyss.rows import encrypt_rows, secret_tables
 
 FIT = FitConfig(iterations=80, max_gaussians=600, grow_start=0.2, grow_every=20, evaluate_every=0, seed=0)
 SMALL: dict[str, Any] = {"hidden": (16, 16), "branch": 8}  # a decoder of few bytes

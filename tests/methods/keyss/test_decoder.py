@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import fields, replace
 from itertools import combinations
 from typing import Any
 
@@ -13,108 +13,114 @@ from keyss.methods import ATTRIBUTES, Decoder, DecoderShape, parse_mask
 from tiny_scenes import random_gaussians
 
 FIELD_OF = {"op": "opacity_logits", "ro": "quats", "sc": "log_scales", "xyz": "means", "sh": "sh"}
+KEY, OTHER = random_embeddings(2, torch.Generator().manual_seed(0))
 
 
-def _embedding(seed: int = 0) -> torch.Tensor:
-    return random_embeddings(1, torch.Generator().manual_seed(seed))[0]
-
-
-def _trained(mask: str = "op,ro,sc,xyz,sh", **shape: Any) -> Decoder:
-    """A network whose last layers are not zero any more, for the embedding of seed 0."""
+def _decoder(mask: str = "op,ro,sc,xyz,sh", **shape: Any) -> Decoder:
     torch.manual_seed(0)
-    decoder = Decoder(DecoderShape(mask=parse_mask(mask), **shape))
-    decoder.prepare(random_gaussians(), _embedding())
-    for branch in decoder.network.branches.values():
-        torch.nn.init.normal_(branch[-1].weight)
-    return decoder.requires_grad_(False)
+    return Decoder(DecoderShape(mask=parse_mask(mask), **shape)).requires_grad_(False)
 
 
 def _distance(a: Gaussians, b: Gaussians, name: str) -> float:
     return (getattr(a, name) - getattr(b, name)).abs().max().item()
 
 
-@pytest.mark.parametrize("conditioning", ["gate", "bias"])
-def test_a_new_decoder_changes_nothing_for_any_key(conditioning: Any) -> None:
-    gaussians = random_gaussians()
-    decoder = Decoder(DecoderShape(mask=ATTRIBUTES, conditioning=conditioning))
-    decoder.prepare(gaussians, _embedding())
-    for seed in range(3):
-        decoded = decoder(gaussians, _embedding(seed))
-        assert all(_distance(decoded, gaussians, f.name) == 0 for f in fields(Gaussians))
+@pytest.mark.parametrize("released", [False, True])
+def test_equations_6_and_8_written_out(released: bool) -> None:
+    """In float64, for one Gaussian, from the weights alone."""
+    model, decoder = random_gaussians(40), _decoder(released=released, hidden=(5, 7), branch=3)
+    decoded = decoder(model, 3 * KEY)
+    weights = {name: value.double() for name, value in decoder.state_dict().items()}
+
+    def layer(name: str, values: torch.Tensor) -> torch.Tensor:
+        return weights[f"{name}.weight"] @ values + weights[f"{name}.bias"]
+
+    def unit(values: torch.Tensor) -> torch.Tensor:
+        return values.double() / values.double().norm()
+
+    for i in (0, 17):
+        row = {name: getattr(model, field)[i].flatten() for name, field in FIELD_OF.items()}
+        logit = row["op"].double()
+        alpha = logit / model.opacity_logits.double().norm() if released else logit.sigmoid()
+        others = [unit(row[name]) for name in ("ro", "sc", "xyz", "sh")]
+        f = torch.cat([alpha, *others, KEY.double()])
+        h = layer("common.2", layer("common.0", f).relu()).relu()
+        for name, field in FIELD_OF.items():
+            residual = layer(f"branches.{name}.2", layer(f"branches.{name}.0", h).relu())
+            if released and name != "op":
+                residual = residual.relu()
+            expected = row[name].double() + residual
+            torch.testing.assert_close(
+                getattr(decoded, field)[i].flatten().double(), expected, rtol=1e-4, atol=1e-4
+            )
 
 
 @pytest.mark.parametrize(
     "mask", [mask for size in range(1, 6) for mask in combinations(ATTRIBUTES, size)], ids=",".join
 )
-def test_a_mask_updates_its_attributes_and_no_others(mask: tuple[str, ...]) -> None:
+def test_theta_updates_its_attributes_and_no_others(mask: tuple[str, ...]) -> None:
     gaussians = random_gaussians(40)
-    decoded = _trained(",".join(mask))(gaussians, _embedding())
+    decoded = _decoder(",".join(mask))(gaussians, KEY)
     for name, field in FIELD_OF.items():
         assert (_distance(decoded, gaussians, field) > 0) == (name in mask), name
 
 
-@pytest.mark.parametrize("residuals", ["signed", "one-sided"])
-def test_residuals_have_either_sign_unless_they_are_as_published(residuals: Any) -> None:
-    gaussians = random_gaussians()
-    decoded = _trained(residuals=residuals)(gaussians, _embedding())
-    for name, field in FIELD_OF.items():
-        residual = getattr(decoded, field) - getattr(gaussians, field)
-        assert residual.max() > 0, field
-        assert (residual.min() < 0) == (residuals == "signed" or name == "op"), field
+def test_the_key_chooses_what_is_decoded() -> None:
+    gaussians, decoder = random_gaussians(), _decoder()
+    decoded = decoder(gaussians, KEY)
+    for field in FIELD_OF.values():
+        assert _distance(decoded, decoder(gaussians, OTHER), field) > 1e-3
 
 
-def test_the_gate_lets_one_key_through_and_no_other() -> None:
-    gaussians, decoder = random_gaussians(), _trained("op")
-    own = _embedding()
-    assert _distance(decoder(gaussians, own), gaussians, "opacity_logits") > 1
-    # Half precision of the key is near enough; wrong keys are nowhere near.
-    assert _distance(decoder(gaussians, own.half().float()), decoder(gaussians, own), "opacity_logits") == 0
-    for wrong in random_embeddings(1000, torch.Generator().manual_seed(1)):
-        assert _distance(decoder(gaussians, wrong), gaussians, "opacity_logits") == 0
-
-
-def test_the_published_network_sees_lengths_of_one_over_the_whole_model() -> None:
-    """Opacities are normalised over all Gaussians, everything else of each by itself."""
-    gaussians = random_gaussians()
-    network = _trained(inputs="normalised", frequencies=0).network
-    whole = network.describe(gaussians, gaussians)
-    torch.testing.assert_close(whole[:, :3].norm(dim=1), torch.ones(len(gaussians)))
-    torch.testing.assert_close(whole[:, 3].norm(), torch.ones(()))
-    assert torch.equal(network.describe(gaussians[:10], gaussians), whole[:10])
+def test_released_weights_have_the_spread_of_kaiming_initialisation() -> None:
+    layer = _decoder(released=True, hidden=(400, 300)).common[2]
+    assert float(layer.weight.std()) == pytest.approx((2 / 400) ** 0.5, rel=0.02)  # 120,000 weights
+    assert not layer.bias.any()
 
 
 def test_every_gaussian_is_decoded_alone() -> None:
-    """Re-ordering and pruning change nothing for those that stay."""
-    gaussians, decoder, key = random_gaussians(), _trained(), _embedding()
-    decoded = decoder(gaussians, key)
+    """Reordering and pruning change nothing for those that stay, except in the authors' program."""
+    gaussians = random_gaussians()
     chosen = torch.randperm(len(gaussians))[:50]
-    again = decoder(gaussians[chosen], key)
-    for field in FIELD_OF.values():
-        torch.testing.assert_close(getattr(again, field), getattr(decoded, field)[chosen], rtol=0, atol=1e-5)
+    for released in (False, True):
+        decoder = _decoder(released=released)
+        decoded = decoder(gaussians, KEY)
+        part = decoder(gaussians[chosen], KEY, gaussians)
+        for field in FIELD_OF.values():
+            expected = getattr(decoded, field)[chosen]
+            torch.testing.assert_close(getattr(part, field), expected, rtol=0, atol=1e-4)
+        alone = decoder(gaussians[chosen], KEY)
+        moved = _distance(alone, decoded[chosen], "means")
+        assert moved > 1e-3 if released else moved < 1e-4
 
 
-def test_keys_and_positions_and_colours_all_reach_the_result() -> None:
-    gaussians, decoder = random_gaussians(), _trained(conditioning="bias")
-    decoded = decoder(gaussians, _embedding(0))
-    assert _distance(decoded, decoder(gaussians, _embedding(1)), "opacity_logits") > 1e-3
+def test_decoding_in_parts_gives_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Sizes are the file's: otherwise 3 kB could ask for 34 kB for each Gaussian at once."""
+    decoder, stego = _decoder(released=True), random_gaussians()
+    whole, sizes = decoder(stego, KEY), []
+    decoder.register_forward_pre_hook(lambda _, given: sizes.append(len(given[0])))
+    monkeypatch.setattr("keyss.methods.keyss.decoder.DECODED_NUMBERS", 20_000)
+    in_parts = decoder.decode(stego, KEY)
+    assert max(sizes) < len(stego) == sum(sizes)
+    for name, values in vars(whole).items():
+        torch.testing.assert_close(getattr(in_parts, name), values)
+
+
+def test_the_number_of_weights_is_that_of_the_layers() -> None:
+    shape = DecoderShape(hidden=(5, 7), branch=3)
+    weights = [each for name, each in Decoder(shape).named_parameters() if name.endswith("weight")]
+    assert shape.weights == sum(map(torch.numel, weights))
+    assert replace(shape, kind="latent").weights == 0
+
+
+def test_all_attributes_reach_the_result() -> None:
+    gaussians, decoder = random_gaussians(), _decoder()
+    decoded = decoder(gaussians, KEY)
     for field in FIELD_OF.values():
         values = {f.name: getattr(gaussians, f.name) for f in fields(Gaussians)}
-        values[field] = values[field] + 0.1
-        changed = decoder(Gaussians(**values), _embedding(0))
+        values[field] = values[field] + 0.3
         other = "opacity_logits" if field != "opacity_logits" else "log_scales"
-        assert _distance(changed, decoded, other) > 1e-4, field
-
-
-def test_far_positions_stay_within_the_encoding() -> None:
-    gaussians, decoder = random_gaussians(), _trained()
-    far = Gaussians(
-        gaussians.means * 1e6,
-        gaussians.quats,
-        gaussians.log_scales,
-        gaussians.opacity_logits,
-        gaussians.sh,
-    )
-    assert decoder.network._contracted(far.means).norm(dim=1).max() <= 2.0001
+        assert _distance(decoder(Gaussians(**values), KEY), decoded, other) > 1e-4, field
 
 
 def test_masks_are_read_in_any_order_and_refused_by_name() -> None:

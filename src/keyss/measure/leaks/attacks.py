@@ -22,6 +22,7 @@ from keyss.channels import is_appended
 from keyss.core import Camera, Gaussians, Scene, import_extra
 from keyss.fitting.image_metrics import subsample_views
 from keyss.keys import random_embeddings
+from keyss.keys.derivation import EMBEDDING_SIZE
 from keyss.rendering import contributions
 
 OPAQUE = 0.99  # the maximum alpha of a Gaussian in 3DGS
@@ -97,16 +98,19 @@ def file_attacks(cover: Scene, *, cover_views: int = 32, seed: int = 0) -> list[
     ]
 
 
-def decoder_attack(decode: Decode, *, restarts: int = 2, steps: int = 150, seed: int = 0) -> Attack:
+def decoder_attack(
+    decode: Decode, key_size: int = EMBEDDING_SIZE, *, restarts: int = 2, steps: int = 150, seed: int = 0
+) -> Attack:
     """The attack with a secret's decoder and everything encrypted with it, but without the key.
 
     `decode`: see `keyss.methods.opened.Opened`. Without a gradient in the embedding, the search is random.
     """
 
     def show(model: Gaussians) -> Variants:
-        embeddings = {"random": random_embeddings(restarts, torch.Generator().manual_seed(seed))}
+        generator = torch.Generator().manual_seed(seed)
+        embeddings = {"random": random_embeddings(restarts, generator, key_size)}
         for name, balance in (("most exchange", 2.0), ("most change", 0.0)):
-            search = partial(search_embeddings, decode, model, limit=SEARCH_SAMPLE, balance=balance)
+            search = partial(search_embeddings, decode, model, key_size, limit=SEARCH_SAMPLE, balance=balance)
             embeddings[name] = search(restarts=restarts, steps=steps, seed=seed)
         for name, vectors in embeddings.items():
             for index, embedding in enumerate(vectors, start=1):
@@ -123,6 +127,7 @@ def decoder_attack(decode: Decode, *, restarts: int = 2, steps: int = 150, seed:
 def search_embeddings(
     decode: Decode,
     stego: Gaussians,
+    key_size: int = EMBEDDING_SIZE,
     *,
     restarts: int = 8,
     steps: int = 150,
@@ -130,7 +135,7 @@ def search_embeddings(
     balance: float = 2.0,
     seed: int = 0,
 ) -> Tensor:
-    """[restarts, 64] unit vectors for which the decoder seems to show another scene, the best first.
+    """[restarts, key_size] unit vectors for which the decoder seems to show another scene, the best first.
 
     In the published scheme the key is a vector that enters the decoder's first layers. An attacker with the
     network can search for the vector that exchanges most Gaussians, without knowing the secret: gradient
@@ -151,7 +156,7 @@ def search_embeddings(
         change = decode(part, F.normalize(direction, dim=0)).opacities - part.opacities
         return change.abs().mean() - balance * change.mean().abs()
 
-    starts = random_embeddings(restarts, generator)
+    starts = random_embeddings(restarts, generator, key_size)
     if not exchanged(starts[0].to(stego.device).requires_grad_()).requires_grad:
         return starts
     scored = []

@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from keyss.channels.harmonics import KEPT_DEGREE, high_harmonics, row_names, with_high_harmonics
+from keyss.core.arrays import Doubles
 from keyss.core.errors import InputError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Camera
@@ -36,7 +37,8 @@ from keyss.rendering.view import contributions
 
 PRUNED_SHARE = 0.25  # of the published rows, the faintest, which `Design.pruned_steps` render without
 BASIS_SIZE = 2.0  # length of the vectors of the first basis
-NOISE_STEPS, WORTH_STEPS = 50, 100  # after which the noise, and what is pruned, is chosen anew
+BOUND = 0.9  # share of the steps after which rows are given
+NOISE_STEPS, WORTH_STEPS = 50, 100  # after which what is written, and what is pruned, is computed anew
 VIEWS, FEW_VIEWS = 64, 16  # in which contributions are measured for publishing, and in training
 _LOW = 3 * (KEPT_DEGREE + 1) ** 2  # numbers of the cover's colours that are harmonics, not a code
 
@@ -91,39 +93,106 @@ class LatentTraining(KeyssTraining):
         return FixedRows(self.fit, [placed.scene.extent for placed in self.scenes], self.generator)
 
     def step(self) -> None:
+        if self.iteration == self.binding:
+            self.bind()
+        if (
+            (self.iteration >= self.binding
+            and self.iteration % NOISE_STEPS == 0)
+            or self.iteration == self.binding
+        ):
+            high = high_harmonics(self.gaussians_of(0))
+            written = self.decoders[0].place.write(
+                high, self.ranks(self.fit.seed_of("ranks").to_bytes(32, "big"))
+            )
+            self.density["noise"] = torch.from_numpy(written - high).float().to(self.device)
         grown = self.iteration >= self.strategy.refine_stop_iter
         self.pruned = grown and float(torch.rand((), generator=self.generator)) < self.design.pruned_steps
-        if self.iteration % NOISE_STEPS == 0:
-            self.draw_noise()
         if self.pruned and ("kept.0" not in self.density or self.iteration % WORTH_STEPS == 0):
             self.choose_kept()
         super().step()
         self.pruned = False
 
+    @property
+    def binding(self) -> int:
+        """The step from which each Gaussian of a secret has its row, and the cover's geometry stays."""
+        return int(BOUND * self.iterations)
+
     @torch.no_grad()
-    def draw_noise(self) -> None:
-        """Numbers as a plain model has them in place of the latents, the same in a run that is resumed."""
-        clean = high_harmonics(self.gaussians_of(0, None))
-        own = np.random.default_rng(self.fit.seed_of(f"noise {self.iteration}"))
-        place = self.decoders[0].place
-        written = place.write(clean, own.random((len(clean), place.directions.shape[1])))
-        self.density["noise"] = torch.from_numpy(written - clean).float().to(self.device)
+    def bind(self) -> None:
+        """Give the secrets' Gaussians their rows: what matters most those that pruning removes last."""
+        rows = self.usable_rows()
+        if not len(rows):
+            raise InputError(
+                "no Gaussian of the cover has harmonics to hide one of a secret: train longer, or use "
+                '`method="carry"`'
+            )
+        for scene, decoder in enumerate(self.decoders, 1):
+            model, own = self.gaussians_of(scene), of_scene(self.parameters, scene)
+            worth = self.worth(model, scene, VIEWS).masked_fill(model.opacities < self.fit.prune_opacity, 0.0)
+            best = worth.argsort(descending=True, stable=True)[: len(rows)]
+            rest = torch.ones(len(model), dtype=torch.bool, device=self.device)
+            rest[best] = False
+            order = torch.empty_like(rest, dtype=torch.int64)
+            order[rows] = best
+            free = torch.ones_like(rest)
+            free[rows] = False
+            order[free] = rest.nonzero()[:, 0]
+            for name, parameter in own.items():
+                state = self.optimizers[f"{scene}/{name}"].state[parameter]
+                for values in (parameter.data, *state.values()):
+                    if isinstance(values, Tensor) and values.shape[:1] == parameter.shape[:1]:
+                        values.copy_(values[order].clone())
+            own["opacities"].data[free] = EMPTY  # what has no row is not published
+            decoder.fit_secret(self.latents(scene)[rows.cpu().numpy()])
+
+    def usable_rows(self) -> Tensor:
+        """[M] the rows that hide a Gaussian, the most opaque first."""
+        cover = self.gaussians_of(0).detach()
+        # An identity that occurs twice would have one pad.
+        _, index, counts = np.unique(row_names(cover), axis=0, return_inverse=True, return_counts=True)
+        once = torch.from_numpy(counts[index.reshape(-1)] == 1).to(self.device)
+        high = (cover.sh[:, (KEPT_DEGREE + 1) ** 2 :] != 0).flatten(1).any(1)
+        usable = once & high & (cover.opacities >= self.fit.prune_opacity)
+        order = cover.opacity_logits.argsort(descending=True, stable=True)
+        return order[usable[order]]
+
+    def latents(self, scene: int) -> Doubles:
+        """[N, D] of a secret's Gaussians."""
+        model, rows = self.gaussians_of(scene).detach(), self.parameters[f"{scene}/sh"].detach()
+        return self.decoders[scene - 1].to_latents(model, rows).double().cpu().numpy()
+
+    def ranks(self, entropy: bytes) -> Doubles:
+        """[N, R] what is written into the rows: encrypted latents, and noise that follows from `entropy`."""
+        count = self.decoders[0].place.directions.shape[1]
+        words = np.frombuffer(stream(entropy, "latents", 8 * len(self) * count), "<u8")
+        ranks: Doubles = ((words >> np.uint64(11)) / 2.0**53).reshape(len(self), count)
+        rows, names = self.usable_rows().cpu().numpy(), row_names(self.gaussians_of(0))
+        for scene, (decoder, key) in enumerate(zip(self.decoders, self.keys, strict=True), 1):
+            ranks[rows, decoder.own] = decoder.encrypt(self.latents(scene)[rows], key, names[rows])
+        return ranks
+
+    def set_rates(self) -> None:
+        super().set_rates()
+        if self.iteration > self.binding:  # pads follow from the geometry
+            for name in ("means", "quats", "scales", "opacities"):
+                self.optimizers[name].param_groups[0]["lr"] = 0.0
 
     @torch.no_grad()
     def choose_kept(self) -> None:
         """[N] what is left of each scene when the faintest PRUNED_SHARE of the published file is removed."""
-        cover = self.gaussians_of(0, None)
+        cover = self.gaussians_of(0)
         alive = cover.opacities >= self.fit.prune_opacity
         faintest = cover.opacity_logits.masked_fill(~alive, -math.inf).argsort()
         kept = alive.clone()
         kept[faintest[: int((~alive).sum()) + int(PRUNED_SHARE * int(alive.sum()))]] = False
         self.density["kept.0"] = kept
-        # Rows without harmonics hide nothing.
-        left = int((kept & (cover.sh[:, (KEPT_DEGREE + 1) ** 2 :] != 0).flatten(1).any(1)).sum())
+        left = int(kept[self.usable_rows()].sum())
         for scene in range(1, len(self.scenes)):
-            worth = self.worth(self.gaussians_of(scene), scene, FEW_VIEWS)
-            best = torch.zeros_like(kept)
-            best[worth.argsort(descending=True, stable=True)[:left]] = True
+            best = kept
+            if self.iteration < self.binding:
+                worth = self.worth(self.gaussians_of(scene), scene, FEW_VIEWS)
+                best = torch.zeros_like(kept)
+                best[worth.argsort(descending=True, stable=True)[:left]] = True
             self.density[f"kept.{scene}"] = best
 
     def worth(self, model: Gaussians, scene: int, views: int) -> Tensor:
@@ -153,39 +222,16 @@ class LatentTraining(KeyssTraining):
 
     @torch.no_grad()
     def publish(self, entropy: bytes) -> tuple[Gaussians, list[KeyssSecret]]:
-        least, place = self.fit.prune_opacity, self.decoders[0].place.to("cpu")
+        clean = self.gaussians_of(0).detach()
+        high = self.decoders[0].place.write(high_harmonics(clean), self.ranks(entropy))
         # The rows in the order of plain 3DGS, which appends what grows.
-        born = self.density["born"].cpu().argsort(stable=True)
-        cover = without_faint(self.gaussians_of(0, None).detach().to("cpu")[born], least)
-        names, high = row_names(cover), high_harmonics(cover)
-        _, index, counts = np.unique(names, axis=0, return_inverse=True, return_counts=True)
-        free = np.flatnonzero((counts[index.reshape(-1)] == 1) & (high != 0).any(axis=1))
-        if not len(free):
-            raise InputError(
-                "no Gaussian of the cover has harmonics to hide one of a secret: train longer, or use "
-                '`method="carry"`'
-            )
-        # Opaque rows are kept longest, and get what contributes most.
-        rows = free[np.argsort(-cover.opacity_logits.numpy()[free], kind="stable")]
-        count = place.directions.shape[1]
-        words = np.frombuffer(stream(entropy, "latents", 8 * len(cover) * count), "<u8")
-        ranks = ((words >> np.uint64(11)) / 2.0**53).reshape(len(cover), count)
-        for scene, key in enumerate(self.keys, 1):
-            decoder = self.decoders[scene - 1].to("cpu").requires_grad_(False)
-            model = self.gaussians_of(scene).detach().to("cpu")
-            alive = (model.opacities >= least).nonzero()[:, 0]
-            worth = self.worth(model[alive], scene, VIEWS)
-            chosen = alive[worth.argsort(descending=True, stable=True)[: len(rows)]]
-            colours = self.parameters[f"{scene}/sh"].detach().to("cpu")[chosen]
-            latents = decoder.to_latents(model[chosen], colours).double().numpy()
-            decoder.fit_secret(latents)
-            own = rows[: len(chosen)]
-            ranks[own, decoder.own] = decoder.encrypt(latents, key, names[own])
-        stego = with_high_harmonics(cover, place.write(high, ranks))
+        born = self.density["born"].argsort(stable=True)
+        stego = without_faint(with_high_harmonics(clean, high)[born].to("cpu"), self.fit.prune_opacity)
         # Training makes do without the faintest rows: only what is lost beyond them has to be made up for.
         opaque = stego[stego.opacities.argsort()[int(PRUNED_SHARE * len(stego)) :]]
         anchors, secrets = choose_anchors(stego, self.fit.known_seed), []
         for decoder, key, placed in zip(self.decoders, self.keys, self.scenes[1:], strict=True):
+            decoder = decoder.to("cpu").requires_grad_(False)
             found = visibility(decoder.decode(stego, key))[0], visibility(decoder.decode(opaque, key))[1]
             secrets.append(KeyssSecret(decoder, key.cpu(), placed.frame, anchors, *found))
         return stego, secrets

@@ -14,14 +14,13 @@ from dataclasses import replace
 from typing import Any
 
 import torch
-from torch import Tensor
 
 from keyss.channels import APPENDED, LOW_BITS, check_payload_fits
 from keyss.channels.harmonics import KEPT_DEGREE
 from keyss.core.errors import KeyssError, KeyssWarning, UsageError
 from keyss.core.similarity import Similarity
 from keyss.keys import DerivedKey
-from keyss.keys.clip import MODEL, clip_keys
+from keyss.keys.clip import MODEL, ClipKeys, clip_keys
 from keyss.keys.derivation import SALT_BYTES, expand
 from keyss.methods.base import Capabilities, Context, Plan, Source, Stego
 from keyss.methods.keyss.combined import PlacedScene
@@ -57,7 +56,7 @@ class KeyssMethod:
         latent = shape.kind == "latent"
         if latent:
             latents_of(shape.sh_degree, secrets)
-        _vectors([], options, b"")
+        _encoder(options)
         probe = KeyssSecret(
             DECODERS[shape.kind](shape), torch.zeros(shape.key_size), Similarity(), torch.rand(ANCHORS, 3)
         )
@@ -85,10 +84,14 @@ class KeyssMethod:
         """
         keys, design = [each.key for each in secrets], options.configuration
         entropy = context.entropy or os.urandom(32)
-        vectors = _vectors(keys, options, entropy)
-        training = training_of(design)
-        sources = [cover, *secrets]
-        run = training(PlacedScene.all_of(sources), vectors, options, design, context.device)
+        if encoder := _encoder(options):
+            vectors = [encoder(key) for key in keys]
+        else:
+            salt = expand(entropy, "keyss/embedding-salt", SALT_BYTES)
+            vectors = [DerivedKey.of(key, salt).embedding() for key in keys]
+        sources, random_key = [cover, *secrets], encoder.random if encoder else None
+        placed = PlacedScene.all_of(sources)
+        run = training_of(design)(placed, vectors, options, design, context.device, random_key)
         run.train(sources, context)
         stego, hidden = run.publish(entropy)
         payloads = [secret.payload() for secret in hidden]
@@ -110,13 +113,9 @@ def training_of(design: Design) -> type[KeyssTraining]:
     return LatentTraining if design.decoder.kind == "latent" else KeyssTraining
 
 
-def _vectors(keys: Sequence[str], options: KeyssOptions, entropy: bytes) -> list[Tensor]:
-    """k of each key, for the decoder. Raises BackendError where CLIP is missing."""
-    if options.key_encoder == "clip":
-        encoder = clip_keys(options.clip_model or MODEL)
-        return [encoder(key) for key in keys]
-    salt = expand(entropy, "keyss/embedding-salt", SALT_BYTES) if keys else b""
-    return [DerivedKey.of(key, salt).embedding() for key in keys]
+def _encoder(options: KeyssOptions) -> ClipKeys | None:
+    """CLIP, if it turns keys into vectors. Raises BackendError where it is missing."""
+    return clip_keys(options.clip_model or MODEL) if options.key_encoder == "clip" else None
 
 
 METHOD = KeyssMethod()

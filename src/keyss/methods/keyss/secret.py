@@ -111,15 +111,14 @@ class KeyssSecret:
         return decoded if frame == "cover" else self.frame.inverse().apply_gaussians(decoded)
 
     def decode(self, stego: Gaussians, key: Tensor) -> Gaussians:
-        """D(stego, k) for the vector [K] of a key; see `Opened.decode`.
+        """D(stego, k) for the vector [K] of a key, or `stego` itself where that is the cover.
 
         Appended Gaussians are left out: they came after the training.
         """
         decoder, key = self.decoder.to(stego.device), key.to(stego.device)
         own = stego[~is_appended(stego)].with_sh_degree(decoder.shape.sh_degree)
-        if torch.is_grad_enabled():
-            return decoder(own, key)  # type: ignore[no-any-return]
-        return decoder.decode(own, key)
+        decoded: Gaussians = decoder(own, key) if torch.is_grad_enabled() else decoder.decode(own, key)
+        return stego if decoded is own else decoded
 
     def remains(self, revealed: Gaussians) -> Remains:
         """See `Opened.remains`; Gaussians that are never rendered do not count."""

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -57,12 +57,13 @@ class KeyssTraining(JointRun):
         options: MethodOptions,
         design: Design,
         device: torch.device,
+        random_key: Callable[[torch.Generator], Tensor] | None = None,  # [K] that of a random key
     ) -> None:
         count = len(scenes)
         names = [role_of(scene, count) for scene in range(count)]
         super().__init__([placed.scene for placed in scenes], options.fit, device, names)
         self.scenes, self.options, self.design = scenes, options, design
-        self.keys = [key.to(device) for key in keys]
+        self.keys, self.random_key = [key.to(device) for key in keys], random_key
         self.betas = [design.beta_cover, *[design.beta_secret] * (count - 1)]
         self.poses = CombinedPoses(scenes, device)
         self.owners = chosen_scenes(design.poses, count)
@@ -102,6 +103,8 @@ class KeyssTraining(JointRun):
         """[K] the vector of a key that opens nothing, drawn anew at every step."""
         if not self.design.beta_incorrect:
             return None
+        if self.random_key is not None:
+            return self.random_key(self.generator).to(self.device)
         return random_embeddings(1, self.generator, len(self.keys[0]))[0].to(self.device)
 
     def losses(self, poses: Sequence[Pose], wrong_key: Tensor | None) -> tuple[Tensor, list[Rendered]]:

@@ -89,6 +89,7 @@ class HandedSecret:
     handed: HandedTensors
     show: Show
     decode: None = None
+    key_size: int = 0
 
     @property
     def frame(self) -> Similarity | None:

@@ -25,6 +25,7 @@ class CarriedSecret:
     bits: int  # of a record, or of a Gaussian in a payload
     frame: None = None
     decode: None = None
+    key_size: int = 0
 
     def reveal(self, stego: Gaussians, *, frame: Frame = "secret", force: bool = False) -> Gaussians:
         """The Gaussians that are left, which compensate for those that were lost with their carriers."""

@@ -1,0 +1,210 @@
+"""The design `latent`: what is encrypted, what a row gives back, and its training."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from scipy.stats import kstest
+
+from channels.low_bits.trained_like import trained_like
+from channels.test_harmonics import heavy_tailed
+from keyss import Gaussians, KeyssOptions, WrongKeyError
+from keyss.channels import is_appended
+from keyss.channels.harmonics import high_harmonics, row_names, with_high_harmonics
+from keyss.core import InputError, UsageError, same_bits
+from keyss.fitting import make_optimizers, to_parameters
+from keyss.fitting.rows import FixedRows
+from keyss.measure import search_embeddings
+from keyss.methods import DecoderShape, LatentDecoder, registry
+from keyss.methods.keyss.latent import latents_of
+from methods.hiding import Hidden, check_resumes, hide_scenes, three_scenes
+from methods.keyss.small import FIT, KEYS, VECTORS, begun, small
+from tiny_scenes import random_gaussians
+
+
+def _written(secrets: int = 1, count: int = 900) -> tuple[Gaussians, list[LatentDecoder], list[np.ndarray]]:  # type: ignore[type-arg]
+    """Latents of `secrets` in the first rows of a cover."""
+    cover, latents = heavy_tailed(1000), latents_of(3, secrets)
+    decoders = []
+    for secret in range(secrets):
+        decoder = LatentDecoder(DecoderShape(kind="latent", secrets=secrets, secret=secret))
+        decoder.place.fit(cover)
+        torch.nn.init.normal_(decoder.basis, generator=torch.Generator().manual_seed(secret))
+        decoders.append(decoder.requires_grad_(False))
+    ranks = np.random.default_rng(0).random((1000, latents * secrets))
+    values = []
+    for secret, decoder in enumerate(decoders):
+        model = trained_like(count, seed=10 + secret)
+        colours = torch.cat([model.sh[:, 0], model.sh[:, 1:].flatten(1)[:, : latents - 13]], dim=1)
+        values.append(decoder.to_latents(model, colours).double().numpy())
+        decoder.fit_secret(values[-1])
+        own = decoder.encrypt(values[-1], VECTORS[secret], row_names(cover)[:count])
+        ranks[:count, decoder.own] = own
+    stego = with_high_harmonics(cover, decoders[0].place.write(high_harmonics(cover), ranks))
+    return stego, decoders, values
+
+
+@pytest.mark.parametrize("secrets", [1, 2])
+def test_every_secret_comes_back_under_its_key_alone(secrets: int) -> None:
+    stego, decoders, values = _written(secrets)
+    for index, (decoder, expected) in enumerate(zip(decoders, values, strict=True)):
+        decoded = decoder.decode(stego, VECTORS[index])
+        assert len(decoded) == 900
+        wanted = decoder.to_gaussians(torch.from_numpy(expected).float())
+        torch.testing.assert_close(decoded.means, wanted.means, atol=0.01, rtol=0)
+        torch.testing.assert_close(decoded.sh, wanted.sh, atol=0.02, rtol=0)
+        turned = (decoded.quats * wanted.quats).sum(1).abs()
+        assert float(turned.min()) > 0.999
+        assert float((decoded.means - wanted.means).abs().median()) < 1e-5
+        for wrong in (VECTORS[2], VECTORS[1 - index]):
+            assert decoder.decode(stego, wrong) is stego
+
+
+def test_what_is_written_is_uniform_whatever_is_encrypted() -> None:
+    """Constant latents would come out as one rank without the pad."""
+    _, (decoder,), _ = _written()
+    names = row_names(trained_like(2000, seed=3))
+    constant = np.tile(decoder.knots.double().numpy()[:, 16], (2000, 1))
+    ranks = decoder.encrypt(constant, VECTORS[0], names)
+    assert kstest(ranks.ravel(), "uniform").pvalue > 1e-6
+    assert kstest((ranks[:, 0] - ranks[:, 1]) % 1, "uniform").pvalue > 1e-6
+
+
+def test_pads_of_two_secrets_under_one_key_differ() -> None:
+    """Otherwise the difference of two files would be the difference of their secrets."""
+    _, (decoder,), (values,) = _written()
+    names = row_names(trained_like(900))
+    first = decoder.encrypt(values, VECTORS[0], names)
+    decoder.fit_secret(values + 1e-9)
+    second = decoder.encrypt(values, VECTORS[0], names)
+    assert kstest(((first - second) % 1).ravel(), "uniform").pvalue > 1e-6
+
+
+def test_nearly_the_key_is_as_wrong_as_any_and_a_search_finds_nothing() -> None:
+    stego, (decoder,), _ = _written()
+    near = VECTORS[0].clone()
+    near[0] = torch.nextafter(near[0], torch.tensor(2.0))
+    assert decoder.decode(stego, near) is stego
+    for found in search_embeddings(decoder.decode, stego, restarts=2, steps=20):
+        assert decoder.decode(stego, found) is stego
+
+
+def test_rows_may_be_pruned_reordered_and_repeated_but_not_exchanged() -> None:
+    stego, (decoder,), _ = _written()
+    whole = decoder.decode(stego, VECTORS[0])
+    assert same_bits(decoder.decode(Gaussians.cat([stego, stego]), VECTORS[0]), whole)
+    backwards = decoder.decode(stego[torch.arange(999, -1, -2)], VECTORS[0])
+    assert same_bits(backwards[torch.arange(len(backwards) - 1, -1, -1)], whole[1::2])
+    exchanged = replace(stego, sh=torch.cat([stego.sh[:, :4], stego.sh[:, 4:].roll(1, 0)], dim=1))
+    assert decoder.decode(exchanged, VECTORS[0]) is exchanged
+
+
+def test_a_gaussian_has_room_for_two_secrets_and_no_more() -> None:
+    assert [latents_of(3, 1), latents_of(3, 2), latents_of(2, 1)] == [24, 17, 13]
+    for degree, secrets in ((3, 3), (2, 2), (1, 1), (0, 1)):
+        with pytest.raises(UsageError, match="no room for one of each"):
+            latents_of(degree, secrets)
+
+
+@pytest.fixture(scope="module")
+def hidden() -> Hidden:
+    scenes, models = three_scenes()
+    return hide_scenes(scenes, KEYS, small("latent"), plains=models)
+
+
+@pytest.mark.parametrize("secret", [0, 1])
+def test_hiding_all_the_way(hidden: Hidden, secret: int) -> None:
+    """A trained secret is opened as it was published, and the rest of the file is the cover's."""
+    opened = registry.open_model(hidden.stego, KEYS[secret])
+    assert opened.fingerprint() == hidden.opened[secret].fingerprint()
+    revealed = opened.reveal(hidden.stego)
+    assert opened.remains(revealed).whole
+    assert len(revealed) > 100
+    for key in ("First key", "other"):
+        with pytest.raises(WrongKeyError):
+            registry.open_model(hidden.stego, key)
+
+
+def test_a_model_that_was_moved_is_refused(hidden: Hidden) -> None:
+    for other in (replace(hidden.stego, means=hidden.stego.means + 1e-2), random_gaussians(seed=9)):
+        with pytest.raises(InputError, match="moved or rounded"):
+            hidden.opened[0].reveal(other)
+
+
+def test_losses_beyond_the_faintest_rows_are_made_up_for(hidden: Hidden) -> None:
+    secret, own = hidden.opened[0], hidden.stego[~is_appended(hidden.stego)]
+    opaque = own[own.opacities.argsort(descending=True)[: int(0.75 * len(own))]]
+    alone = secret.decode(opaque, secret.key)  # type: ignore[attr-defined]
+    assert same_bits(secret.reveal(opaque, frame="cover"), alone[alone.opacities >= 1 / 255])
+    few = own[::2]
+    alone = secret.decode(few, secret.key)  # type: ignore[attr-defined]
+    more = secret.reveal(few, frame="cover")
+    assert more.opacities.mean() > alone[alone.opacities >= 1 / 255].opacities.mean()
+
+
+def test_an_interrupted_training_resumes_to_the_same_result(tmp_path: Path) -> None:
+    options = small("latent").with_fit(iterations=40, grow_every=5)
+    check_resumes(options, tmp_path, "hide", three_scenes()[1][:2])
+
+
+def test_a_cover_without_harmonics_is_refused() -> None:
+    scenes, models = three_scenes()
+    with pytest.raises(InputError, match="train longer"):
+        hide_scenes(
+            scenes[:2],
+            KEYS[:1],
+            small("latent"),
+            plains=[models[0].with_sh_degree(0).with_sh_degree(3), models[1]],
+        )
+    with pytest.raises(InputError, match="train longer"):
+        hide_scenes(scenes[:2], KEYS[:1], small("latent").with_fit(iterations=1), plains=models[:2])
+
+
+def test_the_cover_does_not_depend_on_the_secret() -> None:
+    """Nor does its file, but for what is encrypted: nobody learns anything from which Gaussians it has."""
+    scenes, models = three_scenes()
+    stegos = [
+        hide_scenes([scenes[0], scenes[s]], KEYS[:1], small("latent"), plains=[models[0], models[s]]).stego
+        for s in (1, 2)
+    ]
+    first, second = (stego[~is_appended(stego)] for stego in stegos)
+    assert len(first) == len(second)
+    assert torch.equal(first.means, second.means)
+    assert torch.equal(first.sh[:, :1], second.sh[:, :1])
+
+
+def test_rows_are_in_the_order_in_which_plain_3dgs_makes_them() -> None:
+    """Its own points first, and what grew later at the end."""
+    scenes, models = three_scenes()
+    run = begun(small("latent").with_fit(iterations=120), scenes[:2], models[:2])
+    for _ in range(120):
+        run.step()
+    born = run.density["born"]
+    fresh = born >= len(born)
+    assert 0 < fresh.sum() < len(born)
+    stego, _ = run.publish(bytes(32))
+    old = ~fresh & (run.gaussians().opacities >= FIT.prune_opacity)
+    assert torch.equal(stego.means[: int(old.sum())], run.gaussians().means[old])
+
+
+def test_clones_come_before_both_parts_of_splits_each_in_the_order_of_their_sources() -> None:
+    fit = replace(FIT, max_gaussians=100)
+    model = trained_like(12)
+    logits = torch.cat([torch.zeros(6), torch.full((6,), -8.0)])  # six places
+    large = torch.tensor([False] * 3 + [True] * 9)[:, None]
+    scales = torch.where(large, 0.0, -9.0).expand(12, 3).clone()
+    params = to_parameters(replace(model, opacity_logits=logits, log_scales=scales), torch.device("cpu"))
+    density = FixedRows(fit, [1.0], torch.Generator().manual_seed(0))
+    born = torch.arange(12).flip(0)
+    grown = density.grow(params, make_optimizers(params, fit, 1.0), 0, torch.ones(12), 1, born)
+    assert grown.tolist() == [9, 10, 11, 5, 4, 3, 6, 7, 8]
+
+
+def test_too_many_secrets_are_refused_before_anything_is_trained() -> None:
+    sources, options = [None] * 4, KeyssOptions(fit=FIT)
+    with pytest.raises(UsageError, match="SH degree 3 with 3 secrets"):
+        registry.get("keyss").prepare(sources, options)  # type: ignore[arg-type]
