@@ -41,7 +41,7 @@ OLDEST_QUICK := tests/core tests/files tests/keys tests/rendering
 
 FAST := -m "not slow and not cuda and not real"
 # A process that is done takes the second half of what another has still to do: neighbours, which share what is
-# expensive, stay together but for a few. What measures time runs alone.
+# expensive, stay together but for a few.
 PARALLEL := -n $(JOBS) --dist worksteal
 # Each has one thread: those of BLAS and OpenMP wait for each other busily where others need the cores. Tests of
 # threads ask for several.
