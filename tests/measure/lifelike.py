@@ -14,14 +14,11 @@ from keyss.core import SH_C0, Gaussians, Similarity
 
 
 def lifelike(count: int, seed: int = 0) -> Gaussians:
-    """Flat Gaussians, mostly lying one way, mostly transparent, a few of them huge; colour follows place.
-
-    Computed in double precision and rounded once, so that they are the same on every processor.
-    """
+    """Flat Gaussians, mostly lying one way, mostly transparent, a few of them huge; colour follows place."""
     generator = torch.Generator().manual_seed(seed)
 
     def normal(*shape: int) -> torch.Tensor:
-        return torch.randn(*shape, generator=generator, dtype=torch.float64)
+        return torch.randn(*shape, generator=generator)
 
     means = normal(count, 3) * torch.exp(0.5 * normal(count, 1))
     log_scales = -4 + 1.25 * normal(count, 1) + 0.35 * normal(count, 3) - torch.tensor([0.0, 0.0, 1.0])
@@ -36,7 +33,7 @@ def lifelike(count: int, seed: int = 0) -> Gaussians:
         log_scales=log_scales,
         opacity_logits=-2.1 + 1.5 * normal(count),
         sh=sh,
-    ).map(torch.Tensor.float)
+    )
 
 
 def doubled_scales(model: Gaussians) -> Gaussians:
