@@ -14,7 +14,8 @@ from keyss.keys import DerivedKey
 def trained_like(count: int, seed: int = 0, sh_degree: int = 3) -> Gaussians:
     """Normal numbers of the magnitudes that training gives, every bit of their mantissas random.
 
-    The same to the bit on every processor, for they are drawn in double precision.
+    Drawn in double precision and rounded once, so that they do not differ in the last bits from one processor
+    to the next.
     """
     generator = torch.Generator().manual_seed(seed)
 
