@@ -5,6 +5,7 @@
 #   make test-real     one small real scene end to end, from ../shared/data or $KEYSS_TEST_DATA
 #   make test-slow     real scenes at full length; `make test-cuda` what needs a GPU
 #   make test-oldest   the fast tests with the oldest versions that pyproject.toml declares, in .venv-oldest
+#   make test-processors   the fast tests as older processors compute (ARGS="tests/fitting" for some of them)
 #   make coverage      the fast tests, and which lines they reach
 #   make web           build the viewer of web/ into src/keyss/viewer/assets (needs node, which its users do not)
 #   make reader        the viewer's reader as an npm package, in out/keyss-reader
@@ -40,17 +41,26 @@ OLDEST_QUICK := tests/core tests/files tests/keys tests/rendering
 
 FAST := -m "not slow and not cuda and not real"
 # A process that is done takes the second half of what another has still to do: neighbours, which share what is
-# expensive, stay together but for a few. What measures time runs alone.
+# expensive, stay together but for a few.
 PARALLEL := -n $(JOBS) --dist worksteal
 # Each has one thread: those of BLAS and OpenMP wait for each other busily where others need the cores. Tests of
 # threads ask for several.
-test coverage: export OMP_NUM_THREADS = 1
+test coverage test-on-baseline test-on-avx2: export OMP_NUM_THREADS = 1
+
+# Last bits differ from processor to processor and trainings amplify them, which no test may depend on. torch
+# and numba are held to the instructions that every 64-bit processor has, and to those of 2013. numba takes the
+# features of this processor for another one, too, unless it is told that there are none beyond that one's own.
+PROCESSORS ?= baseline $(if $(filter x86_64,$(shell uname -m)),avx2)
+AS_BASELINE := ATEN_CPU_CAPABILITY=default NUMBA_CPU_NAME=generic NUMBA_CPU_FEATURES= \
+  NUMBA_NUM_THREADS=1 PYTHONHASHSEED=1
+AS_AVX2 := ATEN_CPU_CAPABILITY=avx2 NUMBA_CPU_NAME=haswell NUMBA_CPU_FEATURES= \
+  NUMBA_NUM_THREADS=2 PYTHONHASHSEED=2
 
 # Where it is set, each of the hundreds of processes that tests start compiles all of keyss.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test web reader test-web test-web-units test-real test-slow test-cuda test-oldest test-oldest-quick coverage \
-  lint format docs pictures venv clean \
+.PHONY: demo test web reader test-web test-web-units test-real test-slow test-cuda test-oldest test-oldest-quick \
+  test-processors test-on-baseline test-on-avx2 coverage lint format docs pictures venv clean \
   benchmark-check benchmark-baseline benchmark-rasterizer
 
 demo: $(PACKAGE)
@@ -58,6 +68,14 @@ demo: $(PACKAGE)
 
 test: lint
 	$(BIN)/python -m pytest $(FAST) $(PARALLEL) $(ARGS)
+
+test-processors: $(PROCESSORS:%=test-on-%)
+
+test-on-baseline: $(DEV)
+	$(AS_BASELINE) $(BIN)/python -m pytest $(FAST) $(PARALLEL) $(ARGS)
+
+test-on-avx2: $(DEV)
+	$(AS_AVX2) $(BIN)/python -m pytest $(FAST) $(PARALLEL) $(ARGS)
 
 test-real: $(DEV)
 	$(BIN)/python -m pytest -m real $(ARGS)

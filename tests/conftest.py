@@ -14,7 +14,6 @@ from hypothesis import settings
 
 import keyss  # noqa: F401  before any test module imports torch: see keyss._threads
 import uncompiled  # noqa: F401  before any test module imports gsply
-from alone import pytest_runtest_protocol  # noqa: F401  hook
 from cheap_keys import choose_costs, pytest_sessionstart  # noqa: F401  hook
 from child_coverage import count_or_not
 from same_draws import begin_draws, draw_the_same, pytest_fixture_setup  # noqa: F401  hook

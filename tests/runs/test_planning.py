@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import os
 import shutil
-import time
 from collections import namedtuple
 from functools import partial
 from pathlib import Path
@@ -54,11 +54,10 @@ def test_a_bound_has_a_stage_where_one_is_fitted() -> None:
         assert {stage.name for stage in stages} <= {"bound of the secret"}  # the cover's is its plain model
 
 
-@pytest.mark.alone
 @pytest.mark.argon2
 @pytest.mark.parametrize("given", [True, False])
 def test_estimates_are_near_the_measured_run(given: bool, tmp_path: Path) -> None:
-    """With wide bounds, since the machine has other users."""
+    """In time of processors, which others do not take; fast and slow ones differ by an order of magnitude."""
     if given:
         cover, secret = trained_like(20_000), Secret(trained_like(9000, 1), KEY)
         method = CarryOptions()
@@ -66,10 +65,10 @@ def test_estimates_are_near_the_measured_run(given: bool, tmp_path: Path) -> Non
         cover, secret = tiny_scene(0), Secret(tiny_scene(1), KEY)  # type: ignore[assignment]
         method = CarryOptions(fit=FIT.__class__(iterations=300, max_gaussians=400, seed=0), publish="any")
     plan = keyss.hide(cover, [secret], method=method, dry_run=True).plan
-    start = time.perf_counter()
+    start = sum(os.times()[:4])  # of this process and of those that it started
     result = keyss.hide(cover, [secret], method=method, out=tmp_path / "run", min_psnr=0)
-    seconds = time.perf_counter() - start
-    assert seconds / 6 < plan.seconds < 6 * seconds
+    seconds = sum(os.times()[:4]) - start
+    assert seconds / 10 < plan.seconds < 10 * seconds
     files = [path for path in (tmp_path / "run").rglob("*") if path.is_file()]
     assert len(result.stego) <= plan.gaussians
     assert (tmp_path / "run/publish/stego.ply").stat().st_size <= plan.file_bytes

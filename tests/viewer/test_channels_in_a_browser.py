@@ -55,14 +55,16 @@ def published(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]
 def test_keys_open_what_keyss_reveals_and_a_wrong_one_nothing(
     tab: Visit, published: Callable[[str], Path], tmp_path: Path, kind: str
 ) -> None:
+    """Every key takes as many derivations, which are nearly all of the time."""
     stego = published(kind)
     tab.goto(export_html(stego, tmp_path / "page.html")[0].as_uri() + POSE)
     cover = tab.picture()
     assert psnr(cover, drawn(read_model(stego), POSE)) > CLOSE
-    tab.finds_nothing("another key")
+    work = tab.finds_nothing("another key")
+    assert len(work) > 1
     for key in keys_of(kind):
         revealed = keyss.reveal(stego, key).gaussians
-        tab.try_key(key)
+        assert tab.try_key(key) == work
         tab.at(POSE)
         shown = tab.picture()
         assert psnr(shown, drawn(revealed, POSE)) > CLOSE > psnr(shown, cover)
@@ -78,27 +80,10 @@ def test_a_file_in_colours_is_saved_and_all_keys_look_alike(tab: Visit, tmp_path
     tab.goto(export_html(tmp_path / "stego.spz", tmp_path / "page.html")[0].as_uri())
     seen = []
     for key in ("another key", KEYS[0]):
-        tab.page.evaluate(
-            """() => {
-                const [seen, shown] = [window.seen = [], document.getElementById('progress')];
-                const observer = new MutationObserver(() => seen.push(shown.value));
-                observer.observe(shown, { attributeFilter: ['value'] });
-            }"""
-        )
-        tab.try_key(key)
+        seen.append(tab.try_key(key, thorough=True))
         assert tab.page.locator("#save").is_visible() == (key == KEYS[0])
-        seen.append(list(dict.fromkeys(tab.page.evaluate("window.seen"))))
     assert seen[0] == seen[1]
     assert len(seen[0]) > 17
     assert tab.page.locator("#save").inner_text() == f"Save a note.txt ({len(note.data)} bytes)"
     assert tab.saved("#save", tmp_path / "note.txt") == note.name
     assert (tmp_path / "note.txt").read_bytes() == note.data
-
-
-@pytest.mark.alone
-@pytest.mark.parametrize("kind", ["ply", "spz", "appended.spz", ROWS])
-def test_a_wrong_key_takes_as_long_as_a_right_one(
-    tab: Visit, published: Callable[[str], Path], tmp_path: Path, kind: str
-) -> None:
-    tab.goto(export_html(published(kind), tmp_path / "page.html")[0].as_uri())
-    tab.takes_as_long_for_each("wrong", KEYS[0], "wrong again", KEYS[0], "and again")

@@ -12,7 +12,11 @@ from keyss.keys import DerivedKey
 
 
 def trained_like(count: int, seed: int = 0, sh_degree: int = 3) -> Gaussians:
-    """Normal numbers of the magnitudes that training gives, every bit of their mantissas random."""
+    """Normal numbers of the magnitudes that training gives, every bit of their mantissas random.
+
+    Drawn in double precision and rounded once, so that they do not differ in the last bits from one processor
+    to the next.
+    """
     generator = torch.Generator().manual_seed(seed)
 
     def normal(*shape: int, mean: float = 0.0, spread: float = 1.0) -> torch.Tensor:
@@ -34,7 +38,7 @@ def rounded(model: Gaussians, seed: int = 0, step: float = 4e-5) -> Gaussians:
     0 to 3 are ones in 22, 33, 43 and 47 % of the cases; 22, 37, 42 and 48 % in a model trained in that way.
     """
     generator = torch.Generator().manual_seed(seed)
-    steps = step * torch.randn(model.sh[:, 1:].shape, generator=generator)
+    steps = (step * torch.randn(model.sh[:, 1:].shape, generator=generator, dtype=torch.float64)).float()
     return replace(model, sh=torch.cat([model.sh[:, :1], (model.sh[:, 1:] + steps) - steps], dim=1))
 
 

@@ -18,13 +18,18 @@ def plain(seed: int, count: int = COUNT) -> Gaussians:
     """Harmonics of many magnitudes, large Gaussians last, no opacity below 0.005."""
     model = trained_like(count, seed)
     generator = torch.Generator().manual_seed(1000 + seed)
-    strength = torch.exp(2.0 * torch.randn(count, 1, 1, generator=generator) - 3.0)
-    sh = torch.cat([model.sh[:, :1], model.sh[:, 1:] * strength], dim=1)
+
+    def normal(*shape: int) -> torch.Tensor:
+        return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+    # In double precision and rounded once: single precision ends in other bits on other processors.
+    strength = torch.exp(2.0 * normal(count, 1, 1) - 3.0)
+    sh = torch.cat([model.sh[:, :1], (model.sh[:, 1:] * strength).float()], dim=1)
     # Low bits of their own, for subtracting leaves zeros in numbers near 0.
-    noise = 1e-5 * torch.randn(count, generator=generator, dtype=torch.float64)
+    noise = 1e-5 * normal(count)
     logits = model.opacity_logits.double().abs() * 2.5 - 5.2 + noise
     model = replace(model, sh=sh, opacity_logits=logits.float())
-    first = model.log_scales.mean(1) + torch.randn(count, generator=generator)
+    first = model.log_scales.double().mean(1) + normal(count)
     return model[first.argsort()]
 
 

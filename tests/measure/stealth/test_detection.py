@@ -7,7 +7,7 @@ import pytest
 from sklearn.metrics import roc_auc_score
 
 from keyss.measure import stealth_statistics
-from measure.stealth.careless import overwritten, plain, plain_rounded
+from measure.stealth.careless import overwritten, plain_rounded
 from stealth_detection import Examples, areas, learned_detectors, single_detectors
 
 SCENES = 4
@@ -59,15 +59,18 @@ def test_a_direction_that_holds_in_one_scene_only_does_not_count() -> None:
     assert next(each.auc for each in found if each.name == "1") < 0.75
 
 
-@pytest.mark.parametrize(("natural", "least", "most"), [(plain_rounded, 0.95, 1.0), (plain, 0.2, 0.8)])
-def test_careless_embedding_is_told_where_bits_were_not_random(natural, least: float, most: float) -> None:  # type: ignore[no-untyped-def]
+def test_careless_embedding_is_told_where_bits_were_not_random() -> None:
+    """By one statistic in every pair: its means, 0.38 and 0.50, are 15 standard deviations apart.
+
+    If nothing told them, the best of 250 statistics would be right in all pairs once in 600 times.
+    """
     rows, hidden, scenes, models = [], [], [], []
     for seed in range(12):
-        model = natural(seed)
+        model = plain_rounded(seed)
         for kind, file in enumerate((model, overwritten(model, seed))):
             rows.append({name: each.value for name, each in stealth_statistics(file).items()})
             hidden.append(kind)
             scenes.append(str(seed % SCENES))
             models.append(str(seed))
-    examples = Examples.of(rows, hidden, scenes, models)
-    assert least <= max(each.auc for each in learned_detectors(examples)) <= most
+    found, _ = single_detectors(Examples.of(rows, hidden, scenes, models))
+    assert found[0].auc == 1

@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 from llvmlite import ir
+from llvmlite.ir.instructions import FastMathFlags
 from numba import extending, types
 from numba.core import cgutils
 from numba.extending import lower_builtin, models, register_model, type_callable
@@ -179,12 +180,22 @@ def load_interleaved(typingctx, array, index):
     return types.UniTuple(float32x8, 3)(array, index), codegen
 
 
+class _NoFlags(FastMathFlags):
+    """numba adds the flags of `fastmath` to every call; none of them reaches this one."""
+
+    def add(self, name):
+        pass
+
+
 @intrinsic
 def fused_multiply_add(typingctx, a, b, c):
-    """a b + c of float32 numbers, rounded once."""
+    """a b + c of float32 numbers, rounded once, also by processors without such an instruction."""
 
     def codegen(context, builder, signature, arguments):
-        return builder.fma(*arguments)
+        # With `afn` or `contract` LLVM makes a product and a sum of it there, which round twice.
+        found = builder.fma(*arguments)
+        found.fastmath = _NoFlags()
+        return found
 
     return types.float32(types.float32, types.float32, types.float32), codegen
 
