@@ -28,7 +28,7 @@ from keyss.core.gaussians import Gaussians
 from keyss.core.similarity import Similarity
 from keyss.files.models import write_model
 from keyss.keys import generate_key, random_embeddings
-from keyss.methods import Decoder, DecoderShape, HiddenSecret, choose_anchors, open_model
+from keyss.methods import Decoder, DecoderShape, KeyssSecret, choose_anchors, open_model
 
 import torch
 
@@ -41,10 +41,9 @@ def main() -> None:
     right, wrong = generate_key(), generate_key()
     plain = trained_like(asked.gaussians)
     generator = torch.Generator().manual_seed(0)
-    decoder = Decoder(DecoderShape()).requires_grad_(False)
-    decoder.prepare(plain, random_embeddings(1, generator)[0])
-    anchors = choose_anchors(plain, generator)
-    secret = HiddenSecret(decoder, Similarity(), anchors)
+    decoder = Decoder(DecoderShape(mask=("op",))).requires_grad_(False)
+    key = random_embeddings(1, generator)[0]
+    secret = KeyssSecret(decoder, key, Similarity(), choose_anchors(plain, 0))
     contents = [(right, secret.payload())]
     files = {
         "low bits": LOW_BITS.prepare(plain).embed(contents),

@@ -13,16 +13,17 @@ import pytest
 import keyss
 from channels.low_bits.trained_like import trained_like
 from fitting.test_plain import InterruptAt
-from keyss import CarryOptions, FitConfig, Gaussians, KeyssOptions, Secret
+from keyss import CarryOptions, FitConfig, Gaussians, Secret
 from keyss.channels import AppendedReader, LowBitsReader, is_appended
 from keyss.core import Interrupted, OutputError, WrongKeyError
 from keyss.keys import DerivedKey, derivation
 from keyss.methods import MethodOptions
+from methods.keyss.small import small
 from tiny_scenes import tiny_scene
 
 FIT = FitConfig(iterations=20, max_gaussians=300, grow_start=0.2, grow_every=5, evaluate_every=0)
 KEY = "a key of many characters: 93hXmQ2"
-JOINT = KeyssOptions(design="mlp", fit=FIT, hidden=(8, 8), branch=8)
+JOINT = small("published", FIT)
 # In appended Gaussians: low bits of so small a cover have no room now and then, depending on the processor.
 CARRIED = CarryOptions(fit=FIT, publish="any")
 METHODS = [replace(CARRIED, refit="always"), CARRIED]

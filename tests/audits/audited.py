@@ -14,17 +14,18 @@ import msgspec
 import pytest
 
 import keyss
-from keyss import KeyssOptions, Secret
+from keyss import Secret
 from keyss.audits import Audit, audit
 from keyss.core import KeyssWarning
 from keyss.measure import Change, converters, half_floats, random_pruning
 from keyss.measure.robustness import survival
+from methods.keyss.small import small
 from test_api import CONFIG, write_nerfstudio
 from tiny_scenes import random_gaussians, tiny_scene
 
 KEYS = ("the key of a treasure", "the key of a map")
 # There are decoders then, and so there is something to be measured of wrong keys.
-JOINT = KeyssOptions(design="mlp", fit=CONFIG.fit, hidden=(8, 8), branch=8)
+JOINT = small("published", CONFIG.fit)
 
 
 def audited_run(root: Path) -> None:

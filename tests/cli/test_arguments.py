@@ -54,7 +54,18 @@ class TestArguments:
     def test_options_override_the_preset(self, keyss: Run, hidden: list[Any]) -> None:
         said = keyss(
             *("hide", "--cover", "A", "--secret", "B", "-o", "out", "--preset", "quick", "--iterations", 7),
-            *("--max-gaussians", 80, "--seed", 9, "--method", "keyss", "--design", "mlp", "--mask", "xyz,sc"),
+            *(
+                "--max-gaussians",
+                80,
+                "--seed",
+                9,
+                "--method",
+                "keyss",
+                "--design",
+                "released",
+                "--mask",
+                "xyz,sc",
+            ),
             *("--width", 10),
             *("--background", 1, 0.5, 0, "--cover-model", "m.ply", "--resume", "--device", "cpu"),
         )
@@ -62,7 +73,7 @@ class TestArguments:
         _, options = hidden[0]
         config = options.pop("method")
         assert (config.fit.iterations, config.fit.max_gaussians, config.fit.seed) == (7, 80, 9)
-        assert config.mask == ("sc", "xyz")
+        assert (config.configuration.name, config.configuration.decoder.mask) == ("released", ("sc", "xyz"))
         assert config.fit.evaluate_every == PRESETS["quick"].evaluate_every
         assert options.pop("reporter") is not None
         assert options == {

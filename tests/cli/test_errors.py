@@ -69,7 +69,7 @@ def _empty_key(folder: Path) -> list[object]:
 
 def _without_clip(folder: Path) -> list[object]:
     pytest.importorskip("transformers", reason="needs keyss[clip]")
-    return _jointly(folder, design="mlp", key_encoder="clip", clip_model=folder / "a")
+    return _jointly(folder, design="published", key_encoder="clip", clip_model=folder / "a")
 
 
 def _jointly(folder: Path, **changes: object) -> list[object]:

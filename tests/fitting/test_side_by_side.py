@@ -16,10 +16,11 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from keyss import FitConfig, KeyssOptions, Secret, hide
+from keyss import FitConfig, Secret, hide
 from keyss.core import Gaussians, InputError, Interrupted, KeyssWarning, OtherProcessError, same_bits
 from keyss.fitting import Fit, fit_scenes, side_by_side, steps_done
 from keyss.progress import Reporter
+from methods.keyss.small import small
 from other_processes import command_of, descendants, until
 from tiny_scenes import tiny_scene
 
@@ -312,7 +313,7 @@ def test_fits_run_one_after_the_other_if_the_reporter_displays_one(
 @pytest.mark.filterwarnings("ignore:.*appended Gaussians")
 def test_hiding_gives_the_same_bytes(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Plain models and bounds of both scenes."""
-    options = KeyssOptions(design="mlp", fit=replace(CONFIG, iterations=60), hidden=(8, 8), branch=8)
+    options = small("published", replace(CONFIG, iterations=60))
     found = []
     for least in (1, 10**6):
         monkeypatch.setattr(side_by_side, "MIN_STEPS", least)

@@ -14,7 +14,8 @@ import keyss  # noqa: F401  before anything imports torch
 from keyss.core import Similarity
 from keyss.fitting import FitConfig, PlainRun, TrainingRun, here, joined, save_checkpoint, train
 from keyss.keys import random_embeddings
-from keyss.methods import JointTraining, KeyssOptions, PlacedScene, registry
+from keyss.methods import KeyssTraining, PlacedScene, registry
+from methods.keyss.small import small
 from tiny_scenes import random_gaussians, tiny_scene
 
 SEED = 3
@@ -28,23 +29,14 @@ def plain(fit: FitConfig, device: torch.device) -> PlainRun:
     return PlainRun(tiny_scene(), fit, device)
 
 
-def joint(fit: FitConfig, device: torch.device) -> JointTraining:
+def joint(fit: FitConfig, device: torch.device) -> KeyssTraining:
     """With wrong keys, poses of both scenes, and all attributes decoded."""
-    options = KeyssOptions(
-        design="mlp",
-        fit=fit,
-        mask=("op", "ro", "sc", "xyz", "sh"),
-        conditioning="bias",
-        common_poses=0.5,
-        hidden=(16, 16),
-        branch=8,
-    )
-    embeddings = list(random_embeddings(1, torch.Generator().manual_seed(0)))
-    run: JointTraining = options.settings.training(_placed(), embeddings, options, device)
-    return run
+    options = small("published", fit, common_poses=0.5)
+    keys = list(random_embeddings(1, torch.Generator().manual_seed(0)))
+    return KeyssTraining(_placed(), keys, options, options.configuration, device)
 
 
-def watergs(fit: FitConfig, device: torch.device) -> JointTraining:
+def watergs(fit: FitConfig, device: torch.device) -> KeyssTraining:
     """A peer with a network, and with parameters that have no gradients at the end."""
     method: Any = registry.get("watergs")
     options = method.options(fit=fit, common_poses=0.5)

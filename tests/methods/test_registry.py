@@ -31,7 +31,7 @@ from keyss.methods import (
     encode_all,
     registry,
 )
-from methods.keyss.hiding import some_secret
+from methods.keyss.small import some_secret
 from tiny_scenes import random_gaussians
 
 KEY = "a key of many characters: 93hXmQ2"
@@ -172,7 +172,7 @@ def test_a_method_that_this_program_does_not_have_is_named(
         keyss.hide(cover, [Secret(secret, KEY)], method=WholeOptions())
 
 
-@pytest.mark.parametrize(("method", "expected"), [("keyss", "HiddenSecret"), ("carry", "CarriedSecret")])
+@pytest.mark.parametrize(("method", "expected"), [("keyss", "KeyssSecret"), ("carry", "CarriedSecret")])
 def test_what_lies_in_a_model_tells_its_method(method: str, expected: str) -> None:
     """One reading of the low bits serves all methods."""
     prepared = LOW_BITS.prepare(trained_like(2500))
@@ -189,9 +189,8 @@ def test_what_lies_in_a_model_tells_its_method(method: str, expected: str) -> No
 @pytest.mark.parametrize(
     ("name", "changes"),
     [
-        ("keyss", {"decoder_rate": 0.0, "design": "mlp"}),
-        *((name, {"secret_weight": 0.0}) for name in ("keyss", "3dgs-sh", "gs-hider")),
-        *((name, {"cover_weight": float("nan")}) for name in ("keyss", "3dgs-decoder")),
+        *((name, {"network_rate": 0.0}) for name in ("3dgs-sh", "gs-hider")),
+        ("3dgs-decoder", {"network_rate": float("nan")}),
     ],
 )
 def test_what_would_be_divided_by_nothing_is_refused(name: str, changes: dict[str, Any]) -> None:

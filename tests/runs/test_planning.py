@@ -7,18 +7,18 @@ import shutil
 from collections import namedtuple
 from functools import partial
 from pathlib import Path
-from typing import get_args
 
 import pytest
 import torch
 
 import keyss
 from channels.low_bits.trained_like import trained_like
-from keyss import CarryOptions, FitConfig, KeyssOptions, Secret
+from keyss import CarryOptions, FitConfig, Secret
 from keyss.core import OutputError
 from keyss.files import write_model
-from keyss.methods import Decoder, DesignName, registry
+from keyss.methods import registry
 from keyss.methods.peers.decoder import Convolutions, weights_of
+from methods.keyss.small import small
 from tiny_scenes import tiny_scene
 
 KEY = "a key of many characters: 93hXmQ2"
@@ -29,7 +29,7 @@ Usage = namedtuple("Usage", "total used free")
 @pytest.mark.filterwarnings("ignore:.*appended Gaussians")
 def test_stages_and_sizes_of_a_run_from_photos(tmp_path: Path) -> None:
     secrets = [Secret(tiny_scene(1), KEY), Secret(tiny_scene(2), KEY + "2")]
-    options = KeyssOptions(design="mlp", fit=FIT, hidden=(8, 8), branch=8)
+    options = small("published", FIT)
     plan = keyss.hide(tiny_scene(0), secrets, method=options, out=tmp_path / "run", dry_run=True).plan
     fits = [stage for stage in plan.stages if stage.name.startswith("plain model")]
     assert [stage.name.removeprefix("plain model of the ") for stage in fits] == [
@@ -119,12 +119,6 @@ def test_only_methods_with_networks_take_longer() -> None:
 def test_plans_count_the_weights_of_the_networks() -> None:
     for channels in (3, 16):
         assert weights_of(channels) == _weights(Convolutions(channels))
-    for design in get_args(DesignName):
-        if design == "carriers":
-            continue
-        shape = KeyssOptions(design=design).settings.shape(3)
-        key = 64 * shape.hidden[0] if shape.conditioning == "bias" else 0
-        assert shape.network_weights == _weights(Decoder(shape)) - key
 
 
 def _weights(network: torch.nn.Module) -> int:

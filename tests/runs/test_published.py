@@ -13,10 +13,11 @@ import pytest
 import keyss
 from channels.low_bits.trained_like import trained_like
 from fitting.test_plain import InterruptAt
-from keyss import CarryOptions, FitConfig, Gaussians, KeyssOptions, Secret
+from keyss import CarryOptions, FitConfig, Gaussians, Secret
 from keyss.core import Interrupted
 from keyss.methods import CarriedSecret, MethodOptions
 from keyss.runs import secret_ids
+from methods.keyss.small import small
 
 pytestmark = pytest.mark.usefixtures("umask")
 
@@ -25,9 +26,7 @@ FIT = FitConfig(iterations=4, max_gaussians=1600, evaluate_every=0)
 METHODS = {
     "refitted": CarryOptions(fit=FIT, iterations=4, refit="always"),
     "carried for any format": CarryOptions(fit=FIT, publish="any"),
-    "keyss": KeyssOptions(
-        fit=replace(FIT, iterations=16, seed=2_718_281_828), design="published", hidden=(8, 8), branch=8
-    ),
+    "keyss": small("published", replace(FIT, iterations=16, seed=2_718_281_828)),
     "carry": CarryOptions(fit=FIT),
 }
 

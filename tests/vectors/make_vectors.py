@@ -28,6 +28,7 @@ from cryptography.hazmat.primitives.ciphers.algorithms import AES  # noqa: E402
 from cryptography.hazmat.primitives.ciphers.modes import CBC, ECB  # noqa: E402
 from cryptography.hazmat.primitives.hashes import SHA256  # noqa: E402
 from cryptography.hazmat.primitives.kdf.hkdf import HKDFExpand  # noqa: E402
+from keyss.methods.keyss.rows import visibility  # noqa: E402
 from scipy.spatial.transform import Rotation  # noqa: E402
 
 from channels.codes import published as codes_examples  # noqa: E402
@@ -61,7 +62,6 @@ from keyss.methods import (  # noqa: E402  # noqa: E402
     RowSecret,
     choose_anchors,
 )
-from keyss.methods.keyss.rows import visibility  # noqa: E402
 from keyss.methods.records import whole  # noqa: E402
 from keyss.methods.records.embedding import METHOD  # noqa: E402
 from keyss.methods.records.opening import unpack  # noqa: E402

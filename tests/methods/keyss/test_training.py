@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import fields, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +35,10 @@ def hidden() -> Hidden:
 def _run(design: str = "published", **changes: Any) -> KeyssTraining:
     scenes = [tiny_scene(seed) for seed in range(3)]
     return begun(small(design, **changes), scenes, [random_gaussians(seed=seed) for seed in range(3)])
+
+
+def _moved_by(offset: torch.Tensor, cover: Gaussians, _: object) -> Gaussians:
+    return replace(cover, means=cover.means + offset)
 
 
 def _loss(image: torch.Tensor, target: torch.Tensor, weight: float) -> torch.Tensor:
@@ -89,11 +94,10 @@ def test_their_program_shows_what_the_view_sees_of_the_cover() -> None:
         with torch.no_grad():
             before = run.draw([1], camera, 0)[0].image
             behind = camera.viewmat[:3, :3].T @ (torch.tensor([0.0, 0.0, -3.0]) - camera.viewmat[:3, 3])
-            offset = behind - run.parameters["means"]
-            run.parameters["means"] += offset * (torch.arange(len(run)) < len(run) // 2)[:, None]
-            run.decoder.updated = lambda cover, _: replace(  # type: ignore[method-assign]
-                cover, means=cover.means - offset * (torch.arange(len(cover)) < len(cover) // 2)[:, None]
-            )
+            offset = (behind - run.parameters["means"]) * (torch.arange(len(run)) < len(run) // 2)[:, None]
+            run.parameters["means"] += offset
+            back = partial(_moved_by, -offset)
+            run.decoder.updated = back  # type: ignore[method-assign]
             after = run.draw([1], camera, 0)[0].image
         changed = float((after - before).abs().mean())
         assert changed > 0.01 if design == "released" else changed < 0.2

@@ -17,7 +17,7 @@ from keyss.audits import audit
 from keyss.cli import main
 from keyss.core import DecodedGaussians, InputError, Similarity, UsageError, WrongKeyError
 from keyss.fitting import State
-from keyss.methods import JointTraining, PeerOptions, PlacedScene, registry
+from keyss.methods import KeyssTraining, PeerOptions, PlacedScene, registry
 from keyss.methods.peers.watergs import COVER_BITS, graded_bits, ranges_of, read_bits, write_bits
 from keyss.runs import stego_in
 from keyss.runs.files import handed_names
@@ -167,7 +167,7 @@ def test_an_interrupted_training_goes_on_bit_for_bit(name: str) -> None:
     method: Any = registry.get(name)
     whole, resumed = (method.training(placed, options_of(name), torch.device("cpu")) for _ in range(2))
 
-    def run_to(run: JointTraining, end: int) -> State:
+    def run_to(run: KeyssTraining, end: int) -> State:
         torch.manual_seed(run.iteration)  # which `train` keeps
         while run.iteration < end:
             run.step()

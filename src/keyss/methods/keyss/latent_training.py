@@ -95,11 +95,8 @@ class LatentTraining(KeyssTraining):
     def step(self) -> None:
         if self.iteration == self.binding:
             self.bind()
-        if (
-            (self.iteration >= self.binding
-            and self.iteration % NOISE_STEPS == 0)
-            or self.iteration == self.binding
-        ):
+        since = self.iteration - self.binding
+        if since >= 0 and since % NOISE_STEPS == 0:
             high = high_harmonics(self.gaussians_of(0))
             written = self.decoders[0].place.write(
                 high, self.ranks(self.fit.seed_of("ranks").to_bytes(32, "big"))
@@ -151,8 +148,9 @@ class LatentTraining(KeyssTraining):
         # An identity that occurs twice would have one pad.
         _, index, counts = np.unique(row_names(cover), axis=0, return_inverse=True, return_counts=True)
         once = torch.from_numpy(counts[index.reshape(-1)] == 1).to(self.device)
-        high = (cover.sh[:, (KEPT_DEGREE + 1) ** 2 :] != 0).flatten(1).any(1)
-        usable = once & high & (cover.opacities >= self.fit.prune_opacity)
+        # Training leaves all harmonics of a saturated channel at 0: it has to stay like that.
+        alive = ~dead_channels(cover).any(1)
+        usable = once & alive & (cover.opacities >= self.fit.prune_opacity)
         order = cover.opacity_logits.argsort(descending=True, stable=True)
         return order[usable[order]]
 
@@ -188,7 +186,7 @@ class LatentTraining(KeyssTraining):
         self.density["kept.0"] = kept
         left = int(kept[self.usable_rows()].sum())
         for scene in range(1, len(self.scenes)):
-            best = kept
+            best = kept.clone()
             if self.iteration < self.binding:
                 worth = self.worth(self.gaussians_of(scene), scene, FEW_VIEWS)
                 best = torch.zeros_like(kept)
@@ -224,6 +222,7 @@ class LatentTraining(KeyssTraining):
     def publish(self, entropy: bytes) -> tuple[Gaussians, list[KeyssSecret]]:
         clean = self.gaussians_of(0).detach()
         high = self.decoders[0].place.write(high_harmonics(clean), self.ranks(entropy))
+        high *= ~dead_channels(clean).repeat(1, high.shape[1] // 3).cpu().numpy()
         # The rows in the order of plain 3DGS, which appends what grows.
         born = self.density["born"].argsort(stable=True)
         stego = without_faint(with_high_harmonics(clean, high)[born].to("cpu"), self.fit.prune_opacity)
@@ -235,6 +234,11 @@ class LatentTraining(KeyssTraining):
             found = visibility(decoder.decode(stego, key))[0], visibility(decoder.decode(opaque, key))[1]
             secrets.append(KeyssSecret(decoder, key.cpu(), placed.frame, anchors, *found))
         return stego, secrets
+
+
+def dead_channels(model: Gaussians) -> Tensor:
+    """[N, 3] the channels whose harmonics of degree 1 are all 0."""
+    return (model.sh[:, 1:4] == 0).all(1)
 
 
 def first_basis(plain: Gaussians, count: int, width: int) -> Tensor:
