@@ -1,10 +1,18 @@
-"""The notebooks in examples/ run, from the first cell to the last."""
+"""The examples run: notebooks from the first cell to the last, and a design of one's own."""
 
 from __future__ import annotations
 
+import runpy
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
+import torch
+
+from keyss.methods import DECODERS, open_model
+from methods.hiding import hide_scenes, three_scenes
+from methods.keyss.small import FIT
 
 nbclient = pytest.importorskip("nbclient")
 nbformat = pytest.importorskip("nbformat")
@@ -29,3 +37,21 @@ def test_a_notebook_runs(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyP
     outputs = [output for cell in notebook.cells for output in cell.get("outputs", ())]
     assert any("image/png" in output.get("data", {}) for output in outputs)
     assert not [output for output in outputs if output.get("name") == "stderr"]
+
+
+def test_a_design_of_ones_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In at most 40 lines: it trains, is published, and reveals what its decoder says and no more."""
+    path = Path(__file__).parents[1] / "examples" / "own_design.py"
+    assert len(path.read_text().splitlines()) <= 40
+    monkeypatch.setitem(DECODERS, "bounded", DECODERS["mlp"])  # removed again after the test
+    example: dict[str, Any] = runpy.run_path(str(path))
+    design = replace(example["DESIGN"], decoder_rate=1e-2)
+    options = example["KeyssOptions"](fit=replace(FIT, iterations=10), design=design)
+    scenes, models = three_scenes()
+    stego = hide_scenes(scenes[:2], ["a key"], options, plains=models[:2]).stego
+    opened = open_model(stego, "a key")
+    decoded = opened.decode(stego, opened.key)  # type: ignore[misc,attr-defined]
+    moved = (decoded.means - stego[: len(decoded)].means).abs()
+    assert type(opened.decoder).__name__ == "BoundedDecoder"  # type: ignore[attr-defined]
+    assert 0 < float(moved.max()) <= example["REACH"] + 1e-6
+    assert torch.isfinite(decoded.means).all()
