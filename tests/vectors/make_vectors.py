@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 FOLDER = Path(__file__).parent
+STRIDE = 49
 TWO_KEYS = ("first key of two", "zweiter Schlüssel")
 sys.path.insert(0, str(FOLDER.parent))
 
@@ -28,11 +29,11 @@ from cryptography.hazmat.primitives.ciphers.algorithms import AES  # noqa: E402
 from cryptography.hazmat.primitives.ciphers.modes import CBC, ECB  # noqa: E402
 from cryptography.hazmat.primitives.hashes import SHA256  # noqa: E402
 from cryptography.hazmat.primitives.kdf.hkdf import HKDFExpand  # noqa: E402
-from keyss.methods.keyss.rows import visibility  # noqa: E402
 from scipy.spatial.transform import Rotation  # noqa: E402
 
 from channels.codes import published as codes_examples  # noqa: E402
 from channels.low_bits.trained_like import trained_like  # noqa: E402
+from channels.test_harmonics import heavy_tailed  # noqa: E402
 from files.formats.examples import model_of, random_compressed, random_sog, random_spz  # noqa: E402
 from keyss.channels import (  # noqa: E402
     LOW_BITS,
@@ -53,20 +54,12 @@ from keyss.files.formats.compressed_ply import CompressedPlyCodes  # noqa: E402
 from keyss.files.formats.sog import SogCodes  # noqa: E402
 from keyss.files.formats.spz import SpzCodes  # noqa: E402
 from keyss.keys.derivation import random_embeddings  # noqa: E402
-from keyss.methods import (  # noqa: E402  # noqa: E402
-    ATTRIBUTES,
-    Decoder,
-    DecoderShape,
-    HiddenFile,
-    HiddenSecret,
-    RowSecret,
-    choose_anchors,
-)
+from keyss.methods import Decoder, DecoderShape, HiddenFile, KeyssSecret, choose_anchors  # noqa: E402  # noqa: E402
 from keyss.methods.records import whole  # noqa: E402
 from keyss.methods.records.embedding import METHOD  # noqa: E402
 from keyss.methods.records.opening import unpack  # noqa: E402
 from methods.carry.carried import embed  # noqa: E402
-from methods.keyss.hiding import some_secret, written  # noqa: E402
+from methods.keyss.small import latent_model, some_secret  # noqa: E402
 from vectors.surviving import NAMES, write_surviving  # noqa: E402
 
 
@@ -164,7 +157,6 @@ def main() -> None:
     write_counted()
     write_whole()
     write_keyss()
-    write_carriers()
 
 
 def write_published() -> None:
@@ -248,23 +240,21 @@ def write_whole() -> None:
 
 
 def write_keyss() -> None:
-    """Some rows of what decoders of every kind make of `carried.ply`, and that in `keyss.ply` of this."""
+    """Some rows of what decoders of every kind make of models; some of their secrets were lost."""
     shapes = [
-        DecoderShape(mask=ATTRIBUTES, hidden=(6, 5), branch=4, frequencies=2, sh_degree=1),
-        DecoderShape(
-            mask=("op", "sh"),
-            conditioning="bias",
-            hidden=(4, 4),
-            branch=3,
-            frequencies=0,
-            inputs="normalised",
-            residuals="one-sided",
-        ),
+        DecoderShape(hidden=(6, 5), branch=4, sh_degree=1),
+        DecoderShape(mask=("op", "sh"), hidden=(4, 4), branch=3, key_size=7, released=True),
     ]
     stego = read_model(FOLDER / "carried.ply")
     payloads = [("carried.ply", decoder_of(shape, stego).payload().data) for shape in shapes]
     key = json.loads((FOLDER / "carried.json").read_text())["key"]
     payloads.append(("keyss.ply", open_content(read_model(FOLDER / "keyss.ply"), key).data))
+    for name, count in (("latent.ply", 1), ("latent-two.ply", 2)):
+        stego, secrets, _ = latent_model(heavy_tailed(60), 50, count)
+        write_model(FOLDER / name, stego)
+        for lost, secret in zip((1.5, 0.5), secrets, strict=False):
+            changed = replace(secret, frame=some_frame(), visibility=lost * secret.visibility)
+            payloads.append((name, changed.payload().data))
     found = [
         {"file": name, "payload": payload.hex()} | decoded(payload, read_model(FOLDER / name))
         for name, payload in payloads
@@ -272,41 +262,14 @@ def write_keyss() -> None:
     (FOLDER / "keyss.json").write_text(json.dumps(found, indent=1) + "\n")
 
 
-def write_carriers() -> None:
-    """Rows of secrets of the design `carriers`, some without blue harmonics, and what they reveal.
-
-    The second file has two secrets in frames of their own; some rows of the first of them were lost.
-    """
-    stego, (secret,), _ = written(count=50, rows=60)
-    write_model(FOLDER / "carriers.ply", stego)
-    payloads = [("carriers.ply", secret.payload().data)]
-    stego, secrets, models = written(secrets=2, count=50, rows=60)
-    write_model(FOLDER / "carriers-two.ply", stego)
-    for lost, own, model in zip((1.5, 0.5), secrets, models, strict=True):
-        moved = replace(own, frame=some_frame(), visibility=lost * visibility(model))
-        payloads.append(("carriers-two.ply", moved.payload().data))
-    found = [
-        {"file": name, "payload": payload.hex()} | carried(payload, read_model(FOLDER / name))
-        for name, payload in payloads
-    ]
-    (FOLDER / "carriers.json").write_text(json.dumps(found, indent=1) + "\n")
-
-
-def carried(payload: bytes, stego: Gaussians) -> dict[str, Any]:
-    """What the rows of a payload reveal: SHA-256 of float32 columns."""
-    secret = RowSecret.of(Payload("keyss", payload))
-    model = secret.reveal(stego)
-    return shown(model, secret.count, visibility(secret.decode(stego, secret.embedding)) < secret.visibility)
-
-
-def decoder_of(shape: DecoderShape, stego: Gaussians) -> HiddenSecret:
+def decoder_of(shape: DecoderShape, stego: Gaussians) -> KeyssSecret:
     """A secret with a decoder that changes much, in a frame of its own; a third of it was lost."""
     generator = torch.Generator().manual_seed(16)
-    decoder = Decoder(shape)
-    decoder.prepare(stego.with_sh_degree(shape.sh_degree), random_embeddings(1, generator)[0])
-    for weights in decoder.network.parameters():
+    decoder = Decoder(shape).requires_grad_(False)
+    for weights in decoder.parameters():
         torch.nn.init.normal_(weights, std=0.3, generator=generator)
-    return HiddenSecret(decoder.requires_grad_(False), some_frame(), choose_anchors(stego, generator), 600)
+    key = random_embeddings(1, generator, shape.key_size)[0]
+    return KeyssSecret(decoder, key, some_frame(), choose_anchors(stego, 16), 600, 300.0)
 
 
 def some_frame() -> Similarity:
@@ -316,9 +279,9 @@ def some_frame() -> Similarity:
 
 
 def decoded(payload: bytes, stego: Gaussians) -> dict[str, Any]:
-    """How many Gaussians a payload reveals, and every 99th of them."""
-    model = HiddenSecret.of(Payload("keyss", payload)).reveal(stego)
-    rows = {each.name: getattr(model[::99], each.name).flatten().tolist() for each in fields(Gaussians)}
+    """How many Gaussians a payload reveals, and every 49th of them."""
+    model = KeyssSecret.of(Payload("keyss", payload)).reveal(stego)
+    rows = {each.name: getattr(model[::STRIDE], each.name).flatten().tolist() for each in fields(Gaussians)}
     return {"count": len(model), "rows": {name: [round(v, 7) for v in each] for name, each in rows.items()}}
 
 

@@ -14,15 +14,15 @@ from keyss.files import read_model, write_model
 from keyss.methods import HiddenFile, embed_models
 from keyss.viewer import export_html
 from measure.lifelike import lifelike
-from methods.keyss.hiding import written
+from methods.keyss.small import latent_model
 from viewer.browser import CLOSE, IN_CHROMIUM, POSE, Visit, drawn, made, psnr
 
 pytestmark = IN_CHROMIUM
 
 KEYS = ("the first key", "ein zweiter Schlüssel")
 PUBLISHED = {"ply": "ply"} | {suffix.removeprefix("."): publish for publish, suffix in SUFFIXES.items()}
-ROWS = "rows.ply"  # of the method keyss, in low bits
-KINDS = (*PUBLISHED, "appended.ply", "appended.spz", "appended.sog", ROWS)
+LATENT = "latent.ply"  # of the method keyss, in harmonics and low bits
+KINDS = (*PUBLISHED, "appended.ply", "appended.spz", "appended.sog", LATENT)
 
 
 def keys_of(kind: str) -> tuple[str, ...]:
@@ -36,9 +36,10 @@ def published(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]
 
     @cache
     def stego(kind: str) -> Path:
-        if kind == ROWS:
-            cover, (secret,), _ = written(count=1400, rows=1600)
-            model = LOW_BITS.prepare(cover).embed([(KEYS[0], secret.payload())], entropy=bytes(32))
+        if kind == LATENT:
+            cover, (secret,), _ = latent_model(made(4000, 0), 1000)
+            prepared = LOW_BITS.prepare(cover, sh_degree=1)
+            model = prepared.embed([(KEYS[0], secret.payload())], entropy=bytes(32))
         else:
             channel = channel_for(PUBLISHED[kind]) if kind in PUBLISHED else channel_for("any", "appended")  # type: ignore[arg-type]
             keys, secrets = keys_of(kind), [made(100, seed).with_sh_degree(1) for seed in (1, 2)]

@@ -11,12 +11,11 @@ import pytest
 from keyss.core import KeyssWarning
 from keyss.files import read_model
 from keyss.methods.records import whole
-from vectors.make_vectors import FOLDER, carried, counted, decoded, digests, revealed
+from vectors.make_vectors import FOLDER, counted, decoded, digests, revealed
 
 REVEALED = json.loads((FOLDER / "revealed.json").read_text())
 WHOLE = json.loads((FOLDER / "whole.json").read_text())
 COUNTED = json.loads((FOLDER / "counted.json").read_text())
-CARRIERS = json.loads((FOLDER / "carriers.json").read_text())
 KEYSS = json.loads((FOLDER / "keyss.json").read_text())
 PUBLISHED = json.loads((FOLDER / "published.json").read_text())
 
@@ -59,9 +58,3 @@ def test_what_decoders_reveal(expected: dict[str, Any]) -> None:
     assert found["count"] == expected["count"]
     for name, values in expected["rows"].items():
         assert found["rows"][name] == pytest.approx(values, abs=1e-5, rel=1e-5)
-
-
-@pytest.mark.parametrize("expected", CARRIERS, ids=lambda each: f"{each['file']} {each['count']}")
-def test_what_carriers_reveal(expected: dict[str, Any]) -> None:
-    found = carried(bytes.fromhex(expected["payload"]), read_model(FOLDER / expected["file"]))
-    check(found, {name: expected[name] for name in expected if name not in ("file", "payload")})

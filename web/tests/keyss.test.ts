@@ -2,18 +2,18 @@ import { expect, test } from 'vitest';
 import { selected } from '../src/core/gaussians.ts';
 import { inverse, moved } from '../src/core/similarity.ts';
 import { decodeKeyss } from '../src/keyss/secret.ts';
-import { expectRevealed, hex, jsonVector, modelOf, type Shown } from './vectors.ts';
+import { hex, jsonVector, modelOf } from './vectors.ts';
 
 interface Revealed {
   file: string;
   payload: string;
   count: number;
-  rows: Record<string, number[]>; // every 99th
+  rows: Record<string, number[]>; // every 49th
 }
 
 const KEYSS = jsonVector<Revealed[]>('keyss.json');
-const CARRIERS = jsonVector<({ file: string; payload: string } & Shown)[]>('carriers.json');
-const STRIDE = 99;
+const LATENT = KEYSS.filter(({ file }) => file.startsWith('latent'));
+const STRIDE = 49;
 
 test.each(KEYSS)('a decoder makes of $file what Python makes of it, $count Gaussians, to 1e-5', async (expected) => {
   const { gaussians } = decodeKeyss(hex(expected.payload), await modelOf(expected.file));
@@ -29,22 +29,18 @@ test.each(KEYSS)('a decoder makes of $file what Python makes of it, $count Gauss
   }
 });
 
-test.each(CARRIERS)('carriers hold in $file what Python reads, $count Gaussians, bit for bit', async (expected) => {
-  expectRevealed(decodeKeyss(hex(expected.payload), await modelOf(expected.file)), expected);
-});
-
 test('rows that were lost or stand in another order change nothing of the others', async () => {
-  const { file, payload } = CARRIERS[0];
+  const { file, payload } = LATENT[0];
   const model = await modelOf(file);
   const all = decodeKeyss(hex(payload), model).gaussians;
-  const rows = [...Array(model.count).keys()].filter((row) => row % 3).reverse();
+  const rows = [...Array(model.count).keys()].filter((row) => row % 8).reverse();
   const some = decodeKeyss(hex(payload), selected(model, rows)).gaussians;
   const names = [...some.means].map(String);
   expect(some.count).toBeGreaterThan(all.count / 2);
   expect([...all.means].map(String)).toEqual(expect.arrayContaining(names));
 });
 
-test.each([KEYSS[0], CARRIERS[1]])('a model that was rounded is refused, and so is damage', async ({ file, payload }) => {
+test.each([KEYSS[0], LATENT[1]])('a model that was rounded is refused, and so is damage', async ({ file, payload }) => {
   const model = await modelOf(file);
   const rounded = { ...model, means: model.means.map((each) => Math.round(each * 1000) / 1000) };
   expect(() => decodeKeyss(hex(payload), rounded)).toThrow(/^The model was moved or rounded/);

@@ -4,9 +4,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import torch
+from torch import Tensor
 
+from channels.low_bits.trained_like import trained_like
 from keyss import FitConfig, Gaussians, KeyssOptions
+from keyss.channels.harmonics import high_harmonics, row_names, with_high_harmonics
 from keyss.core import Scene
 from keyss.core.similarity import Similarity
 from keyss.keys import random_embeddings
@@ -16,9 +20,11 @@ from keyss.methods import (
     DecoderShape,
     KeyssSecret,
     KeyssTraining,
+    LatentDecoder,
     PlacedScene,
     choose_anchors,
 )
+from keyss.methods.keyss.latent import latents_of
 from keyss.methods.keyss.method import training_of
 from keyss.methods.keyss.secret import visibility
 
@@ -54,3 +60,38 @@ def some_secret(stego: Gaussians) -> KeyssSecret:
     frame = Similarity(1.001, translation=torch.full((3,), 0.01, dtype=torch.float64))
     key = VECTORS[0]
     return KeyssSecret(decoder, key, frame, choose_anchors(stego, 0), *visibility(decoder.decode(stego, key)))
+
+
+def latent_model(
+    cover: Gaussians, count: int, secrets: int = 1
+) -> tuple[Gaussians, list[KeyssSecret], list[Tensor]]:
+    """`cover` with latents in its first `count` rows, the secrets, and the latents [count, D] of each."""
+    size = latents_of(3, secrets)
+    ranks = np.random.default_rng(0).random((len(cover), size * secrets))
+    decoders, values = [], []
+    for secret in range(secrets):
+        decoder = LatentDecoder(DecoderShape(kind="latent", secrets=secrets, secret=secret))
+        decoder.place.fit(cover)
+        torch.nn.init.normal_(decoder.basis, generator=torch.Generator().manual_seed(secret))
+        decoder.basis.data = decoder.basis.data.half().float()  # as a payload has it
+        model = trained_like(count, seed=10 + secret)
+        colours = torch.cat([model.sh[:, 0], model.sh[:, 1:].flatten(1)[:, : size - 13]], dim=1)
+        latents = decoder.requires_grad_(False).to_latents(model, colours)
+        decoder.fit_secret(latents.double().numpy())
+        names = row_names(cover)[:count]
+        ranks[:count, decoder.own] = decoder.encrypt(latents.double().numpy(), VECTORS[secret], names)
+        decoders.append(decoder)
+        values.append(latents)
+    stego = with_high_harmonics(cover, decoders[0].place.write(high_harmonics(cover), ranks))
+    frame = Similarity(1.001, translation=torch.full((3,), 0.01, dtype=torch.float64))
+    found = [
+        KeyssSecret(
+            decoder,
+            VECTORS[secret],
+            frame,
+            choose_anchors(stego, 0),
+            *visibility(decoder.decode(stego, VECTORS[secret])),
+        )
+        for secret, decoder in enumerate(decoders)
+    ]
+    return stego, found, values

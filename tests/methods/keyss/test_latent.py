@@ -9,43 +9,28 @@ import numpy as np
 import pytest
 import torch
 from scipy.stats import kstest
+from torch import Tensor
 
 from channels.low_bits.trained_like import trained_like
 from channels.test_harmonics import heavy_tailed
 from keyss import Gaussians, KeyssOptions, WrongKeyError
 from keyss.channels import is_appended
-from keyss.channels.harmonics import high_harmonics, row_names, with_high_harmonics
+from keyss.channels.harmonics import row_names
 from keyss.core import InputError, UsageError, same_bits
 from keyss.fitting import make_optimizers, to_parameters
 from keyss.fitting.rows import FixedRows
 from keyss.measure import search_embeddings
-from keyss.methods import DecoderShape, LatentDecoder, registry
+from keyss.methods import LatentDecoder, registry
 from keyss.methods.keyss.latent import latents_of
 from methods.hiding import Hidden, check_resumes, hide_scenes, three_scenes
-from methods.keyss.small import FIT, KEYS, VECTORS, begun, small
+from methods.keyss.small import FIT, KEYS, VECTORS, begun, latent_model, small
 from tiny_scenes import random_gaussians
 
 
-def _written(secrets: int = 1, count: int = 900) -> tuple[Gaussians, list[LatentDecoder], list[np.ndarray]]:  # type: ignore[type-arg]
-    """Latents of `secrets` in the first rows of a cover."""
-    cover, latents = heavy_tailed(1000), latents_of(3, secrets)
-    decoders = []
-    for secret in range(secrets):
-        decoder = LatentDecoder(DecoderShape(kind="latent", secrets=secrets, secret=secret))
-        decoder.place.fit(cover)
-        torch.nn.init.normal_(decoder.basis, generator=torch.Generator().manual_seed(secret))
-        decoders.append(decoder.requires_grad_(False))
-    ranks = np.random.default_rng(0).random((1000, latents * secrets))
-    values = []
-    for secret, decoder in enumerate(decoders):
-        model = trained_like(count, seed=10 + secret)
-        colours = torch.cat([model.sh[:, 0], model.sh[:, 1:].flatten(1)[:, : latents - 13]], dim=1)
-        values.append(decoder.to_latents(model, colours).double().numpy())
-        decoder.fit_secret(values[-1])
-        own = decoder.encrypt(values[-1], VECTORS[secret], row_names(cover)[:count])
-        ranks[:count, decoder.own] = own
-    stego = with_high_harmonics(cover, decoders[0].place.write(high_harmonics(cover), ranks))
-    return stego, decoders, values
+def _written(secrets: int = 1) -> tuple[Gaussians, list[LatentDecoder], list[Tensor]]:
+    """Latents of `secrets` in 900 of 1,000 rows."""
+    stego, found, latents = latent_model(heavy_tailed(1000), 900, secrets)
+    return stego, [secret.decoder for secret in found], latents  # type: ignore[misc]
 
 
 @pytest.mark.parametrize("secrets", [1, 2])
@@ -54,7 +39,7 @@ def test_every_secret_comes_back_under_its_key_alone(secrets: int) -> None:
     for index, (decoder, expected) in enumerate(zip(decoders, values, strict=True)):
         decoded = decoder.decode(stego, VECTORS[index])
         assert len(decoded) == 900
-        wanted = decoder.to_gaussians(torch.from_numpy(expected).float())
+        wanted = decoder.to_gaussians(expected)
         torch.testing.assert_close(decoded.means, wanted.means, atol=0.01, rtol=0)
         torch.testing.assert_close(decoded.sh, wanted.sh, atol=0.02, rtol=0)
         turned = (decoded.quats * wanted.quats).sum(1).abs()
@@ -78,9 +63,10 @@ def test_pads_of_two_secrets_under_one_key_differ() -> None:
     """Otherwise the difference of two files would be the difference of their secrets."""
     _, (decoder,), (values,) = _written()
     names = row_names(trained_like(900))
-    first = decoder.encrypt(values, VECTORS[0], names)
-    decoder.fit_secret(values + 1e-9)
-    second = decoder.encrypt(values, VECTORS[0], names)
+    latents = values.double().numpy()
+    first = decoder.encrypt(latents, VECTORS[0], names)
+    decoder.fit_secret(latents + 1e-9)
+    second = decoder.encrypt(latents, VECTORS[0], names)
     assert kstest(((first - second) % 1).ravel(), "uniform").pvalue > 1e-6
 
 
@@ -101,6 +87,9 @@ def test_rows_may_be_pruned_reordered_and_repeated_but_not_exchanged() -> None:
     assert same_bits(backwards[torch.arange(len(backwards) - 1, -1, -1)], whole[1::2])
     exchanged = replace(stego, sh=torch.cat([stego.sh[:, :4], stego.sh[:, 4:].roll(1, 0)], dim=1))
     assert decoder.decode(exchanged, VECTORS[0]) is exchanged
+    _, (secret,), _ = latent_model(heavy_tailed(1000), 900)
+    with pytest.raises(InputError, match="none of its Gaussians opens"):
+        secret.reveal(exchanged)
 
 
 def test_a_gaussian_has_room_for_two_secrets_and_no_more() -> None:

@@ -1,14 +1,15 @@
-/** A secret of the method keyss, of either version; `keyss.methods.keyss.secret` in Python. */
+/** A secret of the method keyss; `keyss.methods.keyss.secret` in Python. */
 import { changed, damaged, otherVersion } from '../core/errors.ts';
 import { compensated, type Gaussians, opacity, where } from '../core/gaussians.ts';
 import { inverse, isSimilarity, moved, type Similarity } from '../core/similarity.ts';
 import { ascii } from '../core/bytes.ts';
-import { Decoder } from './decoder.ts';
-import { decodeRows } from './rows.ts';
+import { decodeNetwork, shapeOf, tensorOf } from './decoder.ts';
+import { decodeLatent } from './latent.ts';
 import { numbersOf, objectOf, parsed, readTensors } from './safetensors.ts';
 
 const FORMAT = 'keyss-secret';
-const [NETWORK, ROWS] = [8, 9]; // versions: by a decoder, or row by row
+const VERSION = 10;
+const LEAST = 1e-6; // share of the visibility that is left
 const [MAX_ANCHORS, ANCHORS_NEEDED, ANCHOR_TOLERANCE] = [64, 0.25, 1e-6];
 const MAX_COUNT = 2 ** 31;
 const DRAWN_OPACITY = Math.fround(1 / 255);
@@ -20,20 +21,24 @@ export function decodeKeyss(payload: Uint8Array, stego: Gaussians): { gaussians:
   const read = readTensors(payload);
   const header = objectOf(parsed(ascii(String(read.metadata.keyss))));
   if (header.format !== FORMAT) throw damaged();
-  if (header.version !== NETWORK && header.version !== ROWS) throw otherVersion();
-  const count = header.count as number;
-  if (!Number.isInteger(count) || count < 0 || count > MAX_COUNT) throw damaged();
-  const frame = frameOf(objectOf(header.frame));
+  if (header.version !== VERSION) throw otherVersion();
+  const [count, visibility] = [header.count, header.visibility] as number[];
+  if (!Number.isInteger(count) || count < 0 || count > MAX_COUNT || !(visibility >= 0)) throw damaged();
+  const [frame, shape] = [frameOf(objectOf(header.frame)), shapeOf(objectOf(header.shape))];
   const own = where(stego, (row) => stego.opacityLogits[row] !== APPENDED_LOGIT);
-  if (header.version === NETWORK) checkAnchors(read.tensors.get('anchors'), stego);
-  const left = header.version === ROWS ? decodeRows(header, read, own) : drawn(Decoder.of(header.shape, read).decode(own), count);
-  return { gaussians: moved(inverse(frame), left), hidden: count };
+  checkAnchors(read.tensors.get('anchors'), stego);
+  const key = tensorOf(read, 'key', shape.keySize).values;
+  const decoded = (shape.kind === 'latent' ? decodeLatent : decodeNetwork)(shape, read, key, own);
+  return { gaussians: moved(inverse(frame), drawn(decoded, visibility)), hidden: count };
 }
 
-/** Without what is never drawn, unless that is all, making up for what was lost of `count` Gaussians. */
-function drawn(decoded: Gaussians, count: number): Gaussians {
+/** Without what is never drawn, unless that is all, making up for what is missing of the sum of all opacities. */
+function drawn(decoded: Gaussians, visibility: number): Gaussians {
   const found = where(decoded, (row) => Math.fround(opacity(decoded.opacityLogits[row])) >= DRAWN_OPACITY);
-  return found.count ? compensated(found, count) : decoded;
+  if (!found.count) return decoded;
+  const seen = found.opacityLogits.reduce((sum, each) => sum + opacity(each), 0);
+  const left = Math.max(Math.min(1, seen / Math.max(visibility, 1e-9)), LEAST);
+  return compensated(found, Math.round(found.count / left));
 }
 
 function frameOf(described: Record<string, unknown>): Similarity {

@@ -148,10 +148,11 @@ class LatentTraining(KeyssTraining):
         # An identity that occurs twice would have one pad.
         _, index, counts = np.unique(row_names(cover), axis=0, return_inverse=True, return_counts=True)
         once = torch.from_numpy(counts[index.reshape(-1)] == 1).to(self.device)
-        # Training leaves all harmonics of a saturated channel at 0: it has to stay like that.
-        alive = ~dead_channels(cover).any(1)
-        usable = once & alive & (cover.opacities >= self.fit.prune_opacity)
-        order = cover.opacity_logits.argsort(descending=True, stable=True)
+        high = (cover.sh[:, (KEPT_DEGREE + 1) ** 2 :] != 0).flatten(1).any(1)
+        usable = once & high & (cover.opacities >= self.fit.prune_opacity)
+        # Rows with a saturated channel come last: where it stays so, nothing is written in the end.
+        first = cover.opacity_logits.masked_fill(saturated(cover).any(1), -math.inf)
+        order = first.argsort(descending=True, stable=True)
         return order[usable[order]]
 
     def latents(self, scene: int) -> Doubles:
@@ -222,7 +223,8 @@ class LatentTraining(KeyssTraining):
     def publish(self, entropy: bytes) -> tuple[Gaussians, list[KeyssSecret]]:
         clean = self.gaussians_of(0).detach()
         high = self.decoders[0].place.write(high_harmonics(clean), self.ranks(entropy))
-        high *= ~dead_channels(clean).repeat(1, high.shape[1] // 3).cpu().numpy()
+        # Training leaves all harmonics of a saturated channel at 0, and so does publishing.
+        high *= ~saturated(clean).repeat(1, high.shape[1] // 3).cpu().numpy()
         # The rows in the order of plain 3DGS, which appends what grows.
         born = self.density["born"].argsort(stable=True)
         stego = without_faint(with_high_harmonics(clean, high)[born].to("cpu"), self.fit.prune_opacity)
@@ -236,7 +238,7 @@ class LatentTraining(KeyssTraining):
         return stego, secrets
 
 
-def dead_channels(model: Gaussians) -> Tensor:
+def saturated(model: Gaussians) -> Tensor:
     """[N, 3] the channels whose harmonics of degree 1 are all 0."""
     return (model.sh[:, 1:4] == 0).all(1)
 

@@ -104,6 +104,11 @@ class KeyssSecret:
         if not force:
             self.check_unchanged(stego)
         decoded = self.decode(stego, self.key).to("cpu")
+        if decoded is stego:
+            raise InputError(
+                "the harmonics of the model were changed since the secret was hidden in them: none of its "
+                "Gaussians opens"
+            )
         if (visible := decoded.opacities >= DRAWN_OPACITY).any():
             decoded = decoded[visible]
         left = min(1.0, visibility(decoded)[1] / max(self.visibility, 1e-9))

@@ -78,9 +78,10 @@ export function identities(gaussians: Gaussians, fields: Fields): Uint8Array {
   return found;
 }
 
-/** How many bytes the low bits of one Gaussian make. */
-export function lowWidth(fields: Fields): number {
-  return (fields.quatsInUse ? GEOMETRY : GEOMETRY - 4) + Math.floor((3 * (fields.width - GEOMETRY)) / 2);
+/** How many bytes the low bits of one Gaussian make, of so many harmonics at most. */
+export function lowWidth(fields: Fields, harmonics = Infinity): number {
+  const count = Math.min(harmonics, fields.width - GEOMETRY);
+  return (fields.quatsInUse ? GEOMETRY : GEOMETRY - 4) + Math.floor((3 * count) / 2);
 }
 
 /** [N, B] the low bits as bytes. */

@@ -36,6 +36,29 @@ export class CellCipher {
     return found;
   }
 
+  /** [N, size] what data of zeros would become: pads that follow from the secret and the names. */
+  stream(names: Uint8Array): Uint8Array {
+    const [count, blocks] = [names.length / BLOCK, Math.ceil((1 + this.size) / BLOCK)];
+    let tags = encrypted(this.tagKey, names);
+    for (let block = 0; block < blocks; block++) tags = encrypted(this.tagKey, tags);
+    let seeds: Uint8Array = names.slice();
+    for (let cell = 0; cell < count; cell++) {
+      for (let at = 0; at < TAG_BYTES; at++) seeds[cell * BLOCK + at] ^= tags[cell * BLOCK + at];
+    }
+    seeds = encrypted(this.seedKey, seeds);
+    const found = new Uint8Array(count * this.size);
+    for (let block = 0; block * BLOCK < this.size; block++) {
+      const counted = seeds.slice();
+      for (let cell = 0; cell < count; cell++) counted[(cell + 1) * BLOCK - 1] ^= block;
+      const stream = encrypted(this.streamKey, counted);
+      const width = Math.min(BLOCK, this.size - block * BLOCK);
+      for (let cell = 0; cell < count; cell++) {
+        found.set(stream.subarray(cell * BLOCK, cell * BLOCK + width), cell * this.size + block * BLOCK);
+      }
+    }
+    return found;
+  }
+
   private decryptSome(
     found: Found, names: Uint8Array, low: Uint8Array, width: number, offset: number, slot: number,
     start: number, end: number,

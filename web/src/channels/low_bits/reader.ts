@@ -27,6 +27,7 @@ export class LowBitsReader implements Reader {
     private readonly names: Uint8Array, // [N, 16] identities
     private readonly low: Uint8Array, // [N, width]
     private readonly width: number,
+    private readonly narrow: number, // bytes before harmonics above degree 1, which some secrets leave as they are
     readonly salts: Uint8Array[], // the likeliest first
   ) {}
 
@@ -39,7 +40,7 @@ export class LowBitsReader implements Reader {
       fields = fieldsOf(selected(model, rows));
       [names, low] = [rowsOf(names, rows, IDENTITY_BYTES), rowsOf(low, rows, width)];
     }
-    return new LowBitsReader(names, low, width, salts(fields, names, low, width));
+    return new LowBitsReader(names, low, width, lowWidth(fields, 9), salts(fields, names, low, width));
   }
 
   get derivations(): number {
@@ -56,13 +57,14 @@ export class LowBitsReader implements Reader {
     for (const each of masters) {
       secret = new Uint8Array(expand(await each, 'low-bits/key', 32));
       if (!room) continue;
-      const found = mostFrequentOf(this.decrypted(new CellCipher(secret, 'key', DATA_KEY_BYTES)));
+      const found = mostFrequentOf(this.decrypted(new CellCipher(secret, 'key', DATA_KEY_BYTES), this.width));
       if (found) dataKeys.push(found);
     }
     for (const dataKey of dataKeys) {
-      const parts = this.decrypted(this.parameterCipher(dataKey));
-      if (!parts.length) continue;
-      return this.content(dataKey, unpackParameters(parts));
+      for (const width of this.widths) {
+        const parts = this.decrypted(this.parameterCipher(dataKey, width), width);
+        if (parts.length) return this.content(dataKey, unpackParameters(parts), width);
+      }
     }
     if (room && dataKeys.length === 0) this.passesForNothing(secret);
     return null;
@@ -70,16 +72,16 @@ export class LowBitsReader implements Reader {
 
   private passesForNothing(secret: Uint8Array): void {
     const dataKey = expand(secret, 'low-bits/none', DATA_KEY_BYTES);
-    this.decrypted(this.parameterCipher(dataKey));
+    for (const width of this.widths) this.decrypted(this.parameterCipher(dataKey, width), width);
     const size = Math.floor(this.width / DUMMY_CELLS) - TAG_BYTES;
-    for (const label of ['record', 'copy']) this.decrypted(new CellCipher(dataKey, label, size), DUMMY_CELLS);
+    for (const label of ['record', 'copy']) this.decrypted(new CellCipher(dataKey, label, size), this.width, DUMMY_CELLS);
   }
 
-  private async content(dataKey: Uint8Array, parameters: Parameters): Promise<Content> {
+  private async content(dataKey: Uint8Array, parameters: Parameters, width: number): Promise<Content> {
     const { isPayload, cells, recordBytes, method, header } = parameters;
-    if (recordBytes < 1 || recordBytes > Math.floor(this.width / cells) - TAG_BYTES) throw damaged();
+    if (recordBytes < 1 || recordBytes > Math.floor(width / cells) - TAG_BYTES) throw damaged();
     const [records, copies] = ['record', 'copy'].map((label) =>
-      this.decrypted(new CellCipher(dataKey, label, recordBytes), cells),
+      this.decrypted(new CellCipher(dataKey, label, recordBytes), width, cells),
     );
     if (isPayload) {
       const [size, codewords] = unpackCodewords(parameters);
@@ -95,13 +97,18 @@ export class LowBitsReader implements Reader {
     return { service: 'records', method, header, records: all };
   }
 
-  private parameterCipher(dataKey: Uint8Array): CellCipher {
-    return new CellCipher(dataKey, 'parameters', this.width - TAG_BYTES);
+  /** Bytes of a Gaussian that carriers may have. */
+  private get widths(): number[] {
+    return [...new Set([this.width, this.narrow])].filter((width) => width >= TAG_BYTES + DATA_KEY_BYTES);
   }
 
-  /** What the cipher decrypts in any of the cells of each Gaussian, in the order of these. */
-  private decrypted(cipher: CellCipher, cells = 1): Uint8Array[] {
-    const size = Math.floor(this.width / cells);
+  private parameterCipher(dataKey: Uint8Array, width: number): CellCipher {
+    return new CellCipher(dataKey, 'parameters', width - TAG_BYTES);
+  }
+
+  /** What the cipher decrypts in any of the cells of each Gaussian's first bytes, in the order of these. */
+  private decrypted(cipher: CellCipher, width: number, cells = 1): Uint8Array[] {
+    const size = Math.floor(width / cells);
     const found: { row: number; data: Uint8Array }[] = [];
     for (let slot = 0; slot < cells; slot++) {
       const { rows, data } = cipher.decrypt(this.names, this.low, this.width, slot * size, slot);
