@@ -13,13 +13,12 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any
 
-import msgspec
-
 from keyss.core.errors import InputError, OutputError, UsageError, did_you_mean, import_extra
 from keyss.core.scene import ViewOptions
 from keyss.files.atomic import write_bytes
 from keyss.files.colmap import MODEL_PLACES, colmap_model_folder, read_colmap
 from keyss.many.cell import result_of
+from keyss.many.changes import with_changes
 from keyss.many.paper import PAPER, Group, Reproduction, Run, figure_rows, judged, reproduction_text
 from keyss.many.running import CellFolder, Forecast
 from keyss.methods import registry
@@ -200,7 +199,7 @@ def _options(run: Run) -> MethodOptions:
     """The paper's settings, except the changes of the run."""
     preset = registry.get(run.method).options.preset("full")
     design = {"design": "published"} if run.method == "keyss" else {}
-    return msgspec.convert({**msgspec.to_builtins(preset), **design, **run.changes}, type(preset))
+    return with_changes(preset, {**design, **run.changes})
 
 
 def _paths(scenes: Sequence[PathLike]) -> dict[str, str]:

@@ -22,7 +22,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from itertools import product
 from math import prod
 from pathlib import Path
@@ -35,8 +35,9 @@ from keyss.audits import PARTS
 from keyss.core.errors import InputError, KeyssError, did_you_mean, import_extra
 from keyss.core.scene import ViewOptions
 from keyss.files.reading import read_text
-from keyss.fitting.config import MAX_SEED, PRESETS, FitConfig
+from keyss.fitting.config import MAX_SEED, PRESETS
 from keyss.keys.key_file import read_key
+from keyss.many.changes import FIT, known_changes, with_changes
 from keyss.many.running import RETRIES, CellFolder, Forecast, ManyResult, Outcome
 from keyss.many.tables import CellNumbers, write_tables
 from keyss.methods import registry
@@ -46,7 +47,6 @@ from keyss.runs.files import PathLike
 
 MAX_BYTES = 1 << 20  # of the file
 MAX_CELLS = 100_000
-_FIT = "fit"  # prefix of the options of training
 _AT_LEAST_ONE = Meta(min_length=1)
 # Numbers that differ from run to run, or repeat arguments.
 _NO_MEASURES = {"seconds", "seed", "version", "width"}
@@ -165,22 +165,17 @@ def _suggestion(message: str) -> str:
 
 def _options(where: str, preset: MethodOptions, given: Mapping[str, Any]) -> MethodOptions:
     """The preset with changed options; those of training are in a mapping `fit` or named `fit.NAME`."""
-    nested = given.get(_FIT, {})
+    nested = given.get(FIT, {})
     if not isinstance(nested, dict):
         raise InputError(f"{where}.fit: expected a mapping, got {nested!r}")
-    flat = {f"{_FIT}.{name}": value for name, value in nested.items()}
-    flat |= {name: value for name, value in given.items() if name != _FIT}
-    training = {f"{_FIT}.{each.name}" for each in fields(FitConfig) if each.name != "seed"}
-    known = training | {each.name for each in fields(preset) if each.name != _FIT}
+    flat = {f"{FIT}.{name}": value for name, value in nested.items()}
+    flat |= {name: value for name, value in given.items() if name != FIT}
+    known = known_changes(preset)
     for name in flat:
         if name not in known:
             raise InputError(f"{where}: {str(name)[:60]!r} is unknown; {did_you_mean(str(name), known)}")
-    fit = {name.removeprefix(f"{_FIT}."): value for name, value in flat.items() if name in training}
-    own = {name: value for name, value in flat.items() if name not in training}
     try:
-        fitted = msgspec.convert({**msgspec.to_builtins(preset.fit), **fit}, FitConfig)
-        options = msgspec.convert({**msgspec.to_builtins(preset), **own}, type(preset))
-        return options.with_fit(**{name: getattr(fitted, name) for name in fit})
+        return with_changes(preset, flat)
     except (KeyssError, msgspec.ValidationError) as error:
         raise InputError(f"{where}: {error}") from error
 
