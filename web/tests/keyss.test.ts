@@ -56,6 +56,31 @@ test.each([KEYSS[0], LATENT[1]])('a model that was rounded is refused, and so is
   }
 });
 
+test.each([KEYSS[0], LATENT[1]])('a header that breaks one of its bounds is damage: $file', async ({ file, payload }) => {
+  const [model, bytes] = [await modelOf(file), Buffer.from(payload, 'hex')];
+  const end = 8 + Number(bytes.readBigUInt64LE());
+  const header = bytes.toString('latin1', 8, end).replaceAll('\\"', "'");
+  const decode = (from: RegExp, to: string): unknown => {
+    const changed = header.replace(from, to);
+    expect([from, changed]).not.toEqual([from, header]);
+    const size = Buffer.alloc(8);
+    const text = Buffer.from(changed.replaceAll("'", '\\"'), 'latin1');
+    size.writeBigUInt64LE(BigInt(text.length));
+    return decodeKeyss(Uint8Array.from(Buffer.concat([size, text, bytes.subarray(end)])), model);
+  };
+  const changes: [RegExp, string][] = [
+    [/keyss-secret/, 'keyss-secrets'], [/'kind':/, "'kind':1,'more':"], [/'(mlp|latent)'/, "'other'"], [/'op','ro'/, "'ro','op'"],
+    [/'op'/, "'oq'"], [/false/, '0'], [/'key_size':64/, "'key_size':65"], [/'sh_degree':\d/, "'sh_degree':4"],
+    [/'secret':\d/, "'secret':9"], [/'secrets':\d/, "'secrets':0"], [/'branch':\d+/, "'branch':0.5"], [/'hidden':./, "'hidden':[1,"],
+    [/'count':\d/, "'count':-"], [/'visibility':/, "'visibility':-"], [/'visibility':/, "'visibility':1e999,'more':"],
+    [/'scale':\d/, "'scale':-1"], [/'rotation':../, "'rotation':[[2"], [/"key"/, '"kex"'], [/decoder/, 'recoded'],
+    [/"anchors".*?]/, '"anchors":{"dtype":"F32","shape":[0,3]'], [/"shape":\[64\]/, '"shape":[-4]'], [/"F16"/, '"I16"'],
+    [/("decoder.*?offsets":\[)/, '$1-1'],
+  ];
+  for (const [from, to] of changes) expect(() => decode(from, to), String(from)).toThrow('This file is damaged.');
+  expect(() => decode(/'version':10/, "'version':11")).toThrow(/another version/);
+});
+
 test('what is moved and moved back is as it was', async () => {
   const model = await modelOf('carried.ply');
   const turn = [0, -0.6, 0.8, 1, 0, 0, 0, 0.8, 0.6];

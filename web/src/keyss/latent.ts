@@ -1,116 +1,107 @@
-/** Secrets of the design `latent`; `keyss.methods.keyss.latent` and `keyss.channels.harmonics` in Python say why. */
+/** The design `latent`: `keyss.methods.keyss.latent` and `keyss.channels.harmonics` in Python say why. */
 import { sha256 } from '@noble/hashes/sha2.js';
 import { fieldsOf, IDENTITY_BYTES, identities } from '../channels/low_bits/bits.ts';
 import { CellCipher } from '../channels/low_bits/cells.ts';
-import { bytesKey, joined, viewOf } from '../core/bytes.ts';
+import { bytesKey, joined } from '../core/bytes.ts';
 import { changed, damaged } from '../core/errors.ts';
-import { coefficients, emptyGaussians, type Gaussians, withDegree } from '../core/gaussians.ts';
+import { coefficients, emptyGaussians, where, withDegree } from '../core/gaussians.ts';
+import { wordsOf } from '../core/words.ts';
 import { expand } from '../keys/keys.ts';
-import { type Shape, tensorOf } from './decoder.ts';
+import type { Decode, Shape } from './decoder.ts';
 import type { Tensors } from './safetensors.ts';
 
-const KEPT = 4; // harmonics of a channel, those of degrees 0 and 1, that are as they were
-const [OWN, MOST, LEAST_KEPT] = [13, 24, 2]; // latents without the code, latents at most, directions of the cover's
-const [SHARE, GUARD] = [4, 1 / 256];
-const NONCE_BYTES = 16;
-const ROUNDING = 1e-10;
-const MAX_EXPONENT = 80;
+const KEPT = 3 * coefficients(1); // numbers of the harmonics that hold nothing
+const [OWN, MOST, LEAST_KEPT] = [13, 24, 2]; // latents without the code; at most; directions that hold none
+const [SHARE, GUARD, ROUNDING] = [4, 1 / 256, 1e-10];
+const [NONCE_BYTES, ROWS] = [16, 1 << 14]; // rows at a time
+const MAX_EXPONENT = 80; // of a spread
 const RANKS = [0, ...Array.from({ length: 31 }, (_, at) => 1 / (1 + Math.exp(7 - (14 * at) / 30))), 1];
 
-/** The Gaussians that the harmonics of `model` hold for a key. Raises InputError for damage, and where there are none. */
-export function decodeLatent(shape: Shape, read: Tensors, key: Float32Array, model: Gaussians): Gaussians {
-  const width = 3 * (coefficients(shape.shDegree) - KEPT);
-  const count = Math.min(MOST, Math.floor((width - LEAST_KEPT) / shape.secrets)); // latents
-  if (count < OWN) throw damaged();
-  const all = count * shape.secrets;
-  const numbers = (name: string, ...size: number[]): Float32Array => tensorOf(read, `decoder.${name}`, ...size).values;
-  const place = {
-    width, all, directions: numbers('place.directions', width, all), slopes: numbers('place.slopes', 2, all),
-    quantiles: numbers('place.quantiles', all, RANKS.length),
-  };
-  const [knots, basis] = [numbers('knots', count, RANKS.length), numbers('basis', count - OWN, width + 9)];
-  const seed = joined(new Uint8Array(Float32Array.from(key).buffer), Uint8Array.from(numbers('nonce', NONCE_BYTES)));
-  const own = withDegree(model, shape.shDegree);
-  const bare = withDegree(model, 0);
-  const names = identities(bare, fieldsOf(bare));
-  const pads = viewOf(new CellCipher(expand(sha256(seed), 'latents', 32), 'pad', 4 * count).stream(names));
-  const found: Float64Array[] = [];
-  const seen = new Set<string>(); // copies of a row count once
-  for (let row = 0; row < model.count; row++) {
-    const end = 3 * coefficients(shape.shDegree) * (row + 1);
-    const ranks = ranksOf(place, own.sh.subarray(end - width, end));
-    const name = bytesKey(names.subarray(IDENTITY_BYTES * row, IDENTITY_BYTES * (row + 1)));
-    if (!ranks || seen.has(name)) continue;
-    const latents = new Float64Array(count);
-    let fits = true;
-    for (let at = 0; at < count && fits; at++) {
-      const pad = pads.getUint32(4 * (count * row + at), true) / 2 ** 32;
-      const rank = ranks[count * shape.secret + at] - pad;
-      const inside = SHARE * (rank - Math.floor(rank));
-      fits = inside <= 1;
-      const share = Math.min(1, Math.max(0, (inside - GUARD) / (1 - 2 * GUARD)));
-      latents[at] = interpolated(share, RANKS, knots.subarray(RANKS.length * at, RANKS.length * (at + 1)));
+/** Raises InputError for other tensors than the shape needs; decoding raises it where no row is the secret's. */
+export function latentOf({ shDegree, secrets, secret }: Shape, tensors: Tensors, key: Float32Array): Decode {
+  const harmonics = 3 * coefficients(shDegree);
+  const high = Math.max(0, harmonics - KEPT);
+  const count = Math.min(MOST, Math.floor((high - LEAST_KEPT) / secrets));
+  if (count < OWN || secret >= secrets) throw damaged();
+  const [written, first] = [count * secrets, count * secret];
+  const directions = tensors.take('decoder.place.directions', high, written);
+  const slopes = tensors.take('decoder.place.slopes', 2, written);
+  const quantiles = rows(tensors.take('decoder.place.quantiles', written, RANKS.length), RANKS.length);
+  const basis = rows(tensors.take('decoder.basis', count - OWN, harmonics - 3), harmonics - 3);
+  const knots = rows(tensors.take('decoder.knots', count, RANKS.length), RANKS.length);
+  const nonce = Uint8Array.from(tensors.take('decoder.nonce', NONCE_BYTES));
+  const seed = sha256(joined(new Uint8Array(key.buffer, key.byteOffset, 4 * key.length), nonce));
+  const cipher = new CellCipher(expand(seed, 'latents', 32), 'pad', 4 * count);
+  const [along, latents] = [new Float64Array(written), new Float32Array(count)];
+
+  /** Whether a row is the secret's: then its latents are in `latents`. */
+  function decrypt(numbers: Float32Array, pads: Uint32Array): boolean {
+    along.fill(0);
+    for (let at = 0; at < high; at++) {
+      for (let j = 0; j < written; j++) along[j] += numbers[at] * directions[at * written + j];
     }
-    if (!fits) continue;
-    seen.add(name);
-    found.push(latents);
+    let [power, whole] = [0, 0];
+    for (let at = 0; at < high; at++) {
+      let rest = numbers[at];
+      for (let j = 0; j < written; j++) rest -= along[j] * directions[at * written + j];
+      [power, whole] = [power + rest ** 2, whole + numbers[at] ** 2];
+    }
+    if (power <= ROUNDING * whole) return false;
+    for (let j = 0; j < first + count; power += along[j++] ** 2) {
+      const own = j - first;
+      if (own < 0) continue;
+      const level = Math.sqrt(power / (high - written + j));
+      const exponent = slopes[j] + slopes[written + j] * Math.log(level);
+      const spread = Math.exp(Math.min(MAX_EXPONENT, Math.max(-MAX_EXPONENT, exponent)));
+      const turned = interpolated(along[j] / spread, quantiles[j], RANKS) - pads[own] / 2 ** 32;
+      const inside = SHARE * (turned - Math.floor(turned));
+      if (!(inside <= 1)) return false;
+      latents[own] = interpolated((inside - GUARD) / (1 - 2 * GUARD), RANKS, knots[own]);
+    }
+    return true;
   }
-  if (!found.length) throw changed();
-  return gaussiansOf(found, basis, shape.shDegree);
+
+  return (model) => {
+    const bare = withDegree(model, 0);
+    const names = identities(bare, fieldsOf(bare));
+    const [found, seen] = [emptyGaussians(model.count, shDegree), new Set<string>()];
+    let pads: Uint32Array = new Uint32Array(0);
+    for (let row = 0; row < model.count; row++) {
+      const at = row % ROWS;
+      if (!at) pads = wordsOf(cipher.pads(names.subarray(IDENTITY_BYTES * row, IDENTITY_BYTES * (row + ROWS))));
+      const numbers = model.sh.subarray(harmonics * row + KEPT, harmonics * (row + 1));
+      if (!decrypt(numbers, pads.subarray(count * at, count * (at + 1)))) continue;
+      const [to, name] = [seen.size, bytesKey(names.subarray(IDENTITY_BYTES * row, IDENTITY_BYTES * (row + 1)))];
+      if (seen.has(name)) continue; // a copy of another row
+      seen.add(name);
+      const [opacity, x, y, z] = latents;
+      found.opacityLogits[to] = opacity;
+      found.quats.set([Math.sqrt(Math.max(0, 1 - x * x - y * y - z * z)), x, y, z], 4 * to);
+      found.logScales.set(latents.subarray(4, 7), 3 * to);
+      found.means.set(latents.subarray(7, 10), 3 * to);
+      found.sh.set(latents.subarray(10, OWN), harmonics * to);
+      const colours = found.sh.subarray(harmonics * to + 3, harmonics * (to + 1));
+      colours.forEach((_, j) => (colours[j] = basis.reduce((sum, each, code) => sum + each[j] * latents[OWN + code], 0)));
+      if (!colours.every(Number.isFinite)) throw damaged();
+    }
+    if (!seen.size) throw changed();
+    return where(found, (row) => row < seen.size);
+  };
 }
 
-interface Place {
-  readonly width: number; // harmonics above degree 1
-  readonly all: number; // directions
-  readonly directions: Float32Array; // [width, all]
-  readonly slopes: Float32Array; // [2, all]
-  readonly quantiles: Float32Array; // [all, 33]
+function rows(table: Float32Array, width: number): Float32Array[] {
+  return Array.from({ length: table.length / width }, (_, row) => table.subarray(row * width, (row + 1) * width));
 }
 
-/** [all] the ranks that were written into harmonics [width]; null where there is nothing. */
-function ranksOf({ width, all, directions, slopes, quantiles }: Place, harmonics: Float32Array): Float64Array | null {
-  const [written, kept] = [new Float64Array(all), Float64Array.from(harmonics)];
-  for (let at = 0; at < width; at++) for (let j = 0; j < all; j++) written[j] += harmonics[at] * directions[all * at + j];
-  for (let at = 0; at < width; at++) for (let j = 0; j < all; j++) kept[at] -= written[j] * directions[all * at + j];
-  let power = kept.reduce((sum, each) => sum + each * each, 0);
-  if (!(power > ROUNDING * harmonics.reduce((sum, each) => sum + each * each, 0))) return null;
-  return written.map((each, j) => {
-    const level = Math.sqrt(power / (width - all + j));
-    const exponent = slopes[j] + slopes[all + j] * Math.log(level);
-    const spread = Math.exp(Math.min(MAX_EXPONENT, Math.max(-MAX_EXPONENT, exponent)));
-    power += each * each;
-    return interpolated(each / spread, quantiles.subarray(RANKS.length * j, RANKS.length * (j + 1)), RANKS);
-  });
-}
-
-/** The number at `x` on the line through the points (xs, ys), whose ends it does not leave. */
-function interpolated(x: number, xs: ArrayLike<number>, ys: ArrayLike<number>): number {
-  let [low, high] = [0, xs.length - 1];
-  if (!(x > xs[low])) return ys[low];
-  if (x >= xs[high]) return ys[high];
+/** The value at x of the line through points with ascending `from` and any `to`, which ends level. */
+function interpolated(x: number, from: ArrayLike<number>, to: ArrayLike<number>): number {
+  let [low, high] = [0, from.length - 1];
+  if (!(x > from[low])) return x <= from[low] ? to[low] : NaN;
+  if (x >= from[high]) return to[high];
   while (high - low > 1) {
     const middle = (low + high) >> 1;
-    if (xs[middle] <= x) low = middle;
+    if (x >= from[middle]) low = middle;
     else high = middle;
   }
-  return ys[low] + ((x - xs[low]) / (xs[high] - xs[low])) * (ys[high] - ys[low]);
-}
-
-function gaussiansOf(latents: Float64Array[], basis: Float32Array, shDegree: number): Gaussians {
-  const found = emptyGaussians(latents.length, shDegree);
-  const width = 3 * coefficients(shDegree);
-  latents.forEach((own, row) => {
-    found.opacityLogits[row] = own[0];
-    const [x, y, z] = own.subarray(1, 4);
-    found.quats.set([Math.sqrt(Math.max(0, 1 - x * x - y * y - z * z)), x, y, z], 4 * row);
-    found.logScales.set(own.subarray(4, 7), 3 * row);
-    found.means.set(own.subarray(7, 10), 3 * row);
-    const sh = new Float64Array(width);
-    sh.set(own.subarray(10, OWN));
-    for (let code = OWN; code < own.length; code++) {
-      for (let at = 3; at < width; at++) sh[at] += own[code] * basis[(width - 3) * (code - OWN) + at - 3];
-    }
-    found.sh.set(sh, width * row);
-  });
-  return found;
+  return to[low] + ((to[high] - to[low]) * (x - from[low])) / (from[high] - from[low]);
 }

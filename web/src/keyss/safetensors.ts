@@ -2,29 +2,51 @@
 import { halfFloat, viewOf } from '../core/bytes.ts';
 import { damaged } from '../core/errors.ts';
 
-export interface Tensor {
-  readonly shape: readonly number[];
-  readonly values: Float32Array;
-}
-
-export interface Tensors {
-  readonly metadata: Record<string, unknown>;
-  readonly tensors: ReadonlyMap<string, Tensor>;
-}
-
 const SIZES: Record<string, number> = { U8: 1, F16: 2, F32: 4 };
 
-/** Tensors of bytes, half or single precision. Raises InputError for anything else, and for numbers that are not finite. */
-export function readTensors(data: Uint8Array): Tensors {
-  if (data.length < 8) throw damaged();
-  const size = Number(viewOf(data).getBigUint64(0, true));
-  if (size > data.length - 8) throw damaged();
-  const header = objectOf(parsed(data.subarray(8, 8 + size)));
-  const tensors = new Map<string, Tensor>();
-  for (const [name, each] of Object.entries(header)) {
-    if (name !== '__metadata__') tensors.set(name, tensorOf(objectOf(each), data.subarray(8 + size)));
+/** Tensors of bytes, half or single precision, which are taken out one by one. */
+export class Tensors {
+  private constructor(
+    readonly metadata: Record<string, unknown>,
+    private readonly left: Map<string, unknown>,
+    private readonly data: Uint8Array,
+  ) {}
+
+  /** Raises InputError for anything else. */
+  static of(data: Uint8Array): Tensors {
+    if (data.length < 8) throw damaged();
+    const size = Number(viewOf(data).getBigUint64(0, true));
+    if (size > data.length - 8) throw damaged();
+    const { __metadata__, ...described } = objectOf(parsed(data.subarray(8, 8 + size)));
+    return new Tensors(objectOf(__metadata__), new Map(Object.entries(described)), data.subarray(8 + size));
   }
-  return { metadata: objectOf(header.__metadata__), tensors };
+
+  /** Whether all have been taken. */
+  get done(): boolean {
+    return this.left.size === 0;
+  }
+
+  /** Raises InputError for no such tensor. */
+  shapeOf(name: string): number[] {
+    return numbersOf(objectOf(this.left.get(name)).shape);
+  }
+
+  /** Raises InputError for no tensor of this shape, and for numbers that are not finite. */
+  take(name: string, ...shape: number[]): Float32Array {
+    const { dtype, data_offsets } = objectOf(this.left.get(name));
+    const [[start, end], width] = [numbersOf(data_offsets, 2), SIZES[String(dtype)]];
+    const count = shape.reduce((product, each) => product * each, 1);
+    const fits = width && Number.isInteger(start) && start >= 0 && end <= this.data.length && end - start === width * count;
+    if (!fits || this.shapeOf(name).join() !== shape.join()) throw damaged();
+    this.left.delete(name);
+    const bytes = this.data.subarray(start, end);
+    if (width === 1) return Float32Array.from(bytes);
+    const view = viewOf(bytes);
+    const read = (at: number): number => (width === 4 ? view.getFloat32(4 * at, true) : halfFloat(view.getUint16(2 * at, true)));
+    const values = new Float32Array(count).map((_, at) => read(at));
+    if (!values.every(Number.isFinite)) throw damaged();
+    return values;
+  }
 }
 
 export function parsed(bytes: Uint8Array): unknown {
@@ -35,9 +57,16 @@ export function parsed(bytes: Uint8Array): unknown {
   }
 }
 
-export function objectOf(value: unknown): Record<string, unknown> {
+/** With these fields in this order, or any. */
+export function objectOf(value: unknown, ...fields: string[]): Record<string, unknown> {
   if (typeof value !== 'object' || value === null || Array.isArray(value)) throw damaged();
+  if (fields.length && Object.keys(value).join() !== fields.join()) throw damaged();
   return value as Record<string, unknown>;
+}
+
+export function integerOf(value: unknown, least: number, most: number): number {
+  if (!Number.isInteger(value) || (value as number) < least || (value as number) > most) throw damaged();
+  return value as number;
 }
 
 /** [length] finite numbers, or any number of them. */
@@ -45,18 +74,4 @@ export function numbersOf(value: unknown, length?: number): number[] {
   const fine = Array.isArray(value) && value.every((each) => Number.isFinite(each));
   if (!fine || (length !== undefined && value.length !== length)) throw damaged();
   return value as number[];
-}
-
-function tensorOf(described: Record<string, unknown>, data: Uint8Array): Tensor {
-  const shape = numbersOf(described.shape);
-  const [start, end] = numbersOf(described.data_offsets, 2);
-  const width = SIZES[String(described.dtype)];
-  const count = shape.reduce((product, each) => product * each, 1);
-  const fits = width && Number.isInteger(start) && start >= 0 && end <= data.length && end - start === width * count;
-  if (!fits || !shape.every((each) => Number.isInteger(each) && each >= 0)) throw damaged();
-  const view = viewOf(data.subarray(start, end));
-  const read = (at: number): number => (width === 4 ? view.getFloat32(4 * at, true) : halfFloat(view.getUint16(2 * at, true)));
-  const values = width === 1 ? Float32Array.from(data.subarray(start, end)) : new Float32Array(count).map((_, at) => read(at));
-  if (!values.every(Number.isFinite)) throw damaged();
-  return { shape, values };
 }

@@ -78,10 +78,10 @@ export function identities(gaussians: Gaussians, fields: Fields): Uint8Array {
   return found;
 }
 
-/** How many bytes the low bits of one Gaussian make, of so many harmonics at most. */
+/** How many bytes the low bits of one Gaussian make, or those before so many of its harmonics. */
 export function lowWidth(fields: Fields, harmonics = Infinity): number {
-  const count = Math.min(harmonics, fields.width - GEOMETRY);
-  return (fields.quatsInUse ? GEOMETRY : GEOMETRY - 4) + Math.floor((3 * count) / 2);
+  const used = Math.min(harmonics, fields.width - GEOMETRY);
+  return (fields.quatsInUse ? GEOMETRY : GEOMETRY - 4) + Math.floor((3 * used) / 2);
 }
 
 /** [N, B] the low bits as bytes. */

@@ -14,13 +14,11 @@ export interface Found {
 
 /** Decrypts cells of `size` bytes of data for one use of a secret. */
 export class CellCipher {
-  readonly cellBytes: number;
   private readonly tagKey: Uint8Array;
   private readonly seedKey: Uint8Array;
   private readonly streamKey: Uint8Array;
 
   constructor(secret: Uint8Array, label: string, readonly size: number) {
-    this.cellBytes = TAG_BYTES + size;
     [this.tagKey, this.seedKey, this.streamKey] = ['tag', 'seed', 'stream'].map((use) =>
       expand(secret, `${label}/${use}`, 32),
     );
@@ -31,73 +29,73 @@ export class CellCipher {
     const found: Found = { rows: [], data: [] };
     const count = names.length / BLOCK;
     for (let start = 0; start < count; start += CELLS) {
-      this.decryptSome(found, names, low, width, offset, slot, start, Math.min(count, start + CELLS));
+      const own = names.subarray(start * BLOCK, (start + CELLS) * BLOCK);
+      this.decryptSome(found, start, own, low.subarray(start * width + offset), width, slot);
     }
     return found;
   }
 
-  /** [N, size] what data of zeros would become: pads that follow from the secret and the names. */
-  stream(names: Uint8Array): Uint8Array {
-    const [count, blocks] = [names.length / BLOCK, Math.ceil((1 + this.size) / BLOCK)];
-    let tags = encrypted(this.tagKey, names);
-    for (let block = 0; block < blocks; block++) tags = encrypted(this.tagKey, tags);
-    let seeds: Uint8Array = names.slice();
-    for (let cell = 0; cell < count; cell++) {
-      for (let at = 0; at < TAG_BYTES; at++) seeds[cell * BLOCK + at] ^= tags[cell * BLOCK + at];
-    }
-    seeds = encrypted(this.seedKey, seeds);
-    const found = new Uint8Array(count * this.size);
-    for (let block = 0; block * BLOCK < this.size; block++) {
-      const counted = seeds.slice();
-      for (let cell = 0; cell < count; cell++) counted[(cell + 1) * BLOCK - 1] ^= block;
-      const stream = encrypted(this.streamKey, counted);
-      const width = Math.min(BLOCK, this.size - block * BLOCK);
-      for (let cell = 0; cell < count; cell++) {
-        found.set(stream.subarray(cell * BLOCK, cell * BLOCK + width), cell * this.size + block * BLOCK);
-      }
-    }
-    return found;
+  /** [N, size] the key streams of cells in slot 0 whose data are zeros: a pseudo-random function of `names`. */
+  pads(names: Uint8Array): Uint8Array {
+    const states = this.states(names, new Uint8Array((names.length / BLOCK) * this.stride));
+    return this.streams(names, states, BLOCK, 0);
   }
 
-  private decryptSome(
-    found: Found, names: Uint8Array, low: Uint8Array, width: number, offset: number, slot: number,
-    start: number, end: number,
-  ): void {
-    const { size } = this;
-    const count = end - start;
-    const from = (cell: number): number => (start + cell) * width + offset;
-    const own = names.subarray(start * BLOCK, end * BLOCK);
-    let seeds: Uint8Array = own.slice();
-    for (let cell = 0; cell < count; cell++) {
-      for (let at = 0; at < TAG_BYTES; at++) seeds[cell * BLOCK + at] ^= low[from(cell) + at];
-      seeds[cell * BLOCK + TAG_BYTES] ^= slot;
-    }
-    seeds = encrypted(this.seedKey, seeds);
-    const stride = Math.ceil((1 + size) / BLOCK) * BLOCK;
+  /** Of Gaussians from `start` on; every `width` bytes of `cells` begin with a cell. */
+  private decryptSome(found: Found, start: number, own: Uint8Array, cells: Uint8Array, width: number, slot: number): void {
+    const [{ size, stride }, count] = [this, own.length / BLOCK];
+    const streams = this.streams(own, cells, width, slot);
     const messages = new Uint8Array(count * stride); // slot, data, and zeros up to a block
-    for (let block = 0; block * BLOCK < size; block++) {
-      const counted = seeds.slice();
-      for (let cell = 0; cell < count; cell++) counted[(cell + 1) * BLOCK - 1] ^= block;
-      const stream = encrypted(this.streamKey, counted);
-      for (let cell = 0; cell < count; cell++) {
-        messages[cell * stride] = slot;
-        for (let at = block * BLOCK; at < Math.min(size, (block + 1) * BLOCK); at++) {
-          messages[cell * stride + 1 + at] = low[from(cell) + TAG_BYTES + at] ^ stream[cell * BLOCK + (at % BLOCK)];
-        }
-      }
+    for (let cell = 0; cell < count; cell++) {
+      const [to, from] = [cell * stride + 1, cell * width + TAG_BYTES];
+      messages[to - 1] = slot;
+      for (let at = 0; at < size; at++) messages[to + at] = cells[from + at] ^ streams[cell * size + at];
     }
-    let state = encrypted(this.tagKey, own);
-    for (let block = 0; block < stride; block += BLOCK) {
-      for (let at = 0; at < state.length; at++) state[at] ^= messages[Math.floor(at / BLOCK) * stride + block + (at % BLOCK)];
-      state = encrypted(this.tagKey, state);
-    }
+    const states = this.states(own, messages);
     for (let cell = 0; cell < count; cell++) {
       let different = 0;
-      for (let at = 0; at < TAG_BYTES; at++) different |= state[cell * BLOCK + at] ^ low[from(cell) + at];
+      for (let at = 0; at < TAG_BYTES; at++) different |= states[cell * BLOCK + at] ^ cells[cell * width + at];
       if (different !== 0) continue;
       found.rows.push(start + cell);
       found.data.push(messages.slice(cell * stride + 1, cell * stride + 1 + size));
     }
+  }
+
+  private get stride(): number {
+    return Math.ceil((1 + this.size) / BLOCK) * BLOCK;
+  }
+
+  /** [N, 16] that begin with the tags of `messages` [N, stride]. */
+  private states(names: Uint8Array, messages: Uint8Array): Uint8Array {
+    const { stride } = this;
+    let state = encrypted(this.tagKey, names);
+    for (let block = 0; block < stride; block += BLOCK) {
+      for (let at = 0; at < state.length; at++) state[at] ^= messages[Math.floor(at / BLOCK) * stride + block + (at % BLOCK)];
+      state = encrypted(this.tagKey, state);
+    }
+    return state;
+  }
+
+  /** [N, size] the key streams; every `width` bytes of `cells` begin with a tag. */
+  private streams(names: Uint8Array, cells: Uint8Array, width: number, slot: number): Uint8Array {
+    const [{ size }, count] = [this, names.length / BLOCK];
+    const found = new Uint8Array(count * size);
+    let seeds: Uint8Array = names.slice();
+    for (let cell = 0; cell < count; cell++) {
+      for (let at = 0; at < TAG_BYTES; at++) seeds[cell * BLOCK + at] ^= cells[cell * width + at];
+      seeds[cell * BLOCK + TAG_BYTES] ^= slot;
+    }
+    seeds = encrypted(this.seedKey, seeds);
+    for (let start = 0; start < size; start += BLOCK) {
+      const counted = seeds.slice();
+      for (let cell = 0; cell < count; cell++) counted[(cell + 1) * BLOCK - 1] ^= start / BLOCK;
+      const stream = encrypted(this.streamKey, counted);
+      const end = Math.min(BLOCK, size - start);
+      for (let cell = 0; cell < count; cell++) {
+        for (let at = 0; at < end; at++) found[cell * size + start + at] = stream[cell * BLOCK + at];
+      }
+    }
+    return found;
   }
 }
 

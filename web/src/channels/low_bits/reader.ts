@@ -18,8 +18,10 @@ import { salts } from './salts.ts';
 
 const ASSOCIATED = ascii('keyss/v1/low-bits');
 const DATA_KEY_BYTES = 16;
+const LEAST_WIDTH = TAG_BYTES + DATA_KEY_BYTES;
 const SALTS_TRIED = 4;
 const DUMMY_CELLS = 2; // of a carrier that a key which opens nothing looks into
+const NARROW_HARMONICS = 9; // of degree 1: some secrets leave the low bits of the others as they are
 
 /** The low bits of a model, prepared for any number of keys. */
 export class LowBitsReader implements Reader {
@@ -27,7 +29,7 @@ export class LowBitsReader implements Reader {
     private readonly names: Uint8Array, // [N, 16] identities
     private readonly low: Uint8Array, // [N, width]
     private readonly width: number,
-    private readonly narrow: number, // bytes before harmonics above degree 1, which some secrets leave as they are
+    private readonly widths: readonly number[], // that a secret may use
     readonly salts: Uint8Array[], // the likeliest first
   ) {}
 
@@ -40,7 +42,8 @@ export class LowBitsReader implements Reader {
       fields = fieldsOf(selected(model, rows));
       [names, low] = [rowsOf(names, rows, IDENTITY_BYTES), rowsOf(low, rows, width)];
     }
-    return new LowBitsReader(names, low, width, lowWidth(fields, 9), salts(fields, names, low, width));
+    const widths = [...new Set([width, lowWidth(fields, NARROW_HARMONICS)])].filter((each) => each >= LEAST_WIDTH);
+    return new LowBitsReader(names, low, width, widths, salts(fields, names, low, width));
   }
 
   get derivations(): number {
@@ -49,32 +52,32 @@ export class LowBitsReader implements Reader {
 
   /** What `key` opens, null for nothing. Raises InputError for damage. */
   async open(key: string, derive: Derive = here): Promise<Content | null> {
-    const room = this.width >= TAG_BYTES + DATA_KEY_BYTES;
     const dataKeys: Uint8Array[] = [];
     let secret = new Uint8Array(32);
     // Other workers derive what comes next while this one looks through the cells.
     const masters = this.salts.slice(0, this.derivations).map((salt) => derive(key, salt));
     for (const each of masters) {
       secret = new Uint8Array(expand(await each, 'low-bits/key', 32));
-      if (!room) continue;
-      const found = mostFrequentOf(this.decrypted(new CellCipher(secret, 'key', DATA_KEY_BYTES), this.width));
+      if (!this.widths.length) continue;
+      const found = mostFrequentOf(this.decrypted(new CellCipher(secret, 'key', DATA_KEY_BYTES)));
       if (found) dataKeys.push(found);
     }
     for (const dataKey of dataKeys) {
-      for (const width of this.widths) {
-        const parts = this.decrypted(this.parameterCipher(dataKey, width), width);
-        if (parts.length) return this.content(dataKey, unpackParameters(parts), width);
-      }
+      const every = this.widths.map((width) => [width, this.parts(dataKey, width)] as const);
+      const found = every.find(([, parts]) => parts.length);
+      if (found) return this.content(dataKey, unpackParameters(found[1]), found[0]);
     }
-    if (room && dataKeys.length === 0) this.passesForNothing(secret);
+    if (dataKeys.length === 0 && this.widths.length) {
+      const none = expand(secret, 'low-bits/none', DATA_KEY_BYTES);
+      for (const width of this.widths) this.parts(none, width);
+      this.passesForNothing(none, this.width);
+    }
     return null;
   }
 
-  private passesForNothing(secret: Uint8Array): void {
-    const dataKey = expand(secret, 'low-bits/none', DATA_KEY_BYTES);
-    for (const width of this.widths) this.decrypted(this.parameterCipher(dataKey, width), width);
-    const size = Math.floor(this.width / DUMMY_CELLS) - TAG_BYTES;
-    for (const label of ['record', 'copy']) this.decrypted(new CellCipher(dataKey, label, size), this.width, DUMMY_CELLS);
+  private passesForNothing(dataKey: Uint8Array, width: number): void {
+    const size = Math.floor(width / DUMMY_CELLS) - TAG_BYTES;
+    for (const label of ['record', 'copy']) this.decrypted(new CellCipher(dataKey, label, size), width, DUMMY_CELLS);
   }
 
   private async content(dataKey: Uint8Array, parameters: Parameters, width: number): Promise<Content> {
@@ -83,6 +86,7 @@ export class LowBitsReader implements Reader {
     const [records, copies] = ['record', 'copy'].map((label) =>
       this.decrypted(new CellCipher(dataKey, label, recordBytes), width, cells),
     );
+    if (width < this.width) this.passesForNothing(dataKey, this.width - width);
     if (isPayload) {
       const [size, codewords] = unpackCodewords(parameters);
       const chunks = records.map((each): [number, Uint8Array] => [
@@ -97,17 +101,12 @@ export class LowBitsReader implements Reader {
     return { service: 'records', method, header, records: all };
   }
 
-  /** Bytes of a Gaussian that carriers may have. */
-  private get widths(): number[] {
-    return [...new Set([this.width, this.narrow])].filter((width) => width >= TAG_BYTES + DATA_KEY_BYTES);
+  private parts(dataKey: Uint8Array, width: number): Uint8Array[] {
+    return this.decrypted(new CellCipher(dataKey, 'parameters', width - TAG_BYTES));
   }
 
-  private parameterCipher(dataKey: Uint8Array, width: number): CellCipher {
-    return new CellCipher(dataKey, 'parameters', width - TAG_BYTES);
-  }
-
-  /** What the cipher decrypts in any of the cells of each Gaussian's first bytes, in the order of these. */
-  private decrypted(cipher: CellCipher, width: number, cells = 1): Uint8Array[] {
+  /** What the cipher decrypts in any of the cells of each Gaussian, in the order of these. */
+  private decrypted(cipher: CellCipher, width = this.width, cells = 1): Uint8Array[] {
     const size = Math.floor(width / cells);
     const found: { row: number; data: Uint8Array }[] = [];
     for (let slot = 0; slot < cells; slot++) {
