@@ -72,7 +72,7 @@ test.each([KEYSS[0], LATENT[1]])('a header that breaks one of its bounds is dama
     [/keyss-secret/, 'keyss-secrets'], [/'kind':/, "'kind':1,'more':"], [/'(mlp|latent)'/, "'other'"], [/'op','ro'/, "'ro','op'"],
     [/'op'/, "'oq'"], [/false/, '0'], [/'key_size':64/, "'key_size':65"], [/'sh_degree':\d/, "'sh_degree':4"],
     [/'secret':\d/, "'secret':9"], [/'secrets':\d/, "'secrets':0"], [/'branch':\d+/, "'branch':0.5"], [/'hidden':./, "'hidden':[1,"],
-    [/'count':\d/, "'count':-"], [/'visibility':/, "'visibility':-"], [/'visibility':/, "'visibility':1e999,'more':"],
+    [/'count':\d/, "'count':-1"], [/'visibility':/, "'visibility':-"], [/'visibility':/, "'visibility':1e999,'more':"],
     [/'scale':\d/, "'scale':-1"], [/'rotation':../, "'rotation':[[2"], [/"key"/, '"kex"'], [/decoder/, 'recoded'],
     [/"anchors".*?]/, '"anchors":{"dtype":"F32","shape":[0,3]'], [/"shape":\[64\]/, '"shape":[-4]'], [/"F16"/, '"I16"'],
     [/("decoder.*?offsets":\[)/, '$1-1'],
