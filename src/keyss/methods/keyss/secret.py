@@ -103,12 +103,13 @@ class KeyssSecret:
         """
         if not force:
             self.check_unchanged(stego)
-        decoded = self.decode(stego, self.key).to("cpu")
+        decoded = self.decode(stego, self.key)
         if decoded is stego:
             raise InputError(
                 "the harmonics of the model were changed since the secret was hidden in them: none of its "
                 "Gaussians opens"
             )
+        decoded = decoded.to("cpu")
         if (visible := decoded.opacities >= DRAWN_OPACITY).any():
             decoded = decoded[visible]
         left = min(1.0, visibility(decoded)[1] / max(self.visibility, 1e-9))
