@@ -7,6 +7,7 @@ from functools import cache
 from pathlib import Path
 
 import pytest
+import torch
 
 import keyss
 from keyss.channels import LOW_BITS, SUFFIXES, channel_for
@@ -70,7 +71,13 @@ def test_keys_open_what_keyss_reveals_and_a_wrong_one_nothing(
         shown = tab.picture()
         assert psnr(shown, drawn(revealed, POSE)) > CLOSE > psnr(shown, cover)
         tab.saved("#download", tmp_path / "secret.ply")
-        assert read_model(tmp_path / "secret.ply").digest() == revealed.digest()
+        saved = read_model(tmp_path / "secret.ply")
+        if kind == LATENT:  # latents are real numbers, which two languages compute with other roundings
+            assert len(saved) == len(revealed)
+            for name, values in vars(revealed).items():
+                torch.testing.assert_close(getattr(saved, name), values, atol=1e-5, rtol=1e-5)
+        else:
+            assert saved.digest() == revealed.digest()
     assert all(url.startswith(("file:", "blob:null/")) for url in tab.requests), tab.requests
 
 

@@ -10,7 +10,7 @@ The file of a sweep lists pairs, methods, options and seeds, as YAML:
         options: {prune_to_fit: true}
       - method: keyss
         preset: quick
-        grid: {design: [published, mlp], fit.iterations: [500, 1000]}
+        grid: {design: [published, latent], fit.iterations: [500, 1000]}
     seeds: [0, 1, 2]
 
 Everything is checked before anything runs: names of fields, types, options of methods, and that files exist.

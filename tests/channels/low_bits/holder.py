@@ -62,7 +62,9 @@ def _opened(stego: Gaussians, key: DerivedKey) -> tuple[Any, dict[tuple[int, int
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(CellCipher, "decrypt", decrypt)
         patch.setattr(
-            LowBitsReader, "_decrypt", lambda self, cipher, cells=1, _=None: every(self, cipher, cells)
+            LowBitsReader,
+            "_decrypt",
+            lambda self, cipher, width, cells=1, _=None: every(self, cipher, width, cells),
         )
         content = LowBitsReader.of(stego).extract(key)
     return content, {name: np.concatenate(parts) for name, parts in cells.items()}
