@@ -11,7 +11,8 @@ import type { Decode, Shape } from './decoder.ts';
 import type { Tensors } from './safetensors.ts';
 
 const KEPT = 3 * coefficients(1); // numbers of the harmonics that hold nothing
-const [OWN, MOST, LEAST_KEPT] = [13, 24, 2]; // latents without the code; at most; directions that hold none
+const [OWN, LEAST_KEPT] = [13, 2]; // latents without the code; directions that hold none
+const [ONE, TWO] = [24, 14]; // latents of one secret at most, and of each of two
 const [SHARE, GUARD, ROUNDING] = [4, 1 / 256, 1e-10];
 const [NONCE_BYTES, ROWS] = [16, 1 << 14]; // rows at a time
 const MAX_EXPONENT = 80; // of a spread
@@ -21,7 +22,7 @@ const RANKS = [0, ...Array.from({ length: 31 }, (_, at) => 1 / (1 + Math.exp(7 -
 export function latentOf({ shDegree, secrets, secret }: Shape, tensors: Tensors, key: Float32Array): Decode {
   const harmonics = 3 * coefficients(shDegree);
   const high = Math.max(0, harmonics - KEPT);
-  const count = Math.min(MOST, Math.floor((high - LEAST_KEPT) / secrets));
+  const count = Math.min(secrets > 1 ? TWO : ONE, Math.floor((high - LEAST_KEPT) / secrets));
   if (count < OWN || secret >= secrets) throw damaged();
   const [written, first] = [count * secrets, count * secret];
   const directions = tensors.take('decoder.place.directions', high, written);

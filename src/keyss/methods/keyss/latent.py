@@ -36,7 +36,7 @@ from keyss.keys.derivation import expand
 from keyss.methods.keyss.decoder import Decoder, DecoderShape
 
 OWN = 13  # latents without the code: opacity 1, rotation 3, log scales 3, position 3, constant colour 3
-MOST = 24  # latents of a secret: more cost the cover more than they give the secret
+MOST = (24, 14)  # latents of one secret, of each of two: more cost the cover more than they give secrets
 LEAST_KEPT = 2  # directions that stay the cover's, by which the spread of a row is known
 SHARE = 4  # a latent takes 1 / SHARE of the circle: a foreign row passes once in SHARE ** latents times
 GUARD = 1 / 256  # at both ends of that share, for rounding
@@ -45,7 +45,7 @@ NONCE_BYTES = 16
 
 def latents_of(sh_degree: int, secrets: int) -> int:
     """D, the latents of each of so many secrets. Raises UsageError where a row has no room."""
-    count = min(MOST, (harmonics_above(sh_degree) - LEAST_KEPT) // secrets)
+    count = min(MOST[min(secrets, 2) - 1], (harmonics_above(sh_degree) - LEAST_KEPT) // secrets)
     if count < OWN:
         raise UsageError(
             f"SH degree {sh_degree} with {secrets} secrets: the harmonics of a Gaussian have no room for one "
