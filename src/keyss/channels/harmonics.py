@@ -58,13 +58,15 @@ class Harmonics(nn.Module):
     """R directions, and what plain models have in them."""
 
     directions: Tensor  # [H, R] orthonormal
-    slopes: Tensor  # [2, R] number j spreads like exp(a + b log(root mean square of what is before it))
+    # [3, R] number j spreads like exp(a + b log(kept) + c log(before)): the root mean squares of what stays
+    # as it is, and of numbers 0 to j - 1
+    slopes: Tensor
     quantiles: Tensor  # [R, 33] of a number over its spread, at RANKS
 
     def __init__(self, width: int, count: int) -> None:
         super().__init__()
         self.register_buffer("directions", torch.zeros(width, count))
-        self.register_buffer("slopes", torch.zeros(2, count))
+        self.register_buffer("slopes", torch.zeros(3, count))
         self.register_buffer("quantiles", torch.linspace(-1, 1, len(RANKS)).repeat(count, 1))
 
     def fit(self, plain: Gaussians) -> Tensor:
@@ -84,14 +86,16 @@ class Harmonics(nn.Module):
         vectors = np.linalg.eigh(weighted.T @ weighted)[1]
         count = self.directions.shape[1]
         self.directions.copy_(torch.from_numpy(vectors[:, :count]))
-        written, power = self._split(harmonics)
+        written, kept = self._split(harmonics)
+        before = np.zeros_like(kept)
         for j, column in enumerate(written.T):
-            seen = (power > 0) & (column != 0)
-            before, own = np.log(self._level(power[seen], j)), np.log(np.abs(column[seen]))
-            slope = np.cov(before, own)[0, 1] / max(float(np.var(before, ddof=1)), 1e-12)
-            self.slopes[:, j] = torch.tensor([own.mean() - slope * before.mean(), slope])
-            self.quantiles[j] = increasing(np.quantile(column[seen] / self._spread(power[seen], j), RANKS))
-            power = power + column**2
+            seen = (kept > 0) & (column != 0)
+            levels = self._levels(kept[seen], before[seen], j)
+            solution = np.linalg.lstsq(levels, np.log(np.abs(column[seen])), rcond=None)[0]
+            self.slopes[:, j] = torch.from_numpy(solution)
+            spread = self._spread(kept[seen], before[seen], j)
+            self.quantiles[j] = increasing(np.quantile(column[seen] / spread, RANKS))
+            before = before + column**2
         return torch.from_numpy(vectors[:, count:]).float()
 
     def write(self, harmonics: Doubles, ranks: Doubles) -> Doubles:
@@ -102,23 +106,23 @@ class Harmonics(nn.Module):
         directions = self.directions.double().numpy()
         kept = harmonics - (harmonics @ directions) @ directions.T
         power = (kept**2).sum(axis=1)
-        alive, written = power > 0, np.zeros_like(ranks)
+        alive, written, before = power > 0, np.zeros_like(ranks), np.zeros(len(ranks))
         power = np.where(alive, power, 1.0)
         for j, own in enumerate(ranks.T):
             value = np.interp(own, RANKS, self.quantiles[j].double().numpy())
-            written[:, j] = value * self._spread(power, j)
-            power = power + written[:, j] ** 2
+            written[:, j] = value * self._spread(power, before, j)
+            before = before + written[:, j] ** 2
         return np.where(alive[:, None], kept + written @ directions.T, harmonics)
 
     def read(self, harmonics: Doubles) -> tuple[Doubles, Flags]:
         """[N, R] the ranks that `write` wrote into [N, H]; [N] which rows have any."""
         written, power = self._split(harmonics)
-        alive, ranks = power > 0, np.empty_like(written)
+        alive, ranks, before = power > 0, np.empty_like(written), np.zeros(len(written))
         power = np.where(alive, power, 1.0)
         for j, column in enumerate(written.T):
-            relative = column / self._spread(power, j)
+            relative = column / self._spread(power, before, j)
             ranks[:, j] = np.interp(relative, self.quantiles[j].double().numpy(), RANKS)
-            power = power + column**2
+            before = before + column**2
         return ranks, alive
 
     def _split(self, harmonics: Doubles) -> tuple[Doubles, Doubles]:
@@ -128,15 +132,15 @@ class Harmonics(nn.Module):
         power = ((harmonics - written @ directions.T) ** 2).sum(axis=1)
         return written, np.where(power > _ROUNDING * (harmonics**2).sum(axis=1), power, 0.0)
 
-    def _level(self, power: Doubles, j: int) -> Doubles:
-        """[N] the root mean square of the numbers before number j, from their sum of squares."""
+    def _levels(self, kept: Doubles, before: Doubles, j: int) -> Doubles:
+        """[N, 3] 1 and the two logarithms of `slopes` for number j, from sums of squares [N]."""
         width, count = self.directions.shape
-        return np.sqrt(power / (width - count + j))
+        own = np.zeros_like(kept) if j == 0 else np.log(np.maximum(before, _ROUNDING * kept) / j) / 2
+        return np.stack([np.ones_like(kept), np.log(kept / (width - count)) / 2, own], axis=1)
 
-    def _spread(self, power: Doubles, j: int) -> Doubles:
-        offset, slope = self.slopes[:, j].double().numpy()
-        spread: Doubles = np.exp(np.clip(offset + slope * np.log(self._level(power, j)), -80, 80))
-        return spread
+    def _spread(self, kept: Doubles, before: Doubles, j: int) -> Doubles:
+        exponents = self._levels(kept, before, j) @ self.slopes[:, j].double().numpy()
+        return np.exp(np.clip(exponents, -80, 80))
 
 
 def increasing(values: Doubles) -> Tensor:

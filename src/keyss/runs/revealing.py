@@ -79,7 +79,7 @@ def reveal_model(
         opened = registry.open_model(model, key, decoy=decoy)
     revealed = opened.reveal(model.to(device), frame=frame, force=force)
     remains = opened.remains(revealed)
-    return Revealed(revealed, remains, tuple(_loss(remains)))
+    return Revealed(revealed, remains, tuple(loss_warnings(remains)))
 
 
 def reveal_any(model: Gaussians, key: str, device: torch.device) -> Revealed:
@@ -95,8 +95,8 @@ def revealed_file(file: HiddenFile) -> Revealed:
     return Revealed(None, Remains(len(file.data), len(file.data)), file=file)
 
 
-def _loss(remains: Remains) -> list[str]:
-    """A warning for a secret that is not whole."""
+def loss_warnings(remains: Remains) -> list[str]:
+    """Warnings about a secret that is not whole."""
     if remains.share < 1 - NOTICED_LOSS:
         return [
             f"{_count(remains)}: the others {_CAUSE}; the rest was made larger and denser to compensate; the "
@@ -104,6 +104,12 @@ def _loss(remains: Remains) -> list[str]:
         ]
     if remains.share > 1 + NOTICED_LOSS:
         return [f"{_count(remains)}: Gaussians were copied or changed in the published file"]
+    left, chunks = remains.chunks or (0, 0)
+    if left < chunks:
+        return [
+            f"{chunks - left:,} of {chunks:,} chunks of the secret's payload are lost and were restored: the "
+            "published file was changed"
+        ]
     return []
 
 
@@ -213,8 +219,6 @@ def check_secret(revealed: Revealed) -> SecretCheck:
     problems = list(revealed.warnings)
     if not remains.whole and not problems:
         problems.append(f"{remains.found:,} of {remains.hidden:,} Gaussians of the secret were found")
-    if lost:
-        problems.append(f"{lost:,} of {chunks:,} chunks of its payload are lost and were restored")
     return SecretCheck(
         found=remains.found,
         hidden=remains.hidden,

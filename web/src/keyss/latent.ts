@@ -26,7 +26,7 @@ export function latentOf({ shDegree, secrets, secret }: Shape, tensors: Tensors,
   if (count < OWN || secret >= secrets) throw damaged();
   const [written, first] = [count * secrets, count * secret];
   const directions = tensors.take('decoder.place.directions', high, written);
-  const slopes = tensors.take('decoder.place.slopes', 2, written);
+  const slopes = tensors.take('decoder.place.slopes', 3, written);
   const quantiles = rows(tensors.take('decoder.place.quantiles', written, RANKS.length), RANKS.length);
   const basis = rows(tensors.take('decoder.basis', count - OWN, harmonics - 3), harmonics - 3);
   const knots = rows(tensors.take('decoder.knots', count, RANKS.length), RANKS.length);
@@ -41,18 +41,19 @@ export function latentOf({ shDegree, secrets, secret }: Shape, tensors: Tensors,
     for (let at = 0; at < high; at++) {
       for (let j = 0; j < written; j++) along[j] += numbers[at] * directions[at * written + j];
     }
-    let [power, whole] = [0, 0];
+    let [power, whole, before] = [0, 0, 0];
     for (let at = 0; at < high; at++) {
       let rest = numbers[at];
       for (let j = 0; j < written; j++) rest -= along[j] * directions[at * written + j];
       [power, whole] = [power + rest ** 2, whole + numbers[at] ** 2];
     }
     if (power <= ROUNDING * whole) return false;
-    for (let j = 0; j < first + count; power += along[j++] ** 2) {
+    for (let j = 0; j < first + count; before += along[j++] ** 2) {
       const own = j - first;
       if (own < 0) continue;
-      const level = Math.sqrt(power / (high - written + j));
-      const exponent = slopes[j] + slopes[written + j] * Math.log(level);
+      const earlier = j && Math.log(Math.max(before, ROUNDING * power) / j) / 2;
+      const kept = Math.log(power / (high - written)) / 2;
+      const exponent = slopes[j] + slopes[written + j] * kept + slopes[2 * written + j] * earlier;
       const spread = Math.exp(Math.min(MAX_EXPONENT, Math.max(-MAX_EXPONENT, exponent)));
       const turned = interpolated(along[j] / spread, quantiles[j], RANKS) - pads[own] / 2 ** 32;
       const inside = SHARE * (turned - Math.floor(turned));
