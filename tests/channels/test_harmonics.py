@@ -54,7 +54,7 @@ def test_ranks_come_back_from_single_precision() -> None:
 
 
 def test_uniform_ranks_are_written_as_a_plain_model_has_them() -> None:
-    """Direction by direction: the same spread, and the same dependence on the rest of the row, and on each other.
+    """Direction by direction: the same spread, and the same dependence on the rest and on each other.
 
     The Kolmogorov-Smirnov distance of two samples of 4,000 exceeds 0.062 once in 10^6 times where their
     distributions are equal; the Bonferroni bound for 24 directions adds 0.004.

@@ -140,7 +140,8 @@ class Harmonics(nn.Module):
 
     def _spread(self, kept: Doubles, before: Doubles, j: int) -> Doubles:
         exponents = self._levels(kept, before, j) @ self.slopes[:, j].double().numpy()
-        return np.exp(np.clip(exponents, -80, 80))
+        spread: Doubles = np.exp(np.clip(exponents, -80, 80))
+        return spread
 
 
 def increasing(values: Doubles) -> Tensor:
