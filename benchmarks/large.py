@@ -168,7 +168,7 @@ def _step(step: str, folder: Path, options: argparse.Namespace) -> None:
     elif step == "hide":
         with ThreadPoolExecutor(2) as readers:  # as `keyss hide` does
             cover, secret = readers.map(read_model, (folder / "cover.ply", folder / "secret.ply"))
-        if options.publish == "ply":
+        if options.publish in ("auto", "ply"):
             prepared = LOW_BITS.prepare(cover)
             if options.prune:
                 secret = most_visible(

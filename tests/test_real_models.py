@@ -1,17 +1,14 @@
-"""Public models as people have them, in each other: accepted, or refused at once with a way that is."""
+"""Public models as people have them, in each other, by the defaults."""
 
 from __future__ import annotations
 
-import re
 import time
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 import keyss
 from keyss import CarryOptions, Gaussians, Secret
-from keyss.core import KeyssError
 from keyss.methods import MethodOptions, Source, registry
 
 pytestmark = pytest.mark.real
@@ -25,52 +22,21 @@ def models(real_data: Path) -> dict[str, Gaussians]:
     return {name: keyss.read_model(real_data / "splats" / f"{name}.ply") for name in NAMES}
 
 
-def refusal(options: MethodOptions, *models: Gaussians) -> str | None:
-    """What is said before the first step, None if nothing is."""
+def prepared(options: MethodOptions, *models: Gaussians) -> MethodOptions:
     sources = [Source(model, photos=False) for model in models]
-    try:
-        registry.of_options(options).prepare(sources, options)
-    except KeyssError as error:
-        return str(error)
-    return None
+    return registry.of_options(options).prepare(sources, options)
 
 
-def named_ways(message: str) -> list[MethodOptions]:
-    """The options that the advice at the end of a message names, each group of them a way."""
-    ways = []
-    for group in re.findall(r"`([^`]+)`", message.rpartition("; ")[2]):
-        given: dict[str, Any] = {}
-        for name, value in re.findall(r'(\w+)=("\w+"|\w+)', group):
-            given[name] = {"True": True}.get(value, value.strip('"'))
-        if "sh_degree" in given:
-            given["sh_degree"] = int(given["sh_degree"])
-        ways.append(CarryOptions(**given))
-    return ways
-
-
+@pytest.mark.filterwarnings("ignore::keyss.core.KeyssWarning")
 @pytest.mark.parametrize("cover", NAMES)
-def test_every_pair_is_accepted_or_shown_a_way(models: dict[str, Gaussians], cover: str) -> None:
+def test_every_pair_is_accepted(models: dict[str, Gaussians], cover: str) -> None:
+    """Unnoticed where that leaves enough of the secret: of 20 pairs, in 12."""
     for name, secret in models.items():
         start = time.process_time()
-        said = refusal(CarryOptions(), models[cover], secret)
+        found = prepared(CarryOptions(), models[cover], secret).publish
         assert time.process_time() - start < CPU_SECONDS, name
-        if said is None:
-            continue
-        ways = named_ways(said)
-        assert ways, said
-        assert ways[-1].publish == "any"
-        for way in ways:
-            then = refusal(way, models[cover], secret)
-            assert then is None, (name, said, then)
-
-
-def test_covers_without_harmonics_and_quantised_ones_are_where_it_matters(
-    models: dict[str, Gaussians],
-) -> None:
-    assert [model.sh_degree for model in models.values()] == [0, 0, 3, 2, 2]
-    for name in NAMES:
-        said = refusal(CarryOptions(), models[name], models["playbot_lod4"])
-        assert (said is None) == (name == "inria_cuda_7000")
+        small = len(secret) < 10_000
+        assert found == "auto" or len(secret) > 3 * len(models[cover]) or not small, (name, found)
 
 
 @pytest.mark.parametrize(
@@ -78,8 +44,10 @@ def test_covers_without_harmonics_and_quantised_ones_are_where_it_matters(
     [
         ("inria_cuda_7000", "playbot_lod4", CarryOptions(), (80, 40)),
         ("inria_cuda_7000", "inria_cuda_7000", CarryOptions(), (80, 40)),
-        ("playbot_lod2", "guitar", CarryOptions(dither=True), (55, 50)),
-        ("playbot_lod2", "inria_cuda_7000", CarryOptions(dither=True), (55, 50)),
+        ("playbot_lod2", "inria_cuda_7000", CarryOptions(), (48, 50)),
+        ("guitar", "playbot_lod4", CarryOptions(), (55, 45)),
+        ("biker", "guitar", CarryOptions(), (55, 35)),
+        ("playbot_lod4", "biker", CarryOptions(), (40, 40)),
     ],
 )
 def test_what_is_accepted_comes_out_well(

@@ -62,7 +62,10 @@ def test_what_is_lost_is_said(keyss: Run) -> None:
 
 def test_a_cover_without_harmonics_gets_the_room_that_the_refusal_promises(keyss: Run) -> None:
     flat = [word.replace("cover.ply", "flat.ply") for word in HIDE]
-    refused = keyss(*flat, "--secret", "small.ply", "-o", "run")
+    shown = keyss(*flat, "--secret", "small.ply", "-o", "shown")
+    assert shown.status == 0, shown.err
+    assert "whoever inspects the published file sees that it holds something" in shown.err.splitlines()[0]
+    refused = keyss(*flat, "--secret", "small.ply", "--publish", "ply", "-o", "run")
     assert refused.status == 2
     assert "--sh-degree 1 makes room" in refused.err
     done = keyss(*flat, "--secret", "small.ply", "--sh-degree", "1", "--iterations", "5", "-o", "run")

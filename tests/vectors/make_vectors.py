@@ -43,6 +43,7 @@ from keyss.channels import (  # noqa: E402
     in_counted_order,
     last_bits,
     open_content,
+    quiet_channel,
 )
 from keyss.channels.codes.fields import _log2  # noqa: E402
 from keyss.core.gaussians import Gaussians  # noqa: E402
@@ -191,6 +192,15 @@ def write_coded(suffix: str) -> None:
     write_model(FOLDER / f"coded{suffix}", coded)
 
 
+def write_decoded(suffix: str) -> None:
+    """A .ply that was decoded from codes, with a secret in their place."""
+    codes = codes_examples.FORMATS[suffix].of(codes_examples.model_of(1500, 21, 0))
+    model = codes.dequantise()
+    payload = HiddenFile("a note.txt", b"Written at night, read at noon.\n").payload()
+    stego = quiet_channel(LOW_BITS, model).prepare(model).embed([(TWO_KEYS[0], payload)], entropy=bytes(32))
+    write_model(FOLDER / f"decoded-{suffix.split('.')[1]}.ply", stego)
+
+
 def write_extremes() -> None:
     """Numbers far from what training gives, in formats in which they tell how many bits carry."""
     random = np.random.default_rng(15)
@@ -298,6 +308,8 @@ def write_revealed(key: str) -> None:
     for suffix in codes_examples.FORMATS:
         write_coded(suffix)
         opened += [revealed(f"coded{suffix}", each) for each in TWO_KEYS]
+        write_decoded(suffix)
+        opened.append(revealed(f"decoded-{suffix.split('.')[1]}.ply", TWO_KEYS[0]))
     write_surviving(FOLDER, TWO_KEYS)
     opened += [revealed(name, TWO_KEYS[0]) for name in NAMES]
     opened += [revealed(name, TWO_KEYS[1]) for name in NAMES[:3:2]]

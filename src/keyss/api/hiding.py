@@ -18,7 +18,7 @@ import torch
 
 from keyss.api.asking import HideResult, Secret, check_keys, method_for, sources_of
 from keyss.api.fitting import begun, together
-from keyss.channels import AnyChannel, Channel, Publish, channel_for, open_content
+from keyss.channels import AnyChannel, Channel, Publish, channel_for, open_content, quiet_channel
 from keyss.core.errors import KeyssWarning, QualityError, UsageError
 from keyss.core.gaussians import Gaussians, same_bits
 from keyss.core.scene import Scene, ViewOptions
@@ -61,6 +61,9 @@ from keyss.runs.records import read_record, record_bytes
 
 MIN_PSNR = 20.0  # dB to the plain model; below it, renders show something else
 MIN_PRUNED_PSNR = 25.0  # the same for secrets that lost Gaussians without a refit
+# Below this PSNR to the plain model a difference is seen; but nothing is lost where photos are matched nearly
+# as well, to so many dB, and so much SSIM.
+_FAR, _NEARLY_PSNR, _NEARLY_SSIM = 30.0, 3.0, 0.1
 # dB; empty renders of dark or small objects can have a high PSNR, and of invisible ones the highest
 _BETTER_THAN_NOTHING, _GOOD, _EMPTY = 3.0, 40.0, 119.0
 
@@ -91,10 +94,11 @@ def hide(
     Cover and secrets are scenes of photos, or models of any format, which are rendered for measurements.
     Plain models of scenes are fitted unless they are given. Secrets can also be files, in a cover that is a
     model. `method`: a name, or the options of a method (`CarryOptions`, `KeyssOptions`). `publish` and
-    `channel`, if given, replace those of the options: "ply" hides in low bits; "spz", "sog" and
-    "compressed-ply" in the integers of such a file, which must stay unchanged; "any" in what survives
-    conversion, which is the channel "appended" (more Gaussians, which are visible in the file) or "colours"
-    (less room). `width`, `background`, `skip_missing`: see `load_scene`.
+    `channel`, if given, replace those of the options: "ply" hides in low bits, or in the steps
+    of a model that was decoded from another format; "spz", "sog" and "compressed-ply" in the integers of
+    such a file, which must stay unchanged; "any" in what survives conversion, which is the channel "appended"
+    (more Gaussians, which are visible in the file) or "colours" (less room). "auto" is "ply", or "any" with a
+    warning for a cover that holds nothing unnoticed. `width`, `background`, `skip_missing`: see `load_scene`.
 
     `out` (a folder) gets `publish/` with the stego model, and `private/` with fitted models, `config.json`,
     `metrics.json`, the files to hand over for methods that need them (`keyss.methods.handed`), and
@@ -118,7 +122,7 @@ def hide(
                 raise UsageError(f"hiding files does not use `{name}`: leave it out")
         if isinstance(cover, Scene) or not is_model(cover):
             raise UsageError("hiding a file needs a model as the cover; `keyss fit` makes one from photos")
-        where = channel_for(publish or "ply", channel or "colours")
+        where = channel_for(publish or "auto", channel or "colours")
         found = _hide_files(cover, secrets, where, None if dry_run else out, overwrite)
         return replace(found, stego=None) if dry_run else found
     if out is not None and is_model_path(out):
@@ -208,7 +212,7 @@ def hide(
             ]
             sizes = [(len(model), len(each.model)) for model, each in zip(read, sources, strict=True)]
             again = ", and `resume=True` skips the training that is done" * trains
-            _check_quality(shown, min_psnr, sizes, options.trains, again)
+            _check_quality(shown, min_psnr, sizes, options, again)
         bounds = list(map(Bound.of, options.training(len(sources)), plain_steps))
         longer = _fit_bounds(bounds, sources, stego, options, context) if bound else {}
         if ranks.first:
@@ -247,7 +251,7 @@ def _hide_files(
     keys = [each.key for each in secrets]
     payloads = [(key, each.payload()) for key, each in zip(keys, hidden, strict=True)]
     try:
-        stego = place.prepare(model).embed(payloads)
+        stego = quiet_channel(place, model).prepare(model).embed(payloads)
     except UsageError as error:
         if place.grows:
             raise
@@ -310,29 +314,45 @@ def _as_read(stego: Stego, keys: Sequence[str], folder: RunFolder | None) -> lis
 
 
 def _check_quality(
-    shown: Sequence[Shown], min_psnr: float | None, sizes: Sequence[tuple[int, int]], refits: bool, again: str
+    shown: Sequence[Shown],
+    min_psnr: float | None,
+    sizes: Sequence[tuple[int, int]],
+    options: MethodOptions,
+    again: str,
 ) -> None:
-    """Raise QualityError if the cover or a secret is too far from its plain model.
+    """Raise QualityError if the cover or a secret is too far from its plain model; warn if it is far.
 
     `sizes`: Gaussians of each and of its plain model. `again`: of the message, what `resume` does.
     """
-    for index, (each, (count, before)) in enumerate(zip(_fidelity(shown), sizes, strict=True)):
+    for index, (render, (count, before)) in enumerate(zip(shown, sizes, strict=True)):
+        each, plain, own = render.fidelity, render.plain, render.quality
+        if each is None or plain is None:
+            continue
         who = "the cover" if index == 0 else "the secret" if len(shown) == 2 else f"secret {index}"
-        least = MIN_PRUNED_PSNR if count < before and not refits else MIN_PSNR
+        cut = count < before
+        least = MIN_PRUNED_PSNR if cut and not options.trains else MIN_PSNR
         limit = least if min_psnr is None else min_psnr
-        kept = f" with {count:,} of {before:,} Gaussians" if count < before else ""
+        kept = f" with {count:,} of {before:,} Gaussians" if cut else ""
         found = f"{who}{kept} is at {each.psnr:.1f} dB PSNR to its plain model"
+        way = '; `publish="any"` keeps all of them, and shows that there is a secret' * (
+            cut and options.publish != "any"
+        )
         if each.psnr < limit:
             raise QualityError(
-                f"{found}, below {limit:g} dB: nothing was published; a lower `min_psnr` publishes it{again}"
+                f"{found}, below {limit:g} dB: nothing was published; a lower `min_psnr` publishes it"
+                f"{again}{way}"
             )
         if limit > 0 and (
             each.psnr < min(each.nothing + _BETTER_THAN_NOTHING, _GOOD) or each.nothing > _EMPTY
         ):
             raise QualityError(
                 f"{found}, and empty renders are at {each.nothing:.1f} dB: nothing was published; "
-                f"`min_psnr=0` publishes it anyway{again}"
+                f"`min_psnr=0` publishes it anyway{again}{way}"
             )
+        lost = own.psnr < plain.psnr - _NEARLY_PSNR and each.psnr < _FAR
+        if min_psnr is None and (lost or own.ssim < plain.ssim - _NEARLY_SSIM):
+            ssims = f"SSIM {own.ssim:.2f} where the plain model has {plain.ssim:.2f}"
+            warnings.warn(f"{found}, {ssims}{way}", KeyssWarning, stacklevel=3)
 
 
 def _fidelity(shown: Sequence[Shown]) -> tuple[RenderFidelity, ...]:

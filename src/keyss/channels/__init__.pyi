@@ -50,6 +50,7 @@ from .publishing import (
     channel_for as channel_for,
     open_content as open_content,
     quick_attempt as quick_attempt,
+    quiet_channel as quiet_channel,
     suffix_of as suffix_of,
 )
 from .reed_solomon import Codewords as Codewords

@@ -13,7 +13,7 @@ from keyss.core.gaussians import Gaussians
 from keyss.files.formats.common import CodedGaussians
 from keyss.keys.derivation import DerivedKey
 
-Publish = Literal["ply", "spz", "sog", "compressed-ply", "any"]
+Publish = Literal["auto", "ply", "spz", "sog", "compressed-ply", "any"]
 AnyChannel = Literal["appended", "colours"]  # of a model that may be converted to any format
 
 SUFFIXES = {"spz": ".spz", "sog": ".sog", "compressed-ply": ".compressed.ply"}  # of files whose codes carry
@@ -29,7 +29,7 @@ def channel_for(publish: Publish, channel: AnyChannel = "appended") -> Channel:
             f"expected a format to publish in ({', '.join(get_args(Publish))}), and "
             f"{' or '.join(get_args(AnyChannel))} for any, got {publish!r} and {channel!r}"
         )
-    if publish == "ply":
+    if publish in ("auto", "ply"):
         from keyss.channels.low_bits.channel import LOW_BITS
 
         return LOW_BITS
@@ -44,6 +44,17 @@ def channel_for(publish: Publish, channel: AnyChannel = "appended") -> Channel:
     from keyss.channels.colours.channel import COLOURS
 
     return COLOURS
+
+
+def quiet_channel(channel: Channel, cover: Gaussians) -> Channel:
+    """The place that `cover` has for `channel`: of low bits its codes, if it was decoded from some."""
+    if channel.name == "low_bits":
+        from keyss.channels.codes.channel import DecodedChannel
+        from keyss.channels.codes.decoded import Decoded
+
+        if decoded := Decoded.of(cover):
+            return DecodedChannel(decoded)
+    return channel
 
 
 def suffix_of(stego: Gaussians) -> str:
@@ -102,10 +113,13 @@ def _readers(stego: Gaussians) -> Iterator[Reader]:
 
 def _exact(stego: Gaussians) -> SaltedReader | None:
     """The reader of bits that only the unchanged file has: codes of a coded file, else low bits."""
-    if isinstance(stego, CodedGaussians):
-        from keyss.channels.codes.channel import CodesReader
+    from keyss.channels.codes.channel import CodesReader
+    from keyss.channels.codes.decoded import Decoded
 
+    if isinstance(stego, CodedGaussians):
         return CodesReader.of(stego.codes)
+    if decoded := Decoded.of(stego):
+        return CodesReader.of(decoded.codes, decoded.exact)
     from keyss.channels.low_bits.contents import LowBitsReader
 
     return LowBitsReader.of(stego)

@@ -106,12 +106,13 @@ class HideArguments:
     ] = ()
     key_file: KeyFiles = ()
     publish: Annotated[
-        Literal["ply", "spz", "sog", "compressed-ply", "any"],
+        Literal["auto", "ply", "spz", "sog", "compressed-ply", "any"],
         arg(
-            help="File to publish: any is a .ply that may be converted later; the others must stay as they "
-            "are, and all but ply have room for small secrets only."
+            help="File to publish. any: a .ply that may be converted later; whoever inspects it sees "
+            "that it holds something. The others must stay as they are; all but ply hold small secrets only. "
+            "auto: ply, or any with a warning where the cover holds nothing unnoticed."
         ),
-    ] = "ply"
+    ] = "auto"
     out: OutFolder
     method: str
     preset: Preset = "default"

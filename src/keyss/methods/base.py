@@ -111,7 +111,8 @@ class MethodOptions:
     method: ClassVar[str]  # name in files and on the command line, 1 to 15 ASCII characters
 
     fit: FitConfig = field(default_factory=FitConfig)  # of plain models, and of the method's own training
-    publish: Publish = "ply"  # format of the published model; any: it may be converted
+    # Format of the published model; any: it may be converted; auto: ply, or any if nothing goes in unnoticed.
+    publish: Publish = "auto"
     # For models that may be converted: appended Gaussians have room for everything, and everybody sees them;
     # colours have little room and show less.
     channel: AnyChannel = "appended"
@@ -185,7 +186,7 @@ class MethodOptions:
 
     def check_published_exactly(self) -> None:
         """Raise UsageError where a jointly trained model would be published in a lossy form."""
-        if self.publish != "ply":
+        if self.publish not in ("auto", "ply"):
             raise UsageError(
                 f'`publish="{self.publish}"`: this method needs the published model bit for bit: leave it '
                 'out, or use `method="carry"`'

@@ -89,7 +89,7 @@ def test_too_large_secrets_are_refused_or_pruned(run: Run, tmp_path: Path) -> No
 
 def test_a_cover_without_any_room_names_what_works_and_not_what_was_given(run: Run, tmp_path: Path) -> None:
     write_model(tmp_path / "tiny.ply", trained_like(100))
-    for flags in ((), ("--prune-to-fit",), ("--refit=never",)):
+    for flags in (("--publish=ply",), ("--prune-to-fit",), ("--refit=never",)):
         scenes = ("--cover", tmp_path / "tiny.ply", "--secret", "secret.ply")
         status, _, err = run(*HIDE, *scenes, "-o", tmp_path / "out", *flags)
         assert status == 2
@@ -185,10 +185,10 @@ def test_what_cannot_work_is_refused_before_anything_is_fitted(tmp_path: Path) -
     coarse = trained_like(1500).map(lambda v: (v * 64).round() / 64)
     secret = Secret(tiny_scene(1), KEY)
     with pytest.raises(UsageError, match="`dither=True`"):
-        keyss.hide(coarse, [secret], method="carry", out=tmp_path / "run")
+        keyss.hide(coarse, [secret], method="carry", publish="ply", out=tmp_path / "run")
     flat = random_gaussians(1500, sh_degree=0)
     model = Secret(tiny_scene(1), KEY, random_gaussians(100, sh_degree=3))
     other = Secret(tiny_scene(1), KEY + "2")
     with pytest.raises(UsageError, match="SH degree 0 has no room"):
-        keyss.hide(flat, [other, model], method="carry", out=tmp_path / "run")
+        keyss.hide(flat, [other, model], method="carry", publish="ply", out=tmp_path / "run")
     assert not (tmp_path / "run").exists()

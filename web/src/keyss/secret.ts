@@ -12,7 +12,7 @@ const DECODERS = new Map<unknown, typeof networkOf>([['mlp', networkOf], ['laten
 const [MAX_ANCHORS, ANCHORS_NEEDED, ANCHOR_TOLERANCE] = [64, 0.25, 1e-6];
 const [MAX_COUNT, LEAST_LEFT] = [2 ** 31, 1e-6]; // of Gaussians; share of the visibility
 const DRAWN_OPACITY = Math.fround(1 / 255);
-const APPENDED_OPACITY = 1.1 / 255;
+const APPENDED_OPACITY = 1.00001 / 255;
 const APPENDED_LOGIT = Math.fround(Math.log(APPENDED_OPACITY / (1 - APPENDED_OPACITY)));
 
 /** What the payload reveals of a model, and how many Gaussians there were. Raises InputError. */

@@ -1,4 +1,4 @@
-"""Secrets in the last bits of the codes of a final .spz, .sog or compressed .ply.
+"""Secrets in the last bits of the codes of a .spz, .sog or compressed .ply, or of a .ply decoded from one.
 
 The file is passed on byte for byte, so values are exact and nothing is redundant. `fields` chooses the
 numbers that carry bits, `kept` those that are left alone, `syndromes` lets readers do without that list, and
@@ -11,10 +11,11 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass, fields as dataclass_fields
+from dataclasses import dataclass, fields as dataclass_fields, replace
 from functools import cached_property
 
 import numpy as np
+import torch
 
 from keyss.channels.base import (
     Channel,
@@ -28,8 +29,9 @@ from keyss.channels.base import (
     unpack_payload,
 )
 from keyss.channels.codes import syndromes
+from keyss.channels.codes.decoded import Decoded
 from keyss.channels.codes.fields import FORMATS, Field, Levels, carrying
-from keyss.channels.codes.kept import changeable, in_counted_order, in_file_order
+from keyss.channels.codes.kept import changeable, counted_order, file_order, in_counted_order, in_rows
 from keyss.channels.codes.layout import SLOT_BYTES, ZONE_RATE, Header, Zones, find_header, to_bits, to_bytes
 from keyss.channels.codes.syndromes import rate_of
 from keyss.channels.mixing import random_fractions, random_order, random_words
@@ -66,6 +68,19 @@ class CodesChannel(Channel):
         return Room(gaussians, gaussians * _BITS_PER_GAUSSIAN // 8 if slots else 0, _OVERHEAD)
 
 
+class DecodedChannel(CodesChannel):
+    """The channel in a model that was decoded from a file of some format; see `Decoded`."""
+
+    def __init__(self, decoded: Decoded) -> None:
+        super().__init__(decoded.codes.name)
+        self.decoded = decoded
+        self.place = f"steps of its numbers, which are those of a {self.format} file"
+
+    def prepare(self, cover: Gaussians) -> CodesCover:
+        """`cover`: the model of `decoded`, or the same with fewer harmonics."""
+        return CodesCover.of(self.decoded.codes, replace(self.decoded, model=cover.detach().to("cpu")))
+
+
 @dataclass(frozen=True)
 class CodesCover:
     """Codes whose room is known; see `keyss.channels.base.PreparedCover`."""
@@ -73,12 +88,14 @@ class CodesCover:
     codes: Codes  # in the order in which bits are counted
     fields: list[Field]
     free: list[Flags]  # of each field, which levels may be changed
+    decoded: Decoded | None = None  # the model that is published in the place of the codes, in that order
 
     @staticmethod
-    def of(codes: Codes) -> CodesCover:
-        """Raises UsageError for codes without room."""
-        ordered, fields = in_counted_order(codes)
-        cover = CodesCover(ordered, fields, changeable(ordered, fields, _digest(codes)))
+    def of(codes: Codes, decoded: Decoded | None = None) -> CodesCover:
+        """Raises UsageError for codes without room. `decoded`: the model that is published, not the codes."""
+        ordered, fields = in_counted_order(codes, decoded.exact if decoded else None)
+        model = decoded[counted_order(codes)] if decoded else None
+        cover = CodesCover(ordered, fields, changeable(ordered, fields, _digest(codes)), model)
         if not cover.zones.slots or cover.rate < ZONE_RATE:
             raise UsageError(
                 f"a cover of {len(fields[0].levels):,} Gaussians has no room for secrets in the codes of "
@@ -112,17 +129,15 @@ class CodesCover:
         return Room(self._count, compressible, _OVERHEAD)
 
     @property
-    def cover(self) -> CodedGaussians:
-        return CodedGaussians.of(self.codes)
+    def cover(self) -> Gaussians:
+        return self.decoded.model if self.decoded else CodedGaussians.of(self.codes)
 
     @property
     def _count(self) -> int:
         """Gaussians."""
-        return len(self.fields[0].levels)
+        return len(self.codes)
 
-    def embed(
-        self, contents: Sequence[tuple[str, Content]], *, entropy: bytes | None = None
-    ) -> CodedGaussians:
+    def embed(self, contents: Sequence[tuple[str, Content]], *, entropy: bytes | None = None) -> Gaussians:
         """See `PreparedCover`. Raises UsageError for more secrets than there are slots, too."""
         packed = [pack_payload(content) for _, content in contents]
         mixed = randomness(entropy, _digest(self.codes), *packed)
@@ -132,8 +147,15 @@ class CodesCover:
             keys = [DerivedKey.of(key, salt) for key, _ in contents]
             check_keys([key.verifier() for key in keys])
             embedded = self._embedded(list(zip(keys, packed, strict=True)), salt, own)
-            if embedded is not None:
-                return CodedGaussians.of(embedded)
+            if embedded is None:
+                continue
+            within = random_fractions(own, "codes/file-order", 3 * self._count).reshape(-1, 3) - 0.5
+            order = file_order(embedded, within)
+            if self.decoded is None:
+                return CodedGaussians.of(in_rows(embedded, order))
+            if not self.decoded.is_sorted:
+                order = self.decoded.order.argsort()
+            return self.decoded.with_codes(self.codes, embedded)[torch.from_numpy(order)]
         raise RuntimeError("no block order was found in which all blocks have room")
 
     def _embedded(
@@ -158,11 +180,7 @@ class CodesCover:
             encrypted = encrypt(_data_key(key), packed, _ASSOCIATED, size=size)
             data[_range(len(data), start, size)] = to_bits(encrypted)
         bits = self._solved(to_bits(bytes(zone)), data, salt, entropy)
-        if bits is None:
-            return None
-        within = random_fractions(entropy, "codes/file-order", 3 * self._count).reshape(-1, 3) - 0.5
-        sorted_again: Codes = in_file_order(self._written(bits, entropy), within)
-        return sorted_again
+        return None if bits is None else self._written(bits, entropy)
 
     def _solved(self, zone: Bits, data: Bits, salt: bytes, entropy: bytes) -> Bits | None:
         """The last bits of all levels; those that may change are random."""
@@ -198,9 +216,9 @@ class CodesReader(SaltedReader):
     salts: Sequence[bytes]
 
     @staticmethod
-    def of(codes: Codes) -> CodesReader | None:
-        """None for codes without room."""
-        _, fields = in_counted_order(codes)
+    def of(codes: Codes, exact: Flags | None = None) -> CodesReader | None:
+        """None for codes without room. `exact`: of a model that was decoded from the codes."""
+        _, fields = in_counted_order(codes, exact)
         room = _zones(fields)
         if not room.slots:
             return None

@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 
 from keyss.channels.codes.fields import Field, Levels, carrying, sog_distances
 from keyss.channels.mixing import random_fractions, row_hashes
-from keyss.core.arrays import Doubles, Flags, Floats, Integers
+from keyss.core.arrays import Doubles, Flags, Floats, Integers, Words
 from keyss.files.formats.common import Codes, morton_order
 from keyss.files.formats.compressed_ply import CompressedPlyCodes
 from keyss.files.formats.sog import SogCodes
@@ -134,46 +134,59 @@ def _pairs(values: Integers, counts: Integers, distance: int) -> float:
     return float((counts[there] * counts[at[there]]).sum())
 
 
-def in_counted_order(codes: Codes) -> tuple[Any, list[Field]]:
+def in_counted_order(codes: Codes, exact: Flags | None = None) -> tuple[Any, list[Field]]:
     """The codes in the order in which bits are counted, and their fields.
 
-    Gaussians of a .sog that are alike in all codes that are not written carry nothing.
+    Gaussians that are not `exact` [N] (see `Decoded`) carry nothing, nor do those of a .sog that are alike in
+    all codes that are not written.
     """
-    if not isinstance(codes, SogCodes):
-        return codes, carrying(codes).fields(codes)
-    rows, alike = _sog_order(codes)
-    codes = _taken(codes, rows)
-    fields = carrying(codes).fields(codes)
-    return codes, [replace(each, bits=np.where(alike, 0, each.bits)) for each in fields]
+    silent = np.zeros(len(codes), np.bool_) if exact is None else ~exact
+    if isinstance(codes, SogCodes):
+        silent |= _alike(codes)
+    rows = counted_order(codes)
+    codes, silent = in_rows(codes, rows), silent[rows]
+    return codes, [
+        replace(each, bits=np.where(silent, 0, each.bits)) for each in carrying(codes).fields(codes)
+    ]
 
 
-def in_file_order(codes: Codes, within: Doubles) -> Any:
-    """The codes as a writer of the format sorts them.
+def counted_order(codes: Codes) -> Integers:
+    """The rows [N] in the order in which bits are counted."""
+    return (
+        np.argsort(_sog_names(codes), kind="stable") if isinstance(codes, SogCodes) else np.arange(len(codes))
+    )
+
+
+def file_order(codes: Codes, within: Doubles) -> Integers:
+    """The rows [N] as a writer of the format sorts them.
 
     It sorts before it rounds, so that a few neighbours seem to be out of order. `within` [N, 3], random in
     [-0.5, 0.5]: how far above their levels the numbers were. Extremes lie on their levels.
     """
     if not isinstance(codes, SogCodes):
-        return codes
+        return np.arange(len(codes))
     levels = codes.positions
     extreme = (levels == levels.min(axis=0)) | (levels == levels.max(axis=0))
     means: Floats = codes.positions_at(levels + np.where(extreme, 0.0, within)).astype(np.float32)
-    return _taken(codes, morton_order(means))
+    return morton_order(means)
 
 
-def _taken(codes: SogCodes, rows: Integers) -> SogCodes:
+def in_rows(codes: Codes, rows: Integers) -> Any:
+    """The Gaussians of `codes` in another order; only those of a .sog have one of their own."""
+    if not isinstance(codes, SogCodes):
+        return codes
     return replace(codes, **{name: getattr(codes, name)[rows] for name in _SOG_ARRAYS})
 
 
-def _sog_order(codes: SogCodes) -> tuple[Integers, Flags]:
-    """The rows [N] by hashes of codes that are not written, and which of them, in that order, share one.
-
-    Where two hashes are equal by chance, a little room is lost.
-    """
+def _sog_names(codes: SogCodes) -> Words:
+    """[N] hashes of codes that are not written. Where two are equal by chance, a little room is lost."""
     parts = (codes.scales, codes.colors, codes.alphas, codes.labels, codes.largest)
     levels = sog_distances(codes, codes.positions)
-    names = row_hashes(np.concatenate([each.reshape(len(levels), -1) for each in (*parts, levels)], axis=1))
-    rows = np.argsort(names, kind="stable")
-    same = np.diff(names[rows]) == 0
-    alike: Flags = np.append(same, False) | np.append(False, same)
-    return rows, alike
+    return row_hashes(np.concatenate([each.reshape(len(levels), -1) for each in (*parts, levels)], axis=1))
+
+
+def _alike(codes: SogCodes) -> Flags:
+    """[N] which Gaussians share their hash with another one."""
+    _, index, counts = np.unique(_sog_names(codes), return_inverse=True, return_counts=True)
+    alike: Flags = counts[index.reshape(-1)] > 1
+    return alike

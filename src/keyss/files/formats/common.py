@@ -30,6 +30,10 @@ class Codes(ABC):
     name: ClassVar[str]  # of the format, as users know it
     sorts: ClassVar[bool] = True  # its writer sorts models
 
+    @abstractmethod
+    def __len__(self) -> int:
+        """Gaussians."""
+
     @classmethod
     @abstractmethod
     def parse(cls, data: bytes) -> Self:

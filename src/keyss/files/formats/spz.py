@@ -39,7 +39,7 @@ from keyss.files.formats.common import (
 GZIP, NGSP = b"\x1f\x8b", b"NGSP"
 EXTENSIONS = 2  # flag: the file has extensions
 _MAX_EXTENSION_BYTES = 1 << 20
-_MAX_FRACTIONAL_BITS = 24
+MAX_FRACTIONAL_BITS = 24
 _LEGACY = struct.Struct("<4sIIBBBB")  # magic, version, count, SH degree, fractional bits, flags, reserved
 _HEADER = struct.Struct("<4sIIBBBBI12s")  # ..., flags, number of streams, offset of the table, reserved
 _ENTRY = struct.Struct("<QQ")  # of the table: compressed and uncompressed bytes
@@ -47,7 +47,7 @@ _ZSTD_LEVEL = 12  # as in Niantic's library
 _ZSTD_WINDOW = 1 << 27
 VERSION = 3  # has 10-bit rotations, and more programs read it than the newer 4
 _FRACTIONAL_BITS = 12  # steps of 1/4096 world unit, as in Niantic's library
-_MAX = 2**23 - 1  # the largest code of a position
+MAX_POSITION = 2**23 - 1  # the largest code of a position
 _COLOR_SCALE = 0.15  # 0.15 f_dc + 0.5 is within 0 to 1
 _MAGNITUDE = 2**9 - 1  # a component of a rotation has a sign and 9 bits
 _SH_STEPS = np.array([8] * 3 + [16] * 12)  # 5 bits for degree 1, 4 above, as in Niantic's library
@@ -165,9 +165,9 @@ def _zstd(packed: bytes, size: int) -> Bytes:
 def _checked(header: Header, size: int) -> Header:
     check_sh_degree(header.sh_degree)
     check_count(header.count, size)
-    if header.fractional_bits > _MAX_FRACTIONAL_BITS:
+    if header.fractional_bits > MAX_FRACTIONAL_BITS:
         raise InputError(
-            f"expected positions of at most {_MAX_FRACTIONAL_BITS} fractional bits, "
+            f"expected positions of at most {MAX_FRACTIONAL_BITS} fractional bits, "
             f"found {header.fractional_bits}"
         )
     return header
@@ -244,10 +244,10 @@ class SpzCodes(Codes):
         return pack(header, [*sections, rotations, self.sh.tobytes()])
 
     @classmethod
-    def quantise(cls, model: Gaussians) -> Self:
+    def quantise(cls, model: Gaussians, fractional_bits: int | None = None) -> Self:
         """See `Codes`: in version 3. Raises OutputError for positions beyond 8 million."""
         means, quats, log_scales, opacities, f_dc, rest = arrays_of(model)
-        bits = _fractional_bits(means)
+        bits = _fractional_bits(means) if fractional_bits is None else fractional_bits
         largest, xyz = smallest_three(np.roll(quats * _QUAT_SIGNS, -1, axis=1))
         magnitudes = np.floor(np.abs(xyz) * (_MAGNITUDE / np.sqrt(0.5)) + 0.5).clip(0, _MAGNITUDE)
         return cls(
@@ -287,11 +287,11 @@ class SpzCodes(Codes):
 def _fractional_bits(means: Floats) -> int:
     """The default, or as many as the largest position leaves."""
     extent = float(np.abs(means).max())
-    if not extent < _MAX:
+    if not extent < MAX_POSITION:
         raise OutputError(
-            f"SPZ holds positions up to {_MAX:,} world units, and this model reaches {extent:.3g}"
+            f"SPZ holds positions up to {MAX_POSITION:,} world units, and this model reaches {extent:.3g}"
         )
-    return next(bits for bits in range(_FRACTIONAL_BITS, -1, -1) if extent * 2**bits < _MAX)
+    return next(bits for bits in range(_FRACTIONAL_BITS, -1, -1) if extent * 2**bits < MAX_POSITION)
 
 
 def _quantised_harmonics(rest: Floats) -> Bytes:

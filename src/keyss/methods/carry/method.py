@@ -25,6 +25,11 @@ from keyss.rendering.difference import Viewpoints, psnr_between
 _MODEL_ITERATIONS, _MODEL_RATE = 400, 0.1
 _SELECTION_VIEWS = 64
 _PLANNED = bytes(32)  # entropy of room that is only measured: every rank, and the plan, find the same
+_VISIBLE = (
+    "the cover can hold the secret, but whoever inspects the published file sees that it holds something "
+    '(`publish="any"`); nothing goes in unnoticed (`publish="ply"`): {}'
+)
+_LEAST_SHARE = 1 / 6  # of a secret's Gaussians: with fewer, refits of public models are below 30 dB
 _FEWER = (
     "the secrets share the room, and each has fewer Gaussians than it could have alone: whoever has one of "
     "the keys can notice that there are other secrets"
@@ -53,10 +58,18 @@ class CarryMethod:
         options = options.with_fit(sh_degree=degree)
         if cover.given is None:
             options = options.for_fitted_cover()
-        room = room_for(cover.given, options, _PLANNED)
-        options = replace(options, max_secret_degree=room.max_secret_degree)
-        secret_sizes = _secret_sizes(secrets, options)
-        sizes = room.sizes(secret_sizes)
+        try:
+            room = room_for(cover.given, options, _PLANNED)
+            options = replace(options, max_secret_degree=room.max_secret_degree)
+            secret_sizes = _secret_sizes(secrets, options)
+            sizes = room.sizes(secret_sizes)
+            if options.may_show and cover.given is not None:
+                _check_share(secret_sizes, sizes)
+        except UsageError as refused:
+            if not options.may_show or cover.given is None:
+                raise
+            warnings.warn(_VISIBLE.format(refused), KeyssWarning, stacklevel=2)
+            return self.prepare(sources, replace(options, publish="any"))
         cut = [size != secret.size for size, secret in zip(sizes, secret_sizes, strict=True)]
         if options.refit == "always":
             cut = [True] * len(cut)
@@ -158,6 +171,13 @@ def _secret_sizes(secrets: Sequence[Source], options: CarryOptions) -> list[Secr
         SecretSize(fit.max_gaussians, fit.sh_degree) if secret.given is None else SecretSize.of(secret.given)
         for secret, fit in zip(secrets, fits, strict=True)
     ]
+
+
+def _check_share(secrets: Sequence[SecretSize], sizes: Sequence[tuple[int, int]]) -> None:
+    """Raise UsageError for given secrets of which hardly anything would be left."""
+    for secret, (count, _) in zip(secrets, sizes, strict=True):
+        if secret.model is not None and count < _LEAST_SHARE * secret.count:
+            raise UsageError(f"a secret of {secret.count:,} Gaussians would be cut down to {count:,}")
 
 
 def _check_fit(secrets: Sequence[SecretSize], sizes: Sequence[tuple[int, int]], more_room: str) -> None:

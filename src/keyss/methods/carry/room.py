@@ -17,6 +17,7 @@ from keyss.channels import (
     LowBitsRoom,
     PreparedCover,
     Room,
+    quiet_channel,
     usable_carriers,
 )
 from keyss.channels.low_bits.bits import Layout
@@ -77,6 +78,11 @@ class CarryOptions(MethodOptions):
     def may_train(self) -> bool:
         """True unless refits are ruled out."""
         return self.refit != "never" and not self.prune_to_fit
+
+    @property
+    def may_show(self) -> bool:
+        """Whether secrets that do not go in unnoticed may go in visibly."""
+        return self.publish == "auto" and self.refit == "auto" and not self.prune_to_fit and not self.dither
 
     def fits(self, scenes: int) -> list[FitConfig]:
         """Secrets get the steps of a refit if none follows, and no more harmonics than can be carried."""
@@ -224,12 +230,12 @@ class WholeRoom:
     prepared: PreparedCover | None = None
     max_secret_degree = 3
     refit_share = 0.97  # of the Gaussians that fit before a refit, which changes how well they compress
-    more_room = '`publish="ply"` has more room'
+    more_room = _ANY
 
     @staticmethod
-    def of(cover: Gaussians | None, options: CarryOptions) -> WholeRoom:
+    def of(cover: Gaussians | None, options: CarryOptions, channel: Channel) -> WholeRoom:
         """The room in `cover`. Raises UsageError for a cover without room."""
-        degree, count, channel = options.fit.sh_degree, options.fit.max_gaussians, options.place
+        degree, count = options.fit.sh_degree, options.fit.max_gaussians
         if cover is None:
             return WholeRoom(count, degree, channel, channel.room(count, degree))
         if cover.sh_degree > degree:
@@ -267,7 +273,10 @@ def room_for(
 
     Raises UsageError for a cover without room.
     """
-    return RecordRoom.of(cover, options, entropy) if options.place.records else WholeRoom.of(cover, options)
+    place = options.place
+    if cover is not None and not options.dither:
+        place = quiet_channel(place, cover)
+    return RecordRoom.of(cover, options, entropy) if place.records else WholeRoom.of(cover, options, place)
 
 
 def _ways(cover: Gaussians | None, options: CarryOptions) -> str:

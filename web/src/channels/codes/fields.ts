@@ -112,10 +112,11 @@ export function log2(value: number): number {
   return exponent + 2 * (NUMBER[0] - 1); // of a mantissa of 0.5 to 1
 }
 
-/** The last bits of all levels, each 0 or 1, in the order in which they are counted. */
-export function lastBits(codes: Codes): Uint8Array {
+/** The last bits of all levels, each 0 or 1, in the order in which they are counted; `silent` [N] rows have none. */
+export function lastBits(codes: Codes, silent?: Uint8Array): Uint8Array {
   const rows = codes.kind === 'sog' ? sogOrder(codes) : null;
   const fields = fieldsOf(codes);
+  for (const { bits } of fields) silent?.forEach((each, row) => each && (bits[row] = 0));
   const count = rows?.length ?? codes.count;
   const rowAt = (index: number): number => (rows === null ? index : rows[index]);
   let size = 0;

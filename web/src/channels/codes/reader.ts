@@ -26,9 +26,9 @@ export class CodesReader implements Reader {
     private readonly held: Uint32Array, // what blocks of data hold at most
   ) {}
 
-  /** Null for codes that have no room for anything. */
-  static of(codes: Codes): CodesReader | null {
-    const bits = lastBits(codes);
+  /** Null for codes that have no room for anything. `silent` [N]: Gaussians that carry nothing. */
+  static of(codes: Codes, silent?: Uint8Array): CodesReader | null {
+    const bits = lastBits(codes, silent);
     const room = new Room(bits.length);
     if (!room.slots || room.bits > MAX_BITS) return null;
     const noSalt = new Uint8Array(SALT_BYTES);
