@@ -74,7 +74,7 @@ def test_agrees_with_pycolmap_on_a_real_scene(real_data: Path, tmp_path: Path) -
         np.testing.assert_allclose(taken.viewmat[:3], image.cam_from_world().matrix(), atol=1e-12)
         np.testing.assert_allclose(taken.lens.K, image.camera.calibration_matrix())
     points = [reconstruction.points3D[i] for i in sorted(reconstruction.points3D)]
-    np.testing.assert_array_equal(layout.points.xyz, np.array([p.xyz for p in points], np.float32))
+    np.testing.assert_array_equal(layout.points.xyz, np.array([p.xyz for p in points]))
     np.testing.assert_array_equal(layout.points.rgb, [p.color for p in points])
 
     as_text(real_data / "fox" / "sparse" / "0", tmp_path / "fox" / "sparse" / "0")

@@ -93,9 +93,13 @@ def sources_of(
     # Large files take seconds each, most of them outside of Python's lock.
     with ThreadPoolExecutor(_READERS) as readers:
         found = readers.map(_drawable, [model for model, _ in given], names)
+        loaded = [
+            as_scene(source, views) if photos else None
+            for source, (_, photos) in zip(sources, given, strict=True)
+        ]
         return [
-            Source(model, photos, key, as_scene(source, views) if photos else None)
-            for source, model, (_, photos), key in zip(sources, found, given, ["", *keys], strict=True)
+            Source(scene.localised(model) if scene and model else model, photos, key, scene)
+            for model, (_, photos), key, scene in zip(found, given, ["", *keys], loaded, strict=True)
         ]
 
 

@@ -72,8 +72,8 @@ def render(
     target = resolve_device(device)
     inputs = [Path(model)] if isinstance(model, str | Path) else []
     folder = RunFolder(out, "render", inputs=inputs, overwrite=overwrite) if out is not None else None
-    gaussians = as_model(model).to(target)
     scene = as_scene(cameras, views)
+    gaussians = scene.localised(as_model(model)).to(target)
     splits: dict[str, tuple[View, ...]] = {"test": scene.test, "train": scene.train, "all": scene.views}
     pictures = renders_of(gaussians, scene, splits[split])
     if folder:
@@ -148,6 +148,7 @@ def _write_film(
     else:
         scene = as_scene(cameras, views)
         color = scene.background
+        models = [scene.localised(each) for each in models]
         paths = [[_even(camera) for camera in around([view.camera for view in scene.views], count)]]
         paths *= len(models)
     reporter = reporter or Reporter()

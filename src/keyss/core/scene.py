@@ -11,6 +11,11 @@ import torch
 from torch import Tensor
 
 from keyss.core.errors import UsageError
+from keyss.core.gaussians import Gaussians
+
+# Least depth, in world units, that is rendered of scenes whose cameras are that far from each other, or more;
+# of smaller ones in proportion.
+NEAR, ORDINARY_EXTENT = 0.01, 0.5
 
 # Weight of the fallback point in `focus_point`, against a mean of projections with eigenvalues of at most 1:
 # it dominates if the viewing axes differ by less than about two degrees.
@@ -26,6 +31,7 @@ class Camera:
     width: int
     height: int
     name: str = ""
+    near: float = NEAR  # least depth that is rendered, in world units
 
     @property
     def position(self) -> Tensor:
@@ -75,6 +81,8 @@ class Scene:
     points: Tensor  # [P, 3] float32 sparse reconstruction, may be empty
     colors: Tensor  # [P, 3] uint8 sRGB colours of the points
     background: Tensor = field(default_factory=lambda: torch.zeros(3))  # [3] in [0, 1], behind everything
+    # [3] float64: where the scene's frame begins in the frame of its files, if that is not the same one.
+    origin: Tensor = field(default_factory=lambda: torch.zeros(3, dtype=torch.float64))
 
     @property
     def views(self) -> tuple[View, ...]:
@@ -95,6 +103,16 @@ class Scene:
             centre = self.points.double().mean(0) if len(self.points) else focus_point(cameras)
             reach = float((positions[0].double() - centre).norm())
         return 1.1 * reach
+
+    def localised(self, model: Gaussians) -> Gaussians:
+        """`model` in the scene's frame, which it may be in already, or in that of the scene's files."""
+        if not self.origin.any():
+            return model
+        middle = model.means.detach().double().cpu().median(0).values
+        if middle.norm() < (middle - self.origin).norm():
+            return model
+        means = model.means.double() - self.origin.to(model.device)
+        return replace(model, means=means.to(model.means.dtype))
 
     def digest(self) -> str:
         """SHA-256 over all cameras, photos, points and the background: equal for equal content only."""

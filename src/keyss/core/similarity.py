@@ -67,7 +67,7 @@ class Similarity:
         moved[:3, :3] = rotation
         # From scale * (R_c x + t_c) with x = R^T (x' - t) / scale: the camera's own axes keep unit length.
         moved[:3, 3] = self.scale * viewmat[:3, 3] - rotation @ self.translation.to(viewmat.device)
-        return replace(camera, viewmat=moved.to(camera.viewmat.dtype))
+        return replace(camera, viewmat=moved.to(camera.viewmat.dtype), near=self.scale * camera.near)
 
     def apply_gaussians(self, gaussians: Gaussians) -> Gaussians:
         """The Gaussians, moved with the world, view-dependent colours included.

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from keyss.core.arrays import Bytes, Doubles, Floats
+from keyss.core.arrays import Bytes, Doubles
 from keyss.core.errors import InputError, KeyssWarning
 from keyss.files.lens import Lens
 
@@ -30,20 +30,20 @@ class Photo:
 class PointCloud:
     """Positions and sRGB colours."""
 
-    xyz: Floats  # [P, 3]
+    xyz: Doubles  # [P, 3]
     rgb: Bytes  # [P, 3]
 
     @staticmethod
     def checked(where: Path, xyz: Doubles, rgb: Bytes) -> PointCloud:
-        """The points as float32. Raises InputError if a coordinate is not finite or beyond 1e15."""
+        """The points. Raises InputError if a coordinate is not finite or beyond 1e15."""
         bad = ~(np.abs(xyz) <= MAX_COORDINATE).all(axis=1)
         if bad.any():
             first = int(bad.argmax())
             raise InputError(f"{where}: expected finite points, found {xyz[first]} as point {first + 1}")
-        return PointCloud(xyz.astype(np.float32), rgb)
+        return PointCloud(xyz, rgb)
 
 
-NO_POINTS = PointCloud(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8))
+NO_POINTS = PointCloud(np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
 
 
 @dataclass(frozen=True)

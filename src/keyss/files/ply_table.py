@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, BinaryIO
 import numpy as np
 import numpy.typing as npt
 
-from keyss.core.arrays import Floats
+from keyss.core.arrays import Numbers
 from keyss.core.errors import InputError
 from keyss.files.reading import open_input
 
@@ -47,11 +47,12 @@ class Vertices:
 
     names: list[str]
     count: int
-    blocks: Iterator[Floats]  # [n, len(names)] each; `count` rows in all; they may be changed
+    blocks: Iterator[Numbers]  # [n, len(names)] each; `count` rows in all; they may be changed
+    dtype: type  # of the rows
 
-    def rows(self) -> Floats:
+    def rows(self) -> Numbers:
         """[count, len(names)] all rows."""
-        rows = np.empty((self.count, len(self.names)), np.float32)
+        rows: Numbers = np.empty((self.count, len(self.names)), self.dtype)
         start = 0
         for block in self.blocks:
             rows[start : start + len(block)] = block
@@ -71,7 +72,9 @@ class _Element:
         return sum(int(code[1]) for code in self.properties.values())
 
 
-def read_vertices(file: BinaryIO, choose: Callable[[dict[str, str]], list[str]]) -> Vertices:
+def read_vertices(
+    file: BinaryIO, choose: Callable[[dict[str, str]], list[str]], dtype: type = np.float32
+) -> Vertices:
     """The vertex properties that `choose` picks, from an open PLY file.
 
     `choose` gets the numpy codes of all scalar vertex properties by name ("f4", "u1", ...) and returns
@@ -89,11 +92,11 @@ def read_vertices(file: BinaryIO, choose: Callable[[dict[str, str]], list[str]])
         # Every value takes a digit and a separator; the file's last separator may be missing.
         skipped = sum(element.count * len(element.properties) for element in before)
         _check_size(file, 2 * (skipped + vertex.count * len(vertex.properties)) - 1, vertex)
-        return Vertices(names, vertex.count, _ascii_blocks(file, skipped, vertex, columns))
+        return Vertices(names, vertex.count, _ascii_blocks(file, skipped, vertex, columns, dtype), dtype)
     skipped = sum(element.count * element.stride for element in before)
     _check_size(file, skipped + vertex.count * vertex.stride, vertex)
     file.seek(skipped, os.SEEK_CUR)
-    return Vertices(names, vertex.count, _binary_blocks(file, byte_order, vertex, columns))
+    return Vertices(names, vertex.count, _binary_blocks(file, byte_order, vertex, columns, dtype), dtype)
 
 
 def read_tables(file: BinaryIO) -> dict[str, npt.NDArray[np.void]]:
@@ -138,11 +141,11 @@ def read_point_cloud(path: Path) -> PointCloud:
         return ["x", "y", "z", *colors]
 
     with open_input(path) as file:
-        rows = read_vertices(file, choose).rows()
+        rows = read_vertices(file, choose, np.float64).rows()
     colors = rows[:, 3:] if rows.shape[1] > 3 else np.full((len(rows), 3), _GREY)
     if not ((colors >= 0) & (colors <= 255)).all():  # possible in ascii
         raise InputError(f"{path}: expected colours of 0 to 255, found others")
-    return PointCloud.checked(path, rows[:, :3].astype(np.float64), colors.astype(np.uint8))
+    return PointCloud.checked(path, rows[:, :3], colors.astype(np.uint8))
 
 
 def _read_header(file: BinaryIO) -> tuple[str | None, list[_Element]]:
@@ -213,7 +216,9 @@ def _check_size(file: BinaryIO, needed: int, vertex: _Element) -> None:
         )
 
 
-def _binary_blocks(file: BinaryIO, byte_order: str, vertex: _Element, columns: list[int]) -> Iterator[Floats]:
+def _binary_blocks(
+    file: BinaryIO, byte_order: str, vertex: _Element, columns: list[int], into: type
+) -> Iterator[Numbers]:
     dtype = np.dtype([(name, byte_order + code) for name, code in vertex.properties.items()])
     is_float32 = set(vertex.properties.values()) == {"f4"}
     names = [list(vertex.properties)[column] for column in columns]
@@ -225,16 +230,19 @@ def _binary_blocks(file: BinaryIO, byte_order: str, vertex: _Element, columns: l
             raise InputError("not a whole .ply file: it ends inside the data")
         if is_float32:
             table = np.frombuffer(data, byte_order + "f4").reshape(count, -1)
-            yield table.take(columns, axis=1).astype(np.float32, copy=False)
+            yield table.take(columns, axis=1).astype(into, copy=False)
             continue
-        table, rows = np.frombuffer(data, dtype=dtype), np.empty((count, len(names)), np.float32)
+        table = np.frombuffer(data, dtype=dtype)
+        rows: Numbers = np.empty((count, len(names)), into)
         with np.errstate(over="ignore", invalid="ignore"):  # float32 overflow is reported as infinite
             for column, name in enumerate(names):
                 rows[:, column] = table[name]
         yield rows
 
 
-def _ascii_blocks(file: BinaryIO, skipped: int, vertex: _Element, columns: list[int]) -> Iterator[Floats]:
+def _ascii_blocks(
+    file: BinaryIO, skipped: int, vertex: _Element, columns: list[int], into: type
+) -> Iterator[Numbers]:
     """Rows in text, after `skipped` values. Only the order of the values matters, not the lines."""
     width = len(vertex.properties)
     step = max(1, _CHUNK_BYTES // (8 * max(1, width)))
@@ -246,7 +254,7 @@ def _ascii_blocks(file: BinaryIO, skipped: int, vertex: _Element, columns: list[
             count = min(step, vertex.count - start) * width
             values = np.fromiter((float(token) for token in tokens), dtype=np.float64, count=count)
             with np.errstate(over="ignore"):
-                yield values.reshape(-1, width)[:, columns].astype(np.float32)
+                yield values.reshape(-1, width)[:, columns].astype(into)
     except (StopIteration, ValueError) as error:
         raise InputError("the ascii data are cut short or hold something not a number") from error
 

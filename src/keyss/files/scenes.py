@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import functools
 import os
+import warnings
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from keyss.core.arrays import Floats
-from keyss.core.errors import InputError, UsageError
-from keyss.core.scene import Camera, Scene, View, checked_background
+from keyss.core.arrays import Doubles, Floats
+from keyss.core.errors import InputError, KeyssWarning, UsageError
+from keyss.core.scene import NEAR, ORDINARY_EXTENT, Camera, Scene, View, checked_background
 from keyss.files.colmap import MODEL_PLACES, colmap_model_folder, read_colmap
 from keyss.files.foreign import what_it_is
 from keyss.files.images import is_turned, probe_image, read_image, shrink
@@ -22,6 +24,7 @@ from keyss.files.layout import Photo, SceneLayout
 from keyss.files.lens import Lens, Undistortion, undistortion
 from keyss.files.transforms import read_blender, read_nerfstudio
 
+_FAR = 1000  # extents from the origin: single precision has ten thousandths of one left
 _KNOWN = (
     "COLMAP (sparse/0/cameras.bin or .txt, images/); Blender / NeRF-synthetic (transforms_train.json); "
     "Nerfstudio (transforms.json)"
@@ -44,6 +47,9 @@ def load_scene(
     `skip_missing`: photos that are missing on disk are left out, with a KeyssWarning, before test views are
     chosen.
 
+    A scene whose place is over a thousand times as far from the origin as its cameras from each other, as
+    georeferenced ones are, is moved there, with a KeyssWarning: see `Scene.origin`.
+
     The test views are those of the layout's split if it has one, else every 8th image by name. Camera names
     are the layout's image paths, relative to `images/` for COLMAP and to the scene's folder for the others
     (`train/r_0.png`). If COLMAP's `images/` is missing, the largest of `images_2/`, `images_4/` and
@@ -63,23 +69,54 @@ def load_scene(
         if not part:
             raise InputError(f"{folder}: expected at least one image {purpose}, found none")
 
-    photos = layout.train + layout.test
+    origin, extent = _place([photo.viewmat for photo in layout.train])
+    if origin.any():
+        where = ", ".join(f"{each:.9g}" for each in origin)
+        warnings.warn(
+            f"{folder}: too far from the origin for single precision: the scene and its models are moved by "
+            f"minus ({where})",
+            KeyssWarning,
+            stacklevel=2,
+        )
+    near = NEAR * min(1.0, extent / ORDINARY_EXTENT)
+    photos = [replace(each, viewmat=_moved(each.viewmat, origin)) for each in layout.train + layout.test]
     has_alpha = [probe_image(photo.path)[2] for photo in photos]  # all, to find missing photos now
     if behind is None:
         behind = torch.full((3,), float(any(has_alpha)))
     # Most scenes have one lens, and a map is as large as a photo, so only the last two are cached.
     undistortions = functools.lru_cache(maxsize=2)(undistortion)
     with ThreadPoolExecutor(max_workers=min(8, os.cpu_count() or 1)) as pool:
-        decode = functools.partial(_view, width=width, background=behind.numpy(), undistortions=undistortions)
+        decode = functools.partial(
+            _view, width=width, background=behind.numpy(), undistortions=undistortions, near=near
+        )
         views = tuple(pool.map(decode, photos))
     return Scene(
         name=folder.resolve().name,
         train=views[: len(layout.train)],
         test=views[len(layout.train) :],
-        points=torch.from_numpy(layout.points.xyz),
+        points=torch.from_numpy((layout.points.xyz - origin).astype(np.float32)),
         colors=torch.from_numpy(layout.points.rgb),
         background=behind,
+        origin=torch.from_numpy(origin),
     )
+
+
+def _place(viewmats: Sequence[Doubles]) -> tuple[Doubles, float]:
+    """The origin [3] for cameras [4, 4], 0 unless they are far from it, and their extent."""
+    centres = np.array([-each[:3, :3].T @ each[:3, 3] for each in viewmats])
+    middle = centres.mean(axis=0)
+    extent = float(np.linalg.norm(centres - middle, axis=1).max())
+    if not 0 < extent < np.linalg.norm(middle) / _FAR:
+        return np.zeros(3), extent or ORDINARY_EXTENT
+    step = 2.0 ** np.floor(np.log2(extent))
+    return np.rint(middle / step) * step, extent
+
+
+def _moved(viewmat: Doubles, origin: Doubles) -> Doubles:
+    """The camera [4, 4] in a frame that begins at `origin`."""
+    moved = viewmat.copy()
+    moved[:3, 3] += viewmat[:3, :3] @ origin
+    return moved
 
 
 def read_layout(folder: Path, skip_missing: bool) -> SceneLayout:
@@ -110,6 +147,7 @@ def _view(
     width: int | None,
     background: Floats,
     undistortions: Callable[[Lens, str], Undistortion],
+    near: float,
 ) -> View:
     pixels = read_image(photo.path, background)
     lens = photo.lens.on_image(pixels.shape[1], pixels.shape[0])
@@ -128,6 +166,7 @@ def _view(
         width=lens.width,
         height=lens.height,
         name=photo.name,
+        near=near,
     )
     if width is not None and width < camera.width:
         height = max(1, round(camera.height * width / camera.width))

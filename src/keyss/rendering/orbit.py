@@ -12,7 +12,16 @@ from torch import Tensor
 
 from keyss.core.errors import UsageError
 from keyss.core.gaussians import SH_C0, Gaussians
-from keyss.core.scene import Camera, Scene, View, camera_positions, checked_background, focus_point
+from keyss.core.scene import (
+    NEAR,
+    ORDINARY_EXTENT,
+    Camera,
+    Scene,
+    View,
+    camera_positions,
+    checked_background,
+    focus_point,
+)
 from keyss.core.similarity import up_direction
 from keyss.files.models import is_model_path
 from keyss.rendering.arguments import MAX_SIDE
@@ -83,6 +92,7 @@ def orbit(model: Gaussians, size: int, views: int = VIEWS) -> list[Camera]:
     middle, radius = middle_and_radius(model)
     reach = radius / math.sin(math.radians(FIELD_OF_VIEW / 2))
     limit = math.sin(math.radians(MAX_ELEVATION))
+    near = _near(radius)
     cameras = []
     for index in range(views):
         # A Fibonacci lattice: equal steps of the sine of the elevation, golden angles of the azimuth.
@@ -91,7 +101,7 @@ def orbit(model: Gaussians, size: int, views: int = VIEWS) -> list[Camera]:
         flat = math.sqrt(1 - height * height)
         outward = torch.tensor([flat * math.cos(azimuth), -height, flat * math.sin(azimuth)])
         position = middle + outward * reach * DISTANCES[index % len(DISTANCES)]
-        cameras.append(looking(position, -outward, size, f"orbit_{index:03d}.png"))
+        cameras.append(looking(position, -outward, size, f"orbit_{index:03d}.png", near))
     return cameras
 
 
@@ -119,11 +129,16 @@ def _quantile(values: Tensor, weight: Tensor, share: float) -> Tensor:
     return values[int(torch.searchsorted(total, share * total[-1]).clamp_max(len(values) - 1))]
 
 
-def looking(position: Tensor, forward: Tensor, size: int, name: str) -> Camera:
+def _near(radius: float) -> float:
+    """Least depth that is rendered of a model of that radius."""
+    return NEAR * min(1.0, radius / ORDINARY_EXTENT)
+
+
+def looking(position: Tensor, forward: Tensor, size: int, name: str, near: float = NEAR) -> Camera:
     """A square camera at `position` that looks along the unit vector `forward`, with -y up."""
     focal = 0.5 * size / math.tan(math.radians(FIELD_OF_VIEW / 2))
     K = torch.tensor([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1]])
-    return Camera(look_at(position, forward, torch.tensor([0.0, -1.0, 0.0])), K, size, size, name)
+    return Camera(look_at(position, forward, torch.tensor([0.0, -1.0, 0.0])), K, size, size, name, near)
 
 
 def look_at(position: Tensor, forward: Tensor, up: Tensor) -> Tensor:
@@ -145,11 +160,12 @@ def circle(model: Gaussians, size: int, frames: int) -> list[Camera]:
     middle, radius = middle_and_radius(model)
     reach = _DISTANCE * radius / math.sin(math.radians(FIELD_OF_VIEW / 2))
     height, flat = math.sin(math.radians(ELEVATION)), math.cos(math.radians(ELEVATION))
+    near = _near(radius)
     cameras = []
     for index in range(frames):
         azimuth = 2 * math.pi * index / frames
         outward = torch.tensor([flat * math.cos(azimuth), -height, flat * math.sin(azimuth)])
-        cameras.append(looking(middle + outward * reach, -outward, size, f"circle_{index:04d}.png"))
+        cameras.append(looking(middle + outward * reach, -outward, size, f"circle_{index:04d}.png", near))
     return cameras
 
 

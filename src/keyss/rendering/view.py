@@ -84,6 +84,7 @@ def _render(
         camera.K.to(device)[None],
         camera.width,
         camera.height,
+        near_plane=camera.near,
         sh_degree=sh_degree,
         backgrounds=None if background is None else background.to(device)[None],
     )

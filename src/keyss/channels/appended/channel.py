@@ -20,6 +20,7 @@ import torch
 from keyss.channels.appended import packets, pilots
 from keyss.channels.appended.lattice import (
     all_shifts,
+    check_place,
     colours_of,
     in_order,
     in_own_frame,
@@ -79,6 +80,8 @@ class Appended(Channel):
     grows = True
 
     def prepare(self, cover: Gaussians) -> AppendedCover:
+        """See `Channel`. Raises UsageError for a cover so far out that float32 is too coarse."""
+        check_place(own_frame(cover))
         return AppendedCover(cover)
 
     def room(self, gaussians: int, sh_degree: int) -> Room:

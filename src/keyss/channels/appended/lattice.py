@@ -19,6 +19,7 @@ import torch
 from torch import Tensor
 
 from keyss.core.arrays import Bits, Doubles, Flags, Integers, Words, doubles
+from keyss.core.errors import UsageError
 from keyss.core.gaussians import DRAWN_OPACITY, Gaussians
 from keyss.core.similarity import Similarity
 from keyss.files.formats.common import with_largest_w
@@ -70,6 +71,19 @@ def own_frame(model: Gaussians) -> Similarity:
     size = 2.0 ** round(math.log2(size)) if 0 < size < math.inf else 1.0
     step = size / 2**POSITION_BITS
     return Similarity(size, translation=torch.from_numpy(np.rint((low + high - size) / 2 / step) * step))
+
+
+def check_place(to_world: Similarity) -> None:
+    """Raise UsageError if float32 does not hold positions in that frame to a quarter of a step."""
+    corner = to_world.translation.numpy()
+    step = to_world.scale / 2**POSITION_BITS
+    if float(np.spacing(np.float32(np.abs(corner).max()))) > step / 4:
+        x, y, z = corner
+        away = f"{x:.9g},{y:.9g},{-z:.9g}"  # its axes are turned by half a turn about z
+        raise UsageError(
+            "the cover is too far from the origin for the single precision of its file: move it, e.g. with "
+            f"`splat-transform IN -t {away} OUT.ply`"
+        )
 
 
 def in_order(words: Bits) -> Bits:

@@ -1,0 +1,101 @@
+"""A similarity of the world changes nothing that is measured, or there is a sentence why."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+import keyss
+from keyss import FitConfig, Secret
+from keyss.core import KeyssWarning, Scene, Similarity, UsageError
+from keyss.files.scenes import load_scene
+from keyss.fitting import mean_psnr
+from tiny_scenes import random_gaussians, tiny_scene
+
+TURN = Rotation.from_rotvec([0.3, -0.8, 1.9]).as_matrix()
+WORLDS = {
+    "UTM": ((456_789.0, 5_412_345.0, 120.0), 1.0),
+    "beyond": ((1e7, -1e7, 1e7), 1.0),
+    "millimetres": ((0.0, 0.0, 0.0), 1e-3),
+    "tiny": ((0.0, 0.0, 0.0), 1e-4),
+    "huge": ((0.0, 0.0, 0.0), 1e6),
+    "small and far": ((1e7, 0.0, 0.0), 0.01),
+}
+KEY = "a key of many characters: 93hXmQ2"
+
+
+def written(folder: Path, shift: tuple[float, ...], scale: float) -> Path:
+    """A scene in Nerfstudio's layout, moved in double precision."""
+    scene = tiny_scene()
+    folder.mkdir()
+    frames = []
+    for view in scene.views:
+        camera = view.camera
+        pose = np.linalg.inv(camera.viewmat.double().numpy())
+        pose[:3, :3] = TURN @ pose[:3, :3]
+        pose[:3, 3] = scale * TURN @ pose[:3, 3] + shift
+        pose[:3, 1:3] *= -1  # OpenGL's axes
+        Image.fromarray(view.image.numpy()).save(folder / camera.name)
+        (fx, _, cx), (_, fy, cy), _ = camera.K.tolist()
+        lens = {"w": camera.width, "h": camera.height, "fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy}
+        frames.append({"file_path": camera.name, "transform_matrix": pose.tolist(), **lens})
+    points = scale * scene.points.double().numpy() @ TURN.T + shift
+    rows = [f"{x!r} {y!r} {z!r}" for x, y, z in points.tolist()]
+    header = f"ply\nformat ascii 1.0\nelement vertex {len(rows)}\n"
+    header += "".join(f"property double {axis}\n" for axis in "xyz")
+    (folder / "points.ply").write_text("\n".join([header + "end_header", *rows, ""]))
+    meta = {"camera_model": "PINHOLE", "ply_file_path": "points.ply", "frames": frames}
+    (folder / "transforms.json").write_text(json.dumps(meta))
+    return folder
+
+
+def psnr_of_fit(scene: Scene) -> float:
+    config = FitConfig(iterations=150, max_gaussians=300, seed=0)
+    return mean_psnr(keyss.fit(scene, config=config).gaussians, scene.test, scene.background)
+
+
+@pytest.mark.filterwarnings("ignore::keyss.core.KeyssWarning")
+@pytest.mark.parametrize("world", WORLDS)
+def test_a_scene_of_any_unit_at_any_place_trains_as_well(world: str, tmp_path: Path) -> None:
+    base = load_scene(written(tmp_path / "base", (0.0, 0.0, 0.0), 1.0))
+    moved = load_scene(written(tmp_path / "moved", *WORLDS[world]))
+    assert abs(psnr_of_fit(moved) - psnr_of_fit(base)) < 0.3
+
+
+def test_a_scene_far_out_says_where_it_is(tmp_path: Path) -> None:
+    shift, scale = WORLDS["UTM"]
+    folder = written(tmp_path / "scene", shift, scale)
+    with pytest.warns(KeyssWarning, match=r"moved by minus \(45678\d, 541234\d, "):
+        scene = load_scene(folder)
+    assert (scene.origin - torch.tensor(shift, dtype=torch.float64)).norm() < 10
+    local = random_gaussians()
+    far = Similarity(1.0, translation=scene.origin).apply_gaussians(local)
+    for model in (local, far):
+        assert (scene.localised(model).means - local.means).abs().max() < 1  # single precision far out
+
+
+@pytest.mark.parametrize("scale", [1e-4, 1e-3, 1.0, 1e6])
+@pytest.mark.parametrize("publish", ["ply", "any"])
+def test_hiding_in_a_model_of_any_unit(publish: str, scale: float) -> None:
+    cover = Similarity(scale).apply_gaussians(random_gaussians(2500, seed=1))
+    noise = torch.Generator().manual_seed(0)
+    cover = cover.map(lambda v: (v * (1 + 1e-6 * torch.randn(v.shape, generator=noise))).float())
+    secret = random_gaussians(100, seed=2)
+    hidden = keyss.hide(cover, [Secret(secret, KEY)], publish=publish, width=64)  # type: ignore[arg-type]
+    assert hidden.metrics.against_plain[0].psnr > 60
+    assert hidden.metrics.cover.ssim > 0.99
+    assert len(keyss.reveal(hidden.stego, KEY).gaussians) == 100
+
+
+def test_a_model_too_far_out_is_refused_with_the_cure() -> None:
+    cover = Similarity(1.0, translation=torch.tensor([456_789.0, 5_412_345.0, 0.0])).apply_gaussians(
+        random_gaussians(500)
+    )
+    with pytest.raises(UsageError, match=r"splat-transform .* -t 45678"):
+        keyss.hide(cover, [Secret(random_gaussians(20), KEY)], publish="any", width=24)
