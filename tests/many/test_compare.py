@@ -12,7 +12,8 @@ from keyss import compare
 from keyss.cli import main
 from keyss.core import InputError, OutputError, UsageError
 from keyss.fitting import PRESETS
-from keyss.many import Forecast, comparing, performing, running
+from keyss.many import Forecast, comparison, run_cell
+from keyss.many.engine import claimed
 from keyss.methods import Bound, registry
 
 SMALL = ["--iterations", "60", "--max-gaussians", "240", "--seed", "3"]
@@ -28,7 +29,7 @@ def test_a_table_a_picture_and_a_second_start(
     out = tmp_path / "compared"
     names = "3dgs,3dgs-sh,watergs,carry"
     command = ["compare", "--cover", str(folders[0]), "--secret", str(folders[1]), *SMALL, "-o", str(out)]
-    monkeypatch.setattr(comparing, "EVERY", tuple(names.split(",")))
+    monkeypatch.setattr(comparison, "EVERY", tuple(names.split(",")))
     assert main([*command, "--methods", names]) == 2
     assert "carry: not possible" in capsys.readouterr().err  # so small a cover has no room
     assert main([*command, "--dry-run"]) == 0
@@ -78,7 +79,7 @@ def test_a_table_a_picture_and_a_second_start(
 @pytest.mark.parametrize("iterations", [61, 3000])
 def test_every_scene_is_drawn_as_often_by_every_method(name: str, iterations: int) -> None:
     for preset in map(registry.get(name).options.preset, PRESETS):
-        options, plain = comparing.within(iterations, preset)
+        options, plain = comparison.within(iterations, preset)
         trained = [Bound.of(each, own).steps for each, own in zip(options.training(2), plain, strict=True)]
         assert trained == [iterations] * 2
 
@@ -101,14 +102,14 @@ def test_where_no_method_works_the_reasons_are_said_and_there_is_no_picture(
     monkeypatch: pytest.MonkeyPatch,
     verb: str,
 ) -> None:
-    real, out = getattr(performing, verb), tmp_path / "out"
+    real, out = getattr(run_cell, verb), tmp_path / "out"
 
     def full(*arguments: object, **more: object) -> object:
         if more.get("dry_run"):
             return real(*arguments, **more)
         raise InputError("the disk is full")
 
-    monkeypatch.setattr(performing, verb, full)
+    monkeypatch.setattr(run_cell, verb, full)
     command = ["compare", "--cover", str(folders[0]), "--secret", str(folders[1]), *SMALL, "-o", str(out)]
     assert main([*command, "--methods", "3dgs"]) == 4
     assert capsys.readouterr().err.splitlines()[-1] == "keyss: error: not possible: 3dgs"
@@ -120,11 +121,11 @@ def test_one_budget_and_one_process_for_a_folder(folders: tuple[Path, Path], tmp
     """Without numbers the budget is that of the first method's preset."""
     found = compare(*folders, methods=["carry:quick", "3dgs"], out=tmp_path / "out", dry_run=True)
     assert isinstance(found, Forecast)
-    assert {each.name.partition(", ")[2] for each in found.cells} >= {"500 steps, seed 0"}
-    with running.claimed(tmp_path / "out"), pytest.raises(OutputError, match="is at work"):
+    assert {each.name.partition(", ")[2] for each in found.cells.values()} >= {"500 steps, seed 0"}
+    with claimed(tmp_path / "out"), pytest.raises(OutputError, match="is at work"):
         compare(*folders, methods=["carry:quick"], out=tmp_path / "out")
 
 
 def test_all_is_every_method_and_keyss_as_published() -> None:
-    assert set(comparing.EVERY) == {*registry.METHODS, "keyss:published"}
-    assert len(comparing.EVERY) == len(set(comparing.EVERY))
+    assert set(comparison.EVERY) == {*registry.METHODS, "keyss:published"}
+    assert len(comparison.EVERY) == len(set(comparison.EVERY))

@@ -267,25 +267,21 @@ def _size(count: int) -> str:
     return f"{count / 1e6:,.1f} MB" if count >= 1e6 else f"{count / 1e3:,.1f} kB"
 
 
-def print_forecast(found: Forecast, jobs: int | None = None) -> None:
+def print_forecast(found: Forecast) -> None:
     """The cells of a dry run, with estimates for those that are not done."""
-    from keyss.many.engines import Resources
-
-    rows = []
-    for each in found.cells:
+    rows, cells = [], found.cells.values()
+    for each in cells:
         time, memory = "done" if each.done else "cannot work", ""
         if each.plan is not None:
             time, memory = about(each.plan.seconds), f"{each.plan.memory_bytes / 1e9:.1f} GB"
         rows.append((each.name, time, memory))
     print_table(("run", "time, about", "memory"), rows)
-    for each in found.cells:
+    for each in cells:
         if each.refused:
             print(f"{each.name}: {each.refused}")
-    resources = Resources.divided(jobs, max((each.memory_bytes for each in found.plans), default=1))
     print(
-        f"{len(found.cells)} run{'s' * (len(found.cells) != 1)}, {len(found.plans)} to do: about "
-        f"{about(sum(each.seconds for each in found.plans))} with all cores of this machine,\n"
-        f"{resources.jobs} at once, each with {resources.threads} thread{'s' * (resources.threads != 1)}."
+        f"{len(cells)} run{'s' * (len(cells) != 1)}, {len(found.plans)} to do: about "
+        f"{about(sum(each.seconds for each in found.plans))} on this machine."
     )
     print("Dry run: nothing was written. Times are rough.")
 

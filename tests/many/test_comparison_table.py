@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
-
-from keyss.many import ComparedMethod, Comparison, comparing
+from keyss.many import ComparedMethod, Comparison, comparison_table
 
 ROW = ComparedMethod(
     name="a|b",
@@ -42,7 +40,7 @@ ROW = ComparedMethod(
 def cells(*rows: ComparedMethod) -> list[dict[str, str]]:
     """By head, the scenes' PSNRs under theirs."""
     found: list[dict[str, str]] = [{} for _ in rows]
-    for table in comparing.comparison_tables(Comparison(arguments={}, methods=rows)).values():
+    for table in comparison_table.comparison_tables(Comparison(arguments={}, methods=rows)).values():
         for own, row in zip(found, table[1:], strict=True):
             own.update(zip(table[0], row, strict=True))
     return found
@@ -63,9 +61,17 @@ def test_what_does_not_open_is_lost_and_what_was_not_tried_is_not_said_to_be() -
     assert found["pruned"] == "-2.5, +0.0"
     assert found[".spz"] == "+0.3, lost"
     assert found["purified"] == "not tried"
-    assert comparing.comparison_notes(Comparison(arguments={}, methods=(ROW,)))[0] == (
-        "not tried (a|b): purified: no tool"
-    )
+    notes = comparison_table.comparison_notes(Comparison(arguments={}, methods=(ROW,)))
+    assert notes[0] == "not tried: purified: no tool (a|b)"
+
+
+def test_what_was_done_with_our_own_tools_is_marked() -> None:
+    row = replace(ROW, notes={"survival..spz": "our own converter: no gsply"})
+    (found,) = cells(row)
+    assert found[".spz"] == "+0.3, lost *"
+    assert found["pruned"] == "-2.5, +0.0"
+    notes = comparison_table.comparison_notes(Comparison(arguments={}, methods=(row,)))
+    assert notes[0] == "* .spz: our own converter: no gsply (a|b)"
 
 
 def test_a_standard_file_is_what_readers_read_not_what_a_method_says() -> None:
@@ -77,7 +83,7 @@ def test_a_standard_file_is_what_readers_read_not_what_a_method_says() -> None:
         "yes, 3 of 3 readers",
         "no, 2 of 3 readers",
         "yes, 1 of 1 readers",
-        "not tried",
+        "our own reader",
     ]
 
 
@@ -91,30 +97,12 @@ def test_wrong_keys() -> None:
 def test_markdown_has_equal_rows_and_a_sentence_for_what_was_not_possible() -> None:
     none = ComparedMethod(name="c", error="no room")
     whole = Comparison(arguments={}, methods=(ROW, none))
-    text = comparing.comparison_text(whole)
+    text = comparison_table.comparison_text(whole)
     for part in text.split("## ")[1:]:
         lines = [line for line in part.splitlines() if line.startswith("|")]
         assert len(lines) == 3  # heads, rule, the one that was possible
         assert len({line.count("|") for line in lines}) == 1
     assert "- c: not possible: no room" in text
-    assert "## Fidelity" in comparing.comparison_text(
+    assert "## Fidelity" in comparison_table.comparison_text(
         Comparison(arguments={})
     )  # also where nothing was possible
-
-
-def test_no_heading_of_the_picture_is_cut() -> None:
-    """However narrow the pictures are."""
-    narrow = [np.zeros((40, 2, 3), np.uint8)] * 3
-    picture = comparing.contact_sheet(["cover", "secret", "error of the secret"], {"photos": narrow})
-    right = np.asarray(picture)[:25, -4:]  # a gap's worth of white right of the last heading
-    assert (right == 255).all()
-
-
-def test_pictures_stand_in_rows_and_columns() -> None:
-    red, blue = (np.full((3, 4, 3), color, np.uint8) for color in ((255, 0, 0), (0, 0, 255)))
-    picture = np.asarray(
-        comparing.contact_sheet(["left", "right"], {"": [red, blue], "2": [red, blue]}, cell=60)
-    )
-    assert (picture[-61:-1, -162:-82] == (255, 0, 0)).all()
-    assert (picture[-122:-62, -81:-1] == (0, 0, 255)).all()
-    assert (picture[:-124] != 255).any()

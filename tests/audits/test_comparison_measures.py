@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 import torch
 
+from keyss.audits import comparison_measures as measures
 from keyss.core import Gaussians, InputError
-from keyss.many import measures
 from measure.stealth.careless import normalised, overwritten, plain
 from tiny_scenes import random_gaussians, tiny_scene
 
