@@ -59,21 +59,22 @@ def manifest(folder: Path, text: str) -> Path:
         ("", "expected the names of columns"),
         (HEAD, "at least one asset"),
         ("covr,secret,out\na,b,c\n", "did you mean cover"),
-        ("cover,out\na,c\n", "line 2: expected either a secret or a secret_file"),
-        ("secret,out\na,c\n", "line 2: expected a value in the column cover"),
-        ("cover,secret,out,key_file\na,b,c,k\n", "leave out the column key_file"),
+        ("out,out\na,b\n", "'out' is no column, or one twice"),
+        ("cover,out\na,c\n", "line 2: expected a cover, out, and either a secret"),
+        ("secret,out\na,c\n", "line 2: expected a cover, out"),
+        ("cover,secret,out,key_file\na,b,c,k\n", "line 2: leave out the column key_file"),
         (HEAD + "a.ply,secret.ply\n", "line 2: expected as many columns"),
-        (HEAD + "a.ply,,x\n", "line 2: expected either a secret or a secret_file"),
+        (HEAD + "a.ply,,x\n", "line 2: expected a cover, out, and either a secret"),
         (HEAD + "a.ply,secret.ply\0,x\n", "line 2: expected paths"),
-        (HEAD + "a.ply,secret.ply,../x\n", "line 2: out: expected the name of a folder"),
-        (HEAD + "a.ply,secret.ply,/x\n", "line 2: out: expected the name of a folder"),
-        (HEAD + "a.ply,secret.ply,Private/x\n", "line 2: out: expected the name of a folder"),
-        (HEAD + "a.ply,secret.ply,x\nb.ply,secret.ply,X\n", "line 3: out: is the folder of line 2"),
+        (HEAD + "a.ply,secret.ply,../x\n", "line 2: out: expected a folder in"),
+        (HEAD + "a.ply,secret.ply,/x\n", "line 2: out: expected a folder in"),
+        (HEAD + "a.ply,secret.ply,Private/x\n", "line 2: out: expected a folder in"),
+        (HEAD + "a.ply,secret.ply,x\nb.ply,secret.ply,X\n", "line 3: out: is the folder of "),
         (
             HEAD + "a.ply,secret.ply,x\nb.ply,secret.ply,x/y\n",
-            "line 3: out: is the folder of line 2, or lies in it",
+            "line 3: out: is the folder of ",
         ),
-        (HEAD + "a.ply,secret.ply,x/y\nb.ply,secret.ply,x\n", "line 2: out: is the folder of line 3"),
+        (HEAD + "a.ply,secret.ply,x/y\nb.ply,secret.ply,x\n", "line 2: out: is the folder of "),
         (HEAD + '"a.ply,secret.ply,x\n', "expected CSV"),
     ],
 )
@@ -84,7 +85,7 @@ def test_what_is_wrong_in_a_table_is_said_with_its_line(folder: Path, text: str,
 
 
 def test_without_a_master_key_every_row_names_a_key_file(folder: Path) -> None:
-    with pytest.raises(InputError, match="expected a value in the column key_file"):
+    with pytest.raises(InputError, match="line 2: expected a key_file"):
         batch.read_rows(manifest(folder, HEAD + "a.ply,secret.ply,x\n"), master=False)
 
 

@@ -87,15 +87,16 @@ class Subject:
 
 
 def files(subject: Subject) -> Numbers:
-    """Bytes of the published and the handed files; how many third-party programs read the published one."""
+    """Megabytes of the published and the handed files; how many other programs read the published one."""
     published = stego_in(subject.run.folder)
     handed = (subject.run.folder / HANDED).glob("*")
-    found: Numbers = {"published": published.stat().st_size}
-    found["handed"] = sum(path.stat().st_size for path in handed)
+    found: Numbers = {"published_mb": published.stat().st_size / 1e6}
+    found["handed_mb"] = sum(path.stat().st_size for path in handed) / 1e6
     programs = readers(published)
     tried = [each for each in programs if each.loads is not None]
-    found |= {"readers": len(tried), "readers that load": sum(each.loads is True for each in tried)}
-    if not tried:
+    if tried:
+        found |= {"readers": len(tried), "readers that load": sum(each.loads is True for each in tried)}
+    else:
         found["standard .ply"] = f"{OWN} reader only: {'; '.join(f'{each.note}' for each in programs)}"
     return found
 
@@ -104,7 +105,7 @@ def pictures(subject: Subject) -> Numbers:
     """Render times of the cover and the first secret, also relative to plain 3DGS."""
     found: Numbers = {}
     for role, each in subject.times(subject.models).items():
-        found |= {f"{role}.seconds": each.seconds, f"{role}.ratio": each.ratio}
+        found |= {f"{role}.ms": 1e3 * each.seconds, f"{role}.ratio": each.ratio}
     return found
 
 
@@ -129,7 +130,7 @@ def secrecy(subject: Subject) -> Numbers:
 
 
 def survival(subject: Subject) -> Numbers:
-    """Loss in dB of cover and secret by pruning, conversion and purification.
+    """Change in dB of cover and secret by pruning, conversion and purification.
 
     A secret that no longer opens has no number.
     """
@@ -146,9 +147,9 @@ def survival(subject: Subject) -> Numbers:
         if result.skipped is not None or result.cover is None:
             found[name] = result.skipped or "not measured"
             continue
-        found[f"{name}.cover"] = result.cover.loss
+        found[f"{name}.cover"] = -result.cover.loss
         if result.secrets[0].opens:
-            found[f"{name}.secret"] = result.secrets[0].loss
+            found[f"{name}.secret"] = -result.secrets[0].loss
     return found
 
 

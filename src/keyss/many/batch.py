@@ -54,18 +54,6 @@ SUMMARY = f"{PRIVATE}/batch.csv"
 _RECORD = f"{PRIVATE}/asset.json"  # in the folder of a finished asset
 
 
-@dataclass(frozen=True)
-class Row:
-    """A row of the table, with absolute paths."""
-
-    line: int  # of the file
-    cover: str
-    secret: str | None
-    secret_file: str | None
-    out: str  # as the file has it
-    key_file: str | None
-
-
 @dataclass(frozen=True, kw_only=True)
 class Asset:
     """A hiding, without its key."""
@@ -73,8 +61,8 @@ class Asset:
     keyss: str = __version__
     name: str  # folder of its results, relative to the batch's
     cover: str
-    secret: str | None
-    secret_file: str | None
+    secret: str | None = None
+    secret_file: str | None = None
     key_file: str
     options: MethodOptions
     views: ViewOptions
@@ -89,61 +77,52 @@ class Asset:
         return same and stego_in(place).exists() and not changed_since(record, inputs)
 
 
-def read_rows(path: Path, *, master: bool) -> list[Row]:
-    """All rows; paths are relative to the folder of the file. Raises InputError, which names the line.
+def read_rows(path: Path, *, master: bool) -> list[dict[str, str]]:
+    """All rows by columns, without empty values; paths, except `out`, are absolute.
 
     `master`: keys are derived, and no row names the file of one. Missing files are not an error here: they
-    fail their own asset.
+    fail their own asset. Raises InputError, which names the line.
     """
     reader = csv.DictReader(io.StringIO(read_text(path, MAX_BYTES)), strict=True)
+    found, lines = [], {}
     try:
         heads = reader.fieldnames = [head.strip() for head in reader.fieldnames or ()]
-        rows = [(reader.line_num, row) for row in reader]
+        for head in heads:
+            if head not in COLUMNS or heads.count(head) > 1:
+                near = did_you_mean(head, COLUMNS)
+                raise InputError(f"{path}: {head[:60]!r} is no column, or one twice; {near}")
+        for row in reader:
+            where = f"{path}, line {reader.line_num}"
+            found.append(_checked(where, path.absolute().parent, row, master))
+            # File systems may treat two spellings as the same name.
+            place = PurePosixPath(unicodedata.normalize("NFC", found[-1]["out"]).casefold())
+            lines[where] = place
     except csv.Error as error:
         raise InputError(f"{path}: expected CSV: {error}") from error
-    for head in heads:
-        if head not in COLUMNS:
-            raise InputError(f"{path}: no column is called {head[:60]!r}; {did_you_mean(head, COLUMNS)}")
-    if len(set(heads)) < len(heads):
-        raise InputError(f"{path}: two columns have the same name")
-    if master and "key_file" in heads:
-        raise InputError(f"{path}: leave out the column key_file: keys are derived from the master key")
-    found = [_row(path, line, row, master) for line, row in rows]
     if not found:
         raise InputError(f"{path}: expected the names of columns, and at least one asset")
-    # File systems may treat two spellings as the same name.
-    places = sorted(
-        (PurePosixPath(unicodedata.normalize("NFC", each.out).casefold()), each.line) for each in found
-    )
-    for (first, line), (second, other) in pairwise(places):
-        if second.is_relative_to(first):
-            raise InputError(f"{path}, line {other}: out: is the folder of line {line}, or lies in it")
+    for (where, place), (other, inner) in pairwise(sorted(lines.items(), key=lambda each: each[1])):
+        if inner.is_relative_to(place):
+            raise InputError(f"{other}: out: is the folder of {where}, or lies in it")
     return found
 
 
-def _row(path: Path, line: int, row: dict[str, str], master: bool) -> Row:
-    where = f"{path}, line {line}"
+def _checked(where: str, base: Path, row: dict[str, str], master: bool) -> dict[str, str]:
     if None in row or None in row.values():
         raise InputError(f"{where}: expected as many columns as there are names of them")
     given = {name: value.strip() for name, value in row.items() if value.strip()}
     if any("\0" in value for value in given.values()):
         raise InputError(f"{where}: expected paths, got a NUL character")
-    for name in ("cover", "out") if master else ("cover", "out", "key_file"):
-        if name not in given:
-            more = "; keys come from it or from `master_key_file`" if name == "key_file" else ""
-            raise InputError(f"{where}: expected a value in the column {name}{more}")
-    if ("secret" in given) == ("secret_file" in given):
-        raise InputError(f"{where}: expected either a secret or a secret_file")
+    if master == ("key_file" in given):
+        what = "leave out the column key_file with a master key" if master else "expected a key_file"
+        raise InputError(f"{where}: {what}: keys come from it or from `master_key_file`")
+    if not {"cover", "out"} <= given.keys() or ("secret" in given) == ("secret_file" in given):
+        raise InputError(f"{where}: expected a cover, out, and either a secret or a secret_file")
     out = given.pop("out")
     parts = PurePosixPath(out).parts
     if ".." in parts or out.startswith("/") or parts[:1] == () or parts[0].casefold() == PRIVATE:
-        raise InputError(
-            f"{where}: out: expected the name of a folder in the batch's, and not {PRIVATE}, got {out!r}"
-        )
-    paths = {name: os.path.realpath(path.absolute().parent / value) for name, value in given.items()}
-    return Row(
-        line, paths["cover"], paths.get("secret"), paths.get("secret_file"), out, paths.get("key_file")
-    )
+        raise InputError(f"{where}: out: expected a folder in the batch's, and not {PRIVATE}, got {out!r}")
+    return {name: os.path.realpath(base / value) for name, value in given.items()} | {"out": out}
 
 
 def hide_batch(
@@ -173,24 +152,17 @@ def hide_batch(
     rows, out = read_rows(Path(manifest), master=master is not None), Path(out)
     if master is not None:
         read_key(master)
-    _warn_of_covers([row.cover for row in rows if is_model(row.cover)])
+    _warn_of_covers([row["cover"] for row in rows if is_model(row["cover"])])
     common: dict[str, Any] = {
         "options": registry.get(method).options() if isinstance(method, str) else method,
         "views": ViewOptions.of(width, background, skip_missing),
         "min_psnr": min_psnr,
         "device": device,
     }
-    assets = {
-        out / row.out: Asset(
-            name=row.out,
-            cover=row.cover,
-            secret=row.secret,
-            secret_file=row.secret_file,
-            key_file=row.key_file or str(master),
-            **common,
-        )
-        for row in rows
-    }
+    assets: dict[Path, Asset] = {}
+    for row in rows:
+        name = row.pop("out")
+        assets[out / name] = Asset(name=name, **{"key_file": str(master), **row, **common})
     with claimed(out, mode=0o777):
         if master is not None:
             settle_master_key(out, master)

@@ -76,8 +76,8 @@ def compare(
     `out` (a folder) gets the cells, and `comparison.json`, `.md`, `.csv` and `.tex` (PSNR, SSIM and LPIPS, a
     row for each scene, with standard deviations over seeds) and `.png` (a row for each method: cover, secret,
     and the secret's error). Cells that are done are skipped. `dry_run`: only return their plans. A method
-    that fails has a row with the error. Raises UsageError, before anything is trained, for one of `methods` that
-    is not possible with these settings; KeyssError and its children; Interrupted.
+    that fails has a row with the error. Raises UsageError, before anything is trained, for one of `methods`
+    that is not possible with these settings; KeyssError and its children; Interrupted.
     """
     if is_model(cover) or is_model(secret):
         raise UsageError("comparing takes scenes, folders of photos: models have none to compare with")
@@ -165,7 +165,7 @@ def _named(text: str) -> MethodOptions:
 def _row(name: str, outcomes: Sequence[Outcome], folder: CellFolder) -> ComparedMethod:
     """The means of the numbers that all seeds have."""
     method = registry.get(folder.cells[outcomes[0].folder].method)
-    row = ComparedMethod(name=name, keys=method.capabilities.keys, max_secrets=method.max_secrets)
+    row = ComparedMethod(name=name, keys=method.capabilities.keys)
     results = [each.result for each in outcomes if each.result is not None]
     if len(results) < len(outcomes):
         return replace(row, error=next(each.error for each in outcomes if each.error))

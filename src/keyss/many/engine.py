@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Protocol
 
 from keyss.core.errors import BackendError, KeyssError, OutputError, UsageError, import_extra
 from keyss.files.atomic import lock
@@ -31,15 +31,8 @@ class Task(Protocol):
     def device(self) -> str: ...
 
 
-class Ended(NamedTuple):
-    """The end of a task."""
-
-    folder: Path  # of its results
-    result: Any
-    error: str | None
-
-
 Work = Callable[[Any, Path, Reporter], Any]  # runs a task in a folder; returns its result
+Ended = tuple[Path, Any, str | None]  # folder of a task, its result, and an error
 Engine = Callable[[Work, Mapping[Path, Task]], Iterator[Ended]]  # runs tasks by folder, in any order
 
 
@@ -56,10 +49,11 @@ def engine(ray: str | None, cores: int, reporter: Reporter | None) -> Iterator[E
     with nullcontext(partial(_here, reporter)) if ray is None else _cluster(ray, cores) as run:
 
         def running(work: Work, tasks: Mapping[Path, Task]) -> Iterator[Ended]:
-            for number, each in enumerate(run(work, tasks), start=1):
-                how = "failed" if each.error else "done"
-                reporter.note(f"[{number}/{len(tasks)}] {tasks[each.folder].name}: {how}")
-                yield each
+            for number, (folder, result, error) in enumerate(run(work, tasks), start=1):
+                reporter.note(
+                    f"[{number}/{len(tasks)}] {tasks[folder].name}: {'failed' if error else 'done'}"
+                )
+                yield folder, result, error
 
         yield running
 
@@ -88,12 +82,12 @@ def _here(reporter: Reporter, work: Work, tasks: Mapping[Path, Task]) -> Iterato
 def _attempt(work: Work, task: Task, folder: Path, reporter: Reporter | None = None) -> Ended:
     """Run one task; an error becomes a result."""
     try:
-        return Ended(folder, work(task, folder, reporter or default_reporter()), None)
+        return folder, work(task, folder, reporter or default_reporter()), None
     except (KeyssError, OSError) as error:
-        return Ended(folder, None, str(error))
+        return folder, None, str(error)
     except Exception as error:  # such as of a GPU without memory
         traceback.print_exc()
-        return Ended(folder, None, f"{type(error).__name__}: {error}")
+        return folder, None, f"{type(error).__name__}: {error}"
 
 
 @contextmanager
@@ -117,9 +111,9 @@ def _cluster(address: str, cores: int) -> Iterator[Engine]:
             (done,), _ = ray.wait(list(running))
             folder = running.pop(done)
             try:
-                yield ray.get(done)._replace(folder=folder)
+                yield (folder, *ray.get(done)[1:])
             except ray.exceptions.RayError as error:
-                yield Ended(folder, None, f"lost by Ray: {str(error).strip().splitlines()[0]}")
+                yield folder, None, f"lost by Ray: {str(error).strip().splitlines()[0]}"
 
     try:
         yield run

@@ -20,8 +20,7 @@ Paths are relative to the folder of the file.
 from __future__ import annotations
 
 import os
-import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from itertools import product
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -106,12 +105,13 @@ def read_spec(path: Path) -> SweepSpec:
     try:
         spec = msgspec.convert(yaml.safe_load(read_text(path, MAX_BYTES)), SweepSpec)
     except (yaml.YAMLError, msgspec.ValidationError, ValueError, RecursionError) as error:
-        message = " ".join(str(error).split())
-        raise InputError(f"{path}: expected YAML of a sweep: {message}{_suggestion(message)}") from error
+        raise InputError(f"{path}: expected YAML of a sweep: {' '.join(str(error).split())}") from error
     if len(set(spec.seeds)) < len(spec.seeds):
         raise InputError(f"{path}: seeds: expected different ones, got one twice")
-    _check_labels(f"{path}: pairs", [pair.label for pair in spec.pairs])
-    _check_labels(f"{path}: methods", [entry.label for entry in spec.methods])
+    names = {"pairs": [each.label for each in spec.pairs], "methods": [each.label for each in spec.methods]}
+    for what, labels in names.items():
+        if same := [label for label in labels if labels.count(label) > 1]:  # tables would take them for one
+            raise InputError(f"{path}: {what}: two have the name {same[0]!r}: give one another `name`")
     most = min(registry.get(entry.method).max_secrets for entry in spec.methods)
     pairs = tuple(
         _checked(f"{path}: pairs[{index}]", path, pair, most) for index, pair in enumerate(spec.pairs)
@@ -142,23 +142,6 @@ def variants(path: Path, spec: SweepSpec) -> Iterator[tuple[str, MethodOptions, 
             except (KeyssError, msgspec.ValidationError) as error:
                 raise InputError(f"{where}: {error}") from error
             yield entry.label, options, choices
-
-
-def _suggestion(message: str) -> str:
-    """The end of a message about an unknown name: the nearest known one."""
-    if field := re.search(r"unknown field `(.+?)`", message):
-        kinds = (SweepSpec, Pair, MethodSpec)
-        return f"; {did_you_mean(field[1], [name for kind in kinds for name in kind.__struct_fields__])}"
-    if value := re.search(r"enum value '(.+?)' ", message):
-        return f"; {did_you_mean(value[1], [*registry.METHODS, *PRESETS, *PARTS])}"
-    return ""
-
-
-def _check_labels(where: str, labels: Sequence[str]) -> None:
-    """Raise InputError for equal names: the tables would take them for seeds of one."""
-    for index, label in enumerate(labels):
-        if (first := labels.index(label)) < index:
-            raise InputError(f"{where}[{index}]: has the name {label!r} of [{first}]: give it another `name`")
 
 
 def _checked(where: str, path: Path, pair: Pair, most: int) -> Pair:
@@ -199,9 +182,9 @@ def sweep(
 
     They run one after the other in this process, or with `ray` at the same time on a Ray cluster: its
     address, or "local" for one of this machine; `cores`: of each cell there. `dry_run`: only return the plans
-    of the cells. Keys are derived from a master key and the cells' names: the one in `master_key_file`, or a new one
-    in the private part of `out`. Raises KeyssError and its children, and Interrupted; a cell that fails is in
-    the result.
+    of the cells. Keys are derived from a master key and the cells' names: the one in `master_key_file`, or a
+    new one in the private part of `out`. Raises KeyssError and its children, and Interrupted; a cell that
+    fails is in the result.
     """
     path = Path(spec)
     found = read_spec(path)
