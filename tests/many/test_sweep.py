@@ -303,8 +303,8 @@ def test_a_dry_run_writes_nothing_and_names_what_cannot_work(keyss: Run, tmp_pat
     before = sorted(tmp_path.rglob("*"))
     found = sweep(spec, out, dry_run=True)
     assert isinstance(found, Forecast)
-    assert len(found.cells) == len(found.plans) == 2
-    assert all(each.seconds > 0 and each.memory_bytes > 10**8 for each in found.plans)
+    assert len(found.names) == len(found.plans) == 2
+    assert all(each.seconds > 0 and each.memory_bytes > 10**8 for each in found.plans.values())
     said = keyss("sweep", spec, "-o", out, "--dry-run")
     assert said.status == 0, said
     assert "2 runs, 2 to do: about " in said.out

@@ -60,7 +60,7 @@ def compare(
     from keyss.cli.tables import print_files, print_forecast, print_table
     from keyss.core.errors import InputError
     from keyss.many import Forecast
-    from keyss.many.comparison_table import comparison_notes, comparison_tables
+    from keyss.many.comparison import comparison_notes, comparison_tables
     from keyss.progress import reporter
 
     given = {"iterations": iterations, "max_gaussians": max_gaussians, "width": width}

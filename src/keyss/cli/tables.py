@@ -269,19 +269,18 @@ def _size(count: int) -> str:
 
 def print_forecast(found: Forecast) -> None:
     """The cells of a dry run, with estimates for those that are not done."""
-    rows, cells = [], found.cells.values()
-    for each in cells:
-        time, memory = "done" if each.done else "cannot work", ""
-        if each.plan is not None:
-            time, memory = about(each.plan.seconds), f"{each.plan.memory_bytes / 1e9:.1f} GB"
-        rows.append((each.name, time, memory))
+    rows = []
+    for place, name in found.names.items():
+        time, memory = "cannot work" if place in found.refused else "done", ""
+        if (plan := found.plans.get(place)) is not None:
+            time, memory = about(plan.seconds), f"{plan.memory_bytes / 1e9:.1f} GB"
+        rows.append((name, time, memory))
     print_table(("run", "time, about", "memory"), rows)
-    for each in cells:
-        if each.refused:
-            print(f"{each.name}: {each.refused}")
+    for place, reason in found.refused.items():
+        print(f"{found.names[place]}: {reason}")
     print(
-        f"{len(cells)} run{'s' * (len(cells) != 1)}, {len(found.plans)} to do: about "
-        f"{about(sum(each.seconds for each in found.plans))} on this machine."
+        f"{len(rows)} run{'s' * (len(rows) != 1)}, {len(found.plans)} to do: about "
+        f"{about(sum(plan.seconds for plan in found.plans.values()))} on this machine."
     )
     print("Dry run: nothing was written. Times are rough.")
 

@@ -14,10 +14,9 @@ from keyss.files.atomic import write_bytes
 from keyss.fitting.config import FitConfig
 from keyss.keys.key_file import KEY_LENGTH, generate_key, read_key
 from keyss.keys.master import MasterKey
-from keyss.many.cell import RUN, Cell, result_of
+from keyss.many.cell import RUN, Cell, plan_of, result_of, run_cell
 from keyss.many.engine import claimed, engine
 from keyss.many.result_tables import CellNumbers
-from keyss.many.run_cell import plan_of, run_cell
 from keyss.methods import registry
 from keyss.methods.base import MethodOptions, Plan
 from keyss.progress import Reporter
@@ -63,25 +62,12 @@ class ManyResult:
 
 
 @dataclass(frozen=True)
-class CellPlan:
-    """A cell before it runs."""
-
-    name: str
-    done: bool
-    plan: Plan | None = None  # None if it is done or refused
-    refused: str | None = None  # why it cannot work
-
-
-@dataclass(frozen=True)
 class Forecast:
     """The cells of a folder before they run, in their order, by their folders."""
 
-    cells: Mapping[Path, CellPlan]
-
-    @property
-    def plans(self) -> list[Plan]:
-        """The plans of the cells to run."""
-        return [each.plan for each in self.cells.values() if each.plan is not None]
+    names: Mapping[Path, str]
+    plans: Mapping[Path, Plan]  # of the cells to run
+    refused: Mapping[Path, str]  # why a cell cannot work
 
 
 def settle_master_key(out: Path, given: Path | None) -> None:
@@ -184,11 +170,11 @@ class CellFolder:
 
     def forecast(self) -> Forecast:
         """The plan of each cell. Writes nothing."""
-        found = {}
+        plans, refused = {}, {}
         for place, cell in self.cells.items():
-            done = result_of(cell, place) is not None
             try:
-                found[place] = CellPlan(cell.name, done, None if done else plan_of(cell, place))
+                if result_of(cell, place) is None:
+                    plans[place] = plan_of(cell, place)
             except KeyssError as error:
-                found[place] = CellPlan(cell.name, done, refused=str(error))
-        return Forecast(found)
+                refused[place] = str(error)
+        return Forecast({place: cell.name for place, cell in self.cells.items()}, plans, refused)
