@@ -32,7 +32,7 @@ def evaluate(
     ] = None,
     device: Device = "auto",
 ) -> None:
-    """Measure PSNR, SSIM and LPIPS of a run again on test views, with the right keys and wrong ones.
+    """Measure PSNR, SSIM and LPIPS of a run again, with the right keys and wrong ones.
 
     Test views are photos that were held out of training or, for a model, renders of it. Each measurement is
     compared with its bound: plain 3DGS of as many Gaussians and as many training steps (`keyss hide --bound`
