@@ -29,24 +29,22 @@ from typing import Any
 from keyss._version import __version__
 from keyss.api.asking import Secret
 from keyss.api.hiding import hide
-from keyss.core.errors import InputError, KeyssWarning, did_you_mean
-from keyss.core.scene import ViewOptions
-from keyss.files.atomic import write_bytes
+from keyss.core import InputError, KeyssWarning, ViewOptions
+from keyss.core.errors import did_you_mean
+from keyss.files import write_bytes
 from keyss.files.reading import read_text
-from keyss.keys.key_file import read_key
-from keyss.keys.master import MasterKey
+from keyss.keys import MasterKey, read_key
 from keyss.many.cell import changed_since
 from keyss.many.cell_folder import ManyResult, Outcome, settle_master_key
 from keyss.many.engine import claimed, engine
 from keyss.many.result_tables import csv_bytes
-from keyss.methods import registry
-from keyss.methods.base import MethodOptions
+from keyss.methods import MethodOptions, registry
 from keyss.progress import Reporter
 from keyss.rendering import Backend
 from keyss.rendering.orbit import is_model
-from keyss.runs.files import PathLike, stego_in
-from keyss.runs.folder import PRIVATE, read_manifest
-from keyss.runs.records import record_bytes, write_record
+from keyss.runs import read_manifest, record_bytes, stego_in, write_record
+from keyss.runs.files import PathLike
+from keyss.runs.folder import PRIVATE
 
 MAX_BYTES = 64 << 20
 COLUMNS = ("cover", "secret", "secret_file", "out", "key_file")

@@ -9,16 +9,16 @@ from pathlib import Path
 from typing import Any
 
 from keyss.audits.comparison_measures import check_extras
-from keyss.core.errors import KeyssError, OutputError
-from keyss.files.atomic import write_bytes
-from keyss.fitting.config import FitConfig
-from keyss.keys.key_file import KEY_LENGTH, generate_key, read_key
-from keyss.keys.master import MasterKey
+from keyss.core import KeyssError, OutputError
+from keyss.files import write_bytes
+from keyss.fitting import FitConfig
+from keyss.keys import MasterKey, generate_key, read_key
+from keyss.keys.key_file import KEY_LENGTH
 from keyss.many.cell import RUN, Cell, plan_of, result_of, run_cell
 from keyss.many.engine import claimed, engine
 from keyss.many.result_tables import CellNumbers
-from keyss.methods import registry
-from keyss.methods.base import MethodOptions, Plan
+from keyss.methods import MethodOptions, registry
+from keyss.methods.base import Plan
 from keyss.progress import Reporter
 from keyss.runs.files import MODEL
 from keyss.runs.folder import PRIVATE

@@ -15,10 +15,9 @@ from PIL import Image
 
 from keyss._version import __version__
 from keyss.audits.comparison_measures import CONVERSIONS, OWN
+from keyss.core import UsageError, ViewOptions
 from keyss.core.arrays import Bytes
-from keyss.core.errors import UsageError
-from keyss.core.scene import ViewOptions
-from keyss.files.atomic import write_bytes
+from keyss.files import write_bytes
 from keyss.fitting import PRESETS, FitConfig
 from keyss.fitting.lpips import HOW_TO_GET
 from keyss.many.cell import RUN, keys_of
@@ -26,14 +25,13 @@ from keyss.many.cell_folder import CellFolder, Forecast, Outcome
 from keyss.many.result_tables import markdown_rows, write_scene_tables
 from keyss.measure.contact_sheet import contact_sheet
 from keyss.measure.images import renders_of
-from keyss.methods import registry
-from keyss.methods.base import MethodOptions
+from keyss.methods import MethodOptions, registry
 from keyss.progress import Reporter
 from keyss.rendering import Backend, resolve_device
 from keyss.rendering.orbit import is_model
+from keyss.runs import write_record
 from keyss.runs.files import PathLike
 from keyss.runs.opening import HidingRun, open_run
-from keyss.runs.records import write_record
 
 STEM = "comparison"  # of the names of its files
 MEASURES = ("files", "pictures", "secrecy", "survival")

@@ -12,28 +12,20 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from functools import partial
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
-from keyss.core.errors import BackendError, KeyssError, OutputError, UsageError, import_extra
-from keyss.files.atomic import lock
+from keyss.core import BackendError, KeyssError, OutputError, UsageError, import_extra
+from keyss.files import lock
 from keyss.progress import Reporter, reporter as default_reporter
 from keyss.runs.folder import PRIVATE, check_not_published, make_private
 
 _LOCAL = "local"  # a cluster of this machine
 
 
-class Task(Protocol):
-    """A run."""
-
-    @property
-    def name(self) -> str: ...
-    @property
-    def device(self) -> str: ...
-
-
+Tasks = Mapping[Path, Any]  # by their folders; each has a `name` and a `device`
 Work = Callable[[Any, Path, Reporter], Any]  # runs a task in a folder; returns its result
 Ended = tuple[Path, Any, str | None]  # folder of a task, its result, and an error
-Engine = Callable[[Work, Mapping[Path, Task]], Iterator[Ended]]  # runs tasks by folder, in any order
+Engine = Callable[[Work, Tasks], Iterator[Ended]]  # runs tasks, in any order
 
 
 @contextmanager
@@ -48,7 +40,7 @@ def engine(ray: str | None, cores: int, reporter: Reporter | None) -> Iterator[E
     reporter = reporter or default_reporter()
     with nullcontext(partial(_here, reporter)) if ray is None else _cluster(ray, cores) as run:
 
-        def running(work: Work, tasks: Mapping[Path, Task]) -> Iterator[Ended]:
+        def running(work: Work, tasks: Tasks) -> Iterator[Ended]:
             for number, (folder, result, error) in enumerate(run(work, tasks), start=1):
                 reporter.note(
                     f"[{number}/{len(tasks)}] {tasks[folder].name}: {'failed' if error else 'done'}"
@@ -74,12 +66,12 @@ def claimed(out: Path, mode: int = 0o700) -> Iterator[None]:
         yield
 
 
-def _here(reporter: Reporter, work: Work, tasks: Mapping[Path, Task]) -> Iterator[Ended]:
+def _here(reporter: Reporter, work: Work, tasks: Tasks) -> Iterator[Ended]:
     for folder, task in tasks.items():
         yield _attempt(work, task, folder, reporter)
 
 
-def _attempt(work: Work, task: Task, folder: Path, reporter: Reporter | None = None) -> Ended:
+def _attempt(work: Work, task: Any, folder: Path, reporter: Reporter | None = None) -> Ended:
     """Run one task; an error becomes a result."""
     try:
         return folder, work(task, folder, reporter or default_reporter()), None
@@ -102,7 +94,7 @@ def _cluster(address: str, cores: int) -> Iterator[Engine]:
     except Exception as error:  # Ray raises many kinds of errors while it connects
         raise BackendError(f"cannot reach a Ray cluster at {address}: {error}") from error
 
-    def run(work: Work, tasks: Mapping[Path, Task]) -> Iterator[Ended]:
+    def run(work: Work, tasks: Tasks) -> Iterator[Ended]:
         remote, running = ray.remote(_attempt), {}
         for folder, task in tasks.items():
             chosen = remote.options(name=task.name, num_cpus=cores, num_gpus=int(task.device == "cuda"))

@@ -11,21 +11,20 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any
 
-from keyss.core.errors import UsageError, did_you_mean
-from keyss.core.scene import ViewOptions
-from keyss.files.atomic import write_bytes
+from keyss.core import UsageError, ViewOptions
+from keyss.core.errors import did_you_mean
+from keyss.files import write_bytes
 from keyss.files.benchmark_scenes import BENCHMARK, download_scenes, link_scene
 from keyss.many.cell_folder import CellFolder, Forecast
 from keyss.many.option_changes import with_changes
 from keyss.many.paper import PAPER, Group, Reproduction, Run, figure_rows, judged, reproduction_text
 from keyss.many.result_tables import write_scene_tables
-from keyss.methods import registry
-from keyss.methods.base import MethodOptions
+from keyss.methods import MethodOptions, registry
 from keyss.progress import Reporter
 from keyss.rendering import Backend
 from keyss.rendering.orbit import is_model
+from keyss.runs import write_record
 from keyss.runs.files import PathLike
-from keyss.runs.records import write_record
 
 SMALL = {"iterations": 1000, "max_gaussians": 9000, "width": 120}
 SSIM_WEIGHT = 0.5  # of the loss, for plain models too

@@ -12,7 +12,7 @@ from pathlib import Path
 from statistics import fmean, stdev
 from typing import Any
 
-from keyss.files.atomic import write_bytes
+from keyss.files import write_bytes
 
 # Decimals and the better direction of what papers on 3DGS report.
 _METRICS = {

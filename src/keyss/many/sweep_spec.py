@@ -29,16 +29,16 @@ import msgspec
 from msgspec import Meta
 
 from keyss.audits import PARTS
-from keyss.core.errors import InputError, KeyssError, did_you_mean, import_extra
-from keyss.core.scene import ViewOptions
+from keyss.core import InputError, KeyssError, ViewOptions, import_extra
+from keyss.core.errors import did_you_mean
 from keyss.files.reading import read_text
-from keyss.fitting.config import MAX_SEED, PRESETS
-from keyss.keys.key_file import read_key
+from keyss.fitting import PRESETS
+from keyss.fitting.config import MAX_SEED
+from keyss.keys import read_key
 from keyss.many.cell_folder import CellFolder, Forecast, ManyResult
 from keyss.many.option_changes import known_changes, with_changes
 from keyss.many.result_tables import write_sweep_tables
-from keyss.methods import registry
-from keyss.methods.base import MethodOptions
+from keyss.methods import MethodOptions, registry
 from keyss.progress import Reporter
 from keyss.rendering.orbit import is_model
 from keyss.runs.files import PathLike
