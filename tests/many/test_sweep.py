@@ -14,7 +14,7 @@ import pytest
 
 import keyss as library
 from cli.said import Run
-from keyss.core import BackendError, InputError, Interrupted, OutputError
+from keyss.core import BackendError, InputError, OutputError
 from keyss.many import Forecast, ManyResult, cell_folder, sweep, sweep_spec
 from keyss.many.engine import claimed
 from keyss.progress import Reporter
@@ -226,6 +226,12 @@ class Interrupting(Reporter):
 
     trainings = 0
 
+    def __init__(self) -> None:
+        self.notes: list[str] = []
+
+    def note(self, line: str) -> None:
+        self.notes.append(line)
+
     def start(self, title: str, iterations: int, iteration: int) -> None:
         self.trainings += 1
 
@@ -255,8 +261,10 @@ def test_a_training_goes_on_where_ctrl_c_stopped_it_and_scenes_are_fitted_once(t
         "     options: {publish: any, dither: true, fit.iterations: 20, fit.max_gaussians: 150}}\n"
         "bound: true\n",
     )
-    with pytest.raises(Interrupted):
-        run(spec, tmp_path / "out", reporter=Interrupting())
+    interrupting = Interrupting()
+    with pytest.raises(KeyboardInterrupt):
+        run(spec, tmp_path / "out", reporter=interrupting)
+    assert interrupting.notes[-1] == "interrupted: the same command resumes"
     noted = Noting()
     found = run(spec, tmp_path / "out", reporter=noted)
     assert [each.error for each in found.outcomes] == [None] * 2

@@ -146,7 +146,7 @@ def compare(
     row for each scene, with standard deviations over seeds) and `.png` (a row for each method: cover, secret,
     and the secret's error). Cells that are done are skipped. `dry_run`: only return their plans. A method
     that fails has a row with the error. Raises UsageError, before anything is trained, for one of `methods`
-    that is not possible with these settings; KeyssError and its children; Interrupted.
+    that is not possible with these settings; KeyssError and its children; KeyboardInterrupt.
     """
     if is_model(cover) or is_model(secret):
         raise UsageError("comparing takes scenes, folders of photos: models have none to compare with")

@@ -14,7 +14,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from keyss.core import BackendError, KeyssError, OutputError, UsageError, import_extra
+from keyss.core import BackendError, Interrupted, KeyssError, OutputError, UsageError, import_extra
 from keyss.files import lock
 from keyss.progress import Reporter, reporter as default_reporter
 from keyss.runs.folder import PRIVATE, check_not_published, make_private
@@ -68,7 +68,12 @@ def claimed(out: Path, mode: int = 0o700) -> Iterator[None]:
 
 def _here(reporter: Reporter, work: Work, tasks: Tasks) -> Iterator[Ended]:
     for folder, task in tasks.items():
-        yield _attempt(work, task, folder, reporter)
+        try:
+            ended = _attempt(work, task, folder, reporter)
+        except Interrupted as error:  # which advises to resume a single run
+            reporter.note("interrupted: the same command resumes")
+            raise KeyboardInterrupt(*error.args) from error
+        yield ended
 
 
 def _attempt(work: Work, task: Any, folder: Path, reporter: Reporter | None = None) -> Ended:

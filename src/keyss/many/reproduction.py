@@ -57,7 +57,7 @@ def reproduce(
     `out` (a folder) gets `TABLE.json`, `.md`, `.csv` and `.tex` (PSNR, SSIM and LPIPS, a row for each scene,
     with standard deviations over `seeds`), and the cells, which tables in one folder share. Cells that are
     done are skipped. `dry_run`: only return their plans. The result lists runs that failed.
-    Raises KeyssError and its children for impossible scenes and arguments; Interrupted.
+    Raises KeyssError and its children for impossible scenes and arguments; KeyboardInterrupt.
     """
     if table not in PAPER.tables:
         raise UsageError(f"no table is called {table!r}; {did_you_mean(table, PAPER.tables)}")

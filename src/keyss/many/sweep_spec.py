@@ -183,8 +183,8 @@ def sweep(
     They run one after the other in this process, or with `ray` at the same time on a Ray cluster: its
     address, or "local" for one of this machine; `cores`: of each cell there. `dry_run`: only return the plans
     of the cells. Keys are derived from a master key and the cells' names: the one in `master_key_file`, or a
-    new one in the private part of `out`. Raises KeyssError and its children, and Interrupted; a cell that
-    fails is in the result.
+    new one in the private part of `out`. Raises KeyssError and its children, and
+    KeyboardInterrupt; a cell that fails is in the result.
     """
     path = Path(spec)
     found = read_spec(path)
