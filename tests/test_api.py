@@ -98,7 +98,7 @@ def test_metrics_have_their_shape(run: Path) -> None:
         ),
     }
     assert metrics["method"] == "carry"
-    assert set(metrics["cover"]) == set(metrics["secrets"][0]) == {"psnr", "ssim"}
+    assert set(metrics["cover"]) == set(metrics["secrets"][0]) == {"psnr", "ssim", "lpips"}
     assert set(metrics["baseline"]) == {"cover", "secrets", "gaussians", "steps", "equal"}
     assert metrics["photos"] == [True, True]
     assert metrics["wrong_key"] is None  # there is no decoder that a wrong one could be tried on

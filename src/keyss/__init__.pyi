@@ -11,9 +11,9 @@ from .files import load_scene as load_scene, read_model as read_model, write_mod
 from .fitting import FitConfig as FitConfig
 from .keys import generate_key as generate_key, read_key as read_key
 from .many.batch import hide_batch as hide_batch
-from .many.comparing import compare as compare
-from .many.reproducing import reproduce as reproduce
-from .many.sweeping import sweep as sweep
+from .many.comparison import compare as compare
+from .many.reproduction import reproduce as reproduce
+from .many.sweep_spec import sweep as sweep
 from .methods import CarryOptions as CarryOptions, KeyssOptions as KeyssOptions
 from .runs.describe import info as info
 from .runs.revealing import Revealed as Revealed

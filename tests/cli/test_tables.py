@@ -40,6 +40,12 @@ class TestNumbers:
         assert rows[0] == ["on test photos", "PSNR", "SSIM", "Gaussians", "steps"]
         assert rows[1] == ["cover", "30.00", "0.500", "1,234", "10"]
 
+    def test_lpips_stands_beside_psnr_and_ssim(self) -> None:
+        rows = self.table(replace(METRICS, cover=ImageQuality(30.0, 0.5, 0.125)))
+        assert rows[0][:4] == ["on test photos", "PSNR", "SSIM", "LPIPS"]
+        assert rows[1][:4] == ["cover", "30.00", "0.500", "0.125"]
+        assert ["PSNR in dB. LPIPS with AlexNet: lower is better."] in rows
+
     def test_two_secrets_and_wrong_keys_in_80_columns(self) -> None:
         two = replace(
             METRICS,

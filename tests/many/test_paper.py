@@ -9,7 +9,7 @@ import pytest
 from keyss.cli import many
 from keyss.fitting import PRESETS
 from keyss.many import paper
-from keyss.many.changes import with_changes
+from keyss.many.option_changes import with_changes
 from keyss.methods import KeyssOptions, registry
 
 TABLES = paper.PAPER.tables

@@ -11,8 +11,9 @@ import torch
 
 from cli.said import Run, listing
 from keyss import Gaussians, read_model, reproduce
+from keyss.audits import comparison_measures
 from keyss.core import InputError
-from keyss.many import Forecast, Reproduction, measures, performing, reproducing
+from keyss.many import Forecast, Reproduction, cell, reproduction
 from keyss.measure import opacity_pruning, random_pruning
 from tiny_scenes import random_gaussians
 
@@ -24,13 +25,15 @@ FLAGS = ("--iterations", 20, "--max-gaussians", 150, "--pairs", "a,b", "--seed",
 def out(folders: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with the table "pruning", which others use the run of."""
     folder = tmp_path_factory.mktemp("tables") / "paper"
-    with pytest.warns(UserWarning, match="secrets lie in appended Gaussians"):
-        run("pruning", folders, folder)
+    with pytest.MonkeyPatch.context() as patch:  # opening what was pruned takes long
+        patch.setattr(comparison_measures, "PRUNED_SHARES", (0.25,))
+        with pytest.warns(UserWarning, match="secrets lie in appended Gaussians"):
+            run("pruning", folders, folder)
     return folder
 
 
 def run(table: str, folders: tuple[Path, Path], out: Path, **options: Any) -> Reproduction:
-    found = reproduce(table, folders, pairs=["a,b"], seed=5, out=out, **SIZES, **options)
+    found = reproduce(table, folders, pairs=["a,b"], seeds=[5], out=out, **SIZES, **options)
     assert isinstance(found, Reproduction)
     return found
 
@@ -51,7 +54,11 @@ def test_a_table_lies_beside_the_papers(out: Path) -> None:
     metrics = json.loads((run_of("KeySS, a-b", out) / "private" / "metrics.json").read_text())
     assert here["whole, cover"] == pytest.approx(metrics["cover"]["psnr"], abs=0.05)
     assert here["whole, secret"] == pytest.approx(metrics["secrets"][0]["psnr"], abs=0.05)
-    assert None not in here.values()
+    assert {name for name, value in here.items() if value is not None} == {
+        f"{what}, {role}"
+        for what in ("whole", "25% by opacity", "25% random")
+        for role in ("cover", "secret")
+    }
     assert metrics["iterations"] == 20
     assert metrics["steps"] == [20, 20]  # as many as plain 3DGS
     assert metrics["baseline"]["equal"] == [True, True]
@@ -67,18 +74,18 @@ def test_what_is_done_is_not_done_again(
     def refused(*arguments: object, **more: object) -> None:
         raise AssertionError("nothing is to be run")
 
-    monkeypatch.setattr(performing, "hide", refused)
-    monkeypatch.setattr(performing, "fit", refused)
+    monkeypatch.setattr(cell, "hide", refused)
+    monkeypatch.setattr(cell, "fit", refused)
     assert not run("pruning", folders, out).failures
     assert listing(out / "cells") == before
-    found = reproduce("pruning", folders, pairs=["a,b"], seed=5, out=out, **SIZES, dry_run=True)  # type: ignore[arg-type]
+    found = reproduce("pruning", folders, pairs=["a,b"], seeds=[5], out=out, **SIZES, dry_run=True)  # type: ignore[arg-type]
     assert isinstance(found, Forecast)
-    assert all(each.done for each in found.cells)
+    assert not found.plans
     monkeypatch.undo()
     with pytest.warns(UserWarning, match="secrets lie in appended Gaussians"):
-        other = reproduce("pruning", folders, pairs=["a,b"], seed=6, out=out, **SIZES, dry_run=True)  # type: ignore[arg-type]
+        other = reproduce("pruning", folders, pairs=["a,b"], seeds=[6], out=out, **SIZES, dry_run=True)  # type: ignore[arg-type]
     assert isinstance(other, Forecast)
-    assert not any(each.done for each in other.cells)
+    assert len(other.plans) == len(other.names)
 
 
 def test_a_run_that_fails_is_said_and_the_others_go_on(
@@ -87,7 +94,7 @@ def test_a_run_that_fails_is_said_and_the_others_go_on(
     def failing(*arguments: object, **more: object) -> None:
         raise InputError("not today")
 
-    monkeypatch.setattr(performing, "hide", failing)
+    monkeypatch.setattr(cell, "hide", failing)
     found = run("speed", folders, out)
     assert found.failures == {f"{name}, a-b": "not today" for name in ("3DGS", "GS-Hider", "WaterGS")}
     verdicts = [each.verdict for each in found.claims]
@@ -121,24 +128,33 @@ def test_the_command(keyss: Run, out: Path, folders: tuple[Path, Path], tmp_path
 def test_the_papers_scenes_have_its_sizes_and_pairs(
     folders: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(reproducing, "link_scene", lambda data, name, folder: folders[name < "c"])
+    monkeypatch.setattr(reproduction, "link_scene", lambda data, name, folder: folders[name < "c"])
     found = reproduce(
         "multi", data=tmp_path, pairs=["bicycle,bonsai,room"], out=tmp_path / "out", dry_run=True
     )
     assert isinstance(found, Forecast)
-    assert {each.name.partition(", ")[2] for each in found.cells} >= {"bicycle-bonsai-room"}
-    assert {each.plan.stages[0].steps for each in found.cells if each.plan} == {30_000}
-    assert max(each.plan.gaussians for each in found.cells if each.plan) == 500_000
+    assert {each.partition(", ")[2] for each in found.names.values()} >= {"bicycle-bonsai-room"}
+    assert {each.stages[0].steps for each in found.plans.values()} == {30_000}
+    assert max(each.gaussians for each in found.plans.values()) == 500_000
 
 
 def test_what_is_appended_is_neither_counted_nor_pruned(out: Path) -> None:
     stego = read_model(run_of("KeySS, a-b", out) / "publish" / "stego.ply")
-    own = measures.own_gaussians(stego)
+    own = comparison_measures.own_gaussians(stego)
     assert 0 < len(own) <= 150 < len(stego)
     for change in (random_pruning(0.25), opacity_pruning(0.25)):
-        left = measures.sparing(change)(stego)
-        assert len(measures.own_gaussians(left)) == len(change(own))
-        assert len(left) - len(measures.own_gaussians(left)) == len(stego) - len(own)
-        assert torch.equal(measures.own_gaussians(left).means, change(own).means)
+        left = comparison_measures.sparing(change)(stego)
+        assert len(comparison_measures.own_gaussians(left)) == len(change(own))
+        assert len(left) - len(comparison_measures.own_gaussians(left)) == len(stego) - len(own)
+        assert torch.equal(comparison_measures.own_gaussians(left).means, change(own).means)
     plain: Gaussians = random_gaussians(100)
-    assert torch.equal(measures.own_gaussians(plain).means, plain.means)
+    assert torch.equal(comparison_measures.own_gaussians(plain).means, plain.means)
+
+
+def test_the_command_says_what_cannot_be_downloaded(keyss: Run, tmp_path: Path) -> None:
+    full = ("reproduce", "single", "--data", tmp_path / "data", "-o", tmp_path / "out")
+    both = keyss(*full, "--download", "--dry-run")
+    assert (both.status, "--download" in both.err) == (2, True)
+    without = keyss("reproduce", "single", "a", "b", "--download", "-o", tmp_path / "out")
+    assert (without.status, "--data" in without.err) == (2, True)
+    assert not (tmp_path / "data").exists()

@@ -16,11 +16,12 @@ import pytest
 import torch
 from scipy.ndimage import gaussian_filter
 
-from keyss.core import InputError
+from keyss.core import InputError, View
 from keyss.files import images as pictures
-from keyss.fitting import Target, ssim
-from keyss.measure import compare_images, images
-from tiny_scenes import ring_cameras
+from keyss.fitting import Target, lpips, quality, ssim
+from keyss.measure import compare_images
+from keyss.rendering import render
+from tiny_scenes import random_gaussians, ring_cameras
 
 Pixels = npt.NDArray[np.uint8]
 
@@ -100,14 +101,14 @@ def test_what_does_not_match_is_refused() -> None:
 
 @pytest.fixture
 def forgotten_weights() -> Iterator[None]:
-    images._weights.cache_clear()
+    lpips._weights.cache_clear()
     yield
-    images._weights.cache_clear()
+    lpips._weights.cache_clear()
 
 
 @pytest.mark.usefixtures("forgotten_weights")
 def test_it_is_said_how_to_get_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(images, "find_spec", lambda name: None)
+    monkeypatch.setattr(lpips, "find_spec", lambda name: None)
     found = compare_images([("x", _picture())], [("x", _picture())])
     assert found.mean.lpips_alex is None
     assert found.views["x"] == found.mean
@@ -129,7 +130,7 @@ def test_other_weights_are_refused_and_never_unpickled(
     (tmp_path / "weights").mkdir()
     (tmp_path / "weights" / "alexnet.ckpt").write_bytes(pickle.dumps(_Trap(tmp_path / "sprung")))
     package = SimpleNamespace(origin=str(tmp_path / "__init__.py"))
-    monkeypatch.setattr(images, "find_spec", lambda name: package)
+    monkeypatch.setattr(lpips, "find_spec", lambda name: package)
     found = compare_images([("x", _picture())], [("x", _picture())])
     assert "other weights" in str(found.missing)
     assert not (tmp_path / "sprung").exists()
@@ -143,12 +144,27 @@ def test_lpips_needs_room_for_its_layers() -> None:
 
 
 @needs_weights
+def test_a_model_s_lpips_is_that_of_its_renders() -> None:
+    """None where one of the views is too small."""
+    model, background = random_gaussians(seed=4), torch.zeros(3)
+    (small,) = ring_cameras(1)
+    camera = replace(small, width=64, height=48, K=small.K * torch.tensor([[2.0], [2.0], [1.0]]))
+    view = View(camera, torch.from_numpy(_picture()))
+    own = quality(model, [view], background)
+    expected = lpips.lpips_alex(render(model, camera, background).clamp(0, 1), view.image.float() / 255)
+    assert own.lpips == pytest.approx(expected, rel=1e-5)
+    assert expected > 0.1
+    cropped = View(replace(camera, height=20), view.image[:20])
+    assert quality(model, [view, cropped], background).lpips is None
+
+
+@needs_weights
 def test_lpips_is_that_of_its_authors(monkeypatch: pytest.MonkeyPatch) -> None:
     """Their layers, their order, their linear heads; AlexNet's convolutions are the ones we read.
 
     The first of these are as everybody prints them who loads torchvision's AlexNet.
     """
-    convolutions, _ = images._weights()
+    convolutions, _ = lpips._weights(torch.device("cpu"))
     published = torch.tensor([1.1864e-01, 9.4069e-02, 9.5435e-02])
     torch.testing.assert_close(convolutions[0][0][0, 0, 0, :3], published, rtol=1e-4, atol=0)
 

@@ -23,7 +23,6 @@ def switch(help: str, name: str | None = None) -> Any:
 
 Device = Annotated[Literal["auto", "cpu", "cuda"], arg(help="Device; auto uses a CUDA GPU if there is one.")]
 Seed = Annotated[int | None, optional("N", "Seed of all random numbers, to repeat a run.", "random")]
-FixedSeed = Annotated[int, arg(metavar="N", help="Seed of all random numbers.")]
 KeyFiles = Annotated[
     UseAppendAction[tuple[Path, ...]],
     optional("FILE", "Key file, one for each secret.", "KEYSS_KEY or a prompt"),
@@ -40,10 +39,10 @@ Iterations = Annotated[
     int | None, optional("N", "Training steps of a model, and of a refit.", "the preset's")
 ]
 MaxGaussians = Annotated[int | None, optional("N", "Maximum number of Gaussians of a model.", "the preset's")]
-Jobs = Annotated[
-    int | None, optional("N", "Parallel jobs, which share the cores.", "as cores and memory allow")
+Ray = Annotated[
+    str | None, optional("ADDRESS", "Ray cluster to run on, or `local`.", "one after the other, here")
 ]
-Ray = Annotated[str | None, optional("ADDRESS", "Ray cluster to run on, or `local`.", "local processes")]
+Cores = Annotated[int, arg(metavar="N", help="With --ray: cores of each run.")]
 Overwrite = Annotated[bool, switch("Replace existing results.")]
 Resume = Annotated[bool, switch("Continue an interrupted run in the same folder.")]
 OutFolder = Annotated[Path, arg(aliases=["-o"], metavar="FOLDER", help="Folder for the results.")]

@@ -16,8 +16,8 @@ from tyro.conf import OmitArgPrefixes, UseAppendAction, arg
 from keyss.cli.arguments import (
     PHOTOS,
     TRAINING,
+    Cores,
     Device,
-    Jobs,
     KeyFiles,
     OutFolder,
     Overwrite,
@@ -84,8 +84,8 @@ class Batch:
     master_key_file: Annotated[
         Path | None, optional("FILE", "Key file to derive each asset's key from (`keyss keygen --asset`).")
     ] = None
-    jobs: Jobs = None
     ray: Ray = None
+    cores: Cores = 1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -312,10 +312,11 @@ def _hide_batch(args: HideArguments, table: Path) -> None:
     from keyss.cli.keys import key_of_file, warn_of_weak_keys
     from keyss.cli.tables import print_files, print_outcome
     from keyss.methods import registry
+    from keyss.progress import reporter
 
     check_command("hide --batch", trains=False)
     method, batch = registry.get(args.method), args.batch
-    used = "batch master_key_file jobs ray out publish channel preset overwrite device min_psnr"
+    used = "batch master_key_file ray cores out publish channel preset overwrite device min_psnr"
     used += " width background skip_missing iterations max_gaussians seed"
     _refuse(args, "--batch", used, vars(args.own))
     if batch.master_key_file is not None:
@@ -328,8 +329,9 @@ def _hide_batch(args: HideArguments, table: Path) -> None:
         **vars(args.photos),
         min_psnr=args.details.min_psnr,
         device=args.device,
-        jobs=batch.jobs,
         ray=batch.ray,
+        cores=batch.cores,
+        reporter=reporter(),
         overwrite=args.overwrite,
     )
     if skipped := sum(each.skipped for each in result.outcomes):

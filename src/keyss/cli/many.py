@@ -3,26 +3,31 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from tyro.conf import Positional, UseAppendAction, arg
 
 from keyss.cli.arguments import (
+    Cores,
     Device,
-    FixedSeed,
     Iterations,
-    Jobs,
     MaxGaussians,
     OutFolder,
     Ray,
     Width,
     check_there,
+    checked_seed,
     optional,
     switch,
 )
 
 TableName = Literal["single", "multi", "masks", "combined", "pruning", "sinkhorn", "speed"]
+_SCENES = "PSNR, SSIM and LPIPS, a row for each scene: mean and standard deviation over seeds"
 QUICK = {"iterations": 500, "max_gaussians": 3000, "width": 100}
+Seeds = Annotated[
+    UseAppendAction[tuple[int, ...]],
+    optional("N", "Seed of all random numbers; repeat for means and standard deviations.", "0"),
+]
 DryRun = Annotated[bool, switch("Print the runs with estimates of time and memory; write nothing.")]
 
 
@@ -40,7 +45,7 @@ def compare(
     width: Width = None,
     dry_run: DryRun = False,
     device: Device = "auto",
-    seed: FixedSeed = 0,
+    seed: Seeds = (),
 ) -> None:
     """Hide a scene by each method with the same budget, and tabulate the results.
 
@@ -55,7 +60,7 @@ def compare(
     from keyss.cli.tables import print_files, print_forecast, print_table
     from keyss.core.errors import InputError
     from keyss.many import Forecast
-    from keyss.many.comparing import comparison_notes, comparison_tables
+    from keyss.many.comparison import comparison_notes, comparison_tables
     from keyss.progress import reporter
 
     given = {"iterations": iterations, "max_gaussians": max_gaussians, "width": width}
@@ -65,7 +70,7 @@ def compare(
         cover,
         secret,
         methods=named,
-        seed=seed,
+        seeds=tuple(map(checked_seed, seed)) or (0,),
         device=device,
         out=out,
         dry_run=dry_run,
@@ -73,14 +78,16 @@ def compare(
         **budget,
     )
     if isinstance(comparison, Forecast):
-        print_forecast(comparison, 1)
+        print_forecast(comparison)
         return
     for heads, *rows in comparison_tables(comparison).values():
         print_table(heads, rows)
     described = {
         "comparison.png": "a row for each method: cover, secret, error; it shows the secret",
-        "comparison.md": "the table, in Markdown",
-        "comparison.json": "the numbers, for programs",
+        "comparison.md": "the tables, in Markdown",
+        "comparison.csv": _SCENES,
+        "comparison.tex": "the same, for LaTeX (booktabs)",
+        "comparison.json": "all numbers, for programs",
     }
     print(*comparison_notes(comparison), sep="\n")
     print_files(out, described)
@@ -129,7 +136,7 @@ def reproduce(
         int | None, optional("PIXELS", "Downscale wider photos to this width.", "see --data")
     ] = None,
     device: Device = "auto",
-    seed: FixedSeed = 0,
+    seed: Seeds = (),
 ) -> None:
     """Reproduce a table of the KeySS paper, and check its claims.
 
@@ -158,21 +165,23 @@ def reproduce(
         iterations=iterations,
         max_gaussians=max_gaussians,
         width=width,
-        seed=seed,
+        seeds=tuple(map(checked_seed, seed)) or (0,),
         device=device,
         out=out,
         dry_run=dry_run,
         reporter=reporter(),
     )
     if isinstance(reproduction, Forecast):
-        print_forecast(reproduction, 1)
+        print_forecast(reproduction)
         return
     heads, *rows = reproduction_rows(reproduction)
     print_table(heads, rows)
     means = f"Published and measured figures, on test views; means over {len(reproduction.pairs)} pair(s)."
     described = {
         f"{table}.md": "the table and the verdicts, in Markdown",
-        f"{table}.json": "the same, for programs",
+        f"{table}.csv": _SCENES,
+        f"{table}.tex": "the same, for LaTeX (booktabs)",
+        f"{table}.json": "all figures, for programs",
         "cells": "the runs, which other tables share",
     }
     print(*reproduction_notes(reproduction), means, sep="\n")
@@ -187,9 +196,8 @@ def sweep(
     ],
     *,
     out: OutFolder,
-    jobs: Jobs = None,
     ray: Ray = None,
-    retries: Annotated[int, arg(metavar="N", help="Retries of a cell whose process died.")] = 2,
+    cores: Cores = 1,
     master_key_file: Annotated[
         Path | None,
         optional("FILE", "Key file to derive the cells' keys from (`keyss keygen --asset`).", "a new one"),
@@ -200,24 +208,31 @@ def sweep(
 
     docs/sweeps.md describes SPEC. Run the same command again to resume.
 
-    example: keyss sweep sweep.yaml -o runs/sweep --jobs 2
+    example: keyss sweep sweep.yaml -o runs/sweep
 
     example: keyss sweep sweep.yaml -o runs/sweep --dry-run
     """
     import keyss
     from keyss.cli.tables import print_files, print_forecast, print_outcome
-    from keyss.core.errors import UsageError
     from keyss.many import Forecast
+    from keyss.progress import reporter
 
-    if retries < 0:
-        raise UsageError(f"--retries: expected 0 or more, got {retries}")
-    options: dict[str, Any] = {"jobs": jobs, "ray": ray, "retries": retries, "dry_run": dry_run}
-    result = keyss.sweep(spec, out, master_key_file=master_key_file, **options)
+    result = keyss.sweep(
+        spec,
+        out,
+        master_key_file=master_key_file,
+        ray=ray,
+        cores=cores,
+        dry_run=dry_run,
+        reporter=reporter(),
+    )
     if isinstance(result, Forecast):
-        print_forecast(result, jobs)
+        print_forecast(result)
         return
     described = {
-        "results.csv": "means over seeds, with 95 % confidence intervals",
+        "scenes.csv": _SCENES,
+        "scenes.tex": "the same, for LaTeX (booktabs)",
+        "results.csv": "all measures: mean and standard deviation over seeds",
         "cells.csv": "the numbers of each cell",
         "private/master-key.txt": "the key from which those of the cells are derived",
     }

@@ -32,7 +32,7 @@ def evaluate(
     ] = None,
     device: Device = "auto",
 ) -> None:
-    """Measure a run again on test views, with the right keys and wrong ones.
+    """Measure PSNR, SSIM and LPIPS of a run again, with the right keys and wrong ones.
 
     Test views are photos that were held out of training or, for a model, renders of it. Each measurement is
     compared with its bound: plain 3DGS of as many Gaussians and as many training steps (`keyss hide --bound`
@@ -45,9 +45,12 @@ def evaluate(
     import keyss
     from keyss.cli.keys import keys_of_run
     from keyss.cli.tables import print_files, print_hiding
+    from keyss.fitting.lpips import HOW_TO_GET, MIN_SIZE
 
     metrics = keyss.evaluate(run, keys_of_run(run, key_file), wrong_keys=wrong_keys, device=device)
     print_hiding(metrics)
+    if metrics.cover.lpips is None:
+        print(f"{HOW_TO_GET}; photos must have at least {MIN_SIZE} x {MIN_SIZE} pixels.")
     print_files(run, {"private/metrics.json": "the measurements"})
 
 

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from keyss.runs.revealing import Verification
 
 
-_HEADS = ("PSNR", "SSIM", "bound", "loss", "start", "Gaussians", "plain", "steps")
+_HEADS = ("PSNR", "SSIM", "LPIPS", "bound", "loss", "start", "Gaussians", "plain", "steps")
 
 
 class Console(RichConsole):
@@ -75,6 +75,8 @@ def _scene_rows(metrics: HideMetrics) -> list[dict[str, str]]:
         strict=True,
     ):
         row = {"PSNR": f"{own.psnr:.2f}", "SSIM": f"{own.ssim:.3f}"}
+        if own.lpips is not None:
+            row["LPIPS"] = f"{own.lpips:.3f}"
         row["Gaussians"] = f"{size:,}"
         if not photos:  # the test views are renders of the given model, so there is no bound
             plain = steps = None
@@ -129,7 +131,7 @@ def print_plan(plan: Plan) -> None:
 
 def _explanations(metrics: HideMetrics, names: Sequence[str], heads: Sequence[str]) -> list[str]:
     """A line for each term of the table of a hiding."""
-    lines = ["PSNR in dB."]
+    lines = ["PSNR in dB." + " LPIPS with AlexNet: lower is better." * ("LPIPS" in heads)]
     size = "as many Gaussians"
     if _sizes_differ(metrics):
         size = "its own number of Gaussians" if _sizes_differ(metrics, 0.02) else "about as many Gaussians"
@@ -177,9 +179,11 @@ def _explanations(metrics: HideMetrics, names: Sequence[str], heads: Sequence[st
 
 def print_fit(metrics: FitMetrics) -> None:
     """The numbers of a plain fit."""
-    quality = (f"{metrics.psnr:.2f}", f"{metrics.ssim:.3f}")
+    quality = {"PSNR": f"{metrics.psnr:.2f}", "SSIM": f"{metrics.ssim:.3f}"}
+    if metrics.lpips is not None:
+        quality["LPIPS"] = f"{metrics.lpips:.3f}"
     sizes = (f"{metrics.gaussians:,}", f"{metrics.iterations:,}", f"{metrics.seconds:.0f}")
-    print_table(("PSNR", "SSIM", "Gaussians", "iterations", "seconds"), [(*quality, *sizes)], texts=0)
+    print_table((*quality, "Gaussians", "iterations", "seconds"), [(*quality.values(), *sizes)], texts=0)
 
 
 def print_verdicts(audit: Audit) -> None:
@@ -263,25 +267,20 @@ def _size(count: int) -> str:
     return f"{count / 1e6:,.1f} MB" if count >= 1e6 else f"{count / 1e3:,.1f} kB"
 
 
-def print_forecast(found: Forecast, jobs: int | None = None) -> None:
+def print_forecast(found: Forecast) -> None:
     """The cells of a dry run, with estimates for those that are not done."""
-    from keyss.many.engines import Resources
-
     rows = []
-    for each in found.cells:
-        time, memory = "done" if each.done else "cannot work", ""
-        if each.plan is not None:
-            time, memory = about(each.plan.seconds), f"{each.plan.memory_bytes / 1e9:.1f} GB"
-        rows.append((each.name, time, memory))
+    for place, name in found.names.items():
+        time, memory = "cannot work" if place in found.refused else "done", ""
+        if (plan := found.plans.get(place)) is not None:
+            time, memory = about(plan.seconds), f"{plan.memory_bytes / 1e9:.1f} GB"
+        rows.append((name, time, memory))
     print_table(("run", "time, about", "memory"), rows)
-    for each in found.cells:
-        if each.refused:
-            print(f"{each.name}: {each.refused}")
-    resources = Resources.divided(jobs, max((each.memory_bytes for each in found.plans), default=1))
+    for place, reason in found.refused.items():
+        print(f"{found.names[place]}: {reason}")
     print(
-        f"{len(found.cells)} run{'s' * (len(found.cells) != 1)}, {len(found.plans)} to do: about "
-        f"{about(sum(each.seconds for each in found.plans))} with all cores of this machine,\n"
-        f"{resources.jobs} at once, each with {resources.threads} thread{'s' * (resources.threads != 1)}."
+        f"{len(rows)} run{'s' * (len(rows) != 1)}, {len(found.plans)} to do: about "
+        f"{about(sum(plan.seconds for plan in found.plans.values()))} on this machine."
     )
     print("Dry run: nothing was written. Times are rough.")
 

@@ -1,4 +1,4 @@
-"""Image quality: PSNR and SSIM of renders against photos."""
+"""Image quality: PSNR, SSIM and LPIPS of renders against photos."""
 
 from __future__ import annotations
 
@@ -9,9 +9,11 @@ from statistics import fmean
 import torch
 from torch import Tensor
 
+from keyss.core.errors import KeyssError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import View
 from keyss.fitting.losses import Target, ssim
+from keyss.fitting.lpips import lpips_alex
 from keyss.rendering import render
 
 
@@ -21,6 +23,7 @@ class ImageQuality:
 
     psnr: float  # dB
     ssim: float  # the 3DGS variant, at most 1
+    lpips: float | None = None  # with AlexNet; None without its weights, or for images below 31 x 31 pixels
 
 
 def psnr(image: Tensor, reference: Tensor) -> float:
@@ -31,12 +34,16 @@ def psnr(image: Tensor, reference: Tensor) -> float:
 
 def view_quality(image: Tensor, photo: Tensor) -> ImageQuality:
     """Quality of a render against its photo, both [H, W, 3] in [0, 1]."""
-    return ImageQuality(psnr(image, photo), float(ssim(image, Target.of(photo))))
+    try:
+        distance = lpips_alex(image, photo)
+    except KeyssError:
+        distance = None
+    return ImageQuality(psnr(image, photo), float(ssim(image, Target.of(photo))), distance)
 
 
 @torch.no_grad()
 def quality(gaussians: Gaussians, views: Sequence[View], background: Tensor) -> ImageQuality:
-    """Mean PSNR and SSIM of the views' float32 renders against their photos."""
+    """Mean quality of the views' float32 renders against their photos."""
     qualities = [
         view_quality(
             render(gaussians, view.camera, background).clamp(0, 1),
@@ -49,7 +56,12 @@ def quality(gaussians: Gaussians, views: Sequence[View], background: Tensor) -> 
 
 def mean_quality(views: Sequence[ImageQuality]) -> ImageQuality:
     """The means over the views."""
-    return ImageQuality(fmean(view.psnr for view in views), fmean(view.ssim for view in views))
+    distances = [view.lpips for view in views if view.lpips is not None]
+    return ImageQuality(
+        fmean(view.psnr for view in views),
+        fmean(view.ssim for view in views),
+        fmean(distances) if len(distances) == len(views) else None,
+    )
 
 
 @torch.no_grad()

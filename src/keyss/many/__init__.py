@@ -1,9 +1,9 @@
-"""Many runs: one engine and four kinds of specification.
+"""Many runs: sweeps, batches, comparisons of methods, and the paper's tables.
 
 A *cell* is a plain fit, or a hiding and its measures, in a folder of its own (`keyss.many.cell`). Cells run
-in processes of this machine, on a cluster, or in this process (`keyss.many.running`), and never run again
-once they are done. A sweep (YAML), a batch (CSV), a comparison of methods and a table of the paper each add
-cells to a folder and tabulate the results.
+one after the other in this process, or on a Ray cluster (`keyss.many.engine`), and never run again once they
+are done. A sweep (YAML), a comparison of methods and a table of the paper each add cells to a folder
+(`keyss.many.cell_folder`) and tabulate the results; a batch (CSV) runs on the same engine.
 """
 
 import lazy_loader

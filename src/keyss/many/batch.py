@@ -19,136 +19,108 @@ import os
 import unicodedata
 import warnings
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from itertools import pairwise
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-import msgspec
-
-from keyss.core.errors import InputError, KeyssError, KeyssWarning, OutputError, did_you_mean
-from keyss.core.scene import ViewOptions
-from keyss.files.atomic import write_bytes
+from keyss._version import __version__
+from keyss.api.asking import Secret
+from keyss.api.hiding import hide
+from keyss.core import InputError, KeyssWarning, ViewOptions
+from keyss.core.errors import did_you_mean
+from keyss.files import write_bytes
 from keyss.files.reading import read_text
-from keyss.keys.derivation import SALT_BYTES, DerivedKey
-from keyss.keys.key_file import read_key
-from keyss.many.cell import CELL, RESULT, Cell
-from keyss.many.running import CELLS, RETRIES, ManyResult, Outcome, claimed, run_cells, settle_master_key
-from keyss.many.tables import csv_bytes
-from keyss.methods import registry
-from keyss.methods.base import MethodOptions
+from keyss.keys import MasterKey, read_key
+from keyss.many.cell import changed_since
+from keyss.many.cell_folder import ManyResult, Outcome, settle_master_key
+from keyss.many.engine import claimed, engine
+from keyss.many.result_tables import csv_bytes
+from keyss.methods import MethodOptions, registry
+from keyss.progress import Reporter
 from keyss.rendering import Backend
 from keyss.rendering.orbit import is_model
+from keyss.runs import read_manifest, record_bytes, stego_in, write_record
 from keyss.runs.files import PathLike
 from keyss.runs.folder import PRIVATE
-from keyss.runs.records import read_record
 
 MAX_BYTES = 64 << 20
-MAX_ROWS = 1_000_000
 COLUMNS = ("cover", "secret", "secret_file", "out", "key_file")
-_OWN = "private"  # the folder of the batch's own files
 SUMMARY = f"{PRIVATE}/batch.csv"
+_RECORD = f"{PRIVATE}/asset.json"  # in the folder of a finished asset
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Asset:
-    """A row, with absolute paths."""
+    """A hiding, without its key."""
 
-    line: int  # of the file
-    cover: Path
-    secret: Path | None
-    secret_file: Path | None
-    out: str  # as the file has it
-    key_file: Path | None
+    keyss: str = __version__
+    name: str  # folder of its results, relative to the batch's
+    cover: str
+    secret: str | None = None
+    secret_file: str | None = None
+    key_file: str
+    options: MethodOptions
+    views: ViewOptions
+    min_psnr: float | None
+    device: Backend
+
+    def is_done(self, place: Path) -> bool:
+        """True if it was made from the same files, with the same options, by the same version of keyss."""
+        record = place / _RECORD
+        inputs = [each for each in (self.cover, self.secret, self.secret_file, self.key_file) if each]
+        same = os.path.exists(record) and record.read_bytes() == record_bytes(self)
+        return same and stego_in(place).exists() and not changed_since(record, inputs)
 
 
-def read_assets(path: Path, *, master: bool) -> list[Asset]:
-    """All assets; paths are relative to the folder of the file. Raises InputError, which names the line.
+def read_rows(path: Path, *, master: bool) -> list[dict[str, str]]:
+    """All rows by columns, without empty values; paths, except `out`, are absolute.
 
     `master`: keys are derived, and no row names the file of one. Missing files are not an error here: they
-    fail their own asset.
+    fail their own asset. Raises InputError, which names the line.
     """
-    text = read_text(path, MAX_BYTES)
+    reader = csv.DictReader(io.StringIO(read_text(path, MAX_BYTES)), strict=True)
+    found, lines = [], {}
     try:
-        rows = list(csv.reader(io.StringIO(text), strict=True))
+        heads = reader.fieldnames = [head.strip() for head in reader.fieldnames or ()]
+        for head in heads:
+            if head not in COLUMNS or heads.count(head) > 1:
+                near = did_you_mean(head, COLUMNS)
+                raise InputError(f"{path}: {head[:60]!r} is no column, or one twice; {near}")
+        for row in reader:
+            where = f"{path}, line {reader.line_num}"
+            found.append(_checked(where, path.absolute().parent, row, master))
+            # File systems may treat two spellings as the same name.
+            place = PurePosixPath(unicodedata.normalize("NFC", found[-1]["out"]).casefold())
+            lines[where] = place
     except csv.Error as error:
         raise InputError(f"{path}: expected CSV: {error}") from error
-    if not rows:
-        raise InputError(f"{path}: expected a first line with the names of columns, found nothing")
-    heads = [head.strip() for head in rows[0]]
-    _check_heads(path, heads, master)
-    found: list[Asset] = []
-    for line, cells in enumerate(rows[1:], start=2):
-        if not any(cell.strip() for cell in cells):
-            continue
-        if len(cells) != len(heads):
-            raise InputError(f"{path}, line {line}: expected {len(heads)} columns, got {len(cells)}")
-        asset = _asset(path, line, dict(zip(heads, (cell.strip() for cell in cells), strict=True)), master)
-        found.append(asset)
-        if len(found) > MAX_ROWS:
-            raise InputError(f"{path}: expected at most {MAX_ROWS:,} assets")
-    _check_apart(path, found)
     if not found:
-        raise InputError(f"{path}: expected at least one asset")
+        raise InputError(f"{path}: expected the names of columns, and at least one asset")
+    for (where, place), (other, inner) in pairwise(sorted(lines.items(), key=lambda each: each[1])):
+        if inner.is_relative_to(place):
+            raise InputError(f"{other}: out: is the folder of {where}, or lies in it")
     return found
 
 
-def _check_heads(path: Path, heads: list[str], master: bool) -> None:
-    for head in heads:
-        if head not in COLUMNS:
-            raise InputError(f"{path}: no column is called {head[:60]!r}; {did_you_mean(head, COLUMNS)}")
-    if len(set(heads)) < len(heads):
-        raise InputError(f"{path}: two columns have the same name")
-    needed = {"cover", "out"} | (set() if master else {"key_file"})
-    if missing := sorted(needed - set(heads)):
-        more = "; keys come from it or from `master_key_file`" if "key_file" in missing else ""
-        raise InputError(f"{path}: expected a column {missing[0]}{more}")
-    if not {"secret", "secret_file"} & set(heads):
-        raise InputError(f"{path}: expected a column secret or secret_file")
-    if master and "key_file" in heads:
-        raise InputError(f"{path}: leave out the column key_file: keys are derived from the master key")
-
-
-def _check_apart(path: Path, assets: Sequence[Asset]) -> None:
-    """Raise InputError for a folder of results that is that of another asset, or lies in it."""
-    # File systems may treat two spellings as the same name.
-    places = [PurePosixPath(unicodedata.normalize("NFC", each.out).casefold()) for each in assets]
-    lines: dict[PurePosixPath, int] = {}
-    for asset, place in zip(assets, places, strict=True):
-        if (other := lines.setdefault(place, asset.line)) != asset.line:
-            raise InputError(f"{path}, line {asset.line}: out: {asset.out} is the folder of line {other}")
-    for asset, place in zip(assets, places, strict=True):
-        for parent in place.parents:
-            if parent in lines:
-                raise InputError(
-                    f"{path}, line {asset.line}: out: {asset.out} lies in the folder of line {lines[parent]}"
-                )
-
-
-def _asset(path: Path, line: int, row: dict[str, str], master: bool) -> Asset:
-    where = f"{path}, line {line}"
-
-    def place(column: str) -> Path | None:
-        value = row.get(column)
-        if value and "\0" in value:
-            raise InputError(f"{where}: {column}: expected a path, got {value!r}")
-        return path.absolute().parent / value if value else None
-
-    cover, out = place("cover"), row["out"]
-    if cover is None:
-        raise InputError(f"{where}: cover: expected a model or a scene, got nothing")
-    secret, file = place("secret"), place("secret_file")
-    if (secret is None) == (file is None):
-        raise InputError(f"{where}: expected a secret or a secret_file, got {'both' if secret else 'none'}")
-    key_file = place("key_file")
-    if key_file is None and not master:
-        raise InputError(f"{where}: key_file: expected the file of a key, got nothing")
+def _checked(where: str, base: Path, row: dict[str, str], master: bool) -> dict[str, str]:
+    if None in row or None in row.values():
+        raise InputError(f"{where}: expected as many columns as there are names of them")
+    given = {name: value.strip() for name, value in row.items() if value.strip()}
+    if any("\0" in value for value in given.values()):
+        raise InputError(f"{where}: expected paths, got a NUL character")
+    if master == ("key_file" in given):
+        what = "leave out the column key_file with a master key" if master else "expected a key_file"
+        raise InputError(f"{where}: {what}: keys come from it or from `master_key_file`")
+    if not {"cover", "out"} <= given.keys() or ("secret" in given) == ("secret_file" in given):
+        raise InputError(f"{where}: expected a cover, out, and either a secret or a secret_file")
+    out = given.pop("out")
     parts = PurePosixPath(out).parts
-    if not parts or ".." in parts or parts[0] == "/" or parts[0].casefold() == _OWN or "\0" in out:
-        raise InputError(
-            f"{where}: out: expected the name of a folder in that of the batch, and not {_OWN}, got {out!r}"
-        )
-    return Asset(line, cover, secret, file, out, key_file)
+    if ".." in parts or out.startswith("/") or parts[:1] == () or parts[0].casefold() == PRIVATE:
+        raise InputError(f"{where}: out: expected a folder in the batch's, and not {PRIVATE}, got {out!r}")
+    return {name: os.path.realpath(base / value) for name, value in given.items()} | {"out": out}
 
 
 def hide_batch(
@@ -162,105 +134,93 @@ def hide_batch(
     skip_missing: bool = False,
     min_psnr: float | None = None,
     device: Backend = "auto",
-    jobs: int | None = None,
     ray: str | None = None,
-    retries: int = RETRIES,
+    cores: int = 1,
     overwrite: bool = False,
+    reporter: Reporter | None = None,
 ) -> ManyResult:
     """Hide a secret in each cover of a table (see `keyss.many.batch`), each in its own folder below `out`.
 
-    Assets that are done are skipped; one whose cover, secret, key or options have changed since is refused
-    unless with `overwrite`. `master_key_file`: its key and the column `out` give each asset a key of its own
-    (`keyss.keys.master`). `jobs`, `ray`, `retries`: see `keyss.sweep`; the other arguments are those of
-    `hide`. Raises KeyssError and its children for what concerns all; the result has what concerns one asset.
+    Assets that are done are skipped; one whose files or options have changed since is refused unless with
+    `overwrite`. `master_key_file`: its key and the column `out` give each asset a key of its own
+    (`keyss.keys.master`). `ray`, `cores`: see `keyss.sweep`; the other arguments are those of `hide`. Raises
+    KeyssError and its children for what concerns all; the result has what concerns one asset.
     """
-    options = method
-    if isinstance(options, str):
-        options = registry.get(options).options()
     master = None if master_key_file is None else Path(master_key_file).absolute()
-    assets, out = read_assets(Path(manifest), master=master is not None), Path(out)
+    rows, out = read_rows(Path(manifest), master=master is not None), Path(out)
     if master is not None:
         read_key(master)
-    covers = Counter(os.path.realpath(asset.cover) for asset in assets if is_model(asset.cover))
-    if again := [cover for cover, times in covers.items() if times > 1]:
+    _warn_of_covers([row["cover"] for row in rows if is_model(row["cover"])])
+    common: dict[str, Any] = {
+        "options": registry.get(method).options() if isinstance(method, str) else method,
+        "views": ViewOptions.of(width, background, skip_missing),
+        "min_psnr": min_psnr,
+        "device": device,
+    }
+    assets: dict[Path, Asset] = {}
+    for row in rows:
+        name = row.pop("out")
+        assets[out / name] = Asset(name=name, **{"key_file": str(master), **row, **common})
+    with claimed(out, mode=0o777):
+        if master is not None:
+            settle_master_key(out, master)
+        done = {place for place, asset in assets.items() if asset.is_done(place)}
+        found = {place: Outcome(assets[place].name, place, skipped=True) for place in done}
+        due = {place: asset for place, asset in assets.items() if place not in done}
+        if due:
+            work = partial(_hide, derived=master is not None, overwrite=overwrite)
+            with engine(ray, cores, reporter) as run:
+                for place, _, error in run(work, due):
+                    found[place] = Outcome(due[place].name, place, error=error)
+        outcomes = [found[place] for place in assets]
+        write_bytes(out / SUMMARY, _summary(out, outcomes))
+    return ManyResult(tuple(outcomes), (SUMMARY,))
+
+
+def _hide(asset: Asset, place: Path, reporter: Reporter, *, derived: bool, overwrite: bool) -> None:
+    """Hide, and write the record of the asset. `derived`: its key file has the master key."""
+    key = read_key(Path(asset.key_file))
+    key = MasterKey(key).key_of(asset.name) if derived else key
+    if asset.secret_file is not None:
+        secret = Secret(file=asset.secret_file, key=key)
+        publish, channel = asset.options.publish, asset.options.channel
+        hide(asset.cover, [secret], publish=publish, channel=channel, out=place, overwrite=overwrite)
+    else:
+        hide(
+            asset.cover,
+            [Secret(asset.secret, key)],
+            method=asset.options,
+            **vars(asset.views),
+            min_psnr=asset.min_psnr,
+            device=asset.device,
+            out=place,
+            overwrite=overwrite,
+            resume=not overwrite and read_manifest(place).running is not None,
+            reporter=reporter,
+        )
+    write_record(place / _RECORD, asset)
+
+
+def _warn_of_covers(covers: Sequence[str]) -> None:
+    """Warn of models that are published more than once."""
+    if again := [cover for cover, times in Counter(covers).items() if times > 1]:
         warnings.warn(
             f"{len(again)} of the covers ({Path(again[0]).name}) are published more than once. Each file "
             "gets low bits of its own, but comparing two shows that both hide something: give each asset a "
             "cover of its own if others may have both",
             KeyssWarning,
-            stacklevel=2,
+            stacklevel=3,
         )
-    common: dict[str, Any] = {
-        "views": ViewOptions.of(width, background, skip_missing),
-        "min_psnr": min_psnr,
-        "device": device,
-        "method": registry.of_options(options).name,
-        "options": msgspec.to_builtins(options),
-    }
-    with claimed(out, mode=0o777):
-        if master is not None:
-            settle_master_key(out, master)
-        found: dict[str, Outcome] = {}
-        cells: list[tuple[Cell, Path]] = []
-        for asset in assets:
-            folder = out / PRIVATE / CELLS / asset.out
-            try:
-                cells.append((_cell(asset, out, folder, master, common, overwrite), folder))
-            except KeyssError as error:
-                found[asset.out] = Outcome(asset.out, folder, None, str(error))
-        ended = run_cells(f"batch of {len(assets)} assets", cells, jobs=jobs, ray=ray, retries=retries)
-        found |= {each.name: each for each in ended}
-        outcomes = [found[asset.out] for asset in assets]
-        write_bytes(out / SUMMARY, _summary(out, outcomes))
-    return ManyResult(tuple(outcomes), (SUMMARY,))
-
-
-def _cell(
-    asset: Asset, out: Path, folder: Path, master: Path | None, common: Mapping[str, Any], overwrite: bool
-) -> Cell:
-    """The asset's cell. Raises InputError and OutputError where it must not begin."""
-    place = out / asset.out
-    cell = Cell(
-        name=asset.out,
-        cover=os.path.realpath(asset.cover),
-        secrets=() if asset.secret is None else (os.path.realpath(asset.secret),),
-        files=() if asset.secret_file is None else (os.path.realpath(asset.secret_file),),
-        run=os.path.relpath(place, folder),  # relative: the whole batch can be moved
-        key_files=() if asset.key_file is None else (str(asset.key_file),),
-        master_key_file=None if master is None else str(master),
-        key_names=() if master is None else (asset.out,),
-        **common,
-    )
-    identity = cell.identity
-    check = "" if asset.key_file is None else _key_check(read_key(asset.key_file), identity)
-    cell = replace(cell, id=f"{identity}{check}")
-    try:
-        there = place.is_file() or (place.is_dir() and any(place.iterdir()))
-        before = read_record(folder / CELL, Cell) if (folder / CELL).exists() else None
-    except OSError as error:
-        raise OutputError(f"cannot write {place}: {error.strerror}") from error
-    if before is None or before.id != cell.id:
-        if there and not overwrite:
-            what = "exists, and is not from this batch"
-            what = what if before is None else "was made with another key, or from other inputs or options"
-            raise OutputError(f"{place} {what}: `overwrite=True` replaces what keyss wrote there")
-        (folder / RESULT).unlink(missing_ok=True)
-    return cell
-
-
-def _key_check(key: str, identity: str) -> str:
-    """A value that recognises the key of a cell; testing a guess costs as much as at the published file."""
-    salt = hashlib.sha256(b"keyss/v1/batch" + identity.encode()).digest()[:SALT_BYTES]
-    return DerivedKey.of(key, salt).verifier().hex()
 
 
 def _summary(out: Path, outcomes: Sequence[Outcome]) -> bytes:
+    """A line for each asset: its state, and the published file with its checksum, or the error."""
     rows = []
     for each in outcomes:
         row = {"out": each.name, "state": "failed", "published": "", "sha256": "", "error": each.error or ""}
-        if each.result is not None:
-            published = os.path.normpath(each.folder / each.result.published)
-            row |= {"state": "done", "published": os.path.relpath(published, out)}
-            row |= {"sha256": each.result.sha256}
+        if each.error is None:
+            stego = stego_in(each.folder)
+            row |= {"state": "done", "published": os.path.relpath(stego, out)}
+            row |= {"sha256": hashlib.sha256(stego.read_bytes()).hexdigest()}
         rows.append(row)
     return csv_bytes(rows)

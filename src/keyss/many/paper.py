@@ -12,7 +12,7 @@ from typing import Any, Literal
 import msgspec
 
 from keyss._version import __version__
-from keyss.many.tables import markdown_rows
+from keyss.many.result_tables import markdown_rows
 
 Group = tuple[str, ...]  # names of a cover and of its secrets
 Figure = float | tuple[float, ...]  # one number, or one for each published group
@@ -99,7 +99,7 @@ class JudgedClaim:
 class Reproduction:
     """A reproduced table: `TABLE.json`."""
 
-    version: int = 2
+    version: int = 3
     keyss: str = __version__
     table: str
     title: str

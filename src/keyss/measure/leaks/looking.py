@@ -16,7 +16,8 @@ from torch import Tensor
 from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene, View
-from keyss.fitting.image_metrics import subsample_views, view_quality
+from keyss.fitting.image_metrics import psnr, subsample_views
+from keyss.fitting.losses import Target, ssim
 from keyss.measure.leaks.attacks import Attack
 from keyss.rendering import render
 
@@ -101,10 +102,11 @@ def leak_scores(model: Gaussians, views: Sequence[View], background: Tensor) -> 
     for view in views:
         photo = view.image.to(model.device).float() / 255
         image = render(model, view.camera, background).clamp(0, 1)
-        fitted = view_quality(fit_colours(image, photo).clamp(0, 1), photo)
+        fitted = fit_colours(image, photo).clamp(0, 1)
         gradient = gradient_correlation(image, photo)
         gradient_coarse = gradient_correlation(coarse(image), coarse(photo))
-        rows.append(LeakScores(fitted.psnr, fitted.ssim, gradient, gradient_coarse))
+        similarity = float(ssim(fitted, Target.of(photo)))
+        rows.append(LeakScores(psnr(fitted, photo), similarity, gradient, gradient_coarse))
     return LeakScores.combined(fmean, rows)
 
 

@@ -225,6 +225,28 @@ def converters(sog_iterations: int = 1) -> list[Converter]:
     ]
 
 
+def own_converter(format: str) -> Converter:
+    """A conversion by keyss itself, for where a tool is missing: `format` is .spz or compressed .ply."""
+    name = {".spz": "there.spz", "compressed .ply": "there.compressed.ply"}[format]
+
+    def there_and_back(source: Path, folder: Path) -> tuple[Path, Path]:
+        there, back = folder / name, folder / "back.ply"
+        write_model(there, read_model(source))
+        write_model(back, read_model(there))
+        return there, back
+
+    return Converter(format, "keyss", "", there_and_back)
+
+
+def why_missing(tool: str) -> str | None:
+    """Why splat-transform or a Python package cannot be used; None if it is installed."""
+    try:
+        find_splat_transform() if tool == "splat-transform" else find_package(tool)
+    except BackendError as error:
+        return str(error)
+    return None
+
+
 def find_splat_transform() -> str:
     """The program: KEYSS_SPLAT_TRANSFORM, else node_modules here, else on the PATH. Raises BackendError."""
     here = Path("node_modules") / ".bin" / "splat-transform"

@@ -1,6 +1,7 @@
 """Measures of a finished hiding that `compare` and `reproduce` ask for, beside those of `hide` and `audit`.
 
-Each is a function from a run to numbers by name. A string in place of a number says why it was skipped.
+Each is a function from a run to numbers by name. A string instead says why there is no number, or with what
+the numbers of that name were measured for want of a tool.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from keyss.core.scene import Scene, ViewOptions
 from keyss.files.models import read_model
 from keyss.measure.images import renders_of, steganalysed
 from keyss.measure.robustness.changes import Change, opacity_pruning, purification, random_pruning
-from keyss.measure.robustness.survival import converters, measure_robustness
+from keyss.measure.robustness.survival import converters, measure_robustness, own_converter, why_missing
 from keyss.measure.sinkhorn import composite_score, sinkhorn_3d
 from keyss.measure.speed import RenderTime, readers, render_time
 from keyss.measure.stealth.judging import judge
@@ -39,7 +40,8 @@ Numbers = dict[str, float | str]
 PRUNED_SHARES = (0.05, 0.10, 0.15, 0.25)  # of the Gaussians
 _LOST = 0.25  # of the Gaussians
 _GIVEN_UP = 0.01  # of the blending weight in the cover's views, by purification
-CONVERSIONS = ((".spz", "gsply"), ("compressed .ply", "splat-transform"))  # two formats, two programs
+CONVERSIONS = {".spz": "gsply", "compressed .ply": "splat-transform"}  # by two programs
+OWN = "our own"  # notes on what was measured with
 _EVERY_VIEW = 10**6
 _ROUNDS = 5  # of timing pictures
 _ROLES = ("cover", "secret")
@@ -85,22 +87,25 @@ class Subject:
 
 
 def files(subject: Subject) -> Numbers:
-    """Bytes of the published and the handed files; how many third-party programs read the published one."""
+    """Megabytes of the published and the handed files; how many other programs read the published one."""
     published = stego_in(subject.run.folder)
     handed = (subject.run.folder / HANDED).glob("*")
-    found: Numbers = {"published": published.stat().st_size}
-    found["handed"] = sum(path.stat().st_size for path in handed)
-    tried = readers(published)
-    found |= {each.reader: each.note for each in tried if each.loads is None and each.note}
-    found["readers"] = sum(each.loads is not None for each in tried)
-    return found | {"readers that load": sum(each.loads is True for each in tried)}
+    found: Numbers = {"published_mb": published.stat().st_size / 1e6}
+    found["handed_mb"] = sum(path.stat().st_size for path in handed) / 1e6
+    programs = readers(published)
+    tried = [each for each in programs if each.loads is not None]
+    if tried:
+        found |= {"readers": len(tried), "readers that load": sum(each.loads is True for each in tried)}
+    else:
+        found["standard .ply"] = f"{OWN} reader only: {'; '.join(f'{each.note}' for each in programs)}"
+    return found
 
 
 def pictures(subject: Subject) -> Numbers:
     """Render times of the cover and the first secret, also relative to plain 3DGS."""
     found: Numbers = {}
     for role, each in subject.times(subject.models).items():
-        found |= {f"{role}.seconds": each.seconds, f"{role}.ratio": each.ratio}
+        found |= {f"{role}.ms": 1e3 * each.seconds, f"{role}.ratio": each.ratio}
     return found
 
 
@@ -125,15 +130,14 @@ def secrecy(subject: Subject) -> Numbers:
 
 
 def survival(subject: Subject) -> Numbers:
-    """Loss in dB of cover and secret by pruning, conversion and purification.
+    """Change in dB of cover and secret by pruning, conversion and purification.
 
     A secret that no longer opens has no number.
     """
-    changes = trials(subject.scenes[0])
-    found: Numbers = {}
+    changes, found = trials(subject.scenes[0]), own_converters()
     if not subject.standard:
         reason = "needs a 3DGS model, and this method publishes none"
-        found |= {name: reason for name in changes if name != "pruned"}
+        found = {name: reason for name in changes if name != "pruned"}
         changes = {"pruned": changes["pruned"]}
     cover, *others = subject.scenes
     whole = measure_robustness(
@@ -143,17 +147,26 @@ def survival(subject: Subject) -> Numbers:
         if result.skipped is not None or result.cover is None:
             found[name] = result.skipped or "not measured"
             continue
-        found[f"{name}.cover"] = result.cover.loss
+        found[f"{name}.cover"] = -result.cover.loss
         if result.secrets[0].opens:
-            found[f"{name}.secret"] = result.secrets[0].loss
+            found[f"{name}.secret"] = -result.secrets[0].loss
     return found
 
 
 def trials(cover: Scene) -> dict[str, Change]:
     """The changes that `survival` tries, by name; purification uses the cover's photos."""
     known = {(each.format, each.tool): each for each in converters()}
-    conversions = {each[0]: known[each].change() for each in CONVERSIONS}
+    conversions = {
+        name: (own_converter(name) if why_missing(tool) else known[name, tool]).change()
+        for name, tool in CONVERSIONS.items()
+    }
     return {"pruned": random_pruning(_LOST), **conversions, "purified": purification(cover, _GIVEN_UP)}
+
+
+def own_converters() -> Numbers:
+    """Notes on conversions whose tools are missing, which keyss does itself."""
+    missing = {name: why_missing(tool) for name, tool in CONVERSIONS.items()}
+    return {name: f"{OWN} converter: {why}" for name, why in missing.items() if why}
 
 
 def pruning(subject: Subject) -> Numbers:

