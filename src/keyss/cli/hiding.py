@@ -149,6 +149,8 @@ def hide(args: HideArguments) -> None:
 
 def _hide_scenes(args: HideArguments, cover: Path) -> None:
     import keyss
+    from keyss import progress
+    from keyss.channels import is_appended
     from keyss.cli.entry import answers
     from keyss.cli.reporting import reporting
     from keyss.cli.tables import print_files, print_hiding, print_plan
@@ -190,10 +192,12 @@ def _hide_scenes(args: HideArguments, cover: Path) -> None:
     if not answers():
         return
     assert result.metrics is not None
-    print_hiding(result.metrics)
+    print_hiding(result.metrics, brief=progress.level < 1)
     _warn_of_idle(idle, result.metrics.iterations)
     what = "the cover with the secret in it" if options.trains or method.capabilities.keys else "the cover"
-    how = _HOW_TO_PUBLISH[options.place.survives]
+    assert result.stego is not None
+    appended = bool(is_appended(result.stego).any())  # also where nothing goes in unnoticed
+    how = _HOW_TO_PUBLISH[options.place.survives or appended]
     print_files(
         args.out,
         {
@@ -207,8 +211,8 @@ def _hide_scenes(args: HideArguments, cover: Path) -> None:
         return
     files = "both files" if method.capabilities.hands_over else "the file"
     print(
-        "Send the key over another channel than the file, and keep a copy: without it the secret is lost. "
-        f"Whoever has {files} and the key runs `keyss reveal`."
+        "Send the key over another channel, and keep a copy: without it the secret is lost. Whoever has "
+        f"{files} and the key runs `keyss reveal`; `keyss info {args.out}` prints all measurements."
     )
 
 

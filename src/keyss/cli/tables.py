@@ -37,8 +37,8 @@ class Console(RichConsole):
         raise  # the BrokenPipeError that is being handled
 
 
-def print_hiding(metrics: HideMetrics, console: Console | None = None) -> None:
-    """The measurements of a hiding: a row for each scene with its bound, wrong keys, and the room."""
+def print_hiding(metrics: HideMetrics, console: Console | None = None, *, brief: bool = False) -> None:
+    """The measurements of a hiding: a row for each scene with its bound, then the others unless `brief`."""
     names = ["cover", "secret"]
     if len(metrics.secrets) > 1:
         names = ["cover", *(f"secret {number}" for number, _ in enumerate(metrics.secrets, start=1))]
@@ -52,8 +52,10 @@ def print_hiding(metrics: HideMetrics, console: Console | None = None) -> None:
     table = [[name, *(row.get(head, "") for head in heads)] for name, row in zip(first, rows, strict=True)]
     console = console or Console()
     print_table([views, *heads], table, console=console)
-    for line in _explanations(metrics, names, heads):
+    for line in _reached(metrics, names) if brief else _explanations(metrics, names, heads):
         console.print(line, highlight=False, markup=False)
+    if brief:
+        return
     for name, unit in {"capacity": "Gaussians", "capacity_bytes": "bytes"}.items():
         if name in metrics.details:
             console.print(f"Room in the cover: {metrics.details[name]:,} {unit}.", highlight=False)
@@ -160,6 +162,12 @@ def _explanations(metrics: HideMetrics, names: Sequence[str], heads: Sequence[st
             f"Chance level: {chance}, PSNR of the stego model itself to the secret; no wrong key should "
             "exceed it."
         )
+    return lines + _reached(metrics, names)
+
+
+def _reached(metrics: HideMetrics, names: Sequence[str]) -> list[str]:
+    """A line on the published file, and one on each secret."""
+    lines = []
     reached = (f"{name} {each.psnr:.1f}" for name, each in zip(names, metrics.against_plain, strict=True))
     lines.append(f"Revealed from the published file, PSNR to the plain models: {', '.join(reached)} dB.")
     kept = zip(
