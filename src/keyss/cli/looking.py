@@ -68,8 +68,8 @@ def view(
     if not 0 <= port < 1 << 16:
         raise UsageError(f"--port: expected 0 to {(1 << 16) - 1}, got {port}")
     server = ModelServer(model, host, port, look)
-    who = "only this machine" if host in ("127.0.0.1", "localhost", "::1") else f"all who can reach {host}"
-    print(f"{server.address} shows {model} to {who}; press Ctrl-C to stop", flush=True)
+    who = "only on this machine" if server.is_local else f"to all who can reach {host} and know this address"
+    print(f"{server.address} shows {model} {who}; press Ctrl-C to stop", flush=True)
     server.run()
 
 
