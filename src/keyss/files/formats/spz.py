@@ -44,7 +44,7 @@ _LEGACY = struct.Struct("<4sIIBBBB")  # magic, version, count, SH degree, fracti
 _HEADER = struct.Struct("<4sIIBBBBI12s")  # ..., flags, number of streams, offset of the table, reserved
 _ENTRY = struct.Struct("<QQ")  # of the table: compressed and uncompressed bytes
 _ZSTD_LEVEL = 12  # as in Niantic's library
-_ZSTD_WINDOW = 1 << 27
+_ZSTD_WINDOW = 1 << 23  # bytes that decoders should support (RFC 8878)
 VERSION = 3  # has 10-bit rotations, and more programs read it than the newer 4
 _FRACTIONAL_BITS = 12  # steps of 1/4096 world unit, as in Niantic's library
 MAX_POSITION = 2**23 - 1  # the largest code of a position
@@ -152,8 +152,9 @@ def _unpack_zstd(data: bytes) -> tuple[Header, list[Bytes]]:
 
 def _zstd(packed: bytes, size: int) -> Bytes:
     """[size] the first bytes of a stream. Raises InputError if there are fewer."""
+    unpacker = zstandard.ZstdDecompressor(max_window_size=max(_ZSTD_WINDOW, 2 * size))
     try:
-        with zstandard.ZstdDecompressor(max_window_size=_ZSTD_WINDOW).stream_reader(packed) as reader:
+        with unpacker.stream_reader(packed) as reader:
             body = reader.read(size)
     except zstandard.ZstdError as error:
         raise InputError(f"damaged SPZ: {reason(error)}") from error

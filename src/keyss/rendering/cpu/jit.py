@@ -75,8 +75,8 @@ def _compiled(function: Any, fastmath: bool | set[str], forceinline: bool = Fals
 def cache_folder() -> Path | None:
     """The cache folder for kernels of exactly these sources; None if there is no safe place.
 
-    It is in the first of `NUMBA_CACHE_DIR`, `__pycache__` beside this file and the user's cache that only this
-    user can write: what lies there is unpickled.
+    It is in the first of `NUMBA_CACHE_DIR`, `__pycache__` beside this file and the user's cache that only
+    this user can write to: what lies there is unpickled.
     """
     digest = hashlib.sha256(repr(DRAWN_OPACITY).encode())
     for source in sorted(Path(__file__).parent.glob("*.py")):
