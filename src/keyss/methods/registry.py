@@ -72,7 +72,7 @@ def open_model(stego: Gaussians, key: str, *, decoy: bool = False) -> Opened:
     key that opens nothing then gives a `Decoy`, else raises WrongKeyError. Raises InputError for damage.
     """
     from keyss.channels import open_content, quick_attempt
-    from keyss.methods.opened import Decoy
+    from keyss.methods.decoy import Decoy
 
     if not decoy:
         return _unpacked(open_content(stego, key))
