@@ -150,7 +150,7 @@ def test_wrong_key_writes_nothing(run: Path, tmp_path: Path) -> None:
 def test_a_decoy_is_the_cover_in_a_file_like_a_revealed_secret(
     run: Path, folders: tuple[Path, Path], tmp_path: Path
 ) -> None:
-    """It changes every value that a decoder changes, by little, in the same way for one key every time."""
+    """All of its numbers are others, a little, in the same way for one key every time."""
     paths = [tmp_path / f"{name}.ply" for name in ("right", "wrong", "again", "other")]
     for path, key in zip(paths, ("the key", "wrong", "wrong", "other"), strict=True):
         keyss.reveal(run / "publish" / "stego.ply", key, decoy=True, out=path)
@@ -161,13 +161,12 @@ def test_a_decoy_is_the_cover_in_a_file_like_a_revealed_secret(
     assert heads[0][:2] + heads[0][3:] == heads[1][:2] + heads[1][3:]  # all but the number of Gaussians
     decoy, whole = keyss.read_model(paths[1]), keyss.read_model(run / "publish" / "stego.ply")
     stego = whole[whole.opacities > 1.6 / 255]  # without what is appended
-    assert len(decoy) == len(stego)
-    for name in ("means", "quats", "log_scales", "opacity_logits"):
-        assert (getattr(decoy, name) != getattr(stego, name)).float().mean() > 0.9, name
+    assert 0.79 * len(stego) < len(decoy) <= len(stego)
+    assert not set(decoy.means[:, 0].tolist()) & set(stego.means[:, 0].tolist())
     for (_, shown), (_, cover) in zip(
         keyss.render(decoy, folders[0]), keyss.render(stego, folders[0]), strict=True
     ):
-        assert (shown.float() - cover.float()).square().mean() < 255**2 * 1e-4  # 40 dB
+        assert (shown.float() - cover.float()).square().mean() < 255**2 * 1e-3  # 30 dB
 
 
 def test_one_file_is_enough(folders: tuple[Path, Path], tmp_path: Path) -> None:
@@ -186,8 +185,8 @@ def test_one_file_is_enough(folders: tuple[Path, Path], tmp_path: Path) -> None:
         keyss.reveal(tmp_path / "moved.ply", "The key")
     decoy = keyss.reveal(tmp_path / "moved.ply", "The key", decoy=True).gaussians
     shown = result.stego[result.stego.opacities >= 1 / 255]
-    assert not torch.equal(decoy.means, shown.means)
-    torch.testing.assert_close(decoy.means, shown.means, rtol=0, atol=0.02)
+    assert len(decoy) < len(shown)
+    assert (torch.cdist(decoy.means, shown.means).min(dim=1).values < 0.02).all()
 
 
 def test_outputs_that_exist_are_refused_before_any_work(
