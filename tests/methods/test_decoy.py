@@ -16,8 +16,8 @@ from keyss.rendering import psnr_between
 KEY = "a key of many characters: 93hXmQ2"
 
 
-def decoy_of(stego: Gaussians, seed: int = 0, appended: bool = False) -> Gaussians:
-    return Decoy.of(stego, keys(seed)[0], appended=appended).reveal(stego)
+def decoy_of(stego: Gaussians, seed: int = 0, records: bool = True) -> Gaussians:
+    return Decoy.of(stego, keys(seed)[0], records=records).reveal(stego)
 
 
 def test_a_key_gives_the_same_each_time_and_another_key_something_else() -> None:
@@ -28,10 +28,10 @@ def test_a_key_gives_the_same_each_time_and_another_key_something_else() -> None
     assert not set(first.means[:, 0].tolist()) & set(stego.means[:, 0].tolist())
 
 
-@pytest.mark.parametrize("appended", [False, True])
-def test_it_looks_like_the_cover(appended: bool) -> None:
+@pytest.mark.parametrize("records", [False, True])
+def test_it_looks_like_the_cover(records: bool) -> None:
     stego = trained_like(2000)
-    assert psnr_between(stego, decoy_of(stego, appended=appended)) > 30
+    assert psnr_between(stego, decoy_of(stego, records=records)) > 30
 
 
 def test_sizes_are_not_those_of_the_input() -> None:

@@ -10,7 +10,6 @@ import torch
 from keyss.channels import TYPICAL_SHARE, LowBitsRoom
 from keyss.core.gaussians import DRAWN_OPACITY, Gaussians
 from keyss.core.similarity import Similarity
-from keyss.files.formats.common import CodedGaussians
 from keyss.keys.derivation import DerivedKey
 from keyss.methods.opened import Frame, Remains
 from keyss.methods.records import whole
@@ -39,11 +38,12 @@ class Decoy:
     share: float  # of the rendered Gaussians, how many are left
     order: int  # seed of their order
     appended: bool = False  # True if the model has appended Gaussians, which are left out
+    records: bool = True  # True if a secret would lie in records, else in one payload
     decode: None = None
     key_size: int = 0
 
     @staticmethod
-    def of(stego: Gaussians, key: DerivedKey, *, appended: bool = False) -> Decoy:
+    def of(stego: Gaussians, key: DerivedKey, *, appended: bool = False, records: bool = True) -> Decoy:
         """The decoy of a wrong key, the same whenever model and key are the same."""
         generator = torch.Generator().manual_seed(int.from_bytes(key.expand("decoy", 8), "little") >> 1)
         changes = _STRENGTH * torch.randn(_KNOTS, generator=generator)
@@ -55,7 +55,7 @@ class Decoy:
         share = 1 - (1 - _LEAST) * float(torch.rand((), generator=generator))
         order = int(torch.randint(1 << 62, (), generator=generator))
         frame = Similarity(scale, torch.matrix_exp(skew - skew.T), shift * size)
-        return Decoy(frame, changes, share, order, appended)
+        return Decoy(frame, changes, share, order, appended, records)
 
     def reveal(self, stego: Gaussians, *, frame: Frame = "secret", force: bool = False) -> Gaussians:
         """The rendered Gaussians of the cover, all changed; see `Opened.reveal`."""
@@ -79,7 +79,7 @@ class Decoy:
         ways = product(range(stego.sh_degree, -1, -1), (2, 1))  # SH degree, records in a carrier
         found = ((cells, Table.of_size(8 * room.record_bytes(cells), degree)) for degree, cells in ways)
         cells, table = next((each for each in found if each[1]), (0, None))
-        if table is None or self.appended or isinstance(stego, CodedGaussians):
+        if table is None or not self.records:
             precision = whole.Precision.usual(model)
             return whole.decode(whole.encode(model, precision.finer(_FINER * self.appended)))
         order = torch.randperm(len(model), generator=torch.Generator().manual_seed(self.order))

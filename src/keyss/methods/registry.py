@@ -80,7 +80,7 @@ def open_model(stego: Gaussians, key: str, *, decoy: bool = False) -> Opened:
     if attempt is None:
         raise WrongKeyError()
     if attempt.content is None:
-        return Decoy.of(stego, attempt.key, appended=attempt.appended)
+        return Decoy.of(stego, attempt.key, appended=attempt.appended, records=attempt.records)
     return _unpacked(attempt.content)
 
 
