@@ -14,7 +14,7 @@ from keyss.files import read_model
 class TestTheWholePath:
     def test_reveal_render_evaluate_info(self, keyss: Run, world: Path, tmp_path: Path) -> None:
         secret, images, key = tmp_path / "secret.ply", tmp_path / "images", world / "key.txt"
-        said = keyss("reveal", world / "hidden" / "publish" / "stego.ply", "--key-file", key, "-o", secret)
+        said = keyss("reveal", world / "hidden" / "publish" / "model.ply", "--key-file", key, "-o", secret)
         left = len(read_model(secret))
         assert 0 < left <= 100
         assert said == Said(0, f"{secret}: {left} of {left} Gaussians\n", "")
@@ -47,7 +47,7 @@ class TestTheWholePath:
         assert json.loads((out / "private" / "metrics.json").read_text())["width"] == 8
 
     def test_a_decoy_looks_like_a_success(self, keyss: Run, world: Path, tmp_path: Path) -> None:
-        stego = world / "hidden" / "publish" / "stego.ply"
+        stego = world / "hidden" / "publish" / "model.ply"
         said = []
         for name, key in (("a", "key.txt"), ("b", "wrong.txt")):
             out = tmp_path / f"{name}.ply"

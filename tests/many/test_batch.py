@@ -93,7 +93,7 @@ def check_batch(folder: Path, count: int, broken: set[int]) -> None:
     with (folder / "out" / "private" / "batch.csv").open() as file:
         assert [row["state"] for row in csv.DictReader(file)] == ["done"] * count
     for index in range(count):
-        assert (folder / "out" / f"asset-{index}" / "publish" / "stego.ply").exists()
+        assert (folder / "out" / f"asset-{index}" / "publish" / "model.ply").exists()
 
 
 def test_a_cover_that_is_published_twice_is_warned_of(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -182,12 +182,12 @@ def test_the_key_of_an_asset_opens_it_and_no_other(
     said = keyss("keygen", "--asset", "scenes/1", "--master-key-file", tmp_path / "master.txt")
     key = said.out.strip()
     assert key == MasterKey(KEY).key_of("scenes/1")
-    stego = out / "scenes" / "1" / "publish" / "stego.ply"
+    stego = out / "scenes" / "1" / "publish" / "model.ply"
     assert len(library.reveal(stego, key).gaussians) == 40
     other = MasterKey(KEY).key_of("files/1")
     with pytest.raises(WrongKeyError):
         library.reveal(stego, other)
-    found = library.reveal(out / "files" / "1" / "publish" / "stego.ply", other).file
+    found = library.reveal(out / "files" / "1" / "publish" / "model.ply", other).file
     assert (found.name, found.data) == ("letter.txt", b"for your eyes only")
     assert (out / "private").stat().st_mode & 0o077 == 0
 

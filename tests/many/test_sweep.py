@@ -132,7 +132,7 @@ def test_a_cell_runs_again_when_its_data_options_or_result_changed(tmp_path: Pat
     spec = write_spec(tmp_path, ["a.ply"], seeds=2)
     out = tmp_path / "out"
     cells = [each.folder for each in run(spec, out, jobs=1).outcomes]
-    (cells[0] / "run" / "publish" / "stego.ply").unlink()
+    (cells[0] / "run" / "publish" / "model.ply").unlink()
     assert [each.skipped for each in run(spec, out, jobs=1).outcomes] == [False, True]
     spec.write_text(spec.read_text().replace("publish: any", "publish: any, prune_to_fit: true"))
     assert [each.skipped for each in run(spec, out, jobs=1).outcomes] == [False, False]
@@ -250,8 +250,8 @@ def test_real_cells_that_were_killed_have_the_bytes_of_undisturbed_ones(
     assert not calm.failed
     kill_until_done(spec, tmp_path / "out", "real", 2, seed=1, longest=6)
     for one, other in zip(
-        sorted((tmp_path / "calm").glob("cells/*/run/publish/stego.ply")),
-        sorted((tmp_path / "out").glob("cells/*/run/publish/stego.ply")),
+        sorted((tmp_path / "calm").glob("cells/*/run/publish/model.ply")),
+        sorted((tmp_path / "out").glob("cells/*/run/publish/model.ply")),
         strict=True,
     ):
         assert one.read_bytes() == other.read_bytes()
