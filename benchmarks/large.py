@@ -141,7 +141,7 @@ def _command(step: str, folder: Path, options: argparse.Namespace) -> list[str]:
         carry = ["--method", "carry", "--publish", options.publish, *["--prune-to-fit"][: options.prune]]
         return [*run, *carry, *models, *key, "-o", f"{folder}/run"]
     suffix = "ply" if options.publish in ("ply", "any") else options.publish.replace("-", ".")
-    return [*run, f"{folder}/run/publish/stego.{suffix}", *key, "-o", f"{folder}/revealed.ply"]
+    return [*run, f"{folder}/run/publish/model.{suffix}", *key, "-o", f"{folder}/revealed.ply"]
 
 
 def _run(command: list[str]) -> Cost:

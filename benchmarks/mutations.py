@@ -1,35 +1,45 @@
-"""Damaged model files: each has to end in a model or in an InputError, soon and in little memory.
+"""Damaged files: each has to be read or to end in an InputError, soon and in little memory.
 
     python benchmarks/mutations.py --count 100000
+    python benchmarks/mutations.py --count 10000 --lies             # only those that lie about sizes
     python benchmarks/mutations.py --count 10000 --only a.payload   # what a key opens, written by an attacker
 
 Files of every format are damaged at random, before and after they are packed: bits, bytes, words with
-extreme values, cuts, repeats, megabytes of zeros. What is not as it should be is printed with the seed that
-repeats it.
+extreme values, cuts, repeats, megabytes of zeros; every other one states sizes that are not true
+(`lies.py`). What is not as it should be is printed with the seed that repeats it.
 """
 
 from __future__ import annotations
 
 import argparse
+import ctypes
 import gzip
 import io
-import resource
+import struct
 import sys
+import tempfile
 import time
+import warnings
 import zipfile
+from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 from keyss.core import Gaussians, InputError
-from keyss.files import model_bytes, model_of_bytes
+from keyss.core.decoded import DecodedGaussians, PictureNetwork
+from keyss.files import load_scene, model_bytes, model_of_bytes
 from keyss.files.formats.spz import SpzCodes
+from keyss.files.images import read_image
 from keyss.methods.records import whole
+from keyss.methods.tensors import Header, damage_refused, pack_tensors, unpack_tensors
+from lies import LIES, image
 
 import numpy as np
 import torch
 
 SECONDS = 2.0  # that one file of a few kilobytes may take
 CARRIERS = 6000  # Gaussians of the published model that holds a payload
-ROOM = 2 << 30  # bytes that all of them may take beside what the program has
+MEMORY, PER_BYTE = 200 << 20, 32  # bytes that reading a file may take: so many, and of each of its bytes
 _EXTREMES = (0, 1, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF, 0x7F800000, 0x7FC00000, 0x3F800000, 0x10000, 0xFF)
 
 
@@ -45,11 +55,30 @@ def examples(count: int = 60) -> dict[str, list[bytes]]:
     found = {name: [model_bytes(name, model(degree)) for degree in (0, 2)] for name in names}
     found["a.spz"].append(replace(SpzCodes.quantise(model(1)), version=4).serialise())
     found["a.payload"] = [whole.encode(model(degree)) for degree in range(4)]
-    return found
+    layers = ((torch.randn(3, 4, 3, 3, generator=generator), torch.zeros(3)),)
+    decoded = DecodedGaussians.of(model(0), PictureNetwork(layers, torch.zeros(4)), torch.zeros(count, 4))
+    found["a.3dgs.safetensors"] = [model_bytes("a.3dgs.safetensors", decoded)]
+    found["a.tensors"] = [pack_tensors({"a": torch.ones(3), "b": torch.ones(2, 2)}, Header("test", 1))]
+    found["a.png"] = [image("PNG", 16, 16)]
+    return found | {name: [data] for name, data in _colmap().items()}
 
 
-def damaged(data: bytes, rng: np.random.Generator) -> bytes:
-    """`data`, damaged in one of many ways, inside or outside of what packs it."""
+def _colmap() -> dict[str, bytes]:
+    """The files of a scene of four photos."""
+    image_of = struct.Struct("<I7dI6sQ")
+    images = [image_of.pack(i, 1, 0, 0, 0, 0, 0, 4, 1, b"%d.png\0" % i, 0) for i in range(4)]
+    points = [struct.pack("<QdddBBBdQ", i, 1, 2, i, 0, 0, 0, 0.5, 1) + bytes(8) for i in range(9)]
+    return {
+        "cameras.bin": struct.pack("<QIiQQ4d", 1, 1, 1, 16, 16, 16, 16, 8, 8),
+        "images.bin": struct.pack("<Q", 4) + b"".join(images),
+        "points3D.bin": struct.pack("<Q", 9) + b"".join(points),
+    }
+
+
+def damaged(name: str, data: bytes, rng: np.random.Generator, lies: float = 0.5) -> bytes:
+    """`data` with sizes that are lies (in the share `lies`), or damaged in or outside of what packs it."""
+    if name in LIES and rng.random() < lies:
+        return LIES[name](data, rng)
     if rng.random() < 0.7:
         if data.startswith(b"\x1f\x8b"):
             return gzip.compress(_damaged(gzip.decompress(data), rng), 1)
@@ -97,17 +126,67 @@ def _damaged(data: bytes, rng: np.random.Generator) -> bytes:
 
 def attempt(name: str, data: bytes) -> str | None:
     """What is wrong with how a file is read, if anything."""
-    start = time.perf_counter()
-    try:
-        model = whole.decode(data, CARRIERS) if name == "a.payload" else model_of_bytes(name, data)
-        finite = all(bool(value.isfinite().all()) for value in vars(model).values())
-        problem = None if finite and len(model) else "a model that is empty or not finite"
-    except InputError as error:
-        problem = None if len(str(error)) < 1000 else "a message without end"
-    except Exception as error:
-        problem = f"{type(error).__name__}: {error}"
-    seconds = time.perf_counter() - start
-    return problem or (f"{seconds:.1f} s" if seconds > SECONDS else None)
+    start, problem = time.process_time(), None
+
+    def read() -> None:
+        nonlocal problem
+        try:
+            problem = _read(name, data)
+        except InputError as error:
+            problem = None if len(str(error)) < 1000 else "a message without end"
+        except Exception as error:
+            problem = f"{type(error).__name__}: {error}"
+
+    used, allowed = peak_memory(read), MEMORY + PER_BYTE * len(data)
+    seconds = time.process_time() - start
+    if used > allowed:
+        return f"{used >> 20:,} MiB of memory for {len(data):,} bytes"
+    return problem or (f"{seconds:.1f} s" if seconds > SECONDS + len(data) / 1e6 else None)
+
+
+def peak_memory(call: Callable[[], None]) -> int:
+    """Bytes by which a call makes the process grow at most; 0 where the system does not tell (not Linux)."""
+    if not sys.platform.startswith("linux"):
+        call()
+        return 0
+    ctypes.CDLL(None).malloc_trim(0)  # else freed memory would be used again without growth
+    Path("/proc/self/clear_refs").write_text("5")  # resets the peak
+    before = _memory("VmRSS")
+    call()
+    return _memory("VmHWM") - before
+
+
+def _memory(name: str) -> int:
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return next(int(line.split()[1]) for line in lines if line.startswith(name)) << 10
+
+
+def _read(name: str, data: bytes) -> str | None:
+    if name in ("a.png", "cameras.bin", "images.bin", "points3D.bin"):
+        with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            return _read_from(Path(folder), name, data)
+    if name == "a.tensors":
+        with damage_refused("damaged"):
+            unpack_tensors(data, Header, "test", 1)
+        return None
+    model = whole.decode(data, CARRIERS) if name == "a.payload" else model_of_bytes(name, data)
+    finite = all(bool(value.isfinite().all()) for value in vars(model).values() if torch.is_tensor(value))
+    return None if finite and len(model) else "a model that is empty or not finite"
+
+
+def _read_from(folder: Path, name: str, data: bytes) -> str | None:
+    if name == "a.png":
+        (folder / name).write_bytes(data)
+        read_image(folder / name, np.ones(3, np.float32))
+        return None
+    (folder / "images").mkdir()
+    for number in range(4):
+        (folder / "images" / f"{number}.png").write_bytes(image("PNG", 16, 16))
+    for each, content in (_colmap() | {name: data}).items():
+        (folder / each).write_bytes(content)
+    load_scene(folder)
+    return None
 
 
 def main() -> int:
@@ -117,29 +196,23 @@ def main() -> int:
     parser.add_argument("--count", type=int, default=100_000)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", help="name of one kind of file")
+    parser.add_argument("--lies", action="store_true", help="only files that lie about sizes")
     asked = parser.parse_args()
     files = [(name, data) for name, every in examples().items() for data in every]
-    files = [(name, data) for name, data in files if asked.only in (None, name)]
+    files = [each for each in files if asked.only in (None, each[0]) and (not asked.lies or each[0] in LIES)]
     for name, data in files:
-        assert attempt(name, data) is None, name
-    with open("/proc/self/statm") as file:
-        have = int(file.read().split()[0]) * resource.getpagesize()
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    resource.setrlimit(resource.RLIMIT_AS, (have + ROOM, have + ROOM))
+        assert attempt(name, data) is None, (name, attempt(name, data))
     failures, start = 0, time.perf_counter()
     for number in range(asked.count):
         name, data = files[number % len(files)]
         rng = np.random.default_rng([asked.seed, number])
-        mutated = damaged(data, rng)
+        mutated = damaged(name, data, rng, 1.0 if asked.lies else 0.5)
         if problem := attempt(name, mutated):
             failures += 1
             print(f"{name}, seed {asked.seed}, number {number}: {problem}", flush=True)
         if number % 10_000 == 9_999:
             print(f"{number + 1:,} files, {time.perf_counter() - start:.0f} s", file=sys.stderr, flush=True)
-    used = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024
-    print(
-        f"{asked.count:,} files of {len(files)}: {failures} not as they should be, {used:,.0f} MiB of memory"
-    )
+    print(f"{asked.count:,} files of {len(files)}: {failures} not as they should be")
     return 1 if failures else 0
 
 

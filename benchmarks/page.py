@@ -72,7 +72,7 @@ def server_of(count: int, folder: Path) -> ModelServer:
         cover, [keyss.Secret(secret, KEY)], method=CarryOptions(), width=32, min_psnr=0, out=folder / "run"
     )
     print(f"{len(hidden.stego):,} Gaussians carry {len(secret):,}", flush=True)
-    server = ModelServer(folder / "run/publish/stego.ply")
+    server = ModelServer(folder / "run/publish/model.ply")
     threading.Thread(target=server.run, daemon=True).start()
     return server
 
@@ -97,7 +97,7 @@ def key_times(pairs: list[str], runs: int) -> None:
             keyss.hide(
                 cover, [keyss.Secret(secret, KEY)], method=method, width=32, min_psnr=0, out=folder / "run"
             )
-            page = export_html(folder / "run/publish/stego.ply", folder / "page.html")[0]
+            page = export_html(folder / "run/publish/model.ply", folder / "page.html")[0]
             times: dict[str, list[float]] = {KEY: [], "another key": []}
             keys = runs * list(times)
             order.shuffle(keys)

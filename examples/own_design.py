@@ -31,4 +31,4 @@ if __name__ == "__main__":
     key = generate_key()
     options = KeyssOptions(design=DESIGN).with_fit(iterations=200, max_gaussians=2000)
     keyss.hide(cover, [Secret(secret, key)], method=options, width=100, out=out, min_psnr=0)
-    print(keyss.reveal(f"{out}/publish/stego.ply", key).gaussians)
+    print(keyss.reveal(f"{out}/publish/model.ply", key).gaussians)

@@ -68,7 +68,7 @@ def run(folders: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory) ->
 def test_hide_writes_its_results_and_nothing_else(run: Path) -> None:
     files = {str(path.relative_to(run)) for path in run.rglob("*") if path.is_file()}
     assert files == {
-        "publish/stego.ply",
+        "publish/model.ply",
         "private/config.json",
         "private/metrics.json",
         "private/manifest.json",
@@ -117,7 +117,7 @@ def test_evaluate_measures_the_same_from_the_files(run: Path) -> None:
 
 
 def test_metrics_are_of_what_reveal_writes(run: Path, folders: tuple[Path, Path], tmp_path: Path) -> None:
-    secret = keyss.reveal(run / "publish" / "stego.ply", "the key", out=tmp_path / "secret.ply").gaussians
+    secret = keyss.reveal(run / "publish" / "model.ply", "the key", out=tmp_path / "secret.ply").gaussians
     again = keyss.read_model(tmp_path / "secret.ply")
     assert torch.equal(secret.means, again.means)
     assert torch.equal(secret.sh, again.sh)
@@ -128,7 +128,7 @@ def test_metrics_are_of_what_reveal_writes(run: Path, folders: tuple[Path, Path]
 
 def test_the_same_run_gives_the_same_bytes(run: Path, folders: tuple[Path, Path], tmp_path: Path) -> None:
     keyss.hide(folders[0], [Secret(folders[1], "the key")], method=ANY, out=tmp_path / "again")
-    for name in ("publish/stego.ply", "private/secret-1.ply"):
+    for name in ("publish/model.ply", "private/secret-1.ply"):
         assert (tmp_path / "again" / name).read_bytes() == (run / name).read_bytes()
 
 
@@ -143,31 +143,30 @@ def test_existing_models_are_bounds_and_are_not_fitted_again(
 
 def test_wrong_key_writes_nothing(run: Path, tmp_path: Path) -> None:
     with pytest.raises(WrongKeyError):
-        keyss.reveal(run / "publish" / "stego.ply", "wrong", out=tmp_path / "x.ply")
+        keyss.reveal(run / "publish" / "model.ply", "wrong", out=tmp_path / "x.ply")
     assert not list(tmp_path.iterdir())
 
 
 def test_a_decoy_is_the_cover_in_a_file_like_a_revealed_secret(
     run: Path, folders: tuple[Path, Path], tmp_path: Path
 ) -> None:
-    """It changes every value that a decoder changes, by little, in the same way for one key every time."""
+    """All of its numbers are others, a little, in the same way for one key every time."""
     paths = [tmp_path / f"{name}.ply" for name in ("right", "wrong", "again", "other")]
     for path, key in zip(paths, ("the key", "wrong", "wrong", "other"), strict=True):
-        keyss.reveal(run / "publish" / "stego.ply", key, decoy=True, out=path)
+        keyss.reveal(run / "publish" / "model.ply", key, decoy=True, out=path)
     right, wrong, again, other = (path.read_bytes() for path in paths)
     assert wrong == again
-    assert wrong not in (other, right, (run / "publish" / "stego.ply").read_bytes())
+    assert wrong not in (other, right, (run / "publish" / "model.ply").read_bytes())
     heads = [data[: data.index(b"end_header")].splitlines() for data in (right, wrong)]
     assert heads[0][:2] + heads[0][3:] == heads[1][:2] + heads[1][3:]  # all but the number of Gaussians
-    decoy, whole = keyss.read_model(paths[1]), keyss.read_model(run / "publish" / "stego.ply")
+    decoy, whole = keyss.read_model(paths[1]), keyss.read_model(run / "publish" / "model.ply")
     stego = whole[whole.opacities > 1.6 / 255]  # without what is appended
-    assert len(decoy) == len(stego)
-    for name in ("means", "quats", "log_scales", "opacity_logits"):
-        assert (getattr(decoy, name) != getattr(stego, name)).float().mean() > 0.9, name
+    assert 0.79 * len(stego) < len(decoy) <= len(stego)
+    assert not set(decoy.means[:, 0].tolist()) & set(stego.means[:, 0].tolist())
     for (_, shown), (_, cover) in zip(
         keyss.render(decoy, folders[0]), keyss.render(stego, folders[0]), strict=True
     ):
-        assert (shown.float() - cover.float()).square().mean() < 255**2 * 1e-4  # 40 dB
+        assert (shown.float() - cover.float()).square().mean() < 255**2 * 1e-3  # 30 dB
 
 
 def test_one_file_is_enough(folders: tuple[Path, Path], tmp_path: Path) -> None:
@@ -178,7 +177,7 @@ def test_one_file_is_enough(folders: tuple[Path, Path], tmp_path: Path) -> None:
     secret = Secret(folders[1], "the key", model=models[1])
     out = tmp_path / "run"
     result = keyss.hide(folders[0], [secret], method=config, cover_model=models[0], out=out, min_psnr=0)
-    (tmp_path / "moved.ply").write_bytes((out / "publish" / "stego.ply").read_bytes())
+    (tmp_path / "moved.ply").write_bytes((out / "publish" / "model.ply").read_bytes())
     revealed = keyss.reveal(tmp_path / "moved.ply", "the key").gaussians
     assert torch.equal(revealed.means, keyss.reveal(result.stego, "the key").gaussians.means)
     assert keyss.evaluate(out, ["the key"]) == result.metrics
@@ -186,8 +185,8 @@ def test_one_file_is_enough(folders: tuple[Path, Path], tmp_path: Path) -> None:
         keyss.reveal(tmp_path / "moved.ply", "The key")
     decoy = keyss.reveal(tmp_path / "moved.ply", "The key", decoy=True).gaussians
     shown = result.stego[result.stego.opacities >= 1 / 255]
-    assert not torch.equal(decoy.means, shown.means)
-    torch.testing.assert_close(decoy.means, shown.means, rtol=0, atol=0.02)
+    assert len(decoy) < len(shown)
+    assert (torch.cdist(decoy.means, shown.means).min(dim=1).values < 0.02).all()
 
 
 def test_outputs_that_exist_are_refused_before_any_work(
@@ -195,13 +194,13 @@ def test_outputs_that_exist_are_refused_before_any_work(
 ) -> None:
     (tmp_path / "x.ply").write_text("mine")
     with pytest.raises(OutputError, match="exists"):
-        keyss.reveal(run / "publish" / "stego.ply", "the key", out=tmp_path / "x.ply")
+        keyss.reveal(run / "publish" / "model.ply", "the key", out=tmp_path / "x.ply")
     with pytest.raises(OutputError, match="exists"):
         keyss.hide(folders[0], [Secret(folders[1], "k")], method=CONFIG, out=tmp_path)
     with pytest.raises(OutputError, match="exists"):
         keyss.fit(folders[0], out=tmp_path)
     assert (tmp_path / "x.ply").read_text() == "mine"
-    keyss.reveal(run / "publish" / "stego.ply", "the key", out=tmp_path / "x.ply", overwrite=True)
+    keyss.reveal(run / "publish" / "model.ply", "the key", out=tmp_path / "x.ply", overwrite=True)
     assert len(keyss.read_model(tmp_path / "x.ply"))
 
 
@@ -228,12 +227,12 @@ def test_a_full_disk_leaves_no_results_but_keeps_the_work(
 
 
 def test_render_writes_a_picture_per_test_view(run: Path, folders: tuple[Path, Path], tmp_path: Path) -> None:
-    pictures = keyss.render(run / "publish" / "stego.ply", folders[0], out=tmp_path / "images")
+    pictures = keyss.render(run / "publish" / "model.ply", folders[0], out=tmp_path / "images")
     assert {p.name for p in (tmp_path / "images").iterdir()} == {"private", *(name for name, _ in pictures)}
     name, image = pictures[0]
     read = cv2.imread(str(tmp_path / "images" / name))
     assert np.array_equal(read[:, :, ::-1], image.numpy())
-    assert len(keyss.render(run / "publish" / "stego.ply", folders[0], split="all")) == 16
+    assert len(keyss.render(run / "publish" / "model.ply", folders[0], split="all")) == 16
 
 
 def test_info_describes_everything_keyss_reads_and_writes(run: Path, folders: tuple[Path, Path]) -> None:
@@ -241,10 +240,10 @@ def test_info_describes_everything_keyss_reads_and_writes(run: Path, folders: tu
         facts: dict[str, Any] = msgspec.to_builtins(keyss.info(path))
         return facts
 
-    assert found(run / "publish" / "stego.ply")["sh_degree"] == 3
-    assert found(run / "publish" / "stego.ply").keys() == found(run / "private" / "cover.ply").keys()
+    assert found(run / "publish" / "model.ply")["sh_degree"] == 3
+    assert found(run / "publish" / "model.ply").keys() == found(run / "private" / "cover.ply").keys()
     assert found(folders[0])["test_views"] == 2
-    assert found(run)["metrics"]["gaussians"] == len(keyss.read_model(run / "publish" / "stego.ply"))
+    assert found(run)["metrics"]["gaussians"] == len(keyss.read_model(run / "publish" / "model.ply"))
     with pytest.raises(InputError, match="no such"):
         keyss.info(run / "nothing")
 
@@ -297,7 +296,7 @@ def test_python_and_command_line_write_the_same(tmp_path: Path, monkeypatch: pyt
     assert (
         main(["hide", "--publish", "any", "--refit", "always", *arguments, "-o", str(tmp_path / "line")]) == 0
     )
-    for name in ("private/config.json", "publish/stego.ply"):
+    for name in ("private/config.json", "publish/model.ply"):
         assert (tmp_path / "line" / name).read_bytes() == (tmp_path / "python" / name).read_bytes(), name
     config = json.loads((tmp_path / "line" / "private" / "config.json").read_text())["options"]
     assert (config["refits"], config["fit"]["iterations"]) == ([2], 2)

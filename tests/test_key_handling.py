@@ -82,13 +82,13 @@ def test_nothing_that_is_written_or_said_holds_the_key(
     assert main(["hide", *scenes, *other, *size, "--resume"]) == 5
     assert "other arguments (keys: not the same)" in capsys.readouterr().err
     assert main(["hide", *scenes, *key, *size, "--resume"]) == 0
-    stego = str(run / "publish" / "stego.ply")
+    stego = str(run / "publish" / "model.ply")
     assert main(["reveal", stego, *key, "-o", str(folder / "secret.ply")]) == 0
     assert main(["evaluate", str(run), *key]) == 0
     assert main(["reveal", str(run / "private" / "cover.ply"), *key, "-o", str(folder / "no.ply")]) == 3
     assert main(["info", stego]) == 0
     written = list(_files(folder))
-    assert {"stego.ply", "config.json", "metrics.json"} <= {path.name for path in written}
+    assert {"model.ply", "config.json", "metrics.json"} <= {path.name for path in written}
     assert [path for path in written if _spelt(path.read_bytes())] == []
     said = capsys.readouterr()
     assert "others can read this key file" in said.err

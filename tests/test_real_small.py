@@ -38,16 +38,16 @@ def test_bonsai_hides_fox(real_data: Path, tmp_path: Path) -> None:
         *("hide", "--cover", bonsai, "--secret", fox, "--key-file", key, "-o", out),
         *("--width", WIDTH, "--max-gaussians", 4000, "--iterations", 300, "--seed", 0),
     )
-    run("reveal", out / "publish" / "stego.ply", "--key-file", key, "-o", tmp_path / "fox.ply")
+    run("reveal", out / "publish" / "model.ply", "--key-file", key, "-o", tmp_path / "fox.ply")
     run("evaluate", out, "--key-file", key)
     metrics = json.loads((out / "private" / "metrics.json").read_text())
-    cover = psnr_against_photos(out / "publish" / "stego.ply", bonsai)
+    cover = psnr_against_photos(out / "publish" / "model.ply", bonsai)
     secret = psnr_against_photos(tmp_path / "fox.ply", fox)
     assert cover == pytest.approx(metrics["cover"]["psnr"], abs=0.1)
     assert secret == pytest.approx(metrics["secrets"][0]["psnr"], abs=0.1)
     assert cover > 19.1  # 20.1 was measured, and 22.9 for the secret
     assert secret > 21.9
-    assert psnr_against_photos(out / "publish" / "stego.ply", fox) < 9  # no fox without the key
-    stego = out / "publish" / "stego.ply"
+    assert psnr_against_photos(out / "publish" / "model.ply", fox) < 9  # no fox without the key
+    stego = out / "publish" / "model.ply"
     assert main(["reveal", str(stego), "--key-file", str(other), "-o", str(tmp_path / "no.ply")]) == 3
     assert not (tmp_path / "no.ply").exists()

@@ -143,5 +143,5 @@ def test_a_resumed_hiding_keeps_its_seed(tmp_path: Path, stage: str) -> None:
     assert metrics["seed"] == config["options"]["fit"]["seed"] == seed
     whole = replace(JOINT, fit=replace(JOINT.fit, seed=seed))
     keyss.hide(*scenes, method=whole, min_psnr=0, out=tmp_path / "whole")
-    for name in ("publish/stego.ply", "private/cover.ply", "private/secret-1.ply"):
+    for name in ("publish/model.ply", "private/cover.ply", "private/secret-1.ply"):
         assert (run / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()

@@ -3,7 +3,7 @@
     from keyss import Secret, hide, reveal
 
     hide("scenes/garden", [Secret("scenes/treasure", key)], width=400, out="runs/hidden")
-    reveal("runs/hidden/publish/stego.ply", key, out="treasure.ply")
+    reveal("runs/hidden/publish/model.ply", key, out="treasure.ply")
 
 Names are loaded at their first use, which keeps `import keyss` fast.
 """

@@ -70,7 +70,7 @@ def test_it_writes_what_the_parts_found(run: Path, calls: list[str]) -> None:
     assert calls == ["speed", "leaks"]
     assert read_audit(run) == found
     assert json.loads((run / "private" / "audit" / "audit.json").read_text())["version"] == 4
-    assert gaussians_of(found) == len(keyss.read_model(run / "publish" / "stego.ply"))
+    assert gaussians_of(found) == len(keyss.read_model(run / "publish" / "model.ply"))
     assert found.leaks == ((), ())
     assert (len(found.controls), len(set(found.controls))) == (2, 2)
     assert (run / "private" / "audit" / "pictures" / "a.png").exists()

@@ -15,7 +15,7 @@ import pytest
 from cli.said import SMALL, Run, assert_refused, listing
 from files.scene_files import write_colmap
 
-STEGO = "hidden/publish/stego.ply"
+STEGO = "hidden/publish/model.ply"
 
 
 def _truncated_scene(folder: Path) -> list[object]:
@@ -29,7 +29,7 @@ def _ply_with(change: Callable[[bytes], bytes]) -> Callable[[Path], list[object]
     """`reveal` on a stego file after `change` of its bytes."""
 
     def prepare(folder: Path) -> list[object]:
-        stego = folder / "hidden" / "publish" / "stego.ply"
+        stego = folder / "hidden" / "publish" / "model.ply"
         stego.write_bytes(change(stego.read_bytes()))
         return ["reveal", stego, "--key-file", folder / "key.txt", "-o", folder / "secret.ply"]
 
@@ -83,7 +83,7 @@ def _plain(folder: Path, name: str) -> Path:
 
 
 def _reveal(folder: Path, *extra: object, key: Path | None = None) -> list[object]:
-    stego, key = folder / "hidden" / "publish" / "stego.ply", key or folder / "key.txt"
+    stego, key = folder / "hidden" / "publish" / "model.ply", key or folder / "key.txt"
     return ["reveal", stego, "--key-file", key, "-o", folder / "secret.ply", *extra]
 
 
@@ -105,7 +105,7 @@ ERRORS: dict[str, tuple[int, str, Callable[[Path], list[object]]]] = {
     "key file empty": (4, "keyss keygen", _empty_key),
     "too few key files": (2, "--key-file", lambda f: [*_hide(f), "--secret", f / "b"]),
     "no key at all": (2, "KEYSS_KEY", lambda f: ["reveal", f / STEGO, "-o", f / "s.ply"]),
-    "data truncated": (4, "stego.ply", _ply_with(lambda data: data[:-1])),
+    "data truncated": (4, "model.ply", _ply_with(lambda data: data[:-1])),
     "NaN": (4, "NaN", _ply_with(_with_nan)),
     "nothing in the model": (
         3,
@@ -192,9 +192,9 @@ def test_a_full_disk_is_a_line_and_leaves_nothing(
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr("keyss.files.atomic.os.fsync", full)
-    arguments = [world / "hidden" / "publish" / "stego.ply", "--key-file", world / "key.txt"]
+    arguments = [world / "hidden" / "publish" / "model.ply", "--key-file", world / "key.txt"]
     assert_refused(keyss("reveal", *arguments, "-o", tmp_path / "secret.ply"), 5, "No space left")
-    arguments = [world / "hidden" / "publish" / "stego.ply", "--cameras", world / "a"]
+    arguments = [world / "hidden" / "publish" / "model.ply", "--cameras", world / "a"]
     assert_refused(keyss("render", *arguments, "-o", tmp_path / "images"), 5, "No space left")
     assert listing(tmp_path) == {}
 

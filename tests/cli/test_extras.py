@@ -26,9 +26,9 @@ print(json.dumps(statuses))
 """
 WORKING = (
     "hide --method carry --cover cover.ply --secret secret.ply --width 16 -o run",
-    "reveal run/publish/stego.ply -o revealed.ply",
+    "reveal run/publish/model.ply -o revealed.ply",
     "evaluate run",
-    "view run/publish/stego.ply -o page.html",
+    "view run/publish/model.ply -o page.html",
 )
 REFUSED = (
     "audit run",

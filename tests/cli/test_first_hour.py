@@ -30,11 +30,11 @@ def test_one_key_in_python_in_a_file_and_in_the_environment(
     text = Path("key.txt").read_text()
     assert text.endswith("\n")
     library.hide("cover.ply", [library.Secret("small.ply", text)], out="run")
-    assert keyss("reveal", "run/publish/stego.ply", "--key-file", "key.txt", "-o", "out.ply").status == 0
-    assert library.reveal("run/publish/stego.ply", library.read_key("key.txt")).gaussians.sh_degree == 2
+    assert keyss("reveal", "run/publish/model.ply", "--key-file", "key.txt", "-o", "out.ply").status == 0
+    assert library.reveal("run/publish/model.ply", library.read_key("key.txt")).gaussians.sh_degree == 2
     for key, status in ((f"{KEY} ", 0), (f"{KEY}x", 3)):
         monkeypatch.setenv("KEYSS_KEY", key)
-        said = keyss("verify", "run/publish/stego.ply")
+        said = keyss("verify", "run/publish/model.ply")
         assert said.status == status
         assert ("white space around the key does not count" in said.err) == key.endswith(" ")
 
@@ -46,13 +46,13 @@ def test_what_fits_is_carried_as_it_is(keyss: Run) -> None:
     assert "refit" not in said.err
     assert "step" not in said.out.lower()
     assert "on renders of the given models" in said.out
-    assert library.reveal("run/publish/stego.ply", KEY).gaussians.sh_degree == 2
+    assert library.reveal("run/publish/model.ply", KEY).gaussians.sh_degree == 2
 
 
 def test_what_is_lost_is_said(keyss: Run) -> None:
     said = keyss(*HIDE, "--secret", "large.ply", "--prune-to-fit", "-o", "run")
     assert said.status == 0, said.err
-    kept = len(library.reveal("run/publish/stego.ply", KEY).gaussians)
+    kept = len(library.reveal("run/publish/model.ply", KEY).gaussians)
     assert f"The secret kept {kept:,} of 2,500 Gaussians, " in said.out
     refused = keyss(*HIDE, "--secret", "large.ply", "--prune-to-fit", "--publish", "spz", "-o", "poor")
     assert refused.status == 7
@@ -80,4 +80,4 @@ def test_short_fits_of_two_photos_end_in_models_that_carry(keyss: Run, world: Pa
     assert said.status == 0, said.err
     assert "refit of the secret" in said.err  # the cover got half as many Gaussians
     assert "The secret kept" in said.out
-    assert keyss("verify", "run/publish/stego.ply", "--key-file", "key.txt").status == 0
+    assert keyss("verify", "run/publish/model.ply", "--key-file", "key.txt").status == 0

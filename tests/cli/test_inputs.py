@@ -25,7 +25,7 @@ def test_a_run_in_place_of_a_model_is_told_its_file(
     keyss: Run, world: Path, tmp_path: Path, inside: str
 ) -> None:
     run, out = world / "hidden" / inside, tmp_path / "out"
-    give = f"found a folder; give {world / 'hidden' / 'publish' / 'stego.ply'}"
+    give = f"found a folder; give {world / 'hidden' / 'publish' / 'model.ply'}"
     assert_refused(keyss("reveal", run, *key(world), "-o", tmp_path / "s.ply"), 4, give)
     assert_refused(keyss("render", run, "--cameras", world / "a", "-o", out), 4, give)
     hide = ("hide", "--cover", world / "a", "--secret", world / "b", *key(world), "-o", out)
@@ -36,7 +36,7 @@ def test_a_run_in_place_of_a_model_is_told_its_file(
 def test_a_run_in_place_of_a_scene_is_told_its_file(keyss: Run, world: Path, tmp_path: Path) -> None:
     said = keyss("fit", world / "hidden", "-o", tmp_path / "out")
     assert_refused(
-        said, 4, f"expected a scene, found a run; its model is {world / 'hidden/publish/stego.ply'}"
+        said, 4, f"expected a scene, found a run; its model is {world / 'hidden/publish/model.ply'}"
     )
 
 
@@ -49,7 +49,7 @@ def test_another_folder_in_place_of_a_model_is_called_one(keyss: Run, world: Pat
         assert_refused(said, 4, f"{world / 'a'}: expected the file of a 3DGS model (.compressed.ply, ")
 
 
-@pytest.mark.parametrize("inside", ["publish/stego.ply", "publish", "private", "private/config.json"])
+@pytest.mark.parametrize("inside", ["publish/model.ply", "publish", "private", "private/config.json"])
 @pytest.mark.parametrize("command", ["evaluate", "audit", "audit --report-only"])
 def test_what_lies_in_a_run_is_told_the_run(keyss: Run, world: Path, command: str, inside: str) -> None:
     path = world / "hidden" / inside
@@ -219,7 +219,7 @@ def test_a_run_remembers_that_photos_were_missing(keyss: Run, world: Path, tmp_p
     said = keyss("evaluate", run, *key(world))
     assert said.status == 0, said.err
     assert [line for line in warnings_of(said) if "left out: 02.png" in line]
-    stego, out = run / "publish/stego.ply", tmp_path / "pictures"
+    stego, out = run / "publish/model.ply", tmp_path / "pictures"
     assert_refused(keyss("render", stego, "--cameras", scene, "-o", out), 4, "--skip-missing")
     assert (
         keyss("render", stego, "--cameras", scene, "-o", out, "--skip-missing", "--split", "all").status == 0

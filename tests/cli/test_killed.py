@@ -39,7 +39,7 @@ COMMANDS: Mapping[str, Command] = {
     "hide": Command(
         f"hide {SCENES} --publish any --min-psnr=0 -o OUT {SIZE}",
         "--resume",
-        results=("publish/stego.ply", "private/cover.ply", "private/secret-1.ply"),
+        results=("publish/model.ply", "private/cover.ply", "private/secret-1.ply"),
         numbers=("private/metrics.json",),
     ),
     "audit": Command(
@@ -49,7 +49,7 @@ COMMANDS: Mapping[str, Command] = {
         numbers=("private/audit/audit.json",),
     ),
     "reveal": Command(
-        "reveal RUN/publish/stego.ply --key-file key.txt -o OUT --device cpu",
+        "reveal RUN/publish/model.ply --key-file key.txt -o OUT --device cpu",
         "--overwrite",
         in_run=True,
         results=("",),

@@ -56,7 +56,7 @@ def test_results_are_whole_whatever_becomes_of_the_output(
 
 @pytest.mark.parametrize(("redirection", "status"), [("<&- >&- 2>&-", 0), (">/dev/full", 5)])
 def test_so_is_a_secret(world: Path, tmp_path: Path, redirection: str, status: int) -> None:
-    secret, stego = tmp_path / "secret.ply", world / "hidden" / "publish" / "stego.ply"
+    secret, stego = tmp_path / "secret.ply", world / "hidden" / "publish" / "model.ply"
     done = shell(redirection, "reveal", stego, "--key-file", world / "key.txt", "-o", secret)
     assert done.returncode == status, done.stderr
     assert len(read_model(secret)) > 0

@@ -26,7 +26,7 @@ def test_below_the_limit_nothing_is_published_and_a_lower_limit_needs_no_trainin
     said = keyss(*hide, "--min-psnr", 0, "--resume")
     assert said.status == 0
     assert "plain model of the secret (b): 43 steps, continuing at 43" in said.err
-    assert (tmp_path / "run" / "publish" / "stego.ply").exists()
+    assert (tmp_path / "run" / "publish" / "model.ply").exists()
 
 
 @pytest.fixture

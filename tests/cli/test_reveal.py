@@ -71,7 +71,7 @@ def test_runs_and_checks_are_described_in_words(keyss: Run, world: Path) -> None
     said = keyss("info", world / "hidden").out
     assert "hiding by the method carry" in said
     assert "_" not in said.replace(str(world), "")
-    said = keyss("verify", world / "hidden/publish/stego.ply", "--key-file", world / "key.txt").out
+    said = keyss("verify", world / "hidden/publish/model.ply", "--key-file", world / "key.txt").out
     assert said.endswith("complete\n")
     assert_refused(keyss("info", world), 4, f"name one of {world / 'hidden'}")
 
@@ -290,7 +290,7 @@ def test_a_run_is_not_replaced_by_what_is_made_of_it(keyss: Run, files: Path, tm
     small = tmp_path / "small.ply"
     write_model(small, trained_like(100, 3))
     assert keyss(*hide, "--cover", files / "plain.ply", "--secret", small).status == 0
-    before, stego = listing(tmp_path), tmp_path / "run" / "publish" / "stego.ply"
+    before, stego = listing(tmp_path), tmp_path / "run" / "publish" / "model.ply"
     assert_refused(keyss(*hide, "--overwrite", "--cover", stego, "--secret", small), 2, "is the input")
     render = ("render", stego, "--cameras", files / "plain.ply", "-o", tmp_path / "run", "--overwrite")
     assert_refused(keyss(*render), 2, "is the input")

@@ -43,7 +43,7 @@ def _arguments(folder: Path, out: Path) -> list[object]:
 
 
 def test_files_come_back_byte_for_byte(keyss: Run, folder: Path, tmp_path: Path) -> None:
-    stego = folder / "out" / "publish" / "stego.ply"
+    stego = folder / "out" / "publish" / "model.ply"
     assert stego.stat().st_size == (folder / "cover.ply").stat().st_size
     for index, name in enumerate(("letter.pdf", "empty")):
         out = tmp_path / f"back{index}"
@@ -66,7 +66,7 @@ def test_what_does_not_go_together_is_refused(keyss: Run, folder: Path, world: P
         assert_refused(keyss(*hide, flag, value), 2, f"leave out {flag}")
     photos = ("hide", "--cover", world / "a", "--secret-file", folder / "empty", "-o", out)
     assert_refused(keyss(*photos, "--key-file", folder / "key0"), 2, "needs a model as the cover")
-    stego, key = folder / "out" / "publish" / "stego.ply", ("--key-file", folder / "key0")
+    stego, key = folder / "out" / "publish" / "model.ply", ("--key-file", folder / "key0")
     assert_refused(keyss("reveal", stego, *key, "-o", tmp_path / "s.ply"), 4, "a file of 3,000 bytes")
     assert_refused(keyss("reveal", stego, *key, "-o", back, "--decoy"), 2, "--decoy")
     assert_refused(keyss("reveal", folder / "cover.ply", *key, "-o", back), 3, "opens nothing")
@@ -108,7 +108,7 @@ def test_published_anywhere_a_file_opens_from_what_it_was_converted_to(
     said = keyss(*hide, "--publish", "any", "-o", out)
     assert (said.status, said.err) == (0, "")
     assert "may be converted" in said.out
-    said = keyss("convert", out / "publish" / "stego.ply", tmp_path / "web.spz", *key)
+    said = keyss("convert", out / "publish" / "model.ply", tmp_path / "web.spz", *key)
     assert (said.status, said.err) == (0, "")
     assert keyss("reveal", tmp_path / "web.spz", *key, "-o", tmp_path / "back").status == 0
     assert (tmp_path / "back").read_bytes() == (tmp_path / "note.txt").read_bytes()

@@ -49,7 +49,7 @@ def _assert_ended(process: subprocess.Popen[str], signum: signal.Signals, when: 
 
 
 def _commands(world: Path, folder: Path) -> dict[str, list[object]]:
-    stego, key = next((world / "hidden").rglob("stego.ply")), world / "key.txt"
+    stego, key = next((world / "hidden").rglob("publish/model.ply")), world / "key.txt"
     return {
         "help": ["--help"],
         "info": ["info", stego],
@@ -114,7 +114,7 @@ _ALSO = ("keyss.cli.entry", "tyro", "torch.nn", "numba.core.types")
 )
 def test_ctrl_c_in_the_middle_of_an_import(world: Path, module: str) -> None:
     """Where it comes up as an exception, torch is loaded half, and crashes when it is loaded again."""
-    stego, key = next((world / "hidden").rglob("stego.ply")), world / "key.txt"
+    stego, key = next((world / "hidden").rglob("publish/model.ply")), world / "key.txt"
     verify = ["verify", str(stego), "--key-file", str(key)]  # loads as much as any command
     assert _ended(LOADING.format(module=module), *verify) == Said(130, "", "keyss: interrupted\n")
 

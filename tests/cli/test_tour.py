@@ -42,10 +42,10 @@ def tour(keyss: Run) -> None:
     models = "--cover own/cover.ply --secret own/secret.ply --width 16 --device cpu"
     done(f"hide --method carry {models} --key-file key.txt -o carried")
     for run in ("hidden", "carried"):
-        done(f"reveal {run}/publish/stego.ply --key-file key.txt -o {run}.ply")
-        done(f"verify {run}/publish/stego.ply --key-file key.txt")
+        done(f"reveal {run}/publish/model.ply --key-file key.txt -o {run}.ply")
+        done(f"verify {run}/publish/model.ply --key-file key.txt")
         done(f"evaluate {run} --key-file key.txt")
-        done(f"info {run}/publish/stego.ply")
+        done(f"info {run}/publish/model.ply")
     done("render hidden.ply --cameras b -o images --split all")
     done("audit hidden --key-file key.txt --only parameters --controls 2 --device cpu")
     done("audit hidden --report-only")
@@ -64,7 +64,7 @@ def published(folder: Path) -> set[str]:
     return {str(path.relative_to(folder)) for path in folder.glob("**/publish/*")}
 
 
-PUBLISHED = {"hidden/publish/stego.ply", "carried/publish/stego.ply"}
+PUBLISHED = {"hidden/publish/model.ply", "carried/publish/model.ply"}
 
 
 def test_only_what_is_to_be_published_is_readable_by_others(keyss: Run, mine: Path) -> None:
@@ -93,6 +93,6 @@ def test_nor_does_the_demo_show_more(
     monkeypatch.setattr(run_demo, "__kwdefaults__", run_demo.__kwdefaults__ | small)
     said = keyss("demo", "-o", tmp_path / "demo", "--device", "cpu")
     assert said.status == 0, said.err
-    assert published(tmp_path) == {"demo/publish/stego.ply"}
-    assert readable_by_others(tmp_path) == {"demo/publish/stego.ply", "demo/index.html"}
+    assert published(tmp_path) == {"demo/publish/model.ply"}
+    assert readable_by_others(tmp_path) == {"demo/publish/model.ply", "demo/index.html"}
     assert stat.S_IMODE((tmp_path / "demo" / "private").stat().st_mode) == 0o700

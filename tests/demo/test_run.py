@@ -45,20 +45,20 @@ def test_it_leaves_everything_there_is_to_look_at(run: tuple[Path, demo.DemoResu
 
 def test_the_key_opens_what_it_wrote(run: tuple[Path, demo.DemoResult], tmp_path: Path) -> None:
     out, _ = run
-    keyss.reveal(out / "publish" / "stego.ply", "demo-key-3", out=tmp_path / "again.ply")
+    keyss.reveal(out / "publish" / "model.ply", "demo-key-3", out=tmp_path / "again.ply")
     assert (tmp_path / "again.ply").read_bytes() == (out / "secret.ply").read_bytes()
 
 
 def test_the_key_opens_the_file_for_the_web_too(run: tuple[Path, demo.DemoResult], tmp_path: Path) -> None:
     found = keyss.reveal(run[0] / "web.spz", "demo-key-3").gaussians
-    assert len(found) == len(keyss.reveal(run[0] / "publish" / "stego.ply", "demo-key-3").gaussians)
+    assert len(found) == len(keyss.reveal(run[0] / "publish" / "model.ply", "demo-key-3").gaussians)
 
 
 def test_one_seed_gives_the_same_bytes_in_another_place(
     run: tuple[Path, demo.DemoResult], tmp_path: Path
 ) -> None:
     demo.run_demo(tmp_path, seed=3, **SMALL)
-    for name in ("publish/stego.ply", "secret.ply"):
+    for name in ("publish/model.ply", "secret.ply"):
         assert (tmp_path / name).read_bytes() == (run[0] / name).read_bytes()
 
 

@@ -253,8 +253,8 @@ def test_broken_photos_are_named(tmp_path: Path) -> None:
         load_scene(tmp_path)
 
 
-@pytest.mark.parametrize("side", [9_500, 30_000])
-def test_decompression_bombs_are_refused_unopened(tmp_path: Path, side: int) -> None:
+@pytest.mark.parametrize(("side", "limit"), [(5_000, "24"), (9_500, "89"), (30_000, "89")])
+def test_decompression_bombs_are_refused_unopened(tmp_path: Path, side: int, limit: str) -> None:
     header = struct.pack(">IIBBBBB", side, side, 8, 2, 0, 0, 0)
     chunks = [(b"IHDR", header), (b"IDAT", zlib.compress(bytes(1000))), (b"IEND", b"")]
     png = b"\x89PNG\r\n\x1a\n" + b"".join(
@@ -263,7 +263,7 @@ def test_decompression_bombs_are_refused_unopened(tmp_path: Path, side: int) -> 
     )
     folder = write_colmap(tmp_path, cameras=counted(camera_bytes(width=side, height=side)))
     (folder / "images" / "01.png").write_bytes(png)
-    with pytest.raises(InputError, match=r"01\.png: expected an image of at most 89,000,000 pixels"):
+    with pytest.raises(InputError, match=rf"01\.png: expected an image of at most {limit},000,000 pixels"):
         load_scene(folder)
 
 

@@ -322,7 +322,7 @@ def test_hiding_gives_the_same_bytes(monkeypatch: pytest.MonkeyPatch, tmp_path: 
         hide(tiny_scene(0), [secret], method=options, bound=True, out=out, min_psnr=0)
         found.append({path.name: path.read_bytes() for path in out.rglob("*.ply")})
     assert found[0] == found[1]
-    assert {"stego.ply", "cover.ply", "secret-1.ply"} <= set(found[0])
+    assert {"model.ply", "cover.ply", "secret-1.ply"} <= set(found[0])
 
 
 @pytest.mark.parametrize(

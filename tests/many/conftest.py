@@ -21,7 +21,7 @@ def fake_run(job: cell.Cell, folder: Path, reporter: Reporter) -> cell.Result:
         raise RuntimeError("out of memory")
     seed = getattr(job.options, "fit", job.options).known_seed
     (folder / "run" / "publish").mkdir(parents=True, exist_ok=True)
-    (folder / "run" / "publish" / "stego.ply").write_text(f"{seed}")
+    (folder / "run" / "publish" / "model.ply").write_text(f"{seed}")
     numbers = {"cover.psnr": 30.0 + seed, "cover.ssim": 0.9, "secrets.1.psnr": 20.0, "seconds": 1.0}
     result = cell.Result(seconds=0.1, numbers=numbers)
     write_bytes(folder / "cell.json", record_bytes(job))

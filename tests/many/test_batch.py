@@ -40,7 +40,7 @@ def _fake_hiding(monkeypatch: pytest.MonkeyPatch) -> None:
             raise InputError(f"cannot read {cover}")
         (out / "publish").mkdir(parents=True, exist_ok=True)
         make_private(out / "private")
-        (out / "publish" / "stego.ply").write_text(cover)
+        (out / "publish" / "model.ply").write_text(cover)
 
     monkeypatch.setattr(batch, "hide", fake)
 
@@ -206,12 +206,12 @@ def test_the_key_of_an_asset_opens_it_and_no_other(tmp_path: Path, keyss: Run) -
     said = keyss("keygen", "--asset", "scenes/1", "--master-key-file", tmp_path / "master.txt")
     key = said.out.strip()
     assert key == MasterKey(KEY).key_of("scenes/1")
-    stego = out / "scenes" / "1" / "publish" / "stego.ply"
+    stego = out / "scenes" / "1" / "publish" / "model.ply"
     assert len(library.reveal(stego, key).gaussians) == 40
     other = MasterKey(KEY).key_of("files/1")
     with pytest.raises(WrongKeyError):
         library.reveal(stego, other)
-    found = library.reveal(out / "files" / "1" / "publish" / "stego.ply", other).file
+    found = library.reveal(out / "files" / "1" / "publish" / "model.ply", other).file
     assert (found.name, found.data) == ("letter.txt", b"for your eyes only")
     assert (out / "private").stat().st_mode & 0o077 == 0
 

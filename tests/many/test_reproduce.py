@@ -139,7 +139,7 @@ def test_the_papers_scenes_have_its_sizes_and_pairs(
 
 
 def test_what_is_appended_is_neither_counted_nor_pruned(out: Path) -> None:
-    stego = read_model(run_of("KeySS, a-b", out) / "publish" / "stego.ply")
+    stego = read_model(run_of("KeySS, a-b", out) / "publish" / "model.ply")
     own = comparison_measures.own_gaussians(stego)
     assert 0 < len(own) <= 150 < len(stego)
     for change in (random_pruning(0.25), opacity_pruning(0.25)):

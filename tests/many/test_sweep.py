@@ -159,7 +159,7 @@ def test_a_cell_runs_again_when_its_files_options_or_result_changed(tmp_path: Pa
     spec = write_spec(tmp_path, ["a.ply"], seeds=2)
     out = tmp_path / "out"
     cells = [each.folder for each in run(spec, out).outcomes]
-    (cells[0] / "run" / "publish" / "stego.ply").unlink()
+    (cells[0] / "run" / "publish" / "model.ply").unlink()
     assert skipped(run(spec, out)) == [False, True]
     written = (cells[0] / "result.json").stat().st_mtime
     os.utime(tmp_path / "a.ply", (written + 5, written + 5))
@@ -296,7 +296,7 @@ def test_the_key_of_a_cell_opens_it(tmp_path: Path, keyss: Run) -> None:
     (cell,) = run(real_spec(tmp_path, 1), tmp_path / "out").outcomes
     name, master = f"cell/{cell.folder.name}/1", tmp_path / "out" / "private" / "master-key.txt"
     key = keyss("keygen", "--asset", name, "--master-key-file", master).out.strip()
-    assert len(library.reveal(cell.folder / "run" / "publish" / "stego.ply", key).gaussians) == 40
+    assert len(library.reveal(cell.folder / "run" / "publish" / "model.ply", key).gaussians) == 40
     assert json.loads((cell.folder / "cell.json").read_text())["method"] == "carry"
 
 

@@ -123,7 +123,7 @@ def test_from_python(models: tuple[Path, Path], tmp_path: Path) -> None:
     assert secret_quality.psnr == pytest.approx(plain.psnr, abs=1e-3)
     assert result.metrics.details == {"floats": 60 * 14}
     assert keyss.evaluate(tmp_path / "run", [KEY]) == result.metrics
-    revealed = keyss.reveal(tmp_path / "run" / "publish" / "stego.ply", KEY).gaussians
+    revealed = keyss.reveal(tmp_path / "run" / "publish" / "model.ply", KEY).gaussians
     assert torch.equal(revealed.means, random_gaussians(60, sh_degree=0).means)
     with pytest.raises(WrongKeyError):
         keyss.reveal(result.stego, "wrong")
@@ -150,7 +150,7 @@ def test_from_the_command_line(
     config = json.loads((run / "private" / "config.json").read_text())
     assert (config["method"], config["options"]["most"]) == ("whole", 60)
     assert keyss("evaluate", run).status == 0
-    assert keyss("reveal", run / "publish" / "stego.ply", "-o", tmp_path / "revealed.ply").status == 0
+    assert keyss("reveal", run / "publish" / "model.ply", "-o", tmp_path / "revealed.ply").status == 0
     said = keyss("info", run)
     assert said.status == 0
     assert "whole" in said.out

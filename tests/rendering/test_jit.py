@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from pathlib import Path
 
@@ -54,6 +55,27 @@ def test_an_unwritable_place_is_passed_over(tmp_path: Path, monkeypatch: pytest.
     assert folder.parent == tmp_path / "cache"
     places.pop()
     assert jit.cache_folder.__wrapped__() is None
+
+
+@pytest.mark.skipif(not hasattr(os, "getuid"), reason="folders have no owners and modes here")
+def test_a_place_that_others_can_change_is_passed_over(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    find, place = jit.cache_folder.__wrapped__, tmp_path / "shared"
+    place.mkdir()
+    monkeypatch.setattr(jit, "_cache_parents", lambda: [place / "cache"])
+    for mode, is_safe in ((0o700, True), (0o777, False), (0o775, False), (0o1777, True)):
+        place.chmod(mode)
+        assert (find() is not None) == is_safe, oct(mode)
+    folder = find()
+    assert folder is not None
+    assert folder.stat().st_mode & 0o777 == 0o700
+    folder.chmod(0o777)
+    assert find() is None
+    folder.chmod(0o700)
+    another = os.getuid() + 1
+    monkeypatch.setattr(os, "getuid", lambda: another)  # the folder was made by somebody else
+    assert find() is None
 
 
 def test_kernels_compile_without_any_cache(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -31,14 +31,14 @@ def failing(error: BaseException) -> Callable[[Path], None]:
 def make(path: Path, stage: str = "hide", files: dict[str, bytes] | None = None, **how: object) -> None:
     folder = RunFolder(path, stage, **how)  # type: ignore[arg-type]
     with folder.work():
-        names = {"publish/stego.ply": b"1", "private/cover.ply": b"2"} if files is None else files
+        names = {"publish/model.ply": b"1", "private/cover.ply": b"2"} if files is None else files
         folder.write(names)
 
 
 def interrupt(path: Path, arguments: dict[str, object], stage: str = "hide", **how: bool) -> None:
     """Leaves a checkpoint."""
     folder = RunFolder(path, stage, arguments, **how)
-    contents = {"publish/stego.ply": b"half", "x": failing(KeyboardInterrupt())}
+    contents = {"publish/model.ply": b"half", "x": failing(KeyboardInterrupt())}
     with pytest.raises(KeyboardInterrupt), folder.work():  # noqa: PT012
         write_bytes(folder.checkpoints / "fit", b"state")
         folder.write(contents)
@@ -49,13 +49,13 @@ def test_all_files_appear_and_only_what_is_published_can_be_read(tmp_path: Path,
     assert list(tmp_path.iterdir()) == []
     with folder.work():
         (folder.checkpoints / "fit").touch()
-        folder.write({"publish/stego.ply": b"1", "private/cover.ply": b"2"})
-        assert tree(tmp_path).keys().isdisjoint({"a/run/publish/stego.ply"})
-    assert tree(folder.path) == {"publish/stego.ply": b"1", "private/cover.ply": b"2"}
+        folder.write({"publish/model.ply": b"1", "private/cover.ply": b"2"})
+        assert tree(tmp_path).keys().isdisjoint({"a/run/publish/model.ply"})
+    assert tree(folder.path) == {"publish/model.ply": b"1", "private/cover.ply": b"2"}
     modes = {str(p.relative_to(folder.path)): p.stat().st_mode & 0o777 for p in folder.path.rglob("*")}
     assert modes == {
         "publish": 0o755,
-        "publish/stego.ply": 0o644,
+        "publish/model.ply": 0o644,
         "private": 0o700,
         "private/cover.ply": 0o600,
         MANIFEST: 0o600,
@@ -76,13 +76,13 @@ def test_none_appears_when_one_fails(
     before = tree(tmp_path), read_manifest(path)
     folder = RunFolder(path, "hide", overwrite=there)
     with pytest.raises(raised), folder.work():
-        folder.write({"publish/stego.ply": b"new", "y": failing(error)})
+        folder.write({"publish/model.ply": b"new", "y": failing(error)})
     assert (tree(tmp_path), read_manifest(path)) == before
     assert path.exists() == there
 
 
 def test_overwriting_removes_what_was_written_and_nothing_else(tmp_path: Path) -> None:
-    make(tmp_path, files={"publish/stego.ply": b"1", "publish/stego.spz": b"2", "private/old/x": b"3"})
+    make(tmp_path, files={"publish/model.ply": b"1", "publish/model.spz": b"2", "private/old/x": b"3"})
     make(tmp_path, "audit", {"private/report.html": b"4"}, onto=("hide",))
     foreign = {
         "notes.txt": b"mine",
@@ -93,9 +93,9 @@ def test_overwriting_removes_what_was_written_and_nothing_else(tmp_path: Path) -
     for name, data in foreign.items():
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_bytes(data)
-    make(tmp_path, files={"publish/stego.ply": b"new"}, overwrite=True)
-    assert tree(tmp_path) == foreign | {"publish/stego.ply": b"new"}
-    assert read_manifest(tmp_path).files == {"hide": ("publish/stego.ply",)}
+    make(tmp_path, files={"publish/model.ply": b"new"}, overwrite=True)
+    assert tree(tmp_path) == foreign | {"publish/model.ply": b"new"}
+    assert read_manifest(tmp_path).files == {"hide": ("publish/model.ply",)}
 
 
 def test_an_audit_keeps_the_results_of_hiding(tmp_path: Path) -> None:
@@ -103,19 +103,19 @@ def test_an_audit_keeps_the_results_of_hiding(tmp_path: Path) -> None:
     for data in (b"first", b"second"):
         make(tmp_path, "audit", {"private/report.html": data}, onto=("hide",), overwrite=data == b"second")
     assert tree(tmp_path)["private/report.html"] == b"second"
-    assert tree(tmp_path)["publish/stego.ply"] == b"1"
+    assert tree(tmp_path)["publish/model.ply"] == b"1"
     with pytest.raises(OutputError, match="exists"):
         RunFolder(tmp_path, "audit", onto=("hide",))
 
 
 def test_files_of_others_are_never_replaced(tmp_path: Path) -> None:
     (tmp_path / "publish").mkdir()
-    (tmp_path / "publish" / "stego.ply").write_bytes(b"mine")
+    (tmp_path / "publish" / "model.ply").write_bytes(b"mine")
     with pytest.raises(OutputError, match="in the way"):
-        RunFolder(tmp_path, "hide", writes=("publish/stego.ply",), overwrite=True)
+        RunFolder(tmp_path, "hide", writes=("publish/model.ply",), overwrite=True)
     with pytest.raises(OutputError, match="in the way"):
         make(tmp_path, overwrite=True)
-    assert tree(tmp_path) == {"publish/stego.ply": b"mine"}
+    assert tree(tmp_path) == {"publish/model.ply": b"mine"}
 
 
 @pytest.mark.parametrize("name", ["checkpoint", "unfinished"])
@@ -163,27 +163,27 @@ def test_an_interrupted_run_resumes_with_the_same_arguments_only(tmp_path: Path)
     assert 0 < first < folder.earlier_seconds
     with folder.work():
         assert (folder.checkpoints / "fit").read_bytes() == b"state"
-        folder.write({"publish/stego.ply": b"whole"})
-    assert tree(tmp_path) == {"publish/stego.ply": b"whole"}
+        folder.write({"publish/model.ply": b"whole"})
+    assert tree(tmp_path) == {"publish/model.ply": b"whole"}
 
 
 def test_a_run_that_was_killed_without_a_checkpoint_starts_anew(tmp_path: Path) -> None:
     interrupt(tmp_path, {"width": 1})
     (tmp_path / "private" / "checkpoint" / "fit").unlink()  # as a kill before the first checkpoint leaves it
     make(tmp_path)
-    assert tree(tmp_path)["publish/stego.ply"] == b"1"
+    assert tree(tmp_path)["publish/model.ply"] == b"1"
     assert read_manifest(tmp_path).running is None
 
 
 def test_starting_anew_drops_checkpoints_and_keeps_results_until_the_end(tmp_path: Path) -> None:
     make(tmp_path)
     interrupt(tmp_path, {"width": 1}, overwrite=True)
-    assert tree(tmp_path)["publish/stego.ply"] == b"1"
+    assert tree(tmp_path)["publish/model.ply"] == b"1"
     folder = RunFolder(tmp_path, "hide", {"width": 2}, overwrite=True)
     with folder.work():
         assert not list(folder.checkpoints.iterdir())
-        folder.write({"publish/stego.ply": b"new"})
-    assert tree(tmp_path) == {"publish/stego.ply": b"new"}
+        folder.write({"publish/model.ply": b"new"})
+    assert tree(tmp_path) == {"publish/model.ply": b"new"}
 
 
 def test_resuming_a_run_that_never_began_starts_it(tmp_path: Path) -> None:
@@ -210,8 +210,8 @@ def test_a_replaced_file_stays_in_the_manifest(tmp_path: Path) -> None:
     (tmp_path / "private" / "mine").write_bytes(b"mine")
     with pytest.raises(OutputError, match="in the way"):
         write_again(tmp_path, "audit", "private/mine", b"3")
-    make(tmp_path, files={"publish/stego.ply": b"new"}, overwrite=True)
-    assert tree(tmp_path) == {"publish/stego.ply": b"new", "private/mine": b"mine"}
+    make(tmp_path, files={"publish/model.ply": b"new"}, overwrite=True)
+    assert tree(tmp_path) == {"publish/model.ply": b"new", "private/mine": b"mine"}
 
 
 @pytest.mark.parametrize("name", ["../victim", "/etc/passwd", "a/../../victim", "", MANIFEST])
@@ -227,15 +227,15 @@ def test_a_forged_manifest_reaches_nothing_outside(tmp_path: Path, name: str) ->
 def test_links_in_a_run_folder_are_not_followed(tmp_path: Path) -> None:
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()
-    (elsewhere / "stego.ply").write_bytes(b"mine")
+    (elsewhere / "model.ply").write_bytes(b"mine")
     run = tmp_path / "run"
     make(run)
-    (run / "publish" / "stego.ply").unlink()
+    (run / "publish" / "model.ply").unlink()
     (run / "publish").rmdir()
     (run / "publish").symlink_to(elsewhere)
     with pytest.raises(OutputError, match="leads out of"):
         make(run, overwrite=True)
-    assert (elsewhere / "stego.ply").read_bytes() == b"mine"
+    assert (elsewhere / "model.ply").read_bytes() == b"mine"
 
 
 def test_clearing_keeps_files_of_others(tmp_path: Path) -> None:

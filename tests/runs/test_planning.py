@@ -71,7 +71,7 @@ def test_estimates_are_near_the_measured_run(given: bool, tmp_path: Path) -> Non
     assert seconds / 10 < plan.seconds < 10 * seconds
     files = [path for path in (tmp_path / "run").rglob("*") if path.is_file()]
     assert len(result.stego) <= plan.gaussians
-    assert (tmp_path / "run/publish/stego.ply").stat().st_size <= plan.file_bytes
+    assert (tmp_path / "run/publish/model.ply").stat().st_size <= plan.file_bytes
     assert sum(path.stat().st_size for path in files) <= plan.disk_bytes
     assert 1e8 < plan.memory_bytes < 2e10
 

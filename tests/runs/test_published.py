@@ -71,9 +71,9 @@ def _telling(run: Path, folder: Path) -> list[bytes]:
 @pytest.mark.parametrize("method", METHODS)
 def test_only_the_model_is_published_and_nothing_in_it_names_a_secret(tmp_path: Path, method: str) -> None:
     run = _hide(tmp_path, METHODS[method])
-    assert {path.name for path in (run / "publish").iterdir()} == {"stego.ply"}
+    assert {path.name for path in (run / "publish").iterdir()} == {"model.ply"}
     assert {path.name for path in run.iterdir()} == {"publish", "private"}
-    data = (run / "publish" / "stego.ply").read_bytes()
+    data = (run / "publish" / "model.ply").read_bytes()
     assert [text for text in _telling(run, tmp_path) if text in data] == []
     assert data[: 1 << 12].count(b"comment") == 0
     assert set(_modes(run / "private").values()) == {0o700, 0o600}
@@ -91,7 +91,7 @@ def test_checkpoints_are_private_while_a_run_is_interrupted(tmp_path: Path) -> N
 
 def test_revealed_models_are_private_files(tmp_path: Path) -> None:
     run = _hide(tmp_path, METHODS["carry"])
-    keyss.reveal(run / "publish" / "stego.ply", KEY, out=tmp_path / "revealed.ply")
+    keyss.reveal(run / "publish" / "model.ply", KEY, out=tmp_path / "revealed.ply")
     assert _modes(tmp_path / "revealed.ply") == {"revealed.ply": 0o600}
     (run / "private").chmod(0o755)  # as an older program left it
     keyss.evaluate(run, [KEY])

@@ -51,7 +51,7 @@ def served(stego: Path) -> Iterator[str]:
         assert process.stdout is not None
         try:
             line = process.stdout.readline()
-            found = re.match(r"(http://127\.0\.0\.1:[0-9]+/) .*only this machine", line)
+            found = re.match(r"(http://127\.0\.0\.1:[0-9]+/\S+/) .*only on this machine", line)
             assert found, line
             yield found[1]
         finally:

@@ -10,7 +10,9 @@ import subprocess
 import threading
 from base64 import b64decode, b64encode
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from urllib.parse import urlsplit
 
 import pytest
 
@@ -28,14 +30,34 @@ def model(tmp_path: Path) -> Path:
     return path
 
 
+@contextmanager
+def running(server: ModelServer) -> Iterator[None]:
+    thread = threading.Thread(target=server.run)
+    thread.start()
+    yield
+    server.close()
+    thread.join()
+
+
 @pytest.fixture
 def server(model: Path) -> Iterator[ModelServer]:
     found = ModelServer(model)
-    thread = threading.Thread(target=found.run)
-    thread.start()
-    yield found
-    found.close()
-    thread.join()
+    with running(found):
+        yield found
+
+
+def get(
+    server: ModelServer, path: str, *, folder: str | None = None, hosts: list[str] | None = None
+) -> tuple[int, bytes, dict[str, str]]:
+    """Status, content and headers of a request with these headers `Host`, by default the right one."""
+    where = urlsplit(server.address)
+    connection = http.client.HTTPConnection(where.hostname or "", where.port, timeout=10)
+    connection.putrequest("GET", (where.path if folder is None else folder) + path, skip_host=True)
+    for host in [where.netloc] if hosts is None else hosts:
+        connection.putheader("Host", host)
+    connection.endheaders()
+    answer = connection.getresponse()
+    return answer.status, answer.read(), dict(answer.getheaders())
 
 
 def test_one_file_has_everything_in_it_and_may_ask_nobody(model: Path, tmp_path: Path) -> None:
@@ -72,28 +94,57 @@ def test_a_folder_for_a_web_server(model: Path, tmp_path: Path) -> None:
 def test_the_server_gives_out_the_page_and_the_model_and_nothing_else(
     server: ModelServer, model: Path
 ) -> None:
-    port = int(server.address.rstrip("/").rpartition(":")[2])
-    assert server.address == f"http://127.0.0.1:{port}/"
-
-    def get(path: str, host: str = "127.0.0.1") -> tuple[int, bytes, dict[str, str]]:
-        connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
-        connection.request("GET", path, headers={"Host": f"{host}:{port}"})
-        answer = connection.getresponse()
-        return answer.status, answer.read(), dict(answer.getheaders())
-
-    status, page, headers = get("/")
+    where = urlsplit(server.address)
+    assert re.fullmatch(r"/[\w-]{20,}/", where.path)
+    with running(other := ModelServer(model)):
+        assert urlsplit(other.address).path != where.path
+    status, page, headers = get(server, "")
     assert status == 200
     assert headers["Content-Security-Policy"].startswith("default-src 'self';")
     name = re.search(rb'name="keyss-model" content="([^"]*)"', page)
     assert name is not None
-    assert get(f"/{name[1].decode()}")[1] == model.read_bytes()
-    assert get("/viewer.js")[1] == asset("viewer.js")
-    for path in ("/model/", "/model/..%2f..%2fetc/passwd", "/../../etc/passwd", "/page.html", "/a/b"):
-        assert get(path)[0] == 404, path
-    assert get("/", host="elsewhere.example")[0] == 403
-    assert get("/", host="[")[0] == 400
+    assert get(server, name[1].decode())[1] == model.read_bytes()
+    assert get(server, "viewer.js")[1] == asset("viewer.js")
+    for path in ("model/", "model/..%2f..%2fetc/passwd", "../../etc/passwd", "page.html", "a/b"):
+        assert get(server, path)[0] == 404, path
+    for path in ("/", "/viewer.js", f"/{name[1].decode()}", "/live"):  # what other users could guess
+        assert get(server, path, folder="")[0] == 404, path
     with pytest.raises(OutputError, match="cannot serve"):
-        ModelServer(model, port=port)
+        ModelServer(model, port=where.port or 0)
+
+
+@pytest.mark.parametrize(
+    ("address", "served"),
+    [
+        ("127.0.0.1", ["127.0.0.1", "localhost", "LOCALHOST"]),
+        ("127.0.0.2", ["127.0.0.2", "localhost"]),
+        ("localhost", ["127.0.0.1", "localhost"]),
+        ("::1", ["[::1]", "localhost"]),
+    ],
+)
+def test_only_hosts_that_are_served_get_the_model(model: Path, address: str, served: list[str]) -> None:
+    """Other names that resolve to the server (DNS rebinding) get nothing, whatever a parser makes of them."""
+    try:
+        found = ModelServer(model, address)
+    except OutputError:
+        pytest.skip(f"this machine has no address {address}")
+    with running(found):
+        port = urlsplit(found.address).port
+        for name in served:
+            assert get(found, "", hosts=[f"{name}:{port}"])[0] == 200, name
+            assert get(found, "", hosts=[name])[0] == 200, name
+            assert get(found, "", hosts=[f"{name}:{port}"] * 2)[0] == 403, name
+        hostile = [
+            "evil.example",
+            "evil.example@localhost",
+            "localhost#evil.example",
+            "localhost/evil.example",
+        ]
+        hostile += ["localhost.", "[", "", "localhost:x", "localhost:1:2", "localhost:1 2", "127.0.0.3"]
+        for name in hostile:
+            assert get(found, "", hosts=[name])[0] == 403, name
+            assert get(found, "", hosts=[served[0], name])[0] == 403, name
+        assert get(found, "", hosts=[])[0] == 403
 
 
 def test_the_page_is_small_and_has_its_licences() -> None:

@@ -1,5 +1,6 @@
 import { expect, test } from 'vitest';
 import { readModel } from '../src/files/models.ts';
+import { joined } from '../src/core/bytes.ts';
 import { column, plyHeader } from '../src/files/ply.ts';
 import { openZip } from '../src/files/packed.ts';
 import { columns, jsonVector, modelOf, vector } from './vectors.ts';
@@ -46,6 +47,36 @@ test('the files of an archive', async () => {
   const file = openZip(vector('published.sog'));
   expect(JSON.parse(new TextDecoder().decode(await file('meta.json'))).version).toBe(2);
   await expect(file('nothing')).rejects.toThrow();
+});
+
+test('an archive whose files are listed again or claim more than there is', async () => {
+  const bytes = vector('published.sog');
+  const view = new DataView(bytes.buffer.slice(bytes.byteOffset, bytes.byteOffset + bytes.length));
+  const [end, size] = [bytes.length - 22, view.getUint32(bytes.length - 10, true)];
+  const directory = view.getUint32(end + 16, true);
+  const entry = bytes.slice(directory, directory + 46 + view.getUint16(directory + 28, true));
+  expect(size).toBe(end - directory);
+  const changed = (...entries: Uint8Array[]): Uint8Array => {
+    const tail = bytes.slice(end);
+    new DataView(tail.buffer).setUint16(10, view.getUint16(end + 10, true) + entries.length, true);
+    return joined(bytes.slice(0, end), ...entries, tail);
+  };
+  const named = (letter: string, claimed: number, at: number): Uint8Array => {
+    const again = entry.slice();
+    again[46] = letter.charCodeAt(0);
+    new DataView(again.buffer).setUint32(24, claimed, true);
+    new DataView(again.buffer).setUint32(42, at, true);
+    return again;
+  };
+  expect(() => openZip(changed(named('x', 100, directory)))).not.toThrow();
+  expect(() => openZip(changed(named('x', 100, 0)))).toThrow();
+  expect(() => openZip(changed(named('x', 0xfffffffe, directory)))).toThrow();
+  expect(() => openZip(changed(named('x', 2 * bytes.length + (1 << 20), directory)))).toThrow();
+});
+
+test('rows that have no properties make no room', async () => {
+  const header = 'ply\nformat binary_little_endian 1.0\nelement vertex 999999999\nend_header\n';
+  await expect(readModel(new TextEncoder().encode(header))).rejects.toThrow('is not a 3D Gaussian Splatting model');
 });
 
 test('a .sog is what Python reads, bit for bit', async () => {

@@ -79,6 +79,7 @@ class Attempt:
     key: DerivedKey
     content: Content | None
     appended: bool  # True if there are appended Gaussians
+    records: bool  # True if scenes lie there as records, else as one payload
 
 
 def quick_attempt(stego: Gaussians, key: str) -> Attempt | None:
@@ -94,7 +95,9 @@ def quick_attempt(stego: Gaussians, key: str) -> Attempt | None:
     content = None
     with suppress(WrongKeyError):
         content = _read_from(stego, reader.extract(derived))
-    return Attempt(derived, content, appended is not None)
+    from keyss.channels.low_bits.contents import LowBitsReader
+
+    return Attempt(derived, content, appended is not None, isinstance(reader, LowBitsReader))
 
 
 def _read_from(stego: Gaussians, content: Content) -> Content:

@@ -105,7 +105,9 @@ def _cache() -> str:
 
     folder = cache_folder()
     if folder is None:
-        raise BackendError("no writable folder: every command compiles the kernels again, 10 to 20 s")
+        raise BackendError(
+            "no folder that only this user can write to: every command compiles the kernels again, 10 to 20 s"
+        )
     return str(folder)
 
 

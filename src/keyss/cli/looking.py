@@ -45,9 +45,9 @@ def view(
 
     Keys never leave the browser, and the page makes no requests to others than --allow-host.
 
-    example: keyss view runs/hidden/publish/stego.ply
+    example: keyss view runs/hidden/publish/model.ply
 
-    example: keyss view runs/hidden/publish/stego.ply -o page.html
+    example: keyss view runs/hidden/publish/model.ply -o page.html
     """
     check_there(model)
     from keyss.core.errors import UsageError
@@ -68,8 +68,8 @@ def view(
     if not 0 <= port < 1 << 16:
         raise UsageError(f"--port: expected 0 to {(1 << 16) - 1}, got {port}")
     server = ModelServer(model, host, port, look)
-    who = "only this machine" if host in ("127.0.0.1", "localhost", "::1") else f"all who can reach {host}"
-    print(f"{server.address} shows {model} to {who}; press Ctrl-C to stop", flush=True)
+    who = "only on this machine" if server.is_local else f"to all who can reach {host} and know this address"
+    print(f"{server.address} shows {model} {who}; press Ctrl-C to stop", flush=True)
     server.run()
 
 
@@ -95,7 +95,7 @@ def render(
 
     example: keyss render secret.ply --cameras SCENE_B -o images/
 
-    example: keyss render stego.ply --wipe secret.ply --cameras SCENE_A --video video.mp4
+    example: keyss render model.ply --wipe secret.ply --cameras SCENE_A --video video.mp4
     """
     check_there(model, cameras)
     from keyss.core.errors import UsageError
@@ -128,7 +128,7 @@ def info(
 ) -> None:
     """Describe a model, a scene or a run.
 
-    example: keyss info runs/hidden/publish/stego.ply
+    example: keyss info runs/hidden/publish/model.ply
     """
     from keyss.cli.tables import print_info, print_json
     from keyss.runs.describe import info as describe

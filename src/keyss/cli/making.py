@@ -49,7 +49,7 @@ def demo(
         {
             "comparison.png": "everything in one picture: look here first",
             "index.html": "the published model in a browser: type the key there",
-            "publish/stego.ply": "the published model: opens in any 3DGS viewer",
+            "publish/model.ply": "the published model: opens in any 3DGS viewer",
             "secret.ply": "the secret that the key revealed from it",
             "web.spz": "both for the web: hidden to survive conversion, then converted",
             "key.txt": "the key of this demo, which is public",
@@ -171,7 +171,7 @@ def convert(
 
     example: keyss convert cover.ply cover.spz
 
-    example: keyss convert stego.ply stego.sog --key-file key.txt --dry-run
+    example: keyss convert model.ply model.sog --key-file key.txt --dry-run
     """
     check_there(model, *key_file)
     import sys

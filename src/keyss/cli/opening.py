@@ -40,9 +40,9 @@ def reveal(
 ) -> None:
     """Reveal the secret that a key opens.
 
-    example: keyss reveal runs/hidden/publish/stego.ply --key-file key.txt -o secret.ply
+    example: keyss reveal runs/hidden/publish/model.ply --key-file key.txt -o secret.ply
 
-    example: keyss reveal - --key-file key.txt -o - < stego.ply > secret.ply
+    example: keyss reveal - --key-file key.txt -o - < model.ply > secret.ply
     """
     check_there(stego, handed, *key_file)
     import keyss
@@ -89,7 +89,7 @@ def verify(
 
     Exit status: 0 sound and complete, 3 the key opens nothing, 4 not sound or not complete.
 
-    example: keyss verify stego.ply --key-file key.txt
+    example: keyss verify model.ply --key-file key.txt
     """
     check_there(model, key_file)
     import keyss

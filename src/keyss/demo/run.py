@@ -53,7 +53,7 @@ def run_demo(
     """Hide one scene in the other, open it, and write a comparison picture and a viewer page to `out`.
 
     `width`: of the photos in pixels, if smaller than they are. The key is `demo-key-SEED`, which is public.
-    On the CPU, the same seed gives the same `stego.ply` and `secret.ply`. Raises KeyssError and its children;
+    On the CPU, the same seed gives the same `model.ply` and `secret.ply`. Raises KeyssError and its children;
     on any exception, Ctrl-C included, the demo removes everything it wrote.
     """
     out = Path(out)

@@ -14,7 +14,7 @@ import numpy as np
 from PIL import Image
 from torch import Tensor
 
-from keyss.core.arrays import Bytes, Floats
+from keyss.core.arrays import Bytes, Floats, Numbers
 from keyss.core.errors import InputError, UsageError, import_extra
 from keyss.core.scene import Camera
 from keyss.files.atomic import write_bytes
@@ -22,6 +22,8 @@ from keyss.files.atomic import write_bytes
 # Only formats of photos: some of Pillow's others start external programs.
 _FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP")
 _MAX_PIXELS = 89_000_000  # just under Pillow's own limit for decompression bombs
+_ANY_PIXELS, _PER_BYTE = 24_000_000, 16  # pixels that any file may have, and that each of its bytes may give
+_BAND = 1 << 18  # pixels that are converted at a time
 SUFFIX = ".mp4"
 _CODECS = (("libx264", {"crf": "18", "preset": "medium"}), ("mpeg4", {"qscale": "3"}))
 
@@ -29,7 +31,8 @@ _CODECS = (("libx264", {"crf": "18", "preset": "medium"}), ("mpeg4", {"qscale": 
 def open_image(path: Path) -> Image.Image:
     """Open an image without decoding its pixels.
 
-    Raises InputError if the file is missing, is not an image or has more than 89 million pixels.
+    Raises InputError if the file is missing, is not an image, or has more than 89 million pixels or more than
+    its bytes can hold.
     """
     try:
         image = Image.open(path, formats=_FORMATS)
@@ -43,10 +46,11 @@ def open_image(path: Path) -> Image.Image:
             raise InputError(f"{path}: expected an image ({kinds}), found an empty file") from error
         reason = getattr(error, "strerror", None) or error
         raise InputError(f"{path}: expected an image ({kinds}), but it cannot be read: {reason}") from error
-    if image.width * image.height > _MAX_PIXELS:
+    limit = min(_MAX_PIXELS, max(_ANY_PIXELS, _PER_BYTE * os.path.getsize(path)))
+    if image.width * image.height > limit:
         image.close()
         raise InputError(
-            f"{path}: expected an image of at most {_MAX_PIXELS:,} pixels, found {image.width}x{image.height}"
+            f"{path}: expected an image of at most {limit:,} pixels, found {image.width}x{image.height}"
         )
     return image
 
@@ -110,15 +114,23 @@ def png_bytes(image: Tensor) -> bytes:
 
 
 def _to_rgb(image: Image.Image, background: Floats) -> Bytes:
+    rgb = np.empty((image.height, image.width, 3), np.uint8)
+    rows = max(1, _BAND // image.width)
+    for top in range(0, image.height, rows):
+        end = min(top + rows, image.height)
+        rgb[top:end] = _rows_to_rgb(image.crop((0, top, image.width, end)), background)
+    return rgb
+
+
+def _rows_to_rgb(image: Image.Image, background: Floats) -> Numbers:
     if image.mode.startswith("I"):  # 16-bit grey, which Pillow would clip instead of scale
         grey = np.asarray(image, dtype=np.float64).clip(0, 65535)
-        return np.repeat(np.rint(grey / 257).astype(np.uint8)[:, :, None], 3, axis=2)
+        return np.rint(grey / 257)[:, :, None]
     if image.has_transparency_data:
         rgba = np.asarray(image.convert("RGBA"), dtype=np.float32)
         alpha = rgba[:, :, 3:] / 255
-        mixed = rgba[:, :, :3] * alpha + 255 * background * (1 - alpha)
-        return np.rint(mixed).astype(np.uint8)
-    return np.array(image.convert("RGB"), dtype=np.uint8)
+        return np.rint(rgba[:, :, :3] * alpha + 255 * background * (1 - alpha))
+    return np.asarray(image.convert("RGB"))
 
 
 def check_video(path: Path | str) -> None:

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from keyss.core.gaussians import SH_C0, Gaussians
+from keyss.core.neighbours import nearest_neighbours
 from keyss.core.scene import Scene, camera_positions, focus_point
 from keyss.fitting.adam import RowAdam
 from keyss.fitting.config import FitConfig
@@ -65,15 +66,12 @@ def initial_gaussians(
 
     points [P, 3] and colors [P, 3] uint8; `limit` of them are sampled if there are more.
     """
-    from scipy.spatial import cKDTree  # slow to import, and only a start from points needs it
-
     if len(points) > limit:
         chosen = torch.randperm(len(points), generator=generator)[:limit].sort().values
         points, colors = points[chosen], colors[chosen]
     count = len(points)
     coordinates = points.double().numpy()
-    neighbours = min(4, count)
-    distances = cKDTree(coordinates).query(coordinates, k=neighbours)[0].reshape(count, neighbours)
+    distances = nearest_neighbours(coordinates, min(4, count))[0]
     spacing = torch.from_numpy(distances[:, 1:]).square().mean(1).sqrt() if count > 1 else torch.ones(1)
     sh = torch.zeros(count, (sh_degree + 1) ** 2, 3)
     sh[:, 0] = (colors.float() / 255 - 0.5) / SH_C0

@@ -25,9 +25,9 @@ OVERHEAD = 4 + 16  # length of the compressed data, and the tag
 _NONCE = bytes(12)
 
 
-def bucket(size: int) -> int:
-    """`size` rounded up to a multiple of an eighth of the power of two above it, and to at least 4096."""
-    step = max(SMALLEST_BUCKET, 1 << max(0, (size - 1).bit_length() - 3))
+def bucket(size: int, smallest: int = SMALLEST_BUCKET) -> int:
+    """`size` rounded up to a multiple of an eighth of the power of two above it, or of `smallest`."""
+    step = max(smallest, 1 << max(0, (size - 1).bit_length() - 3))
     return -(-size // step) * step
 
 

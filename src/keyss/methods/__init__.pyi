@@ -15,6 +15,7 @@ from .carry.room import (
     SecretSize as SecretSize,
     of_degree as of_degree,
 )
+from .decoy import Decoy as Decoy
 from .dither import dither_model as dither_model
 from .keyss.combined import CombinedPoses as CombinedPoses, PlacedScene as PlacedScene
 from .keyss.decoder import (
@@ -32,13 +33,7 @@ from .keyss.options import (
 )
 from .keyss.secret import DECODERS as DECODERS, KeyssSecret as KeyssSecret, choose_anchors as choose_anchors
 from .keyss.training import KeyssTraining as KeyssTraining
-from .opened import (
-    Decoy as Decoy,
-    Frame as Frame,
-    HiddenFile as HiddenFile,
-    Opened as Opened,
-    Remains as Remains,
-)
+from .opened import Frame as Frame, HiddenFile as HiddenFile, Opened as Opened, Remains as Remains
 from .peers.method import PeerOptions as PeerOptions
 from .plain_models import Bound as Bound, with_plain_models as with_plain_models
 from .records.embedding import (

@@ -72,7 +72,7 @@ def open_model(stego: Gaussians, key: str, *, decoy: bool = False) -> Opened:
     key that opens nothing then gives a `Decoy`, else raises WrongKeyError. Raises InputError for damage.
     """
     from keyss.channels import open_content, quick_attempt
-    from keyss.methods.opened import Decoy
+    from keyss.methods.decoy import Decoy
 
     if not decoy:
         return _unpacked(open_content(stego, key))
@@ -80,7 +80,7 @@ def open_model(stego: Gaussians, key: str, *, decoy: bool = False) -> Opened:
     if attempt is None:
         raise WrongKeyError()
     if attempt.content is None:
-        return Decoy.of(stego, attempt.key, appended=attempt.appended)
+        return Decoy.of(stego, attempt.key, appended=attempt.appended, records=attempt.records)
     return _unpacked(attempt.content)
 
 

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from keyss.core.errors import InputError, UsageError
+from keyss.files.formats.decoded import load_tensors
 
 _ENTRY = "keyss"
 # What reading a damaged header or damaged tensors can raise.
@@ -45,7 +46,7 @@ def unpack_tensors(
 
     `kind`: the class of the header, which has its types and bounds. Raises InputError for another version.
     """
-    tensors = safetensors.torch.load(data)  # checks the sizes
+    tensors = load_tensors(data)
     size = int.from_bytes(data[:8], "little")
     outer = msgspec.json.decode(data[8 : 8 + size], type=dict[str, msgspec.Raw])
     text = msgspec.json.decode(outer["__metadata__"], type=dict[str, str])[_ENTRY].encode()

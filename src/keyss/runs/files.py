@@ -18,9 +18,9 @@ from keyss.files.models import DECODED_SUFFIX, is_model_path, known_suffixes, re
 from keyss.methods.handed import SUFFIX
 from keyss.runs.folder import PRIVATE, PUBLISH
 
-STEGO = f"{PUBLISH}/stego.ply"
+STEGO = f"{PUBLISH}/model.ply"  # a name that tells nothing
 # In any format.
-STEGOS = (STEGO, *(f"{PUBLISH}/stego{suffix}" for suffix in (*SUFFIXES.values(), DECODED_SUFFIX)))
+STEGOS = (STEGO, *(f"{PUBLISH}/model{suffix}" for suffix in (*SUFFIXES.values(), DECODED_SUFFIX)))
 MODEL = "model.ply"  # of a plain fit
 CONFIG, METRICS, REPORT = f"{PRIVATE}/config.json", f"{PRIVATE}/metrics.json", f"{PRIVATE}/report.html"
 HANDED = f"{PRIVATE}/hand-over"  # for those who may see a secret
@@ -43,8 +43,8 @@ def model_in(folder: Path) -> Path | None:
 def stego_name(stego: Gaussians) -> str:
     """The name of the file of a published model in the folder of a run."""
     if isinstance(stego, DecodedGaussians):
-        return f"{PUBLISH}/stego{DECODED_SUFFIX}"
-    return f"{PUBLISH}/stego{suffix_of(stego)}"
+        return f"{PUBLISH}/model{DECODED_SUFFIX}"
+    return f"{PUBLISH}/model{suffix_of(stego)}"
 
 
 def stego_in(folder: Path) -> Path:

@@ -1,14 +1,12 @@
 """A page of this machine that shows a training while it runs.
 
 While nobody watches, nothing is copied. While the page polls, the model is copied between two steps, at most
-every few seconds and for at most a fiftieth of the time; the server's thread encodes the copy. The URL has a
-random part, without which other users of the machine get nothing: the model may be a secret.
+every few seconds and for at most a fiftieth of the time; the server's thread encodes the copy.
 """
 
 from __future__ import annotations
 
 import json
-import secrets
 import threading
 import time
 from collections.abc import Callable
@@ -52,8 +50,7 @@ class LiveTraining:
         contents = {_STATE: ("application/json", self._state)}
         for side in ("published", "secret"):
             contents[f"{_STATE}/{side}.ply"] = ("application/octet-stream", self._opens(side))
-        folder = f"/{secrets.token_urlsafe(16)}/"
-        self._server = PageServer(served_page("keyss-live", _STATE, look or {}), contents, folder=folder)
+        self._server = PageServer(served_page("keyss-live", _STATE, look or {}), contents)
         self._thread = threading.Thread(target=self._server.run, daemon=True)
         self._timer = timer
         self._progress = _NO_PROGRESS

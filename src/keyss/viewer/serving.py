@@ -1,7 +1,13 @@
-"""Serves the page over HTTP, by default on this machine only."""
+"""Serves the page over HTTP, by default on this machine only.
+
+The URL has a random part, without which other users of the machine get nothing: the model may be a secret.
+"""
 
 from __future__ import annotations
 
+import ipaddress
+import re
+import secrets
 import shutil
 import socket
 from collections.abc import Callable, Mapping
@@ -17,7 +23,6 @@ from keyss.viewer.look import Look
 from keyss.viewer.page import SCRIPT, STYLE, asset, readable, served_page, served_policy
 
 LOCALHOST = "127.0.0.1"
-_LOCAL_NAMES = {"127.0.0.1", "localhost", "::1"}
 # By path: the media type, and a function that opens the content or raises OSError.
 Contents = Mapping[str, tuple[str, Callable[[], BinaryIO]]]
 
@@ -29,34 +34,40 @@ class _ServerIPv6(ThreadingHTTPServer):
 class PageServer:
     """Serves the page and `contents`, and nothing else."""
 
-    def __init__(
-        self, page: bytes, contents: Contents, host: str = LOCALHOST, port: int = 0, folder: str = "/"
-    ) -> None:
-        """`port` 0 takes any free port. `folder` is the prefix of all paths, with both slashes.
-
-        Raises OutputError if the port is in use.
-        """
+    def __init__(self, page: bytes, contents: Contents, host: str = LOCALHOST, port: int = 0) -> None:
+        """`port` 0 takes any free port. Raises OutputError if the port is in use."""
         application: Contents = {
             "": ("text/html; charset=utf-8", lambda: BytesIO(page)),
             SCRIPT: ("text/javascript; charset=utf-8", lambda: BytesIO(asset(SCRIPT))),
             STYLE: ("text/css; charset=utf-8", lambda: BytesIO(asset(STYLE))),
         }
-        everything = {folder + name: content for name, content in {**application, **contents}.items()}
+        self._folder = f"/{secrets.token_urlsafe(16)}/"
+        everything = {self._folder + name: each for name, each in {**application, **contents}.items()}
         everything["/favicon.ico"] = ("image/x-icon", lambda: BytesIO())
-        self._folder = folder
         try:
             kind = _ServerIPv6 if ":" in host else ThreadingHTTPServer
-            self._server = kind((host, port), _handler(everything, host in _LOCAL_NAMES))
+            self._server = kind((host, port), BaseHTTPRequestHandler)
         except (OSError, OverflowError) as error:
             raise OutputError(f"cannot serve on {host}, port {port}: {error}") from error
         self._server.daemon_threads = True
+        self._ip = ipaddress.ip_address(str(self._server.server_address[0]))
+        self._server.RequestHandlerClass = _handler(everything, self._names(host))
 
     @property
     def address(self) -> str:
-        """The URL of the page."""
-        host, port = self._server.server_address[:2]
-        name = f"[{host!s}]" if ":" in str(host) else host
-        return f"http://{name!s}:{port}{self._folder}"
+        """The URL of the page, which cannot be guessed."""
+        return f"http://{_in_url(self._ip)}:{self._server.server_address[1]}{self._folder}"
+
+    @property
+    def is_local(self) -> bool:
+        """True if only this machine can connect."""
+        return self._ip.is_loopback
+
+    def _names(self, host: str) -> set[str] | None:
+        """The hosts whose requests are answered; None for all, where the server listens on all addresses."""
+        if self._ip.is_unspecified:
+            return None
+        return {host.lower(), _in_url(self._ip), *(["localhost"] if self.is_local else [])}
 
     def run(self) -> None:
         """Serve until another thread calls `close`, or a signal ends it."""
@@ -85,19 +96,20 @@ class ModelServer(PageServer):
         super().__init__(page, {f"model/{file.name}": ("application/octet-stream", file.open)}, host, port)
 
 
-def _handler(contents: Contents, local: bool) -> type[BaseHTTPRequestHandler]:
+def _in_url(ip: ipaddress.IPv4Address | ipaddress.IPv6Address) -> str:
+    return f"[{ip}]" if ip.version == 6 else str(ip)
+
+
+def _handler(contents: Contents, names: set[str] | None) -> type[BaseHTTPRequestHandler]:
     class Handler(BaseHTTPRequestHandler):
         server_version, sys_version = "keyss", ""
         timeout = 30
 
         def do_GET(self) -> None:
-            try:
-                host = urlsplit(f"//{self.headers.get('Host', '')}").hostname
-            except ValueError:
-                self.send_error(HTTPStatus.BAD_REQUEST)
-                return
-            # DNS rebinding: another site's name resolves to this server, whose model it must not read.
-            if local and host not in _LOCAL_NAMES:
+            # DNS rebinding: another site's name resolves to this server, whose model it must not read. The
+            # port is that of a tunnel, if there is one.
+            hosts = [re.sub(":[0-9]+$", "", each.lower()) for each in self.headers.get_all("Host", [])]
+            if names is not None and (len(hosts) != 1 or hosts[0] not in names):
                 self.send_error(HTTPStatus.FORBIDDEN)
                 return
             content = contents.get(unquote(urlsplit(self.path).path))

@@ -16,6 +16,7 @@ from hypothesis import given, settings, strategies as st
 from keyss.channels import APPENDED, AppendedReader, Payload
 from keyss.channels.appended import pilots
 from keyss.channels.appended.lattice import WORD_BITS, to_gaussians
+from keyss.channels.base import pack_payload
 from keyss.core import (
     DRAWN_OPACITY,
     Gaussians,
@@ -28,6 +29,7 @@ from keyss.core import (
 )
 from keyss.files import read_model, write_model
 from keyss.keys import derivation
+from keyss.keys.encryption import compressed_size
 from keyss.measure import cropping, fewer_harmonics, half_floats, random_pruning
 from keyss.rendering import psnr_between
 from measure.lifelike import lifelike, turned
@@ -69,7 +71,16 @@ def test_every_size_comes_back(cover: Gaussians, size: int, seed: int) -> None:
     reader = AppendedReader.of(stego)
     assert reader is not None
     assert reader.open(KEY) == Payload("carry", data)
-    assert abs(len(stego) - len(cover) - APPENDED.appended(size)) < 100
+    packed = compressed_size(pack_payload(Payload("carry", data)))
+    assert len(stego) - len(cover) == APPENDED.appended([packed])
+
+
+def test_how_many_are_appended_tells_neither_a_size_nor_how_many_secrets_there_are() -> None:
+    sizes = range(200, 100_000, 61)
+    alone = {APPENDED.appended([size]) for size in sizes}
+    assert len({APPENDED.appended([size]) for size in range(40_000, 80_000, 61)}) <= 9
+    assert {APPENDED.appended([size, 300]) for size in sizes if size < 60_000} <= alone
+    assert {APPENDED.appended([size, size // 2, 900]) for size in sizes if size < 40_000} <= alone
 
 
 def test_the_cover_stays_and_looks_the_same(cover: Gaussians, stego: Gaussians) -> None:

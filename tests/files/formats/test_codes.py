@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import struct
+import zlib
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
@@ -44,6 +47,37 @@ def test_extensions_of_an_spz_are_kept() -> None:
     for version in (3, 4):
         codes = replace(random_spz(np.random.default_rng(0), version, 9, 3), flags=2, extensions=b"\1\2\3")
         assert SpzCodes.parse(codes.serialise()) == codes
+
+
+def settings_of(data: bytes) -> list[tuple[int, int]]:
+    """Levels and memory (zlib's `memLevel`) with which a gzip file is what zlib makes of its content."""
+    content, found = zlib.decompress(data, 31), []
+    for level, memory in product(range(1, 10), (8, 9)):
+        packer = zlib.compressobj(level, zlib.DEFLATED, -15, memory)
+        if packer.compress(content) + packer.flush() == data[10:-8]:
+            found.append((level, memory))
+    return found
+
+
+@pytest.mark.parametrize(("level", "memory"), [(6, 9), (6, 8), (9, 9), (1, 8)])
+def test_an_spz_is_compressed_again_as_it_was(level: int, memory: int) -> None:
+    """Otherwise compressing its content once more would tell that it was changed."""
+    codes = random_spz(np.random.default_rng(0), 3, 30_000, 3)
+    content = zlib.decompress(codes.serialise(), 31)
+    packer = zlib.compressobj(level, zlib.DEFLATED, -15, memory)
+    head = b"\x1f\x8b\x08\0" + b"\x12\x34\x56\x78" + b"\0\xff"  # with a time and a system
+    end = struct.pack("<II", zlib.crc32(content), len(content))
+    read = SpzCodes.parse(head + packer.compress(content) + packer.flush() + end)
+    again = replace(read, alphas=read.alphas ^ 1).serialise()
+    assert again[:10] == head
+    assert (level, memory) in settings_of(again)
+    assert SpzCodes.parse(again) == replace(read, alphas=read.alphas ^ 1)
+
+
+def test_a_new_spz_is_compressed_as_by_niantics_library() -> None:
+    found = settings_of(SpzCodes.quantise(model_of(20_000, 1)).serialise())
+    assert (6, 9) in found
+    assert (6, 8) not in found
 
 
 @pytest.mark.parametrize("version", [3, 4])

@@ -10,6 +10,7 @@ import time
 import tracemalloc
 import zipfile
 from collections.abc import Callable
+from copy import copy
 from dataclasses import replace
 from pathlib import Path
 
@@ -23,6 +24,7 @@ from files.formats.examples import model_of
 from keyss.core import Gaussians, InputError
 from keyss.files import model_bytes, model_of_bytes, read_model, write_model
 from keyss.files.formats.spz import SpzCodes
+from keyss.methods.tensors import Header, unpack_tensors
 from mutations import attempt, damaged, examples
 
 MODEL = model_of(60, 1)
@@ -46,7 +48,7 @@ def test_damaged_files(name: str) -> None:
     for data in examples()[name]:
         assert attempt(name, data) is None
         for number in range(150):
-            mutated = damaged(data, np.random.default_rng([7, number]))
+            mutated = damaged(name, data, np.random.default_rng([7, number]))
             assert attempt(name, mutated) is None, number
 
 
@@ -110,6 +112,21 @@ def test_a_zstd_bomb() -> None:
     tracemalloc.stop()
 
 
+def test_a_zstd_window_that_nothing_needs() -> None:
+    codes = replace(SpzCodes.quantise(MODEL), version=4)
+    data = bytearray(codes.serialise())
+    assert data[128:134] == b"\x28\xb5\x2f\xfd" + data[132:134]  # the first frame
+    flags, run = 0, struct.pack("<I", 1 | 1 << 1 | 540 << 3)[:3] + b"\0"
+    for exponent, is_fine in ((13, True), (17, False)):  # 8 MiB, 128 MiB
+        frame = b"\x28\xb5\x2f\xfd" + bytes([flags, exponent << 3]) + run
+        old = struct.unpack_from("<Q", data, 32)[0]
+        changed = data[:32] + struct.pack("<Q", len(frame)) + data[40:128] + frame + data[128 + old :]
+        if is_fine:
+            model_of_bytes("a.spz", bytes(changed))
+        else:
+            refused("a.spz", bytes(changed), "damaged SPZ")
+
+
 def archive(files: dict[str, bytes], compression: int = zipfile.ZIP_STORED) -> bytes:
     data = io.BytesIO()
     with zipfile.ZipFile(data, "w", compression) as found:
@@ -136,9 +153,23 @@ def test_a_zip_bomb() -> None:
     inside = contents(model_bytes("a.sog", MODEL))
     for name in ("meta.json", "means_l.webp"):
         bomb = archive(inside | {name: bytes(200 * MEGABYTE)}, zipfile.ZIP_DEFLATED)
-        refused("a.sog", bomb, "unpacks to 209,715,200 bytes")
+        refused("a.sog", bomb, "bytes that unpack to 209,7")
     lzma = archive(inside, zipfile.ZIP_LZMA)
     refused("a.sog", lzma, "unsupported ZIP compression")
+
+
+def test_a_zip_bomb_behind_a_directory_that_lies() -> None:
+    """A file that claims 4 GB does not make room for others, nor does one that is listed many times."""
+    inside = contents(model_bytes("a.sog", MODEL)) | {"means_l.webp": bytes(200 * MEGABYTE)}
+    bomb = bytearray(archive(inside | {"junk": b""}, zipfile.ZIP_DEFLATED))
+    struct.pack_into("<I", bomb, bomb.rindex(b"PK\1\2") + 20, 0xFFFFFFFE)  # packed bytes of the last one
+    refused("a.sog", bytes(bomb), "bytes that unpack to 209,7")
+    data = io.BytesIO()
+    with zipfile.ZipFile(data, "w", zipfile.ZIP_DEFLATED) as found:
+        for name, content in contents(model_bytes("a.sog", MODEL)).items():
+            found.writestr(name, content)
+        found.filelist += [copy(found.filelist[0]) for _ in range(51)]
+    refused("a.sog", data.getvalue(), "two of its files are at the same place")
 
 
 def webp(width: int, height: int) -> bytes:
@@ -263,6 +294,21 @@ def test_a_gltf_that_repeats_its_gaussians_or_their_bytes() -> None:
 
     refused("a.glb", with_json(with_nodes), "over and over", limit=32 * MEGABYTE)
     refused("a.glb", with_json(with_shared_bytes, model_of(60, 3)), "over and over")
+
+
+def test_a_gltf_of_many_empty_nodes() -> None:
+    data = with_json(lambda gltf: gltf.update(nodes=[{}] * 10**6))
+    refused("a.glb", data, "expected JSON of at most 1,048,576 bytes, found")
+
+
+def test_many_tensors_of_no_bytes() -> None:
+    """Such as a file that a key opens may announce, where 64 MiB take 1 MiB of the published model."""
+    empty = {f"{i}": {"dtype": "F32", "shape": [0], "data_offsets": [0, 0]} for i in range(20_000)}
+    header = json.dumps(empty).encode()
+    data = struct.pack("<Q", len(header)) + header
+    refused("a.3dgs.safetensors", data, "a header of .* more than the")
+    with pytest.raises(ValueError, match="a header of"):
+        unpack_tensors(data, Header, "test", 1)
 
 
 def test_nodes_move_gaussians() -> None:

@@ -165,6 +165,21 @@ def test_we_read_gsplys_spz(tmp_path: Path, version: int, degree: int) -> None:
     assert_close(read_model(tmp_path / "a.spz"), theirs, 1e-5)
 
 
+def test_gsplys_spz_stays_as_it_is_but_for_its_codes(tmp_path: Path) -> None:
+    write_model(tmp_path / "in.ply", model_of(2000, 2))
+    gsply.write_spz(tmp_path / "a.spz", gsply.plyread(tmp_path / "in.ply"), version=3)
+    data = (tmp_path / "a.spz").read_bytes()
+    assert SpzCodes.parse(data).serialise() == data
+
+
+def test_splat_transforms_spz_stays_as_it_is_but_for_its_codes(
+    splat_transform: Transform, tmp_path: Path
+) -> None:
+    write_model(tmp_path / "in.ply", model_of(2000, 2))
+    data = splat_transform(tmp_path / "in.ply", tmp_path / "a.spz").read_bytes()
+    assert SpzCodes.parse(data).serialise() == data
+
+
 def test_we_read_gsplys_spz_of_version_2(tmp_path: Path) -> None:
     """It reads this version and does not write it."""
     codes = SpzCodes.quantise(model_of(300, 1))

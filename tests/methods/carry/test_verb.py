@@ -49,7 +49,7 @@ def test_hide_and_reveal_files(run: Run, tmp_path: Path) -> None:
     assert "Chance level" not in out
     names = {str(path.relative_to(tmp_path / "out")) for path in (tmp_path / "out").rglob("*.*")}
     assert names == {
-        "publish/stego.ply",
+        "publish/model.ply",
         *("private/metrics.json", "private/config.json", "private/manifest.json"),
     }
     metrics = json.loads((tmp_path / "out/private/metrics.json").read_text())
@@ -59,7 +59,7 @@ def test_hide_and_reveal_files(run: Run, tmp_path: Path) -> None:
     assert metrics["secrets"][0]["psnr"] > 55
     assert metrics["secrets"][0]["psnr"] > metrics["chance_level"][0] + 20
     assert metrics["wrong_key"] is None
-    stego = tmp_path / "out/publish/stego.ply"
+    stego = tmp_path / "out/publish/model.ply"
     assert run("reveal", stego, "--key-file", "key", "-o", tmp_path / "secret.ply")[0] == 0
     assert len(read_model(tmp_path / "secret.ply")) == 900
     assert run("reveal", stego, "--key-file", "other", "-o", tmp_path / "none.ply")[0] == 3
@@ -131,7 +131,7 @@ def test_from_photos_a_model_is_fitted_first_and_photos_judge(tmp_path: Path) ->
     (secret,), (plain,) = result.metrics.secrets, result.metrics.baseline.secrets
     assert plain is not None
     assert secret.psnr == pytest.approx(plain.psnr, abs=0.05)
-    revealed = keyss.reveal(tmp_path / "run/publish/stego.ply", KEY).gaussians
+    revealed = keyss.reveal(tmp_path / "run/publish/model.ply", KEY).gaussians
     assert (len(revealed),) == result.metrics.secret_gaussians
     with pytest.raises(UsageError, match="scenes in memory"):
         keyss.evaluate(tmp_path / "run", [KEY])

@@ -1,4 +1,4 @@
-/** The form of both examples: `show` gets the address of a .ply of the model that the key opened in stego.ply. */
+/** The form of both examples: `show` gets the address of a .ply of the model that the key opened in model.ply. */
 export function openingForm(show) {
   const [form, status] = [document.querySelector('form'), document.querySelector('output')];
   const worker = new Worker('worker.js', { type: 'module' });
@@ -14,7 +14,7 @@ export function openingForm(show) {
   };
   form.onsubmit = async (event) => {
     event.preventDefault();
-    const bytes = new Uint8Array(await (await fetch('stego.ply')).arrayBuffer());
+    const bytes = new Uint8Array(await (await fetch('model.ply')).arrayBuffer());
     worker.postMessage({ bytes, key: form.elements.key.value });
   };
 }

@@ -8,7 +8,7 @@ import { damaged, InputError } from '../core/errors.ts';
 const [END, CENTRAL, LOCAL] = [0x06054b50, 0x02014b50, 0x04034b50];
 const MAX_MEMBERS = 64;
 const MAX_COMMENT = 65557; // bytes of the end of the directory, its comment included
-const SMALL = 1 << 20;
+export const SMALL = 1 << 20; // bytes that a member may unpack to in an archive of any size
 
 /** What gives a member by its name. Raises InputError for what is no whole archive. */
 export function openZip(bytes: Uint8Array): (name: string) => Promise<Uint8Array> {
@@ -31,12 +31,15 @@ export function openZip(bytes: Uint8Array): (name: string) => Promise<Uint8Array
     });
     at += 46 + nameSize + extra + comment;
   }
+  const whole = [...members.values()].reduce((sum, { size }) => sum + size, 0);
+  const places = new Set([...members.values()].map((each) => each.at));
+  if (places.size < members.size || whole > 2 * bytes.length + SMALL) throw damaged();
   return async (name) => {
     const found = members.get(name);
     if (!found || found.at + 30 > bytes.length || view.getUint32(found.at, true) !== LOCAL) throw damaged();
     const start = found.at + 30 + view.getUint16(found.at + 26, true) + view.getUint16(found.at + 28, true);
     const data = bytes.subarray(start, start + found.packed);
-    if (data.length !== found.packed || found.size > Math.max(SMALL, 2 * bytes.length)) throw damaged();
+    if (data.length !== found.packed) throw damaged();
     if (found.method === 0) return data;
     if (found.method === 8) return unpacked(data, 'deflate-raw', found.size);
     throw damaged();

@@ -107,10 +107,11 @@ export function readPly(bytes: Uint8Array): Gaussians {
   const rest = vertex?.properties.filter((each) => /^f_rest_[0-9]+$/.test(each.name)).length ?? 0;
   const shDegree = [0, 9, 24, 45].indexOf(rest);
   if (vertex === undefined || vertex.count === 0 || shDegree < 0) throw noModel();
+  const names = new Set(vertex.properties.map(({ name }) => name)); // rows without any take no bytes
+  if (!plyColumns(shDegree).every(({ name }) => names.has(name))) throw noModel();
   const found = emptyGaussians(vertex.count, shDegree);
   for (const { name, to, offset } of plyColumns(shDegree)) {
-    const values = column(bytes, header, vertex, name);
-    if (values === null) throw noModel();
+    const values = column(bytes, header, vertex, name)!;
     const width = found[to].length / found.count;
     for (let row = 0; row < values.length; row++) found[to][row * width + offset] = values[row];
   }

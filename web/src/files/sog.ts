@@ -3,7 +3,7 @@ import { damaged, InputError } from '../core/errors.ts';
 import { coefficients, emptyGaussians, type Gaussians } from '../core/gaussians.ts';
 import { fromSmallestThree, holds, logit } from './coded.ts';
 import { checkedFinite } from './ply.ts';
-import { type Decode, inBrowser, openZip, type Pixels, pixelsBy } from './packed.ts';
+import { type Decode, inBrowser, openZip, type Pixels, pixelsBy, SMALL } from './packed.ts';
 
 export const FINEST = 65535; // a position's largest code
 export const LARGEST = 252; // of the fourth byte of a quaternion: w, x, y or z is not stored
@@ -100,6 +100,7 @@ function dequantised(codes: SogCodes): Gaussians {
 
 function checkedMeta(bytes: Uint8Array, size: number): Meta {
   let meta: Meta;
+  if (bytes.length > SMALL) throw damaged();
   try {
     meta = JSON.parse(new TextDecoder().decode(bytes)) as Meta;
     if (meta.version !== 2) throw new InputError('This SOG is of a version that cannot be read.');

@@ -2,6 +2,7 @@
 import { halfFloat, viewOf } from '../core/bytes.ts';
 import { damaged } from '../core/errors.ts';
 
+const MAX_HEADER_BYTES = 1 << 17;
 const SIZES: Record<string, number> = { U8: 1, F16: 2, F32: 4 };
 
 /** Tensors of bytes, half or single precision, which are taken out one by one. */
@@ -16,7 +17,7 @@ export class Tensors {
   static of(data: Uint8Array): Tensors {
     if (data.length < 8) throw damaged();
     const size = Number(viewOf(data).getBigUint64(0, true));
-    if (size > data.length - 8) throw damaged();
+    if (size > Math.min(data.length - 8, MAX_HEADER_BYTES)) throw damaged();
     const { __metadata__, ...described } = objectOf(parsed(data.subarray(8, 8 + size)));
     return new Tensors(objectOf(__metadata__), new Map(Object.entries(described)), data.subarray(8 + size));
   }

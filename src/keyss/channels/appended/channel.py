@@ -4,7 +4,8 @@ They survive every publication format, and moving, rotating and scaling of the w
 that they are there; reading them takes the key. A payload is encrypted as a whole (ChaCha20-Poly1305 under a
 key that Argon2id gives with the file's salt), cut into packets, and given parity by Reed-Solomon in codewords
 of at most 8192 packets, any 5895 of which suffice. Every packet is a Gaussian. A header tells how many of
-them hold data.
+them hold data. Random words pad all that is appended to one of few numbers, which tell neither how large
+secrets are nor how many.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ import torch
 
 from keyss.channels.appended import packets, pilots
 from keyss.channels.appended.lattice import (
+    WORD_BITS,
     all_shifts,
     check_place,
     colours_of,
@@ -50,7 +52,7 @@ from keyss.core.arrays import Bits, Doubles, Integers
 from keyss.core.errors import KeyssWarning, UsageError, WrongKeyError
 from keyss.core.gaussians import Gaussians
 from keyss.keys.derivation import SALT_BYTES, DerivedKey, expand, stream
-from keyss.keys.encryption import OVERHEAD, compressed_size, decrypt, encrypt
+from keyss.keys.encryption import OVERHEAD, bucket, compressed_size, decrypt, encrypt
 
 # A quarter of the packets may be lost, and some of the others garbled, with so many deviations more. Longer
 # codewords need fewer packets and more time: these are of 8192.
@@ -59,6 +61,7 @@ _LEFT, _DEVIATIONS, _MAX_DATA = 0.74, 4.2, 5895
 _WIDE, _NARROW, _WIDE_PACKETS = 8, 6, 90_000
 _MAX_PACKETS = 1_000_000  # of data; a header tells up to 2^20
 MAX_BYTES = _MAX_PACKETS * _NARROW - OVERHEAD - METHOD_BYTES
+_STEP = 256  # Gaussians by which small numbers of appended ones differ
 _OVERHEAD = 128  # bytes of a payload beside its data, at most
 
 # Gaussians in which pilots are counted; places of the lattice that are tried then, with so many deviations
@@ -87,10 +90,10 @@ class Appended(Channel):
     def room(self, gaussians: int, sh_degree: int) -> Room:
         return Room(gaussians, MAX_BYTES, _OVERHEAD, grows=True)
 
-    def appended(self, size: int) -> int:
-        """Gaussians that a payload of `size` compressed bytes takes, alone in a model."""
-        own = packets.HEADERS + _codewords_for(size, alone=True).chunks
-        return own + pilots.count_for(own)
+    def appended(self, sizes: Sequence[int]) -> int:
+        """Gaussians that payloads of so many compressed bytes take together."""
+        alone = len(sizes) == 1
+        return _padded(sum(packets.HEADERS + _codewords_for(size, alone).chunks for size in sizes))
 
 
 APPENDED = Appended()
@@ -118,7 +121,11 @@ class AppendedCover:
             warnings.warn(_NOTICED, KeyssWarning, stacklevel=2)
         alone = len(keys) == 1
         words = [_words(*each, alone, random) for each in zip(keys, packed, strict=True)]
-        words.append(pilots.write(salt, pilots.count_for(sum(map(len, words))), random))
+        used = sum(map(len, words))
+        total = _padded(used)
+        words.append(pilots.write(salt, pilots.count_for(total), random))
+        rest = total - used - pilots.count_for(total)
+        words.append(random.integers(0, 2, (rest, WORD_BITS), np.uint8))
         every = in_order(np.concatenate(words))
         model = self.cover.detach().to("cpu")
         return Gaussians.cat([model, to_gaussians(every, own_frame(model), model.sh_degree)])
@@ -162,6 +169,14 @@ class AppendedReader(SaltedReader):
                 encrypted = _codewords(header, width).decode(numbers.astype(np.int64), data, errors=True)
                 return unpack_payload(decrypt(key.expand("appended/data", 32), encrypted, _ASSOCIATED))
         raise WrongKeyError()
+
+
+def _padded(used: int) -> int:
+    """How many Gaussians are appended where `used` carry data: one of few numbers, which says little."""
+    total = bucket(used, _STEP)
+    while total - pilots.count_for(total) < used:
+        total = bucket(total + 1, _STEP)
+    return total
 
 
 def _codewords_for(size: int, alone: bool) -> Codewords:

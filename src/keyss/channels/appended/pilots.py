@@ -28,7 +28,7 @@ from keyss.core.similarity import Similarity
 from keyss.keys.derivation import SALT_BYTES
 
 MIN = 128  # pilots of a model
-SHARE = 1 / 32  # of the other appended Gaussians
+SHARE = 1 / 33  # of the appended Gaussians
 _PUBLIC = np.uint64(0x6B65797373_617070)  # distinguishes this hash from others
 ONE_IN = 64  # one in so many random words is a pilot
 _PART_BITS, _PARTS = 16, SALT_BYTES // 2
@@ -47,9 +47,9 @@ class Found:
     salt: bytes
 
 
-def count_for(others: int) -> int:
-    """How many pilots belong to so many other appended Gaussians."""
-    return max(MIN, round(others * SHARE))
+def count_for(appended: int) -> int:
+    """How many of so many appended Gaussians are pilots."""
+    return max(MIN, round(appended * SHARE))
 
 
 def write(salt: bytes, count: int, random: np.random.Generator) -> Bits:

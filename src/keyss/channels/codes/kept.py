@@ -15,11 +15,11 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from keyss.channels.codes.fields import Field, Levels, carrying, sog_distances
 from keyss.channels.mixing import random_fractions, row_hashes
 from keyss.core.arrays import Doubles, Flags, Floats, Integers, Words
+from keyss.core.neighbours import nearest_neighbours
 from keyss.files.formats.common import Codes, morton_order
 from keyss.files.formats.compressed_ply import CompressedPlyCodes
 from keyss.files.formats.sog import SogCodes
@@ -62,7 +62,7 @@ def _alone(codes: Codes, fields: list[Field], random: Doubles) -> Flags:
     model = codes.dequantise()
     means, log_scales = (each.double().numpy() for each in (model.means, model.log_scales))
     sizes = np.exp(np.sort(log_scales, axis=1)[:, 1])
-    distance, near = cKDTree(means).query(means, k=min(_NEIGHBOURS + 1, len(means)))
+    distance, near = nearest_neighbours(means, min(_NEIGHBOURS + 1, len(means)))
     ratio = distance[:, 1] / sizes / _CLONES
     both = np.minimum(np.arange(len(means)), near[:, 1])  # of two nearest to each other, both or none
     alone: Flags = random[both] * (1 + ratio**3) < ratio**3

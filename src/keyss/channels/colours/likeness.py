@@ -16,9 +16,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from keyss.core.arrays import Doubles, Flags, Integers
+from keyss.core.neighbours import nearest_neighbours
 
 _NEIGHBOURS = 3  # in space
 _SIZES = (3e-6, 3e-4, 0.002, 0.008, 0.03, 0.12)  # of differences in colour, below which all count as the same
@@ -66,7 +66,7 @@ class Likeness:
         `example` [N, 3]: the colours with changes of this kind in greens and blues.
         """
         count = len(colours)
-        near = cKDTree(positions).query(positions, k=min(_NEIGHBOURS + 1, count))[1].reshape(count, -1)
+        near = nearest_neighbours(positions, min(_NEIGHBOURS + 1, count))[1]
         row = np.arange(count)
         nearest = _Pairs.of(row, near[:, 1], count)
         further = _Pairs.of(np.repeat(row, near.shape[1] - 2), near[:, 2:].ravel(), count)

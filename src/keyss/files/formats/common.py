@@ -73,7 +73,7 @@ class Codes(ABC):
     def __eq__(self, other: object) -> bool:
         if type(other) is not type(self):
             return NotImplemented
-        names = [each.name for each in fields(self)]  # type: ignore[arg-type]
+        names = [each.name for each in fields(self) if each.compare]  # type: ignore[arg-type]
         pairs = ((np.asarray(getattr(self, name)), np.asarray(getattr(other, name))) for name in names)
         return all(a.dtype == b.dtype and np.array_equal(a, b) for a, b in pairs)
 

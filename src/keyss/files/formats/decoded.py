@@ -20,6 +20,7 @@ from keyss.core.gaussians import Gaussians
 from keyss.files.formats.common import reason
 
 FORMAT = "keyss-decoded/1"
+_MAX_HEADER_BYTES = 1 << 17  # a tensor of no bytes takes 20 times its part of the header
 
 _NAMES = tuple(each.name for each in fields(Gaussians))
 
@@ -42,9 +43,17 @@ def write(model: DecodedGaussians) -> bytes:
 def read(data: bytes) -> Gaussians:
     """The model of `write`. Raises InputError."""
     try:
-        return _of_tensors(safetensors.torch.load(data))
+        return _of_tensors(load_tensors(data))
     except (safetensors.SafetensorError, ValueError, KeyError, IndexError, RuntimeError) as error:
         raise InputError(f"expected a model that a network decodes: {reason(error)}") from error
+
+
+def load_tensors(data: bytes) -> dict[str, Tensor]:
+    """The tensors of a safetensors file with a short header. Raises ValueError, and as the library does."""
+    size = int.from_bytes(data[:8], "little")
+    if size > _MAX_HEADER_BYTES:
+        raise ValueError(f"a header of {size:,} bytes, more than the {_MAX_HEADER_BYTES:,} expected")
+    return safetensors.torch.load(data)
 
 
 def _of_tensors(tensors: dict[str, Tensor]) -> DecodedGaussians:

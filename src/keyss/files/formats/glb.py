@@ -45,6 +45,7 @@ _FLOAT, _BYTE, _ARRAY_BUFFER, _POINTS = 5126, 5121, 34962, 0
 _COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 _TURN = (0.0, 0.0, 1.0, 0.0)  # 180 degrees about z, xyzw
+_MAX_JSON_BYTES = 1 << 20  # parsed, it takes up to 80 times as much
 _MAX_DEPTH = 64  # of nested nodes
 _MAX_PARTS = 64  # primitives with Gaussians
 _AGAIN = "damaged glTF: the same Gaussians over and over"
@@ -199,6 +200,8 @@ def _chunks(data: bytes) -> tuple[_Document, bytes]:
             raise InputError("not a whole .glb: a chunk is missing, cut short, or out of place")
         chunks.append(data[at : at + length])
         at += length
+    if len(chunks[0]) > _MAX_JSON_BYTES:
+        raise InputError(f"expected JSON of at most {_MAX_JSON_BYTES:,} bytes, found {len(chunks[0]):,}")
     try:
         return msgspec.json.decode(chunks[0], type=_Document), chunks[1]
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
@@ -233,7 +236,7 @@ def _transform(node: _Node) -> Doubles:
     try:
         if node.matrix is not None:
             transform = np.array(node.matrix, np.float64).reshape(4, 4).T
-        else:
+        elif node.rotation or node.scale or node.translation:  # slow
             rotation = Rotation.from_quat(node.rotation or [0, 0, 0, 1]).as_matrix()
             transform[:3, :3] = rotation * np.array(node.scale or [1, 1, 1], np.float64).reshape(3)
             transform[:3, 3] = node.translation or [0, 0, 0]

@@ -77,6 +77,8 @@ class _Version(msgspec.Struct):
 
 def read_meta(data: bytes) -> Meta:
     """A meta.json with all file names and bounds. Raises InputError."""
+    if len(data) > _MAX_META_BYTES:
+        raise InputError(f"expected a meta.json of at most {_MAX_META_BYTES:,} bytes, found {len(data):,}")
     try:
         version = msgspec.json.decode(data, type=_Version).version
         if version != 2:
@@ -94,28 +96,30 @@ def read_meta(data: bytes) -> Meta:
 
 
 def opened(data: bytes) -> Callable[[str], bytes]:
-    """A function that reads a file of the archive by name, unpacked to at most twice the archive's size.
+    """A function that reads a file of the archive by name. Raises InputError, as the function does.
 
-    Raises InputError, as the function does.
+    Together the files unpack to at most 1 MiB more than twice the bytes of the archive.
     """
     try:
         archive = zipfile.ZipFile(io.BytesIO(data))
     except _BROKEN as error:
         raise InputError(f"not a whole SOG: {reason(error)}") from error
-    if len(archive.infolist()) > _MAX_MEMBERS:
-        raise InputError(f"expected a SOG of at most {_MAX_MEMBERS} files, found {len(archive.infolist()):,}")
-    size = sum(info.compress_size for info in archive.infolist())
+    members = archive.infolist()
+    if len(members) > _MAX_MEMBERS:
+        raise InputError(f"expected a SOG of at most {_MAX_MEMBERS} files, found {len(members):,}")
+    if len({info.header_offset for info in members}) < len(members):
+        raise InputError("damaged SOG: two of its files are at the same place")
+    unpacked = sum(info.file_size for info in members)
+    if unpacked > 2 * len(data) + _MAX_META_BYTES:
+        raise InputError(f"damaged SOG: {len(data):,} bytes that unpack to {unpacked:,}")
 
     def read(name: str) -> bytes:
         try:
             info = archive.getinfo(name)
-            limit = max(_MAX_META_BYTES, 2 * size)
-            if info.file_size > limit:
-                raise InputError(f"damaged SOG: {name[:80]!r} unpacks to {info.file_size:,} bytes")
             if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
                 raise InputError(f"damaged SOG: {name[:80]!r} has an unsupported ZIP compression")
             with archive.open(info) as file:
-                return file.read(limit)
+                return file.read(info.file_size)
         except KeyError as error:
             raise InputError(
                 f"not a SOG: there is no {name[:80]!r} in the archive; unpack it if it is another"

@@ -8,12 +8,11 @@ The container is a header and six byte sections, compressed by gzip or, in versi
 
 from __future__ import annotations
 
-import gzip
 import struct
 import zlib
 from collections.abc import Sequence
-from dataclasses import dataclass
-from itertools import pairwise
+from dataclasses import dataclass, field
+from itertools import pairwise, product
 from typing import Self
 
 import numpy as np
@@ -37,6 +36,9 @@ from keyss.files.formats.common import (
 )
 
 GZIP, NGSP = b"\x1f\x8b", b"NGSP"
+_GZIP_HEADER = b"\x1f\x8b\x08\0\0\0\0\0\0\x03"  # without time and name, as zlib writes it
+_GZIP_BYTES, _PART = len(_GZIP_HEADER), 1 << 18
+_NIANTIC = 6, 9  # zlib's level and memory
 EXTENSIONS = 2  # flag: the file has extensions
 _MAX_EXTENSION_BYTES = 1 << 20
 MAX_FRACTIONAL_BITS = 24
@@ -44,7 +46,7 @@ _LEGACY = struct.Struct("<4sIIBBBB")  # magic, version, count, SH degree, fracti
 _HEADER = struct.Struct("<4sIIBBBBI12s")  # ..., flags, number of streams, offset of the table, reserved
 _ENTRY = struct.Struct("<QQ")  # of the table: compressed and uncompressed bytes
 _ZSTD_LEVEL = 12  # as in Niantic's library
-_ZSTD_WINDOW = 1 << 27
+_ZSTD_WINDOW = 1 << 23  # bytes that decoders should support (RFC 8878)
 VERSION = 3  # has 10-bit rotations, and more programs read it than the newer 4
 _FRACTIONAL_BITS = 12  # steps of 1/4096 world unit, as in Niantic's library
 MAX_POSITION = 2**23 - 1  # the largest code of a position
@@ -85,17 +87,53 @@ def unpack(data: bytes) -> tuple[Header, list[Bytes]]:
     raise InputError("not an SPZ file: it begins neither as gzip data nor with NGSP")
 
 
-def pack(header: Header, sections: Sequence[bytes]) -> bytes:
-    """A file of the six sections."""
+def pack(header: Header, sections: Sequence[bytes], like: bytes = b"") -> bytes:
+    """A file of the six sections, compressed as the file `like` of another version of the model was."""
     common = (NGSP, header.version, header.count, header.sh_degree, header.fractional_bits, header.flags)
     if header.version < 4:
-        return gzip.compress(_LEGACY.pack(*common, 0) + b"".join(sections) + header.extensions, 6, mtime=0)
+        content = _LEGACY.pack(*common, 0) + b"".join(sections) + header.extensions
+        return _gzip(content, like if like.startswith(GZIP) else b"")
     compressor = zstandard.ZstdCompressor(level=_ZSTD_LEVEL)
     streams = [(len(each), compressor.compress(each)) for each in sections if each]
     table = b"".join(_ENTRY.pack(len(packed), size) for size, packed in streams)
     at = _HEADER.size + len(header.extensions)
     start = _HEADER.pack(*common, len(streams), at, bytes(12)) + header.extensions
     return start + table + b"".join(packed for _, packed in streams)
+
+
+def _gzip(content: bytes, like: bytes) -> bytes:
+    """`content` in gzip, with the header and settings of `like`, else those of Niantic's library.
+
+    Other settings, which compressing once more reveals, would tell that the file was written again.
+    """
+    packer = _packer(*_settings_of(like))
+    header = like[:_GZIP_BYTES] if like and not like[3] else _GZIP_HEADER
+    end = struct.pack("<II", zlib.crc32(content), len(content) & 0xFFFFFFFF)
+    return header + packer.compress(content) + packer.flush() + end
+
+
+def _packer(level: int, memory: int) -> zlib._Compress:
+    return zlib.compressobj(level, zlib.DEFLATED, -zlib.MAX_WBITS, memory)
+
+
+def _settings_of(packed: bytes) -> tuple[int, int]:
+    """Level and memory with which zlib writes `packed`; those of Niantic's library if there are none."""
+    if packed and not packed[3]:  # no header with a name or other fields
+        content = zlib.decompress(packed, 31)
+        for settings in product((6, 9, *range(1, 6), 7, 8), (9, 8)):
+            if _is_packed_with(packed, content, settings):
+                return settings
+    return _NIANTIC
+
+
+def _is_packed_with(packed: bytes, content: bytes, settings: tuple[int, int]) -> bool:
+    packer, at = _packer(*settings), _GZIP_BYTES
+    for start in range(0, len(content), _PART):  # the first parts tell
+        part = packer.compress(content[start : start + _PART])
+        if not packed.startswith(part, at):
+            return False
+        at += len(part)
+    return packed.startswith(packer.flush(), at)
 
 
 def _unpack_gzip(data: bytes) -> tuple[Header, list[Bytes]]:
@@ -152,8 +190,9 @@ def _unpack_zstd(data: bytes) -> tuple[Header, list[Bytes]]:
 
 def _zstd(packed: bytes, size: int) -> Bytes:
     """[size] the first bytes of a stream. Raises InputError if there are fewer."""
+    unpacker = zstandard.ZstdDecompressor(max_window_size=max(_ZSTD_WINDOW, 2 * size))
     try:
-        with zstandard.ZstdDecompressor(max_window_size=_ZSTD_WINDOW).stream_reader(packed) as reader:
+        with unpacker.stream_reader(packed) as reader:
             body = reader.read(size)
     except zstandard.ZstdError as error:
         raise InputError(f"damaged SPZ: {reason(error)}") from error
@@ -192,6 +231,7 @@ class SpzCodes(Codes):
     rotations: Shorts
     sh: Bytes  # [N, K - 1, 3] harmonics in 128ths from -1 on
     extensions: bytes = b""  # kept, not parsed
+    packed: bytes = field(default=b"", repr=False, compare=False)  # the file that was read
 
     def __len__(self) -> int:
         return len(self.positions)
@@ -224,6 +264,7 @@ class SpzCodes(Codes):
             rotations=rotations,
             sh=sections[5].reshape(n, -1, 3),
             extensions=header.extensions,
+            packed=data,
         )
 
     def serialise(self) -> bytes:
@@ -241,7 +282,7 @@ class SpzCodes(Codes):
         sections = [fixed.tobytes(), self.alphas.tobytes(), self.colors.tobytes(), self.scales.tobytes()]
         degree = {0: 0, 3: 1, 8: 2, 15: 3}[self.sh.shape[1]]
         header = Header(self.version, n, degree, self.fractional_bits, self.flags, self.extensions)
-        return pack(header, [*sections, rotations, self.sh.tobytes()])
+        return pack(header, [*sections, rotations, self.sh.tobytes()], self.packed)
 
     @classmethod
     def quantise(cls, model: Gaussians, fractional_bits: int | None = None) -> Self:

@@ -15,11 +15,11 @@ from collections.abc import Iterator
 from itertools import combinations
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from keyss.channels import usable_carriers
 from keyss.core.arrays import Doubles, Flags, Integers, Words32, doubles
 from keyss.core.gaussians import Gaussians
+from keyss.core.neighbours import nearest_neighbours
 from keyss.measure.stealth.statistic import (
     ATTRIBUTES,
     NOTHING,
@@ -112,8 +112,7 @@ def _within(words: BitPatterns, attributes: tuple[int, ...]) -> Iterator[tuple[W
 def nearest_pairs(positions: Doubles, neighbours: int) -> Integers:
     """[P, 2] each Gaussian and its nearest `neighbours`, every pair once."""
     count = min(neighbours + 1, len(positions))
-    _, near = cKDTree(positions).query(positions, k=count)
-    near = near.reshape(len(positions), -1)
+    _, near = nearest_neighbours(positions, count)
     pairs = np.stack([np.repeat(np.arange(len(near)), near.shape[1]), near.ravel()], axis=1)
     pairs = np.sort(pairs[pairs[:, 0] != pairs[:, 1]], axis=1)
     return np.unique(pairs, axis=0)

@@ -11,10 +11,10 @@ from collections.abc import Iterator
 
 import numpy as np
 from scipy.signal import find_peaks
-from scipy.spatial import cKDTree
 
 from keyss.core.arrays import Doubles, Integers, doubles
 from keyss.core.gaussians import Gaussians
+from keyss.core.neighbours import nearest_neighbours
 from keyss.measure.stealth.statistic import BitPatterns, Statistic, portion
 
 _QUANTILES = (0.05, 0.1, 0.25, 0.5, 0.9)
@@ -46,7 +46,7 @@ def colours(model: Gaussians, words: BitPatterns) -> dict[str, Statistic]:
     if len(values) < _MIN_PAIRS:
         return statistics
     positions = np.nan_to_num(doubles(model.means))
-    _, near = cKDTree(positions).query(positions, k=2)
+    _, near = nearest_neighbours(positions, 2)
     rows = np.arange(len(values))
     pairs = {"neighbours": np.stack([rows, near[:, 1]], axis=1), "rows": np.stack([rows[1:], rows[:-1]], 1)}
     for name, pair in pairs.items():

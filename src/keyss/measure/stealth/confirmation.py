@@ -8,11 +8,11 @@ hold something else.
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial import cKDTree
 from scipy.stats import ks_2samp, spearmanr
 
 from keyss.core.arrays import Doubles, Numbers, doubles
 from keyss.core.gaussians import Gaussians
+from keyss.core.neighbours import nearest_neighbours
 from keyss.measure.stealth.colours import INVISIBLE, shapes_of
 from keyss.measure.stealth.statistic import BitPatterns
 
@@ -85,7 +85,7 @@ def _by_rows(own: Doubles, theirs: Doubles) -> dict[str, float]:
     own = own[:: max(1, -(-len(own) // _QUERIES))]
     if min(len(own), len(theirs)) < _MIN_COUNT:
         return {"rows at the same place": at_ends}
-    distance, nearest = cKDTree(theirs).query(own)
+    distance, nearest = (each[:, 0] for each in nearest_neighbours(own, 1, theirs))
     best = distance <= np.quantile(distance, 0.25)
     in_order = _correlation(np.flatnonzero(best), nearest[best])
     return {

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import stat
 import sys
 import tempfile
 from contextlib import suppress
@@ -72,9 +73,10 @@ def _compiled(function: Any, fastmath: bool | set[str], forceinline: bool = Fals
 
 @cache
 def cache_folder() -> Path | None:
-    """The cache folder for kernels of exactly these sources; None if nothing is writable.
+    """The cache folder for kernels of exactly these sources; None if there is no safe place.
 
-    It is in the first writable of `NUMBA_CACHE_DIR`, `__pycache__` beside this file, and the user's cache.
+    It is in the first of `NUMBA_CACHE_DIR`, `__pycache__` beside this file and the user's cache that only
+    this user can write to: what lies there is unpickled.
     """
     digest = hashlib.sha256(repr(DRAWN_OPACITY).encode())
     for source in sorted(Path(__file__).parent.glob("*.py")):
@@ -82,12 +84,25 @@ def cache_folder() -> Path | None:
     for parent in _cache_parents():
         folder = parent / f"keyss-kernels-{digest.hexdigest()[:16]}"
         try:
-            folder.mkdir(parents=True, exist_ok=True)
+            folder.mkdir(mode=0o700, parents=True, exist_ok=True)
             with tempfile.TemporaryFile(dir=folder):
-                return folder
+                if _is_private(folder):
+                    return folder
         except OSError:
             continue
     return None
+
+
+def _is_private(folder: Path) -> bool:
+    """True if nobody but this user and root can change or replace a folder. Raises OSError."""
+    if not hasattr(os, "getuid"):  # Windows, where folders inherit their owner's rights
+        return True
+    folder = folder.resolve()
+    states = [each.stat() for each in (folder, *folder.parents)]
+    return states[0].st_uid == os.getuid() and all(
+        state.st_uid in (0, os.getuid()) and (not state.st_mode & 0o022 or state.st_mode & stat.S_ISVTX)
+        for state in states
+    )
 
 
 def _cache_parents() -> list[Path]:
