@@ -79,7 +79,7 @@ class Page {
       if (this.secret) save('secret.ply', new Blob([writePly(this.secret) as BlobPart]));
     });
     page.close.addEventListener('click', () => this.closeSecret());
-    page.wipe.addEventListener('input', () => this.split(Number(page.wipe.value) / 100));
+    page.wipe.addEventListener('input', () => this.split(1 - Number(page.wipe.value) / 100));
     if (page.main.dataset.background) page.background.value = page.main.dataset.background;
     this.viewer?.setBackground(page.background.value);
     listenToLooks(() => {
@@ -244,7 +244,7 @@ class Page {
 
   /** How much of the width shows the published model, beside the secret: 0 to 1. */
   private split(share: number): void {
-    page.wipe.value = String(100 * share);
+    page.wipe.value = String(100 * (1 - share));
     this.viewer?.setSplit(share);
     placeBorder(share);
   }
