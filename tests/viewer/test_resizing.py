@@ -12,13 +12,14 @@ from keyss.files import read_model, write_model
 from keyss.viewer import export_html
 from methods.carry.carried import embed
 from serving import serving
-from viewer.browser import CLOSE, IN_CHROMIUM, Visit, drawn, made, psnr, visit
+from viewer.browser import CLOSE, IN_CHROMIUM, PANEL, Visit, drawn, made, psnr, visit
 
 pytestmark = IN_CHROMIUM
 
 KEY = "the key on the phone"
 # Far enough that no Gaussian is larger than engines draw.
 POSE = "#eye=3,-2.4,-12&target=0.2,0.1,0"
+PHONE = {"has_touch": True, "is_mobile": True}
 PORTRAIT, LANDSCAPE = {"width": 390, "height": 844}, {"width": 844, "height": 390}
 
 
@@ -39,17 +40,17 @@ def page_file(stego: Path) -> Path:
     return export_html(stego, stego.parent / "page.html")[0]
 
 
-def assert_drawn(tab: Visit, published: Gaussians, size: tuple[int, int] | None = None) -> None:
-    """Assert that the whole canvas shows what our own renderer draws at its size."""
+def assert_drawn(tab: Visit, published: Gaussians) -> tuple[int, int]:
+    """Assert that the canvas shows what our own renderer draws at its width and height; return both."""
     found = tab.picture()
     height, width = found.shape[:2]
-    assert size in (None, (width, height))
     assert psnr(found, drawn(published, POSE, width, height)) > CLOSE
+    return width, height
 
 
 def test_the_secret_stays_when_the_search_has_ended(chromium: Any, page_file: Path) -> None:
     """The panel gets lines and loses them, and the canvas another height, while pictures are drawn."""
-    with visit(chromium, viewport=PORTRAIT, has_touch=True, is_mobile=True) as tab:
+    with visit(chromium, viewport=PORTRAIT, **PHONE) as tab:
         tab.goto(page_file.as_uri())
         published = tab.picture()
         tab.page.tap("#keying > summary")
@@ -63,19 +64,20 @@ def test_the_secret_stays_when_the_search_has_ended(chromium: Any, page_file: Pa
         assert tab.page.evaluate("document.documentElement.scrollWidth <= window.innerWidth")
 
 
-def test_a_phone_is_turned_and_its_panel_folded(tab: Visit, page_file: Path, published: Gaussians) -> None:
-    tab.page.set_viewport_size(PORTRAIT)
-    tab.goto(page_file.as_uri() + POSE)
-    heights = []
-    for _ in range(2):
-        assert_drawn(tab, published)
-        heights.append(tab.page.locator("#view").bounding_box()["height"])  # type: ignore[index]
-        tab.page.click("#more")
-    assert heights[0] > heights[1]
-    tab.page.set_viewport_size(LANDSCAPE)
-    assert_drawn(tab, published, (LANDSCAPE["width"] - 340, LANDSCAPE["height"]))
-    tab.page.set_viewport_size(PORTRAIT)
-    assert_drawn(tab, published)
+def test_a_phone_is_turned_and_its_panel_folded(chromium: Any, page_file: Path, published: Gaussians) -> None:
+    fits = "(panel => panel.scrollWidth <= panel.clientWidth)(document.querySelector('.panel'))"
+    with visit(chromium, viewport=PORTRAIT, **PHONE) as tab:
+        tab.goto(page_file.as_uri() + POSE)
+        heights = []
+        for _ in range(2):
+            heights.append(assert_drawn(tab, published)[1])
+            tab.page.tap("#more")
+        assert heights[0] > heights[1]
+        tab.page.tap("#more")
+        for viewport, size in ((LANDSCAPE, (844 - PANEL, 390)), (PORTRAIT, (390, heights[1]))):
+            tab.page.set_viewport_size(viewport)
+            assert assert_drawn(tab, published) == size
+            assert tab.page.evaluate(fits)
 
 
 def test_the_element_of_another_site_is_resized(
@@ -95,4 +97,4 @@ def test_the_element_of_another_site_is_resized(
                 " `width: ${width}px; height: ${height}px` }",
                 [width, height],
             )
-            assert_drawn(tab, published, (width, height))
+            assert assert_drawn(tab, published) == (width, height)

@@ -124,7 +124,7 @@ class Page {
     this.hideSecret();
     page.open.disabled = page.key.disabled = false;
     page.facts.textContent = `${this.name}\n${count(model.count)} Gaussians, SH degree ${model.shDegree}`;
-    if (leftOut) page.facts.textContent += `\n${count(leftOut)} more have numbers that are not finite: left out`;
+    if (leftOut) page.facts.textContent += `\n${count(leftOut)} are left out: their numbers are not finite`;
     document.title = `${this.name} · keyss viewer`;
     this.showPublished();
     this.controls.setPose(poseOfHash(this.asked) ?? poseOfHash(page.main.dataset.pose ?? '') ?? this.firstPose());
