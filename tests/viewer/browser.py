@@ -46,7 +46,7 @@ def made(count: int, seed: int) -> Gaussians:
     return replace(model, log_scales=0.5 * model.log_scales, sh=sh)
 
 
-def camera_of(address: str) -> Camera:
+def camera_of(address: str, width: int = WIDTH, height: int = HEIGHT) -> Camera:
     """The page's camera at the pose in its URL."""
     found = parse_qs(address.partition("#")[2])
     eye, target = (torch.tensor([float(n) for n in found[name][0].split(",")]) for name in ("eye", "target"))
@@ -55,14 +55,14 @@ def camera_of(address: str) -> Camera:
     viewmat = torch.eye(4)
     viewmat[:3, :3] = torch.stack([right, torch.linalg.cross(forward, right), forward])
     viewmat[:3, 3] = -viewmat[:3, :3] @ eye
-    focal = 0.5 * HEIGHT / math.tan(math.radians(25))
-    K = torch.tensor([[focal, 0, WIDTH / 2], [0, focal, HEIGHT / 2], [0, 0, 1]])
-    return Camera(viewmat, K, WIDTH, HEIGHT)
+    focal = 0.5 * height / math.tan(math.radians(25))
+    K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
+    return Camera(viewmat, K, width, height)
 
 
-def drawn(model: Gaussians, address: str) -> Picture:
+def drawn(model: Gaussians, address: str, width: int = WIDTH, height: int = HEIGHT) -> Picture:
     """[H, W, 3] 0 to 255: our own render of the pose in an address."""
-    return (render(model, camera_of(address)).clamp(0, 1) * 255).numpy().astype(np.float64)
+    return (render(model, camera_of(address, width, height)).clamp(0, 1) * 255).numpy().astype(np.float64)
 
 
 def psnr(a: Picture, b: Picture) -> float:
@@ -93,18 +93,19 @@ class Visit:
         )
 
     def picture(self) -> Picture:
-        """[H, W, 3] 0 to 255 what is on the canvas once it does not change any more."""
-        self.page.evaluate("document.querySelector('.panel').style.visibility = 'hidden'")
+        """[H, W, 3] 0 to 255 what is on the canvas, also in a frame, once it does not change any more."""
+        frame = self.page.frames[-1]
+        frame.evaluate("document.querySelector('.panel').style.visibility = 'hidden'")
         try:
             before, deadline = b"", time.monotonic() + PATIENCE / 1000
             while time.monotonic() < deadline:
-                now = self.page.locator("#picture").screenshot()
+                now = frame.locator("#picture").screenshot()
                 if now == before:
                     break
                 before = now
                 self.page.wait_for_timeout(700)
         finally:
-            self.page.evaluate("document.querySelector('.panel').style.visibility = ''")
+            frame.evaluate("document.querySelector('.panel').style.visibility = ''")
         return np.asarray(Image.open(io.BytesIO(before)).convert("RGB")).astype(np.float64)
 
     def try_key(self, key: str, *, thorough: bool = False) -> list[float]:
@@ -154,9 +155,9 @@ class Visit:
 
 
 @contextmanager
-def visit(browser: Any) -> Iterator[Visit]:
-    """A new tab, which must not log errors."""
-    page = browser.new_page(viewport={"width": PANEL + WIDTH, "height": HEIGHT})
+def visit(browser: Any, **options: Any) -> Iterator[Visit]:
+    """A new tab, which must not log errors; `options` are those of Playwright's `new_page`."""
+    page = browser.new_page(**{"viewport": {"width": PANEL + WIDTH, "height": HEIGHT}} | options)
     page.set_default_timeout(PATIENCE)
     found = Visit(page)
     page.on("console", lambda each: found.complaints.append(each.text) if each.type == "error" else None)

@@ -184,6 +184,9 @@ def test_looking_saving_and_wiping(
     assert saved.digest() == secrets[0].digest()
     tab.at(POSE)
     whole = tab.picture()
+    assert tab.page.input_value("#wipe") == "100"  # at "Secret", which is what is seen
+    tab.page.fill("#wipe", "0")
+    assert psnr(tab.picture(), whole) < CLOSE  # the published model
     tab.page.fill("#wipe", "50")
     assert tab.page.locator("#wiping").inner_text().split() == ["Published", "Secret"]
     half = tab.picture()

@@ -24,6 +24,7 @@ export interface Question {
 export interface Answer {
   readonly id: number;
   readonly model?: Gaussians;
+  readonly leftOut?: number; // Gaussians of its file
   readonly file?: HiddenFile;
   readonly error?: string; // one sentence
   readonly stopped?: boolean; // a search, before its end
@@ -48,8 +49,8 @@ function answer(message: Answer, moved: Transferable[] = []): void {
 
 async function load({ id = 0, name, keyless }: Question, bytes: Uint8Array): Promise<void> {
   const read = await readModel(bytes, name);
-  const { codes, ...model } = read;
-  answer({ id, model }, keyless ? buffersOf(model) : []);
+  const { codes, leftOut, ...model } = read;
+  answer({ id, model, leftOut }, keyless ? buffersOf(model) : []);
   if (keyless) return;
   stego = model;
   // Afterwards: the picture comes first. Where there is no memory nothing opens, and the page goes on.

@@ -1,4 +1,5 @@
 import { expect, test } from 'vitest';
+import { selected } from '../src/core/gaussians.ts';
 import { readModel } from '../src/files/models.ts';
 import { joined } from '../src/core/bytes.ts';
 import { column, plyHeader } from '../src/files/ply.ts';
@@ -40,7 +41,52 @@ test('a .ply of text is what the binary one is, bit for bit', async () => {
   const text = (body: string): Uint8Array => new TextEncoder().encode(head + body);
   expect(columns(await readModel(text(rows)))).toEqual(columns(await readModel(bytes)));
   await expect(readModel(text(rows.slice(0, -40)))).rejects.toThrow('This is not a whole .ply file.');
-  await expect(readModel(text(rows.replace(/\d/, 'x')))).rejects.toThrow('This file holds numbers that are not finite.');
+  const first = rows.split(' ', 1)[0];
+  for (const infinite of ['nan', 'inf', '-Infinity', '-NAN']) {
+    expect((await readModel(text(rows.replace(first, infinite)))).leftOut).toBe(1);
+  }
+  await expect(readModel(text(rows.replace(/\d/, 'x')))).rejects.toThrow('This is not a whole .ply file.');
+});
+
+/** `file` with one number of one row of each of these properties replaced. */
+function withNumbers(file: Uint8Array, row: number, numbers: Record<string, number>): Uint8Array {
+  const [bytes, [vertex]] = [file.slice(), plyHeader(file).elements];
+  for (const [name, value] of Object.entries(numbers)) {
+    const { offset } = vertex.properties.find((each) => each.name === name)!;
+    new DataView(bytes.buffer).setFloat32(vertex.start + row * vertex.stride + offset, value, true);
+  }
+  return bytes;
+}
+
+test('Gaussians that are not finite are left out of a .ply, and counted', async () => {
+  const whole = await readModel(vector('carried.ply'));
+  let bytes = vector('carried.ply');
+  for (const [row, name] of ['x', 'f_dc_1', 'f_rest_44', 'opacity', 'scale_2', 'rot_3'].entries()) {
+    bytes = withNumbers(bytes, 3 * row, { [name]: name === 'rot_3' ? -Infinity : NaN });
+  }
+  const { leftOut, ...found } = await readModel(bytes);
+  expect(leftOut).toBe(6);
+  const rows = [...Array(whole.count).keys()].filter((row) => row > 15 || row % 3);
+  expect(columns(found)).toEqual(columns(selected(whole, rows)));
+});
+
+test('infinities that stand for flat, opaque and invisible Gaussians are numbers', async () => {
+  const flat = withNumbers(vector('carried.ply'), 1, { scale_0: -Infinity, opacity: Infinity });
+  const found = await readModel(withNumbers(flat, 2, { opacity: -Infinity }));
+  expect(found.leftOut).toBe(0);
+  expect(Math.exp(found.logScales[3])).toBeCloseTo(2 ** -126, 42);
+  expect([...found.opacityLogits.subarray(1, 3)]).toEqual([16, -16]);
+});
+
+test('a file without a Gaussian that can be drawn says what to do', async () => {
+  const bytes = vector('carried.ply');
+  const [vertex] = plyHeader(bytes).elements;
+  const header = new TextDecoder('latin1').decode(bytes.subarray(0, vertex.start));
+  const empty = new TextEncoder().encode(header.replace(/element vertex \d+/, 'element vertex 0'));
+  await expect(readModel(empty)).rejects.toThrow(/^This file holds no Gaussians: export it again/);
+  const nan = { x: NaN };
+  const none = Array.from({ length: vertex.count }).reduce<Uint8Array>((file, _, row) => withNumbers(file, row, nan), bytes);
+  await expect(readModel(none)).rejects.toThrow(/^This file holds numbers that are not finite: export it again/);
 });
 
 test('the files of an archive', async () => {

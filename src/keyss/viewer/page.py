@@ -19,11 +19,9 @@ from pathlib import Path
 from typing import BinaryIO
 from urllib.parse import quote
 
-import keyss.files  # imports torch when it reads a model, which the page itself does not need
+import keyss.files
 from keyss.core.errors import InputError, KeyssWarning, OutputError, UsageError
 from keyss.files.atomic import check_not_an_input, check_output_file, mode_like, write_bytes
-from keyss.files.ply_rows import is_compressed, read_model_rows
-from keyss.files.reading import open_input
 from keyss.viewer.look import Look
 
 SCRIPT, STYLE, LICENCES, INDEX = "viewer.js", "viewer.css", "licences.txt", "index.html"
@@ -91,8 +89,6 @@ def export_html(
     for origin in (look[name] for name in ("host", "embedder") if name in look):
         if not _ORIGIN.fullmatch(origin):
             raise UsageError(f"expected an origin such as https://www.example.com, got {origin}")
-    if file.size > MAX_BYTES:
-        raise UsageError(f"{model} has {file.size:,} bytes, more than the {MAX_BYTES:,} that a page loads")
     try:
         with file.open() as opened:
             data = opened.read()
@@ -160,7 +156,7 @@ class Readable:
 def readable(model: Path) -> Readable:
     """The model's file if the page reads its format, else a lossless conversion, with a KeyssWarning.
 
-    Raises InputError if it is not a whole model.
+    Warns and raises as `read_model`, and UsageError for a file that is too large.
     """
     try:
         with model.open("rb") as file:
@@ -168,18 +164,15 @@ def readable(model: Path) -> Readable:
             size = file.seek(0, 2)
     except OSError:
         header, size = b"", 0  # read_model raises the InputError
+    if size > MAX_BYTES:
+        raise UsageError(f"{model} has {size:,} bytes, more than the {MAX_BYTES:,} that a page loads")
+    gaussians = keyss.files.read_model(model)
     is_text = header.startswith(b"ply") and b"\nformat ascii" in header.partition(b"end_header")[0]
-    if header and not is_text and (header.startswith(_MAGIC) or model.name.lower().endswith(".splat")):
-        if header.startswith(b"ply") and not is_compressed(model):
-            with open_input(model) as file:
-                read_model_rows(file)  # checks header and size, and reads no rows
-        else:
-            keyss.files.read_model(model)
+    if not is_text and (header.startswith(_MAGIC) or model.name.lower().endswith(".splat")):
         return Readable(model.name, lambda: model.open("rb"), size)
 
     from keyss.files.models import model_bytes
 
-    gaussians = keyss.files.read_model(model)
     name, kind = f"{model.stem}.ply", "a .ply in text" if is_text else f"a {model.suffix}"
     data = model_bytes(name, gaussians)
     warnings.warn(

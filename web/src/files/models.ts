@@ -14,6 +14,7 @@ export type Codes = SpzCodes | SogCodes | CompressedPlyCodes;
 /** A file's model. Whatever makes another one of it must leave out the codes. */
 export interface ReadModel extends Gaussians {
   readonly codes?: Codes;
+  readonly leftOut?: number; // Gaussians of the file that are not finite
 }
 
 /** `decode`: what decodes the images of a .sog. Raises InputError for a file that is none of them, or damaged. */

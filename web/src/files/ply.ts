@@ -1,11 +1,12 @@
 /** Reader and writer of models in the Inria .ply layout; hostile files end in an InputError. */
 import { ascii, joined, viewOf } from '../core/bytes.ts';
 import { InputError } from '../core/errors.ts';
-import { coefficients, COLUMNS, emptyGaussians, type Gaussians } from '../core/gaussians.ts';
+import { coefficients, COLUMNS, emptyGaussians, type Gaussians, where } from '../core/gaussians.ts';
 
 const MAX_HEADER_BYTES = 65536;
 const [SPACE, MAX_DIGITS] = [32, 100]; // of text
 const OPACITY_LOGIT_BOUND = 16; // in the place of infinities
+const LEAST_LOG_SCALE = -87.33654; // in the place of minus infinity
 
 /** Of a type by either of its names the bytes that it takes, and what reads it. */
 const TYPES = new Map(([
@@ -82,10 +83,19 @@ export function binaryPly(bytes: Uint8Array): Uint8Array {
     const start = at;
     while (bytes[at] > SPACE) at++;
     if (at === start || at - start > MAX_DIGITS) throw notWhole();
-    values.setFloat64(8 * index, Number(String.fromCharCode(...bytes.subarray(start, at))), true);
+    values.setFloat64(8 * index, numberOf(String.fromCharCode(...bytes.subarray(start, at))), true);
   }
   const binary = header.replace(/\nformat ascii/, '\nformat binary_little_endian').replace(/(\nproperty )\S+/g, '$1double');
   return joined(ascii(binary), new Uint8Array(values.buffer));
+}
+
+/** A number as programs write it. Raises InputError for what is none. */
+function numberOf(text: string): number {
+  const found = Number(text);
+  if (!Number.isNaN(found) || /^[+-]?nan$/i.test(text)) return found;
+  const [, sign] = /^([+-]?)inf(?:inity)?$/i.exec(text) ?? [];
+  if (sign === undefined) throw notWhole();
+  return sign === '-' ? -Infinity : Infinity;
 }
 
 /** Numbers of one property of all rows. */
@@ -100,15 +110,16 @@ export function column(bytes: Uint8Array, header: PlyHeader, element: Element, n
   return values;
 }
 
-/** A model. Raises InputError for anything that is not a whole, finite 3DGS model. */
-export function readPly(bytes: Uint8Array): Gaussians {
+/** A model without rows that are not finite. Raises InputError for anything that is not a whole 3DGS model. */
+export function readPly(bytes: Uint8Array): UsableGaussians {
   const header = plyHeader(bytes);
   const vertex = header.elements.find((each) => each.name === 'vertex');
   const rest = vertex?.properties.filter((each) => /^f_rest_[0-9]+$/.test(each.name)).length ?? 0;
   const shDegree = [0, 9, 24, 45].indexOf(rest);
-  if (vertex === undefined || vertex.count === 0 || shDegree < 0) throw noModel();
+  if (vertex === undefined || shDegree < 0) throw noModel();
   const names = new Set(vertex.properties.map(({ name }) => name)); // rows without any take no bytes
   if (!plyColumns(shDegree).every(({ name }) => names.has(name))) throw noModel();
+  if (vertex.count === 0) throw new InputError(`This file holds no Gaussians${CURE}`);
   const found = emptyGaussians(vertex.count, shDegree);
   for (const { name, to, offset } of plyColumns(shDegree)) {
     const values = column(bytes, header, vertex, name)!;
@@ -118,13 +129,35 @@ export function readPly(bytes: Uint8Array): Gaussians {
   for (const [row, logit] of found.opacityLogits.entries()) {
     if (Math.abs(logit) === Infinity) found.opacityLogits[row] = Math.sign(logit) * OPACITY_LOGIT_BOUND;
   }
-  return checkedFinite(found);
+  for (const [at, logScale] of found.logScales.entries()) {
+    if (logScale === -Infinity) found.logScales[at] = LEAST_LOG_SCALE;
+  }
+  return usable(found);
 }
 
-/** Raises InputError for numbers that are none. */
+export interface UsableGaussians extends Gaussians {
+  readonly leftOut: number; // Gaussians of the file
+}
+
+/** The Gaussians whose numbers are finite, which alone can be drawn. Raises InputError if there are none. */
+export function usable(gaussians: Gaussians): UsableGaussians {
+  if (isFinite(gaussians)) return { ...gaussians, leftOut: 0 };
+  const widths = COLUMNS.map((each) => [gaussians[each], gaussians[each].length / gaussians.count] as const);
+  const found = where(gaussians, (row) =>
+    widths.every(([values, width]) => values.subarray(row * width, (row + 1) * width).every(Number.isFinite)),
+  );
+  if (found.count === 0) throw notFinite();
+  return { ...found, leftOut: gaussians.count - found.count };
+}
+
+/** Raises InputError for numbers that are not finite. */
 export function checkedFinite(gaussians: Gaussians): Gaussians {
-  if (COLUMNS.every((each) => gaussians[each].every(Number.isFinite))) return gaussians;
-  throw new InputError('This file holds numbers that are not finite.');
+  if (isFinite(gaussians)) return gaussians;
+  throw notFinite();
+}
+
+function isFinite(gaussians: Gaussians): boolean {
+  return COLUMNS.every((each) => gaussians[each].every(Number.isFinite));
 }
 
 /** The properties of a .ply in the order in which keyss writes them: where each lies in a row of which column. */
@@ -161,6 +194,12 @@ export function writePly(gaussians: Gaussians): Uint8Array {
     }
   }
   return joined(header, data);
+}
+
+const CURE = ': export it again from the program that made it.';
+
+function notFinite(): InputError {
+  return new InputError(`This file holds numbers that are not finite${CURE}`);
 }
 
 function notWhole(): InputError {

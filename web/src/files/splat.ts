@@ -1,14 +1,14 @@
 /** Reader of .splat, 32 bytes for each Gaussian; `keyss.files.formats.splat` on the other side. */
 import { viewOf } from '../core/bytes.ts';
 import { damaged } from '../core/errors.ts';
-import { emptyGaussians, type Gaussians } from '../core/gaussians.ts';
+import { emptyGaussians } from '../core/gaussians.ts';
 import { logit, logScale, SH_C0, unitQuat } from './coded.ts';
-import { checkedFinite } from './ply.ts';
+import { usable, type UsableGaussians } from './ply.ts';
 
 const ROW = 32; // bytes: mean and scale in floats, red, green, blue, opacity and the quaternion in bytes
 
-/** Raises InputError. */
-export function readSplat(bytes: Uint8Array): Gaussians {
+/** A model without rows that are not finite. Raises InputError. */
+export function readSplat(bytes: Uint8Array): UsableGaussians {
   if (bytes.length === 0 || bytes.length % ROW) throw damaged();
   const view = viewOf(bytes);
   const model = emptyGaussians(bytes.length / ROW, 0);
@@ -22,5 +22,5 @@ export function readSplat(bytes: Uint8Array): Gaussians {
     const [w, x, y, z] = bytes.subarray(at + 28, at + ROW);
     model.quats.set(unitQuat(w / 128 - 1, x / 128 - 1, y / 128 - 1, z / 128 - 1), 4 * row);
   }
-  return checkedFinite(model);
+  return usable(model);
 }

@@ -79,7 +79,7 @@ class Page {
       if (this.secret) save('secret.ply', new Blob([writePly(this.secret) as BlobPart]));
     });
     page.close.addEventListener('click', () => this.closeSecret());
-    page.wipe.addEventListener('input', () => this.split(Number(page.wipe.value) / 100));
+    page.wipe.addEventListener('input', () => this.split(1 - Number(page.wipe.value) / 100));
     if (page.main.dataset.background) page.background.value = page.main.dataset.background;
     this.viewer?.setBackground(page.background.value);
     listenToLooks(() => {
@@ -117,13 +117,14 @@ class Page {
     const own = this.begun();
     this.say('Reading …');
     page.problem.textContent = this.viewer ? '' : NO_WEBGL;
-    const { model, error } = await this.opener.ask({ bytes, name }, [bytes.buffer]);
+    const { model, leftOut, error } = await this.opener.ask({ bytes, name }, [bytes.buffer]);
     if (own !== this.work) return;
     if (model === undefined) return this.fail(error ?? 'This file cannot be read.');
     [this.name, this.published] = [(this.work === 1 && asked.title) || (page.main.dataset.title ?? name), model];
     this.hideSecret();
     page.open.disabled = page.key.disabled = false;
     page.facts.textContent = `${this.name}\n${count(model.count)} Gaussians, SH degree ${model.shDegree}`;
+    if (leftOut) page.facts.textContent += `\n${count(leftOut)} are left out: their numbers are not finite`;
     document.title = `${this.name} · keyss viewer`;
     this.showPublished();
     this.controls.setPose(poseOfHash(this.asked) ?? poseOfHash(page.main.dataset.pose ?? '') ?? this.firstPose());
@@ -168,6 +169,7 @@ class Page {
     const key = page.key.value;
     if (!key || this.published === null || page.open.disabled) return;
     const own = this.begun();
+    if (window.matchMedia('(pointer: coarse)').matches) page.key.blur(); // a phone's keyboard covers the picture
     this.controls.rotate(false);
     this.writeAddress(); // now, so that it is the same whatever the key opens
     let said = 'Key tried.';
@@ -244,7 +246,7 @@ class Page {
 
   /** How much of the width shows the published model, beside the secret: 0 to 1. */
   private split(share: number): void {
-    page.wipe.value = String(100 * share);
+    page.wipe.value = String(100 * (1 - share));
     this.viewer?.setSplit(share);
     placeBorder(share);
   }

@@ -48,15 +48,17 @@ export class Viewer {
     const system = app.systems.gsplat as GSplatComponentSystem;
     system.on('frame:request', () => this.draw());
     system.on('frame:ready', (_camera: unknown, _layer: unknown, ready: boolean) => (this.ready = ready));
-    app.on('framerender', () => (this.drawing = app.renderNextFrame)); // the engine's other frames draw nothing
+    app.on('framerender', () => {
+      this.drawing = app.renderNextFrame; // the engine's other frames draw nothing
+      if (this.drawing) this.resize();
+    });
     app.on('frameend', () => {
       if (this.drawing) this.afterFrame();
     });
     app.on('update', () => this.rest());
     app.graphicsDevice.on('devicerestored', () => this.restored());
     app.start();
-    new ResizeObserver(() => this.resize()).observe(canvas);
-    this.resize();
+    new ResizeObserver(() => this.draw()).observe(canvas);
   }
 
   /** Raises an error where there is no WebGL 2. */
@@ -199,19 +201,18 @@ export class Viewer {
     this.asleep = true;
   }
 
+  /** Only right before a frame is drawn: a canvas that gets another size loses its picture. */
   private resize(): void {
     const ratio = Math.min(window.devicePixelRatio || 1, 2) * this.scale;
     const [width, height] = [this.canvas.clientWidth, this.canvas.clientHeight];
     if (!width || !height) return;
     this.app.setCanvasResolution(RESOLUTION_FIXED, Math.max(1, Math.round(width * ratio)), Math.max(1, Math.round(height * ratio)));
-    this.draw();
   }
 
   private setScale(scale: number): void {
     if (scale === this.scale) return;
     this.scale = scale;
     for (const half of Object.values(this.halves)) this.place(half);
-    this.resize();
   }
 
   /** The Gaussians that belong to the resolution of now; they are made when they are needed first. */
@@ -255,10 +256,8 @@ export class Viewer {
         this.setScale(1);
       }
       this.draw();
-    } else if (this.whenReady.length) {
-      if (this.ready) for (const resolve of this.whenReady.splice(0)) resolve();
-      else this.draw();
-    } else if (this.wanted) this.draw();
+    } else if (this.wanted || (this.whenReady.length && !this.ready)) this.draw();
+    else for (const resolve of this.whenReady.splice(0)) resolve();
   }
 }
 

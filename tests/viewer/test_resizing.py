@@ -1,0 +1,100 @@
+"""The picture when its place on the page gets another size: phones, a folded panel, frames of other sites."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from keyss.core import Gaussians
+from keyss.files import read_model, write_model
+from keyss.viewer import export_html
+from methods.carry.carried import embed
+from serving import serving
+from viewer.browser import CLOSE, IN_CHROMIUM, PANEL, Visit, drawn, made, psnr, visit
+
+pytestmark = IN_CHROMIUM
+
+KEY = "the key on the phone"
+# Far enough that no Gaussian is larger than engines draw.
+POSE = "#eye=3,-2.4,-12&target=0.2,0.1,0"
+PHONE = {"has_touch": True, "is_mobile": True}
+PORTRAIT, LANDSCAPE = {"width": 390, "height": 844}, {"width": 844, "height": 390}
+
+
+@pytest.fixture(scope="module")
+def stego(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("published") / "stego.ply"
+    write_model(path, embed(made(4000, 0), [(KEY, made(200, 1))], entropy=bytes(32)))
+    return path
+
+
+@pytest.fixture(scope="module")
+def published(stego: Path) -> Gaussians:
+    return read_model(stego)
+
+
+@pytest.fixture(scope="module")
+def page_file(stego: Path) -> Path:
+    return export_html(stego, stego.parent / "page.html")[0]
+
+
+def assert_drawn(tab: Visit, published: Gaussians) -> tuple[int, int]:
+    """Assert that the canvas shows what our own renderer draws at its width and height; return both."""
+    found = tab.picture()
+    height, width = found.shape[:2]
+    assert psnr(found, drawn(published, POSE, width, height)) > CLOSE
+    return width, height
+
+
+def test_the_secret_stays_when_the_search_has_ended(chromium: Any, page_file: Path) -> None:
+    """The panel gets lines and loses them, and the canvas another height, while pictures are drawn."""
+    with visit(chromium, viewport=PORTRAIT, **PHONE) as tab:
+        tab.goto(page_file.as_uri())
+        published = tab.picture()
+        tab.page.tap("#keying > summary")
+        tab.try_key(KEY, thorough=True)
+        assert tab.page.evaluate("document.activeElement.id") != "key"  # whose keyboard covers the picture
+        shown = tab.picture()
+        tab.page.evaluate("document.getElementById('wipe').dispatchEvent(new Event('input'))")  # draws again
+        assert shown.std() > 10
+        assert psnr(shown, tab.picture()) > 40
+        assert shown.shape[0] < published.shape[0]
+        assert tab.page.evaluate("document.documentElement.scrollWidth <= window.innerWidth")
+
+
+def test_a_phone_is_turned_and_its_panel_folded(chromium: Any, page_file: Path, published: Gaussians) -> None:
+    fits = "(panel => panel.scrollWidth <= panel.clientWidth)(document.querySelector('.panel'))"
+    with visit(chromium, viewport=PORTRAIT, **PHONE) as tab:
+        tab.goto(page_file.as_uri() + POSE)
+        heights = []
+        for _ in range(2):
+            heights.append(assert_drawn(tab, published)[1])
+            tab.page.tap("#more")
+        assert heights[0] > heights[1]
+        tab.page.tap("#more")
+        for viewport, size in ((LANDSCAPE, (844 - PANEL, 390)), (PORTRAIT, (390, heights[1]))):
+            tab.page.set_viewport_size(viewport)
+            assert assert_drawn(tab, published) == size
+            assert tab.page.evaluate(fits)
+
+
+def test_the_element_of_another_site_is_resized(
+    tab: Visit, stego: Path, published: Gaussians, tmp_path: Path
+) -> None:
+    export_html(stego, tmp_path / "site", look={"pose": POSE.removeprefix("#")})
+    with serving(tmp_path / "site") as site:
+        (tmp_path / "site" / "own.html").write_text(
+            "<!doctype html><link rel=icon href=data:,><script src=embed.js></script><keyss-viewer>"
+        )
+        tab.page.goto(f"{site}own.html")
+        frame = tab.page.frame_locator("iframe")
+        frame.locator("main[data-picture=settled]").wait_for()
+        for width, height in ((320, 240), (500, 200), (240, 280)):
+            tab.page.evaluate(
+                "([width, height]) => { document.querySelector('keyss-viewer').style.cssText ="
+                " `width: ${width}px; height: ${height}px` }",
+                [width, height],
+            )
+            assert assert_drawn(tab, published) == (width, height)
