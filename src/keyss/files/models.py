@@ -25,8 +25,14 @@ from keyss.core.decoded import DecodedGaussians
 from keyss.core.errors import InputError, OutputError, UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.files.atomic import atomic_write, check_not_an_input, check_output_file
-from keyss.files.foreign import kind_of
-from keyss.files.ply_rows import finite_rows, has_packed_header, model_names, read_model_rows
+from keyss.files.foreign import START_BYTES, is_foreign_zip, kind_of
+from keyss.files.ply_rows import (
+    check_not_activated,
+    finite_rows,
+    has_packed_header,
+    model_names,
+    read_model_rows,
+)
 from keyss.files.ply_table import ply_header
 from keyss.files.reading import (
     MAX_BYTES,
@@ -93,7 +99,7 @@ def write_ply(model: Gaussians, file: BinaryIO) -> None:
     flat = model.detach().to("cpu")
     file.write(ply_header({"vertex": (n, (f"float {name}" for name in names))}))
     blocks = (_rows(flat[start : start + _BLOCK]) for start in range(0, n, _BLOCK))
-    for rows in finite_rows(blocks, names, OutputError):
+    for rows in finite_rows(blocks, names):
         file.write(rows.astype("<f4", copy=False).data)
 
 
@@ -114,8 +120,8 @@ def read_ply(file: BinaryIO) -> Gaussians:
     """Read a 3DGS model: float32 tensors on the CPU, SH of the file's own degree.
 
     Properties are found by name, in any order and of any scalar type; normals, unknown properties,
-    comments, other elements and bytes after the data are ignored. Infinite opacity logits become
-    +-OPACITY_LOGIT_BOUND. Raises InputError if it is not a complete, finite 3DGS model.
+    comments, other elements and bytes after the data are ignored. Rows that are not finite are left out, see
+    `usable_rows`. Raises InputError if it is not a complete 3DGS model.
     """
     vertices = read_model_rows(file)
     n, k = vertices.count, (len(vertices.names) - 11) // 3
@@ -131,7 +137,9 @@ def read_ply(file: BinaryIO) -> Gaussians:
         for color in range(3):
             sh[part, 1:, color] = rest[:, color]
         start = part.stop
-    return Gaussians(*map(torch.from_numpy, (means, quats, log_scales, opacity_logits, sh)))
+    check_not_activated(means[:start], log_scales[:start], opacity_logits[:start])
+    arrays = (means, quats, log_scales, opacity_logits, sh)
+    return Gaussians(*(torch.from_numpy(each[:start]) for each in arrays))
 
 
 def _read_any_ply(file: BinaryIO) -> Gaussians:
@@ -270,9 +278,11 @@ def _write(
 
 def _read(file: BinaryIO, name: str) -> Gaussians:
     """The model in an open file, in the format of its first bytes, which `name` must not contradict."""
-    start = file.read(16)
+    start = file.read(START_BYTES)
     file.seek(0)
     fitting = [each for each in FORMATS if each.magic and start.startswith(each.magic)]
+    if is_foreign_zip(start):
+        fitting = []
     named = _by_suffix(name)
     if named in fitting or (named and start and not named.magic and not fitting):
         return named.read(file)

@@ -47,17 +47,17 @@ class Vertices:
 
     names: list[str]
     count: int
-    blocks: Iterator[Numbers]  # [n, len(names)] each; `count` rows in all; they may be changed
+    blocks: Iterator[Numbers]  # [n, len(names)] each; `count` rows at most; they may be changed
     dtype: type  # of the rows
 
     def rows(self) -> Numbers:
-        """[count, len(names)] all rows."""
+        """[n, len(names)] all rows."""
         rows: Numbers = np.empty((self.count, len(self.names)), self.dtype)
         start = 0
         for block in self.blocks:
             rows[start : start + len(block)] = block
             start += len(block)
-        return rows
+        return rows[:start]
 
 
 @dataclass
