@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -11,6 +12,7 @@ import torch
 import keyss as package
 from channels.low_bits.trained_like import trained_like
 from cli.said import PROGRAM, Run, assert_refused, write_key
+from keyss.core import Similarity
 from keyss.files import read_model, write_model
 from methods.carry.carried import embed
 from tiny_scenes import random_gaussians
@@ -48,6 +50,30 @@ def test_says_what_it_costs(keyss: Run, files: Path, tmp_path: Path, suffix: str
             assert 25 < float(first.split("renders at ")[1].split()[0]) < 100
         assert others == ["a secret in low bits would be lost; --key-file checks that a secret survives"]
     assert len(read_model(out)) == COUNT
+
+
+@pytest.mark.parametrize("unit", [1e-3, 1e-5, 1e4])
+def test_the_cost_does_not_depend_on_the_unit(keyss: Run, tmp_path: Path, unit: float) -> None:
+    """Also of models that are smaller than the nearest distance that rasterizers draw."""
+    generator = torch.Generator().manual_seed(2)
+    model = random_gaussians(COUNT)
+    model = replace(model, log_scales=torch.randn(COUNT, 3, generator=generator) * 0.5 - 2)
+    costs = []
+    for name, scale in (("one", 1.0), ("other", unit)):
+        changed = Similarity(scale=scale).apply_gaussians(model)
+        write_model(tmp_path / f"{name}.ply", changed)
+        said = keyss("convert", tmp_path / f"{name}.ply", tmp_path / f"{name}.compressed.ply").out
+        costs.append(float(said.split("renders at ")[1].split()[0]))
+    assert costs[0] == pytest.approx(costs[1], abs=1.0)
+    said = keyss("convert", tmp_path / "other.ply", tmp_path / "other.spz")
+    assert "unchanged" not in said.out
+    assert len(read_model(tmp_path / "other.spz").means.unique(dim=0)) == COUNT or unit < 1e-4
+
+
+def test_empty_renders_are_not_called_unchanged(keyss: Run, tmp_path: Path) -> None:
+    model = random_gaussians(COUNT)
+    write_model(tmp_path / "a.ply", replace(model, opacity_logits=torch.full((COUNT,), -12.0)))
+    assert "renders are empty" in keyss("convert", tmp_path / "a.ply", tmp_path / "a.splat").out
 
 
 @pytest.mark.parametrize("suffix", ["spz", "sog", "compressed.ply", "glb", "splat"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,7 +10,7 @@ from pathlib import Path
 import torch
 
 from keyss.core.errors import InputError, QualityError, UsageError, WrongKeyError
-from keyss.core.gaussians import Gaussians
+from keyss.core.gaussians import DRAWN_OPACITY, Gaussians
 from keyss.files.atomic import mode_like, write_bytes
 from keyss.files.models import check_model_output, keeps_low_bits, model_bytes, model_of_bytes
 from keyss.files.reading import is_standard, write_standard_output
@@ -43,7 +44,7 @@ class Conversion:
     gaussians: Gaussians  # as read from it
     bytes_before: int | None  # None: read from standard input or from memory
     bytes_after: int
-    psnr: float  # dB between renders before and after, from around the model; 120: equal
+    psnr: float  # dB between renders before and after, from around the model; 120: equal; NaN: empty
     keeps_low_bits: bool  # whether the format keeps them
     secrets: tuple[KeptSecret, ...]  # in the order of the keys
 
@@ -80,7 +81,8 @@ def convert(
         for key, each in zip(keys, opened, strict=True)
     )
     size = None if source is None or is_standard(source) else source.stat().st_size
-    psnr = psnr_between(before.to(target), after.to(target))
+    drawn = bool(((before.opacities >= DRAWN_OPACITY) & ~before.overflow).any())
+    psnr = psnr_between(before.to(target), after.to(target)) if drawn else math.nan
     result = Conversion(after, size, len(data), psnr, keeps_low_bits(path), secrets)
     lost = [number for number, each in enumerate(secrets, 1) if not each.kept]
     if lost and not (force or dry_run):

@@ -25,8 +25,9 @@ OPACITY_LOGIT_BOUND = 16.0
 LEAST_LOG_SCALE = -87.33654  # of the smallest normal float32; in place of minus infinity
 _ENOUGH = 100  # Gaussians from which on `check_not_activated` judges, and about as many that it looks at
 _NEARLY_ALL = 0.99  # share of the scales
-_SMALL_SCALE = 0.2  # positive values that are as small as this are scales, not their logarithms
-_LARGE = 0.05  # Gaussians whose scale relative to the model's is above this are not those of a trained model
+# Values that are all positive are scales, not their logarithms, if half of them are below _SMALL_SCALE, if as
+# logarithms they made half of the Gaussians larger than _LARGE of the model, or if they vary by _RATIO.
+_SMALL_SCALE, _LARGE, _RATIO = 0.2, 0.3, 20.0
 
 
 def is_compressed(path: Path) -> bool:
@@ -129,15 +130,15 @@ def _counts(names: list[str], bad: Integers) -> str:
 def check_not_activated(means: Floats, log_scales: Floats, opacity_logits: Floats) -> None:
     """Raise InputError if scales or opacities of a model [N, ...] are those that renderers use.
 
-    Logits of trained models are not all within 0 to 1, and logarithms of scales are not all positive unless
-    Gaussians are small for the model.
+    Logits of trained models are not all within 0 to 1. Logarithms of scales are all positive in large units
+    only, where they are much alike.
     """
     if len(means) < _ENOUGH:
         return
     means, log_scales = means[:: len(means) // _ENOUGH], log_scales[:: len(means) // _ENOUGH]
     spread = np.median(np.abs(means - np.median(means, axis=0)).max(axis=1))
-    middle = float(np.median(log_scales))
-    large = middle < _SMALL_SCALE or np.exp(min(middle, 80.0)) > _LARGE * spread
+    least, middle, most = np.quantile(log_scales, [0.05, 0.5, 0.95])
+    large = middle < _SMALL_SCALE or np.exp(min(middle, 80.0)) > _LARGE * spread or most > _RATIO * least
     low, high = opacity_logits.min(), opacity_logits.max()
     activated = {
         "scales": bool((log_scales > 0).mean() > _NEARLY_ALL) and large,
