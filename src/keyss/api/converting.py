@@ -13,6 +13,7 @@ from keyss.core.errors import InputError, QualityError, UsageError, WrongKeyErro
 from keyss.core.gaussians import DRAWN_OPACITY, Gaussians
 from keyss.files.atomic import mode_like, write_bytes
 from keyss.files.models import check_model_output, keeps_low_bits, model_bytes, model_of_bytes
+from keyss.files.ply_extras import with_extras
 from keyss.files.reading import is_standard, write_standard_output
 from keyss.rendering import Backend, resolve_device
 from keyss.rendering.difference import psnr_between
@@ -74,7 +75,7 @@ def convert(
         check_not_published(path)
     before = as_model(model)
     opened = [reveal_any(before, key, target) for key in keys]
-    data = model_bytes(path, before)
+    data = model_bytes(path, with_extras(before, source, before))
     after = model_of_bytes(path, data)
     secrets = tuple(
         KeptSecret(each.remains.found, _left(after, key, target), "bytes" if each.file else "Gaussians")

@@ -26,6 +26,7 @@ from keyss.core.errors import InputError, OutputError, UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.files.atomic import atomic_write, check_not_an_input, check_output_file
 from keyss.files.foreign import START_BYTES, is_foreign_zip, kind_of
+from keyss.files.ply_extras import NORMALS, ExtendedGaussians, PlyExtras
 from keyss.files.ply_rows import (
     check_not_activated,
     finite_rows,
@@ -33,7 +34,7 @@ from keyss.files.ply_rows import (
     model_names,
     read_model_rows,
 )
-from keyss.files.ply_table import ply_header
+from keyss.files.ply_table import TYPES, ply_header
 from keyss.files.reading import (
     MAX_BYTES,
     check_standard_output,
@@ -90,17 +91,29 @@ def _writer(name: str) -> Callable[[Gaussians, BinaryIO], None]:
 def write_ply(model: Gaussians, file: BinaryIO) -> None:
     """Write `model` as little-endian float32 in the Inria layout.
 
-    Normals are zeros, infinite opacity logits become +-OPACITY_LOGIT_BOUND, and the bytes depend on the
-    values only. Raises OutputError when there are no Gaussians or a value is not finite.
+    Normals are zeros and there are no other properties, unless `model` has extras. Infinite opacity logits
+    become +-OPACITY_LOGIT_BOUND, and the bytes depend on the values only. Raises OutputError when there are
+    no Gaussians or a value is not finite.
     """
     n, k = model.sh.shape[:2]
     names = model_names(k)
-    names[3:3] = ["nx", "ny", "nz"]
+    names[3:3] = NORMALS
     flat = model.detach().to("cpu")
-    file.write(ply_header({"vertex": (n, (f"float {name}" for name in names))}))
+    extras = model.extras if isinstance(model, ExtendedGaussians) else PlyExtras((), {})
+    further = {name: values for name, values in extras.properties.items() if name not in NORMALS}
+    properties = [f"float {name}" for name in names]
+    properties += [f"{TYPES[values.dtype.str[1:]]} {name}" for name, values in further.items()]
+    file.write(ply_header({"vertex": (n, properties)}, extras.comments))
     blocks = (_rows(flat[start : start + _BLOCK]) for start in range(0, n, _BLOCK))
+    start = 0
     for rows in finite_rows(blocks, names):
-        file.write(rows.astype("<f4", copy=False).data)
+        part = slice(start, start + len(rows))
+        for name in extras.properties.keys() & set(NORMALS):
+            rows[:, names.index(name)] = extras.properties[name][part]
+        columns = [rows, *(values[part, None] for values in further.values())]
+        little = (each.astype(each.dtype.newbyteorder("<"), copy=False) for each in columns)
+        file.write(np.concatenate([each.view(np.uint8) for each in little], axis=1).data)
+        start = part.stop
 
 
 def _rows(part: Gaussians) -> Floats:

@@ -7,14 +7,15 @@ from __future__ import annotations
 
 import re
 import warnings
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
+import numpy.typing as npt
 
-from keyss.core.arrays import Floats, Integers
+from keyss.core.arrays import Flags, Floats, Integers
 from keyss.core.errors import InputError, KeyssWarning, OutputError
 from keyss.files.ply_table import MAX_HEADER_BYTES, Vertices, read_vertices
 from keyss.files.reading import open_input
@@ -55,7 +56,7 @@ def read_rows(path: Path) -> tuple[list[str], Floats]:
 
 def read_model_rows(file: BinaryIO) -> Vertices:
     """The properties of a model in the order of `model_names`, as `usable_rows`. Raises InputError."""
-    vertices = read_vertices(file, _model_properties)
+    vertices = read_vertices(file, model_properties)
     return replace(vertices, blocks=usable_rows(vertices, getattr(file, "name", "the model")))
 
 
@@ -90,6 +91,18 @@ def usable_rows(vertices: Vertices, where: str) -> Iterator[Floats]:
             KeyssWarning,
             stacklevel=2,
         )
+
+
+def finite_gaussians(table: npt.NDArray[np.void]) -> Flags:
+    """[N] the vertices that `usable_rows` keeps, of all in a file."""
+    names = model_properties(table.dtype.names or ())
+    finite = np.ones(len(table), np.bool_)
+    for name in names:
+        with np.errstate(over="ignore"):
+            values = table[name].astype(np.float32)
+        flat, opacity = name.startswith("scale_") & np.isneginf(values), name == "opacity"
+        finite &= np.isfinite(values) | flat | (opacity & ~np.isnan(values))
+    return finite
 
 
 def finite_rows(blocks: Iterable[Floats], names: list[str]) -> Iterator[Floats]:
@@ -153,7 +166,7 @@ def check_not_activated(means: Floats, log_scales: Floats, opacity_logits: Float
         )
 
 
-def _model_properties(found: Mapping[str, str]) -> list[str]:
+def model_properties(found: Collection[str]) -> list[str]:
     """Names of the properties that make a model. Raises InputError if any is missing."""
     rest = {name for name in found if re.fullmatch(r"f_rest_[0-9]+", name)}
     names = model_names(len(rest) // 3 + 1)
@@ -167,7 +180,7 @@ def _model_properties(found: Mapping[str, str]) -> list[str]:
             "this is a 2DGS model: its Gaussians are flat and have no scale_2; open it in SuperSplat "
             "(superspl.at/editor) and export a .ply, which has one"
         )
-    if missing[:3] == names[3:6] and {"red", "green", "blue", "opacity"} <= found.keys():
+    if missing[:3] == names[3:6] and {"red", "green", "blue", "opacity"} <= set(found):
         raise InputError(
             "this is a 3DGS model with colours as red, green and blue instead of harmonics (f_dc_0, ...): "
             "export it again with harmonics, from Nerfstudio with `--ply-color-mode sh_coeffs`"
