@@ -162,3 +162,21 @@ def test_others_can_read_what_is_made_of_what_they_can_read(keyss: Run, tmp_path
     assert keyss("view", tmp_path / "m.ply", "-o", tmp_path / "page").status == 0
     made = [tmp_path / "m.spz", tmp_path / "page.html", *(tmp_path / "page").iterdir()]
     assert {path.stat().st_mode & 0o777 for path in made} == {mode}
+
+
+def test_the_folder_of_a_training_is_a_model(keyss: Run, tmp_path: Path) -> None:
+    for number in (7000, 30000):
+        folder = tmp_path / "trained" / "point_cloud" / f"iteration_{number}"
+        folder.mkdir(parents=True)
+        write_model(folder / "point_cloud.ply", trained_like(COUNT + number // 10))
+    said = keyss("convert", tmp_path / "trained", tmp_path / "a.spz")
+    assert said.err.count("its model is point_cloud/iteration_30000/point_cloud.ply") == 1
+    assert len(read_model(tmp_path / "a.spz")) == COUNT + 3000
+    write_model(tmp_path / "secret.ply", trained_like(60, 1))
+    key, run = write_key(tmp_path / "key"), tmp_path / "run"
+    options = ["--secret", tmp_path / "secret.ply", "--key-file", key, "--min-psnr", "0", "-o", run]
+    said = keyss("hide", "--cover", tmp_path / "trained", *options)
+    assert said.status == 0, said.err
+    assert said.err.count("its model is") == 1
+    assert len(read_model(run / "publish" / "stego.ply")) == COUNT + 3000
+    assert keyss("evaluate", run, "--key-file", key).status == 0

@@ -15,6 +15,7 @@ from keyss.files.atomic import mode_like, write_bytes
 from keyss.files.models import check_model_output, keeps_low_bits, model_bytes, model_of_bytes
 from keyss.files.ply_extras import with_extras
 from keyss.files.reading import is_standard, write_standard_output
+from keyss.files.trained import model_file
 from keyss.rendering import Backend, resolve_device
 from keyss.rendering.difference import psnr_between
 from keyss.runs.files import PathLike, as_model
@@ -69,11 +70,11 @@ def convert(
     nothing, InputError, OutputError, and UsageError for an unknown suffix.
     """
     target = resolve_device(device)
-    source = None if isinstance(model, Gaussians) else Path(model)
+    source = None if isinstance(model, Gaussians) else model_file(model)
     path = check_model_output(out, overwrite, [source] if source else [])
     if not is_standard(path):
         check_not_published(path)
-    before = as_model(model)
+    before = as_model(model if source is None else source)
     opened = [reveal_any(before, key, target) for key in keys]
     data = model_bytes(path, with_extras(before, source, before))
     after = model_of_bytes(path, data)

@@ -16,6 +16,7 @@ _CHECKPOINT = (
     "point_cloud/iteration_N/point_cloud.ply by itself"
 )
 _UNPACK = "unpack it, and give the folder or the model that is in it"
+CHECKPOINTS = f"checkpoints of a training; {_CHECKPOINT}"  # in a folder
 START_BYTES = 256  # of a file, which tell its kind
 _ZIP = b"PK\x03\x04"
 _POSES = "a scene is a folder of photos with their poses, e.g. from COLMAP"

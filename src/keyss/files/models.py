@@ -25,7 +25,7 @@ from keyss.core.decoded import DecodedGaussians
 from keyss.core.errors import InputError, OutputError, UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.files.atomic import atomic_write, check_not_an_input, check_output_file
-from keyss.files.foreign import START_BYTES, is_foreign_zip, kind_of
+from keyss.files.foreign import CHECKPOINTS, START_BYTES, is_foreign_zip, kind_of
 from keyss.files.ply_extras import NORMALS, ExtendedGaussians, PlyExtras
 from keyss.files.ply_rows import (
     check_not_activated,
@@ -43,6 +43,7 @@ from keyss.files.reading import (
     read_standard_input,
     write_standard_output,
 )
+from keyss.files.trained import has_checkpoints, is_training, model_file
 
 DECODED_SUFFIX = ".3dgs.safetensors"  # of models that a network decodes
 _BLOCK = 1 << 13  # Gaussians that are written at a time
@@ -181,17 +182,25 @@ def is_model_path(path: Path | str) -> bool:
     return _by_suffix(path) is not None
 
 
+def is_model_source(path: Path | str) -> bool:
+    """True if `read_model` reads a model at a path: by its suffix, or in the folder of a training."""
+    return is_model_path(path) or is_training(path)
+
+
 def read_model(path: Path | str) -> Gaussians:
     """The model at `path`, on the CPU; "-" is standard input. The first bytes tell the format.
+
+    Of the folder of another program's training it is the latest model, with a KeyssWarning.
 
     Raises InputError for a file that is missing, of unknown format, named like another format, or not a
     complete and finite model.
     """
     if is_standard(path):
         return model_of_bytes("standard input", read_standard_input())
-    path = Path(path)
+    path = model_file(path)
     if os.path.isdir(path):
-        raise InputError(f"{path}: expected the file of a 3DGS model ({known_suffixes()}), found a folder")
+        found = f"a folder of {CHECKPOINTS}" if has_checkpoints(path) else "a folder"
+        raise InputError(f"{path}: expected the file of a 3DGS model ({known_suffixes()}), found {found}")
     if not os.path.isfile(path):
         raise InputError(f"{path}: expected a 3DGS model ({known_suffixes()}), but there is no such file")
     with open_input(path) as file:

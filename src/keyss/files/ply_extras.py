@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -17,6 +16,7 @@ from keyss.core.gaussians import Gaussians
 from keyss.files.ply_rows import finite_gaussians, has_packed_header, model_properties
 from keyss.files.ply_table import read_vertex_table
 from keyss.files.reading import open_input
+from keyss.files.trained import model_file
 
 NORMALS = ("nx", "ny", "nz")
 _SAME_PLACE = 0.01  # of the model's spread: how far hiding moves no Gaussian
@@ -50,9 +50,10 @@ def with_extras(model: Gaussians, source: Any, read: Gaussians) -> Gaussians:
     `model` has the Gaussians of `read` in the same order, and possibly more after them, whose extras are 0.
     Otherwise, and for a source that is not the path of a .ply, the result is `model`. Raises InputError.
     """
-    if type(model) is not Gaussians or not isinstance(source, str | Path) or not os.path.isfile(source):
+    if type(model) is not Gaussians or not isinstance(source, str | Path):
         return model
-    extras = _read_extras(Path(source), len(read))
+    path = model_file(source)
+    extras = _read_extras(path, len(read)) if path.is_file() else None
     if extras is None or not _begins_with(model, read):
         return model
     missing = len(model) - len(read)

@@ -24,6 +24,7 @@ from keyss.core.errors import InputError, KeyssWarning, OutputError, UsageError
 from keyss.files.atomic import check_not_an_input, check_output_file, mode_like, write_bytes
 from keyss.files.ply_rows import is_compressed, read_model_rows
 from keyss.files.reading import open_input
+from keyss.files.trained import model_file
 from keyss.viewer.look import Look
 
 SCRIPT, STYLE, LICENCES, INDEX = "viewer.js", "viewer.css", "licences.txt", "index.html"
@@ -86,7 +87,7 @@ def export_html(
     Others can read what is written if they can read `model`. Returns the paths written. Raises UsageError
     for a model that is too large, InputError if it is not a model, OutputError.
     """
-    model, out = Path(model), Path(out)
+    model, out = model_file(model), Path(out)
     file, look = readable(model), look or {}
     for origin in (look[name] for name in ("host", "embedder") if name in look):
         if not _ORIGIN.fullmatch(origin):
@@ -162,6 +163,7 @@ def readable(model: Path) -> Readable:
 
     Raises InputError if it is not a whole model.
     """
+    model = model_file(model)
     try:
         with model.open("rb") as file:
             header = file.read(_MAX_HEADER)
