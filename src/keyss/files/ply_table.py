@@ -131,7 +131,6 @@ def _skip(file: BinaryIO, before: list[_Element], vertex: _Element) -> None:
     file.seek(skipped, os.SEEK_CUR)
 
 
-
 def read_tables(file: BinaryIO) -> dict[str, npt.NDArray[np.void]]:
     """All elements of a binary PLY by name, as structured arrays with the properties' own types.
 
