@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -11,6 +12,7 @@ import torch
 import keyss as package
 from channels.low_bits.trained_like import trained_like
 from cli.said import PROGRAM, Run, assert_refused, write_key
+from keyss.core import Similarity
 from keyss.files import read_model, write_model
 from methods.carry.carried import embed
 from tiny_scenes import random_gaussians
@@ -48,6 +50,30 @@ def test_says_what_it_costs(keyss: Run, files: Path, tmp_path: Path, suffix: str
             assert 25 < float(first.split("renders at ")[1].split()[0]) < 100
         assert others == ["a secret in low bits would be lost; --key-file checks that a secret survives"]
     assert len(read_model(out)) == COUNT
+
+
+@pytest.mark.parametrize("unit", [1e-3, 1e-5, 1e4])
+def test_the_cost_does_not_depend_on_the_unit(keyss: Run, tmp_path: Path, unit: float) -> None:
+    """Also of models that are smaller than the nearest distance that rasterizers draw."""
+    generator = torch.Generator().manual_seed(2)
+    model = random_gaussians(COUNT)
+    model = replace(model, log_scales=torch.randn(COUNT, 3, generator=generator) * 0.5 - 2)
+    costs = []
+    for name, scale in (("one", 1.0), ("other", unit)):
+        changed = Similarity(scale=scale).apply_gaussians(model)
+        write_model(tmp_path / f"{name}.ply", changed)
+        said = keyss("convert", tmp_path / f"{name}.ply", tmp_path / f"{name}.compressed.ply").out
+        costs.append(float(said.split("renders at ")[1].split()[0]))
+    assert costs[0] == pytest.approx(costs[1], abs=1.0)
+    said = keyss("convert", tmp_path / "other.ply", tmp_path / "other.spz")
+    assert "unchanged" not in said.out
+    assert len(read_model(tmp_path / "other.spz").means.unique(dim=0)) == COUNT or unit < 1e-4
+
+
+def test_empty_renders_are_not_called_unchanged(keyss: Run, tmp_path: Path) -> None:
+    model = random_gaussians(COUNT)
+    write_model(tmp_path / "a.ply", replace(model, opacity_logits=torch.full((COUNT,), -12.0)))
+    assert "renders are empty" in keyss("convert", tmp_path / "a.ply", tmp_path / "a.splat").out
 
 
 @pytest.mark.parametrize("suffix", ["spz", "sog", "compressed.ply", "glb", "splat"])
@@ -136,3 +162,21 @@ def test_others_can_read_what_is_made_of_what_they_can_read(keyss: Run, tmp_path
     assert keyss("view", tmp_path / "m.ply", "-o", tmp_path / "page").status == 0
     made = [tmp_path / "m.spz", tmp_path / "page.html", *(tmp_path / "page").iterdir()]
     assert {path.stat().st_mode & 0o777 for path in made} == {mode}
+
+
+def test_the_folder_of_a_training_is_a_model(keyss: Run, tmp_path: Path) -> None:
+    for number in (7000, 30000):
+        folder = tmp_path / "trained" / "point_cloud" / f"iteration_{number}"
+        folder.mkdir(parents=True)
+        write_model(folder / "point_cloud.ply", trained_like(COUNT + number // 10))
+    said = keyss("convert", tmp_path / "trained", tmp_path / "a.spz")
+    assert said.err.count("its model is point_cloud/iteration_30000/point_cloud.ply") == 1
+    assert len(read_model(tmp_path / "a.spz")) == COUNT + 3000
+    write_model(tmp_path / "secret.ply", trained_like(60, 1))
+    key, run = write_key(tmp_path / "key"), tmp_path / "run"
+    options = ["--secret", tmp_path / "secret.ply", "--key-file", key, "--min-psnr", "0", "-o", run]
+    said = keyss("hide", "--cover", tmp_path / "trained", *options)
+    assert said.status == 0, said.err
+    assert said.err.count("its model is") == 1
+    assert len(read_model(run / "publish" / "stego.ply")) == COUNT + 3000
+    assert keyss("evaluate", run, "--key-file", key).status == 0

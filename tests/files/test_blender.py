@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from files.scene_files import frames, look_at_origin, photo, save, write_blender, write_json
-from keyss.core import InputError, UsageError
+from keyss.core import InputError, KeyssWarning, UsageError
 from keyss.files import load_scene
 
 
@@ -113,27 +113,44 @@ def changed(row: int, column: int, value: object) -> list[list[object]]:
 @pytest.mark.parametrize(
     ("matrix", "message"),
     [
-        (None, r"Expected `array`, got `null` - at {at}`"),
-        ([[1, 0, 0, 0]], r"Expected `array` of length >= 3 - at {at}`"),
-        ([[1, 0, 0]] * 4, r"Expected `array` of length 4 - at {at}\[0\]`"),
-        ([1, 2, 3, 4], r"Expected `array`, got `int` - at {at}\[0\]`"),
-        (changed(0, 0, "one"), r"Expected `float`, got `str` - at {at}\[0\]\[0\]`"),
-        (changed(0, 0, None), r"Expected `float`, got `null` - at {at}\[0\]\[0\]`"),
-        (changed(0, 0, True), r"Expected `float`, got `bool` - at {at}\[0\]\[0\]`"),
-        (changed(0, 3, math.nan), "JSON is malformed"),
-        (changed(0, 3, 10**400), r"out of range - at {at}\[0\]\[3\]`"),
-        (changed(0, 3, 1e300), "frame 0: .*finite `transform_matrix`"),
-        (changed(3, 3, 2.0), "frame 0: .*ends in 0 0 0 1"),
-        (changed(0, 2, 1.1), "frame 0: .*with a rotation"),
-        (changed(0, 2, -1.0), "frame 0: .*with a rotation"),  # a mirror
-        ([[0, 0, 0, 1]] * 3, "frame 0: .*with a rotation"),
+        (None, r"Expected `array`, got `null`"),
+        ([[1, 0, 0, 0]], r"Expected `array` of length >= 3"),
+        ([[1, 0, 0]] * 4, r"Expected `array` of length 4, got 3 - at `\$\[0\]`"),
+        ([1, 2, 3, 4], r"Expected `array`, got `int` - at `\$\[0\]`"),
+        (changed(0, 0, "one"), r"Expected `float`, got `str` - at `\$\[0\]\[0\]`"),
+        (changed(0, 0, None), r"Expected `float`, got `null` - at `\$\[0\]\[0\]`"),
+        (changed(0, 0, True), r"Expected `float`, got `bool` - at `\$\[0\]\[0\]`"),
+        (changed(0, 3, math.nan), "finite `transform_matrix`"),
+        (changed(1, 1, -math.inf), "finite `transform_matrix`"),
+        (changed(3, 0, math.nan), "ends in 0 0 0 1"),
+        (changed(0, 3, 10**400), r"out of range - at `\$\[0\]\[3\]`"),
+        (changed(0, 3, 1e300), "finite `transform_matrix`"),
+        (changed(3, 3, 2.0), "ends in 0 0 0 1"),
+        (changed(0, 2, 1.1), "with a rotation"),
+        (changed(0, 2, -1.0), "with a rotation"),  # a mirror
+        ([[0, 0, 0, 1]] * 3, "with a rotation"),
+        ([[0] * 4] * 3, "with a rotation"),
     ],
 )
 def test_impossible_poses_are_named(tmp_path: Path, matrix: object, message: str) -> None:
+    """By the photo, which can be left out."""
     write_transforms(write_blender(tmp_path), matrix)
-    place = r"`\$\.frames\[0\]\.transform_matrix"
-    with pytest.raises(InputError, match="transforms_train.json: .*" + message.replace("{at}", place)):
+    end = r".*`skip_missing=True` leaves out such photos \(1 of 2 photos\)"
+    with pytest.raises(
+        InputError, match=rf"transforms_train.json: frame 0 \(train/r_0.png\): .*{message}{end}"
+    ):
         load_scene(tmp_path)
+    said = r"1 of 2 photos have no usable camera and are left out: train/r_0.png$"
+    with pytest.warns(KeyssWarning, match=said):
+        scene = load_scene(tmp_path, skip_missing=True)
+    assert [view.camera.name for view in scene.train] == ["train/r_1.png"]
+
+
+def test_a_scene_without_any_usable_camera_is_refused(tmp_path: Path) -> None:
+    meta = {"camera_angle_x": math.nan, "frames": frames(["train/r_0", "train/r_1"])}
+    write_json(write_blender(tmp_path) / "transforms_train.json", meta)
+    with pytest.raises(InputError, match=r"frame 0 \(train/r_0.png\): .*camera_angle_x .*found nan$"):
+        load_scene(tmp_path, skip_missing=True)
 
 
 @pytest.mark.parametrize("angle", [0, -1, 3.2, "wide", None, 10**400, [0.7]])
@@ -147,8 +164,8 @@ def test_impossible_angles_are_named(tmp_path: Path, angle: object) -> None:
 def test_missing_photos_and_wrong_sizes_are_named(tmp_path: Path) -> None:
     write_blender(tmp_path)
     meta = json.loads((tmp_path / "transforms_train.json").read_text())
-    write_json(tmp_path / "transforms_train.json", meta | {"w": 13, "h": 8})
-    with pytest.raises(InputError, match=r"r_0\.png: .* its camera, 13x8 .* found 12x8"):
+    write_json(tmp_path / "transforms_train.json", meta | {"w": 15, "h": 8})
+    with pytest.raises(InputError, match=r"r_0\.png: .* its camera, 15x8, .* found 12x8"):
         load_scene(tmp_path)
     write_json(tmp_path / "transforms_train.json", meta | {"w": 24, "h": 16})
     assert load_scene(tmp_path).train[0].camera.K[0, 0] == pytest.approx(6 / math.tan(0.35))

@@ -247,7 +247,7 @@ def one_camera(**fields: Any) -> dict[str, bytes]:
 @pytest.mark.parametrize(
     ("replaced", "message"),
     [
-        (second_image("01.png", quaternion=(0, 0, 0, 0)), "image 2: expected a rotation"),
+        (second_image("01.png", quaternion=(0, 0, 0, 0)), "'01.png': expected a rotation.*skip_missing"),
         (second_image("01.png", quaternion=(math.nan, 0, 0, 1)), "expected a rotation"),
         (second_image("01.png", quaternion=(1e308,) * 4), "expected a rotation"),
         (second_image("01.png", translation=(0, math.inf, 0)), "finite translation"),
@@ -308,4 +308,49 @@ def test_broken_text_names_the_line(tmp_path: Path, name: str, text: str, messag
 def test_a_missing_model_file_is_named(tmp_path: Path) -> None:
     (write_colmap(tmp_path) / "sparse" / "0" / "images.bin").unlink()
     with pytest.raises(InputError, match=r"images\.bin: expected a file"):
+        load_scene(tmp_path)
+
+
+def test_a_photo_without_a_pose_can_be_left_out(tmp_path: Path) -> None:
+    poses = [(1, 0, 0, 0), (math.nan, 0, 0, 1), (1, 0, 0, 0)]
+    images = counted(*(image_bytes(i + 1, f"{i:02}.png", pose) for i, pose in enumerate(poses)))
+    with pytest.warns(KeyssWarning, match=r"1 of 3 photos have no usable camera and are left out: 01.png$"):
+        layout = read_colmap(write_colmap(tmp_path, images=images), skip_missing=True)
+    assert [photo.name for photo in (*layout.train, *layout.test)] == ["02.png", "00.png"]
+
+
+@pytest.mark.parametrize("place", ["sparse", "colmap/sparse"])
+def test_of_several_models_the_one_with_most_photos_is_used(tmp_path: Path, place: str) -> None:
+    write_colmap(tmp_path, 2, model=f"{place}/0")
+    write_colmap(tmp_path, 5, model=f"{place}/1")
+    write_colmap(tmp_path, 3, model=f"{place}/10")
+    said = rf"there are 3 sparse models; the one with most photos is used, {place}/1 \(5 photos\)"
+    with pytest.warns(KeyssWarning, match=said):
+        scene = load_scene(tmp_path)
+    assert len(scene.views) == 5
+    (tmp_path / place / "10" / "images.bin").write_bytes(b"\xff")  # the damage of another does not matter
+    with pytest.warns(KeyssWarning, match=said):
+        assert len(load_scene(tmp_path).views) == 5
+
+
+def test_names_in_another_case_are_found(tmp_path: Path) -> None:
+    folder = write_colmap(tmp_path)
+    before = load_scene(folder)
+    (folder / "images").rename(folder / "Images")
+    (folder / "Images" / "01.png").rename(folder / "Images" / "01.PNG")
+    assert load_scene(folder).digest() == before.digest()
+    (folder / "Images" / "01.Png").write_bytes(b"another")  # which of them is meant is unknown
+    with pytest.raises(InputError, match=r"1 of 3 photos are missing: 01\.png"):
+        load_scene(folder)
+
+
+def test_one_file_is_not_two_photos(tmp_path: Path) -> None:
+    images = counted(image_bytes(1, "00.png"), image_bytes(2, "01.png"), image_bytes(3, "00.PNG"))
+    with pytest.raises(InputError, match=r"1 of 3 photos are missing: 00\.PNG"):
+        load_scene(write_colmap(tmp_path, images=images))
+
+
+def test_masks_are_said_not_to_be_used(tmp_path: Path) -> None:
+    (write_colmap(tmp_path) / "masks").mkdir()
+    with pytest.warns(KeyssWarning, match="masks: masks are not used"):
         load_scene(tmp_path)

@@ -8,7 +8,9 @@ import os
 import zipfile
 from pathlib import Path
 
+import numpy as np
 import pytest
+import torch
 from PIL import Image
 
 from files.scene_files import photo
@@ -18,10 +20,22 @@ from keyss.files import load_scene, read_model, what_it_is
 CONVERT = "convert it to .ply first, e.g. with `splat-transform IN OUT.ply`"
 
 
-def zipped() -> bytes:
+def zipped(name: str = "meta.json") -> bytes:
     data = io.BytesIO()
     with zipfile.ZipFile(data, "w") as archive:
-        archive.writestr("meta.json", "{}")
+        archive.writestr(name, "{}")
+    return data.getvalue()
+
+
+def checkpoint(*, new: bool) -> bytes:
+    data = io.BytesIO()
+    torch.save({"means": torch.zeros(3)}, data, _use_new_zipfile_serialization=new)
+    return data.getvalue()
+
+
+def arrays() -> bytes:
+    data = io.BytesIO()
+    np.savez(data, means=np.zeros(3))
     return data.getvalue()
 
 
@@ -39,6 +53,13 @@ FILES = {  # name and content, and what they are
     "a.ksplat": (bytes(64), f"a .ksplat model, which keyss does not read; {CONVERT}"),
     "a.glb": (b"glTF", "a glTF file"),
     "a.lcc": (b"{}", f"an LCC model, which keyss does not read; {CONVERT}"),
+    "a.pt": (checkpoint(new=True), "a checkpoint of a training; keyss never opens pickles"),
+    "a.ckpt": (checkpoint(new=True), "a checkpoint of a training"),
+    "a.pth": (checkpoint(new=False), "a checkpoint of a training"),
+    "ckpt_6999_rank0": (checkpoint(new=True), "a checkpoint of a training"),
+    "old": (checkpoint(new=False), "a checkpoint of a training"),
+    "a.npz": (arrays(), "arrays of NumPy; export a .ply"),
+    "a.usdz": (zipped("a.usdc"), "a USD scene; export a .ply"),
     "a.csv": (b"x,y,z\n1,2,3\n", "a table; export a .ply"),
     "a.zip": (zipped(), "a ZIP archive; unpack it"),
     "a": (gzip.compress(b"1"), "gzip data; unpack it"),

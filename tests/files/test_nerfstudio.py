@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import json
+import math
 import struct
 from collections.abc import Iterator
 from contextlib import suppress
@@ -15,9 +16,20 @@ import pycolmap
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from files.scene_files import frames, mutations, photo, save, write_json, write_nerfstudio
+from files.scene_files import (
+    camera_bytes,
+    counted,
+    frames,
+    mutations,
+    photo,
+    save,
+    write_colmap,
+    write_json,
+    write_nerfstudio,
+)
 from keyss.core import InputError, KeyssWarning
 from keyss.files import load_scene
+from keyss.files.colmap import read_colmap
 from keyss.files.lens import undistortion
 from keyss.files.ply_table import read_point_cloud
 from keyss.files.transforms import read_nerfstudio
@@ -92,6 +104,39 @@ def test_splits(tmp_path: Path) -> None:
     assert names(write_nerfstudio(tmp_path, 4, test_filenames=FRAMES[:3])) == (["3"], ["0", "1", "2"])
 
 
+@pytest.mark.parametrize("extra", [{"k5": 0.01, "k6": 0.02}, {"camera_model": "FULL_OPENCV"}])
+def test_opencvs_eight_coefficients_mean_what_colmap_means(tmp_path: Path, extra: dict[str, object]) -> None:
+    brown = {"k1": 0.1, "k2": 0.02, "p1": 0.001, "p2": 0.002, "k3": 0.01, "k4": 0.03, **extra}
+    lens = read_nerfstudio(write_nerfstudio(tmp_path / "a", **brown)).train[0].lens
+    rest = (float(brown.get("k5", 0)), float(brown.get("k6", 0)))  # type: ignore[arg-type]
+    params = (10.0, 11.0, 6.5, 4.0, 0.1, 0.02, 0.001, 0.002, 0.01, 0.03, *rest)
+    assert (
+        lens
+        == read_colmap(write_colmap(tmp_path / "b", cameras=counted(camera_bytes(model=6, params=params))))
+        .train[0]
+        .lens
+    )
+
+
+def test_names_in_another_case_are_found(tmp_path: Path) -> None:
+    folder = write_nerfstudio(tmp_path, 4, train_filenames=[each.upper() for each in FRAMES[:3]])
+    for each in FRAMES[:2]:
+        (folder / each).rename(folder / each.replace("frame", "Frame"))
+    scene = load_scene(folder)
+    assert [view.camera.name for view in scene.train] == [
+        "images/Frame_00000.png", "images/Frame_00001.png", "images/frame_00002.png"
+    ]  # fmt: skip
+
+
+def test_masks_are_said_not_to_be_used(tmp_path: Path) -> None:
+    folder = write_nerfstudio(tmp_path)
+    meta = json.loads((folder / "transforms.json").read_text())
+    meta["frames"][1]["mask_path"] = "masks/1.png"
+    write_json(folder / "transforms.json", meta)
+    with pytest.warns(KeyssWarning, match="`mask_path`: masks are not used"):
+        load_scene(folder)
+
+
 @pytest.mark.parametrize("others", [{}, {"test_filenames": [], "val_filenames": []}])
 def test_every_eighth_photo_is_for_testing_where_all_are_for_training(
     tmp_path: Path, others: dict[str, object]
@@ -126,6 +171,9 @@ def test_a_split_holds_for_the_photos_that_are_left(tmp_path: Path) -> None:
         ({"camera_model": 5}, r"Expected `str.*`, got `int` - at `\$\.camera_model`"),
         ({"camera_model": ["OPENCV"]}, r"Expected `str.*`, got `array` - at `\$\.camera_model`"),
         ({"k4": 0.1}, "expected k4 = 0"),
+        ({"w": math.nan}, "whole numbers as `w` and `h`, found nan, 8"),
+        ({"cx": math.inf}, "principal point"),
+        ({"camera_model": "OPENCV_FISHEYE", "k5": 0.1}, "a fisheye lens has no coefficients k5"),
         ({"camera_model": "OPENCV_FISHEYE", "p1": 0.1}, "a fisheye lens has no coefficients p1"),
         ({"fl_x": None, "fl_y": None}, "expected `fl_x` or `camera_angle_x`, found neither"),
         ({"fl_x": -10}, "focal lengths"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tracemalloc
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import gsply
@@ -12,9 +13,10 @@ import pytest
 import torch
 from hypothesis import HealthCheck, given, settings, strategies as st
 
-from keyss.core import Gaussians, InputError, OutputError, same_bits
+from keyss.core import Gaussians, InputError, KeyssWarning, OutputError, same_bits
 from keyss.files import read_model, write_model
-from keyss.files.ply_rows import OPACITY_LOGIT_BOUND
+from keyss.files.ply_rows import LEAST_LOG_SCALE, OPACITY_LOGIT_BOUND
+from keyss.runs.describe import ModelInfo, info
 from tiny_scenes import random_gaussians
 
 Transform = Callable[..., Path]
@@ -174,12 +176,72 @@ def test_infinite_opacity_is_clamped(tmp_path: Path) -> None:
         ("y", 1e60, "double"),
     ],
 )
-def test_other_values_must_be_finite(tmp_path: Path, name: str, value: float, kind: str) -> None:
-    columns = columns_of(random_gaussians(4, sh_degree=1))
-    columns[name] = np.array([0.0, value, value, 0.0])
+def test_rows_that_are_not_finite_are_left_out(tmp_path: Path, name: str, value: float, kind: str) -> None:
+    model = random_gaussians(4, sh_degree=1)
+    columns = columns_of(model)
+    columns[name] = np.array([columns[name][0], value, value, columns[name][3]])
     (tmp_path / "a.ply").write_bytes(ply_bytes(columns, kinds={name: kind}))
-    with pytest.raises(InputError, match=rf"among 4 Gaussians: {name} in 2$"):
+    said = rf"a.ply: 2 of 4 Gaussians are left out: they have NaN or infinite values \({name} in 2\)"
+    with pytest.warns(KeyssWarning, match=said):
+        found = read_model(tmp_path / "a.ply")
+    assert same_bits(found, model[torch.tensor([0, 3])])
+    with pytest.warns(KeyssWarning, match=said):
+        facts = info(tmp_path / "a.ply")
+    assert isinstance(facts, ModelInfo)
+    assert facts.gaussians == 2
+    columns[name] = np.full(4, value)
+    (tmp_path / "a.ply").write_bytes(ply_bytes(columns, kinds={name: kind}))
+    with pytest.raises(InputError, match=rf"among 4 Gaussians: {name} in 4$"):
         read_model(tmp_path / "a.ply")
+
+
+def test_flat_gaussians_are_kept(tmp_path: Path) -> None:
+    """Scales of 0 are log scales of minus infinity; they are drawn as discs."""
+    model = random_gaussians(4, sh_degree=0)
+    columns = columns_of(model)
+    columns["scale_1"] = np.array([-np.inf, -3.0, -np.inf, -3.0])
+    (tmp_path / "a.ply").write_bytes(ply_bytes(columns))
+    found = read_model(tmp_path / "a.ply")
+    assert found.log_scales[:, 1].tolist() == pytest.approx([LEAST_LOG_SCALE, -3.0] * 2)
+    assert (found.scales > 0).all()
+    write_model(tmp_path / "b.splat", found)
+    assert len(read_model(tmp_path / "b.splat")) == 4
+
+
+# --- models of other programs ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("unit", [0.001, 1.0, 1000.0, 1e6])
+@pytest.mark.parametrize("which", ["scales", "opacities", "scales and opacities"])
+def test_activated_values_are_refused_in_any_unit(tmp_path: Path, unit: float, which: str) -> None:
+    model = random_gaussians(400, sh_degree=0)
+    generator = torch.Generator().manual_seed(0)
+    scales = torch.exp(torch.randn(400, 3, generator=generator) - 3)
+    opacities = torch.rand(400, generator=generator)
+    plain = Gaussians(unit * model.means, model.quats, (unit * scales).log(), opacities.logit(), model.sh)
+    write_model(tmp_path / "plain.ply", plain)
+    assert same_bits(read_model(tmp_path / "plain.ply"), plain)
+    if "scales" in which:
+        plain = replace(plain, log_scales=plain.scales)
+    if "opacities" in which:
+        plain = replace(plain, opacity_logits=plain.opacities)
+    write_model(tmp_path / "activated.ply", plain)
+    with pytest.raises(InputError, match=f"its {which} are those that renderers use.* apply log to"):
+        read_model(tmp_path / "activated.ply")
+
+
+def test_models_of_other_kinds_are_told_the_way_out(tmp_path: Path) -> None:
+    columns = columns_of(random_gaussians(4, sh_degree=0))
+    flat = {name: values for name, values in columns.items() if name != "scale_2"}
+    (tmp_path / "a.ply").write_bytes(ply_bytes(flat))
+    with pytest.raises(InputError, match=r"a\.ply: this is a 2DGS model.*SuperSplat"):
+        read_model(tmp_path / "a.ply")
+    rgb = {name: values for name, values in columns.items() if not name.startswith("f_dc")}
+    rgb |= {name: np.full(4, 128) for name in ("red", "green", "blue")}
+    kinds = dict.fromkeys(("red", "green", "blue"), "uchar")
+    (tmp_path / "b.ply").write_bytes(ply_bytes(rgb, kinds=kinds))
+    with pytest.raises(InputError, match="--ply-color-mode sh_coeffs"):
+        read_model(tmp_path / "b.ply")
 
 
 # --- what is refused -------------------------------------------------------------------------------------

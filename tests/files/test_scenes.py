@@ -122,10 +122,23 @@ def test_photos_shrunk_by_a_whole_number_after_their_cameras_were_made(tmp_path:
     np.testing.assert_allclose(camera.K, [[40 * 12 / 49, 0, 6], [0, 40 * 8 / 31, 4], [0, 0, 1]], rtol=1e-6)
 
 
-@pytest.mark.parametrize("size", [(8, 12), (6, 4), (18, 12), (36, 30)])
+@pytest.mark.parametrize("size", [(18, 12), (6, 4), (17, 11), (30, 20)])
+def test_intrinsics_are_scaled_to_photos_of_the_same_aspect(tmp_path: Path, size: tuple[int, int]) -> None:
+    width, height = size
+    cameras = counted(camera_bytes(width=width, height=height, params=(40, 50, width / 2, height / 2)))
+    folder = write_colmap(tmp_path, cameras=cameras)
+    said = f"intrinsics of 3 of 3 photos are scaled to their size: 0.* has 12x8 .*{width}x{height}$"
+    with pytest.warns(KeyssWarning, match=said):
+        camera = load_scene(folder).train[0].camera
+    assert (camera.width, camera.height) == (12, 8)
+    expected = [[40 * 12 / width, 0, 6], [0, 50 * 8 / height, 4], [0, 0, 1]]
+    np.testing.assert_allclose(camera.K, expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize("size", [(8, 12), (12, 9), (15, 8), (36, 30)])
 def test_other_sizes_are_refused_with_both(tmp_path: Path, size: tuple[int, int]) -> None:
     folder = write_colmap(tmp_path, cameras=counted(camera_bytes(width=size[0], height=size[1])))
-    with pytest.raises(InputError, match=f"0[0-2].png: .* {size[0]}x{size[1]} .* found 12x8"):
+    with pytest.raises(InputError, match=f"0[0-2].png: .* {size[0]}x{size[1]}, or .* found 12x8; resize it"):
         load_scene(folder)
 
 
@@ -190,7 +203,7 @@ def test_a_photo_that_only_its_exif_data_turn_is_explained(tmp_path: Path) -> No
     for path in (tmp_path / "images").iterdir():
         Image.fromarray(photo(1)).save(path, exif=exif)
     with pytest.raises(
-        InputError, match=r"camera, 8x12 .*found 12x8; its EXIF orientation .* rotate its pixels"
+        InputError, match=r"camera, 8x12, .*found 12x8; its EXIF orientation .* rotate its pixels"
     ):
         load_scene(tmp_path)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,10 +10,12 @@ from pathlib import Path
 import torch
 
 from keyss.core.errors import InputError, QualityError, UsageError, WrongKeyError
-from keyss.core.gaussians import Gaussians
+from keyss.core.gaussians import DRAWN_OPACITY, Gaussians
 from keyss.files.atomic import mode_like, write_bytes
 from keyss.files.models import check_model_output, keeps_low_bits, model_bytes, model_of_bytes
+from keyss.files.ply_extras import with_extras
 from keyss.files.reading import is_standard, write_standard_output
+from keyss.files.trained import model_file
 from keyss.rendering import Backend, resolve_device
 from keyss.rendering.difference import psnr_between
 from keyss.runs.files import PathLike, as_model
@@ -43,7 +46,7 @@ class Conversion:
     gaussians: Gaussians  # as read from it
     bytes_before: int | None  # None: read from standard input or from memory
     bytes_after: int
-    psnr: float  # dB between renders before and after, from around the model; 120: equal
+    psnr: float  # dB between renders before and after, from around the model; 120: equal; NaN: empty
     keeps_low_bits: bool  # whether the format keeps them
     secrets: tuple[KeptSecret, ...]  # in the order of the keys
 
@@ -67,20 +70,21 @@ def convert(
     nothing, InputError, OutputError, and UsageError for an unknown suffix.
     """
     target = resolve_device(device)
-    source = None if isinstance(model, Gaussians) else Path(model)
+    source = None if isinstance(model, Gaussians) else model_file(model)
     path = check_model_output(out, overwrite, [source] if source else [])
     if not is_standard(path):
         check_not_published(path)
-    before = as_model(model)
+    before = as_model(model if source is None else source)
     opened = [reveal_any(before, key, target) for key in keys]
-    data = model_bytes(path, before)
+    data = model_bytes(path, with_extras(before, source, before))
     after = model_of_bytes(path, data)
     secrets = tuple(
         KeptSecret(each.remains.found, _left(after, key, target), "bytes" if each.file else "Gaussians")
         for key, each in zip(keys, opened, strict=True)
     )
     size = None if source is None or is_standard(source) else source.stat().st_size
-    psnr = psnr_between(before.to(target), after.to(target))
+    drawn = bool(((before.opacities >= DRAWN_OPACITY) & ~before.overflow).any())
+    psnr = psnr_between(before.to(target), after.to(target)) if drawn else math.nan
     result = Conversion(after, size, len(data), psnr, keeps_low_bits(path), secrets)
     lost = [number for number, each in enumerate(secrets, 1) if not each.kept]
     if lost and not (force or dry_run):

@@ -23,6 +23,7 @@ from keyss.core.errors import KeyssWarning, QualityError, UsageError
 from keyss.core.gaussians import Gaussians, same_bits
 from keyss.core.scene import Scene, ViewOptions
 from keyss.files.models import is_model_path, read_model
+from keyss.files.ply_extras import with_extras
 from keyss.files.reading import read_file
 from keyss.fitting.image_metrics import quality
 from keyss.fitting.ranks import here
@@ -205,7 +206,8 @@ def hide(
         stego = chosen.hide(sources[0], sources[1:], options, context)
         shown: list[Shown] = []
         if ranks.first:
-            read = _as_read(stego, keys, folder)
+            published = with_extras(stego.gaussians, cover if models[0] is None else models[0], plain[0])
+            read = _as_read(stego, published, keys, folder)
             shown = [
                 show(model.to(target), each.model.to(target), each.scene, of_plain=not each.photos)
                 for model, each in zip(read, sources, strict=True)
@@ -258,7 +260,7 @@ def _hide_files(
         raise UsageError(f'{error}; `publish="any", channel="appended"` has room for all') from error
     with folder.work() if folder else nullcontext():
         name = stego_name(stego)
-        there = folder.write({name: stego}) if folder else None
+        there = folder.write({name: with_extras(stego, cover, model)}) if folder else None
         as_read = read_model(there / name) if there else stego
         if [HiddenFile.of(open_content(as_read, key)) for key in keys] != hidden:
             raise RuntimeError("the hidden files do not open again from the published file")
@@ -295,14 +297,16 @@ def _entropy(keys: Sequence[str], options: MethodOptions, plain: Sequence[Gaussi
     return hashlib.sha256(b"".join(hashlib.sha256(each).digest() for each in parts)).digest()
 
 
-def _as_read(stego: Stego, keys: Sequence[str], folder: RunFolder | None) -> list[Gaussians]:
-    """The stego model and the secrets, from the files that are given away."""
+def _as_read(
+    stego: Stego, published: Gaussians, keys: Sequence[str], folder: RunFolder | None
+) -> list[Gaussians]:
+    """The stego model and the secrets, from the files that are given away; `published` is one of them."""
     model, given = stego.gaussians, bool(stego.handed)
     packed = [pack(payload, key or None) for payload, key in zip(stego.handed, keys, strict=given)]
     if folder:
         handed = dict(zip(handed_names(len(packed)), packed, strict=True))
         name = stego_name(model)
-        model = read_model(folder.write({name: model, **handed}) / name)
+        model = read_model(folder.write({name: published, **handed}) / name)
     opened: Sequence[Opened]
     if packed:
         opened = [open_handed(data, key or None) for data, key in zip(packed, keys, strict=True)]

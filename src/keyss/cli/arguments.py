@@ -61,7 +61,7 @@ class Photos:
             "white for transparent photos, else black",
         ),
     ] = None
-    skip_missing: Annotated[bool, switch("Skip photos that a scene names but that do not exist.")] = False
+    skip_missing: Annotated[bool, switch("Skip photos that do not exist or have no usable camera.")] = False
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
@@ -238,6 +239,8 @@ def print_conversion(out: str, found: Conversion, *, dry_run: bool, file: TextIO
     """The cost of a conversion: size, PSNR of renders, and what is left of the secrets."""
     was = "" if found.bytes_before is None else f", {_size(found.bytes_before)} before"
     renders = "renders unchanged" if found.psnr >= 120 else f"renders at {found.psnr:.1f} dB PSNR"
+    if math.isnan(found.psnr):
+        renders = "renders are empty: the model is invisible"
     print(f"{out}: {len(found.gaussians):,} Gaussians, {_size(found.bytes_after)}{was}, {renders}", file=file)
     for number, secret in enumerate(found.secrets, 1):
         which = "the secret" if len(found.secrets) == 1 else f"the secret of key {number}"

@@ -59,7 +59,7 @@ class ViewOptions:
 
     width: int | None = None  # pixels; wider photos are shrunk
     background: tuple[float, ...] | None = None  # [3] in [0, 1]
-    skip_missing: bool = False  # skip photos that do not exist
+    skip_missing: bool = False  # skip photos that do not exist or have no usable camera
 
     @staticmethod
     def of(

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from keyss.core.errors import InputError, OutputError, import_extra
-from keyss.files.colmap import MODEL_PLACES, colmap_model_folder, read_colmap
+from keyss.files.colmap import colmap_model_folder, read_colmap
 
 TEST_EVERY = 8
 
@@ -69,7 +69,7 @@ def link_scene(data: Path, name: str, folder: Path) -> Path:
     """
     photos, images = BENCHMARK[name]
     scene, source = folder / name, data / name
-    model = next((place for place in MODEL_PLACES if colmap_model_folder(source, (place,))), None)
+    model = colmap_model_folder(source)
     if model is None or not (source / images).is_dir():
         raise InputError(
             f"{data}: expected a folder {name} with {images} and a COLMAP model, a scene of Mip-NeRF 360 (or "
@@ -77,7 +77,7 @@ def link_scene(data: Path, name: str, folder: Path) -> Path:
         )
     try:
         scene.mkdir(parents=True, exist_ok=True)
-        for place, target in (("sparse", source / model), (images, source / images)):
+        for place, target in (("sparse", model), (images, source / images)):
             if not (scene / place).is_symlink():
                 (scene / place).symlink_to(target.resolve())
     except OSError as error:

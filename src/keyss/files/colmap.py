@@ -8,6 +8,7 @@ its last record. Format: https://colmap.github.io/format.html
 from __future__ import annotations
 
 import math
+import os
 import struct
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -24,22 +25,27 @@ from keyss.core.errors import InputError, KeyssWarning
 from keyss.files.layout import (
     MAX_COORDINATE,
     NO_POINTS,
+    FileFinder,
     Photo,
     PointCloud,
     SceneLayout,
     hold_out,
+    leave_out_broken,
     leave_out_missing,
     refuse_duplicates,
+    warn_of_masks,
 )
 from keyss.files.lens import Lens, make_lens
-from keyss.files.reading import read_file, read_text
+from keyss.files.reading import open_input, read_file, read_text
 
 # Folders of the sparse model, best first; the last is that of Nerfstudio's scenes.
 MODEL_PLACES = ("sparse/0", "sparse", ".", "colmap/sparse/0")
+_IMAGE_BYTES = 73  # of an image in images.bin, at least
+_IMAGES_LAYOUT = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"  # of a line of images.txt
 _IMAGE_FOLDERS = ("images", "images_2", "images_4", "images_8")
 
 _T = TypeVar("_T")
-_Image = tuple[str, int, Doubles]  # name, camera id, [4, 4] world to camera
+_Image = tuple[str, int, Sequence[float]]  # name, camera id, quaternion wxyz and translation
 
 # Parameters in file order. The fisheye models with fewer coefficients are OPENCV_FISHEYE with zeros.
 _PARAMETERS = {
@@ -66,7 +72,8 @@ def read_colmap(folder: Path, *, skip_missing: bool = False) -> SceneLayout:
 
     If `images/` has no photos, the first of `images_2/`, `images_4/` and `images_8/` that has some is used.
     Points are sorted by id; without points there is a KeyssWarning. Files are `.bin` if `cameras.bin`
-    exists, else `.txt`. Image names may have subfolders. `skip_missing`: see `leave_out_missing`.
+    exists, else `.txt`. Image names may have subfolders, and another case than on disk. `skip_missing`: see
+    `leave_out_missing` and `leave_out_broken`. Masks are not used, with a KeyssWarning.
 
     Raises InputError for names that are absolute or contain `..`, and if a file is missing, truncated, too
     long, or has impossible values (NaN, zero quaternions, unknown cameras, absurd counts or sizes).
@@ -74,6 +81,13 @@ def read_colmap(folder: Path, *, skip_missing: bool = False) -> SceneLayout:
     model = colmap_model_folder(folder)
     if model is None:
         raise InputError(f"{folder}: expected a COLMAP model (sparse/0/cameras.bin or .txt), found none")
+    if len(beside := _models_at(model)) > 1:
+        warnings.warn(
+            f"{folder}: there are {len(beside)} sparse models; the one with most photos is used, "
+            f"{model.relative_to(folder)} ({_photo_count(model):,} photos)",
+            KeyssWarning,
+            stacklevel=2,
+        )
     if (model / "cameras.bin").is_file():
         cameras, images = _cameras_bin(model / "cameras.bin"), _images_bin(model / "images.bin")
         points = _points(model / "points3D.bin", _points_bin)
@@ -85,34 +99,73 @@ def read_colmap(folder: Path, *, skip_missing: bool = False) -> SceneLayout:
         if camera_id in lenses:
             raise InputError(f"{model}: expected every camera once, found id {camera_id} twice")
         lenses[camera_id] = lens
-    photos = []
-    for name, camera_id, viewmat in images:
+    photos, broken, total = [], {}, 0
+    for name, camera_id, pose in images:
+        total += 1
         parsed = PureWindowsPath(name)  # splits at both kinds of slash and knows drives
         if not name.isprintable() or not parsed.parts or parsed.anchor or ".." in parsed.parts:
             raise InputError(f"{model}: expected image names inside images/, found {name!r}")
         if camera_id not in lenses:
             raise InputError(f"{model}: image {name!r} refers to camera {camera_id}, which does not exist")
-        photos.append(Photo(folder / name, name, viewmat, lenses[camera_id]))
+        try:
+            viewmat = _viewmat(f"{model}: image {name!r}", pose)
+            photos.append(Photo(folder / name, name, viewmat, lenses[camera_id]))
+        except InputError as error:
+            broken[name] = str(error)
     refuse_duplicates(model, photos)
+    leave_out_broken(model, total, broken, skip_missing)
     images_folder, existing = _existing(folder, photos)
     missing = sorted({photo.name for photo in photos} - {photo.name for photo in existing})
     leave_out_missing(folder / images_folder, len(photos), missing, skip_missing)
+    if (folder / "masks").is_dir():
+        warn_of_masks(folder / "masks")
     return SceneLayout(*hold_out(model, existing), points)
 
 
 def colmap_model_folder(folder: Path, places: Sequence[str] = MODEL_PLACES) -> Path | None:
-    """The first of `places` in a scene's folder with a sparse model, or None."""
-    for candidate in (folder / place for place in places):
-        if any((candidate / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt")):
-            return candidate
+    """The sparse model in the first of `places` in a scene's folder that has one, or None.
+
+    Of several beside each other, as of photos that COLMAP could not connect, it is that of most photos.
+    """
+    for place in places:
+        if found := _models_at(folder / place):
+            return max(found, key=_photo_count)
     return None
+
+
+def _models_at(place: Path) -> list[Path]:
+    """The sparse model at a place, and those in numbered folders beside it if it is one of these."""
+    beside = place.parent.glob("[0-9]*") if place.parent.name == "sparse" else ()
+    numbered = sorted((each for each in beside if each.name.isdecimal()), key=lambda each: int(each.name))
+    return [
+        each
+        for each in numbered or [place]
+        if any((each / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt"))
+    ]
+
+
+def _photo_count(model: Path) -> int:
+    """The number of photos that a sparse model announces; 0 if it is damaged."""
+    try:
+        if (model / "cameras.bin").is_file():
+            with open_input(model / "images.bin") as file:
+                count = int.from_bytes(file.read(8), "little")
+                return count if _IMAGE_BYTES * count <= file.seek(0, os.SEEK_END) else 0
+        return sum(1 for _ in _rows(model / "images.txt", _IMAGES_LAYOUT, lines=2))
+    except InputError:
+        return 0
 
 
 def _existing(folder: Path, photos: Sequence[Photo]) -> tuple[str, list[Photo]]:
     """(the folder of images that is used, the photos in it)."""
+    finder = FileFinder()
     for images in _IMAGE_FOLDERS:
-        placed = [replace(photo, path=folder / images / photo.name) for photo in photos]
-        if existing := [photo for photo in placed if photo.path.exists()]:
+        named = [folder / images / photo.name for photo in photos]
+        exact = {path for path in named if path.exists()}
+        found = {folder / finder.find(folder, f"{images}/{photo.name}"): photo for photo in photos}
+        found |= {path: photo for path, photo in zip(named, photos, strict=True) if path in exact}
+        placed = {photo.name: replace(photo, path=path) for path, photo in found.items() if path.exists()}
+        if existing := [placed[photo.name] for photo in photos if photo.name in placed]:
             return images, existing
     return _IMAGE_FOLDERS[0], []
 
@@ -205,9 +258,9 @@ def _cameras_bin(path: Path) -> Iterator[tuple[int, Lens]]:
 
 def _images_bin(path: Path) -> Iterator[_Image]:
     records = _Records(path)
-    for _ in range(records.count(73, "images")):
-        image_id, *pose, camera_id = records.take("<I7dI", "an image")
-        yield records.name(), camera_id, _viewmat(f"{path}: image {image_id}", pose)
+    for _ in range(records.count(_IMAGE_BYTES, "images")):
+        _, *pose, camera_id = records.take("<I7dI", "an image")
+        yield records.name(), camera_id, pose
         records.skip(24 * records.count(24, "observations"), "observations")
     records.end()
 
@@ -257,8 +310,8 @@ def _cameras_txt(path: Path) -> Iterator[tuple[int, Lens]]:
 
 
 def _images_txt(path: Path) -> Iterator[_Image]:
-    for where, words in _rows(path, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME", lines=2):
-        yield words[9], _number(int, where, words[8]), _viewmat(where, _floats(where, words[1:8], 7))
+    for where, words in _rows(path, _IMAGES_LAYOUT, lines=2):
+        yield words[9], _number(int, where, words[8]), _floats(where, words[1:8], 7)
 
 
 def _points_txt(path: Path) -> PointCloud:

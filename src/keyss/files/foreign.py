@@ -10,7 +10,15 @@ from keyss.files.reading import open_input
 CONVERT = "convert it to .ply first, e.g. with `splat-transform IN OUT.ply`"
 _MODEL = "give it where a model is asked for"
 _EXPORT = "export a .ply from the program that made it"
+_CHECKPOINT = (
+    "keyss never opens pickles, which can run programs; export a .ply: gsplat's simple_trainer.py with "
+    "`--save_ply`, Nerfstudio with `ns-export gaussian-splat`, Inria's train.py writes "
+    "point_cloud/iteration_N/point_cloud.ply by itself"
+)
 _UNPACK = "unpack it, and give the folder or the model that is in it"
+CHECKPOINTS = f"checkpoints of a training; {_CHECKPOINT}"  # in a folder
+START_BYTES = 256  # of a file, which tell its kind
+_ZIP = b"PK\x03\x04"
 _POSES = "a scene is a folder of photos with their poses, e.g. from COLMAP"
 
 
@@ -20,9 +28,10 @@ class _Kind:
     advice: str
     suffixes: tuple[str, ...] = ()
     magic: tuple[bytes, ...] = ()  # possible first bytes
+    member: tuple[bytes, ...] = ()  # how the name of the first file in a ZIP archive may end
 
 
-# The first kind whose suffix fits, else the first whose magic does, since some formats are ZIP archives.
+# The first kind whose suffix fits, else the first whose content does.
 _KINDS = (
     _Kind("an SPZ model", _MODEL, (".spz",), (b"NGSP",)),
     _Kind("an SOG model", _MODEL, (".sog",)),
@@ -32,12 +41,21 @@ _KINDS = (
     _Kind("an LCC model", CONVERT, (".lcc", ".lcc2")),
     _Kind("an unpacked SOG model", CONVERT, ("meta.json",)),
     _Kind("a glTF file with its data beside it", "export a .glb from the program that made it", (".gltf",)),
+    _Kind(
+        "a checkpoint of a training",
+        _CHECKPOINT,
+        (".pt", ".pth", ".ckpt", ".pkl"),
+        (b"\x80\x02", b"\x80\x03", b"\x80\x04", b"\x80\x05"),
+        (b"data.pkl",),
+    ),
+    _Kind("arrays of NumPy", _EXPORT, (".npz", ".npy"), (b"\x93NUMPY",), (b".npy",)),
+    _Kind("a USD scene", _EXPORT, (".usdz", ".usd", ".usda", ".usdc"), (b"PXR-USDC",), (b".usdc", b".usda")),
     _Kind("a table", _EXPORT, (".csv", ".tsv")),
     _Kind("a web page", _EXPORT, (".html", ".htm"), (b"<!DOCTYPE", b"<html")),
     _Kind("a JSON file", "give the folder that it lies in", (".json",)),
     _Kind("a PLY file under another name", "rename it to end in .ply", magic=(b"ply\n", b"ply\r")),
     _Kind("gzip data", _UNPACK, (".gz",), (b"\x1f\x8b",)),
-    _Kind("a ZIP archive", _UNPACK, (".zip",), (b"PK\x03\x04",)),
+    _Kind("a ZIP archive", _UNPACK, (".zip",), (_ZIP,)),
     _Kind("an archive", _UNPACK, (".tar", ".tgz", ".7z", ".rar"), (b"7z\xbc\xaf\x27\x1c", b"Rar!")),
     _Kind(
         "a picture",
@@ -57,18 +75,31 @@ def what_it_is(path: Path) -> str:
     if not path.is_file():  # reading a pipe could block for ever
         return "neither a file nor a folder"
     with open_input(path) as file:
-        return kind_of(path.name, file.read(16))
+        return kind_of(path.name, file.read(START_BYTES))
 
 
 def kind_of(name: str, start: bytes) -> str:
-    """`what_it_is` for a file with this name and these first 16 bytes."""
+    """`what_it_is` for a file with this name and these first START_BYTES."""
     if not start:
         return "an empty file"
     by_suffix = (kind for kind in _KINDS if name.lower().endswith(kind.suffixes))
     by_magic = (kind for kind in _KINDS if start.startswith(kind.magic))
-    kind = next(by_suffix, None) or next(by_magic, None)
+    kind = next(by_suffix, None) or _kind_in_zip(start) or next(by_magic, None)
     if kind is None:
         return "a file of no kind that keyss knows"  # does not quote it: it may be a key
     if kind.advice == CONVERT:
         return f"{kind.name}, which keyss does not read; {CONVERT}"
     return f"{kind.name}; {kind.advice}"
+
+
+def is_foreign_zip(start: bytes) -> bool:
+    """True for a ZIP archive that is not a model, such as a checkpoint, from its first START_BYTES."""
+    return _kind_in_zip(start) is not None
+
+
+def _kind_in_zip(start: bytes) -> _Kind | None:
+    """The kind of a ZIP archive, from the local header of its first file."""
+    if not start.startswith(_ZIP):
+        return None
+    member = start[30 : 30 + int.from_bytes(start[26:28], "little")]
+    return next((kind for kind in _KINDS if kind.member and member.endswith(kind.member)), None)

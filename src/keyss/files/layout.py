@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -82,6 +83,61 @@ def leave_out_missing(where: Path, total: int, missing: Sequence[str], skip_miss
     if len(missing) == total:
         raise InputError(f"{where}: all of its {total:,} photos are missing: {listed}")
     warnings.warn(f"{where}: {count} are missing and left out: {listed}", KeyssWarning, stacklevel=2)
+
+
+def leave_out_broken(where: Path, total: int, broken: Mapping[str, str], skip_missing: bool) -> None:
+    """`leave_out_missing` for photos without a usable camera; `broken` has messages by name of the photo."""
+    if not broken:
+        return
+    first = next(iter(broken.values()))
+    if len(broken) == total:
+        raise InputError(first)
+    count = f"{len(broken):,} of {total:,} photos"
+    if not skip_missing:
+        raise InputError(f"{first}; `skip_missing=True` leaves out such photos ({count})")
+    listed = ", ".join(list(broken)[:5]) + (f" and {len(broken) - 5:,} more" if len(broken) > 5 else "")
+    warnings.warn(
+        f"{where}: {count} have no usable camera and are left out: {listed}", KeyssWarning, stacklevel=2
+    )
+
+
+def warn_of_masks(where: Path | str) -> None:
+    """Tell that a scene has masks, since none are used."""
+    warnings.warn(
+        f"{where}: masks are not used: what they cover is fitted too; make those pixels transparent in the "
+        "photos (PNG) to fit the background there",
+        KeyssWarning,
+        stacklevel=2,
+    )
+
+
+class FileFinder:
+    """Finds files whose names have another case than those that a scene lists."""
+
+    def __init__(self) -> None:
+        self._listings: dict[Path, dict[str, list[str]]] = {}
+
+    def find(self, folder: Path, name: str) -> str:
+        """`name`, relative to `folder`, as it is spelt on disk, if exactly one path matches; else `name`."""
+        if (folder / name).exists():
+            return name
+        found: list[str] = []
+        for part in name.split("/"):
+            here = folder.joinpath(*found)
+            alike = [part] if (here / part).exists() else self._listing(here).get(part.casefold(), [])
+            if len(alike) != 1:
+                return name
+            found.append(alike[0])
+        return "/".join(found)
+
+    def _listing(self, folder: Path) -> dict[str, list[str]]:
+        """The names in a folder by their spelling without case."""
+        if folder not in self._listings:
+            names: dict[str, list[str]] = {}
+            for each in os.listdir(folder) if folder.is_dir() else ():
+                names.setdefault(each.casefold(), []).append(each)
+            self._listings[folder] = names
+        return self._listings[folder]
 
 
 def refuse_duplicates(where: Path, photos: Sequence[Photo]) -> None:

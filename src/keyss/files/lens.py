@@ -43,17 +43,23 @@ class Lens:
         """[3, 3] pixels."""
         return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]], dtype=np.float64)
 
-    def on_image(self, width: int, height: int) -> Lens | None:
-        """The lens for an image of the lens's size, or of that size divided by a whole number, else None.
+    def is_divided_for(self, width: int, height: int) -> bool:
+        """True for an image of the lens's size divided by a whole number, either side rounded up or down."""
+        factor = max(1, round(self.width / width))
+        return abs(width * factor - self.width) < factor and abs(height * factor - self.height) < factor
 
-        Photos are often shrunk (`images_4`) after their cameras were computed; either side may be rounded up
-        or down.
+    def on_image(self, width: int, height: int) -> Lens | None:
+        """The lens for an image of the same aspect, to within a pixel, or None.
+
+        Photos are often shrunk (`images_4`) after their cameras were computed.
         """
         if (width, height) == (self.width, self.height):
             return self
-        factor = round(self.width / width)
-        fits = abs(width * factor - self.width) < factor and abs(height * factor - self.height) < factor
-        if factor < 2 or not fits:
+        fits = self.is_divided_for(width, height) or (
+            abs(self.height * width / self.width - height) < 1
+            or abs(self.width * height / self.height - width) < 1
+        )
+        if not fits:
             return None
         x, y = width / self.width, height / self.height
         return replace(

@@ -25,9 +25,16 @@ from keyss.core.decoded import DecodedGaussians
 from keyss.core.errors import InputError, OutputError, UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.files.atomic import atomic_write, check_not_an_input, check_output_file
-from keyss.files.foreign import kind_of
-from keyss.files.ply_rows import finite_rows, has_packed_header, model_names, read_model_rows
-from keyss.files.ply_table import ply_header
+from keyss.files.foreign import CHECKPOINTS, START_BYTES, is_foreign_zip, kind_of
+from keyss.files.ply_extras import NORMALS, ExtendedGaussians, PlyExtras
+from keyss.files.ply_rows import (
+    check_not_activated,
+    finite_rows,
+    has_packed_header,
+    model_names,
+    read_model_rows,
+)
+from keyss.files.ply_table import TYPES, ply_header
 from keyss.files.reading import (
     MAX_BYTES,
     check_standard_output,
@@ -36,6 +43,7 @@ from keyss.files.reading import (
     read_standard_input,
     write_standard_output,
 )
+from keyss.files.trained import has_checkpoints, is_training, model_file
 
 DECODED_SUFFIX = ".3dgs.safetensors"  # of models that a network decodes
 _BLOCK = 1 << 13  # Gaussians that are written at a time
@@ -84,17 +92,29 @@ def _writer(name: str) -> Callable[[Gaussians, BinaryIO], None]:
 def write_ply(model: Gaussians, file: BinaryIO) -> None:
     """Write `model` as little-endian float32 in the Inria layout.
 
-    Normals are zeros, infinite opacity logits become +-OPACITY_LOGIT_BOUND, and the bytes depend on the
-    values only. Raises OutputError when there are no Gaussians or a value is not finite.
+    Normals are zeros and there are no other properties, unless `model` has extras. Infinite opacity logits
+    become +-OPACITY_LOGIT_BOUND, and the bytes depend on the values only. Raises OutputError when there are
+    no Gaussians or a value is not finite.
     """
     n, k = model.sh.shape[:2]
     names = model_names(k)
-    names[3:3] = ["nx", "ny", "nz"]
+    names[3:3] = NORMALS
     flat = model.detach().to("cpu")
-    file.write(ply_header({"vertex": (n, (f"float {name}" for name in names))}))
+    extras = model.extras if isinstance(model, ExtendedGaussians) else PlyExtras((), {})
+    further = {name: values for name, values in extras.properties.items() if name not in NORMALS}
+    properties = [f"float {name}" for name in names]
+    properties += [f"{TYPES[values.dtype.str[1:]]} {name}" for name, values in further.items()]
+    file.write(ply_header({"vertex": (n, properties)}, extras.comments))
     blocks = (_rows(flat[start : start + _BLOCK]) for start in range(0, n, _BLOCK))
-    for rows in finite_rows(blocks, names, OutputError):
-        file.write(rows.astype("<f4", copy=False).data)
+    start = 0
+    for rows in finite_rows(blocks, names):
+        part = slice(start, start + len(rows))
+        for name in extras.properties.keys() & set(NORMALS):
+            rows[:, names.index(name)] = extras.properties[name][part]
+        columns = [rows, *(values[part, None] for values in further.values())]
+        little = (each.astype(each.dtype.newbyteorder("<"), copy=False) for each in columns)
+        file.write(np.concatenate([each.view(np.uint8) for each in little], axis=1).data)
+        start = part.stop
 
 
 def _rows(part: Gaussians) -> Floats:
@@ -114,8 +134,8 @@ def read_ply(file: BinaryIO) -> Gaussians:
     """Read a 3DGS model: float32 tensors on the CPU, SH of the file's own degree.
 
     Properties are found by name, in any order and of any scalar type; normals, unknown properties,
-    comments, other elements and bytes after the data are ignored. Infinite opacity logits become
-    +-OPACITY_LOGIT_BOUND. Raises InputError if it is not a complete, finite 3DGS model.
+    comments, other elements and bytes after the data are ignored. Rows that are not finite are left out, see
+    `usable_rows`. Raises InputError if it is not a complete 3DGS model.
     """
     vertices = read_model_rows(file)
     n, k = vertices.count, (len(vertices.names) - 11) // 3
@@ -131,7 +151,9 @@ def read_ply(file: BinaryIO) -> Gaussians:
         for color in range(3):
             sh[part, 1:, color] = rest[:, color]
         start = part.stop
-    return Gaussians(*map(torch.from_numpy, (means, quats, log_scales, opacity_logits, sh)))
+    check_not_activated(means[:start], log_scales[:start], opacity_logits[:start])
+    arrays = (means, quats, log_scales, opacity_logits, sh)
+    return Gaussians(*(torch.from_numpy(each[:start]) for each in arrays))
 
 
 def _read_any_ply(file: BinaryIO) -> Gaussians:
@@ -160,17 +182,25 @@ def is_model_path(path: Path | str) -> bool:
     return _by_suffix(path) is not None
 
 
+def is_model_source(path: Path | str) -> bool:
+    """True if `read_model` reads a model at a path: by its suffix, or in the folder of a training."""
+    return is_model_path(path) or is_training(path)
+
+
 def read_model(path: Path | str) -> Gaussians:
     """The model at `path`, on the CPU; "-" is standard input. The first bytes tell the format.
+
+    Of the folder of another program's training it is the latest model, with a KeyssWarning.
 
     Raises InputError for a file that is missing, of unknown format, named like another format, or not a
     complete and finite model.
     """
     if is_standard(path):
         return model_of_bytes("standard input", read_standard_input())
-    path = Path(path)
+    path = model_file(path)
     if os.path.isdir(path):
-        raise InputError(f"{path}: expected the file of a 3DGS model ({known_suffixes()}), found a folder")
+        found = f"a folder of {CHECKPOINTS}" if has_checkpoints(path) else "a folder"
+        raise InputError(f"{path}: expected the file of a 3DGS model ({known_suffixes()}), found {found}")
     if not os.path.isfile(path):
         raise InputError(f"{path}: expected a 3DGS model ({known_suffixes()}), but there is no such file")
     with open_input(path) as file:
@@ -270,9 +300,11 @@ def _write(
 
 def _read(file: BinaryIO, name: str) -> Gaussians:
     """The model in an open file, in the format of its first bytes, which `name` must not contradict."""
-    start = file.read(16)
+    start = file.read(START_BYTES)
     file.seek(0)
     fitting = [each for each in FORMATS if each.magic and start.startswith(each.magic)]
+    if is_foreign_zip(start):
+        fitting = []
     named = _by_suffix(name)
     if named in fitting or (named and start and not named.magic and not fitting):
         return named.read(file)

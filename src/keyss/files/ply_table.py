@@ -37,6 +37,7 @@ _SCALARS = {
     "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4",
     "float": "f4", "float32": "f4", "double": "f8", "float64": "f8",
 }  # fmt: skip
+TYPES = {code: name for name, code in reversed(_SCALARS.items())}  # the first name of each code
 _LIST = "l0"  # in place of the code of a list property
 _BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": None}
 
@@ -47,17 +48,17 @@ class Vertices:
 
     names: list[str]
     count: int
-    blocks: Iterator[Numbers]  # [n, len(names)] each; `count` rows in all; they may be changed
+    blocks: Iterator[Numbers]  # [n, len(names)] each; `count` rows at most; they may be changed
     dtype: type  # of the rows
 
     def rows(self) -> Numbers:
-        """[count, len(names)] all rows."""
+        """[n, len(names)] all rows."""
         rows: Numbers = np.empty((self.count, len(self.names)), self.dtype)
         start = 0
         for block in self.blocks:
             rows[start : start + len(block)] = block
             start += len(block)
-        return rows
+        return rows[:start]
 
 
 @dataclass
@@ -82,21 +83,52 @@ def read_vertices(
     elements and bytes after the data are ignored. Raises InputError for a file that is damaged or too short,
     and for list properties in or before the vertices; so do the blocks.
     """
-    byte_order, elements = _read_header(file)
-    index = [element.name for element in elements].index("vertex")
-    before, vertex = elements[:index], elements[index]
-    _check_no_list([*before, vertex])
+    byte_order, before, vertex, _ = _vertex_header(file)
     names = choose(vertex.properties)
     columns = [list(vertex.properties).index(name) for name in names]
     if byte_order is None:
-        # Every value takes a digit and a separator; the file's last separator may be missing.
-        skipped = sum(element.count * len(element.properties) for element in before)
-        _check_size(file, 2 * (skipped + vertex.count * len(vertex.properties)) - 1, vertex)
-        return Vertices(names, vertex.count, _ascii_blocks(file, skipped, vertex, columns, dtype), dtype)
+        return Vertices(names, vertex.count, _ascii_blocks(file, before, vertex, columns, dtype), dtype)
+    _skip(file, before, vertex)
+    return Vertices(names, vertex.count, _binary_blocks(file, byte_order, vertex, columns, dtype), dtype)
+
+
+def read_vertex_table(file: BinaryIO) -> tuple[npt.NDArray[np.void], list[str]]:
+    """All vertices as a structured array with the properties' own types, and the header's comment lines.
+
+    A binary file is mapped into memory. Raises InputError as `read_vertices` does.
+    """
+    byte_order, before, vertex, comments = _vertex_header(file)
+    if byte_order is not None:
+        _skip(file, before, vertex)
+        dtype = np.dtype([(name, byte_order + code) for name, code in vertex.properties.items()])
+        if not vertex.count:
+            return np.empty(0, dtype), comments
+        return np.memmap(file, dtype, "r", file.tell(), (vertex.count,)), comments
+    table = np.empty(vertex.count, np.dtype(list(vertex.properties.items())))
+    start = 0
+    every = list(range(len(vertex.properties)))
+    for block in _ascii_blocks(file, before, vertex, every, np.float64):
+        for name, values in zip(vertex.properties, block.T, strict=True):
+            with np.errstate(over="ignore", invalid="ignore"):
+                table[name][start : start + len(block)] = values
+        start += len(block)
+    return table, comments
+
+
+def _vertex_header(file: BinaryIO) -> tuple[str | None, list[_Element], _Element, list[str]]:
+    """(byte order or None for ascii, elements before the vertices, the vertices, lines of comments)."""
+    byte_order, elements, comments = _read_header(file)
+    index = [element.name for element in elements].index("vertex")
+    before, vertex = elements[:index], elements[index]
+    _check_no_list([*before, vertex])
+    return byte_order, before, vertex, comments
+
+
+def _skip(file: BinaryIO, before: list[_Element], vertex: _Element) -> None:
+    """Move to the vertices of a binary file. Raises InputError if it is too short for all."""
     skipped = sum(element.count * element.stride for element in before)
     _check_size(file, skipped + vertex.count * vertex.stride, vertex)
     file.seek(skipped, os.SEEK_CUR)
-    return Vertices(names, vertex.count, _binary_blocks(file, byte_order, vertex, columns, dtype), dtype)
 
 
 def read_tables(file: BinaryIO) -> dict[str, npt.NDArray[np.void]]:
@@ -104,7 +136,7 @@ def read_tables(file: BinaryIO) -> dict[str, npt.NDArray[np.void]]:
 
     Raises InputError for ascii, for list properties and for a file that is damaged or too short.
     """
-    byte_order, elements = _read_header(file)
+    byte_order, elements, _ = _read_header(file)
     if byte_order is None:
         raise InputError("expected a binary .ply file, found one in ascii")
     _check_no_list(elements)
@@ -117,12 +149,15 @@ def read_tables(file: BinaryIO) -> dict[str, npt.NDArray[np.void]]:
     return tables
 
 
-def ply_header(elements: Mapping[str, tuple[int, Iterable[str]]]) -> bytes:
-    """The header of a little-endian file, from each element's count and properties such as "float x"."""
-    lines = ["ply", "format binary_little_endian 1.0"]
+def ply_header(elements: Mapping[str, tuple[int, Iterable[str]]], comments: Iterable[str] = ()) -> bytes:
+    """The header of a little-endian file, from each element's count and properties such as "float x".
+
+    `comments`: whole lines, as `read_vertex_table` returns them.
+    """
+    lines = ["ply", "format binary_little_endian 1.0", *comments]
     for name, (count, properties) in elements.items():
         lines += [f"element {name} {count}", *(f"property {each}" for each in properties)]
-    return "\n".join([*lines, "end_header\n"]).encode()
+    return "\n".join([*lines, "end_header\n"]).encode("latin-1")
 
 
 def read_point_cloud(path: Path) -> PointCloud:
@@ -148,17 +183,23 @@ def read_point_cloud(path: Path) -> PointCloud:
     return PointCloud.checked(path, rows[:, :3], colors.astype(np.uint8))
 
 
-def _read_header(file: BinaryIO) -> tuple[str | None, list[_Element]]:
-    """(byte order or None for ascii, the elements, one of them the vertices); the data come next."""
+def _read_header(file: BinaryIO) -> tuple[str | None, list[_Element], list[str]]:
+    """(byte order or None for ascii, the elements, lines of comments); the data come next.
+
+    One element is the vertices.
+    """
     lines = _header_lines(file)
     if lines[0] != "ply":
         raise InputError("expected a .ply file, but it does not begin with a line 'ply'")
     formats: list[str | None] = []
     elements: list[_Element] = []
+    comments: list[str] = []
     for number, line in enumerate(lines[1:], start=2):
         match line.split():
-            case [] | ["comment" | "obj_info", *_]:
+            case []:
                 pass
+            case ["comment" | "obj_info", *_]:
+                comments.append(line)
             case ["format", name, "1.0"] if name in _BYTE_ORDERS and not formats:
                 formats.append(_BYTE_ORDERS[name])
             case ["element", name, count] if re.fullmatch(r"[0-9]{1,18}", count):
@@ -177,7 +218,7 @@ def _read_header(file: BinaryIO) -> tuple[str | None, list[_Element]]:
             f"expected one 'format' line and one 'element vertex' in the PLY header, "
             f"got {len(formats)} and {names.count('vertex')}"
         )
-    return formats[0], elements
+    return formats[0], elements, comments
 
 
 def _header_lines(file: BinaryIO) -> list[str]:
@@ -241,10 +282,13 @@ def _binary_blocks(
 
 
 def _ascii_blocks(
-    file: BinaryIO, skipped: int, vertex: _Element, columns: list[int], into: type
+    file: BinaryIO, before: list[_Element], vertex: _Element, columns: list[int], into: type
 ) -> Iterator[Numbers]:
-    """Rows in text, after `skipped` values. Only the order of the values matters, not the lines."""
+    """Rows in text, after other elements. Only the order of the values matters, not the lines."""
     width = len(vertex.properties)
+    skipped = sum(element.count * len(element.properties) for element in before)
+    # Every value takes a digit and a separator; the file's last separator may be missing.
+    _check_size(file, 2 * (skipped + vertex.count * width) - 1, vertex)
     step = max(1, _CHUNK_BYTES // (8 * max(1, width)))
     tokens = _tokens(file)
     try:

@@ -18,10 +18,11 @@ from keyss.core.arrays import Doubles, Floats
 from keyss.core.errors import InputError, KeyssWarning, UsageError
 from keyss.core.scene import NEAR, ORDINARY_EXTENT, Camera, Scene, View, checked_background
 from keyss.files.colmap import MODEL_PLACES, colmap_model_folder, read_colmap
-from keyss.files.foreign import what_it_is
+from keyss.files.foreign import CHECKPOINTS, what_it_is
 from keyss.files.images import is_turned, probe_image, read_image, shrink
 from keyss.files.layout import Photo, SceneLayout
 from keyss.files.lens import Lens, Undistortion, undistortion
+from keyss.files.trained import has_checkpoints
 from keyss.files.transforms import read_blender, read_nerfstudio
 
 _FAR = 1000  # extents from the origin: single precision has ten thousandths of one left
@@ -44,8 +45,8 @@ def load_scene(
     per axis; photos are never enlarged.
     `background`: three numbers in [0, 1], behind everything and under transparent pixels; by default white
     if any photo has an alpha channel, else black.
-    `skip_missing`: photos that are missing on disk are left out, with a KeyssWarning, before test views are
-    chosen.
+    `skip_missing`: photos that are missing on disk, or whose camera is unusable, are left out, with a
+    KeyssWarning, before test views are chosen.
 
     A scene whose place is over a thousand times as far from the origin as its cameras from each other, as
     georeferenced ones are, is moved there, with a KeyssWarning: see `Scene.origin`.
@@ -57,7 +58,7 @@ def load_scene(
     `keyss.fitting.parameters.initial_points`. Rotations are orthonormal up to float32.
 
     Raises InputError for an unknown layout, broken or truncated files, missing or undecodable images, images
-    whose size contradicts their camera's (it may be divided by a whole number), or fewer than one training
+    whose aspect contradicts their camera's (by more than a pixel), or fewer than one training
     and one test image. Raises UsageError for a `width` or `background` out of range.
     """
     if width is not None and width < 1:
@@ -80,9 +81,10 @@ def load_scene(
         )
     near = NEAR * min(1.0, extent / ORDINARY_EXTENT)
     photos = [replace(each, viewmat=_moved(each.viewmat, origin)) for each in layout.train + layout.test]
-    has_alpha = [probe_image(photo.path)[2] for photo in photos]  # all, to find missing photos now
+    probed = [probe_image(photo.path) for photo in photos]  # all, to find missing photos now
+    photos = _on_images(folder, photos, [(width, height) for width, height, _ in probed])
     if behind is None:
-        behind = torch.full((3,), float(any(has_alpha)))
+        behind = torch.full((3,), float(any(transparent for *_, transparent in probed)))
     # Most scenes have one lens, and a map is as large as a photo, so only the last two are cached.
     undistortions = functools.lru_cache(maxsize=2)(undistortion)
     with ThreadPoolExecutor(max_workers=min(8, os.cpu_count() or 1)) as pool:
@@ -139,7 +141,44 @@ def read_layout(folder: Path, skip_missing: bool) -> SceneLayout:
     except OSError as error:
         raise InputError(f"{folder}: cannot be read: {error.strerror}") from error
     found = ", ".join(entries[:8]) + (", ..." if len(entries) > 8 else "") or "an empty folder"
+    if has_checkpoints(folder):
+        raise InputError(f"{folder}: expected a scene or a model, found a folder of {CHECKPOINTS}")
     raise InputError(f"{folder}: expected a scene, found {found}. Known layouts: {_KNOWN}")
+
+
+def _on_images(folder: Path, photos: Sequence[Photo], sizes: Sequence[tuple[int, int]]) -> list[Photo]:
+    """The photos with lenses for their images, which have these sizes (width, height).
+
+    Raises InputError where the aspect does not fit. Tells of images whose size is not that of their camera
+    divided by a whole number, by a KeyssWarning.
+    """
+    fitted, scaled = [], []
+    for photo, size in zip(photos, sizes, strict=True):
+        lens = photo.lens.on_image(*size)
+        pair = f"{photo.lens.width}x{photo.lens.height}", f"{size[0]}x{size[1]}"
+        if lens is None:
+            turned = is_turned(photo.path)
+            raise InputError(
+                f"{photo.path}: expected the size of its camera, {pair[0]}, or another of that aspect, found "
+                f"{pair[1]}; "
+                + (
+                    "its EXIF orientation rotates it: rotate its pixels"
+                    if turned
+                    else "resize it instead of "
+                    "cropping it, or compute the cameras from the photos as they are"
+                )
+            )
+        if not photo.lens.is_divided_for(*size):
+            scaled.append(f"{photo.name} has {pair[1]} pixels, its camera {pair[0]}")
+        fitted.append(replace(photo, lens=lens))
+    if scaled:
+        warnings.warn(
+            f"{folder}: the intrinsics of {len(scaled):,} of {len(photos):,} photos are scaled to their "
+            f"size: {scaled[0]}",
+            KeyssWarning,
+            stacklevel=3,
+        )
+    return fitted
 
 
 def _view(
@@ -150,13 +189,7 @@ def _view(
     near: float,
 ) -> View:
     pixels = read_image(photo.path, background)
-    lens = photo.lens.on_image(pixels.shape[1], pixels.shape[0])
-    if lens is None:
-        raise InputError(
-            f"{photo.path}: expected the size of its camera, {photo.lens.width}x{photo.lens.height} "
-            f"(or that divided by a whole number), found {pixels.shape[1]}x{pixels.shape[0]}"
-            + ("; its EXIF orientation rotates it: rotate its pixels" if is_turned(photo.path) else "")
-        )
+    lens = photo.lens
     if not lens.is_pinhole:
         straighten = undistortions(lens, str(photo.path.parent))
         pixels, lens = straighten(pixels), straighten.pinhole

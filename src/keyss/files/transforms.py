@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import os
 import warnings
@@ -17,11 +18,14 @@ from keyss.core.errors import InputError, KeyssWarning
 from keyss.files.images import probe_image
 from keyss.files.layout import (
     MAX_COORDINATE,
+    FileFinder,
     Photo,
     SceneLayout,
     hold_out,
+    leave_out_broken,
     leave_out_missing,
     refuse_duplicates,
+    warn_of_masks,
 )
 from keyss.files.lens import Lens, make_lens
 from keyss.files.ply_table import read_point_cloud
@@ -29,10 +33,11 @@ from keyss.files.reading import read_text
 
 _MAX_JSON_BYTES = 256 * 2**20
 _EXTENSIONS = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG", ".webp")
-_PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
-_COEFFICIENTS = ("k1", "k2", "k3", "k4", "p1", "p2")
+_PERSPECTIVE = ("OPENCV", "FULL_OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
+_COEFFICIENTS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 
 _Row = tuple[float, float, float, float]
+_Matrix = Annotated[list[_Row], msgspec.Meta(min_length=3, max_length=4)]
 
 
 class _Intrinsics(msgspec.Struct):
@@ -52,13 +57,16 @@ class _Intrinsics(msgspec.Struct):
     k2: float | None = None
     k3: float | None = None
     k4: float | None = None
+    k5: float | None = None
+    k6: float | None = None
     p1: float | None = None
     p2: float | None = None
 
 
 class _Frame(_Intrinsics, kw_only=True):
     file_path: str
-    transform_matrix: Annotated[list[_Row], msgspec.Meta(min_length=3, max_length=4)]
+    transform_matrix: Any = None  # checked by itself, so that an error names the photo
+    mask_path: Any = None
 
 
 class _Transforms(_Intrinsics, kw_only=True):
@@ -117,29 +125,38 @@ def _read(path: Path, skip_missing: bool) -> _Posed:
     may lack its extension, and must stay inside that folder or its parent. Raises InputError.
     """
     try:
-        meta = msgspec.json.decode(read_text(path, _MAX_JSON_BYTES), type=_Transforms)
-    except (msgspec.MsgspecError, RecursionError) as error:
+        # Not by msgspec, which refuses the NaN and Infinity that Python writes.
+        meta = msgspec.convert(json.loads(read_text(path, _MAX_JSON_BYTES)), type=_Transforms)
+    except (msgspec.MsgspecError, ValueError, RecursionError) as error:
         raise InputError(f"{path}: expected JSON with posed frames: {error}") from error
     if not meta.frames:
         raise InputError(f"{path}: expected posed frames, found none")
-    names = [_image_name(path, frame.file_path) for frame in meta.frames]
+    finder = FileFinder()
+    names = [_image_name(path, frame.file_path, finder) for frame in meta.frames]
     missing = {name for name in names if not (path.parent / name).exists()}
     leave_out_missing(path, len(names), sorted(missing), skip_missing)
-    photos = []
+    photos, broken = [], {}
     for i, (name, frame) in enumerate(zip(names, meta.frames, strict=True)):
         if name in missing:
             continue
-        where = f"{path}: frame {i}"
-        viewmat = _viewmat(where, np.array(frame.transform_matrix))
-        photos.append(Photo(path.parent / name, name, viewmat, _lens(where, meta, frame, path.parent / name)))
+        where = f"{path}: frame {i} ({name})"
+        try:
+            viewmat = _viewmat(where, _matrix(where, frame.transform_matrix))
+            lens = _lens(where, meta, frame, path.parent / name)
+            photos.append(Photo(path.parent / name, name, viewmat, lens))
+        except InputError as error:
+            broken[name] = str(error)
+    leave_out_broken(path, len(photos) + len(broken), broken, skip_missing)
     refuse_duplicates(path, photos)
+    if any(frame.mask_path for frame in meta.frames):
+        warn_of_masks(f"{path}: `mask_path`")
     return _Posed(meta, tuple(names), tuple(photos))
 
 
 def _split(path: Path, posed: _Posed) -> tuple[tuple[Photo, ...], tuple[Photo, ...]]:
-    meta, photos, names = posed.meta, posed.photos, set(posed.names)
+    meta, photos, names, finder = posed.meta, posed.photos, set(posed.names), FileFinder()
     train, test = (
-        {_image_name(path, each) for each in listed or ()}
+        {_image_name(path, each, finder) for each in listed or ()}
         for listed in (meta.train_filenames, meta.test_filenames or meta.val_filenames)
     )
     if unknown := (train | test) - names:
@@ -171,11 +188,21 @@ def _inside(path: Path, file_path: str) -> str:
     return name
 
 
-def _image_name(path: Path, file_path: str) -> str:
-    """The name of an image beside a JSON file, with its extension added if necessary and if it exists."""
+def _image_name(path: Path, file_path: str, finder: FileFinder) -> str:
+    """The name of an image beside a JSON file, spelt as on disk, with its extension added if necessary."""
     name = _inside(path, file_path)
-    extensions = (each for each in ("", *_EXTENSIONS) if os.path.isfile(path.parent / (name + each)))
-    return name + next(extensions, "")
+    names = (finder.find(path.parent, name + each) for each in ("", *_EXTENSIONS))
+    return next((each for each in names if os.path.isfile(path.parent / each)), name)
+
+
+def _matrix(where: str, values: object) -> Doubles:
+    """[3 or 4, 4]. Raises InputError."""
+    try:
+        return np.array(msgspec.convert(values, type=_Matrix))
+    except msgspec.ValidationError as error:
+        raise InputError(
+            f"{where}: expected a `transform_matrix` of 3 or 4 rows of 4 numbers: {error}"
+        ) from error
 
 
 def _viewmat(where: str, values: Doubles) -> Doubles:
@@ -210,11 +237,11 @@ def _lens(where: str, file: _Intrinsics, frame: _Intrinsics, image: Path) -> Len
         known = ", ".join((*_PERSPECTIVE, "OPENCV_FISHEYE"))
         raise InputError(f"{where}: camera_model {model[:80]!r} is not supported (known: {known})")
     if "w" in meta and "h" in meta:
-        width, height = int(meta["w"]), int(meta["h"])
-        if (width, height) != (meta["w"], meta["h"]):
+        if not (float(meta["w"]).is_integer() and float(meta["h"]).is_integer()):
             raise InputError(
                 f"{where}: expected whole numbers as `w` and `h`, found {meta['w']:g}, {meta['h']:g}"
             )
+        width, height = int(meta["w"]), int(meta["h"])
     else:
         width, height, _ = probe_image(image)
     fx = _focal(where, meta, "fl_x", "camera_angle_x", width)
@@ -222,8 +249,9 @@ def _lens(where: str, file: _Intrinsics, frame: _Intrinsics, image: Path) -> Len
     if fx is None and fy is None:
         raise InputError(f"{where}: expected `fl_x` or `camera_angle_x`, found neither")
     values = {key: meta[key] for key in _COEFFICIENTS if key in meta}
-    if not fisheye and values.pop("k4", 0.0) != 0.0:
-        # Nerfstudio's k4 is a 4th radial term, OpenCV's the first of a denominator.
+    rational = model == "FULL_OPENCV" or values.get("k5", 0.0) != 0.0 or values.get("k6", 0.0) != 0.0
+    if not fisheye and not rational and values.pop("k4", 0.0) != 0.0:
+        # Nerfstudio's k4 is a 4th radial term, OpenCV's the first of a denominator, which k5 and k6 continue.
         raise InputError(f"{where}: expected k4 = 0 for a lens that is not a fisheye, found {meta['k4']}")
     values["fx"], values["fy"] = fx if fx is not None else fy, fy if fy is not None else fx
     values["cx"], values["cy"] = meta.get("cx", width / 2), meta.get("cy", height / 2)

@@ -23,7 +23,7 @@ from keyss.core.scene import (
     focus_point,
 )
 from keyss.core.similarity import up_direction
-from keyss.files.models import is_model_path
+from keyss.files.models import is_model_source
 from keyss.rendering.arguments import MAX_SIDE
 from keyss.rendering.view import render
 
@@ -43,7 +43,7 @@ _DISTANCE = 0.8  # relative to that from which the whole model is visible
 
 def is_model(source: str | Path | Gaussians) -> bool:
     """True if a source is a model or a model's path, not a folder of photos."""
-    return isinstance(source, Gaussians) or is_model_path(source)
+    return isinstance(source, Gaussians) or is_model_source(source)
 
 
 @torch.no_grad()

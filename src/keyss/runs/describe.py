@@ -71,8 +71,9 @@ def info(path: str | Path) -> RunInfo | ModelInfo | SceneInfo:
         raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
 
 
-def _folder_info(path: Path) -> RunInfo | SceneInfo:
+def _folder_info(path: Path) -> RunInfo | ModelInfo | SceneInfo:
     from keyss.files.scenes import load_scene
+    from keyss.files.trained import is_training, model_file
     from keyss.runs.config import FitMetrics, HideMetrics
     from keyss.runs.files import METRICS, MODEL, is_run, stego_in
     from keyss.runs.records import read_record
@@ -84,6 +85,8 @@ def _folder_info(path: Path) -> RunInfo | SceneInfo:
     if runs := sorted(each for each in path.iterdir() if is_run(each)):
         named = ", ".join(map(str, runs[:_NAMED])) + f" and {len(runs) - _NAMED} more" * (len(runs) > _NAMED)
         raise InputError(f"{path} is not a run, but a folder of runs: name one of {named}")
+    if is_training(path):
+        return _model_info(model_file(path))
     scene = load_scene(path, skip_missing=True)
     camera = scene.train[0].camera
     return SceneInfo(

@@ -14,7 +14,7 @@ from keyss.core.errors import InputError, UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene, ViewOptions
 from keyss.files.foreign import what_it_is
-from keyss.files.models import DECODED_SUFFIX, is_model_path, known_suffixes, read_model
+from keyss.files.models import DECODED_SUFFIX, is_model_source, known_suffixes, read_model
 from keyss.methods.handed import SUFFIX
 from keyss.runs.folder import PRIVATE, PUBLISH
 
@@ -108,7 +108,7 @@ def as_scene(
     """
     if isinstance(source, Scene):
         return source
-    if not isinstance(source, Gaussians) and not is_model_path(source):
+    if not isinstance(source, Gaussians) and not is_model_source(source):
         from keyss.files.scenes import load_scene
 
         if os.path.exists(source) and not os.path.isdir(source):

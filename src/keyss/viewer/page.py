@@ -22,6 +22,7 @@ from urllib.parse import quote
 import keyss.files
 from keyss.core.errors import InputError, KeyssWarning, OutputError, UsageError
 from keyss.files.atomic import check_not_an_input, check_output_file, mode_like, write_bytes
+from keyss.files.trained import model_file
 from keyss.viewer.look import Look
 
 SCRIPT, STYLE, LICENCES, INDEX = "viewer.js", "viewer.css", "licences.txt", "index.html"
@@ -84,7 +85,7 @@ def export_html(
     Others can read what is written if they can read `model`. Returns the paths written. Raises UsageError
     for a model that is too large, InputError if it is not a model, OutputError.
     """
-    model, out = Path(model), Path(out)
+    model, out = model_file(model), Path(out)
     file, look = readable(model), look or {}
     for origin in (look[name] for name in ("host", "embedder") if name in look):
         if not _ORIGIN.fullmatch(origin):
@@ -158,6 +159,7 @@ def readable(model: Path) -> Readable:
 
     Warns and raises as `read_model`, and UsageError for a file that is too large.
     """
+    model = model_file(model)
     try:
         with model.open("rb") as file:
             header = file.read(_MAX_HEADER)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import struct
 import zlib
 from dataclasses import replace
@@ -187,6 +188,21 @@ def test_spz_makes_room_for_large_models(reach: float) -> None:
     codes = SpzCodes.quantise(model)
     assert worst(codes.dequantise().means, model.means) <= 0.51 * 2.0**-codes.fractional_bits
     assert reach > 2048 or codes.fractional_bits == 12
+
+
+@pytest.mark.parametrize("scale", [1.0, 0.1, 0.001, 0.0001])
+@pytest.mark.parametrize("offset", [0.0, 3.0])
+def test_spz_is_as_precise_in_small_units(scale: float, offset: float) -> None:
+    """Positions keep 1/2048 of the median distance from the middle, as far as 24 bits reach."""
+    model = model_of(2000, 0)
+    log_scales = model.log_scales + math.log(scale)
+    model = replace(model, means=(model.means + offset) * scale, log_scales=log_scales)
+    codes = SpzCodes.quantise(model)
+    assert codes.fractional_bits == 12 if scale == 1 else codes.fractional_bits > 12
+    distance = (model.means - model.means.median(dim=0).values).abs().amax(dim=1).median()
+    assert worst(codes.dequantise().means, model.means) <= float(distance) / 2048 * 1.01
+    assert len(np.unique(codes.positions, axis=0)) == 2000
+    assert SpzCodes.parse(codes.serialise()) == codes
 
 
 def test_spz_refuses_models_that_are_too_large() -> None:

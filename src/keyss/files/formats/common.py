@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from abc import ABC, abstractmethod
 from dataclasses import fields, replace
 from typing import ClassVar, Self
@@ -10,7 +11,7 @@ import numpy as np
 import torch
 
 from keyss.core.arrays import Bytes, Doubles, Floats, Integers, Numbers, Words
-from keyss.core.errors import InputError, OutputError
+from keyss.core.errors import InputError, KeyssWarning, OutputError
 from keyss.core.gaussians import SH_C0, Gaussians
 from keyss.files.ply_rows import OPACITY_LOGIT_BOUND
 
@@ -135,15 +136,51 @@ def gaussians_of(
 
     Raises InputError for values that are not finite in single precision.
     """
+    model = _model(means, quats, log_scales, opacities, colors, rest)
+    if wrong := _not_finite(model):
+        raise InputError(f"NaN or infinite values in {', '.join(wrong)}")
+    return model
+
+
+def usable_gaussians_of(*arrays: Numbers) -> Gaussians:
+    """`gaussians_of` without Gaussians that are not finite, of whose number a KeyssWarning tells.
+
+    Raises InputError if none remain.
+    """
+    model = _model(*arrays)
+    if not (wrong := _not_finite(model)):
+        return model
+    parts = (getattr(model, each.name).reshape(len(model), -1) for each in fields(model))
+    finite = torch.cat(list(parts), dim=1).isfinite().all(1)
+    if not finite.any():
+        raise InputError(f"NaN or infinite values in {', '.join(wrong)}")
+    warnings.warn(
+        f"{int((~finite).sum()):,} of {len(model):,} Gaussians are left out: they have NaN or infinite "
+        f"values ({', '.join(wrong)})",
+        KeyssWarning,
+        stacklevel=2,
+    )
+    return model[finite]
+
+
+def _model(
+    means: Numbers,
+    quats: Numbers,
+    log_scales: Numbers,
+    opacities: Numbers,
+    colors: Numbers,
+    rest: Numbers,
+) -> Gaussians:
     with np.errstate(over="ignore", invalid="ignore"):
         sh = np.empty((len(rest), 1 + rest.shape[1], 3), np.float32)
         sh[:, 0], sh[:, 1:] = colors, rest
         parts = (means, quats, log_scales, _logits(opacities), sh)
-        model = Gaussians(*(torch.from_numpy(np.require(each, np.float32, ["C", "W"])) for each in parts))
-    wrong = [each.name for each in fields(model) if not bool(getattr(model, each.name).isfinite().all())]
-    if wrong:
-        raise InputError(f"NaN or infinite values in {', '.join(wrong)}")
-    return model
+        return Gaussians(*(torch.from_numpy(np.require(each, np.float32, ["C", "W"])) for each in parts))
+
+
+def _not_finite(model: Gaussians) -> list[str]:
+    """The attributes with values that are not finite."""
+    return [each.name for each in fields(model) if not bool(getattr(model, each.name).isfinite().all())]
 
 
 def writable(model: Gaussians) -> Gaussians:
@@ -158,8 +195,7 @@ def writable(model: Gaussians) -> Gaussians:
         ~flat.opacity_logits.isinf(), flat.opacity_logits.clamp(-bound, bound)
     )
     flat = replace(flat, opacity_logits=opacity_logits)
-    wrong = [each.name for each in fields(flat) if not bool(getattr(flat, each.name).isfinite().all())]
-    if wrong:
+    if wrong := _not_finite(flat):
         raise OutputError(f"NaN or infinite values in {', '.join(wrong)}")
     return flat
 

@@ -29,12 +29,12 @@ from keyss.core.similarity import Similarity
 from keyss.files.formats.common import (
     arrays_of,
     colour_bytes,
-    gaussians_of,
     log_scales_of,
     reason,
     scales_of,
     to_bytes,
     unit,
+    usable_gaussians_of,
     writable,
 )
 
@@ -124,7 +124,10 @@ def read(data: bytes) -> Gaussians:
             room -= sum(getattr(model, each.name).numel() for each in fields(model))
             parts.append(_moved(model, to_scene))
     if not parts:
-        raise InputError(f"a glTF file without Gaussians: nothing in its scene has {EXTENSION}")
+        raise InputError(
+            f"a glTF file without Gaussians, such as a mesh: nothing in its scene has {EXTENSION}; keyss "
+            "hides 3DGS models, which a training such as `keyss fit` makes from photos"
+        )
     degree = max(part.sh_degree for part in parts)
     return Gaussians.cat([part.with_sh_degree(degree) for part in parts])
 
@@ -250,7 +253,11 @@ def _transform(node: _Node) -> Doubles:
 def _gaussians(document: _Document, primitive: _Primitive, binary: bytes, room: int) -> Gaussians:
     """The Gaussians of a primitive, in its own coordinates, if they have at most `room` numbers."""
     if "extensions" in primitive.extensions[EXTENSION]:
-        raise InputError("its Gaussians are compressed by another glTF extension, which keyss does not read")
+        names = ", ".join(primitive.extensions[EXTENSION]["extensions"])[:80]
+        raise InputError(
+            f"its Gaussians are compressed ({names}), which keyss does not read in a glTF file; export a "
+            ".ply or .spz from the program that made it"
+        )
 
     def attribute(name: str, width: int) -> Numbers:
         if name not in primitive.attributes:
@@ -267,11 +274,11 @@ def _gaussians(document: _Document, primitive: _Primitive, binary: bytes, room: 
     alphas = attribute(f"{EXTENSION}:OPACITY", 1)[:, 0]
     if not len(means) or any(len(each) != len(means) for each in (quats, scales, alphas, *sh)):
         raise InputError("damaged glTF: no Gaussians, or attributes of different lengths")
-    if not ((alphas >= 0) & (alphas <= 1)).all():
+    if ((alphas < 0) | (alphas > 1)).any():
         raise InputError("damaged glTF: opacities outside of 0 to 1")
     rest = np.stack(sh[1:], axis=1) if degree else np.empty((len(means), 0, 3))
     wxyz = unit(np.roll(quats, 1, axis=1))
-    return gaussians_of(means, wxyz, log_scales_of(scales), alphas, sh[0], rest)
+    return usable_gaussians_of(means, wxyz, log_scales_of(scales), alphas, sh[0], rest)
 
 
 def _values(document: _Document, index: int, width: int, binary: bytes) -> Numbers:

@@ -14,11 +14,11 @@ from keyss.files.formats.common import (
     arrays_of,
     colour_bytes,
     f_dc_of,
-    gaussians_of,
     log_scales_of,
     scales_of,
     to_bytes,
     unit,
+    usable_gaussians_of,
     writable,
 )
 
@@ -34,7 +34,7 @@ def read(data: bytes) -> Gaussians:
             f"not a whole .splat: expected 32 bytes for each Gaussian, found {len(data):,} in total"
         )
     rows = np.frombuffer(data, _ROW)
-    return gaussians_of(
+    return usable_gaussians_of(
         rows["mean"],
         unit(rows["quat"].astype(np.float64) / 128 - 1),
         log_scales_of(rows["scale"]),

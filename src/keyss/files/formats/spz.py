@@ -8,6 +8,7 @@ The container is a header and six byte sections, compressed by gzip or, in versi
 
 from __future__ import annotations
 
+import math
 import struct
 import zlib
 from collections.abc import Sequence
@@ -48,7 +49,8 @@ _ENTRY = struct.Struct("<QQ")  # of the table: compressed and uncompressed bytes
 _ZSTD_LEVEL = 12  # as in Niantic's library
 _ZSTD_WINDOW = 1 << 23  # bytes that decoders should support (RFC 8878)
 VERSION = 3  # has 10-bit rotations, and more programs read it than the newer 4
-_FRACTIONAL_BITS = 12  # steps of 1/4096 world unit, as in Niantic's library
+_FRACTIONAL_BITS = 12  # steps of 1/4096 world unit, as in Niantic's library; small scenes get more
+_LEAST_STEPS, _STEPS_PER_GAUSSIAN = 1024, 8  # across half of the model, and the median size of Gaussians
 MAX_POSITION = 2**23 - 1  # the largest code of a position
 _COLOR_SCALE = 0.15  # 0.15 f_dc + 0.5 is within 0 to 1
 _MAGNITUDE = 2**9 - 1  # a component of a rotation has a sign and 9 bits
@@ -288,7 +290,7 @@ class SpzCodes(Codes):
     def quantise(cls, model: Gaussians, fractional_bits: int | None = None) -> Self:
         """See `Codes`: in version 3. Raises OutputError for positions beyond 8 million."""
         means, quats, log_scales, opacities, f_dc, rest = arrays_of(model)
-        bits = _fractional_bits(means) if fractional_bits is None else fractional_bits
+        bits = _fractional_bits(means, log_scales) if fractional_bits is None else fractional_bits
         largest, xyz = smallest_three(np.roll(quats * _QUAT_SIGNS, -1, axis=1))
         magnitudes = np.floor(np.abs(xyz) * (_MAGNITUDE / np.sqrt(0.5)) + 0.5).clip(0, _MAGNITUDE)
         return cls(
@@ -325,14 +327,18 @@ class SpzCodes(Codes):
         )
 
 
-def _fractional_bits(means: Floats) -> int:
-    """The default, or as many as the largest position leaves."""
+def _fractional_bits(means: Floats, log_scales: Floats) -> int:
+    """The default, or more for a model in small units, or as many as the largest position leaves."""
     extent = float(np.abs(means).max())
+    spread = float(np.median(np.abs(means - np.median(means, axis=0)).max(axis=1)))
+    size = math.exp(float(np.median(log_scales.max(axis=1)).clip(-60, 60)))
+    wanted = math.ceil(math.log2(max(_LEAST_STEPS / max(spread, 1e-20), _STEPS_PER_GAUSSIAN / size)))
     if not extent < MAX_POSITION:
         raise OutputError(
             f"SPZ holds positions up to {MAX_POSITION:,} world units, and this model reaches {extent:.3g}"
         )
-    return next(bits for bits in range(_FRACTIONAL_BITS, -1, -1) if extent * 2**bits < MAX_POSITION)
+    most = min(max(wanted, _FRACTIONAL_BITS), MAX_FRACTIONAL_BITS)
+    return next(bits for bits in range(most, -1, -1) if extent * 2**bits < MAX_POSITION)
 
 
 def _quantised_harmonics(rest: Floats) -> Bytes:

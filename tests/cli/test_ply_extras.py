@@ -1,0 +1,98 @@
+"""Properties and comments of other programs, which stay in what is made from their files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from channels.low_bits.trained_like import trained_like
+from cli.said import Run, write_key
+from files.test_ply import columns_of, ply_bytes
+from keyss.core import Gaussians, same_bits
+from keyss.files import read_model, write_model
+from keyss.files.ply_table import read_vertex_table
+
+COUNT = 1500
+COMMENTS = b"comment Exported by the studio's tool, 2\xe9\nobj_info taken in May\n"
+
+
+def extended(model: Gaussians, path: Path, form: str = "binary_little_endian") -> dict[str, np.ndarray]:
+    """Write `model` with properties of several types before, between and after its own."""
+    rng = np.random.default_rng(0)
+    n = len(model)
+    extra = {
+        "label": rng.integers(-(2**31), 2**31, n),
+        "nx": rng.normal(size=n).astype(np.float32),
+        "confidence": rng.random(n).astype(np.float32),
+        "time": rng.random(n),
+        "class": rng.integers(0, 256, n),
+        "f0": rng.integers(-(2**15), 2**15, n),
+    }
+    columns = columns_of(model)
+    both = {"label": extra["label"]} | columns | extra
+    kinds = {"label": "int32", "time": "double", "class": "uchar", "f0": "short"}
+    data = ply_bytes(both, form=form, kinds=kinds)
+    path.write_bytes(data.replace(b"element vertex", COMMENTS + b"element vertex", 1))
+    return extra
+
+
+def check_extras(path: Path, extra: dict[str, np.ndarray], rows: slice = slice(None)) -> None:
+    with path.open("rb") as file:
+        table, comments = read_vertex_table(file)
+    assert "\n".join(comments).encode("latin-1") + b"\n" == COMMENTS
+    for name, values in extra.items():
+        assert np.array_equal(table[name][: len(values[rows])], values[rows]), name
+
+
+@pytest.mark.parametrize("form", ["ascii", "binary_little_endian", "binary_big_endian"])
+def test_convert_keeps_them(keyss: Run, tmp_path: Path, form: str) -> None:
+    model = trained_like(COUNT)
+    extra = extended(model, tmp_path / "a.ply", form)
+    said = keyss("convert", tmp_path / "a.ply", tmp_path / "b.ply")
+    assert "renders unchanged" in said.out
+    check_extras(tmp_path / "b.ply", extra)
+    assert same_bits(read_model(tmp_path / "b.ply"), model)
+    assert keyss("convert", tmp_path / "a.ply", tmp_path / "c.spz").status == 0  # which cannot hold them
+
+
+def test_rows_that_are_left_out_take_theirs_along(keyss: Run, tmp_path: Path) -> None:
+    model = trained_like(COUNT)
+    model.means[7, 1] = torch.nan
+    model.opacity_logits[9] = torch.inf
+    model.log_scales[11, 2] = -torch.inf
+    extra = extended(model, tmp_path / "a.ply")
+    said = keyss("convert", tmp_path / "a.ply", tmp_path / "b.ply")
+    assert f"1 of {COUNT:,} Gaussians are left out" in said.err
+    kept = {name: np.delete(values, 7) for name, values in extra.items()}
+    check_extras(tmp_path / "b.ply", kept)
+    assert len(read_model(tmp_path / "b.ply")) == COUNT - 1
+
+
+@pytest.mark.parametrize(
+    ("what", "publish"),
+    [
+        ("--secret", ["ply"]),
+        ("--secret", ["any"]),
+        ("--secret-file", ["ply"]),
+        ("--secret-file", ["any"]),
+        ("--secret-file", ["any", "--channel", "colours"]),
+    ],
+)
+def test_the_published_file_keeps_them(keyss: Run, tmp_path: Path, what: str, publish: list[str]) -> None:
+    extra = extended(trained_like(COUNT), tmp_path / "cover.ply")
+    write_model(tmp_path / "secret.ply", trained_like(60, 1))
+    (tmp_path / "secret.txt").write_bytes(b"seven words")
+    secret = tmp_path / ("secret.ply" if what == "--secret" else "secret.txt")
+    key = write_key(tmp_path / "key")
+    options = ["--publish", *publish, *(["--min-psnr", "0"] if what == "--secret" else [])]
+    out = tmp_path / "run"
+    cover = tmp_path / "cover.ply"
+    said = keyss("hide", "--cover", cover, what, secret, "--key-file", key, "-o", out, *options)
+    assert said.status == 0, said.err
+    stego = tmp_path / "run" / "publish" / "stego.ply"
+    check_extras(stego, extra)
+    out = tmp_path / f"out{secret.suffix}"
+    assert keyss("reveal", stego, "--key-file", key, "-o", out).status == 0
