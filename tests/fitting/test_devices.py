@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 import torch
 
+from fitting.small_trainings import FIT, RUNS, trained
 from fitting.test_plain import InterruptAt
-from fitting.training_together import FIT, RUNS, trained
 from keyss.core import Interrupted
 from keyss.fitting import PlainRun, fit_scene, load_checkpoint
 from tiny_scenes import tiny_scene

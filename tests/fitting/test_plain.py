@@ -12,13 +12,16 @@ from keyss.core import Gaussians, InputError, Interrupted, UsageError
 from keyss.fitting import (
     FitConfig,
     PlainRun,
+    Target,
     fit_scene,
     load_checkpoint,
     mean_psnr,
+    photometric_loss,
     save_checkpoint,
     steps_done,
 )
 from keyss.progress import Reporter
+from keyss.rendering import render_with_meta
 from tiny_scenes import tiny_scene
 
 CONFIG = FitConfig(
@@ -53,6 +56,20 @@ def test_fitting_improves_psnr_on_test_views() -> None:
     before, after = (mean_psnr(model, scene.test, scene.background) for model in (start, fitted))
     assert after > before + 3
     assert len(start) < len(fitted) <= config.max_gaussians
+
+
+def test_a_step_minimises_the_mean_loss_of_its_views() -> None:
+    scene, config = tiny_scene(), replace(CONFIG, views_per_step=2)
+    run, same = (PlainRun(scene, config, torch.device("cpu")) for _ in range(2))
+    model, losses = same.gaussians(), []
+    for view in [scene.train[same.shuffle.sample()] for _ in range(2)]:
+        image, _ = render_with_meta(model, view.camera, scene.background, sh_degree=0)
+        losses.append(float(photometric_loss(image, Target.of(view.image), config.ssim_weight)))
+    run.step()
+    assert float(run.loss) == pytest.approx(sum(losses) / 2, rel=1e-5)
+    assert losses[0] != pytest.approx(losses[1], rel=1e-2)
+    with pytest.raises(UsageError, match="views_per_step"):
+        FitConfig(views_per_step=0)
 
 
 def test_one_seed_gives_one_model_and_leaves_the_global_random_state_alone() -> None:

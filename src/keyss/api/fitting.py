@@ -1,22 +1,16 @@
-"""`fit`: a plain 3DGS model of a scene, trained by one process or by those of torchrun together."""
+"""`fit`: a plain 3DGS model of a scene."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from contextlib import nullcontext
-from dataclasses import asdict, replace
-from functools import wraps
+from dataclasses import asdict
 from pathlib import Path
-from typing import ParamSpec, TypeVar
-
-import msgspec
 
 from keyss.core.scene import Scene, ViewOptions
 from keyss.fitting.config import FitConfig
 from keyss.fitting.image_metrics import quality
 from keyss.fitting.plain import FitResult, fit_scene
-from keyss.fitting.ranks import here, joined
 from keyss.progress import Reporter
 from keyss.rendering import Backend, resolve_device
 from keyss.runs.config import FitMetrics, FitRunConfig
@@ -24,42 +18,17 @@ from keyss.runs.files import CONFIG, METRICS, MODEL, Background, PathLike, as_sc
 from keyss.runs.folder import RunFolder, recorded_number
 from keyss.runs.planning import in_a_line, plan_fit, worth_planning
 
-P = ParamSpec("P")
-R = TypeVar("R")
 
+def seeded(config: FitConfig, interrupted: Path | None, *names: str) -> FitConfig:
+    """`config` with a seed: its own, that of an `interrupted` run's folder, or a random one.
 
-def together(verb: Callable[P, R]) -> Callable[P, R]:
-    """Let all processes of torchrun join in `verb`, which takes `device`."""
-
-    @wraps(verb)
-    def joining(*arguments: P.args, **options: P.kwargs) -> R:
-        with joined(str(options.get("device", "auto"))):
-            return verb(*arguments, **options)
-
-    return joining
-
-
-def begun(config: FitConfig, interrupted: Path | None, *names: str) -> FitConfig:
-    """`config` with a seed and a number of views, the same in all processes.
-
-    A resumed run takes them from the `interrupted` run's folder, in whose arguments its config is found by
-    `names`. Otherwise the default is a random seed, and one view for each process. Raises UsageError if the
-    views cannot be divided evenly.
+    `names` lead to the config among the arguments of that run.
     """
-    ranks = here()
-    if interrupted is not None and ranks.first:
+    if interrupted is not None:
         config = config.seeded(recorded_number(interrupted, *names, "seed"))
-        if config.views_per_step is None:
-            views = recorded_number(interrupted, *names, "views_per_step")
-            config = replace(config, views_per_step=views)
-    config = config.seeded()
-    if ranks.count == 1:
-        return config
-    config = replace(config, views_per_step=ranks.views(config.views_per_step))
-    return msgspec.json.decode(ranks.from_first(msgspec.json.encode(config)), type=FitConfig)
+    return config.seeded()
 
 
-@together
 def fit(
     scene: PathLike | Scene,
     *,
@@ -77,12 +46,12 @@ def fit(
 
     `width`, `background`, `skip_missing`: see `load_scene`. `out` (a folder) gets `model.ply`, and `private/`
     with `config.json`, `metrics.json` and checkpoints, from which `resume` continues. Without a seed in
-    `config` the run uses a random one, which `config.json` records. Of several processes of torchrun the
-    first one writes and reports; all return the model. Raises KeyssError, and Interrupted on Ctrl-C.
+    `config` the run uses a random one, which `config.json` records. Raises KeyssError, and Interrupted on
+    Ctrl-C.
     """
-    started, answers = time.monotonic(), here().first
+    started = time.monotonic()
     interrupted = Path(out) if resume and out is not None else None
-    config = begun(config or FitConfig(), interrupted, "config")
+    config = seeded(config or FitConfig(), interrupted, "config")
     target = resolve_device(device)
     settings = FitRunConfig(
         scene=path_of(scene),
@@ -90,7 +59,7 @@ def fit(
         config=config,
     )
     folder = None
-    if out is not None and answers:
+    if out is not None:
         folder = RunFolder(
             out,
             "fit",
@@ -100,7 +69,7 @@ def fit(
             resume=resume,
         )
     loaded = as_scene(scene, settings.views)
-    if reporter and answers and not resume and worth_planning(config):
+    if reporter and not resume and worth_planning(config):
         reporter.note(f"fit: {in_a_line(plan_fit(loaded, config, target))}")
     with folder.work() if folder else nullcontext():
         result = fit_scene(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import math
 import time
 import warnings
@@ -13,11 +12,10 @@ from contextlib import nullcontext
 from dataclasses import asdict, replace
 from pathlib import Path
 
-import msgspec
 import torch
 
 from keyss.api.asking import HideResult, Secret, check_keys, method_for, sources_of
-from keyss.api.fitting import begun, together
+from keyss.api.fitting import seeded
 from keyss.channels import AnyChannel, Channel, Publish, channel_for, open_content, quiet_channel
 from keyss.core.errors import KeyssWarning, QualityError, UsageError
 from keyss.core.gaussians import Gaussians, same_bits
@@ -26,7 +24,6 @@ from keyss.files.models import is_model_path, read_model
 from keyss.files.ply_extras import with_extras
 from keyss.files.reading import read_file
 from keyss.fitting.image_metrics import quality
-from keyss.fitting.ranks import here
 from keyss.keys import DerivedKey
 from keyss.keys.derivation import SALT_BYTES
 from keyss.keys.encryption import MAX_PAYLOAD_BYTES
@@ -69,7 +66,6 @@ _FAR, _NEARLY_PSNR, _NEARLY_SSIM = 30.0, 3.0, 0.1
 _BETTER_THAN_NOTHING, _GOOD, _EMPTY = 3.0, 40.0, 119.0
 
 
-@together
 def hide(
     cover: PathLike | Scene | Gaussians,
     secrets: Sequence[Secret],
@@ -113,8 +109,7 @@ def hide(
 
     At the end the published file is opened with the keys, and rendered beside the plain models. If a PSNR is
     below `min_psnr` (dB; by default 20, and 25 for secrets that were pruned without a refit), or no better
-    than that of empty pictures, nothing is published, and QualityError is raised; checkpoints stay. Of
-    several processes of torchrun the first one writes, measures and reports.
+    than that of empty pictures, nothing is published, and QualityError is raised; checkpoints stay.
     Raises other KeyssErrors too, and Interrupted on Ctrl-C.
     """
     if any(secret.file is not None for secret in secrets):
@@ -135,9 +130,9 @@ def hide(
     chosen, options = method_for(method, secrets)
     if publish or channel:
         options = replace(options, publish=publish or options.publish, channel=channel or options.channel)
-    began, ranks = time.monotonic(), here()
+    began = time.monotonic()
     interrupted = Path(out) if resume and out is not None else None
-    options = replace(options, fit=begun(options.fit, interrupted, "options", "fit"))
+    options = replace(options, fit=seeded(options.fit, interrupted, "options", "fit"))
     keys = [secret.key for secret in secrets]
     target = resolve_device(device)
     given = [cover, *(secret.source for secret in secrets)]
@@ -156,7 +151,7 @@ def hide(
     )
     folder = None
     place = None if out is None else Path(out)
-    if place is not None and ranks.first and not dry_run:
+    if place is not None and not dry_run:
         arguments = asdict(settings) | {"models": [m and path_of(m) for m in models]}
         arguments |= {"bound": True} if bound else {}
         arguments["keys"] = _key_checks(keys, settings)
@@ -178,7 +173,7 @@ def hide(
         config.iterations if each.given is None else _steps_of(model)
         for each, model, config in zip(sources, models, configs, strict=True)
     ]
-    if place is not None and ranks.first:
+    if place is not None:
         check_disk(place, options, sources)
     trains = not dry_run and (options.trains or any(each.given is None for each in sources))
     sources = [
@@ -191,7 +186,7 @@ def hide(
         return HideResult(plan=plan_hiding(chosen, options, sources, target, place, bound=bound))
     long = (trains and worth_planning(options.fit)) or options.place.grows
     with folder.work() if folder else nullcontext():
-        if reporter and ranks.first and not resume and long:
+        if reporter and not resume and long:
             planned = plan_hiding(chosen, options, sources, target, place, bound=bound)
             for line in (f"hide: {in_a_line(planned)}", *planned.notes):
                 reporter.note(line)
@@ -202,23 +197,20 @@ def hide(
                 warnings.simplefilter("ignore", KeyssWarning)
                 options = chosen.prepare([replace(each, given=each.model) for each in sources], options)
         plain = [each.model for each in sources]
-        context = replace(context, entropy=ranks.from_first(_entropy(keys, options, plain)))
+        context = replace(context, entropy=_entropy(keys, options, plain))
         stego = chosen.hide(sources[0], sources[1:], options, context)
-        shown: list[Shown] = []
-        if ranks.first:
-            published = with_extras(stego.gaussians, cover if models[0] is None else models[0], plain[0])
-            read = _as_read(stego, published, keys, folder)
-            shown = [
-                show(model.to(target), each.model.to(target), each.scene, of_plain=not each.photos)
-                for model, each in zip(read, sources, strict=True)
-            ]
-            sizes = [(len(model), len(each.model)) for model, each in zip(read, sources, strict=True)]
-            again = ", and `resume=True` skips the training that is done" * trains
-            _check_quality(shown, min_psnr, sizes, options, again)
+        published = with_extras(stego.gaussians, cover if models[0] is None else models[0], plain[0])
+        read = _as_read(stego, published, keys, folder)
+        shown = [
+            show(model.to(target), each.model.to(target), each.scene, of_plain=not each.photos)
+            for model, each in zip(read, sources, strict=True)
+        ]
+        sizes = [(len(model), len(each.model)) for model, each in zip(read, sources, strict=True)]
+        again = ", and `resume=True` skips the training that is done" * trains
+        _check_quality(shown, min_psnr, sizes, options, again)
         bounds = list(map(Bound.of, options.training(len(sources)), plain_steps))
         longer = _fit_bounds(bounds, sources, stego, options, context) if bound else {}
-        if ranks.first:
-            metrics = _measured(stego, sources, options, shown, target, bounds, plain_steps, longer, began)
+        metrics = _measured(stego, sources, options, shown, target, bounds, plain_steps, longer, began)
         if folder:
             payloads = secret_ids(options.fit.known_seed, stego.opened)
             made = {
@@ -229,9 +221,6 @@ def hide(
             made |= {bound_names(len(secrets))[index]: model for index, model in longer.items()}
             settings = replace(settings, options=options, payloads=payloads)
             folder.write({**made, CONFIG: settings, METRICS: metrics})
-    if ranks.count > 1:
-        text = json.dumps(asdict(metrics) if ranks.first else None)  # keeps NaN
-        metrics = msgspec.convert(json.loads(ranks.from_first(text.encode())), HideMetrics)
     return HideResult(stego.gaussians, metrics)
 
 

@@ -10,18 +10,16 @@ import sys
 import time
 import warnings
 from collections.abc import Callable, Collection, Iterator, Sequence
-from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from contextlib import contextmanager
 from dataclasses import is_dataclass
 from typing import Any, get_type_hints
 
 from keyss import __version__
-from keyss._torchrun import processes, rank
 from keyss.core.errors import (
     BackendError,
     Interrupted,
     KeyssError,
     KeyssWarning,
-    OtherProcessError,
     OutputError,
     UsageError,
     nearest,
@@ -42,7 +40,6 @@ _NAME = re.compile(r"`([a-z_]\w*)`")
 
 # Arguments whose flags have another name.
 _RENAMED = {"key": "key-file", "keys": "key-file", "secrets": "secret", "model": "secret-model"}
-COMMANDS = ("fit", "hide")  # that train
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -54,7 +51,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     options: set[str] = set()  # of the command, by their names in Python
     try:
-        with only_first_prints(), _warnings_as_lines(options), _verbosity(arguments) as words:
+        with _warnings_as_lines(options), _verbosity(arguments) as words:
             try:
                 _run(words or ["--help"], options)
             finally:
@@ -68,8 +65,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         status, message = explain(_interrupt_behind(error) or error)
         if status == INTERNAL_ERROR and os.environ.get("KEYSS_DEBUG") == "1":
             raise
-        if prints(error):
-            print(f"keyss: {prefix()}{_one_line(as_flags(message, options))}", file=sys.stderr)
+        print(f"keyss: {_one_line(as_flags(message, options))}", file=sys.stderr)
         return status
 
 
@@ -79,7 +75,6 @@ def _run(arguments: list[str], options: set[str]) -> None:
     if arguments in (["--version"], ["-V"]):  # before the slow import of the argument parser
         print(__version__)
         return
-    check_command(name)
 
     import tyro
 
@@ -277,35 +272,3 @@ def options_of_group(group: Any) -> dict[str, Any]:
         nested = getattr(hint, "__origin__", hint)
         found |= options_of_group(nested) if is_dataclass(nested) else {name: hint}
     return found
-
-
-def answers() -> bool:
-    """True in the first process, or the only one."""
-    return rank() == 0
-
-
-@contextmanager
-def only_first_prints() -> Iterator[None]:
-    """Silences the standard streams of all processes but the first."""
-    if answers():
-        yield
-        return
-    with open(os.devnull, "w") as nowhere, redirect_stdout(nowhere), redirect_stderr(nowhere):
-        yield
-
-
-def prints(error: BaseException) -> bool:
-    """True if this process prints `error`: only the first prints errors that all of them raise."""
-    return answers() or not isinstance(error, UsageError | OtherProcessError | KeyboardInterrupt)
-
-
-def prefix() -> str:
-    """The prefix of messages from processes other than the first."""
-    return "" if answers() else f"process {rank() + 1} of {processes()}: "
-
-
-def check_command(command: str, *, trains: bool | None = None) -> None:
-    """Raise UsageError for a command that does not train, in several processes."""
-    trains = command.startswith("-") or command in COMMANDS if trains is None else trains
-    if processes() > 1 and not trains:
-        raise UsageError(f"torchrun is for `keyss fit` and `keyss hide`: start `keyss {command}` without it")

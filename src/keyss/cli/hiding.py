@@ -151,7 +151,6 @@ def _hide_scenes(args: HideArguments, cover: Path) -> None:
     import keyss
     from keyss import progress
     from keyss.channels import is_appended
-    from keyss.cli.entry import answers
     from keyss.cli.reporting import reporting
     from keyss.cli.tables import print_files, print_hiding, print_plan
     from keyss.core.errors import UsageError
@@ -189,8 +188,6 @@ def _hide_scenes(args: HideArguments, cover: Path) -> None:
             reporter=reporter,
             **described,
         )
-    if not answers():
-        return
     assert result.metrics is not None
     print_hiding(result.metrics, brief=progress.level < 1)
     _warn_of_idle(idle, result.metrics.iterations)
@@ -283,11 +280,9 @@ def _method_options(args: HideArguments, method: Method) -> MethodOptions:
 def _hide_files(args: HideArguments, cover: Path) -> None:
     import keyss
     from keyss.channels import channel_for
-    from keyss.cli.entry import check_command
     from keyss.cli.tables import print_files
     from keyss.runs.files import STEGOS
 
-    check_command("hide --secret-file", trains=False)
     _refuse(args, "--secret-file", "cover secret_file key_file publish out overwrite device channel dry_run")
     files, keys = args.secret_file, _keys(args, len(args.secret_file))
     channel = args.details.channel or "colours"
@@ -312,13 +307,12 @@ def _hide_files(args: HideArguments, cover: Path) -> None:
 
 def _hide_batch(args: HideArguments, table: Path) -> None:
     import keyss
-    from keyss.cli.entry import as_flags, check_command, options_of_group
+    from keyss.cli.entry import as_flags, options_of_group
     from keyss.cli.keys import key_of_file, warn_of_weak_keys
     from keyss.cli.tables import print_files, print_outcome
     from keyss.methods import registry
     from keyss.progress import reporter
 
-    check_command("hide --batch", trains=False)
     method, batch = registry.get(args.method), args.batch
     used = "batch master_key_file ray cores out publish channel preset overwrite device min_psnr"
     used += " width background skip_missing iterations max_gaussians seed"

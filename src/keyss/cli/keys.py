@@ -9,7 +9,6 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from keyss._torchrun import processes
 from keyss.core.errors import UsageError
 from keyss.keys.key_file import normalized_key, read_key
 
@@ -32,7 +31,7 @@ def keys(files: Sequence[Path], count: int, *, confirm: bool = False) -> list[st
                 f"{VARIABLE} holds one key, but there are {count} secrets: give --key-file for each"
             )
         return given
-    if not sys.stdin.isatty() or processes() > 1:
+    if not sys.stdin.isatty():
         raise UsageError(f"no key: give --key-file FILE, set {VARIABLE}, or run in a terminal for a prompt")
     return [_prompted(f"Key {i + 1} of {count}" if count > 1 else "Key", confirm) for i in range(count)]
 

@@ -80,7 +80,6 @@ def fit(
     from dataclasses import replace
 
     import keyss
-    from keyss.cli.entry import answers
     from keyss.cli.reporting import reporting
     from keyss.cli.tables import print_files, print_fit
     from keyss.fitting.config import PRESETS
@@ -99,8 +98,6 @@ def fit(
             resume=resume,
             reporter=reporter,
         )
-    if not answers():
-        return
     print_fit(read_record(out / METRICS, FitMetrics))
     print_files(out, {"model.ply": "the model", "private": "measurements and configuration"})
 

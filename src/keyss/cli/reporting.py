@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 from keyss.cli.arguments import Training
-from keyss.cli.entry import answers
 from keyss.core.errors import import_extra
 from keyss.progress import Reporter, reporter as lines
 
@@ -25,7 +24,7 @@ def reporting(out: Path, scene: Path, training: Training) -> Iterator[Reporter]:
     reporter: Reporter = lines()
     if training.tensorboard:
         reporter = TensorBoardReporter(out, reporter)
-    if not (training.live and answers()):
+    if not training.live:
         yield reporter
         return
     from keyss.viewer.live import LiveTraining

@@ -28,7 +28,6 @@ from .parameters import (
     to_parameters as to_parameters,
 )
 from .plain import FitResult as FitResult, PlainRun as PlainRun, fit_scene as fit_scene
-from .ranks import Ranks as Ranks, here as here, joined as joined
 from .sampling import own_randomness as own_randomness
 from .schedule import Schedule as Schedule
 from .side_by_side import Fit as Fit, fit_scenes as fit_scenes

@@ -24,20 +24,8 @@ _UNREADABLE = (OSError, KeyError, ValueError, TypeError, safetensors.SafetensorE
 
 def save_checkpoint(path: Path, tensors: State, meta: Mapping[str, Any]) -> None:
     """Atomically write `tensors` and the JSON-able `meta`; any device can load them. Raises OutputError."""
-    write_bytes(path, pack_state(tensors, meta))
-
-
-def pack_state(tensors: State, meta: Mapping[str, Any]) -> bytes:
-    """Serialise `tensors` and the JSON-able `meta`."""
     contiguous = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
-    return safetensors.torch.save(contiguous, {"meta": json.dumps(meta)})
-
-
-def unpack_state(data: bytes) -> tuple[State, dict[str, Any]]:
-    """Restore the result of `pack_state`, on the CPU."""
-    size = int.from_bytes(data[:8], "little")
-    header = json.loads(data[8 : 8 + size])
-    return safetensors.torch.load(data), json.loads(header["__metadata__"]["meta"])
+    write_bytes(path, safetensors.torch.save(contiguous, {"meta": json.dumps(meta)}))
 
 
 def load_checkpoint(path: Path) -> tuple[State, dict[str, Any]]:

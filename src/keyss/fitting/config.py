@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 from keyss.core.errors import UsageError
 
 MAX_SEED = 2**48 - 1  # every reader of JSON represents it exactly
-MAX_VIEWS = 10**4  # of a step
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,9 +25,7 @@ class FitConfig:
     ssim_weight: float = 0.2  # lambda of the photometric loss
     # None: a run samples one from the system, and nobody else can repeat the run.
     seed: int | None = None
-    # Views of a step, whose mean loss is minimised, over all processes (`fitting.ranks`); None: one for each
-    # process. Rates are per step and do not depend on it (docs/scaling.md).
-    views_per_step: int | None = None
+    views_per_step: int = 1  # whose mean loss a step minimises; rates do not depend on it
 
     means_rate: float = 1.6e-4  # times the scene's extent, decays to 1 % of it
     scales_rate: float = 5e-3
@@ -55,10 +52,9 @@ class FitConfig:
     checkpoint_seconds: float = 180.0
 
     def __post_init__(self) -> None:
-        if self.views_per_step is not None and not 1 <= self.views_per_step <= MAX_VIEWS:
-            raise UsageError(f"`views_per_step`: expected 1 to {MAX_VIEWS}, got {self.views_per_step}")
         for name, low, high in (
             ("iterations", 1, 10**7),
+            ("views_per_step", 1, 10**4),
             ("max_gaussians", 16, 10**8),
             ("sh_degree", 0, 3),
             ("ssim_weight", 0, 1),

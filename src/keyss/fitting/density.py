@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, TypeVar
 
 import torch
@@ -12,7 +12,6 @@ from torch import Tensor
 
 from keyss.fitting.config import FitConfig
 from keyss.fitting.parameters import Optimizers, Parameters
-from keyss.fitting.ranks import here
 from keyss.fitting.schedule import boost_of
 
 T = TypeVar("T")
@@ -59,31 +58,23 @@ class CappedStrategy(DefaultStrategy):  # type: ignore[misc]
         self,
         views: Sequence[T],
         loss_at: Callable[[T], tuple[Tensor, list[Rendered]]],
-        trained: Iterable[Tensor],
-        params: Parameters,
+        count: int,
     ) -> tuple[Tensor, dict[str, Any]]:
-        """Compute the gradients of the mean loss of a step's `views` in `trained`, over all ranks.
+        """Compute the gradients of the mean loss of a step's `views` of `count` Gaussians.
 
         `loss_at` renders one view and returns its loss and the renders that count for densification. Returns
         the mean loss, and the info that `step_post_backward` takes.
         """
-        ranks, count = here(), len(params["means"])
         losses: list[Tensor] = []
         renders: list[Rendered] = []
-        for view in ranks.mine(views):
+        for view in views:
             loss, rendered = loss_at(view)
             for meta, _, _ in rendered:
                 meta["means2d"].retain_grad()
             (loss / len(views)).backward()
             losses.append(loss.detach() / len(views))
             renders += [(meta, indices, weight / len(views)) for meta, indices, weight in rendered]
-        total, info = torch.stack(losses).sum(), self.combined(renders, count)
-        if ranks.count == 1:
-            return total, info
-        statistics: dict[str, Any] = dict.fromkeys(_STATISTICS)
-        self._update_state(params, statistics, info)
-        total, *sums = ranks.sum(trained, [total, *statistics.values()])
-        return total, dict(zip(_STATISTICS, sums, strict=True))
+        return torch.stack(losses).sum(), self.combined(renders, count)
 
     def combined(self, renders: Sequence[Rendered], count: int) -> dict[str, Any]:
         """The info of a step's renders of `count` Gaussians."""
@@ -100,7 +91,7 @@ class CappedStrategy(DefaultStrategy):  # type: ignore[misc]
     def _update_state(
         self, params: Parameters, state: dict[str, Any], info: dict[str, Any], packed: bool = False
     ) -> None:
-        """Add the statistics of renders, given by their meta, or summed over all ranks.
+        """Add the statistics of renders, given by their meta, or summed by `by_scene`.
 
         The sums are those of gsplat, which selects the visible Gaussians first: on a CPU, that takes twice as
         long.

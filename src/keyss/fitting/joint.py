@@ -16,7 +16,6 @@ from keyss.fitting.config import FitConfig
 from keyss.fitting.density import CappedStrategy, Rendered
 from keyss.fitting.image_metrics import psnr, subsample_views
 from keyss.fitting.parameters import Optimizers, Parameters, make_optimizers, to_parameters
-from keyss.fitting.ranks import here
 from keyss.fitting.rows import of_scene
 from keyss.fitting.sampling import Shuffle, own_randomness
 from keyss.fitting.schedule import Schedule
@@ -36,7 +35,7 @@ class JointRun(ABC):
     ) -> None:
         self.fit, self.device, self.names = fit, device, names
         self.iterations, self.iteration = fit.iterations, 0
-        self.views_per_step = here().views(fit.views_per_step)
+        self.views_per_step = fit.views_per_step
         self.generator = torch.Generator().manual_seed(fit.known_seed)
         self.watched = [subsample_views(scene.test, 8) for scene in scenes]
         self.backgrounds = [scene.background.to(device) for scene in scenes]
@@ -80,8 +79,7 @@ class JointRun(ABC):
 
     def optimise(self, views: Sequence[T], loss_at: Callable[[T], tuple[Tensor, list[Rendered]]]) -> None:
         """Take the step that the losses of `views` ask for; see `CappedStrategy.backward`."""
-        trained = (*self.parameters.values(), *self.networks.parameters())
-        self.loss, info = self.strategy.backward(views, loss_at, trained, self.parameters)
+        self.loss, info = self.strategy.backward(views, loss_at, len(self))
         self.set_rates()
         for optimizer in (*self.optimizers.values(), self.network_optimizer):
             optimizer.step()

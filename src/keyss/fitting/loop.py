@@ -1,4 +1,4 @@
-"""The loop of every training run: progress, checkpoints, signals, resume, several processes."""
+"""The loop of every training run: progress, checkpoints, signals, resume."""
 
 from __future__ import annotations
 
@@ -15,10 +15,9 @@ import torch
 from torch import Tensor
 
 from keyss import _threads
-from keyss.core.errors import InputError, Interrupted, KeyssWarning, OtherProcessError
-from keyss.fitting.checkpoint import State, load_checkpoint, pack_state, save_checkpoint, unpack_state
+from keyss.core.errors import InputError, Interrupted, KeyssWarning
+from keyss.fitting.checkpoint import State, load_checkpoint, save_checkpoint
 from keyss.fitting.config import FitConfig
-from keyss.fitting.ranks import here
 from keyss.fitting.sampling import own_randomness
 from keyss.progress import Reporter
 
@@ -41,17 +40,13 @@ class TrainingRun(Protocol):
         """The loss of the last step."""
 
     def step(self) -> None:
-        """Take one optimisation step, which increases `iteration`.
-
-        It waits for other processes before it changes parameters: if one has ended, only the order of views
-        and `iteration` have changed.
-        """
+        """Take one optimisation step, which increases `iteration`."""
 
     def evaluate(self) -> dict[str, float]:
         """Quality on held-out views, by name."""
 
     def state(self) -> tuple[State, dict[str, Any]]:
-        """Tensors, which are not copied except for the order of views, and JSON-able numbers."""
+        """Tensors, which are not copied, and JSON-able numbers."""
 
     def load(self, tensors: State, meta: dict[str, Any]) -> None: ...
 
@@ -82,70 +77,43 @@ def train(
     Raises InputError for a checkpoint with another `fingerprint`: JSON-able settings and digests of inputs.
     On a CPU, the same seed gives the same model, interrupted or not. The global random state, from which
     gsplat's densification samples, is seeded, saved in the checkpoint, and restored for the caller.
-
-    Of several processes, the first one has the `checkpoint` and the `reporter`; the others start from its
-    state. A signal to one of them interrupts all. When one ends, the first saves, and all raise
-    OtherProcessError.
     """
-    ranks, evaluate_every = here(), config.evaluate_every
-    if not ranks.first:
-        checkpoint, reporter, evaluate_every = None, None, 0
     reporter = reporter or Reporter()
     if _threads.spinning and torch.get_num_threads() > 1:
         warnings.warn(_SPINNING, KeyssWarning, stacklevel=2)
 
-    def save(state: tuple[State, dict[str, Any]]) -> None:
+    def save() -> None:
         if checkpoint is not None:
-            save_checkpoint(checkpoint, state[0], state[1] | {"fingerprint": fingerprint})
+            tensors, meta = run.state()
+            tensors |= {"rng": torch.get_rng_state()}
+            save_checkpoint(checkpoint, tensors, meta | {"fingerprint": fingerprint})
 
-    saves = checkpoint is not None or ranks.count > 1
-    with deferred(saves=saves) as interrupted, own_randomness(config.known_seed):
+    with deferred(saves=checkpoint is not None) as interrupted, own_randomness(config.known_seed):
         if checkpoint is not None and resume and checkpoint.exists():
             _resume(run, checkpoint, fingerprint)
-        if ranks.count > 1:
-            _load(run, *unpack_state(ranks.from_first(pack_state(*_state(run)))))
         saved = time.monotonic()
         numbers: dict[str, float] = {}
-        before = None  # the state before a step that needs other processes
         model = getattr(run, "gaussians", None)  # runs without one have no model to display
         reporter.start(title, run.iterations, run.iteration)
         try:
             while run.iteration < run.iterations:
-                before = _state(run) if ranks.count > 1 else None
                 run.step()
-                before = None
-                if evaluate_every and run.iteration % evaluate_every == 0:
+                if config.evaluate_every and run.iteration % config.evaluate_every == 0:
                     numbers = run.evaluate()
                 with_loss = reporter.loss_every and run.iteration % reporter.loss_every == 0
                 loss = {"loss": float(run.loss)} if with_loss else {}
                 reporter.update(run.iteration, len(run), numbers | loss)
                 if model is not None:
                     reporter.look(model)
-                if signum := ranks.agree(interrupted() or 0, len(run)):
-                    save(_state(run))
-                    raise Interrupted(checkpoint, run.iteration, signal.Signals(signum))
+                if signum := interrupted():
+                    save()
+                    raise Interrupted(checkpoint, run.iteration, signum)
                 if time.monotonic() - saved > config.checkpoint_seconds:
-                    save(_state(run))
+                    save()
                     saved = time.monotonic()
-            save(_state(run))
-        except OtherProcessError as error:
-            save(before or _state(run))
-            remedy = "nothing was saved" if checkpoint is None else REMEDY
-            raise OtherProcessError(f"{error}; {remedy}") from error
+            save()
         finally:
             reporter.finish()
-
-
-def _state(run: TrainingRun) -> tuple[State, dict[str, Any]]:
-    """The state of a run and of torch's global generator."""
-    tensors, meta = run.state()
-    return tensors | {"rng": torch.get_rng_state()}, meta
-
-
-def _load(run: TrainingRun, tensors: State, meta: dict[str, Any]) -> None:
-    """Restore what `_state` returned. Raises KeyError if something is missing."""
-    torch.set_rng_state(tensors.pop("rng"))
-    run.load(tensors, meta)
 
 
 def _resume(run: TrainingRun, checkpoint: Path, fingerprint: dict[str, Any]) -> None:
@@ -155,7 +123,8 @@ def _resume(run: TrainingRun, checkpoint: Path, fingerprint: dict[str, Any]) -> 
         remedy = "give the same ones, or start anew with `overwrite=True`"
         raise InputError(f"{checkpoint}: belongs to a run with other settings or inputs; {remedy}")
     try:
-        _load(run, tensors, meta)
+        torch.set_rng_state(tensors.pop("rng"))
+        run.load(tensors, meta)
     except KeyError as error:
         raise InputError(f"{checkpoint}: not a checkpoint of this version (no {error})") from error
 

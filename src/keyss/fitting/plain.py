@@ -24,7 +24,6 @@ from keyss.fitting.parameters import (
     to_gaussians,
     to_parameters,
 )
-from keyss.fitting.ranks import here
 from keyss.fitting.sampling import Shuffle
 from keyss.fitting.schedule import Schedule
 from keyss.progress import Reporter
@@ -58,7 +57,6 @@ class PlainRun:
         self.background = scene.background.to(device)
         self.iterations = config.iterations
         self.iteration = 0
-        self.views_per_step = here().views(config.views_per_step)
         self.generator = torch.Generator().manual_seed(config.known_seed)
         if model is None:
             points, colors = initial_points(scene, config.max_gaussians, self.generator)
@@ -76,7 +74,7 @@ class PlainRun:
 
     def step(self) -> None:
         config = self.config
-        chosen = [self.shuffle.sample() for _ in range(self.views_per_step)]
+        chosen = [self.shuffle.sample() for _ in range(config.views_per_step)]
         self.iteration += 1
         degree = config.sh_degree_at(self.iteration) if self.grows else config.sh_degree
 
@@ -86,8 +84,7 @@ class PlainRun:
             target = self.targets.of(index, lambda: view.image.to(self.device))
             return photometric_loss(image, target, config.ssim_weight), [(meta, None, 1.0)]
 
-        trained = self.parameters.values()
-        self.loss, info = self.strategy.backward(chosen, loss_at, trained, self.parameters)
+        self.loss, info = self.strategy.backward(chosen, loss_at, len(self))
         self.schedule.set(self.optimizers, self.iteration)
         for optimizer in self.optimizers.values():
             optimizer.step()

@@ -30,7 +30,6 @@ from keyss.fitting.config import FitConfig
 from keyss.fitting.loop import ENDING, REMEDY, deferred
 from keyss.fitting.losses import Targets
 from keyss.fitting.plain import fit_scene
-from keyss.fitting.ranks import here
 from keyss.progress import Reporter
 
 MIN_STEPS = 1000  # shorter trainings are not worth the two seconds that a process takes to start
@@ -74,11 +73,11 @@ def fit_scenes(
 def at_once(fits: Sequence[Fit], device: torch.device) -> int:
     """The number of fits that run at the same time; 1 for one after the other.
 
-    On a CPU, it is limited by the fits of at least MIN_STEPS, threads, cores and memory. It is 1 in trainings
-    of several processes (torchrun) and where no process can be started.
+    On a CPU, it is limited by the fits of at least MIN_STEPS, threads, cores and memory. It is 1 where
+    no process can be started.
     """
     long = [fit for fit in fits if fit.config.iterations >= MIN_STEPS]
-    if len(long) < 2 or device.type != "cpu" or here().count > 1 or not _processes.can_start():
+    if len(long) < 2 or device.type != "cpu" or not _processes.can_start():
         return 1
     size = min(len(long), torch.get_num_threads(), _processes.usable_cores())
     if (available := _processes.available_memory()) is not None:

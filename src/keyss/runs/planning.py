@@ -20,7 +20,6 @@ from keyss.core.errors import OutputError
 from keyss.core.scene import Scene
 from keyss.fitting.config import FitConfig
 from keyss.fitting.losses import Targets
-from keyss.fitting.ranks import here
 from keyss.methods.base import Method, MethodOptions, Plan, Source, Stage, role_of
 from keyss.methods.plain_models import Bound, plain_stage
 from keyss.progress import about
@@ -71,7 +70,7 @@ def plan_hiding(
             for source, rendered in zip(sources, plan.rendered, strict=True)
             if rendered
         )
-        stages.append(Stage("hiding", plan.steps, sum(plan.rendered), plan.steps * _views(fit) * step))
+        stages.append(Stage("hiding", plan.steps, sum(plan.rendered), plan.steps * fit.views_per_step * step))
     measuring = sum(
         _RENDERS * len(source.scene.test) * _step_seconds(device, size, source.scene) / 3
         for source, size in zip(sources, sizes, strict=True)
@@ -173,7 +172,7 @@ def _free_bytes(out: Path) -> int:
 def _fit_stage(name: str, config: FitConfig, scene: Scene, gaussians: int, device: torch.device) -> Stage:
     """A plain fit that grows to so many Gaussians."""
     step = _step_seconds(device, 0.75 * gaussians, scene)
-    return Stage(name, config.iterations, gaussians, config.iterations * _views(config) * step)
+    return Stage(name, config.iterations, gaussians, config.iterations * config.views_per_step * step)
 
 
 def _step_seconds(device: torch.device, gaussians: float, scene: Scene, plan: Plan | None = None) -> float:
@@ -185,11 +184,6 @@ def _step_seconds(device: torch.device, gaussians: float, scene: Scene, plan: Pl
         return 5e-3 + 1e-8 * gaussians + 5e-9 * pixels + 1e-12 * weights
     threads = 0.5 + 0.5 * torch.get_num_threads()
     return 3e-3 + (8e-7 * gaussians + 3e-7 * pixels + 3e-10 * weights) / threads
-
-
-def _views(config: FitConfig) -> int:
-    """Views of a step that this process renders."""
-    return here().views(config.views_per_step) // here().count
 
 
 def _memory_bytes(gaussians: int, sh_degree: int, trains: bool) -> int:

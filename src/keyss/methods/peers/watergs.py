@@ -35,7 +35,6 @@ from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Camera
 from keyss.files.formats.common import morton_order
 from keyss.fitting.parameters import make_optimizers, to_gaussians
-from keyss.fitting.ranks import here
 from keyss.keys.derivation import stream
 from keyss.methods.base import Capabilities
 from keyss.methods.keyss.training import Picture
@@ -212,7 +211,6 @@ class WaterGsTraining(PeerTraining):
             F.binary_cross_entropy_with_logits(self.mapping(logits), target).backward()
             adam.step()
         adam.zero_grad()
-        here().share(self.mapping.parameters())
 
     def result(self) -> tuple[Gaussians, HandedTensors]:
         """Publishes all Gaussians, because the autoencoder depends on their order."""
