@@ -169,7 +169,7 @@ def _warnings_as_lines(options: Collection[str]) -> Iterator[None]:
 
 @contextmanager
 def _verbosity(arguments: Sequence[str]) -> Iterator[list[str]]:
-    """`arguments` without -q and -v. With -v, prints time and memory unless the context ends by an error."""
+    """`arguments` without -q and -v. With -v, prints the time unless the context ends by an error."""
     levels = [_LEVELS[word] for word in arguments if word in _LEVELS]
     if not levels:  # avoids importing the progress module
         yield list(arguments)
@@ -182,24 +182,9 @@ def _verbosity(arguments: Sequence[str]) -> Iterator[list[str]]:
     try:
         yield [word for word in arguments if word not in _LEVELS]
         if progress.level > 0:
-            print(f"keyss: done in {time.monotonic() - start:.1f} s{_memory()}", file=sys.stderr)
+            print(f"keyss: done in {time.monotonic() - start:.1f} s", file=sys.stderr)
     finally:
         progress.level = before
-
-
-def _memory() -> str:
-    """The peak memory of this process and of the largest one that it started, if the system knows."""
-    try:
-        import resource
-    except ImportError:
-        return ""
-    unit = 1 if sys.platform == "darwin" else 1024
-    own, others = (
-        f"{resource.getrusage(whose).ru_maxrss * unit / 1e6:,.0f} MB"
-        for whose in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
-    )
-    besides = f", and {others} in another process" if others != "0 MB" else ""
-    return f", with at most {own} of memory{besides}"
 
 
 def _interrupt_behind(error: BaseException | None) -> KeyboardInterrupt | None:

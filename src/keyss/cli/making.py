@@ -106,7 +106,12 @@ def keygen(
     *,
     out: Annotated[
         Path | None,
-        optional("FILE", "New key file, readable only by you.", "the standard output", aliases=["-o"]),
+        optional(
+            "FILE",
+            "New key file, readable only by you (on Windows: by all who can read its folder).",
+            "the standard output",
+            aliases=["-o"],
+        ),
     ] = None,
     bits: Annotated[int, arg(metavar="N", help="Strength in bits; each character has 5.95.")] = 95,
     asset: Annotated[

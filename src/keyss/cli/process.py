@@ -19,7 +19,8 @@ from contextlib import suppress
 from types import FrameType
 from typing import Any, NoReturn
 
-_SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP")  # Windows has no SIGHUP
+from keyss._interrupts import ENDING
+
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # of malloc.h
 _IMPORTING = "<frozen importlib._bootstrap>"
 _CLEAR_LINE = b"\r\x1b[K\x1b[?25h"  # and show the cursor, which progress lines hide
@@ -65,10 +66,9 @@ class _Process:
         self.status: int | None = None  # of the command, once it is done
 
     def run(self) -> NoReturn:
-        for name in _SIGNALS:
-            signum = getattr(signal, name, None)
+        for signum in ENDING:
             # Ignored signals stay ignored: `nohup`, and background commands of scripts.
-            if signum is not None and signal.getsignal(signum) is not signal.SIG_IGN:
+            if signal.getsignal(signum) is not signal.SIG_IGN:
                 signal.signal(signum, self.on_signal)
         sys.unraisablehook = self.on_unraisable
         prepare_streams()

@@ -1,7 +1,6 @@
 from .atomic import (
     atomic_write as atomic_write,
     check_output_file as check_output_file,
-    held_by as held_by,
     lock as lock,
     write_bytes as write_bytes,
 )

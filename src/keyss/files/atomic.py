@@ -1,13 +1,15 @@
-"""Atomic writes, lock files, and checks of where output may be written."""
+"""Atomic writes, lock files, and checks of where output may be written.
+
+Windows ignores the modes of files: whoever may read a folder may read what is written into it.
+"""
 
 from __future__ import annotations
 
-import errno
-import fcntl
 import os
 import stat
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
+from functools import partial
 from pathlib import Path
 from typing import BinaryIO
 
@@ -18,7 +20,7 @@ from keyss.core.errors import OutputError, UsageError
 def atomic_write(path: Path | str, mode: int = 0o600) -> Iterator[BinaryIO]:
     """Open a temporary file beside `path`; on success fsync it and rename it to `path`.
 
-    On failure the temporary file is removed and `path` is unchanged; the next write reuses a temporary file
+    On failure the temporary file is removed and `path` is unchanged; the next write removes a temporary file
     that a killed process left. Files have `mode`, by default 0600, since most of them are secrets or tell of
     one. Raises OutputError when the system refuses (disk full, no permission, missing folder), and when
     another process is writing the same file.
@@ -26,28 +28,20 @@ def atomic_write(path: Path | str, mode: int = 0o600) -> Iterator[BinaryIO]:
     path = Path(path)
     temporary = path.with_name(f".{path.name}.unfinished")
     try:
-        descriptor = _open_locked(temporary)
-    except BlockingIOError as error:
-        raise OutputError(f"cannot write {path}: another process is writing it") from error
+        with lock(path.with_name(f".{path.name}.lock"), path):
+            temporary.unlink(missing_ok=True)
+            try:
+                with open(temporary, "xb", opener=partial(os.open, mode=0o600)) as file:
+                    yield file
+                    file.flush()
+                    os.fsync(file.fileno())
+                temporary.chmod(mode)
+                os.replace(temporary, path)  # after closing, which Windows needs
+            except BaseException:
+                temporary.unlink(missing_ok=True)
+                raise
     except OSError as error:
-        raise OutputError(f"cannot write {path}: {error.strerror}") from error
-    status = os.fstat(descriptor)
-    if not stat.S_ISREG(status.st_mode) or status.st_uid != os.geteuid() or status.st_nlink != 1:
-        os.close(descriptor)
-        raise OutputError(f"cannot write {path}: {temporary} is in the way")
-    try:
-        with os.fdopen(descriptor, "wb") as file:
-            os.fchmod(descriptor, mode)
-            os.ftruncate(descriptor, 0)
-            yield file
-            file.flush()
-            os.fsync(descriptor)
-            os.replace(temporary, path)
-    except BaseException as error:
-        temporary.unlink(missing_ok=True)
-        if isinstance(error, OSError):
-            raise OutputError(f"cannot write {path}: {error.strerror or error}") from error
-        raise
+        raise OutputError(f"cannot write {path}: {error.strerror or error}") from error
 
 
 def write_bytes(path: Path | str, data: bytes, mode: int = 0o600) -> None:
@@ -69,41 +63,27 @@ def mode_like(source: Path) -> int:
 
 
 @contextmanager
-def lock(path: Path) -> Iterator[None]:
-    """Hold the lock file `path`, which contains our process id, and remove it afterwards.
+def lock(path: Path, written: Path) -> Iterator[None]:
+    """Hold the lock file `path`, which stands for the file or folder `written`, and remove it afterwards.
 
-    The system releases the lock if the process dies. Raises OutputError, which names the parent of the
-    file's folder, when another process holds the lock, or the system refuses.
+    The system releases the lock if the process dies. Raises OutputError while another process holds the lock,
+    and when the system refuses.
     """
+    from filelock import FileLock, Timeout  # slow to import
+
+    held = FileLock(path, timeout=0)
     try:
-        descriptor = _open_locked(path)
-    except BlockingIOError as error:
-        where = path.parent.parent
-        raise OutputError(f"{where}: process {_pid(path)} is at work in this folder") from error
+        held.acquire()
+    except Timeout as error:
+        raise OutputError(f"cannot write {written}: another process is writing it") from error
     except OSError as error:
-        raise OutputError(f"cannot write {path}: {error.strerror}") from error
+        raise OutputError(f"cannot write {written}: {error.strerror or error}") from error
     try:
-        os.ftruncate(descriptor, 0)
-        os.write(descriptor, str(os.getpid()).encode())
         yield
     finally:
-        path.unlink(missing_ok=True)
-        os.close(descriptor)
-
-
-def held_by(path: Path) -> str | None:
-    """The id of the process that holds the lock file; None if it is free."""
-    try:
-        descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW)
-    except OSError:
-        return None
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except OSError:
-        return _pid(path)
-    finally:
-        os.close(descriptor)
-    return None
+        with suppress(OSError):  # Windows removes the file when the lock is released
+            path.unlink()
+        held.release()
 
 
 def check_not_an_input(path: Path | str, inputs: Iterable[Path]) -> None:
@@ -126,29 +106,3 @@ def check_output_file(path: Path | str, overwrite: bool) -> Path:
     if not os.access(path.parent, os.W_OK):
         raise OutputError(f"cannot write {path}: nothing can be written in {path.parent}")
     return path
-
-
-def _open_locked(path: Path) -> int:
-    """Open or create `path`, locked until the descriptor is closed.
-
-    Raises BlockingIOError while another process holds the lock, OSError otherwise.
-    """
-    while True:
-        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            if os.path.samestat(os.fstat(descriptor), os.stat(path, follow_symlinks=False)):
-                return descriptor
-        except OSError as error:
-            if error.errno != errno.ENOENT:
-                os.close(descriptor)
-                raise
-        os.close(descriptor)  # the previous holder renamed or removed the file: try again
-
-
-def _pid(path: Path) -> str:
-    try:
-        text = path.read_bytes()[:20].decode("ascii", "replace").strip()
-    except OSError:
-        text = ""
-    return text if text.isdigit() else "(unknown)"

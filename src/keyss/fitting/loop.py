@@ -15,13 +15,12 @@ import torch
 from torch import Tensor
 
 from keyss import _threads
+from keyss._interrupts import ENDING
 from keyss.core.errors import InputError, Interrupted, KeyssWarning
 from keyss.fitting.checkpoint import State, load_checkpoint, save_checkpoint
 from keyss.fitting.config import FitConfig
 from keyss.fitting.sampling import own_randomness
 from keyss.progress import Reporter
-
-ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 # True: a second signal changes nothing. For processes that another one kills where that must be at once.
 patient = False

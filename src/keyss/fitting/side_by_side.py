@@ -22,12 +22,13 @@ from pathlib import Path
 import torch
 
 from keyss import _processes
+from keyss._interrupts import ENDING
 from keyss.core.errors import Interrupted, KeyssWarning, OtherProcessError, signal_of
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
 from keyss.fitting.checkpoint import steps_done
 from keyss.fitting.config import FitConfig
-from keyss.fitting.loop import ENDING, REMEDY, deferred
+from keyss.fitting.loop import REMEDY, deferred
 from keyss.fitting.losses import Targets
 from keyss.fitting.plain import fit_scene
 from keyss.progress import Reporter

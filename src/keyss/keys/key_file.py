@@ -55,7 +55,10 @@ def read_key(path: str | Path) -> str:
 
 
 def write_new_key(path: Path, key: str) -> None:
-    """Write a key file that only its owner can read. Raises OutputError if the path exists."""
+    """Write a key file that only its owner can read, or on Windows whoever can read its folder.
+
+    Raises OutputError if the path exists.
+    """
     try:
         descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
     except FileExistsError as error:
@@ -64,7 +67,6 @@ def write_new_key(path: Path, key: str) -> None:
         raise OutputError(f"cannot write {path}: {error.strerror}") from error
     try:
         with os.fdopen(descriptor, "w", encoding="utf-8") as file:
-            os.fchmod(descriptor, 0o600)  # whatever the umask
             file.write(f"{key}\n")
             file.flush()
             os.fsync(descriptor)

@@ -62,7 +62,7 @@ def claimed(out: Path, mode: int = 0o700) -> Iterator[None]:
     except OSError as error:
         raise OutputError(f"cannot write {out}: {error.strerror}") from error
     make_private(out / PRIVATE)
-    with lock(out / PRIVATE / "lock"):
+    with lock(out / PRIVATE / "lock", out):
         yield
 
 

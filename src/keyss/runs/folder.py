@@ -13,7 +13,7 @@ import time
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
-from pathlib import Path, PurePosixPath
+from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
 
 import msgspec
@@ -21,7 +21,7 @@ import msgspec
 from keyss._version import __version__
 from keyss.core.errors import InputError, OutputError, UsageError
 from keyss.core.gaussians import Gaussians
-from keyss.files.atomic import check_not_an_input, held_by, lock, public_mode, write_bytes
+from keyss.files.atomic import check_not_an_input, lock, public_mode, write_bytes
 from keyss.files.models import write_model
 from keyss.runs.records import read_record, write_record
 
@@ -96,8 +96,9 @@ class RunFolder:
 
     def _check(self, overwrite: bool, resume: bool) -> None:
         """Raise OutputError if this stage must not begin."""
-        if (pid := held_by(self.path / _LOCK)) is not None:
-            raise OutputError(f"{self.path}: process {pid} is at work in this folder")
+        if (self.path / _LOCK).exists():
+            with lock(self.path / _LOCK, self.path):  # raises OutputError if another process holds it
+                pass
         manifest = read_manifest(self.path)
         in_use = set(manifest.files) - self.onto or (manifest == Manifest() and any(self.path.iterdir()))
         if (running := manifest.running) is not None:
@@ -150,7 +151,7 @@ class RunFolder:
             with _os_errors(self.path):
                 self.path.mkdir(parents=True, exist_ok=True)
             make_private(self.path / PRIVATE)
-            with lock(self.path / _LOCK):
+            with lock(self.path / _LOCK, self.path):
                 manifest = read_manifest(self.path)  # again: from now on, no other process changes it
                 if not self._resumes:
                     _drop_unfinished(self.path, manifest)
@@ -192,7 +193,7 @@ class RunFolder:
                 written = [staging / name]
                 if written[0].is_dir():
                     written = sorted(path for path in written[0].rglob("*") if path.is_file())
-                self._names += [str(path.relative_to(staging)) for path in written]
+                self._names += [path.relative_to(staging).as_posix() for path in written]
         return staging
 
     def keep(self, stage: str, name: str, content: Any) -> None:
@@ -261,7 +262,7 @@ def clear(folder: Path) -> None:
     if not (folder / PRIVATE).is_dir():
         return
     with _os_errors(folder):
-        with lock(folder / _LOCK):
+        with lock(folder / _LOCK, folder):
             manifest = read_manifest(folder)
             _drop_unfinished(folder, manifest)
             _remove(folder, [name for names in manifest.files.values() for name in names])
@@ -273,7 +274,7 @@ def clear(folder: Path) -> None:
 def write_again(folder: Path, stage: str, name: str, content: Any) -> None:
     """Replace a file of a finished stage. Raises OutputError, also if a process is at work in the folder."""
     make_private(folder / PRIVATE)
-    with _os_errors(folder), lock(folder / _LOCK):
+    with _os_errors(folder), lock(folder / _LOCK, folder):
         _write_listed(folder, stage, name, content)
 
 
@@ -292,8 +293,8 @@ def read_manifest(folder: Path) -> Manifest:
             f"{error}; without it, keyss does not know which files in {folder} it wrote"
         ) from error
     for name in (name for names in manifest.files.values() for name in names):
-        parts = PurePosixPath(name).parts
-        if not parts or ".." in parts or parts[0] == "/" or "\0" in name or name == MANIFEST:
+        listed = PureWindowsPath(name)  # splits at both kinds of slash and knows drives
+        if not listed.name or ".." in listed.parts or listed.anchor or "\0" in name or name == MANIFEST:
             raise OutputError(f"{path}: {name!r} is not a file in this folder")
     return manifest
 
@@ -366,7 +367,7 @@ def _refuse_foreign(folder: Path, name: str) -> None:
         return
     ours = {name for names in read_manifest(folder).files.values() for name in names}
     inside = target.rglob("*") if target.is_dir() and not target.is_symlink() else ()
-    files = [str(path.relative_to(folder)) for path in inside if path.is_symlink() or not path.is_dir()]
+    files = [path.relative_to(folder).as_posix() for path in inside if path.is_symlink() or not path.is_dir()]
     if name not in ours and not (files and ours.issuperset(files)):
         raise OutputError(
             f"{target} is in the way, and keyss did not write it: move it, or choose another folder"

@@ -6,13 +6,12 @@ Sizes follow from the models and the options. Times come from constants.
 from __future__ import annotations
 
 import os
-import resource
 import shutil
-import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import psutil
 import torch
 
 from keyss.channels import Publish
@@ -189,8 +188,7 @@ def _step_seconds(device: torch.device, gaussians: float, scene: Scene, plan: Pl
 def _memory_bytes(gaussians: int, sh_degree: int, trains: bool) -> int:
     """Parameters, gradients and moments, two checkpoints, and the present size of this process."""
     state = gaussians * _floats(sh_degree) * 4
-    unit = 1 if sys.platform == "darwin" else 1024
-    resident = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
+    resident: int = psutil.Process().memory_info().rss
     return resident + (4 + 2 * _STATE_COPIES if trains else 3) * state
 
 
