@@ -104,10 +104,11 @@ def read_vertex_table(file: BinaryIO) -> tuple[npt.NDArray[np.void], list[str]]:
         if not vertex.count:
             return np.empty(0, dtype), comments
         return np.memmap(file, dtype, "r", file.tell(), (vertex.count,)), comments
+    every = list(range(len(vertex.properties)))
+    blocks = _ascii_blocks(file, before, vertex, every, np.float64)
     table = np.empty(vertex.count, np.dtype(list(vertex.properties.items())))
     start = 0
-    every = list(range(len(vertex.properties)))
-    for block in _ascii_blocks(file, before, vertex, every, np.float64):
+    for block in blocks:
         for name, values in zip(vertex.properties, block.T, strict=True):
             with np.errstate(over="ignore", invalid="ignore"):
                 table[name][start : start + len(block)] = values
@@ -284,11 +285,18 @@ def _binary_blocks(
 def _ascii_blocks(
     file: BinaryIO, before: list[_Element], vertex: _Element, columns: list[int], into: type
 ) -> Iterator[Numbers]:
-    """Rows in text, after other elements. Only the order of the values matters, not the lines."""
-    width = len(vertex.properties)
+    """Rows in text, after other elements. Raises InputError at once if the file is too short for all."""
     skipped = sum(element.count * len(element.properties) for element in before)
     # Every value takes a digit and a separator; the file's last separator may be missing.
-    _check_size(file, 2 * (skipped + vertex.count * width) - 1, vertex)
+    _check_size(file, 2 * (skipped + vertex.count * len(vertex.properties)) - 1, vertex)
+    return _ascii_rows(file, skipped, vertex, columns, into)
+
+
+def _ascii_rows(
+    file: BinaryIO, skipped: int, vertex: _Element, columns: list[int], into: type
+) -> Iterator[Numbers]:
+    """Rows in text, after `skipped` values. Only the order of the values matters, not the lines."""
+    width = len(vertex.properties)
     step = max(1, _CHUNK_BYTES // (8 * max(1, width)))
     tokens = _tokens(file)
     try:

@@ -24,6 +24,7 @@ from files.formats.examples import model_of
 from keyss.core import Gaussians, InputError, KeyssWarning
 from keyss.files import model_bytes, model_of_bytes, read_model, write_model
 from keyss.files.formats.spz import SpzCodes
+from keyss.files.ply_table import read_vertex_table
 from keyss.methods.tensors import Header, unpack_tensors
 from mutations import attempt, damaged, examples
 
@@ -78,6 +79,10 @@ def test_counts_that_are_too_large(count: int) -> None:
     ply = f"ply\nformat binary_little_endian 1.0\nelement chunk {count // 256}\nproperty float min_x\n"
     ply += f"element vertex {count}\nproperty uint packed_position\nend_header\n"
     refused("a.ply", ply.encode() + bytes(500), "the header announces")
+    text = model_bytes("a.ply", MODEL).replace(b"binary_little_endian", b"ascii")
+    refused("a.ply", text.replace(b"vertex 60", b"vertex %d" % count), "the header announces")
+    with pytest.raises(InputError, match="the header announces"):
+        read_vertex_table(io.BytesIO(text.replace(b"vertex 60", b"vertex %d" % count)))
     refused("a.sog", with_meta(lambda meta: meta.update(count=count)), "it announces")
     refused(
         "a.glb", with_json(lambda gltf: gltf["accessors"][0].update(count=count)), "exceeds its buffer view"
