@@ -92,7 +92,7 @@ def test_the_published_file_keeps_them(keyss: Run, tmp_path: Path, what: str, pu
     cover = tmp_path / "cover.ply"
     said = keyss("hide", "--cover", cover, what, secret, "--key-file", key, "-o", out, *options)
     assert said.status == 0, said.err
-    stego = tmp_path / "run" / "publish" / "stego.ply"
+    stego = tmp_path / "run" / "publish" / "model.ply"
     check_extras(stego, extra)
     out = tmp_path / f"out{secret.suffix}"
     assert keyss("reveal", stego, "--key-file", key, "-o", out).status == 0

@@ -242,6 +242,12 @@ def print_conversion(out: str, found: Conversion, *, dry_run: bool, file: TextIO
     if math.isnan(found.psnr):
         renders = "renders are empty: the model is invisible"
     print(f"{out}: {len(found.gaussians):,} Gaussians, {_size(found.bytes_after)}{was}, {renders}", file=file)
+    if out.lower().endswith(".spz"):
+        print(
+            "y is up in an .spz, as Niantic's library and splat-transform 2 write it; programs that do not "
+            "turn it (splat-transform 3) show it upside down",
+            file=file,
+        )
     for number, secret in enumerate(found.secrets, 1):
         which = "the secret" if len(found.secrets) == 1 else f"the secret of key {number}"
         state = "survives" if secret.kept else f"is lost: {secret.after:,} {secret.unit} are left"

@@ -86,9 +86,10 @@ def read_vertices(
     byte_order, before, vertex, _ = _vertex_header(file)
     names = choose(vertex.properties)
     columns = [list(vertex.properties).index(name) for name in names]
+    _check_vertices(file, byte_order, before, vertex)
     if byte_order is None:
         return Vertices(names, vertex.count, _ascii_blocks(file, before, vertex, columns, dtype), dtype)
-    _skip(file, before, vertex)
+    _skip(file, before)
     return Vertices(names, vertex.count, _binary_blocks(file, byte_order, vertex, columns, dtype), dtype)
 
 
@@ -98,17 +99,17 @@ def read_vertex_table(file: BinaryIO) -> tuple[npt.NDArray[np.void], list[str]]:
     A binary file is mapped into memory. Raises InputError as `read_vertices` does.
     """
     byte_order, before, vertex, comments = _vertex_header(file)
+    _check_vertices(file, byte_order, before, vertex)
     if byte_order is not None:
-        _skip(file, before, vertex)
+        _skip(file, before)
         dtype = np.dtype([(name, byte_order + code) for name, code in vertex.properties.items()])
         if not vertex.count:
             return np.empty(0, dtype), comments
         return np.memmap(file, dtype, "r", file.tell(), (vertex.count,)), comments
-    every = list(range(len(vertex.properties)))
-    blocks = _ascii_blocks(file, before, vertex, every, np.float64)
     table = np.empty(vertex.count, np.dtype(list(vertex.properties.items())))
     start = 0
-    for block in blocks:
+    every = list(range(len(vertex.properties)))
+    for block in _ascii_blocks(file, before, vertex, every, np.float64):
         for name, values in zip(vertex.properties, block.T, strict=True):
             with np.errstate(over="ignore", invalid="ignore"):
                 table[name][start : start + len(block)] = values
@@ -125,11 +126,19 @@ def _vertex_header(file: BinaryIO) -> tuple[str | None, list[_Element], _Element
     return byte_order, before, vertex, comments
 
 
-def _skip(file: BinaryIO, before: list[_Element], vertex: _Element) -> None:
-    """Move to the vertices of a binary file. Raises InputError if it is too short for all."""
-    skipped = sum(element.count * element.stride for element in before)
-    _check_size(file, skipped + vertex.count * vertex.stride, vertex)
-    file.seek(skipped, os.SEEK_CUR)
+def _check_vertices(file: BinaryIO, byte_order: str | None, before: list[_Element], vertex: _Element) -> None:
+    """Raise InputError if what follows the header is too short for the vertices."""
+    parts = [*before, vertex]
+    if byte_order is None:
+        # Every value takes a digit and a separator; the file's last separator may be missing.
+        _check_size(file, 2 * sum(each.count * len(each.properties) for each in parts) - 1, vertex)
+    else:
+        _check_size(file, sum(each.count * each.stride for each in parts), vertex)
+
+
+def _skip(file: BinaryIO, before: list[_Element]) -> None:
+    """Move to the vertices of a binary file."""
+    file.seek(sum(element.count * element.stride for element in before), os.SEEK_CUR)
 
 
 def read_tables(file: BinaryIO) -> dict[str, npt.NDArray[np.void]]:
@@ -285,18 +294,9 @@ def _binary_blocks(
 def _ascii_blocks(
     file: BinaryIO, before: list[_Element], vertex: _Element, columns: list[int], into: type
 ) -> Iterator[Numbers]:
-    """Rows in text, after other elements. Raises InputError at once if the file is too short for all."""
-    skipped = sum(element.count * len(element.properties) for element in before)
-    # Every value takes a digit and a separator; the file's last separator may be missing.
-    _check_size(file, 2 * (skipped + vertex.count * len(vertex.properties)) - 1, vertex)
-    return _ascii_rows(file, skipped, vertex, columns, into)
-
-
-def _ascii_rows(
-    file: BinaryIO, skipped: int, vertex: _Element, columns: list[int], into: type
-) -> Iterator[Numbers]:
-    """Rows in text, after `skipped` values. Only the order of the values matters, not the lines."""
+    """Rows in text, after other elements. Only the order of the values matters, not the lines."""
     width = len(vertex.properties)
+    skipped = sum(element.count * len(element.properties) for element in before)
     step = max(1, _CHUNK_BYTES // (8 * max(1, width)))
     tokens = _tokens(file)
     try:
