@@ -95,6 +95,7 @@ def test_another_version_is_refused_by_number() -> None:
         {"visibility": -1.0},
         {"visibility": None},
         {"shape": SHAPE | {"mask": ["op"]}},  # fewer branches than there are weights for
+        {"shape": SHAPE | {"hidden": [4096, 4096], "branch": 4096}},  # half a gigabyte of weights
         {"shape": SHAPE | {"extra": 1}},
         {"shape": SHAPE | {"mask": ["xyz", "op"]}},
         {"count": -1},

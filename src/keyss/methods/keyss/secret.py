@@ -83,6 +83,8 @@ class KeyssSecret:
                     f"the secret needs a decoder of kind {shape.kind!r}, and this program has "
                     f"{', '.join(DECODERS)}: import the module that adds it to `DECODERS` first"
                 )
+            if sum(value.numel() for value in tensors.values()) < shape.weights:
+                raise ValueError("its decoder has more weights than the payload")
             anchors, key = tensors.pop("anchors").float(), tensors.pop("key").float()
             if anchors.dim() != 2 or anchors.shape[1] != 3 or not 1 <= len(anchors) <= ANCHORS:
                 raise ValueError(f"expected up to {ANCHORS} anchors, got shape {list(anchors.shape)}")
