@@ -21,12 +21,8 @@ from keyss.fitting.config import FitConfig
 from keyss.fitting.sampling import own_randomness
 from keyss.progress import Reporter
 
-ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-
-# True: a second signal changes nothing. For processes that another one kills where that must be at once.
-patient = False
-
-REMEDY = "continue with the same command and `resume=True`"
+# Windows has no SIGHUP.
+ENDING = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
 
 
 class TrainingRun(Protocol):
@@ -105,7 +101,7 @@ def train(
                 reporter.update(run.iteration, len(run), numbers | loss)
                 if model is not None:
                     reporter.look(model)
-                if signum := interrupted():
+                if signum := interrupted() or (signal.SIGINT if reporter.interrupts() else None):
                     save()
                     raise Interrupted(checkpoint, run.iteration, signum)
                 if time.monotonic() - saved > config.checkpoint_seconds:
@@ -143,8 +139,8 @@ def deferred(*, saves: bool) -> Iterator[Callable[[], signal.Signals | None]]:
 
     def note(signum: int, frame: Any) -> None:
         nonlocal seen
-        if seen is None or patient:
-            seen = seen or signal.Signals(signum)
+        if seen is None:
+            seen = signal.Signals(signum)
             return
         restore()
         signal.raise_signal(signum)
