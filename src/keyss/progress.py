@@ -19,7 +19,7 @@ class Reporter:
     """Displays the progress of trainings; this one displays nothing."""
 
     loss_every = 0  # steps between two losses among the numbers; 0: none, since reading it slows a GPU down
-    several = False  # whether it can display several trainings at once, with ten updates a second of each
+    several = False  # whether it can display several trainings at once
 
     def start(self, title: str, iterations: int, iteration: int) -> None:
         """A training begins; a resumed one has done `iteration` of its `iterations` steps."""
@@ -29,6 +29,10 @@ class Reporter:
 
     def look(self, model: Callable[[], Any]) -> None:
         """A step is done; `model` returns the present Gaussians, whose tensors later steps change."""
+
+    def interrupts(self) -> bool:
+        """True ends the training after this step, as Ctrl-C does."""
+        return False
 
     def note(self, line: str) -> None:
         """Display a line before the training begins."""

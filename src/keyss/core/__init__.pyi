@@ -5,7 +5,6 @@ from .errors import (
     Interrupted as Interrupted,
     KeyssError as KeyssError,
     KeyssWarning as KeyssWarning,
-    OtherProcessError as OtherProcessError,
     OutputError as OutputError,
     QualityError as QualityError,
     UsageError as UsageError,

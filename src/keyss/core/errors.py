@@ -67,10 +67,6 @@ class BackendError(KeyssError):
     exit_status = 6
 
 
-class OtherProcessError(BackendError):
-    """Another process of the same run has ended, and reports the reason itself."""
-
-
 class KeyssWarning(UserWarning):
     """A problem that does not prevent a result."""
 

@@ -22,11 +22,6 @@ from keyss.fitting.config import FitConfig
 from keyss.fitting.sampling import own_randomness
 from keyss.progress import Reporter
 
-# True: a second signal changes nothing. For processes that another one kills where that must be at once.
-patient = False
-
-REMEDY = "continue with the same command and `resume=True`"
-
 
 class TrainingRun(Protocol):
     """A training run, whose future depends on nothing but what `state` returns."""
@@ -104,7 +99,7 @@ def train(
                 reporter.update(run.iteration, len(run), numbers | loss)
                 if model is not None:
                     reporter.look(model)
-                if signum := interrupted():
+                if signum := interrupted() or (signal.SIGINT if reporter.interrupts() else None):
                     save()
                     raise Interrupted(checkpoint, run.iteration, signum)
                 if time.monotonic() - saved > config.checkpoint_seconds:
@@ -142,8 +137,8 @@ def deferred(*, saves: bool) -> Iterator[Callable[[], signal.Signals | None]]:
 
     def note(signum: int, frame: Any) -> None:
         nonlocal seen
-        if seen is None or patient:
-            seen = seen or signal.Signals(signum)
+        if seen is None:
+            seen = signal.Signals(signum)
             return
         restore()
         signal.raise_signal(signum)

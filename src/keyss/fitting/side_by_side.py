@@ -2,8 +2,7 @@
 
 A training step is many short pieces of work, and the second of two threads waits for half of them: two
 trainings of one thread each take less time than one after the other with both (docs/scaling.md). The models
-do not depend on the number of threads: they are equal to the bit. Threads of one process would wait for
-Python's lock.
+do not depend on the number of threads: they are equal to the bit.
 """
 
 from __future__ import annotations
@@ -11,37 +10,39 @@ from __future__ import annotations
 import multiprocessing
 import pickle
 import signal
-import subprocess
-import warnings
+import sys
+import traceback
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from multiprocessing.connection import wait
+from multiprocessing.connection import Connection, wait
+from multiprocessing.context import SpawnProcess
 from pathlib import Path
+from types import ModuleType
+from typing import cast
 
+import psutil
 import torch
 
-from keyss import _processes
 from keyss._interrupts import ENDING
-from keyss.core.errors import Interrupted, KeyssWarning, OtherProcessError, signal_of
+from keyss.core.errors import BackendError, Interrupted
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
-from keyss.fitting.checkpoint import steps_done
 from keyss.fitting.config import FitConfig
-from keyss.fitting.loop import REMEDY, deferred
-from keyss.fitting.losses import Targets
+from keyss.fitting.loop import deferred
 from keyss.fitting.plain import fit_scene
 from keyss.progress import Reporter
 
 MIN_STEPS = 1000  # shorter trainings are not worth the two seconds that a process takes to start
-POLL = 0.1  # seconds between checks for signals, and between two progress reports of one process
+_SPAWN = multiprocessing.get_context("spawn")
+_ENDED = (
+    "the process of the {} has ended (exit code {}), as systems end processes when memory runs out; with "
+    "OMP_NUM_THREADS=1 in the environment, fits run one after the other and need less; `resume=True` "
+    "continues from the last checkpoint"
+)
 
-_PROCESS_BYTES = 500 << 20  # libraries, and the images of a step
-_COPIES = 16  # numbers in training for each number of a model: moments, gradients, intermediate results
-_EXIT_SECONDS = 5.0  # for a process to exit after it has sent its model
 
-
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Fit:
     """Arguments of `fit_scene` for one plain model."""
 
@@ -57,169 +58,123 @@ def fit_scenes(
 ) -> list[Gaussians]:
     """The models that `fit_scene` gives, with its errors; fitted at the same time where `at_once` allows it.
 
-    They are fitted one after the other if a reporter cannot follow several, and, with a KeyssWarning, if no
-    process can be started. On Ctrl-C and on errors, running fits save their checkpoints. Raises
-    OtherProcessError if a process is killed.
+    On Ctrl-C and on errors, running fits save their checkpoints. Raises BackendError if a process is killed.
     """
-    followed = all(fit.reporter is None or fit.reporter.several for fit in fits)
-    if followed and (size := at_once(fits, torch.device(device))) > 1:
-        try:
-            return _fit_in_processes(fits, size, resume)
-        except _NoProcessError as error:
-            reason = f"fits run one after the other, because no process could be started: {error}"
-            warnings.warn(reason, KeyssWarning, stacklevel=2)
-    return [fitted(fit, device, resume) for fit in fits]
+    size, models = at_once(fits, torch.device(device)), list[Gaussians]()
+    while rest := fits[len(models) : len(models) + size]:
+        if len(rest) > 1:
+            models += _side_by_side(rest, resume)
+        else:
+            models.append(fit_scene(**vars(rest[0]), device=device, resume=resume).gaussians)
+    return models
 
 
 def at_once(fits: Sequence[Fit], device: torch.device) -> int:
-    """The number of fits that run at the same time; 1 for one after the other.
+    """The number of fits that run at the same time: as threads and memory allow.
 
-    On a CPU, it is limited by the fits of at least MIN_STEPS, threads, cores and memory. It is 1 where
-    no process can be started.
+    It is 1 on GPUs, for fits of fewer than MIN_STEPS, if a reporter cannot follow several, and where no
+    process can be started: in those of `multiprocessing`, and in frozen apps.
     """
-    long = [fit for fit in fits if fit.config.iterations >= MIN_STEPS]
-    if len(long) < 2 or device.type != "cpu" or not _processes.can_start():
+    size = min(len(fits), torch.get_num_threads())
+    if device.type != "cpu" or multiprocessing.parent_process() or hasattr(sys, "frozen"):
         return 1
-    size = min(len(long), torch.get_num_threads(), _processes.usable_cores())
-    if (available := _processes.available_memory()) is not None:
-        size = min(size, available // max(map(process_bytes, long)))
+    for fit in fits:
+        if fit.config.iterations < MIN_STEPS or (fit.reporter and not fit.reporter.several):
+            return 1
+        numbers = fit.config.max_gaussians * (11 + 3 * (fit.config.sh_degree + 1) ** 2)
+        photos = sum(view.image.nbytes for view in fit.scene.train)
+        needed = (500 << 20) + 13 * photos + 64 * numbers  # with the targets of losses, and what Adam needs
+        size = min(size, psutil.virtual_memory().available // needed)
     return max(1, size)
 
 
-def process_bytes(fit: Fit) -> int:
-    """Rough memory of the process of a fit."""
-    images = [each for view in fit.scene.views for each in (view.image, view.unrounded) if each is not None]
-    numbers = fit.config.max_gaussians * (11 + 3 * (fit.config.sh_degree + 1) ** 2)
-    pictures = sum(image.nbytes for image in images) + Targets.most_bytes(fit.scene.train)
-    return _PROCESS_BYTES + pictures + 4 * _COPIES * numbers
-
-
-def fitted(fit: Fit, device: torch.device | str, resume: bool) -> Gaussians:
-    """The model of one fit, in this process; see `fit_scene`."""
-    return fit_scene(
-        fit.scene,
-        fit.config,
-        device=device,
-        title=fit.title,
-        checkpoint=fit.checkpoint,
-        resume=resume,
-        reporter=fit.reporter,
-    ).gaussians
-
-
-class _NoProcessError(Exception):
-    """No process can be started, or one ends before it has loaded its libraries."""
-
-
-def _fit_in_processes(fits: Sequence[Fit], size: int, resume: bool) -> list[Gaussians]:
-    """Run at most `size` fits at the same time.
-
-    Raises _NoProcessError, the first error of a fit, Interrupted, or OtherProcessError.
-    """
-    threads = max(1, torch.get_num_threads() // size)
-    workers: list[_Worker] = []
-    models: dict[int, Gaussians] = {}
+def _side_by_side(fits: Sequence[Fit], resume: bool) -> list[Gaussians]:
+    running: dict[Connection, tuple[Fit, Reporter, SpawnProcess]] = {}
+    models: dict[Connection, Gaussians] = {}
     with deferred(saves=any(fit.checkpoint for fit in fits)) as interrupted:
         try:
-            while len(models) < len(fits):
-                running = [index for index in range(len(workers)) if index not in models]
-                if len(running) < size and len(workers) < len(fits):
-                    workers.append(_Worker(fits[len(workers)], threads, resume, first=not workers))
-                    continue
-                ready = wait([workers[index].connection for index in running], POLL)
-                for index in running:
-                    worker = workers[index]
-                    if worker.connection in ready and (model := worker.receive()) is not None:
-                        models[index] = model
-                if signum := interrupted():
-                    raise Interrupted(None, None, signum)
-        except (Exception, Interrupted) as error:
-            for worker in workers:
-                worker.process.terminate()
-            for worker in workers:
-                worker.process.wait()
-            # A signal to all processes says more than the exit status of one.
-            signum = interrupted() or (signal_of(error) if isinstance(error, Interrupted) else None)
-            if signum is None:
-                raise
-            saved = [fit.checkpoint for fit in fits if fit.checkpoint and fit.checkpoint.exists()]
-            raise Interrupted(saved[0] if saved else None, None, signum) from None
+            for fit in fits:
+                connection, process = _started()
+                reporter = fit.reporter or Reporter()
+                running[connection] = fit, reporter.beside() if running else reporter, process
+            for connection, (fit, reporter, _) in running.items():
+                task = replace(fit, reporter=None), resume, torch.get_num_threads() // len(fits)
+                _send(connection, (*task, reporter.loss_every))
+            while not interrupted() and (left := running.keys() - models.keys()):
+                for connection in cast(list[Connection], wait(left, 0.1)):
+                    fit, reporter, process = running[connection]
+                    try:
+                        message = connection.recv()
+                    except (EOFError, OSError):
+                        process.join()
+                        raise BackendError(_ENDED.format(fit.title, process.exitcode)) from None
+                    if isinstance(message, Exception):
+                        raise message
+                    if isinstance(message, Gaussians):
+                        models[connection] = message
+                    else:
+                        getattr(reporter, message[0])(*message[1:])
         finally:
-            for index, worker in enumerate(workers):
-                if index not in models:
-                    worker.close()
-    return [models[index] for index in range(len(fits))]
+            for connection in running:
+                connection.close()  # interrupts trainings, which then save their checkpoints
+            for _, reporter, process in running.values():
+                process.join()
+                reporter.finish()
+        if signum := interrupted():
+            saved = [fit.checkpoint for fit in fits if fit.checkpoint and fit.checkpoint.exists()]
+            raise Interrupted(saved[0] if saved else None, None, signum)
+    return [models[connection] for connection in running]
 
 
-class _Worker:
-    """A process that runs `keyss.fitting.worker`."""
-
-    def __init__(self, fit: Fit, threads: int, resume: bool, *, first: bool) -> None:
-        """Raises _NoProcessError."""
-        self.fit, self.resume = fit, resume
-        self.loaded = False
-        self.connection, theirs = multiprocessing.Pipe()
+def _started() -> tuple[Connection, SpawnProcess]:
+    """A process for one fit, which ignores Ctrl-C (terminals send it to all), and the connection to it."""
+    ours, theirs = _SPAWN.Pipe()
+    process, script, handler = _SPAWN.Process(target=_work, args=(theirs,)), sys.modules["__main__"], None
+    sys.modules["__main__"] = ModuleType("__main__")  # otherwise it would run the script again
+    with suppress(ValueError):  # only the main thread handles signals
+        handler = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
         with theirs:
-            try:
-                self.process = subprocess.Popen(
-                    [*_processes.command("keyss.fitting.worker"), str(theirs.fileno())],
-                    stdin=subprocess.PIPE,
-                    env=_processes.environment(threads),
-                    pass_fds=[theirs.fileno()],
-                    start_new_session=True,  # Ctrl-C in a terminal reaches this process only
-                )
-            except OSError as error:
-                self.connection.close()
-                raise _NoProcessError(error) from error
-        self.reporter = fit.reporter or Reporter()
-        if not first:
-            self.reporter = self.reporter.beside()
-        self.reporter.start(fit.title, fit.config.iterations, steps_done(fit.checkpoint) if resume else 0)
+            process.start()
+    finally:
+        sys.modules["__main__"] = script
+        if handler is not None:
+            signal.signal(signal.SIGINT, handler)
+    return ours, process
 
-    def receive(self) -> Gaussians | None:
-        """Handle one message; the last one is the model.
 
-        Raises the error of the fit, or what `_cause_of_end` returns.
-        """
+def _work(connection: Connection) -> None:
+    """Receive a fit, and send its progress and its model or error."""
+    for signum in ENDING:  # left to the process that has started this one
+        signal.signal(signum, signal.SIG_IGN)
+    with suppress(EOFError, Interrupted):
+        fit, resume, threads, loss_every = connection.recv()
+        torch.set_num_threads(threads)
+        fit = replace(fit, reporter=_Sender(connection, loss_every))
         try:
-            message = pickle.loads(self.connection.recv_bytes())
-            if message is None:
-                self.loaded = True
-                task = replace(self.fit, reporter=None), self.resume, self.reporter.loss_every
-                self.connection.send_bytes(pickle.dumps(task))
-        except (EOFError, OSError):
-            raise self._cause_of_end() from None
-        match message:
-            case Gaussians():
-                self.close(_EXIT_SECONDS)
-                return message
-            case BaseException():
-                raise message
-            case (iteration, gaussians, numbers):
-                self.reporter.update(iteration, gaussians, numbers)
-        return None
+            _send(connection, fit_scene(**vars(fit), resume=resume).gaussians)
+        except Exception as error:
+            error.add_note(traceback.format_exc())
+            _send(connection, error)
 
-    def _cause_of_end(self) -> Exception | Interrupted:
-        """Why the process has ended without a model."""
-        status = self.process.wait()
-        for signum in ENDING:
-            if status in (-signum, 128 + signum):
-                return Interrupted(None, None, signum)
-        if not self.loaded:
-            return _NoProcessError("it ended while it was loading")
-        saved = self.fit.checkpoint is not None and self.fit.checkpoint.exists()
-        message = f"the process for the {self.fit.title} has ended ({_processes.how_it_ended(status)}); "
-        message += REMEDY if saved else "nothing was saved"
-        if status == -signal.SIGKILL:  # systems send it when they run out of memory
-            message += (
-                "; with OMP_NUM_THREADS=1 in the environment, fits run one after the other and need less"
-            )
-        return OtherProcessError(message)
 
-    def close(self, patience: float = 0.0) -> None:
-        """End the process, `patience` seconds from now at the latest."""
-        with self.process, self.connection:
-            with suppress(subprocess.TimeoutExpired):
-                self.process.wait(patience)
-            self.process.kill()
-        self.reporter.finish()
+class _Sender(Reporter):
+    """Sends what is reported; interrupts a training when the other end of the connection closes."""
+
+    def __init__(self, connection: Connection, loss_every: int) -> None:
+        self.connection, self.loss_every = connection, loss_every
+
+    def start(self, title: str, iterations: int, iteration: int) -> None:
+        _send(self.connection, ("start", title, iterations, iteration))
+
+    def update(self, iteration: int, gaussians: int, numbers: dict[str, float]) -> None:
+        _send(self.connection, ("update", iteration, gaussians, numbers))
+
+    def interrupts(self) -> bool:
+        return bool(wait([self.connection], 0))
+
+
+def _send(connection: Connection, message: object) -> None:
+    """Send unless the other end is closed; Connection.send would move tensors to shared memory."""
+    with suppress(OSError):
+        connection.send_bytes(pickle.dumps(message))
