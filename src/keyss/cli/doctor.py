@@ -86,9 +86,8 @@ def _version(package: str, advice: str) -> str:
 def _cores() -> str:
     import torch
 
-    from keyss._processes import usable_cores
-
-    return f"{usable_cores()} of {os.cpu_count()} usable, {torch.get_num_threads()} threads"
+    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return f"{usable} of {os.cpu_count()} usable, {torch.get_num_threads()} threads"
 
 
 def _gpu() -> str:
