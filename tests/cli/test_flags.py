@@ -17,7 +17,7 @@ from keyss.core import KeyssWarning, UsageError
 SOURCE = Path(__file__).parents[2] / "src" / "keyss"
 OPTIONS = {"overwrite", "sh_degree", "key_file", "secret", "publish", "secret_model", "download"}
 # Options of other programs, and whole commands, which a page may quote.
-QUOTED = re.compile(r"`keyss [^`]*`|(pip|npm) install [^,)]*")
+QUOTED = re.compile(r"`(keyss|simple_trainer.py|splat-transform|ns-export) [^`]*`|(pip|npm) install [^,)]*")
 
 
 @pytest.mark.parametrize(

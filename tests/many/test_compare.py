@@ -130,7 +130,7 @@ def test_one_budget_and_one_process_for_a_folder(folders: tuple[Path, Path], tmp
     found = compare(*folders, methods=["carry:quick", "3dgs"], out=tmp_path / "out", dry_run=True)
     assert isinstance(found, Forecast)
     assert {each.partition(", ")[2] for each in found.names.values()} >= {"500 steps, seed 0"}
-    with claimed(tmp_path / "out"), pytest.raises(OutputError, match="is at work"):
+    with claimed(tmp_path / "out"), pytest.raises(OutputError, match="another process"):
         compare(*folders, methods=["carry:quick"], out=tmp_path / "out")
 
 

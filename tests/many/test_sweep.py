@@ -302,7 +302,7 @@ def test_the_key_of_a_cell_opens_it(tmp_path: Path, keyss: Run) -> None:
 
 def test_two_sweeps_do_not_work_in_one_folder(tmp_path: Path) -> None:
     spec = write_spec(tmp_path, ["a.ply"], seeds=1)
-    with claimed(tmp_path / "out"), pytest.raises(OutputError, match="is at work"):
+    with claimed(tmp_path / "out"), pytest.raises(OutputError, match="another process"):
         run(spec, tmp_path / "out")
 
 

@@ -75,7 +75,8 @@ def test_keys_open_what_keyss_reveals_and_a_wrong_one_nothing(
         if kind == LATENT:  # latents are real numbers, which two languages compute with other roundings
             assert len(saved) == len(revealed)
             for name, values in vars(revealed).items():
-                torch.testing.assert_close(getattr(saved, name), values, atol=1e-5, rtol=1e-5)
+                loose = 1e-3 if name == "quats" else 1e-5  # w is the root of what x, y and z leave of 1
+                torch.testing.assert_close(getattr(saved, name), values, atol=loose, rtol=1e-5)
         else:
             assert saved.digest() == revealed.digest()
     assert all(url.startswith(("file:", "blob:null/")) for url in tab.requests), tab.requests

@@ -28,7 +28,7 @@ FOREIGN = Path(__file__).with_name("foreign.html").read_text()
 
 @pytest.fixture(scope="module")
 def stego(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("site") / "stego.ply"
+    path = tmp_path_factory.mktemp("site") / "model.ply"
     write_model(path, embed(made(2000, 0), [(KEY, made(150, 1))], entropy=bytes(32)))
     return path
 
@@ -91,11 +91,11 @@ def test_a_poster_is_shown_until_there_is_a_picture(tab: Visit, stego: Path, tmp
     export_html(stego, tmp_path)
     Image.new("RGB", (8, 6), "red").save(tmp_path / "poster.png")
     with serving(tmp_path) as site:
-        tab.page.route("**/stego.ply", lambda route: None)  # no answer
+        tab.page.route("**/model.ply", lambda route: None)  # no answer
         tab.page.goto(f"{site}?poster=poster.png")
         tab.page.wait_for_function("() => document.getElementById('poster').naturalWidth === 8")
         assert tab.page.locator("#poster").is_visible()
-        tab.page.unroute("**/stego.ply")
+        tab.page.unroute("**/model.ply")
         tab.goto(f"{site}?poster=poster.png")
         tab.page.wait_for_selector("#poster", state="hidden")
 

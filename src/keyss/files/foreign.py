@@ -11,8 +11,8 @@ CONVERT = "convert it to .ply first, e.g. with `splat-transform IN OUT.ply`"
 _MODEL = "give it where a model is asked for"
 _EXPORT = "export a .ply from the program that made it"
 _CHECKPOINT = (
-    "keyss never opens pickles, which can run programs; export a .ply: gsplat's simple_trainer.py with "
-    "`--save_ply`, Nerfstudio with `ns-export gaussian-splat`, Inria's train.py writes "
+    "keyss never opens pickles, which can run programs; export a .ply: gsplat's with "
+    "`simple_trainer.py --save_ply`, Nerfstudio with `ns-export gaussian-splat`, Inria's train.py writes "
     "point_cloud/iteration_N/point_cloud.ply by itself"
 )
 _UNPACK = "unpack it, and give the folder or the model that is in it"

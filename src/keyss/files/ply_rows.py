@@ -183,7 +183,8 @@ def model_properties(found: Collection[str]) -> list[str]:
     if missing[:3] == names[3:6] and {"red", "green", "blue", "opacity"} <= set(found):
         raise InputError(
             "this is a 3DGS model with colours as red, green and blue instead of harmonics (f_dc_0, ...): "
-            "export it again with harmonics, from Nerfstudio with `--ply-color-mode sh_coeffs`"
+            "export it again with harmonics, from Nerfstudio with "
+            "`ns-export gaussian-splat --ply-color-mode sh_coeffs`"
         )
     if missing:
         kind = "a point cloud, not a 3DGS model" if missing == names[3:] else "not a 3DGS model"

@@ -25,7 +25,7 @@ def test_hide_reveal_verify_and_info(publish: str, tmp_path: Path) -> None:
     asked = [keyss.Secret(model, f"key number {i}") for i, model in enumerate(secrets)]
     keyss.hide(cover, asked, method=options, width=32, min_psnr=0, out=tmp_path / "run")
     (stego,) = (tmp_path / "run" / "publish").iterdir()
-    assert stego.name == f"stego{SUFFIXES[publish]}"
+    assert stego.name == f"model{SUFFIXES[publish]}"
     for index, secret in enumerate(secrets):
         found = keyss.reveal(stego, f"key number {index}").gaussians
         assert len(found) == 140
