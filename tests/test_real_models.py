@@ -27,18 +27,27 @@ def prepared(options: MethodOptions, *models: Gaussians) -> MethodOptions:
     return registry.of_options(options).prepare(sources, options)
 
 
+# Secrets of which less than a sixth would go in unnoticed.
+VISIBLE = {
+    "biker": {"playbot_lod2"},
+    "guitar": {"biker", "playbot_lod2"},
+    "inria_cuda_7000": {"biker", "playbot_lod2"},
+    "playbot_lod2": {"biker"},
+    "playbot_lod4": {"biker", "guitar", "inria_cuda_7000", "playbot_lod2"},
+}
+
+
 @pytest.mark.filterwarnings("ignore::keyss.core.KeyssWarning")
 @pytest.mark.parametrize("cover", NAMES)
 def test_every_pair_is_accepted(models: dict[str, Gaussians], cover: str) -> None:
-    """Unnoticed where that leaves enough of the secret: of 20 pairs, in 12."""
-    for name, secret in models.items():
+    for name in set(NAMES) - {cover}:
         start = time.process_time()
-        found = prepared(CarryOptions(), models[cover], secret).publish
+        found = prepared(CarryOptions(), models[cover], models[name]).publish
         assert time.process_time() - start < CPU_SECONDS, name
-        small = len(secret) < 10_000
-        assert found == "auto" or len(secret) > 3 * len(models[cover]) or not small, (name, found)
+        assert (found == "any") == (name in VISIBLE[cover]), name
 
 
+@pytest.mark.filterwarnings("ignore::keyss.core.KeyssWarning")
 @pytest.mark.parametrize(
     ("cover", "secret", "options", "least"),
     [
