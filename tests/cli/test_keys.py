@@ -156,5 +156,5 @@ def test_weak_keys_get_a_warning_without_the_key(capsys: pytest.CaptureFixture[s
     keys.warn_of_weak_keys([generate_key(20), "hunter2"])
     said = capsys.readouterr().err
     assert "key 2: " in said
-    assert "bits" in said
+    assert "guesses" in said
     assert "hunter2" not in said

@@ -8,4 +8,4 @@ from .key_file import (
     read_key as read_key,
 )
 from .master import MasterKey as MasterKey
-from .strength import ENOUGH_BITS as ENOUGH_BITS, key_strength_bits as key_strength_bits, weakness as weakness
+from .strength import ENOUGH_GUESSES as ENOUGH_GUESSES, key_guesses as key_guesses, weakness as weakness

@@ -13,6 +13,7 @@ from pathlib import Path
 from keyss.core.errors import InputError, KeyssWarning, OutputError, UsageError
 
 MAX_KEY_BYTES = 4096
+_TOO_LONG = f"the key is longer than {MAX_KEY_BYTES} bytes"
 ALPHABET = string.ascii_letters + string.digits
 KEY_LENGTH = 22  # characters of 5.95 bits: 131 bits
 _SPACES = "\t\n\v\f\r \u1680\u2028\u2029\ufeff"  # those of JavaScript's `trim`; NFKC replaces the others
@@ -25,6 +26,8 @@ def normalized_key(text: str) -> str:
     other white space that it drops. Raises UsageError for a key that is empty, longer than 4096 bytes, or not
     UTF-8; the message omits the key.
     """
+    if len(text) > 2 * MAX_KEY_BYTES:  # normalising takes quadratic time, and may shorten a text
+        raise UsageError(_TOO_LONG)
     form = unicodedata.normalize("NFKC", text)
     key = form.strip(_SPACES)
     if not key:
@@ -36,7 +39,7 @@ def normalized_key(text: str) -> str:
     except UnicodeEncodeError:
         raise UsageError("expected a key in UTF-8, found other bytes") from None
     if size > MAX_KEY_BYTES:
-        raise UsageError(f"the key is longer than {MAX_KEY_BYTES} bytes")
+        raise UsageError(_TOO_LONG)
     return key
 
 
