@@ -72,9 +72,11 @@ def test_the_cost_does_not_depend_on_the_unit(keyss: Run, tmp_path: Path, unit: 
     assert len(read_model(tmp_path / "other.spz").means.unique(dim=0)) == COUNT or unit < 1e-4
 
 
-def test_empty_renders_are_not_called_unchanged(keyss: Run, tmp_path: Path) -> None:
-    model = random_gaussians(COUNT)
-    write_model(tmp_path / "a.ply", replace(model, opacity_logits=torch.full((COUNT,), -12.0)))
+@pytest.mark.parametrize("hidden", [{"opacity_logits": -12.0}, {"sh": -4.0}], ids=["transparent", "black"])
+def test_empty_renders_are_not_called_unchanged(keyss: Run, tmp_path: Path, hidden: dict[str, float]) -> None:
+    model = random_gaussians(COUNT, sh_degree=0)
+    changed = {name: torch.full_like(getattr(model, name), value) for name, value in hidden.items()}
+    write_model(tmp_path / "a.ply", replace(model, **changed))
     assert "renders are empty" in keyss("convert", tmp_path / "a.ply", tmp_path / "a.splat").out
 
 

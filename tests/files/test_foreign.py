@@ -59,6 +59,7 @@ FILES = {  # name and content, and what they are
     "ckpt_6999_rank0": (checkpoint(new=True), "a checkpoint of a training"),
     "old": (checkpoint(new=False), "a checkpoint of a training"),
     "a.npz": (arrays(), "arrays of NumPy; export a .ply"),
+    "a.obj": (b"v 0 0 0\n", "a mesh; keyss hides 3DGS models, which a training such as `keyss fit`"),
     "a.usdz": (zipped("a.usdc"), "a USD scene; export a .ply"),
     "a.csv": (b"x,y,z\n1,2,3\n", "a table; export a .ply"),
     "a.zip": (zipped(), "a ZIP archive; unpack it"),

@@ -10,6 +10,7 @@ from keyss.files.reading import open_input
 CONVERT = "convert it to .ply first, e.g. with `splat-transform IN OUT.ply`"
 _MODEL = "give it where a model is asked for"
 _EXPORT = "export a .ply from the program that made it"
+FIT = "keyss hides 3DGS models, which a training such as `keyss fit` makes from photos"
 _CHECKPOINT = (
     "keyss never opens pickles, which can run programs; export a .ply: gsplat's with "
     "`simple_trainer.py --save_ply`, Nerfstudio with `ns-export gaussian-splat`, Inria's train.py writes "
@@ -50,6 +51,7 @@ _KINDS = (
     ),
     _Kind("arrays of NumPy", _EXPORT, (".npz", ".npy"), (b"\x93NUMPY",), (b".npy",)),
     _Kind("a USD scene", _EXPORT, (".usdz", ".usd", ".usda", ".usdc"), (b"PXR-USDC",), (b".usdc", b".usda")),
+    _Kind("a mesh", FIT, (".obj", ".fbx", ".stl", ".dae")),
     _Kind("a table", _EXPORT, (".csv", ".tsv")),
     _Kind("a web page", _EXPORT, (".html", ".htm"), (b"<!DOCTYPE", b"<html")),
     _Kind("a JSON file", "give the folder that it lies in", (".json",)),

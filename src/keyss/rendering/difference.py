@@ -46,6 +46,14 @@ def psnr_between(before: Gaussians, after: Gaussians, viewpoints: Viewpoints | N
     return float(-10 * torch.log10(torch.stack(errors).mean().clamp_min(1e-12)))
 
 
+@torch.no_grad()
+def is_seen(model: Gaussians) -> bool:
+    """True if renders from around a model show more than the background."""
+    views = Viewpoints.around(model)
+    background = views.background.to(model.device)
+    return any(bool((render(model, each, background) != background).any()) for each in views.cameras)
+
+
 def _shrunk(camera: Camera) -> Camera:
     scale = min(1.0, _SIZE / max(camera.width, camera.height))
     return camera.resized(max(1, round(scale * camera.width)), max(1, round(scale * camera.height)))

@@ -295,6 +295,28 @@ def test_a_gltf_that_lies(change: Callable[[dict], object], words: str) -> None:
     refused("a.glb", with_json(change), words)
 
 
+@pytest.mark.parametrize("where", ["inside", "instead"])
+def test_spz_inside_gltf_is_named(where: str) -> None:
+    name = f"KHR_gaussian_splats_{where}_spz"
+
+    def compress(gltf: dict) -> None:
+        gltf["extensionsUsed"] = [*gltf["extensionsUsed"], name]
+        extensions = gltf["meshes"][0]["primitives"][0]["extensions"]
+        if where == "inside":
+            extensions["KHR_gaussian_splatting"]["extensions"] = {name: {"bufferView": 0}}
+        else:
+            extensions[name] = extensions.pop("KHR_gaussian_splatting")
+
+    refused("a.glb", with_json(compress), rf"compressed \({name}\), .*; export a .ply or .spz")
+
+
+def test_a_compression_that_is_no_extension() -> None:
+    def compress(gltf: dict) -> None:
+        gltf["meshes"][0]["primitives"][0]["extensions"]["KHR_gaussian_splatting"]["extensions"] = 5
+
+    refused("a.glb", with_json(compress), r"compressed \(unknown\)")
+
+
 def test_a_gltf_that_repeats_its_gaussians_or_their_bytes() -> None:
     def with_nodes(gltf: dict) -> None:
         gltf["nodes"] = [{"mesh": 0}] * 20_000

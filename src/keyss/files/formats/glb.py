@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import fields
 from typing import Any
 
@@ -26,6 +26,7 @@ from keyss.core.arrays import Doubles, Numbers
 from keyss.core.errors import InputError
 from keyss.core.gaussians import Gaussians
 from keyss.core.similarity import Similarity
+from keyss.files.foreign import FIT
 from keyss.files.formats.common import (
     arrays_of,
     colour_bytes,
@@ -124,9 +125,9 @@ def read(data: bytes) -> Gaussians:
             room -= sum(getattr(model, each.name).numel() for each in fields(model))
             parts.append(_moved(model, to_scene))
     if not parts:
+        _refuse_compressed(name for name in document.extensionsUsed if "spz" in name.lower())
         raise InputError(
-            f"a glTF file without Gaussians, such as a mesh: nothing in its scene has {EXTENSION}; keyss "
-            "hides 3DGS models, which a training such as `keyss fit` makes from photos"
+            f"a glTF file without Gaussians, such as a mesh: nothing in its scene has {EXTENSION}; {FIT}"
         )
     degree = max(part.sh_degree for part in parts)
     return Gaussians.cat([part.with_sh_degree(degree) for part in parts])
@@ -183,6 +184,15 @@ def write(model: Gaussians) -> bytes:
     size = _HEADER.size + 2 * _CHUNK.size + len(text) + len(binary)
     start = _HEADER.pack(_MAGIC, 2, size) + _CHUNK.pack(len(text), _JSON) + text
     return start + _CHUNK.pack(len(binary), _BIN) + bytes(binary)
+
+
+def _refuse_compressed(extensions: Iterable[str]) -> None:
+    """Raise InputError if Gaussians are compressed by glTF extensions of these names."""
+    if names := ", ".join(extensions)[:80]:
+        raise InputError(
+            f"its Gaussians are compressed ({names}), which keyss does not read in a glTF file; export a "
+            ".ply or .spz from the program that made it"
+        )
 
 
 def _chunks(data: bytes) -> tuple[_Document, bytes]:
@@ -252,12 +262,8 @@ def _transform(node: _Node) -> Doubles:
 
 def _gaussians(document: _Document, primitive: _Primitive, binary: bytes, room: int) -> Gaussians:
     """The Gaussians of a primitive, in its own coordinates, if they have at most `room` numbers."""
-    if "extensions" in primitive.extensions[EXTENSION]:
-        names = ", ".join(primitive.extensions[EXTENSION]["extensions"])[:80]
-        raise InputError(
-            f"its Gaussians are compressed ({names}), which keyss does not read in a glTF file; export a "
-            ".ply or .spz from the program that made it"
-        )
+    compressed = primitive.extensions[EXTENSION].get("extensions", {})
+    _refuse_compressed(compressed if isinstance(compressed, dict) else ["unknown"])
 
     def attribute(name: str, width: int) -> Numbers:
         if name not in primitive.attributes:
