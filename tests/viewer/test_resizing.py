@@ -55,13 +55,16 @@ def test_the_secret_stays_when_the_search_has_ended(chromium: Any, page_file: Pa
         published = tab.picture()
         tab.page.tap("#keying > summary")
         tab.try_key(KEY, thorough=True)
-        assert tab.page.evaluate("document.activeElement.id") != "key"  # whose keyboard covers the picture
+        focused = "document.activeElement.id"
+        assert tab.page.evaluate(focused) != "key"  # whose keyboard covers the picture
         shown = tab.picture()
         tab.page.evaluate("document.getElementById('wipe').dispatchEvent(new Event('input'))")  # draws again
         assert shown.std() > 10
         assert psnr(shown, tab.picture()) > 40
         assert shown.shape[0] < published.shape[0]
         assert tab.page.evaluate("document.documentElement.scrollWidth <= window.innerWidth")
+        tab.page.tap("#close")
+        assert tab.page.evaluate(focused) != "key"
 
 
 def test_a_phone_is_turned_and_its_panel_folded(chromium: Any, page_file: Path, published: Gaussians) -> None:

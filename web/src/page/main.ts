@@ -16,6 +16,7 @@ import { Viewer } from './viewer.ts';
 
 const ADDRESS_AFTER = 400; // milliseconds after the last movement
 const MAX_BYTES = 2 ** 31;
+const KEYBOARD_COVERS = window.matchMedia('(pointer: coarse)'); // the picture, while the key's field has the focus
 const NO_WEBGL = "Your browser doesn't support WebGL 2, which is needed to show the model.";
 const INTERRUPTED = 'The browser interrupted graphics. The picture comes back by itself; if not, reload the page.';
 
@@ -169,7 +170,7 @@ class Page {
     const key = page.key.value;
     if (!key || this.published === null || page.open.disabled) return;
     const own = this.begun();
-    if (window.matchMedia('(pointer: coarse)').matches) page.key.blur(); // a phone's keyboard covers the picture
+    if (KEYBOARD_COVERS.matches) page.key.blur();
     this.controls.rotate(false);
     this.writeAddress(); // now, so that it is the same whatever the key opens
     let said = 'Key tried.';
@@ -234,7 +235,7 @@ class Page {
     this.controls.setPose(pose);
     this.writeAddress();
     this.say('');
-    page.key.focus();
+    if (!KEYBOARD_COVERS.matches) page.key.focus();
   }
 
   private hideSecret(): void {
