@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pycolmap
 import pytest
-from hypothesis import given, settings, strategies as st
+from hypothesis import example, given, settings, strategies as st
 
 from files.scene_files import (
     camera_bytes,
@@ -268,6 +268,8 @@ FIELDS = ["w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x", "k1", "k2", "k
     entries=st.dictionaries(st.tuples(st.integers(0, 3), st.integers(0, 3)), NUMBERS, max_size=2),
     fisheye=st.booleans(),
 )
+@example(fields={"w": 10**400}, entries={}, fisheye=False)
+@example(fields={}, entries={(0, 0): -(10**400)}, fisheye=False)
 @settings(max_examples=80, deadline=None, database=None)
 def test_any_numbers_give_an_input_error_or_a_sound_scene(
     tmp_path_factory: pytest.TempPathFactory,

@@ -125,8 +125,10 @@ def _read(path: Path, skip_missing: bool) -> _Posed:
     may lack its extension, and must stay inside that folder or its parent. Raises InputError.
     """
     try:
-        # Not by msgspec, which refuses the NaN and Infinity that Python writes.
-        meta = msgspec.convert(json.loads(read_text(path, _MAX_JSON_BYTES)), type=_Transforms)
+        # Not by msgspec, which refuses the NaN and Infinity that Python writes. msgspec cannot convert
+        # integers beyond float64; such integers become infinite.
+        text = read_text(path, _MAX_JSON_BYTES)
+        meta = msgspec.convert(json.loads(text, parse_int=_number), type=_Transforms)
     except (msgspec.MsgspecError, ValueError, RecursionError) as error:
         raise InputError(f"{path}: expected JSON with posed frames: {error}") from error
     if not meta.frames:
@@ -151,6 +153,10 @@ def _read(path: Path, skip_missing: bool) -> _Posed:
     if any(frame.mask_path for frame in meta.frames):
         warn_of_masks(f"{path}: `mask_path`")
     return _Posed(meta, tuple(names), tuple(photos))
+
+
+def _number(digits: str) -> int | float:
+    return int(digits) if len(digits) < 19 else float(digits)
 
 
 def _split(path: Path, posed: _Posed) -> tuple[tuple[Photo, ...], tuple[Photo, ...]]:
