@@ -14,8 +14,8 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any
 
-from keyss.audits import Audit, read_audit
 from keyss.files import write_bytes
+from keyss.lab.audits import Audit, read_audit
 
 BEGIN, END = "<!-- audits: begin -->", "<!-- audits: end -->"
 Cell = Callable[[Any], str]  # of an `Audit`, whose parts may be None: see `_try`

@@ -22,7 +22,7 @@ from colours import FORMATS, OTHERS, Change
 from keyss.core import BackendError, Gaussians, InputError, WrongKeyError
 from keyss.files import load_scene, read_model
 from keyss.keys import derivation
-from keyss.measure import fine_tuning
+from keyss.lab import fine_tuning
 from keyss.methods import HiddenFile
 
 import numpy as np

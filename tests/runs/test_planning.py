@@ -16,8 +16,8 @@ from channels.low_bits.trained_like import trained_like
 from keyss import CarryOptions, FitConfig, Secret
 from keyss.core import OutputError
 from keyss.files import write_model
+from keyss.lab.peers.decoder import Convolutions, weights_of
 from keyss.methods import registry
-from keyss.methods.peers.decoder import Convolutions, weights_of
 from methods.keyss.small import small
 from tiny_scenes import tiny_scene
 
