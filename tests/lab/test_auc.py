@@ -9,13 +9,13 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 from hypothesis import given, settings, strategies as st
-from measure.test_stegexpose import smooth, with_payload
 from scipy.special import expit, logit
 from scipy.stats import norm
 
 from keyss.core import UsageError
 from keyss.lab import auc_between, stegexpose_auc
 from keyss.runs import record_bytes
+from lab.test_stegexpose import smooth, with_payload
 
 SCORES = st.lists(st.sampled_from([None, math.nan, -0.5, 0.0, 0.1, 0.2, 0.7, 1e300]), min_size=1, max_size=9)
 

@@ -6,8 +6,8 @@ from typing import get_args
 
 import pytest
 
-from keyss.cli import many
 from keyss.fitting import PRESETS
+from keyss.lab import commands as many
 from keyss.lab.many import paper
 from keyss.lab.many.option_changes import with_changes
 from keyss.methods import KeyssOptions, registry
