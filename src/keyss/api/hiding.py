@@ -54,7 +54,7 @@ from keyss.runs.files import (
     stego_name,
 )
 from keyss.runs.folder import RunFolder
-from keyss.runs.planning import check_disk, in_a_line, plan_hiding, worth_planning
+from keyss.runs.planning import check_room, in_a_line, plan_hiding, worth_planning
 from keyss.runs.records import read_record, record_bytes
 
 MIN_PSNR = 20.0  # dB to the plain model; below it, renders show something else
@@ -173,8 +173,6 @@ def hide(
         config.iterations if each.given is None else _steps_of(model)
         for each, model, config in zip(sources, models, configs, strict=True)
     ]
-    if place is not None:
-        check_disk(place, options, sources)
     trains = not dry_run and (options.trains or any(each.given is None for each in sources))
     sources = [
         each
@@ -182,13 +180,14 @@ def hide(
         else replace(each, loaded=as_scene(source, settings.views, train_pictures=trains, model=each.given))
         for source, each in zip(given, sources, strict=True)
     ]
+    plan = plan_hiding(chosen, options, sources, target, place)
+    check_room(plan, place)
     if dry_run:
-        return HideResult(plan=plan_hiding(chosen, options, sources, target, place, bound=bound))
+        return HideResult(plan=plan)
     long = (trains and worth_planning(options.fit)) or options.place.grows
     with folder.work() if folder else nullcontext():
         if reporter and not resume and long:
-            planned = plan_hiding(chosen, options, sources, target, place, bound=bound)
-            for line in (f"hide: {in_a_line(planned)}", *planned.notes):
+            for line in (f"hide: {in_a_line(plan)}", *plan.notes):
                 reporter.note(line)
         context = Context(target, folder.checkpoints if folder and trains else None, resume, reporter)
         sources = with_plain_models(sources, configs, context)

@@ -167,11 +167,8 @@ class MethodOptions:
         """The same with changed fields of `fit`."""
         return replace(self, fit=replace(self.fit, **changes))
 
-    def joint_plan(self, secrets: int, *, gaussian_weights: float = 0.0, pixel_weights: float = 0.0) -> Plan:
-        """The plan of methods that train all scenes together, with as many Gaussians as a plain model has.
-
-        `*_weights`: see `Plan`.
-        """
+    def joint_plan(self, secrets: int) -> Plan:
+        """The plan of methods that train all scenes together, with as many Gaussians as a plain model has."""
         fit = self.fit
         return Plan(
             gaussians=fit.max_gaussians,
@@ -180,8 +177,6 @@ class MethodOptions:
             capacity=fit.max_gaussians,
             steps=fit.iterations,
             rendered=(fit.max_gaussians,) * (1 + secrets),
-            gaussian_weights=gaussian_weights,
-            pixel_weights=pixel_weights,
         )
 
     def check_published_exactly(self) -> None:
@@ -216,8 +211,6 @@ class Plan:
     capacity: int  # Gaussians of the secrets that fit
     steps: int = 0  # of the method's own training
     rendered: tuple[int, ...] = ()  # Gaussians of the cover and of each secret in a step
-    gaussian_weights: float = 0.0  # of the networks that a step evaluates for each Gaussian
-    pixel_weights: float = 0.0  # of the networks that a step evaluates for each rendered pixel
     notes: tuple[str, ...] = ()  # what the options cost, a sentence each
 
     method: str = ""

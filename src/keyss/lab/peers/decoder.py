@@ -43,11 +43,6 @@ class Convolutions(torch.nn.Module):
         return PictureNetwork(tuple(zip(weights[::2], weights[1::2], strict=True)), background)
 
 
-def weights_of(channels: int) -> int:
-    """The number of weights of `Convolutions`, without biases."""
-    return sum(9 * before * after for before, after in pairwise([channels, *[WIDTH] * (LAYERS - 1), 3]))
-
-
 def network_tensors(network: PictureNetwork) -> dict[str, Tensor]:
     """The tensors of a network by name."""
     tensors = {"background": network.background}
@@ -106,6 +101,5 @@ METHOD = Peer(
     capabilities=Capabilities(keys=False, hands_over=True, models=False),
     open=_open,
     training=DecoderTraining,
-    pixel_weights=weights_of(3),
 )
 unpack = METHOD.unpack

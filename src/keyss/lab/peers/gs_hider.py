@@ -17,7 +17,7 @@ from keyss.core.decoded import DecodedGaussians
 from keyss.core.errors import InputError
 from keyss.core.gaussians import SH_C0, Gaussians
 from keyss.core.scene import Camera
-from keyss.lab.peers.decoder import Convolutions, network_of, network_tensors, weights_of
+from keyss.lab.peers.decoder import Convolutions, network_of, network_tensors
 from keyss.lab.peers.method import HandedTensors, Peer, PeerOptions, PeerTraining, Show
 from keyss.methods.base import Capabilities
 from keyss.methods.keyss.training import Picture
@@ -86,6 +86,5 @@ METHOD = Peer(
     capabilities=Capabilities(keys=False, hands_over=True, standard=False, models=False),
     open=_open,
     training=GsHiderTraining,
-    pixel_weights=2 * weights_of(FEATURES),
 )
 unpack = METHOD.unpack

@@ -219,7 +219,6 @@ class Peer:
     capabilities: Capabilities
     open: Callable[[HandedTensors], Show]  # raises InputError and ValueError for damage
     training: type[PeerTraining] | None = None  # None: `hide` is another
-    pixel_weights: int = 0  # see `Plan`
     max_secrets: int = 1
 
     @property
@@ -232,7 +231,7 @@ class Peer:
 
     def plan(self, sources: Sequence[Source], options: PeerOptions) -> Plan:
         """Both scenes share as many Gaussians as a plain model has."""
-        return options.joint_plan(1, pixel_weights=self.pixel_weights)
+        return options.joint_plan(1)
 
     def hide(self, cover: Source, secrets: Sequence[Source], options: PeerOptions, context: Context) -> Stego:
         """Train both scenes together. Raises Interrupted, and InputError for another run's checkpoint."""
