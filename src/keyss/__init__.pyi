@@ -3,6 +3,7 @@ from .api.asking import HideResult as HideResult, Secret as Secret
 from .api.converting import convert as convert
 from .api.fitting import fit as fit
 from .api.hiding import hide as hide
+from .api.hiding_files import SecretFile as SecretFile, hide_files as hide_files
 from .api.looking import evaluate as evaluate, render as render
 from .api.opening import reveal as reveal, verify as verify
 from .core import Gaussians as Gaussians, KeyssError as KeyssError, WrongKeyError as WrongKeyError

@@ -286,9 +286,9 @@ def _hide_files(args: HideArguments, cover: Path) -> None:
     _refuse(args, "--secret-file", "cover secret_file key_file publish out overwrite device channel dry_run")
     files, keys = args.secret_file, _keys(args, len(args.secret_file))
     channel = args.details.channel or "colours"
-    result = keyss.hide(
+    result = keyss.hide_files(
         cover,
-        [keyss.Secret(file=file, key=key) for file, key in zip(files, keys, strict=True)],
+        list(map(keyss.SecretFile, files, keys)),
         publish=args.publish,
         channel=channel,
         out=args.out,

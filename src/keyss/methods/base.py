@@ -27,11 +27,10 @@ from keyss.progress import Reporter
 class Source:
     """The cover or a secret: the plain model or the photos that are given, and later both."""
 
-    given: Gaussians | None  # plain 3DGS model on the CPU; None: one is fitted to the photos
-    photos: bool  # False: only the model is given, and renders of it replace photos
+    given: Gaussians | None  # plain 3DGS model on the CPU; None until it is fitted to the photos
+    photos: bool  # False: renders of the model replace photos
     key: str = field(default="", repr=False)  # of a secret, if the method has keys
     loaded: Scene | None = None
-    fitted: Gaussians | None = None
 
     @property
     def scene(self) -> Scene:
@@ -43,10 +42,9 @@ class Source:
     @property
     def model(self) -> Gaussians:
         """The plain model, in the scene's own frame, on the CPU."""
-        model = self.fitted if self.given is None else self.given
-        if model is None:
+        if self.given is None:
             raise ValueError("the plain model is not fitted yet")
-        return model
+        return self.given
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,7 @@ def with_plain_models(
     }
     titles = [plain_stage(role_of(index, len(sources))) for index in range(len(sources))]
     fitted = _fit_all(missing, "plain model", titles, context)
-    return [replace(source, fitted=fitted.get(index)) for index, source in enumerate(sources)]
+    return [replace(source, given=fitted.get(index, source.given)) for index, source in enumerate(sources)]
 
 
 def plain_stage(role: str) -> str:

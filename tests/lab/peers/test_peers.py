@@ -157,7 +157,7 @@ def test_what_a_network_draws_is_no_cover(made: Made, folders: tuple[Path, Path]
         with pytest.raises(UsageError, match="network"):
             keyss.hide(cover, [Secret(secret, KEY)])
     with pytest.raises(UsageError, match="network"):
-        keyss.hide(stego, [Secret(file=made.handed, key=KEY)], out=made.out.parent / "files")
+        keyss.hide_files(stego, [keyss.SecretFile(made.handed, KEY)], out=made.out.parent / "files")
 
 
 @pytest.mark.parametrize("name", TRAINED)

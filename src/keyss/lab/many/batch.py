@@ -29,6 +29,7 @@ from typing import Any
 from keyss._version import __version__
 from keyss.api.asking import Secret
 from keyss.api.hiding import hide
+from keyss.api.hiding_files import SecretFile, hide_files
 from keyss.core import InputError, KeyssWarning, ViewOptions
 from keyss.core.errors import did_you_mean
 from keyss.files import write_bytes
@@ -182,10 +183,16 @@ def _hide(asset: Asset, place: Path, reporter: Reporter, *, derived: bool, overw
     key = read_key(Path(asset.key_file))
     key = MasterKey(key).key_of(asset.name) if derived else key
     if asset.secret_file is not None:
-        secret = Secret(file=asset.secret_file, key=key)
-        publish, channel = asset.options.publish, asset.options.channel
-        hide(asset.cover, [secret], publish=publish, channel=channel, out=place, overwrite=overwrite)
-    else:
+        secrets, options = [SecretFile(asset.secret_file, key)], asset.options
+        hide_files(
+            asset.cover,
+            secrets,
+            publish=options.publish,
+            channel=options.channel,
+            out=place,
+            overwrite=overwrite,
+        )
+    elif asset.secret is not None:
         hide(
             asset.cover,
             [Secret(asset.secret, key)],
