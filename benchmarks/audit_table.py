@@ -1,7 +1,7 @@
 """One table of several audits, a column each.
 
     keyss hide ... -o runs/best && keyss audit runs/best --key-file key.txt     # and so on, then
-    python benchmarks/audit_table.py best=runs/best carry=runs/carry --write docs/audit.md
+    python benchmarks/audit_table.py best=runs/best carry=runs/carry --write docs/experiments.md
 
 With --write the table replaces what lies between the two marker lines of the file.
 """
