@@ -273,7 +273,7 @@ def sweep(
 ) -> None:
     """Hide over a grid of scenes, methods, options and seeds, and tabulate the results.
 
-    docs/sweeps.md describes SPEC. Run the same command again to resume.
+    docs/experiments.md describes SPEC. Run the same command again to resume.
 
     example: keyss sweep sweep.yaml -o runs/sweep
 
