@@ -31,7 +31,7 @@ import torch
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
 from keyss import read_model, write_model
-from channels.low_bits.trained_like import trained_like
+from channels.quiet.trained_like import trained_like
 from keyss.channels import LOW_BITS
 from keyss.methods import embed_models, most_visible, pruned, record_request
 from keyss.runs.revealing import reveal_model

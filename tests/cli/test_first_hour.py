@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 import keyss as library
-from channels.low_bits.trained_like import trained_like
+from channels.quiet.trained_like import trained_like
 from cli.said import SMALL, Run, write_key
 from keyss.files import write_model
 

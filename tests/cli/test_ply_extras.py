@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from channels.low_bits.trained_like import trained_like
+from channels.quiet.trained_like import trained_like
 from cli.said import Run, write_key
 from files.test_ply import columns_of, ply_bytes
 from keyss.core import Gaussians, same_bits

@@ -11,7 +11,7 @@ from hypothesis import given, strategies as st
 
 import keyss as library
 from channels.colours.made import cover
-from channels.low_bits.trained_like import trained_like
+from channels.quiet.trained_like import trained_like
 from cli.said import Run, assert_refused, listing, write_key
 from keyss import write_model
 from keyss.channels import Payload, pack_payload, unpack_payload

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 import keyss
-from channels.low_bits.trained_like import trained_like
+from channels.quiet.trained_like import trained_like
 from keyss import CarryOptions
 from keyss.channels import LOW_BITS
 from keyss.core import Gaussians, KeyssWarning, Scene, Similarity, UsageError, WrongKeyError, same_bits

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 import keyss
-from channels.low_bits.trained_like import trained_like
+from channels.quiet.trained_like import trained_like
 from keyss import CarryOptions, FitConfig, Secret
 from keyss.core import OutputError
 from keyss.files import write_model

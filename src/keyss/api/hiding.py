@@ -11,12 +11,13 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
 from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 import torch
 
 from keyss.api.asking import HideResult, Secret, check_keys, method_for, sources_of
 from keyss.api.fitting import seeded
-from keyss.channels import AnyChannel, Channel, Publish, channel_for, open_content, quiet_channel
+from keyss.channels import AnyChannel, Channel, Format, Publish, channel_for, open_content
 from keyss.core.errors import KeyssWarning, QualityError, UsageError
 from keyss.core.gaussians import Gaussians, same_bits
 from keyss.core.scene import Scene, ViewOptions
@@ -72,6 +73,7 @@ def hide(
     *,
     method: str | MethodOptions = DEFAULT,
     publish: Publish | None = None,
+    format: Format | None = None,
     channel: AnyChannel | None = None,
     width: int | None = None,
     background: Background = None,
@@ -90,12 +92,13 @@ def hide(
 
     Cover and secrets are scenes of photos, or models of any format, which are rendered for measurements.
     Plain models of scenes are fitted unless they are given. Secrets can also be files, in a cover that is a
-    model. `method`: a name, or the options of a method (`CarryOptions`, `KeyssOptions`). `publish` and
-    `channel`, if given, replace those of the options: "ply" hides in low bits, or in the steps
-    of a model that was decoded from another format; "spz", "sog" and "compressed-ply" in the integers of
-    such a file, which must stay unchanged; "any" in what survives conversion, which is the channel "appended"
-    (more Gaussians, which are visible in the file) or "colours" (less room). "auto" is "ply", or "any" with a
-    warning for a cover that holds nothing unnoticed. `width`, `background`, `skip_missing`: see `load_scene`.
+    model. `method`: a name, or the options of a method (`CarryOptions`, `KeyssOptions`). `publish`, `format`
+    and `channel`, if given, replace those of the options. "as-is" hides where nobody sees it, in a file that
+    must stay unchanged: in low bits of a "ply", or in the integers of an "spz", "sog" or "compressed-ply", or
+    of a model that was decoded from one. Without a `format` that is the cover's, and where nothing goes in
+    unnoticed, "any" with a warning. "any" hides in what survives conversion, which is the channel "appended"
+    (more Gaussians, which are visible in the file) or "colours" (less room). `width`, `background`,
+    `skip_missing`: see `load_scene`.
 
     `out` (a folder) gets `publish/` with the stego model, and `private/` with fitted models, `config.json`,
     `metrics.json`, the files to hand over for methods that need them (`keyss.methods.handed`), and
@@ -118,8 +121,9 @@ def hide(
                 raise UsageError(f"hiding files does not use `{name}`: leave it out")
         if isinstance(cover, Scene) or not is_model(cover):
             raise UsageError("hiding a file needs a model as the cover; `keyss fit` makes one from photos")
-        where = channel_for(publish or "auto", channel or "colours")
-        found = _hide_files(cover, secrets, where, None if dry_run else out, overwrite)
+        model = as_3dgs_model(cover, "the cover")
+        where = channel_for(publish or "as-is", channel or "colours", format, model)
+        found = _hide_files(cover, model, secrets, where, None if dry_run else out, overwrite)
         return replace(found, stego=None) if dry_run else found
     if out is not None and is_model_path(out):
         raise UsageError(
@@ -128,8 +132,8 @@ def hide(
     if min_psnr is not None and not math.isfinite(min_psnr):
         raise UsageError(f"`min_psnr`: expected a number of dB, got {min_psnr}")
     chosen, options = method_for(method, secrets)
-    if publish or channel:
-        options = replace(options, publish=publish or options.publish, channel=channel or options.channel)
+    asked: dict[str, Any] = {"publish": publish, "format": format, "channel": channel}
+    options = replace(options, **{name: value for name, value in asked.items() if value})
     began = time.monotonic()
     interrupted = Path(out) if resume and out is not None else None
     options = replace(options, fit=seeded(options.fit, interrupted, "options", "fit"))
@@ -226,6 +230,7 @@ def hide(
 
 def _hide_files(
     cover: PathLike | Gaussians,
+    model: Gaussians,
     secrets: Sequence[Secret],
     place: Channel,
     out: PathLike | None,
@@ -238,11 +243,11 @@ def _hide_files(
         read = [cover, *(each.file for each in secrets)]
         inputs = [Path(each) for each in read if isinstance(each, str | Path)]
         folder = RunFolder(out, "hide files", writes=STEGOS, inputs=inputs, overwrite=overwrite)
-    hidden, model = [_hidden_file(each) for each in secrets], as_3dgs_model(cover, "the cover")
+    hidden = [_hidden_file(each) for each in secrets]
     keys = [each.key for each in secrets]
     payloads = [(key, each.payload()) for key, each in zip(keys, hidden, strict=True)]
     try:
-        stego = quiet_channel(place, model).prepare(model).embed(payloads)
+        stego = place.prepare(model).embed(payloads)
     except UsageError as error:
         if place.grows:
             raise

@@ -183,8 +183,8 @@ def _hide(asset: Asset, place: Path, reporter: Reporter, *, derived: bool, overw
     key = MasterKey(key).key_of(asset.name) if derived else key
     if asset.secret_file is not None:
         secret = Secret(file=asset.secret_file, key=key)
-        publish, channel = asset.options.publish, asset.options.channel
-        hide(asset.cover, [secret], publish=publish, channel=channel, out=place, overwrite=overwrite)
+        where = {name: getattr(asset.options, name) for name in ("publish", "format", "channel")}
+        hide(asset.cover, [secret], **where, out=place, overwrite=overwrite)
     else:
         hide(
             asset.cover,

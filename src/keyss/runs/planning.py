@@ -14,7 +14,7 @@ from pathlib import Path
 import psutil
 import torch
 
-from keyss.channels import Publish
+from keyss.channels import Format
 from keyss.core.errors import OutputError
 from keyss.core.scene import Scene
 from keyss.fitting.config import FitConfig
@@ -29,12 +29,12 @@ _RENDERS = 6  # of each test view, to measure
 _STATE_COPIES = 3  # numbers in a checkpoint for each number of a model: itself and two moments
 _MAX_APPENDED = 7  # Gaussians that hold one Gaussian of a secret of SH degree 3
 # About the most bytes of a packed Gaussian without harmonics, and of each of these.
-_PACKED: dict[Publish, tuple[float, float]] = {
+_PACKED: dict[Format, tuple[float, float]] = {
     "spz": (15, 0.3),
     "sog": (18, 0.7),
     "compressed-ply": (16.3, 1),
 }
-_PACKED_APPENDED: dict[Publish, float] = {"spz": 12, "sog": 15, "compressed-ply": 61.3}  # bytes
+_PACKED_APPENDED: dict[Format, float] = {"spz": 12, "sog": 15, "compressed-ply": 61.3}  # bytes
 _OTHER_BYTES = 4 << 20  # JSON files, locks, and the overhead of the file system
 
 
@@ -89,7 +89,7 @@ def plan_hiding(
         notes=notes,
         method=method.name,
         stages=tuple(stages),
-        file_bytes=_file_bytes(plan.gaussians, plan.sh_degree, options.publish),
+        file_bytes=_file_bytes(plan.gaussians, plan.sh_degree, options.format),
         disk_bytes=_disk_bytes(options, sources),
         free_bytes=None if out is None else _free_bytes(out),
         memory_bytes=_memory_bytes(plan.gaussians, plan.sh_degree, trains)
@@ -197,9 +197,9 @@ def _floats(sh_degree: int) -> int:
     return 11 + 3 * (sh_degree + 1) ** 2
 
 
-def _file_bytes(gaussians: int, sh_degree: int, publish: Publish = "ply") -> int:
+def _file_bytes(gaussians: int, sh_degree: int, format: Format | None = None) -> int:
     """Size of a model's file: of a `.ply`, which has normals too, exactly; else about the most."""
-    if publish not in _PACKED:
+    if format not in _PACKED:
         return 4 * gaussians * (3 + _floats(sh_degree)) + 2048
-    without, harmonic = _PACKED[publish]
+    without, harmonic = _PACKED[format]
     return round(gaussians * (without + harmonic * (_floats(sh_degree) - _floats(0)))) + 2048

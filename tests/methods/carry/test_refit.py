@@ -11,7 +11,7 @@ import torch
 from hypothesis import given, strategies as st
 
 import keyss
-from channels.low_bits.trained_like import trained_like
+from channels.quiet.trained_like import trained_like
 from keyss import CarryOptions, FitConfig, Secret
 from keyss.channels import identities
 from keyss.core import Gaussians, KeyssWarning, Scene, UsageError

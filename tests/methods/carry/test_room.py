@@ -10,7 +10,7 @@ import pytest
 import torch
 
 import keyss
-from channels.low_bits.trained_like import trained_like
+from channels.quiet.trained_like import trained_like
 from keyss import CarryOptions, Gaussians, Secret
 from keyss.channels import LowBitsRoom, usable_carriers
 from keyss.core import KeyssWarning, UsageError

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 import keyss
-from channels.low_bits.trained_like import trained_like
+from channels.quiet.trained_like import trained_like
 from cli.said import Run, write_key
 from keyss import CarryOptions, FitConfig, Secret
 from keyss.channels import LOW_BITS

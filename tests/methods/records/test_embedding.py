@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from channels.low_bits.trained_like import trained_like
+from channels.quiet.trained_like import trained_like
 from keyss.channels import LOW_BITS, Embedded, LowBitsCover, open_content
 from keyss.core import same_bits
 from keyss.methods.records import embedding
