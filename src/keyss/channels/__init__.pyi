@@ -38,7 +38,6 @@ from .quiet.cells import CellCipher as CellCipher
 from .quiet.channel import (
     LOW_BITS as LOW_BITS,
     CodesCover as CodesCover,
-    Embedded as Embedded,
     InCodes as InCodes,
     LowBitsCover as LowBitsCover,
 )

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from keyss.channels import LOW_BITS, Content, LowBitsCover, Payload, QuietReader
 from keyss.channels.base import randomness
-from keyss.channels.quiet.writing import digest
+from keyss.channels.quiet.writing import bytes_of
 from keyss.core import Gaussians
 from keyss.keys import DerivedKey
 
@@ -31,9 +31,9 @@ def embed_contents(
     entropy: bytes | None = None,
 ) -> Gaussians:
     """With a key under each salt, stale ones too."""
-    mixed = randomness(entropy, *(digest(content) for _, content in secrets))
+    mixed = randomness(entropy, *(bytes_of(content) for _, content in secrets))
     fresh = [([keys[i] for i in prepared.fresh_salts], content) for keys, content in secrets]
-    return prepared.embed_derived(fresh, mixed).gaussians
+    return prepared.embed_derived(fresh, mixed)
 
 
 def extract(stego: Gaussians, key: str) -> bytes:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,10 +10,7 @@ import torch
 from hypothesis import given, settings, strategies as st
 from hypothesis.extra import numpy as arrays
 
-from channels.quiet.trained_like import trained_like
 from keyss.channels import Layout, identities, read_low_bits, used_words, write_low_bits
-from keyss.channels.quiet import salts
-from keyss.channels.quiet.layout import SALTS
 from keyss.channels.quiet.reading import _are_among
 from keyss.channels.quiet.usable import repeated
 from keyss.core import Gaussians
@@ -86,20 +82,6 @@ def test_what_occurs_twice_is_found_whatever_it_is(values: np.ndarray, shift: in
     values = values << np.uint64(shift)
     times = {value: int((values == value).sum()) for value in values.tolist()}
     assert repeated(values).tolist() == [times[value] > 1 for value in values.tolist()]
-
-
-@pytest.mark.parametrize("looked_at", [SALTS + 1, 40, 700])
-def test_salts_are_the_same_however_few_gaussians_are_looked_at_closely(
-    looked_at: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    model = trained_like(3000, 4)
-    grey = model.sh[:600].mean(dim=2, keepdim=True).expand(-1, -1, 3)  # the likeliest ones are coincidences
-    model = Gaussians.cat([replace(model[:600], sh=10 * grey), model[600:]])
-    names = identities(model)
-    expected = salts.salt_rows(model, names)
-    assert expected.min() >= 600
-    monkeypatch.setattr(salts, "_LOOKED_AT", looked_at)
-    assert salts.salt_rows(model, names).tolist() == expected.tolist()
 
 
 @given(arrays.arrays(np.uint8, (12, 11), elements=st.integers(0, 1)), st.integers(0, 12))

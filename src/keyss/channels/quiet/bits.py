@@ -22,7 +22,6 @@ from hashlib import blake2b
 import numpy as np
 import torch
 
-from keyss.channels.quiet.kernels import pack_harmonics, unpack_harmonics
 from keyss.core.arrays import Bytes, Doubles, Integers, Words32
 from keyss.core.gaussians import Gaussians
 from keyss.rendering.cpu.parallel import in_blocks
@@ -32,7 +31,8 @@ GEOMETRY = len(FIELDS)  # fields of a Gaussian before the spherical harmonics
 QUATS = slice(3, 7)  # of these
 GEOMETRY_BITS, SH_BITS = 8, 12
 UNUSED_BITS = 1  # below them
-_UNUSED, _BYTE = np.uint32(UNUSED_BITS), np.uint32((1 << GEOMETRY_BITS) - 1)
+_UNUSED = np.uint32(UNUSED_BITS)
+_BYTE, _TWELVE = np.uint32((1 << GEOMETRY_BITS) - 1), np.uint32((1 << SH_BITS) - 1)
 UNIT_TOLERANCE = 1e-4  # of a length that is known without the low bits, to 2e-5 on average
 
 IDENTITY_BYTES = 16
@@ -126,10 +126,14 @@ def read_low_bits(gaussians: Gaussians, layout: Layout | None = None) -> Bytes:
     packed = np.empty((len(gaussians), layout.width), np.uint8)
 
     def pack(start: int, stop: int) -> None:
-        own, first = packed[start:stop], 0
-        for field in fields:
-            own[:, first : (first := first + field.shape[1])] = field[start:stop] >> _UNUSED & _BYTE
-        pack_harmonics(harmonics[start:stop], _UNUSED, own[:, first:])
+        own, at = packed[start:stop], layout.width - harmonics.shape[1] * 3 // 2
+        own[:, :at] = np.concatenate([field[start:stop] for field in fields], axis=1) >> _UNUSED & _BYTE
+        low = harmonics[start:stop] >> _UNUSED & _TWELVE
+        first, second = low[:, ::2], low[:, 1::2]
+        middle = first << 4 & _BYTE
+        middle[:, : second.shape[1]] |= second >> 8
+        own[:, at::3], own[:, at + 1 :: 3] = first >> 4, middle[:, : second.shape[1]]
+        own[:, at + 2 :: 3] = second & _BYTE
 
     in_blocks(pack, len(gaussians), BLOCK)
     return packed
@@ -148,11 +152,17 @@ def write_low_bits(
     for rows, data in parts:
 
         def write(start: int, stop: int, rows: Integers = rows, data: Bytes = data) -> None:
-            own, new, first = rows[start:stop], data[start:stop], 0
+            own, new, at = rows[start:stop], data[start:stop].astype(np.uint32), 0
             for field in fields:
-                low = new[:, first : (first := first + field.shape[1])].astype(np.uint32)
+                low = new[:, at : (at := at + field.shape[1])]
                 field[own] = field[own] & ~(_BYTE << _UNUSED) | low << _UNUSED
-            unpack_harmonics(new[:, first:], _UNUSED, own, harmonics)
+            low = harmonics[own] >> _UNUSED & _TWELVE
+            middle, last = new[:, at + 1 :: 3], new[:, at + 2 :: 3]
+            low[:, ::2] = low[:, ::2] & np.uint32(15) | new[:, at::3] << 4
+            paired = low[:, : 2 * middle.shape[1]]
+            paired[:, ::2] = paired[:, ::2] & ~np.uint32(15) | middle >> 4
+            paired[:, 1::2] = (middle & np.uint32(15)) << 8 | last
+            harmonics[own] = harmonics[own] & ~(_TWELVE << _UNUSED) | low << _UNUSED
 
         in_blocks(write, len(rows), BLOCK)
     return written.to(gaussians.device)

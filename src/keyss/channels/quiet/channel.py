@@ -45,7 +45,7 @@ from keyss.channels.quiet.kept import changeable, file_order, in_counted_order, 
 from keyss.channels.quiet.layout import BLOCK_HEADER, LEAST_BYTES, MIN_BLOCKS, LowBitsRoom
 from keyss.channels.quiet.salts import salt, salt_rows
 from keyss.channels.quiet.usable import check_usable, named_carriers
-from keyss.channels.quiet.writing import Writer, digest
+from keyss.channels.quiet.writing import Writer, bytes_of
 from keyss.core.arrays import Bits, Bytes, Flags, Integers
 from keyss.core.errors import KeyssWarning, UsageError
 from keyss.core.gaussians import Gaussians
@@ -131,20 +131,6 @@ class InCodes(Channel):
 
 
 @dataclass(frozen=True)
-class Embedded:
-    """A stego model, and where in it everything lies."""
-
-    gaussians: Gaussians
-    places: list[tuple[Integers, Integers]]  # of each content: [R] the Gaussian and the cell of each record
-    others: Integers  # [H] Gaussians of salts and headers
-
-    def part(self, count: int) -> Integers:
-        """About `count` Gaussians, or all, in their order: enough to open the content of their records."""
-        spaced = np.arange(0, len(self.gaussians), max(1, len(self.gaussians) // count))
-        return np.union1d(spaced, self.others)
-
-
-@dataclass(frozen=True)
 class LowBitsCover:
     """A cover and which of its Gaussians can be written; see `keyss.channels.base.PreparedCover`."""
 
@@ -164,26 +150,21 @@ class LowBitsCover:
         return LowBitsRoom(len(self._rows), self.layout.width)
 
     def embed(self, contents: Sequence[tuple[str, Content]], *, entropy: bytes | None = None) -> Gaussians:
-        """See `PreparedCover`. Takes 1.6 s for each secret for key derivation. Warns as `place` does."""
-        return self.place(contents, entropy).gaussians
-
-    def place(self, contents: Sequence[tuple[str, Content]], entropy: bytes | None) -> Embedded:
-        """`embed`, with the places.
+        """See `PreparedCover`. Takes 1.6 s for each secret for key derivation.
 
         Warns (KeyssWarning) if `decoy=True`, which tries the first salt alone, will not open the model.
         """
-        mixed = randomness(entropy, *(digest(content) for _, content in contents))
+        mixed = randomness(entropy, *(bytes_of(content) for _, content in contents))
         salts = self._salts(mixed)[1]
         if 0 not in self.fresh_salts:
             warnings.warn(_FIRST_IS_STALE, KeyssWarning, stacklevel=2)
         fresh = [salts[index] for index in self.fresh_salts]
-        derived = [(_derived(key, fresh), content) for key, content in contents]
-        return self.embed_derived(derived, mixed)
+        return self.embed_derived([(_derived(key, fresh), content) for key, content in contents], mixed)
 
     def embed_derived(
         self, contents: Sequence[tuple[Sequence[DerivedKey], Content]], entropy: bytes
-    ) -> Embedded:
-        """`place` after key derivation: for each secret its key under each of the `fresh_salts`.
+    ) -> Gaussians:
+        """`embed` after key derivation: for each secret its key under each of the `fresh_salts`.
 
         `entropy`: of `randomness`, for no other file.
         """
@@ -191,13 +172,8 @@ class LowBitsCover:
         fresh, _ = self._salts(entropy)
         writer = Writer(self.names[self._rows], self.layout.width, entropy, len(self.cover))
         writer.write(contents)
-        rows = self._rows[writer.order]
-        parts = [(self.salt_rows[self.fresh_salts], fresh), (rows, writer.table)]
-        return Embedded(
-            write_low_bits(self.cover, self.layout, parts),
-            [(rows[own], slots) for _, (own, slots) in sorted(writer.places.items())],
-            np.concatenate([self.salt_rows, rows[: writer.headers]]),
-        )
+        parts = [(self.salt_rows[self.fresh_salts], fresh), (self._rows[writer.order], writer.table)]
+        return write_low_bits(self.cover, self.layout, parts)
 
     @cached_property
     def fresh_salts(self) -> Integers:
@@ -276,7 +252,7 @@ class CodesCover:
 
     def embed(self, contents: Sequence[tuple[str, Content]], *, entropy: bytes | None = None) -> Gaussians:
         """See `PreparedCover`."""
-        mixed = randomness(entropy, _digest(self.codes), *(digest(content) for _, content in contents))
+        mixed = randomness(entropy, _digest(self.codes), *(bytes_of(content) for _, content in contents))
         for attempt in range(_ATTEMPTS):
             own = expand(mixed, f"quiet/attempt/{attempt}", 32)
             first = np.frombuffer(stream(own, "quiet/salts", self.width), np.uint8)

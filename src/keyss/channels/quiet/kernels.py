@@ -13,7 +13,6 @@ from keyss.rendering.cpu.jit import kernel
 
 _ODD = np.uint64(0x9E3779B97F4A7C15)  # 2^64 over the golden ratio: the high bits of multiples are scattered
 _MAGNITUDE = np.uint32(0x7FFFFFFF)
-_TWELVE = np.uint32((1 << 12) - 1)
 
 
 @kernel
@@ -25,24 +24,6 @@ def hash_rows(rows, found):
             state = (state ^ np.uint64(rows[i, j])) * _ODD
             state ^= state >> np.uint64(29)
         found[i] = state
-
-
-@kernel
-def fill_buckets(words, shift, counts):
-    """How many of `words` [N, C] are in each of the buckets `counts` [2^(64 - shift)], at most 255."""
-    for i in range(len(words)):
-        for j in range(words.shape[1]):
-            at = np.uint64(words[i, j]) * _ODD >> np.uint64(shift)
-            counts[at] += counts[at] < 255
-
-
-@kernel
-def find_full(words, shift, full, found):
-    """`found` [N, C]: whether the bucket of each of `words` [N, C] is `full`, of which each has a bit."""
-    for i in range(len(words)):
-        for j in range(words.shape[1]):
-            at = np.uint64(words[i, j]) * _ODD >> np.uint64(shift)
-            found[i, j] = full[at >> np.uint64(3)] >> np.uint8(at & np.uint64(7)) & np.uint8(1)
 
 
 @kernel
@@ -87,36 +68,3 @@ def count_zeros(words, chosen, zeros, counts):
             for j in range(words.shape[1]):
                 word = words[i, j]
                 counts[word >> np.uint32(23) & np.uint32(255), zeros[word & np.uint32(len(zeros) - 1)]] += 1
-
-
-@kernel
-def pack_harmonics(words, unused, packed):
-    """`packed` [N, C * 3 // 2]: 12 bits above the `unused` ones of words [N, C], two times 12 in three bytes.
-
-    Of the last of an odd number of words only the upper 8 bits.
-    """
-    for i in range(len(words)):
-        for j in range(0, words.shape[1], 2):
-            at = j // 2 * 3
-            first = words[i, j] >> unused & _TWELVE
-            packed[i, at] = first >> np.uint32(4)
-            if j + 1 < words.shape[1]:
-                second = words[i, j + 1] >> unused & _TWELVE
-                packed[i, at + 1] = (first & np.uint32(15)) << np.uint32(4) | second >> np.uint32(8)
-                packed[i, at + 2] = second & np.uint32(255)
-
-
-@kernel
-def unpack_harmonics(packed, unused, rows, words):
-    """The inverse of `pack_harmonics`, into the words [N, C] of `rows` [R]; other bits stay as they are."""
-    for r in range(len(rows)):
-        own = words[rows[r]]
-        for j in range(0, len(own), 2):
-            at = j // 2 * 3
-            first, kept = np.uint32(packed[r, at]) << np.uint32(4), _TWELVE - np.uint32(15)
-            if j + 1 < len(own):
-                middle = np.uint32(packed[r, at + 1])
-                first, kept = first | middle >> np.uint32(4), _TWELVE
-                second = (middle & np.uint32(15)) << np.uint32(8) | np.uint32(packed[r, at + 2])
-                own[j + 1] = own[j + 1] & ~(_TWELVE << unused) | second << unused
-            own[j] = own[j] & ~(kept << unused) | first << unused

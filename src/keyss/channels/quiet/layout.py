@@ -124,8 +124,8 @@ class LowBitsRoom:
         """True if each secret's records are placed as they would be without the others."""
         if list(map(self._alone, requests)) != list(plans):
             return False
-        counts = [request.count + plan.copies for plan, request in zip(plans, requests, strict=True)]
-        return self._fit([plan.cells_per_carrier for plan in plans], counts)
+        both = zip(plans, requests, strict=True)
+        return self._fit([(plan.cells_per_carrier, request.count + plan.copies) for plan, request in both])
 
     def record_capacity(self, requests: Sequence[RecordRequest]) -> int:
         """Records of the smallest useful size that fit for all requests together; 0 if none."""
@@ -144,26 +144,27 @@ class LowBitsRoom:
 
         Raises UsageError with the number of carriers that would do.
         """
-        plans = [plan for plan in map(self._payload_alone, sizes) if plan is not None]
-        if len(plans) == len(sizes) and self._fit(
-            [plan.cells_per_carrier for plan in plans], [plan.cells for plan in plans]
-        ):
-            return plans, True
-        cells, plans = self._payload_cells(len(sizes)), []
-        for size in sizes:
-            codewords = codewords_for(cells, self._chunk_bytes(1), size)
-            if codewords is None:
+        alone = [
+            next((each for each in self._classes() if self._codewords(*each, size)), None) for size in sizes
+        ]
+        cells = [each for each in alone if each is not None]
+        if not (as_alone := len(cells) == len(sizes) and self._fit(cells)):
+            cells = [(1, self._payload_cells(len(sizes)))] * len(sizes)
+        plans = []
+        for each, size in zip(cells, sizes, strict=True):
+            if (codewords := self._codewords(*each, size)) is None:
                 raise UsageError(self.too_small(self.carriers, "usable Gaussians", size, len(sizes)))
-            plans.append(PayloadPlan(1, cells, codewords))
-        return plans, False
+            plans.append(PayloadPlan(*each, codewords))
+        return plans, as_alone
 
     def payload_capacity(self, secrets: int) -> int:
         """Bytes of encrypted payload for each of `secrets`; may be 0."""
-        return largest_payload(self._payload_cells(secrets), self._chunk_bytes(1))
+        codewords = self._codewords(1, self._payload_cells(secrets))
+        return codewords.size if codewords else 0
 
     def too_small(self, count: int, what: str, size: int, secrets: int) -> str:
         """The message for payloads of `size` bytes that do not fit; `count` and `what` describe the model."""
-        if self._chunk_bytes(1) <= 0:
+        if not self.part_bytes:
             return (
                 f"a cover whose Gaussians hold {self.width} bytes has no room for anything in its low bits: "
                 "there are 8 at SH degree 0, 21 at degree 1, and 4 less where quaternions have unit length"
@@ -180,9 +181,19 @@ class LowBitsRoom:
             f"{rounded:,} Gaussians would do"
         )
 
-    def _chunk_bytes(self, cells: int) -> int:
-        """Bytes of a payload's chunk, whole symbols; 0 or less where nothing fits."""
-        return (self.record_bytes(cells) - NUMBER_BYTES) // SYMBOL_BYTES * SYMBOL_BYTES
+    def _codewords(self, cells: int, count: int, size: int | None = None) -> Codewords | None:
+        """The most redundant way to spread `size` bytes, or as many as can be, over `count` such cells.
+
+        None: not safe.
+        """
+        chunk = (self.record_bytes(cells) - NUMBER_BYTES) // SYMBOL_BYTES * SYMBOL_BYTES
+        if count < 1 or chunk < 1:
+            return None
+        number = min(-(-count // MAX_CHUNKS), MAX_CODEWORDS)
+        n = min(count // number, MAX_CHUNKS)
+        most = _most_data(n, number)
+        k = most if size is None else max(1, -(-size // (chunk * number)))
+        return Codewords(number, n, k, chunk) if 0 < k <= most else None
 
     @property
     def _shared(self) -> int:
@@ -204,43 +215,30 @@ class LowBitsRoom:
 
     def _alone(self, request: RecordRequest) -> RecordPlan | None:
         """The plan of a secret for itself; None where it needs what is set aside for others."""
-        if request.header_bytes > _TYPICAL_HEADER:
-            return None
-        for cells, room in self._classes():
+        for cells, room in self._classes() if request.header_bytes <= _TYPICAL_HEADER else ():
             size = self.record_bytes(cells)
             if room >= request.count and size >= request.least_bytes:
-                copies = min(int(MAX_COPIES * request.count), room - request.count)
-                return RecordPlan(size, copies, cells)
-        return None
-
-    def _payload_alone(self, size: int) -> PayloadPlan | None:
-        for cells, room in self._classes():
-            codewords = codewords_for(room, self._chunk_bytes(cells), size)
-            if codewords is not None:
-                return PayloadPlan(cells, room, codewords)
+                return RecordPlan(size, min(int(MAX_COPIES * request.count), room - request.count), cells)
         return None
 
     def _payload_cells(self, secrets: int) -> int:
         """Whole carriers for each of so many payloads that do not fit as they would without the others."""
         return (self.carriers - secrets * self.header_carriers(_TYPICAL_HEADER)) // secrets
 
-    def _fit(self, cells_per_carrier: Sequence[int], counts: Sequence[int]) -> bool:
-        """True if so many cells of each secret fit.
+    def _fit(self, cells: Sequence[tuple[int, int]]) -> bool:
+        """True if the cells of all secrets fit: of each those of a carrier, and their number.
 
         Cells that divide carriers come first, anywhere; then the others on carriers left untouched.
         """
-        divided = {each for each in cells_per_carrier if each > 1}
-        if len(counts) > UNNOTICED or len(divided) > 1:
+        shared, whole = (
+            sum(count for each, count in cells if (each > 1) == divides) for divides in (True, False)
+        )
+        carriers, parts = self._shared, max(each for each, _ in cells)
+        if len(cells) > UNNOTICED or len({each for each, _ in cells if each > 1}) > 1:
             return False
-        carriers, cells = self._shared, max(divided, default=1)
-        both = list(zip(cells_per_carrier, counts, strict=True))
-        whole = sum(count for each, count in both if each == 1)
-        shared = sum(count for each, count in both if each > 1)
-        if shared > cells * carriers or not whole:
-            return shared <= cells * carriers
-        untouched = (1 - shared / (cells * carriers)) ** cells
-        fewest = carriers * untouched - _DEVIATIONS * (carriers * untouched * (1 - untouched)) ** 0.5
-        return bool(whole <= fewest)
+        untouched = max(0.0, 1 - shared / (parts * carriers)) ** parts if shared else 1.0
+        spare = _DEVIATIONS * (carriers * untouched * (1 - untouched)) ** 0.5
+        return shared <= parts * carriers and (not whole or whole <= carriers * untouched - spare)
 
     def _tight(self, requests: Sequence[RecordRequest]) -> list[RecordPlan]:
         """All that there is for these secrets: whole carriers, then fewer copies, then smaller cells."""
@@ -268,23 +266,6 @@ def check_payload_fits(compressed: int, gaussians: int, secrets: int, sh_degree:
         raise UsageError(room.too_small(gaussians, "Gaussians", size, secrets))
 
 
-def codewords_for(cells: int, chunk: int, size: int) -> Codewords | None:
-    """The most redundant way to spread `size` bytes over cells with `chunk` bytes each; None: not safe."""
-    if cells < 1 or chunk < 1:
-        return None
-    count, n = _shape(cells)
-    k = max(1, -(-size // (chunk * count)))
-    return Codewords(count, n, k, chunk) if k <= _most_data(n, count) else None
-
-
-def largest_payload(cells: int, chunk: int) -> int:
-    """The most bytes for which there are `codewords_for` so many cells."""
-    if cells < 1 or chunk < 1:
-        return 0
-    count, n = _shape(cells)
-    return count * _most_data(n, count) * chunk
-
-
 def numbered_chunks(codewords: Codewords, data: bytes, cells: int) -> Bytes:
     """[cells, NUMBER_BYTES + width] numbered chunks; those that are left over repeat the first ones."""
     numbers = np.arange(cells, dtype="<u4") % codewords.chunks
@@ -296,12 +277,6 @@ def split_numbers(chunks: Bytes) -> tuple[Integers, Bytes]:
     """The numbers [C] and the data [C, width] of numbered chunks."""
     numbers: Integers = chunks[:, :NUMBER_BYTES] @ np.array([1, 1 << 8, 1 << 16])
     return numbers, chunks[:, NUMBER_BYTES:]
-
-
-def _shape(cells: int) -> tuple[int, int]:
-    """The number of codewords and their length."""
-    count = min(-(-cells // MAX_CHUNKS), MAX_CODEWORDS)
-    return count, min(cells // count, MAX_CHUNKS)
 
 
 @lru_cache(maxsize=1024)

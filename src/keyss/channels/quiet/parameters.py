@@ -9,7 +9,6 @@ Parameters are cut into numbered parts, one in each cell. Numbers are little-end
 from __future__ import annotations
 
 import struct
-from collections import Counter
 from dataclasses import dataclass
 
 import numpy as np
@@ -69,15 +68,9 @@ class Parameters:
 
 
 def unpack(parts: Bytes) -> Parameters:
-    """From decrypted parts [P, 1 + part] in any order; of parts with one number the most frequent counts.
-
-    Raises InputError when some are lost, and for damage.
-    """
-    votes: dict[int, Counter[bytes]] = {}
-    for row in parts:
-        votes.setdefault(int(row[0]), Counter())[row[1:].tobytes()] += 1
-    best = {number: counter.most_common(1)[0][0] for number, counter in votes.items()}
-    packed = _joined(best, PREFIX_BYTES)
+    """From decrypted parts [P, 1 + part] in any order. Raises InputError when some are lost, and for damage."""
+    numbered = {int(row[0]): row[1:].tobytes() for row in parts}
+    packed = _joined(numbered, PREFIX_BYTES)
     version, service, name, cells, size, length, gaussians, count = _PREFIX.unpack(packed)
     if version != VERSION:
         raise InputError(f"hidden secret of version {version}; this program reads version {VERSION}")
@@ -90,7 +83,7 @@ def unpack(parts: Bytes) -> Parameters:
         method = unpack_method(name)
     except ValueError as error:
         raise InputError(f"the hidden parameters are damaged: {error}") from error
-    header = _joined(best, PREFIX_BYTES + length)[PREFIX_BYTES:]
+    header = _joined(numbered, PREFIX_BYTES + length)[PREFIX_BYTES:]
     return Parameters(service, method, cells, size, gaussians, count, header)
 
 

@@ -31,7 +31,6 @@ from keyss.keys.derivation import SALT_BYTES
 from keyss.rendering.cpu.parallel import in_blocks
 
 _LABEL = b"keyss/v2/salt"
-_LOOKED_AT = 4096  # Gaussians that are looked at closely
 _MANTISSA = np.uint32((1 << 23) - 1)
 
 
@@ -43,19 +42,15 @@ def salt_rows(
     `low` [N, B]: their low bits, where they are known.
     """
     layout = layout or Layout.of(gaussians)
-    # Coincidences take long to find, and make a key larger: those with the smallest keys without are enough.
-    keys = _keys(gaussians, names, layout, coincidences=False)
-    some = np.argpartition(keys, _LOOKED_AT)[:_LOOKED_AT] if len(keys) > _LOOKED_AT else np.arange(len(keys))
-    bound = keys[some].max(initial=0)
-    own = _keys(gaussians[torch.from_numpy(some)], names[some], layout)
-    if len(some) < len(keys) and np.partition(own, SALTS - 1)[SALTS - 1] >= bound:
-        some, own = np.arange(len(keys)), _keys(gaussians, names, layout)
-    if len(own) > SALTS:
-        best = np.argpartition(own, SALTS - 1)[:SALTS]
-        some, own = some[best], own[best]
-    bits = read_low_bits(gaussians[torch.from_numpy(some)], layout) if low is None else low[some]
-    order = sorted(range(len(some)), key=lambda i: (own[i], names[some[i]].tobytes(), bits[i].tobytes()))
-    return some[order]
+    ranks = _ranks(gaussians, layout)
+    # 9 bits of rank, 55 of the identity.
+    keys = ranks << np.uint64(55) | names[:, :8].copy().view(">u8")[:, 0].astype(np.uint64) >> np.uint64(9)
+    best = np.argpartition(keys, SALTS - 1)[:SALTS] if len(keys) > SALTS else np.arange(len(keys))
+    bits = read_low_bits(gaussians[torch.from_numpy(best)], layout) if low is None else low[best]
+    order = sorted(
+        range(len(best)), key=lambda i: (ranks[best[i]], names[best[i]].tobytes(), bits[i].tobytes())
+    )
+    return best[order]
 
 
 def salt(identity: Bytes, low: Bytes) -> bytes:
@@ -63,17 +58,8 @@ def salt(identity: Bytes, low: Bytes) -> bytes:
     return hashlib.sha256(_LABEL + identity.tobytes() + low.tobytes()).digest()[:SALT_BYTES]
 
 
-def _keys(gaussians: Gaussians, names: Bytes, layout: Layout, coincidences: bool = True) -> Words:
-    """[N] what salts are sorted by: 9 bits of rank, 55 of the identity."""
-    ranks = _ranks(gaussians, layout, coincidences)
-    return ranks << np.uint64(55) | names[:, :8].copy().view(">u8")[:, 0].astype(np.uint64) >> np.uint64(9)
-
-
-def _ranks(gaussians: Gaussians, layout: Layout, coincidences: bool = True) -> Words:
-    """[N] 0 to 511: 256 for what may well be left alone, and less the larger the least harmonic is.
-
-    Without `coincidences` what nearly equal numbers tell is left out.
-    """
+def _ranks(gaussians: Gaussians, layout: Layout) -> Words:
+    """[N] 0 to 511: 256 for what may well be left alone, and less the larger the least harmonic is."""
     columns = layout.columns
     stays = layout.mask[columns] | np.uint32(1)
 
@@ -81,9 +67,7 @@ def _ranks(gaussians: Gaussians, layout: Layout, coincidences: bool = True) -> W
         used = used_words(gaussians[start:stop])
         chosen = used[:, columns]
         large = exponents(chosen)
-        doubtful = ((large == 0) | (chosen & _MANTISSA & ~stays == 0)).any(axis=1)
-        if coincidences:
-            doubtful |= near_equal(used, layout)
+        doubtful = ((large == 0) | (chosen & _MANTISSA & ~stays == 0)).any(axis=1) | near_equal(used, layout)
         if layout.quats:
             doubtful |= np.abs(coarse_lengths(used[:, QUATS]) - 1) < UNIT_TOLERANCE
         harmonics = exponents(used[:, GEOMETRY:]) if used.shape[1] > GEOMETRY else large

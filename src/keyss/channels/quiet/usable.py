@@ -39,7 +39,7 @@ from keyss.channels.quiet.bits import (
     identities,
     used_words,
 )
-from keyss.channels.quiet.kernels import fill_buckets, find_full, find_near
+from keyss.channels.quiet.kernels import find_near
 from keyss.channels.quiet.predictability import count_trailing_zeros, least_exponent
 from keyss.core.arrays import Bytes, Doubles, Flags, Integers, Numbers, Words, Words32
 from keyss.core.errors import UsageError
@@ -65,7 +65,6 @@ _SHORT = np.uint32((1 << _SHORT_BITS) - 1)
 # A Gaussian is no measurement when so many of its values have 12 zeros; by chance one in three million is.
 _ZEROS, _ZERO_FIELDS = np.uint32((1 << 12) - 1), 3
 _EQUAL_HARMONICS = 2
-_FEW_WORDS = 1 << 20  # which are sorted as quickly as kernels are loaded
 
 _OPACITY = 7
 # Bit patterns of logits from 16 on. The sigmoid is 1 from 16.64 on, but only the exponent surely stays.
@@ -177,30 +176,14 @@ def near_equal(used: Words32, layout: Layout) -> Flags:
 
 
 def frequent(words: Numbers, times: int) -> Numbers:
-    """[V] which values at least `times` of the unsigned integers [N, C] have, in ascending order.
-
-    Of many, only what shares a bucket with so many others is sorted, which takes a third of the time.
-    """
-    if words.size > _FEW_WORDS:
-        # So many that few are full by chance: for each value 6 where two count, less than 1 from a dozen on.
-        shift = 64 - (1 + 24 * words.size // (times * min(times, 12))).bit_length()
-        counts = np.zeros(1 << 64 - shift, np.uint8)
-        fill_buckets(words, shift, counts)
-        full = np.packbits(counts >= min(times, 255), bitorder="little")
-
-        def some(start: int, stop: int) -> Numbers:
-            found = np.empty(words[start:stop].shape, bool)
-            find_full(words[start:stop], shift, full, found)
-            return words[start:stop][found]
-
-        words = np.concatenate(in_blocks(some, len(words), BLOCK))
+    """[V] which values at least `times` of the unsigned integers [...] have, in ascending order."""
     ordered, further = np.sort(words, axis=None), times - 1
     return np.unique(ordered[further:][ordered[further:] == ordered[: max(0, len(ordered) - further)]])
 
 
 def repeated(values: Words) -> Flags:
     """[N] which of the values [N] occur at least twice."""
-    return among(values, frequent(values[:, None], 2))
+    return among(values, frequent(values, 2))
 
 
 def among(values: Numbers, ordered: Numbers) -> Flags:

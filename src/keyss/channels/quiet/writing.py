@@ -6,7 +6,6 @@ own. Blocks of codes are all there: a secret is a header and the payload in the 
 
 from __future__ import annotations
 
-import hashlib
 import warnings
 from collections.abc import Sequence
 
@@ -58,7 +57,6 @@ class Writer:
         self.table = np.empty((len(names), width), np.uint8)
         fill(entropy, "quiet/noise", self.table)
         self.headers = 0  # carriers of headers, which are the first
-        self.places: dict[int, tuple[Integers, Integers]] = {}  # of each content: its carriers and cells
 
     def write(self, contents: Sequence[tuple[Sequence[DerivedKey], Content]]) -> None:
         """Headers in the first carriers, records in the others. Raises UsageError for too large payloads.
@@ -158,10 +156,8 @@ class Writer:
         """Records, then copies, in the cells `slots` [R] of the carriers `rows` [R]."""
         count, width = content.plan.cells_per_carrier, self._room.width
         cells = as_strided(self.table, (len(self.table), count, width // count), (width, width // count, 1))
-        split = len(content.records)
-        self.places[index] = rows[:split], slots[:split]
         copies = content.records[content.copied]
-        for label, records, at in (("record", content.records, 0), ("copy", copies, split)):
+        for label, records, at in (("record", content.records, 0), ("copy", copies, len(content.records))):
             cipher = CellCipher(self._data_key(index), label, records.shape[1])
             own, which = rows[at : at + len(records)], slots[at : at + len(records)]
             cells[own, which, : cipher.cell_bytes] = cipher.encrypt(self._names[own], records, which)
@@ -177,10 +173,6 @@ def payload_key(data_key: bytes) -> bytes:
     return expand(data_key, "payload-key", 32)
 
 
-def digest(content: Content) -> bytes:
-    """32 bytes that identify a content."""
-    if isinstance(content, Payload):
-        return hashlib.sha256(content.data).digest()
-    state = hashlib.sha256(content.header)
-    state.update(np.ascontiguousarray(content.records).data)
-    return state.digest()
+def bytes_of(content: Content) -> bytes:
+    """All that a content hides."""
+    return content.data if isinstance(content, Payload) else content.header + content.records.tobytes()

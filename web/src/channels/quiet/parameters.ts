@@ -1,40 +1,40 @@
 /** How what a key decrypts is to be read; see docs/format.md, "Parameters". */
-import { bytesKey, joined, mostFrequent, viewOf } from '../../core/bytes.ts';
+import { bytesKey, joined, viewOf } from '../../core/bytes.ts';
 import { damaged, otherVersion, tooMuchLost } from '../../core/errors.ts';
 import type { Codewords } from '../reed_solomon.ts';
 
-const VERSION = 3;
-const PREFIX_BYTES = 34;
-const NUMBERS = 29; // where cells, bytes of a record and bytes of the header begin
+const VERSION = 4;
+const PREFIX_BYTES = 30;
+const NUMBERS = 17; // where cells, bytes of a record and of the header, Gaussians and records begin
 const MAX_CELLS = 4;
 const MAX_HEADER_BYTES = 4096;
 const [MAX_LENGTH, MAX_CHUNKS] = [1 << 13, 1 << 24]; // of one codeword, of all
 export const NUMBER_BYTES = 3; // of a chunk of a payload
 
-/** The parameters of records; a carrier holds `cells` of them. */
+/** The parameters of `count` records and copies; a carrier holds `cells` of them. */
 export interface Parameters {
   readonly isPayload: boolean; // whose records are numbered chunks
   readonly method: string;
   readonly cells: number;
   readonly recordBytes: number;
+  readonly gaussians: number; // of the model in which the secret was hidden
+  readonly count: number;
   readonly header: Uint8Array;
 }
 
-/** From decrypted parts in any order; of parts with one number the most frequent counts. Raises InputError. */
+/** From decrypted parts in any order. Raises InputError. */
 export function unpackParameters(parts: Uint8Array[]): Parameters {
-  const best = new Map<number, Uint8Array>();
-  for (const number of new Set(parts.map((part) => part[0]))) {
-    best.set(number, mostFrequentOf(parts.filter((part) => part[0] === number))!.subarray(1));
-  }
-  const prefix = firstBytes(best, PREFIX_BYTES);
+  const numbered = new Map(parts.map((part) => [part[0], part.subarray(1)]));
+  const prefix = firstBytes(numbered, PREFIX_BYTES);
   const [version, service] = prefix;
   if (version !== VERSION) throw otherVersion();
   const [cells, view] = [prefix[NUMBERS], viewOf(prefix)];
   const [recordBytes, length] = [view.getUint16(NUMBERS + 1, true), view.getUint16(NUMBERS + 3, true)];
+  const [gaussians, count] = [view.getUint32(NUMBERS + 5, true), view.getUint32(NUMBERS + 9, true)];
   if (service < 1 || service > 2 || cells < 1 || cells > MAX_CELLS || length > MAX_HEADER_BYTES) throw damaged();
-  const method = bytesKey(prefix.subarray(2, 17)).replace(/\0+$/, '');
-  const header = firstBytes(best, PREFIX_BYTES + length).subarray(PREFIX_BYTES);
-  return { isPayload: service === 1, method, cells, recordBytes, header };
+  const method = bytesKey(prefix.subarray(2, NUMBERS)).replace(/\0+$/, '');
+  const header = firstBytes(numbered, PREFIX_BYTES + length).subarray(PREFIX_BYTES);
+  return { isPayload: service === 1, method, cells, recordBytes, gaussians, count, header };
 }
 
 /** Bytes of the encrypted payload, and its codewords, from the header of a payload. Raises InputError. */
@@ -46,12 +46,6 @@ export function unpackCodewords({ header, recordBytes }: Parameters): [number, C
   const possible = count >= 1 && count * n <= MAX_CHUNKS && k >= 1 && k <= n && n <= MAX_LENGTH && width % 2 === 0;
   if (!possible || size < 1 || size > count * k * width) throw damaged();
   return [size, { count, n, k, width }];
-}
-
-/** Of equal byte strings those that occur most; the first of several. */
-export function mostFrequentOf(all: Uint8Array[]): Uint8Array | undefined {
-  const best = mostFrequent(all.map(bytesKey));
-  return best && all.find((each) => bytesKey(each) === best[0]);
 }
 
 function firstBytes(parts: Map<number, Uint8Array>, length: number): Uint8Array {

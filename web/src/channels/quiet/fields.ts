@@ -1,6 +1,6 @@
 /**
  * Which numbers of a file's codes carry bits, how many each, and in which order these are counted;
- * `keyss.channels.codes.fields` and `order` on the other side. A .sog is sorted by what is written; its bits are counted
+ * `keyss.channels.quiet.fields` and `order` on the other side. A .sog is sorted by what is written; its bits are counted
  * in an order of what is not.
  *
  * All of it is arithmetic that is the same on every machine, in the same order as there, and no logarithms: a bit more or

@@ -16,10 +16,14 @@ export function salts(fields: Fields, names: Uint8Array, low: Uint8Array, size: 
     compared(names, a, b, IDENTITY_BYTES) ||
     compared(low, a, b, size);
   const order = Array.from(ranks.keys()).sort(compare);
-  return order.slice(0, SALTS).map((row) => {
-    const name = names.subarray(row * IDENTITY_BYTES, (row + 1) * IDENTITY_BYTES);
-    return sha256(joined(LABEL, name, low.subarray(row * size, (row + 1) * size))).slice(0, 16);
-  });
+  return order.slice(0, SALTS).map((row) =>
+    saltOf(names.subarray(row * IDENTITY_BYTES, (row + 1) * IDENTITY_BYTES), low.subarray(row * size, (row + 1) * size)),
+  );
+}
+
+/** The salt of one carrier. */
+export function saltOf(name: Uint8Array, low: Uint8Array): Uint8Array {
+  return sha256(joined(LABEL, name, low)).slice(0, 16);
 }
 
 function compared(rows: Uint8Array, a: number, b: number, width: number): number {

@@ -1,6 +1,6 @@
 import { expect, test } from 'vitest';
-import { CellCipher } from '../src/channels/low_bits/cells.ts';
-import { LowBitsReader } from '../src/channels/low_bits/reader.ts';
+import { CellCipher } from '../src/channels/quiet/cells.ts';
+import { QuietReader } from '../src/channels/quiet/reading.ts';
 import { selected } from '../src/core/gaussians.ts';
 import { readPly, writePly } from '../src/files/ply.ts';
 import { decrypted } from '../src/keys/keys.ts';
@@ -11,7 +11,7 @@ const REVEALED = jsonVector<{ file: string; key: string; payload?: string }[]>('
 const CARRIED = jsonVector<{ key: string; wrong: string }>('carried.json');
 
 test('another key opens nothing', async () => {
-  const reader = LowBitsReader.of(readPly(vector('carried.ply')));
+  const reader = QuietReader.of(readPly(vector('carried.ply')))!;
   expect(await reader.open(CARRIED.wrong)).toBeNull();
 });
 
@@ -19,14 +19,14 @@ test('a payload comes out whole when a tenth of the model is gone, in any order'
   const { key, payload } = REVEALED.find((each) => each.file === 'keyss.ply')!;
   const model = readPly(vector('keyss.ply'));
   const rows = Array.from({ length: model.count }, (_, row) => (row * 701) % model.count);
-  const content = await LowBitsReader.of(selected(model, rows.filter((row) => row % 10))).open(key);
+  const content = await QuietReader.of(selected(model, rows.filter((row) => row % 10)))!.open(key);
   expect(content?.service === 'payload' && digest(content.data)).toBe(payload);
 });
 
 test('one changed bit costs one Gaussian at most', async () => {
   const model = readPly(vector('carried.ply'));
   new Uint32Array(model.sh.buffer)[5 * 48 + 20] ^= 1 << 6;
-  const content = await LowBitsReader.of(model).open(CARRIED.key);
+  const content = await QuietReader.of(model)!.open(CARRIED.key);
   expect(secretOf(content!, model)!.gaussians.count).toBeGreaterThanOrEqual(7);
 });
 

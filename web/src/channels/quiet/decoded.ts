@@ -1,5 +1,5 @@
 /**
- * The codes behind a .ply that a program decoded from a .spz, .sog or compressed .ply; `keyss.channels.codes.decoded` on
+ * The codes behind a .ply that a program decoded from a .spz, .sog or compressed .ply; `keyss.channels.quiet.decoded` on
  * the other side.
  */
 import type { Gaussians } from '../../core/gaussians.ts';
