@@ -86,8 +86,8 @@ def rows(cover: tuple[str, Gaussians], secret: tuple[str, Gaussians], data: Path
         start = time.monotonic()
         opened = whole.decode(QuietReader.of_codes(format_.parse(file)).open(KEY).data)
         revealing = time.monotonic() - start
-        bits = 8 * prepared.size / len(model)
-        most = prepared.size * 8 / (8 * len(whole.encode(kept)) / len(kept)) / len(model)
+        bits = 8 * left / len(model)
+        most = 8 * left / (8 * len(whole.encode(kept)) / len(kept)) / len(model)
         in_format = format_.quantise(in_morton_order(kept)).dequantise()
         numbers = [
             *(against_photos(each, scenes[0]) for each in (untouched, stego)),
@@ -114,7 +114,7 @@ def attributes(name: str, model: Gaussians) -> None:
             free = [each & one for each, one in zip(cover.free, own, strict=True)]
             bits = sum(each.room for each, one in zip(cover.fields, own, strict=True) if one) / len(model)
             # Others may not change: too few are free to hold anything, so the bits that are get noise.
-            noise = np.random.default_rng(0).integers(0, 2, cover.zones.bits).astype(np.uint8)
+            noise = np.random.default_rng(0).integers(0, 2, len(cover.dry)).astype(np.uint8)
             changed = replace(cover, codes=replace(cover, free=free)._written(noise, os.urandom(32))).cover
             found.append(f"{attribute} {bits:.1f} bits {psnr_between(untouched, changed):.1f} dB")
         print(f"{name}, {format_name}: {', '.join(found)}", flush=True)

@@ -29,11 +29,7 @@ _RENDERS = 6  # of each test view, to measure
 _STATE_COPIES = 3  # numbers in a checkpoint for each number of a model: itself and two moments
 _MAX_APPENDED = 7  # Gaussians that hold one Gaussian of a secret of SH degree 3
 # About the most bytes of a packed Gaussian without harmonics, and of each of these.
-_PACKED: dict[Format, tuple[float, float]] = {
-    "spz": (15, 0.3),
-    "sog": (18, 0.7),
-    "compressed-ply": (16.3, 1),
-}
+_PACKED: dict[Format, tuple[float, float]] = {"spz": (15, 0.3), "sog": (18, 0.7), "compressed-ply": (16.3, 1)}
 _PACKED_APPENDED: dict[Format, float] = {"spz": 12, "sog": 15, "compressed-ply": 61.3}  # bytes
 _OTHER_BYTES = 4 << 20  # JSON files, locks, and the overhead of the file system
 
@@ -199,7 +195,7 @@ def _floats(sh_degree: int) -> int:
 
 def _file_bytes(gaussians: int, sh_degree: int, format: Format | None = None) -> int:
     """Size of a model's file: of a `.ply`, which has normals too, exactly; else about the most."""
-    if format not in _PACKED:
+    if format is None or format not in _PACKED:
         return 4 * gaussians * (3 + _floats(sh_degree)) + 2048
     without, harmonic = _PACKED[format]
     return round(gaussians * (without + harmonic * (_floats(sh_degree) - _floats(0)))) + 2048

@@ -99,7 +99,7 @@ def test_every_usable_gaussian_is_written_whether_it_carries_or_not(cover: Gauss
         assert ((counts - counts.mean()) ** 2).sum() / counts.mean() < 255 + 6 * (2 * 255) ** 0.5
         carriers = QuietReader.of(stego)
         carried = extract_derived(carriers, own[0])
-        cells, _ = key_cipher(own[0]).decrypt(carriers.identities, carriers.low)
+        cells, _ = key_cipher(own[0]).decrypt(carriers.names, carriers.low)
         seen.append((carried.count, len(carried.gaussians), int(cells.sum())))
         with pytest.raises(WrongKeyError):
             extract_derived(carriers, keys(3)[0])  # a third key hides nothing
@@ -221,7 +221,7 @@ def test_too_much_pruning_is_said_to_the_holder_of_the_key_only(cover: Gaussians
     own = keys()
     stego = embed_derived(cover, [(own, secret)], entropy=ENTROPY)
     carriers = QuietReader.of(stego)
-    cells, _ = key_cipher(own[0]).decrypt(carriers.identities, carriers.low)
+    cells, _ = key_cipher(own[0]).decrypt(carriers.names, carriers.low)
     keep = np.zeros(len(stego), bool)
     keep[np.flatnonzero(cells)[:2]] = True
     with pytest.raises(WrongKeyError):  # nothing but key cells: as good as nothing
