@@ -21,7 +21,7 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
 import keyss
-from channels.low_bits.trained_like import trained_like
+from channels.quiet.trained_like import trained_like
 from keyss.channels import APPENDED, LOW_BITS
 from keyss.core.errors import WrongKeyError
 from keyss.core.gaussians import Gaussians

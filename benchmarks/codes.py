@@ -22,8 +22,8 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
-from keyss.channels import SUFFIXES, CodesChannel, CodesReader, Payload
-from keyss.channels.codes.fields import FORMATS
+from keyss.channels import SUFFIXES, InCodes, Payload, QuietReader
+from keyss.channels.quiet.fields import FORMATS
 from keyss.core import Gaussians, Scene
 from keyss.files import write_bytes
 from keyss.files.formats.common import in_morton_order
@@ -76,7 +76,7 @@ def rows(cover: tuple[str, Gaussians], secret: tuple[str, Gaussians], data: Path
         model = in_morton_order(cover[1])
         untouched = format_.quantise(model).dequantise()
         start = time.monotonic()
-        prepared = CodesChannel(name).prepare(cover[1])
+        prepared = InCodes(name).prepare(cover[1])
         left = prepared.room.capacity - prepared.room.overhead
         kept = pruned(own, left)
         encoded = fitted(kept, left)
@@ -84,10 +84,10 @@ def rows(cover: tuple[str, Gaussians], secret: tuple[str, Gaussians], data: Path
         file = stego.codes.serialise()
         hiding = time.monotonic() - start
         start = time.monotonic()
-        opened = whole.decode(CodesReader.of(format_.parse(file)).open(KEY).data)
+        opened = whole.decode(QuietReader.of_codes(format_.parse(file)).open(KEY).data)
         revealing = time.monotonic() - start
-        bits = 8 * prepared.size / len(model)
-        most = prepared.size * 8 / (8 * len(whole.encode(kept)) / len(kept)) / len(model)
+        bits = 8 * left / len(model)
+        most = 8 * left / (8 * len(whole.encode(kept)) / len(kept)) / len(model)
         in_format = format_.quantise(in_morton_order(kept)).dequantise()
         numbers = [
             *(against_photos(each, scenes[0]) for each in (untouched, stego)),
@@ -105,7 +105,7 @@ def rows(cover: tuple[str, Gaussians], secret: tuple[str, Gaussians], data: Path
 def attributes(name: str, model: Gaussians) -> None:
     """What each attribute costs alone: PSNR in dB against the untouched file, and bits of a Gaussian."""
     for format_name in FORMATS:
-        cover = CodesChannel(format_name).prepare(model)
+        cover = InCodes(format_name).prepare(model)
         untouched = cover.cover
         written = cover.embed([(KEY, Payload("carry", b""))])
         found = [f"all {psnr_between(untouched, written):.1f} dB"]
@@ -114,7 +114,7 @@ def attributes(name: str, model: Gaussians) -> None:
             free = [each & one for each, one in zip(cover.free, own, strict=True)]
             bits = sum(each.room for each, one in zip(cover.fields, own, strict=True) if one) / len(model)
             # Others may not change: too few are free to hold anything, so the bits that are get noise.
-            noise = np.random.default_rng(0).integers(0, 2, cover.zones.bits).astype(np.uint8)
+            noise = np.random.default_rng(0).integers(0, 2, len(cover.dry)).astype(np.uint8)
             changed = replace(cover, codes=replace(cover, free=free)._written(noise, os.urandom(32))).cover
             found.append(f"{attribute} {bits:.1f} bits {psnr_between(untouched, changed):.1f} dB")
         print(f"{name}, {format_name}: {', '.join(found)}", flush=True)
@@ -126,7 +126,7 @@ def files(folder: Path, format_name: str, models: list[str]) -> None:
     found = []
     for each in models:
         scene, _, path = each.partition("=")
-        cover = CodesChannel(format_name).prepare(read_model(path))
+        cover = InCodes(format_name).prepare(read_model(path))
         plain, stego = (
             folder / f"{Path(path).stem}-{kind}{SUFFIXES[format_name]}" for kind in ("plain", "stego")
         )

@@ -14,8 +14,8 @@ from keyss.files import read_model
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
-from channels.low_bits.payloads import embed_derived
-from channels.low_bits.trained_like import keys
+from channels.quiet.payloads import embed_derived
+from channels.quiet.trained_like import keys
 from keyss.lab.stealth.agreement import count_coincidences
 from keyss.lab.stealth.statistic import BitPatterns
 

@@ -4,7 +4,7 @@
 
 In each model one secret is hidden alone, and beside one to three others, as carried models and as sealed
 payloads. The holder opens his own, tries every cell of the file with his key
-(`tests/channels/low_bits/holder.py`), and takes the statistics of `keyss.lab.stealth` besides. Detectors
+(`tests/channels/quiet/holder.py`), and takes the statistics of `keyss.lab.stealth` besides. Detectors
 learn from all scenes but one.
 """
 
@@ -28,9 +28,9 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
-from channels.low_bits import payloads
-from channels.low_bits.holder import seen_by_holder
-from channels.low_bits.trained_like import keys
+from channels.quiet import payloads
+from channels.quiet.holder import seen_by_holder
+from channels.quiet.trained_like import keys
 from keyss.core import UsageError
 from keyss.lab import stealth_statistics
 from keyss.methods import most_visible

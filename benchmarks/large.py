@@ -2,7 +2,7 @@
 
     python benchmarks/large.py                                # 2 million in 2 million
     python benchmarks/large.py --count 100000 --repeat 3      # the fastest of three
-    python benchmarks/large.py --secret-degree 0 --publish spz --count 100000 --prune
+    python benchmarks/large.py --secret-degree 0 --format spz --count 100000 --prune
     python benchmarks/large.py --commands                     # `keyss hide`, pictures and measures included
 
 Each step is a process of its own, key derivation, reading back what was hidden and imports included; kernels
@@ -31,8 +31,8 @@ import torch
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
 from keyss import read_model, write_model
-from channels.low_bits.trained_like import trained_like
-from keyss.channels import LOW_BITS
+from channels.quiet.trained_like import trained_like
+from keyss.channels import LOW_BITS, channel_for
 from keyss.methods import embed_models, most_visible, pruned, record_request
 from keyss.runs.revealing import reveal_model
 
@@ -87,7 +87,7 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=2_000_000, help="Gaussians of the cover, of SH degree 3")
     parser.add_argument("--share", type=float, default=1.0, help="Gaussians of the secret for each of these")
     parser.add_argument("--secret-degree", type=int, default=3, help="of its spherical harmonics")
-    parser.add_argument("--publish", default="ply", choices=["ply", "spz", "sog", "compressed-ply", "any"])
+    parser.add_argument("--format", default="ply", choices=["ply", "spz", "sog", "compressed-ply", "any"])
     parser.add_argument("--prune", action="store_true", help="leave out what does not fit")
     parser.add_argument("--repeat", type=int, default=1, help="runs of each step; the fastest counts")
     parser.add_argument("--commands", action="store_true", help="of the command line, with all that it does")
@@ -129,7 +129,7 @@ def _fastest(step: str, folder: Path, options: argparse.Namespace) -> Cost:
 
 
 def _arguments(options: argparse.Namespace) -> list[str]:
-    names = ("count", "share", "secret_degree", "publish")
+    names = ("count", "share", "secret_degree", "format")
     pairs = [part for name in names for part in ("--" + name.replace("_", "-"), str(getattr(options, name)))]
     return [*pairs, "--prune"] if options.prune else pairs
 
@@ -138,9 +138,10 @@ def _command(step: str, folder: Path, options: argparse.Namespace) -> list[str]:
     run, key = [sys.executable, "-m", "keyss", step], ["--key-file", str(folder / "key.txt"), "--overwrite"]
     if step == "hide":
         models = ["--cover", str(folder / "cover.ply"), "--secret", str(folder / "secret.ply")]
-        carry = ["--method", "carry", "--publish", options.publish, *["--prune-to-fit"][: options.prune]]
+        published = ["--publish", "any"] if options.format == "any" else ["--format", options.format]
+        carry = ["--method", "carry", *published, *["--prune-to-fit"][: options.prune]]
         return [*run, *carry, *models, *key, "-o", f"{folder}/run"]
-    suffix = "ply" if options.publish in ("ply", "any") else options.publish.replace("-", ".")
+    suffix = "ply" if options.format == "any" else options.format.replace("-", ".")
     return [*run, f"{folder}/run/publish/model.{suffix}", *key, "-o", f"{folder}/revealed.ply"]
 
 
@@ -157,7 +158,7 @@ def _run(command: list[str]) -> Cost:
 
 
 def _step(step: str, folder: Path, options: argparse.Namespace) -> None:
-    suffix = "ply" if options.publish in ("ply", "any") else options.publish.replace("-", ".")
+    suffix = "ply" if options.format == "any" else options.format.replace("-", ".")
     published = folder / f"stego.{suffix}"
     hidden = max(1, round(options.share * options.count))
     if step == "make":
@@ -168,14 +169,16 @@ def _step(step: str, folder: Path, options: argparse.Namespace) -> None:
     elif step == "hide":
         with ThreadPoolExecutor(2) as readers:  # as `keyss hide` does
             cover, secret = readers.map(read_model, (folder / "cover.ply", folder / "secret.ply"))
-        if options.publish in ("auto", "ply"):
+        if options.format == "ply":
             prepared = LOW_BITS.prepare(cover)
             if options.prune:
                 secret = most_visible(
                     secret, prepared.cells.record_capacity([record_request(hidden, secret.sh_degree)])
                 )
         else:
-            prepared = options.place.prepare(cover)
+            any_format = options.format == "any"
+            channel = channel_for("any") if any_format else channel_for("as-is", format=options.format)
+            prepared = channel.prepare(cover)
             if options.prune:
                 secret = pruned(secret, prepared.room.capacity - prepared.room.overhead)
         write_model(published, embed_models(prepared, [KEY], [secret]).gaussians)

@@ -36,8 +36,8 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
-from channels.low_bits.payloads import embed_derived
-from channels.low_bits.trained_like import keys, rounded
+from channels.quiet.payloads import embed_derived
+from channels.quiet.trained_like import keys, rounded
 from keyss.core import Gaussians, UsageError
 from keyss.lab import candidate_scores, stealth_statistics
 from keyss.methods.carry.room import CarryOptions, RecordRoom

@@ -2,9 +2,10 @@
 
     python benchmarks/survival.py MODEL.ply [--bytes N] [--gaussians N] [--photos FOLDER] [--width PIXELS]
 
-A file of random bytes is hidden in the model for `--publish ply` (low bits), `spz` (codes) and `any` (colours
-and appended Gaussians). After each change it is looked for with its key. With `--photos` the model, of that
-scene, is trained on as well. Keys skip Argon2id, which has nothing to do with what is measured.
+A file of random bytes is hidden in the model as it is, in a `.ply` (low bits) and an `.spz` (codes), and for
+`--publish any` (colours and appended Gaussians). After each change it is looked for with its key. With
+`--photos` the model, of that scene, is trained on as well. Keys skip Argon2id, which has nothing to do with
+what is measured.
 
 pip install gsply npm install --no-save @playcanvas/splat-transform@2.7.1   (or KEYSS_SPLAT_TRANSFORM)
 """
@@ -30,8 +31,8 @@ import torch
 
 KEY = "a key of the benchmark 4711"
 CHANNELS: dict[str, dict[str, Any]] = {
-    "low bits (`ply`)": {"publish": "ply"},
-    "codes (`spz`)": {"publish": "spz"},
+    "low bits (`ply`)": {"publish": "as-is"},
+    "codes (`spz`)": {"format": "spz"},
     "colours (`any`)": {"publish": "any", "channel": "colours"},
     "appended (`any`)": {"publish": "any", "channel": "appended"},
 }

@@ -280,7 +280,7 @@ def test_given_models_without_room_are_refused_before_any_work(folders: tuple[Pa
     models = [random_gaussians(200, seed=seed) for seed in (0, 1)]
     secret = Secret(folders[1], "key", models[1])
     with pytest.raises(UsageError, match=r"cover of 200 Gaussians is too small.*`publish=.any.`"):
-        keyss.hide(folders[0], [secret], cover_model=models[0], publish="ply")
+        keyss.hide(folders[0], [secret], cover_model=models[0], format="ply")
 
 
 def test_python_and_command_line_write_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -12,9 +12,9 @@ from pathlib import Path
 
 import pytest
 
-from channels.low_bits.trained_like import trained_like
+from channels.quiet.trained_like import trained_like
 from files.scene_files import write_blender, write_nerfstudio
-from keyss.channels import LowBitsReader
+from keyss.channels import QuietReader
 from keyss.cli import commands, entry, main
 from keyss.core import KeyssError
 from keyss.keys import DerivedKey
@@ -122,5 +122,5 @@ def test_errors_and_representations_do_not_show_the_key() -> None:
     assert KEY not in repr(derived)
     assert derived.expand("writer", 32).hex() not in repr(derived)
     with pytest.raises(KeyssError) as caught:
-        LowBitsReader.of(trained_like(50)).open(KEY)
+        QuietReader.of(trained_like(50)).open(KEY)
     assert not _spelt(str(caught.value).encode())

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 import keyss
-from channels.low_bits.trained_like import trained_like
+from channels.quiet.trained_like import trained_like
 from fitting.test_plain import InterruptAt
 from keyss import CarryOptions, FitConfig, Gaussians, Secret
-from keyss.channels import AppendedReader, LowBitsReader, is_appended
+from keyss.channels import AppendedReader, QuietReader, is_appended
 from keyss.core import Interrupted, OutputError, WrongKeyError
 from keyss.keys import DerivedKey, derivation
 from keyss.methods import MethodOptions
@@ -85,13 +85,13 @@ def test_a_table_made_for_one_hiding_opens_no_other_of_its_seed(options: MethodO
         stegos.append(hidden.stego)
     common = salts[0] & salts[1]
     for own, stego in zip(salts, stegos, strict=True):
-        readers = [each for each in (LowBitsReader.of(stego), AppendedReader.of(stego)) if each]
+        readers = [each for each in (QuietReader.of(stego), AppendedReader.of(stego)) if each]
         assert common <= {salt for each in readers for salt in each.salts}
         assert not any(_opens(each, salt) for each in readers for salt in common)
         assert any(_opens(each, salt) for each in readers for salt in own)
 
 
-def _opens(reader: LowBitsReader | AppendedReader, salt: bytes) -> bool:
+def _opens(reader: QuietReader | AppendedReader, salt: bytes) -> bool:
     try:
         reader.extract(DerivedKey.of(KEY, salt))
     except WrongKeyError:

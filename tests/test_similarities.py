@@ -81,7 +81,7 @@ def test_a_scene_far_out_says_where_it_is(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("scale", [1e-4, 1e-3, 1.0, 1e6])
-@pytest.mark.parametrize("publish", ["ply", "any"])
+@pytest.mark.parametrize("publish", ["as-is", "any"])
 def test_hiding_in_a_model_of_any_unit(publish: str, scale: float) -> None:
     cover = Similarity(scale).apply_gaussians(random_gaussians(2500, seed=1))
     noise = torch.Generator().manual_seed(0)

@@ -7,11 +7,11 @@ import pytest
 import torch
 from scipy.stats import kstest, spearmanr
 
-from channels.low_bits.trained_like import trained_like
-from keyss.channels import LowBitsReader, Payload
+from channels.quiet.trained_like import trained_like
+from keyss.channels import Payload, QuietReader
 from keyss.channels.harmonics import RANKS, Harmonics, high_harmonics, pads, row_names, with_high_harmonics
-from keyss.channels.low_bits.bits import read_low_bits
-from keyss.channels.low_bits.channel import LOW_BITS
+from keyss.channels.quiet.bits import read_low_bits
+from keyss.channels.quiet.channel import LOW_BITS
 from keyss.core import Gaussians, InputError
 
 COUNT = 24
@@ -121,4 +121,4 @@ def test_low_bits_of_high_harmonics_stay_where_latents_lie() -> None:
     assert not changed[21:].any()
     chosen = torch.randperm(4000, generator=torch.Generator().manual_seed(0))[:3200]
     for model in (stego, stego[chosen]):
-        assert LowBitsReader.of(model).open("a key") == payload
+        assert QuietReader.of(model).open("a key") == payload

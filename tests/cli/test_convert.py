@@ -10,7 +10,7 @@ import pytest
 import torch
 
 import keyss as package
-from channels.low_bits.trained_like import trained_like
+from channels.quiet.trained_like import trained_like
 from cli.said import PROGRAM, Run, assert_refused, write_key
 from keyss.core import Similarity
 from keyss.files import read_model, write_model

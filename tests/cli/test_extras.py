@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 
 import cheap_keys
-from channels.low_bits.trained_like import trained_like
+from channels.quiet.trained_like import trained_like
 from files.scene_files import write_blender, write_nerfstudio
 from keyss.files import write_model
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 import keyss as library
-from channels.low_bits.trained_like import trained_like
+from channels.quiet.trained_like import trained_like
 from cli.said import SMALL, Run, write_key
 from keyss.files import write_model
 
@@ -54,7 +54,7 @@ def test_what_is_lost_is_said(keyss: Run) -> None:
     assert said.status == 0, said.err
     kept = len(library.reveal("run/publish/model.ply", KEY).gaussians)
     assert f"The secret kept {kept:,} of 2,500 Gaussians, " in said.out
-    refused = keyss(*HIDE, "--secret", "large.ply", "--prune-to-fit", "--publish", "spz", "-o", "poor")
+    refused = keyss(*HIDE, "--secret", "large.ply", "--prune-to-fit", "--format", "spz", "-o", "poor")
     assert refused.status == 7
     assert "of 2,500 Gaussians is at" in refused.err
     assert not Path("poor/publish").exists()
@@ -65,7 +65,7 @@ def test_a_cover_without_harmonics_gets_the_room_that_the_refusal_promises(keyss
     shown = keyss(*flat, "--secret", "small.ply", "-o", "shown")
     assert shown.status == 0, shown.err
     assert "whoever inspects the published file sees that it holds something" in shown.err.splitlines()[0]
-    refused = keyss(*flat, "--secret", "small.ply", "--publish", "ply", "-o", "run")
+    refused = keyss(*flat, "--secret", "small.ply", "--format", "ply", "-o", "run")
     assert refused.status == 2
     assert "--sh-degree 1 makes room" in refused.err
     done = keyss(*flat, "--secret", "small.ply", "--sh-degree", "1", "--iterations", "5", "-o", "run")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from channels.low_bits.trained_like import trained_like
+from channels.quiet.trained_like import trained_like
 from cli.said import Run, write_key
 from files.test_ply import columns_of, ply_bytes
 from keyss.core import Gaussians, same_bits
@@ -74,9 +74,9 @@ def test_rows_that_are_left_out_take_theirs_along(keyss: Run, tmp_path: Path) ->
 @pytest.mark.parametrize(
     ("what", "publish"),
     [
-        ("--secret", ["ply"]),
+        ("--secret", ["as-is"]),
         ("--secret", ["any"]),
-        ("--secret-file", ["ply"]),
+        ("--secret-file", ["as-is"]),
         ("--secret-file", ["any"]),
         ("--secret-file", ["any", "--channel", "colours"]),
     ],

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from channels.low_bits.trained_like import trained_like
+from channels.quiet.trained_like import trained_like
 from cli.said import SMALL, Run, assert_refused, write_key
 from keyss.files import read_model, write_model
 

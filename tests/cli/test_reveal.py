@@ -13,12 +13,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from channels.codes.published import codes_of, model_of
-from channels.low_bits.trained_like import trained_like
+from channels.quiet.coded import codes_of, model_of
+from channels.quiet.trained_like import trained_like
 from cli.said import PROGRAM, Run, Said, assert_refused, listing, write_key
 from keyss.channels import LOW_BITS, CodesCover, Payload, base
 from keyss.channels.colours import carriers
-from keyss.channels.low_bits import cells
+from keyss.channels.quiet import cells
 from keyss.core import Gaussians
 from keyss.files import read_model, write_model
 from keyss.keys import DerivedKey

@@ -11,7 +11,7 @@ from hypothesis import given, strategies as st
 
 import keyss as library
 from channels.colours.made import cover
-from channels.low_bits.trained_like import trained_like
+from channels.quiet.trained_like import trained_like
 from cli.said import Run, assert_refused, listing, write_key
 from keyss import write_model
 from keyss.channels import Payload, pack_payload, unpack_payload
@@ -86,15 +86,15 @@ def test_a_file_too_large_for_its_cover_is_told_what_would_do(tmp_path: Path) ->
 
 
 @pytest.mark.parametrize(
-    ("publish", "words"),
+    ("format", "words"),
     [("ply", "only 0% of the cover's Gaussians"), ("spz", "this cover of 2,000")],
 )
 def test_covers_without_room_are_named_and_have_one_status(
-    keyss: Run, folder: Path, tmp_path: Path, publish: str, words: str
+    keyss: Run, folder: Path, tmp_path: Path, format: str, words: str
 ) -> None:
     write_model(tmp_path / "rounded.ply", trained_like(2000).map(lambda each: each.half().float()))
     _, _, _, *others = _arguments(folder, tmp_path / "out")
-    hide = ("hide", "--cover", tmp_path / "rounded.ply", *others, "--publish", publish)
+    hide = ("hide", "--cover", tmp_path / "rounded.ply", *others, "--format", format)
     assert_refused(keyss(*hide), 2, words)
 
 

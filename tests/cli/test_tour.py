@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from channels.low_bits.trained_like import trained_like
+from channels.quiet.trained_like import trained_like
 from cli.said import SMALL, Run, Said
 from files.scene_files import write_blender, write_nerfstudio
 from keyss.demo import OPTIONS, run_demo

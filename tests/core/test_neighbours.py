@@ -9,8 +9,8 @@ import pytest
 import torch
 from scipy.spatial.distance import cdist
 
-from keyss.channels.codes.fields import carrying
-from keyss.channels.codes.kept import changeable
+from keyss.channels.quiet.fields import carrying
+from keyss.channels.quiet.kept import changeable
 from keyss.core import Gaussians
 from keyss.core.neighbours import nearest_neighbours
 from keyss.files.formats.spz import SpzCodes

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from channels.low_bits.trained_like import trained_like
+from channels.quiet.trained_like import trained_like
 from keyss.core import BackendError, Gaussians, Scene, UsageError, same_bits
 from keyss.fitting import mean_psnr
 from keyss.lab import (

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 import keyss
-from channels.low_bits.trained_like import trained_like
+from channels.quiet.trained_like import trained_like
 from keyss import CarryOptions
 from keyss.channels import LOW_BITS
 from keyss.core import Gaussians, KeyssWarning, Scene, Similarity, UsageError, WrongKeyError, same_bits
@@ -131,9 +131,9 @@ def pair() -> tuple[list[Scene], list[Gaussians]]:
     return [scenes[0], scenes[2]], [random_gaussians(1500, seed=0), random_gaussians(200, seed=2)]
 
 
-@pytest.mark.parametrize("publish", ["ply", "any"])
+@pytest.mark.parametrize("publish", ["as-is", "any"])
 def test_a_refitted_secret_without_low_bits(
-    publish: Literal["ply", "any"], pair: tuple[list[Scene], list[Gaussians]]
+    publish: Literal["as-is", "any"], pair: tuple[list[Scene], list[Gaussians]]
 ) -> None:
     scenes, models = pair
     config = CarryOptions(

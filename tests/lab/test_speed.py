@@ -11,7 +11,7 @@ import plyfile
 import pytest
 import torch
 
-from channels.low_bits.trained_like import trained_like
+from channels.quiet.trained_like import trained_like
 from keyss.core import Gaussians, Scene
 from keyss.files import write_model
 from keyss.lab import ReaderResult, measure_speed, readers, render_time, reveal_seconds, speed as module

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from channels.low_bits.trained_like import keys, trained_like
+from channels.quiet.trained_like import keys, trained_like
 from keyss.channels import APPENDED, LOW_BITS, Channel
 from keyss.core import Gaussians, same_bits
 from keyss.methods import Decoy, embed_models, open_model

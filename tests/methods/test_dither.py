@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from channels.low_bits.trained_like import keys, trained_like
-from keyss.channels import LOW_BITS, LowBitsReader
+from channels.quiet.trained_like import keys, trained_like
+from keyss.channels import LOW_BITS, QuietReader
 from keyss.core import Gaussians, UsageError, same_bits
 from keyss.methods import dither_model
 from keyss.rendering import psnr_between
@@ -51,7 +51,7 @@ def test_quantised_models_can_carry_again_and_would_be_rounded_back(
         assert (change(after) == before).float().mean() > 0.99, name
     own = keys()
     stego = embed_derived(fine, [(own, model[:1000])])
-    assert len(extract_derived(LowBitsReader.of(stego), own[0]).gaussians) == 1000
+    assert len(extract_derived(QuietReader.of(stego), own[0]).gaussians) == 1000
 
 
 def test_an_added_offset_is_noticed_and_dithered(model: Gaussians) -> None:

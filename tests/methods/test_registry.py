@@ -13,7 +13,7 @@ import pytest
 import torch
 
 import keyss
-from channels.low_bits.trained_like import trained_like
+from channels.quiet.trained_like import trained_like
 from cli.said import Run, assert_refused
 from keyss import Gaussians, Secret
 from keyss.channels import LOW_BITS, Content, Payload

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 import keyss
-from channels.low_bits.trained_like import trained_like
+from channels.quiet.trained_like import trained_like
 from fitting.test_plain import InterruptAt
 from keyss import CarryOptions, FitConfig, Gaussians, Secret
 from keyss.core import Interrupted

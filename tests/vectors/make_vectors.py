@@ -31,21 +31,12 @@ from cryptography.hazmat.primitives.hashes import SHA256  # noqa: E402
 from cryptography.hazmat.primitives.kdf.hkdf import HKDFExpand  # noqa: E402
 from scipy.spatial.transform import Rotation  # noqa: E402
 
-from channels.codes import published as codes_examples  # noqa: E402
-from channels.low_bits.trained_like import trained_like  # noqa: E402
+from channels.quiet import coded  # noqa: E402
+from channels.quiet.trained_like import trained_like  # noqa: E402
 from channels.test_harmonics import heavy_tailed  # noqa: E402
 from files.formats.examples import model_of, random_compressed, random_sog, random_spz  # noqa: E402
-from keyss.channels import (  # noqa: E402
-    LOW_BITS,
-    SUFFIXES,
-    CodesChannel,
-    Payload,
-    in_counted_order,
-    last_bits,
-    open_content,
-    quiet_channel,
-)
-from keyss.channels.codes.fields import _log2  # noqa: E402
+from keyss.channels import LOW_BITS, SUFFIXES, Payload, channel_for, in_counted_order, last_bits, open_content  # noqa: E402
+from keyss.channels.quiet.fields import _log2  # noqa: E402
 from keyss.core.gaussians import Gaussians  # noqa: E402
 from keyss.core.similarity import Similarity  # noqa: E402
 from keyss.files import read_model, write_model  # noqa: E402
@@ -95,7 +86,7 @@ def derivation() -> dict[str, object]:
     for vector in vectors["valid"]:
         key, salt = unicodedata.normalize("NFKC", vector["key"]).encode(), bytes.fromhex(vector["salt"])
         master = hash_secret_raw(key, salt, 3, 64 * 1024, 4, 32, Type.ID)
-        for label in ("writer", "low-bits/key"):
+        for label in ("writer", "quiet/key"):
             expand = HKDFExpand(SHA256(), 32, f"keyss/v1/{label}".encode())
             vector[label] = expand.derive(master).hex()
     return vectors
@@ -180,7 +171,7 @@ def write_published() -> None:
 
 def write_coded(suffix: str) -> None:
     """A model whose codes hold two secrets: a model, and another one or a file."""
-    cover = codes_examples.model_of(2300, 11, 0)
+    cover = coded.model_of(2300, 11, 0)
     other = {
         ".spz": Payload(METHOD, whole.encode(trained_like(25, 12, 2))),
         ".sog": Payload(METHOD, whole.encode(trained_like(60, 13, 0))),
@@ -188,16 +179,18 @@ def write_coded(suffix: str) -> None:
     }[suffix]
     secrets = [(TWO_KEYS[0], Payload(METHOD, whole.encode(trained_like(40, 14, 1)))), (TWO_KEYS[1], other)]
     name = next(each for each, end in SUFFIXES.items() if end == suffix)
-    coded = CodesChannel(name).prepare(cover).embed(secrets, entropy=bytes(32))
-    write_model(FOLDER / f"coded{suffix}", coded)
+    model = channel_for("as-is", format=name).prepare(cover).embed(secrets, entropy=bytes(32))
+    write_model(FOLDER / f"coded{suffix}", model)
 
 
 def write_decoded(suffix: str) -> None:
     """A .ply that was decoded from codes, with a secret in their place."""
-    codes = codes_examples.FORMATS[suffix].of(codes_examples.model_of(1500, 21, 0))
+    codes = coded.FORMATS[suffix].of(coded.model_of(1500, 21, 0))
     model = codes.dequantise()
     payload = HiddenFile("a note.txt", b"Written at night, read at noon.\n").payload()
-    stego = quiet_channel(LOW_BITS, model).prepare(model).embed([(TWO_KEYS[0], payload)], entropy=bytes(32))
+    stego = (
+        channel_for("as-is", cover=model).prepare(model).embed([(TWO_KEYS[0], payload)], entropy=bytes(32))
+    )
     write_model(FOLDER / f"decoded-{suffix.split('.')[1]}.ply", stego)
 
 
@@ -232,7 +225,7 @@ def write_counted() -> None:
 
 def counted(model: CodedGaussians) -> dict[str, Any]:
     """The last bits of all levels: their number, and SHA-256 of a byte for each."""
-    bits = last_bits(in_counted_order(model.codes)[1])
+    bits = last_bits(in_counted_order(model.codes)[2])
     return {"count": len(bits), "sha256": hashlib.sha256(bits.tobytes()).hexdigest()}
 
 
@@ -305,7 +298,7 @@ def write_revealed(key: str) -> None:
     write_model(FOLDER / "pruned.ply", pruned())
     opened = [revealed(name, key) for name in ("carried.ply", "keyss.ply")]
     opened += [revealed("pruned.ply", each) for each in TWO_KEYS]
-    for suffix in codes_examples.FORMATS:
+    for suffix in coded.FORMATS:
         write_coded(suffix)
         opened += [revealed(f"coded{suffix}", each) for each in TWO_KEYS]
         write_decoded(suffix)

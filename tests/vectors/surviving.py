@@ -11,7 +11,7 @@ from pathlib import Path
 import torch
 from scipy.spatial.transform import Rotation
 
-from channels.low_bits.trained_like import trained_like
+from channels.quiet.trained_like import trained_like
 from keyss.channels import APPENDED, COLOURS, Colours, Payload
 from keyss.core.errors import KeyssWarning
 from keyss.core.gaussians import Gaussians

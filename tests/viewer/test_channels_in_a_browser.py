@@ -42,7 +42,8 @@ def published(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]
             prepared = LOW_BITS.prepare(cover, sh_degree=1)
             model = prepared.embed([(KEYS[0], secret.payload())], entropy=bytes(32))
         else:
-            channel = channel_for(PUBLISHED[kind]) if kind in PUBLISHED else channel_for("any", "appended")  # type: ignore[arg-type]
+            format = PUBLISHED.get(kind)
+            channel = channel_for("as-is" if format else "any", format=format)  # type: ignore[arg-type]
             keys, secrets = keys_of(kind), [made(100, seed).with_sh_degree(1) for seed in (1, 2)]
             model = embed_models(
                 channel.prepare(made(4000, 0)), keys, secrets[: len(keys)], entropy=bytes(32)

@@ -1,7 +1,6 @@
 import { expect, test } from 'vitest';
-import { lastBits, log2 } from '../src/channels/codes/fields.ts';
-import { Room } from '../src/channels/codes/layout.ts';
-import { CodesReader } from '../src/channels/codes/reader.ts';
+import { lastBits, log2 } from '../src/channels/quiet/fields.ts';
+import { QuietReader } from '../src/channels/quiet/reading.ts';
 import { sortingOrder } from '../src/core/words.ts';
 import type { Codes } from '../src/files/models.ts';
 import { digest, jsonVector, modelOf } from './vectors.ts';
@@ -31,10 +30,6 @@ test('logarithms of what is no number', () => {
   expect([log2(Infinity), log2(NaN)]).toEqual([Infinity, NaN]);
 });
 
-test('how many slots there are', () => {
-  expect([0, 12287, 12288, 40000, 10 ** 6, 10 ** 8].map((bits) => new Room(bits).slots)).toEqual([0, 0, 4, 4, 32, 256]);
-});
-
 test('rows are sorted by the last word first, equal ones in their order', () => {
   const words = Uint32Array.of(5, 1, 2 ** 32 - 1, 0, 0, 2 ** 31, 5, 1, 65536, 1);
   expect([...sortingOrder(words)]).toEqual([1, 0, 3, 4, 2]);
@@ -46,10 +41,10 @@ test.each(FILES)('another key opens nothing in %s, and derives as much', async (
     salts.push(digest(salt));
     return new Uint8Array(32).fill(7);
   };
-  expect(await CodesReader.of(await codesOf(name))!.open('any', derive)).toBeNull();
+  expect(await QuietReader.of(await modelOf(name))!.open('any', derive)).toBeNull();
   expect(salts.length).toBe(1);
 });
 
 test('codes without room have no reader', async () => {
-  expect(CodesReader.of(await codesOf('published-2.spz'))).toBeNull();
+  expect(QuietReader.of(await modelOf('published-2.spz'))).toBeNull();
 });

@@ -11,13 +11,14 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
 from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 import torch
 
 from keyss.api.asking import HideResult, Secret, method_for, sources_of
 from keyss.api.fitting import seeded
 from keyss.api.quality import check_quality
-from keyss.channels import AnyChannel, Publish
+from keyss.channels import AnyChannel, Format, Publish
 from keyss.core.errors import KeyssWarning, UsageError
 from keyss.core.gaussians import Gaussians, same_bits
 from keyss.core.scene import Scene, ViewOptions
@@ -61,6 +62,7 @@ def hide(
     *,
     method: str | MethodOptions = DEFAULT,
     publish: Publish | None = None,
+    format: Format | None = None,
     channel: AnyChannel | None = None,
     width: int | None = None,
     background: Background = None,
@@ -79,12 +81,12 @@ def hide(
 
     Cover and secrets are scenes of photos, or models of any format, which are rendered for measurements.
     Plain models of scenes are fitted unless they are given. `method`: a name, or the options of a method
-    (`CarryOptions`, `KeyssOptions`). `publish` and `channel`, if given, replace those of the options: "ply"
-    hides in low bits, or in the steps of a model that was decoded from another format; "spz", "sog" and
-    "compressed-ply" in the integers of such a file, which must stay unchanged; "any" in what survives
-    conversion, which is the channel "appended" (more Gaussians, which are visible in the file) or "colours"
-    (less room). "auto" is "ply", or "any" with a warning for a cover that holds nothing unnoticed. `width`,
-    `background`, `skip_missing`: see `load_scene`.
+    (`CarryOptions`, `KeyssOptions`). `publish`, `format` and `channel`, if given, replace those of the
+    options. "as-is" hides where nobody sees it, in a file that must stay unchanged: in low bits of a "ply",
+    or in the integers of an "spz", "sog" or "compressed-ply", or of a model that was decoded from one.
+    Without a `format` that is the cover's, and where nothing goes in unnoticed, "any" with a warning. "any"
+    hides in what survives conversion, which is the channel "appended" (more Gaussians, which are visible in
+    the file) or "colours" (less room). `width`, `background`, `skip_missing`: see `load_scene`.
 
     `out` (a folder) gets `publish/` with the stego model, and `private/` with fitted models, `config.json`,
     `metrics.json`, the files to hand over for methods that need them (`keyss.methods.handed`), and
@@ -101,8 +103,8 @@ def hide(
     Raises other KeyssErrors too, and Interrupted on Ctrl-C.
     """
     chosen, options = method_for(method, secrets)
-    if publish or channel:
-        options = replace(options, publish=publish or options.publish, channel=channel or options.channel)
+    asked: dict[str, Any] = {"publish": publish, "format": format, "channel": channel}
+    options = replace(options, **{name: value for name, value in asked.items() if value})
     _check_arguments(out, min_psnr)
     began, place, target = time.monotonic(), None if out is None else Path(out), resolve_device(device)
     options = replace(options, fit=seeded(options.fit, place if resume else None, "options", "fit"))

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from keyss.api.asking import check_keys
-from keyss.channels import AnyChannel, Publish, channel_for, open_content, quiet_channel
+from keyss.channels import AnyChannel, Format, Publish, channel_for, open_content
 from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
@@ -44,7 +44,8 @@ def hide_files(
     cover: PathLike | Gaussians,
     secrets: Sequence[SecretFile],
     *,
-    publish: Publish = "auto",
+    publish: Publish = "as-is",
+    format: Format | None = None,
     channel: AnyChannel = "colours",
     out: PathLike | None = None,
     overwrite: bool = False,
@@ -52,14 +53,14 @@ def hide_files(
 ) -> HideFilesResult:
     """Hide files in a model, each under its own key, and open them again as a reader does.
 
-    `out` (a folder) gets `publish/` with the stego model. `publish`, `channel`: see `hide`; "auto" refuses a
-    cover that holds nothing unnoticed. `dry_run`: write nothing, and return only the PSNR.
+    `out` (a folder) gets `publish/` with the stego model. `publish`, `format`, `channel`: see `hide`;
+    "as-is" refuses a cover that holds nothing unnoticed. `dry_run`: write nothing, and return only the PSNR.
 
     Raises UsageError where the files do not fit, and other KeyssErrors.
     """
     if isinstance(cover, Scene) or not is_model(cover):
         raise UsageError("hiding a file needs a model as the cover; `keyss fit` makes one from photos")
-    keys, place = [each.key for each in secrets], channel_for(publish, channel)
+    keys = [each.key for each in secrets]
     check_keys(keys)
     folder = None
     if out is not None and not dry_run:
@@ -67,9 +68,10 @@ def hide_files(
         inputs = [Path(each) for each in read if isinstance(each, str | Path)]
         folder = RunFolder(out, "hide files", writes=STEGOS, inputs=inputs, overwrite=overwrite)
     hidden, model = [_hidden_file(each) for each in secrets], as_3dgs_model(cover, "the cover")
+    place = channel_for(publish, channel, format, model)
     payloads = [(key, each.payload()) for key, each in zip(keys, hidden, strict=True)]
     try:
-        stego = quiet_channel(place, model).prepare(model).embed(payloads)
+        stego = place.prepare(model).embed(payloads)
     except UsageError as error:
         if place.grows:
             raise

@@ -1,4 +1,4 @@
-"""Where bits can lie in a published model, and how a reader finds them again: one protocol, four channels."""
+"""Where bits lie in a published model, and how a reader finds them: one protocol, three channels."""
 
 import lazy_loader
 

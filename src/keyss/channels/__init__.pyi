@@ -14,43 +14,42 @@ from .base import (
     unpack_method as unpack_method,
     unpack_payload as unpack_payload,
 )
-from .codes.channel import (
-    CodesChannel as CodesChannel,
-    CodesCover as CodesCover,
-    CodesReader as CodesReader,
-    last_bits as last_bits,
-)
-from .codes.fields import Field as Field
-from .codes.kept import in_counted_order as in_counted_order
 from .colours.channel import COLOURS as COLOURS, Colours as Colours, ColoursCover as ColoursCover
 from .colours.fountain import Fountain as Fountain
 from .colours.reading import ColoursReader as ColoursReader
-from .low_bits.bits import (
+from .publishing import (
+    SUFFIXES as SUFFIXES,
+    AnyChannel as AnyChannel,
+    Format as Format,
+    Publish as Publish,
+    channel_for as channel_for,
+    open_content as open_content,
+    quick_attempt as quick_attempt,
+    suffix_of as suffix_of,
+)
+from .quiet.bits import (
     Layout as Layout,
     identities as identities,
     read_low_bits as read_low_bits,
     used_words as used_words,
     write_low_bits as write_low_bits,
 )
-from .low_bits.cells import CellCipher as CellCipher
-from .low_bits.channel import LOW_BITS as LOW_BITS, Embedded as Embedded, LowBitsCover as LowBitsCover
-from .low_bits.contents import LowBitsReader as LowBitsReader
-from .low_bits.layout import (
+from .quiet.cells import CellCipher as CellCipher
+from .quiet.channel import (
+    LOW_BITS as LOW_BITS,
+    CodesCover as CodesCover,
+    InCodes as InCodes,
+    LowBitsCover as LowBitsCover,
+)
+from .quiet.fields import Field as Field, last_bits as last_bits
+from .quiet.kept import in_counted_order as in_counted_order
+from .quiet.layout import (
     TYPICAL_SHARE as TYPICAL_SHARE,
     LowBitsRoom as LowBitsRoom,
     check_payload_fits as check_payload_fits,
 )
-from .low_bits.parameters import key_cipher as key_cipher
-from .low_bits.salts import salt_rows as salt_rows
-from .low_bits.usable import chance_of_bits as chance_of_bits, usable_carriers as usable_carriers
-from .publishing import (
-    SUFFIXES as SUFFIXES,
-    AnyChannel as AnyChannel,
-    Publish as Publish,
-    channel_for as channel_for,
-    open_content as open_content,
-    quick_attempt as quick_attempt,
-    quiet_channel as quiet_channel,
-    suffix_of as suffix_of,
-)
+from .quiet.parameters import key_cipher as key_cipher
+from .quiet.reading import QuietReader as QuietReader
+from .quiet.salts import salt_rows as salt_rows
+from .quiet.usable import chance_of_bits as chance_of_bits, usable_carriers as usable_carriers
 from .reed_solomon import Codewords as Codewords

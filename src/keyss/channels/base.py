@@ -153,7 +153,7 @@ class SaltedReader(ABC):
 class Channel(ABC):
     """A place for bits in a model."""
 
-    name: ClassVar[str]  # `low_bits`, `codes`, `appended` or `colours`
+    name: ClassVar[str]  # `quiet`, `appended` or `colours`
     place: str  # in messages: "low bits", "codes of the spz file" and so on
     survives: ClassVar[bool] = False  # secrets survive other formats; else the file is passed on unchanged
     grows: ClassVar[bool] = False  # see `Room`

@@ -14,8 +14,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from keyss.channels.low_bits.bits import identities
-from keyss.channels.low_bits.cells import CellCipher
+from keyss.channels.quiet.bits import identities
+from keyss.channels.quiet.cells import CellCipher
 from keyss.core.arrays import Bytes, Doubles, Flags
 from keyss.core.errors import InputError
 from keyss.core.gaussians import Gaussians

@@ -7,7 +7,7 @@ from cryptography.hazmat.primitives.ciphers import Cipher
 from cryptography.hazmat.primitives.ciphers.algorithms import AES
 from cryptography.hazmat.primitives.ciphers.modes import ECB
 
-from keyss.channels.low_bits.kernels import hash_rows
+from keyss.channels.quiet.kernels import hash_rows
 from keyss.core.arrays import Bytes, Doubles, Integers, Numbers, Words
 from keyss.keys.derivation import stream
 

@@ -13,48 +13,46 @@ from keyss.core.gaussians import Gaussians
 from keyss.files.formats.common import CodedGaussians
 from keyss.keys.derivation import DerivedKey
 
-Publish = Literal["auto", "ply", "spz", "sog", "compressed-ply", "any"]
+Publish = Literal["as-is", "any"]
 AnyChannel = Literal["appended", "colours"]  # of a model that may be converted to any format
+Format = Literal["ply", "spz", "sog", "compressed-ply"]  # of a model that stays as it is
 
 SUFFIXES = {"spz": ".spz", "sog": ".sog", "compressed-ply": ".compressed.ply"}  # of files whose codes carry
 
 
-def channel_for(publish: Publish, channel: AnyChannel = "appended") -> Channel:
-    """The channel for a model that is published in the format `publish`, or as "any".
+def channel_for(
+    publish: Publish,
+    channel: AnyChannel = "appended",
+    format: Format | None = None,
+    cover: Gaussians | None = None,
+) -> Channel:
+    """The channel for a model that is published "as-is", in a `format`, or as "any".
 
-    Loads that channel only. Raises UsageError for unknown names.
+    As is, `cover` has one place that is quiet: the codes of its file's format, if that is the one published,
+    or those that it was decoded from, else low bits. Loads that channel only. Raises UsageError for unknown
+    names.
     """
-    if publish not in get_args(Publish) or channel not in get_args(AnyChannel):
-        raise UsageError(
-            f"expected a format to publish in ({', '.join(get_args(Publish))}), and "
-            f"{' or '.join(get_args(AnyChannel))} for any, got {publish!r} and {channel!r}"
-        )
-    if publish in ("auto", "ply"):
-        from keyss.channels.low_bits.channel import LOW_BITS
-
-        return LOW_BITS
-    if publish != "any":
-        from keyss.channels.codes.channel import CodesChannel
-
-        return CodesChannel(publish)
-    if channel == "appended":
+    choices = {"publish": (publish, Publish), "channel": (channel, AnyChannel), "format": (format, Format)}
+    for name, (value, known) in choices.items():
+        if value is not None and value not in get_args(known):
+            raise UsageError(f"`{name}`: expected {' or '.join(get_args(known))}, got {value!r}")
+    if publish == "any" and channel == "appended":
         from keyss.channels.appended.channel import APPENDED
 
         return APPENDED
-    from keyss.channels.colours.channel import COLOURS
+    if publish == "any":
+        from keyss.channels.colours.channel import COLOURS
 
-    return COLOURS
+        return COLOURS
+    from keyss.channels.quiet.channel import LOW_BITS, InCodes
+    from keyss.channels.quiet.decoded import Decoded
 
-
-def quiet_channel(channel: Channel, cover: Gaussians) -> Channel:
-    """The place that `cover` has for `channel`: of low bits its codes, if it was decoded from some."""
-    if channel.name == "low_bits":
-        from keyss.channels.codes.channel import DecodedChannel
-        from keyss.channels.codes.decoded import Decoded
-
-        if decoded := Decoded.of(cover):
-            return DecodedChannel(decoded)
-    return channel
+    if format is None and isinstance(cover, CodedGaussians):
+        return InCodes(cover.codes.name)
+    if format in SUFFIXES:
+        return InCodes(format)
+    decoded = None if cover is None else Decoded.of(cover)
+    return InCodes(decoded.codes.name, decoded) if decoded else LOW_BITS
 
 
 def suffix_of(stego: Gaussians) -> str:
@@ -88,16 +86,17 @@ def quick_attempt(stego: Gaussians, key: str) -> Attempt | None:
     Raises InputError for damage.
     """
     appended = _appended(stego)  # visible in the file, so trying them only if they exist reveals nothing
-    reader = appended or _exact(stego)
+    reader = appended or _quiet(stego)
     if reader is None or not reader.salts:
         return None
     derived = DerivedKey.of(key, reader.salts[0])
     content = None
     with suppress(WrongKeyError):
         content = _read_from(stego, reader.extract(derived))
-    from keyss.channels.low_bits.contents import LowBitsReader
+    from keyss.channels.quiet.reading import QuietReader
 
-    return Attempt(derived, content, appended is not None, isinstance(reader, LowBitsReader))
+    records = isinstance(reader, QuietReader) and not reader.blocks
+    return Attempt(derived, content, appended is not None, records)
 
 
 def _read_from(stego: Gaussians, content: Content) -> Content:
@@ -106,7 +105,7 @@ def _read_from(stego: Gaussians, content: Content) -> Content:
 
 def _readers(stego: Gaussians) -> Iterator[Reader]:
     """The readers of a model; each channel is loaded when the ones before opened nothing."""
-    for reader in (_exact, _appended):
+    for reader in (_quiet, _appended):
         if own := reader(stego):
             yield own
     from keyss.channels.colours.reading import ColoursReader
@@ -114,18 +113,10 @@ def _readers(stego: Gaussians) -> Iterator[Reader]:
     yield ColoursReader.of(stego)
 
 
-def _exact(stego: Gaussians) -> SaltedReader | None:
-    """The reader of bits that only the unchanged file has: codes of a coded file, else low bits."""
-    from keyss.channels.codes.channel import CodesReader
-    from keyss.channels.codes.decoded import Decoded
+def _quiet(stego: Gaussians) -> SaltedReader | None:
+    from keyss.channels.quiet.reading import QuietReader
 
-    if isinstance(stego, CodedGaussians):
-        return CodesReader.of(stego.codes)
-    if decoded := Decoded.of(stego):
-        return CodesReader.of(decoded.codes, decoded.exact)
-    from keyss.channels.low_bits.contents import LowBitsReader
-
-    return LowBitsReader.of(stego)
+    return QuietReader.of(stego)
 
 
 def _appended(stego: Gaussians) -> SaltedReader | None:

@@ -106,13 +106,21 @@ class HideArguments:
     ] = ()
     key_file: KeyFiles = ()
     publish: Annotated[
-        Literal["auto", "ply", "spz", "sog", "compressed-ply", "any"],
+        Literal["as-is", "any"],
         arg(
-            help="File to publish. any: a .ply that may be converted later; whoever inspects it sees "
-            "that it holds something. The others must stay as they are; all but ply hold small secrets only. "
-            "auto: ply, or any with a warning where the cover holds nothing unnoticed."
+            help="as-is: a file that must stay unchanged, in which the secret goes unnoticed; where it "
+            "cannot, any with a warning. any: a .ply that may be converted later; whoever inspects it sees "
+            "that it holds something."
         ),
-    ] = "auto"
+    ] = "as-is"
+    format: Annotated[
+        Literal["ply", "spz", "sog", "compressed-ply"] | None,
+        optional(
+            "{ply,spz,sog,compressed-ply}",
+            "With --publish as-is: this file and nothing else; all but ply hold small secrets only.",
+            "the cover's",
+        ),
+    ] = None
     out: OutFolder
     method: str
     preset: Preset = "default"
@@ -271,7 +279,7 @@ def _method_options(args: HideArguments, method: Method) -> MethodOptions:
         for name, value in vars(args.own).items()
         if value is not None and value is not False
     }
-    changes |= {"publish": args.publish}
+    changes |= {"publish": args.publish, "format": args.format}
     changes |= {"channel": args.details.channel} if args.details.channel else {}
     options = replace(method.options.preset(args.preset), **changes)
     return options.with_fit(**args.training.schedule())
@@ -283,13 +291,18 @@ def _hide_files(args: HideArguments, cover: Path) -> None:
     from keyss.cli.tables import print_files
     from keyss.runs.files import STEGOS
 
-    _refuse(args, "--secret-file", "cover secret_file key_file publish out overwrite device channel dry_run")
+    _refuse(
+        args,
+        "--secret-file",
+        "cover secret_file key_file publish format out overwrite device channel dry_run",
+    )
     files, keys = args.secret_file, _keys(args, len(args.secret_file))
     channel = args.details.channel or "colours"
     result = keyss.hide_files(
         cover,
         list(map(keyss.SecretFile, files, keys)),
         publish=args.publish,
+        format=args.format,
         channel=channel,
         out=args.out,
         overwrite=args.overwrite,
@@ -314,7 +327,7 @@ def _hide_batch(args: HideArguments, table: Path) -> None:
     from keyss.progress import reporter
 
     method, batch = registry.get(args.method), args.batch
-    used = "batch master_key_file ray cores out publish channel preset overwrite device min_psnr"
+    used = "batch master_key_file ray cores out publish format channel preset overwrite device min_psnr"
     used += " width background skip_missing iterations max_gaussians seed"
     _refuse(args, "--batch", used, vars(args.own))
     if batch.master_key_file is not None:

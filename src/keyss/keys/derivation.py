@@ -54,8 +54,8 @@ def fill(secret: bytes, label: str, data: Bytes) -> None:
 class DerivedKey:
     """A key after Argon2id with one salt, and the values that follow from it.
 
-    Labels in use: "embedding" (conditions the decoder), "verifier" (compares keys), "low-bits/key" (encrypts
-    the data key in low bits), "writer" (randomness of hiding), "decoy", and those of the other channels.
+    Labels in use: "embedding" (conditions the decoder), "verifier" (compares keys), "quiet/key" (encrypts a
+    data key), "writer" (randomness of hiding), "decoy", and those of the other channels.
     """
 
     master: bytes  # MASTER_BYTES, the output of Argon2id

@@ -14,7 +14,7 @@ from typing import Any, ClassVar, Protocol, Self
 
 import torch
 
-from keyss.channels import AnyChannel, Channel, Payload, Publish, channel_for
+from keyss.channels import AnyChannel, Channel, Format, Payload, Publish, channel_for
 from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
@@ -109,8 +109,8 @@ class MethodOptions:
     method: ClassVar[str]  # name in files and on the command line, 1 to 15 ASCII characters
 
     fit: FitConfig = field(default_factory=FitConfig)  # of plain models, and of the method's own training
-    # Format of the published model; any: it may be converted; auto: ply, or any if nothing goes in unnoticed.
-    publish: Publish = "auto"
+    publish: Publish = "as-is"  # or any: the published model may be converted
+    format: Format | None = None  # of a model that stays as it is; None: the cover's
     # For models that may be converted: appended Gaussians have room for everything, and everybody sees them;
     # colours have little room and show less.
     channel: AnyChannel = "appended"
@@ -121,6 +121,8 @@ class MethodOptions:
             raise UsageError(
                 f'`channel="{self.channel}"` is for models that may be converted (`publish="any"`)'
             )
+        if self.format and self.publish == "any":
+            raise UsageError(f'`format="{self.format}"` is for models that stay as they are: leave it out')
 
     @classmethod
     def preset(cls, size: str) -> Self:
@@ -131,8 +133,12 @@ class MethodOptions:
 
     @property
     def place(self) -> Channel:
-        """The channel that carries the secrets."""
-        return channel_for(self.publish, self.channel)
+        """The channel that carries the secrets, in a cover that is not known."""
+        return self.place_in(None)
+
+    def place_in(self, cover: Gaussians | None) -> Channel:
+        """The channel that carries the secrets in `cover`."""
+        return channel_for(self.publish, self.channel, self.format, cover)
 
     @property
     def trains(self) -> bool:
@@ -179,10 +185,11 @@ class MethodOptions:
 
     def check_published_exactly(self) -> None:
         """Raise UsageError where a jointly trained model would be published in a lossy form."""
-        if self.publish not in ("auto", "ply"):
+        if self.publish == "any" or self.format not in (None, "ply"):
+            option = 'publish="any"' if self.publish == "any" else f'format="{self.format}"'
             raise UsageError(
-                f'`publish="{self.publish}"`: this method needs the published model bit for bit: leave it '
-                'out, or use `method="carry"`'
+                f"`{option}`: this method needs the published model bit for bit: leave it out, or use "
+                '`method="carry"`'
             )
 
 

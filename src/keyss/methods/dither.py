@@ -33,7 +33,7 @@ def dither_model(model: Gaussians, entropy: bytes) -> Gaussians:
     """`model` with new low bits where they are not random; positions and constant colours stay.
 
     `entropy`: 32 secret bytes. Properties with a single value stay unchanged, and so do
-    quaternions of unit length, which is known exactly: see `keyss.channels.low_bits.bits`.
+    quaternions of unit length, which is known exactly: see `keyss.channels.quiet.bits`.
     """
     changed = {}
     unit = (model.quats.detach().cpu().double().norm(dim=1) - 1).abs() < _UNIT

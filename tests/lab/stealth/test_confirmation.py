@@ -7,7 +7,7 @@ import os
 import numpy as np
 import pytest
 
-from channels.low_bits.trained_like import keys
+from channels.quiet.trained_like import keys
 from keyss.lab import candidate_scores, changed_low_bits
 from lab.stealth.careless import banded, overwritten, plain, shuffled
 from methods.carry.carried import embed_derived

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from channels.low_bits.payloads import embed_contents
-from keyss.channels import LOW_BITS, LowBitsReader
+from channels.quiet.payloads import embed_contents
+from keyss.channels import LOW_BITS, QuietReader
 from keyss.core import Gaussians
 from keyss.keys import DerivedKey
 from keyss.methods import CarriedSecret, encode_all, unpack
@@ -31,8 +31,8 @@ def embed_derived(
 
 
 def extract(stego: Gaussians, key: str) -> CarriedSecret:
-    return unpack(LowBitsReader.of(stego).open(key))
+    return unpack(QuietReader.of(stego).open(key))
 
 
-def extract_derived(reader: LowBitsReader, key: DerivedKey) -> CarriedSecret:
+def extract_derived(reader: QuietReader, key: DerivedKey) -> CarriedSecret:
     return unpack(reader.extract(key))

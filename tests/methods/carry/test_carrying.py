@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 import torch
 
-from channels.low_bits.trained_like import keys, trained_like
+from channels.quiet.trained_like import keys, trained_like
 from keyss.channels import (
     LOW_BITS,
-    LowBitsReader,
     LowBitsRoom,
+    QuietReader,
     identities,
     read_low_bits,
     salt_rows,
     usable_carriers,
 )
-from keyss.channels.low_bits.parameters import key_cipher
+from keyss.channels.quiet.parameters import key_cipher
 from keyss.core import Gaussians, InputError, KeyssWarning, UsageError, WrongKeyError, same_bits
 from keyss.keys import DerivedKey
 from keyss.methods import RecordRoom, SecretSize, Table, encode_all, record_request
@@ -51,7 +51,7 @@ def rows_of(model: Gaussians) -> set[bytes]:
 
 def salt_of(model: Gaussians, own: list[DerivedKey], before: Gaussians) -> DerivedKey:
     """The key under the salt that a reader of `model` tries first."""
-    return own[LowBitsReader.of(before).salts.index(LowBitsReader.of(model).salts[0])]
+    return own[QuietReader.of(before).salts.index(QuietReader.of(model).salts[0])]
 
 
 def test_round_trip(cover: Gaussians, secret: Gaussians) -> None:
@@ -73,7 +73,7 @@ def test_every_degree_in_every_degree_that_has_the_room(cover_degree: int, secre
         with pytest.raises(UsageError, match="room for records of"):
             embed_derived(model, [(own, hidden)])
         return
-    carried = extract_derived(LowBitsReader.of(embed_derived(model, [(own, hidden)])), own[0])
+    carried = extract_derived(QuietReader.of(embed_derived(model, [(own, hidden)])), own[0])
     assert carried.gaussians.sh_degree == secret_degree
     assert len(carried.gaussians) == 900
 
@@ -82,7 +82,7 @@ def test_a_cover_without_spherical_harmonics_is_refused() -> None:
     with pytest.raises(UsageError, match="room for records of 0 bytes"):
         embed_derived(trained_like(1500, sh_degree=0), [(keys(), trained_like(50, 1, 0))])
     with pytest.raises(WrongKeyError):
-        extract_derived(LowBitsReader.of(trained_like(50, sh_degree=0)), keys()[0])
+        extract_derived(QuietReader.of(trained_like(50, sh_degree=0)), keys()[0])
 
 
 def test_every_usable_gaussian_is_written_whether_it_carries_or_not(cover: Gaussians) -> None:
@@ -97,9 +97,9 @@ def test_every_usable_gaussian_is_written_whether_it_carries_or_not(cover: Gauss
         assert (changed == usable_carriers(cover)).all()
         counts = np.bincount(read_low_bits(stego).ravel(), minlength=256)
         assert ((counts - counts.mean()) ** 2).sum() / counts.mean() < 255 + 6 * (2 * 255) ** 0.5
-        carriers = LowBitsReader.of(stego)
+        carriers = QuietReader.of(stego)
         carried = extract_derived(carriers, own[0])
-        cells, _ = key_cipher(own[0]).decrypt(carriers.identities, carriers.low)
+        cells, _ = key_cipher(own[0]).decrypt(carriers.names, carriers.low)
         seen.append((carried.count, len(carried.gaussians), int(cells.sum())))
         with pytest.raises(WrongKeyError):
             extract_derived(carriers, keys(3)[0])  # a third key hides nothing
@@ -110,7 +110,7 @@ def test_two_secrets_open_with_their_own_keys_only(cover: Gaussians) -> None:
     """Two fifths of the cover each, as 40,000 and 40,000 in 100,000."""
     hidden, own = [trained_like(1200, 5), trained_like(1200, 6)], [keys(1), keys(2)]
     stego = embed_derived(cover, list(zip(own, hidden, strict=True)))
-    found = [extract_derived(LowBitsReader.of(stego), each[0]).gaussians for each in own]
+    found = [extract_derived(QuietReader.of(stego), each[0]).gaussians for each in own]
     for got, want in zip(found, hidden, strict=True):
         assert torch.allclose(got.means.sort(0).values, want.means.sort(0).values, atol=1e-3)
     with pytest.raises(UsageError, match="same key"):
@@ -119,11 +119,11 @@ def test_two_secrets_open_with_their_own_keys_only(cover: Gaussians) -> None:
 
 def test_a_secret_as_large_as_the_cover_and_three_that_share(cover: Gaussians) -> None:
     large, own = trained_like(3000, 7), keys()
-    carried = extract_derived(LowBitsReader.of(embed_derived(cover, [(own, large)])), own[0])
+    carried = extract_derived(QuietReader.of(embed_derived(cover, [(own, large)])), own[0])
     assert len(carried.gaussians) == 3000
     secrets = [(keys(seed), trained_like(1400, seed)) for seed in (1, 2, 3)]
     with pytest.warns(KeyssWarning, match="can notice that there are other secrets"):
-        stego = LowBitsReader.of(embed_derived(cover, secrets))
+        stego = QuietReader.of(embed_derived(cover, secrets))
     for each, model in secrets:
         assert len(extract_derived(stego, each[0]).gaussians) == len(model)
 
@@ -140,7 +140,7 @@ def test_every_random_draw_depends_on_the_entropy_only(cover: Gaussians, secret:
 
 def test_a_carrier_says_nothing_of_its_gaussian(cover: Gaussians, secret: Gaussians) -> None:
     own = keys()
-    stego = LowBitsReader.of(embed_derived(cover, [(own, secret)]))
+    stego = QuietReader.of(embed_derived(cover, [(own, secret)]))
     found = extract_derived(stego, own[0]).gaussians
     # The order is that of the carriers in the file; nothing of the secret's own order is left in it.
     origin = secret.means[:, 0].argsort()[found.means[:, 0].argsort().argsort()].double()
@@ -154,11 +154,11 @@ def test_shuffling_changes_nothing_and_pruning_loses_one_for_one(
 ) -> None:
     own = keys()
     stego = embed_derived(cover, [(own, secret)], entropy=ENTROPY)
-    whole = rows_of(extract_derived(LowBitsReader.of(stego), own[0]).gaussians)
+    whole = rows_of(extract_derived(QuietReader.of(stego), own[0]).gaussians)
     order = torch.randperm(len(stego), generator=torch.Generator().manual_seed(seed))
-    assert rows_of(extract_derived(LowBitsReader.of(stego[order]), own[0]).gaussians) == whole
+    assert rows_of(extract_derived(QuietReader.of(stego[order]), own[0]).gaussians) == whole
     pruned = stego[order[: len(stego) * 3 // 4]]
-    carried = extract_derived(LowBitsReader.of(pruned), salt_of(pruned, own, stego))
+    carried = extract_derived(QuietReader.of(pruned), salt_of(pruned, own, stego))
     assert rows_of(carried.gaussians) <= whole
     assert carried.count == len(secret)
     copies = LOW_BITS.prepare(cover).cells.plan_records([record_request(1200, 3)])[0].copies
@@ -174,7 +174,7 @@ def test_cropping_to_half_leaves_half_of_the_secret_everywhere(
     own = keys()
     stego = embed_derived(cover, [(own, secret)], entropy=ENTROPY)
     half = stego[stego.means[:, axis] > stego.means[:, axis].median()]
-    found = extract_derived(LowBitsReader.of(half), salt_of(half, own, stego)).gaussians
+    found = extract_derived(QuietReader.of(half), salt_of(half, own, stego)).gaussians
     # Carriers are drawn at random: half of those that are there once is left, and 3 in 4 of those twice.
     copies = LOW_BITS.prepare(cover).cells.plan_records([record_request(len(secret), 3)])[0].copies
     expected = 0.5 * (len(secret) - copies) + 0.75 * copies
@@ -185,17 +185,17 @@ def test_cropping_to_half_leaves_half_of_the_secret_everywhere(
 def test_a_single_bit_costs_one_carrier_at_most(cover: Gaussians, secret: Gaussians) -> None:
     """Any bit of any value: low ones, high ones, positions; through the whole key, both salts included."""
     stego = embed(cover, [(KEY, secret)], entropy=ENTROPY)
-    own = list(LowBitsReader.of(stego).keys(KEY))[:3]
+    own = list(QuietReader.of(stego).keys(KEY))[:3]
     whole = rows_of(extract(stego, KEY).gaussians)
     random = np.random.default_rng(0)
-    names = LowBitsReader.of(stego).salts
+    names = QuietReader.of(stego).salts
     first = int(salt_rows(stego, identities(stego), read_low_bits(stego))[0])
     for trial in range(60):
         row = first if trial < 5 else int(random.integers(len(stego)))
         changed = _with_flipped_bit(stego, row, int(random.integers(59)), int(random.integers(31)))
         if changed is None:
             continue
-        carriers = LowBitsReader.of(changed)
+        carriers = QuietReader.of(changed)
         found: set[bytes] = set()
         for name in carriers.salts[:2]:
             if name in names[:3]:
@@ -220,20 +220,20 @@ def _with_flipped_bit(model: Gaussians, row: int, column: int, bit: int) -> Gaus
 def test_too_much_pruning_is_said_to_the_holder_of_the_key_only(cover: Gaussians, secret: Gaussians) -> None:
     own = keys()
     stego = embed_derived(cover, [(own, secret)], entropy=ENTROPY)
-    carriers = LowBitsReader.of(stego)
-    cells, _ = key_cipher(own[0]).decrypt(carriers.identities, carriers.low)
+    carriers = QuietReader.of(stego)
+    cells, _ = key_cipher(own[0]).decrypt(carriers.names, carriers.low)
     keep = np.zeros(len(stego), bool)
     keep[np.flatnonzero(cells)[:2]] = True
     with pytest.raises(WrongKeyError):  # nothing but key cells: as good as nothing
-        extract_derived(LowBitsReader.of(stego[torch.from_numpy(keep)]), own[0])
+        extract_derived(QuietReader.of(stego[torch.from_numpy(keep)]), own[0])
     keep[:40] = True
     try:
-        carried = extract_derived(LowBitsReader.of(stego[torch.from_numpy(keep)]), own[0])
+        carried = extract_derived(QuietReader.of(stego[torch.from_numpy(keep)]), own[0])
         assert len(carried.gaussians) < 40
     except (InputError, WrongKeyError):
         pass
     with pytest.raises(WrongKeyError):
-        extract_derived(LowBitsReader.of(stego[torch.from_numpy(keep)]), keys(1)[0])
+        extract_derived(QuietReader.of(stego[torch.from_numpy(keep)]), keys(1)[0])
 
 
 def test_layouts_follow_from_a_secret_s_own_size() -> None:
@@ -286,12 +286,12 @@ def test_strangers_in_the_places_of_the_first_salts_do_not_lock_out_the_key(
     stego: Gaussians, secret: Gaussians
 ) -> None:
     """Three added Gaussians come before all of the model's own in the order of salts."""
-    own = LowBitsReader.of(stego).salts
+    own = QuietReader.of(stego).salts
     added = trained_like(200, seed=9)
     added.sh[:, 1:] *= 20
     added = added[torch.from_numpy(salt_rows(added, identities(added), read_low_bits(added))[:3])]
     crowded = Gaussians.cat([added, stego])
-    assert not set(own) & set(LowBitsReader.of(crowded).salts[:3])
+    assert not set(own) & set(QuietReader.of(crowded).salts[:3])
     assert rows_of(extract(crowded, KEY).gaussians) == rows_of(extract(stego, KEY).gaussians)
     assert len(extract(crowded, KEY).gaussians) == len(secret)
 
@@ -313,7 +313,7 @@ def test_two_secrets_of_40000_in_100000_and_a_third_key_that_hides_nothing() -> 
     """Each takes more than a fifth of the carriers, so two of its records share one."""
     cover, own = trained_like(100_000), [keys(seed) for seed in (1, 2, 3)]
     stego = embed_derived(cover, [(each, trained_like(40_000, seed)) for seed, each in enumerate(own[:2])])
-    carriers = LowBitsReader.of(stego)
+    carriers = QuietReader.of(stego)
     for each in own[:2]:
         carried = extract_derived(carriers, each[0])
         assert len(carried.gaussians) == 40_000

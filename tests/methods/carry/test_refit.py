@@ -11,7 +11,7 @@ import torch
 from hypothesis import given, strategies as st
 
 import keyss
-from channels.low_bits.trained_like import trained_like
+from channels.quiet.trained_like import trained_like
 from keyss import CarryOptions, FitConfig, Secret
 from keyss.channels import identities
 from keyss.core import Gaussians, KeyssWarning, Scene, UsageError
@@ -75,7 +75,7 @@ def test_refits_that_are_asked_for_or_ruled_out() -> None:
         replace(always, prune_to_fit=True)
 
 
-@pytest.mark.parametrize(("publish", "secrets"), [("ply", 1), ("any", 2)])
+@pytest.mark.parametrize(("publish", "secrets"), [("as-is", 1), ("any", 2)])
 def test_from_photos_a_secret_is_fitted_for_the_steps_of_a_refit_too(publish: str, secrets: int) -> None:
     options = CarryOptions(fit=FIT, publish=publish)  # type: ignore[arg-type]
     found = _prepared(options, *[PHOTOS] * (1 + secrets))
@@ -84,9 +84,9 @@ def test_from_photos_a_secret_is_fitted_for_the_steps_of_a_refit_too(publish: st
     assert found.training(1 + secrets) == (Training(),) * (1 + secrets)
 
 
-@pytest.mark.parametrize(("publish", "secrets"), [("ply", 3), ("spz", 1)])
-def test_where_room_is_short_secrets_are_refitted(publish: str, secrets: int) -> None:
-    options = CarryOptions(fit=FIT, publish=publish)  # type: ignore[arg-type]
+@pytest.mark.parametrize(("format", "secrets"), [("ply", 3), ("spz", 1)])
+def test_where_room_is_short_secrets_are_refitted(format: str, secrets: int) -> None:
+    options = CarryOptions(fit=FIT, format=format)  # type: ignore[arg-type]
     warned = pytest.warns(KeyssWarning, match="other secrets") if secrets > 1 else nullcontext()
     with warned:
         found = _prepared(options, *[PHOTOS] * (1 + secrets))

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 import keyss
-from channels.low_bits.trained_like import trained_like
+from channels.quiet.trained_like import trained_like
 from keyss import CarryOptions, Gaussians, Secret
 from keyss.channels import LowBitsRoom, usable_carriers
 from keyss.core import KeyssWarning, UsageError
@@ -40,7 +40,7 @@ def test_quantised_covers_get_random_low_bits_when_asked_for(degree: int) -> Non
     model, secret = trained_like(2000, sh_degree=degree).map(_steps), trained_like(300, 1, 0)
     assert usable_carriers(model).mean() < 0.1
     with pytest.raises(UsageError, match=r"`dither=True` makes room.*`publish=.any.`"):
-        _prepare(CarryOptions(publish="ply"), model, secret)
+        _prepare(CarryOptions(format="ply"), model, secret)
     prepared = RecordRoom.of(model, _prepare(CarryOptions(dither=True), model, secret)).prepared
     assert prepared is not None
     assert prepared.cover.sh_degree == degree
@@ -55,12 +55,12 @@ def test_a_cover_without_harmonics_gets_the_degree_that_its_refusal_names(
     """What is promised before training holds when it is embedded into."""
     cover, secret = change(trained_like(4000, sh_degree=0)), trained_like(9000, 1, 2)
     with pytest.raises(UsageError, match=r"degree 0 .*no room.*`publish=.any.`") as refusal:
-        _prepare(CarryOptions(publish="ply"), cover, secret)
+        _prepare(CarryOptions(format="ply"), cover, secret)
     degree = int(str(refusal.value).partition("`sh_degree=")[2][0])
     assert degree == (2 if change is _unit else 1)
     for less in range(degree):
         with pytest.raises(UsageError, match=f"`sh_degree={degree}[`,]"):
-            _prepare(CarryOptions(sh_degree=less, publish="ply"), cover, secret)
+            _prepare(CarryOptions(sh_degree=less, format="ply"), cover, secret)
     options = _prepare(CarryOptions(sh_degree=degree, dither=True, prune_to_fit=True), cover, secret)
     sources = [Source(each, False, KEY, scene_of_model(each, "m", size=24)) for each in (cover, secret)]
     planned = registry.get("carry").plan(sources, options)
@@ -90,7 +90,7 @@ def test_what_training_will_not_make_random_is_refused() -> None:
         model.sh[:, :, :1].repeat(1, 1, 3),
     )
     with pytest.raises(UsageError, match=r"random low bits.*`publish=.any.`"):
-        _prepare(CarryOptions(publish="ply"), grey, grey)
+        _prepare(CarryOptions(format="ply"), grey, grey)
     with pytest.warns(KeyssWarning, match=r"whoever inspects.*random low bits"):
         assert _prepare(CarryOptions(), grey, grey).publish == "any"
     _prepare(CarryOptions(), trained_like(8000), grey)
@@ -153,10 +153,10 @@ def test_a_secret_loses_harmonics_that_the_cover_has_no_room_for() -> None:
     ("options", "changed"),
     [
         (CarryOptions(), False),
-        (CarryOptions(publish="spz"), False),
+        (CarryOptions(format="spz"), False),
         (CarryOptions(publish="any"), False),
         (CarryOptions(sh_degree=1), True),
-        (CarryOptions(publish="spz", sh_degree=0), True),
+        (CarryOptions(format="spz", sh_degree=0), True),
     ],
 )
 def test_plans_note_what_a_cover_loses_before_embedding(options: CarryOptions, changed: bool) -> None:

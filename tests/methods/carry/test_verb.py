@@ -11,7 +11,7 @@ import pytest
 import torch
 
 import keyss
-from channels.low_bits.trained_like import trained_like
+from channels.quiet.trained_like import trained_like
 from cli.said import Run, write_key
 from keyss import CarryOptions, FitConfig, Secret
 from keyss.channels import LOW_BITS
@@ -89,7 +89,7 @@ def test_too_large_secrets_are_refused_or_pruned(run: Run, tmp_path: Path) -> No
 
 def test_a_cover_without_any_room_names_what_works_and_not_what_was_given(run: Run, tmp_path: Path) -> None:
     write_model(tmp_path / "tiny.ply", trained_like(100))
-    for flags in (("--publish=ply",), ("--prune-to-fit",), ("--refit=never",)):
+    for flags in (("--format=ply",), ("--prune-to-fit",), ("--refit=never",)):
         scenes = ("--cover", tmp_path / "tiny.ply", "--secret", "secret.ply")
         status, _, err = run(*HIDE, *scenes, "-o", tmp_path / "out", *flags)
         assert status == 2
@@ -160,7 +160,7 @@ def test_a_given_model_of_a_scene_is_used() -> None:
 
 
 def test_a_pruned_secret_that_is_not_recognised_is_refused(run: Run, tmp_path: Path) -> None:
-    hide = (*HIDE, "--cover", "cover.ply", "--secret", "large.ply", "--publish", "spz", "--prune-to-fit")
+    hide = (*HIDE, "--cover", "cover.ply", "--secret", "large.ply", "--format", "spz", "--prune-to-fit")
     status, out, err = run(*hide, "-o", tmp_path / "out")
     assert status == 7
     assert re.search(r"the secret with [\d,]+ of 6,000 Gaussians is at .* below 25 dB: nothing was", err)
@@ -185,10 +185,10 @@ def test_what_cannot_work_is_refused_before_anything_is_fitted(tmp_path: Path) -
     coarse = trained_like(1500).map(lambda v: (v * 64).round() / 64)
     secret = Secret(tiny_scene(1), KEY)
     with pytest.raises(UsageError, match="`dither=True`"):
-        keyss.hide(coarse, [secret], method="carry", publish="ply", out=tmp_path / "run")
+        keyss.hide(coarse, [secret], method="carry", format="ply", out=tmp_path / "run")
     flat = random_gaussians(1500, sh_degree=0)
     model = Secret(tiny_scene(1), KEY, random_gaussians(100, sh_degree=3))
     other = Secret(tiny_scene(1), KEY + "2")
     with pytest.raises(UsageError, match="SH degree 0 has no room"):
-        keyss.hide(flat, [other, model], method="carry", publish="ply", out=tmp_path / "run")
+        keyss.hide(flat, [other, model], method="carry", format="ply", out=tmp_path / "run")
     assert not (tmp_path / "run").exists()

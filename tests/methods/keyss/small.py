@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from channels.low_bits.trained_like import trained_like
+from channels.quiet.trained_like import trained_like
 from keyss import FitConfig, Gaussians, KeyssOptions
 from keyss.channels.harmonics import high_harmonics, row_names, with_high_harmonics
 from keyss.core import Scene

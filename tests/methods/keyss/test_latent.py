@@ -11,7 +11,7 @@ import torch
 from scipy.stats import kstest
 from torch import Tensor
 
-from channels.low_bits.trained_like import trained_like
+from channels.quiet.trained_like import trained_like
 from channels.test_harmonics import heavy_tailed
 from keyss import Gaussians, KeyssOptions, WrongKeyError
 from keyss.channels import is_appended

@@ -10,7 +10,7 @@ import torch
 from hypothesis import given, settings, strategies as st
 
 import keyss
-from channels.low_bits.trained_like import trained_like
+from channels.quiet.trained_like import trained_like
 from keyss import Gaussians, Secret
 from keyss.core import DRAWN_OPACITY
 from keyss.files import write_model

@@ -8,7 +8,7 @@ import torch
 from hypothesis import given, settings, strategies as st
 from hypothesis.extra import numpy as arrays
 
-from channels.low_bits.trained_like import trained_like
+from channels.quiet.trained_like import trained_like
 from keyss.core import Gaussians, InputError
 from keyss.methods import Codec, Line, Table, outliers
 from keyss.rendering import render

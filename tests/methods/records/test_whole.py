@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from channels.codes.published import model_of
+from channels.quiet.coded import model_of
 from keyss.core import Camera, Gaussians, InputError, Scene, UsageError, View
 from keyss.core.gaussians import OPPONENT
 from keyss.methods import Table, fitted, good_enough, pruned

@@ -8,18 +8,13 @@
 import type { ReadModel } from '../files/models.ts';
 import type { Derive } from '../keys/keys.ts';
 import { AppendedReader } from './appended/reader.ts';
-import { decodedFrom } from './codes/decoded.ts';
-import { CodesReader } from './codes/reader.ts';
 import { ColoursReader } from './colours/reader.ts';
 import type { Content, Reader } from './content.ts';
-import { LowBitsReader } from './low_bits/reader.ts';
+import { QuietReader } from './quiet/reading.ts';
 
 /** A model's channels, prepared for any number of keys: those that are quick to search, and what is left. */
 export function preparedFor(model: ReadModel): (thorough: boolean) => Channels {
-  const decoded = model.codes ? null : decodedFrom(model);
-  const codes = model.codes ?? decoded?.codes;
-  const exact = codes ? CodesReader.of(codes, decoded?.silent) : LowBitsReader.of(model);
-  const quick = [exact, AppendedReader.of(model)].filter((each) => each !== null);
+  const quick = [QuietReader.of(model), AppendedReader.of(model)].filter((each) => each !== null);
   let colours: Reader | null = null;
   return (thorough) => new Channels(thorough ? [(colours ??= ColoursReader.of(model))] : quick);
 }

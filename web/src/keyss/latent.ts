@@ -1,7 +1,7 @@
 /** The design `latent`: `keyss.methods.keyss.latent` and `keyss.channels.harmonics` in Python say why. */
 import { sha256 } from '@noble/hashes/sha2.js';
-import { fieldsOf, IDENTITY_BYTES, identities } from '../channels/low_bits/bits.ts';
-import { CellCipher } from '../channels/low_bits/cells.ts';
+import { fieldsOf, IDENTITY_BYTES, identities } from '../channels/quiet/bits.ts';
+import { CellCipher } from '../channels/quiet/cells.ts';
 import { bytesKey, joined } from '../core/bytes.ts';
 import { changed, damaged } from '../core/errors.ts';
 import { coefficients, emptyGaussians, where, withDegree } from '../core/gaussians.ts';

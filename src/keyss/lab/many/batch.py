@@ -188,6 +188,7 @@ def _hide(asset: Asset, place: Path, reporter: Reporter, *, derived: bool, overw
             asset.cover,
             secrets,
             publish=options.publish,
+            format=options.format,
             channel=options.channel,
             out=place,
             overwrite=overwrite,

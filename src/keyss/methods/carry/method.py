@@ -27,7 +27,7 @@ _SELECTION_VIEWS = 64
 _PLANNED = bytes(32)  # entropy for plans, which hide nothing
 _VISIBLE = (
     "the cover can hold the secret, but whoever inspects the published file sees that it holds something "
-    '(`publish="any"`); nothing goes in unnoticed (`publish="ply"`): {}'
+    '(`publish="any"`), because nothing goes in unnoticed: {}'
 )
 _LEAST_SHARE = 1 / 6  # of a secret's Gaussians: with fewer, refits of public models are below 30 dB
 _FEWER = (

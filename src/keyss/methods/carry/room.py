@@ -13,14 +13,13 @@ from keyss.channels import (
     LOW_BITS,
     TYPICAL_SHARE,
     Channel,
+    Layout,
     LowBitsCover,
     LowBitsRoom,
     PreparedCover,
     Room,
-    quiet_channel,
     usable_carriers,
 )
-from keyss.channels.low_bits.bits import Layout
 from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.fitting.config import FitConfig
@@ -82,7 +81,8 @@ class CarryOptions(MethodOptions):
     @property
     def may_show(self) -> bool:
         """Whether secrets that do not go in unnoticed may go in visibly."""
-        return self.publish == "auto" and self.refit == "auto" and not self.prune_to_fit and not self.dither
+        asked = self.prune_to_fit or self.dither or self.format is not None
+        return self.publish == "as-is" and self.refit == "auto" and not asked
 
     def fits(self, scenes: int) -> list[FitConfig]:
         """Secrets get the steps of a refit if none follows, and no more harmonics than can be carried."""
@@ -273,9 +273,7 @@ def room_for(
 
     Raises UsageError for a cover without room.
     """
-    place = options.place
-    if cover is not None and not options.dither:
-        place = quiet_channel(place, cover)
+    place = options.place if options.dither else options.place_in(cover)
     return RecordRoom.of(cover, options, entropy) if place.records else WholeRoom.of(cover, options, place)
 
 

@@ -8,15 +8,10 @@ other channel carries a model as one payload (see `whole`).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
-
-import numpy as np
-import torch
 
 from keyss.channels import (
     Content,
-    Embedded,
     LowBitsCover,
     Payload,
     PreparedCover,
@@ -28,15 +23,13 @@ from keyss.channels import (
 from keyss.core.gaussians import Gaussians
 from keyss.methods.base import Stego
 from keyss.methods.records.lines import Table
-from keyss.methods.records.opening import COUNT, CarriedSecret, unpack
+from keyss.methods.records.opening import COUNT, unpack
 from keyss.methods.records.precision import fitted, most_visible_rows
 from keyss.methods.records.quantise import Codec
 from keyss.methods.records.whole import encode
 from keyss.rendering.difference import Viewpoints
 
 METHOD = "carry"  # the method that opens what is embedded
-_OPENED = 100_000  # Gaussians of a large model that are opened again, as from a model that lost the others
-_NOT_AGAIN = "the embedded secrets do not open again as they should"
 
 
 def embed_models(
@@ -54,7 +47,7 @@ def embed_models(
     """
     contents: Sequence[Content]
     if isinstance(cover, LowBitsCover):
-        contents = encoded = encode_all(cover, models)
+        contents = encode_all(cover, models)
         requests = [record_request(len(model), model.sh_degree) for model in models]
         details: dict[str, Any] = {
             "carriers": cover.cells.carriers,
@@ -69,31 +62,12 @@ def embed_models(
         if not cover.room.grows:
             details["capacity_bytes"] = cover.room.capacity
             details["capacity_bits_per_gaussian"] = round(8 * cover.room.capacity / len(cover.cover), 2)
-    keyed: list[tuple[str, Content]] = list(zip(keys, contents, strict=True))
-    if isinstance(cover, LowBitsCover):
-        placed = cover.place(keyed, entropy)
-        stego, opened = placed.gaussians, _opened(placed, keys, encoded)
-    else:
-        stego = cover.embed(keyed, entropy=entropy)
-        opened = [unpack(open_content(stego, key)) for key in keys]
+    stego = cover.embed(list(zip(keys, contents, strict=True)), entropy=entropy)
+    opened = [unpack(open_content(stego, key)) for key in keys]
     if [len(each.gaussians) for each in opened] != list(map(len, models)):
-        raise RuntimeError(_NOT_AGAIN)
+        raise RuntimeError("the embedded secrets do not open again as they should")
     details["bits_per_gaussian"] = [each.bits for each in opened]
     return Stego(stego, tuple(opened), details=details, verified=True)
-
-
-def _opened(placed: Embedded, keys: Sequence[str], contents: Sequence[Records]) -> list[CarriedSecret]:
-    """The secret that each key reveals. Raises RuntimeError if one differs from what was embedded."""
-    rows, found = placed.part(_OPENED), []
-    part = placed.gaussians[torch.from_numpy(rows)]
-    for key, content, (own, cells) in zip(keys, contents, placed.places, strict=True):
-        order = np.lexsort((cells, own))  # as a reader finds them
-        expected = content.records[order[np.isin(own[order], rows)]]
-        read = open_content(part, key)
-        if not isinstance(read, Records) or not np.array_equal(read.records[: len(expected)], expected):
-            raise RuntimeError(_NOT_AGAIN)
-        found.append(unpack(replace(read, records=content.records[order])))
-    return found
 
 
 def encode_all(cover: LowBitsCover, models: Sequence[Gaussians]) -> list[Records]:

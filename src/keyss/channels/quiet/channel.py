@@ -1,0 +1,324 @@
+"""Secrets in bits of a model that nobody sees, to be found again with nothing but the model and a key.
+
+Nothing can be recognised: there is no magic number, no table. The bits lie in *carriers*: the low bits of a
+Gaussian of floats, or a block of last bits of a rounded model's codes (see `syndromes`). A reader tries the
+cell of every carrier and keeps those whose tag fits.
+
+- The *salt* of Argon2id is a hash of one carrier that holds nothing else. Because a Gaussian may be removed,
+  there are SALTS of them (see `salts`). A salt whose Gaussian is not usable is *stale*: the author of the
+  cover knows it in advance. There are key cells for the others. A reader tries SALTS_TRIED salts, and covers
+  with as many stale ones are refused.
+- *Key cells*, encrypted under the key and a salt, hold the secret's data key.
+- *Parameter cells*, encrypted under the data key, tell how the rest is read (see `parameters`).
+- *Records* are encrypted under the data key too; the numbered chunks of an encrypted payload are records (see
+  `layout`). Other records need no number: shuffling and cropping are harmless, and a removed carrier takes
+  only its own record with it. *Copies* of some have another label; they count where the record is gone.
+  Of codes nothing may be lost or reordered: the encrypted payload lies in the blocks after its header.
+
+All of it lies in random carriers, and every usable one gets new bits, noise if nothing else: cells of other
+secrets and of none look alike. All randomness comes from `entropy`, which must be secret: if it followed from
+the cover and one secret, the holder of that secret's key could compute the file without the others. No key
+stream is used twice: data keys depend on entropy and on all contents, and the key stream of a cell on the
+data in it (see `cells`).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+from weakref import WeakKeyDictionary
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from keyss.channels.base import SALTS_TRIED, Channel, Content, Room, check_keys, randomness
+from keyss.channels.mixing import random_fractions
+from keyss.channels.quiet import syndromes
+from keyss.channels.quiet.bits import Layout, read_low_bits, write_low_bits
+from keyss.channels.quiet.decoded import Decoded
+from keyss.channels.quiet.fields import FORMATS, Field, Levels, carrying, last_bits
+from keyss.channels.quiet.kept import changeable, file_order, in_counted_order, in_rows
+from keyss.channels.quiet.layout import BLOCK_HEADER, LEAST_BYTES, MIN_BLOCKS, LowBitsRoom
+from keyss.channels.quiet.salts import salt, salt_rows
+from keyss.channels.quiet.usable import check_usable, named_carriers
+from keyss.channels.quiet.writing import Writer, bytes_of
+from keyss.core.arrays import Bits, Bytes, Flags, Integers
+from keyss.core.errors import KeyssWarning, UsageError
+from keyss.core.gaussians import Gaussians
+from keyss.files.formats.common import CodedGaussians, Codes
+from keyss.keys.derivation import DerivedKey, expand, stream
+from keyss.keys.encryption import OVERHEAD
+from keyss.rendering.cpu.parallel import in_blocks
+
+_ATTEMPTS = 30  # at writing blocks; one in a thousand covers or fewer needs a second one, each time
+_BITS_PER_GAUSSIAN = 18  # of room in codes, about
+_FIRST_IS_STALE = (
+    "the first salt of this model cannot be renewed: keys open it as usual, but not with `decoy=True`, which "
+    "tries no other"
+)
+
+
+class LowBits(Channel):
+    """The channel in the low bits of floats; see `keyss.channels.base.Channel`."""
+
+    name = "quiet"
+    place = "low bits"
+    records = True
+
+    def __init__(self) -> None:
+        # By cover, while it lives and does not change: (versions, usable, names, rows of salts).
+        self._found: WeakKeyDictionary[Gaussians, tuple[list[int], Flags, Bytes, Integers]] = (
+            WeakKeyDictionary()
+        )
+
+    def prepare(self, cover: Gaussians, *, sh_degree: int | None = None) -> LowBitsCover:
+        """See `Channel`. Raises UsageError for low bits that are not random, and for stale salts.
+
+        `sh_degree`: 1 if harmonics of higher degrees must stay as they are, to the bit.
+        """
+        layout, versions = Layout.of(cover), _versions(cover)
+        if (found := self._found.get(cover)) is None or found[0] != versions:
+            usable, names = named_carriers(cover, layout)
+            check_usable(cover, usable, layout)
+            rows = salt_rows(cover, names, layout=layout)
+            stale = int((~usable[rows]).sum())
+            if stale >= SALTS_TRIED:
+                raise UsageError(
+                    f"{stale} of the {len(rows)} salts of this cover cannot be renewed, and whoever made it "
+                    "could try keys in advance"
+                )
+            found = self._found[cover] = versions, usable, names, rows
+        if sh_degree is not None:
+            layout = replace(layout, written_degree=min(sh_degree, layout.sh_degree))
+        return LowBitsCover(cover, layout, *found[1:])
+
+    def room(self, gaussians: int, sh_degree: int) -> Room:
+        return LowBitsRoom.of(gaussians, sh_degree).for_payloads()
+
+
+LOW_BITS = LowBits()
+
+
+class InCodes(Channel):
+    """The channel in the codes of `format`, `spz`, `sog` or `compressed-ply`.
+
+    The file of these codes is published, or a model that was `decoded` from them.
+    """
+
+    name = "quiet"
+
+    def __init__(self, format: str, decoded: Decoded | None = None) -> None:
+        self.format, self.decoded = format, decoded
+        self.place = f"codes of the {format} file"
+        if decoded:
+            self.place = f"steps of its numbers, which are those of a {format} file"
+
+    def prepare(self, cover: Gaussians) -> CodesCover:
+        """The room in the codes of a model; a model read from a file of this format keeps its codes.
+
+        `cover`: of `decoded` the model, or the same with fewer harmonics.
+        """
+        if self.decoded is None:
+            return CodesCover.of(FORMATS[self.format].of(cover))
+        return CodesCover.of(self.decoded.codes, replace(self.decoded, model=cover.detach().to("cpu")))
+
+    def room(self, gaussians: int, sh_degree: int) -> Room:
+        return Room(gaussians, gaussians * _BITS_PER_GAUSSIAN // 8, _overhead(syndromes.BLOCK // 8))
+
+
+@dataclass(frozen=True)
+class LowBitsCover:
+    """A cover and which of its Gaussians can be written; see `keyss.channels.base.PreparedCover`."""
+
+    cover: Gaussians
+    layout: Layout
+    usable: Flags  # [N]
+    names: Bytes  # [N, 16] identities
+    salt_rows: Integers  # [S] in the order of salts
+
+    @property
+    def room(self) -> Room:
+        return self.cells.for_payloads()
+
+    @property
+    def cells(self) -> LowBitsRoom:
+        """The room for records."""
+        return LowBitsRoom(len(self._rows), self.layout.width)
+
+    def embed(self, contents: Sequence[tuple[str, Content]], *, entropy: bytes | None = None) -> Gaussians:
+        """See `PreparedCover`. Takes 1.6 s for each secret for key derivation.
+
+        Warns (KeyssWarning) if `decoy=True`, which tries the first salt alone, will not open the model.
+        """
+        mixed = randomness(entropy, *(bytes_of(content) for _, content in contents))
+        salts = self._salts(mixed)[1]
+        if 0 not in self.fresh_salts:
+            warnings.warn(_FIRST_IS_STALE, KeyssWarning, stacklevel=2)
+        fresh = [salts[index] for index in self.fresh_salts]
+        return self.embed_derived([(_derived(key, fresh), content) for key, content in contents], mixed)
+
+    def embed_derived(
+        self, contents: Sequence[tuple[Sequence[DerivedKey], Content]], entropy: bytes
+    ) -> Gaussians:
+        """`embed` after key derivation: for each secret its key under each of the `fresh_salts`.
+
+        `entropy`: of `randomness`, for no other file.
+        """
+        check_keys([keys[0].verifier() for keys, _ in contents])
+        fresh, _ = self._salts(entropy)
+        writer = Writer(self.names[self._rows], self.layout.width, entropy, len(self.cover))
+        writer.write(contents)
+        parts = [(self.salt_rows[self.fresh_salts], fresh), (self._rows[writer.order], writer.table)]
+        return write_low_bits(self.cover, self.layout, parts)
+
+    @cached_property
+    def fresh_salts(self) -> Integers:
+        """[F] the numbers of the salts whose Gaussians get new bits."""
+        return np.flatnonzero(self.usable[self.salt_rows])
+
+    @cached_property
+    def _rows(self) -> Integers:
+        """[C] the carriers."""
+        carriers = self.usable.copy()
+        carriers[self.salt_rows] = False
+        return np.flatnonzero(carriers)
+
+    def _salts(self, entropy: bytes) -> tuple[Bytes, list[bytes]]:
+        """New low bits [F, B] of the Gaussians of fresh salts, and all salts with them."""
+        noise = stream(entropy, "quiet/salts", len(self.fresh_salts) * self.layout.width)
+        fresh = np.frombuffer(noise, np.uint8).reshape(len(self.fresh_salts), self.layout.width)
+        whole = replace(self.layout, written_degree=None)
+        low = read_low_bits(self.cover[torch.from_numpy(self.salt_rows)], whole)
+        low[self.fresh_salts, : self.layout.width] = fresh
+        return fresh, [salt(*each) for each in zip(self.names[self.salt_rows], low, strict=True)]
+
+
+@dataclass(frozen=True)
+class CodesCover:
+    """Codes and which of their levels can be written; see `keyss.channels.base.PreparedCover`."""
+
+    codes: Codes  # in the order in which bits are counted
+    fields: list[Field]
+    free: list[Flags]  # of each field, which levels may be changed
+    decoded: Decoded | None = None  # the model that is published in the place of the codes, in that order
+
+    @staticmethod
+    def of(codes: Codes, decoded: Decoded | None = None) -> CodesCover:
+        """Raises UsageError for codes without room. `decoded`: the model that is published, not the codes."""
+        rows, ordered, own = in_counted_order(codes, decoded.exact if decoded else None)
+        model = decoded[rows] if decoded else None
+        cover = CodesCover(ordered, own, changeable(ordered, own, _digest(codes)), model)
+        if len(cover.names) < MIN_BLOCKS or cover.width < LEAST_BYTES:
+            raise UsageError(
+                f"a cover of {len(codes):,} Gaussians has no room for secrets in the codes of {codes.name} "
+                "files"
+            )
+        return cover
+
+    @cached_property
+    def dry(self) -> Bits:
+        """1 where a last bit may be changed."""
+        parts = [np.repeat(free, each.bits) for free, each in zip(self.free, self.fields, strict=True)]
+        return np.concatenate(parts).astype(np.uint8)
+
+    @cached_property
+    def places(self) -> Integers:
+        """Which of these bits those of the blocks are."""
+        return syndromes.places(len(self.dry))
+
+    @cached_property
+    def width(self) -> int:
+        """Bytes that a block holds."""
+        return syndromes.width_of(self.dry[self.places])
+
+    @property
+    def names(self) -> Bytes:
+        """[C, 16] identities of the blocks, the first of which gives the salt."""
+        return syndromes.block_names(len(self.places) // syndromes.BLOCK)
+
+    @cached_property
+    def room(self) -> Room:
+        size = (len(self.names) - 1) * self.width
+        # Incompressible data grow by less than a thousandth.
+        return Room(len(self.codes), int(size * (1 - 2**-10)), _overhead(self.width))
+
+    @property
+    def cover(self) -> Gaussians:
+        return self.decoded.model if self.decoded else CodedGaussians.of(self.codes)
+
+    def embed(self, contents: Sequence[tuple[str, Content]], *, entropy: bytes | None = None) -> Gaussians:
+        """See `PreparedCover`."""
+        mixed = randomness(entropy, _digest(self.codes), *(bytes_of(content) for _, content in contents))
+        for attempt in range(_ATTEMPTS):
+            own = expand(mixed, f"quiet/attempt/{attempt}", 32)
+            first = np.frombuffer(stream(own, "quiet/salts", self.width), np.uint8)
+            salts = [salt(self.names[0], first[:LEAST_BYTES])]
+            derived = [(_derived(key, salts), content) for key, content in contents]
+            check_keys([keys[0].verifier() for keys, _ in derived])
+            writer = Writer(self.names[1:], self.width, own, len(self.codes), blocks=True)
+            writer.write(derived)
+            if (bits := self._solved(np.concatenate([first[None], writer.table]), own)) is not None:
+                return self._published(self._written(bits, own), own)
+        raise RuntimeError("the blocks of this cover do not hold what they should")
+
+    def _solved(self, table: Bytes, entropy: bytes) -> Bits | None:
+        """The last bits of all levels, random where they may change; blocks hold `table` [C, width].
+
+        None if a block cannot hold its bytes.
+        """
+        noise = np.frombuffer(stream(entropy, "codes/free", -(-len(self.dry) // 8)), np.uint8)
+        bits = np.where(self.dry, np.unpackbits(noise)[: len(self.dry)], last_bits(self.fields))
+        message, rows = np.unpackbits(table, bitorder="little"), syndromes.matrix(8 * self.width)
+        solved = syndromes.write(bits[self.places], self.dry[self.places], message, rows)
+        if solved is not None:
+            bits[self.places] = solved
+        return None if solved is None else bits
+
+    def _written(self, bits: Bits, entropy: bytes) -> Codes:
+        columns: dict[str, list[Levels]] = {}
+        for field, free in zip(self.fields, self.free, strict=True):
+            own, bits = bits[: field.room], bits[field.room :]
+            ties = random_fractions(entropy, f"codes/ties/{field.name}/{field.column}", len(free)) - 0.5
+            levels = np.where(free, field.with_bits(own, ties), field.levels)
+            columns.setdefault(field.name, []).append(levels)
+        attributes = {name: np.stack(each, axis=1) for name, each in columns.items()}
+        written: Codes = carrying(self.codes).with_levels(self.codes, attributes)
+        return written
+
+    def _published(self, codes: Codes, entropy: bytes) -> Gaussians:
+        """A file of `codes`, or the model decoded from them, in the order of such files or of the cover."""
+        within = random_fractions(entropy, "codes/file-order", 3 * len(codes)).reshape(-1, 3) - 0.5
+        order = file_order(codes, within)
+        if self.decoded is None:
+            return CodedGaussians.of(in_rows(codes, order))
+        if not self.decoded.is_sorted:
+            order = self.decoded.order.argsort()
+        return self.decoded.with_codes(self.codes, codes)[torch.from_numpy(order)]
+
+
+def _overhead(width: int) -> int:
+    """Bytes that a payload in blocks of `width` bytes takes beside its data, at most."""
+    return (BLOCK_HEADER + 1) * width + OVERHEAD
+
+
+def _versions(model: Gaussians) -> list[int]:
+    """How often each tensor was changed in place."""
+    tensors: list[Tensor] = [getattr(model, each.name) for each in fields(model)]
+    return [0 if each.is_inference() else each._version for each in tensors]
+
+
+def _derived(key: str, salts: Sequence[bytes]) -> list[DerivedKey]:
+    """`key` under each salt, several at a time."""
+    return in_blocks(lambda index, _: DerivedKey.of(key, salts[index]), len(salts), 1)
+
+
+def _digest(codes: Codes) -> bytes:
+    state = hashlib.sha256()
+    for each in fields(codes):  # type: ignore[arg-type]
+        value = getattr(codes, each.name)
+        state.update(value.tobytes() if isinstance(value, np.ndarray) else repr(value).encode())
+    return state.digest()

@@ -1,0 +1,124 @@
+"""Models that a program decoded from a .spz, .sog or compressed .ply, as most of those on the web are.
+
+Their low bits follow from the codes of that file, so that new ones would show. But the codes can be computed
+from the numbers: `quantise` finds them, and decoding them gives the same numbers. The secret goes into the
+codes, and the published model is decoded from these.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from keyss.core.arrays import Flags, Integers
+from keyss.core.errors import OutputError
+from keyss.core.gaussians import Gaussians
+from keyss.files.formats.codebooks import SIZE
+from keyss.files.formats.common import CodedGaussians, Codes, morton_order
+from keyss.files.formats.compressed_ply import CompressedPlyCodes
+from keyss.files.formats.sog import SogCodes
+from keyss.files.formats.spz import MAX_FRACTIONAL_BITS, MAX_POSITION, SpzCodes
+
+_WRITTEN = ("means", "quats", "log_scales")  # attributes that carry bits in some format
+_OPACITIES = 256
+_SAMPLE = 1024  # Gaussians that are looked at first
+_CLOSE = 1e-5  # relative: the same number, computed by another program
+_MOST = 0.9  # share of the Gaussians whose numbers follow from codes
+
+
+@dataclass(frozen=True)
+class Decoded:
+    """A model and the codes that it was decoded from."""
+
+    model: Gaussians
+    codes: Codes
+    exact: Flags  # [N] whether the numbers of a Gaussian follow from its codes; the others carry nothing
+    order: Integers  # [N] of each Gaussian its place in the file
+
+    @staticmethod
+    def of(model: Gaussians) -> Decoded | None:
+        """None for a model whose numbers lie on the steps of no format."""
+        if isinstance(model, CodedGaussians) or not len(model) or not _opacities_are_bytes(model):
+            return None
+        model = model.detach().to("cpu")
+        for quantise in (_spz, _sog, _compressed_ply):
+            codes = quantise(model)
+            if codes is not None:
+                exact = _follow(model, codes.dequantise())
+                if exact.mean() >= _MOST:
+                    return Decoded(model, codes, exact, np.arange(len(model)))
+        return None
+
+    def __getitem__(self, rows: Integers) -> Decoded:
+        """The model's Gaussians in another order; `codes` are unchanged."""
+        own, order = self.model[torch.from_numpy(rows)], self.order[rows]
+        return replace(self, model=own, exact=self.exact[rows], order=order)
+
+    @property
+    def is_sorted(self) -> bool:
+        """Whether the file is in the order of `morton_order`, but for a few Gaussians."""
+        places = np.empty(len(self.order))
+        places[self.order[morton_order(self.model.means.numpy())]] = np.arange(len(self.order))
+        return bool((np.diff(places) > 0).mean() >= _MOST)
+
+    def with_codes(self, before: Codes, after: Codes) -> Gaussians:
+        """The model after a change of its codes, both in its order."""
+        old, new = before.dequantise(), after.dequantise()
+        changes = {}
+        for name in _WRITTEN:
+            own, was, now = (getattr(each, name) for each in (self.model, old, new))
+            if name == "quats":
+                now = now * _signs(own, was)
+            changes[name] = torch.where((was == getattr(new, name)).all(1, keepdim=True), own, now)
+        return replace(self.model, **changes)
+
+
+def _opacities_are_bytes(model: Gaussians) -> bool:
+    """Whether opacities have at most 256 values, as in all of the formats."""
+    parts = model.opacity_logits[:_SAMPLE], model.opacity_logits
+    return all(len(each.detach().unique()) <= _OPACITIES for each in parts)
+
+
+def _spz(model: Gaussians) -> Codes | None:
+    means, steps = model.means.numpy().astype(np.float64), model.log_scales.double() * 16
+    if not torch.equal(steps, steps.round()):
+        return None
+    for bits in range(MAX_FRACTIONAL_BITS + 1):
+        levels = np.ldexp(means, bits)
+        if np.abs(levels).max() > MAX_POSITION:
+            return None
+        if (levels == levels.round()).all():
+            return SpzCodes.quantise(model, fractional_bits=bits)
+    return None
+
+
+def _sog(model: Gaussians) -> Codes | None:
+    """Without harmonics, which carry nothing."""
+    few = len(np.unique(model.log_scales.numpy())) <= SIZE and len(np.unique(model.sh[:, 0].numpy())) <= SIZE
+    return SogCodes.quantise(model.with_sh_degree(0)) if few else None
+
+
+def _compressed_ply(model: Gaussians) -> Codes | None:
+    try:
+        return CompressedPlyCodes.quantise(model.with_sh_degree(0))
+    except OutputError:
+        return None
+
+
+def _follow(model: Gaussians, decoded: Gaussians) -> Flags:
+    """[N] whether what carries bits is the same in both, as far as programs agree."""
+    signs = _signs(model.quats, decoded.quats)
+    exact = ((model.quats - signs * decoded.quats).abs() < _CLOSE).all(1)
+    for name in ("means", "log_scales"):
+        own: Tensor = getattr(model, name)
+        exact &= ((own - getattr(decoded, name)).abs() <= _CLOSE * own.abs()).all(1)
+    found: Flags = exact.numpy()
+    return found
+
+
+def _signs(quats: Tensor, others: Tensor) -> Tensor:
+    """[N, 1] 1 or -1: both signs of a quaternion mean one rotation."""
+    return torch.where((quats * others).sum(1, keepdim=True) < 0, -1.0, 1.0)

@@ -1,0 +1,375 @@
+"""Payloads in low bits: what they survive, who can read them, what can be seen, and copies of a file."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import gsply
+import numpy as np
+import plyfile
+import pytest
+import torch
+from argon2.low_level import Type, hash_secret_raw
+
+from channels.quiet.payloads import embed, embed_contents, embed_derived, extract, extract_derived
+from channels.quiet.trained_like import UNNATURAL, keys, trained_like
+from keyss.channels import (
+    LOW_BITS,
+    Layout,
+    LowBitsRoom,
+    QuietReader,
+    RecordRequest,
+    Records,
+    base,
+    check_payload_fits,
+    identities,
+    read_low_bits,
+    salt_rows,
+    usable_carriers,
+    write_low_bits,
+)
+from keyss.channels.quiet import cells
+from keyss.core import Gaussians, InputError, KeyssWarning, UsageError, WrongKeyError, same_bits
+from keyss.files import read_model, write_model
+from keyss.keys import ALPHABET, DerivedKey, generate_key
+from keyss.methods import encode_all
+from keyss.rendering import render
+from tiny_scenes import ring_cameras
+
+PAYLOAD = bytes(range(256)) * 4 + os.urandom(3000)
+KEY = "the right key"
+GENERATED = "q7Rv2LxT9bWm4KzD"
+SMALLEST = 700  # Gaussians that carry a byte
+
+
+@pytest.fixture(scope="module")
+def plain() -> Gaussians:
+    return trained_like(1500)
+
+
+@pytest.fixture(scope="module")
+def stego(plain: Gaussians) -> Gaussians:
+    return embed(plain, [(KEY, PAYLOAD)])
+
+
+def test_a_model_of_equal_gaussians_holds_nothing(plain: Gaussians) -> None:
+    with pytest.raises(WrongKeyError):
+        extract(plain[torch.zeros(200, dtype=torch.int64)], KEY)
+
+
+@pytest.mark.parametrize("degree", [1, 2])
+def test_round_trip_of_lower_degrees(degree: int) -> None:
+    model = trained_like(4000, sh_degree=degree)
+    own = keys()
+    stego = embed_derived(model, [(own, PAYLOAD[:1500])])
+    assert extract_derived(stego, own[0]) == PAYLOAD[:1500]
+
+
+def test_the_same_entropy_gives_the_same_bits_and_other_payloads_others(plain: Gaussians) -> None:
+    own, entropy = keys(), bytes(32)
+    stego = embed_derived(plain, [(own, PAYLOAD)], entropy)
+    assert same_bits(embed_derived(plain, [(own, PAYLOAD)], entropy), stego)
+    for other in (
+        embed_derived(plain, [(own, PAYLOAD[:-1] + b"!")], entropy),
+        embed_derived(plain, [(own, PAYLOAD)]),
+    ):
+        same = (read_low_bits(other) == read_low_bits(stego))[usable_carriers(plain)].mean()
+        assert same == pytest.approx(1 / 256, abs=2e-3)  # as between independent random bytes
+
+
+def test_only_low_bits_of_some_fields_change(plain: Gaussians, stego: Gaussians) -> None:
+    assert torch.equal(plain.means, stego.means)
+    assert torch.equal(plain.sh[:, 0], stego.sh[:, 0])
+    for name, bits in (("log_scales", 9), ("quats", 9), ("opacity_logits", 9), ("sh", 13)):
+        before, after = (getattr(model, name).contiguous().view(torch.int32) for model in (plain, stego))
+        assert not torch.equal(before, after)
+        assert torch.equal(before >> bits, after >> bits), name
+        assert torch.equal(before & 1, after & 1), name
+    assert np.array_equal(identities(plain), identities(stego))
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_survives_shuffling_and_the_loss_of_a_quarter(stego: Gaussians, seed: int) -> None:
+    order = torch.randperm(len(stego), generator=torch.Generator().manual_seed(seed))
+    own = keys()
+    again = embed_derived(stego, [(own, PAYLOAD)])
+    kept = again[order[: len(stego) * 3 // 4]]
+    salt = QuietReader.of(again).salts.index(QuietReader.of(kept).salts[0])
+    assert extract_derived(kept, own[salt]) == PAYLOAD
+    if seed == 0:
+        assert extract(stego[order[: len(stego) * 3 // 4]], KEY) == PAYLOAD
+
+
+def test_too_much_pruning_is_said_to_the_holder_of_the_key_only() -> None:
+    model = trained_like(4000)
+    own, other = keys(), keys(1)
+    room = LOW_BITS.room(3500, 3).capacity
+    stego = embed_derived(model, [(own, os.urandom(room * 9 // 10))])
+    order = torch.randperm(4000, generator=torch.Generator().manual_seed(0))
+    first = salt_rows(stego, identities(stego), read_low_bits(stego))[:1]
+    rest = stego[torch.cat([torch.from_numpy(first), order[:1500]])]
+    with pytest.raises(InputError, match="too much of the model"):
+        extract_derived(rest, own[0])
+    with pytest.raises(WrongKeyError):
+        extract_derived(rest, other[0])
+
+
+def _resave_by_plyfile(source: Path, target: Path) -> None:
+    data = plyfile.PlyData.read(source)
+    plyfile.PlyData([plyfile.PlyElement.describe(data["vertex"].data.copy(), "vertex")]).write(target)
+
+
+RESAVERS: dict[str, Callable[[Path, Path], object]] = {
+    "keyss": lambda source, target: write_model(target, read_model(source)),
+    "gsply": lambda source, target: gsply.plywrite(target, gsply.plyread(source)),
+    "plyfile": _resave_by_plyfile,
+}
+
+
+@pytest.mark.parametrize("name", RESAVERS)
+def test_survives_being_saved_again(stego: Gaussians, tmp_path: Path, name: str) -> None:
+    write_model(tmp_path / "in.ply", stego)
+    RESAVERS[name](tmp_path / "in.ply", tmp_path / "out.ply")
+    assert extract(read_model(tmp_path / "out.ply"), KEY) == PAYLOAD
+
+
+def test_survives_splat_transform(
+    splat_transform: Callable[..., Path], stego: Gaussians, tmp_path: Path
+) -> None:
+    write_model(tmp_path / "in.ply", stego)
+    copy = splat_transform(tmp_path / "in.ply", tmp_path / "out.ply")
+    assert extract(read_model(copy), KEY) == PAYLOAD
+
+
+def test_two_secrets_open_with_their_own_keys_only(plain: Gaussians) -> None:
+    model, first, second = trained_like(3000, seed=5), keys(1), keys(2)
+    stego = embed_derived(model, [(first, b"first"), (second, PAYLOAD)])
+    assert extract_derived(stego, first[0]) == b"first"
+    assert extract_derived(stego, second[0]) == PAYLOAD
+    with pytest.raises(WrongKeyError):
+        extract_derived(stego, keys(3)[0])
+    with pytest.raises(UsageError, match="same key"):
+        embed_derived(model, [(first, b"a"), (first, b"b")])
+
+
+def _neighbours(key: str) -> list[str]:
+    """`key` with one character changed to any other of the alphabet, or its cases exchanged."""
+    changed = {key[:i] + c + key[i + 1 :] for i in range(len(key)) for c in ALPHABET}
+    return sorted((changed | {key.swapcase(), key.upper(), key.lower()}) - {key})
+
+
+def test_a_thousand_random_keys_open_nothing() -> None:
+    """Below Argon2id, whose output is replaced: it is what keys differ in."""
+    model, own = trained_like(SMALLEST, seed=3), keys()
+    stego = embed_derived(model, [(own, b"x")])
+    reader = QuietReader.of(stego)
+    assert extract_derived(reader, own[0]) == b"x"
+    for number in range(1000):
+        with pytest.raises(WrongKeyError):
+            extract_derived(reader, DerivedKey(number.to_bytes(32, "big")))
+
+
+def test_all_one_character_neighbours_open_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """All the way from the text, with an Argon2id that takes 64 KiB and one pass.
+
+    At full cost the same is done by `test_wrong_keys_at_full_cost`.
+    """
+
+    def cheap(secret: bytes, salt: bytes, **costs: object) -> bytes:
+        return hash_secret_raw(secret, salt, 1, 64, 1, 32, Type.ID)
+
+    monkeypatch.setattr("keyss.keys.derivation.hash_secret_raw", cheap)
+    stego = embed(trained_like(SMALLEST, seed=3), [(GENERATED, b"x")])
+    assert extract(stego, GENERATED) == b"x"
+    neighbours = _neighbours(GENERATED)
+    assert len(neighbours) == 16 * 61 + 3
+    for neighbour in neighbours:
+        with pytest.raises(WrongKeyError):
+            extract(stego, neighbour)
+
+
+@pytest.mark.slow
+def test_wrong_keys_at_full_cost() -> None:
+    """1,000 random keys and all one-character neighbours, as a person would try them; 3 to 10 minutes."""
+    stego = embed(trained_like(SMALLEST, seed=3), [(GENERATED, b"x")])
+    assert extract(stego, GENERATED) == b"x"
+    for wrong in [*_neighbours(GENERATED), *(generate_key() for _ in range(1000))]:
+        with pytest.raises(WrongKeyError):
+            extract(stego, wrong)
+
+
+def test_a_wrong_key_makes_the_same_work_as_a_right_one(
+    stego: Gaussians, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Up to the decryption of the payload: as many blocks of AES; in seconds: benchmarks/attempts.py."""
+    blocks = 0
+    real = cells.encrypted_blocks
+
+    def counted(key: bytes, data: np.ndarray) -> np.ndarray:
+        nonlocal blocks
+        blocks += data.size // 16
+        return real(key, data)
+
+    monkeypatch.setattr(cells, "encrypted_blocks", counted)
+    reader = QuietReader.of(stego)
+    right = next(reader.keys(KEY))
+    assert extract_derived(reader, right) == PAYLOAD
+    needed, blocks = blocks, 0
+    with pytest.raises(WrongKeyError):
+        reader.extract(next(reader.keys("The right key")))
+    assert blocks == needed > 0
+
+
+def test_a_wrong_key_is_tried_under_a_few_salts(stego: Gaussians, monkeypatch: pytest.MonkeyPatch) -> None:
+    derived = []
+    monkeypatch.setattr(DerivedKey, "of", lambda key, salt: derived.append(key) or keys(5)[0])
+    with pytest.raises(WrongKeyError):
+        extract(stego, "The right key")
+    assert len(derived) == base.SALTS_TRIED
+
+
+def test_ordinary_models_open_for_nobody_and_look_the_same(plain: Gaussians) -> None:
+    with pytest.raises(WrongKeyError):
+        extract(plain, KEY)
+    with pytest.raises(WrongKeyError):
+        extract(trained_like(50, sh_degree=0), KEY)
+
+
+def test_models_too_small_are_refused_with_the_number_that_would_do() -> None:
+    with pytest.raises(UsageError, match=r"too small.*Gaussians would do"):
+        embed_derived(trained_like(300), [(keys(), PAYLOAD)])
+    with pytest.raises(UsageError, match="SH degree 0"):
+        check_payload_fits(100, 10_000, 1, sh_degree=0)
+    with pytest.raises(UsageError, match="for each of 2 secrets"):
+        check_payload_fits(126_000, 5_000, 2, sh_degree=3)
+    check_payload_fits(126_000, 10_000, 1, sh_degree=3)  # the demo
+
+
+def test_capacity_grows_with_the_model_and_is_kept_to() -> None:
+    rooms = [LowBitsRoom.of(carriers, 3) for carriers in (100, 500, 1000, 5000, 20_000, 200_000)]
+    sizes = [room.for_payloads().capacity for room in rooms]
+    assert sizes == sorted(sizes)
+    assert sizes[0] == 0
+    assert sizes[-1] / 200_000 > 38
+    assert rooms[-1].payload_capacity(1) > 1.9 * rooms[-1].payload_capacity(2)
+    for room, capacity in zip(rooms[1:], sizes[1:], strict=True):
+        room.plan_payloads([capacity])
+        with pytest.raises(UsageError, match="too small"):
+            room.plan_payloads([capacity + 1])
+
+
+@pytest.mark.parametrize("change", UNNATURAL)
+def test_models_without_random_low_bits_are_refused(
+    change: Callable[[Gaussians], Gaussians], plain: Gaussians
+) -> None:
+    with pytest.raises(UsageError, match="low bits"):
+        embed_derived(change(plain), [(keys(), b"x")])
+
+
+def test_values_that_are_not_random_stay_as_they_are() -> None:
+    model = trained_like(1500, seed=8)
+    model.quats[:100] = torch.tensor([1.0, 0, 0, 0])
+    model.sh[100:200, 4:] = 0
+    model.opacity_logits[200:230] = 0.1234567
+    twice = Gaussians.cat([model, model[300:310]])
+    usable = usable_carriers(twice)
+    assert not usable[:230].any()
+    assert not usable[300:310].any()
+    assert not usable[-10:].any()
+    assert usable[310:1500].mean() > 0.95
+    stego = embed_derived(twice, [(keys(), b"x")])
+    assert same_bits(stego[torch.from_numpy(~usable)], twice[torch.from_numpy(~usable)])
+
+
+def test_values_that_are_nearly_equal_stay_as_they_are() -> None:
+    """Grey colours and round Gaussians, whichever low bits their values have."""
+    model = trained_like(3000, seed=8)
+    grey, round_ = slice(0, 300), slice(300, 600)
+    model.sh[grey, 7, 2] = model.sh[grey, 7, 0] * (1 + 1e-5)
+    model.log_scales[round_, 1] = model.log_scales[round_, 2] * (1 - 1e-6)
+    usable = usable_carriers(model)
+    assert not usable[:600].any()
+    assert usable[600:].mean() > 0.95
+    stego = embed_derived(model, [(keys(), b"x")])
+    assert np.array_equal(usable_carriers(stego)[:600], usable[:600])
+    assert same_bits(model[:600], stego[:600])
+
+
+def test_renders_before_and_after_are_equal_beyond_what_can_be_seen() -> None:
+    model = trained_like(1500, seed=9)
+    log_scales = (0.7371 * model.log_scales.double()).float()
+    model = replace(model, means=model.means / 4, log_scales=log_scales, sh=model.sh * 2)
+    stego = embed_derived(model, [(keys(), PAYLOAD)])
+    for camera in ring_cameras(4):
+        error = (render(model, camera) - render(stego, camera)).square().mean()
+        assert -10 * torch.log10(error) > 70
+
+
+def _carried(cover: Gaussians, count: int) -> Gaussians:
+    prepared = LOW_BITS.prepare(cover)
+    (plan,) = prepared.cells.plan_records([RecordRequest(count, 33, 10)])
+    data = torch.randint(256, (count, plan.record_bytes), dtype=torch.uint8).numpy()
+    records = Records("test", bytes(10), data, plan, torch.arange(plan.copies).numpy())
+    return embed_contents(prepared, [(keys(1), records)])
+
+
+@pytest.fixture(scope="module")
+def cover() -> Gaussians:
+    return trained_like(1500, 4)
+
+
+def test_two_hidings_in_one_cover_have_no_salt_in_common(cover: Gaussians) -> None:
+    first, second = (QuietReader.of(_carried(cover, 50)).salts for _ in range(2))
+    assert len(set(first)) == len(set(second)) == 12
+    assert not set(first) & set(second)
+
+
+def test_copies_count_once(cover: Gaussians) -> None:
+    stego = _carried(cover, 200)
+    five = Gaussians.cat([stego] * 5)[torch.randperm(5 * len(stego))]
+    one, other = (QuietReader.of(model).extract(keys(1)[0]) for model in (stego, five))
+    assert isinstance(one, Records)
+    assert isinstance(other, Records)
+    assert len(one.records) == len(other.records) == 200
+    assert {row.tobytes() for row in one.records} == {row.tobytes() for row in other.records}
+
+
+def test_who_merges_two_files_under_one_key_is_told(cover: Gaussians) -> None:
+    first, second = embed(cover, [(KEY, b"first")]), embed(trained_like(1500, 9), [(KEY, b"second")])
+    with pytest.warns(KeyssWarning, match=r"about 1,500 of 3,000 Gaussians were added"):
+        assert extract(Gaussians.cat([first, second]), KEY) in (b"first", b"second")
+
+
+def replaced(first: Gaussians, second: Gaussians, kept: float) -> Gaussians:
+    """What somebody without keys makes of two files, so that the key of both opens the first one's secret.
+
+    The salts of the second are overwritten, and the first loses Gaussians that give no salt.
+    """
+    rows = salt_rows(second, identities(second), read_low_bits(second))
+    low = np.random.default_rng(0).integers(0, 256, (len(rows), 75), np.uint8)
+    second = write_low_bits(second, Layout.of(second), [(rows, low)])
+    salts = salt_rows(first, identities(first), read_low_bits(first))
+    rest = np.setdiff1d(np.arange(len(first)), salts)[: int(kept * len(first))]
+    return Gaussians.cat([second, first[torch.from_numpy(np.concatenate([salts, rest]))]])
+
+
+@pytest.mark.parametrize("kept", [1.0, 0.8, 0.5])
+def test_who_puts_one_file_into_another_does_not_go_unnoticed(cover: Gaussians, kept: float) -> None:
+    other, secret = trained_like(1500, 9), trained_like(300, 10, 0)
+    records = encode_all(LOW_BITS.prepare(cover), [secret])[0]
+    first = LOW_BITS.prepare(cover).embed([(KEY, records)])
+    second = embed(other, [(KEY, b"second")])
+    with pytest.warns(KeyssWarning, match="Gaussians were added to the file"):
+        opened = QuietReader.of(replaced(first, second, kept)).open(KEY)
+    assert isinstance(opened, Records)
+
+
+def test_who_adds_or_removes_a_few_gaussians_is_not_warned(cover: Gaussians) -> None:
+    stego = embed(cover, [(KEY, b"first")])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert extract(Gaussians.cat([stego, trained_like(400, 14)])[300:], KEY) == b"first"

@@ -1,0 +1,212 @@
+"""Which Gaussians may be written: what gives low bits away, and that what is written gives nothing away."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, strategies as st
+
+from channels.quiet.payloads import embed_derived
+from channels.quiet.trained_like import keys, trained_like
+from keyss.channels import LOW_BITS, QuietReader, chance_of_bits, read_low_bits, usable_carriers
+from keyss.channels.quiet import usable
+from keyss.channels.quiet.bits import Layout, used_words, write_low_bits
+from keyss.channels.quiet.predictability import count_trailing_zeros, least_exponent
+from keyss.channels.quiet.usable import GIVEN_AWAY, check_usable
+from keyss.core import Gaussians, UsageError, same_bits
+
+STEP = 2.0**-12  # scale of the last steps of the optimiser that rounds them
+MODELS = 16
+
+
+def rounded_like(count: int, seed: int, step: float = STEP) -> Gaussians:
+    """A model whose optimiser rounds its last step before subtracting it, in numpy's single precision."""
+    model = trained_like(count, seed)
+    random = np.random.default_rng(seed)
+    before = model.sh.numpy()
+    steps = (random.choice([-1, 1], before.shape) * random.exponential(step, before.shape)).astype(np.float32)
+    return replace(model, sh=torch.from_numpy(before - steps))
+
+
+def small_even_numbers(model: Gaussians) -> float:
+    """Zeros less ones in bits 1 to 3 of small harmonics with an even mantissa, in standard deviations."""
+    words = used_words(model)[:, 8:]
+    small = words[((words >> 23 & 255) < 127 + np.log2(STEP)) & (words & 1 == 0)]
+    ones = sum(int((small >> bit & 1).sum()) for bit in (1, 2, 3))
+    return (1.5 * len(small) - ones) / (0.75 * len(small)) ** 0.5
+
+
+def _auc(plain: list[float], changed: list[float]) -> float:
+    greater = np.subtract.outer(plain, changed)
+    return float((greater > 0).mean() + 0.5 * (greater == 0).mean())
+
+
+@pytest.fixture(scope="module")
+def rounded() -> list[Gaussians]:
+    return [rounded_like(1500, seed) for seed in range(MODELS)]
+
+
+def test_models_with_trailing_zeros_and_new_bits_look_alike(rounded: list[Gaussians]) -> None:
+    """The sum that told all carried models from plain ones, as somebody counts who knows the optimiser."""
+    stegos = [embed_derived(model, [(keys(), bytes(100))]) for model in rounded]
+    plain = [small_even_numbers(model) for model in rounded]
+    assert np.mean(plain) > 3  # trailing zeros there are
+    assert abs(_auc(plain, [small_even_numbers(stego) for stego in stegos]) - 0.5) < 0.1
+    # The control: new bits in every Gaussian.
+    random = np.random.default_rng(0)
+    careless = [
+        write_low_bits(
+            model,
+            Layout.of(model),
+            [(np.arange(len(model)), random.integers(0, 256, (len(model), 75), np.uint8))],
+        )
+        for model in rounded
+    ]
+    assert _auc(plain, [small_even_numbers(model) for model in careless]) > 0.95
+
+
+def test_little_is_left_alone_where_nothing_is_given_away(rounded: list[Gaussians]) -> None:
+    """Near-equal components are 3 % by chance."""
+    fine = [usable_carriers(trained_like(1500, seed)).mean() for seed in range(MODELS)]
+    assert min(fine) > 0.92
+    assert max(usable_carriers(model).mean() for model in rounded) < 0.88
+
+
+@pytest.mark.parametrize("step", [2.0**-16, 2.0**-13, 2.0**-10])
+def test_what_is_given_away_keeps_to_its_share(step: float) -> None:
+    """By the true probabilities of trailing zeros, which the limit is to be safe for."""
+    words = np.concatenate([used_words(rounded_like(4000, seed, step))[:, 8:] for seed in (1, 2)])
+    counts = count_trailing_zeros(words, np.ones(len(words), bool))
+    least = least_exponent(counts, GIVEN_AWAY)
+    exponents = np.arange(256)
+    # A step is larger than 2^(e + 2) with this probability: then bits 0 and 1 of a number are zero.
+    forced = np.exp(-(2.0 ** (exponents - 127 + 2)) / step)
+    even = counts[:, 1:].sum(axis=1)
+    given_away = (even * (2 * forced) ** 2)[least:].sum()
+    assert given_away <= GIVEN_AWAY
+    assert least < 127 + np.log2(step) + 4  # not much more is left alone than has to be
+
+
+def test_trailing_zeros_are_counted_by_exponent() -> None:
+    numbers = np.array([[0.75], [1.0 + 2**-23], [1.0 + 2**-20], [-(2.0 + 2**-10)], [3.0], [5.0]], np.float32)
+    counts = count_trailing_zeros(numbers.view(np.uint32), np.arange(6) < 5)
+    assert counts.sum() == 5
+    assert counts[126, 12] == counts[127, 0] == counts[127, 3] == 1
+    assert counts[128, 12] == 2  # 12 or more
+
+
+@given(st.lists(st.integers(0, 40), max_size=90), st.integers(1, 5), st.sampled_from([np.uint32, np.uint64]))
+def test_frequent_values_are_those_that_counting_finds(values: list[int], times: int, kind: type) -> None:
+    words = np.array(values, kind)[:, None]
+    found, counts = np.unique(words, return_counts=True)
+    assert np.array_equal(usable.frequent(words, times), found[counts >= times])
+
+
+def test_the_chance_of_uniform_bits_is_one_and_that_of_others_is_small() -> None:
+    random = np.random.default_rng(0)
+    words = random.integers(0, 1 << 23, (4000, 40), np.uint32) | np.uint32(120 << 23)
+    assert chance_of_bits(words, 13) > 1e-3
+    copied = words & ~np.uint32(2) | words << 1 & np.uint32(2)  # bit 1 is bit 0
+    assert chance_of_bits(copied, 13) < 1e-100
+    chained = np.where(words & 64, words, words & ~np.uint32(128))  # bit 7 is zero more often where bit 6 is
+    assert chance_of_bits(chained, 13) < 1e-100
+
+
+def test_bits_that_depend_on_each_other_are_refused() -> None:
+    """Every byte is uniform, and so is every bit by itself."""
+    model = trained_like(4000, 2)
+    words = model.sh.numpy().view(np.uint32)
+    words ^= (words & 1) << 9 ^ (words >> 9 & 1) << 9  # bit 9 is bit 0
+    with pytest.raises(UsageError, match=r"low bits of (f_rest|harmonics) in this cover are not random"):
+        LOW_BITS.prepare(model)
+    usable = np.ones(4000, bool)
+    check_usable(trained_like(4000, 2), usable)
+
+
+def test_clones_stay_as_they_are() -> None:
+    """Gaussians that training hardly moved apart: a whole triple with the same high bits."""
+    model = trained_like(3000, 5)
+    clones = model[:40].map(lambda values: values * (1 + 2e-7))
+    both = Gaussians.cat([model, replace(clones, means=clones.means + 0.01)])
+    usable = usable_carriers(both)
+    assert not usable[:40].any()
+    assert not usable[-40:].any()
+    assert usable[40:3000].mean() > 0.92
+    scales = replace(clones, means=clones.means + 1, sh=model.sh[50:90], quats=model.quats[50:90])
+    assert usable_carriers(Gaussians.cat([model, scales]))[:40].mean() < 0.1
+
+
+def test_quaternions_of_unit_length_stay_so() -> None:
+    model = trained_like(4000, 6)
+    unit = replace(model, quats=torch.nn.functional.normalize(model.quats, dim=1))
+    own = keys()
+    stego = embed_derived(unit, [(own, b"secret")])
+    assert Layout.of(unit) == Layout.of(stego) == Layout(3, quats=False)
+    assert torch.equal(stego.quats, unit.quats)
+    assert read_low_bits(stego).shape[1] == 71
+    assert QuietReader.of(stego).extract(own[0]).data == b"secret"  # type: ignore[union-attr]
+    half = replace(model, quats=torch.where(torch.arange(4000)[:, None] < 1500, unit.quats, model.quats))
+    assert Layout.of(half).quats
+    stego = embed_derived(half, [(own, b"secret")])
+    assert same_bits(stego[:1500], half[:1500])
+    assert usable_carriers(half)[1500:].mean() > 0.92
+
+
+def test_harmonics_of_one_colour_that_agree_several_times_stay_as_they_are() -> None:
+    """A Gaussian that few views show gets equal steps for all of them; by chance one pair may be equal."""
+    model = trained_like(2000)
+    for row in range(100):
+        for pair in range(1 + row % 2):
+            model.sh[row, 2 + 2 * pair, row % 3] = model.sh[row, 1 + 2 * pair, row % 3] * (1 + 2.0**-20)
+    usable = usable_carriers(model)
+    assert not usable[:100][1::2].any()
+    assert usable[:100][0::2].mean() > 0.9
+    assert usable[100:].mean() > 0.94
+
+
+def test_short_values_count_only_where_there_are_more_than_by_chance() -> None:
+    """Else those that are left alone and those that embedding makes would be twice as many."""
+    one, many = trained_like(2000), trained_like(2000)
+    one.sh[0, 1, 0] = 0.25
+    many.sh[:40, 1, 0] = (1 + torch.arange(40) % 8 / 8) * 0.5 ** (torch.arange(40) // 8)
+    assert usable_carriers(trained_like(2000))[0]
+    assert usable_carriers(one)[0]
+    assert not usable_carriers(many)[:40].any()
+
+
+def test_a_cover_that_was_changed_in_place_is_looked_at_again() -> None:
+    """What was found is kept as long as the cover is as it was."""
+    cover = trained_like(1000)
+    before = LOW_BITS.prepare(cover)
+    assert LOW_BITS.prepare(cover).usable is before.usable
+    assert before.usable[:10].any()
+    cover.log_scales[:10] = 0.5
+    after = LOW_BITS.prepare(cover)
+    assert not after.usable[:10].any()
+    assert (after.names[:10] != before.names[:10]).any()
+
+
+def test_saturated_opacities_stay_as_they_are() -> None:
+    """Logits whose sigmoid has no gradient stay equal in clones whose other numbers were trained."""
+    model = trained_like(2000, 3)
+    model.opacity_logits[:200] = torch.linspace(16.0001, 19, 200) * 1.0001
+    model.opacity_logits[200:400] = -model.opacity_logits[:200]
+    usable = usable_carriers(model)
+    assert not usable[:200].any()
+    assert usable[200:].mean() > 0.9
+
+
+@pytest.mark.parametrize("shared", [[0, 1], [6, 7], list(range(15))])
+def test_gaussians_that_share_harmonics_of_one_channel_stay_as_they_are(shared: list[int]) -> None:
+    """As where the colour of a channel is clamped: its harmonics are frozen, and all others are trained."""
+    model = trained_like(2000, 4)
+    for row in range(60):
+        for coefficient in shared:
+            model.sh[row, 1 + coefficient, row % 3] = model.sh[1000 + row, 1 + coefficient, row % 3]
+    usable = usable_carriers(model)
+    assert not usable[:60].any()
+    assert not usable[1000:1060].any()
+    assert usable[60:1000].mean() > 0.92

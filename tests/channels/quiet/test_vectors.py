@@ -1,0 +1,69 @@
+"""Known answers: files written today open tomorrow, and what must fail fails for the reason named."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from keyss.channels import CellCipher
+from keyss.core import errors
+from keyss.keys import DerivedKey, encryption
+
+pytestmark = pytest.mark.argon2
+
+FOLDER = Path(__file__).parents[3] / "tests" / "vectors"
+DERIVATION = json.loads((FOLDER / "derivation.json").read_text())
+SEALING = json.loads((FOLDER / "sealing.json").read_text())
+
+
+def _derived(vector: dict[str, Any]) -> DerivedKey:
+    return DerivedKey.of(vector["key"], bytes.fromhex(vector["salt"]))
+
+
+@pytest.mark.parametrize("vector", DERIVATION["valid"], ids=lambda vector: ascii(vector["key"]))
+def test_derivation(vector: dict[str, Any]) -> None:
+    key = _derived(vector)
+    assert key.verifier().hex() == vector["verifier"]
+    for label in ("writer", "quiet/key"):
+        assert key.expand(label, 32).hex() == vector[label]
+    assert key.embedding()[:4].tolist() == pytest.approx(vector["embedding_first_4"], abs=2e-6)
+
+
+@pytest.mark.parametrize("vector", DERIVATION["invalid"], ids=lambda vector: vector["why"])
+def test_derivation_that_must_fail(vector: dict[str, Any]) -> None:
+    with pytest.raises(getattr(errors, vector["error"])):
+        _derived(vector)
+
+
+def test_sealing() -> None:
+    vector = SEALING["sealed"]
+    parts = (bytes.fromhex(vector[name]) for name in ("data_key", "sealed", "associated"))
+    assert encryption.decrypt(*parts).hex() == vector["payload"]
+
+
+@pytest.mark.parametrize("vector", SEALING["invalid"], ids=lambda vector: vector["why"])
+def test_sealing_that_must_fail(vector: dict[str, Any]) -> None:
+    good = SEALING["sealed"]
+    with pytest.raises(getattr(errors, vector["error"]), match=vector["words"]):
+        encryption.decrypt(
+            bytes.fromhex(good["data_key"]),
+            bytes.fromhex(vector["sealed"]),
+            bytes.fromhex(good["associated"]),
+        )
+
+
+def test_cell() -> None:
+    vector = SEALING["cell"]
+    identity, data, cell = (
+        np.frombuffer(bytes.fromhex(vector[name]), np.uint8)[None] for name in ("identity", "data", "cell")
+    )
+    secret, label = bytes.fromhex(vector["secret"]), vector["label"]
+    cipher = CellCipher(secret, label, data.shape[1])
+    assert (cipher.encrypt(identity, data, vector["slot"]) == cell).all()
+    fits, decrypted = cipher.decrypt(identity, cell, vector["slot"])
+    assert fits.all()
+    assert (decrypted == data).all()

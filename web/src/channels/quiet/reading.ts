@@ -1,0 +1,183 @@
+/**
+ * What a key opens in the low bits of a model, or in the codes of a file; `keyss.channels.quiet.reading` on the other side.
+ *
+ * A key that opens nothing makes the same passes over all cells as one that opens a secret, and all salts are always
+ * tried, so that how long it takes tells next to nothing.
+ */
+import { ascii, bytesKey, mostFrequent, rowsOf } from '../../core/bytes.ts';
+import { damaged, tooMuchLost } from '../../core/errors.ts';
+import { type Gaussians, selected } from '../../core/gaussians.ts';
+import type { Codes, ReadModel } from '../../files/models.ts';
+import { decrypted, type Derive, expand } from '../../keys/keys.ts';
+import { here } from '../../keys/pool.ts';
+import type { Content, Reader } from '../content.ts';
+import { decoded } from '../reed_solomon.ts';
+import { fieldsOf, IDENTITY_BYTES, identities, lowBits, lowWidth } from './bits.ts';
+import { CellCipher, TAG_BYTES } from './cells.ts';
+import { decodedFrom } from './decoded.ts';
+import { lastBits } from './fields.ts';
+import { NUMBER_BYTES, type Parameters, unpackCodewords, unpackParameters } from './parameters.ts';
+import { saltOf, salts } from './salts.ts';
+import { BLOCK_BYTES, held } from './syndromes.ts';
+
+const ASSOCIATED = ascii('keyss/v1/quiet');
+const DATA_KEY_BYTES = 16;
+const LEAST_WIDTH = TAG_BYTES + DATA_KEY_BYTES;
+const SALTS_TRIED = 4;
+const DUMMY_CELLS = 2; // of a carrier that a key which opens nothing looks into
+const NARROW_HARMONICS = 9; // of degree 1: some secrets leave the low bits of the others as they are
+const [LEAST_BYTES, MIN_BLOCKS] = [48, 4]; // of a block of codes, of a file with room
+const MAX_BITS = 2 ** 30; // of codes; more would take more memory than tabs have
+
+/** The data of a cell, and its carrier. */
+interface Cell {
+  readonly row: number;
+  readonly data: Uint8Array;
+}
+
+/** The carriers of a model, prepared for any number of keys. */
+export class QuietReader implements Reader {
+  private constructor(
+    private readonly names: Uint8Array, // [C, 16] identities
+    private readonly low: Uint8Array, // [C, width]
+    private readonly width: number,
+    private readonly widths: readonly number[], // of parameters
+    readonly salts: Uint8Array[], // the likeliest first
+    private readonly blocks = false, // the carriers are blocks of codes
+  ) {}
+
+  /** In the codes of a coded or decoded model, else in low bits; null without room. */
+  static of(model: ReadModel): QuietReader | null {
+    if (model.codes) return QuietReader.ofCodes(model.codes);
+    const decoded = decodedFrom(model);
+    return decoded ? QuietReader.ofCodes(decoded.codes, decoded.silent) : QuietReader.ofLowBits(model);
+  }
+
+  private static ofLowBits(model: Gaussians): QuietReader {
+    let fields = fieldsOf(model);
+    let [names, low] = [identities(model, fields), lowBits(fields)];
+    const width = lowWidth(fields);
+    const rows = firstOfEach(names, low, width);
+    if (rows.length < model.count) {
+      fields = fieldsOf(selected(model, rows));
+      [names, low] = [rowsOf(names, rows, IDENTITY_BYTES), rowsOf(low, rows, width)];
+    }
+    const widths = [...new Set([width, lowWidth(fields, NARROW_HARMONICS)])].filter((each) => each >= LEAST_WIDTH);
+    return new QuietReader(names, low, width, widths, salts(fields, names, low, width));
+  }
+
+  /** `silent` [N]: Gaussians that carry nothing. */
+  private static ofCodes(codes: Codes, silent?: Uint8Array): QuietReader | null {
+    const bits = lastBits(codes, silent);
+    if (bits.length < MIN_BLOCKS * 8 * BLOCK_BYTES || bits.length > MAX_BITS) return null;
+    const low = held(bits);
+    const numbers = new Uint32Array((IDENTITY_BYTES / 4) * (low.length / BLOCK_BYTES));
+    for (let block = 0; 4 * block < numbers.length; block++) numbers[4 * block] = block;
+    const names = new Uint8Array(numbers.buffer);
+    const salt = saltOf(names.subarray(0, IDENTITY_BYTES), low.subarray(0, LEAST_BYTES));
+    const [others, rest] = [names.subarray(IDENTITY_BYTES), low.subarray(BLOCK_BYTES)];
+    return new QuietReader(others, rest, BLOCK_BYTES, [LEAST_BYTES], [salt], true);
+  }
+
+  get derivations(): number {
+    return Math.min(SALTS_TRIED, this.salts.length);
+  }
+
+  /** What `key` opens, null for nothing. Raises InputError for damage. */
+  async open(key: string, derive: Derive = here): Promise<Content | null> {
+    const dataKeys: Uint8Array[] = [];
+    let secret = new Uint8Array(32);
+    // Other workers derive what comes next while this one looks through the cells.
+    const masters = this.salts.slice(0, this.derivations).map((salt) => derive(key, salt));
+    for (const each of masters) {
+      secret = new Uint8Array(expand(await each, 'quiet/key', 32));
+      if (!this.widths.length) continue;
+      const cells = this.cells(new CellCipher(secret, 'key', DATA_KEY_BYTES));
+      const best = mostFrequent(cells.map(({ data }) => bytesKey(data)));
+      if (best) dataKeys.push(cells.find(({ data }) => bytesKey(data) === best[0])!.data);
+    }
+    for (const dataKey of dataKeys) {
+      for (const width of this.widths) {
+        const parts = this.parts(dataKey, width);
+        if (!parts.length) continue;
+        const parameters = unpackParameters(parts.map(({ data }) => data));
+        if (!this.blocks) return this.content(dataKey, parameters, width);
+        return this.payload(dataKey, parameters, this.inBlocks(parameters, parts[parts.length - 1].row));
+      }
+    }
+    if (dataKeys.length === 0 && this.widths.length) {
+      const none = expand(secret, 'quiet/none', DATA_KEY_BYTES);
+      for (const width of this.widths) this.parts(none, width);
+      this.passesForNothing(none, this.width);
+    }
+    return null;
+  }
+
+  private passesForNothing(dataKey: Uint8Array, width: number): void {
+    const size = Math.floor(width / DUMMY_CELLS) - TAG_BYTES;
+    for (const label of ['record', 'copy']) this.cells(new CellCipher(dataKey, label, size), width, DUMMY_CELLS);
+  }
+
+  private async content(dataKey: Uint8Array, parameters: Parameters, width: number): Promise<Content> {
+    const { isPayload, cells, recordBytes, method, header } = parameters;
+    if (recordBytes < 1 || recordBytes > Math.floor(width / cells) - TAG_BYTES) throw damaged();
+    const [records, copies] = ['record', 'copy'].map((label) =>
+      this.cells(new CellCipher(dataKey, label, recordBytes), width, cells).map(({ data }) => data),
+    );
+    if (width < this.width) this.passesForNothing(dataKey, this.width - width);
+    if (isPayload) {
+      const [size, codewords] = unpackCodewords(parameters);
+      const chunks = records.map((each): [number, Uint8Array] => [
+        each[0] | (each[1] << 8) | (each[2] << 16), each.subarray(NUMBER_BYTES),
+      ]);
+      return this.payload(dataKey, parameters, decoded(codewords, chunks).subarray(0, size));
+    }
+    const known = new Set(records.map(bytesKey));
+    const all = [...records, ...copies.filter((each) => !known.has(bytesKey(each)))];
+    if (!all.length) throw tooMuchLost();
+    return { service: 'records', method, header, records: all };
+  }
+
+  private async payload(dataKey: Uint8Array, { method }: Parameters, encrypted: Uint8Array): Promise<Content> {
+    const data = await decrypted(expand(dataKey, 'payload-key', 32), encrypted, ASSOCIATED);
+    return { service: 'payload', method, data };
+  }
+
+  /** What the blocks after `row` hold, where the parameters are. */
+  private inBlocks({ count, recordBytes }: Parameters, row: number): Uint8Array {
+    const blocks = this.low.length / BLOCK_BYTES;
+    if (count > blocks || recordBytes < 1 || recordBytes > BLOCK_BYTES) throw damaged();
+    const rows = Array.from({ length: count }, (_, index) => (row + 1 + index) % blocks);
+    const found = new Uint8Array(count * recordBytes);
+    rows.forEach((each, at) => found.set(this.low.subarray(each * BLOCK_BYTES, each * BLOCK_BYTES + recordBytes), at * recordBytes));
+    return found;
+  }
+
+  private parts(dataKey: Uint8Array, width: number): Cell[] {
+    return this.cells(new CellCipher(dataKey, 'parameters', width - TAG_BYTES));
+  }
+
+  /** The cells of each carrier that the cipher decrypts, in the order of these. */
+  private cells(cipher: CellCipher, width = this.width, cells = 1): Cell[] {
+    const size = Math.floor(width / cells);
+    const found: Cell[] = [];
+    for (let slot = 0; slot < cells; slot++) {
+      const { rows, data } = cipher.decrypt(this.names, this.low, this.width, slot * size, slot);
+      rows.forEach((row, index) => found.push({ row, data: data[index] }));
+    }
+    return found.sort((a, b) => a.row - b.row);
+  }
+}
+
+/** Rows of Gaussians, those that agree in identity and low bits only once. */
+function firstOfEach(names: Uint8Array, low: Uint8Array, width: number): number[] {
+  const seen = new Set<string>();
+  const rows: number[] = [];
+  for (let row = 0; row < names.length / IDENTITY_BYTES; row++) {
+    const name = names.subarray(row * IDENTITY_BYTES, (row + 1) * IDENTITY_BYTES);
+    const all = bytesKey(name) + bytesKey(low.subarray(row * width, (row + 1) * width));
+    if (!seen.has(all)) rows.push(row);
+    seen.add(all);
+  }
+  return rows;
+}
