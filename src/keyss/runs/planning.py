@@ -110,7 +110,7 @@ def needs_of_fit(scene: Scene, config: FitConfig) -> Needs:
 
 
 def _needs(largest: int, written: int, trained: int, degree: int, photos: Sequence[Scene]) -> Needs:
-    """From numbers of Gaussians. A training has gradients, moments and two checkpoints, one being replaced."""
+    """From numbers of Gaussians. A training has gradients, moments, two checkpoints."""
     resident: int = psutil.Process().memory_info().rss
     copies = 4 + 2 * _STATE_COPIES if trained else 3
     targets = max((Targets.most_bytes(scene.train) for scene in photos), default=0)
