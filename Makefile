@@ -14,7 +14,7 @@
 #   make pictures      the pictures of the documents, from the demo
 #   make benchmark-check        a quick benchmark against the stored one; fails where something got slower
 #   make benchmark-baseline     store what the quick benchmark measures as the next baseline
-#   make benchmark-rasterizer   time the CPU rasterizer (ARGS="--large", "--models FOLDER", "--write FILE")
+#   make benchmark-rasterizer   time the CPU rasterizer (ARGS="--large", "--models FOLDER")
 # On Linux, PyPI's torch brings the CUDA libraries, several gigabytes. For a machine without a GPU:
 #   make demo PIP_EXTRA="--extra-index-url https://download.pytorch.org/whl/cpu"
 

@@ -16,8 +16,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
 from channels.quiet.payloads import embed_derived
 from channels.quiet.trained_like import keys
-from keyss.measure.stealth.agreement import count_coincidences
-from keyss.measure.stealth.statistic import BitPatterns
+from keyss.lab.stealth.agreement import count_coincidences
+from keyss.lab.stealth.statistic import BitPatterns
 
 
 def main(paths: list[str]) -> None:

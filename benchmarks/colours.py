@@ -38,7 +38,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-from keyss import measure
+from keyss import lab
 from colours_payloads import run_payloads
 from keyss.channels import Colours, ColoursCover, Payload
 from keyss.core.errors import BackendError, InputError, WrongKeyError
@@ -146,7 +146,7 @@ def _measure(
                 continue
             failures[what] += not _opens(changed, seed, data)
             if pruned:
-                removed = measure.random_pruning(0.25, seed)(changed)
+                removed = lab.random_pruning(0.25, seed)(changed)
                 failures[f"{what}, 25 % removed"] += not _opens(removed, seed, data)
     bits = 8 * size / len(prepared.cover)
     start = f"| {name} | {np.mean(psnrs):.1f} ({min(psnrs):.1f}) | {size:,} | {bits:.2f}"
@@ -261,25 +261,25 @@ def _then(first: Change, second: Change) -> Change:
     return lambda model: second(first(model))
 
 
-_BY_TOOL: dict[str, Change] = {f"{each.format} by {each.tool}": each for each in measure.converters()}
+_BY_TOOL: dict[str, Change] = {f"{each.format} by {each.tool}": each for each in lab.converters()}
 FORMATS: dict[str, Change] = {"raw `.ply`": lambda model: model, **_BY_TOOL}
 OTHERS: dict[str, Change] = {
     "reordered": _shuffled,
-    "cropped to a half": measure.cropping(1),
-    "50 % removed at random": measure.random_pruning(0.5, 1),
-    "25 % of lowest opacity removed": measure.opacity_pruning(0.25),
+    "cropped to a half": lab.cropping(1),
+    "50 % removed at random": lab.random_pruning(0.5, 1),
+    "25 % of lowest opacity removed": lab.opacity_pruning(0.25),
     "another scene a quarter as large": _beside(0.25),
     "another scene as large": _beside(1.0),
-    "without harmonics": measure.fewer_harmonics(0),
-    "half floats": measure.half_floats(),
+    "without harmonics": lab.fewer_harmonics(0),
+    "half floats": lab.half_floats(),
     "rotated and moved": _moved(1.0),
     "scaled by 1.37, rotated and moved": _moved(1.37),
     "`.spz` by gsply, then scaled": _then(_BY_TOOL[".spz by gsply"], _moved(1.37)),
     "scaled, then `.spz` by gsply": _then(_moved(1.37), _BY_TOOL[".spz by gsply"]),
-    "noise on colour, 0.01 of its spread": measure.noise("colour", 0.01),
-    "noise on colour, 0.03 of its spread": measure.noise("colour", 0.03),
-    "noise on log scales, 0.01 of their spread": measure.noise("log scale", 0.01),
-    "noise on opacity, 0.01 of its spread": measure.noise("logit opacity", 0.01),
+    "noise on colour, 0.01 of its spread": lab.noise("colour", 0.01),
+    "noise on colour, 0.03 of its spread": lab.noise("colour", 0.03),
+    "noise on log scales, 0.01 of their spread": lab.noise("log scale", 0.01),
+    "noise on opacity, 0.01 of its spread": lab.noise("logit opacity", 0.01),
 }
 
 

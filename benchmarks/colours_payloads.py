@@ -15,7 +15,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from keyss import measure
+from keyss import lab
 from keyss.channels import Colours, ColoursCover
 from keyss.core.errors import BackendError
 from keyss.core.gaussians import Gaussians
@@ -61,7 +61,7 @@ def run_payloads(
             except BackendError:
                 continue
             opened[what] = opens(changed, number, data)
-            removed = measure.random_pruning(REMOVED, number)(changed)
+            removed = lab.random_pruning(REMOVED, number)(changed)
             opened[f"{what}, {REMOVED:.0%} removed"] = opens(removed, number, data)
         record = {
             "number": number,

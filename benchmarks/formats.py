@@ -20,7 +20,7 @@ from pathlib import Path
 from keyss.core import BackendError, Gaussians
 from keyss.core.similarity import Similarity
 from keyss.files.models import read_model, write_model
-from keyss.measure import transform
+from keyss.lab import transform
 from keyss.rendering.difference import psnr_between
 
 import numpy as np

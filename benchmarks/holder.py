@@ -4,7 +4,7 @@
 
 In each model one secret is hidden alone, and beside one to three others, as carried models and as sealed
 payloads. The holder opens his own, tries every cell of the file with his key
-(`tests/channels/quiet/holder.py`), and takes the statistics of `keyss.measure.stealth` besides. Detectors
+(`tests/channels/quiet/holder.py`), and takes the statistics of `keyss.lab.stealth` besides. Detectors
 learn from all scenes but one.
 """
 
@@ -32,7 +32,7 @@ from channels.quiet import payloads
 from channels.quiet.holder import seen_by_holder
 from channels.quiet.trained_like import keys
 from keyss.core import UsageError
-from keyss.measure import stealth_statistics
+from keyss.lab import stealth_statistics
 from keyss.methods import most_visible
 from methods.carry import carried
 from stealth_detection import Examples, learned_detectors, single_detectors

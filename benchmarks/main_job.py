@@ -1,12 +1,9 @@
-"""What one hiding takes from photos to a measured result, against an older commit, and its fits side by side.
+"""What one hiding takes from photos to a measured result, against an older commit.
 
     python benchmarks/main_job.py --cover bonsai --secret fox --against 2f752b1
-    python benchmarks/main_job.py --cover bonsai --secret fox --fits
 
 `keyss hide` as it is typed, in a process of its own, with the working tree and with the older commit in
-turns. With `--fits` also the plain models alone: one after the other with all threads, and side by side with
-half of them each, as `keyss hide` fits them. Each tree first hides for a few steps, so that its kernels are
-compiled.
+turns. Each tree first hides for a few steps, so that its kernels are compiled.
 """
 
 from __future__ import annotations
@@ -22,12 +19,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from keyss import FitConfig
-from keyss.files import load_scene
-from keyss.fitting.side_by_side import MIN_STEPS, Fit, fit_scenes
-
-import torch
-
 ROOT = Path(__file__).resolve().parents[1]
 KEY = "Xq7Rf2LmZ9aT+001"
 FEW = 60  # steps
@@ -42,7 +33,6 @@ def main() -> None:
     parser.add_argument("--cover", type=Path, required=True)
     parser.add_argument("--secret", type=Path, required=True)
     parser.add_argument("--against", metavar="COMMIT")
-    parser.add_argument("--fits", action="store_true")
     parser.add_argument("--width", type=int, default=200)
     parser.add_argument("--max-gaussians", type=int, default=20_000)
     parser.add_argument("--seed", type=int, default=0)
@@ -50,12 +40,8 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--repeats", type=int, default=2)
     options = parser.parse_args()
-    if options.fits and (options.iterations or MIN_STEPS) < MIN_STEPS:
-        parser.error(f"--fits: fewer than {MIN_STEPS} steps are not done side by side")
     with tempfile.TemporaryDirectory() as name:
         found = hidings(options, Path(name))
-        if options.fits:
-            found |= fits(options)
     steps = f"{options.iterations} steps" if options.iterations else "each commit's own number of steps"
     print(f"{steps}, {options.threads} thread(s); the least of {options.repeats}\n")
     print("| | seconds | processor seconds |\n| --- | --- | --- |")
@@ -88,25 +74,6 @@ def decibels(run: Path) -> str:
     metrics = json.loads(next(run.rglob("metrics.json")).read_text())
     cover, secret = metrics["cover"]["psnr"], metrics["secrets"][0]["psnr"]
     return f"cover {cover:.2f} dB, secret {secret:.2f} dB"
-
-
-def fits(options: argparse.Namespace) -> dict[str, list[Times]]:
-    """The plain models of both scenes, in this process and in two, with as many threads in all."""
-    torch.set_num_threads(options.threads)
-    config = FitConfig(
-        iterations=options.iterations or MIN_STEPS, max_gaussians=options.max_gaussians, seed=options.seed
-    )
-    scenes = [load_scene(each, width=options.width) for each in (options.cover, options.secret)]
-    both = [Fit(scene, config, scene.name) for scene in scenes]
-    found: dict[str, list[Times]] = {"fits, one after the other": [], "fits, side by side": []}
-    for _ in range(options.repeats):
-        for (what, times), groups in zip(found.items(), ([[fit] for fit in both], [both]), strict=True):
-            print(what, flush=True)
-            before, start = processor_seconds(), time.perf_counter()
-            for group in groups:
-                fit_scenes(group)
-            times.append((time.perf_counter() - start, processor_seconds() - before))
-    return found
 
 
 def sizes(options: argparse.Namespace) -> Command:

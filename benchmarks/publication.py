@@ -20,7 +20,7 @@ from keyss import reveal
 from codes import against_photos
 from keyss.core import BackendError, Gaussians, KeyssError
 from keyss.files import read_model, write_model
-from keyss.measure import Converter, converters
+from keyss.lab import Converter, converters
 from keyss.runs.opening import HidingRun, open_run
 
 

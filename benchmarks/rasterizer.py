@@ -22,7 +22,7 @@ from pathlib import Path
 from arithmetic_peak import OPERATIONS_PER_PAIR, peak_operations
 from benchmark_record import make_record, numbers_of_table, processor_name, write_record
 from keyss.core import Camera, Gaussians
-from keyss.files import read_model, write_bytes
+from keyss.files import read_model
 from keyss.fitting.config import FitConfig
 from keyss.fitting.losses import Target, photometric_loss
 from keyss.fitting.parameters import make_optimizers, to_gaussians, to_parameters
@@ -35,8 +35,6 @@ from torch import Tensor
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "tests"))
 from rendering.dense_reference import dense_rasterization  # noqa: E402
-
-START, END = "<!-- measured by `make benchmark-rasterizer` -->", "<!-- end of what was measured -->"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -277,7 +275,6 @@ def main() -> None:
     parser.add_argument("--models", type=Path, help="folder with 3DGS .ply files to draw too")
     parser.add_argument("--repeats", type=int, default=15, help="repeats of each measurement")
     parser.add_argument("--threads", type=int, nargs="+", default=sorted({1, os.cpu_count() or 1}))
-    parser.add_argument("--write", type=Path, help="put the tables into this Markdown file")
     options = parser.parse_args()
 
     cases = [*CASES, *([LARGE] if options.large else [])]
@@ -327,13 +324,6 @@ def main() -> None:
     }
     ratios = {name: value for name, value in numbers.items() if name.endswith("step / rasterizer")}
     print(write_record(make_record("rasterizer", numbers, ratios)))
-    if options.write is not None:
-        page = options.write.read_text()
-        if START not in page or END not in page:
-            parser.error(f"--write: {options.write} lacks the lines {START} and {END}")
-        head, rest = page.split(START, 1)
-        _, tail = rest.split(END, 1)
-        write_bytes(options.write, f"{head}{START}\n{text}\n{END}{tail}".encode())
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""How well the attacks of `keyss.measure.stealth` tell files that hide something, on models that you have.
+"""How well the attacks of `keyss.lab.stealth` tell files that hide something, on models that you have.
 
     python benchmarks/stealth.py bonsai=a.ply bonsai=b.ply fox=c.ply ...  # plain, of three scenes or more
     python benchmarks/stealth.py ... --refitted bonsai=stego.ply:secret.ply  # stego files, secrets' models
@@ -39,7 +39,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 from channels.quiet.payloads import embed_derived
 from channels.quiet.trained_like import keys, rounded
 from keyss.core import Gaussians, UsageError
-from keyss.measure import candidate_scores, stealth_statistics
+from keyss.lab import candidate_scores, stealth_statistics
 from keyss.methods.carry.room import CarryOptions, RecordRoom
 from methods.carry import carried
 from stealth_detection import Detection, Examples, confirmed, learned_detectors, single_detectors

@@ -12,7 +12,7 @@ from typing import Any
 
 from keyss.core import Gaussians
 from keyss.core.arrays import Doubles, Flags, Integers, Words32
-from keyss.measure.stealth.statistic import NOTHING, BitPatterns, Statistic, normal, ulps
+from keyss.lab.stealth.statistic import NOTHING, BitPatterns, Statistic, normal, ulps
 
 import numpy as np
 from scipy.spatial import cKDTree

@@ -18,12 +18,12 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from keyss import Secret, convert, hide, reveal
+from keyss import SecretFile, convert, hide_files, reveal
 from colours import FORMATS, OTHERS, Change
 from keyss.core import BackendError, Gaussians, InputError, WrongKeyError
 from keyss.files import load_scene, read_model
 from keyss.keys import derivation
-from keyss.measure import fine_tuning
+from keyss.lab import fine_tuning
 from keyss.methods import HiddenFile
 
 import numpy as np
@@ -79,8 +79,8 @@ def main() -> None:
         order = torch.randperm(len(model), generator=torch.Generator().manual_seed(0))
         model = model[order[: asked.gaussians]]
     data = np.random.default_rng(0).bytes(asked.bytes)
-    secret = Secret(file=data, key=KEY, name="file")
-    made = {name: hide(model, [secret], **options) for name, options in CHANNELS.items()}
+    secret = SecretFile(data, KEY, "file")
+    made = {name: hide_files(model, [secret], **options) for name, options in CHANNELS.items()}
     print(f"{asked.model.stem}, {len(model):,} Gaussians, a file of {asked.bytes} bytes\n")
     print(f"| what becomes of the model | {' | '.join(made)} |")
     print("| --- |" + " --- |" * len(made))

@@ -111,7 +111,8 @@ def real_data() -> Path:
 def splat_transform() -> Callable[..., Path]:
     """Converts (source, target) -> target by splat-transform; skips if it is not installed."""
     from keyss.core import BackendError
-    from keyss.measure import find_splat_transform, transform
+    from keyss.files.foreign import find_splat_transform
+    from keyss.lab import transform
 
     try:
         find_splat_transform()

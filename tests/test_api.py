@@ -262,7 +262,7 @@ def test_info_sums_up_a_model(tmp_path: Path) -> None:
 
 
 def test_a_secret_does_not_show_its_key() -> None:
-    assert "hunter2" not in repr(Secret("scene", "hunter2"))
+    assert "hunter2" not in repr(Secret("scene", "hunter2")) + repr(keyss.SecretFile("file", "hunter2"))
 
 
 def test_keys_are_checked_before_any_work(folders: tuple[Path, Path], tmp_path: Path) -> None:

@@ -37,7 +37,7 @@ def test_a_front_door_loads_what_its_stub_lists(package: str) -> None:
 LIGHT = """
 import sys, keyss.core, keyss.files, keyss.runs, keyss.rendering, keyss.measure
 print({"torch", "scipy", "sklearn", "ot"} & sys.modules.keys())
-import keyss.measure.two_sample, keyss.measure.sinkhorn
+import keyss.lab.two_sample, keyss.lab.sinkhorn
 print({"sklearn", "ot"} & sys.modules.keys())
 """
 

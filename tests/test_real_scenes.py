@@ -9,8 +9,8 @@ import pytest
 
 import keyss
 from keyss import CarryOptions, FitConfig, Secret
-from keyss.audits import audit, read_audit, verdicts
 from keyss.cli import main
+from keyss.lab.audits import audit, read_audit, verdicts
 
 pytestmark = pytest.mark.slow
 CONFIG = CarryOptions(fit=FitConfig(max_gaussians=20_000, seed=0))

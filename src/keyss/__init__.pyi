@@ -3,17 +3,18 @@ from .api.asking import HideResult as HideResult, Secret as Secret
 from .api.converting import convert as convert
 from .api.fitting import fit as fit
 from .api.hiding import hide as hide
+from .api.hiding_files import SecretFile as SecretFile, hide_files as hide_files
 from .api.looking import evaluate as evaluate, render as render
 from .api.opening import reveal as reveal, verify as verify
-from .audits.run import audit as audit
 from .core import Gaussians as Gaussians, KeyssError as KeyssError, WrongKeyError as WrongKeyError
 from .files import load_scene as load_scene, read_model as read_model, write_model as write_model
 from .fitting import FitConfig as FitConfig
 from .keys import generate_key as generate_key, read_key as read_key
-from .many.batch import hide_batch as hide_batch
-from .many.comparison import compare as compare
-from .many.reproduction import reproduce as reproduce
-from .many.sweep_spec import sweep as sweep
+from .lab.audits.run import audit as audit
+from .lab.many.batch import hide_batch as hide_batch
+from .lab.many.comparison import compare as compare
+from .lab.many.reproduction import reproduce as reproduce
+from .lab.many.sweep_spec import sweep as sweep
 from .methods import CarryOptions as CarryOptions, KeyssOptions as KeyssOptions
 from .runs.describe import info as info
 from .runs.revealing import Revealed as Revealed

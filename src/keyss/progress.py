@@ -19,7 +19,6 @@ class Reporter:
     """Displays the progress of trainings; this one displays nothing."""
 
     loss_every = 0  # steps between two losses among the numbers; 0: none, since reading it slows a GPU down
-    several = False  # whether it can display several trainings at once
 
     def start(self, title: str, iterations: int, iteration: int) -> None:
         """A training begins; a resumed one has done `iteration` of its `iterations` steps."""
@@ -30,10 +29,6 @@ class Reporter:
     def look(self, model: Callable[[], Any]) -> None:
         """A step is done; `model` returns the present Gaussians, whose tensors later steps change."""
 
-    def interrupts(self) -> bool:
-        """True ends the training after this step, as Ctrl-C does."""
-        return False
-
     def note(self, line: str) -> None:
         """Display a line before the training begins."""
 
@@ -42,10 +37,6 @@ class Reporter:
 
     def of_secret(self) -> Reporter:
         """A reporter for the training of a secret."""
-        return self
-
-    def beside(self) -> Reporter:
-        """A reporter for one more training at the same time, if it can display `several`."""
         return self
 
 
@@ -60,46 +51,23 @@ class ProgressLines(Reporter):
 
     In a terminal, one line is redrawn every 0.25 seconds; elsewhere, for logs, a line is printed every 10
     seconds. `every` changes this. Lines are redrawn by `update`, not by a thread, which would take cores from
-    training. A terminal displays one block at a time: that of `first` has the lines of all running trainings.
+    training.
     """
-
-    several = True
 
     def __init__(
         self,
         console: Console,
         every: float | None = None,
         timer: Callable[[], float] = time.monotonic,
-        first: ProgressLines | None = None,
     ) -> None:
         self.console = console
         self.live = console.is_terminal
         self.every = (0.25 if self.live else 10.0) if every is None else every
         self.timer = timer
-        self.first = first or self
-        self.block: Progress | None = None
-        self.open = 0  # lines of the block
         self.task: Task | None = None
 
-    def beside(self) -> ProgressLines:
-        """A reporter for another training at the same time: in a terminal, the line below."""
-        return ProgressLines(self.console, self.every, self.timer, self.first)
-
     def start(self, title: str, iterations: int, iteration: int) -> None:
-        if self.first.block is None:
-            self.first.block = self._new_block()
-            self.first.block.start()
-        self.first.open += 1
-        self.progress = self.first.block
-        number = self.progress.add_task(title, total=iterations, completed=iteration, facts="starting")
-        self.task = next(task for task in self.progress.tasks if task.id == number)
-        self.displayed, self.numbers = self.timer(), ""
-        if not self.live:
-            where = f", continuing at {iteration}" if iteration else ""
-            self.note(f"{title}: {iterations} steps{where}")
-
-    def _new_block(self) -> Progress:
-        return Progress(
+        self.progress = Progress(
             TextColumn("{task.description}", markup=False),
             BarColumn(bar_width=12),
             MofNCompleteColumn(),
@@ -110,6 +78,13 @@ class ProgressLines(Reporter):
             disable=not self.live,
             get_time=self.timer,
         )
+        self.progress.start()
+        self.progress.add_task(title, total=iterations, completed=iteration, facts="starting")
+        self.task = self.progress.tasks[0]
+        self.displayed, self.numbers = self.timer(), ""
+        if not self.live:
+            where = f", continuing at {iteration}" if iteration else ""
+            self.note(f"{title}: {iterations} steps{where}")
 
     def update(self, iteration: int, gaussians: int, numbers: dict[str, float]) -> None:
         task = self.task
@@ -133,10 +108,7 @@ class ProgressLines(Reporter):
             return
         duration = f"in {clock(task.elapsed or 0)}"
         self.progress.update(task.id, facts=_joined(duration, self.numbers), refresh=True)
-        self.first.open -= 1
-        if self.first.open == 0:
-            self.progress.stop()
-            self.first.block = None
+        self.progress.stop()
         if not self.live:
             how = "done" if task.finished else f"stopped at {task.completed}"
             self.note(_joined(f"{task.description}: {how} {duration}", self.numbers))

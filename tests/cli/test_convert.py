@@ -113,8 +113,8 @@ def test_a_secret_survives_from_ply_to_ply(keyss: Run, files: Path, tmp_path: Pa
 
 
 def test_a_hidden_file_is_not_destroyed_unasked(keyss: Run, files: Path, tmp_path: Path) -> None:
-    stego = package.hide(
-        trained_like(2500), [package.Secret(file=b"a letter" * 20, key="q7Rv2LxT9bWm4KzD")]
+    stego = package.hide_files(
+        trained_like(2500), [package.SecretFile(b"a letter" * 20, "q7Rv2LxT9bWm4KzD")]
     ).stego
     write_model(tmp_path / "stego.ply", stego)
     key = ("--key-file", files / "other")

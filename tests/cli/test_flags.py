@@ -55,7 +55,7 @@ def _strings(tree: ast.Module) -> Iterator[tuple[int, str]]:
 
 
 def test_no_message_below_the_command_line_names_a_flag() -> None:
-    upper = (SOURCE / "cli", SOURCE / "demo")
+    upper = (SOURCE / "cli", SOURCE / "demo", SOURCE / "lab" / "commands.py")
     files = [path for path in SOURCE.rglob("*.py") if not any(map(path.is_relative_to, upper))]
     assert len(files) > 50
     found = {

@@ -11,9 +11,9 @@ import pytest
 
 from cli.said import COMMANDS, Run, Said
 from keyss import __version__
-from keyss.audits import PARTS
 from keyss.files import write_model
 from keyss.fitting import PRESETS as FIT_PRESETS
+from keyss.lab.audits import PARTS
 from keyss.methods import registry
 from tiny_scenes import random_gaussians
 

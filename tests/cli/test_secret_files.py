@@ -82,7 +82,7 @@ def test_a_scene_is_not_taken_for_a_file(tmp_path: Path) -> None:
 
 def test_a_file_too_large_for_its_cover_is_told_what_would_do(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"too small to carry .* Gaussians would do; .*channel="):
-        library.hide(trained_like(2000), [library.Secret(file=os.urandom(90_000), key=KEYS[0])])
+        library.hide_files(trained_like(2000), [library.SecretFile(os.urandom(90_000), KEYS[0])])
 
 
 @pytest.mark.parametrize(

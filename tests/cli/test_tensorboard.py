@@ -9,9 +9,7 @@ from pathlib import Path
 import pytest
 
 from cli.said import SMALL, Run, assert_refused
-from keyss.cli import reporting
 from keyss.files import read_model
-from keyss.progress import Reporter
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of TensorBoard's own
@@ -33,23 +31,6 @@ def test_losses_come_back(keyss: Run, scene: Path) -> None:
     # What trains is the same, watched or not.
     keyss("fit", scene, "-o", scene.parent / "plain", *SMALL[2:], "--seed", 0)
     assert (out / "model.ply").read_bytes() == (scene.parent / "plain" / "model.ply").read_bytes()
-
-
-@pytest.mark.filterwarnings("ignore::DeprecationWarning")
-def test_two_trainings_at_the_same_time_have_a_run_each(tmp_path: Path) -> None:
-    events = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
-    cover = reporting.TensorBoardReporter(tmp_path, Reporter())
-    assert cover.several
-    secret = cover.beside()
-    for title, each in (("cover", cover), ("secret", secret)):
-        each.start(title, 10, 0)
-    for factor, each in ((1.0, cover), (2.0, secret)):
-        each.update(10, 100, {"loss": factor})
-        each.finish()
-    for title, loss in (("cover", 1.0), ("secret", 2.0)):
-        found = events.EventAccumulator(str(tmp_path / reporting.FOLDER / title))
-        found.Reload()
-        assert [each.value for each in found.Scalars("loss")] == [loss]
 
 
 def test_without_it_nothing_is_begun(keyss: Run, scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:

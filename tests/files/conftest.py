@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from keyss.measure import transform
+from keyss.lab import transform
 
 NEWER = Path(__file__).parents[2] / "web" / "node_modules" / ".bin" / "splat-transform"
 

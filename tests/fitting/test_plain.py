@@ -18,7 +18,6 @@ from keyss.fitting import (
     mean_psnr,
     photometric_loss,
     save_checkpoint,
-    steps_done,
 )
 from keyss.progress import Reporter
 from keyss.rendering import render_with_meta
@@ -120,15 +119,6 @@ def test_a_damaged_checkpoint_is_an_input_error(tmp_path: Path) -> None:
         path.write_bytes(data[:size])
         with pytest.raises(InputError):
             load_checkpoint(path)
-        assert steps_done(path) == 0
-
-
-def test_steps_of_a_checkpoint(tmp_path: Path) -> None:
-    path = tmp_path / "checkpoint.safetensors"
-    assert steps_done(None) == steps_done(path) == 0
-    for told, steps in (({"iteration": 7}, 7), ({"iteration": None}, 0), ({}, 0)):
-        save_checkpoint(path, {"a": torch.ones(3)}, told)
-        assert steps_done(path) == steps
 
 
 def test_a_scene_without_points_starts_from_random_ones() -> None:

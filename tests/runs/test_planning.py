@@ -9,15 +9,12 @@ from functools import partial
 from pathlib import Path
 
 import pytest
-import torch
 
 import keyss
 from channels.quiet.trained_like import trained_like
 from keyss import CarryOptions, FitConfig, Secret
 from keyss.core import OutputError
 from keyss.files import write_model
-from keyss.methods import registry
-from keyss.methods.peers.decoder import Convolutions, weights_of
 from methods.keyss.small import small
 from tiny_scenes import tiny_scene
 
@@ -42,16 +39,6 @@ def test_stages_and_sizes_of_a_run_from_photos(tmp_path: Path) -> None:
     assert plan.capacity < plan.secret_gaussians == 800
     assert plan.free_bytes is not None
     assert list(tmp_path.iterdir()) == []
-
-
-def test_a_bound_has_a_stage_where_one_is_fitted() -> None:
-    secret = Secret(tiny_scene(1), KEY)
-    for bound, steps in ((False, []), (True, [150])):
-        options = CarryOptions(fit=FIT, iterations=90, publish="any", refit="always")
-        plan = keyss.hide(tiny_scene(0), [secret], method=options, bound=bound, dry_run=True).plan
-        stages = [stage for stage in plan.stages if stage.name.startswith("bound")]
-        assert [stage.steps for stage in stages] == steps
-        assert {stage.name for stage in stages} <= {"bound of the secret"}  # the cover's is its plain model
 
 
 @pytest.mark.argon2
@@ -105,21 +92,3 @@ def test_a_full_disk_is_refused_before_anything_is_written(
             verb(tmp_path / "cover.ply", secrets, method="carry", out=tmp_path / "a" / "run")
     assert set(asked) == {tmp_path.resolve()}
     assert [path.name for path in tmp_path.iterdir()] == ["cover.ply"]
-
-
-def test_only_methods_with_networks_take_longer() -> None:
-    seconds, small = {}, FitConfig(iterations=10, max_gaussians=200, seed=0)
-    for name in ("3dgs-sh", "3dgs-decoder", "gs-hider"):
-        options = registry.get(name).options(fit=small)
-        plan = keyss.hide(tiny_scene(0), [Secret(tiny_scene(1), "")], method=options, dry_run=True).plan
-        seconds[name] = next(stage.seconds for stage in plan.stages if stage.name == "hiding")
-    assert seconds["3dgs-sh"] < seconds["3dgs-decoder"] < seconds["gs-hider"]
-
-
-def test_plans_count_the_weights_of_the_networks() -> None:
-    for channels in (3, 16):
-        assert weights_of(channels) == _weights(Convolutions(channels))
-
-
-def _weights(network: torch.nn.Module) -> int:
-    return sum(each.numel() for name, each in network.named_parameters() if name.endswith("weight"))

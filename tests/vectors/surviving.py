@@ -20,7 +20,7 @@ from keyss.files import write_model
 from keyss.methods import HiddenFile
 from keyss.methods.records import whole
 from keyss.methods.records.embedding import METHOD
-from measure.lifelike import lifelike
+from lab.lifelike import lifelike
 
 NAMES = ("appended.ply", "appended-moved.spz", "colours.spz", "colours-moved.splat")
 NOTE = HiddenFile("a note.txt", b"Written at noon, read at night.\n")

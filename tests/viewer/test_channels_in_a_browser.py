@@ -14,7 +14,7 @@ from keyss.channels import LOW_BITS, SUFFIXES, channel_for
 from keyss.files import read_model, write_model
 from keyss.methods import HiddenFile, embed_models
 from keyss.viewer import export_html
-from measure.lifelike import lifelike
+from lab.lifelike import lifelike
 from methods.keyss.small import latent_model
 from viewer.browser import CLOSE, IN_CHROMIUM, POSE, Visit, drawn, made, psnr
 

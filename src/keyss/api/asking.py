@@ -22,20 +22,11 @@ _READERS = 2  # threads that read files
 
 @dataclass(frozen=True)
 class Secret:
-    """A scene or a file to hide, and its key (methods without keys take none)."""
+    """A scene to hide, and its key (methods without keys take none)."""
 
-    scene: PathLike | Scene | Gaussians | None = None  # folder of photos, or model
+    scene: PathLike | Scene | Gaussians  # folder of photos, or model
     key: str = field(default="", repr=False)
     model: PathLike | Gaussians | None = None  # plain 3DGS model of the scene, fitted if there is none
-    file: PathLike | bytes | None = None  # instead of a scene
-    name: str = ""  # of the file, shown when it is revealed; by default its own
-
-    @property
-    def source(self) -> PathLike | Scene | Gaussians:
-        """The scene. Raises UsageError if there is none."""
-        if self.scene is None:
-            raise UsageError("expected secrets with a `scene`, or all of them with a `file`")
-        return self.scene
 
 
 @dataclass(frozen=True)
@@ -43,8 +34,7 @@ class HideResult:
     """The result of `hide`."""
 
     stego: Gaussians | None = None  # to be published; None of a dry run
-    metrics: HideMetrics | None = None  # None of files and of a dry run
-    psnr: float | None = None  # of files: dB of the stego model's views to the cover's, at most 120
+    metrics: HideMetrics | None = None  # None of a dry run
     plan: Plan | None = None  # of a dry run
 
 
@@ -98,7 +88,7 @@ def sources_of(
             for source, (_, photos) in zip(sources, given, strict=True)
         ]
         return [
-            Source(scene.localised(model) if scene and model else model, photos, key, scene)
+            Source(scene.localised(model) if scene and model is not None else model, photos, key, scene)
             for model, (_, photos), key, scene in zip(found, given, ["", *keys], loaded, strict=True)
         ]
 

@@ -197,4 +197,4 @@ def _even(camera: Camera) -> Camera:
     width, height = camera.width - camera.width % 2, camera.height - camera.height % 2
     if min(width, height) < 2:
         raise UsageError(f"pictures of {camera.width} x {camera.height} pixels are too small for a film")
-    return Camera(camera.viewmat, camera.K, width, height, camera.name)
+    return replace(camera, width=width, height=height)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from tyro.conf import UseAppendAction, arg
+from tyro.conf import Positional, UseAppendAction, arg
 
 
 def optional(metavar: str, help: str, default: str = "", aliases: list[str] | None = None) -> Any:
@@ -45,6 +45,7 @@ Ray = Annotated[
 Cores = Annotated[int, arg(metavar="N", help="With --ray: cores of each run.")]
 Overwrite = Annotated[bool, switch("Replace existing results.")]
 Resume = Annotated[bool, switch("Continue an interrupted run in the same folder.")]
+Run = Annotated[Positional[Path], arg(metavar="RUN", help="Result folder of `keyss hide`.")]
 OutFolder = Annotated[Path, arg(aliases=["-o"], metavar="FOLDER", help="Folder for the results.")]
 
 
@@ -107,6 +108,11 @@ def check_there(*paths: Path | None, expected: str = "a file or folder") -> None
     for path in paths:
         if path is not None and str(path) != "-" and not os.path.lexists(path):
             raise InputError(f"{path}: expected {expected}, but there is no such file")
+
+
+def check_run(run: Path) -> None:
+    """See `check_there`."""
+    check_there(run, expected="the folder of a run, as `keyss hide` writes it")
 
 
 def checked_seed(seed: int) -> int:

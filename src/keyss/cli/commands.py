@@ -10,12 +10,18 @@ import importlib
 from collections.abc import Callable, Sequence
 
 GROUPS = {
-    "make": {"demo": "making", "fit": "making", "hide": "hiding", "keygen": "making", "convert": "making"},
-    "open": {"reveal": "opening", "verify": "opening"},
-    "look": {"view": "looking", "render": "looking", "info": "looking"},
-    "measure": {"evaluate": "measuring", "audit": "measuring"},
-    "many": {"compare": "many", "reproduce": "many", "sweep": "many"},
-    "check": {"doctor": "doctor"},
+    "make": {
+        "demo": "cli.making",
+        "fit": "cli.making",
+        "hide": "cli.hiding",
+        "keygen": "cli.making",
+        "convert": "cli.making",
+    },
+    "open": {"reveal": "cli.opening", "verify": "cli.opening"},
+    "look": {"view": "cli.looking", "render": "cli.looking", "info": "cli.looking"},
+    "measure": {"evaluate": "cli.looking", "audit": "lab.commands"},
+    "many": dict.fromkeys(("compare", "reproduce", "sweep"), "lab.commands"),
+    "check": {"doctor": "cli.doctor"},
 }
 MODULES = {name: module for group in GROUPS.values() for name, module in group.items()}
 
@@ -39,7 +45,7 @@ Exit status: 0 done, 2 wrong usage, 3 wrong key, 4 unreadable input, 5 unwritabl
 
 def command(name: str) -> Callable[..., None]:
     """The function of a command."""
-    found: Callable[..., None] = getattr(importlib.import_module(f"keyss.cli.{MODULES[name]}"), name)
+    found: Callable[..., None] = getattr(importlib.import_module(f"keyss.{MODULES[name]}"), name)
     return found
 
 

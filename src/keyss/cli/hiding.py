@@ -298,9 +298,9 @@ def _hide_files(args: HideArguments, cover: Path) -> None:
     )
     files, keys = args.secret_file, _keys(args, len(args.secret_file))
     channel = args.details.channel or "colours"
-    result = keyss.hide(
+    result = keyss.hide_files(
         cover,
-        [keyss.Secret(file=file, key=key) for file, key in zip(files, keys, strict=True)],
+        list(map(keyss.SecretFile, files, keys)),
         publish=args.publish,
         format=args.format,
         channel=channel,
@@ -348,7 +348,9 @@ def _hide_batch(args: HideArguments, table: Path) -> None:
     if skipped := sum(each.skipped for each in result.outcomes):
         print(f"{skipped} of {len(result.outcomes)} assets were done before")
     print_files(args.out, {"private/batch.csv": "the outcome of each asset"})
-    print_outcome(result, "assets", partial(as_flags, options=options_of_group(type(args))))
+    print_outcome(
+        result.errors, len(result.outcomes), "assets", partial(as_flags, options=options_of_group(type(args)))
+    )
 
 
 def _refuse(args: HideArguments, mode: str, used: str, own: Sequence[str] = ()) -> None:

@@ -1,4 +1,4 @@
-"""The commands that show models: `view`, `render` and `info`."""
+"""The commands that show and measure models: `view`, `render`, `info` and `evaluate`."""
 
 from __future__ import annotations
 
@@ -7,7 +7,18 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from keyss.cli.arguments import PHOTOS, Device, Overwrite, Photos, check_there, optional, switch
+from keyss.cli.arguments import (
+    PHOTOS,
+    Device,
+    KeyFiles,
+    Overwrite,
+    Photos,
+    Run,
+    check_run,
+    check_there,
+    optional,
+    switch,
+)
 
 
 def view(
@@ -134,3 +145,34 @@ def info(
     from keyss.runs.describe import info as describe
 
     (print_json if json_ else print_info)(describe(path))
+
+
+def evaluate(
+    run: Run,
+    *,
+    key_file: KeyFiles = (),
+    wrong_keys: Annotated[
+        int | None, optional("N", "Number of random wrong keys, for methods with a decoder.", "32")
+    ] = None,
+    device: Device = "auto",
+) -> None:
+    """Measure PSNR, SSIM and LPIPS of a run again, with the right keys and wrong ones.
+
+    Test views are photos that were held out of training or, for a model, renders of it. Each measurement is
+    compared with its bound: plain 3DGS of as many Gaussians and as many training steps (`keyss hide --bound`
+    fits it), or the plain model that the scene started from. The chance level is the PSNR of the stego model
+    itself to the secret; a wrong key should not exceed it.
+
+    example: keyss evaluate runs/hidden --key-file key.txt
+    """
+    check_run(run)
+    import keyss
+    from keyss.cli.keys import keys_of_run
+    from keyss.cli.tables import print_files, print_hiding
+    from keyss.fitting.lpips import HOW_TO_GET, MIN_SIZE
+
+    metrics = keyss.evaluate(run, keys_of_run(run, key_file), wrong_keys=wrong_keys, device=device)
+    print_hiding(metrics)
+    if metrics.cover.lpips is None:
+        print(f"{HOW_TO_GET}; photos must have at least {MIN_SIZE} x {MIN_SIZE} pixels.")
+    print_files(run, {"private/metrics.json": "the measurements"})

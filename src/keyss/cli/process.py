@@ -9,19 +9,15 @@ from __future__ import annotations
 
 import atexit
 import codecs
-import ctypes
-import gc
 import io
 import os
 import signal
 import sys
-from contextlib import suppress
 from types import FrameType
 from typing import Any, NoReturn
 
 from keyss._interrupts import ENDING
 
-_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # of malloc.h
 _IMPORTING = "<frozen importlib._bootstrap>"
 _CLEAR_LINE = b"\r\x1b[K\x1b[?25h"  # and show the cursor, which progress lines hide
 REPLACING = "keyss.replacing"  # a handler of encoding errors
@@ -43,17 +39,6 @@ _PLAIN = {
 }
 
 
-def keep_memory() -> None:
-    """Let glibc keep up to 256 MiB of freed memory, which large models need again and again.
-
-    Otherwise the kernel takes back and clears most arrays of more than 128 KiB. No effect on other systems.
-    """
-    with suppress(OSError, AttributeError, TypeError):
-        mallopt = ctypes.CDLL(None).mallopt
-        mallopt(_M_MMAP_THRESHOLD, 32 << 20)  # the largest that glibc accepts
-        mallopt(_M_TRIM_THRESHOLD, 256 << 20)
-
-
 def main() -> NoReturn:
     """Run the command line, and exit."""
     _Process().run()
@@ -72,8 +57,6 @@ class _Process:
                 signal.signal(signum, self.on_signal)
         sys.unraisablehook = self.on_unraisable
         prepare_streams()
-        keep_memory()
-        gc.set_threshold(700, 10, 1000)  # full collections would take a quarter of the time to import torch
         try:
             self.running = True
             from keyss.cli.entry import main

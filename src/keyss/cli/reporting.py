@@ -43,7 +43,6 @@ class TensorBoardReporter(Reporter):
     """
 
     loss_every = 10  # steps
-    several = True
 
     def __init__(self, out: Path, lines: Reporter) -> None:
         module = import_extra("torch.utils.tensorboard.writer", "tensorboard", "use --tensorboard")
@@ -68,9 +67,6 @@ class TensorBoardReporter(Reporter):
             self.last = measured
             for name, value in measured.items():
                 self.open.add_scalar(name, value, iteration)
-
-    def beside(self) -> TensorBoardReporter:
-        return TensorBoardReporter(self.out, self.lines.beside())
 
     def note(self, line: str) -> None:
         self.lines.note(line)

@@ -20,8 +20,6 @@ from keyss.runs.records import record_bytes
 
 if TYPE_CHECKING:
     from keyss.api.converting import Conversion
-    from keyss.audits import Audit
-    from keyss.many import Forecast, ManyResult
     from keyss.methods.base import Plan
     from keyss.runs.config import FitMetrics, HideMetrics
     from keyss.runs.describe import ModelInfo, RunInfo, SceneInfo
@@ -195,16 +193,6 @@ def print_fit(metrics: FitMetrics) -> None:
     print_table((*quality, "Gaussians", "iterations", "seconds"), [(*quality.values(), *sizes)], texts=0)
 
 
-def print_verdicts(audit: Audit) -> None:
-    """The verdicts of an audit: a line for each measure, with its baseline or control."""
-    from keyss.audits import headline, verdicts
-
-    lines = verdicts(audit)
-    rows = [(line.measure, line.value, line.beside, line.limit, line.word) for line in lines]
-    print_table(("measure", "measured", "baseline or control", "limit", "verdict"), rows, texts=5)
-    Console().print(headline(lines), highlight=False)
-
-
 def print_info(found: RunInfo | ModelInfo | SceneInfo) -> None:
     """Print the description of `keyss info`."""
     from keyss.runs.describe import RunInfo
@@ -260,14 +248,15 @@ def print_conversion(out: str, found: Conversion, *, dry_run: bool, file: TextIO
         print("dry run: nothing was written", file=file)
 
 
-def print_outcome(result: ManyResult, what: str, as_said: Callable[[str], str] = str) -> None:
-    """The number of cells that are done, and errors `as_said`. Raises InputError if any cell failed."""
-    failed, count = result.failed, len(result.outcomes)
-    print(f"{count - len(failed)} of {count} {what} are done")
-    for each in failed:
-        print(f"failed: {each.name}: {as_said(each.error or '')}")
-    if failed:
-        raise InputError(f"{len(failed)} of {count} {what} failed")
+def print_outcome(
+    errors: Mapping[str, str], count: int, what: str, as_said: Callable[[str], str] = str
+) -> None:
+    """How many of `count` are done, and the errors of the others by name. Raises InputError for errors."""
+    print(f"{count - len(errors)} of {count} {what} are done")
+    for name, error in errors.items():
+        print(f"failed: {name}: {as_said(error)}")
+    if errors:
+        raise InputError(f"{len(errors)} of {count} {what} failed")
 
 
 def print_json(facts: object) -> None:
@@ -282,24 +271,6 @@ def print_json(facts: object) -> None:
 
 def _size(count: int) -> str:
     return f"{count / 1e6:,.1f} MB" if count >= 1e6 else f"{count / 1e3:,.1f} kB"
-
-
-def print_forecast(found: Forecast) -> None:
-    """The cells of a dry run, with estimates for those that are not done."""
-    rows = []
-    for place, name in found.names.items():
-        time, memory = "cannot work" if place in found.refused else "done", ""
-        if (plan := found.plans.get(place)) is not None:
-            time, memory = about(plan.seconds), f"{plan.memory_bytes / 1e9:.1f} GB"
-        rows.append((name, time, memory))
-    print_table(("run", "time, about", "memory"), rows)
-    for place, reason in found.refused.items():
-        print(f"{found.names[place]}: {reason}")
-    print(
-        f"{len(rows)} run{'s' * (len(rows) != 1)}, {len(found.plans)} to do: about "
-        f"{about(sum(plan.seconds for plan in found.plans.values()))} on this machine."
-    )
-    print("Dry run: nothing was written. Times are rough.")
 
 
 def print_files(folder: Path, names: Mapping[str, str]) -> None:

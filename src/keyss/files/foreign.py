@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import os
+import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
+from keyss.core.errors import BackendError
 from keyss.files.reading import open_input
 
 CONVERT = "convert it to .ply first, e.g. with `splat-transform IN OUT.ply`"
@@ -105,3 +108,16 @@ def _kind_in_zip(start: bytes) -> _Kind | None:
         return None
     member = start[30 : 30 + int.from_bytes(start[26:28], "little")]
     return next((kind for kind in _KINDS if kind.member and member.endswith(kind.member)), None)
+
+
+def find_splat_transform() -> str:
+    """The program: KEYSS_SPLAT_TRANSFORM, else node_modules here, else on the PATH. Raises BackendError."""
+    here = Path("node_modules") / ".bin" / "splat-transform"
+    named = os.environ.get("KEYSS_SPLAT_TRANSFORM")
+    program = named or (str(here.absolute()) if here.exists() else shutil.which("splat-transform"))
+    if not program or not Path(program).exists():
+        raise BackendError(
+            "splat-transform is not installed (npm install --no-save @playcanvas/splat-transform@2.7.1, "
+            "or its path in KEYSS_SPLAT_TRANSFORM)"
+        )
+    return program

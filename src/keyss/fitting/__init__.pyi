@@ -1,10 +1,5 @@
 from .adam import RowAdam as RowAdam
-from .checkpoint import (
-    State as State,
-    load_checkpoint as load_checkpoint,
-    save_checkpoint as save_checkpoint,
-    steps_done as steps_done,
-)
+from .checkpoint import State as State, load_checkpoint as load_checkpoint, save_checkpoint as save_checkpoint
 from .config import PRESETS as PRESETS, FitConfig as FitConfig
 from .density import CappedStrategy as CappedStrategy
 from .image_metrics import (
@@ -30,4 +25,3 @@ from .parameters import (
 from .plain import FitResult as FitResult, PlainRun as PlainRun, fit_scene as fit_scene
 from .sampling import own_randomness as own_randomness
 from .schedule import Schedule as Schedule
-from .side_by_side import Fit as Fit, fit_scenes as fit_scenes

@@ -1,7 +1,8 @@
 """Adam with a learning rate for each number of a row, in one pass over memory on a CPU.
 
 It moves all Gaussians, also those outside the view. Skipping these ("selective" Adam, Mallick et al. 2024,
-"Taming 3DGS") saves no time here, because memory is then read with gaps, and costs quality (docs/lessons.md).
+"Taming 3DGS") saves no time here, because memory is then read with gaps, and costs quality
+(docs/performance.md).
 """
 
 from __future__ import annotations

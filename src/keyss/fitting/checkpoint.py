@@ -38,15 +38,6 @@ def load_checkpoint(path: Path) -> tuple[State, dict[str, Any]]:
         raise InputError(f"{path}: not a checkpoint of this version ({error})") from error
 
 
-def steps_done(path: Path | None) -> int:
-    """Training steps of a checkpoint; 0 without one, or if it cannot be read."""
-    try:
-        with safetensors.safe_open(path, framework="pt") as file:
-            return int(json.loads((file.metadata() or {})["meta"])["iteration"])
-    except _UNREADABLE:  # TypeError: no path
-        return 0
-
-
 def pack_model(parameters: Parameters, optimizers: Optimizers, density: Mapping[str, Any]) -> State:
     """Parameters, their Adam moments and the statistics of a strategy: `means`, `means.exp_avg`, ..."""
     state: State = {}

@@ -38,7 +38,7 @@ class FitConfig:
     boost: float | None = None
 
     # Share of the run, at its end, over which all rates decay to a tenth: at constant rates, Gaussians jitter
-    # around their optimum. Only models that do not grow gain by it (docs/lessons.md).
+    # around their optimum. Only models that do not grow gain by it (docs/performance.md).
     settle: float = 0.0
 
     grow_start: float = 0.1  # densification starts here, or at 500 iterations if that is earlier

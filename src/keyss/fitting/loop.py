@@ -99,7 +99,7 @@ def train(
                 reporter.update(run.iteration, len(run), numbers | loss)
                 if model is not None:
                     reporter.look(model)
-                if signum := interrupted() or (signal.SIGINT if reporter.interrupts() else None):
+                if signum := interrupted():
                     save()
                     raise Interrupted(checkpoint, run.iteration, signum)
                 if time.monotonic() - saved > config.checkpoint_seconds:

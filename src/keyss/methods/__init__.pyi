@@ -34,7 +34,6 @@ from .keyss.options import (
 from .keyss.secret import DECODERS as DECODERS, KeyssSecret as KeyssSecret, choose_anchors as choose_anchors
 from .keyss.training import KeyssTraining as KeyssTraining
 from .opened import Frame as Frame, HiddenFile as HiddenFile, Opened as Opened, Remains as Remains
-from .peers.method import PeerOptions as PeerOptions
 from .plain_models import Bound as Bound, with_plain_models as with_plain_models
 from .records.embedding import (
     embed_models as embed_models,

@@ -27,11 +27,10 @@ from keyss.progress import Reporter
 class Source:
     """The cover or a secret: the plain model or the photos that are given, and later both."""
 
-    given: Gaussians | None  # plain 3DGS model on the CPU; None: one is fitted to the photos
-    photos: bool  # False: only the model is given, and renders of it replace photos
+    given: Gaussians | None  # plain 3DGS model on the CPU; None until it is fitted to the photos
+    photos: bool  # False: renders of the model replace photos
     key: str = field(default="", repr=False)  # of a secret, if the method has keys
     loaded: Scene | None = None
-    fitted: Gaussians | None = None
 
     @property
     def scene(self) -> Scene:
@@ -43,10 +42,9 @@ class Source:
     @property
     def model(self) -> Gaussians:
         """The plain model, in the scene's own frame, on the CPU."""
-        model = self.fitted if self.given is None else self.given
-        if model is None:
+        if self.given is None:
             raise ValueError("the plain model is not fitted yet")
-        return model
+        return self.given
 
 
 @dataclass(frozen=True)
@@ -173,11 +171,8 @@ class MethodOptions:
         """The same with changed fields of `fit`."""
         return replace(self, fit=replace(self.fit, **changes))
 
-    def joint_plan(self, secrets: int, *, gaussian_weights: float = 0.0, pixel_weights: float = 0.0) -> Plan:
-        """The plan of methods that train all scenes together, with as many Gaussians as a plain model has.
-
-        `*_weights`: see `Plan`.
-        """
+    def joint_plan(self, secrets: int) -> Plan:
+        """The plan of methods that train all scenes together, with as many Gaussians as a plain model has."""
         fit = self.fit
         return Plan(
             gaussians=fit.max_gaussians,
@@ -186,8 +181,6 @@ class MethodOptions:
             capacity=fit.max_gaussians,
             steps=fit.iterations,
             rendered=(fit.max_gaussians,) * (1 + secrets),
-            gaussian_weights=gaussian_weights,
-            pixel_weights=pixel_weights,
         )
 
     def check_published_exactly(self) -> None:
@@ -223,8 +216,6 @@ class Plan:
     capacity: int  # Gaussians of the secrets that fit
     steps: int = 0  # of the method's own training
     rendered: tuple[int, ...] = ()  # Gaussians of the cover and of each secret in a step
-    gaussian_weights: float = 0.0  # of the networks that a step evaluates for each Gaussian
-    pixel_weights: float = 0.0  # of the networks that a step evaluates for each rendered pixel
     notes: tuple[str, ...] = ()  # what the options cost, a sentence each
 
     method: str = ""

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
 from keyss.fitting.config import FitConfig
-from keyss.fitting.side_by_side import Fit, fit_scenes
+from keyss.fitting.plain import fit_scene
 from keyss.methods.base import Context, Source, Training, role_of
 
 
@@ -20,7 +20,7 @@ def with_plain_models(
     """The sources with plain models on the CPU, in their own frames; those that are not given are fitted.
 
     Each fit has its own seed, derived from that of its config, and tells nothing of the seeds of others.
-    Raises what `fit_scenes` raises.
+    Raises what `fit_scene` raises.
     """
     missing = {
         index: (source.scene, config)
@@ -29,7 +29,7 @@ def with_plain_models(
     }
     titles = [plain_stage(role_of(index, len(sources))) for index in range(len(sources))]
     fitted = _fit_all(missing, "plain model", titles, context)
-    return [replace(source, fitted=fitted.get(index)) for index, source in enumerate(sources)]
+    return [replace(source, given=fitted.get(index, source.given)) for index, source in enumerate(sources)]
 
 
 def plain_stage(role: str) -> str:
@@ -73,20 +73,16 @@ def _fit_all(
     fits: Mapping[int, tuple[Scene, FitConfig]], kind: str, titles: Sequence[str], context: Context
 ) -> dict[int, Gaussians]:
     """Fit scenes by index, the cover first; `kind` names the seeds and the checkpoints."""
-    models = fit_scenes(
-        [
-            Fit(
-                scene,
-                replace(config, seed=config.seed_of(f"{kind} {index}")),
-                f"{titles[index]} ({scene.name})",
-                context.checkpoints / f"{kind.split()[0]}-{index}.safetensors"
-                if context.checkpoints
-                else None,
-                context.reporter if index == 0 else context.reporter and context.reporter.of_secret(),
-            )
-            for index, (scene, config) in fits.items()
-        ],
-        device=context.device,
-        resume=context.resume,
-    )
-    return dict(zip(fits, models, strict=True))
+    folder = context.checkpoints
+    return {
+        index: fit_scene(
+            scene,
+            replace(config, seed=config.seed_of(f"{kind} {index}")),
+            title=f"{titles[index]} ({scene.name})",
+            checkpoint=folder / f"{kind.split()[0]}-{index}.safetensors" if folder else None,
+            reporter=context.reporter if index == 0 else context.reporter and context.reporter.of_secret(),
+            device=context.device,
+            resume=context.resume,
+        ).gaussians
+        for index, (scene, config) in fits.items()
+    }

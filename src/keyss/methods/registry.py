@@ -37,7 +37,7 @@ METHODS = {
         {"design": str, "mask": str, "key_encoder": str, "clip_model": str},
     ),
     **{
-        name: Modules(f"{_ROOM}.peers.{module}", f"{_ROOM}.peers.{module}", {"common_poses": str})
+        name: Modules(f"keyss.lab.peers.{module}", f"keyss.lab.peers.{module}", {"common_poses": str})
         for name, module in {
             "3dgs": "bound",
             "3dgs-sh": "sh",

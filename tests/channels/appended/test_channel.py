@@ -30,10 +30,10 @@ from keyss.core import (
 from keyss.files import read_model, write_model
 from keyss.keys import derivation
 from keyss.keys.encryption import compressed_size
-from keyss.measure import cropping, fewer_harmonics, half_floats, random_pruning
+from keyss.lab import cropping, fewer_harmonics, half_floats, random_pruning
 from keyss.rendering import psnr_between
-from measure.lifelike import lifelike, turned
-from measure.stealth.careless import shuffled
+from lab.lifelike import lifelike, turned
+from lab.stealth.careless import shuffled
 
 KEY, ENTROPY = "Rosebud, 1941", bytes(range(32))
 DATA = np.random.default_rng(0).bytes(9000)

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from keyss.channels import COLOURS, ColoursReader, Payload, PreparedCover
 from keyss.core import Gaussians
-from measure.lifelike import lifelike
+from lab.lifelike import lifelike
 
 METHOD = "t"
 PACKED = 1 + len(METHOD)  # bytes beside the data

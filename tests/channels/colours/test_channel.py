@@ -21,10 +21,10 @@ from keyss.channels.colours import header, reading
 from keyss.channels.colours.carriers import CELL, Numbers, Salts
 from keyss.channels.colours.header import FILE_KEY_BYTES, Header, Index, read_header
 from keyss.core import Gaussians, InputError, KeyssError, KeyssWarning, UsageError, WrongKeyError
-from keyss.measure import converters, cropping, half_floats, noise, opacity_pruning, random_pruning
+from keyss.lab import converters, cropping, half_floats, noise, opacity_pruning, random_pruning
 from keyss.rendering import psnr_between
-from measure.lifelike import turned
-from measure.stealth.careless import shuffled
+from lab.lifelike import turned
+from lab.stealth.careless import shuffled
 
 ENTROPY = bytes(range(32))
 STRENGTH = 45.0

@@ -41,7 +41,7 @@ def test_hide_reveal_verify_and_info(format: str, tmp_path: Path) -> None:
 
 @EVERY
 def test_what_was_made_in_memory_opens_there(format: str) -> None:
-    found = keyss.hide(model_of(3000), [keyss.Secret(file=b"a note", key="key one")], format=format)  # type: ignore[arg-type]
+    found = keyss.hide_files(model_of(3000), [keyss.SecretFile(b"a note", "key one")], format=format)  # type: ignore[arg-type]
     assert keyss.reveal(found.stego, "key one").file.data == b"a note"
     with pytest.raises(keyss.WrongKeyError):  # another model, whose codes carry nothing
         keyss.reveal(found.stego.with_sh_degree(0), "key one")

@@ -19,7 +19,7 @@ from keyss.channels.harmonics import row_names
 from keyss.core import InputError, UsageError, same_bits
 from keyss.fitting import make_optimizers, to_parameters
 from keyss.fitting.rows import FixedRows
-from keyss.measure import search_embeddings
+from keyss.lab import search_embeddings
 from keyss.methods import LatentDecoder, registry
 from keyss.methods.keyss.latent import latents_of
 from methods.hiding import Hidden, check_resumes, hide_scenes, three_scenes

@@ -124,19 +124,12 @@ def check_sh_degree(degree: int) -> int:
     return (degree + 1) ** 2 - 1
 
 
-def gaussians_of(
-    means: Numbers,
-    quats: Numbers,
-    log_scales: Numbers,
-    opacities: Numbers,
-    colors: Numbers,
-    rest: Numbers,
-) -> Gaussians:
-    """A model from arrays: `opacities` in [0, 1]; `colors` [N, 3] are f_dc, `rest` [N, K - 1, 3] the others.
+def gaussians_of(*arrays: Numbers) -> Gaussians:
+    """A model from arrays, in the order of `_model`.
 
     Raises InputError for values that are not finite in single precision.
     """
-    model = _model(means, quats, log_scales, opacities, colors, rest)
+    model = _model(*arrays)
     if wrong := _not_finite(model):
         raise InputError(f"NaN or infinite values in {', '.join(wrong)}")
     return model
@@ -167,9 +160,9 @@ def _model(
     means: Numbers,
     quats: Numbers,
     log_scales: Numbers,
-    opacities: Numbers,
-    colors: Numbers,
-    rest: Numbers,
+    opacities: Numbers,  # [N] in [0, 1]
+    colors: Numbers,  # [N, 3], f_dc
+    rest: Numbers,  # [N, K - 1, 3], the other harmonics
 ) -> Gaussians:
     with np.errstate(over="ignore", invalid="ignore"):
         sh = np.empty((len(rest), 1 + rest.shape[1], 3), np.float32)

@@ -24,7 +24,7 @@ from keyss.rendering.difference import Viewpoints, psnr_between
 # Without photos, the start is nearly right: the largest number of steps, and a factor on the rates.
 _MODEL_ITERATIONS, _MODEL_RATE = 400, 0.1
 _SELECTION_VIEWS = 64
-_PLANNED = bytes(32)  # entropy of room that is only measured: every rank, and the plan, find the same
+_PLANNED = bytes(32)  # entropy for plans, which hide nothing
 _VISIBLE = (
     "the cover can hold the secret, but whoever inspects the published file sees that it holds something "
     '(`publish="any"`), because nothing goes in unnoticed: {}'

@@ -70,10 +70,7 @@ class KeyssMethod:
 
     def plan(self, sources: Sequence[Source], options: KeyssOptions) -> Plan:
         """All scenes share as many Gaussians as a plain model has."""
-        design, secrets = options.configuration, len(sources) - 1
-        shape = replace(design.decoder, sh_degree=options.fit.sh_degree)
-        decoded = secrets + (design.beta_incorrect > 0)
-        return options.joint_plan(secrets, gaussian_weights=decoded * shape.weights)
+        return options.joint_plan(len(sources) - 1)
 
     def hide(
         self, cover: Source, secrets: Sequence[Source], options: KeyssOptions, context: Context

@@ -1,0 +1,93 @@
+"""`hide_files`: any files in a cover that is a model."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import nullcontext
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from keyss.api.asking import check_keys
+from keyss.channels import AnyChannel, Format, Publish, channel_for, open_content
+from keyss.core.errors import UsageError
+from keyss.core.gaussians import Gaussians
+from keyss.core.scene import Scene
+from keyss.files.models import read_model
+from keyss.files.ply_extras import with_extras
+from keyss.files.reading import read_file
+from keyss.keys.encryption import MAX_PAYLOAD_BYTES
+from keyss.methods.opened import HiddenFile
+from keyss.rendering.difference import psnr_between
+from keyss.rendering.orbit import is_model
+from keyss.runs.files import STEGOS, PathLike, as_3dgs_model, stego_name
+from keyss.runs.folder import RunFolder
+
+
+@dataclass(frozen=True)
+class SecretFile:
+    """A file to hide, and its key."""
+
+    file: PathLike | bytes
+    key: str = field(repr=False)
+    name: str = ""  # shown when the file is revealed; by default its own
+
+
+@dataclass(frozen=True)
+class HideFilesResult:
+    """The result of `hide_files`."""
+
+    stego: Gaussians | None  # to be published; None of a dry run
+    psnr: float  # dB of the stego model's views to the cover's, at most 120
+
+
+def hide_files(
+    cover: PathLike | Gaussians,
+    secrets: Sequence[SecretFile],
+    *,
+    publish: Publish = "as-is",
+    format: Format | None = None,
+    channel: AnyChannel = "colours",
+    out: PathLike | None = None,
+    overwrite: bool = False,
+    dry_run: bool = False,
+) -> HideFilesResult:
+    """Hide files in a model, each under its own key, and open them again as a reader does.
+
+    `out` (a folder) gets `publish/` with the stego model. `publish`, `format`, `channel`: see `hide`; "as-is"
+    refuses a cover that holds nothing unnoticed. `dry_run`: write nothing, and return only the PSNR.
+
+    Raises UsageError where the files do not fit, and other KeyssErrors.
+    """
+    if isinstance(cover, Scene) or not is_model(cover):
+        raise UsageError("hiding a file needs a model as the cover; `keyss fit` makes one from photos")
+    keys = [each.key for each in secrets]
+    check_keys(keys)
+    folder = None
+    if out is not None and not dry_run:
+        read = [cover, *(each.file for each in secrets)]
+        inputs = [Path(each) for each in read if isinstance(each, str | Path)]
+        folder = RunFolder(out, "hide files", writes=STEGOS, inputs=inputs, overwrite=overwrite)
+    hidden, model = [_hidden_file(each) for each in secrets], as_3dgs_model(cover, "the cover")
+    place = channel_for(publish, channel, format, model)
+    payloads = [(key, each.payload()) for key, each in zip(keys, hidden, strict=True)]
+    try:
+        stego = place.prepare(model).embed(payloads)
+    except UsageError as error:
+        if place.grows:
+            raise
+        raise UsageError(f'{error}; `publish="any", channel="appended"` has room for all') from error
+    with folder.work() if folder else nullcontext():
+        name = stego_name(stego)
+        there = folder.write({name: with_extras(stego, cover, model)}) if folder else None
+        as_read = read_model(there / name) if there else stego
+        if [HiddenFile.of(open_content(as_read, key)) for key in keys] != hidden:
+            raise RuntimeError("the hidden files do not open again from the published file")
+    return HideFilesResult(None if dry_run else stego, psnr_between(model, stego))
+
+
+def _hidden_file(secret: SecretFile) -> HiddenFile:
+    """Raises InputError for a file that is missing or too large to be hidden."""
+    if isinstance(secret.file, bytes):
+        return HiddenFile(secret.name, secret.file)
+    path = Path(secret.file)
+    return HiddenFile(secret.name or path.name, read_file(path, MAX_PAYLOAD_BYTES))

@@ -1,0 +1,66 @@
+from .auc import Auc as Auc, auc_between as auc_between, delong as delong
+from .distances import (
+    AttributeDistance as AttributeDistance,
+    against_controls as against_controls,
+    attribute_distances as attribute_distances,
+)
+from .leaks.attacks import (
+    Attack as Attack,
+    decoder_attack as decoder_attack,
+    file_attacks as file_attacks,
+    search_embeddings as search_embeddings,
+    with_the_key as with_the_key,
+)
+from .leaks.looking import (
+    AttackResult as AttackResult,
+    LeakScores as LeakScores,
+    coarse as coarse,
+    fit_colours as fit_colours,
+    gradient_correlation as gradient_correlation,
+    leak_scores as leak_scores,
+    look_for_secret as look_for_secret,
+)
+from .peers.method import PeerOptions as PeerOptions
+from .robustness.changes import (
+    Change as Change,
+    cropping as cropping,
+    fewer_harmonics as fewer_harmonics,
+    fine_tuning as fine_tuning,
+    half_floats as half_floats,
+    noise as noise,
+    opacity_pruning as opacity_pruning,
+    purification as purification,
+    random_pruning as random_pruning,
+)
+from .robustness.survival import (
+    ChangedQuality as ChangedQuality,
+    ChangeResult as ChangeResult,
+    Converter as Converter,
+    converters as converters,
+    default_changes as default_changes,
+    measure_robustness as measure_robustness,
+    reveal_changed as reveal_changed,
+    transform as transform,
+)
+from .sinkhorn import composite_score as composite_score, sinkhorn_3d as sinkhorn_3d
+from .speed import (
+    ReaderResult as ReaderResult,
+    SpeedResult as SpeedResult,
+    measure_speed as measure_speed,
+    readers as readers,
+    render_time as render_time,
+    reveal_seconds as reveal_seconds,
+)
+from .stealth.confirmation import candidate_scores as candidate_scores, changed_low_bits as changed_low_bits
+from .stealth.judging import judge as judge, stealth_statistics as stealth_statistics
+from .stegexpose import (
+    Scores as Scores,
+    StegExposeAuc as StegExposeAuc,
+    score_image as score_image,
+    stegexpose_auc as stegexpose_auc,
+)
+from .two_sample import (
+    auc_beside_controls as auc_beside_controls,
+    features as features,
+    two_sample_auc as two_sample_auc,
+)

@@ -1,0 +1,132 @@
+"""Distances between the Gaussians of two models as distributions, beside those between control models.
+
+Exact 1-D Wasserstein distances along axes and random directions (sliced Wasserstein, Bonneel et al. 2015) of
+features that are equal for equal Gaussians, however they are stored. They detect what 3D-Sinkhorn misses: see
+`keyss.lab.sinkhorn`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from statistics import fmean
+
+import numpy as np
+
+from keyss.core import Gaussians, UsageError, import_extra
+from keyss.core.arrays import Floats
+from keyss.lab.two_sample import features
+
+SLICES = 32
+MAX_GAUSSIANS = 100_000  # of each model; larger ones are subsampled
+_RESOLUTION = 1e-6  # of a row's largest magnitude: a smaller range is rounding
+
+
+@dataclass(frozen=True)
+class AttributeDistance:
+    """The distance of one attribute from control models, in units of their 5 to 95 % range."""
+
+    distance: float  # mean over the controls
+    control: float  # mean over pairs of controls: seed-to-seed variation
+    ratio: float | None  # distance / control; 1 is another training seed; None if `control` is 0
+    original: float | None = None  # the same ratio for the cover's own plain model
+
+
+def against_controls(
+    model: Gaussians,
+    controls: Sequence[Gaussians],
+    *,
+    original: Gaussians | None = None,
+    seed: int = 0,
+) -> dict[str, AttributeDistance]:
+    """`attribute_distances` of `model` and of `controls`, plain models of the same scene from other seeds.
+
+    `original`: another plain model of the scene that is compared with the controls too, since it can be
+    further from them than they are from each other. Raises UsageError for fewer than two controls and for an
+    empty model.
+    """
+    if len(controls) < 2:
+        raise UsageError(f"expected at least two control models of the scene, got {len(controls)}")
+
+    def mean(pairs: Iterable[tuple[Gaussians, Gaussians]]) -> dict[str, float]:
+        every = [attribute_distances(one, two, seed=seed) for one, two in pairs]
+        return {name: fmean(distances[name] for distances in every) for name in every[0]}
+
+    stego = mean((control, model) for control in controls)
+    between = mean(combinations(controls, 2))
+    own = None if original is None else mean((control, original) for control in controls)
+    return {
+        name: AttributeDistance(
+            stego[name],
+            control,
+            ratio=stego[name] / control if control else None,
+            original=own[name] / control if own and control else None,
+        )
+        for name, control in between.items()
+    }
+
+
+def attribute_distances(reference: Gaussians, other: Gaussians, *, seed: int = 0) -> dict[str, float]:
+    """Wasserstein distances of two models' attributes, in units of the reference's 5 to 95 % range.
+
+    By attribute, as in `features`: the mean over its axes and 32 random directions. `joint`: the mean over
+    random directions in the space of all attributes, equally weighted. All comparisons with one `seed` share
+    their directions. An attribute that is constant in the reference is measured in units of the range of both
+    models; one that is the same constant in both is skipped. Models may differ in size and SH degree; one
+    with more than `MAX_GAUSSIANS` Gaussians is subsampled. Raises UsageError for an empty model.
+    """
+    both = [features(model, limit=MAX_GAUSSIANS, seed=seed) for model in (reference, other)]
+    generator = np.random.default_rng(seed)
+    result, rows = {}, []
+    for name in both[0]:
+        axes = [model[name].T for model in both]
+        along_axes, units = _along(*axes)
+        scaled = [_in_units(each, units[:, None]) for each in axes]
+        directions = _directions(generator, len(units))
+        along_slices, widths = _along(directions @ scaled[0], directions @ scaled[1])
+        result[name] = _mean(np.append(along_axes, along_slices), np.append(units, widths))
+        weight = np.float32(1 / np.sqrt(max(int((units > 0).sum()), 1)))
+        rows.append([weight * each for each in scaled])
+    one, two = (np.concatenate(parts) for parts in zip(*rows, strict=True))
+    directions = _directions(generator, len(one))
+    result["joint"] = _mean(*_along(directions @ one, directions @ two))
+    return result
+
+
+def _directions(generator: np.random.Generator, size: int) -> Floats:
+    """[SLICES, size] random unit vectors; none in one dimension, where the axis is enough."""
+    vectors = generator.standard_normal((SLICES if size > 1 else 0, size))
+    unit: Floats = (vectors / np.linalg.norm(vectors, axis=1, keepdims=True)).astype(np.float32)
+    return unit
+
+
+def _mean(distances: Floats, units: Floats) -> float:
+    """The mean over the rows with a range."""
+    return float(distances[units > 0].mean()) if (units > 0).any() else 0.0
+
+
+def _along(reference: Floats, other: Floats) -> tuple[Floats, Floats]:
+    """[D] distances of the rows of [D, N] and [D, M] in units of the reference's range, and the units [D].
+
+    Both are 0 for a row that is one constant in both.
+    """
+    one, two = np.sort(reference, axis=1), np.sort(other, axis=1)
+    last = one.shape[1] - 1
+    span = np.maximum(one[:, -1], two[:, -1]) - np.minimum(one[:, 0], two[:, 0])
+    ends = np.stack([one[:, 0], one[:, -1], two[:, 0], two[:, -1]])
+    smallest = np.float32(_RESOLUTION) * np.abs(ends).max(axis=0)
+    units = one[:, round(0.95 * last)] - one[:, round(0.05 * last)]
+    units = np.where(units > smallest, units, np.where(span > smallest, span, 0))
+    if one.shape == two.shape:
+        areas: Floats = np.abs(one - two).mean(axis=1)
+    else:
+        ot = import_extra("ot", "audit", "compute distances")
+        areas = ot.wasserstein_1d(one.T.astype(np.float64), two.T.astype(np.float64), require_sort=False)
+    return _in_units(areas, units), units
+
+
+def _in_units(values: Floats, units: Floats) -> Floats:
+    """`values` / `units`, which broadcast; 0 where the unit is 0."""
+    divisors: Floats = np.where(units > 0, units, np.inf)
+    return values / divisors

@@ -1,0 +1,188 @@
+"""Runs attacks on a stego model and on plain models, and scores the images against the secret.
+
+Scores are similarities to photos, after the best fit of colours.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import astuple, dataclass
+from statistics import fmean
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from keyss.core.errors import UsageError
+from keyss.core.gaussians import Gaussians
+from keyss.core.scene import Scene, View
+from keyss.fitting.image_metrics import psnr, subsample_views
+from keyss.fitting.losses import Target, ssim
+from keyss.lab.leaks.attacks import Attack
+from keyss.rendering import render
+
+# Limits of a leak, in scores that respond to the secret's shapes and not to haze.
+PSNR_LIMIT = 1.0  # dB closer to the secret's photos than a control
+SSIM_LIMIT = 0.05
+GRADIENT_LIMIT = 0.1  # correlation of coarse gradients with the photos', above a control's
+
+COARSE = 64  # pixels of the longer side: shapes that are slightly misplaced still match
+
+_GAP = 4  # pixels between the parts of a picture
+_VIEWS = 8  # from which attacks look
+
+
+@dataclass(frozen=True)
+class LeakScores:
+    """How well images show photos: means over views, or differences of such means.
+
+    PSNR and SSIM after the best fit of colours. Without it any bright cloud is closer to a photo than black.
+    """
+
+    psnr_fitted: float  # dB
+    ssim_fitted: float  # as in 3DGS
+    gradient: float  # `gradient_correlation`
+    gradient_coarse: float  # the same of `coarse` images
+
+    @staticmethod
+    def combined(function: Callable[[Sequence[float]], float], rows: Sequence[LeakScores]) -> LeakScores:
+        """A function of each score over all rows."""
+        return LeakScores(*(function(column) for column in zip(*map(astuple, rows), strict=True)))
+
+    def evidence(self) -> float:
+        """The maximum of a leak's scores relative to their limits; above 1 the secret's shapes show.
+
+        Of those that haze alone does not increase.
+        """
+        return max(
+            self.psnr_fitted / PSNR_LIMIT,
+            self.ssim_fitted / SSIM_LIMIT,
+            self.gradient_coarse / GRADIENT_LIMIT,
+        )
+
+    def __sub__(self, other: LeakScores) -> LeakScores:
+        return LeakScores(*(a - b for a, b in zip(astuple(self), astuple(other), strict=True)))
+
+
+def gradient_correlation(image: Tensor, reference: Tensor) -> float:
+    """Normalised cross-correlation of the brightness gradients of two [H, W, 3] images, -1 to 1.
+
+    Of central differences of the mean channel: the sum of g . h over inner pixels, divided by the root of the
+    product of the sums of |g|^2 and |h|^2. Invariant to brightness and contrast; 1 for equal images, -1 for
+    the negative, 0 for a constant image.
+    """
+    first, second = _gradients(image), _gradients(reference)
+    size = (first.square().sum() * second.square().sum()).sqrt()
+    return float((first * second).sum() / size) if size > 0 else 0.0
+
+
+def coarse(image: Tensor) -> Tensor:
+    """[h, w, 3] the image shrunk to COARSE pixels on its longer side by averaging; never enlarged."""
+    height, width = image.shape[:2]
+    scale = min(1.0, COARSE / max(height, width))
+    size = (max(1, round(scale * height)), max(1, round(scale * width)))
+    return F.adaptive_avg_pool2d(image.permute(2, 0, 1), size).permute(1, 2, 0)
+
+
+def fit_colours(image: Tensor, reference: Tensor) -> Tensor:
+    """[H, W, 3] the image with the factor, of either sign, and offset per channel that fit best.
+
+    Least squares. A constant channel becomes the mean of the reference's.
+    """
+    centred, target = image - image.mean(dim=(0, 1)), reference - reference.mean(dim=(0, 1))
+    variance = centred.square().sum(dim=(0, 1))
+    factor = (centred * target).sum(dim=(0, 1)) / variance.clamp_min(1e-12)
+    return centred * factor + reference.mean(dim=(0, 1))
+
+
+@torch.no_grad()
+def leak_scores(model: Gaussians, views: Sequence[View], background: Tensor) -> LeakScores:
+    """Scores of a model against the photos of views, means over the views."""
+    rows = []
+    for view in views:
+        photo = view.image.to(model.device).float() / 255
+        image = render(model, view.camera, background).clamp(0, 1)
+        fitted = fit_colours(image, photo).clamp(0, 1)
+        gradient = gradient_correlation(image, photo)
+        gradient_coarse = gradient_correlation(coarse(image), coarse(photo))
+        similarity = float(ssim(fitted, Target.of(photo)))
+        rows.append(LeakScores(psnr(fitted, photo), similarity, gradient, gradient_coarse))
+    return LeakScores.combined(fmean, rows)
+
+
+def _gradients(image: Tensor) -> Tensor:
+    """[2, H - 2, W - 2] central differences of the brightness, down and to the right."""
+    grey = image.double().mean(dim=2)
+    down, right = grey[2:, 1:-1] - grey[:-2, 1:-1], grey[1:-1, 2:] - grey[1:-1, :-2]
+    return torch.stack([down, right])
+
+
+@dataclass(frozen=True)
+class AttackResult:
+    """How much more of a secret an attack shows in the stego model than in control models.
+
+    An attack has variants: thresholds, shares, clusters. The maximum over them counts, since an attacker
+    recognises the secret.
+    """
+
+    attack: str
+    sentence: str
+    with_key: bool  # not an attack, but the revealed secret
+    scores: LeakScores  # each the maximum over the variants
+    leak: LeakScores  # `scores` less those of the controls, which have as many variants
+    best: str  # the variant with the largest `LeakScores.evidence`, which is pictured and judged
+    best_leak: LeakScores  # its scores less those of the controls
+    picture: str | None = None  # name of a file, in an audit
+
+
+@torch.no_grad()
+def look_for_secret(
+    stego: Gaussians,
+    controls: Sequence[Gaussians],
+    secret: Scene,
+    attacks: Sequence[Attack],
+) -> tuple[list[AttackResult], dict[str, Tensor]]:
+    """How well attacks show the secret, from its own test cameras, against its photos.
+
+    The strictest assumption: the attacker looks from where the secret was photographed. `controls` are plain
+    models of the cover; `secret` has its test cameras in the cover's frame (`keyss.measure.in_cover`), of
+    which at most 8 are used. Images are uint8 [H, W, 3] by the attack's name: its best variant on
+    the stego model and on the first control, from the first test camera, and the photo. Raises UsageError
+    without a control or without test views.
+    """
+    if not controls:
+        raise UsageError("leaks: expected at least one plain model of the cover to compare with")
+    if not secret.test:
+        raise UsageError(f"leaks: the scene {secret.name} has no test views")
+    views = subsample_views(secret.test, _VIEWS)
+
+    def look(attack: Attack, model: Gaussians) -> dict[str, tuple[LeakScores, Tensor]]:
+        """Scores of all variants of an attack, and pictures [H, W, 3] uint8 from the first view."""
+        shown = {}
+        for label, variant in attack.show(model):
+            image = render(variant, views[0].camera, secret.background).clamp(0, 1)
+            picture = (image * 255).round().to(torch.uint8).cpu()
+            shown[label] = leak_scores(variant, views, secret.background), picture
+        return shown
+
+    results, pictures = [], {}
+    for attack in attacks:
+        variants = look(attack, stego)
+        of_controls = [look(attack, model) for model in controls]
+        highest = [LeakScores.combined(max, [each for each, _ in shown.values()]) for shown in of_controls]
+        control = LeakScores.combined(fmean, highest)
+        leaks = {label: own - control for label, (own, _) in variants.items()}
+        best = max(leaks, key=lambda label: leaks[label].evidence())
+        scored = LeakScores.combined(max, [own for own, _ in variants.values()])
+        results.append(
+            AttackResult(
+                attack.name, attack.sentence, attack.with_key, scored, scored - control, best, leaks[best]
+            )
+        )
+        pictures[attack.name] = _beside([variants[best][1], of_controls[0][best][1], views[0].image])
+    return results, pictures
+
+
+def _beside(images: Sequence[Tensor]) -> Tensor:
+    """The images [H, W, 3] side by side, with white gaps."""
+    return torch.cat([F.pad(image.cpu(), (0, 0, 0, _GAP), value=255) for image in images], dim=1)[:, :-_GAP]

@@ -1,0 +1,316 @@
+"""`compare`: methods side by side, on the same scenes and with the same budget, and their tables as text."""
+
+from __future__ import annotations
+
+import io
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from statistics import fmean
+from typing import Any, TypeVar
+
+import numpy as np
+from PIL import Image
+
+from keyss._version import __version__
+from keyss.core import UsageError, ViewOptions
+from keyss.core.arrays import Bytes
+from keyss.files import write_bytes
+from keyss.fitting import PRESETS, FitConfig
+from keyss.fitting.lpips import HOW_TO_GET
+from keyss.lab.audits.comparison_measures import CONVERSIONS, OWN
+from keyss.lab.many.cell import RUN, keys_of
+from keyss.lab.many.cell_folder import CellFolder, Forecast, Outcome
+from keyss.lab.many.result_tables import markdown_rows, write_scene_tables
+from keyss.measure.contact_sheet import contact_sheet
+from keyss.measure.images import renders_of
+from keyss.methods import MethodOptions, registry
+from keyss.progress import Reporter
+from keyss.rendering import Backend, resolve_device
+from keyss.rendering.orbit import is_model
+from keyss.runs import write_record
+from keyss.runs.files import PathLike
+from keyss.runs.opening import HidingRun, open_run
+
+STEM = "comparison"  # of the names of its files
+MEASURES = ("files", "pictures", "secrecy", "survival")
+CONTROLS = (
+    "control-1",
+    "control-2",
+)  # plain models of the cover from other seeds, as a comparison for published ones
+
+# Every method, and its variants.
+EVERY = tuple(
+    name
+    for each in registry.METHODS
+    for name in (each, *(f"{each}:{variant}" for variant in registry.get(each).options.variants()))
+)
+
+# Columns by their heads: %-formats of numbers by name. The first of which all numbers were measured counts.
+_FIDELITY = {
+    "cover": ["%(cover.psnr).2f"],
+    "SSIM": ["%(cover.ssim).3f"],
+    "LPIPS": ["%(cover.lpips).3f"],
+    "secret": ["%(secrets.1.psnr).2f"],
+    "SSIM ": ["%(secrets.1.ssim).3f"],
+    "LPIPS ": ["%(secrets.1.lpips).3f"],
+    "published, MB": ["%(files.published_mb).2f"],
+    "handed over, MB": ["%(files.handed_mb).2f"],
+    "cover, ms": ["%(pictures.cover.ms).0f (%(pictures.cover.ratio).1fx)"],
+    "secret, ms": ["%(pictures.secret.ms).0f (%(pictures.secret.ratio).1fx)"],
+    "seconds": ["%(seconds).0f"],
+    "steps": ["%(steps.1)d, %(steps.2)d", "unknown"],
+}
+_SECRECY = {
+    "wrong keys": [
+        "%(wrong_key.vs_cover.mean).1f, %(wrong_key.vs_secrets.1.max).1f (%(chance_level.1).1f)",
+        "%(wrong keys)s",
+    ],
+    "standard .ply": ["%(files.readers that load)d of %(files.readers)d readers", f"{OWN} reader *"],
+    **{
+        head: [f"%(secrecy.{name}){form} (%(secrecy.{name}_plain){form})", "no 3DGS"]
+        for head, name, form in (
+            ("classifier", "classifier", ".2f"),
+            ("p", "stealth", ".1g"),
+            ("StegExpose", "stegexpose", ".2f"),
+        )
+    },
+    **{
+        head: [
+            f"%(survival.{head}.cover)+.1f, %(survival.{head}.secret)+.1f",
+            f"%(survival.{head}.cover)+.1f, lost",
+            "not tried",
+        ]
+        for head in ("pruned", *CONVERSIONS, "purified")
+    },
+}
+_LEGEND = (
+    "Test views: photos that were not trained on. Steps: those in which cover and secret were rendered, in "
+    "total. 3dgs is the bound: plain 3DGS of as many Gaussians and as many training steps. ms: the time of "
+    "a picture, and its ratio to that of plain 3DGS. Seconds: of hiding, after plain models.",
+    "Wrong keys: PSNR in dB of what they show against the cover, and at most against the secret; in brackets "
+    "that of the published model itself against the secret. Classifier and StegExpose: area under the ROC "
+    "curve against plain models of the cover from other seeds, 0.5 where they cannot be told apart. p: of "
+    "the file's least likely statistic beside those. In brackets the same of a plain model of the cover.",
+    "Pruned of a random quarter, converted and back, purified (as by GSPure): change of cover and secret in "
+    "dB. Lost: the secret no longer opens.",
+)
+OptionsT = TypeVar("OptionsT", bound=MethodOptions)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ComparedMethod:
+    """One method; `error` is the reason for a missing result."""
+
+    name: str  # METHOD, METHOD:PRESET or METHOD:VARIANT
+    error: str | None = None
+    keys: bool = True  # whether a key opens the secret
+    numbers: dict[str, float] = field(default_factory=dict)  # see `Result` of cell.py; means over seeds
+    notes: dict[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Comparison:
+    """`comparison.json`."""
+
+    version: int = 4
+    keyss: str = __version__
+    arguments: dict[str, Any]
+    methods: tuple[ComparedMethod, ...] = ()
+
+
+def compare(
+    cover: PathLike,
+    secret: PathLike,
+    *,
+    methods: Sequence[str] = (),
+    iterations: int | None = None,
+    max_gaussians: int | None = None,
+    width: int | None = None,
+    seeds: Sequence[int] = (0,),
+    device: Backend = "auto",
+    out: PathLike,
+    dry_run: bool = False,
+    reporter: Reporter | None = None,
+) -> Comparison | Forecast:
+    """Hide one scene in another by each of the `methods` (by default all), and tabulate the results.
+
+    A method is a name, METHOD:PRESET or METHOD:VARIANT; all have the given steps and Gaussians, else those of
+    the first one's preset. Plain models of both scenes are fitted once. Steps are counted for each scene in
+    total: a method that continues the training of a plain model starts with one of half as many steps. So
+    `3dgs` is the bound of all: plain 3DGS of as many Gaussians and as many training steps. With several
+    `seeds` numbers are means over them.
+
+    `out` (a folder) gets the cells, and `comparison.json`, `.md`, `.csv` and `.tex` (PSNR, SSIM and LPIPS, a
+    row for each scene, with standard deviations over seeds) and `.png` (a row for each method: cover, secret,
+    and the secret's error). Cells that are done are skipped. `dry_run`: only return their plans. A method
+    that fails has a row with the error. Raises UsageError, before anything is trained, for one of `methods`
+    that is not possible with these settings; KeyssError and its children; KeyboardInterrupt.
+    """
+    if is_model(cover) or is_model(secret):
+        raise UsageError("comparing takes scenes, folders of photos: models have none to compare with")
+    chosen = {name: _named(name) for name in methods or EVERY}
+    sizes = {"iterations": iterations, "max_gaussians": max_gaussians}
+    given = {name: size for name, size in sizes.items() if size is not None}
+    fit = replace(next(iter(chosen.values())).fit, seed=seeds[0], **given)
+    scenes = [os.path.realpath(cover), os.path.realpath(secret)]
+    folder = CellFolder(Path(out), common={"views": ViewOptions(width), "device": device})
+    controls = [folder.plain(scenes[0], replace(fit, seed=fit.seed_of(each))) for each in CONTROLS]
+    places = {
+        name: [_add(folder, name, scenes, preset, replace(fit, seed=seed), controls) for seed in seeds]
+        for name, preset in chosen.items()
+    }
+    if dry_run or methods:
+        forecast = folder.forecast()
+        for name in methods:
+            if places[name][0] in forecast.refused:
+                raise UsageError(f"{name}: not possible: {forecast.refused[places[name][0]]}")
+        if dry_run:
+            return forecast
+    outcomes = folder.run(reporter=reporter)
+    arguments = {"cover": scenes[0], "secret": scenes[1], "iterations": fit.iterations}
+    arguments |= {"max_gaussians": fit.max_gaussians, "width": width, "seeds": list(seeds)}
+    rows = [_row(name, [outcomes[place] for place in each], folder) for name, each in places.items()]
+    found = Comparison(arguments=arguments, methods=tuple(rows))
+    write_record(folder.out / f"{STEM}.json", found)
+    write_bytes(folder.out / f"{STEM}.md", comparison_text(found).encode())
+    done = [
+        (name, seed, outcomes[place])
+        for name, each in places.items()
+        for seed, place in zip(seeds, each, strict=True)
+        if outcomes[place].result
+    ]
+    names = [os.path.basename(scene) for scene in scenes]
+    write_scene_tables(
+        folder.out, STEM, [each.row({"method": name}, names, seed) for name, seed, each in done]
+    )
+    runs = {name: _opened(folder, each[0]) for name, each in places.items() if outcomes[each[0]].result}
+    if runs:
+        picture = io.BytesIO()
+        comparison_sheet(runs, device).save(picture, "PNG", optimize=True)
+        write_bytes(folder.out / f"{STEM}.png", picture.getvalue())
+    return found
+
+
+def within(iterations: int, options: OptionsT) -> tuple[OptionsT, list[int]]:
+    """Options, and steps of plain models of cover and secret: each scene has `iterations` in total."""
+    continues = [each.continues and each.steps > 0 for each in options.training(2)]
+    plain = iterations - iterations // 2
+    own = max(1, iterations // 2) if any(continues) else iterations
+    options = options.with_fit(iterations=own)
+    return options, [plain if each else iterations for each in continues]
+
+
+def _add(
+    folder: CellFolder,
+    name: str,
+    scenes: Sequence[str],
+    preset: MethodOptions,
+    fit: FitConfig,
+    controls: list[str],
+) -> Path:
+    """Add a hiding and its plain fits; its folder."""
+    options, steps = within(fit.iterations, preset)
+    options = options.with_fit(max_gaussians=fit.max_gaussians, seed=fit.seed)
+    models = [
+        folder.plain(scene, replace(fit, iterations=count, sh_degree=each.sh_degree))
+        for scene, count, each in zip(scenes, steps, options.fits(2), strict=True)
+    ]
+    controls = [folder.plain(scenes[0], fit), *controls]
+    return folder.hiding(name, scenes, options, models, measures=MEASURES, controls=controls)
+
+
+def _named(text: str) -> MethodOptions:
+    """The options of METHOD, METHOD:PRESET or METHOD:VARIANT. Raises UsageError."""
+    name, _, kind = text.partition(":")
+    method = registry.get(name)
+    variants = method.options.variants()
+    if kind and kind not in (*PRESETS, *variants):
+        raise UsageError(f"{text}: expected one of {', '.join((*PRESETS, *variants))}")
+    return variants[kind] if kind in variants else method.options.preset(kind or "default")
+
+
+def _row(name: str, outcomes: Sequence[Outcome], folder: CellFolder) -> ComparedMethod:
+    """The means of the numbers that all seeds have."""
+    method = registry.get(folder.cells[outcomes[0].folder].method)
+    row = ComparedMethod(name=name, keys=method.capabilities.keys)
+    results = [each.result for each in outcomes if each.result is not None]
+    if len(results) < len(outcomes):
+        return replace(row, error=next(each.error for each in outcomes if each.error))
+    shared = set.intersection(*(set(each.numbers) for each in results))
+    numbers = {
+        each: fmean(one.numbers[each] for one in results) for each in results[0].numbers if each in shared
+    }
+    return replace(row, numbers=numbers, notes=results[0].notes)
+
+
+def _opened(folder: CellFolder, place: Path) -> HidingRun:
+    return open_run(place / RUN, [key for key in keys_of(folder.cells[place], place) if key])
+
+
+def comparison_sheet(runs: Mapping[str, HidingRun], device: Backend) -> Image.Image:
+    """A row for each method: cover, secret and its error (times 4) from the middle test camera."""
+    target = resolve_device(device)
+    rows: dict[str, Sequence[Bytes]] = {}
+    for name, run in runs.items():
+        stego = run.stego.to(target)
+        models = [stego, run.opened[0].reveal(stego).to(target)]
+        photos, renders = [], []
+        for scene, model in zip(run.scenes(train_pictures=False), models, strict=True):
+            view = scene.test[len(scene.test) // 2]
+            photos.append(view.image.numpy())
+            renders.append(renders_of(model, scene, [view])[0][1].numpy())
+        error = np.abs(photos[1].astype(int) - renders[1]).clip(0, 63).astype(np.uint8) * 4
+        rows.setdefault("photos", [*photos, np.zeros_like(error)])
+        rows[name] = [*renders, error]
+    return contact_sheet(["cover", "secret", "error of the secret, x4"], rows)
+
+
+def comparison_tables(found: Comparison) -> dict[str, list[list[str]]]:
+    """Rows of text by title, the heads first: fidelity and cost, secrecy and survival.
+
+    Methods that failed have no row.
+    """
+    rows = [each for each in found.methods if each.error is None]
+    return {
+        title: [
+            ["method", *(head.rstrip() for head in columns)],
+            *([row.name, *(_cell(row, head, formats) for head, formats in columns.items())] for row in rows),
+        ]
+        for title, columns in (("Fidelity and cost", _FIDELITY), ("Secrecy and survival", _SECRECY))
+    }
+
+
+def _cell(row: ComparedMethod, head: str, formats: list[str]) -> str:
+    values = row.numbers | {"wrong keys": "open nothing" if row.keys else "no keys"}
+    for each in formats:
+        try:
+            text = each % values
+        except KeyError:
+            continue
+        return f"{text} *" if row.notes.get(f"survival.{head}", "").startswith(OWN) else text
+    return ""
+
+
+def comparison_notes(comparison: Comparison) -> list[str]:
+    """Methods that failed, reasons to skip or replace a measure, and the legend: a line each."""
+    failures = [f"{row.name}: not possible: {row.error}" for row in comparison.methods if row.error]
+    reasons: dict[str, list[str]] = {}
+    for row in comparison.methods:
+        for measure, reason in row.notes.items():
+            how = "*" if reason.startswith(OWN) else "not tried:"
+            reasons.setdefault(f"{how} {measure.partition('.')[2]}: {reason}", []).append(row.name)
+    skipped = [f"{reason} ({', '.join(names)})" for reason, names in reasons.items()]
+    if any("cover.lpips" not in row.numbers for row in comparison.methods if row.numbers):
+        skipped.append(f"no LPIPS: {HOW_TO_GET}")
+    return [*failures, *skipped, *_LEGEND]
+
+
+def comparison_text(comparison: Comparison) -> str:
+    """Both tables and the notes in Markdown."""
+    lines = []
+    for title, rows in comparison_tables(comparison).items():
+        lines += [f"## {title}", "", *markdown_rows(rows), ""]
+    lines += [f"- {note}" for note in comparison_notes(comparison)]
+    return "\n".join(lines) + "\n"

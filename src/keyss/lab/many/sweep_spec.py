@@ -1,0 +1,224 @@
+"""`sweep`: the cells of a specification, and the tables of their results.
+
+The file of a sweep lists pairs, methods, options and seeds, as YAML:
+
+    pairs:
+      - cover: scenes/bonsai
+        secrets: [scenes/fox]
+    methods:
+      - method: carry
+        options: {prune_to_fit: true}
+      - method: keyss
+        preset: quick
+        grid: {design: [published, latent], fit.iterations: [500, 1000]}
+    seeds: [0, 1, 2]
+
+Everything is checked before anything runs: names of fields, types, options of methods, and that files exist.
+Paths are relative to the folder of the file.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from itertools import product
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import msgspec
+from msgspec import Meta
+
+from keyss.core import InputError, KeyssError, ViewOptions, import_extra
+from keyss.core.errors import did_you_mean
+from keyss.files.reading import read_text
+from keyss.fitting import PRESETS
+from keyss.fitting.config import MAX_SEED
+from keyss.keys import read_key
+from keyss.lab.audits import PARTS
+from keyss.lab.many.cell_folder import CellFolder, Forecast, ManyResult
+from keyss.lab.many.option_changes import known_changes, with_changes
+from keyss.lab.many.result_tables import write_sweep_tables
+from keyss.methods import MethodOptions, registry
+from keyss.progress import Reporter
+from keyss.rendering.orbit import is_model
+from keyss.runs.files import PathLike
+
+MAX_BYTES = 1 << 20  # of the file
+_AT_LEAST_ONE = Meta(min_length=1)
+Row = tuple[dict[str, Any], list[str], int]  # labels, scenes and seed of a cell in tables
+
+
+class Pair(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A cover and its secrets: scenes or models."""
+
+    cover: str
+    secrets: Annotated[tuple[str, ...], _AT_LEAST_ONE]
+    name: str | None = None
+    cover_model: str | None = None  # plain models of scenes; None: fitted
+    secret_models: tuple[str, ...] = ()
+
+    @property
+    def label(self) -> str:
+        """The name of the pair in tables."""
+        return self.name or "-".join(Path(source).stem for source in (self.cover, *self.secrets))
+
+
+class MethodSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A method, and options that override its preset."""
+
+    method: Literal[tuple(registry.METHODS)]  # type: ignore[valid-type]
+    name: str | None = None
+    preset: Literal[tuple(PRESETS)] = "default"  # type: ignore[valid-type]
+    options: dict[str, Any] = {}
+    grid: dict[str, Annotated[list[Any], _AT_LEAST_ONE]] = {}  # values of options, in all combinations
+
+    @property
+    def label(self) -> str:
+        """The name of the method in tables."""
+        return self.name or self.method
+
+
+class SweepSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The content of a sweep's file."""
+
+    pairs: Annotated[tuple[Pair, ...], _AT_LEAST_ONE]
+    methods: Annotated[tuple[MethodSpec, ...], _AT_LEAST_ONE]
+    seeds: Annotated[tuple[Annotated[int, Meta(ge=0, le=MAX_SEED)], ...], _AT_LEAST_ONE] = (0,)
+    evaluate: tuple[Literal[tuple(PARTS)], ...] = ()  # type: ignore[valid-type]  # beyond `keyss hide`'s own
+    width: int | None = None
+    background: tuple[float, float, float] | None = None
+    skip_missing: bool = False
+    min_psnr: float = 0.0
+    bound: bool = False
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+
+    @property
+    def common(self) -> dict[str, Any]:
+        """The fields of all cells."""
+        views = ViewOptions(self.width, self.background, self.skip_missing)
+        return {"views": views, "min_psnr": self.min_psnr, "bound": self.bound, "device": self.device}
+
+
+def read_spec(path: Path) -> SweepSpec:
+    """The sweep in a file, with absolute paths. Raises InputError, and BackendError without PyYAML."""
+    yaml = import_extra("yaml", "sweep", "read sweeps")
+    try:
+        spec = msgspec.convert(yaml.safe_load(read_text(path, MAX_BYTES)), SweepSpec)
+    except (yaml.YAMLError, msgspec.ValidationError, ValueError, RecursionError) as error:
+        raise InputError(f"{path}: expected YAML of a sweep: {' '.join(str(error).split())}") from error
+    if len(set(spec.seeds)) < len(spec.seeds):
+        raise InputError(f"{path}: seeds: expected different ones, got one twice")
+    names = {"pairs": [each.label for each in spec.pairs], "methods": [each.label for each in spec.methods]}
+    for what, labels in names.items():
+        if same := [label for label in labels if labels.count(label) > 1]:  # tables would take them for one
+            raise InputError(f"{path}: {what}: two have the name {same[0]!r}: give one another `name`")
+    most = min(registry.get(entry.method).max_secrets for entry in spec.methods)
+    pairs = tuple(
+        _checked(f"{path}: pairs[{index}]", path, pair, most) for index, pair in enumerate(spec.pairs)
+    )
+    for _ in variants(path, spec):  # raises InputError
+        pass
+    return msgspec.structs.replace(spec, pairs=pairs)
+
+
+def variants(path: Path, spec: SweepSpec) -> Iterator[tuple[str, MethodOptions, dict[str, Any]]]:
+    """Every method with every combination of its grid: name in tables, options, and choices from the grid.
+
+    Raises InputError for invalid options.
+    """
+    for index, entry in enumerate(spec.methods):
+        where = f"{path}: methods[{index}]"
+        preset = registry.get(entry.method).options.preset(entry.preset)
+        known = known_changes(preset)
+        for name in (*entry.options, *entry.grid):
+            if name not in known:
+                raise InputError(f"{where}: option {name[:60]!r} is unknown; {did_you_mean(name, known)}")
+            if name in entry.options and name in entry.grid:
+                raise InputError(f"{where}: {name} is both in the options and in the grid")
+        for values in product(*entry.grid.values()):
+            choices = dict(zip(entry.grid, values, strict=True))
+            try:
+                options = with_changes(preset, {**entry.options, **choices})
+            except (KeyssError, msgspec.ValidationError) as error:
+                raise InputError(f"{where}: {error}") from error
+            yield entry.label, options, choices
+
+
+def _checked(where: str, path: Path, pair: Pair, most: int) -> Pair:
+    """The pair with absolute paths. Raises InputError for a missing one, and for more secrets than `most`."""
+    secrets, models = len(pair.secrets), len(pair.secret_models)
+    if secrets > most:
+        raise InputError(f"{where}.secrets: expected at most {most}, got {secrets}")
+    if models not in (0, secrets):
+        raise InputError(f"{where}.secret_models: expected none or one for each secret, got {models}")
+
+    def absolute(name: str, value: str) -> str:
+        whole = os.path.realpath(os.path.join(path.absolute().parent, os.path.expanduser(value)))
+        if not os.path.exists(whole):
+            raise InputError(f"{where}.{name}: there is no {value}")
+        return whole
+
+    return msgspec.structs.replace(
+        pair,
+        name=pair.label,
+        cover=absolute("cover", pair.cover),
+        secrets=tuple(absolute("secrets", each) for each in pair.secrets),
+        cover_model=pair.cover_model and absolute("cover_model", pair.cover_model),
+        secret_models=tuple(absolute("secret_models", each) for each in pair.secret_models),
+    )
+
+
+def sweep(
+    spec: PathLike,
+    out: PathLike,
+    *,
+    master_key_file: PathLike | None = None,
+    ray: str | None = None,
+    cores: int = 1,
+    dry_run: bool = False,
+    reporter: Reporter | None = None,
+) -> ManyResult | Forecast:
+    """Run all cells of a specification that are not done, and write the tables of all that are.
+
+    They run one after the other in this process, or with `ray` at the same time on a Ray cluster: its
+    address, or "local" for one of this machine; `cores`: of each cell there. `dry_run`: only return the plans
+    of the cells. Keys are derived from a master key and the cells' names: the one in `master_key_file`, or a
+    new one in the private part of `out`. Raises KeyssError and its children, and
+    KeyboardInterrupt; a cell that fails is in the result.
+    """
+    path = Path(spec)
+    found = read_spec(path)
+    master = None if master_key_file is None else Path(master_key_file).absolute()
+    if master is not None:
+        read_key(master)
+    folder = CellFolder(Path(out), master, found.common)
+    rows = _add(path, found, folder)
+    if dry_run:
+        return folder.forecast()
+    outcomes = folder.run(ray=ray, cores=cores, reporter=reporter)
+    ended = [outcomes[place].row(*row) for place, row in rows.items() if outcomes[place].result]
+    tables = write_sweep_tables(folder.out, ended)
+    return ManyResult(tuple(outcomes[place] for place in rows), tuple(tables))
+
+
+def _add(path: Path, spec: SweepSpec, folder: CellFolder) -> dict[Path, Row]:
+    """Add all cells, in the order of pairs, methods, choices and seeds; what names each in tables.
+
+    Scenes without plain models share fits.
+    """
+    found: dict[Path, Row] = {}
+    for pair, (method, preset, choices), seed in product(spec.pairs, variants(path, spec), spec.seeds):
+        options = preset.with_fit(seed=seed)
+        sources = [pair.cover, *pair.secrets]
+        given = [pair.cover_model, *(pair.secret_models or [None] * len(pair.secrets))]
+        models = [
+            model if model or is_model(source) else folder.plain(source, config)
+            for source, model, config in zip(sources, given, options.fits(len(sources)), strict=True)
+        ]
+        chosen = "".join(f" {name}={value}" for name, value in choices.items())
+        name = f"{pair.label} {method}{chosen} seed {seed}"
+        place = folder.hiding(name, sources, options, models, measures=spec.evaluate)
+        labels = {"pair": pair.label, "method": method, **choices}
+        scenes = [Path(source).stem for source in sources]
+        found.setdefault(place, (labels, scenes, seed))
+    return found

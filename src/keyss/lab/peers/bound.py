@@ -1,0 +1,55 @@
+"""The bound: two plain 3DGS models (Kerbl et al. 2023), one published, one handed over. Nothing is hidden."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import ClassVar
+
+from keyss.core.gaussians import Gaussians
+from keyss.lab.peers.method import HandedTensors, Peer, PeerOptions, Show
+from keyss.methods.base import Capabilities, Context, Plan, Source, Stego, Training
+
+_NAMES = tuple(each.name for each in fields(Gaussians))
+
+
+@dataclass(frozen=True, kw_only=True)
+class BoundOptions(PeerOptions):
+    """Options of the plain models."""
+
+    method: ClassVar[str] = "3dgs"
+
+    def training(self, scenes: int) -> tuple[Training, ...]:
+        """No training beside that of plain models."""
+        return (Training(),) * scenes
+
+
+@dataclass(frozen=True)
+class BoundMethod(Peer):
+    """See `keyss.methods.base.Method`."""
+
+    def plan(self, sources: Sequence[Source], options: PeerOptions) -> Plan:
+        """Both models as they are."""
+        fit = options.fit
+        cover, secret = (fit.max_gaussians if each.given is None else len(each.given) for each in sources)
+        degree = fit.sh_degree if sources[0].given is None else sources[0].given.sh_degree
+        return Plan(gaussians=cover, sh_degree=degree, secret_gaussians=secret, capacity=secret)
+
+    def hide(self, cover: Source, secrets: Sequence[Source], options: PeerOptions, context: Context) -> Stego:
+        """Hand the secret's model over."""
+        (secret,) = secrets
+        return self.stego(cover.model, HandedTensors(vars(secret.model)))
+
+
+def _open(handed: HandedTensors) -> Show:
+    model = Gaussians(*handed.taken(_NAMES))
+    return lambda stego: model
+
+
+METHOD = BoundMethod(
+    options=BoundOptions,
+    summary="two plain models, the second handed over: nothing is hidden, a bound",
+    capabilities=Capabilities(keys=False, hands_over=True),
+    open=_open,
+)
+unpack = METHOD.unpack

@@ -1,0 +1,90 @@
+"""GS-Hider (Zhang et al., NeurIPS 2024): coupled features in place of harmonics, and two networks.
+
+The Gaussians' 16 features are rendered like colours. A scene decoder, which is published with them, turns the
+rendered features into the cover's picture, and a message decoder, which is handed over, into the secret's. No
+viewer of 3DGS models shows either.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+
+from keyss.core.decoded import DecodedGaussians
+from keyss.core.errors import InputError
+from keyss.core.gaussians import SH_C0, Gaussians
+from keyss.core.scene import Camera
+from keyss.lab.peers.decoder import Convolutions, network_of, network_tensors
+from keyss.lab.peers.method import HandedTensors, Peer, PeerOptions, PeerTraining, Show
+from keyss.methods.base import Capabilities
+from keyss.methods.keyss.training import Picture
+from keyss.rendering import decode_picture, render_features
+
+FEATURES = 16
+_NOISE = 0.1  # standard deviation of the features that start as noise
+
+
+class GsHiderTraining(PeerTraining):
+    """The training of features instead of harmonics, a scene decoder and a message decoder."""
+
+    def prepare(self, start: Gaussians) -> None:
+        """Three features start as the points' colours, the others as noise."""
+        del self.parameters["sh"], self.optimizers["sh"]
+        noise = _NOISE * torch.randn(len(start), FEATURES - 3)
+        self.add("features", torch.cat([SH_C0 * start.sh[:, 0], noise], 1), self.options.fit.sh0_rate)
+        self.decoders = (Convolutions(FEATURES), Convolutions(FEATURES))  # of the scene, of the message
+        self.networks.extend(self.decoders)
+
+    def draw(self, scenes: Sequence[int], camera: Camera, sh_degree: int) -> list[Picture]:
+        """All images come from one render of the features."""
+        background = torch.zeros(FEATURES, device=self.device)
+        image, meta = render_features(self.gaussians(), self.parameters["features"], camera, background)
+        networks = (self.decoders[scene].network(background) for scene in scenes)
+        return [Picture(decode_picture(image, network), meta) for network in networks]
+
+    def gaussians(self) -> Gaussians:
+        """[N] without colours."""
+        own = self.parameters
+        sh = torch.zeros(len(self), 1, 3, device=self.device)
+        return Gaussians(own["means"], own["quats"], own["scales"], own["opacities"], sh)
+
+    def result(self) -> tuple[Gaussians, HandedTensors]:
+        visible = self.visible()
+        background = torch.zeros(FEATURES, device=self.device)
+        cover, secret = (
+            decoder.network(background).map(lambda values: values.detach().cpu()) for decoder in self.decoders
+        )
+        features = self.parameters["features"].detach()[visible].cpu()
+        stego = DecodedGaussians.of(self.gaussians().detach()[visible].to("cpu"), cover, features)
+        return stego, HandedTensors(network_tensors(secret), self.frame)
+
+
+@dataclass(frozen=True, kw_only=True)
+class GsHiderOptions(PeerOptions):
+    """See `PeerOptions`."""
+
+    method: ClassVar[str] = "gs-hider"
+
+
+def _open(handed: HandedTensors) -> Show:
+    network = network_of(handed)
+
+    def show(stego: Gaussians) -> Gaussians:
+        if not isinstance(stego, DecodedGaussians) or stego.features is None:
+            raise InputError("expected the model that gs-hider published, which has features")
+        return DecodedGaussians.of(stego, network, stego.features)
+
+    return show
+
+
+METHOD = Peer(
+    options=GsHiderOptions,
+    summary="features in place of harmonics, and a network for each scene",
+    capabilities=Capabilities(keys=False, hands_over=True, standard=False, models=False),
+    open=_open,
+    training=GsHiderTraining,
+)
+unpack = METHOD.unpack

@@ -1,0 +1,254 @@
+"""The common part of the peers: one secret, one joint training, one file that is handed over."""
+
+from __future__ import annotations
+
+import hashlib
+from abc import abstractmethod
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Annotated, ClassVar
+
+import torch
+from torch import Tensor
+
+from keyss.channels import Content, Payload
+from keyss.core.errors import InputError, UsageError
+from keyss.core.gaussians import Gaussians
+from keyss.core.scene import Camera
+from keyss.core.similarity import Similarity
+from keyss.fitting.adam import RowAdam
+from keyss.methods.base import (
+    Capabilities,
+    CommandLineOption,
+    Context,
+    MethodOptions,
+    Plan,
+    Source,
+    Stego,
+    Training,
+    check_above_zero,
+)
+from keyss.methods.keyss.combined import PlacedScene
+from keyss.methods.keyss.decoder import DecoderShape
+from keyss.methods.keyss.options import Design, Scenes
+from keyss.methods.keyss.training import KeyssTraining, Picture
+from keyss.methods.opened import Frame, Remains
+from keyss.methods.tensors import Header, damage_refused, pack_tensors, unpack_tensors
+
+FORMAT, VERSION = "keyss-peer", 1
+DAMAGED = "what was handed over is damaged"
+
+
+@dataclass(frozen=True)
+class _Header(Header):
+    rows: int | None
+    frame: Similarity | None
+
+
+@dataclass(frozen=True)
+class HandedTensors:
+    """Tensors to hand over, and where the secret is in the cover's frame."""
+
+    tensors: Mapping[str, Tensor]  # float32 or uint8
+    frame: Similarity | None = None  # from the secret's into the cover's; None: never placed there
+    rows: int | None = None  # Gaussians of the published model, if they are needed in their order
+
+    def payload(self, method: str) -> Payload:
+        """The file of the method of that name."""
+        header = _Header(FORMAT, VERSION, self.rows, self.frame)
+        return Payload(method, pack_tensors(self.tensors, header))
+
+    @staticmethod
+    def of(content: Content) -> HandedTensors:
+        """The tensors of `payload`. Raises InputError for anything else."""
+        with damage_refused(DAMAGED):
+            if not isinstance(content, Payload):
+                raise ValueError("expected one string of bytes, got records")
+            header, tensors = unpack_tensors(content.data, _Header, FORMAT, VERSION)
+        return HandedTensors(tensors, header.frame, header.rows)
+
+    def taken(self, names: Iterable[str], *, of_bytes: Collection[str] = ()) -> list[Tensor]:
+        """The tensors of these names: uint8 those `of_bytes`, else float32.
+
+        Raises InputError for other types, and if there are more or fewer.
+        """
+        expected = {name: torch.uint8 if name in of_bytes else torch.float32 for name in names}
+        if expected != {name: value.dtype for name, value in self.tensors.items()}:
+            found = ", ".join(sorted(self.tensors))[:200]
+            raise InputError(f"{DAMAGED}: expected {', '.join(expected)}, found {found}")
+        return [self.tensors[name] for name in expected]
+
+
+Show = Callable[[Gaussians], Gaussians]  # from a model on the CPU, in the cover's frame; raises ValueError
+
+
+@dataclass(frozen=True)
+class HandedSecret:
+    """An `Opened`: a handed-over file applied to the published model."""
+
+    handed: HandedTensors
+    show: Show
+    decode: None = None
+    key_size: int = 0
+
+    @property
+    def frame(self) -> Similarity | None:
+        return self.handed.frame
+
+    def reveal(self, stego: Gaussians, *, frame: Frame = "secret", force: bool = False) -> Gaussians:
+        """See `Opened.reveal`; raises InputError for a model with other Gaussians."""
+        rows = self.handed.rows
+        if rows is not None and len(stego) != rows:
+            raise InputError(
+                f"expected the {rows:,} Gaussians that were published, in their order, got {len(stego):,}: "
+                "each row of the handed-over file belongs to one of them"
+            )
+        if frame == "cover" and self.frame is None:
+            raise UsageError('this secret never was in the cover\'s frame: leave out `frame="cover"`')
+        with damage_refused("what was handed over does not fit"):
+            shown = self.show(stego.detach().to("cpu"))
+        if self.frame is None or frame == "cover":
+            return shown
+        return self.frame.inverse().apply_gaussians(shown)
+
+    def remains(self, revealed: Gaussians) -> Remains:
+        """All of the secret: damage reveals nothing."""
+        return Remains(len(revealed), len(revealed))
+
+    def fingerprint(self) -> str:
+        return hashlib.sha256(self.handed.payload("peer").data).hexdigest()[:16]
+
+
+@dataclass(frozen=True, kw_only=True)
+class PeerOptions(MethodOptions):
+    """Options of all peers: the joint training is as long and has as many Gaussians as plain models.
+
+    It combines poses, points and densification as KeySS's does. Each peer has its own class, by which its
+    options are recognised.
+    """
+
+    points: ClassVar[Scenes] = "both"  # scenes whose sparse points start the model
+
+    common_poses: Annotated[
+        float,
+        CommandLineOption(
+            "Share of steps that render both scenes from one pose, 0 to 1; the papers': 1.",
+            metavar="SHARE",
+        ),
+    ] = 1.0
+    network_rate: float = 1e-3  # of Adam, decays to 5 % of it
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_above_zero(self, "network_rate")
+        self.check_published_exactly()
+        _ = self.design  # raises for values out of range
+
+    @property
+    def design(self) -> Design:
+        """The configuration of the joint training, which has no decoder of Gaussians and no keys."""
+        return Design(
+            name=self.method,
+            decoder=DecoderShape(),
+            ssim_weight=None,
+            beta_incorrect=0.0,
+            points=self.points,
+            common_poses=self.common_poses,
+            decoder_rate=self.network_rate,
+            weight_decay=0.0,
+        )
+
+    def training(self, scenes: int) -> tuple[Training, ...]:
+        """Every step renders all scenes."""
+        return (Training(self.fit.iterations, continues=False),) * scenes
+
+
+class PeerTraining(KeyssTraining):
+    """The joint training of a peer: `prepare` adds what it trains, `draw` renders scenes."""
+
+    options: PeerOptions
+
+    def __init__(self, scenes: Sequence[PlacedScene], options: PeerOptions, device: torch.device) -> None:
+        super().__init__(scenes, [], options, options.design, device)
+
+    @abstractmethod
+    def prepare(self, start: Gaussians) -> None:
+        """Add parameters (`add`) and networks (`networks`); their random numbers are the run's own."""
+
+    @abstractmethod
+    def draw(self, scenes: Sequence[int], camera: Camera, sh_degree: int) -> list[Picture]:
+        """Render some scenes, in that order; they may share a render."""
+
+    @abstractmethod
+    def result(self) -> tuple[Gaussians, HandedTensors]:
+        """The published model, on the CPU, and the tensors to hand over, after the training."""
+
+    def add(self, name: str, values: Tensor, optimizer: RowAdam | float) -> None:
+        """Add a parameter [N, ...] of the Gaussians, with its optimiser or a rate for a new one."""
+        self.parameters[name] = parameter = torch.nn.Parameter(values.to(self.device).contiguous())
+        if isinstance(optimizer, RowAdam):
+            optimizer.param_groups[0]["params"] = [parameter]
+            self.optimizers[name] = optimizer
+        else:
+            fused = self.device.type == "cuda"
+            self.optimizers[name] = RowAdam(
+                [{"params": [parameter], "lr": optimizer}], eps=1e-15, fused=fused
+            )
+
+    def opacity_for_pruning(self) -> Tensor:
+        """[N] how visible each Gaussian is in the scene that shows it most."""
+        return self.parameters["opacities"].detach().sigmoid()
+
+    @property
+    def frame(self) -> Similarity:
+        """From the secret's own frame into the cover's."""
+        return self.scenes[1].frame
+
+    def visible(self) -> Tensor:
+        """[N] which Gaussians have an opacity above the limit of pruning; all if none has."""
+        visible = self.opacity_for_pruning() >= self.options.fit.prune_opacity
+        return visible if bool(visible.any()) else torch.ones_like(visible)
+
+
+@dataclass(frozen=True)
+class Peer:
+    """A `Method` with a joint training, one secret, and one file that is handed over for it."""
+
+    options: type[PeerOptions]
+    summary: str
+    capabilities: Capabilities
+    open: Callable[[HandedTensors], Show]  # raises InputError and ValueError for damage
+    training: type[PeerTraining] | None = None  # None: `hide` is another
+    max_secrets: int = 1
+
+    @property
+    def name(self) -> str:
+        return self.options.method
+
+    def prepare(self, sources: Sequence[Source], options: PeerOptions) -> PeerOptions:
+        """Accepts all scenes."""
+        return options
+
+    def plan(self, sources: Sequence[Source], options: PeerOptions) -> Plan:
+        """Both scenes share as many Gaussians as a plain model has."""
+        return options.joint_plan(1)
+
+    def hide(self, cover: Source, secrets: Sequence[Source], options: PeerOptions, context: Context) -> Stego:
+        """Train both scenes together. Raises Interrupted, and InputError for another run's checkpoint."""
+        training = self.training
+        assert training is not None
+        sources = [cover, *secrets]
+        run = training(PlacedScene.all_of(sources), options, context.device)
+        run.train(sources, context)
+        return self.stego(*run.result(), run.iterations)
+
+    def stego(self, published: Gaussians, handed: HandedTensors, iterations: int = 0) -> Stego:
+        """The result of hiding, opened from the payload that is handed over."""
+        payload = handed.payload(self.name)
+        return Stego(published, (self.unpack(payload),), iterations, handed=(payload,))
+
+    def unpack(self, content: Content) -> HandedSecret:
+        """The secret of a handed-over file. Raises InputError for damage."""
+        handed = HandedTensors.of(content)
+        with damage_refused(DAMAGED):
+            return HandedSecret(handed, self.open(handed))

@@ -1,0 +1,298 @@
+"""PSNR that cover and secrets lose when the published model changes.
+
+Among the changes are conversions to other formats and back by third-party programs: gsply (PyPI) and
+splat-transform (npm).
+
+pip install gsply
+npm install --no-save @playcanvas/splat-transform@2.7.1
+"""
+
+from __future__ import annotations
+
+import subprocess
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from importlib import import_module
+from pathlib import Path
+from statistics import fmean
+from types import ModuleType
+
+from keyss.core.errors import BackendError, InputError, KeyssError, UsageError, WrongKeyError
+from keyss.core.gaussians import Gaussians
+from keyss.core.scene import Scene
+from keyss.files.foreign import find_splat_transform
+from keyss.files.models import read_model, write_model
+from keyss.fitting.image_metrics import mean_psnr, subsample_views
+from keyss.lab.robustness import changes as change
+from keyss.lab.robustness.changes import Change
+from keyss.measure.hiding import in_cover
+from keyss.methods.opened import Opened
+
+PRUNED = (0.05, 0.10, 0.15, 0.25, 0.50)
+NOISE = (0.001, 0.01, 0.1)
+SEEDS = 3  # of each random removal; results vary by a dB or two
+UNCHANGED = "none"
+
+# Opens a secret in a stego model on the CPU; raises KeyssError if it does not open.
+Opener = Callable[[Gaussians], Opened]
+TIMEOUT = 600.0  # seconds for one conversion
+
+
+@dataclass(frozen=True)
+class ChangedQuality:
+    """A scene against its test photos after a change."""
+
+    psnr: float  # dB
+    loss: float  # dB less than in the unchanged model
+    opens: bool = True  # always True for the cover
+    error: str | None = None  # why a secret does not open
+
+
+@dataclass(frozen=True)
+class ChangeResult:
+    """Quality of cover and secrets after a change of the published model: means over its random seeds.
+
+    If a secret does not open, its quality is that of the changed model itself, from the secret's cameras.
+    """
+
+    attack: str  # changes of one attack differ in strength only
+    strength: float
+    unit: str
+    sentence: str
+    seeds: int = 1  # number of changes that this is the mean of
+    skipped: str | None = None  # which tool is missing; `cover` and `secrets` are unset then
+    cover: ChangedQuality | None = None
+    secrets: tuple[ChangedQuality, ...] = ()
+
+
+def default_changes(cover: Scene, *, seed: int = 0) -> list[Change]:
+    """All changes, grouped by attack, the mildest first; some train on the photos of `cover`."""
+    return [
+        *(change.random_pruning(share, seed + index) for share in PRUNED for index in range(SEEDS)),
+        *(change.opacity_pruning(share) for share in PRUNED),
+        *(change.cropping(seed + index) for index in range(SEEDS)),
+        *(change.fewer_harmonics(degree) for degree in (2, 1, 0)),
+        change.half_floats(),
+        *(change.noise(attribute, strength, seed) for attribute in change.NOISY for strength in NOISE),
+        *(converter.change() for converter in converters()),
+        *(change.purification(cover, given_up, seed=seed) for given_up in (0.0, 0.01)),
+        change.fine_tuning(cover, seed=seed),
+    ]
+
+
+def measure_robustness(
+    stego: Gaussians,
+    openers: Sequence[Opener],  # one for each secret
+    cover: Scene,
+    secrets: Sequence[Scene],
+    *,
+    changes: Sequence[Change] | None = None,
+    max_views: int = 8,
+    seed: int = 0,
+    progress: Callable[[int, int], None] | None = None,
+) -> list[ChangeResult]:
+    """PSNRs of cover and secrets after each of the `changes`; the first result is the unchanged model's.
+
+    `changes`: by default `default_changes`, about 50; the ones of equal attack and strength become one
+    result. `max_views`: test views of each scene. `progress`: called with the numbers of changes done and of
+    all. Renders on the device of `stego`. The same seed gives the same numbers. Raises UsageError unless
+    there is one opener for each secret, and KeyssError for a secret that does not open in the unchanged
+    model.
+    """
+    if len(openers) != len(secrets):
+        raise UsageError(f"expected an opener for each of {len(secrets)} secret(s), got {len(openers)}")
+    changes = default_changes(cover, seed=seed) if changes is None else changes
+    opened = [opener(stego.to("cpu")) for opener in openers]
+    placed = [in_cover(*pair, cover) for pair in zip(opened, secrets, strict=True)]
+
+    def psnr(model: Gaussians, scene: Scene) -> float:
+        return mean_psnr(model, subsample_views(scene.test, max_views), scene.background.to(model.device))
+
+    def secret_quality(model: Gaussians, index: int) -> ChangedQuality:
+        try:
+            revealed = reveal_changed(openers[index], model).to(model.device)
+        except KeyssError as error:
+            why = "this key opens nothing here" if isinstance(error, WrongKeyError) else f"{error}"
+            return ChangedQuality(psnr(model, placed[index]), 0.0, opens=False, error=why)
+        return ChangedQuality(psnr(revealed, secrets[index]), 0.0)
+
+    results: dict[tuple[str, float], list[ChangeResult]] = {}
+    before: list[float] = []
+    unchanged = Change(UNCHANGED, 0, "", "Nothing is changed.", lambda model: model)
+    for number, each in enumerate([unchanged, *changes]):
+        if progress is not None:
+            progress(number, len(changes) + 1)
+        result = ChangeResult(each.attack, each.strength, each.unit, each.sentence)
+        try:
+            changed = each(stego)
+        except BackendError as error:
+            result = replace(result, skipped=f"{error}")
+        else:
+            after = [ChangedQuality(psnr(changed, cover), 0.0)]
+            after += [secret_quality(changed, index) for index in range(len(secrets))]
+            before = before or [quality.psnr for quality in after]
+            lost = [replace(now, loss=was - now.psnr) for now, was in zip(after, before, strict=True)]
+            result = replace(result, cover=lost[0], secrets=tuple(lost[1:]))
+        results.setdefault((each.attack, each.strength), []).append(result)
+    return [_mean(group) for group in results.values()]
+
+
+def reveal_changed(opener: Opener, stego: Gaussians) -> Gaussians:
+    """The secret in its own frame, as `keyss reveal` gives it, with `--force` if the model requires it.
+
+    Raises WrongKeyError and InputError as the opener does.
+    """
+    stego = stego.to("cpu")
+    secret = opener(stego)
+    try:
+        return secret.reveal(stego)
+    except InputError:  # positions changed: it seems to be another model
+        return secret.reveal(stego, force=True)
+
+
+def _mean(results: Sequence[ChangeResult]) -> ChangeResult:
+    """Results that differ in their random seed as one."""
+    covers = [each.cover for each in results if each.cover is not None]
+    if not covers:
+        return results[0]
+    secrets = zip(*(each.secrets for each in results), strict=True)
+    return replace(
+        results[0],
+        seeds=len(results),
+        cover=_mean_quality(covers),
+        secrets=tuple(map(_mean_quality, secrets)),
+    )
+
+
+def _mean_quality(qualities: Sequence[ChangedQuality]) -> ChangedQuality:
+    return ChangedQuality(
+        fmean(each.psnr for each in qualities),
+        fmean(each.loss for each in qualities),
+        all(each.opens for each in qualities),
+        next((each.error for each in qualities if each.error), None),
+    )
+
+
+@dataclass(frozen=True)
+class Converter:
+    """Converts models to a format and back."""
+
+    format: str
+    tool: str
+    note: str  # a remark on this conversion, or nothing
+    there_and_back: Callable[[Path, Path], tuple[Path, Path]]  # .ply, folder -> other file, .ply
+
+    def __call__(self, model: Gaussians) -> Gaussians:
+        """Raises BackendError if the tool is missing or fails."""
+        with tempfile.TemporaryDirectory() as folder:
+            source = Path(folder) / "source.ply"
+            write_model(source, model)
+            try:
+                return read_model(self.there_and_back(source, Path(folder))[1])
+            except BackendError:
+                raise
+            except (KeyssError, OSError, ValueError) as error:
+                reason = (str(error) or type(error).__name__).splitlines()[0]
+                raise BackendError(f"{self.tool} failed on {self.format}: {reason}") from error
+
+    def change(self) -> Change:
+        sentence = f"Converted to {self.format} and back by {self.tool}{self.note}."
+        attack = f"conversion to {self.format} by {self.tool}"
+        return Change(attack, 1, "times", sentence, lambda model: self(model).to(model.device))
+
+
+def converters(sog_iterations: int = 1) -> list[Converter]:
+    """All known conversions, whether or not their tools are installed.
+
+    `sog_iterations`: of the clustering of harmonics in .sog, by default ten in splat-transform, which without
+    a GPU takes half a minute each for 20,000 Gaussians.
+    """
+    rounds = "one round" if sog_iterations == 1 else f"{sog_iterations} rounds"
+    return [
+        Converter("compressed .ply", "gsply", "", _gsply_compressed),
+        Converter(".spz", "gsply", " (version 3)", _gsply_spz),
+        Converter("compressed .ply", "splat-transform", "", _through("there.compressed.ply")),
+        Converter(".spz", "splat-transform", " (version 4)", _through("there.spz")),
+        Converter(
+            ".sog",
+            "splat-transform",
+            f", with {rounds} of clustering harmonics",
+            _through("there.sog", "-i", str(sog_iterations)),
+        ),
+        Converter(".splat", "splat-transform", ", which only reads this format", _splat),
+    ]
+
+
+def own_converter(format: str) -> Converter:
+    """A conversion by keyss itself, for where a tool is missing: `format` is .spz or compressed .ply."""
+    name = {".spz": "there.spz", "compressed .ply": "there.compressed.ply"}[format]
+
+    def there_and_back(source: Path, folder: Path) -> tuple[Path, Path]:
+        there, back = folder / name, folder / "back.ply"
+        write_model(there, read_model(source))
+        write_model(back, read_model(there))
+        return there, back
+
+    return Converter(format, "keyss", "", there_and_back)
+
+
+def why_missing(tool: str) -> str | None:
+    """Why splat-transform or a Python package cannot be used; None if it is installed."""
+    try:
+        find_splat_transform() if tool == "splat-transform" else find_package(tool)
+    except BackendError as error:
+        return str(error)
+    return None
+
+
+def find_package(name: str) -> ModuleType:
+    """A third-party Python package. Raises BackendError."""
+    try:
+        return import_module(name)
+    except ImportError as error:
+        raise BackendError(f"{name} is not installed (pip install {name})") from error
+
+
+def transform(source: Path, target: Path, *options: str) -> Path:
+    """`target`, converted from `source` by splat-transform. Raises BackendError."""
+    tool = find_splat_transform()
+    command = [tool, "-q", "-w", "-g", "cpu", *options, str(source), str(target)]
+    try:
+        subprocess.run(command, check=True, capture_output=True, text=True, timeout=TIMEOUT)
+    except subprocess.TimeoutExpired as error:
+        raise BackendError(f"splat-transform took more than {TIMEOUT:.0f} s for {target.name}") from error
+    except (OSError, subprocess.CalledProcessError) as error:
+        message = getattr(error, "stderr", None) or str(error)
+        raise BackendError(
+            f"splat-transform failed on {target.name}: {message.strip().splitlines()[-1]}"
+        ) from error
+    return target
+
+
+def _through(name: str, *options: str) -> Callable[[Path, Path], tuple[Path, Path]]:
+    def there_and_back(source: Path, folder: Path) -> tuple[Path, Path]:
+        there = transform(source, folder / name, *options)
+        return there, transform(there, folder / "back.ply")
+
+    return there_and_back
+
+
+def _gsply_compressed(source: Path, folder: Path) -> tuple[Path, Path]:
+    gsply, there, back = find_package("gsply"), folder / "there.compressed.ply", folder / "back.ply"
+    gsply.plywrite(there, gsply.plyread(source), compressed=True)
+    gsply.plywrite(back, gsply.plyread(there))
+    return there, back
+
+
+def _gsply_spz(source: Path, folder: Path) -> tuple[Path, Path]:
+    gsply, there, back = find_package("gsply"), folder / "there.spz", folder / "back.ply"
+    gsply.write_spz(there, gsply.plyread(source), version=3)
+    gsply.plywrite(back, gsply.read_spz(there))
+    return there, back
+
+
+def _splat(source: Path, folder: Path) -> tuple[Path, Path]:
+    there = folder / "there.splat"
+    write_model(there, read_model(source))
+    return there, transform(there, folder / "back.ply")

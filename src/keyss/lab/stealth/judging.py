@@ -1,0 +1,184 @@
+"""Which statistics of a file are unusual, compared with control models of the same scene."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from keyss.core import Gaussians, UsageError
+from keyss.lab.stealth.agreement import agreement, coincidences
+from keyss.lab.stealth.bits import bits
+from keyss.lab.stealth.colours import colours, invisible_modes, opacities
+from keyss.lab.stealth.confirmation import candidate_scores, changed_low_bits
+from keyss.lab.stealth.invariants import invariants, order
+from keyss.lab.stealth.statistic import BitPatterns, Statistic
+
+# Detectors by kind: functions of a model and its bit patterns that give statistics by name.
+KINDS: dict[str, Callable[[Gaussians, BitPatterns], dict[str, Statistic]]] = {
+    "bits": bits,
+    "agreement": agreement,
+    "coincidences": coincidences,
+    "invariants": invariants,
+    "opacities": opacities,
+    "order": order,
+    "colours": colours,
+}
+_AGREEMENT = 0.03  # relative error assumed for a statistic without a known error
+_MANY = 1e7  # degrees of freedom: normal
+
+
+@dataclass(frozen=True)
+class JudgedStatistic:
+    """A statistic of the file, and of control models."""
+
+    name: str  # "kind: what is counted"
+    value: float
+    low: float  # minimum of the controls
+    high: float  # maximum of the controls
+    p: float  # that another control model is as far from the mean of the controls
+    exact: float | None  # p-value of the file alone under the statistic's own null, if it has one
+
+
+@dataclass(frozen=True)
+class StealthResult:
+    """The findings of an attacker with the source code, but no key, in the file alone."""
+
+    statistics: tuple[JudgedStatistic, ...]  # the least likely first
+    least: float  # minimum of the p-values, corrected for their number
+    least_of_controls: float  # the minimum for a control judged by the others
+    # Scores of a model of each secret against the file, judged by its scores against the controls; None
+    # without a model.
+    confirmations: tuple[tuple[JudgedStatistic, ...] | None, ...] = ()
+    invisible_groups: int = 0  # modes of the opacities too low to be rendered: countable secrets
+    changed_low_bits: float = 0.0  # share of the Gaussians that differ from the cover's model in low bits
+
+    @property
+    def least_confirmation(self) -> float:
+        """The minimum p-value of confirming a secret, corrected for their number; 1 if there is none."""
+        rows = [row for scores in self.confirmations for row in scores or ()]
+        return min([1.0, *(row.p * len(rows) for row in rows)])
+
+
+def stealth_statistics(model: Gaussians) -> dict[str, Statistic]:
+    """Statistics of one file by "kind: name", if there is enough data; kinds are KINDS.
+
+    Takes half a second for 10,000 Gaussians.
+    """
+    words = BitPatterns.of(model)
+    return {
+        f"{kind}: {name}": statistic
+        for kind, detect in KINDS.items()
+        for name, statistic in detect(model, words).items()
+        if not math.isnan(statistic.value)
+    }
+
+
+def judge(
+    file: Gaussians,
+    controls: Sequence[Gaussians],
+    *,
+    original: Gaussians | None = None,
+    candidates: Sequence[Gaussians | None] = (),
+) -> StealthResult:
+    """Compare a file with plain models of its scene from other seeds.
+
+    `original`: the cover's own plain model. `candidates`: a plain model of each secret, if there is one.
+    Raises UsageError for fewer than two controls.
+    """
+    if len(controls) < 2:
+        raise UsageError(f"expected at least two control models of the scene, got {len(controls)}")
+    own = stealth_statistics(file)
+    others = [stealth_statistics(model) for model in controls]
+    rows = _rows(own, others)
+    among_controls = [1.0]
+    if len(controls) > 2:
+        among_controls = [
+            _least(_rows(each, others[:index] + others[index + 1 :])) for index, each in enumerate(others)
+        ]
+    return StealthResult(
+        statistics=tuple(rows),
+        least=_least(rows),
+        least_of_controls=min(among_controls),
+        confirmations=tuple(
+            None if candidate is None else _confirmation(file, controls, candidate)
+            for candidate in candidates
+        ),
+        invisible_groups=len(invisible_modes(file)),
+        changed_low_bits=0.0 if original is None else changed_low_bits(file, original),
+    )
+
+
+def _confirmation(
+    file: Gaussians, controls: Sequence[Gaussians], candidate: Gaussians
+) -> tuple[JudgedStatistic, ...]:
+    own, *others = (
+        {f"candidate: {name}": Statistic(score) for name, score in candidate_scores(model, candidate).items()}
+        for model in (file, *controls)
+    )
+    return tuple(_rows(own, others))
+
+
+def _rows(own: Mapping[str, Statistic], controls: Sequence[Mapping[str, Statistic]]) -> list[JudgedStatistic]:
+    """The statistics that all models have, the least likely first."""
+    models = [own, *controls]
+    samples = {
+        name: [each[name] for each in controls]
+        for name in own
+        if all(name in each and math.isfinite(each[name].value) for each in models)
+    }
+    # How much more the statistics of bits vary between trainings than by sampling.
+    ratios = [
+        _between(others) / _sampling(others)
+        for name, others in samples.items()
+        if name.startswith("bits: ") and _sampling(others)
+    ]
+    excess = max(1.0, float(np.mean(ratios))) if ratios else None
+    rows = []
+    for name, others in samples.items():
+        values = [each.value for each in others]
+        p = _p(own[name], others, excess if name.startswith("bits: ") else None)
+        rows.append(JudgedStatistic(name, own[name].value, min(values), max(values), p, own[name].p))
+    return sorted(rows, key=lambda row: row.p)
+
+
+def _least(rows: Sequence[JudgedStatistic]) -> float:
+    """The minimum p with Bonferroni's correction, which is valid for dependent statistics."""
+    return min(1.0, rows[0].p * len(rows)) if rows else 1.0
+
+
+def _p(own: Statistic, controls: Sequence[Statistic], excess: float | None) -> float:
+    """Two-sided p by Student's t for one more value; known sampling errors add degrees of freedom.
+
+    The variances between controls and of sampling add up; degrees of freedom by Welch and Satterthwaite. Few
+    controls estimate the first one poorly: if similar statistics vary by `excess` times their sampling
+    variance, and this one by at most three times that, `excess` gives its variance.
+    """
+    from scipy.special import stdtr  # slow to import
+
+    count = len(controls)
+    mean = float(np.mean([each.value for each in controls]))
+    apart = abs(own.value - mean)
+    if apart == 0:
+        return 1.0
+    between, sampling = _between(controls), _sampling(controls)
+    sampling_own = (own.error or 0.0) ** 2
+    if excess is not None and between <= 3 * excess * sampling:
+        variance, degrees = excess * (sampling_own + sampling / count), _MANY
+    else:
+        # Few controls may agree by chance, and a constant statistic has no variance.
+        floor = (_AGREEMENT * max(abs(mean), 1e-3)) ** 2 if sampling + sampling_own == 0 else 0.0
+        unknown = between * (1 + 1 / count) + floor
+        variance = unknown + sampling_own + sampling / count
+        degrees = min(_MANY, (count - 1) * variance**2 / max(unknown, 1e-150) ** 2)
+    return float(2 * stdtr(degrees, -apart / math.sqrt(variance)))
+
+
+def _between(controls: Sequence[Statistic]) -> float:
+    return float(np.var([each.value for each in controls], ddof=1))
+
+
+def _sampling(controls: Sequence[Statistic]) -> float:
+    return float(np.mean([(each.error or 0.0) ** 2 for each in controls]))

@@ -1,0 +1,110 @@
+"""A small run that was really hidden and audited, and changes of its record."""
+
+from __future__ import annotations
+
+import copy
+import json
+import shutil
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+
+import keyss
+from keyss import Secret
+from keyss.core import KeyssWarning
+from keyss.lab import Change, converters, half_floats, random_pruning
+from keyss.lab.audits import Audit, audit
+from keyss.lab.robustness import survival
+from methods.keyss.small import small
+from test_api import CONFIG, write_nerfstudio
+from tiny_scenes import random_gaussians, tiny_scene
+
+KEYS = ("the key of a treasure", "the key of a map")
+# There are decoders then, and so there is something to be measured of wrong keys.
+JOINT = small("published", CONFIG.fit)
+
+
+def audited_run(root: Path) -> None:
+    """`run`: two secrets in a garden, 40 x 30 pixels, audited by all parts; one converter is missing."""
+    scenes = [
+        write_nerfstudio(root / name, tiny_scene(seed))
+        for seed, name in enumerate(("garden", "treasure", "map"))
+    ]
+    secrets = [
+        Secret(scene, key, random_gaussians(150, seed))
+        for seed, (scene, key) in enumerate(zip(scenes[1:], KEYS, strict=True), start=1)
+    ]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", KeyssWarning)  # of secrets that are large for their cover
+        keyss.hide(
+            scenes[0],
+            secrets,
+            method=JOINT.with_fit(max_gaussians=1300, iterations=20, seed=0),
+            width=40,
+            cover_model=random_gaussians(1000, seed=0),
+            min_psnr=0,  # 20 steps from points
+            out=root / "run",
+        )
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(survival, "default_changes", lambda *_, **__: _few_changes())
+        patch.setenv("KEYSS_SPLAT_TRANSFORM", str(root / "nowhere"))
+        audit(root / "run", KEYS, controls=2)
+
+
+def _few_changes() -> list[Change]:
+    sog = next(each for each in converters() if each.format == ".sog")
+    return [
+        random_pruning(0.1),
+        *(random_pruning(0.25, draw) for draw in range(3)),
+        half_floats(),
+        sog.change(),
+    ]
+
+
+def found_in(run: Path) -> dict[str, Any]:
+    """The JSON of a run's audit, to be changed."""
+    data: dict[str, Any] = json.loads((run / "private" / "audit" / "audit.json").read_bytes())
+    return data
+
+
+def run_with(run: Path, folder: Path, data: object) -> Path:
+    """A copy of a run's audit in a folder, with other JSON."""
+    if not (folder / "private" / "audit").exists():
+        shutil.copytree(run / "private" / "audit", folder / "private" / "audit")
+    (folder / "private" / "audit" / "audit.json").write_text(json.dumps(data))
+    return folder
+
+
+def changed(data: dict[str, Any], *changes: tuple[str, Any]) -> Audit:
+    """The record with other values, as of `put`."""
+    data = copy.deepcopy(data)
+    put(data, *changes)
+    return msgspec.convert(data, Audit)
+
+
+def put(data: dict[str, Any], *changes: tuple[str, Any]) -> None:
+    """Put other values at places such as "images.secrets.0.mean.psnr"."""
+    for place, value in changes:
+        *path, last = (int(step) if step.isdigit() else step for step in place.split("."))
+        at: Any = data
+        for step in path:
+            at = at[step]
+        at[last] = value
+
+
+def with_all_texts(value: Any, text: str, keep: Callable[[str], bool]) -> Any:
+    """JSON with every text replaced but those under names to be kept."""
+    match value:
+        case str():
+            return text
+        case list():
+            return [with_all_texts(item, text, keep) for item in value]
+        case dict():
+            return {
+                name: item if keep(name) else with_all_texts(item, text, keep) for name, item in value.items()
+            }
+    return value

@@ -1,0 +1,200 @@
+"""An audit from files: what it writes, resumes and refuses."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import fields
+from pathlib import Path
+from typing import Any, get_args
+
+import pytest
+import torch
+from keyss.cli.measuring import PartName
+
+import keyss
+from keyss import Secret
+from keyss.cli import main
+from keyss.core import InputError, Interrupted, OutputError, UsageError, WrongKeyError
+from keyss.lab import SpeedResult
+from keyss.lab.audits import Audit, PartResult, audit, parts, read_audit
+from test_api import ANY, write_nerfstudio
+from tiny_scenes import tiny_scene
+
+KEY = "open sesame 4711"
+
+
+@pytest.fixture(scope="module")
+def hidden(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("audit")
+    cover, secret = (write_nerfstudio(root / name, tiny_scene(seed)) for seed, name in enumerate("ab"))
+    method = ANY.with_fit(max_gaussians=600)
+    keyss.hide(cover, [Secret(secret, KEY)], method=method, out=root / "run")
+    return root / "run"
+
+
+@pytest.fixture
+def run(hidden: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(hidden, tmp_path / "run"))
+
+
+@pytest.fixture
+def calls(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Two parts that only note that they were called; the second can be told to fail."""
+    called: list[str] = []
+
+    def speed(subject: Any, seed: int, progress: Any) -> PartResult[SpeedResult]:
+        called.append("speed")
+        progress(1, 2)
+        result = SpeedResult({}, (), {"stego": len(subject.stego)})
+        return PartResult(result, {"a.png": torch.zeros(4, 5, 3, dtype=torch.uint8)})
+
+    def leaks(subject: Any, seed: int, progress: Any) -> PartResult[Any]:
+        called.append("leaks")
+        if called.count("leaks") == 1 and "fail" in called:
+            raise KeyboardInterrupt
+        return PartResult(((),) * len(subject.controls))
+
+    monkeypatch.setattr("keyss.lab.audits.run.PARTS", {"speed": speed, "leaks": leaks})
+    return called
+
+
+def gaussians_of(found: Audit) -> int:
+    """What the first of the parts noted."""
+    assert found.speed is not None
+    return found.speed.bytes["stego"]
+
+
+def test_it_writes_what_the_parts_found(run: Path, calls: list[str]) -> None:
+    found = audit(run, [KEY], controls=2)
+    assert calls == ["speed", "leaks"]
+    assert read_audit(run) == found
+    assert json.loads((run / "private" / "audit" / "audit.json").read_text())["version"] == 4
+    assert gaussians_of(found) == len(keyss.read_model(run / "publish" / "model.ply"))
+    assert found.leaks == ((), ())
+    assert (len(found.controls), len(set(found.controls))) == (2, 2)
+    assert (run / "private" / "audit" / "pictures" / "a.png").exists()
+    assert not (run / "private" / "checkpoint").exists()
+    assert KEY not in (run / "private" / "audit" / "audit.json").read_text()
+
+
+def test_plain_models_are_made_once_and_differ(run: Path, calls: list[str]) -> None:
+    audit(run, [KEY], controls=2)
+    models = sorted((run / "private" / "controls").glob("*.ply"))
+    times = [path.stat().st_mtime_ns for path in models]
+    assert len(models) == 2
+    assert models[0].read_bytes() != models[1].read_bytes()
+    audit(run, [KEY], controls=2, overwrite=True)
+    assert [path.stat().st_mtime_ns for path in models] == times
+
+
+def test_an_interrupted_audit_goes_on_after_what_it_has(
+    run: Path, calls: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    calls.append("fail")
+    with pytest.raises(Interrupted):
+        audit(run, [KEY], controls=2)
+    assert not (run / "private" / "audit" / "audit.json").exists()
+    assert main(["audit", str(run), "--report-only"]) == 0
+    assert "interrupted before leaks: --resume with the same arguments" in capsys.readouterr().err
+    assert 'id="speed"' in (run / "private" / "report.html").read_text()
+    with pytest.raises(OutputError, match="`resume=True` with the same arguments"):
+        audit(run, [KEY], controls=2)
+    with pytest.raises(OutputError, match="controls: 2 then, 3 now"):
+        audit(run, [KEY], controls=3, resume=True)
+    found = audit(run, [KEY], controls=2, resume=True)
+    assert calls == ["fail", "speed", "leaks", "leaks"]
+    assert gaussians_of(found) > 0
+    assert (run / "private" / "audit" / "pictures" / "a.png").exists()
+
+
+def test_an_interrupt_between_parts_says_how_to_resume(
+    run: Path, calls: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patched:
+        patched.setattr("keyss.lab.audits.page.report_bytes", interrupted)
+        with pytest.raises(Interrupted) as caught:
+            audit(run, [KEY], controls=2)
+    assert caught.value.checkpoint is not None
+    audit(run, [KEY], controls=2, resume=True)
+    assert calls == ["speed", "leaks"]
+
+
+def test_an_interrupt_before_the_first_part_is_told_so(
+    run: Path, calls: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("keyss.lab.audits.run.PARTS", {"speed": interrupted})
+    with pytest.raises(Interrupted):
+        audit(run, [KEY], controls=2)
+    assert main(["audit", str(run), "--report-only"]) == 4
+    said = capsys.readouterr().err
+    assert "the audit was interrupted before there was anything to report: --resume with the same" in said
+
+
+def interrupted(*_: object) -> None:
+    raise KeyboardInterrupt
+
+
+def test_results_are_not_replaced_by_accident(run: Path, calls: list[str]) -> None:
+    audit(run, [KEY], controls=2, only=["leaks"])
+    with pytest.raises(OutputError, match="`overwrite=True`"):
+        audit(run, [KEY], controls=2)
+    assert read_audit(run).speed is None
+
+
+def test_what_it_refuses(run: Path, tmp_path: Path, calls: list[str]) -> None:
+    with pytest.raises(WrongKeyError):
+        audit(run, ["another"])
+    with pytest.raises(UsageError, match="at least 2"):
+        audit(run, [KEY], controls=1)
+    with pytest.raises(UsageError, match="no such part"):
+        audit(run, [KEY], only=["looks"])
+    with pytest.raises(InputError):
+        audit(tmp_path, [KEY])
+    (run / "private" / "cover.ply").unlink()
+    with pytest.raises(UsageError, match="`original`"):
+        audit(run, [KEY], controls=2)
+
+
+def test_every_part_has_a_sentence_and_a_field_of_the_record() -> None:
+    assert all((part.__doc__ or "").strip() for part in parts.PARTS.values())
+    assert set(parts.PARTS) < {field.name for field in fields(Audit)}
+
+
+def test_the_command_runs_the_real_parts_and_writes_the_report(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All parts but robustness, whose changes have tests of their own and take longer."""
+    monkeypatch.setenv("COLUMNS", "200")  # no cell of the table wraps
+    (tmp_path / "key").write_text(KEY)
+    chosen = [name for name in parts.PARTS if name != "robustness"]
+    flags = [word for name in chosen for word in ("--only", name)]
+    arguments = ["audit", str(run), "--key-file", str(tmp_path / "key"), "--controls", "2", *flags]
+    assert main(arguments) == 0
+    assert "classifier between models" in capsys.readouterr().out
+    found = read_audit(run)
+    assert found.robustness is None
+    assert found.parameters is not None
+    assert set(found.parameters.distances) >= {"position", "scale", "rotation", "opacity", "joint"}
+    assert all(each.original is not None for each in found.parameters.distances.values())
+    metrics = json.loads((run / "private" / "metrics.json").read_text())
+    psnrs = metrics["cover"]["psnr"] + metrics["secrets"][0]["psnr"]
+    assert found.parameters.score == pytest.approx(psnrs * (1 - found.parameters.sinkhorn.sum))
+    sizes = [len(each) for each in vars(found.parameters.two_sample).values()]
+    assert sizes == [2, 1, 2]
+    assert found.leaks is not None
+    assert not any(row.with_key for row in found.leaks[0])  # records never lie in the cover's frame
+    assert found.images is not None
+    pictures = {file for files in found.images.pictures.values() for file in files.values()}
+    pictures |= {str(row.picture) for row in found.leaks[0]}
+    assert all((run / "private" / "audit" / name).is_file() for name in pictures)
+    page = (run / "private" / "report.html").read_text()
+    assert "data:image/png" in page
+    assert KEY not in page
+    (run / "private" / "report.html").unlink()
+    assert main(["audit", str(run), "--report-only"]) == 0
+    assert (run / "private" / "report.html").read_text() == page
+
+
+def test_the_command_names_its_parts_as_the_audit_does() -> None:
+    assert get_args(PartName) == tuple(parts.PARTS)

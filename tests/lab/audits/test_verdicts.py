@@ -1,0 +1,246 @@
+"""The verdict on each number, on both sides of each limit."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from keyss.lab.audits import Audit, Verdict, headline, verdicts
+from lab.audits.audited import changed, put
+
+Data = dict[str, Any]
+Change = tuple[str, Any]
+IMAGES, BASELINES = "images.models.{}.images.mean.psnr", "images.models.{}.baseline.mean.psnr"
+LEAK = "leaks.{}.{}.best_leak.{}"
+STEGEXPOSE, CONTROL = "stegexpose.stego.fused", "stegexpose.control.fused"
+
+
+def judged(audit: Audit) -> dict[str, Verdict]:
+    return {line.measure: line for line in verdicts(audit)}
+
+
+def _auc(auc: float, low: float, high: float) -> Data:
+    return {"auc": auc, "low": low, "high": high}
+
+
+def _score(p: float) -> Data:
+    return {"name": f"candidate: {p}", "value": 0, "low": 0, "high": 0, "p": p, "exact": None}
+
+
+ALL_FINE: list[Change] = [
+    (IMAGES.format(0), 27.5),
+    (BASELINES.format(0), 27.0),
+    (IMAGES.format(1), 30.0),
+    (BASELINES.format(1), 30.5),
+    (IMAGES.format(2), 27.5),
+    (BASELINES.format(2), 28.0),
+    (
+        "wrong_key.vs_secrets",
+        [{"mean": 7.1, "min": 7.0, "max": 7.2}, {"mean": 8, "min": 7, "max": 8.5}],
+    ),
+    ("chance_level", [7.0, 8.0]),
+    ("wrong_key.keys", 16),
+    ("parameters.two_sample.stego", [{"auc": 0.55, "low": 0.54, "high": 0.56}]),
+    ("parameters.two_sample.control", [{"auc": 0.52, "low": 0.51, "high": 0.53}]),
+    ("parameters.two_sample.original", []),
+    ("stealth.least", 0.2),
+    ("stealth.least_of_controls", 0.5),
+    ("stealth.confirmations", [[_score(0.1), _score(0.02)], None]),
+    (STEGEXPOSE, _auc(0.75, 0.3, 1.0)),
+    (CONTROL, _auc(0.5, 0.4, 0.6)),
+]
+
+
+@pytest.fixture
+def fine(data: Data) -> Data:
+    """A real audit with numbers that are all within their limits."""
+    no_leak = dict.fromkeys(data["leaks"][0][0]["leak"], -0.1)
+    for attacks in data["leaks"]:
+        for row in attacks:
+            row["leak"], row["best_leak"] = dict(no_leak), dict(no_leak)
+    data["leaks"][1][2]["best_leak"] |= {"psnr_fitted": 0.4, "ssim_fitted": 0.01}
+    data["leaks"][1][2] |= {"attack": "matched opacities", "best": "below 0.05"}
+    for each in data["parameters"]["distances"].values():
+        each |= {"ratio": 1.1, "original": None}
+    for row in data["robustness"]:
+        pruned = (row["attack"], row["strength"]) == ("random pruning", 0.25)
+        for each in [row["cover"], *row["secrets"]] if row["cover"] else ():
+            each["loss"] = 2.5 if pruned else each["loss"]
+    put(data, *ALL_FINE)
+    return data
+
+
+def test_the_whole_audit(fine: Data) -> None:
+    lines = judged(changed(fine, (IMAGES.format(2), 25.5)))
+    assert {name: line.word for name, line in lines.items()} == {
+        "cover on test photos": "fine",
+        "secret 1 on test photos": "fine",
+        "secret 2 on test photos": "missed",
+        "wrong keys": "fine",
+        "leaks without the key": "fine",
+        "the file by itself": "fine",
+        "guessing the secret": "fine",
+        "attributes of the Gaussians": "fine",
+        "classifier between models": "fine",
+        "StegExpose on renders": "fine",
+        "loss of a random 25% of the Gaussians": "fine",
+    }
+    assert lines["wrong keys"].value == "8.50 dB, best of 16"
+    assert lines["leaks without the key"].value == (
+        "+0.40 dB, +0.010 SSIM, −0.10 gradients (secret 2, matched opacities: below 0.05)"
+    )
+    assert lines["loss of a random 25% of the Gaussians"].value == "secret −2.50 dB"
+    assert lines["loss of a random 25% of the Gaussians"].beside == "cover −2.50 dB"
+
+
+@pytest.mark.parametrize(
+    ("measure", "place", "within", "beyond", "word"),
+    [
+        ("cover on test photos", IMAGES.format(0), 26.0, 25.9, "visible"),
+        ("secret 1 on test photos", IMAGES.format(1), 29.5, 29.4, "missed"),
+        ("wrong keys", "wrong_key.vs_secrets.0.max", 8.0, 8.1, "visible"),
+        ("leaks without the key", LEAK.format(0, 1, "psnr_fitted"), 1.0, 1.01, "visible"),
+        ("leaks without the key", LEAK.format(0, 1, "ssim_fitted"), 0.05, 0.051, "visible"),
+        ("leaks without the key", LEAK.format(0, 1, "gradient_coarse"), 0.1, 0.11, "visible"),
+        ("the file by itself", "stealth.least", 0.01, 0.009, "visible"),
+        ("the file by itself", "stealth.least", 0.2, 0.0, "visible"),
+        ("guessing the secret", "stealth.confirmations.0.1.p", 0.005, 0.0049, "visible"),
+        ("attributes of the Gaussians", "parameters.distances.opacity.ratio", 1.5, 1.51, "visible"),
+        ("classifier between models", "parameters.two_sample.stego.0.auc", 0.6, 0.61, "visible"),
+        ("StegExpose on renders", f"{STEGEXPOSE}.low", 0.5, 0.51, "visible"),
+        ("StegExpose on renders", f"{STEGEXPOSE}.high", 0.75, 0.45, "visible"),
+    ],
+)
+def test_each_threshold(fine: Data, measure: str, place: str, within: Any, beyond: Any, word: str) -> None:
+    assert judged(changed(fine, (place, within)))[measure].word == "fine"
+    assert judged(changed(fine, (place, beyond)))[measure].word == word
+
+
+def _pruned(fine: Data, place: str, value: Any) -> Verdict:
+    """The line about random pruning with another value."""
+    index = next(i for i, row in enumerate(fine["robustness"]) if row["strength"] == 0.25)
+    found = changed(fine, (f"robustness.{index}.{place}", value))
+    return judged(found)["loss of a random 25% of the Gaussians"]
+
+
+def test_pruning_may_cost_a_secret_little_more_than_the_cover(fine: Data) -> None:
+    assert _pruned(fine, "secrets.1.loss", 2.5 + 1.49).word == "fine"
+    beyond = _pruned(fine, "secrets.1.loss", 2.5 + 1.51)
+    assert (beyond.word, beyond.value) == ("missed", "secret −4.01 dB")
+    lost = _pruned(fine, "secrets.0.opens", False)
+    assert (lost.word, lost.value) == ("missed", "the secret does not open")
+
+
+def test_a_detector_near_a_half_is_fine_however_narrow_its_interval(fine: Data) -> None:
+    near, far = _auc(0.58, 0.57, 0.59), _auc(0.62, 0.61, 0.63)
+    assert judged(changed(fine, (STEGEXPOSE, near)))["StegExpose on renders"].word == "fine"
+    assert judged(changed(fine, (STEGEXPOSE, far)))["StegExpose on renders"].word == "visible"
+
+
+def test_with_the_key_the_secret_is_expected_to_show(fine: Data) -> None:
+    row = fine["leaks"][0][1]
+    row["best_leak"] |= {"psnr_fitted": 20.0, "ssim_fitted": 0.7}
+    assert judged(changed(fine))["leaks without the key"].word == "visible"
+    row["with_key"] = True
+    assert judged(changed(fine))["leaks without the key"].word == "fine"
+
+
+def test_a_detector_is_judged_beside_what_it_finds_between_controls(fine: Data) -> None:
+    found = (STEGEXPOSE, _auc(0.73, 0.68, 0.78))
+    assert judged(changed(fine, found))["StegExpose on renders"].word == "visible"
+    line = judged(changed(fine, found, (CONTROL, _auc(0.70, 0.65, 0.75))))["StegExpose on renders"]
+    assert (line.word, line.beside) == ("fine", "0.70 (0.65 to 0.75), between plain models")
+
+
+def test_a_file_is_as_unusual_as_plain_models_are(fine: Data) -> None:
+    found = changed(fine, ("stealth.least", 0.002), ("stealth.least_of_controls", 0.001))
+    line = judged(found)["the file by itself"]
+    assert (line.word, line.beside) == ("fine", "0.00100, between plain models")
+    assert line.value.startswith("p = 0.00200 (")
+    guessed = judged(changed(fine))["guessing the secret"]
+    assert guessed.value == "p = 0.0400 (candidate: 0.02)"
+
+
+def test_what_was_not_measured_is_not_judged(fine: Data) -> None:
+    parts = ("images", "wrong_key", "leaks", "parameters", "stealth", "stegexpose", "robustness", "speed")
+    assert judged(changed(fine, *((part, None) for part in parts))) == {}
+    for each in fine["parameters"]["distances"].values():
+        each["ratio"] = None
+    left_out = [
+        ("robustness", [row for row in fine["robustness"] if row["strength"] != 0.25]),
+        ("images.models.0.baseline", None),
+        ("stealth.statistics", []),
+        ("chance_level", []),
+        ("leaks", [[], []]),
+    ]
+    assert set(judged(changed(fine, *left_out))) == {
+        "secret 1 on test photos",
+        "secret 2 on test photos",
+        "classifier between models",
+        "StegExpose on renders",
+    }
+
+
+def test_the_headline(fine: Data) -> None:
+    assert headline([]) == "Nothing was measured that could be judged."
+    lines = verdicts(changed(fine))
+    assert headline(lines) == "All 11 measures are within their limits."
+    changes = ((f"{STEGEXPOSE}.high", 0.45), (IMAGES.format(2), 25.5))
+    assert headline(verdicts(changed(fine, *changes))) == (
+        "9 of 11 measures are within their limits. Visible: StegExpose on renders. "
+        "Missed: secret 2 on test photos."
+    )
+
+
+def test_fine_gradients_alone_are_not_judged_and_coarse_shapes_are(fine: Data) -> None:
+    measure = "leaks without the key"
+    assert judged(changed(fine, (LEAK.format(0, 0, "gradient"), 0.4)))[measure].word == "fine"
+    line = judged(changed(fine, (LEAK.format(0, 0, "ssim_fitted"), 0.06)))[measure]
+    assert line.word == "visible"
+    assert "secret 1, restored opacities: " in line.value
+    assert "+0.060 SSIM" in line.value
+
+
+def test_the_attack_that_is_named_is_the_one_that_is_judged(fine: Data) -> None:
+    """Not the largest of each number, from attacks that no picture shows together."""
+    apart = [(LEAK.format(0, 0, "psnr_fitted"), 0.5), (LEAK.format(0, 3, "ssim_fitted"), 0.045)]
+    line = judged(changed(fine, *apart))["leaks without the key"]
+    assert line.value.startswith("−0.10 dB, +0.045 SSIM, ")
+    assert "inverted opacities" in line.value
+
+
+def test_renders_of_given_models_are_not_called_photos(fine: Data) -> None:
+    models = [("images.models.0.photos", False), (BASELINES.format(0), 120.0)]
+    line = judged(changed(fine, *models, (IMAGES.format(0), 46.0)))["cover on renders of its model"]
+    assert (line.word, line.beside, line.limit) == ("fine", "the given model itself", "at least 45 dB")
+
+
+def test_an_attribute_may_lie_as_far_off_as_that_of_the_covers_plain_model(fine: Data) -> None:
+    ratio, original = (f"parameters.distances.scale.{name}" for name in ("ratio", "original"))
+    measure, opacity = "attributes of the Gaussians", "parameters.distances.opacity.ratio"
+    assert judged(changed(fine, (ratio, 1.9)))[measure].word == "visible"
+    assert judged(changed(fine, (ratio, 1.9), (original, 1.9)))[measure].word == "fine"
+    line = judged(changed(fine, (ratio, 1.9), (original, 1.9), (opacity, 1.6)))[measure]
+    assert (line.word, line.value) == ("visible", "opacity 1.60×")
+
+
+def test_a_classifier_may_tell_as_much_as_of_the_covers_plain_model(fine: Data) -> None:
+    def word(original: float) -> str:
+        auc = {"low": 0.0, "high": 1.0}
+        stego = ("parameters.two_sample.stego", [auc | {"auc": 0.9}])
+        own = ("parameters.two_sample.original", [auc | {"auc": original}])
+        return judged(changed(fine, stego, own))["classifier between models"].word
+
+    assert [word(original) for original in (0.5, 0.88, 0.9)] == ["visible", "visible", "fine"]
+
+
+def test_what_nobody_sees_is_fine_however_perfect_the_baseline(fine: Data) -> None:
+    perfect = (BASELINES.format(0), 120.0)
+    for psnr, word in ((45.1, "fine"), (44.9, "visible")):
+        found = changed(fine, perfect, (IMAGES.format(0), psnr))
+        assert judged(found)["cover on test photos"].word == word
+
+
+def test_wrong_keys_that_were_tried_on_no_secret_have_no_verdict(fine: Data) -> None:
+    assert "wrong keys" not in judged(changed(fine, ("wrong_key.vs_secrets", [])))

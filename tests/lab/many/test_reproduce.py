@@ -1,0 +1,160 @@
+"""A table from photos to claims, at a size where it takes seconds."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from cli.said import Run, listing
+from keyss import Gaussians, read_model, reproduce
+from keyss.core import InputError
+from keyss.lab import opacity_pruning, random_pruning
+from keyss.lab.audits import comparison_measures
+from keyss.lab.many import Forecast, Reproduction, cell, reproduction
+from tiny_scenes import random_gaussians
+
+SIZES = {"iterations": 20, "max_gaussians": 150}
+FLAGS = ("--iterations", 20, "--max-gaussians", 150, "--pairs", "a,b", "--seed", 5)
+
+
+@pytest.fixture(scope="module")
+def out(folders: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the table "pruning", which others use the run of."""
+    folder = tmp_path_factory.mktemp("tables") / "paper"
+    with pytest.MonkeyPatch.context() as patch:  # opening what was pruned takes long
+        patch.setattr(comparison_measures, "PRUNED_SHARES", (0.25,))
+        with pytest.warns(UserWarning, match="secrets lie in appended Gaussians"):
+            run("pruning", folders, folder)
+    return folder
+
+
+def run(table: str, folders: tuple[Path, Path], out: Path, **options: Any) -> Reproduction:
+    found = reproduce(table, folders, pairs=["a,b"], seeds=[5], out=out, **SIZES, **options)
+    assert isinstance(found, Reproduction)
+    return found
+
+
+def run_of(cell: str, out: Path) -> Path:
+    """The folder of the results of a cell by its name."""
+    (path,) = (path for path in out.glob("cells/*/cell.json") if json.loads(path.read_text())["name"] == cell)
+    return path.parent / "run"
+
+
+def test_a_table_lies_beside_the_papers(out: Path) -> None:
+    found = json.loads((out / "pruning.json").read_text())
+    assert found["pairs"] == ["a-b"]
+    row, ours = found["rows"]
+    here = row["here"]
+    assert ours["here"].keys() == here.keys()
+    assert ours["published"] == {}
+    metrics = json.loads((run_of("KeySS, a-b", out) / "private" / "metrics.json").read_text())
+    assert here["whole, cover"] == pytest.approx(metrics["cover"]["psnr"], abs=0.05)
+    assert here["whole, secret"] == pytest.approx(metrics["secrets"][0]["psnr"], abs=0.05)
+    assert {name for name, value in here.items() if value is not None} == {
+        f"{what}, {role}"
+        for what in ("whole", "25% by opacity", "25% random")
+        for role in ("cover", "secret")
+    }
+    assert metrics["iterations"] == 20
+    assert metrics["steps"] == [20, 20]  # as many as plain 3DGS
+    assert metrics["baseline"]["equal"] == [True, True]
+    assert {each["verdict"] for each in found["claims"]} <= {"holds", "holds in part", "does not hold here"}
+    assert "| whole, cover | 25.98 / " in (out / "pruning.md").read_text()
+
+
+def test_what_is_done_is_not_done_again(
+    out: Path, folders: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = listing(out / "cells")
+
+    def refused(*arguments: object, **more: object) -> None:
+        raise AssertionError("nothing is to be run")
+
+    monkeypatch.setattr(cell, "hide", refused)
+    monkeypatch.setattr(cell, "fit", refused)
+    assert not run("pruning", folders, out).failures
+    assert listing(out / "cells") == before
+    found = reproduce("pruning", folders, pairs=["a,b"], seeds=[5], out=out, **SIZES, dry_run=True)  # type: ignore[arg-type]
+    assert isinstance(found, Forecast)
+    assert not found.plans
+    monkeypatch.undo()
+    with pytest.warns(UserWarning, match="secrets lie in appended Gaussians"):
+        other = reproduce("pruning", folders, pairs=["a,b"], seeds=[6], out=out, **SIZES, dry_run=True)  # type: ignore[arg-type]
+    assert isinstance(other, Forecast)
+    assert len(other.plans) == len(other.names)
+
+
+def test_a_run_that_fails_is_said_and_the_others_go_on(
+    out: Path, folders: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch, keyss: Run
+) -> None:
+    def failing(*arguments: object, **more: object) -> None:
+        raise InputError("not today")
+
+    monkeypatch.setattr(cell, "hide", failing)
+    found = run("speed", folders, out)
+    assert found.failures == {f"{name}, a-b": "not today" for name in ("3DGS", "GS-Hider", "WaterGS")}
+    verdicts = [each.verdict for each in found.claims]
+    assert verdicts[0] in ("holds", "holds in part", "does not hold here")  # from the first run
+    assert verdicts[1] == "not measured"
+    said = keyss("reproduce", "speed", *folders, *FLAGS, "-o", out)
+    assert (said.status, said.err.splitlines()[-1]) == (4, "keyss: error: 3 run(s) failed")
+    assert "not today" in said.out
+
+
+def test_the_command(keyss: Run, out: Path, folders: tuple[Path, Path], tmp_path: Path) -> None:
+    said = keyss("reproduce", "pruning", *folders, *FLAGS, "-o", out)
+    assert said.status == 0, said.err
+    assert "25% random, secret" in said.out
+    assert "Random loss of a quarter" in said.out
+    planned = keyss("reproduce", "sinkhorn", *folders, *FLAGS, "--dry-run", "-o", tmp_path / "new")
+    assert planned.status == 0, planned.err
+    assert not (tmp_path / "new").exists()
+    assert [line.split("  ")[0] for line in planned.out.splitlines()[1:6]] == [
+        *(f"plain model of {scene}, 20 steps, seed 5" for scene in "ab"),
+        *(f"{mask}, a-b" for mask in ("op", "op,ro", "op,ro,sc,xyz")),
+    ]
+    assert "5 to do" in planned.out
+    assert keyss("reproduce", "single", folders[0], "-o", tmp_path / "new").status == 2
+    said = keyss("reproduce", "single", *folders, "--width", 0, "-o", tmp_path / "new")
+    assert (said.status, "--width" in said.err) == (2, True), said
+    full = keyss("reproduce", "multi", "--data", tmp_path, "-o", tmp_path / "new")
+    assert (full.status, "Mip-NeRF 360" in full.err) == (4, True)
+
+
+def test_the_papers_scenes_have_its_sizes_and_pairs(
+    folders: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(reproduction, "link_scene", lambda data, name, folder: folders[name < "c"])
+    found = reproduce(
+        "multi", data=tmp_path, pairs=["bicycle,bonsai,room"], out=tmp_path / "out", dry_run=True
+    )
+    assert isinstance(found, Forecast)
+    assert {each.partition(", ")[2] for each in found.names.values()} >= {"bicycle-bonsai-room"}
+    assert {each.stages[0].steps for each in found.plans.values()} == {30_000}
+    assert max(each.gaussians for each in found.plans.values()) == 500_000
+
+
+def test_what_is_appended_is_neither_counted_nor_pruned(out: Path) -> None:
+    stego = read_model(run_of("KeySS, a-b", out) / "publish" / "model.ply")
+    own = comparison_measures.own_gaussians(stego)
+    assert 0 < len(own) <= 150 < len(stego)
+    for change in (random_pruning(0.25), opacity_pruning(0.25)):
+        left = comparison_measures.sparing(change)(stego)
+        assert len(comparison_measures.own_gaussians(left)) == len(change(own))
+        assert len(left) - len(comparison_measures.own_gaussians(left)) == len(stego) - len(own)
+        assert torch.equal(comparison_measures.own_gaussians(left).means, change(own).means)
+    plain: Gaussians = random_gaussians(100)
+    assert torch.equal(comparison_measures.own_gaussians(plain).means, plain.means)
+
+
+def test_the_command_says_what_cannot_be_downloaded(keyss: Run, tmp_path: Path) -> None:
+    full = ("reproduce", "single", "--data", tmp_path / "data", "-o", tmp_path / "out")
+    both = keyss(*full, "--download", "--dry-run")
+    assert (both.status, "--download" in both.err) == (2, True)
+    without = keyss("reproduce", "single", "a", "b", "--download", "-o", tmp_path / "out")
+    assert (without.status, "--data" in without.err) == (2, True)
+    assert not (tmp_path / "data").exists()

@@ -1,0 +1,50 @@
+"""Which scenes hide which."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from keyss import reproduce
+from keyss.core import UsageError
+from keyss.files.benchmark_scenes import BENCHMARK
+from keyss.lab.many import paper, reproduction
+
+
+def test_every_scene_hides_the_next() -> None:
+    groups_of = reproduction.groups_of
+    assert groups_of(["a", "b"], 1, (), None) == [("a", "b"), ("b", "a")]
+    assert groups_of(["a", "b", "c"], 2, (), None) == [("a", "b", "c"), ("b", "c", "a"), ("c", "a", "b")]
+
+
+def test_the_papers_scenes_are_those_of_its_tables() -> None:
+    pairs, triples = paper.PAPER.pairs, paper.PAPER.triples
+    assert tuple(BENCHMARK) == (*(cover for cover, _ in pairs), "playroom")
+    assert {name for pair in pairs for name in pair} == set(BENCHMARK)
+    assert {name for triple in triples for name in triple} <= set(BENCHMARK)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"table": "singel", "scenes": ["a", "b"]}, "did you mean single"),
+        ({"table": "single"}, "at least 2 scenes"),
+        ({"table": "single", "scenes": ["a"]}, "at least 2 scenes"),
+        ({"table": "multi", "scenes": ["a", "b"]}, "at least 3 scenes"),
+        ({"table": "single", "scenes": ["a", "x/a"]}, "different names"),
+        ({"table": "single", "scenes": ["a", "b"], "data": "d"}, "leave out the others"),
+        ({"table": "single", "scenes": ["a", "b"], "pairs": ["a,c"]}, "no scene is called 'c'"),
+        ({"table": "single", "scenes": ["a", "b"], "pairs": ["a"]}, "a cover and 1 secret"),
+        ({"table": "multi", "scenes": ["a", "b", "c"], "pairs": ["a,b,b"]}, "different names"),
+        ({"table": "single", "scenes": ["a", "b"], "iterations": 0}, "`iterations`"),
+        ({"table": "single", "scenes": ["a.ply", "b"]}, "models have none"),
+    ],
+)
+def test_what_cannot_be_is_refused_before_anything_is_written(
+    tmp_path: Path, arguments: dict[str, object], words: str
+) -> None:
+    for dry_run in (True, False):
+        with pytest.raises(UsageError, match=words):
+            reproduce(**arguments, dry_run=dry_run, out=tmp_path / "out")  # type: ignore[arg-type]
+    assert not (tmp_path / "out").exists()

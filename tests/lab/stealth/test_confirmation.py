@@ -1,0 +1,75 @@
+"""Scores of candidates tell the hidden one where a file shows it, and none where it does not."""
+
+from __future__ import annotations
+
+import os
+
+import numpy as np
+import pytest
+
+from channels.quiet.trained_like import keys
+from keyss.lab import candidate_scores, changed_low_bits
+from lab.stealth.careless import banded, overwritten, plain, shuffled
+from methods.carry.carried import embed_derived
+from stealth_detection import confirmed
+
+SECRETS = 4
+
+
+@pytest.fixture(scope="module")
+def shown() -> np.ndarray:
+    """Scores [files, candidates] where secrets lie in a band, shuffled."""
+    candidates = [plain(10 + index, 800) for index in range(SECRETS)]
+    files = [shuffled(banded(plain(index), secret)) for index, secret in enumerate(candidates)]
+    return np.array([[candidate_scores(file, each) for each in candidates] for file in files])
+
+
+def _confirmed(scores: np.ndarray, name: str) -> float:
+    return confirmed(np.vectorize(lambda each: each[name])(scores), range(SECRETS))
+
+
+def test_rows_of_the_secret_are_found_in_any_order_and_frame(shown: np.ndarray) -> None:
+    assert _confirmed(shown, "rows that fit") == 1
+    assert _confirmed(shown, "nearness of rows, first quarter") == 1
+
+
+def test_the_order_of_rows_confirms() -> None:
+    candidates = [plain(10 + index, 800) for index in range(SECRETS)]
+    files = [banded(plain(index), secret) for index, secret in enumerate(candidates)]
+    scores = np.array([[candidate_scores(file, each) for each in candidates] for file in files])
+    assert _confirmed(scores, "order of rows that fit") == 1
+    assert scores[0, 0]["order of rows that fit"] > 0.5
+    assert _confirmed(scores, "rows at the same place") == 1
+
+
+def test_identical_high_bits_confirm() -> None:
+    file = overwritten(plain(1))
+    assert candidate_scores(file, plain(1))["identical high bits"] == 1
+    assert candidate_scores(file, plain(2))["identical high bits"] == 0
+    assert changed_low_bits(file, plain(1)) == 1
+    assert changed_low_bits(file, plain(2)) == changed_low_bits(file, file) == 0
+
+
+def test_carried_secrets_are_not_confirmed() -> None:
+    """Nearly chance for each score: half of 24 cases are right."""
+    candidates = [plain(10 + index, 700) for index in range(SECRETS)]
+    covers = [plain(index) for index in range(SECRETS)]
+    before = [
+        candidate_scores(cover, each)["nearness of rows, median"] for cover in covers for each in candidates
+    ]
+    files = [
+        embed_derived(cover, [(keys(index), secret)], os.urandom(32))
+        for index, (cover, secret) in enumerate(zip(covers, candidates, strict=True))
+    ]
+    after = [
+        candidate_scores(file, each)["nearness of rows, median"] for file in files for each in candidates
+    ]
+    assert after == pytest.approx(before, abs=1e-2)
+
+
+def test_what_is_ranked_is_relative_to_other_files() -> None:
+    scores = np.array(
+        [[5.0, 9.0, 1.0], [3.0, 11.0, 1.0], [3.0, 9.0, 2.0]]
+    )  # the second resembles all files most
+    assert confirmed(scores, [0, 1, 2]) == 1
+    assert confirmed(np.zeros((3, 3)), [0, 1, 2]) == 0.5

@@ -1,0 +1,176 @@
+"""Every detector finds the tell that it is made for, and nothing in plain models."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+
+import pytest
+import torch
+
+from keyss.core import Gaussians
+from keyss.lab import judge, stealth_statistics
+from lab.stealth.careless import (
+    banded,
+    grey,
+    in_steps,
+    normalised,
+    overwritten,
+    plain,
+    plain_rounded,
+    shuffled,
+    with_siblings,
+)
+
+
+def z(name: str, model: Gaussians, other: Gaussians) -> float:
+    """Standard errors between a statistic of two models."""
+    one, two = stealth_statistics(model)[name], stealth_statistics(other)[name]
+    assert one.error is not None
+    assert two.error is not None
+    return abs(one.value - two.value) / (one.error**2 + two.error**2) ** 0.5
+
+
+def p(name: str, model: Gaussians) -> float:
+    found = stealth_statistics(model)[name].p
+    assert found is not None
+    return found
+
+
+@pytest.mark.parametrize(
+    ("name", "natural"),
+    [
+        ("bits: ones in bits 1-3, tiny harmonics", plain_rounded),
+        ("bits: zeros above a zero, tiny harmonics", plain_rounded),
+        ("bits: 4 zeros at the end, tiny harmonics", plain_rounded),
+        ("agreement: close low bits, channels", lambda seed: grey(plain(seed))),
+        ("agreement: near misses, channels", lambda seed: grey(plain(seed))),
+        ("agreement: equal low bits, neighbours", lambda seed: with_siblings(plain(seed))),
+        ("agreement: near misses, sharers", lambda seed: with_siblings(plain(seed))),
+        ("invariants: quaternions of unit length", lambda seed: normalised(plain(seed))),
+        ("invariants: quaternions of nearly unit length", lambda seed: normalised(plain(seed))),
+        ("invariants: repeated values, sh3", lambda seed: with_siblings(plain(seed))),
+    ],
+)
+def test_new_low_bits_where_they_were_not_random(name: str, natural: Callable[[int], Gaussians]) -> None:
+    model = natural(1)
+    sealed = overwritten(model, bits=8)
+    if "sharers" in name:
+        # Siblings share constant colours, which stay as they are; the rest is near now, not equal.
+        assert stealth_statistics(sealed)[name].value > 0.1
+    assert z(name, model, sealed) > 5
+    assert z(name, model, natural(2)) < 4.5
+
+
+def test_new_middle_bits_where_channels_were_alike() -> None:
+    name, noise = "agreement: within a quarter of an octave, channels", torch.Generator().manual_seed(0)
+    model = plain(1)
+    sh = model.sh[:, :, :1] * torch.exp(0.1 * torch.randn(model.sh.shape, generator=noise))
+    model = dataclasses.replace(model, sh=sh)
+    assert p(name, model) < 1e-20
+    assert p(name, overwritten(model, bits=20)) > 1e-4
+
+
+def test_low_bits_that_were_random_stay_so() -> None:
+    """The control of the test above: the same change, where there was nothing to destroy."""
+    model = plain(1)
+    before, after = stealth_statistics(model), stealth_statistics(overwritten(model))
+    for name in before:
+        one, two = before[name], after[name]
+        if one.error:
+            assert abs(one.value - two.value) < 5 * (one.error**2 + (two.error or 0) ** 2) ** 0.5, name
+
+
+def test_exact_nulls_hold_in_models_with_random_bits() -> None:
+    """Of many p-values over some models about as many are small as should be."""
+    values = [
+        each.p
+        for seed in range(4)
+        for name, each in stealth_statistics(plain(seed)).items()
+        if each.p is not None and name.startswith("bits") and "position" not in name
+    ]
+    assert len(values) > 200
+    assert sum(value < 0.05 for value in values) / len(values) < 0.09
+    assert min(values) > 0.01 / len(values)
+
+
+def test_values_in_steps_are_found() -> None:
+    name = "invariants: clusters of values, opacity"
+    assert p(name, in_steps(plain(1))) < 1e-9
+    assert p(name, plain(1)) > 1e-4
+
+
+def test_unit_quaternions_in_a_part_of_the_file() -> None:
+    mixed = Gaussians.cat([normalised(plain(1, 1500)), plain(2, 1500)])
+    statistics = stealth_statistics(mixed)
+    assert statistics["invariants: unit quaternions in parts of rows, range of shares"].value > 0.9
+    assert (
+        stealth_statistics(plain(1))["invariants: unit quaternions in parts of rows, range of shares"].value
+        < 0.1
+    )
+
+
+def test_secrets_in_bands_are_seen_and_counted() -> None:
+    one, two = banded(plain(1), plain(2)), banded(plain(1), plain(2), plain(3))
+    assert stealth_statistics(plain(1))["opacities: share of opacities, invisible"].value == 0
+    assert stealth_statistics(one)["opacities: share of opacities, invisible"].value > 0.4
+    controls = [plain(3, 400), plain(4, 400)]
+    assert [judge(model, controls).invisible_groups for model in (plain(1), one, two)] == [0, 1, 2]
+
+
+def test_an_order_that_is_not_the_trainers_is_seen() -> None:
+    name = "order: row and size, correlation"
+    assert p(name, plain(1)) < 1e-20
+    assert p(name, shuffled(plain(1))) > 1e-4
+    appended = "order: halves of rows, opacity"
+    assert p(appended, banded(plain(1), plain(2))) < 1e-20
+    assert p(appended, plain(1)) > 1e-4
+
+
+def test_duplicates_are_counted() -> None:
+    model = plain(1)
+    name = "order: near duplicates"
+    assert stealth_statistics(model)[name].value < 0.01
+    assert stealth_statistics(Gaussians.cat([model, overwritten(model)]))[name].value > 0.4
+
+
+@pytest.mark.parametrize("count", [1, 2, 40, 150])
+def test_small_models_have_fewer_statistics(count: int) -> None:
+    some, every = stealth_statistics(plain(1)[:count]), stealth_statistics(plain(1))
+    assert set(some) < set(every)
+
+
+def test_models_without_harmonics() -> None:
+    assert stealth_statistics(plain(1).with_sh_degree(0))
+
+
+def test_noise_in_green_and_blue_is_seen_beside_red() -> None:
+    """Neighbours that were alike are no more, in the channels with noise alone."""
+    generator = torch.Generator().manual_seed(0)
+    count = 4000
+    means = torch.rand(count, 3, generator=generator)
+    base = torch.stack([(9 * means[:, axis]).sin() for axis in range(3)], dim=1)
+    sh = (base + 0.01 * torch.randn(count, 3, generator=generator))[:, None]
+    clean = Gaussians(
+        means, torch.randn(count, 4), torch.full((count, 3), -4.0), torch.zeros(count), sh.contiguous()
+    )
+    noisy = sh.clone()
+    noisy[:, 0, 1:] += 0.2 * torch.rand(count, 2, generator=generator)
+    # The last has noise in red as well: no yardstick.
+    before, after, swapped = (
+        stealth_statistics(dataclasses.replace(clean, sh=each))["colours: green of neighbours, 0.05"].value
+        for each in (sh, noisy, noisy.roll(-1, 2))
+    )
+    assert abs(before) < 0.4 < after - before
+    assert swapped < after
+
+
+def test_frozen_values_of_clones_are_found_by_channel() -> None:
+    """Harmonics of one channel, and saturated opacities, that differ after careless embedding alone."""
+    model = plain(1)
+    model.opacity_logits[:200] = 17.3
+    model.means[:200] = model.means[:1] + 0.001 * model.means[:200]
+    frozen, overwritten_too = (stealth_statistics(each) for each in (model, overwritten(model, bits=8)))
+    name = "coincidences: saturated, opacity"
+    assert frozen[name].value == 2**8
+    assert overwritten_too[name].value < 10

@@ -1,0 +1,126 @@
+"""AUCs against pairs counted one by one; intervals by hand and by how often they hold the truth."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from hypothesis import given, settings, strategies as st
+from scipy.special import expit, logit
+from scipy.stats import norm
+
+from keyss.core import UsageError
+from keyss.lab import auc_between, stegexpose_auc
+from keyss.runs import record_bytes
+from lab.test_stegexpose import smooth, with_payload
+
+SCORES = st.lists(st.sampled_from([None, math.nan, -0.5, 0.0, 0.1, 0.2, 0.7, 1e300]), min_size=1, max_size=9)
+
+
+@given(SCORES, SCORES)
+@settings(deadline=None)
+def test_the_auc_counts_pairs_in_order(negatives: list[float | None], positives: list[float | None]) -> None:
+    def number(score: float | None) -> float:
+        return -math.inf if score is None or math.isnan(score) else score
+
+    pairs = [(number(n), number(p)) for n in negatives for p in positives]
+    counted = sum((n < p) + 0.5 * (n == p) for n, p in pairs) / len(pairs)
+    found = auc_between(negatives, positives)
+    assert found.auc == pytest.approx(counted, abs=1e-12)
+    assert 0 <= found.low <= found.auc + 1e-12
+    assert found.auc - 1e-12 <= found.high <= 1
+
+
+def test_three_against_three_by_hand() -> None:
+    found = auc_between([1, 2, 3], [2, 3, 4])
+    components = [1 / 2, 5 / 6, 1]  # of 2, 3, 4 against the others; those of 3, 2, 1 are the same
+    variance = 2 * np.var(components, ddof=1) / 3
+    spread = 1.959964 * math.sqrt(variance) / (7 / 9 * 2 / 9)
+    assert found.auc == pytest.approx(7 / 9)
+    assert found.low == pytest.approx(expit(logit(7 / 9) - spread), abs=1e-6)
+    assert found.high == pytest.approx(expit(logit(7 / 9) + spread), abs=1e-6)
+
+
+def test_the_interval_holds_the_truth_19_times_in_20() -> None:
+    random = np.random.default_rng(0)
+    truth = norm.cdf(1 / math.sqrt(2))
+    held = []
+    for _ in range(300):
+        found = auc_between(random.normal(0, 1, 25).tolist(), random.normal(1, 1, 15).tolist())
+        held.append(found.low <= truth <= found.high)
+    assert 0.92 < np.mean(held) < 0.985
+
+
+def test_classes_that_do_not_overlap_leave_some_doubt() -> None:
+    """Were the true AUC 0.478, five disjoint pairs would all be in order once in 40 times."""
+    found = auc_between([0.0] * 5, [1.0] * 9)
+    assert (found.auc, found.high) == (1, 1)
+    assert found.low**5 == pytest.approx(1 / 40)
+    reverse = auc_between([1.0] * 9, [0.0] * 5)
+    assert (reverse.auc, reverse.low) == (0, 0)
+    assert reverse.high == pytest.approx(1 - found.low)
+
+
+def test_what_has_no_score_is_below_all_others() -> None:
+    found = auc_between([math.nan, 0.0], [None, -5.0, math.nan])
+    assert found.auc == pytest.approx((0.5 + 1 + 0.5) / 6)
+
+
+@pytest.mark.parametrize(("negatives", "positives"), [([], [1.0]), ([1.0], []), ([], [])])
+def test_a_class_without_scores_is_refused(negatives: list[float], positives: list[float]) -> None:
+    with pytest.raises(UsageError, match="both classes"):
+        auc_between(negatives, positives)
+
+
+def views(size: tuple[int, int], count: int = 8) -> list[npt.NDArray[np.uint8]]:
+    """Cut-outs of one image."""
+    whole = smooth((size[0] + 10 * count, size[1]))
+    return [whole[10 * i : 10 * i + size[0]] for i in range(count)]
+
+
+class TestStegExpose:
+    def test_last_bits_that_were_replaced_are_seen(self) -> None:
+        plain = views((300, 300))
+        found = stegexpose_auc(plain, [with_payload(image, 0.7) for image in plain])
+        assert found.fused.auc == 1
+        plain, stego = ([row.fusion or 0 for row in each] for each in (found.plain, found.stego))
+        assert max(plain) < min(stego)
+        assert found.detectors == {
+            "primary_sets": 0.0,  # no solution for any of the stego images
+            "chi_square": 1.0,
+            "sample_pairs": 1.0,
+            "rs": 1.0,
+        }
+
+    def test_a_model_that_draws_otherwise_is_not(self) -> None:
+        """What hiding in a model does to its renders: some light more or less, before rounding."""
+        random = np.random.default_rng(5)
+        plain = views((60, 80), 24)
+        stego = [np.rint(image + random.normal(0, 0.4, image.shape)).astype(np.uint8) for image in plain]
+        plain = [np.rint(image + random.normal(0, 0.4, image.shape)).astype(np.uint8) for image in plain]
+        found = stegexpose_auc(plain, stego).fused
+        assert found.low < 0.5 < found.high
+
+    def test_detectors_that_take_no_image_have_no_auc(self) -> None:
+        images = views((9, 12))
+        found = stegexpose_auc(images, images)
+        assert found.detectors == {
+            "primary_sets": 0.5,
+            "chi_square": None,
+            "sample_pairs": None,
+            "rs": 0.5,
+        }
+        assert found.fused.auc == 0.5
+
+    def test_images_without_any_score_are_none(self) -> None:
+        found = stegexpose_auc([smooth((1, 1))], [smooth((1, 1))])
+        assert json.loads(record_bytes(found))["plain"][0]["fusion"] is None
+
+    def test_other_views_are_refused(self) -> None:
+        images = views((9, 12))
+        for plain, stego in ((images, images[1:]), ([], []), (images, [image[1:] for image in images])):
+            with pytest.raises(UsageError, match="same views"):
+                stegexpose_auc(plain, stego)

@@ -1,0 +1,181 @@
+"""Losses of cover and secrets after changes of published models."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+from statistics import fmean
+from typing import Literal
+
+import pytest
+import torch
+
+import keyss
+from channels.quiet.trained_like import trained_like
+from keyss import CarryOptions
+from keyss.channels import LOW_BITS
+from keyss.core import Gaussians, KeyssWarning, Scene, Similarity, UsageError, WrongKeyError, same_bits
+from keyss.fitting import mean_psnr
+from keyss.lab import (
+    ChangedQuality,
+    default_changes,
+    half_floats,
+    measure_robustness,
+    noise,
+    purification,
+    random_pruning,
+    reveal_changed,
+)
+from keyss.methods import Opened, open_model, record_request
+from lab.opened import Whole
+from methods.carry.carried import embed
+from methods.carry.test_refit import TINY
+from methods.hiding import hide_scenes, moved, three_scenes
+from tiny_scenes import random_gaussians, tiny_scene
+
+KEY = "the right key"
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return tiny_scene(0, views=8)
+
+
+def test_losses_are_differences_of_quality(scene: Scene) -> None:
+    """The secret is the cover, so every number is known; two seeds of one change give their mean."""
+    model = random_gaussians(seed=0)
+    changes = [random_pruning(0.5, seed) for seed in (0, 1)]
+    steps: list[tuple[int, int]] = []
+    rows = measure_robustness(
+        model, [Whole], scene, [scene], changes=changes, progress=lambda *step: steps.append(step)
+    )
+    assert [(row.attack, row.seeds) for row in rows] == [("none", 1), ("random pruning", 2)]
+    before = mean_psnr(model, scene.test, scene.background)
+    assert rows[0].cover == rows[0].secrets[0] == ChangedQuality(before, 0)
+    after = fmean(mean_psnr(change(model), scene.test, scene.background) for change in changes)
+    assert rows[1].cover is not None
+    assert (rows[1].cover.psnr, rows[1].cover.loss) == pytest.approx((after, before - after))
+    assert rows[1].secrets == (rows[1].cover,)
+    assert steps == [(0, 3), (1, 3), (2, 3)]
+    assert measure_robustness(model, [Whole], scene, [scene], changes=changes) == rows
+
+
+def test_views_are_bounded() -> None:
+    scene, model = tiny_scene(0, views=16), random_gaussians(150, seed=0)
+    (row,) = measure_robustness(model, [], scene, [], changes=[], max_views=1)
+    assert row.cover is not None
+    assert row.cover.psnr == mean_psnr(model, scene.test[:1], scene.background)
+
+
+def test_a_lost_secret_looks_like_the_cover_from_the_secrets_cameras(scene: Scene) -> None:
+    """The secret's cameras are the cover's in another frame: chance level is the cover's quality."""
+    model = random_gaussians(seed=0)
+    frame = Similarity(2.0, translation=torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64))
+    elsewhere = moved(scene, frame.inverse())
+
+    def opener(changed: Gaussians) -> Whole:
+        if len(changed) < len(model):
+            raise WrongKeyError("this key opens nothing here")
+        return Whole(frame.inverse().apply_gaussians(changed), frame)
+
+    changes = [random_pruning(0.2), half_floats()]
+    rows = measure_robustness(model, [opener], scene, [elsewhere], changes=changes)
+    (lost,), (opened,) = rows[1].secrets, rows[2].secrets
+    assert (lost.opens, lost.error) == (False, "this key opens nothing here")
+    assert rows[1].cover is not None
+    assert lost.psnr == pytest.approx(rows[1].cover.psnr, abs=0.01)
+    assert opened.opens
+    with pytest.raises(UsageError, match="each of 1 secret"):
+        measure_robustness(model, [], scene, [scene], changes=[])
+    with pytest.raises(WrongKeyError):
+        measure_robustness(model[:5], [opener], scene, [elsewhere], changes=[])
+
+
+def test_a_secret_that_one_seed_loses_does_not_open(scene: Scene) -> None:
+    model = random_gaussians(seed=0)
+    changes = [random_pruning(0.5, seed) for seed in (0, 1)]
+    kept = changes[0](model).means
+
+    def opener(changed: Gaussians) -> Whole:
+        if len(changed) < len(model) and not torch.equal(changed.means, kept):
+            raise WrongKeyError("this key opens nothing here")
+        return Whole(changed)
+
+    _, pruned = measure_robustness(model, [opener], scene, [scene], changes=changes)
+    assert (pruned.secrets[0].opens, pruned.secrets[0].error) == (False, "this key opens nothing here")
+
+
+def test_the_default_changes_are_those_of_the_papers_and_more(scene: Scene) -> None:
+    changes = default_changes(scene, seed=7)
+    pruned = [0.05, 0.10, 0.15, 0.25, 0.50]
+    assert [change.strength for change in changes if change.attack == "pruning by opacity"] == pruned
+    assert sorted({change.strength for change in changes if change.attack == "random pruning"}) == pruned
+    assert all(change.sentence.endswith(".") for change in changes)
+    attacks = [change.attack for change in changes]
+    assert sum(attack.startswith("noise on ") for attack in set(attacks)) == 6
+    assert {"purification", "fine-tuning", "cropping", "half floats", "fewer harmonics"} < set(attacks)
+    # The changes of each attack follow one another.
+    assert sum(a != b for a, b in pairwise(attacks)) + 1 == len(set(attacks))
+
+
+# --- secrets that are really there -----------------------------------------------------------------------
+
+
+def opener(stego: Gaussians) -> Opened:
+    return open_model(stego, KEY)
+
+
+@pytest.fixture(scope="module")
+def pair() -> tuple[list[Scene], list[Gaussians]]:
+    scenes, _ = three_scenes()
+    return [scenes[0], scenes[2]], [random_gaussians(1500, seed=0), random_gaussians(200, seed=2)]
+
+
+@pytest.mark.parametrize("publish", ["as-is", "any"])
+def test_a_refitted_secret_without_low_bits(
+    publish: Literal["as-is", "any"], pair: tuple[list[Scene], list[Gaussians]]
+) -> None:
+    scenes, models = pair
+    config = CarryOptions(
+        fit=replace(TINY, iterations=5, max_gaussians=2000, boost=1.0), publish=publish, refit="always"
+    )
+    hidden = hide_scenes(scenes, [KEY], config, plains=models)
+    revealed = keyss.reveal(hidden.stego, KEY).gaussians
+    assert same_bits(reveal_changed(opener, hidden.stego), revealed)
+
+    changes = [random_pruning(0.1), half_floats(), purification(scenes[0], steps=0)]
+    _, pruned, rounded, purified = measure_robustness(
+        hidden.stego, [opener], scenes[0], scenes[1:], changes=changes
+    )
+    if publish == "any":
+        again = revealed  # all of it, or nothing
+    else:
+        with pytest.warns(KeyssWarning, match="of 200 Gaussians"):
+            again = keyss.reveal(changes[0](hidden.stego), KEY).gaussians
+    assert pruned.secrets[0].opens
+    assert pruned.secrets[0].psnr == mean_psnr(again, scenes[1].test, scenes[1].background)
+    assert rounded.secrets[0].opens == (publish == "any")
+    if publish == "any":
+        assert rounded.secrets[0].loss == 0
+    else:
+        assert rounded.secrets[0].error == "this key opens nothing here"
+        assert rounded.secrets[0].loss > 10
+    assert purified.cover is not None
+    assert abs(purified.cover.loss) < 0.1
+    assert purified.secrets[0].loss > 10  # nothing of the secret is seen in the cover
+
+
+def test_pruning_a_carried_model_costs_what_it_must() -> None:
+    """A Gaussian of the secret is lost with its carrier, unless there is a copy on another."""
+    cover, secret, share = trained_like(3000), trained_like(1200, seed=1), 0.25
+    stego = embed(cover, [(KEY, secret)])
+    (layout,) = LOW_BITS.prepare(cover).cells.plan_records([record_request(1200, 3)])
+    expected = (1200 - layout.copies) * (1 - share) + layout.copies * (1 - share**2)
+    left = reveal_changed(opener, random_pruning(share)(stego))
+    assert abs(len(left) - expected) < 5 * (1200 * share * (1 - share)) ** 0.5
+    whole = reveal_changed(opener, stego)
+    assert len(whole) == 1200
+    assert left.opacities.mean() > whole.opacities.mean() + 0.02  # makes up for those that are lost
+    with pytest.raises(WrongKeyError):
+        reveal_changed(opener, noise("harmonics", 1e-4)(stego))
+    assert len(reveal_changed(opener, noise("colour", 0.1)(stego))) == 1200  # carries nothing

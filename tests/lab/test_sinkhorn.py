@@ -1,0 +1,112 @@
+"""3D-Sinkhorn is what the paper computes, and is as blind."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import asdict, replace
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+import torch
+
+from keyss.core import Gaussians, UsageError
+from keyss.lab import composite_score, sinkhorn_3d
+from lab.lifelike import (
+    doubled_scales,
+    lifelike,
+    random_rotations,
+    red_for_blue,
+    rescaled_quaternions,
+    some_transparent,
+    stronger_harmonics,
+    tripled_positions,
+)
+
+MODEL = lifelike(10_000)
+Doubles = npt.NDArray[np.float64]
+
+
+def _by_definition(original: Doubles, other: Doubles) -> float:
+    """Cost of the plan u K v with the right margins, where empty bins have u or v = 0 (Cuturi 2013)."""
+    original, other = original / original.max(), other / other.max()
+    ours, edges = np.histogram(original, 100)
+    theirs, _ = np.histogram(other, edges)
+    centres = (edges[1:] + edges[:-1]) / 2
+    cost = np.abs(centres[:, None] - centres)
+    kernel, v = np.exp(-cost / 0.01), np.ones(100)
+    for _ in range(5000):
+        u = ours / ours.sum() / (kernel @ v)
+        v = theirs / theirs.sum() / (kernel.T @ u)
+    return float(u @ (kernel * cost) @ v)
+
+
+@pytest.mark.parametrize("change", [some_transparent, rescaled_quaternions])
+def test_it_is_the_optimal_plans_cost(change: Callable[[Gaussians], Gaussians]) -> None:
+    changed = change(MODEL)
+    found = sinkhorn_3d(MODEL, changed)
+    lengths = {
+        "opacity": lambda model: model.opacities,
+        "rotation": lambda model: model.quats.norm(dim=1),
+        "scale": lambda model: model.scales.norm(dim=1),
+        "position": lambda model: model.means.norm(dim=1),
+        "colour": lambda model: model.sh[:, 0].norm(dim=1),
+    }
+    for name, length in lengths.items():
+        expected = _by_definition(length(MODEL).double().numpy(), length(changed).double().numpy())
+        assert asdict(found)[name] == pytest.approx(expected, abs=1e-4), name
+    assert found.sum == pytest.approx(sum(asdict(found)[name] for name in lengths))
+    assert found.mean == pytest.approx(found.sum / 5)
+
+
+def test_a_model_is_not_at_distance_zero_from_itself() -> None:
+    """On a wide histogram of bins h, the plan exp(-|i - j| h / 0.01) costs h / sinh(h / 0.01)."""
+    lengths = MODEL.quats.norm(dim=1)
+    h = float((lengths.max() - lengths.min()) / lengths.max()) / 100
+    assert sinkhorn_3d(MODEL, MODEL).rotation == pytest.approx(h / math.sinh(h / 0.01), rel=0.03)
+
+
+@pytest.mark.parametrize(
+    "change", [doubled_scales, random_rotations, tripled_positions, red_for_blue, stronger_harmonics]
+)
+def test_it_does_not_see_what_everybody_sees(change: Callable[[Gaussians], Gaussians]) -> None:
+    same, changed = sinkhorn_3d(MODEL, MODEL), sinkhorn_3d(MODEL, change(MODEL))
+    assert asdict(changed) == pytest.approx(asdict(same), abs=1e-5)
+
+
+def test_it_sees_lengths_of_quaternions_which_nobody_sees() -> None:
+    same, changed = sinkhorn_3d(MODEL, MODEL), sinkhorn_3d(MODEL, rescaled_quaternions(MODEL))
+    assert changed.mean > 4 * same.mean
+    for name in ("opacity", "scale", "position", "colour"):
+        assert asdict(changed)[name] == asdict(same)[name]
+
+
+def test_it_is_not_symmetric() -> None:
+    """Of a tight cluster within a wide range nothing is lost; the other way round what lies outside is."""
+    narrow = replace(MODEL, sh=1 + 0.01 * MODEL.sh)
+    there, back = sinkhorn_3d(MODEL, narrow).colour, sinkhorn_3d(narrow, MODEL).colour
+    assert there > 3 * back
+
+
+def test_odd_models_give_numbers() -> None:
+    odd = replace(
+        MODEL,
+        quats=torch.nn.functional.normalize(MODEL.quats, dim=1),
+        opacity_logits=torch.full_like(MODEL.opacity_logits, math.inf),
+        sh=torch.zeros_like(MODEL.sh),
+    )
+    for pair in ((odd, odd), (odd, MODEL), (MODEL, odd)):
+        assert all(0 <= value < 6 for value in asdict(sinkhorn_3d(*pair)).values())
+    with pytest.raises(UsageError, match="empty"):
+        sinkhorn_3d(MODEL[:0], MODEL)
+
+
+@pytest.mark.parametrize(
+    ("cover", "secret", "distance", "score"),
+    [(26.020, 26.138, 0.181, 42.717), (26.036, 26.113, 0.175, 43.008), (25.980, 26.427, 0.153, 44.389)],
+)
+def test_the_score_is_that_of_the_papers_table(
+    cover: float, secret: float, distance: float, score: float
+) -> None:
+    assert composite_score(cover, secret, distance) == pytest.approx(score, abs=0.03)
