@@ -84,9 +84,9 @@ def hide(
     (`CarryOptions`, `KeyssOptions`). `publish`, `format` and `channel`, if given, replace those of the
     options. "as-is" hides where nobody sees it, in a file that must stay unchanged: in low bits of a "ply",
     or in the integers of an "spz", "sog" or "compressed-ply", or of a model that was decoded from one.
-    Without a `format` it is the cover's, or "any" with a warning for a cover that holds nothing unnoticed.
-    "any" hides in what survives conversion, which is the channel "appended" (more Gaussians, which are
-    visible in the file) or "colours" (less room). `width`, `background`, `skip_missing`: see `load_scene`.
+    Without a `format` that is the cover's, and where nothing goes in unnoticed, "any" with a warning. "any"
+    hides in what survives conversion, which is the channel "appended" (more Gaussians, which are visible in
+    the file) or "colours" (less room). `width`, `background`, `skip_missing`: see `load_scene`.
 
     `out` (a folder) gets `publish/` with the stego model, and `private/` with fitted models, `config.json`,
     `metrics.json`, the files to hand over for methods that need them (`keyss.methods.handed`), and
@@ -165,7 +165,7 @@ def hide(
 def _check_arguments(out: PathLike | None, min_psnr: float | None) -> None:
     if out is not None and is_model_path(out):
         raise UsageError(
-            f"{out}: expected the name of a folder; the format of the model in it follows from `format`"
+            f"{out}: expected the name of a folder; the format of the model in it follows from `publish`"
         )
     if min_psnr is not None and not math.isfinite(min_psnr):
         raise UsageError(f"`min_psnr`: expected a number of dB, got {min_psnr}")

@@ -53,8 +53,8 @@ def hide_files(
 ) -> HideFilesResult:
     """Hide files in a model, each under its own key, and open them again as a reader does.
 
-    `out` (a folder) gets `publish/` with the stego model. `publish`, `format`, `channel`: see `hide`; "as-is"
-    refuses a cover that holds nothing unnoticed. `dry_run`: write nothing, and return only the PSNR.
+    `out` (a folder) gets `publish/` with the stego model. `publish`, `format`, `channel`: see `hide`;
+    "as-is" refuses a cover that holds nothing unnoticed. `dry_run`: write nothing, and return only the PSNR.
 
     Raises UsageError where the files do not fit, and other KeyssErrors.
     """

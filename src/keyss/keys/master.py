@@ -30,6 +30,8 @@ class MasterKey:
 
         Names are normalised to NFC. Raises UsageError for a name that is empty, not text, or too long.
         """
+        if len(name) > _MAX_NAME_BYTES:  # normalising takes quadratic time
+            raise UsageError(f"expected a name of 1 to {_MAX_NAME_BYTES} bytes, got {len(name)} characters")
         try:
             data = unicodedata.normalize("NFC", name).encode()
         except UnicodeEncodeError as error:

@@ -68,7 +68,7 @@ class Parameters:
 
 
 def unpack(parts: Bytes) -> Parameters:
-    """From decrypted parts [P, 1 + part] in any order. Raises InputError for damage and loss."""
+    """From decrypted parts [P, 1 + part] in any order. Raises InputError for damaged or lost ones."""
     numbered = {int(row[0]): row[1:].tobytes() for row in parts}
     packed = _joined(numbered, PREFIX_BYTES)
     version, service, name, cells, size, length, gaussians, count = _PREFIX.unpack(packed)

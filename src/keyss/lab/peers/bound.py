@@ -48,7 +48,7 @@ def _open(handed: HandedTensors) -> Show:
 
 METHOD = BoundMethod(
     options=BoundOptions,
-    summary="two plain models, the second handed over: nothing is hidden, a bound",
+    summary="upper bound: the secret is a separate file",
     capabilities=Capabilities(keys=False, hands_over=True),
     open=_open,
 )
