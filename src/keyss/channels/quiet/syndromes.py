@@ -65,14 +65,18 @@ def write(bits: Bits, dry: Bits, message: Bits, rows: Words) -> Bits | None:
     One elimination for all blocks: with as many columns of the matrix P as it has rows, and the others F,
     changes are x_P = P^-1 wanted + P^-1 F x_F. A block then needs an x_F by which x_P is 0 where bits stay.
     """
-    reduced, inverse, pivots = _eliminated(rows)
+    rate = len(rows)
+    identity = np.packbits(np.eye(rate, -(-rate // 64) * 64, dtype=np.uint8), axis=1, bitorder="little")
+    reduced = np.concatenate([rows, identity.view(np.uint64)], axis=1)
+    pivots = _eliminated(reduced, _WORDS)
     if (pivots < 0).any():
         return None
+    left, inverse = np.split(_unpacked(reduced), [BLOCK], axis=1)
     others = np.setdiff1d(np.arange(BLOCK), pivots)
-    wanted = (message ^ read(bits, rows)).reshape(-1, len(rows))
-    changed = _product(wanted, _unpacked(inverse)[:, : len(rows)].T)
+    wanted = (message ^ read(bits, rows)).reshape(-1, rate)
+    changed = _product(wanted, inverse[:, :rate].T)
     blocks, may = bits.reshape(-1, BLOCK).copy(), dry.reshape(-1, BLOCK) == 1
-    free = np.ascontiguousarray(_unpacked(reduced)[:, others])  # P^-1 F
+    free = np.ascontiguousarray(left[:, others])  # P^-1 F
     rest = np.zeros((len(blocks), len(others)), np.uint8)
     if not _solve(free, np.ascontiguousarray(free.T), may[:, pivots], may[:, others], changed, rest):
         return None
@@ -94,15 +98,14 @@ def _unpacked(rows: Words) -> Bits:
 
 
 @kernel
-def _eliminated(rows):  # type: ignore[no-untyped-def]
-    """`rows` reduced, so that in column pivots[i] only row i is 1; the row operations; the pivots, or -1."""
-    rate, words = rows.shape
-    own, made = rows.copy(), np.zeros((rate, -(-rate // 64)), np.uint64)
-    pivots = np.full(rate, -1)
+def _eliminated(own, words):  # type: ignore[no-untyped-def]
+    """Reduce the rows `own` [rate, W], so that in column pivots[i] of the first `words` only row i is 1.
+
+    The pivots; -1 from the first row on that is 0.
+    """
+    pivots = np.full(len(own), -1)
     one = np.uint64(1)
-    for row in range(rate):
-        made[row, row // 64] |= one << np.uint64(row % 64)
-    for row in range(rate):
+    for row in range(len(own)):
         word = 0
         while word < words and own[row, word] == 0:
             word += 1
@@ -112,13 +115,11 @@ def _eliminated(rows):  # type: ignore[no-untyped-def]
         while (own[row, word] >> place) & one == 0:
             place += one
         pivots[row] = 64 * word + np.int64(place)
-        for other in range(rate):
+        for other in range(len(own)):
             if other != row and (own[other, word] >> place) & one:
-                for at in range(word, words):  # loops take a fifth of what slices do
+                for at in range(word, own.shape[1]):  # loops take a fifth of what slices do
                     own[other, at] ^= own[row, at]
-                for at in range(1 + row // 64):
-                    made[other, at] ^= made[row, at]
-    return own, made, pivots
+    return pivots
 
 
 @kernel

@@ -7,7 +7,7 @@
 import { ascii, bytesKey, mostFrequent, rowsOf } from '../../core/bytes.ts';
 import { damaged, tooMuchLost } from '../../core/errors.ts';
 import { type Gaussians, selected } from '../../core/gaussians.ts';
-import type { Codes, ReadModel } from '../../files/models.ts';
+import type { ReadModel } from '../../files/models.ts';
 import { decrypted, type Derive, expand } from '../../keys/keys.ts';
 import { here } from '../../keys/pool.ts';
 import type { Content, Reader } from '../content.ts';
@@ -15,7 +15,7 @@ import { decoded } from '../reed_solomon.ts';
 import { fieldsOf, IDENTITY_BYTES, identities, lowBits, lowWidth } from './bits.ts';
 import { CellCipher, TAG_BYTES } from './cells.ts';
 import { decodedFrom } from './decoded.ts';
-import { lastBits } from './fields.ts';
+import { lastBits, type Levels, levelsOf } from './fields.ts';
 import { NUMBER_BYTES, type Parameters, unpackCodewords, unpackParameters } from './parameters.ts';
 import { saltOf, salts } from './salts.ts';
 import { BLOCK_BYTES, held } from './syndromes.ts';
@@ -48,9 +48,9 @@ export class QuietReader implements Reader {
 
   /** In the codes of a coded or decoded model, else in low bits; null without room. */
   static of(model: ReadModel): QuietReader | null {
-    if (model.codes) return QuietReader.ofCodes(model.codes);
+    if (model.codes) return QuietReader.ofCodes(levelsOf(model.codes));
     const decoded = decodedFrom(model);
-    return decoded ? QuietReader.ofCodes(decoded.codes, decoded.silent) : QuietReader.ofLowBits(model);
+    return decoded ? QuietReader.ofCodes(decoded.levels, decoded.silent) : QuietReader.ofLowBits(model);
   }
 
   private static ofLowBits(model: Gaussians): QuietReader {
@@ -67,8 +67,8 @@ export class QuietReader implements Reader {
   }
 
   /** `silent` [N]: Gaussians that carry nothing. */
-  private static ofCodes(codes: Codes, silent?: Uint8Array): QuietReader | null {
-    const bits = lastBits(codes, silent);
+  private static ofCodes(levels: Levels, silent?: Uint8Array): QuietReader | null {
+    const bits = lastBits(levels, silent);
     if (bits.length < MIN_BLOCKS * 8 * BLOCK_BYTES || bits.length > MAX_BITS) return null;
     const low = held(bits);
     const numbers = new Uint32Array((IDENTITY_BYTES / 4) * (low.length / BLOCK_BYTES));
