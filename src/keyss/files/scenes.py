@@ -18,11 +18,11 @@ from keyss.core.arrays import Doubles, Floats
 from keyss.core.errors import InputError, KeyssWarning, UsageError
 from keyss.core.scene import NEAR, ORDINARY_EXTENT, Camera, Scene, View, checked_background
 from keyss.files.colmap import MODEL_PLACES, colmap_model_folder, read_colmap
-from keyss.files.foreign import CHECKPOINTS, what_it_is
+from keyss.files.foreign import what_it_is
 from keyss.files.images import is_turned, probe_image, read_image, read_mask, shrink
 from keyss.files.layout import Photo, SceneLayout
 from keyss.files.lens import Lens, Undistortion, undistortion
-from keyss.files.trained import has_checkpoints
+from keyss.files.trained import kind_of_folder
 from keyss.files.transforms import read_blender, read_nerfstudio
 
 _FAR = 1000  # extents from the origin: single precision has ten thousandths of one left
@@ -151,8 +151,8 @@ def read_layout(folder: Path, skip_missing: bool) -> SceneLayout:
     except OSError as error:
         raise InputError(f"{folder}: cannot be read: {error.strerror}") from error
     found = ", ".join(entries[:8]) + (", ..." if len(entries) > 8 else "") or "an empty folder"
-    if has_checkpoints(folder):
-        raise InputError(f"{folder}: expected a scene or a model, found a folder of {CHECKPOINTS}")
+    if kind := kind_of_folder(folder):
+        raise InputError(f"{folder}: expected a scene or a model, found {kind}")
     raise InputError(f"{folder}: expected a scene, found {found}. Known layouts: {_KNOWN}")
 
 
