@@ -54,6 +54,23 @@ def test_says_what_it_costs(keyss: Run, files: Path, tmp_path: Path, suffix: str
     assert len(read_model(out)) == COUNT
 
 
+@pytest.mark.parametrize("unit", [1e-4, 1e-3, 1.0, 1e3, 1e6])
+def test_sizes_beyond_spz_are_told_the_cure(keyss: Run, tmp_path: Path, unit: float) -> None:
+    write_model(tmp_path / "in.ply", Similarity(unit).apply_gaussians(random_gaussians(COUNT)))
+    said = keyss("convert", tmp_path / "in.ply", tmp_path / "out.spz")
+    assert said.status == 0
+    assert ("of the Gaussians are smaller" in said.err) == (unit in (1e-4, 1e6))
+    psnr = float(said.out.split("renders at ")[1].split()[0])
+    if unit in (1e-4, 1e6):
+        factor = float(said.err.split(" -s ")[1].split()[0])
+        write_model(tmp_path / "in.ply", Similarity(factor * unit).apply_gaussians(random_gaussians(COUNT)))
+        said = keyss("convert", tmp_path / "in.ply", tmp_path / "scaled.spz")
+        assert "smaller" not in said.err
+        assert float(said.out.split("renders at ")[1].split()[0]) > psnr + 10
+    else:
+        assert psnr > 30
+
+
 @pytest.mark.parametrize("unit", [1e-3, 1e-5, 1e4])
 def test_the_cost_does_not_depend_on_the_unit(keyss: Run, tmp_path: Path, unit: float) -> None:
     """Also of models that are smaller than the nearest distance that rasterizers draw."""

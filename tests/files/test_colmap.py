@@ -348,9 +348,3 @@ def test_one_file_is_not_two_photos(tmp_path: Path) -> None:
     images = counted(image_bytes(1, "00.png"), image_bytes(2, "01.png"), image_bytes(3, "00.PNG"))
     with pytest.raises(InputError, match=r"1 of 3 photos are missing: 00\.PNG"):
         load_scene(write_colmap(tmp_path, images=images))
-
-
-def test_masks_are_said_not_to_be_used(tmp_path: Path) -> None:
-    (write_colmap(tmp_path) / "masks").mkdir()
-    with pytest.warns(KeyssWarning, match="masks: masks are not used"):
-        load_scene(tmp_path)

@@ -128,15 +128,6 @@ def test_names_in_another_case_are_found(tmp_path: Path) -> None:
     ]  # fmt: skip
 
 
-def test_masks_are_said_not_to_be_used(tmp_path: Path) -> None:
-    folder = write_nerfstudio(tmp_path)
-    meta = json.loads((folder / "transforms.json").read_text())
-    meta["frames"][1]["mask_path"] = "masks/1.png"
-    write_json(folder / "transforms.json", meta)
-    with pytest.warns(KeyssWarning, match="`mask_path`: masks are not used"):
-        load_scene(folder)
-
-
 @pytest.mark.parametrize("others", [{}, {"test_filenames": [], "val_filenames": []}])
 def test_every_eighth_photo_is_for_testing_where_all_are_for_training(
     tmp_path: Path, others: dict[str, object]

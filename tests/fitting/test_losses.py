@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -7,6 +9,7 @@ from hypothesis import given, settings, strategies as st
 
 from keyss.core import View
 from keyss.fitting import Target, photometric_loss, psnr, quality, ssim, ssim_torch, subsample_views
+from keyss.rendering import render
 from tiny_scenes import random_gaussians, ring_cameras, tiny_scene
 
 
@@ -16,7 +19,7 @@ def _images(height: int, width: int, seed: int = 0) -> tuple[torch.Tensor, torch
     return a, (a + 0.2 * torch.randn(height, width, 3, generator=generator)).clamp(0, 1)
 
 
-def _ssim_by_definition(a: torch.Tensor, b: torch.Tensor) -> float:
+def _ssim_by_definition(a: torch.Tensor, b: torch.Tensor, mask: torch.Tensor | None = None) -> float:
     """Window by window in float64, with zeros outside, straight from Wang et al. 2004."""
     offsets = torch.arange(-5, 6, dtype=torch.float64)
     weights = torch.exp(-(offsets[:, None] ** 2 + offsets[None] ** 2) / (2 * 1.5**2))
@@ -34,7 +37,8 @@ def _ssim_by_definition(a: torch.Tensor, b: torch.Tensor) -> float:
             values.append(
                 ((2 * mp * mq + c1) * (2 * cov + c2) / ((mp**2 + mq**2 + c1) * (vp + vq + c2))).mean()
             )
-    return float(torch.stack(values).mean())
+    found = torch.stack(values)
+    return float((found if mask is None else found[mask.flatten()]).mean())
 
 
 def test_ssim_is_what_its_definition_says() -> None:
@@ -42,6 +46,31 @@ def test_ssim_is_what_its_definition_says() -> None:
     expected = _ssim_by_definition(a, b)
     assert float(ssim(a, Target.of(b))) == pytest.approx(expected, abs=2e-6)
     assert float(ssim_torch(a, Target.of(b))) == pytest.approx(expected, abs=2e-6)
+
+
+def test_quality_is_that_of_what_masks_leave() -> None:
+    """Equal to a render where the mask is True, and noise elsewhere."""
+    model, camera = random_gaussians(), ring_cameras(1)[0]
+    image = (render(model, camera).clamp(0, 1) * 255).round().to(torch.uint8)
+    mask = torch.rand(image.shape[:2], generator=torch.Generator().manual_seed(1)) > 0.3
+    noise = torch.randint(0, 256, image.shape, generator=torch.Generator().manual_seed(2), dtype=torch.uint8)
+    view = View(camera, torch.where(mask[:, :, None], image, noise), mask=mask)
+    found = quality(model, [view], torch.zeros(3))
+    expected = (render(model, camera).clamp(0, 1) - image / 255)[mask].square().mean()
+    assert found.psnr == pytest.approx(float(-10 * expected.log10()), abs=1e-3)
+    assert found.ssim > 0.999
+    assert quality(model, [replace(view, mask=None)], torch.zeros(3)).ssim < 0.9
+
+
+def test_the_ssim_of_a_mask_is_the_mean_of_its_pixels() -> None:
+    """Windows see the mean colour where it is False."""
+    a, b = _images(17, 14)
+    mask = torch.rand(17, 14, generator=torch.Generator().manual_seed(3)) > 0.3
+    mean = b[mask].mean(0)
+    filled = [torch.where(mask[..., None], each, mean) for each in (a, b)]
+    expected = _ssim_by_definition(*filled, mask)
+    assert float(ssim(a, Target.of(b, mask))) == pytest.approx(expected, abs=2e-6)
+    assert expected != pytest.approx(_ssim_by_definition(a, b), abs=1e-3)
 
 
 def test_ssim_of_an_image_with_itself_is_one() -> None:

@@ -57,6 +57,28 @@ def test_fitting_improves_psnr_on_test_views() -> None:
     assert len(start) < len(fitted) <= config.max_gaussians
 
 
+def test_what_masks_cover_has_no_part_in_a_fit() -> None:
+    scene, config = tiny_scene(views=32), replace(CONFIG, iterations=300)
+    generator = torch.Generator().manual_seed(5)
+    masked, occluded = [], []
+    for index, view in enumerate(scene.train):
+        mask, image = torch.ones(view.image.shape[:2], dtype=torch.bool), view.image.clone()
+        if index % 3:  # something that moves before the scene
+            x, y = (int(torch.randint(low, low + 8, (1,), generator=generator)) for low in (8, 5))
+            mask[y : y + 12, x : x + 14] = False
+            image[~mask] = torch.tensor([255, 0, 255], dtype=torch.uint8)
+        masked.append(replace(view, mask=mask))
+        occluded.append(replace(view, image=image, mask=mask))
+    unmasked = [replace(view, mask=None) for view in occluded]
+    with_masks, same, without = (
+        fit_scene(replace(scene, train=tuple(views)), config).gaussians
+        for views in (occluded, masked, unmasked)
+    )
+    assert _same(with_masks, same)
+    good, bad = (mean_psnr(model, scene.test, scene.background) for model in (with_masks, without))
+    assert good > bad + 2
+
+
 def test_a_step_minimises_the_mean_loss_of_its_views() -> None:
     scene, config = tiny_scene(), replace(CONFIG, views_per_step=2)
     run, same = (PlainRun(scene, config, torch.device("cpu")) for _ in range(2))

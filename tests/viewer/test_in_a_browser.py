@@ -6,6 +6,7 @@ import math
 import re
 import subprocess
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 from urllib.parse import urljoin
@@ -18,11 +19,12 @@ from keyss.core import Gaussians
 from keyss.files import read_model, write_model
 from keyss.viewer import export_html
 from methods.carry.carried import embed, extract
-from viewer.browser import CLOSE, IN_CHROMIUM, POSE, WEB, Visit, camera_of, made, psnr
+from viewer.browser import CLOSE, IN_CHROMIUM, POSE, WEB, Visit, camera_of, drawn, made, psnr
 
 pytestmark = IN_CHROMIUM
 
 KEYS = ("the first key", "ein zweiter Schlüssel")
+FAR = "#eye=3,-2.4,-12&target=0.2,0.1,0"  # where no Gaussian is larger than engines draw
 AXE = WEB / "node_modules" / "axe-core" / "axe.min.js"
 
 
@@ -125,6 +127,80 @@ def test_a_garbled_file_gives_one_sentence(tab: Visit, page_file: Path, tmp_path
         assert re.fullmatch(r"This [^.]*\.?[^.]*\.", said), said
     tab.page.set_input_files("#file", page_file.parent / "stego.ply")
     tab.page.wait_for_function("() => document.getElementById('problem').textContent === ''")
+
+
+def test_the_slider_says_what_is_seen(
+    tab: Visit, page_file: Path, stego: Path, secrets: list[Gaussians], tmp_path: Path
+) -> None:
+    models = dict(zip(("first", "second"), secrets, strict=True))
+    models |= {"published": read_model(stego), "other": made(300, 5)}
+    write_model(tmp_path / "other.ply", models["other"])
+    (tmp_path / "cut.ply").write_bytes(stego.read_bytes()[:5000])
+
+    def assert_seen(expected: str, slider: str | None) -> None:
+        """The published model beside a secret is seen from a pose of the secret's frame."""
+        tab.at(FAR)
+        found = tab.picture()
+        close = [name for name, model in models.items() if psnr(found, drawn(model, FAR)) > CLOSE]
+        assert close == ([] if slider == "0" else [expected])
+        assert found.std() > 10
+        assert tab.page.locator("#wiping").is_visible() == (slider is not None)
+        assert slider is None or tab.page.input_value("#wipe") == slider
+
+    tab.goto(page_file.as_uri())
+    assert_seen("published", None)
+    tab.try_key(KEYS[0])
+    assert_seen("first", "100")
+    tab.page.fill("#wipe", "0")
+    assert_seen("published", "0")
+    tab.try_key(KEYS[1])
+    assert_seen("second", "100")
+    tab.page.click("#keyless > summary")
+    tab.page.check("#faint")  # the published model is looked at
+    tab.page.wait_for_function("() => document.getElementById('count').textContent !== ''")
+    tab.page.uncheck("#faint")
+    tab.page.fill("#threshold", "0")
+    tab.page.wait_for_function("() => document.getElementById('count').textContent.startsWith('4,000 of')")
+    assert_seen("published", "0")
+    tab.page.fill("#wipe", "100")
+    tab.page.set_input_files("#file", tmp_path / "cut.ply")
+    tab.page.wait_for_function("() => document.getElementById('problem').textContent !== ''")
+    assert_seen("second", "100")
+    tab.page.click("#close")
+    assert_seen("published", None)
+    tab.try_key(KEYS[0])
+    assert_seen("first", "100")
+    tab.page.set_input_files("#file", tmp_path / "other.ply")
+    tab.page.wait_for_function("() => document.getElementById('facts').textContent.includes('other')")
+    tab.settle()
+    assert_seen("other", None)
+
+
+@pytest.mark.parametrize("kind", ["empty", "NaN", "activated"])
+def test_a_dropped_file_that_cannot_be_drawn_names_the_cure(
+    tab: Visit, page_file: Path, tmp_path: Path, kind: str
+) -> None:
+    model = made(200, 1)
+    if kind == "activated":
+        model = replace(model, log_scales=model.scales, opacity_logits=model.opacities)
+    write_model(tmp_path / "model.ply", model)
+    data = (tmp_path / "model.ply").read_bytes()
+    header, _, rows = data.partition(b"end_header\n")
+    if kind == "NaN":
+        data = header + b"end_header\n" + b"\xff" * len(rows)
+    if kind == "empty":
+        data = header.replace(b"vertex 200", b"vertex 0") + b"end_header\n"
+    (tmp_path / "model.ply").write_bytes(data)
+    tab.goto(page_file.as_uri())
+    drop = """([name, bytes]) => {
+        const data = new DataTransfer();
+        data.items.add(new File([Uint8Array.from(bytes)], name));
+        const how = {dataTransfer: data, bubbles: true, cancelable: true};
+        document.body.dispatchEvent(new DragEvent('drop', how));
+    }"""
+    tab.page.evaluate(drop, ["model.ply", list(data)])
+    tab.page.wait_for_function("() => document.getElementById('problem').textContent !== ''")
+    assert re.search("^This file.*: export it again ", tab.page.locator("#problem").inner_text())
 
 
 def test_everything_goes_by_keyboard(tab: Visit, page_file: Path) -> None:

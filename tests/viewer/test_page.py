@@ -12,6 +12,7 @@ import warnings
 from base64 import b64decode, b64encode
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -101,7 +102,14 @@ def test_what_no_page_can_show_is_refused_before_one_is_written(
     start = whole.index(b"end_header\n") + len(b"end_header\n")
     nan = np.full(len(whole[start:]) // 4, np.nan, "<f4").tobytes()
     empty = whole[:start].replace(b"vertex 5\n", b"vertex 0\n")
-    for content, said in ((whole[:start] + nan, "NaN or infinite values"), (empty, "holds no Gaussians")):
+    scaled = random_gaussians(200, sh_degree=0)
+    write_model(model, replace(scaled, log_scales=scaled.scales, opacity_logits=scaled.opacities))
+    refused = {
+        whole[:start] + nan: "NaN or infinite values",
+        empty: "holds no Gaussians",
+        model.read_bytes(): "export it again without activating them",
+    }
+    for content, said in refused.items():
         model.write_bytes(content)
         for shown in (lambda: export_html(model, tmp_path / out), lambda: ModelServer(model)):
             with pytest.raises(InputError, match=said):

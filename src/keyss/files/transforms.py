@@ -25,7 +25,6 @@ from keyss.files.layout import (
     leave_out_broken,
     leave_out_missing,
     refuse_duplicates,
-    warn_of_masks,
 )
 from keyss.files.lens import Lens, make_lens
 from keyss.files.ply_table import read_point_cloud
@@ -66,7 +65,7 @@ class _Intrinsics(msgspec.Struct):
 class _Frame(_Intrinsics, kw_only=True):
     file_path: str
     transform_matrix: Any = None  # checked by itself, so that an error names the photo
-    mask_path: Any = None
+    mask_path: str | None = None
 
 
 class _Transforms(_Intrinsics, kw_only=True):
@@ -145,13 +144,12 @@ def _read(path: Path, skip_missing: bool) -> _Posed:
         try:
             viewmat = _viewmat(where, _matrix(where, frame.transform_matrix))
             lens = _lens(where, meta, frame, path.parent / name)
-            photos.append(Photo(path.parent / name, name, viewmat, lens))
+            mask = frame.mask_path and path.parent / finder.find(path.parent, _inside(path, frame.mask_path))
+            photos.append(Photo(path.parent / name, name, viewmat, lens, mask or None))
         except InputError as error:
             broken[name] = str(error)
     leave_out_broken(path, len(photos) + len(broken), broken, skip_missing)
     refuse_duplicates(path, photos)
-    if any(frame.mask_path for frame in meta.frames):
-        warn_of_masks(f"{path}: `mask_path`")
     return _Posed(meta, tuple(names), tuple(photos))
 
 

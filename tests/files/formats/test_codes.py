@@ -190,6 +190,7 @@ def test_spz_makes_room_for_large_models(reach: float) -> None:
     assert reach > 2048 or codes.fractional_bits == 12
 
 
+@pytest.mark.filterwarnings("ignore:.*between which .spz holds scales")
 @pytest.mark.parametrize("scale", [1.0, 0.1, 0.001, 0.0001])
 @pytest.mark.parametrize("offset", [0.0, 3.0])
 def test_spz_is_as_precise_in_small_units(scale: float, offset: float) -> None:

@@ -156,6 +156,10 @@ def test_decoders_that_will_be_appended_are_told_of_before_any_work() -> None:
 
 def test_targets_are_photos_where_there_are_and_renders_elsewhere() -> None:
     scenes, models = three_scenes()
+    mask = torch.ones(scenes[1].train[3].image.shape[:2], dtype=torch.bool)
+    mask[:3, :4] = False
+    masked = tuple(replace(view, mask=mask) for view in scenes[1].train)
+    scenes[1] = replace(scenes[1], train=masked)
     frame = Similarity(0.5, torch.eye(3, dtype=torch.float64), torch.ones(3, dtype=torch.float64))
     placed = [
         PlacedScene.of(scenes[0], models[0], Similarity()),
@@ -163,11 +167,14 @@ def test_targets_are_photos_where_there_are_and_renders_elsewhere() -> None:
     ]
     poses = CombinedPoses(placed, torch.device("cpu"))
     own = poses.target(1, owner=1, index=3)
-    assert torch.equal(own.image, scenes[1].train[3].image.float() / 255)
+    assert torch.equal(own.image[mask], scenes[1].train[3].image[mask].float() / 255)
     # The model moved into the cover's frame shows from a moved camera what its photo shows.
     rendered = render(placed[1].plain, poses.camera(1, 3)).clamp(0, 1)
-    assert (rendered - own.image).abs().mean() < 4e-3
+    assert (rendered - own.image)[mask].abs().mean() < 4e-3
+    assert own.mask is not None
+    assert torch.equal(own.mask, mask)
     foreign = poses.target(0, owner=1, index=3)
+    assert foreign.mask is None  # what stands before one scene does not stand before another
     expected = render(models[0], poses.camera(1, 3)).clamp(0, 1)
     assert (foreign.image - expected).abs().max() <= 0.5 / 255 + 1e-6
 

@@ -100,7 +100,7 @@ def leak_scores(model: Gaussians, views: Sequence[View], background: Tensor) -> 
     """Scores of a model against the photos of views, means over the views."""
     rows = []
     for view in views:
-        photo = view.image.to(model.device).float() / 255
+        photo = view.photo(model.device)
         image = render(model, view.camera, background).clamp(0, 1)
         fitted = fit_colours(image, photo).clamp(0, 1)
         gradient = gradient_correlation(image, photo)
