@@ -10,20 +10,10 @@ import sys
 import tomllib
 from pathlib import Path
 
-import msgspec
 import pytest
 import yaml
 
 import keyss
-from benchmark_record import (
-    BenchmarkRecord,
-    Change,
-    Machine,
-    numbers_of_table,
-    read_record,
-    regressions,
-    write_record,
-)
 
 ROOT = Path(__file__).parents[1]
 TESTED = ("audit", "clip", "test")  # extras
@@ -139,47 +129,3 @@ def test_the_least_versions_are_those_that_are_tested() -> None:
         if name != "torch" and not (pinned.get(name, "") + ".").startswith(version + ".")
     }
     assert different == {}
-
-
-def record(**ratios: float) -> BenchmarkRecord:
-    machine = Machine("a processor", 2, "Linux x86_64", "3.11", {"numpy": "2.0"})
-    return BenchmarkRecord(name="quick", commit="0123456789ab", machine=machine, ratios=ratios)
-
-
-def test_benchmarks_fail_on_what_got_slower_and_on_nothing_else() -> None:
-    baseline = record(draw=2.0, hide=10.0, reveal=1.0)
-    assert regressions(record(draw=2.6, hide=13.4, reveal=0.1), baseline, 0.35) == []
-    slower = regressions(record(draw=2.8, hide=13.4, reveal=1.0), baseline, 0.35)
-    assert slower == [Change("draw", 2.0, 2.8)]
-    assert "1.40 times" in str(slower[0])
-
-
-def test_benchmarks_notice_a_ratio_that_is_gone_or_new() -> None:
-    changes = regressions(record(draw=2.0, other=1.0), record(draw=2.0, hide=1.0), 0.35)
-    assert changes == [Change("hide", 1.0, None), Change("other", None, 1.0)]
-    assert [str(change) for change in changes] == ["hide: no longer measured", "other: not in the baseline"]
-
-
-def test_a_record_comes_back_from_its_file(tmp_path: Path) -> None:
-    written = record(draw=2.0)
-    assert read_record(write_record(written, tmp_path / "new" / "record.json")) == written
-    (tmp_path / "other.json").write_text('{"name": "quick", "ratios": {"draw": "fast"}}')
-    with pytest.raises(msgspec.ValidationError):
-        read_record(tmp_path / "other.json")
-
-
-def test_the_stored_records_can_be_read() -> None:
-    paths = list((ROOT / "benchmarks" / "results").rglob("*.json"))
-    assert ROOT / "benchmarks" / "results" / "quick" / "baseline.json" in paths
-    for path in paths:
-        assert read_record(path).name == path.parent.name
-
-
-def test_numbers_are_taken_from_a_table() -> None:
-    rows = [["guitar", "2", "81.5 (83.0)", "1.20"], ["robot", "2", "7", "1.15"]]
-    assert numbers_of_table(["scene", "threads", "forward", "step / pass"], rows) == {
-        "guitar, 2: forward": 81.5,
-        "guitar, 2: step / pass": 1.2,
-        "robot, 2: forward": 7.0,
-        "robot, 2: step / pass": 1.15,
-    }

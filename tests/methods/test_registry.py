@@ -17,7 +17,6 @@ from channels.quiet.trained_like import trained_like
 from cli.said import Run, assert_refused
 from keyss import Gaussians, Secret
 from keyss.channels import LOW_BITS, Content, Payload
-from keyss.cli.hiding import own_options
 from keyss.core import InputError, UsageError, WrongKeyError
 from keyss.methods import (
     Capabilities,
@@ -68,7 +67,6 @@ class WholeMethod:
     """Embeds the secret's floats as they are."""
 
     name = "whole"
-    summary = "embed the floats themselves"
     max_secrets = 1
     capabilities = Capabilities()
     options = WholeOptions
@@ -103,7 +101,14 @@ METHOD = WholeMethod()
 
 @pytest.fixture(autouse=True)
 def entered(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(registry.METHODS, "whole", registry.Modules(__name__, __name__, {"most": str}))
+    monkeypatch.setitem(
+        registry.METHODS,
+        "whole",
+        registry.Modules(
+            "embed the floats themselves",
+            *(f"{__name__}:{name}" for name in ("WholeOptions", "METHOD", "unpack")),
+        ),
+    )
 
 
 @pytest.fixture
@@ -202,9 +207,3 @@ def test_what_would_be_divided_by_nothing_is_refused(name: str, changes: dict[st
 def test_opacities_that_would_never_be_mapped_are_refused() -> None:
     with pytest.raises(UsageError, match="before growth stops"):
         registry.get("watergs").options.preset("default").with_fit(iterations=1)
-
-
-@pytest.mark.parametrize("name", registry.METHODS)
-def test_own_options_are_known_before_a_method_is_loaded(name: str) -> None:
-    kinds = {each: kind for each, (kind, _) in own_options(registry.get(name)).items()}
-    assert registry.METHODS[name].own == {each: bool if kind is bool else str for each, kind in kinds.items()}

@@ -15,7 +15,6 @@ import pytest
 import torch
 from torch import Tensor
 
-import rasterizer_threads
 from keyss import FitConfig, _threads, fit
 from keyss.core import KeyssWarning
 from keyss.rendering.cpu import parallel
@@ -160,23 +159,6 @@ def test_forked_processes_draw_the_same() -> None:
         child.join(PATIENCE)
         child.kill()
     assert digest(scene) == expected
-
-
-def test_pieces_that_are_dealt_out_are_all_of_the_work() -> None:
-    """The pieces that the benchmark times one by one make up a complete rendering."""
-    scene = many()
-    expected = scene.results()
-    with rasterizer_threads.timed(4) as found:
-        assert differing(scene.results(), expected) == []
-    assert set(found.pieces) > {"project", "list_pairs", "sort_pairs", "blend", "blend_backward"}
-    assert all(seconds >= 0 for pieces in found.pieces.values() for seconds in pieces)
-
-
-def test_the_next_piece_goes_to_who_is_free_first() -> None:
-    assert rasterizer_threads.makespan([3, 1, 1, 1], 1) == 6
-    assert rasterizer_threads.makespan([3, 1, 1, 1], 2) == 3
-    assert rasterizer_threads.makespan([1, 1, 1, 3], 2) == 4
-    assert rasterizer_threads.makespan([1, 2], 8) == 2
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ from keyss.rendering import Backend, resolve_device
 from keyss.runs.config import FitMetrics, FitRunConfig
 from keyss.runs.files import CONFIG, METRICS, MODEL, Background, PathLike, as_scene, path_of
 from keyss.runs.folder import RunFolder, recorded_number
-from keyss.runs.planning import check_room, in_a_line, plan_fit, worth_planning
+from keyss.runs.planning import check_room, in_a_line, needs_of_fit, plan_fit, worth_planning
 
 
 def seeded(config: FitConfig, interrupted: Path | None, *names: str) -> FitConfig:
@@ -69,10 +69,9 @@ def fit(
             resume=resume,
         )
     loaded = as_scene(scene, settings.views)
-    plan = plan_fit(loaded, config, target)
-    check_room(plan, None if out is None else Path(out))
+    check_room(needs_of_fit(loaded, config), None if out is None else Path(out))
     if reporter and not resume and worth_planning(config):
-        reporter.note(f"fit: {in_a_line(plan)}")
+        reporter.note(f"fit: {in_a_line(plan_fit(loaded, config, target))}")
     with folder.work() if folder else nullcontext():
         result = fit_scene(
             loaded,

@@ -52,7 +52,7 @@ from keyss.runs.files import (
     stego_name,
 )
 from keyss.runs.folder import RunFolder
-from keyss.runs.planning import check_room, in_a_line, plan_hiding, worth_planning
+from keyss.runs.planning import check_room, in_a_line, needs_of_hiding, plan_hiding, worth_planning
 from keyss.runs.records import read_record, record_bytes
 
 
@@ -127,13 +127,13 @@ def hide(
         else replace(source, loaded=as_scene(each, views, train_pictures=trains, model=source.given))
         for each, source in zip(given, sources, strict=True)
     ]
-    plan = plan_hiding(chosen, options, sources, target, place)
-    check_room(plan, place)
+    check_room(needs_of_hiding(options, sources), place)
     if dry_run:
-        return HideResult(plan=plan)
+        return HideResult(plan=plan_hiding(chosen, options, sources, target, place))
 
     with folder.work() if folder else nullcontext():
         if reporter and not resume and (options.place.grows or (trains and worth_planning(options.fit))):
+            plan = plan_hiding(chosen, options, sources, target, place)
             for line in (f"hide: {in_a_line(plan)}", *plan.notes):
                 reporter.note(line)
         context = Context(target, folder.checkpoints if folder and trains else None, resume, reporter)

@@ -17,11 +17,9 @@ from .base import (
 from .colours.channel import COLOURS as COLOURS, Colours as Colours, ColoursCover as ColoursCover
 from .colours.fountain import Fountain as Fountain
 from .colours.reading import ColoursReader as ColoursReader
+from .names import AnyChannel as AnyChannel, Format as Format, Publish as Publish
 from .publishing import (
     SUFFIXES as SUFFIXES,
-    AnyChannel as AnyChannel,
-    Format as Format,
-    Publish as Publish,
     channel_for as channel_for,
     open_content as open_content,
     quick_attempt as quick_attempt,

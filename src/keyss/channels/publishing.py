@@ -5,17 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import Literal, get_args
+from typing import get_args
 
 from keyss.channels.base import Channel, Content, Payload, Reader, SaltedReader
+from keyss.channels.names import AnyChannel, Format, Publish
 from keyss.core.errors import UsageError, WrongKeyError
 from keyss.core.gaussians import Gaussians
 from keyss.files.formats.common import CodedGaussians
 from keyss.keys.derivation import DerivedKey
-
-Publish = Literal["as-is", "any"]
-AnyChannel = Literal["appended", "colours"]  # of a model that may be converted to any format
-Format = Literal["ply", "spz", "sog", "compressed-ply"]  # of a model that stays as it is
 
 SUFFIXES = {"spz": ".spz", "sog": ".sog", "compressed-ply": ".compressed.ply"}  # of files whose codes carry
 

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import sys
 from argparse import ArgumentParser
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields, make_dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
-import tyro
 from tyro.conf import OmitArgPrefixes, UseAppendAction, arg
 
 from keyss.cli.arguments import (
@@ -148,10 +147,11 @@ def hide(args: HideArguments) -> None:
 
     example: keyss hide --batch assets.csv --method carry --master-key-file master.txt -o runs/assets
     """
+    _check_without_torch(args)
     if args.batch.batch is not None:
         _hide_batch(args, args.batch.batch)
         return
-    assert args.cover is not None  # see `_check_without_torch`
+    assert args.cover is not None
     (_hide_files if args.secret_file else _hide_scenes)(args, args.cover)
 
 
@@ -166,7 +166,7 @@ def _hide_scenes(args: HideArguments, cover: Path) -> None:
     from keyss.runs.files import HANDED, STEGOS
 
     method = registry.get(args.method)
-    options, secrets = _method_options(args, method), _secrets(args, method)
+    options, secrets = _method_options(args), _secrets(args, method)
     idle = _idle_without_training(args, cover)
     if idle and not options.may_train:
         raise UsageError(
@@ -271,9 +271,11 @@ def _warn_of_idle(idle: str, steps: int) -> None:
         )
 
 
-def _method_options(args: HideArguments, method: Method) -> MethodOptions:
+def _method_options(args: HideArguments) -> MethodOptions:
     """The preset, overridden by the options of the command line."""
-    known = own_options(method)
+    from keyss.methods.registry import options_of
+
+    known = own_options(args.method)
     changes = {
         name: parse(value) if (parse := known[name][1].parse) else value
         for name, value in vars(args.own).items()
@@ -281,7 +283,7 @@ def _method_options(args: HideArguments, method: Method) -> MethodOptions:
     }
     changes |= {"publish": args.publish, "format": args.format}
     changes |= {"channel": args.details.channel} if args.details.channel else {}
-    options = replace(method.options.preset(args.preset), **changes)
+    options = replace(options_of(args.method).preset(args.preset), **changes)
     return options.with_fit(**args.training.schedule())
 
 
@@ -323,10 +325,9 @@ def _hide_batch(args: HideArguments, table: Path) -> None:
     from keyss.cli.entry import as_flags, options_of_group
     from keyss.cli.keys import key_of_file, warn_of_weak_keys
     from keyss.cli.tables import print_files, print_outcome
-    from keyss.methods import registry
     from keyss.progress import reporter
 
-    method, batch = registry.get(args.method), args.batch
+    batch = args.batch
     used = "batch master_key_file ray cores out publish format channel preset overwrite device min_psnr"
     used += " width background skip_missing iterations max_gaussians seed"
     _refuse(args, "--batch", used, vars(args.own))
@@ -335,7 +336,7 @@ def _hide_batch(args: HideArguments, table: Path) -> None:
     result = keyss.hide_batch(
         table,
         args.out,
-        method=_method_options(args, method),
+        method=_method_options(args),
         master_key_file=batch.master_key_file,
         **vars(args.photos),
         min_psnr=args.details.min_psnr,
@@ -373,9 +374,9 @@ def with_options_of_method(arguments: Sequence[str]) -> Callable[..., None]:
 
     chooser = ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
     chooser.add_argument("--method", nargs="?")
-    args = chooser.parse_known_args(arguments)[0].method
-    name = args if args in registry.METHODS else registry.DEFAULT
-    flags = {each: set(map(flag, modules.own)) for each, modules in registry.METHODS.items()}
+    asked = chooser.parse_known_args(arguments)[0].method
+    name = asked if asked in registry.METHODS else registry.DEFAULT
+    flags = {each: set(map(flag, own_options(each))) for each in registry.METHODS}
     for argument in arguments:
         given = argument.partition("=")[0].replace("_", "-")
         having = [each for each in flags if given in flags[each]]
@@ -384,46 +385,16 @@ def with_options_of_method(arguments: Sequence[str]) -> Callable[..., None]:
             raise UsageError(
                 f"{given} is an option of --method {' and '.join(having)}; --method {name} has: {known}"
             )
-    if arguments and not {"-h", "--help"} & set(arguments):
-        _check_without_torch(name, arguments)
-    method = registry.get(name)
-    summaries = "; ".join(f"{each}: {registry.get(each).summary}" for each in registry.METHODS)
-    return _parsed_as(_arguments_of(name, f"{summaries}.", map(_own_field, own_options(method).items())))
-
-
-def _check_without_torch(name: str, arguments: Sequence[str]) -> None:
-    """Refuse wrong options and missing files before torch is imported, the slowest part of the start.
-
-    Raises UsageError and InputError, and SystemExit as argument parsers do.
-    """
-    from keyss.cli.entry import as_flags
-    from keyss.core.errors import UsageError
-    from keyss.fitting import FitConfig
-    from keyss.methods.registry import METHODS
-
-    own = [
-        (each, bool, field(default=False)) if kind is bool else (each, str | None, field(default=None))
-        for each, kind in METHODS[name].own.items()
+    summaries = "; ".join(f"{each}: {modules.summary}" for each, modules in registry.METHODS.items())
+    methods: Any = Annotated[Literal[tuple(registry.METHODS)], arg(help=f"{summaries}.")]
+    own = make_dataclass("Own", map(_own_field, own_options(name).items()), frozen=True, kw_only=True)
+    own.__doc__ = f"Options that only the method {name} has."
+    changed: list[tuple[str, Any, Any]] = [
+        ("method", methods, field(default=name)),
+        ("own", Annotated[own, arg(name=name), OmitArgPrefixes], field(default=own())),
     ]
-    config = (tyro.conf.FlagCreatePairsOff,)
-    args = tyro.cli(_arguments_of(name, "", own), prog="keyss hide", args=arguments, config=config)
-    check_there(args.cover, args.details.cover_model, args.batch.batch, args.batch.master_key_file)
-    check_there(*args.secret, *args.secret_file, *args.key_file, *args.details.secret_model)
-    try:
-        FitConfig(**args.training.schedule())
-    except UsageError as error:
-        raise UsageError(as_flags(str(error), args.training.schedule())) from error
-    if args.batch.batch is not None:
-        return
-    if args.cover is None:
-        raise UsageError("no cover: give --cover SCENE, or --batch CSV for many hidings")
-    if only_for_many := given(args.batch):
-        raise UsageError(f"{only_for_many[0]} is for many hidings: give --batch CSV, or leave it out")
-    if not (args.secret_file or args.secret):
-        raise UsageError("no secret: give --secret SCENE or --secret-file FILE, one for each secret")
+    kind = make_dataclass("Arguments", changed, bases=(HideArguments,), frozen=True, kw_only=True)
 
-
-def _parsed_as(kind: type[HideArguments]) -> Callable[..., None]:
     def command(args: HideArguments) -> None:
         hide(args)
 
@@ -432,20 +403,24 @@ def _parsed_as(kind: type[HideArguments]) -> Callable[..., None]:
     return command
 
 
-def _arguments_of(
-    name: str, methods_help: str, own_fields: Iterable[tuple[str, Any, Any]]
-) -> type[HideArguments]:
-    """`HideArguments` with the methods, and the own options of the method `name` as a group."""
-    from keyss.methods.registry import METHODS
+def _check_without_torch(args: HideArguments) -> None:
+    """Refuse wrong options and missing files before torch is imported, the slowest part of the start.
 
-    methods: Any = Annotated[Literal[tuple(METHODS)], arg(help=methods_help)]
-    own = make_dataclass("Own", own_fields, frozen=True, kw_only=True)
-    own.__doc__ = f"Options that only the method {name} has."
-    changed: list[tuple[str, Any, Any]] = [
-        ("method", methods, field(default=name)),
-        ("own", Annotated[own, arg(name=name), OmitArgPrefixes], field(default=own())),
-    ]
-    return make_dataclass("Arguments", changed, bases=(HideArguments,), frozen=True, kw_only=True)
+    Raises UsageError and InputError.
+    """
+    from keyss.core.errors import UsageError
+
+    check_there(args.cover, args.details.cover_model, args.batch.batch, args.batch.master_key_file)
+    check_there(*args.secret, *args.secret_file, *args.key_file, *args.details.secret_model)
+    _method_options(args)
+    if args.batch.batch is not None:
+        return
+    if args.cover is None:
+        raise UsageError("no cover: give --cover SCENE, or --batch CSV for many hidings")
+    if only_for_many := given(args.batch):
+        raise UsageError(f"{only_for_many[0]} is for many hidings: give --batch CSV, or leave it out")
+    if not (args.secret_file or args.secret):
+        raise UsageError("no secret: give --secret SCENE or --secret-file FILE, one for each secret")
 
 
 def _own_field(named: tuple[str, tuple[Any, CommandLineOption]]) -> tuple[str, Any, Any]:
@@ -457,14 +432,16 @@ def _own_field(named: tuple[str, tuple[Any, CommandLineOption]]) -> tuple[str, A
     return name, Annotated[(str if option.parse else kind) | None, described], field(default=None)
 
 
-def own_options(method: Method) -> dict[str, tuple[Any, CommandLineOption]]:
+def own_options(method: str) -> dict[str, tuple[Any, CommandLineOption]]:
     """Types and descriptions of the fields of a method's options that the command line has."""
     from keyss.methods.base import CommandLineOption
+    from keyss.methods.registry import options_of
 
-    hints = get_type_hints(method.options, include_extras=True)
+    options = options_of(method)
+    hints = get_type_hints(options, include_extras=True)
     return {
         each.name: (get_args(hints[each.name])[0], replace(extra, default=extra.default or str(each.default)))
-        for each in fields(method.options)
+        for each in fields(options)
         for extra in getattr(hints[each.name], "__metadata__", ())
         if isinstance(extra, CommandLineOption)
     }

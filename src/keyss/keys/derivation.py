@@ -7,20 +7,23 @@ result, with labels: no derived value reveals anything about another. Keys are n
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
 from argon2.exceptions import HashingError
 from argon2.low_level import Type, hash_secret_raw
 from cryptography.hazmat.primitives.ciphers import Cipher
 from cryptography.hazmat.primitives.ciphers.algorithms import ChaCha20
 from cryptography.hazmat.primitives.hashes import SHA256
 from cryptography.hazmat.primitives.kdf.hkdf import HKDFExpand
-from torch import Tensor
 
 from keyss.core.arrays import Bytes
 from keyss.core.errors import InputError
 from keyss.keys.key_file import normalized_key
+
+if TYPE_CHECKING:  # the command line reads options without torch
+    import torch
+    from torch import Tensor
 
 SALT_BYTES = 16
 MASTER_BYTES = 32
@@ -88,6 +91,7 @@ class DerivedKey:
 
     def embedding(self) -> Tensor:
         """[64] float32 unit vector, uniform on the sphere, which conditions the decoder."""
+        import torch
         from scipy.special import ndtri  # slower to load than a key is to derive
 
         words = np.frombuffer(self.expand("embedding", 8 * EMBEDDING_SIZE), "<u8")
@@ -103,4 +107,6 @@ def unit_vector(normal: Tensor) -> Tensor:
 
 def random_embeddings(count: int, generator: torch.Generator, size: int = EMBEDDING_SIZE) -> Tensor:
     """[count, size] embeddings of random keys: independent uniform unit vectors."""
+    import torch
+
     return unit_vector(torch.randn(count, size, generator=generator, dtype=torch.float64))

@@ -20,7 +20,7 @@ from .leaks.looking import (
     leak_scores as leak_scores,
     look_for_secret as look_for_secret,
 )
-from .peers.method import PeerOptions as PeerOptions
+from .peers.options import PeerOptions as PeerOptions
 from .robustness.changes import (
     Change as Change,
     cropping as cropping,

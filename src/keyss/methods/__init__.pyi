@@ -9,27 +9,21 @@ from .base import (
     divided as divided,
 )
 from .carry.method import most_contributing as most_contributing
-from .carry.room import (
-    CarryOptions as CarryOptions,
-    RecordRoom as RecordRoom,
-    SecretSize as SecretSize,
-    of_degree as of_degree,
-)
+from .carry.options import CarryOptions as CarryOptions
+from .carry.room import RecordRoom as RecordRoom, SecretSize as SecretSize, of_degree as of_degree
 from .decoy import Decoy as Decoy
 from .dither import dither_model as dither_model
 from .keyss.combined import CombinedPoses as CombinedPoses, PlacedScene as PlacedScene
-from .keyss.decoder import (
-    ATTRIBUTES as ATTRIBUTES,
-    Decoder as Decoder,
-    DecoderShape as DecoderShape,
-    parse_mask as parse_mask,
-)
+from .keyss.decoder import Decoder as Decoder
 from .keyss.latent import LatentDecoder as LatentDecoder
 from .keyss.options import (
+    ATTRIBUTES as ATTRIBUTES,
     DESIGNS as DESIGNS,
+    DecoderShape as DecoderShape,
     Design as Design,
     DesignName as DesignName,
     KeyssOptions as KeyssOptions,
+    parse_mask as parse_mask,
 )
 from .keyss.secret import DECODERS as DECODERS, KeyssSecret as KeyssSecret, choose_anchors as choose_anchors
 from .keyss.training import KeyssTraining as KeyssTraining

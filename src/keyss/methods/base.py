@@ -10,17 +10,20 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, ClassVar, Protocol, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, Self
 
-import torch
-
-from keyss.channels import AnyChannel, Channel, Format, Payload, Publish, channel_for
+from keyss.channels.names import AnyChannel, Format, Publish
 from keyss.core.errors import UsageError
-from keyss.core.gaussians import Gaussians
-from keyss.core.scene import Scene
 from keyss.fitting.config import PRESETS, FitConfig
-from keyss.methods.opened import Opened
-from keyss.progress import Reporter
+
+if TYPE_CHECKING:  # the command line reads options without torch
+    import torch
+
+    from keyss.channels import Channel, Payload
+    from keyss.core.gaussians import Gaussians
+    from keyss.core.scene import Scene
+    from keyss.methods.opened import Opened
+    from keyss.progress import Reporter
 
 
 @dataclass(frozen=True)
@@ -138,6 +141,8 @@ class MethodOptions:
 
     def place_in(self, cover: Gaussians | None) -> Channel:
         """The channel that carries the secrets in `cover`."""
+        from keyss.channels import channel_for
+
         return channel_for(self.publish, self.channel, self.format, cover)
 
     @property
@@ -234,7 +239,6 @@ class Method(Protocol):
     """One way to hide secrets."""
 
     name: str  # that of its options
-    summary: str  # one line that continues the name
     max_secrets: int  # in one model
     capabilities: Capabilities
     options: type[MethodOptions]

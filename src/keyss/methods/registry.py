@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from importlib import import_module
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from keyss.core.errors import InputError, UsageError, WrongKeyError
 
@@ -16,51 +16,78 @@ if TYPE_CHECKING:
 
 
 class Modules(NamedTuple):
-    """The modules of a method."""
+    """Where the parts of a method are, as `module:name`."""
 
-    hiding: str  # has METHOD, a `keyss.methods.base.Method`
-    opening: str  # has `unpack`, from the content of a channel or a handed-over file to an `Opened`
-    own: dict[str, type]  # options that only it has on the command line, which are bool or take a value
+    summary: str  # continues the name in one line
+    options: str  # its `MethodOptions`, in a module that does not import torch
+    hiding: str  # a `keyss.methods.base.Method`
+    opening: str  # from the content of a channel or a handed-over file to an `Opened`
 
 
-_ROOM = "keyss.methods"
+def _peer(module: str, options: str, summary: str) -> Modules:
+    room = "keyss.lab.peers"
+    return Modules(summary, f"{room}.options:{options}", f"{room}.{module}:METHOD", f"{room}.{module}:unpack")
+
+
 DEFAULT = "carry"
 METHODS = {
     "carry": Modules(
-        f"{_ROOM}.carry.method",
-        f"{_ROOM}.records.opening",
-        {"refit": str, "prune_to_fit": bool, "dither": bool, "sh_degree": str},
+        "the secrets' Gaussians, encrypted in the cover's",
+        "keyss.methods.carry.options:CarryOptions",
+        "keyss.methods.carry.method:METHOD",
+        "keyss.methods.records.opening:unpack",
     ),
     "keyss": Modules(
-        f"{_ROOM}.keyss.method",
-        f"{_ROOM}.keyss.secret",
-        {"design": str, "mask": str, "key_encoder": str, "clip_model": str},
+        "train one model and a decoder for all keys jointly, as the paper does",
+        "keyss.methods.keyss.options:KeyssOptions",
+        "keyss.methods.keyss.method:METHOD",
+        "keyss.methods.keyss.secret:unpack",
     ),
-    **{
-        name: Modules(f"keyss.lab.peers.{module}", f"keyss.lab.peers.{module}", {"common_poses": str})
-        for name, module in {
-            "3dgs": "bound",
-            "3dgs-sh": "sh",
-            "3dgs-decoder": "decoder",
-            "gs-hider": "gs_hider",
-            "watergs": "watergs",
-        }.items()
-    },
+    "3dgs": _peer("bound", "BoundOptions", "upper bound: the secret is a separate file"),
+    "3dgs-sh": _peer("sh", "ShOptions", "second harmonics for the secret, handed over (baseline)"),
+    "3dgs-decoder": _peer(
+        "decoder",
+        "DecoderOptions",
+        "a network from the cover's picture to the secret's, handed over (baseline)",
+    ),
+    "gs-hider": _peer(
+        "gs_hider", "GsHiderOptions", "features in place of harmonics, and a network for each scene"
+    ),
+    "watergs": _peer(
+        "watergs",
+        "WaterGsOptions",
+        "harmonics in low bits of harmonics, opacities by an autoencoder (Splats in Splats)",
+    ),
 }
+
+
+def _load(place: str) -> Any:
+    module, name = place.split(":")
+    return getattr(import_module(module), name)
+
+
+def options_of(name: str) -> type[MethodOptions]:
+    """The class of a method's options, without torch. Raises UsageError."""
+    options: type[MethodOptions] = _load(_modules(name).options)
+    return options
+
+
+def _modules(name: str) -> Modules:
+    if name not in METHODS:
+        raise UsageError(f"method {name!r}: expected {' or '.join(METHODS)}")
+    return METHODS[name]
 
 
 def get(name: str) -> Method:
     """The method of that name. Raises UsageError."""
-    if name not in METHODS:
-        raise UsageError(f"method {name!r}: expected {' or '.join(METHODS)}")
-    method: Method = import_module(METHODS[name].hiding).METHOD
+    method: Method = _load(_modules(name).hiding)
     return method
 
 
 def of_options(options: MethodOptions) -> Method:
     """The method with options of this class. Raises UsageError."""
     name = getattr(options, "method", None)
-    if name not in METHODS or type(options) is not get(name).options:
+    if name not in METHODS or type(options) is not options_of(name):
         raise UsageError(f"expected options of a method ({', '.join(METHODS)}), got {type(options).__name__}")
     return get(name)
 
@@ -104,5 +131,5 @@ def _unpacked(content: Content) -> Opened:
         raise InputError(
             f"the secret was hidden by the method {name!r}; this program has {', '.join(METHODS)}"
         )
-    unpack: Callable[[Content], Opened] = import_module(METHODS[name].opening).unpack
+    unpack: Callable[[Content], Opened] = _load(METHODS[name].opening)
     return unpack(content)

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import psutil
 import torch
@@ -39,50 +40,37 @@ def plan_hiding(
 ) -> Plan:
     """The plan of a hiding, without bounds. Writes nothing."""
     plan, count = method.plan(sources, options), len(sources)
-    configs, scenes = options.fits(count), [source.scene for source in sources]
-    sizes = [
-        config.max_gaussians if source.given is None else len(source.given)
-        for source, config in zip(sources, configs, strict=True)
-    ]
-    steps = [
-        options.fit.views_per_step * _step(device, size, scene)
-        for size, scene in zip(sizes, scenes, strict=True)
-    ]
+    scenes, sizes = [source.scene for source in sources], _sizes(options, sources)
+    steps = [_step(device, size, scene) for size, scene in zip(sizes, scenes, strict=True)]
     stages = [
         Stage(plain_stage(role_of(index, count)), config.iterations, size, config.iterations * step)
-        for index, (source, config, size, step) in enumerate(zip(sources, configs, sizes, steps, strict=True))
-        if source.given is None
+        for index, (config, size, step) in enumerate(zip(options.fits(count), sizes, steps, strict=True))
+        if sources[index].given is None
     ]
-    trained = sum(sizes) if options.trains else sum(each.gaussians for each in stages)
     if plan.steps:
-        step = sum(
-            _step(device, size, scene) for size, scene in zip(plan.rendered, scenes, strict=True) if size
-        )
+        rendered = zip(plan.rendered, scenes, strict=True)
+        step = sum(_step(device, size, scene) for size, scene in rendered if size)
         stages.append(Stage("hiding", plan.steps, sum(plan.rendered), plan.steps * step))
     measuring = sum(_RENDERS * len(scene.test) * step for scene, step in zip(scenes, steps, strict=True))
     measuring += _KEY_SECONDS * (count - 1)
     stages.append(Stage("encrypting, opening, measuring", 0, plan.gaussians, measuring))
-    degree = max(plan.sh_degree, options.fit.sh_degree)
-    appended = _MAX_APPENDED * sum(sizes[1:]) if options.place.grows else 0
-    written = plan.gaussians + appended + sum(sizes) + 2 * _STATE_COPIES * trained
+    needs = needs_of_hiding(options, sources)
     return replace(
         plan,
         method=method.name,
         stages=tuple(stages),
         file_bytes=_ply_bytes(plan.gaussians, plan.sh_degree),
-        disk_bytes=_ply_bytes(written, degree) + _OTHER_BYTES,
+        disk_bytes=needs.disk_bytes,
         free_bytes=None if out is None else _free_bytes(out),
-        memory_bytes=_memory_bytes(plan.gaussians, plan.sh_degree, scenes if trained else ()),
+        memory_bytes=needs.memory_bytes,
     )
 
 
 def plan_fit(scene: Scene, config: FitConfig, device: torch.device) -> Plan:
     """The plan of a plain fit."""
     gaussians, degree = config.max_gaussians, config.sh_degree
-    file_bytes, seconds = (
-        _ply_bytes(gaussians, degree),
-        config.iterations * config.views_per_step * _step(device, gaussians, scene),
-    )
+    seconds = config.iterations * config.views_per_step * _step(device, gaussians, scene)
+    needs = needs_of_fit(scene, config)
     return Plan(
         gaussians=gaussians,
         sh_degree=degree,
@@ -90,9 +78,45 @@ def plan_fit(scene: Scene, config: FitConfig, device: torch.device) -> Plan:
         capacity=0,
         steps=config.iterations,
         stages=(Stage("fit", config.iterations, gaussians, seconds),),
-        file_bytes=file_bytes,
-        disk_bytes=(1 + 2 * _STATE_COPIES) * file_bytes + _OTHER_BYTES,
-        memory_bytes=_memory_bytes(gaussians, degree, [scene]),
+        file_bytes=_ply_bytes(gaussians, degree),
+        disk_bytes=needs.disk_bytes,
+        memory_bytes=needs.memory_bytes,
+    )
+
+
+class Needs(NamedTuple):
+    """Upper limits of what a run takes at once."""
+
+    disk_bytes: int
+    memory_bytes: int
+
+
+def needs_of_hiding(options: MethodOptions, sources: Sequence[Source]) -> Needs:
+    """What a hiding takes; `options` are prepared."""
+    sizes, fit = _sizes(options, sources), options.fit
+    degree = max(fit.sh_degree if source.given is None else source.given.sh_degree for source in sources)
+    fitted = [options.trains or source.given is None for source in sources]
+    trained = sum(size for size, each in zip(sizes, fitted, strict=True) if each)
+    appended = _MAX_APPENDED * sum(sizes[1:]) if options.place.grows else 0
+    published = max(sizes[0], fit.max_gaussians if options.trains else 0) + appended
+    photos = [source.scene for source in sources if source.photos and trained]
+    return _needs(published, published + sum(sizes), trained, degree, photos)
+
+
+def needs_of_fit(scene: Scene, config: FitConfig) -> Needs:
+    """What a plain fit takes."""
+    cap = config.max_gaussians
+    return _needs(cap, cap, cap, config.sh_degree, [scene])
+
+
+def _needs(largest: int, written: int, trained: int, degree: int, photos: Sequence[Scene]) -> Needs:
+    """From numbers of Gaussians. A training has gradients, moments, two checkpoints."""
+    resident: int = psutil.Process().memory_info().rss
+    copies = 4 + 2 * _STATE_COPIES if trained else 3
+    targets = max((Targets.most_bytes(scene.train) for scene in photos), default=0)
+    return Needs(
+        _ply_bytes(written + 2 * _STATE_COPIES * trained, degree) + _OTHER_BYTES,
+        resident + copies * _ply_bytes(largest, degree) + targets,
     )
 
 
@@ -109,16 +133,16 @@ def in_a_line(plan: Plan) -> str:
     )
 
 
-def check_room(plan: Plan, out: Path | None) -> None:
+def check_room(needs: Needs, out: Path | None) -> None:
     """Raise OutputError where the disk of `out` is too small for all files; warn of too little memory."""
-    if out is not None and (free := _free_bytes(out)) < plan.disk_bytes:
+    if out is not None and (free := _free_bytes(out)) < needs.disk_bytes:
         raise OutputError(
-            f"{out}: expected {plan.disk_bytes / 1e6:,.0f} MB of free space for models and checkpoints, "
+            f"{out}: expected {needs.disk_bytes / 1e6:,.0f} MB of free space for models and checkpoints, "
             f"found {free / 1e6:,.0f} MB; make room, choose another place, or a smaller `max_gaussians`"
         )
-    if plan.memory_bytes > (available := _available_memory()):
+    if needs.memory_bytes > (available := _available_memory()):
         warnings.warn(
-            f"this takes about {plan.memory_bytes / 1e9:.1f} GB of memory, and {available / 1e9:.1f} GB are "
+            f"this takes about {needs.memory_bytes / 1e9:.1f} GB of memory, and {available / 1e9:.1f} GB are "
             "free: a smaller `width` or `max_gaussians` takes less",
             KeyssWarning,
             stacklevel=2,
@@ -135,6 +159,14 @@ def _available_memory() -> int:
     return available
 
 
+def _sizes(options: MethodOptions, sources: Sequence[Source]) -> list[int]:
+    """Upper limits of the Gaussians of the plain models."""
+    return [
+        config.max_gaussians if source.given is None else len(source.given)
+        for source, config in zip(sources, options.fits(len(sources)), strict=True)
+    ]
+
+
 def _free_bytes(out: Path) -> int:
     """Free bytes on the disk of `out`, which need not exist."""
     folder = Path(os.path.realpath(out))
@@ -147,14 +179,6 @@ def _step(device: torch.device, gaussians: int, scene: Scene) -> float:
     """Seconds of a training step with one view."""
     camera = scene.test[0].camera
     return _STEP_SECONDS[device.type] * (gaussians + camera.width * camera.height / 2)
-
-
-def _memory_bytes(gaussians: int, sh_degree: int, trained: Sequence[Scene]) -> int:
-    """Parameters, gradients, moments and two checkpoints, photos, and the present size of this process."""
-    resident: int = psutil.Process().memory_info().rss
-    copies = 4 + 2 * _STATE_COPIES if trained else 3
-    photos = max((Targets.most_bytes(scene.train) for scene in trained), default=0)
-    return resident + copies * _ply_bytes(gaussians, sh_degree) + photos
 
 
 def _ply_bytes(gaussians: int, sh_degree: int) -> int:

@@ -21,12 +21,12 @@ import zstandard
 from PIL import Image
 
 from files.formats.examples import model_of
+from files.formats.mutations import attempt, damaged, examples
 from keyss.core import Gaussians, InputError, KeyssWarning
 from keyss.files import model_bytes, model_of_bytes, read_model, write_model
 from keyss.files.formats.spz import SpzCodes
 from keyss.files.ply_table import read_vertex_table
 from keyss.methods.tensors import Header, unpack_tensors
-from mutations import attempt, damaged, examples
 
 MODEL = model_of(60, 1)
 MEGABYTE = 1 << 20

@@ -10,8 +10,8 @@ import pytest
 from channels.quiet.trained_like import keys
 from keyss.lab import candidate_scores, changed_low_bits
 from lab.stealth.careless import banded, overwritten, plain, shuffled
+from lab.stealth.detectors import confirmed
 from methods.carry.carried import embed_derived
-from stealth_detection import confirmed
 
 SECRETS = 4
 

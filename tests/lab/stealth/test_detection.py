@@ -8,7 +8,7 @@ from sklearn.metrics import roc_auc_score
 
 from keyss.lab import stealth_statistics
 from lab.stealth.careless import overwritten, plain_rounded
-from stealth_detection import Examples, areas, learned_detectors, single_detectors
+from lab.stealth.detectors import Examples, areas, learned_detectors, single_detectors
 
 SCENES = 4
 

@@ -7,7 +7,7 @@ import pytest
 from keyss.core import UsageError
 from keyss.lab import judge
 from lab.stealth.careless import banded, grey, normalised, overwritten, plain, plain_rounded
-from stealth_predictor import BitPredictor
+from lab.stealth.predictor import BitPredictor
 
 LIMIT = 0.01
 

@@ -4,24 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from typing import ClassVar
 
 from keyss.core.gaussians import Gaussians
-from keyss.lab.peers.method import HandedTensors, Peer, PeerOptions, Show
-from keyss.methods.base import Capabilities, Context, Plan, Source, Stego, Training
+from keyss.lab.peers.method import HandedTensors, Peer, Show
+from keyss.lab.peers.options import BoundOptions, PeerOptions
+from keyss.methods.base import Capabilities, Context, Plan, Source, Stego
 
 _NAMES = tuple(each.name for each in fields(Gaussians))
-
-
-@dataclass(frozen=True, kw_only=True)
-class BoundOptions(PeerOptions):
-    """Options of the plain models."""
-
-    method: ClassVar[str] = "3dgs"
-
-    def training(self, scenes: int) -> tuple[Training, ...]:
-        """No training beside that of plain models."""
-        return (Training(),) * scenes
 
 
 @dataclass(frozen=True)
@@ -48,7 +37,6 @@ def _open(handed: HandedTensors) -> Show:
 
 METHOD = BoundMethod(
     options=BoundOptions,
-    summary="upper bound: the secret is a separate file",
     capabilities=Capabilities(keys=False, hands_over=True),
     open=_open,
 )

@@ -7,9 +7,7 @@ the secret's pictures. The network is handed over; it is as large as one of GS-H
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import pairwise
-from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -18,9 +16,9 @@ from keyss.core.decoded import DecodedGaussians, PictureNetwork
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Camera
 from keyss.fitting.parameters import to_gaussians
-from keyss.lab.peers.method import HandedTensors, Peer, PeerOptions, PeerTraining, Show
+from keyss.lab.peers.method import HandedTensors, Peer, PeerTraining, Show
+from keyss.lab.peers.options import DecoderOptions
 from keyss.methods.base import Capabilities
-from keyss.methods.keyss.options import Scenes
 from keyss.methods.keyss.training import Picture
 from keyss.rendering import decode_picture
 
@@ -79,15 +77,6 @@ class DecoderTraining(PeerTraining):
         return stego, HandedTensors(network_tensors(network), self.frame)
 
 
-@dataclass(frozen=True, kw_only=True)
-class DecoderOptions(PeerOptions):
-    """The Gaussians show the cover only, so they start from its points."""
-
-    method: ClassVar[str] = "3dgs-decoder"
-
-    points: ClassVar[Scenes] = "cover"
-
-
 def _open(handed: HandedTensors) -> Show:
     network = network_of(handed)
     if len(network.background) != 3:
@@ -97,7 +86,6 @@ def _open(handed: HandedTensors) -> Show:
 
 METHOD = Peer(
     options=DecoderOptions,
-    summary="a network from the cover's picture to the secret's, handed over (baseline)",
     capabilities=Capabilities(keys=False, hands_over=True, models=False),
     open=_open,
     training=DecoderTraining,

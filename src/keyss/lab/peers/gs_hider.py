@@ -8,8 +8,6 @@ viewer of 3DGS models shows either.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import ClassVar
 
 import torch
 
@@ -18,7 +16,8 @@ from keyss.core.errors import InputError
 from keyss.core.gaussians import SH_C0, Gaussians
 from keyss.core.scene import Camera
 from keyss.lab.peers.decoder import Convolutions, network_of, network_tensors
-from keyss.lab.peers.method import HandedTensors, Peer, PeerOptions, PeerTraining, Show
+from keyss.lab.peers.method import HandedTensors, Peer, PeerTraining, Show
+from keyss.lab.peers.options import GsHiderOptions
 from keyss.methods.base import Capabilities
 from keyss.methods.keyss.training import Picture
 from keyss.rendering import decode_picture, render_features
@@ -62,13 +61,6 @@ class GsHiderTraining(PeerTraining):
         return stego, HandedTensors(network_tensors(secret), self.frame)
 
 
-@dataclass(frozen=True, kw_only=True)
-class GsHiderOptions(PeerOptions):
-    """See `PeerOptions`."""
-
-    method: ClassVar[str] = "gs-hider"
-
-
 def _open(handed: HandedTensors) -> Show:
     network = network_of(handed)
 
@@ -82,7 +74,6 @@ def _open(handed: HandedTensors) -> Show:
 
 METHOD = Peer(
     options=GsHiderOptions,
-    summary="features in place of harmonics, and a network for each scene",
     capabilities=Capabilities(keys=False, hands_over=True, standard=False, models=False),
     open=_open,
     training=GsHiderTraining,

@@ -6,7 +6,6 @@ import hashlib
 from abc import abstractmethod
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated, ClassVar
 
 import torch
 from torch import Tensor
@@ -17,20 +16,9 @@ from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Camera
 from keyss.core.similarity import Similarity
 from keyss.fitting.adam import RowAdam
-from keyss.methods.base import (
-    Capabilities,
-    CommandLineOption,
-    Context,
-    MethodOptions,
-    Plan,
-    Source,
-    Stego,
-    Training,
-    check_above_zero,
-)
+from keyss.lab.peers.options import PeerOptions
+from keyss.methods.base import Capabilities, Context, Plan, Source, Stego
 from keyss.methods.keyss.combined import PlacedScene
-from keyss.methods.keyss.decoder import DecoderShape
-from keyss.methods.keyss.options import Design, Scenes
 from keyss.methods.keyss.training import KeyssTraining, Picture
 from keyss.methods.opened import Frame, Remains
 from keyss.methods.tensors import Header, damage_refused, pack_tensors, unpack_tensors
@@ -119,50 +107,6 @@ class HandedSecret:
         return hashlib.sha256(self.handed.payload("peer").data).hexdigest()[:16]
 
 
-@dataclass(frozen=True, kw_only=True)
-class PeerOptions(MethodOptions):
-    """Options of all peers: the joint training is as long and has as many Gaussians as plain models.
-
-    It combines poses, points and densification as KeySS's does. Each peer has its own class, by which its
-    options are recognised.
-    """
-
-    points: ClassVar[Scenes] = "both"  # scenes whose sparse points start the model
-
-    common_poses: Annotated[
-        float,
-        CommandLineOption(
-            "Share of steps that render both scenes from one pose, 0 to 1; the papers': 1.",
-            metavar="SHARE",
-        ),
-    ] = 1.0
-    network_rate: float = 1e-3  # of Adam, decays to 5 % of it
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_above_zero(self, "network_rate")
-        self.check_published_exactly()
-        _ = self.design  # raises for values out of range
-
-    @property
-    def design(self) -> Design:
-        """The configuration of the joint training, which has no decoder of Gaussians and no keys."""
-        return Design(
-            name=self.method,
-            decoder=DecoderShape(),
-            ssim_weight=None,
-            beta_incorrect=0.0,
-            points=self.points,
-            common_poses=self.common_poses,
-            decoder_rate=self.network_rate,
-            weight_decay=0.0,
-        )
-
-    def training(self, scenes: int) -> tuple[Training, ...]:
-        """Every step renders all scenes."""
-        return (Training(self.fit.iterations, continues=False),) * scenes
-
-
 class PeerTraining(KeyssTraining):
     """The joint training of a peer: `prepare` adds what it trains, `draw` renders scenes."""
 
@@ -215,7 +159,6 @@ class Peer:
     """A `Method` with a joint training, one secret, and one file that is handed over for it."""
 
     options: type[PeerOptions]
-    summary: str
     capabilities: Capabilities
     open: Callable[[HandedTensors], Show]  # raises InputError and ValueError for damage
     training: type[PeerTraining] | None = None  # None: `hide` is another

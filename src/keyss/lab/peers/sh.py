@@ -7,13 +7,13 @@ of its own, the published model shows the secret.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import ClassVar
+from dataclasses import replace
 
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Camera
 from keyss.fitting.parameters import make_optimizers, to_gaussians
-from keyss.lab.peers.method import HandedTensors, Peer, PeerOptions, PeerTraining, Show
+from keyss.lab.peers.method import HandedTensors, Peer, PeerTraining, Show
+from keyss.lab.peers.options import ShOptions
 from keyss.methods.base import Capabilities
 from keyss.methods.keyss.training import Picture
 
@@ -39,13 +39,6 @@ class ShTraining(PeerTraining):
         return stego, HandedTensors({_NAMES[1]: secret_sh[visible]}, self.frame, rows=len(stego))
 
 
-@dataclass(frozen=True, kw_only=True)
-class ShOptions(PeerOptions):
-    """See `PeerOptions`."""
-
-    method: ClassVar[str] = "3dgs-sh"
-
-
 def _open(handed: HandedTensors) -> Show:
     (sh,) = handed.taken([_NAMES[1]])
     return lambda stego: replace(stego, sh=sh)
@@ -53,7 +46,6 @@ def _open(handed: HandedTensors) -> Show:
 
 METHOD = Peer(
     options=ShOptions,
-    summary="second harmonics for the secret, handed over (baseline)",
     capabilities=Capabilities(keys=False, hands_over=True),
     open=_open,
     training=ShTraining,

@@ -19,10 +19,9 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache
 from itertools import pairwise
-from typing import ClassVar
 
 import numpy as np
 import torch
@@ -30,13 +29,14 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from keyss.core.arrays import Bits, Words32
-from keyss.core.errors import InputError, UsageError
+from keyss.core.errors import InputError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Camera
 from keyss.files.formats.common import morton_order
 from keyss.fitting.parameters import make_optimizers, to_gaussians
 from keyss.keys.derivation import stream
-from keyss.lab.peers.method import HandedTensors, Peer, PeerOptions, PeerTraining, Show
+from keyss.lab.peers.method import HandedTensors, Peer, PeerTraining, Show
+from keyss.lab.peers.options import WaterGsOptions
 from keyss.methods.base import Capabilities
 from keyss.methods.keyss.training import Picture
 
@@ -223,21 +223,6 @@ class WaterGsTraining(PeerTraining):
         return stego, HandedTensors(tensors, self.frame, rows=len(stego))
 
 
-@dataclass(frozen=True, kw_only=True)
-class WaterGsOptions(PeerOptions):
-    """See `PeerOptions`."""
-
-    method: ClassVar[str] = "watergs"
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if int(self.fit.iterations * self.fit.grow_stop) < 1:
-            raise UsageError(
-                "`fit`: expected at least one step before growth stops and opacities are mapped; got "
-                f"{self.fit.iterations} steps, and growth in {self.fit.grow_stop:g} of them"
-            )
-
-
 def _open(handed: HandedTensors) -> Show:
     mapping = OpacityMapping().requires_grad_(False)
     names = [f"mapping.{name}" for name in mapping.state_dict()]
@@ -258,7 +243,6 @@ def _open(handed: HandedTensors) -> Show:
 
 METHOD = Peer(
     options=WaterGsOptions,
-    summary="harmonics in low bits of harmonics, opacities by an autoencoder (Splats in Splats)",
     capabilities=Capabilities(hands_over=True),
     open=_open,
     training=WaterGsTraining,

@@ -15,7 +15,8 @@ from keyss.fitting.image_metrics import subsample_views
 from keyss.fitting.plain import fit_scene
 from keyss.fitting.schedule import boost_of
 from keyss.methods.base import Capabilities, Context, Plan, Source, Stego, role_of
-from keyss.methods.carry.room import REFIT, CarryOptions, SecretSize, WholeRoom, room_for
+from keyss.methods.carry.options import REFIT, CarryOptions
+from keyss.methods.carry.room import SecretSize, WholeRoom, room_for
 from keyss.methods.records.embedding import embed_models
 from keyss.methods.records.quantise import out_of_range
 from keyss.rendering import contributions
@@ -40,7 +41,6 @@ class CarryMethod:
     """See `keyss.methods.base.Method`."""
 
     name = CarryOptions.method
-    summary = "the secrets' Gaussians, encrypted in the cover's"
     max_secrets = 256
     capabilities = Capabilities()
     options = CarryOptions

@@ -33,7 +33,8 @@ from keyss.core.arrays import Bytes, Doubles, Flags
 from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.keys.derivation import expand
-from keyss.methods.keyss.decoder import Decoder, DecoderShape
+from keyss.methods.keyss.decoder import Decoder
+from keyss.methods.keyss.options import DecoderShape
 
 OWN = 13  # latents without the code: opacity 1, rotation 3, log scales 3, position 3, constant colour 3
 MOST = (24, 14)  # latents of one secret, of each of two: more cost the cover more than they give secrets

@@ -37,7 +37,6 @@ class KeyssMethod:
     """See `keyss.methods.base.Method`."""
 
     name = KeyssOptions.method
-    summary = "train one model and a decoder for all keys jointly, as the paper does"
     max_secrets = 9
     capabilities = Capabilities()
     options = KeyssOptions

@@ -6,9 +6,69 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Annotated, ClassVar, Literal, get_args
 
+from msgspec import Meta
+
 from keyss.core.errors import UsageError, did_you_mean
+from keyss.keys.derivation import EMBEDDING_SIZE
 from keyss.methods.base import CommandLineOption, MethodOptions, Training, check_above_zero
-from keyss.methods.keyss.decoder import ATTRIBUTES, DecoderShape, Mask, parse_mask
+
+Attribute = Literal["op", "ro", "sc", "xyz", "sh"]  # opacity, rotation, scale, position, colour
+Mask = tuple[Attribute, ...]  # the attributes where theta (equation 8) is 1
+ATTRIBUTES: Mask = get_args(Attribute)
+CHANNELS = {"op": 1, "ro": 4, "sc": 3, "xyz": 3}  # sh: three per coefficient
+
+Width = Annotated[int, Meta(ge=1, le=4096)]  # bounds for what is read from files
+
+
+def parse_mask(text: str) -> Mask:
+    """The attributes in a text like `op,ro,sc`, in canonical order. Raises UsageError for unknown or none."""
+    names = {name.strip() for name in text.split(",") if name.strip()}
+    unknown = sorted(names - set(ATTRIBUTES))
+    if unknown or not names:
+        raise UsageError(
+            f"mask {text!r}: expected some of {','.join(ATTRIBUTES)}, got {','.join(unknown) or 'none'}"
+        )
+    return tuple(name for name in ATTRIBUTES if name in names)
+
+
+@dataclass(frozen=True, kw_only=True)
+class DecoderShape:
+    """Kind and sizes of a decoder; appendix B: two layers for the common branch, two for each other."""
+
+    kind: Annotated[str, Meta(min_length=1, max_length=32)] = (
+        "mlp"  # see `keyss.methods.keyss.secret.DECODERS`
+    )
+    mask: Mask = ATTRIBUTES  # theta
+    hidden: tuple[Width, Width] = (64, 128)  # of the common branch; their program's, the paper gives none
+    branch: Width = 64  # of each attribute's branch
+    sh_degree: Annotated[int, Meta(ge=0, le=3)] = 3
+    key_size: Width = EMBEDDING_SIZE  # numbers of a key's vector
+    # Their program's inputs, residuals, start of the weights and training instead of the text's.
+    released: bool = False
+    secrets: Annotated[int, Meta(ge=1, le=9)] = 1  # of the model
+    secret: Annotated[int, Meta(ge=0, le=8)] = 0  # which of them, if each has its own decoder
+
+    def sized(self, sh_degree: int, key_size: int, secrets: int) -> DecoderShape:
+        """The same for models of that SH degree, keys of so many numbers and so many secrets."""
+        return replace(self, sh_degree=sh_degree, key_size=key_size, secrets=secrets)
+
+    @property
+    def inputs(self) -> int:
+        """Numbers that describe one Gaussian and a key."""
+        return 11 + 3 * (self.sh_degree + 1) ** 2 + self.key_size
+
+    def channels(self, attribute: str) -> int:
+        return CHANNELS.get(attribute, 3 * (self.sh_degree + 1) ** 2)
+
+    @property
+    def weights(self) -> int:
+        """Weights that are multiplied to decode one Gaussian, without biases."""
+        if self.kind == "latent":
+            return 0
+        first, second = self.hidden
+        branches = sum(self.branch * (second + self.channels(each)) for each in self.mask)
+        return self.inputs * first + first * second + branches
+
 
 Scenes = Literal["both", "cover", "secret"]  # "both": all scenes, also with several secrets
 

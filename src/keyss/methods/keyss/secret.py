@@ -21,8 +21,9 @@ from keyss.channels import Content, Payload, is_appended
 from keyss.core.errors import InputError
 from keyss.core.gaussians import DRAWN_OPACITY, Gaussians, compensate_pruning
 from keyss.core.similarity import Similarity
-from keyss.methods.keyss.decoder import Decoder, DecoderShape, parse_mask
+from keyss.methods.keyss.decoder import Decoder
 from keyss.methods.keyss.latent import LatentDecoder
+from keyss.methods.keyss.options import DecoderShape, parse_mask
 from keyss.methods.opened import Frame, Remains
 from keyss.methods.tensors import Header, damage_refused, pack_tensors, unpack_tensors
 

@@ -1,8 +1,8 @@
 """Damaged files: each has to be read or to end in an InputError, soon and in little memory.
 
-    python benchmarks/mutations.py --count 100000
-    python benchmarks/mutations.py --count 10000 --lies             # only those that lie about sizes
-    python benchmarks/mutations.py --count 10000 --only a.payload   # what a key opens, written by an attacker
+    python tests/files/formats/mutations.py --count 100000
+    python tests/files/formats/mutations.py --count 10000 --lies             # only those that lie about sizes
+    python tests/files/formats/mutations.py --count 10000 --only a.payload   # written by an attacker
 
 Files of every format are damaged at random, before and after they are packed: bits, bytes, words with
 extreme values, cuts, repeats, megabytes of zeros; every other one states sizes that are not true
@@ -25,6 +25,12 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+
+import numpy as np
+import torch
+
+from files.formats.lies import LIES, image
 from keyss.core import Gaussians, InputError
 from keyss.core.decoded import DecodedGaussians, PictureNetwork
 from keyss.files import load_scene, model_bytes, model_of_bytes
@@ -32,10 +38,6 @@ from keyss.files.formats.spz import SpzCodes
 from keyss.files.images import read_image
 from keyss.methods.records import whole
 from keyss.methods.tensors import Header, damage_refused, pack_tensors, unpack_tensors
-from lies import LIES, image
-
-import numpy as np
-import torch
 
 SECONDS = 2.0  # that one file of a few kilobytes may take
 CARRIERS = 6000  # Gaussians of the published model that holds a payload

@@ -1,0 +1,103 @@
+"""The options of the peers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated, ClassVar
+
+from keyss.core.errors import UsageError
+from keyss.methods.base import CommandLineOption, MethodOptions, Training, check_above_zero
+from keyss.methods.keyss.options import DecoderShape, Design, Scenes
+
+
+@dataclass(frozen=True, kw_only=True)
+class PeerOptions(MethodOptions):
+    """Options of all peers: the joint training is as long and has as many Gaussians as plain models.
+
+    It combines poses, points and densification as KeySS's does. Each peer has its own class, by which its
+    options are recognised.
+    """
+
+    points: ClassVar[Scenes] = "both"  # scenes whose sparse points start the model
+
+    common_poses: Annotated[
+        float,
+        CommandLineOption(
+            "Share of steps that render both scenes from one pose, 0 to 1; the papers': 1.",
+            metavar="SHARE",
+        ),
+    ] = 1.0
+    network_rate: float = 1e-3  # of Adam, decays to 5 % of it
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_above_zero(self, "network_rate")
+        self.check_published_exactly()
+        _ = self.design  # raises for values out of range
+
+    @property
+    def design(self) -> Design:
+        """The configuration of the joint training, which has no decoder of Gaussians and no keys."""
+        return Design(
+            name=self.method,
+            decoder=DecoderShape(),
+            ssim_weight=None,
+            beta_incorrect=0.0,
+            points=self.points,
+            common_poses=self.common_poses,
+            decoder_rate=self.network_rate,
+            weight_decay=0.0,
+        )
+
+    def training(self, scenes: int) -> tuple[Training, ...]:
+        """Every step renders all scenes."""
+        return (Training(self.fit.iterations, continues=False),) * scenes
+
+
+@dataclass(frozen=True, kw_only=True)
+class BoundOptions(PeerOptions):
+    """Options of the plain models."""
+
+    method: ClassVar[str] = "3dgs"
+
+    def training(self, scenes: int) -> tuple[Training, ...]:
+        """No training beside that of plain models."""
+        return (Training(),) * scenes
+
+
+@dataclass(frozen=True, kw_only=True)
+class DecoderOptions(PeerOptions):
+    """The Gaussians show the cover only, so they start from its points."""
+
+    method: ClassVar[str] = "3dgs-decoder"
+
+    points: ClassVar[Scenes] = "cover"
+
+
+@dataclass(frozen=True, kw_only=True)
+class GsHiderOptions(PeerOptions):
+    """See `PeerOptions`."""
+
+    method: ClassVar[str] = "gs-hider"
+
+
+@dataclass(frozen=True, kw_only=True)
+class ShOptions(PeerOptions):
+    """See `PeerOptions`."""
+
+    method: ClassVar[str] = "3dgs-sh"
+
+
+@dataclass(frozen=True, kw_only=True)
+class WaterGsOptions(PeerOptions):
+    """See `PeerOptions`."""
+
+    method: ClassVar[str] = "watergs"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if int(self.fit.iterations * self.fit.grow_stop) < 1:
+            raise UsageError(
+                "`fit`: expected at least one step before growth stops and opacities are mapped; got "
+                f"{self.fit.iterations} steps, and growth in {self.fit.grow_stop:g} of them"
+            )

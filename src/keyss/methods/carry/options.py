@@ -1,0 +1,82 @@
+"""The options of carrying."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Annotated, Any, ClassVar, Literal, Self
+
+from keyss.core.errors import UsageError
+from keyss.fitting.config import FitConfig
+from keyss.methods.base import CommandLineOption, MethodOptions, Training
+
+REFIT = 1.15  # steps of a refit to photos for each of a fit: with as many, secrets lose 0.15 dB
+
+
+@dataclass(frozen=True, kw_only=True)
+class CarryOptions(MethodOptions):
+    """Options of carrying; `fit` is that of plain models, of which secrets get REFIT more steps."""
+
+    method: ClassVar[str] = "carry"
+
+    refit: Annotated[
+        Literal["auto", "always", "never"],
+        CommandLineOption("Refit secrets to the room in the cover; auto: those that do not fit into it."),
+    ] = "auto"
+    prune_to_fit: Annotated[
+        bool,
+        CommandLineOption("Leave out the least visible Gaussians of too large a secret, without a refit."),
+    ] = False
+    dither: Annotated[bool, CommandLineOption("Give the cover new low bits where they are not random.")] = (
+        False
+    )
+    sh_degree: Annotated[
+        int | None,
+        CommandLineOption(
+            "Degree of the published model's spherical harmonics, 0 to 3.", metavar="N", default="the cover's"
+        ),
+    ] = None
+    iterations: int | None = None  # of a refit; None: REFIT for each of `fit`, and fewer without photos
+
+    # Set by `prepare`: the highest SH degree of secrets, and steps of the refit of each secret, 0 for those
+    # that are carried as they are.
+    max_secret_degree: int = 3
+    refits: tuple[int, ...] = ()
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.refit == "always" and self.prune_to_fit:
+            raise UsageError('`prune_to_fit` is instead of a refit: leave it out, or `refit="always"`')
+
+    @property
+    def may_train(self) -> bool:
+        """True unless refits are ruled out."""
+        return self.refit != "never" and not self.prune_to_fit
+
+    @property
+    def may_show(self) -> bool:
+        """Whether secrets that do not go in unnoticed may go in visibly."""
+        asked = self.prune_to_fit or self.dither or self.format is not None
+        return self.publish == "as-is" and self.refit == "auto" and not asked
+
+    def fits(self, scenes: int) -> list[FitConfig]:
+        """Secrets get the steps of a refit if none follows, and no more harmonics than can be carried."""
+        degree = min(self.fit.sh_degree, self.max_secret_degree)
+        alone = round((1 + REFIT) * self.fit.iterations)
+        of_secrets = [
+            replace(self.fit, sh_degree=degree, iterations=self.fit.iterations if steps else alone)
+            for steps in self.refits or (0,) * (scenes - 1)
+        ]
+        return [self.fit, *of_secrets]
+
+    def training(self, scenes: int) -> tuple[Training, ...]:
+        """The refits."""
+        return (Training(), *map(Training, self.refits or (0,) * (scenes - 1)))
+
+    def for_fitted_cover(self) -> Self:
+        """Dithered where the channel needs random low bits: a fit of few steps may not have them."""
+        return replace(self, dither=True) if self.place.records else self
+
+    def with_fit(self, **changes: Any) -> Self:
+        """The same with changed fields of `fit`; `iterations` also changes those of refits."""
+        found = super().with_fit(**changes)
+        return replace(found, iterations=changes["iterations"]) if "iterations" in changes else found
