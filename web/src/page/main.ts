@@ -176,13 +176,14 @@ class Page {
       this.searches(search);
       this.say(search === 'quick' ? 'Trying the key …' : `${said} Searching more thoroughly …`);
       delete page.main.dataset.picture;
-      const { model, file, stopped } = await this.opener.ask({ key, thorough: search === 'thorough' });
+      const { model, file, foreign, stopped } = await this.opener.ask({ key, thorough: search === 'thorough' });
       if (own !== this.work) return;
       this.searches('');
       if (search === 'quick') tell({ event: 'key-tried' });
       if (file || model) tell({ event: 'opened', kind: file ? 'file' : 'model' });
       if (file) said += this.offer(file);
       if (model) said += this.reveal(model);
+      if (foreign) said += ` About ${count(foreign)} Gaussians of the file were added or changed: it may not be its secret.`;
       this.say(stopped ? `${said} Search stopped.` : said);
       await this.picture();
       if (own !== this.work) return;

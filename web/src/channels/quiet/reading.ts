@@ -27,6 +27,7 @@ const SALTS_TRIED = 4;
 const DUMMY_CELLS = 2; // of a carrier that a key which opens nothing looks into
 const NARROW_HARMONICS = 9; // of degree 1: some secrets leave the low bits of the others as they are
 const [LEAST_BYTES, MIN_BLOCKS] = [48, 4]; // of a block of codes, of a file with room
+const [FOREIGN, DEVIATIONS] = [1 / 4, 5]; // share of the Gaussians that may be foreign; of what is left
 const MAX_BITS = 2 ** 30; // of codes; more would take more memory than tabs have
 
 /** The data of a cell, and its carrier. */
@@ -130,12 +131,22 @@ export class QuietReader implements Reader {
       const chunks = records.map((each): [number, Uint8Array] => [
         each[0] | (each[1] << 8) | (each[2] << 16), each.subarray(NUMBER_BYTES),
       ]);
-      return this.payload(dataKey, parameters, decoded(codewords, chunks).subarray(0, size));
+      const payload = await this.payload(dataKey, parameters, decoded(codewords, chunks).subarray(0, size));
+      return { ...payload, foreign: this.foreign(parameters, records.length) };
     }
     const known = new Set(records.map(bytesKey));
     const all = [...records, ...copies.filter((each) => !known.has(bytesKey(each)))];
     if (!all.length) throw tooMuchLost();
-    return { service: 'records', method, header, records: all };
+    const foreign = this.foreign(parameters, records.length + copies.length);
+    return { service: 'records', method, header, records: all, foreign };
+  }
+
+  /** Where `cells` are left of a secret. */
+  private foreign({ gaussians, count }: Parameters, cells: number): number | undefined {
+    const [rows, all] = [this.names.length / IDENTITY_BYTES, Math.max(1, count)];
+    const left = Math.min(1, cells / all);
+    const found = rows - Math.floor((left + DEVIATIONS * Math.sqrt((left * (1 - left)) / all)) * gaussians);
+    return found > FOREIGN * rows ? found : undefined;
   }
 
   private async payload(dataKey: Uint8Array, { method }: Parameters, encrypted: Uint8Array): Promise<Content> {
