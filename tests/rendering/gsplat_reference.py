@@ -20,7 +20,7 @@ from torch import Tensor
 
 from rendering.pretended_cuda import OnGpu, held
 
-ALPHA_MIN, TRANSMITTANCE_MIN, ALPHA_MAX = 1 / 255, 1e-4, 0.999  # `Common.h`, and the rasterizing kernels
+ALPHA_MIN, TRANSMITTANCE_MIN, ALPHA_MAX = 1 / 255, 1e-4, 0.999  # in CUDA's kernels
 NAN = math.nan
 
 
@@ -43,7 +43,9 @@ def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
     return launch
 
 
-def project(means: Tensor, quats: Tensor, scales: Tensor, *camera: Any, **planes: float) -> tuple[Tensor, ...]:
+def project(
+    means: Tensor, quats: Tensor, scales: Tensor, *camera: Any, **planes: float
+) -> tuple[Tensor, ...]:
     covariances, _ = reference._quat_scale_to_covar_preci(quats, scales, True, False)
     found: tuple[Tensor, ...] = reference._fully_fused_projection(means, covariances, *camera, **planes)
     return found
@@ -51,9 +53,9 @@ def project(means: Tensor, quats: Tensor, scales: Tensor, *camera: Any, **planes
 
 @kernel
 def projection_ewa_3dgs_fused_fwd(
-    means: Tensor, covars: None, quats: Tensor, scales: Tensor, opacities: Tensor, viewmats: Tensor, Ks: Tensor,
-    width: int, height: int, eps2d: float, near: float, far: float, radius_clip: float, compensate: bool,
-    camera_model: str,
+    means: Tensor, covars: None, quats: Tensor, scales: Tensor, opacities: Tensor, viewmats: Tensor,
+    Ks: Tensor, width: int, height: int, eps2d: float, near: float, far: float, radius_clip: float,
+    compensate: bool, camera_model: str,
 ) -> tuple[Tensor | None, ...]:  # fmt: skip
     assert (covars, radius_clip, compensate, camera_model) == (None, 0.0, False, "pinhole")
     # The kernels draw what is on the near plane, unlike the reference.
@@ -123,10 +125,22 @@ def intersect_tile(
     means2d: Tensor, radii: Tensor, depths: Tensor, images: None, gaussians: None, count: int, size: int,
     columns: int, rows: int, sort: bool, segmented: bool,
 ) -> tuple[Tensor, ...]:  # fmt: skip
+    """As `reference._isect_tiles`, whose loops in Python take too long for trainings."""
     assert sort
-    counts, keys, ids = reference._isect_tiles(means2d, radii, depths, size, columns, rows, False)
-    keys, order = keys.sort(stable=True)  # as CUB's radix sort is
-    return counts, keys, ids[order]
+    count_of_tiles = means2d.new_tensor([columns, rows])
+    low = ((means2d - radii) / size).floor().nan_to_num(0).clamp_min(0).minimum(count_of_tiles).int()
+    high = ((means2d + radii) / size).ceil().nan_to_num(0).clamp_min(0).minimum(count_of_tiles).int()
+    spans = (high - low) * (radii > 0).all(-1, keepdim=True)
+    counts = spans.prod(-1, dtype=torch.int32)
+    ids = torch.arange(counts.numel()).repeat_interleave(counts.flatten())
+    within = torch.arange(len(ids)) - (counts.flatten().cumsum(0) - counts.flatten())[ids]
+    widths, starts = spans[..., 0].flatten()[ids], low.reshape(-1, 2)[ids]
+    tiles = (starts[:, 1] + within // widths) * columns + starts[:, 0] + within % widths
+    tiles = (ids // means2d.shape[-2] << (columns * rows).bit_length()) | tiles
+    keys, order = ((tiles << 32) | depths.flatten()[ids].view(torch.int32)).sort(
+        stable=True
+    )  # as CUB's sort is
+    return counts, keys, ids[order].int()
 
 
 @kernel
@@ -136,8 +150,8 @@ def intersect_offset(ids: Tensor, images: int, columns: int, rows: int) -> Tenso
 
 @kernel
 def rasterize_to_pixels_3dgs_fwd(
-    means2d: Tensor, conics: Tensor, colors: Tensor, opacities: Tensor, backgrounds: Tensor | None, masks: None,
-    width: int, height: int, size: int, offsets: Tensor, ids: Tensor,
+    means2d: Tensor, conics: Tensor, colors: Tensor, opacities: Tensor, backgrounds: Tensor | None,
+    masks: None, width: int, height: int, size: int, offsets: Tensor, ids: Tensor,
 ) -> tuple[Tensor | None, ...]:  # fmt: skip
     assert masks is None
     inputs = (means2d, conics, colors, opacities, width, height, size, offsets, ids, backgrounds)
@@ -146,13 +160,15 @@ def rasterize_to_pixels_3dgs_fwd(
 
 @kernel
 def rasterize_to_pixels_3dgs_bwd(
-    means2d: Tensor, conics: Tensor, colors: Tensor, opacities: Tensor, backgrounds: Tensor | None, masks: None,
-    width: int, height: int, size: int, offsets: Tensor, ids: Tensor, alphas: Tensor, last: None,
+    means2d: Tensor, conics: Tensor, colors: Tensor, opacities: Tensor, backgrounds: Tensor | None,
+    masks: None, width: int, height: int, size: int, offsets: Tensor, ids: Tensor, alphas: Tensor, last: None,
     v_colors: Tensor, v_alphas: Tensor, absolute: bool,
 ) -> tuple[Tensor | None, ...]:  # fmt: skip
     assert not absolute
     gradients = pullback(
-        lambda *leaves: reference._rasterize_to_pixels(*leaves, width, height, size, offsets, ids, backgrounds),
+        lambda *leaves: reference._rasterize_to_pixels(
+            *leaves, width, height, size, offsets, ids, backgrounds
+        ),
         [means2d, conics, colors, opacities],
         [v_colors, v_alphas],
     )
@@ -166,9 +182,10 @@ def pullback(
     """The gradients of a function's inputs; zeros where it does not depend on any."""
     leaves = [each.detach().requires_grad_() for each in inputs]
     results = function(*leaves)
-    if not results[0].requires_grad:
-        return tuple(map(torch.zeros_like, leaves))
-    return torch.autograd.grad(results, leaves, upstream, materialize_grads=True)
+    # Where nothing is drawn, a result depends on none of them.
+    total = sum((result * factor).sum() for result, factor in zip(results, upstream, strict=True))
+    total = total + sum(0 * leaf.sum() for leaf in leaves)
+    return torch.autograd.grad(total, leaves)
 
 
 def rasterize_to_indices_3dgs(

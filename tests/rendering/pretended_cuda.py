@@ -48,6 +48,10 @@ class PretendedGpu(TorchFunctionMode):
         self, func: Callable[..., Any], types: Any, args: tuple[Any, ...] = (), kwargs: Any = None
     ) -> Any:
         kwargs = kwargs or {}
+        if func is torch._C._nn._parse_to:  # of `Module.to`
+            return func(*args, **kwargs)
+        if func is torch._has_compatible_shallow_copy_type:
+            return isinstance(args[0], OnGpu) == isinstance(args[1], OnGpu)
         if func in _BACKWARD and self.checks:
             with PretendedGpu(checks=False):
                 return func(*args, **kwargs)
@@ -62,7 +66,9 @@ class PretendedGpu(TorchFunctionMode):
         if self.checks and there and not moves and func not in _CROSSING:
             foreign = [each.shape for each in tensors if not isinstance(each, OnGpu) and each.dim() > 0]
             if foreign:
-                raise RuntimeError(f"{func}: expected all tensors to be on one device, got {foreign} on the CPU")
+                raise RuntimeError(
+                    f"{func}: expected all tensors to be on one device, got {foreign} on the CPU"
+                )
         if self.checks and func is Tensor.__getitem__ and not isinstance(args[0], OnGpu) and there:
             raise RuntimeError("indices should be either on cpu or on the same device as the indexed tensor")
         goes = there if not wanted else wanted[-1] == "cuda"
@@ -93,11 +99,6 @@ def _placed(value: Any, there: bool) -> Any:
 
 @contextmanager
 def pretended_gpu() -> Iterator[torch.device]:
-    """The device, while it is there. Modules move to it as new parameters."""
-    before = torch.__future__.get_overwrite_module_params_on_conversion()
-    torch.__future__.set_overwrite_module_params_on_conversion(True)
-    try:
-        with PretendedGpu():
-            yield DEVICE
-    finally:
-        torch.__future__.set_overwrite_module_params_on_conversion(before)
+    """The device, while it is there."""
+    with PretendedGpu():
+        yield DEVICE
