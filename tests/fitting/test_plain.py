@@ -104,7 +104,7 @@ def test_one_seed_gives_one_model_and_leaves_the_global_random_state_alone() -> 
     assert not _same(first, fit_scene(scene, replace(CONFIG, seed=1)).gaussians)
 
 
-@pytest.mark.parametrize("iteration", [1, 33, 80])
+@pytest.mark.parametrize("iteration", [1, 33])
 def test_an_interrupted_run_resumes_to_the_same_model(tmp_path: Path, iteration: int) -> None:
     scene, path = tiny_scene(), tmp_path / "checkpoint.safetensors"
     with pytest.raises(Interrupted) as caught:
@@ -123,16 +123,6 @@ def test_a_checkpoint_of_other_settings_is_refused(tmp_path: Path) -> None:
         fit_scene(tiny_scene(3), replace(CONFIG, iterations=5), checkpoint=path, resume=True)
 
 
-def test_a_checkpoint_of_another_version_is_refused(tmp_path: Path) -> None:
-    scene, path = tiny_scene(), tmp_path / "checkpoint.safetensors"
-    fit_scene(scene, replace(CONFIG, iterations=5), checkpoint=path)
-    tensors, meta = load_checkpoint(path)
-    tensors["sh0"] = tensors.pop("sh")
-    save_checkpoint(path, tensors, meta)
-    with pytest.raises(InputError, match="this version"):
-        fit_scene(scene, replace(CONFIG, iterations=5), checkpoint=path, resume=True)
-
-
 def test_a_damaged_checkpoint_is_an_input_error(tmp_path: Path) -> None:
     path = tmp_path / "checkpoint.safetensors"
     save_checkpoint(path, {"a": torch.ones(3)}, {"iteration": 1})
@@ -149,24 +139,7 @@ def test_a_scene_without_points_starts_from_random_ones() -> None:
     assert mean_psnr(fitted, scene.test, scene.background) > 18
 
 
-def test_sh_degree_rises_within_a_run_of_any_length() -> None:
-    for iterations in (10, 300, 30_000):
-        config = FitConfig(iterations=iterations)
-        assert config.sh_degree_at(0) == 0
-        assert config.sh_degree_at(iterations) == 3
-
-
 @pytest.mark.parametrize("changes", [{"iterations": 0}, {"max_gaussians": -5}, {"sh_degree": 4}])
 def test_settings_out_of_range_are_refused_by_name(changes: dict[str, int]) -> None:
     with pytest.raises(UsageError, match=next(iter(changes))):
         FitConfig(**changes)  # type: ignore[arg-type]
-
-
-def test_nothing_is_left_below_the_limit_of_pruning() -> None:
-    config = replace(CONFIG, iterations=60, grow_start=0.1, grow_stop=0.2, prune_opacity=0.08)
-    fitted = fit_scene(tiny_scene(), config).gaussians
-    run = PlainRun(tiny_scene(), config, torch.device("cpu"))
-    torch.manual_seed(config.known_seed)
-    while run.iteration < config.iterations:
-        run.step()
-    assert float(run.gaussians().opacities.min()) < 0.08 <= float(fitted.opacities.min())

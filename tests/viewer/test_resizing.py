@@ -53,6 +53,7 @@ def assert_drawn(tab: Visit, model: Gaussians) -> tuple[int, int]:
     return width, height
 
 
+@pytest.mark.slow
 def test_the_secret_stays_when_the_search_has_ended(chromium: Any, page_file: Path) -> None:
     """The panel gets lines and loses them, and the canvas another height, while pictures are drawn."""
     with visit(chromium, viewport=PORTRAIT, **PHONE) as tab:
@@ -72,6 +73,7 @@ def test_the_secret_stays_when_the_search_has_ended(chromium: Any, page_file: Pa
         assert tab.page.evaluate(focused) != "key"
 
 
+@pytest.mark.slow
 def test_a_phone_is_turned_and_its_panel_folded(chromium: Any, page_file: Path, published: Gaussians) -> None:
     fits = "(panel => panel.scrollWidth <= panel.clientWidth)(document.querySelector('.panel'))"
     with visit(chromium, viewport=PORTRAIT, **PHONE) as tab:
@@ -106,6 +108,7 @@ def test_a_phone_is_turned_while_it_shows_a_secret(
             assert tab.page.input_value("#wipe") == "100"
 
 
+@pytest.mark.slow
 def test_the_element_of_another_site_is_resized(
     tab: Visit, stego: Path, published: Gaussians, secret: Gaussians, tmp_path: Path
 ) -> None:
