@@ -16,7 +16,7 @@ import pytest
 import torch
 from gsplat.cuda._torch_impl import _isect_tiles
 
-from channels.low_bits.trained_like import trained_like
+from channels.quiet.trained_like import trained_like
 from fitting.small_trainings import FIT, placed
 from keyss import CarryOptions, FitConfig, Secret, hide, reveal
 from keyss.fitting import PlainRun
