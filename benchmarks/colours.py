@@ -40,7 +40,7 @@ from pathlib import Path
 
 from keyss import lab
 from colours_payloads import run_payloads
-from keyss.channels import Colours, ColoursCover, Payload
+from keyss.channels import Colours, ColoursCover, ColoursReader, Payload
 from keyss.core.errors import BackendError, InputError, WrongKeyError
 from keyss.core.gaussians import Gaussians
 from keyss.core.similarity import Similarity
@@ -201,10 +201,10 @@ def _measure_speed(models: Sequence[Path], gaussians: int | None) -> None:
                     Colours().prepare(model).embed([("a key of some length", Payload(METHOD, bytes(200)))])
                 )
             elif step == "right":
-                Colours().reader(stego).open("a key of some length")
+                ColoursReader.of(stego).open("a key of some length")
             else:
                 with suppress(WrongKeyError):
-                    Colours().reader(stego).open("another key of some length")
+                    ColoursReader.of(stego).open("another key of some length")
             seconds.append(f"{time.monotonic() - start:.1f} s")
         memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
         print(f"| {path.stem} | {len(model):,} | {' | '.join(seconds)} | {memory:,.0f} MiB |", flush=True)
@@ -225,7 +225,7 @@ def _drawn(model: Gaussians, count: int | None) -> Gaussians:
 
 def _opens(model: Gaussians, seed: int, data: bytes) -> bool:
     try:
-        return Colours().reader(model).open(_key(seed)) == Payload(METHOD, data)
+        return ColoursReader.of(model).open(_key(seed)) == Payload(METHOD, data)
     except (WrongKeyError, InputError):
         return False
 

@@ -5,10 +5,9 @@ from __future__ import annotations
 import math
 import os
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from itertools import combinations
-from typing import Any
 
 import numpy as np
 import pytest
@@ -16,12 +15,13 @@ import torch
 from hypothesis import given, settings, strategies as st
 
 from channels.colours.made import PACKED, cover, embed, extract
-from keyss.channels import COLOURS, Colours, ColoursCover, ColoursReader, Fountain
+from keyss.channels import COLOURS, Colours, ColoursCover
 from keyss.channels.colours import header, reading
-from keyss.channels.colours.carriers import CELL, Numbers, Salts
-from keyss.channels.colours.header import FILE_KEY_BYTES, Header, Index, read_header
+from keyss.channels.colours.carriers import Carriers
+from keyss.channels.colours.header import FILE_KEY_BYTES, Header, places
+from keyss.channels.colours.salts import Salts
 from keyss.core import Gaussians, InputError, KeyssError, KeyssWarning, UsageError, WrongKeyError
-from keyss.lab import converters, cropping, half_floats, noise, opacity_pruning, random_pruning
+from keyss.lab import converters, half_floats, noise, opacity_pruning, random_pruning
 from keyss.rendering import psnr_between
 from lab.lifelike import turned
 from lab.stealth.careless import shuffled
@@ -54,41 +54,12 @@ def test_every_size_up_to_capacity_comes_back(prepared: ColoursCover, share: flo
 
 
 def test_a_header_made_up_by_chance_hides_no_other(
-    prepared: ColoursCover, payload: bytes, stego: Gaussians, monkeypatch: pytest.MonkeyPatch
+    payload: bytes, stego: Gaussians, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """One attempt of 2^16 gives bits whose tag is right, and there are 27 for each key."""
-    made_up = (Header(bytes([number] * FILE_KEY_BYTES), bytes(2), 40, 1, 0, 63, 20, 0) for number in range(2))
-    monkeypatch.setattr(
-        "keyss.channels.colours.reading.read_header", lambda *args: next(made_up, None) or read_header(*args)
-    )
-    assert extract(stego, "a") == payload
-
-
-def test_names_are_those_that_agree_best_with_the_header(
-    prepared: ColoursCover, payload: bytes, stego: Gaussians, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A header can be read where log scales are shifted by part of a cell, but not what it belongs to."""
-    offsets: dict[int, float] = {}
-    kept: list[Index] = []  # so that no two have the same id
-    headers: list[Header] = []
-    of_reader, shift = ColoursReader._indices, 2 * CELL / 7
-
-    def indices(reader: ColoursReader) -> Iterator[tuple[float, Index]]:
-        for offset, index in of_reader(reader):
-            offsets[id(index)] = abs(offset - round(Numbers.of(stego).size / CELL) * CELL - shift)
-            kept.append(index)
-            yield offset, index
-
-    def read(*args: Any) -> Header | None:
-        headers.extend(found for found in [read_header(*args)] if found)
-        return headers[0] if headers else None
-
-    monkeypatch.setattr(ColoursReader, "_indices", indices)
-    monkeypatch.setattr(Index, "promise", lambda index, secrets: -offsets[id(index)])
-    monkeypatch.setattr("keyss.channels.colours.reading.read_header", read)
-    assert extract(stego, "a") == payload  # finds the header
-    monkeypatch.setattr("keyss.channels.colours.reading._BEST", 7)
-    assert extract(stego, "a") == payload
+    """One attempt of 2^16 gives bits whose tag is right, and there are four for each key."""
+    read, made_up = Header.read, iter([Header(bytes(FILE_KEY_BYTES), 40, 0, 63, 20, 0, 0)])
+    monkeypatch.setattr(Header, "read", lambda *args: next(made_up, None) or read(*args))
+    assert extract(turned(1.37)(stego), "a") == payload
 
 
 def test_what_does_not_fit_is_refused_with_what_would(prepared: ColoursCover, payload: bytes) -> None:
@@ -149,9 +120,7 @@ def test_a_full_model_opens_after(name: str, stego: Gaussians, payload: bytes) -
 
 
 HARDER: dict[str, Callable[[Gaussians], Gaussians]] = {
-    "one half": cropping(1),
-    "another half": cropping(2),
-    "a random half": random_pruning(0.5),
+    "two random thirds": random_pruning(1 / 3),
     "without the faintest": opacity_pruning(0.25),
     "scaling before spz": lambda model: _spz(turned(0.4)(model)),
     "another scene beside it": lambda model: Gaussians.cat([cover(2000, seed=5), model]),
@@ -178,7 +147,7 @@ def test_formats_of_other_programs(index: int, stego: Gaussians, payload: bytes)
 
 
 def test_two_keys_open_their_own_and_a_third_nothing(prepared: ColoursCover) -> None:
-    size = prepared.room.capacity // 30  # small enough for both to lie as each would alone
+    size = prepared.room.capacity // 60  # small enough for both to lie as each would alone
     data = {name: os.urandom(size) for name in "ab"}
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -206,14 +175,14 @@ def test_equal_keys_and_none_are_refused(prepared: ColoursCover) -> None:
 def test_files_of_one_cover_and_one_secret_differ_in_all_they_carry(prepared: ColoursCover) -> None:
     """But for what lies under a salt that two files share by chance, which docs/channels.md tells.
 
-    Each of 16 salts is shared by two files with a chance of 1/49: of 45 pairs, 14.7 salts with a standard
-    deviation of 3.8. That is tested with one entropy; the rest holds for any pair that shares none.
+    Each of 12 salts is shared by two files with a chance of 1/49: of 45 pairs, 11.0 salts with a standard
+    deviation of 3.3. That is tested with one entropy; the rest holds for any pair that shares none.
     """
     entropies = [bytes([index]) * 32 for index in range(10)]
     many = [embed(prepared, [("a", b"same")], entropy=entropy) for entropy in entropies]
-    salts = [set(Salts.of(Numbers.of(each)).salts) for each in many]
+    salts = [set(Salts.of(Carriers.of(each)).salts) for each in many]
     shared = {pair: len(salts[pair[0]] & salts[pair[1]]) for pair in combinations(range(10), 2)}
-    assert sum(shared.values()) < 14.7 + 4 * 3.8
+    assert sum(shared.values()) < 11.0 + 4 * 3.3
     first, second = (many[index] for index in min(shared, key=lambda pair: shared[pair]))
     assert min(shared.values()) == 0
     written = [(each.sh[:, 0] - prepared.cover.sh[:, 0])[:, 1:].flatten() for each in (first, second)]
@@ -221,41 +190,6 @@ def test_files_of_one_cover_and_one_secret_differ_in_all_they_carry(prepared: Co
     small = [each[both].clip(-0.03, 0.03) for each in written]  # salts move by more
     assert abs(np.corrcoef(small[0], small[1])[0, 1]) < 0.1
     assert float((written[0] == written[1])[both].float().mean()) < 0.01
-
-
-def test_entropy_decides_everything(prepared: ColoursCover) -> None:
-    one, same = (embed(prepared, [("a", b"x")], entropy=ENTROPY) for _ in range(2))
-    assert torch.equal(one.sh, same.sh)
-
-
-def test_a_lost_payload_is_told_from_one_that_was_never_there(
-    stego: Gaussians, prepared: ColoursCover
-) -> None:
-    """Headers survive a little more loss than payloads; now and then one is lost first all the same."""
-    told = 0
-    for seed in range(5):
-        with pytest.raises((InputError, WrongKeyError)) as error:
-            extract(random_pruning(0.45, seed)(stego), "a")
-        told += "the key is right, but too much" in str(error.value)
-    assert told >= 3
-    with pytest.raises(WrongKeyError):
-        extract(prepared.cover, "a")
-
-
-def test_a_changed_bit_of_the_payload_is_never_handed_out(
-    stego: Gaussians, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    decode = Fountain.decode
-
-    def wrong(self: Fountain, *arguments: object) -> tuple[np.ndarray, bool]:
-        bits, done = decode(self, *arguments)  # type: ignore[arg-type]
-        if self.size > 1000:
-            bits[777] ^= 1
-        return bits, done
-
-    monkeypatch.setattr(Fountain, "decode", wrong)
-    with pytest.raises(InputError, match="the key is right"):
-        extract(stego, "a")
 
 
 @pytest.mark.parametrize("count", [0, 1, 30, 200])
@@ -288,12 +222,6 @@ def test_equal_gaussians_cost_nothing_but_themselves(stego: Gaussians, payload: 
     assert extract(Gaussians.cat([stego, stego]), "a") == payload
 
 
-def test_a_model_of_one_gaussian_many_times_is_refused() -> None:
-    model = replace(cover(1)[torch.zeros(3000, dtype=torch.int64)])
-    with pytest.raises(UsageError):
-        embed(model, [("a", b"x")])
-
-
 def test_repeated_and_equal_colours_are_left_alone() -> None:
     model = cover(6000)
     sh = model.sh.clone()
@@ -319,19 +247,15 @@ def test_a_rounded_model_gets_values_that_it_has() -> None:
 
 
 def test_a_wrong_key_does_the_work_of_a_right_one(stego: Gaussians, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Counted in looks at parts of headers, which take no less with one key than with another."""
-    looks, parts = [0], Index.parts
-
-    def counted(self: Index, *arguments: object) -> object:
-        looks[0] += 1
-        return parts(self, *arguments)  # type: ignore[arg-type]
-
-    monkeypatch.setattr(Index, "parts", counted)
+    """Counted in searches for places, one for each salt of each header and payload that is looked for."""
+    searches = []
+    monkeypatch.setattr(header, "places", lambda *args: searches.append(0) or places(*args))
+    monkeypatch.setattr(reading, "places", header.places)
     extract(stego, "a")
-    right, looks[0] = looks[0], 0
+    right = len(searches)
     with pytest.raises(WrongKeyError):
         extract(stego, "b")
-    assert looks[0] == right
+    assert len(searches) == 2 * right
 
 
 def test_false_acceptance_is_rarer_than_two_to_the_minus_64(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -350,6 +274,6 @@ def test_false_acceptance_is_rarer_than_two_to_the_minus_64(monkeypatch: pytest.
     for name in "ab":
         with pytest.raises(Exception, match="the key is right" if name == "a" else "opens nothing"):
             extract(stego, name)
-    assert 1 <= len(sizes) <= 4
+    assert 1 <= len(sizes) <= 8
     largest = max(header.bucket_bytes(bucket) for bucket in range(256))
     assert math.log2(len(sizes) * 8 * (largest / 16) / 2**106) < -64

@@ -8,7 +8,7 @@
 import type { ReadModel } from '../files/models.ts';
 import type { Derive } from '../keys/keys.ts';
 import { AppendedReader } from './appended/reader.ts';
-import { ColoursReader } from './colours/reader.ts';
+import { ColoursReader } from './colours/reading.ts';
 import type { Content, Reader } from './content.ts';
 import { QuietReader } from './quiet/reading.ts';
 

@@ -1,243 +1,210 @@
 """The capacity of a model, and where a payload goes to be least visible and least detectable.
 
 A payload is detected by the variance that writing adds. Per byte, that is least with one bit in each number
-(depth 1). So a payload gets as large a share of the carriers as it needs at that depth. A payload that needs
-more gets all carriers, and the least depth and level that hold it.
-
-A payload that is small enough is written only where that leaves the model as likely as it was (`likeness`).
+(level `ONE`). So a payload gets as large a share of the carriers as it needs at that level. A payload that
+needs more gets all carriers, and the least level that holds it. A small payload is written only where that
+leaves the model as likely as it was (`likeness`).
 
 A writer leaves some Gaussians alone. Readers need not know which: a number that was left alone reads as lost.
 """
 
 from __future__ import annotations
 
-import math
 from bisect import bisect_left
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import product
 
 import numpy as np
 
-from keyss.channels.colours.carriers import CELL, Carriers, Numbers
-from keyss.channels.colours.header import SHARES, UNNOTICED, Kind, bucket_bytes
-from keyss.channels.colours.lattice import COLUMNS, LEVELS, MAX_BITS, SPACING, bit_counts
+from keyss.channels.colours.carriers import Carriers
+from keyss.channels.colours.header import PLACES, SHARES, bucket_bytes
+from keyss.channels.colours.lattice import COLUMNS, LEVELS, ONE, SPACING, bit_counts
 from keyss.channels.colours.likeness import Likeness
+from keyss.channels.colours.salts import SALTS
 from keyss.core.arrays import Doubles, Flags, Floats, Integers, doubles
 from keyss.core.gaussians import Gaussians
 from keyss.keys.encryption import OVERHEAD
 from keyss.rendering.difference import psnr_between
 
+UNNOTICED = 2  # secrets whose headers are always there at level ONE, if only as noise
 _RATE = 0.42  # data bits for each bit of information that is expected to be read
 _GARBAGE = 0.02  # share of carriers whose name changes although it seemed stable
-_COMFORTABLE = 0.8  # how full a share may be; the rest makes up for losses
-_ROBUST = 0.5  # the same for a payload that is detectable anyway
-SPREAD = 0.5  # dB by which a file may stay below `Capacity.psnr`
+_COMFORTABLE = 0.8  # how full a share is at level ONE, if there is room; the rest makes up for losses
+_ROBUST = 0.5  # the same at other levels, if there is room: such a payload is detectable anyway
+_MARGIN = 0.5  # dB by which the cost of a payload may exceed the predicted one
 _INCOMPRESSIBLE = 11  # bytes by which zlib lengthens data that it cannot compress
 _ROUNDED = 0.25  # share of repeated colours from which on a model is a rounded one
+_WRITTEN = 0.7  # of the places of a header, at least
 _LOW = np.uint32(1023)  # bits of a float that stay
 _SHORT = np.uint32((1 << 20) - 1)  # a number whose last bits are all zero was typed, not trained
 
 
 @dataclass(frozen=True)
 class Layout:
-    """Where payloads go: each gets so many SHARES of the carriers."""
+    """Where a payload goes."""
 
     level: int  # see `bit_counts`
-    depth: int
-    shares: tuple[int, ...]
+    share: float  # of the carriers
     likely: bool = False  # True if numbers keep their values where others would be less likely
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Capacity:
-    """The capacity of a model."""
+    """The capacity of a model whose views keep a PSNR of `strength` dB."""
 
     model: Gaussians
-    numbers: Numbers
-    strength: float  # dB PSNR that views keep
-    measured: dict[tuple[int, int], float] = field(default_factory=dict, compare=False)  # see `psnr`
+    carriers: Carriers
+    strength: float
 
-    def bytes(self, depth: int) -> int:
-        """The largest packed payload with up to `depth` bits in a number; 0 if none fits."""
-        room = self._room(self._level(depth), depth) if len(self.own) else 0.0
+    @cached_property
+    def bytes(self) -> int:
+        """The largest packed payload; 0 if none fits."""
+        if not len(self.carriers):
+            return 0
+        room = max(self._room(ONE) * self._affordable, self._room(self._highest))
         largest = max((bucket_bytes(each) for each in range(256) if bucket_bytes(each) <= room), default=0)
         return max(0, largest - OVERHEAD - _INCOMPRESSIBLE)
 
-    def layout(self, sizes: Sequence[int]) -> Layout | None:
-        """The layout of encrypted payloads of these sizes in bytes; None if they do not fit."""
-        level = self._level(1)
-        for likely in (True, False):
-            for comfort in (_COMFORTABLE, 1.0):
-                shares = self._shares(sizes, level, 1, comfort, likely)
-                if sum(shares) <= SHARES:
-                    return Layout(level, 1, shares, likely)
-        for comfort in (_ROBUST, 1.0):
-            for depth in range(2, MAX_BITS + 1):
-                level = self._least_level(sizes, depth, comfort)
-                shares = self._shares(sizes, level, depth, comfort)
-                if sum(shares) <= SHARES and self.psnr(level, depth) >= self.strength + SPREAD:
-                    return Layout(level, depth, _stretched(shares))
-        level = self._level(MAX_BITS)
-        shares = self._shares(sizes, level, MAX_BITS, 1.0)
-        return Layout(level, MAX_BITS, _stretched(shares)) if sum(shares) <= SHARES else None
+    def layouts(self, sizes: Sequence[int]) -> tuple[list[Layout], bool] | None:
+        """The layouts of encrypted payloads of these sizes in bytes, and whether one tells of others.
 
-    def psnr(self, level: int, depth: int) -> float:
-        """PSNR in dB that views keep beside a payload in all carriers and its headers."""
-        if (level, depth) not in self.measured:
-            random, bits = np.random.default_rng(0), bit_counts(self.own, level, depth)
-            places = random.uniform(-0.5, 0.5, (len(bits), COLUMNS))  # in steps
-            kind = Kind.of(depth)
-            bits[random.random(len(bits)) < self._headers(depth)] = kind.depth
-            steps = np.where((bits > 0) & ~self.alone[self.own_rows], SPACING * 2.0**bits, 0.0)
-            noise = places * steps[:, None]
-            sh = self.model.sh.detach().clone()
-            sh[self.numbers.rows[self.own_rows], 0, 1:] += sh.new_tensor(noise)
-            self.measured[level, depth] = psnr_between(self.model, replace(self.model.detach(), sh=sh))
-        return self.measured[level, depth]
+        None if they do not fit.
+        """
+        padded = [bucket_bytes(bucket_of(size)) for size in sizes]
+        alone = [self._layout(size) for size in padded]
+        found = [each for each in alone if each is not None]
+        if len(found) == len(alone) and sum(each.share for each in found) <= 1:
+            return found, len(sizes) > UNNOTICED
+        together = self._layout(sum(padded))
+        if together is None:
+            return None
+        return [replace(together, share=together.share * size / sum(padded)) for size in padded], True
 
-    def _level(self, depth: int) -> int:
-        """The highest level of this depth whose PSNR is at least `strength`, or the lowest one."""
-
-        def is_below(level: int) -> bool:
-            return self.psnr(level, depth) < self.strength + SPREAD
-
-        if not is_below(LEVELS - 1):  # as mostly at depth 1
-            return LEVELS - 1
-        return max(0, bisect_left(range(LEVELS), True, key=is_below) - 1)
-
-    def _least_level(self, sizes: Sequence[int], depth: int, comfort: float) -> int:
-        """The lowest level of this depth that holds payloads of these sizes, or the highest of all."""
-
-        def holds(level: int) -> bool:
-            return sum(self._shares(sizes, level, depth, comfort)) <= SHARES
-
-        return bisect_left(range(LEVELS - 1), True, key=holds)
-
-    def _shares(
-        self, sizes: Sequence[int], level: int, depth: int, comfort: float, likely: bool = False
-    ) -> tuple[int, ...]:
-        room = max(comfort * self._room(level, depth, likely), 1e-3)
-        buckets = [bucket_bytes(bucket_of(size)) for size in sizes]
-        return tuple(max(1, math.ceil(SHARES * min(1e6, size / room))) for size in buckets)
-
-    def _room(self, level: int, depth: int, likely: bool = False) -> float:
-        """The number of bytes that all carriers hold."""
-        information = self._information(self.admission if likely else 1.0)
-        bits = COLUMNS * float((bit_counts(self.own, level, depth) * information).sum())
-        return _RATE * (1 - self._headers(depth)) * bits / 8
+    def _layout(self, size: int) -> Layout | None:
+        for likely, comfort in product((True, False), (_COMFORTABLE, 1.0)):
+            share = size / max(comfort * self._room(ONE, likely), 1e-3)
+            if share <= self._affordable:
+                return Layout(ONE, share, likely)
+        holds = (size <= _ROBUST * self._room(level) for level in range(1, self._highest))
+        level = next((level for level, enough in enumerate(holds, start=1) if enough), self._highest)
+        return Layout(level, 1.0) if self._highest and size <= self._room(level) else None
 
     @cached_property
-    def carriers(self) -> Carriers:
-        return self.numbers.carriers(float(np.round(self.numbers.size / CELL) * CELL))
+    def _affordable(self) -> float:
+        """Share of the carriers that may carry one bit in each number."""
+        affordable = 10 ** ((self._psnr(ONE) - self.strength - _MARGIN) / 10)
+        return float(min(1.0, affordable)) - 1 / SHARES  # shares are rounded up
 
     @cached_property
-    def own_rows(self) -> Integers:
-        """[D] the carriers that are written, or left alone."""
-        return self.carriers.one_of_each()
+    def _highest(self) -> int:
+        """The highest level at which all carriers may carry, or the level ONE."""
+        levels = range(1, LEVELS)
+        return bisect_left(levels, True, key=lambda each: self._psnr(each) < self.strength + _MARGIN)
 
-    @cached_property
-    def own(self) -> Carriers:
-        return self.carriers[self.own_rows]
+    def _psnr(self, level: int) -> float:
+        """PSNR in dB that views keep beside a payload in all carriers."""
+        rows = self.carriers.own[~self.alone[self.carriers.own]]
+        bits = bit_counts(self.carriers.impact[rows], level)[:, None]
+        places = np.random.default_rng(0).uniform(-0.5, 0.5, (len(rows), COLUMNS))  # in steps
+        sh = self.model.sh.detach().clone()
+        noise = places * np.where(bits > 0, SPACING * 2.0**bits, 0.0)
+        sh[self.carriers.rows[rows], 0, 1:] += sh.new_tensor(noise)
+        return psnr_between(self.model, replace(self.model.detach(), sh=sh))
+
+    def _room(self, level: int, likely: bool = False) -> float:
+        """Bytes that all carriers hold, from the information that a reader is expected to get."""
+        rows = self.carriers.own
+        if not len(rows):
+            return 0.0
+        sure = (1 - _GARBAGE) * (1 - self.carriers.doubt[rows]) / self.carriers.namesakes[rows]
+        chance = ((1 - (self.admission if likely else 1.0) * sure) / 2).clip(1e-12, 0.5)  # of a wrong bit
+        information = 1 + chance * np.log2(chance) + (1 - chance) * np.log2(1 - chance)
+        bits = COLUMNS * bit_counts(self.carriers.impact[rows], level) * information * ~self.alone[rows]
+        headers = SALTS * PLACES * (UNNOTICED if level == ONE else 1)
+        return float(_RATE * np.exp(-headers / len(rows)) * bits.sum() / 8)
 
     @cached_property
     def quiet(self) -> Quiet:
-        return Quiet(self.model)
+        return Quiet(self.model, self.carriers.rows)
 
     @cached_property
     def alone(self) -> Flags:
         """[C] carriers that are left alone."""
-        return self.quiet.left_alone()[self.numbers.rows]
-
-    def _headers(self, depth: int) -> float:
-        """Share of the carriers that headers take."""
-        return 1 - (1 - Kind.of(depth).share(len(self.own))) ** (UNNOTICED if depth == 1 else 1)
+        return self.quiet.alone()
 
     @cached_property
     def likeness(self) -> Likeness:
-        """The likeness of the C carriers, for changes as writing makes them."""
-        means = doubles(self.model.means)[self.numbers.rows]
-        return Likeness.of(self.numbers.colours, np.nan_to_num(means).clip(-1e15, 1e15), self._example)
+        """The likeness of the carriers, for changes as writing makes them."""
+        means = np.nan_to_num(doubles(self.model.means)[self.carriers.rows]).clip(-1e15, 1e15)
+        return Likeness.of(self.carriers.colours, means, self._example)
 
     @cached_property
     def admission(self) -> float:
         """Share of the written numbers that get another value where only likely ones do."""
-        changed = self.numbers.colours.copy()
-        rows = self.own_rows[~self.alone[self.own_rows]]
+        rows = self.carriers.own[~self.alone[self.carriers.own]]
+        if not len(rows):
+            return 0.0
+        changed = self.carriers.colours.copy()
         changed[rows] = self._example[rows]
-        admitted = self.likeness.admitted(self.numbers.colours, changed, np.random.default_rng(2))
-        return float(admitted[rows].mean()) if len(rows) else 0.0
+        admitted = self.likeness.admitted(self.carriers.colours, changed, np.random.default_rng(2))
+        return float(admitted[rows].mean())
+
+    @cached_property
+    def gaps(self) -> bool:
+        """True if headers may do without unlikely numbers: enough of their places are still written."""
+        return self.admission * (1 - float(self.alone[self.carriers.own].mean())) > _WRITTEN
 
     @cached_property
     def _example(self) -> Doubles:
         """[C, 3] colours with noise in green and blue as writing adds it."""
-        colours = self.numbers.colours.copy()
-        noise = np.random.default_rng(1).uniform(-SPACING, SPACING, (len(colours), COLUMNS))
-        for column in range(1, 1 + COLUMNS):
-            new = colours[:, column] + noise[:, column - 1]
-            colours[:, column] = self.quiet.fitted(self.numbers.rows, column, new)
-        return colours
-
-    def _information(self, admission: float) -> Doubles:
-        """[D] bits of information that a reader is expected to get from each written bit."""
-        namesakes = self.carriers.namesakes()[self.own_rows]
-        garbage = 1 - admission * (1 - _GARBAGE) * (1 - self.own.doubt) / namesakes
-        chance = (garbage / 2).clip(1e-12, 0.5)
-        entropy = -chance * np.log2(chance) - (1 - chance) * np.log2(1 - chance)
-        information: Doubles = ~self.alone[self.own_rows] * (1 - entropy)
-        return information
+        noise = np.random.default_rng(1).uniform(-SPACING, SPACING, (len(self.carriers), COLUMNS))
+        colours = self.carriers.colours
+        return np.hstack([colours[:, :1], self.quiet.fitted(colours[:, 1:] + noise)])
 
 
 def bucket_of(size: int) -> int:
     """The least bucket that holds `size` bytes, or the largest of all."""
-    return next((each for each in range(255) if bucket_bytes(each) >= size), 255)
-
-
-def _stretched(shares: tuple[int, ...]) -> tuple[int, ...]:
-    """All SHARES, in the same proportion."""
-    left, stretched = SHARES, []
-    for index, share in enumerate(shares):
-        stretched.append(left * share // sum(shares[index:]))
-        left -= stretched[-1]
-    return tuple(stretched)
+    return bisect_left(range(255), size, key=bucket_bytes)
 
 
 class Quiet:
-    """The constant colours of a model with N Gaussians, as training or rounding left them."""
+    """The constant colours of a model's carriers in `rows` [C], as training or rounding left them."""
 
-    def __init__(self, model: Gaussians) -> None:
-        self._colours: Floats = model.sh[:, 0].detach().cpu().float().numpy()
-        every = [np.unique(column, return_inverse=True, return_counts=True) for column in self._colours.T]
+    def __init__(self, model: Gaussians, rows: Integers) -> None:
+        colours: Floats = model.sh[:, 0].detach().cpu().float().numpy()
+        every = [np.unique(column, return_inverse=True, return_counts=True) for column in colours.T]
         repeated = np.stack([counts[inverse.ravel()] > 1 for _, inverse, counts in every], axis=1)
         self._values = [values for values, _, _ in every]
         self._rounded = bool(len(repeated)) and float(repeated.mean()) > _ROUNDED
-        self._repeated = repeated.any(axis=1)
+        self._colours, self._repeated = colours[rows], repeated[rows].any(axis=1)
 
-    def left_alone(self) -> Flags:
-        """[N] Gaussians with a colour that is repeated, typed, or equal in two channels.
+    def alone(self) -> Flags:
+        """[C] carriers with a colour that is repeated, typed, or equal in two channels.
 
         None of a rounded model, where all are repeated. Colours that are nearly equal are not left alone:
         there would be too many of them beside those that the others were moved away from.
         """
-        if self._rounded or not len(self._colours):
+        if self._rounded:
             return np.zeros(len(self._colours), bool)
         typed = ((self._colours.view(np.uint32) & _SHORT) == 0).any(axis=1)
-        alone: Flags = self._repeated | typed
-        alone |= (self._colours == np.roll(self._colours, 1, axis=1)).any(axis=1)
+        grey = (self._colours == np.roll(self._colours, 1, axis=1)).any(axis=1)
+        alone: Flags = self._repeated | typed | grey
         return alone
 
-    def fitted(self, rows: Integers, column: int, new: Doubles) -> Floats:
-        """[R] `new` values of a column as this model would have them.
+    def fitted(self, new: Doubles) -> Floats:
+        """[C, 2] `new` greens and blues as this model would have them; those that are the old ones stay.
 
         In a rounded model: the nearest value that it has, if a reader reads the same from it. In others: with
         the last bits of the old values, which are not quite random after training.
         """
-        old, values = self._colours[rows, column], self._values[column]
+        old = np.ascontiguousarray(self._colours[:, 1:])
+        low = old.view(np.uint32) & _LOW
+        fitted: Floats = (new.astype(np.float32).view(np.uint32) & ~_LOW | low).view(np.float32)
         if self._rounded:
-            above = np.searchsorted(values, new).clip(1, len(values) - 1) if len(values) > 1 else 0
-            below = values[np.maximum(above - 1, 0)]
-            nearest = np.where(new - below < values[above] - new, below, values[above])
-            return np.where(np.abs(nearest - new) <= SPACING / 2, nearest, new).astype(np.float32)
-        bits = new.astype(np.float32).view(np.uint32) & ~_LOW | old.view(np.uint32) & _LOW
-        same: Floats = bits.view(np.float32)
-        return same
+            for column, values in enumerate(self._values[1:]):
+                own = new[:, column]
+                nearest = values[np.searchsorted((values[1:] + values[:-1]) / 2, own)]
+                fitted[:, column] = np.where(np.abs(nearest - own) <= SPACING / 2, nearest, own)
+        return np.where(new == old, old, fitted)

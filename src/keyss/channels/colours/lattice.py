@@ -4,9 +4,6 @@ A number that carries b bits is moved to the nearest point of one of 2^b lattice
 lie SPACING apart and are shifted together by a *dither*, a number that only the key tells and that no two
 Gaussians share. So without the key the change is independent noise, uniform over one step, of variance
 step^2 / 12, and no value is likelier than another.
-
-The bits of a Gaussian follow from its *impact* and one *level* for all: one bit less for every factor of four
-in how much a change of its colour shows, so that all that carry something cost equally much.
 """
 
 from __future__ import annotations
@@ -15,75 +12,63 @@ import math
 
 import numpy as np
 
-from keyss.channels.colours.carriers import Carriers, Names, random_pairs, rank
+from keyss.channels.colours.carriers import Names, fractions, random_pairs
 from keyss.channels.mixing import mixed
-from keyss.core.arrays import Bits, Doubles, Floats, Integers, Words
+from keyss.core.arrays import Bits, Doubles, Flags, Integers, Words
 
 COLUMNS = 2  # numbers of a Gaussian that are written
 MAX_BITS = 5  # of a number
 SPACING = 0.0275  # between neighbouring points
 LEVELS = 64
+ONE = 0  # the level at which every number carries one bit
 _BIT = math.log(4)  # of impact; a level is a quarter of a bit
 _MIDDLE = 24  # level at which an impact of zero carries nothing any more
 _NOISE = 0.23  # standard deviation of a format's rounding, in spacings
 _POINTS = np.array([-1.0, 0.0, 1.0, 2.0])  # that a number may have come from, from the one below on
 
 
-def bit_counts(carriers: Carriers, level: int, depth: int) -> Integers:
-    """[C] bits of each of a carrier's numbers: at most `depth`, and more at a higher level (below LEVELS)."""
-    bits = np.floor((level - _MIDDLE) / 4 - carriers.impact / _BIT)
-    return bits.clip(0, depth).astype(np.int64)
+def bit_counts(impact: Doubles, level: int) -> Integers:
+    """[C] bits of each number of carriers: more at a higher level, and one less for four times the impact.
+
+    So all numbers that carry something cost equally much.
+    """
+    if level == ONE:
+        return np.ones(len(impact), np.int64)
+    return np.floor((level - _MIDDLE) / 4 - impact / _BIT).clip(0, MAX_BITS).astype(np.int64)
 
 
 def seeds(secret: bytes, label: str, names: Names, bits: Integers) -> Words:
     """[B] the seeds of all bits of Gaussians with these names, for `Fountain`; `bits` [C]: of each number."""
-    counts = COLUMNS * bits
-    order = np.arange(1, counts.sum() + 1) - np.repeat(np.cumsum(counts) - counts, counts)
-    return mixed(np.repeat(rank(secret, label, names), counts) ^ mixed(order.astype(np.uint64)))
+    order = mixed(np.arange(COLUMNS * MAX_BITS, dtype=np.uint64)).reshape(COLUMNS, MAX_BITS)
+    return mixed(random_pairs(secret, label, names)[:, :1, None] ^ order)[_carried(bits)]
 
 
-def write(secret: bytes, carriers: Carriers, bits: Integers, code: Bits) -> Doubles:
-    """[C, 2] new values that carry the bits `code` [B], `bits` [C] in each number."""
-    counts = np.repeat(bits, COLUMNS)
-    label, first = np.zeros(len(counts), np.int64), np.cumsum(counts) - counts
-    for bit in range(MAX_BITS):
-        rows = np.flatnonzero(counts > bit)
-        label[rows] = label[rows] << 1 | code[first[rows] + bit]
-    step, values = SPACING * 2.0**counts, carriers.values.ravel()
-    points = dithers(secret, carriers.names).ravel() * step + _ungray(label) * SPACING
-    nearest = np.round((values - points) / step) * step + points
-    return np.where(counts > 0, nearest, values).reshape(-1, COLUMNS)
+def write(secret: bytes, names: Names, values: Doubles, bits: Integers, code: Bits) -> Doubles:
+    """[C, 2] new `values` of carriers that hold the bits `code` [B], `bits` [C] in each number."""
+    carried, step = _carried(bits), 2.0 ** bits[:, None]
+    gray = np.zeros(carried.shape, np.uint8)
+    gray[carried] = code
+    weights = 2.0 ** (bits[:, None, None] - 1 - np.arange(MAX_BITS))
+    label = (np.bitwise_xor.accumulate(gray, axis=2) * weights * carried).sum(axis=2)
+    points = fractions(secret, "dither", names) * step + label
+    new = (np.round((values / SPACING - points) / step) * step + points) * SPACING
+    return np.where(bits[:, None] > 0, new, values)
 
 
-def read(dither: Doubles, carriers: Carriers, bits: Integers, doubt: Doubles) -> Floats:
-    """[B] logarithms of P(0) / P(1) of all bits; each number of a carrier has `bits` [C].
-
-    `dither` [C, 2]: of `dithers`. `doubt` [C]: the chance that a carrier holds something else.
-    """
-    counts, doubts = np.repeat(bits, COLUMNS), np.repeat(doubt, COLUMNS)
-    period = 1 << counts
-    place = np.mod(carriers.values.ravel() / SPACING - dither.ravel() * period, period)[:, None]
+def read(secret: bytes, names: Names, values: Doubles, bits: Integers) -> Doubles:
+    """[B] P(0) - P(1) of all bits of carriers that `write` has written."""
+    period = 2 ** bits[:, None]
+    place = np.mod(values / SPACING - fractions(secret, "dither", names) * period, period)[..., None]
     points = np.floor(place) + _POINTS
     weight = np.exp(-((place - points) ** 2) / (2 * _NOISE**2))
-    weight /= weight.sum(axis=1, keepdims=True)
-    label = points.astype(np.int64) % period[:, None]
-    label ^= label >> 1
-    ratios, ends = np.zeros(int(counts.sum()), np.float32), np.cumsum(counts)
-    for bit in range(MAX_BITS):  # from the last one on
-        rows = np.flatnonzero(counts > bit)
-        ones = (weight[rows] * (label[rows] >> bit & 1)).sum(axis=1)
-        ones = ((1 - doubts[rows]) * ones + doubts[rows] / 2).clip(1e-9, 1 - 1e-9)
-        ratios[ends[rows] - 1 - bit] = np.log((1 - ones) / ones)
-    return ratios
+    label = points.astype(np.int64) % period[..., None]
+    shifts = (bits[:, None] - 1 - np.arange(MAX_BITS)).clip(0)[:, None, None]
+    signs = 1 - 2 * ((label ^ label >> 1)[..., None] >> shifts & 1)  # [C, 2, points, bits]
+    hints: Doubles = (weight[..., None] * signs).sum(axis=2) / weight.sum(axis=2)[..., None]
+    return hints[_carried(bits)]
 
 
-def dithers(secret: bytes, names: Names) -> Doubles:
-    """[C, 2] numbers in [0, 1)."""
-    return (random_pairs(secret, "dither", names) >> np.uint64(11)) / 2.0**53
-
-
-def _ungray(code: Integers) -> Integers:
-    """The number whose Gray code, number xor half of it, is `code` (up to 8 bits)."""
-    for shift in (1, 2, 4):
-        code = code ^ code >> shift
-    return code
+def _carried(bits: Integers) -> Flags:
+    """[C, COLUMNS, MAX_BITS] which bits there are."""
+    carried: Flags = np.arange(MAX_BITS) < bits[:, None, None]
+    return np.repeat(carried, COLUMNS, axis=1)

@@ -1,30 +1,32 @@
-/**
- * Which numbers of a model carry something, and by what else of the model they are known again;
- * `keyss.channels.colours.carriers` on the other side.
- */
-import { median, rowsOf } from '../../core/bytes.ts';
+/** Gaussians that carry bits, and the names by which they are known again; `keyss.channels.colours.carriers`. */
+import { ecb } from '@noble/ciphers/aes.js';
+import { rowsOf } from '../../core/bytes.ts';
 import { type Gaussians, opacity, where, withDegree } from '../../core/gaussians.ts';
+import { namesakes, type Words, wordsOf } from '../../core/words.ts';
+import { expand } from '../../keys/keys.ts';
 
-export const [SCALE_STEP, COLOUR_STEP, OPACITY_STEP] = [1 / 16, 1 / 38.25, 1 / 255]; // of 8-bit formats
-export const CELL = 0.25; // of a log scale
-export const [COLOUR_NOISE, OPACITY_NOISE] = [0.009, 0.004]; // what formats move these numbers by, at most
-export const NAME = 8; // numbers of a name: five, and zeros up to a block of AES
-const [SCALE_STEPS, COLOUR_STEPS, OPACITY_STEPS] = [4, 5, 16]; // that make a cell
+export const [SCALE_STEPS, COLOUR_STEPS, OPACITY_STEPS] = [16, 38.25, 255]; // of 8-bit formats, in one
+export const [COLOUR_NOISE, OPACITY_NOISE] = [0.344, 1.02]; // what formats move these by, in steps, at most
+const SCALE_NOISE = 0.144;
+const [RATIO_CELL, OPACITY_CELL, RED_CELL] = [4, 8, 3]; // steps
 const MIN_OPACITY = 2.5 / 255;
-const SCALE_NOISE = 0.018;
-const SCALE_ROUNDED = SCALE_STEP / 2;
 const CELLS = 30_000; // on either side of zero
+const NAME = 8; // numbers of a name: four, and zeros up to a block of AES
 
-/** What names and carriers are made of, of the C Gaussians that are visible and finite. */
-export interface Numbers {
+/** C Gaussians as a reader sees them. */
+export interface Carriers {
   readonly count: number;
-  readonly size: number; // the median log scale: it tells by how much a model was scaled
   readonly logScales: Float64Array; // [C, 3]
   readonly opacities: Float64Array; // [C]
   readonly colours: Float64Array; // [C, 3] constant coefficients
+  readonly names: Int16Array; // [C, NAME] numbers of cells: two ratios of scales, opacity, red; zeros
+  readonly doubt: Float64Array; // [C] chance that the name is not what it was when it was written
+  readonly impact: Float64Array; // [C] how much a change of colour shows
+  readonly alike: Float64Array; // [C] how many carriers have the same name, itself included
 }
 
-export function numbersOf(model: Gaussians): Numbers {
+/** The visible and finite Gaussians. `alignment`: steps of log scales that make up for a scaling of the model. */
+export function carriersOf(model: Gaussians, alignment = 0): Carriers {
   const bare = withDegree(model, 0);
   const seen = where(bare, (row) => {
     let sum = 0; // finite where all are
@@ -32,69 +34,54 @@ export function numbersOf(model: Gaussians): Numbers {
     return Number.isFinite(sum) && Math.fround(opacity(bare.opacityLogits[row])) > MIN_OPACITY;
   });
   const [logScales, colours] = [Float64Array.from(seen.logScales), Float64Array.from(seen.sh)];
-  const sizes = Float64Array.from({ length: seen.count }, (_, row) => {
-    return (logScales[3 * row] + logScales[3 * row + 1] + logScales[3 * row + 2]) / 3;
-  });
   const opacities = Float64Array.from(seen.opacityLogits, (logit) => Math.fround(opacity(logit)));
-  return { count: seen.count, size: median(sizes), logScales, opacities, colours };
-}
-
-/** C Gaussians as a reader sees them. */
-export interface Carriers {
-  readonly count: number;
-  readonly names: Int16Array; // [C, NAME] numbers of cells: three log scales, opacity, red; zeros
-  readonly doubt: Float64Array; // [C] chance that the name is not what it was when it was written
-  readonly values: Float64Array; // [C, 2] green and blue
-}
-
-/** The carriers and their names. `offset`: what counts as a log scale of zero. */
-export function carriersOf(numbers: Numbers, offset: number): Carriers {
-  const { count, logScales, opacities, colours } = numbers;
-  const scaleNoise = (offset % CELL === 0 ? SCALE_NOISE : SCALE_ROUNDED) / SCALE_STEP;
-  const names = new Int16Array(NAME * count);
-  const doubt = new Float64Array(count);
-  const values = new Float64Array(2 * count);
-  for (let row = 0; row < count; row++) {
-    let stays = 1;
-    const cell = (column: number, value: number, steps: number, noise: number): void => {
-      const found = Math.floor(value / steps);
-      const inside = value - found * steps;
-      const nearest = Math.min(inside, steps - inside);
-      stays *= 1 - Math.max(0, Math.min(0.5, (noise - nearest) / (2 * noise)));
-      names[NAME * row + column] = Math.max(-CELLS, Math.min(CELLS, found));
-    };
-    for (let axis = 0; axis < 3; axis++) {
-      cell(axis, (logScales[3 * row + axis] - offset) / SCALE_STEP - 0.5, SCALE_STEPS, scaleNoise);
-    }
-    cell(3, opacities[row] / OPACITY_STEP - 0.5, OPACITY_STEPS, OPACITY_NOISE / OPACITY_STEP);
-    cell(4, colours[3 * row] / COLOUR_STEP, COLOUR_STEPS, COLOUR_NOISE / COLOUR_STEP);
-    doubt[row] = 1 - stays;
-    values[2 * row] = colours[3 * row + 1];
-    values[2 * row + 1] = colours[3 * row + 2];
+  const names = new Int16Array(NAME * seen.count);
+  const [doubt, impact] = [new Float64Array(seen.count), new Float64Array(seen.count)];
+  for (let row = 0; row < seen.count; row++) {
+    const [a, b, c] = logScales.subarray(3 * row, 3 * row + 3);
+    const whole = [a, b, c].map((each) => cellOf(each * SCALE_STEPS + 0.5 + alignment, 1, SCALE_NOISE));
+    const ratios = [0, 1].map((axis) => {
+      const [cell, edge] = cellOf(whole[axis + 1][0] - whole[axis][0] + 0.5, RATIO_CELL, 1);
+      return [cell, 2 * edge * (whole[axis][1] + whole[axis + 1][1])];
+    });
+    const seenAs = cellOf(opacities[row] * OPACITY_STEPS - 0.5, OPACITY_CELL, OPACITY_NOISE);
+    const cells = [...ratios, seenAs, cellOf(colours[3 * row] * COLOUR_STEPS, RED_CELL, COLOUR_NOISE)];
+    cells.forEach(([cell], column) => (names[NAME * row + column] = cell));
+    doubt[row] = 1 - cells.reduce((product, [, each]) => product * (1 - each), 1);
+    impact[row] = Math.max(a + b, a + c, b + c) + 2 * Math.log(Math.max(1e-3, ((seenAs[0] + 0.5) * OPACITY_CELL) / OPACITY_STEPS));
   }
-  return { count, names, doubt, values };
+  const alike = Float64Array.from(namesakes(new Uint32Array(names.buffer).filter((_, at) => at % 4 < 2))); // by four numbers
+  return { count: seen.count, logScales, opacities, colours, names, doubt, impact, alike };
 }
 
-/** As with an offset that is larger by so many cells. */
-export function shifted(carriers: Carriers, cells: number): Carriers {
-  const names = carriers.names.slice();
-  for (let at = 0; at < names.length; at += NAME) {
-    for (let axis = 0; axis < 3; axis++) names[at + axis] -= cells;
-  }
-  return { ...carriers, names };
+/** The cell of `steps` steps that a value lies in, and the chance that noise has moved it there. */
+export function cellOf(value: number, steps: number, noise: number): [number, number] {
+  const cell = Math.floor(value / steps);
+  const inside = value - cell * steps;
+  const nearest = Math.min(inside, steps - inside);
+  return [Math.max(-CELLS, Math.min(CELLS, cell)), Math.max(0, Math.min(0.5, (noise - nearest) / (2 * noise)))];
 }
 
 /** The carriers of these rows. */
-export function chosen({ names, doubt, values }: Carriers, rows: ArrayLike<number>): Carriers {
+export function chosen({ logScales, opacities, colours, names, doubt, impact, alike }: Carriers, rows: ArrayLike<number>): Carriers {
   return {
-    count: rows.length, names: rowsOf(names, rows, NAME), doubt: rowsOf(doubt, rows, 1), values: rowsOf(values, rows, 2),
+    count: rows.length, logScales: rowsOf(logScales, rows, 3), opacities: rowsOf(opacities, rows, 1),
+    colours: rowsOf(colours, rows, 3), names: rowsOf(names, rows, NAME), doubt: rowsOf(doubt, rows, 1),
+    impact: rowsOf(impact, rows, 1), alike: rowsOf(alike, rows, 1),
   };
 }
 
-/** How much a change of colour shows, from the name: log of area times squared opacity. */
-export function impact(names: Int16Array, row: number): number {
-  const [a, b, c] = [names[NAME * row], names[NAME * row + 1], names[NAME * row + 2]];
-  const two = a + b + c - Math.min(a, b, c) + 1; // halves of a cell are added
-  const seen = (names[NAME * row + 3] + 0.5) * OPACITY_STEPS * OPACITY_STEP;
-  return two * CELL + 2 * Math.log(Math.max(1e-3, seen));
+/** [C, 2] words for names [C, NAME], pseudo-random without the secret: AES-256 of the names. */
+export function randomPairs(secret: Uint8Array, label: string, names: Int16Array): Words {
+  const bytes = new Uint8Array(names.buffer, names.byteOffset, names.byteLength);
+  if (!bytes.length) return new Uint32Array(0);
+  return wordsOf(ecb(expand(secret, `colours/${label}`, 32), { disablePadding: true }).encrypt(bytes));
+}
+
+/** [C, 2] numbers in [0, 1) for names [C, NAME]. */
+export function fractions(secret: Uint8Array, label: string, names: Int16Array): Float64Array {
+  const words = randomPairs(secret, label, names);
+  return Float64Array.from({ length: words.length >> 1 }, (_, at) => {
+    return (words[2 * at + 1] * 2 ** 21 + (words[2 * at] >>> 11)) / 2 ** 53;
+  });
 }

@@ -1,186 +1,115 @@
-/**
- * A rateless code, read softly: any bits of it, in any order, some of them wrong, give the data back (Shokrollahi 2006;
- * Etesami and Shokrollahi 2006). `keyss.channels.colours.fountain` on the other side.
- */
+/** A rateless code, read softly (Shokrollahi 2006; Etesami and Shokrollahi 2006); `keyss.channels.colours.fountain`. */
 import { mix, mixed, sortingOrder, type Words } from '../../core/words.ts';
 
-/** Shares of code bits that are sums of so many. */
-type Degrees = readonly (readonly [number, number])[];
-
-// Shokrollahi 2006, table I, k = 65,536, with more single ones, which decoding starts from.
-export const RAPTOR: Degrees = [
-  [1, 0.02], [2, 0.486], [3, 0.163], [4, 0.072], [5, 0.081], [8, 0.055], [9, 0.037], [19, 0.055], [65, 0.031],
-];
-export const NOISY: Degrees = [[1, 0.15], [2, 0.5], [3, 0.25], [4, 0.1]];
-const REPEATS = 4; // parity checks that each data bit takes part in
+// How many intermediate bits each of 128 code bits is the sum of.
+const RAPTOR = repeated([[1, 3], [2, 62], [3, 21], [4, 9], [5, 10], [8, 7], [9, 5], [19, 7], [65, 4]]);
+export const NOISY = repeated([[1, 19], [2, 64], [3, 32], [4, 13]]);
+const REPEATS = 4; // parity bits that each data bit takes part in
+const [ROUNDS, SETTLED] = [60, 3];
+const [SURE, LEAST] = [1 - 1e-6, 1e-12]; // limits of |P(0) - P(1)|
 const [RANK_LOW, RANK_HIGH] = [0xd192ed03, 0xd1b54a32]; // of one odd constant
-const SURE = 25; // log-likelihood ratio of what is known
-const MOST = 30; // of any message
-const NEARLY_SURE = 0.9999999999;
-const SETTLED = 3; // rounds in a row in which the parity checks have to hold
+
+function repeated(counts: readonly (readonly [number, number])[]): number[] {
+  return counts.flatMap(([degree, count]) => new Array<number>(count).fill(degree));
+}
+
+/** Sums of intermediate bits: equation i has the `degrees[i]` members after those of the ones before. */
+interface Equations {
+  readonly degrees: Uint16Array;
+  readonly members: Uint32Array;
+}
 
 /** The code for `size` data bits. */
 export class Fountain {
-  readonly length: number; // intermediate bits
   private readonly parity: number;
-  private readonly checks: Equations;
 
-  constructor(readonly size: number, private readonly degrees: Degrees = RAPTOR) {
+  constructor(readonly size: number, private readonly degrees = RAPTOR) {
     this.parity = 64 + Math.floor(size / 25);
-    this.length = size + this.parity;
-    this.checks = parityChecks(size, this.parity);
   }
 
   /** [n] the code bits of `seeds` [n] for data bits [size]. */
   encode(data: ArrayLike<number>, seeds: Words): Uint8Array {
-    const every = new Uint8Array(this.length);
-    every.set(data);
-    const { starts, members } = this.checks;
-    for (let check = 0; check < this.parity; check++) {
-      const own = this.size + check; // the last member: all others are known by now
-      for (let at = starts[check]; at < starts[check + 1] - 1; at++) every[own] ^= every[members[at]];
+    const bits = Uint8Array.from(data);
+    return sums(Uint8Array.from([...bits, ...sums(bits, this.checks())]), this.equations(seeds));
+  }
+
+  /** The likeliest data bits [size]; `hints` [n]: P(0) - P(1) of the code bits of `seeds` [n]. */
+  decode(seeds: Words, hints: ArrayLike<number>): Uint8Array {
+    const [own, checks] = [this.equations(seeds), this.checks()];
+    const width = checks.degrees[0];
+    const degrees = Uint16Array.from([...own.degrees, ...checks.degrees.map((degree) => degree + 1)]);
+    const members = new Uint32Array(own.members.length + this.parity * (width + 1));
+    members.set(own.members);
+    for (let check = 0, at = own.members.length; check < this.parity; check++, at += width + 1) {
+      members.set(checks.members.subarray(check * width, (check + 1) * width), at);
+      members[at + width] = this.size + check;
     }
-    return this.sums(every, seeds);
-  }
-
-  /** [n] the code bits of `seeds` [n] for intermediate bits [length]. */
-  sums(every: Uint8Array, seeds: Words): Uint8Array {
-    const { starts, members } = equations(seeds, this.length, this.degrees);
-    const found = new Uint8Array(seeds.length >> 1);
-    for (let row = 0; row < found.length; row++) {
-      for (let at = starts[row]; at < starts[row + 1]; at++) found[row] ^= every[members[at]];
-    }
-    return found;
-  }
-
-  /**
-   * The likeliest intermediate bits [length], of which the first `size` are data. `ratios` [n]: natural logarithms of
-   * P(0) / P(1) of the code bits of `seeds` [n]. Takes at most `rounds` passes.
-   */
-  likeliest(seeds: Words, ratios: Float32Array, rounds: number): Uint8Array {
-    const all = equations(seeds, this.length, this.degrees, this.checks);
-    const given = new Float32Array(all.starts.length - 1).fill(SURE);
-    ratios.forEach((ratio, row) => (given[row] = Math.max(-SURE, Math.min(SURE, ratio))));
-    const total = propagated(all, given, this.length, this.parity, rounds);
-    return Uint8Array.from(total, (each) => (each < 0 ? 1 : 0));
-  }
-}
-
-/** Totals [length] after belief propagation, one check after the other; the last `parity` checks have to hold. */
-function propagated(
-  { starts, members }: Equations, given: Float32Array, length: number, parity: number, rounds: number,
-): Float32Array {
-  const total = new Float32Array(length);
-  const sent = new Float32Array(members.length);
-  const checks = given.length;
-  let widest = 1;
-  for (let check = 0; check < checks; check++) widest = Math.max(widest, starts[check + 1] - starts[check]);
-  const before = new Float64Array(widest + 1);
-  const factor = new Float64Array(widest);
-  for (let round = 0, held = 0; round < rounds && held < SETTLED; round++) {
-    for (let check = 0; check < checks; check++) {
-      const first = starts[check];
-      const degree = starts[check + 1] - first;
-      before[0] = halfTangent(given[check]);
-      for (let i = 0; i < degree; i++) {
-        factor[i] = halfTangent(total[members[first + i]] - sent[first + i]);
-        before[i + 1] = before[i] * factor[i];
+    const [sent, sizes] = [new Float64Array(members.length), new Float64Array(members.length)];
+    let total = new Float64Array(this.size + this.parity);
+    for (let round = 0, settled = 0; round < ROUNDS && settled < SETTLED; round++) {
+      const next = new Float64Array(total.length);
+      for (let row = 0, start = 0; row < degrees.length; start += degrees[row++]) {
+        const known = row < hints.length ? Math.max(-SURE, Math.min(SURE, hints[row])) : SURE;
+        let [size, sign] = [Math.log(Math.abs(known) + LEAST), known < 0 ? -1 : 1];
+        for (let at = start; at < start + degrees[row]; at++) {
+          const belief = 1 - 2 / (Math.exp(total[members[at]] - sent[at]) + 1); // tanh of the half, several times faster
+          sizes[at] = Math.log(Math.abs(belief) + LEAST);
+          size += sizes[at];
+          sent[at] = belief < 0 ? -1 : 1; // the sign, until the sum over all is known
+          sign *= sent[at];
+        }
+        for (let at = start; at < start + degrees[row]; at++) {
+          const product = Math.min(SURE, Math.exp(size - sizes[at]));
+          sent[at] *= sign * Math.log((1 + product) / (1 - product));
+          next[members[at]] += sent[at];
+        }
       }
-      let after = 1;
-      for (let i = degree - 1; i >= 0; i--) {
-        const product = before[i] * after;
-        after *= factor[i];
-        let message = MOST;
-        if (product < -NEARLY_SURE) message = -MOST;
-        else if (product <= NEARLY_SURE) message = Math.log((1 + product) / (1 - product));
-        total[members[first + i]] += Math.fround(message) - sent[first + i];
-        sent[first + i] = message;
-      }
+      settled = total.every((each, bit) => each < 0 === next[bit] < 0) ? settled + 1 : 0;
+      total = next;
     }
-    held = parityHolds(starts, members, total, checks - parity) ? held + 1 : 0;
+    return Uint8Array.from(total.subarray(0, this.size), (each) => (each < 0 ? 1 : 0));
   }
-  return total;
-}
 
-function parityHolds(starts: Uint32Array, members: Uint32Array, total: Float32Array, first: number): boolean {
-  for (let check = first; check < starts.length - 1; check++) {
-    let odd = false;
-    for (let at = starts[check]; at < starts[check + 1]; at++) odd = odd !== total[members[at]] < 0;
-    if (odd) return false;
+  private equations(seeds: Words): Equations {
+    const length = this.size + this.parity;
+    const degrees = Uint16Array.from({ length: seeds.length >> 1 }, (_, row) => {
+      return Math.min(this.degrees[mix(seeds[2 * row], seeds[2 * row + 1])[1] >>> 25], Math.floor(length / 4));
+    });
+    return { degrees, members: drawn(seeds, degrees, length) };
   }
-  return true;
-}
 
-/** tanh(x / 2), which is several times faster this way. */
-function halfTangent(x: number): number {
-  return x > 40 ? 1 : 1 - 2 / (Math.exp(x) + 1);
-}
-
-/** Sums of intermediate bits: equation i has the members from starts[i] to starts[i + 1]. */
-interface Equations {
-  readonly starts: Uint32Array; // [n + 1]
-  readonly members: Uint32Array;
-}
-
-/** Those of code bits with these seeds [n], and `more` after them, of `length` intermediate bits. */
-function equations(seeds: Words, length: number, degrees: Degrees, more?: Equations): Equations {
-  const count = seeds.length >> 1;
-  const most = degrees.map(([degree]) => Math.min(degree, Math.max(1, Math.floor(length / 4))));
-  const bounds: number[] = [];
-  for (const [, share] of degrees) bounds.push((bounds.at(-1) ?? 0) + share);
-  bounds.pop();
-  const starts = new Uint32Array(count + (more ? more.starts.length : 1));
-  for (let row = 0; row < count; row++) {
-    const found = mix(seeds[2 * row], seeds[2 * row + 1]);
-    const uniform = (found[1] * 2 ** 32 + found[0]) / 2 ** 64;
-    let chosen = 0;
-    while (chosen < bounds.length && bounds[chosen] <= uniform) chosen++;
-    starts[row + 1] = starts[row] + most[chosen];
+  /** The data bits that each parity bit is the sum of. */
+  private checks(): Equations {
+    const all = REPEATS * this.size;
+    const order = sortingOrder(mixed(Uint32Array.from({ length: 2 * all }, (_, at) => (at % 2 ? 0 : at / 2))));
+    const degrees = new Uint16Array(this.parity).fill(Math.ceil(all / this.parity));
+    const members = Uint32Array.from({ length: this.parity * degrees[0] }, (_, at) => Math.floor(order[at % all] / REPEATS));
+    return { degrees, members };
   }
-  const members = new Uint32Array(starts[count] + (more ? more.members.length : 0));
-  for (let row = 0; row < count; row++) {
-    // The product of (rank + 1) and an odd constant, one sum after the other.
-    let [low, high] = [0, 0];
-    for (let at = starts[row]; at < starts[row + 1]; at++) {
+}
+
+function sums(bits: Uint8Array, { degrees, members }: Equations): Uint8Array {
+  let at = 0;
+  return Uint8Array.from(degrees, (degree) => {
+    let sum = 0;
+    for (let end = at + degree; at < end; at++) sum ^= bits[members[at]];
+    return sum;
+  });
+}
+
+/** For each of the seeds as many numbers below `length` as its degree. */
+function drawn(seeds: Words, degrees: Uint16Array, length: number): Uint32Array {
+  const found = new Uint32Array(degrees.reduce((sum, each) => sum + each, 0));
+  let at = 0;
+  degrees.forEach((degree, row) => {
+    let [low, high] = [0, 0]; // the product of the rank, from 1 on, and the constant
+    for (let end = at + degree; at < end; at++) {
       low += RANK_LOW;
       high = (high + RANK_HIGH + (low > 0xffffffff ? 1 : 0)) >>> 0;
       low >>>= 0;
-      members[at] = scaled(mix(seeds[2 * row] ^ low, seeds[2 * row + 1] ^ high)[1], length);
+      // A number of 32 bits times `length`, divided by 2^32: exact below 2^53.
+      found[at] = Math.floor((mix(seeds[2 * row] ^ low, seeds[2 * row + 1] ^ high)[1] * length) / 2 ** 32);
     }
-  }
-  if (more) {
-    more.starts.forEach((start, index) => (starts[count + index] = starts[count] + start));
-    members.set(more.members, starts[count]);
-  }
-  return { starts, members };
-}
-
-/** [parity] checks: of some data bits, a parity bit and the one before it (irregular repeat-accumulate). */
-function parityChecks(size: number, parity: number): Equations {
-  const count = size * REPEATS;
-  const keys = new Uint32Array(2 * count);
-  const [low, high] = [(size << 20) >>> 0, size >>> 12];
-  for (let at = 0; at < count; at++) {
-    keys[2 * at] = at ^ low;
-    keys[2 * at + 1] = high;
-  }
-  const check = new Uint32Array(count);
-  sortingOrder(mixed(keys)).forEach((row, at) => (check[row] = at % parity));
-  const starts = new Uint32Array(parity + 1);
-  for (const row of check) starts[row + 1]++;
-  for (let row = 0; row < parity; row++) starts[row + 1] += starts[row] + (row ? 2 : 1);
-  const members = new Uint32Array(starts[parity]);
-  const ends = starts.slice(0, parity);
-  check.forEach((row, at) => (members[ends[row]++] = Math.floor(at / REPEATS)));
-  for (let row = 0; row < parity; row++) {
-    if (row) members[ends[row]++] = size + row - 1;
-    members[ends[row]++] = size + row;
-  }
-  return { starts, members };
-}
-
-/** `number` of 32 bits times `length` below 2^31, divided by 2^32. */
-function scaled(number: number, length: number): number {
-  const high = Math.floor(number / 0x10000) * length;
-  return Math.floor((high + Math.floor(((number & 0xffff) * length) / 0x10000)) / 0x10000);
+  });
+  return found;
 }

@@ -1,137 +1,104 @@
-/**
- * The header, on which a key is tried first: how to read the rest, in a few Gaussians that the key chooses;
- * `keyss.channels.colours.header` on the other side.
- */
-import { chacha20 } from '@noble/ciphers/chacha.js';
+/** The header, on which a key is tried first: how to read the rest; `keyss.channels.colours.header`. */
 import { hmac } from '@noble/hashes/hmac.js';
 import { sha256 } from '@noble/hashes/sha2.js';
-import { ascii } from '../../core/bytes.ts';
-import { mix, runs, sortingOrder, type Words, wordsOf } from '../../core/words.ts';
-import { expand } from '../../keys/keys.ts';
-import { type Carriers, chosen } from './carriers.ts';
+import { ascii, joined, median } from '../../core/bytes.ts';
+import { expand, SALT_BYTES } from '../../keys/keys.ts';
+import { type Carriers, chosen, fractions } from './carriers.ts';
 import { Fountain, NOISY } from './fountain.ts';
-import { COLUMNS, dithers, MAX_BITS, rank, readBits, seedsOf, sum } from './lattice.ts';
+import { COLUMNS, readBits, seedsOf } from './lattice.ts';
 
-export const FILE_KEY_BYTES = 5;
-export const SHARES = 256; // parts of the carriers; a payload has some of them
-export const IDLE = 1 / 32; // unit of the share of carriers that were left alone
-const PARTITION_BYTES = 2;
+export const STATIC_SALT = sha256(ascii('keyss/v1/colours-static')).slice(0, SALT_BYTES);
+const FILE_KEY_BYTES = 5;
+const SHARES = 256; // parts of the carriers; a payload has some of them
+const IDLE = 1 / 255; // unit of the share of carriers that were left alone
+const PLACES = 96; // Gaussians of a header under each salt
+const PILOTS = 10; // of the places
+const PLAIN_BYTES = FILE_KEY_BYTES + 6;
 const CHECK_BYTES = 2;
-export const HEADER_BYTES = 14;
-const ROUNDS = 20;
-const TRIES = 3; // to tell salts that were lost
-const [MIN_TRUST, MAX_TRUST] = [0.02, 0.95];
-const DECODED = 0.3; // weight of a bit that was decoded beside one that was known
-const PILOTS = 16; // numbers of each salt's part that are known beforehand
 const PRIOR = 0.4; // logarithm of the odds that a salt is one, before anything else is known
-const PUBLIC = sha256(ascii('keyss/v1/colours-places'));
-const [PAD_LOW, PAD_HIGH] = [0x1e98df25, 0x9fb21c65];
+const HELD = 0.5; // chance that a place under a salt holds what was written
+const MEDIAN_STEPS = 8; // of the median impact, in one
+const CODE = new Fountain(8 * (PLAIN_BYTES + CHECK_BYTES), NOISY);
 
-/** How headers are written: in how many Gaussians for each salt, with how many bits in each of their numbers. */
-export interface Kind {
-  readonly places: number;
-  readonly depth: number;
+/** The secrets of one key in one file: the same in every file, and under each salt. */
+export interface Secrets {
+  readonly fixed: Uint8Array;
+  readonly salted: readonly Uint8Array[];
 }
 
-const KINDS: readonly Kind[] = [{ places: 64, depth: 1 }, { places: 96, depth: 2 }];
-// How likely a place, and the ones after it, hold what was written: in an ordinary model; in two merged ones.
-const [USUAL, MERGED] = [[0.65], [0.4, 0.2]];
-export const VIEWS: readonly (readonly [Kind, readonly number[]])[] = [
-  [KINDS[0], USUAL], [KINDS[1], USUAL], [KINDS[1], MERGED],
-];
-
-const fountain = new Fountain(8 * HEADER_BYTES, NOISY);
+/** From the key derived under STATIC_SALT and under each salt. */
+export function secretsOf([first, ...others]: readonly Uint8Array[]): Secrets {
+  return { fixed: expand(first, 'colours/static', 32), salted: others.map((each) => expand(each, 'colours/header', 32)) };
+}
 
 /** How a payload is read. */
 export interface Header {
-  readonly fileKey: Uint8Array;
+  readonly key: Uint8Array; // of the payload
   readonly partition: Uint8Array; // by which carriers are shared out
   readonly level: number; // of `bitCounts`
-  readonly depth: number;
   readonly first: number; // of SHARES that the payload has,
   readonly last: number; // this one included
-  readonly bucket: number;
-  readonly idle: number; // share of its carriers that hold nothing, in units of IDLE
-  readonly bits: Uint8Array; // of all this, as they were read
+  readonly size: number; // bytes of the payload
+  readonly held: number; // share of its carriers that hold something
+  readonly median: number; // of impacts when it was written, in MEDIAN_STEPS, without multiples of 256
 }
 
-/** The kind of the header of a payload. */
-export function kindOf(header: Header): Kind {
-  return KINDS[Math.min(KINDS.length, header.depth) - 1];
-}
-
-/** Rows of the carriers that the payload has. */
-export function ownRows(header: Header, carriers: Carriers): number[] {
-  const parts = rank(header.partition, 'partition', carriers.names);
-  const found: number[] = [];
-  for (let row = 0; row < carriers.count; row++) {
-    const part = parts[2 * row] % SHARES;
-    if (part >= header.first && part <= header.last) found.push(row);
+/** null where there is none; one attempt in 2^16 finds one by chance, which opens nothing. */
+export function readHeader({ fixed, salted }: Secrets, carriers: Carriers): Header | null {
+  const [words, hints]: [number[], number[]] = [[], []];
+  for (const secret of salted) {
+    const { rows, pilots } = placesOf(secret, carriers);
+    const own = chosen(carriers, rows);
+    const bits = new Uint8Array(rows.length).fill(1);
+    const read = readBits(secret, own, bits).map((hint, at) => {
+      const place = Math.floor(at / COLUMNS);
+      return (HELD * (1 - own.doubt[place]) * hint) / own.alike[place];
+    });
+    const isPilot = (at: number): boolean => pilots[Math.floor(at / COLUMNS)];
+    const odds = read.reduce((sum, hint, at) => (isPilot(at) ? sum + Math.log1p(hint) : sum), PRIOR);
+    const seeds = seedsOf(secret, 'header-seeds', own, bits);
+    read.forEach((hint, at) => {
+      if (isPilot(at)) return;
+      hints.push(hint / (1 + Math.exp(-odds)));
+      words.push(seeds[2 * at], seeds[2 * at + 1]);
+    });
   }
-  return found;
+  const data = packBits(CODE.decode(Uint32Array.from(words), hints));
+  const plain = data.subarray(0, PLAIN_BYTES);
+  const check = hmac(sha256, expand(fixed, 'colours/check', 32), plain);
+  if (data.subarray(PLAIN_BYTES).some((each, at) => each !== check[at])) return null;
+  const [level, first, last, bucket, idle, middle] = plain.subarray(FILE_KEY_BYTES);
+  const partition = plain.slice(0, FILE_KEY_BYTES);
+  const key = expand(joined(fixed, partition), 'colours/data-key', 32);
+  const size = (16 + (bucket % 16)) << (Math.floor(bucket / 16) + 1); // 32 to 2 million
+  return { key, partition, level, first, last, size, held: 1 - idle * IDLE, median: middle };
 }
 
-/** The size that a number of one byte stands for: 32 to 2 million bytes. */
-export function bucketBytes(bucket: number): number {
-  return (16 + (bucket % 16)) << (Math.floor(bucket / 16) + 1);
+/** [C] which carriers the payload has: its share, without those of headers. */
+export function ownRows(header: Header, { salted }: Secrets, carriers: Carriers): number[] {
+  const taken = new Set(salted.flatMap((secret) => placesOf(secret, carriers).rows));
+  const parts = fractions(header.partition, 'partition', carriers.names);
+  return [...Array(carriers.count).keys()].filter((row) => {
+    const part = Math.floor(SHARES * parts[2 * row]);
+    return part >= header.first && part <= header.last && !taken.has(row);
+  });
 }
 
-/** The header of this kind whose parts lie under these secrets, if there is one. */
-export function readHeader(
-  secrets: readonly Uint8Array[], check: Uint8Array, index: Index, kind: Kind, view: readonly number[],
-): Header | null {
-  if (!index.size || !secrets.length) return null;
-  const parts = index.parts(secrets, kind, view);
-  const seeds = Uint32Array.from(parts.flatMap((part) => [...part.seeds]));
-  const odds = oddsOf(parts, secrets.length);
-  let trusts = odds.map(trust);
-  for (let attempt = 0; attempt < TRIES; attempt++) {
-    const ratios = Float32Array.from(parts.flatMap(({ hints, salt }) => [...hints].map((hint) => {
-      return 2 * Math.atanh(Math.max(-0.9999, Math.min(0.9999, hint * trusts[salt])));
-    })));
-    const every = fountain.likeliest(seeds, ratios, ROUNDS);
-    const header = unpackHeader(every.subarray(0, fountain.size), check);
-    if (header !== null) return header;
-    const agree = odds.slice();
-    for (const part of parts) agree[part.salt] += DECODED * agreement(signed(part.hints, fountain.sums(every, part.seeds)));
-    trusts = agree.map(trust);
+/** How much larger impacts are than when the header was written. */
+export function shiftOf(header: Header, { impact }: Carriers): number {
+  const off = MEDIAN_STEPS * median(impact) - header.median + 128;
+  return (off - Math.floor(off / 256) * 256 - 128) / MEDIAN_STEPS;
+}
+
+/** The carriers with the PLACES names that a secret chooses, and which of them are pilots. */
+function placesOf(secret: Uint8Array, { names }: Carriers): { rows: number[]; pilots: boolean[] } {
+  const numbers = fractions(secret, 'places', names).filter((_, at) => at % 2 === 0);
+  const least: number[] = [];
+  for (const each of numbers.slice().sort()) {
+    if (each !== least.at(-1) && least.push(each) > PLACES) break;
   }
-  return null;
-}
-
-/** How far what lies under these secrets agrees with the header: 0 by chance. */
-export function headerAgreement(header: Header, secrets: readonly Uint8Array[], index: Index): number {
-  if (!index.size) return 0;
-  return index.parts(secrets, kindOf(header), USUAL).reduce((before, { seeds, hints, pilots }) => {
-    return before + sum(pilots) + sum(signed(hints, fountain.encode(header.bits, seeds)));
-  }, 0);
-}
-
-/** Hints that bits are what they were read as, of hints that they are 0. */
-function signed(hints: Float64Array, bits: Uint8Array): Float64Array {
-  return hints.map((hint, at) => (bits[at] ? -hint : hint));
-}
-
-/** null where it is not one: by chance one of 2^16 is, and opens nothing. */
-function unpackHeader(bits: Uint8Array, check: Uint8Array): Header | null {
-  const data = packBits(bits);
-  const plain = data.subarray(0, HEADER_BYTES - CHECK_BYTES);
-  const tag = hmac(sha256, check, plain);
-  if (data[HEADER_BYTES - 2] !== tag[0] || data[HEADER_BYTES - 1] !== tag[1]) return null;
-  const [level, b, c, d, e] = data.subarray(FILE_KEY_BYTES + PARTITION_BYTES);
-  const found = {
-    fileKey: data.slice(0, FILE_KEY_BYTES),
-    partition: data.slice(FILE_KEY_BYTES, FILE_KEY_BYTES + PARTITION_BYTES),
-    // 8 bits of level, 3 of depth, 8 each of first, last and bucket, 5 of idle
-    level,
-    depth: b >> 5,
-    first: ((b & 31) << 3) | (c >> 5),
-    last: ((c & 31) << 3) | (d >> 5),
-    bucket: ((d & 31) << 3) | (e >> 5),
-    idle: e & 31,
-    bits: bits.slice(),
-  };
-  return found.depth < 1 || found.depth > MAX_BITS || found.last < found.first ? null : found;
+  const rows = [...numbers.keys()].filter((row) => numbers[row] < (least[PLACES] ?? 1));
+  return { rows, pilots: rows.map((row) => numbers[row] < (least[PILOTS] ?? 1)) };
 }
 
 /** Bytes of bits, the highest first. */
@@ -139,107 +106,4 @@ export function packBits(bits: Uint8Array): Uint8Array {
   const bytes = new Uint8Array(Math.ceil(bits.length / 8));
   bits.forEach((bit, at) => (bytes[at >> 3] |= bit << (7 - (at & 7))));
   return bytes;
-}
-
-function trust(odds: number): number {
-  return Math.max(MIN_TRUST, Math.min(MAX_TRUST, 1 / (1 + Math.exp(-odds))));
-}
-
-/** Code bits of a header under one salt, as one Gaussian of each place says; hints are P(0) - P(1). */
-interface Part {
-  readonly salt: number;
-  readonly seeds: Words; // [B]
-  readonly hints: Float64Array; // [B]
-  readonly pilots: Float64Array; // [PILOTS] the same of bits that are 0
-}
-
-/** Carriers by the public hash of their names. */
-export class Index {
-  private readonly hashes: Words; // [P] ascending, each once
-  private readonly first: Uint32Array; // [P] a carrier with each name
-  private readonly alike: Uint32Array; // [P] how many have it
-
-  constructor(private readonly carriers: Carriers) {
-    const hashes = rank(PUBLIC, 'places', carriers.names);
-    const order = sortingOrder(hashes);
-    const starts = runs(hashes, order);
-    this.first = starts.slice(0, -1).map((start) => order[start]);
-    this.alike = starts.slice(1).map((end, at) => end - starts[at]);
-    this.hashes = new Uint32Array(2 * this.first.length).map((_, at) => hashes[2 * this.first[at >> 1] + (at & 1)]);
-  }
-
-  get size(): number {
-    return this.first.length;
-  }
-
-  /** [count] places of the names that this secret's header is in, or those so many behind. */
-  private places(secret: Uint8Array, count: number, behind: number): Uint32Array {
-    const key = expand(secret, 'colours/places', 32);
-    const points = wordsOf(chacha20(key, new Uint8Array(12), new Uint8Array(8 * count)));
-    const found = new Uint32Array(count);
-    for (let at = 0; at < count; at++) {
-      found[at] = (this.firstFrom(points[2 * at], points[2 * at + 1]) + behind) % this.size;
-    }
-    return found;
-  }
-
-  /** [places] a carrier with each name that this secret's header is in. */
-  rows(secret: Uint8Array, kind: Kind): Uint32Array {
-    return this.places(secret, kind.places, 0).map((place) => this.first[place]);
-  }
-
-  /** What the first `count` Gaussians of each salt hold, if it is one. */
-  parts(secrets: readonly Uint8Array[], kind: Kind, view: readonly number[], count = kind.places): Part[] {
-    const bits = new Uint8Array(count).fill(kind.depth);
-    return view.flatMap((sure, behind) => secrets.map((secret, salt) => {
-      const places = this.places(secret, count, behind);
-      const own = chosen(this.carriers, places.map((place) => this.first[place]));
-      const words = seedsOf(rank(secret, 'header-seeds', own.names), bits);
-      const read = readBits(dithers(secret, own.names), own, bits, new Float64Array(count));
-      const hints = Float64Array.from(read, (ratio, bit) => {
-        const at = Math.floor(bit / (COLUMNS * kind.depth));
-        const certain = (sure * (1 - own.doubt[at])) / this.alike[places[at]];
-        return Math.tanh(ratio / 2) * certain * (isPadded(words, bit) ? -1 : 1);
-      });
-      return { salt, seeds: words.subarray(2 * PILOTS), hints: hints.subarray(PILOTS), pilots: hints.subarray(0, PILOTS) };
-    }));
-  }
-
-  /** How much likelier the pilots are with a header than without: a logarithm. */
-  promise(secrets: readonly Uint8Array[]): number {
-    if (!this.size || !secrets.length) return -Infinity;
-    return Math.max(...KINDS.map((kind) => {
-      const odds = oddsOf(this.parts(secrets, kind, USUAL, PILOTS / (COLUMNS * kind.depth)), secrets.length);
-      return odds.reduce((sum, each) => sum + Math.log1p(Math.exp(Math.max(-50, Math.min(50, each)))), 0);
-    }));
-  }
-
-  /** The first place whose hash is at least this word; `size` where there is none. */
-  private firstFrom(low: number, high: number): number {
-    let [from, to] = [0, this.size];
-    while (from < to) {
-      const middle = (from + to) >> 1;
-      const difference = this.hashes[2 * middle + 1] - high || this.hashes[2 * middle] - low;
-      if (difference < 0) from = middle + 1;
-      else to = middle;
-    }
-    return from;
-  }
-}
-
-/** [S] logarithms of the odds that each of the salts is one. */
-function oddsOf(parts: readonly Part[], salts: number): number[] {
-  const odds = new Array<number>(salts).fill(PRIOR);
-  for (const { salt, pilots } of parts) odds[salt] += agreement(pilots);
-  return odds;
-}
-
-/** The logarithm of how much likelier these hints are if all bits are 0 than by chance. */
-function agreement(hints: Float64Array): number {
-  return hints.reduce((sum, hint) => sum + Math.log1p(Math.max(-0.99, hint)), 0);
-}
-
-/** Whether the code bit with this seed is encrypted by a one. */
-function isPadded(seeds: Words, at: number): boolean {
-  return mix(seeds[2 * at] ^ PAD_LOW, seeds[2 * at + 1] ^ PAD_HIGH)[1] >>> 31 === 1;
 }

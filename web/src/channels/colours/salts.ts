@@ -1,65 +1,43 @@
-/** The Gaussians that serve as salts of Argon2id; `keyss.channels.colours.salts` on the other side. */
+/** The Gaussians that serve as salts of Argon2id; `keyss.channels.colours.salts`. */
 import { sha256 } from '@noble/hashes/sha2.js';
 import { ascii, bytesKey, joined } from '../../core/bytes.ts';
-import { runs, sortingOrder } from '../../core/words.ts';
 import { SALT_BYTES } from '../../keys/keys.ts';
-import { COLOUR_NOISE, COLOUR_STEP, NAME, type Numbers, OPACITY_NOISE, OPACITY_STEP, SCALE_STEP } from './carriers.ts';
-import { rank } from './lattice.ts';
+import {
+  type Carriers, cellOf, COLOUR_NOISE, COLOUR_STEPS, fractions, OPACITY_NOISE, OPACITY_STEPS, SCALE_STEPS,
+} from './carriers.ts';
 
-const SALTS = 16; // at most
+const SALTS = 12; // at most
 const BANDS = [0.08, 0.4, 1.01]; // limits of two bands of opacity, with half of the salts each
-const STEPS = [16, 8, 8, 5, 5, 5]; // of opacity, two ratios of scales, red, green and blue that make a cell
-const NOISE = [
-  OPACITY_NOISE / OPACITY_STEP, 1, 1,
-  ...[COLOUR_NOISE / COLOUR_STEP, COLOUR_NOISE / COLOUR_STEP, COLOUR_NOISE / COLOUR_STEP],
-];
-const UNCHANGED = 4; // of these numbers: opacity, ratios and red
-const MAX_CELLS = 30_000;
+const [OPACITY_CELL, RATIO_CELL, COLOUR_CELL] = [16, 8, 5]; // steps
 const LABEL = ascii('keyss/v1/colours-salt');
-const PUBLIC = sha256(LABEL);
 
-/** Up to 16 salts of 16 bytes. */
-export function saltsOf(numbers: Numbers): Uint8Array[] {
-  const cells = new Int16Array(STEPS.length * numbers.count);
-  const stable: number[][] = BANDS.slice(1).map(() => []);
-  for (let row = 0; row < numbers.count; row++) {
-    const inner = putCells(numbers, row, cells);
-    const band = BANDS.findIndex((least) => numbers.opacities[row] <= least) - 1;
-    if (inner && band >= 0) stable[band].push(row);
-  }
+/** Up to 12 salts of 16 bytes. */
+export function saltsOf({ count, logScales, opacities, colours }: Carriers): Uint8Array[] {
+  const cells = new Int16Array(6 * count);
+  const names = new Int16Array(8 * count); // the first four cells, and zeros up to a block of AES
+  const stable = Array.from({ length: count }, (_, row) => {
+    const ratio = (axis: number) => (logScales[3 * row + axis + 1] - logScales[3 * row + axis]) * SCALE_STEPS - 0.5;
+    const own = [
+      cellOf(opacities[row] * OPACITY_STEPS - 0.5, OPACITY_CELL, OPACITY_NOISE),
+      ...[0, 1].map((axis) => cellOf(ratio(axis), RATIO_CELL, 1)),
+      ...[0, 1, 2].map((column) => cellOf(colours[3 * row + column] * COLOUR_STEPS, COLOUR_CELL, COLOUR_NOISE)),
+    ];
+    own.forEach(([cell], column) => (cells[6 * row + column] = cell));
+    names.set(cells.subarray(6 * row, 6 * row + 4), 8 * row);
+    return own.slice(0, 4).every(([, doubt]) => doubt === 0);
+  });
+  const hashes = fractions(sha256(LABEL), 'salt', names);
   const salts = new Map<string, Uint8Array>();
-  for (const rows of stable) {
-    const names = new Int16Array(NAME * rows.length);
-    rows.forEach((row, to) => {
-      names.set(cells.subarray(STEPS.length * row, STEPS.length * row + UNCHANGED), NAME * to);
+  BANDS.slice(1).forEach((high, band) => {
+    const listed = new Map<number, number>(); // the first Gaussian with each hash
+    opacities.forEach((each, row) => {
+      const hash = hashes[2 * row];
+      if (stable[row] && each > BANDS[band] && each <= high && !listed.has(hash)) listed.set(hash, row);
     });
-    const ranks = rank(PUBLIC, 'salt', names);
-    const order = sortingOrder(ranks);
-    for (const start of runs(ranks, order).slice(0, -1).slice(0, SALTS / stable.length)) {
-      const row = rows[order[start]];
-      const own = cells.slice(STEPS.length * row, STEPS.length * (row + 1));
-      const salt = sha256(joined(LABEL, new Uint8Array(own.buffer))).slice(0, SALT_BYTES);
+    for (const [, row] of [...listed].sort(([a], [b]) => a - b).slice(0, SALTS / (BANDS.length - 1))) {
+      const salt = sha256(joined(LABEL, new Uint8Array(cells.slice(6 * row, 6 * row + 6).buffer))).slice(0, SALT_BYTES);
       salts.set(bytesKey(salt), salt);
     }
-  }
-  return [...salts.values()];
-}
-
-/** Writes the cells of a Gaussian; whether those that writing leaves alone are where no format moves them out. */
-function putCells({ logScales, opacities, colours }: Numbers, row: number, cells: Int16Array): boolean {
-  const steps = [
-    opacities[row] / OPACITY_STEP - 0.5,
-    (logScales[3 * row + 1] - logScales[3 * row]) / SCALE_STEP - 0.5,
-    (logScales[3 * row + 2] - logScales[3 * row + 1]) / SCALE_STEP - 0.5,
-    ...[0, 1, 2].map((colour) => colours[3 * row + colour] / COLOUR_STEP),
-  ];
-  let inner = true;
-  steps.forEach((step, column) => {
-    const place = Math.max(-MAX_CELLS, Math.min(MAX_CELLS, step / STEPS[column]));
-    const cell = Math.floor(place);
-    cells[STEPS.length * row + column] = cell;
-    const outward = Math.abs(place - cell - 0.5) / (0.5 - NOISE[column] / STEPS[column]);
-    if (column < UNCHANGED && outward >= 1) inner = false;
   });
-  return inner;
+  return [...salts.values()];
 }
