@@ -194,6 +194,13 @@ def test_paths_that_leave_are_refused(tmp_path: Path, file_path: str) -> None:
         load_scene(write_nerfstudio(tmp_path, frames=frames(["images/frame_00000.png", file_path])))
 
 
+@pytest.mark.parametrize("start", ["/home/somebody/scenes/garden/", "C:\\data\\garden\\"])
+def test_paths_of_another_computer_are_found_in_the_folder(tmp_path: Path, start: str) -> None:
+    paths = [f"images/frame_{index:05}.png" for index in range(3)]
+    write_nerfstudio(tmp_path, frames=frames([start + path for path in paths]))
+    assert sorted(view.camera.name for view in load_scene(tmp_path).views) == paths
+
+
 @pytest.mark.parametrize("file_path", [7, None])
 def test_paths_that_are_no_text_are_named(tmp_path: Path, file_path: object) -> None:
     both = frames(["images/frame_00000.png", "images/frame_00001.png"])

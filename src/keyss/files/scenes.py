@@ -28,7 +28,8 @@ from keyss.files.transforms import read_blender, read_nerfstudio
 _FAR = 1000  # extents from the origin: single precision has ten thousandths of one left
 _KNOWN = (
     "COLMAP (sparse/0/cameras.bin or .txt, images/); Blender / NeRF-synthetic (transforms_train.json); "
-    "Nerfstudio (transforms.json)"
+    "Nerfstudio (transforms.json). COLMAP (`colmap automatic_reconstructor`) and Nerfstudio "
+    "(`ns-process-data images`) find the cameras of photos"
 )
 
 

@@ -181,9 +181,16 @@ def _split(path: Path, posed: _Posed) -> tuple[tuple[Photo, ...], tuple[Photo, .
 
 
 def _inside(path: Path, file_path: str) -> str:
-    """A path from a JSON file, normalised: relative to the file's folder, inside it or its parent."""
+    """A path from a JSON file, normalised: relative to the file's folder, inside it or its parent.
+
+    An absolute path, as of another computer, is that of its longest end that exists in the file's folder.
+    """
     name = os.path.normpath(file_path.replace("\\", "/")).replace(os.sep, "/")
     parts = name.split("/")
+    if os.path.isabs(name) or ":" in parts[0]:
+        ends = ("/".join(parts[start:]) for start in range(1, len(parts)))
+        name = next((end for end in ends if (path.parent / end).is_file()), name)
+        parts = name.split("/")
     outside = os.path.isabs(name) or ":" in parts[0] or parts[:2] == ["..", ".."] or name in (".", "..")
     if outside or not file_path.isprintable():
         raise InputError(
