@@ -89,7 +89,7 @@ def changed(row: int, column: int, value: object) -> list[list[object]]:
         (changed(0, 0, "one"), r"Expected `float`, got `str` - at `\$\[0\]\[0\]`"),
         (changed(0, 3, math.nan), "finite `transform_matrix`"),
         (changed(3, 0, math.nan), "ends in 0 0 0 1"),
-        (changed(0, 3, 10**400), r"out of range - at `\$\[0\]\[3\]`"),
+        (changed(0, 3, 10**400), "finite `transform_matrix`"),
         (changed(0, 3, 1e300), "finite `transform_matrix`"),
         (changed(0, 2, 1.1), "with a rotation"),
         (changed(0, 2, -1.0), "with a rotation"),  # a mirror
