@@ -57,7 +57,7 @@ import cheap_keys
 
 Change = Callable[[Gaussians], Gaussians]
 FIFTH = 0.2
-METHOD, PACKED = "t", 2  # of payloads, and bytes that they take beside their data
+METHOD, PACKED = "t", 2  # payload header: method, and bytes beside the data
 
 
 def main() -> None:

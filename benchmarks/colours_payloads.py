@@ -28,7 +28,7 @@ Change = Callable[[Gaussians], Gaussians]
 Embed = Callable[[ColoursCover, int, bytes], Gaussians]  # cover, number of the key, payload
 Opens = Callable[[Gaussians, int, bytes], bool]  # model, number of the key, payload
 OWN = (".ply", ".spz", ".compressed.ply", ".sog", ".splat")  # written and read by this library
-REMOVED = 0.25  # of the Gaussians
+REMOVED = 0.25  # fraction of the Gaussians
 
 
 def run_payloads(

@@ -29,7 +29,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 VISIBLE = 0.05
-Writer = Callable[[Path, Path], object]  # from a .ply to a file
+Writer = Callable[[Path, Path], object]  # converts a .ply
 
 
 def main() -> None:

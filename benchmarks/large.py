@@ -79,7 +79,7 @@ class Cost:
 
     seconds: float
     processor: float  # seconds of all threads, those of the system included
-    gibibytes: float  # of memory, at most
+    gibibytes: float  # peak memory
 
 
 def main() -> None:
@@ -167,7 +167,7 @@ def _step(step: str, folder: Path, options: argparse.Namespace) -> None:
     elif step == "copy":
         write_model(folder / "copy.ply", read_model(folder / "cover.ply"))
     elif step == "hide":
-        with ThreadPoolExecutor(2) as readers:  # as `keyss hide` does
+        with ThreadPoolExecutor(2) as readers:  # `keyss hide` reads them like this
             cover, secret = readers.map(read_model, (folder / "cover.ply", folder / "secret.ply"))
         if options.format == "ply":
             prepared = LOW_BITS.prepare(cover)

@@ -22,7 +22,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 KEY = "Xq7Rf2LmZ9aT+001"
 FEW = 60  # steps
-LIBRARIES = ("OMP", "MKL", "NUMBA")  # that have threads, as the names of their settings begin
+LIBRARIES = ("OMP", "MKL", "NUMBA")  # libraries with threads: prefixes of their settings
 
 Command = list[object]
 Times = tuple[float, float]  # seconds and processor seconds

@@ -37,7 +37,7 @@ from lies import LIES, image
 import numpy as np
 import torch
 
-SECONDS = 2.0  # that one file of a few kilobytes may take
+SECONDS = 2.0  # time limit for a file of a few kilobytes
 CARRIERS = 6000  # Gaussians of the published model that holds a payload
 MEMORY, PER_BYTE = 200 << 20, 32  # bytes that reading a file may take: so many, and of each of its bytes
 _EXTREMES = (0, 1, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF, 0x7F800000, 0x7FC00000, 0x3F800000, 0x10000, 0xFF)

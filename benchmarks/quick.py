@@ -40,7 +40,7 @@ from threadpoolctl import threadpool_limits
 
 BASELINE = RESULTS / "quick" / "baseline.json"
 TOLERANCE = 0.5  # share by which a ratio may grow; it grew by up to 0.4 when five others used the machine
-WIDTH, HEIGHT, COUNT = 400, 266, 50_000  # of what is drawn
+WIDTH, HEIGHT, COUNT = 400, 266, 50_000  # workload of the renderer
 CARRIED = 20_000  # Gaussians, in as many
 KEY = "the key of the benchmark"
 

@@ -34,7 +34,7 @@ import torch
 
 THREADS = (1, 2, 4, 8, 16, 32)
 _WHOLE = ("sort_by_depth",)  # not divided into pieces
-_ENDS = {"blend": 9, "blend_backward": 5}  # which argument holds the last entries of tiles
+_ENDS = {"blend": 9, "blend_backward": 5}  # index of the argument that holds the last entries of tiles
 
 
 def makespan(pieces: Sequence[float], threads: int) -> float:
@@ -119,7 +119,7 @@ def _pieces(kernel: Callable[..., None], arguments: tuple[Any, ...]) -> list[flo
     """Do all the work of a kernel; seconds of its pieces, in their order."""
     if (place := _ENDS.get(kernel.__name__)) is not None:
         ends = arguments[place]
-        call = min(_seconds(kernel, len(ends), arguments) for _ in range(5))  # without a piece
+        call = min(_seconds(kernel, len(ends), arguments) for _ in range(5))  # overhead of a call: no pieces
         return [
             max(
                 0.0,

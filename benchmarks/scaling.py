@@ -1,7 +1,7 @@
 """What work takes as it grows: measured sizes, a model fitted to them, and a size four times as large.
 
     python benchmarks/scaling.py                # some minutes on 2 cores
-    python benchmarks/scaling.py --only step    # of one kind of work
+    python benchmarks/scaling.py --only step    # one kind of work
 
 The model is a sum of costs that are not negative: of a call, of each Gaussian, pixel, secret or photo, by
 non-negative least squares of relative errors. `predicted` is what it says of the largest size, which it was
@@ -43,7 +43,7 @@ class Work:
     """A kind of work, the sizes it is measured at, and what grows with them."""
 
     name: str
-    terms: tuple[str, ...]  # of a size; a constant is always there
+    terms: tuple[str, ...]  # terms computed from a size; a constant is always added
     sizes: tuple[Size, ...]
     larger: Size  # four times the largest
     seconds: Callable[[Size], float]

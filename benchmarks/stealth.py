@@ -48,7 +48,7 @@ from stealth_predictor import BitPredictor, sample
 
 PART_SIZES = (2000, 5000)
 PAYLOAD_BYTES = 4000
-TRAINING_ROWS, MAX_TRAINED_ON = 20_000, 20  # of the predictor
+TRAINING_ROWS, MAX_TRAINED_ON = 20_000, 20  # limits for the predictor
 CANDIDATES = 24
 SHOWN = 8  # single statistics in the table
 

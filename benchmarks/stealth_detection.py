@@ -14,7 +14,7 @@ from keyss.core.arrays import Doubles, Integers
 
 import numpy as np
 
-_DRAWS = 300  # of a bootstrap
+_DRAWS = 300  # bootstrap samples
 _EXCHANGES = 100
 _BEST = 12  # statistics that tell most, for logistic regression ...
 _EXAMPLES = 16  # ... one for so many examples, for others fit by chance
@@ -35,7 +35,7 @@ class Detection:
 class Examples:
     """Files, or one part of each; those of one `model` are the same, plain and with something in it."""
 
-    names: tuple[str, ...]  # of statistics
+    names: tuple[str, ...]  # names of the statistics
     values: Doubles  # [E, S], NaN where there was too little to count
     hidden: Integers  # [E] 0 plain, 1 with something in it
     scene: Integers  # [E]

@@ -20,7 +20,7 @@ from scipy.spatial import cKDTree
 LOWEST, HIGHEST = 1, 13  # bits that are predicted, the candidates for being replaced
 ATTRIBUTES_LEFT_ALONE = (0, 4)  # positions and constant colours
 _ABOVE, _BELOW = 5, 4  # bits that are seen
-ROWS = 30_000  # of one model
+ROWS = 30_000  # rows per model
 _TREES, _LEAVES = 60, 24
 _UNSIGNED = np.uint32(0x7FFFFFFF)
 _SURE = 0.1  # distance from 1/2 of a prediction that says something

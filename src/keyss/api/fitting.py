@@ -20,9 +20,9 @@ from keyss.runs.planning import check_room, in_a_line, needs_of_fit, plan_fit, w
 
 
 def seeded(config: FitConfig, interrupted: Path | None, *names: str) -> FitConfig:
-    """`config` with a seed: its own, that of an `interrupted` run's folder, or a random one.
+    """`config` with a seed: its own, that of the `interrupted` run, or a random one.
 
-    `names` lead to the config among the arguments of that run.
+    `interrupted`: the run's folder; `names`: the path to its config among its arguments.
     """
     if interrupted is not None:
         config = config.seeded(recorded_number(interrupted, *names, "seed"))

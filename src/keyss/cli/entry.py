@@ -31,7 +31,7 @@ OUT_OF_MEMORY = 8
 INTERNAL_ERROR = 70  # EX_SOFTWARE
 NO_ROOM = OutputError.exit_status
 _LEVELS = {"-q": -1, "--quiet": -1, "-v": 1, "--verbose": 1}
-_KEY_OPTIONS = ("-k", "-p", "--key", "--keys", "--password", "--passphrase")  # that people may expect
+_KEY_OPTIONS = ("-k", "-p", "--key", "--keys", "--password", "--passphrase")  # options that people may expect
 # Between backticks: `overwrite=True`, `method="carry", dither=True`, `sh_degree`.
 _VALUE = r"""(?:"[^"`]*"|'[^'`]*'|[\w.+-]+)"""
 _ASSIGNMENT = rf"([A-Za-z_]\w*)=({_VALUE})"
@@ -49,7 +49,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     KEYSS_DEBUG=1 in the environment, internal errors are raised.
     """
     arguments = list(sys.argv[1:] if arguments is None else arguments)
-    options: set[str] = set()  # of the command, by their names in Python
+    options: set[str] = set()  # options of the command, by their names in Python
     try:
         with _warnings_as_lines(options), _verbosity(arguments) as words:
             try:

@@ -48,7 +48,7 @@ class _Process:
     def __init__(self) -> None:
         self.received: int | None = None  # the first signal
         self.running = False  # inside a command, which cleans up on an interrupt
-        self.status: int | None = None  # of the command, once it is done
+        self.status: int | None = None  # exit status; None while the command runs
 
     def run(self) -> NoReturn:
         for signum in ENDING:

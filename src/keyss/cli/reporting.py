@@ -12,7 +12,7 @@ from keyss.cli.arguments import Training
 from keyss.core.errors import import_extra
 from keyss.progress import Reporter, reporter as lines
 
-FOLDER = "private/tensorboard"  # of a run: losses may reveal something about a secret
+FOLDER = "private/tensorboard"  # relative to a run; private, since losses may reveal something about a secret
 
 
 @contextmanager

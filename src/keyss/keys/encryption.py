@@ -1,8 +1,7 @@
 """Authenticated encryption of one payload: compressed, padded and encrypted under a data key of its own.
 
-ChaCha20-Poly1305 (RFC 8439) with a zero nonce: each data key encrypts one message only, since the writer
-samples it or derives it from everything that it encrypts. Lengths are padded to coarse buckets first, and
-reveal little about the content.
+ChaCha20-Poly1305 (RFC 8439) with a zero nonce. This is safe because each data key encrypts one message only:
+it is random, or derived from everything that it encrypts. Padding to coarse buckets hides exact lengths.
 """
 
 from __future__ import annotations

@@ -20,7 +20,7 @@ Score = float | None
 class Auc:
     """The area under a ROC curve: how often a positive scores above a negative, ties counting half."""
 
-    auc: float  # in [0, 1]
+    auc: float  # 0 to 1
     low: float  # 95 % interval, by DeLong (1988)
     high: float
 

@@ -19,8 +19,8 @@ from keyss.core.arrays import Floats
 from keyss.lab.two_sample import features
 
 SLICES = 32
-MAX_GAUSSIANS = 100_000  # of each model; larger ones are subsampled
-_RESOLUTION = 1e-6  # of a row's largest magnitude: a smaller range is rounding
+MAX_GAUSSIANS = 100_000  # Gaussians per model; larger models are subsampled
+_RESOLUTION = 1e-6  # relative to a row's largest magnitude: a smaller range is rounding
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class AttributeDistance:
     distance: float  # mean over the controls
     control: float  # mean over pairs of controls: seed-to-seed variation
     ratio: float | None  # distance / control; 1 is another training seed; None if `control` is 0
-    original: float | None = None  # the same ratio for the cover's own plain model
+    original: float | None = None  # ratio for the cover's own plain model
 
 
 def against_controls(

@@ -18,7 +18,7 @@ from keyss.core.arrays import Bytes, Doubles, Integers
 
 _SAMPLES = 1024  # per block of chi-square
 _MIN_BLOCKS = 256  # the original program fails with fewer
-_FREEDOM = 127  # of the test; there are 128 terms
+_FREEDOM = 127  # degrees of freedom: 128 terms - 1
 _AT_ONCE = 4096  # blocks whose histograms are in memory together
 _ROWS = 128  # origins of RS's blocks in memory together; even, so that disjoint blocks stay disjoint
 

@@ -28,7 +28,7 @@ class RenderTime:
     """The time of one render of a model."""
 
     seconds: float  # median
-    ratio: float  # to a plain model of the same scene: median over pairs of renders, which cancels other load
+    ratio: float  # median over pairs of renders, relative to a plain model of the scene; cancels other load
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class SpeedResult:
     """Times and sizes of the published model ("stego") and of the revealed ones ("secret N")."""
 
     render: dict[str, RenderTime]
-    reveal_seconds: tuple[float, ...]  # from file to file for each secret, key derivation included
+    reveal_seconds: tuple[float, ...]  # per secret, file to file, with key derivation
     bytes: dict[str, int]
 
 

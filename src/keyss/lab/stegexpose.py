@@ -53,9 +53,9 @@ def score_image(image: Bytes) -> Scores:
 class StegExposeAuc:
     """StegExpose on renders of the same views by two models."""
 
-    plain: tuple[Scores, ...]  # of each view
+    plain: tuple[Scores, ...]  # per view
     stego: tuple[Scores, ...]
-    fused: Auc  # of the mean of the detectors
+    fused: Auc  # AUC for the mean of the detectors
     detectors: dict[str, float | None]  # AUC of each detector; None if it accepts none of the images
 
 

@@ -19,7 +19,7 @@ from keyss.core.arrays import Doubles, Flags, Floats, Integers, Numbers
 from keyss.files.ply_rows import OPACITY_LOGIT_BOUND
 from keyss.lab.auc import Auc, delong
 
-MIN_GAUSSIANS, MAX_GAUSSIANS = 100, 10_000  # of each model
+MIN_GAUSSIANS, MAX_GAUSSIANS = 100, 10_000  # Gaussians per model
 FOLDS = 5
 _CELLS = 8  # along each axis
 _TREES, _LEAVES = 50, 16

@@ -32,7 +32,7 @@ class Source:
 
     given: Gaussians | None  # plain 3DGS model on the CPU; None until it is fitted to the photos
     photos: bool  # False: renders of the model replace photos
-    key: str = field(default="", repr=False)  # of a secret, if the method has keys
+    key: str = field(default="", repr=False)  # the secret's key, if the method has keys
     loaded: Scene | None = None
 
     @property
@@ -54,7 +54,7 @@ class Source:
 class Training:
     """The method's own training of one scene, which a bound has to match."""
 
-    steps: int = 0  # that render the scene
+    steps: int = 0  # steps that render the scene
     continues: bool = True  # starts from the plain model, whose steps count too
 
 
@@ -76,7 +76,7 @@ class Stego:
 
     gaussians: Gaussians  # the published model
     opened: tuple[Opened, ...]  # the secrets as their keys open them
-    iterations: int = 0  # of the method's own training
+    iterations: int = 0  # joint training steps
     details: Mapping[str, Any] = field(default_factory=dict)  # the method's own numbers, for metrics.json
     verified: bool = False  # True if `opened` was read from `gaussians` with the keys
     handed: tuple[Payload, ...] = ()  # the file that is handed over for each secret, if there are any
@@ -102,7 +102,7 @@ class CommandLineOption:
     help: str
     metavar: str | None = None  # stands for the value in the help
     default: str | None = None  # the meaning of None
-    parse: Callable[[str], Any] | None = None  # from text to the value, if the type does not
+    parse: Callable[[str], Any] | None = None  # parses text, if the type does not
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -111,9 +111,9 @@ class MethodOptions:
 
     method: ClassVar[str]  # name in files and on the command line, 1 to 15 ASCII characters
 
-    fit: FitConfig = field(default_factory=FitConfig)  # of plain models, and of the method's own training
+    fit: FitConfig = field(default_factory=FitConfig)  # plain models, and joint training
     publish: Publish = "as-is"  # or any: the published model may be converted
-    format: Format | None = None  # of a model that stays as it is; None: the cover's
+    format: Format | None = None  # for `publish="as-is"`; None: the cover's format
     # For models that may be converted: appended Gaussians have room for everything, and everybody sees them;
     # colours have little room and show less.
     channel: AnyChannel = "appended"
@@ -215,18 +215,18 @@ class Plan:
     Sizes are exact for given models, and upper limits for models that are not fitted yet.
     """
 
-    gaussians: int  # of the published model
-    sh_degree: int  # of the published model
-    secret_gaussians: int  # of all secrets together
+    gaussians: int  # Gaussians of the published model
+    sh_degree: int  # SH degree of the published model
+    secret_gaussians: int  # total over the secrets
     capacity: int  # Gaussians of the secrets that fit
-    steps: int = 0  # of the method's own training
+    steps: int = 0  # joint training steps
     rendered: tuple[int, ...] = ()  # Gaussians of the cover and of each secret in a step
     notes: tuple[str, ...] = ()  # what the options cost, a sentence each
 
     method: str = ""
     stages: tuple[Stage, ...] = ()
-    file_bytes: int = 0  # of the published model, at most
-    disk_bytes: int = 0  # of all files that exist at the same time, checkpoints included
+    file_bytes: int = 0  # upper limit for the published model
+    disk_bytes: int = 0  # maximum on disk at one time, checkpoints included
     free_bytes: int | None = None  # on their disk; None if nothing is written
     memory_bytes: int = 0  # a rough estimate
 
@@ -238,8 +238,8 @@ class Plan:
 class Method(Protocol):
     """One way to hide secrets."""
 
-    name: str  # that of its options
-    max_secrets: int  # in one model
+    name: str  # equal to `options.method`
+    max_secrets: int  # maximum secrets per model
     capabilities: Capabilities
     options: type[MethodOptions]
 

@@ -35,7 +35,7 @@ class Decoy:
 
     frame: Similarity
     changes: torch.Tensor  # [_KNOTS] of opacity logits
-    share: float  # of the rendered Gaussians, how many are left
+    share: float  # fraction of the rendered Gaussians that is left
     order: int  # seed of their order
     appended: bool = False  # True if the model has appended Gaussians, which are left out
     records: bool = True  # True if a secret would lie in records, else in one payload

@@ -15,7 +15,7 @@ from keyss.core.similarity import Similarity
 
 Frame = Literal["secret", "cover"]
 
-FILE = "file"  # in the place of a method's name
+FILE = "file"  # replaces the name of a method
 MAX_NAME_BYTES = 255
 
 
@@ -25,7 +25,7 @@ class Remains:
 
     found: int  # Gaussians that are left
     hidden: int  # Gaussians that were hidden; 0: unknown
-    chunks: tuple[int, int] | None = None  # of the payload: those left and those written; None: no chunks
+    chunks: tuple[int, int] | None = None  # payload chunks left and written; None: not divided
     slack: float = 0.0  # share by which the numbers may differ although nothing was lost
 
     @property

@@ -41,7 +41,7 @@ def plain_stage(role: str) -> str:
 class Bound:
     """Plain 3DGS of as many Gaussians and as many training steps as a scene had, for comparison."""
 
-    steps: int | None  # of the scene in total; None: unknown, because its plain model was given
+    steps: int | None  # total training steps of the scene; None: unknown, its plain model was given
     equal: bool  # True if the plain model has as many steps and is the bound itself
 
     @staticmethod

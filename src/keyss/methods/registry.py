@@ -19,9 +19,9 @@ class Modules(NamedTuple):
     """Where the parts of a method are, as `module:name`."""
 
     summary: str  # continues the name in one line
-    options: str  # its `MethodOptions`, in a module that does not import torch
+    options: str  # a `MethodOptions`, in a module that does not import torch
     hiding: str  # a `keyss.methods.base.Method`
-    opening: str  # from the content of a channel or a handed-over file to an `Opened`
+    opening: str  # turns content of a channel or a handed-over file into an `Opened`
 
 
 def _peer(module: str, options: str, summary: str) -> Modules:

@@ -12,7 +12,7 @@ from keyss.rendering.cpu.layout import CHANNEL_MAX, EPS2D_MIN
 
 MAX_SIDE = 2**16  # pixels
 MAX_CHANNELS = 32
-CAMERA_MAX = 1e12  # in viewmats and Ks, so that products do not overflow
+CAMERA_MAX = 1e12  # bounds viewmats and Ks, so that products do not overflow
 FOCAL_LENGTH_MIN = 1e-6  # pixels
 
 _BATCHES = "batch dimensions are not supported"

@@ -37,13 +37,13 @@ from keyss.runs.opening import HidingRun
 
 Numbers = dict[str, float | str]
 
-PRUNED_SHARES = (0.05, 0.10, 0.15, 0.25)  # of the Gaussians
-_LOST = 0.25  # of the Gaussians
-_GIVEN_UP = 0.01  # of the blending weight in the cover's views, by purification
-CONVERSIONS = {".spz": "gsply", "compressed .ply": "splat-transform"}  # by two programs
+PRUNED_SHARES = (0.05, 0.10, 0.15, 0.25)  # fractions of the Gaussians
+_LOST = 0.25  # fraction of the Gaussians
+_GIVEN_UP = 0.01  # fraction of the blending weight in the cover's views that purification removes
+CONVERSIONS = {".spz": "gsply", "compressed .ply": "splat-transform"}  # format and the program that writes it
 OWN = "our own"  # notes on what was measured with
 _EVERY_VIEW = 10**6
-_ROUNDS = 5  # of timing pictures
+_ROUNDS = 5  # repetitions when timing renders
 _ROLES = ("cover", "secret")
 _ATTRIBUTES = {"opacity": "op", "scale": "sc", "rotation": "ro", "position": "xyz", "colour": "sh"}
 

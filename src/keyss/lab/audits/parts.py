@@ -69,7 +69,7 @@ class AuditSubject:
     original: Gaussians  # plain model of the cover
     baselines: tuple[Gaussians | None, ...]  # plain models of the secrets, if there are any
     controls: tuple[Gaussians, ...]  # plain models of the cover from other seeds
-    seeds: tuple[int, ...]  # of the controls
+    seeds: tuple[int, ...]  # seeds of the controls
     device: torch.device
 
 
@@ -96,7 +96,7 @@ def subject_of(
         raise UsageError(f"{run.folder} has no plain model of the cover to compare with: give `original`")
     stego = run.stego.to(device)
     config = run.config.options.fit
-    if original is not None or run.config.models_given[0]:  # its size is not the run's
+    if original is not None or run.config.models_given[0]:  # the run's maximum is not for this model
         config = replace(config, max_gaussians=max(len(plain), 16))
     seeds = tuple(run.config.options.fit.seed_of(f"control {seed + index}") for index in range(controls))
     return AuditSubject(
@@ -144,7 +144,7 @@ def _plain_model(
 class PartResult(Generic[T]):
     """The result of one part of an audit."""
 
-    section: T  # of `Audit`
+    section: T  # a field of `Audit`
     pictures: dict[str, Tensor] = field(default_factory=dict)  # [H, W, 3] uint8 by file name
 
 

@@ -182,6 +182,6 @@ def _audited_run(run: HidingRun) -> AuditedRun:
         width=run.config.views.width,
         gaussians=len(run.stego),
         standard=registry.get(run.config.method).capabilities.standard,
-        config=msgspec.json.decode(msgspec.json.encode(run.config.options)),  # as reading gives it back
+        config=msgspec.json.decode(msgspec.json.encode(run.config.options)),  # like `read_audit`
         versions={"python": platform.python_version()} | {name: version_of(name) for name in _LIBRARIES},
     )

@@ -26,15 +26,15 @@ from keyss.keys.derivation import EMBEDDING_SIZE
 from keyss.rendering import contributions
 
 OPAQUE = 0.99  # the maximum alpha of a Gaussian in 3DGS
-THRESHOLDS = (0.01, 0.05, 0.2)  # of opacities; the paper's figures use 0.05
-SHARES = (0.1, 0.3, 0.5)  # of the least contributing
+THRESHOLDS = (0.01, 0.05, 0.2)  # opacities; the paper's figures use 0.05
+SHARES = (0.1, 0.3, 0.5)  # fractions of the Gaussians, least contributing first
 DEVIATIONS = (2.0, 3.5)  # robust z-scores of outliers
 CLUSTERS = (2, 4)
 SEARCH_SAMPLE = 1000  # Gaussians used to search embeddings; more do not change the result
 
 _BRIGHTEST = 0.99  # the quantile that rescaling makes OPAQUE, robust to outliers
-_TO_SIGMA = 1.4826  # from a median absolute deviation to the standard deviation of a normal distribution
-_MIN_SPREAD = 1e-3  # of a logarithm: attributes that differ by rounding have no outliers
+_TO_SIGMA = 1.4826  # converts a median absolute deviation to a normal standard deviation
+_MIN_SPREAD = 1e-3  # log units: attributes that differ only by rounding have no outliers
 _MIN_LENGTH = 1e-12
 _CLUSTER_SAMPLE = 5000  # Gaussians used to find clusters
 _MIN_CLUSTERED = 10

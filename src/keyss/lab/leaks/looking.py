@@ -29,7 +29,7 @@ GRADIENT_LIMIT = 0.1  # correlation of coarse gradients with the photos', above 
 COARSE = 64  # pixels of the longer side: shapes that are slightly misplaced still match
 
 _GAP = 4  # pixels between the parts of a picture
-_VIEWS = 8  # from which attacks look
+_VIEWS = 8  # cameras per scene for attacks
 
 
 @dataclass(frozen=True)
@@ -40,9 +40,9 @@ class LeakScores:
     """
 
     psnr_fitted: float  # dB
-    ssim_fitted: float  # as in 3DGS
+    ssim_fitted: float  # 3DGS's SSIM
     gradient: float  # `gradient_correlation`
-    gradient_coarse: float  # the same of `coarse` images
+    gradient_coarse: float  # `gradient_correlation` of `coarse` images
 
     @staticmethod
     def combined(function: Callable[[Sequence[float]], float], rows: Sequence[LeakScores]) -> LeakScores:
@@ -131,7 +131,7 @@ class AttackResult:
     scores: LeakScores  # each the maximum over the variants
     leak: LeakScores  # `scores` less those of the controls, which have as many variants
     best: str  # the variant with the largest `LeakScores.evidence`, which is pictured and judged
-    best_leak: LeakScores  # its scores less those of the controls
+    best_leak: LeakScores  # scores of the best variant minus those of the controls
     picture: str | None = None  # name of a file, in an audit
 
 

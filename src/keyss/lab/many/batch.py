@@ -50,7 +50,7 @@ from keyss.runs.folder import PRIVATE
 MAX_BYTES = 64 << 20
 COLUMNS = ("cover", "secret", "secret_file", "out", "key_file")
 SUMMARY = f"{PRIVATE}/batch.csv"
-_RECORD = f"{PRIVATE}/asset.json"  # in the folder of a finished asset
+_RECORD = f"{PRIVATE}/asset.json"  # relative to the folder of a finished asset
 
 
 @dataclass(frozen=True, kw_only=True)

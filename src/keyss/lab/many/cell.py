@@ -54,7 +54,7 @@ class Cell:
     """
 
     keyss: str = __version__
-    name: str  # for people
+    name: str  # display name
     cover: str  # a scene, or a model
     secrets: tuple[str, ...] = ()
     models: tuple[str | None, ...] = ()  # plain models of the cover and of each secret
@@ -97,10 +97,10 @@ class Result:
 
     version: int = 3
     keyss: str = __version__
-    seconds: float  # of the attempt that finished it
+    seconds: float  # duration of the attempt that finished it
     numbers: dict[str, float] = field(default_factory=dict)  # everything measured, by names with dots
     notes: dict[str, str] = field(default_factory=dict)  # on measures that were skipped or replaced
-    measures: tuple[str, ...] = ()  # of the cell's, those in `numbers`
+    measures: tuple[str, ...] = ()  # measures of the cell that are in `numbers`
 
 
 def earlier_result(cell: Cell, folder: Path) -> Result | None:
@@ -149,7 +149,7 @@ def plan_of(cell: Cell, folder: Path) -> Plan:
     has_keys, count = registry.get(cell.method).capabilities.keys, len(cell.secrets)
     keys = [f"key {index}" if has_keys else "" for index in range(count)]
     found = hide(**_arguments(cell, folder, keys), dry_run=True).plan
-    assert found is not None  # of a dry run
+    assert found is not None  # a dry run always has a plan
     fits = {plain_stage(role_of(index, 1 + count)) for index, each in enumerate(cell.models) if each}
     return replace(found, stages=tuple(each for each in found.stages if each.name not in fits))
 

@@ -67,7 +67,7 @@ class Forecast:
     """The cells of a folder before they run, in their order, by their folders."""
 
     names: Mapping[Path, str]
-    plans: Mapping[Path, Plan]  # of the cells to run
+    plans: Mapping[Path, Plan]  # cells to run
     refused: Mapping[Path, str]  # why a cell cannot work
 
 

@@ -33,7 +33,7 @@ from keyss.runs import write_record
 from keyss.runs.files import PathLike
 from keyss.runs.opening import HidingRun, open_run
 
-STEM = "comparison"  # of the names of its files
+STEM = "comparison"  # file names without their suffix
 MEASURES = ("files", "pictures", "secrecy", "survival")
 CONTROLS = (
     "control-1",

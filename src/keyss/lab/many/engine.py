@@ -22,7 +22,7 @@ from keyss.runs.folder import PRIVATE, check_not_published, make_private
 _LOCAL = "local"  # a cluster of this machine
 
 
-Tasks = Mapping[Path, Any]  # by their folders; each has a `name` and a `device`
+Tasks = Mapping[Path, Any]  # tasks by folder; each has a `name` and a `device`
 Work = Callable[[Any, Path, Reporter], Any]  # runs a task in a folder; returns its result
 Ended = tuple[Path, Any, str | None]  # folder of a task, its result, and an error
 Engine = Callable[[Work, Tasks], Iterator[Ended]]  # runs tasks, in any order
@@ -70,7 +70,7 @@ def _here(reporter: Reporter, work: Work, tasks: Tasks) -> Iterator[Ended]:
     for folder, task in tasks.items():
         try:
             ended = _attempt(work, task, folder, reporter)
-        except Interrupted as error:  # which advises to resume a single run
+        except Interrupted as error:  # its message says how to resume a single run
             reporter.note("interrupted: the same command resumes")
             raise KeyboardInterrupt(*error.args) from error
         yield ended

@@ -16,7 +16,7 @@ from keyss.lab.many.result_tables import markdown_rows
 
 Group = tuple[str, ...]  # names of a cover and of its secrets
 Figure = float | tuple[float, ...]  # one number, or one for each published group
-Measured = Mapping[str, Mapping[str, float | None]]  # by run and measure
+Measured = Mapping[str, Mapping[str, float | None]]  # value by run and measure
 Verdict = Literal["holds", "holds in part", "does not hold here", "not measured"]
 
 _PART = re.compile(
@@ -91,7 +91,7 @@ class JudgedClaim:
 
     text: str
     verdict: Verdict
-    parts: int  # that could be measured
+    parts: int  # parts that could be measured
     holding: int
 
 

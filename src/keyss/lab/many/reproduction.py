@@ -27,7 +27,7 @@ from keyss.runs import write_record
 from keyss.runs.files import PathLike
 
 SMALL = {"iterations": 1000, "max_gaussians": 9000, "width": 120}
-SSIM_WEIGHT = 0.5  # of the loss, for plain models too
+SSIM_WEIGHT = 0.5  # D-SSIM weight of the loss, also for plain models
 
 
 def reproduce(
@@ -166,7 +166,7 @@ def groups_of(
 
 def _numbers(numbers: Mapping[str, float]) -> dict[str, float]:
     """The numbers of a cell, by the names of the paper's figures."""
-    measures = ("pruning.", "rendering.", "sinkhorn.")  # whose numbers have the paper's names
+    measures = ("pruning.", "rendering.", "sinkhorn.")  # prefixes of numbers named after the paper's
     figures = {name.partition(".")[2]: value for name, value in numbers.items() if name.startswith(measures)}
     secrets = [value for name, value in numbers.items() if re.fullmatch(r"secrets\.\d+\.psnr", name)]
     figures |= {f"secret {number}": psnr for number, psnr in enumerate(secrets, start=1)}

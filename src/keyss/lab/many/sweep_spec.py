@@ -43,7 +43,7 @@ from keyss.progress import Reporter
 from keyss.rendering.orbit import is_model
 from keyss.runs.files import PathLike
 
-MAX_BYTES = 1 << 20  # of the file
+MAX_BYTES = 1 << 20  # size of the file
 _AT_LEAST_ONE = Meta(min_length=1)
 Row = tuple[dict[str, Any], list[str], int]  # labels, scenes and seed of a cell in tables
 

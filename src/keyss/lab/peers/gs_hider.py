@@ -34,7 +34,7 @@ class GsHiderTraining(PeerTraining):
         del self.parameters["sh"], self.optimizers["sh"]
         noise = _NOISE * torch.randn(len(start), FEATURES - 3)
         self.add("features", torch.cat([SH_C0 * start.sh[:, 0], noise], 1), self.options.fit.sh0_rate)
-        self.decoders = (Convolutions(FEATURES), Convolutions(FEATURES))  # of the scene, of the message
+        self.decoders = (Convolutions(FEATURES), Convolutions(FEATURES))  # scene, message
         self.networks.extend(self.decoders)
 
     def draw(self, scenes: Sequence[int], camera: Camera, sh_degree: int) -> list[Picture]:

@@ -38,7 +38,7 @@ class HandedTensors:
     """Tensors to hand over, and where the secret is in the cover's frame."""
 
     tensors: Mapping[str, Tensor]  # float32 or uint8
-    frame: Similarity | None = None  # from the secret's into the cover's; None: never placed there
+    frame: Similarity | None = None  # secret frame to cover frame; None: never placed there
     rows: int | None = None  # Gaussians of the published model, if they are needed in their order
 
     def payload(self, method: str) -> Payload:
@@ -67,7 +67,7 @@ class HandedTensors:
         return [self.tensors[name] for name in expected]
 
 
-Show = Callable[[Gaussians], Gaussians]  # from a model on the CPU, in the cover's frame; raises ValueError
+Show = Callable[[Gaussians], Gaussians]  # takes a model on the CPU in the cover's frame; raises ValueError
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ class PeerOptions(MethodOptions):
             metavar="SHARE",
         ),
     ] = 1.0
-    network_rate: float = 1e-3  # of Adam, decays to 5 % of it
+    network_rate: float = 1e-3  # Adam; decays to 5 %
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -41,9 +41,9 @@ from keyss.methods.base import Capabilities
 from keyss.methods.keyss.training import Picture
 
 COVER_BITS = (8, 10, 12, 14)  # low bits in use, of the 23 of a mantissa, by degree
-SECRET_BITS = (16, 13, 11, 10)  # of a coefficient if there is room for all, by degree
-WIDTHS, KERNEL = (1, 16, 32, 16, 1), 9  # of the autoencoder, along the list of Gaussians
-_FIT_STEPS = 200  # that fit the autoencoder to the secret's own opacities
+SECRET_BITS = (16, 13, 11, 10)  # bits per coefficient by degree, if all secrets fit
+WIDTHS, KERNEL = (1, 16, 32, 16, 1), 9  # autoencoder: channels, and kernel size along the list of Gaussians
+_FIT_STEPS = 200  # steps that fit the autoencoder to the secret's own opacities
 _RANGE = 0.999  # quantile of the coefficients above degree 0 at which they are clipped
 _BLOCK = 1 << 14  # Gaussians at a time
 _CIPHER_BYTES = 32

@@ -37,7 +37,7 @@ class Change:
 
     attack: str  # changes of one attack differ in strength only
     strength: float
-    unit: str  # of the strength
+    unit: str  # unit of `strength`
     sentence: str  # what it does, for the report
     apply: Callable[[Gaussians], Gaussians]
 

@@ -31,7 +31,7 @@ from keyss.methods.opened import Opened
 
 PRUNED = (0.05, 0.10, 0.15, 0.25, 0.50)
 NOISE = (0.001, 0.01, 0.1)
-SEEDS = 3  # of each random removal; results vary by a dB or two
+SEEDS = 3  # repetitions per random removal; results vary by a dB or two
 UNCHANGED = "none"
 
 # Opens a secret in a stego model on the CPU; raises KeyssError if it does not open.
@@ -61,7 +61,7 @@ class ChangeResult:
     unit: str
     sentence: str
     seeds: int = 1  # number of changes that this is the mean of
-    skipped: str | None = None  # which tool is missing; `cover` and `secrets` are unset then
+    skipped: str | None = None  # the missing tool; `cover` and `secrets` are unset then
     cover: ChangedQuality | None = None
     secrets: tuple[ChangedQuality, ...] = ()
 

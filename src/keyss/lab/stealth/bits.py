@@ -23,7 +23,7 @@ from keyss.lab.stealth.statistic import (
 )
 
 RANGES = {"0": (0, 1), "1-3": (1, 4), "4-8": (4, 9), "9-12": (9, 13)}
-_BITS = 14  # from the last one on
+_BITS = 14  # lowest bits of a number
 _HARMONICS = ATTRIBUTES.index("sh1")
 _MIN_COUNT = 64  # numbers of a stratum
 

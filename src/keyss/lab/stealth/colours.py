@@ -21,7 +21,7 @@ _QUANTILES = (0.05, 0.1, 0.25, 0.5, 0.9)
 _CHANNELS = {"green": 1, "blue": 2}
 _PARTS = ("most visible", "more visible", "less visible", "least visible")
 _MIN_PAIRS = 200
-_TINY = 1e-4  # of a colour: smaller differences count as none
+_TINY = 1e-4  # colour differences below this count as none
 INVISIBLE = -5.6  # logits below are never rendered
 _SHARES = {
     "logit below -12": (-np.inf, -12.0),
@@ -35,8 +35,8 @@ _SHARES = {
 }
 _FAINT = -2.944
 _BANDWIDTH, _STEP = 0.15, 0.05  # logits
-_MIN_GAUSSIANS = 30  # of a mode
-_DIP = 0.5  # of the lower of two modes: the density must fall to this between them
+_MIN_GAUSSIANS = 30  # minimum Gaussians per mode
+_DIP = 0.5  # two modes are separate if the density between them falls to this fraction of the lower one
 
 
 def colours(model: Gaussians, words: BitPatterns) -> dict[str, Statistic]:

@@ -16,7 +16,7 @@ from keyss.core.neighbours import nearest_neighbours
 from keyss.lab.stealth.colours import INVISIBLE, shapes_of
 from keyss.lab.stealth.statistic import BitPatterns
 
-MAX_GAUSSIANS = 20_000  # of each model
+MAX_GAUSSIANS = 20_000  # Gaussians per model
 _QUERIES = 4000  # rows whose nearest ones are searched
 _MIN_ENERGY = -20.0  # logarithm
 _MATCHED = 0.02  # distance of logarithms of energies; chance is below one in a thousand

@@ -27,12 +27,12 @@ from keyss.lab.two_sample import space_cells
 _UNIT = 5e-7  # error of a length normalised in float32
 _MOVED, _AROUND = 2e-4, 2e-3  # how far embedding moves a length; the range that gives the smooth density
 _CELLS = 4  # along each axis
-_BLOCKS = 16  # of rows
-_MIN_GAUSSIANS = 30  # of a part
-_CLUSTERED = 0.01  # of the usual gap between neighbouring values
+_BLOCKS = 16  # blocks of consecutive rows
+_MIN_GAUSSIANS = 30  # minimum Gaussians per part
+_CLUSTERED = 0.01  # fraction of the median gap between neighbouring values
 _WINDOW = 32
 _KS_SPREAD = 0.2603  # standard deviation of Kolmogorov's distribution
-_NEAR = 1e-5  # of the model's size
+_NEAR = 1e-5  # fraction of the model's size
 
 
 def invariants(model: Gaussians, words: BitPatterns) -> dict[str, Statistic]:

@@ -38,7 +38,7 @@ class JudgedStatistic:
     value: float
     low: float  # minimum of the controls
     high: float  # maximum of the controls
-    p: float  # that another control model is as far from the mean of the controls
+    p: float  # chance that another control model is as far from the mean of the controls
     exact: float | None  # p-value of the file alone under the statistic's own null, if it has one
 
 
@@ -49,8 +49,8 @@ class StealthResult:
     statistics: tuple[JudgedStatistic, ...]  # the least likely first
     least: float  # minimum of the p-values, corrected for their number
     least_of_controls: float  # the minimum for a control judged by the others
-    # Scores of a model of each secret against the file, judged by its scores against the controls; None
-    # without a model.
+    # For each secret: scores of its model against the file, judged by those against the controls. None: the
+    # secret has no model.
     confirmations: tuple[tuple[JudgedStatistic, ...] | None, ...] = ()
     invisible_groups: int = 0  # modes of the opacities too low to be rendered: countable secrets
     changed_low_bits: float = 0.0  # share of the Gaussians that differ from the cover's model in low bits

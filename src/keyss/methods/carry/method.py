@@ -30,7 +30,7 @@ _VISIBLE = (
     "the cover can hold the secret, but whoever inspects the published file sees that it holds something "
     '(`publish="any"`), because nothing goes in unnoticed: {}'
 )
-_LEAST_SHARE = 1 / 6  # of a secret's Gaussians: with fewer, refits of public models are below 30 dB
+_LEAST_SHARE = 1 / 6  # fraction of a secret's Gaussians; refits of public models with fewer are below 30 dB
 _FEWER = (
     "the secrets share the room, and each has fewer Gaussians than it could have alone: whoever has one of "
     "the keys can notice that there are other secrets"
@@ -84,7 +84,7 @@ class CarryMethod:
             options.iterations or (steps if secret.photos else min(options.fit.iterations, _MODEL_ITERATIONS))
             for secret in secrets
         ]
-        planned = options.refits or (0,) * len(cut)  # of the first call
+        planned = options.refits or (0,) * len(cut)  # set by the first call
         return replace(
             options, refits=tuple(p or (n if c else 0) for p, n, c in zip(planned, refits, cut, strict=True))
         )

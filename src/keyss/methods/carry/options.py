@@ -35,10 +35,10 @@ class CarryOptions(MethodOptions):
             "Degree of the published model's spherical harmonics, 0 to 3.", metavar="N", default="the cover's"
         ),
     ] = None
-    iterations: int | None = None  # of a refit; None: REFIT for each of `fit`, and fewer without photos
+    iterations: int | None = None  # steps per refit; None: REFIT per step of `fit`, fewer without photos
 
-    # Set by `prepare`: the highest SH degree of secrets, and steps of the refit of each secret, 0 for those
-    # that are carried as they are.
+    # Set by `prepare`: the maximum SH degree of secrets, and the refit steps of each secret (0: carried
+    # unchanged).
     max_secret_degree: int = 3
     refits: tuple[int, ...] = ()
 

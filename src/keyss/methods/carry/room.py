@@ -30,8 +30,8 @@ from keyss.methods.records.precision import most_visible, pruned
 from keyss.methods.records.whole import encode
 from keyss.rendering.difference import Viewpoints
 
-_BITS_PER_GAUSSIAN = 150  # of the payload of a secret that is not fitted yet
-_DRAWS = 3  # of new low bits: in covers of few bits, one in five has stale salts or bits that seem not random
+_BITS_PER_GAUSSIAN = 150  # payload estimate for a secret that is not fitted yet
+_DRAWS = 3  # attempts at new low bits: in covers of few bits, one in five has stale salts or nonrandom bits
 _TINY = 16  # Gaussians; a secret is not cut down to fewer
 _ANY = '`publish="any"` has room for all'
 
@@ -74,11 +74,11 @@ def _check_not_tiny(
 class RecordRoom:
     """The room for records in low bits: exact for a prepared cover, estimated for one not fitted yet."""
 
-    gaussians: int  # of the cover
-    sh_degree: int  # of the cover
+    gaussians: int  # Gaussians of the cover
+    sh_degree: int  # SH degree of the cover
     room: LowBitsRoom
     prepared: LowBitsCover | None = None  # None: not fitted yet
-    refit_share = 1.0  # of the Gaussians that fit before a refit
+    refit_share = 1.0  # refit size / Gaussians that fit
     more_room = _ANY
 
     @staticmethod
@@ -150,14 +150,14 @@ class RecordRoom:
 class WholeRoom:
     """The room for payloads: exact for a prepared cover, estimated for one not fitted yet."""
 
-    gaussians: int  # of the cover
-    sh_degree: int  # of the published model
+    gaussians: int  # Gaussians of the cover
+    sh_degree: int  # SH degree of the published model
     channel: Channel
     room: Room
     cover: Gaussians | None = None  # before embedding; None: not fitted yet
     prepared: PreparedCover | None = None
     max_secret_degree = 3
-    refit_share = 0.97  # of the Gaussians that fit before a refit, which changes how well they compress
+    refit_share = 0.97  # refit size / Gaussians that fit: refitted Gaussians compress a little worse
     more_room = _ANY
 
     @staticmethod

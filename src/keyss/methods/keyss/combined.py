@@ -30,7 +30,7 @@ class PlacedScene:
 
     scene: Scene
     plain: Gaussians
-    frame: Similarity  # from its own frame into the cover's
+    frame: Similarity  # own frame to cover frame
 
     @staticmethod
     def of(scene: Scene, plain: Gaussians, frame: Similarity) -> PlacedScene:

@@ -35,11 +35,11 @@ from keyss.methods.keyss.secret import KeyssSecret, choose_anchors, visibility
 from keyss.methods.keyss.training import KeyssTraining, Picture
 from keyss.rendering.view import contributions
 
-PRUNED_SHARE = 0.25  # of the published rows, the faintest, which `Design.pruned_steps` render without
+PRUNED_SHARE = 0.25  # fraction of the published rows, faintest first, that pruned steps leave out
 BASIS_SIZE = 2.0  # length of the vectors of the first basis
 BOUND = 0.9  # share of the steps after which rows are given
 NOISE_STEPS, WORTH_STEPS = 50, 100  # after which what is written, and what is pruned, is computed anew
-VIEWS, FEW_VIEWS = 64, 16  # in which contributions are measured for publishing, and in training
+VIEWS, FEW_VIEWS = 64, 16  # views for measuring contributions: when publishing, in training
 _LOW = 3 * (KEPT_DEGREE + 1) ** 2  # numbers of the cover's colours that are harmonics, not a code
 
 

@@ -29,10 +29,10 @@ from keyss.methods.tensors import Header, damage_refused, pack_tensors, unpack_t
 
 NAME = "keyss"
 FORMAT, VERSION = "keyss-secret", 10
-DECODERS: dict[str, type[Decoder]] = {"mlp": Decoder, "latent": LatentDecoder}  # by `DecoderShape.kind`
+DECODERS: dict[str, type[Decoder]] = {"mlp": Decoder, "latent": LatentDecoder}  # keys: `DecoderShape.kind`
 ANCHORS = 64
 ANCHORS_NEEDED = 0.25  # share that must be found again
-ANCHOR_TOLERANCE = 1e-6  # of the model's size
+ANCHOR_TOLERANCE = 1e-6  # fraction of the model's size
 _SLACK = 0.01  # share of the Gaussians that rounding may make visible or invisible
 _WEIGHTS = "decoder."
 
@@ -53,7 +53,7 @@ class KeyssSecret:
 
     decoder: Decoder
     key: Tensor = field(repr=False)  # [K] the vector of its key
-    frame: Similarity  # from the secret's own frame into the cover's
+    frame: Similarity  # secret frame to cover frame
     anchors: Tensor  # [A, 3] positions of Gaussians of the stego model
     count: int = 0  # Gaussians that it has when it is revealed from a whole file; 0: unknown
     visibility: float = 0.0  # sum of opacities; where less is left, the others make up for it

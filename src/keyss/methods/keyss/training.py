@@ -43,8 +43,8 @@ class Picture:
     """A render of a scene."""
 
     image: Tensor  # [H, W, 3]
-    meta: dict[str, Any]  # of the rasterization
-    indices: Tensor | None = None  # of the Gaussians that were rendered; None: all
+    meta: dict[str, Any]  # second result of the rasterization
+    indices: Tensor | None = None  # Gaussians that were rendered; None: all
 
 
 class KeyssTraining(JointRun):

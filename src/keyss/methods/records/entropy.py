@@ -19,7 +19,7 @@ from keyss.rendering.cpu.jit import inlined, kernel
 
 MAX_NUMBER = 1 << 29  # differences have at most 31 bits
 _MOST = 31
-_CONTEXTS = 16  # of counts; one more is that of the first bits
+_CONTEXTS = 16  # contexts for counts; one more is for first bits
 
 
 def encode(table: Integers, shares: Integers, groups: Integers) -> bytes:

@@ -21,7 +21,7 @@ LINE = struct.Struct("<2f2e")  # centre, spread, reach, far reach
 # The line with the least square error makes numbers smaller on average, which costs more against photos than
 # errors that are independent of the numbers: this part of the error gets this weight.
 _SHRINKING_WEIGHT = 20.0
-MAX_BITS = 24  # of one number: float32 has no more
+MAX_BITS = 24  # bits per number: float32 has no more
 CHROMA_FEWER = 2  # bits
 BANDS = (1, 3, 5, 7)  # spherical harmonics of degrees 0 to 3; each of three colours
 

@@ -13,7 +13,7 @@ from keyss.methods.opened import Frame, Remains
 from keyss.methods.records import whole
 from keyss.methods.records.quantise import Codec
 
-COUNT = struct.Struct("<I")  # of Gaussians, before the codec in the header of records
+COUNT = struct.Struct("<I")  # number of Gaussians, before the codec in the header of records
 
 
 @dataclass(frozen=True)
@@ -22,7 +22,7 @@ class CarriedSecret:
 
     gaussians: Gaussians  # those that are left, in the order of their carriers
     count: int  # Gaussians that were embedded
-    bits: int  # of a record, or of a Gaussian in a payload
+    bits: int  # bits per record, or per Gaussian of a payload
     frame: None = None
     decode: None = None
     key_size: int = 0

@@ -22,7 +22,7 @@ _SHARES = (3, 3, 1, 3, 3, 18)
 _TRIES, _CLOSE, _BIT = 6, 0.15, 6.02  # dB
 _COARSEST = 0.1  # step of harmonics: from afar, where renders are compared, their errors do not show
 _FINEST = 2.0  # octaves below the usual steps: about 58 dB
-_BITS_OF_OCTAVE = 13  # of a Gaussian, harmonics not counted
+_BITS_OF_OCTAVE = 13  # bits per Gaussian and octave, without harmonics
 
 
 def good_enough(model: Gaussians, viewpoints: Viewpoints | None = None) -> Precision:

@@ -49,12 +49,12 @@ from keyss.rendering.cpu.parallel import in_blocks
 
 MAX_LOGIT = 16.0  # beyond it the float32 sigmoid is exactly 0 or 1
 _MAX_HARMONIC = 1e6  # beyond it a colour is black or white wherever it is rendered at all
-_MIN_LENGTH = 1e-12  # of quaternions: a shorter one turns nothing
+_MIN_LENGTH = 1e-12  # shorter quaternions have no rotation
 _SAMPLE = 20_000  # Gaussians that tell which numbers are outliers, and that lines are fitted to
-_TABLE_BITS = 14  # of codes whose numbers are looked up, which is faster than `sinh`
+_TABLE_BITS = 14  # codes up to this size are decoded by a table, faster than by `sinh`
 _BLOCK = 1 << 12  # Gaussians at a time: their numbers stay in the cache
 _TABLE_BYTES = 8  # one for each number of bits, 0 for a band of harmonics that is not there
-_QUAT_LINE = Line(0, 0, 0.5**0.5, 0.5**0.5)  # of the three smaller components
+_QUAT_LINE = Line(0, 0, 0.5**0.5, 0.5**0.5)  # quaternion's three smaller components
 
 
 @dataclass(frozen=True)

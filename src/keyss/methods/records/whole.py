@@ -29,14 +29,14 @@ from keyss.methods.records import entropy
 from keyss.methods.records.quantise import numbers_of
 
 _ALWAYS = 1 << 16  # Gaussians that any payload may announce
-_MIN_BYTES = 2  # of each Gaussian in larger models
+_MIN_BYTES = 2  # minimum bytes per Gaussian of a larger model
 _HEAD = struct.Struct("<IB5f6f")
-_POSITION_STEP = 0.03  # in the median size of Gaussians
+_POSITION_STEP = 0.03  # relative to the median size of Gaussians
 _DIFFERENCES = np.array([1.0, 1.5, 1.5])  # steps of brightness and differences of constant colours
 _PER_OCTAVE = 0.5 / math.log(2)  # half octaves of the step
 _FINER = 6  # half octaves by which a step may be finer or coarser
 _MAX_STEP = 1e6
-_LEAST_W = 1 / 16  # its square
+_LEAST_W = 1 / 16  # minimum w^2
 # Columns of x, y, z, log scales, opacity, colours, quaternion: the eighths of the number before that a number
 # is predicted to be, and the groups of chances. Harmonics have two more groups and no prediction.
 _SHARES = (8, 8, 8, 2, 2, 2, 2, 6, 6, 6, 0, 0, 0)

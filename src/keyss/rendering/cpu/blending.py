@@ -72,7 +72,7 @@ from keyss.rendering.cpu.simd8 import (
 
 ANCHOR_ROWS = 8  # rows between two evaluations of exp, see above
 UNROLLED_ROWS = 4  # blended without a branch, which would cost more than an empty row
-PLANE = TILE_PIXELS + (UNROLLED_ROWS - 1) * TILE_WIDTH  # with room for unrolled rows below the tile
+PLANE = TILE_PIXELS + (UNROLLED_ROWS - 1) * TILE_WIDTH  # includes room for unrolled rows below the tile
 BATCH = 16  # Gaussians between two tests whether the whole tile is full
 
 STRIP = 3  # numbers per strip, see `list_strips`

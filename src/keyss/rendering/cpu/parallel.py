@@ -28,8 +28,8 @@ def run(kernel: Callable[..., None], *arguments: Any) -> None:
     `counter` is an int64 array of one zero, from which the kernel takes the number of its next piece with
     `simd8.fetch_add`.
     """
-    # The first call loads the kernel under a lock of LLVM's bindings, which Ctrl-C may leave locked: a helper
-    # that waits for it would block this thread.
+    # The first call loads the kernel under a lock of LLVM's bindings. Ctrl-C may leave it locked, and a
+    # helper thread waiting for it would block this one.
     most = _CORES if getattr(kernel, "overloads", True) else 1
     _on_threads(most, kernel, np.zeros(1, np.int64), *arguments)
 

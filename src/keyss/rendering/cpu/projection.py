@@ -77,7 +77,7 @@ class Linearised(NamedTuple):
     inverse_depth: Any
     slopes: Any  # x / z and y / z
     clamped: Any  # slopes at which the perspective is linearised
-    jacobian: Any  # its entries xx, xz, yy and yz; the others are 0
+    jacobian: Any  # entries xx, xz, yy and yz; the others are 0
     jw: Any  # rows of J W
     quaternion: Any  # normalised
     square: Any  # squared length of the quaternion

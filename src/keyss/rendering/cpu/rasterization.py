@@ -231,7 +231,7 @@ def _render(
     )  # fmt: skip
     counts = cursors.T.ravel()
     ends_of_counts = np.cumsum(counts)
-    cursors[:] = (ends_of_counts - counts).reshape(-1, shares).T  # from counts to starts
+    cursors[:] = (ends_of_counts - counts).reshape(-1, shares).T  # counts become starts
     tile_starts = np.append(cursors[0], ends_of_counts[-1])
     first_slots = np.cumsum(slot_counts, dtype=np.int32) - slot_counts
     pairs = int(tile_starts[-1])
