@@ -30,7 +30,7 @@ from keyss.files.formats.common import in_morton_order
 from keyss.files.models import read_model, write_model
 from keyss.files.scenes import load_scene
 from keyss.fitting import psnr
-from keyss.methods import fitted, most_visible, pruned
+from keyss.methods import encode_to_size, most_visible, prune_to_size
 from keyss.methods.records import whole
 from keyss.rendering import render
 from keyss.rendering.difference import psnr_between
@@ -78,8 +78,8 @@ def rows(cover: tuple[str, Gaussians], secret: tuple[str, Gaussians], data: Path
         start = time.monotonic()
         prepared = InCodes(name).prepare(cover[1])
         left = prepared.room.capacity - prepared.room.overhead
-        kept = pruned(own, left)
-        encoded = fitted(kept, left)
+        kept = prune_to_size(own, left)
+        encoded = encode_to_size(kept, left)
         stego = prepared.embed([(KEY, Payload("carry", encoded))])
         file = stego.codes.serialise()
         hiding = time.monotonic() - start

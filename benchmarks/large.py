@@ -33,7 +33,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 from keyss import read_model, write_model
 from channels.quiet.trained_like import trained_like
 from keyss.channels import LOW_BITS, channel_for
-from keyss.methods import embed_models, most_visible, pruned, record_request
+from keyss.methods import embed_models, most_visible, prune_to_size, record_request
 from keyss.runs.revealing import reveal_model
 
 KEY = "the key of the benchmark: 7Vw3-Qp"
@@ -180,7 +180,7 @@ def _step(step: str, folder: Path, options: argparse.Namespace) -> None:
             channel = channel_for("any") if any_format else channel_for("as-is", format=options.format)
             prepared = channel.prepare(cover)
             if options.prune:
-                secret = pruned(secret, prepared.room.capacity - prepared.room.overhead)
+                secret = prune_to_size(secret, prepared.room.capacity - prepared.room.overhead)
         write_model(published, embed_models(prepared, [KEY], [secret]).gaussians)
     else:
         revealed = reveal_model(read_model(published), KEY, device=torch.device("cpu")).gaussians

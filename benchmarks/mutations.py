@@ -31,7 +31,7 @@ from keyss.files import load_scene, model_bytes, model_of_bytes
 from keyss.files.formats.spz import SpzCodes
 from keyss.files.images import read_image
 from keyss.methods.records import whole
-from keyss.methods.tensors import Header, damage_refused, pack_tensors, unpack_tensors
+from keyss.methods.tensors import Header, pack_tensors, refuse_damage, unpack_tensors
 from lies import LIES, image
 
 import numpy as np
@@ -167,7 +167,7 @@ def _read(name: str, data: bytes) -> str | None:
             warnings.simplefilter("ignore")
             return _read_from(Path(folder), name, data)
     if name == "a.tensors":
-        with damage_refused("damaged"):
+        with refuse_damage("damaged"):
             unpack_tensors(data, Header, "test", 1)
         return None
     model = whole.decode(data, CARRIERS) if name == "a.payload" else model_of_bytes(name, data)

@@ -88,7 +88,7 @@ def sources_of(
             for source, (_, photos) in zip(sources, given, strict=True)
         ]
         return [
-            Source(scene.localised(model) if scene and model is not None else model, photos, key, scene)
+            Source(scene.to_scene_frame(model) if scene and model is not None else model, photos, key, scene)
             for model, (_, photos), key, scene in zip(found, given, ["", *keys], loaded, strict=True)
         ]
 

@@ -16,7 +16,7 @@ from typing import Any
 import torch
 
 from keyss.api.asking import HideResult, Secret, method_for, sources_of
-from keyss.api.fitting import seeded
+from keyss.api.fitting import with_seed
 from keyss.api.quality import check_quality
 from keyss.channels import AnyChannel, Format, Publish
 from keyss.core.errors import KeyssWarning, UsageError
@@ -27,11 +27,11 @@ from keyss.files.ply_extras import with_extras
 from keyss.fitting.image_metrics import quality
 from keyss.keys import DerivedKey
 from keyss.keys.derivation import SALT_BYTES
-from keyss.measure.hiding import Shown, measure_hiding, show
+from keyss.measure.hiding import Shown, compare, measure_hiding
 from keyss.methods.base import Context, Method, MethodOptions, Source, Stego
 from keyss.methods.handed import pack
 from keyss.methods.opened import Opened
-from keyss.methods.plain_models import Bound, fit_bounds, with_plain_models
+from keyss.methods.plain_models import Bound, fit_bounds, fit_plain_models
 from keyss.methods.registry import DEFAULT, open_handed, open_model
 from keyss.progress import Reporter
 from keyss.rendering import Backend, resolve_device
@@ -107,7 +107,7 @@ def hide(
     options = replace(options, **{name: value for name, value in asked.items() if value})
     _check_arguments(out, min_psnr)
     began, place, target = time.monotonic(), None if out is None else Path(out), resolve_device(device)
-    options = replace(options, fit=seeded(options.fit, place if resume else None, "options", "fit"))
+    options = replace(options, fit=with_seed(options.fit, place if resume else None, "options", "fit"))
     given, keys = [cover, *(secret.scene for secret in secrets)], [secret.key for secret in secrets]
     models = [cover_model, *(secret.model for secret in secrets)]
     views = ViewOptions.of(width, background, skip_missing)
@@ -145,7 +145,7 @@ def hide(
         published = with_extras(stego.gaussians, cover if cover_model is None else cover_model, plain[0])
         read = _write_and_read(stego, published, keys, folder)
         shown = [
-            show(model.to(target), each.model.to(target), each.scene, of_plain=not each.photos)
+            compare(model.to(target), each.model.to(target), each.scene, of_plain=not each.photos)
             for model, each in zip(read, sources, strict=True)
         ]
         sizes = [(len(model), len(each)) for model, each in zip(read, plain, strict=True)]
@@ -235,7 +235,7 @@ def _fit_models(
     """Fit missing plain models, and prepare the options for them."""
     if all(each.given is not None for each in sources):
         return sources, options
-    fitted = with_plain_models(sources, options.fits(len(sources)), context)
+    fitted = fit_plain_models(sources, options.fits(len(sources)), context)
     with warnings.catch_warnings():  # the first call has warned already
         warnings.simplefilter("ignore", KeyssWarning)
         return fitted, method.prepare(fitted, options)

@@ -72,7 +72,7 @@ def render(
     inputs = [Path(model)] if isinstance(model, str | Path) else []
     folder = RunFolder(out, "render", inputs=inputs, overwrite=overwrite) if out is not None else None
     scene = as_scene(cameras, views)
-    gaussians = scene.localised(as_model(model)).to(target)
+    gaussians = scene.to_scene_frame(as_model(model)).to(target)
     splits: dict[str, tuple[View, ...]] = {"test": scene.test, "train": scene.train, "all": scene.views}
     pictures = renders_of(gaussians, scene, splits[split])
     if folder:
@@ -147,7 +147,7 @@ def _write_film(
     else:
         scene = as_scene(cameras, views)
         color = scene.background
-        models = [scene.localised(each) for each in models]
+        models = [scene.to_scene_frame(each) for each in models]
         paths = [[_crop_to_even(camera) for camera in around([view.camera for view in scene.views], count)]]
         paths *= len(models)
     reporter = reporter or Reporter()

@@ -104,7 +104,7 @@ class Scene:
             reach = float((positions[0].double() - centre).norm())
         return 1.1 * reach
 
-    def localised(self, model: Gaussians) -> Gaussians:
+    def to_scene_frame(self, model: Gaussians) -> Gaussians:
         """`model` in the scene's frame; it may be in this frame already, or in that of the scene's files."""
         if not self.origin.any():
             return model

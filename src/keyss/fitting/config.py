@@ -66,7 +66,7 @@ class FitConfig:
         if self.seed is not None and not 0 <= self.seed <= MAX_SEED:
             raise UsageError(f"`seed`: expected 0 to {MAX_SEED}, got {self.seed}")
 
-    def seeded(self, otherwise: int | None = None) -> FitConfig:
+    def with_seed(self, otherwise: int | None = None) -> FitConfig:
         """The config with a seed: its own, else `otherwise`, else one from the system's random source."""
         if self.seed is not None:
             return self
@@ -74,9 +74,9 @@ class FitConfig:
 
     @property
     def known_seed(self) -> int:
-        """The seed. Raises ValueError without one: see `seeded`."""
+        """The seed. Raises ValueError without one: see `with_seed`."""
         if self.seed is None:
-            raise ValueError("expected a config with a seed: `seeded` samples one")
+            raise ValueError("expected a config with a seed: `with_seed` samples one")
         return self.seed
 
     def seed_of(self, use: str) -> int:

@@ -74,13 +74,15 @@ class CappedStrategy(DefaultStrategy):  # type: ignore[misc]
             (loss / len(views)).backward()
             losses.append(loss.detach() / len(views))
             renders += [(meta, indices, weight / len(views)) for meta, indices, weight in rendered]
-        return torch.stack(losses).sum(), self.combined(renders, count)
+        return torch.stack(losses).sum(), self.densification_info(renders, count)
 
-    def combined(self, renders: Sequence[Rendered], count: int) -> dict[str, Any]:
+    def densification_info(self, renders: Sequence[Rendered], count: int) -> dict[str, Any]:
         """The info of a step's renders of `count` Gaussians."""
         return combine_densification(renders, count)
 
-    def by_scene(self, renders: Sequence[Rendered], count: int, scenes: int, *, dim: int) -> dict[str, Any]:
+    def scene_stats(
+        self, renders: Sequence[Rendered], count: int, scenes: int, *, dim: int
+    ) -> dict[str, Any]:
         """Statistics of each scene's own renders, stacked along `dim`; `renders` cycle through the scenes."""
         found: list[dict[str, Any]] = []
         for scene in range(scenes):
@@ -91,7 +93,7 @@ class CappedStrategy(DefaultStrategy):  # type: ignore[misc]
     def _update_state(
         self, params: Parameters, state: dict[str, Any], info: dict[str, Any], packed: bool = False
     ) -> None:
-        """Add the statistics of renders, given by their meta, or summed by `by_scene`.
+        """Add the statistics of renders, given by their meta, or summed by `scene_stats`.
 
         The sums equal gsplat's. Selecting the visible Gaussians first, as gsplat does, takes twice as long on
         a CPU.

@@ -130,7 +130,7 @@ def fit_scene(
     own SH degree. Raises Interrupted on Ctrl-C after saving `checkpoint`, InputError for a checkpoint of
     another run.
     """
-    config, inputs = (config or FitConfig()).seeded(), {"scene": scene.digest()}
+    config, inputs = (config or FitConfig()).with_seed(), {"scene": scene.digest()}
     if model is not None:
         rates = {name: rate * value for name, value in vars(config).items() if name.endswith("_rate")}
         config = replace(config, sh_degree=model.sh_degree, settle=REFIT_SETTLE, boost=1.0, **rates)

@@ -42,8 +42,8 @@ class FixedRows(CappedStrategy):
         state: dict[str, Any] = super().initialize_state(scene_scale)
         return state | {"born": torch.arange(self.max_gaussians)}
 
-    def combined(self, renders: Sequence[Rendered], count: int) -> dict[str, Any]:
-        return self.by_scene(renders, count, len(self.extents), dim=0)
+    def densification_info(self, renders: Sequence[Rendered], count: int) -> dict[str, Any]:
+        return self.scene_stats(renders, count, len(self.extents), dim=0)
 
     @torch.no_grad()
     def step_post_backward(

@@ -19,9 +19,9 @@ from keyss.cli.arguments import (
     Resume,
     Run,
     Width,
+    check_exists,
     check_run,
-    check_there,
-    checked_seed,
+    check_seed,
     optional,
     switch,
 )
@@ -82,7 +82,7 @@ def audit(
             original=original,
             controls=controls,
             only=only,
-            seed=checked_seed(seed),
+            seed=check_seed(seed),
             device=device,
             overwrite=overwrite,
             resume=resume,
@@ -122,7 +122,7 @@ def compare(
 
     example: keyss compare --cover SCENE_A --secret SCENE_B --quick -o runs/compared
     """
-    check_there(cover, secret)
+    check_exists(cover, secret)
     import keyss
     from keyss.cli.tables import print_files, print_table
     from keyss.core.errors import InputError
@@ -137,7 +137,7 @@ def compare(
         cover,
         secret,
         methods=named,
-        seeds=tuple(map(checked_seed, seed)) or (0,),
+        seeds=tuple(map(check_seed, seed)) or (0,),
         device=device,
         out=out,
         dry_run=dry_run,
@@ -232,7 +232,7 @@ def reproduce(
         iterations=iterations,
         max_gaussians=max_gaussians,
         width=width,
-        seeds=tuple(map(checked_seed, seed)) or (0,),
+        seeds=tuple(map(check_seed, seed)) or (0,),
         device=device,
         out=out,
         dry_run=dry_run,

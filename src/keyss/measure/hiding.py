@@ -104,7 +104,7 @@ def measure_hiding(
         raise UsageError(f"expected at least one wrong key, got {wrong_keys}")
     if shown is None:
         models = [stego, *(secret.reveal(stego).to(stego.device) for secret in opened)]
-        shown = list(map(show, models, baselines, scenes))
+        shown = list(map(compare, models, baselines, scenes))
     cover = scenes[0]
     placed = [in_cover(*pair, cover) for pair in zip(opened, scenes[1:], strict=True)]
     return HidingQuality(
@@ -163,7 +163,7 @@ def _wrong_keys(
 
 
 @torch.no_grad()
-def show(model: Gaussians, plain: Gaussians | None, scene: Scene, *, of_plain: bool = False) -> Shown:
+def compare(model: Gaussians, plain: Gaussians | None, scene: Scene, *, of_plain: bool = False) -> Shown:
     """Compare both models with the test views of their scene, rendering each view once.
 
     Fidelity compares the model with the plain model, without photos. `of_plain`: the scene has no photos; its

@@ -125,9 +125,9 @@ def read_handed(path: PathLike, key: str | None) -> Opened:
         raise InputError(f"{path}: {error}") from error
 
 
-def is_sealed(path: PathLike) -> bool:
+def is_encrypted(path: PathLike) -> bool:
     """True if a file that was handed over needs a key. Raises InputError."""
-    return handing.is_sealed(read_file(Path(path), handing.MAX_BYTES))
+    return handing.is_encrypted(read_file(Path(path), handing.MAX_BYTES))
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from channels.quiet.trained_like import trained_like
 from keyss import CarryOptions, FitConfig, Secret
 from keyss.channels import identities
 from keyss.core import Gaussians, KeyssWarning, Scene, UsageError
-from keyss.methods import Source, Training, divided, most_contributing, registry
+from keyss.methods import Source, Training, divide, most_contributing, registry
 from methods.hiding import check_resumes, hide_scenes, psnr_in, three_scenes
 from tiny_scenes import random_gaussians, tiny_scene
 
@@ -133,7 +133,7 @@ def test_an_interrupted_refit_resumes_to_the_same_result(tmp_path: Path) -> None
 
 @given(st.lists(st.integers(0, 50), min_size=1, max_size=5), st.integers(0, 300))
 def test_shares_use_all_there_is_and_no_more(available: list[int], total: int) -> None:
-    shares = divided(available, total)
+    shares = divide(available, total)
     assert all(0 <= share <= n for share, n in zip(shares, available, strict=True))
     assert sum(shares) == min(total, sum(available))
     unfilled = [share for share, n in zip(shares, available, strict=True) if share < n]

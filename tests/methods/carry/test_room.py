@@ -15,7 +15,7 @@ from keyss import CarryOptions, Gaussians, Secret
 from keyss.channels import LowBitsRoom, usable_carriers
 from keyss.core import KeyssWarning, UsageError
 from keyss.fitting import mean_psnr
-from keyss.methods import Context, RecordRoom, SecretSize, Source, of_degree, registry
+from keyss.methods import Context, RecordRoom, SecretSize, Source, registry, to_degree
 from keyss.rendering import scene_of_model
 from tiny_scenes import random_gaussians
 
@@ -76,7 +76,7 @@ def test_a_cover_without_harmonics_gets_the_degree_that_its_refusal_names(
 def test_new_harmonics_cannot_be_seen() -> None:
     model = random_gaussians(300, sh_degree=0)
     scene = scene_of_model(model, "m", size=48)
-    assert mean_psnr(of_degree(model, 3, bytes(32)), scene.test, scene.background) > 55
+    assert mean_psnr(to_degree(model, 3, bytes(32)), scene.test, scene.background) > 55
 
 
 def test_what_training_will_not_make_random_is_refused() -> None:
@@ -124,7 +124,7 @@ def test_zeros_that_training_left_stay() -> None:
     """Small random numbers in their place would be known by their size."""
     model = trained_like(2000)
     model.sh[:150, 4:] = 0
-    assert torch.equal(of_degree(model, 3, os.urandom(32)).sh, model.sh)
+    assert torch.equal(to_degree(model, 3, os.urandom(32)).sh, model.sh)
     assert _prepare(CarryOptions(), model, trained_like(300, 1)).refits == (0,)
 
 

@@ -97,7 +97,7 @@ def test_their_program_shows_what_the_view_sees_of_the_cover() -> None:
             offset = (behind - run.parameters["means"]) * (torch.arange(len(run)) < len(run) // 2)[:, None]
             run.parameters["means"] += offset
             back = partial(_moved_by, -offset)
-            run.decoder.updated = back  # type: ignore[method-assign]
+            run.decoder.add_residuals = back  # type: ignore[method-assign]
             after = run.draw([1], camera, 0)[0].image
         changed = float((after - before).abs().mean())
         assert changed > 0.01 if design == "released" else changed < 0.2

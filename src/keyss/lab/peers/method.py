@@ -21,7 +21,7 @@ from keyss.methods.base import Capabilities, Context, Plan, Source, Stego
 from keyss.methods.keyss.combined import PlacedScene
 from keyss.methods.keyss.training import KeyssTraining, Picture
 from keyss.methods.opened import Frame, Remains
-from keyss.methods.tensors import Header, damage_refused, pack_tensors, unpack_tensors
+from keyss.methods.tensors import Header, pack_tensors, refuse_damage, unpack_tensors
 
 FORMAT, VERSION = "keyss-peer", 1
 DAMAGED = "what was handed over is damaged"
@@ -49,7 +49,7 @@ class HandedTensors:
     @staticmethod
     def of(content: Content) -> HandedTensors:
         """The tensors of `payload`. Raises InputError for anything else."""
-        with damage_refused(DAMAGED):
+        with refuse_damage(DAMAGED):
             if not isinstance(content, Payload):
                 raise ValueError("expected one string of bytes, got records")
             header, tensors = unpack_tensors(content.data, _Header, FORMAT, VERSION)
@@ -93,7 +93,7 @@ class HandedSecret:
             )
         if frame == "cover" and self.frame is None:
             raise UsageError('this secret never was in the cover\'s frame: leave out `frame="cover"`')
-        with damage_refused("what was handed over does not fit"):
+        with refuse_damage("what was handed over does not fit"):
             shown = self.show(stego.detach().to("cpu"))
         if self.frame is None or frame == "cover":
             return shown
@@ -193,5 +193,5 @@ class Peer:
     def unpack(self, content: Content) -> HandedSecret:
         """The secret of a handed-over file. Raises InputError for damage."""
         handed = HandedTensors.of(content)
-        with damage_refused(DAMAGED):
+        with refuse_damage(DAMAGED):
             return HandedSecret(handed, self.open(handed))

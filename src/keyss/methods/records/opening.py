@@ -1,4 +1,4 @@
-"""Carried secrets, opened from records or from a payload."""
+"""Open carried secrets from records or a payload."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class CarriedSecret:
     key_size: int = 0
 
     def reveal(self, stego: Gaussians, *, frame: Frame = "secret", force: bool = False) -> Gaussians:
-        """The Gaussians that are left, which compensate for those that were lost with their carriers."""
+        """The Gaussians that are left, enlarged to compensate for those lost with their carriers."""
         if frame == "cover":
             raise UsageError(
                 'a carried secret never lay in the cover\'s coordinates: leave out `frame="cover"`'
@@ -43,7 +43,7 @@ class CarriedSecret:
 
 
 def unpack(content: Content) -> CarriedSecret:
-    """The Gaussians that are left, of records in any order. Raises InputError for damage."""
+    """The Gaussians that are left; records may be in any order. Raises InputError for damage."""
     if not isinstance(content, Records):
         gaussians = whole.decode(content.data, content.carriers)
         return CarriedSecret(gaussians, len(gaussians), round(8 * len(content.data) / len(gaussians)))
