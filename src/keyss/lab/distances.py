@@ -81,16 +81,16 @@ def attribute_distances(reference: Gaussians, other: Gaussians, *, seed: int = 0
     result, rows = {}, []
     for name in both[0]:
         axes = [model[name].T for model in both]
-        along_axes, units = _along(*axes)
-        scaled = [_in_units(each, units[:, None]) for each in axes]
+        along_axes, units = _row_distances(*axes)
+        scaled = [_divide(each, units[:, None]) for each in axes]
         directions = _directions(generator, len(units))
-        along_slices, widths = _along(directions @ scaled[0], directions @ scaled[1])
+        along_slices, widths = _row_distances(directions @ scaled[0], directions @ scaled[1])
         result[name] = _mean(np.append(along_axes, along_slices), np.append(units, widths))
         weight = np.float32(1 / np.sqrt(max(int((units > 0).sum()), 1)))
         rows.append([weight * each for each in scaled])
     one, two = (np.concatenate(parts) for parts in zip(*rows, strict=True))
     directions = _directions(generator, len(one))
-    result["joint"] = _mean(*_along(directions @ one, directions @ two))
+    result["joint"] = _mean(*_row_distances(directions @ one, directions @ two))
     return result
 
 
@@ -106,7 +106,7 @@ def _mean(distances: Floats, units: Floats) -> float:
     return float(distances[units > 0].mean()) if (units > 0).any() else 0.0
 
 
-def _along(reference: Floats, other: Floats) -> tuple[Floats, Floats]:
+def _row_distances(reference: Floats, other: Floats) -> tuple[Floats, Floats]:
     """[D] distances of the rows of [D, N] and [D, M] in units of the reference's range, and the units [D].
 
     Both are 0 for a row that is one constant in both.
@@ -123,10 +123,10 @@ def _along(reference: Floats, other: Floats) -> tuple[Floats, Floats]:
     else:
         ot = import_extra("ot", "audit", "compute distances")
         areas = ot.wasserstein_1d(one.T.astype(np.float64), two.T.astype(np.float64), require_sort=False)
-    return _in_units(areas, units), units
+    return _divide(areas, units), units
 
 
-def _in_units(values: Floats, units: Floats) -> Floats:
+def _divide(values: Floats, units: Floats) -> Floats:
     """`values` / `units`, which broadcast; 0 where the unit is 0."""
     divisors: Floats = np.where(units > 0, units, np.inf)
     return values / divisors

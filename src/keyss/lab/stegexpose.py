@@ -45,7 +45,7 @@ def score_image(image: Bytes) -> Scores:
     for name, detector in DETECTORS.items():
         score = detector(image)
         scores[name] = score if score is None or math.isnan(score) else min(abs(score), 1.0)
-    available = _present(scores.values())
+    available = _finite(scores.values())
     return Scores(**scores, fusion=sum(available) / len(available) if available else math.nan)
 
 
@@ -76,12 +76,12 @@ def stegexpose_auc(plain_images: Sequence[Bytes], stego_images: Sequence[Bytes])
     detectors: dict[str, float | None] = {}
     for name in DETECTORS:
         negatives, positives = ([getattr(scores, name) for scores in group] for group in (plain, stego))
-        answers = _present(negatives + positives)
+        answers = _finite(negatives + positives)
         detectors[name] = auc_between(negatives, positives).auc if answers else None
     fused = ([scores.fusion for scores in group] for group in (plain, stego))
     return StegExposeAuc(plain, stego, auc_between(*fused), detectors)
 
 
-def _present(scores: Iterable[float | None]) -> list[float]:
+def _finite(scores: Iterable[float | None]) -> list[float]:
     """The scores that are neither None nor NaN."""
     return [score for score in scores if score is not None and not math.isnan(score)]

@@ -73,7 +73,7 @@ def two_sample_auc(a: Gaussians, b: Gaussians, *, seed: int = 0) -> Auc:
             "expected Gaussians spread over space, but they lie in too few places for five folds"
         )
     aucs, variances = zip(
-        *(_held_out(values, is_b, fold == index, seed) for index in range(FOLDS)), strict=True
+        *(_held_out_auc(values, is_b, fold == index, seed) for index in range(FOLDS)), strict=True
     )
     auc, margin = fmean(aucs), 1.96 * sum(variances) ** 0.5 / FOLDS
     return Auc(auc, max(auc - margin, 0.0), min(auc + margin, 1.0))
@@ -125,7 +125,7 @@ def _folds(positions: Floats, seed: int) -> Integers:
     return np.random.default_rng(seed).permutation(cell.max() + 1)[cell] % FOLDS
 
 
-def _held_out(values: Floats, is_b: Flags, held_out: Flags, seed: int) -> tuple[float, float]:
+def _held_out_auc(values: Floats, is_b: Flags, held_out: Flags, seed: int) -> tuple[float, float]:
     """AUC on held-out Gaussians of trees trained on the others, and its variance."""
     ensemble = import_extra("sklearn.ensemble", "audit", "train classifiers")
     threadpoolctl = import_extra("threadpoolctl", "audit", "train classifiers")

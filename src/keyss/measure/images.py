@@ -97,7 +97,7 @@ def _ssim(a: Doubles, b: Doubles) -> tuple[float, float]:
     return float(values.mean()), float(values[RADIUS:-RADIUS, RADIUS:-RADIUS].mean())
 
 
-def steganalysed(views: Sequence[View]) -> list[View]:
+def select_views(views: Sequence[View]) -> list[View]:
     """At most 64 views, evenly spaced in the order of their names."""
     return list(subsample_views(sorted(views, key=lambda view: view.camera.name), STEGANALYSED_VIEWS))
 

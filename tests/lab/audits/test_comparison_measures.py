@@ -33,26 +33,26 @@ def covers() -> Covers:
 
 
 def test_the_plain_model_is_as_usual_as_itself(covers: Covers) -> None:
-    found = covers.judged(covers.models[0], True)
+    found = covers.judge(covers.models[0], True)
     assert found == covers.own
     assert found["stealth"] > 1e-3
     assert found["stegexpose"] == 0.5
 
 
 def test_what_is_careless_is_seen(covers: Covers) -> None:
-    assert covers.judged(overwritten(covers.models[0]), True)["stealth"] < 1e-6
-    faint = covers.judged(replace(covers.models[0], opacity_logits=covers.models[0].opacity_logits - 9), True)
+    assert covers.judge(overwritten(covers.models[0]), True)["stealth"] < 1e-6
+    faint = covers.judge(replace(covers.models[0], opacity_logits=covers.models[0].opacity_logits - 9), True)
     assert faint["classifier"] > 0.95
     assert covers.own["classifier"] < 0.7
 
 
 def test_of_what_is_no_3dgs_model_only_pictures_are_judged(covers: Covers) -> None:
-    assert covers.judged(covers.models[0], False) == {"stegexpose": 0.5}
+    assert covers.judge(covers.models[0], False) == {"stegexpose": 0.5}
 
 
 def test_so_few_gaussians_tell_nothing() -> None:
     few = [random_gaussians(40, seed) for seed in range(3)]
-    assert "classifier" not in Covers(tiny_scene(0), few).judged(few[0], True)
+    assert "classifier" not in Covers(tiny_scene(0), few).judge(few[0], True)
 
 
 @pytest.fixture

@@ -14,7 +14,7 @@ from keyss.core import InputError, OutputError, UsageError
 from keyss.fitting import PRESETS
 from keyss.lab.audits import comparison_measures
 from keyss.lab.many import Forecast, cell, comparison
-from keyss.lab.many.engine import claimed
+from keyss.lab.many.engine import claim_folder
 from keyss.lab.two_sample import Auc
 from keyss.methods import Bound, registry
 
@@ -87,7 +87,7 @@ def test_a_table_a_picture_and_a_second_start(
 @pytest.mark.parametrize("iterations", [61, 3000])
 def test_every_scene_is_drawn_as_often_by_every_method(name: str, iterations: int) -> None:
     for preset in map(registry.get(name).options.preset, PRESETS):
-        options, plain = comparison.within(iterations, preset)
+        options, plain = comparison.split_budget(iterations, preset)
         trained = [Bound.of(each, own).steps for each, own in zip(options.training(2), plain, strict=True)]
         assert trained == [iterations] * 2
 
@@ -130,7 +130,7 @@ def test_one_budget_and_one_process_for_a_folder(folders: tuple[Path, Path], tmp
     found = compare(*folders, methods=["carry:quick", "3dgs"], out=tmp_path / "out", dry_run=True)
     assert isinstance(found, Forecast)
     assert {each.partition(", ")[2] for each in found.names.values()} >= {"500 steps, seed 0"}
-    with claimed(tmp_path / "out"), pytest.raises(OutputError, match="another process"):
+    with claim_folder(tmp_path / "out"), pytest.raises(OutputError, match="another process"):
         compare(*folders, methods=["carry:quick"], out=tmp_path / "out")
 
 

@@ -65,7 +65,7 @@ def test_sums_and_scores_follow_from_the_other_figures() -> None:
 @pytest.mark.parametrize("name", TABLES)
 def test_claims_hold_for_the_papers_own_figures(name: str) -> None:
     """All but one: with two secrets a wrong key shows 16.5 dB of the bicycle instead of 22.5."""
-    found = {claim.text: paper.judged(claim, published(name)) for claim in TABLES[name].claims}
+    found = {claim.text: paper.judge_claim(claim, published(name)) for claim in TABLES[name].claims}
     assert all(each.parts for each in found.values())
     exceptions = {text: each for text, each in found.items() if each.verdict != "holds"}
     if name == "multi":
@@ -88,7 +88,7 @@ def test_claims_hold_for_the_papers_own_figures(name: str) -> None:
 )
 def test_the_rule(values: list[float | None], verdict: str, holding: int, parts: int) -> None:
     claim = paper.Claim(text="a claim", parts=tuple(f"run: {index} >= 0.5" for index in range(3)))
-    found = paper.judged(claim, {"run": {f"{index}": value for index, value in enumerate(values)}})
+    found = paper.judge_claim(claim, {"run": {f"{index}": value for index, value in enumerate(values)}})
     assert (found.verdict, found.holding, found.parts) == (verdict, holding, parts)
 
 
@@ -105,9 +105,9 @@ def test_the_rule(values: list[float | None], verdict: str, holding: int, parts:
 )
 def test_a_part_is_a_difference_within_limits(part: str, holds: int) -> None:
     values: dict[str, dict[str, float | None]] = {"a": {"x": 3.0, "long, y": 3.0}, "b": {"x": 1.0}}
-    assert paper.judged(paper.Claim(text="", parts=(part,)), values).holding == holds
+    assert paper.judge_claim(paper.Claim(text="", parts=(part,)), values).holding == holds
     others = values | {"c": {"x": 2.0}, "d": {"x": None}}
-    assert paper.judged(paper.Claim(text="", parts=(part,)), others).parts == 1 + ("*" in part)
+    assert paper.judge_claim(paper.Claim(text="", parts=(part,)), others).parts == 1 + ("*" in part)
 
 
 def test_the_command_knows_all_tables() -> None:
@@ -142,7 +142,7 @@ def test_a_mean_over_other_pairs_is_no_mean() -> None:
     here = rows[0].here
     assert here["whole, cover"] == 21.0
     assert here["whole, secret"] is None
-    claims = tuple(paper.judged(claim, {"KeySS": here}) for claim in table.claims)
+    claims = tuple(paper.judge_claim(claim, {"KeySS": here}) for claim in table.claims)
     assert {each.verdict for each in claims} == {"not measured"}
     text = paper.reproduction_text(
         paper.Reproduction(

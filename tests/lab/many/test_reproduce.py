@@ -143,7 +143,7 @@ def test_what_is_appended_is_neither_counted_nor_pruned(out: Path) -> None:
     own = comparison_measures.own_gaussians(stego)
     assert 0 < len(own) <= 150 < len(stego)
     for change in (random_pruning(0.25), opacity_pruning(0.25)):
-        left = comparison_measures.sparing(change)(stego)
+        left = comparison_measures.spare_appended(change)(stego)
         assert len(comparison_measures.own_gaussians(left)) == len(change(own))
         assert len(left) - len(comparison_measures.own_gaussians(left)) == len(stego) - len(own)
         assert torch.equal(comparison_measures.own_gaussians(left).means, change(own).means)

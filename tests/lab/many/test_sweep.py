@@ -16,7 +16,7 @@ import keyss as library
 from cli.said import Run
 from keyss.core import BackendError, InputError, OutputError
 from keyss.lab.many import Forecast, ManyResult, cell_folder, sweep, sweep_spec
-from keyss.lab.many.engine import claimed
+from keyss.lab.many.engine import claim_folder
 from keyss.progress import Reporter
 from keyss.runs import MANIFEST
 from lab.many.conftest import fake_run
@@ -302,7 +302,7 @@ def test_the_key_of_a_cell_opens_it(tmp_path: Path, keyss: Run) -> None:
 
 def test_two_sweeps_do_not_work_in_one_folder(tmp_path: Path) -> None:
     spec = write_spec(tmp_path, ["a.ply"], seeds=1)
-    with claimed(tmp_path / "out"), pytest.raises(OutputError, match="another process"):
+    with claim_folder(tmp_path / "out"), pytest.raises(OutputError, match="another process"):
         run(spec, tmp_path / "out")
 
 

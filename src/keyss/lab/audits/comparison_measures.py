@@ -29,7 +29,7 @@ from keyss.lab.speed import RenderTime, readers, render_time
 from keyss.lab.stealth.judging import judge
 from keyss.lab.stegexpose import stegexpose_auc
 from keyss.lab.two_sample import two_sample_auc
-from keyss.measure.images import renders_of, steganalysed
+from keyss.measure.images import renders_of, select_views
 from keyss.methods import registry
 from keyss.rendering import Backend, resolve_device
 from keyss.runs.files import HANDED, as_scene, stego_in
@@ -126,7 +126,7 @@ def secrecy(subject: Subject) -> Numbers:
     config = subject.run.config
     covers = _covers(subject.controls, config.cover or "", config.views, subject.backend)
     plain = {f"{name}_plain": value for name, value in covers.own.items()}
-    return {**covers.judged(subject.stego, subject.standard), **plain}
+    return {**covers.judge(subject.stego, subject.standard), **plain}
 
 
 def survival(subject: Subject) -> Numbers:
@@ -174,7 +174,7 @@ def pruning(subject: Subject) -> Numbers:
     kinds = {"by opacity": opacity_pruning, "random": random_pruning}
     named = {f"{share:.0%} {how}": kinds[how](share) for how in kinds for share in PRUNED_SHARES}
     cover, *others = subject.scenes
-    changes = [sparing(each) for each in named.values()]
+    changes = [spare_appended(each) for each in named.values()]
     results = measure_robustness(
         subject.stego, subject.run.openers, cover, others, changes=changes, max_views=_EVERY_VIEW
     )
@@ -223,7 +223,7 @@ class PlainCovers:
     scene: Scene
     models: Sequence[Gaussians]  # at least three, on the device: the one to compare with, then controls
 
-    def judged(self, model: Gaussians, standard: bool) -> dict[str, float]:
+    def judge(self, model: Gaussians, standard: bool) -> dict[str, float]:
         """A model against the controls; unless it is `standard`, only its pictures.
 
         The mean AUC of trees that separate its Gaussians from those of the controls, the lowest p-value of
@@ -240,7 +240,7 @@ class PlainCovers:
     @cached_property
     def own(self) -> dict[str, float]:
         """The plain model against the controls."""
-        return self.judged(self.models[0], True)
+        return self.judge(self.models[0], True)
 
     @cached_property
     def plain_pictures(self) -> list[Bytes]:
@@ -249,7 +249,7 @@ class PlainCovers:
 
     def pictures(self, model: Gaussians) -> list[Bytes]:
         """Renders of a model that StegExpose looks at."""
-        views = steganalysed(self.scene.views)
+        views = select_views(self.scene.views)
         return [image.numpy() for _, image in renders_of(model, self.scene, views)]
 
 
@@ -264,7 +264,7 @@ def own_gaussians(stego: Gaussians) -> Gaussians:
     return stego if isinstance(stego, DecodedGaussians) else stego[~is_appended(stego)]
 
 
-def sparing(change: Change) -> Change:
+def spare_appended(change: Change) -> Change:
     """The same change, but not to appended Gaussians."""
 
     def apply(model: Gaussians) -> Gaussians:

@@ -63,7 +63,7 @@ def report_bytes(audit: Audit, folder: Path) -> bytes:
     except RecursionError as error:
         raise InputError(f"{folder}: the audit's configuration is nested too deeply") from error
     script = _asset("slider.js")
-    lines, notes = verdicts(audit), _not_measured(audit)
+    lines, notes = verdicts(audit), _missing_parts(audit)
     models = audit.images.models if audit.images else ()
     sections = {"verdict": "Verdict"} if lines else {}
     if audit.images and audit.images.pictures:
@@ -124,7 +124,7 @@ def _environment() -> Environment:
         loader=jinja2.PackageLoader("keyss.lab.audits"),
         autoescape=True,
         undefined=jinja2.StrictUndefined,
-        finalize=_finalized,
+        finalize=_finalize,
         trim_blocks=True,
         lstrip_blocks=True,
     )
@@ -133,7 +133,7 @@ def _environment() -> Environment:
     return environment
 
 
-def _finalized(value: object) -> object:
+def _finalize(value: object) -> object:
     """The value of an expression in a template; untrusted text becomes one printable line."""
     if isinstance(value, str) and not isinstance(value, Markup):
         return clean(value)
@@ -157,7 +157,7 @@ def _comparisons(models: Sequence[ModelImages]) -> list[tuple[str, ImageComparis
     return rows
 
 
-def _not_measured(audit: Audit) -> list[str]:
+def _missing_parts(audit: Audit) -> list[str]:
     """Everything that the audit lacks, and how to get it."""
     notes = []
     for name, (_, title) in _PARTS.items():

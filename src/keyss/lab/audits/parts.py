@@ -46,7 +46,7 @@ from keyss.lab.stealth.judging import StealthResult, judge
 from keyss.lab.stegexpose import stegexpose_auc
 from keyss.lab.two_sample import auc_beside_controls
 from keyss.measure.hiding import in_cover
-from keyss.measure.images import compare_images, photos_of, renders_of, steganalysed
+from keyss.measure.images import compare_images, photos_of, renders_of, select_views
 from keyss.progress import Reporter
 from keyss.runs.files import CONTROLS, as_model, stego_in
 from keyss.runs.folder import RunFolder
@@ -261,7 +261,7 @@ def stealth(subject: AuditSubject, seed: int, progress: PartProgress) -> PartRes
 def stegexpose(subject: AuditSubject, seed: int, progress: PartProgress) -> PartResult[RendersResult]:
     """StegExpose on renders of the stego model and of plain models."""
     cover = subject.scenes[0]
-    views = steganalysed(cover.views)
+    views = select_views(cover.views)
     models = (subject.controls[0], subject.stego, subject.controls[1])
     plain, stego, control = (
         [image.numpy() for _, image in renders_of(model, cover, views)] for model in models

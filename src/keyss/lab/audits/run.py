@@ -97,7 +97,7 @@ def audit(
             chance_level=opened.metrics.chance_level,
         )
         partial_audit = PartialAudit(folder.checkpoints, begun, _inputs(subject, seed))
-        chosen = _chosen(only, standard)
+        chosen = _choose_parts(only, standard)
         for index, name in enumerate(chosen):
             if getattr(partial_audit.audit, name) is None:
                 progress = PartProgress(reporter, f"audit, {index + 1} of {len(chosen)}: {name}")
@@ -142,7 +142,7 @@ def _report(run: Path) -> Audit:
     place = run / CHECKPOINTS if running else run
     result = read_audit(place)
     if running:
-        parts = _chosen(running.arguments["only"], result.run.standard)
+        parts = _choose_parts(running.arguments["only"], result.run.standard)
         missing = [name for name in parts if getattr(result, name) is None]
         warnings.warn(
             f"the audit was interrupted before {', '.join(missing)}: `resume=True` with the same arguments "
@@ -154,7 +154,7 @@ def _report(run: Path) -> Audit:
     return result
 
 
-def _chosen(only: Sequence[str], standard: bool) -> list[str]:
+def _choose_parts(only: Sequence[str], standard: bool) -> list[str]:
     """The parts of an audit of a run, `standard` if it published a 3DGS model."""
     possible = [name for name in PARTS if standard or name not in OF_3DGS_MODELS]
     return [name for name in possible if not only or name in only]

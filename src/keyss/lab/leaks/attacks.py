@@ -60,22 +60,22 @@ def file_attacks(cover: Scene, *, cover_views: int = 32, seed: int = 0) -> list[
         Attack(
             "restored opacities",
             "Gaussians below an opacity are made opaque and the others left out, or all made opaque.",
-            partial(_faint, _opaque, and_all=True),
+            partial(_below_thresholds, _make_opaque, and_all=True),
         ),
         Attack(
             "rescaled opacities",
             "Gaussians below an opacity alone, all opacities multiplied by one factor.",
-            partial(_faint, _rescaled),
+            partial(_below_thresholds, _rescale),
         ),
         Attack(
             "matched opacities",
             "Gaussians below an opacity alone, with the opacities of the others, given by rank.",
-            _matched,
+            _match_opacities,
         ),
         Attack(
             "inverted opacities",
             "Opacities o become 1 - o, of Gaussians below an opacity alone or of all.",
-            partial(_faint, lambda m: replace(m, opacity_logits=-m.opacity_logits), and_all=True),
+            partial(_below_thresholds, lambda m: replace(m, opacity_logits=-m.opacity_logits), and_all=True),
         ),
         Attack(
             "least contribution",
@@ -152,12 +152,12 @@ def search_embeddings(
     if len(part) > limit:
         part = part[torch.randperm(len(part), generator=generator)[:limit].to(stego.device)]
 
-    def exchanged(direction: Tensor) -> Tensor:
+    def exchange(direction: Tensor) -> Tensor:
         change = decode(part, F.normalize(direction, dim=0)).opacities - part.opacities
         return change.abs().mean() - balance * change.mean().abs()
 
     starts = random_embeddings(restarts, generator, key_size)
-    if not exchanged(starts[0].to(stego.device).requires_grad_()).requires_grad:
+    if not exchange(starts[0].to(stego.device).requires_grad_()).requires_grad:
         return starts
     scored = []
     for start in starts:
@@ -165,10 +165,10 @@ def search_embeddings(
         optimizer = torch.optim.Adam([direction], lr=0.02)
         for _ in range(steps):
             optimizer.zero_grad()
-            (-exchanged(direction)).backward()
+            (-exchange(direction)).backward()
             optimizer.step()
         with torch.no_grad():
-            scored.append((float(exchanged(direction)), F.normalize(direction.detach(), dim=0).cpu()))
+            scored.append((float(exchange(direction)), F.normalize(direction.detach(), dim=0).cpu()))
     scored.sort(key=lambda pair: -pair[0])
     return torch.stack([embedding for _, embedding in scored])
 
@@ -183,13 +183,13 @@ def with_the_key(reveal: Callable[[Gaussians], Gaussians]) -> Attack:
     )
 
 
-def _opaque(model: Gaussians) -> Gaussians:
+def _make_opaque(model: Gaussians) -> Gaussians:
     """All Gaussians with opacity OPAQUE."""
     logit = math.log(OPAQUE / (1 - OPAQUE))
     return replace(model, opacity_logits=torch.full_like(model.opacity_logits, logit))
 
 
-def _rescaled(model: Gaussians) -> Gaussians:
+def _rescale(model: Gaussians) -> Gaussians:
     """Opacities times the factor that makes the largest ones OPAQUE."""
     if len(model) == 0:
         return model
@@ -199,7 +199,9 @@ def _rescaled(model: Gaussians) -> Gaussians:
     return replace(model, opacity_logits=scaled.logit().to(model.opacity_logits))
 
 
-def _faint(change: Callable[[Gaussians], Gaussians], model: Gaussians, *, and_all: bool = False) -> Variants:
+def _below_thresholds(
+    change: Callable[[Gaussians], Gaussians], model: Gaussians, *, and_all: bool = False
+) -> Variants:
     """Change the Gaussians below each threshold alone, and optionally the whole model."""
     for threshold in THRESHOLDS:
         yield f"below {threshold}", change(model[model.opacities < threshold])
@@ -207,7 +209,7 @@ def _faint(change: Callable[[Gaussians], Gaussians], model: Gaussians, *, and_al
         yield "all", change(model)
 
 
-def _matched(model: Gaussians) -> Variants:
+def _match_opacities(model: Gaussians) -> Variants:
     """The Gaussians below each threshold with the opacities of the others by rank.
 
     Undoes any monotone reduction of opacities.
@@ -226,7 +228,7 @@ def _least_contributing(cameras: Sequence[Camera], model: Gaussians) -> Variants
     """The shares of the Gaussians that contribute least to the cameras' images, made opaque."""
     order = contributions(model, cameras).argsort(stable=True)
     for share in SHARES:
-        yield f"{share:.0%}", _opaque(model[order[: round(share * len(model))]])
+        yield f"{share:.0%}", _make_opaque(model[order[: round(share * len(model))]])
 
 
 def _quaternion_length(model: Gaussians) -> Tensor:
@@ -259,7 +261,7 @@ def _outliers(attribute: str, model: Gaussians) -> Variants:
         score = score / (_TO_SIGMA * score.abs().median()).clamp_min(_MIN_SPREAD)
     for side, sign in (("low", -1), ("high", 1)):
         for deviation in DEVIATIONS:
-            yield f"{side}, {deviation} deviations", _opaque(model[sign * score > deviation])
+            yield f"{side}, {deviation} deviations", _make_opaque(model[sign * score > deviation])
 
 
 def _clusters(seed: int, model: Gaussians) -> Variants:
@@ -275,7 +277,7 @@ def _clusters(seed: int, model: Gaussians) -> Variants:
             labels = _cluster_labels(model, count, seed)
         order = torch.bincount(labels, minlength=count).argsort(descending=True, stable=True)
         for index, label in enumerate(order, start=1):
-            yield f"{index} of {count}", _opaque(model[(labels == label).to(model.device)])
+            yield f"{index} of {count}", _make_opaque(model[(labels == label).to(model.device)])
 
 
 def _cluster_labels(model: Gaussians, count: int, seed: int) -> Tensor:

@@ -45,7 +45,7 @@ class LeakScores:
     gradient_coarse: float  # `gradient_correlation` of `coarse` images
 
     @staticmethod
-    def combined(function: Callable[[Sequence[float]], float], rows: Sequence[LeakScores]) -> LeakScores:
+    def combine(function: Callable[[Sequence[float]], float], rows: Sequence[LeakScores]) -> LeakScores:
         """A function of each score over all rows."""
         return LeakScores(*(function(column) for column in zip(*map(astuple, rows), strict=True)))
 
@@ -107,7 +107,7 @@ def leak_scores(model: Gaussians, views: Sequence[View], background: Tensor) -> 
         gradient_coarse = gradient_correlation(coarse(image), coarse(photo))
         similarity = float(ssim(fitted, Target.of(photo)))
         rows.append(LeakScores(psnr(fitted, photo), similarity, gradient, gradient_coarse))
-    return LeakScores.combined(fmean, rows)
+    return LeakScores.combine(fmean, rows)
 
 
 def _gradients(image: Tensor) -> Tensor:
@@ -169,20 +169,20 @@ def look_for_secret(
     for attack in attacks:
         variants = look(attack, stego)
         of_controls = [look(attack, model) for model in controls]
-        highest = [LeakScores.combined(max, [each for each, _ in shown.values()]) for shown in of_controls]
-        control = LeakScores.combined(fmean, highest)
+        highest = [LeakScores.combine(max, [each for each, _ in shown.values()]) for shown in of_controls]
+        control = LeakScores.combine(fmean, highest)
         leaks = {label: own - control for label, (own, _) in variants.items()}
         best = max(leaks, key=lambda label: leaks[label].evidence())
-        scored = LeakScores.combined(max, [own for own, _ in variants.values()])
+        scored = LeakScores.combine(max, [own for own, _ in variants.values()])
         results.append(
             AttackResult(
                 attack.name, attack.sentence, attack.with_key, scored, scored - control, best, leaks[best]
             )
         )
-        pictures[attack.name] = _beside([variants[best][1], of_controls[0][best][1], views[0].image])
+        pictures[attack.name] = _side_by_side([variants[best][1], of_controls[0][best][1], views[0].image])
     return results, pictures
 
 
-def _beside(images: Sequence[Tensor]) -> Tensor:
+def _side_by_side(images: Sequence[Tensor]) -> Tensor:
     """The images [H, W, 3] side by side, with white gaps."""
     return torch.cat([F.pad(image.cpu(), (0, 0, 0, _GAP), value=255) for image in images], dim=1)[:, :-_GAP]

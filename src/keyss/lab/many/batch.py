@@ -36,8 +36,8 @@ from keyss.files import write_bytes
 from keyss.files.reading import read_text
 from keyss.keys import MasterKey, read_key
 from keyss.lab.many.cell import changed_since
-from keyss.lab.many.cell_folder import ManyResult, Outcome, settle_master_key
-from keyss.lab.many.engine import claimed, engine
+from keyss.lab.many.cell_folder import ManyResult, Outcome, check_master_key
+from keyss.lab.many.engine import claim_folder, engine
 from keyss.lab.many.result_tables import csv_bytes
 from keyss.methods import MethodOptions, registry
 from keyss.progress import Reporter
@@ -92,7 +92,7 @@ def read_rows(path: Path, *, master: bool) -> list[dict[str, str]]:
                 raise InputError(f"{path}: {head[:60]!r} is no column, or one twice; {near}")
         for row in reader:
             where = f"{path}, line {reader.line_num}"
-            found.append(_checked(where, path.absolute().parent, row, master))
+            found.append(_check_row(where, path.absolute().parent, row, master))
             # File systems may treat two spellings as the same name.
             place = PurePosixPath(unicodedata.normalize("NFC", found[-1]["out"]).casefold())
             lines[where] = place
@@ -106,7 +106,7 @@ def read_rows(path: Path, *, master: bool) -> list[dict[str, str]]:
     return found
 
 
-def _checked(where: str, base: Path, row: dict[str, str], master: bool) -> dict[str, str]:
+def _check_row(where: str, base: Path, row: dict[str, str], master: bool) -> dict[str, str]:
     if None in row or None in row.values():
         raise InputError(f"{where}: expected as many columns as there are names of them")
     given = {name: value.strip() for name, value in row.items() if value.strip()}
@@ -162,9 +162,9 @@ def hide_batch(
     for row in rows:
         name = row.pop("out")
         assets[out / name] = Asset(name=name, **{"key_file": str(master), **row, **common})
-    with claimed(out, mode=0o777):
+    with claim_folder(out, mode=0o777):
         if master is not None:
-            settle_master_key(out, master)
+            check_master_key(out, master)
         done = {place for place, asset in assets.items() if asset.is_done(place)}
         found = {place: Outcome(assets[place].name, place, skipped=True) for place in done}
         due = {place: asset for place, asset in assets.items() if place not in done}

@@ -130,7 +130,7 @@ def run_cell(cell: Cell, folder: Path, reporter: Reporter) -> Result:
     if before is None:
         before = Result(seconds=0.0, numbers=(_hide if cell.secrets else _fit)(cell, folder, reporter))
     missing = [each for each in cell.measures if each not in before.measures]
-    measured = _measured(cell, missing, folder, reporter) if missing else {}
+    measured = _measure(cell, missing, folder, reporter) if missing else {}
     result = Result(
         seconds=round(time.monotonic() - start, 1),
         numbers=before.numbers | {name: each for name, each in measured.items() if not isinstance(each, str)},
@@ -222,7 +222,7 @@ def _place(folder: Path, path: str) -> Path:
     return Path(os.path.normpath(folder.absolute() / path))
 
 
-def _measured(cell: Cell, names: list[str], folder: Path, reporter: Reporter) -> dict[str, float | str]:
+def _measure(cell: Cell, names: list[str], folder: Path, reporter: Reporter) -> dict[str, float | str]:
     """The numbers of some measures, or notes on them."""
     keys, run = [key for key in keys_of(cell, folder) if key], folder / RUN
     found: dict[str, float | str] = {}

@@ -15,7 +15,7 @@ from keyss.keys import MasterKey, generate_key, read_key
 from keyss.keys.key_file import KEY_LENGTH
 from keyss.lab.audits.comparison_measures import check_extras
 from keyss.lab.many.cell import RUN, Cell, plan_of, result_of, run_cell
-from keyss.lab.many.engine import claimed, engine
+from keyss.lab.many.engine import claim_folder, engine
 from keyss.lab.many.result_tables import CellNumbers
 from keyss.methods import MethodOptions, registry
 from keyss.methods.base import Plan
@@ -71,7 +71,7 @@ class Forecast:
     refused: Mapping[Path, str]  # why a cell cannot work
 
 
-def settle_master_key(out: Path, given: Path | None) -> None:
+def check_master_key(out: Path, given: Path | None) -> None:
     """Create a master key if none is given. Raises OutputError if existing results have another one."""
     own, kept = out / MASTER_KEY, out / _CHECK
     if given is None and not own.exists():
@@ -145,8 +145,8 @@ class CellFolder:
         The arguments are those of `engine`. Raises KeyssError for what concerns all cells.
         """
         found: dict[Path, Outcome] = {}
-        with claimed(self.out):
-            settle_master_key(self.out, self.master_key_file)
+        with claim_folder(self.out):
+            check_master_key(self.out, self.master_key_file)
             for folder, cell in self.cells.items():
                 if (result := result_of(cell, folder)) is not None:
                     found[folder] = Outcome(cell.name, folder, result, skipped=True)

@@ -150,7 +150,7 @@ def compare(
     """
     if is_model(cover) or is_model(secret):
         raise UsageError("comparing takes scenes, folders of photos: models have none to compare with")
-    chosen = {name: _named(name) for name in methods or EVERY}
+    chosen = {name: _parse_method(name) for name in methods or EVERY}
     sizes = {"iterations": iterations, "max_gaussians": max_gaussians}
     given = {name: size for name, size in sizes.items() if size is not None}
     fit = replace(next(iter(chosen.values())).fit, seed=seeds[0], **given)
@@ -185,7 +185,7 @@ def compare(
     write_scene_tables(
         folder.out, STEM, [each.row({"method": name}, names, seed) for name, seed, each in done]
     )
-    runs = {name: _opened(folder, each[0]) for name, each in places.items() if outcomes[each[0]].result}
+    runs = {name: _open_run(folder, each[0]) for name, each in places.items() if outcomes[each[0]].result}
     if runs:
         picture = io.BytesIO()
         comparison_sheet(runs, device).save(picture, "PNG", optimize=True)
@@ -193,7 +193,7 @@ def compare(
     return found
 
 
-def within(iterations: int, options: OptionsT) -> tuple[OptionsT, list[int]]:
+def split_budget(iterations: int, options: OptionsT) -> tuple[OptionsT, list[int]]:
     """Options, and steps of plain models of cover and secret: each scene has `iterations` in total."""
     continues = [each.continues and each.steps > 0 for each in options.training(2)]
     plain = iterations - iterations // 2
@@ -211,7 +211,7 @@ def _add(
     controls: list[str],
 ) -> Path:
     """Add a hiding and its plain fits; its folder."""
-    options, steps = within(fit.iterations, preset)
+    options, steps = split_budget(fit.iterations, preset)
     options = options.with_fit(max_gaussians=fit.max_gaussians, seed=fit.seed)
     models = [
         folder.plain(scene, replace(fit, iterations=count, sh_degree=each.sh_degree))
@@ -221,7 +221,7 @@ def _add(
     return folder.hiding(name, scenes, options, models, measures=MEASURES, controls=controls)
 
 
-def _named(text: str) -> MethodOptions:
+def _parse_method(text: str) -> MethodOptions:
     """The options of METHOD, METHOD:PRESET or METHOD:VARIANT. Raises UsageError."""
     name, _, kind = text.partition(":")
     method = registry.get(name)
@@ -245,7 +245,7 @@ def _row(name: str, outcomes: Sequence[Outcome], folder: CellFolder) -> Compared
     return replace(row, numbers=numbers, notes=results[0].notes)
 
 
-def _opened(folder: CellFolder, place: Path) -> HidingRun:
+def _open_run(folder: CellFolder, place: Path) -> HidingRun:
     return open_run(place / RUN, [key for key in keys_of(folder.cells[place], place) if key])
 
 

@@ -38,7 +38,7 @@ def engine(ray: str | None, cores: int, reporter: Reporter | None) -> Iterator[E
     if cores < 1:
         raise UsageError(f"`cores`: expected at least 1, got {cores}")
     reporter = reporter or default_reporter()
-    with nullcontext(partial(_here, reporter)) if ray is None else _cluster(ray, cores) as run:
+    with nullcontext(partial(_in_process, reporter)) if ray is None else _cluster(ray, cores) as run:
 
         def running(work: Work, tasks: Tasks) -> Iterator[Ended]:
             for number, (folder, result, error) in enumerate(run(work, tasks), start=1):
@@ -51,7 +51,7 @@ def engine(ray: str | None, cores: int, reporter: Reporter | None) -> Iterator[E
 
 
 @contextmanager
-def claimed(out: Path, mode: int = 0o700) -> Iterator[None]:
+def claim_folder(out: Path, mode: int = 0o700) -> Iterator[None]:
     """Create the folder if necessary, and lock it while the block runs.
 
     Raises OutputError, also inside a folder to be published.
@@ -66,7 +66,7 @@ def claimed(out: Path, mode: int = 0o700) -> Iterator[None]:
         yield
 
 
-def _here(reporter: Reporter, work: Work, tasks: Tasks) -> Iterator[Ended]:
+def _in_process(reporter: Reporter, work: Work, tasks: Tasks) -> Iterator[Ended]:
     for folder, task in tasks.items():
         try:
             ended = _attempt(work, task, folder, reporter)

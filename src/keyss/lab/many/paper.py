@@ -141,12 +141,12 @@ def mean_figure(table: Table, figure: Figure, covers: Collection[str] = ()) -> f
     return fmean([value for cover, value in by_cover if cover in covers] or figure)
 
 
-def judged(claim: Claim, figures: Measured) -> JudgedClaim:
+def judge_claim(claim: Claim, figures: Measured) -> JudgedClaim:
     """A claim `holds` if all of its parts hold, and `holds in part` if at least half of them do.
 
     A part that lacks a figure does not count; without any part, the claim is `not measured`.
     """
-    parts = [held for part in claim.parts for held in _held(part, figures) if held is not None]
+    parts = [held for part in claim.parts for held in _judge_part(part, figures) if held is not None]
     holding = sum(parts)
     verdict: Verdict = "does not hold here"
     if not parts:
@@ -156,7 +156,7 @@ def judged(claim: Claim, figures: Measured) -> JudgedClaim:
     return JudgedClaim(text=claim.text, verdict=verdict, parts=len(parts), holding=holding)
 
 
-def _held(part: str, figures: Measured) -> Iterator[bool | None]:
+def _judge_part(part: str, figures: Measured) -> Iterator[bool | None]:
     """Whether the part holds for each run that it compares with; None without a figure."""
     match = _PART.fullmatch(part)
     assert match is not None, part

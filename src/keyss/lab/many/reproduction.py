@@ -17,7 +17,7 @@ from keyss.files import write_bytes
 from keyss.files.benchmark_scenes import BENCHMARK, download_scenes, link_scene
 from keyss.lab.many.cell_folder import CellFolder, Forecast
 from keyss.lab.many.option_changes import with_changes
-from keyss.lab.many.paper import PAPER, Group, Reproduction, Run, figure_rows, judged, reproduction_text
+from keyss.lab.many.paper import PAPER, Group, Reproduction, Run, figure_rows, judge_claim, reproduction_text
 from keyss.lab.many.result_tables import write_scene_tables
 from keyss.methods import MethodOptions, registry
 from keyss.progress import Reporter
@@ -110,7 +110,7 @@ def reproduce(
         arguments={**sizes, "seeds": list(seeds)},
         pairs=tuple("-".join(group) for group in groups),
         rows=figures,
-        claims=tuple(judged(claim, measured) for claim in spec.claims),
+        claims=tuple(judge_claim(claim, measured) for claim in spec.claims),
         failures={each.name: each.error for each in outcomes.values() if each.error},
     )
     write_record(folder.out / f"{table}.json", reproduction)

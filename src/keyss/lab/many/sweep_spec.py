@@ -114,7 +114,7 @@ def read_spec(path: Path) -> SweepSpec:
             raise InputError(f"{path}: {what}: two have the name {same[0]!r}: give one another `name`")
     most = min(registry.get(entry.method).max_secrets for entry in spec.methods)
     pairs = tuple(
-        _checked(f"{path}: pairs[{index}]", path, pair, most) for index, pair in enumerate(spec.pairs)
+        _resolve_pair(f"{path}: pairs[{index}]", path, pair, most) for index, pair in enumerate(spec.pairs)
     )
     for _ in variants(path, spec):  # raises InputError
         pass
@@ -144,7 +144,7 @@ def variants(path: Path, spec: SweepSpec) -> Iterator[tuple[str, MethodOptions, 
             yield entry.label, options, choices
 
 
-def _checked(where: str, path: Path, pair: Pair, most: int) -> Pair:
+def _resolve_pair(where: str, path: Path, pair: Pair, most: int) -> Pair:
     """The pair with absolute paths. Raises InputError for a missing one, and for more secrets than `most`."""
     secrets, models = len(pair.secrets), len(pair.secret_models)
     if secrets > most:

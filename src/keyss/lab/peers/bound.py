@@ -31,7 +31,7 @@ class BoundMethod(Peer):
 
 
 def _open(handed: HandedTensors) -> Show:
-    model = Gaussians(*handed.taken(_NAMES))
+    model = Gaussians(*handed.take(_NAMES))
     return lambda stego: model
 
 

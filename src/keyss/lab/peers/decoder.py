@@ -52,7 +52,7 @@ def network_tensors(network: PictureNetwork) -> dict[str, Tensor]:
 def network_of(handed: HandedTensors) -> PictureNetwork:
     """The network of `network_tensors`. Raises InputError, ValueError and TypeError for damage."""
     names = [f"{kind}.{index}" for index in range(LAYERS) for kind in ("weight", "bias")]
-    background, *rest = handed.taken(["background", *names])
+    background, *rest = handed.take(["background", *names])
     return PictureNetwork(tuple(zip(rest[::2], rest[1::2], strict=True)), background)
 
 

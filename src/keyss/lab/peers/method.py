@@ -55,7 +55,7 @@ class HandedTensors:
             header, tensors = unpack_tensors(content.data, _Header, FORMAT, VERSION)
         return HandedTensors(tensors, header.frame, header.rows)
 
-    def taken(self, names: Iterable[str], *, of_bytes: Collection[str] = ()) -> list[Tensor]:
+    def take(self, names: Iterable[str], *, of_bytes: Collection[str] = ()) -> list[Tensor]:
         """The tensors of these names: uint8 those `of_bytes`, else float32.
 
         Raises InputError for other types, and if there are more or fewer.

@@ -40,7 +40,7 @@ class ShTraining(PeerTraining):
 
 
 def _open(handed: HandedTensors) -> Show:
-    (sh,) = handed.taken([_NAMES[1]])
+    (sh,) = handed.take([_NAMES[1]])
     return lambda stego: replace(stego, sh=sh)
 
 

@@ -165,14 +165,14 @@ class WaterGsTraining(PeerTraining):
         self.networks.append(self.mapping)
 
     @property
-    def mapped(self) -> bool:
+    def is_mapped(self) -> bool:
         """True once the autoencoder has replaced free opacities."""
         return self.iteration >= int(self.strategy.refine_stop_iter)
 
     def step(self) -> None:
-        before = self.mapped
+        before = self.is_mapped
         super().step()
-        if self.mapped and not before:
+        if self.is_mapped and not before:
             self._sort()
             self._fit_mapping()
 
@@ -186,7 +186,7 @@ class WaterGsTraining(PeerTraining):
             model = to_gaussians(self.parameters)
             if scene:
                 free = self.parameters["secret_opacities"]
-                logits = self.mapping(model.opacity_logits) if self.mapped else free
+                logits = self.mapping(model.opacity_logits) if self.is_mapped else free
                 model = replace(model, opacity_logits=logits, sh=self.parameters["secret_sh"])
             pictures.append(self.render(model, scene, camera, sh_degree))
         return pictures
@@ -226,7 +226,7 @@ class WaterGsTraining(PeerTraining):
 def _open(handed: HandedTensors) -> Show:
     mapping = OpacityMapping().requires_grad_(False)
     names = [f"mapping.{name}" for name in mapping.state_dict()]
-    *weights, ranges, numbers = handed.taken([*names, "ranges", "cipher"], of_bytes=["cipher"])
+    *weights, ranges, numbers = handed.take([*names, "ranges", "cipher"], of_bytes=["cipher"])
     mapping.load_state_dict(dict(zip(mapping.state_dict(), weights, strict=True)))
     if numbers.shape != (_CIPHER_BYTES,) or ranges.dim() != 1:
         raise ValueError("no such cipher")

@@ -138,7 +138,7 @@ def fine_tuning(cover: Scene, steps: int = 500, seed: int = 0) -> Change:
     """Continue training on the cover's photos, as plain 3DGS without density control."""
     sentence = f"Training continues on the cover's photos for {steps} steps."
     return Change(
-        "fine-tuning", steps, "steps", sentence, partial(refined, scene=cover, steps=steps, seed=seed)
+        "fine-tuning", steps, "steps", sentence, partial(fine_tune, scene=cover, steps=steps, seed=seed)
     )
 
 
@@ -146,11 +146,11 @@ def purification(cover: Scene, given_up: float = 0.0, steps: int = 300, seed: in
     """Prune the Gaussians that the cover's training views do not use, then train.
 
     Follows GSPure (arXiv 2511.22262), which prunes by the same weights, but clusters them. `given_up`: see
-    `unused`.
+    `find_unused`.
     """
 
     def apply(model: Gaussians) -> Gaussians:
-        return refined(model[~unused(model, cover, given_up)], cover, steps, seed)
+        return fine_tune(model[~find_unused(model, cover, given_up)], cover, steps, seed)
 
     sentence = (
         "Gaussians that the cover's photos do not use are removed"
@@ -160,7 +160,7 @@ def purification(cover: Scene, given_up: float = 0.0, steps: int = 300, seed: in
     return Change("purification", given_up, "share of the blending weight given up", sentence, apply)
 
 
-def unused(model: Gaussians, cover: Scene, given_up: float = 0.0) -> Tensor:
+def find_unused(model: Gaussians, cover: Scene, given_up: float = 0.0) -> Tensor:
     """[N] True for the Gaussians that contribute least to the training views, but never for all.
 
     Their share of the blending weights, summed over pixels and views, is at most `given_up`; with 0 they
@@ -173,7 +173,7 @@ def unused(model: Gaussians, cover: Scene, given_up: float = 0.0) -> Tensor:
     return torch.zeros_like(chosen).index_put((order,), chosen)
 
 
-def refined(model: Gaussians, scene: Scene, steps: int, seed: int = 0) -> Gaussians:
+def fine_tune(model: Gaussians, scene: Scene, steps: int, seed: int = 0) -> Gaussians:
     """`model` after `steps` steps of plain 3DGS on the training views, at the rates of such a run."""
     config = FitConfig(iterations=max(steps, 1), boost=1.0)
     parameters = to_parameters(model, model.device)

@@ -181,7 +181,7 @@ class Converter:
     format: str
     tool: str
     note: str  # a remark on this conversion, or nothing
-    there_and_back: Callable[[Path, Path], tuple[Path, Path]]  # .ply, folder -> other file, .ply
+    round_trip: Callable[[Path, Path], tuple[Path, Path]]  # .ply, folder -> other file, .ply
 
     def __call__(self, model: Gaussians) -> Gaussians:
         """Raises BackendError if the tool is missing or fails."""
@@ -189,7 +189,7 @@ class Converter:
             source = Path(folder) / "source.ply"
             write_model(source, model)
             try:
-                return read_model(self.there_and_back(source, Path(folder))[1])
+                return read_model(self.round_trip(source, Path(folder))[1])
             except BackendError:
                 raise
             except (KeyssError, OSError, ValueError) as error:
@@ -212,13 +212,13 @@ def converters(sog_iterations: int = 1) -> list[Converter]:
     return [
         Converter("compressed .ply", "gsply", "", _gsply_compressed),
         Converter(".spz", "gsply", " (version 3)", _gsply_spz),
-        Converter("compressed .ply", "splat-transform", "", _through("there.compressed.ply")),
-        Converter(".spz", "splat-transform", " (version 4)", _through("there.spz")),
+        Converter("compressed .ply", "splat-transform", "", _convert_through("there.compressed.ply")),
+        Converter(".spz", "splat-transform", " (version 4)", _convert_through("there.spz")),
         Converter(
             ".sog",
             "splat-transform",
             f", with {rounds} of clustering harmonics",
-            _through("there.sog", "-i", str(sog_iterations)),
+            _convert_through("there.sog", "-i", str(sog_iterations)),
         ),
         Converter(".splat", "splat-transform", ", which only reads this format", _splat),
     ]
@@ -228,13 +228,13 @@ def own_converter(format: str) -> Converter:
     """A conversion by keyss itself, for where a tool is missing: `format` is .spz or compressed .ply."""
     name = {".spz": "there.spz", "compressed .ply": "there.compressed.ply"}[format]
 
-    def there_and_back(source: Path, folder: Path) -> tuple[Path, Path]:
+    def round_trip(source: Path, folder: Path) -> tuple[Path, Path]:
         there, back = folder / name, folder / "back.ply"
         write_model(there, read_model(source))
         write_model(back, read_model(there))
         return there, back
 
-    return Converter(format, "keyss", "", there_and_back)
+    return Converter(format, "keyss", "", round_trip)
 
 
 def why_missing(tool: str) -> str | None:
@@ -270,12 +270,12 @@ def transform(source: Path, target: Path, *options: str) -> Path:
     return target
 
 
-def _through(name: str, *options: str) -> Callable[[Path, Path], tuple[Path, Path]]:
-    def there_and_back(source: Path, folder: Path) -> tuple[Path, Path]:
+def _convert_through(name: str, *options: str) -> Callable[[Path, Path], tuple[Path, Path]]:
+    def round_trip(source: Path, folder: Path) -> tuple[Path, Path]:
         there = transform(source, folder / name, *options)
         return there, transform(there, folder / "back.ply")
 
-    return there_and_back
+    return round_trip
 
 
 def _gsply_compressed(source: Path, folder: Path) -> tuple[Path, Path]:

@@ -26,7 +26,7 @@ from keyss.lab.stealth.statistic import (
     BitPatterns,
     Statistic,
     excess,
-    more_than_smooth,
+    excess_over_smooth,
     normal,
     portion,
     ulps,
@@ -54,7 +54,7 @@ def agreement(model: Gaussians, words: BitPatterns) -> dict[str, Statistic]:
     """
     statistics: dict[str, Statistic] = {}
     for name, attributes in _GROUPS.items():
-        pairs = list(_within(words, attributes))
+        pairs = list(_pairs_within_gaussians(words, attributes))
         if pairs:
             one, other = (np.concatenate(each) for each in zip(*pairs, strict=True))
             statistics |= {f"{key}, {name}": each for key, each in _of_pairs(one, other).items()}
@@ -82,7 +82,7 @@ def _of_pairs(one: Words32, other: Words32) -> dict[str, Statistic]:
         ),
         "equal low bits": excess(int(equal[same_high].sum()), int(same_high.sum()), 1 / size),
         # Unequal pairs less than _MOVED apart, beyond the number expected from pairs further apart.
-        "near misses": more_than_smooth(inside, max(around, 1) * _MOVED / (_AROUND - _MOVED), len(apart)),
+        "near misses": excess_over_smooth(inside, max(around, 1) * _MOVED / (_AROUND - _MOVED), len(apart)),
         "equal": portion(float(equal.sum()), len(equal)),
         "within a quarter of an octave": _within_quarters(one, other),
     }
@@ -97,7 +97,9 @@ def _within_quarters(one: Words32, other: Words32) -> Statistic:
     return normal(12 * float(covariance[0, 1]) / (1 << 16), float(both.sum()) ** -0.5)
 
 
-def _within(words: BitPatterns, attributes: tuple[int, ...]) -> Iterator[tuple[Words32, Words32]]:
+def _pairs_within_gaussians(
+    words: BitPatterns, attributes: tuple[int, ...]
+) -> Iterator[tuple[Words32, Words32]]:
     """Pairs of numbers of one Gaussian, within a coefficient's channels or an attribute, without signs."""
     for attribute in attributes:
         own = words.bits[:, words.of_attribute(attribute)] & np.uint32(0x7FFFFFFF)
@@ -154,7 +156,7 @@ def count_coincidences(model: Gaussians, words: BitPatterns) -> dict[str, tuple[
         own = words.bits[:, field]
         of_all, of_near, of_bright = f"all, {name}", f"neighbours, {name}", f"saturated, {name}"
         for kind, pairs, chosen in (
-            (of_all, _agreeing(own & ~low), usable),
+            (of_all, _agreeing_pairs(own & ~low), usable),
             (of_near, near, usable),
             (of_bright, bright, np.ones(len(usable), bool)),
         ):
@@ -175,7 +177,7 @@ def _columns(words: BitPatterns) -> Iterator[tuple[str, int, int]]:
                 yield name, int(column), _WRITTEN[attribute]
 
 
-def _agreeing(kept: np.ndarray) -> Integers:
+def _agreeing_pairs(kept: np.ndarray) -> Integers:
     """[P, 2] rows whose `kept` bits [N] agree, near each other in the order of these."""
     order = np.argsort(kept, kind="stable")
     pairs = [np.zeros((0, 2), np.int64)]

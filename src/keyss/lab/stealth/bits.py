@@ -44,7 +44,7 @@ def bits(model: Gaussians, words: BitPatterns) -> dict[str, Statistic]:
         values = own[trained & (exponent >= low) & (exponent < high)]
         statistics |= {f"{name}, {magnitude} harmonics": each for name, each in _of_values(values).items()}
     small = trained & (exponent < MAGNITUDES["middling"][1])
-    statistics["zeros together in a Gaussian"] = _together(own, small)
+    statistics["zeros together in a Gaussian"] = _count_variance(own, small)
     tiny = (trained & (exponent < MAGNITUDES["tiny"][1])).any(axis=1)
     for name, rows in (("with", tiny), ("without", ~tiny)):
         found = _of_values(own[rows][trained[rows]])["ones in bits 1-3"]
@@ -91,7 +91,7 @@ def _strata(values: Words32) -> Statistic:
     return dispersion(total, degrees)
 
 
-def _together(values: Words32, chosen: Flags) -> Statistic:
+def _count_variance(values: Words32, chosen: Flags) -> Statistic:
     """Variance over Gaussians of the number of small harmonics with three zeros above the last bit."""
     zeros = ((values & np.uint32(14) == 0) & chosen).sum(axis=1)
     trials = chosen.sum(axis=1)

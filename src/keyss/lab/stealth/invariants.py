@@ -18,7 +18,7 @@ from keyss.lab.stealth.statistic import (
     BitPatterns,
     Statistic,
     excess,
-    more_than_smooth,
+    excess_over_smooth,
     normal,
     portion,
 )
@@ -44,7 +44,7 @@ def invariants(model: Gaussians, words: BitPatterns) -> dict[str, Statistic]:
             continue
         trained = words.trained[:, words.of_attribute(index)]
         statistics[f"short numbers, {attribute}"] = portion(float((~trained).sum()), trained.size)
-        repeated = sum(_repeated(own[:, field][trained[:, field]]) for field in range(own.shape[1]))
+        repeated = sum(_count_repeated(own[:, field][trained[:, field]]) for field in range(own.shape[1]))
         statistics[f"repeated values, {attribute}"] = portion(repeated, own.size)
         clusters = [
             _clusters(own[:, field].view(np.float32).astype(np.float64)) for field in range(own.shape[1])
@@ -62,7 +62,7 @@ def _lengths(model: Gaussians) -> dict[str, Statistic]:
     around = int(((error >= _MOVED) & (error < _AROUND)).sum())
     statistics = {
         "quaternions of unit length": portion(float(unit.sum()), len(unit)),
-        "quaternions of nearly unit length": more_than_smooth(
+        "quaternions of nearly unit length": excess_over_smooth(
             nearly, max(around, 1) * _MOVED / (_AROUND - _MOVED), len(unit)
         ),
         "distance of quaternions from unit length, median": Statistic(
@@ -80,7 +80,7 @@ def _lengths(model: Gaussians) -> dict[str, Statistic]:
     return statistics
 
 
-def _repeated(values: Words32) -> int:
+def _count_repeated(values: Words32) -> int:
     """Number of values that are not unique."""
     _, counts = np.unique(values, return_counts=True)
     return int(counts[counts > 1].sum())

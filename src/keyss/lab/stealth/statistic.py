@@ -101,7 +101,7 @@ def portion(hits: float, trials: int) -> Statistic:
     return Statistic(hits / max(trials, 1), math.sqrt(max(hits, 1.0)) / max(trials, 1))
 
 
-def more_than_smooth(hits: int, expected: float, of: int) -> Statistic:
+def excess_over_smooth(hits: int, expected: float, of: int) -> Statistic:
     """`hits` beyond those of a smooth density, as a share, with the Poisson probability."""
     error = math.sqrt(max(hits, expected, 1.0)) / max(of, 1)
     return Statistic((hits - expected) / max(of, 1), error, float(pdtrc(hits - 1, expected)) if hits else 1.0)
