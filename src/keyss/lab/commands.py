@@ -116,8 +116,8 @@ def compare(
 ) -> None:
     """Hide a scene by each method with the same budget, and tabulate the results.
 
-    The budget is a number of Gaussians, and of training steps for each scene. The method 3dgs is the bound:
-    plain 3DGS with that budget. Methods that cannot run with it are listed, and are an error if
+    The budget is a number of Gaussians, and of training steps for each scene. The method 3dgs is the upper
+    bound: plain 3DGS with that budget. Methods that cannot run with it are listed, and are an error if
     `--methods` names them. Run the same command again to resume.
 
     example: keyss compare --cover SCENE_A --secret SCENE_B --quick -o runs/compared
@@ -308,7 +308,7 @@ def sweep(
 
 
 def _print_verdicts(audit: Audit) -> None:
-    """The verdicts of an audit: a line for each measure, with its baseline or control."""
+    """Print the verdicts of an audit: a line per measure, with its baseline or control."""
     from keyss.cli.tables import Console, print_table
     from keyss.lab.audits import headline, verdicts
 
@@ -319,7 +319,7 @@ def _print_verdicts(audit: Audit) -> None:
 
 
 def _print_forecast(found: Forecast) -> None:
-    """The cells of a dry run, with estimates for those that are not done."""
+    """Print the cells of a dry run, with estimates for those to do."""
     from keyss.cli.tables import print_table
     from keyss.progress import about
 

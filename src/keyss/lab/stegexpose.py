@@ -1,7 +1,7 @@
 """StegExpose (2014): four detectors of LSB replacement in 8-bit images, and their mean.
 
-An independent implementation that reproduces the original's scores, quirks included. On a renderer's output
-an AUC near 0.5 is expected: nothing replaces the last bits of pixels.
+An independent implementation that reproduces the original's scores, quirks included. On renders, the expected
+AUC is 0.5: nothing replaces the last bits of pixels.
 """
 
 from __future__ import annotations
@@ -60,11 +60,10 @@ class StegExposeAuc:
 
 
 def stegexpose_auc(plain_images: Sequence[Bytes], stego_images: Sequence[Bytes]) -> StegExposeAuc:
-    """StegExpose on renders of the same views by a plain and by a stego model, [H, W, 3] uint8 each.
+    """StegExpose on renders [H, W, 3] uint8 of the same views by a plain and by a stego model.
 
-    Chi Square needs about 87,700 pixels, Sample Pairs even sizes. On a renderer's output an AUC near 0.5 is
-    expected whatever is hidden, since no pixel's last bit is replaced. Raises UsageError if the views differ
-    in number or size.
+    Chi Square needs about 87,700 pixels, Sample Pairs even sizes. Raises UsageError if the views differ in
+    number or size.
     """
     sizes = [[image.shape[:2] for image in images] for images in (plain_images, stego_images)]
     if not sizes[0] or sizes[0] != sizes[1]:

@@ -1,4 +1,4 @@
-"""The parts of an audit: what each takes, what it measures, and against which baseline or control."""
+"""The parts of an audit: functions that measure a run against baselines and controls."""
 
 from __future__ import annotations
 
@@ -82,10 +82,10 @@ def subject_of(
     reporter: Reporter,
     folder: RunFolder,
 ) -> AuditSubject:
-    """Read, reveal and fit what the audit needs; plain models are kept in the run's `folder` for reuse.
+    """Read, reveal and fit the input of an audit; fitted models are kept in the run's `folder` for reuse.
 
-    `original`: a plain model of the cover, by default the run's own. `controls`: how many to train, from
-    seeds derived from the run's own and `seed`. Raises UsageError without a plain model of the cover.
+    `original`: a plain model of the cover, by default the run's own. `controls`: number of models to train,
+    with seeds derived from the run's and `seed`. Raises UsageError without a plain model of the cover.
     """
     scenes = run.scenes()
     plain, *_ = run.plain_models()
@@ -119,7 +119,7 @@ def subject_of(
 def _plain_model(
     scene: Scene, config: FitConfig, folder: RunFolder, device: torch.device, reporter: Reporter
 ) -> Gaussians:
-    """A plain model of a scene, from the run's folder if it was fitted there before."""
+    """Fit a plain model of a scene, or read it from the run's folder."""
     made_of = json.dumps({"scene": scene.digest(), "config": asdict(config)}, sort_keys=True)
     name = f"seed-{config.seed}-{hashlib.sha256(made_of.encode()).hexdigest()[:12]}"
     model = f"{CONTROLS}/{name}.ply"
@@ -149,7 +149,7 @@ class PartResult(Generic[T]):
 
 
 class PartialAudit:
-    """The audit so far, with its pictures, in a folder laid out as a run's; for the same `inputs` only."""
+    """An unfinished audit and its pictures, in a folder laid out like a run's; only for equal `inputs`."""
 
     def __init__(self, folder: Path, begun: Audit, inputs: dict[str, object]) -> None:
         self.folder, self.audit = folder, begun
@@ -176,7 +176,7 @@ class PartialAudit:
 
 
 class PartProgress:
-    """Progress of one part: call it with the numbers of items done and of all."""
+    """Progress of one part: call it with the number of finished items and the total."""
 
     def __init__(self, reporter: Reporter, title: str) -> None:
         self._reporter, self._title, self._total = reporter, title, 0
@@ -198,7 +198,7 @@ AuditPart = Callable[[AuditSubject, int, PartProgress], PartResult[Any]]
 
 
 def images(subject: AuditSubject, seed: int, progress: PartProgress) -> PartResult[ImagesResult]:
-    """Cover and secrets against the test views, with plain models as baselines, and some of the images."""
+    """Compare cover and secrets with the test views, and plain models as baselines; keep some images."""
     models = [subject.stego, *subject.revealed]
     plains = [subject.original, *subject.baselines]
     results = []
@@ -235,7 +235,7 @@ def images(subject: AuditSubject, seed: int, progress: PartProgress) -> PartResu
 
 
 def parameters(subject: AuditSubject, seed: int, progress: PartProgress) -> PartResult[ParametersResult]:
-    """Distances of the parameters from plain models: 3D-Sinkhorn as published, Wasserstein, a classifier."""
+    """Distances of the parameters from plain models: published 3D-Sinkhorn, Wasserstein, a classifier."""
     original, stego, controls = subject.original, subject.stego, subject.controls
     progress(0, 3)
     sinkhorn = sinkhorn_3d(original, stego)
@@ -251,7 +251,7 @@ def parameters(subject: AuditSubject, seed: int, progress: PartProgress) -> Part
 
 
 def stealth(subject: AuditSubject, seed: int, progress: PartProgress) -> PartResult[StealthResult]:
-    """Statistics of the file compared with plain models, and whether a guessed secret can be confirmed."""
+    """Compare statistics of the file with plain models, and try to confirm guessed secrets."""
     progress(0, 1)
     return PartResult(
         judge(subject.stego, subject.controls, original=subject.original, candidates=subject.baselines)
@@ -296,7 +296,7 @@ def leaks(
 def robustness(
     subject: AuditSubject, seed: int, progress: PartProgress
 ) -> PartResult[tuple[ChangeResult, ...]]:
-    """PSNR that the cover and the secrets lose when the stego model changes."""
+    """PSNR loss of the cover and the secrets when the stego model changes."""
     cover, *secrets = subject.scenes
     rows = measure_robustness(
         subject.stego, subject.run.openers, cover, secrets, seed=seed, progress=progress

@@ -21,8 +21,8 @@ from keyss.runs.files import run_folder
 from keyss.runs.folder import PRIVATE
 from keyss.runs.records import read_record
 
-AUDIT_FOLDER, AUDIT_FILE = f"{PRIVATE}/audit", "audit.json"  # the folder is in that of the run
-PICTURES = "pictures"  # folder in that of the audit
+AUDIT_FOLDER, AUDIT_FILE = f"{PRIVATE}/audit", "audit.json"  # folder relative to the run
+PICTURES = "pictures"  # folder relative to the audit's
 
 
 @dataclass(frozen=True)
@@ -31,11 +31,11 @@ class AuditedRun:
 
     path: str
     method: str
-    cover: str  # a scene folder, or a model without photos; so are the secrets
+    cover: str  # a scene folder, or a model without photos; `secrets` too
     secrets: tuple[str, ...]
     width: int | None  # pixels, if photos were shrunk
     gaussians: int  # Gaussians of the stego model
-    standard: bool = True  # whether a 3DGS model is published
+    standard: bool = True  # True if a 3DGS model is published
     config: dict[str, Any] = field(default_factory=dict)
     versions: dict[str, str] = field(default_factory=dict)  # Python and libraries, by name
 
@@ -90,7 +90,7 @@ class Audit:
     run: AuditedRun
     controls: tuple[int, ...]  # seeds of the plain models of the cover to compare with
     wrong_key: WrongKeys | None = None  # copied from the run's `metrics.json`, like the chance level
-    chance_level: tuple[float, ...] = ()  # dB, the stego model itself against each secret's test views
+    chance_level: tuple[float, ...] = ()  # dB, the stego model against each secret's test views
     images: ImagesResult | None = None
     parameters: ParametersResult | None = None
     stealth: StealthResult | None = None
@@ -101,7 +101,7 @@ class Audit:
 
 
 def read_audit(run: Path) -> Audit:
-    """A run's audit. Raises InputError if it is missing, broken, too large or of another version."""
+    """Read a run's audit. Raises InputError if it is missing, broken, too large or of another version."""
     path = run / AUDIT_FOLDER / AUDIT_FILE
     if not path.exists():
         run_folder(run)

@@ -1,8 +1,8 @@
 """The summary of an audit: a verdict for each measure.
 
-*fine*: within the limit. *visible*: without the key it may be visible that something is hidden, or what.
-*missed*: nothing is visible, but the quality is lower than it should be.
-All limits are here, except those of leaks, which are in `keyss.lab.leaks.looking`.
+*fine*: within the limit. *visible*: that something is hidden, or what, may be visible without the key.
+*missed*: nothing is visible, but the quality is too low. Limits of leaks are in `keyss.lab.leaks.looking`,
+all others here.
 """
 
 from __future__ import annotations
@@ -131,7 +131,7 @@ def _leaks(audit: Audit) -> Iterator[Verdict]:
 
 
 def _stealth(audit: Audit) -> Iterator[Verdict]:
-    """Statistics of the file, and whether a guess of a secret can be confirmed."""
+    """Verdicts on statistics of the file, and on confirming a guess of a secret."""
     result = audit.stealth
     if result is None or not result.statistics:
         return

@@ -1,8 +1,8 @@
-"""Attacks by name: changes of a model that may show a secret without its key.
+"""Attacks: changes of a model that may show a secret without its key.
 
-Transparent Gaussians may belong to a secret (KeySS, figures 2 and 6). A second scene that is stored in
-attributes that do not render (lengths of quaternions, harmonics of transparent Gaussians), or trained
-differently, may form a group of its own. No attack changes a model in place.
+Transparent Gaussians may belong to a secret (KeySS, figures 2 and 6). A second scene, stored in attributes
+that do not affect renders (lengths of quaternions, harmonics of transparent Gaussians) or trained
+differently, may form a cluster. Attacks do not change a model in place.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ DEVIATIONS = (2.0, 3.5)  # robust z-scores of outliers
 CLUSTERS = (2, 4)
 SEARCH_SAMPLE = 1000  # Gaussians used to search embeddings; more do not change the result
 
-_BRIGHTEST = 0.99  # the quantile that rescaling makes OPAQUE, robust to outliers
+_BRIGHTEST = 0.99  # quantile that rescaling makes OPAQUE; robust to outliers
 _TO_SIGMA = 1.4826  # converts a median absolute deviation to a normal standard deviation
 _MIN_SPREAD = 1e-3  # log units: attributes that differ only by rounding have no outliers
 _MIN_LENGTH = 1e-12
@@ -45,7 +45,7 @@ Decode = Callable[[Gaussians, Tensor], Gaussians]  # `keyss.methods.opened.Opene
 
 @dataclass(frozen=True)
 class Attack:
-    """One attack: makes models to render, with the same labels for every model."""
+    """One attack: changes a model into labelled variants to render; labels do not depend on the model."""
 
     name: str
     sentence: str
@@ -101,9 +101,9 @@ def file_attacks(cover: Scene, *, cover_views: int = 32, seed: int = 0) -> list[
 def decoder_attack(
     decode: Decode, key_size: int = EMBEDDING_SIZE, *, restarts: int = 2, steps: int = 150, seed: int = 0
 ) -> Attack:
-    """The attack with a secret's decoder and everything encrypted with it, but without the key.
+    """The attack with a secret's decoder, but without the key.
 
-    `decode`: see `keyss.methods.opened.Opened`. Without a gradient in the embedding, the search is random.
+    `decode`: see `keyss.methods.opened.Opened`; if it has no gradient in the embedding, the search is random.
     """
 
     def show(model: Gaussians) -> Variants:
@@ -135,17 +135,16 @@ def search_embeddings(
     balance: float = 2.0,
     seed: int = 0,
 ) -> Tensor:
-    """[restarts, key_size] unit vectors for which the decoder seems to show another scene, the best first.
+    """[restarts, key_size] unit vectors for which the decoder seems to show another scene, best first.
 
-    In the published scheme the key is a vector that enters the decoder's first layers. An attacker with the
-    network can search for the vector that exchanges most Gaussians, without knowing the secret: gradient
-    ascent from random starts on the mean change of the opacities, less `balance` times the change of their
-    mean. Making some Gaussians visible and as many others invisible replaces one scene by another; only
-    adding or removing does not. `balance=0` counts all change, which finds a secret that needs more Gaussians
-    than the cover.
+    In the published scheme, the key is a vector that enters the decoder's first layers. An attacker with the
+    network can search for the vector that exchanges most Gaussians: by gradient ascent from random starts, on
+    the mean absolute change of the opacities minus `balance` times the absolute change of their mean. Making
+    some Gaussians visible and others invisible replaces a scene; only adding or removing them does not.
+    `balance=0` counts all changes, and finds secrets with more Gaussians than the cover.
 
-    A random subset of `limit` Gaussians is decoded; appended Gaussians, which no decoder changes, are
-    ignored. Returns the random starts if the decoded opacities have no gradient in the embedding.
+    Decodes a random subset of `limit` Gaussians, without appended ones. Returns the random starts if the
+    decoded opacities have no gradient in the embedding.
     """
     generator = torch.Generator().manual_seed(seed)
     part = stego.detach()[~is_appended(stego)]
@@ -174,7 +173,7 @@ def search_embeddings(
 
 
 def with_the_key(reveal: Callable[[Gaussians], Gaussians]) -> Attack:
-    """The reference: the secret in the cover's frame, as its key reveals it."""
+    """The reference: the secret revealed with its key, in the cover's frame."""
     return Attack(
         "with the key",
         "Not an attack: the secret itself.",
@@ -184,13 +183,13 @@ def with_the_key(reveal: Callable[[Gaussians], Gaussians]) -> Attack:
 
 
 def _make_opaque(model: Gaussians) -> Gaussians:
-    """All Gaussians with opacity OPAQUE."""
+    """Set all opacities to OPAQUE."""
     logit = math.log(OPAQUE / (1 - OPAQUE))
     return replace(model, opacity_logits=torch.full_like(model.opacity_logits, logit))
 
 
 def _rescale(model: Gaussians) -> Gaussians:
-    """Opacities times the factor that makes the largest ones OPAQUE."""
+    """Scale opacities so that the largest become OPAQUE."""
     if len(model) == 0:
         return model
     opacities = model.opacity_logits.double().sigmoid()
@@ -210,7 +209,7 @@ def _below_thresholds(
 
 
 def _match_opacities(model: Gaussians) -> Variants:
-    """The Gaussians below each threshold with the opacities of the others by rank.
+    """Give the Gaussians below each threshold the opacities of the others, by rank.
 
     Undoes any monotone reduction of opacities.
     """
@@ -225,14 +224,14 @@ def _match_opacities(model: Gaussians) -> Variants:
 
 
 def _least_contributing(cameras: Sequence[Camera], model: Gaussians) -> Variants:
-    """The shares of the Gaussians that contribute least to the cameras' images, made opaque."""
+    """The Gaussians that contribute least to the cameras' images, made opaque."""
     order = contributions(model, cameras).argsort(stable=True)
     for share in SHARES:
         yield f"{share:.0%}", _make_opaque(model[order[: round(share * len(model))]])
 
 
 def _quaternion_length(model: Gaussians) -> Tensor:
-    """[N] natural logarithm."""
+    """[N] natural logarithm of the length."""
     length: Tensor = model.quats.norm(dim=1).clamp_min(_MIN_LENGTH).log()
     return length
 
@@ -250,10 +249,9 @@ ATTRIBUTES: dict[str, Callable[[Gaussians], Tensor]] = {
 
 
 def _outliers(attribute: str, model: Gaussians) -> Variants:
-    """Only the Gaussians whose robust z-score in an attribute is beyond a limit, made opaque.
+    """The Gaussians whose robust z-score in an attribute is beyond a limit, made opaque.
 
-    The score is the distance from the model's median over the standard deviation estimated by the median
-    absolute deviation, negated on the low side.
+    The score is (value - median) / standard deviation, estimated by the median absolute deviation.
     """
     score = ATTRIBUTES[attribute](model)
     if len(model):
@@ -265,11 +263,11 @@ def _outliers(attribute: str, model: Gaussians) -> Variants:
 
 
 def _clusters(seed: int, model: Gaussians) -> Variants:
-    """Groups of similar Gaussians, each alone and made opaque, the largest first.
+    """Clusters of similar Gaussians, each alone and made opaque, largest first.
 
-    A Gaussian mixture of opacity logit, sorted log scales, constant colour, and the logarithms of quaternion
-    length and SH energy, all standardised. Without positions, which would cut the scene into pieces. A model
-    of fewer than ten Gaussians is one group, and the others are empty.
+    A Gaussian mixture of opacity logit, sorted log scales, constant colour, and logarithms of quaternion
+    length and SH energy, all standardised; positions would cut the scene into pieces. A model of fewer than
+    ten Gaussians is one cluster; the others are empty.
     """
     for count in CLUSTERS:
         labels = torch.zeros(len(model), dtype=torch.long)
@@ -296,7 +294,7 @@ def _cluster_labels(model: Gaussians, count: int, seed: int) -> Tensor:
     mixtures = import_extra("sklearn.mixture", "audit", "find clusters")
     threadpoolctl = import_extra("threadpoolctl", "audit", "find clusters")
     mixture = mixtures.GaussianMixture(count, reg_covar=1e-3, random_state=seed)
-    # For matrices of 9 x 9, starting threads takes a hundred times as long as the work.
+    # For 9 x 9 matrices, starting threads takes a hundred times as long as the work.
     with threadpoolctl.threadpool_limits(1), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # a mixture that has not converged is good enough
         mixture.fit(rows[sample])

@@ -1,13 +1,13 @@
-"""`hide_batch`: one hiding for each asset of a table; an asset that fails does not stop the others.
+"""`hide_batch`: one hiding per asset of a table; a failed asset does not stop the others.
 
 The table is a CSV file with a row for each asset:
 
 | column | what |
 | --- | --- |
-| `cover` | model or scene that everybody may see |
+| `cover` | public model or scene |
 | `secret`, or `secret_file` | scene or model to hide in it, or any file |
 | `out` | folder of its results, in the batch's; it is also the asset's name under a master key |
-| `key_file` | file with its key; left out where keys are derived from a master key |
+| `key_file` | file with its key; none with a master key |
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ class Asset:
     device: Backend
 
     def is_done(self, place: Path) -> bool:
-        """True if it was made from the same files, with the same options, by the same version of keyss."""
+        """True if it was made from equal files and options by this version of keyss."""
         record = place / _RECORD
         inputs = [each for each in (self.cover, self.secret, self.secret_file, self.key_file) if each]
         same = os.path.exists(record) and record.read_bytes() == record_bytes(self)
@@ -77,10 +77,10 @@ class Asset:
 
 
 def read_rows(path: Path, *, master: bool) -> list[dict[str, str]]:
-    """All rows by columns, without empty values; paths, except `out`, are absolute.
+    """Read all rows without empty values; paths, except `out`, become absolute.
 
-    `master`: keys are derived, and no row names the file of one. Missing files are not an error here: they
-    fail their own asset. Raises InputError, which names the line.
+    `master`: keys are derived, and rows have no key file. Missing files are no error here, but fail their
+    asset. Raises InputError with the line.
     """
     reader = csv.DictReader(io.StringIO(read_text(path, MAX_BYTES)), strict=True)
     found, lines = [], {}
@@ -142,10 +142,10 @@ def hide_batch(
 ) -> ManyResult:
     """Hide a secret in each cover of a table (see this module), each in its own folder below `out`.
 
-    Assets that are done are skipped; one whose files or options have changed since is refused unless with
-    `overwrite`. `master_key_file`: its key and the column `out` give each asset a key of its own
-    (`keyss.keys.master`). `ray`, `cores`: see `keyss.sweep`; the other arguments are those of `hide`. Raises
-    KeyssError and its children for what concerns all; the result has what concerns one asset.
+    Finished assets are skipped; those with changed files or options fail without `overwrite`.
+    `master_key_file`: derive each asset's key from this key and the column `out` (`keyss.keys.master`).
+    `ray`, `cores`: see `keyss.sweep`; the other arguments are those of `hide`. Raises KeyssError for errors
+    that concern all assets; the result has those of single assets.
     """
     master = None if master_key_file is None else Path(master_key_file).absolute()
     rows, out = read_rows(Path(manifest), master=master is not None), Path(out)
@@ -179,7 +179,7 @@ def hide_batch(
 
 
 def _hide(asset: Asset, place: Path, reporter: Reporter, *, derived: bool, overwrite: bool) -> None:
-    """Hide, and write the record of the asset. `derived`: its key file has the master key."""
+    """Hide, and write the record of the asset. `derived`: its key file holds the master key."""
     key = read_key(Path(asset.key_file))
     key = MasterKey(key).key_of(asset.name) if derived else key
     if asset.secret_file is not None:
@@ -222,7 +222,7 @@ def _warn_of_covers(covers: Sequence[str]) -> None:
 
 
 def _summary(out: Path, outcomes: Sequence[Outcome]) -> bytes:
-    """A line for each asset: its state, and the published file with its checksum, or the error."""
+    """CSV with a row per asset: its state, and the published file with its checksum, or the error."""
     rows = []
     for each in outcomes:
         row = {"out": each.name, "state": "failed", "published": "", "sha256": "", "error": each.error or ""}

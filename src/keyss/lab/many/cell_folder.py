@@ -37,10 +37,10 @@ class Outcome:
     folder: Path
     result: Any = None
     error: str | None = None  # the reason for a missing result
-    skipped: bool = False  # was done before
+    skipped: bool = False  # True if it was finished before
 
     def row(self, labels: Mapping[str, Any], scenes: Sequence[str], seed: int) -> CellNumbers:
-        """The cell in tables, without numbers that differ from run to run or repeat arguments."""
+        """The cell for tables, without times and arguments."""
         numbers = {
             name: value
             for name, value in self.result.numbers.items()
@@ -58,17 +58,17 @@ class ManyResult:
 
     @property
     def errors(self) -> dict[str, str]:
-        """Of the runs that failed, by name."""
+        """Errors of failed runs, by name."""
         return {each.name: each.error for each in self.outcomes if each.error is not None}
 
 
 @dataclass(frozen=True)
 class Forecast:
-    """The cells of a folder before they run, in their order, by their folders."""
+    """The cells of a folder before they run, by their folders, in order."""
 
     names: Mapping[Path, str]
     plans: Mapping[Path, Plan]  # cells to run
-    refused: Mapping[Path, str]  # why a cell cannot work
+    refused: Mapping[Path, str]  # reasons why cells cannot run
 
 
 def check_master_key(out: Path, given: Path | None) -> None:
@@ -88,7 +88,7 @@ def check_master_key(out: Path, given: Path | None) -> None:
 
 @dataclass
 class CellFolder:
-    """Cells by their folders in `out`; equal cells share one."""
+    """Cells by their folders in `out`; equal cells share a folder."""
 
     out: Path
     master_key_file: Path | None = None
@@ -96,7 +96,7 @@ class CellFolder:
     cells: dict[Path, Cell] = field(default_factory=dict)
 
     def plain(self, scene: str, config: FitConfig) -> str:
-        """Add the plain fit of a scene; its model, relative to the folder of another cell."""
+        """Add the plain fit of a scene; returns its model, relative to the folder of another cell."""
         name = f"plain model of {Path(scene).name}, {config.iterations:,} steps, seed {config.seed}"
         shared = {each: self.common[each] for each in ("views", "device")}
         return f"../{self._add(Cell(name=name, cover=scene, options=config, **shared)).name}/{RUN}/{MODEL}"
@@ -111,9 +111,9 @@ class CellFolder:
         measures: tuple[str, ...] = (),
         controls: Sequence[str] = (),
     ) -> Path:
-        """Add a hiding; its folder. `sources`: the cover, then the secrets.
+        """Add a hiding; returns its folder. `sources`: the cover, then the secrets.
 
-        Raises BackendError for measures that need packages which are not installed.
+        Raises BackendError if packages for the measures are not installed.
         """
         check_extras(measures)
         if models[0] is not None:  # a plain fit of the same folder
@@ -140,9 +140,9 @@ class CellFolder:
     def run(
         self, ray: str | None = None, cores: int = 1, reporter: Reporter | None = None
     ) -> dict[Path, Outcome]:
-        """Run all cells that are not done, plain fits first; outcomes by folder.
+        """Run all unfinished cells, plain fits first; returns outcomes by folder.
 
-        The arguments are those of `engine`. Raises KeyssError for what concerns all cells.
+        The arguments are those of `engine`. Raises KeyssError for errors that concern all cells.
         """
         found: dict[Path, Outcome] = {}
         with claim_folder(self.out):

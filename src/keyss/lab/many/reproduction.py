@@ -1,4 +1,4 @@
-"""`reproduce`: a table of the paper, run again on its scenes or others, and shown beside its figures."""
+"""`reproduce`: run a table of the paper on its scenes or others, and compare the figures."""
 
 from __future__ import annotations
 
@@ -48,16 +48,16 @@ def reproduce(
 ) -> Reproduction | Forecast:
     """Reproduce a table of the paper, one of `keyss.lab.many.paper.PAPER.tables`.
 
-    The `scenes` (folders of photos) hide each other, with 1,000 steps, 9,000 Gaussians and 120 pixels of
-    width unless others are given. With `data` they are the paper's in that folder, Mip-NeRF 360 and playroom
-    of Deep Blending, with its 30,000 steps and 500,000 Gaussians; `download` fetches those that are missing.
-    `pairs`: which hide which, as "COVER,SECRET" or "COVER,SECRET,SECRET" by the names of their folders; by
-    default each hides the next, and the paper's as published.
+    The `scenes` (folders of photos) hide each other, by default with 1,000 steps, 9,000 Gaussians and a width
+    of 120 pixels. `data`: a folder with the paper's scenes (Mip-NeRF 360, and playroom of Deep Blending), run
+    with the paper's 30,000 steps and 500,000 Gaussians; `download` fetches missing ones. `pairs`: covers and
+    secrets, as "COVER,SECRET" or "COVER,SECRET,SECRET" by the names of their folders; by default each scene
+    hides the next, and the paper's are paired as published.
 
-    `out` (a folder) gets `TABLE.json`, `.md`, `.csv` and `.tex` (PSNR, SSIM and LPIPS, a row for each scene,
-    with standard deviations over `seeds`), and the cells, which tables in one folder share. Cells that are
-    done are skipped. `dry_run`: only return their plans. The result lists runs that failed.
-    Raises KeyssError and its children for impossible scenes and arguments; KeyboardInterrupt.
+    `out` (a folder) gets `TABLE.json`, `.md`, `.csv` and `.tex` (PSNR, SSIM and LPIPS per scene, with
+    standard deviations over `seeds`), and the cells, which tables in one folder share. Finished cells are
+    skipped. `dry_run`: only return their plans. The result lists failed runs. Raises KeyssError for
+    impossible scenes and arguments; KeyboardInterrupt.
     """
     if table not in PAPER.tables:
         raise UsageError(f"no table is called {table!r}; {did_you_mean(table, PAPER.tables)}")
@@ -122,7 +122,7 @@ def reproduce(
 
 
 def _options(run: Run) -> MethodOptions:
-    """The paper's settings, except the changes of the run."""
+    """The paper's settings with the changes of the run."""
     preset = registry.get(run.method).options.preset("full")
     design = {"design": "published"} if run.method == "keyss" else {}
     return with_changes(preset, {**design, **run.changes})
@@ -143,7 +143,7 @@ def _paths(scenes: Sequence[PathLike]) -> dict[str, str]:
 def groups_of(
     names: Sequence[str], secrets: int, pairs: Sequence[str], default: Sequence[Group] | None
 ) -> Sequence[Group]:
-    """Which scenes hide which; by default each hides the next ones, the last ones the first again.
+    """Groups of a cover and its secrets; by default each scene hides the next ones, cyclically.
 
     `pairs`: COVER,SECRET or COVER,SECRET,SECRET. Raises UsageError.
     """
@@ -172,6 +172,6 @@ def _numbers(numbers: Mapping[str, float]) -> dict[str, float]:
     figures |= {f"secret {number}": psnr for number, psnr in enumerate(secrets, start=1)}
     cover, secret = numbers["cover.psnr"], fmean(secrets)
     figures |= {"cover": cover, "secret": secret, "mean of both": (cover + secret) / 2}
-    # Through the decoder of the first secret.
+    # Wrong keys of the first secret's decoder.
     wrong = {"cover": "wrong_key.vs_cover.mean", "secret": "wrong_key.vs_secrets.1.mean"}
     return figures | {f"wrong key, {role}": numbers[name] for role, name in wrong.items() if name in numbers}

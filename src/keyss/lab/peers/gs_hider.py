@@ -1,8 +1,7 @@
 """GS-Hider (Zhang et al., NeurIPS 2024): coupled features in place of harmonics, and two networks.
 
-The Gaussians' 16 features are rendered like colours. A scene decoder, which is published with them, turns the
-rendered features into the cover's picture, and a message decoder, which is handed over, into the secret's. No
-viewer of 3DGS models shows either.
+The Gaussians' 16 features are rendered like colours. A published scene decoder maps rendered features to the
+cover's image, a handed-over message decoder to the secret's. Viewers of 3DGS models show neither.
 """
 
 from __future__ import annotations
@@ -45,7 +44,7 @@ class GsHiderTraining(PeerTraining):
         return [Picture(decode_picture(image, network), meta) for network in networks]
 
     def gaussians(self) -> Gaussians:
-        """[N] without colours."""
+        """The Gaussians, without colours."""
         own = self.parameters
         sh = torch.zeros(len(self), 1, 3, device=self.device)
         return Gaussians(own["means"], own["quats"], own["scales"], own["opacities"], sh)

@@ -1,6 +1,6 @@
-"""PSNR that cover and secrets lose when the published model changes.
+"""PSNR loss of cover and secrets when the published model changes.
 
-Among the changes are conversions to other formats and back by third-party programs: gsply (PyPI) and
+Changes include conversions to other formats and back by third-party programs: gsply (PyPI) and
 splat-transform (npm).
 
 pip install gsply
@@ -44,7 +44,7 @@ class ChangedQuality:
     """A scene against its test photos after a change."""
 
     psnr: float  # dB
-    loss: float  # dB less than in the unchanged model
+    loss: float  # dB below the unchanged model
     opens: bool = True  # always True for the cover
     error: str | None = None  # why a secret does not open
 
@@ -60,14 +60,14 @@ class ChangeResult:
     strength: float
     unit: str
     sentence: str
-    seeds: int = 1  # number of changes that this is the mean of
+    seeds: int = 1  # number of changes averaged
     skipped: str | None = None  # the missing tool; `cover` and `secrets` are unset then
     cover: ChangedQuality | None = None
     secrets: tuple[ChangedQuality, ...] = ()
 
 
 def default_changes(cover: Scene, *, seed: int = 0) -> list[Change]:
-    """All changes, grouped by attack, the mildest first; some train on the photos of `cover`."""
+    """All changes, grouped by attack, mildest first; some train on the photos of `cover`."""
     return [
         *(change.random_pruning(share, seed + index) for share in PRUNED for index in range(SEEDS)),
         *(change.opacity_pruning(share) for share in PRUNED),
@@ -94,11 +94,10 @@ def measure_robustness(
 ) -> list[ChangeResult]:
     """PSNRs of cover and secrets after each of the `changes`; the first result is the unchanged model's.
 
-    `changes`: by default `default_changes`, about 50; the ones of equal attack and strength become one
-    result. `max_views`: test views of each scene. `progress`: called with the numbers of changes done and of
-    all. Renders on the device of `stego`. The same seed gives the same numbers. Raises UsageError unless
-    there is one opener for each secret, and KeyssError for a secret that does not open in the unchanged
-    model.
+    `changes`: by default `default_changes`, about 50; results of equal attack and strength are averaged.
+    `max_views`: test views per scene. `progress`: called with the number of finished changes and the total.
+    Renders on the device of `stego`. Deterministic in `seed`. Raises UsageError unless there is one opener
+    per secret, KeyssError if a secret does not open in the unchanged model.
     """
     if len(openers) != len(secrets):
         raise UsageError(f"expected an opener for each of {len(secrets)} secret(s), got {len(openers)}")
@@ -139,20 +138,17 @@ def measure_robustness(
 
 
 def reveal_changed(opener: Opener, stego: Gaussians) -> Gaussians:
-    """The secret in its own frame, as `keyss reveal` gives it, with `--force` if the model requires it.
-
-    Raises WrongKeyError and InputError as the opener does.
-    """
+    """Reveal the secret in its own frame, with `force` if needed. Raises the errors of the opener."""
     stego = stego.to("cpu")
     secret = opener(stego)
     try:
         return secret.reveal(stego)
-    except InputError:  # positions changed: it seems to be another model
+    except InputError:  # changed positions look like another model
         return secret.reveal(stego, force=True)
 
 
 def _mean(results: Sequence[ChangeResult]) -> ChangeResult:
-    """Results that differ in their random seed as one."""
+    """Average results of different random seeds."""
     covers = [each.cover for each in results if each.cover is not None]
     if not covers:
         return results[0]
@@ -205,8 +201,8 @@ class Converter:
 def converters(sog_iterations: int = 1) -> list[Converter]:
     """All known conversions, whether or not their tools are installed.
 
-    `sog_iterations`: of the clustering of harmonics in .sog, by default ten in splat-transform, which without
-    a GPU takes half a minute each for 20,000 Gaussians.
+    `sog_iterations`: rounds of clustering harmonics in .sog; splat-transform's default is ten, at half a
+    minute each for 20,000 Gaussians without a GPU.
     """
     rounds = "one round" if sog_iterations == 1 else f"{sog_iterations} rounds"
     return [
@@ -225,7 +221,7 @@ def converters(sog_iterations: int = 1) -> list[Converter]:
 
 
 def own_converter(format: str) -> Converter:
-    """A conversion by keyss itself, for where a tool is missing: `format` is .spz or compressed .ply."""
+    """A conversion by keyss itself, if a tool is missing; `format` is .spz or compressed .ply."""
     name = {".spz": "there.spz", "compressed .ply": "there.compressed.ply"}[format]
 
     def round_trip(source: Path, folder: Path) -> tuple[Path, Path]:
@@ -238,7 +234,7 @@ def own_converter(format: str) -> Converter:
 
 
 def why_missing(tool: str) -> str | None:
-    """Why splat-transform or a Python package cannot be used; None if it is installed."""
+    """The reason why splat-transform or a Python package is unusable; None if it is installed."""
     try:
         find_splat_transform() if tool == "splat-transform" else find_package(tool)
     except BackendError as error:
@@ -255,7 +251,7 @@ def find_package(name: str) -> ModuleType:
 
 
 def transform(source: Path, target: Path, *options: str) -> Path:
-    """`target`, converted from `source` by splat-transform. Raises BackendError."""
+    """Convert `source` to `target` with splat-transform; returns `target`. Raises BackendError."""
     tool = find_splat_transform()
     command = [tool, "-q", "-w", "-g", "cpu", *options, str(source), str(target)]
     try:

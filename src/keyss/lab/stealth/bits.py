@@ -1,7 +1,7 @@
-"""Bits of mantissas that are not random, given everything else that an attacker sees.
+"""Mantissa bits that are not random, conditioned on everything else that an attacker sees.
 
-By attribute, magnitude and position of the bit; given the bit below; and numbers that contradict themselves:
-training that leaves a zero in the last bit leaves zeros above it too, embedding does not.
+Statistics by attribute, magnitude and position of the bit, and given the bit below. Numbers with a zero in
+the last bit have zeros above it too after training, but not after embedding.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _MIN_COUNT = 64  # numbers of a stratum
 
 
 def bits(model: Gaussians, words: BitPatterns) -> dict[str, Statistic]:
-    """Statistics of single numbers, by attribute and magnitude; nulls are exact: fair, independent bits."""
+    """Statistics of single numbers by attribute and magnitude, with an exact null: fair, independent bits."""
     statistics: dict[str, Statistic] = {}
     for index, attribute in enumerate(ATTRIBUTES):
         columns = words.of_attribute(index)
@@ -53,7 +53,7 @@ def bits(model: Gaussians, words: BitPatterns) -> dict[str, Statistic]:
 
 
 def _of_values(values: Words32) -> dict[str, Statistic]:
-    """Shares of ones, of trailing zeros, and of zeros in bits 1 to 3 above a zero against above a one."""
+    """Shares of ones, of trailing zeros, and of zeros in bits 1 to 3 given bit 0."""
     statistics = {}
     for name, (low, high) in RANGES.items():
         ones = sum(int((values >> bit & 1).sum()) for bit in range(low, high))
@@ -70,7 +70,7 @@ def _of_values(values: Words32) -> dict[str, Statistic]:
 
 
 def _difference(one: Flags, other: Flags, expected: float) -> Statistic:
-    """Difference of the shares in `one` and `other`; by chance both are `expected`."""
+    """Difference of the shares in `one` and `other`, both `expected` under the null."""
     if min(len(one), len(other)) < _MIN_COUNT:
         return NOTHING
     error = (expected * (1 - expected) * (1 / len(one) + 1 / len(other))) ** 0.5
@@ -92,7 +92,7 @@ def _strata(values: Words32) -> Statistic:
 
 
 def _count_variance(values: Words32, chosen: Flags) -> Statistic:
-    """Variance over Gaussians of the number of small harmonics with three zeros above the last bit."""
+    """Variance over Gaussians of their count of small harmonics with zeros in bits 1 to 3."""
     zeros = ((values & np.uint32(14) == 0) & chosen).sum(axis=1)
     trials = chosen.sum(axis=1)
     rows = trials > 1
