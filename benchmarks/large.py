@@ -69,7 +69,7 @@ identities(models[0])
 write_model(f"{folder}/least.ply", models[0])
 models[0] = read_model(f"{folder}/least.ply")
 for model, scene in zip(models, scenes):
-    hiding.show(model, model, scene, of_plain=True)
+    hiding.compare(model, model, scene, of_plain=True)
 """
 
 

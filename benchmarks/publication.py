@@ -47,7 +47,7 @@ def _converted(converter: Converter, model: Gaussians) -> tuple[Gaussians, int]:
     with TemporaryDirectory() as folder:
         source = Path(folder) / "source.ply"
         write_model(source, model)
-        there, back = converter.there_and_back(source, Path(folder))
+        there, back = converter.round_trip(source, Path(folder))
         return read_model(back), there.stat().st_size
 
 

@@ -147,7 +147,7 @@ def measure_rasterizer(case: Case, threads: int, repeats: int) -> list[str]:
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 - before
     graph = draw().grad_fn
     assert graph is not None
-    (drawing,) = graph.next_functions[0][0].drawings  # type: ignore[union-attr]
+    (drawing,) = graph.next_functions[0][0].renderings  # type: ignore[union-attr]
     pairs = blended_pairs(drawing, camera.width, camera.height)
     floor = 1e3 * OPERATIONS_PER_PAIR * pairs / 8 / peak_operations() / threads
     return [

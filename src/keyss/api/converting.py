@@ -17,7 +17,7 @@ from keyss.files.ply_extras import with_extras
 from keyss.files.reading import is_standard, write_standard_output
 from keyss.files.trained import model_file
 from keyss.rendering import Backend, resolve_device
-from keyss.rendering.difference import is_seen, psnr_between
+from keyss.rendering.difference import is_visible, psnr_between
 from keyss.runs.files import PathLike, as_model
 from keyss.runs.folder import check_not_published
 from keyss.runs.revealing import reveal_any
@@ -82,7 +82,7 @@ def convert(
         for key, each in zip(keys, opened, strict=True)
     )
     size = None if source is None or is_standard(source) else source.stat().st_size
-    psnr = psnr_between(before.to(target), after.to(target)) if is_seen(before.to(target)) else math.nan
+    psnr = psnr_between(before.to(target), after.to(target)) if is_visible(before.to(target)) else math.nan
     result = Conversion(after, size, len(data), psnr, keeps_low_bits(path), secrets)
     lost = [number for number, each in enumerate(secrets, 1) if not each.kept]
     if lost and not (force or dry_run):

@@ -91,8 +91,8 @@ _LEGEND = (
     "per picture, and its ratio to that of plain 3DGS. Seconds: time of hiding, after plain models.",
     "Wrong keys: mean PSNR in dB of their renders against the cover, and maximum against the secret; in "
     "brackets, the published model itself against the secret. Classifier and StegExpose: area under the ROC "
-    "curve against plain models of the cover with other seeds; 0.5 if indistinguishable. p: minimum p-value of "
-    "the file's statistics against those models. In brackets: a plain model of the cover.",
+    "curve against plain models of the cover with other seeds; 0.5 if indistinguishable. p: minimum p-value "
+    "of the file's statistics against those models. In brackets: a plain model of the cover.",
     "Pruned (a random quarter), converted and back, purified (GSPure): change of cover and secret in dB. "
     "Lost: the secret no longer opens.",
 )
@@ -267,7 +267,7 @@ def comparison_sheet(runs: Mapping[str, HidingRun], device: Backend) -> Image.Im
 
 
 def comparison_tables(found: Comparison) -> dict[str, list[list[str]]]:
-    """Rows of text by title, heads first: fidelity and cost, secrecy and survival. Failed methods have none."""
+    """Rows of text by title, heads first: fidelity and cost, secrecy and survival; without failed methods."""
     rows = [each for each in found.methods if each.error is None]
     return {
         title: [

@@ -14,7 +14,7 @@ import numpy as np
 
 from keyss.core.arrays import Integers
 from keyss.core.errors import InputError
-from keyss.rendering.cpu.jit import inlined, kernel
+from keyss.rendering.cpu.jit import inline, kernel
 
 MAX_NUMBER = 1 << 29  # differences have at most 31 bits
 _MAX_BITS = 31
@@ -40,7 +40,7 @@ def decode(data: bytes, count: int, shares: Integers, groups: Integers) -> Integ
     return table
 
 
-@inlined
+@inline
 def _byte(coder: Any, data: Any, reading: bool) -> None:
     """Read or write a byte. `coder`: low end of the range (reading: offset in it), range, bytes so far."""
     at = coder[2]
@@ -58,7 +58,7 @@ def _byte(coder: Any, data: Any, reading: bool) -> None:
     coder[0] = coder[0] << 8 & 0xFFFFFFFF
 
 
-@inlined
+@inline
 def _raw_bit(coder: Any, data: Any, reading: bool, bit: int, bound: int) -> int:
     """Write or read a bit; `bound`: the part of the range for 0."""
     if reading:
@@ -72,7 +72,7 @@ def _raw_bit(coder: Any, data: Any, reading: bool, bit: int, bound: int) -> int:
     return bit
 
 
-@inlined
+@inline
 def _bit(coder: Any, data: Any, reading: bool, bit: int, estimates: Any) -> int:
     """`_bit` with two adaptive `estimates` [2] of the probability of 0, in 65,536ths; their mean is used."""
     bit = _raw_bit(coder, data, reading, bit, (coder[1] >> 12) * ((estimates[0] + estimates[1]) >> 5))
