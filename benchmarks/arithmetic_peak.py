@@ -1,4 +1,4 @@
-"""How many 8-lane arithmetic operations a core can do a second: what the blending is compared with."""
+"""Peak rate of 8-lane arithmetic on one core, with which the blending is compared."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ import numpy as np
 # three colours.
 OPERATIONS_PER_PAIR = 14
 _ROUNDS = 2_000_000
-_CHAINS = 12  # independent ones, enough to hide the latency of each
+_CHAINS = 12  # independent operations, enough to hide latencies
 
 
 def peak_operations() -> float:
-    """Vector operations (multiply-adds) a second on one core, the best of several tries."""
+    """Vector operations (multiply-adds) per second on one core, the best of several tries."""
     values = np.full(8 * _CHAINS, 0.5, np.float32)
     _multiply_adds(values, 1)
     best = 0.0

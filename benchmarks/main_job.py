@@ -1,9 +1,9 @@
-"""What one hiding takes from photos to a measured result, against an older commit.
+"""Time of one hiding, from photos to measurements, against an older commit.
 
     python benchmarks/main_job.py --cover bonsai --secret fox --against 2f752b1
 
-`keyss hide` as it is typed, in a process of its own, with the working tree and with the older commit in
-turns. Each tree first hides for a few steps, so that its kernels are compiled.
+Runs `keyss hide` in alternating processes of the working tree and the older commit. Each tree first hides for
+a few steps, to compile its kernels.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ def main() -> None:
 
 
 def hidings(options: argparse.Namespace, folder: Path) -> dict[str, list[Times]]:
-    """Whole hidings, by the tree that ran them."""
+    """Times of complete hidings by tree."""
     (folder / "key.txt").write_text(KEY)
     scenes = ["--cover", options.cover.resolve(), "--secret", options.secret.resolve()]
     job = ["hide", *scenes, "--key-file", folder / "key.txt", *sizes(options)]
@@ -59,12 +59,14 @@ def hidings(options: argparse.Namespace, folder: Path) -> dict[str, list[Times]]
         trees = {"hide, this tree": ROOT, **older}
         for what, tree in trees.items():
             few = ["--iterations", FEW, "--min-psnr", 0, "-o", folder / f"first, {what}"]
-            timed(tree, [*job, *few], options.threads)
+            time_command(tree, [*job, *few], options.threads)
         for number in range(options.repeats):
             for what, tree in trees.items():
                 out = folder / f"{number}, {what}"
                 steps = ["--iterations", options.iterations] if options.iterations else []
-                found.setdefault(what, []).append(timed(tree, [*job, *steps, "-o", out], options.threads))
+                found.setdefault(what, []).append(
+                    time_command(tree, [*job, *steps, "-o", out], options.threads)
+                )
                 print(f"{what}: {decibels(out)}", flush=True)
     return found
 
@@ -82,7 +84,7 @@ def sizes(options: argparse.Namespace) -> Command:
 
 @contextmanager
 def older_tree(commit: str | None, place: Path) -> Iterator[dict[str, Path]]:
-    """The tree of a commit in a folder, by what its hidings are called; none without one."""
+    """Check out a commit; yields its folder by the name of its hidings, or nothing without a commit."""
     if commit is None:
         yield {}
         return
@@ -94,8 +96,8 @@ def older_tree(commit: str | None, place: Path) -> Iterator[dict[str, Path]]:
         subprocess.run([*git, "remove", "--force", place], check=True)
 
 
-def timed(tree: Path, command: Command, threads: int) -> Times:
-    """What the `keyss` of a tree takes for a command. Raises CalledProcessError where it fails."""
+def time_command(tree: Path, command: Command, threads: int) -> Times:
+    """Time a command of a tree's `keyss`. Raises CalledProcessError if it fails."""
     environment = os.environ | {f"{library}_NUM_THREADS": str(threads) for library in LIBRARIES}
     environment["PYTHONPATH"] = str(tree / "src")
     before, start = processor_seconds(), time.perf_counter()
@@ -105,7 +107,7 @@ def timed(tree: Path, command: Command, threads: int) -> Times:
 
 
 def processor_seconds() -> float:
-    """Of this process and of those that it has started, so far."""
+    """Processor time of this process and its finished children."""
     return sum(os.times()[:4])
 
 

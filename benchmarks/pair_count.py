@@ -1,4 +1,4 @@
-"""How much there is to blend: (Gaussian, pixel) pairs, counted one by one without the kernels' shortcuts."""
+"""Number of (Gaussian, pixel) pairs to blend, counted one by one without the kernels' shortcuts."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ import numpy as np
 
 
 def blended_pairs(rendering: Rendering, width: int, height: int) -> int:
-    """The pairs that add to a pixel: alpha of 1/255 or more, before the pixel has stopped."""
+    """The pairs that contribute to a pixel: alpha of 1/255 or more, before the pixel is full."""
     return int(
         _count(rendering.footprints, rendering.tile_starts, rendering.entries, rendering.ends, width, height)
     )

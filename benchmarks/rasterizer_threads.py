@@ -1,15 +1,13 @@
-"""How far more threads can help the CPU rasterizer: `python benchmarks/rasterizer_threads.py --help`.
+"""Upper bounds on the speedup of the CPU rasterizer by threads: see `--help`.
 
-Kernels draw their pieces of work from a counter (`keyss.rendering.cpu.parallel`). Here one thread does all
-pieces of a scene, and the time of each is taken, in seconds of the thread's own processor time. Then they are
-dealt out to T threads as the counter would: the next piece to the thread that is free first. What comes out
-is a bound: memory that threads share, caches and the waking of threads cost nothing in it. It needs no such
-number of cores.
+Kernels take pieces of work from a counter (`keyss.rendering.cpu.parallel`). Here one thread does all pieces
+of a scene, and the processor time of each is measured. Then the pieces are assigned to T threads like by the
+counter: the next piece to the first free thread. The result is an upper bound, without the costs of shared
+memory, caches and waking threads. It does not need T cores.
 
-Pieces of the two blending kernels, runs of tiles, are timed one by one. Those of the other kernels are taken
-to cost what their Gaussians (`project`) or their pairs with tiles (`list_pairs`, `sort_pairs`) are of the
-kernel's time. What is not divided, sorting by depth and the places of pairs, and all that is no kernel, is on
-one thread.
+Pieces of the two blending kernels, runs of tiles, are timed one by one. Times of the other kernels are
+divided in proportion to Gaussians (`project`) or pairs with tiles (`list_pairs`, `sort_pairs`). Undivided
+work (sorting by depth, the places of pairs, everything outside of kernels) is on one thread.
 """
 
 from __future__ import annotations
@@ -33,12 +31,12 @@ import numpy as np
 import torch
 
 THREADS = (1, 2, 4, 8, 16, 32)
-_WHOLE = ("sort_by_depth",)  # not divided into pieces
+_WHOLE = ("sort_by_depth",)  # kernels without pieces
 _ENDS = {"blend": 9, "blend_backward": 5}  # index of the argument that holds the last entries of tiles
 
 
 def makespan(pieces: Sequence[float], threads: int) -> float:
-    """When the last of `threads` is done that take `pieces` in their order, each as soon as it is free."""
+    """Time until the last of `threads` ends that take `pieces` in order, each when it is free."""
     free = [0.0] * threads
     for piece in pieces:
         heapq.heappush(free, heapq.heappop(free) + piece)
@@ -47,7 +45,7 @@ def makespan(pieces: Sequence[float], threads: int) -> float:
 
 @dataclass
 class Pass:
-    """Seconds of the pieces of each kernel in a forward or backward pass, and of what no kernel does."""
+    """Seconds of the pieces of each kernel in a forward or backward pass, and of the rest."""
 
     pieces: dict[str, list[float]] = field(default_factory=dict)
     alone: float = 0.0
@@ -56,7 +54,7 @@ class Pass:
         return self.alone + sum(makespan(each, threads) for each in self.pieces.values())
 
     def smaller(self, other: Pass) -> Pass:
-        """Of two measurements the smaller numbers."""
+        """Elementwise minimum of two measurements."""
         if not self.pieces:
             return other
         pieces = {name: list(map(min, each, other.pieces[name])) for name, each in self.pieces.items()}
@@ -64,7 +62,7 @@ class Pass:
 
 
 def measure(case: Case, threads: int, repeats: int) -> tuple[Pass, Pass]:
-    """Forward and backward with the pieces that they have on so many threads, each the least of `repeats`."""
+    """Forward and backward pass with the pieces for `threads`; minimum of `repeats`."""
     torch.set_num_threads(1)
     gaussians, camera = case.scene()
     tensors = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh)
@@ -85,7 +83,7 @@ def measure(case: Case, threads: int, repeats: int) -> tuple[Pass, Pass]:
 
 @contextmanager
 def timed(threads: int) -> Iterator[Pass]:
-    """Times what runs in the block, divided as for so many threads, on this one."""
+    """Time the block on this thread, with the pieces for `threads`."""
     found, inside = Pass(), 0.0
 
     def run(kernel: Callable[..., None], *arguments: Any) -> None:
@@ -116,7 +114,7 @@ def timed(threads: int) -> Iterator[Pass]:
 
 
 def _pieces(kernel: Callable[..., None], arguments: tuple[Any, ...]) -> list[float]:
-    """Do all the work of a kernel; seconds of its pieces, in their order."""
+    """Run a kernel; returns seconds of its pieces, in order."""
     if (place := _ENDS.get(kernel.__name__)) is not None:
         ends = arguments[place]
         call = min(_seconds(kernel, len(ends), arguments) for _ in range(5))  # overhead of a call: no pieces
@@ -140,7 +138,7 @@ def _pieces(kernel: Callable[..., None], arguments: tuple[Any, ...]) -> list[flo
 
 
 def _seconds(kernel: Callable[..., None], first: int, arguments: tuple[Any, ...]) -> float:
-    """Processor time of the pieces from `first` on."""
+    """Processor time of the pieces starting at `first`."""
     counter = np.array([first])
     start = time.thread_time()
     kernel(counter, *arguments)
