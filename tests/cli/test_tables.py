@@ -86,7 +86,7 @@ class TestNumbers:
 
     def test_what_the_numbers_are_compared_with_is_said(self) -> None:
         rows = self.table(METRICS)
-        assert ["Bound: PSNR of plain 3DGS of as many Gaussians and as many training steps."] in rows
+        assert ["Bound: upper bound, PSNR of plain 3DGS with as many Gaussians and the same steps."] in rows
         assert any(row[0].startswith("Chance level: 9.00, PSNR of the stego") for row in rows)
         alone = replace(METRICS, baseline=BaselineQuality(None, (None,), (None, None)))
         assert not any(row[0].startswith(("Bound:", "Start:")) for row in self.table(alone))

@@ -91,8 +91,8 @@ def hide(
     `out` (a folder) gets `publish/` with the stego model, and `private/` with fitted models, `config.json`,
     `metrics.json`, the files to hand over for methods that need them (`keyss.methods.handed`), and
     checkpoints, from which `resume` continues. Without a seed in the options' `fit` the run uses a random
-    one, which `config.json` records. With one, the same arguments give the same bytes on a CPU with as many
-    threads.
+    one, which `config.json` records. With a seed, the same arguments and number of threads give the same
+    bytes on a CPU.
 
     `bound`: fit upper bounds to compare with, plain 3DGS with equal Gaussians and training steps; otherwise
     `metrics.json` says which baselines had fewer steps. `dry_run`: check arguments, return only the plan.

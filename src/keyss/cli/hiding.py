@@ -59,7 +59,7 @@ class Details:
     ] = None
     bound: Annotated[
         bool,
-        switch("Also fit plain 3DGS of as many Gaussians and steps to compare with; takes twice as long."),
+        switch("Also fit upper bounds, plain 3DGS with equal Gaussians and steps; takes twice as long."),
     ] = False
     channel: Annotated[
         Literal["appended", "colours"] | None,

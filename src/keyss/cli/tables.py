@@ -139,14 +139,14 @@ def _explanations(metrics: HideMetrics, names: Sequence[str], heads: Sequence[st
     if "plain" in heads:
         lines.append("Plain: Gaussians of the plain model.")
     if "bound" in heads:
-        lines.append(f"Bound: PSNR of plain 3DGS of {size} and as many training steps.")
+        lines.append(f"Bound: upper bound, PSNR of plain 3DGS with {size} and the same steps.")
     if "start" in heads:
         baseline = metrics.baseline
         pairs = zip(baseline.steps, baseline.equal, strict=False)
         shorter = {steps for steps, equal in pairs if steps is not None and not equal}
         fewer = " or ".join(f"{steps:,}" for steps in sorted(shorter)) or "fewer"
         lines.append(
-            f"Start: PSNR of a plain model of {size} and {fewer} training steps, which is no bound; `keyss "
+            f"Start: PSNR of a plain model with {size} and {fewer} training steps, no upper bound; `keyss "
             "hide --bound` fits one."
         )
     if (wrong := metrics.wrong_key) is not None:

@@ -177,7 +177,7 @@ class MethodOptions:
         return replace(self, fit=replace(self.fit, **changes))
 
     def joint_plan(self, secrets: int) -> Plan:
-        """The plan of a joint training with as many Gaussians as a plain model."""
+        """The plan of a joint training with the size of one plain model."""
         fit = self.fit
         return Plan(
             gaussians=fit.max_gaussians,

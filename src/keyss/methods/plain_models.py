@@ -42,7 +42,7 @@ class Bound:
     """An upper bound: plain 3DGS with as many Gaussians and training steps as a scene had."""
 
     steps: int | None  # total training steps of the scene; None: unknown, its plain model was given
-    equal: bool  # True if the plain model has as many steps and is the bound itself
+    equal: bool  # True if the plain model has equal steps and is the upper bound itself
 
     @staticmethod
     def of(training: Training, plain_steps: int | None) -> Bound:

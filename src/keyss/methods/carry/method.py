@@ -28,7 +28,7 @@ _SELECTION_VIEWS = 64
 _PLANNED = bytes(32)  # dummy entropy for plans
 _VISIBLE = (
     "the cover can hold the secret, but whoever inspects the published file sees that it holds something "
-    '(`publish="any"`), because nothing goes in unnoticed: {}'
+    '(`publish="any"`), because it cannot be hidden unnoticed: {}'
 )
 _MIN_SHARE = 1 / 6  # fraction of a secret's Gaussians; refits of public models with fewer are below 30 dB
 _FEWER = (
