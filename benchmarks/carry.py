@@ -85,7 +85,7 @@ def _photos(pairs: list[list[str]], width: int) -> None:
             print(f"{secret} in {cover}: {error}", flush=True)
             continue
         found = extract(stego, KEY).gaussians
-        kept = stego[_kept(len(stego))]
+        kept = stego[_kept_rows(len(stego))]
         left = extract(kept, KEY)
         compensated = compensate_pruning(left.gaussians, left.count)
         raw, mended = (_against(scenes[secret], each) for each in (left.gaussians, compensated))
@@ -105,7 +105,7 @@ def _photos(pairs: list[list[str]], width: int) -> None:
         )
 
 
-def _kept(count: int) -> torch.Tensor:
+def _kept_rows(count: int) -> torch.Tensor:
     order = torch.randperm(count, generator=torch.Generator().manual_seed(0))
     return order[: round(count * (1 - REMOVED))].sort().values
 

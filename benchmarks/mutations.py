@@ -81,13 +81,13 @@ def damaged(name: str, data: bytes, rng: np.random.Generator, lies: float = 0.5)
         return LIES[name](data, rng)
     if rng.random() < 0.7:
         if data.startswith(b"\x1f\x8b"):
-            return gzip.compress(_damaged(gzip.decompress(data), rng), 1)
+            return gzip.compress(_damage_bytes(gzip.decompress(data), rng), 1)
         if data.startswith(b"PK"):
-            return _damaged_archive(data, rng)
-    return _damaged(data, rng)
+            return _damage_archive(data, rng)
+    return _damage_bytes(data, rng)
 
 
-def _damaged_archive(data: bytes, rng: np.random.Generator) -> bytes:
+def _damage_archive(data: bytes, rng: np.random.Generator) -> bytes:
     """A ZIP archive one of whose files is damaged."""
     found = io.BytesIO()
     with zipfile.ZipFile(io.BytesIO(data)) as old, zipfile.ZipFile(found, "w") as new:
@@ -95,11 +95,11 @@ def _damaged_archive(data: bytes, rng: np.random.Generator) -> bytes:
         chosen = "meta.json" if rng.random() < 0.5 else names[rng.integers(len(names))]
         for name in names:
             content = old.read(name)
-            new.writestr(name, _damaged(content, rng) if name == chosen else content)
+            new.writestr(name, _damage_bytes(content, rng) if name == chosen else content)
     return found.getvalue()
 
 
-def _damaged(data: bytes, rng: np.random.Generator) -> bytes:
+def _damage_bytes(data: bytes, rng: np.random.Generator) -> bytes:
     found = bytearray(data)
     for _ in range(rng.integers(1, 4)):
         # Damage headers more often: they are short, and most failures come from them.

@@ -53,7 +53,7 @@ class Pass:
     def seconds(self, threads: int) -> float:
         return self.alone + sum(makespan(each, threads) for each in self.pieces.values())
 
-    def smaller(self, other: Pass) -> Pass:
+    def minimum(self, other: Pass) -> Pass:
         """Elementwise minimum of two measurements."""
         if not self.pieces:
             return other
@@ -77,7 +77,7 @@ def measure(case: Case, threads: int, repeats: int) -> tuple[Pass, Pass]:
             )
         with timed(threads) as backward:
             images[0].backward(weights)
-        best = (best[0].smaller(forward), best[1].smaller(backward))
+        best = (best[0].minimum(forward), best[1].minimum(backward))
     return best
 
 

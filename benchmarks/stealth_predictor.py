@@ -93,7 +93,7 @@ def sample(model: Gaussians, rows: int, seed: int) -> tuple[Doubles, Integers]:
     random = np.random.default_rng(seed)
     beside, distance = _likes(words, model)
     # Frequent numbers are multiples of a learning rate, which embedding does not change.
-    allowed = words.trained & ~np.isin(words.attribute, UNCHANGED_ATTRIBUTES) & ~_repeated(words.bits)
+    allowed = words.trained & ~np.isin(words.attribute, UNCHANGED_ATTRIBUTES) & ~_is_frequent(words.bits)
     chosen = []
     candidates = np.flatnonzero(allowed)
     if not len(candidates):
@@ -105,10 +105,10 @@ def sample(model: Gaussians, rows: int, seed: int) -> tuple[Doubles, Integers]:
     chosen.append(random.choice(candidates, rows // 3))
     at = np.concatenate(chosen)
     bit = random.integers(LOWEST, HIGHEST, len(at))
-    return _seen(words, at, bit, beside, distance), (words.bits.ravel()[at] >> bit & 1).astype(np.int64)
+    return _features(words, at, bit, beside, distance), (words.bits.ravel()[at] >> bit & 1).astype(np.int64)
 
 
-def _seen(words: BitPatterns, at: Integers, bit: Integers, beside: Words32, distance: Doubles) -> Doubles:
+def _features(words: BitPatterns, at: Integers, bit: Integers, beside: Words32, distance: Doubles) -> Doubles:
     """[R, features] of the bits of numbers `at` flat indices."""
     own, width = words.bits.ravel()[at], words.bits.shape[1]
     row, field = at // width, at % width
@@ -128,7 +128,7 @@ def _seen(words: BitPatterns, at: Integers, bit: Integers, beside: Words32, dist
     return np.stack([np.asarray(each, np.float64) for each in columns], axis=1)
 
 
-def _repeated(bits: Words32) -> Flags:
+def _is_frequent(bits: Words32) -> Flags:
     """[N, F] True for numbers whose magnitude occurs often."""
     _, inverse, times = np.unique(bits & _UNSIGNED, return_inverse=True, return_counts=True)
     found: Flags = (times > _OFTEN)[inverse].reshape(bits.shape)

@@ -42,7 +42,7 @@ def test_a_misspelt_option(keyss: Run, arguments: tuple[str, ...], meant: str) -
 @pytest.mark.parametrize("command", COMMANDS)
 def test_every_option_of_the_help_is_known(keyss: Run, command: str) -> None:
     """The help comes from the parser; messages take the options of a command from its signature."""
-    known = {f"--{name.replace('_', '-')}" for name in entry.options_of(commands.parsed(command, []))}
+    known = {f"--{name.replace('_', '-')}" for name in entry.options_of(commands.parse_target(command, []))}
     lines = (line.strip("│ ") for line in keyss(command, "--help").out.splitlines())
     named = (line.partition("  ")[0] for line in lines if line.startswith("-"))
     offered = {flag for line in named for flag in re.findall(r"--[a-z][a-z-]*", line)}

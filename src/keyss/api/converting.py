@@ -78,7 +78,7 @@ def convert(
     data = model_bytes(path, with_extras(before, source, before))
     after = model_of_bytes(path, data)
     secrets = tuple(
-        KeptSecret(each.remains.found, _left(after, key, target), "bytes" if each.file else "Gaussians")
+        KeptSecret(each.remains.found, _size_left(after, key, target), "bytes" if each.file else "Gaussians")
         for key, each in zip(keys, opened, strict=True)
     )
     size = None if source is None or is_standard(source) else source.stat().st_size
@@ -97,7 +97,7 @@ def convert(
     return result
 
 
-def _left(model: Gaussians, key: str, device: torch.device) -> int:
+def _size_left(model: Gaussians, key: str, device: torch.device) -> int:
     """Size of what a key opens in a converted model, in Gaussians or bytes."""
     try:
         return reveal_any(model, key, device).remains.found

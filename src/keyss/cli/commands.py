@@ -49,7 +49,7 @@ def command(name: str) -> Callable[..., None]:
     return found
 
 
-def parsed(name: str, arguments: Sequence[str]) -> Callable[..., None]:
+def parse_target(name: str, arguments: Sequence[str]) -> Callable[..., None]:
     """The function to parse: for `hide`, with the options of the method named in `arguments`."""
     if name == "hide":
         from keyss.cli.hiding import with_options_of_method

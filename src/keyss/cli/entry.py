@@ -95,7 +95,7 @@ def _run(arguments: list[str], options: set[str]) -> None:
             "a key cannot be an argument, which other users could see: give --key-file FILE, set KEYSS_KEY, "
             "or type it at the prompt"
         )
-    command = commands.parsed(name, rest)
+    command = commands.parse_target(name, rest)
     options.update(options_of(command))
     if "out" not in options and {"-o", "--out"} & {word.partition("=")[0] for word in rest}:
         where = "name OUT after IN" if name == "convert" else "results go into the folder of the run, if any"
@@ -112,7 +112,7 @@ def _print_completion(arguments: list[str]) -> None:
         raise UsageError("--completion: expected bash or zsh")
     app = tyro.extras.SubcommandApp()
     for name in commands.MODULES:
-        app.command(name=name)(commands.parsed(name, []))
+        app.command(name=name)(commands.parse_target(name, []))
     printing = ["--tyro-print-completion", *arguments]
     app.cli(prog="keyss", args=printing, config=(tyro.conf.FlagCreatePairsOff,))
 

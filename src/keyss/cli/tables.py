@@ -51,7 +51,7 @@ def print_hiding(metrics: HideMetrics, console: Console | None = None, *, brief:
     table = [[name, *(row.get(head, "") for head in heads)] for name, row in zip(first, rows, strict=True)]
     console = console or Console()
     print_table([views, *heads], table, console=console)
-    for line in _reached(metrics, names) if brief else _explanations(metrics, names, heads):
+    for line in _lines_on_files(metrics, names) if brief else _explanations(metrics, names, heads):
         console.print(line, highlight=False, markup=False)
     if brief:
         return
@@ -161,10 +161,10 @@ def _explanations(metrics: HideMetrics, names: Sequence[str], heads: Sequence[st
             f"Chance level: {chance}, PSNR of the stego model itself to the secret; no wrong key should "
             "exceed it."
         )
-    return lines + _reached(metrics, names)
+    return lines + _lines_on_files(metrics, names)
 
 
-def _reached(metrics: HideMetrics, names: Sequence[str]) -> list[str]:
+def _lines_on_files(metrics: HideMetrics, names: Sequence[str]) -> list[str]:
     """A line on the published file, and one on each secret."""
     lines = []
     reached = (f"{name} {each.psnr:.1f}" for name, each in zip(names, metrics.against_plain, strict=True))

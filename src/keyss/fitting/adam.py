@@ -66,7 +66,7 @@ def _adam(
             p[i] = fused_multiply_add(-steps[i], quotient, p[i])
 
 
-def _unwrapped(name: str) -> Any:
+def _unwrap(name: str) -> Any:
     """A method of torch's optimizers without the wrapper that disables `torch.compile`.
 
     The wrapper loads torch's compiler, which takes a second.
@@ -83,10 +83,10 @@ class RowAdam(torch.optim.Adam):
     are torch's. On a CPU, results do not depend on the number of threads.
     """
 
-    add_param_group = _unwrapped("add_param_group")
-    load_state_dict = _unwrapped("load_state_dict")
-    state_dict = _unwrapped("state_dict")
-    zero_grad = _unwrapped("zero_grad")
+    add_param_group = _unwrap("add_param_group")
+    load_state_dict = _unwrap("load_state_dict")
+    state_dict = _unwrap("state_dict")
+    zero_grad = _unwrap("zero_grad")
 
     @torch.no_grad()
     def step(self, closure: None = None) -> None:  # type: ignore[override]

@@ -82,7 +82,7 @@ def train(
             tensors |= {"rng": torch.get_rng_state()}
             save_checkpoint(checkpoint, tensors, meta | {"fingerprint": fingerprint})
 
-    with deferred(saves=checkpoint is not None) as interrupted, own_randomness(config.known_seed):
+    with defer_signals(saves=checkpoint is not None) as interrupted, own_randomness(config.known_seed):
         if checkpoint is not None and resume and checkpoint.exists():
             _resume(run, checkpoint, fingerprint)
         saved = time.monotonic()
@@ -124,7 +124,7 @@ def _resume(run: TrainingRun, checkpoint: Path, fingerprint: dict[str, Any]) -> 
 
 
 @contextmanager
-def deferred(*, saves: bool) -> Iterator[Callable[[], signal.Signals | None]]:
+def defer_signals(*, saves: bool) -> Iterator[Callable[[], signal.Signals | None]]:
     """Turn signals into a flag to check between steps; a second signal acts at once.
 
     SIGTERM and SIGHUP are deferred only if the caller `saves` its state. Ignored signals stay ignored, as

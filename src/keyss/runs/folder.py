@@ -88,7 +88,7 @@ class RunFolder:
             if not self.path.is_dir():
                 raise OutputError(f"{self.path} exists and is not a folder")
             self._check(overwrite, resume)
-            for name in self._replaced(read_manifest(self.path)) if overwrite else ():
+            for name in self._files_to_replace(read_manifest(self.path)) if overwrite else ():
                 check_not_an_input(self.path / name, inputs)
         for name in writes:
             _refuse_foreign(self.path, name)
@@ -118,7 +118,7 @@ class RunFolder:
                 f"{self.path} exists: choose another folder, or `overwrite=True` to replace what keyss wrote"
             )
 
-    def _replaced(self, manifest: Manifest) -> list[str]:
+    def _files_to_replace(self, manifest: Manifest) -> list[str]:
         """Names of the files that this stage replaces."""
         return [name for stage, names in manifest.files.items() if stage not in self.onto for name in names]
 
@@ -202,7 +202,7 @@ class RunFolder:
     def _finish(self) -> None:
         manifest = read_manifest(self.path)
         kept = {stage: names for stage, names in manifest.files.items() if stage in self.onto}
-        _remove(self.path, self._replaced(manifest))
+        _remove(self.path, self._files_to_replace(manifest))
         # List files before they appear, so that the manifest knows them after a crash.
         manifest = replace(manifest, files=kept | {self.stage: tuple(self._names)})
         self._save(manifest)

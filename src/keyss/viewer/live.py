@@ -111,7 +111,7 @@ class LiveTraining:
         return BytesIO(json.dumps({**self._progress, "versions": versions}).encode())
 
     def _opener(self, side: str) -> Callable[[], BinaryIO]:
-        def opened() -> BinaryIO:
+        def open_copy() -> BinaryIO:
             copy = self._copies.get(side)
             if copy is None:
                 raise FileNotFoundError(side)
@@ -122,7 +122,7 @@ class LiveTraining:
                     raise OSError(str(error)) from error
             return BytesIO(copy.ply)
 
-        return opened
+        return open_copy
 
 
 class LiveReporter(Reporter):

@@ -36,11 +36,11 @@ class PlacedScene:
     def of(scene: Scene, plain: Gaussians, frame: Similarity) -> PlacedScene:
         """Move a scene and its plain model, both in the scene's own frame, by `frame`."""
 
-        def moved(views: Sequence[View]) -> tuple[View, ...]:
+        def move(views: Sequence[View]) -> tuple[View, ...]:
             return tuple(View(frame.apply_camera(view.camera), view.image) for view in views)
 
         points = frame.apply_points(scene.points)
-        placed = replace(scene, train=moved(scene.train), test=moved(scene.test), points=points)
+        placed = replace(scene, train=move(scene.train), test=move(scene.test), points=points)
         return PlacedScene(placed, frame.apply_gaussians(plain), frame)
 
     @staticmethod

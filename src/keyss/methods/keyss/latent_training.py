@@ -152,7 +152,7 @@ class LatentTraining(KeyssTraining):
         high = (cover.sh[:, (KEPT_DEGREE + 1) ** 2 :] != 0).flatten(1).any(1)
         usable = once & high & (cover.opacities >= self.fit.prune_opacity)
         # Rows with a saturated channel come last: `publish` writes nothing into those that stay saturated.
-        first = cover.opacity_logits.masked_fill(saturated(cover).any(1), -math.inf)
+        first = cover.opacity_logits.masked_fill(is_saturated(cover).any(1), -math.inf)
         order = first.argsort(descending=True, stable=True)
         return order[usable[order]]
 
@@ -225,7 +225,7 @@ class LatentTraining(KeyssTraining):
         clean = self.gaussians_of(0).detach()
         high = self.decoders[0].place.write(high_harmonics(clean), self.ranks(entropy))
         # Harmonics of a saturated channel stay at 0, as in training.
-        high *= ~saturated(clean).repeat(1, high.shape[1] // 3).cpu().numpy()
+        high *= ~is_saturated(clean).repeat(1, high.shape[1] // 3).cpu().numpy()
         # Sort rows like plain 3DGS, which appends new Gaussians.
         born = self.density["born"].argsort(stable=True)
         stego = without_faint(with_high_harmonics(clean, high)[born].to("cpu"), self.fit.prune_opacity)
@@ -239,7 +239,7 @@ class LatentTraining(KeyssTraining):
         return stego, secrets
 
 
-def saturated(model: Gaussians) -> Tensor:
+def is_saturated(model: Gaussians) -> Tensor:
     """[N, 3] True for channels whose harmonics of degree 1 are all 0."""
     return (model.sh[:, 1:4] == 0).all(1)
 

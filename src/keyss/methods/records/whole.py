@@ -80,7 +80,7 @@ def encode(model: Gaussians, precision: Precision | None = None) -> bytes:
     offsets = np.concatenate([a - b for a, b in zip(plain, centres, strict=True)], axis=1)
     colours = np.concatenate([brightness, differences], axis=1)
     even = _round(np.concatenate([offsets, colours], axis=1) / _even_steps(steps))
-    finer = _finer(*_even_numbers(even, centres, steps)[1:3])
+    finer = _refinement(*_even_numbers(even, centres, steps)[1:3])
     quats = with_largest_w(doubles(model.quats))[:, 1:] / _steps(steps[4], finer)
     harmonics = (doubles(model.sh[:, 1:]) @ OPPONENT.T).reshape(len(model), -1) / _steps(steps[5], finer)
     codes = np.concatenate([even, _round(np.concatenate([quats, harmonics], axis=1))], axis=1)
@@ -111,7 +111,7 @@ def decode(data: bytes, carriers: int | None = None) -> Gaussians:
         )
     codes = entropy.decode(data[_HEAD.size :], count, *_columns(sh_degree))
     means, log_scales, logits, colours = _even_numbers(codes[:, :10], centres, steps)
-    finer = _finer(log_scales, logits)
+    finer = _refinement(log_scales, logits)
     x, y, z = (codes[:, 10:13] * _steps(steps[4], finer)).T
     w = np.sqrt(np.maximum(1 - (x * x + y * y + z * z), _LEAST_W))
     harmonics = codes[:, 13:] * _steps(steps[5], finer)
@@ -152,7 +152,7 @@ def _from_opponents(parts: Doubles) -> Doubles:
     return colours
 
 
-def _finer(log_scales: Doubles, logits: Doubles) -> Integers:
+def _refinement(log_scales: Doubles, logits: Doubles) -> Integers:
     """[N] half octaves by which each Gaussian's steps are finer than the median Gaussian's."""
     scales = np.sort(log_scales, axis=1)
     # log(opacity) is about min(logit, 0).
