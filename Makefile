@@ -3,7 +3,7 @@
 #   make test          lint, types, import rules and the fast tests, in two processes (JOBS=4: in four)
 #   make lint          ruff (rules and format), mypy, import-linter; `make format` formats
 #   make test-real     one small real scene end to end, from ../shared/data or $KEYSS_TEST_DATA
-#   make test-slow     real scenes at full length; `make test-cuda` what needs a GPU
+#   make test-slow     real scenes at full length, browsers, killed processes; `make test-cuda` what needs a GPU
 #   make test-oldest   the fast tests with the oldest versions that pyproject.toml declares, in .venv-oldest
 #   make test-processors   the fast tests as older processors compute (ARGS="tests/fitting" for some of them)
 #   make coverage      the fast tests, and which lines they reach

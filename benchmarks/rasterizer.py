@@ -19,7 +19,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from arithmetic_peak import OPERATIONS_PER_PAIR, peak_operations
 from benchmark_record import make_record, numbers_of_table, processor_name, write_record
 from keyss.core import Camera, Gaussians
 from keyss.files import read_model
@@ -27,7 +26,6 @@ from keyss.fitting.config import FitConfig
 from keyss.fitting.losses import Target, photometric_loss
 from keyss.fitting.parameters import make_optimizers, to_gaussians, to_parameters
 from keyss.rendering import rasterization, render
-from pair_count import blended_pairs
 
 import torch
 from torch import Tensor
@@ -145,21 +143,12 @@ def measure_rasterizer(case: Case, threads: int, repeats: int) -> list[str]:
         for leaf in leaves:
             leaf.grad = None
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 - before
-    graph = draw().grad_fn
-    assert graph is not None
-    (drawing,) = graph.next_functions[0][0].renderings  # type: ignore[union-attr]
-    pairs = blended_pairs(drawing, camera.width, camera.height)
-    floor = 1e3 * OPERATIONS_PER_PAIR * pairs / 8 / peak_operations() / threads
     return [
         f"{case.name}, {case.width}x{case.height}",
         str(threads),
         str(only),
         str(forward),
         str(backward),
-        f"{pairs / 1e6:.1f}",
-        f"{pairs / only.best / 1e6:.2f}",
-        f"{pairs / (forward.best + backward.best) / 1e6:.2f}",
-        f"{floor:.1f} ({floor / only.best:.0%})",
         f"{peak / 2**20:.0f}",
     ]
 
@@ -295,8 +284,7 @@ def main() -> None:
     pairs = [(case, threads) for case in cases for threads in options.threads]
     tables = [
         (
-            ["scene, SH 3", "threads", "forward only", "forward", "backward", "M pairs blended",
-             "G pairs/s forward only", "G pairs/s both", "arithmetic floor of forward only", "peak MiB"],
+            ["scene, SH 3", "threads", "forward only", "forward", "backward", "peak MiB"],
             [run_alone(measure_rasterizer, case, threads, n) for case, threads in pairs],
         ),
         (

@@ -21,7 +21,6 @@ import keyss
 from keyss import CarryOptions, FitConfig, Secret
 from keyss.cli import main
 from keyss.core import InputError, OutputError, Scene, UsageError, WrongKeyError
-from keyss.runs import STEGO, read_config
 from tiny_scenes import HEIGHT, WIDTH, random_gaussians
 
 CONFIG = CarryOptions(
@@ -79,34 +78,6 @@ def test_hide_writes_its_results_and_nothing_else(run: Path) -> None:
         assert "the key" not in path.read_text()
 
 
-def test_metrics_have_their_shape(run: Path) -> None:
-    metrics = json.loads((run / "private" / "metrics.json").read_text())
-    assert set(metrics) == {
-        *("method", "cover", "secrets", "baseline", "wrong_key", "chance_level", "gaussians"),
-        *("photos", "against_plain"),
-        *(
-            "secret_gaussians",
-            "secret_degrees",
-            "iterations",
-            "steps",
-            "seconds",
-            "width",
-            "seed",
-            "details",
-            "version",
-            "keyss",
-        ),
-    }
-    assert metrics["method"] == "carry"
-    assert set(metrics["cover"]) == set(metrics["secrets"][0]) == {"psnr", "ssim", "lpips"}
-    assert set(metrics["baseline"]) == {"cover", "secrets", "gaussians", "steps", "equal"}
-    assert metrics["photos"] == [True, True]
-    assert metrics["wrong_key"] is None  # there is no decoder that a wrong one could be tried on
-    assert len(metrics["chance_level"]) == 1
-    assert metrics["iterations"] == 69
-    assert metrics["width"] == WIDTH
-
-
 def test_evaluate_measures_the_same_from_the_files(run: Path) -> None:
     before = json.loads((run / "private" / "metrics.json").read_text())
     after = keyss.evaluate(run, ["the key"])
@@ -130,15 +101,6 @@ def test_the_same_run_gives_the_same_bytes(run: Path, folders: tuple[Path, Path]
     keyss.hide(folders[0], [Secret(folders[1], "the key")], method=ANY, out=tmp_path / "again")
     for name in ("publish/model.ply", "private/secret-1.ply"):
         assert (tmp_path / "again" / name).read_bytes() == (run / name).read_bytes()
-
-
-def test_existing_models_are_bounds_and_are_not_fitted_again(
-    run: Path, folders: tuple[Path, Path], tmp_path: Path
-) -> None:
-    given = run / "private" / "cover.ply"
-    secret = Secret(folders[1], "the key", model=run / "private" / "secret-1.ply")
-    keyss.hide(folders[0], [secret], method=ANY, cover_model=given, out=tmp_path / "again")
-    assert (tmp_path / "again" / STEGO).read_bytes() == (run / STEGO).read_bytes()
 
 
 def test_wrong_key_writes_nothing(run: Path, tmp_path: Path) -> None:
@@ -167,26 +129,6 @@ def test_a_decoy_is_the_cover_in_a_file_like_a_revealed_secret(
         keyss.render(decoy, folders[0]), keyss.render(stego, folders[0]), strict=True
     ):
         assert (shown.float() - cover.float()).square().mean() < 255**2 * 1e-3  # 30 dB
-
-
-def test_one_file_is_enough(folders: tuple[Path, Path], tmp_path: Path) -> None:
-    """The published model carries what the key opens, and looks like any other."""
-    fit = replace(CONFIG.fit, iterations=20, max_gaussians=1500, grow_every=10)
-    config = replace(CONFIG, fit=fit)
-    models = [random_gaussians(1500, seed=seed) for seed in (0, 1)]
-    secret = Secret(folders[1], "the key", model=models[1])
-    out = tmp_path / "run"
-    result = keyss.hide(folders[0], [secret], method=config, cover_model=models[0], out=out, min_psnr=0)
-    (tmp_path / "moved.ply").write_bytes((out / "publish" / "model.ply").read_bytes())
-    revealed = keyss.reveal(tmp_path / "moved.ply", "the key").gaussians
-    assert torch.equal(revealed.means, keyss.reveal(result.stego, "the key").gaussians.means)
-    assert keyss.evaluate(out, ["the key"]) == result.metrics
-    with pytest.raises(WrongKeyError):
-        keyss.reveal(tmp_path / "moved.ply", "The key")
-    decoy = keyss.reveal(tmp_path / "moved.ply", "The key", decoy=True).gaussians
-    shown = result.stego[result.stego.opacities >= 1 / 255]
-    assert len(decoy) < len(shown)
-    assert (torch.cdist(decoy.means, shown.means).min(dim=1).values < 0.02).all()
 
 
 def test_outputs_that_exist_are_refused_before_any_work(
@@ -248,19 +190,6 @@ def test_info_describes_everything_keyss_reads_and_writes(run: Path, folders: tu
         keyss.info(run / "nothing")
 
 
-def test_info_sums_up_a_model(tmp_path: Path) -> None:
-    model, path = random_gaussians(50, sh_degree=1), tmp_path / "a.ply"
-    keyss.write_model(path, model)
-    info = msgspec.to_builtins(keyss.info(path))
-    assert (info["gaussians"], info["sh_degree"], info["bytes"]) == (50, 1, path.stat().st_size)
-    for corner, expected in zip(
-        info["bounding_box"], (model.means.amin(0), model.means.amax(0)), strict=True
-    ):
-        assert corner == pytest.approx(expected.tolist(), abs=1e-4)
-    share = float((model.opacities < 0.05).float().mean())
-    assert info["nearly_transparent"] == pytest.approx(share, abs=1e-4)
-
-
 def test_a_secret_does_not_show_its_key() -> None:
     assert "hunter2" not in repr(Secret("scene", "hunter2")) + repr(keyss.SecretFile("file", "hunter2"))
 
@@ -273,14 +202,6 @@ def test_keys_are_checked_before_any_work(folders: tuple[Path, Path], tmp_path: 
     with pytest.raises(UsageError, match="1 to 256 secrets"):
         keyss.hide(scene, [], method=CONFIG, out=tmp_path / "run")
     assert not (tmp_path / "run").exists()
-
-
-def test_given_models_without_room_are_refused_before_any_work(folders: tuple[Path, Path]) -> None:
-    """However large the cap: a warm start adds no Gaussians to the cover that it is given."""
-    models = [random_gaussians(200, seed=seed) for seed in (0, 1)]
-    secret = Secret(folders[1], "key", models[1])
-    with pytest.raises(UsageError, match=r"cover of 200 Gaussians is too small.*`publish=.any.`"):
-        keyss.hide(folders[0], [secret], cover_model=models[0], format="ply")
 
 
 def test_python_and_command_line_write_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -300,26 +221,6 @@ def test_python_and_command_line_write_the_same(tmp_path: Path, monkeypatch: pyt
         assert (tmp_path / "line" / name).read_bytes() == (tmp_path / "python" / name).read_bytes(), name
     config = json.loads((tmp_path / "line" / "private" / "config.json").read_text())["options"]
     assert (config["refits"], config["fit"]["iterations"]) == ([2], 2)
-
-
-def test_configurations_come_back_with_their_method_s_options(run: Path, tmp_path: Path) -> None:
-    config = read_config(run / "private" / "config.json")
-    assert config.options == replace(ANY, refits=(69,))
-    assert config.method == "carry"
-    for old, new, words in (
-        ('"carry"', '"none"', "method 'none'"),
-        ('"sh_degree": null', '"sh_degrees": null', None),  # fields that are not known are passed over
-        ('"seed": 0', '"seed": "0"', "seed"),
-        ('"version": 1', '"version": 99', "version 1, got 99"),
-    ):
-        text = (run / "private" / "config.json").read_text()
-        assert old in text
-        (tmp_path / "config.json").write_text(text.replace(old, new))
-        if words is None:
-            read_config(tmp_path / "config.json")
-            continue
-        with pytest.raises(InputError, match=words):
-            read_config(tmp_path / "config.json")
 
 
 def _signatures() -> str:

@@ -62,31 +62,6 @@ def test_plain_lines_come_now_and_then(timer: Timer) -> None:
     ]
 
 
-def test_plain_lines_of_a_resumed_run(timer: Timer) -> None:
-    log = console(False)
-    lines = ProgressLines(log, timer=timer)
-    lines.start("fit [x]", 300, 200)
-    for iteration in (201, 300):
-        timer.now += 9.9
-        lines.update(iteration, 0, {})
-    lines.finish()
-    assert text(log).splitlines() == [
-        "fit [x]: 300 steps, continuing at 200",
-        "fit [x]: 300/300, 10.0 it/s, 0:00 left",
-        "fit [x]: done in 0:20",
-    ]
-
-
-def test_the_remaining_time_follows_from_the_recent_speed(timer: Timer) -> None:
-    log = console(False)
-    lines = ProgressLines(log, 0.0, timer)
-    lines.start("fit", 1000, 0)
-    for iteration, seconds in [(1, 100.0), *((i, 0.5) for i in range(2, 101))]:
-        timer.now += seconds
-        lines.update(iteration, 0, {})
-    assert text(log).splitlines()[-1] == "fit: 100/1000, 2.0 it/s, 7:30 left"
-
-
 def test_the_live_line_is_redrawn_and_ends_with_the_time_taken(timer: Timer) -> None:
     screen = console(True)
     line = ProgressLines(screen, timer=timer)

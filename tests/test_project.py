@@ -3,79 +3,18 @@
 from __future__ import annotations
 
 import importlib.util
-import os
 import re
-import subprocess
-import sys
 import tomllib
 from pathlib import Path
 
-import msgspec
 import pytest
 import yaml
 
 import keyss
-from benchmark_record import (
-    BenchmarkRecord,
-    Change,
-    Machine,
-    numbers_of_table,
-    read_record,
-    regressions,
-    write_record,
-)
 
 ROOT = Path(__file__).parents[1]
 TESTED = ("audit", "clip", "test")  # extras
 DOCUMENTS = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md")])
-SKIPPING = """
-import pytest
-
-def test_a_missing_tool():
-    pytest.skip("needs a chisel")
-
-def test_a_missing_gpu():
-    pytest.skip("CUDA is not available")
-
-@pytest.mark.skipif(True, reason="needs a hammer")
-def test_a_mark():
-    pass
-
-@pytest.mark.xfail(reason="known")
-def test_an_expected_failure():
-    assert False
-
-def test_what_runs():
-    pass
-"""
-
-
-def outcome(folder: Path, ci: str) -> tuple[int, str]:
-    """Exit status and output of pytest on test files in a folder that follow the rule about skips."""
-    (folder / "conftest.py").write_text("from skip_policy import *")
-    # An absent package skips this whole file while it is collected.
-    (folder / "test_whole.py").write_text("import pytest\npytest.importorskip('a_package_that_is_absent')")
-    (folder / "test_some.py").write_text(SKIPPING)
-    environment = {**os.environ, "CI": ci, "PYTHONPATH": str(ROOT / "tests")}
-    options = ["-q", "-rA", "-p", "no:cacheprovider", "--continue-on-collection-errors"]
-    command = [sys.executable, "-m", "pytest", *options, str(folder)]
-    done = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=120, check=False)
-    return done.returncode, done.stdout
-
-
-def test_a_skip_on_ci_is_a_failure_unless_its_reason_is_allowed(tmp_path: Path) -> None:
-    status, output = outcome(tmp_path, "true")
-    assert status != 0
-    assert "skipped on CI, where everything must run: needs a chisel" in output
-    assert "skipped on CI, where everything must run: needs a hammer" in output
-    assert "a_package_that_is_absent" in output
-    assert "1 failed, 1 passed, 1 skipped, 1 xfailed, 2 errors" in output
-
-
-def test_elsewhere_skips_are_skips(tmp_path: Path) -> None:
-    status, output = outcome(tmp_path, "")
-    assert status == 0
-    assert "1 passed, 4 skipped, 1 xfailed" in output
 
 
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
@@ -139,47 +78,3 @@ def test_the_least_versions_are_those_that_are_tested() -> None:
         if name != "torch" and not (pinned.get(name, "") + ".").startswith(version + ".")
     }
     assert different == {}
-
-
-def record(**ratios: float) -> BenchmarkRecord:
-    machine = Machine("a processor", 2, "Linux x86_64", "3.11", {"numpy": "2.0"})
-    return BenchmarkRecord(name="quick", commit="0123456789ab", machine=machine, ratios=ratios)
-
-
-def test_benchmarks_fail_on_what_got_slower_and_on_nothing_else() -> None:
-    baseline = record(draw=2.0, hide=10.0, reveal=1.0)
-    assert regressions(record(draw=2.6, hide=13.4, reveal=0.1), baseline, 0.35) == []
-    slower = regressions(record(draw=2.8, hide=13.4, reveal=1.0), baseline, 0.35)
-    assert slower == [Change("draw", 2.0, 2.8)]
-    assert "1.40 times" in str(slower[0])
-
-
-def test_benchmarks_notice_a_ratio_that_is_gone_or_new() -> None:
-    changes = regressions(record(draw=2.0, other=1.0), record(draw=2.0, hide=1.0), 0.35)
-    assert changes == [Change("hide", 1.0, None), Change("other", None, 1.0)]
-    assert [str(change) for change in changes] == ["hide: no longer measured", "other: not in the baseline"]
-
-
-def test_a_record_comes_back_from_its_file(tmp_path: Path) -> None:
-    written = record(draw=2.0)
-    assert read_record(write_record(written, tmp_path / "new" / "record.json")) == written
-    (tmp_path / "other.json").write_text('{"name": "quick", "ratios": {"draw": "fast"}}')
-    with pytest.raises(msgspec.ValidationError):
-        read_record(tmp_path / "other.json")
-
-
-def test_the_stored_records_can_be_read() -> None:
-    paths = list((ROOT / "benchmarks" / "results").rglob("*.json"))
-    assert ROOT / "benchmarks" / "results" / "quick" / "baseline.json" in paths
-    for path in paths:
-        assert read_record(path).name == path.parent.name
-
-
-def test_numbers_are_taken_from_a_table() -> None:
-    rows = [["guitar", "2", "81.5 (83.0)", "1.20"], ["robot", "2", "7", "1.15"]]
-    assert numbers_of_table(["scene", "threads", "forward", "step / pass"], rows) == {
-        "guitar, 2: forward": 81.5,
-        "guitar, 2: step / pass": 1.2,
-        "robot, 2: forward": 7.0,
-        "robot, 2: step / pass": 1.15,
-    }

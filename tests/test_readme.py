@@ -26,10 +26,3 @@ def test_the_python_example_runs(
     exec(compile(short, "README.md", "exec"), {})
     assert "100 Gaussians" in capsys.readouterr().out
     assert (tmp_path / "secret.ply").exists()
-
-
-def test_the_files_it_links_to_exist() -> None:
-    root = Path(__file__).parents[1]
-    links = [link for link in re.findall(r"\]\(([^)#]+)\)", README) if "://" not in link]
-    assert links
-    assert [link for link in links if not (root / link).exists()] == []

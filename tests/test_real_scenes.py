@@ -36,13 +36,6 @@ def test_bonsai_hides_fox_without_loss(run: Path) -> None:
     assert metrics.wrong_key is None  # they open nothing
 
 
-def test_plain_models_are_as_good_as_measured(run: Path) -> None:
-    """Fox: 30.5, 30.9 and 30.7 dB with seeds 0 to 2 and 3,000 steps, 31.5 with 6,000."""
-    baseline = keyss.evaluate(run, ["a key for a fox"]).baseline
-    assert baseline.cover.psnr > 26.1
-    assert baseline.secrets[0].psnr > 31.0
-
-
 def test_an_audit_finds_nothing_of_the_fox(run: Path) -> None:
     audit(run, ["a key for a fox"], controls=2, only=["leaks", "robustness"])
     words = {line.measure: line.word for line in verdicts(read_audit(run))}

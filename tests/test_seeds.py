@@ -56,11 +56,6 @@ def test_two_hidings_of_the_same_inputs_have_no_rotation_in_common(options: Meth
     assert not one & two
 
 
-def test_hidings_with_one_seed_have_all_rotations_in_common() -> None:
-    one, two = (_rotations(_hidden(CARRIED.with_fit(seed=7))) for _ in range(2))
-    assert one == two
-
-
 @pytest.mark.filterwarnings("ignore:.*appended Gaussians")
 @pytest.mark.parametrize("options", [CarryOptions(fit=FIT), JOINT], ids=["carry", "keyss"])
 def test_a_table_made_for_one_hiding_opens_no_other_of_its_seed(options: MethodOptions) -> None:
@@ -102,15 +97,6 @@ def _opens(reader: QuietReader | AppendedReader, salt: bytes) -> bool:
 def test_two_fits_have_no_rotation_in_common() -> None:
     one, two = (_rotations(keyss.fit(tiny_scene(), config=FIT).gaussians) for _ in range(2))
     assert not one & two
-
-
-def test_the_plain_models_of_one_hiding_have_seeds_of_their_own(tmp_path: Path) -> None:
-    secret = Secret(tiny_scene(0), KEY)  # the cover's own photos
-    keyss.hide(tiny_scene(0), [secret], method=CARRIED.with_fit(seed=7), min_psnr=0, out=tmp_path / "run")
-    cover, own = (
-        keyss.read_model(tmp_path / "run" / "private" / f"{name}.ply") for name in ("cover", "secret-1")
-    )
-    assert not _rotations(cover) & _rotations(own)
 
 
 @pytest.mark.parametrize("given", [None, 7])

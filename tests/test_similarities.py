@@ -21,10 +21,7 @@ from tiny_scenes import random_gaussians, tiny_scene
 TURN = Rotation.from_rotvec([0.3, -0.8, 1.9]).as_matrix()
 WORLDS = {
     "UTM": ((456_789.0, 5_412_345.0, 120.0), 1.0),
-    "beyond": ((1e7, -1e7, 1e7), 1.0),
-    "millimetres": ((0.0, 0.0, 0.0), 1e-3),
     "tiny": ((0.0, 0.0, 0.0), 1e-4),
-    "huge": ((0.0, 0.0, 0.0), 1e6),
     "small and far": ((1e7, 0.0, 0.0), 0.01),
 }
 KEY = "a key of many characters: 93hXmQ2"
@@ -60,12 +57,18 @@ def psnr_of_fit(scene: Scene) -> float:
     return mean_psnr(keyss.fit(scene, config=config).gaussians, scene.test, scene.background)
 
 
+@pytest.fixture(scope="module")
+def usual_psnr(tmp_path_factory: pytest.TempPathFactory) -> float:
+    return psnr_of_fit(load_scene(written(tmp_path_factory.mktemp("worlds") / "usual", (0.0, 0.0, 0.0), 1.0)))
+
+
 @pytest.mark.filterwarnings("ignore::keyss.core.KeyssWarning")
 @pytest.mark.parametrize("world", WORLDS)
-def test_a_scene_of_any_unit_at_any_place_trains_as_well(world: str, tmp_path: Path) -> None:
-    base = load_scene(written(tmp_path / "base", (0.0, 0.0, 0.0), 1.0))
+def test_a_scene_of_any_unit_at_any_place_trains_as_well(
+    world: str, usual_psnr: float, tmp_path: Path
+) -> None:
     moved = load_scene(written(tmp_path / "moved", *WORLDS[world]))
-    assert abs(psnr_of_fit(moved) - psnr_of_fit(base)) < 0.3
+    assert abs(psnr_of_fit(moved) - usual_psnr) < 0.3
 
 
 def test_a_scene_far_out_says_where_it_is(tmp_path: Path) -> None:
@@ -80,7 +83,7 @@ def test_a_scene_far_out_says_where_it_is(tmp_path: Path) -> None:
         assert (scene.to_scene_frame(model).means - local.means).abs().max() < 1  # single precision far out
 
 
-@pytest.mark.parametrize("scale", [1e-4, 1e-3, 1.0, 1e6])
+@pytest.mark.parametrize("scale", [1e-4, 1e6])
 @pytest.mark.parametrize("publish", ["as-is", "any"])
 def test_hiding_in_a_model_of_any_unit(publish: str, scale: float) -> None:
     cover = Similarity(scale).apply_gaussians(random_gaussians(2500, seed=1))

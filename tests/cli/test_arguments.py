@@ -9,7 +9,6 @@ import pytest
 
 import keyss as library
 from cli.said import METRICS, Run, assert_refused
-from keyss import CarryOptions, KeyssOptions
 from keyss.fitting import PRESETS
 from tiny_scenes import random_gaussians
 
@@ -89,12 +88,6 @@ class TestArguments:
             "resume": True,
         }
 
-    def test_by_default_the_preset_stays_as_it_is(self, keyss: Run, hidden: list[Any]) -> None:
-        assert keyss("hide", "--cover", "A", "--secret", "B", "-o", "out").status == 0
-        assert hidden[0][1]["method"] == CarryOptions()
-        assert keyss("hide", "--method", "keyss", "--cover", "A", "--secret", "B", "-o", "out").status == 0
-        assert hidden[1][1]["method"] == KeyssOptions()
-
     def test_options_of_a_method_reach_it(self, keyss: Run, hidden: list[Any]) -> None:
         scenes = ("hide", "--cover", "A", "--secret", "B", "-o", "out")
         clip = ("--key-encoder", "clip", "--clip-model", "C")
@@ -143,6 +136,3 @@ class TestArguments:
         assert hidden == []
         assert keyss(*carry, "--cover", "a.ply", "--secret", "B").status == 0
         assert keyss("hide", "-o", "out", *extra, "--cover", "a.ply", "--secret", "b.ply").status == 0
-
-    def test_hide_needs_a_secret(self, keyss: Run, hidden: list[Any]) -> None:
-        assert keyss("hide", "--cover", "A", "-o", "out").status == 2

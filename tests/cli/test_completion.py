@@ -39,8 +39,3 @@ def test_of_bash(keyss: Run, script: Path, words: list[str], completed: set[str]
     command = ["bash", "-c", line, "bash", str(script), *words]
     done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=60)
     assert set(done.stdout.split()) == completed
-
-
-def test_of_other_shells(keyss: Run) -> None:
-    assert keyss("--completion", "zsh").out.startswith("#compdef keyss")
-    assert keyss("--completion", "fish").status == 2

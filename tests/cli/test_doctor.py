@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-import tomllib
 from importlib import metadata
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -15,7 +13,6 @@ from torch import Tensor
 
 from cli.said import Run, Said
 from keyss import __version__, rendering
-from keyss.cli import doctor
 from keyss.core import Camera, Gaussians
 
 
@@ -75,26 +72,3 @@ def test_what_is_missing_and_how_to_get_it(keyss: Run, monkeypatch: pytest.Monke
     assert re.search(r"^missing +\[video\] .*pip install 'keyss\[video\]'$", said.out, re.MULTILINE)
     assert re.search(r"^broken +numba +pip install numba$", said.out, re.MULTILINE)
     assert said.err.count("\n") == 1
-
-
-def test_torch_that_does_not_load(keyss: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Every check goes on beside one that fails, whatever with."""
-
-    def failing() -> str:
-        raise OSError("libtorch.so: cannot open")
-
-    monkeypatch.setattr(doctor, "_cores", failing)
-    said = keyss("doctor", "--device", "cpu")
-    assert said.status == 6
-    assert re.search(r"^broken +cores +OSError: libtorch.so: cannot open$", said.out, re.MULTILINE)
-    assert re.search(r"^ok +test frame ", said.out, re.MULTILINE)
-
-
-def test_it_knows_the_extras_that_there_are() -> None:
-    project = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())["project"]
-    declared = project["optional-dependencies"]
-    users = {name for name in declared if name not in ("test", "docs", "dev")}
-    assert doctor.EXTRAS.keys() == users
-    for name, (package, _) in doctor.EXTRAS.items():
-        assert declared[name][0].startswith(package)
-    assert all(any(each.startswith(name) for each in project["dependencies"]) for name in doctor.LIBRARIES)

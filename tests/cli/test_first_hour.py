@@ -39,16 +39,6 @@ def test_one_key_in_python_in_a_file_and_in_the_environment(
         assert ("white space around the key does not count" in said.err) == key.endswith(" ")
 
 
-def test_what_fits_is_carried_as_it_is(keyss: Run) -> None:
-    said = keyss(*HIDE, "--secret", "small.ply", "-o", "run")
-    assert said.status == 0, said.err
-    assert "The secret kept 200 of 200 Gaussians, 1" in said.out  # more than 100 dB: nothing was refitted
-    assert "refit" not in said.err
-    assert "step" not in said.out.lower()
-    assert "on renders of the given models" in said.out
-    assert library.reveal("run/publish/model.ply", KEY).gaussians.sh_degree == 2
-
-
 def test_what_is_lost_is_said(keyss: Run) -> None:
     said = keyss(*HIDE, "--secret", "large.ply", "--prune-to-fit", "-o", "run")
     assert said.status == 0, said.err

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import ast
-import re
 import warnings
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -14,10 +11,7 @@ from cli.said import Run
 from keyss.cli import entry
 from keyss.core import KeyssWarning, UsageError
 
-SOURCE = Path(__file__).parents[2] / "src" / "keyss"
 OPTIONS = {"overwrite", "sh_degree", "key_file", "secret", "publish", "secret_model", "download"}
-# Options of other programs, and whole commands, which a page may quote.
-QUOTED = re.compile(r"`(keyss|simple_trainer.py|splat-transform|ns-export) [^`]*`|(pip|npm) install [^,)]*")
 
 
 @pytest.mark.parametrize(
@@ -41,32 +35,6 @@ def test_arguments_become_flags(message: str, said: str) -> None:
     assert entry.as_flags(message, OPTIONS) == said
 
 
-def _strings(tree: ast.Module) -> Iterator[tuple[int, str]]:
-    """Those that a person may read: not documentation, and not the help of the command line."""
-    skipped = set()
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
-            skipped.add(node.value)
-        if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "CommandLineOption":
-            skipped |= {each for each in ast.walk(node) if isinstance(each, ast.Constant)}
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Constant) and isinstance(node.value, str) and node not in skipped:
-            yield node.lineno, node.value
-
-
-def test_no_message_below_the_command_line_names_a_flag() -> None:
-    upper = (SOURCE / "cli", SOURCE / "demo", SOURCE / "lab" / "commands.py")
-    files = [path for path in SOURCE.rglob("*.py") if not any(map(path.is_relative_to, upper))]
-    assert len(files) > 50
-    found = {
-        f"{path.relative_to(SOURCE)}:{line}": text
-        for path in files
-        for line, text in _strings(ast.parse(path.read_text(encoding="utf-8")))
-        if re.search(r"(?<![\w-])--[a-z]", QUOTED.sub("", text))
-    }
-    assert found == {}
-
-
 class TestWarnings:
     @pytest.fixture
     def warning(self, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -84,9 +52,3 @@ class TestWarnings:
             "keyss: warning: no. 2 --overwrite",
             "keyss: error: at last",
         ]
-
-    @pytest.mark.usefixtures("warning")
-    def test_nothing_of_it_stays(self, keyss: Run) -> None:
-        before = warnings.showwarning
-        keyss("info", "x")
-        assert warnings.showwarning is before

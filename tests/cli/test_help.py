@@ -13,7 +13,6 @@ from cli.said import COMMANDS, Run, Said
 from keyss import __version__
 from keyss.files import write_model
 from keyss.fitting import PRESETS as FIT_PRESETS
-from keyss.lab.audits import PARTS
 from keyss.methods import registry
 from tiny_scenes import random_gaussians
 
@@ -70,16 +69,6 @@ class TestHelp:
             assert f"--preset {{{','.join(FIT_PRESETS)}}}" in said
             assert "(default: default)" in said
 
-    def test_says_what_the_presets_come_to(self, keyss: Run) -> None:
-        for command in ("fit", "hide"):
-            said = "".join(keyss(command, "--help").out.replace("│", " ").split())
-            for name, fit in FIT_PRESETS.items():
-                assert f"{name}{fit.iterations:,}and{fit.max_gaussians:,}" in said
-
-    def test_offers_the_parts_of_an_audit_there_are(self, keyss: Run) -> None:
-        said = " ".join(keyss("audit", "--help").out.replace("│", " ").split())
-        assert f"{', '.join(PARTS)}; repeat for more" in said
-
     @pytest.mark.parametrize("method", ["carry"])
     def test_of_hide_is_as_it_was(self, keyss: Run, method: str) -> None:
         """Names, defaults and sentences of all options; `hide_METHOD_help.txt` is what is meant."""
@@ -100,15 +89,6 @@ class TestHelp:
     @pytest.mark.parametrize("arguments", [("--version",), ("-V",)])
     def test_of_the_version(self, keyss: Run, arguments: tuple[str, ...]) -> None:
         assert keyss(*arguments) == Said(0, f"{__version__}\n", "")
-
-    def test_comes_without_being_asked_for(self, keyss: Run) -> None:
-        assert keyss() == keyss("--help")
-
-    def test_an_unknown_method_names_those_there_are(self, keyss: Run) -> None:
-        said = keyss("hide", "--method", "none", "--cover", "A", "--secret", "B", "-o", "out")
-        assert said.status == 2
-        assert "keyss" in said.err
-        assert "carry" in said.err
 
     @pytest.mark.parametrize("arguments", [("frobnicate",), ("fit",), ("info", "x", "--nonsense")])
     def test_wrong_usage_exits_with_2(self, keyss: Run, arguments: tuple[str, ...]) -> None:

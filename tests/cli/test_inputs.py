@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -33,22 +32,6 @@ def test_a_run_in_place_of_a_model_is_told_its_file(
     assert listing(tmp_path) == {}
 
 
-def test_a_run_in_place_of_a_scene_is_told_its_file(keyss: Run, world: Path, tmp_path: Path) -> None:
-    said = keyss("fit", world / "hidden", "-o", tmp_path / "out")
-    assert_refused(
-        said, 4, f"expected a scene, found a run; its model is {world / 'hidden/publish/model.ply'}"
-    )
-
-
-def test_another_folder_in_place_of_a_model_is_called_one(keyss: Run, world: Path, tmp_path: Path) -> None:
-    for arguments in (
-        ("reveal", world / "a", *key(world)),
-        ("render", world / "a", "--cameras", world / "a"),
-    ):
-        said = keyss(*arguments, "-o", tmp_path / "out.ply")
-        assert_refused(said, 4, f"{world / 'a'}: expected the file of a 3DGS model (.compressed.ply, ")
-
-
 @pytest.mark.parametrize("inside", ["publish/model.ply", "publish", "private", "private/config.json"])
 @pytest.mark.parametrize("command", ["evaluate", "audit", "audit --report-only"])
 def test_what_lies_in_a_run_is_told_the_run(keyss: Run, world: Path, command: str, inside: str) -> None:
@@ -57,41 +40,6 @@ def test_what_lies_in_a_run_is_told_the_run(keyss: Run, world: Path, command: st
     kind = "a folder" if path.is_dir() else "a file"
     assert_refused(said, 4, f"{path}: expected the folder of a run")
     assert f"found {kind} in one; give {world / 'hidden'}" in said.err
-
-
-@pytest.mark.parametrize("path", ["key.txt", "a", "nowhere"])
-def test_what_is_no_run_is_not_evaluated(keyss: Run, world: Path, path: str) -> None:
-    said = keyss("evaluate", world / path, *key(world))
-    assert_refused(said, 4, f"{world / path}: expected the folder of a run, as `keyss hide` writes it")
-
-
-FOREIGN = {
-    "scene.gltf": (b"{}", "a glTF file with its data beside it", "export a .glb"),
-    "scene.csv": (b"x,y,z\n0,0,0\n", "a table", "export a .ply"),
-    "photo.jpg": (b"\xff\xd8\xff\xe0", "a picture", "poses"),
-}
-
-
-@pytest.mark.parametrize("name", FOREIGN)
-def test_foreign_files_are_called_what_they_are(keyss: Run, world: Path, tmp_path: Path, name: str) -> None:
-    content, kind, advice = FOREIGN[name]
-    path = tmp_path / name
-    path.write_bytes(content)
-    before = listing(tmp_path)
-    hide = ("hide", *key(world), "-o", tmp_path / "out")
-    for said in (
-        keyss("info", path),
-        keyss(*hide, "--cover", path, "--secret", world / "b"),
-        keyss(*hide, "--cover", world / "a", "--secret", path),
-        keyss("reveal", path, *key(world), "-o", tmp_path / "s.ply"),
-        keyss("render", path, "--cameras", world / "a", "-o", tmp_path / "out"),
-        keyss("fit", path, "-o", tmp_path / "out"),
-    ):
-        assert_refused(said, 4, f"found {kind}")
-        assert str(path) in said.err
-        assert advice in said.err
-    assert "expected a scene folder or a 3DGS model (.compressed.ply, .ply" in said.err
-    assert listing(tmp_path) == before
 
 
 def test_a_key_file_in_place_of_a_model_is_not_quoted(keyss: Run, world: Path, tmp_path: Path) -> None:
@@ -149,19 +97,6 @@ def test_an_unreadable_scene_is_an_input_that_cannot_be_read(
     (scene / closed).chmod(0o700)
 
 
-def test_a_run_of_somebody_else_s_is_an_input_that_cannot_be_read(
-    keyss: Run, world: Path, open_folder: Path
-) -> None:
-    run = shutil.copytree(world / "hidden", open_folder / "run")
-    key = ("--key-file", open_folder / "key")
-    keyss("evaluate", open_folder / "nowhere", *key)  # imports all it needs
-    (run / "private").chmod(0)
-    with unprivileged():
-        said = keyss("evaluate", run, *key)
-    (run / "private").chmod(0o700)
-    assert_refused(said, 4, f"{run}: cannot be read: Permission denied")
-
-
 def fitted(keyss: Run, scene: Path, out: Path, *extra: object) -> Said:
     said = keyss("fit", scene, "-o", out, *SMALL, *extra)
     assert said.status == 0, said.err
@@ -171,17 +106,6 @@ def fitted(keyss: Run, scene: Path, out: Path, *extra: object) -> Said:
 
 def warnings_of(said: Said) -> list[str]:
     return [line for line in said.err.splitlines() if line.startswith("keyss: warning: ")]
-
-
-def test_colmap_without_points_starts_from_random_ones(keyss: Run, tmp_path: Path) -> None:
-    scene = write_colmap(tmp_path / "scene", count=4)
-    (scene / "sparse/0/points3D.bin").unlink()
-    for out, seed in (("one", 3), ("two", 3), ("three", 4)):
-        (warning,) = warnings_of(fitted(keyss, scene, tmp_path / out, "--seed", seed))
-        assert "points3D.bin: there are no points; a fit starts from random points" in warning
-    first, again, other = ((tmp_path / out / "model.ply").read_bytes() for out in ("one", "two", "three"))
-    assert first == again
-    assert first != other
 
 
 MISSING = {
@@ -205,23 +129,3 @@ def test_a_missing_photo_is_named_and_left_out_on_demand(keyss: Run, tmp_path: P
     described = keyss("info", scene, "--json")
     assert json.loads(described.out)["train_views"] == {"colmap": 2, "blender": 3, "nerfstudio": 2}[layout]
     assert warnings_of(described) == [warning]
-
-
-def test_a_run_remembers_that_photos_were_missing(keyss: Run, world: Path, tmp_path: Path) -> None:
-    scene, run = write_colmap(tmp_path / "scene", count=4), tmp_path / "run"
-    (scene / "images/02.png").unlink()
-    scenes = ("--cover", scene, "--secret", world / "b", *key(world))
-    hide = ("hide", *scenes, "--publish", "any", "-o", run, *SMALL)
-    assert_refused(keyss(*hide), 4, "1 of 4 photos are missing: 02.png;")
-    said = keyss(*hide, "--skip-missing")
-    assert said.status == 0, said.err
-    assert json.loads((run / "private/config.json").read_text())["views"]["skip_missing"] is True
-    said = keyss("evaluate", run, *key(world))
-    assert said.status == 0, said.err
-    assert [line for line in warnings_of(said) if "left out: 02.png" in line]
-    stego, out = run / "publish/model.ply", tmp_path / "pictures"
-    assert_refused(keyss("render", stego, "--cameras", scene, "-o", out), 4, "--skip-missing")
-    assert (
-        keyss("render", stego, "--cameras", scene, "-o", out, "--skip-missing", "--split", "all").status == 0
-    )
-    assert sorted(path.name for path in out.glob("*.png")) == ["00.png", "01.png", "03.png"]

@@ -58,7 +58,3 @@ class TestKeygen:
         assert_refused(keyss("keygen", "-o", tmp_path / "link"), 5, "never replaced")
         assert_refused(keyss("keygen", "-o", tmp_path / "none" / "key"), 5, "No such file")
         assert {each.name for each in tmp_path.iterdir()} == {"key.txt", "link"}
-
-    def test_takes_no_seed(self, keyss: Run) -> None:
-        """A key that can be drawn again is no secret."""
-        assert keyss("keygen", "--seed", 1).status == 2

@@ -67,13 +67,6 @@ def test_files_that_hold_no_key_are_refused(tmp_path: Path, data: bytes, words: 
         keys.key_of_file(write(tmp_path, data))
 
 
-def test_files_that_cannot_be_read_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="cannot be read"):
-        keys.key_of_file(tmp_path / "missing")
-    with pytest.raises(InputError, match="cannot be read"):
-        keys.key_of_file(tmp_path)
-
-
 def test_files_come_before_the_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("KEYSS_KEY", "from the environment")
     assert keys.keys([write(tmp_path, b"from the file\n")], 1) == ["from the file"]
@@ -85,21 +78,6 @@ def test_files_come_before_the_environment(tmp_path: Path, monkeypatch: pytest.M
         keys.keys([], 1)
     monkeypatch.setenv("KEYSS_KEY", os.fsdecode(b"\xff"))
     with pytest.raises(UsageError, match="UTF-8"):
-        keys.keys([], 1)
-
-
-def test_as_many_files_as_secrets(tmp_path: Path) -> None:
-    path = write(tmp_path, b"k")
-    assert keys.keys([path, path], 2) == ["k", "k"]
-    with pytest.raises(UsageError, match="got 1"):
-        keys.keys([path], 2)
-    with pytest.raises(UsageError, match="one --key-file, got 2"):
-        keys.keys([path, path], 1)
-
-
-def test_without_a_terminal_nobody_is_asked(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sys.stdin.isatty", lambda: False, raising=False)
-    with pytest.raises(UsageError, match="no key"):
         keys.keys([], 1)
 
 
@@ -126,14 +104,6 @@ class TestPrompt:
         typed += [""]
         with pytest.raises(UsageError, match="empty"):
             keys.keys([], 1, confirm=True)
-
-    def test_an_end_of_input_is_no_key(self, typed: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
-        def ctrl_d(prompt: str) -> str:
-            raise EOFError
-
-        monkeypatch.setattr(getpass, "getpass", ctrl_d)
-        with pytest.raises(UsageError, match="no key was typed"):
-            keys.keys([], 1)
 
 
 def test_a_key_file_that_others_can_read_gets_a_warning_without_the_key(

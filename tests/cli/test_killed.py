@@ -158,13 +158,6 @@ def disturb(
     shutil.rmtree(out.parent)
 
 
-@pytest.mark.parametrize(("name", "signum"), [("hide", signal.SIGKILL), ("audit", signal.SIGINT)])
-def test_a_repeated_command_ends_as_if_nothing_had_disturbed_it(
-    world: Path, undisturbed: Undisturbed, name: str, signum: int
-) -> None:
-    disturb(world, undisturbed, name, signum, seed=1000 + signum)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(50))
 def test_fifty_commands_are_disturbed(world: Path, undisturbed: Undisturbed, seed: int) -> None:

@@ -13,7 +13,6 @@ import pytest
 
 from cli.said import COMMANDS, PROGRAM, SMALL, Run
 from keyss.cli import main, process
-from keyss.files import read_model
 
 NARROW = ["ascii", "cp1252", *(pytest.param(name, marks=pytest.mark.slow) for name in ("latin-1", "cp437"))]
 
@@ -54,15 +53,6 @@ def test_results_are_whole_whatever_becomes_of_the_output(
     assert [path.name for path in tmp_path.iterdir()] == ["key.txt"]
 
 
-@pytest.mark.parametrize(("redirection", "status"), [("<&- >&- 2>&-", 0), (">/dev/full", 5)])
-def test_so_is_a_secret(world: Path, tmp_path: Path, redirection: str, status: int) -> None:
-    secret, stego = tmp_path / "secret.ply", world / "hidden" / "publish" / "model.ply"
-    done = shell(redirection, "reveal", stego, "--key-file", world / "key.txt", "-o", secret)
-    assert done.returncode == status, done.stderr
-    assert len(read_model(secret)) > 0
-    assert [path.name for path in tmp_path.iterdir()] == ["secret.ply"]
-
-
 def _with_a_reader_that_leaves(arguments: list[object]) -> subprocess.CompletedProcess[bytes]:
     pipe = subprocess.PIPE
     process = subprocess.Popen([*PROGRAM, *map(str, arguments)], stdout=pipe, stderr=pipe)
@@ -84,12 +74,6 @@ def test_an_error_has_its_status_where_nobody_can_be_told(redirection: str, stat
     assert shell(redirection, "info", "nowhere").returncode == status
 
 
-def test_progress_that_cannot_be_shown_stops_nothing(world: Path, tmp_path: Path) -> None:
-    done = shell("2>/dev/full", "fit", world / "b", "-o", tmp_path / "out", *SMALL[2:])
-    assert done.returncode == 0
-    assert b"PSNR" in done.stdout
-
-
 @pytest.mark.parametrize("encoding", NARROW)
 def test_help_and_errors_in_any_encoding(encoding: str) -> None:
     done = shell("", "--help", PYTHONIOENCODING=encoding)
@@ -108,14 +92,7 @@ def test_help_is_made_of_characters_with_a_likeness_in_ascii(keyss: Run, command
     assert said.encode("ascii", process.REPLACING).count(b"?") == said.count("?")
 
 
-def test_what_cannot_be_shown_is_replaced() -> None:
-    assert "╭ • 7 ≤ 8…".encode("ascii", process.REPLACING) == b"+ * 7 <= 8..."
-    assert "ä鍵".encode("cp1252", process.REPLACING) == b"\xe4?"
-    assert (
-        os.fsdecode(b"\xff.ply").encode("utf-8", process.REPLACING) == b"\xff.ply"
-    )  # a file's name as it is
-
-
+@pytest.mark.slow
 def test_numbers_in_a_locale_without_characters(world: Path, tmp_path: Path) -> None:
     """`fit` and `info`, progress included, where Python's own UTF-8 is switched off."""
     plain = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}

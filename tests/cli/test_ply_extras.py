@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
 from channels.quiet.trained_like import trained_like
 from cli.said import Run, write_key
@@ -56,19 +55,6 @@ def test_convert_keeps_them(keyss: Run, tmp_path: Path, form: str) -> None:
     check_extras(tmp_path / "b.ply", extra)
     assert same_bits(read_model(tmp_path / "b.ply"), model)
     assert keyss("convert", tmp_path / "a.ply", tmp_path / "c.spz").status == 0  # which cannot hold them
-
-
-def test_rows_that_are_left_out_take_theirs_along(keyss: Run, tmp_path: Path) -> None:
-    model = trained_like(COUNT)
-    model.means[7, 1] = torch.nan
-    model.opacity_logits[9] = torch.inf
-    model.log_scales[11, 2] = -torch.inf
-    extra = extended(model, tmp_path / "a.ply")
-    said = keyss("convert", tmp_path / "a.ply", tmp_path / "b.ply")
-    assert f"1 of {COUNT:,} Gaussians are left out" in said.err
-    kept = {name: np.delete(values, 7) for name, values in extra.items()}
-    check_extras(tmp_path / "b.ply", kept)
-    assert len(read_model(tmp_path / "b.ply")) == COUNT - 1
 
 
 @pytest.mark.parametrize(

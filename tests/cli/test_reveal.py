@@ -60,22 +60,6 @@ def reveal(keyss: Run, files: Path, tmp_path: Path) -> Run:
     return run
 
 
-def test_an_output_that_cannot_be_written_is_refused_before_the_work(
-    reveal: Run, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(os, "access", lambda *asked: False)
-    assert_refused(reveal("whole.ply", key="other"), 5, "nothing can be written in")
-
-
-def test_runs_and_checks_are_described_in_words(keyss: Run, world: Path) -> None:
-    said = keyss("info", world / "hidden").out
-    assert "hiding by the method carry" in said
-    assert "_" not in said.replace(str(world), "")
-    said = keyss("verify", world / "hidden/publish/model.ply", "--key-file", world / "key.txt").out
-    assert said.endswith("complete\n")
-    assert_refused(keyss("info", world), 4, f"name one of {world / 'hidden'}")
-
-
 def test_many_gaussians_in_a_small_file_are_refused(keyss: Run, files: Path, tmp_path: Path) -> None:
     data = whole.encode(model_of(100, sh_degree=0))
     hostile = Payload("carry", (1 << 17).to_bytes(4, "little") + data[4:])
@@ -145,16 +129,6 @@ class TestOpensNothing:
         for word in ("another key", "converted or quantised", "moved", "trained on"):
             assert word in said[0].err
 
-    def test_with_a_decoy_too_and_with_one_salt(self, reveal: Run, work: dict[str, int]) -> None:
-        made = []
-        for model, key in (("plain.ply", "key"), ("whole.ply", "other")):
-            work.update(keys=0, blocks=0)
-            said = reveal(model, "--decoy", "--overwrite", key=key)
-            assert (said.status, said.err) == (0, "")
-            made.append(dict(work))
-        assert made[0] == made[1]
-        assert made[0]["keys"] == 1
-
 
 class TestOutputs:
     @pytest.mark.parametrize("how", ["same", "dots", "symlink", "hardlink"])
@@ -176,13 +150,6 @@ class TestOutputs:
         said = keyss("reveal", model, "--key-file", files / "key", "-o", out, "--overwrite")
         assert_refused(said, 2, "is the input")
         assert listing(tmp_path) == before
-
-    @pytest.mark.parametrize("name", ["secret.spz", "secret.compressed.ply"])
-    def test_a_secret_comes_in_the_format_that_is_asked_for(
-        self, keyss: Run, files: Path, tmp_path: Path, name: str
-    ) -> None:
-        said = keyss("reveal", files / "whole.ply", "--key-file", files / "key", "-o", tmp_path / name)
-        assert (said.status, len(read_model(tmp_path / name))) == (0, 500)
 
 
 class TestStreams:
@@ -283,15 +250,3 @@ class TestVerify:
             assert "pruning by opacity" in said.err
         said = keyss("verify", files / "plain.ply", "--key-file", files / "key")
         assert_refused(said, 3, "opens nothing")
-
-
-def test_a_run_is_not_replaced_by_what_is_made_of_it(keyss: Run, files: Path, tmp_path: Path) -> None:
-    hide = ("hide", "--method", "carry", "--width", 24, "--key-file", files / "key", "-o", tmp_path / "run")
-    small = tmp_path / "small.ply"
-    write_model(small, trained_like(100, 3))
-    assert keyss(*hide, "--cover", files / "plain.ply", "--secret", small).status == 0
-    before, stego = listing(tmp_path), tmp_path / "run" / "publish" / "model.ply"
-    assert_refused(keyss(*hide, "--overwrite", "--cover", stego, "--secret", small), 2, "is the input")
-    render = ("render", stego, "--cameras", files / "plain.ply", "-o", tmp_path / "run", "--overwrite")
-    assert_refused(keyss(*render), 2, "is the input")
-    assert listing(tmp_path) == before

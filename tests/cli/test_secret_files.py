@@ -18,7 +18,6 @@ from keyss.channels import Payload, pack_payload, unpack_payload
 from keyss.cli import main
 from keyss.core import InputError, UsageError
 from keyss.methods import HiddenFile
-from methods.carry.carried import embed
 
 KEYS = ("q7Rv2LxT9bWm4KzD", "W2mz8Qe5TnYc6LkA")
 
@@ -74,28 +73,9 @@ def test_what_does_not_go_together_is_refused(keyss: Run, folder: Path, world: P
     assert listing(tmp_path) == {}
 
 
-def test_a_scene_is_not_taken_for_a_file(tmp_path: Path) -> None:
-    stego = embed(trained_like(2000), [(KEYS[0], trained_like(500, 1))])
-    with pytest.raises(InputError, match="opens a scene, not a file"):
-        library.reveal(stego, KEYS[0], out=tmp_path / "back")
-
-
 def test_a_file_too_large_for_its_cover_is_told_what_would_do(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"too small to carry .* Gaussians would do; .*channel="):
         library.hide_files(trained_like(2000), [library.SecretFile(os.urandom(90_000), KEYS[0])])
-
-
-@pytest.mark.parametrize(
-    ("format", "words"),
-    [("ply", "only 0% of the cover's Gaussians"), ("spz", "this cover of 2,000")],
-)
-def test_covers_without_room_are_named_and_have_one_status(
-    keyss: Run, folder: Path, tmp_path: Path, format: str, words: str
-) -> None:
-    write_model(tmp_path / "rounded.ply", trained_like(2000).map(lambda each: each.half().float()))
-    _, _, _, *others = _arguments(folder, tmp_path / "out")
-    hide = ("hide", "--cover", tmp_path / "rounded.ply", *others, "--format", format)
-    assert_refused(keyss(*hide), 2, words)
 
 
 def test_published_anywhere_a_file_opens_from_what_it_was_converted_to(
@@ -136,8 +116,3 @@ def test_payloads_of_others_are_read_or_refused(data: bytes) -> None:
     except InputError:
         return
     assert len(found.data) <= len(data)
-
-
-def test_a_name_beyond_measure_is_refused() -> None:
-    with pytest.raises(UsageError, match="255 bytes"):
-        HiddenFile("n" * 256, b"").payload()

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import re
-
 import pytest
 
-from cli.said import COMMANDS, Run, assert_refused
-from keyss.cli import commands, entry
+from cli.said import Run, assert_refused
 
 
 @pytest.mark.parametrize(
@@ -37,13 +34,3 @@ def test_a_misspelt_option(keyss: Run, arguments: tuple[str, ...], meant: str) -
     said = keyss(*arguments)
     assert (said.status, said.out) == (2, "")
     assert meant in said.err.partition("Perhaps you meant")[2]
-
-
-@pytest.mark.parametrize("command", COMMANDS)
-def test_every_option_of_the_help_is_known(keyss: Run, command: str) -> None:
-    """The help comes from the parser; messages take the options of a command from its signature."""
-    known = {f"--{name.replace('_', '-')}" for name in entry.options_of(commands.parse_target(command, []))}
-    lines = (line.strip("│ ") for line in keyss(command, "--help").out.splitlines())
-    named = (line.partition("  ")[0] for line in lines if line.startswith("-"))
-    offered = {flag for line in named for flag in re.findall(r"--[a-z][a-z-]*", line)}
-    assert offered - {"--help"} == known

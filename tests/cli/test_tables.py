@@ -6,11 +6,10 @@ import io
 import re
 from dataclasses import replace
 
-import pytest
 from rich.console import Console
 
 from cli.said import METRICS
-from keyss.cli.tables import print_hiding, print_table
+from keyss.cli.tables import print_hiding
 from keyss.fitting import ImageQuality
 from keyss.measure import BaselineQuality, PsnrRange, WrongKeys
 from keyss.runs import HideMetrics
@@ -34,17 +33,6 @@ class TestNumbers:
             ["PSNR in dB."],
         ]
         assert rows[-1] == ["Room in the cover: 1,000 Gaussians."]
-
-    def test_columns_that_nothing_fills_are_left_out(self) -> None:
-        rows = self.table(replace(METRICS, baseline=BaselineQuality(None, (None,), (None, None)), details={}))
-        assert rows[0] == ["on test photos", "PSNR", "SSIM", "Gaussians", "steps"]
-        assert rows[1] == ["cover", "30.00", "0.500", "1,234", "10"]
-
-    def test_lpips_stands_beside_psnr_and_ssim(self) -> None:
-        rows = self.table(replace(METRICS, cover=ImageQuality(30.0, 0.5, 0.125)))
-        assert rows[0][:4] == ["on test photos", "PSNR", "SSIM", "LPIPS"]
-        assert rows[1][:4] == ["cover", "30.00", "0.500", "0.125"]
-        assert ["PSNR in dB. LPIPS with AlexNet: lower is better."] in rows
 
     def test_two_secrets_and_wrong_keys_in_80_columns(self) -> None:
         two = replace(
@@ -76,38 +64,10 @@ class TestNumbers:
         )
         assert "Chance level: 9.00, 8.00" in said
 
-    def test_rows_that_no_terminal_holds_become_lists(self, capsys: pytest.CaptureFixture[str]) -> None:
-        print_table(["method", *"abc"], [["keyss", "x" * 40, "y" * 40, "z 1"]])
-        assert capsys.readouterr().out.splitlines()[:2] == ["method: keyss", f"a: {'x' * 40}"]
-
-    def test_what_was_written_was_opened_again(self) -> None:
-        said = " ".join(cell for row in self.table(METRICS) for cell in row)
-        assert "PSNR to the plain models: cover 32.0, secret 31.0 dB" in said
-
-    def test_what_the_numbers_are_compared_with_is_said(self) -> None:
-        rows = self.table(METRICS)
-        assert ["Bound: upper bound, PSNR of plain 3DGS with as many Gaussians and the same steps."] in rows
-        assert any(row[0].startswith("Chance level: 9.00, PSNR of the stego") for row in rows)
-        alone = replace(METRICS, baseline=BaselineQuality(None, (None,), (None, None)))
-        assert not any(row[0].startswith(("Bound:", "Start:")) for row in self.table(alone))
-
-    def test_models_that_nothing_trained_have_neither_steps_nor_bounds(self) -> None:
-        rows = self.table(replace(METRICS, photos=(False, False)))
-        assert rows[0] == ["on renders of the given models", "PSNR", "SSIM", "Gaussians"]
-        assert rows[1] == ["cover", "30.00", "0.500", "1,234"]
-        assert not any("training steps" in cell for row in rows for cell in row)
-
     def test_what_is_left_of_a_secret_is_said(self) -> None:
         baseline = replace(METRICS.baseline, gaussians=(10, 8406))
         fewer = replace(METRICS, baseline=baseline, secret_gaussians=(2480,), secret_degrees=((0, 3),))
         assert ["The secret kept 2,480 of 8,406 Gaussians, SH degree 0 of 3, 31.0 dB."] in self.table(fewer)
-
-    def test_a_baseline_of_another_size_has_its_number_of_gaussians_beside_it(self) -> None:
-        baseline = replace(METRICS.baseline, gaussians=(152_746, None))
-        rows = self.table(replace(METRICS, baseline=baseline))
-        assert rows[0][-3:] == ["Gaussians", "plain", "steps"]
-        assert rows[1][-3:] == ["1,234", "152,746", "10"]
-        assert not any("as many Gaussians" in cell for row in rows for cell in row)
 
     def test_a_plain_model_of_fewer_steps_is_no_bound(self) -> None:
         shorter = replace(METRICS.baseline, secrets=(ImageQuality(19.0, 0.2),))

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import stat
-import sys
 from pathlib import Path
 
 import pytest
 
-from cli.said import SMALL, Run, assert_refused
+from cli.said import SMALL, Run
 from keyss.files import read_model
 
 
@@ -31,13 +30,3 @@ def test_losses_come_back(keyss: Run, scene: Path) -> None:
     # What trains is the same, watched or not.
     keyss("fit", scene, "-o", scene.parent / "plain", *SMALL[2:], "--seed", 0)
     assert (out / "model.ply").read_bytes() == (scene.parent / "plain" / "model.ply").read_bytes()
-
-
-def test_without_it_nothing_is_begun(keyss: Run, scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in list(sys.modules):
-        if name.split(".")[0] == "tensorboard" or name.startswith("torch.utils.tensorboard"):
-            monkeypatch.delitem(sys.modules, name)
-    monkeypatch.setitem(sys.modules, "tensorboard", None)
-    said = keyss("fit", scene, "-o", scene.parent / "out", *SMALL[2:], "--tensorboard")
-    assert_refused(said, 6, "pip install 'keyss[tensorboard]'")
-    assert not (scene.parent / "out").exists()

@@ -51,19 +51,8 @@ class TestEstimate:
         assert re.search(rf"^fit: {self.WORDS}\n.*fit b: 20 steps", said.err, re.DOTALL)
         assert "about" not in fit(keyss, scene, "-q", "--overwrite").err
 
-    def test_changes_no_result(self, keyss: Run, scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        fit(keyss, scene)
-        model = (scene.parent / "out" / "model.ply").read_bytes()
-        monkeypatch.setattr("keyss.runs.planning._LONG", 10**9)
-        assert "about" not in fit(keyss, scene, "--overwrite").err
-        assert (scene.parent / "out" / "model.ply").read_bytes() == model
-
     def test_of_hide(self, keyss: Run, world: Path, tmp_path: Path) -> None:
         scenes = ("--cover", world / "a", "--secret", world / "b", "--key-file", world / "key.txt")
         said = keyss("hide", "--publish", "any", *scenes, "-o", tmp_path / "out", *SMALL, "--min-psnr", 0)
         assert said.status == 0, said.err
         assert re.search(rf"^hide: {self.WORDS}\n", said.err, re.MULTILINE)
-
-    def test_not_before_work_that_is_refused(self, keyss: Run, scene: Path) -> None:
-        fit(keyss, scene)
-        assert fit(keyss, scene).err.startswith("keyss: error: ")

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-import sys
 from pathlib import Path
 
 import cv2
@@ -15,10 +13,9 @@ import torch
 import keyss as library
 from cli.said import Run, assert_refused
 from files.scene_files import write_nerfstudio
-from keyss import load_scene, write_model
-from keyss.api import looking
-from keyss.core import Camera, Gaussians, UsageError
-from keyss.rendering import around, circle, look_at, middle_and_radius, render
+from keyss import write_model
+from keyss.core import Camera, Gaussians
+from keyss.rendering import circle, middle_and_radius, render
 from tiny_scenes import random_gaussians
 
 Frames = list[npt.NDArray[np.uint8]]
@@ -79,21 +76,6 @@ def test_a_wipe_from_one_model_to_the_other_and_back(keyss: Run, files: Path, tm
         assert frames[index][:, 47:49].mean() > 200
 
 
-def test_with_the_cameras_of_a_scene(keyss: Run, files: Path, tmp_path: Path) -> None:
-    scene = ("--cameras", files / "scene")
-    said = keyss("render", files / "a.ply", *scene, "--video", tmp_path / "s.mp4", "--seconds", 0.2)
-    assert said.status == 0, said.err
-    cameras = sorted((view.camera for view in load_scene(files / "scene").views), key=lambda each: each.name)
-    frames = frames_of(tmp_path / "s.mp4")
-    height, width = cameras[0].height, cameras[0].width
-    assert [frame.shape for frame in frames] == [(height - height % 2, width - width % 2, 3)] * 5
-
-
-def test_a_path_needs_cameras() -> None:
-    with pytest.raises(UsageError, match="found none"):
-        around([], 3)
-
-
 def test_a_circle_looks_at_the_middle_from_above() -> None:
     model = random_gaussians(50)
     middle, _ = middle_and_radius(model)
@@ -102,52 +84,6 @@ def test_a_circle_looks_at_the_middle_from_above() -> None:
         torch.testing.assert_close(at[:2], torch.zeros(2), atol=1e-5, rtol=0)
         assert at[2] > 0
         assert camera.position[1] < middle[1]  # up is -y
-
-
-def ring(degrees: range, up: str) -> list[Camera]:
-    """Cameras on a ring of radius 3 around (1, 2, 3), at a height of 1, that look at its middle."""
-    found = []
-    for index, angle in enumerate(degrees):
-        flat = 3 * math.cos(math.radians(angle)), 3 * math.sin(math.radians(angle))
-        outward = torch.tensor([flat[0], -1.0, flat[1]] if up == "-y" else [*flat, 1.0])
-        axis = torch.tensor([0.0, -1.0, 0.0] if up == "-y" else [0.0, 0.0, 1.0])
-        viewmat = look_at(MIDDLE + outward, -outward / outward.norm(), axis)
-        found.append(Camera(viewmat, torch.eye(3), 8, 8, f"{index:03}"))
-    return found
-
-
-MIDDLE = torch.tensor([1.0, 2.0, 3.0])
-
-
-@pytest.mark.parametrize("up", ["-y", "z"])
-def test_around_what_cameras_look_at(up: str) -> None:
-    """The same ring again, from wherever it begins."""
-    cameras = ring(range(0, 360, 30), up)
-    path = around(cameras, 12)
-    places = torch.stack([camera.position for camera in cameras])
-    found = torch.stack([camera.position for camera in path])
-    assert float(torch.cdist(found, places).min(dim=1).values.max()) < 1e-2
-    assert float(torch.cdist(places, found).min(dim=1).values.max()) < 1e-2
-    for camera in path:
-        nearest = cameras[int((places - camera.position).norm(dim=1).argmin())]
-        torch.testing.assert_close(camera.viewmat, nearest.viewmat, atol=1e-2, rtol=0)
-
-
-def test_around_stays_where_cameras_were() -> None:
-    """Those of a half ring: the path sways between its ends."""
-    path = around(ring(range(0, 181, 20), "-y"), 24)
-    offsets = torch.stack([camera.position for camera in path]) - MIDDLE
-    assert float(offsets[:, 2].min()) > -0.1
-    assert float(offsets[:, 0].min()) == pytest.approx(-3, abs=0.1)
-    assert float(offsets[:, 0].max()) == pytest.approx(3, abs=0.1)
-
-
-def test_wipes() -> None:
-    black, grey = np.zeros((4, 10, 3), np.uint8), np.full((4, 10, 3), 99, np.uint8)
-    assert (looking.wiped(black, grey, 0) == 0).all()
-    assert (looking.wiped(black, grey, 1) == 99).all()
-    assert looking.wiped(black, grey, 0.5)[0, :, 0].tolist() == [99] * 4 + [255] * 2 + [0] * 4
-    assert [looking.shown(time) for time in (0, 0.5, 1)] == [0, 1, 0]
 
 
 @pytest.mark.parametrize(
@@ -179,14 +115,6 @@ def test_what_is_refused(
     assert_refused(keyss("render", "a.ply", *arguments), status, words)
     assert (files / "there.mp4").read_bytes() == b"mine"
     assert not (files / "film.mp4").exists()
-
-
-def test_without_the_package(
-    keyss: Run, files: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(sys.modules, "av", None)
-    said = keyss("render", files / "a.ply", "--video", tmp_path / "a.mp4")
-    assert_refused(said, 6, "pip install 'keyss[video]'")
 
 
 def test_an_interrupted_film_leaves_nothing(

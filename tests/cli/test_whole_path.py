@@ -38,29 +38,6 @@ class TestTheWholePath:
         assert f"--seed {metrics['seed']}" in said.out.splitlines()[0]
         assert "{" not in said.out
 
-    def test_fit_prints_its_numbers_and_files(self, keyss: Run, world: Path, tmp_path: Path) -> None:
-        out = tmp_path / "plain"
-        said = keyss("fit", world / "a", "-o", out, *SMALL, "--width", 8)
-        assert said.status == 0
-        assert "fit a: 20 steps" in said.err
-        assert str(out / "model.ply") in said.out
-        assert json.loads((out / "private" / "metrics.json").read_text())["width"] == 8
-
-    def test_a_decoy_looks_like_a_success(self, keyss: Run, world: Path, tmp_path: Path) -> None:
-        stego = world / "hidden" / "publish" / "model.ply"
-        said = []
-        for name, key in (("a", "key.txt"), ("b", "wrong.txt")):
-            out = tmp_path / f"{name}.ply"
-            said.append(keyss("reveal", stego, "--key-file", world / key, "--decoy", "-o", out))
-        right, wrong = said
-        assert right.status == 0
-        assert wrong.status == 0
-        assert wrong.err == right.err
-        outs = [re.sub(r"[ab]\.ply|[0-9,]+", "", each.out) for each in said]
-        assert outs[0] == outs[1]
-        heads = [(tmp_path / name).read_bytes().partition(b"end_header")[0] for name in ("a.ply", "b.ply")]
-        assert len({re.sub(rb"vertex [0-9]+", b"", each) for each in heads}) == 1
-
 
 def test_a_dry_run_prints_the_whole_and_writes_nothing(keyss: Run, world: Path, tmp_path: Path) -> None:
     scenes = ("--cover", world / "a", "--secret", world / "b", "--key-file", world / "key.txt")

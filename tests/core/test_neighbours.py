@@ -2,19 +2,11 @@
 
 from __future__ import annotations
 
-import time
-
 import numpy as np
 import pytest
-import torch
 from scipy.spatial.distance import cdist
 
-from keyss.channels.quiet.fields import carrying
-from keyss.channels.quiet.kept import changeable
-from keyss.core import Gaussians
 from keyss.core.neighbours import nearest_neighbours
-from keyss.files.formats.spz import SpzCodes
-from keyss.fitting.parameters import initial_gaussians
 
 
 @pytest.mark.parametrize("copies", [1, 3, 40])
@@ -35,14 +27,3 @@ def test_others_than_the_points_themselves() -> None:
     assert distances.tolist() == [[1, 1], [0.5, 1]]
     assert sorted(indices[0].tolist()) == [1, 2]
     assert indices[1].tolist() == [3, 0]
-
-
-def test_equal_points_do_not_take_quadratic_time() -> None:
-    """In a .spz, 131,072 equal Gaussians take 3 kB."""
-    count = 1 << 17
-    points = torch.zeros(count, 3)
-    codes = SpzCodes.of(Gaussians(points, torch.ones(count, 4), points, points[:, 0], points[:, None]))
-    start = time.process_time()
-    initial_gaussians(points, points.byte(), 0, count, torch.Generator())
-    changeable(codes, carrying(codes).fields(codes), bytes(32))
-    assert time.process_time() - start < 10  # comparing all pairs takes many times as long

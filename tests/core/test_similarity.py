@@ -49,16 +49,6 @@ quick = settings(max_examples=40, deadline=None)
 
 @quick
 @given(seeds)
-def test_inverse(seed: int) -> None:
-    a = random_similarity(seed)
-    points = torch.randn(10, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
-    torch.testing.assert_close(a.inverse().apply_points(a.apply_points(points)), points)
-    torch.testing.assert_close(a.apply_points(a.inverse().apply_points(points)), points)
-    assert a.scale * a.inverse().scale == pytest.approx(1)
-
-
-@quick
-@given(seeds)
 def test_camera_sees_the_same_image_of_the_moved_world(seed: int) -> None:
     similarity, camera = random_similarity(seed), random_camera(seed)
     points = torch.randn(10, 3, generator=torch.Generator().manual_seed(seed))
@@ -90,25 +80,6 @@ def test_covariances_and_quaternion_lengths(seed: int) -> None:
 
 
 @quick
-@given(seeds)
-def test_quaternions_agree_with_scipy(seed: int) -> None:
-    """Also where one component dominates or vanishes, as in half turns."""
-    rng = np.random.default_rng(seed)
-    axis = rng.normal(size=3) * rng.integers(0, 2, size=3)
-    turn = Rotation.from_rotvec(axis / max(np.linalg.norm(axis), 1e-9) * rng.choice([0, 1e-7, 1, np.pi]))
-    identity = Gaussians(
-        torch.zeros(1, 3),
-        torch.tensor([[1.0, 0, 0, 0]]),
-        torch.zeros(1, 3),
-        torch.zeros(1),
-        torch.zeros(1, 1, 3),
-    )
-    similarity = Similarity(rotation=torch.from_numpy(turn.as_matrix()))
-    w, x, y, z = similarity.apply_gaussians(identity).quats[0].double().tolist()
-    assert (Rotation.from_quat([x, y, z, w]) * turn.inv()).magnitude() < 1e-6
-
-
-@quick
 @given(seeds, st.integers(0, 3))
 def test_colour_turns_with_the_world(seed: int, degree: int) -> None:
     similarity, gaussians = random_similarity(seed), random_gaussians(seed, degree)
@@ -117,29 +88,6 @@ def test_colour_turns_with_the_world(seed: int, degree: int) -> None:
     before = _eval_sh_bases_fast(k, directions @ similarity.rotation) @ gaussians.sh.double()
     after = _eval_sh_bases_fast(k, directions) @ similarity.apply_gaussians(gaussians).sh.double()
     torch.testing.assert_close(after, before, rtol=0, atol=3e-6)
-
-
-def test_colour_rotation_is_exact_in_float64() -> None:
-    similarity, gaussians = random_similarity(3), random_gaussians(3).map(Tensor.double)
-    directions = torch.nn.functional.normalize(torch.randn(30, 3, dtype=torch.float64), dim=1)
-    before = _eval_sh_bases_fast(16, directions @ similarity.rotation) @ gaussians.sh
-    after = _eval_sh_bases_fast(16, directions) @ similarity.apply_gaussians(gaussians).sh
-    torch.testing.assert_close(after, before, rtol=0, atol=1e-12)
-
-
-def test_gaussians_come_back() -> None:
-    similarity, gaussians = random_similarity(7), random_gaussians(7)
-    back = similarity.inverse().apply_gaussians(similarity.apply_gaussians(gaussians))
-    for name in ("means", "log_scales", "opacity_logits", "sh"):
-        torch.testing.assert_close(getattr(back, name), getattr(gaussians, name), rtol=1e-5, atol=1e-5)
-    torch.testing.assert_close(covariances(back), covariances(gaussians), rtol=1e-4, atol=1e-4)
-
-
-def test_is_differentiable() -> None:
-    gaussians = random_gaussians(1).map(Tensor.requires_grad_)
-    moved = random_similarity(1).apply_gaussians(gaussians)
-    sum(getattr(moved, name).square().sum() for name in ("means", "quats", "log_scales", "sh")).backward()
-    assert all(getattr(gaussians, name).grad.isfinite().all() for name in ("means", "quats", "sh"))
 
 
 @pytest.mark.parametrize(
@@ -156,8 +104,3 @@ def test_is_differentiable() -> None:
 def test_invalid_similarities_are_refused(scale: float, rotation: Tensor) -> None:
     with pytest.raises(ValueError, match="similarity: "):
         Similarity(scale, rotation.double())
-
-
-def test_bad_shapes() -> None:
-    with pytest.raises(ValueError, match="expected a"):
-        Similarity(rotation=torch.eye(4))

@@ -5,16 +5,11 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
 
-from keyss.core import OPPONENT, compensate_pruning
+from keyss.core import compensate_pruning
 from tiny_scenes import random_gaussians, tiny_scene
-
-
-def test_a_model_is_described_in_a_line() -> None:
-    assert repr(random_gaussians(1500, sh_degree=2)) == "<1,500 Gaussians of SH degree 2 on cpu>"
 
 
 def test_a_single_training_photo_has_an_extent_by_which_gaussians_can_move() -> None:
@@ -25,16 +20,6 @@ def test_a_single_training_photo_has_an_extent_by_which_gaussians_can_move() -> 
     seen = replace(alone, points=points, colors=torch.zeros(2, 3, dtype=torch.uint8))
     assert seen.extent == pytest.approx(1.1 * float(centre.norm()), rel=1e-5)
     assert replace(alone, points=points[:0]).extent > 0
-
-
-def test_opponent_colours_are_orthonormal_and_greys_have_no_differences() -> None:
-    assert OPPONENT.dtype == np.float64
-    np.testing.assert_allclose(OPPONENT @ OPPONENT.T, np.eye(3), atol=1e-15)
-    greys = np.linspace(-2, 2, 9)[:, None] * np.ones(3)
-    apart = greys @ OPPONENT.T
-    np.testing.assert_allclose(apart[:, 0], np.sqrt(3) * greys[:, 0])
-    np.testing.assert_allclose(apart[:, 1:], 0, atol=1e-15)
-    np.testing.assert_allclose(apart @ OPPONENT, greys, atol=1e-15)
 
 
 @pytest.mark.parametrize(("left", "count"), [(1000, 1000), (995, 1000), (10, 0)])

@@ -54,14 +54,6 @@ def test_the_key_opens_the_file_for_the_web_too(run: tuple[Path, demo.DemoResult
     assert len(found) == len(keyss.reveal(run[0] / "publish" / "model.ply", "demo-key-3").gaussians)
 
 
-def test_one_seed_gives_the_same_bytes_in_another_place(
-    run: tuple[Path, demo.DemoResult], tmp_path: Path
-) -> None:
-    demo.run_demo(tmp_path, seed=3, **SMALL)
-    for name in ("publish/model.ply", "secret.ply"):
-        assert (tmp_path / name).read_bytes() == (run[0] / name).read_bytes()
-
-
 def test_a_folder_in_use_is_refused_and_overwrite_touches_only_its_own(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import torch
 
-from files.scene_files import frames, look_at_origin, photo, save, write_blender, write_json
-from keyss.core import InputError, KeyssWarning, UsageError
+from files.scene_files import frames, look_at_origin, photo, write_blender, write_json
+from keyss.core import InputError, KeyssWarning
 from keyss.files import load_scene
 
 
@@ -51,18 +51,6 @@ def test_transparency_shows_the_background(tmp_path: Path, background: object) -
     np.testing.assert_allclose(scene.background, behind, rtol=1e-6)
 
 
-@pytest.mark.parametrize("background", [(0, 0), (0, 0, 2), (0, 0, math.nan), torch.tensor([-1.0, 0, 0])])
-def test_backgrounds_out_of_range_are_refused(tmp_path: Path, background: object) -> None:
-    with pytest.raises(UsageError, match=r"three numbers in \[0, 1\]"):
-        load_scene(tmp_path, background=background)  # type: ignore[arg-type]
-
-
-def test_opaque_photos_have_a_black_background(tmp_path: Path) -> None:
-    scene = load_scene(write_blender(tmp_path, channels=3))
-    assert scene.background.tolist() == [0, 0, 0]
-    assert np.array_equal(scene.train[1].image.numpy(), photo(1))
-
-
 @pytest.mark.parametrize(
     ("splits", "train", "test"),
     [
@@ -77,25 +65,6 @@ def test_which_photos_are_for_testing(
     scene = load_scene(write_blender(tmp_path, splits))
     assert [v.camera.name for v in scene.train] == train
     assert [v.camera.name for v in scene.test] == test
-
-
-def test_training_photos_are_not_tested_on(tmp_path: Path) -> None:
-    write_blender(tmp_path)
-    (tmp_path / "transforms_test.json").write_text((tmp_path / "transforms_train.json").read_text())
-    with pytest.raises(InputError, match=r"every image once, found 'train/r_0\.png' twice"):
-        load_scene(tmp_path)
-
-
-def test_uniform_scale_and_rounding_leave_a_rigid_motion(tmp_path: Path) -> None:
-    write_blender(tmp_path)
-    matrix = np.array(look_at_origin(0.5))
-    matrix[:3, :3] *= 2.5
-    matrix[:3, :3] += 1e-3
-    write_transforms(tmp_path, matrix.tolist())
-    camera = load_scene(tmp_path).train[0].camera
-    rotation = camera.viewmat[:3, :3].double()
-    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-6)
-    np.testing.assert_allclose(camera.position, matrix[:3, 3], atol=1e-5)
 
 
 def write_transforms(folder: Path, matrix: object) -> None:
@@ -118,18 +87,13 @@ def changed(row: int, column: int, value: object) -> list[list[object]]:
         ([[1, 0, 0]] * 4, r"Expected `array` of length 4, got 3 - at `\$\[0\]`"),
         ([1, 2, 3, 4], r"Expected `array`, got `int` - at `\$\[0\]`"),
         (changed(0, 0, "one"), r"Expected `float`, got `str` - at `\$\[0\]\[0\]`"),
-        (changed(0, 0, None), r"Expected `float`, got `null` - at `\$\[0\]\[0\]`"),
-        (changed(0, 0, True), r"Expected `float`, got `bool` - at `\$\[0\]\[0\]`"),
         (changed(0, 3, math.nan), "finite `transform_matrix`"),
-        (changed(1, 1, -math.inf), "finite `transform_matrix`"),
         (changed(3, 0, math.nan), "ends in 0 0 0 1"),
         (changed(0, 3, 10**400), r"out of range - at `\$\[0\]\[3\]`"),
         (changed(0, 3, 1e300), "finite `transform_matrix`"),
-        (changed(3, 3, 2.0), "ends in 0 0 0 1"),
         (changed(0, 2, 1.1), "with a rotation"),
         (changed(0, 2, -1.0), "with a rotation"),  # a mirror
         ([[0, 0, 0, 1]] * 3, "with a rotation"),
-        ([[0] * 4] * 3, "with a rotation"),
     ],
 )
 def test_impossible_poses_are_named(tmp_path: Path, matrix: object, message: str) -> None:
@@ -159,23 +123,3 @@ def test_impossible_angles_are_named(tmp_path: Path, angle: object) -> None:
     path.write_text(json.dumps(json.loads(path.read_text()) | {"camera_angle_x": angle}))
     with pytest.raises(InputError, match="camera_angle_x"):
         load_scene(tmp_path)
-
-
-def test_missing_photos_and_wrong_sizes_are_named(tmp_path: Path) -> None:
-    write_blender(tmp_path)
-    meta = json.loads((tmp_path / "transforms_train.json").read_text())
-    write_json(tmp_path / "transforms_train.json", meta | {"w": 15, "h": 8})
-    with pytest.raises(InputError, match=r"r_0\.png: .* its camera, 15x8, .* found 12x8"):
-        load_scene(tmp_path)
-    write_json(tmp_path / "transforms_train.json", meta | {"w": 24, "h": 16})
-    assert load_scene(tmp_path).train[0].camera.K[0, 0] == pytest.approx(6 / math.tan(0.35))
-    (tmp_path / "train" / "r_1.png").unlink()
-    with pytest.raises(InputError, match="1 of 2 photos are missing: train/r_1;"):
-        load_scene(tmp_path)
-
-
-def test_jpeg_extension_is_found_too(tmp_path: Path) -> None:
-    write_blender(tmp_path)
-    (tmp_path / "train" / "r_0.png").unlink()
-    save(tmp_path / "train" / "r_0.jpg", photo(0))
-    assert load_scene(tmp_path).train[0].camera.name == "train/r_0.jpg"

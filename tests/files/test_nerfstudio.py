@@ -7,29 +7,16 @@ import json
 import math
 import struct
 from collections.abc import Iterator
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pycolmap
 import pytest
-from hypothesis import example, given, settings, strategies as st
 
-from files.scene_files import (
-    camera_bytes,
-    counted,
-    frames,
-    mutations,
-    photo,
-    save,
-    write_colmap,
-    write_json,
-    write_nerfstudio,
-)
-from keyss.core import InputError, KeyssWarning
+from files.scene_files import frames, photo, write_json, write_nerfstudio
+from keyss.core import InputError
 from keyss.files import load_scene
-from keyss.files.colmap import read_colmap
 from keyss.files.lens import undistortion
 from keyss.files.ply_table import read_point_cloud
 from keyss.files.transforms import read_nerfstudio
@@ -94,68 +81,6 @@ def names(folder: Path) -> tuple[list[str], list[str]]:
     return [p.name[-5] for p in layout.train], [p.name[-5] for p in layout.test]  # type: ignore[return-value]
 
 
-def test_splits(tmp_path: Path) -> None:
-    assert names(write_nerfstudio(tmp_path, 10)) == ([*"1234567", "9"], ["0", "8"])
-    both = {"train_filenames": FRAMES[:3], "test_filenames": ["./" + FRAMES[5]]}
-    assert names(write_nerfstudio(tmp_path, 10, **both)) == (["0", "1", "2"], ["5"])
-    validation = {"train_filenames": FRAMES[:3], "test_filenames": [], "val_filenames": FRAMES[6:8]}
-    assert names(write_nerfstudio(tmp_path, 10, **validation)) == (["0", "1", "2"], ["6", "7"])
-    assert names(write_nerfstudio(tmp_path, 4, train_filenames=FRAMES[:3])) == (["0", "1", "2"], ["3"])
-    assert names(write_nerfstudio(tmp_path, 4, test_filenames=FRAMES[:3])) == (["3"], ["0", "1", "2"])
-
-
-@pytest.mark.parametrize("extra", [{"k5": 0.01, "k6": 0.02}, {"camera_model": "FULL_OPENCV"}])
-def test_opencvs_eight_coefficients_mean_what_colmap_means(tmp_path: Path, extra: dict[str, object]) -> None:
-    brown = {"k1": 0.1, "k2": 0.02, "p1": 0.001, "p2": 0.002, "k3": 0.01, "k4": 0.03, **extra}
-    lens = read_nerfstudio(write_nerfstudio(tmp_path / "a", **brown)).train[0].lens
-    rest = (float(brown.get("k5", 0)), float(brown.get("k6", 0)))  # type: ignore[arg-type]
-    params = (10.0, 11.0, 6.5, 4.0, 0.1, 0.02, 0.001, 0.002, 0.01, 0.03, *rest)
-    assert (
-        lens
-        == read_colmap(write_colmap(tmp_path / "b", cameras=counted(camera_bytes(model=6, params=params))))
-        .train[0]
-        .lens
-    )
-
-
-def test_names_in_another_case_are_found(tmp_path: Path) -> None:
-    folder = write_nerfstudio(tmp_path, 4, train_filenames=[each.upper() for each in FRAMES[:3]])
-    for each in FRAMES[:2]:
-        (folder / each).rename(folder / each.replace("frame", "Frame"))
-    scene = load_scene(folder)
-    assert [view.camera.name for view in scene.train] == [
-        "images/Frame_00000.png", "images/Frame_00001.png", "images/frame_00002.png"
-    ]  # fmt: skip
-
-
-def test_masks_are_said_not_to_be_used(tmp_path: Path) -> None:
-    folder = write_nerfstudio(tmp_path)
-    meta = json.loads((folder / "transforms.json").read_text())
-    meta["frames"][1]["mask_path"] = "masks/1.png"
-    write_json(folder / "transforms.json", meta)
-    with pytest.warns(KeyssWarning, match="`mask_path`: masks are not used"):
-        load_scene(folder)
-
-
-@pytest.mark.parametrize("others", [{}, {"test_filenames": [], "val_filenames": []}])
-def test_every_eighth_photo_is_for_testing_where_all_are_for_training(
-    tmp_path: Path, others: dict[str, object]
-) -> None:
-    folder = write_nerfstudio(tmp_path, 10, train_filenames=FRAMES, **others)
-    with pytest.warns(KeyssWarning, match="`train_filenames` has all photos; every 8th"):
-        assert names(folder) == ([*"1234567", "9"], ["0", "8"])
-
-
-def test_a_split_holds_for_the_photos_that_are_left(tmp_path: Path) -> None:
-    folder = write_nerfstudio(tmp_path, 6, train_filenames=FRAMES[:4])
-    for gone in (FRAMES[0], FRAMES[4]):
-        (folder / gone).unlink()
-    with pytest.warns(KeyssWarning, match=r"2 of 6 .* images/frame_00000.png, images/frame_00004.png$"):
-        layout = read_nerfstudio(folder, skip_missing=True)
-    assert [p.name for p in layout.train] == FRAMES[1:4]
-    assert [p.name for p in layout.test] == FRAMES[5:6]
-
-
 @pytest.mark.parametrize(
     ("extra", "message"),
     [
@@ -203,20 +128,11 @@ def test_paths_that_leave_are_refused(tmp_path: Path, file_path: str) -> None:
         load_scene(write_nerfstudio(tmp_path, frames=frames(["images/frame_00000.png", file_path])))
 
 
-@pytest.mark.parametrize("file_path", [7, None])
-def test_paths_that_are_no_text_are_named(tmp_path: Path, file_path: object) -> None:
-    both = frames(["images/frame_00000.png", "images/frame_00001.png"])
-    both[1]["file_path"] = file_path
-    with pytest.raises(InputError, match=r"Expected `str`, got .* at `\$\.frames\[1\]\.file_path`"):
-        load_scene(write_nerfstudio(tmp_path, frames=both))
-
-
-def test_photos_beside_the_folder_are_allowed(tmp_path: Path) -> None:
-    paths = ["../photos/0.png", "../photos/1.png"]
-    scene_folder = write_nerfstudio(tmp_path / "scene", frames=frames(paths))
-    for i in range(2):
-        save(tmp_path / "photos" / f"{i}.png", photo(i))
-    assert [v.camera.name for v in load_scene(scene_folder).views] == paths[::-1]
+@pytest.mark.parametrize("start", ["/home/somebody/scenes/garden/", "C:\\data\\garden\\"])
+def test_paths_of_another_computer_are_found_in_the_folder(tmp_path: Path, start: str) -> None:
+    paths = [f"images/frame_{index:05}.png" for index in range(3)]
+    write_nerfstudio(tmp_path, frames=frames([start + path for path in paths]))
+    assert sorted(view.camera.name for view in load_scene(tmp_path).views) == paths
 
 
 @pytest.mark.parametrize(
@@ -253,42 +169,6 @@ def test_junk_anywhere_gives_an_input_error_or_a_scene(tmp_path: Path) -> None:
         except InputError:
             outcomes.add("refused")
     assert outcomes == {"refused", "read"}
-
-
-NUMBERS = st.one_of(
-    st.sampled_from([0, -1, 1, 2**31, 10**400, 1e-320, 1e308, -1e308, 1e15, 1e16, 6.5, 1e-9]),
-    st.integers(),
-    st.floats(allow_nan=False, allow_infinity=False),
-)
-FIELDS = ["w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x", "k1", "k2", "k3", "k4", "p1", "p2"]
-
-
-@given(
-    fields=st.dictionaries(st.sampled_from(FIELDS), NUMBERS, min_size=1, max_size=3),
-    entries=st.dictionaries(st.tuples(st.integers(0, 3), st.integers(0, 3)), NUMBERS, max_size=2),
-    fisheye=st.booleans(),
-)
-@example(fields={"w": 10**400}, entries={}, fisheye=False)
-@example(fields={}, entries={(0, 0): -(10**400)}, fisheye=False)
-@settings(max_examples=80, deadline=None, database=None)
-def test_any_numbers_give_an_input_error_or_a_sound_scene(
-    tmp_path_factory: pytest.TempPathFactory,
-    fields: dict[str, float],
-    entries: dict[tuple[int, int], float],
-    fisheye: bool,
-) -> None:
-    folder = write_nerfstudio(tmp_path_factory.mktemp("scene"), 2, is_fisheye=fisheye, **fields)
-    meta = json.loads((folder / "transforms.json").read_text())
-    for (row, column), value in entries.items():
-        meta["frames"][1]["transform_matrix"][row][column] = value
-    write_json(folder / "transforms.json", meta)
-    with suppress(InputError):
-        for view in load_scene(folder).views:
-            rotation = view.camera.viewmat[:3, :3]
-            np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-5)
-            assert view.camera.viewmat.isfinite().all()
-            assert view.camera.K.isfinite().all()
-            assert view.image.shape == (view.camera.height, view.camera.width, 3)
 
 
 XYZ = np.array([[0, 1, 2], [3, 4, 5.5], [-1, 0, 7]], np.float32)
@@ -333,51 +213,3 @@ def test_points_agree_with_colmaps_export(real_data: Path, tmp_path: Path) -> No
     expected = np.array([[*p.xyz.astype(np.float32), *p.color] for p in reconstruction.points3D.values()])
     found = np.concatenate([points.xyz, points.rgb], axis=1)
     np.testing.assert_array_equal(found[np.lexsort(found.T)], expected[np.lexsort(expected.T)])
-
-
-def test_points_without_colours_are_grey(tmp_path: Path) -> None:
-    axes = "property float x\nproperty float y\nproperty float z\n"
-    header = f"ply\nformat ascii 1.0\nelement vertex 1\n{axes}end_header\n"
-    (tmp_path / "a.ply").write_text(header + "1 2 3")
-    points = read_point_cloud(tmp_path / "a.ply")
-    assert (points.xyz.tolist(), points.rgb.tolist()) == ([[1, 2, 3]], [[128, 128, 128]])
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_damaged_plys_are_refused_or_read(tmp_path: Path, kind: str) -> None:
-    path = tmp_path / "a.ply"
-    data = cloud(kind)
-    whole = len(data) if "binary" in kind else len(data.rstrip()) - len(b" 9")
-    for length in range(whole):
-        path.write_bytes(data[:length])
-        with pytest.raises(InputError, match=r"a\.ply: "):
-            read_point_cloud(path)
-    outcomes = set()
-    for broken in mutations(data, 300):
-        path.write_bytes(broken)
-        try:
-            assert np.isfinite(read_point_cloud(path).xyz).all()
-            outcomes.add("read")
-        except InputError:
-            outcomes.add("refused")
-    assert outcomes == {"refused", "read"}
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "message"),
-    [
-        ("vertex 3", "vertex 99999999999999999999999", "line 4 of the PLY header"),
-        ("vertex 3", "vertex -3", "line 4 of the PLY header"),
-        ("vertex 3", "vertex 300000000000", "header announces 300,000,000,000 vertices"),
-        ("ascii", "utf-8", "line 2 of the PLY header"),
-        ("property float z", "property float w", "expected vertices with x, y and z"),
-        ("property float z", "property float x", "line 7 of the PLY header"),
-        ("property float z", "property list uchar float z", "has a list property"),
-        ("property uchar red", "property float red", "red, green and blue of type uchar"),
-        ("end_header", "end", "ends inside the header"),
-    ],
-)
-def test_what_is_wrong_with_a_ply_is_named(tmp_path: Path, old: str, new: str, message: str) -> None:
-    (tmp_path / "a.ply").write_bytes(cloud("ascii").replace(old.encode(), new.encode()))
-    with pytest.raises(InputError, match=message):
-        read_point_cloud(tmp_path / "a.ply")

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from keyss.core import OutputError
-from keyss.files import atomic_write, check_output_file, lock, write_bytes
+from keyss.files import atomic_write, lock, write_bytes
 
 WRITE_AND_WAIT = """
 import sys, time
@@ -102,14 +102,3 @@ def test_a_lock_dies_with_its_process(tmp_path: Path) -> None:
     with lock(path, Path("here")):
         assert path.exists()
     assert not path.exists()
-
-
-def test_a_folder_is_no_file_to_write(tmp_path: Path) -> None:
-    with pytest.raises(OutputError, match="is a folder"):
-        check_output_file(tmp_path, True)
-    with pytest.raises(OutputError, match="there is no folder"):
-        check_output_file(tmp_path / "no" / "x", False)
-    write_bytes(tmp_path / "x", b"")
-    with pytest.raises(OutputError, match="exists"):
-        check_output_file(tmp_path / "x", False)
-    assert check_output_file(tmp_path / "x", True) == tmp_path / "x"

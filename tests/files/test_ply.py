@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tracemalloc
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -13,9 +12,9 @@ import pytest
 import torch
 from hypothesis import HealthCheck, given, settings, strategies as st
 
-from keyss.core import Gaussians, InputError, KeyssWarning, OutputError, same_bits
+from keyss.core import Gaussians, InputError, KeyssWarning, same_bits
 from keyss.files import read_model, write_model
-from keyss.files.ply_rows import LEAST_LOG_SCALE, OPACITY_LOGIT_BOUND
+from keyss.files.ply_rows import LEAST_LOG_SCALE
 from keyss.runs.describe import ModelInfo, info
 from tiny_scenes import random_gaussians
 
@@ -88,24 +87,6 @@ def test_layout_is_inrias(tmp_path: Path) -> None:
     assert (tmp_path / "a.ply").read_bytes() == ply_bytes(expected)
 
 
-def test_bytes_depend_on_values_only(tmp_path: Path) -> None:
-    gaussians = random_gaussians(9, sh_degree=2)
-    write_model(tmp_path / "a.ply", gaussians)
-    strided = gaussians.map(lambda t: torch.stack([t, t], dim=-1)[..., 0].requires_grad_())
-    write_model(tmp_path / "b.ply", strided)
-    assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
-
-
-def test_refuses_to_write_what_it_would_not_read(tmp_path: Path) -> None:
-    gaussians = random_gaussians(3, sh_degree=0)
-    with pytest.raises(OutputError, match="no Gaussians"):
-        write_model(tmp_path / "a.ply", gaussians[:0])
-    gaussians.means[1, 2] = torch.nan
-    with pytest.raises(OutputError, match="z in 1"):
-        write_model(tmp_path / "a.ply", gaussians)
-    assert list(tmp_path.iterdir()) == []
-
-
 # --- reading ---------------------------------------------------------------------------------------------
 
 finite = st.floats(width=32, allow_nan=False, allow_infinity=False)
@@ -139,32 +120,6 @@ def test_reads_by_name(tmp_path: Path, form: str, degree: int) -> None:
     path = tmp_path / "a.ply"
     path.write_bytes(ply_bytes({name: columns[name] for name in names}, form=form, kinds=kinds))
     assert same_bits(read_model(path), gaussians)
-
-
-def test_reads_what_is_longer_than_one_chunk(tmp_path: Path) -> None:
-    gaussians = random_gaussians(12_345, sh_degree=3)
-    write_model(tmp_path / "a.ply", gaussians)
-    assert same_bits(read_model(tmp_path / "a.ply"), gaussians)
-
-
-def test_ignores_comments_other_elements_and_trailing_bytes(model: Path) -> None:
-    head, body = model.read_bytes().split(b"end_header\n", 1)
-    head = head.replace(b"ply\n", "ply\r\ncomment é end_header\nobj_info a b c\n\n".encode(), 1)
-    head = head.replace(b"element vertex", b"element camera 2\nproperty double f\nelement vertex")
-    head += b"element face 3\nproperty list uchar int vertex_indices\ncomment\n"
-    other = model.with_name("other.ply")
-    other.write_bytes(head + b"end_header\n" + bytes(16) + body + b"anything")
-    assert same_bits(read_model(other), read_model(model))
-
-
-def test_infinite_opacity_is_clamped(tmp_path: Path) -> None:
-    gaussians = random_gaussians(3, sh_degree=0)
-    columns = columns_of(gaussians)
-    columns["opacity"] = np.array([np.inf, -np.inf, 40.0])
-    (tmp_path / "a.ply").write_bytes(ply_bytes(columns))
-    logits = read_model(tmp_path / "a.ply").opacity_logits
-    assert logits.tolist() == [OPACITY_LOGIT_BOUND, -OPACITY_LOGIT_BOUND, 40.0]
-    assert 0 < logits[:2].sigmoid().min() < logits[:2].sigmoid().max() < 1
 
 
 @pytest.mark.parametrize(
@@ -211,7 +166,7 @@ def test_flat_gaussians_are_kept(tmp_path: Path) -> None:
 # --- models of other programs ----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("unit", [0.001, 1.0, 1000.0, 1e6])
+@pytest.mark.parametrize("unit", [0.001, 1e6])
 @pytest.mark.parametrize("which", ["scales", "opacities", "scales and opacities"])
 def test_activated_values_are_refused_in_any_unit(tmp_path: Path, unit: float, which: str) -> None:
     model = random_gaussians(400, sh_degree=0)
@@ -288,60 +243,6 @@ def test_refuses(tmp_path: Path, case: str) -> None:
         read_model(tmp_path / "a.ply")
 
 
-@pytest.mark.parametrize("form", ["binary_little_endian", "ascii"])
-@pytest.mark.parametrize("count", ["6", "1000000000000", "999999999999999999"])
-def test_count_is_checked_against_the_size(tmp_path: Path, form: str, count: str) -> None:
-    data = ply_bytes(columns_of(random_gaussians(5, sh_degree=1)), form=form)
-    if form == "ascii":  # so short that even the smallest excess cannot fit
-        head, _ = data.split(b"end_header\n")
-        data = head + b"end_header\n" + b"1 " * 140
-    (tmp_path / "a.ply").write_bytes(data.replace(b"vertex 5\n", f"vertex {count}\n".encode()))
-    with pytest.raises(InputError, match="the header announces"):
-        read_model(tmp_path / "a.ply")
-
-
-@pytest.mark.parametrize(
-    ("other", "message"),
-    [
-        (b"element a 999999999999999999\nproperty int i\nelement vertex 5", "not a whole"),
-        (b"element vertex 0", "holds no Gaussians"),
-    ],
-)
-def test_absurd_elements_before_the_vertices_and_no_vertices(model: Path, other: bytes, message: str) -> None:
-    model.write_bytes(model.read_bytes().replace(b"element vertex 5", other))
-    with pytest.raises(InputError, match=message):
-        read_model(model)
-
-
-@pytest.mark.parametrize("tail", [b"", b"word"])
-def test_broken_ascii(tmp_path: Path, tail: bytes) -> None:
-    head, body = ply_bytes(columns_of(random_gaussians(5, sh_degree=0)), form="ascii").split(b"end_header\n")
-    (tmp_path / "a.ply").write_bytes(head + b"end_header\n" + body.rsplit(b" ", 1)[0] + b" " + tail)
-    with pytest.raises(InputError, match="cut short or hold something not a number"):
-        read_model(tmp_path / "a.ply")
-
-
-def test_ascii_in_one_line_takes_no_more_memory_than_in_lines(tmp_path: Path) -> None:
-    head, body = ply_bytes(columns_of(random_gaussians(6000, sh_degree=3)), form="ascii").split(
-        b"end_header\n"
-    )
-    peaks = []
-    for separator in (b"\n", b" "):
-        (tmp_path / "a.ply").write_bytes(head + b"end_header\n" + body.replace(b"\n", separator))
-        tracemalloc.start()
-        read_model(tmp_path / "a.ply")
-        peaks.append(tracemalloc.get_traced_memory()[1])
-        tracemalloc.stop()
-    assert peaks[1] < 1.5 * peaks[0]
-
-
-def test_one_number_without_end(tmp_path: Path) -> None:
-    head = ply_bytes(columns_of(random_gaussians(5, sh_degree=0)), form="ascii").split(b"end_header\n")[0]
-    (tmp_path / "a.ply").write_bytes(head + b"end_header\n" + b"1" * 3_000_000)
-    with pytest.raises(InputError, match="not a number"):
-        read_model(tmp_path / "a.ply")
-
-
 def test_truncation_anywhere(model: Path) -> None:
     data = model.read_bytes()
     body = data.index(b"end_header\n") + len(b"end_header\n")
@@ -351,27 +252,6 @@ def test_truncation_anywhere(model: Path) -> None:
         model.write_bytes(data[:offset])
         with pytest.raises(InputError):
             read_model(model)
-
-
-@pytest.mark.parametrize("form", ["binary_little_endian", "ascii"])
-def test_flipped_bytes_in_the_header(tmp_path: Path, form: str) -> None:
-    data = ply_bytes(columns_of(random_gaussians(5, sh_degree=1)), form=form)
-    body = data.index(b"end_header\n") + len(b"end_header\n")
-    rng = np.random.default_rng(0)
-    path = tmp_path / "a.ply"
-    valid = 0
-    for _ in range(600):
-        damaged = bytearray(data)
-        for at in rng.integers(0, body, size=rng.integers(1, 4)):
-            damaged[at] = rng.choice([damaged[at] ^ (1 << rng.integers(0, 8)), rng.integers(0, 256)])
-        path.write_bytes(damaged)
-        try:
-            gaussians = read_model(path)
-        except InputError:
-            continue
-        valid += 1
-        assert all(getattr(gaussians, name).isfinite().all() for name in FIELDS)
-    assert valid < 400
 
 
 # --- other people's models and tools ---------------------------------------------------------------------
@@ -422,14 +302,3 @@ def test_splat_transform_copies_ours(splat_transform: Transform, tmp_path: Path,
     write_model(tmp_path / "in.ply", gaussians)
     copy = splat_transform(tmp_path / "in.ply", tmp_path / "out.ply")
     assert same_bits(read_model(copy), gaussians)
-
-
-def test_splat_transform_converts_ours(splat_transform: Transform, tmp_path: Path) -> None:
-    gaussians = random_gaussians(40, sh_degree=3)
-    write_model(tmp_path / "in.ply", gaussians)
-    table = splat_transform(tmp_path / "in.ply", tmp_path / "out.csv").read_text().splitlines()
-    header, first = table[0].split(","), [float(cell) for cell in table[1].split(",")]
-    expected = columns_of(gaussians)
-    assert set(header) >= set(names_of(3, normals=False))
-    for name, value in zip(header, first, strict=True):
-        assert value == pytest.approx(float(expected[name][0]), abs=1e-5), name

@@ -58,6 +58,13 @@ def test_checkpoints_without_a_model_are_told_the_way_out(tmp_path: Path, place:
             read(tmp_path)
 
 
+def test_an_unpacked_sog_is_told_the_way_out(tmp_path: Path) -> None:
+    (tmp_path / "meta.json").write_text("{}")
+    for read in (read_model, load_scene):
+        with pytest.raises(InputError, match=r"found an unpacked SOG model.*`splat-transform IN OUT\.ply`"):
+            read(tmp_path)
+
+
 def test_a_scene_with_a_model_beside_its_photos_is_a_scene(tmp_path: Path) -> None:
     write_model(write_colmap(tmp_path) / "splat.ply", random_gaussians(3))
     assert not is_model(tmp_path)

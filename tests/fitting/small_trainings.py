@@ -29,14 +29,14 @@ def joint(fit: FitConfig, device: torch.device) -> KeyssTraining:
     """With wrong keys, poses of both scenes, and all attributes decoded."""
     options = small("published", fit, common_poses=0.5)
     keys = list(random_embeddings(1, torch.Generator().manual_seed(0)))
-    return KeyssTraining(_placed(), keys, options, options.configuration, device)
+    return KeyssTraining(placed(), keys, options, options.configuration, device)
 
 
 def watergs(fit: FitConfig, device: torch.device) -> KeyssTraining:
     """A peer with a network, and with parameters that have no gradients at the end."""
     method: Any = registry.get("watergs")
     options = method.options(fit=fit, common_poses=0.5)
-    return method.training(_placed(), options, device)  # type: ignore[no-any-return]
+    return method.training(placed(), options, device)  # type: ignore[no-any-return]
 
 
 RUNS: Mapping[str, Callable[[FitConfig, torch.device], Any]] = {
@@ -53,7 +53,8 @@ def trained(name: str, fit: FitConfig, device: str = "cpu", **options: Any) -> T
     return run
 
 
-def _placed() -> list[PlacedScene]:
+def placed() -> list[PlacedScene]:
+    """Two scenes in one frame."""
     scenes = [tiny_scene(0), tiny_scene(1)]
     models = [random_gaussians(seed=seed, sh_degree=1) for seed in (0, 1)]
     return [PlacedScene.of(*each, Similarity()) for each in zip(scenes, models, strict=True)]

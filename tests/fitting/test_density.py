@@ -33,21 +33,6 @@ def test_growth_stops_at_the_cap_and_prefers_the_largest_gradients() -> None:
     assert kept[:-10].all()
 
 
-def test_all_gaussians_above_the_threshold_grow_below_the_cap() -> None:
-    strategy, parameters, optimizers, state = _setup(10 * COUNT)
-    strategy._grow_gs(parameters, optimizers, state, step=1000)
-    assert len(parameters["means"]) == 2 * COUNT - 1  # all but the first, whose gradient is 0
-
-
-def test_pruning_continues_at_the_cap_and_uses_the_given_opacity() -> None:
-    strategy, parameters, optimizers, state = _setup(COUNT)
-    opacities = torch.full((COUNT,), 0.5)
-    opacities[:7] = 0.001
-    strategy.opacity_for_pruning = lambda: opacities
-    assert strategy._prune_gs(parameters, optimizers, state, step=1000) == 7
-    assert all(len(parameter) == COUNT - 7 for parameter in parameters.values())
-
-
 def test_never_prunes_everything() -> None:
     strategy, parameters, optimizers, state = _setup(COUNT)
     strategy.opacity_for_pruning = lambda: torch.zeros(COUNT)

@@ -57,6 +57,28 @@ def test_fitting_improves_psnr_on_test_views() -> None:
     assert len(start) < len(fitted) <= config.max_gaussians
 
 
+def test_what_masks_cover_has_no_part_in_a_fit() -> None:
+    scene, config = tiny_scene(views=32), replace(CONFIG, iterations=300)
+    generator = torch.Generator().manual_seed(5)
+    masked, occluded = [], []
+    for index, view in enumerate(scene.train):
+        mask, image = torch.ones(view.image.shape[:2], dtype=torch.bool), view.image.clone()
+        if index % 3:  # something that moves before the scene
+            x, y = (int(torch.randint(low, low + 8, (1,), generator=generator)) for low in (8, 5))
+            mask[y : y + 12, x : x + 14] = False
+            image[~mask] = torch.tensor([255, 0, 255], dtype=torch.uint8)
+        masked.append(replace(view, mask=mask))
+        occluded.append(replace(view, image=image, mask=mask))
+    unmasked = [replace(view, mask=None) for view in occluded]
+    with_masks, same, without = (
+        fit_scene(replace(scene, train=tuple(views)), config).gaussians
+        for views in (occluded, masked, unmasked)
+    )
+    assert _same(with_masks, same)
+    good, bad = (mean_psnr(model, scene.test, scene.background) for model in (with_masks, without))
+    assert good > bad + 2
+
+
 def test_a_step_minimises_the_mean_loss_of_its_views() -> None:
     scene, config = tiny_scene(), replace(CONFIG, views_per_step=2)
     run, same = (PlainRun(scene, config, torch.device("cpu")) for _ in range(2))
@@ -82,7 +104,7 @@ def test_one_seed_gives_one_model_and_leaves_the_global_random_state_alone() -> 
     assert not _same(first, fit_scene(scene, replace(CONFIG, seed=1)).gaussians)
 
 
-@pytest.mark.parametrize("iteration", [1, 33, 80])
+@pytest.mark.parametrize("iteration", [1, 33])
 def test_an_interrupted_run_resumes_to_the_same_model(tmp_path: Path, iteration: int) -> None:
     scene, path = tiny_scene(), tmp_path / "checkpoint.safetensors"
     with pytest.raises(Interrupted) as caught:
@@ -101,16 +123,6 @@ def test_a_checkpoint_of_other_settings_is_refused(tmp_path: Path) -> None:
         fit_scene(tiny_scene(3), replace(CONFIG, iterations=5), checkpoint=path, resume=True)
 
 
-def test_a_checkpoint_of_another_version_is_refused(tmp_path: Path) -> None:
-    scene, path = tiny_scene(), tmp_path / "checkpoint.safetensors"
-    fit_scene(scene, replace(CONFIG, iterations=5), checkpoint=path)
-    tensors, meta = load_checkpoint(path)
-    tensors["sh0"] = tensors.pop("sh")
-    save_checkpoint(path, tensors, meta)
-    with pytest.raises(InputError, match="this version"):
-        fit_scene(scene, replace(CONFIG, iterations=5), checkpoint=path, resume=True)
-
-
 def test_a_damaged_checkpoint_is_an_input_error(tmp_path: Path) -> None:
     path = tmp_path / "checkpoint.safetensors"
     save_checkpoint(path, {"a": torch.ones(3)}, {"iteration": 1})
@@ -127,24 +139,7 @@ def test_a_scene_without_points_starts_from_random_ones() -> None:
     assert mean_psnr(fitted, scene.test, scene.background) > 18
 
 
-def test_sh_degree_rises_within_a_run_of_any_length() -> None:
-    for iterations in (10, 300, 30_000):
-        config = FitConfig(iterations=iterations)
-        assert config.sh_degree_at(0) == 0
-        assert config.sh_degree_at(iterations) == 3
-
-
 @pytest.mark.parametrize("changes", [{"iterations": 0}, {"max_gaussians": -5}, {"sh_degree": 4}])
 def test_settings_out_of_range_are_refused_by_name(changes: dict[str, int]) -> None:
     with pytest.raises(UsageError, match=next(iter(changes))):
         FitConfig(**changes)  # type: ignore[arg-type]
-
-
-def test_nothing_is_left_below_the_limit_of_pruning() -> None:
-    config = replace(CONFIG, iterations=60, grow_start=0.1, grow_stop=0.2, prune_opacity=0.08)
-    fitted = fit_scene(tiny_scene(), config).gaussians
-    run = PlainRun(tiny_scene(), config, torch.device("cpu"))
-    torch.manual_seed(config.known_seed)
-    while run.iteration < config.iterations:
-        run.step()
-    assert float(run.gaussians().opacities.min()) < 0.08 <= float(fitted.opacities.min())

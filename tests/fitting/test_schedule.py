@@ -53,13 +53,6 @@ def test_short_runs_start_with_larger_rates_and_end_with_those_of_3dgs() -> None
     )
 
 
-def test_boosts_fall_with_the_number_of_steps() -> None:
-    boosts = [Schedule(FitConfig(iterations=n), _cameras(), EXTENT).boost for n in (10, 1000, 3000, 29_000)]
-    assert boosts == sorted(boosts, reverse=True)
-    assert boosts[1] == pytest.approx(5, rel=1e-2)
-    assert boosts[3] > 1
-
-
 def test_positions_move_in_proportion_to_a_pixel_of_the_nearest_camera() -> None:
     depths = torch.tensor([-0.9, 0.0, 1.0, 100.0, -3.1])
     means = torch.stack([torch.zeros(5), torch.zeros(5), depths], 1)
@@ -70,18 +63,3 @@ def test_positions_move_in_proportion_to_a_pixel_of_the_nearest_camera() -> None
     config = FitConfig(iterations=1000)
     narrow = Schedule(config, _cameras(zoom=2.3), EXTENT).pixel_sizes(means)
     assert torch.allclose(narrow, distances / 2, atol=1e-5)
-
-
-def test_what_fills_the_nearest_view_grows_as_in_3dgs() -> None:
-    """At a distance of 1; the sizes are half, twice, ten and a hundred times the limit of a twentieth."""
-    config, model = FitConfig(iterations=1000), random_gaussians(4)
-    sizes = torch.tensor([0.025, 0.1, 0.5, 5.0])
-    thin = torch.stack([sizes.log(), torch.full((4,), -9.0), torch.full((4,), -9.0)], 1)
-    model = replace(model, means=torch.zeros(4, 3), log_scales=thin)
-    optimizers = make_optimizers(to_parameters(model, torch.device("cpu")), config, EXTENT)
-    Schedule(config, _cameras(), EXTENT).set(optimizers, 1)
-    found = {name: each["row_scale"] for name in optimizers for each in optimizers[name].state.values()}
-    assert found.keys() == {"means", "scales", "opacities"}
-    assert torch.allclose(found["scales"], torch.tensor([1, 0.5, 0.2, 0.2]), atol=2e-3)
-    least = 5**-0.25
-    assert torch.allclose(found["opacities"], torch.tensor([1, least, least, least]), atol=2e-3)

@@ -9,7 +9,7 @@ import torch
 from argon2.low_level import Type, hash_secret_raw
 
 from keyss.core import InputError, UsageError
-from keyss.keys import ALPHABET, DerivedKey, MasterKey, generate_key, random_embeddings
+from keyss.keys import ALPHABET, DerivedKey, MasterKey, generate_key
 
 pytestmark = pytest.mark.argon2
 
@@ -71,13 +71,6 @@ def test_generated_keys_are_alphanumeric_and_fresh() -> None:
     assert len(generate_key(40)) == 40
     with pytest.raises(UsageError):
         generate_key(0)
-
-
-def test_random_embeddings_are_unit_vectors_from_the_generator() -> None:
-    first = random_embeddings(5, torch.Generator().manual_seed(3))
-    assert first.shape == (5, 64)
-    torch.testing.assert_close(first.norm(dim=1), torch.ones(5))
-    assert torch.equal(first, random_embeddings(5, torch.Generator().manual_seed(3)))
 
 
 @pytest.mark.argon2

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 
 import numpy as np
@@ -14,7 +13,6 @@ from scipy.stats import norm
 
 from keyss.core import UsageError
 from keyss.lab import auc_between, stegexpose_auc
-from keyss.runs import record_bytes
 from lab.test_stegexpose import smooth, with_payload
 
 SCORES = st.lists(st.sampled_from([None, math.nan, -0.5, 0.0, 0.1, 0.2, 0.7, 1e300]), min_size=1, max_size=9)
@@ -54,21 +52,6 @@ def test_the_interval_holds_the_truth_19_times_in_20() -> None:
     assert 0.92 < np.mean(held) < 0.985
 
 
-def test_classes_that_do_not_overlap_leave_some_doubt() -> None:
-    """Were the true AUC 0.478, five disjoint pairs would all be in order once in 40 times."""
-    found = auc_between([0.0] * 5, [1.0] * 9)
-    assert (found.auc, found.high) == (1, 1)
-    assert found.low**5 == pytest.approx(1 / 40)
-    reverse = auc_between([1.0] * 9, [0.0] * 5)
-    assert (reverse.auc, reverse.low) == (0, 0)
-    assert reverse.high == pytest.approx(1 - found.low)
-
-
-def test_what_has_no_score_is_below_all_others() -> None:
-    found = auc_between([math.nan, 0.0], [None, -5.0, math.nan])
-    assert found.auc == pytest.approx((0.5 + 1 + 0.5) / 6)
-
-
 @pytest.mark.parametrize(("negatives", "positives"), [([], [1.0]), ([1.0], []), ([], [])])
 def test_a_class_without_scores_is_refused(negatives: list[float], positives: list[float]) -> None:
     with pytest.raises(UsageError, match="both classes"):
@@ -94,30 +77,6 @@ class TestStegExpose:
             "sample_pairs": 1.0,
             "rs": 1.0,
         }
-
-    def test_a_model_that_draws_otherwise_is_not(self) -> None:
-        """What hiding in a model does to its renders: some light more or less, before rounding."""
-        random = np.random.default_rng(5)
-        plain = views((60, 80), 24)
-        stego = [np.rint(image + random.normal(0, 0.4, image.shape)).astype(np.uint8) for image in plain]
-        plain = [np.rint(image + random.normal(0, 0.4, image.shape)).astype(np.uint8) for image in plain]
-        found = stegexpose_auc(plain, stego).fused
-        assert found.low < 0.5 < found.high
-
-    def test_detectors_that_take_no_image_have_no_auc(self) -> None:
-        images = views((9, 12))
-        found = stegexpose_auc(images, images)
-        assert found.detectors == {
-            "primary_sets": 0.5,
-            "chi_square": None,
-            "sample_pairs": None,
-            "rs": 0.5,
-        }
-        assert found.fused.auc == 0.5
-
-    def test_images_without_any_score_are_none(self) -> None:
-        found = stegexpose_auc([smooth((1, 1))], [smooth((1, 1))])
-        assert json.loads(record_bytes(found))["plain"][0]["fusion"] is None
 
     def test_other_views_are_refused(self) -> None:
         images = views((9, 12))

@@ -11,9 +11,7 @@ import pytest
 import torch
 
 import keyss
-from channels.quiet.trained_like import trained_like
 from keyss import CarryOptions
-from keyss.channels import LOW_BITS
 from keyss.core import Gaussians, KeyssWarning, Scene, Similarity, UsageError, WrongKeyError, same_bits
 from keyss.fitting import mean_psnr
 from keyss.lab import (
@@ -21,14 +19,12 @@ from keyss.lab import (
     default_changes,
     half_floats,
     measure_robustness,
-    noise,
     purification,
     random_pruning,
     reveal_changed,
 )
-from keyss.methods import Opened, open_model, record_request
+from keyss.methods import Opened, open_model
 from lab.opened import Whole
-from methods.carry.carried import embed
 from methods.carry.test_refit import TINY
 from methods.hiding import hide_scenes, moved, three_scenes
 from tiny_scenes import random_gaussians, tiny_scene
@@ -60,13 +56,6 @@ def test_losses_are_differences_of_quality(scene: Scene) -> None:
     assert measure_robustness(model, [Whole], scene, [scene], changes=changes) == rows
 
 
-def test_views_are_bounded() -> None:
-    scene, model = tiny_scene(0, views=16), random_gaussians(150, seed=0)
-    (row,) = measure_robustness(model, [], scene, [], changes=[], max_views=1)
-    assert row.cover is not None
-    assert row.cover.psnr == mean_psnr(model, scene.test[:1], scene.background)
-
-
 def test_a_lost_secret_looks_like_the_cover_from_the_secrets_cameras(scene: Scene) -> None:
     """The secret's cameras are the cover's in another frame: chance level is the cover's quality."""
     model = random_gaussians(seed=0)
@@ -89,20 +78,6 @@ def test_a_lost_secret_looks_like_the_cover_from_the_secrets_cameras(scene: Scen
         measure_robustness(model, [], scene, [scene], changes=[])
     with pytest.raises(WrongKeyError):
         measure_robustness(model[:5], [opener], scene, [elsewhere], changes=[])
-
-
-def test_a_secret_that_one_seed_loses_does_not_open(scene: Scene) -> None:
-    model = random_gaussians(seed=0)
-    changes = [random_pruning(0.5, seed) for seed in (0, 1)]
-    kept = changes[0](model).means
-
-    def opener(changed: Gaussians) -> Whole:
-        if len(changed) < len(model) and not torch.equal(changed.means, kept):
-            raise WrongKeyError("this key opens nothing here")
-        return Whole(changed)
-
-    _, pruned = measure_robustness(model, [opener], scene, [scene], changes=changes)
-    assert (pruned.secrets[0].opens, pruned.secrets[0].error) == (False, "this key opens nothing here")
 
 
 def test_the_default_changes_are_those_of_the_papers_and_more(scene: Scene) -> None:
@@ -163,19 +138,3 @@ def test_a_refitted_secret_without_low_bits(
     assert purified.cover is not None
     assert abs(purified.cover.loss) < 0.1
     assert purified.secrets[0].loss > 10  # nothing of the secret is seen in the cover
-
-
-def test_pruning_a_carried_model_costs_what_it_must() -> None:
-    """A Gaussian of the secret is lost with its carrier, unless there is a copy on another."""
-    cover, secret, share = trained_like(3000), trained_like(1200, seed=1), 0.25
-    stego = embed(cover, [(KEY, secret)])
-    (layout,) = LOW_BITS.prepare(cover).cells.plan_records([record_request(1200, 3)])
-    expected = (1200 - layout.copies) * (1 - share) + layout.copies * (1 - share**2)
-    left = reveal_changed(opener, random_pruning(share)(stego))
-    assert abs(len(left) - expected) < 5 * (1200 * share * (1 - share)) ** 0.5
-    whole = reveal_changed(opener, stego)
-    assert len(whole) == 1200
-    assert left.opacities.mean() > whole.opacities.mean() + 0.02  # makes up for those that are lost
-    with pytest.raises(WrongKeyError):
-        reveal_changed(opener, noise("harmonics", 1e-4)(stego))
-    assert len(reveal_changed(opener, noise("colour", 0.1)(stego))) == 1200  # carries nothing

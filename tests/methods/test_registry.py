@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
 import pytest
@@ -27,10 +27,8 @@ from keyss.methods import (
     Remains,
     Source,
     Stego,
-    encode_all,
     registry,
 )
-from methods.keyss.small import some_secret
 from tiny_scenes import random_gaussians
 
 KEY = "a key of many characters: 93hXmQ2"
@@ -175,35 +173,3 @@ def test_a_method_that_this_program_does_not_have_is_named(
         keyss.hide(cover, [Secret(secret, KEY)], method="whole")
     with pytest.raises(UsageError, match="WholeOptions"):
         keyss.hide(cover, [Secret(secret, KEY)], method=WholeOptions())
-
-
-@pytest.mark.parametrize(("method", "expected"), [("keyss", "KeyssSecret"), ("carry", "CarriedSecret")])
-def test_what_lies_in_a_model_tells_its_method(method: str, expected: str) -> None:
-    """One reading of the low bits serves all methods."""
-    prepared = LOW_BITS.prepare(trained_like(2500))
-    content: dict[str, Callable[[], Any]] = {
-        "keyss": lambda: some_secret(prepared.cover).payload(),
-        "carry": lambda: encode_all(prepared, [trained_like(100, 1)])[0],
-    }
-    stego = prepared.embed([(KEY, content[method]())])
-    opened = registry.open_model(stego, KEY)
-    assert type(opened).__name__ == expected
-    assert 0 < len(opened.reveal(stego)) <= 2500
-
-
-@pytest.mark.parametrize(
-    ("name", "changes"),
-    [
-        *((name, {"network_rate": 0.0}) for name in ("3dgs-sh", "gs-hider")),
-        ("3dgs-decoder", {"network_rate": float("nan")}),
-    ],
-)
-def test_what_would_be_divided_by_nothing_is_refused(name: str, changes: dict[str, Any]) -> None:
-    options = registry.get(name).options()
-    with pytest.raises(UsageError, match=f"`{next(iter(changes))}`: expected a number above 0"):
-        replace(options, **changes)
-
-
-def test_opacities_that_would_never_be_mapped_are_refused() -> None:
-    with pytest.raises(UsageError, match="before growth stops"):
-        registry.get("watergs").options.preset("default").with_fit(iterations=1)

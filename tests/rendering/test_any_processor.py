@@ -6,6 +6,8 @@ import os
 import sys
 from pathlib import Path
 
+import pytest
+
 from keyss.rendering.cpu import jit
 from rendering import child_process
 
@@ -13,6 +15,7 @@ from rendering import child_process
 SCENES = ("random", "three cameras, features")
 
 
+@pytest.mark.slow
 def test_images_and_gradients_without_avx2() -> None:
     """In a child process, since the processor is chosen once; the compiled kernels are cached."""
     cache = jit.cache_folder()

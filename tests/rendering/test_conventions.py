@@ -52,19 +52,6 @@ def test_x_is_right_and_y_is_down() -> None:
     assert divmod(int(alpha.argmax()), 9) == (5, 6)
 
 
-def test_front_covers_back_and_background_lies_behind() -> None:
-    image, _ = draw([[0, 0, 2], [0, 0, 1]], [0.5, 0.25], [[1, 0, 0], [0, 1, 0]], background=[0, 0, 1])
-    assert image[4, 4].tolist() == pytest.approx([0.75 * 0.5, 0.25, 0.75 * 0.5], abs=1e-6)
-
-
-def test_alpha_is_cut_off_below_1_in_255_and_clamped_at_0_999() -> None:
-    assert draw([[0, 0, 1]], [0.99 / 255], [[1, 1, 1]])[1].max() == 0
-    assert draw([[0, 0, 1]], [1.01 / 255], [[1, 1, 1]])[1].max() == pytest.approx(1.01 / 255, rel=1e-5)
-    assert draw([[0, 0, 1]], [1.0], [[1, 1, 1]])[1].max() == pytest.approx(0.999, abs=1e-6)
-    _, alpha = draw([[0, 0, 1]], [0.5], [[1, 1, 1]])
-    assert (alpha[alpha > 0] >= 1 / 255).all()
-
-
 def test_a_pixel_stops_before_its_transmittance_falls_to_1_in_10000() -> None:
     # 0.1^3 = 1e-3 passes; the fourth would leave 1e-4 exactly or less, and is not drawn.
     _, alpha = draw([[0, 0, 1.0 + i] for i in range(5)], [0.91] * 5, [[1, 1, 1]] * 5, scale=0.3)
@@ -93,18 +80,3 @@ def test_colour_is_half_plus_the_constant_harmonic_and_is_not_clamped_above() ->
     below = Gaussians(*(getattr(gaussians, name) for name in ("means", "quats", "log_scales")),
                       gaussians.opacity_logits, -dc * 10)  # fmt: skip
     assert render(below, camera)[4, 4, 0] == 0
-
-
-def test_sh_degree_limits_the_harmonics() -> None:
-    generator = torch.Generator().manual_seed(0)
-    camera = Camera(torch.eye(4), torch.tensor([[10.0, 0, 4.5], [0, 10, 4.5], [0, 0, 1]]), 9, 9)
-    gaussians = Gaussians(
-        torch.tensor([[0.1, 0.2, 1]]),
-        torch.tensor([[1.0, 0, 0, 0]]),
-        torch.full((1, 3), -2.0),
-        torch.tensor([3.0]),
-        torch.randn(1, 16, 3, generator=generator),
-    )
-    for degree in range(4):
-        expected = render(gaussians.with_sh_degree(degree), camera)
-        assert torch.equal(render(gaussians, camera, sh_degree=degree), expected)

@@ -66,16 +66,6 @@ def test_the_picture_is_what_the_layers_make_of_the_features(model: DecodedGauss
     torch.testing.assert_close(render(model, camera), expected, atol=1e-4, rtol=1e-4)
 
 
-def test_without_features_the_network_sees_the_colours_before_its_own_background() -> None:
-    """The caller's background is not the one that the network was trained with."""
-    plain, camera = random_gaussians(50), ring_cameras()[0]
-    identity = torch.zeros(3, 3, 3, 3)
-    identity[range(3), range(3), 1, 1] = 1
-    own = torch.tensor([0.2, 0.4, 0.6])
-    shown = DecodedGaussians.of(plain, PictureNetwork(((identity, torch.zeros(3)),), own))
-    torch.testing.assert_close(render(shown, camera, torch.ones(3)), render(plain, camera, own))
-
-
 def test_selecting_moving_and_turning_keep_the_network(model: DecodedGaussians) -> None:
     camera = ring_cameras()[3]
     turn = torch.linalg.matrix_exp(torch.tensor([[0, -0.3, 0.1], [0.3, 0, 0.2], [-0.1, -0.2, 0]]).double())

@@ -33,18 +33,6 @@ def test_a_buffer_is_used_again_only_after_its_last_array_is_gone() -> None:
     assert again.dtype == np.int32
 
 
-def test_free_memory_is_bounded() -> None:
-    arrays = [memory.empty((100_000 + size,), np.uint8) for size in range(3 * memory.MAX_FREE)]
-    arrays.clear()
-    assert len(memory._free) == 3 * memory.MAX_FREE
-    memory.empty((10_000_000,), np.uint8)  # fits into none of them
-    assert len(memory._free) == memory.MAX_FREE + 1
-
-
-def test_arrays_may_be_empty() -> None:
-    assert memory.empty((0, 16), np.float32).shape == (0, 16)
-
-
 # A million Gaussians as in fitted scenes, nearly all of them visible. A few are drawn before, so that what
 # the compiler takes is not counted.
 DRAW_A_MILLION = """

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from keyss.core import Gaussians, Similarity, camera_positions
+from keyss.core import Gaussians, camera_positions
 from keyss.rendering import VIEWS, middle_and_radius, scene_of_model
 from keyss.rendering.orbit import orbit
 from tiny_scenes import random_gaussians
@@ -50,33 +50,3 @@ def test_a_model_without_extent_still_makes_a_scene(model: Gaussians) -> None:
     scene = scene_of_model(model, "dot", size=8)
     assert len(scene.views) == VIEWS
     assert all(view.camera.viewmat.isfinite().all() for view in scene.views)
-
-
-def test_models_move_with_their_cameras() -> None:
-    """A moved and scaled model has the same views."""
-    model = random_gaussians(300)
-    frame = Similarity(
-        3.0, torch.eye(3, dtype=torch.float64), torch.tensor([5.0, 1, -2], dtype=torch.float64)
-    )
-    here, there = (scene_of_model(each, "m", size=SIZE) for each in (model, frame.apply_gaussians(model)))
-    difference = here.train[0].image.float() - there.train[0].image.float()
-    assert difference.abs().mean() < 1
-
-
-@pytest.mark.parametrize(("place", "log_scale"), [(0.0, 10.0), (1e10, 10.0), (1e30, 80.0)])
-def test_one_huge_gaussian_is_not_all_that_cameras_look_at(place: float, log_scale: float) -> None:
-    model = random_gaussians(500)
-    middle, radius = middle_and_radius(model)
-    changed = model.map(torch.clone)
-    changed.means[7], changed.log_scales[7], changed.opacity_logits[7] = place, log_scale, 9.0
-    found, reach = middle_and_radius(changed)
-    torch.testing.assert_close(found, middle, atol=0.1 * radius, rtol=0)
-    assert reach == pytest.approx(radius, rel=0.1)
-
-
-def test_large_models_have_two_test_views(monkeypatch: pytest.MonkeyPatch) -> None:
-    model = random_gaussians(20)
-    assert len(scene_of_model(model, "m", size=8, train_pictures=False).test) == 8
-    monkeypatch.setattr("keyss.rendering.orbit._LARGE", 20)
-    scene = scene_of_model(model, "m", size=8, train_pictures=False)
-    assert (len(scene.test), len(scene.views)) == (2, VIEWS)

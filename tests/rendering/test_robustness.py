@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
 import pytest
 import torch
 
 from keyss.rendering import rasterization
-from keyss.rendering.cpu import memory, rasterization as cpu_rasterization
-from rendering.scenes import DIFFERENTIABLE, random_scene
+from rendering.scenes import random_scene
 
 ATTRIBUTES = ("means", "quats", "scales", "opacities", "colors")
 
@@ -67,45 +65,3 @@ def test_nothing_to_see_is_the_background(count: int) -> None:
     assert (means.grad == 0).all()
     assert background.grad is not None
     assert background.grad.tolist() == [[45.0, 45.0, 45.0]]
-
-
-def test_without_cameras_there_are_no_images_and_all_gradients_are_zero() -> None:
-    scene = random_scene(count=3000, cameras=0)
-    for floats in (3000, 9000, 12000, 144000):  # what the memory holds of which gradients may be made
-        memory.empty((floats,), np.float32)[:] = math.nan
-    results = scene.results()
-    assert results["images"].shape == (0, scene.height, scene.width, 3)
-    for name in DIFFERENTIABLE:
-        assert (results[f"gradient of {name}"] == 0).all(), name
-
-
-def test_only_wanted_gradients_are_made() -> None:
-    scene = random_scene()
-    for wanted in DIFFERENTIABLE:
-        leaves = {name: leaf.requires_grad_(name == wanted) for name, leaf in scene.leaves().items()}
-        images, _, meta = scene.draw(leaves)
-        images.sum().backward()
-        assert [name for name, leaf in leaves.items() if leaf.grad is not None] == [wanted]
-        assert meta["means2d"].requires_grad == (wanted not in ("colors", "backgrounds"))
-    with torch.no_grad():
-        images, _, meta = scene.draw(scene.leaves())
-    assert not images.requires_grad
-    assert not meta["means2d"].requires_grad
-
-
-def test_alpha_alone_has_gradients() -> None:
-    scene = random_scene()
-    leaves = scene.leaves()
-    _, alphas, _ = scene.draw(leaves)
-    alphas.sum().backward()
-    assert leaves["opacities"].grad is not None
-    assert (leaves["opacities"].grad > 0).any()
-    assert leaves["colors"].grad is not None
-    assert (leaves["colors"].grad == 0).all()
-
-
-def test_too_many_tiles_are_an_error_not_a_crash(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cpu_rasterization, "MAX_PAIRS", 3)
-    scene = random_scene()
-    with pytest.raises(cpu_rasterization.BackendError, match="tiles together"):
-        scene.draw(scene.leaves())

@@ -3,19 +3,15 @@
 from __future__ import annotations
 
 import multiprocessing
-import os
-import subprocess
 import sys
 import threading
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
-from typing import ClassVar
 
 import pytest
 import torch
 from torch import Tensor
 
-import rasterizer_threads
 from keyss import FitConfig, _threads, fit
 from keyss.core import KeyssWarning
 from keyss.rendering.cpu import parallel
@@ -86,24 +82,6 @@ def test_python_threads_may_render_at_once(threads: int) -> None:
             assert wrong == [[]] * 12
 
 
-@pytest.mark.parametrize(("threads", "cores", "expected"), [(1, 8, 1), (2, 8, 2), (7, 8, 7), (7, 2, 2)])
-def test_no_more_threads_than_torch_uses_and_the_machine_has(
-    threads: int, cores: int, expected: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(parallel, "_CORES", cores)
-    torch.set_num_threads(threads)
-    everyone = threading.Barrier(expected)
-    seen: list[int] = []
-
-    def kernel(counter: object) -> None:
-        seen.append(threading.get_ident())
-        everyone.wait(PATIENCE)  # breaks, with an error, where fewer come
-
-    parallel.run(kernel)
-    assert len(seen) == len(set(seen)) == expected
-    assert threading.get_ident() in seen
-
-
 def test_an_error_on_a_helper_thread_is_raised() -> None:
     torch.set_num_threads(2)
     here, both = threading.get_ident(), threading.Barrier(2)
@@ -115,25 +93,6 @@ def test_an_error_on_a_helper_thread_is_raised() -> None:
 
     with pytest.raises(RuntimeError, match="the helper failed"):
         parallel.run(kernel)
-
-
-def test_a_kernel_is_loaded_by_the_thread_that_calls_it() -> None:
-    """Otherwise Ctrl-C, which interrupts that thread, could leave a helper waiting for a lock forever."""
-    seen: list[str] = []
-
-    class Kernel:
-        overloads: ClassVar[dict[str, str]] = {}
-
-        def __call__(self, counter: object) -> None:
-            seen.append(threading.current_thread().name)
-            self.overloads["loaded"] = ""
-
-    torch.set_num_threads(2)
-    kernel = Kernel()
-    parallel.run(kernel)
-    assert seen == [threading.current_thread().name]
-    parallel.run(kernel)
-    assert len(seen) >= 2  # a helper may come too late to be called
 
 
 def test_spawned_processes_draw_the_same() -> None:
@@ -160,36 +119,6 @@ def test_forked_processes_draw_the_same() -> None:
         child.join(PATIENCE)
         child.kill()
     assert digest(scene) == expected
-
-
-def test_pieces_that_are_dealt_out_are_all_of_the_work() -> None:
-    """The pieces that the benchmark times one by one make up a complete rendering."""
-    scene = many()
-    expected = scene.results()
-    with rasterizer_threads.timed(4) as found:
-        assert differing(scene.results(), expected) == []
-    assert set(found.pieces) > {"project", "list_pairs", "sort_pairs", "blend", "blend_backward"}
-    assert all(seconds >= 0 for pieces in found.pieces.values() for seconds in pieces)
-
-
-def test_the_next_piece_goes_to_who_is_free_first() -> None:
-    assert rasterizer_threads.makespan([3, 1, 1, 1], 1) == 6
-    assert rasterizer_threads.makespan([3, 1, 1, 1], 2) == 3
-    assert rasterizer_threads.makespan([1, 1, 1, 3], 2) == 4
-    assert rasterizer_threads.makespan([1, 2], 8) == 2
-
-
-@pytest.mark.parametrize(
-    ("imports", "spinning"), [("torch, keyss", True), ("keyss, torch", False), ("torch", None)]
-)
-def test_spinning_idle_threads_of_torch_are_detected(imports: str, spinning: bool | None) -> None:
-    """A choice of the user is not reported."""
-    environment = {name: value for name, value in os.environ.items() if name != "OMP_WAIT_POLICY"}
-    if spinning is None:
-        environment["OMP_WAIT_POLICY"] = "active"
-    code = f"import {imports}; from keyss import _threads; print(_threads.spinning)"
-    found = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
-    assert found.stdout.strip() == str(bool(spinning))
 
 
 def test_training_warns_of_spinning_threads(monkeypatch: pytest.MonkeyPatch) -> None:

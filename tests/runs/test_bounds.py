@@ -10,10 +10,7 @@ import pytest
 
 import keyss
 from keyss import CarryOptions, FitConfig, Secret
-from keyss.fitting import PRESETS, PlainRun, plain
-from keyss.methods import Bound, Training, registry
-from keyss.runs import HideMetrics
-from tiny_scenes import tiny_scene
+from keyss.fitting import PlainRun
 
 FIT = FitConfig(iterations=40, max_gaussians=300, grow_every=20, evaluate_every=0, seed=0)
 KEY = "a key of many characters: 93hXmQ2"
@@ -79,50 +76,3 @@ def test_a_start_with_fewer_steps_is_not_called_a_bound(
         folders[0], [unknown], method=CarryOptions(fit=FIT, publish="any"), bound=True, min_psnr=0
     ).metrics
     assert carried.baseline.equal == (True, True)  # nothing is trained on
-
-
-@pytest.mark.parametrize("name", registry.METHODS)
-def test_bounds_follow_from_the_training_of_a_method(name: str) -> None:
-    for options in map(registry.get(name).options.preset, PRESETS):
-        trainings = options.training(2)
-        assert len(trainings) == 2
-        assert any(each.steps for each in trainings) == options.trains
-        for each in trainings:
-            bound = Bound.of(each, options.fit.iterations)
-            assert bound.steps is not None
-            plain_steps = options.fit.iterations if each.continues else 0
-            assert bound.steps == plain_steps + each.steps
-            assert bound.config(options.fit).iterations == bound.steps
-
-
-def test_peers_train_both_scenes_at_every_step() -> None:
-    for name in ("3dgs-sh", "3dgs-decoder", "gs-hider", "watergs"):
-        options = registry.get(name).options()
-        if options.trains:
-            assert options.training(2) == (Training(options.fit.iterations, continues=False),) * 2
-            assert Bound.of(options.training(2)[0], options.fit.iterations).equal
-
-
-def test_rates_settle_to_a_tenth(monkeypatch: pytest.MonkeyPatch) -> None:
-    rates: list[float] = []
-    step = PlainRun.step
-
-    def watched(self: PlainRun) -> None:
-        step(self)
-        rates.append(self.optimizers["opacities"].param_groups[0]["lr"])
-
-    monkeypatch.setattr(PlainRun, "step", watched)
-    plain.fit_scene(tiny_scene(0), replace(FIT, settle=0.25, boost=1.0))
-    assert rates[:30] == [FIT.opacities_rate] * 30
-    assert rates[30] < rates[29]
-    assert rates[-1] == pytest.approx(0.1 * FIT.opacities_rate)
-    assert sorted(rates, reverse=True) == rates
-
-
-def test_older_records_are_read(folders: tuple[Path, Path]) -> None:
-    metrics = keyss.hide(
-        folders[0], [Secret(folders[1], KEY)], method=CarryOptions(fit=FIT, publish="any"), min_psnr=0
-    ).metrics
-    data = msgspec.to_builtins(metrics)
-    del data["steps"], data["baseline"]["steps"], data["baseline"]["equal"]
-    assert msgspec.convert(data, HideMetrics).baseline.equal == ()

@@ -10,7 +10,7 @@ import pytest
 
 from keyss.core import OutputError, UsageError
 from keyss.files import lock, write_bytes
-from keyss.runs import MANIFEST, Manifest, RunFolder, clear, read_manifest, write_again
+from keyss.runs import MANIFEST, Manifest, RunFolder, read_manifest, write_again
 
 
 def tree(folder: Path) -> dict[str, bytes]:
@@ -97,16 +97,6 @@ def test_overwriting_removes_what_was_written_and_nothing_else(tmp_path: Path) -
     assert read_manifest(tmp_path).files == {"hide": ("publish/model.ply",)}
 
 
-def test_an_audit_keeps_the_results_of_hiding(tmp_path: Path) -> None:
-    make(tmp_path)
-    for data in (b"first", b"second"):
-        make(tmp_path, "audit", {"private/report.html": data}, onto=("hide",), overwrite=data == b"second")
-    assert tree(tmp_path)["private/report.html"] == b"second"
-    assert tree(tmp_path)["publish/model.ply"] == b"1"
-    with pytest.raises(OutputError, match="exists"):
-        RunFolder(tmp_path, "audit", onto=("hide",))
-
-
 def test_files_of_others_are_never_replaced(tmp_path: Path) -> None:
     (tmp_path / "publish").mkdir()
     (tmp_path / "publish" / "model.ply").write_bytes(b"mine")
@@ -115,19 +105,6 @@ def test_files_of_others_are_never_replaced(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match="in the way"):
         make(tmp_path, overwrite=True)
     assert tree(tmp_path) == {"publish/model.ply": b"mine"}
-
-
-@pytest.mark.parametrize("name", ["checkpoint", "unfinished"])
-def test_folders_of_others_are_not_taken_for_unfinished_runs(tmp_path: Path, name: str) -> None:
-    make(tmp_path)
-    (tmp_path / "private" / name).mkdir()
-    (tmp_path / "private" / name / "notes.txt").write_bytes(b"mine")
-    before = tree(tmp_path), read_manifest(tmp_path)
-    with pytest.raises(OutputError, match="in the way"):
-        make(tmp_path, overwrite=True)
-    with pytest.raises(OutputError, match="in the way"):
-        clear(tmp_path)
-    assert (tree(tmp_path), read_manifest(tmp_path)) == before
 
 
 def test_a_folder_in_use_is_refused(tmp_path: Path) -> None:
@@ -174,23 +151,6 @@ def test_a_run_that_was_killed_without_a_checkpoint_starts_anew(tmp_path: Path) 
     assert read_manifest(tmp_path).running is None
 
 
-def test_starting_anew_drops_checkpoints_and_keeps_results_until_the_end(tmp_path: Path) -> None:
-    make(tmp_path)
-    interrupt(tmp_path, {"width": 1}, overwrite=True)
-    assert tree(tmp_path)["publish/model.ply"] == b"1"
-    folder = RunFolder(tmp_path, "hide", {"width": 2}, overwrite=True)
-    with folder.work():
-        assert not list(folder.checkpoints.iterdir())
-        folder.write({"publish/model.ply": b"new"})
-    assert tree(tmp_path) == {"publish/model.ply": b"new"}
-
-
-def test_resuming_a_run_that_never_began_starts_it(tmp_path: Path) -> None:
-    for path in (tmp_path / "new", tmp_path / "empty"):
-        path.name == "empty" and path.mkdir()
-        make(path, resume=True)
-
-
 def test_two_processes_are_not_at_work_in_one_folder(tmp_path: Path) -> None:
     make(tmp_path)
     with lock(tmp_path / "private" / "lock", tmp_path):
@@ -199,18 +159,6 @@ def test_two_processes_are_not_at_work_in_one_folder(tmp_path: Path) -> None:
         with pytest.raises(OutputError, match="another process is writing it"):
             write_again(tmp_path, "hide", "private/metrics.json", b"1")
     assert (tmp_path / MANIFEST).exists()
-
-
-def test_a_replaced_file_stays_in_the_manifest(tmp_path: Path) -> None:
-    make(tmp_path)
-    write_again(tmp_path, "audit", "private/report.html", b"1")
-    write_again(tmp_path, "audit", "private/report.html", b"2")
-    assert tree(tmp_path)["private/report.html"] == b"2"
-    (tmp_path / "private" / "mine").write_bytes(b"mine")
-    with pytest.raises(OutputError, match="in the way"):
-        write_again(tmp_path, "audit", "private/mine", b"3")
-    make(tmp_path, files={"publish/model.ply": b"new"}, overwrite=True)
-    assert tree(tmp_path) == {"publish/model.ply": b"new", "private/mine": b"mine"}
 
 
 @pytest.mark.parametrize("name", ["../victim", "/etc/passwd", "a/../../victim", "", MANIFEST])
@@ -235,33 +183,3 @@ def test_links_in_a_run_folder_are_not_followed(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match="leads out of"):
         make(run, overwrite=True)
     assert (elsewhere / "model.ply").read_bytes() == b"mine"
-
-
-def test_clearing_keeps_files_of_others(tmp_path: Path) -> None:
-    run = tmp_path / "run"
-    make(run)
-    (run / "notes.txt").write_bytes(b"mine")
-    clear(run)
-    assert tree(run) == {"notes.txt": b"mine"}
-    (run / "notes.txt").unlink()
-    make(run)
-    clear(run)
-    clear(run)
-    assert not run.exists()
-
-
-def test_a_folder_that_a_stage_wrote_is_replaced_and_one_with_anything_else_is_not(tmp_path: Path) -> None:
-    def write(folder: Path) -> None:
-        folder.mkdir()
-        (folder / "photo.png").write_bytes(b"photo")
-
-    for overwrite in (False, True, True):
-        with RunFolder(tmp_path / "run", "scenes", overwrite=overwrite).work() as run:
-            run.write({"scenes/a": write})
-    (tmp_path / "run/scenes/a/mine.txt").write_text("mine")
-    with (
-        pytest.raises(OutputError, match="keyss did not write it"),
-        RunFolder(tmp_path / "run", "scenes", overwrite=True).work() as run,
-    ):
-        run.write({"scenes/a": write})
-    assert (tmp_path / "run/scenes/a/photo.png").read_bytes() == b"photo"

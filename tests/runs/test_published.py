@@ -15,8 +15,7 @@ from channels.quiet.trained_like import trained_like
 from fitting.test_plain import InterruptAt
 from keyss import CarryOptions, FitConfig, Gaussians, Secret
 from keyss.core import Interrupted
-from keyss.methods import CarriedSecret, MethodOptions
-from keyss.runs import secret_ids
+from keyss.methods import MethodOptions
 from methods.keyss.small import small
 
 pytestmark = pytest.mark.usefixtures("umask")
@@ -96,13 +95,3 @@ def test_revealed_models_are_private_files(tmp_path: Path) -> None:
     (run / "private").chmod(0o755)  # as an older program left it
     keyss.evaluate(run, [KEY])
     assert set(_modes(run / "private").values()) == {0o700, 0o600}
-
-
-def test_a_secret_has_another_name_in_every_run() -> None:
-    """Names do not show that two runs hide the same secret, and cannot be looked up."""
-    opened = CarriedSecret(trained_like(100), 100, 568)
-    names = {seed: secret_ids(seed, [opened]) for seed in (1, 2)}
-    assert names[1] == secret_ids(1, [opened])
-    assert names[1] != names[2]
-    assert opened.fingerprint() not in names[1] + names[2]
-    assert secret_ids(1, [replace(opened, gaussians=trained_like(100, 1))]) != names[1]

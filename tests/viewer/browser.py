@@ -86,7 +86,7 @@ class Visit:
 
     def at(self, pose: str) -> None:
         """Move the camera there, also if the address has that pose already: it never has a secret's."""
-        self.page.evaluate(
+        self.page.frames[-1].evaluate(
             "pose => { location.hash = pose;"
             " dispatchEvent(new HashChangeEvent('hashchange', { newURL: location.href })) }",
             pose,

@@ -41,6 +41,7 @@ def foreign(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, st
         yield folder, address.rstrip("/")
 
 
+@pytest.mark.slow
 def test_an_element_of_another_site_shows_the_page_and_is_told(
     tab: Visit, stego: Path, foreign: tuple[Path, str], tmp_path: Path
 ) -> None:
@@ -70,6 +71,7 @@ def test_an_element_of_another_site_shows_the_page_and_is_told(
             assert tab.page.evaluate("told") == []
 
 
+@pytest.mark.slow
 def test_a_sandboxed_frame_shows_the_page_without_its_panel(
     tab: Visit, stego: Path, foreign: tuple[Path, str]
 ) -> None:
@@ -87,6 +89,7 @@ def test_a_sandboxed_frame_shows_the_page_without_its_panel(
     assert frame.locator("#rotate").get_attribute("aria-pressed") == "false"
 
 
+@pytest.mark.slow
 def test_a_poster_is_shown_until_there_is_a_picture(tab: Visit, stego: Path, tmp_path: Path) -> None:
     export_html(stego, tmp_path)
     Image.new("RGB", (8, 6), "red").save(tmp_path / "poster.png")
@@ -109,6 +112,7 @@ def test_what_is_no_origin_is_refused(stego: Path, tmp_path: Path, wrong: str) -
             export_html(stego, tmp_path / "page.html", look={name: wrong})
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not (WEB / "node_modules").exists(), reason="no web/node_modules: `make web` installs it")
 @pytest.mark.parametrize("engine", ["playcanvas", "spark"])
 def test_the_reader_gives_other_engines_what_a_key_opens(

@@ -7,7 +7,6 @@ import json
 import re
 import subprocess
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -133,15 +132,7 @@ def test_nobody_gets_anything_without_the_address(training: LiveTraining) -> Non
             assert get(training, name, folder)[0] == 404, folder + name
 
 
-def test_a_diverged_training_has_no_file(training: LiveTraining) -> None:
-    model, reporter = Copies(), training.reporter(Reporter())
-    model.model = replace(model.model, means=model.model.means * float("nan"))
-    reporter.start("fit", 1, 0)
-    stepped(reporter, 1, model)
-    assert get(training, "live/published.ply")[0] != 200
-    assert state(training)["versions"]["published"] == 1
-
-
+@pytest.mark.slow
 @pytest.mark.skipif(PROGRAM is None, reason="no Chromium on PATH")
 def test_a_fit_is_seen_while_it_goes_on(tab: Visit, tmp_path: Path) -> None:
     scene = write_nerfstudio(tmp_path / "scene", count=4)

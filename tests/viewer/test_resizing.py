@@ -10,7 +10,7 @@ import pytest
 from keyss.core import Gaussians
 from keyss.files import read_model, write_model
 from keyss.viewer import export_html
-from methods.carry.carried import embed
+from methods.carry.carried import embed, extract
 from serving import serving
 from viewer.browser import CLOSE, IN_CHROMIUM, PANEL, Visit, drawn, made, psnr, visit
 
@@ -36,18 +36,24 @@ def published(stego: Path) -> Gaussians:
 
 
 @pytest.fixture(scope="module")
+def secret(published: Gaussians) -> Gaussians:
+    return extract(published, KEY).gaussians
+
+
+@pytest.fixture(scope="module")
 def page_file(stego: Path) -> Path:
     return export_html(stego, stego.parent / "page.html")[0]
 
 
-def assert_drawn(tab: Visit, published: Gaussians) -> tuple[int, int]:
+def assert_drawn(tab: Visit, model: Gaussians) -> tuple[int, int]:
     """Assert that the canvas shows what our own renderer draws at its width and height; return both."""
     found = tab.picture()
     height, width = found.shape[:2]
-    assert psnr(found, drawn(published, POSE, width, height)) > CLOSE
+    assert psnr(found, drawn(model, POSE, width, height)) > CLOSE
     return width, height
 
 
+@pytest.mark.slow
 def test_the_secret_stays_when_the_search_has_ended(chromium: Any, page_file: Path) -> None:
     """The panel gets lines and loses them, and the canvas another height, while pictures are drawn."""
     with visit(chromium, viewport=PORTRAIT, **PHONE) as tab:
@@ -67,6 +73,7 @@ def test_the_secret_stays_when_the_search_has_ended(chromium: Any, page_file: Pa
         assert tab.page.evaluate(focused) != "key"
 
 
+@pytest.mark.slow
 def test_a_phone_is_turned_and_its_panel_folded(chromium: Any, page_file: Path, published: Gaussians) -> None:
     fits = "(panel => panel.scrollWidth <= panel.clientWidth)(document.querySelector('.panel'))"
     with visit(chromium, viewport=PORTRAIT, **PHONE) as tab:
@@ -83,8 +90,27 @@ def test_a_phone_is_turned_and_its_panel_folded(chromium: Any, page_file: Path, 
             assert tab.page.evaluate(fits)
 
 
+def test_a_phone_is_turned_while_it_shows_a_secret(
+    chromium: Any, page_file: Path, secret: Gaussians, published: Gaussians
+) -> None:
+    with visit(chromium, viewport=PORTRAIT, **PHONE) as tab:
+        tab.goto(page_file.as_uri())
+        tab.page.tap("#keying > summary")
+        tab.try_key(KEY)
+        tab.at(POSE)
+        size = assert_drawn(tab, secret)
+        tab.page.tap("#keying > summary")
+        folded = assert_drawn(tab, secret)
+        assert folded[1] > size[1]
+        for viewport, size in ((LANDSCAPE, (844 - PANEL, 390)), (PORTRAIT, folded)):
+            tab.page.set_viewport_size(viewport)
+            assert assert_drawn(tab, secret) == size
+            assert tab.page.input_value("#wipe") == "100"
+
+
+@pytest.mark.slow
 def test_the_element_of_another_site_is_resized(
-    tab: Visit, stego: Path, published: Gaussians, tmp_path: Path
+    tab: Visit, stego: Path, published: Gaussians, secret: Gaussians, tmp_path: Path
 ) -> None:
     export_html(stego, tmp_path / "site", look={"pose": POSE.removeprefix("#")})
     with serving(tmp_path / "site") as site:
@@ -101,3 +127,13 @@ def test_the_element_of_another_site_is_resized(
                 [width, height],
             )
             assert assert_drawn(tab, published) == (width, height)
+        tab.page.evaluate("document.querySelector('keyss-viewer').setAttribute('key-field', '')")
+        frame.locator("main[data-picture=settled]").wait_for()
+        frame.locator("#key").fill(KEY)
+        frame.locator("#key").press("Enter")
+        frame.locator("#revealed:not([hidden])").wait_for()
+        tab.at(POSE)
+        for style in ("width: 500px; height: 400px", "display: none", "width: 320px; height: 500px"):
+            tab.page.evaluate("style => { document.querySelector('keyss-viewer').style = style }", style)
+            if "none" not in style:
+                assert_drawn(tab, secret)

@@ -25,6 +25,7 @@ export interface Answer {
   readonly id: number;
   readonly model?: Gaussians;
   readonly leftOut?: number; // Gaussians of its file
+  readonly foreign?: number; // Gaussians that were added to the secret's file, or changed, where they are many
   readonly file?: HiddenFile;
   readonly error?: string; // one sentence
   readonly stopped?: boolean; // a search, before its end
@@ -63,8 +64,9 @@ async function unlock(id: number, key: string, thorough: boolean): Promise<void>
   const content = reader ? await reader.open(key, counted(id, reader.derivations)) : null;
   answer({ id, progress: 1 }); // before the secret is decoded, which wrong keys have no part in
   const model = content && stego && secretOf(content, stego)?.gaussians;
-  if (model) answer({ id, model }, buffersOf(model));
-  else answer({ id, file: (content && fileOf(content)) ?? undefined });
+  const foreign = content?.foreign;
+  if (model) answer({ id, model, foreign }, buffersOf(model));
+  else answer({ id, file: (content && fileOf(content)) ?? undefined, foreign });
 }
 
 /** `derive`, telling the page how many of so many keys have been derived. */

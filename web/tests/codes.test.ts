@@ -1,5 +1,5 @@
 import { expect, test } from 'vitest';
-import { lastBits, log2 } from '../src/channels/quiet/fields.ts';
+import { lastBits, levelsOf, log2 } from '../src/channels/quiet/fields.ts';
 import { QuietReader } from '../src/channels/quiet/reading.ts';
 import { sortingOrder } from '../src/core/words.ts';
 import type { Codes } from '../src/files/models.ts';
@@ -18,7 +18,7 @@ async function codesOf(name: string): Promise<Codes> {
 }
 
 test.each(Object.entries(COUNTED.bits))('the bits that carry in %s', async (name, { count, sha256 }) => {
-  const bits = lastBits(await codesOf(name));
+  const bits = lastBits(levelsOf(await codesOf(name)));
   expect([bits.length, digest(bits)]).toEqual([count, sha256]);
 });
 

@@ -30,6 +30,15 @@ test('one changed bit costs one Gaussian at most', async () => {
   expect(secretOf(content!, model)!.gaussians.count).toBeGreaterThanOrEqual(7);
 });
 
+test('Gaussians that were added are counted', async () => {
+  const model = readPly(vector('carried.ply'));
+  const rows = Array.from({ length: model.count }, (_, row) => row);
+  const more = selected(model, [...rows, ...rows]);
+  more.means.subarray(3 * model.count).forEach((_, at, own) => (own[at] += 1));
+  expect((await QuietReader.of(more)!.open(CARRIED.key))?.foreign).toBe(model.count);
+  expect((await QuietReader.of(model)!.open(CARRIED.key))?.foreign).toBeUndefined();
+});
+
 test('a cell', () => {
   const { cell } = jsonVector<{ cell: Record<string, string> & { slot: number } }>('sealing.json');
   const data = hex(cell.data);

@@ -7,14 +7,15 @@ from cryptography.hazmat.primitives.ciphers import Cipher
 from cryptography.hazmat.primitives.ciphers.algorithms import AES
 from cryptography.hazmat.primitives.ciphers.modes import ECB
 
-from keyss.channels.quiet.kernels import hash_rows
 from keyss.core.arrays import Bytes, Doubles, Integers, Numbers, Words
 from keyss.keys.derivation import stream
+
+_ODD = np.uint64(0x9E3779B97F4A7C15)  # 2^64 over the golden ratio: the high bits of multiples are scattered
 
 
 def mixed(words: Words) -> Words:
     """[...] numbers that look random for different ones: the finaliser of splitmix64 (Steele et al. 2014)."""
-    state = words.astype(np.uint64) + np.uint64(0x9E3779B97F4A7C15)
+    state = words.astype(np.uint64) + _ODD
     state = (state ^ state >> np.uint64(30)) * np.uint64(0xBF58476D1CE4E5B9)
     state = (state ^ state >> np.uint64(27)) * np.uint64(0x94D049BB133111EB)
     return state ^ state >> np.uint64(31)
@@ -22,8 +23,10 @@ def mixed(words: Words) -> Words:
 
 def row_hashes(rows: Numbers) -> Words:
     """[N] a hash of each row of integers [N, C]: equal for equal rows, and for others hardly ever."""
-    found = np.empty(len(rows), np.uint64)
-    hash_rows(rows, found)
+    found = np.zeros(len(rows), np.uint64)
+    for column in rows.T:
+        found = (found ^ column.astype(np.uint64)) * _ODD
+        found ^= found >> np.uint64(29)
     return found
 
 

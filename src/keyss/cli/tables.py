@@ -139,7 +139,7 @@ def _explanations(metrics: HideMetrics, names: Sequence[str], heads: Sequence[st
     if "plain" in heads:
         lines.append("Plain: Gaussians of the plain model.")
     if "bound" in heads:
-        lines.append(f"Bound: upper bound, PSNR of plain 3DGS with {size} and the same steps.")
+        lines.append(f"Bound: upper bound, plain 3DGS with {size} and the same steps.")
     if "start" in heads:
         baseline = metrics.baseline
         pairs = zip(baseline.steps, baseline.equal, strict=False)

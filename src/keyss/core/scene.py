@@ -51,6 +51,11 @@ class View:
     camera: Camera
     image: Tensor  # [H, W, 3] uint8 sRGB
     unrounded: Tensor | None = None  # [H, W, 3] in [0, 1]: the render itself, if the image is not a photo
+    mask: Tensor | None = None  # [H, W] bool: False where the photo does not count
+
+    def photo(self, device: torch.device) -> Tensor:
+        """[H, W, 3] in [0, 1] the image."""
+        return self.image.to(device).float() / 255
 
 
 @dataclass(frozen=True)
@@ -120,6 +125,7 @@ class Scene:
         tensors = [self.points, self.colors, self.background]
         for view in self.views:
             tensors += [view.camera.viewmat, view.camera.K, view.image]
+            tensors += [] if view.mask is None else [view.mask]
         for tensor in tensors:
             state.update(f"{tensor.dtype} {list(tensor.shape)}".encode())
             state.update(tensor.contiguous().numpy().tobytes())

@@ -14,7 +14,7 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
-from pathlib import Path, PureWindowsPath
+from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any, TypeVar
 
 import numpy as np
@@ -33,7 +33,6 @@ from keyss.files.layout import (
     leave_out_broken,
     leave_out_missing,
     refuse_duplicates,
-    warn_of_masks,
 )
 from keyss.files.lens import Lens, make_lens
 from keyss.files.reading import open_input, read_file, read_text
@@ -73,7 +72,8 @@ def read_colmap(folder: Path, *, skip_missing: bool = False) -> SceneLayout:
     If `images/` has no photos, the first of `images_2/`, `images_4/` and `images_8/` that has some is used.
     Points are sorted by id; without points there is a KeyssWarning. Files are `.bin` if `cameras.bin`
     exists, else `.txt`. Image names may have subfolders, and another case than on disk. `skip_missing`: see
-    `leave_out_missing` and `leave_out_broken`. Masks are not used, with a KeyssWarning.
+    `leave_out_missing` and `leave_out_broken`. The mask of NAME.EXT is `masks/NAME.EXT.png`, as in COLMAP, or
+    `masks/NAME.png`.
 
     Raises InputError for names that are absolute or contain `..`, and if a file is missing, truncated, too
     long, or has impossible values (NaN, zero quaternions, unknown cameras, absurd counts or sizes).
@@ -117,9 +117,7 @@ def read_colmap(folder: Path, *, skip_missing: bool = False) -> SceneLayout:
     images_folder, existing = _existing(folder, photos)
     missing = sorted({photo.name for photo in photos} - {photo.name for photo in existing})
     leave_out_missing(folder / images_folder, len(photos), missing, skip_missing)
-    if (folder / "masks").is_dir():
-        warn_of_masks(folder / "masks")
-    return SceneLayout(*hold_out(model, existing), points)
+    return SceneLayout(*hold_out(model, _with_masks(folder, existing)), points)
 
 
 def colmap_model_folder(folder: Path, places: Sequence[str] = MODEL_PLACES) -> Path | None:
@@ -168,6 +166,22 @@ def _existing(folder: Path, photos: Sequence[Photo]) -> tuple[str, list[Photo]]:
         if existing := [placed[photo.name] for photo in photos if photo.name in placed]:
             return images, existing
     return _IMAGE_FOLDERS[0], []
+
+
+def _with_masks(folder: Path, photos: Sequence[Photo]) -> list[Photo]:
+    """The photos with those of their masks that exist. Warns where there are masks of other names only."""
+    masks, finder, found = folder / "masks", FileFinder(), []
+    for photo in photos if masks.is_dir() else ():
+        names = (f"{photo.name}.png", f"{PurePosixPath(photo.name).with_suffix('.png')}", photo.name)
+        paths = (masks / finder.find(masks, name) for name in names)
+        found.append(replace(photo, mask=next((path for path in paths if path.is_file()), None)))
+    if found and not any(photo.mask for photo in found):
+        warnings.warn(
+            f"{masks}: no mask is used, since none is named like a photo: expected {photos[0].name}.png",
+            KeyssWarning,
+            stacklevel=3,
+        )
+    return found or list(photos)
 
 
 def _lens(where: str, model: str, width: int, height: int, read: Callable[[int], Sequence[float]]) -> Lens:

@@ -55,6 +55,8 @@ _KINDS = (
     _Kind("arrays of NumPy", _EXPORT, (".npz", ".npy"), (b"\x93NUMPY",), (b".npy",)),
     _Kind("a USD scene", _EXPORT, (".usdz", ".usd", ".usda", ".usdc"), (b"PXR-USDC",), (b".usdc", b".usda")),
     _Kind("a mesh", FIT, (".obj", ".fbx", ".stl", ".dae")),
+    _Kind("a point cloud", FIT, (".las", ".laz", ".e57", ".pcd", ".xyz"), (b"LASF", b"ASTM-E57")),
+    _Kind("a project of a training program", _EXPORT, (".psht",)),
     _Kind("a table", _EXPORT, (".csv", ".tsv")),
     _Kind("a web page", _EXPORT, (".html", ".htm"), (b"<!DOCTYPE", b"<html")),
     _Kind("a JSON file", "give the folder that it lies in", (".json",)),

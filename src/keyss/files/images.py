@@ -85,8 +85,28 @@ def read_image(path: Path, background: Floats) -> Bytes:
             raise InputError(f"{path}: expected an image, but it cannot be decoded: {error}") from error
 
 
+def read_mask(path: Path, width: int, height: int) -> Bytes:
+    """[height, width] of an image file of that aspect, to within a pixel: 0 where it is black, else 255.
+
+    Raises InputError, as `open_image` does, and for another aspect.
+    """
+    import cv2
+
+    with open_image(path) as image:
+        if abs(image.height * width / image.width - height) > 1:
+            raise InputError(
+                f"{path}: expected a mask of its photo's aspect, {width}x{height}, found "
+                f"{image.width}x{image.height}"
+            )
+        try:
+            used = np.asarray(image if image.mode.startswith("I") else image.convert("L")) > 0
+        except Exception as error:  # as in read_image
+            raise InputError(f"{path}: expected a mask, but it cannot be decoded: {error}") from error
+    return np.asarray(cv2.resize(np.uint8(255) * used, (width, height), interpolation=cv2.INTER_NEAREST))
+
+
 def shrink(image: Bytes, width: int, height: int) -> Bytes:
-    """Shrink an image to [height, width, 3] by area averaging."""
+    """Shrink an image [H, W, ...] to `width` and `height` by area averaging."""
     import cv2  # slow to import, and models do not need it
 
     # Pillow's BOX filter rounds after each axis, which brightens by up to a level; this rounds once.

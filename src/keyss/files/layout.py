@@ -25,6 +25,7 @@ class Photo:
     name: str
     viewmat: Doubles  # [4, 4] world to camera, OpenCV axes, a rigid motion
     lens: Lens
+    mask: Path | None = None  # an image file, black where the photo does not count
 
 
 @dataclass(frozen=True)
@@ -98,16 +99,6 @@ def leave_out_broken(where: Path, total: int, broken: Mapping[str, str], skip_mi
     listed = ", ".join(list(broken)[:5]) + (f" and {len(broken) - 5:,} more" if len(broken) > 5 else "")
     warnings.warn(
         f"{where}: {count} have no usable camera and are left out: {listed}", KeyssWarning, stacklevel=2
-    )
-
-
-def warn_of_masks(where: Path | str) -> None:
-    """Tell that a scene has masks, since none are used."""
-    warnings.warn(
-        f"{where}: masks are not used: what they cover is fitted too; make those pixels transparent in the "
-        "photos (PNG) to fit the background there",
-        KeyssWarning,
-        stacklevel=2,
     )
 
 

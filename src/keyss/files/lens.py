@@ -107,7 +107,7 @@ class Undistortion:
     map_y: Floats  # [H, W] OpenCV row
 
     def __call__(self, image: Bytes) -> Bytes:
-        """[H, W, 3] undistorted, sampled bilinearly."""
+        """[H, W, ...] undistorted, sampled bilinearly."""
         import cv2  # slow to import, and models do not need it
 
         border = cv2.BORDER_REPLICATE

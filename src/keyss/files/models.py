@@ -25,7 +25,7 @@ from keyss.core.decoded import DecodedGaussians
 from keyss.core.errors import InputError, OutputError, UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.files.atomic import atomic_write, check_not_an_input, check_output_file
-from keyss.files.foreign import CHECKPOINTS, START_BYTES, is_foreign_zip, kind_of
+from keyss.files.foreign import START_BYTES, is_foreign_zip, kind_of
 from keyss.files.ply_extras import NORMALS, ExtendedGaussians, PlyExtras
 from keyss.files.ply_rows import (
     check_not_activated,
@@ -43,7 +43,7 @@ from keyss.files.reading import (
     read_standard_input,
     write_standard_output,
 )
-from keyss.files.trained import has_checkpoints, is_training, model_file
+from keyss.files.trained import is_training, kind_of_folder, model_file
 
 DECODED_SUFFIX = ".3dgs.safetensors"  # of models that a network decodes
 _BLOCK = 1 << 13  # Gaussians that are written at a time
@@ -199,7 +199,7 @@ def read_model(path: Path | str) -> Gaussians:
         return model_of_bytes("standard input", read_standard_input())
     path = model_file(path)
     if os.path.isdir(path):
-        found = f"a folder of {CHECKPOINTS}" if has_checkpoints(path) else "a folder"
+        found = kind_of_folder(path) or "a folder"
         raise InputError(f"{path}: expected the file of a 3DGS model ({known_suffixes()}), found {found}")
     if not os.path.isfile(path):
         raise InputError(f"{path}: expected a 3DGS model ({known_suffixes()}), but there is no such file")

@@ -172,7 +172,8 @@ def model_properties(found: Collection[str]) -> list[str]:
     names = model_names(len(rest) // 3 + 1)
     if len(rest) not in (0, 9, 24, 45) or not rest <= set(names):
         raise InputError(
-            f"expected 0, 9, 24 or 45 properties f_rest_0, f_rest_1, ... (SH degree 0 to 3), got {len(rest)}"
+            f"expected 0, 9, 24 or 45 properties f_rest_0, f_rest_1, ..., got {len(rest)}: export it again "
+            "with harmonics of degree 0, 1, 2 or 3"
         )
     missing = [name for name in names if name not in found]
     if missing == ["scale_2"]:

@@ -18,17 +18,18 @@ from keyss.core.arrays import Doubles, Floats
 from keyss.core.errors import InputError, KeyssWarning, UsageError
 from keyss.core.scene import NEAR, ORDINARY_EXTENT, Camera, Scene, View, checked_background
 from keyss.files.colmap import MODEL_PLACES, colmap_model_folder, read_colmap
-from keyss.files.foreign import CHECKPOINTS, what_it_is
-from keyss.files.images import is_turned, probe_image, read_image, shrink
+from keyss.files.foreign import what_it_is
+from keyss.files.images import is_turned, probe_image, read_image, read_mask, shrink
 from keyss.files.layout import Photo, SceneLayout
 from keyss.files.lens import Lens, Undistortion, undistortion
-from keyss.files.trained import has_checkpoints
+from keyss.files.trained import kind_of_folder
 from keyss.files.transforms import read_blender, read_nerfstudio
 
 _FAR = 1000  # extents from the origin: single precision has ten thousandths of one left
 _KNOWN = (
     "COLMAP (sparse/0/cameras.bin or .txt, images/); Blender / NeRF-synthetic (transforms_train.json); "
-    "Nerfstudio (transforms.json)"
+    "Nerfstudio (transforms.json). COLMAP (`colmap automatic_reconstructor`) and Nerfstudio "
+    "(`ns-process-data images`) find the cameras of photos"
 )
 
 
@@ -56,6 +57,9 @@ def load_scene(
     (`train/r_0.png`). If COLMAP's `images/` is missing, the largest of `images_2/`, `images_4/` and
     `images_8/` is used. A scene may lack points, with a KeyssWarning for COLMAP; see
     `keyss.fitting.parameters.initial_points`. Rotations are orthonormal up to float32.
+
+    Pixels that masks leave out (`mask_path` in transforms.json; `masks/` beside COLMAP's `images/`) do not
+    count, with a KeyssWarning: see `View.mask`. Nor does a resampled pixel that has a part of such a one.
 
     Raises InputError for an unknown layout, broken or truncated files, missing or undecodable images, images
     whose aspect contradicts their camera's (by more than a pixel), or fewer than one training
@@ -92,6 +96,13 @@ def load_scene(
             _view, width=width, background=behind.numpy(), undistortions=undistortions, near=near
         )
         views = tuple(pool.map(decode, photos))
+    if shares := [float((~view.mask).float().mean()) for view in views if view.mask is not None]:
+        warnings.warn(
+            f"{folder}: {len(shares):,} of {len(views):,} photos have masks, which leave "
+            f"{sum(shares) / len(shares):.0%} of their pixels out of training and measures",
+            KeyssWarning,
+            stacklevel=2,
+        )
     return Scene(
         name=folder.resolve().name,
         train=views[: len(layout.train)],
@@ -141,8 +152,8 @@ def read_layout(folder: Path, skip_missing: bool) -> SceneLayout:
     except OSError as error:
         raise InputError(f"{folder}: cannot be read: {error.strerror}") from error
     found = ", ".join(entries[:8]) + (", ..." if len(entries) > 8 else "") or "an empty folder"
-    if has_checkpoints(folder):
-        raise InputError(f"{folder}: expected a scene or a model, found a folder of {CHECKPOINTS}")
+    if kind := kind_of_folder(folder):
+        raise InputError(f"{folder}: expected a scene or a model, found {kind}")
     raise InputError(f"{folder}: expected a scene, found {found}. Known layouts: {_KNOWN}")
 
 
@@ -188,8 +199,9 @@ def _view(
     undistortions: Callable[[Lens, str], Undistortion],
     near: float,
 ) -> View:
-    pixels = read_image(photo.path, background)
-    lens = photo.lens
+    pixels, lens = read_image(photo.path, background), photo.lens
+    if photo.mask:
+        pixels = np.dstack([pixels, read_mask(photo.mask, lens.width, lens.height)])
     if not lens.is_pinhole:
         straighten = undistortions(lens, str(photo.path.parent))
         pixels, lens = straighten(pixels), straighten.pinhole
@@ -204,4 +216,9 @@ def _view(
     if width is not None and width < camera.width:
         height = max(1, round(camera.height * width / camera.width))
         camera, pixels = camera.resized(width, height), shrink(pixels, width, height)
-    return View(camera, torch.from_numpy(np.ascontiguousarray(pixels)))
+    image, counts = torch.from_numpy(np.ascontiguousarray(pixels[:, :, :3])), pixels[:, :, 3:] == 255
+    if photo.mask and not counts.any():
+        raise InputError(
+            f"{photo.mask}: expected a mask that leaves something of its photo, found a black one"
+        )
+    return View(camera, image, mask=torch.from_numpy(counts[:, :, 0]) if photo.mask else None)

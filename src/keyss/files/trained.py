@@ -8,6 +8,7 @@ import warnings
 from pathlib import Path
 
 from keyss.core.errors import KeyssWarning
+from keyss.files.foreign import CHECKPOINTS, what_it_is
 
 # Where Inria's trainer, gsplat's and Nerfstudio's export write models; `*` is the number of steps.
 _MODELS = (
@@ -44,9 +45,12 @@ def model_file(path: Path | str) -> Path:
     return found or path
 
 
-def has_checkpoints(folder: Path) -> bool:
-    """True for the folder of a training with checkpoints, whether or not it has a model."""
-    return any(True for each in _CHECKPOINTS for _ in folder.glob(each))
+def kind_of_folder(folder: Path) -> str | None:
+    """`what_it_is` for a folder that is neither a scene nor a model, None if it is of no known kind."""
+    if any(True for each in _CHECKPOINTS for _ in folder.glob(each)):
+        return f"a folder of {CHECKPOINTS}"
+    unpacked = folder / "meta.json"
+    return what_it_is(unpacked) if unpacked.is_file() else None
 
 
 def _found(folder: Path) -> Path | None:

@@ -25,7 +25,6 @@ from keyss.files.layout import (
     leave_out_broken,
     leave_out_missing,
     refuse_duplicates,
-    warn_of_masks,
 )
 from keyss.files.lens import Lens, make_lens
 from keyss.files.ply_table import read_point_cloud
@@ -66,7 +65,7 @@ class _Intrinsics(msgspec.Struct):
 class _Frame(_Intrinsics, kw_only=True):
     file_path: str
     transform_matrix: Any = None  # checked by itself, so that an error names the photo
-    mask_path: Any = None
+    mask_path: str | None = None
 
 
 class _Transforms(_Intrinsics, kw_only=True):
@@ -145,13 +144,12 @@ def _read(path: Path, skip_missing: bool) -> _Posed:
         try:
             viewmat = _viewmat(where, _matrix(where, frame.transform_matrix))
             lens = _lens(where, meta, frame, path.parent / name)
-            photos.append(Photo(path.parent / name, name, viewmat, lens))
+            mask = frame.mask_path and path.parent / finder.find(path.parent, _inside(path, frame.mask_path))
+            photos.append(Photo(path.parent / name, name, viewmat, lens, mask or None))
         except InputError as error:
             broken[name] = str(error)
     leave_out_broken(path, len(photos) + len(broken), broken, skip_missing)
     refuse_duplicates(path, photos)
-    if any(frame.mask_path for frame in meta.frames):
-        warn_of_masks(f"{path}: `mask_path`")
     return _Posed(meta, tuple(names), tuple(photos))
 
 
@@ -183,9 +181,16 @@ def _split(path: Path, posed: _Posed) -> tuple[tuple[Photo, ...], tuple[Photo, .
 
 
 def _inside(path: Path, file_path: str) -> str:
-    """A path from a JSON file, normalised: relative to the file's folder, inside it or its parent."""
+    """A path from a JSON file, normalised: relative to the file's folder, inside it or its parent.
+
+    An absolute path, as of another computer, is that of its longest end that exists in the file's folder.
+    """
     name = os.path.normpath(file_path.replace("\\", "/")).replace(os.sep, "/")
     parts = name.split("/")
+    if os.path.isabs(name) or ":" in parts[0]:
+        ends = ("/".join(parts[start:]) for start in range(1, len(parts)))
+        name = next((end for end in ends if (path.parent / end).is_file()), name)
+        parts = name.split("/")
     outside = os.path.isabs(name) or ":" in parts[0] or parts[:2] == ["..", ".."] or name in (".", "..")
     if outside or not file_path.isprintable():
         raise InputError(

@@ -26,31 +26,34 @@ class ImageQuality:
     lpips: float | None = None  # AlexNet; None without its weights, or for images below 31 x 31 pixels
 
 
-def psnr(image: Tensor, reference: Tensor) -> float:
-    """Peak signal-to-noise ratio in dB of two [H, W, 3] images; values are clamped to [0, 1] first."""
-    error = (image.clamp(0, 1) - reference.clamp(0, 1)).square().mean()
+def psnr(image: Tensor, reference: Tensor, mask: Tensor | None = None) -> float:
+    """Peak signal-to-noise ratio in dB of two [H, W, 3] images where `mask` [H, W] is True.
+
+    Values are clamped to [0, 1] first.
+    """
+    error = (image.clamp(0, 1) - reference.clamp(0, 1)).square()
+    error = (error if mask is None else error[mask.to(error.device)]).mean()
     return float(-10 * torch.log10(error.clamp_min(1e-12)))
 
 
-def view_quality(image: Tensor, photo: Tensor) -> ImageQuality:
-    """Quality of a render against its photo, both [H, W, 3] in [0, 1]."""
+def view_quality(image: Tensor, view: View) -> ImageQuality:
+    """Quality of a render [H, W, 3] in [0, 1] against its photo, where that counts.
+
+    LPIPS is a mean over all pixels; those that do not count are equal.
+    """
+    photo = view.photo(image.device)
+    target = Target.of(photo, view.mask)
     try:
-        distance = lpips_alex(image, photo)
+        distance = lpips_alex(target.masked(image), target.image)
     except KeyssError:
         distance = None
-    return ImageQuality(psnr(image, photo), float(ssim(image, Target.of(photo))), distance)
+    return ImageQuality(psnr(image, photo, view.mask), float(ssim(image, target)), distance)
 
 
 @torch.no_grad()
 def quality(gaussians: Gaussians, views: Sequence[View], background: Tensor) -> ImageQuality:
     """Mean quality of the views' float32 renders against their photos."""
-    qualities = [
-        view_quality(
-            render(gaussians, view.camera, background).clamp(0, 1),
-            view.image.to(gaussians.device).float() / 255,
-        )
-        for view in views
-    ]
+    qualities = [view_quality(render(gaussians, view.camera, background).clamp(0, 1), view) for view in views]
     return mean_quality(qualities)
 
 
@@ -68,7 +71,7 @@ def mean_quality(views: Sequence[ImageQuality]) -> ImageQuality:
 def mean_psnr(gaussians: Gaussians, views: Sequence[View], background: Tensor) -> float:
     """Mean PSNR in dB of the views' renders against their photos."""
     device = gaussians.device
-    values = [psnr(render(gaussians, v.camera, background), v.image.to(device).float() / 255) for v in views]
+    values = [psnr(render(gaussians, v.camera, background), v.photo(device), v.mask) for v in views]
     return fmean(values)
 
 

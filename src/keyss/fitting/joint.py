@@ -100,10 +100,8 @@ class JointRun(ABC):
         """Mean PSNR of each scene on held-out views."""
         found = {}
         for scene, (name, views) in enumerate(zip(self.names, self.watched, strict=True)):
-            photos = [(view, view.image.to(self.device).float() / 255) for view in views]
-            values = [
-                psnr(self.show(scene, view.camera, self.fit.sh_degree), photo) for view, photo in photos
-            ]
+            shown = [(view, self.show(scene, view.camera, self.fit.sh_degree)) for view in views]
+            values = [psnr(image, view.photo(self.device), view.mask) for view, image in shown]
             found[name] = sum(values) / len(values)
         return found
 

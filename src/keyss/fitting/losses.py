@@ -11,7 +11,7 @@ three more blurs of pointwise derivatives.
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -52,12 +52,19 @@ class Target:
     planes: Tensor  # [3, H, W] in [0, 1]
     mean: Tensor  # [3, H, W] local mean
     variance: Tensor  # [3, H, W] local variance
+    mask: Tensor | None = None  # [H, W] bool: False where the image does not count
 
     @staticmethod
-    def of(image: Tensor) -> Target:
-        """The target of an image [H, W, 3], float in [0, 1] or uint8."""
+    def of(image: Tensor, mask: Tensor | None = None) -> Target:
+        """The target of an image [H, W, 3], float in [0, 1] or uint8.
+
+        Where `mask` [H, W] is False it becomes the mean colour of the others, which SSIM's windows see.
+        """
         if image.dtype == torch.uint8:
             image = image.float() / 255
+        if mask is not None:
+            mask = mask.to(image.device)
+            image = torch.where(mask[:, :, None], image, image[mask].mean(0))
         planes = image.permute(2, 0, 1).contiguous()
         stacked = torch.cat([planes, planes * planes])
         if image.device.type == "cpu":
@@ -66,12 +73,16 @@ class Target:
         else:
             blurred = _blur(stacked)
         mean, square = blurred.chunk(2)
-        return Target(planes, mean, square - mean * mean)
+        return Target(planes, mean, square - mean * mean, mask)
 
     @property
     def image(self) -> Tensor:
         """[H, W, 3] the image."""
         return self.planes.permute(1, 2, 0)
+
+    def masked(self, image: Tensor) -> Tensor:
+        """`image` [H, W, 3], equal to the target where that does not count."""
+        return image if self.mask is None else torch.where(self.mask[:, :, None], image, self.image)
 
 
 class Targets:
@@ -86,10 +97,10 @@ class Targets:
         """Bytes of the cached targets of `views`."""
         return min(TARGET_BYTES, sum(12 * view.image.numel() for view in views))
 
-    def of(self, key: Hashable, image: Callable[[], Tensor]) -> Target:
-        """The target of an `image`, which must be the same whenever `key` is."""
+    def of(self, key: Hashable, image: Callable[[], Tensor], mask: Tensor | None = None) -> Target:
+        """The target of an `image` and a `mask`, which must be the same whenever `key` is."""
         if (target := self._kept.get(key)) is None:
-            target = Target.of(image())
+            target = Target.of(image(), mask)
             needed = 12 * target.planes.numel()  # three tensors of float32
             if needed <= self._left:
                 self._kept[key] = target
@@ -254,22 +265,29 @@ class _PhotometricCpu(torch.autograd.Function):
 
 def ssim_torch(image: Tensor, target: Target) -> Tensor:
     """`ssim` in plain torch, on any device and in any precision: the reference of the kernels."""
-    planes = image.permute(2, 0, 1)
+    planes = target.masked(image).permute(2, 0, 1)
     mean, square, product = _blur(torch.cat([planes, planes * planes, planes * target.planes])).chunk(3)
     variance = square - mean * mean
     covariance = product - mean * target.mean
     numerator = (2 * mean * target.mean + C1) * (2 * covariance + C2)
     denominator = (mean * mean + target.mean * target.mean + C1) * (variance + target.variance + C2)
-    return (numerator / denominator).mean()
+    similarity = numerator / denominator
+    return (similarity if target.mask is None else similarity[:, target.mask]).mean()
 
 
 def ssim(image: Tensor, target: Target) -> Tensor:
     """Mean structural similarity of `image` [H, W, 3] and the target: a differentiable scalar, at most 1."""
+    if target.mask is not None:
+        return ssim_torch(image, target)
     return 1 - photometric_loss(image, target, 1.0)
 
 
 def photometric_loss(image: Tensor, target: Target, ssim_weight: float) -> Tensor:
-    """(1 - w) L1 + w (1 - SSIM) of `image` [H, W, 3] against the target, w in [0, 1]."""
+    """(1 - w) L1 + w (1 - SSIM) of `image` [H, W, 3] against the target, w in [0, 1].
+
+    The mean is over all pixels; those that do not count are equal.
+    """
+    target, image = replace(target, mask=None), target.masked(image)
     if ssim_weight != 0 and image.device.type == "cpu":
         return _PhotometricCpu.apply(image, target, ssim_weight)  # type: ignore[no-any-return, no-untyped-call]
     loss = (image - target.image).abs().mean()

@@ -81,7 +81,7 @@ class PlainRun:
         def loss_at(index: int) -> tuple[Tensor, list[Rendered]]:
             view, model = self.views[index], to_gaussians(self.parameters)
             image, meta = render_with_meta(model, view.camera, self.background, sh_degree=degree)
-            target = self.targets.of(index, lambda: view.image.to(self.device))
+            target = self.targets.of(index, lambda: view.image.to(self.device), view.mask)
             return photometric_loss(image, target, config.ssim_weight), [(meta, None, 1.0)]
 
         self.loss, info = self.strategy.backward(chosen, loss_at, len(self))

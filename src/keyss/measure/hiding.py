@@ -175,16 +175,15 @@ def compare(model: Gaussians, plain: Gaussians | None, scene: Scene, *, of_plain
     plains: list[ImageQuality] = []
     errors, empty = [], []
     for view in scene.test:
-        photo = view.image.to(model.device).float() / 255
         image = render(model, view.camera, background).clamp(0, 1)
-        qualities.append(view_quality(image, photo))
+        qualities.append(view_quality(image, view))
         if plain is None:
             continue
         if of_plain and view.unrounded is not None:
             expected = view.unrounded.to(model.device)
         else:
             expected = render(plain, view.camera, background).clamp(0, 1)
-        plains.append(view_quality(expected, photo))
+        plains.append(view_quality(expected, view))
         if id(view) in compared:
             errors.append((image - expected).square().mean())
             empty.append((background - expected).square().mean())

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import astuple, dataclass, replace
 from functools import partial
 from statistics import fmean
@@ -14,7 +14,7 @@ from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
 from keyss.core import Gaussians, InputError, KeyssError, Scene, View
-from keyss.core.arrays import Bytes, Doubles
+from keyss.core.arrays import Bytes, Doubles, Flags
 from keyss.files.images import picture_names
 from keyss.fitting.image_metrics import psnr, subsample_views
 from keyss.fitting.lpips import lpips_alex
@@ -45,9 +45,12 @@ class ImageComparison:
     missing: str | None = None  # why there is no LPIPS
 
 
-def compare_images(reference: Images, other: Images) -> ImageComparison:
+def compare_images(
+    reference: Images, other: Images, masks: Mapping[str, Tensor] | None = None
+) -> ImageComparison:
     """Scores of images against references of the same names, in the form that `keyss.render` returns.
 
+    `masks`, by name, are [H, W] bool, True where an image counts; LPIPS takes the others as equal.
     LPIPS is left out if its weights are not installed. Raises InputError for images without a partner, of
     different sizes or smaller than 11 x 11 pixels.
     """
@@ -62,7 +65,9 @@ def compare_images(reference: Images, other: Images) -> ImageComparison:
     missing = None
     for name, image in ours.items():
         a, b = _unit_range(name, image, theirs[name])
-        scores = ImageScores(psnr(a, b), *_ssim(a.numpy(), b.numpy()))
+        mask = (masks or {}).get(name, torch.ones(a.shape[:2], dtype=torch.bool))
+        a, b = (torch.where(mask[:, :, None], each, a[mask].mean(0)) for each in (a, b))
+        scores = ImageScores(psnr(a, b, mask), *_ssim(a.numpy(), b.numpy(), mask.numpy()))
         try:
             scores = replace(scores, lpips_alex=lpips_alex(a, b))
         except KeyssError as error:
@@ -85,7 +90,7 @@ def _unit_range(name: str, *pair: Tensor | Bytes) -> list[Tensor]:
     return [torch.from_numpy(image / 255) for image in (a, b)]
 
 
-def _ssim(a: Doubles, b: Doubles) -> tuple[float, float]:
+def _ssim(a: Doubles, b: Doubles, mask: Flags) -> tuple[float, float]:
     """SSIM with zero padding, and without the border."""
     blur = partial(gaussian_filter, sigma=1.5, mode="constant", radius=RADIUS, axes=(0, 1))
     c1, c2 = 0.01**2, 0.03**2
@@ -94,7 +99,8 @@ def _ssim(a: Doubles, b: Doubles) -> tuple[float, float]:
     covariance = blur(a * b) - mean_a * mean_b
     numerator = (2 * mean_a * mean_b + c1) * (2 * covariance + c2)
     values = numerator / ((mean_a**2 + mean_b**2 + c1) * (variances + c2))
-    return float(values.mean()), float(values[RADIUS:-RADIUS, RADIUS:-RADIUS].mean())
+    inner = slice(RADIUS, -RADIUS), slice(RADIUS, -RADIUS)
+    return float(values[mask].mean()), float(values[inner][mask[inner]].mean())
 
 
 def select_views(views: Sequence[View]) -> list[View]:
@@ -106,6 +112,12 @@ def photos_of(views: Sequence[View]) -> list[tuple[str, Tensor]]:
     """Names and uint8 photos [H, W, 3] of views, in the form of `renders_of`."""
     names = picture_names(view.camera for view in views)
     return [(name, view.image) for name, view in zip(names, views, strict=True)]
+
+
+def masks_of(views: Sequence[View]) -> dict[str, Tensor]:
+    """The masks of views that have one, by the names of `photos_of`."""
+    named = zip(picture_names(view.camera for view in views), views, strict=True)
+    return {name: view.mask for name, view in named if view.mask is not None}
 
 
 @torch.no_grad()

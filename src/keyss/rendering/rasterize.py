@@ -62,7 +62,7 @@ def rasterization(
         pixels (after backward its `.grad` holds dL/d(means2d)), radii [C, N, 2] int32 in pixels (0 for
         invisible Gaussians), depths [C, N], width, height, n_cameras, gaussian_ids (None).
 
-    All tensors but the cameras have gradients. On the CPU, everything is computed in float32 and
+    All tensors but the cameras have gradients. Everything is computed in float32. On the CPU, results are
     bit-identical for any number of threads; Gaussians that are not finite or have a colour of 1e12 or more
     are skipped; and means2d is a leaf: losses on it do not reach the means.
 
@@ -83,6 +83,7 @@ def rasterization(
     if backgrounds is not None:
         tensors["backgrounds"] = backgrounds
     check_arguments(tensors, width, height, near_plane, far_plane, eps2d, sh_degree, others)
+    tensors = {name: tensor.float() for name, tensor in tensors.items()}
     if means.device.type == "cuda":
         require_gsplat_cuda()
         import gsplat
@@ -101,7 +102,7 @@ def rasterization(
     if means.device.type != "cpu":
         raise UsageError(f"means: expected a tensor on 'cpu' or 'cuda', got {means.device}")
     if sh_degree is None:
-        tensors["colors"] = colors[:, None]
+        tensors["colors"] = tensors["colors"][:, None]
     if backgrounds is None:
         tensors["backgrounds"] = torch.zeros(len(viewmats), colors.shape[-1])
     settings = Settings(
@@ -113,7 +114,7 @@ def rasterization(
         sh_count=0 if sh_degree is None else (sh_degree + 1) ** 2,
     )
     names = ("viewmats", "Ks", "backgrounds", "means", "quats", "scales", "opacities", "colors")
-    images, alphas, meta = rasterize_on_cpu(settings, *(tensors[each].float().contiguous() for each in names))
+    images, alphas, meta = rasterize_on_cpu(settings, *(tensors[each].contiguous() for each in names))
     meta.update(
         width=settings.width,
         height=settings.height,
@@ -122,6 +123,6 @@ def rasterization(
         batch_ids=None,
         camera_ids=None,
         gaussian_ids=None,
-        opacities=opacities.float().expand(len(viewmats), -1),
+        opacities=tensors["opacities"].expand(len(viewmats), -1),
     )
     return images, alphas, meta

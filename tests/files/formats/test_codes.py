@@ -12,12 +12,11 @@ import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings, strategies as st
-from sklearn.cluster import KMeans
 
 from files.formats.examples import KINDS, assert_close, is_finite, model_of, random_codes, random_spz
-from keyss.core import Gaussians, OutputError, Similarity
-from keyss.files.formats.codebooks import codebook_of, nearest, palette_of
-from keyss.files.formats.common import from_smallest_three, morton_order, smallest_three, unit
+from keyss.core import Gaussians, OutputError
+from keyss.files.formats.codebooks import palette_of
+from keyss.files.formats.common import from_smallest_three, smallest_three, unit
 from keyss.files.formats.compressed_ply import CompressedPlyCodes
 from keyss.files.formats.sog import SogCodes
 from keyss.files.formats.spz import SpzCodes
@@ -26,22 +25,13 @@ SEEDS, COUNTS, DEGREES = st.integers(0, 2**32 - 1), st.integers(1, 300), st.samp
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(SEEDS, COUNTS, DEGREES)
 def test_parsing_inverts_serialising(kind: str, seed: int, count: int, k: int) -> None:
     codes = random_codes(kind, np.random.default_rng(seed), count, k)
     again = type(codes).parse(codes.serialise())
     assert again == codes
     assert is_finite(again.dequantise())
-
-
-def test_codes_differ_in_a_single_bit() -> None:
-    codes = random_spz(np.random.default_rng(0), 3, 20, 3)
-    alphas = codes.alphas.copy()
-    alphas[7] ^= 1
-    assert codes != replace(codes, alphas=alphas)
-    assert codes != replace(codes, flags=codes.flags ^ 1)
-    assert codes == replace(codes, alphas=codes.alphas.copy())
 
 
 def test_extensions_of_an_spz_are_kept() -> None:
@@ -60,7 +50,7 @@ def settings_of(data: bytes) -> list[tuple[int, int]]:
     return found
 
 
-@pytest.mark.parametrize(("level", "memory"), [(6, 9), (6, 8), (9, 9), (1, 8)])
+@pytest.mark.parametrize(("level", "memory"), [(6, 9), (1, 8)])
 def test_an_spz_is_compressed_again_as_it_was(level: int, memory: int) -> None:
     """Otherwise compressing its content once more would tell that it was changed."""
     codes = random_spz(np.random.default_rng(0), 3, 30_000, 3)
@@ -79,24 +69,6 @@ def test_a_new_spz_is_compressed_as_by_niantics_library() -> None:
     found = settings_of(SpzCodes.quantise(model_of(20_000, 1)).serialise())
     assert (6, 9) in found
     assert (6, 8) not in found
-
-
-@pytest.mark.parametrize("version", [3, 4])
-def test_reading_and_writing_an_spz_keeps_its_codes(version: int) -> None:
-    """`dequantise` returns the middle of the interval that `quantise` maps to a code."""
-    codes = replace(SpzCodes.quantise(model_of(500, 3)), version=version)
-    again = replace(SpzCodes.quantise(codes.dequantise()), version=version)
-    # Which of two parts of a rotation is the larger one may change after rounding, and so may the sign of 0.
-    assert replace(again, largest=codes.largest, rotations=codes.rotations) == codes
-    assert np.mean(again.rotations != codes.rotations) < 0.02
-    assert angle(again.dequantise(), codes.dequantise()) < 0.2
-
-
-def test_reading_and_writing_a_compressed_ply_keeps_its_codes() -> None:
-    codes = CompressedPlyCodes.quantise(model_of(700, 2))
-    again = CompressedPlyCodes.quantise(codes.dequantise())
-    for name in ("positions", "scales", "colors", "alphas", "sh"):
-        assert np.array_equal(getattr(again, name), getattr(codes, name)), name
 
 
 def worst(a: torch.Tensor, b: torch.Tensor) -> float:
@@ -171,16 +143,6 @@ def test_errors_of_sog(degree: int) -> None:
         assert float((found_values - values).square().mean()) ** 0.5 <= step_of_256 / 12**0.5
 
 
-def test_spz_rotates_harmonics_with_the_model() -> None:
-    """y and z change signs in the file, and the harmonics as for a rotated model."""
-    model = model_of(50, 3)
-    codes = SpzCodes.quantise(model)
-    turned = Similarity(rotation=torch.diag(torch.tensor([1.0, -1.0, -1.0]))).apply_gaussians(model)
-    assert worst(torch.from_numpy(codes.positions) / 4096, turned.means) < 2e-4
-    errors = (torch.from_numpy(codes.sh).double() - 128) / 128 - turned.sh[:, 1:].clamp(-1, 127 / 128)
-    assert bool((errors.abs() <= spz_harmonics_bound(3)).all())
-
-
 @pytest.mark.parametrize("reach", [1.0, 3000.0, 100_000.0, 8_000_000.0])
 def test_spz_makes_room_for_large_models(reach: float) -> None:
     model = model_of(30, 0)
@@ -190,6 +152,7 @@ def test_spz_makes_room_for_large_models(reach: float) -> None:
     assert reach > 2048 or codes.fractional_bits == 12
 
 
+@pytest.mark.filterwarnings("ignore:.*between which .spz holds scales")
 @pytest.mark.parametrize("scale", [1.0, 0.1, 0.001, 0.0001])
 @pytest.mark.parametrize("offset", [0.0, 3.0])
 def test_spz_is_as_precise_in_small_units(scale: float, offset: float) -> None:
@@ -230,44 +193,6 @@ def test_smallest_three(seed: int) -> None:
     assert np.abs(others).max() <= np.sqrt(0.5) + 1e-12
     again = from_smallest_three(largest, others)
     assert np.abs(np.abs((again * quats).sum(axis=1)) - 1).max() < 1e-12
-
-
-def test_morton_order_brings_neighbours_together() -> None:
-    means = np.random.default_rng(0).random((4096, 3)).astype(np.float32)
-    order = morton_order(means)
-    assert sorted(order.tolist()) == list(range(4096))
-    chunks = means[order].reshape(16, 256, 3)
-    # Sixteen boxes share the volume of one: their sides are about 0.4 long.
-    assert float((chunks.max(axis=1) - chunks.min(axis=1)).mean()) < 0.6
-
-
-def test_codebooks_are_good() -> None:
-    values = np.random.default_rng(0).normal(size=50_000).astype(np.float32)
-    book = codebook_of(values)
-    assert (np.diff(book) >= 0).all()
-    errors = np.abs(book[nearest(book, values)] - values)
-    # Panter and Dite (1951): sqrt(3) pi / 2 / 256^2 is the least mean squared error for normal values. Some
-    # of it is given for rare values, which k-means would serve worse.
-    assert np.square(errors).mean() < 1.4 * np.sqrt(3) * np.pi / 2 / 256**2
-    least = KMeans(256, n_init=1, max_iter=30, random_state=0).fit(values[:, None])
-    others = np.abs(least.cluster_centers_[least.labels_, 0] - values)
-    rare = np.abs(values) > 3
-    assert np.square(errors[rare]).mean() < 0.7 * np.square(others[rare]).mean()
-    mixed = np.concatenate([values[:5000], np.zeros(5000, np.float32)])  # half of them equal
-    assert np.square(codebook_of(mixed)[nearest(codebook_of(mixed), mixed)] - mixed).mean() < 4e-5
-    some = values[:300]
-    assert np.abs(codebook_of(some)[nearest(codebook_of(some), some)] - some).max() < 0.1
-    few = np.array([3, 1, 2, 1], np.float32)
-    assert np.array_equal(codebook_of(few)[nearest(codebook_of(few), few)], few)
-
-
-def test_palettes_are_nearly_as_good_as_k_means() -> None:
-    rng = np.random.default_rng(0)
-    vectors = (rng.normal(size=(3000, 45)) / np.arange(1, 46)).astype(np.float32)
-    palette, labels = palette_of(vectors, 256)
-    assert (len(palette), int(labels.max())) == (256, 255)
-    error = float(np.square(palette[labels] - vectors).sum())
-    assert error < 1.25 * KMeans(256, n_init=1, max_iter=20, random_state=0).fit(vectors).inertia_
 
 
 def test_palettes_of_few_vectors() -> None:

@@ -10,7 +10,6 @@ import time
 import tracemalloc
 import zipfile
 from collections.abc import Callable
-from copy import copy
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,15 +17,14 @@ import numpy as np
 import pytest
 import torch
 import zstandard
-from PIL import Image
 
 from files.formats.examples import model_of
+from files.formats.mutations import attempt, damaged, examples
 from keyss.core import Gaussians, InputError, KeyssWarning
 from keyss.files import model_bytes, model_of_bytes, read_model, write_model
 from keyss.files.formats.spz import SpzCodes
 from keyss.files.ply_table import read_vertex_table
 from keyss.methods.tensors import Header, unpack_tensors
-from mutations import attempt, damaged, examples
 
 MODEL = model_of(60, 1)
 MEGABYTE = 1 << 20
@@ -49,7 +47,7 @@ def refused(name: str, data: bytes, words: str, *, limit: int = 8 * MEGABYTE) ->
 def test_damaged_files(name: str) -> None:
     for data in examples()[name]:
         assert attempt(name, data) is None
-        for number in range(150):
+        for number in range(60):
             mutated = damaged(name, data, np.random.default_rng([7, number]))
             assert attempt(name, mutated) is None, number
 
@@ -57,7 +55,7 @@ def test_damaged_files(name: str) -> None:
 @pytest.mark.parametrize("name", [name for name in examples() if name != "a.ply"])
 def test_truncated_files(name: str) -> None:
     data = examples()[name][-1]
-    for end in np.linspace(0, len(data) - 1, 80).astype(int).tolist():
+    for end in np.linspace(0, len(data) - 1, 40).astype(int).tolist():
         if name == "a.splat" and end and end % 32 == 0:
             continue  # a smaller model
         with pytest.raises(InputError):
@@ -89,12 +87,6 @@ def test_counts_that_are_too_large(count: int) -> None:
     )
 
 
-def test_no_gaussians_at_all() -> None:
-    refused("a.spz", legacy_spz(0), "holds no Gaussians")
-    refused("a.sog", with_meta(lambda meta: meta.update(count=0)), "holds no Gaussians")
-    refused("a.splat", b"", "an empty file")
-
-
 # --- bombs -----------------------------------------------------------------------------------------------
 
 
@@ -116,21 +108,6 @@ def test_a_zstd_bomb() -> None:
     model_of_bytes("a.spz", changed)
     assert tracemalloc.get_traced_memory()[1] < 4 * MEGABYTE
     tracemalloc.stop()
-
-
-def test_a_zstd_window_that_nothing_needs() -> None:
-    codes = replace(SpzCodes.quantise(MODEL), version=4)
-    data = bytearray(codes.serialise())
-    assert data[128:134] == b"\x28\xb5\x2f\xfd" + data[132:134]  # the first frame
-    flags, run = 0, struct.pack("<I", 1 | 1 << 1 | 540 << 3)[:3] + b"\0"
-    for exponent, is_fine in ((13, True), (17, False)):  # 8 MiB, 128 MiB
-        frame = b"\x28\xb5\x2f\xfd" + bytes([flags, exponent << 3]) + run
-        old = struct.unpack_from("<Q", data, 32)[0]
-        changed = data[:32] + struct.pack("<Q", len(frame)) + data[40:128] + frame + data[128 + old :]
-        if is_fine:
-            model_of_bytes("a.spz", bytes(changed))
-        else:
-            refused("a.spz", bytes(changed), "damaged SPZ")
 
 
 def archive(files: dict[str, bytes], compression: int = zipfile.ZIP_STORED) -> bytes:
@@ -162,38 +139,6 @@ def test_a_zip_bomb() -> None:
         refused("a.sog", bomb, "bytes that unpack to 209,7")
     lzma = archive(inside, zipfile.ZIP_LZMA)
     refused("a.sog", lzma, "unsupported ZIP compression")
-
-
-def test_a_zip_bomb_behind_a_directory_that_lies() -> None:
-    """A file that claims 4 GB does not make room for others, nor does one that is listed many times."""
-    inside = contents(model_bytes("a.sog", MODEL)) | {"means_l.webp": bytes(200 * MEGABYTE)}
-    bomb = bytearray(archive(inside | {"junk": b""}, zipfile.ZIP_DEFLATED))
-    struct.pack_into("<I", bomb, bomb.rindex(b"PK\1\2") + 20, 0xFFFFFFFE)  # packed bytes of the last one
-    refused("a.sog", bytes(bomb), "bytes that unpack to 209,7")
-    data = io.BytesIO()
-    with zipfile.ZipFile(data, "w", zipfile.ZIP_DEFLATED) as found:
-        for name, content in contents(model_bytes("a.sog", MODEL)).items():
-            found.writestr(name, content)
-        found.filelist += [copy(found.filelist[0]) for _ in range(51)]
-    refused("a.sog", data.getvalue(), "two of its files are at the same place")
-
-
-def webp(width: int, height: int) -> bytes:
-    data = io.BytesIO()
-    Image.new("RGBA", (width, height)).save(data, "WEBP", lossless=True, quality=0, method=0)
-    return data.getvalue()
-
-
-def test_a_webp_of_huge_size() -> None:
-    """A few bytes whose header announces 1 GB."""
-    small = bytearray(webp(16, 16))
-    small[21:25] = struct.pack("<I", 16382 | 16382 << 14)
-    for image in (bytes(small), webp(4000, 4000)):
-        for name in ("means_l", "quats", "shN_labels", "shN_centroids"):
-            # numpy's and Python's memory is counted here, and a canvas of Pillow's is neither
-            start = time.process_time()
-            refused("a.sog", with_meta(lambda meta: None, **{name: image}), "damaged SOG")
-            assert time.process_time() - start < 0.5
 
 
 @pytest.mark.parametrize(
@@ -250,14 +195,6 @@ def test_numbers_that_are_not_finite(value: float) -> None:
     one_left_out("a.glb", binary[:at] + struct.pack("<f", value) + binary[at + 4 :], "means")
 
 
-def test_scales_of_zero_and_below() -> None:
-    splat = bytearray(model_bytes("a.splat", MODEL))
-    splat[12:16] = struct.pack("<f", 0.0)
-    assert float(model_of_bytes("a.splat", bytes(splat)).log_scales.min()) < -80
-    splat[12:16] = struct.pack("<f", -1.0)
-    one_left_out("a.splat", bytes(splat), "log_scales")
-
-
 # --- glTF ------------------------------------------------------------------------------------------------
 
 
@@ -295,48 +232,6 @@ def test_a_gltf_that_lies(change: Callable[[dict], object], words: str) -> None:
     refused("a.glb", with_json(change), words)
 
 
-@pytest.mark.parametrize("where", ["inside", "instead"])
-def test_spz_inside_gltf_is_named(where: str) -> None:
-    name = f"KHR_gaussian_splats_{where}_spz"
-
-    def compress(gltf: dict) -> None:
-        gltf["extensionsUsed"] = [*gltf["extensionsUsed"], name]
-        extensions = gltf["meshes"][0]["primitives"][0]["extensions"]
-        if where == "inside":
-            extensions["KHR_gaussian_splatting"]["extensions"] = {name: {"bufferView": 0}}
-        else:
-            extensions[name] = extensions.pop("KHR_gaussian_splatting")
-
-    refused("a.glb", with_json(compress), rf"compressed \({name}\), .*; export a .ply or .spz")
-
-
-def test_a_compression_that_is_no_extension() -> None:
-    def compress(gltf: dict) -> None:
-        gltf["meshes"][0]["primitives"][0]["extensions"]["KHR_gaussian_splatting"]["extensions"] = 5
-
-    refused("a.glb", with_json(compress), r"compressed \(unknown\)")
-
-
-def test_a_gltf_that_repeats_its_gaussians_or_their_bytes() -> None:
-    def with_nodes(gltf: dict) -> None:
-        gltf["nodes"] = [{"mesh": 0}] * 20_000
-        gltf["scenes"][0]["nodes"] = list(range(20_000))
-
-    def with_shared_bytes(gltf: dict) -> None:
-        size = gltf["buffers"][0]["byteLength"]
-        gltf["bufferViews"] = [{"buffer": 0, "byteLength": size}]
-        for each in gltf["accessors"]:
-            each |= {"bufferView": 0, "count": size // 16, "componentType": 5121, "normalized": True}
-
-    refused("a.glb", with_json(with_nodes), "over and over", limit=32 * MEGABYTE)
-    refused("a.glb", with_json(with_shared_bytes, model_of(60, 3)), "over and over")
-
-
-def test_a_gltf_of_many_empty_nodes() -> None:
-    data = with_json(lambda gltf: gltf.update(nodes=[{}] * 10**6))
-    refused("a.glb", data, "expected JSON of at most 1,048,576 bytes, found")
-
-
 def test_many_tensors_of_no_bytes() -> None:
     """Such as a file that a key opens may announce, where 64 MiB take 1 MiB of the published model."""
     empty = {f"{i}": {"dtype": "F32", "shape": [0], "data_offsets": [0, 0]} for i in range(20_000)}
@@ -345,26 +240,6 @@ def test_many_tensors_of_no_bytes() -> None:
     refused("a.3dgs.safetensors", data, "a header of .* more than the")
     with pytest.raises(ValueError, match="a header of"):
         unpack_tensors(data, Header, "test", 1)
-
-
-def test_nodes_move_gaussians() -> None:
-    def change(gltf: dict) -> None:
-        gltf["nodes"] = [{"children": [1], "translation": [1, 2, 3]}, {"mesh": 0, "scale": [2, 2, 2]}]
-
-    found = model_of_bytes("a.glb", with_json(change))
-    expected = MODEL.means.numpy() * 2 + np.array([1, 2, 3], np.float32)
-    expected[:, :2] *= -1  # from y up to y down
-    assert np.allclose(found.means.numpy(), expected, atol=1e-5)
-    assert np.allclose(found.log_scales.numpy(), MODEL.log_scales.numpy() + np.log(2), atol=1e-5)
-
-
-def test_deep_json_is_no_problem(tmp_path: Path) -> None:
-    deep = b"[" * 100_000
-    refused("a.sog", archive({"meta.json": deep}), "cannot parse", limit=32 * MEGABYTE)
-    with pytest.raises(InputError):
-        model_of_bytes(
-            "a.glb", struct.pack("<4sIII4s", b"glTF", 2, 20 + len(deep), len(deep), b"JSON") + deep
-        )
 
 
 def test_a_large_sparse_model_is_believed(tmp_path: Path) -> None:

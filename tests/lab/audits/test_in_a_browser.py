@@ -56,10 +56,6 @@ def colours(page: playwright.Page) -> tuple[tuple[int, ...], tuple[int, ...]]:
     return left, right
 
 
-def choose(page: playwright.Page, side: str, label: str) -> None:
-    page.locator(f'select[aria-label$="{side} picture"]').first.select_option(label=label)
-
-
 def test_it_opens_from_disk_without_complaints_or_requests(
     chromium: playwright.Browser, report: Path
 ) -> None:
@@ -77,6 +73,7 @@ def test_it_opens_from_disk_without_complaints_or_requests(
     page.close()
 
 
+@pytest.mark.slow
 def test_the_slider_moves_with_the_keyboard(page: playwright.Page) -> None:
     assert colours(page) == (RED, BLUE)
     slider = page.locator(SLIDER)
@@ -90,31 +87,7 @@ def test_the_slider_moves_with_the_keyboard(page: playwright.Page) -> None:
     assert slider.get_attribute("aria-valuetext") == "100 % photo"
 
 
-def test_the_slider_moves_with_the_mouse(page: playwright.Page) -> None:
-    slider = page.locator(SLIDER)
-    slider.scroll_into_view_if_needed()
-    box = slider.bounding_box()
-    assert box is not None
-    page.mouse.click(box["x"] + 0.9 * box["width"], box["y"] + box["height"] / 2)
-    assert colours(page) == (RED, RED)
-
-
-def test_either_side_can_show_any_picture(page: playwright.Page) -> None:
-    choose(page, "left", "plain model")
-    assert colours(page) == (GREEN, BLUE)
-    choose(page, "right", "photo")
-    assert colours(page) == (GREEN, RED)
-    choose(page, "right", "plain model")
-    assert colours(page) == (GREEN, GREEN)
-
-
-def test_the_difference(page: playwright.Page) -> None:
-    page.locator(".choices input").first.click()
-    assert colours(page)[1] == tuple(min(255, 4 * abs(a - b)) for a, b in zip(RED, BLUE, strict=True))
-    choose(page, "left", "stego model")
-    assert page.locator(".compare").first.locator(".shot.left.right").count() == 1
-
-
+@pytest.mark.slow
 def test_all_pictures_are_shown_without_scripts_and_on_paper(
     chromium: playwright.Browser, page: playwright.Page, report: Path
 ) -> None:
@@ -136,32 +109,7 @@ def test_all_pictures_are_shown_without_scripts_and_on_paper(
     without_scripts.close()
 
 
-@pytest.mark.parametrize("width", [320, 390, 768, 1600])
-def test_the_page_is_never_wider_than_the_window(page: playwright.Page, width: int) -> None:
-    page.set_viewport_size({"width": width, "height": 900})
-    assert page.evaluate("document.documentElement.scrollWidth <= window.innerWidth")
-    assert page.evaluate("Math.max(...[...document.querySelectorAll('p')].map((p) => p.clientWidth))") > 250
-
-
-def test_dark_and_light(page: playwright.Page) -> None:
-    def brightness(of: str, name: str) -> float:
-        color = page.evaluate(f"getComputedStyle(document.querySelector('{of}')).{name}")
-        channels = [float(number) for number in re.findall(r"[\d.]+", color)[:3]]
-        return sum(channels) / 3 / 255
-
-    text, page_ = ("body", "color"), ("body", "backgroundColor")
-    assert brightness(*text) < 0.5 < brightness(*page_)
-    page.emulate_media(color_scheme="dark")
-    assert brightness(*page_) < 0.2
-    assert brightness(*text) > 0.5
-
-
-def test_it_prints_on_a_few_pages(page: playwright.Page) -> None:
-    data = page.pdf(format="A4", prefer_css_page_size=True)
-    assert data.startswith(b"%PDF")
-    assert 4 <= len(re.findall(rb"/Type\s*/Page\b(?!s)", data)) <= 20
-
-
+@pytest.mark.slow
 @pytest.mark.parametrize("guarded", [True, False], ids=["with the policy", "without, as a control"])
 def test_markup_that_slipped_in_could_do_nothing(
     page: playwright.Page, report: Path, tmp_path: Path, guarded: bool

@@ -75,17 +75,6 @@ def test_prose_is_text_with_code_in_backquotes(text: str) -> None:
     assert "".join(page.texts) == clean(text).replace("`", "")
 
 
-def test_backquotes_mark_what_is_typed() -> None:
-    assert prose("run `a <b>` now") == "run <code>a &lt;b&gt;</code> now"
-    assert prose("<i>") == "&lt;i&gt;"
-
-
-def test_a_picture_comes_with_its_size(run: Path) -> None:
-    picture = AuditPictures(run).read("pictures/photo.png")
-    assert (picture.width, picture.height) == (40, 30)
-    assert picture.url.startswith("data:image/png;base64,iVBORw0KGgo")
-
-
 @pytest.mark.parametrize(
     "name",
     [
@@ -118,13 +107,3 @@ def test_only_png_files_are_pictures(run: Path) -> None:
     for name in ("drawing.png", "cut.png", "missing.png", ""):
         with pytest.raises(InputError):
             AuditPictures(run).read(f"pictures/{name}")
-
-
-def test_pictures_have_a_limit_together(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    size = (run / "private" / "audit" / "pictures" / "photo.png").stat().st_size
-    monkeypatch.setattr(page_module, "_MAX_PICTURES", 2 * size)
-    pictures = AuditPictures(run)
-    for _ in range(2):
-        pictures.read("pictures/photo.png")
-    with pytest.raises(InputError, match="at most 0 bytes"):
-        pictures.read("pictures/photo.png")

@@ -84,11 +84,6 @@ def test_what_is_wrong_in_a_table_is_said_with_its_line(folder: Path, text: str,
     assert words in str(caught.value)
 
 
-def test_without_a_master_key_every_row_names_a_key_file(folder: Path) -> None:
-    with pytest.raises(InputError, match="line 2: expected a key_file"):
-        batch.read_rows(manifest(folder, HEAD + "a.ply,secret.ply,x\n"), master=False)
-
-
 def hide(folder: Path, **options: Any) -> ManyResult:
     master = folder / "master.txt"
     return hide_batch(folder / "assets.csv", folder / "out", master_key_file=master, **options)
@@ -159,37 +154,6 @@ def test_another_master_key_is_refused(folder: Path) -> None:
     (folder / "master.txt").write_text("another-key-for-7Qx2")
     with pytest.raises(OutputError, match="another master key"):
         hide(folder)
-
-
-@fake_hiding
-def test_another_key_is_not_taken_for_the_one_before(folder: Path) -> None:
-    manifest(folder, "cover,secret,out,key_file\na.ply,secret.ply,x,key.txt\n")
-    key_file = folder / "key.txt"
-    key_file.write_text(KEY)
-
-    def skipped() -> bool:
-        (outcome,) = hide_batch(folder / "assets.csv", folder / "out").outcomes
-        assert outcome.error is None
-        return outcome.skipped
-
-    assert not skipped()
-    assert skipped()
-    written = (folder / "out" / "x" / "private" / "asset.json").stat().st_mtime
-    key_file.write_text(KEY[::-1])
-    os.utime(key_file, (written + 5, written + 5))
-    assert not skipped()
-    key_file.rename(folder / "other.txt")
-    manifest(folder, "cover,secret,out,key_file\na.ply,secret.ply,x,other.txt\n")
-    assert not skipped()
-    assert not any(KEY[::-1].encode() in path.read_bytes() for path in (folder / "out").rglob("*.*"))
-
-
-@fake_hiding
-def test_a_name_that_no_file_can_have_does_not_stop_the_others(folder: Path) -> None:
-    manifest(folder, HEAD + f"a.ply,secret.ply,{'x' * 300}\na.ply,secret.ply,y\n")
-    long, other = hide(folder).outcomes
-    assert "too long" in str(long.error)
-    assert other.error is None
 
 
 def test_the_key_of_an_asset_opens_it_and_no_other(tmp_path: Path, keyss: Run) -> None:

@@ -11,12 +11,11 @@ from PIL import Image
 from keyss import compare
 from keyss.cli import main
 from keyss.core import InputError, OutputError, UsageError
-from keyss.fitting import PRESETS
 from keyss.lab.audits import comparison_measures
 from keyss.lab.many import Forecast, cell, comparison
 from keyss.lab.many.engine import claim_folder
 from keyss.lab.two_sample import Auc
-from keyss.methods import Bound, registry
+from keyss.methods import registry
 
 SMALL = ["--iterations", "60", "--max-gaussians", "240", "--seed", "3"]
 
@@ -83,15 +82,6 @@ def test_a_table_a_picture_and_a_second_start(
     assert (out / "private" / "master-key.txt").stat().st_mode & 0o77 == 0
 
 
-@pytest.mark.parametrize("name", registry.METHODS)
-@pytest.mark.parametrize("iterations", [61, 3000])
-def test_every_scene_is_drawn_as_often_by_every_method(name: str, iterations: int) -> None:
-    for preset in map(registry.get(name).options.preset, PRESETS):
-        options, plain = comparison.split_budget(iterations, preset)
-        trained = [Bound.of(each, own).steps for each, own in zip(options.training(2), plain, strict=True)]
-        assert trained == [iterations] * 2
-
-
 def test_what_it_does_not_know_is_refused(folders: tuple[Path, Path], tmp_path: Path) -> None:
     for methods, words in ((["3dgs", "lerned"], "lerned"), (["carry:worst"], "worst")):
         with pytest.raises(UsageError, match=words):
@@ -132,8 +122,3 @@ def test_one_budget_and_one_process_for_a_folder(folders: tuple[Path, Path], tmp
     assert {each.partition(", ")[2] for each in found.names.values()} >= {"500 steps, seed 0"}
     with claim_folder(tmp_path / "out"), pytest.raises(OutputError, match="another process"):
         compare(*folders, methods=["carry:quick"], out=tmp_path / "out")
-
-
-def test_all_is_every_method_and_keyss_as_published() -> None:
-    assert set(comparison.EVERY) == {*registry.METHODS, "keyss:published"}
-    assert len(comparison.EVERY) == len(set(comparison.EVERY))

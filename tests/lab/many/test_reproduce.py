@@ -7,15 +7,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import torch
 
 from cli.said import Run, listing
-from keyss import Gaussians, read_model, reproduce
+from keyss import reproduce
 from keyss.core import InputError
-from keyss.lab import opacity_pruning, random_pruning
 from keyss.lab.audits import comparison_measures
-from keyss.lab.many import Forecast, Reproduction, cell, reproduction
-from tiny_scenes import random_gaussians
+from keyss.lab.many import Forecast, Reproduction, cell
 
 SIZES = {"iterations": 20, "max_gaussians": 150}
 FLAGS = ("--iterations", 20, "--max-gaussians", 150, "--pairs", "a,b", "--seed", 5)
@@ -123,38 +120,3 @@ def test_the_command(keyss: Run, out: Path, folders: tuple[Path, Path], tmp_path
     assert (said.status, "--width" in said.err) == (2, True), said
     full = keyss("reproduce", "multi", "--data", tmp_path, "-o", tmp_path / "new")
     assert (full.status, "Mip-NeRF 360" in full.err) == (4, True)
-
-
-def test_the_papers_scenes_have_its_sizes_and_pairs(
-    folders: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    monkeypatch.setattr(reproduction, "link_scene", lambda data, name, folder: folders[name < "c"])
-    found = reproduce(
-        "multi", data=tmp_path, pairs=["bicycle,bonsai,room"], out=tmp_path / "out", dry_run=True
-    )
-    assert isinstance(found, Forecast)
-    assert {each.partition(", ")[2] for each in found.names.values()} >= {"bicycle-bonsai-room"}
-    assert {each.stages[0].steps for each in found.plans.values()} == {30_000}
-    assert max(each.gaussians for each in found.plans.values()) == 500_000
-
-
-def test_what_is_appended_is_neither_counted_nor_pruned(out: Path) -> None:
-    stego = read_model(run_of("KeySS, a-b", out) / "publish" / "model.ply")
-    own = comparison_measures.own_gaussians(stego)
-    assert 0 < len(own) <= 150 < len(stego)
-    for change in (random_pruning(0.25), opacity_pruning(0.25)):
-        left = comparison_measures.spare_appended(change)(stego)
-        assert len(comparison_measures.own_gaussians(left)) == len(change(own))
-        assert len(left) - len(comparison_measures.own_gaussians(left)) == len(stego) - len(own)
-        assert torch.equal(comparison_measures.own_gaussians(left).means, change(own).means)
-    plain: Gaussians = random_gaussians(100)
-    assert torch.equal(comparison_measures.own_gaussians(plain).means, plain.means)
-
-
-def test_the_command_says_what_cannot_be_downloaded(keyss: Run, tmp_path: Path) -> None:
-    full = ("reproduce", "single", "--data", tmp_path / "data", "-o", tmp_path / "out")
-    both = keyss(*full, "--download", "--dry-run")
-    assert (both.status, "--download" in both.err) == (2, True)
-    without = keyss("reproduce", "single", "a", "b", "--download", "-o", tmp_path / "out")
-    assert (without.status, "--data" in without.err) == (2, True)
-    assert not (tmp_path / "data").exists()

@@ -8,21 +8,13 @@ import pytest
 
 from keyss import reproduce
 from keyss.core import UsageError
-from keyss.files.benchmark_scenes import BENCHMARK
-from keyss.lab.many import paper, reproduction
+from keyss.lab.many import reproduction
 
 
 def test_every_scene_hides_the_next() -> None:
     groups_of = reproduction.groups_of
     assert groups_of(["a", "b"], 1, (), None) == [("a", "b"), ("b", "a")]
     assert groups_of(["a", "b", "c"], 2, (), None) == [("a", "b", "c"), ("b", "c", "a"), ("c", "a", "b")]
-
-
-def test_the_papers_scenes_are_those_of_its_tables() -> None:
-    pairs, triples = paper.PAPER.pairs, paper.PAPER.triples
-    assert tuple(BENCHMARK) == (*(cover for cover, _ in pairs), "playroom")
-    assert {name for pair in pairs for name in pair} == set(BENCHMARK)
-    assert {name for triple in triples for name in triple} <= set(BENCHMARK)
 
 
 @pytest.mark.parametrize(

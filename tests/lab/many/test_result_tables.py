@@ -60,23 +60,3 @@ def test_latex_has_equal_rows_and_no_bare_special_characters() -> None:
     assert rows[2].endswith(r"0.33 & -- & -- \\")
     assert {row.replace(r"\&", "").count("&") for row in [*rows, lines[3]]} == {6}
     assert result_tables.latex([]).count("tabular") == 2
-
-
-def test_all_measures_read_back_the_same(tmp_path: Path) -> None:
-    pandas = pytest.importorskip("pandas")
-    made = [
-        result_tables.CellNumbers(
-            labels={"pair": "a,b"},
-            scenes=["a"],
-            seed=seed,
-            cell=f"{seed}",
-            numbers={"x": seed / 3, "y": 1e-300},
-        )
-        for seed in range(4)
-    ]
-    result_tables.write_sweep_tables(tmp_path, made)
-    one = pandas.read_csv(tmp_path / "results.csv")
-    assert list(one["mean"]) == [0.5, 1e-300]
-    assert list(one["seeds"]) == [4, 4]
-    assert one["std"][0] == pytest.approx(np.std([0, 1 / 3, 2 / 3, 1], ddof=1), rel=1e-12)
-    assert len(pandas.read_csv(tmp_path / "cells.csv")) == 8

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import json
 import os
-import signal
 import sys
 from pathlib import Path
 from typing import Any
@@ -14,14 +13,9 @@ import pytest
 
 import keyss as library
 from cli.said import Run
-from keyss.core import BackendError, InputError, OutputError
-from keyss.lab.many import Forecast, ManyResult, cell_folder, sweep, sweep_spec
-from keyss.lab.many.engine import claim_folder
-from keyss.progress import Reporter
-from keyss.runs import MANIFEST
-from lab.many.conftest import fake_run
-from test_api import write_nerfstudio
-from tiny_scenes import random_gaussians, tiny_scene
+from keyss.core import BackendError, InputError
+from keyss.lab.many import Forecast, ManyResult, sweep
+from tiny_scenes import random_gaussians
 
 fake_runs = pytest.mark.usefixtures("_fake_runs")
 
@@ -51,14 +45,6 @@ def spec_of(folder: Path, text: str) -> Path:
     path = folder / "spec.yaml"
     path.write_text(text)
     return path
-
-
-def test_a_grid_is_every_choice_with_every_other(files: Path) -> None:
-    path = spec_of(files, GOOD)
-    found = [options for _, options, _ in sweep_spec.variants(path, sweep_spec.read_spec(path))]
-    chosen = [(each.sh_degree, each.fit.iterations) for each in found]  # type: ignore[attr-defined]
-    assert chosen == [(1, 10), (1, 20), (3, 10), (3, 20)]
-    assert all(each.fit.max_gaussians == 10_000 for each in found)  # of the preset
 
 
 @pytest.mark.parametrize(
@@ -97,11 +83,6 @@ def test_what_is_wrong_in_a_specification_is_said_before_anything_runs(
         run(path, files / "out")
     assert words in str(caught.value)
     assert not (files / "out").exists()
-
-
-def test_deeply_nested_yaml_is_refused(files: Path) -> None:
-    with pytest.raises(InputError):
-        sweep_spec.read_spec(spec_of(files, "pairs: " + "[" * 100_000))
 
 
 def write_spec(folder: Path, covers: list[str], seeds: int, more: str = "") -> Path:
@@ -171,24 +152,6 @@ def test_a_cell_runs_again_when_its_files_options_or_result_changed(tmp_path: Pa
     assert len(list((out / "cells").iterdir())) == 4
 
 
-def test_results_are_not_written_into_what_is_given_away(tmp_path: Path) -> None:
-    publish = tmp_path / "run" / "publish"
-    publish.mkdir(parents=True)
-    (tmp_path / "run" / "private").mkdir()
-    (tmp_path / "run" / MANIFEST).touch()
-    with pytest.raises(OutputError, match="given away"):
-        run(write_spec(tmp_path, ["a.ply"], seeds=1), publish / "sweep")
-
-
-@fake_runs
-def test_a_folder_that_is_there_stays_open_to_whom_it_was(tmp_path: Path) -> None:
-    out = tmp_path / "shared"
-    out.mkdir(mode=0o755)
-    run(write_spec(tmp_path, ["a.ply"], seeds=1), out)
-    assert out.stat().st_mode & 0o777 == 0o755
-    assert (out / "private").stat().st_mode & 0o077 == 0
-
-
 @fake_runs
 def test_a_cell_that_fails_does_not_end_the_others(
     tmp_path: Path, keyss: Run, capsys: pytest.CaptureFixture[str]
@@ -206,104 +169,12 @@ def test_a_cell_that_fails_does_not_end_the_others(
     assert "failed: broken-secret carry seed 0: " in said.out
 
 
-def test_after_ctrl_c_finished_cells_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    spec, out = write_spec(tmp_path, ["a.ply"], seeds=3), tmp_path / "out"
-
-    def interrupted(job: Any, folder: Path, reporter: Reporter) -> Any:
-        if job.options.fit.seed == 1:
-            raise KeyboardInterrupt
-        return fake_run(job, folder, reporter)
-
-    monkeypatch.setattr(cell_folder, "run_cell", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        run(spec, out)
-    monkeypatch.setattr(cell_folder, "run_cell", fake_run)
-    assert skipped(run(spec, out)) == [True, False, False]
-
-
-class Interrupting(Reporter):
-    """Interrupts the second training after a few steps."""
-
-    trainings = 0
-
-    def __init__(self) -> None:
-        self.notes: list[str] = []
-
-    def note(self, line: str) -> None:
-        self.notes.append(line)
-
-    def start(self, title: str, iterations: int, iteration: int) -> None:
-        self.trainings += 1
-
-    def update(self, iteration: int, gaussians: int, numbers: dict[str, float]) -> None:
-        if self.trainings == 2 and iteration == 5:
-            signal.raise_signal(signal.SIGINT)
-
-
-class Noting(Reporter):
-    """Notes at which step trainings begin."""
-
-    def __init__(self) -> None:
-        self.starts: list[int] = []
-
-    def start(self, title: str, iterations: int, iteration: int) -> None:
-        self.starts.append(iteration)
-
-
-def test_a_training_goes_on_where_ctrl_c_stopped_it_and_scenes_are_fitted_once(tmp_path: Path) -> None:
-    write_nerfstudio(tmp_path / "a", tiny_scene())
-    spec = spec_of(
-        tmp_path,
-        "pairs: [{cover: a, secrets: [a]}]\n"
-        "methods:\n"
-        "  - {method: carry, options: {publish: any, fit.iterations: 20, fit.max_gaussians: 150}}\n"
-        "  - {method: carry, name: dithered,\n"
-        "     options: {publish: any, dither: true, fit.iterations: 20, fit.max_gaussians: 150}}\n"
-        "bound: true\n",
-    )
-    interrupting = Interrupting()
-    with pytest.raises(KeyboardInterrupt):
-        run(spec, tmp_path / "out", reporter=interrupting)
-    assert interrupting.notes[-1] == "interrupted: the same command resumes"
-    noted = Noting()
-    found = run(spec, tmp_path / "out", reporter=noted)
-    assert [each.error for each in found.outcomes] == [None] * 2
-    assert noted.starts[0] == 5
-    # Once as a cover and once, with more steps, as a secret.
-    assert len(list((tmp_path / "out").glob("cells/*/run/model.ply"))) == 2
-    assert len(list((tmp_path / "out" / "cells").iterdir())) == 2 + 2
-    for each in found.outcomes:
-        numbers = each.result.numbers
-        assert numbers["baseline.cover.psnr"] == pytest.approx(numbers["cover.psnr"], abs=0.01)
-
-
-@fake_runs
-def test_keys_follow_from_one_master_key_and_stay_private(tmp_path: Path) -> None:
-    spec = write_spec(tmp_path, ["a.ply"], seeds=1)
-    out = tmp_path / "out"
-    run(spec, out)
-    key_file = out / "private" / "master-key.txt"
-    assert out.stat().st_mode & 0o077 == 0
-    assert key_file.stat().st_mode & 0o077 == 0
-    key = key_file.read_text().strip()
-    others = [path for path in out.rglob("*") if path.is_file() and path != key_file]
-    assert not any(key.encode() in path.read_bytes() for path in others)
-    with pytest.raises(OutputError, match="another master key"):
-        run(spec, out, master_key_file=tmp_path / "master.txt")
-
-
 def test_the_key_of_a_cell_opens_it(tmp_path: Path, keyss: Run) -> None:
     (cell,) = run(real_spec(tmp_path, 1), tmp_path / "out").outcomes
     name, master = f"cell/{cell.folder.name}/1", tmp_path / "out" / "private" / "master-key.txt"
     key = keyss("keygen", "--asset", name, "--master-key-file", master).out.strip()
     assert len(library.reveal(cell.folder / "run" / "publish" / "model.ply", key).gaussians) == 40
     assert json.loads((cell.folder / "cell.json").read_text())["method"] == "carry"
-
-
-def test_two_sweeps_do_not_work_in_one_folder(tmp_path: Path) -> None:
-    spec = write_spec(tmp_path, ["a.ply"], seeds=1)
-    with claim_folder(tmp_path / "out"), pytest.raises(OutputError, match="another process"):
-        run(spec, tmp_path / "out")
 
 
 def test_a_dry_run_writes_nothing_and_names_what_cannot_work(keyss: Run, tmp_path: Path) -> None:

@@ -76,13 +76,6 @@ def with_siblings(model: Gaussians) -> Gaussians:
     return Gaussians.cat([model, moved])
 
 
-def in_steps(model: Gaussians) -> Gaussians:
-    """Opacities of eight bits, each moved a little so that it has low bits."""
-    steps = (model.opacity_logits * 12).round() / 12
-    generator = torch.Generator().manual_seed(5)
-    return replace(model, opacity_logits=steps + 1e-5 * torch.rand(len(model), generator=generator))
-
-
 def banded(model: Gaussians, *secrets: Gaussians) -> Gaussians:
     """Secrets at the end of the file, each too faint to be drawn, in a band of its own, in another frame."""
     turned = []

@@ -9,28 +9,15 @@ import pytest
 
 from channels.quiet.trained_like import keys
 from keyss.lab import candidate_scores, changed_low_bits
-from lab.stealth.careless import banded, overwritten, plain, shuffled
+from lab.stealth.careless import banded, overwritten, plain
+from lab.stealth.detectors import confirmed
 from methods.carry.carried import embed_derived
-from stealth_detection import confirmed
 
 SECRETS = 4
 
 
-@pytest.fixture(scope="module")
-def shown() -> np.ndarray:
-    """Scores [files, candidates] where secrets lie in a band, shuffled."""
-    candidates = [plain(10 + index, 800) for index in range(SECRETS)]
-    files = [shuffled(banded(plain(index), secret)) for index, secret in enumerate(candidates)]
-    return np.array([[candidate_scores(file, each) for each in candidates] for file in files])
-
-
 def _confirmed(scores: np.ndarray, name: str) -> float:
     return confirmed(np.vectorize(lambda each: each[name])(scores), range(SECRETS))
-
-
-def test_rows_of_the_secret_are_found_in_any_order_and_frame(shown: np.ndarray) -> None:
-    assert _confirmed(shown, "rows that fit") == 1
-    assert _confirmed(shown, "nearness of rows, first quarter") == 1
 
 
 def test_the_order_of_rows_confirms() -> None:
@@ -65,11 +52,3 @@ def test_carried_secrets_are_not_confirmed() -> None:
         candidate_scores(file, each)["nearness of rows, median"] for file in files for each in candidates
     ]
     assert after == pytest.approx(before, abs=1e-2)
-
-
-def test_what_is_ranked_is_relative_to_other_files() -> None:
-    scores = np.array(
-        [[5.0, 9.0, 1.0], [3.0, 11.0, 1.0], [3.0, 9.0, 2.0]]
-    )  # the second resembles all files most
-    assert confirmed(scores, [0, 1, 2]) == 1
-    assert confirmed(np.zeros((3, 3)), [0, 1, 2]) == 0.5

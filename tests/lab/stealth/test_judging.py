@@ -6,8 +6,7 @@ import pytest
 
 from keyss.core import UsageError
 from keyss.lab import judge
-from lab.stealth.careless import banded, grey, normalised, overwritten, plain, plain_rounded
-from stealth_predictor import BitPredictor
+from lab.stealth.careless import banded, normalised, overwritten, plain, plain_rounded
 
 LIMIT = 0.01
 
@@ -46,36 +45,3 @@ def test_secrets_in_a_band_are_unusual_counted_and_confirmed() -> None:
 def test_it_takes_two_controls() -> None:
     with pytest.raises(UsageError, match="at least two"):
         judge(plain(1), [plain(2)])
-
-
-RANDOM_NOISE = 4.5  # standard errors
-
-
-@pytest.fixture(scope="module")
-def predictor() -> BitPredictor:
-    return BitPredictor.fit([grey(plain_rounded(seed)) for seed in range(6)])
-
-
-def _z(found: object) -> float:
-    value, error = found.value, found.error  # type: ignore[attr-defined]
-    return float(value / error)
-
-
-def test_bits_of_a_trainer_that_rounds_are_predicted_until_they_are_replaced(predictor: BitPredictor) -> None:
-    model = plain_rounded(20)
-    name = "agreement without a like"
-    assert _z(predictor.statistics(model)[name]) > 8
-    assert abs(_z(predictor.statistics(overwritten(model, bits=12))[name])) < RANDOM_NOISE
-
-
-def test_near_channels_predict_each_other(predictor: BitPredictor) -> None:
-    name = "agreement beside its equal"
-    assert predictor.statistics(grey(plain_rounded(21)))[name].value > 0.8
-    assert name not in predictor.statistics(plain(21))
-
-
-def test_random_bits_are_not_predicted(predictor: BitPredictor) -> None:
-    """The exact null: whatever trees say, bits of `plain` are fair and independent."""
-    for name, each in predictor.statistics(plain(22)).items():
-        if each.error is not None:
-            assert abs(_z(each)) < RANDOM_NOISE, name

@@ -40,14 +40,6 @@ def test_hide_reveal_verify_and_info(format: str, tmp_path: Path) -> None:
 
 
 @EVERY
-def test_what_was_made_in_memory_opens_there(format: str) -> None:
-    found = keyss.hide_files(model_of(3000), [keyss.SecretFile(b"a note", "key one")], format=format)  # type: ignore[arg-type]
-    assert keyss.reveal(found.stego, "key one").file.data == b"a note"
-    with pytest.raises(keyss.WrongKeyError):  # another model, whose codes carry nothing
-        keyss.reveal(found.stego.with_sh_degree(0), "key one")
-
-
-@EVERY
 def test_too_large_secrets_are_refused_or_pruned(format: str) -> None:
     cover, asked = model_of(2500), [keyss.Secret(model_of(1500, 1), "key one")]
     pruning = CarryOptions(format=format, prune_to_fit=True)  # type: ignore[arg-type]
@@ -63,12 +55,3 @@ def test_a_published_file_as_cover_is_taken_as_it_is(format: str, tmp_path: Path
     write_model(path, model_of(3000))
     model = read_model(path)
     assert channel_for("as-is", format=format).prepare(model).codes == in_counted_order(model.codes)[1]  # type: ignore
-
-
-@EVERY
-def test_what_carries_is_the_file_that_would_be_written_without_secrets(format: str, tmp_path: Path) -> None:
-    model = model_of(3000)[torch.randperm(3000, generator=torch.Generator().manual_seed(0))]
-    path = tmp_path / f"plain{SUFFIXES[format]}"
-    write_model(path, model)
-    written = read_model(path).codes  # type: ignore[attr-defined]
-    assert channel_for("as-is", format=format).prepare(model).codes == in_counted_order(written)[1]

@@ -8,14 +8,13 @@ from pathlib import Path
 
 import pytest
 import torch
-from hypothesis import given, strategies as st
 
 import keyss
 from channels.quiet.trained_like import trained_like
 from keyss import CarryOptions, FitConfig, Secret
 from keyss.channels import identities
 from keyss.core import Gaussians, KeyssWarning, Scene, UsageError
-from keyss.methods import Source, Training, divide, most_contributing, registry
+from keyss.methods import Source, Training, most_contributing, registry
 from methods.hiding import check_resumes, hide_scenes, psnr_in, three_scenes
 from tiny_scenes import random_gaussians, tiny_scene
 
@@ -95,14 +94,6 @@ def test_where_room_is_short_secrets_are_refitted(format: str, secrets: int) -> 
     assert found.training(1 + secrets) == (Training(), *[Training(1150)] * secrets)
 
 
-def test_harmonics_of_fitted_models_follow_the_cover() -> None:
-    for cover, secret in ((1, 0), (2, 2), (3, 3)):
-        found = _prepared(CarryOptions(fit=FIT), _given(trained_like(8000, sh_degree=cover)), PHOTOS)
-        assert [each.sh_degree for each in found.fits(2)] == [cover, secret]
-    found = _prepared(CarryOptions(fit=FIT, sh_degree=2), PHOTOS, PHOTOS)
-    assert [each.sh_degree for each in found.fits(2)] == [2, 2]
-
-
 def test_what_adds_nothing_to_the_pictures_is_left_out_first() -> None:
     """Behind a wall, out of every view, transparent."""
     plain = random_gaussians(seed=0)
@@ -131,37 +122,10 @@ def test_an_interrupted_refit_resumes_to_the_same_result(tmp_path: Path) -> None
     check_resumes(CarryOptions(fit=TINY, refit="always"), tmp_path, "refit")
 
 
-@given(st.lists(st.integers(0, 50), min_size=1, max_size=5), st.integers(0, 300))
-def test_shares_use_all_there_is_and_no_more(available: list[int], total: int) -> None:
-    shares = divide(available, total)
-    assert all(0 <= share <= n for share, n in zip(shares, available, strict=True))
-    assert sum(shares) == min(total, sum(available))
-    unfilled = [share for share, n in zip(shares, available, strict=True) if share < n]
-    assert max(unfilled, default=0) - min(unfilled, default=0) <= 1
-
-
 @pytest.fixture(scope="module")
 def pair() -> tuple[list[Scene], list[Gaussians]]:
     scenes, _ = three_scenes()
     return [scenes[0], scenes[2]], [random_gaussians(1500, seed=0), random_gaussians(200, seed=2)]
-
-
-def _file(pair: tuple[list[Scene], list[Gaussians]], iterations: int) -> Gaussians:
-    fit = replace(TINY, iterations=iterations, max_gaussians=2000)
-    return hide_scenes(pair[0], ["a key"], CarryOptions(fit=fit, refit="always"), plains=pair[1]).stego
-
-
-def test_there_are_no_transparent_gaussians_but_its_own(pair: tuple[list[Scene], list[Gaussians]]) -> None:
-    stego = _file(pair, 20)
-    assert len(stego) <= len(pair[1][0])
-    assert float(stego.opacities.min()) >= TINY.prune_opacity
-
-
-def test_rows_are_the_covers_in_its_own_order(pair: tuple[list[Scene], list[Gaussians]]) -> None:
-    """Any other order would be told from a fit's, in which what came later stands later."""
-    stego, plain = _file(pair, 2), pair[1][0]
-    own = torch.cdist(stego.sh.flatten(1), plain.sh.flatten(1)).argmin(1)
-    assert (own.diff() > 0).all()
 
 
 def test_what_the_cover_becomes_does_not_depend_on_the_secret_or_the_key(

@@ -14,10 +14,8 @@ import keyss
 from channels.quiet.trained_like import trained_like
 from cli.said import Run, write_key
 from keyss import CarryOptions, FitConfig, Secret
-from keyss.channels import LOW_BITS
-from keyss.core import UsageError, WrongKeyError
+from keyss.core import UsageError
 from keyss.files import read_model, write_model
-from keyss.methods import most_visible, record_request
 from tiny_scenes import random_gaussians, tiny_scene
 
 KEY = "a key of many characters: 93hXmQ2"
@@ -69,33 +67,6 @@ def test_hide_and_reveal_files(run: Run, tmp_path: Path) -> None:
     assert (status, "no decoder" in err) == (2, True)
     assert run("reveal", stego, "--key-file", "key", "--frame", "cover", "-o", tmp_path / "n.ply")[0] == 2
     assert KEY not in "".join(path.read_text() for path in (tmp_path / "out").rglob("*.json"))
-
-
-def test_too_large_secrets_are_refused_or_pruned(run: Run, tmp_path: Path) -> None:
-    hide = (*HIDE, "--cover", "cover.ply", "--secret", "large.ply")
-    status, _, err = run(*hide, "-o", tmp_path / "out", "--refit", "never")
-    assert status == 2
-    cover = LOW_BITS.prepare(read_model("cover.ply"))
-    fits = cover.cells.record_capacity([record_request(6000, 3)])
-    assert 4000 < fits < 4800
-    assert f"there is room for {fits:,} of degree 3; --prune-to-fit" in err
-    assert not (tmp_path / "out").exists()
-    assert run(*hide, "-o", tmp_path / "out", "--prune-to-fit")[0] == 0
-    metrics = json.loads((tmp_path / "out/private/metrics.json").read_text())
-    assert metrics["secret_gaussians"] == [fits]
-    assert metrics["details"]["gaussians_before_pruning"] == [6000]
-    assert 10 < metrics["against_plain"][1]["psnr"] < 60
-
-
-def test_a_cover_without_any_room_names_what_works_and_not_what_was_given(run: Run, tmp_path: Path) -> None:
-    write_model(tmp_path / "tiny.ply", trained_like(100))
-    for flags in (("--format=ply",), ("--prune-to-fit",), ("--refit=never",)):
-        scenes = ("--cover", tmp_path / "tiny.ply", "--secret", "secret.ply")
-        status, _, err = run(*HIDE, *scenes, "-o", tmp_path / "out", *flags)
-        assert status == 2
-        assert "--publish any" in err
-        assert "there is room" not in err
-        assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(
@@ -150,15 +121,6 @@ def test_however_short_its_training_a_fitted_cover_carries(steps: int, views: in
     assert result.metrics.against_plain[0].psnr > 40
 
 
-def test_a_given_model_of_a_scene_is_used() -> None:
-    model = random_gaussians(400)
-    result = keyss.hide(trained_like(1500), [Secret(tiny_scene(1), KEY, model)], method="carry", width=48)
-    assert result.metrics.secret_gaussians == (400,)
-    assert keyss.reveal(result.stego, "wrong", decoy=True) is not None
-    with pytest.raises(WrongKeyError):
-        keyss.reveal(result.stego, "wrong")
-
-
 def test_a_pruned_secret_that_is_not_recognised_is_refused(run: Run, tmp_path: Path) -> None:
     hide = (*HIDE, "--cover", "cover.ply", "--secret", "large.ply", "--format", "spz", "--prune-to-fit")
     status, out, err = run(*hide, "-o", tmp_path / "out")
@@ -169,26 +131,3 @@ def test_a_pruned_secret_that_is_not_recognised_is_refused(run: Run, tmp_path: P
     status, out, _ = run(*hide, "-o", tmp_path / "out", "--min-psnr", 0)
     assert status == 0
     assert "of 6,000 Gaussians, " in out
-
-
-def test_pruning_keeps_what_is_visible() -> None:
-    model = trained_like(1000)
-    model.opacity_logits[:] = 0
-    model.opacity_logits[:400] = -30
-    kept = most_visible(model, 600)
-    assert torch.equal(kept.means, model.means[400:])
-    assert most_visible(model, 1000) is model
-
-
-def test_what_cannot_work_is_refused_before_anything_is_fitted(tmp_path: Path) -> None:
-    """A scene without a model would be fitted for minutes, though the cover has no room."""
-    coarse = trained_like(1500).map(lambda v: (v * 64).round() / 64)
-    secret = Secret(tiny_scene(1), KEY)
-    with pytest.raises(UsageError, match="`dither=True`"):
-        keyss.hide(coarse, [secret], method="carry", format="ply", out=tmp_path / "run")
-    flat = random_gaussians(1500, sh_degree=0)
-    model = Secret(tiny_scene(1), KEY, random_gaussians(100, sh_degree=3))
-    other = Secret(tiny_scene(1), KEY + "2")
-    with pytest.raises(UsageError, match="SH degree 0 has no room"):
-        keyss.hide(flat, [other, model], method="carry", format="ply", out=tmp_path / "run")
-    assert not (tmp_path / "run").exists()

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-from dataclasses import fields, replace
 from itertools import combinations
 from typing import Any
 
@@ -65,19 +64,6 @@ def test_theta_updates_its_attributes_and_no_others(mask: tuple[str, ...]) -> No
         assert (_distance(decoded, gaussians, field) > 0) == (name in mask), name
 
 
-def test_the_key_chooses_what_is_decoded() -> None:
-    gaussians, decoder = random_gaussians(), _decoder()
-    decoded = decoder(gaussians, KEY)
-    for field in FIELD_OF.values():
-        assert _distance(decoded, decoder(gaussians, OTHER), field) > 1e-3
-
-
-def test_released_weights_have_the_spread_of_kaiming_initialisation() -> None:
-    layer = _decoder(released=True, hidden=(400, 300)).common[2]
-    assert float(layer.weight.std()) == pytest.approx((2 / 400) ** 0.5, rel=0.02)  # 120,000 weights
-    assert not layer.bias.any()
-
-
 def test_every_gaussian_is_decoded_alone() -> None:
     """Reordering and pruning change nothing for those that stay, except in the authors' program."""
     gaussians = random_gaussians()
@@ -104,23 +90,6 @@ def test_decoding_in_parts_gives_the_same(monkeypatch: pytest.MonkeyPatch) -> No
     assert max(sizes) < len(stego) == sum(sizes)
     for name, values in vars(whole).items():
         torch.testing.assert_close(getattr(in_parts, name), values)
-
-
-def test_the_number_of_weights_is_that_of_the_layers() -> None:
-    shape = DecoderShape(hidden=(5, 7), branch=3)
-    weights = [each for name, each in Decoder(shape).named_parameters() if name.endswith("weight")]
-    assert shape.weights == sum(map(torch.numel, weights))
-    assert replace(shape, kind="latent").weights == 0
-
-
-def test_all_attributes_reach_the_result() -> None:
-    gaussians, decoder = random_gaussians(), _decoder()
-    decoded = decoder(gaussians, KEY)
-    for field in FIELD_OF.values():
-        values = {f.name: getattr(gaussians, f.name) for f in fields(Gaussians)}
-        values[field] = values[field] + 0.3
-        other = "opacity_logits" if field != "opacity_logits" else "log_scales"
-        assert _distance(decoder(Gaussians(**values), KEY), decoded, other) > 1e-4, field
 
 
 def test_masks_are_read_in_any_order_and_refused_by_name() -> None:

@@ -13,17 +13,14 @@ from torch import Tensor
 
 from channels.quiet.trained_like import trained_like
 from channels.test_harmonics import heavy_tailed
-from keyss import Gaussians, KeyssOptions, WrongKeyError
-from keyss.channels import is_appended
+from keyss import Gaussians, WrongKeyError
 from keyss.channels.harmonics import row_names
 from keyss.core import InputError, UsageError, same_bits
-from keyss.fitting import make_optimizers, to_parameters
-from keyss.fitting.rows import FixedRows
 from keyss.lab import search_embeddings
 from keyss.methods import LatentDecoder, registry
 from keyss.methods.keyss.latent import latents_of
 from methods.hiding import Hidden, check_resumes, hide_scenes, three_scenes
-from methods.keyss.small import FIT, KEYS, VECTORS, begun, latent_model, small
+from methods.keyss.small import KEYS, VECTORS, latent_model, small
 from tiny_scenes import random_gaussians
 
 
@@ -57,17 +54,6 @@ def test_what_is_written_is_uniform_whatever_is_encrypted() -> None:
     ranks = decoder.encrypt(constant, VECTORS[0], names)
     assert kstest(ranks.ravel(), "uniform").pvalue > 1e-6
     assert kstest((ranks[:, 0] - ranks[:, 1]) % 1, "uniform").pvalue > 1e-6
-
-
-def test_pads_of_two_secrets_under_one_key_differ() -> None:
-    """Otherwise the difference of two files would be the difference of their secrets."""
-    _, (decoder,), (values,) = _written()
-    names = row_names(trained_like(900))
-    latents = values.double().numpy()
-    first = decoder.encrypt(latents, VECTORS[0], names)
-    decoder.fit_secret(latents + 1e-9)
-    second = decoder.encrypt(latents, VECTORS[0], names)
-    assert kstest(((first - second) % 1).ravel(), "uniform").pvalue > 1e-6
 
 
 def test_nearly_the_key_is_as_wrong_as_any_and_a_search_finds_nothing() -> None:
@@ -124,17 +110,6 @@ def test_a_model_that_was_moved_is_refused(hidden: Hidden) -> None:
             hidden.opened[0].reveal(other)
 
 
-def test_losses_beyond_the_faintest_rows_are_made_up_for(hidden: Hidden) -> None:
-    secret, own = hidden.opened[0], hidden.stego[~is_appended(hidden.stego)]
-    opaque = own[own.opacities.argsort(descending=True)[: int(0.75 * len(own))]]
-    alone = secret.decode(opaque, secret.key)  # type: ignore[attr-defined]
-    assert same_bits(secret.reveal(opaque, frame="cover"), alone[alone.opacities >= 1 / 255])
-    few = own[::2]
-    alone = secret.decode(few, secret.key)  # type: ignore[attr-defined]
-    more = secret.reveal(few, frame="cover")
-    assert more.opacities.mean() > alone[alone.opacities >= 1 / 255].opacities.mean()
-
-
 def test_an_interrupted_training_resumes_to_the_same_result(tmp_path: Path) -> None:
     options = small("latent").with_fit(iterations=40, grow_every=5)
     check_resumes(options, tmp_path, "hide", three_scenes()[1][:2])
@@ -151,35 +126,3 @@ def test_a_cover_without_harmonics_is_refused() -> None:
         )
     with pytest.raises(InputError, match="train longer"):
         hide_scenes(scenes[:2], KEYS[:1], small("latent").with_fit(iterations=1), plains=models[:2])
-
-
-def test_rows_are_in_the_order_in_which_plain_3dgs_makes_them() -> None:
-    """Its own points first, and what grew later at the end."""
-    scenes, models = three_scenes()
-    run = begun(small("latent").with_fit(iterations=120), scenes[:2], models[:2])
-    for _ in range(120):
-        run.step()
-    born, model = run.density["born"], run.gaussians()
-    assert (born >= len(born)).any()
-    stego, _ = run.publish(bytes(32))
-    kept = model[born.argsort()]
-    assert torch.equal(stego.means, kept.means[kept.opacities >= FIT.prune_opacity])
-
-
-def test_clones_come_before_both_parts_of_splits_each_in_the_order_of_their_sources() -> None:
-    fit = replace(FIT, max_gaussians=100)
-    model = trained_like(12)
-    logits = torch.cat([torch.zeros(6), torch.full((6,), -8.0)])  # six places
-    large = torch.tensor([False] * 3 + [True] * 9)[:, None]
-    scales = torch.where(large, 0.0, -9.0).expand(12, 3).clone()
-    params = to_parameters(replace(model, opacity_logits=logits, log_scales=scales), torch.device("cpu"))
-    density = FixedRows(fit, [1.0], torch.Generator().manual_seed(0))
-    born = torch.arange(12).flip(0)
-    grown = density.grow(params, make_optimizers(params, fit, 1.0), 0, torch.ones(12), 1, born)
-    assert grown.tolist() == [9, 10, 11, 5, 4, 3, 6, 7, 8]
-
-
-def test_too_many_secrets_are_refused_before_anything_is_trained() -> None:
-    sources, options = [None] * 4, KeyssOptions(fit=FIT)
-    with pytest.raises(UsageError, match="SH degree 3 with 3 secrets"):
-        registry.get("keyss").prepare(sources, options)  # type: ignore[arg-type]

@@ -7,14 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings, strategies as st
 
 import keyss
 from channels.quiet.trained_like import trained_like
 from keyss import Gaussians, Secret
 from keyss.core import DRAWN_OPACITY
 from keyss.files import write_model
-from keyss.methods import Codec, Table, outliers
+from keyss.methods import Codec, Table
 from keyss.rendering import render
 from tiny_scenes import ring_cameras
 
@@ -61,7 +60,7 @@ def _psnr(one: Gaussians, other: Gaussians) -> float:
 
 
 @pytest.mark.parametrize(("name", "value"), HOSTILE)
-@pytest.mark.parametrize("bits", [264, 568])
+@pytest.mark.parametrize("bits", [264])
 def test_one_outlier_costs_the_bulk_less_than_a_decibel(bits: int, name: str, value: float) -> None:
     model = _bulk(1000)
     changed = _with(model, torch.tensor([17]), name, value)
@@ -70,52 +69,6 @@ def test_one_outlier_costs_the_bulk_less_than_a_decibel(bits: int, name: str, va
     assert _psnr(model[rest], _coded(changed, bits)[rest]) > _psnr(model[rest], plain[rest]) - 1
     # With the outlier: one that is drawn is drawn, one that is not stays away.
     assert _psnr(changed, _coded(changed, bits)) > _psnr(model, plain) - 3
-
-
-@given(st.data(), st.integers(0, 3), st.sampled_from([0, 22, 300]), st.floats(0, 0.04))
-@settings(max_examples=30, deadline=None, database=None)
-def test_no_share_of_hostile_values_spoils_the_bulk(
-    data: st.DataObject, degree: int, more: int, share: float
-) -> None:
-    """At most three times the error that lines for the bulk alone make.
-
-    2.5 times is what the rule for outliers allows a line to be stretched; what is left is for the errors of
-    rounding, of which so few numbers have no exact mean.
-    """
-    model = _bulk(300, data.draw(st.integers(0, 9)), degree)
-    changed = model.map(torch.clone)
-    bad = torch.zeros(300, dtype=torch.bool)
-    finite = st.floats(allow_nan=False, allow_infinity=False, width=32)
-    for _ in range(int(300 * share)):
-        row, name = data.draw(st.integers(0, 299)), data.draw(st.sampled_from(NAMES))
-        getattr(changed, name)[row] = data.draw(finite)
-        bad[row] = True
-    bits = Table.floor(degree).total + more
-    alone, found = _coded(model, bits), _coded(changed, bits)
-    usual = ~bad & ~torch.from_numpy(outliers(changed))
-    assert int(usual.sum()) >= 300 - int(bad.sum()) - 15
-    for name in NAMES[:1] + NAMES[2:]:
-        own, now = (
-            (getattr(each, name) - getattr(model, name))[usual].double().square().mean().sqrt()
-            for each in (alone, found)
-        )
-        assert float(now) <= 3 * float(own) + 1e-6, name
-
-
-def test_one_value_at_the_edge_of_a_bulk_that_others_move_costs_no_more() -> None:
-    """The worst that few values can do: most of them widen the bulk, the last one lies at its new edge."""
-    model, bits = _bulk(300, degree=0), Table.floor(0).total
-    alone = _coded(model, bits)
-    for value in np.linspace(-16, 16, 17):
-        changed = _with(model, torch.arange(9), "opacity_logits", 16.0)
-        changed = _with(changed, torch.tensor([0]), "opacity_logits", float(value))
-        usual = ~torch.from_numpy(outliers(changed))
-        usual[:9] = False
-        own, now = (
-            (each.opacity_logits - model.opacity_logits)[usual].double().square().mean().sqrt()
-            for each in (alone, _coded(changed, bits))
-        )
-        assert float(now) <= 3 * float(own), value
 
 
 def test_what_is_never_drawn_comes_back_transparent_and_within_bounds() -> None:

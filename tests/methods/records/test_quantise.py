@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 import torch
 from hypothesis import given, settings, strategies as st
 from hypothesis.extra import numpy as arrays
@@ -83,21 +82,6 @@ def test_quaternions_of_no_length_and_of_either_sign_mean_the_rotation_that_they
     assert torch.allclose(quats[:2].abs(), torch.eye(4)[:2], atol=0.01)
 
 
-@pytest.mark.parametrize("degree", range(4))
-def test_tables_grow_bit_by_bit_and_say_when_nothing_fits(degree: int) -> None:
-    floor = Table.floor(degree)
-    assert Table.of_size(floor.total, degree) == floor
-    assert Table.of_size(floor.total - 1, degree) is None
-    totals = []
-    for bits in range(floor.total, 1200, 50):
-        table = Table.of_size(bits, degree)
-        assert table is not None
-        assert bits - 63 <= table.total <= bits or table.bits[0] == 24
-        assert table.sh_degree == degree
-        totals.append(table.total)
-    assert totals == sorted(totals)
-
-
 def test_half_and_whole_records_of_degree_3_are_as_near_as_promised() -> None:
     """Of a model with colours that go together, as those of trained ones do."""
     model = trained_like(2000, seed=4)
@@ -122,28 +106,3 @@ def test_damaged_parameters_are_an_input_error_or_bounded_numbers(data: bytes) -
         return
     records = np.random.default_rng(0).integers(0, 256, (20, codec.table.record_bytes), dtype=np.uint8)
     assert all(torch.isfinite(values).all() for values in vars(codec.decode(records)).values())
-
-
-@pytest.mark.parametrize(
-    ("centre", "spread", "reach"),
-    [(np.nan, 1, 1), (0, -1, 1), (0, 1, 0), (0, 1, np.inf), (0, 1, 61), (0, 1e29, 60), (1e31, 0, 1)],
-)
-def test_lines_that_could_give_numbers_out_of_bounds_are_refused(
-    centre: float, spread: float, reach: float
-) -> None:
-    for reaches in ((reach, 1), (1, reach)):
-        with pytest.raises(ValueError, match="no such line"):
-            Line(centre, spread, *reaches)
-
-
-def test_lines_of_a_sample_reach_the_furthest_number_of_all_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("keyss.methods.records.quantise._SAMPLE", 100)
-    model = trained_like(9000, 0)
-    codec, usual = Codec.fit(model, Table.floor(3)), ~outliers(model)
-    for values, line in zip(model.means.double().numpy().T, codec.lines[:3], strict=True):
-        assert np.abs(line.positions(values[usual])).max() <= line.reach
-        assert np.abs(line.positions(values)).max() <= max(line.reach, line.far_reach)
-    records = codec.encode(model)
-    back, part = codec.decode(records), codec.decode(records[5000:])
-    assert torch.equal(back.sh[5000:], part.sh)
-    assert torch.equal(back.quats[5000:], part.quats)

@@ -5,15 +5,13 @@ from __future__ import annotations
 import tracemalloc
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
 from channels.quiet.coded import model_of
-from keyss.core import Camera, Gaussians, InputError, Scene, UsageError, View
-from keyss.core.gaussians import OPPONENT
+from keyss.core import Camera, InputError, Scene, UsageError, View
 from keyss.methods import Table, choose_precision, encode_to_size, prune_to_size
 from keyss.methods.records import whole
 from keyss.rendering import Viewpoints, psnr_between
@@ -69,7 +67,7 @@ def test_a_few_bytes_that_announce_many_gaussians_are_refused_before_they_are_un
         whole.decode((1 << 20).to_bytes(4, "little") + data[4:] + padding, 6000)
 
 
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", range(4))
 def test_hostile_payloads_take_little_memory(seed: int) -> None:
     random = np.random.default_rng(seed)
     count = int(random.choice([1 << 16, (1 << 16) + 1, 1 << 20, 1 << 22, (1 << 32) - 1]))
@@ -84,37 +82,6 @@ def test_hostile_payloads_take_little_memory(seed: int) -> None:
     assert peak < len(padding) + (200 << 20)
 
 
-def test_the_most_gaussians_that_a_small_model_may_announce_take_little_memory() -> None:
-    model = model_of(1, sh_degree=3)
-    most = Gaussians.cat([model] * (1 << 16))
-    data = whole.encode(most)
-    tracemalloc.start()
-    assert len(whole.decode(data, 100)) == 1 << 16
-    _, peak = tracemalloc.get_traced_memory()
-    tracemalloc.stop()
-    assert peak < 200 << 20
-    with pytest.raises(InputError, match="announces"):
-        whole.decode(whole.encode(Gaussians.cat([most, model])), 100)
-
-
-def test_harmonics_are_rounded_to_steps_that_are_finer_for_what_covers_more() -> None:
-    model = model_of(2000, sh_degree=3)
-    small = model.opacity_logits < model.opacity_logits.median()
-    scales = model.log_scales - 2.0 * small[:, None]
-    model = replace(model, log_scales=scales)
-    step = 0.03
-    precision = replace(whole.Precision.usual(model), harmonics=step)
-    found = whole.decode(whole.encode(model, precision))
-    error = (found.sh - model.sh)[:, 1:].double().numpy() @ OPPONENT.T
-    largest = np.abs(error).reshape(2000, -1).max(axis=1)
-    seen = (scales.sort(dim=1).values[:, 1:].sum(1) + 2 * model.opacity_logits.clamp(max=0)).double().numpy()
-    octaves = (seen - np.median(seen)) / np.log(2)
-    steps = step * 2.0 ** -(octaves / 4).clip(-3, 3)
-    # A quarter of an octave for rounding what is known of the Gaussian, and some for how precisely it is.
-    assert (largest < steps / 2 * 2**0.5).all()
-    assert largest[small.numpy()].mean() > 1.5 * largest[~small.numpy()].mean()
-
-
 def test_it_is_good_enough_from_where_it_is_looked_at() -> None:
     """At about 43.75 dB, which a few renders estimate: 24 models got 43.71 to 44.01 dB, with a standard
     deviation of 0.07, and this one 43.65 with the kernels of an older processor.
@@ -127,14 +94,6 @@ def test_it_is_good_enough_from_where_it_is_looked_at() -> None:
     opened = whole.decode(whole.encode(model, found))
     assert 43.25 < psnr_between(model, opened, viewpoints) < 47
     assert encode_to_size(model, 1 << 20, short=True, viewpoints=viewpoints) == whole.encode(model, found)
-
-
-def test_large_pictures_are_compared_at_a_smaller_size() -> None:
-    model = model_of(50)
-    camera = orbit(model, 1000, 1)[0]
-    (small,) = Viewpoints.of(_scene([camera])).cameras
-    assert (small.width, small.height) == (256, 256)
-    assert torch.allclose(small.K[:2] / 256, camera.K[:2] / 1000)
 
 
 def test_what_is_seen_least_is_left_out_until_it_fits() -> None:

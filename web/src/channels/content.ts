@@ -3,8 +3,12 @@ import { bytesKey } from '../core/bytes.ts';
 import { damaged } from '../core/errors.ts';
 import type { Derive } from '../keys/keys.ts';
 
+interface Opened {
+  readonly foreign?: number; // Gaussians that were added to the secret's file, or changed, where they are many
+}
+
 /** Small pieces of one size that are found one by one. */
-export interface Records {
+export interface Records extends Opened {
   readonly service: 'records';
   readonly method: string;
   readonly header: Uint8Array;
@@ -12,7 +16,7 @@ export interface Records {
 }
 
 /** Bytes that come out whole or not at all. */
-export interface Payload {
+export interface Payload extends Opened {
   readonly service: 'payload';
   readonly method: string;
   readonly data: Uint8Array;

@@ -7,6 +7,8 @@ const MAX_HEADER_BYTES = 65536;
 const [SPACE, MAX_DIGITS] = [32, 100]; // of text
 const OPACITY_LOGIT_BOUND = 16; // in the place of infinities
 const LEAST_LOG_SCALE = -87.33654; // in the place of minus infinity
+// What tells scales from their logarithms, as in keyss.files.ply_rows.
+const [ENOUGH, NEARLY_ALL, SMALL_SCALE, LARGE, RATIO] = [100, 0.99, 0.2, 0.3, 20];
 
 /** Of a type by either of its names the bytes that it takes, and what reads it. */
 const TYPES = new Map(([
@@ -132,7 +134,36 @@ export function readPly(bytes: Uint8Array): UsableGaussians {
   for (const [at, logScale] of found.logScales.entries()) {
     if (logScale === -Infinity) found.logScales[at] = LEAST_LOG_SCALE;
   }
-  return usable(found);
+  const kept = usable(found);
+  checkNotActivated(kept);
+  return kept;
+}
+
+/** Raises InputError for scales or opacities that renderers use, in the place of logarithms and logits. */
+function checkNotActivated({ count, means, logScales, opacityLogits }: Gaussians): void {
+  if (count < ENOUGH) return;
+  const step = Math.floor(count / ENOUGH);
+  const rows = Array.from({ length: Math.ceil(count / step) }, (_, at) => at * step);
+  const axes = [0, 1, 2].map((axis) => rows.map((row) => means[3 * row + axis]));
+  const middles = axes.map((each) => quantile(each, 0.5));
+  const spread = quantile(rows.map((_, at) => Math.max(...axes.map((each, axis) => Math.abs(each[at] - middles[axis])))), 0.5);
+  const scales = rows.flatMap((row) => [...logScales.subarray(3 * row, 3 * row + 3)]);
+  const [least, middle, most] = [0.05, 0.5, 0.95].map((share) => quantile(scales, share));
+  const large = middle < SMALL_SCALE || Math.exp(middle) > LARGE * spread || most > RATIO * least;
+  const [low, high] = [Math.min, Math.max].map((pick) => opacityLogits.reduce((a, b) => pick(a, b)));
+  const wrong: string[] = [];
+  if (large && scales.filter((each) => each > 0).length > NEARLY_ALL * scales.length) wrong.push('scales');
+  if (low >= 0 && high <= 1 && high - low > 0.5) wrong.push('opacities');
+  if (wrong.length === 0) return;
+  throw new InputError(`This file's ${wrong.join(' and ')} are those that renderers use: export it again without activating them.`);
+}
+
+/** Of numbers at least one, with linear interpolation. */
+function quantile(values: number[], share: number): number {
+  const sorted = Float64Array.from(values).sort();
+  const at = share * (sorted.length - 1);
+  const [below, above] = [sorted[Math.floor(at)], sorted[Math.ceil(at)]];
+  return below + (at - Math.floor(at)) * (above - below);
 }
 
 export interface UsableGaussians extends Gaussians {

@@ -147,14 +147,12 @@ class Page {
   private async trained(side: TrainedSide, ply: Uint8Array, anew: boolean): Promise<void> {
     const { model } = await this.opener.ask({ bytes: ply, keyless: true }, [ply.buffer]);
     if (model === undefined) return;
-    if (side === 'published') {
+    const share = this.secret ? 1 - Number(page.wipe.value) / 100 : 0;
+    if (side === 'secret') this.showSecret(model, share);
+    else {
       this.published = model;
       this.showPublished();
-    } else {
-      this.secret = model;
-      this.viewer?.show(model, 'right');
-      if (page.revealed.hidden) this.split(0);
-      page.revealed.hidden = this.published === null; // nothing to wipe with
+      this.split(this.secret ? share : 1);
     }
     const looks = side === 'secret' || this.secret === null;
     if (looks && (anew || !this.controls.touched)) this.controls.setPose(this.firstPose());
@@ -178,13 +176,14 @@ class Page {
       this.searches(search);
       this.say(search === 'quick' ? 'Trying the key …' : `${said} Searching more thoroughly …`);
       delete page.main.dataset.picture;
-      const { model, file, stopped } = await this.opener.ask({ key, thorough: search === 'thorough' });
+      const { model, file, foreign, stopped } = await this.opener.ask({ key, thorough: search === 'thorough' });
       if (own !== this.work) return;
       this.searches('');
       if (search === 'quick') tell({ event: 'key-tried' });
       if (file || model) tell({ event: 'opened', kind: file ? 'file' : 'model' });
       if (file) said += this.offer(file);
       if (model) said += this.reveal(model);
+      if (foreign) said += ` About ${count(foreign)} Gaussians of the file were added or changed: it may not be its secret.`;
       this.say(stopped ? `${said} Search stopped.` : said);
       await this.picture();
       if (own !== this.work) return;
@@ -221,10 +220,7 @@ class Page {
   /** Seen as what was there before was. */
   private reveal(model: Gaussians): string {
     const pose = this.likewise(this.pose, this.secret ?? this.published ?? model, model);
-    this.secret = model;
-    this.viewer?.show(model, 'right');
-    this.split(0);
-    page.revealed.hidden = false;
+    this.showSecret(model, 0);
     this.controls.setPose(pose);
     return ` It reveals a model of ${count(model.count)} Gaussians.`;
   }
@@ -239,14 +235,19 @@ class Page {
   }
 
   private hideSecret(): void {
-    this.secret = null;
-    page.revealed.hidden = page.save.hidden = true;
-    this.viewer?.show(null, 'right');
-    placeBorder(null);
+    this.showSecret(null, 1);
+    page.save.hidden = true;
+  }
+
+  private showSecret(model: Gaussians | null, share: number): void {
+    this.secret = model;
+    this.viewer?.show(model, 'right');
+    this.split(share);
   }
 
   /** How much of the width shows the published model, beside the secret: 0 to 1. */
   private split(share: number): void {
+    page.revealed.hidden = this.secret === null || this.published === null; // nothing to wipe with
     page.wipe.value = String(100 * (1 - share));
     this.viewer?.setSplit(share);
     placeBorder(share);

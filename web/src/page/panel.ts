@@ -55,10 +55,10 @@ export function showKey(shown: boolean): void {
   page.show.setAttribute('aria-pressed', String(shown));
 }
 
-/** The border between the two models, at a share of the width; null for none. */
-export function placeBorder(share: number | null): void {
-  page.border.hidden = share === null || share <= 0 || share >= 1;
-  page.border.style.left = `${100 * (share ?? 0)}%`;
+/** The border between the two models, at a share of the width. */
+export function placeBorder(share: number): void {
+  page.border.hidden = share <= 0 || share >= 1;
+  page.border.style.left = `${100 * share}%`;
 }
 
 export function count(number: number): string {

@@ -58,7 +58,7 @@ class Layout:
 
     @property
     def width(self) -> int:
-        """Whole bytes that the low bits of one Gaussian hold."""
+        """Whole bytes that the low bits of one Gaussian hold: 8, 21, 44 and 75 at degrees 0 to 3."""
         return GEOMETRY - 4 * (not self.quats) + self.harmonics * 3 // 2
 
     @property
@@ -85,11 +85,6 @@ class Layout:
     def shifts(self) -> Words32:
         """[F] by which a word is shifted so that the bits in use, and those below them, are gone."""
         return np.array([int(each).bit_length() for each in self.mask], np.uint32)
-
-
-def bytes_per_gaussian(sh_degree: int) -> int:
-    """Bytes of one Gaussian's low bits, quaternions included: 8, 21, 44 and 75 at degrees 0 to 3."""
-    return Layout(sh_degree).width
 
 
 def coarse_lengths(quats: Words32) -> Doubles:

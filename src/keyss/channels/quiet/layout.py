@@ -33,7 +33,7 @@ from functools import lru_cache
 import numpy as np
 
 from keyss.channels.base import RecordPlan, RecordRequest, Room
-from keyss.channels.quiet.bits import bytes_per_gaussian
+from keyss.channels.quiet.bits import Layout
 from keyss.channels.quiet.cells import TAG_BYTES
 from keyss.channels.reed_solomon import SYMBOL_BYTES, Codewords
 from keyss.core.arrays import Bytes, Integers
@@ -81,7 +81,7 @@ class LowBitsRoom:
 
     @staticmethod
     def of(carriers: int, sh_degree: int) -> LowBitsRoom:
-        return LowBitsRoom(carriers, bytes_per_gaussian(sh_degree))
+        return LowBitsRoom(carriers, Layout(sh_degree).width)
 
     def for_payloads(self) -> Room:
         return Room(self.carriers, self.payload_capacity(1), SMALLEST_BUCKET)

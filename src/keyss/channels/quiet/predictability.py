@@ -20,13 +20,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from keyss.channels.quiet.kernels import count_zeros
 from keyss.core.arrays import Doubles, Flags, Integers, Words32
 
 MAX_ZEROS = 12  # that are counted: more are rare, or a short number
 EXPONENTS = 256
 _NUMBERS = np.arange(1 << MAX_ZEROS, dtype=np.uint32)[:, None] | np.uint32(1 << MAX_ZEROS)
-_ZEROS = (_NUMBERS >> np.arange(MAX_ZEROS + 1, dtype=np.uint32) & 1).argmax(axis=1)  # [4096], trailing
+_ZEROS = (
+    (_NUMBERS >> np.arange(MAX_ZEROS + 1, dtype=np.uint32) & 1).argmax(axis=1).astype(np.uint32)
+)  # [4096], trailing
 # Of the log-likelihood below its maximum, at the confidence limit: one-sided, one in 200 at worst.
 _DROP = 3.3
 _MARGIN = 8  # octaves beyond the numbers' own in which the scale is looked for
@@ -40,9 +41,9 @@ def count_trailing_zeros(words: Words32, chosen: Flags) -> Integers:
 
     Of `words` [N, C] those of the `chosen` rows [N].
     """
-    counts = np.zeros((EXPONENTS, MAX_ZEROS + 1), np.int64)
-    count_zeros(words, chosen, _ZEROS, counts)
-    return counts
+    own = words[chosen].ravel()
+    kinds = (own >> np.uint32(23) & np.uint32(255)) * np.uint32(MAX_ZEROS + 1) + _ZEROS[own & np.uint32(4095)]
+    return np.bincount(kinds, minlength=EXPONENTS * (MAX_ZEROS + 1)).reshape(EXPONENTS, -1)
 
 
 def least_exponent(counts: Integers, share: float) -> int:
@@ -67,14 +68,11 @@ def _confidence_limit(counts: Doubles, exponents: Integers) -> float:
 
     Where too few small numbers are there to tell, s is no larger than steps can be.
     """
-    coarse = np.arange(exponents[0] - _MARGIN, exponents[-1] + _MARGIN + 1, dtype=np.float64)
-    likelihoods = np.array([_log_likelihood(counts, exponents, scale) for scale in coarse])
-    near = coarse[likelihoods.argmax()] + np.arange(-1, 1 + _STEP, _STEP)
-    least = max(_log_likelihood(counts, exponents, scale) for scale in near) - _DROP
-    likely = coarse[likelihoods >= least].max(initial=near[0])
-    fine = [*near, *(likely + np.arange(0, 1 + _STEP, _STEP))]
-    limit = float(max(scale for scale in fine if _log_likelihood(counts, exponents, scale) >= least))
-    if likelihoods[0] < least:  # there are such steps
+    scales = np.arange(exponents[0] - _MARGIN, exponents[-1] + _MARGIN + 1, _STEP)
+    likelihoods = np.array([_log_likelihood(counts, exponents, scale) for scale in scales])
+    likely = likelihoods >= likelihoods.max() - _DROP
+    limit = float(scales[likely][-1])
+    if not likely[0]:  # there are such steps
         return limit
     numbers = counts.sum(axis=1).cumsum()
     return min(limit, float(exponents[np.searchsorted(numbers, numbers[-1] / 2)]) - _LARGEST)

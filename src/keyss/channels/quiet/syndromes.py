@@ -65,18 +65,24 @@ def write(bits: Bits, dry: Bits, message: Bits, rows: Words) -> Bits | None:
     One elimination for all blocks: with as many columns of the matrix P as it has rows, and the others F,
     changes are x_P = P^-1 wanted + P^-1 F x_F. A block then needs an x_F by which x_P is 0 where bits stay.
     """
-    reduced, inverse, pivots = _eliminated(rows)
+    rate = len(rows)
+    reduced = np.concatenate([_unpacked(rows), np.eye(rate, dtype=np.uint8)], axis=1)
+    pivots = _reduced(reduced, BLOCK)
     if (pivots < 0).any():
         return None
     others = np.setdiff1d(np.arange(BLOCK), pivots)
-    wanted = (message ^ read(bits, rows)).reshape(-1, len(rows))
-    changed = _product(wanted, _unpacked(inverse)[:, : len(rows)].T)
+    free, inverse = reduced[:, others], reduced[:, BLOCK:]  # P^-1 F, P^-1
+    changed = _product((message ^ read(bits, rows)).reshape(-1, rate), inverse.T)
     blocks, may = bits.reshape(-1, BLOCK).copy(), dry.reshape(-1, BLOCK) == 1
-    free = np.ascontiguousarray(_unpacked(reduced)[:, others])  # P^-1 F
     rest = np.zeros((len(blocks), len(others)), np.uint8)
-    if not _solve(free, np.ascontiguousarray(free.T), may[:, pivots], may[:, others], changed, rest):
-        return None
-    blocks[:, pivots] ^= changed
+    for own, wanted, found in zip(may, changed, rest, strict=True):
+        stay, inside = ~own[pivots], np.flatnonzero(own[others])
+        system = np.concatenate([free[stay][:, inside], wanted[stay, None]], axis=1)
+        columns = _reduced(system, len(inside))
+        if system[columns < 0, -1].any():
+            return None
+        found[inside[columns[columns >= 0]]] = system[columns >= 0, -1]
+    blocks[:, pivots] ^= changed ^ _product(rest, free.T)
     blocks[:, others] ^= rest
     return blocks.reshape(-1)
 
@@ -94,64 +100,19 @@ def _unpacked(rows: Words) -> Bits:
 
 
 @kernel
-def _eliminated(rows):  # type: ignore[no-untyped-def]
-    """`rows` reduced, so that in column pivots[i] only row i is 1; the row operations; the pivots, or -1."""
-    rate, words = rows.shape
-    own, made = rows.copy(), np.zeros((rate, -(-rate // 64)), np.uint64)
-    pivots = np.full(rate, -1)
-    one = np.uint64(1)
-    for row in range(rate):
-        made[row, row // 64] |= one << np.uint64(row % 64)
-    for row in range(rate):
-        word = 0
-        while word < words and own[row, word] == 0:
-            word += 1
-        if word == words:
-            break
-        place = np.uint64(0)
-        while (own[row, word] >> place) & one == 0:
-            place += one
-        pivots[row] = 64 * word + np.int64(place)
-        for other in range(rate):
-            if other != row and (own[other, word] >> place) & one:
-                for at in range(word, words):  # loops take a fifth of what slices do
-                    own[other, at] ^= own[row, at]
-                for at in range(1 + row // 64):
-                    made[other, at] ^= made[row, at]
-    return own, made, pivots
+def _reduced(own, count):  # type: ignore[no-untyped-def]
+    """Eliminate, modulo 2: for each row [R] of `own` the column, of the first `count`, where only it is 1.
 
-
-@kernel
-def _solve(free, columns, may, rest_may, changed, rest):  # type: ignore[no-untyped-def]
-    """Find `rest` [B, F], 0 except where `rest_may`: `changed` [B, R] + free rest is 0 except where `may`.
-
-    `free` [R, F], `columns` its transpose. `changed` becomes the sum. False where there is none.
+    -1 for rows that become 0 there.
     """
-    count = len(columns)
-    own, goal = np.empty((len(free), count), np.uint8), np.empty(len(free), np.uint8)
-    pivots = np.empty(len(free), np.int64)
-    for block in range(len(changed)):
-        number = 0
-        for row in range(len(free)):
-            if not may[block, row]:
-                own[number], goal[number] = free[row] * rest_may[block], changed[block, row]
-                number += 1
-        for row in range(number):
-            pivots[row] = -1
-            for column in range(count):
-                if own[row, column]:
-                    pivots[row] = column
-                    break
-            if pivots[row] < 0:
-                if goal[row]:
-                    return False
-                continue
-            for other in range(number):
-                if other != row and own[other, pivots[row]]:
-                    own[other] ^= own[row]
-                    goal[other] ^= goal[row]
-        for row in range(number):
-            if pivots[row] >= 0 and goal[row]:
-                rest[block, pivots[row]] = 1
-                changed[block] ^= columns[pivots[row]]
-    return True
+    columns = np.full(len(own), -1)
+    for row in range(len(own)):
+        for column in range(count):
+            if own[row, column]:
+                columns[row] = column
+                for other in range(len(own)):
+                    if other != row and own[other, column]:
+                        for at in range(own.shape[1]):  # takes a fifth of what slices do
+                            own[other, at] ^= own[row, at]
+                break
+    return columns

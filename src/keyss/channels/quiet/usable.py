@@ -23,6 +23,7 @@ from __future__ import annotations
 
 import math
 from concurrent.futures import ThreadPoolExecutor
+from itertools import combinations
 
 import numpy as np
 import torch
@@ -39,7 +40,6 @@ from keyss.channels.quiet.bits import (
     identities,
     used_words,
 )
-from keyss.channels.quiet.kernels import find_near
 from keyss.channels.quiet.predictability import count_trailing_zeros, least_exponent
 from keyss.core.arrays import Bytes, Doubles, Flags, Integers, Numbers, Words, Words32
 from keyss.core.errors import UsageError
@@ -64,7 +64,8 @@ _SHORT_BITS = 20
 _SHORT = np.uint32((1 << _SHORT_BITS) - 1)
 # A Gaussian is no measurement when so many of its values have 12 zeros; by chance one in three million is.
 _ZEROS, _ZERO_FIELDS = np.uint32((1 << 12) - 1), 3
-_EQUAL_HARMONICS = 2
+_EQUAL_HARMONICS = 2  # pairs
+_MAGNITUDE = np.uint32(0x7FFFFFFF)
 
 _OPACITY = 7
 # Bit patterns of logits from 16 on. The sigmoid is 1 from 16.64 on, but only the exponent surely stays.
@@ -166,13 +167,18 @@ def exponents(words: Words32) -> Bytes:
 def near_equal(used: Words32, layout: Layout) -> Flags:
     """[N] whether two scales, two components of a quaternion or two channels of a colour are nearly equal.
 
-    Or two pairs of one colour's harmonics, next to each other by size, equal. By chance some 4 % of all
-    Gaussians are. `used` [N, F]: of `used_words`.
+    Or two pairs of one colour's harmonics equal. By chance some 4 % of all Gaussians are. `used` [N, F]: of
+    `used_words`.
     """
-    near = np.empty(len(used), bool)
-    groups = np.array([[0, 3], [QUATS.start, 4 if layout.quats else 0]])
-    find_near(used, layout.shifts, groups, GEOMETRY, _EQUAL_HARMONICS, near)
-    return near
+    high = np.ascontiguousarray(((used & _MAGNITUDE) >> layout.shifts).astype(np.int32).T)
+    harmonics = high[GEOMETRY:].reshape(-1, 3, len(used))
+    near, equal = np.zeros(len(used), bool), np.zeros(len(used), np.int16)
+    for values in (high[:3], *([high[QUATS]] if layout.quats else []), *harmonics):
+        for one, other in combinations(values, 2):
+            near |= np.abs(one - other) <= 1
+    for first, second in combinations(harmonics, 2):
+        equal += (first == second).sum(axis=0, dtype=np.int16)
+    return near | (equal >= _EQUAL_HARMONICS)
 
 
 def frequent(words: Numbers, times: int) -> Numbers:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 import struct
+import warnings
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -21,7 +22,7 @@ import numpy.typing as npt
 import zstandard
 
 from keyss.core.arrays import Bytes, Floats, Shorts
-from keyss.core.errors import InputError, OutputError
+from keyss.core.errors import InputError, KeyssWarning, OutputError
 from keyss.core.gaussians import Gaussians
 from keyss.files.formats.common import (
     Codes,
@@ -52,6 +53,8 @@ VERSION = 3  # has 10-bit rotations, and more programs read it than the newer 4
 _FRACTIONAL_BITS = 12  # steps of 1/4096 world unit, as in Niantic's library; small scenes get more
 _LEAST_STEPS, _STEPS_PER_GAUSSIAN = 1024, 8  # across half of the model, and the median size of Gaussians
 MAX_POSITION = 2**23 - 1  # the largest code of a position
+_LOG_SCALES, _FEW = (-10.0, 255 / 16 - 10), 0.01
+_USUAL = -4.0  # log scale of Gaussians in usual units
 _COLOR_SCALE = 0.15  # 0.15 f_dc + 0.5 is within 0 to 1
 _MAGNITUDE = 2**9 - 1  # a component of a rotation has a sign and 9 bits
 _SH_STEPS = np.array([8] * 3 + [16] * 12)  # 5 bits for degree 1, 4 above, as in Niantic's library
@@ -288,9 +291,13 @@ class SpzCodes(Codes):
 
     @classmethod
     def quantise(cls, model: Gaussians, fractional_bits: int | None = None) -> Self:
-        """See `Codes`: in version 3. Raises OutputError for positions beyond 8 million."""
+        """See `Codes`: in version 3. Raises OutputError for positions beyond 8 million.
+
+        Tells of Gaussians that get another size, by a KeyssWarning.
+        """
         means, quats, log_scales, opacities, f_dc, rest = arrays_of(model)
         bits = _fractional_bits(means, log_scales) if fractional_bits is None else fractional_bits
+        _warn_of_sizes(log_scales)
         largest, xyz = smallest_three(np.roll(quats * _QUAT_SIGNS, -1, axis=1))
         magnitudes = np.floor(np.abs(xyz) * (_MAGNITUDE / np.sqrt(0.5)) + 0.5).clip(0, _MAGNITUDE)
         return cls(
@@ -335,10 +342,25 @@ def _fractional_bits(means: Floats, log_scales: Floats) -> int:
     wanted = math.ceil(math.log2(max(_LEAST_STEPS / max(spread, 1e-20), _STEPS_PER_GAUSSIAN / size)))
     if not extent < MAX_POSITION:
         raise OutputError(
-            f"SPZ holds positions up to {MAX_POSITION:,} world units, and this model reaches {extent:.3g}"
+            f"SPZ holds positions up to {MAX_POSITION:,} world units, and this model reaches {extent:.3g}: "
+            "write another format, or move the model or remove Gaussians far out first"
         )
     most = min(max(wanted, _FRACTIONAL_BITS), MAX_FRACTIONAL_BITS)
     return next(bits for bits in range(most, -1, -1) if extent * 2**bits < MAX_POSITION)
+
+
+def _warn_of_sizes(log_scales: Floats) -> None:
+    """Tell where more than _FEW of the Gaussians are smaller or larger than codes hold, in two axes."""
+    size = np.sort(log_scales, axis=1)[:, 1]
+    if (share := float(((size < _LOG_SCALES[0]) | (size > _LOG_SCALES[1])).mean())) > _FEW:
+        least, most = np.exp(_LOG_SCALES)
+        warnings.warn(
+            f"{share:.0%} of the Gaussians are smaller than {least:.2g} or larger than {most:.3g} world "
+            "units, between which .spz holds scales, and change: write another format, or scale the model "
+            f"first, e.g. with `splat-transform IN -s {np.exp(_USUAL - np.median(size)):.2g} OUT.ply`",
+            KeyssWarning,
+            stacklevel=2,
+        )
 
 
 def _quantised_harmonics(rest: Floats) -> Bytes:

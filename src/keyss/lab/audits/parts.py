@@ -46,7 +46,7 @@ from keyss.lab.stealth.judging import StealthResult, judge
 from keyss.lab.stegexpose import stegexpose_auc
 from keyss.lab.two_sample import auc_beside_controls
 from keyss.measure.hiding import in_cover
-from keyss.measure.images import compare_images, photos_of, renders_of, select_views
+from keyss.measure.images import compare_images, masks_of, photos_of, renders_of, select_views
 from keyss.progress import Reporter
 from keyss.runs.files import CONTROLS, as_model, stego_in
 from keyss.runs.folder import RunFolder
@@ -208,7 +208,7 @@ def images(subject: AuditSubject, seed: int, progress: PartProgress) -> PartResu
         progress(index, len(models))
         name = numbered("secret", index - 1, len(models) - 1) if index else "cover"
         has_photos = subject.run.metrics.photos[index]
-        photos = photos_of(scene.test)
+        photos, masks = photos_of(scene.test), masks_of(scene.test)
         own = renders_of(model, scene, scene.test)
         shown = {
             "photo" if has_photos else "given model": photos,
@@ -217,11 +217,11 @@ def images(subject: AuditSubject, seed: int, progress: PartProgress) -> PartResu
         baseline = None
         if plain is not None:
             shown["plain model"] = renders_of(plain, scene, scene.test)
-            baseline = compare_images(photos, shown["plain model"])
+            baseline = compare_images(photos, shown["plain model"], masks)
         if index:
             placed = subject.in_cover[index - 1]
             shown["without the key"] = renders_of(subject.stego, placed, placed.test)
-        compared = compare_images(photos, own)
+        compared = compare_images(photos, own, masks)
         size = None if plain is None else len(plain)
         results.append(ModelImages(name, has_photos, compared, len(model), baseline, size))
         for view in range(len(photos))[:: -(-len(photos) // PICTURED_VIEWS)]:

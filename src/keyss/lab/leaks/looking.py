@@ -94,7 +94,7 @@ def leak_scores(model: Gaussians, views: Sequence[View], background: Tensor) -> 
     """Mean scores of a model against the photos of views."""
     rows = []
     for view in views:
-        photo = view.image.to(model.device).float() / 255
+        photo = view.photo(model.device)
         image = render(model, view.camera, background).clamp(0, 1)
         fitted = fit_colours(image, photo).clamp(0, 1)
         gradient = gradient_correlation(image, photo)

@@ -183,7 +183,7 @@ def fine_tune(model: Gaussians, scene: Scene, steps: int, seed: int = 0) -> Gaus
     for step in range(1, steps + 1):
         view = scene.train[shuffle.sample()]
         image = render(to_gaussians(parameters), view.camera, background)
-        target = Target.of(view.image.to(model.device))
+        target = Target.of(view.image.to(model.device), view.mask)
         photometric_loss(image, target, config.ssim_weight).backward()
         schedule.set(optimizers, step)
         for optimizer in optimizers.values():

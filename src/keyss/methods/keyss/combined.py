@@ -37,7 +37,7 @@ class PlacedScene:
         """Move a scene and its plain model, both in the scene's own frame, by `frame`."""
 
         def move(views: Sequence[View]) -> tuple[View, ...]:
-            return tuple(View(frame.apply_camera(view.camera), view.image) for view in views)
+            return tuple(replace(view, camera=frame.apply_camera(view.camera)) for view in views)
 
         points = frame.apply_points(scene.points)
         placed = replace(scene, train=move(scene.train), test=move(scene.test), points=points)
@@ -78,12 +78,12 @@ class CombinedPoses:
 
     def target(self, scene: int, owner: int, index: int) -> Target:
         """The target of `scene` at training pose `index` of `owner`."""
-        own = self.scenes[owner].scene.train[index].image
+        own = self.scenes[owner].scene.train[index] if scene == owner else None
 
         def image() -> Tensor:
-            return (own if scene == owner else self._render(scene, owner, index)).to(self.device)
+            return (own.image if own else self._render(scene, owner, index)).to(self.device)
 
-        return self._targets.of((scene, owner, index), image)
+        return self._targets.of((scene, owner, index), image, own.mask if own else None)
 
     def _render(self, scene: int, owner: int, index: int) -> Tensor:
         """Render once, and cache as 8-bit pixels, like photos, up to CACHE_BYTES."""

@@ -1,16 +1,16 @@
 /**
- * Which numbers of a file's codes carry bits, how many each, and in which order these are counted;
- * `keyss.channels.quiet.fields` and `order` on the other side. A .sog is sorted by what is written; its bits are counted
+ * Which numbers of a rounded model carry bits, how many each, and in which order these are counted;
+ * `keyss.channels.quiet.fields` and `kept` on the other side. A .sog is sorted by what is written; its bits are counted
  * in an order of what is not.
  *
  * All of it is arithmetic that is the same on every machine, in the same order as there, and no logarithms: a bit more or
  * less anywhere, and nothing could be read.
  */
 import { highProduct, runs, sortingOrder, type Words } from '../../core/words.ts';
-import { CHUNK, type CompressedPlyCodes, rotationPart as pliedPart, VECTOR, vectorPart } from '../../files/compressed_ply.ts';
+import { CHUNK, rotationPart as pliedPart, VECTOR, vectorPart } from '../../files/compressed_ply.ts';
 import type { Codes } from '../../files/models.ts';
-import { FINEST, LARGEST, type SogCodes } from '../../files/sog.ts';
-import { positionCode, rotationPart, rotationWord, type SpzCodes } from '../../files/spz.ts';
+import { FINEST, LARGEST } from '../../files/sog.ts';
+import { positionCode, rotationPart, rotationWord } from '../../files/spz.ts';
 
 const MAX_BITS = 10;
 const SHARE = -3; // 2 to this: the range of what is written, in sizes of the Gaussian
@@ -20,83 +20,101 @@ const MAX_DISTANCE = 64; // powers of 2
 const AXES = [0, 1, 2];
 const [FACTOR_HIGH, FACTOR_LOW] = [0x9e3779b9, 0x7f4a7c15];
 
-/** One coordinate of an attribute of N Gaussians. */
+/** A number of a Gaussian: of an axis, or of a part of its rotation. */
+export type OfAxis = (row: number, axis: number) => number;
+
+/** One coordinate of an attribute: of each Gaussian an integer that grows with what it stands for, and its bits, 0 to 10. */
 interface Field {
-  readonly levels: Int32Array; // [N] integers that grow with what they stand for
-  readonly bits: Uint8Array; // [N] that each carries, 0 to 10
+  readonly level: (row: number) => number;
+  readonly bits: (row: number) => number;
 }
 
-/** In the order of the file's Gaussians. */
-function fieldsOf(codes: Codes): Field[] {
-  if (codes.kind === 'spz') return spzFields(codes);
-  return codes.kind === 'sog' ? sogFields(codes) : compressedPlyFields(codes);
+/** The integers of a rounded model. */
+export interface Levels {
+  readonly fields: Field[];
+  readonly rows: ArrayLike<number>; // of Gaussians, in the order in which bits are counted
 }
 
-/** By how many powers of 2 a .sog's steps are larger at a position than at 0. */
-function sogDistance(codes: SogCodes, row: number, axis: number): number {
-  const log = Math.abs(codes.mins[axis] + sogExtent(codes, axis) * (codes.positions[3 * row + axis] / FINEST));
-  return Math.min(Math.max(Math.floor(log * LOG2_E), 0), MAX_DISTANCE);
+/** Those of a file. */
+export function levelsOf(codes: Codes): Levels {
+  if (codes.kind === 'spz') {
+    const turn = (row: number, part: number): number => rotationPart(rotationWord(codes, row), part);
+    const [scale, place] = [byRow(codes.scales, 3), (row: number, axis: number) => positionCode(codes, row, axis)];
+    return spzLevels(codes.count, codes.fractionalBits, scale, place, codes.version === 2 ? null : turn);
+  }
+  if (codes.kind === 'sog') {
+    const [index, colour, quat] = [codes.scales, codes.colours, codes.quats].map((each) => byRow(each, 4));
+    const unwritten = (row: number): number[] => [
+      ...AXES.map((axis) => index(row, axis)), ...[0, 1, 2, 3].map((part) => colour(row, part)),
+      codes.labels[row], quat(row, 3) - LARGEST,
+    ];
+    const scale = (row: number, axis: number): number => codes.scaleBook[index(row, axis)];
+    return sogLevels(codes, scale, byRow(codes.positions, 3), quat, unwritten);
+  }
+  const scale = (row: number, axis: number): number => vectorPart(codes.scales[row], axis);
+  return compressedPlyLevels(codes.count, codes.scaleBounds, scale, (row, part) => pliedPart(codes.rotations[row], part));
 }
 
-function sogExtent({ mins, maxs }: SogCodes, axis: number): number {
-  return maxs[axis] > mins[axis] ? maxs[axis] - mins[axis] : 1;
+export function byRow(table: ArrayLike<number>, width: number): OfAxis {
+  return (row, axis) => table[width * row + axis];
 }
 
-function spzFields(codes: SpzCodes): Field[] {
-  const { count, version, fractionalBits, scales } = codes;
+/** Of a .spz; `turn` is null where rotations carry nothing. */
+export function spzLevels(count: number, fractionalBits: number, scale: OfAxis, place: OfAxis, turn: OfAxis | null): Levels {
   const bits = Uint8Array.from({ length: count }, (_, row) => {
-    const size = (middle(scales[3 * row], scales[3 * row + 1], scales[3 * row + 2]) / 16 - 10) * LOG2_E;
+    const size = (middle(row, scale) / 16 - 10) * LOG2_E;
     return fitting(size + fractionalBits + SHARE);
   });
-  const places = AXES.map((axis) => ({ levels: levels(count, (row) => positionCode(codes, row, axis)), bits }));
-  if (version === 2) return places;
-  return [...places, ...turns(count, 3, (row, index) => rotationPart(rotationWord(codes, row), index))];
+  const places = fieldsOf(place, (row) => bits[row]);
+  return { fields: turn ? [...places, ...fieldsOf(turn, () => 3)] : places, rows: inOrder(count) };
 }
 
-function sogFields(codes: SogCodes): Field[] {
-  const { count, scaleBook, scales, positions, quats } = codes;
-  const places = AXES.map((axis) => {
-    const finest = log2(sogExtent(codes, axis) / FINEST);
-    const bits = Uint8Array.from({ length: count }, (_, row) => {
-      const [a, b, c] = AXES.map((each) => scaleBook[scales[4 * row + each]]);
-      const step = finest + sogDistance(codes, row, axis) + 0.5;
-      return fitting(middle(a, b, c) * LOG2_E + SHARE - step);
-    });
-    return { levels: levels(count, (row) => positions[3 * row + axis]), bits };
+/** Of a .sog; `unwritten`: numbers that are not written, by which Gaussians are known, but for distances. */
+export function sogLevels(
+  { count, mins, maxs }: { count: number; mins: readonly number[]; maxs: readonly number[] },
+  scale: OfAxis, place: OfAxis, turn: OfAxis, unwritten: (row: number) => number[],
+): Levels {
+  const extent = AXES.map((axis) => (maxs[axis] > mins[axis] ? maxs[axis] - mins[axis] : 1));
+  /** By how many powers of 2 steps are larger at a position than at 0. */
+  const distance = (row: number, axis: number): number => {
+    const log = Math.abs(mins[axis] + extent[axis] * (place(row, axis) / FINEST));
+    return Math.min(Math.max(Math.floor(log * LOG2_E), 0), MAX_DISTANCE);
+  };
+  const finest = extent.map((each) => log2(each / FINEST));
+  const places = fieldsOf(place, (row, axis) => {
+    const step = finest[axis] + distance(row, axis) + 0.5;
+    return fitting(middle(row, scale) * LOG2_E + SHARE - step);
   });
-  return [...places, ...turns(count, 2, (row, index) => quats[4 * row + index])];
+  const names = hashes(count, (row) => [...unwritten(row), ...AXES.map((axis) => distance(row, axis))]);
+  return { fields: [...places, ...fieldsOf(turn, () => 2)], rows: unique(names) };
 }
 
-function compressedPlyFields(codes: CompressedPlyCodes): Field[] {
-  const { count, scaleBounds, scales, rotations } = codes;
-  const sizes = AXES.map((axis) => {
-    const [low, high] = scaleBounds[axis];
-    const chunks = low.map((least, chunk) => fitting(LOG_SCALE - log2((high[chunk] - least) / VECTOR[axis])));
-    const bits = Uint8Array.from({ length: count }, (_, row) => chunks[Math.floor(row / CHUNK)]);
-    return { levels: levels(count, (row) => vectorPart(scales[row], axis)), bits };
-  });
-  return [...sizes, ...turns(count, 3, (row, index) => pliedPart(rotations[row], index))];
+/** Of a compressed .ply; `bounds` [3, 2, C]: least and largest log scales of each chunk. */
+export function compressedPlyLevels(count: number, bounds: Float64Array[][], scale: OfAxis, turn: OfAxis): Levels {
+  const bits = bounds.map(([low, high], axis) =>
+    Uint8Array.from(low, (least, chunk) => fitting(LOG_SCALE - log2((high[chunk] - least) / VECTOR[axis]))),
+  );
+  const scales = fieldsOf(scale, (row, axis) => bits[axis][Math.floor(row / CHUNK)]);
+  return { fields: [...scales, ...fieldsOf(turn, () => 3)], rows: inOrder(count) };
 }
 
-function levels(count: number, level: (row: number) => number): Int32Array {
-  const found = new Int32Array(count);
-  for (let row = 0; row < count; row++) found[row] = level(row);
-  return found;
+function fieldsOf(level: OfAxis, bits: OfAxis): Field[] {
+  return AXES.map((axis) => ({ level: (row) => level(row, axis), bits: (row) => bits(row, axis) }));
 }
 
-function turns(count: number, each: number, part: (row: number, index: number) => number): Field[] {
-  const bits = new Uint8Array(count).fill(each);
-  return AXES.map((index) => ({ levels: levels(count, (row) => part(row, index)), bits }));
+function inOrder(count: number): Uint32Array {
+  return Uint32Array.from({ length: count }, (_, row) => row);
 }
 
-/** The second of three numbers by size. */
-function middle(a: number, b: number, c: number): number {
+/** The second by size of the numbers of three axes. */
+function middle(row: number, of: OfAxis): number {
+  const [a, b, c] = [of(row, 0), of(row, 1), of(row, 2)];
   return Math.max(Math.min(a, b), Math.min(Math.max(a, b), c));
 }
 
-/** The number of bits of levels that span at most 2 ** `log`; NaN, which becomes 0 as a byte, for NaN. */
+/** The number of bits of levels that span at most 2 ** `log`; 0 for NaN. */
 function fitting(log: number): number {
-  return Math.min(Math.max(Math.floor(log), 0), MAX_BITS);
+  return Math.min(Math.max(Math.floor(log), 0), MAX_BITS) || 0;
 }
 
 const NUMBER = new Float64Array(1);
@@ -113,45 +131,34 @@ export function log2(value: number): number {
 }
 
 /** The last bits of all levels, each 0 or 1, in the order in which they are counted; `silent` [N] rows have none. */
-export function lastBits(codes: Codes, silent?: Uint8Array): Uint8Array {
-  const rows = codes.kind === 'sog' ? sogOrder(codes) : null;
-  const fields = fieldsOf(codes);
-  for (const { bits } of fields) silent?.forEach((each, row) => each && (bits[row] = 0));
-  const count = rows?.length ?? codes.count;
-  const rowAt = (index: number): number => (rows === null ? index : rows[index]);
+export function lastBits({ fields, rows }: Levels, silent?: Uint8Array): Uint8Array {
+  const count = ({ bits }: Field, row: number): number => (silent?.[row] ? 0 : bits(row));
   let size = 0;
-  for (const { bits } of fields) for (let index = 0; index < count; index++) size += bits[rowAt(index)];
+  for (const field of fields) for (let index = 0; index < rows.length; index++) size += count(field, rows[index]);
   const found = new Uint8Array(size);
   let at = 0;
-  for (const { levels, bits } of fields) {
-    for (let index = 0; index < count; index++) {
-      const row = rowAt(index);
-      for (let bit = 0; bit < bits[row]; bit++) found[at++] = (levels[row] >> bit) & 1;
+  for (const field of fields) {
+    for (let index = 0; index < rows.length; index++) {
+      const [own, level] = [count(field, rows[index]), field.level(rows[index])];
+      for (let bit = 0; bit < own; bit++) found[at++] = (level >> bit) & 1;
     }
   }
   return found;
 }
 
-/** Gaussians by hashes of what is not written, without those that share one: these carry nothing. */
-function sogOrder(codes: SogCodes): Uint32Array {
-  const words = hashes(codes.count, [
-    ...AXES.map((axis) => (row: number) => codes.scales[4 * row + axis]),
-    ...[0, 1, 2, 3].map((part) => (row: number) => codes.colours[4 * row + part]),
-    (row) => codes.labels[row],
-    (row) => codes.quats[4 * row + 3] - LARGEST,
-    ...AXES.map((axis) => (row: number) => sogDistance(codes, row, axis)),
-  ]);
+/** Rows by the order of their hashes, without those that share one: these carry nothing. */
+function unique(words: Words): Uint32Array {
   const order = sortingOrder(words);
   const starts = runs(words, order);
   return starts.filter((start, run) => starts[run + 1] === start + 1).map((start) => order[start]);
 }
 
-/** [N] of each Gaussian a hash of all columns: times a constant, and the upper bits added to the lower ones. */
-function hashes(count: number, columns: ((row: number) => number)[]): Words {
+/** [N] a hash of the numbers of each row: times a constant, and the upper bits added to the lower ones. */
+function hashes(count: number, numbers: (row: number) => number[]): Words {
   const words = new Uint32Array(2 * count);
-  for (const column of columns) {
-    for (let row = 0; row < count; row++) {
-      const low = (words[2 * row] ^ column(row)) >>> 0;
+  for (let row = 0; row < count; row++) {
+    for (const number of numbers(row)) {
+      const low = (words[2 * row] ^ number) >>> 0;
       const lower = Math.imul(low, FACTOR_LOW) >>> 0;
       const product = highProduct(low, FACTOR_LOW) + Math.imul(low, FACTOR_HIGH);
       const upper = (product + Math.imul(words[2 * row + 1], FACTOR_LOW)) >>> 0;

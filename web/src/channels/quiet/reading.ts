@@ -7,7 +7,7 @@
 import { ascii, bytesKey, mostFrequent, rowsOf } from '../../core/bytes.ts';
 import { damaged, tooMuchLost } from '../../core/errors.ts';
 import { type Gaussians, selected } from '../../core/gaussians.ts';
-import type { Codes, ReadModel } from '../../files/models.ts';
+import type { ReadModel } from '../../files/models.ts';
 import { decrypted, type Derive, expand } from '../../keys/keys.ts';
 import { here } from '../../keys/pool.ts';
 import type { Content, Reader } from '../content.ts';
@@ -15,7 +15,7 @@ import { decoded } from '../reed_solomon.ts';
 import { fieldsOf, IDENTITY_BYTES, identities, lowBits, lowWidth } from './bits.ts';
 import { CellCipher, TAG_BYTES } from './cells.ts';
 import { decodedFrom } from './decoded.ts';
-import { lastBits } from './fields.ts';
+import { lastBits, type Levels, levelsOf } from './fields.ts';
 import { NUMBER_BYTES, type Parameters, unpackCodewords, unpackParameters } from './parameters.ts';
 import { saltOf, salts } from './salts.ts';
 import { BLOCK_BYTES, held } from './syndromes.ts';
@@ -27,6 +27,7 @@ const SALTS_TRIED = 4;
 const DUMMY_CELLS = 2; // of a carrier that a key which opens nothing looks into
 const NARROW_HARMONICS = 9; // of degree 1: some secrets leave the low bits of the others as they are
 const [LEAST_BYTES, MIN_BLOCKS] = [48, 4]; // of a block of codes, of a file with room
+const [FOREIGN, DEVIATIONS] = [1 / 4, 5]; // share of the Gaussians that may be foreign; of what is left
 const MAX_BITS = 2 ** 30; // of codes; more would take more memory than tabs have
 
 /** The data of a cell, and its carrier. */
@@ -48,9 +49,9 @@ export class QuietReader implements Reader {
 
   /** In the codes of a coded or decoded model, else in low bits; null without room. */
   static of(model: ReadModel): QuietReader | null {
-    if (model.codes) return QuietReader.ofCodes(model.codes);
+    if (model.codes) return QuietReader.ofCodes(levelsOf(model.codes));
     const decoded = decodedFrom(model);
-    return decoded ? QuietReader.ofCodes(decoded.codes, decoded.silent) : QuietReader.ofLowBits(model);
+    return decoded ? QuietReader.ofCodes(decoded.levels, decoded.silent) : QuietReader.ofLowBits(model);
   }
 
   private static ofLowBits(model: Gaussians): QuietReader {
@@ -67,8 +68,8 @@ export class QuietReader implements Reader {
   }
 
   /** `silent` [N]: Gaussians that carry nothing. */
-  private static ofCodes(codes: Codes, silent?: Uint8Array): QuietReader | null {
-    const bits = lastBits(codes, silent);
+  private static ofCodes(levels: Levels, silent?: Uint8Array): QuietReader | null {
+    const bits = lastBits(levels, silent);
     if (bits.length < MIN_BLOCKS * 8 * BLOCK_BYTES || bits.length > MAX_BITS) return null;
     const low = held(bits);
     const numbers = new Uint32Array((IDENTITY_BYTES / 4) * (low.length / BLOCK_BYTES));
@@ -130,12 +131,22 @@ export class QuietReader implements Reader {
       const chunks = records.map((each): [number, Uint8Array] => [
         each[0] | (each[1] << 8) | (each[2] << 16), each.subarray(NUMBER_BYTES),
       ]);
-      return this.payload(dataKey, parameters, decoded(codewords, chunks).subarray(0, size));
+      const payload = await this.payload(dataKey, parameters, decoded(codewords, chunks).subarray(0, size));
+      return { ...payload, foreign: this.foreign(parameters, records.length) };
     }
     const known = new Set(records.map(bytesKey));
     const all = [...records, ...copies.filter((each) => !known.has(bytesKey(each)))];
     if (!all.length) throw tooMuchLost();
-    return { service: 'records', method, header, records: all };
+    const foreign = this.foreign(parameters, records.length + copies.length);
+    return { service: 'records', method, header, records: all, foreign };
+  }
+
+  /** Where `cells` are left of a secret. */
+  private foreign({ gaussians, count }: Parameters, cells: number): number | undefined {
+    const [rows, all] = [this.names.length / IDENTITY_BYTES, Math.max(1, count)];
+    const left = Math.min(1, cells / all);
+    const found = rows - Math.floor((left + DEVIATIONS * Math.sqrt((left * (1 - left)) / all)) * gaussians);
+    return found > FOREIGN * rows ? found : undefined;
   }
 
   private async payload(dataKey: Uint8Array, { method }: Parameters, encrypted: Uint8Array): Promise<Content> {

@@ -1,8 +1,8 @@
 """Damaged files: each must be read or raise an InputError, quickly and in little memory.
 
-    python benchmarks/mutations.py --count 100000
-    python benchmarks/mutations.py --count 10000 --lies             # only those that lie about sizes
-    python benchmarks/mutations.py --count 10000 --only a.payload   # what a key opens, written by an attacker
+    python tests/files/formats/mutations.py --count 100000
+    python tests/files/formats/mutations.py --count 10000 --lies             # only those that lie about sizes
+    python tests/files/formats/mutations.py --count 10000 --only a.payload   # written by an attacker
 
 Files of every format are damaged at random, before and after packing: bits, bytes, words with extreme values,
 cuts, repeats, megabytes of zeros; every other file declares false sizes (`lies.py`). Failures are printed
@@ -25,6 +25,12 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+
+import numpy as np
+import torch
+
+from files.formats.lies import LIES, image
 from keyss.core import Gaussians, InputError
 from keyss.core.decoded import DecodedGaussians, PictureNetwork
 from keyss.files import load_scene, model_bytes, model_of_bytes
@@ -32,10 +38,6 @@ from keyss.files.formats.spz import SpzCodes
 from keyss.files.images import read_image
 from keyss.methods.records import whole
 from keyss.methods.tensors import Header, pack_tensors, refuse_damage, unpack_tensors
-from lies import LIES, image
-
-import numpy as np
-import torch
 
 SECONDS = 2.0  # time limit for a file of a few kilobytes
 CARRIERS = 6000  # Gaussians of the published model that holds a payload

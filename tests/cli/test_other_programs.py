@@ -1,0 +1,109 @@
+"""Models as other programs write them, by the commands that a new user tries first."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import gsply
+import numpy as np
+import pytest
+from numpy.lib.recfunctions import append_fields, repack_fields
+from plyfile import PlyData, PlyElement
+
+from channels.quiet.trained_like import trained_like
+from cli.said import Run, write_key
+from keyss.files import read_model, write_model
+
+Write = Callable[[Path, np.ndarray], None]
+COUNT = 800
+
+
+def with_plyfile(*more: PlyElement, first: bool = False, **options: object) -> Write:
+    """With other elements before or after the Gaussians."""
+
+    def write(path: Path, rows: np.ndarray) -> None:
+        own = [PlyElement.describe(rows, "vertex")]
+        PlyData([*more, *own] if first else [*own, *more], **options).write(str(path))
+
+    return write
+
+
+def doubles(path: Path, rows: np.ndarray) -> None:
+    with_plyfile(byte_order=">")(path, rows.astype([(name, "f8") for name in rows.dtype.names]))
+
+
+def labels(path: Path, rows: np.ndarray) -> None:
+    """Colours of a point cloud and numbers of objects beside each Gaussian."""
+    kinds = {"red": "u1", "green": "u1", "blue": "u1", "segment": "i4"}
+    values = [np.arange(len(rows)).astype(kind) for kind in kinds.values()]
+    with_plyfile()(path, append_fields(rows, list(kinds), values, usemask=False))
+
+
+def shuffled(path: Path, rows: np.ndarray) -> None:
+    names = [name for name in sorted(rows.dtype.names) if not name.startswith("n")]
+    with_plyfile()(path, repack_fields(rows[names]))
+
+
+def carriage_returns(path: Path, rows: np.ndarray) -> None:
+    with_plyfile()(path, rows)
+    header, end, data = path.read_bytes().partition(b"end_header\n")
+    path.write_bytes((header + end).replace(b"\n", b"\r\n") + data)
+
+
+def changed(**values: float) -> Write:
+    """The first half of the Gaussians with these numbers."""
+
+    def write(path: Path, rows: np.ndarray) -> None:
+        for name, value in values.items():
+            rows[name][: len(rows) // 2] = value
+        with_plyfile()(path, rows)
+
+    return write
+
+
+def of_gsply(path: Path, rows: np.ndarray) -> None:
+    with_plyfile()(path, rows)
+    gsply.plywrite(str(path), gsply.plyread(str(path)))
+
+
+FACES = PlyElement.describe(np.array([([0, 1, 2],)], dtype=[("vertex_indices", "i4", (3,))]), "face")
+CAMERA = PlyElement.describe(np.zeros(1, [("view_px", "f4"), ("frame", "i4")]), "camera")
+KINDS: dict[str, Write] = {
+    "big-endian doubles": doubles,
+    "text": with_plyfile(text=True),
+    "a camera before the Gaussians": with_plyfile(CAMERA, first=True, comments=["SH degree 1"]),
+    "faces behind the Gaussians": with_plyfile(FACES),
+    "labels": labels,
+    "properties by name, no normals": shuffled,
+    "lines that end as on Windows": carriage_returns,
+    "gsply": of_gsply,
+    "quaternions of length 0": changed(rot_0=0, rot_1=0, rot_2=0, rot_3=0),
+    "round and opaque": changed(scale_0=-4, scale_1=-4, scale_2=-4, opacity=20),
+    "one stray Gaussian": lambda path, rows: changed(x=0)(path, np.append(rows, far_out(rows[:1]))),
+    "copies of one Gaussian": lambda path, rows: with_plyfile()(path, np.repeat(rows[:1], len(rows))),
+}
+
+
+def far_out(rows: np.ndarray) -> np.ndarray:
+    rows = rows.copy()
+    rows["y"] = 1e9
+    return rows
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_first_commands_of_a_new_user(keyss: Run, tmp_path: Path, kind: str) -> None:
+    model, run, revealed = tmp_path / "model.ply", tmp_path / "run", tmp_path / "revealed.ply"
+    write_model(model, trained_like(COUNT, 0, 1))
+    write_model(tmp_path / "secret.ply", trained_like(30, 1, 1))
+    KINDS[kind](model, PlyData.read(str(model))["vertex"].data.copy())
+    key = write_key(tmp_path / "key.txt")
+    secret = ("--secret", tmp_path / "secret.ply", "--key-file", key)
+    said = keyss("hide", "--cover", model, *secret, "--width", 32, "-o", run)
+    assert said.status == 0, said.err
+    said = keyss("reveal", run / "publish" / "model.ply", "--key-file", key, "-o", revealed)
+    assert said.status == 0, said.err
+    assert len(read_model(revealed)) == 30
+    assert keyss("view", model, "-o", tmp_path / "page.html").status == 0
+    said = keyss("convert", model, tmp_path / "model.spz")
+    assert said.status == 0 or (kind == "one stray Gaussian" and "remove Gaussians far out" in said.err)

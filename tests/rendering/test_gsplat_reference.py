@@ -1,0 +1,147 @@
+"""What a GPU is given and gives back, without one: gsplat computes by its own reference implementation.
+
+Only the kernels themselves and the driver are left to `make test-cuda`.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+from gsplat.cuda._torch_impl import _isect_tiles
+
+from channels.quiet.trained_like import trained_like
+from fitting.small_trainings import FIT, placed
+from keyss import CarryOptions, FitConfig, Secret, hide, reveal
+from keyss.fitting import PlainRun
+from keyss.keys import random_embeddings
+from keyss.methods import DESIGNS, registry
+from keyss.methods.keyss.method import training_of
+from keyss.runs import stego_in
+from methods.keyss.small import small
+from rendering.gsplat_reference import COMPILED, NERFACC
+from rendering.pretended_cuda import OnGpu, held, pretended_gpu
+from rendering.scenes import SCENES, random_scene
+from rendering.test_cuda import IMAGE_ERROR, check_backends_agree
+from tiny_scenes import tiny_scene
+
+KEY = "a key of the tests: 3kV-9q"
+STEPS = replace(FIT, iterations=4, max_gaussians=300, sh_degree=3, grow_stop=0.8, grow_every=2)
+PEERS = [name for name, where in registry.METHODS.items() if ".peers." in where.hiding and name != "3dgs"]
+
+
+@pytest.fixture
+def gpu(monkeypatch: pytest.MonkeyPatch) -> Iterator[torch.device]:
+    monkeypatch.setitem(sys.modules, "gsplat.cuda._backend", SimpleNamespace(_C=COMPILED))
+    monkeypatch.setitem(sys.modules, "nerfacc", NERFACC)
+    monkeypatch.setattr("keyss.rendering.rasterize.require_gsplat_cuda", lambda: None)
+    monkeypatch.setattr("keyss.rendering.backends.require_gsplat_cuda", lambda: None)
+    with pretended_gpu() as device:
+        yield device
+
+
+def test_the_pretended_gpu_refuses_what_a_gpu_refuses(gpu: torch.device) -> None:
+    here, there = torch.ones(3), torch.ones(3, device="cuda")
+    assert (here.device.type, there.device, (there * 2).device) == ("cpu", gpu, gpu)
+    with pytest.raises(RuntimeError, match="expected all tensors to be on one device"):
+        here + there
+    with pytest.raises(TypeError, match="can't convert cuda:0 device type tensor to numpy"):
+        there.numpy()
+    with pytest.raises(RuntimeError, match="same device as the indexed tensor"):
+        here[there > 0]
+    there.cpu().zero_()
+    assert float(there.sum()) == 3
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_backends_agree(name: str, gpu: torch.device) -> None:
+    check_backends_agree(SCENES[name](), gpu)
+
+
+def test_double_precision_is_rounded_as_on_the_cpu(gpu: torch.device) -> None:
+    scene = random_scene()
+    leaves = {
+        name: leaf.detach().to(gpu).requires_grad_() for name, leaf in scene.leaves(torch.float64).items()
+    }
+    found, expected = scene.results(leaves), scene.results(scene.leaves(torch.float64))
+    assert found["images"].dtype == torch.float32
+    assert found["gradient of means"].dtype == torch.float64
+    assert (found["images"].cpu() - expected["images"]).abs().max() <= IMAGE_ERROR
+
+
+def test_nothing_is_seen(gpu: torch.device) -> None:
+    scene = random_scene()
+    scene.means[:, 2] -= 100
+    results = scene.results({name: leaf.detach().to(gpu) for name, leaf in scene.leaves().items()})
+    assert not results["radii"].any()
+    assert torch.equal(results["images"].cpu(), scene.backgrounds[:, None, None].float().expand(1, 40, 48, 3))
+
+
+def training(name: str, config: FitConfig, device: torch.device) -> Any:
+    """Of a plain model, a design, or a peer."""
+    if name == "plain":
+        return PlainRun(tiny_scene(), config, device)
+    if name not in DESIGNS:
+        method: Any = registry.get(name)
+        return method.training(placed(), method.options(fit=config, common_poses=0.5), device)
+    options = small(name, config)
+    vectors = list(random_embeddings(1, torch.Generator().manual_seed(0)))
+    return training_of(options.configuration)(placed(), vectors, options, options.configuration, device)
+
+
+@pytest.mark.parametrize("name", ["plain", *DESIGNS, *PEERS])
+def test_trainings_have_the_gradients_of_the_cpu(name: str, gpu: torch.device) -> None:
+    here, there = (training(name, STEPS, device) for device in (torch.device("cpu"), gpu))
+    for run in (here, there):
+        torch.manual_seed(0)
+        with torch.no_grad():
+            for (
+                parameter
+            ) in run.parameters.values():  # scales of equal length leave rotations without gradients
+                parameter += 0.05 * torch.randn(parameter.shape).to(parameter.device)
+        run.step()
+    assert abs(float(there.loss) - float(here.loss)) < 1e-5
+    assert here.optimizers.keys() == there.optimizers.keys()
+    for part, optimizer in here.optimizers.items():
+        (expected,) = optimizer.state.values()  # moments: linear in the gradients, unlike Adam's first steps
+        (found,) = there.optimizers[part].state.values()
+        assert isinstance(found["exp_avg"], OnGpu)
+        error = (found["exp_avg"].cpu() - expected["exp_avg"]).norm()
+        assert error <= 1e-3 * expected["exp_avg"].norm(), part
+    while there.iteration < there.iterations:  # with density control, and what trainings do at their end
+        there.step()
+    assert all(parameter.isfinite().all() for parameter in there.parameters.values())
+
+
+@pytest.mark.parametrize("method", ["carry", "latent"])
+def test_models_are_hidden_and_revealed(
+    method: str, gpu: torch.device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("keyss.measure.hiding.WRONG_KEYS", 1)
+    models, scenes = [trained_like(800, seed=seed) for seed in (1, 2)], [tiny_scene(0), tiny_scene(1)]
+    options = CarryOptions() if method == "carry" else small(method, STEPS)
+    hide(
+        scenes[0], [Secret(scenes[1], KEY, models[1])], method=options, cover_model=models[0],
+        device="cuda", out=tmp_path / "run", min_psnr=0,
+    )  # fmt: skip
+    revealed = reveal(stego_in(tmp_path / "run"), KEY, device="cuda").gaussians
+    assert not isinstance(revealed.means, OnGpu)
+    here = reveal(stego_in(tmp_path / "run"), KEY, device="cpu").gaussians
+    assert (revealed.means - here.means).abs().max() < 1e-6
+
+
+@pytest.mark.parametrize("name", ["random", "three cameras", "around the camera"])
+def test_gaussians_are_in_the_tiles_of_the_reference(name: str, gpu: torch.device) -> None:
+    scene = SCENES[name]()
+    _, _, meta = scene.draw({key: leaf.to(gpu) for key, leaf in scene.leaves().items()})
+    rows, columns = meta["tile_height"], meta["tile_width"]
+    footprints = [held(meta[key]).detach() for key in ("means2d", "radii", "depths")]
+    counts, ids, _ = _isect_tiles(*footprints, meta["tile_size"], columns, rows)
+    assert torch.equal(held(meta["tiles_per_gauss"]), counts)
+    assert torch.equal(held(meta["isect_ids"]), ids)
