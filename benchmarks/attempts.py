@@ -1,10 +1,10 @@
-"""How long a right and a wrong key take: medians of attempts that take turns.
+"""Times of right and wrong keys: medians of alternating attempts.
 
     python benchmarks/attempts.py [--gaussians 20000] [--rounds 21]
 
-"open" is everything up to the unpacked secret or to the refusal, "reveal" what `keyss reveal --decoy` does,
-its files included. The noise is the right key against itself, every other attempt against the rest. On a
-machine that does other things it is larger than what is to be seen; the time of the processor suffers less.
+"open" is everything up to the unpacked secret or the refusal, "reveal" is `keyss reveal --decoy` with its
+files. The noise compares the right key with itself: every other attempt with the rest. On a busy machine it
+exceeds the difference; processor time is less noisy.
 """
 
 from __future__ import annotations

@@ -1,12 +1,12 @@
-"""What a benchmark measured, as one JSON file for each run, and how two of them compare.
+"""Records of benchmark runs as JSON files, and comparison of two records.
 
 A record names the commit and the machine. Its *numbers* are absolute (seconds, bytes, decibels; the name ends
-in the unit) and mean something on that machine only. Its *ratios* compare what keyss does with a fixed
-workload on the same machine at the same time, or one part of keyss with another: they can be held against
-those of another day. Less is better for every ratio.
+in the unit) and valid on that machine only. Its *ratios* compare keyss with a fixed workload on the same
+machine at the same time, or parts of keyss with each other: they are comparable between days. Less is better
+for every ratio.
 
-Records of benchmarks lie in `benchmarks/results/NAME/COMMIT.json`; `baseline.json` beside them is what
-`make benchmark-check` compares with.
+Records are `benchmarks/results/NAME/COMMIT.json`; `make benchmark-check` compares with `baseline.json` beside
+them.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ RESULTS = ROOT / "benchmarks" / "results"
 
 @dataclass(frozen=True)
 class Machine:
-    """Where a benchmark ran."""
+    """The machine of a benchmark."""
 
     processor: str
     cores: int
@@ -43,7 +43,7 @@ class BenchmarkRecord:
 
     version: int = 1
     name: str
-    commit: str  # 12 hexadecimal digits, then `-changed` where files differed from it
+    commit: str  # 12 hexadecimal digits, then `-changed` if files differed from it
     machine: Machine
     numbers: dict[str, float] = field(default_factory=dict)
     ratios: dict[str, float] = field(default_factory=dict)
@@ -51,7 +51,7 @@ class BenchmarkRecord:
 
 @dataclass(frozen=True)
 class Change:
-    """A ratio that is not what it was; None where one of the records lacks it."""
+    """A changed ratio; None if a record lacks it."""
 
     ratio: str
     before: float | None
@@ -65,14 +65,14 @@ class Change:
 
 
 def make_record(name: str, numbers: dict[str, float], ratios: dict[str, float]) -> BenchmarkRecord:
-    """What was measured, with this commit and this machine."""
+    """A record of this commit on this machine."""
     return BenchmarkRecord(
         name=name, commit=this_commit(), machine=this_machine(), numbers=numbers, ratios=ratios
     )
 
 
 def write_record(record: BenchmarkRecord, path: Path | None = None) -> Path:
-    """Write `record` to `path`, by default `benchmarks/results/NAME/COMMIT.json`; the path."""
+    """Write `record` to `path`, by default `benchmarks/results/NAME/COMMIT.json`; returns the path."""
     path = path or RESULTS / record.name / f"{record.commit}.json"
     path.parent.mkdir(parents=True, exist_ok=True)
     write_bytes(path, msgspec.json.format(msgspec.json.encode(record), indent=2) + b"\n")
@@ -80,12 +80,12 @@ def write_record(record: BenchmarkRecord, path: Path | None = None) -> Path:
 
 
 def read_record(path: Path) -> BenchmarkRecord:
-    """The record in a file. Raises msgspec.ValidationError for one that is none, OSError without a file."""
+    """Read a record. Raises msgspec.ValidationError for other files, OSError without a file."""
     return msgspec.json.decode(path.read_bytes(), type=BenchmarkRecord)
 
 
 def regressions(now: BenchmarkRecord, baseline: BenchmarkRecord, tolerance: float) -> list[Change]:
-    """Ratios that grew by more than a share of `tolerance`, and those that only one of the records has."""
+    """Ratios that grew by more than the share `tolerance`, and those missing in one of the records."""
     names = sorted(now.ratios.keys() | baseline.ratios.keys())
     changes = [Change(name, baseline.ratios.get(name), now.ratios.get(name)) for name in names]
     return [
@@ -105,20 +105,20 @@ def numbers_of_table(titles: list[str], rows: list[list[str]], labels: int = 2) 
 
 
 def this_commit() -> str:
-    """The commit that is checked out; `unknown` outside a repository."""
+    """The checked-out commit; `unknown` outside a repository."""
     digits, changed = _git("rev-parse", "--short=12", "HEAD"), _git("status", "--porcelain", "-uno")
     return "unknown" if not digits else digits + ("-changed" if changed else "")
 
 
 def this_machine() -> Machine:
-    """The machine that this runs on."""
+    """The current machine."""
     libraries = {name: version(name) for name in ("numba", "numpy", "torch")}
     system = f"{platform.system()} {platform.machine()}"
     return Machine(processor_name(), os.cpu_count() or 1, system, platform.python_version(), libraries)
 
 
 def processor_name() -> str:
-    """As the system calls it."""
+    """The system's name for the processor."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
     except OSError:

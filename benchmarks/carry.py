@@ -1,4 +1,4 @@
-"""What carrying holds and costs: capacities, and decibels for models that you have. Times: `large.py`.
+"""Capacity and cost of carrying, in decibels for your own models. Times: `large.py`.
 
 python benchmarks/carry.py                      # capacities
 python benchmarks/carry.py --models FOLDER      # every .ply in it as a cover, and as a secret in the next
@@ -56,7 +56,7 @@ def _capacities() -> None:
 
 
 def _models(paths: list[Path]) -> None:
-    """Renders from around each model, of the stego model and of what comes out again."""
+    """Compare renders of each cover and secret with those of the stego model and the revealed secret."""
     models = {path: read_model(path) for path in paths}
     for cover, secret in zip(paths, paths[1:] + paths[:1], strict=True):
         try:
@@ -75,7 +75,7 @@ def _models(paths: list[Path]) -> None:
 
 
 def _photos(pairs: list[list[str]], width: int) -> None:
-    """Against the test photos, whole and with a quarter of the Gaussians removed."""
+    """Compare with the test photos, before and after removing a quarter of the Gaussians."""
     scenes = {scene: load_scene(scene, width=width) for scene, _ in pairs}
     for (cover, cover_path), (secret, secret_path) in permutations(pairs, 2):
         model, hidden = read_model(cover_path), read_model(secret_path)
@@ -85,7 +85,7 @@ def _photos(pairs: list[list[str]], width: int) -> None:
             print(f"{secret} in {cover}: {error}", flush=True)
             continue
         found = extract(stego, KEY).gaussians
-        kept = stego[_kept(len(stego))]
+        kept = stego[_kept_rows(len(stego))]
         left = extract(kept, KEY)
         compensated = compensate_pruning(left.gaussians, left.count)
         raw, mended = (_against(scenes[secret], each) for each in (left.gaussians, compensated))
@@ -105,7 +105,7 @@ def _photos(pairs: list[list[str]], width: int) -> None:
         )
 
 
-def _kept(count: int) -> torch.Tensor:
+def _kept_rows(count: int) -> torch.Tensor:
     order = torch.randperm(count, generator=torch.Generator().manual_seed(0))
     return order[: round(count * (1 - REMOVED))].sort().values
 

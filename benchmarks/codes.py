@@ -1,16 +1,17 @@
-"""What carrying in the codes of published files costs and holds: the tables of docs/channels.md.
+"""Capacity and cost of carrying in the codes of published files: the tables of docs/channels.md.
 
     python benchmarks/codes.py --data FOLDER --pair bonsai=cover.ply,fox=secret.ply --write docs/channels.md
     python benchmarks/codes.py --attributes bonsai=cover.ply
     python benchmarks/codes.py --files FOLDER --format spz bonsai=a.ply bonsai=b.ply fox=c.ply ...
     python benchmarks/stealth.py --quick --pairs $(cat FOLDER/pairs)
 
-The second gives the cost of each attribute alone; the third writes of each model an untouched file and one
-nine tenths full, and lists them for the fourth, which tells how well they are told apart.
+The second command gives the cost of each attribute alone. The third writes an untouched and a
+nine-tenths-full file of each model, and lists them for the fourth, which measures how well they can be
+distinguished.
 
-Each `--pair` names a folder of photos in `--data` and a model of it for the cover, then for the secret (a
-folder that is not there: pictures of the model itself are taken). The secret is as large as fits, and at most
-a sixth of the cover's Gaussians, of SH degree 0. Costs are against the untouched file of the format.
+Each `--pair` names a folder of photos in `--data` and a model of it for the cover, then for the secret
+(without the folder, renders of the model replace photos). The secret is as large as fits, at most a sixth of
+the cover's Gaussians, of SH degree 0. Costs are relative to the untouched file of the format.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from keyss.files.formats.common import in_morton_order
 from keyss.files.models import read_model, write_model
 from keyss.files.scenes import load_scene
 from keyss.fitting import psnr
-from keyss.methods import fitted, most_visible, pruned
+from keyss.methods import encode_to_size, most_visible, prune_to_size
 from keyss.methods.records import whole
 from keyss.rendering import render
 from keyss.rendering.difference import psnr_between
@@ -78,8 +79,8 @@ def rows(cover: tuple[str, Gaussians], secret: tuple[str, Gaussians], data: Path
         start = time.monotonic()
         prepared = InCodes(name).prepare(cover[1])
         left = prepared.room.capacity - prepared.room.overhead
-        kept = pruned(own, left)
-        encoded = fitted(kept, left)
+        kept = prune_to_size(own, left)
+        encoded = encode_to_size(kept, left)
         stego = prepared.embed([(KEY, Payload("carry", encoded))])
         file = stego.codes.serialise()
         hiding = time.monotonic() - start
@@ -103,7 +104,7 @@ def rows(cover: tuple[str, Gaussians], secret: tuple[str, Gaussians], data: Path
 
 
 def attributes(name: str, model: Gaussians) -> None:
-    """What each attribute costs alone: PSNR in dB against the untouched file, and bits of a Gaussian."""
+    """The cost of each attribute alone: PSNR in dB against the untouched file, and bits per Gaussian."""
     for format_name in FORMATS:
         cover = InCodes(format_name).prepare(model)
         untouched = cover.cover
@@ -113,7 +114,7 @@ def attributes(name: str, model: Gaussians) -> None:
             own = [each.name == attribute for each in cover.fields]
             free = [each & one for each, one in zip(cover.free, own, strict=True)]
             bits = sum(each.room for each, one in zip(cover.fields, own, strict=True) if one) / len(model)
-            # Others may not change: too few are free to hold anything, so the bits that are get noise.
+            # Other attributes must not change; their free bits, too few to hold anything, get noise.
             noise = np.random.default_rng(0).integers(0, 2, len(cover.dry)).astype(np.uint8)
             changed = replace(cover, codes=replace(cover, free=free)._written(noise, os.urandom(32))).cover
             found.append(f"{attribute} {bits:.1f} bits {psnr_between(untouched, changed):.1f} dB")
@@ -121,7 +122,7 @@ def attributes(name: str, model: Gaussians) -> None:
 
 
 def files(folder: Path, format_name: str, models: list[str]) -> None:
-    """Write pairs of files, and in the file `pairs` what benchmarks/stealth.py is told of them."""
+    """Write pairs of files, and the file `pairs` with the arguments of benchmarks/stealth.py."""
     folder.mkdir(parents=True, exist_ok=True)
     found = []
     for each in models:
@@ -145,8 +146,8 @@ def main() -> None:
     parser.add_argument("--attributes", action="append", default=[], metavar="NAME=FILE")
     parser.add_argument("--files", type=Path, metavar="FOLDER")
     parser.add_argument("--format", choices=tuple(FORMATS), default="spz")
-    parser.add_argument("--width", type=int, default=200, help="of pictures, in pixels")
-    parser.add_argument("--write", type=Path, help="page that gets the table between its two marks")
+    parser.add_argument("--width", type=int, default=200, help="width of renders in pixels")
+    parser.add_argument("--write", type=Path, help="page to write the table to, between two marks")
     arguments = parser.parse_args()
     for each in arguments.attributes:
         name, _, path = each.partition("=")

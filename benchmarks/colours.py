@@ -1,4 +1,4 @@
-"""What the colours of a model carry, what that costs, and what of it survives.
+"""Capacity, cost and robustness of the channel `colours`.
 
 python benchmarks/colours.py MODEL.ply ... [--gaussians N] [--payloads P] [--strengths 45 55] [--changes]
                                 [--only FORMAT] [--size BYTES]
@@ -6,20 +6,20 @@ python benchmarks/colours.py MODEL.ply ... --payloads N --log FILE [--gaussians 
 python benchmarks/colours.py SCENE-1.ply SCENE-2.ply ... --pairs FOLDER [--shares 1 0.5 0.2 0.05]
 python benchmarks/colours.py MODEL.ply --speed [--gaussians N]
 
-For each model and strength: net bits per Gaussian and the cost of a full model, and how many of P payloads,
-each with a new key and new entropy, do not come back from each format, alone and with a quarter of the
-Gaussians removed at random on top. With --changes also other changes, at full capacity and at a fifth of it.
-Argon2id is cheap, which has nothing to do with what is measured, but with --speed.
+For each model and strength: net bits per Gaussian, the cost of a full model, and how many of P payloads, each
+with a new key and new entropy, are lost in each format, alone and with a quarter of the Gaussians removed at
+random. With --changes, also other changes, at full capacity and at a fifth of it. Argon2id is replaced by a
+cheap function, except with --speed.
 
-With --log, N payloads in all, spread over the models, each through the formats that this library writes,
-and each M-th through other people's programs as well: one line of JSON for each payload, appended; what is in
-the file already is not done again.
+With --log, N payloads in total, distributed over the models, go through the formats that keyss writes, and
+each M-th also through third-party programs. Each payload appends a line of JSON; payloads in the file are
+skipped.
 
-With --pairs nothing is measured: each model, and each with a payload of so much of its capacity, is written
-as it comes back from each format, and `FOLDER/STRENGTH-FORMAT-SHARE.txt` names them for
-`xargs python benchmarks/stealth.py --quick --pairs < FILE`. With --speed: seconds and memory of writing 200
-bytes and of reading with a right key and a wrong one, Argon2id included. `--gaussians` draws so many of each
-model, and with --speed more than it has.
+With --pairs, nothing is measured: each model, with and without a payload of a share of its capacity, is
+converted to each format and back, and `FOLDER/STRENGTH-FORMAT-SHARE.txt` lists the files for `xargs python
+benchmarks/stealth.py --quick --pairs < FILE`. With --speed: seconds and memory of writing 200 bytes, and of
+reading with a right and a wrong key, Argon2id included. `--gaussians` samples each model to this size (with
+--speed, even beyond its own).
 
 pip install gsply npm install --no-save @playcanvas/splat-transform@2.7.1   (or KEYSS_SPLAT_TRANSFORM)
 """
@@ -57,7 +57,7 @@ import cheap_keys
 
 Change = Callable[[Gaussians], Gaussians]
 FIFTH = 0.2
-METHOD, PACKED = "t", 2  # of payloads, and bytes that they take beside their data
+METHOD, PACKED = "t", 2  # payload header: method, and bytes beside the data
 
 
 def main() -> None:
@@ -68,8 +68,8 @@ def main() -> None:
     parser.add_argument("--log", type=Path, metavar="FILE")
     parser.add_argument("--foreign-each", type=int, default=10)
     parser.add_argument("--strengths", type=float, nargs="+", default=[45.0])
-    parser.add_argument("--seed", type=int, default=0, help="of keys, payloads and what is removed")
-    parser.add_argument("--size", type=int, help="bytes of a payload, instead of all that a model holds")
+    parser.add_argument("--seed", type=int, default=0, help="seed of keys, payloads and removals")
+    parser.add_argument("--size", type=int, help="bytes of a payload (default: the capacity)")
     parser.add_argument("--changes", action="store_true")
     parser.add_argument("--only", default="", help="formats with this in their name")
     parser.add_argument("--pairs", type=Path, metavar="FOLDER")
@@ -87,20 +87,20 @@ def main() -> None:
         return
     if asked.log:
         run_payloads(
-            [(path.stem, partial(_of_file, path, asked.gaussians)) for path in asked.models],
+            [(path.stem, partial(_read, path, asked.gaussians)) for path in asked.models],
             asked.payloads,
             asked.log,
             strength=asked.strengths[0],
             foreign={what: change for what, change in _BY_TOOL.items() if asked.only in what},
             each=asked.foreign_each,
-            embed=_embedded,
+            embed=_embed,
             opens=_opens,
         )
         return
     print("| model | Gaussians | asked, dB | cost, dB | bytes | bits per Gaussian | what | failures |")
     print("| --- | --- | --- | --- | --- | --- | --- | --- |")
     for path in asked.models:
-        model = _of_file(path, asked.gaussians)
+        model = _read(path, asked.gaussians)
         for strength in asked.strengths:
             prepared = Colours(strength).prepare(model)
             name = f"{path.stem} | {len(prepared.cover):,} | {strength:.0f}"
@@ -112,13 +112,13 @@ def main() -> None:
                 _measure(prepared, name, OTHERS, asked.payloads, asked.seed, FIFTH)
 
 
-def _of_file(path: Path, gaussians: int | None) -> Gaussians:
-    """As many as asked for, or all where there are fewer."""
+def _read(path: Path, gaussians: int | None) -> Gaussians:
+    """At most `gaussians` of the model."""
     model = read_model(path)
-    return _drawn(model, gaussians) if gaussians is not None and gaussians < len(model) else model
+    return _resample(model, gaussians) if gaussians is not None and gaussians < len(model) else model
 
 
-def _embedded(prepared: ColoursCover, number: int, data: bytes) -> Gaussians:
+def _embed(prepared: ColoursCover, number: int, data: bytes) -> Gaussians:
     return prepared.embed([(_key(number), Payload(METHOD, data))], entropy=number.to_bytes(32, "big"))
 
 
@@ -131,12 +131,12 @@ def _measure(
     share: float = 1.0,
     pruned: bool = False,
 ) -> None:
-    """Prints a row for each change in `wanted`."""
+    """Print a row for each change in `wanted`."""
     size, failures, psnrs = round(share * (prepared.room.capacity - PACKED)), Counter[str](), []
     missing: set[str] = set()
     for seed in range(first, first + payloads):
         data = np.random.default_rng(seed).bytes(size)
-        stego = _embedded(prepared, seed, data)
+        stego = _embed(prepared, seed, data)
         psnrs.append(psnr_between(prepared.cover, stego))
         for what, change in wanted.items():
             try:
@@ -170,7 +170,7 @@ def _write_pairs(
         for share in shares:
             size = int(share * (prepared.room.capacity - PACKED))
             data = np.random.default_rng(number).bytes(size)
-            stego = made[f"{share:g}"] = _embedded(prepared, number, data)
+            stego = made[f"{share:g}"] = _embed(prepared, number, data)
             print(
                 f"{path.stem} {share:g}: {size:,} bytes, {psnr_between(prepared.cover, stego):.1f} dB",
                 flush=True,
@@ -191,7 +191,7 @@ def _measure_speed(models: Sequence[Path], gaussians: int | None) -> None:
     print("| model | Gaussians | embed | extract | wrong key | most memory |")
     print("| --- | --- | --- | --- | --- | --- |")
     for path in models:
-        model = _drawn(read_model(path), gaussians)
+        model = _resample(read_model(path), gaussians)
         seconds = []
         stego = model
         for step in ("embed", "right", "wrong"):
@@ -210,8 +210,8 @@ def _measure_speed(models: Sequence[Path], gaussians: int | None) -> None:
         print(f"| {path.stem} | {len(model):,} | {' | '.join(seconds)} | {memory:,.0f} MiB |", flush=True)
 
 
-def _drawn(model: Gaussians, count: int | None) -> Gaussians:
-    """So many of a model; where it has fewer, each as often as it takes, scaled at random by a little."""
+def _resample(model: Gaussians, count: int | None) -> Gaussians:
+    """Sample `count` Gaussians; beyond the model's own number, repeat them at slightly random scales."""
     if count is None:
         return model
     generator = torch.Generator().manual_seed(0)
@@ -234,20 +234,20 @@ def _key(seed: int) -> str:
     return f"key number {seed}"
 
 
-def _moved(scale: float) -> Change:
+def _move(scale: float) -> Change:
     rotation = torch.from_numpy(Rotation.from_euler("xyz", [0.3, 1.1, -2.0]).as_matrix())
     return Similarity(scale, rotation, torch.tensor([3.0, -2.0, 5.0], dtype=torch.float64)).apply_gaussians
 
 
-def _shuffled(model: Gaussians) -> Gaussians:
+def _shuffle(model: Gaussians) -> Gaussians:
     return model[torch.randperm(len(model), generator=torch.Generator().manual_seed(0))]
 
 
-def _beside(share: float) -> Change:
-    """Put together with some of itself, moved, mirrored in colour and scaled: another scene of that kind."""
+def _append_copy(share: float) -> Change:
+    """Append a share of the model, moved, scaled and with mirrored colours, as another scene."""
 
     def apply(model: Gaussians) -> Gaussians:
-        other = _moved(1.3)(model[: int(share * len(model))])
+        other = _move(1.3)(model[: int(share * len(model))])
         return Gaussians.cat([model, Gaussians(*_parts(other))])
 
     def _parts(other: Gaussians) -> tuple[torch.Tensor, ...]:
@@ -257,25 +257,25 @@ def _beside(share: float) -> Change:
     return apply
 
 
-def _then(first: Change, second: Change) -> Change:
+def _chain(first: Change, second: Change) -> Change:
     return lambda model: second(first(model))
 
 
 _BY_TOOL: dict[str, Change] = {f"{each.format} by {each.tool}": each for each in lab.converters()}
 FORMATS: dict[str, Change] = {"raw `.ply`": lambda model: model, **_BY_TOOL}
 OTHERS: dict[str, Change] = {
-    "reordered": _shuffled,
+    "reordered": _shuffle,
     "cropped to a half": lab.cropping(1),
     "50 % removed at random": lab.random_pruning(0.5, 1),
     "25 % of lowest opacity removed": lab.opacity_pruning(0.25),
-    "another scene a quarter as large": _beside(0.25),
-    "another scene as large": _beside(1.0),
+    "another scene a quarter as large": _append_copy(0.25),
+    "another scene as large": _append_copy(1.0),
     "without harmonics": lab.fewer_harmonics(0),
     "half floats": lab.half_floats(),
-    "rotated and moved": _moved(1.0),
-    "scaled by 1.37, rotated and moved": _moved(1.37),
-    "`.spz` by gsply, then scaled": _then(_BY_TOOL[".spz by gsply"], _moved(1.37)),
-    "scaled, then `.spz` by gsply": _then(_moved(1.37), _BY_TOOL[".spz by gsply"]),
+    "rotated and moved": _move(1.0),
+    "scaled by 1.37, rotated and moved": _move(1.37),
+    "`.spz` by gsply, then scaled": _chain(_BY_TOOL[".spz by gsply"], _move(1.37)),
+    "scaled, then `.spz` by gsply": _chain(_move(1.37), _BY_TOOL[".spz by gsply"]),
     "noise on colour, 0.01 of its spread": lab.noise("colour", 0.01),
     "noise on colour, 0.03 of its spread": lab.noise("colour", 0.03),
     "noise on log scales, 0.01 of their spread": lab.noise("log scale", 0.01),

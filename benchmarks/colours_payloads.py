@@ -1,8 +1,8 @@
-"""Many payloads through many formats: how often one of the channel `colours` does not come back.
+"""Failure rates of payloads of the channel `colours` in many formats.
 
-`python benchmarks/colours.py MODEL.ply ... --payloads N --log FILE` appends a line of JSON for each payload,
-goes on where the file ends, and prints a table of all that is in it. Payload i, as large as the model holds,
-is hidden in model i modulo their number under a new key and with new entropy.
+`python benchmarks/colours.py MODEL.ply ... --payloads N --log FILE` appends a line of JSON per payload,
+resumes at the end of the file, and prints a table of all lines. Payload i fills model i modulo their number,
+under a new key and with new entropy.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ Change = Callable[[Gaussians], Gaussians]
 Embed = Callable[[ColoursCover, int, bytes], Gaussians]  # cover, number of the key, payload
 Opens = Callable[[Gaussians, int, bytes], bool]  # model, number of the key, payload
 OWN = (".ply", ".spz", ".compressed.ply", ".sog", ".splat")  # written and read by this library
-REMOVED = 0.25  # of the Gaussians
+REMOVED = 0.25  # fraction of the Gaussians
 
 
 def run_payloads(
@@ -42,7 +42,7 @@ def run_payloads(
     embed: Embed,
     opens: Opens,
 ) -> None:
-    """`foreign`: formats by other programs, through which goes every payload whose number `each` divides."""
+    """Run all payloads. `foreign`: formats by other programs, for every `each`-th payload."""
     done = [json.loads(line) for line in log.read_text().splitlines()] if log.exists() else []
     prepared: dict[str, ColoursCover] = {}
     for number in range(len(done), count):
@@ -53,7 +53,7 @@ def run_payloads(
         data = np.random.default_rng(number).bytes(cover.room.capacity - 2)
         stego = embed(cover, number, data)
         opened: dict[str, bool] = {}
-        ways: dict[str, Change] = {f"`{suffix}`": _written(suffix) for suffix in OWN}
+        ways: dict[str, Change] = {f"`{suffix}`": _convert_by_keyss(suffix) for suffix in OWN}
         ways |= foreign if number % each == 0 else {}
         for what, change in ways.items():
             try:
@@ -78,8 +78,8 @@ def run_payloads(
     print(table(done[:count]))
 
 
-def _written(suffix: str) -> Change:
-    """To a file of this format and back, both by this library."""
+def _convert_by_keyss(suffix: str) -> Change:
+    """Convert to this format and back with keyss."""
 
     def change(model: Gaussians) -> Gaussians:
         with tempfile.TemporaryDirectory() as folder:
@@ -91,10 +91,9 @@ def _written(suffix: str) -> Change:
 
 
 def table(records: Sequence[Mapping[str, Any]]) -> str:
-    """What was hidden in which models, and failures by format.
+    """Tables of payloads by model, and failures by format.
 
-    Where nothing failed in n openings, a failure rate of more than 3 / n would have shown itself with a
-    chance of 95 % (the rule of three).
+    Without failures in n openings, the failure rate is below 3 / n with 95 % confidence (rule of three).
     """
     lines = [
         "| model | Gaussians | payloads | bytes | bits per Gaussian | cost, dB: mean (least) |",
@@ -121,7 +120,7 @@ def table(records: Sequence[Mapping[str, Any]]) -> str:
 
 
 def _bound(failures: int, count: int) -> float:
-    """One-sided 95 % bound for a rate (Clopper and Pearson); near 3 / `count` where nothing failed."""
+    """One-sided 95 % upper bound for a rate (Clopper and Pearson); about 3 / `count` without failures."""
     from scipy.stats import beta
 
     return float(beta.ppf(0.95, failures + 1, count - failures)) if failures < count else 1.0

@@ -1,12 +1,12 @@
-"""What each format does to each attribute of a model, for docs/formats.md.
+"""Errors of each format in each attribute of a model, for docs/formats.md.
 
     pip install gsply
     npm install --no-save @playcanvas/splat-transform@2.7.1
     python benchmarks/formats.py fits/bonsai.ply fits/fox.ply
 
-Every model is written by each program, and read by keyss. Of Gaussians that can be seen (opacity above 0.05):
-root mean square and 99th percentile of the change. Bytes per Gaussian; PSNR of pictures from around the
-model, after against before. Writers whose program is absent are left out.
+Each program writes every model, and keyss reads it. For visible Gaussians (opacity above 0.05): root mean
+square and 99th percentile of the change; also bytes per Gaussian, and PSNR between renders before and after.
+Missing programs are skipped.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 VISIBLE = 0.05
-Writer = Callable[[Path, Path], object]  # from a .ply to a file
+Writer = Callable[[Path, Path], object]  # converts a .ply
 
 
 def main() -> None:
@@ -53,7 +53,7 @@ def main() -> None:
 
 
 def writers() -> list[tuple[str, str, Writer]]:
-    """Names, suffixes, and what writes."""
+    """Names, suffixes and writers."""
 
     def ours(source: Path, target: Path) -> None:
         write_model(target, read_model(source))
@@ -61,7 +61,7 @@ def writers() -> list[tuple[str, str, Writer]]:
     def gsply_spz(source: Path, target: Path) -> None:
         import gsply
 
-        # It does not turn models into the frame of an .spz.
+        # gsply does not rotate models into the frame of an .spz.
         turn = Similarity(rotation=torch.diag(torch.tensor([1.0, -1.0, -1.0])))
         model, turned = turn.apply_gaussians(read_model(source)), target.with_suffix(".turned.ply")
         model = replace(model, quats=read_model(source).quats * torch.tensor([1.0, 1.0, -1.0, -1.0]))
@@ -88,7 +88,7 @@ def writers() -> list[tuple[str, str, Writer]]:
 
 
 def through(path: Path, suffix: str, writer: Writer) -> tuple[float, float, list[tuple[float, float]]]:
-    """(bytes per Gaussian, PSNR, change of each attribute) of a model that a writer wrote."""
+    """Bytes per Gaussian, PSNR, and change of each attribute of a written model."""
     before = read_model(path)
     with tempfile.TemporaryDirectory() as folder:
         source, target = Path(folder) / "in.ply", Path(folder) / f"out.{suffix}"
@@ -113,7 +113,7 @@ def changes(before: Gaussians, after: Gaussians) -> list[tuple[float, float]]:
 
 
 def _nearest(before: Gaussians, after: Gaussians) -> np.ndarray:
-    """[N] which of `after` each of `before` became: the nearest in position, size and colour together."""
+    """[N] rows of `after` nearest to those of `before` in position, size and colour together."""
 
     def features(model: Gaussians) -> np.ndarray:
         parts = zip((model.means, model.log_scales, model.sh[:, 0]), scales, (50, 1, 1), strict=True)
@@ -132,7 +132,7 @@ def _spread(difference: Tensor | None) -> tuple[float, float]:
 
 
 def _cells(every: tuple[list[tuple[float, float]], ...]) -> list[str]:
-    """Of each attribute the mean over models, as "rms / 99th percentile"."""
+    """Means over models for each attribute, as "rms / 99th percentile"."""
     means = np.mean(np.array(every), axis=0)
     return ["lost" if np.isnan(rms) else f"{_short(rms)} / {_short(most)}" for rms, most in means]
 

@@ -1,11 +1,10 @@
-"""Whether the holder of one key can tell that other secrets lie in the file, on models that you have.
+"""Detection of other secrets by the holder of one key, on your own models.
 
     python benchmarks/holder.py bonsai=a.ply bonsai=b.ply fox=c.ply ...   # plain, of three scenes or more
 
-In each model one secret is hidden alone, and beside one to three others, as carried models and as sealed
-payloads. The holder opens his own, tries every cell of the file with his key
-(`tests/channels/quiet/holder.py`), and takes the statistics of `keyss.lab.stealth` besides. Detectors
-learn from all scenes but one.
+In each model, a secret is hidden alone and beside one to three others, as carried models and as encrypted
+payloads. The holder opens it, tries every cell of the file with the key (`tests/channels/quiet/holder.py`),
+and computes the statistics of `keyss.lab.stealth`. Detectors are cross-validated over scenes.
 """
 
 from __future__ import annotations
@@ -38,7 +37,7 @@ from lab.stealth.detectors import Examples, learned_detectors, single_detectors
 from methods.carry import carried
 
 MAX_OTHERS = 3
-SHARE = 8  # secrets are at most one such part of the cover's Gaussians
+SHARE = 8  # secrets have at most 1 / SHARE of the cover's Gaussians
 PAYLOAD_BYTES = (500, 3000)
 KINDS = ("carried", "sealed")
 SHOWN = 3  # single statistics in the table
@@ -49,7 +48,7 @@ class Job:
     index: int
     scene: str
     cover: str
-    others: tuple[str, ...]  # models to make secrets of
+    others: tuple[str, ...]  # models of the secrets
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -64,7 +63,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     ]
     started = time.monotonic()
     with ProcessPoolExecutor(options.workers, get_context("fork"), initializer=_one_thread) as pool:
-        results = list(pool.map(_seen, jobs))
+        results = list(pool.map(_count_or_skip, jobs))
     jobs, seen = zip(*[each for each in zip(jobs, results, strict=True) if each[1]], strict=True)
     print(f"{len(jobs)} models of {len({job.scene for job in jobs})} scenes, ", end="")
     print(f"{time.monotonic() - started:.0f} s\n")
@@ -87,19 +86,16 @@ def _one_thread() -> None:
     torch.set_num_threads(1)
 
 
-def _seen(job: Job) -> dict[tuple[str, int], dict[str, float]] | None:
-    """By kind, and alone (0) or beside others (1): what the holder of the first key counts.
-
-    None for a cover that is too small for several secrets.
-    """
+def _count_or_skip(job: Job) -> dict[tuple[str, int], dict[str, float]] | None:
+    """The first holder's statistics by kind, alone (0) or beside others (1); None for too small covers."""
     try:
-        return _counted(job)
+        return _count(job)
     except UsageError as error:
         print(f"{job.cover}: {error}", file=sys.stderr)
         return None
 
 
-def _counted(job: Job) -> dict[tuple[str, int], dict[str, float]]:
+def _count(job: Job) -> dict[tuple[str, int], dict[str, float]]:
     random = np.random.default_rng(job.index)
     cover = read_model(job.cover)
     secrets = [

@@ -1,15 +1,14 @@
-"""What carrying large models takes, from files to files: seconds, processor seconds, memory.
+"""Seconds, processor seconds and memory of carrying large models, from files to files.
 
     python benchmarks/large.py                                # 2 million in 2 million
     python benchmarks/large.py --count 100000 --repeat 3      # the fastest of three
     python benchmarks/large.py --secret-degree 0 --format spz --count 100000 --prune
     python benchmarks/large.py --commands                     # `keyss hide`, pictures and measures included
 
-Each step is a process of its own, key derivation, reading back what was hidden and imports included; kernels
-are compiled before. `floor` reads the bytes of the cover, hashes, enciphers and writes them; `copy` reads and
-writes a model; `least`, with `--commands`, is the part of `keyss hide` that is neither the tests of the cover
-nor encoding and embedding. Where other programs run beside it, look at processor seconds, and at their ratio
-to those of `floor`.
+Each step is a separate process and includes imports, key derivation and reading the secret back; kernels are
+compiled before. `floor` reads, hashes, encrypts and writes the bytes of the cover; `copy` reads and writes a
+model; `least`, with `--commands`, is `keyss hide` without tests of the cover, encoding and embedding. On a
+busy machine, look at processor seconds and their ratio to those of `floor`.
 """
 
 from __future__ import annotations
@@ -33,12 +32,12 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 from keyss import read_model, write_model
 from channels.quiet.trained_like import trained_like
 from keyss.channels import LOW_BITS, channel_for
-from keyss.methods import embed_models, most_visible, pruned, record_request
+from keyss.methods import embed_models, most_visible, prune_to_size, record_request
 from keyss.runs.revealing import reveal_model
 
 KEY = "the key of the benchmark: 7Vw3-Qp"
 STEPS = ("floor", "copy", "least", "hide", "reveal")
-# What the bytes of the cover take without any of ours: read, hashed, enciphered, written.
+# The cost without keyss: read, hash, encrypt and write the bytes of the cover.
 FLOOR = """
 import hashlib, os, sys
 from cryptography.hazmat.primitives.ciphers import Cipher, algorithms, modes
@@ -49,9 +48,8 @@ with open(f"{sys.argv[1]}/floor", "wb") as file:
     file.write(cipher.encryptor().update(data))
     os.fsync(file.fileno())
 """
-# What `keyss hide` would take if the tests of the cover, encoding and embedding took no time: both models are
-# read and hashed, keys derived under 12 salts, to resume, for randomness and to open again, the model is
-# written and read, and pictures of all are rendered.
+# `keyss hide` without tests of the cover, encoding and embedding: reads and hashes both models, derives keys
+# under 12 salts, for resuming, for randomness and for opening, writes and reads the model, and renders all.
 LEAST = """
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -69,28 +67,30 @@ identities(models[0])
 write_model(f"{folder}/least.ply", models[0])
 models[0] = read_model(f"{folder}/least.ply")
 for model, scene in zip(models, scenes):
-    hiding.show(model, model, scene, of_plain=True)
+    hiding.compare(model, model, scene, of_plain=True)
 """
 
 
 @dataclass(frozen=True)
 class Cost:
-    """Of one process."""
+    """The cost of one process."""
 
     seconds: float
-    processor: float  # seconds of all threads, those of the system included
-    gibibytes: float  # of memory, at most
+    processor: float  # seconds of all threads, system time included
+    gibibytes: float  # peak memory
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--count", type=int, default=2_000_000, help="Gaussians of the cover, of SH degree 3")
-    parser.add_argument("--share", type=float, default=1.0, help="Gaussians of the secret for each of these")
-    parser.add_argument("--secret-degree", type=int, default=3, help="of its spherical harmonics")
+    parser.add_argument(
+        "--share", type=float, default=1.0, help="Gaussians of the secret per Gaussian of the cover"
+    )
+    parser.add_argument("--secret-degree", type=int, default=3, help="SH degree of the secret")
     parser.add_argument("--format", default="ply", choices=["ply", "spz", "sog", "compressed-ply", "any"])
-    parser.add_argument("--prune", action="store_true", help="leave out what does not fit")
+    parser.add_argument("--prune", action="store_true", help="prune the secret to fit")
     parser.add_argument("--repeat", type=int, default=1, help="runs of each step; the fastest counts")
-    parser.add_argument("--commands", action="store_true", help="of the command line, with all that it does")
+    parser.add_argument("--commands", action="store_true", help="measure the command line")
     parser.add_argument("--step", nargs=2, metavar=("STEP", "FOLDER"), help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.step:
@@ -103,7 +103,7 @@ def main() -> None:
         small = folder / "small"
         small.mkdir()
         few = [*_arguments(options), "--count", "2000"]
-        for step in ("make", "copy", "hide", "reveal"):  # everything is compiled then
+        for step in ("make", "copy", "hide", "reveal"):  # compiles all kernels
             _run([sys.executable, __file__, "--step", step, str(small), *few])
         if options.commands:
             _run([sys.executable, "-c", LEAST, str(small)])
@@ -146,7 +146,7 @@ def _command(step: str, folder: Path, options: argparse.Namespace) -> list[str]:
 
 
 def _run(command: list[str]) -> Cost:
-    """Raises SystemExit where it fails."""
+    """Run a command. Raises SystemExit if it fails."""
     start = time.perf_counter()
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
     _, status, usage = os.wait4(process.pid, 0)
@@ -167,7 +167,7 @@ def _step(step: str, folder: Path, options: argparse.Namespace) -> None:
     elif step == "copy":
         write_model(folder / "copy.ply", read_model(folder / "cover.ply"))
     elif step == "hide":
-        with ThreadPoolExecutor(2) as readers:  # as `keyss hide` does
+        with ThreadPoolExecutor(2) as readers:  # `keyss hide` reads them like this
             cover, secret = readers.map(read_model, (folder / "cover.ply", folder / "secret.ply"))
         if options.format == "ply":
             prepared = LOW_BITS.prepare(cover)
@@ -180,7 +180,7 @@ def _step(step: str, folder: Path, options: argparse.Namespace) -> None:
             channel = channel_for("any") if any_format else channel_for("as-is", format=options.format)
             prepared = channel.prepare(cover)
             if options.prune:
-                secret = pruned(secret, prepared.room.capacity - prepared.room.overhead)
+                secret = prune_to_size(secret, prepared.room.capacity - prepared.room.overhead)
         write_model(published, embed_models(prepared, [KEY], [secret]).gaussians)
     else:
         revealed = reveal_model(read_model(published), KEY, device=torch.device("cpu")).gaussians

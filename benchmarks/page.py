@@ -1,13 +1,12 @@
-"""How long the viewer's page takes in headless Chromium without a GPU: the table of docs/viewer.md.
+"""Speed of the viewer's page in headless Chromium without a GPU: the table of docs/viewer.md.
 
     python benchmarks/page.py [--count 100000] [--runs 3]
     python benchmarks/page.py --pairs COVER.ply:SECRET.ply ... [--runs 4]  # times of right and wrong keys
 
-A model of so many Gaussians of SH degree 3, as large as those of models of as many are, that carries a secret
-of nine tenths as many of degree 0, served as by `keyss view`: seconds to the first picture and to all of it;
-frames per second while the camera turns; seconds from a key to the picture, wrong and right in turn; memory
-of the tab.
-Needs playwright (the `test` extra) and Chromium.
+A model of SH degree 3 with Gaussians of typical sizes, which carries a secret of 90 % as many Gaussians of
+degree 0, is served like by `keyss view`. Measures seconds to the first image and to the complete one; frames
+per second while the camera turns; seconds from a key to the image, alternating wrong and right keys; memory
+of the tab. Needs playwright (the `test` extra) and Chromium.
 """
 
 from __future__ import annotations
@@ -54,10 +53,10 @@ TURN = """() => new Promise((resolve) => {
 })"""
 
 
-def sized(count: int, seed: int) -> Gaussians:
-    """A model whose Gaussians are as large beside the whole as in downloaded models of 90,000 and 150,000.
+def sized_model(count: int, seed: int) -> Gaussians:
+    """A model with the relative sizes of downloaded models of 90,000 and 150,000 Gaussians.
 
-    Of those, in standard deviations of the positions: a median of 0.004 to 0.01, a tenth above 0.04 to 0.06.
+    In standard deviations of the positions: a median of 0.004 to 0.01, and 10 % above 0.04 to 0.06.
     """
     model = made(count, seed)
     generator = torch.Generator().manual_seed(seed)
@@ -66,8 +65,8 @@ def sized(count: int, seed: int) -> Gaussians:
 
 
 def server_of(count: int, folder: Path) -> ModelServer:
-    """Serves the page and a model that carries."""
-    cover, secret = sized(count, 0), sized(count * 9 // 10, 1).with_sh_degree(0)
+    """Serve the page and a stego model."""
+    cover, secret = sized_model(count, 0), sized_model(count * 9 // 10, 1).with_sh_degree(0)
     hidden = keyss.hide(
         cover, [keyss.Secret(secret, KEY)], method=CarryOptions(), width=32, min_psnr=0, out=folder / "run"
     )
@@ -78,7 +77,7 @@ def server_of(count: int, folder: Path) -> ModelServer:
 
 
 def memory(tab: Visit) -> float:
-    """MiB of JavaScript's heap and its buffers."""
+    """MiB of the JavaScript heap and its buffers."""
     client = tab.page.context.new_cdp_session(tab.page)
     client.send("HeapProfiler.collectGarbage")
     used = client.send("Runtime.getHeapUsage")
@@ -86,7 +85,7 @@ def memory(tab: Visit) -> float:
 
 
 def key_times(pairs: list[str], runs: int) -> None:
-    """For each pair the seconds of `runs` right and as many wrong keys, in random order."""
+    """Print seconds of `runs` right and wrong keys for each pair, in random order."""
     overlapping, order = 0, random.Random(0)
     with tempfile.TemporaryDirectory() as name, sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=PROGRAM, args=SWITCHES)

@@ -1,10 +1,10 @@
-"""What a hiding is worth after other people's programs converted it: the table of docs/channels.md.
+"""Quality of a hiding after conversion by third-party programs: the table of docs/channels.md.
 
     python benchmarks/publication.py RUN --key-file key.txt [--sog-iterations 10] [--only NAME ...]
 
-RUN: a folder of `keyss hide --publish any` with one secret. For each program and format the published model
-is converted, and so is the cover's plain model; the secret is revealed from the converted file alone. PSNR in
-dB against the test photos.
+RUN: a folder of `keyss hide --publish any` with one secret. Each program converts the published model and the
+cover's plain model to each format; the secret is revealed from the converted file. PSNR in dB against the
+test photos.
 
     pip install gsply
     npm install --no-save @playcanvas/splat-transform@2.7.1   (or KEYSS_SPLAT_TRANSFORM)
@@ -25,14 +25,14 @@ from keyss.runs.opening import HidingRun, open_run
 
 
 def row(run: HidingRun, name: str, converter: Converter | None) -> str:
-    """What one program's conversion leaves of cover and secret; None: as it was published."""
+    """Quality of cover and secret after one program's conversion; None: as published."""
     cover, secret = run.scenes(train_pictures=False)
     plain = run.plain_models()[0]
     if plain is None:
         raise SystemExit(f"{run.folder} has no plain model of its cover")
     stego, size, untouched = run.stego, 0, 0
     if converter is not None:
-        (stego, size), (plain, untouched) = _converted(converter, stego), _converted(converter, plain)
+        (stego, size), (plain, untouched) = _convert(converter, stego), _convert(converter, plain)
     try:
         revealed = f"{against_photos(reveal(stego, run.keys[0]).gaussians, secret):.2f}"
     except KeyssError as error:
@@ -42,12 +42,12 @@ def row(run: HidingRun, name: str, converter: Converter | None) -> str:
     return f"| {name} | {sizes} | {covers[0]:.2f} / {covers[1]:.2f} | {revealed} |"
 
 
-def _converted(converter: Converter, model: Gaussians) -> tuple[Gaussians, int]:
-    """A model after conversion and back, and the bytes of the converted file."""
+def _convert(converter: Converter, model: Gaussians) -> tuple[Gaussians, int]:
+    """Convert a model and back; also returns the bytes of the converted file."""
     with TemporaryDirectory() as folder:
         source = Path(folder) / "source.ply"
         write_model(source, model)
-        there, back = converter.there_and_back(source, Path(folder))
+        there, back = converter.round_trip(source, Path(folder))
         return read_model(back), there.stat().st_size
 
 

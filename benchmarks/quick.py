@@ -1,14 +1,13 @@
-"""Whether something got slower, in under two minutes: `make benchmark-check`, `make benchmark-baseline`.
+"""Detect slowdowns in under two minutes: `make benchmark-check`, `make benchmark-baseline`.
 
     python benchmarks/quick.py             # measure and write the record of this commit
-    python benchmarks/quick.py --check     # compare with the baseline; exit status 1 where it is slower
+    python benchmarks/quick.py --check     # compare with the baseline; exit status 1 if slower
     python benchmarks/quick.py --baseline  # the record becomes the baseline
 
-Every part takes turns with a fixed workload on one thread: a product of matrices for what computes with
-floats, AES and BLAKE2b over 32 MiB for what encrypts. The fastest round of each counts, in time of the
-processor and not of the clock. Ratios are compared, so that a slower or busier machine shows nearly the same.
-They still differ between kinds of processors (another width of vectors): store a baseline of your own before
-you change something, or believe only large changes.
+Every part alternates with a fixed workload on one thread: matrix products for floating-point parts, AES and
+BLAKE2b over 32 MiB for encryption. The fastest round of each counts, in processor time. Ratios hardly depend
+on the speed and load of the machine, but differ between types of processors (vector widths): store your own
+baseline before a change, or trust only large differences.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ from keyss.fitting.losses import Target, photometric_loss
 from keyss.fitting.parameters import make_optimizers, to_gaussians, to_parameters
 from keyss.rendering import render
 from methods.carry.carried import embed, extract
-from rasterizer import camera_before, made_up
+from rasterizer import camera_before, synthetic_model
 
 import numpy as np
 import torch
@@ -39,9 +38,9 @@ from cryptography.hazmat.primitives.ciphers.modes import CTR
 from threadpoolctl import threadpool_limits
 
 BASELINE = RESULTS / "quick" / "baseline.json"
-TOLERANCE = 0.5  # share by which a ratio may grow; it grew by up to 0.4 when five others used the machine
-WIDTH, HEIGHT, COUNT = 400, 266, 50_000  # of what is drawn
-CARRIED = 20_000  # Gaussians, in as many
+TOLERANCE = 0.5  # share by which a ratio may grow; it grew by up to 0.4 on a busy machine
+WIDTH, HEIGHT, COUNT = 400, 266, 50_000  # workload of the renderer
+CARRIED = 20_000  # Gaussians of cover and secret
 KEY = "the key of the benchmark"
 
 Part = Callable[[], object]
@@ -78,12 +77,12 @@ def main() -> int:
 
 
 def over(workload: str, seconds: dict[str, float]) -> dict[str, float]:
-    """Each part's time over that of the fixed workload."""
+    """Each part's time / time of the fixed workload."""
     return {f"{name} / {workload}": seconds[name] / seconds[workload] for name in seconds if name != workload}
 
 
 def fastest(parts: dict[str, Part], rounds: int) -> dict[str, float]:
-    """Processor seconds of each part's fastest round. They take turns, and the first round does not count."""
+    """Processor seconds of each part's fastest round. Parts alternate; the first round does not count."""
     best = dict.fromkeys(parts, float("inf"))
     for repeat in range(rounds + 1):
         for name, part in parts.items():
@@ -113,7 +112,7 @@ def encryption() -> Part:
 
 def drawing_parts() -> dict[str, Part]:
     """The rasterizer forward and backward, the loss with its gradient, and a whole training step."""
-    gaussians = made_up(COUNT)
+    gaussians = synthetic_model(COUNT)
     camera = camera_before(gaussians.means, WIDTH, HEIGHT)
     config = FitConfig()
     with torch.no_grad():

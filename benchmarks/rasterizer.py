@@ -1,7 +1,7 @@
-"""How fast the CPU rasterizer is: `make benchmark-rasterizer`, or `python benchmarks/rasterizer.py --help`.
+"""Speed of the CPU rasterizer: `make benchmark-rasterizer`, or `python benchmarks/rasterizer.py --help`.
 
-Each case runs in a process of its own, so that its peak memory can be told. Times are wall time of
-repeats that follow a warm-up; the smallest says what the code needs, the median what this machine gave.
+Each case runs in a separate process, to measure its peak memory. Times are wall times after a warm-up; the
+minimum shows the cost of the code, the median that on this machine.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from rendering.dense_reference import dense_rasterization  # noqa: E402
 
 @dataclass(frozen=True, kw_only=True)
 class Case:
-    """What is drawn: made-up Gaussians, or those of a file."""
+    """The scene to render: synthetic Gaussians, or those of a file."""
 
     name: str
     width: int
@@ -49,19 +49,19 @@ class Case:
         if self.file is not None:
             gaussians = read_model(self.file)
             return gaussians, camera_before(gaussians.means, self.width, self.height)
-        gaussians = made_up(self.count)
+        gaussians = synthetic_model(self.count)
         return gaussians, camera_before(gaussians.means, self.width, self.height)
 
 
 CASES = (
-    Case(name="50k made up", width=400, height=266, count=50_000),
-    Case(name="200k made up", width=780, height=520, count=200_000),
+    Case(name="50k synthetic", width=400, height=266, count=50_000),
+    Case(name="200k synthetic", width=780, height=520, count=200_000),
 )
-LARGE = Case(name="1M made up", width=1600, height=1066, count=1_000_000)
+LARGE = Case(name="1M synthetic", width=1600, height=1066, count=1_000_000)
 
 
-def made_up(count: int) -> Gaussians:
-    """A cloud of Gaussians of SH degree 3 whose sizes shrink with their number, as in fitted scenes."""
+def synthetic_model(count: int) -> Gaussians:
+    """A cloud of Gaussians of SH degree 3 whose sizes shrink with their number, like in fitted scenes."""
     generator = torch.Generator().manual_seed(0)
 
     def normal(*shape: int) -> Tensor:
@@ -77,7 +77,7 @@ def made_up(count: int) -> Gaussians:
 
 
 def camera_before(means: Tensor, width: int, height: int) -> Camera:
-    """A camera that sees most of the Gaussians: four spreads before their middle."""
+    """A camera that sees most of the Gaussians, four spreads in front of their middle."""
     middle = means.median(0).values
     spread = (means - middle).abs().median(0).values.max() / 0.6745
     viewmat = torch.eye(4)
@@ -88,8 +88,8 @@ def camera_before(means: Tensor, width: int, height: int) -> Camera:
 
 
 def load_kernels() -> None:
-    """Draw a few Gaussians, forward and backward."""
-    gaussians = made_up(10).map(lambda tensor: tensor.requires_grad_())
+    """Render a few Gaussians, forward and backward, to load the kernels."""
+    gaussians = synthetic_model(10).map(lambda tensor: tensor.requires_grad_())
     render(gaussians, camera_before(gaussians.means.detach(), 8, 8)).sum().backward()
 
 
@@ -116,7 +116,7 @@ class Times:
 def measure_rasterizer(case: Case, threads: int, repeats: int) -> list[str]:
     """One row of the first table."""
     torch.set_num_threads(threads)
-    load_kernels()  # takes memory that is not counted
+    load_kernels()  # its memory does not count
     gaussians, camera = case.scene()
     tensors = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh)
     leaves = [tensor.detach().requires_grad_() for tensor in tensors]
@@ -154,7 +154,7 @@ def measure_rasterizer(case: Case, threads: int, repeats: int) -> list[str]:
 
 
 def measure_step(case: Case, threads: int, repeats: int) -> list[str]:
-    """One row of the second table: what a training step costs beside the rasterizer."""
+    """One row of the second table: the cost of a training step relative to the rasterizer."""
     torch.set_num_threads(threads)
     gaussians, camera = case.scene()
     config = FitConfig()
@@ -201,10 +201,10 @@ def measure_step(case: Case, threads: int, repeats: int) -> list[str]:
 
 
 def measure_against_torch(threads: int, repeats: int) -> list[str]:
-    """One row of the third table: plain torch, every Gaussian at every pixel, on a scene it can hold."""
+    """One row of the third table: plain torch, all Gaussians at all pixels, on a small scene."""
     torch.set_num_threads(threads)
     count, width, height = 1000, 64, 48
-    gaussians = made_up(count)
+    gaussians = synthetic_model(count)
     camera = camera_before(gaussians.means, width, height)
     weights = torch.randn(height, width, 3, generator=torch.Generator().manual_seed(1))
     tensors = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh)
@@ -229,7 +229,7 @@ def measure_against_torch(threads: int, repeats: int) -> list[str]:
         rows.append((forward.best, backward.best))
     (dense_forward, dense_backward), (forward_ms, backward_ms) = rows
     return [
-        f"{count} made up, {width}x{height}",
+        f"{count} synthetic, {width}x{height}",
         str(threads),
         f"{dense_forward:.1f}",
         f"{dense_backward:.1f}",
@@ -241,7 +241,7 @@ def measure_against_torch(threads: int, repeats: int) -> list[str]:
 
 
 def _memory() -> int:
-    """Bytes of memory in use by this process now; the peak so far where the system does not tell."""
+    """Bytes of memory in use by this process; the peak so far on systems that do not report it."""
     try:
         pages = int(Path("/proc/self/statm").read_text().split()[1])
     except OSError:
@@ -250,7 +250,7 @@ def _memory() -> int:
 
 
 def table(titles: list[str], rows: list[list[str]]) -> str:
-    """As Markdown, in columns that line up."""
+    """An aligned Markdown table."""
     cells = [titles, *rows]
     widths = [max(len(row[i]) for row in cells) for i in range(len(titles))]
     lines = [f"| {' | '.join(c.ljust(w) for c, w in zip(row, widths, strict=True))} |" for row in cells]
@@ -276,7 +276,7 @@ def main() -> None:
 
     context = multiprocessing.get_context("spawn")
 
-    def alone(measurement: Callable[..., list[str]], *arguments: object) -> list[str]:
+    def run_alone(measurement: Callable[..., list[str]], *arguments: object) -> list[str]:
         with context.Pool(1) as pool:
             return pool.apply(measurement, arguments)
 
@@ -285,17 +285,17 @@ def main() -> None:
     tables = [
         (
             ["scene, SH 3", "threads", "forward only", "forward", "backward", "peak MiB"],
-            [alone(measure_rasterizer, case, threads, n) for case, threads in pairs],
+            [run_alone(measure_rasterizer, case, threads, n) for case, threads in pairs],
         ),
         (
             ["training step", "threads", "rasterizer alone", "render", "loss", "backward", "optimiser",
              "step", "step / rasterizer"],
-            [alone(measure_step, case, threads, n) for case, threads in pairs],
+            [run_alone(measure_step, case, threads, n) for case, threads in pairs],
         ),
         (
             ["plain torch", "threads", "its forward", "its backward", "our forward", "our backward",
              "forward, times faster", "backward, times faster"],
-            [alone(measure_against_torch, threads, n) for threads in options.threads],
+            [run_alone(measure_against_torch, threads, n) for threads in options.threads],
         ),
     ]  # fmt: skip
     heading = (

@@ -1,12 +1,12 @@
-"""Short fits with large rates against 3DGS's rates: PSNR on test photos and processor time of training.
+"""Short fits with boosted rates against 3DGS's rates: PSNR on test photos, and processor time of training.
 
     python benchmarks/recipe.py ../shared/data                      # the default of 1,000 steps against 3,000
     python benchmarks/recipe.py ../shared/data --steps 500 --against 1000 --gaussians 10000 --width 200
 
 Scenes are the folders of photos in DATA, and rings of cameras around the models in DATA/splats; all of them
 also in hard variants (`VARIANTS`): cropped to the other orientation, in other units, with few photos, without
-points, with one photo of noise, from too near, from far with a narrow field of view. Every row is kept in the
-file given by `--results`, so that a run that was stopped resumes. Runs with one thread.
+points, with one photo of noise, from too near, from far with a narrow field of view. Rows are saved in the
+file `--results`, from which an interrupted run resumes. Runs with one thread.
 """
 
 from __future__ import annotations
@@ -61,10 +61,10 @@ def main() -> None:
                 continue
             scene, common = load(), {"max_gaussians": options.gaussians, "seed": seed}
             if not compiled:
-                fitted(scene, FitConfig(iterations=50, **common))
+                fit_and_score(scene, FitConfig(iterations=50, **common))
                 compiled = True
-            ours, seconds = fitted(scene, FitConfig(iterations=options.steps, **common))
-            theirs, before = fitted(scene, FitConfig(iterations=options.against, **common, **THREEDGS))
+            ours, seconds = fit_and_score(scene, FitConfig(iterations=options.steps, **common))
+            theirs, before = fit_and_score(scene, FitConfig(iterations=options.against, **common, **THREEDGS))
             found = {"psnr": ours, "3dgs": theirs, "gain": ours - theirs, "time": seconds / before}
             rows.append(wanted | {key: round(value, 3) for key, value in found.items()})
             options.results.write_text(json.dumps(rows, indent=1) + "\n")
@@ -80,7 +80,7 @@ def main() -> None:
 
 
 def by_seed(rows: list[dict[str, Any]]) -> None:
-    """Print what seeds alone change: means of scenes, and 3DGS's rates against themselves."""
+    """Print the effect of seeds: means of scenes, and 3DGS's rates against themselves."""
     every = [[row for row in rows if row["scene"] == name] for name in sorted({row["scene"] for row in rows})]
     means = [(mean(row["gain"] for row in own), own[0]["scene"]) for own in every]
     print(f"lowest mean of a scene: {min(means)[0]:+.2f} dB ({min(means)[1]})")
@@ -89,7 +89,7 @@ def by_seed(rows: list[dict[str, Any]]) -> None:
     print(f"more than 1 dB below: {ours} of {len(rows)}; 3DGS's with another seed {below} of {len(pairs)}")
 
 
-def fitted(scene: Scene, config: FitConfig) -> tuple[float, float]:
+def fit_and_score(scene: Scene, config: FitConfig) -> tuple[float, float]:
     """PSNR on the test photos, and processor seconds of training."""
     run = PlainRun(scene, config, torch.device("cpu"))
     started = time.process_time()
@@ -102,7 +102,7 @@ def fitted(scene: Scene, config: FitConfig) -> tuple[float, float]:
 
 
 def scenes(data: Path, width: int) -> dict[str, Callable[[], Scene]]:
-    """What loads each scene, by name."""
+    """Functions that load each scene, by name."""
     found: dict[str, Callable[[], Scene]] = {}
     for folder in sorted(each for each in data.iterdir() if each.is_dir()):
         if any((folder / name).exists() for name in ("sparse", "transforms_train.json", "transforms.json")):
@@ -122,7 +122,7 @@ def on_views(scene: Scene, change: Callable[[View], View]) -> Scene:
     return replace(scene, train=tuple(map(change, scene.train)), test=tuple(map(change, scene.test)))
 
 
-def scaled(scene: Scene, factor: float) -> Scene:
+def scale(scene: Scene, factor: float) -> Scene:
     """The scene in other units of length."""
 
     def moved(view: View) -> View:
@@ -133,7 +133,7 @@ def scaled(scene: Scene, factor: float) -> Scene:
     return replace(on_views(scene, moved), points=scene.points * factor)
 
 
-def cropped(scene: Scene) -> Scene:
+def crop(scene: Scene) -> Scene:
     """The middle half of the photos along their longer side."""
 
     def half(view: View) -> View:
@@ -147,7 +147,7 @@ def cropped(scene: Scene) -> Scene:
     return on_views(scene, half)
 
 
-def few(scene: Scene, count: int = 20) -> Scene:
+def keep_photos(scene: Scene, count: int = 20) -> Scene:
     return replace(scene, train=scene.train[:: max(1, len(scene.train) // count)][:count])
 
 
@@ -157,7 +157,7 @@ def with_points(scene: Scene, count: int) -> Scene:
 
 
 def with_noise(scene: Scene) -> Scene:
-    """One photo is noise."""
+    """Replace one photo by noise."""
     train, middle = list(scene.train), len(scene.train) // 2
     size, generator = train[middle].image.shape, torch.Generator().manual_seed(2)
     noise = torch.randint(0, 256, size, generator=generator, dtype=torch.uint8)
@@ -167,10 +167,10 @@ def with_noise(scene: Scene) -> Scene:
 
 VARIANTS: dict[str, Callable[[Scene], Scene]] = {
     "as it is": lambda scene: scene,
-    "cropped": cropped,
-    "1,000 times larger": lambda scene: scaled(scene, 1000.0),
-    "20 times smaller": lambda scene: scaled(scene, 0.05),
-    "20 photos": few,
+    "cropped": crop,
+    "1,000 times larger": lambda scene: scale(scene, 1000.0),
+    "20 times smaller": lambda scene: scale(scene, 0.05),
+    "20 photos": keep_photos,
     "one photo of noise": with_noise,
     "300 points": lambda scene: with_points(scene, 300),
     "no points": lambda scene: with_points(scene, 0),

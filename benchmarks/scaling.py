@@ -1,11 +1,11 @@
-"""What work takes as it grows: measured sizes, a model fitted to them, and a size four times as large.
+"""Scaling of run times: measured sizes, a model fitted to them, and its prediction for a larger size.
 
     python benchmarks/scaling.py                # some minutes on 2 cores
-    python benchmarks/scaling.py --only step    # of one kind of work
+    python benchmarks/scaling.py --only step    # one kind of work
 
-The model is a sum of costs that are not negative: of a call, of each Gaussian, pixel, secret or photo, by
-non-negative least squares of relative errors. `predicted` is what it says of the largest size, which it was
-not fitted to, four times as large as any of those in everything that grows.
+The model is a sum of nonnegative costs per call, Gaussian, pixel, secret or photo, by nonnegative least
+squares of relative errors. `predicted` is its value at a held-out size, four times as large in everything
+that grows.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from keyss.fitting.parameters import make_optimizers, to_gaussians, to_parameter
 from keyss.methods import embed_models
 from keyss.rendering import render
 from keyss.runs.revealing import reveal_model
-from rasterizer import camera_before, load_kernels, made_up
+from rasterizer import camera_before, load_kernels, synthetic_model
 
 import numpy as np
 import torch
@@ -40,17 +40,17 @@ Size = dict[str, float]
 
 @dataclass(frozen=True)
 class Work:
-    """A kind of work, the sizes it is measured at, and what grows with them."""
+    """A kind of work, its sizes, and the terms of its cost."""
 
     name: str
-    terms: tuple[str, ...]  # of a size; a constant is always there
+    terms: tuple[str, ...]  # terms computed from a size; a constant is always added
     sizes: tuple[Size, ...]
     larger: Size  # four times the largest
     seconds: Callable[[Size], float]
 
 
 def best_of(repeats: int, call: Callable[[], object]) -> float:
-    """Seconds of the fastest, after one that is not counted."""
+    """Seconds of the fastest of `repeats` calls, after a warm-up."""
     times = []
     for _ in range(repeats + 1):
         start = time.perf_counter()
@@ -62,7 +62,7 @@ def best_of(repeats: int, call: Callable[[], object]) -> float:
 def step_seconds(size: Size) -> float:
     """A training step: render, loss, backward, Adam."""
     torch.set_num_threads(int(size.get("threads", torch.get_num_threads())))
-    model = made_up(int(size["Gaussian"]))
+    model = synthetic_model(int(size["Gaussian"]))
     width = round((size["pixel"] * 1.5) ** 0.5)
     camera = camera_before(model.means, width, round(size["pixel"] / width))
     with torch.no_grad():
@@ -81,27 +81,27 @@ def step_seconds(size: Size) -> float:
 
 def picture_seconds(size: Size) -> float:
     """A picture without gradients."""
-    model = made_up(int(size["Gaussian"]))
+    model = synthetic_model(int(size["Gaussian"]))
     width = round((size["pixel"] * 1.5) ** 0.5)
     camera = camera_before(model.means, width, round(size["pixel"] / width))
     with torch.no_grad():
         return best_of(5, lambda: render(model, camera))
 
 
-def trained(count: int, seed: int) -> Gaussians:
-    """Made up, with low bits that look trained."""
+def trained_like(count: int, seed: int) -> Gaussians:
+    """A synthetic model with low bits that look trained."""
     generator = torch.Generator().manual_seed(seed)
-    model = made_up(count)
+    model = synthetic_model(count)
     return model.map(lambda each: each * (1 + 1e-3 * torch.randn(each.shape, generator=generator)))
 
 
 def carry_seconds(size: Size) -> float:
-    """From files to a file: secrets of a tenth of the cover, all together, are carried, and opened again."""
+    """Carry secrets, in total a tenth of the cover, from files to a file, and open them again."""
     count, secrets = int(size["Gaussian"]), int(size.get("secret", 1))
     with tempfile.TemporaryDirectory() as name:
         cover, secret = Path(name) / "cover.ply", Path(name) / "secret.ply"
-        write_model(cover, trained(count, 0))
-        write_model(secret, trained(int(size.get("each", count)), 1))
+        write_model(cover, trained_like(count, 0))
+        write_model(secret, trained_like(int(size.get("each", count)), 1))
         keys = [f"key {number} of the benchmark, 9fK2" for number in range(secrets)]
 
         def carry() -> None:
@@ -113,12 +113,12 @@ def carry_seconds(size: Size) -> float:
 
 
 def reveal_seconds(size: Size) -> float:
-    """From file to file."""
+    """Reveal from file to file."""
     count = int(size["Gaussian"])
     with tempfile.TemporaryDirectory() as name:
         key, stego = "the key of the benchmark, 9fK2", Path(name) / "stego.ply"
-        hidden = trained(count, 1)
-        prepared = LOW_BITS.prepare(trained(count, 0))
+        hidden = trained_like(count, 1)
+        prepared = LOW_BITS.prepare(trained_like(count, 0))
         write_model(stego, embed_models(prepared, [key], [hidden[:count]]).gaussians)
 
         def reveal() -> None:
@@ -129,7 +129,7 @@ def reveal_seconds(size: Size) -> float:
 
 
 def photo_seconds(size: Size) -> float:
-    """Reading JPEG photos, as scenes do."""
+    """Read JPEG photos like scenes."""
     count, pixels = int(size["photo"]), int(size["pixel"])
     width = round((pixels * 1.5) ** 0.5)
     with tempfile.TemporaryDirectory() as name:
@@ -145,7 +145,7 @@ COUNTS = (10_000.0, 40_000.0, 160_000.0)
 DRAWN = tuple({"Gaussian": gaussians, "pixel": pixels} for gaussians in COUNTS for pixels in COUNTS)
 LARGER = {"Gaussian": 640_000.0, "pixel": 640_000.0}
 MODELS = tuple({"Gaussian": float(count)} for count in (50_000, 100_000, 200_000, 400_000))
-COUNTED = {"secret", "photo"}  # one by one, all else in millions
+COUNTED = {"secret", "photo"}  # units of one; other terms are in millions
 WORKS = (
     Work("step", ("Gaussian", "pixel"), DRAWN, LARGER, step_seconds),
     Work("picture", ("Gaussian", "pixel"), DRAWN, LARGER, picture_seconds),
@@ -172,15 +172,15 @@ WORKS = (
 )
 
 
-def fitted(sizes: list[Size], terms: tuple[str, ...], seconds: list[float]) -> dict[str, float]:
-    """Seconds of a call, and for each unit of the terms; none is negative."""
+def fit_costs(sizes: list[Size], terms: tuple[str, ...], seconds: list[float]) -> dict[str, float]:
+    """Nonnegative seconds per call and per unit of each term."""
     rows = np.array([[1.0, *(size[term] for term in terms)] for size in sizes]) / np.array(seconds)[:, None]
     scale = rows.max(0)
     found, _ = nnls(rows / scale, np.ones(len(sizes)))
     return dict(zip(("a call", *terms), found / scale, strict=True))
 
 
-def predicted(costs: dict[str, float], size: Size) -> float:
+def predict(costs: dict[str, float], size: Size) -> float:
     return sum(cost * size.get(term, 1.0) for term, cost in costs.items())
 
 
@@ -200,10 +200,10 @@ def main() -> None:
         if options.only and work.name not in options.only:
             continue
         seconds = [work.seconds(size) for size in work.sizes]
-        costs = fitted(list(work.sizes), work.terms, seconds)
+        costs = fit_costs(list(work.sizes), work.terms, seconds)
         pairs = zip(work.sizes, seconds, strict=True)
-        misfit = max(abs(predicted(costs, size) / took - 1) for size, took in pairs)
-        expected, took = predicted(costs, work.larger), work.seconds(work.larger)
+        misfit = max(abs(predict(costs, size) / took - 1) for size, took in pairs)
+        expected, took = predict(costs, work.larger), work.seconds(work.larger)
         parts = [f"{costs['a call']:.3g} a call"]
         for term in work.terms:
             unit, cost = (term, costs[term]) if term in COUNTED else (f"million {term}", 1e6 * costs[term])

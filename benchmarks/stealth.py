@@ -1,14 +1,14 @@
-"""How well the attacks of `keyss.lab.stealth` tell files that hide something, on models that you have.
+"""Detection of hidden content by the attacks of `keyss.lab.stealth`, on your own models.
 
     python benchmarks/stealth.py bonsai=a.ply bonsai=b.ply fox=c.ply ...  # plain, of three scenes or more
     python benchmarks/stealth.py ... --refitted bonsai=stego.ply:secret.ply  # stego files, secrets' models
-    python benchmarks/stealth.py --pairs bonsai=plain.ply:stego.ply ...     # files made by something else
-    python benchmarks/stealth.py ... --rounded   # models as trainers leave them that round steps
+    python benchmarks/stealth.py --pairs bonsai=plain.ply:stego.ply ...     # given files
+    python benchmarks/stealth.py ... --rounded   # models like those of trainers that round steps
     python benchmarks/stealth.py ... --quick     # two random parts of each model, no predictor, no candidates
 
-From each plain model are made a carried one, which holds as much of a model of the next scene as fits, and
-one with a sealed payload. Statistics are taken of whole models and of parts of 2,000 to 5,000 Gaussians,
-random ones and pieces of space. Detectors learn from all scenes but one and are tried on that one.
+Each plain model is made to carry as much of a model of the next scene as fits, and to hold an encrypted
+payload. Statistics are computed for complete models and for parts of 2,000 to 5,000 Gaussians, random ones
+and pieces of space. Detectors are cross-validated over scenes.
 """
 
 from __future__ import annotations
@@ -48,16 +48,16 @@ from methods.carry import carried
 
 PART_SIZES = (2000, 5000)
 PAYLOAD_BYTES = 4000
-TRAINING_ROWS, MAX_TRAINED_ON = 20_000, 20  # of the predictor
+TRAINING_ROWS, MAX_TRAINED_ON = 20_000, 20  # limits for the predictor
 CANDIDATES = 24
 SHOWN = 8  # single statistics in the table
 
 
 @dataclass(frozen=True)
 class File:
-    """One file to be judged; `pair` names the plain model that it was made from."""
+    """One file to judge; `pair` names the plain model from which it was made."""
 
-    kind: str  # "plain", "carried", "sealed", "refitted" or "given"
+    kind: str  # "plain", "carried", "sealed" (encrypted payload), "refitted" or "given"
     scene: str
     pair: str
     model: Gaussians
@@ -66,7 +66,7 @@ class File:
 
 @dataclass(frozen=True)
 class Job:
-    """A plain model and what is to be made of it."""
+    """A plain model and the files to make from it."""
 
     index: int
     scene: str
@@ -82,13 +82,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     with ProcessPoolExecutor(options.workers, get_context("fork"), initializer=_one_thread) as pool:
         files = [file for made in pool.map(_make, _jobs(options)) for file in made]
         print(f"{len(files)} files after {time.monotonic() - started:.0f} s", file=sys.stderr)
-        for scene, path, secret in map(_named, options.refitted):
+        for scene, path, secret in map(_parse_named, options.refitted):
             files.append(File("refitted", scene, path, read_model(path), secret))
         pieces = [(file, name, piece) for file in files for name, piece in _pieces(file, options.quick)]
         rows = list(pool.map(_statistics, [piece for _, _, piece in pieces], chunksize=4))
         print(f"{len(rows)} pieces after {time.monotonic() - started:.0f} s", file=sys.stderr)
         if not options.quick:
-            for row, more in zip(rows, _predicted(pool, files, pieces), strict=True):
+            for row, more in zip(rows, _predict(pool, files, pieces), strict=True):
                 row |= more
             print(f"predicted after {time.monotonic() - started:.0f} s", file=sys.stderr)
         found = _detections(files, pieces, rows)
@@ -118,21 +118,21 @@ def _arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
     return parser.parse_args(arguments)
 
 
-def _named(text: str) -> tuple[str, str, str]:
-    """Scene, file, and the file after a colon."""
+def _parse_named(text: str) -> tuple[str, str, str]:
+    """Parse scene, file, and the file after a colon."""
     scene, _, paths = text.partition("=")
     first, _, second = paths.partition(":")
     return scene, first, second
 
 
 def _jobs(options: argparse.Namespace) -> list[Job]:
-    plain = [_named(text)[:2] for text in options.plain]
+    plain = [_parse_named(text)[:2] for text in options.plain]
     jobs = []
     for index, (scene, path) in enumerate(plain):
         others = [each for named, each in plain if named != scene]
-        # The secret: of another scene, and each time another model as far as there are some.
+        # The secret is of another scene, and a different model each time if there are enough.
         jobs.append(Job(index, scene, path, others[(7 * index + 3) % len(others)], options.rounded))
-    pairs = [_named(text) for text in options.pairs]
+    pairs = [_parse_named(text) for text in options.pairs]
     return jobs + [
         Job(len(plain) + index, scene, path, "", False, given)
         for index, (scene, path, given) in enumerate(pairs)
@@ -144,7 +144,7 @@ def _one_thread() -> None:
 
 
 def _make(job: Job) -> list[File]:
-    """The plain model, and what something is hidden in."""
+    """The plain model, and files that hide something."""
     cover = read_model(job.path)
     if job.given:
         return [
@@ -165,9 +165,9 @@ def _make(job: Job) -> list[File]:
 
 
 def _pieces(file: File, quick: bool) -> Iterable[tuple[str, Gaussians]]:
-    """The whole model and disjoint parts of it, two to four, the same ones of all files of one pair.
+    """The model and two to four disjoint parts of it, equal for all files of a pair.
 
-    With `quick`, of the parts only the first two random ones.
+    `quick`: only the first two random parts.
     """
     yield "whole", file.model
     count = len(file.model)
@@ -188,10 +188,10 @@ def _statistics(piece: Gaussians) -> dict[str, float]:
     return {name: each.value for name, each in stealth_statistics(piece).items()}
 
 
-def _predicted(
+def _predict(
     pool: ProcessPoolExecutor, files: Sequence[File], pieces: Sequence[tuple[File, str, Gaussians]]
 ) -> list[dict[str, float]]:
-    """Of each piece, what trees that learned from plain models of the other scenes say of its bits."""
+    """Statistics of each piece's bits, predicted by trees trained on plain models of the other scenes."""
     plain = [file for file in files if file.kind == "plain"]
     samples = list(pool.map(_sample, [file.model for file in plain], chunksize=2))
     found: list[dict[str, float]] = [{} for _ in pieces]
@@ -199,7 +199,7 @@ def _predicted(
         others = [each for file, each in zip(plain, samples, strict=True) if file.scene != scene]
         predictor = BitPredictor.of_samples(others[:: -(-len(others) // MAX_TRAINED_ON)])
         own = [index for index, (file, _, _) in enumerate(pieces) if file.scene == scene]
-        judge: Callable[[Gaussians], dict[str, float]] = partial(_judged, predictor)
+        judge: Callable[[Gaussians], dict[str, float]] = partial(_predictor_statistics, predictor)
         for index, row in zip(
             own, pool.map(judge, [pieces[each][2] for each in own], chunksize=4), strict=True
         ):
@@ -211,7 +211,7 @@ def _sample(model: Gaussians) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.i
     return sample(model, TRAINING_ROWS, 0)
 
 
-def _judged(predictor: BitPredictor, piece: Gaussians) -> dict[str, float]:
+def _predictor_statistics(predictor: BitPredictor, piece: Gaussians) -> dict[str, float]:
     from threadpoolctl import threadpool_limits
 
     with threadpool_limits(1, "openmp"):
@@ -221,7 +221,7 @@ def _judged(predictor: BitPredictor, piece: Gaussians) -> dict[str, float]:
 def _detections(
     files: Sequence[File], pieces: Sequence[tuple[File, str, Gaussians]], rows: Sequence[dict[str, float]]
 ) -> dict[str, dict[str, Any]]:
-    """By kind and piece: the worst statistics, what chance makes of the worst, and classifiers."""
+    """By kind and piece: the best detectors, the maximum expected by chance, and classifiers."""
     found = {}
     for kind in dict.fromkeys(file.kind for file in files if file.kind != "plain"):
         for piece in ("whole", "random", "space"):
@@ -254,7 +254,7 @@ def _detections(
 
 
 def _confirmations(pool: ProcessPoolExecutor, files: Sequence[File]) -> dict[str, dict[str, float]]:
-    """By kind and score, how often the true candidate is ranked above another one."""
+    """By kind and score: probability that the true candidate ranks above another one."""
     found = {}
     for kind in ("carried", "refitted"):
         own = [file for file in files if file.kind == kind and file.secret]

@@ -1,11 +1,10 @@
-"""What survives what, for each channel: the table of docs/formats.md.
+"""Robustness of each channel against each change: the table of docs/formats.md.
 
     python benchmarks/survival.py MODEL.ply [--bytes N] [--gaussians N] [--photos FOLDER] [--width PIXELS]
 
-A file of random bytes is hidden in the model as it is, in a `.ply` (low bits) and an `.spz` (codes), and for
-`--publish any` (colours and appended Gaussians). After each change it is looked for with its key. With
-`--photos` the model, of that scene, is trained on as well. Keys skip Argon2id, which has nothing to do with
-what is measured.
+A file of random bytes is hidden in a `.ply` (low bits) and an `.spz` (codes), and for `--publish any`
+(colours and appended Gaussians). After each change, its key is tried. With `--photos` of its scene, the model
+is also fine-tuned. Keys skip Argon2id, which does not affect the result.
 
 pip install gsply npm install --no-save @playcanvas/splat-transform@2.7.1   (or KEYSS_SPLAT_TRANSFORM)
 """
@@ -39,7 +38,7 @@ CHANNELS: dict[str, dict[str, Any]] = {
 OWN = (".ply", ".spz", ".sog", ".compressed.ply", ".glb", ".splat")
 
 
-def _by_keyss(suffix: str) -> Change:
+def _convert_by_keyss(suffix: str) -> Change:
     def change(model: Gaussians) -> Gaussians:
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / f"converted{suffix}"
@@ -50,7 +49,7 @@ def _by_keyss(suffix: str) -> Change:
 
 
 def survives(model: Gaussians, data: bytes, change: Change) -> str:
-    """A word for what the key opens after a change."""
+    """A word for the result of opening after a change."""
     try:
         changed = change(model)
     except BackendError as error:
@@ -87,7 +86,7 @@ def main() -> None:
     print("| cost (dB) | " + " | ".join(f"{each.psnr:.0f}" for each in made.values()) + " |")
     more = " | ".join(f"{len(each.stego) - len(model):,}" for each in made.values())
     print(f"| Gaussians added | {more} |", flush=True)
-    own = {f"`{suffix}` by keyss": _by_keyss(suffix) for suffix in OWN}
+    own = {f"`{suffix}` by keyss": _convert_by_keyss(suffix) for suffix in OWN}
     every = {"passed on as it is": lambda model: model, **own, **FORMATS, **OTHERS}
     if asked.photos:
         photos = load_scene(asked.photos, width=asked.width)

@@ -16,9 +16,9 @@ REACH = 0.1  # world units
 class BoundedDecoder(Decoder):
     """The paper's decoder with bounded residuals of positions (equation 8)."""
 
-    def updated(self, cover, residuals):
+    def add_residuals(self, cover, residuals):
         xyz = REACH * residuals["xyz"].tanh()
-        return super().updated(cover, {**residuals, "xyz": xyz})
+        return super().add_residuals(cover, {**residuals, "xyz": xyz})
 
 
 DECODERS["bounded"] = BoundedDecoder  # whoever reveals such a secret imports this file, too

@@ -100,7 +100,7 @@ def test_no_command_takes_a_key_as_an_argument() -> None:
         ("hide", ["--method", name, "--help"]) for name in registry.METHODS
     ]
     for name, arguments in asked:
-        options = entry.options_of(commands.to_parse(name, arguments))
+        options = entry.options_of(commands.parse_target(name, arguments))
         keys = {name: hint for name, hint in options.items() if "key" in name}
         for name in keys.keys() - {"wrong_keys", "key_encoder"}:
             assert "Path" in str(keys[name]), name

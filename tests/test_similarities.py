@@ -80,7 +80,7 @@ def test_a_scene_far_out_says_where_it_is(tmp_path: Path) -> None:
     local = random_gaussians()
     far = Similarity(1.0, translation=scene.origin).apply_gaussians(local)
     for model in (local, far):
-        assert (scene.localised(model).means - local.means).abs().max() < 1  # single precision far out
+        assert (scene.to_scene_frame(model).means - local.means).abs().max() < 1  # single precision far out
 
 
 @pytest.mark.parametrize("scale", [1e-4, 1e6])

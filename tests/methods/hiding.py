@@ -14,7 +14,7 @@ import torch
 from fitting.test_plain import InterruptAt
 from keyss.core import Gaussians, InputError, Interrupted, KeyssWarning, Scene, Similarity, same_bits
 from keyss.fitting import mean_psnr
-from keyss.methods import Context, MethodOptions, Opened, Source, registry, with_plain_models
+from keyss.methods import Context, MethodOptions, Opened, Source, fit_plain_models, registry
 from keyss.progress import Reporter
 from tiny_scenes import random_gaussians, tiny_scene
 
@@ -44,7 +44,7 @@ def hide_scenes(
     """
     given = plains or [None] * len(scenes)
     method = registry.of_options(options)
-    options = replace(options, fit=options.fit.seeded(0))
+    options = replace(options, fit=options.fit.with_seed(0))
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", ".*appended", KeyssWarning)
         sources = [
@@ -52,7 +52,7 @@ def hide_scenes(
         ]
         options = method.prepare(sources, options)
         context = Context(torch.device("cpu"), checkpoints, resume, reporter, entropy=bytes(32))
-        cover, *secrets = with_plain_models(sources, options.fits(len(sources)), context)
+        cover, *secrets = fit_plain_models(sources, options.fits(len(sources)), context)
         stego = method.hide(cover, secrets, options, context)
     return Hidden(stego.gaussians, stego.opened)
 

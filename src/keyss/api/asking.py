@@ -1,4 +1,4 @@
-"""Arguments and result of `hide`: arguments are checked before any work."""
+"""Arguments and result of `hide`. Arguments are checked before any work."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ class Secret:
 class HideResult:
     """The result of `hide`."""
 
-    stego: Gaussians | None = None  # to be published; None of a dry run
+    stego: Gaussians | None = None  # publish this; None after a dry run
     metrics: HideMetrics | None = None  # None of a dry run
-    plan: Plan | None = None  # of a dry run
+    plan: Plan | None = None  # only of a dry run
 
 
 def method_for(chosen: str | MethodOptions, secrets: Sequence[Secret]) -> tuple[Method, MethodOptions]:
-    """A method and its options. Raises UsageError for a number of secrets or keys that it cannot have."""
+    """A method and its options. Raises UsageError if the method does not support these secrets or keys."""
     if isinstance(chosen, MethodOptions):
         method, options = registry.of_options(chosen), chosen
     else:
@@ -65,9 +65,9 @@ def sources_of(
     keys: Sequence[str],
     views: ViewOptions,
 ) -> list[Source]:
-    """The cover and the secrets with their photos and plain models; a model given as a scene is its own.
+    """The cover and the secrets with their photos and plain models; a scene may be its own model.
 
-    `keys`: of the secrets. Raises UsageError and InputError.
+    `keys`: one per secret. Raises UsageError and InputError.
     """
     given: list[tuple[PathLike | Gaussians | None, bool]] = []  # models, and whether there are photos
     for index, (source, model) in enumerate(zip(sources, models, strict=True)):
@@ -80,21 +80,21 @@ def sources_of(
             model = source  # type: ignore[assignment]
         given.append((model, photos))
     names = ["the cover"] + ["the secret"] * (len(given) - 1)
-    # Large files take seconds each, most of them outside of Python's lock.
+    # Reading large files takes seconds each, mostly without the GIL.
     with ThreadPoolExecutor(_READERS) as readers:
-        found = readers.map(_drawable, [model for model, _ in given], names)
+        found = readers.map(_read_visible, [model for model, _ in given], names)
         loaded = [
             as_scene(source, views) if photos else None
             for source, (_, photos) in zip(sources, given, strict=True)
         ]
         return [
-            Source(scene.localised(model) if scene and model is not None else model, photos, key, scene)
+            Source(scene.to_scene_frame(model) if scene and model is not None else model, photos, key, scene)
             for model, (_, photos), key, scene in zip(found, given, ["", *keys], loaded, strict=True)
         ]
 
 
-def _drawable(model: PathLike | Gaussians | None, what: str) -> Gaussians | None:
-    """The model, if there is one. Raises UsageError if all of it is transparent."""
+def _read_visible(model: PathLike | Gaussians | None, what: str) -> Gaussians | None:
+    """Read the model, if there is one. Raises UsageError if all of it is transparent."""
     found = None if model is None else as_3dgs_model(model, what)
     if found is not None and not (found.opacities >= DRAWN_OPACITY).any():
         raise UsageError(f"{what}'s model is invisible: all of its Gaussians are transparent")
@@ -102,7 +102,7 @@ def _drawable(model: PathLike | Gaussians | None, what: str) -> Gaussians | None
 
 
 def check_keys(keys: Sequence[str]) -> None:
-    """Raise UsageError for invalid keys, and for two that key derivation treats as equal."""
+    """Raise UsageError for invalid keys, and for two keys that normalise to the same text."""
     for (i, a), (j, b) in combinations(enumerate(map(normalized_key, keys), 1), 2):
         if a == b:
             raise UsageError(

@@ -1,4 +1,4 @@
-"""`convert`: a model in another format, and the cost for the model and its secrets."""
+"""`convert`: write a model in another format, and measure the loss for the model and its secrets."""
 
 from __future__ import annotations
 
@@ -17,18 +17,17 @@ from keyss.files.ply_extras import with_extras
 from keyss.files.reading import is_standard, write_standard_output
 from keyss.files.trained import model_file
 from keyss.rendering import Backend, resolve_device
-from keyss.rendering.difference import is_seen, psnr_between
+from keyss.rendering.difference import is_visible, psnr_between
 from keyss.runs.files import PathLike, as_model
 from keyss.runs.folder import check_not_published
 from keyss.runs.revealing import reveal_any
 
-# A secret with a smaller share of its Gaussians left counts as lost.
-_KEPT = 0.99
+_KEPT = 0.99  # share; a secret with fewer Gaussians left counts as lost
 
 
 @dataclass(frozen=True)
 class KeptSecret:
-    """How much of a secret its key opens before and after the conversion."""
+    """Size of a secret that its key opens before and after the conversion."""
 
     before: int  # Gaussians, or bytes of a hidden file
     after: int
@@ -43,12 +42,12 @@ class KeptSecret:
 class Conversion:
     """A model in another format."""
 
-    gaussians: Gaussians  # as read from it
+    gaussians: Gaussians  # read back from the converted file
     bytes_before: int | None  # None: read from standard input or from memory
     bytes_after: int
-    psnr: float  # dB between renders before and after, from around the model; 120: equal; NaN: empty
+    psnr: float  # dB between renders before and after, from all around; 120: equal; NaN: empty
     keeps_low_bits: bool  # whether the format keeps them
-    secrets: tuple[KeptSecret, ...]  # in the order of the keys
+    secrets: tuple[KeptSecret, ...]  # one per key, in order
 
 
 @torch.no_grad()
@@ -62,12 +61,12 @@ def convert(
     overwrite: bool = False,
     device: Backend = "auto",
 ) -> Conversion:
-    """Write a model in the format of the suffix of `out`, and measure what that costs.
+    """Write a model in the format of the suffix of `out`, and measure the loss.
 
-    If a secret that one of `keys` opens would be lost, QualityError is raised and nothing is written, unless
-    with `force`. Others can read the file if they can read `model`. `dry_run` writes nothing at all. Without
-    keys, the result does not tell whether something is hidden. Raises WrongKeyError for a key that opens
-    nothing, InputError, OutputError, and UsageError for an unknown suffix.
+    Raises QualityError and writes nothing if a secret that one of `keys` opens would be lost, unless with
+    `force`. The file gets the permissions of `model`. `dry_run` writes nothing at all. Without keys, the
+    result does not reveal whether something is hidden. Raises WrongKeyError for a key that opens nothing,
+    InputError, OutputError, and UsageError for an unknown suffix.
     """
     target = resolve_device(device)
     source = None if isinstance(model, Gaussians) else model_file(model)
@@ -79,11 +78,11 @@ def convert(
     data = model_bytes(path, with_extras(before, source, before))
     after = model_of_bytes(path, data)
     secrets = tuple(
-        KeptSecret(each.remains.found, _left(after, key, target), "bytes" if each.file else "Gaussians")
+        KeptSecret(each.remains.found, _size_left(after, key, target), "bytes" if each.file else "Gaussians")
         for key, each in zip(keys, opened, strict=True)
     )
     size = None if source is None or is_standard(source) else source.stat().st_size
-    psnr = psnr_between(before.to(target), after.to(target)) if is_seen(before.to(target)) else math.nan
+    psnr = psnr_between(before.to(target), after.to(target)) if is_visible(before.to(target)) else math.nan
     result = Conversion(after, size, len(data), psnr, keeps_low_bits(path), secrets)
     lost = [number for number, each in enumerate(secrets, 1) if not each.kept]
     if lost and not (force or dry_run):
@@ -98,8 +97,8 @@ def convert(
     return result
 
 
-def _left(model: Gaussians, key: str, device: torch.device) -> int:
-    """How much a key opens in a converted model, in Gaussians or bytes."""
+def _size_left(model: Gaussians, key: str, device: torch.device) -> int:
+    """Size of what a key opens in a converted model, in Gaussians or bytes."""
     try:
         return reveal_any(model, key, device).remains.found
     except (WrongKeyError, InputError, UsageError):
@@ -107,7 +106,7 @@ def _left(model: Gaussians, key: str, device: torch.device) -> int:
 
 
 def _refusal(path: Path, result: Conversion, lost: Sequence[int]) -> str:
-    """Why nothing was written."""
+    """The message if nothing was written."""
     first = result.secrets[lost[0] - 1]
     which = "the secret that the key opens" if len(result.secrets) == 1 else f"the secret of key {lost[0]}"
     left = f"{first.after:,} of its {first.before:,} {first.unit} would be left in {path}"

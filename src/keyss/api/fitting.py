@@ -19,14 +19,14 @@ from keyss.runs.folder import RunFolder, recorded_number
 from keyss.runs.planning import check_room, in_a_line, needs_of_fit, plan_fit, worth_planning
 
 
-def seeded(config: FitConfig, interrupted: Path | None, *names: str) -> FitConfig:
-    """`config` with a seed: its own, that of an `interrupted` run's folder, or a random one.
+def with_seed(config: FitConfig, interrupted: Path | None, *names: str) -> FitConfig:
+    """`config` with a seed: its own, that of the `interrupted` run, or a random one.
 
-    `names` lead to the config among the arguments of that run.
+    `interrupted`: the run's folder; `names`: the path to its config among its arguments.
     """
     if interrupted is not None:
-        config = config.seeded(recorded_number(interrupted, *names, "seed"))
-    return config.seeded()
+        config = config.with_seed(recorded_number(interrupted, *names, "seed"))
+    return config.with_seed()
 
 
 def fit(
@@ -51,7 +51,7 @@ def fit(
     """
     started = time.monotonic()
     interrupted = Path(out) if resume and out is not None else None
-    config = seeded(config or FitConfig(), interrupted, "config")
+    config = with_seed(config or FitConfig(), interrupted, "config")
     target = resolve_device(device)
     settings = FitRunConfig(
         scene=path_of(scene),

@@ -1,4 +1,4 @@
-"""`hide`: secrets in a cover, revealed again and measured."""
+"""`hide`: hide secrets in a cover, reveal them again, and measure the result."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from typing import Any
 import torch
 
 from keyss.api.asking import HideResult, Secret, method_for, sources_of
-from keyss.api.fitting import seeded
+from keyss.api.fitting import with_seed
 from keyss.api.quality import check_quality
 from keyss.channels import AnyChannel, Format, Publish
 from keyss.core.errors import KeyssWarning, UsageError
@@ -27,11 +27,11 @@ from keyss.files.ply_extras import with_extras
 from keyss.fitting.image_metrics import quality
 from keyss.keys import DerivedKey
 from keyss.keys.derivation import SALT_BYTES
-from keyss.measure.hiding import Shown, measure_hiding, show
+from keyss.measure.hiding import Shown, compare, measure_hiding
 from keyss.methods.base import Context, Method, MethodOptions, Source, Stego
 from keyss.methods.handed import pack
 from keyss.methods.opened import Opened
-from keyss.methods.plain_models import Bound, fit_bounds, with_plain_models
+from keyss.methods.plain_models import Bound, fit_bounds, fit_plain_models
 from keyss.methods.registry import DEFAULT, open_handed, open_model
 from keyss.progress import Reporter
 from keyss.rendering import Backend, resolve_device
@@ -82,32 +82,32 @@ def hide(
     Cover and secrets are scenes of photos, or models of any format, which are rendered for measurements.
     Plain models of scenes are fitted unless they are given. `method`: a name, or the options of a method
     (`CarryOptions`, `KeyssOptions`). `publish`, `format` and `channel`, if given, replace those of the
-    options. "as-is" hides where nobody sees it, in a file that must stay unchanged: in low bits of a "ply",
-    or in the integers of an "spz", "sog" or "compressed-ply", or of a model that was decoded from one.
-    Without a `format` that is the cover's, and where nothing goes in unnoticed, "any" with a warning. "any"
-    hides in what survives conversion, which is the channel "appended" (more Gaussians, which are visible in
-    the file) or "colours" (less room). `width`, `background`, `skip_missing`: see `load_scene`.
+    options. "as-is" hides unnoticeably, in a file that must stay unchanged: in low bits of a "ply", or in the
+    integers of an "spz", "sog" or "compressed-ply", or of a model decoded from one. By default `format` is
+    the cover's; if nothing can be hidden in it unnoticed, `publish` becomes "any", with a warning. "any"
+    survives conversion: in the channel "appended" (more Gaussians, which are visible in the file) or
+    "colours" (less room). `width`, `background`, `skip_missing`: see `load_scene`.
 
     `out` (a folder) gets `publish/` with the stego model, and `private/` with fitted models, `config.json`,
     `metrics.json`, the files to hand over for methods that need them (`keyss.methods.handed`), and
     checkpoints, from which `resume` continues. Without a seed in the options' `fit` the run uses a random
-    one, which `config.json` records. With one, the same arguments give the same bytes on a CPU with as many
-    threads.
+    one, which `config.json` records. With a seed, the same arguments and number of threads give the same
+    bytes on a CPU.
 
-    `bound`: fit plain 3DGS of as many Gaussians and training steps to compare with; otherwise `metrics.json`
-    says which baselines had fewer steps. `dry_run`: check arguments, and return only the plan.
+    `bound`: fit upper bounds to compare with, plain 3DGS with equal Gaussians and training steps; otherwise
+    `metrics.json` says which baselines had fewer steps. `dry_run`: check arguments, return only the plan.
 
-    At the end the published file is opened with the keys, and rendered beside the plain models. If a PSNR is
-    below `min_psnr` (dB; by default 20, and 25 for secrets that were pruned without a refit), or no better
-    than that of empty pictures, nothing is published, and QualityError is raised; checkpoints stay.
-    Raises other KeyssErrors too, and Interrupted on Ctrl-C.
+    At the end, the published file is opened with the keys and compared with the plain models. Raises
+    QualityError, publishes nothing and keeps checkpoints if a PSNR is below `min_psnr` (dB; by default 20,
+    and 25 for secrets pruned without a refit) or no better than that of empty renders. Raises other
+    KeyssErrors too, and Interrupted on Ctrl-C.
     """
     chosen, options = method_for(method, secrets)
     asked: dict[str, Any] = {"publish": publish, "format": format, "channel": channel}
     options = replace(options, **{name: value for name, value in asked.items() if value})
     _check_arguments(out, min_psnr)
     began, place, target = time.monotonic(), None if out is None else Path(out), resolve_device(device)
-    options = replace(options, fit=seeded(options.fit, place if resume else None, "options", "fit"))
+    options = replace(options, fit=with_seed(options.fit, place if resume else None, "options", "fit"))
     given, keys = [cover, *(secret.scene for secret in secrets)], [secret.key for secret in secrets]
     models = [cover_model, *(secret.model for secret in secrets)]
     views = ViewOptions.of(width, background, skip_missing)
@@ -137,15 +137,15 @@ def hide(
             for line in (f"hide: {in_a_line(plan)}", *plan.notes):
                 reporter.note(line)
         context = Context(target, folder.checkpoints if folder and trains else None, resume, reporter)
-        sources, options = _fitted(chosen, sources, options, context)
+        sources, options = _fit_models(chosen, sources, options, context)
         plain = [each.model for each in sources]
         context = replace(context, entropy=_entropy(keys, options, plain))
         stego = chosen.hide(sources[0], sources[1:], options, context)
 
         published = with_extras(stego.gaussians, cover if cover_model is None else cover_model, plain[0])
-        read = _as_read(stego, published, keys, folder)
+        read = _write_and_read(stego, published, keys, folder)
         shown = [
-            show(model.to(target), each.model.to(target), each.scene, of_plain=not each.photos)
+            compare(model.to(target), each.model.to(target), each.scene, of_plain=not each.photos)
             for model, each in zip(read, sources, strict=True)
         ]
         sizes = [(len(model), len(each)) for model, each in zip(read, plain, strict=True)]
@@ -153,12 +153,12 @@ def hide(
 
         bounds = list(map(Bound.of, options.training(len(sources)), plain_steps))
         longer = _fit_bounds(bounds, sources, stego, options, context) if bound else {}
-        metrics = _measured(stego, sources, options, shown, target, bounds, plain_steps, longer, began)
+        metrics = _measure(stego, sources, options, shown, target, bounds, plain_steps, longer, began)
         if folder:
             settings = replace(
                 settings, options=options, payloads=secret_ids(options.fit.known_seed, stego.opened)
             )
-            folder.write({**_models_made(given, plain, longer), CONFIG: settings, METRICS: metrics})
+            folder.write({**_models_to_write(given, plain, longer), CONFIG: settings, METRICS: metrics})
     return HideResult(stego.gaussians, metrics)
 
 
@@ -178,7 +178,7 @@ def _settings(
     views: ViewOptions,
     options: MethodOptions,
 ) -> RunConfig[MethodOptions]:
-    """The content of `config.json`, as it is known at the start."""
+    """The content of `config.json` known at the start."""
     return RunConfig(
         method=method.name,
         cover=path_of(given[0]),
@@ -229,22 +229,22 @@ def _plain_steps(
     ]
 
 
-def _fitted(
+def _fit_models(
     method: Method, sources: list[Source], options: MethodOptions, context: Context
 ) -> tuple[list[Source], MethodOptions]:
-    """The sources with plain models, and the options prepared for these."""
+    """Fit missing plain models, and prepare the options for them."""
     if all(each.given is not None for each in sources):
         return sources, options
-    fitted = with_plain_models(sources, options.fits(len(sources)), context)
-    with warnings.catch_warnings():  # given by the first call
+    fitted = fit_plain_models(sources, options.fits(len(sources)), context)
+    with warnings.catch_warnings():  # the first call has warned already
         warnings.simplefilter("ignore", KeyssWarning)
         return fitted, method.prepare(fitted, options)
 
 
-def _models_made(
+def _models_to_write(
     given: Sequence[PathLike | Scene | Gaussians], plain: Sequence[Gaussians], bounds: Mapping[int, Gaussians]
 ) -> dict[str, Gaussians]:
-    """Plain models and bounds by file name, without plain models that are files of the user."""
+    """Plain models and upper bounds by file name, without plain models that the user gave as files."""
     secrets = len(given) - 1
     made = {
         name: model
@@ -255,15 +255,15 @@ def _models_made(
 
 
 def _key_checks(keys: Sequence[str], settings: RunConfig[MethodOptions]) -> list[str]:
-    """Verifiers of the keys for resumed runs; guessing a key from one is as slow as from the stego model."""
+    """Verifiers of the keys, to resume; guessing a key from one is as slow as from the stego model."""
     salt = hashlib.sha256(b"keyss/v1/resume" + record_bytes(settings)).digest()[:SALT_BYTES]
     return [DerivedKey.of(key, salt).verifier().hex() for key in keys if key]
 
 
 def _entropy(keys: Sequence[str], options: MethodOptions, plain: Sequence[Gaussians]) -> bytes:
-    """32 bytes that follow from keys, options and models, and that cannot be guessed without the keys.
+    """32 bytes derived from keys, options and models; infeasible to guess without the keys.
 
-    The salt depends on all models, so that no table of keys can be made before the secrets are known.
+    The salt depends on all models, so that keys cannot be guessed in advance.
     """
     with ThreadPoolExecutor(len(plain)) as workers:
         models = [digest.encode() for digest in workers.map(Gaussians.digest, plain)]
@@ -274,10 +274,10 @@ def _entropy(keys: Sequence[str], options: MethodOptions, plain: Sequence[Gaussi
     return hashlib.sha256(b"".join(hashlib.sha256(each).digest() for each in parts)).digest()
 
 
-def _as_read(
+def _write_and_read(
     stego: Stego, published: Gaussians, keys: Sequence[str], folder: RunFolder | None
 ) -> list[Gaussians]:
-    """The stego model and the secrets, from the files that are given away; `published` is one of them."""
+    """Write the files to give away, `published` among them, and read the stego model and the secrets back."""
     model, given = stego.gaussians, bool(stego.handed)
     packed = [pack(payload, key or None) for payload, key in zip(stego.handed, keys, strict=given)]
     if folder:
@@ -288,14 +288,14 @@ def _as_read(
     if packed:
         opened = [open_handed(data, key or None) for data, key in zip(packed, keys, strict=True)]
     elif stego.verified and same_bits(model, stego.gaussians):
-        opened = stego.opened  # the same bits were opened before
+        opened = stego.opened  # opening the same bits again would change nothing
     else:
         opened = [open_model(model, key) for key in keys]
     return [model, *(each.reveal(model) for each in opened)]
 
 
 def _steps_of(model: PathLike | Gaussians | None) -> int | None:
-    """Steps of the training of a plain model that is given, if `fit` wrote it."""
+    """Training steps of a given plain model, if `fit` wrote it."""
     if model is None or isinstance(model, Gaussians) or Path(model).name != MODEL:
         return None
     metrics = Path(model).parent / METRICS
@@ -309,10 +309,10 @@ def _fit_bounds(
     options: MethodOptions,
     context: Context,
 ) -> dict[int, Gaussians]:
-    """Plain 3DGS of scenes with more training steps than their plain models, by index."""
+    """Upper bounds for scenes with more training steps than their plain models, by index."""
     sizes = [len(stego.gaussians), *(len(each.reveal(stego.gaussians)) for each in stego.opened)]
     configs = {
-        # A secret that was pruned to fit is compared with a model of that size.
+        # The upper bound of a pruned secret has the size of what is left.
         index: bound.config(options.fit, size if size < len(source.model) else None)
         for index, (bound, source, size) in enumerate(zip(bounds, sources, sizes, strict=True))
         if not bound.equal and bound.steps is not None and source.photos
@@ -320,7 +320,7 @@ def _fit_bounds(
     return fit_bounds([each.scene for each in sources], configs, context)
 
 
-def _measured(
+def _measure(
     stego: Stego,
     sources: Sequence[Source],
     options: MethodOptions,

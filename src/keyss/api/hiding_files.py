@@ -1,4 +1,4 @@
-"""`hide_files`: any files in a cover that is a model."""
+"""`hide_files`: hide any files in a model."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ class SecretFile:
 
     file: PathLike | bytes
     key: str = field(repr=False)
-    name: str = ""  # shown when the file is revealed; by default its own
+    name: str = ""  # displayed when the file is revealed; default: its own name
 
 
 @dataclass(frozen=True)
 class HideFilesResult:
     """The result of `hide_files`."""
 
-    stego: Gaussians | None  # to be published; None of a dry run
+    stego: Gaussians | None  # publish this; None after a dry run
     psnr: float  # dB of the stego model's views to the cover's, at most 120
 
 
@@ -51,12 +51,11 @@ def hide_files(
     overwrite: bool = False,
     dry_run: bool = False,
 ) -> HideFilesResult:
-    """Hide files in a model, each under its own key, and open them again as a reader does.
+    """Hide files in a model, each under its own key, and open them again to check.
 
     `out` (a folder) gets `publish/` with the stego model. `publish`, `format`, `channel`: see `hide`;
-    "as-is" refuses a cover that holds nothing unnoticed. `dry_run`: write nothing, and return only the PSNR.
-
-    Raises UsageError where the files do not fit, and other KeyssErrors.
+    `dry_run`: write nothing, and return only the PSNR. Raises UsageError if the files do not fit (with
+    "as-is", into what goes unnoticed), and other KeyssErrors.
     """
     if isinstance(cover, Scene) or not is_model(cover):
         raise UsageError("hiding a file needs a model as the cover; `keyss fit` makes one from photos")
@@ -67,7 +66,7 @@ def hide_files(
         read = [cover, *(each.file for each in secrets)]
         inputs = [Path(each) for each in read if isinstance(each, str | Path)]
         folder = RunFolder(out, "hide files", writes=STEGOS, inputs=inputs, overwrite=overwrite)
-    hidden, model = [_hidden_file(each) for each in secrets], as_3dgs_model(cover, "the cover")
+    hidden, model = [_read(each) for each in secrets], as_3dgs_model(cover, "the cover")
     place = channel_for(publish, channel, format, model)
     payloads = [(key, each.payload()) for key, each in zip(keys, hidden, strict=True)]
     try:
@@ -85,8 +84,8 @@ def hide_files(
     return HideFilesResult(None if dry_run else stego, psnr_between(model, stego))
 
 
-def _hidden_file(secret: SecretFile) -> HiddenFile:
-    """Raises InputError for a file that is missing or too large to be hidden."""
+def _read(secret: SecretFile) -> HiddenFile:
+    """Read the file. Raises InputError if it is missing or too large."""
     if isinstance(secret.file, bytes):
         return HiddenFile(secret.name, secret.file)
     path = Path(secret.file)

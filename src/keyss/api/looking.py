@@ -57,11 +57,10 @@ def render(
     `width`, `background`, `skip_missing`: see `load_scene`; a skipped photo has no camera. `out` (a folder)
     gets a PNG for each camera.
 
-    With `video` (an .mp4 of 25 frames a second) it writes that instead, and returns no images. The camera
-    circles the model; with `cameras`, it circles what they look at, at their height. `wipe`: a second model,
-    which is uncovered from the left and covered again; without `cameras` each model has a circle of its own.
-    `width` is then 400 pixels by default, and sizes are rounded to even numbers. Raises KeyssError and its
-    children.
+    With `video` (an .mp4 of 25 frames per second) it writes a video instead, and returns no images. The
+    camera circles the model; with `cameras`, it circles their focus at their height. `wipe`: a second model,
+    wiped in from the left and out again; without `cameras` each model has a circle of its own. `width` is
+    then 400 pixels by default, and sizes are rounded to even numbers. Raises KeyssError.
     """
     views = ViewOptions.of(width, background, skip_missing)
     if video is not None:
@@ -73,7 +72,7 @@ def render(
     inputs = [Path(model)] if isinstance(model, str | Path) else []
     folder = RunFolder(out, "render", inputs=inputs, overwrite=overwrite) if out is not None else None
     scene = as_scene(cameras, views)
-    gaussians = scene.localised(as_model(model)).to(target)
+    gaussians = scene.to_scene_frame(as_model(model)).to(target)
     splits: dict[str, tuple[View, ...]] = {"test": scene.test, "train": scene.train, "all": scene.views}
     pictures = renders_of(gaussians, scene, splits[split])
     if folder:
@@ -92,8 +91,8 @@ def evaluate(
 ) -> HideMetrics:
     """Measure a run of `hide` again on the test views; rewrites its `metrics.json`.
 
-    `keys`: those of all its secrets, in any order. `wrong_keys`: number of random wrong keys to measure, 32
-    by default, sampled with `seed`, by default the run's; only for methods whose keys condition a decoder.
+    `keys`: one per secret, in any order. `wrong_keys`: number of random wrong keys to measure, 32 by default,
+    sampled with `seed`, by default the run's; only for methods whose keys condition a decoder.
     Raises WrongKeyError for a key that opens nothing, UsageError for a secret without a key.
     """
     target = resolve_device(device)
@@ -148,8 +147,8 @@ def _write_film(
     else:
         scene = as_scene(cameras, views)
         color = scene.background
-        models = [scene.localised(each) for each in models]
-        paths = [[_even(camera) for camera in around([view.camera for view in scene.views], count)]]
+        models = [scene.to_scene_frame(each) for each in models]
+        paths = [[_crop_to_even(camera) for camera in around([view.camera for view in scene.views], count)]]
         paths *= len(models)
     reporter = reporter or Reporter()
     reporter.start(f"video {Path(out).name}", count, 0)
@@ -179,7 +178,7 @@ def frame_count(seconds: float) -> int:
 
 
 def shown(time: float) -> float:
-    """How much of the second model a wipe shows at `time`, from 0 to 1: none, all at a half, none again."""
+    """Share of the second model that a wipe shows at `time` in [0, 1]: 0 at both ends, 1 in the middle."""
     return 0.5 - 0.5 * math.cos(2 * math.pi * time)
 
 
@@ -192,8 +191,8 @@ def wiped(first: Bytes, second: Bytes, share: float) -> Bytes:
     return picture
 
 
-def _even(camera: Camera) -> Camera:
-    """Without its last column or row where their number is odd, for films have no colour there."""
+def _crop_to_even(camera: Camera) -> Camera:
+    """Drop the last column or row if their number is odd: video codecs cannot store its colour."""
     width, height = camera.width - camera.width % 2, camera.height - camera.height % 2
     if min(width, height) < 2:
         raise UsageError(f"pictures of {camera.width} x {camera.height} pixels are too small for a film")

@@ -39,18 +39,17 @@ def reveal(
 ) -> Revealed:
     """Reveal the secret that `key` opens in a stego model: a scene, as an ordinary model, or a file.
 
-    The model itself tells which method hid the secret. `frame`: "secret" gives a scene in its own frame,
-    which its cameras fit; "cover" leaves it where it was hidden, unless it was carried. Where Gaussians were
-    lost, those left are enlarged to make up for them (`keyss.core.gaussians`). `force` is for
-    models that were quantised or pruned: it skips the check that a decoder belongs to the model, and accepts
-    any loss. `handed`: the file that was handed over for this secret, for methods that need one
-    (`keyss.methods.handed`). Some of those have no keys, and some give a model that a network decodes
-    (`keyss.core.decoded`), which is no 3DGS model.
+    The model determines the method. `frame`: "secret" gives a scene in its own frame, in which its cameras
+    are valid; "cover" leaves it where it was hidden, unless it was carried. If Gaussians were lost, the
+    others are enlarged to compensate (`keyss.core.gaussians`). `force` is for quantised or pruned models: it
+    skips the check that a decoder belongs to the model, and accepts any loss. `handed`: the file handed over
+    for this secret, for methods that need one (`keyss.methods.handed`). Some of those have no keys, and some
+    give a model that a network decodes (`keyss.core.decoded`), which is no 3DGS model.
 
-    `out` (a file) gets the secret: a scene if the name is that of a model (.ply, .spz, ...), else a file.
-    Raises WrongKeyError for a key that opens nothing (with `decoy` the cover is revealed instead, see
-    `keyss.methods.opened`), and InputError for a damaged file and where less than a tenth of the secret is
-    left. Warns (KeyssWarning) where more than a hundredth is missing.
+    `out` (a file) gets the secret: a scene for the suffix of a model (.ply, .spz, ...), else a file. Raises
+    WrongKeyError for a key that opens nothing (`decoy` reveals the cover instead, see `keyss.methods.decoy`),
+    InputError for a damaged file or if less than 10 % of the secret is left. Warns (KeyssWarning) if more
+    than 1 % is missing.
     """
     target = resolve_device(device)
     inputs = [] if isinstance(stego, Gaussians) else [Path(stego)]
@@ -101,8 +100,8 @@ def verify(
 ) -> Verification:
     """Check that a model is sound and, with a key, that its secret is complete; writes nothing.
 
-    Without a key, the result does not tell whether something is hidden. Raises InputError for a file that is
-    not a whole and finite model, WrongKeyError for a key that opens nothing.
+    Without a key, the result does not reveal whether something is hidden. Raises InputError for a file that
+    is not a complete and finite model, WrongKeyError for a key that opens nothing.
     """
     target = resolve_device(device)
     name = "model" if isinstance(model, Gaussians) else str(model)

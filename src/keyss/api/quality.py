@@ -1,4 +1,4 @@
-"""Whether a hiding is good enough to be published."""
+"""Check that a hiding is good enough to be published."""
 
 from __future__ import annotations
 
@@ -10,11 +10,10 @@ from keyss.measure.hiding import Shown
 from keyss.methods.base import MethodOptions
 
 MIN_PSNR = 20.0  # dB to the plain model; below it, renders show something else
-MIN_PRUNED_PSNR = 25.0  # the same for secrets that lost Gaussians without a refit
-# Below this PSNR to the plain model a difference is seen; but nothing is lost where photos are matched nearly
-# as well, to so many dB, and so much SSIM.
-_FAR, _NEARLY_PSNR, _NEARLY_SSIM = 30.0, 3.0, 0.1
-# dB; empty renders of dark or small objects can have a high PSNR, and of invisible ones the highest
+MIN_PRUNED_PSNR = 25.0  # dB, for secrets that lost Gaussians without a refit
+_FAR = 30.0  # dB to the plain model; differences are visible below it
+_PSNR_TOLERANCE, _SSIM_TOLERANCE = 3.0, 0.1  # dB and SSIM to photos, below the plain model's
+# dB. Empty renders score high for dark or small objects, and highest for invisible ones.
 _BETTER_THAN_NOTHING, _GOOD, _EMPTY = 3.0, 40.0, 119.0
 
 
@@ -28,9 +27,9 @@ def check_quality(
 ) -> None:
     """Raise QualityError if the cover or a secret is too far from its plain model; warn if it is far.
 
-    `sizes`: Gaussians of each and of its plain model. `resumes`: `resume` skips the training that is done.
+    `sizes`: Gaussians of each model and of its plain model. `resumes`: `resume` skips finished training.
     """
-    again = ", and `resume=True` skips the training that is done" * resumes
+    again = ", and `resume=True` skips finished training" * resumes
     for index, (render, (count, before)) in enumerate(zip(shown, sizes, strict=True)):
         each, plain, own = render.fidelity, render.plain, render.quality
         if each is None or plain is None:
@@ -56,7 +55,7 @@ def check_quality(
                 f"{found}, and empty renders are at {each.nothing:.1f} dB: nothing was published; "
                 f"`min_psnr=0` publishes it anyway{again}{way}"
             )
-        lost = own.psnr < plain.psnr - _NEARLY_PSNR and each.psnr < _FAR
-        if min_psnr is None and (lost or own.ssim < plain.ssim - _NEARLY_SSIM):
+        lost = own.psnr < plain.psnr - _PSNR_TOLERANCE and each.psnr < _FAR
+        if min_psnr is None and (lost or own.ssim < plain.ssim - _SSIM_TOLERANCE):
             ssims = f"SSIM {own.ssim:.2f} where the plain model has {plain.ssim:.2f}"
             warnings.warn(f"{found}, {ssims}{way}", KeyssWarning, stacklevel=3)

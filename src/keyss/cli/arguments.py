@@ -84,13 +84,13 @@ class Training:
 PHOTOS, TRAINING = Photos(), Training()
 
 
-def given(options: Any) -> list[str]:
-    """The flags of the options, those of groups included, that differ from their defaults."""
+def changed_flags(options: Any) -> list[str]:
+    """Flags whose options, also in groups, differ from their defaults."""
     flags = []
     for each in fields(options):
         value = getattr(options, each.name)
         if is_dataclass(value):
-            flags += given(value)
+            flags += changed_flags(value)
         elif value != each.default:
             flags.append(flag(each.name))
     return flags
@@ -101,8 +101,8 @@ def flag(name: str) -> str:
     return f"--{name.replace('_', '-')}"
 
 
-def check_there(*paths: Path | None, expected: str = "a file or folder") -> None:
-    """Raise InputError for an input that does not exist, before torch is loaded; - is the standard input."""
+def check_exists(*paths: Path | None, expected: str = "a file or folder") -> None:
+    """Raise InputError if an input does not exist; - is the standard input. Does not import torch."""
     from keyss.core.errors import InputError
 
     for path in paths:
@@ -111,12 +111,12 @@ def check_there(*paths: Path | None, expected: str = "a file or folder") -> None
 
 
 def check_run(run: Path) -> None:
-    """See `check_there`."""
-    check_there(run, expected="the folder of a run, as `keyss hide` writes it")
+    """Raise InputError if the run does not exist; see `check_exists`."""
+    check_exists(run, expected="the folder of a run, as `keyss hide` writes it")
 
 
-def checked_seed(seed: int) -> int:
-    """`seed`, if every generator takes it. Raises UsageError."""
+def check_seed(seed: int) -> int:
+    """Return `seed`. Raises UsageError unless every generator accepts it."""
     from keyss.core.errors import UsageError
 
     if not 0 <= seed < 1 << 32:

@@ -1,7 +1,7 @@
 """The commands, in the groups of `keyss --help`, and the module of each.
 
-A module is imported when its command runs, and imports what is heavy inside the command, so that
-`keyss --help` answers at once.
+A module is imported when its command runs, and imports heavy packages inside the command, which keeps
+`keyss --help` fast.
 """
 
 from __future__ import annotations
@@ -49,8 +49,8 @@ def command(name: str) -> Callable[..., None]:
     return found
 
 
-def to_parse(name: str, arguments: Sequence[str]) -> Callable[..., None]:
-    """The function that is parsed: for `hide`, with the options of the method named in `arguments`."""
+def parse_target(name: str, arguments: Sequence[str]) -> Callable[..., None]:
+    """The function to parse: for `hide`, with the options of the method named in `arguments`."""
     if name == "hide":
         from keyss.cli.hiding import with_options_of_method
 

@@ -25,7 +25,7 @@ EXTRAS = {
 }
 LIBRARIES = ("torch", "gsplat", "numba", "numpy", "opencv-python-headless", "cryptography", "argon2-cffi")
 OPTIONAL = ("GPU", "kernel cache", "splat-transform", *(f"[{name}]" for name in EXTRAS))
-_TOLERANCE = 1e-4  # of a pixel's value from 0 to 1
+_TOLERANCE = 1e-4  # colours are in [0, 1]
 
 
 def doctor(

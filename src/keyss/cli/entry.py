@@ -31,7 +31,7 @@ OUT_OF_MEMORY = 8
 INTERNAL_ERROR = 70  # EX_SOFTWARE
 NO_ROOM = OutputError.exit_status
 _LEVELS = {"-q": -1, "--quiet": -1, "-v": 1, "--verbose": 1}
-_KEY_OPTIONS = ("-k", "-p", "--key", "--keys", "--password", "--passphrase")  # that people may expect
+_KEY_OPTIONS = ("-k", "-p", "--key", "--keys", "--password", "--passphrase")  # options that people may expect
 # Between backticks: `overwrite=True`, `method="carry", dither=True`, `sh_degree`.
 _VALUE = r"""(?:"[^"`]*"|'[^'`]*'|[\w.+-]+)"""
 _ASSIGNMENT = rf"([A-Za-z_]\w*)=({_VALUE})"
@@ -49,7 +49,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     KEYSS_DEBUG=1 in the environment, internal errors are raised.
     """
     arguments = list(sys.argv[1:] if arguments is None else arguments)
-    options: set[str] = set()  # of the command, by their names in Python
+    options: set[str] = set()  # options of the command, by their names in Python
     try:
         with _warnings_as_lines(options), _verbosity(arguments) as words:
             try:
@@ -58,7 +58,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 _flush()
         return 0
     except BrokenPipeError:
-        # The interpreter must not try to flush the buffer again.
+        # Otherwise the interpreter would flush the buffer again.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return BROKEN_PIPE
     except (Exception, KeyboardInterrupt) as error:
@@ -72,7 +72,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _run(arguments: list[str], options: set[str]) -> None:
     """Run the command that `arguments` name; its options are added to `options`."""
     name, *rest = arguments
-    if arguments in (["--version"], ["-V"]):  # before the slow import of the argument parser
+    if arguments in (["--version"], ["-V"]):  # needs no argument parser, whose import is slow
         print(__version__)
         return
 
@@ -95,7 +95,7 @@ def _run(arguments: list[str], options: set[str]) -> None:
             "a key cannot be an argument, which other users could see: give --key-file FILE, set KEYSS_KEY, "
             "or type it at the prompt"
         )
-    command = commands.to_parse(name, rest)
+    command = commands.parse_target(name, rest)
     options.update(options_of(command))
     if "out" not in options and {"-o", "--out"} & {word.partition("=")[0] for word in rest}:
         where = "name OUT after IN" if name == "convert" else "results go into the folder of the run, if any"
@@ -112,7 +112,7 @@ def _print_completion(arguments: list[str]) -> None:
         raise UsageError("--completion: expected bash or zsh")
     app = tyro.extras.SubcommandApp()
     for name in commands.MODULES:
-        app.command(name=name)(commands.to_parse(name, []))
+        app.command(name=name)(commands.parse_target(name, []))
     printing = ["--tyro-print-completion", *arguments]
     app.cli(prog="keyss", args=printing, config=(tyro.conf.FlagCreatePairsOff,))
 
@@ -169,7 +169,7 @@ def _warnings_as_lines(options: Collection[str]) -> Iterator[None]:
 
 @contextmanager
 def _verbosity(arguments: Sequence[str]) -> Iterator[list[str]]:
-    """`arguments` without -q and -v. With -v, prints the time unless the context ends by an error."""
+    """Yield `arguments` without -q and -v. With -v, prints the time unless the context raises an error."""
     levels = [_LEVELS[word] for word in arguments if word in _LEVELS]
     if not levels:  # avoids importing the progress module
         yield list(arguments)
@@ -188,7 +188,7 @@ def _verbosity(arguments: Sequence[str]) -> Iterator[list[str]]:
 
 
 def _interrupt_behind(error: BaseException | None) -> KeyboardInterrupt | None:
-    """The interrupt that caused `error`, or during whose handling it was raised."""
+    """The interrupt in the chain of causes and contexts of `error`, if any."""
     while error is not None and not isinstance(error, KeyboardInterrupt):
         error = error.__cause__ or error.__context__
     return error
@@ -203,21 +203,21 @@ def _flush() -> None:
 
 
 def _is_out_of_memory(error: BaseException) -> bool:
-    """Whether `error` is Python's, or PyTorch's on the CPU or a GPU."""
+    """True for out-of-memory errors of Python and PyTorch, on the CPU or a GPU."""
     if isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError":
         return True
     return isinstance(error, RuntimeError) and "can't allocate memory" in str(error)
 
 
 def _one_line(message: str) -> str:
-    """`message` without line breaks and control characters, which file names may contain."""
+    """`message` without line breaks and control characters, e.g. from file names."""
     return " ".join("".join(c if c.isprintable() else " " for c in message).split())
 
 
 def as_flags(message: str, options: Collection[str]) -> str:
-    """`message` with flags in place of the arguments that it names between backticks.
+    """Replace arguments between backticks in `message` by flags.
 
-    Names without a value are replaced only if they are in `options`, since they may be anything else.
+    Names without a value are replaced only if they are in `options`.
     """
 
     def assignments(found: re.Match[str]) -> str:
@@ -241,7 +241,7 @@ def _flag(name: str, value: str) -> str:
 
 
 def options_of(command: Callable[..., Any]) -> dict[str, Any]:
-    """The options of a command with their types, those of groups included."""
+    """Names and types of a command's options, those of groups included."""
     found: dict[str, Any] = {}
     for each in inspect.signature(command, eval_str=True).parameters.values():
         if is_dataclass(group := getattr(each.annotation, "__origin__", each.annotation)):

@@ -25,9 +25,9 @@ from keyss.cli.arguments import (
     Ray,
     Resume,
     Training,
-    check_there,
+    changed_flags,
+    check_exists,
     flag,
-    given,
     optional,
     switch,
 )
@@ -59,7 +59,7 @@ class Details:
     ] = None
     bound: Annotated[
         bool,
-        switch("Also fit plain 3DGS of as many Gaussians and steps to compare with; takes twice as long."),
+        switch("Also fit upper bounds, plain 3DGS with equal Gaussians and steps; takes twice as long."),
     ] = False
     channel: Annotated[
         Literal["appended", "colours"] | None,
@@ -201,7 +201,7 @@ def _hide_scenes(args: HideArguments, cover: Path) -> None:
     _warn_of_idle(idle, result.metrics.iterations)
     what = "the cover with the secret in it" if options.trains or method.capabilities.keys else "the cover"
     assert result.stego is not None
-    appended = bool(is_appended(result.stego).any())  # also where nothing goes in unnoticed
+    appended = bool(is_appended(result.stego).any())  # true if "as-is" fell back to "any"
     how = _HOW_TO_PUBLISH[options.place.survives or appended]
     print_files(
         args.out,
@@ -222,7 +222,7 @@ def _hide_scenes(args: HideArguments, cover: Path) -> None:
 
 
 def _secrets(args: HideArguments, method: Method) -> list[Any]:
-    """The scenes to hide, with their keys and models."""
+    """The secrets with their keys and models."""
     import keyss
     from keyss.core.errors import InputError, UsageError
     from keyss.files.foreign import what_it_is
@@ -251,19 +251,21 @@ def _keys(args: HideArguments, count: int) -> list[str]:
 
 
 def _idle_without_training(args: HideArguments, cover: Path) -> str:
-    """The given options that only affect training, if models of all scenes are given; otherwise empty."""
+    """The given options that only affect training, if all scenes are models; otherwise empty."""
     from keyss.rendering.orbit import is_model
 
     sources = [args.details.cover_model or cover, *(args.details.secret_model or args.secret)]
     if not all(map(is_model, sources)):
         return ""
     preset = ["--preset"] if args.preset != "default" else []
-    flags = (flag for flag in given(args.training) if flag in ("--iterations", "--max-gaussians", "--live"))
+    flags = (
+        flag for flag in changed_flags(args.training) if flag in ("--iterations", "--max-gaussians", "--live")
+    )
     return " and ".join([*preset, *flags])
 
 
 def _warn_of_idle(idle: str, steps: int) -> None:
-    """Warn of options that had no effect, if no step was trained."""
+    """Warn of options without effect if there was no training."""
     if idle and not steps:
         print(
             f"keyss: warning: {idle} had no effect: the secrets fit as they are, and nothing is trained",
@@ -272,7 +274,7 @@ def _warn_of_idle(idle: str, steps: int) -> None:
 
 
 def _method_options(args: HideArguments) -> MethodOptions:
-    """The preset, overridden by the options of the command line."""
+    """The preset with the options of the command line."""
     from keyss.methods.registry import options_of
 
     known = own_options(args.method)
@@ -358,14 +360,14 @@ def _refuse(args: HideArguments, mode: str, used: str, own: Sequence[str] = ()) 
     """Raise UsageError for a given option that `mode` does not use."""
     from keyss.core.errors import UsageError
 
-    names = {flag.removeprefix("--").replace("-", "_"): flag for flag in given(args)}
+    names = {flag.removeprefix("--").replace("-", "_"): flag for flag in changed_flags(args)}
     if unused := [flag for name, flag in names.items() if name not in (*used.split(), *own)]:
         instead = ", or give the cover and the secret of one row" * (unused[0] == "--dry-run")
         raise UsageError(f"{mode} does not use {unused[0]}: leave out {unused[0]}{instead}")
 
 
 def with_options_of_method(arguments: Sequence[str]) -> Callable[..., None]:
-    """`hide` as it is parsed: with the options of the method that `arguments` choose, and no others.
+    """`hide` with the options of the method in `arguments`, for the parser.
 
     Raises UsageError for an option that only another method has.
     """
@@ -404,20 +406,17 @@ def with_options_of_method(arguments: Sequence[str]) -> Callable[..., None]:
 
 
 def _check_without_torch(args: HideArguments) -> None:
-    """Refuse wrong options and missing files before torch is imported, the slowest part of the start.
-
-    Raises UsageError and InputError.
-    """
+    """Check options and files before the slow import of torch. Raises UsageError and InputError."""
     from keyss.core.errors import UsageError
 
-    check_there(args.cover, args.details.cover_model, args.batch.batch, args.batch.master_key_file)
-    check_there(*args.secret, *args.secret_file, *args.key_file, *args.details.secret_model)
+    check_exists(args.cover, args.details.cover_model, args.batch.batch, args.batch.master_key_file)
+    check_exists(*args.secret, *args.secret_file, *args.key_file, *args.details.secret_model)
     _method_options(args)
     if args.batch.batch is not None:
         return
     if args.cover is None:
         raise UsageError("no cover: give --cover SCENE, or --batch CSV for many hidings")
-    if only_for_many := given(args.batch):
+    if only_for_many := changed_flags(args.batch):
         raise UsageError(f"{only_for_many[0]} is for many hidings: give --batch CSV, or leave it out")
     if not (args.secret_file or args.secret):
         raise UsageError("no secret: give --secret SCENE or --secret-file FILE, one for each secret")
@@ -433,7 +432,7 @@ def _own_field(named: tuple[str, tuple[Any, CommandLineOption]]) -> tuple[str, A
 
 
 def own_options(method: str) -> dict[str, tuple[Any, CommandLineOption]]:
-    """Types and descriptions of the fields of a method's options that the command line has."""
+    """Types and descriptions of a method's options on the command line."""
     from keyss.methods.base import CommandLineOption
     from keyss.methods.registry import options_of
 

@@ -1,4 +1,4 @@
-"""Where keys come from: files, the environment or a prompt, but never arguments, which others can see."""
+"""Read keys from files, the environment or a prompt, but never from arguments, which others can see."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ VARIABLE = "KEYSS_KEY"
 
 
 def keys(files: Sequence[Path], count: int, *, confirm: bool = False) -> list[str]:
-    """`count` keys: from `files`, else from the environment, else from a prompt.
+    """Read `count` keys from `files`, else from the environment, else from a prompt.
 
-    `confirm`: prompt twice, for keys to hide with. Raises UsageError if the numbers differ or there is no
-    terminal for a prompt, InputError for a file without a key.
+    `confirm`: prompt twice. Raises UsageError if `files` are not `count` or there is no terminal for a
+    prompt, InputError for a file without a key.
     """
     if files and len(files) != count:
         expected = "one --key-file" if count == 1 else f"one --key-file for each of {count} secrets"
@@ -33,7 +33,7 @@ def keys(files: Sequence[Path], count: int, *, confirm: bool = False) -> list[st
         return given
     if not sys.stdin.isatty():
         raise UsageError(f"no key: give --key-file FILE, set {VARIABLE}, or run in a terminal for a prompt")
-    return [_prompted(f"Key {i + 1} of {count}" if count > 1 else "Key", confirm) for i in range(count)]
+    return [_prompt(f"Key {i + 1} of {count}" if count > 1 else "Key", confirm) for i in range(count)]
 
 
 def given_keys(files: Sequence[Path]) -> list[str]:
@@ -68,7 +68,7 @@ def warn_of_weak_keys(chosen: Sequence[str]) -> None:
 
 
 def key_of_file(path: Path) -> str:
-    """The key in a file; warns if others can read it. Raises InputError for a file without a key."""
+    """Read a key file; warns if others can read it. Raises InputError for a file without a key."""
     key = read_key(path)
     mode = path.stat().st_mode
     if os.name == "posix" and stat.S_ISREG(mode) and mode & (stat.S_IRGRP | stat.S_IROTH):
@@ -79,7 +79,7 @@ def key_of_file(path: Path) -> str:
     return key
 
 
-def _prompted(prompt: str, confirm: bool) -> str:
+def _prompt(prompt: str, confirm: bool) -> str:
     try:
         key = normalized_key(getpass.getpass(f"{prompt}: "))
         if confirm and normalized_key(getpass.getpass(f"{prompt} again: ")) != key:

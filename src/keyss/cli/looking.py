@@ -14,8 +14,8 @@ from keyss.cli.arguments import (
     Overwrite,
     Photos,
     Run,
+    check_exists,
     check_run,
-    check_there,
     optional,
     switch,
 )
@@ -48,7 +48,7 @@ def view(
     ] = None,
     embed_in: Annotated[
         str | None,
-        optional("ORIGIN", "Site that frames the page and is told when a key opens something.", "none"),
+        optional("ORIGIN", "Site that may frame the page, and receives an event when a key opens.", "none"),
     ] = None,
     overwrite: Overwrite = False,
 ) -> None:
@@ -60,7 +60,7 @@ def view(
 
     example: keyss view runs/hidden/publish/model.ply -o page.html
     """
-    check_there(model)
+    check_exists(model)
     from keyss.core.errors import UsageError
     from keyss.viewer import ModelServer, export_html, look_of_model
 
@@ -108,7 +108,7 @@ def render(
 
     example: keyss render model.ply --wipe secret.ply --cameras SCENE_A --video video.mp4
     """
-    check_there(model, cameras)
+    check_exists(model, cameras)
     from keyss.core.errors import UsageError
 
     if video is not None and (out is not None or split != "test"):
@@ -158,9 +158,9 @@ def evaluate(
 ) -> None:
     """Measure PSNR, SSIM and LPIPS of a run again, with the right keys and wrong ones.
 
-    Test views are photos that were held out of training or, for a model, renders of it. Each measurement is
-    compared with its bound: plain 3DGS of as many Gaussians and as many training steps (`keyss hide --bound`
-    fits it), or the plain model that the scene started from. The chance level is the PSNR of the stego model
+    Test views are photos held out of training or, for a model, renders of it. Each measurement is compared
+    with its upper bound, plain 3DGS of as many Gaussians and training steps (`keyss hide --bound` fits it),
+    or with the plain model from which training started. The chance level is the PSNR of the stego model
     itself to the secret; a wrong key should not exceed it.
 
     example: keyss evaluate runs/hidden --key-file key.txt

@@ -17,8 +17,8 @@ from keyss.cli.arguments import (
     Preset,
     Resume,
     Training,
-    check_there,
-    checked_seed,
+    check_exists,
+    check_seed,
     optional,
     switch,
 )
@@ -31,9 +31,9 @@ def demo(
     device: Device = "auto",
     seed: Annotated[int, arg(metavar="N", help="Seed of all random numbers, the demo's key included.")] = 0,
 ) -> None:
-    """Hide one made-up scene in another and open it again, in about a minute.
+    """Hide one synthetic scene in another and open it again, in about a minute.
 
-    Both are compared with plain 3DGS of as many Gaussians and as many training steps.
+    Compares both with plain 3DGS of equal numbers of Gaussians and training steps.
 
     example: keyss demo -o out/demo
     """
@@ -41,7 +41,7 @@ def demo(
     from keyss.demo import WRONG_KEYS, run_demo
     from keyss.progress import reporter
 
-    result = run_demo(out, seed=checked_seed(seed), device=device, overwrite=overwrite, reporter=reporter())
+    result = run_demo(out, seed=check_seed(seed), device=device, overwrite=overwrite, reporter=reporter())
     print_hiding(result.metrics)
     print(f"Wrong keys refused: {result.refused} of {len(WRONG_KEYS)}.")
     print_files(
@@ -76,7 +76,7 @@ def fit(
 
     example: keyss fit SCENE -o runs/cover --live
     """
-    check_there(scene)
+    check_exists(scene)
     from dataclasses import replace
 
     import keyss
@@ -175,7 +175,7 @@ def convert(
 
     example: keyss convert model.ply model.sog --key-file key.txt --dry-run
     """
-    check_there(model, *key_file)
+    check_exists(model, *key_file)
     import sys
 
     import keyss

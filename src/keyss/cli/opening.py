@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, UseAppendAction, arg
 
-from keyss.cli.arguments import Device, Overwrite, check_there, optional, switch
+from keyss.cli.arguments import Device, Overwrite, check_exists, optional, switch
 
 
 def reveal(
@@ -44,14 +44,14 @@ def reveal(
 
     example: keyss reveal - --key-file key.txt -o - < model.ply > secret.ply
     """
-    check_there(stego, handed, *key_file)
+    check_exists(stego, handed, *key_file)
     import keyss
     from keyss.cli.keys import keys
 
     key: str | None = None
     if handed is not None:
-        from keyss.runs.revealing import is_sealed  # imports torch
-    if handed is None or key_file or is_sealed(handed):
+        from keyss.runs.revealing import is_encrypted  # imports torch
+    if handed is None or key_file or is_encrypted(handed):
         (key,) = keys(key_file, 1)
     from keyss.files.reading import is_standard
     from keyss.progress import waiting
@@ -91,7 +91,7 @@ def verify(
 
     example: keyss verify model.ply --key-file key.txt
     """
-    check_there(model, key_file)
+    check_exists(model, key_file)
     import keyss
     from keyss.cli.keys import given_keys
     from keyss.cli.tables import print_json, print_verification

@@ -1,8 +1,8 @@
 """The process of the command line: signals, standard streams, exit.
 
-Python raises an exception at any point on Ctrl-C. During an import this prints a traceback, or crashes native
-libraries such as torch's that are half loaded, also at the interpreter's shutdown. Therefore this module
-imports little, installs signal handlers before anything else is imported, and ends the process itself.
+On Ctrl-C, Python raises an exception at any point. During imports and at the interpreter's shutdown this
+prints a traceback or crashes half-loaded native libraries. Therefore this module imports little, installs
+signal handlers before other imports, and ends the process itself.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from keyss._interrupts import ENDING
 _IMPORTING = "<frozen importlib._bootstrap>"
 _CLEAR_LINE = b"\r\x1b[K\x1b[?25h"  # and show the cursor, which progress lines hide
 REPLACING = "keyss.replacing"  # a handler of encoding errors
-# For characters that an output cannot encode, such as one in ASCII or an old code page.
+# Replacements of characters that an output's encoding lacks, such as ASCII or an old code page.
 _PLAIN = {
     **dict.fromkeys("•·×", "*"),
     **dict.fromkeys("─━╸╺╴╶—–−", "-"),
@@ -48,7 +48,7 @@ class _Process:
     def __init__(self) -> None:
         self.received: int | None = None  # the first signal
         self.running = False  # inside a command, which cleans up on an interrupt
-        self.status: int | None = None  # of the command, once it is done
+        self.status: int | None = None  # exit status; None while the command runs
 
     def run(self) -> NoReturn:
         for signum in ENDING:
@@ -76,7 +76,7 @@ class _Process:
 
     def on_signal(self, signum: int, frame: FrameType | None) -> None:
         if self.status is not None:
-            os._exit(self.status)  # the command is done, the interpreter is shutting down
+            os._exit(self.status)  # the interpreter is shutting down
         first, self.received = self.received is None, self.received or signum
         if not (first and self.running) or _is_importing(frame):
             self.end(self.received)
@@ -89,7 +89,7 @@ class _Process:
         sys.__unraisablehook__(unraisable)
 
     def end(self, signum: int) -> NoReturn:
-        """Exit at once with one line, since anything may be half done."""
+        """Exit immediately with one line: any operation may be incomplete."""
         line = f"keyss: {'interrupted' if signum == signal.SIGINT else 'terminated'}\n".encode()
         try:
             os.write(2, _CLEAR_LINE * os.isatty(2) + line)
@@ -106,7 +106,7 @@ def _is_importing(frame: FrameType | None) -> bool:
 
 
 class _Unfailing(io.FileIO):
-    """A stream for messages, which are dropped if they cannot be written."""
+    """A stream that drops messages on write errors."""
 
     def write(self, data: Any) -> int:
         try:
@@ -116,10 +116,10 @@ class _Unfailing(io.FileIO):
 
 
 def prepare_streams() -> None:
-    """Make sure that the standard streams are open and accept every character.
+    """Ensure that the standard streams are open and accept every character.
 
-    A closed stream is opened on the null device. Otherwise the next opened file would get its descriptor, and
-    messages would be written into a result.
+    Closed streams are opened on the null device: otherwise the next opened file would get their descriptor,
+    and receive messages.
     """
     for number in range(3):
         try:
@@ -139,7 +139,7 @@ def prepare_streams() -> None:
 
 
 def _replace(error: UnicodeError) -> tuple[str | bytes, int]:
-    """A similar character or `?`; undecodable bytes of a file name stay as they are."""
+    """A similar character or `?`; undecodable bytes of a file name do not change."""
     if not isinstance(error, UnicodeEncodeError):
         raise error
     first = error.object[error.start]

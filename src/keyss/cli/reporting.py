@@ -12,12 +12,12 @@ from keyss.cli.arguments import Training
 from keyss.core.errors import import_extra
 from keyss.progress import Reporter, reporter as lines
 
-FOLDER = "private/tensorboard"  # of a run: losses may reveal something about a secret
+FOLDER = "private/tensorboard"  # relative to a run; private, since losses may reveal something about a secret
 
 
 @contextmanager
 def reporting(out: Path, scene: Path, training: Training) -> Iterator[Reporter]:
-    """The reporter of `fit` and `hide`. With --live, a page shows the training while the context is open.
+    """The reporter of `fit` and `hide`. With --live, a page shows the training within the context.
 
     Raises BackendError if TensorBoard is not installed, OutputError if the page cannot be served.
     """
@@ -36,10 +36,10 @@ def reporting(out: Path, scene: Path, training: Training) -> Iterator[Reporter]:
 
 
 class TensorBoardReporter(Reporter):
-    """Reports to `lines` and to event files in the run's folder `out`, where each training has a subfolder.
+    """Reports to `lines` and to event files in the run's folder `out`, in a subfolder for each training.
 
-    Files are opened when a training starts, since the run's folder exists by then, and closed at its end.
-    Raises BackendError if TensorBoard is not installed.
+    Files are opened when a training starts, because the run's folder does not exist earlier. Raises
+    BackendError if TensorBoard is not installed.
     """
 
     loss_every = 10  # steps

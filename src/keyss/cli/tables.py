@@ -1,4 +1,4 @@
-"""What commands print at their end."""
+"""Final output of commands."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Console(RichConsole):
 
 
 def print_hiding(metrics: HideMetrics, console: Console | None = None, *, brief: bool = False) -> None:
-    """The measurements of a hiding: a row for each scene with its bound, then the others unless `brief`."""
+    """Print the measurements of a hiding: a row per scene, then the rest unless `brief`."""
     names = ["cover", "secret"]
     if len(metrics.secrets) > 1:
         names = ["cover", *(f"secret {number}" for number, _ in enumerate(metrics.secrets, start=1))]
@@ -51,7 +51,7 @@ def print_hiding(metrics: HideMetrics, console: Console | None = None, *, brief:
     table = [[name, *(row.get(head, "") for head in heads)] for name, row in zip(first, rows, strict=True)]
     console = console or Console()
     print_table([views, *heads], table, console=console)
-    for line in _reached(metrics, names) if brief else _explanations(metrics, names, heads):
+    for line in _lines_on_files(metrics, names) if brief else _explanations(metrics, names, heads):
         console.print(line, highlight=False, markup=False)
     if brief:
         return
@@ -79,7 +79,7 @@ def _scene_rows(metrics: HideMetrics) -> list[dict[str, str]]:
         if own.lpips is not None:
             row["LPIPS"] = f"{own.lpips:.3f}"
         row["Gaussians"] = f"{size:,}"
-        if not photos:  # the test views are renders of the given model, so there is no bound
+        if not photos:  # test views are renders of the given model: no upper bound
             plain = steps = None
         if steps is not None:
             row["steps"] = f"{steps:,}"
@@ -94,13 +94,13 @@ def _scene_rows(metrics: HideMetrics) -> list[dict[str, str]]:
 
 
 def _sizes_differ(metrics: HideMetrics, tolerance: float = 0.0) -> bool:
-    """True if a plain model has another number of Gaussians than its scene, beyond a share of these."""
+    """True if numbers of Gaussians of a scene and its plain model differ by more than a `tolerance` share."""
     sizes = zip([metrics.gaussians, *metrics.secret_gaussians], metrics.baseline.gaussians, strict=True)
     return any(plain is not None and abs(plain - own) > tolerance * own for own, plain in sizes)
 
 
 def print_plan(plan: Plan) -> None:
-    """Stages, room and estimates of a run that has not begun."""
+    """Print stages, room and estimates of a run."""
     rows = [
         (
             stage.name,
@@ -139,14 +139,14 @@ def _explanations(metrics: HideMetrics, names: Sequence[str], heads: Sequence[st
     if "plain" in heads:
         lines.append("Plain: Gaussians of the plain model.")
     if "bound" in heads:
-        lines.append(f"Bound: PSNR of plain 3DGS of {size} and as many training steps.")
+        lines.append(f"Bound: upper bound, plain 3DGS with {size} and the same steps.")
     if "start" in heads:
         baseline = metrics.baseline
         pairs = zip(baseline.steps, baseline.equal, strict=False)
         shorter = {steps for steps, equal in pairs if steps is not None and not equal}
         fewer = " or ".join(f"{steps:,}" for steps in sorted(shorter)) or "fewer"
         lines.append(
-            f"Start: PSNR of a plain model of {size} and {fewer} training steps, which is no bound; `keyss "
+            f"Start: PSNR of a plain model with {size} and {fewer} training steps, no upper bound; `keyss "
             "hide --bound` fits one."
         )
     if (wrong := metrics.wrong_key) is not None:
@@ -161,10 +161,10 @@ def _explanations(metrics: HideMetrics, names: Sequence[str], heads: Sequence[st
             f"Chance level: {chance}, PSNR of the stego model itself to the secret; no wrong key should "
             "exceed it."
         )
-    return lines + _reached(metrics, names)
+    return lines + _lines_on_files(metrics, names)
 
 
-def _reached(metrics: HideMetrics, names: Sequence[str]) -> list[str]:
+def _lines_on_files(metrics: HideMetrics, names: Sequence[str]) -> list[str]:
     """A line on the published file, and one on each secret."""
     lines = []
     reached = (f"{name} {each.psnr:.1f}" for name, each in zip(names, metrics.against_plain, strict=True))
@@ -185,7 +185,7 @@ def _reached(metrics: HideMetrics, names: Sequence[str]) -> list[str]:
 
 
 def print_fit(metrics: FitMetrics) -> None:
-    """The numbers of a plain fit."""
+    """Print the numbers of a plain fit."""
     quality = {"PSNR": f"{metrics.psnr:.2f}", "SSIM": f"{metrics.ssim:.3f}"}
     if metrics.lpips is not None:
         quality["LPIPS"] = f"{metrics.lpips:.3f}"
@@ -224,7 +224,7 @@ def print_verification(found: Verification) -> None:
 
 
 def print_conversion(out: str, found: Conversion, *, dry_run: bool, file: TextIO) -> None:
-    """The cost of a conversion: size, PSNR of renders, and what is left of the secrets."""
+    """Print the cost of a conversion: size, PSNR of renders, and the parts of secrets that are left."""
     was = "" if found.bytes_before is None else f", {_size(found.bytes_before)} before"
     renders = "renders unchanged" if found.psnr >= 120 else f"renders at {found.psnr:.1f} dB PSNR"
     if math.isnan(found.psnr):
@@ -251,7 +251,7 @@ def print_conversion(out: str, found: Conversion, *, dry_run: bool, file: TextIO
 def print_outcome(
     errors: Mapping[str, str], count: int, what: str, as_said: Callable[[str], str] = str
 ) -> None:
-    """How many of `count` are done, and the errors of the others by name. Raises InputError for errors."""
+    """Print the number of results and the `errors` by name. Raises InputError if there are errors."""
     print(f"{count - len(errors)} of {count} {what} are done")
     for name, error in errors.items():
         print(f"failed: {name}: {as_said(error)}")
@@ -260,7 +260,7 @@ def print_outcome(
 
 
 def print_json(facts: object) -> None:
-    """A record as JSON, in ASCII where the standard output cannot encode its text."""
+    """Print a record as JSON, in ASCII if the standard output cannot encode it."""
     text = record_bytes(facts).decode()
     try:
         text.encode(sys.stdout.encoding or "utf-8")
@@ -274,12 +274,12 @@ def _size(count: int) -> str:
 
 
 def print_files(folder: Path, names: Mapping[str, str]) -> None:
-    """The paths and descriptions of the results that exist."""
+    """Print paths and descriptions of the results that exist."""
     _print_columns([(str(folder / name), text) for name, text in names.items() if (folder / name).exists()])
 
 
 def _print_columns(rows: Sequence[tuple[str, str]]) -> None:
-    """Two columns of plain text: paths must not be wrapped, however narrow the terminal."""
+    """Print two columns of plain text. Paths are never wrapped."""
     width = max((len(name) for name, _ in rows), default=0)
     for name, text in rows:
         print(f"{name:<{width}}  {text}")
@@ -288,23 +288,25 @@ def _print_columns(rows: Sequence[tuple[str, str]]) -> None:
 def print_table(
     heads: Sequence[str], rows: Iterable[Sequence[str]], *, texts: int = 1, console: Console | None = None
 ) -> None:
-    """A table whose first `texts` columns are aligned left; the others hold numbers.
+    """Print a table; its first `texts` columns are aligned left, the others hold numbers.
 
-    Cells wrap between words. Where that is not enough for the terminal, each row becomes a list.
+    Cells wrap between words. If the terminal is too narrow, each row becomes a list.
     """
     console, rows = console or Console(), list(rows)
     columns = list(zip(heads, *rows, strict=True))
-    least = [max(cell_len(word) for cell in cells for word in cell.split() or [""]) for cells in columns]
+    needed = [max(cell_len(word) for cell in cells for word in cell.split() or [""]) for cells in columns]
     widths = [max(map(cell_len, cells)) for cells in columns]
     gaps = 2 * (len(heads) - 1)
-    if sum(least) + gaps > console.width:
+    if sum(needed) + gaps > console.width:
         for row in rows:
             for head, cell in zip(heads, row, strict=True):
                 console.print(f"{head}: {cell}", highlight=False, markup=False)
             console.print()
         return
     while sum(widths) + gaps > console.width:
-        widths[max(range(len(widths)), key=lambda index: (widths[index] > least[index]) * widths[index])] -= 1
+        widths[
+            max(range(len(widths)), key=lambda index: (widths[index] > needed[index]) * widths[index])
+        ] -= 1
     table = Table(box=None, pad_edge=False, header_style="bold", padding=(0, 2, 0, 0))
     for index, (head, width) in enumerate(zip(heads, widths, strict=True)):
         table.add_column(head, justify="left" if index < texts else "right", width=width)

@@ -19,7 +19,7 @@ Words = npt.NDArray[np.uint64]
 Integers = npt.NDArray[np.int64]
 Floats = npt.NDArray[np.float32]
 Doubles = npt.NDArray[np.float64]
-Numbers = npt.NDArray[Any]  # of any kind
+Numbers = npt.NDArray[Any]  # any dtype
 
 
 def doubles(values: Tensor) -> Doubles:

@@ -12,7 +12,7 @@ from torch import Tensor
 from keyss.core.gaussians import Gaussians
 
 MAX_FEATURES = 32  # channels that rasterizers render at once
-MAX_LAYERS, MAX_CHANNELS = 16, 256  # of a network: limits the memory for files of others
+MAX_LAYERS, MAX_CHANNELS = 16, 256  # per network: bounds the memory for untrusted files
 Layers = tuple[tuple[Tensor, Tensor], ...]  # weight [out, in, 3, 3] and bias [out] of each
 
 

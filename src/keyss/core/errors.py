@@ -18,8 +18,8 @@ OPENS_NOTHING = (
     "this key opens nothing here: it may be another key or misspelt; the model may have changed since it was "
     "published (converted or quantised, moved, scaled, pruned, edited or trained on); or nothing is hidden"
 )
-_PACKAGES = {"ot": "pot", "sklearn": "scikit-learn", "yaml": "pyyaml"}  # by module, if the names differ
-MAX_LENGTH = 100  # characters of a word that is compared
+_PACKAGES = {"ot": "pot", "sklearn": "scikit-learn", "yaml": "pyyaml"}  # module: package, if the names differ
+MAX_LENGTH = 100  # characters; longer words are not compared
 
 
 class KeyssError(Exception):

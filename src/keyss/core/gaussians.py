@@ -17,10 +17,10 @@ from torch import Tensor
 OPPONENT = np.array([[1, 1, 1], [1, -1, 0], [1, 1, -2]]) / np.sqrt([[3], [2], [6]])
 SH_C0 = 0.28209479177387814  # the constant SH basis function
 DRAWN_OPACITY = 1 / 255  # 3DGS rasterizers skip Gaussians below it
-# Beyond these values, projecting a Gaussian overflows in single precision, and it is not rendered.
+# Rasterizers skip Gaussians beyond these limits, whose projection would overflow in single precision.
 MAX_COORDINATE, MAX_LOG_SCALE, MAX_LENGTH, MAX_COLOUR = 1e15, 40.0, 1.8e19, 1e12
 _GROWTH = 0.25  # exponent; the best of 0 to 0.5 on the scenes bonsai and fox with 25 and 50 % lost
-_MAX_LOST = 0.9  # share; greater losses are compensated like this one
+_MAX_LOST = 0.9  # share; greater losses are compensated like 90 %
 _MIN_LOST = 0.01  # share; smaller losses are not compensated
 
 
@@ -67,7 +67,7 @@ class Gaussians:
         """[N] bool, True for Gaussians that rasterizers skip because their values are too large."""
         limits = (MAX_COORDINATE, MAX_LENGTH / 2, MAX_LOG_SCALE, math.inf, MAX_COLOUR / 2)
         if all(magnitude(getattr(self, f.name)) <= at for f, at in zip(fields(self), limits, strict=True)):
-            return torch.zeros(len(self), dtype=torch.bool, device=self.device)  # of nearly every model
+            return torch.zeros(len(self), dtype=torch.bool, device=self.device)  # the common case
         far = ~(self.means.abs() <= MAX_COORDINATE).all(1)
         large = ~(self.log_scales <= MAX_LOG_SCALE).all(1)
         long = ~(self.quats.double().norm(dim=1) <= MAX_LENGTH)
@@ -124,13 +124,13 @@ class Gaussians:
 
 
 def magnitude(values: Tensor) -> float:
-    """The largest absolute value of a tensor; NaN if there is one in it, 0 of nothing."""
-    least, most = values.aminmax() if values.numel() else (values.new_zeros(()), values.new_zeros(()))
-    return float(torch.maximum(-least, most))
+    """The largest absolute value of a tensor: NaN if it contains NaN, 0 if it is empty."""
+    low, high = values.aminmax() if values.numel() else (values.new_zeros(()), values.new_zeros(()))
+    return float(torch.maximum(-low, high))
 
 
 def same_bits(one: Gaussians, other: Gaussians) -> bool:
-    """True if two plain models are equal to the bit, in the same order."""
+    """True if two plain models are bitwise equal, in the same order."""
     if not type(one) is type(other) is Gaussians:
         return False
     if (len(one), one.sh_degree) != (len(other), other.sh_degree):
@@ -140,10 +140,10 @@ def same_bits(one: Gaussians, other: Gaussians) -> bool:
 
 
 def compensate_pruning(gaussians: Gaussians, count: int) -> Gaussians:
-    """Make the remaining Gaussians of a model that had `count` denser and larger, to cover as much as before.
+    """Enlarge the remaining Gaussians of a pruned model that had `count`, and raise their opacities.
 
     If a share p remains, opacities become 1 - (1 - opacity)^(1 / p), and the standard deviations grow by
-    p^-0.25. For a quarter of a model, this recovers 0.4 to 1 dB of the 2 to 4 dB that were lost. Returns
+    p^-0.25. With a quarter of a model left, this recovers 0.4 to 1 dB of the 2 to 4 dB lost. Returns
     `gaussians` unchanged if fewer than 1 % were lost or `count` is 0 (unknown).
     """
     share = max(len(gaussians) / max(count, 1), 1 - _MAX_LOST)

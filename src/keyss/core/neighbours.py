@@ -1,4 +1,4 @@
-"""Nearest neighbours, in time that does not grow with the square of equal points, as in hostile files."""
+"""Nearest neighbours, in subquadratic time even if all points are equal, as in hostile files."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from keyss.core.arrays import Doubles, Integers
 
 
 def nearest_neighbours(points: Doubles, count: int, among: Doubles | None = None) -> tuple[Doubles, Integers]:
-    """Distances and indices [N, count] of the nearest of `among` [M, D], by default of the `points` [N, D].
+    """Distances and indices [N, count] of the nearest rows of `among` [M, D], by default `points` [N, D].
 
-    Of more than `count` equal points the first ones are found. `count` must be at most M.
+    Among equal points, the first ones win. `count` must be at most M.
     """
-    from scipy.spatial import cKDTree  # slow to import, and most commands need no neighbours
+    from scipy.spatial import cKDTree  # slow to import
 
     among = points if among is None else among
     # A tree cannot split equal points: each query would compare all of them.

@@ -13,8 +13,8 @@ from torch import Tensor
 from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
 
-# Least depth, in world units, that is rendered of scenes whose cameras are that far from each other, or more;
-# of smaller ones in proportion.
+# Near plane, in world units, of scenes with at least ORDINARY_EXTENT between cameras. Smaller scenes have a
+# proportionally smaller one.
 NEAR, ORDINARY_EXTENT = 0.01, 0.5
 
 # Weight of the fallback point in `focus_point`, against a mean of projections with eigenvalues of at most 1:
@@ -31,7 +31,7 @@ class Camera:
     width: int
     height: int
     name: str = ""
-    near: float = NEAR  # least depth that is rendered, in world units
+    near: float = NEAR  # near plane, in world units
 
     @property
     def position(self) -> Tensor:
@@ -85,8 +85,8 @@ class Scene:
     test: tuple[View, ...]
     points: Tensor  # [P, 3] float32 sparse reconstruction, may be empty
     colors: Tensor  # [P, 3] uint8 sRGB colours of the points
-    background: Tensor = field(default_factory=lambda: torch.zeros(3))  # [3] in [0, 1], behind everything
-    # [3] float64: where the scene's frame begins in the frame of its files, if that is not the same one.
+    background: Tensor = field(default_factory=lambda: torch.zeros(3))  # [3] in [0, 1]
+    # [3] float64: origin of the scene's frame in the frame of its files.
     origin: Tensor = field(default_factory=lambda: torch.zeros(3, dtype=torch.float64))
 
     @property
@@ -98,8 +98,8 @@ class Scene:
     def extent(self) -> float:
         """1.1 x the largest distance of a training camera from their mean (3DGS's `cameras_extent`).
 
-        If all cameras are in one place, their distance from the scene: with an extent of 0 nothing would
-        move.
+        If all cameras are in one place, 1.1 x their distance from the scene: an extent of 0 would stop
+        training.
         """
         cameras = [view.camera for view in self.train]
         positions = camera_positions(cameras)
@@ -109,8 +109,8 @@ class Scene:
             reach = float((positions[0].double() - centre).norm())
         return 1.1 * reach
 
-    def localised(self, model: Gaussians) -> Gaussians:
-        """`model` in the scene's frame, which it may be in already, or in that of the scene's files."""
+    def to_scene_frame(self, model: Gaussians) -> Gaussians:
+        """`model` in the scene's frame; it may be in this frame already, or in that of the scene's files."""
         if not self.origin.any():
             return model
         middle = model.means.detach().double().cpu().median(0).values
@@ -145,9 +145,8 @@ def camera_axes(cameras: Sequence[Camera], row: int) -> Tensor:
 def focus_point(cameras: Sequence[Camera]) -> Tensor:
     """[3] float64 point nearest to all viewing axes, in the least-squares sense.
 
-    If the axes are nearly parallel, or meet behind most cameras, it is the point in front of the mean camera,
-    at the mean distance of the cameras from that (1 if all are in one place). Raises ValueError without
-    cameras.
+    If the axes are nearly parallel, or meet behind most cameras, the point lies in front of the mean camera,
+    at the cameras' mean distance from it (1 if all are in one place). Raises ValueError without cameras.
     """
     if not cameras:
         raise ValueError("cameras: expected at least one, got none")

@@ -140,8 +140,8 @@ def align(secret_cameras: Sequence[Camera], cover_cameras: Sequence[Camera]) -> 
 
     It maps the secret's focus point to the cover's, and makes the mean distances of the cameras from it and
     the up directions equal. The rotation about the up direction makes the mean headings equal if both
-    captures have one (a half ring has, a full ring has not), and is as small as possible otherwise. Without
-    an up direction, nothing is rotated.
+    captures have one (a half ring does, a full ring does not), and is as small as possible otherwise. Without
+    an up direction, the rotation is the identity.
 
     Raises ValueError when either set is empty.
     """

@@ -1,4 +1,4 @@
-"""The demo: one synthetic scene is hidden in another and revealed with its key; wrong keys are refused."""
+"""The demo: hides one synthetic scene in another, reveals it with its key, and tries wrong keys."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ VIEWER = "index.html"
 class DemoResult:
     """The measurements of the demo."""
 
-    metrics: HideMetrics  # as in metrics.json
-    refused: int  # how many of the wrong keys were refused
+    metrics: HideMetrics  # content of metrics.json
+    refused: int  # number of wrong keys that opened nothing
 
 
 def run_demo(
@@ -52,12 +52,12 @@ def run_demo(
 ) -> DemoResult:
     """Hide one scene in the other, open it, and write a comparison picture and a viewer page to `out`.
 
-    `width`: of the photos in pixels, if smaller than they are. The key is `demo-key-SEED`, which is public.
-    On the CPU, the same seed gives the same `model.ply` and `secret.ply`. Raises KeyssError and its children;
-    on any exception, Ctrl-C included, the demo removes everything it wrote.
+    `width`: pixels to which photos are shrunk. The key is `demo-key-SEED`, which is public. On the CPU, the
+    same seed gives the same `model.ply` and `secret.ply`. Raises KeyssError. On any exception, Ctrl-C
+    included, the demo removes everything it wrote.
     """
     out = Path(out)
-    # Replaces everything an earlier demo wrote, and what was derived from it.
+    # Replaces all files of an earlier demo, those of other stages included.
     scenes = RunFolder(out, "scenes", {"seed": seed}, overwrite=overwrite)
     try:
         with scenes.work():
@@ -82,7 +82,7 @@ def run_demo(
         with results.work():
             revealed = keyss.reveal(out / STEGO, key, device=device).gaussians
             refused = sum(_is_refused(out / STEGO, wrong, device) for wrong in WRONG_KEYS)
-            there = results.write({WEB: _for_the_web(out, cover, secret, key, device)})
+            there = results.write({WEB: _hide_for_web(out, cover, secret, key, device)})
             converted = keyss.reveal(there / WEB, key, device=device).gaussians
             picture = io.BytesIO()
             comparison = _comparison(out, revealed, converted, cover, secret, metrics, device)
@@ -100,8 +100,8 @@ def run_demo(
         raise
 
 
-def _for_the_web(out: Path, cover: Scene, secret: Scene, key: str, device: Backend) -> Gaussians:
-    """The plain secret carried in the plain cover in a way that survives conversion to other formats."""
+def _hide_for_web(out: Path, cover: Scene, secret: Scene, key: str, device: Backend) -> Gaussians:
+    """Carry the plain secret in the plain cover so that it survives conversion to other formats."""
     plain_cover, plain_secret = (out / name for name in plain_names(1))
     hidden = keyss.hide(
         cover,

@@ -1,7 +1,7 @@
 """Adam with a learning rate for each number of a row, in one pass over memory on a CPU.
 
-It moves all Gaussians, also those outside the view. Skipping these ("selective" Adam, Mallick et al. 2024,
-"Taming 3DGS") saves no time here, because memory is then read with gaps, and costs quality
+It updates all Gaussians, including those outside the view. Skipping these ("selective" Adam, Mallick et al.
+2024, "Taming 3DGS") costs quality and saves no time here, because memory accesses are no longer contiguous
 (docs/performance.md).
 """
 
@@ -42,7 +42,7 @@ def _adam(
     mean_share, square_share, root, eps = constants
     width = len(rates)
     size = max(1, NUMBERS_PER_JOB // width) * width
-    steps = np.empty(size, np.float32)  # the rates of all numbers of a job, for rows are short
+    steps = np.empty(size, np.float32)  # rates for a whole job: rows are too short to vectorise
     for i in range(size):
         steps[i] = rates[i % width]
     while True:
@@ -60,13 +60,13 @@ def _adam(
         for i in range(len(p)):
             m[i] += mean_share * (g[i] - m[i])
             v[i] += square_share * (g[i] * g[i] - v[i])
-            # Rounded once, as in CUDA's Adam. With a step that is rounded before it is subtracted, numbers
-            # near zero would keep trailing zeros, which would tell models of keyss from others.
+            # Rounded once, as in CUDA's Adam. Rounding the step before the subtraction would leave trailing
+            # zeros in numbers near zero, which would identify models trained by keyss.
             quotient = m[i] / (np.sqrt(v[i]) * root + eps)
             p[i] = fused_multiply_add(-steps[i], quotient, p[i])
 
 
-def _as_written(name: str) -> Any:
+def _unwrap(name: str) -> Any:
     """A method of torch's optimizers without the wrapper that disables `torch.compile`.
 
     The wrapper loads torch's compiler, which takes a second.
@@ -83,10 +83,10 @@ class RowAdam(torch.optim.Adam):
     are torch's. On a CPU, results do not depend on the number of threads.
     """
 
-    add_param_group = _as_written("add_param_group")
-    load_state_dict = _as_written("load_state_dict")
-    state_dict = _as_written("state_dict")
-    zero_grad = _as_written("zero_grad")
+    add_param_group = _unwrap("add_param_group")
+    load_state_dict = _unwrap("load_state_dict")
+    state_dict = _unwrap("state_dict")
+    zero_grad = _unwrap("zero_grad")
 
     @torch.no_grad()
     def step(self, closure: None = None) -> None:  # type: ignore[override]
@@ -110,11 +110,11 @@ class RowAdam(torch.optim.Adam):
     def scale_rows(self, scale: Tensor) -> None:
         """Multiply the learning rate of each row by `scale` [N], until the next call.
 
-        It is part of the state: densification keeps it for rows that stay, and gives new ones 0.
+        The scale is part of the state: densification keeps it for remaining rows, and gives new rows 0.
         """
         group = self.param_groups[0]
         (parameter,) = group["params"]
-        self._initialized(parameter, group)["row_scale"] = scale.to(parameter).contiguous()
+        self._state_of(parameter, group)["row_scale"] = scale.to(parameter).contiguous()
 
     def _scale(self, parameter: Tensor, group: dict[str, Any]) -> Tensor | None:
         """The factor on the learning rate, broadcastable to the parameter; None: 1 everywhere."""
@@ -125,8 +125,8 @@ class RowAdam(torch.optim.Adam):
         rows = rows.view(-1, *[1] * (parameter.dim() - 1))
         return rows if scale is None else rows * scale
 
-    def _initialized(self, parameter: Tensor, group: dict[str, Any]) -> dict[str, Any]:
-        """The state of a parameter, which is torch's before the first step if there is none."""
+    def _state_of(self, parameter: Tensor, group: dict[str, Any]) -> dict[str, Any]:
+        """The state of a parameter, initialised as in torch before the first step."""
         state: dict[str, Any] = self.state[parameter]
         if not state:
             state["step"] = torch.tensor(0.0, device=parameter.device if group["fused"] else None)
@@ -135,7 +135,7 @@ class RowAdam(torch.optim.Adam):
         return state
 
     def _step_on_cpu(self, parameter: Tensor, group: dict[str, Any]) -> None:
-        state = self._initialized(parameter, group)
+        state = self._state_of(parameter, group)
         state["step"] += 1
         step = int(state["step"])
         beta1, beta2 = group["betas"]

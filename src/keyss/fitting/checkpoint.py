@@ -51,7 +51,7 @@ def pack_model(parameters: Parameters, optimizers: Optimizers, density: Mapping[
 def unpack_model(
     state: State, parameters: Parameters, optimizers: Optimizers, density: dict[str, Any]
 ) -> None:
-    """Restore the result of `pack_model`, whatever the present number of Gaussians is."""
+    """Restore the result of `pack_model`; the number of Gaussians may differ."""
     device = parameters["means"].device
     for name, old in list(parameters.items()):
         parameter = torch.nn.Parameter(state[name].to(device))

@@ -15,17 +15,16 @@ MAX_SEED = 2**48 - 1  # every reader of JSON represents it exactly
 class FitConfig:
     """Plain 3DGS (Kerbl et al. 2023, section 5 and appendix), with a schedule in fractions of the run.
 
-    The original has absolute step numbers. With fractions, 1,000 iterations grow, reach the full SH degree
-    and settle as 30,000 do.
+    The original has absolute step numbers. Fractions give 1,000 iterations the same phases as 30,000.
     """
 
     iterations: int = 1000
     max_gaussians: int = 30_000  # cap
     sh_degree: int = 3
     ssim_weight: float = 0.2  # lambda of the photometric loss
-    # None: a run samples one from the system, and nobody else can repeat the run.
+    # None: each run samples its own from the system.
     seed: int | None = None
-    views_per_step: int = 1  # whose mean loss a step minimises; rates do not depend on it
+    views_per_step: int = 1  # a step minimises their mean loss; rates do not depend on it
 
     means_rate: float = 1.6e-4  # times the scene's extent, decays to 1 % of it
     scales_rate: float = 5e-3
@@ -34,11 +33,11 @@ class FitConfig:
     sh0_rate: float = 2.5e-3
     shN_rate: float = 1.25e-4
 
-    # Factor on these rates at the start of a run, see `fitting.schedule`; None: by the number of steps.
+    # Factor on these rates at the start of a run, see `fitting.schedule`; None: depends on `iterations`.
     boost: float | None = None
 
-    # Share of the run, at its end, over which all rates decay to a tenth: at constant rates, Gaussians jitter
-    # around their optimum. Only models that do not grow gain by it (docs/performance.md).
+    # Last share of the run, in which all rates decay to a tenth: at constant rates, Gaussians jitter around
+    # their optimum. It helps only models that do not grow (docs/performance.md).
     settle: float = 0.0
 
     grow_start: float = 0.1  # densification starts here, or at 500 iterations if that is earlier
@@ -67,17 +66,17 @@ class FitConfig:
         if self.seed is not None and not 0 <= self.seed <= MAX_SEED:
             raise UsageError(f"`seed`: expected 0 to {MAX_SEED}, got {self.seed}")
 
-    def seeded(self, otherwise: int | None = None) -> FitConfig:
-        """The config with a seed: its own, else `otherwise`, else a random one of the system."""
+    def with_seed(self, otherwise: int | None = None) -> FitConfig:
+        """The config with a seed: its own, else `otherwise`, else one from the system's random source."""
         if self.seed is not None:
             return self
         return replace(self, seed=secrets.randbelow(MAX_SEED + 1) if otherwise is None else otherwise)
 
     @property
     def known_seed(self) -> int:
-        """The seed. Raises ValueError without one: see `seeded`."""
+        """The seed. Raises ValueError without one: see `with_seed`."""
         if self.seed is None:
-            raise ValueError("expected a config with a seed: `seeded` samples one")
+            raise ValueError("expected a config with a seed: `with_seed` samples one")
         return self.seed
 
     def seed_of(self, use: str) -> int:

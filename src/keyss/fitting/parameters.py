@@ -1,7 +1,7 @@
 """A 3DGS model as gsplat's strategies expect it: a dict of parameters, each with its Adam.
 
 The names `means quats scales opacities` (scales and opacities before their activation) are gsplat's, for
-training only. Unlike in gsplat, all SH coefficients are one parameter, which no step has to concatenate.
+training only. Unlike in gsplat, all SH coefficients are one parameter, so no step concatenates them.
 """
 
 from __future__ import annotations
@@ -95,6 +95,6 @@ def initial_points(scene: Scene, limit: int, generator: torch.Generator) -> tupl
     cameras = [view.camera for view in scene.train]
     focus = focus_point(cameras)
     distance = camera_positions(cameras).double().sub(focus).norm(dim=1).mean()
-    count = min(limit // 2, 20_000)  # half of the cap: the other half grows where it is needed
+    count = min(limit // 2, 20_000)  # the other half of the cap is for growth
     points = focus + (torch.rand(count, 3, generator=generator) - 0.5) * distance
     return points.float(), torch.full((count, 3), 128, dtype=torch.uint8)

@@ -1,4 +1,4 @@
-"""Plain 3DGS: one scene from its training photos (Kerbl et al. 2023), or a model of it trained on."""
+"""Plain 3DGS (Kerbl et al. 2023): train a model on the photos of one scene, or fine-tune a given model."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from keyss.fitting.schedule import Schedule
 from keyss.progress import Reporter
 from keyss.rendering import render_with_meta
 
-REFIT_SETTLE = 0.5  # share of a refit over which it settles
+REFIT_SETTLE = 0.5  # `settle` of a refit
 
 
 @dataclass(frozen=True)
@@ -37,13 +37,13 @@ class FitResult:
     """A fitted model and its configuration."""
 
     gaussians: Gaussians  # on the CPU
-    config: FitConfig  # with the seed
+    config: FitConfig  # includes the seed
 
 
 class PlainRun:
     """A plain 3DGS training; see `keyss.fitting.loop.TrainingRun`.
 
-    With a `model`, it starts from that model and keeps the number of its Gaussians.
+    With a `model`, training starts from it and keeps its number of Gaussians.
     """
 
     def __init__(
@@ -126,11 +126,11 @@ def fit_scene(
 ) -> FitResult:
     """Train plain 3DGS on the training views of `scene`; only a run with a seed can be resumed.
 
-    A given `model` is trained further, without growing or pruning it, at the rates of `config` times `rate`;
-    the SH degree is its own. Raises Interrupted on Ctrl-C after saving `checkpoint`, InputError for a
-    checkpoint of another run.
+    A given `model` is fine-tuned without density control, at the rates of `config` times `rate` and at its
+    own SH degree. Raises Interrupted on Ctrl-C after saving `checkpoint`, InputError for a checkpoint of
+    another run.
     """
-    config, inputs = (config or FitConfig()).seeded(), {"scene": scene.digest()}
+    config, inputs = (config or FitConfig()).with_seed(), {"scene": scene.digest()}
     if model is not None:
         rates = {name: rate * value for name, value in vars(config).items() if name.endswith("_rate")}
         config = replace(config, sh_degree=model.sh_degree, settle=REFIT_SETTLE, boost=1.0, **rates)
@@ -145,9 +145,9 @@ def fit_scene(
 
 
 def without_faint(model: Gaussians, min_opacity: float) -> Gaussians:
-    """`model` without Gaussians that fell below the limit of pruning after density control stopped.
+    """Remove Gaussians below `min_opacity`, which fall below it after density control has stopped.
 
-    The original trainer leaves none either, and their absence must not tell models with secrets from others.
+    The original trainer leaves none either, so their absence does not reveal a secret.
     """
     kept = model.opacities >= min_opacity
     return model[kept] if kept.any() else model

@@ -1,4 +1,4 @@
-"""Ours: density control with a fixed number of rows, each of which is a Gaussian of every scene."""
+"""Density control (ours) with a fixed number of rows: each row holds one Gaussian of every scene."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ from keyss.fitting.config import FitConfig
 from keyss.fitting.density import CappedStrategy, Rendered
 from keyss.fitting.parameters import Optimizers, Parameters
 
-EMPTY = -8.0  # opacity logit of a place without a Gaussian
-_FILLING = 5  # last steps of density control, which fill the places that are still empty
+EMPTY = -8.0  # opacity logit of an empty slot
+_FILLING = 5  # last rounds of density control, which fill the remaining empty slots
 T = TypeVar("T")
 
 
 def of_scene(named: dict[str, T], scene: int) -> dict[str, T]:
-    """Those that belong to a scene: `means` to the cover, `1/means` to secret 1."""
+    """The entries of one scene, by their names in it: `means` is the cover's, `1/means` secret 1's."""
     own = str(scene) if scene else ""
     return {name.rpartition("/")[2]: value for name, value in named.items() if name.rpartition("/")[0] == own}
 
 
 class FixedRows(CappedStrategy):
-    """Density control in which clones and splits take the places of pruned Gaussians, for each scene.
+    """Density control that puts clones and splits into the slots of pruned Gaussians, for each scene.
 
-    Thresholds and times are those of plain 3DGS. The last steps also fill the places that are still empty, an
-    equal part each, because a row without a Gaussian of the cover cannot have one of a secret.
+    Thresholds and intervals are those of plain 3DGS. The last rounds also fill the remaining empty slots, an
+    equal part each: a row without a Gaussian of the cover cannot have one of a secret.
     """
 
     def __init__(self, fit: FitConfig, extents: Sequence[float], generator: torch.Generator) -> None:
@@ -38,12 +38,12 @@ class FixedRows(CappedStrategy):
         self.extents, self.generator = extents, generator
 
     def initialize_state(self, scene_scale: float = 1.0) -> dict[str, Any]:
-        """`born`: [N] the place that plain 3DGS gives the cover's Gaussian in each row."""
+        """`born`: [N] the index of the cover's Gaussian in each row if plain 3DGS had appended it."""
         state: dict[str, Any] = super().initialize_state(scene_scale)
         return state | {"born": torch.arange(self.max_gaussians)}
 
-    def combined(self, renders: Sequence[Rendered], count: int) -> dict[str, Any]:
-        return self.by_scene(renders, count, len(self.extents), dim=0)
+    def densification_info(self, renders: Sequence[Rendered], count: int) -> dict[str, Any]:
+        return self.scene_stats(renders, count, len(self.extents), dim=0)
 
     @torch.no_grad()
     def step_post_backward(
@@ -80,8 +80,8 @@ class FixedRows(CappedStrategy):
     ) -> Tensor:
         """Clone small Gaussians and split large ones into dead places, the largest gradients first.
 
-        Returns the rows of new Gaussians in the order in which plain 3DGS appends them: clones, then the
-        first and the second halves of splits, each in the order of `born`.
+        Returns the rows of new Gaussians in plain 3DGS's order: clones, then first and second halves of
+        splits, each sorted by `born`.
         """
         dead = params["opacities"].detach().sigmoid() < self.prune_opa
         places = dead.nonzero()[:, 0]

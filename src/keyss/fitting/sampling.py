@@ -11,10 +11,7 @@ from torch import Tensor
 
 @contextmanager
 def own_randomness(seed: int) -> Iterator[None]:
-    """Seed torch's global generators for the block, and restore them afterwards.
-
-    Of several GPUs, only the current one's generator.
-    """
+    """Seed torch's global generators, on the CPU and the current GPU, and restore them after the block."""
     gpus = [torch.cuda.current_device()] if torch.cuda.is_available() else []
     with torch.random.fork_rng(gpus):
         torch.manual_seed(seed)

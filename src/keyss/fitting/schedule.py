@@ -1,7 +1,7 @@
 """Learning rates over the steps of a run.
 
-The rates of 3DGS are made for 30,000 steps, and are too small for fewer. Shorter runs start with larger ones,
-which fall to those of 3DGS (benchmarks/recipe.py compares them).
+The rates of 3DGS suit 30,000 steps, and are too small for fewer. Shorter runs start with larger rates, which
+decay to those of 3DGS (benchmarks/recipe.py compares them).
 """
 
 from __future__ import annotations
@@ -15,15 +15,15 @@ from keyss.core.scene import Camera, camera_positions
 from keyss.fitting.config import FitConfig
 from keyss.fitting.parameters import Optimizers
 
-LAST_RATE = 0.1  # share of the rates at the end of a run that settles
+LAST_RATE = 0.1  # final factor on the rates of a run that settles
 _FULL_STEPS = 30_000
 _MAX_BOOST = 5.0
-_BOOST_GROWTH = 0.54  # exponent: 1,500 steps and fewer have the maximum
+_BOOST_GROWTH = 0.54  # exponent; 1,500 steps and fewer get the maximum
 _BOOSTED = 0.6  # share of a run with constant, larger rates
-_EXPONENTS = {"means": 7 / 4, "opacities": 1 / 4}  # of the boost; 1 for other attributes
-_LARGE = 0.05  # size over distance from the nearest camera, from which a Gaussian's boost is less
-_CAMERAS = 32  # from which distances are measured
-_FOCAL = 1.15  # focal length, for a picture of area 1, at which rates are those of 3DGS; 47 degrees
+_EXPONENTS = {"means": 7 / 4, "opacities": 1 / 4}  # exponents of the boost; 1 for other attributes
+_LARGE = 0.05  # size / distance to the nearest camera; larger Gaussians get a smaller boost
+_CAMERAS = 32  # cameras used to measure distances
+_FOCAL = 1.15  # focal length / sqrt(image area) at which rates equal 3DGS's; 47 degrees
 
 
 class Schedule:
@@ -49,7 +49,7 @@ class Schedule:
         self.zooms = torch.tensor(focals).sqrt() / _FOCAL  # [C]
 
     def set(self, optimizers: Optimizers, iteration: int) -> None:
-        """Set the rates of step `iteration`, the first of which is 1."""
+        """Set the rates of step `iteration`, counted from 1."""
         config = self.config
         progress = iteration / config.iterations
         boosted = min(1.0, (1 - progress) / (1 - _BOOSTED))
@@ -62,7 +62,7 @@ class Schedule:
                 group["lr"] = initial * factor * 0.01**progress
             else:
                 group["lr"] = initial * factor**boosted * settled
-        # Densification, which adds rows without a scale, happens after steps that are multiples.
+        # Densification adds rows without a scale after every `refine_every` steps.
         if self.boost > 1 and (iteration - 1) % config.refine_every == 0:
             means, log_scales = (
                 optimizers[name].param_groups[0]["params"][0].detach() for name in ("means", "scales")
@@ -75,9 +75,9 @@ class Schedule:
                 optimizers[name].scale_rows(small.clamp(least, 1.0))
 
     def pixel_sizes(self, means: Tensor) -> Tensor:
-        """[N] in proportion to the size of a pixel at each of `means` [N, 3], for the nearest camera.
+        """[N] relative pixel size at each of `means` [N, 3] for the nearest camera, in world units.
 
-        In world units; it is the distance for cameras of 47 degrees.
+        For cameras of 47 degrees, it equals the distance.
         """
         return (torch.cdist(means, self.positions.to(means)) / self.zooms.to(means)).amin(1)
 

@@ -1,8 +1,8 @@
 """The paper's key encoder, CLIP's text encoder (section 3.2, "The Key-Controllable Scheme").
 
-It only tells the decoder which secret to show. The key that encrypts the payload is derived from the typed
-text by Argon2id, because CLIP is no key derivation: it is fast, it ignores case, and similar texts have
-similar vectors. Revealing needs no CLIP: the encrypted payload contains the vector.
+It only conditions the decoder. Argon2id derives the encryption key from the typed text, because CLIP is no
+key derivation function: it is fast, it ignores case, and similar texts have similar vectors. Revealing needs
+no CLIP: the encrypted payload contains the vector.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ MODEL = "openai/clip-vit-large-patch14"  # ViT-L/14 (section 4.1)
 class ClipKeys:
     """`encoder(key)` returns the vector of a key: k = AvgPool(E(k)).
 
-    `model`: a folder that holds CLIP as `transformers` saves it, or the name of a model in its cache; nothing
-    is ever downloaded. Raises BackendError when `transformers` or the model is not there.
+    `model`: a folder that `transformers` saved, or the name of a model in its cache; nothing is ever
+    downloaded. Raises BackendError if `transformers` or the model is missing.
     """
 
     def __init__(self, model: str | Path = MODEL) -> None:
@@ -57,4 +57,4 @@ class ClipKeys:
         return self("".join(_CHARACTERS[int(each)] for each in chosen))
 
 
-clip_keys = lru_cache(maxsize=1)(ClipKeys)  # a large model that preparing and hiding share
+clip_keys = lru_cache(maxsize=1)(ClipKeys)  # loads the large model once for preparing and hiding

@@ -29,7 +29,7 @@ SALT_BYTES = 16
 MASTER_BYTES = 32
 EMBEDDING_SIZE = 64
 _STREAM_BLOCK = 1 << 16  # bytes
-TIME_COST, MEMORY_KIB, PARALLELISM = 3, 64 * 1024, 4  # of Argon2id: passes, KiB and lanes
+TIME_COST, MEMORY_KIB, PARALLELISM = 3, 64 * 1024, 4  # Argon2id: passes, KiB, lanes
 
 
 def expand(secret: bytes, label: str, length: int) -> bytes:

@@ -1,8 +1,7 @@
 """Authenticated encryption of one payload: compressed, padded and encrypted under a data key of its own.
 
-ChaCha20-Poly1305 (RFC 8439) with a zero nonce: each data key encrypts one message only, since the writer
-samples it or derives it from everything that it encrypts. Lengths are padded to coarse buckets first, and
-reveal little about the content.
+ChaCha20-Poly1305 (RFC 8439) with a zero nonce. This is safe because each data key encrypts one message only:
+it is random, or derived from everything that it encrypts. Padding to coarse buckets hides exact lengths.
 """
 
 from __future__ import annotations
@@ -38,7 +37,7 @@ def encrypted_size(compressed: int) -> int:
 
 def compressed_size(payload: bytes) -> int:
     """Bytes of `payload` as `encrypt` compresses it."""
-    return len(_compressed(payload))
+    return len(_compress(payload))
 
 
 def encrypt(data_key: bytes, payload: bytes, associated: bytes = b"", *, size: int | None = None) -> bytes:
@@ -49,7 +48,7 @@ def encrypt(data_key: bytes, payload: bytes, associated: bytes = b"", *, size: i
     """
     if len(payload) > MAX_PAYLOAD_BYTES:
         raise UsageError(f"expected at most {MAX_PAYLOAD_BYTES:,} bytes to encrypt, got {len(payload):,}")
-    packed = _compressed(payload)
+    packed = _compress(payload)
     size = encrypted_size(len(packed)) if size is None else size
     plain = struct.pack("<I", len(packed)) + packed
     if size < len(packed) + OVERHEAD:
@@ -85,7 +84,7 @@ def _cipher(data_key: bytes) -> ChaCha20Poly1305:
     return ChaCha20Poly1305(expand(data_key, "payload", 32))
 
 
-def _compressed(payload: bytes) -> bytes:
+def _compress(payload: bytes) -> bytes:
     packed = zlib.compress(payload, 9)
     return packed if len(payload) <= _max_size(len(packed)) else zlib.compress(payload, 0)
 

@@ -44,7 +44,7 @@ def normalized_key(text: str) -> str:
 
 
 def read_key(path: str | Path) -> str:
-    """The key in a file, as the command line reads it. Raises InputError for a file without a key."""
+    """Read a key file like the command line. Raises InputError for a file without a key."""
     path = Path(path)
     try:
         with path.open("rb") as file:
@@ -58,7 +58,7 @@ def read_key(path: str | Path) -> str:
 
 
 def write_new_key(path: Path, key: str) -> None:
-    """Write a key file that only its owner can read, or on Windows whoever can read its folder.
+    """Write a key file that only its owner can read (on Windows, everyone who can read its folder).
 
     Raises OutputError if the path exists.
     """
@@ -81,7 +81,7 @@ def write_new_key(path: Path, key: str) -> None:
 
 
 def generate_key(length: int = 16) -> str:
-    """A random alphanumeric key of the system's random source: 5.95 bits per character.
+    """A random alphanumeric key from the system's random source: 5.95 bits per character.
 
     Raises UsageError for a length outside 1 to 1024.
     """
@@ -91,5 +91,5 @@ def generate_key(length: int = 16) -> str:
 
 
 def length_for(bits: int) -> int:
-    """Length for which `generate_key` reaches `bits`."""
+    """Minimum length for which `generate_key` gives `bits` of entropy."""
     return math.ceil(bits / math.log2(len(ALPHABET)))

@@ -20,7 +20,7 @@ _MAX_NAME_BYTES = 4096
 
 
 class MasterKey:
-    """A master key; deriving it takes about 0.1 s, and no time for each name."""
+    """A master key. Deriving it takes about 0.1 s; names then cost next to nothing."""
 
     def __init__(self, key: str) -> None:
         self._derived = DerivedKey.of(key, _SALT)
@@ -42,11 +42,11 @@ class MasterKey:
         label = f"master/{hashlib.sha256(data).hexdigest()}"
         number = int.from_bytes(self._derived.expand(label, 32), "big")
         characters = []
-        for _ in range(KEY_LENGTH):  # of 256 bits the last 131: uniform to 2^-125
+        for _ in range(KEY_LENGTH):  # 131 of 256 bits: uniform to 2^-125
             number, digit = divmod(number, len(ALPHABET))
             characters.append(ALPHABET[digit])
         return "".join(characters)
 
     def check(self) -> str:
-        """32 hexadecimal digits that identify this master key; a guess costs as much as any."""
+        """32 hexadecimal digits that identify this master key; each guess costs a key derivation."""
         return self._derived.expand("master-check", 16).hex()

@@ -1,8 +1,8 @@
-"""Strength of keys: how many guesses find one, and a warning for weak keys.
+"""Strength of keys: the number of guesses that find one, and a warning for weak keys.
 
-zxcvbn counts the guesses of somebody who knows how people choose passwords (Wheeler 2016): words, names,
-dates, keyboards, repetitions. It cannot know that a key is used elsewhere. Argon2id costs 0.1 s of a core and
-64 MiB for each guess: ENOUGH_GUESSES take three hundred thousand years of one core.
+zxcvbn (Wheeler 2016) estimates guesses from patterns in passwords that people choose: words, names, dates,
+keyboards, repetitions. It cannot detect a key reused from elsewhere. Argon2id costs 0.1 s of a core and
+64 MiB per guess: ENOUGH_GUESSES take three hundred thousand years of one core.
 """
 
 from __future__ import annotations
@@ -12,13 +12,13 @@ import math
 from keyss.keys.key_file import normalized_key
 
 ENOUGH_GUESSES = 1e14
-_MAX_LENGTH = 100  # characters that are looked at, since the time grows faster than their number
+_MAX_LENGTH = 100  # characters; zxcvbn takes superlinear time
 
 
 def key_guesses(key: str) -> float:
-    """The number of guesses that find `key`, as it is used: see `normalized_key`, which raises UsageError.
+    """The number of guesses that find `key` after `normalized_key`. Raises UsageError for an invalid key.
 
-    A random character counts as ten guesses, letters too: 10^16 for 16 generated ones.
+    zxcvbn counts a random character, even a letter, as ten guesses: 10^16 for a generated key of 16.
     """
     from zxcvbn import zxcvbn  # slow to import
 

@@ -1,4 +1,4 @@
-"""How well a score separates two classes: the area under the ROC curve."""
+"""The area under the ROC curve."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ Score = float | None
 
 @dataclass(frozen=True)
 class Auc:
-    """The area under a ROC curve: how often a positive scores above a negative, ties counting half."""
+    """The area under a ROC curve: probability that a positive scores above a negative; ties count half."""
 
-    auc: float  # in [0, 1]
+    auc: float  # 0 to 1
     low: float  # 95 % interval, by DeLong (1988)
     high: float
 
@@ -28,9 +28,9 @@ class Auc:
 def auc_between(negatives: Sequence[Score], positives: Sequence[Score]) -> Auc:
     """The AUC of scores that should be higher for positives; None and NaN are missing scores.
 
-    A missing score counts as lower than every number, so a detector that answers less often for one class can
-    have an AUC far from 0.5. The interval treats images as independent, which neighbouring views are not: it
-    is too narrow. Raises UsageError for an empty class.
+    A missing score counts as lower than every number, so a detector that fails more often on one class can
+    have an AUC far from 0.5. The interval treats images as independent and is too narrow for neighbouring
+    views. Raises UsageError for an empty class.
     """
     if not negatives or not positives:
         raise UsageError(f"expected scores of both classes, got {len(negatives)} and {len(positives)}")
@@ -45,7 +45,7 @@ def auc_between(negatives: Sequence[Score], positives: Sequence[Score]) -> Auc:
 def delong(negatives: Doubles, positives: Doubles) -> tuple[float, float]:
     """AUC of scores [N] and [P], and its variance by DeLong, DeLong and Clarke-Pearson.
 
-    By ranks, as in Sun and Xu (2014). The variance is 0 if a class has a single score.
+    Computed from ranks (Sun and Xu, 2014). The variance is 0 if a class has a single score.
     """
     from scipy.stats import rankdata  # slow to import
 
@@ -60,8 +60,8 @@ def delong(negatives: Doubles, positives: Doubles) -> tuple[float, float]:
 def _interval(auc: float, variance: float, pairs: int) -> tuple[float, float]:
     """The 95 % interval by DeLong's variance on the logit scale (Pepe 2003).
 
-    The variance is 0 if a class is a single image or the classes do not overlap. Then the interval is that of
-    `pairs` independent pairs, all in order: an AUC of 0.025^(1 / pairs) remains possible.
+    If the variance is 0, because a class is a single image or the classes do not overlap, the interval is
+    that of `pairs` independent pairs, all in order: it reaches an AUC of 0.025^(1 / pairs).
     """
     from scipy.special import expit, logit
 

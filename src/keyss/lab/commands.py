@@ -19,9 +19,9 @@ from keyss.cli.arguments import (
     Resume,
     Run,
     Width,
+    check_exists,
     check_run,
-    check_there,
-    checked_seed,
+    check_seed,
     optional,
     switch,
 )
@@ -82,7 +82,7 @@ def audit(
             original=original,
             controls=controls,
             only=only,
-            seed=checked_seed(seed),
+            seed=check_seed(seed),
             device=device,
             overwrite=overwrite,
             resume=resume,
@@ -116,13 +116,13 @@ def compare(
 ) -> None:
     """Hide a scene by each method with the same budget, and tabulate the results.
 
-    The budget is a number of Gaussians, and of training steps for each scene. The method 3dgs is the bound:
-    plain 3DGS with that budget. Methods that cannot run with it are listed, and are an error if
+    The budget is a number of Gaussians, and of training steps for each scene. The method 3dgs is the upper
+    bound: plain 3DGS with that budget. Methods that cannot run with it are listed, and are an error if
     `--methods` names them. Run the same command again to resume.
 
     example: keyss compare --cover SCENE_A --secret SCENE_B --quick -o runs/compared
     """
-    check_there(cover, secret)
+    check_exists(cover, secret)
     import keyss
     from keyss.cli.tables import print_files, print_table
     from keyss.core.errors import InputError
@@ -137,7 +137,7 @@ def compare(
         cover,
         secret,
         methods=named,
-        seeds=tuple(map(checked_seed, seed)) or (0,),
+        seeds=tuple(map(check_seed, seed)) or (0,),
         device=device,
         out=out,
         dry_run=dry_run,
@@ -232,7 +232,7 @@ def reproduce(
         iterations=iterations,
         max_gaussians=max_gaussians,
         width=width,
-        seeds=tuple(map(checked_seed, seed)) or (0,),
+        seeds=tuple(map(check_seed, seed)) or (0,),
         device=device,
         out=out,
         dry_run=dry_run,
@@ -308,7 +308,7 @@ def sweep(
 
 
 def _print_verdicts(audit: Audit) -> None:
-    """The verdicts of an audit: a line for each measure, with its baseline or control."""
+    """Print the verdicts of an audit: a line per measure, with its baseline or control."""
     from keyss.cli.tables import Console, print_table
     from keyss.lab.audits import headline, verdicts
 
@@ -319,7 +319,7 @@ def _print_verdicts(audit: Audit) -> None:
 
 
 def _print_forecast(found: Forecast) -> None:
-    """The cells of a dry run, with estimates for those that are not done."""
+    """Print the cells of a dry run, with estimates for those to do."""
     from keyss.cli.tables import print_table
     from keyss.progress import about
 

@@ -1,7 +1,7 @@
-"""Distances between the Gaussians of two models as distributions, beside those between control models.
+"""Distances between the distributions of Gaussians of two models, beside those between control models.
 
 Exact 1-D Wasserstein distances along axes and random directions (sliced Wasserstein, Bonneel et al. 2015) of
-features that are equal for equal Gaussians, however they are stored. They detect what 3D-Sinkhorn misses: see
+features that do not depend on how Gaussians are stored. They detect what 3D-Sinkhorn misses: see
 `keyss.lab.sinkhorn`.
 """
 
@@ -19,8 +19,8 @@ from keyss.core.arrays import Floats
 from keyss.lab.two_sample import features
 
 SLICES = 32
-MAX_GAUSSIANS = 100_000  # of each model; larger ones are subsampled
-_RESOLUTION = 1e-6  # of a row's largest magnitude: a smaller range is rounding
+MAX_GAUSSIANS = 100_000  # Gaussians per model; larger models are subsampled
+_RESOLUTION = 1e-6  # relative to a row's largest magnitude: a smaller range is rounding
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class AttributeDistance:
     distance: float  # mean over the controls
     control: float  # mean over pairs of controls: seed-to-seed variation
     ratio: float | None  # distance / control; 1 is another training seed; None if `control` is 0
-    original: float | None = None  # the same ratio for the cover's own plain model
+    original: float | None = None  # ratio for the cover's own plain model
 
 
 def against_controls(
@@ -42,9 +42,8 @@ def against_controls(
 ) -> dict[str, AttributeDistance]:
     """`attribute_distances` of `model` and of `controls`, plain models of the same scene from other seeds.
 
-    `original`: another plain model of the scene that is compared with the controls too, since it can be
-    further from them than they are from each other. Raises UsageError for fewer than two controls and for an
-    empty model.
+    `original`: another plain model of the scene to compare with the controls, since it can be further from
+    them than they are from each other. Raises UsageError for fewer than two controls and for an empty model.
     """
     if len(controls) < 2:
         raise UsageError(f"expected at least two control models of the scene, got {len(controls)}")
@@ -70,32 +69,32 @@ def against_controls(
 def attribute_distances(reference: Gaussians, other: Gaussians, *, seed: int = 0) -> dict[str, float]:
     """Wasserstein distances of two models' attributes, in units of the reference's 5 to 95 % range.
 
-    By attribute, as in `features`: the mean over its axes and 32 random directions. `joint`: the mean over
-    random directions in the space of all attributes, equally weighted. All comparisons with one `seed` share
-    their directions. An attribute that is constant in the reference is measured in units of the range of both
-    models; one that is the same constant in both is skipped. Models may differ in size and SH degree; one
-    with more than `MAX_GAUSSIANS` Gaussians is subsampled. Raises UsageError for an empty model.
+    Keys are those of `features` (means over axes and 32 random directions) and `joint` (mean over random
+    directions in the space of all attributes, equally weighted). Comparisons with one `seed` share their
+    directions. If an attribute is constant in the reference, its unit is the range of both models; if it is
+    the same constant in both, it is skipped. Models may differ in size and SH degree; those with more than
+    `MAX_GAUSSIANS` Gaussians are subsampled. Raises UsageError for an empty model.
     """
     both = [features(model, limit=MAX_GAUSSIANS, seed=seed) for model in (reference, other)]
     generator = np.random.default_rng(seed)
     result, rows = {}, []
     for name in both[0]:
         axes = [model[name].T for model in both]
-        along_axes, units = _along(*axes)
-        scaled = [_in_units(each, units[:, None]) for each in axes]
+        along_axes, units = _row_distances(*axes)
+        scaled = [_divide(each, units[:, None]) for each in axes]
         directions = _directions(generator, len(units))
-        along_slices, widths = _along(directions @ scaled[0], directions @ scaled[1])
+        along_slices, widths = _row_distances(directions @ scaled[0], directions @ scaled[1])
         result[name] = _mean(np.append(along_axes, along_slices), np.append(units, widths))
         weight = np.float32(1 / np.sqrt(max(int((units > 0).sum()), 1)))
         rows.append([weight * each for each in scaled])
     one, two = (np.concatenate(parts) for parts in zip(*rows, strict=True))
     directions = _directions(generator, len(one))
-    result["joint"] = _mean(*_along(directions @ one, directions @ two))
+    result["joint"] = _mean(*_row_distances(directions @ one, directions @ two))
     return result
 
 
 def _directions(generator: np.random.Generator, size: int) -> Floats:
-    """[SLICES, size] random unit vectors; none in one dimension, where the axis is enough."""
+    """[SLICES, size] random unit vectors; none in one dimension, which has its axis."""
     vectors = generator.standard_normal((SLICES if size > 1 else 0, size))
     unit: Floats = (vectors / np.linalg.norm(vectors, axis=1, keepdims=True)).astype(np.float32)
     return unit
@@ -106,10 +105,10 @@ def _mean(distances: Floats, units: Floats) -> float:
     return float(distances[units > 0].mean()) if (units > 0).any() else 0.0
 
 
-def _along(reference: Floats, other: Floats) -> tuple[Floats, Floats]:
-    """[D] distances of the rows of [D, N] and [D, M] in units of the reference's range, and the units [D].
+def _row_distances(reference: Floats, other: Floats) -> tuple[Floats, Floats]:
+    """[D] distances of the rows of [D, N] and [D, M] in units of the reference's range, and [D] units.
 
-    Both are 0 for a row that is one constant in both.
+    Both are 0 for a row that is the same constant in both.
     """
     one, two = np.sort(reference, axis=1), np.sort(other, axis=1)
     last = one.shape[1] - 1
@@ -123,10 +122,10 @@ def _along(reference: Floats, other: Floats) -> tuple[Floats, Floats]:
     else:
         ot = import_extra("ot", "audit", "compute distances")
         areas = ot.wasserstein_1d(one.T.astype(np.float64), two.T.astype(np.float64), require_sort=False)
-    return _in_units(areas, units), units
+    return _divide(areas, units), units
 
 
-def _in_units(values: Floats, units: Floats) -> Floats:
-    """`values` / `units`, which broadcast; 0 where the unit is 0."""
+def _divide(values: Floats, units: Floats) -> Floats:
+    """`values` / `units` with broadcasting; 0 if the unit is 0."""
     divisors: Floats = np.where(units > 0, units, np.inf)
     return values / divisors

@@ -1,9 +1,10 @@
 """StegExpose's four detectors of LSB replacement: chi-square, primary sets, sample pairs and RS.
 
 - Chi-square: random last bits make values that differ only in the last bit equally frequent.
-- Primary sets and sample pairs: LSB replacement evens out differences of neighbours. Both count pairs of
-  neighbours (u, v) and solve the same quadratic equation for the embedding rate.
-- RS: counts small blocks of pixels that flipped last bits make rougher (regular) or smoother (singular).
+- Primary sets and sample pairs: count pairs of neighbours (u, v), whose differences LSB replacement evens
+out,
+  and solve the same quadratic equation for the embedding rate.
+- RS: counts small blocks that become rougher (regular) or smoother (singular) when last bits are flipped.
 """
 
 from __future__ import annotations
@@ -18,9 +19,9 @@ from keyss.core.arrays import Bytes, Doubles, Integers
 
 _SAMPLES = 1024  # per block of chi-square
 _MIN_BLOCKS = 256  # the original program fails with fewer
-_FREEDOM = 127  # of the test; there are 128 terms
-_AT_ONCE = 4096  # blocks whose histograms are in memory together
-_ROWS = 128  # origins of RS's blocks in memory together; even, so that disjoint blocks stay disjoint
+_FREEDOM = 127  # degrees of freedom: 128 terms - 1
+_AT_ONCE = 4096  # blocks per batch of histograms
+_ROWS = 128  # rows of RS's blocks per batch; even, so that disjoint blocks stay disjoint
 
 Plane = NDArray[np.int16]  # [H, W]
 Counts = Integers  # [2, 2]: under F1 and under F-1, the number of regular and of singular blocks
@@ -30,7 +31,7 @@ Number = np.float64
 def chi_square(image: Bytes) -> float | None:
     """Mean p-value over the first 1024, 2048, ... samples of [H, W, 3], in [0, 1].
 
-    Samples are in order of rows, red green blue. None for images of less than about 87,700 pixels. Not
+    Samples are in row-major order, red, green, blue. None for images of less than about 87,700 pixels. Not
     calibrated: a smooth histogram alone gives 0.3.
     """
     samples = image.reshape(-1)
@@ -52,7 +53,7 @@ def chi_square(image: Bytes) -> float | None:
 
 
 def _p_values(histograms: Integers) -> Doubles:
-    """[N] p-values of [N, 256] histograms, none of whose bins is empty."""
+    """[N] p-values of [N, 256] histograms without empty bins."""
     observed = histograms[:, 0::2].astype(np.float64)
     expected = ((histograms[:, 0::2] + histograms[:, 1::2]) // 2).astype(np.float64)
     expected *= (observed.sum(1) / expected.sum(1))[:, None]
@@ -75,7 +76,7 @@ def primary_sets(image: Bytes) -> float:
 def sample_pairs(image: Bytes) -> float | None:
     """Mean embedding rate over the channels of [H, W, 3], from horizontal and vertical pairs; unbounded.
 
-    None if width or height is odd, for which the original program fails.
+    None if width or height is odd: the original program fails.
     """
     if image.shape[0] % 2 or image.shape[1] % 2:
         return None
@@ -105,10 +106,10 @@ def _equation(pairs: int, y: int, z: int, w: int) -> tuple[Number, Number, Numbe
 
 
 def _horizontal_pairs(plane: Bytes) -> Integers:
-    """[5] counts over the disjoint pairs (0, 1), (2, 3), ... in each row of [H, W], by kind.
+    """[5] counts of kinds of disjoint pairs (0, 1), (2, 3), ... in the rows of [H, W].
 
-    All; y: u > v for even v, u < v for odd v; z: u = v; w: u and v differ only in the last bit; and w of
-    primary sets: y except pairs of two even values. An odd last column is ignored.
+    All; y: u > v for even v, u < v for odd v; z: u = v; w: u and v differ only in the last bit; w of primary
+    sets: y without pairs of even values. An odd last column is ignored.
     """
     even = plane.shape[1] // 2 * 2
     u, v = plane[:, 0:even:2], plane[:, 1:even:2]
@@ -118,7 +119,7 @@ def _horizontal_pairs(plane: Bytes) -> Integers:
 
 
 def rs(image: Bytes) -> float:
-    """Embedding rate in [H, W, 3], the mean over channels and over overlapping and disjoint 2x2 blocks.
+    """Mean embedding rate over channels of [H, W, 3], and over overlapping and disjoint 2x2 blocks.
 
     Unbounded; NaN for images without a block.
     """
@@ -130,7 +131,7 @@ def rs(image: Bytes) -> float:
 
 
 def _count_image(plane: Bytes) -> Integers:
-    """[2, 2, 2, 2]: of overlapping and of disjoint blocks, the `Counts` of the image and of its flip."""
+    """[2, 2, 2, 2]: for overlapping and disjoint blocks, `Counts` of the image and its flip."""
     counts = np.zeros((2, 2, 2, 2), dtype=np.int64)
     for start in range(0, plane.shape[0] - 1, _ROWS):
         strip = plane[start : start + _ROWS + 1].astype(np.int16)
@@ -140,7 +141,7 @@ def _count_image(plane: Bytes) -> Integers:
 
 
 def _count_strip(pixels: Plane) -> Integers:
-    """[2, 2, 2]: of overlapping and of disjoint blocks, the `Counts`."""
+    """[2, 2, 2]: `Counts` of overlapping and disjoint blocks."""
     counts = np.zeros((2, 2, 2), dtype=np.int64)
     across, down = np.abs(pixels[:, :-1] - pixels[:, 1:]), np.abs(pixels[:-1] - pixels[1:])
     before = _roughness(across, across, down, down)
@@ -153,7 +154,7 @@ def _count_strip(pixels: Plane) -> Integers:
 
 
 def _masked_roughness(pixels: Plane, flipped: Plane) -> Iterator[Plane]:
-    """Roughness of every block with one diagonal flipped, then with the other."""
+    """Roughness of each block with one diagonal flipped, then with the other."""
     left, right = np.abs(flipped[:, :-1] - pixels[:, 1:]), np.abs(pixels[:, :-1] - flipped[:, 1:])
     upper, lower = np.abs(flipped[:-1] - pixels[1:]), np.abs(pixels[:-1] - flipped[1:])
     yield _roughness(left, right, upper, lower)
@@ -161,7 +162,7 @@ def _masked_roughness(pixels: Plane, flipped: Plane) -> Iterator[Plane]:
 
 
 def _roughness(top: Plane, bottom: Plane, left: Plane, right: Plane) -> Plane:
-    """[H-1, W-1]: per block, the sum over its edges, of differences across [H, W-1] and down [H-1, W]."""
+    """[H-1, W-1] sums of the edges of each block, from differences across [H, W-1] and down [H-1, W]."""
     return top[:-1] + bottom[1:] + left[:, :-1] + right[:, 1:]
 
 

@@ -1,9 +1,9 @@
-"""3D-Sinkhorn as published (KeySS, section 3.3), for comparison with published numbers.
+"""The published 3D-Sinkhorn (KeySS, section 3.3), for comparison with published numbers.
 
 It misses most changes: norms ignore directions, and dividing each model by its own maximum cancels common
 factors. Doubled scales, rotated Gaussians and swapped red and blue give the same value as an identical model,
-which is not 0 either. It does change with the lengths of quaternions, which no render shows.
-`keyss.lab.distances` has none of these faults.
+which is not 0. It depends on lengths of quaternions, which do not affect renders. `keyss.lab.distances` has
+none of these faults.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Rendering and revealing times, file sizes, and whether third-party programs read the files."""
+"""Rendering and revealing times, file sizes, and compatibility with third-party programs."""
 
 from __future__ import annotations
 
@@ -28,16 +28,16 @@ class RenderTime:
     """The time of one render of a model."""
 
     seconds: float  # median
-    ratio: float  # to a plain model of the same scene: median over pairs of renders, which cancels other load
+    ratio: float  # median over pairs of renders, relative to a plain model of the scene; cancels other load
 
 
 @dataclass(frozen=True)
 class ReaderResult:
-    """Whether a third-party program reads a file."""
+    """The result of reading a file with a third-party program."""
 
     reader: str
-    loads: bool | None  # whether all values are equal to the last bit; None: not tried
-    gaussians: int | None = None  # number that it reads
+    loads: bool | None  # True if all values are bitwise equal; None: not tried
+    gaussians: int | None = None  # number of Gaussians read
     note: str | None = None  # why it fails or was not tried
 
 
@@ -46,7 +46,7 @@ class SpeedResult:
     """Times and sizes of the published model ("stego") and of the revealed ones ("secret N")."""
 
     render: dict[str, RenderTime]
-    reveal_seconds: tuple[float, ...]  # from file to file for each secret, key derivation included
+    reveal_seconds: tuple[float, ...]  # per secret, file to file, with key derivation
     bytes: dict[str, int]
 
 
@@ -60,10 +60,10 @@ def measure_speed(
     device: torch.device | str = "cpu",
     progress: Callable[[int, int], None] | None = None,
 ) -> SpeedResult:
-    """Measure the published model, and what the keys reveal, beside plain models of the same scenes.
+    """Measure the published model and the revealed secrets beside plain models of the same scenes.
 
-    `progress`: called with the numbers of models done and of all. Raises KeyssError if a secret does not
-    open.
+    `progress`: called with the number of finished models and the total. Raises KeyssError if a secret does
+    not open.
     """
     times: dict[str, RenderTime] = {}
     with tempfile.TemporaryDirectory() as folder:
@@ -106,7 +106,7 @@ def render_time(
 
 
 def reveal_seconds(stego: Path, opener: Opener, out: Path, *, repeats: int = 3) -> tuple[Path, float]:
-    """The revealed file, `out` with the suffix of its format, and the median time from file to file."""
+    """The revealed file (`out` with the suffix of its format), and the median time from file to file."""
     seconds = []
     for _ in range(repeats):
         start = time.perf_counter()
@@ -118,7 +118,7 @@ def reveal_seconds(stego: Path, opener: Opener, out: Path, *, repeats: int = 3) 
 
 
 def readers(path: Path) -> list[ReaderResult]:
-    """Whether plyfile, gsply and splat-transform read a model file: compares the copies that they write."""
+    """Read a model file with plyfile, gsply and splat-transform, and compare the copies that they write."""
     programs = {"plyfile": _plyfile, "gsply": _gsply, "splat-transform": transform}
     if path.name.endswith(DECODED_SUFFIX):
         note = "a network renders it: it is not a 3DGS model"

@@ -1,7 +1,7 @@
 """StegExpose (2014): four detectors of LSB replacement in 8-bit images, and their mean.
 
-An independent implementation that reproduces the original's scores, quirks included. On a renderer's output
-an AUC near 0.5 is expected: nothing replaces the last bits of pixels.
+An independent implementation that reproduces the original's scores, quirks included. On renders, the expected
+AUC is 0.5: nothing replaces the last bits of pixels.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def score_image(image: Bytes) -> Scores:
     for name, detector in DETECTORS.items():
         score = detector(image)
         scores[name] = score if score is None or math.isnan(score) else min(abs(score), 1.0)
-    available = _present(scores.values())
+    available = _finite(scores.values())
     return Scores(**scores, fusion=sum(available) / len(available) if available else math.nan)
 
 
@@ -53,18 +53,17 @@ def score_image(image: Bytes) -> Scores:
 class StegExposeAuc:
     """StegExpose on renders of the same views by two models."""
 
-    plain: tuple[Scores, ...]  # of each view
+    plain: tuple[Scores, ...]  # per view
     stego: tuple[Scores, ...]
-    fused: Auc  # of the mean of the detectors
+    fused: Auc  # AUC for the mean of the detectors
     detectors: dict[str, float | None]  # AUC of each detector; None if it accepts none of the images
 
 
 def stegexpose_auc(plain_images: Sequence[Bytes], stego_images: Sequence[Bytes]) -> StegExposeAuc:
-    """StegExpose on renders of the same views by a plain and by a stego model, [H, W, 3] uint8 each.
+    """StegExpose on renders [H, W, 3] uint8 of the same views by a plain and by a stego model.
 
-    Chi Square needs about 87,700 pixels, Sample Pairs even sizes. On a renderer's output an AUC near 0.5 is
-    expected whatever is hidden, since no pixel's last bit is replaced. Raises UsageError if the views differ
-    in number or size.
+    Chi Square needs about 87,700 pixels, Sample Pairs even sizes. Raises UsageError if the views differ in
+    number or size.
     """
     sizes = [[image.shape[:2] for image in images] for images in (plain_images, stego_images)]
     if not sizes[0] or sizes[0] != sizes[1]:
@@ -76,12 +75,12 @@ def stegexpose_auc(plain_images: Sequence[Bytes], stego_images: Sequence[Bytes])
     detectors: dict[str, float | None] = {}
     for name in DETECTORS:
         negatives, positives = ([getattr(scores, name) for scores in group] for group in (plain, stego))
-        answers = _present(negatives + positives)
+        answers = _finite(negatives + positives)
         detectors[name] = auc_between(negatives, positives).auc if answers else None
     fused = ([scores.fusion for scores in group] for group in (plain, stego))
     return StegExposeAuc(plain, stego, auc_between(*fused), detectors)
 
 
-def _present(scores: Iterable[float | None]) -> list[float]:
+def _finite(scores: Iterable[float | None]) -> list[float]:
     """The scores that are neither None nor NaN."""
     return [score for score in scores if score is not None and not math.isnan(score)]

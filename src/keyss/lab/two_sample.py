@@ -19,7 +19,7 @@ from keyss.core.arrays import Doubles, Flags, Floats, Integers, Numbers
 from keyss.files.ply_rows import OPACITY_LOGIT_BOUND
 from keyss.lab.auc import Auc, delong
 
-MIN_GAUSSIANS, MAX_GAUSSIANS = 100, 10_000  # of each model
+MIN_GAUSSIANS, MAX_GAUSSIANS = 100, 10_000  # Gaussians per model
 FOLDS = 5
 _CELLS = 8  # along each axis
 _TREES, _LEAVES = 50, 16
@@ -27,7 +27,7 @@ _TREES, _LEAVES = 50, 16
 
 @dataclass(frozen=True)
 class TwoSampleAucs:
-    """The classifier on a model and on control models of its scene."""
+    """Classifier AUCs of a model and of control models of its scene."""
 
     stego: tuple[Auc, ...]  # each control against the model
     control: tuple[Auc, ...]  # each pair of controls: seed-to-seed variation
@@ -39,8 +39,8 @@ def auc_beside_controls(
 ) -> TwoSampleAucs:
     """`two_sample_auc` of `model` and of `controls`, plain models of the same scene from other seeds.
 
-    `original`: another plain model of the scene that is compared with the controls too, since it can be
-    further from them than they are from each other. Raises UsageError for fewer than two controls.
+    `original`: another plain model of the scene to compare with the controls, since it can be further from
+    them than they are from each other. Raises UsageError for fewer than two controls.
     """
     if len(controls) < 2:
         raise UsageError(f"expected at least two control models of the scene, got {len(controls)}")
@@ -55,11 +55,10 @@ def two_sample_auc(a: Gaussians, b: Gaussians, *, seed: int = 0) -> Auc:
     """AUC of boosted trees that distinguish single Gaussians of `b` from those of `a`.
 
     The mean over five folds, with its 95 % confidence interval by DeLong's method (1988). Trees see
-    `features` of equally many Gaussians of both models, at most 10,000 random ones.
-    Folds consist of cells of space: with folds of single Gaussians, the trees would learn each held-out
-    Gaussian's equal under the opposite label, and a model against itself would score far below 0.5. Raises
-    UsageError for a model of fewer than 100 Gaussians or of too few distinct positions for five folds, and
-    BackendError without scikit-learn.
+    `features` of equal numbers of Gaussians of both models, at most 10,000 each. Folds consist of cells of
+    space: with random folds, the trees would learn a held-out Gaussian's duplicate under the opposite label,
+    and a model against itself would score far below 0.5. Raises UsageError for a model of fewer than 100
+    Gaussians or of too few distinct positions for five folds, BackendError without scikit-learn.
     """
     size = min(len(a), len(b), MAX_GAUSSIANS)
     if size < MIN_GAUSSIANS:
@@ -73,7 +72,7 @@ def two_sample_auc(a: Gaussians, b: Gaussians, *, seed: int = 0) -> Auc:
             "expected Gaussians spread over space, but they lie in too few places for five folds"
         )
     aucs, variances = zip(
-        *(_held_out(values, is_b, fold == index, seed) for index in range(FOLDS)), strict=True
+        *(_held_out_auc(values, is_b, fold == index, seed) for index in range(FOLDS)), strict=True
     )
     auc, margin = fmean(aucs), 1.96 * sum(variances) ** 0.5 / FOLDS
     return Auc(auc, max(auc - margin, 0.0), min(auc + margin, 1.0))
@@ -84,14 +83,14 @@ def features(gaussians: Gaussians, *, limit: int | None = None, seed: int = 0) -
 
     - `position`: D = 3.
     - `scale`: the 3 log scales in ascending order.
-    - `rotation`: the 6 entries of R diag(log s - mean log s) R^T, with those off the diagonal times sqrt 2,
-      for Frobenius distances. Sign and length of the quaternion and the order of axes do not matter.
+    - `rotation`: the 6 entries of R diag(log s - mean log s) R^T, off-diagonal ones times sqrt 2 for
+    Frobenius
+      distances. Invariant to sign and length of the quaternion and to the order of axes.
     - `opacity`: the logit, clamped to -16 and 16; NaN counts as transparent.
     - `colour`: RGB of the constant coefficients.
     - `harmonics`: the 45 other coefficients, zeros above the model's degree.
 
-    `limit`: the maximum number of Gaussians, chosen at random by `seed`. Raises UsageError for an empty
-    model.
+    `limit`: maximum number of Gaussians, sampled with `seed`. Raises UsageError for an empty model.
     """
     if len(gaussians) == 0:
         raise UsageError("expected a model with Gaussians in it, got an empty one")
@@ -120,26 +119,26 @@ def space_cells(positions: Numbers, per_axis: int) -> Integers:
 
 
 def _folds(positions: Floats, seed: int) -> Integers:
-    """[N] the fold of each Gaussian; each cell of space has a random one."""
+    """[N] fold of each Gaussian; cells of space are assigned at random."""
     _, cell = np.unique(space_cells(positions, _CELLS), return_inverse=True)
     return np.random.default_rng(seed).permutation(cell.max() + 1)[cell] % FOLDS
 
 
-def _held_out(values: Floats, is_b: Flags, held_out: Flags, seed: int) -> tuple[float, float]:
-    """AUC on held-out Gaussians of trees trained on the others, and its variance."""
+def _held_out_auc(values: Floats, is_b: Flags, held_out: Flags, seed: int) -> tuple[float, float]:
+    """AUC and its variance on held-out Gaussians, for trees trained on the others."""
     ensemble = import_extra("sklearn.ensemble", "audit", "train classifiers")
     threadpoolctl = import_extra("threadpoolctl", "audit", "train classifiers")
     trees = ensemble.HistGradientBoostingClassifier(
         max_iter=_TREES, max_leaf_nodes=_LEAVES, early_stopping=False, random_state=seed
     )
-    with threadpoolctl.threadpool_limits(1, "openmp"):  # so few rows do not keep several threads busy
+    with threadpoolctl.threadpool_limits(1, "openmp"):  # too few rows for several threads
         trees.fit(values[~held_out], is_b[~held_out])
         scores = trees.decision_function(values[held_out])
     return delong(scores[~is_b[held_out]], scores[is_b[held_out]])
 
 
 def _elongation(quats: Floats, log_scales: Floats) -> Doubles:
-    """[N, 6] direction and amount of each Gaussian's elongation: see `features`."""
+    """[N, 6] the feature `rotation`; see `features`."""
     xyzw = quats[:, [1, 2, 3, 0]].astype(np.float64)
     xyzw[~xyzw.any(axis=1), 3] = 1  # a zero quaternion means no rotation
     axes = Rotation.from_quat(xyzw).as_matrix()

@@ -11,7 +11,7 @@ from keyss.core.arrays import Bytes
 
 
 def contact_sheet(heads: Sequence[str], rows: Mapping[str, Sequence[Bytes]], cell: int = 200) -> Image.Image:
-    """Rows of pictures [H, W, 3], each `cell` pixels high, beside the names of the rows and below heads."""
+    """Rows of pictures [H, W, 3], each `cell` pixels high, with names on the left and `heads` above."""
     gap, font = cell // 40, ImageFont.load_default(cell // 14)
     scaled = [
         [

@@ -25,15 +25,15 @@ _FIDELITY_VIEWS = 8
 class BaselineQuality:
     """Plain 3DGS of the same scenes; None if a scene has no plain model.
 
-    It is a bound only if `equal`, with as many Gaussians and training steps; else it is the model that
-    training started from.
+    If `equal`, it has as many Gaussians and training steps, and is an upper bound; else it is the model from
+    which training started.
     """
 
     cover: ImageQuality | None
     secrets: tuple[ImageQuality | None, ...]
-    gaussians: tuple[int | None, ...]  # of the plain models of the cover and of the secrets
-    steps: tuple[int | None, ...] = ()  # of their training; None: given models, unknown
-    equal: tuple[bool, ...] = ()  # whether the scene itself had as many steps in all
+    gaussians: tuple[int | None, ...]  # plain models: cover, then secrets
+    steps: tuple[int | None, ...] = ()  # training steps of the plain models; None: given, unknown
+    equal: tuple[bool, ...] = ()  # whether the scene had as many steps in total
 
 
 @dataclass(frozen=True)
@@ -51,15 +51,15 @@ class WrongKeys:
 
     keys: int
     vs_cover: PsnrRange  # means over the decoders
-    vs_secrets: tuple[PsnrRange, ...]  # of each decoder, from its secret's cameras
+    vs_secrets: tuple[PsnrRange, ...]  # per decoder, on its secret's cameras
 
 
 @dataclass(frozen=True)
 class RenderFidelity:
-    """Renders of a model against those of the plain model that it should look like, from test cameras."""
+    """Renders of a model against renders of its plain model, on test cameras."""
 
-    psnr: float  # dB, of the mean squared error over all views; at most 120
-    nothing: float  # dB, of empty renders
+    psnr: float  # dB, from the mean squared error over all views; at most 120
+    nothing: float  # dB, empty renders against those of the plain model
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ class Shown:
     """The quality of a model on the test views of its scene, and of the plain model."""
 
     quality: ImageQuality
-    plain: ImageQuality | None  # this and the next are None without a plain model
+    plain: ImageQuality | None  # None without a plain model, like `fidelity`
     fidelity: RenderFidelity | None
 
 
@@ -88,23 +88,23 @@ def measure_hiding(
     scenes: Sequence[Scene],  # the cover, then the secrets in the order of `opened`, each in its own frame
     baselines: Sequence[Gaussians | None],  # plain models of the scenes, each in its own frame
     *,
-    steps: Sequence[int | None] = (),  # of the baselines, and whether their scenes had as many
+    steps: Sequence[int | None] = (),  # training steps of the baselines, and whether their scenes had as many
     equal: Sequence[bool] = (),
     wrong_keys: int = WRONG_KEYS,
     seed: int = 0,
-    shown: Sequence[Shown] | None = None,  # of stego model and secrets, if known: they are not rendered again
+    shown: Sequence[Shown] | None = None,  # stego model, then secrets; saves rendering them again
 ) -> HidingQuality:
     """Measure cover and secrets, their plain models, and renders under wrong keys.
 
     Wrong keys are embeddings sampled like those of random keys. An attacker with a decoder but no key sees
-    what they decode to; it should look like the cover, that is, be at the chance level. Raises UsageError for
-    no wrong keys.
+    the models they decode to, which should look like the cover: PSNRs at the chance level. Raises UsageError
+    if `wrong_keys` is less than 1.
     """
     if wrong_keys < 1:
         raise UsageError(f"expected at least one wrong key, got {wrong_keys}")
     if shown is None:
         models = [stego, *(secret.reveal(stego).to(stego.device) for secret in opened)]
-        shown = list(map(show, models, baselines, scenes))
+        shown = list(map(compare, models, baselines, scenes))
     cover = scenes[0]
     placed = [in_cover(*pair, cover) for pair in zip(opened, scenes[1:], strict=True)]
     return HidingQuality(
@@ -125,7 +125,7 @@ def measure_hiding(
 def in_cover(opened: Opened, secret: Scene, cover: Scene) -> Scene:
     """The secret's scene with its test cameras in the cover's frame.
 
-    A secret without a frame of its own there is placed where its training cameras fit the cover's best.
+    A secret without a frame there is placed by aligning its training cameras with the cover's.
     """
     frame = opened.frame
     if frame is None:
@@ -139,7 +139,7 @@ def _wrong_keys(
     stego: Gaussians,
     opened: Sequence[Opened],
     cover: Scene,
-    secrets: Sequence[Scene],  # in the cover's frame
+    secrets: Sequence[Scene],  # placed in the cover's frame
     count: int,
     seed: int,
 ) -> WrongKeys | None:
@@ -163,11 +163,11 @@ def _wrong_keys(
 
 
 @torch.no_grad()
-def show(model: Gaussians, plain: Gaussians | None, scene: Scene, *, of_plain: bool = False) -> Shown:
-    """Compare both models with the test views of their scene; each view is rendered once, none is kept.
+def compare(model: Gaussians, plain: Gaussians | None, scene: Scene, *, of_plain: bool = False) -> Shown:
+    """Compare both models with the test views of their scene, rendering each view once.
 
-    Fidelity compares a model with the plain model itself, independently of photos. `of_plain`: the scene has
-    no photos; its images are renders of the plain model, which are not rendered again.
+    Fidelity compares the model with the plain model, without photos. `of_plain`: the scene has no photos; its
+    images are renders of the plain model, and are reused.
     """
     background = scene.background.to(model.device)
     compared = set(map(id, subsample_views(scene.test, _FIDELITY_VIEWS)))

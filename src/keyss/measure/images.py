@@ -31,8 +31,8 @@ class ImageScores:
     """Scores of an image against its reference. SSIM: 11 x 11 Gaussian window of sigma 1.5, mean over RGB."""
 
     psnr: float  # dB; at most 120, for equal images
-    ssim_3dgs: float  # as 3DGS computes it, with zero padding
-    ssim_standard: float  # without the border of 5 pixels (Wang et al. 2004, scikit-image, pytorch-msssim)
+    ssim_3dgs: float  # 3DGS's, with zero padding
+    ssim_standard: float  # crops a border of 5 pixels (Wang et al. 2004, scikit-image, pytorch-msssim)
     lpips_alex: float | None = None  # LPIPS 0.1 with AlexNet, from 0; needs at least 31 x 31 pixels
 
 
@@ -40,7 +40,7 @@ class ImageScores:
 class ImageComparison:
     """Images against references of the same names."""
 
-    views: dict[str, ImageScores]  # by name
+    views: dict[str, ImageScores]  # scores by view name
     mean: ImageScores  # over the views (Mip-NeRF 360's protocol for PSNR)
     missing: str | None = None  # why there is no LPIPS
 
@@ -103,7 +103,7 @@ def _ssim(a: Doubles, b: Doubles, mask: Flags) -> tuple[float, float]:
     return float(values[mask].mean()), float(values[inner][mask[inner]].mean())
 
 
-def steganalysed(views: Sequence[View]) -> list[View]:
+def select_views(views: Sequence[View]) -> list[View]:
     """At most 64 views, evenly spaced in the order of their names."""
     return list(subsample_views(sorted(views, key=lambda view: view.camera.name), STEGANALYSED_VIEWS))
 

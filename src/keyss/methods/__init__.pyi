@@ -6,11 +6,11 @@ from .base import (
     Source as Source,
     Stego as Stego,
     Training as Training,
-    divided as divided,
+    divide as divide,
 )
 from .carry.method import most_contributing as most_contributing
 from .carry.options import CarryOptions as CarryOptions
-from .carry.room import RecordRoom as RecordRoom, SecretSize as SecretSize, of_degree as of_degree
+from .carry.room import RecordRoom as RecordRoom, SecretSize as SecretSize, to_degree as to_degree
 from .decoy import Decoy as Decoy
 from .dither import dither_model as dither_model
 from .keyss.combined import CombinedPoses as CombinedPoses, PlacedScene as PlacedScene
@@ -28,7 +28,7 @@ from .keyss.options import (
 from .keyss.secret import DECODERS as DECODERS, KeyssSecret as KeyssSecret, choose_anchors as choose_anchors
 from .keyss.training import KeyssTraining as KeyssTraining
 from .opened import Frame as Frame, HiddenFile as HiddenFile, Opened as Opened, Remains as Remains
-from .plain_models import Bound as Bound, with_plain_models as with_plain_models
+from .plain_models import Bound as Bound, fit_plain_models as fit_plain_models
 from .records.embedding import (
     embed_models as embed_models,
     encode_all as encode_all,
@@ -37,10 +37,10 @@ from .records.embedding import (
 from .records.lines import Line as Line, Table as Table
 from .records.opening import CarriedSecret as CarriedSecret, unpack as unpack
 from .records.precision import (
-    fitted as fitted,
-    good_enough as good_enough,
+    choose_precision as choose_precision,
+    encode_to_size as encode_to_size,
     most_visible as most_visible,
-    pruned as pruned,
+    prune_to_size as prune_to_size,
 )
 from .records.quantise import Codec as Codec, outliers as outliers
 from .registry import open_model as open_model

@@ -1,7 +1,7 @@
-"""The protocol of methods: from scenes and keys to a published model, and from it and a key to a secret.
+"""The protocol of methods: hide secrets under keys in a published model, and open it with a key.
 
-A method lives in a folder of its own and is entered once, in `keyss.methods.registry`. Nothing outside its
-folder tests for its name: it declares its capabilities, and returns its results as these types.
+A method has a folder and an entry in `keyss.methods.registry`. Code outside the folder never tests for the
+method's name, but for its capabilities.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ if TYPE_CHECKING:  # the command line reads options without torch
 
 @dataclass(frozen=True)
 class Source:
-    """The cover or a secret: the plain model or the photos that are given, and later both."""
+    """The cover or a secret, given as photos or a plain model; later it has both."""
 
     given: Gaussians | None  # plain 3DGS model on the CPU; None until it is fitted to the photos
     photos: bool  # False: renders of the model replace photos
-    key: str = field(default="", repr=False)  # of a secret, if the method has keys
+    key: str = field(default="", repr=False)  # the secret's key, if the method has keys
     loaded: Scene | None = None
 
     @property
@@ -52,9 +52,9 @@ class Source:
 
 @dataclass(frozen=True)
 class Training:
-    """The method's own training of one scene, which a bound has to match."""
+    """The method's own training of one scene, which its upper bound has to match."""
 
-    steps: int = 0  # that render the scene
+    steps: int = 0  # steps that render the scene
     continues: bool = True  # starts from the plain model, whose steps count too
 
 
@@ -66,7 +66,7 @@ class Context:
     checkpoints: Path | None = None  # folder for the state of interrupted trainings
     resume: bool = False
     reporter: Reporter | None = None
-    # 32 secret bytes from which all randomness is derived: equal ones give equal files. None: the system's.
+    # 32 secret bytes that seed all randomness: equal bytes give equal files. None: the system's randomness.
     entropy: bytes | None = field(default=None, repr=False)
 
 
@@ -75,11 +75,11 @@ class Stego:
     """The result of hiding."""
 
     gaussians: Gaussians  # the published model
-    opened: tuple[Opened, ...]  # the secrets as their keys open them
-    iterations: int = 0  # of the method's own training
+    opened: tuple[Opened, ...]  # the secrets, opened with their keys
+    iterations: int = 0  # joint training steps
     details: Mapping[str, Any] = field(default_factory=dict)  # the method's own numbers, for metrics.json
     verified: bool = False  # True if `opened` was read from `gaussians` with the keys
-    handed: tuple[Payload, ...] = ()  # the file that is handed over for each secret, if there are any
+    handed: tuple[Payload, ...] = ()  # files to hand over, one per secret, if the method has any
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,9 +100,9 @@ class CommandLineOption:
     """
 
     help: str
-    metavar: str | None = None  # stands for the value in the help
+    metavar: str | None = None  # placeholder of the value in the help
     default: str | None = None  # the meaning of None
-    parse: Callable[[str], Any] | None = None  # from text to the value, if the type does not
+    parse: Callable[[str], Any] | None = None  # parses text, if the type does not
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -111,11 +111,11 @@ class MethodOptions:
 
     method: ClassVar[str]  # name in files and on the command line, 1 to 15 ASCII characters
 
-    fit: FitConfig = field(default_factory=FitConfig)  # of plain models, and of the method's own training
+    fit: FitConfig = field(default_factory=FitConfig)  # plain models, and joint training
     publish: Publish = "as-is"  # or any: the published model may be converted
-    format: Format | None = None  # of a model that stays as it is; None: the cover's
-    # For models that may be converted: appended Gaussians have room for everything, and everybody sees them;
-    # colours have little room and show less.
+    format: Format | None = None  # for `publish="as-is"`; None: the cover's format
+    # For `publish="any"`: appended Gaussians have unlimited room but are visible in the file; colours have
+    # little room and are less visible.
     channel: AnyChannel = "appended"
 
     def __post_init__(self) -> None:
@@ -136,7 +136,7 @@ class MethodOptions:
 
     @property
     def place(self) -> Channel:
-        """The channel that carries the secrets, in a cover that is not known."""
+        """The channel that carries the secrets, for an unknown cover."""
         return self.place_in(None)
 
     def place_in(self, cover: Gaussians | None) -> Channel:
@@ -165,19 +165,19 @@ class MethodOptions:
 
     @classmethod
     def variants(cls) -> Mapping[str, Self]:
-        """Options of other variants that a comparison adds, by name."""
+        """Options of further variants for comparisons, by name."""
         return {}
 
     def for_fitted_cover(self) -> Self:
-        """The same for a cover that keyss fits, which may be changed until it can carry."""
+        """Options for a cover that keyss fits, which may be changed to have room."""
         return self
 
     def with_fit(self, **changes: Any) -> Self:
-        """The same with changed fields of `fit`."""
+        """Options with changed fields of `fit`."""
         return replace(self, fit=replace(self.fit, **changes))
 
     def joint_plan(self, secrets: int) -> Plan:
-        """The plan of methods that train all scenes together, with as many Gaussians as a plain model has."""
+        """The plan of a joint training with the size of one plain model."""
         fit = self.fit
         return Plan(
             gaussians=fit.max_gaussians,
@@ -189,7 +189,7 @@ class MethodOptions:
         )
 
     def check_published_exactly(self) -> None:
-        """Raise UsageError where a jointly trained model would be published in a lossy form."""
+        """Raise UsageError if a jointly trained model would be published in a lossy format."""
         if self.publish == "any" or self.format not in (None, "ply"):
             option = 'publish="any"' if self.publish == "any" else f'format="{self.format}"'
             raise UsageError(
@@ -203,8 +203,8 @@ class Stage:
     """A part of a run."""
 
     name: str
-    steps: int  # 0 where nothing is trained
-    gaussians: int  # at its end, at most
+    steps: int  # 0 without training
+    gaussians: int  # upper limit at its end
     seconds: float  # a rough estimate
 
 
@@ -215,18 +215,18 @@ class Plan:
     Sizes are exact for given models, and upper limits for models that are not fitted yet.
     """
 
-    gaussians: int  # of the published model
-    sh_degree: int  # of the published model
-    secret_gaussians: int  # of all secrets together
+    gaussians: int  # Gaussians of the published model
+    sh_degree: int  # SH degree of the published model
+    secret_gaussians: int  # total over the secrets
     capacity: int  # Gaussians of the secrets that fit
-    steps: int = 0  # of the method's own training
+    steps: int = 0  # joint training steps
     rendered: tuple[int, ...] = ()  # Gaussians of the cover and of each secret in a step
-    notes: tuple[str, ...] = ()  # what the options cost, a sentence each
+    notes: tuple[str, ...] = ()  # sentences on the costs of options
 
     method: str = ""
     stages: tuple[Stage, ...] = ()
-    file_bytes: int = 0  # of the published model, at most
-    disk_bytes: int = 0  # of all files that exist at the same time, checkpoints included
+    file_bytes: int = 0  # upper limit for the published model
+    disk_bytes: int = 0  # maximum on disk at one time, checkpoints included
     free_bytes: int | None = None  # on their disk; None if nothing is written
     memory_bytes: int = 0  # a rough estimate
 
@@ -238,20 +238,20 @@ class Plan:
 class Method(Protocol):
     """One way to hide secrets."""
 
-    name: str  # that of its options
-    max_secrets: int  # in one model
+    name: str  # equal to `options.method`
+    max_secrets: int  # maximum secrets per model
     capabilities: Capabilities
     options: type[MethodOptions]
 
     def prepare(self, sources: Sequence[Source], options: Any) -> Any:
-        """The options completed for these scenes, the cover first.
+        """Complete the options for these scenes, the cover first.
 
-        Called again once the plain models are fitted, with these as the given ones.
-        Raises UsageError and InputError for what cannot work, before anything is trained.
+        Called again with the plain models once they are fitted. Raises UsageError and InputError for what
+        cannot work, before any training.
         """
 
     def plan(self, sources: Sequence[Source], options: Any) -> Plan:
-        """The fields of the plan that a method knows; `options` are prepared."""
+        """Fill in the fields of the plan that the method knows; `options` are prepared."""
 
     def hide(self, cover: Source, secrets: Sequence[Source], options: Any, context: Context) -> Stego:
         """Hide the secrets; `options` are prepared and have a seed.
@@ -260,8 +260,8 @@ class Method(Protocol):
         """
 
 
-def divided(available: Sequence[int], total: int) -> list[int]:
-    """`total` items in equal shares, each at most what is `available`; the others share the rest."""
+def divide(available: Sequence[int], total: int) -> list[int]:
+    """Divide `total` items equally, with at most `available` [S] for each share; the others get the rest."""
     shares = [0] * len(available)
     left = total
     for done, index in enumerate(sorted(range(len(available)), key=lambda i: available[i])):
@@ -271,7 +271,7 @@ def divided(available: Sequence[int], total: int) -> list[int]:
 
 
 def role_of(index: int, scenes: int) -> str:
-    """The name of scene `index` of so many: the cover comes first, and a single secret has no number."""
+    """The name of scene `index` of `scenes`. Scene 0 is the cover; a single secret has no number."""
     return "cover" if index == 0 else "secret" if scenes == 2 else f"secret {index}"
 
 

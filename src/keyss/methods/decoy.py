@@ -1,4 +1,4 @@
-"""What a wrong key opens with `decoy`: the cover, as a carried secret would come out of the model."""
+"""Decoys: with `decoy`, a wrong key opens the cover, encoded like a carried secret."""
 
 from __future__ import annotations
 
@@ -18,24 +18,24 @@ from keyss.methods.records.quantise import Codec
 
 _STRENGTH = 0.02  # standard deviation of changes of opacity logits
 _MOVE = 1e-4  # standard deviation of rotations (radians), shifts (of the model's size) and changes of scale
-_FAINT = 1.6 * DRAWN_OPACITY  # opacity that appended Gaussians do not reach
-_KNOTS, _LOGITS = 16, 10.0  # the changes are a piecewise linear function of logits from -10 to 10
-_FINER = -0.5  # octaves: about the precision of payloads that are appended
-_LEAST = 0.8  # share of the cover's Gaussians that are left, at least
+_FAINT = 1.6 * DRAWN_OPACITY  # upper limit of opacities of appended Gaussians
+_KNOTS, _LOGITS = 16, 10.0  # changes are piecewise linear in logits from -10 to 10
+_FINER = -0.5  # octaves: about the precision of appended payloads
+_MIN_SHARE = 0.8  # minimum share of the cover's Gaussians that are left
 
 
 @dataclass(frozen=True)
 class Decoy:
-    """An `Opened` that shows the cover, changed too little to be seen.
+    """An `Opened` that shows the cover, imperceptibly changed.
 
-    Opacities change by a smooth function of opacity, everything by a similarity, and the faintest Gaussians
-    are left out. All of it is sampled from the derived key: without the key nobody can compute the bytes.
-    What is left is encoded and decoded like a carried secret, whose numbers are quantised.
+    A smooth function changes opacities, a similarity moves everything, and the faintest Gaussians are left
+    out. The derived key seeds all of it, so that nobody can compute the bytes without the key. The rest is
+    encoded and decoded like a carried secret, which quantises its numbers.
     """
 
     frame: Similarity
     changes: torch.Tensor  # [_KNOTS] of opacity logits
-    share: float  # of the rendered Gaussians, how many are left
+    share: float  # fraction of the rendered Gaussians that is left
     order: int  # seed of their order
     appended: bool = False  # True if the model has appended Gaussians, which are left out
     records: bool = True  # True if a secret would lie in records, else in one payload
@@ -44,7 +44,7 @@ class Decoy:
 
     @staticmethod
     def of(stego: Gaussians, key: DerivedKey, *, appended: bool = False, records: bool = True) -> Decoy:
-        """The decoy of a wrong key, the same whenever model and key are the same."""
+        """The decoy of a wrong key; a deterministic function of model and key."""
         generator = torch.Generator().manual_seed(int.from_bytes(key.expand("decoy", 8), "little") >> 1)
         changes = _STRENGTH * torch.randn(_KNOTS, generator=generator)
         rotation, shift = _MOVE * torch.randn(2, 3, generator=generator, dtype=torch.float64)
@@ -52,7 +52,7 @@ class Decoy:
         skew[[2, 0, 1], [1, 2, 0]] = rotation
         size = (stego.means - stego.means.mean(0)).norm(dim=1).median().double().clamp_min(1e-9).cpu()
         scale = 1 + _MOVE + abs(float(shift.mean()))  # far enough from 1 to change all log scales
-        share = 1 - (1 - _LEAST) * float(torch.rand((), generator=generator))
+        share = 1 - (1 - _MIN_SHARE) * float(torch.rand((), generator=generator))
         order = int(torch.randint(1 << 62, (), generator=generator))
         frame = Similarity(scale, torch.matrix_exp(skew - skew.T), shift * size)
         return Decoy(frame, changes, share, order, appended, records)
@@ -71,10 +71,10 @@ class Decoy:
         changed = changed[changed.opacity_logits.topk(count).indices.sort().values]
         if frame == "secret":
             changed = self.frame.inverse().apply_gaussians(changed)
-        return self._as_carried(changed, stego)
+        return self._encode_and_decode(changed, stego)
 
-    def _as_carried(self, model: Gaussians, stego: Gaussians) -> Gaussians:
-        """`model`, encoded and decoded as what `stego` would carry."""
+    def _encode_and_decode(self, model: Gaussians, stego: Gaussians) -> Gaussians:
+        """Encode and decode `model` like a secret carried by `stego`."""
         room = LowBitsRoom.of(int(TYPICAL_SHARE * len(stego)), stego.sh_degree)
         ways = product(range(stego.sh_degree, -1, -1), (2, 1))  # SH degree, records in a carrier
         found = ((cells, Table.of_size(8 * room.record_bytes(cells), degree)) for degree, cells in ways)
@@ -84,13 +84,13 @@ class Decoy:
             return whole.decode(whole.encode(model, precision.finer(_FINER * self.appended)))
         order = torch.randperm(len(model), generator=torch.Generator().manual_seed(self.order))
         model = model[order[: cells * room.carriers]].with_sh_degree(table.sh_degree)
-        codec, outliers = Codec.and_outliers(model, table)
+        codec, outliers = Codec.fit_with_outliers(model, table)
         return codec.decode(codec.encode(model, outliers))
 
     def remains(self, revealed: Gaussians) -> Remains:
-        """All of the decoy, which is never damaged."""
+        """A decoy is always complete."""
         return Remains(len(revealed), len(revealed))
 
     def fingerprint(self) -> str:
-        """A constant, which no secret of a run has."""
+        """A constant that no secret has."""
         return "decoy"

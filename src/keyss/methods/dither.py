@@ -1,10 +1,9 @@
-"""New low bits for models that came through a coarser format.
+"""Dithering: new low bits for models that were stored in a coarser format.
 
-If a property has few different values, as after 8 or 16 bits, or low bits that are not uniform, as after an
-added offset, each value is moved by a random amount below half of the distance to the nearest other value:
-less than the format's own precision, which would round it back. The values are then spread around the steps
-of the format. Trained values are spread differently: an expert sees that the model was dithered, but not
-whether its low bits carry anything.
+If a property has few distinct values, as after quantisation to 8 or 16 bits, or non-uniform low bits, as
+after adding an offset, each value moves by a random amount below half of the distance to the nearest other
+value: less than the precision of the format, which would round it back. An expert can detect the dithering,
+since trained values are distributed differently, but not whether low bits carry anything.
 """
 
 from __future__ import annotations
@@ -19,10 +18,10 @@ from keyss.core.arrays import Doubles, Flags, Floats
 from keyss.core.gaussians import Gaussians
 from keyss.keys.derivation import stream
 
-_BITS, _CHANCE = 9, 1e-6  # low bits that depend on each other are not random
-_FEW = 0.8  # share of different values below which a property was quantised; in trained models above 0.95
-_SPARSE = 0.1  # share of different values above which the steps of a format are finer than gaps in the data
-_TYPICAL = 0.9  # quantile of the distances above which a distance is a gap in the data
+_BITS, _CHANCE = 9, 1e-6  # low bits tested for randomness, and the minimum p-value
+_FEW = 0.8  # distinct values / values of a quantised property, at most; above 0.95 in trained models
+_SPARSE = 0.1  # distinct values / values above which a format's steps are finer than gaps in the data
+_TYPICAL = 0.9  # quantile of the distances; larger ones are gaps in the data
 _SAMPLE = 20_000  # Gaussians
 _UNIT = 1e-5  # the largest difference between 1 and the length of a unit quaternion
 _FAINT = 1e-3  # standard deviation of new harmonics
@@ -30,10 +29,10 @@ _LOOSE = {"log_scales": 0.01, "quats": 0.01, "opacity_logits": 0.01, "sh": _FAIN
 
 
 def dither_model(model: Gaussians, entropy: bytes) -> Gaussians:
-    """`model` with new low bits where they are not random; positions and constant colours stay.
+    """`model` with new low bits where they are not random; positions and constant colours do not change.
 
-    `entropy`: 32 secret bytes. Properties with a single value stay unchanged, and so do
-    quaternions of unit length, which is known exactly: see `keyss.channels.quiet.bits`.
+    `entropy`: 32 secret bytes. Properties with a single value do not change, nor do quaternions of unit
+    length (see `keyss.channels.quiet.bits`).
     """
     changed = {}
     unit = (model.quats.detach().cpu().double().norm(dim=1) - 1).abs() < _UNIT
@@ -44,33 +43,33 @@ def dither_model(model: Gaussians, entropy: bytes) -> Gaussians:
             if not _is_natural(columns[:, column]):
                 random = stream(entropy, f"dither/{name}/{column}", 8 * len(columns))
                 noise = np.frombuffer(random, "<u8").astype(np.float64) / 2.0**63 - 1
-                columns[:, column] = _dithered(columns[:, column], noise)
+                columns[:, column] = _dither(columns[:, column], noise)
         if name == "quats":
             values[unit] = model.quats.detach().cpu()[unit]
         changed[name] = values
     return Gaussians(means=model.means, **changed)
 
 
-def raised(model: Gaussians, sh_degree: int, entropy: bytes) -> Gaussians:
-    """`model` with harmonics up to `sh_degree`, the new ones random and too small to be seen.
+def raise_degree(model: Gaussians, sh_degree: int, entropy: bytes) -> Gaussians:
+    """`model` with harmonics up to `sh_degree`; new ones are random and imperceptible.
 
-    Zeros have no low bits that could be replaced. A model of this degree or more stays unchanged.
+    (Zeros have no replaceable low bits.) A model of this degree or more does not change.
     """
     count = 3 * ((sh_degree + 1) ** 2 - model.sh.shape[1])
     if count <= 0:
         return model
     seed = int.from_bytes(stream(entropy, "dither/raised", 8), "little") >> 1
     generator = torch.Generator().manual_seed(seed)
-    # Scaled before they are rounded: a product of single precision keeps a trace of its factor.
+    # Scale before rounding: products in single precision keep a trace of their factor.
     noise = _FAINT * torch.randn(len(model), count // 3, 3, generator=generator, dtype=torch.float64)
     return replace(model, sh=torch.cat([model.sh, noise.to(model.sh)], dim=1))
 
 
-def loosened(model: Gaussians, usable: Flags, entropy: bytes) -> Gaussians:
-    """`model` with small noise on the numbers of all Gaussians that are not `usable` [N]; positions stay.
+def add_noise(model: Gaussians, usable: Flags, entropy: bytes) -> Gaussians:
+    """Add small noise to Gaussians that are not `usable` [N]; positions do not change.
 
-    After few steps of training, many Gaussians still have equal scales, grey colours or no harmonics, so that
-    their low bits cannot be replaced. Quaternions stay where most of them have unit length.
+    After few training steps, many Gaussians still have equal scales, grey colours or no harmonics, whose low
+    bits cannot be replaced. Quaternions do not change if most have unit length.
     """
     rows = torch.from_numpy(np.flatnonzero(~usable))
     seed = int.from_bytes(stream(entropy, "dither/loosened", 8), "little") >> 1
@@ -90,7 +89,7 @@ def loosened(model: Gaussians, usable: Flags, entropy: bytes) -> Gaussians:
 
 
 def _is_natural(values: Floats) -> bool:
-    """True if the values are random to the last bit, except a few zeros, which training leaves too."""
+    """True if all bits of the values look random, except for a few zeros, which training leaves too."""
     measured = values[values != 0]
     if len(measured) > _FEW * len(values):
         values = measured
@@ -100,7 +99,7 @@ def _is_natural(values: Floats) -> bool:
     return chance_of_bits(words, _BITS) > _CHANCE
 
 
-def _dithered(values: Floats, noise: Doubles) -> Floats:
+def _dither(values: Floats, noise: Doubles) -> Floats:
     """`values` moved by `noise` in [-1, 1] times half of the distance to the nearest other value."""
     unique, inverse = np.unique(values.astype(np.float64), return_inverse=True)
     if len(unique) < 2:
@@ -110,7 +109,7 @@ def _dithered(values: Floats, noise: Doubles) -> Floats:
     reach = np.minimum(reach, np.quantile(gaps, _TYPICAL)) / 2
     half = unique.astype(np.float16)
     if len(unique) > _SPARSE * len(values) and (half == unique).all():
-        # Of half precision, but not every value occurs: the next one that does may be several steps away.
+        # Half precision with gaps: the nearest other value may be several steps away.
         reach = np.minimum(reach, np.spacing(np.abs(half)).astype(np.float64) / 2)
     moved: Floats = (values + noise * reach[inverse]).astype(np.float32)
     return moved

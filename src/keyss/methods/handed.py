@@ -1,9 +1,9 @@
-"""Files that are handed over: with one and the published model, a secret can be seen.
+"""Handed-over files: each reveals a secret together with the published model.
 
-Methods that do not store all of a secret in the published model have one for each secret. It is sealed with
-the secret's key if the method has keys; else whoever has the file sees the secret.
+Methods that do not store all of a secret in the published model have one per secret. It is encrypted with the
+secret's key if the method has keys; else whoever has the file sees the secret.
 
-    magic (16 bytes) | method (15) | 1 if sealed, else 0 | salt (16, zeros if not sealed) | content
+    magic (16 bytes) | method (15) | 1 if encrypted, else 0 | salt (16, zeros if not encrypted) | content
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _EXPECTED = "expected a file that was handed over, as `keyss hide` writes them f
 
 
 def pack(payload: Payload, key: str | None) -> bytes:
-    """The bytes of the file, sealed if there is a key."""
+    """The bytes of the file, encrypted if there is a key."""
     start = _MAGIC + pack_method(payload.method)
     if key is None:
         return start + bytes(1 + SALT_BYTES) + payload.data
@@ -32,29 +32,29 @@ def pack(payload: Payload, key: str | None) -> bytes:
     return header + encrypt(_data_key(header, key), payload.data, header)
 
 
-def is_sealed(data: bytes) -> bool:
-    """True if the file takes a key. Raises InputError for other files."""
+def is_encrypted(data: bytes) -> bool:
+    """True if the file needs a key. Raises InputError for other files."""
     if len(data) < _HEADER or not data.startswith(_MAGIC):
         raise InputError(f"{_EXPECTED}, got something else")
-    sealed = data[len(_MAGIC) + METHOD_BYTES]
-    if sealed not in (0, 1):
+    encrypted = data[len(_MAGIC) + METHOD_BYTES]
+    if encrypted not in (0, 1):
         raise InputError(f"{_EXPECTED}, got a damaged one")
-    return bool(sealed)
+    return bool(encrypted)
 
 
 def unpack(data: bytes, key: str | None) -> Payload:
     """The payload of `pack`. Raises InputError, WrongKeyError, UsageError for a missing or unneeded key."""
-    sealed, header, content = is_sealed(data), data[:_HEADER], data[_HEADER:]
+    encrypted, header, content = is_encrypted(data), data[:_HEADER], data[_HEADER:]
     try:
         method = unpack_method(header[len(_MAGIC) :])
     except UnicodeDecodeError as error:
         raise InputError(f"{_EXPECTED}, got a damaged one") from error
-    if not sealed:
+    if not encrypted:
         if key is not None:
             raise UsageError(f"the method {method} has no keys: whoever has this file sees the secret")
         return Payload(method, content)
     if key is None:
-        raise UsageError("this file is sealed with a key: give it")
+        raise UsageError("this file is encrypted with a key: give it")
     try:
         return Payload(method, decrypt(_data_key(header, key), content, header))
     except InputError as error:

@@ -15,7 +15,7 @@ from keyss.core.similarity import Similarity
 
 Frame = Literal["secret", "cover"]
 
-FILE = "file"  # in the place of a method's name
+FILE = "file"  # replaces the name of a method
 MAX_NAME_BYTES = 255
 
 
@@ -25,8 +25,8 @@ class Remains:
 
     found: int  # Gaussians that are left
     hidden: int  # Gaussians that were hidden; 0: unknown
-    chunks: tuple[int, int] | None = None  # of the payload: those left and those written; None: no chunks
-    slack: float = 0.0  # share by which the numbers may differ although nothing was lost
+    chunks: tuple[int, int] | None = None  # payload chunks left and written; None: not divided
+    slack: float = 0.0  # share by which `found` and `hidden` may differ without a loss
 
     @property
     def share(self) -> float:
@@ -40,18 +40,18 @@ class Remains:
 
 
 class Opened(Protocol):
-    """A secret as its key opens it, before it is revealed."""
+    """A secret opened by its key, but not revealed yet."""
 
     @property
     def frame(self) -> Similarity | None:
-        """From the secret's own frame into the cover's; None if it was never in the cover's."""
+        """Secret frame to cover frame; None if the secret was never in the cover's."""
 
     @property
     def decode(self) -> Callable[[Gaussians, Tensor], Gaussians] | None:
-        """The decoder, from a stego model and a key's vector [`key_size`] to Gaussians in the cover's frame.
+        """The decoder: a stego model and a key's vector [`key_size`] give Gaussians in the cover's frame.
 
-        The white-box attack follows its gradient in the vector. None if keys condition no decoder: then a
-        wrong key shows nothing at all.
+        Differentiable in the vector, for white-box attacks. None if keys condition no decoder: wrong keys
+        then show nothing at all.
         """
 
     @property
@@ -59,27 +59,27 @@ class Opened(Protocol):
         """Numbers of a key's vector; 0 without a decoder."""
 
     def reveal(self, stego: Gaussians, *, frame: Frame = "secret", force: bool = False) -> Gaussians:
-        """The secret as a model of its own, on the CPU; `force`: even from a changed model.
+        """The secret as a standalone model on the CPU; `force`: even from a changed model.
 
-        Raises InputError for a model that it does not belong to, UsageError for a frame that it never was in.
+        Raises InputError if it does not belong to the model, UsageError for a frame that it never was in.
         """
 
     def remains(self, revealed: Gaussians) -> Remains:
-        """The part of the secret that `reveal` gave."""
+        """The part of the secret in the result of `reveal`."""
 
     def fingerprint(self) -> str:
-        """16 hexadecimal digits that identify the secret in a run, and tell nothing about it."""
+        """16 hexadecimal digits that identify the secret in a run, and reveal nothing about it."""
 
 
 @dataclass(frozen=True)
 class HiddenFile:
-    """A hidden file with its former name, which is shown and never used as a path."""
+    """A hidden file and its name, which is displayed and never used as a path."""
 
     name: str
     data: bytes = field(repr=False)
 
     def payload(self) -> Payload:
-        """The payload for a channel. Raises UsageError for a name of more than MAX_NAME_BYTES."""
+        """The payload for a channel. Raises UsageError for a name longer than MAX_NAME_BYTES."""
         name = self.name.encode()
         if len(name) > MAX_NAME_BYTES:
             raise UsageError(f"expected a name of at most {MAX_NAME_BYTES} bytes, got {len(name)}")
@@ -87,7 +87,7 @@ class HiddenFile:
 
     @staticmethod
     def of(content: Content) -> HiddenFile:
-        """The file of a payload. Raises InputError for other content, and for damage."""
+        """Read a payload. Raises InputError for other content and damage."""
         if content.method != FILE or not isinstance(content, Payload):
             raise InputError("this key opens a scene, not a file: give it a model's name, such as secret.ply")
         size = content.data[0] if content.data else 0

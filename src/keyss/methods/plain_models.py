@@ -1,4 +1,4 @@
-"""Plain models that a method starts from, and bounds that its results are compared with."""
+"""Plain models, from which methods start, and upper bounds, with which their results are compared."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from keyss.fitting.plain import fit_scene
 from keyss.methods.base import Context, Source, Training, role_of
 
 
-def with_plain_models(
+def fit_plain_models(
     sources: Sequence[Source],  # the cover, then the secrets
     configs: Sequence[FitConfig],
     context: Context,
 ) -> list[Source]:
-    """The sources with plain models on the CPU, in their own frames; those that are not given are fitted.
+    """Fit missing plain models, on the CPU and in their own frames.
 
-    Each fit has its own seed, derived from that of its config, and tells nothing of the seeds of others.
-    Raises what `fit_scene` raises.
+    Each fit has its own seed, derived from its config's, which does not reveal other seeds. Raises the errors
+    of `fit_scene`.
     """
     missing = {
         index: (source.scene, config)
@@ -39,14 +39,14 @@ def plain_stage(role: str) -> str:
 
 @dataclass(frozen=True)
 class Bound:
-    """Plain 3DGS of as many Gaussians and as many training steps as a scene had, for comparison."""
+    """An upper bound: plain 3DGS with as many Gaussians and training steps as a scene had."""
 
-    steps: int | None  # of the scene in total; None: unknown, because its plain model was given
-    equal: bool  # True if the plain model has as many steps and is the bound itself
+    steps: int | None  # total training steps of the scene; None: unknown, its plain model was given
+    equal: bool  # True if the plain model has equal steps and is the upper bound itself
 
     @staticmethod
     def of(training: Training, plain_steps: int | None) -> Bound:
-        """The bound of a scene; `plain_steps`: steps of its plain model, if they are known."""
+        """The upper bound of a scene; `plain_steps`: steps of its plain model, if known."""
         if not training.continues:
             return Bound(training.steps, training.steps == plain_steps)
         if not training.steps:
@@ -54,7 +54,7 @@ class Bound:
         return Bound(None if plain_steps is None else plain_steps + training.steps, False)
 
     def config(self, fit: FitConfig, gaussians: int | None = None) -> FitConfig:
-        """The fit, with at most so many `gaussians`. Raises ValueError if `steps` are not known."""
+        """The fit, with at most `gaussians`. Raises ValueError if `steps` is unknown."""
         if self.steps is None:
             raise ValueError("the number of steps is not known")
         limit = fit.max_gaussians if gaussians is None else max(16, gaussians)
@@ -64,7 +64,7 @@ class Bound:
 def fit_bounds(
     scenes: Sequence[Scene], configs: Mapping[int, FitConfig], context: Context
 ) -> dict[int, Gaussians]:
-    """The bounds of some scenes, by index; see `with_plain_models`."""
+    """The upper bounds of some scenes, by index; see `fit_plain_models`."""
     fits = {index: (scenes[index], config) for index, config in configs.items()}
     return _fit_all(fits, "bound", ["plain 3DGS of as many steps"] * len(scenes), context)
 

@@ -1,4 +1,4 @@
-"""All methods, each entered once and loaded when it is needed, as is torch."""
+"""All methods, loaded on first use, like torch."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ if TYPE_CHECKING:
 
 
 class Modules(NamedTuple):
-    """Where the parts of a method are, as `module:name`."""
+    """The parts of a method, as `module:name`."""
 
-    summary: str  # continues the name in one line
-    options: str  # its `MethodOptions`, in a module that does not import torch
+    summary: str  # one line, printed after the name
+    options: str  # a `MethodOptions`, in a module that does not import torch
     hiding: str  # a `keyss.methods.base.Method`
-    opening: str  # from the content of a channel or a handed-over file to an `Opened`
+    opening: str  # turns content of a channel or a handed-over file into an `Opened`
 
 
-def _peer(module: str, options: str, summary: str) -> Modules:
+def _baseline(module: str, options: str, summary: str) -> Modules:
     room = "keyss.lab.peers"
     return Modules(summary, f"{room}.options:{options}", f"{room}.{module}:METHOD", f"{room}.{module}:unpack")
 
@@ -43,17 +43,17 @@ METHODS = {
         "keyss.methods.keyss.method:METHOD",
         "keyss.methods.keyss.secret:unpack",
     ),
-    "3dgs": _peer("bound", "BoundOptions", "upper bound: the secret is a separate file"),
-    "3dgs-sh": _peer("sh", "ShOptions", "second harmonics for the secret, handed over (baseline)"),
-    "3dgs-decoder": _peer(
+    "3dgs": _baseline("bound", "BoundOptions", "upper bound: the secret is a separate file"),
+    "3dgs-sh": _baseline("sh", "ShOptions", "second harmonics for the secret, handed over (baseline)"),
+    "3dgs-decoder": _baseline(
         "decoder",
         "DecoderOptions",
         "a network from the cover's picture to the secret's, handed over (baseline)",
     ),
-    "gs-hider": _peer(
+    "gs-hider": _baseline(
         "gs_hider", "GsHiderOptions", "features in place of harmonics, and a network for each scene"
     ),
-    "watergs": _peer(
+    "watergs": _baseline(
         "watergs",
         "WaterGsOptions",
         "harmonics in low bits of harmonics, opacities by an autoencoder (Splats in Splats)",
@@ -95,33 +95,33 @@ def of_options(options: MethodOptions) -> Method:
 def open_model(stego: Gaussians, key: str, *, decoy: bool = False) -> Opened:
     """The secret that `key` opens in a model (see `keyss.channels.publishing`).
 
-    With `decoy`, only one salt is tried, because otherwise a wrong key would take longer than a right one. A
-    key that opens nothing then gives a `Decoy`, else raises WrongKeyError. Raises InputError for damage.
+    Raises WrongKeyError for a key that opens nothing, InputError for damage. With `decoy`, such a key gives a
+    `Decoy` instead, and only one salt is tried: otherwise wrong keys would take longer than right ones.
     """
     from keyss.channels import open_content, quick_attempt
     from keyss.methods.decoy import Decoy
 
     if not decoy:
-        return _unpacked(open_content(stego, key))
+        return _unpack(open_content(stego, key))
     attempt = quick_attempt(stego, key)
     if attempt is None:
         raise WrongKeyError()
     if attempt.content is None:
         return Decoy.of(stego, attempt.key, appended=attempt.appended, records=attempt.records)
-    return _unpacked(attempt.content)
+    return _unpack(attempt.content)
 
 
 def open_handed(data: bytes, key: str | None) -> Opened:
-    """The secret in a file that was handed over (see `keyss.methods.handed`).
+    """The secret in a handed-over file (see `keyss.methods.handed`).
 
-    Raises WrongKeyError, InputError, and UsageError for a key missing or unneeded.
+    Raises WrongKeyError, InputError, and UsageError for a missing or unneeded key.
     """
     from keyss.methods import handed
 
-    return _unpacked(handed.unpack(data, key))
+    return _unpack(handed.unpack(data, key))
 
 
-def _unpacked(content: Content) -> Opened:
+def _unpack(content: Content) -> Opened:
     from keyss.methods.opened import FILE, HiddenFile, OpensAFileError
 
     name = content.method

@@ -17,7 +17,7 @@ from keyss.core.errors import InputError, UsageError
 from keyss.files.formats.decoded import load_tensors
 
 _ENTRY = "keyss"
-# What reading a damaged header or damaged tensors can raise.
+# Errors from reading a damaged header or damaged tensors.
 _LIBRARY_ERRORS = (safetensors.SafetensorError, msgspec.MsgspecError)
 _DAMAGE = (*_LIBRARY_ERRORS, KeyError, TypeError, ValueError, OverflowError, RuntimeError, UsageError)
 
@@ -34,17 +34,17 @@ HeaderT = TypeVar("HeaderT", bound=Header)
 
 
 def pack_tensors(tensors: Mapping[str, Tensor], header: Header) -> bytes:
-    """The same tensors and header give the same bytes."""
+    """Serialise tensors and a header. Deterministic."""
     kept = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
-    return safetensors.torch.save(kept, {_ENTRY: _encoded(header).decode()})
+    return safetensors.torch.save(kept, {_ENTRY: _encode_header(header).decode()})
 
 
 def unpack_tensors(
     data: bytes, kind: type[HeaderT], format: str, version: int
 ) -> tuple[HeaderT, dict[str, Tensor]]:
-    """The header and the tensors of `pack_tensors`, all finite. Call it within `damage_refused`.
+    """The header and the tensors of `pack_tensors`, all finite. Call it within `refuse_damage`.
 
-    `kind`: the class of the header, which has its types and bounds. Raises InputError for another version.
+    `kind`: the header's class, with types and bounds. Raises InputError for another version.
     """
     tensors = load_tensors(data)
     size = int.from_bytes(data[:8], "little")
@@ -55,24 +55,24 @@ def unpack_tensors(
         raise ValueError(f"format {found.format[:40]!r}")
     if found.version != version:
         raise InputError(f"secret of version {found.version}; this program reads version {version}")
-    # The only fields with a type that msgspec does not know are those of a `Similarity`.
+    # msgspec needs the hook for the tensors of a `Similarity`.
     header = msgspec.json.decode(
         text, type=kind, dec_hook=lambda _, numbers: torch.tensor(numbers, dtype=torch.float64)
     )
-    if _encoded(header) != text:
+    if _encode_header(header) != text:
         raise ValueError("its header has more or other fields")
     if not all(value.isfinite().all() for value in tensors.values()):
         raise ValueError("expected finite numbers")
     return header, tensors
 
 
-def _encoded(header: Header) -> bytes:
+def _encode_header(header: Header) -> bytes:
     return msgspec.json.encode(header, enc_hook=Tensor.tolist)
 
 
 @contextmanager
-def damage_refused(what: str) -> Iterator[None]:
-    """Turn the errors that reading damaged bytes raises into an InputError that begins with `what`."""
+def refuse_damage(what: str) -> Iterator[None]:
+    """Turn errors from reading damaged bytes into an InputError that begins with `what`."""
     try:
         yield
     except _DAMAGE as error:

@@ -12,13 +12,13 @@ from keyss.rendering.cpu.layout import CHANNEL_MAX, EPS2D_MIN
 
 MAX_SIDE = 2**16  # pixels
 MAX_CHANNELS = 32
-CAMERA_MAX = 1e12  # in viewmats and Ks, so that products do not overflow
+CAMERA_MAX = 1e12  # bounds viewmats and Ks, so that products do not overflow
 FOCAL_LENGTH_MIN = 1e-6  # pixels
 
 _BATCHES = "batch dimensions are not supported"
 _NO_CAMERAS = "colors are the same for every camera"
 
-# Arguments of gsplat that only say how it computes.
+# Arguments of gsplat that do not affect results.
 IGNORED = frozenset(("packed", "tile_size", "channel_chunk", "segmented"))
 # Arguments of gsplat that must have their default.
 ONLY_VALUES: dict[str, Any] = {
@@ -51,7 +51,7 @@ def check_arguments(
     sh_degree: int | None,
     others: Mapping[str, Any],
 ) -> None:
-    """Raise ValueError for a wrong shape or value, UsageError for what gsplat supports and we do not."""
+    """Raise ValueError for invalid shapes and values, UsageError for unsupported features of gsplat."""
     _check_others(others)
     for name, tensor in tensors.items():
         if not isinstance(tensor, Tensor):
@@ -120,7 +120,7 @@ def _check_colors(colors: Tensor, count: int, sh_degree: int | None) -> None:
 
 
 def _check_cameras(viewmats: Tensor, Ks: Tensor, backgrounds: Tensor | None) -> None:
-    """Raise ValueError for numbers that would spoil every pixel; bad Gaussians are merely skipped."""
+    """Raise ValueError for numbers that would affect every pixel; invalid Gaussians are only skipped."""
     limits = {
         "viewmats": (viewmats, CAMERA_MAX),
         "Ks": (Ks, CAMERA_MAX),

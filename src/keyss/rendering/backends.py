@@ -1,4 +1,4 @@
-"""Decides which device renders."""
+"""Selection of the device that renders."""
 
 from __future__ import annotations
 

@@ -25,19 +25,19 @@ class Viewpoints:
 
     @staticmethod
     def around(model: Gaussians) -> Viewpoints:
-        """Four views around a model, if nothing but the model is known."""
+        """Four views around a model, for models without cameras."""
         return Viewpoints(orbit(model, _SIZE, _ORBIT_VIEWS))
 
     @staticmethod
     def of(scene: Scene) -> Viewpoints:
-        """Up to eight training views of a scene, shrunk."""
+        """Up to eight downscaled training views of a scene."""
         views = scene.train[:: max(1, -(-len(scene.train) // _SCENE_VIEWS))]
-        return Viewpoints([_shrunk(view.camera) for view in views], scene.background)
+        return Viewpoints([_shrink(view.camera) for view in views], scene.background)
 
 
 @torch.no_grad()
 def psnr_between(before: Gaussians, after: Gaussians, viewpoints: Viewpoints | None = None) -> float:
-    """PSNR in dB between renders of two models, at most 120; by default from around the first."""
+    """PSNR in dB between renders of two models, at most 120; by default from views around the first."""
     views = viewpoints or Viewpoints.around(before)
     errors, background = [], views.background.to(before.device)
     for camera in views.cameras:
@@ -47,13 +47,13 @@ def psnr_between(before: Gaussians, after: Gaussians, viewpoints: Viewpoints | N
 
 
 @torch.no_grad()
-def is_seen(model: Gaussians) -> bool:
-    """True if renders from around a model show more than the background."""
+def is_visible(model: Gaussians) -> bool:
+    """True if renders around a model show more than the background."""
     views = Viewpoints.around(model)
     background = views.background.to(model.device)
     return any(bool((render(model, each, background) != background).any()) for each in views.cameras)
 
 
-def _shrunk(camera: Camera) -> Camera:
+def _shrink(camera: Camera) -> Camera:
     scale = min(1.0, _SIZE / max(camera.width, camera.height))
     return camera.resized(max(1, round(scale * camera.width)), max(1, round(scale * camera.height)))

@@ -1,4 +1,4 @@
-"""Cameras around a model or a scene: for videos, and for the images that stand for photos."""
+"""Cameras around a model or a scene, for videos and for renders that replace photos."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ VIEWS = 96
 IMAGE_SIZE = 400  # pixels, width and height
 FIELD_OF_VIEW = 50.0  # degrees
 MAX_ELEVATION = 60.0  # degrees, up and down
-# Distances of successive cameras, relative to that from which the whole model is visible.
+# Cycle of camera distances, relative to the one from which the whole model is visible.
 DISTANCES = (1.0, 0.75, 1.0, 0.5)
-TEST_EVERY, _LARGE = 12, 500_000  # views; Gaussians whose renders take long
+TEST_EVERY, _LARGE = 12, 500_000  # views; minimum Gaussians of a model with slow renders
 _QUANTILE, _MAX_RATIO = 0.95, 10.0  # weights are clamped to this multiple of this quantile
-_SAMPLE = 200_000  # Gaussians from which `middle_and_radius` is computed
+_SAMPLE = 200_000  # maximum Gaussians for computing `middle_and_radius`
 ELEVATION = 20.0  # degrees
 _GAP = math.pi / 2  # a larger gap between cameras makes a path turn back
-_DISTANCE = 0.8  # relative to that from which the whole model is visible
+_DISTANCE = 0.8  # relative to the distance from which the whole model is visible
 
 
 def is_model(source: str | Path | Gaussians) -> bool:
@@ -57,9 +57,9 @@ def scene_of_model(
 ) -> Scene:
     """A scene of renders of `model`, size x size, from the cameras of `orbit`.
 
-    Every twelfth is a test view; from 500,000 Gaussians on, only two are. Without `train_pictures`, only test
-    views are rendered; the images of the others are [0, 0, 3]. Raises UsageError for a `size` or `background`
-    out of range.
+    Every twelfth is a test view; models of 500,000 Gaussians or more have two test views. Without
+    `train_pictures`, only test views are rendered; other images are [0, 0, 3]. Raises UsageError for a `size`
+    or `background` out of range.
     """
     size = IMAGE_SIZE if size is None else size
     if not 1 <= size <= MAX_SIDE:
@@ -101,16 +101,16 @@ def orbit(model: Gaussians, size: int, views: int = VIEWS) -> list[Camera]:
         flat = math.sqrt(1 - height * height)
         outward = torch.tensor([flat * math.cos(azimuth), -height, flat * math.sin(azimuth)])
         position = middle + outward * reach * DISTANCES[index % len(DISTANCES)]
-        cameras.append(looking(position, -outward, size, f"orbit_{index:03d}.png", near))
+        cameras.append(camera_along(position, -outward, size, f"orbit_{index:03d}.png", near))
     return cameras
 
 
 def middle_and_radius(model: Gaussians) -> tuple[Tensor, float]:
     """The middle [3] and the radius of the visible part of a model, in world units.
 
-    Gaussians are weighted by opacity and size, where a huge one counts as ten large ones. The radius contains
-    nine tenths of the weight, but is at most three times that of one half: of an object, this is all; of an
-    unbounded scene, its middle. Large models are sampled.
+    Gaussians are weighted by opacity and size, clamped to ten times that of a large one. The radius contains
+    90 % of the weight, but is at most three times the radius of 50 %: it covers an object, and the middle of
+    an unbounded scene. Large models are subsampled.
     """
     model = model[:: max(1, len(model) // _SAMPLE)]
     scales = model.scales.sort(dim=1).values
@@ -130,11 +130,11 @@ def _quantile(values: Tensor, weight: Tensor, share: float) -> Tensor:
 
 
 def _near(radius: float) -> float:
-    """Least depth that is rendered of a model of that radius."""
+    """The near plane for a model of this radius."""
     return NEAR * min(1.0, radius / ORDINARY_EXTENT)
 
 
-def looking(position: Tensor, forward: Tensor, size: int, name: str, near: float = NEAR) -> Camera:
+def camera_along(position: Tensor, forward: Tensor, size: int, name: str, near: float = NEAR) -> Camera:
     """A square camera at `position` that looks along the unit vector `forward`, with -y up."""
     focal = 0.5 * size / math.tan(math.radians(FIELD_OF_VIEW / 2))
     K = torch.tensor([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1]])
@@ -165,16 +165,17 @@ def circle(model: Gaussians, size: int, frames: int) -> list[Camera]:
     for index in range(frames):
         azimuth = 2 * math.pi * index / frames
         outward = torch.tensor([flat * math.cos(azimuth), -height, flat * math.sin(azimuth)])
-        cameras.append(looking(middle + outward * reach, -outward, size, f"circle_{index:04d}.png", near))
+        cameras.append(
+            camera_along(middle + outward * reach, -outward, size, f"circle_{index:04d}.png", near)
+        )
     return cameras
 
 
 def around(cameras: Sequence[Camera], frames: int) -> list[Camera]:
     """A level circle around the focus of `cameras`, at their median distance and height, with their up.
 
-    If they leave a gap of a quarter or more, as in front of a wall, the path sways between the ends of the
-    photographed arc instead. Lens and size are those of the first camera by name. Raises UsageError if there
-    are no cameras.
+    If they leave a gap of a quarter circle or more, the path swings between the ends of the photographed arc
+    instead. Intrinsics and size are those of the first camera by name. Raises UsageError without cameras.
     """
     if not cameras:
         raise UsageError("expected a scene with cameras, found none")
@@ -197,7 +198,7 @@ def around(cameras: Sequence[Camera], frames: int) -> list[Camera]:
 
 
 def _angles(seen: Tensor, frames: int) -> list[float]:
-    """Angles around the full circle, or to and fro on the arc of the cameras' angles `seen`."""
+    """Angles of frames around the full circle, or back and forth on the arc of the cameras' angles `seen`."""
     ordered = seen.sort().values
     gaps = torch.cat([ordered[1:] - ordered[:-1], ordered[:1] + 2 * math.pi - ordered[-1:]])
     widest = int(gaps.argmax())

@@ -53,8 +53,8 @@ def rasterization(
         eps2d: variance in pixels^2 added to every footprint, 0.3 or more.
         sh_degree: degree up to which to use the SH coefficients, 0 to 3, with K >= (sh_degree + 1)^2.
         backgrounds: colour behind everything; black when None.
-        others: gsplat's other arguments: `packed`, `tile_size`, `channel_chunk` and `segmented` are ignored,
-            since they only say how gsplat computes; of the others only gsplat's default is supported.
+        others: gsplat's other arguments. `packed`, `tile_size`, `channel_chunk` and `segmented`, which do not
+            affect results, are ignored; all others must have gsplat's default.
 
     Returns:
         Images [C, H, W, D], not clamped above, with D = 3 for SH; alphas [C, H, W, 1] in [0, 1]; and a
@@ -67,8 +67,8 @@ def rasterization(
     are skipped; and means2d is a leaf: losses on it do not reach the means.
 
     Raises:
-        ValueError: a shape, dtype or number is not as above.
-        UsageError: names an option, shape or device that gsplat may support and this function does not.
+        ValueError: a shape, dtype or number is invalid.
+        UsageError: gsplat may support an option, shape or device, but this function does not.
         BackendError: gsplat's CUDA kernels are missing, or the lists of tiles would take too much memory.
     """
     tensors = {

@@ -1,4 +1,4 @@
-"""Renders `Gaussians` from a `Camera`."""
+"""Render `Gaussians` from a `Camera`."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from keyss.rendering.rasterize import rasterization
 def render(
     gaussians: Gaussians, camera: Camera, background: Tensor | None = None, *, sh_degree: int | None = None
 ) -> Tensor:
-    """The image [H, W, 3] that the camera sees: 0 is black, 1 is white, not clamped above.
+    """Render an image [H, W, 3]: 0 is black, 1 is white, not clamped above.
 
-    `background` [3] is behind everything, black when None; a model that a network decodes has its own.
-    `sh_degree` limits the spherical harmonics, by default all. Renders on the device of the Gaussians;
-    differentiable. Raises what `rasterization` raises.
+    `background` [3]: black if None; a model that a network decodes has its own. `sh_degree`: maximum degree
+    of the spherical harmonics, by default all. Renders on the device of the Gaussians; differentiable. Raises
+    the errors of `rasterization`.
     """
     return render_with_meta(gaussians, camera, background, sh_degree=sh_degree)[0]
 
@@ -29,7 +29,7 @@ def render(
 def render_with_meta(
     gaussians: Gaussians, camera: Camera, background: Tensor | None = None, *, sh_degree: int | None = None
 ) -> tuple[Tensor, dict[str, Any]]:
-    """Like `render`, with the meta of `rasterization` for this camera, plus the `alpha` [H, W]."""
+    """`render`, and the meta of `rasterization` with the `alpha` [H, W]."""
     if sh_degree is None:
         sh_degree = gaussians.sh_degree
     if not isinstance(gaussians, DecodedGaussians):
@@ -45,7 +45,7 @@ def render_with_meta(
 def render_features(
     gaussians: Gaussians, features: Tensor, camera: Camera, background: Tensor | None = None
 ) -> tuple[Tensor, dict[str, Any]]:
-    """Like `render_with_meta`, with `features` [N, C] instead of colours: the image is [H, W, C]."""
+    """`render_with_meta` with `features` [N, C] instead of colours; the image is [H, W, C]."""
     return _render(gaussians, features, camera, background, None)
 
 
@@ -59,7 +59,7 @@ def decode_picture(features: Tensor, network: PictureNetwork) -> Tensor:
 
 @torch.enable_grad()
 def contributions(gaussians: Gaussians, cameras: Sequence[Camera]) -> Tensor:
-    """[N] the blending weights of each Gaussian, summed over all pixels of all views."""
+    """[N] blending weights of each Gaussian, summed over all pixels of all views."""
     model = gaussians.detach()
     # An image is linear in the colours: the gradient with respect to a colour is the sum of its weights.
     grey = torch.zeros(len(model), 1, device=model.device, requires_grad=True)
@@ -88,5 +88,5 @@ def _render(
         sh_degree=sh_degree,
         backgrounds=None if background is None else background.to(device)[None],
     )
-    # Unlike an index, a squeezed axis costs no copy in the backward pass.
+    # squeeze, unlike indexing, needs no copy in the backward pass.
     return images.squeeze(0), meta | {"alpha": alphas.squeeze(0).squeeze(-1)}

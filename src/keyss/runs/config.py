@@ -31,10 +31,10 @@ class RunConfig(Generic[OptionsT]):
     method: str
     cover: str | None
     secrets: tuple[str | None, ...]
-    models_given: tuple[bool, ...]  # of the cover and the secrets; False: the plain model is fitted
+    models_given: tuple[bool, ...]  # cover, then secrets; False: the plain model is fitted
     views: ViewOptions
     payloads: tuple[str, ...]  # `secret_ids` of the secrets
-    options: OptionsT  # of the method
+    options: OptionsT  # options of the method
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,7 +50,7 @@ class FitRunConfig:
 
 def read_config(path: Path) -> RunConfig[MethodOptions]:
     """The configuration of a hiding, with the options of its method. Raises InputError."""
-    # Unknown fields are skipped, so the name can be read whatever the method.
+    # Unknown fields are ignored, so this reads the name for every method.
     name = read_record(path, RunConfig[MethodOptions]).method
     if name not in registry.METHODS:
         raise InputError(f"{path}: method {name!r}: expected one of {', '.join(registry.METHODS)}")
@@ -62,7 +62,7 @@ def read_config(path: Path) -> RunConfig[MethodOptions]:
 
 
 def secret_ids(seed: int, opened: Iterable[Opened]) -> tuple[str, ...]:
-    """Names of the secrets in a run of this seed; the same secret has another name in every run."""
+    """Identifiers of the secrets; the same secret has another identifier in a run with another seed."""
     texts = (f"keyss/v1/secret {seed} {secret.fingerprint()}" for secret in opened)
     return tuple(hashlib.sha256(text.encode()).hexdigest()[:16] for text in texts)
 
@@ -74,18 +74,17 @@ class HideMetrics(HidingQuality):
     version: int = 1
     keyss: str = __version__  # the program that wrote it
     method: str
-    gaussians: int  # of the stego model
-    photos: tuple[bool, ...]  # of the cover and the secrets; False: test views are renders of a given model
-    secret_gaussians: tuple[int, ...]  # of the revealed secrets
-    secret_degrees: tuple[tuple[int, int], ...] = ()  # SH degrees of them, and of their plain models
-    iterations: int  # of the method's own training, 0 without one
-    # Training steps of the cover and of each secret, those of the plain model included if it was trained on;
-    # None: unknown, since the plain model was given.
+    gaussians: int  # Gaussians of the stego model
+    photos: tuple[bool, ...]  # cover, then secrets; False: test views are renders of a given model
+    secret_gaussians: tuple[int, ...]  # Gaussians of each revealed secret
+    secret_degrees: tuple[tuple[int, int], ...] = ()  # SH degree of each, and of its plain model
+    iterations: int  # joint training steps; 0 if the method does not train
+    # Total training steps of the cover and of each secret; None: unknown, the plain model was given.
     steps: tuple[int | None, ...] = ()
-    seconds: float  # of the whole run, interrupted parts included
+    seconds: float  # total, interrupted parts included
     width: int  # pixels of the cover's test views
     seed: int
-    against_plain: tuple[RenderFidelity, ...]  # cover, then secrets, opened from the written files
+    against_plain: tuple[RenderFidelity, ...]  # cover, then secrets, read from the written files
     details: Mapping[str, Any] = field(default_factory=dict)  # further numbers of the method
 
 
@@ -97,6 +96,6 @@ class FitMetrics(ImageQuality):
     keyss: str = __version__
     gaussians: int
     iterations: int
-    seconds: float  # of the whole run, interrupted parts included
+    seconds: float  # total, interrupted parts included
     width: int  # pixels of the photos
     seed: int

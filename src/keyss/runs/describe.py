@@ -97,7 +97,7 @@ def _folder_info(path: Path) -> RunInfo | ModelInfo | SceneInfo:
         image_size=(camera.width, camera.height),
         points=len(scene.points),
         extent=round(scene.extent, 4),
-        background=_rounded(scene.background),
+        background=_round(scene.background),
     )
 
 
@@ -122,7 +122,7 @@ def _model_info(path: Path) -> ModelInfo:
         bytes=None if is_standard(path) else path.stat().st_size,
         gaussians=len(means),
         sh_degree=sh_degree,
-        bounding_box=(_rounded(means.min(axis=0)), _rounded(means.max(axis=0))),
+        bounding_box=(_round(means.min(axis=0)), _round(means.max(axis=0))),
         nearly_transparent=round(float((logits < np.log(0.05 / 0.95)).mean()), 4),
     )
 
@@ -140,5 +140,5 @@ def _ply_rows(path: Path) -> tuple[Any, Any, int] | None:
     return rows[:, :3], rows[:, names.index("opacity")], round(((len(names) - 11) // 3) ** 0.5) - 1
 
 
-def _rounded(values: Iterable[Any]) -> tuple[float, ...]:
+def _round(values: Iterable[Any]) -> tuple[float, ...]:
     return tuple(round(float(x), 4) for x in values)

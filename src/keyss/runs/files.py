@@ -18,12 +18,11 @@ from keyss.files.models import DECODED_SUFFIX, is_model_source, known_suffixes, 
 from keyss.methods.handed import SUFFIX
 from keyss.runs.folder import PRIVATE, PUBLISH
 
-STEGO = f"{PUBLISH}/model.ply"  # a name that tells nothing
-# In any format.
+STEGO = f"{PUBLISH}/model.ply"  # an innocuous name
 STEGOS = (STEGO, *(f"{PUBLISH}/model{suffix}" for suffix in (*SUFFIXES.values(), DECODED_SUFFIX)))
-MODEL = "model.ply"  # of a plain fit
+MODEL = "model.ply"  # result of a plain fit
 CONFIG, METRICS, REPORT = f"{PRIVATE}/config.json", f"{PRIVATE}/metrics.json", f"{PRIVATE}/report.html"
-HANDED = f"{PRIVATE}/hand-over"  # for those who may see a secret
+HANDED = f"{PRIVATE}/hand-over"  # files for those who may see a secret
 CONTROLS = f"{PRIVATE}/controls"  # plain models of the cover from other seeds, for audits
 PathLike = str | Path
 Background = Tensor | Sequence[float] | None
@@ -81,7 +80,7 @@ def plain_names(secrets: int) -> list[str]:
 
 
 def bound_names(secrets: int) -> list[str]:
-    """Files of plain 3DGS with as many steps as the scenes, if these are more than those of plain models."""
+    """Files of the upper bounds: plain 3DGS with as many steps as scenes whose plain models had fewer."""
     return [f"{PRIVATE}/bound-{index}.ply" for index in ("cover", *range(1, secrets + 1))]
 
 

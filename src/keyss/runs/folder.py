@@ -1,4 +1,4 @@
-"""The folder of a run: its files, the process at work in it, and which files keyss may remove.
+"""The folder of a run: its files, the process that works in it, and the files that keyss may remove.
 
 `publish/` holds what may be given away and nothing else. `private/` (mode 0700, files 0600) holds the rest:
 the manifest, which lists every file that keyss wrote, and while a run is at work its lock, checkpoints and
@@ -38,7 +38,7 @@ class Running:
 
     stage: str
     arguments: dict[str, Any]  # must be equal to resume
-    seconds: float = 0.0  # of its interrupted parts
+    seconds: float = 0.0  # duration of its interrupted parts
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,12 +55,11 @@ class RunFolder:
     """A folder for the results of one stage, such as hiding, or an audit of a finished hiding.
 
     `arguments`: JSON-able, must be equal to resume. `onto`: stages whose results stay; replacing those of
-    other stages takes `overwrite`. `writes`: names of files to come, as far as they are known; files of
-    others with these names are refused. `inputs`: files that are read and must not be replaced.
+    other stages needs `overwrite`. `writes`: known names of files to write; raises OutputError if others
+    wrote such files. `inputs`: files that are read and must not be replaced.
 
-    Nothing is created before `work`. Raises OutputError if the folder is not empty and neither `overwrite`
-    nor `resume` is given, if there is nothing to resume, and if another process is at work in it; UsageError
-    for both at once.
+    Nothing is created before `work`. Raises OutputError if the folder is not empty without `overwrite` or
+    `resume`, if there is nothing to resume, and if another process works in it; UsageError for both options.
     """
 
     def __init__(
@@ -76,7 +75,7 @@ class RunFolder:
         resume: bool = False,
     ) -> None:
         self.path, self.stage, self.onto = Path(path), stage, frozenset(onto)
-        # As a manifest returns them: tuples become lists.
+        # Equal to what a manifest returns: tuples become lists.
         self.arguments: dict[str, Any] = msgspec.json.decode(msgspec.json.encode(dict(arguments or {})))
         if overwrite and resume:
             raise UsageError("`overwrite=True` starts anew and `resume=True` continues: give one of them")
@@ -84,12 +83,12 @@ class RunFolder:
         self._existed = self.path.exists()
         self._resumes = False
         self._started = time.monotonic()
-        self.earlier_seconds = 0.0  # of the interrupted parts of a resumed run
+        self.earlier_seconds = 0.0  # interrupted parts of a resumed run
         if self.path.is_symlink() or self._existed:
             if not self.path.is_dir():
                 raise OutputError(f"{self.path} exists and is not a folder")
             self._check(overwrite, resume)
-            for name in self._replaced(read_manifest(self.path)) if overwrite else ():
+            for name in self._files_to_replace(read_manifest(self.path)) if overwrite else ():
                 check_not_an_input(self.path / name, inputs)
         for name in writes:
             _refuse_foreign(self.path, name)
@@ -119,7 +118,7 @@ class RunFolder:
                 f"{self.path} exists: choose another folder, or `overwrite=True` to replace what keyss wrote"
             )
 
-    def _replaced(self, manifest: Manifest) -> list[str]:
+    def _files_to_replace(self, manifest: Manifest) -> list[str]:
         """Names of the files that this stage replaces."""
         return [name for stage, names in manifest.files.items() if stage not in self.onto for name in names]
 
@@ -143,16 +142,15 @@ class RunFolder:
     def work(self) -> Iterator[RunFolder]:
         """Claim the folder while the block runs.
 
-        At its end, the written files appear, all or none; the files that they replace and checkpoints are
-        removed. If the block fails, checkpoints stay to resume from; without checkpoints, the folder is left
-        as it was. Raises OutputError.
+        At its end, all written files appear or none, and checkpoints and replaced files are removed. If the
+        block fails, checkpoints stay; without checkpoints, the folder does not change. Raises OutputError.
         """
         try:
             with _os_errors(self.path):
                 self.path.mkdir(parents=True, exist_ok=True)
             make_private(self.path / PRIVATE)
             with lock(self.path / _LOCK, self.path):
-                manifest = read_manifest(self.path)  # again: from now on, no other process changes it
+                manifest = read_manifest(self.path)  # read again: no other process can change it now
                 if not self._resumes:
                     _drop_unfinished(self.path, manifest)
                 shutil.rmtree(self.path / _STAGING, ignore_errors=True)
@@ -204,8 +202,8 @@ class RunFolder:
     def _finish(self) -> None:
         manifest = read_manifest(self.path)
         kept = {stage: names for stage, names in manifest.files.items() if stage in self.onto}
-        _remove(self.path, self._replaced(manifest))
-        # Listed before they appear: the manifest knows them, whatever happens in between.
+        _remove(self.path, self._files_to_replace(manifest))
+        # List files before they appear, so that the manifest knows them after a crash.
         manifest = replace(manifest, files=kept | {self.stage: tuple(self._names)})
         self._save(manifest)
         try:
@@ -219,12 +217,12 @@ class RunFolder:
             _remove(self.path, self._names)
             self._save(replace(manifest, files=kept))
             raise
-        # Last: unfinished files are known as our own only while the manifest says that a stage is running.
+        # This order matters: unfinished files count as keyss's only while a stage is running.
         _drop_unfinished(self.path, manifest)
         self._save(replace(manifest, running=None))
 
     def _give_up(self) -> None:
-        """Leave what can be resumed, or the folder as it was."""
+        """Keep checkpoints to resume from; without any, restore the folder."""
         shutil.rmtree(self.path / _STAGING, ignore_errors=True)
         manifest = read_manifest(self.path)
         if self._has_checkpoints():
@@ -242,7 +240,7 @@ class RunFolder:
 
     def _has_checkpoints(self) -> bool:
         folder = self.path / CHECKPOINTS
-        # A name with a leading dot is a file that a killed process did not finish.
+        # Names with a leading dot are unfinished files of killed processes.
         return folder.is_dir() and any(not path.name.startswith(".") for path in folder.iterdir())
 
     def _save(self, manifest: Manifest) -> None:
@@ -258,7 +256,7 @@ def check_not_published(path: Path | str) -> None:
 
 
 def clear(folder: Path) -> None:
-    """Remove all files that keyss wrote into a folder, and the folder if it is empty then."""
+    """Remove all files that keyss wrote into a folder, then the folder if it is empty."""
     if not (folder / PRIVATE).is_dir():
         return
     with _os_errors(folder):
@@ -272,7 +270,7 @@ def clear(folder: Path) -> None:
 
 
 def write_again(folder: Path, stage: str, name: str, content: Any) -> None:
-    """Replace a file of a finished stage. Raises OutputError, also if a process is at work in the folder."""
+    """Replace a file of a finished stage. Raises OutputError, also if a process works in the folder."""
     make_private(folder / PRIVATE)
     with _os_errors(folder), lock(folder / _LOCK, folder):
         _write_listed(folder, stage, name, content)
@@ -281,7 +279,7 @@ def write_again(folder: Path, stage: str, name: str, content: Any) -> None:
 def read_manifest(folder: Path) -> Manifest:
     """The manifest of a folder, empty if there is none.
 
-    Raises OutputError for a damaged one, and for names outside the folder.
+    Raises OutputError if it is damaged or names files outside the folder.
     """
     path = folder / MANIFEST
     if not path.exists():
@@ -311,7 +309,7 @@ def recorded_number(folder: Path, *names: str) -> int | None:
 def _drop_unfinished(folder: Path, manifest: Manifest) -> None:
     """Remove checkpoints and unfinished files.
 
-    Raises OutputError if they exist although no stage is running: then keyss did not write them.
+    Raises OutputError if they exist while no stage is running: keyss did not write them.
     """
     for name in (CHECKPOINTS, _STAGING):
         if manifest.running is None and os.path.lexists(folder / name):
@@ -343,21 +341,21 @@ def _write_listed(folder: Path, stage: str, name: str, content: Any) -> None:
 
 
 def make_private(folder: Path) -> None:
-    """Make a folder, or take away the access of others to it. Raises OutputError."""
+    """Make a folder that only its owner can access. Raises OutputError."""
     with _os_errors(folder):
         folder.mkdir(parents=True, exist_ok=True, mode=0o700)
         folder.chmod(0o700)
 
 
 def _make_parents(folder: Path, name: str) -> None:
-    """Make the parent folders of a file; in `private/`, only the owner has access to them."""
+    """Make the parent folders of a file; in `private/`, only the owner can access them."""
     mode = 0o700 if name.startswith(f"{PRIVATE}/") else 0o777
     for parent in reversed(PurePosixPath(name).parents[:-1]):
         (folder / parent).mkdir(mode=mode, exist_ok=True)
 
 
 def _refuse_foreign(folder: Path, name: str) -> None:
-    """Raise OutputError if there is a file of this name that keyss did not write."""
+    """Raise OutputError if `name` exists and keyss did not write it."""
     target = folder / name
     if any((folder / parent).is_symlink() for parent in PurePosixPath(name).parents if parent.name):
         raise OutputError(
@@ -375,7 +373,7 @@ def _refuse_foreign(folder: Path, name: str) -> None:
 
 
 def _remove(folder: Path, names: Collection[str]) -> None:
-    """Remove files, and parent folders that are empty then. Links out of `folder` are not followed."""
+    """Remove files, then empty parent folders. Links out of `folder` are not followed."""
     for name in names:
         path = folder / name
         parents = list(path.relative_to(folder).parents)[:-1]

@@ -38,13 +38,13 @@ class HidingRun:
     config: RunConfig[MethodOptions]
     metrics: HideMetrics
     stego: Gaussians
-    opened: tuple[Opened, ...]  # in the order of the secrets
-    keys: tuple[str, ...] = field(repr=False)  # in the same order; "" where the method has none
-    sources: tuple[str, ...]  # of the cover, then of the secrets: scene folders, or models without photos
+    opened: tuple[Opened, ...]  # one per secret, in order
+    keys: tuple[str, ...] = field(repr=False)  # one per secret; "" if the method has no keys
+    sources: tuple[str, ...]  # cover, then secrets: scene folders, or models without photos
 
     @property
     def openers(self) -> list[Callable[[Gaussians], Opened]]:
-        """Functions that open the secrets in a changed model; files that are handed over do not change."""
+        """Functions that open the secrets in a changed model; handed-over files do not change."""
         if registry.get(self.config.method).capabilities.hands_over:
             return [lambda _, secret=secret: secret for secret in self.opened]  # type: ignore[misc]
         return [lambda stego, key=key: registry.open_model(stego, key) for key in self.keys]  # type: ignore[misc]
@@ -63,7 +63,7 @@ class HidingRun:
         return models
 
     def baselines(self) -> list[Gaussians | None]:
-        """Models to compare with: `plain_models`, or bounds that were trained for longer."""
+        """Models to compare with: upper bounds, which were trained for longer, else `plain_models`."""
         bounds = [self.folder / name for name in bound_names(len(self.opened))]
         return [
             read_model(bound) if bound.exists() else plain

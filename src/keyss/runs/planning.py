@@ -23,10 +23,10 @@ from keyss.methods.plain_models import plain_stage
 from keyss.progress import about
 
 _LONG = 1000  # steps
-_STEP_SECONDS = {"cpu": 5e-7, "cuda": 6e-9}  # of a training step, for each Gaussian and two pixels
-_KEY_SECONDS = 3.0  # to derive a secret's key for every salt, and to open the secret again
+_STEP_SECONDS = {"cpu": 5e-7, "cuda": 6e-9}  # per training step, Gaussian and two pixels
+_KEY_SECONDS = 3.0  # deriving a secret's key for every salt, and opening the secret again
 _RENDERS = 2  # training steps that take as long as measuring a test view
-_STATE_COPIES = 3  # of a model's size: a checkpoint has the model and two moments of Adam
+_STATE_COPIES = 3  # checkpoint / model: parameters and two moments of Adam
 _MAX_APPENDED = 7  # Gaussians that hold one Gaussian of a secret of SH degree 3
 _OTHER_BYTES = 4 << 20  # JSON files, locks, and the overhead of the file system
 
@@ -38,7 +38,7 @@ def plan_hiding(
     device: torch.device,
     out: Path | None,
 ) -> Plan:
-    """The plan of a hiding, without bounds. Writes nothing."""
+    """The plan of a hiding, without upper bounds. Writes nothing."""
     plan, count = method.plan(sources, options), len(sources)
     scenes, sizes = [source.scene for source in sources], _sizes(options, sources)
     steps = [_step(device, size, scene) for size, scene in zip(sizes, scenes, strict=True)]
@@ -85,14 +85,14 @@ def plan_fit(scene: Scene, config: FitConfig, device: torch.device) -> Plan:
 
 
 class Needs(NamedTuple):
-    """Upper limits of what a run takes at once."""
+    """Upper limits of a run's disk space and memory."""
 
     disk_bytes: int
     memory_bytes: int
 
 
 def needs_of_hiding(options: MethodOptions, sources: Sequence[Source]) -> Needs:
-    """What a hiding takes; `options` are prepared."""
+    """Needs of a hiding; `options` are prepared."""
     sizes, fit = _sizes(options, sources), options.fit
     degree = max(fit.sh_degree if source.given is None else source.given.sh_degree for source in sources)
     fitted = [options.trains or source.given is None for source in sources]
@@ -104,16 +104,16 @@ def needs_of_hiding(options: MethodOptions, sources: Sequence[Source]) -> Needs:
 
 
 def needs_of_fit(scene: Scene, config: FitConfig) -> Needs:
-    """What a plain fit takes."""
+    """Needs of a plain fit."""
     cap = config.max_gaussians
     return _needs(cap, cap, cap, config.sh_degree, [scene])
 
 
 def _needs(largest: int, written: int, trained: int, degree: int, photos: Sequence[Scene]) -> Needs:
-    """From numbers of Gaussians. A training has gradients, moments, two checkpoints."""
+    """Needs from numbers of Gaussians. Training has gradients, moments and two checkpoints."""
     resident: int = psutil.Process().memory_info().rss
     copies = 4 + 2 * _STATE_COPIES if trained else 3
-    targets = max((Targets.most_bytes(scene.train) for scene in photos), default=0)
+    targets = max((Targets.max_bytes(scene.train) for scene in photos), default=0)
     return Needs(
         _ply_bytes(written + 2 * _STATE_COPIES * trained, degree) + _OTHER_BYTES,
         resident + copies * _ply_bytes(largest, degree) + targets,
@@ -121,7 +121,7 @@ def _needs(largest: int, written: int, trained: int, degree: int, photos: Sequen
 
 
 def worth_planning(config: FitConfig) -> bool:
-    """True if a training is so long that its estimate is worth a line."""
+    """True if a training is long enough to report an estimate."""
     return config.iterations >= _LONG
 
 
@@ -134,7 +134,7 @@ def in_a_line(plan: Plan) -> str:
 
 
 def check_room(needs: Needs, out: Path | None) -> None:
-    """Raise OutputError where the disk of `out` is too small for all files; warn of too little memory."""
+    """Raise OutputError if the disk of `out` lacks space for all files; warn if memory is short."""
     if out is not None and (free := _free_bytes(out)) < needs.disk_bytes:
         raise OutputError(
             f"{out}: expected {needs.disk_bytes / 1e6:,.0f} MB of free space for models and checkpoints, "
@@ -150,7 +150,7 @@ def check_room(needs: Needs, out: Path | None) -> None:
 
 
 def _available_memory() -> int:
-    """Bytes that this process can still take: of the machine, and of its container (Linux, cgroup 2)."""
+    """Bytes available on the machine and in its container (Linux, cgroup 2)."""
     available: int = psutil.virtual_memory().available
     with suppress(OSError, ValueError):  # "max" without a limit
         group = Path("/sys/fs/cgroup")

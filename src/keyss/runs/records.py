@@ -1,7 +1,7 @@
 """Typed records in JSON files: frozen dataclasses, read and written by msgspec.
 
-A file's record has the integer field `version`, whose default is the version that this program writes and
-reads. Fields that the class does not have are passed over; everything else must be of the types it states.
+A file's record has an integer field `version`. Its default is the version that this program writes and reads.
+Unknown fields are ignored; all others must have the declared types.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ class _Versioned(msgspec.Struct):
 def read_record(path: Path, type: type[T], *, at_most: int = MAX_BYTES) -> T:
     """Read the record of a dataclass from a JSON file of at most `at_most` bytes.
 
-    Raises InputError, which names the file and the place in it, for a file that is missing, too large or not
-    JSON, for another version, and for values of wrong types.
+    Raises InputError, with the file and the place in it, if the file is missing, too large or not JSON, has
+    another version, or has values of wrong types.
     """
     try:
         exists = path.exists()

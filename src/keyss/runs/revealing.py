@@ -1,4 +1,4 @@
-"""From a published model and a key to a secret, and checks of both: soundness, and how much is left."""
+"""Reveal the secret of a key in a published model, and check both: soundness, and the share that is left."""
 
 from __future__ import annotations
 
@@ -14,13 +14,10 @@ from keyss.methods import handed as handing, registry
 from keyss.methods.opened import Frame, HiddenFile, Opened, OpensAFileError, Remains
 from keyss.runs.files import PathLike
 
-# Pruning compensation makes up for the loss of nine tenths at most (`keyss.core.gaussians`): with
-# less left, renders become emptier and emptier.
-MIN_LEFT = 0.1
-# A loss that is compensated.
-NOTICED_LOSS = 0.01
-# Far beyond the values of trained and public models: none has a Gaussian beyond 10 radii or larger than one
-# radius; one has 3.5 % duplicates.
+MIN_LEFT = 0.1  # share; pruning compensation stops there (`keyss.core.gaussians`), and renders become empty
+NOTICED_LOSS = 0.01  # share; pruning compensation begins there
+# No known trained or public model has a Gaussian beyond 10 radii or larger than one radius; one has 3.5 %
+# duplicates.
 _FAR, _ENORMOUS = 1000.0, 100.0  # radii of the visible part
 _MAX_DUPLICATES = 0.1  # share
 _MAX_HARMONIC = 1000.0
@@ -32,8 +29,8 @@ class Revealed:
     """The scene or the file that a key opened."""
 
     scene: Gaussians | None  # on the CPU
-    remains: Remains  # of a file in bytes
-    warnings: tuple[str, ...] = ()  # of missing Gaussians
+    remains: Remains  # bytes instead of Gaussians for a file
+    warnings: tuple[str, ...] = ()  # missing Gaussians
     file: HiddenFile | None = None
 
     @property
@@ -91,12 +88,12 @@ def reveal_any(model: Gaussians, key: str, device: torch.device) -> Revealed:
 
 
 def revealed_file(file: HiddenFile) -> Revealed:
-    """The result for a hidden file, which is always whole."""
+    """The result for a hidden file, which is always complete."""
     return Revealed(None, Remains(len(file.data), len(file.data)), file=file)
 
 
 def loss_warnings(remains: Remains) -> list[str]:
-    """Warnings about a secret that is not whole."""
+    """Warnings about an incomplete secret."""
     if remains.share < 1 - NOTICED_LOSS:
         return [
             f"{_count(remains)}: the others {_CAUSE}; the rest was made larger and denser to compensate; the "
@@ -128,9 +125,9 @@ def read_handed(path: PathLike, key: str | None) -> Opened:
         raise InputError(f"{path}: {error}") from error
 
 
-def is_sealed(path: PathLike) -> bool:
+def is_encrypted(path: PathLike) -> bool:
     """True if a file that was handed over needs a key. Raises InputError."""
-    return handing.is_sealed(read_file(Path(path), handing.MAX_BYTES))
+    return handing.is_encrypted(read_file(Path(path), handing.MAX_BYTES))
 
 
 @dataclass(frozen=True)
@@ -140,11 +137,11 @@ class ModelCheck:
     gaussians: int
     sh_degree: int
     duplicates: int  # Gaussians that are equal to another one in every value
-    unit_quaternions: float  # share of those of length 1; others are valid too
+    unit_quaternions: float  # share with length 1; others are valid too
     no_rotation: int  # quaternions of length 0
-    far: int  # a thousand times as far out as visible Gaussians
-    enormous: int  # visible and a hundred times as large as the visible part
-    out_of_range: int  # with harmonics beyond 1000
+    far: int  # Gaussians a thousand times as far out as visible ones
+    enormous: int  # visible Gaussians a hundred times as large as the visible part
+    out_of_range: int  # Gaussians with a harmonic beyond 1000
     problems: tuple[str, ...]
 
 
@@ -155,8 +152,8 @@ class SecretCheck:
     found: int  # Gaussians
     hidden: int  # Gaussians in all; 0: unknown
     share: float  # found / hidden
-    chunks: int | None  # of its payload; None if it is not divided
-    chunks_lost: int | None  # restored from the others
+    chunks: int | None  # chunks of the payload; None if it is not divided
+    chunks_lost: int | None  # restored by error correction
     problems: tuple[str, ...]
 
 
@@ -175,8 +172,8 @@ class Verification:
 
 
 def check_model(model: Gaussians) -> ModelCheck:
-    """Count values that no trained model has. `model`: on the CPU, all values finite."""
-    from keyss.rendering.orbit import middle_and_radius  # which renders
+    """Count values that no trained model has. `model` must be on the CPU and finite."""
+    from keyss.rendering.orbit import middle_and_radius  # slow to import
 
     visible = model.opacities >= DRAWN_OPACITY
     middle, radius = middle_and_radius(model[visible] if visible.any() else model)

@@ -1,7 +1,7 @@
-"""A page of this machine that shows a training while it runs.
+"""A local page that shows a training while it runs.
 
-While nobody watches, nothing is copied. While the page polls, the model is copied between two steps, at most
-every few seconds and for at most a fiftieth of the time; the server's thread encodes the copy.
+The model is copied between two steps while a page polls, at most every few seconds and for at most a fiftieth
+of the time; the server's thread encodes the copy.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ from keyss.viewer.serving import PageServer
 Side = Literal["published", "secret"]
 EVERY = 3.0  # minimum seconds between two copies
 _COST = 50  # a copy is followed by a pause of this many times its duration
-_WATCHED = 15.0  # seconds for which a request counts as somebody watching
-_LAST = 5.0  # seconds for which the result is offered at most
+_WATCHED = 15.0  # seconds after a request for which the page counts as open
+_LAST = 5.0  # maximum seconds for which the result is served
 _STATE = "live"
 # `numbers` are in decibels, by name.
 _NO_PROGRESS: dict[str, Any] = {"title": "", "iteration": 0, "iterations": 0, "gaussians": 0, "numbers": {}}
@@ -35,7 +35,7 @@ _NO_PROGRESS: dict[str, Any] = {"title": "", "iteration": 0, "iterations": 0, "g
 
 @dataclass
 class _Copy:
-    """A copy of a model, and its file once it was requested."""
+    """A copy of a model, and its file once requested."""
 
     version: int
     model: Gaussians
@@ -49,7 +49,7 @@ class LiveTraining:
         """Raises OutputError."""
         contents = {_STATE: ("application/json", self._state)}
         for side in ("published", "secret"):
-            contents[f"{_STATE}/{side}.ply"] = ("application/octet-stream", self._opens(side))
+            contents[f"{_STATE}/{side}.ply"] = ("application/octet-stream", self._opener(side))
         self._server = PageServer(served_page("keyss-live", _STATE, look or {}), contents)
         self._thread = threading.Thread(target=self._server.run, daemon=True)
         self._timer = timer
@@ -71,7 +71,7 @@ class LiveTraining:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        # The page asks every 2 s: let it fetch the result before it is gone.
+        # The page polls every 2 s: let it fetch the result.
         deadline = time.monotonic() + _LAST
         while kind is None and time.monotonic() < deadline and self._is_unseen():
             time.sleep(0.1)
@@ -79,7 +79,7 @@ class LiveTraining:
         self._thread.join()
 
     def _is_unseen(self) -> bool:
-        """True if somebody watches who has not got the newest copies yet."""
+        """True if a page is open that has not fetched the newest copies."""
         watched = self._timer() - self._requested < _WATCHED
         return watched and any(copy.ply is None for copy in self._copies.values())
 
@@ -88,11 +88,11 @@ class LiveTraining:
         return LiveReporter(self, reporter, "published")
 
     def progress(self, **shown: Any) -> None:
-        """Set what the page shows beside the model: the names of `_NO_PROGRESS`."""
+        """Set the progress on the page: any fields of `_NO_PROGRESS`."""
         self._progress = _NO_PROGRESS | shown
 
     def look(self, side: Side, model: Callable[[], Gaussians]) -> None:
-        """Copy the model if somebody watches and a copy is due, and always after the last step."""
+        """Copy the model if a page is open and a copy is due, and always after the last step."""
         now, is_last = self._timer(), self._progress["iteration"] >= self._progress["iterations"]
         is_due = now - self._requested < _WATCHED and now - self._copied >= self._pause
         if not (is_due or is_last):
@@ -110,8 +110,8 @@ class LiveTraining:
         versions = {side: copy.version if copy else 0 for side, copy in copies.items()}
         return BytesIO(json.dumps({**self._progress, "versions": versions}).encode())
 
-    def _opens(self, side: str) -> Callable[[], BinaryIO]:
-        def opened() -> BinaryIO:
+    def _opener(self, side: str) -> Callable[[], BinaryIO]:
+        def open_copy() -> BinaryIO:
             copy = self._copies.get(side)
             if copy is None:
                 raise FileNotFoundError(side)
@@ -122,7 +122,7 @@ class LiveTraining:
                     raise OSError(str(error)) from error
             return BytesIO(copy.ply)
 
-        return opened
+        return open_copy
 
 
 class LiveReporter(Reporter):

@@ -1,4 +1,4 @@
-"""What the page shows at first: a model from the side from which its photos were taken."""
+"""The initial view of the page: the model from the side of its photos."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from keyss.files.scenes import read_layout
 from keyss.rendering.orbit import around
 from keyss.runs.files import CONFIG, is_run
 
-# By name: `pose`, as the page's address has it ("eye=X,Y,Z&target=X,Y,Z", and "&up=z" or "&up=X,Y,Z");
-# `camera`, the same for a camera of the photos, of which the page takes side and tilt; `up`, an axis ("-y");
-# `background`, "#rrggbb"; `title`; `host`, an origin from which the page may load models and pictures;
-# `embedder`, that of a site that frames the page and is told what happens. The page finds what is missing.
+# Keys: `pose`, as in the page's address ("eye=X,Y,Z&target=X,Y,Z", and "&up=z" or "&up=X,Y,Z"); `camera`, a
+# pose of the photos that sets side and tilt; `up`, an axis ("-y"); `background`, "#rrggbb"; `title`; `host`,
+# an origin from which the page may load models and pictures; `embedder`, the origin of a site that frames the
+# page and receives its events. The page chooses missing values.
 Look = dict[str, str]
 
 
 def look_of_model(model: Path) -> Look:
-    """As its scene was photographed if the model lies in a run and the scene is still there."""
+    """The look of the scene from which the model's run was made, empty if either is missing."""
     run = next((parent for parent in model.absolute().parents[:2] if is_run(parent)), None)
     try:
         config = json.loads((run / CONFIG).read_bytes()) if run else {}
@@ -34,10 +34,10 @@ def look_of_model(model: Path) -> Look:
 
 
 def look_of_scene(scene: Path) -> Look:
-    """From the middle of the cameras' arc, at their median height; empty for other paths than a scene's."""
+    """The middle of the cameras' arc, at their median height; empty if the path is not a scene."""
     try:
         layout = read_layout(scene, skip_missing=True)
-        is_white = probe_image(layout.train[0].path)[2]  # as in `load_scene`
+        is_white = probe_image(layout.train[0].path)[2]  # `load_scene` does the same
     except InputError:
         return {}
     poses = [torch.from_numpy(photo.viewmat.astype(np.float32)) for photo in layout.train]

@@ -1,7 +1,7 @@
 """The viewer as files: one self-contained page, or a folder for a static host.
 
-The content security policy of the page allows no other host than `Look` names, and that of a self-contained
-page not even its own. The page contains the published model and no secret.
+The content security policy of a page allows its own host and the one in `Look`; that of a self-contained page
+allows only the latter. The page contains the published model and no secret.
 """
 
 from __future__ import annotations
@@ -29,25 +29,25 @@ SCRIPT, STYLE, LICENCES, INDEX = "viewer.js", "viewer.css", "licences.txt", "ind
 EMBED = "embed.js"  # an element for other sites
 MAX_IN_ONE_FILE = 64 << 20  # bytes of a model; browsers limit text to 512 MiB and parse it slowly
 MAX_BYTES = 2 << 30
-# Argon2id is WebAssembly. Workers and saved pictures come from blobs that the page makes itself.
+# Argon2id is WebAssembly. Workers and saved pictures are blobs that the page makes itself.
 _WASM, _SELF = "'wasm-unsafe-eval'", "'self'"
 _NOTHING = "object-src 'none'; base-uri 'none'; form-action 'none'"
-# The page recognises formats by their first bytes, and .splat, which has no signature, by its name.
+# The page detects formats by their first bytes, and .splat, which has no signature, by its suffix.
 _MAGIC = (b"ply", b"NGSP", b"\x1f\x8b", b"PK\x03\x04")
 _MAX_HEADER = 64 << 10  # bytes of a .ply
 _ORIGIN = re.compile(r"https?://[A-Za-z0-9.-]+(:[0-9]+)?")
 
 
 def served_policy() -> str:
-    """The content security policy of a page whose parts are served beside it."""
+    """The content security policy of a page with separate script and style."""
     scripts = f"script-src {_SELF} {_WASM}; worker-src {_SELF} blob:"
     return f"default-src {_SELF}; {scripts}; img-src {_SELF} blob: data:; {_NOTHING}"
 
 
 def served_page(kind: str, url: str, look: Look) -> bytes:
-    """The page with style and script beside it.
+    """The page with separate style and script.
 
-    `url` is a model's for the kind "keyss-model", that of the JSON of `LiveTraining` for "keyss-live".
+    `url`: of a model for the kind "keyss-model", of the JSON of `LiveTraining` for "keyss-live".
     """
     return _page(
         policy=served_policy(),
@@ -79,11 +79,10 @@ def export_html(
 ) -> tuple[Path, ...]:
     """Write the viewer with the published `model`: one file if `out` ends in .html, else a folder.
 
-    The file opens from disk; a folder, for larger models, needs a web server. `look`: see `look_of_model`.
-    A model in a format that the page does not read is converted, with a KeyssWarning. A folder has an element
-    for other sites, embed.js.
-    Others can read what is written if they can read `model`. Returns the paths written. Raises UsageError
-    for a model that is too large, InputError if it is not a model, OutputError.
+    The file opens from disk; a folder, for larger models, needs a web server, and has embed.js, an element
+    for other sites. `look`: see `look_of_model`. A model in a format that the page does not read is
+    converted, with a KeyssWarning. The files get the permissions of `model`. Returns the paths written.
+    Raises UsageError if the model is too large, InputError if it is not a model, OutputError.
     """
     model, out = model_file(model), Path(out)
     file, look = readable(model), look or {}

@@ -1,6 +1,6 @@
 """Serves the page over HTTP, by default on this machine only.
 
-The URL has a random part, without which other users of the machine get nothing: the model may be a secret.
+The URL has a random part, which other users of the machine do not know: the model may be a secret.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ class PageServer:
         return self._ip.is_loopback
 
     def _names(self, host: str) -> set[str] | None:
-        """The hosts whose requests are answered; None for all, where the server listens on all addresses."""
+        """Accepted `Host` headers; None accepts all, if the server listens on all addresses."""
         if self._ip.is_unspecified:
             return None
         return {host.lower(), _in_url(self._ip), *(["localhost"] if self.is_local else [])}
@@ -106,8 +106,8 @@ def _handler(contents: Contents, names: set[str] | None) -> type[BaseHTTPRequest
         timeout = 30
 
         def do_GET(self) -> None:
-            # DNS rebinding: another site's name resolves to this server, whose model it must not read. The
-            # port is that of a tunnel, if there is one.
+            # Against DNS rebinding, in which another site's name resolves to this server. Ports are ignored:
+            # a tunnel has its own.
             hosts = [re.sub(":[0-9]+$", "", each.lower()) for each in self.headers.get_all("Host", [])]
             if names is not None and (len(hosts) != 1 or hosts[0] not in names):
                 self.send_error(HTTPStatus.FORBIDDEN)
@@ -126,7 +126,7 @@ def _handler(contents: Contents, names: set[str] | None) -> type[BaseHTTPRequest
                         self.send_header(name, value)
                     self.end_headers()
                     shutil.copyfileobj(file, self.wfile)
-            except OSError:  # the client has left, or the model is gone
+            except OSError:  # the client disconnected, or the model was removed
                 self.close_connection = True
 
         def log_message(self, format: str, *args: object) -> None:

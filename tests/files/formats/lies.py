@@ -1,4 +1,4 @@
-"""Files whose sizes are lies: counts, lengths, offsets and dimensions that formats state, true or not."""
+"""Files with false sizes: counts, lengths, offsets and dimensions that formats declare."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ _LIMITS = (2**31 - 1, 2**31, 2**32 - 2, 2**32 - 1, 2**53, 2**63, 2**64 - 1)
 
 
 def claim(rng: Random, bits: int = 32) -> int:
-    """A size that a field of so many bits can state."""
+    """A size for a field of `bits`."""
     return min(int(rng.choice(np.array(_CLAIMS + _LIMITS, np.uint64))), 2**bits - 1)
 
 
 def zeros(rng: Random) -> bytes:
-    """Up to 2 MiB of zeros, seldom up to 64."""
+    """Up to 2 MiB of zeros, rarely up to 64."""
     return bytes(int(rng.integers(0, MEBIBYTE << int(rng.choice([0, 1, 6], p=[0.6, 0.39, 0.01])))))
 
 
@@ -62,7 +62,7 @@ def ply(data: bytes, rng: Random) -> bytes:
 
 
 def spz(data: bytes, rng: Random) -> bytes:
-    """Of version 3: a header that lies, or more or less than it announces."""
+    """Version 3: a false header, or more or less data than it declares."""
     content = bytearray(gzip.decompress(data))
     if rng.random() < 0.7:
         struct.pack_into("<I", content, 8, claim(rng))
@@ -72,7 +72,7 @@ def spz(data: bytes, rng: Random) -> bytes:
 
 
 def spz4(data: bytes, rng: Random) -> bytes:
-    """Of version 4: sizes of the header, of the table and of frames."""
+    """Version 4: false sizes of the header, the table and frames."""
     count, degree, streams = struct.unpack_from("<I", data, 8)[0], data[12], data[15]
     if rng.random() < 0.5:
         count = claim(rng)
@@ -93,7 +93,7 @@ def spz4(data: bytes, rng: Random) -> bytes:
 
 
 def _frame(rng: Random, size: int) -> bytes:
-    """A zstd frame of `size` zeros, or one whose header states another window and size."""
+    """A zstd frame of `size` zeros, or one whose header declares another window and size."""
     if rng.random() < 0.5:
         return zstandard.ZstdCompressor().compress(bytes(size))
     window = int(rng.integers(0, 256))  # the exponent less 10, times 8
@@ -102,7 +102,7 @@ def _frame(rng: Random, size: int) -> bytes:
 
 
 def sog(data: bytes, rng: Random) -> bytes:
-    """A meta.json, images or a directory that lie."""
+    """A false meta.json, images or directory."""
     with zipfile.ZipFile(io.BytesIO(data)) as old:
         files = {name: old.read(name) for name in old.namelist()}
     meta = json.loads(files["meta.json"])
@@ -134,7 +134,7 @@ def webp(data: bytes, rng: Random) -> bytes:
 
 
 def _archive(files: dict[str, bytes], rng: Random) -> bytes:
-    """A ZIP whose directory may state other sizes and places, with files that are not there or shared."""
+    """A ZIP whose directory may declare other sizes and offsets, and missing or shared files."""
     found, kind = io.BytesIO(), int(rng.choice([zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED]))
     with zipfile.ZipFile(found, "w", kind) as archive:
         for name, content in files.items():
@@ -159,7 +159,7 @@ def _archive(files: dict[str, bytes], rng: Random) -> bytes:
 
 
 def glb(data: bytes, rng: Random) -> bytes:
-    """Accessors, views, nodes and chunks that lie, or JSON that is small and takes much memory."""
+    """False accessors, views, nodes and chunks, or small JSON that takes much memory."""
     (size,) = struct.unpack_from("<I", data, 12)
     document, binary = json.loads(data[20 : 20 + size]), data[28 + size :]
     for _ in range(int(rng.integers(1, 4))):
@@ -190,7 +190,7 @@ def glb(data: bytes, rng: Random) -> bytes:
 
 
 def safetensors(data: bytes, rng: Random) -> bytes:
-    """Shapes, offsets, a length of the header that lie, or very many tensors of no bytes."""
+    """False shapes, offsets and header length, or very many empty tensors."""
     (size,) = struct.unpack_from("<Q", data)
     header, body = json.loads(data[8 : 8 + size]), data[8 + size :]
     names = [name for name in header if name != "__metadata__"]
@@ -208,21 +208,21 @@ def safetensors(data: bytes, rng: Random) -> bytes:
 
 
 def payload(data: bytes, rng: Random) -> bytes:
-    """A carried secret that announces another number of Gaussians or another degree."""
+    """A carried secret that declares another number of Gaussians or another degree."""
     changed = bytearray(data)
     struct.pack_into("<IB", changed, 0, claim(rng), int(rng.integers(0, 4)))
     return bytes(changed) + (zeros(rng) if rng.random() < 0.5 else b"")
 
 
 def image(kind: str, width: int, height: int, **options: Any) -> bytes:
-    """A picture of one colour, a few bytes for any size."""
+    """An image of one colour, a few bytes at any size."""
     found = io.BytesIO()
     Image.new("RGBA", (width, height)).save(found, kind, **options)
     return found.getvalue()
 
 
 def png(data: bytes, rng: Random) -> bytes:
-    """A PNG of a few bytes whose header states any size, some of which it has."""
+    """A PNG of a few bytes whose header declares any size, true or false."""
     width, height = (int(rng.choice([1, 255, 1024, 2048, 4096, 9400, 65535, 2**31 - 1])) for _ in range(2))
     if rng.random() < 0.1 and width * height <= 1 << 25:
         return image("PNG", width, height)
@@ -232,7 +232,7 @@ def png(data: bytes, rng: Random) -> bytes:
 
 
 def colmap(data: bytes, rng: Random) -> bytes:
-    """A cameras.bin, images.bin or points3D.bin with other numbers of records or in them."""
+    """A cameras.bin, images.bin or points3D.bin with false counts."""
     changed = bytearray(data if rng.random() < 0.5 else data + zeros(rng))
     at = 0 if rng.random() < 0.5 else int(rng.integers(8, len(data) - 8))
     struct.pack_into("<Q", changed, at, claim(rng, 64))

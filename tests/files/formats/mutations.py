@@ -1,12 +1,12 @@
-"""Damaged files: each has to be read or to end in an InputError, soon and in little memory.
+"""Damaged files: each must be read or raise an InputError, quickly and in little memory.
 
     python tests/files/formats/mutations.py --count 100000
     python tests/files/formats/mutations.py --count 10000 --lies             # only those that lie about sizes
     python tests/files/formats/mutations.py --count 10000 --only a.payload   # written by an attacker
 
-Files of every format are damaged at random, before and after they are packed: bits, bytes, words with
-extreme values, cuts, repeats, megabytes of zeros; every other one states sizes that are not true
-(`lies.py`). What is not as it should be is printed with the seed that repeats it.
+Files of every format are damaged at random, before and after packing: bits, bytes, words with extreme values,
+cuts, repeats, megabytes of zeros; every other file declares false sizes (`lies.py`). Failures are printed
+with the seed that repeats them.
 """
 
 from __future__ import annotations
@@ -37,16 +37,16 @@ from keyss.files import load_scene, model_bytes, model_of_bytes
 from keyss.files.formats.spz import SpzCodes
 from keyss.files.images import read_image
 from keyss.methods.records import whole
-from keyss.methods.tensors import Header, damage_refused, pack_tensors, unpack_tensors
+from keyss.methods.tensors import Header, pack_tensors, refuse_damage, unpack_tensors
 
-SECONDS = 2.0  # that one file of a few kilobytes may take
+SECONDS = 2.0  # time limit for a file of a few kilobytes
 CARRIERS = 6000  # Gaussians of the published model that holds a payload
-MEMORY, PER_BYTE = 200 << 20, 32  # bytes that reading a file may take: so many, and of each of its bytes
+MEMORY, PER_BYTE = 200 << 20, 32  # memory limit for reading a file: bytes, and bytes per byte of the file
 _EXTREMES = (0, 1, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF, 0x7F800000, 0x7FC00000, 0x3F800000, 0x10000, 0xFF)
 
 
 def examples(count: int = 60) -> dict[str, list[bytes]]:
-    """Small files of each format, by a name that ends as they do."""
+    """Small files of each format, by a name with its suffix."""
     generator = torch.Generator().manual_seed(0)
 
     def model(degree: int) -> Gaussians:
@@ -78,18 +78,18 @@ def _colmap() -> dict[str, bytes]:
 
 
 def damaged(name: str, data: bytes, rng: np.random.Generator, lies: float = 0.5) -> bytes:
-    """`data` with sizes that are lies (in the share `lies`), or damaged in or outside of what packs it."""
+    """Damage `data` inside or outside of its packing, or (in the share `lies`) give it false sizes."""
     if name in LIES and rng.random() < lies:
         return LIES[name](data, rng)
     if rng.random() < 0.7:
         if data.startswith(b"\x1f\x8b"):
-            return gzip.compress(_damaged(gzip.decompress(data), rng), 1)
+            return gzip.compress(_damage_bytes(gzip.decompress(data), rng), 1)
         if data.startswith(b"PK"):
-            return _damaged_archive(data, rng)
-    return _damaged(data, rng)
+            return _damage_archive(data, rng)
+    return _damage_bytes(data, rng)
 
 
-def _damaged_archive(data: bytes, rng: np.random.Generator) -> bytes:
+def _damage_archive(data: bytes, rng: np.random.Generator) -> bytes:
     """A ZIP archive one of whose files is damaged."""
     found = io.BytesIO()
     with zipfile.ZipFile(io.BytesIO(data)) as old, zipfile.ZipFile(found, "w") as new:
@@ -97,14 +97,14 @@ def _damaged_archive(data: bytes, rng: np.random.Generator) -> bytes:
         chosen = "meta.json" if rng.random() < 0.5 else names[rng.integers(len(names))]
         for name in names:
             content = old.read(name)
-            new.writestr(name, _damaged(content, rng) if name == chosen else content)
+            new.writestr(name, _damage_bytes(content, rng) if name == chosen else content)
     return found.getvalue()
 
 
-def _damaged(data: bytes, rng: np.random.Generator) -> bytes:
+def _damage_bytes(data: bytes, rng: np.random.Generator) -> bytes:
     found = bytearray(data)
     for _ in range(rng.integers(1, 4)):
-        # Headers are short, and most of what can go wrong is in them.
+        # Damage headers more often: they are short, and most failures come from them.
         end = len(found) if rng.random() < 0.4 else min(len(found), 128)
         at = int(rng.integers(0, max(1, end)))
         match int(rng.integers(0, 7)):
@@ -127,7 +127,7 @@ def _damaged(data: bytes, rng: np.random.Generator) -> bytes:
 
 
 def attempt(name: str, data: bytes) -> str | None:
-    """What is wrong with how a file is read, if anything."""
+    """Read a file; returns a description of the failure, if any."""
     start, problem = time.process_time(), None
 
     def read() -> None:
@@ -147,11 +147,11 @@ def attempt(name: str, data: bytes) -> str | None:
 
 
 def peak_memory(call: Callable[[], None]) -> int:
-    """Bytes by which a call makes the process grow at most; 0 where the system does not tell (not Linux)."""
+    """Peak growth of the process in a call, in bytes; 0 on systems other than Linux."""
     if not sys.platform.startswith("linux"):
         call()
         return 0
-    ctypes.CDLL(None).malloc_trim(0)  # else freed memory would be used again without growth
+    ctypes.CDLL(None).malloc_trim(0)  # otherwise freed memory would be reused
     Path("/proc/self/clear_refs").write_text("5")  # resets the peak
     before = _memory("VmRSS")
     call()
@@ -169,7 +169,7 @@ def _read(name: str, data: bytes) -> str | None:
             warnings.simplefilter("ignore")
             return _read_from(Path(folder), name, data)
     if name == "a.tensors":
-        with damage_refused("damaged"):
+        with refuse_damage("damaged"):
             unpack_tensors(data, Header, "test", 1)
         return None
     model = whole.decode(data, CARRIERS) if name == "a.payload" else model_of_bytes(name, data)

@@ -13,7 +13,7 @@ from keyss.cli import main
 from keyss.core import InputError, OutputError, UsageError
 from keyss.lab.audits import comparison_measures
 from keyss.lab.many import Forecast, cell, comparison
-from keyss.lab.many.engine import claimed
+from keyss.lab.many.engine import claim_folder
 from keyss.lab.two_sample import Auc
 from keyss.methods import registry
 
@@ -120,5 +120,5 @@ def test_one_budget_and_one_process_for_a_folder(folders: tuple[Path, Path], tmp
     found = compare(*folders, methods=["carry:quick", "3dgs"], out=tmp_path / "out", dry_run=True)
     assert isinstance(found, Forecast)
     assert {each.partition(", ")[2] for each in found.names.values()} >= {"500 steps, seed 0"}
-    with claimed(tmp_path / "out"), pytest.raises(OutputError, match="another process"):
+    with claim_folder(tmp_path / "out"), pytest.raises(OutputError, match="another process"):
         compare(*folders, methods=["carry:quick"], out=tmp_path / "out")

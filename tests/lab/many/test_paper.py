@@ -59,7 +59,7 @@ def test_sums_and_scores_follow_from_the_other_figures() -> None:
 @pytest.mark.parametrize("name", TABLES)
 def test_claims_hold_for_the_papers_own_figures(name: str) -> None:
     """All but one: with two secrets a wrong key shows 16.5 dB of the bicycle instead of 22.5."""
-    found = {claim.text: paper.judged(claim, published(name)) for claim in TABLES[name].claims}
+    found = {claim.text: paper.judge_claim(claim, published(name)) for claim in TABLES[name].claims}
     assert all(each.parts for each in found.values())
     exceptions = {text: each for text, each in found.items() if each.verdict != "holds"}
     if name == "multi":

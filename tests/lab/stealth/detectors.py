@@ -1,8 +1,7 @@
-"""How well statistics tell files that hide something from plain ones, learned from other scenes.
+"""Detectors of hidden content from statistics of files, cross-validated over scenes.
 
-A scene's own files are never learned from. Standard errors are bootstrapped over whole models, for parts of
-one are not independent; the largest of many areas under curves is held against the same with labels exchanged
-within pairs, which is what chance makes of so many tries.
+Standard errors are bootstrapped over models, because parts of a model are not independent. The largest of
+many areas under curves is compared with those after exchanging labels within pairs (a permutation test).
 """
 
 from __future__ import annotations
@@ -14,28 +13,28 @@ import numpy as np
 
 from keyss.core.arrays import Doubles, Integers
 
-_DRAWS = 300  # of a bootstrap
+_DRAWS = 300  # bootstrap samples
 _EXCHANGES = 100
-_BEST = 12  # statistics that tell most, for logistic regression ...
-_EXAMPLES = 16  # ... one for so many examples, for others fit by chance
+_BEST = 12  # best statistics for logistic regression ...
+_EXAMPLES = 16  # ... at most one per this many examples, against overfitting
 MAX_NAMED = 10  # single detectors
 
 
 @dataclass(frozen=True)
 class Detection:
-    """One detector: area under the ROC curve on scenes that it did not learn from."""
+    """One detector: area under the ROC curve on held-out scenes."""
 
     name: str
     auc: float
     error: float  # standard error
-    pooled: float  # area over the files of all scenes together, as for one threshold
+    pooled: float  # area over the files of all scenes together, for a common threshold
 
 
 @dataclass(frozen=True)
 class Examples:
-    """Files, or one part of each; those of one `model` are the same, plain and with something in it."""
+    """Files, or one part of each; those of one `model` differ only in hidden content."""
 
-    names: tuple[str, ...]  # of statistics
+    names: tuple[str, ...]  # names of the statistics
     values: Doubles  # [E, S], NaN where there was too little to count
     hidden: Integers  # [E] 0 plain, 1 with something in it
     scene: Integers  # [E]
@@ -55,9 +54,9 @@ class Examples:
 
 
 def single_detectors(examples: Examples, *, seed: int = 0) -> tuple[list[Detection], float]:
-    """Every statistic by itself, the worst first, and what chance makes of the largest in one of 20 cases.
+    """Every statistic by itself, largest area first, and the 95 % quantile of the largest under permutation.
 
-    Its direction, and what is usual, come from the other scenes.
+    The sign and the normal range come from the other scenes.
     """
     held_out = _HeldOut.of(examples)
     scores = held_out.scores(examples.hidden)
@@ -93,7 +92,7 @@ def learned_detectors(examples: Examples, *, seed: int = 0) -> list[Detection]:
             usual = np.nanmedian(np.where(np.isnan(others).all(axis=0), 0.0, others), axis=0)
             train, test = (np.where(np.isnan(part), usual, part) for part in (others, examples.values[held]))
             if name == "logistic":
-                # By rank, for a few statistics have tails of many standard deviations.
+                # Ranks, because some statistics have tails of many standard deviations.
                 spread = QuantileTransformer(n_quantiles=min(len(train), 200), output_distribution="normal")
                 above = _lean(_ranks(train), examples.hidden[~held])
                 best = np.argsort(-np.abs(above))[: min(_BEST, 1 + len(train) // _EXAMPLES)]
@@ -114,8 +113,8 @@ def learned_detectors(examples: Examples, *, seed: int = 0) -> list[Detection]:
 def areas(scores: Doubles, hidden: Integers, scene: Integers) -> Doubles:
     """[S] areas under the ROC curves of scores [E, S], ties counting half: means over scenes.
 
-    Each scene's files are compared with each other only. Over all together, scores of scenes that learned
-    from each other would be compared, and detectors of nothing come out below a half.
+    Only files of one scene are compared. Pooling scenes that were trained on each other would put useless
+    detectors below 0.5.
     """
     total, weights = np.zeros(scores.shape[1]), 0
     for each in np.unique(scene):
@@ -133,10 +132,10 @@ def areas(scores: Doubles, hidden: Integers, scene: Integers) -> Doubles:
 
 
 def confirmed(scores: Doubles, true: Sequence[int]) -> float:
-    """How often the true candidate is ranked above another one, ties counting half; 0.5 is chance.
+    """Probability that the true candidate ranks above another one, ties counting half; 0.5 is chance.
 
-    `scores` [F, C] of files and candidates, `true` [F] the candidate in each file. Each candidate's scores
-    are taken relative to what it has in files that hold something else, and each file's to those of others.
+    `scores` [F, C] of files and candidates, `true` [F] the candidate in each file. Scores are relative to the
+    candidate's in files that hold something else, then to the file's for other candidates.
     """
     scores = np.asarray(scores, float)
     own = np.zeros(scores.shape, bool)
@@ -166,10 +165,10 @@ def _ranks(values: Doubles) -> Doubles:
 
 @dataclass(frozen=True)
 class _HeldOut:
-    """Each scene's statistics as seen by an attacker who knows the other scenes."""
+    """Each scene's statistics, normalised by the other scenes."""
 
-    centred: Doubles  # [E, S] values less the median of the other scenes
-    # Of each scene: its examples, the others, and ranks of these.
+    centred: Doubles  # [E, S] values minus the median of the other scenes
+    # For each scene: its examples, the others, and ranks of the others.
     folds: tuple[tuple[Integers, Integers, Doubles], ...]
 
     @staticmethod
@@ -185,7 +184,7 @@ class _HeldOut:
         return _HeldOut(centred, tuple(folds))
 
     def scores(self, hidden: Integers) -> Doubles:
-        """[E, S] with the sign that files with something in them have in the other scenes."""
+        """[E, S] scores with the sign of hidden content in the other scenes."""
         signed = np.empty_like(self.centred)
         for held, others, ranks in self.folds:
             labels = hidden[others]
@@ -194,13 +193,13 @@ class _HeldOut:
 
 
 def _lean(ranks: Doubles, hidden: Integers) -> Doubles:
-    """[S] how much higher statistics rank where something is hidden."""
+    """[S] difference in mean rank between files with and without hidden content."""
     found: Doubles = ranks[hidden == 1].mean(axis=0) - ranks[hidden == 0].mean(axis=0)
     return found
 
 
 def _errors(scores: Doubles, examples: Examples) -> Doubles:
-    """[S] standard errors of areas: whole models are drawn again, scene by scene."""
+    """[S] standard errors of areas, bootstrapped over models within scenes."""
     random = np.random.default_rng(0)
     rows = [np.flatnonzero(examples.model == model) for model in np.unique(examples.model)]
     scenes = np.array([examples.scene[own[0]] for own in rows])

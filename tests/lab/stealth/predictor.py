@@ -1,8 +1,8 @@
-"""A learned test: boosted trees predict a bit from all that an attacker sees beside it.
+"""A learned test: boosted trees predict a bit from everything that an attacker sees beside it.
 
-Trained on plain models of other scenes. On a file whose bits are what training left they predict a little, or
-much, where the trainer's arithmetic shows; bits that were replaced they predict no better than a coin, which
-is an exact null: whatever the trees say, a fair bit that is independent of it agrees with it half the time.
+They are trained on plain models of other scenes. They can predict some bits that training left, if the
+trainer's arithmetic is visible, but not replaced bits. The null is exact: a fair independent bit agrees with
+any prediction half of the time.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ from keyss.core import Gaussians
 from keyss.core.arrays import Doubles, Flags, Integers, Words32
 from keyss.lab.stealth.statistic import NOTHING, BitPatterns, Statistic, normal, ulps
 
-LOWEST, HIGHEST = 1, 13  # bits that are predicted, the candidates for being replaced
-ATTRIBUTES_LEFT_ALONE = (0, 4)  # positions and constant colours
-_ABOVE, _BELOW = 5, 4  # bits that are seen
-ROWS = 30_000  # of one model
+LOWEST, HIGHEST = 1, 13  # predicted bits, those that embedding may replace
+UNCHANGED_ATTRIBUTES = (0, 4)  # positions and constant colours
+_ABOVE, _BELOW = 5, 4  # neighbouring bits among the features
+ROWS = 30_000  # rows per model
 _TREES, _LEAVES = 60, 24
 _UNSIGNED = np.uint32(0x7FFFFFFF)
-_SURE = 0.1  # distance from 1/2 of a prediction that says something
+_SURE = 0.1  # minimum distance from 1/2 of a confident prediction
 _MIN_COUNT = 64
-_OFTEN = 6  # times: three channels of a grey Gaussian and of its sibling
-_DISTANCES = slice(0, 2)  # columns of what is seen
+_OFTEN = 6  # occurrences: three channels of a grey Gaussian and of its sibling
+_DISTANCES = slice(0, 2)  # columns of the features
 
 
 class BitPredictor:
@@ -42,7 +42,7 @@ class BitPredictor:
 
     @staticmethod
     def of_samples(samples: Sequence[tuple[Doubles, Integers]], *, seed: int = 0) -> BitPredictor:
-        """From `sample`s, which several folds can share."""
+        """Fit to results of `sample`, which several folds can share."""
         from sklearn.ensemble import HistGradientBoostingClassifier  # slow to import
 
         x, y = (np.concatenate(each) for each in zip(*samples, strict=True))
@@ -56,13 +56,13 @@ class BitPredictor:
         return BitPredictor(trees.fit(x, y))
 
     def statistics(self, model: Gaussians, *, seed: int = 0) -> dict[str, Statistic]:
-        """How well the bits of a file are predicted; see `of_sample`."""
+        """Prediction quality on the bits of a file; see `of_sample`."""
         return self.of_sample(*sample(model, ROWS, seed))
 
     def of_sample(self, seen: Doubles, bits: Integers) -> dict[str, Statistic]:
-        """Gain in log-likelihood per bit, and agreement with predictions as a share of what they promise.
+        """Gain in log-likelihood per bit, and agreement with predictions / expected agreement.
 
-        Agreement is 1 where the file is as plain models are and 0 where its bits are random; null: 0.
+        Agreement is 1 for plain models and 0 for random bits; null: 0.
         """
         chance = self._trees.predict_proba(seen)[:, 1]
         said = np.where(bits == 1, chance, 1 - chance).clip(1e-6)
@@ -88,12 +88,12 @@ def _agreement(lean: Doubles, came: Doubles) -> Statistic:
 
 
 def sample(model: Gaussians, rows: int, seed: int) -> tuple[Doubles, Integers]:
-    """[R, features] and [R] bits: of the smallest numbers, of those with the nearest likes, and of any."""
+    """[R, features] and [R] bits of the smallest numbers, of those with the nearest relatives, and of any."""
     words = BitPatterns.of(model)
     random = np.random.default_rng(seed)
     beside, distance = _likes(words, model)
-    # What occurs again and again is a multiple of a learning rate, which everybody leaves alone.
-    allowed = words.trained & ~np.isin(words.attribute, ATTRIBUTES_LEFT_ALONE) & ~_repeated(words.bits)
+    # Frequent numbers are multiples of a learning rate, which embedding does not change.
+    allowed = words.trained & ~np.isin(words.attribute, UNCHANGED_ATTRIBUTES) & ~_is_frequent(words.bits)
     chosen = []
     candidates = np.flatnonzero(allowed)
     if not len(candidates):
@@ -105,11 +105,11 @@ def sample(model: Gaussians, rows: int, seed: int) -> tuple[Doubles, Integers]:
     chosen.append(random.choice(candidates, rows // 3))
     at = np.concatenate(chosen)
     bit = random.integers(LOWEST, HIGHEST, len(at))
-    return _seen(words, at, bit, beside, distance), (words.bits.ravel()[at] >> bit & 1).astype(np.int64)
+    return _features(words, at, bit, beside, distance), (words.bits.ravel()[at] >> bit & 1).astype(np.int64)
 
 
-def _seen(words: BitPatterns, at: Integers, bit: Integers, beside: Words32, distance: Doubles) -> Doubles:
-    """[R, features] of numbers `at` (flat indices) and their bits."""
+def _features(words: BitPatterns, at: Integers, bit: Integers, beside: Words32, distance: Doubles) -> Doubles:
+    """[R, features] of the bits of numbers `at` flat indices."""
     own, width = words.bits.ravel()[at], words.bits.shape[1]
     row, field = at // width, at % width
     columns: list[Any] = [each.ravel()[at] for each in distance]
@@ -128,15 +128,15 @@ def _seen(words: BitPatterns, at: Integers, bit: Integers, beside: Words32, dist
     return np.stack([np.asarray(each, np.float64) for each in columns], axis=1)
 
 
-def _repeated(bits: Words32) -> Flags:
-    """[N, F] which numbers occur again and again, whatever their sign."""
+def _is_frequent(bits: Words32) -> Flags:
+    """[N, F] True for numbers whose magnitude occurs often."""
     _, inverse, times = np.unique(bits & _UNSIGNED, return_inverse=True, return_counts=True)
     found: Flags = (times > _OFTEN)[inverse].reshape(bits.shape)
     return found
 
 
 def _likes(words: BitPatterns, model: Gaussians) -> tuple[Words32, Doubles]:
-    """[L, N, F] numbers that may be alike, and [L, N, F] base-2 logarithms of their distance in last bits.
+    """[L, N, F] related numbers, and [L, N, F] base-2 logarithms of their distance in the last place.
 
     The nearest of the other channels or axes of the same Gaussian, and the same field of the nearest
     neighbour in space.

@@ -45,7 +45,7 @@ def test_equation_11_written_out(design: str, weight: float) -> None:
     black = torch.zeros(3)
     models = [cover, run.decoder(cover, VECTORS[0]), run.decoder(cover, VECTORS[1])]
     if design == "released":
-        seen = run.seen(cover, camera)
+        seen = run.visible_rows(cover, camera)
         models[1:] = [model[seen] for model in models[1:]]
     targets = [run.poses.target(scene, *pose).image for scene in range(3)]
     images = [render(model.with_sh_degree(0), camera, black) for model in models]

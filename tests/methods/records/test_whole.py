@@ -12,7 +12,7 @@ import torch
 
 from channels.quiet.coded import model_of
 from keyss.core import Camera, InputError, Scene, UsageError, View
-from keyss.methods import Table, fitted, good_enough, pruned
+from keyss.methods import Table, choose_precision, encode_to_size, prune_to_size
 from keyss.methods.records import whole
 from keyss.rendering import Viewpoints, psnr_between
 from keyss.rendering.orbit import orbit
@@ -90,17 +90,17 @@ def test_it_is_good_enough_from_where_it_is_looked_at() -> None:
     viewpoints = Viewpoints.of(_scene(orbit(model, 64, 12)))
     assert 4 <= len(viewpoints.cameras) <= 8
     assert torch.equal(viewpoints.background, torch.ones(3))
-    found = good_enough(model, viewpoints)
+    found = choose_precision(model, viewpoints)
     opened = whole.decode(whole.encode(model, found))
     assert 43.25 < psnr_between(model, opened, viewpoints) < 47
-    assert fitted(model, 1 << 20, short=True, viewpoints=viewpoints) == whole.encode(model, found)
+    assert encode_to_size(model, 1 << 20, short=True, viewpoints=viewpoints) == whole.encode(model, found)
 
 
 def test_what_is_seen_least_is_left_out_until_it_fits() -> None:
     model = model_of(800, sh_degree=1)
-    kept = pruned(model, 4000)
+    kept = prune_to_size(model, 4000)
     assert 200 < len(kept) < 800
-    assert len(fitted(kept, 4000)) <= 4000
-    assert pruned(model, 1 << 20) is model
+    assert len(encode_to_size(kept, 4000)) <= 4000
+    assert prune_to_size(model, 1 << 20) is model
     with pytest.raises(UsageError, match=r"800 Gaussians takes .* room for 4,000"):
-        fitted(model, 4000)
+        encode_to_size(model, 4000)

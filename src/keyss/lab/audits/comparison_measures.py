@@ -1,7 +1,7 @@
-"""Measures of a finished hiding that `compare` and `reproduce` ask for, beside those of `hide` and `audit`.
+"""Measures of a finished hiding for `compare` and `reproduce`, beside those of `hide` and `audit`.
 
-Each is a function from a run to numbers by name. A string instead says why there is no number, or with what
-the numbers of that name were measured for want of a tool.
+Each is a function from a run to numbers by name. A string instead of a number is the reason why it is
+missing, or a note on a replacement of a missing tool.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from keyss.lab.speed import RenderTime, readers, render_time
 from keyss.lab.stealth.judging import judge
 from keyss.lab.stegexpose import stegexpose_auc
 from keyss.lab.two_sample import two_sample_auc
-from keyss.measure.images import renders_of, steganalysed
+from keyss.measure.images import renders_of, select_views
 from keyss.methods import registry
 from keyss.rendering import Backend, resolve_device
 from keyss.runs.files import HANDED, as_scene, stego_in
@@ -37,13 +37,13 @@ from keyss.runs.opening import HidingRun
 
 Numbers = dict[str, float | str]
 
-PRUNED_SHARES = (0.05, 0.10, 0.15, 0.25)  # of the Gaussians
-_LOST = 0.25  # of the Gaussians
-_GIVEN_UP = 0.01  # of the blending weight in the cover's views, by purification
-CONVERSIONS = {".spz": "gsply", "compressed .ply": "splat-transform"}  # by two programs
-OWN = "our own"  # notes on what was measured with
+PRUNED_SHARES = (0.05, 0.10, 0.15, 0.25)  # fractions of the Gaussians
+_LOST = 0.25  # fraction of the Gaussians
+_GIVEN_UP = 0.01  # fraction of the blending weight in the cover's views that purification removes
+CONVERSIONS = {".spz": "gsply", "compressed .ply": "splat-transform"}  # format and the program that writes it
+OWN = "our own"  # begins notes on replacements
 _EVERY_VIEW = 10**6
-_ROUNDS = 5  # of timing pictures
+_ROUNDS = 5  # repetitions when timing renders
 _ROLES = ("cover", "secret")
 _ATTRIBUTES = {"opacity": "op", "scale": "sc", "rotation": "ro", "position": "xyz", "colour": "sh"}
 
@@ -54,7 +54,7 @@ class Subject:
 
     run: HidingRun
     backend: Backend
-    controls: tuple[Path, ...] = ()  # plain models of the cover: that of the run's seed, then other seeds
+    controls: tuple[Path, ...] = ()  # plain models of the cover: the run's seed, then other seeds
 
     @cached_property
     def scenes(self) -> list[Scene]:
@@ -87,7 +87,7 @@ class Subject:
 
 
 def files(subject: Subject) -> Numbers:
-    """Megabytes of the published and the handed files; how many other programs read the published one."""
+    """Megabytes of the published and the handed-over files; number of programs that read the former."""
     published = stego_in(subject.run.folder)
     handed = (subject.run.folder / HANDED).glob("*")
     found: Numbers = {"published_mb": published.stat().st_size / 1e6}
@@ -119,21 +119,18 @@ def rendering(subject: Subject) -> Numbers:
 
 
 def secrecy(subject: Subject) -> Numbers:
-    """How well detectors separate the published model, and the plain one of its seed, from other seeds'.
+    """Detection of the published model, and of a plain one of its seed, among models of other seeds.
 
-    If no 3DGS model is published, only pictures are judged.
+    Only renders are judged if no 3DGS model is published.
     """
     config = subject.run.config
     covers = _covers(subject.controls, config.cover or "", config.views, subject.backend)
     plain = {f"{name}_plain": value for name, value in covers.own.items()}
-    return {**covers.judged(subject.stego, subject.standard), **plain}
+    return {**covers.judge(subject.stego, subject.standard), **plain}
 
 
 def survival(subject: Subject) -> Numbers:
-    """Change in dB of cover and secret by pruning, conversion and purification.
-
-    A secret that no longer opens has no number.
-    """
+    """Changes in dB of cover and secret by pruning, conversion and purification; none for lost secrets."""
     changes, found = trials(subject.scenes[0]), own_converters()
     if not subject.standard:
         reason = "needs a 3DGS model, and this method publishes none"
@@ -154,7 +151,7 @@ def survival(subject: Subject) -> Numbers:
 
 
 def trials(cover: Scene) -> dict[str, Change]:
-    """The changes that `survival` tries, by name; purification uses the cover's photos."""
+    """Changes of `survival` by name; purification uses the cover's photos."""
     known = {(each.format, each.tool): each for each in converters()}
     conversions = {
         name: (own_converter(name) if why_missing(tool) else known[name, tool]).change()
@@ -164,17 +161,17 @@ def trials(cover: Scene) -> dict[str, Change]:
 
 
 def own_converters() -> Numbers:
-    """Notes on conversions whose tools are missing, which keyss does itself."""
+    """Notes on conversions by keyss, because tools are missing."""
     missing = {name: why_missing(tool) for name, tool in CONVERSIONS.items()}
     return {name: f"{OWN} converter: {why}" for name, why in missing.items() if why}
 
 
 def pruning(subject: Subject) -> Numbers:
-    """PSNR in dB of the cover and the first secret after pruning, where they still open."""
+    """PSNR in dB of the cover and the first secret after pruning; none for lost secrets."""
     kinds = {"by opacity": opacity_pruning, "random": random_pruning}
     named = {f"{share:.0%} {how}": kinds[how](share) for how in kinds for share in PRUNED_SHARES}
     cover, *others = subject.scenes
-    changes = [sparing(each) for each in named.values()]
+    changes = [spare_appended(each) for each in named.values()]
     results = measure_robustness(
         subject.stego, subject.run.openers, cover, others, changes=changes, max_views=_EVERY_VIEW
     )
@@ -189,7 +186,7 @@ def pruning(subject: Subject) -> Numbers:
 def sinkhorn(subject: Subject) -> Numbers:
     """3D-Sinkhorn from the cover's plain model to the published one: sum, attributes, composite score.
 
-    Raises InputError for a run without that plain model.
+    Raises InputError without a plain model.
     """
     run = subject.run
     plain = run.plain_models()[0]
@@ -210,7 +207,7 @@ MEASURES: Mapping[str, Callable[[Subject], Numbers]] = {
 
 
 def check_extras(measures: Iterable[str]) -> None:
-    """Raise BackendError for a package that one of the measures needs and that is not installed."""
+    """Raise BackendError if a package of one of the measures is not installed."""
     for name in measures:
         for module in _MODULES.get(name, ()):
             import_extra(module, "audit", f"measure {name}")
@@ -218,16 +215,16 @@ def check_extras(measures: Iterable[str]) -> None:
 
 @dataclass(frozen=True)
 class PlainCovers:
-    """Plain models of the cover, as a comparison for published ones."""
+    """Plain models of the cover, to compare published ones with."""
 
     scene: Scene
     models: Sequence[Gaussians]  # at least three, on the device: the one to compare with, then controls
 
-    def judged(self, model: Gaussians, standard: bool) -> dict[str, float]:
-        """A model against the controls; unless it is `standard`, only its pictures.
+    def judge(self, model: Gaussians, standard: bool) -> dict[str, float]:
+        """Compare a model with the controls; only its renders unless it is `standard`.
 
-        The mean AUC of trees that separate its Gaussians from those of the controls, the lowest p-value of
-        its statistics, corrected for their number, and the AUC of StegExpose on its pictures.
+        Gives the mean AUC of trees that separate its Gaussians from the controls', the minimum p-value of its
+        statistics (corrected for their number), and StegExpose's AUC on its renders.
         """
         controls, found = self.models[1:], {}
         if standard:
@@ -240,16 +237,16 @@ class PlainCovers:
     @cached_property
     def own(self) -> dict[str, float]:
         """The plain model against the controls."""
-        return self.judged(self.models[0], True)
+        return self.judge(self.models[0], True)
 
     @cached_property
     def plain_pictures(self) -> list[Bytes]:
-        """Those of the first control."""
+        """Renders of the first control."""
         return self.pictures(self.models[1])
 
     def pictures(self, model: Gaussians) -> list[Bytes]:
-        """Renders of a model that StegExpose looks at."""
-        views = steganalysed(self.scene.views)
+        """Renders of a model for StegExpose."""
+        views = select_views(self.scene.views)
         return [image.numpy() for _, image in renders_of(model, self.scene, views)]
 
 
@@ -264,8 +261,8 @@ def own_gaussians(stego: Gaussians) -> Gaussians:
     return stego if isinstance(stego, DecodedGaussians) else stego[~is_appended(stego)]
 
 
-def sparing(change: Change) -> Change:
-    """The same change, but not to appended Gaussians."""
+def spare_appended(change: Change) -> Change:
+    """The change without appended Gaussians."""
 
     def apply(model: Gaussians) -> Gaussians:
         if isinstance(model, DecodedGaussians) or not bool(is_appended(model).any()):

@@ -1,6 +1,6 @@
-"""The report: one HTML file that opens from disk and, by its own policy, loads nothing.
+"""The report: one HTML file that opens from disk and loads nothing, enforced by its policy.
 
-The texts, the images and the size of an audit are untrusted.
+Texts, images and size of an audit are untrusted.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _AUDIT = "`keyss audit RUN --key-file KEY` measures it"
 _EVALUATE = "`keyss evaluate RUN --key-file KEY` measures it, and a new audit includes it"
 _NO_MODEL = "the method does not publish a 3DGS model"
 _MAX_PICTURE = 32 * 2**20
-_MAX_PICTURES = 256 * 2**20  # of all together, for browsers
+_MAX_PICTURES = 256 * 2**20  # bytes of all pictures; browsers cannot show more
 _MAX_ENTRIES = 10_000
 _MAX_NUMBER = 1e15
 _MAX_TEXT = 1_000
@@ -54,16 +54,15 @@ _PARTS = {
 def report_bytes(audit: Audit, folder: Path) -> bytes:
     """The content of the report.
 
-    It needs no network: pictures, style and script are inside. The same audit gives the same bytes. `folder`
-    holds the audit's pictures, as a run's does. Raises InputError for an audit that is too large or names
-    pictures outside the folder.
+    Pictures, style and script are embedded. Deterministic. `folder` holds the audit's pictures, like a run's.
+    Raises InputError for an audit that is too large or names pictures outside the folder.
     """
     try:
         check_bounds(audit)
     except RecursionError as error:
         raise InputError(f"{folder}: the audit's configuration is nested too deeply") from error
     script = _asset("slider.js")
-    lines, notes = verdicts(audit), _not_measured(audit)
+    lines, notes = verdicts(audit), _missing_parts(audit)
     models = audit.images.models if audit.images else ()
     sections = {"verdict": "Verdict"} if lines else {}
     if audit.images and audit.images.pictures:
@@ -96,7 +95,7 @@ def report_bytes(audit: Audit, folder: Path) -> bytes:
 
 
 def _policy(script: str) -> str:
-    """Even if markup slipped through the escaping, browsers would run no other script and fetch nothing."""
+    """A content security policy: even unescaped markup could run no other script and fetch nothing."""
     digest = b64encode(hashlib.sha256(script.encode()).digest()).decode()
     return (
         f"default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'sha256-{digest}'; "
@@ -105,7 +104,7 @@ def _policy(script: str) -> str:
 
 
 def prose(text: str) -> Markup:
-    """Text in which `backquotes` mark code."""
+    """Format text with `backquotes` as code."""
     code = Markup("<code>{}</code>")
     return Markup("").join(
         code.format(part) if i % 2 else part for i, part in enumerate(clean(text).split("`"))
@@ -124,7 +123,7 @@ def _environment() -> Environment:
         loader=jinja2.PackageLoader("keyss.lab.audits"),
         autoescape=True,
         undefined=jinja2.StrictUndefined,
-        finalize=_finalized,
+        finalize=_finalize,
         trim_blocks=True,
         lstrip_blocks=True,
     )
@@ -133,15 +132,15 @@ def _environment() -> Environment:
     return environment
 
 
-def _finalized(value: object) -> object:
-    """The value of an expression in a template; untrusted text becomes one printable line."""
+def _finalize(value: object) -> object:
+    """Convert the value of an expression in a template; untrusted text becomes one printable line."""
     if isinstance(value, str) and not isinstance(value, Markup):
         return clean(value)
     return "" if value is None else value
 
 
 def _title(audit: Audit) -> str:
-    """Names the secrets and the cover."""
+    """The title, with the names of the secrets and the cover."""
     cover, *secrets = (PurePath(path).name or path for path in (audit.run.cover, *audit.run.secrets))
     return f"{' and '.join(secrets) or 'A secret'}, hidden in {cover}"
 
@@ -157,8 +156,8 @@ def _comparisons(models: Sequence[ModelImages]) -> list[tuple[str, ImageComparis
     return rows
 
 
-def _not_measured(audit: Audit) -> list[str]:
-    """Everything that the audit lacks, and how to get it."""
+def _missing_parts(audit: Audit) -> list[str]:
+    """Sentences on missing parts of the audit, and how to get them."""
     notes = []
     for name, (_, title) in _PARTS.items():
         if not getattr(audit, name):

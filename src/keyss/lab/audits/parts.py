@@ -1,4 +1,4 @@
-"""The parts of an audit: what each takes, what it measures, and against which baseline or control."""
+"""The parts of an audit: functions that measure a run against baselines and controls."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ from keyss.lab.stealth.judging import StealthResult, judge
 from keyss.lab.stegexpose import stegexpose_auc
 from keyss.lab.two_sample import auc_beside_controls
 from keyss.measure.hiding import in_cover
-from keyss.measure.images import compare_images, masks_of, photos_of, renders_of, steganalysed
+from keyss.measure.images import compare_images, masks_of, photos_of, renders_of, select_views
 from keyss.progress import Reporter
 from keyss.runs.files import CONTROLS, as_model, stego_in
 from keyss.runs.folder import RunFolder
@@ -69,7 +69,7 @@ class AuditSubject:
     original: Gaussians  # plain model of the cover
     baselines: tuple[Gaussians | None, ...]  # plain models of the secrets, if there are any
     controls: tuple[Gaussians, ...]  # plain models of the cover from other seeds
-    seeds: tuple[int, ...]  # of the controls
+    seeds: tuple[int, ...]  # seeds of the controls
     device: torch.device
 
 
@@ -82,10 +82,10 @@ def subject_of(
     reporter: Reporter,
     folder: RunFolder,
 ) -> AuditSubject:
-    """Read, reveal and fit what the audit needs; plain models are kept in the run's `folder` for reuse.
+    """Read, reveal and fit the input of an audit; fitted models are kept in the run's `folder` for reuse.
 
-    `original`: a plain model of the cover, by default the run's own. `controls`: how many to train, from
-    seeds derived from the run's own and `seed`. Raises UsageError without a plain model of the cover.
+    `original`: a plain model of the cover, by default the run's own. `controls`: number of models to train,
+    with seeds derived from the run's and `seed`. Raises UsageError without a plain model of the cover.
     """
     scenes = run.scenes()
     plain, *_ = run.plain_models()
@@ -96,7 +96,7 @@ def subject_of(
         raise UsageError(f"{run.folder} has no plain model of the cover to compare with: give `original`")
     stego = run.stego.to(device)
     config = run.config.options.fit
-    if original is not None or run.config.models_given[0]:  # its size is not the run's
+    if original is not None or run.config.models_given[0]:  # the run's maximum is not for this model
         config = replace(config, max_gaussians=max(len(plain), 16))
     seeds = tuple(run.config.options.fit.seed_of(f"control {seed + index}") for index in range(controls))
     return AuditSubject(
@@ -119,7 +119,7 @@ def subject_of(
 def _plain_model(
     scene: Scene, config: FitConfig, folder: RunFolder, device: torch.device, reporter: Reporter
 ) -> Gaussians:
-    """A plain model of a scene, from the run's folder if it was fitted there before."""
+    """Fit a plain model of a scene, or read it from the run's folder."""
     made_of = json.dumps({"scene": scene.digest(), "config": asdict(config)}, sort_keys=True)
     name = f"seed-{config.seed}-{hashlib.sha256(made_of.encode()).hexdigest()[:12]}"
     model = f"{CONTROLS}/{name}.ply"
@@ -144,12 +144,12 @@ def _plain_model(
 class PartResult(Generic[T]):
     """The result of one part of an audit."""
 
-    section: T  # of `Audit`
+    section: T  # a field of `Audit`
     pictures: dict[str, Tensor] = field(default_factory=dict)  # [H, W, 3] uint8 by file name
 
 
 class PartialAudit:
-    """The audit so far, with its pictures, in a folder laid out as a run's; for the same `inputs` only."""
+    """An unfinished audit and its pictures, in a folder laid out like a run's; only for equal `inputs`."""
 
     def __init__(self, folder: Path, begun: Audit, inputs: dict[str, object]) -> None:
         self.folder, self.audit = folder, begun
@@ -176,7 +176,7 @@ class PartialAudit:
 
 
 class PartProgress:
-    """Progress of one part: call it with the numbers of items done and of all."""
+    """Progress of one part: call it with the number of finished items and the total."""
 
     def __init__(self, reporter: Reporter, title: str) -> None:
         self._reporter, self._title, self._total = reporter, title, 0
@@ -198,7 +198,7 @@ AuditPart = Callable[[AuditSubject, int, PartProgress], PartResult[Any]]
 
 
 def images(subject: AuditSubject, seed: int, progress: PartProgress) -> PartResult[ImagesResult]:
-    """Cover and secrets against the test views, with plain models as baselines, and some of the images."""
+    """Compare cover and secrets with the test views, and plain models as baselines; keep some images."""
     models = [subject.stego, *subject.revealed]
     plains = [subject.original, *subject.baselines]
     results = []
@@ -235,7 +235,7 @@ def images(subject: AuditSubject, seed: int, progress: PartProgress) -> PartResu
 
 
 def parameters(subject: AuditSubject, seed: int, progress: PartProgress) -> PartResult[ParametersResult]:
-    """Distances of the parameters from plain models: 3D-Sinkhorn as published, Wasserstein, a classifier."""
+    """Distances of the parameters from plain models: published 3D-Sinkhorn, Wasserstein, a classifier."""
     original, stego, controls = subject.original, subject.stego, subject.controls
     progress(0, 3)
     sinkhorn = sinkhorn_3d(original, stego)
@@ -251,7 +251,7 @@ def parameters(subject: AuditSubject, seed: int, progress: PartProgress) -> Part
 
 
 def stealth(subject: AuditSubject, seed: int, progress: PartProgress) -> PartResult[StealthResult]:
-    """Statistics of the file compared with plain models, and whether a guessed secret can be confirmed."""
+    """Compare statistics of the file with plain models, and try to confirm guessed secrets."""
     progress(0, 1)
     return PartResult(
         judge(subject.stego, subject.controls, original=subject.original, candidates=subject.baselines)
@@ -261,7 +261,7 @@ def stealth(subject: AuditSubject, seed: int, progress: PartProgress) -> PartRes
 def stegexpose(subject: AuditSubject, seed: int, progress: PartProgress) -> PartResult[RendersResult]:
     """StegExpose on renders of the stego model and of plain models."""
     cover = subject.scenes[0]
-    views = steganalysed(cover.views)
+    views = select_views(cover.views)
     models = (subject.controls[0], subject.stego, subject.controls[1])
     plain, stego, control = (
         [image.numpy() for _, image in renders_of(model, cover, views)] for model in models
@@ -296,7 +296,7 @@ def leaks(
 def robustness(
     subject: AuditSubject, seed: int, progress: PartProgress
 ) -> PartResult[tuple[ChangeResult, ...]]:
-    """PSNR that the cover and the secrets lose when the stego model changes."""
+    """PSNR loss of the cover and the secrets when the stego model changes."""
     cover, *secrets = subject.scenes
     rows = measure_robustness(
         subject.stego, subject.run.openers, cover, secrets, seed=seed, progress=progress

@@ -21,8 +21,8 @@ from keyss.runs.files import run_folder
 from keyss.runs.folder import PRIVATE
 from keyss.runs.records import read_record
 
-AUDIT_FOLDER, AUDIT_FILE = f"{PRIVATE}/audit", "audit.json"  # the folder is in that of the run
-PICTURES = "pictures"  # folder in that of the audit
+AUDIT_FOLDER, AUDIT_FILE = f"{PRIVATE}/audit", "audit.json"  # folder relative to the run
+PICTURES = "pictures"  # folder relative to the audit's
 
 
 @dataclass(frozen=True)
@@ -31,13 +31,13 @@ class AuditedRun:
 
     path: str
     method: str
-    cover: str  # a scene folder, or a model without photos; so are the secrets
+    cover: str  # a scene folder, or a model without photos; `secrets` too
     secrets: tuple[str, ...]
     width: int | None  # pixels, if photos were shrunk
-    gaussians: int  # of the stego model
-    standard: bool = True  # whether a 3DGS model is published
+    gaussians: int  # Gaussians of the stego model
+    standard: bool = True  # True if a 3DGS model is published
     config: dict[str, Any] = field(default_factory=dict)
-    versions: dict[str, str] = field(default_factory=dict)  # of Python and of libraries, by name
+    versions: dict[str, str] = field(default_factory=dict)  # Python and libraries, by name
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class ModelImages:
     photos: bool  # False: test views are renders of a given model
     images: ImageComparison
     gaussians: int
-    baseline: ImageComparison | None  # of the plain model; this and the next are None without one
+    baseline: ImageComparison | None  # plain model; None without one, like `baseline_gaussians`
     baseline_gaussians: int | None
 
 
@@ -56,7 +56,7 @@ class ModelImages:
 class ImagesResult:
     """Cover and secrets against the test views."""
 
-    models: tuple[ModelImages, ...]  # of the cover, then of the secrets
+    models: tuple[ModelImages, ...]  # cover, then secrets
     pictures: dict[str, dict[str, str]]  # files in the audit's folder by view and by model
 
 
@@ -64,7 +64,7 @@ class ImagesResult:
 class ParametersResult:
     """Distances of the stego model's parameters from those of plain models."""
 
-    sinkhorn: Sinkhorn3D  # as published, from the cover's plain model
+    sinkhorn: Sinkhorn3D  # published model against the cover's plain model
     sinkhorn_controls: tuple[Sinkhorn3D, ...]
     score: float  # composite score (KeySS, eq. 10)
     distances: dict[str, AttributeDistance]
@@ -89,8 +89,8 @@ class Audit:
     seconds: float
     run: AuditedRun
     controls: tuple[int, ...]  # seeds of the plain models of the cover to compare with
-    wrong_key: WrongKeys | None = None  # from the run's `metrics.json`, like the chance level
-    chance_level: tuple[float, ...] = ()  # dB, the stego model itself against each secret's test views
+    wrong_key: WrongKeys | None = None  # copied from the run's `metrics.json`, like the chance level
+    chance_level: tuple[float, ...] = ()  # dB, the stego model against each secret's test views
     images: ImagesResult | None = None
     parameters: ParametersResult | None = None
     stealth: StealthResult | None = None
@@ -101,7 +101,7 @@ class Audit:
 
 
 def read_audit(run: Path) -> Audit:
-    """A run's audit. Raises InputError if it is missing, broken, too large or of another version."""
+    """Read a run's audit. Raises InputError if it is missing, broken, too large or of another version."""
     path = run / AUDIT_FOLDER / AUDIT_FILE
     if not path.exists():
         run_folder(run)

@@ -1,4 +1,4 @@
-"""The audit of a run: takes all measures in turn and stores each as soon as it is finished."""
+"""The audit of a run: measures part by part, and stores each result at once."""
 
 from __future__ import annotations
 
@@ -44,18 +44,16 @@ def audit(
     resume: bool = False,
     reporter: Reporter | None = None,
 ) -> Audit:
-    """Measure quality, stealth, leaks, robustness and speed of a folder that `hide` made.
+    """Measure quality, stealth, leaks, robustness and speed of a folder of `hide`.
 
-    `keys`: those of all its secrets, in any order. `report_only`: only writes `private/report.html` again,
-    from the audit that the run already has, or from the finished parts of an interrupted one; it needs no
-    keys. `original`: a plain model of the cover, by default the run's own. `controls`: the number of plain
-    models of the cover, from other seeds, to compare with; at least 2, kept in `private/controls/`. `only`:
-    names of parts, by default all.
+    `keys`: one per secret, in any order. `report_only`: only write `private/report.html` again, from the
+    run's audit or the finished parts of an interrupted one; needs no keys. `original`: a plain model of the
+    cover, by default the run's own. `controls`: number of plain models of the cover with other seeds to
+    compare with; at least 2, kept in `private/controls/`. `only`: names of parts, by default all.
 
-    The folder gets `private/audit/` with `audit.json`, which is also returned, and pictures, and
-    `private/report.html`. An interrupted audit keeps its finished parts, and `resume` continues after them.
-    Raises KeyssError and its children, BackendError among them without the extra `audit`, and Interrupted on
-    Ctrl-C.
+    The folder gets `private/audit/` with pictures and `audit.json`, which is also returned, and
+    `private/report.html`. `resume` continues an interrupted audit after its finished parts. Raises KeyssError
+    (BackendError without the extra `audit`), and Interrupted on Ctrl-C.
     """
     if report_only:
         return _report(Path(run))
@@ -97,7 +95,7 @@ def audit(
             chance_level=opened.metrics.chance_level,
         )
         partial_audit = PartialAudit(folder.checkpoints, begun, _inputs(subject, seed))
-        chosen = _chosen(only, standard)
+        chosen = _choose_parts(only, standard)
         for index, name in enumerate(chosen):
             if getattr(partial_audit.audit, name) is None:
                 progress = PartProgress(reporter, f"audit, {index + 1} of {len(chosen)}: {name}")
@@ -117,7 +115,7 @@ def audit(
 
 @contextmanager
 def _resumable(checkpoints: Path) -> Iterator[None]:
-    """Tell how to continue after an interrupt, wherever it comes."""
+    """Turn any interrupt into Interrupted, which says how to continue."""
     try:
         yield
     except Interrupted:
@@ -128,7 +126,7 @@ def _resumable(checkpoints: Path) -> Iterator[None]:
 
 
 def _report(run: Path) -> Audit:
-    """Write the report of the audit that a run has, finished or not; nothing else of the run changes."""
+    """Write the report of a run's audit, finished or not."""
     import_extra("jinja2", "audit", "write a report")
     from keyss.lab.audits.page import report_bytes
 
@@ -142,7 +140,7 @@ def _report(run: Path) -> Audit:
     place = run / CHECKPOINTS if running else run
     result = read_audit(place)
     if running:
-        parts = _chosen(running.arguments["only"], result.run.standard)
+        parts = _choose_parts(running.arguments["only"], result.run.standard)
         missing = [name for name in parts if getattr(result, name) is None]
         warnings.warn(
             f"the audit was interrupted before {', '.join(missing)}: `resume=True` with the same arguments "
@@ -154,14 +152,14 @@ def _report(run: Path) -> Audit:
     return result
 
 
-def _chosen(only: Sequence[str], standard: bool) -> list[str]:
-    """The parts of an audit of a run, `standard` if it published a 3DGS model."""
+def _choose_parts(only: Sequence[str], standard: bool) -> list[str]:
+    """The parts of an audit; `standard`: the run published a 3DGS model."""
     possible = [name for name in PARTS if standard or name not in OF_3DGS_MODELS]
     return [name for name in possible if not only or name in only]
 
 
 def _inputs(subject: AuditSubject, seed: int) -> dict[str, object]:
-    """Everything that the results of parts depend on."""
+    """All inputs of the parts."""
     return {
         "payloads": subject.run.config.payloads,
         "stego": subject.stego.digest(),
@@ -182,6 +180,6 @@ def _audited_run(run: HidingRun) -> AuditedRun:
         width=run.config.views.width,
         gaussians=len(run.stego),
         standard=registry.get(run.config.method).capabilities.standard,
-        config=msgspec.json.decode(msgspec.json.encode(run.config.options)),  # as reading gives it back
+        config=msgspec.json.decode(msgspec.json.encode(run.config.options)),  # like `read_audit`
         versions={"python": platform.python_version()} | {name: version_of(name) for name in _LIBRARIES},
     )

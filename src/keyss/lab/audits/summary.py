@@ -1,8 +1,8 @@
 """The summary of an audit: a verdict for each measure.
 
-*fine*: within the limit. *visible*: without the key it may be visible that something is hidden, or what.
-*missed*: nothing is visible, but the quality is lower than it should be.
-All limits are here, except those of leaks, which are in `keyss.lab.leaks.looking`.
+*fine*: within the limit. *visible*: that something is hidden, or what, may be visible without the key.
+*missed*: nothing is visible, but the quality is too low. Limits of leaks are in `keyss.lab.leaks.looking`,
+all others here.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ QUALITY_LOSS = 1.0  # dB of cover or secret below the plain model of the same sc
 INVISIBLE = 45.0  # dB: a higher PSNR makes no visible difference
 IDENTICAL = 119.9  # dB; a given model has 120 against its own renders
 DISTANCE_RATIO = 1.5  # distance from controls / distance between controls
-TWO_SAMPLE_AUC = 0.6  # of the classifier between the Gaussians of two models
+TWO_SAMPLE_AUC = 0.6  # classifier between the Gaussians of two models
 AUC_TOLERANCE = 0.01  # above the AUC of the cover's own plain model
 UNUSUAL = 0.01  # p, corrected for the number of statistics
 IMAGE_AUC = 0.1  # distance of StegExpose's AUC from 0.5
@@ -40,7 +40,7 @@ class Verdict:
     beside: str  # the baseline or control
     limit: str
     word: Word
-    section: str  # of the report
+    section: str  # section of the report
 
 
 def verdicts(audit: Audit) -> list[Verdict]:
@@ -131,7 +131,7 @@ def _leaks(audit: Audit) -> Iterator[Verdict]:
 
 
 def _stealth(audit: Audit) -> Iterator[Verdict]:
-    """Statistics of the file, and whether a guess of a secret can be confirmed."""
+    """Verdicts on statistics of the file, and on confirming a guess of a secret."""
     result = audit.stealth
     if result is None or not result.statistics:
         return

@@ -1,8 +1,8 @@
-"""Attacks by name: changes of a model that may show a secret without its key.
+"""Attacks: changes of a model that may show a secret without its key.
 
-Transparent Gaussians may belong to a secret (KeySS, figures 2 and 6). A second scene that is stored in
-attributes that do not render (lengths of quaternions, harmonics of transparent Gaussians), or trained
-differently, may form a group of its own. No attack changes a model in place.
+Transparent Gaussians may belong to a secret (KeySS, figures 2 and 6). A second scene, stored in attributes
+that do not affect renders (lengths of quaternions, harmonics of transparent Gaussians) or trained
+differently, may form a cluster. Attacks do not change a model in place.
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ from keyss.keys.derivation import EMBEDDING_SIZE
 from keyss.rendering import contributions
 
 OPAQUE = 0.99  # the maximum alpha of a Gaussian in 3DGS
-THRESHOLDS = (0.01, 0.05, 0.2)  # of opacities; the paper's figures use 0.05
-SHARES = (0.1, 0.3, 0.5)  # of the least contributing
+THRESHOLDS = (0.01, 0.05, 0.2)  # opacities; the paper's figures use 0.05
+SHARES = (0.1, 0.3, 0.5)  # fractions of the Gaussians, least contributing first
 DEVIATIONS = (2.0, 3.5)  # robust z-scores of outliers
 CLUSTERS = (2, 4)
 SEARCH_SAMPLE = 1000  # Gaussians used to search embeddings; more do not change the result
 
-_BRIGHTEST = 0.99  # the quantile that rescaling makes OPAQUE, robust to outliers
-_TO_SIGMA = 1.4826  # from a median absolute deviation to the standard deviation of a normal distribution
-_MIN_SPREAD = 1e-3  # of a logarithm: attributes that differ by rounding have no outliers
+_BRIGHTEST = 0.99  # quantile that rescaling makes OPAQUE; robust to outliers
+_TO_SIGMA = 1.4826  # converts a median absolute deviation to a normal standard deviation
+_MIN_SPREAD = 1e-3  # log units: attributes that differ only by rounding have no outliers
 _MIN_LENGTH = 1e-12
 _CLUSTER_SAMPLE = 5000  # Gaussians used to find clusters
 _MIN_CLUSTERED = 10
@@ -45,7 +45,7 @@ Decode = Callable[[Gaussians, Tensor], Gaussians]  # `keyss.methods.opened.Opene
 
 @dataclass(frozen=True)
 class Attack:
-    """One attack: makes models to render, with the same labels for every model."""
+    """One attack: changes a model into labelled variants to render; labels do not depend on the model."""
 
     name: str
     sentence: str
@@ -60,22 +60,22 @@ def file_attacks(cover: Scene, *, cover_views: int = 32, seed: int = 0) -> list[
         Attack(
             "restored opacities",
             "Gaussians below an opacity are made opaque and the others left out, or all made opaque.",
-            partial(_faint, _opaque, and_all=True),
+            partial(_below_thresholds, _make_opaque, and_all=True),
         ),
         Attack(
             "rescaled opacities",
             "Gaussians below an opacity alone, all opacities multiplied by one factor.",
-            partial(_faint, _rescaled),
+            partial(_below_thresholds, _rescale),
         ),
         Attack(
             "matched opacities",
             "Gaussians below an opacity alone, with the opacities of the others, given by rank.",
-            _matched,
+            _match_opacities,
         ),
         Attack(
             "inverted opacities",
             "Opacities o become 1 - o, of Gaussians below an opacity alone or of all.",
-            partial(_faint, lambda m: replace(m, opacity_logits=-m.opacity_logits), and_all=True),
+            partial(_below_thresholds, lambda m: replace(m, opacity_logits=-m.opacity_logits), and_all=True),
         ),
         Attack(
             "least contribution",
@@ -101,9 +101,9 @@ def file_attacks(cover: Scene, *, cover_views: int = 32, seed: int = 0) -> list[
 def decoder_attack(
     decode: Decode, key_size: int = EMBEDDING_SIZE, *, restarts: int = 2, steps: int = 150, seed: int = 0
 ) -> Attack:
-    """The attack with a secret's decoder and everything encrypted with it, but without the key.
+    """The attack with a secret's decoder, but without the key.
 
-    `decode`: see `keyss.methods.opened.Opened`. Without a gradient in the embedding, the search is random.
+    `decode`: see `keyss.methods.opened.Opened`; if it has no gradient in the embedding, the search is random.
     """
 
     def show(model: Gaussians) -> Variants:
@@ -135,29 +135,28 @@ def search_embeddings(
     balance: float = 2.0,
     seed: int = 0,
 ) -> Tensor:
-    """[restarts, key_size] unit vectors for which the decoder seems to show another scene, the best first.
+    """[restarts, key_size] unit vectors for which the decoder seems to show another scene, best first.
 
-    In the published scheme the key is a vector that enters the decoder's first layers. An attacker with the
-    network can search for the vector that exchanges most Gaussians, without knowing the secret: gradient
-    ascent from random starts on the mean change of the opacities, less `balance` times the change of their
-    mean. Making some Gaussians visible and as many others invisible replaces one scene by another; only
-    adding or removing does not. `balance=0` counts all change, which finds a secret that needs more Gaussians
-    than the cover.
+    In the published scheme, the key is a vector that enters the decoder's first layers. An attacker with the
+    network can search for the vector that exchanges most Gaussians: by gradient ascent from random starts, on
+    the mean absolute change of the opacities minus `balance` times the absolute change of their mean. Making
+    some Gaussians visible and others invisible replaces a scene; only adding or removing them does not.
+    `balance=0` counts all changes, and finds secrets with more Gaussians than the cover.
 
-    A random subset of `limit` Gaussians is decoded; appended Gaussians, which no decoder changes, are
-    ignored. Returns the random starts if the decoded opacities have no gradient in the embedding.
+    Decodes a random subset of `limit` Gaussians, without appended ones. Returns the random starts if the
+    decoded opacities have no gradient in the embedding.
     """
     generator = torch.Generator().manual_seed(seed)
     part = stego.detach()[~is_appended(stego)]
     if len(part) > limit:
         part = part[torch.randperm(len(part), generator=generator)[:limit].to(stego.device)]
 
-    def exchanged(direction: Tensor) -> Tensor:
+    def exchange(direction: Tensor) -> Tensor:
         change = decode(part, F.normalize(direction, dim=0)).opacities - part.opacities
         return change.abs().mean() - balance * change.mean().abs()
 
     starts = random_embeddings(restarts, generator, key_size)
-    if not exchanged(starts[0].to(stego.device).requires_grad_()).requires_grad:
+    if not exchange(starts[0].to(stego.device).requires_grad_()).requires_grad:
         return starts
     scored = []
     for start in starts:
@@ -165,16 +164,16 @@ def search_embeddings(
         optimizer = torch.optim.Adam([direction], lr=0.02)
         for _ in range(steps):
             optimizer.zero_grad()
-            (-exchanged(direction)).backward()
+            (-exchange(direction)).backward()
             optimizer.step()
         with torch.no_grad():
-            scored.append((float(exchanged(direction)), F.normalize(direction.detach(), dim=0).cpu()))
+            scored.append((float(exchange(direction)), F.normalize(direction.detach(), dim=0).cpu()))
     scored.sort(key=lambda pair: -pair[0])
     return torch.stack([embedding for _, embedding in scored])
 
 
 def with_the_key(reveal: Callable[[Gaussians], Gaussians]) -> Attack:
-    """The reference: the secret in the cover's frame, as its key reveals it."""
+    """The reference: the secret revealed with its key, in the cover's frame."""
     return Attack(
         "with the key",
         "Not an attack: the secret itself.",
@@ -183,14 +182,14 @@ def with_the_key(reveal: Callable[[Gaussians], Gaussians]) -> Attack:
     )
 
 
-def _opaque(model: Gaussians) -> Gaussians:
-    """All Gaussians with opacity OPAQUE."""
+def _make_opaque(model: Gaussians) -> Gaussians:
+    """Set all opacities to OPAQUE."""
     logit = math.log(OPAQUE / (1 - OPAQUE))
     return replace(model, opacity_logits=torch.full_like(model.opacity_logits, logit))
 
 
-def _rescaled(model: Gaussians) -> Gaussians:
-    """Opacities times the factor that makes the largest ones OPAQUE."""
+def _rescale(model: Gaussians) -> Gaussians:
+    """Scale opacities so that the largest become OPAQUE."""
     if len(model) == 0:
         return model
     opacities = model.opacity_logits.double().sigmoid()
@@ -199,7 +198,9 @@ def _rescaled(model: Gaussians) -> Gaussians:
     return replace(model, opacity_logits=scaled.logit().to(model.opacity_logits))
 
 
-def _faint(change: Callable[[Gaussians], Gaussians], model: Gaussians, *, and_all: bool = False) -> Variants:
+def _below_thresholds(
+    change: Callable[[Gaussians], Gaussians], model: Gaussians, *, and_all: bool = False
+) -> Variants:
     """Change the Gaussians below each threshold alone, and optionally the whole model."""
     for threshold in THRESHOLDS:
         yield f"below {threshold}", change(model[model.opacities < threshold])
@@ -207,8 +208,8 @@ def _faint(change: Callable[[Gaussians], Gaussians], model: Gaussians, *, and_al
         yield "all", change(model)
 
 
-def _matched(model: Gaussians) -> Variants:
-    """The Gaussians below each threshold with the opacities of the others by rank.
+def _match_opacities(model: Gaussians) -> Variants:
+    """Give the Gaussians below each threshold the opacities of the others, by rank.
 
     Undoes any monotone reduction of opacities.
     """
@@ -223,14 +224,14 @@ def _matched(model: Gaussians) -> Variants:
 
 
 def _least_contributing(cameras: Sequence[Camera], model: Gaussians) -> Variants:
-    """The shares of the Gaussians that contribute least to the cameras' images, made opaque."""
+    """The Gaussians that contribute least to the cameras' images, made opaque."""
     order = contributions(model, cameras).argsort(stable=True)
     for share in SHARES:
-        yield f"{share:.0%}", _opaque(model[order[: round(share * len(model))]])
+        yield f"{share:.0%}", _make_opaque(model[order[: round(share * len(model))]])
 
 
 def _quaternion_length(model: Gaussians) -> Tensor:
-    """[N] natural logarithm."""
+    """[N] natural logarithm of the length."""
     length: Tensor = model.quats.norm(dim=1).clamp_min(_MIN_LENGTH).log()
     return length
 
@@ -248,10 +249,9 @@ ATTRIBUTES: dict[str, Callable[[Gaussians], Tensor]] = {
 
 
 def _outliers(attribute: str, model: Gaussians) -> Variants:
-    """Only the Gaussians whose robust z-score in an attribute is beyond a limit, made opaque.
+    """The Gaussians whose robust z-score in an attribute is beyond a limit, made opaque.
 
-    The score is the distance from the model's median over the standard deviation estimated by the median
-    absolute deviation, negated on the low side.
+    The score is (value - median) / standard deviation, estimated by the median absolute deviation.
     """
     score = ATTRIBUTES[attribute](model)
     if len(model):
@@ -259,15 +259,15 @@ def _outliers(attribute: str, model: Gaussians) -> Variants:
         score = score / (_TO_SIGMA * score.abs().median()).clamp_min(_MIN_SPREAD)
     for side, sign in (("low", -1), ("high", 1)):
         for deviation in DEVIATIONS:
-            yield f"{side}, {deviation} deviations", _opaque(model[sign * score > deviation])
+            yield f"{side}, {deviation} deviations", _make_opaque(model[sign * score > deviation])
 
 
 def _clusters(seed: int, model: Gaussians) -> Variants:
-    """Groups of similar Gaussians, each alone and made opaque, the largest first.
+    """Clusters of similar Gaussians, each alone and made opaque, largest first.
 
-    A Gaussian mixture of opacity logit, sorted log scales, constant colour, and the logarithms of quaternion
-    length and SH energy, all standardised. Without positions, which would cut the scene into pieces. A model
-    of fewer than ten Gaussians is one group, and the others are empty.
+    A Gaussian mixture of opacity logit, sorted log scales, constant colour, and logarithms of quaternion
+    length and SH energy, all standardised; positions would cut the scene into pieces. A model of fewer than
+    ten Gaussians is one cluster; the others are empty.
     """
     for count in CLUSTERS:
         labels = torch.zeros(len(model), dtype=torch.long)
@@ -275,7 +275,7 @@ def _clusters(seed: int, model: Gaussians) -> Variants:
             labels = _cluster_labels(model, count, seed)
         order = torch.bincount(labels, minlength=count).argsort(descending=True, stable=True)
         for index, label in enumerate(order, start=1):
-            yield f"{index} of {count}", _opaque(model[(labels == label).to(model.device)])
+            yield f"{index} of {count}", _make_opaque(model[(labels == label).to(model.device)])
 
 
 def _cluster_labels(model: Gaussians, count: int, seed: int) -> Tensor:
@@ -294,7 +294,7 @@ def _cluster_labels(model: Gaussians, count: int, seed: int) -> Tensor:
     mixtures = import_extra("sklearn.mixture", "audit", "find clusters")
     threadpoolctl = import_extra("threadpoolctl", "audit", "find clusters")
     mixture = mixtures.GaussianMixture(count, reg_covar=1e-3, random_state=seed)
-    # For matrices of 9 x 9, starting threads takes a hundred times as long as the work.
+    # For 9 x 9 matrices, starting threads takes a hundred times as long as the work.
     with threadpoolctl.threadpool_limits(1), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # a mixture that has not converged is good enough
         mixture.fit(rows[sample])

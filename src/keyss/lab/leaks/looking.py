@@ -1,7 +1,4 @@
-"""Runs attacks on a stego model and on plain models, and scores the images against the secret.
-
-Scores are similarities to photos, after the best fit of colours.
-"""
+"""Run attacks on a stego model and on plain models, and score the images against the secret's photos."""
 
 from __future__ import annotations
 
@@ -21,39 +18,36 @@ from keyss.fitting.losses import Target, ssim
 from keyss.lab.leaks.attacks import Attack
 from keyss.rendering import render
 
-# Limits of a leak, in scores that respond to the secret's shapes and not to haze.
+# Limits of a leak, in scores that haze alone does not increase.
 PSNR_LIMIT = 1.0  # dB closer to the secret's photos than a control
 SSIM_LIMIT = 0.05
 GRADIENT_LIMIT = 0.1  # correlation of coarse gradients with the photos', above a control's
 
-COARSE = 64  # pixels of the longer side: shapes that are slightly misplaced still match
+COARSE = 64  # pixels of the longer side: slightly misplaced shapes still match
 
 _GAP = 4  # pixels between the parts of a picture
-_VIEWS = 8  # from which attacks look
+_VIEWS = 8  # cameras per scene for attacks
 
 
 @dataclass(frozen=True)
 class LeakScores:
-    """How well images show photos: means over views, or differences of such means.
+    """Similarity of images to photos: means over views, or differences of such means.
 
-    PSNR and SSIM after the best fit of colours. Without it any bright cloud is closer to a photo than black.
+    PSNR and SSIM after `fit_colours`; otherwise any bright haze would be closer to a photo than black.
     """
 
     psnr_fitted: float  # dB
-    ssim_fitted: float  # as in 3DGS
+    ssim_fitted: float  # 3DGS's SSIM
     gradient: float  # `gradient_correlation`
-    gradient_coarse: float  # the same of `coarse` images
+    gradient_coarse: float  # `gradient_correlation` of `coarse` images
 
     @staticmethod
-    def combined(function: Callable[[Sequence[float]], float], rows: Sequence[LeakScores]) -> LeakScores:
-        """A function of each score over all rows."""
+    def combine(function: Callable[[Sequence[float]], float], rows: Sequence[LeakScores]) -> LeakScores:
+        """Apply `function` to each score over all rows."""
         return LeakScores(*(function(column) for column in zip(*map(astuple, rows), strict=True)))
 
     def evidence(self) -> float:
-        """The maximum of a leak's scores relative to their limits; above 1 the secret's shapes show.
-
-        Of those that haze alone does not increase.
-        """
+        """The maximum ratio of a leak's scores to their limits; above 1 the secret's shapes are visible."""
         return max(
             self.psnr_fitted / PSNR_LIMIT,
             self.ssim_fitted / SSIM_LIMIT,
@@ -67,9 +61,9 @@ class LeakScores:
 def gradient_correlation(image: Tensor, reference: Tensor) -> float:
     """Normalised cross-correlation of the brightness gradients of two [H, W, 3] images, -1 to 1.
 
-    Of central differences of the mean channel: the sum of g . h over inner pixels, divided by the root of the
-    product of the sums of |g|^2 and |h|^2. Invariant to brightness and contrast; 1 for equal images, -1 for
-    the negative, 0 for a constant image.
+    With central differences g and h of the mean channel: sum(g . h) / sqrt(sum(|g|^2) sum(|h|^2)) over inner
+    pixels. Invariant to brightness and contrast; 1 for equal images, -1 for the negative, 0 for a constant
+    image.
     """
     first, second = _gradients(image), _gradients(reference)
     size = (first.square().sum() * second.square().sum()).sqrt()
@@ -77,7 +71,7 @@ def gradient_correlation(image: Tensor, reference: Tensor) -> float:
 
 
 def coarse(image: Tensor) -> Tensor:
-    """[h, w, 3] the image shrunk to COARSE pixels on its longer side by averaging; never enlarged."""
+    """[h, w, 3] the image averaged down to COARSE pixels on its longer side; smaller images do not change."""
     height, width = image.shape[:2]
     scale = min(1.0, COARSE / max(height, width))
     size = (max(1, round(scale * height)), max(1, round(scale * width)))
@@ -85,9 +79,9 @@ def coarse(image: Tensor) -> Tensor:
 
 
 def fit_colours(image: Tensor, reference: Tensor) -> Tensor:
-    """[H, W, 3] the image with the factor, of either sign, and offset per channel that fit best.
+    """[H, W, 3] the image with the least-squares factor (of either sign) and offset per channel.
 
-    Least squares. A constant channel becomes the mean of the reference's.
+    A constant channel becomes the mean of the reference's.
     """
     centred, target = image - image.mean(dim=(0, 1)), reference - reference.mean(dim=(0, 1))
     variance = centred.square().sum(dim=(0, 1))
@@ -97,7 +91,7 @@ def fit_colours(image: Tensor, reference: Tensor) -> Tensor:
 
 @torch.no_grad()
 def leak_scores(model: Gaussians, views: Sequence[View], background: Tensor) -> LeakScores:
-    """Scores of a model against the photos of views, means over the views."""
+    """Mean scores of a model against the photos of views."""
     rows = []
     for view in views:
         photo = view.photo(model.device)
@@ -107,7 +101,7 @@ def leak_scores(model: Gaussians, views: Sequence[View], background: Tensor) -> 
         gradient_coarse = gradient_correlation(coarse(image), coarse(photo))
         similarity = float(ssim(fitted, Target.of(photo)))
         rows.append(LeakScores(psnr(fitted, photo), similarity, gradient, gradient_coarse))
-    return LeakScores.combined(fmean, rows)
+    return LeakScores.combine(fmean, rows)
 
 
 def _gradients(image: Tensor) -> Tensor:
@@ -119,19 +113,19 @@ def _gradients(image: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class AttackResult:
-    """How much more of a secret an attack shows in the stego model than in control models.
+    """Scores of an attack on the stego model, and their excess over control models.
 
-    An attack has variants: thresholds, shares, clusters. The maximum over them counts, since an attacker
-    recognises the secret.
+    An attack has variants: thresholds, shares, clusters. The maximum over them counts, because an attacker
+    recognises the best one.
     """
 
     attack: str
     sentence: str
     with_key: bool  # not an attack, but the revealed secret
-    scores: LeakScores  # each the maximum over the variants
-    leak: LeakScores  # `scores` less those of the controls, which have as many variants
-    best: str  # the variant with the largest `LeakScores.evidence`, which is pictured and judged
-    best_leak: LeakScores  # its scores less those of the controls
+    scores: LeakScores  # maximum of each score over the variants
+    leak: LeakScores  # `scores` minus those of the controls
+    best: str  # variant with the maximum `LeakScores.evidence`, which is pictured and judged
+    best_leak: LeakScores  # scores of the best variant minus those of the controls
     picture: str | None = None  # name of a file, in an audit
 
 
@@ -142,13 +136,13 @@ def look_for_secret(
     secret: Scene,
     attacks: Sequence[Attack],
 ) -> tuple[list[AttackResult], dict[str, Tensor]]:
-    """How well attacks show the secret, from its own test cameras, against its photos.
+    """Score attacks by their renders from the secret's test cameras against its photos.
 
-    The strictest assumption: the attacker looks from where the secret was photographed. `controls` are plain
-    models of the cover; `secret` has its test cameras in the cover's frame (`keyss.measure.in_cover`), of
-    which at most 8 are used. Images are uint8 [H, W, 3] by the attack's name: its best variant on
-    the stego model and on the first control, from the first test camera, and the photo. Raises UsageError
-    without a control or without test views.
+    This is the strictest assumption: the attacker knows the cameras. `controls` are plain models of the
+    cover; `secret` has its test cameras in the cover's frame (`keyss.measure.in_cover`), of which at most 8
+    are used. Also returns images, uint8 [H, W, 3], by attack: its best variant on the stego model and on the
+    first control from the first test camera, and the photo. Raises UsageError without a control or test
+    views.
     """
     if not controls:
         raise UsageError("leaks: expected at least one plain model of the cover to compare with")
@@ -169,20 +163,20 @@ def look_for_secret(
     for attack in attacks:
         variants = look(attack, stego)
         of_controls = [look(attack, model) for model in controls]
-        highest = [LeakScores.combined(max, [each for each, _ in shown.values()]) for shown in of_controls]
-        control = LeakScores.combined(fmean, highest)
+        highest = [LeakScores.combine(max, [each for each, _ in shown.values()]) for shown in of_controls]
+        control = LeakScores.combine(fmean, highest)
         leaks = {label: own - control for label, (own, _) in variants.items()}
         best = max(leaks, key=lambda label: leaks[label].evidence())
-        scored = LeakScores.combined(max, [own for own, _ in variants.values()])
+        scored = LeakScores.combine(max, [own for own, _ in variants.values()])
         results.append(
             AttackResult(
                 attack.name, attack.sentence, attack.with_key, scored, scored - control, best, leaks[best]
             )
         )
-        pictures[attack.name] = _beside([variants[best][1], of_controls[0][best][1], views[0].image])
+        pictures[attack.name] = _side_by_side([variants[best][1], of_controls[0][best][1], views[0].image])
     return results, pictures
 
 
-def _beside(images: Sequence[Tensor]) -> Tensor:
+def _side_by_side(images: Sequence[Tensor]) -> Tensor:
     """The images [H, W, 3] side by side, with white gaps."""
     return torch.cat([F.pad(image.cpu(), (0, 0, 0, _GAP), value=255) for image in images], dim=1)[:, :-_GAP]

@@ -1,13 +1,13 @@
-"""`hide_batch`: one hiding for each asset of a table; an asset that fails does not stop the others.
+"""`hide_batch`: one hiding per asset of a table; a failed asset does not stop the others.
 
 The table is a CSV file with a row for each asset:
 
 | column | what |
 | --- | --- |
-| `cover` | model or scene that everybody may see |
+| `cover` | public model or scene |
 | `secret`, or `secret_file` | scene or model to hide in it, or any file |
 | `out` | folder of its results, in the batch's; it is also the asset's name under a master key |
-| `key_file` | file with its key; left out where keys are derived from a master key |
+| `key_file` | file with its key; none with a master key |
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ from keyss.files import write_bytes
 from keyss.files.reading import read_text
 from keyss.keys import MasterKey, read_key
 from keyss.lab.many.cell import changed_since
-from keyss.lab.many.cell_folder import ManyResult, Outcome, settle_master_key
-from keyss.lab.many.engine import claimed, engine
+from keyss.lab.many.cell_folder import ManyResult, Outcome, check_master_key
+from keyss.lab.many.engine import claim_folder, engine
 from keyss.lab.many.result_tables import csv_bytes
 from keyss.methods import MethodOptions, registry
 from keyss.progress import Reporter
@@ -50,7 +50,7 @@ from keyss.runs.folder import PRIVATE
 MAX_BYTES = 64 << 20
 COLUMNS = ("cover", "secret", "secret_file", "out", "key_file")
 SUMMARY = f"{PRIVATE}/batch.csv"
-_RECORD = f"{PRIVATE}/asset.json"  # in the folder of a finished asset
+_RECORD = f"{PRIVATE}/asset.json"  # relative to the folder of a finished asset
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,7 +69,7 @@ class Asset:
     device: Backend
 
     def is_done(self, place: Path) -> bool:
-        """True if it was made from the same files, with the same options, by the same version of keyss."""
+        """True if it was made from equal files and options by this version of keyss."""
         record = place / _RECORD
         inputs = [each for each in (self.cover, self.secret, self.secret_file, self.key_file) if each]
         same = os.path.exists(record) and record.read_bytes() == record_bytes(self)
@@ -77,10 +77,10 @@ class Asset:
 
 
 def read_rows(path: Path, *, master: bool) -> list[dict[str, str]]:
-    """All rows by columns, without empty values; paths, except `out`, are absolute.
+    """Read all rows without empty values; paths, except `out`, become absolute.
 
-    `master`: keys are derived, and no row names the file of one. Missing files are not an error here: they
-    fail their own asset. Raises InputError, which names the line.
+    `master`: keys are derived, and rows have no key file. Missing files are no error here, but fail their
+    asset. Raises InputError with the line.
     """
     reader = csv.DictReader(io.StringIO(read_text(path, MAX_BYTES)), strict=True)
     found, lines = [], {}
@@ -92,7 +92,7 @@ def read_rows(path: Path, *, master: bool) -> list[dict[str, str]]:
                 raise InputError(f"{path}: {head[:60]!r} is no column, or one twice; {near}")
         for row in reader:
             where = f"{path}, line {reader.line_num}"
-            found.append(_checked(where, path.absolute().parent, row, master))
+            found.append(_check_row(where, path.absolute().parent, row, master))
             # File systems may treat two spellings as the same name.
             place = PurePosixPath(unicodedata.normalize("NFC", found[-1]["out"]).casefold())
             lines[where] = place
@@ -106,7 +106,7 @@ def read_rows(path: Path, *, master: bool) -> list[dict[str, str]]:
     return found
 
 
-def _checked(where: str, base: Path, row: dict[str, str], master: bool) -> dict[str, str]:
+def _check_row(where: str, base: Path, row: dict[str, str], master: bool) -> dict[str, str]:
     if None in row or None in row.values():
         raise InputError(f"{where}: expected as many columns as there are names of them")
     given = {name: value.strip() for name, value in row.items() if value.strip()}
@@ -142,10 +142,10 @@ def hide_batch(
 ) -> ManyResult:
     """Hide a secret in each cover of a table (see this module), each in its own folder below `out`.
 
-    Assets that are done are skipped; one whose files or options have changed since is refused unless with
-    `overwrite`. `master_key_file`: its key and the column `out` give each asset a key of its own
-    (`keyss.keys.master`). `ray`, `cores`: see `keyss.sweep`; the other arguments are those of `hide`. Raises
-    KeyssError and its children for what concerns all; the result has what concerns one asset.
+    Finished assets are skipped; those with changed files or options fail without `overwrite`.
+    `master_key_file`: derive each asset's key from this key and the column `out` (`keyss.keys.master`).
+    `ray`, `cores`: see `keyss.sweep`; the other arguments are those of `hide`. Raises KeyssError for errors
+    that concern all assets; the result has those of single assets.
     """
     master = None if master_key_file is None else Path(master_key_file).absolute()
     rows, out = read_rows(Path(manifest), master=master is not None), Path(out)
@@ -162,9 +162,9 @@ def hide_batch(
     for row in rows:
         name = row.pop("out")
         assets[out / name] = Asset(name=name, **{"key_file": str(master), **row, **common})
-    with claimed(out, mode=0o777):
+    with claim_folder(out, mode=0o777):
         if master is not None:
-            settle_master_key(out, master)
+            check_master_key(out, master)
         done = {place for place, asset in assets.items() if asset.is_done(place)}
         found = {place: Outcome(assets[place].name, place, skipped=True) for place in done}
         due = {place: asset for place, asset in assets.items() if place not in done}
@@ -179,7 +179,7 @@ def hide_batch(
 
 
 def _hide(asset: Asset, place: Path, reporter: Reporter, *, derived: bool, overwrite: bool) -> None:
-    """Hide, and write the record of the asset. `derived`: its key file has the master key."""
+    """Hide, and write the record of the asset. `derived`: its key file holds the master key."""
     key = read_key(Path(asset.key_file))
     key = MasterKey(key).key_of(asset.name) if derived else key
     if asset.secret_file is not None:
@@ -222,7 +222,7 @@ def _warn_of_covers(covers: Sequence[str]) -> None:
 
 
 def _summary(out: Path, outcomes: Sequence[Outcome]) -> bytes:
-    """A line for each asset: its state, and the published file with its checksum, or the error."""
+    """CSV with a row per asset: its state, and the published file with its checksum, or the error."""
     rows = []
     for each in outcomes:
         row = {"out": each.name, "state": "failed", "published": "", "sha256": "", "error": each.error or ""}

@@ -48,13 +48,13 @@ CELL, RESULT, RUN = "cell.json", "result.json", "run"
 
 @dataclass(frozen=True, kw_only=True)
 class Cell:
-    """A hiding, or without secrets a plain fit of the cover. Paths are absolute.
+    """A hiding or, without secrets, a plain fit of the cover. Paths are absolute.
 
-    A plain model may be that of another cell: its path is relative to the cell's folder.
+    Paths of plain models of other cells are relative to the cell's folder.
     """
 
     keyss: str = __version__
-    name: str  # for people
+    name: str  # display name
     cover: str  # a scene, or a model
     secrets: tuple[str, ...] = ()
     models: tuple[str | None, ...] = ()  # plain models of the cover and of each secret
@@ -70,9 +70,9 @@ class Cell:
 
     @property
     def identity(self) -> str:
-        """SHA-256 (hexadecimal) of the version of keyss, the options and the paths of all inputs.
+        """SHA-256 (hexadecimal) of the version of keyss, options and input paths.
 
-        Neither measures nor the master key count: they are not options of the run in the cell's folder.
+        Measures and the master key are not included, because the run does not depend on them.
         """
         same = replace(self, name="", measures=(), master_key_file=None)
         return hashlib.sha256(record_bytes(same)).hexdigest()
@@ -84,7 +84,7 @@ class Cell:
         return [Path(each).parts[1] for each in models]
 
     def is_stale(self, folder: Path) -> bool:
-        """True if its result is older than a file or folder that it reads, or its model has been removed."""
+        """True if the result is older than an input, or the model was removed."""
         models = [each for each in self.models if each and os.path.isabs(each)]
         inputs = [self.cover, *self.secrets, *models]
         gone = (folder / RESULT).exists() and model_in(folder / RUN) is None
@@ -97,21 +97,21 @@ class Result:
 
     version: int = 3
     keyss: str = __version__
-    seconds: float  # of the attempt that finished it
+    seconds: float  # duration of the attempt that finished it
     numbers: dict[str, float] = field(default_factory=dict)  # everything measured, by names with dots
     notes: dict[str, str] = field(default_factory=dict)  # on measures that were skipped or replaced
-    measures: tuple[str, ...] = ()  # of the cell's, those in `numbers`
+    measures: tuple[str, ...] = ()  # measures of the cell that are in `numbers`
 
 
 def earlier_result(cell: Cell, folder: Path) -> Result | None:
-    """The result in a cell's folder, which may lack measures; None without one, and if it is stale."""
+    """The result in a cell's folder, possibly without some measures; None if missing or stale."""
     if not (folder / RESULT).exists() or cell.is_stale(folder):
         return None
     return read_record(folder / RESULT, Result)
 
 
 def result_of(cell: Cell, folder: Path) -> Result | None:
-    """The result of a finished cell, with all its measures; None if it has to run."""
+    """The result of a finished cell with all measures; None if it has to run."""
     result = earlier_result(cell, folder)
     return result if result is not None and {*cell.measures} <= {*result.measures} else None
 
@@ -130,7 +130,7 @@ def run_cell(cell: Cell, folder: Path, reporter: Reporter) -> Result:
     if before is None:
         before = Result(seconds=0.0, numbers=(_hide if cell.secrets else _fit)(cell, folder, reporter))
     missing = [each for each in cell.measures if each not in before.measures]
-    measured = _measured(cell, missing, folder, reporter) if missing else {}
+    measured = _measure(cell, missing, folder, reporter) if missing else {}
     result = Result(
         seconds=round(time.monotonic() - start, 1),
         numbers=before.numbers | {name: each for name, each in measured.items() if not isinstance(each, str)},
@@ -149,13 +149,13 @@ def plan_of(cell: Cell, folder: Path) -> Plan:
     has_keys, count = registry.get(cell.method).capabilities.keys, len(cell.secrets)
     keys = [f"key {index}" if has_keys else "" for index in range(count)]
     found = hide(**_arguments(cell, folder, keys), dry_run=True).plan
-    assert found is not None  # of a dry run
+    assert found is not None  # a dry run always has a plan
     fits = {plain_stage(role_of(index, 1 + count)) for index, each in enumerate(cell.models) if each}
     return replace(found, stages=tuple(each for each in found.stages if each.name not in fits))
 
 
 def keys_of(cell: Cell, folder: Path) -> list[str]:
-    """A key for each secret, derived from the master key, or "" where the method has none."""
+    """A key per secret, derived from the master key, or "" if the method has no keys."""
     if not registry.get(cell.method).capabilities.keys or cell.master_key_file is None:
         return [""] * len(cell.secrets)
     master = MasterKey(read_key(Path(cell.master_key_file)))
@@ -163,7 +163,7 @@ def keys_of(cell: Cell, folder: Path) -> list[str]:
 
 
 def flat(record: Any, prefix: str = "") -> dict[str, float]:
-    """All finite numbers of a nested record, by names joined with dots."""
+    """All finite numbers of a nested record, by dotted names."""
     if isinstance(record, int | float) and not isinstance(record, bool) and isfinite(record):
         return {prefix: float(record)}
     pairs: list[tuple[Any, Any]] = []
@@ -203,7 +203,7 @@ def _hide(cell: Cell, folder: Path, reporter: Reporter) -> dict[str, float]:
 
 
 def _arguments(cell: Cell, folder: Path, keys: list[str]) -> dict[str, Any]:
-    """The arguments of `hide`; models that are not there yet are left out."""
+    """The arguments of `hide`, without models that do not exist yet."""
     places = [each and _place(folder, each) for each in cell.models or (None,) * (1 + len(cell.secrets))]
     cover, *models = (place if place and place.exists() else None for place in places)
     return {
@@ -222,8 +222,8 @@ def _place(folder: Path, path: str) -> Path:
     return Path(os.path.normpath(folder.absolute() / path))
 
 
-def _measured(cell: Cell, names: list[str], folder: Path, reporter: Reporter) -> dict[str, float | str]:
-    """The numbers of some measures, or notes on them."""
+def _measure(cell: Cell, names: list[str], folder: Path, reporter: Reporter) -> dict[str, float | str]:
+    """Numbers of measures, or notes on them."""
     keys, run = [key for key in keys_of(cell, folder) if key], folder / RUN
     found: dict[str, float | str] = {}
     if parts := [name for name in names if name in PARTS]:

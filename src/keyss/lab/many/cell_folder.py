@@ -15,7 +15,7 @@ from keyss.keys import MasterKey, generate_key, read_key
 from keyss.keys.key_file import KEY_LENGTH
 from keyss.lab.audits.comparison_measures import check_extras
 from keyss.lab.many.cell import RUN, Cell, plan_of, result_of, run_cell
-from keyss.lab.many.engine import claimed, engine
+from keyss.lab.many.engine import claim_folder, engine
 from keyss.lab.many.result_tables import CellNumbers
 from keyss.methods import MethodOptions, registry
 from keyss.methods.base import Plan
@@ -37,10 +37,10 @@ class Outcome:
     folder: Path
     result: Any = None
     error: str | None = None  # the reason for a missing result
-    skipped: bool = False  # was done before
+    skipped: bool = False  # True if it was finished before
 
     def row(self, labels: Mapping[str, Any], scenes: Sequence[str], seed: int) -> CellNumbers:
-        """The cell in tables, without numbers that differ from run to run or repeat arguments."""
+        """The cell for tables, without times and arguments."""
         numbers = {
             name: value
             for name, value in self.result.numbers.items()
@@ -58,20 +58,20 @@ class ManyResult:
 
     @property
     def errors(self) -> dict[str, str]:
-        """Of the runs that failed, by name."""
+        """Errors of failed runs, by name."""
         return {each.name: each.error for each in self.outcomes if each.error is not None}
 
 
 @dataclass(frozen=True)
 class Forecast:
-    """The cells of a folder before they run, in their order, by their folders."""
+    """The cells of a folder before they run, by their folders, in order."""
 
     names: Mapping[Path, str]
-    plans: Mapping[Path, Plan]  # of the cells to run
-    refused: Mapping[Path, str]  # why a cell cannot work
+    plans: Mapping[Path, Plan]  # cells to run
+    refused: Mapping[Path, str]  # reasons why cells cannot run
 
 
-def settle_master_key(out: Path, given: Path | None) -> None:
+def check_master_key(out: Path, given: Path | None) -> None:
     """Create a master key if none is given. Raises OutputError if existing results have another one."""
     own, kept = out / MASTER_KEY, out / _CHECK
     if given is None and not own.exists():
@@ -88,7 +88,7 @@ def settle_master_key(out: Path, given: Path | None) -> None:
 
 @dataclass
 class CellFolder:
-    """Cells by their folders in `out`; equal cells share one."""
+    """Cells by their folders in `out`; equal cells share a folder."""
 
     out: Path
     master_key_file: Path | None = None
@@ -96,7 +96,7 @@ class CellFolder:
     cells: dict[Path, Cell] = field(default_factory=dict)
 
     def plain(self, scene: str, config: FitConfig) -> str:
-        """Add the plain fit of a scene; its model, relative to the folder of another cell."""
+        """Add the plain fit of a scene; returns its model, relative to the folder of another cell."""
         name = f"plain model of {Path(scene).name}, {config.iterations:,} steps, seed {config.seed}"
         shared = {each: self.common[each] for each in ("views", "device")}
         return f"../{self._add(Cell(name=name, cover=scene, options=config, **shared)).name}/{RUN}/{MODEL}"
@@ -111,9 +111,9 @@ class CellFolder:
         measures: tuple[str, ...] = (),
         controls: Sequence[str] = (),
     ) -> Path:
-        """Add a hiding; its folder. `sources`: the cover, then the secrets.
+        """Add a hiding; returns its folder. `sources`: the cover, then the secrets.
 
-        Raises BackendError for measures that need packages which are not installed.
+        Raises BackendError if packages for the measures are not installed.
         """
         check_extras(measures)
         if models[0] is not None:  # a plain fit of the same folder
@@ -140,13 +140,13 @@ class CellFolder:
     def run(
         self, ray: str | None = None, cores: int = 1, reporter: Reporter | None = None
     ) -> dict[Path, Outcome]:
-        """Run all cells that are not done, plain fits first; outcomes by folder.
+        """Run all unfinished cells, plain fits first; returns outcomes by folder.
 
-        The arguments are those of `engine`. Raises KeyssError for what concerns all cells.
+        The arguments are those of `engine`. Raises KeyssError for errors that concern all cells.
         """
         found: dict[Path, Outcome] = {}
-        with claimed(self.out):
-            settle_master_key(self.out, self.master_key_file)
+        with claim_folder(self.out):
+            check_master_key(self.out, self.master_key_file)
             for folder, cell in self.cells.items():
                 if (result := result_of(cell, folder)) is not None:
                     found[folder] = Outcome(cell.name, folder, result, skipped=True)

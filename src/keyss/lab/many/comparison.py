@@ -1,4 +1,4 @@
-"""`compare`: methods side by side, on the same scenes and with the same budget, and their tables as text."""
+"""`compare`: methods on the same scenes with the same budget, and tables of the results."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from keyss.runs import write_record
 from keyss.runs.files import PathLike
 from keyss.runs.opening import HidingRun, open_run
 
-STEM = "comparison"  # of the names of its files
+STEM = "comparison"  # file names without their suffix
 MEASURES = ("files", "pictures", "secrecy", "survival")
 CONTROLS = (
     "control-1",
@@ -47,7 +47,7 @@ EVERY = tuple(
     for name in (each, *(f"{each}:{variant}" for variant in registry.get(each).options.variants()))
 )
 
-# Columns by their heads: %-formats of numbers by name. The first of which all numbers were measured counts.
+# %-formats of cells by column. The first one whose numbers were all measured is used.
 _FIDELITY = {
     "cover": ["%(cover.psnr).2f"],
     "SSIM": ["%(cover.ssim).3f"],
@@ -87,14 +87,14 @@ _SECRECY = {
 }
 _LEGEND = (
     "Test views: photos that were not trained on. Steps: those in which cover and secret were rendered, in "
-    "total. 3dgs is the bound: plain 3DGS of as many Gaussians and as many training steps. ms: the time of "
-    "a picture, and its ratio to that of plain 3DGS. Seconds: of hiding, after plain models.",
-    "Wrong keys: PSNR in dB of what they show against the cover, and at most against the secret; in brackets "
-    "that of the published model itself against the secret. Classifier and StegExpose: area under the ROC "
-    "curve against plain models of the cover from other seeds, 0.5 where they cannot be told apart. p: of "
-    "the file's least likely statistic beside those. In brackets the same of a plain model of the cover.",
-    "Pruned of a random quarter, converted and back, purified (as by GSPure): change of cover and secret in "
-    "dB. Lost: the secret no longer opens.",
+    "total. 3dgs is the upper bound: plain 3DGS with equal numbers of Gaussians and training steps. ms: time "
+    "per picture, and its ratio to that of plain 3DGS. Seconds: time of hiding, after plain models.",
+    "Wrong keys: mean PSNR in dB of their renders against the cover, and maximum against the secret; in "
+    "brackets, the published model itself against the secret. Classifier and StegExpose: area under the ROC "
+    "curve against plain models of the cover with other seeds; 0.5 if indistinguishable. p: minimum p-value "
+    "of the file's statistics against those models. In brackets: a plain model of the cover.",
+    "Pruned (a random quarter), converted and back, purified (GSPure): change of cover and secret in dB. "
+    "Lost: the secret no longer opens.",
 )
 OptionsT = TypeVar("OptionsT", bound=MethodOptions)
 
@@ -136,21 +136,20 @@ def compare(
 ) -> Comparison | Forecast:
     """Hide one scene in another by each of the `methods` (by default all), and tabulate the results.
 
-    A method is a name, METHOD:PRESET or METHOD:VARIANT; all have the given steps and Gaussians, else those of
-    the first one's preset. Plain models of both scenes are fitted once. Steps are counted for each scene in
-    total: a method that continues the training of a plain model starts with one of half as many steps. So
-    `3dgs` is the bound of all: plain 3DGS of as many Gaussians and as many training steps. With several
-    `seeds` numbers are means over them.
+    A method is a name, METHOD:PRESET or METHOD:VARIANT; all have the given steps and Gaussians, or those of
+    the first one's preset. Plain models of both scenes are fitted once. Steps are totals per scene: a method
+    that continues the training of a plain model starts with one of half the steps. Thus `3dgs` is an upper
+    bound for all: plain 3DGS with equal Gaussians and training steps. Numbers are means over `seeds`.
 
-    `out` (a folder) gets the cells, and `comparison.json`, `.md`, `.csv` and `.tex` (PSNR, SSIM and LPIPS, a
-    row for each scene, with standard deviations over seeds) and `.png` (a row for each method: cover, secret,
-    and the secret's error). Cells that are done are skipped. `dry_run`: only return their plans. A method
-    that fails has a row with the error. Raises UsageError, before anything is trained, for one of `methods`
-    that is not possible with these settings; KeyssError and its children; KeyboardInterrupt.
+    `out` (a folder) gets the cells, and `comparison.json`, `.md`, `.csv` and `.tex` (PSNR, SSIM and LPIPS per
+    scene, with standard deviations over seeds) and `.png` (a row per method: cover, secret, and the secret's
+    error). Finished cells are skipped. `dry_run`: only return their plans. A failed method has a row with the
+    error. Raises UsageError before training if one of `methods` is not possible with these settings, other
+    KeyssErrors, and KeyboardInterrupt.
     """
     if is_model(cover) or is_model(secret):
         raise UsageError("comparing takes scenes, folders of photos: models have none to compare with")
-    chosen = {name: _named(name) for name in methods or EVERY}
+    chosen = {name: _parse_method(name) for name in methods or EVERY}
     sizes = {"iterations": iterations, "max_gaussians": max_gaussians}
     given = {name: size for name, size in sizes.items() if size is not None}
     fit = replace(next(iter(chosen.values())).fit, seed=seeds[0], **given)
@@ -185,7 +184,7 @@ def compare(
     write_scene_tables(
         folder.out, STEM, [each.row({"method": name}, names, seed) for name, seed, each in done]
     )
-    runs = {name: _opened(folder, each[0]) for name, each in places.items() if outcomes[each[0]].result}
+    runs = {name: _open_run(folder, each[0]) for name, each in places.items() if outcomes[each[0]].result}
     if runs:
         picture = io.BytesIO()
         comparison_sheet(runs, device).save(picture, "PNG", optimize=True)
@@ -193,8 +192,8 @@ def compare(
     return found
 
 
-def within(iterations: int, options: OptionsT) -> tuple[OptionsT, list[int]]:
-    """Options, and steps of plain models of cover and secret: each scene has `iterations` in total."""
+def split_budget(iterations: int, options: OptionsT) -> tuple[OptionsT, list[int]]:
+    """Split total steps per scene: options, and steps of the plain models of cover and secret."""
     continues = [each.continues and each.steps > 0 for each in options.training(2)]
     plain = iterations - iterations // 2
     own = max(1, iterations // 2) if any(continues) else iterations
@@ -210,8 +209,8 @@ def _add(
     fit: FitConfig,
     controls: list[str],
 ) -> Path:
-    """Add a hiding and its plain fits; its folder."""
-    options, steps = within(fit.iterations, preset)
+    """Add a hiding and its plain fits; returns the folder of the hiding."""
+    options, steps = split_budget(fit.iterations, preset)
     options = options.with_fit(max_gaussians=fit.max_gaussians, seed=fit.seed)
     models = [
         folder.plain(scene, replace(fit, iterations=count, sh_degree=each.sh_degree))
@@ -221,7 +220,7 @@ def _add(
     return folder.hiding(name, scenes, options, models, measures=MEASURES, controls=controls)
 
 
-def _named(text: str) -> MethodOptions:
+def _parse_method(text: str) -> MethodOptions:
     """The options of METHOD, METHOD:PRESET or METHOD:VARIANT. Raises UsageError."""
     name, _, kind = text.partition(":")
     method = registry.get(name)
@@ -245,12 +244,12 @@ def _row(name: str, outcomes: Sequence[Outcome], folder: CellFolder) -> Compared
     return replace(row, numbers=numbers, notes=results[0].notes)
 
 
-def _opened(folder: CellFolder, place: Path) -> HidingRun:
+def _open_run(folder: CellFolder, place: Path) -> HidingRun:
     return open_run(place / RUN, [key for key in keys_of(folder.cells[place], place) if key])
 
 
 def comparison_sheet(runs: Mapping[str, HidingRun], device: Backend) -> Image.Image:
-    """A row for each method: cover, secret and its error (times 4) from the middle test camera."""
+    """A picture with a row per method: cover, secret and its error (times 4) from the middle test camera."""
     target = resolve_device(device)
     rows: dict[str, Sequence[Bytes]] = {}
     for name, run in runs.items():
@@ -268,10 +267,7 @@ def comparison_sheet(runs: Mapping[str, HidingRun], device: Backend) -> Image.Im
 
 
 def comparison_tables(found: Comparison) -> dict[str, list[list[str]]]:
-    """Rows of text by title, the heads first: fidelity and cost, secrecy and survival.
-
-    Methods that failed have no row.
-    """
+    """Rows of text by title, heads first: fidelity and cost, secrecy and survival; without failed methods."""
     rows = [each for each in found.methods if each.error is None]
     return {
         title: [
@@ -294,7 +290,7 @@ def _cell(row: ComparedMethod, head: str, formats: list[str]) -> str:
 
 
 def comparison_notes(comparison: Comparison) -> list[str]:
-    """Methods that failed, reasons to skip or replace a measure, and the legend: a line each."""
+    """Lines on failed methods and on skipped or replaced measures, and the legend."""
     failures = [f"{row.name}: not possible: {row.error}" for row in comparison.methods if row.error]
     reasons: dict[str, list[str]] = {}
     for row in comparison.methods:

@@ -1,7 +1,7 @@
-"""Where many runs happen: one after the other in this process, or at the same time on a Ray cluster.
+"""Engines for many runs: sequentially in this process, or in parallel on a Ray cluster.
 
-Folders and inputs must be reachable under the same paths from every node. Ray pickles tasks on their way
-between its own processes; no file of keyss is pickled.
+Every node must have folders and inputs under the same paths. Ray pickles tasks between its own processes;
+keyss writes no pickles.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from keyss.runs.folder import PRIVATE, check_not_published, make_private
 _LOCAL = "local"  # a cluster of this machine
 
 
-Tasks = Mapping[Path, Any]  # by their folders; each has a `name` and a `device`
+Tasks = Mapping[Path, Any]  # tasks by folder; each has a `name` and a `device`
 Work = Callable[[Any, Path, Reporter], Any]  # runs a task in a folder; returns its result
 Ended = tuple[Path, Any, str | None]  # folder of a task, its result, and an error
 Engine = Callable[[Work, Tasks], Iterator[Ended]]  # runs tasks, in any order
@@ -30,15 +30,15 @@ Engine = Callable[[Work, Tasks], Iterator[Ended]]  # runs tasks, in any order
 
 @contextmanager
 def engine(ray: str | None, cores: int, reporter: Reporter | None) -> Iterator[Engine]:
-    """An engine. Raises BackendError for a cluster that cannot be reached, UsageError.
+    """An engine. `ray`: HOST:PORT, ray://HOST:PORT, auto, or local for a cluster on this machine; None: here.
 
-    `ray`: HOST:PORT, ray://HOST:PORT, auto, or local for a cluster of this machine; None: this process.
-    `cores`: of each task on Ray. An error of one task does not stop the others.
+    `cores`: cores per task on Ray. An error of one task does not stop the others. Raises BackendError if the
+    cluster cannot be reached, UsageError.
     """
     if cores < 1:
         raise UsageError(f"`cores`: expected at least 1, got {cores}")
     reporter = reporter or default_reporter()
-    with nullcontext(partial(_here, reporter)) if ray is None else _cluster(ray, cores) as run:
+    with nullcontext(partial(_in_process, reporter)) if ray is None else _cluster(ray, cores) as run:
 
         def running(work: Work, tasks: Tasks) -> Iterator[Ended]:
             for number, (folder, result, error) in enumerate(run(work, tasks), start=1):
@@ -51,10 +51,10 @@ def engine(ray: str | None, cores: int, reporter: Reporter | None) -> Iterator[E
 
 
 @contextmanager
-def claimed(out: Path, mode: int = 0o700) -> Iterator[None]:
+def claim_folder(out: Path, mode: int = 0o700) -> Iterator[None]:
     """Create the folder if necessary, and lock it while the block runs.
 
-    Raises OutputError, also inside a folder to be published.
+    Raises OutputError, also for folders inside `publish/`.
     """
     check_not_published(out)
     try:
@@ -66,11 +66,11 @@ def claimed(out: Path, mode: int = 0o700) -> Iterator[None]:
         yield
 
 
-def _here(reporter: Reporter, work: Work, tasks: Tasks) -> Iterator[Ended]:
+def _in_process(reporter: Reporter, work: Work, tasks: Tasks) -> Iterator[Ended]:
     for folder, task in tasks.items():
         try:
             ended = _attempt(work, task, folder, reporter)
-        except Interrupted as error:  # which advises to resume a single run
+        except Interrupted as error:  # its message says how to resume a single run
             reporter.note("interrupted: the same command resumes")
             raise KeyboardInterrupt(*error.args) from error
         yield ended
@@ -82,14 +82,14 @@ def _attempt(work: Work, task: Any, folder: Path, reporter: Reporter | None = No
         return folder, work(task, folder, reporter or default_reporter()), None
     except (KeyssError, OSError) as error:
         return folder, None, str(error)
-    except Exception as error:  # such as of a GPU without memory
+    except Exception as error:  # e.g. a GPU out of memory
         traceback.print_exc()
         return folder, None, f"{type(error).__name__}: {error}"
 
 
 @contextmanager
 def _cluster(address: str, cores: int) -> Iterator[Engine]:
-    """Ray, which tries again where a process or a node is lost."""
+    """Ray, which retries tasks of lost processes and nodes."""
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     ray = import_extra("ray", "sweep", "run on a cluster")
     where = {"include_dashboard": False} if address == _LOCAL else {"address": address}

@@ -15,7 +15,7 @@ FIT, DESIGN = "fit", "design"  # prefixes: options of training, fields of a desi
 
 
 def known_changes(preset: MethodOptions) -> set[str]:
-    """The names that `with_changes` knows."""
+    """Names of options that `with_changes` accepts."""
     known = {each.name for each in fields(preset)} - {FIT}
     known |= {f"{FIT}.{each.name}" for each in fields(FitConfig) if each.name != "seed"}
     if isinstance(preset, KeyssOptions):

@@ -1,4 +1,4 @@
-"""The tables of the KeySS paper: runs, published figures and claims (`paper.toml`), and measured figures."""
+"""Tables of the KeySS paper: runs, published figures and claims (`paper.toml`), and measured figures."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from keyss.lab.many.result_tables import markdown_rows
 
 Group = tuple[str, ...]  # names of a cover and of its secrets
 Figure = float | tuple[float, ...]  # one number, or one for each published group
-Measured = Mapping[str, Mapping[str, float | None]]  # by run and measure
+Measured = Mapping[str, Mapping[str, float | None]]  # value by run and measure
 Verdict = Literal["holds", "holds in part", "does not hold here", "not measured"]
 
 _PART = re.compile(
@@ -26,7 +26,7 @@ _PART = re.compile(
 
 
 class Run(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A hiding with the paper's settings, except `changes` of the method's options."""
+    """A hiding with the paper's settings, except for `changes` of the method's options."""
 
     figures: dict[str, Figure] = {}  # published, by measure
     method: str = "keyss"
@@ -91,7 +91,7 @@ class JudgedClaim:
 
     text: str
     verdict: Verdict
-    parts: int  # that could be measured
+    parts: int  # parts that could be measured
     holding: int
 
 
@@ -118,9 +118,9 @@ def figure_rows(
 ) -> tuple[FigureRow, ...]:
     """Published figures beside measured ones, a row for each run.
 
-    `numbers`: by run, those of each group of scenes with a result. `count`: of groups; a figure that was not
-    measured on all of them is missing, as means over different ones do not compare. `covers`: of the
-    published groups that were run; without any, published figures are means over all.
+    `numbers`: by run, for each group of scenes with a result. `count`: number of groups; a figure must be
+    measured on all of them, because means over different groups are not comparable. `covers`: covers of the
+    published groups that were run; if empty, published figures are means over all.
     """
     rows = []
     for name, run in table.runs.items():
@@ -134,19 +134,19 @@ def figure_rows(
 
 
 def mean_figure(table: Table, figure: Figure, covers: Collection[str] = ()) -> float:
-    """A published figure as one number: the mean over the `covers` that it has, else over all."""
+    """The mean of a published figure over its `covers`, or over all groups if it has none of them."""
     if isinstance(figure, float):
         return figure
     by_cover = zip((cover for cover, *_ in table.groups), figure, strict=True)
     return fmean([value for cover, value in by_cover if cover in covers] or figure)
 
 
-def judged(claim: Claim, figures: Measured) -> JudgedClaim:
-    """A claim `holds` if all of its parts hold, and `holds in part` if at least half of them do.
+def judge_claim(claim: Claim, figures: Measured) -> JudgedClaim:
+    """Judge a claim: it `holds` if all of its parts hold, and `holds in part` if at least half of them do.
 
-    A part that lacks a figure does not count; without any part, the claim is `not measured`.
+    Parts without figures do not count; without any part, the claim is `not measured`.
     """
-    parts = [held for part in claim.parts for held in _held(part, figures) if held is not None]
+    parts = [held for part in claim.parts for held in _judge_part(part, figures) if held is not None]
     holding = sum(parts)
     verdict: Verdict = "does not hold here"
     if not parts:
@@ -156,8 +156,8 @@ def judged(claim: Claim, figures: Measured) -> JudgedClaim:
     return JudgedClaim(text=claim.text, verdict=verdict, parts=len(parts), holding=holding)
 
 
-def _held(part: str, figures: Measured) -> Iterator[bool | None]:
-    """Whether the part holds for each run that it compares with; None without a figure."""
+def _judge_part(part: str, figures: Measured) -> Iterator[bool | None]:
+    """True if the part holds, for each run that it compares with; None without a figure."""
     match = _PART.fullmatch(part)
     assert match is not None, part
     run, limit = match["run"], float(match["limit"])
@@ -172,7 +172,7 @@ def _held(part: str, figures: Measured) -> Iterator[bool | None]:
 
 
 def reproduction_rows(reproduction: Reproduction) -> list[list[str]]:
-    """Rows of text, the heads first: "published / here". A table of few runs is transposed."""
+    """Rows of text, heads first: "published / here". Tables with few runs are transposed."""
     measures = list(dict.fromkeys(measure for row in reproduction.rows for measure in row.here))
     table = [["published / here", *measures]]
     for row in reproduction.rows:
@@ -189,7 +189,7 @@ def reproduction_rows(reproduction: Reproduction) -> list[list[str]]:
 
 
 def reproduction_notes(reproduction: Reproduction) -> list[str]:
-    """A line for each claim and for each run that failed."""
+    """A line per claim and per failed run."""
     lines = [f"{each.verdict} ({each.holding} of {each.parts}): {each.text}" for each in reproduction.claims]
     return [*lines, *(f"failed: {name}: {error}" for name, error in reproduction.failures.items())]
 

@@ -1,4 +1,4 @@
-"""`reproduce`: a table of the paper, run again on its scenes or others, and shown beside its figures."""
+"""`reproduce`: run a table of the paper on its scenes or others, and compare the figures."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from keyss.files import write_bytes
 from keyss.files.benchmark_scenes import BENCHMARK, download_scenes, link_scene
 from keyss.lab.many.cell_folder import CellFolder, Forecast
 from keyss.lab.many.option_changes import with_changes
-from keyss.lab.many.paper import PAPER, Group, Reproduction, Run, figure_rows, judged, reproduction_text
+from keyss.lab.many.paper import PAPER, Group, Reproduction, Run, figure_rows, judge_claim, reproduction_text
 from keyss.lab.many.result_tables import write_scene_tables
 from keyss.methods import MethodOptions, registry
 from keyss.progress import Reporter
@@ -27,7 +27,7 @@ from keyss.runs import write_record
 from keyss.runs.files import PathLike
 
 SMALL = {"iterations": 1000, "max_gaussians": 9000, "width": 120}
-SSIM_WEIGHT = 0.5  # of the loss, for plain models too
+SSIM_WEIGHT = 0.5  # D-SSIM weight of the loss, also for plain models
 
 
 def reproduce(
@@ -48,16 +48,16 @@ def reproduce(
 ) -> Reproduction | Forecast:
     """Reproduce a table of the paper, one of `keyss.lab.many.paper.PAPER.tables`.
 
-    The `scenes` (folders of photos) hide each other, with 1,000 steps, 9,000 Gaussians and 120 pixels of
-    width unless others are given. With `data` they are the paper's in that folder, Mip-NeRF 360 and playroom
-    of Deep Blending, with its 30,000 steps and 500,000 Gaussians; `download` fetches those that are missing.
-    `pairs`: which hide which, as "COVER,SECRET" or "COVER,SECRET,SECRET" by the names of their folders; by
-    default each hides the next, and the paper's as published.
+    The `scenes` (folders of photos) hide each other, by default with 1,000 steps, 9,000 Gaussians and a width
+    of 120 pixels. `data`: a folder with the paper's scenes (Mip-NeRF 360, and playroom of Deep Blending), run
+    with the paper's 30,000 steps and 500,000 Gaussians; `download` fetches missing ones. `pairs`: covers and
+    secrets, as "COVER,SECRET" or "COVER,SECRET,SECRET" by the names of their folders; by default each scene
+    hides the next, and the paper's are paired as published.
 
-    `out` (a folder) gets `TABLE.json`, `.md`, `.csv` and `.tex` (PSNR, SSIM and LPIPS, a row for each scene,
-    with standard deviations over `seeds`), and the cells, which tables in one folder share. Cells that are
-    done are skipped. `dry_run`: only return their plans. The result lists runs that failed.
-    Raises KeyssError and its children for impossible scenes and arguments; KeyboardInterrupt.
+    `out` (a folder) gets `TABLE.json`, `.md`, `.csv` and `.tex` (PSNR, SSIM and LPIPS per scene, with
+    standard deviations over `seeds`), and the cells, which tables in one folder share. Finished cells are
+    skipped. `dry_run`: only return their plans. The result lists failed runs. Raises KeyssError for
+    impossible scenes and arguments; KeyboardInterrupt.
     """
     if table not in PAPER.tables:
         raise UsageError(f"no table is called {table!r}; {did_you_mean(table, PAPER.tables)}")
@@ -110,7 +110,7 @@ def reproduce(
         arguments={**sizes, "seeds": list(seeds)},
         pairs=tuple("-".join(group) for group in groups),
         rows=figures,
-        claims=tuple(judged(claim, measured) for claim in spec.claims),
+        claims=tuple(judge_claim(claim, measured) for claim in spec.claims),
         failures={each.name: each.error for each in outcomes.values() if each.error},
     )
     write_record(folder.out / f"{table}.json", reproduction)
@@ -122,7 +122,7 @@ def reproduce(
 
 
 def _options(run: Run) -> MethodOptions:
-    """The paper's settings, except the changes of the run."""
+    """The paper's settings with the changes of the run."""
     preset = registry.get(run.method).options.preset("full")
     design = {"design": "published"} if run.method == "keyss" else {}
     return with_changes(preset, {**design, **run.changes})
@@ -143,7 +143,7 @@ def _paths(scenes: Sequence[PathLike]) -> dict[str, str]:
 def groups_of(
     names: Sequence[str], secrets: int, pairs: Sequence[str], default: Sequence[Group] | None
 ) -> Sequence[Group]:
-    """Which scenes hide which; by default each hides the next ones, the last ones the first again.
+    """Groups of a cover and its secrets; by default each scene hides the next ones, cyclically.
 
     `pairs`: COVER,SECRET or COVER,SECRET,SECRET. Raises UsageError.
     """
@@ -166,12 +166,12 @@ def groups_of(
 
 def _numbers(numbers: Mapping[str, float]) -> dict[str, float]:
     """The numbers of a cell, by the names of the paper's figures."""
-    measures = ("pruning.", "rendering.", "sinkhorn.")  # whose numbers have the paper's names
+    measures = ("pruning.", "rendering.", "sinkhorn.")  # prefixes of numbers named after the paper's
     figures = {name.partition(".")[2]: value for name, value in numbers.items() if name.startswith(measures)}
     secrets = [value for name, value in numbers.items() if re.fullmatch(r"secrets\.\d+\.psnr", name)]
     figures |= {f"secret {number}": psnr for number, psnr in enumerate(secrets, start=1)}
     cover, secret = numbers["cover.psnr"], fmean(secrets)
     figures |= {"cover": cover, "secret": secret, "mean of both": (cover + secret) / 2}
-    # Through the decoder of the first secret.
+    # Wrong keys of the first secret's decoder.
     wrong = {"cover": "wrong_key.vs_cover.mean", "secret": "wrong_key.vs_secrets.1.mean"}
     return figures | {f"wrong key, {role}": numbers[name] for role, name in wrong.items() if name in numbers}

@@ -14,7 +14,7 @@ from typing import Any
 
 from keyss.files import write_bytes
 
-# Decimals and the better direction of what papers on 3DGS report.
+# Decimals and heads of the usual metrics.
 _METRICS = {
     "psnr": (2, "PSNR $\\uparrow$"),
     "ssim": (3, "SSIM $\\uparrow$"),
@@ -36,10 +36,7 @@ class CellNumbers:
 
 
 def summaries(cells: Iterable[CellNumbers]) -> list[dict[str, Any]]:
-    """A row for each measure of the cells that differ in their seeds only: mean and standard deviation.
-
-    In the order of the cells; measures by name.
-    """
+    """Rows of means and standard deviations over seeds, in the order of cells, then by measure."""
     rows = []
     for labels, group in _groups(cells):
         for measure in sorted({name for each in group for name in each.numbers}):
@@ -50,7 +47,7 @@ def summaries(cells: Iterable[CellNumbers]) -> list[dict[str, Any]]:
 
 
 def scene_rows(cells: Iterable[CellNumbers]) -> list[dict[str, Any]]:
-    """A row for each scene of the cells that differ in their seeds only: PSNR in dB, SSIM and LPIPS."""
+    """Rows of PSNR in dB, SSIM and LPIPS per scene: means and standard deviations over seeds."""
     rows = []
     for labels, group in _groups(cells):
         for index, scene in enumerate(group[0].scenes):
@@ -71,7 +68,7 @@ def mean_and_std(values: Sequence[float]) -> tuple[float, float]:
 
 
 def _groups(cells: Iterable[CellNumbers]) -> list[tuple[dict[str, str], list[CellNumbers]]]:
-    """Cells with the same labels, in their order; labels that only others have are empty."""
+    """Group cells by labels, in their order; missing labels are empty."""
     every = list(cells)
     blank = dict.fromkeys((name for cell in every for name in cell.labels), "")
     groups: dict[str, tuple[dict[str, str], list[CellNumbers]]] = {}
@@ -82,7 +79,7 @@ def _groups(cells: Iterable[CellNumbers]) -> list[tuple[dict[str, str], list[Cel
 
 
 def write_scene_tables(out: Path, stem: str, cells: Sequence[CellNumbers]) -> list[str]:
-    """`STEM.csv` and `STEM.tex`, with the rows of `scene_rows`; returns their names. Raises OutputError."""
+    """Write `scene_rows` to `STEM.csv` and `STEM.tex`; returns their names. Raises OutputError."""
     rows = scene_rows(cells)
     write_bytes(out / f"{stem}.csv", csv_bytes(rows))
     write_bytes(out / f"{stem}.tex", latex(rows).encode())
@@ -90,9 +87,9 @@ def write_scene_tables(out: Path, stem: str, cells: Sequence[CellNumbers]) -> li
 
 
 def write_sweep_tables(out: Path, cells: Sequence[CellNumbers]) -> list[str]:
-    """`results.csv` and `cells.csv` with all measures, and `scenes`; returns their names.
+    """Write `results.csv` and `cells.csv` with all measures, and `scenes`; returns their names.
 
-    Equal results are equal files. Raises OutputError.
+    Deterministic. Raises OutputError.
     """
     rows = [
         {**labels, "seed": cell.seed, "cell": cell.cell, "measure": measure, "value": value}
@@ -106,7 +103,7 @@ def write_sweep_tables(out: Path, cells: Sequence[CellNumbers]) -> list[str]:
 
 
 def latex(rows: Sequence[Mapping[str, Any]]) -> str:
-    """The rows of `scene_rows` as a tabular for the package booktabs: means, and known deviations."""
+    """The rows of `scene_rows` as a LaTeX table (booktabs): means and deviations."""
     texts = [name for name, value in rows[0].items() if isinstance(value, str)] if rows else []
     heads = [name.capitalize() for name in texts] + [head for _, head in _METRICS.values()]
     lines = [
@@ -127,14 +124,14 @@ def latex(rows: Sequence[Mapping[str, Any]]) -> str:
 
 
 def markdown_rows(rows: Sequence[Sequence[str]]) -> list[str]:
-    """Lines of a table in Markdown; the first row has the heads."""
+    """Lines of a Markdown table; the first row is the head."""
     lines = [" | ".join(cell.replace("|", "/") for cell in row) for row in rows]
     lines.insert(1, " | ".join("---" for _ in rows[0]))
     return [f"| {line} |" for line in lines]
 
 
 def csv_bytes(rows: Sequence[Mapping[str, Any]]) -> bytes:
-    """Rows by the names of columns, which are those of the first; NaN is empty."""
+    """Rows as CSV with the columns of the first row; NaN is empty."""
     text = io.StringIO()
     if rows:
         writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")

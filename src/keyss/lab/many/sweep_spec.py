@@ -1,6 +1,6 @@
-"""`sweep`: the cells of a specification, and the tables of their results.
+"""`sweep`: run the cells of a specification, and tabulate their results.
 
-The file of a sweep lists pairs, methods, options and seeds, as YAML:
+A specification is a YAML file with pairs, methods, options and seeds:
 
     pairs:
       - cover: scenes/bonsai
@@ -13,8 +13,8 @@ The file of a sweep lists pairs, methods, options and seeds, as YAML:
         grid: {design: [published, latent], fit.iterations: [500, 1000]}
     seeds: [0, 1, 2]
 
-Everything is checked before anything runs: names of fields, types, options of methods, and that files exist.
-Paths are relative to the folder of the file.
+Names of fields, types, options of methods and the existence of files are checked before anything runs. Paths
+are relative to the folder of the file.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ from keyss.progress import Reporter
 from keyss.rendering.orbit import is_model
 from keyss.runs.files import PathLike
 
-MAX_BYTES = 1 << 20  # of the file
+MAX_BYTES = 1 << 20  # size of the file
 _AT_LEAST_ONE = Meta(min_length=1)
 Row = tuple[dict[str, Any], list[str], int]  # labels, scenes and seed of a cell in tables
 
@@ -100,7 +100,7 @@ class SweepSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
 
 
 def read_spec(path: Path) -> SweepSpec:
-    """The sweep in a file, with absolute paths. Raises InputError, and BackendError without PyYAML."""
+    """Read a sweep; paths become absolute. Raises InputError, and BackendError without PyYAML."""
     yaml = import_extra("yaml", "sweep", "read sweeps")
     try:
         spec = msgspec.convert(yaml.safe_load(read_text(path, MAX_BYTES)), SweepSpec)
@@ -110,11 +110,11 @@ def read_spec(path: Path) -> SweepSpec:
         raise InputError(f"{path}: seeds: expected different ones, got one twice")
     names = {"pairs": [each.label for each in spec.pairs], "methods": [each.label for each in spec.methods]}
     for what, labels in names.items():
-        if same := [label for label in labels if labels.count(label) > 1]:  # tables would take them for one
+        if same := [label for label in labels if labels.count(label) > 1]:  # tables would merge them
             raise InputError(f"{path}: {what}: two have the name {same[0]!r}: give one another `name`")
     most = min(registry.get(entry.method).max_secrets for entry in spec.methods)
     pairs = tuple(
-        _checked(f"{path}: pairs[{index}]", path, pair, most) for index, pair in enumerate(spec.pairs)
+        _resolve_pair(f"{path}: pairs[{index}]", path, pair, most) for index, pair in enumerate(spec.pairs)
     )
     for _ in variants(path, spec):  # raises InputError
         pass
@@ -122,7 +122,7 @@ def read_spec(path: Path) -> SweepSpec:
 
 
 def variants(path: Path, spec: SweepSpec) -> Iterator[tuple[str, MethodOptions, dict[str, Any]]]:
-    """Every method with every combination of its grid: name in tables, options, and choices from the grid.
+    """Each method with each combination of its grid: name in tables, options, and choices from the grid.
 
     Raises InputError for invalid options.
     """
@@ -144,8 +144,8 @@ def variants(path: Path, spec: SweepSpec) -> Iterator[tuple[str, MethodOptions, 
             yield entry.label, options, choices
 
 
-def _checked(where: str, path: Path, pair: Pair, most: int) -> Pair:
-    """The pair with absolute paths. Raises InputError for a missing one, and for more secrets than `most`."""
+def _resolve_pair(where: str, path: Path, pair: Pair, most: int) -> Pair:
+    """Make paths absolute. Raises InputError for missing files, and for more secrets than `most`."""
     secrets, models = len(pair.secrets), len(pair.secret_models)
     if secrets > most:
         raise InputError(f"{where}.secrets: expected at most {most}, got {secrets}")
@@ -178,13 +178,12 @@ def sweep(
     dry_run: bool = False,
     reporter: Reporter | None = None,
 ) -> ManyResult | Forecast:
-    """Run all cells of a specification that are not done, and write the tables of all that are.
+    """Run all unfinished cells of a specification, and write tables of all results.
 
-    They run one after the other in this process, or with `ray` at the same time on a Ray cluster: its
-    address, or "local" for one of this machine; `cores`: of each cell there. `dry_run`: only return the plans
-    of the cells. Keys are derived from a master key and the cells' names: the one in `master_key_file`, or a
-    new one in the private part of `out`. Raises KeyssError and its children, and
-    KeyboardInterrupt; a cell that fails is in the result.
+    Cells run sequentially in this process, or in parallel on a Ray cluster. `ray`: its address, or "local"
+    for one on this machine; `cores`: cores per cell there. `dry_run`: only return the plans of the cells.
+    Keys are derived from a master key (in `master_key_file`, or a new one in the private part of `out`) and
+    the cells' names. Raises KeyssError and KeyboardInterrupt; the result has the errors of failed cells.
     """
     path = Path(spec)
     found = read_spec(path)
@@ -202,7 +201,7 @@ def sweep(
 
 
 def _add(path: Path, spec: SweepSpec, folder: CellFolder) -> dict[Path, Row]:
-    """Add all cells, in the order of pairs, methods, choices and seeds; what names each in tables.
+    """Add all cells, in the order of pairs, methods, choices and seeds; returns their rows of tables.
 
     Scenes without plain models share fits.
     """

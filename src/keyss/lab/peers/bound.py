@@ -1,4 +1,4 @@
-"""The bound: two plain 3DGS models (Kerbl et al. 2023), one published, one handed over. Nothing is hidden."""
+"""The upper bound: two plain 3DGS models (Kerbl et al. 2023), one published, one handed over."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ class BoundMethod(Peer):
     """See `keyss.methods.base.Method`."""
 
     def plan(self, sources: Sequence[Source], options: PeerOptions) -> Plan:
-        """Both models as they are."""
+        """Both models, unchanged."""
         fit = options.fit
         cover, secret = (fit.max_gaussians if each.given is None else len(each.given) for each in sources)
         degree = fit.sh_degree if sources[0].given is None else sources[0].given.sh_degree
         return Plan(gaussians=cover, sh_degree=degree, secret_gaussians=secret, capacity=secret)
 
     def hide(self, cover: Source, secrets: Sequence[Source], options: PeerOptions, context: Context) -> Stego:
-        """Hand the secret's model over."""
+        """Hand over the secret's model."""
         (secret,) = secrets
         return self.stego(cover.model, HandedTensors(vars(secret.model)))
 
 
 def _open(handed: HandedTensors) -> Show:
-    model = Gaussians(*handed.taken(_NAMES))
+    model = Gaussians(*handed.take(_NAMES))
     return lambda stego: model
 
 

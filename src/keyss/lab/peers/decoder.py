@@ -1,7 +1,7 @@
 """3DGS+Decoder: a network from the rendered cover to the secret (a baseline of GS-Hider and KeySS).
 
-The published model is a 3DGS model of the cover, trained together with a network that turns its renders into
-the secret's pictures. The network is handed over; it is as large as one of GS-Hider's decoders.
+The published model is a 3DGS model of the cover, trained jointly with a network that maps its renders to the
+secret's images. The network is handed over; it has the size of one of GS-Hider's decoders.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ WIDTH, LAYERS = 64, 5
 
 
 class Convolutions(torch.nn.Module):
-    """A network from images with so many channels to RGB."""
+    """Convolutions from images with `channels` to RGB."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -50,9 +50,9 @@ def network_tensors(network: PictureNetwork) -> dict[str, Tensor]:
 
 
 def network_of(handed: HandedTensors) -> PictureNetwork:
-    """The network of `network_tensors`. Raises InputError, ValueError and TypeError for damage."""
+    """Read a network from `network_tensors`. Raises InputError, ValueError and TypeError for damage."""
     names = [f"{kind}.{index}" for index in range(LAYERS) for kind in ("weight", "bias")]
-    background, *rest = handed.taken(["background", *names])
+    background, *rest = handed.take(["background", *names])
     return PictureNetwork(tuple(zip(rest[::2], rest[1::2], strict=True)), background)
 
 
@@ -64,7 +64,7 @@ class DecoderTraining(PeerTraining):
         self.networks.append(self.network)
 
     def draw(self, scenes: Sequence[int], camera: Camera, sh_degree: int) -> list[Picture]:
-        """The cover is rendered with its background; the network turns that into the secret's image."""
+        """Render the cover with its background; the network maps the render to the secret's image."""
         cover = self.render(to_gaussians(self.parameters), 0, camera, sh_degree)
         network = self.network.network(self.backgrounds[0])
         return [

@@ -1,8 +1,7 @@
 """GS-Hider (Zhang et al., NeurIPS 2024): coupled features in place of harmonics, and two networks.
 
-The Gaussians' 16 features are rendered like colours. A scene decoder, which is published with them, turns the
-rendered features into the cover's picture, and a message decoder, which is handed over, into the secret's. No
-viewer of 3DGS models shows either.
+The Gaussians' 16 features are rendered like colours. A published scene decoder maps rendered features to the
+cover's image, a handed-over message decoder to the secret's. Viewers of 3DGS models show neither.
 """
 
 from __future__ import annotations
@@ -34,7 +33,7 @@ class GsHiderTraining(PeerTraining):
         del self.parameters["sh"], self.optimizers["sh"]
         noise = _NOISE * torch.randn(len(start), FEATURES - 3)
         self.add("features", torch.cat([SH_C0 * start.sh[:, 0], noise], 1), self.options.fit.sh0_rate)
-        self.decoders = (Convolutions(FEATURES), Convolutions(FEATURES))  # of the scene, of the message
+        self.decoders = (Convolutions(FEATURES), Convolutions(FEATURES))  # scene, message
         self.networks.extend(self.decoders)
 
     def draw(self, scenes: Sequence[int], camera: Camera, sh_degree: int) -> list[Picture]:
@@ -45,7 +44,7 @@ class GsHiderTraining(PeerTraining):
         return [Picture(decode_picture(image, network), meta) for network in networks]
 
     def gaussians(self) -> Gaussians:
-        """[N] without colours."""
+        """The Gaussians, without colours."""
         own = self.parameters
         sh = torch.zeros(len(self), 1, 3, device=self.device)
         return Gaussians(own["means"], own["quats"], own["scales"], own["opacities"], sh)

@@ -1,4 +1,4 @@
-"""The common part of the peers: one secret, one joint training, one file that is handed over."""
+"""The common part of the baselines: one secret, one joint training, one handed-over file."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from keyss.methods.base import Capabilities, Context, Plan, Source, Stego
 from keyss.methods.keyss.combined import PlacedScene
 from keyss.methods.keyss.training import KeyssTraining, Picture
 from keyss.methods.opened import Frame, Remains
-from keyss.methods.tensors import Header, damage_refused, pack_tensors, unpack_tensors
+from keyss.methods.tensors import Header, pack_tensors, refuse_damage, unpack_tensors
 
 FORMAT, VERSION = "keyss-peer", 1
 DAMAGED = "what was handed over is damaged"
@@ -35,30 +35,30 @@ class _Header(Header):
 
 @dataclass(frozen=True)
 class HandedTensors:
-    """Tensors to hand over, and where the secret is in the cover's frame."""
+    """Tensors to hand over, and the placement of the secret in the cover's frame."""
 
     tensors: Mapping[str, Tensor]  # float32 or uint8
-    frame: Similarity | None = None  # from the secret's into the cover's; None: never placed there
-    rows: int | None = None  # Gaussians of the published model, if they are needed in their order
+    frame: Similarity | None = None  # secret frame to cover frame; None: never placed there
+    rows: int | None = None  # Gaussians of the published model, if their order matters
 
     def payload(self, method: str) -> Payload:
-        """The file of the method of that name."""
+        """The file to hand over; `method`: name of the method."""
         header = _Header(FORMAT, VERSION, self.rows, self.frame)
         return Payload(method, pack_tensors(self.tensors, header))
 
     @staticmethod
     def of(content: Content) -> HandedTensors:
-        """The tensors of `payload`. Raises InputError for anything else."""
-        with damage_refused(DAMAGED):
+        """Read a payload. Raises InputError for other content."""
+        with refuse_damage(DAMAGED):
             if not isinstance(content, Payload):
                 raise ValueError("expected one string of bytes, got records")
             header, tensors = unpack_tensors(content.data, _Header, FORMAT, VERSION)
         return HandedTensors(tensors, header.frame, header.rows)
 
-    def taken(self, names: Iterable[str], *, of_bytes: Collection[str] = ()) -> list[Tensor]:
-        """The tensors of these names: uint8 those `of_bytes`, else float32.
+    def take(self, names: Iterable[str], *, of_bytes: Collection[str] = ()) -> list[Tensor]:
+        """The tensors of these names: uint8 for those in `of_bytes`, else float32.
 
-        Raises InputError for other types, and if there are more or fewer.
+        Raises InputError for other types, and for missing or further tensors.
         """
         expected = {name: torch.uint8 if name in of_bytes else torch.float32 for name in names}
         if expected != {name: value.dtype for name, value in self.tensors.items()}:
@@ -67,7 +67,7 @@ class HandedTensors:
         return [self.tensors[name] for name in expected]
 
 
-Show = Callable[[Gaussians], Gaussians]  # from a model on the CPU, in the cover's frame; raises ValueError
+Show = Callable[[Gaussians], Gaussians]  # takes a model on the CPU in the cover's frame; raises ValueError
 
 
 @dataclass(frozen=True)
@@ -93,14 +93,14 @@ class HandedSecret:
             )
         if frame == "cover" and self.frame is None:
             raise UsageError('this secret never was in the cover\'s frame: leave out `frame="cover"`')
-        with damage_refused("what was handed over does not fit"):
+        with refuse_damage("what was handed over does not fit"):
             shown = self.show(stego.detach().to("cpu"))
         if self.frame is None or frame == "cover":
             return shown
         return self.frame.inverse().apply_gaussians(shown)
 
     def remains(self, revealed: Gaussians) -> Remains:
-        """All of the secret: damage reveals nothing."""
+        """A handed-over secret is complete or does not open."""
         return Remains(len(revealed), len(revealed))
 
     def fingerprint(self) -> str:
@@ -108,7 +108,7 @@ class HandedSecret:
 
 
 class PeerTraining(KeyssTraining):
-    """The joint training of a peer: `prepare` adds what it trains, `draw` renders scenes."""
+    """The joint training of a baseline: `prepare` adds parameters and networks, `draw` renders scenes."""
 
     options: PeerOptions
 
@@ -121,7 +121,7 @@ class PeerTraining(KeyssTraining):
 
     @abstractmethod
     def draw(self, scenes: Sequence[int], camera: Camera, sh_degree: int) -> list[Picture]:
-        """Render some scenes, in that order; they may share a render."""
+        """Render scenes in the given order; they may share a render."""
 
     @abstractmethod
     def result(self) -> tuple[Gaussians, HandedTensors]:
@@ -140,28 +140,28 @@ class PeerTraining(KeyssTraining):
             )
 
     def opacity_for_pruning(self) -> Tensor:
-        """[N] how visible each Gaussian is in the scene that shows it most."""
+        """[N] maximum opacity over the scenes."""
         return self.parameters["opacities"].detach().sigmoid()
 
     @property
     def frame(self) -> Similarity:
-        """From the secret's own frame into the cover's."""
+        """Secret frame to cover frame."""
         return self.scenes[1].frame
 
     def visible(self) -> Tensor:
-        """[N] which Gaussians have an opacity above the limit of pruning; all if none has."""
+        """[N] True for Gaussians above the opacity limit of pruning; all True if none is."""
         visible = self.opacity_for_pruning() >= self.options.fit.prune_opacity
         return visible if bool(visible.any()) else torch.ones_like(visible)
 
 
 @dataclass(frozen=True)
 class Peer:
-    """A `Method` with a joint training, one secret, and one file that is handed over for it."""
+    """A `Method` with a joint training, one secret and one handed-over file."""
 
     options: type[PeerOptions]
     capabilities: Capabilities
     open: Callable[[HandedTensors], Show]  # raises InputError and ValueError for damage
-    training: type[PeerTraining] | None = None  # None: `hide` is another
+    training: type[PeerTraining] | None = None  # None: a subclass overrides `hide`
     max_secrets: int = 1
 
     @property
@@ -169,15 +169,15 @@ class Peer:
         return self.options.method
 
     def prepare(self, sources: Sequence[Source], options: PeerOptions) -> PeerOptions:
-        """Accepts all scenes."""
+        """Accept all scenes."""
         return options
 
     def plan(self, sources: Sequence[Source], options: PeerOptions) -> Plan:
-        """Both scenes share as many Gaussians as a plain model has."""
+        """Both scenes share the Gaussians of one model."""
         return options.joint_plan(1)
 
     def hide(self, cover: Source, secrets: Sequence[Source], options: PeerOptions, context: Context) -> Stego:
-        """Train both scenes together. Raises Interrupted, and InputError for another run's checkpoint."""
+        """Train both scenes jointly. Raises Interrupted, and InputError for another run's checkpoint."""
         training = self.training
         assert training is not None
         sources = [cover, *secrets]
@@ -186,12 +186,12 @@ class Peer:
         return self.stego(*run.result(), run.iterations)
 
     def stego(self, published: Gaussians, handed: HandedTensors, iterations: int = 0) -> Stego:
-        """The result of hiding, opened from the payload that is handed over."""
+        """The result of hiding, opened from the handed-over payload."""
         payload = handed.payload(self.name)
         return Stego(published, (self.unpack(payload),), iterations, handed=(payload,))
 
     def unpack(self, content: Content) -> HandedSecret:
         """The secret of a handed-over file. Raises InputError for damage."""
         handed = HandedTensors.of(content)
-        with damage_refused(DAMAGED):
+        with refuse_damage(DAMAGED):
             return HandedSecret(handed, self.open(handed))

@@ -1,4 +1,4 @@
-"""The options of the peers."""
+"""Options of the baselines."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from keyss.methods.keyss.options import DecoderShape, Design, Scenes
 
 @dataclass(frozen=True, kw_only=True)
 class PeerOptions(MethodOptions):
-    """Options of all peers: the joint training is as long and has as many Gaussians as plain models.
+    """Options of all baselines: joint training has the steps and Gaussians of plain models.
 
-    It combines poses, points and densification as KeySS's does. Each peer has its own class, by which its
-    options are recognised.
+    It combines poses, points and densification like KeySS's. Each baseline has its own class, which
+    identifies it.
     """
 
     points: ClassVar[Scenes] = "both"  # scenes whose sparse points start the model
@@ -27,7 +27,7 @@ class PeerOptions(MethodOptions):
             metavar="SHARE",
         ),
     ] = 1.0
-    network_rate: float = 1e-3  # of Adam, decays to 5 % of it
+    network_rate: float = 1e-3  # Adam; decays to 5 %
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -37,7 +37,7 @@ class PeerOptions(MethodOptions):
 
     @property
     def design(self) -> Design:
-        """The configuration of the joint training, which has no decoder of Gaussians and no keys."""
+        """The configuration of the joint training, without a decoder of Gaussians and keys."""
         return Design(
             name=self.method,
             decoder=DecoderShape(),

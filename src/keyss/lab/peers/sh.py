@@ -1,7 +1,7 @@
 """3DGS+SH: a second set of harmonics on the same Gaussians (a baseline of GS-Hider, 2024, and KeySS).
 
-The published model is a 3DGS model of the cover. The secret's harmonics are handed over: with them in place
-of its own, the published model shows the secret.
+The published model is a 3DGS model of the cover. The secret's harmonics are handed over; they replace its own
+to show the secret.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ class ShTraining(PeerTraining):
     """The training of two sets of harmonics; everything else is shared."""
 
     def prepare(self, start: Gaussians) -> None:
-        """Both start equal: every point has the colour of its own scene."""
+        """Both sets start equal: every point has the colour of its own scene."""
         optimizer = make_optimizers(self.parameters, self.options.fit, self.extent)["sh"]
         self.add(_NAMES[1], start.sh.clone(), optimizer)
 
@@ -40,7 +40,7 @@ class ShTraining(PeerTraining):
 
 
 def _open(handed: HandedTensors) -> Show:
-    (sh,) = handed.taken([_NAMES[1]])
+    (sh,) = handed.take([_NAMES[1]])
     return lambda stego: replace(stego, sh=sh)
 
 

@@ -1,14 +1,14 @@
 """Splats in Splats, also WaterGS (Guo et al. 2024): harmonics in the low bits of harmonics, mapped opacities.
 
-Both scenes share positions, scales and rotations. The secret's harmonics lie encrypted in the low bits of the
-cover's, and a small convolutional autoencoder maps the cover's opacities to its own. The published file is a
-3DGS model; the autoencoder and the cipher's key are handed over, sealed with the secret's key.
+Both scenes share positions, scales and rotations. The secret's harmonics are encrypted in the low bits of the
+cover's, and a small convolutional autoencoder maps the cover's opacities to the secret's. The published file
+is a 3DGS model; the autoencoder and the cipher's key are handed over, encrypted with the secret's key.
 
-The paper leaves open how many bits there are and when the autoencoder is trained. Here:
+The paper does not specify the number of bits and when the autoencoder is trained. Here:
 
-- Bits are graded by importance on both sides: the secret's constant coefficients get the most bits and degree
-  3 the fewest, and the most important bits are stored where they cost the cover least, at the bottom of its
-  highest degrees.
+- Bits are graded by importance: the secret's constant coefficients get the most bits and degree 3 the fewest,
+  and the most important bits are stored where they cost the cover least, in the lowest bits of its highest
+  degrees.
 - When growth stops, the Gaussians are sorted along a Morton curve, so that neighbours in the list are
   neighbours in space. The autoencoder is fitted to the secret's opacities and replaces them for the rest of
   the training, in which everything else adapts to it.
@@ -40,17 +40,17 @@ from keyss.lab.peers.options import WaterGsOptions
 from keyss.methods.base import Capabilities
 from keyss.methods.keyss.training import Picture
 
-COVER_BITS = (8, 10, 12, 14)  # low bits in use, of the 23 of a mantissa, by degree
-SECRET_BITS = (16, 13, 11, 10)  # of a coefficient if there is room for all, by degree
-WIDTHS, KERNEL = (1, 16, 32, 16, 1), 9  # of the autoencoder, along the list of Gaussians
-_FIT_STEPS = 200  # that fit the autoencoder to the secret's own opacities
-_RANGE = 0.999  # quantile of the coefficients above degree 0 at which they are clipped
-_BLOCK = 1 << 14  # Gaussians at a time
+COVER_BITS = (8, 10, 12, 14)  # low bits in use by degree; a mantissa has 23
+SECRET_BITS = (16, 13, 11, 10)  # bits per coefficient by degree, if all secrets fit
+WIDTHS, KERNEL = (1, 16, 32, 16, 1), 9  # autoencoder: channels, and kernel size along the list of Gaussians
+_FIT_STEPS = 200  # steps that fit the autoencoder to the secret's own opacities
+_RANGE = 0.999  # coefficients above degree 0 are clipped at this quantile
+_BLOCK = 1 << 14  # Gaussians per block
 _CIPHER_BYTES = 32
 
 
 def graded_bits(degree: int) -> tuple[int, ...]:
-    """Bits of a secret's coefficients by degree, in a model of SH `degree`: as many as have room."""
+    """Maximum bits of a secret's coefficients by degree, in a model of SH `degree`."""
     room = sum((2 * each + 1) * COVER_BITS[each] for each in range(degree + 1))
     candidates = (
         [max(0, bits - less) for bits in SECRET_BITS[: degree + 1]] for less in range(SECRET_BITS[0])
@@ -62,14 +62,14 @@ def graded_bits(degree: int) -> tuple[int, ...]:
 
 @cache
 def _places(degree: int) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
-    """(coefficient, bit) of the secret's bits, the most important first, and of the cover's bits for them.
+    """(coefficient, bit) of the secret's bits, most important first, and of the cover's bits for them.
 
-    The cover has more. Bit 0 is the lowest.
+    The cover has more bits. Bit 0 is the lowest.
     """
     degrees = [math.isqrt(index) for index in range((degree + 1) ** 2)]
     sizes = graded_bits(degree)
     secret = [(index, bit) for index, each in enumerate(degrees) for bit in range(sizes[each])]
-    # The most important bits are the high ones, and among these those of low degrees.
+    # Importance: high bits first, then low degrees.
     secret.sort(key=lambda place: (sizes[degrees[place[0]]] - place[1], degrees[place[0]]))
     cover = [(index, bit) for index, each in enumerate(degrees) for bit in range(COVER_BITS[each])]
     cover.sort(key=lambda place: (place[1], -degrees[place[0]]))
@@ -77,7 +77,7 @@ def _places(degree: int) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
 
 
 def ranges_of(sh: Tensor) -> Tensor:
-    """[degree + 1] the largest magnitudes of the coefficients of each degree that are not clipped."""
+    """[degree + 1] magnitudes at which the coefficients of each degree are clipped."""
     found = []
     for degree in range(math.isqrt(sh.shape[1])):
         values = sh[:, degree**2 : (degree + 1) ** 2].abs().flatten().double().numpy()
@@ -86,7 +86,7 @@ def ranges_of(sh: Tensor) -> Tensor:
 
 
 def write_bits(cover: Tensor, secret: Tensor, ranges: Tensor, cipher: bytes) -> Tensor:
-    """`cover` [N, K, 3] with `secret` [N, K, 3] in its low bits, which all look random."""
+    """Encrypt `secret` [N, K, 3] in the low bits of `cover` [N, K, 3], all of which become random."""
     degree = math.isqrt(cover.shape[1]) - 1
     sizes, (places, homes) = graded_bits(degree), _places(degree)
     words = cover.contiguous().numpy().view(np.uint32).copy()
@@ -102,7 +102,7 @@ def write_bits(cover: Tensor, secret: Tensor, ranges: Tensor, cipher: bytes) -> 
 
 
 def read_bits(stego: Tensor, ranges: Tensor, cipher: bytes) -> Tensor:
-    """The secret [N, K, 3] of `write_bits`, rounded."""
+    """Decrypt the secret [N, K, 3] of `write_bits`, with quantised coefficients."""
     degree = math.isqrt(stego.shape[1]) - 1
     sizes, (places, homes) = graded_bits(degree), _places(degree)
     words = stego.contiguous().numpy().view(np.uint32)
@@ -131,7 +131,7 @@ def _codes(secret: Tensor, ranges: Tensor, sizes: Sequence[int]) -> Words32:
 
 
 def _blocks(count: int, places: int, cipher: bytes) -> Iterator[tuple[slice, Bits]]:
-    """Slices of the Gaussians, and for each slice its key stream, bits [n, places, 3]."""
+    """Slices of the Gaussians and their key streams, bits [n, places, 3]."""
     for number, start in enumerate(range(0, count, _BLOCK)):
         shape = (min(_BLOCK, count - start), places, 3)
         data = np.frombuffer(stream(cipher, f"watergs/{number}", -(-math.prod(shape) // 8)), np.uint8)
@@ -155,7 +155,7 @@ class OpacityMapping(torch.nn.Module):
 
 
 class WaterGsTraining(PeerTraining):
-    """The training of two sets of harmonics and of opacities; the second opacities are mapped in the end."""
+    """Training of two sets of harmonics and opacities; the second opacities become mapped ones."""
 
     def prepare(self, start: Gaussians) -> None:
         optimizer = make_optimizers(self.parameters, self.options.fit, self.extent)["sh"]
@@ -165,14 +165,14 @@ class WaterGsTraining(PeerTraining):
         self.networks.append(self.mapping)
 
     @property
-    def mapped(self) -> bool:
+    def is_mapped(self) -> bool:
         """True once the autoencoder has replaced free opacities."""
         return self.iteration >= int(self.strategy.refine_stop_iter)
 
     def step(self) -> None:
-        before = self.mapped
+        before = self.is_mapped
         super().step()
-        if self.mapped and not before:
+        if self.is_mapped and not before:
             self._sort()
             self._fit_mapping()
 
@@ -186,14 +186,14 @@ class WaterGsTraining(PeerTraining):
             model = to_gaussians(self.parameters)
             if scene:
                 free = self.parameters["secret_opacities"]
-                logits = self.mapping(model.opacity_logits) if self.mapped else free
+                logits = self.mapping(model.opacity_logits) if self.is_mapped else free
                 model = replace(model, opacity_logits=logits, sh=self.parameters["secret_sh"])
             pictures.append(self.render(model, scene, camera, sh_degree))
         return pictures
 
     @torch.no_grad()
     def _sort(self) -> None:
-        """Sort the Gaussians as they are published; the autoencoder depends on their order."""
+        """Sort the Gaussians along a Morton curve; the autoencoder depends on their order."""
         means = self.parameters["means"]
         order = torch.from_numpy(morton_order(means.detach().cpu().numpy())).to(means.device)
         for name, parameter in self.parameters.items():
@@ -202,7 +202,7 @@ class WaterGsTraining(PeerTraining):
                     values.copy_(values[order])
 
     def _fit_mapping(self) -> None:
-        """Fit by cross entropy: squared errors have almost no gradient where opacities are nearly 0 or 1."""
+        """Fit by cross entropy: squared errors have vanishing gradients for opacities near 0 or 1."""
         logits = self.parameters["opacities"].detach()
         target = self.parameters["secret_opacities"].detach().sigmoid()
         adam = torch.optim.Adam(self.mapping.parameters(), lr=5 * self.options.network_rate)
@@ -213,7 +213,7 @@ class WaterGsTraining(PeerTraining):
         adam.zero_grad()
 
     def result(self) -> tuple[Gaussians, HandedTensors]:
-        """Publishes all Gaussians, because the autoencoder depends on their order."""
+        """Publish all Gaussians, because the autoencoder depends on their order."""
         cover = to_gaussians(self.parameters).detach().to("cpu")
         secret_sh = self.parameters["secret_sh"].detach().cpu()
         ranges, cipher = ranges_of(secret_sh), os.urandom(_CIPHER_BYTES)
@@ -226,7 +226,7 @@ class WaterGsTraining(PeerTraining):
 def _open(handed: HandedTensors) -> Show:
     mapping = OpacityMapping().requires_grad_(False)
     names = [f"mapping.{name}" for name in mapping.state_dict()]
-    *weights, ranges, numbers = handed.taken([*names, "ranges", "cipher"], of_bytes=["cipher"])
+    *weights, ranges, numbers = handed.take([*names, "ranges", "cipher"], of_bytes=["cipher"])
     mapping.load_state_dict(dict(zip(mapping.state_dict(), weights, strict=True)))
     if numbers.shape != (_CIPHER_BYTES,) or ranges.dim() != 1:
         raise ValueError("no such cipher")

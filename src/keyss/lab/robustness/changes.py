@@ -1,6 +1,6 @@
-"""Changes of a published model: accidents that files meet, and attacks with photos of the cover.
+"""Changes of a published model: accidents, and attacks with photos of the cover.
 
-Each is a pure function from `Gaussians` to `Gaussians`; all randomness follows from its seed.
+Each is a pure function from `Gaussians` to `Gaussians`, deterministic in its seed.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class Change:
 
     attack: str  # changes of one attack differ in strength only
     strength: float
-    unit: str  # of the strength
+    unit: str  # unit of `strength`
     sentence: str  # what it does, for the report
     apply: Callable[[Gaussians], Gaussians]
 
@@ -61,7 +61,7 @@ def opacity_pruning(share: float) -> Change:
 
 
 def _pruning(attack: str, share: float, sentence: str, order: Callable[[Gaussians], Tensor]) -> Change:
-    """Remove the first `share` of the Gaussians in an order; at least one stays."""
+    """Remove the first `share` of the Gaussians in an order, but never all."""
     if not 0 <= share < 1:
         raise UsageError(f"pruning: expected a share of 0 or more and less than 1, got {share}")
 
@@ -138,19 +138,19 @@ def fine_tuning(cover: Scene, steps: int = 500, seed: int = 0) -> Change:
     """Continue training on the cover's photos, as plain 3DGS without density control."""
     sentence = f"Training continues on the cover's photos for {steps} steps."
     return Change(
-        "fine-tuning", steps, "steps", sentence, partial(refined, scene=cover, steps=steps, seed=seed)
+        "fine-tuning", steps, "steps", sentence, partial(fine_tune, scene=cover, steps=steps, seed=seed)
     )
 
 
 def purification(cover: Scene, given_up: float = 0.0, steps: int = 300, seed: int = 0) -> Change:
     """Prune the Gaussians that the cover's training views do not use, then train.
 
-    Follows GSPure (arXiv 2511.22262), which prunes by the same weights, but clusters them. `given_up`: see
-    `unused`.
+    Follows GSPure (arXiv 2511.22262), which prunes by clusters of the same weights. `given_up`: see
+    `find_unused`.
     """
 
     def apply(model: Gaussians) -> Gaussians:
-        return refined(model[~unused(model, cover, given_up)], cover, steps, seed)
+        return fine_tune(model[~find_unused(model, cover, given_up)], cover, steps, seed)
 
     sentence = (
         "Gaussians that the cover's photos do not use are removed"
@@ -160,11 +160,10 @@ def purification(cover: Scene, given_up: float = 0.0, steps: int = 300, seed: in
     return Change("purification", given_up, "share of the blending weight given up", sentence, apply)
 
 
-def unused(model: Gaussians, cover: Scene, given_up: float = 0.0) -> Tensor:
+def find_unused(model: Gaussians, cover: Scene, given_up: float = 0.0) -> Tensor:
     """[N] True for the Gaussians that contribute least to the training views, but never for all.
 
-    Their share of the blending weights, summed over pixels and views, is at most `given_up`; with 0 they
-    contribute nothing.
+    `given_up`: maximum share of their blending weights, summed over pixels and views.
     """
     weights = contributions(model, [view.camera for view in subsample_views(cover.train, VIEWS)]).double()
     ascending, order = weights.sort(stable=True)
@@ -173,8 +172,8 @@ def unused(model: Gaussians, cover: Scene, given_up: float = 0.0) -> Tensor:
     return torch.zeros_like(chosen).index_put((order,), chosen)
 
 
-def refined(model: Gaussians, scene: Scene, steps: int, seed: int = 0) -> Gaussians:
-    """`model` after `steps` steps of plain 3DGS on the training views, at the rates of such a run."""
+def fine_tune(model: Gaussians, scene: Scene, steps: int, seed: int = 0) -> Gaussians:
+    """Fine-tune `model` for `steps` steps of plain 3DGS on the training views."""
     config = FitConfig(iterations=max(steps, 1), boost=1.0)
     parameters = to_parameters(model, model.device)
     optimizers = make_optimizers(parameters, config, scene.extent)
@@ -194,9 +193,9 @@ def refined(model: Gaussians, scene: Scene, steps: int, seed: int = 0) -> Gaussi
 
 
 def _generator(use: str, seed: int) -> torch.Generator:
-    """Random numbers independent of a training with the same seed, and of other uses.
+    """A generator independent of trainings and other changes with the same seed.
 
-    Otherwise a change could remove exactly the Gaussians that a training chose, such as a secret's anchors.
+    Otherwise a change could remove exactly the Gaussians that a training sampled, such as a secret's anchors.
     """
     digest = hashlib.sha256(f"keyss/robustness/{use} {seed}".encode()).digest()
     return torch.Generator().manual_seed(int.from_bytes(digest[:8], "little") >> 1)

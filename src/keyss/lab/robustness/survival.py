@@ -1,6 +1,6 @@
-"""PSNR that cover and secrets lose when the published model changes.
+"""PSNR loss of cover and secrets when the published model changes.
 
-Among the changes are conversions to other formats and back by third-party programs: gsply (PyPI) and
+Changes include conversions to other formats and back by third-party programs: gsply (PyPI) and
 splat-transform (npm).
 
 pip install gsply
@@ -31,7 +31,7 @@ from keyss.methods.opened import Opened
 
 PRUNED = (0.05, 0.10, 0.15, 0.25, 0.50)
 NOISE = (0.001, 0.01, 0.1)
-SEEDS = 3  # of each random removal; results vary by a dB or two
+SEEDS = 3  # repetitions per random removal; results vary by a dB or two
 UNCHANGED = "none"
 
 # Opens a secret in a stego model on the CPU; raises KeyssError if it does not open.
@@ -44,7 +44,7 @@ class ChangedQuality:
     """A scene against its test photos after a change."""
 
     psnr: float  # dB
-    loss: float  # dB less than in the unchanged model
+    loss: float  # dB below the unchanged model
     opens: bool = True  # always True for the cover
     error: str | None = None  # why a secret does not open
 
@@ -60,14 +60,14 @@ class ChangeResult:
     strength: float
     unit: str
     sentence: str
-    seeds: int = 1  # number of changes that this is the mean of
-    skipped: str | None = None  # which tool is missing; `cover` and `secrets` are unset then
+    seeds: int = 1  # number of changes averaged
+    skipped: str | None = None  # the missing tool; `cover` and `secrets` are unset then
     cover: ChangedQuality | None = None
     secrets: tuple[ChangedQuality, ...] = ()
 
 
 def default_changes(cover: Scene, *, seed: int = 0) -> list[Change]:
-    """All changes, grouped by attack, the mildest first; some train on the photos of `cover`."""
+    """All changes, grouped by attack, mildest first; some train on the photos of `cover`."""
     return [
         *(change.random_pruning(share, seed + index) for share in PRUNED for index in range(SEEDS)),
         *(change.opacity_pruning(share) for share in PRUNED),
@@ -94,11 +94,10 @@ def measure_robustness(
 ) -> list[ChangeResult]:
     """PSNRs of cover and secrets after each of the `changes`; the first result is the unchanged model's.
 
-    `changes`: by default `default_changes`, about 50; the ones of equal attack and strength become one
-    result. `max_views`: test views of each scene. `progress`: called with the numbers of changes done and of
-    all. Renders on the device of `stego`. The same seed gives the same numbers. Raises UsageError unless
-    there is one opener for each secret, and KeyssError for a secret that does not open in the unchanged
-    model.
+    `changes`: by default `default_changes`, about 50; results of equal attack and strength are averaged.
+    `max_views`: test views per scene. `progress`: called with the number of finished changes and the total.
+    Renders on the device of `stego`. Deterministic in `seed`. Raises UsageError unless there is one opener
+    per secret, KeyssError if a secret does not open in the unchanged model.
     """
     if len(openers) != len(secrets):
         raise UsageError(f"expected an opener for each of {len(secrets)} secret(s), got {len(openers)}")
@@ -139,20 +138,17 @@ def measure_robustness(
 
 
 def reveal_changed(opener: Opener, stego: Gaussians) -> Gaussians:
-    """The secret in its own frame, as `keyss reveal` gives it, with `--force` if the model requires it.
-
-    Raises WrongKeyError and InputError as the opener does.
-    """
+    """Reveal the secret in its own frame, with `force` if needed. Raises the errors of the opener."""
     stego = stego.to("cpu")
     secret = opener(stego)
     try:
         return secret.reveal(stego)
-    except InputError:  # positions changed: it seems to be another model
+    except InputError:  # changed positions look like another model
         return secret.reveal(stego, force=True)
 
 
 def _mean(results: Sequence[ChangeResult]) -> ChangeResult:
-    """Results that differ in their random seed as one."""
+    """Average results of different random seeds."""
     covers = [each.cover for each in results if each.cover is not None]
     if not covers:
         return results[0]
@@ -181,7 +177,7 @@ class Converter:
     format: str
     tool: str
     note: str  # a remark on this conversion, or nothing
-    there_and_back: Callable[[Path, Path], tuple[Path, Path]]  # .ply, folder -> other file, .ply
+    round_trip: Callable[[Path, Path], tuple[Path, Path]]  # .ply, folder -> other file, .ply
 
     def __call__(self, model: Gaussians) -> Gaussians:
         """Raises BackendError if the tool is missing or fails."""
@@ -189,7 +185,7 @@ class Converter:
             source = Path(folder) / "source.ply"
             write_model(source, model)
             try:
-                return read_model(self.there_and_back(source, Path(folder))[1])
+                return read_model(self.round_trip(source, Path(folder))[1])
             except BackendError:
                 raise
             except (KeyssError, OSError, ValueError) as error:
@@ -205,40 +201,40 @@ class Converter:
 def converters(sog_iterations: int = 1) -> list[Converter]:
     """All known conversions, whether or not their tools are installed.
 
-    `sog_iterations`: of the clustering of harmonics in .sog, by default ten in splat-transform, which without
-    a GPU takes half a minute each for 20,000 Gaussians.
+    `sog_iterations`: rounds of clustering harmonics in .sog; splat-transform's default is ten, at half a
+    minute each for 20,000 Gaussians without a GPU.
     """
     rounds = "one round" if sog_iterations == 1 else f"{sog_iterations} rounds"
     return [
         Converter("compressed .ply", "gsply", "", _gsply_compressed),
         Converter(".spz", "gsply", " (version 3)", _gsply_spz),
-        Converter("compressed .ply", "splat-transform", "", _through("there.compressed.ply")),
-        Converter(".spz", "splat-transform", " (version 4)", _through("there.spz")),
+        Converter("compressed .ply", "splat-transform", "", _convert_through("there.compressed.ply")),
+        Converter(".spz", "splat-transform", " (version 4)", _convert_through("there.spz")),
         Converter(
             ".sog",
             "splat-transform",
             f", with {rounds} of clustering harmonics",
-            _through("there.sog", "-i", str(sog_iterations)),
+            _convert_through("there.sog", "-i", str(sog_iterations)),
         ),
         Converter(".splat", "splat-transform", ", which only reads this format", _splat),
     ]
 
 
 def own_converter(format: str) -> Converter:
-    """A conversion by keyss itself, for where a tool is missing: `format` is .spz or compressed .ply."""
+    """A conversion by keyss itself, if a tool is missing; `format` is .spz or compressed .ply."""
     name = {".spz": "there.spz", "compressed .ply": "there.compressed.ply"}[format]
 
-    def there_and_back(source: Path, folder: Path) -> tuple[Path, Path]:
+    def round_trip(source: Path, folder: Path) -> tuple[Path, Path]:
         there, back = folder / name, folder / "back.ply"
         write_model(there, read_model(source))
         write_model(back, read_model(there))
         return there, back
 
-    return Converter(format, "keyss", "", there_and_back)
+    return Converter(format, "keyss", "", round_trip)
 
 
 def why_missing(tool: str) -> str | None:
-    """Why splat-transform or a Python package cannot be used; None if it is installed."""
+    """The reason why splat-transform or a Python package is unusable; None if it is installed."""
     try:
         find_splat_transform() if tool == "splat-transform" else find_package(tool)
     except BackendError as error:
@@ -255,7 +251,7 @@ def find_package(name: str) -> ModuleType:
 
 
 def transform(source: Path, target: Path, *options: str) -> Path:
-    """`target`, converted from `source` by splat-transform. Raises BackendError."""
+    """Convert `source` to `target` with splat-transform; returns `target`. Raises BackendError."""
     tool = find_splat_transform()
     command = [tool, "-q", "-w", "-g", "cpu", *options, str(source), str(target)]
     try:
@@ -270,12 +266,12 @@ def transform(source: Path, target: Path, *options: str) -> Path:
     return target
 
 
-def _through(name: str, *options: str) -> Callable[[Path, Path], tuple[Path, Path]]:
-    def there_and_back(source: Path, folder: Path) -> tuple[Path, Path]:
+def _convert_through(name: str, *options: str) -> Callable[[Path, Path], tuple[Path, Path]]:
+    def round_trip(source: Path, folder: Path) -> tuple[Path, Path]:
         there = transform(source, folder / name, *options)
         return there, transform(there, folder / "back.ply")
 
-    return there_and_back
+    return round_trip
 
 
 def _gsply_compressed(source: Path, folder: Path) -> tuple[Path, Path]:

@@ -1,12 +1,12 @@
-"""Low bits of numbers that agree for a reason.
+"""Low bits of related numbers.
 
-Channels of a grey Gaussian, axes of a round one, neighbours that were one Gaussian before a split, Gaussians
-that share whole rows: if their high bits are equal, their low bits are close or equal too, unless replaced.
+Channels of a grey Gaussian, axes of a round one, halves of a split, Gaussians that share rows: if their high
+bits are equal, their low bits are close or equal too, unless embedding has replaced them.
 
-Coincidences are numbers of two Gaussians that agree in all bits that embedding leaves alone. Training leaves
-numbers equal in clones where it freezes or copies them: saturated opacities, the harmonics of one channel,
-whole Gaussians. Embedding keeps the high bits and bit 0 and makes the others random, unless it leaves both
-Gaussians alone. The null of pairs with a usable Gaussian is exact: independent low bits.
+Coincidences are numbers of two Gaussians with equal high bits and bit 0, which embedding keeps. Training
+copies or freezes numbers in clones: saturated opacities, harmonics of one channel, whole Gaussians. Embedding
+makes their other bits random, unless neither Gaussian is a carrier. The null for pairs with a usable Gaussian
+is exact: independent low bits.
 """
 
 from __future__ import annotations
@@ -26,35 +26,35 @@ from keyss.lab.stealth.statistic import (
     BitPatterns,
     Statistic,
     excess,
-    more_than_smooth,
+    excess_over_smooth,
     normal,
     portion,
     ulps,
 )
 
 _LOW = 13  # bits that may have been replaced
-_QUARTER, _MANY = 21, 1000  # lowest bit that quarters of octaves differ in; pairs of numbers
-_CLOSE = 1 << 5  # steps of the last bit
+_QUARTER, _MANY = 21, 1000  # lowest differing bit of quarters of octaves; minimum pairs of numbers
+_CLOSE = 1 << 5  # units in the last place
 _NEIGHBOURS = 3
-# Embedding moves a number by at most this many steps of its last bit.
+# Maximum change by embedding, and the range that gives the smooth density; units in the last place.
 _MOVED, _AROUND = 1 << _LOW, 1 << (_LOW + 3)
 _GROUPS = {"axes": (1,), "quaternion": (2,), "channels": (5, 6, 7), "constant colour": (4,)}
 _WRITTEN = {"scale": 8, "rotation": 8, "opacity": 8, "sh1": 12, "sh2": 12, "sh3": 12}  # bits above bit 0
 _CHANNELS = ("red", "green", "blue")
-_LAGS = 4  # between pairs in the order of their high bits
+_LAGS = 4  # maximum distance of pairs in the order of their high bits
 _NEAREST = 16
 _SATURATED = 16.0  # logit
 
 
 def agreement(model: Gaussians, words: BitPatterns) -> dict[str, Statistic]:
-    """Shares of pairs with close low bits among those with equal high bits, and of pairs slightly apart.
+    """Shares of pairs with close low bits among those with equal high bits, and of near misses.
 
-    The exact null of the first is independent low bits. Pairs slightly apart beyond a smooth density were
-    equal before embedding.
+    The exact null of the first is independent low bits. Near misses in excess of a smooth density were equal
+    before embedding.
     """
     statistics: dict[str, Statistic] = {}
     for name, attributes in _GROUPS.items():
-        pairs = list(_within(words, attributes))
+        pairs = list(_pairs_within_gaussians(words, attributes))
         if pairs:
             one, other = (np.concatenate(each) for each in zip(*pairs, strict=True))
             statistics |= {f"{key}, {name}": each for key, each in _of_pairs(one, other).items()}
@@ -69,27 +69,27 @@ def agreement(model: Gaussians, words: BitPatterns) -> dict[str, Statistic]:
 
 
 def _of_pairs(one: Words32, other: Words32) -> dict[str, Statistic]:
-    apart = ulps(one, other)
+    distance = ulps(one, other)
     same_high = (one >> _LOW) == (other >> _LOW)
-    equal = apart == 0
+    equal = distance == 0
     size = 1 << _LOW
-    inside = int(((apart > 0) & (apart < _MOVED)).sum())
-    around = int(((apart >= _MOVED) & (apart < _AROUND)).sum())
+    inside = int(((distance > 0) & (distance < _MOVED)).sum())
+    around = int(((distance >= _MOVED) & (distance < _AROUND)).sum())
     near = (2 * _CLOSE - 1) * size - _CLOSE * (_CLOSE - 1)  # ordered pairs closer than _CLOSE
     return {
         "close low bits": excess(
-            int((apart[same_high] < _CLOSE).sum()), int(same_high.sum()), near / size**2
+            int((distance[same_high] < _CLOSE).sum()), int(same_high.sum()), near / size**2
         ),
         "equal low bits": excess(int(equal[same_high].sum()), int(same_high.sum()), 1 / size),
-        # Unequal pairs less than _MOVED apart, beyond the number expected from pairs further apart.
-        "near misses": more_than_smooth(inside, max(around, 1) * _MOVED / (_AROUND - _MOVED), len(apart)),
+        # Unequal pairs closer than _MOVED, against the number expected from pairs further apart.
+        "near misses": excess_over_smooth(inside, max(around, 1) * _MOVED / (_AROUND - _MOVED), len(equal)),
         "equal": portion(float(equal.sum()), len(equal)),
         "within a quarter of an octave": _within_quarters(one, other),
     }
 
 
 def _within_quarters(one: Words32, other: Words32) -> Statistic:
-    """Correlation of the next 8 bits where exponents and the two leading bits agree; 0 if these are new."""
+    """Correlation of the next 8 bits if exponents and the two leading bits agree; 0 for random bits."""
     both = (one >> _QUARTER == other >> _QUARTER) & (one > 0) & (other > 0)
     if both.sum() < _MANY:
         return NOTHING
@@ -97,8 +97,10 @@ def _within_quarters(one: Words32, other: Words32) -> Statistic:
     return normal(12 * float(covariance[0, 1]) / (1 << 16), float(both.sum()) ** -0.5)
 
 
-def _within(words: BitPatterns, attributes: tuple[int, ...]) -> Iterator[tuple[Words32, Words32]]:
-    """Pairs of numbers of one Gaussian, within a coefficient's channels or an attribute, without signs."""
+def _pairs_within_gaussians(
+    words: BitPatterns, attributes: tuple[int, ...]
+) -> Iterator[tuple[Words32, Words32]]:
+    """Pairs of magnitudes in one Gaussian, within a coefficient's channels or an attribute."""
     for attribute in attributes:
         own = words.bits[:, words.of_attribute(attribute)] & np.uint32(0x7FFFFFFF)
         if not own.size:
@@ -110,7 +112,7 @@ def _within(words: BitPatterns, attributes: tuple[int, ...]) -> Iterator[tuple[W
 
 
 def nearest_pairs(positions: Doubles, neighbours: int) -> Integers:
-    """[P, 2] each Gaussian and its nearest `neighbours`, every pair once."""
+    """[P, 2] pairs of each Gaussian and its nearest `neighbours`, each pair once."""
     count = min(neighbours + 1, len(positions))
     _, near = nearest_neighbours(positions, count)
     pairs = np.stack([np.repeat(np.arange(len(near)), near.shape[1]), near.ravel()], axis=1)
@@ -131,7 +133,7 @@ def _sharers(words: BitPatterns) -> Integers:
 
 
 def coincidences(model: Gaussians, words: BitPatterns) -> dict[str, Statistic]:
-    """Equal low bits among pairs with equal high bits, over those expected by chance."""
+    """Pairs with equal low bits among those with equal high bits, relative to chance."""
     return {
         name: excess(equal, pairs, 2.0**-bits)
         for name, (equal, pairs, bits) in count_coincidences(model, words).items()
@@ -139,10 +141,9 @@ def coincidences(model: Gaussians, words: BitPatterns) -> dict[str, Statistic]:
 
 
 def count_coincidences(model: Gaussians, words: BitPatterns) -> dict[str, tuple[int, int, int]]:
-    """By name: pairs with equal low bits, pairs with equal high bits, and the number of low bits.
+    """Numbers by name: pairs with equal low bits, pairs with equal high bits, low bits.
 
-    Of all pairs and of neighbours in space, with a usable Gaussian; then of neighbours that are saturated,
-    usable or not.
+    For all pairs and for neighbours in space, if one Gaussian is usable; for all saturated neighbours.
     """
     usable = usable_carriers(model)
     near = nearest_pairs(doubles(model.means), _NEAREST)
@@ -154,7 +155,7 @@ def count_coincidences(model: Gaussians, words: BitPatterns) -> dict[str, tuple[
         own = words.bits[:, field]
         of_all, of_near, of_bright = f"all, {name}", f"neighbours, {name}", f"saturated, {name}"
         for kind, pairs, chosen in (
-            (of_all, _agreeing(own & ~low), usable),
+            (of_all, _agreeing_pairs(own & ~low), usable),
             (of_near, near, usable),
             (of_bright, bright, np.ones(len(usable), bool)),
         ):
@@ -167,7 +168,7 @@ def count_coincidences(model: Gaussians, words: BitPatterns) -> dict[str, tuple[
 
 
 def _columns(words: BitPatterns) -> Iterator[tuple[str, int, int]]:
-    """Name, number and written bits of each column; the harmonics of a channel have one name."""
+    """Name, index and replaced bits of each column; the harmonics of a channel share a name."""
     for index, attribute in enumerate(ATTRIBUTES):
         if attribute in _WRITTEN:
             for number, column in enumerate(np.flatnonzero(words.attribute == index)):
@@ -175,8 +176,8 @@ def _columns(words: BitPatterns) -> Iterator[tuple[str, int, int]]:
                 yield name, int(column), _WRITTEN[attribute]
 
 
-def _agreeing(kept: np.ndarray) -> Integers:
-    """[P, 2] rows whose `kept` bits [N] agree, near each other in the order of these."""
+def _agreeing_pairs(kept: np.ndarray) -> Integers:
+    """[P, 2] pairs of rows whose `kept` bits [N] agree, at most _LAGS apart when sorted by these."""
     order = np.argsort(kept, kind="stable")
     pairs = [np.zeros((0, 2), np.int64)]
     for lag in range(1, min(_LAGS, len(kept) - 1) + 1):

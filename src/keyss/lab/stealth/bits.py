@@ -1,7 +1,7 @@
-"""Bits of mantissas that are not random, given everything else that an attacker sees.
+"""Mantissa bits that are not random, conditioned on everything else that an attacker sees.
 
-By attribute, magnitude and position of the bit; given the bit below; and numbers that contradict themselves:
-training that leaves a zero in the last bit leaves zeros above it too, embedding does not.
+Statistics by attribute, magnitude and position of the bit, and given the bit below. Numbers with a zero in
+the last bit have zeros above it too after training, but not after embedding.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from keyss.lab.stealth.statistic import (
 )
 
 RANGES = {"0": (0, 1), "1-3": (1, 4), "4-8": (4, 9), "9-12": (9, 13)}
-_BITS = 14  # from the last one on
+_BITS = 14  # lowest bits of a number
 _HARMONICS = ATTRIBUTES.index("sh1")
 _MIN_COUNT = 64  # numbers of a stratum
 
 
 def bits(model: Gaussians, words: BitPatterns) -> dict[str, Statistic]:
-    """Statistics of single numbers, by attribute and magnitude; nulls are exact: fair, independent bits."""
+    """Statistics of single numbers by attribute and magnitude, with an exact null: fair, independent bits."""
     statistics: dict[str, Statistic] = {}
     for index, attribute in enumerate(ATTRIBUTES):
         columns = words.of_attribute(index)
@@ -44,7 +44,7 @@ def bits(model: Gaussians, words: BitPatterns) -> dict[str, Statistic]:
         values = own[trained & (exponent >= low) & (exponent < high)]
         statistics |= {f"{name}, {magnitude} harmonics": each for name, each in _of_values(values).items()}
     small = trained & (exponent < MAGNITUDES["middling"][1])
-    statistics["zeros together in a Gaussian"] = _together(own, small)
+    statistics["zeros together in a Gaussian"] = _count_variance(own, small)
     tiny = (trained & (exponent < MAGNITUDES["tiny"][1])).any(axis=1)
     for name, rows in (("with", tiny), ("without", ~tiny)):
         found = _of_values(own[rows][trained[rows]])["ones in bits 1-3"]
@@ -53,7 +53,7 @@ def bits(model: Gaussians, words: BitPatterns) -> dict[str, Statistic]:
 
 
 def _of_values(values: Words32) -> dict[str, Statistic]:
-    """Shares of ones, of trailing zeros, and of zeros in bits 1 to 3 above a zero against above a one."""
+    """Shares of ones, of trailing zeros, and of zeros in bits 1 to 3 given bit 0."""
     statistics = {}
     for name, (low, high) in RANGES.items():
         ones = sum(int((values >> bit & 1).sum()) for bit in range(low, high))
@@ -70,7 +70,7 @@ def _of_values(values: Words32) -> dict[str, Statistic]:
 
 
 def _difference(one: Flags, other: Flags, expected: float) -> Statistic:
-    """Difference of the shares in `one` and `other`; by chance both are `expected`."""
+    """Difference of the shares in `one` and `other`, both `expected` under the null."""
     if min(len(one), len(other)) < _MIN_COUNT:
         return NOTHING
     error = (expected * (1 - expected) * (1 / len(one) + 1 / len(other))) ** 0.5
@@ -91,8 +91,8 @@ def _strata(values: Words32) -> Statistic:
     return dispersion(total, degrees)
 
 
-def _together(values: Words32, chosen: Flags) -> Statistic:
-    """Variance over Gaussians of the number of small harmonics with three zeros above the last bit."""
+def _count_variance(values: Words32, chosen: Flags) -> Statistic:
+    """Variance over Gaussians of their count of small harmonics with zeros in bits 1 to 3."""
     zeros = ((values & np.uint32(14) == 0) & chosen).sum(axis=1)
     trials = chosen.sum(axis=1)
     rows = trials > 1

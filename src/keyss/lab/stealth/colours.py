@@ -1,8 +1,8 @@
-"""Noise in green and blue compared with red, which the channel of colours does not write.
+"""Noise in green and blue relative to red, which the channel `colours` does not change, and opacities.
 
-Neighbours in space and rows, often one Gaussian before density control, differ about equally in all three
-channels. Noise in two of them shows first in the pairs that differ least, and most in small and faint
-Gaussians. Hiding Gaussians too faint to be rendered changes the distribution of opacities.
+Neighbours in space and in rows, often one Gaussian before density control, differ about equally in all three
+colours. Noise in two of them is most noticeable in pairs that differ least, and in small and faint Gaussians.
+Hiding Gaussians too faint to render changes the distribution of opacities.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _QUANTILES = (0.05, 0.1, 0.25, 0.5, 0.9)
 _CHANNELS = {"green": 1, "blue": 2}
 _PARTS = ("most visible", "more visible", "less visible", "least visible")
 _MIN_PAIRS = 200
-_TINY = 1e-4  # of a colour: smaller differences count as none
+_TINY = 1e-4  # colour differences below this count as none
 INVISIBLE = -5.6  # logits below are never rendered
 _SHARES = {
     "logit below -12": (-np.inf, -12.0),
@@ -35,12 +35,12 @@ _SHARES = {
 }
 _FAINT = -2.944
 _BANDWIDTH, _STEP = 0.15, 0.05  # logits
-_MIN_GAUSSIANS = 30  # of a mode
-_DIP = 0.5  # of the lower of two modes: the density must fall to this between them
+_MIN_GAUSSIANS = 30  # minimum Gaussians per mode
+_DIP = 0.5  # two modes are separate if the density between them falls to this fraction of the lower one
 
 
 def colours(model: Gaussians, words: BitPatterns) -> dict[str, Statistic]:
-    """Logarithms of ratios of differences; 0 if green or blue vary as red does."""
+    """Log ratios of differences; 0 if green or blue vary like red."""
     values = np.nan_to_num(doubles(model.sh[:, 0]))
     statistics: dict[str, Statistic] = {}
     if len(values) < _MIN_PAIRS:
@@ -50,18 +50,18 @@ def colours(model: Gaussians, words: BitPatterns) -> dict[str, Statistic]:
     rows = np.arange(len(values))
     pairs = {"neighbours": np.stack([rows, near[:, 1]], axis=1), "rows": np.stack([rows[1:], rows[:-1]], 1)}
     for name, pair in pairs.items():
-        apart = np.abs(values[pair[:, 0]] - values[pair[:, 1]])
+        distance = np.abs(values[pair[:, 0]] - values[pair[:, 1]])
         for channel, index in _CHANNELS.items():
             for quantile in _QUANTILES:
-                ratio = _ratio(apart[:, index], apart[:, 0], quantile)
+                ratio = _ratio(distance[:, index], distance[:, 0], quantile)
                 statistics[f"{channel} of {name}, {quantile}"] = ratio
-            close = apart[apart[:, 0] <= np.quantile(apart[:, 0], 0.1)]
-            ratio = _ratio(close[:, index], apart[:, index], 0.5)
+            close = distance[distance[:, 0] <= np.quantile(distance[:, 0], 0.1)]
+            ratio = _ratio(close[:, index], distance[:, index], 0.5)
             statistics[f"{channel} of {name} with the same red"] = ratio
     for name, part in _parts(model):
-        apart = np.abs(values[part] - values[near[part, 1]])
+        distance = np.abs(values[part] - values[near[part, 1]])
         for channel, index in _CHANNELS.items():
-            statistics[f"{channel} of neighbours, {name}"] = _ratio(apart[:, index], apart[:, 0], 0.25)
+            statistics[f"{channel} of neighbours, {name}"] = _ratio(distance[:, index], distance[:, 0], 0.25)
     inside = {f"{one} and {other}": np.abs(values[:, i] - values[:, j]) for one, other, i, j in _BETWEEN}
     usual = np.median(np.stack(list(inside.values())), axis=1).mean()
     for name, each in inside.items():
@@ -88,7 +88,7 @@ def _ratio(one: Doubles, other: Doubles, quantile: float) -> Statistic:
 
 
 def opacities(model: Gaussians, words: BitPatterns) -> dict[str, Statistic]:
-    """Shares by opacity, and differences between faint Gaussians and the others."""
+    """Shares of ranges of opacity, and differences between faint and other Gaussians."""
     logits = doubles(model.opacity_logits)
     statistics = {
         f"share of opacities, {name}": portion(float(((logits >= low) & (logits < high)).sum()), len(logits))
@@ -106,7 +106,7 @@ def opacities(model: Gaussians, words: BitPatterns) -> dict[str, Statistic]:
 
 
 def invisible_modes(model: Gaussians) -> list[float]:
-    """Peaks of the density of opacity logits too low to be rendered: one for each group hidden there."""
+    """Peaks in the density of invisible opacity logits, one per group hidden there."""
     logits = doubles(model.opacity_logits)
     return _modes(logits[logits < INVISIBLE])
 

@@ -1,8 +1,7 @@
 """Scores for an attacker who has a candidate for the secret, but no key.
 
-Higher scores mean that the file looks more as if it held the candidate. A score alone means nothing, since
-some candidates resemble all files: the true one must score higher than others, and higher than in files that
-hold something else.
+Higher scores suggest that the file holds the candidate. Some candidates resemble all files, so a score means
+something only in comparison: with other candidates, and with files that hold something else.
 """
 
 from __future__ import annotations
@@ -16,8 +15,8 @@ from keyss.core.neighbours import nearest_neighbours
 from keyss.lab.stealth.colours import INVISIBLE, shapes_of
 from keyss.lab.stealth.statistic import BitPatterns
 
-MAX_GAUSSIANS = 20_000  # of each model
-_QUERIES = 4000  # rows whose nearest ones are searched
+MAX_GAUSSIANS = 20_000  # Gaussians per model
+_QUERIES = 4000  # rows for nearest-neighbour searches
 _MIN_ENERGY = -20.0  # logarithm
 _MATCHED = 0.02  # distance of logarithms of energies; chance is below one in a thousand
 _LOW = 13  # bits that may have been replaced
@@ -25,7 +24,7 @@ _MIN_COUNT = 50
 
 
 def candidate_scores(file: Gaussians, candidate: Gaussians) -> dict[str, float]:
-    """Scores by name. Models may differ in size and SH degree; the order of rows matters."""
+    """Scores by name. Models may differ in size and SH degree; some scores depend on the order of rows."""
     degree = min(file.sh_degree, candidate.sh_degree)
     file, candidate = (
         each.with_sh_degree(degree)[:: max(1, -(-len(each) // MAX_GAUSSIANS))] for each in (file, candidate)
@@ -46,7 +45,7 @@ def candidate_scores(file: Gaussians, candidate: Gaussians) -> dict[str, float]:
 
 
 def changed_low_bits(file: Gaussians, other: Gaussians) -> float:
-    """Share of the Gaussians that `other` has too, but with other low bits."""
+    """Share of the Gaussians that have an equal in `other` except for low bits."""
     shared, same = (
         np.isin(_high_rows(file, slice(None), low), _high_rows(other, slice(None), low)) for low in (_LOW, 0)
     )
@@ -75,12 +74,12 @@ def _energies(model: Gaussians) -> Doubles:
 
 
 def _by_rows(own: Doubles, theirs: Doubles) -> dict[str, float]:
-    """Nearest rows: the share that matches, distances of the best, and correlation of their order."""
+    """Scores from nearest rows: share of matches, distances of the best, correlation of their order."""
     count = min(len(own), len(theirs))
     at_ends = max(
         _correlation(own[part, 0], theirs[:count, 0]) for part in (slice(0, count), slice(-count, None))
     )
-    # Gaussians without harmonics are all alike.
+    # Gaussians without harmonics match each other.
     own, theirs = (each[(each > _MIN_ENERGY).all(axis=1)] for each in (own, theirs))
     own = own[:: max(1, -(-len(own) // _QUERIES))]
     if min(len(own), len(theirs)) < _MIN_COUNT:
@@ -104,7 +103,7 @@ def _correlation(one: Numbers, other: Numbers) -> float:
 
 
 def _high_rows(model: Gaussians, columns: slice, low: int = _LOW) -> Numbers:
-    """[N] the bits above the `low` lowest of each row as one value."""
+    """[N] rows without their `low` lowest bits, each as one value."""
     high = np.ascontiguousarray(BitPatterns.of(model).bits[:, columns] >> low)
     return high.view(f"V{4 * high.shape[1]}")[:, 0]
 
@@ -120,7 +119,7 @@ def _identity(file: Gaussians, candidate: Gaussians) -> float:
 
 
 def _marginals(model: Gaussians) -> dict[str, Doubles]:
-    """Quantities that do not depend on the frame: shapes, energies, colours."""
+    """Frame-independent quantities: shapes, energies, colours."""
     shapes = shapes_of(model) | {"brightness": doubles(model.sh[:, 0]).mean(1)}
     kept = "flatness", "elongation", "brightness", "length of quaternions"
     marginals = {name: shapes[name] for name in kept}

@@ -1,7 +1,4 @@
-"""Properties that some tools keep exactly, and changed low bits only nearly; and the order of rows.
-
-The order is compared with the content of rows, and adjacent rows with each other.
-"""
+"""Properties that tools preserve exactly but embedding only approximately, and the order of rows."""
 
 from __future__ import annotations
 
@@ -18,25 +15,25 @@ from keyss.lab.stealth.statistic import (
     BitPatterns,
     Statistic,
     excess,
-    more_than_smooth,
+    excess_over_smooth,
     normal,
     portion,
 )
 from keyss.lab.two_sample import space_cells
 
 _UNIT = 5e-7  # error of a length normalised in float32
-_MOVED, _AROUND = 2e-4, 2e-3  # how far embedding moves a length; the range that gives the smooth density
+_MOVED, _AROUND = 2e-4, 2e-3  # maximum change of a length by embedding; range that gives the smooth density
 _CELLS = 4  # along each axis
-_BLOCKS = 16  # of rows
-_MIN_GAUSSIANS = 30  # of a part
-_CLUSTERED = 0.01  # of the usual gap between neighbouring values
+_BLOCKS = 16  # blocks of consecutive rows
+_MIN_GAUSSIANS = 30  # minimum Gaussians per part
+_CLUSTERED = 0.01  # fraction of the median gap between neighbouring values
 _WINDOW = 32
 _KS_SPREAD = 0.2603  # standard deviation of Kolmogorov's distribution
-_NEAR = 1e-5  # of the model's size
+_NEAR = 1e-5  # fraction of the model's size
 
 
 def invariants(model: Gaussians, words: BitPatterns) -> dict[str, Statistic]:
-    """Unit quaternions in the whole file and in parts of it, repeated values, clusters, short numbers."""
+    """Unit quaternions in the file and its parts, repeated values, clusters, short numbers."""
     statistics = _lengths(model)
     for index, attribute in enumerate(ATTRIBUTES):
         own = words.bits[:, words.of_attribute(index)]
@@ -44,7 +41,7 @@ def invariants(model: Gaussians, words: BitPatterns) -> dict[str, Statistic]:
             continue
         trained = words.trained[:, words.of_attribute(index)]
         statistics[f"short numbers, {attribute}"] = portion(float((~trained).sum()), trained.size)
-        repeated = sum(_repeated(own[:, field][trained[:, field]]) for field in range(own.shape[1]))
+        repeated = sum(_count_repeated(own[:, field][trained[:, field]]) for field in range(own.shape[1]))
         statistics[f"repeated values, {attribute}"] = portion(repeated, own.size)
         clusters = [
             _clusters(own[:, field].view(np.float32).astype(np.float64)) for field in range(own.shape[1])
@@ -55,14 +52,14 @@ def invariants(model: Gaussians, words: BitPatterns) -> dict[str, Statistic]:
 
 
 def _lengths(model: Gaussians) -> dict[str, Statistic]:
-    """Shares of quaternions of exactly and of nearly unit length, overall and in parts."""
+    """Shares of quaternions of exactly and nearly unit length, in the file and in its parts."""
     error = (model.quats.detach().cpu().double().norm(dim=1) - 1).abs().numpy()
     unit = error < _UNIT
     nearly = int((~unit & (error < _MOVED)).sum())
     around = int(((error >= _MOVED) & (error < _AROUND)).sum())
     statistics = {
         "quaternions of unit length": portion(float(unit.sum()), len(unit)),
-        "quaternions of nearly unit length": more_than_smooth(
+        "quaternions of nearly unit length": excess_over_smooth(
             nearly, max(around, 1) * _MOVED / (_AROUND - _MOVED), len(unit)
         ),
         "distance of quaternions from unit length, median": Statistic(
@@ -80,16 +77,16 @@ def _lengths(model: Gaussians) -> dict[str, Statistic]:
     return statistics
 
 
-def _repeated(values: Words32) -> int:
+def _count_repeated(values: Words32) -> int:
     """Number of values that are not unique."""
     _, counts = np.unique(values, return_counts=True)
     return int(counts[counts > 1].sum())
 
 
 def _clusters(values: Doubles) -> tuple[int, int]:
-    """Number of gaps between sorted values that are far smaller than their neighbours, and of all gaps.
+    """Number of gaps between sorted values far smaller than their neighbours, and number of gaps.
 
-    For a smooth density, gaps over their mean are exponential: one in a hundred is below 0.01.
+    For a smooth density, gaps / mean gap is exponential: one in a hundred is below 0.01.
     """
     ordered = np.unique(values)
     if len(ordered) < 4 * _WINDOW:
@@ -102,9 +99,9 @@ def _clusters(values: Doubles) -> tuple[int, int]:
 
 
 def order(model: Gaussians, words: BitPatterns) -> dict[str, Statistic]:
-    """Correlations of the content of rows with their number, and halves against each other; null: any order.
+    """Correlations of the content of rows with their index, and differences of halves; null: random order.
 
-    Plain models have an order too, given by density control: compared with controls, a shuffled file is as
+    Plain models have an order too, from density control: compared with controls, a shuffled file is as
     unusual as one with a second model at its end.
     """
     statistics: dict[str, Statistic] = {}
@@ -129,7 +126,7 @@ def order(model: Gaussians, words: BitPatterns) -> dict[str, Statistic]:
 
 
 def _pairs_within(positions: Doubles, distance: float) -> int:
-    """How many pairs of rows are so near to each other; equal rows are counted without comparing them."""
+    """Number of pairs of rows within `distance`; takes linear time for equal rows."""
     places, copies = np.unique(positions, axis=0, return_counts=True)
     tree = cKDTree(places)
     ordered = float(tree.count_neighbors(tree, distance, weights=(copies, copies)))
@@ -137,7 +134,7 @@ def _pairs_within(positions: Doubles, distance: float) -> int:
 
 
 def _columns(model: Gaussians) -> dict[str, Doubles]:
-    """[N] the content of each Gaussian by name."""
+    """[N] properties of each Gaussian by name."""
     positions = model.means.detach().cpu().double()
     contents = {f"position {axis}": positions[:, index] for index, axis in enumerate("xyz")}
     contents["distance"] = (positions - positions.median(0).values).norm(dim=1)

@@ -1,4 +1,4 @@
-"""Which statistics of a file are unusual, compared with control models of the same scene."""
+"""Find unusual statistics of a file, compared with control models of the same scene."""
 
 from __future__ import annotations
 
@@ -38,21 +38,21 @@ class JudgedStatistic:
     value: float
     low: float  # minimum of the controls
     high: float  # maximum of the controls
-    p: float  # that another control model is as far from the mean of the controls
+    p: float  # chance that another control model is as far from the mean of the controls
     exact: float | None  # p-value of the file alone under the statistic's own null, if it has one
 
 
 @dataclass(frozen=True)
 class StealthResult:
-    """The findings of an attacker with the source code, but no key, in the file alone."""
+    """What an attacker with the source code, but no key, finds in the file."""
 
     statistics: tuple[JudgedStatistic, ...]  # the least likely first
     least: float  # minimum of the p-values, corrected for their number
     least_of_controls: float  # the minimum for a control judged by the others
-    # Scores of a model of each secret against the file, judged by its scores against the controls; None
-    # without a model.
+    # For each secret: scores of its model against the file, judged by those against the controls. None: the
+    # secret has no model.
     confirmations: tuple[tuple[JudgedStatistic, ...] | None, ...] = ()
-    invisible_groups: int = 0  # modes of the opacities too low to be rendered: countable secrets
+    invisible_groups: int = 0  # modes of invisible opacities: countable secrets
     changed_low_bits: float = 0.0  # share of the Gaussians that differ from the cover's model in low bits
 
     @property
@@ -129,7 +129,7 @@ def _rows(own: Mapping[str, Statistic], controls: Sequence[Mapping[str, Statisti
         for name in own
         if all(name in each and math.isfinite(each[name].value) for each in models)
     }
-    # How much more the statistics of bits vary between trainings than by sampling.
+    # Variance of the statistics of bits between trainings / sampling variance.
     ratios = [
         _between(others) / _sampling(others)
         for name, others in samples.items()
@@ -150,18 +150,18 @@ def _least(rows: Sequence[JudgedStatistic]) -> float:
 
 
 def _p(own: Statistic, controls: Sequence[Statistic], excess: float | None) -> float:
-    """Two-sided p by Student's t for one more value; known sampling errors add degrees of freedom.
+    """Two-sided p of one more value by Student's t, with degrees of freedom by Welch and Satterthwaite.
 
-    The variances between controls and of sampling add up; degrees of freedom by Welch and Satterthwaite. Few
-    controls estimate the first one poorly: if similar statistics vary by `excess` times their sampling
-    variance, and this one by at most three times that, `excess` gives its variance.
+    Variance between controls and sampling variance add up. Few controls estimate the former poorly: if
+    similar statistics have `excess` times their sampling variance, and this one at most three times that,
+    `excess` gives its variance.
     """
     from scipy.special import stdtr  # slow to import
 
     count = len(controls)
     mean = float(np.mean([each.value for each in controls]))
-    apart = abs(own.value - mean)
-    if apart == 0:
+    distance = abs(own.value - mean)
+    if distance == 0:
         return 1.0
     between, sampling = _between(controls), _sampling(controls)
     sampling_own = (own.error or 0.0) ** 2
@@ -173,7 +173,7 @@ def _p(own: Statistic, controls: Sequence[Statistic], excess: float | None) -> f
         unknown = between * (1 + 1 / count) + floor
         variance = unknown + sampling_own + sampling / count
         degrees = min(_MANY, (count - 1) * variance**2 / max(unknown, 1e-150) ** 2)
-    return float(2 * stdtr(degrees, -apart / math.sqrt(variance)))
+    return float(2 * stdtr(degrees, -distance / math.sqrt(variance)))
 
 
 def _between(controls: Sequence[Statistic]) -> float:

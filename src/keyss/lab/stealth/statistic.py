@@ -1,4 +1,4 @@
-"""Detectors see floats as bit patterns, and give numbers about a file, with standard errors and p-values."""
+"""Bit patterns of a model, and statistics of detectors with standard errors and p-values."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ from keyss.core.gaussians import Gaussians
 
 ATTRIBUTES = ("position", "scale", "rotation", "opacity", "colour", "sh1", "sh2", "sh3")
 MANTISSA = 23
-# By binary exponent. A number keeps the grid of its largest value in training, so small ones tell most.
+# Ranges of binary exponents. Training rounds a number on the grid of its largest value: small ones reveal
+# most.
 MAGNITUDES = {"tiny": (-126, -15), "small": (-15, -13), "middling": (-13, -9), "large": (-9, 128)}
 # A number that ends in this many zeros was not trained; embedding does not change it.
 _SHORT = np.uint32((1 << 20) - 1)
@@ -22,7 +23,7 @@ _SHORT = np.uint32((1 << 20) - 1)
 
 @dataclass(frozen=True)
 class BitPatterns:
-    """The floats of N Gaussians as bit patterns, F to each."""
+    """The F floats of each of N Gaussians, as bit patterns."""
 
     bits: Words32  # [N, F]
     attribute: Integers  # [F] index into ATTRIBUTES
@@ -47,16 +48,16 @@ class BitPatterns:
         return result
 
     def of_attribute(self, index: int) -> slice:
-        """Columns."""
+        """The columns of an attribute."""
         columns = np.flatnonzero(self.attribute == index)
         return slice(int(columns[0]), int(columns[-1]) + 1) if len(columns) else slice(0, 0)
 
 
 def ulps(one: Words32, other: Words32) -> Integers:
-    """Steps of the last bit between numbers; 2^31 if their signs differ."""
+    """Distance of numbers in units in the last place; 2^31 if their signs differ."""
     a, b = (each & 0x7FFFFFFF for each in (one, other))
-    apart = np.abs(a.astype(np.int64) - b.astype(np.int64))
-    return np.where((one ^ other) >> 31 == 0, apart, np.int64(1) << 31)
+    distance = np.abs(a.astype(np.int64) - b.astype(np.int64))
+    return np.where((one ^ other) >> 31 == 0, distance, np.int64(1) << 31)
 
 
 @dataclass(frozen=True)
@@ -83,12 +84,12 @@ def share(hits: float, trials: float, expected: float = 0.5) -> Statistic:
 
 
 def normal(value: float, error: float, expected: float = 0.0) -> Statistic:
-    """A number that is normal around `expected` under the null; two-sided."""
+    """A value that is normal around `expected` under the null; two-sided."""
     return Statistic(value, error, float(2 * ndtr(-abs(value - expected) / error)))
 
 
 def excess(hits: int, trials: int, expected: float) -> Statistic:
-    """`hits` over their expected number, with the exact binomial probability of at least as many."""
+    """`hits` / expected hits, with the exact binomial tail probability."""
     if trials == 0:
         return NOTHING
     p = float(bdtrc(hits - 1, trials, expected)) if hits else 1.0
@@ -97,18 +98,18 @@ def excess(hits: int, trials: int, expected: float) -> Statistic:
 
 
 def portion(hits: float, trials: int) -> Statistic:
-    """A share without a null of its own."""
+    """A share without a null hypothesis."""
     return Statistic(hits / max(trials, 1), math.sqrt(max(hits, 1.0)) / max(trials, 1))
 
 
-def more_than_smooth(hits: int, expected: float, of: int) -> Statistic:
-    """`hits` beyond those of a smooth density, as a share, with the Poisson probability."""
+def excess_over_smooth(hits: int, expected: float, of: int) -> Statistic:
+    """`hits` in excess of a smooth density, as a share, with the Poisson tail probability."""
     error = math.sqrt(max(hits, expected, 1.0)) / max(of, 1)
     return Statistic((hits - expected) / max(of, 1), error, float(pdtrc(hits - 1, expected)) if hits else 1.0)
 
 
 def dispersion(chi_square: float, degrees: int) -> Statistic:
-    """Chi-square per degree of freedom less 1: above 0 is more uneven than random."""
+    """Chi-square per degree of freedom - 1: above 0 is more uneven than random."""
     if degrees < 10:
         return NOTHING
     return Statistic(chi_square / degrees - 1, math.sqrt(2 / degrees), float(chdtrc(degrees, chi_square)))

@@ -1,4 +1,4 @@
-"""The method `carry`: the secrets' Gaussians, encrypted in the published model."""
+"""The method `carry`: encrypts the secrets' Gaussians in the published model."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ from keyss.methods.records.quantise import out_of_range
 from keyss.rendering import contributions
 from keyss.rendering.difference import Viewpoints, psnr_between
 
-# Without photos, the start is nearly right: the largest number of steps, and a factor on the rates.
+# Refits to renders start near the optimum: maximum steps, and factor on the rates.
 _MODEL_ITERATIONS, _MODEL_RATE = 400, 0.1
 _SELECTION_VIEWS = 64
-_PLANNED = bytes(32)  # entropy for plans, which hide nothing
+_PLANNED = bytes(32)  # dummy entropy for plans
 _VISIBLE = (
     "the cover can hold the secret, but whoever inspects the published file sees that it holds something "
-    '(`publish="any"`), because nothing goes in unnoticed: {}'
+    '(`publish="any"`), because it cannot be hidden unnoticed: {}'
 )
-_LEAST_SHARE = 1 / 6  # of a secret's Gaussians: with fewer, refits of public models are below 30 dB
+_MIN_SHARE = 1 / 6  # fraction of a secret's Gaussians; refits of public models with fewer are below 30 dB
 _FEWER = (
     "the secrets share the room, and each has fewer Gaussians than it could have alone: whoever has one of "
     "the keys can notice that there are other secrets"
@@ -46,10 +46,10 @@ class CarryMethod:
     options = CarryOptions
 
     def prepare(self, sources: Sequence[Source], options: CarryOptions) -> CarryOptions:
-        """Decides which secrets are refitted: after the fits also those for which the cover is too small.
+        """Choose the secrets to refit: once all are fitted, also those that do not fit the cover.
 
-        Refuses a given cover without room, and given secrets that neither fit nor may be changed. Secrets
-        that are fitted first are made to fit.
+        Raises UsageError for a given cover without room, and for given secrets that neither fit nor may be
+        changed. Secrets that keyss fits are made to fit.
         """
         cover, *secrets = sources
         degree = options.sh_degree
@@ -84,13 +84,13 @@ class CarryMethod:
             options.iterations or (steps if secret.photos else min(options.fit.iterations, _MODEL_ITERATIONS))
             for secret in secrets
         ]
-        planned = options.refits or (0,) * len(cut)  # of the first call
+        planned = options.refits or (0,) * len(cut)  # set by the first call
         return replace(
             options, refits=tuple(p or (n if c else 0) for p, n, c in zip(planned, refits, cut, strict=True))
         )
 
     def plan(self, sources: Sequence[Source], options: CarryOptions) -> Plan:
-        """The room in the cover before refits; notes tell what the cover and the secrets lose."""
+        """The room in the cover before refits; notes list the losses of the cover and the secrets."""
         cover, *secrets = sources
         room, secret_sizes = room_for(cover.given, options, _PLANNED), _secret_sizes(secrets, options)
         sizes = room.sizes(secret_sizes)
@@ -128,7 +128,7 @@ class CarryMethod:
     def hide(
         self, cover: Source, secrets: Sequence[Source], options: CarryOptions, context: Context
     ) -> Stego:
-        """Refit the secrets that need it, embed all, and open each again as its reader will.
+        """Refit the secrets that need it, embed all, and open each again to check.
 
         Raises UsageError for a cover without room, Interrupted on Ctrl-C, and InputError for a
         checkpoint of another run.
@@ -143,7 +143,7 @@ class CarryMethod:
             for index, (secret, steps, fits) in enumerate(zip(secrets, options.refits, fitting, strict=True)):
                 if steps:
                     cut = len(fits) < len(secret.model)
-                    models[index] = refitted(
+                    models[index] = refit(
                         secret.model.with_sh_degree(fits.sh_degree),
                         secret.scene,
                         max(1, int(room.refit_share * len(fits))) if cut else len(fits),
@@ -174,14 +174,14 @@ def _secret_sizes(secrets: Sequence[Source], options: CarryOptions) -> list[Secr
 
 
 def _check_share(secrets: Sequence[SecretSize], sizes: Sequence[tuple[int, int]]) -> None:
-    """Raise UsageError for given secrets of which hardly anything would be left."""
+    """Raise UsageError for given secrets that would lose most of their Gaussians."""
     for secret, (count, _) in zip(secrets, sizes, strict=True):
-        if secret.model is not None and count < _LEAST_SHARE * secret.count:
+        if secret.model is not None and count < _MIN_SHARE * secret.count:
             raise UsageError(f"a secret of {secret.count:,} Gaussians would be cut down to {count:,}")
 
 
 def _check_fit(secrets: Sequence[SecretSize], sizes: Sequence[tuple[int, int]], more_room: str) -> None:
-    """Raise UsageError for given secrets that do not fit as they are."""
+    """Raise UsageError for given secrets that do not fit unchanged."""
     for secret, (count, degree) in zip(secrets, sizes, strict=True):
         if secret.model is not None and secret.size != (count, degree):
             raise UsageError(
@@ -194,7 +194,7 @@ def _check_fit(secrets: Sequence[SecretSize], sizes: Sequence[tuple[int, int]], 
 METHOD = CarryMethod()
 
 
-def refitted(
+def refit(
     secret: Gaussians,
     scene: Scene,
     count: int,
@@ -204,7 +204,7 @@ def refitted(
     photos: bool,
     name: str,
 ) -> Gaussians:
-    """Train the `count` Gaussians of `secret` that contribute most.
+    """Fine-tune the `count` Gaussians of `secret` with the largest contributions.
 
     Raises Interrupted on Ctrl-C, InputError for a checkpoint of another run.
     """

@@ -1,4 +1,4 @@
-"""The options of carrying."""
+"""The options of the method `carry`."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from keyss.core.errors import UsageError
 from keyss.fitting.config import FitConfig
 from keyss.methods.base import CommandLineOption, MethodOptions, Training
 
-REFIT = 1.15  # steps of a refit to photos for each of a fit: with as many, secrets lose 0.15 dB
+REFIT = 1.15  # refit steps / fit steps, with photos; at 1, secrets lose 0.15 dB
 
 
 @dataclass(frozen=True, kw_only=True)
 class CarryOptions(MethodOptions):
-    """Options of carrying; `fit` is that of plain models, of which secrets get REFIT more steps."""
+    """Options of `carry`; `fit` is for plain models, and refits add REFIT times its steps."""
 
     method: ClassVar[str] = "carry"
 
@@ -35,10 +35,10 @@ class CarryOptions(MethodOptions):
             "Degree of the published model's spherical harmonics, 0 to 3.", metavar="N", default="the cover's"
         ),
     ] = None
-    iterations: int | None = None  # of a refit; None: REFIT for each of `fit`, and fewer without photos
+    iterations: int | None = None  # steps per refit; None: REFIT per step of `fit`, fewer without photos
 
-    # Set by `prepare`: the highest SH degree of secrets, and steps of the refit of each secret, 0 for those
-    # that are carried as they are.
+    # Set by `prepare`: the maximum SH degree of secrets, and the refit steps of each secret (0: carried
+    # unchanged).
     max_secret_degree: int = 3
     refits: tuple[int, ...] = ()
 
@@ -49,17 +49,17 @@ class CarryOptions(MethodOptions):
 
     @property
     def may_train(self) -> bool:
-        """True unless refits are ruled out."""
+        """True unless the options exclude refits."""
         return self.refit != "never" and not self.prune_to_fit
 
     @property
     def may_show(self) -> bool:
-        """Whether secrets that do not go in unnoticed may go in visibly."""
+        """True if secrets that cannot be hidden unnoticed may be hidden visibly."""
         asked = self.prune_to_fit or self.dither or self.format is not None
         return self.publish == "as-is" and self.refit == "auto" and not asked
 
     def fits(self, scenes: int) -> list[FitConfig]:
-        """Secrets get the steps of a refit if none follows, and no more harmonics than can be carried."""
+        """Secrets get the steps of a refit if none follows, and at most the harmonics that fit."""
         degree = min(self.fit.sh_degree, self.max_secret_degree)
         alone = round((1 + REFIT) * self.fit.iterations)
         of_secrets = [
@@ -73,10 +73,10 @@ class CarryOptions(MethodOptions):
         return (Training(), *map(Training, self.refits or (0,) * (scenes - 1)))
 
     def for_fitted_cover(self) -> Self:
-        """Dithered where the channel needs random low bits: a fit of few steps may not have them."""
+        """Dither the cover if the channel needs random low bits: few training steps may not make them."""
         return replace(self, dither=True) if self.place.records else self
 
     def with_fit(self, **changes: Any) -> Self:
-        """The same with changed fields of `fit`; `iterations` also changes those of refits."""
+        """Options with changed fields of `fit`; `iterations` also changes those of refits."""
         found = super().with_fit(**changes)
         return replace(found, iterations=changes["iterations"]) if "iterations" in changes else found

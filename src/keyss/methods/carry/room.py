@@ -1,4 +1,4 @@
-"""The room for secrets in a cover: a record for each Gaussian in low bits, else a payload for each secret."""
+"""The room for secrets in a cover: records of Gaussians in low bits, or a payload per secret."""
 
 from __future__ import annotations
 
@@ -22,23 +22,23 @@ from keyss.channels import (
 from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.keys.derivation import expand
-from keyss.methods.base import divided
+from keyss.methods.base import divide
 from keyss.methods.carry.options import CarryOptions
-from keyss.methods.dither import dither_model, loosened, raised
+from keyss.methods.dither import add_noise, dither_model, raise_degree
 from keyss.methods.records.embedding import largest_degree, record_request, shares
-from keyss.methods.records.precision import most_visible, pruned
+from keyss.methods.records.precision import most_visible, prune_to_size
 from keyss.methods.records.whole import encode
 from keyss.rendering.difference import Viewpoints
 
-_BITS_PER_GAUSSIAN = 150  # of the payload of a secret that is not fitted yet
-_DRAWS = 3  # of new low bits: in covers of few bits, one in five has stale salts or bits that seem not random
-_TINY = 16  # Gaussians; a secret is not cut down to fewer
+_BITS_PER_GAUSSIAN = 150  # payload estimate for a secret that is not fitted yet
+_DRAWS = 3  # attempts at new low bits: in covers of few bits, one in five has stale salts or nonrandom bits
+_TINY = 16  # Gaussians; secrets are not pruned to fewer
 _ANY = '`publish="any"` has room for all'
 
 
 @dataclass(frozen=True)
 class SecretSize:
-    """The size of a secret, or the largest that it may get if it is not fitted yet."""
+    """The size of a secret, or its maximum size if it is not fitted yet."""
 
     count: int
     sh_degree: int
@@ -74,18 +74,18 @@ def _check_not_tiny(
 class RecordRoom:
     """The room for records in low bits: exact for a prepared cover, estimated for one not fitted yet."""
 
-    gaussians: int  # of the cover
-    sh_degree: int  # of the cover
+    gaussians: int  # Gaussians of the cover
+    sh_degree: int  # SH degree of the cover
     room: LowBitsRoom
     prepared: LowBitsCover | None = None  # None: not fitted yet
-    refit_share = 1.0  # of the Gaussians that fit before a refit
+    refit_share = 1.0  # refit size / Gaussians that fit
     more_room = _ANY
 
     @staticmethod
     def of(cover: Gaussians | None, options: CarryOptions, entropy: bytes | None = None) -> RecordRoom:
-        """The room in `cover` once it has the harmonics and low bits that `options` ask for.
+        """The room in `cover` after the changes of harmonics and low bits in `options`.
 
-        Raises UsageError for Gaussians without room for a record, and for low bits that are not random.
+        Raises UsageError if a record does not fit into a Gaussian, and if low bits are not random.
         """
         try:
             return RecordRoom._of(cover, options, os.urandom(32) if entropy is None else entropy)
@@ -96,14 +96,14 @@ class RecordRoom:
     def _of(cover: Gaussians | None, options: CarryOptions, entropy: bytes) -> RecordRoom:
         degree, count = options.fit.sh_degree, options.fit.max_gaussians
         if cover is not None:
-            cover = of_degree(cover, degree, entropy)
+            cover = to_degree(cover, degree, entropy)
         layout = Layout(degree) if cover is None else Layout.of(cover)
         if largest_degree(LowBitsRoom(0, layout.width).record_bytes(1)) is None:
             unit = "" if layout.quats else " with unit quaternions"
             raise UsageError(f"a cover of SH degree {degree}{unit} has no room for anything in its low bits")
         if cover is None:
             return RecordRoom(count, degree, LowBitsRoom(int(TYPICAL_SHARE * count), layout.width))
-        prepared = _prepared(cover, expand(entropy, "carry/dither", 32) if options.dither else None)
+        prepared = _prepare(cover, expand(entropy, "carry/dither", 32) if options.dither else None)
         return RecordRoom(len(cover), degree, prepared.cells, prepared)
 
     @property
@@ -113,29 +113,29 @@ class RecordRoom:
 
     @property
     def max_secret_degree(self) -> int:
-        """The highest SH degree of secrets whose records fit into a Gaussian."""
+        """The maximum SH degree of secrets whose records fit into a Gaussian."""
         return largest_degree(self.room.record_bytes(1)) or 0
 
     def sizes(self, secrets: Sequence[SecretSize]) -> list[tuple[int, int]]:
-        """Gaussians and SH degree that each secret can have, at most its own.
+        """Gaussians and SH degree that fit for each secret, at most its own.
 
-        Raises UsageError for a cover that is too small.
+        Raises UsageError if the cover is too small.
         """
         counts = [secret.count for secret in secrets]
         degrees = [min(secret.sh_degree, self.max_secret_degree) for secret in secrets]
         requests = [record_request(*size) for size in zip(counts, degrees, strict=True)]
         capacity = self.room.record_capacity(requests)
         if sum(counts) > capacity:
-            # A key must not reveal whether there are other secrets, unless that leaves one of them no room.
+            # A key must not reveal whether there are other secrets, unless one of them would have no room.
             largest = max(request.least_bytes for request in requests)
             share = self.room.unnoticed_records(largest, len(secrets)) if len(secrets) > 1 else 0
-            counts = [min(count, share) for count in counts] if share else divided(counts, capacity)
+            counts = [min(count, share) for count in counts] if share else divide(counts, capacity)
         place = f"low bits, {self.room.carriers:,} of them random"
         _check_not_tiny(counts, secrets, self.gaussians, place, _ANY)
         return list(zip(counts, degrees, strict=True))
 
     def prune(self, models: Sequence[Gaussians], viewpoints: Sequence[Viewpoints]) -> list[Gaussians]:
-        """The most visible Gaussians of each model that fit, all of them if they do."""
+        """The most visible Gaussians of each model that fit, or all."""
         return [
             most_visible(model.with_sh_degree(degree), count)
             for model, (count, degree) in zip(models, self.sizes([*map(SecretSize.of, models)]), strict=True)
@@ -150,14 +150,14 @@ class RecordRoom:
 class WholeRoom:
     """The room for payloads: exact for a prepared cover, estimated for one not fitted yet."""
 
-    gaussians: int  # of the cover
-    sh_degree: int  # of the published model
+    gaussians: int  # Gaussians of the cover
+    sh_degree: int  # SH degree of the published model
     channel: Channel
     room: Room
     cover: Gaussians | None = None  # before embedding; None: not fitted yet
     prepared: PreparedCover | None = None
     max_secret_degree = 3
-    refit_share = 0.97  # of the Gaussians that fit before a refit, which changes how well they compress
+    refit_share = 0.97  # refit size / Gaussians that fit: refitted Gaussians compress a little worse
     more_room = _ANY
 
     @staticmethod
@@ -185,10 +185,10 @@ class WholeRoom:
     def prune(self, models: Sequence[Gaussians], viewpoints: Sequence[Viewpoints]) -> list[Gaussians]:
         """See `RecordRoom.prune`; the SH degree is the one that renders most like the model."""
         rooms = shares(self.room, [len(encode(model)) for model in models])
-        return [pruned(*each) for each in zip(models, rooms, viewpoints, strict=True)]
+        return [prune_to_size(*each) for each in zip(models, rooms, viewpoints, strict=True)]
 
     def appended(self, secrets: Sequence[SecretSize]) -> int:
-        """About how many Gaussians the model grows by."""
+        """Approximate number of Gaussians by which the model grows."""
         if not self.room.grows:
             return 0
         return APPENDED.appended([secret.payload_bytes for secret in secrets])
@@ -197,7 +197,7 @@ class WholeRoom:
 def room_for(
     cover: Gaussians | None, options: CarryOptions, entropy: bytes | None = None
 ) -> RecordRoom | WholeRoom:
-    """The room in a cover: exact for one that is fitted, otherwise estimated.
+    """The room in a cover: exact for a fitted one, otherwise estimated.
 
     Raises UsageError for a cover without room.
     """
@@ -206,13 +206,13 @@ def room_for(
 
 
 def _ways(cover: Gaussians | None, options: CarryOptions) -> str:
-    """For messages: the smallest change of the options that gives `cover` room, and what always works."""
+    """For messages: the smallest change of the options that gives `cover` room, and one that always works."""
     entropy = os.urandom(32)
     degrees = [degree for degree in (1, 2) if degree > options.fit.sh_degree]
     for degree in (None, *degrees):
         for dither in (False, True):
             if degree is None and dither <= options.dither:
-                continue  # what was refused
+                continue  # refused already
             changed = options if degree is None else options.with_fit(sh_degree=degree)
             try:
                 room = RecordRoom._of(cover, replace(changed, dither=dither or options.dither), entropy)
@@ -224,8 +224,8 @@ def _ways(cover: Gaussians | None, options: CarryOptions) -> str:
     return _ANY
 
 
-def _prepared(cover: Gaussians, entropy: bytes | None) -> LowBitsCover:
-    """The cover as it is, or dithered from `entropy`. Raises UsageError for low bits that are not random."""
+def _prepare(cover: Gaussians, entropy: bytes | None) -> LowBitsCover:
+    """Prepare the cover, dithered by `entropy` if needed. Raises UsageError if low bits are not random."""
     try:
         return LOW_BITS.prepare(cover)
     except UsageError as error:
@@ -240,14 +240,14 @@ def _prepared(cover: Gaussians, entropy: bytes | None) -> LowBitsCover:
         except UsageError:
             pass
         try:
-            return LOW_BITS.prepare(loosened(dithered, usable_carriers(dithered), noise))
+            return LOW_BITS.prepare(add_noise(dithered, usable_carriers(dithered), noise))
         except UsageError as error:
             refused = error
     raise refused
 
 
-def of_degree(model: Gaussians, sh_degree: int, entropy: bytes) -> Gaussians:
-    """`model` with harmonics of `sh_degree`; added ones are too small to be seen."""
+def to_degree(model: Gaussians, sh_degree: int, entropy: bytes) -> Gaussians:
+    """`model` with harmonics of `sh_degree`; added ones are imperceptible."""
     if model.sh_degree > sh_degree:
         return model.with_sh_degree(sh_degree)
-    return raised(model, sh_degree, expand(entropy, "carry/raised", 32))
+    return raise_degree(model, sh_degree, expand(entropy, "carry/raised", 32))

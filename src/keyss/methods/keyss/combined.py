@@ -1,7 +1,7 @@
 """Combined camera poses and combined SfM points (KeySS, section 3.4).
 
-Every training pose of every scene supervises all scenes. The target is a scene's photo where there is one for
-the pose, and elsewhere a render of its plain 3DGS model. Everything is in the cover's frame.
+Every training pose of every scene supervises all scenes. A scene's target is its photo from that pose, or a
+render of its plain 3DGS model if there is none. Everything is in the cover's frame.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from keyss.core.similarity import Similarity, align
 from keyss.fitting.config import FitConfig
 from keyss.fitting.losses import Target, Targets
 from keyss.fitting.parameters import initial_gaussians, initial_points
-from keyss.methods.base import Source, divided
+from keyss.methods.base import Source, divide
 from keyss.rendering import render
 
 CACHE_BYTES = 2 << 30
@@ -30,31 +30,31 @@ class PlacedScene:
 
     scene: Scene
     plain: Gaussians
-    frame: Similarity  # from its own frame into the cover's
+    frame: Similarity  # own frame to cover frame
 
     @staticmethod
     def of(scene: Scene, plain: Gaussians, frame: Similarity) -> PlacedScene:
         """Move a scene and its plain model, both in the scene's own frame, by `frame`."""
 
-        def moved(views: Sequence[View]) -> tuple[View, ...]:
+        def move(views: Sequence[View]) -> tuple[View, ...]:
             return tuple(replace(view, camera=frame.apply_camera(view.camera)) for view in views)
 
         points = frame.apply_points(scene.points)
-        placed = replace(scene, train=moved(scene.train), test=moved(scene.test), points=points)
+        placed = replace(scene, train=move(scene.train), test=move(scene.test), points=points)
         return PlacedScene(placed, frame.apply_gaussians(plain), frame)
 
     @staticmethod
     def all_of(sources: Sequence[Source]) -> list[PlacedScene]:
-        """The cover, then the secrets, whose cameras are aligned with the cover's (ours; see `align`)."""
+        """The cover, then the secrets, aligned with it by their cameras (ours; see `align`)."""
         cameras = [[view.camera for view in source.scene.train] for source in sources]
         frames = [Similarity(), *(align(each, cameras[0]) for each in cameras[1:])]
         return [PlacedScene.of(each.scene, each.model, at) for each, at in zip(sources, frames, strict=True)]
 
 
 def combined_points(scenes: Sequence[Scene], fit: FitConfig, generator: torch.Generator) -> Gaussians:
-    """Gaussians at the points of all scenes, in equal shares of the cap as far as there are points."""
+    """Gaussians at the points of all scenes, in equal shares of the cap if there are enough points."""
     clouds = [initial_points(scene, fit.max_gaussians, generator) for scene in scenes]
-    counts = divided([len(points) for points, _ in clouds], fit.max_gaussians)
+    counts = divide([len(points) for points, _ in clouds], fit.max_gaussians)
     parts = [
         initial_gaussians(points, colors, fit.sh_degree, share, generator)
         for (points, colors), share in zip(clouds, counts, strict=True)
@@ -86,7 +86,7 @@ class CombinedPoses:
         return self._targets.of((scene, owner, index), image, own.mask if own else None)
 
     def _render(self, scene: int, owner: int, index: int) -> Tensor:
-        """Rendered once, kept as 8-bit pixels like the photos while they fit into CACHE_BYTES."""
+        """Render once, and cache as 8-bit pixels, like photos, up to CACHE_BYTES."""
         cached = self._rendered.get((scene, owner, index))
         if cached is not None:
             return cached

@@ -1,7 +1,4 @@
-"""The decoder D: turns the cover's Gaussians into a secret's, one by one, told by the key which secret.
-
-KeySS, section 3.2 and appendix B.
-"""
+"""The decoder D: maps each of the cover's Gaussians to a secret's (KeySS, section 3.2 and appendix B)."""
 
 from __future__ import annotations
 
@@ -16,7 +13,7 @@ from keyss.core.gaussians import Gaussians
 from keyss.methods.keyss.options import DecoderShape
 
 FIELDS = {"op": "opacity_logits", "ro": "quats", "sc": "log_scales", "xyz": "means", "sh": "sh"}
-DECODED_NUMBERS = 1 << 23  # held at a time: 32 MiB, whatever sizes a file gives its decoder
+DECODED_NUMBERS = 1 << 23  # maximum activations at a time: 32 MiB, even for untrusted files
 
 
 class Decoder(nn.Module):
@@ -44,16 +41,16 @@ class Decoder(nn.Module):
                     nn.init.zeros_(layer.bias)
 
     def forward(self, cover: Gaussians, key: Tensor, whole: Gaussians | None = None) -> Gaussians:
-        """Decode `cover`, which may be a part of the model `whole`."""
-        features = [*self.normalized(cover, whole or cover), F.normalize(key, dim=0).expand(len(cover), -1)]
+        """Decode `cover`, which may be a part of `whole`."""
+        features = [*self.normalize(cover, whole or cover), F.normalize(key, dim=0).expand(len(cover), -1)]
         h = self.common(torch.cat(features, dim=1))
-        return self.updated(cover, {name: branch(h) for name, branch in self.branches.items()})
+        return self.add_residuals(cover, {name: branch(h) for name, branch in self.branches.items()})
 
-    def normalized(self, cover: Gaussians, whole: Gaussians) -> list[Tensor]:
+    def normalize(self, cover: Gaussians, whole: Gaussians) -> list[Tensor]:
         """alpha, r, s, mu and c of section 3.2, each divided by its length ("L2-normalized", appendix B).
 
-        Of the opacity, a single number, that would leave the sign: alpha in (0, 1) goes in as it is. Their
-        program divides all raw opacities by the length of the vector of all.
+        The opacity is a single number, so normalising would leave only its sign: alpha in (0, 1) is not
+        normalised. The authors' program divides raw opacities by the norm of all of them.
         """
         alpha = cover.opacities
         if self.shape.released:
@@ -61,10 +58,10 @@ class Decoder(nn.Module):
         others = (cover.quats, cover.log_scales, cover.means, cover.sh.flatten(1))
         return [alpha[:, None], *(F.normalize(values, dim=1) for values in others)]
 
-    def updated(self, cover: Gaussians, residuals: Mapping[str, Tensor]) -> Gaussians:
+    def add_residuals(self, cover: Gaussians, residuals: Mapping[str, Tensor]) -> Gaussians:
         """attribute* = attribute + theta . residual (equation 8), on raw attributes.
 
-        In their program, residuals of all but the opacity are at least 0.
+        In the authors' program, all residuals but the opacity's are clamped at 0.
         """
         changed = {}
         for name, residual in residuals.items():
@@ -75,7 +72,7 @@ class Decoder(nn.Module):
 
     @torch.no_grad()
     def decode(self, stego: Gaussians, key: Tensor) -> Gaussians:
-        """`forward`, in parts."""
+        """`forward` in parts, to bound memory."""
         shape = self.shape
         numbers = 4 * (shape.inputs + sum(shape.hidden) + len(shape.mask) * shape.branch)
         step = max(1, DECODED_NUMBERS // numbers)

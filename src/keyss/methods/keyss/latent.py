@@ -1,13 +1,12 @@
-"""Ours: the decoder of the design `latent`, which is linear, and the encryption of what it decodes.
+"""The linear decoder of the design `latent` (ours), and the encryption of its input.
 
-Every row of the published model is a Gaussian of the cover, and its harmonics hold the *latents* of a
-Gaussian of each secret (`keyss.channels.harmonics`): opacity, rotation, scale, position, constant colour, and
-a code, from which a trained basis makes the harmonics.
+Every row of the published model is a Gaussian of the cover. Its harmonics hold the *latents* of a Gaussian of
+each secret (`keyss.channels.harmonics`): opacity, rotation, scale, position, constant colour, and a code that
+a trained basis expands to harmonics.
 
-Latents are encrypted by a stream cipher on real numbers: a latent becomes its rank in (0, 1/4), a pad in
-[0, 1) that follows from the key and the row is added modulo 1, and that is the rank that is written. Whatever
-the latents are, it is uniform. A row belongs to a key if all its latents come out in (0, 1/4): another key
-opens no row and shows the cover.
+Latents are encrypted by a stream cipher on real numbers: the rank of a latent, scaled to (0, 1/4), plus a pad
+in [0, 1) derived from the key and the row, modulo 1. The result is uniform for any latents. A row belongs to
+a key if all its latents decrypt to (0, 1/4): another key opens no row and shows the cover.
 """
 
 from __future__ import annotations
@@ -37,16 +36,16 @@ from keyss.methods.keyss.decoder import Decoder
 from keyss.methods.keyss.options import DecoderShape
 
 OWN = 13  # latents without the code: opacity 1, rotation 3, log scales 3, position 3, constant colour 3
-MOST = (24, 14)  # latents of one secret, of each of two: more cost the cover more than they give secrets
-LEAST_KEPT = 2  # directions that stay the cover's, by which the spread of a row is known
-SHARE = 4  # a latent takes 1 / SHARE of the circle: a foreign row passes once in SHARE ** latents times
-GUARD = 1 / 256  # at both ends of that share, for rounding
+MAX_LATENTS = (24, 14)  # for one secret, for each of two: more cost the cover more than secrets gain
+MIN_KEPT = 2  # directions that stay the cover's, and give the spread of a row
+SHARE = 4  # a latent takes 1 / SHARE of the circle: a foreign row passes with probability SHARE ** -latents
+GUARD = 1 / 256  # margin for rounding, at both ends of a latent's share
 NONCE_BYTES = 16
 
 
 def latents_of(sh_degree: int, secrets: int) -> int:
-    """D, the latents of each of so many secrets. Raises UsageError where a row has no room."""
-    count = min(MOST[min(secrets, 2) - 1], (harmonics_above(sh_degree) - LEAST_KEPT) // secrets)
+    """D, the latents of each of `secrets`. Raises UsageError if a row has no room for them."""
+    count = min(MAX_LATENTS[min(secrets, 2) - 1], (harmonics_above(sh_degree) - MIN_KEPT) // secrets)
     if count < OWN:
         raise UsageError(
             f"SH degree {sh_degree} with {secrets} secrets: the harmonics of a Gaussian have no room for one "
@@ -56,10 +55,10 @@ def latents_of(sh_degree: int, secrets: int) -> int:
 
 
 class LatentDecoder(Decoder):
-    """D for one secret of those that share the rows."""
+    """The decoder D of one secret among those that share the rows."""
 
     knots: Tensor  # [D, 33] quantiles of the secret's latents, at RANKS
-    nonce: Tensor  # [16] bytes that follow from the secret, so that no pad serves two
+    nonce: Tensor  # [16] bytes derived from the secret, so that pads are never reused
 
     def __init__(self, shape: DecoderShape) -> None:
         nn.Module.__init__(self)
@@ -105,7 +104,7 @@ class LatentDecoder(Decoder):
         return (inside + self._pads(key, names)) % 1
 
     def decrypt(self, ranks: Doubles, key: Tensor, names: Bytes) -> tuple[Doubles, Flags]:
-        """[M, D] the latents in the rows that belong to `key`; [N] which these are."""
+        """[M, D] latents in the rows that belong to `key`, and [N] which rows these are."""
         inside = SHARE * ((ranks - self._pads(key, names)) % 1)
         fits: Flags = np.all(inside <= 1, axis=1)
         own = ((inside[fits] - GUARD) / (1 - 2 * GUARD)).clip(0, 1)
@@ -124,7 +123,7 @@ class LatentDecoder(Decoder):
         return torch.cat([opacity, rotation, model.log_scales, model.means, colours], dim=1)
 
     def colours(self, rows: Tensor) -> Tensor:
-        """[N, K, 3] harmonics of rows [N, 3 + C]: constant colours, and a code that the basis multiplies."""
+        """[N, K, 3] harmonics of rows [N, 3 + C]: constant colours, and the code times the basis."""
         return Colours.apply(rows, self.basis, None)  # type: ignore[no-any-return,no-untyped-call]
 
     def to_gaussians(self, latents: Tensor) -> Gaussians:
@@ -136,9 +135,9 @@ class LatentDecoder(Decoder):
 
 
 class Colours(torch.autograd.Function):
-    """[N, K, 3] harmonics of rows [N, W]: the first numbers as they are, the others times `basis` [C, H].
+    """[N, K, 3] harmonics of rows [N, W]: the first numbers unchanged, the others times `basis` [C, H].
 
-    `noise` [N, H] is added to the product. In one pass, where torch's own operations take four.
+    `noise` [N, H] is added to the product. Takes one pass; torch's own operations take four.
     """
 
     @staticmethod

@@ -1,9 +1,9 @@
-"""Ours: the training of the design `latent`. Every row of the model is a Gaussian of each scene.
+"""The training of the design `latent` (ours). Every row of the model is a Gaussian of each scene.
 
-Each scene starts from its own points with the whole cap, has its own views and its own density control, as
-plain 3DGS does. The cover trains with numbers like those that will be written in place of the latents, the
-secrets with harmonics that the decoder makes of a code. Adam's moments are those of latents before
-encryption: with moments of what is written, secrets lose 1.1 dB. Wrong keys open no row and need no loss.
+Like plain 3DGS, each scene has its own starting points up to the cap, views and density control. The cover
+trains with noise in the place of the encrypted latents, the secrets with harmonics decoded from codes. Adam's
+moments are those of latents before encryption: with moments of encrypted latents, secrets lose 1.1 dB. Wrong
+keys open no row and need no loss.
 """
 
 from __future__ import annotations
@@ -35,11 +35,11 @@ from keyss.methods.keyss.secret import KeyssSecret, choose_anchors, visibility
 from keyss.methods.keyss.training import KeyssTraining, Picture
 from keyss.rendering.view import contributions
 
-PRUNED_SHARE = 0.25  # of the published rows, the faintest, which `Design.pruned_steps` render without
-BASIS_SIZE = 2.0  # length of the vectors of the first basis
-BOUND = 0.9  # share of the steps after which rows are given
-NOISE_STEPS, WORTH_STEPS = 50, 100  # after which what is written, and what is pruned, is computed anew
-VIEWS, FEW_VIEWS = 64, 16  # in which contributions are measured for publishing, and in training
+PRUNED_SHARE = 0.25  # fraction of the published rows, faintest first, that pruned steps leave out
+BASIS_SIZE = 2.0  # length of the vectors of the initial basis
+BOUND = 0.9  # share of the steps after which rows are assigned
+NOISE_STEPS, WORTH_STEPS = 50, 100  # steps between updates of the noise, and of the pruned rows
+VIEWS, FEW_VIEWS = 64, 16  # views for measuring contributions: when publishing, in training
 _LOW = 3 * (KEPT_DEGREE + 1) ** 2  # numbers of the cover's colours that are harmonics, not a code
 
 
@@ -47,13 +47,13 @@ class LatentTraining(KeyssTraining):
     """See `KeyssTraining`. Parameters of secret s have names like `s/means`; `sh` are codes of colours."""
 
     decoders: list[LatentDecoder]
-    pruned = False  # whether a step renders what pruning leaves
+    pruned = False  # True while a step renders pruned models
 
     def start(self) -> Gaussians:
-        return self.filled(0)
+        return self.pad_to_cap(0)
 
-    def filled(self, scene: int) -> Gaussians:
-        """A scene's sparse points, as plain 3DGS starts, and empty places up to the cap."""
+    def pad_to_cap(self, scene: int) -> Gaussians:
+        """A scene's sparse points, like the start of plain 3DGS, padded with empty slots to the cap."""
         model = combined_points([self.scenes[scene].scene], self.fit, self.generator)
         rest = model[torch.arange(self.fit.max_gaussians - len(model)) % len(model)]
         rest = replace(rest, opacity_logits=torch.full((len(rest),), EMPTY))
@@ -61,22 +61,22 @@ class LatentTraining(KeyssTraining):
 
     def prepare(self, start: Gaussians) -> None:
         fit, count = self.fit, len(self.keys)
-        shape = self.design.decoder.sized(fit.sh_degree, len(self.keys[0]), count)
+        shape = self.design.decoder.with_sizes(fit.sh_degree, len(self.keys[0]), count)
         self.decoders = [LatentDecoder(replace(shape, secret=secret)) for secret in range(count)]
         self.kept = self.decoders[0].place.fit(self.scenes[0].plain).T.contiguous().to(self.device)
         place = self.decoders[0].place.state_dict()
         for decoder, placed in zip(self.decoders, self.scenes[1:], strict=True):
             decoder.place.load_state_dict(place)
-            decoder.basis.data.copy_(first_basis(placed.plain, *decoder.basis.shape))
+            decoder.basis.data.copy_(initial_basis(placed.plain, *decoder.basis.shape))
         self.networks.extend(self.decoders)
         self.schedules = []
         for scene, placed in enumerate(self.scenes):
             cameras = [view.camera for view in placed.scene.train]
             self.schedules.append(Schedule(fit, cameras, placed.scene.extent))
-            own = to_parameters(self.filled(scene) if scene else start, self.device)
+            own = to_parameters(self.pad_to_cap(scene) if scene else start, self.device)
             optimizers = make_optimizers(own, fit, placed.scene.extent)
             first, coded = (3, len(self.decoders[scene - 1].basis)) if scene else (_LOW, len(self.kept))
-            # A number of a code moves as far as all the harmonics that it stands for.
+            # The rate of a code's number is the sum of those of the harmonics that it encodes.
             rates = torch.full((first + coded,), fit.shN_rate, device=self.device)
             rates[:3] = fit.sh0_rate
             rates[first:] *= (own["sh"][0].numel() - first) / max(1, coded)
@@ -111,12 +111,12 @@ class LatentTraining(KeyssTraining):
 
     @property
     def binding(self) -> int:
-        """The step from which each Gaussian of a secret has its row, and the cover's geometry stays."""
+        """The step that assigns rows to the secrets' Gaussians and freezes the cover's geometry."""
         return int(BOUND * self.iterations)
 
     @torch.no_grad()
     def bind(self) -> None:
-        """Give the secrets' Gaussians their rows: what matters most those that pruning removes last."""
+        """Assign rows to the secrets' Gaussians: the largest contributions get the most opaque rows."""
         rows = self.usable_rows()
         if not len(rows):
             raise InputError(
@@ -125,7 +125,8 @@ class LatentTraining(KeyssTraining):
             )
         for scene, decoder in enumerate(self.decoders, 1):
             model, own = self.gaussians_of(scene), of_scene(self.parameters, scene)
-            worth = self.worth(model, scene, VIEWS).masked_fill(model.opacities < self.fit.prune_opacity, 0.0)
+            faint = model.opacities < self.fit.prune_opacity
+            worth = self.contribution(model, scene, VIEWS).masked_fill(faint, 0.0)
             best = worth.argsort(descending=True, stable=True)[: len(rows)]
             rest = torch.ones(len(model), dtype=torch.bool, device=self.device)
             rest[best] = False
@@ -139,29 +140,29 @@ class LatentTraining(KeyssTraining):
                 for values in (parameter.data, *state.values()):
                     if isinstance(values, Tensor) and values.shape[:1] == parameter.shape[:1]:
                         values.copy_(values[order].clone())
-            own["opacities"].data[free] = EMPTY  # what has no row is not published
+            own["opacities"].data[free] = EMPTY  # without a row, a Gaussian is not published
             decoder.fit_secret(self.latents(scene)[rows.cpu().numpy()])
 
     def usable_rows(self) -> Tensor:
-        """[M] the rows that hide a Gaussian, the most opaque first."""
+        """[M] rows that can hide a Gaussian, most opaque first."""
         cover = self.gaussians_of(0).detach()
-        # An identity that occurs twice would have one pad.
+        # Equal identities would reuse a pad.
         _, index, counts = np.unique(row_names(cover), axis=0, return_inverse=True, return_counts=True)
         once = torch.from_numpy(counts[index.reshape(-1)] == 1).to(self.device)
         high = (cover.sh[:, (KEPT_DEGREE + 1) ** 2 :] != 0).flatten(1).any(1)
         usable = once & high & (cover.opacities >= self.fit.prune_opacity)
-        # Rows with a saturated channel come last: where it stays so, nothing is written in the end.
-        first = cover.opacity_logits.masked_fill(saturated(cover).any(1), -math.inf)
+        # Rows with a saturated channel come last: `publish` writes nothing into those that stay saturated.
+        first = cover.opacity_logits.masked_fill(is_saturated(cover).any(1), -math.inf)
         order = first.argsort(descending=True, stable=True)
         return order[usable[order]]
 
     def latents(self, scene: int) -> Doubles:
-        """[N, D] of a secret's Gaussians."""
+        """[N, D] latents of a secret's Gaussians."""
         model, rows = self.gaussians_of(scene).detach(), self.parameters[f"{scene}/sh"].detach()
         return self.decoders[scene - 1].to_latents(model, rows).double().cpu().numpy()
 
     def ranks(self, entropy: bytes) -> Doubles:
-        """[N, R] what is written into the rows: encrypted latents, and noise that follows from `entropy`."""
+        """[N, R] ranks to write into the rows: encrypted latents, and noise seeded by `entropy`."""
         count = self.decoders[0].place.directions.shape[1]
         words = np.frombuffer(stream(entropy, "latents", 8 * len(self) * count), "<u8")
         ranks: Doubles = ((words >> np.uint64(11)) / 2.0**53).reshape(len(self), count)
@@ -172,13 +173,13 @@ class LatentTraining(KeyssTraining):
 
     def set_rates(self) -> None:
         super().set_rates()
-        if self.iteration > self.binding:  # pads follow from the geometry
+        if self.iteration > self.binding:  # pads depend on the geometry
             for name in ("means", "quats", "scales", "opacities"):
                 self.optimizers[name].param_groups[0]["lr"] = 0.0
 
     @torch.no_grad()
     def choose_kept(self) -> None:
-        """[N] what is left of each scene when the faintest PRUNED_SHARE of the published file is removed."""
+        """Update the masks [N] of Gaussians left when the faintest PRUNED_SHARE of the rows is removed."""
         cover = self.gaussians_of(0)
         alive = cover.opacities >= self.fit.prune_opacity
         faintest = cover.opacity_logits.masked_fill(~alive, -math.inf).argsort()
@@ -189,18 +190,18 @@ class LatentTraining(KeyssTraining):
         for scene in range(1, len(self.scenes)):
             best = kept.clone()
             if self.iteration < self.binding:
-                worth = self.worth(self.gaussians_of(scene), scene, FEW_VIEWS)
+                worth = self.contribution(self.gaussians_of(scene), scene, FEW_VIEWS)
                 best = torch.zeros_like(kept)
                 best[worth.argsort(descending=True, stable=True)[:left]] = True
             self.density[f"kept.{scene}"] = best
 
-    def worth(self, model: Gaussians, scene: int, views: int) -> Tensor:
-        """[N] what each Gaussian of a secret adds to views of its scene."""
+    def contribution(self, model: Gaussians, scene: int, views: int) -> Tensor:
+        """[N] contribution of each Gaussian of a secret to views of its scene."""
         cameras = [view.camera for view in subsample_views(self.scenes[scene].scene.train, views)]
         return contributions(model, cameras) * model.opacities
 
     def gaussians_of(self, scene: int, noise: Tensor | None = None) -> Gaussians:
-        """[N] the Gaussians of a scene, attached to the graph; `noise` in place of the latents."""
+        """The Gaussians of a scene, attached to the graph, with `noise` in place of the latents."""
         own = of_scene(self.parameters, scene)
         basis = self.decoders[scene - 1].basis if scene else self.kept
         sh = Colours.apply(own["sh"], basis, noise)  # type: ignore[no-untyped-call]
@@ -223,12 +224,12 @@ class LatentTraining(KeyssTraining):
     def publish(self, entropy: bytes) -> tuple[Gaussians, list[KeyssSecret]]:
         clean = self.gaussians_of(0).detach()
         high = self.decoders[0].place.write(high_harmonics(clean), self.ranks(entropy))
-        # Training leaves all harmonics of a saturated channel at 0, and so does publishing.
-        high *= ~saturated(clean).repeat(1, high.shape[1] // 3).cpu().numpy()
-        # The rows in the order of plain 3DGS, which appends what grows.
+        # Harmonics of a saturated channel stay at 0, as in training.
+        high *= ~is_saturated(clean).repeat(1, high.shape[1] // 3).cpu().numpy()
+        # Sort rows like plain 3DGS, which appends new Gaussians.
         born = self.density["born"].argsort(stable=True)
         stego = without_faint(with_high_harmonics(clean, high)[born].to("cpu"), self.fit.prune_opacity)
-        # Training makes do without the faintest rows: only what is lost beyond them has to be made up for.
+        # Pruned training steps already compensate for the faintest rows: count losses from there on.
         opaque = stego[stego.opacities.argsort()[int(PRUNED_SHARE * len(stego)) :]]
         anchors, secrets = choose_anchors(stego, self.fit.known_seed), []
         for decoder, key, placed in zip(self.decoders, self.keys, self.scenes[1:], strict=True):
@@ -238,13 +239,13 @@ class LatentTraining(KeyssTraining):
         return stego, secrets
 
 
-def saturated(model: Gaussians) -> Tensor:
-    """[N, 3] the channels whose harmonics of degree 1 are all 0."""
+def is_saturated(model: Gaussians) -> Tensor:
+    """[N, 3] True for channels whose harmonics of degree 1 are all 0."""
     return (model.sh[:, 1:4] == 0).all(1)
 
 
-def first_basis(plain: Gaussians, count: int, width: int) -> Tensor:
-    """[count, width] the directions in which the harmonics of a plain model vary most."""
+def initial_basis(plain: Gaussians, count: int, width: int) -> Tensor:
+    """[count, width] principal directions of the harmonics of a plain model."""
     harmonics = plain.sh[:, 1:].flatten(1) * plain.opacities[:, None]
     vectors = torch.linalg.eigh(harmonics.T @ harmonics)[1]
     basis: Tensor = BASIS_SIZE * vectors.flip(1)[:, :count].T

@@ -1,8 +1,8 @@
-"""KeySS, *Key-Secured 3D Secrets within 3D Gaussian Splatting*: the method of that name.
+"""KeySS, *Key-Secured 3D Secrets within 3D Gaussian Splatting*.
 
 Read `options` (the paper's symbols and values), `decoder` (equations 3, 6 and 8), `combined` (poses and
 points) and `training` (losses 4, 5 and 7, their sum 11, one step, publishing). `latent`, `latent_training`
-and `rows` are the default design, which is ours; `secret` is what is hidden beside the model.
+and `keyss.fitting.rows` are the default design (ours); `secret` is the hidden payload.
 """
 
 from __future__ import annotations
@@ -42,9 +42,9 @@ class KeyssMethod:
     options = KeyssOptions
 
     def prepare(self, sources: Sequence[Source], options: KeyssOptions) -> KeyssOptions:
-        """Sets the design's loss. Warns (KeyssWarning) of models too small for the payloads' low bits.
+        """Set the design's loss. Warns (KeyssWarning) if models are too small for the payloads' low bits.
 
-        Raises UsageError for more secrets than the design can hide, BackendError where CLIP is missing.
+        Raises UsageError for more secrets than the design can hide, BackendError if CLIP is missing.
         """
         design, secrets = options.configuration, len(sources) - 1
         if design.ssim_weight is not None:
@@ -68,13 +68,13 @@ class KeyssMethod:
         return options
 
     def plan(self, sources: Sequence[Source], options: KeyssOptions) -> Plan:
-        """All scenes share as many Gaussians as a plain model has."""
+        """All scenes share the Gaussians of one model."""
         return options.joint_plan(len(sources) - 1)
 
     def hide(
         self, cover: Source, secrets: Sequence[Source], options: KeyssOptions, context: Context
     ) -> Stego:
-        """Train the cover and the secrets together, and encrypt what reveals each.
+        """Train the cover and the secrets jointly, and hide a payload for each secret.
 
         Raises Interrupted on Ctrl-C, and InputError for a checkpoint of another run.
         """
@@ -94,7 +94,7 @@ class KeyssMethod:
         keyed = list(zip(keys, payloads, strict=True))
         details: dict[str, Any] = {}
         try:
-            # Where latents are, low bits are not free.
+            # Low bits of harmonics that hold latents are not free.
             degree = KEPT_DEGREE if design.decoder.kind == "latent" else None
             found = LOW_BITS.prepare(stego, sh_degree=degree).embed(keyed, entropy=entropy)
         except KeyssError as error:
@@ -110,7 +110,7 @@ def training_of(design: Design) -> type[KeyssTraining]:
 
 
 def _encoder(options: KeyssOptions) -> ClipKeys | None:
-    """CLIP, if it turns keys into vectors. Raises BackendError where it is missing."""
+    """CLIP, if it is the key encoder. Raises BackendError if it is missing."""
     return clip_keys(options.clip_model or MODEL) if options.key_encoder == "clip" else None
 
 

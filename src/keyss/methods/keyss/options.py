@@ -17,7 +17,7 @@ Mask = tuple[Attribute, ...]  # the attributes where theta (equation 8) is 1
 ATTRIBUTES: Mask = get_args(Attribute)
 CHANNELS = {"op": 1, "ro": 4, "sc": 3, "xyz": 3}  # sh: three per coefficient
 
-Width = Annotated[int, Meta(ge=1, le=4096)]  # bounds for what is read from files
+Width = Annotated[int, Meta(ge=1, le=4096)]  # bounds for untrusted files
 
 
 def parse_mask(text: str) -> Mask:
@@ -39,17 +39,17 @@ class DecoderShape:
         "mlp"  # see `keyss.methods.keyss.secret.DECODERS`
     )
     mask: Mask = ATTRIBUTES  # theta
-    hidden: tuple[Width, Width] = (64, 128)  # of the common branch; their program's, the paper gives none
-    branch: Width = 64  # of each attribute's branch
+    hidden: tuple[Width, Width] = (64, 128)  # common branch; from the authors' program, the paper gives none
+    branch: Width = 64  # branch of each attribute
     sh_degree: Annotated[int, Meta(ge=0, le=3)] = 3
     key_size: Width = EMBEDDING_SIZE  # numbers of a key's vector
-    # Their program's inputs, residuals, start of the weights and training instead of the text's.
+    # The authors' program instead of the paper's text: inputs, residuals, initial weights, training.
     released: bool = False
-    secrets: Annotated[int, Meta(ge=1, le=9)] = 1  # of the model
-    secret: Annotated[int, Meta(ge=0, le=8)] = 0  # which of them, if each has its own decoder
+    secrets: Annotated[int, Meta(ge=1, le=9)] = 1  # number of secrets in the model
+    secret: Annotated[int, Meta(ge=0, le=8)] = 0  # index of the secret, if each has its own decoder
 
-    def sized(self, sh_degree: int, key_size: int, secrets: int) -> DecoderShape:
-        """The same for models of that SH degree, keys of so many numbers and so many secrets."""
+    def with_sizes(self, sh_degree: int, key_size: int, secrets: int) -> DecoderShape:
+        """The decoder for models of this SH degree, keys of `key_size` numbers, and `secrets`."""
         return replace(self, sh_degree=sh_degree, key_size=key_size, secrets=secrets)
 
     @property
@@ -62,7 +62,7 @@ class DecoderShape:
 
     @property
     def weights(self) -> int:
-        """Weights that are multiplied to decode one Gaussian, without biases."""
+        """Number of weights, without biases; 0 for "latent"."""
         if self.kind == "latent":
             return 0
         first, second = self.hidden
@@ -79,19 +79,19 @@ class Design:
 
     name: str
     decoder: DecoderShape  # D of equations 3 and 6, with theta of equation 8
-    # lambda_cover = lambda_secret = lambda_incorrect of equations 4, 5 and 7, also for plain models; None:
-    # that of the fit.
+    # lambda_cover = lambda_secret = lambda_incorrect (equations 4, 5 and 7), also for plain models. None: use
+    # the fit's weight.
     ssim_weight: float | None = 0.5
     beta_cover: float = 0.5  # equation 11
-    beta_secret: float = 0.5  # of each secret
+    beta_secret: float = 0.5  # for each secret
     beta_incorrect: float = 0.01  # 0: no wrong keys in training
     points: Scenes = "both"  # scenes whose sparse points start the model (combined SfM points)
     poses: Scenes = "both"  # scenes whose training poses are used (combined camera poses)
-    densification: Scenes = "both"  # scenes whose gradients ask for growth (combined densification)
-    # Share of the steps that render all scenes from one pose; in the others each scene has its own photo.
+    densification: Scenes = "both"  # scenes whose gradients count (combined densification)
+    # Share of the steps that render all scenes from one pose; in the others each scene has its own.
     common_poses: float = 1.0
-    decoder_rate: float = 5e-5  # of AdamW, decays to 5 % of it; the paper gives none: their program's
-    weight_decay: float = 1e-4  # their program's
+    decoder_rate: float = 5e-5  # AdamW; decays to 5 %. From the authors' program: the paper gives none
+    weight_decay: float = 1e-4  # from the authors' program
     # Ours: share of the steps after density control that render without the faintest quarter of each scene.
     pruned_steps: float = 0.0
 
@@ -124,7 +124,7 @@ DESIGNS: dict[str, Design] = {
     ),
     # The paper's text.
     "published": _PUBLISHED,
-    # The authors' program, where it differs from the text or the text says nothing; docs/keyss.md lists it.
+    # The authors' program where it differs from the text or the text is silent; docs/keyss.md lists these.
     "released": replace(
         _PUBLISHED,
         name="released",
@@ -192,7 +192,7 @@ class KeyssOptions(MethodOptions):
 
     @property
     def configuration(self) -> Design:
-        """The design in full, with the given mask. Raises UsageError for the name of none."""
+        """The complete design, with the given mask. Raises UsageError for an unknown name."""
         design = self.design
         if isinstance(design, str):
             design = DESIGNS[parse_design(design)]

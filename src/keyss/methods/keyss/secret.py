@@ -1,8 +1,8 @@
-"""A hidden secret: revealing it, and its bytes, the payload, which a channel encrypts with the secret's key.
+"""A hidden secret, and its payload, which a channel encrypts with the secret's key.
 
-The payload holds the decoder (what was trained in half precision, constants in single) with the vector of
-the key, the similarity from the secret's own frame, and *anchors*: positions of some Gaussians of the stego
-model, by which a model that was moved or rounded is recognised. docs/format.md lists the bytes.
+The payload holds the decoder (weights in half precision, constants in single), the vector of the key, the
+similarity from the secret's frame to the cover's, and *anchors*: positions of some Gaussians of the stego
+model, to detect a moved or rounded model. docs/format.md lists the bytes.
 """
 
 from __future__ import annotations
@@ -25,21 +25,21 @@ from keyss.methods.keyss.decoder import Decoder
 from keyss.methods.keyss.latent import LatentDecoder
 from keyss.methods.keyss.options import DecoderShape, parse_mask
 from keyss.methods.opened import Frame, Remains
-from keyss.methods.tensors import Header, damage_refused, pack_tensors, unpack_tensors
+from keyss.methods.tensors import Header, pack_tensors, refuse_damage, unpack_tensors
 
 NAME = "keyss"
 FORMAT, VERSION = "keyss-secret", 10
-DECODERS: dict[str, type[Decoder]] = {"mlp": Decoder, "latent": LatentDecoder}  # by `DecoderShape.kind`
+DECODERS: dict[str, type[Decoder]] = {"mlp": Decoder, "latent": LatentDecoder}  # keys: `DecoderShape.kind`
 ANCHORS = 64
-ANCHORS_NEEDED = 0.25  # share that must be found again
-ANCHOR_TOLERANCE = 1e-6  # of the model's size
+ANCHORS_NEEDED = 0.25  # minimum share found
+ANCHOR_TOLERANCE = 1e-6  # fraction of the model's size
 _SLACK = 0.01  # share of the Gaussians that rounding may make visible or invisible
 _WEIGHTS = "decoder."
 
 
 @dataclass(frozen=True)
 class _Header(Header):
-    """msgspec holds it to these types and bounds."""
+    """Types and bounds that msgspec checks."""
 
     shape: DecoderShape
     frame: Similarity
@@ -53,11 +53,11 @@ class KeyssSecret:
 
     decoder: Decoder
     key: Tensor = field(repr=False)  # [K] the vector of its key
-    frame: Similarity  # from the secret's own frame into the cover's
+    frame: Similarity  # secret frame to cover frame
     anchors: Tensor  # [A, 3] positions of Gaussians of the stego model
-    count: int = 0  # Gaussians that it has when it is revealed from a whole file; 0: unknown
-    visibility: float = 0.0  # sum of opacities; where less is left, the others make up for it
-    chunks: tuple[int, int] | None = None  # see `Payload`; not part of what is packed
+    count: int = 0  # Gaussians revealed from a complete file; 0: unknown
+    visibility: float = 0.0  # sum of opacities, revealed from a complete file
+    chunks: tuple[int, int] | None = None  # see `Payload`; not packed
 
     def payload(self) -> Payload:
         """The payload for a channel; the same secret gives the same bytes."""
@@ -71,8 +71,8 @@ class KeyssSecret:
 
     @staticmethod
     def of(content: Content) -> KeyssSecret:
-        """What `payload` gave. Raises InputError for anything else, for damage, and another version."""
-        with damage_refused("the payload is no secret of keyss, or damaged"):
+        """Read a payload. Raises InputError for other content, damage and another version."""
+        with refuse_damage("the payload is no secret of keyss, or damaged"):
             if not isinstance(content, Payload):
                 raise ValueError("expected one string of bytes, got records")
             header, tensors = unpack_tensors(content.data, _Header, FORMAT, VERSION)
@@ -100,9 +100,9 @@ class KeyssSecret:
 
     @torch.no_grad()
     def reveal(self, stego: Gaussians, *, frame: Frame = "secret", force: bool = False) -> Gaussians:
-        """A model that needs no decoder and no cover, without invisible Gaussians; see `Opened.reveal`.
+        """The secret as a standalone model, without invisible Gaussians; see `Opened.reveal`.
 
-        If Gaussians were lost, the others make up for them.
+        If Gaussians were lost, the others are enlarged to compensate.
         """
         if not force:
             self.check_unchanged(stego)
@@ -120,9 +120,9 @@ class KeyssSecret:
         return decoded if frame == "cover" else self.frame.inverse().apply_gaussians(decoded)
 
     def decode(self, stego: Gaussians, key: Tensor) -> Gaussians:
-        """D(stego, k) for the vector [K] of a key, or `stego` itself where that is the cover.
+        """D(stego, k) for the vector [K] of a key, or `stego` itself if the key opens no row.
 
-        Appended Gaussians are left out: they came after the training.
+        Appended Gaussians are left out: they were added after the training.
         """
         decoder, key = self.decoder.to(stego.device), key.to(stego.device)
         own = stego[~is_appended(stego)].with_sh_degree(decoder.shape.sh_degree)
@@ -162,7 +162,7 @@ def choose_anchors(stego: Gaussians, seed: int) -> Tensor:
 
 
 def visibility(model: Gaussians) -> tuple[int, float]:
-    """How many Gaussians are rendered, and the sum of their opacities."""
+    """The number of visible Gaussians, and the sum of their opacities."""
     visible = model.opacities[model.opacities >= DRAWN_OPACITY]
     return len(visible), float(visible.double().sum())
 

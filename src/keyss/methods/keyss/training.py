@@ -1,6 +1,6 @@
-"""The training: one model and one decoder, from scratch, with three losses (KeySS, sections 3.1 to 3.4).
+"""Joint training of one model and one decoder, from scratch, with three losses (KeySS, sections 3.1 to 3.4).
 
-`KeyssTraining` is the paper's. The design `latent` and the rivals override parts of it.
+`KeyssTraining` is the paper's. The design `latent` and the baselines override parts of it.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ from keyss.rendering import render_with_meta
 Pose = tuple[int, int]  # a scene and the index of its training view
 
 
-def chosen_scenes(which: Scenes, count: int) -> list[int]:
-    """Indices of the scenes that `which` stands for, of the cover (0) and the secrets."""
+def scene_indices(which: Scenes, count: int) -> list[int]:
+    """Indices of the scenes in `which`: 0 is the cover, then the secrets."""
     return {"both": list(range(count)), "cover": [0], "secret": list(range(1, count))}[which]
 
 
@@ -43,8 +43,8 @@ class Picture:
     """A render of a scene."""
 
     image: Tensor  # [H, W, 3]
-    meta: dict[str, Any]  # of the rasterization
-    indices: Tensor | None = None  # of the Gaussians that were rendered; None: all
+    meta: dict[str, Any]  # second result of the rasterization
+    indices: Tensor | None = None  # Gaussians that were rendered; None: all
 
 
 class KeyssTraining(JointRun):
@@ -57,7 +57,7 @@ class KeyssTraining(JointRun):
         options: MethodOptions,
         design: Design,
         device: torch.device,
-        random_key: Callable[[torch.Generator], Tensor] | None = None,  # [K] that of a random key
+        random_key: Callable[[torch.Generator], Tensor] | None = None,  # [K] vector of a random key
     ) -> None:
         count = len(scenes)
         names = [role_of(scene, count) for scene in range(count)]
@@ -66,24 +66,24 @@ class KeyssTraining(JointRun):
         self.keys, self.random_key = [key.to(device) for key in keys], random_key
         self.betas = [design.beta_cover, *[design.beta_secret] * (count - 1)]
         self.poses = CombinedPoses(scenes, device)
-        self.owners = chosen_scenes(design.poses, count)
-        self.growing = chosen_scenes(design.densification, count)
+        self.owners = scene_indices(design.poses, count)
+        self.growing = scene_indices(design.densification, count)
         self.owner_order = Shuffle(len(self.owners), self.generator)
         self.begin(self.start(), design.decoder_rate, design.weight_decay)
 
     def start(self) -> Gaussians:
         """G_cover at the first step: the combined SfM points (section 3.4)."""
-        chosen = [self.scenes[i].scene for i in chosen_scenes(self.design.points, len(self.scenes))]
+        chosen = [self.scenes[i].scene for i in scene_indices(self.design.points, len(self.scenes))]
         return combined_points(chosen, self.fit, self.generator)
 
     def prepare(self, start: Gaussians) -> None:
         """One decoder for all secrets."""
-        shape = self.design.decoder.sized(self.fit.sh_degree, len(self.keys[0]), len(self.keys))
+        shape = self.design.decoder.with_sizes(self.fit.sh_degree, len(self.keys[0]), len(self.keys))
         self.decoder = DECODERS[shape.kind](shape)
         self.networks.append(self.decoder)
 
     def density_control(self) -> CappedStrategy:
-        """Clones, splits and prunes; in their program, nothing of it at the cap."""
+        """Density control; the authors' program stops it at the cap."""
         return CappedStrategy(self.fit, self.opacity_for_pruning, freeze=self.design.decoder.released)
 
     def step(self) -> None:
@@ -92,7 +92,7 @@ class KeyssTraining(JointRun):
         self.optimise(views, lambda view: self.losses(*view))
 
     def sample_poses(self) -> list[Pose]:
-        """The training pose that each scene is rendered from: one of any scene (combined camera poses)."""
+        """The training pose for each scene: one of any scene (combined camera poses)."""
         count = len(self.scenes)
         if float(torch.rand((), generator=self.generator)) < self.design.common_poses:
             owner = self.owners[self.owner_order.sample()]
@@ -100,7 +100,7 @@ class KeyssTraining(JointRun):
         return [(scene, self.shuffles[scene].sample()) for scene in range(count)]
 
     def wrong_key(self) -> Tensor | None:
-        """[K] the vector of a key that opens nothing, drawn anew at every step."""
+        """[K] vector of a wrong key, sampled at every step."""
         if not self.design.beta_incorrect:
             return None
         if self.random_key is not None:
@@ -108,10 +108,10 @@ class KeyssTraining(JointRun):
         return random_embeddings(1, self.generator, len(self.keys[0]))[0].to(self.device)
 
     def losses(self, poses: Sequence[Pose], wrong_key: Tensor | None) -> tuple[Tensor, list[Rendered]]:
-        """L of equation 11, and the renders whose gradients ask for growth (combined densification)."""
+        """L of equation 11, and the renders whose gradients count for combined densification."""
         degree, ssim_weight = self.fit.sh_degree_at(self.iteration), self.fit.ssim_weight
         total = torch.zeros((), device=self.device)
-        renders: dict[int, Rendered] = {}  # rivals render scenes together
+        renders: dict[int, Rendered] = {}  # baselines render scenes together
         for pose in dict.fromkeys(poses):
             scenes = [scene for scene, own in enumerate(poses) if own == pose]
             pictures = self.draw(scenes, self.poses.camera(*pose), degree)
@@ -128,7 +128,7 @@ class KeyssTraining(JointRun):
             picture = self.render(shown, 0, self.poses.camera(*poses[0]), degree)
             incorrect = photometric_loss(picture.image, self.poses.target(0, *poses[0]), ssim_weight)
             total = total + self.design.beta_incorrect * incorrect
-        if self.design.decoder.released:  # gradients of the weighted losses, as they are
+        if self.design.decoder.released:  # gradients of the weighted losses, unscaled
             return total, [(meta, indices, 1.0) for meta, indices, _ in renders.values()]
         return total, list(renders.values())
 
@@ -141,21 +141,21 @@ class KeyssTraining(JointRun):
         return self.decoder(cover, self.keys[scene - 1])  # type: ignore[no-any-return]
 
     def draw(self, scenes: Sequence[int], camera: Camera, sh_degree: int) -> list[Picture]:
-        """Render some scenes, in that order."""
+        """Render scenes, in the given order."""
         cover, pictures = self.cover(), []
         for scene in scenes:
             model, indices = (self.secret(cover, scene), None) if scene else (cover, None)
             if scene and self.design.decoder.released:
-                # Their program multiplies a secret's opacities and scales by whether the view sees the
-                # Gaussian in the cover: 0 is not rendered. A published file cannot do that.
-                indices = self.seen(cover, camera)
+                # The authors' program masks a secret's opacities and scales by the Gaussian's visibility in
+                # the cover's render. A published file cannot do that.
+                indices = self.visible_rows(cover, camera)
                 model = model[indices]
             pictures.append(self.render(model, scene, camera, sh_degree, indices))
         return pictures
 
     @torch.no_grad()
-    def seen(self, cover: Gaussians, camera: Camera) -> Tensor:
-        """Indices of the Gaussians of the cover that touch a view."""
+    def visible_rows(self, cover: Gaussians, camera: Camera) -> Tensor:
+        """Indices of the cover's Gaussians that are visible in a view."""
         radii = self.render(cover.detach().with_sh_degree(0), 0, camera, 0).meta["radii"][0]
         return (radii > 0).all(1).nonzero()[:, 0]  # type: ignore[no-any-return]
 
@@ -171,18 +171,18 @@ class KeyssTraining(JointRun):
 
     @torch.no_grad()
     def opacity_for_pruning(self) -> Tensor:
-        """[N] opacities in the scene that shows a Gaussian most; in their program, in the cover."""
+        """[N] maximum opacity over the scenes; in the authors' program, the cover's."""
         cover = to_gaussians(self.parameters).detach()
         secrets = [] if self.design.decoder.released else range(1, len(self.scenes))
         models = [cover, *(self.secret(cover, scene) for scene in secrets)]
         return torch.stack([model.opacities for model in models]).amax(0)
 
     def publish(self, entropy: bytes) -> tuple[Gaussians, list[KeyssSecret]]:
-        """G_cover on the CPU before its low bits are written, and what reveals each secret.
+        """G_cover on the CPU, before its low bits are written, and the secrets.
 
-        `entropy`: 32 secret bytes from which all randomness is derived.
+        `entropy`: 32 secret bytes that seed all randomness.
         """
-        # In a random order: in training, the points of each scene lie together.
+        # Shuffle: in training, the points of each scene are contiguous.
         stego = self.gaussians().to("cpu")
         numbers = np.frombuffer(stream(entropy, "order", 8 * len(stego)), "<u8")
         stego = stego[torch.from_numpy(numbers.argsort(kind="stable"))]
@@ -194,7 +194,7 @@ class KeyssTraining(JointRun):
         return stego, secrets
 
     def gaussians(self) -> Gaussians:
-        """The model as it would be published."""
+        """The model to publish."""
         return self.cover().detach()
 
     def train(self, sources: Sequence[Source], context: Context) -> None:
@@ -207,7 +207,7 @@ class KeyssTraining(JointRun):
                 "method": self.options.method,
                 "scenes": [source.scene.digest() for source in sources],
                 "models": [source.model.digest() for source in sources],
-                "options": json.loads(json.dumps(asdict(self.options))),  # tuples as they are read back
+                "options": json.loads(json.dumps(asdict(self.options))),  # tuples become lists
             },
             checkpoint=context.checkpoints / "joint.safetensors" if context.checkpoints else None,
             resume=context.resume,

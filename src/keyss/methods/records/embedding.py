@@ -1,8 +1,8 @@
-"""Models as records or payloads in a prepared cover, opened again as their readers will.
+"""Embed models in a prepared cover, as records or payloads, and open them again to check.
 
-In low bits a Gaussian is a record (see `quantise`); the header tells how records are decoded and how many
-there were. Copies of the most visible Gaussians are embedded a second time as far as there is room. Every
-other channel carries a model as one payload (see `whole`).
+In low bits a Gaussian is a record (see `quantise`); the header holds the codec and the number of records.
+Free room is filled with copies of the most visible Gaussians. All other channels carry a model as one payload
+(see `whole`).
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from keyss.core.gaussians import Gaussians
 from keyss.methods.base import Stego
 from keyss.methods.records.lines import Table
 from keyss.methods.records.opening import COUNT, unpack
-from keyss.methods.records.precision import fitted, most_visible_rows
+from keyss.methods.records.precision import encode_to_size, most_visible_rows
 from keyss.methods.records.quantise import Codec
 from keyss.methods.records.whole import encode
 from keyss.rendering.difference import Viewpoints
@@ -40,10 +40,10 @@ def embed_models(
     viewpoints: Sequence[Viewpoints] | None = None,
     entropy: bytes | None = None,
 ) -> Stego:
-    """All Gaussians of each model, under its key, opened again.
+    """Embed all Gaussians of each model under its key, and open them again.
 
-    `viewpoints` of each model tell how precise a payload has to be; by default, four views around it. Raises
-    UsageError if the models do not fit.
+    `viewpoints`: views of each model that determine the precision of a payload; by default, four around it.
+    Raises UsageError if the models do not fit.
     """
     contents: Sequence[Content]
     if isinstance(cover, LowBitsCover):
@@ -71,13 +71,13 @@ def embed_models(
 
 
 def encode_all(cover: LowBitsCover, models: Sequence[Gaussians]) -> list[Records]:
-    """The records of all models, as precise as they fit into `cover` together. Raises UsageError if not."""
+    """The records of all models, as precise as fits into `cover`. Raises UsageError if they do not fit."""
     plans = cover.cells.plan_records([record_request(len(model), model.sh_degree) for model in models])
     found = []
     for model, plan in zip(models, plans, strict=True):
         table = Table.of_size(8 * plan.record_bytes, model.sh_degree)
         assert table is not None  # the plan has room for the floor
-        codec, outlier = Codec.and_outliers(model, table)
+        codec, outlier = Codec.fit_with_outliers(model, table)
         header = COUNT.pack(len(model)) + codec.pack()
         copied = most_visible_rows(model, plan.copies)
         found.append(Records(METHOD, header, codec.encode(model, outlier), plan, copied))
@@ -91,16 +91,15 @@ def record_request(count: int, sh_degree: int) -> RecordRequest:
 
 
 def largest_degree(record_bytes: int) -> int | None:
-    """The highest SH degree of Gaussians whose records take at most so many bytes; None if there is none."""
+    """The maximum SH degree of records of at most `record_bytes`; None if none fits."""
     return next((each for each in (3, 2, 1, 0) if Table.floor(each).record_bytes <= record_bytes), None)
 
 
 def shares(room: Room, needed: Sequence[int]) -> list[int]:
-    """Bytes that the payload of each secret may take, whose encodings need `needed` bytes.
+    """Maximum bytes of each secret's payload, for secrets that need `needed` bytes.
 
-    A quarter of the capacity, half of it or all, whichever is enough: then a secret is as precise as it would
-    be alone, and its key tells nothing of others. If that is too much for all of them, or the model grows,
-    equal shares.
+    A quarter of the capacity, half of it or all, whichever suffices: a secret is then as precise as alone,
+    and its key does not reveal others. If these exceed the capacity, or the model grows, equal shares.
     """
     parts = [
         next((each for each in (4, 2) if size <= room.capacity // each - room.overhead), 1) for size in needed
@@ -115,6 +114,6 @@ def _payloads(
 ) -> list[Payload]:
     rooms = shares(cover.room, [len(encode(model)) for model in models])
     return [
-        Payload(METHOD, fitted(model, room, short=cover.room.grows, viewpoints=views))
+        Payload(METHOD, encode_to_size(model, room, short=cover.room.grows, viewpoints=views))
         for model, room, views in zip(models, rooms, viewpoints, strict=True)
     ]

@@ -10,24 +10,24 @@ import numpy as np
 
 from keyss.core.arrays import Doubles, Flags, Words32
 
-_TAIL = 0.05  # share of the numbers that is ignored on each side when the extent of the bulk is measured
-_EVEN_MARGIN = 0.75  # on an evenly spaced line, widths of the bulk between it and the first outlier
-_FAR = 8.0  # on an asinh line, distances of the bulk from the median up to the first outlier
-_FURTHEST = 1e30  # no line gives a larger number
+_TAIL = 0.05  # share of the numbers on each side that the quantiles of the bulk leave out
+_EVEN_MARGIN = 0.75  # evenly spaced lines: distance to the first outlier / width of the bulk
+_FAR = 8.0  # asinh lines: distance from the median to the first outlier / that to the end of the bulk
+_FURTHEST = 1e30  # lines give no larger numbers
 _MIN_SPREAD = 1e-9
-_HALF = 1e-3  # half precision, in which reaches are stored, rounds by less than this share
-_SAMPLE = 20_000  # numbers that the candidates for a line are compared on
+_HALF = 1e-3  # maximum relative rounding error of reaches, which are stored in half precision
+_SAMPLE = 20_000  # numbers for comparing candidate lines
 LINE = struct.Struct("<2f2e")  # centre, spread, reach, far reach
-# The line with the least square error makes numbers smaller on average, which costs more against photos than
-# errors that are independent of the numbers: this part of the error gets this weight.
+# The line with the minimum square error shrinks numbers on average, which costs more against photos than
+# errors independent of the numbers. Weight of the error's shrinking part.
 _SHRINKING_WEIGHT = 20.0
-MAX_BITS = 24  # of one number: float32 has no more
+MAX_BITS = 24  # bits per number: float32 has no more
 CHROMA_FEWER = 2  # bits
 BANDS = (1, 3, 5, 7)  # spherical harmonics of degrees 0 to 3; each of three colours
 
-# Bits with which quantising an attribute alone leaves 60 dB to the unquantised model, measured on models of
-# bonsai and fox (200 px, 20,000 Gaussians). One bit more or less is 6 dB. Spherical harmonics get 0.8 more,
-# and at least as many as highlights need, which PSNR against photos shows.
+# Bits at which quantising one attribute gives 60 dB against the unquantised model, measured on models of
+# bonsai and fox (200 px, 20,000 Gaussians). A bit is 6 dB. Spherical harmonics get 0.8 more, and at least
+# what highlights need, measured by PSNR against photos.
 _BITS_FOR_60_DB = (15.5, 8.8, 8.2, 7.2, 8.2, 5.2, 5.4, 5.4)
 _NUMBERS = (3, 3, 3, 1, *(3 * count for count in BANDS))
 _FLOOR = (15, 8, 8, 7, 8, 4, 4, 4)
@@ -80,7 +80,7 @@ class Line:
 
 
 class Kind(NamedTuple):
-    """Which lines suit the numbers of one kind."""
+    """The type of line for one kind of number."""
 
     even: bool = False  # evenly spaced, else by asinh
     clips: bool = False  # the furthest numbers of the bulk may be clipped
@@ -91,12 +91,12 @@ EVEN, POSITION = Kind(even=True), Kind()
 COLOUR, HARMONIC = Kind(clips=True), Kind(clips=True, centred=True)
 
 
-def neighbourhood(values: Doubles, kind: Kind) -> tuple[float, float]:
-    """The least and the largest number that is no outlier of `values`.
+def inlier_range(values: Doubles, kind: Kind) -> tuple[float, float]:
+    """The range of inliers of `values`, as minimum and maximum.
 
-    Quantiles measure the bulk, and fewer than `_TAIL` of the values, whatever they are, cannot move these
-    beyond the others. Such values therefore lengthen an evenly spaced line at most 2.5 times (the bulk and
-    two margins), and make each number less precise by the same factor.
+    It follows from quantiles, which a share of values below `_TAIL` cannot move beyond the others. Outliers
+    therefore lengthen an evenly spaced line at most 2.5 times (the bulk and two margins), and cost the same
+    factor in precision.
     """
     if kind.even:
         low = float(np.quantile(values, _TAIL, method="higher"))
@@ -109,9 +109,9 @@ def neighbourhood(values: Doubles, kind: Kind) -> tuple[float, float]:
 
 
 def fit_line(kind: Kind, bits: int, sample: Doubles, bulk: Doubles, outliers: Doubles) -> Line:
-    """The line for the bulk, of which `sample` [N, C] is a part, with a far reach for the outliers.
+    """Fit a line to the bulk, given a `sample` [N, C] of it, with a far reach for the outliers.
 
-    `bulk` and `outliers` [2]: their least and their largest number, infinities where there are none.
+    `bulk` and `outliers` [2]: minimum and maximum of each, infinities if empty.
     """
     if kind.even:
         centre, spread = float(bulk.sum()) / 2, 0.0
@@ -126,7 +126,7 @@ def fit_line(kind: Kind, bits: int, sample: Doubles, bulk: Doubles, outliers: Do
 
 
 def _best_line(whole: Line, bits: int, values: Doubles, bulk: Doubles) -> Line:
-    """The line with the least error among some with other spreads that reach as far as `whole` or less."""
+    """The line with the minimum error among candidates of other spreads and reaches up to that of `whole`."""
     sample = values[:: max(1, values.size // _SAMPLE)].ravel()
     furthest = _furthest(whole, bulk) or 1.0
     best, least = whole, np.inf
@@ -158,8 +158,8 @@ def _reach_of(line: Line, distance: float) -> float:
 class Table:
     """Bits of one number of positions, log scales, quaternions and opacity, then of each band of harmonics.
 
-    For harmonics, the constant ones included, these are the bits of the brightness; the two differences of
-    colours, which have a tenth of the energy, get two fewer. Raises ValueError for bits out of range.
+    For harmonics, constant ones included, these are the bits of the brightness; the two colour differences,
+    with a tenth of the energy, get two fewer. Raises ValueError for bits out of range.
     """
 
     bits: tuple[int, ...]
@@ -172,20 +172,19 @@ class Table:
 
     @staticmethod
     def floor(sh_degree: int) -> Table:
-        """The smallest table in use: about 50 dB against the unquantised model."""
+        """The smallest table for records: about 50 dB against the unquantised model."""
         return Table(_FLOOR[: 5 + sh_degree])
 
     @staticmethod
     def short() -> Table:
-        """A still smaller table of SH degree 0, for payloads: about 40 dB."""
+        """A smaller table of SH degree 0, for payloads: about 40 dB."""
         return Table(tuple(each - 2 for each in _FLOOR[:5]))
 
     @staticmethod
     def of_size(bits: int, sh_degree: int, start: Table | None = None) -> Table | None:
-        """The table for records of at most `bits` with the least error; None if `start` does not fit.
+        """The table of at most `bits` with the minimum error; None if `start` does not fit.
 
-        `start`: by default the floor. Each further bit goes to the attribute that it takes the most error
-        from.
+        `start`: by default the floor. Each further bit goes where it reduces the error most.
         """
         table = start or Table.floor(sh_degree)
         while (room := bits - table.total) >= 0:

@@ -1,4 +1,4 @@
-"""Carried secrets, opened from records or from a payload."""
+"""Open carried secrets from records or a payload."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from keyss.methods.opened import Frame, Remains
 from keyss.methods.records import whole
 from keyss.methods.records.quantise import Codec
 
-COUNT = struct.Struct("<I")  # of Gaussians, before the codec in the header of records
+COUNT = struct.Struct("<I")  # number of Gaussians, before the codec in the header of records
 
 
 @dataclass(frozen=True)
@@ -22,13 +22,13 @@ class CarriedSecret:
 
     gaussians: Gaussians  # those that are left, in the order of their carriers
     count: int  # Gaussians that were embedded
-    bits: int  # of a record, or of a Gaussian in a payload
+    bits: int  # bits per record, or per Gaussian of a payload
     frame: None = None
     decode: None = None
     key_size: int = 0
 
     def reveal(self, stego: Gaussians, *, frame: Frame = "secret", force: bool = False) -> Gaussians:
-        """The Gaussians that are left, which compensate for those that were lost with their carriers."""
+        """The Gaussians that are left, enlarged to compensate for those lost with their carriers."""
         if frame == "cover":
             raise UsageError(
                 'a carried secret never lay in the cover\'s coordinates: leave out `frame="cover"`'
@@ -43,7 +43,7 @@ class CarriedSecret:
 
 
 def unpack(content: Content) -> CarriedSecret:
-    """The Gaussians that are left, of records in any order. Raises InputError for damage."""
+    """The Gaussians that are left; records may be in any order. Raises InputError for damage."""
     if not isinstance(content, Records):
         gaussians = whole.decode(content.data, content.carriers)
         return CarriedSecret(gaussians, len(gaussians), round(8 * len(content.data) / len(gaussians)))

@@ -1,4 +1,4 @@
-"""Which Gaussians of a secret are encoded, and how precisely, so that they fit into the room there is."""
+"""Choose Gaussians of a secret, and their precision, to fit a size."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from keyss.files.formats.common import in_morton_order
 from keyss.methods.records.whole import Precision, decode, encode
 from keyss.rendering.difference import Viewpoints, psnr_between
 
-_GOOD_ENOUGH = 43.75  # dB of renders against those of the model: photos at 30 dB lose 0.1 to 0.3
+_GOOD_ENOUGH = 43.75  # dB between renders; PSNRs against photos of 30 dB drop by 0.1 to 0.3
 _ATTRIBUTES = ("means", "log_scales", "opacity_logits", "colours", "quats", "harmonics")
-# Shares of the squared error: the counts of numbers, of harmonics those that are not zero. At the least
-# total, a finer step costs each attribute as many bits for what it gains.
+# Shares of the squared error: counts of (nonzero) numbers. At the minimum total, a finer step has the same
+# gain per bit for each attribute.
 _SHARES = (3, 3, 1, 3, 3, 18)
 _TRIES, _CLOSE, _BIT = 6, 0.15, 6.02  # dB
-_COARSEST = 0.1  # step of harmonics: from afar, where renders are compared, their errors do not show
+_COARSEST = 0.1  # maximum step of harmonics, whose errors do not show in distant renders
 _FINEST = 2.0  # octaves below the usual steps: about 58 dB
-_BITS_OF_OCTAVE = 13  # of a Gaussian, harmonics not counted
+_BITS_OF_OCTAVE = 13  # bits per Gaussian and octave, without harmonics
 
 
-def good_enough(model: Gaussians, viewpoints: Viewpoints | None = None) -> Precision:
-    """The coarsest precision whose renders are good enough, estimated with few renders.
+def choose_precision(model: Gaussians, viewpoints: Viewpoints | None = None) -> Precision:
+    """The coarsest precision whose renders are good enough, from few renders.
 
-    The cost of each attribute alone is measured once; then all steps are scaled together.
+    Measures the cost of each attribute once, then scales all steps together.
     """
     rough = Precision.usual(model).finer(-1)
     model = in_morton_order(model)
@@ -51,28 +51,28 @@ def good_enough(model: Gaussians, viewpoints: Viewpoints | None = None) -> Preci
     return precision
 
 
-def pruned(model: Gaussians, room: int, viewpoints: Viewpoints | None = None) -> Gaussians:
-    """All of `model` if it fits into `room` bytes, else its most visible Gaussians.
+def prune_to_size(model: Gaussians, room: int, viewpoints: Viewpoints | None = None) -> Gaussians:
+    """`model` if it fits into `room` bytes, else its most visible Gaussians, at the best-looking SH degree.
 
-    These are of the SH degree that renders most like the model. Raises UsageError if nothing fits.
+    Raises UsageError if nothing fits.
     """
     if len(encode(model)) <= room:
         return model
     degrees = range(model.sh_degree + 1)
-    candidates = [found for each in degrees if (found := _pruned(model.with_sh_degree(each), room))]
+    candidates = [found for each in degrees if (found := _prune_to_size(model.with_sh_degree(each), room))]
     if not candidates:
         raise UsageError(f"nothing of a secret fits into {room:,} bytes")
     return max(candidates, key=lambda each: psnr_between(model, each, viewpoints))
 
 
-def fitted(
+def encode_to_size(
     model: Gaussians, room: int, *, short: bool = False, viewpoints: Viewpoints | None = None
 ) -> bytes:
-    """`model` in at most `room` bytes, as precise as fits.
+    """Encode `model` in at most `room` bytes, as precisely as possible.
 
-    `short`: no more precise than is hard to see from the `viewpoints`. Raises UsageError if it does not fit.
+    `short`: use no more bytes than `choose_precision` needs. Raises UsageError if it does not fit.
     """
-    if short and len(data := encode(model, good_enough(model, viewpoints))) <= room:
+    if short and len(data := encode(model, choose_precision(model, viewpoints))) <= room:
         return data
     usual = encode(model)
     if len(usual) > room:
@@ -89,7 +89,7 @@ def fitted(
 
 
 def most_visible(gaussians: Gaussians, count: int) -> Gaussians:
-    """The `count` Gaussians of `most_visible_rows`; all of them if there are no more."""
+    """The `count` Gaussians of `most_visible_rows`, or all if there are fewer."""
     if count >= len(gaussians):
         return gaussians
     return gaussians[torch.from_numpy(most_visible_rows(gaussians, count))]
@@ -98,8 +98,8 @@ def most_visible(gaussians: Gaussians, count: int) -> Gaussians:
 def most_visible_rows(gaussians: Gaussians, count: int) -> Integers:
     """[count] indices of the Gaussians with the largest opacity times size, in ascending order.
 
-    Size is the square root of the cross-section, and no more than that of a typical large Gaussian:
-    otherwise a few huge faint ones would replace all detail.
+    Size is the square root of the cross-section, clamped at that of a typical large Gaussian: a few huge
+    faint ones must not replace all detail.
     """
     size = gaussians.log_scales.sort(dim=1).values[:, 1:].mean(1)  # log, of the larger two axes
     at_most = size.kthvalue(int(0.9 * len(size)) + 1).values
@@ -108,7 +108,7 @@ def most_visible_rows(gaussians: Gaussians, count: int) -> Integers:
     return rows
 
 
-def _pruned(model: Gaussians, room: int) -> Gaussians | None:
+def _prune_to_size(model: Gaussians, room: int) -> Gaussians | None:
     """The most visible Gaussians that fit into `room` bytes; None if none fits."""
     count = len(model)
     while count > 0:

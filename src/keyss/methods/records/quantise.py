@@ -1,19 +1,19 @@
 """Gaussians as records of a fixed number of bits, and back.
 
-A record holds everything that renders: position, log scales, opacity logit, direction of the quaternion
-(its length means nothing), colour and spherical harmonics. Numbers go through a `Line`:
+A record holds position, log scales, opacity logit, unit quaternion, colour and spherical harmonics. A `Line`
+maps numbers to codes:
 
 - log scales and opacity logits are evenly spaced between their extremes;
-- positions, colours and harmonics are spaced by asinh((value - centre) / spread): fine where most are, coarse
-  in proportion to the distance further out. Positions reach to the furthest one; of the others the few
-  furthest may be clipped, whichever gives the least mean square error;
-- three colours become their brightness and two differences, which are small, on a line of their own;
+- positions, colours and harmonics are spaced by asinh((value - centre) / spread): fine near the centre, and
+in
+  proportion to the distance further out. Lines of positions reach all of them; others may clip a few numbers
+  if that reduces the mean square error;
+- three colours become brightness and two differences, which are small, on a line of their own;
 - a quaternion becomes its three smallest components, none above sqrt(1/2), and the index of the largest.
 
 Lines are fitted to the bulk. A Gaussian with a number far outside of it is an *outlier*: one bit of its
-record says so, and its numbers go through the same lines with a longer reach. So outliers cost the bulk
-nothing but that bit, whatever their numbers are. Numbers so large that nothing is rendered, or nothing else,
-are clamped.
+record is set, and its numbers use the same lines with a longer reach. Outliers thus cost the bulk one bit,
+whatever their numbers. Extreme numbers, which hide everything or nothing, are clamped.
 """
 
 from __future__ import annotations
@@ -42,35 +42,35 @@ from keyss.methods.records.lines import (
     Line,
     Table,
     fit_line,
-    neighbourhood,
+    inlier_range,
 )
 from keyss.rendering.cpu.jit import kernel
 from keyss.rendering.cpu.parallel import in_blocks
 
 MAX_LOGIT = 16.0  # beyond it the float32 sigmoid is exactly 0 or 1
 _MAX_HARMONIC = 1e6  # beyond it a colour is black or white wherever it is rendered at all
-_MIN_LENGTH = 1e-12  # of quaternions: a shorter one turns nothing
-_SAMPLE = 20_000  # Gaussians that tell which numbers are outliers, and that lines are fitted to
-_TABLE_BITS = 14  # of codes whose numbers are looked up, which is faster than `sinh`
-_BLOCK = 1 << 12  # Gaussians at a time: their numbers stay in the cache
-_TABLE_BYTES = 8  # one for each number of bits, 0 for a band of harmonics that is not there
-_QUAT_LINE = Line(0, 0, 0.5**0.5, 0.5**0.5)  # of the three smaller components
+_MIN_LENGTH = 1e-12  # shorter quaternions have no rotation
+_SAMPLE = 20_000  # Gaussians for finding the range of inliers, and for fitting lines
+_TABLE_BITS = 14  # codes up to this size are decoded by a table, faster than by `sinh`
+_BLOCK = 1 << 12  # Gaussians per block, which fits into the cache
+_TABLE_BYTES = 8  # a byte per number of bits; 0 for missing bands of harmonics
+_QUAT_LINE = Line(0, 0, 0.5**0.5, 0.5**0.5)  # quaternion's three smaller components
 
 
 @dataclass(frozen=True)
 class Codec:
-    """How the Gaussians of one secret are written: a table of bits, and a line for each kind of number."""
+    """The encoding of one secret's Gaussians: a table of bits, and a line for each kind of number."""
 
     table: Table
     lines: tuple[Line, ...]  # x, y, z, log scales, opacity logits; two per band, the constant one first
 
     @staticmethod
     def fit(gaussians: Gaussians, table: Table) -> Codec:
-        """The lines that suit `gaussians`, which have the SH degree of the table."""
-        return Codec.and_outliers(gaussians, table)[0]
+        """Fit lines to `gaussians`, which must have the SH degree of the table."""
+        return Codec.fit_with_outliers(gaussians, table)[0]
 
     @staticmethod
-    def and_outliers(gaussians: Gaussians, table: Table) -> tuple[Codec, Flags]:
+    def fit_with_outliers(gaussians: Gaussians, table: Table) -> tuple[Codec, Flags]:
         """`fit`, and the `outliers` [N]."""
         if table.sh_degree != gaussians.sh_degree:
             raise ValueError(f"SH degree {gaussians.sh_degree}, but the table is for {table.sh_degree}")
@@ -92,9 +92,9 @@ class Codec:
         return columns + [line.encode(values, bits, outlier) for line, bits, values in every]
 
     def encode(self, gaussians: Gaussians, outlier: Flags | None = None) -> Bytes:
-        """[N, record_bytes] the records of N Gaussians: codes one after the other, the highest bit first.
+        """[N, record_bytes] records: concatenated codes, most significant bit first, padded with zeros.
 
-        The bits left over are zero. `outlier` [N]: their `outliers`, where they are known.
+        `outlier` [N]: `outliers(gaussians)`, if known.
         """
         outlier = outliers(gaussians) if outlier is None else outlier
         bits, records = self._code_bits(), np.zeros((len(gaussians), self.table.record_bytes), np.uint8)
@@ -111,7 +111,7 @@ class Codec:
         return np.array([bits for columns, bits in self.table.layout for _ in range(columns)])
 
     def decode(self, records: Bytes) -> Gaussians:
-        """The Gaussians of records [N, record_bytes]: finite float32, whatever bytes they are."""
+        """Decode records [N, record_bytes]. Any bytes give finite float32 Gaussians."""
         k = (self.table.sh_degree + 1) ** 2
         fields = [np.empty((len(records), *shape), np.float32) for shape in ((3,), (4,), (3,), (), (k, 3))]
         bits, tables = self._code_bits(), self._tables()
@@ -123,8 +123,8 @@ class Codec:
         return Gaussians(*map(torch.from_numpy, fields))
 
     def _tables(self) -> tuple[Doubles, Integers, Doubles]:
-        """What `_decode` takes: the numbers of all codes with few bits, of the bulk and then of outliers; [C]
-        where those of each code start, -1 for more bits; and [C, 4] the line of each.
+        """Lookup tables of `_decode`: numbers of all codes with few bits, bulk then outliers; [C] start of
+        each code's numbers, -1 for more bits; [C, 4] lines.
         """
         numbers, starts, lines, size = [np.zeros(0)], [-1, -1], [_QUAT_LINE] * 2, 0
         for line, (columns, bits) in zip((_QUAT_LINE, *self.lines), self.table.layout[2:], strict=True):
@@ -139,7 +139,7 @@ class Codec:
         return np.concatenate(numbers), np.array(starts), np.array([astuple(each) for each in lines])
 
     def pack(self) -> bytes:
-        """The codec itself: 92 to 164 bytes."""
+        """The codec as 92 to 164 bytes."""
         lines = (LINE.pack(*astuple(line)) for line in self.lines)
         return bytes(self.table.bits).ljust(_TABLE_BYTES, b"\0") + b"".join(lines)
 
@@ -150,7 +150,7 @@ class Codec:
 
     @staticmethod
     def unpack(data: bytes) -> Codec:
-        """The codec of `pack`; what follows it is ignored. Raises InputError for anything else."""
+        """Read the bytes of `pack`; ignores further bytes. Raises InputError for damage."""
         try:
             table = Table(tuple(data[:_TABLE_BYTES].rstrip(b"\0")))
             numbers = data[_TABLE_BYTES : Codec.packed_size(table.sh_degree)]
@@ -166,7 +166,7 @@ class Codec:
 def _pack(codes: Any, bits: Any, records: Any) -> None:
     """Write the codes [N, C] of `bits` [C] into `records` [N, bytes], which are zero."""
     for i in range(len(codes)):
-        held, count, at = np.uint64(0), 0, 0  # the lowest `count` bits that are held are not written yet
+        held, count, at = np.uint64(0), 0, 0  # the lowest `count` bits of `held` are pending
         for j in range(len(bits)):
             held = held << np.uint64(bits[j]) | np.uint64(codes[i, j])
             count += bits[j]
@@ -192,10 +192,10 @@ def _decode(
     opacity_logits: Any,
     sh: Any,
 ) -> None:
-    """The inverse of `_pack` into the fields of Gaussians; `numbers`, `starts`, `lines`: of `_tables`.
+    """Decode records into the fields of Gaussians; `numbers`, `starts`, `lines`: see `_tables`.
 
-    A record has the codes of `Codec.codes`: outlier, left out, three of the quaternion, three of the
-    position, three scales, opacity; then of each band the brightness and two differences of each harmonic.
+    A record has the codes of `Codec.codes`: outlier, left out, 3 of the quaternion, 3 of the position, 3
+    scales, opacity; then, for each band, the brightness and two differences of each harmonic.
     """
     values = np.empty(len(bits))
     for i in range(len(records)):
@@ -224,7 +224,7 @@ def _decode(
             squares += values[2 + j] ** 2
             means[i, j], log_scales[i, j] = values[5 + j], values[8 + j]
         opacity_logits[i] = values[11]
-        length = max(1.0, math.sqrt(squares))  # codes that no quaternion has
+        length = max(1.0, math.sqrt(squares))  # invalid codes may be longer
         for j in range(3):
             quats[i, j + (j >= left_out)] = values[2 + j] / length
         quats[i, left_out] = math.sqrt(max(0.0, 1 - squares))
@@ -238,7 +238,7 @@ def _decode(
 
 
 def outliers(gaussians: Gaussians) -> Flags:
-    """[N] which Gaussians have a number far outside of the bulk; none if that would be all."""
+    """[N] True for Gaussians with a number far outside of the bulk; all False if that were all of them."""
     return _bulk(gaussians)[0]
 
 
@@ -246,7 +246,7 @@ def _bulk(gaussians: Gaussians) -> tuple[Flags, list[tuple[Doubles, Doubles, Dou
     """The `outliers` [N]; for each line a sample of the bulk's numbers, and extents of bulk and outliers."""
     found, every = np.zeros(len(gaussians), bool), max(1, len(gaussians) // _SAMPLE)
     sample = numbers_of(gaussians[::every])
-    ends = list(map(neighbourhood, sample, _kinds(gaussians.sh_degree)))
+    ends = list(map(inlier_range, sample, _kinds(gaussians.sh_degree)))
 
     def judge(start: int, stop: int) -> list[list[tuple[float, float]]]:
         numbers, own = numbers_of(gaussians[start:stop]), found[start:stop]
@@ -262,7 +262,7 @@ def _bulk(gaussians: Gaussians) -> tuple[Flags, list[tuple[Doubles, Doubles, Dou
 
 
 def out_of_range(gaussians: Gaussians) -> int:
-    """The number of Gaussians with a number that a record clamps, and that no rendering depends on."""
+    """The number of Gaussians with extreme numbers, which records clamp."""
     beyond = gaussians.overflow | (gaussians.log_scales < -MAX_LOG_SCALE).any(1)
     if magnitude(gaussians.sh) > _MAX_HARMONIC:
         beyond |= (gaussians.sh.abs() > _MAX_HARMONIC).flatten(1).any(1)
@@ -284,8 +284,8 @@ def _bits(table: Table) -> list[int]:
 def numbers_of(gaussians: Gaussians) -> list[Doubles]:
     """[N, count] the numbers of each line.
 
-    A Gaussian whose numbers overflow is never rendered: it becomes transparent, because its clamped numbers
-    would be rendered.
+    Rasterizers skip Gaussians whose numbers overflow; since clamping would make them visible, they become
+    transparent.
     """
     own = gaussians.detach().to("cpu")
     fields = (own.means, own.log_scales, own.opacity_logits, own.sh, own.overflow)

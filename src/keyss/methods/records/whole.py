@@ -2,14 +2,14 @@
 
     number of Gaussians (4 bytes), SH degree (1), centres (20), steps (24), all numbers (see `entropy`)
 
-Gaussians are sorted along a Z-order curve. Every number is divided by a step and rounded, so that numbers far
-from the others cost more bits and no precision. Three colours become brightness and two differences; the
-quaternion is the one of the same ellipsoid whose w is largest, and w follows from x, y and z.
+Gaussians are sorted along a Z-order curve. Every number is divided by a step and rounded, so outliers cost
+more bits and no precision. Colours become brightness and two differences. Of the quaternions of an ellipsoid,
+the one with the largest w is stored, without w.
 
-An error in a quaternion or in harmonics costs more the more of a picture the Gaussian covers. Their steps
-therefore shrink by a quarter of an octave for each octave by which area times opacity squared exceeds the
-median. (Equal errors in a picture would need half an octave, but small Gaussians are seen from nearer; a
-quarter measured best.) Both sides compute it from scales and opacity.
+Errors in quaternions and harmonics cost more in Gaussians that cover more of an image. Their steps therefore
+shrink by a quarter of an octave for each octave of area times opacity squared above the median. (Equal errors
+in an image would need half an octave, but small Gaussians are seen from nearer; a quarter measured best.)
+Encoder and decoder compute the steps from scales and opacity.
 """
 
 from __future__ import annotations
@@ -28,24 +28,24 @@ from keyss.files.formats.common import in_morton_order, with_largest_w
 from keyss.methods.records import entropy
 from keyss.methods.records.quantise import numbers_of
 
-_ALWAYS = 1 << 16  # Gaussians that any payload may announce
-_MIN_BYTES = 2  # of each Gaussian in larger models
+_ALWAYS = 1 << 16  # Gaussians that a payload of any size may declare
+_MIN_BYTES = 2  # minimum bytes per Gaussian of a larger model
 _HEAD = struct.Struct("<IB5f6f")
-_POSITION_STEP = 0.03  # in the median size of Gaussians
+_POSITION_STEP = 0.03  # relative to the median size of Gaussians
 _DIFFERENCES = np.array([1.0, 1.5, 1.5])  # steps of brightness and differences of constant colours
 _PER_OCTAVE = 0.5 / math.log(2)  # half octaves of the step
-_FINER = 6  # half octaves by which a step may be finer or coarser
+_FINER = 6  # maximum change of a step, in half octaves
 _MAX_STEP = 1e6
-_LEAST_W = 1 / 16  # its square
-# Columns of x, y, z, log scales, opacity, colours, quaternion: the eighths of the number before that a number
-# is predicted to be, and the groups of chances. Harmonics have two more groups and no prediction.
+_LEAST_W = 1 / 16  # minimum w^2
+# Columns of x, y, z, log scales, opacity, colours, quaternion: `shares` and `groups` of `entropy.encode`.
+# Harmonics have two more groups and no prediction.
 _SHARES = (8, 8, 8, 2, 2, 2, 2, 6, 6, 6, 0, 0, 0)
 _GROUPS = (0, 0, 0, 1, 1, 1, 2, 3, 4, 4, 5, 5, 5)
 
 
 @dataclass(frozen=True)
 class Precision:
-    """The steps that a model is encoded with, which float32 rounds."""
+    """Quantisation steps of the attributes, rounded to float32."""
 
     means: float
     log_scales: float = 0.04
@@ -66,24 +66,24 @@ class Precision:
 
     @property
     def steps(self) -> list[float]:
-        """As both sides know them."""
+        """The steps in the file."""
         steps = np.array([getattr(self, field.name) for field in fields(self)], np.float32)
         return [float(each) for each in steps.clip(1e-12, _MAX_STEP)]
 
 
 def encode(model: Gaussians, precision: Precision | None = None) -> bytes:
-    """`model` as bytes, by default with the usual precision."""
+    """Encode `model`, by default with the usual precision."""
     model = in_morton_order(model)
     steps = (precision or Precision.usual(model)).steps
     *plain, brightness, differences = numbers_of(model.with_sh_degree(0))
     centres = [float(np.float32(np.median(each))) for each in plain]
-    apart = np.concatenate([a - b for a, b in zip(plain, centres, strict=True)], axis=1)
+    offsets = np.concatenate([a - b for a, b in zip(plain, centres, strict=True)], axis=1)
     colours = np.concatenate([brightness, differences], axis=1)
-    even = _rounded(np.concatenate([apart, colours], axis=1) / _even_steps(steps))
-    finer = _finer(*_even_numbers(even, centres, steps)[1:3])
+    even = _round(np.concatenate([offsets, colours], axis=1) / _even_steps(steps))
+    finer = _refinement(*_even_numbers(even, centres, steps)[1:3])
     quats = with_largest_w(doubles(model.quats))[:, 1:] / _steps(steps[4], finer)
     harmonics = (doubles(model.sh[:, 1:]) @ OPPONENT.T).reshape(len(model), -1) / _steps(steps[5], finer)
-    codes = np.concatenate([even, _rounded(np.concatenate([quats, harmonics], axis=1))], axis=1)
+    codes = np.concatenate([even, _round(np.concatenate([quats, harmonics], axis=1))], axis=1)
     head = _HEAD.pack(len(model), model.sh_degree, *centres, *steps)
     return head + entropy.encode(codes, *_columns(model.sh_degree))
 
@@ -91,8 +91,8 @@ def encode(model: Gaussians, precision: Precision | None = None) -> bytes:
 def decode(data: bytes, carriers: int | None = None) -> Gaussians:
     """The model of `encode`, read from a model of `carriers` Gaussians. Raises InputError for damage.
 
-    Memory is bounded: above 2^16 Gaussians, each takes at least 2 bytes of `data`, and there are no more than
-    `carriers`.
+    Memory is bounded: above 2^16 Gaussians, each needs at least 2 bytes of `data`, and `carriers` is the
+    maximum.
     """
     if len(data) < _HEAD.size:
         raise InputError("the hidden secret is damaged: it is too short")
@@ -111,7 +111,7 @@ def decode(data: bytes, carriers: int | None = None) -> Gaussians:
         )
     codes = entropy.decode(data[_HEAD.size :], count, *_columns(sh_degree))
     means, log_scales, logits, colours = _even_numbers(codes[:, :10], centres, steps)
-    finer = _finer(log_scales, logits)
+    finer = _refinement(log_scales, logits)
     x, y, z = (codes[:, 10:13] * _steps(steps[4], finer)).T
     w = np.sqrt(np.maximum(1 - (x * x + y * y + z * z), _LEAST_W))
     harmonics = codes[:, 13:] * _steps(steps[5], finer)
@@ -126,14 +126,14 @@ def _columns(sh_degree: int) -> tuple[Integers, Integers]:
     return np.array([*_SHARES, *[0, 0, 0] * others]), np.array([*_GROUPS, *[6, 7, 7] * others])
 
 
-def _rounded(numbers: Doubles) -> Integers:
+def _round(numbers: Doubles) -> Integers:
     bounded = np.nan_to_num(numbers).clip(-entropy.MAX_NUMBER, entropy.MAX_NUMBER)
     whole: Integers = np.rint(bounded).astype(np.int64)
     return whole
 
 
 def _even_steps(steps: list[float]) -> Doubles:
-    """[10] steps of the columns that have the same ones for all Gaussians."""
+    """[10] steps of the columns whose steps are equal for all Gaussians."""
     means, log_scales, opacity, colours, *_ = steps
     return np.array([*[means] * 3, *[log_scales] * 3, opacity, *colours * _DIFFERENCES])
 
@@ -146,21 +146,19 @@ def _even_numbers(codes: Integers, centres: list[float], steps: list[float]) -> 
 
 
 def _from_opponents(parts: Doubles) -> Doubles:
-    """[N, K, 3] colours of brightness and two differences.
-
-    One product and one sum after the other: every reader gets the same float32 numbers.
-    """
+    """[N, K, 3] colours from brightness and two differences, in a fixed order of operations."""
     bright, first, second = (parts[:, :, row, None] * OPPONENT[row] for row in range(3))
     colours: Doubles = bright + first + second
     return colours
 
 
-def _finer(log_scales: Doubles, logits: Doubles) -> Integers:
-    """[N] half octaves by which each Gaussian's steps are finer than those of the median one."""
+def _refinement(log_scales: Doubles, logits: Doubles) -> Integers:
+    """[N] half octaves by which each Gaussian's steps are finer than the median Gaussian's."""
     scales = np.sort(log_scales, axis=1)
-    seen = scales[:, 2] + scales[:, 1] + 2 * np.minimum(logits, 0)  # nearly the logarithm of the opacity
-    middle = np.sort(seen)[(len(seen) - 1) // 2]
-    found: Integers = np.floor((seen - middle) * _PER_OCTAVE + 0.5).astype(np.int64)
+    # log(opacity) is about min(logit, 0).
+    weight = scales[:, 2] + scales[:, 1] + 2 * np.minimum(logits, 0)
+    median = np.sort(weight)[(len(weight) - 1) // 2]
+    found: Integers = np.floor((weight - median) * _PER_OCTAVE + 0.5).astype(np.int64)
     return found.clip(-_FINER, _FINER)
 
 

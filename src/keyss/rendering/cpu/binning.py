@@ -1,8 +1,8 @@
-"""Lists the Gaussians that touch each tile, front to back.
+"""Lists of the Gaussians that touch each tile, front to back.
 
-A radix sort orders the visible Gaussians by depth; a stable counting sort then puts (Gaussian, tile) pairs
-into tiles. Each pair also has a slot, in which the backward pass stores its sums. The slots of a Gaussian are
-neighbours: threads need no locks, and sums are added in a fixed order.
+A radix sort orders the visible Gaussians by depth; a stable counting sort then bins (Gaussian, tile) pairs by
+tile. Each pair has a slot, in which the backward pass stores its sums. The slots of a Gaussian are
+contiguous: threads need no locks, and sums are added in a fixed order.
 """
 
 # mypy: allow-untyped-defs, allow-untyped-calls, disable-error-code="misc,operator,assignment"
@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from keyss.rendering.cpu.jit import inlined, kernel
+from keyss.rendering.cpu.jit import inline, kernel
 from keyss.rendering.cpu.layout import (
     ENTRY_ROWS_SHIFT,
     EXTENT_X,
@@ -97,13 +97,13 @@ def sort_by_depth(depths, order, spare_order, keys, spare_keys):
     return count
 
 
-@inlined
+@inline
 def _measure_columns(footprints, g, height, first_column, spans, place):
-    """The rows of pixels that the ellipse alpha >= 1/255 covers in 8 columns of tiles.
+    """Compute the rows of pixels that the ellipse alpha >= 1/255 covers in 8 columns of tiles.
 
     Its footprint starts at g. spans[place:] gets the first rows, spans[place + 8:] the last ones. At x from
-    its centre the ellipse spans shear x -+ sqrt(level - curvature x^2); its extreme points in y are at
-    x = +-lowest_x. Within a column the extremes are there or at the column's edges.
+    its centre, the ellipse spans shear x -+ sqrt(level - curvature x^2). Within a column, its extremes in y
+    are at x = +-lowest_x or at the column's edges.
     """
     x = at(footprints, g + X)
     y = at(footprints, g + Y) - HALF
@@ -130,10 +130,10 @@ def _measure_columns(footprints, g, height, first_column, spans, place):
 
 @kernel
 def list_pairs(counter, footprints, order, tile_columns, height, starts, tiles, rows, slot_counts, cursors):
-    """List the tiles of each Gaussian and its rows there; those of share w start at starts[w].
+    """List the tiles of each Gaussian and its rows in them; the list of share w begins at starts[w].
 
     slot_counts[i] becomes the number of tiles that Gaussian i touches, cursors[w, t] the number of Gaussians
-    in share w that touch tile t. `tiles` and `rows` have room for one more at the end.
+    in share w that touch tile t. `tiles` and `rows` have room for one more entry at the end.
     """
     shares = cursors.shape[0]
     count = order.shape[0]
@@ -151,7 +151,7 @@ def list_pairs(counter, footprints, order, tile_columns, height, starts, tiles, 
         end = (share + 1) * count // shares
         for start in range(share * count // shares, end, BATCH):
             size = min(BATCH, end - start)
-            # First the arithmetic with long latencies for the whole batch, then the branches on its results.
+            # Arithmetic with long latencies first, for the whole batch, then branches on its results.
             for k in range(size):
                 prefetch_read(footprints, np.int64(at(order, min(start + k + BATCH, end - 1))) * PACKED)
                 g = np.int64(at(order, start + k)) * PACKED
@@ -173,7 +173,7 @@ def list_pairs(counter, footprints, order, tile_columns, height, starts, tiles, 
                     last = np.int64(at(spans, 16 * k + 8 + column % 8))
                     for row in range(first >> TILE_HEIGHT_LOG2, (last >> TILE_HEIGHT_LOG2) + 1):
                         tile = row * tile_columns + first_column
-                        # Written in any case, since a branch for empty columns would be slower.
+                        # Written unconditionally: a branch for empty columns would be slower.
                         tiles[place] = tile
                         first_row = max(first - row * TILE_HEIGHT, 0)
                         last_row = min(last - row * TILE_HEIGHT, TILE_HEIGHT - 1)
@@ -188,8 +188,8 @@ def list_pairs(counter, footprints, order, tile_columns, height, starts, tiles, 
 def sort_pairs(counter, order, starts, tiles, rows, slot_counts, first_slots, cursors, entries, entry_slots):
     """Sort the pairs of `list_pairs` into tiles, starting at the cursors.
 
-    An entry is a Gaussian and, shifted by `layout.ENTRY_ROWS_SHIFT`, its rows. entry_slots gets the slots, of
-    which Gaussian i has slot_counts[i] from first_slots[i]; if it is empty, first_slots is not read.
+    An entry is a Gaussian and, shifted by `layout.ENTRY_ROWS_SHIFT`, its rows. entry_slots gets the slots:
+    Gaussian i has slot_counts[i] slots from first_slots[i]. If it is empty, first_slots is not read.
     """
     shares = cursors.shape[0]
     count = order.shape[0]

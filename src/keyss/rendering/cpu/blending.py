@@ -2,17 +2,17 @@
 
 A tile is 8 pixels wide, so that a vector is a row. The transmittance of a full pixel is stored negated.
 
-Down a column of pixels a Gaussian's footprint is a Gaussian in y, which two recurrences evaluate:
-footprint(y + 1) = footprint(y) ratio(y) and ratio(y + 1) = ratio(y) decay. A row costs two
-multiplications, and exp is needed only every ANCHOR_ROWS rows. At such an anchor the footprint may
-underflow although a row further down is visible: with eps2d >= 0.3 the curvature in y is at most 1/0.3, so
-7 rows above a pixel with alpha >= 1/255 it can be e^-130. Therefore footprints and alphas are multiplied by
-2^64, and transmittances divided by it, which is exact.
+Down a column of pixels, a Gaussian's footprint is a Gaussian in y, evaluated by two recurrences:
+footprint(y + 1) = footprint(y) ratio(y) and ratio(y + 1) = ratio(y) decay. A row costs two multiplications;
+exp is needed only every ANCHOR_ROWS rows. At such an anchor, the footprint may underflow although a row below
+is visible: with eps2d >= 0.3 the curvature in y is at most 1/0.3, so it can be e^-130 at 7 rows above a pixel
+with alpha >= 1/255. Therefore footprints and alphas are multiplied by 2^64, and transmittances divided by it,
+which is exact.
 
-Each kernel is compiled twice. If `features` is None, a Gaussian has the three colours of its footprint,
-which stay in registers while its rows are blended. If `features` is an array [N, channels], the channels do
-not fit into registers: the weights of a strip's pixels are buffered first, then each channel passes over
-them. Numba removes the branches on None at compile time.
+Each kernel is compiled twice. If `features` is None, the three colours of a Gaussian's footprint stay in
+registers while its rows are blended. If `features` is an array [N, channels], the channels do not fit into
+registers: the weights of a strip's pixels are buffered, then each channel passes over them. Numba removes the
+branches on None at compile time.
 """
 
 # mypy: allow-untyped-defs, allow-untyped-calls, disable-error-code="misc,operator"
@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from keyss.rendering.cpu.jit import finite_inlined, finite_kernel
+from keyss.rendering.cpu.jit import finite_inline, finite_kernel
 from keyss.rendering.cpu.layout import (
     ALPHA_MAX,
     ALPHA_MIN,
@@ -72,8 +72,8 @@ from keyss.rendering.cpu.simd8 import (
 
 ANCHOR_ROWS = 8  # rows between two evaluations of exp, see above
 UNROLLED_ROWS = 4  # blended without a branch, which would cost more than an empty row
-PLANE = TILE_PIXELS + (UNROLLED_ROWS - 1) * TILE_WIDTH  # with room for unrolled rows below the tile
-BATCH = 16  # Gaussians between two tests whether the whole tile is full
+PLANE = TILE_PIXELS + (UNROLLED_ROWS - 1) * TILE_WIDTH  # includes room for unrolled rows below the tile
+BATCH = 16  # Gaussians between two tests for a full tile
 
 STRIP = 3  # numbers per strip, see `list_strips`
 MAX_STRIPS = BATCH * (TILE_HEIGHT // ANCHOR_ROWS)
@@ -85,7 +85,7 @@ SCALED_ALPHA_MAX = ALPHA_MAX * SCALE
 SCALED_TRANSMITTANCE_MIN = TRANSMITTANCE_MIN * INVERSE
 
 
-@finite_inlined
+@finite_inline
 def blend_row(planes, k, footprint):
     """Blend a row of a footprint into the transmittance at planes[k:k + 8].
 
@@ -100,7 +100,7 @@ def blend_row(planes, k, footprint):
     return alpha, select_gt(after, SCALED_TRANSMITTANCE_MIN, weight, ZERO)
 
 
-@finite_inlined
+@finite_inline
 def _is_full(planes):
     """True if all pixels of the tile are full."""
     largest = load8(planes, 0)
@@ -109,14 +109,14 @@ def _is_full(planes):
     return not any_gt(largest, SCALED_TRANSMITTANCE_MIN)
 
 
-@finite_inlined
+@finite_inline
 def list_strips(footprints, features, entries, start, end, last, left, top, strips, strip_footprints):
     """Cut the Gaussians of entries start..end into strips of up to ANCHOR_ROWS rows; returns their number.
 
     A strip is STRIP numbers in `strips`: the start of the Gaussian's record, and the start and end of its
-    pixels in a plane. strip_footprints gets the footprint, times 2^64, of its first row, and the ratio of the
-    next row to it. All exponentials of a batch come before the blending, since they are independent and have
-    long latencies. `last` is the end of the tile's list.
+    pixels in a plane. strip_footprints gets the footprint (times 2^64) of its first row, and the ratio of the
+    next row to it. Exponentials of a batch are independent and have long latencies, so they are computed
+    before blending. `last` is the end of the tile's list.
     """
     centre_x = f32(left) + HALF
     centre_y = f32(top) + HALF
@@ -147,7 +147,7 @@ def list_strips(footprints, features, entries, start, end, last, left, top, stri
     return count
 
 
-@finite_inlined
+@finite_inline
 def _blend_tile(
     footprints, features, channels, entries, start, end, left, top, planes, weights, strips, strip_footprints
 ):

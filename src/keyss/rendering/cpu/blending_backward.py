@@ -1,6 +1,6 @@
-"""Gradients of footprints and colours from those of the image: the backward pass of `blending`.
+"""The backward pass of `blending`: gradients of footprints and colours from those of the image.
 
-Entries are replayed front to back, by the same steps as in the forward pass.
+Entries are replayed front to back, with the same arithmetic as in the forward pass.
 """
 
 # mypy: allow-untyped-defs, allow-untyped-calls, disable-error-code="misc,operator"
@@ -19,7 +19,7 @@ from keyss.rendering.cpu.blending import (
     blend_row,
     list_strips,
 )
-from keyss.rendering.cpu.jit import finite_inlined, finite_kernel
+from keyss.rendering.cpu.jit import finite_inline, finite_kernel
 from keyss.rendering.cpu.layout import (
     BLUE,
     DECAY,
@@ -59,16 +59,16 @@ from keyss.rendering.cpu.simd8 import (
 PREFETCH = 6  # list entries ahead whose memory is prefetched
 
 
-@finite_inlined
+@finite_inline
 def _blend_tile_backward(
     footprints, features, channels, entries, slots, start, end, left, top, planes, weights, strips,
     strip_footprints, moments, extras,
 ):  # fmt: skip
-    """Replay entries start..end front to back; leave the sums of each pair in its slot (see layout.MOMENTS).
+    """Replay entries start..end front to back; write the sums of each pair to its slot (see layout.MOMENTS).
 
     planes = [transmittance | behind | the gradient of each channel]. `behind` is the product of the loss
-    gradient with the light from behind the current Gaussian: that with the whole pixel minus what was passed.
-    Within a row dx is fixed per lane, so the loop over rows sums powers of dy only.
+    gradient and the light from behind the current Gaussian: the pixel minus the Gaussians in front. dx is
+    constant per lane, so the loop over rows only sums powers of dy.
     """
     extra_width = 1 if features is None else channels
     centre_x = f32(left) + HALF

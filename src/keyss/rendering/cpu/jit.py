@@ -1,8 +1,8 @@
-"""Compiles kernels and caches the code.
+"""Decorators that compile kernels and cache the code.
 
-numba's cache notices changes of the file that contains a kernel, but not of the files it imports. Therefore
-all kernels share a cache folder whose name is a hash of every source file in this package, and of the one
-number that they take from elsewhere.
+numba's cache detects changes of the file that contains a kernel, but not of files it imports. Therefore all
+kernels share a cache folder whose name is a hash of every source file in this package, and of the only
+constant imported from outside.
 """
 
 from __future__ import annotations
@@ -23,38 +23,37 @@ from keyss.core.gaussians import DRAWN_OPACITY
 
 _numba: Any = numba  # typed in some versions only
 
-# All of `fastmath` but the assumption that there are no NaN and infinities: a Gaussian with a NaN must fail
-# the comparisons that select it, not index out of bounds.
+# `fastmath` without the assumption that there are no NaN and infinities: a Gaussian with a NaN must fail the
+# comparisons that select it, not index out of bounds.
 _NAN_SAFE = {"contract", "arcp", "nsz", "reassoc", "afn"}
 
 
 def kernel(function: Any) -> Any:
-    """Compile `function` at its first call; NaN and infinity compare as IEEE says."""
-    return _compiled(function, fastmath=_NAN_SAFE)
+    """Compile `function` at its first call; NaN and infinity compare as in IEEE 754."""
+    return _compile(function, fastmath=_NAN_SAFE)
 
 
 def finite_kernel(function: Any) -> Any:
     """`kernel`, but the compiler may assume that all numbers are finite."""
-    return _compiled(function, fastmath=True)
+    return _compile(function, fastmath=True)
 
 
-def inlined(function: Any) -> Any:
+def inline(function: Any) -> Any:
     """Inline a function into the kernels that call it.
 
-    LLVM would not inline large functions. Those would exist twice, alone and optimised with the kernel; a
-    process that compiles calls the first and one that loads from the cache the second, and the two round
-    differently.
+    LLVM does not inline large functions by itself. A process that compiles them would call the separate code,
+    one that loads the cached kernel the code optimised with it, and the two round differently.
     """
-    return _compiled(function, fastmath=_NAN_SAFE, forceinline=True)
+    return _compile(function, fastmath=_NAN_SAFE, forceinline=True)
 
 
-def finite_inlined(function: Any) -> Any:
-    """`inlined`, for functions that only a `finite_kernel` calls."""
-    return _compiled(function, fastmath=True, forceinline=True)
+def finite_inline(function: Any) -> Any:
+    """`inline`, for functions that only a `finite_kernel` calls."""
+    return _compile(function, fastmath=True, forceinline=True)
 
 
-def _compiled(function: Any, fastmath: bool | set[str], forceinline: bool = False) -> Any:
-    # Inlined functions borrow the kernel's arrays: counting references would cost more than some arithmetic.
+def _compile(function: Any, fastmath: bool | set[str], forceinline: bool = False) -> Any:
+    # Inlined functions borrow the kernel's arrays: reference counting would cost more than some arithmetic.
     options = {"fastmath": fastmath, "forceinline": forceinline, "error_model": "numpy", "nogil": True}
     options["_nrt"] = not forceinline
     folder = cache_folder()
@@ -65,7 +64,7 @@ def _compiled(function: Any, fastmath: bool | set[str], forceinline: bool = Fals
     _numba.config.CACHE_DIR = str(folder)
     try:
         return _numba.njit(cache=True, **options)(function)
-    except RuntimeError:  # the folder has gone, and numba's own are not writable either
+    except RuntimeError:  # the folder was removed, and numba's own are not writable
         return _numba.njit(**options)(function)
     finally:
         _numba.config.CACHE_DIR = folder_before
@@ -76,7 +75,7 @@ def cache_folder() -> Path | None:
     """The cache folder for kernels of exactly these sources; None if there is no safe place.
 
     It is in the first of `NUMBA_CACHE_DIR`, `__pycache__` beside this file and the user's cache that only
-    this user can write to: what lies there is unpickled.
+    this user can write to, because numba unpickles its content.
     """
     digest = hashlib.sha256(repr(DRAWN_OPACITY).encode())
     for source in sorted(Path(__file__).parent.glob("*.py")):

@@ -1,4 +1,4 @@
-"""Constants that all kernels share: the rendering conventions, and the layouts of their arrays."""
+"""Constants of all kernels: rendering conventions, and layouts of arrays."""
 
 import numpy as np
 
@@ -6,16 +6,16 @@ from keyss.core.gaussians import DRAWN_OPACITY
 
 f32 = np.float32
 
-# Conventions of 3DGS as in gsplat's classic mode.
+# Conventions of 3DGS, as in gsplat's classic mode.
 ALPHA_MIN = f32(DRAWN_OPACITY)  # contributions below this are skipped
 INVERSE_ALPHA_MIN = f32(1 / DRAWN_OPACITY)
 ALPHA_MAX = f32(0.999)  # alpha is clamped to this; no gradient passes a clamped alpha
-TRANSMITTANCE_MIN = f32(1e-4)  # a Gaussian that would leave no more ends its pixel and is skipped
-RADIUS_SIGMAS = f32(3.33)  # reported radii are at most this many standard deviations
+TRANSMITTANCE_MIN = f32(1e-4)  # a Gaussian that would leave less ends its pixel and is skipped
+RADIUS_SIGMAS = f32(3.33)  # maximum reported radii in standard deviations
 FOV_MARGIN = f32(0.15)  # the Jacobian is clamped beyond this share of the image on each side
-EPS2D_MIN = 0.3  # the recurrence down the rows of a tile is exact from here on
+EPS2D_MIN = 0.3  # minimum for an exact recurrence down the rows of a tile
 
-# A tile is as wide as a vector; the recurrence down its rows pays in tall tiles.
+# A tile is as wide as a vector, and tall to amortise the recurrence down its rows.
 TILE_WIDTH = 8
 TILE_HEIGHT = 32
 TILE_WIDTH_LOG2 = 3
@@ -41,9 +41,9 @@ EXTENT_X = 10  # half the width of the bounding box of all pixels with alpha >= 
 EXTENT_Y = 11
 DECAY = 12  # exp(2 YY), the ratio of successive ratios down a column
 
-# Sums that the backward pass leaves for a (Gaussian, tile) pair. The moments are one vector: with
-# s = dL/d(-sigma), sums of s, s dx, s dy, s dx^2, s dx dy, s dy^2 and of the red and green gradient. The
-# extras are the sum of the blue gradient; or, with features, that of each channel (red and green stay 0).
+# Sums of the backward pass for a (Gaussian, tile) pair. The moments are one vector: with s = dL/d(-sigma),
+# sums of s, s dx, s dy, s dx^2, s dx dy, s dy^2 and of the red and green gradient. Extras are the sum of the
+# blue gradient or, with features, of each channel's (red and green stay 0).
 MOMENTS = 8
 
 # The camera array: rotation (row-major, 0 to 8), translation, intrinsics and position in the world.
@@ -57,7 +57,7 @@ CX = 14
 CY = 15
 POSITION = 16
 
-# Tiles per piece of work: neighbours share cache lines of slots.
+# Tiles per piece of work; neighbouring tiles share cache lines of slots.
 TILE_RUN = 8
 
 CHUNK = 2048  # Gaussians per piece of work in the kernels that loop over Gaussians
@@ -69,4 +69,4 @@ TWO = f32(2)
 HUGE = f32(1e30)  # larger numbers are treated as infinite
 # Gaussians with larger colours or depths are skipped: the backward pass multiplies colours by 2^64.
 CHANNEL_MAX = f32(1e12)
-NORM_MIN = f32(1e-24)  # smallest squared length that is normalised
+NORM_MIN = f32(1e-24)  # minimum squared length for normalising

@@ -1,7 +1,7 @@
 """Arrays for the kernels, aligned to cache lines, in recycled memory.
 
-Every call needs tens of megabytes for a few milliseconds. With fresh memory, page faults would cost as much
-as the arithmetic.
+A call needs tens of megabytes for a few milliseconds. Page faults of fresh memory would cost as much as the
+arithmetic.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ Array = np.ndarray[Any, Any]
 MAX_FREE = 40  # unused buffers to keep: slightly more than one call needs
 MIN_BYTES = 2**15  # smaller arrays come from numpy
 
-# Free buffers by the number of their return, so that the least recently used come first, and these numbers by
-# capacity, since a linear search would nearly double the time of an allocation. A loan may end in the garbage
-# collector at any moment: there is no lock, only atomic operations.
+# Free buffers by the number of their return (least recently used first), and these numbers by capacity, since
+# a linear search would nearly double the time of an allocation. The garbage collector may end a loan at any
+# moment, so there is no lock: all operations are atomic.
 _free: dict[int, Array] = {}
 _returns: dict[int, list[int]] = {}
 _numbers = itertools.count()

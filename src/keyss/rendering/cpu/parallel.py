@@ -1,9 +1,9 @@
-"""Runs kernels on several threads.
+"""Run kernels on several threads.
 
-Kernels release the GIL and take small pieces of work from a shared counter, so ordinary Python threads run
-them. Unlike numba's `prange` this needs no second compilation, is safe to call from several threads and
-after a fork, and a busy core delays only its current piece. The pieces, and hence the results, do not depend
-on the number of threads.
+Kernels release the GIL and take small pieces of work from a shared counter, so that ordinary Python threads
+can run them. Unlike numba's `prange`, this needs no second compilation, is safe in several threads and after
+a fork, and a busy core delays only its current piece. Pieces, and hence results, do not depend on the number
+of threads.
 """
 
 from __future__ import annotations
@@ -28,16 +28,16 @@ def run(kernel: Callable[..., None], *arguments: Any) -> None:
     `counter` is an int64 array of one zero, from which the kernel takes the number of its next piece with
     `simd8.fetch_add`.
     """
-    # The first call loads the kernel under a lock of LLVM's bindings, which Ctrl-C may leave locked: a helper
-    # that waits for it would block this thread.
-    most = _CORES if getattr(kernel, "overloads", True) else 1
-    _on_threads(most, kernel, np.zeros(1, np.int64), *arguments)
+    # The first call loads the kernel under a lock of LLVM's bindings. Ctrl-C may leave it locked, and a
+    # helper thread waiting for it would block this one.
+    limit = _CORES if getattr(kernel, "overloads", True) else 1
+    _on_threads(limit, kernel, np.zeros(1, np.int64), *arguments)
 
 
 def in_blocks(function: Callable[[int, int], T], count: int, size: int) -> list[T]:
-    """The results of `function(start, stop)` for all blocks of `size` below `count`, in order.
+    """Results of `function(start, stop)` for all blocks of `size` below `count`, in order.
 
-    They run on as many threads as torch uses, which helps if `function` releases the GIL.
+    Runs on as many threads as torch uses, which helps if `function` releases the GIL.
     """
     starts = range(0, count, size)
     results: dict[int, T] = {}
@@ -50,14 +50,14 @@ def in_blocks(function: Callable[[int, int], T], count: int, size: int) -> list[
     return [results[start] for start in starts]
 
 
-def _on_threads(most: int, work: Callable[..., None], *arguments: Any) -> None:
-    """Call `work` on this thread and on helpers, `most` together, and return when all are done."""
-    helpers = min(torch.get_num_threads(), most) - 1
+def _on_threads(limit: int, work: Callable[..., None], *arguments: Any) -> None:
+    """Call `work` on this thread and on helpers, at most `limit` in total; returns when all are done."""
+    helpers = min(torch.get_num_threads(), limit) - 1
     tasks = [_pool(helpers).submit(work, *arguments) for _ in range(helpers)]
     try:
         work(*arguments)
     finally:
-        # Every piece is taken by now, so a helper that has not started can be cancelled.
+        # All pieces are taken by now, so helpers that have not started can be cancelled.
         for task in tasks:
             if not task.cancel():
                 task.result()

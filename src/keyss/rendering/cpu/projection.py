@@ -1,8 +1,8 @@
-"""Projects 3D Gaussians to 2D ones: EWA splatting (Zwicker et al. 2001, eq. 31) in the form of 3DGS.
+"""Projection of 3D Gaussians to 2D: EWA splatting (Zwicker et al. 2001, eq. 31) in the form of 3DGS.
 
 The covariance in the image is V V^T + eps2d I with the 2x3 matrix V = J W R S: the Jacobian of the
-perspective, the camera rotation, the Gaussian's rotation and scales. The code keeps V rather than the
-product, because the determinant is then a sum of squares and cannot cancel.
+perspective, the camera rotation, the Gaussian's rotation and scales. The code uses V instead of the product:
+the determinant is then a sum of squares, without cancellation.
 
 A vector holds 8 Gaussians, one in each lane.
 """
@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from keyss.rendering.cpu.jit import inlined, kernel
+from keyss.rendering.cpu.jit import inline, kernel
 from keyss.rendering.cpu.layout import (
     ALPHA_MIN,
     CHANNEL_MAX,
@@ -77,7 +77,7 @@ class Linearised(NamedTuple):
     inverse_depth: Any
     slopes: Any  # x / z and y / z
     clamped: Any  # slopes at which the perspective is linearised
-    jacobian: Any  # its entries xx, xz, yy and yz; the others are 0
+    jacobian: Any  # entries xx, xz, yy and yz; the others are 0
     jw: Any  # rows of J W
     quaternion: Any  # normalised
     square: Any  # squared length of the quaternion
@@ -86,8 +86,8 @@ class Linearised(NamedTuple):
     jwr: Any  # rows of J W R
 
 
-@inlined
-def linearised(camera, settings, means, quats, ids, start):
+@inline
+def linearise(camera, settings, means, quats, ids, start):
     """`Linearised` of the 8 Gaussians ids[start:]."""
     px, py, pz = gather3(means, ids, start, 3, 0)
     x = px * camera[0] + py * camera[1] + pz * camera[2] + camera[TX]
@@ -96,8 +96,8 @@ def linearised(camera, settings, means, quats, ids, start):
     inverse = divide(ONE, z)
     u = x * inverse
     v = y * inverse
-    clamped_u = _within_margin(u, camera[CX], camera[FX], f32(settings.width))
-    clamped_v = _within_margin(v, camera[CY], camera[FY], f32(settings.height))
+    clamped_u = _clamp_to_margin(u, camera[CX], camera[FX], f32(settings.width))
+    clamped_v = _clamp_to_margin(v, camera[CY], camera[FY], f32(settings.height))
     jxx = inverse * camera[FX]
     jyy = inverse * camera[FY]
     jxz = ZERO - jxx * clamped_u
@@ -124,14 +124,14 @@ def linearised(camera, settings, means, quats, ids, start):
     )  # fmt: skip
 
 
-@inlined
-def _within_margin(slope, centre, focal, size):
+@inline
+def _clamp_to_margin(slope, centre, focal, size):
     """Slopes clamped to the image and a margin around it."""
     margin = FOV_MARGIN * size / focal
     return minimum(maximum(slope, -(centre / focal + margin)), (size - centre) / focal + margin)
 
 
-@inlined
+@inline
 def _rotation_matrix(quaternion):
     """The rows of the rotation matrices of unit quaternions."""
     w, x, y, z = quaternion
@@ -142,7 +142,7 @@ def _rotation_matrix(quaternion):
     )
 
 
-@inlined
+@inline
 def _times_matrix(row, matrix):
     """A row vector times a 3x3 matrix, given by its rows."""
     return (
@@ -152,18 +152,18 @@ def _times_matrix(row, matrix):
     )
 
 
-@inlined
+@inline
 def times(a, b):
     """Elementwise products of 3 vectors each."""
     return a[0] * b[0], a[1] * b[1], a[2] * b[2]
 
 
-@inlined
+@inline
 def dot(a, b):
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-@inlined
+@inline
 def _squared_area(u, v):
     """|u x v|^2, which is det(V V^T) by Cauchy-Binet for the rows u and v of V."""
     x = u[1] * v[2] - u[2] * v[1]
@@ -217,7 +217,7 @@ def project(counter, gaussians, camera, settings, projected):
                 red, green, blue = shade(means, colors, sh_count, camera, seen, k, basis, coefficients)
                 clamped = (maximum(red, ZERO), maximum(green, ZERO), maximum(blue, ZERO))
                 scatter(footprints, seen, k, PACKED, RED, clamped)
-                # Written so that a NaN counts too.
+                # NaN must count too.
                 size_of_color = absolute(red) + absolute(green) + absolute(blue)
                 if any_gt(select_gt(CHANNEL_MAX, size_of_color, ZERO, ONE), ZERO):
                     store8(results, 0, size_of_color)
@@ -228,12 +228,12 @@ def project(counter, gaussians, camera, settings, projected):
             _copy_colors(colors, seen, visible, projected)
 
 
-@inlined
+@inline
 def _project(gaussians, camera, settings, footprints, ids, start, results):
     """Footprints without colour; results = [mean x | mean y | depth | radius x | radius y | tiles]."""
     width, height, near, far, eps2d, _ = settings
     (opacity,) = gather1(gaussians.opacities, ids, start, 1, 0)
-    linear = linearised(camera, settings, gaussians.means, gaussians.quats, ids, start)
+    linear = linearise(camera, settings, gaussians.means, gaussians.quats, ids, start)
     z = linear.point[2]
     # `seen` is 1 or 0. A NaN fails every test.
     seen = select_ge(opacity, ALPHA_MIN, ONE, ZERO)
@@ -284,7 +284,7 @@ def _project(gaussians, camera, settings, footprints, ids, start, results):
     scatter(footprints, ids, start, PACKED, 8, (zero, zero, extent_x, extent_y, decay, zero, zero, zero))
 
 
-@inlined
+@inline
 def _tiles(centre, extent, size, per_pixel):
     """The number of tiles, along one axis, with pixel centres within the extents."""
     first = floor8(maximum(ceil8(centre - extent - HALF), ZERO) * per_pixel)
@@ -292,7 +292,7 @@ def _tiles(centre, extent, size, per_pixel):
     return maximum(last - first + ONE, ZERO)
 
 
-@inlined
+@inline
 def _hide(i, projected):
     projected.depths[i] = ZERO
     projected.radii[i, 0] = 0
@@ -300,7 +300,7 @@ def _hide(i, projected):
     projected.tile_bounds[i] = 0
 
 
-@inlined
+@inline
 def _copy_colors(colors, seen, visible, projected):
     """Copy colours that are not SH into `features`, or into the footprints if it has no columns."""
     footprints, features = projected.footprints, projected.features

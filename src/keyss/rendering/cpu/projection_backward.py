@@ -1,8 +1,7 @@
-"""Gradients of the Gaussians from those of the 2D footprints: the backward pass of `projection`.
+"""The backward pass of `projection`: gradients of the Gaussians from those of the 2D footprints.
 
-Only Gaussians in the list of a tile have a gradient. A vector holds 8 of them, one in each lane; at the end
-the last Gaussian fills the free lanes, and its gradient is computed and written several times, with equal
-results.
+Only Gaussians in the list of a tile have a gradient. A vector holds 8 of them, one in each lane. The last
+Gaussian fills free lanes at the end: its gradient is written several times, with equal results.
 """
 
 # mypy: allow-untyped-defs, allow-untyped-calls, disable-error-code="misc"
@@ -11,9 +10,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from keyss.rendering.cpu.jit import inlined, kernel
+from keyss.rendering.cpu.jit import inline, kernel
 from keyss.rendering.cpu.layout import CHUNK, HALF, HUGE, MOMENTS, NORM_MIN, ONE, PACKED, RED, TWO, ZERO
-from keyss.rendering.cpu.projection import PREFETCH, dot, linearised, times
+from keyss.rendering.cpu.projection import PREFETCH, dot, linearise, times
 from keyss.rendering.cpu.rows import gather1, gather3, gather8, load_transposed, scatter
 from keyss.rendering.cpu.shading import prefetch_coefficients, shade_backward
 from keyss.rendering.cpu.simd8 import (
@@ -37,7 +36,7 @@ def project_backward(
 ):  # fmt: skip
     """Fill `gradients` and means2d_gradient.
 
-    Without need_colors, gradients.colors is not touched. `channels` is the number of feature channels, 0 if
+    Without need_colors, gradients.colors does not change. `channels` is the number of feature channels, 0 if
     the colours are in the footprints.
     """
     means, colors, colors_gradient = gaussians.means, gaussians.colors, gradients.colors
@@ -84,7 +83,7 @@ def project_backward(
             )  # fmt: skip
 
 
-@inlined
+@inline
 def _find_listed(start, end, sh_count, slot_counts, need_colors, ids, gradients, means2d_gradient):
     """Fill `ids` with the Gaussians that have pairs; returns their number. Zeros the other gradients."""
     means_gradient, quats_gradient, scales_gradient, opacities_gradient, colors_gradient = gradients
@@ -112,13 +111,13 @@ def _find_listed(start, end, sh_count, slot_counts, need_colors, ids, gradients,
     return listed
 
 
-@inlined
+@inline
 def _sum_pairs(
     ids, start, first_slots, slot_counts, moments, extras, channels, need_colors, colors_gradient, sums,
 ):  # fmt: skip
-    """Sums over the tiles of each of the 8 Gaussians ids[start:]: six moments, red, green and blue.
+    """Sums over the tiles of the 8 Gaussians ids[start:]: six moments, red, green and blue.
 
-    Of feature channels they go to colors_gradient instead.
+    Sums of feature channels are written to colors_gradient instead.
     """
     extra_width = max(channels, 1)
     for lane in range(8):
@@ -141,11 +140,11 @@ def _sum_pairs(
     return columns[:6], columns[6], columns[7], load8(sums, 64)
 
 
-@inlined
+@inline
 def _gaussian_gradients(
     gaussians, camera, settings, footprints, ids, start, moments, through_color, gradients, means2d_gradient,
 ):  # fmt: skip
-    """Go back through footprint and perspective. `through_color`: dL/d(mean) through the view directions."""
+    """Differentiate footprint and perspective. `through_color`: dL/d(mean) through the view directions."""
     s_1, s_x, s_y, s_xx, s_xy, s_yy = moments
     _, _, conic_xx, conic_xy, conic_yy, _, _, _ = gather8(footprints, ids, start, PACKED, 0)
     conic_xx = conic_xx * -TWO
@@ -166,23 +165,23 @@ def _gaussian_gradients(
     cov_xy = (t_00 * conic_xy + t_01 * conic_yy) * HALF
     cov_yy = (t_10 * conic_xy + t_11 * conic_yy) * HALF
 
-    linear = linearised(camera, settings, gaussians.means, gaussians.quats, ids, start)
+    linear = linearise(camera, settings, gaussians.means, gaussians.quats, ids, start)
     p, q = linear.jwr
     scales = gather3(gaussians.scales, ids, start, 3, 0)
 
     # dL/dV = 2 dL/d(covariance) V, then scales, rotation and the rows of J W.
     doubled = (scales[0] * TWO, scales[1] * TWO, scales[2] * TWO)
-    du = times(_combined(cov_xx, p, cov_xy, q), doubled)
-    dv = times(_combined(cov_xy, p, cov_yy, q), doubled)
+    du = times(_combine(cov_xx, p, cov_xy, q), doubled)
+    dv = times(_combine(cov_xy, p, cov_yy, q), doubled)
     u = times(du, p)
     v = times(dv, q)
     scatter(gradients.scales, ids, start, 3, 0, (u[0] + v[0], u[1] + v[1], u[2] + v[2]))
     du = times(du, scales)
     dv = times(dv, scales)
     a, b = linear.jw
-    d00, d01, d02 = _combined(a[0], du, b[0], dv)
-    d10, d11, d12 = _combined(a[1], du, b[1], dv)
-    d20, d21, d22 = _combined(a[2], du, b[2], dv)
+    d00, d01, d02 = _combine(a[0], du, b[0], dv)
+    d10, d11, d12 = _combine(a[1], du, b[1], dv)
+    d20, d21, d22 = _combine(a[2], du, b[2], dv)
     qw, qx, qy, qz = linear.quaternion
     ew = (qx * (d21 - d12) + qy * (d02 - d20) + qz * (d10 - d01)) * TWO
     ex = (qy * (d10 + d01) + qz * (d20 + d02) + qw * (d21 - d12) - qx * (d11 + d22) * TWO) * TWO
@@ -202,8 +201,8 @@ def _gaussian_gradients(
     da = (_finite(dot(du, r[0])), _finite(dot(du, r[1])), _finite(dot(du, r[2])))
     db = (_finite(dot(dv, r[0])), _finite(dot(dv, r[1])), _finite(dot(dv, r[2])))
 
-    # Through J and the projected centre to the mean in camera space (tx, ty, tz). J does not depend on a
-    # clamped slope.
+    # Gradient of the mean in camera space (tx, ty, tz), through J and the projected centre. J does not depend
+    # on clamped slopes.
     jxx, _, jyy, _ = linear.jacobian
     clamped_x, clamped_y = linear.clamped
     djxx = da[0] * camera[0] + da[1] * camera[1] + da[2] * camera[2]
@@ -229,18 +228,18 @@ def _gaussian_gradients(
     scatter(gradients.means, ids, start, 3, 0, mean_gradient)
 
 
-@inlined
-def _combined(x, p, y, q):
+@inline
+def _combine(x, p, y, q):
     """x p + y q, with 3 vectors each in p and q."""
     return x * p[0] + y * q[0], x * p[1] + y * q[1], x * p[2] + y * q[2]
 
 
-@inlined
+@inline
 def _finite(a):
-    """`a`, and 0 where it is NaN or too large to multiply, as happens for Gaussians of absurd sizes."""
+    """`a`, or 0 if it is NaN or too large to multiply, as for absurdly large Gaussians."""
     return select_gt(HUGE, absolute(a), a, ZERO)
 
 
-@inlined
+@inline
 def _one_where_equal(a, b):
     return select_ge(a, b, select_ge(b, a, ONE, ZERO), ZERO)

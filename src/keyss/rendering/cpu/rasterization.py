@@ -49,12 +49,12 @@ class ProjectedArrays(NamedTuple):
     means2d: Array  # [N, 2] pixels
     depths: Array  # [N]; 0 for invisible Gaussians
     radii: Array  # [N, 2] int32, pixels; 0 for invisible Gaussians
-    tile_bounds: Array  # [N] int32, upper bound of the tiles that the Gaussian touches
+    tile_bounds: Array  # [N] int32, upper bound on the number of tiles that the Gaussian touches
 
 
 @dataclass(frozen=True)
 class Rendering:
-    """One camera's forward pass, as far as the backward pass needs it."""
+    """Results of one camera's forward pass that the backward pass needs."""
 
     camera: Array  # [CAMERA], see `layout`
     footprints: Array  # [N, PACKED]
@@ -64,7 +64,7 @@ class Rendering:
     tile_starts: Array  # [tiles + 1] first list entry of each tile
     entries: Array  # [pairs] Gaussians and their rows, see `layout.ENTRY_ROWS_SHIFT`
     entry_slots: Array  # [pairs] the slot of each list entry; empty without gradients
-    ends: Array  # [tiles] the list entry at which the tile was full
+    ends: Array  # [tiles] list entry at which the tile was full
 
 
 def rasterize(
@@ -231,7 +231,7 @@ def _render(
     )  # fmt: skip
     counts = cursors.T.ravel()
     ends_of_counts = np.cumsum(counts)
-    cursors[:] = (ends_of_counts - counts).reshape(-1, shares).T  # from counts to starts
+    cursors[:] = (ends_of_counts - counts).reshape(-1, shares).T  # counts become starts
     tile_starts = np.append(cursors[0], ends_of_counts[-1])
     first_slots = np.cumsum(slot_counts, dtype=np.int32) - slot_counts
     pairs = int(tile_starts[-1])

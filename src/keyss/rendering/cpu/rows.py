@@ -1,4 +1,4 @@
-"""Gathers and scatters rows of arrays: column k of 8 rows becomes one vector.
+"""Gather and scatter rows of arrays: column k of 8 rows becomes one vector.
 
 A row belongs to one Gaussian; `ids[start:start + 8]` selects 8 of them. A Gaussian may occur several times if
 the stored values are equal. Arrays are flat: row i starts at i * stride.
@@ -15,7 +15,7 @@ from numba.core import cgutils
 from keyss.rendering.cpu.simd8 import FLOAT, INT, VECTOR, element, float32x8, intrinsic, shuffle
 
 
-def _transposed(builder, rows):
+def _transpose(builder, rows):
     """The transpose of 8 vectors: the i-th result has the i-th lanes of all rows."""
     rows = list(rows)
     # Exchange lanes between rows 4, 2 and 1 apart.
@@ -50,7 +50,7 @@ def _parts(builder, address, count):
             first += size
 
 
-def _gathering(count):
+def _make_gather(count):
     @intrinsic
     def gather(typingctx, array, ids, start, stride, column):
         def codegen(context, builder, signature, arguments):
@@ -64,7 +64,7 @@ def _gathering(count):
                     lanes = [8 + lane - first if first <= lane < first + size else lane for lane in range(8)]
                     value = shuffle(builder, value, builder.shuffle_vector(part, part, wide), lanes)
                 rows.append(value)
-            return context.make_tuple(builder, signature.return_type, _transposed(builder, rows)[:count])
+            return context.make_tuple(builder, signature.return_type, _transpose(builder, rows)[:count])
 
         return types.UniTuple(float32x8, count)(array, ids, start, types.intp, types.intp), codegen
 
@@ -72,20 +72,20 @@ def _gathering(count):
 
 
 # (array, ids, start, stride, column): columns column:column + count of the 8 rows, as a tuple of vectors.
-gather1 = _gathering(1)
-gather3 = _gathering(3)
-gather4 = _gathering(4)
-gather8 = _gathering(8)
+gather1 = _make_gather(1)
+gather3 = _make_gather(3)
+gather4 = _make_gather(4)
+gather8 = _make_gather(8)
 
 
 @intrinsic
 def scatter(typingctx, array, ids, start, stride, column, values):
-    """Write a tuple of vectors to the columns from `column` on."""
+    """Write a tuple of vectors to the columns starting at `column`."""
 
     def codegen(context, builder, signature, arguments):
         count = signature.args[5].count
         columns = cgutils.unpack_tuple(builder, arguments[5], count)
-        rows = _transposed(builder, columns + [ir.Constant(VECTOR, ir.Undefined)] * (8 - count))
+        rows = _transpose(builder, columns + [ir.Constant(VECTOR, ir.Undefined)] * (8 - count))
         for value, row in zip(rows, _addresses(context, builder, signature, arguments), strict=True):
             for first, size, address in _parts(builder, row, count):
                 lanes = ir.Constant(ir.VectorType(INT, size), list(range(first, first + size)))
@@ -106,6 +106,6 @@ def load_transposed(typingctx, array, index):
             place = builder.gep(address, [INT(8 * row)])
             rows.append(builder.load(builder.bitcast(place, VECTOR.as_pointer())))
             rows[-1].align = 4
-        return context.make_tuple(builder, signature.return_type, _transposed(builder, rows))
+        return context.make_tuple(builder, signature.return_type, _transpose(builder, rows))
 
     return types.UniTuple(float32x8, 8)(array, index), codegen

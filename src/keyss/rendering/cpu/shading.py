@@ -9,7 +9,7 @@ vector at 8 k.
 
 from __future__ import annotations
 
-from keyss.rendering.cpu.jit import inlined
+from keyss.rendering.cpu.jit import inline
 from keyss.rendering.cpu.layout import HALF, NORM_MIN, ONE, POSITION, TWO, ZERO, f32
 from keyss.rendering.cpu.rows import gather3, gather8, scatter
 from keyss.rendering.cpu.simd8 import (
@@ -44,7 +44,7 @@ _10 = f32(10)
 _15 = f32(15)
 
 
-@inlined
+@inline
 def shade(means, colors, sh_count, camera, ids, start, basis, coefficients):
     """Unclamped red, green and blue of the 8 Gaussians ids[start:]."""
     px, py, pz = gather3(means, ids, start, 3, 0)
@@ -62,12 +62,12 @@ def shade(means, colors, sh_count, camera, ids, start, basis, coefficients):
     return red, green, blue
 
 
-@inlined
+@inline
 def shade_backward(
     means, colors, sh_count, camera, ids, start, red, green, blue, need_colors, basis, coefficients,
     colors_gradient,
 ):  # fmt: skip
-    """Fills the gradients of the SH coefficients; returns dL/d(mean) through the view directions."""
+    """Fill the gradients of the SH coefficients; returns dL/d(mean) through the view directions."""
     px, py, pz = gather3(means, ids, start, 3, 0)
     x, y, z, inverse = view_directions(camera, px, py, pz)
     dx = splat(ZERO)
@@ -95,7 +95,7 @@ def shade_backward(
     return dx, dy, dz
 
 
-@inlined
+@inline
 def sh_basis(basis, count, x, y, z):
     """Fill basis[:8 count] (count 1, 4, 9 or 16) for the unit directions (x, y, z)."""
     store8(basis, 0, splat(C0))
@@ -123,7 +123,7 @@ def sh_basis(basis, count, x, y, z):
             store8(basis, 120, (xx - yy * _3) * x * -C3_YXX)
 
 
-@inlined
+@inline
 def sh_direction_gradient(d, count, x, y, z):
     """dL/d(x, y, z) where d[8 k:] = dL/d(basis k), count 4 or more; x, y, z are treated as independent."""
     gx = load8(d, 24) * -C1
@@ -156,7 +156,7 @@ def sh_direction_gradient(d, count, x, y, z):
     return gx, gy, gz
 
 
-@inlined
+@inline
 def view_directions(camera, px, py, pz):
     """Unit vectors from the camera to world points, and inverse distances."""
     x = px - camera[POSITION]
@@ -166,13 +166,13 @@ def view_directions(camera, px, py, pz):
     return x * inverse, y * inverse, z * inverse, inverse
 
 
-@inlined
+@inline
 def inverse_length(square):
     """1 / sqrt(square); a large finite number for 0."""
     return divide(ONE, square_root(maximum(square, NORM_MIN)))
 
 
-@inlined
+@inline
 def prefetch_coefficients(colors, sh_count, i):
     """Prefetch the SH coefficients of Gaussian i."""
     row = i * colors.shape[1] * 3
@@ -180,7 +180,7 @@ def prefetch_coefficients(colors, sh_count, i):
         prefetch_read(colors, k)
 
 
-@inlined
+@inline
 def load_coefficients(colors, sh_count, ids, start, coefficients):
     """Load the SH coefficients of the 8 Gaussians ids[start:]: coefficient k of channel c at 8 (3 k + c)."""
     stride = colors.shape[1] * 3
@@ -203,7 +203,7 @@ def load_coefficients(colors, sh_count, ids, start, coefficients):
         store8(coefficients, 8 * k + 56, v7)
 
 
-@inlined
+@inline
 def store_coefficients(colors_gradient, sh_count, ids, start, coefficients):
     """The inverse of `load_coefficients`."""
     stride = colors_gradient.shape[1] * 3

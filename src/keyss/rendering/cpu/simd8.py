@@ -1,11 +1,11 @@
 """Explicit vectors of 8 float32 for numba kernels, and a few scalar operations that numba lacks.
 
 LLVM does not vectorise the row loops of the rasterizer by itself. The type maps to LLVM's <8 x float>, which
-every target can execute: one AVX register, two SSE or NEON registers. `+`, `-` and `*` work between vectors
-and between a vector and a float32.
+all targets support: one AVX register, two SSE or NEON registers. `+`, `-` and `*` work between vectors and
+between a vector and a float32.
 
-Arrays are indexed flat, must be contiguous, and are not bounds-checked. The decorator of the kernel
-determines what the compiler may assume of floats, see `jit`.
+Arrays are indexed flat, must be contiguous, and are not bounds-checked. The decorator of the kernel sets the
+floating-point assumptions of the compiler, see `jit`.
 """
 
 # mypy: allow-untyped-defs, allow-untyped-calls, disable-error-code="misc"
@@ -24,7 +24,7 @@ from numba import extending, types
 from numba.core import cgutils
 from numba.extending import lower_builtin, models, register_model, type_callable
 
-from keyss.rendering.cpu.jit import inlined
+from keyss.rendering.cpu.jit import inline
 
 intrinsic: Any = extending.intrinsic  # kernels call intrinsics without the typing context
 
@@ -69,11 +69,11 @@ def _splat(builder, scalar):
 
 
 def _operand(argument_type):
-    """The type to pass an argument as: vectors unchanged, numbers as float32."""
+    """The type of an argument: vectors unchanged, numbers as float32."""
     return argument_type if isinstance(argument_type, Float32x8) else types.float32
 
 
-def _as_vectors(builder, signature, values):
+def _to_vectors(builder, signature, values):
     return [
         value if isinstance(argument, Float32x8) else _splat(builder, value)
         for argument, value in zip(signature.args, values, strict=True)
@@ -107,7 +107,7 @@ def _register_operator(python_operator, instruction):
         return typer
 
     def lower(context, builder, signature, values):
-        return getattr(builder, instruction)(*_as_vectors(builder, signature, values))
+        return getattr(builder, instruction)(*_to_vectors(builder, signature, values))
 
     for operands in ((Float32x8, Float32x8), (Float32x8, types.Float), (types.Float, Float32x8)):
         lower_builtin(python_operator, *operands)(lower)
@@ -181,7 +181,7 @@ def load_interleaved(typingctx, array, index):
 
 
 class _NoFlags(FastMathFlags):
-    """numba adds the flags of `fastmath` to every call; none of them reaches this one."""
+    """Ignores the flags of `fastmath` that numba adds to every call."""
 
     def add(self, name):
         pass
@@ -189,10 +189,10 @@ class _NoFlags(FastMathFlags):
 
 @intrinsic
 def fused_multiply_add(typingctx, a, b, c):
-    """a b + c of float32 numbers, rounded once, also by processors without such an instruction."""
+    """a b + c of float32 numbers, rounded once, even on processors without such an instruction."""
 
     def codegen(context, builder, signature, arguments):
-        # With `afn` or `contract` LLVM makes a product and a sum of it there, which round twice.
+        # With `afn` or `contract`, LLVM would emit a product and a sum on these, which round twice.
         found = builder.fma(*arguments)
         found.fastmath = _NoFlags()
         return found
@@ -200,61 +200,61 @@ def fused_multiply_add(typingctx, a, b, c):
     return types.float32(types.float32, types.float32, types.float32), codegen
 
 
-def _of_vectors(build):
-    """The intrinsic that `build` makes of vectors; numbers among its arguments become vectors of them."""
+def _vector_intrinsic(build):
+    """An intrinsic from `build`, which takes vectors; numbers among its arguments are broadcast."""
 
     def function(typingctx, *operands):
         def codegen(context, builder, signature, arguments):
-            return build(builder, *_as_vectors(builder, signature, arguments))
+            return build(builder, *_to_vectors(builder, signature, arguments))
 
         return float32x8(*map(_operand, operands)), codegen
 
-    # numba takes no variable number of arguments.
+    # numba does not support *arguments.
     function.__signature__ = inspect.signature(build)  # type: ignore[attr-defined]
     return intrinsic(function)
 
 
-def _selected(predicate, builder, a, b, yes, no):
+def _select(predicate, builder, a, b, yes, no):
     return builder.select(builder.fcmp_ordered(predicate, a, b), yes, no)
 
 
-def _called(name, builder, a):
+def _call(name, builder, a):
     return builder.call(_llvm_function(builder, name, VECTOR, [VECTOR]), [a])
 
 
-multiply_add = _of_vectors(_multiply_add)  # a * b + c, one instruction where the CPU has it
-divide = _of_vectors(lambda builder, a, b: builder.fdiv(a, b))
-select_ge = _of_vectors(partial(_selected, ">="))  # (a, b, yes, no): `yes` where a >= b, else `no`
-select_gt = _of_vectors(partial(_selected, ">"))
-select_le = _of_vectors(partial(_selected, "<="))
-minimum = _of_vectors(lambda builder, a, b: _selected("<", builder, a, b, a, b))
-maximum = _of_vectors(lambda builder, a, b: _selected(">", builder, a, b, a, b))
-square_root = _of_vectors(partial(_called, "llvm.sqrt.v8f32"))
-floor8 = _of_vectors(partial(_called, "llvm.floor.v8f32"))
-ceil8 = _of_vectors(partial(_called, "llvm.ceil.v8f32"))
-absolute = _of_vectors(partial(_called, "llvm.fabs.v8f32"))
+multiply_add = _vector_intrinsic(_multiply_add)  # a * b + c, one instruction where the CPU has it
+divide = _vector_intrinsic(lambda builder, a, b: builder.fdiv(a, b))
+select_ge = _vector_intrinsic(partial(_select, ">="))  # (a, b, yes, no): `yes` where a >= b, else `no`
+select_gt = _vector_intrinsic(partial(_select, ">"))
+select_le = _vector_intrinsic(partial(_select, "<="))
+minimum = _vector_intrinsic(lambda builder, a, b: _select("<", builder, a, b, a, b))
+maximum = _vector_intrinsic(lambda builder, a, b: _select(">", builder, a, b, a, b))
+square_root = _vector_intrinsic(partial(_call, "llvm.sqrt.v8f32"))
+floor8 = _vector_intrinsic(partial(_call, "llvm.floor.v8f32"))
+ceil8 = _vector_intrinsic(partial(_call, "llvm.ceil.v8f32"))
+absolute = _vector_intrinsic(partial(_call, "llvm.fabs.v8f32"))
 
 
-@_of_vectors
+@_vector_intrinsic
 def splat(builder, a):
     """The vector with `a` in every lane."""
     return a
 
 
-@_of_vectors
+@_vector_intrinsic
 def ramp(builder, start):
     """(start, start + 1, ... start + 7)."""
     return builder.fadd(start, ir.Constant(VECTOR, [float(i) for i in range(8)]))
 
 
-@_of_vectors
+@_vector_intrinsic
 def negative_abs(builder, a):
     """-|a|."""
     bits = builder.or_(builder.bitcast(a, INT_VECTOR), ir.Constant(INT_VECTOR, [-(1 << 31)] * 8))
     return builder.bitcast(bits, VECTOR)
 
 
-@_of_vectors
+@_vector_intrinsic
 def sum_lanes_of_8(builder, a0, a1, a2, a3, a4, a5, a6, a7):
     """The vector whose lane i is the sum of the lanes of a_i: 7 steps instead of 8 times 3."""
 
@@ -272,10 +272,10 @@ def sum_lanes_of_8(builder, a0, a1, a2, a3, a4, a5, a6, a7):
 
 @intrinsic
 def any_gt(typingctx, a, b):
-    """True where a > b in any lane."""
+    """True if a > b in any lane."""
 
     def codegen(context, builder, signature, arguments):
-        mask = builder.fcmp_ordered(">", *_as_vectors(builder, signature, arguments))
+        mask = builder.fcmp_ordered(">", *_to_vectors(builder, signature, arguments))
         lanes = ir.IntType(8)
         return builder.icmp_unsigned("!=", builder.bitcast(mask, lanes), lanes(0))
 
@@ -312,7 +312,7 @@ def _exponent_and_fraction(typingctx, x):
     return types.UniTuple(float32x8, 2)(float32x8), codegen
 
 
-@inlined
+@inline
 def log(x):
     """Natural logarithm of positive normal numbers, within 1e-7 (1 + |log x|)."""
     exponent, fraction = _exponent_and_fraction(x)
@@ -344,7 +344,7 @@ def _exponential(power):
 
     def build(builder, x):
         scaled = builder.fmul(x, _constant(_LOG2_E))
-        exponent = _called("llvm.rint.v8f32", builder, scaled)
+        exponent = _call("llvm.rint.v8f32", builder, scaled)
         fraction = builder.fsub(scaled, exponent)
         result = _constant(_EXP2_COEFFICIENTS[-1])
         for coefficient in _EXP2_COEFFICIENTS[-2::-1]:
@@ -353,9 +353,9 @@ def _exponential(power):
         steps = builder.add(steps, ir.Constant(INT_VECTOR, [power] * 8))
         shift = builder.shl(steps, ir.Constant(INT_VECTOR, [23] * 8))
         result = builder.bitcast(builder.add(builder.bitcast(result, INT_VECTOR), shift), VECTOR)
-        return _selected(">", builder, x, _constant(lowest), result, _constant(0.0))
+        return _select(">", builder, x, _constant(lowest), result, _constant(0.0))
 
-    return _of_vectors(build)
+    return _vector_intrinsic(build)
 
 
 exp = _exponential(0)  # e^x for x < 87, and 0 below -87; the relative error is about 1e-7 (1 + |x|)
@@ -388,7 +388,7 @@ def put(typingctx, array, index, value):
 
 @intrinsic
 def fetch_add(typingctx, array, index, value):
-    """Atomically add to an integer element; returns what it was before."""
+    """Atomically add to an integer element; returns its old value."""
 
     def codegen(context, builder, signature, arguments):
         address = element(context, builder, signature.args[0], *arguments[:2])
@@ -417,7 +417,7 @@ prefetch_read = _prefetch(0)  # (array, index): prefetch the cache line of array
 prefetch_write = _prefetch(1)
 
 
-def _rounding(name):
+def _make_rounding(name):
     @intrinsic
     def to_integer(typingctx, x):
         def codegen(context, builder, signature, arguments):
@@ -429,6 +429,6 @@ def _rounding(name):
     return to_integer
 
 
-# numba compiles math.floor and math.ceil to library calls; these are one instruction each.
-floor = _rounding("floor")
-ceil = _rounding("ceil")
+# Single instructions; numba compiles math.floor and math.ceil to library calls.
+floor = _make_rounding("floor")
+ceil = _make_rounding("ceil")
