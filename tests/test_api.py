@@ -5,7 +5,6 @@ from __future__ import annotations
 import difflib
 import inspect
 import json
-import os
 import re
 from dataclasses import is_dataclass, replace
 from pathlib import Path
@@ -144,28 +143,6 @@ def test_outputs_that_exist_are_refused_before_any_work(
     assert (tmp_path / "x.ply").read_text() == "mine"
     keyss.reveal(run / "publish" / "model.ply", "the key", out=tmp_path / "x.ply", overwrite=True)
     assert len(keyss.read_model(tmp_path / "x.ply"))
-
-
-def test_a_full_disk_leaves_no_results_but_keeps_the_work(
-    folders: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    config = replace(CONFIG.fit, iterations=5)
-    real = os.replace
-
-    def full(source: Any, target: Any) -> None:
-        if str(target).endswith("metrics.json"):
-            raise OSError(28, "No space left on device")
-        real(source, target)
-
-    monkeypatch.setattr(os, "replace", full)
-    with pytest.raises(OutputError, match="No space left"):
-        keyss.fit(folders[0], config=config, out=tmp_path / "run")
-    left = {path.name for path in (tmp_path / "run").rglob("*") if path.is_file()}
-    assert left == {"fit.safetensors", "manifest.json"}
-    monkeypatch.undo()
-    keyss.fit(folders[0], config=config, out=tmp_path / "run", resume=True)
-    assert (tmp_path / "run" / "model.ply").exists()
-    assert not (tmp_path / "run" / "private" / "checkpoint").exists()
 
 
 def test_render_writes_a_picture_per_test_view(run: Path, folders: tuple[Path, Path], tmp_path: Path) -> None:

@@ -88,14 +88,6 @@ def test_the_cost_does_not_depend_on_the_unit(keyss: Run, tmp_path: Path, unit: 
     assert len(read_model(tmp_path / "other.spz").means.unique(dim=0)) == COUNT or unit < 1e-4
 
 
-@pytest.mark.parametrize("hidden", [{"opacity_logits": -12.0}, {"sh": -4.0}], ids=["transparent", "black"])
-def test_empty_renders_are_not_called_unchanged(keyss: Run, tmp_path: Path, hidden: dict[str, float]) -> None:
-    model = random_gaussians(COUNT, sh_degree=0)
-    changed = {name: torch.full_like(getattr(model, name), value) for name, value in hidden.items()}
-    write_model(tmp_path / "a.ply", replace(model, **changed))
-    assert "renders are empty" in keyss("convert", tmp_path / "a.ply", tmp_path / "a.splat").out
-
-
 @pytest.mark.parametrize("suffix", ["sog", "compressed.ply"])
 def test_every_verb_that_takes_models_takes_each_format(keyss: Run, files: Path, suffix: str) -> None:
     path = files / f"plain.{suffix}"

@@ -39,17 +39,6 @@ def test_one_key_in_python_in_a_file_and_in_the_environment(
         assert ("white space around the key does not count" in said.err) == key.endswith(" ")
 
 
-def test_what_is_lost_is_said(keyss: Run) -> None:
-    said = keyss(*HIDE, "--secret", "large.ply", "--prune-to-fit", "-o", "run")
-    assert said.status == 0, said.err
-    kept = len(library.reveal("run/publish/model.ply", KEY).gaussians)
-    assert f"The secret kept {kept:,} of 2,500 Gaussians, " in said.out
-    refused = keyss(*HIDE, "--secret", "large.ply", "--prune-to-fit", "--format", "spz", "-o", "poor")
-    assert refused.status == 7
-    assert "of 2,500 Gaussians is at" in refused.err
-    assert not Path("poor/publish").exists()
-
-
 def test_a_cover_without_harmonics_gets_the_room_that_the_refusal_promises(keyss: Run) -> None:
     flat = [word.replace("cover.ply", "flat.ply") for word in HIDE]
     shown = keyss(*flat, "--secret", "small.ply", "-o", "shown")

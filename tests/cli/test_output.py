@@ -24,7 +24,6 @@ def shell(redirection: str, *arguments: object, **environment: str) -> subproces
     return subprocess.run(command, capture_output=True, env=variables, timeout=120, check=False)
 
 
-@pytest.mark.counted
 @pytest.mark.parametrize(
     ("redirection", "status"),
     [
@@ -68,7 +67,6 @@ def test_a_reader_that_leaves_is_no_error(command: str) -> None:
     assert _with_a_reader_that_leaves([command]).returncode == 141
 
 
-@pytest.mark.counted
 @pytest.mark.parametrize(("redirection", "status"), [("2>/dev/full", 4), ("2>&-", 4), ("2>&- >&-", 4)])
 def test_an_error_has_its_status_where_nobody_can_be_told(redirection: str, status: int) -> None:
     assert shell(redirection, "info", "nowhere").returncode == status

@@ -173,23 +173,6 @@ class TestStreams:
         status, out, err = self.program("info", "-", "--json", data=out)
         assert (status, json.loads(out)["gaussians"]) == (0, 500)
 
-    def test_what_cannot_be_read(self, keyss: Run, files: Path, tmp_path: Path) -> None:
-        data = (files / "whole.ply").read_bytes()[:-9]
-        status, out, err = self.program("verify", "-", data=data)
-        assert (status, out) == (4, b"")
-        assert "standard input: not a whole .ply file" in err
-        said = keyss("reveal", "-", "-o", tmp_path / "s.ply")
-        assert_refused(said, 2, "--key-file")  # no prompt: standard input is in use
-
-    def test_no_model_is_written_to_a_terminal(
-        self, keyss: Run, files: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        import sys
-
-        monkeypatch.setattr(type(sys.stdout), "isatty", lambda self: True)
-        said = keyss("reveal", files / "whole.ply", "--key-file", files / "key", "-o", "-")
-        assert (said.status, "terminal" in said.err, said.out) == (2, True, "")
-
 
 class TestVerify:
     def test_a_sound_model_whatever_is_in_it(self, keyss: Run, files: Path) -> None:

@@ -14,7 +14,7 @@ from channels.colours.made import cover
 from channels.quiet.trained_like import trained_like
 from cli.said import Run, assert_refused, listing, write_key
 from keyss import write_model
-from keyss.channels import Payload, pack_payload, unpack_payload
+from keyss.channels import Payload
 from keyss.cli import main
 from keyss.core import InputError, UsageError
 from keyss.methods import HiddenFile
@@ -94,19 +94,6 @@ def test_published_anywhere_a_file_opens_from_what_it_was_converted_to(
     assert (tmp_path / "back").read_bytes() == (tmp_path / "note.txt").read_bytes()
     said = keyss("reveal", tmp_path / "web.spz", "--key-file", folder / "key1", "-o", tmp_path / "none")
     assert_refused(said, 3, "opens nothing")
-
-
-@given(st.binary(max_size=400), st.text(max_size=60))
-def test_any_bytes_and_any_name_come_back(data: bytes, name: str) -> None:
-    file = HiddenFile(name.encode(errors="replace").decode(), data)
-    assert HiddenFile.of(file.payload()) == file
-    assert unpack_payload(pack_payload(file.payload())) == file.payload()
-
-
-@pytest.mark.parametrize("data", [b"", b"\0x", b"file", b"sixteen letters!\0x", b"\xff\0x"])
-def test_what_no_writer_packed_is_refused(data: bytes) -> None:
-    with pytest.raises(InputError):
-        unpack_payload(data)
 
 
 @given(st.binary(max_size=300))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import random
 import signal
 import subprocess
 import sys
@@ -12,8 +11,6 @@ from pathlib import Path
 import pytest
 
 from cli.said import PROGRAM, Run, Said, assert_refused, listing
-
-pytestmark = pytest.mark.counted
 
 WORDS = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated", signal.SIGHUP: "terminated"}
 
@@ -69,21 +66,6 @@ def test_a_signal_ends_any_command_with_one_line(
     process.send_signal(signum)
     _assert_ended(process, signum, f"{command} after {seconds} s")
     assert not [name for name in listing(tmp_path) if name.endswith(".unfinished")]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("command", ["help", "info", "reveal", "fit"])
-def test_signals_at_random_moments(world: Path, tmp_path: Path, command: str) -> None:
-    moments = random.Random(command)
-    for number in range(24):
-        folder = tmp_path / str(number)
-        folder.mkdir()
-        process = _started(_commands(world, folder)[command])
-        seconds, signum = moments.uniform(0, 0.4 if command == "help" else 3), moments.choice(list(WORDS))
-        time.sleep(seconds)
-        process.send_signal(signum)
-        _assert_ended(process, signum, f"{command}, {signum.name} after {seconds:.3f} s")
-        assert not [name for name in listing(folder) if name.endswith(".unfinished")]
 
 
 def _ended(program: str, *arguments: str) -> Said:

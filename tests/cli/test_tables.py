@@ -11,7 +11,6 @@ from rich.console import Console
 from cli.said import METRICS
 from keyss.cli.tables import print_hiding
 from keyss.fitting import ImageQuality
-from keyss.measure import BaselineQuality, PsnrRange, WrongKeys
 from keyss.runs import HideMetrics
 
 
@@ -33,36 +32,6 @@ class TestNumbers:
             ["PSNR in dB."],
         ]
         assert rows[-1] == ["Room in the cover: 1,000 Gaussians."]
-
-    def test_two_secrets_and_wrong_keys_in_80_columns(self) -> None:
-        two = replace(
-            METRICS,
-            secrets=METRICS.secrets * 2,
-            baseline=BaselineQuality(
-                ImageQuality(30.0, 0.5),
-                (ImageQuality(19.0, 0.2), None),
-                (10**5,) * 3,
-                (9,) * 3,
-                (True, False, True),
-            ),
-            photos=(True, True, False),
-            against_plain=METRICS.against_plain + METRICS.against_plain[1:],
-            secret_gaussians=(5, 6),
-            steps=(10**4, 10**4, 10**4),
-            chance_level=(9.0, 8.0),
-            wrong_key=WrongKeys(
-                7, PsnrRange(28.0, 27.0, 29.0), (PsnrRange(8.0, 7.0, 9.5), PsnrRange(6.0, 5.0, 7.5))
-            ),
-        )
-        rows = self.table(two)
-        assert rows[2] == ["secret 1", "20.00", "0.250", "19.00", "5", "100,000", "10,000"]
-        assert rows[3][0] == "secret 2 (renders)"
-        said = " ".join(cell for row in rows for cell in row)
-        assert (
-            "7 wrong keys: on average 28.00 to the cover, at least 27.00; at most 9.50 to the secret 1"
-            in said
-        )
-        assert "Chance level: 9.00, 8.00" in said
 
     def test_what_is_left_of_a_secret_is_said(self) -> None:
         baseline = replace(METRICS.baseline, gaussians=(10, 8406))

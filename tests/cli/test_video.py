@@ -59,23 +59,6 @@ def test_once_around_a_model(keyss: Run, files: Path, tmp_path: Path) -> None:
     assert psnr(frames[0], meant[5]) < 25  # it moved
 
 
-def test_a_wipe_from_one_model_to_the_other_and_back(keyss: Run, files: Path, tmp_path: Path) -> None:
-    models = ("render", files / "a.ply", "--wipe", files / "b.ply")
-    said = keyss(*models, "--video", tmp_path / "w.mp4", "--seconds", 0.32, "--width", 96)
-    assert said.status == 0, said.err
-    frames = frames_of(tmp_path / "w.mp4")
-    a, b = (
-        [picture(model, camera) for camera in circle(model, 96, 8)]
-        for model in (random_gaussians(400, seed) for seed in (0, 1))
-    )
-    assert psnr(frames[0], a[0]) > 30
-    assert psnr(frames[4], b[4]) > 30
-    for index in (2, 6):  # half of each
-        assert psnr(frames[index][:, :44], b[index][:, :44]) > 28
-        assert psnr(frames[index][:, 52:], a[index][:, 52:]) > 28
-        assert frames[index][:, 47:49].mean() > 200
-
-
 def test_a_circle_looks_at_the_middle_from_above() -> None:
     model = random_gaussians(50)
     middle, _ = middle_and_radius(model)

@@ -124,26 +124,3 @@ def write_nerfstudio(folder: Path, count: int = 3, **extra: object) -> Path:
     }
     write_json(folder / "transforms.json", {k: v for k, v in (meta | extra).items() if v is not None})
     return folder
-
-
-def mutations(data: bytes, count: int, seed: int = 0) -> list[bytes]:
-    """`data` with a few bytes overwritten, cut out or doubled, in `count` reproducible ways."""
-    rng = np.random.default_rng(seed)
-    broken = []
-    for _ in range(count):
-        changed = bytearray(data)
-        for _ in range(rng.integers(1, 4)):
-            at = int(rng.integers(0, len(changed)))
-            match rng.integers(0, 4):
-                case 0:
-                    changed[at] = int(rng.integers(0, 256))
-                case 1:
-                    changed[at : at + 8] = b"\xff" * len(changed[at : at + 8])
-                case 2:
-                    del changed[at : at + int(rng.integers(1, 9))]
-                case _:
-                    changed[at:at] = changed[at : at + 8]
-            if not changed:
-                break
-        broken.append(bytes(changed))
-    return broken

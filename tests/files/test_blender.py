@@ -51,22 +51,6 @@ def test_transparency_shows_the_background(tmp_path: Path, background: object) -
     np.testing.assert_allclose(scene.background, behind, rtol=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("splits", "train", "test"),
-    [
-        (("train", "test", "val"), ["train/r_0.png", "train/r_1.png"], ["test/r_0.png", "test/r_1.png"]),
-        (("train", "val"), ["train/r_0.png", "train/r_1.png"], ["val/r_0.png", "val/r_1.png"]),
-        (("train",), ["train/r_1.png"], ["train/r_0.png"]),
-    ],
-)
-def test_which_photos_are_for_testing(
-    tmp_path: Path, splits: tuple[str, ...], train: list[str], test: list[str]
-) -> None:
-    scene = load_scene(write_blender(tmp_path, splits))
-    assert [v.camera.name for v in scene.train] == train
-    assert [v.camera.name for v in scene.test] == test
-
-
 def write_transforms(folder: Path, matrix: object) -> None:
     meta = {"camera_angle_x": 0.7, "frames": frames(["train/r_0", "train/r_1"])}
     meta["frames"][0]["transform_matrix"] = matrix  # type: ignore[index]

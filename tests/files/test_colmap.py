@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import struct
 from pathlib import Path
 from typing import Any
 
@@ -12,16 +11,7 @@ import pycolmap
 import pytest
 import torch
 
-from files.scene_files import (
-    camera_bytes,
-    counted,
-    image_bytes,
-    mutations,
-    photo,
-    point_bytes,
-    save,
-    write_colmap,
-)
+from files.scene_files import camera_bytes, counted, image_bytes, photo, point_bytes, save, write_colmap
 from keyss.core import InputError, KeyssWarning
 from keyss.files import load_scene
 from keyss.files.colmap import read_colmap
@@ -141,37 +131,6 @@ def test_every_truncation_is_an_input_error(tmp_path: Path, name: str) -> None:
             read_colmap(tmp_path)
     path.write_bytes(data + b"\0")
     with pytest.raises(InputError, match="end of the file"):
-        read_colmap(tmp_path)
-
-
-@pytest.mark.parametrize("suffix", [".bin", ".txt"])
-@pytest.mark.parametrize("kind", ["cameras", "images", "points3D"])
-def test_damage_gives_an_input_error_or_a_scene(tmp_path: Path, kind: str, suffix: str) -> None:
-    folder = tmp_path / "scene"
-    write = text_scene if suffix == ".txt" else write_colmap
-    write(folder)
-    path = folder / "sparse" / "0" / (kind + suffix)
-    outcomes = set()
-    for broken in mutations(path.read_bytes(), 60):
-        path.write_bytes(broken)
-        try:
-            scene = load_scene(folder)
-        except InputError:
-            outcomes.add("refused")
-        else:
-            outcomes.add("read")
-            cameras = [view.camera for view in scene.views]
-            assert all(c.viewmat.isfinite().all() and c.K.isfinite().all() for c in cameras)
-            assert scene.points.isfinite().all()
-    assert outcomes == {"refused", "read"}
-
-
-@pytest.mark.parametrize("name", BINARIES)
-@pytest.mark.parametrize("count", [2**64 - 1, 1000])
-def test_absurd_counts_are_refused_before_allocating(tmp_path: Path, name: str, count: int) -> None:
-    path = write_colmap(tmp_path) / "sparse" / "0" / name
-    path.write_bytes(struct.pack("<Q", count) + path.read_bytes()[8:])
-    with pytest.raises(InputError, match=f"expected {count} "):
         read_colmap(tmp_path)
 
 

@@ -2,9 +2,7 @@ from __future__ import annotations
 
 from typing import Any
 
-import pytest
 import torch
-from gsplat.strategy import DefaultStrategy
 
 from keyss.fitting import CappedStrategy, FitConfig, Optimizers, Parameters, make_optimizers, to_parameters
 from tiny_scenes import random_gaussians
@@ -38,22 +36,3 @@ def test_never_prunes_everything() -> None:
     strategy.opacity_for_pruning = lambda: torch.zeros(COUNT)
     strategy._prune_gs(parameters, optimizers, state, step=1000)
     assert len(parameters["means"]) == COUNT
-
-
-@pytest.mark.parametrize("cameras", [1, 3])
-def test_statistics_are_equal_to_those_of_gsplat(cameras: int) -> None:
-    strategy, parameters, _, _ = _setup(COUNT)
-    generator = torch.Generator().manual_seed(0)
-    ours, theirs = strategy.initialize_state(1.0), strategy.initialize_state(1.0)
-    for _ in range(3):
-        means2d = torch.zeros(cameras, COUNT, 2)
-        means2d.grad = torch.randn(cameras, COUNT, 2, generator=generator)
-        radii = torch.randint(-1, 4, (cameras, COUNT, 2), generator=generator, dtype=torch.int32).clamp_min(0)
-        means2d.grad[(radii == 0).any(-1)] = torch.nan
-        info = {"means2d": means2d, "radii": radii, "width": 201, "height": 133, "n_cameras": cameras}
-        info["gaussian_ids"] = None
-        strategy._update_state(parameters, ours, info)
-        DefaultStrategy._update_state(strategy, parameters, theirs, info)
-    assert ours["count"].max() > 2
-    for name in ("grad2d", "count"):
-        assert torch.equal(ours[name], theirs[name]), name

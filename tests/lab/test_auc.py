@@ -9,7 +9,6 @@ import numpy.typing as npt
 import pytest
 from hypothesis import given, settings, strategies as st
 from scipy.special import expit, logit
-from scipy.stats import norm
 
 from keyss.core import UsageError
 from keyss.lab import auc_between, stegexpose_auc
@@ -42,16 +41,6 @@ def test_three_against_three_by_hand() -> None:
     assert found.high == pytest.approx(expit(logit(7 / 9) + spread), abs=1e-6)
 
 
-def test_the_interval_holds_the_truth_19_times_in_20() -> None:
-    random = np.random.default_rng(0)
-    truth = norm.cdf(1 / math.sqrt(2))
-    held = []
-    for _ in range(300):
-        found = auc_between(random.normal(0, 1, 25).tolist(), random.normal(1, 1, 15).tolist())
-        held.append(found.low <= truth <= found.high)
-    assert 0.92 < np.mean(held) < 0.985
-
-
 @pytest.mark.parametrize(("negatives", "positives"), [([], [1.0]), ([1.0], []), ([], [])])
 def test_a_class_without_scores_is_refused(negatives: list[float], positives: list[float]) -> None:
     with pytest.raises(UsageError, match="both classes"):
@@ -77,9 +66,3 @@ class TestStegExpose:
             "sample_pairs": 1.0,
             "rs": 1.0,
         }
-
-    def test_other_views_are_refused(self) -> None:
-        images = views((9, 12))
-        for plain, stego in ((images, images[1:]), ([], []), (images, [image[1:] for image in images])):
-            with pytest.raises(UsageError, match="same views"):
-                stegexpose_auc(plain, stego)

@@ -65,35 +65,6 @@ class TestAgainstTheOriginal:
             assert str(scores.fusion > 0.2).lower() == row["flagged"], row["file"]
 
 
-class TestByHand:
-    @pytest.mark.parametrize(
-        ("pairs", "score"),
-        [
-            # X, Y that counts as W, Y of two even numbers, Z, Z: 1.5 x² - 3 x + 1 = 0
-            ([1, 2, 3, 2, 4, 2, 5, 5, 7, 7], 1 - 1 / math.sqrt(3)),
-            # as above, but the second Y counts as W too, though 9 and 2 are no such pair: 2 x² - 3 x + 1 = 0
-            ([1, 2, 3, 2, 9, 2, 5, 5, 7, 7], 0.5),
-            # and three: no root
-            ([1, 2, 3, 2, 9, 2, 7, 2, 5, 5, 7, 7], math.nan),
-            # an odd last column is left out
-            ([1, 2, 3, 2, 4, 2, 5, 5, 7, 7, 99], 1 - 1 / math.sqrt(3)),
-        ],
-    )
-    def test_primary_sets(self, pairs: list[int], score: float) -> None:
-        image = np.zeros((1, len(pairs), 3), dtype=np.uint8)
-        image[0, :, 0] = pairs  # red alone counts
-        assert score_image(image).primary_sets == pytest.approx(score, nan_ok=True)
-
-    def test_four_pixels(self) -> None:
-        """Sample Pairs: 2 x² - 4 x + 2 = 0; Primary Sets: x² - 2 x + 2 = 0; RS: 0 / 0."""
-        scores = score_image(grey([[2, 3], [2, 3]]))
-        assert scores.sample_pairs == 1.0
-        assert scores.chi_square is None
-        assert math.isnan(scores.primary_sets or 0)
-        assert math.isnan(scores.rs or 0)
-        assert scores.fusion == 1.0
-
-
 class TestAgainstItsDescription:
     """The same, written out one pixel at a time."""
 

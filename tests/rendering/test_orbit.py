@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import pytest
 import torch
 
 from keyss.core import Gaussians, camera_positions
-from keyss.rendering import VIEWS, middle_and_radius, scene_of_model
+from keyss.rendering import middle_and_radius
 from keyss.rendering.orbit import orbit
 from tiny_scenes import random_gaussians
 
@@ -41,12 +40,3 @@ def test_faint_and_distant_gaussians_move_no_camera() -> None:
     moved, larger = middle_and_radius(Gaussians.cat([model, far, faint]))
     assert float((moved - middle).norm()) < 0.2 * radius
     assert larger < 1.3 * radius
-
-
-@pytest.mark.parametrize(
-    "model", [random_gaussians(1), replace(random_gaussians(3), means=torch.zeros(3, 3))]
-)
-def test_a_model_without_extent_still_makes_a_scene(model: Gaussians) -> None:
-    scene = scene_of_model(model, "dot", size=8)
-    assert len(scene.views) == VIEWS
-    assert all(view.camera.viewmat.isfinite().all() for view in scene.views)

@@ -24,7 +24,7 @@ HOSTILE = (
     *(1e3, -1e3, 1e8, 1e15, -1e15, 1e19, -1e25, 1e30, -1e30, 3.4e38, -3.4e38, 1.0),
 )
 GAUSSIAN = ("means", "quats", "scales", "opacities", "colors")
-DTYPES = (torch.float32, torch.float64, torch.float16, torch.bfloat16)
+
 
 # SH degree or number of channels.
 colors = st.one_of(
@@ -38,17 +38,6 @@ def guarded(tensor: Tensor) -> Tensor:
     memory = torch.full((tensor.numel() + 128,), math.nan, dtype=tensor.dtype)
     inside = memory[64 : 64 + tensor.numel()].view(tensor.shape)
     return inside.copy_(tensor)
-
-
-def strided(tensor: Tensor) -> Tensor:
-    """A copy with NaN between any two numbers in memory."""
-    return torch.stack([tensor, torch.full_like(tensor, math.nan)], -1)[..., 0]
-
-
-def transposed(tensor: Tensor) -> Tensor:
-    """A copy with the dimensions in reverse order in memory."""
-    reverse = tuple(reversed(range(tensor.dim())))
-    return tensor.permute(reverse).contiguous().permute(reverse)
 
 
 def check_finite(results: dict[str, Tensor]) -> None:
@@ -113,35 +102,6 @@ def test_hostile_cameras_give_finite_images_or_an_error_by_name(data: st.DataObj
         )
     else:
         check_finite(results)
-
-
-@settings(max_examples=80, deadline=None)
-@given(st.data())
-def test_types_and_layouts_do_not_matter(data: st.DataObject) -> None:
-    scene = random_scene(
-        count=data.draw(st.sampled_from([0, 1, 20])),
-        width=21,
-        height=35,
-        cameras=data.draw(st.integers(0, 2)),
-        **data.draw(colors),
-    )
-    names = (*DIFFERENTIABLE, *CAMERAS)
-    layouts = st.sampled_from([guarded, strided, transposed])
-    given_ = {
-        name: data.draw(layouts)(getattr(scene, name).to(data.draw(st.sampled_from(DTYPES))))
-        for name in names
-    }
-    plain = {name: tensor.float().contiguous() for name, tensor in given_.items()}
-    both = []
-    for arguments in (given_, plain):
-        leaves = {name: arguments[name].detach().requires_grad_() for name in DIFFERENTIABLE}
-        both.append(scene.results(leaves, **{name: arguments[name] for name in CAMERAS}))
-    for name, tensor in both[0].items():
-        if not name.startswith("gradient of") or name.endswith("means2d"):
-            assert torch.equal(tensor, both[1][name]), name
-        else:
-            assert tensor.dtype == given_[name.removeprefix("gradient of ")].dtype
-            assert torch.equal(tensor, both[1][name].to(tensor.dtype)), name
 
 
 @settings(max_examples=40, deadline=None)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import os
 from pathlib import Path
 from typing import Any
 
@@ -125,26 +124,6 @@ def real(folder: Path) -> Path:
     library.write_model(folder / "b.ply", random_gaussians(610, seed=2))
     library.write_model(folder / "secret.ply", random_gaussians(40, seed=1))
     return folder
-
-
-def test_results_that_were_made_otherwise_are_not_replaced_unasked(folder: Path) -> None:
-    manifest(real(folder), "cover,secret_file,out\na.ply,master.txt,x\n")
-    (folder / "out" / "x").mkdir(parents=True)
-    (folder / "out" / "x" / "mine.txt").write_text("mine")
-    assert "exists: choose another folder" in next(iter(hide(folder).errors.values()))
-    (folder / "out" / "x" / "mine.txt").unlink()
-    assert hide(folder).errors == {}
-    assert hide(folder).outcomes[0].skipped
-    written = (folder / "out" / "x" / "private" / "asset.json").stat().st_mtime
-    os.utime(folder / "a.ply", (written + 5, written + 5))  # another cover
-    assert "`overwrite=True` to replace" in next(iter(hide(folder).errors.values()))
-    os.utime(folder / "a.ply", (written - 5, written - 5))
-    assert hide(folder).outcomes[0].skipped
-    manifest(folder, "cover,secret_file,out\nb.ply,master.txt,x\n")
-    assert "`overwrite=True` to replace" in next(iter(hide(folder).errors.values()))
-    replaced = hide(folder, overwrite=True)
-    assert (replaced.errors, replaced.outcomes[0].skipped) == ({}, False)
-    assert hide(folder).outcomes[0].skipped
 
 
 @fake_hiding

@@ -4,29 +4,14 @@ from __future__ import annotations
 
 import os
 
-import numpy as np
 import pytest
 
 from channels.quiet.trained_like import keys
 from keyss.lab import candidate_scores, changed_low_bits
-from lab.stealth.careless import banded, overwritten, plain
-from lab.stealth.detectors import confirmed
+from lab.stealth.careless import overwritten, plain
 from methods.carry.carried import embed_derived
 
 SECRETS = 4
-
-
-def _confirmed(scores: np.ndarray, name: str) -> float:
-    return confirmed(np.vectorize(lambda each: each[name])(scores), range(SECRETS))
-
-
-def test_the_order_of_rows_confirms() -> None:
-    candidates = [plain(10 + index, 800) for index in range(SECRETS)]
-    files = [banded(plain(index), secret) for index, secret in enumerate(candidates)]
-    scores = np.array([[candidate_scores(file, each) for each in candidates] for file in files])
-    assert _confirmed(scores, "order of rows that fit") == 1
-    assert scores[0, 0]["order of rows that fit"] > 0.5
-    assert _confirmed(scores, "rows at the same place") == 1
 
 
 def test_identical_high_bits_confirm() -> None:

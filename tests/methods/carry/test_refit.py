@@ -74,15 +74,6 @@ def test_refits_that_are_asked_for_or_ruled_out() -> None:
         replace(always, prune_to_fit=True)
 
 
-@pytest.mark.parametrize(("publish", "secrets"), [("as-is", 1), ("any", 2)])
-def test_from_photos_a_secret_is_fitted_for_the_steps_of_a_refit_too(publish: str, secrets: int) -> None:
-    options = CarryOptions(fit=FIT, publish=publish)  # type: ignore[arg-type]
-    found = _prepared(options, *[PHOTOS] * (1 + secrets))
-    assert found.refits == (0,) * secrets
-    assert [each.iterations for each in found.fits(1 + secrets)] == [1000, *[2150] * secrets]
-    assert found.training(1 + secrets) == (Training(),) * (1 + secrets)
-
-
 @pytest.mark.parametrize(("format", "secrets"), [("ply", 3), ("spz", 1)])
 def test_where_room_is_short_secrets_are_refitted(format: str, secrets: int) -> None:
     options = CarryOptions(fit=FIT, format=format)  # type: ignore[arg-type]

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import tracemalloc
 from collections.abc import Sequence
-from contextlib import suppress
 
-import numpy as np
 import pytest
 import torch
 
 from channels.quiet.coded import model_of
-from keyss.core import Camera, InputError, Scene, UsageError, View
+from keyss.core import Camera, Scene, UsageError, View
 from keyss.methods import Table, choose_precision, encode_to_size, prune_to_size
 from keyss.methods.records import whole
 from keyss.rendering import Viewpoints, psnr_between
@@ -37,49 +34,6 @@ def test_a_whole_model_comes_back_as_its_records_would() -> None:
     assert psnrs[0] > 34
     assert psnrs[1] > 40
     assert sizes[1] * 8 < 3000 * Table.floor(2).total
-
-
-def test_damaged_encodings_end_in_an_input_error() -> None:
-    data = whole.encode(model_of(500))
-    generator = torch.Generator().manual_seed(0)
-    for cut in (0, 3, 50, 200, len(data) - 1):
-        with pytest.raises(InputError):
-            whole.decode(data[:cut])
-    with pytest.raises(InputError, match="announces"):
-        whole.decode(b"\xff\xff\xff\x7f" + data[4:])
-    for _ in range(200):
-        changed = bytearray(data)
-        at = int(torch.randint(len(data), (), generator=generator))
-        changed[at] ^= 1 << int(torch.randint(8, (), generator=generator))
-        try:
-            found = whole.decode(bytes(changed))
-        except InputError:
-            continue
-        assert all(bool(getattr(found, name).isfinite().all()) for name in ("means", "quats", "sh"))
-
-
-def test_a_few_bytes_that_announce_many_gaussians_are_refused_before_they_are_unpacked() -> None:
-    data = whole.encode(model_of(500))
-    with pytest.raises(InputError, match="more than"):
-        whole.decode((1 << 20).to_bytes(4, "little") + data[4:])
-    padding = (1 << 22) * b"\0\0\0"  # which channels compress to kilobytes
-    with pytest.raises(InputError, match=r"more than .* in 6,000 Gaussians hold"):
-        whole.decode((1 << 20).to_bytes(4, "little") + data[4:] + padding, 6000)
-
-
-@pytest.mark.parametrize("seed", range(4))
-def test_hostile_payloads_take_little_memory(seed: int) -> None:
-    random = np.random.default_rng(seed)
-    count = int(random.choice([1 << 16, (1 << 16) + 1, 1 << 20, 1 << 22, (1 << 32) - 1]))
-    head = bytearray(whole.encode(model_of(500))[:49])
-    head[:5] = count.to_bytes(4, "little") + bytes([int(random.integers(4))])
-    padding = int(random.choice([0, 1 << 20, 3 << 22])) * b"\0"
-    tracemalloc.start()
-    with suppress(InputError):
-        whole.decode(bytes(head) + padding, 6000)
-    _, peak = tracemalloc.get_traced_memory()
-    tracemalloc.stop()
-    assert peak < len(padding) + (200 << 20)
 
 
 def test_it_is_good_enough_from_where_it_is_looked_at() -> None:
