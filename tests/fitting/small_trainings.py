@@ -53,8 +53,8 @@ def trained(name: str, fit: FitConfig, device: str = "cpu", **options: Any) -> T
     return run
 
 
-def placed() -> list[PlacedScene]:
+def placed(sh_degree: int = 1) -> list[PlacedScene]:
     """Two scenes in one frame."""
     scenes = [tiny_scene(0), tiny_scene(1)]
-    models = [random_gaussians(seed=seed, sh_degree=1) for seed in (0, 1)]
+    models = [random_gaussians(seed=seed, sh_degree=sh_degree) for seed in (0, 1)]
     return [PlacedScene.of(*each, Similarity()) for each in zip(scenes, models, strict=True)]

@@ -221,10 +221,11 @@ def rasterize_to_indices_3dgs(
 
 def render_weight_from_alpha(alphas: Tensor, ray_indices: Tensor, n_rays: int) -> tuple[Tensor, Tensor]:
     """nerfacc's function: the blending weight [M] of each alpha, and the transmittance before it."""
-    _, lengths = ray_indices.unique_consecutive(return_counts=True)
-    rays = torch.nn.utils.rnn.pad_sequence(torch.split(1 - alphas, lengths.tolist()), True, 1.0)
-    before = torch.cat([torch.ones(len(rays), 1), rays.cumprod(1)[:, :-1]], 1)
-    before = before[torch.arange(rays.shape[1]) < lengths[:, None]]
+    _, rays, lengths = ray_indices.unique_consecutive(return_inverse=True, return_counts=True)
+    places = rays, torch.arange(len(rays)) - (lengths.cumsum(0) - lengths)[rays]
+    left = torch.ones(len(lengths), int(lengths.max()) + 1)
+    left = left.index_put((places[0], places[1] + 1), 1 - alphas).cumprod(1)
+    before = left[places]
     return alphas * before, before
 
 

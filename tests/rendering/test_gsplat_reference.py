@@ -28,7 +28,7 @@ from methods.keyss.small import small
 from rendering.gsplat_reference import COMPILED, NERFACC
 from rendering.pretended_cuda import OnGpu, held, pretended_gpu
 from rendering.scenes import SCENES, random_scene
-from rendering.test_cuda import IMAGE_ERROR, check_backends_agree
+from rendering.test_cuda import IMAGE_ERROR, check_backends_agree, results_on
 from tiny_scenes import tiny_scene
 
 KEY = "a key of the tests: 3kV-9q"
@@ -78,9 +78,9 @@ def test_double_precision_is_rounded_as_on_the_cpu(gpu: torch.device) -> None:
 def test_nothing_is_seen(gpu: torch.device) -> None:
     scene = random_scene()
     scene.means[:, 2] -= 100
-    results = scene.results({name: leaf.detach().to(gpu) for name, leaf in scene.leaves().items()})
+    results = results_on(gpu, scene)
     assert not results["radii"].any()
-    assert torch.equal(results["images"].cpu(), scene.backgrounds[:, None, None].float().expand(1, 40, 48, 3))
+    assert torch.equal(results["images"], scene.backgrounds[:, None, None].float().expand(1, 40, 48, 3))
 
 
 def training(name: str, config: FitConfig, device: torch.device) -> Any:
@@ -89,10 +89,12 @@ def training(name: str, config: FitConfig, device: torch.device) -> Any:
         return PlainRun(tiny_scene(), config, device)
     if name not in DESIGNS:
         method: Any = registry.get(name)
-        return method.training(placed(), method.options(fit=config, common_poses=0.5), device)
+        return method.training(placed(sh_degree=3), method.options(fit=config, common_poses=0.5), device)
     options = small(name, config)
     vectors = list(random_embeddings(1, torch.Generator().manual_seed(0)))
-    return training_of(options.configuration)(placed(), vectors, options, options.configuration, device)
+    return training_of(options.configuration)(
+        placed(sh_degree=3), vectors, options, options.configuration, device
+    )
 
 
 @pytest.mark.parametrize("name", ["plain", *DESIGNS, *PEERS])
@@ -119,6 +121,7 @@ def test_trainings_have_the_gradients_of_the_cpu(name: str, gpu: torch.device) -
     assert all(parameter.isfinite().all() for parameter in there.parameters.values())
 
 
+@pytest.mark.filterwarnings("ignore:.*the secrets lie in appended Gaussians")
 @pytest.mark.parametrize("method", ["carry", "latent"])
 def test_models_are_hidden_and_revealed(
     method: str, gpu: torch.device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

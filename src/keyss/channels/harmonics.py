@@ -26,6 +26,11 @@ RANKS = np.concatenate([[0.0], 1 / (1 + np.exp(-np.linspace(-7, 7, 31))), [1.0]]
 _ROUNDING = 1e-10  # share of a row's squares that rounding alone leaves in directions without anything
 
 
+def doubles(tensor: Tensor) -> Doubles:
+    """A tensor of any device as an array of the same shape."""
+    return tensor.detach().cpu().double().numpy()  # type: ignore[no-any-return]
+
+
 def harmonics_above(sh_degree: int) -> int:
     """H, the numbers of the harmonics above KEPT_DEGREE, of three colours."""
     return max(0, 3 * ((sh_degree + 1) ** 2 - (KEPT_DEGREE + 1) ** 2))
@@ -33,7 +38,7 @@ def harmonics_above(sh_degree: int) -> int:
 
 def high_harmonics(model: Gaussians) -> Doubles:
     """[N, H] the harmonics above KEPT_DEGREE."""
-    return model.sh[:, (KEPT_DEGREE + 1) ** 2 :].detach().flatten(1).cpu().double().numpy()
+    return doubles(model.sh[:, (KEPT_DEGREE + 1) ** 2 :].flatten(1))
 
 
 def with_high_harmonics(model: Gaussians, harmonics: Doubles) -> Gaussians:
@@ -82,7 +87,7 @@ class Harmonics(nn.Module):
                 'secret: train longer, or use `method="carry"`'
             )
         harmonics = harmonics[chosen]
-        weighted = harmonics * plain.opacities.double().numpy()[chosen, None]
+        weighted = harmonics * doubles(plain.opacities)[chosen, None]
         vectors = np.linalg.eigh(weighted.T @ weighted)[1]
         count = self.directions.shape[1]
         self.directions.copy_(torch.from_numpy(vectors[:, :count]))
@@ -103,13 +108,13 @@ class Harmonics(nn.Module):
 
         Rows without anything in other directions, because no view ever showed them, stay as they are.
         """
-        directions = self.directions.double().numpy()
+        directions = doubles(self.directions)
         kept = harmonics - (harmonics @ directions) @ directions.T
         power = (kept**2).sum(axis=1)
         alive, written, before = power > 0, np.zeros_like(ranks), np.zeros(len(ranks))
         power = np.where(alive, power, 1.0)
         for j, own in enumerate(ranks.T):
-            value = np.interp(own, RANKS, self.quantiles[j].double().numpy())
+            value = np.interp(own, RANKS, doubles(self.quantiles[j]))
             written[:, j] = value * self._spread(power, before, j)
             before = before + written[:, j] ** 2
         return np.where(alive[:, None], kept + written @ directions.T, harmonics)
@@ -121,13 +126,13 @@ class Harmonics(nn.Module):
         power = np.where(alive, power, 1.0)
         for j, column in enumerate(written.T):
             relative = column / self._spread(power, before, j)
-            ranks[:, j] = np.interp(relative, self.quantiles[j].double().numpy(), RANKS)
+            ranks[:, j] = np.interp(relative, doubles(self.quantiles[j]), RANKS)
             before = before + column**2
         return ranks, alive
 
     def _split(self, harmonics: Doubles) -> tuple[Doubles, Doubles]:
         """[N, R] the numbers in the directions; [N] the squares of the rest, summed."""
-        directions = self.directions.double().numpy()
+        directions = doubles(self.directions)
         written = harmonics @ directions
         power = ((harmonics - written @ directions.T) ** 2).sum(axis=1)
         return written, np.where(power > _ROUNDING * (harmonics**2).sum(axis=1), power, 0.0)
@@ -139,7 +144,7 @@ class Harmonics(nn.Module):
         return np.stack([np.ones_like(kept), np.log(kept / (width - count)) / 2, own], axis=1)
 
     def _spread(self, kept: Doubles, before: Doubles, j: int) -> Doubles:
-        exponents = self._levels(kept, before, j) @ self.slopes[:, j].double().numpy()
+        exponents = self._levels(kept, before, j) @ doubles(self.slopes[:, j])
         spread: Doubles = np.exp(np.clip(exponents, -80, 80))
         return spread
 

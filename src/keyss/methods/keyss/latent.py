@@ -22,6 +22,7 @@ from torch import Tensor, nn
 from keyss.channels.harmonics import (
     RANKS,
     Harmonics,
+    doubles,
     harmonics_above,
     high_harmonics,
     increasing,
@@ -98,7 +99,7 @@ class LatentDecoder(Decoder):
 
     def encrypt(self, latents: Doubles, key: Tensor, names: Bytes) -> Doubles:
         """[N, D] ranks in [0, 1) for latents [N, D] in rows with the identities `names` [N, 16]."""
-        knots = self.knots.double().numpy()
+        knots = doubles(self.knots)
         ranks = np.stack([np.interp(*each, RANKS) for each in zip(latents.T, knots, strict=True)], axis=1)
         inside: Doubles = (GUARD + (1 - 2 * GUARD) * ranks) / SHARE
         return (inside + self._pads(key, names)) % 1
@@ -108,7 +109,7 @@ class LatentDecoder(Decoder):
         inside = SHARE * ((ranks - self._pads(key, names)) % 1)
         fits: Flags = np.all(inside <= 1, axis=1)
         own = ((inside[fits] - GUARD) / (1 - 2 * GUARD)).clip(0, 1)
-        knots = self.knots.double().cpu().numpy()
+        knots = doubles(self.knots)
         return np.stack([np.interp(x, RANKS, y) for x, y in zip(own.T, knots, strict=True)], axis=1), fits
 
     def _pads(self, key: Tensor, names: Bytes) -> Doubles:
