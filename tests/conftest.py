@@ -18,6 +18,8 @@ from cheap_keys import choose_costs, pytest_sessionstart  # noqa: F401  hook
 from skip_policy import pytest_make_collect_report, pytest_runtest_makereport  # noqa: F401  hooks
 
 if TYPE_CHECKING:
+    import torch
+
     from cli.said import Run
 
 # What hypothesis makes up is the same in every run of CI, so that a failure comes with the change that made
@@ -76,6 +78,18 @@ def chromium() -> Iterator[Any]:
         browser = started.chromium.launch(executable_path=PROGRAM, args=SWITCHES, timeout=PATIENCE)
         yield browser
         browser.close()
+
+
+@pytest.fixture(scope="session")
+def cuda() -> torch.device:
+    """The GPU, or a skip where there is none that gsplat can use."""
+    from keyss.core import BackendError
+    from keyss.rendering import resolve_device
+
+    try:
+        return resolve_device("cuda")
+    except BackendError as error:
+        pytest.skip(str(error))
 
 
 @pytest.fixture(scope="session")

@@ -9,9 +9,7 @@ import torch
 from gsplat.strategy.ops import duplicate, remove, split
 from torch import Tensor
 
-from keyss.core import BackendError
 from keyss.fitting import FitConfig, Parameters, RowAdam, make_optimizers, to_parameters
-from keyss.rendering import resolve_device
 from tiny_scenes import random_gaussians
 
 RATE, EPS = 0.01, 1e-15
@@ -110,11 +108,7 @@ def test_densification_edits_its_state_like_that_of_torchs_adam() -> None:
 
 
 @pytest.mark.cuda
-def test_a_gpu_gives_the_same_result() -> None:
-    try:
-        device = resolve_device("cuda")
-    except BackendError as error:
-        pytest.skip(str(error))
+def test_a_gpu_gives_the_same_result(cuda: torch.device) -> None:
     start, gradients = torch.rand(500, 16, 3), _gradients((500, 16, 3), 20)
     here, there = (
         _run(
@@ -124,7 +118,7 @@ def test_a_gpu_gives_the_same_result() -> None:
             start.to(d),
             gradients.to(d),
         )
-        for d in (torch.device("cpu"), device)
+        for d in (torch.device("cpu"), cuda)
     )
     assert (here - there.cpu()).abs().max() < 1e-6
 

@@ -27,13 +27,13 @@ def test_a_checkpoint_does_not_depend_on_the_name_of_the_device(tmp_path: Path) 
 
 @pytest.mark.cuda
 @pytest.mark.parametrize("name", RUNS)
-def test_a_run_resumes_on_a_gpu_and_back_on_the_cpu(tmp_path: Path, name: str) -> None:
+def test_a_run_resumes_on_a_gpu_and_back_on_the_cpu(tmp_path: Path, name: str, cuda: torch.device) -> None:
     """The quality is near that of a run on the CPU; the order of sums on a GPU varies."""
     path, fit = tmp_path / "checkpoint.safetensors", replace(FIT, iterations=60)
     with pytest.raises(Interrupted):
         trained(name, fit, checkpoint=path, reporter=InterruptAt(25))
     with pytest.raises(Interrupted):
-        trained(name, fit, "cuda", checkpoint=path, resume=True, reporter=InterruptAt(45))
+        trained(name, fit, str(cuda), checkpoint=path, resume=True, reporter=InterruptAt(45))
     found = trained(name, fit, checkpoint=path, resume=True)
     stayed = trained(name, fit)
     assert abs(len(found) - len(stayed)) <= 0.05 * len(stayed)

@@ -10,8 +10,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from keyss.core import BackendError
-from keyss.rendering import resolve_device
 from rendering.clear_cut import clear_cut
 from rendering.scenes import SCENES, Scene
 
@@ -19,14 +17,6 @@ pytestmark = pytest.mark.cuda
 
 IMAGE_ERROR = 1e-4  # absolute
 GRADIENT_ERROR = 0.02  # the norm of the difference by the norm
-
-
-@pytest.fixture(scope="module")
-def cuda() -> torch.device:
-    try:
-        return resolve_device("cuda")
-    except BackendError as error:
-        pytest.skip(str(error))
 
 
 def results_on(device: torch.device, scene: Scene) -> dict[str, Tensor]:
