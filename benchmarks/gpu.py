@@ -102,6 +102,9 @@ def run_all(options: argparse.Namespace) -> int:
     if options.device == "cuda":  # otherwise gsplat is compiled for all architectures
         capability = "{}.{}".format(*torch.cuda.get_device_capability())
         os.environ.setdefault("TORCH_CUDA_ARCH_LIST", capability)
+        # Where the toolkit is little more than nvcc, torch's packages have the other headers it includes.
+        headers = sorted(map(str, Path(torch.__file__).parents[1].glob("nvidia/*/include")))
+        os.environ.setdefault("CPLUS_INCLUDE_PATH", os.pathsep.join(headers))
     os.environ.setdefault("MAX_JOBS", str(os.cpu_count()))
     began, failed = time.monotonic(), 0
     numbers: dict[str, float] = {}
