@@ -116,7 +116,7 @@ class Times:
 def measure_rasterizer(case: Case, threads: int, repeats: int) -> list[str]:
     """One row of the first table."""
     torch.set_num_threads(threads)
-    load_kernels()  # its memory does not count
+    load_kernels()  # not counted as peak memory
     gaussians, camera = case.scene()
     tensors = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh)
     leaves = [tensor.detach().requires_grad_() for tensor in tensors]

@@ -51,7 +51,7 @@ class View:
     camera: Camera
     image: Tensor  # [H, W, 3] uint8 sRGB
     unrounded: Tensor | None = None  # [H, W, 3] in [0, 1]: the render itself, if the image is not a photo
-    mask: Tensor | None = None  # [H, W] bool: False where the photo does not count
+    mask: Tensor | None = None  # [H, W] bool: False at ignored pixels
 
     def photo(self, device: torch.device) -> Tensor:
         """[H, W, 3] in [0, 1] the image."""

@@ -37,7 +37,7 @@ def psnr(image: Tensor, reference: Tensor, mask: Tensor | None = None) -> float:
 
 
 def view_quality(image: Tensor, view: View) -> ImageQuality:
-    """Quality of a render [H, W, 3] in [0, 1] against its photo, where that counts.
+    """Quality of a render [H, W, 3] in [0, 1] against its photo, inside the mask.
 
     LPIPS is a mean over all pixels; those that do not count are equal.
     """

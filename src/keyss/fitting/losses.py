@@ -52,7 +52,7 @@ class Target:
     planes: Tensor  # [3, H, W] in [0, 1]
     mean: Tensor  # [3, H, W] local mean
     variance: Tensor  # [3, H, W] local variance
-    mask: Tensor | None = None  # [H, W] bool: False where the image does not count
+    mask: Tensor | None = None  # [H, W] bool: False at ignored pixels
 
     @staticmethod
     def of(image: Tensor, mask: Tensor | None = None) -> Target:
@@ -81,7 +81,7 @@ class Target:
         return self.planes.permute(1, 2, 0)
 
     def masked(self, image: Tensor) -> Tensor:
-        """`image` [H, W, 3], equal to the target where that does not count."""
+        """`image` [H, W, 3], with the pixels of the target outside the mask."""
         return image if self.mask is None else torch.where(self.mask[:, :, None], image, self.image)
 
 
