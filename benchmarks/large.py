@@ -53,7 +53,7 @@ with open(f"{sys.argv[1]}/floor", "wb") as file:
 LEAST = """
 import sys
 from concurrent.futures import ThreadPoolExecutor
-from keyss.api import hiding
+from keyss.api import hide as hiding
 from keyss.channels import identities
 from keyss.files.models import read_model, write_model
 from keyss.rendering.orbit import scene_of_model

@@ -21,7 +21,7 @@ from codes import against_photos
 from keyss.core import BackendError, Gaussians, KeyssError
 from keyss.files import read_model, write_model
 from keyss.lab import Converter, converters
-from keyss.runs.opening import HidingRun, open_run
+from keyss.runs.open_run import HidingRun, open_run
 
 
 def row(run: HidingRun, name: str, converter: Converter | None) -> str:

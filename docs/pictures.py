@@ -17,7 +17,7 @@ import torch
 from PIL import Image
 
 from keyss import load_scene, read_model
-from keyss.api.looking import shown, wiped
+from keyss.api.render import shown, wiped
 from keyss.demo import COMPARISON, COVER, KEY, SCENES, SECRET, SECRET_PLY, VIEWER
 from keyss.rendering.orbit import around
 from keyss.rendering.view import render as picture_of

@@ -1,16 +1,16 @@
 from ._version import __version__ as __version__
-from .api.asking import HideResult as HideResult, Secret as Secret
-from .api.converting import convert as convert
-from .api.fitting import fit as fit
-from .api.hiding import hide as hide
-from .api.hiding_files import SecretFile as SecretFile, hide_files as hide_files
-from .api.looking import evaluate as evaluate, render as render
-from .api.opening import reveal as reveal, verify as verify
+from .api.convert import convert as convert
+from .api.fit import fit as fit
+from .api.hide import hide as hide
+from .api.hide_arguments import HideResult as HideResult, Secret as Secret
+from .api.hide_files import SecretFile as SecretFile, hide_files as hide_files
+from .api.render import evaluate as evaluate, render as render
+from .api.reveal import reveal as reveal, verify as verify
 from .core import Gaussians as Gaussians, KeyssError as KeyssError, WrongKeyError as WrongKeyError
 from .files import load_scene as load_scene, read_model as read_model, write_model as write_model
 from .fitting import FitConfig as FitConfig
 from .keys import generate_key as generate_key, read_key as read_key
-from .lab.audits.run import audit as audit
+from .lab.audits.audit_run import audit as audit
 from .lab.many.batch import hide_batch as hide_batch
 from .lab.many.comparison import compare as compare
 from .lab.many.reproduction import reproduce as reproduce

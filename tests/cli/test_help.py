@@ -26,7 +26,7 @@ def loaded(*arguments):
     return set(sys.modules)
 
 assert not loaded("--version") & {"tyro", "rich", "keyss.cli.commands"}
-assert "keyss.cli.hiding" not in loaded("keygen")
+assert "keyss.cli.hide" not in loaded("keygen")
 for arguments in (["--help"], ["keygen", "--help"], ["info", "nowhere"], ["inof"]):
     assert not loaded(*arguments) & {"torch", "numpy", "keyss.methods"}, arguments
 model, other = sys.argv[1:]

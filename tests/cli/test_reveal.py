@@ -24,7 +24,7 @@ from keyss.files import read_model, write_model
 from keyss.keys import DerivedKey
 from keyss.methods import encode_all
 from keyss.methods.records import whole
-from keyss.methods.records.opening import COUNT
+from keyss.methods.records.carried_secret import COUNT
 
 KEY = "q7Rv2LxT9bWm4KzD"
 

@@ -106,7 +106,7 @@ def test_an_interrupted_film_leaves_nothing(
     def interrupted(*given: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("keyss.api.looking.render_view", interrupted)
+    monkeypatch.setattr("keyss.api.render.render_view", interrupted)
     with pytest.raises(KeyboardInterrupt):
         library.render(files / "a.ply", video=tmp_path / "a.mp4", width=32)
     assert list(tmp_path.iterdir()) == []

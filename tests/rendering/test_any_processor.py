@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from keyss.rendering.cpu import jit
+from keyss.kernels import jit
 from rendering import child_process
 
 # Colours and features, one and several cameras; forward and backward.

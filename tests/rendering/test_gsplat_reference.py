@@ -126,7 +126,7 @@ def test_trainings_have_the_gradients_of_the_cpu(name: str, gpu: torch.device) -
 def test_models_are_hidden_and_revealed(
     method: str, gpu: torch.device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("keyss.measure.hiding.WRONG_KEYS", 1)
+    monkeypatch.setattr("keyss.measure.hide_quality.WRONG_KEYS", 1)
     models, scenes = [trained_like(800, seed=seed) for seed in (1, 2)], [tiny_scene(0), tiny_scene(1)]
     options = CarryOptions() if method == "carry" else small(method, STEPS)
     hide(

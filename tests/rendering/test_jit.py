@@ -11,7 +11,8 @@ import numba
 import numpy as np
 import pytest
 
-from keyss.rendering.cpu import blending, jit
+from keyss.kernels import jit
+from keyss.rendering.cpu import blending
 from rendering.child_process import SOURCE, python
 
 

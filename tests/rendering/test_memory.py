@@ -8,7 +8,7 @@ import sys
 import numpy as np
 import pytest
 
-from keyss.rendering.cpu import memory
+from keyss.kernels import memory
 from rendering.child_process import python
 
 

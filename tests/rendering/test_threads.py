@@ -14,7 +14,7 @@ from torch import Tensor
 
 from keyss import FitConfig, _threads, fit
 from keyss.core import KeyssWarning
-from keyss.rendering.cpu import parallel
+from keyss.kernels import parallel
 from rendering.child_process import digest, digest_on_threads
 from rendering.scenes import Scene, random_scene
 from tiny_scenes import tiny_scene

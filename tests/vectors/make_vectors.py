@@ -48,8 +48,8 @@ from keyss.files.formats.spz import SpzCodes  # noqa: E402
 from keyss.keys.derivation import random_embeddings  # noqa: E402
 from keyss.methods import Decoder, DecoderShape, HiddenFile, KeyssSecret, choose_anchors  # noqa: E402  # noqa: E402
 from keyss.methods.records import whole  # noqa: E402
+from keyss.methods.records.carried_secret import unpack  # noqa: E402
 from keyss.methods.records.embedding import METHOD  # noqa: E402
-from keyss.methods.records.opening import unpack  # noqa: E402
 from methods.carry.carried import embed  # noqa: E402
 from methods.keyss.small import latent_model, some_secret  # noqa: E402
 from vectors.surviving import NAMES, write_surviving  # noqa: E402

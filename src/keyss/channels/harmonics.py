@@ -28,7 +28,7 @@ _ROUNDING = 1e-10  # share of a row's squares that rounding alone leaves in dire
 
 def doubles(tensor: Tensor) -> Doubles:
     """A tensor of any device as an array of the same shape."""
-    return tensor.detach().cpu().double().numpy()  # type: ignore[no-any-return]
+    return tensor.detach().cpu().double().numpy()
 
 
 def harmonics_above(sh_degree: int) -> int:

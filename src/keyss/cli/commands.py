@@ -11,15 +11,15 @@ from collections.abc import Callable, Sequence
 
 GROUPS = {
     "make": {
-        "demo": "cli.making",
-        "fit": "cli.making",
-        "hide": "cli.hiding",
-        "keygen": "cli.making",
-        "convert": "cli.making",
+        "demo": "cli.make",
+        "fit": "cli.make",
+        "hide": "cli.hide",
+        "keygen": "cli.make",
+        "convert": "cli.make",
     },
-    "open": {"reveal": "cli.opening", "verify": "cli.opening"},
-    "look": {"view": "cli.looking", "render": "cli.looking", "info": "cli.looking"},
-    "measure": {"evaluate": "cli.looking", "audit": "lab.commands"},
+    "open": {"reveal": "cli.reveal", "verify": "cli.reveal"},
+    "look": {"view": "cli.show", "render": "cli.show", "info": "cli.show"},
+    "measure": {"evaluate": "cli.show", "audit": "lab.commands"},
     "many": dict.fromkeys(("compare", "reproduce", "sweep"), "lab.commands"),
     "check": {"doctor": "cli.doctor"},
 }
@@ -52,7 +52,7 @@ def command(name: str) -> Callable[..., None]:
 def parse_target(name: str, arguments: Sequence[str]) -> Callable[..., None]:
     """The function to parse: for `hide`, with the options of the method named in `arguments`."""
     if name == "hide":
-        from keyss.cli.hiding import with_options_of_method
+        from keyss.cli.hide import with_options_of_method
 
         return with_options_of_method(arguments)
     return command(name)

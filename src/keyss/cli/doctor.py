@@ -100,7 +100,7 @@ def _gpu() -> str:
 
 
 def _cache() -> str:
-    from keyss.rendering.cpu.jit import cache_folder
+    from keyss.kernels.jit import cache_folder
 
     folder = cache_folder()
     if folder is None:

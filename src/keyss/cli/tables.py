@@ -19,7 +19,7 @@ from keyss.progress import about, clock
 from keyss.runs.records import record_bytes
 
 if TYPE_CHECKING:
-    from keyss.api.converting import Conversion
+    from keyss.api.convert import Conversion
     from keyss.methods.base import Plan
     from keyss.runs.config import FitMetrics, HideMetrics
     from keyss.runs.describe import ModelInfo, RunInfo, SceneInfo

@@ -1,4 +1,3 @@
-from .decoded import DecodedGaussians as DecodedGaussians, PictureNetwork as PictureNetwork
 from .errors import (
     BackendError as BackendError,
     InputError as InputError,
@@ -20,6 +19,7 @@ from .gaussians import (
     compensate_pruning as compensate_pruning,
     same_bits as same_bits,
 )
+from .picture_network import DecodedGaussians as DecodedGaussians, PictureNetwork as PictureNetwork
 from .scene import (
     Camera as Camera,
     Scene as Scene,

@@ -21,9 +21,9 @@ import numpy as np
 import torch
 
 from keyss.core.arrays import Floats
-from keyss.core.decoded import DecodedGaussians
 from keyss.core.errors import InputError, OutputError, UsageError
 from keyss.core.gaussians import Gaussians
+from keyss.core.picture_network import DecodedGaussians
 from keyss.files.atomic import atomic_write, check_not_an_input, check_output_file
 from keyss.files.foreign import START_BYTES, is_foreign_zip, kind_of
 from keyss.files.ply_extras import NORMALS, ExtendedGaussians, PlyExtras

@@ -13,9 +13,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-# The cached kernel would miss changes in other files: it uses only these, see `rendering.cpu.jit`.
-from keyss.rendering.cpu import parallel
-from keyss.rendering.cpu.jit import kernel
+# The cached kernel would miss changes in other files: it uses only these, see `kernels.jit`.
+from keyss.kernels import parallel
+from keyss.kernels.jit import kernel
 from keyss.rendering.cpu.simd8 import fetch_add, fused_multiply_add
 
 NUMBERS_PER_JOB = 8192

@@ -21,9 +21,9 @@ from torch import Tensor
 
 from keyss.core.scene import View
 
-# Cached kernels would miss changes in other files: they use only these, see `rendering.cpu.jit`.
-from keyss.rendering.cpu import memory, parallel
-from keyss.rendering.cpu.jit import finite_kernel
+# Cached kernels would miss changes in other files: they use only these, see `kernels.jit`.
+from keyss.kernels import memory, parallel
+from keyss.kernels.jit import finite_kernel
 from keyss.rendering.cpu.simd8 import fetch_add
 
 C1, C2 = 0.01**2, 0.03**2

@@ -11,7 +11,7 @@ from .leaks.attacks import (
     search_embeddings as search_embeddings,
     with_the_key as with_the_key,
 )
-from .leaks.looking import (
+from .leaks.leak_scores import (
     AttackResult as AttackResult,
     LeakScores as LeakScores,
     coarse as coarse,

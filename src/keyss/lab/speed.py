@@ -12,9 +12,9 @@ from statistics import median
 import numpy as np
 import torch
 
-from keyss.core.decoded import DecodedGaussians
 from keyss.core.errors import BackendError, KeyssError
 from keyss.core.gaussians import Gaussians
+from keyss.core.picture_network import DecodedGaussians
 from keyss.core.scene import Scene
 from keyss.files.models import DECODED_SUFFIX, read_model, write_model
 from keyss.files.ply_rows import is_compressed

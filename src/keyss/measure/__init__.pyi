@@ -1,4 +1,4 @@
-from .hiding import (
+from .hide_quality import (
     BaselineQuality as BaselineQuality,
     HidingQuality as HidingQuality,
     PsnrRange as PsnrRange,
@@ -7,4 +7,4 @@ from .hiding import (
     in_cover as in_cover,
     measure_hiding as measure_hiding,
 )
-from .images import ImageComparison as ImageComparison, compare_images as compare_images
+from .image_scores import ImageComparison as ImageComparison, compare_images as compare_images

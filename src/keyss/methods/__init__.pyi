@@ -29,13 +29,13 @@ from .keyss.secret import DECODERS as DECODERS, KeyssSecret as KeyssSecret, choo
 from .keyss.training import KeyssTraining as KeyssTraining
 from .opened import Frame as Frame, HiddenFile as HiddenFile, Opened as Opened, Remains as Remains
 from .plain_models import Bound as Bound, fit_plain_models as fit_plain_models
+from .records.carried_secret import CarriedSecret as CarriedSecret, unpack as unpack
 from .records.embedding import (
     embed_models as embed_models,
     encode_all as encode_all,
     record_request as record_request,
 )
 from .records.lines import Line as Line, Table as Table
-from .records.opening import CarriedSecret as CarriedSecret, unpack as unpack
 from .records.precision import (
     choose_precision as choose_precision,
     encode_to_size as encode_to_size,

@@ -35,7 +35,7 @@ METHODS = {
         "the secrets' Gaussians, encrypted in the cover's",
         "keyss.methods.carry.options:CarryOptions",
         "keyss.methods.carry.method:METHOD",
-        "keyss.methods.records.opening:unpack",
+        "keyss.methods.records.carried_secret:unpack",
     ),
     "keyss": Modules(
         "train one model and a decoder for all keys jointly, as the paper does",

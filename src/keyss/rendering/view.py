@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from keyss.core import Camera, Gaussians
-from keyss.core.decoded import DecodedGaussians, PictureNetwork
+from keyss.core.picture_network import DecodedGaussians, PictureNetwork
 from keyss.rendering.rasterize import rasterization
 
 

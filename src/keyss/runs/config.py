@@ -13,7 +13,7 @@ from keyss.core.errors import InputError
 from keyss.core.scene import ViewOptions
 from keyss.fitting.config import FitConfig
 from keyss.fitting.image_metrics import ImageQuality
-from keyss.measure.hiding import HidingQuality, RenderFidelity
+from keyss.measure.hide_quality import HidingQuality, RenderFidelity
 from keyss.methods import registry
 from keyss.methods.base import MethodOptions
 from keyss.methods.opened import Opened

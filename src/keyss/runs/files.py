@@ -9,9 +9,9 @@ from pathlib import Path
 from torch import Tensor
 
 from keyss.channels import SUFFIXES, suffix_of
-from keyss.core.decoded import DecodedGaussians
 from keyss.core.errors import InputError, UsageError
 from keyss.core.gaussians import Gaussians
+from keyss.core.picture_network import DecodedGaussians
 from keyss.core.scene import Scene, ViewOptions
 from keyss.files.foreign import what_it_is
 from keyss.files.models import DECODED_SUFFIX, is_model_source, known_suffixes, read_model

@@ -14,7 +14,7 @@ from keyss.channels import Layout, identities, read_low_bits, used_words, write_
 from keyss.channels.quiet.reading import _are_among
 from keyss.channels.quiet.usable import repeated
 from keyss.core import Gaussians
-from keyss.rendering.cpu.parallel import in_blocks
+from keyss.kernels.parallel import in_blocks
 
 SHAPES = ((3,), (4,), (3,), ())
 
@@ -96,7 +96,7 @@ def test_blocks_come_in_order_and_failures_come_through(
     threads: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(torch, "get_num_threads", lambda: threads)
-    monkeypatch.setattr("keyss.rendering.cpu.parallel._CORES", 8)
+    monkeypatch.setattr("keyss.kernels.parallel._CORES", 8)
     assert in_blocks(lambda start, stop: (start, stop), 10, 4) == [(0, 4), (4, 8), (8, 10)]
     assert in_blocks(lambda start, stop: start, 0, 4) == []
     with pytest.raises(ZeroDivisionError):

@@ -32,7 +32,7 @@ import torch
 
 from files.formats.lies import LIES, image
 from keyss.core import Gaussians, InputError
-from keyss.core.decoded import DecodedGaussians, PictureNetwork
+from keyss.core.picture_network import DecodedGaussians, PictureNetwork
 from keyss.files import load_scene, model_bytes, model_of_bytes
 from keyss.files.formats.spz import SpzCodes
 from keyss.files.images import read_image

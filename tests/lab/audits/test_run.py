@@ -55,7 +55,7 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list[str]:
             raise KeyboardInterrupt
         return PartResult(((),) * len(subject.controls))
 
-    monkeypatch.setattr("keyss.lab.audits.run.PARTS", {"speed": speed, "leaks": leaks})
+    monkeypatch.setattr("keyss.lab.audits.audit_run.PARTS", {"speed": speed, "leaks": leaks})
     return called
 
 
@@ -101,7 +101,7 @@ def test_an_interrupted_audit_goes_on_after_what_it_has(
 def test_an_interrupt_before_the_first_part_is_told_so(
     run: Path, calls: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("keyss.lab.audits.run.PARTS", {"speed": interrupted})
+    monkeypatch.setattr("keyss.lab.audits.audit_run.PARTS", {"speed": interrupted})
     with pytest.raises(Interrupted):
         audit(run, [KEY], controls=2)
     assert main(["audit", str(run), "--report-only"]) == 4

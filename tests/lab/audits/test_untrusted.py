@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, strategies as st
 
 from keyss.core import InputError
-from keyss.lab.audits import page as page_module, read_audit
+from keyss.lab.audits import read_audit, report as page_module
 from lab.audits.pages import Parsed
 
 AuditPictures, check_bounds = page_module.AuditPictures, page_module.check_bounds

@@ -24,7 +24,7 @@ import torch
 
 from keyss.core.arrays import Bytes, Doubles, Integers, Words32
 from keyss.core.gaussians import Gaussians
-from keyss.rendering.cpu.parallel import in_blocks
+from keyss.kernels.parallel import in_blocks
 
 FIELDS = ("scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3", "opacity")
 GEOMETRY = len(FIELDS)  # fields of a Gaussian before the spherical harmonics

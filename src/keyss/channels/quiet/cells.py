@@ -24,8 +24,8 @@ import numpy as np
 
 from keyss.channels.mixing import encrypted_blocks
 from keyss.core.arrays import Bytes, Flags, Integers
+from keyss.kernels.parallel import in_blocks
 from keyss.keys.derivation import expand
-from keyss.rendering.cpu.parallel import in_blocks
 
 TAG_BYTES = 4
 _BLOCK = 16

@@ -50,9 +50,9 @@ from keyss.core.arrays import Bits, Bytes, Flags, Integers
 from keyss.core.errors import KeyssWarning, UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.files.formats.common import CodedGaussians, Codes
+from keyss.kernels.parallel import in_blocks
 from keyss.keys.derivation import DerivedKey, expand, stream
 from keyss.keys.encryption import OVERHEAD
-from keyss.rendering.cpu.parallel import in_blocks
 
 _ATTEMPTS = 30  # at writing blocks; one in a thousand covers or fewer needs a second one, each time
 _BITS_PER_GAUSSIAN = 18  # of room in codes, about

@@ -27,8 +27,8 @@ from keyss.channels.quiet.layout import SALTS
 from keyss.channels.quiet.usable import exponents, near_equal
 from keyss.core.arrays import Bytes, Integers, Words
 from keyss.core.gaussians import Gaussians
+from keyss.kernels.parallel import in_blocks
 from keyss.keys.derivation import SALT_BYTES
-from keyss.rendering.cpu.parallel import in_blocks
 
 _LABEL = b"keyss/v2/salt"
 _MANTISSA = np.uint32((1 << 23) - 1)

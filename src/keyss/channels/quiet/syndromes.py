@@ -10,8 +10,8 @@ from __future__ import annotations
 import numpy as np
 
 from keyss.core.arrays import Bits, Bytes, Integers, Words
+from keyss.kernels.jit import kernel
 from keyss.keys.derivation import stream
-from keyss.rendering.cpu.jit import kernel
 
 BLOCK = 1024  # bits
 _WORDS = BLOCK // 64

@@ -44,7 +44,7 @@ from keyss.channels.quiet.predictability import count_trailing_zeros, least_expo
 from keyss.core.arrays import Bytes, Doubles, Flags, Integers, Numbers, Words, Words32
 from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
-from keyss.rendering.cpu.parallel import in_blocks
+from keyss.kernels.parallel import in_blocks
 
 MIN_USABLE = 0.5  # share of the Gaussians of a cover
 # Bound of what small numbers give away: squared separation (d') of a plain file and one with new bits, to

@@ -14,9 +14,9 @@ import safetensors.torch
 import torch
 from torch import Tensor
 
-from keyss.core.decoded import DecodedGaussians, PictureNetwork
 from keyss.core.errors import InputError, OutputError
 from keyss.core.gaussians import Gaussians
+from keyss.core.picture_network import DecodedGaussians, PictureNetwork
 from keyss.files.formats.common import reason
 
 FORMAT = "keyss-decoded/1"

@@ -15,13 +15,13 @@ from statistics import fmean
 
 from keyss.channels import is_appended
 from keyss.core.arrays import Bytes
-from keyss.core.decoded import DecodedGaussians
 from keyss.core.errors import InputError, UsageError, import_extra
 from keyss.core.gaussians import Gaussians
+from keyss.core.picture_network import DecodedGaussians
 from keyss.core.scene import Scene, ViewOptions
 from keyss.files.models import read_model
 from keyss.lab.audits import PARTS
-from keyss.lab.audits.run import EXTRA
+from keyss.lab.audits.audit_run import EXTRA
 from keyss.lab.robustness.changes import Change, opacity_pruning, purification, random_pruning
 from keyss.lab.robustness.survival import converters, measure_robustness, own_converter, why_missing
 from keyss.lab.sinkhorn import composite_score, sinkhorn_3d
@@ -29,11 +29,11 @@ from keyss.lab.speed import RenderTime, readers, render_time
 from keyss.lab.stealth.judging import judge
 from keyss.lab.stegexpose import stegexpose_auc
 from keyss.lab.two_sample import two_sample_auc
-from keyss.measure.images import renders_of, select_views
+from keyss.measure.image_scores import renders_of, select_views
 from keyss.methods import registry
 from keyss.rendering import Backend, resolve_device
 from keyss.runs.files import HANDED, as_scene, stego_in
-from keyss.runs.opening import HidingRun
+from keyss.runs.open_run import HidingRun
 
 Numbers = dict[str, float | str]
 

@@ -38,19 +38,19 @@ from keyss.lab.audits.record import (
 )
 from keyss.lab.distances import against_controls
 from keyss.lab.leaks.attacks import decoder_attack, file_attacks, with_the_key
-from keyss.lab.leaks.looking import AttackResult, look_for_secret
+from keyss.lab.leaks.leak_scores import AttackResult, look_for_secret
 from keyss.lab.robustness.survival import ChangeResult, measure_robustness
 from keyss.lab.sinkhorn import composite_score, sinkhorn_3d
 from keyss.lab.speed import SpeedResult, measure_speed
 from keyss.lab.stealth.judging import StealthResult, judge
 from keyss.lab.stegexpose import stegexpose_auc
 from keyss.lab.two_sample import auc_beside_controls
-from keyss.measure.hiding import in_cover
-from keyss.measure.images import compare_images, masks_of, photos_of, renders_of, select_views
+from keyss.measure.hide_quality import in_cover
+from keyss.measure.image_scores import compare_images, masks_of, photos_of, renders_of, select_views
 from keyss.progress import Reporter
 from keyss.runs.files import CONTROLS, as_model, stego_in
 from keyss.runs.folder import RunFolder
-from keyss.runs.opening import HidingRun
+from keyss.runs.open_run import HidingRun
 from keyss.runs.records import write_record
 
 T = TypeVar("T")

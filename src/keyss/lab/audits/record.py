@@ -8,15 +8,15 @@ from typing import Any
 
 from keyss.core.errors import InputError
 from keyss.lab.distances import AttributeDistance
-from keyss.lab.leaks.looking import AttackResult
+from keyss.lab.leaks.leak_scores import AttackResult
 from keyss.lab.robustness.survival import ChangeResult
 from keyss.lab.sinkhorn import Sinkhorn3D
 from keyss.lab.speed import SpeedResult
 from keyss.lab.stealth.judging import StealthResult
 from keyss.lab.stegexpose import StegExposeAuc
 from keyss.lab.two_sample import TwoSampleAucs
-from keyss.measure.hiding import WrongKeys
-from keyss.measure.images import ImageComparison
+from keyss.measure.hide_quality import WrongKeys
+from keyss.measure.image_scores import ImageComparison
 from keyss.runs.files import run_folder
 from keyss.runs.folder import PRIVATE
 from keyss.runs.records import read_record

@@ -1,7 +1,7 @@
 """The summary of an audit: a verdict for each measure.
 
 *fine*: within the limit. *visible*: that something is hidden, or what, may be visible without the key.
-*missed*: nothing is visible, but the quality is too low. Limits of leaks are in `keyss.lab.leaks.looking`,
+*missed*: nothing is visible, but the quality is too low. Limits of leaks are in `leak_scores`,
 all others here.
 """
 
@@ -14,7 +14,7 @@ from typing import Literal
 from keyss.lab.auc import Auc
 from keyss.lab.audits.numbers import decibel, difference, number, numbered, significant, times
 from keyss.lab.audits.record import Audit
-from keyss.lab.leaks.looking import GRADIENT_LIMIT, PSNR_LIMIT, SSIM_LIMIT, AttackResult
+from keyss.lab.leaks.leak_scores import GRADIENT_LIMIT, PSNR_LIMIT, SSIM_LIMIT, AttackResult
 
 QUALITY_LOSS = 1.0  # dB of cover or secret below the plain model of the same scene
 INVISIBLE = 45.0  # dB: a higher PSNR makes no visible difference

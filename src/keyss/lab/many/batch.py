@@ -27,9 +27,9 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from keyss._version import __version__
-from keyss.api.asking import Secret
-from keyss.api.hiding import hide
-from keyss.api.hiding_files import SecretFile, hide_files
+from keyss.api.hide import hide
+from keyss.api.hide_arguments import Secret
+from keyss.api.hide_files import SecretFile, hide_files
 from keyss.core import InputError, KeyssWarning, ViewOptions
 from keyss.core.errors import did_you_mean
 from keyss.files import write_bytes

@@ -23,9 +23,9 @@ from typing import Any, cast
 import msgspec
 
 from keyss._version import __version__
-from keyss.api.asking import Secret
-from keyss.api.fitting import fit
-from keyss.api.hiding import hide
+from keyss.api.fit import fit
+from keyss.api.hide import hide
+from keyss.api.hide_arguments import Secret
 from keyss.core import ViewOptions
 from keyss.files import write_bytes
 from keyss.fitting import FitConfig
@@ -40,7 +40,7 @@ from keyss.rendering import Backend, resolve_device
 from keyss.runs import FitMetrics, HideMetrics, Manifest, read_manifest, read_record, record_bytes
 from keyss.runs.files import METRICS, as_scene, model_in
 from keyss.runs.folder import make_private
-from keyss.runs.opening import open_run
+from keyss.runs.open_run import open_run
 from keyss.runs.planning import plan_fit
 
 CELL, RESULT, RUN = "cell.json", "result.json", "run"

@@ -24,14 +24,14 @@ from keyss.lab.many.cell import RUN, keys_of
 from keyss.lab.many.cell_folder import CellFolder, Forecast, Outcome
 from keyss.lab.many.result_tables import markdown_rows, write_scene_tables
 from keyss.measure.contact_sheet import contact_sheet
-from keyss.measure.images import renders_of
+from keyss.measure.image_scores import renders_of
 from keyss.methods import MethodOptions, registry
 from keyss.progress import Reporter
 from keyss.rendering import Backend, resolve_device
 from keyss.rendering.orbit import is_model
 from keyss.runs import write_record
 from keyss.runs.files import PathLike
-from keyss.runs.opening import HidingRun, open_run
+from keyss.runs.open_run import HidingRun, open_run
 
 STEM = "comparison"  # file names without their suffix
 MEASURES = ("files", "pictures", "secrecy", "survival")

@@ -12,8 +12,8 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
-from keyss.core.decoded import DecodedGaussians, PictureNetwork
 from keyss.core.gaussians import Gaussians
+from keyss.core.picture_network import DecodedGaussians, PictureNetwork
 from keyss.core.scene import Camera
 from keyss.fitting.parameters import to_gaussians
 from keyss.lab.peers.method import HandedTensors, Peer, PeerTraining, Show

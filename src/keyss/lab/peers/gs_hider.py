@@ -10,9 +10,9 @@ from collections.abc import Sequence
 
 import torch
 
-from keyss.core.decoded import DecodedGaussians
 from keyss.core.errors import InputError
 from keyss.core.gaussians import SH_C0, Gaussians
+from keyss.core.picture_network import DecodedGaussians
 from keyss.core.scene import Camera
 from keyss.lab.peers.decoder import Convolutions, network_of, network_tensors
 from keyss.lab.peers.method import HandedTensors, Peer, PeerTraining, Show

@@ -26,7 +26,7 @@ from keyss.files.models import read_model, write_model
 from keyss.fitting.image_metrics import mean_psnr, subsample_views
 from keyss.lab.robustness import changes as change
 from keyss.lab.robustness.changes import Change
-from keyss.measure.hiding import in_cover
+from keyss.measure.hide_quality import in_cover
 from keyss.methods.opened import Opened
 
 PRUNED = (0.05, 0.10, 0.15, 0.25, 0.50)

@@ -22,8 +22,8 @@ from keyss.channels import (
 )
 from keyss.core.gaussians import Gaussians
 from keyss.methods.base import Stego
+from keyss.methods.records.carried_secret import COUNT, unpack
 from keyss.methods.records.lines import Table
-from keyss.methods.records.opening import COUNT, unpack
 from keyss.methods.records.precision import encode_to_size, most_visible_rows
 from keyss.methods.records.quantise import Codec
 from keyss.methods.records.whole import encode

@@ -14,7 +14,7 @@ import numpy as np
 
 from keyss.core.arrays import Integers
 from keyss.core.errors import InputError
-from keyss.rendering.cpu.jit import inline, kernel
+from keyss.kernels.jit import inline, kernel
 
 MAX_NUMBER = 1 << 29  # differences have at most 31 bits
 _MAX_BITS = 31

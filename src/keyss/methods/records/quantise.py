@@ -30,6 +30,8 @@ from keyss.core.arrays import Bytes, Doubles, Flags, Integers, Words32, doubles
 from keyss.core.errors import InputError
 from keyss.core.gaussians import MAX_COORDINATE, MAX_LOG_SCALE, OPPONENT, Gaussians, magnitude
 from keyss.files.formats.common import smallest_three, unit
+from keyss.kernels.jit import kernel
+from keyss.kernels.parallel import in_blocks
 from keyss.methods.records.lines import (
     BANDS,
     CHROMA_FEWER,
@@ -44,8 +46,6 @@ from keyss.methods.records.lines import (
     fit_line,
     inlier_range,
 )
-from keyss.rendering.cpu.jit import kernel
-from keyss.rendering.cpu.parallel import in_blocks
 
 MAX_LOGIT = 16.0  # beyond it the float32 sigmoid is exactly 0 or 1
 _MAX_HARMONIC = 1e6  # beyond it a colour is black or white wherever it is rendered at all

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from keyss.rendering.cpu.jit import inline, kernel
+from keyss.kernels.jit import inline, kernel
 from keyss.rendering.cpu.layout import (
     ENTRY_ROWS_SHIFT,
     EXTENT_X,

@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from keyss.rendering.cpu.jit import finite_inline, finite_kernel
+from keyss.kernels.jit import finite_inline, finite_kernel
 from keyss.rendering.cpu.layout import (
     ALPHA_MAX,
     ALPHA_MIN,

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from keyss.kernels.jit import finite_inline, finite_kernel
 from keyss.rendering.cpu.blending import (
     BATCH,
     INVERSE,
@@ -19,7 +20,6 @@ from keyss.rendering.cpu.blending import (
     blend_row,
     list_strips,
 )
-from keyss.rendering.cpu.jit import finite_inline, finite_kernel
 from keyss.rendering.cpu.layout import (
     BLUE,
     DECAY,

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from keyss.rendering.cpu.jit import inline, kernel
+from keyss.kernels.jit import inline, kernel
 from keyss.rendering.cpu.layout import (
     ALPHA_MIN,
     CHANNEL_MAX,

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from keyss.rendering.cpu.jit import inline, kernel
+from keyss.kernels.jit import inline, kernel
 from keyss.rendering.cpu.layout import CHUNK, HALF, HUGE, MOMENTS, NORM_MIN, ONE, PACKED, RED, TWO, ZERO
 from keyss.rendering.cpu.projection import PREFETCH, dot, linearise, times
 from keyss.rendering.cpu.rows import gather1, gather3, gather8, load_transposed, scatter

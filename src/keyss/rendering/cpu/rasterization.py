@@ -11,11 +11,12 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from keyss.core import BackendError
-from keyss.rendering.cpu import binning, blending, blending_backward, memory, projection, projection_backward
-from keyss.rendering.cpu.jit import announce_compilation
+from keyss.kernels import memory
+from keyss.kernels.jit import announce_compilation
+from keyss.kernels.memory import Array
+from keyss.kernels.parallel import run
+from keyss.rendering.cpu import binning, blending, blending_backward, projection, projection_backward
 from keyss.rendering.cpu.layout import CAMERA, FX, MOMENTS, PACKED, POSITION, TILE_HEIGHT, TILE_WIDTH, TX
-from keyss.rendering.cpu.memory import Array
-from keyss.rendering.cpu.parallel import run
 
 MAX_PAIRS = 2**31 - 1  # positions in the lists of tiles are int32
 

@@ -24,7 +24,7 @@ from numba import extending, types
 from numba.core import cgutils
 from numba.extending import lower_builtin, models, register_model, type_callable
 
-from keyss.rendering.cpu.jit import inline
+from keyss.kernels.jit import inline
 
 intrinsic: Any = extending.intrinsic  # kernels call intrinsics without the typing context
 

@@ -15,9 +15,9 @@ from typing import Any
 
 import torch
 
-from keyss.api.asking import HideResult, Secret, method_for, sources_of
-from keyss.api.fitting import with_seed
-from keyss.api.quality import check_quality
+from keyss.api.fit import with_seed
+from keyss.api.hide_arguments import HideResult, Secret, method_for, sources_of
+from keyss.api.hide_checks import check_quality
 from keyss.channels import AnyChannel, Format, Publish
 from keyss.core.errors import KeyssWarning, UsageError
 from keyss.core.gaussians import Gaussians, same_bits
@@ -27,7 +27,7 @@ from keyss.files.ply_extras import with_extras
 from keyss.fitting.image_metrics import quality
 from keyss.keys import DerivedKey
 from keyss.keys.derivation import SALT_BYTES
-from keyss.measure.hiding import Shown, compare, measure_hiding
+from keyss.measure.hide_quality import Shown, compare, measure_hiding
 from keyss.methods.base import Context, Method, MethodOptions, Source, Stego
 from keyss.methods.handed import pack
 from keyss.methods.opened import Opened

@@ -18,8 +18,8 @@ from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Camera, Scene, View, ViewOptions, checked_background
 from keyss.files.atomic import check_not_an_input, check_output_file
 from keyss.files.images import check_video, png_bytes, write_video
-from keyss.measure.hiding import WRONG_KEYS, measure_hiding
-from keyss.measure.images import renders_of
+from keyss.measure.hide_quality import WRONG_KEYS, measure_hiding
+from keyss.measure.image_scores import renders_of
 from keyss.progress import Reporter
 from keyss.rendering import Backend, render as render_view, resolve_device
 from keyss.rendering.arguments import MAX_SIDE
@@ -27,7 +27,7 @@ from keyss.rendering.orbit import IMAGE_SIZE, around, circle
 from keyss.runs.config import HideMetrics
 from keyss.runs.files import METRICS, Background, PathLike, as_model, as_scene
 from keyss.runs.folder import RunFolder, write_again
-from keyss.runs.opening import open_run
+from keyss.runs.open_run import open_run
 
 Split = Literal["test", "train", "all"]
 FPS = 25

@@ -21,6 +21,7 @@ import numba
 
 from keyss.core.gaussians import DRAWN_OPACITY
 
+_PACKAGE = Path(__file__).parents[1]
 _numba: Any = numba  # typed in some versions only
 
 # `fastmath` without the assumption that there are no NaN and infinities: a Gaussian with a NaN must fail the
@@ -78,7 +79,7 @@ def cache_folder() -> Path | None:
     this user can write to, because numba unpickles its content.
     """
     digest = hashlib.sha256(repr(DRAWN_OPACITY).encode())
-    for source in sorted(Path(__file__).parent.glob("*.py")):
+    for source in sorted([*_PACKAGE.glob("kernels/*.py"), *_PACKAGE.glob("rendering/cpu/*.py")]):
         digest.update(source.name.encode() + b"\0" + source.read_bytes() + b"\0")
     for parent in _cache_parents():
         folder = parent / f"keyss-kernels-{digest.hexdigest()[:16]}"
@@ -105,7 +106,7 @@ def _is_private(folder: Path) -> bool:
 
 
 def _cache_parents() -> list[Path]:
-    parents = [Path(__file__).parent / "__pycache__"]
+    parents = [_PACKAGE / "kernels" / "__pycache__"]
     if _numba.config.CACHE_DIR:
         parents.insert(0, Path(_numba.config.CACHE_DIR))
     user_cache = os.environ.get("LOCALAPPDATA") or os.environ.get("XDG_CACHE_HOME")
@@ -121,6 +122,6 @@ def _cache_parents() -> list[Path]:
 def announce_compilation() -> None:
     """Print once to stderr that the first render takes a while, if nothing is compiled yet."""
     folder = cache_folder()
-    own = f"{Path(__file__).parent.name}_*"  # numba's name for the folder of kernels in this package
-    if folder is None or next(folder.glob(f"{own}/*.nbi"), None) is None:
+    # numba names folders after those of the sources.
+    if folder is None or next(folder.glob("cpu_*/*.nbi"), None) is None:
         print("keyss: compiling the CPU rasterizer, 10 to 20 s, once", file=sys.stderr, flush=True)

@@ -118,7 +118,7 @@ def render(
     if video is None and (wipe is not None or seconds != 8.0):
         raise UsageError("--wipe and --seconds are for videos: give --video FILE")
     import keyss
-    from keyss.api.looking import frame_count
+    from keyss.api.render import frame_count
     from keyss.progress import reporter
 
     film: dict[str, Any] = {"video": video, "wipe": wipe, "seconds": seconds, "reporter": reporter()}

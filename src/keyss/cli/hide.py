@@ -89,7 +89,7 @@ class Batch:
 
 @dataclass(frozen=True, kw_only=True)
 class HideArguments:
-    """The options of `keyss hide`; `keyss.cli.hiding` adds those of the method."""
+    """The options of `keyss hide`; `keyss.cli.hide` adds those of the method."""
 
     cover: Annotated[
         Path | None,

@@ -23,7 +23,7 @@ from keyss.progress import Reporter
 from keyss.rendering import Backend, resolve_device
 from keyss.runs.files import REPORT, PathLike
 from keyss.runs.folder import CHECKPOINTS, RunFolder, read_manifest, write_again
-from keyss.runs.opening import HidingRun, open_run
+from keyss.runs.open_run import HidingRun, open_run
 
 _LIBRARIES = ("torch", "numpy", "scipy", "scikit-learn", "pot", "gsplat", "numba")
 EXTRA = ("jinja2", "ot", "sklearn")
@@ -82,7 +82,7 @@ def audit(
         overwrite=overwrite,
         resume=resume,
     )
-    from keyss.lab.audits.page import report_bytes
+    from keyss.lab.audits.report import report_bytes
 
     with folder.work(), _resumable(folder.checkpoints):
         subject = subject_of(opened, original, controls, seed, target, reporter, folder)
@@ -128,7 +128,7 @@ def _resumable(checkpoints: Path) -> Iterator[None]:
 def _report(run: Path) -> Audit:
     """Write the report of a run's audit, finished or not."""
     import_extra("jinja2", "audit", "write a report")
-    from keyss.lab.audits.page import report_bytes
+    from keyss.lab.audits.report import report_bytes
 
     record = f"{AUDIT_FOLDER}/{AUDIT_FILE}"
     running = None if (run / record).exists() else read_manifest(run).running

@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Sequence
 
 from keyss.core.errors import KeyssWarning, QualityError
-from keyss.measure.hiding import Shown
+from keyss.measure.hide_quality import Shown
 from keyss.methods.base import MethodOptions
 
 MIN_PSNR = 20.0  # dB to the plain model; below it, renders show something else

@@ -7,7 +7,7 @@ from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from keyss.api.asking import check_keys
+from keyss.api.hide_arguments import check_keys
 from keyss.channels import AnyChannel, Format, Publish, channel_for, open_content
 from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians

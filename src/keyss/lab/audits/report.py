@@ -23,7 +23,7 @@ from keyss.lab.audits import numbers
 from keyss.lab.audits.parts import OF_3DGS_MODELS
 from keyss.lab.audits.record import AUDIT_FOLDER, Audit, ModelImages
 from keyss.lab.audits.summary import auc_text, headline, verdicts, worst_leak
-from keyss.measure.images import ImageComparison
+from keyss.measure.image_scores import ImageComparison
 
 if TYPE_CHECKING:
     from jinja2 import Environment

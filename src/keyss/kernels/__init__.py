@@ -1,0 +1,1 @@
+"""What compiled kernels share: compilation and its cache, threads, reused memory."""
