@@ -15,6 +15,7 @@ from hypothesis import settings
 import keyss  # noqa: F401  before any test module imports torch: see keyss._threads
 import uncompiled  # noqa: F401  before any test module imports gsply
 from cheap_keys import choose_costs, pytest_sessionstart  # noqa: F401  hook
+from same_draws import begin_draws, draw_the_same, pytest_fixture_setup  # noqa: F401  hook
 from skip_policy import pytest_make_collect_report, pytest_runtest_makereport  # noqa: F401  hooks
 
 if TYPE_CHECKING:
@@ -26,6 +27,8 @@ if TYPE_CHECKING:
 # it; on other machines it goes on searching. How long an example takes depends on what else a machine does.
 settings.register_profile("tests", derandomize="CI" in os.environ, deadline=None)
 settings.load_profile("tests")
+if "CI" in os.environ:
+    draw_the_same()
 
 # A script that runs the tests in its background has them ignore Ctrl-C, which many of them send.
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
@@ -35,6 +38,7 @@ if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup(item: pytest.Item) -> None:
     """Before fixtures of any scope: those that are shared must not be mixed."""
+    begin_draws(item)
     choose_costs(item)
 
 
