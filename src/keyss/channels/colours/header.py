@@ -24,7 +24,7 @@ from keyss.channels.colours.lattice import COLUMNS, ONE, read, seeds, write
 from keyss.core.arrays import Bits, Doubles, Flags, Integers
 from keyss.keys.derivation import SALT_BYTES, DerivedKey, expand
 
-PLACES = 96  # Gaussians of a header under each salt
+PLACES = 80  # Gaussians of a header under each salt
 DEPTHS = (1, 2)  # bits of each of their numbers beside a payload at level ONE, and beside one at any other
 SHARES = 256  # parts of the carriers; a payload has some of them
 IDLE = 1 / 255  # unit of the share of carriers that were left alone
