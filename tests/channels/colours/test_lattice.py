@@ -109,7 +109,7 @@ def test_salts_are_new_and_are_found_again_after_rounding_and_pruning() -> None:
     first, second = (renewed(carriers, np.random.default_rng(seed)) for seed in (1, 2))
     one, other = Salts.of(first), Salts.of(second)
     assert len(one.salts) >= SALTS
-    assert len(set(one.salts) & set(other.salts)) <= 2  # 1/49 of 12 are expected
+    assert len(set(one.salts) & set(other.salts)) <= 2  # 1/49 of 16 are expected
     sh = model.sh.clone()
     sh[carriers.rows, 0] = torch.from_numpy((np.round(first.colours * 38.25 + 127.5) - 127.5) / 38.25).float()
     kept = torch.rand(6000, generator=torch.Generator().manual_seed(3)) < 0.75

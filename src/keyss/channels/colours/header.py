@@ -2,7 +2,7 @@
 
 There is a *header* under each of a few salts, and all are equal. So they are parts of one code (`fountain`)
 and are read together: one salt's Gaussians replace the lost ones of another. *Pilots*, a few known bits of
-each part, tell which salts were lost.
+each part, tell which salts were lost, and then what was decoded does.
 
 The key chooses the Gaussians whose names it gives the least random numbers: a lost one costs its own place
 and no other.
@@ -20,11 +20,12 @@ import numpy as np
 
 from keyss.channels.colours.carriers import Carriers, fractions
 from keyss.channels.colours.fountain import NOISY, Fountain
-from keyss.channels.colours.lattice import COLUMNS, ONE, bit_counts, read, seeds, write
+from keyss.channels.colours.lattice import COLUMNS, ONE, read, seeds, write
 from keyss.core.arrays import Bits, Doubles, Flags, Integers
 from keyss.keys.derivation import SALT_BYTES, DerivedKey, expand
 
-PLACES = 96  # Gaussians of a header under each salt
+PLACES = 80  # Gaussians of a header under each salt
+DEPTHS = (1, 2)  # bits of each of their numbers beside a payload at level ONE, and beside one at any other
 SHARES = 256  # parts of the carriers; a payload has some of them
 IDLE = 1 / 255  # unit of the share of carriers that were left alone
 FILE_KEY_BYTES = 5
@@ -32,6 +33,8 @@ _PILOTS = 10  # of the places
 _FORMAT = f"{FILE_KEY_BYTES}s6B"
 _CHECK_BYTES = 2
 _PRIOR = 0.4  # logarithm of the odds that a salt is one, before anything else is known
+_TRIES = 3  # to tell salts that were lost
+_DECODED = 0.3  # weight of a bit that was decoded beside one that was known
 _HELD = 0.5  # chance that a place under a salt holds what was written
 _STATIC_SALT = hashlib.sha256(b"keyss/v1/colours-static").digest()[:SALT_BYTES]
 _CODE = Fountain(8 * (struct.calcsize(_FORMAT) + _CHECK_BYTES), NOISY)
@@ -94,31 +97,47 @@ class Header:
 
     def write(self, secrets: Secrets, salt: int, carriers: Carriers) -> tuple[Integers, Doubles]:
         """[P] the carriers that hold the header under one salt, and [P, 2] their new values."""
-        secret = secrets.salted[salt]
+        secret, depth = secrets.salted[salt], DEPTHS[self.level != ONE]
         rows, pilots = places(secret, carriers)
-        names, counts = carriers.names[rows], bit_counts(carriers.impact[rows], ONE)
+        names, counts = carriers.names[rows], np.full(len(rows), depth)
         code = _CODE.encode(self.bits(secrets), seeds(secret, "header-seeds", names, counts))
-        code[np.repeat(pilots, COLUMNS)] = 0
+        code[np.repeat(pilots, COLUMNS * depth)] = 0
         return rows, write(secret, names, carriers.colours[rows, 1:], counts, code)
 
     @staticmethod
     def read(secrets: Secrets, carriers: Carriers) -> Header | None:
         """None where there is none; one attempt in 2^16 finds one by chance, which opens nothing."""
-        words, hints = [np.zeros(0, np.uint64)], [np.zeros(0)]
-        for secret in secrets.salted:
-            rows, pilots = places(secret, carriers)
-            names, counts = carriers.names[rows], bit_counts(carriers.impact[rows], ONE)
-            known = np.repeat(pilots, COLUMNS)
-            sure = _HELD * (1 - carriers.doubt[rows]) / carriers.namesakes[rows]
-            read_hints = np.repeat(sure, COLUMNS) * read(secret, names, carriers.colours[rows, 1:], counts)
-            odds = _PRIOR + np.log1p(read_hints[known]).sum()
-            hints.append(read_hints[~known] / (1 + np.exp(-odds)))
-            words.append(seeds(secret, "header-seeds", names, counts)[~known])
-        found = np.packbits(_CODE.decode(np.concatenate(words), np.concatenate(hints))).tobytes()
-        plain, check = found[:-_CHECK_BYTES], found[-_CHECK_BYTES:]
-        if not hmac.compare_digest(check, secrets.check(plain)):
-            return None
-        return Header(*struct.unpack(_FORMAT, plain))
+        found = [places(secret, carriers) for secret in secrets.salted]
+        headers = [_read(secrets, carriers, found, depth) for depth in DEPTHS]
+        return headers[0] or headers[1]
+
+
+def _read(
+    secrets: Secrets, carriers: Carriers, found: Sequence[tuple[Integers, Flags]], depth: int
+) -> Header | None:
+    """The header with `depth` bits in each number of the places `found`."""
+    words, hints, owners, odds = [np.zeros(0, np.uint64)], [np.zeros(0)], [np.zeros(0, np.int64)], []
+    for salt, (secret, (rows, pilots)) in enumerate(zip(secrets.salted, found, strict=True)):
+        names, counts = carriers.names[rows], np.full(len(rows), depth)
+        known = np.repeat(pilots, COLUMNS * depth)
+        sure = np.repeat(_HELD * (1 - carriers.doubt[rows]) / carriers.namesakes[rows], COLUMNS * depth)
+        every = sure * read(secret, names, carriers.colours[rows, 1:], counts)
+        odds.append(_PRIOR + np.log1p(every[known]).sum())
+        hints.append(every[~known])
+        words.append(seeds(secret, "header-seeds", names, counts)[~known])
+        owners.append(np.full(len(hints[-1]), salt))
+    word, hint, owner = np.concatenate(words), np.concatenate(hints), np.concatenate(owners)
+    agreement: Doubles = np.zeros(len(odds))
+    for _ in range(_TRIES):
+        trust = 1 / (1 + np.exp(-np.array(odds) - _DECODED * agreement))
+        data = _CODE.decode(word, hint * trust[owner])
+        packed = np.packbits(data).tobytes()
+        plain, check = packed[:-_CHECK_BYTES], packed[-_CHECK_BYTES:]
+        if hmac.compare_digest(check, secrets.check(plain)):
+            return Header(*struct.unpack(_FORMAT, plain))
+        logs = np.log1p(hint * (1 - 2.0 * _CODE.encode(data, word)))
+        agreement = np.bincount(owner, logs, len(odds)).astype(np.float64)
+    return None
 
 
 def places(secret: bytes, carriers: Carriers) -> tuple[Integers, Flags]:

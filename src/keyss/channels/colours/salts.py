@@ -30,7 +30,7 @@ from keyss.channels.colours.carriers import (
 from keyss.core.arrays import Integers
 from keyss.keys.derivation import SALT_BYTES
 
-SALTS = 12  # at most; after rounding and random pruning of a quarter, 4 to 9 of them are left
+SALTS = 16  # at most; after rounding and random pruning of a quarter, 5 to 12 of them are left
 _BANDS = (0.08, 0.4, 1.01)  # limits of two bands of opacity, with half of the salts each
 _MAX_MOVED = 3  # cells
 _OPACITY_CELL, _RATIO_CELL, _COLOUR_CELL = 16, 8, 5  # steps

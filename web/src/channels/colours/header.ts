@@ -11,11 +11,14 @@ export const STATIC_SALT = sha256(ascii('keyss/v1/colours-static')).slice(0, SAL
 const FILE_KEY_BYTES = 5;
 const SHARES = 256; // parts of the carriers; a payload has some of them
 const IDLE = 1 / 255; // unit of the share of carriers that were left alone
-const PLACES = 96; // Gaussians of a header under each salt
+const PLACES = 80; // Gaussians of a header under each salt
 const PILOTS = 10; // of the places
+const DEPTHS = [1, 2]; // bits of each of their numbers
 const PLAIN_BYTES = FILE_KEY_BYTES + 6;
 const CHECK_BYTES = 2;
 const PRIOR = 0.4; // logarithm of the odds that a salt is one, before anything else is known
+const TRIES = 3; // to tell salts that were lost
+const DECODED = 0.3; // weight of a bit that was decoded beside one that was known
 const HELD = 0.5; // chance that a place under a salt holds what was written
 const MEDIAN_STEPS = 8; // of the median impact, in one
 const CODE = new Fountain(8 * (PLAIN_BYTES + CHECK_BYTES), NOISY);
@@ -44,31 +47,51 @@ export interface Header {
 }
 
 /** null where there is none; one attempt in 2^16 finds one by chance, which opens nothing. */
-export function readHeader({ fixed, salted }: Secrets, carriers: Carriers): Header | null {
-  const [words, hints]: [number[], number[]] = [[], []];
-  for (const secret of salted) {
-    const { rows, pilots } = placesOf(secret, carriers);
+export function readHeader(secrets: Secrets, carriers: Carriers): Header | null {
+  const places = secrets.salted.map((secret) => placesOf(secret, carriers));
+  const [one, two] = DEPTHS.map((depth) => readAt(depth, secrets, carriers, places));
+  return one ?? two;
+}
+
+/** The header with `depth` bits in each number of its places. */
+function readAt(depth: number, { fixed, salted }: Secrets, carriers: Carriers, places: readonly Places[]): Header | null {
+  const [words, hints, owners]: [number[], number[], number[]] = [[], [], []];
+  const odds = salted.map((secret, salt) => {
+    const { rows, pilots } = places[salt];
     const own = chosen(carriers, rows);
-    const bits = new Uint8Array(rows.length).fill(1);
-    const read = readBits(secret, own, bits).map((hint, at) => {
-      const place = Math.floor(at / COLUMNS);
-      return (HELD * (1 - own.doubt[place]) * hint) / own.alike[place];
-    });
-    const isPilot = (at: number): boolean => pilots[Math.floor(at / COLUMNS)];
-    const odds = read.reduce((sum, hint, at) => (isPilot(at) ? sum + Math.log1p(hint) : sum), PRIOR);
+    const bits = new Uint8Array(rows.length).fill(depth);
     const seeds = seedsOf(secret, 'header-seeds', own, bits);
-    read.forEach((hint, at) => {
-      if (isPilot(at)) return;
-      hints.push(hint / (1 + Math.exp(-odds)));
-      words.push(seeds[2 * at], seeds[2 * at + 1]);
+    let sum = PRIOR;
+    readBits(secret, own, bits).forEach((read, at) => {
+      const place = Math.floor(at / (COLUMNS * depth));
+      const hint = (HELD * (1 - own.doubt[place]) * read) / own.alike[place];
+      if (pilots[place]) {
+        sum += Math.log1p(hint);
+      } else {
+        hints.push(hint);
+        words.push(seeds[2 * at], seeds[2 * at + 1]);
+        owners.push(salt);
+      }
     });
+    return sum;
+  });
+  const seeds = Uint32Array.from(words);
+  const agreement = new Float64Array(odds.length);
+  for (let attempt = 0; attempt < TRIES; attempt++) {
+    const trust = odds.map((each, salt) => 1 / (1 + Math.exp(-each - DECODED * agreement[salt])));
+    const decoded = CODE.decode(seeds, hints.map((hint, at) => hint * trust[owners[at]]));
+    const data = packBits(decoded);
+    const check = hmac(sha256, expand(fixed, 'colours/check', 32), data.subarray(0, PLAIN_BYTES));
+    if (data.subarray(PLAIN_BYTES).every((each, at) => each === check[at])) return unpacked(fixed, data);
+    agreement.fill(0);
+    CODE.encode(decoded, seeds).forEach((bit, at) => (agreement[owners[at]] += Math.log1p(bit ? -hints[at] : hints[at])));
   }
-  const data = packBits(CODE.decode(Uint32Array.from(words), hints));
-  const plain = data.subarray(0, PLAIN_BYTES);
-  const check = hmac(sha256, expand(fixed, 'colours/check', 32), plain);
-  if (data.subarray(PLAIN_BYTES).some((each, at) => each !== check[at])) return null;
-  const [level, first, last, bucket, idle, middle] = plain.subarray(FILE_KEY_BYTES);
-  const partition = plain.slice(0, FILE_KEY_BYTES);
+  return null;
+}
+
+function unpacked(fixed: Uint8Array, data: Uint8Array): Header {
+  const [level, first, last, bucket, idle, middle] = data.subarray(FILE_KEY_BYTES, PLAIN_BYTES);
+  const partition = data.slice(0, FILE_KEY_BYTES);
   const key = expand(joined(fixed, partition), 'colours/data-key', 32);
   const size = (16 + (bucket % 16)) << (Math.floor(bucket / 16) + 1); // 32 to 2 million
   return { key, partition, level, first, last, size, held: 1 - idle * IDLE, median: middle };
@@ -91,7 +114,12 @@ export function shiftOf(header: Header, { impact }: Carriers): number {
 }
 
 /** The carriers with the PLACES names that a secret chooses, and which of them are pilots. */
-function placesOf(secret: Uint8Array, { names }: Carriers): { rows: number[]; pilots: boolean[] } {
+interface Places {
+  readonly rows: readonly number[];
+  readonly pilots: readonly boolean[];
+}
+
+function placesOf(secret: Uint8Array, { names }: Carriers): Places {
   const numbers = fractions(secret, 'places', names).filter((_, at) => at % 2 === 0);
   const least: number[] = [];
   for (const each of numbers.slice().sort()) {

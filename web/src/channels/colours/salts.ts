@@ -6,12 +6,12 @@ import {
   type Carriers, cellOf, COLOUR_NOISE, COLOUR_STEPS, fractions, OPACITY_NOISE, OPACITY_STEPS, SCALE_STEPS,
 } from './carriers.ts';
 
-const SALTS = 12; // at most
+const SALTS = 16; // at most
 const BANDS = [0.08, 0.4, 1.01]; // limits of two bands of opacity, with half of the salts each
 const [OPACITY_CELL, RATIO_CELL, COLOUR_CELL] = [16, 8, 5]; // steps
 const LABEL = ascii('keyss/v1/colours-salt');
 
-/** Up to 12 salts of 16 bytes. */
+/** Up to 16 salts of 16 bytes. */
 export function saltsOf({ count, logScales, opacities, colours }: Carriers): Uint8Array[] {
   const cells = new Int16Array(6 * count);
   const names = new Int16Array(8 * count); // the first four cells, and zeros up to a block of AES
