@@ -17,7 +17,7 @@ from channels.quiet.coded import codes_of, model_of
 from channels.quiet.trained_like import trained_like
 from cli.said import PROGRAM, Run, Said, assert_refused, listing, write_key
 from keyss.channels import LOW_BITS, CodesCover, Payload, base
-from keyss.channels.colours import carriers
+from keyss.channels.colours import salts
 from keyss.channels.quiet import cells
 from keyss.core import Gaussians
 from keyss.files import read_model, write_model
@@ -124,7 +124,7 @@ class TestOpensNothing:
             made.append(dict(work))
         assert said[0] == said[1] == said[2]
         assert made[0] == made[1] == made[2]
-        assert made[0]["keys"] == base.SALTS_TRIED + carriers.SALTS + 1  # in low bits, then in colours
+        assert made[0]["keys"] == base.SALTS_TRIED + salts.SALTS + 1  # in low bits, then in colours
         assert_refused(said[0], 3, "opens nothing here")
         for word in ("another key", "converted or quantised", "moved", "trained on"):
             assert word in said[0].err
