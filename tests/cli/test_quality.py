@@ -21,7 +21,7 @@ def test_below_the_limit_nothing_is_published_and_a_lower_limit_needs_no_trainin
     said = keyss(*hide, "--min-psnr", 90)
     assert said.status == 7
     assert "below 90 dB: nothing was published; a lower --min-psnr" in said.err
-    assert "--resume skips the training" in said.err
+    assert "--resume skips finished training" in said.err
     assert {path.name for path in (tmp_path / "run").iterdir()} == {"private"}
     said = keyss(*hide, "--min-psnr", 0, "--resume")
     assert said.status == 0

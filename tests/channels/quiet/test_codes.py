@@ -101,7 +101,7 @@ def test_nothing_else_changes(suffix: str) -> None:
 @EVERY
 def test_every_bit_that_may_change_is_written(suffix: str) -> None:
     """Each of them is 0 in half of the files and 1 in the others, however short the payload is."""
-    cover = CodesCover.of(codes_of(suffix, 3000))
+    cover = CodesCover.of(codes_of(suffix, 600))
     reads = np.stack([bits_of(written(cover, b"data", entropy=bytes([i]) * 32)) for i in range(64)])
     dry = cover.dry.astype(bool)
     assert 0.8 < dry.mean() < 1
