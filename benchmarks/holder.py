@@ -33,8 +33,8 @@ from channels.quiet.trained_like import keys
 from keyss.core import UsageError
 from keyss.lab import stealth_statistics
 from keyss.methods import most_visible
-from lab.stealth.detectors import Examples, learned_detectors, single_detectors
 from methods.carry import carried
+from stealth_detection import Examples, learned_detectors, single_detectors
 
 MAX_OTHERS = 3
 SHARE = 8  # secrets have at most 1 / SHARE of the cover's Gaussians

@@ -42,9 +42,9 @@ from keyss.core import Gaussians, UsageError
 from keyss.lab import candidate_scores, stealth_statistics
 from keyss.methods.carry.options import CarryOptions
 from keyss.methods.carry.room import RecordRoom
-from lab.stealth.detectors import Detection, Examples, confirmed, learned_detectors, single_detectors
-from lab.stealth.predictor import BitPredictor, sample
 from methods.carry import carried
+from stealth_detection import Detection, Examples, confirmed, learned_detectors, single_detectors
+from stealth_predictor import BitPredictor, sample
 
 PART_SIZES = (2000, 5000)
 PAYLOAD_BYTES = 4000

@@ -40,6 +40,16 @@ def test_stages_and_sizes_of_a_run_from_photos(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_bound_has_a_stage_where_one_is_fitted() -> None:
+    secret = Secret(tiny_scene(1), KEY)
+    for bound, steps in ((False, []), (True, [150])):
+        options = CarryOptions(fit=FIT, iterations=90, publish="any", refit="always")
+        plan = keyss.hide(tiny_scene(0), [secret], method=options, bound=bound, dry_run=True).plan
+        stages = [stage for stage in plan.stages if stage.name.startswith("upper bound")]
+        assert [stage.steps for stage in stages] == steps
+        assert {stage.name for stage in stages} <= {"upper bound of the secret"}
+
+
 def test_the_capacity_is_the_number_of_hidden_gaussians(tmp_path: Path) -> None:
     cover, secret = trained_like(2500), trained_like(6000, 2)
     plan = keyss.hide(

@@ -98,7 +98,7 @@ def convert(
 
 
 def _size_left(model: Gaussians, key: str, device: torch.device) -> int:
-    """Size of what a key opens in a converted model, in Gaussians or bytes."""
+    """Gaussians or bytes of the secret that survived the conversion; 0 if none did."""
     try:
         return reveal_any(model, key, device).remains.found
     except (WrongKeyError, InputError, UsageError):

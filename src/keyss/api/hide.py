@@ -129,11 +129,11 @@ def hide(
     ]
     check_room(needs_of_hiding(options, sources), place)
     if dry_run:
-        return HideResult(plan=plan_hiding(chosen, options, sources, target, place))
+        return HideResult(plan=plan_hiding(chosen, options, sources, target, place, bound=bound))
 
     with folder.work() if folder else nullcontext():
         if reporter and not resume and (options.place.grows or (trains and worth_planning(options.fit))):
-            plan = plan_hiding(chosen, options, sources, target, place)
+            plan = plan_hiding(chosen, options, sources, target, place, bound=bound)
             for line in (f"hide: {in_a_line(plan)}", *plan.notes):
                 reporter.note(line)
         context = Context(target, folder.checkpoints if folder and trains else None, resume, reporter)

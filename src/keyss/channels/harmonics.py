@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from keyss.channels.quiet.bits import identities
 from keyss.channels.quiet.cells import CellCipher
-from keyss.core.arrays import Bytes, Doubles, Flags
+from keyss.core.arrays import Bytes, Doubles, Flags, doubles
 from keyss.core.errors import InputError
 from keyss.core.gaussians import Gaussians
 
@@ -24,11 +24,6 @@ KEPT_DEGREE = 1
 # Probabilities of the quantiles that describe a distribution; close to each other at the ends.
 RANKS = np.concatenate([[0.0], 1 / (1 + np.exp(-np.linspace(-7, 7, 31))), [1.0]])
 _ROUNDING = 1e-10  # share of a row's squares that rounding alone leaves in directions without anything
-
-
-def doubles(tensor: Tensor) -> Doubles:
-    """A tensor of any device as an array of the same shape."""
-    return tensor.detach().cpu().double().numpy()
 
 
 def harmonics_above(sh_degree: int) -> int:

@@ -167,7 +167,7 @@ def _hide_scenes(args: HideArguments, cover: Path) -> None:
 
     method = registry.get(args.method)
     options, secrets = _method_options(args), _secrets(args, method)
-    idle = _idle_without_training(args, cover)
+    idle = _ignored_training_flags(args, cover)
     if idle and not options.may_train:
         raise UsageError(
             f"{idle}: nothing is trained, as models of all scenes are given and --method {options.method} "
@@ -250,7 +250,7 @@ def _keys(args: HideArguments, count: int) -> list[str]:
     return found
 
 
-def _idle_without_training(args: HideArguments, cover: Path) -> str:
+def _ignored_training_flags(args: HideArguments, cover: Path) -> str:
     """The given options that only affect training, if all scenes are models; otherwise empty."""
     from keyss.rendering.orbit import is_model
 

@@ -19,7 +19,7 @@ from keyss.core.scene import Scene
 from keyss.fitting.config import FitConfig
 from keyss.fitting.losses import Targets
 from keyss.methods.base import Method, MethodOptions, Plan, Source, Stage, role_of
-from keyss.methods.plain_models import plain_stage
+from keyss.methods.plain_models import Bound, plain_stage
 from keyss.progress import about
 
 _LONG = 1000  # steps
@@ -37,23 +37,32 @@ def plan_hiding(
     sources: Sequence[Source],  # the cover, then the secrets, loaded at least with their test images
     device: torch.device,
     out: Path | None,
+    *,
+    bound: bool = False,  # also fit the upper bounds
 ) -> Plan:
-    """The plan of a hiding, without upper bounds. Writes nothing."""
+    """The plan of a hiding. Writes nothing."""
     plan, count = method.plan(sources, options), len(sources)
     scenes, sizes = [source.scene for source in sources], _sizes(options, sources)
-    steps = [_step(device, size, scene) for size, scene in zip(sizes, scenes, strict=True)]
-    stages = [
-        Stage(plain_stage(role_of(index, count)), config.iterations, size, config.iterations * step)
-        for index, (config, size, step) in enumerate(zip(options.fits(count), sizes, steps, strict=True))
-        if sources[index].given is None
-    ]
+    renders = [_step(device, size, scene) for size, scene in zip(sizes, scenes, strict=True)]
+    steps = [options.fit.views_per_step * each for each in renders]
+    stages, bounds = [], []
+    for index, (source, config, training) in enumerate(
+        zip(sources, options.fits(count), options.training(count), strict=True)
+    ):
+        role, size, step = role_of(index, count), sizes[index], steps[index]
+        own = config.iterations if source.given is None else None
+        if own is not None:
+            stages.append(Stage(plain_stage(role), own, size, own * step))
+        longer = Bound.of(training, own)
+        if bound and source.photos and not longer.equal and longer.steps is not None:
+            bounds.append(Stage(f"upper bound of the {role}", longer.steps, size, longer.steps * step))
     if plan.steps:
         rendered = zip(plan.rendered, scenes, strict=True)
-        step = sum(_step(device, size, scene) for size, scene in rendered if size)
+        step = options.fit.views_per_step * sum(_step(device, *each) for each in rendered if each[0])
         stages.append(Stage("hiding", plan.steps, sum(plan.rendered), plan.steps * step))
-    measuring = sum(_RENDERS * len(scene.test) * step for scene, step in zip(scenes, steps, strict=True))
+    measuring = sum(_RENDERS * len(scene.test) * each for scene, each in zip(scenes, renders, strict=True))
     measuring += _KEY_SECONDS * (count - 1)
-    stages.append(Stage("encrypting, opening, measuring", 0, plan.gaussians, measuring))
+    stages += [*bounds, Stage("encrypting, opening, measuring", 0, plan.gaussians, measuring)]
     needs = needs_of_hiding(options, sources)
     return replace(
         plan,
@@ -99,7 +108,7 @@ def needs_of_hiding(options: MethodOptions, sources: Sequence[Source]) -> Needs:
     trained = sum(size for size, each in zip(sizes, fitted, strict=True) if each)
     appended = _MAX_APPENDED * sum(sizes[1:]) if options.place.grows else 0
     published = max(sizes[0], fit.max_gaussians if options.trains else 0) + appended
-    photos = [source.scene for source in sources if source.photos and trained]
+    photos = [source.scene for source in sources if trained]
     return _needs(published, published + sum(sizes), trained, degree, photos)
 
 
@@ -152,10 +161,11 @@ def check_room(needs: Needs, out: Path | None) -> None:
 def _available_memory() -> int:
     """Bytes available on the machine and in its container (Linux, cgroup 2)."""
     available: int = psutil.virtual_memory().available
-    with suppress(OSError, ValueError):  # "max" without a limit
+    with suppress(OSError, ValueError, KeyError):  # "max" without a limit
         group = Path("/sys/fs/cgroup")
         limit, used = (int((group / f"memory.{name}").read_text()) for name in ("max", "current"))
-        available = min(available, limit - used)
+        cached = dict(line.split() for line in (group / "memory.stat").read_text().splitlines())
+        available = min(available, limit - used + int(cached["inactive_file"]))
     return available
 
 

@@ -118,9 +118,9 @@ class LowBitsRoom:
                 "needed"
             )
         plans = [plan for plan in map(self._alone, requests) if plan is not None]
-        return plans if self.lie_as_alone(plans, requests) else self._tight(requests)
+        return plans if self.is_independent_layout(plans, requests) else self._tight(requests)
 
-    def lie_as_alone(self, plans: Sequence[RecordPlan], requests: Sequence[RecordRequest]) -> bool:
+    def is_independent_layout(self, plans: Sequence[RecordPlan], requests: Sequence[RecordRequest]) -> bool:
         """True if each secret's records are placed as they would be without the others."""
         if list(map(self._alone, requests)) != list(plans):
             return False

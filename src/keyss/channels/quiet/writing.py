@@ -82,7 +82,7 @@ class Writer:
             requests = [
                 RecordRequest(len(each.records), each.records.shape[1], len(each.header)) for each in records
             ]
-            as_alone = self._room.lie_as_alone([each.plan for each in records], requests)
+            as_alone = self._room.is_independent_layout([each.plan for each in records], requests)
         service = PAYLOAD if payloads else RECORDS
         for index, ((keys, _), each) in enumerate(zip(contents, records, strict=True)):
             self.headers = self._header(self.headers, index, keys, each, service)

@@ -22,14 +22,13 @@ from torch import Tensor, nn
 from keyss.channels.harmonics import (
     RANKS,
     Harmonics,
-    doubles,
     harmonics_above,
     high_harmonics,
     increasing,
     pads,
     row_names,
 )
-from keyss.core.arrays import Bytes, Doubles, Flags
+from keyss.core.arrays import Bytes, Doubles, Flags, doubles
 from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.keys.derivation import expand

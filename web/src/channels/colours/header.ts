@@ -77,16 +77,17 @@ function readAt(depth: number, { fixed, salted }: Secrets, carriers: Carriers, p
   });
   const seeds = Uint32Array.from(words);
   const agreement = new Float64Array(odds.length);
-  for (let attempt = 0; attempt < TRIES; attempt++) {
+  let header: Header | null = null;
+  for (let attempt = 0; attempt < TRIES; attempt++) { // all of them, so that a right key takes as long as a wrong one
     const trust = odds.map((each, salt) => 1 / (1 + Math.exp(-each - DECODED * agreement[salt])));
     const decoded = CODE.decode(seeds, hints.map((hint, at) => hint * trust[owners[at]]));
     const data = packBits(decoded);
     const check = hmac(sha256, expand(fixed, 'colours/check', 32), data.subarray(0, PLAIN_BYTES));
-    if (data.subarray(PLAIN_BYTES).every((each, at) => each === check[at])) return unpacked(fixed, data);
+    if (!header && data.subarray(PLAIN_BYTES).every((each, at) => each === check[at])) header = unpacked(fixed, data);
     agreement.fill(0);
     CODE.encode(decoded, seeds).forEach((bit, at) => (agreement[owners[at]] += Math.log1p(bit ? -hints[at] : hints[at])));
   }
-  return null;
+  return header;
 }
 
 function unpacked(fixed: Uint8Array, data: Uint8Array): Header {

@@ -10,12 +10,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
-from scipy.spatial import cKDTree
-
 from keyss.core import Gaussians
 from keyss.core.arrays import Doubles, Flags, Integers, Words32
 from keyss.lab.stealth.statistic import NOTHING, BitPatterns, Statistic, normal, ulps
+
+import numpy as np
+from scipy.spatial import cKDTree
 
 LOWEST, HIGHEST = 1, 13  # predicted bits, those that embedding may replace
 UNCHANGED_ATTRIBUTES = (0, 4)  # positions and constant colours

@@ -9,9 +9,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-import numpy as np
-
 from keyss.core.arrays import Doubles, Integers
+
+import numpy as np
 
 _DRAWS = 300  # bootstrap samples
 _EXCHANGES = 100
