@@ -32,7 +32,7 @@ INTERNAL_ERROR = 70  # EX_SOFTWARE
 NO_ROOM = OutputError.exit_status
 _LEVELS = {"-q": -1, "--quiet": -1, "-v": 1, "--verbose": 1}
 _KEY_OPTIONS = ("-k", "-p", "--key", "--keys", "--password", "--passphrase")  # options that people may expect
-# Between backticks: `overwrite=True`, `method="carry", dither=True`, `sh_degree`.
+# Between backticks: `overwrite=True`, `method="carry", refit="never"`, `sh_degree`.
 _VALUE = r"""(?:"[^"`]*"|'[^'`]*'|[\w.+-]+)"""
 _ASSIGNMENT = rf"([A-Za-z_]\w*)=({_VALUE})"
 _ASSIGNMENTS = re.compile(rf"`({_ASSIGNMENT}(?:, ?{_ASSIGNMENT})*)`")
