@@ -35,7 +35,6 @@ from keyss.methods.registry import DEFAULT, open_handed, open_model
 from keyss.progress import Reporter
 from keyss.rendering import Backend, resolve_device
 from keyss.rendering.orbit import is_model
-from keyss.runs.config import FitMetrics, HideMetrics, RunConfig, secret_ids
 from keyss.runs.files import (
     CONFIG,
     METRICS,
@@ -51,8 +50,9 @@ from keyss.runs.files import (
     stego_name,
 )
 from keyss.runs.folder import RunFolder
+from keyss.runs.json_records import read_record, record_bytes
 from keyss.runs.planning import check_room, in_a_line, needs_of_hiding, plan_hiding, worth_planning
-from keyss.runs.records import read_record, record_bytes
+from keyss.runs.run_records import FitMetrics, HideMetrics, RunConfig, secret_ids
 
 
 def hide(
