@@ -18,8 +18,7 @@ from files.scene_files import frames, photo, write_json, write_nerfstudio
 from keyss.core import InputError
 from keyss.files import load_scene
 from keyss.files.lens import undistortion
-from keyss.files.ply_table import read_point_cloud
-from keyss.files.transforms import read_nerfstudio
+from keyss.files.transforms import read_nerfstudio, read_point_cloud
 
 FRAMES = [f"images/frame_{i:05}.png" for i in range(10)]
 

@@ -223,9 +223,15 @@ BROKEN = {
     "list before": (header_of("element a 1", "property list uchar int f", *XYZ), "list property"),
     "point cloud": (header_of(*XYZ) + bytes(12), "point cloud, not a 3DGS model.*missing: f_dc_0"),
     "compressed": (header_of("element vertex 1", "property uint packed_position"), "compressed"),
-    "no model": (header_of("element vertex 1", "property float u"), "not a 3DGS model.*missing: x, y, z"),
-    "odd f_rest": (header_of(*XYZ, "property float f_rest_0"), "0, 9, 24 or 45"),
-    "gap in f_rest": (header_of(*XYZ, *(f"property float f_rest_{i + 1}" for i in range(9))), "0, 9, 24"),
+    "no model": (
+        header_of("element vertex 1", "property float u") + bytes(4),
+        "not a 3DGS model.*missing: x, y, z",
+    ),
+    "odd f_rest": (header_of(*XYZ, "property float f_rest_0") + bytes(16), "0, 9, 24 or 45"),
+    "gap in f_rest": (
+        header_of(*XYZ, *(f"property float f_rest_{i + 1}" for i in range(9))) + bytes(48),
+        "0, 9, 24",
+    ),
     "negative": (header_of("element vertex -1"), "cannot parse line"),
     "fraction": (header_of("element vertex 1.5"), "cannot parse line"),
     "underscore": (header_of("element vertex 1_0"), "cannot parse line"),

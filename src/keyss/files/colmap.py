@@ -22,7 +22,9 @@ from scipy.spatial.transform import Rotation
 
 from keyss.core.arrays import Doubles, Numbers
 from keyss.core.errors import InputError, KeyssWarning
-from keyss.files.layout import (
+from keyss.files.inputs import open_input, read_file, read_text
+from keyss.files.lens import Lens, make_lens
+from keyss.files.scene_layout import (
     MAX_COORDINATE,
     NO_POINTS,
     FileFinder,
@@ -34,8 +36,6 @@ from keyss.files.layout import (
     leave_out_missing,
     refuse_duplicates,
 )
-from keyss.files.lens import Lens, make_lens
-from keyss.files.reading import open_input, read_file, read_text
 
 # Folders of the sparse model, best first; the last is that of Nerfstudio's scenes.
 MODEL_PLACES = ("sparse/0", "sparse", ".", "colmap/sparse/0")

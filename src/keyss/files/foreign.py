@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from keyss.core.errors import BackendError
-from keyss.files.reading import open_input
+from keyss.files.inputs import open_input
 
 CONVERT = "convert it to .ply first, e.g. with `splat-transform IN OUT.ply`"
 _MODEL = "give it where a model is asked for"

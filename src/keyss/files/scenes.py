@@ -20,8 +20,8 @@ from keyss.core.scene import NEAR, ORDINARY_EXTENT, Camera, Scene, View, checked
 from keyss.files.colmap import MODEL_PLACES, colmap_model_folder, read_colmap
 from keyss.files.foreign import what_it_is
 from keyss.files.images import is_turned, probe_image, read_image, read_mask, shrink
-from keyss.files.layout import Photo, SceneLayout
 from keyss.files.lens import Lens, Undistortion, undistortion
+from keyss.files.scene_layout import Photo, SceneLayout
 from keyss.files.trained import kind_of_folder
 from keyss.files.transforms import read_blender, read_nerfstudio
 

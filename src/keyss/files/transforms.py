@@ -16,23 +16,25 @@ import numpy as np
 from keyss.core.arrays import Doubles
 from keyss.core.errors import InputError, KeyssWarning
 from keyss.files.images import probe_image
-from keyss.files.layout import (
+from keyss.files.inputs import open_input, read_text
+from keyss.files.lens import Lens, make_lens
+from keyss.files.ply_table import columns, read_vertices
+from keyss.files.scene_layout import (
     MAX_COORDINATE,
     FileFinder,
     Photo,
+    PointCloud,
     SceneLayout,
     hold_out,
     leave_out_broken,
     leave_out_missing,
     refuse_duplicates,
 )
-from keyss.files.lens import Lens, make_lens
-from keyss.files.ply_table import read_point_cloud
-from keyss.files.reading import read_text
 
 _MAX_JSON_BYTES = 256 * 2**20
 _EXTENSIONS = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG", ".webp")
 _PERSPECTIVE = ("OPENCV", "FULL_OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
+_RGB, _GREY = ("red", "green", "blue"), 128  # the colour of points without any
 _COEFFICIENTS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 
 _Row = tuple[float, float, float, float]
@@ -115,6 +117,26 @@ def read_nerfstudio(folder: Path, *, skip_missing: bool = False) -> SceneLayout:
     if posed.meta.ply_file_path is None:
         return SceneLayout(train, test)
     return SceneLayout(train, test, read_point_cloud(folder / _inside(path, posed.meta.ply_file_path)))
+
+
+def read_point_cloud(path: Path) -> PointCloud:
+    """The points of a PLY with `x y z` and, optionally, `red green blue` (uchar), else grey.
+
+    Raises InputError if the file is not such a PLY, is truncated or holds coordinates that are not finite.
+    """
+    with open_input(path) as file:
+        vertices = read_vertices(file)
+        names = vertices.dtype.names or ()
+        if missing := {"x", "y", "z"} - set(names):
+            raise InputError(f"expected vertices with x, y and z, found no {sorted(missing)}")
+        colors = {name: str(vertices.dtype[name]) for name in _RGB if name in names}
+        if list(colors.values()) not in ([], ["uint8"] * 3):
+            raise InputError(f"expected red, green and blue of type uchar, found {colors}")
+        xyz, rgb = [np.empty((0, 3))], [np.empty((0, 3), np.uint8)]
+        for table in vertices.blocks:
+            xyz.append(columns(table, ("x", "y", "z"), np.float64))
+            rgb.append(columns(table, _RGB, np.uint8) if colors else np.full_like(xyz[-1], _GREY, np.uint8))
+    return PointCloud.checked(path, np.concatenate(xyz), np.concatenate(rgb))
 
 
 def _read(path: Path, skip_missing: bool) -> _Posed:

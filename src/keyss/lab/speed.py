@@ -16,8 +16,8 @@ from keyss.core.errors import BackendError, KeyssError
 from keyss.core.gaussians import Gaussians
 from keyss.core.picture_network import DecodedGaussians
 from keyss.core.scene import Scene
+from keyss.files.formats.common import CodedGaussians
 from keyss.files.models import DECODED_SUFFIX, read_model, write_model
-from keyss.files.ply_rows import is_compressed
 from keyss.fitting.image_metrics import subsample_views
 from keyss.lab.robustness.survival import Opener, find_package, reveal_changed, transform
 from keyss.rendering import render
@@ -123,10 +123,10 @@ def readers(path: Path) -> list[ReaderResult]:
     if path.name.endswith(DECODED_SUFFIX):
         note = "a network renders it: it is not a 3DGS model"
         return [ReaderResult(name, False, note=note) for name in programs]
-    if path.suffix != ".ply" or is_compressed(path):
+    expected = read_model(path)
+    if path.suffix != ".ply" or isinstance(expected, CodedGaussians):
         note = "only a .ply of floats stores every number exactly"
         return [ReaderResult(name, None, note=note) for name in programs]
-    expected = read_model(path)
     results: list[ReaderResult] = []
     with tempfile.TemporaryDirectory() as folder:
         for name, copied in programs.items():

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from keyss.core.errors import InputError
 from keyss.files.foreign import what_it_is
-from keyss.files.reading import is_standard
+from keyss.files.inputs import is_standard, open_input
 
 if TYPE_CHECKING:
     from keyss.runs.run_records import FitMetrics, HideMetrics
@@ -129,15 +129,19 @@ def _model_info(path: Path) -> ModelInfo:
 
 def _ply_rows(path: Path) -> tuple[Any, Any, int] | None:
     """Means, opacity logits and SH degree of a plain PLY file, without torch; None for other files."""
-    from keyss.files.ply_rows import is_compressed, read_rows
+    import numpy as np
 
-    if path.suffix.lower() != ".ply" or is_compressed(path):
+    from keyss.files.ply_rows import has_packed_header, read_rows
+
+    if path.suffix.lower() != ".ply":
         return None
-    with path.open("rb") as file:
-        if file.read(3) != b"ply":
+    with open_input(path) as file:
+        if has_packed_header(file) or file.read(3) != b"ply":
             return None
-    names, rows = read_rows(path)
-    return rows[:, :3], rows[:, names.index("opacity")], round(((len(names) - 11) // 3) ** 0.5) - 1
+        file.seek(0)
+        model = read_rows(file)
+        rows = np.concatenate([rows[:, [0, 1, 2, -8]] for rows, _ in model.blocks])
+    return rows[:, :3], rows[:, 3], round(((len(model.names) - 11) // 3) ** 0.5) - 1
 
 
 def _round(values: Iterable[Any]) -> tuple[float, ...]:

@@ -20,8 +20,8 @@ from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
 from keyss.files.atomic import write_bytes
 from keyss.files.images import picture_names, png_bytes
+from keyss.files.inputs import read_file
 from keyss.files.models import read_model
-from keyss.files.reading import read_file
 from keyss.fitting.config import FitConfig
 from keyss.fitting.plain import fit_scene
 from keyss.lab.audits.numbers import numbered

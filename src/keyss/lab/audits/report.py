@@ -18,7 +18,7 @@ from markupsafe import Markup
 
 from keyss.core import InputError, import_extra
 from keyss.files.images import probe_image
-from keyss.files.reading import read_file
+from keyss.files.inputs import read_file
 from keyss.lab.audits import numbers
 from keyss.lab.audits.parts import OF_3DGS_MODELS
 from keyss.lab.audits.record import AUDIT_FOLDER, Audit, ModelImages

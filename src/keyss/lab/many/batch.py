@@ -33,7 +33,7 @@ from keyss.api.hide_files import SecretFile, hide_files
 from keyss.core import InputError, KeyssWarning, ViewOptions
 from keyss.core.errors import did_you_mean
 from keyss.files import write_bytes
-from keyss.files.reading import read_text
+from keyss.files.inputs import read_text
 from keyss.keys import MasterKey, read_key
 from keyss.lab.many.cell import changed_since
 from keyss.lab.many.cell_folder import ManyResult, Outcome, check_master_key

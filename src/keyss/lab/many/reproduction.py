@@ -14,7 +14,7 @@ from typing import Any
 from keyss.core import UsageError, ViewOptions
 from keyss.core.errors import did_you_mean
 from keyss.files import write_bytes
-from keyss.files.benchmark_scenes import BENCHMARK, download_scenes, link_scene
+from keyss.lab.many.benchmark_scenes import BENCHMARK, download_scenes, link_scene
 from keyss.lab.many.cell_folder import CellFolder, Forecast
 from keyss.lab.many.option_changes import with_changes
 from keyss.lab.many.paper import PAPER, Group, Reproduction, Run, figure_rows, judge_claim, reproduction_text

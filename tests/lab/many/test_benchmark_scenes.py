@@ -13,7 +13,7 @@ import pytest
 from files.scene_files import WIDTH, photo, save, write_colmap
 from keyss import load_scene
 from keyss.core import BackendError, InputError
-from keyss.files import benchmark_scenes
+from keyss.lab.many import benchmark_scenes
 from serving import serving
 
 SHRUNK = WIDTH // 4
