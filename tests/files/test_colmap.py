@@ -210,7 +210,7 @@ def test_of_several_models_the_one_with_most_photos_is_used(tmp_path: Path, plac
     write_colmap(tmp_path, 2, model=f"{place}/0")
     write_colmap(tmp_path, 5, model=f"{place}/1")
     write_colmap(tmp_path, 3, model=f"{place}/10")
-    said = rf"there are 3 sparse models; the one with most photos is used, {place}/1 \(5 photos\)"
+    said = rf"there are 3 sparse models; using the one with most photos, {place}/1 \(5 photos\)"
     with pytest.warns(KeyssWarning, match=said):
         scene = load_scene(tmp_path)
     assert len(scene.views) == 5

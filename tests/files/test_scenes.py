@@ -127,7 +127,7 @@ def test_missing_photos_are_refused_or_left_out(tmp_path: Path, layout: str) -> 
     message = f"2 of 10 photos are missing: {gone[0]}, {gone[1]}; .*`skip_missing=True`"
     with pytest.raises(InputError, match=message):
         load_scene(tmp_path)
-    with pytest.warns(KeyssWarning, match=f"2 of 10 photos are missing and left out: {gone[0]}, {gone[1]}$"):
+    with pytest.warns(KeyssWarning, match=f"2 of 10 photos are missing, left out: {gone[0]}, {gone[1]}$"):
         left = load_scene(tmp_path, skip_missing=True)
     names = {view.camera.name for view in left.views}
     assert not names & {train[0].camera.name, train[-1].camera.name}
@@ -146,7 +146,7 @@ def test_a_scene_without_any_photo_is_refused_in_any_case(tmp_path: Path, layout
         path.unlink()
     with pytest.raises(InputError, match=r"7 of 7 photos are missing: .* and 2 more; `skip"):
         load_scene(tmp_path)
-    with pytest.raises(InputError, match="all of its 7 photos are missing"):
+    with pytest.raises(InputError, match="7 of 7 photos are missing.* and 2 more$"):
         load_scene(tmp_path, skip_missing=True)
 
 

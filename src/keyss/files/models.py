@@ -20,7 +20,7 @@ from keyss.core.errors import InputError, OutputError, UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.picture_network import DecodedGaussians
 from keyss.files.atomic import atomic_write, check_not_an_input, check_output_file
-from keyss.files.foreign import START_BYTES, is_foreign_zip, kind_of
+from keyss.files.file_kinds import START_BYTES, identify_content, is_foreign_zip
 from keyss.files.formats import ply
 from keyss.files.inputs import (
     MAX_BYTES,
@@ -31,7 +31,7 @@ from keyss.files.inputs import (
     write_standard_output,
 )
 from keyss.files.ply_rows import has_packed_header
-from keyss.files.trained import is_training, kind_of_folder, model_file
+from keyss.files.training_outputs import identify_folder, is_training, model_file
 
 DECODED_SUFFIX = ".3dgs.safetensors"  # of models that a network decodes
 _PACKED = "compressed_ply:CompressedPlyCodes"
@@ -119,7 +119,7 @@ def read_model(path: Path | str) -> Gaussians:
         return model_of_bytes("standard input", read_standard_input())
     path = model_file(path)
     if os.path.isdir(path):
-        found = kind_of_folder(path) or "a folder"
+        found = identify_folder(path) or "a folder"
         raise InputError(f"{path}: expected the file of a 3DGS model ({known_suffixes()}), found {found}")
     if not os.path.isfile(path):
         raise InputError(f"{path}: expected a 3DGS model ({known_suffixes()}), but there is no such file")
@@ -222,7 +222,7 @@ def _read(file: BinaryIO, name: str) -> Gaussians:
     if named in fitting or (named and start and not named.magic and not fitting):
         return named.read(file)
     if not fitting:
-        raise InputError(f"expected a 3DGS model ({known_suffixes()}), found {kind_of(name, start)}")
+        raise InputError(f"expected a 3DGS model ({known_suffixes()}), found {identify_content(name, start)}")
     found = fitting[-1]
     if named is not None:
         raise InputError(

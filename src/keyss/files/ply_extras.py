@@ -15,7 +15,7 @@ from keyss.core.errors import InputError, KeyssWarning
 from keyss.core.gaussians import Gaussians
 from keyss.files.inputs import open_input
 from keyss.files.ply_rows import has_packed_header, read_rows
-from keyss.files.trained import model_file
+from keyss.files.training_outputs import model_file
 
 NORMALS = ("nx", "ny", "nz")
 _MAX_MOVED = 0.01  # distance by which hiding moves Gaussians, relative to the model's standard deviation

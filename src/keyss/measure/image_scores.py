@@ -15,7 +15,7 @@ from torch import Tensor
 
 from keyss.core import Gaussians, InputError, KeyssError, Scene, View
 from keyss.core.arrays import Bytes, Doubles, Flags
-from keyss.files.images import picture_names
+from keyss.files.images import png_names
 from keyss.fitting.image_metrics import psnr, subsample_views
 from keyss.fitting.lpips import lpips_alex
 from keyss.rendering import render
@@ -110,13 +110,13 @@ def select_views(views: Sequence[View]) -> list[View]:
 
 def photos_of(views: Sequence[View]) -> list[tuple[str, Tensor]]:
     """Names and uint8 photos [H, W, 3] of views, in the form of `renders_of`."""
-    names = picture_names(view.camera for view in views)
+    names = png_names(view.camera for view in views)
     return [(name, view.image) for name, view in zip(names, views, strict=True)]
 
 
 def masks_of(views: Sequence[View]) -> dict[str, Tensor]:
     """The masks of views that have one, by the names of `photos_of`."""
-    named = zip(picture_names(view.camera for view in views), views, strict=True)
+    named = zip(png_names(view.camera for view in views), views, strict=True)
     return {name: view.mask for name, view in named if view.mask is not None}
 
 
@@ -124,7 +124,7 @@ def masks_of(views: Sequence[View]) -> dict[str, Tensor]:
 def renders_of(model: Gaussians, scene: Scene, views: Sequence[View]) -> list[tuple[str, Tensor]]:
     """Names and uint8 renders [H, W, 3], on the CPU, of a model from the cameras of a scene's views."""
     background, renders = scene.background.to(model.device), []
-    names = picture_names(view.camera for view in views)
+    names = png_names(view.camera for view in views)
     for name, view in zip(names, views, strict=True):
         image = render(model, view.camera, background).clamp(0, 1)
         renders.append((name, (image * 255).round().to(torch.uint8).cpu()))

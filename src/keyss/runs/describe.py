@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from keyss.core.errors import InputError
-from keyss.files.foreign import what_it_is
+from keyss.files.file_kinds import identify_file
 from keyss.files.inputs import is_standard, open_input
 
 if TYPE_CHECKING:
@@ -73,7 +73,7 @@ def info(path: str | Path) -> RunInfo | ModelInfo | SceneInfo:
 
 def _folder_info(path: Path) -> RunInfo | ModelInfo | SceneInfo:
     from keyss.files.scenes import load_scene
-    from keyss.files.trained import is_training, model_file
+    from keyss.files.training_outputs import is_training, model_file
     from keyss.runs.files import METRICS, MODEL, is_run, stego_in
     from keyss.runs.json_records import read_record
     from keyss.runs.run_records import FitMetrics, HideMetrics
@@ -112,7 +112,7 @@ def _model_info(path: Path) -> ModelInfo:
         if not (is_standard(path) or is_model_path(path)):
             raise InputError(
                 f"{path}: expected a model ({known_suffixes()}), a scene folder or a result folder, found "
-                f"{what_it_is(path)}"
+                f"{identify_file(path)}"
             )
         model = read_model(path)
         means, logits, sh_degree = model.means.numpy(), model.opacity_logits.numpy(), model.sh_degree

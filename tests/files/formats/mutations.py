@@ -5,7 +5,7 @@
     python tests/files/formats/mutations.py --count 10000 --only a.payload   # written by an attacker
 
 Files of every format are damaged at random, before and after packing: bits, bytes, words with extreme values,
-cuts, repeats, megabytes of zeros; every other file declares false sizes (`lies.py`). Failures are printed
+cuts, repeats, megabytes of zeros; every other file declares false sizes (`false_sizes.py`). Failures are printed
 with the seed that repeats them.
 """
 
@@ -30,7 +30,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 import numpy as np
 import torch
 
-from files.formats.lies import LIES, image
+from files.formats.false_sizes import LIES, image
 from keyss.core import Gaussians, InputError
 from keyss.core.picture_network import DecodedGaussians, PictureNetwork
 from keyss.files import load_scene, model_bytes, model_of_bytes

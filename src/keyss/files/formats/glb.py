@@ -26,7 +26,7 @@ from keyss.core.arrays import Doubles, Numbers
 from keyss.core.errors import InputError
 from keyss.core.gaussians import Gaussians
 from keyss.core.similarity import Similarity
-from keyss.files.foreign import FIT
+from keyss.files.file_kinds import FIT
 from keyss.files.formats.common import (
     arrays_of,
     colour_bytes,

@@ -19,7 +19,7 @@ from keyss.core.errors import InputError, UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
 from keyss.files.atomic import write_bytes
-from keyss.files.images import picture_names, png_bytes
+from keyss.files.images import png_bytes, png_names
 from keyss.files.inputs import read_file
 from keyss.files.models import read_model
 from keyss.fitting.config import FitConfig
@@ -266,7 +266,7 @@ def stegexpose(subject: AuditSubject, seed: int, progress: PartProgress) -> Part
     plain, stego, control = (
         [image.numpy() for _, image in renders_of(model, cover, views)] for model in models
     )
-    names = tuple(picture_names(view.camera for view in views))
+    names = tuple(png_names(view.camera for view in views))
     progress(0, 2)
     auc = stegexpose_auc(plain, stego)
     progress(1, 2)

@@ -21,7 +21,7 @@ from types import ModuleType
 from keyss.core.errors import BackendError, InputError, KeyssError, UsageError, WrongKeyError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
-from keyss.files.foreign import find_splat_transform
+from keyss.files.file_kinds import find_splat_transform
 from keyss.files.models import read_model, write_model
 from keyss.fitting.image_metrics import mean_psnr, subsample_views
 from keyss.lab.robustness import changes as change

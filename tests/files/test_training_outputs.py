@@ -35,7 +35,7 @@ def test_the_latest_model_is_used_and_said(tmp_path: Path, program: str) -> None
         models.append(random_gaussians(20 + seed, seed))
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         write_model(folder / name, models[-1])
-    said = f"run: a folder of a training; its model is {FOLDERS[program][-1]}$"
+    said = f"run: output of a training; its model is {FOLDERS[program][-1]}$"
     assert is_model(folder)
     with pytest.warns(KeyssWarning, match=said):
         assert same_bits(read_model(folder), models[-1])
