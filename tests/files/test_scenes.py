@@ -146,7 +146,7 @@ def test_a_scene_without_any_photo_is_refused_in_any_case(tmp_path: Path, layout
         path.unlink()
     with pytest.raises(InputError, match=r"7 of 7 photos are missing: .* and 2 more; `skip"):
         load_scene(tmp_path)
-    with pytest.raises(InputError, match="7 of 7 photos are missing.* and 2 more$"):
+    with pytest.raises(InputError, match=r"7 of 7 photos are missing: .* and 2 more$"):
         load_scene(tmp_path, skip_missing=True)
 
 

@@ -17,7 +17,7 @@ _CHUNK_BYTES = 1 << 20
 
 @contextmanager
 def open_input(path: Path) -> Iterator[BinaryIO]:
-    """Open a regular file. An OSError or InputError in the block becomes an InputError that names the file."""
+    """Open a regular file. OSErrors and InputErrors in the block become InputErrors that name the file."""
     try:
         if not path.is_file():  # opening a pipe could block forever
             raise InputError(f"expected a file, found {'a folder' if path.is_dir() else 'nothing'}")

@@ -4,9 +4,9 @@
     python tests/files/formats/mutations.py --count 10000 --lies             # only those that lie about sizes
     python tests/files/formats/mutations.py --count 10000 --only a.payload   # written by an attacker
 
-Files of every format are damaged at random, before and after packing: bits, bytes, words with extreme values,
-cuts, repeats, megabytes of zeros; every other file declares false sizes (`false_sizes.py`). Failures are printed
-with the seed that repeats them.
+Damages files of every format at random, before and after compression: bits, bytes, extreme words, cuts,
+repeats, megabytes of zeros; every other file declares false sizes (`false_sizes.py`). Prints failures with a
+seed to repeat them.
 """
 
 from __future__ import annotations
