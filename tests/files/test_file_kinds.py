@@ -82,7 +82,7 @@ READ = {"a.spz", "A.SPZ", "a.sog", "a.splat", "a.glb", "a.zip", "a", "b", "c", "
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_what_it_is_and_what_to_do(tmp_path: Path, name: str) -> None:
+def test_identify_file(tmp_path: Path, name: str) -> None:
     content, found = FILES[name]
     (tmp_path / name).write_bytes(content)
     assert identify_file(tmp_path / name).startswith(found)
@@ -98,6 +98,6 @@ def test_what_it_is_and_what_to_do(tmp_path: Path, name: str) -> None:
     assert f"), found {found}" in str(refused.value)
 
 
-def test_a_pipe_is_not_waited_for(tmp_path: Path) -> None:
+def test_pipes_do_not_block(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     assert identify_file(tmp_path / "pipe") == "neither a file nor a folder"

@@ -237,7 +237,7 @@ def _meshes(document: _Document) -> Iterator[tuple[Doubles, _Mesh]]:
             if node.mesh is not None:
                 yield here, document.meshes[node.mesh]
     except (IndexError, TypeError) as error:
-        raise InputError("damaged glTF: it names a part that is not there") from error
+        raise InputError("damaged glTF: it refers to a missing part") from error
 
 
 def _transform(node: _Node) -> Doubles:
@@ -287,13 +287,13 @@ def _gaussians(document: _Document, primitive: _Primitive, binary: bytes, room: 
 def _values(document: _Document, index: int, width: int, binary: bytes) -> Numbers:
     """[N, width] the values of an accessor into the binary chunk."""
     if not 0 <= index < len(document.accessors):
-        raise InputError("damaged glTF: it names an accessor that is not there")
+        raise InputError("damaged glTF: it refers to a missing accessor")
     accessor = document.accessors[index]
     code = _COMPONENTS.get(accessor.componentType)
     if accessor.sparse is not None or code is None or _WIDTHS.get(accessor.type) != width:
         raise InputError(f"damaged glTF: expected an accessor of {width} numbers each")
     if accessor.bufferView is None or not 0 <= accessor.bufferView < len(document.bufferViews):
-        raise InputError("damaged glTF: it names a buffer view that is not there")
+        raise InputError("damaged glTF: it refers to a missing buffer view")
     view = document.bufferViews[accessor.bufferView]
     if view.buffer != 0 or any("uri" in each for each in document.buffers[:1]):
         raise InputError("expected a .glb that contains its data, found one that refers to other files")
