@@ -186,7 +186,7 @@ def _hide_scenes(args: HideArguments, cover: Path) -> None:
         print_plan(plan)
         _warn_of_idle(idle, sum(stage.steps for stage in plan.stages))
         return
-    with reporting(args.out, cover, args.training) as reporter:
+    with reporting(cover, args.training.live) as reporter:
         result = keyss.hide(
             cover,
             secrets,
