@@ -1,4 +1,5 @@
 from .auc import Auc as Auc, auc_between as auc_between, delong as delong
+from .baselines.baseline_options import BaselineOptions as BaselineOptions
 from .distances import (
     AttributeDistance as AttributeDistance,
     against_controls as against_controls,
@@ -20,7 +21,6 @@ from .leaks.leak_scores import (
     leak_scores as leak_scores,
     look_for_secret as look_for_secret,
 )
-from .peers.options import PeerOptions as PeerOptions
 from .robustness.changes import (
     Change as Change,
     cropping as cropping,

@@ -89,7 +89,7 @@ def test_what_it_does_not_know_is_refused(folders: tuple[Path, Path], tmp_path: 
     with pytest.raises(UsageError, match="models have none"):
         compare(tmp_path / "a.ply", folders[1], out=tmp_path / "out")
     assert not (tmp_path / "out").exists()
-    assert set(registry.METHODS) >= {"3dgs", "3dgs-sh", "3dgs-decoder", "gs-hider", "watergs"}
+    assert set(registry.METHODS) >= {"3dgs", "3dgs-sh", "3dgs-decoder", "gs-hider"}
 
 
 @pytest.mark.parametrize("verb", ["hide", "fit"])
