@@ -53,12 +53,7 @@ from .speed import (
 )
 from .stealth.confirmation import candidate_scores as candidate_scores, changed_low_bits as changed_low_bits
 from .stealth.judging import judge as judge, stealth_statistics as stealth_statistics
-from .stegexpose import (
-    Scores as Scores,
-    StegExposeAuc as StegExposeAuc,
-    score_image as score_image,
-    stegexpose_auc as stegexpose_auc,
-)
+from .stegexpose import score_image as score_image, stegexpose_auc as stegexpose_auc
 from .two_sample import (
     auc_beside_controls as auc_beside_controls,
     features as features,

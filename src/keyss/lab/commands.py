@@ -173,34 +173,28 @@ def reproduce(
         ),
     ] = (),
     *,
-    data: Annotated[
-        Path | None,
-        optional(
-            "FOLDER",
-            "Folder of the paper's scenes (Mip-NeRF 360, and playroom), for its own sizes: 30,000 steps and "
-            "500,000 Gaussians.",
-            "the given scenes, with 1,000 steps, 9,000 Gaussians, 120 pixels",
+    full: Annotated[
+        bool,
+        switch(
+            "The scenes are the paper's: its pairs, 30,000 steps and 500,000 Gaussians, photos as they are."
         ),
-    ] = None,
+    ] = False,
     pairs: Annotated[
         UseAppendAction[tuple[str, ...]],
         optional(
             "COVER,SECRET",
             "Names of a cover and its secret, for multi COVER,SECRET,SECRET; repeat for more.",
-            "each hides the next; with --data as published",
+            "each hides the next; with --full as published",
         ),
     ] = (),
     out: OutFolder,
-    download: Annotated[
-        bool, switch("Download scenes that are missing in --data from their authors, up to 13 GB.")
-    ] = False,
     dry_run: DryRun = False,
-    iterations: Annotated[int | None, optional("N", "Training steps.", "see --data")] = None,
+    iterations: Annotated[int | None, optional("N", "Training steps.", "1,000, or see --full")] = None,
     max_gaussians: Annotated[
-        int | None, optional("N", "Maximum number of Gaussians of a model.", "see --data")
+        int | None, optional("N", "Maximum number of Gaussians of a model.", "9,000, or see --full")
     ] = None,
     width: Annotated[
-        int | None, optional("PIXELS", "Downscale wider photos to this width.", "see --data")
+        int | None, optional("PIXELS", "Downscale wider photos to this width.", "120, or see --full")
     ] = None,
     device: Device = "auto",
     seed: Seeds = (),
@@ -212,22 +206,19 @@ def reproduce(
 
     example: keyss reproduce single SCENE_A SCENE_B -o runs/paper
 
-    example: keyss reproduce multi --data 360_v2 --download -o runs/paper-full
+    example: keyss reproduce multi 360/* --full -o runs/paper-full
     """
     import keyss
     from keyss.cli.tables import print_files, print_table
-    from keyss.core.errors import InputError, UsageError
+    from keyss.core.errors import InputError
     from keyss.lab.many import Forecast
     from keyss.lab.many.paper import reproduction_notes, reproduction_rows
     from keyss.progress import reporter
 
-    if download and (dry_run or data is None):
-        raise UsageError("--download: needs --data, and no --dry-run")
     reproduction = keyss.reproduce(
         table,
         scenes,
-        data=data,
-        download=download,
+        full=full,
         pairs=pairs,
         iterations=iterations,
         max_gaussians=max_gaussians,
@@ -249,7 +240,7 @@ def reproduce(
         f"{table}.csv": _SCENES,
         f"{table}.tex": "the same, for LaTeX (booktabs)",
         f"{table}.json": "all figures, for programs",
-        "cells": "the runs, which other tables share",
+        "trials": "the runs, which other tables share",
     }
     print(*reproduction_notes(reproduction), means, sep="\n")
     print_files(out, described)
@@ -267,7 +258,7 @@ def sweep(
     cores: Cores = 1,
     master_key_file: Annotated[
         Path | None,
-        optional("FILE", "Key file to derive the cells' keys from (`keyss keygen --asset`).", "a new one"),
+        optional("FILE", "Key file to derive the trials' keys from (`keyss keygen --asset`).", "a new one"),
     ] = None,
     dry_run: DryRun = False,
 ) -> None:
@@ -300,11 +291,11 @@ def sweep(
         "scenes.csv": _SCENES,
         "scenes.tex": "the same, for LaTeX (booktabs)",
         "results.csv": "all measures: mean and standard deviation over seeds",
-        "cells.csv": "the numbers of each cell",
-        "private/master-key.txt": "the key from which those of the cells are derived",
+        "trials.csv": "the numbers of each trial",
+        "private/master-key.txt": "the key from which those of the trials are derived",
     }
     print_files(out, described)
-    print_outcome(result.errors, len(result.outcomes), "cells")
+    print_outcome(result.errors, len(result.outcomes), "trials")
 
 
 def _print_verdicts(audit: Audit) -> None:
@@ -319,7 +310,7 @@ def _print_verdicts(audit: Audit) -> None:
 
 
 def _print_forecast(found: Forecast) -> None:
-    """Print the cells of a dry run, with estimates for those to do."""
+    """Print the trials of a dry run, with estimates for those to do."""
     from keyss.cli.tables import print_table
     from keyss.progress import about
 

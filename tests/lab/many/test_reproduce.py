@@ -11,8 +11,8 @@ import pytest
 from cli.said import Run, listing
 from keyss import reproduce
 from keyss.core import InputError
-from keyss.lab.audits import comparison_measures
-from keyss.lab.many import Forecast, Reproduction, cell
+from keyss.lab.audits import trial_measures
+from keyss.lab.many import Forecast, Reproduction, trial
 
 SIZES = {"iterations": 20, "max_gaussians": 150}
 FLAGS = ("--iterations", 20, "--max-gaussians", 150, "--pairs", "a,b", "--seed", 5)
@@ -23,7 +23,7 @@ def out(folders: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory) ->
     """A folder with the table "pruning", which others use the run of."""
     folder = tmp_path_factory.mktemp("tables") / "paper"
     with pytest.MonkeyPatch.context() as patch:  # opening what was pruned takes long
-        patch.setattr(comparison_measures, "PRUNED_SHARES", (0.25,))
+        patch.setattr(trial_measures, "PRUNED_SHARES", (0.25,))
         with pytest.warns(UserWarning, match="secrets lie in appended Gaussians"):
             run("pruning", folders, folder)
     return folder
@@ -35,9 +35,10 @@ def run(table: str, folders: tuple[Path, Path], out: Path, **options: Any) -> Re
     return found
 
 
-def run_of(cell: str, out: Path) -> Path:
-    """The folder of the results of a cell by its name."""
-    (path,) = (path for path in out.glob("cells/*/cell.json") if json.loads(path.read_text())["name"] == cell)
+def run_of(trial: str, out: Path) -> Path:
+    """The folder of the results of a trial by its name."""
+    records = out.glob("trials/*/trial.json")
+    (path,) = (path for path in records if json.loads(path.read_text())["name"] == trial)
     return path.parent / "run"
 
 
@@ -66,15 +67,15 @@ def test_a_table_lies_beside_the_papers(out: Path) -> None:
 def test_what_is_done_is_not_done_again(
     out: Path, folders: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    before = listing(out / "cells")
+    before = listing(out / "trials")
 
     def refused(*arguments: object, **more: object) -> None:
         raise AssertionError("nothing is to be run")
 
-    monkeypatch.setattr(cell, "hide", refused)
-    monkeypatch.setattr(cell, "fit", refused)
+    monkeypatch.setattr(trial, "hide", refused)
+    monkeypatch.setattr(trial, "fit", refused)
     assert not run("pruning", folders, out).failures
-    assert listing(out / "cells") == before
+    assert listing(out / "trials") == before
     found = reproduce("pruning", folders, pairs=["a,b"], seeds=[5], out=out, **SIZES, dry_run=True)  # type: ignore[arg-type]
     assert isinstance(found, Forecast)
     assert not found.plans
@@ -91,7 +92,7 @@ def test_a_run_that_fails_is_said_and_the_others_go_on(
     def failing(*arguments: object, **more: object) -> None:
         raise InputError("not today")
 
-    monkeypatch.setattr(cell, "hide", failing)
+    monkeypatch.setattr(trial, "hide", failing)
     found = run("speed", folders, out)
     assert found.failures == {f"{name}, a-b": "not today" for name in ("3DGS", "GS-Hider")}
     verdicts = [each.verdict for each in found.claims]
@@ -118,5 +119,5 @@ def test_the_command(keyss: Run, out: Path, folders: tuple[Path, Path], tmp_path
     assert keyss("reproduce", "single", folders[0], "-o", tmp_path / "new").status == 2
     said = keyss("reproduce", "single", *folders, "--width", 0, "-o", tmp_path / "new")
     assert (said.status, "--width" in said.err) == (2, True), said
-    full = keyss("reproduce", "multi", "--data", tmp_path, "-o", tmp_path / "new")
-    assert (full.status, "Mip-NeRF 360" in full.err) == (4, True)
+    full = keyss("reproduce", "multi", *folders, "--full", "-o", tmp_path / "new")
+    assert (full.status, "expected a scene called 'flowers', got a, b" in full.err) == (2, True)

@@ -13,8 +13,8 @@ from keyss.lab.many import reproduction
 
 def test_every_scene_hides_the_next() -> None:
     groups_of = reproduction.groups_of
-    assert groups_of(["a", "b"], 1, (), None) == [("a", "b"), ("b", "a")]
-    assert groups_of(["a", "b", "c"], 2, (), None) == [("a", "b", "c"), ("b", "c", "a"), ("c", "a", "b")]
+    assert groups_of(["a", "b"], 1, (), ()) == [("a", "b"), ("b", "a")]
+    assert groups_of(["a", "b", "c"], 2, (), ()) == [("a", "b", "c"), ("b", "c", "a"), ("c", "a", "b")]
 
 
 @pytest.mark.parametrize(
@@ -25,8 +25,8 @@ def test_every_scene_hides_the_next() -> None:
         ({"table": "single", "scenes": ["a"]}, "at least 2 scenes"),
         ({"table": "multi", "scenes": ["a", "b"]}, "at least 3 scenes"),
         ({"table": "single", "scenes": ["a", "x/a"]}, "different names"),
-        ({"table": "single", "scenes": ["a", "b"], "data": "d"}, "leave out the others"),
-        ({"table": "single", "scenes": ["a", "b"], "pairs": ["a,c"]}, "no scene is called 'c'"),
+        ({"table": "single", "scenes": ["a", "b"], "full": True}, "a scene called 'bicycle', got a, b"),
+        ({"table": "single", "scenes": ["a", "b"], "pairs": ["a,c"]}, "a scene called 'c', got a, b"),
         ({"table": "single", "scenes": ["a", "b"], "pairs": ["a"]}, "a cover and 1 secret"),
         ({"table": "multi", "scenes": ["a", "b", "c"], "pairs": ["a,b,b"]}, "different names"),
         ({"table": "single", "scenes": ["a", "b"], "iterations": 0}, "`iterations`"),

@@ -108,10 +108,10 @@ def skipped(found: ManyResult) -> list[bool]:
 
 
 @fake_runs
-def test_every_cell_runs_once_and_equal_sweeps_have_equal_tables(tmp_path: Path) -> None:
+def test_every_trial_runs_once_and_equal_sweeps_have_equal_tables(tmp_path: Path) -> None:
     spec = write_spec(tmp_path, ["a.ply", "b.ply"], seeds=3)
     first = run(spec, tmp_path / "out")
-    assert first.tables == ("results.csv", "cells.csv", "scenes.csv", "scenes.tex")
+    assert first.tables == ("results.csv", "trials.csv", "scenes.csv", "scenes.tex")
     assert skipped(first) == [False] * 6
     assert skipped(run(spec, tmp_path / "out")) == [True] * 6
     run(spec, tmp_path / "other")
@@ -132,28 +132,23 @@ def test_every_cell_runs_once_and_equal_sweeps_have_equal_tables(tmp_path: Path)
         ("a", "cover", "31.0", "1.0", ""),
         ("secret", "secret", "20.0", "0.0", ""),
     ]
-    assert "seconds" not in (tmp_path / "out" / "cells.csv").read_text()  # they differ from run to run
+    assert "seconds" not in (tmp_path / "out" / "trials.csv").read_text()  # they differ from run to run
 
 
 @fake_runs
-def test_a_cell_runs_again_when_its_files_options_or_result_changed(tmp_path: Path) -> None:
+def test_a_trial_runs_again_when_its_files_or_options_change(tmp_path: Path) -> None:
     spec = write_spec(tmp_path, ["a.ply"], seeds=2)
     out = tmp_path / "out"
-    cells = [each.folder for each in run(spec, out).outcomes]
-    (cells[0] / "run" / "publish" / "model.ply").unlink()
-    assert skipped(run(spec, out)) == [False, True]
-    written = (cells[0] / "result.json").stat().st_mtime
-    os.utime(tmp_path / "a.ply", (written + 5, written + 5))
     assert skipped(run(spec, out)) == [False, False]
-    os.utime(tmp_path / "a.ply", (written - 5, written - 5))
+    os.utime(tmp_path / "a.ply", (5, 5))
+    assert skipped(run(spec, out)) == [False, False]
     spec.write_text(spec.read_text().replace("publish: any", "publish: any, prune_to_fit: true"))
     assert skipped(run(spec, out)) == [False, False]
     assert skipped(run(spec, out)) == [True, True]
-    assert len(list((out / "cells").iterdir())) == 4
 
 
 @fake_runs
-def test_a_cell_that_fails_does_not_end_the_others(
+def test_a_trial_that_fails_does_not_end_the_others(
     tmp_path: Path, keyss: Run, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Neither with an error that keyss expects nor with another."""
@@ -165,16 +160,16 @@ def test_a_cell_that_fails_does_not_end_the_others(
     assert (good.error, good.result.numbers["cover.psnr"]) == (None, 30)
     said = keyss("sweep", spec, "-o", tmp_path / "out")
     assert said.status == 4
-    assert "1 of 3 cells are done" in said.out
+    assert "1 of 3 trials are done" in said.out
     assert "failed: broken-secret carry seed 0: " in said.out
 
 
-def test_the_key_of_a_cell_opens_it(tmp_path: Path, keyss: Run) -> None:
-    (cell,) = run(real_spec(tmp_path, 1), tmp_path / "out").outcomes
-    name, master = f"cell/{cell.folder.name}/1", tmp_path / "out" / "private" / "master-key.txt"
+def test_the_key_of_a_trial_opens_it(tmp_path: Path, keyss: Run) -> None:
+    (trial,) = run(real_spec(tmp_path, 1), tmp_path / "out").outcomes
+    name, master = f"trial/{trial.folder.name}/1", tmp_path / "out" / "private" / "master-key.txt"
     key = keyss("keygen", "--asset", name, "--master-key-file", master).out.strip()
-    assert len(library.reveal(cell.folder / "run" / "publish" / "model.ply", key).gaussians) == 40
-    assert json.loads((cell.folder / "cell.json").read_text())["method"] == "carry"
+    assert len(library.reveal(trial.folder / "run" / "publish" / "model.ply", key).gaussians) == 40
+    assert json.loads((trial.folder / "trial.json").read_text())["method"] == "carry"
 
 
 def test_a_dry_run_writes_nothing_and_names_what_cannot_work(keyss: Run, tmp_path: Path) -> None:
@@ -199,7 +194,7 @@ def test_a_dry_run_writes_nothing_and_names_what_cannot_work(keyss: Run, tmp_pat
 @pytest.mark.slow
 @pytest.mark.filterwarnings("default")
 @pytest.mark.argon2  # as in the processes of Ray
-def test_a_local_cluster_does_the_same_cells(tmp_path: Path) -> None:
+def test_a_local_cluster_runs_the_same_trials(tmp_path: Path) -> None:
     pytest.importorskip("ray", reason="ray is not installed")
     spec = real_spec(tmp_path, 2)
     (tmp_path / "broken.ply").write_text("no model")

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from keyss.lab.auc import Auc
-from keyss.lab.audits.numbers import decibel, difference, number, numbered, significant, times
+from keyss.lab.audits.formatting import decibel, difference, number, numbered, significant, times
 from keyss.lab.audits.record import Audit
 from keyss.lab.leaks.leak_scores import GRADIENT_LIMIT, PSNR_LIMIT, SSIM_LIMIT, AttackResult
 
@@ -178,7 +178,7 @@ def _two_sample(audit: Audit) -> Iterator[Verdict]:
 def _renders(audit: Audit) -> Iterator[Verdict]:
     if audit.stegexpose is None:
         return
-    stego, control = audit.stegexpose.stego.fused, audit.stegexpose.control.fused
+    stego, control = audit.stegexpose.stego, audit.stegexpose.control
     excess = abs(stego.auc - 0.5) - abs(control.auc - 0.5)
     undecided = stego.low <= 0.5 <= stego.high
     value, beside = f"AUC {auc_text(stego)}", f"{auc_text(control)}, between plain models"

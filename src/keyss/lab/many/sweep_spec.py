@@ -1,4 +1,4 @@
-"""`sweep`: run the cells of a specification, and tabulate their results.
+"""`sweep`: run the trials of a specification, and tabulate their results.
 
 A specification is a YAML file with pairs, methods, options and seeds:
 
@@ -35,9 +35,10 @@ from keyss.fitting import PRESETS
 from keyss.fitting.config import MAX_SEED
 from keyss.keys import read_key
 from keyss.lab.audits import PARTS
-from keyss.lab.many.cell_folder import CellFolder, Forecast, ManyResult
+from keyss.lab.many.engine import ManyResult
 from keyss.lab.many.option_changes import known_changes, with_changes
-from keyss.lab.many.result_tables import write_sweep_tables
+from keyss.lab.many.result_tables import TrialNumbers, write_sweep_tables
+from keyss.lab.many.trial_folder import Forecast, TrialFolder
 from keyss.methods import MethodOptions, registry
 from keyss.progress import Reporter
 from keyss.rendering.orbit import is_model
@@ -45,7 +46,7 @@ from keyss.runs.files import PathLike
 
 MAX_BYTES = 1 << 20  # size of the file
 _AT_LEAST_ONE = Meta(min_length=1)
-Row = tuple[dict[str, Any], list[str], int]  # labels, scenes and seed of a cell in tables
+Row = tuple[dict[str, Any], list[str], int]  # labels, scenes and seed of a trial in tables
 
 
 class Pair(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -94,7 +95,7 @@ class SweepSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
 
     @property
     def common(self) -> dict[str, Any]:
-        """The fields of all cells."""
+        """The fields of all trials."""
         views = ViewOptions(self.width, self.background, self.skip_missing)
         return {"views": views, "min_psnr": self.min_psnr, "bound": self.bound, "device": self.device}
 
@@ -116,8 +117,6 @@ def read_spec(path: Path) -> SweepSpec:
     pairs = tuple(
         _resolve_pair(f"{path}: pairs[{index}]", path, pair, most) for index, pair in enumerate(spec.pairs)
     )
-    for _ in variants(path, spec):  # raises InputError
-        pass
     return msgspec.structs.replace(spec, pairs=pairs)
 
 
@@ -178,30 +177,31 @@ def sweep(
     dry_run: bool = False,
     reporter: Reporter | None = None,
 ) -> ManyResult | Forecast:
-    """Run all unfinished cells of a specification, and write tables of all results.
+    """Run all unfinished trials of a specification, and write tables of all results.
 
-    Cells run sequentially in this process, or in parallel on a Ray cluster. `ray`: its address, or "local"
-    for one on this machine; `cores`: cores per cell there. `dry_run`: only return the plans of the cells.
-    Keys are derived from a master key (in `master_key_file`, or a new one in the private part of `out`) and
-    the cells' names. Raises KeyssError and KeyboardInterrupt; the result has the errors of failed cells.
+    Trials run one after the other in this process, or in parallel on a Ray cluster. `ray`: its address, or
+    "local" for one on this machine; `cores`: cores per trial there. `dry_run`: only return the plans of the
+    trials. Keys are derived from a master key (in `master_key_file`, or a new one in the private part of
+    `out`) and the trials' names. Raises KeyssError and KeyboardInterrupt; the result has the errors of failed
+    trials.
     """
     path = Path(spec)
     found = read_spec(path)
     master = None if master_key_file is None else Path(master_key_file).absolute()
     if master is not None:
         read_key(master)
-    folder = CellFolder(Path(out), master, found.common)
+    folder = TrialFolder(Path(out), master, found.common)
     rows = _add(path, found, folder)
     if dry_run:
         return folder.forecast()
     outcomes = folder.run(ray=ray, cores=cores, reporter=reporter)
-    ended = [outcomes[place].row(*row) for place, row in rows.items() if outcomes[place].result]
-    tables = write_sweep_tables(folder.out, ended)
+    done = [TrialNumbers.of(outcomes[place], *row) for place, row in rows.items() if outcomes[place].result]
+    tables = write_sweep_tables(folder.out, done)
     return ManyResult(tuple(outcomes[place] for place in rows), tuple(tables))
 
 
-def _add(path: Path, spec: SweepSpec, folder: CellFolder) -> dict[Path, Row]:
-    """Add all cells, in the order of pairs, methods, choices and seeds; returns their rows of tables.
+def _add(path: Path, spec: SweepSpec, folder: TrialFolder) -> dict[Path, Row]:
+    """Add all trials, in the order of pairs, methods, choices and seeds; returns their rows of tables.
 
     Scenes without plain models share fits.
     """
