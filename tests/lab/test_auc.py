@@ -53,16 +53,6 @@ def views(size: tuple[int, int], count: int = 8) -> list[npt.NDArray[np.uint8]]:
     return [whole[10 * i : 10 * i + size[0]] for i in range(count)]
 
 
-class TestStegExpose:
-    def test_last_bits_that_were_replaced_are_seen(self) -> None:
-        plain = views((300, 300))
-        found = stegexpose_auc(plain, [with_payload(image, 0.7) for image in plain])
-        assert found.fused.auc == 1
-        plain, stego = ([row.fusion or 0 for row in each] for each in (found.plain, found.stego))
-        assert max(plain) < min(stego)
-        assert found.detectors == {
-            "primary_sets": 0.0,  # no solution for any of the stego images
-            "chi_square": 1.0,
-            "sample_pairs": 1.0,
-            "rs": 1.0,
-        }
+def test_last_bits_that_were_replaced_are_seen() -> None:
+    plain = views((300, 300))
+    assert stegexpose_auc(plain, [with_payload(image, 0.7) for image in plain]).auc == 1

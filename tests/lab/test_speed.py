@@ -1,41 +1,19 @@
-"""Times, sizes and third-party readers, with a known clock."""
+"""Times and sizes, with a known delay."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from pathlib import Path
-
-import pytest
 
 from channels.quiet.trained_like import trained_like
 from keyss.core import Gaussians, Scene
 from keyss.files import write_model
-from keyss.lab import ReaderResult, measure_speed, readers
+from keyss.lab import measure_speed
 from keyss.methods import Opened, open_model
 from methods.carry.carried import embed
-from tiny_scenes import random_gaussians, tiny_scene
+from tiny_scenes import tiny_scene
 
 KEY = "the right key"
-
-
-# --- readers ---------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_other_peoples_readers_find_our_values(degree: int, tmp_path: Path) -> None:
-    write_model(tmp_path / "a.ply", random_gaussians(40, sh_degree=degree))
-    found = {each.reader: each for each in readers(tmp_path / "a.ply")}
-    for name in ("plyfile", "gsply"):
-        assert found[name] == ReaderResult(name, True, 40)
-
-
-def test_splat_transform_finds_our_values(tmp_path: Path, splat_transform: Callable[..., Path]) -> None:
-    write_model(tmp_path / "a.ply", random_gaussians(40))
-    assert readers(tmp_path / "a.ply")[2] == ReaderResult("splat-transform", True, 40)
-
-
-# --- all of it -------------------------------------------------------------------------------------------
 
 
 def test_speed_of_a_carried_secret(tmp_path: Path) -> None:

@@ -43,14 +43,7 @@ from .robustness.survival import (
     transform as transform,
 )
 from .sinkhorn import composite_score as composite_score, sinkhorn_3d as sinkhorn_3d
-from .speed import (
-    ReaderResult as ReaderResult,
-    SpeedResult as SpeedResult,
-    measure_speed as measure_speed,
-    readers as readers,
-    render_time as render_time,
-    reveal_seconds as reveal_seconds,
-)
+from .speed import SpeedResult as SpeedResult, measure_speed as measure_speed
 from .stealth.confirmation import candidate_scores as candidate_scores, changed_low_bits as changed_low_bits
 from .stealth.judging import judge as judge, stealth_statistics as stealth_statistics
 from .stegexpose import score_image as score_image, stegexpose_auc as stegexpose_auc

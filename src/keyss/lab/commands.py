@@ -55,7 +55,7 @@ def audit(
         UseAppendAction[tuple[PartName, ...]],
         optional("PART", f"Part to audit: {', '.join(get_args(PartName))}; repeat for more.", "all"),
     ] = (),
-    report_only: Annotated[bool, switch("Write the report again, of an interrupted audit too.")] = False,
+    report_only: Annotated[bool, switch("Write the report again, from the stored measurements.")] = False,
     resume: Resume = False,
     overwrite: Overwrite = False,
     device: Device = "auto",

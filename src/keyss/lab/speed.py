@@ -1,4 +1,4 @@
-"""Rendering and revealing times, file sizes, and compatibility with third-party programs."""
+"""Rendering and revealing times, and file sizes."""
 
 from __future__ import annotations
 
@@ -12,14 +12,12 @@ from statistics import median
 import numpy as np
 import torch
 
-from keyss.core.errors import BackendError, KeyssError
 from keyss.core.gaussians import Gaussians
 from keyss.core.picture_network import DecodedGaussians
 from keyss.core.scene import Scene
 from keyss.files.models import DECODED_SUFFIX, read_model, write_model
-from keyss.files.ply_rows import is_compressed
 from keyss.fitting.image_metrics import subsample_views
-from keyss.lab.robustness.survival import Opener, find_package, reveal_changed, transform
+from keyss.lab.robustness.survival import Opener, reveal_changed
 from keyss.rendering import render
 
 
@@ -29,16 +27,6 @@ class RenderTime:
 
     seconds: float  # median
     ratio: float  # median over pairs of renders, relative to a plain model of the scene; cancels other load
-
-
-@dataclass(frozen=True)
-class ReaderResult:
-    """The result of reading a file with a third-party program."""
-
-    reader: str
-    loads: bool | None  # True if all values are bitwise equal; None: not tried
-    gaussians: int | None = None  # number of Gaussians read
-    note: str | None = None  # why it fails or was not tried
 
 
 @dataclass(frozen=True)
@@ -69,9 +57,9 @@ def measure_speed(
     with tempfile.TemporaryDirectory() as folder:
         files, seconds = {"stego": stego}, []
         for number, opener in enumerate(openers, start=1):
-            file, median_seconds = reveal_seconds(stego, opener, Path(folder) / str(number))
-            files[f"secret {number}"] = file
-            seconds.append(median_seconds)
+            name = f"secret {number}"
+            files[name], took = _reveal_to_file(stego, opener, Path(folder) / name)
+            seconds.append(took)
         for number, (name, scene, plain) in enumerate(zip(files, scenes, plains, strict=True)):
             if progress is not None:
                 progress(number, len(files))
@@ -105,7 +93,7 @@ def render_time(
     return RenderTime(float(np.median(seconds)), float(np.median(seconds / plain_seconds)))
 
 
-def reveal_seconds(stego: Path, opener: Opener, out: Path, *, repeats: int = 3) -> tuple[Path, float]:
+def _reveal_to_file(stego: Path, opener: Opener, out: Path, *, repeats: int = 3) -> tuple[Path, float]:
     """The revealed file (`out` with the suffix of its format), and the median time from file to file."""
     seconds = []
     for _ in range(repeats):
@@ -115,39 +103,3 @@ def reveal_seconds(stego: Path, opener: Opener, out: Path, *, repeats: int = 3) 
         write_model(file, revealed)
         seconds.append(time.perf_counter() - start)
     return file, median(seconds)
-
-
-def readers(path: Path) -> list[ReaderResult]:
-    """Read a model file with plyfile, gsply and splat-transform, and compare the copies that they write."""
-    programs = {"plyfile": _plyfile, "gsply": _gsply, "splat-transform": transform}
-    if path.name.endswith(DECODED_SUFFIX):
-        note = "a network renders it: it is not a 3DGS model"
-        return [ReaderResult(name, False, note=note) for name in programs]
-    if path.suffix != ".ply" or is_compressed(path):
-        note = "only a .ply of floats stores every number exactly"
-        return [ReaderResult(name, None, note=note) for name in programs]
-    expected = read_model(path)
-    results: list[ReaderResult] = []
-    with tempfile.TemporaryDirectory() as folder:
-        for name, copied in programs.items():
-            try:
-                model = read_model(copied(path, Path(folder) / f"{name}.ply"))
-            except BackendError as error:
-                results.append(ReaderResult(name, None, note=f"{error}"))
-            except (KeyssError, OSError, ValueError, KeyError) as error:
-                results.append(ReaderResult(name, False, note=f"{error}"))
-            else:
-                equal = model.digest() == expected.digest()
-                results.append(ReaderResult(name, equal, len(model)))
-    return results
-
-
-def _plyfile(source: Path, target: Path) -> Path:
-    find_package("plyfile").PlyData.read(source).write(target)
-    return target
-
-
-def _gsply(source: Path, target: Path) -> Path:
-    gsply = find_package("gsply")
-    gsply.plywrite(target, gsply.plyread(source))
-    return target

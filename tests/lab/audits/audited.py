@@ -6,7 +6,7 @@ import copy
 import json
 import shutil
 import warnings
-from collections.abc import Callable
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -96,15 +96,14 @@ def put(data: dict[str, Any], *changes: tuple[str, Any]) -> None:
         at[last] = value
 
 
-def with_all_texts(value: Any, text: str, keep: Callable[[str], bool]) -> Any:
-    """JSON with every text replaced but those under names to be kept."""
-    match value:
-        case str():
-            return text
-        case list():
-            return [with_all_texts(item, text, keep) for item in value]
-        case dict():
-            return {
-                name: item if keep(name) else with_all_texts(item, text, keep) for name, item in value.items()
-            }
+def with_all_texts(value: Any, text: str, keep: Collection[str]) -> Any:
+    """JSON with every text replaced, except under the names in `keep`."""
+    if isinstance(value, str):
+        return text
+    if isinstance(value, list):
+        return [with_all_texts(item, text, keep) for item in value]
+    if isinstance(value, dict):
+        return {
+            name: item if name in keep else with_all_texts(item, text, keep) for name, item in value.items()
+        }
     return value

@@ -31,7 +31,7 @@ def report(run_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     run = run_with(run_folder, tmp_path_factory.mktemp("coloured"), data)
     items = next(iter(data["images"]["pictures"].values()))
     for label, colour in {"photo": RED, "stego model": BLUE, "plain model": GREEN}.items():
-        Image.new("RGB", (40, 30), colour).save(run / "private" / "audit" / items[label])
+        Image.new("RGB", (40, 30), colour).save(run / "private" / "audit" / "pictures" / items[label])
     audit(run, report_only=True)
     return run / "private" / "report.html"
 

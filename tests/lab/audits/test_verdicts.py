@@ -13,7 +13,7 @@ Data = dict[str, Any]
 Change = tuple[str, Any]
 IMAGES, BASELINES = "images.models.{}.images.mean.psnr", "images.models.{}.baseline.mean.psnr"
 LEAK = "leaks.{}.{}.best_leak.{}"
-STEGEXPOSE, CONTROL = "stegexpose.stego.fused", "stegexpose.control.fused"
+STEGEXPOSE, CONTROL = "stegexpose.stego", "stegexpose.control"
 
 
 def judged(audit: Audit) -> dict[str, Verdict]:

@@ -62,16 +62,16 @@ def spec_of(folder: Path, text: str) -> Path:
         ("method: carry", "method: carrry", "Invalid enum value 'carrry'"),
         ("preset: quick", "preset: quik", "Invalid enum value 'quik'"),
         ("secrets: [b.ply]", "secrets: []", "length >= 1 - at `$.pairs[0].secrets`"),
-        ("methods:", "seeds: [1, 1]\nmethods:", "got one twice"),
+        ("methods:", "seeds: [1, 1]\nmethods:", "two are called 1"),
         ("methods:", "evaluate: [stelth]\nmethods:", "Invalid enum value 'stelth'"),
         ("methods:", "width: !!python/object/apply:os.system [ls]\nmethods:", "expected YAML"),
         ("{cover", "{{{cover", "expected YAML"),
         (
             "methods:",
             "  - {cover: b.ply, secrets: [a.ply], name: a-b}\nmethods:",
-            "pairs: two have the name 'a-b'",
+            "pairs: two are called 'a-b'",
         ),
-        ("methods:", "methods:\n  - {method: carry, preset: default}", "methods: two have the name 'carry'"),
+        ("methods:", "methods:\n  - {method: carry, preset: default}", "methods: two are called 'carry'"),
     ],
 )
 def test_what_is_wrong_in_a_specification_is_said_before_anything_runs(

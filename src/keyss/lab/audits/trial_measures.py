@@ -24,7 +24,7 @@ from keyss.lab.audits.audit_run import EXTRA
 from keyss.lab.robustness.changes import Change, opacity_pruning, purification, random_pruning
 from keyss.lab.robustness.survival import converters, measure_robustness
 from keyss.lab.sinkhorn import composite_score, sinkhorn_3d
-from keyss.lab.speed import readers, render_time
+from keyss.lab.speed import render_time
 from keyss.lab.stealth.judging import judge
 from keyss.lab.stegexpose import stegexpose_auc
 from keyss.lab.two_sample import two_sample_auc
@@ -106,15 +106,11 @@ class MeasuredTrial:
 
 
 def files(trial: MeasuredTrial) -> Numbers:
-    """Megabytes of the published and the handed-over files; number of programs that read the former."""
-    published = stego_in(trial.run.folder)
+    """Megabytes of the published and the handed-over files."""
     handed = (trial.run.folder / HANDED).glob("*")
-    tried = [each for each in readers(published) if each.loads is not None]
     return {
-        "published_mb": published.stat().st_size / 1e6,
+        "published_mb": stego_in(trial.run.folder).stat().st_size / 1e6,
         "handed_mb": sum(path.stat().st_size for path in handed) / 1e6,
-        "readers": len(tried),
-        "readers that load": sum(each.loads is True for each in tried),
     }
 
 

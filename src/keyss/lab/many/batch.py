@@ -1,13 +1,6 @@
 """`hide_batch`: one hiding per asset of a table; a failed asset does not stop the others.
 
-The table is a CSV file with a row for each asset:
-
-| column | what |
-| --- | --- |
-| `cover` | public model or scene |
-| `secret`, or `secret_file` | scene or model to hide in it, or any file |
-| `out` | folder of its results, in the batch's; it is also the asset's name under a master key |
-| `key_file` | file with its key; none with a master key |
+The table is a CSV file with the columns COLUMNS (docs/experiments.md).
 """
 
 from __future__ import annotations
@@ -46,6 +39,8 @@ from keyss.runs.files import PathLike
 from keyss.runs.folder import PRIVATE
 
 MAX_BYTES = 64 << 20
+# A row has a secret (a scene or model) or a secret file, and a key file unless there is a master key. `out`
+# is the folder of its results, and its name under the master key.
 COLUMNS = ("cover", "secret", "secret_file", "out", "key_file")
 SUMMARY = f"{PRIVATE}/batch.csv"
 _RECORD = f"{PRIVATE}/asset.json"  # relative to the folder of a finished asset

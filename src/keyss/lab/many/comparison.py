@@ -66,7 +66,6 @@ _SECRECY = {
         "%(wrong_key.vs_cover.mean).1f, %(wrong_key.vs_secrets.1.max).1f (%(chance_level.1).1f)",
         "%(wrong keys)s",
     ],
-    "standard .ply": ["%(files.readers that load)d of %(files.readers)d readers"],
     "classifier": ["%(secrecy.classifier).2f", "no 3DGS"],
     "p": ["%(secrecy.stealth).1g", "no 3DGS"],
     "StegExpose": ["%(secrecy.stegexpose).2f"],

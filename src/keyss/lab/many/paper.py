@@ -112,15 +112,14 @@ class Reproduction:
 
 def figure_rows(
     table: Table,
-    numbers: Mapping[str, Sequence[Mapping[str, float]]],
-    count: int,
+    numbers: Mapping[str, Sequence[Mapping[str, float]]],  # by run, for each group with a result
+    count: int,  # of groups
     covers: Collection[str] = (),
 ) -> tuple[FigureRow, ...]:
     """Published figures beside measured ones, a row for each run.
 
-    `numbers`: by run, for each group of scenes with a result. `count`: number of groups; a figure must be
-    measured on all of them, because means over different groups are not comparable. `covers`: covers of the
-    published groups that were run; if empty, published figures are means over all.
+    A figure must be measured on all groups, because means over different groups are not comparable.
+    `covers`: covers of the published groups that were run; if empty, published figures are means over all.
     """
     rows = []
     for name, run in table.runs.items():

@@ -1,12 +1,7 @@
 """A trial: one plain fit, or one hiding and its measures, in a folder of its own.
 
-| file | what |
-| --- | --- |
-| `trial.json` | the trial |
-| `result.json` | its numbers; there only when it is done |
-| `run/` | the results of `keyss fit` or `keyss hide` |
-
-A key is in none of these files.
+The folder holds the trial (`trial.json`), the results of `keyss fit` or `keyss hide` (`run/`) and, once it is
+done, its numbers (`result.json`). A key is in none of these files.
 """
 
 from __future__ import annotations

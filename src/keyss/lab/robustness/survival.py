@@ -220,29 +220,7 @@ def converters(sog_iterations: int = 1) -> list[Converter]:
     ]
 
 
-def own_converter(format: str) -> Converter:
-    """A conversion by keyss itself, if a tool is missing; `format` is .spz or compressed .ply."""
-    name = {".spz": "there.spz", "compressed .ply": "there.compressed.ply"}[format]
-
-    def round_trip(source: Path, folder: Path) -> tuple[Path, Path]:
-        there, back = folder / name, folder / "back.ply"
-        write_model(there, read_model(source))
-        write_model(back, read_model(there))
-        return there, back
-
-    return Converter(format, "keyss", "", round_trip)
-
-
-def why_missing(tool: str) -> str | None:
-    """The reason why splat-transform or a Python package is unusable; None if it is installed."""
-    try:
-        find_splat_transform() if tool == "splat-transform" else find_package(tool)
-    except BackendError as error:
-        return str(error)
-    return None
-
-
-def find_package(name: str) -> ModuleType:
+def _find_package(name: str) -> ModuleType:
     """A third-party Python package. Raises BackendError."""
     try:
         return import_module(name)
@@ -275,14 +253,14 @@ def _convert_through(name: str, *options: str) -> Callable[[Path, Path], tuple[P
 
 
 def _gsply_compressed(source: Path, folder: Path) -> tuple[Path, Path]:
-    gsply, there, back = find_package("gsply"), folder / "there.compressed.ply", folder / "back.ply"
+    gsply, there, back = _find_package("gsply"), folder / "there.compressed.ply", folder / "back.ply"
     gsply.plywrite(there, gsply.plyread(source), compressed=True)
     gsply.plywrite(back, gsply.plyread(there))
     return there, back
 
 
 def _gsply_spz(source: Path, folder: Path) -> tuple[Path, Path]:
-    gsply, there, back = find_package("gsply"), folder / "there.spz", folder / "back.ply"
+    gsply, there, back = _find_package("gsply"), folder / "there.spz", folder / "back.ply"
     gsply.write_spz(there, gsply.plyread(source), version=3)
     gsply.plywrite(back, gsply.read_spz(there))
     return there, back
