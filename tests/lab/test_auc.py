@@ -5,14 +5,12 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 from hypothesis import given, settings, strategies as st
 from scipy.special import expit, logit
 
 from keyss.core import UsageError
-from keyss.lab import auc_between, stegexpose_auc
-from lab.test_stegexpose import smooth, with_payload
+from keyss.lab import auc_between
 
 SCORES = st.lists(st.sampled_from([None, math.nan, -0.5, 0.0, 0.1, 0.2, 0.7, 1e300]), min_size=1, max_size=9)
 
@@ -45,14 +43,3 @@ def test_three_against_three_by_hand() -> None:
 def test_a_class_without_scores_is_refused(negatives: list[float], positives: list[float]) -> None:
     with pytest.raises(UsageError, match="both classes"):
         auc_between(negatives, positives)
-
-
-def views(size: tuple[int, int], count: int = 8) -> list[npt.NDArray[np.uint8]]:
-    """Cut-outs of one image."""
-    whole = smooth((size[0] + 10 * count, size[1]))
-    return [whole[10 * i : 10 * i + size[0]] for i in range(count)]
-
-
-def test_last_bits_that_were_replaced_are_seen() -> None:
-    plain = views((300, 300))
-    assert stegexpose_auc(plain, [with_payload(image, 0.7) for image in plain]).auc == 1

@@ -81,7 +81,7 @@ def test_a_plain_model_leaks_nothing(plain_rows: Rows) -> None:
 
 def test_transparent_hidden_gaussians_are_found_by_their_opacity() -> None:
     rows = _look(_with_hidden(math.log(0.01 / 0.99)))
-    for name in ("restored opacities", "rescaled opacities", "matched opacities", "inverted opacities"):
+    for name in ("restored opacities", "matched opacities"):
         assert rows[name].leak.gradient > 0.3, name
         assert rows[name].leak.psnr_fitted > 3, name
     assert rows["restored opacities"].best != "all"
@@ -175,4 +175,4 @@ def test_the_photographed_model_scores_best() -> None:
     scene, model = tiny_scene(0), random_gaussians(seed=0)
     found = leak_scores(model, scene.test, scene.background)
     assert found.psnr_fitted >= quality(model, scene.test, scene.background).psnr > 50
-    assert min(found.gradient, found.gradient_coarse, found.ssim_fitted) > 0.99
+    assert min(found.gradient, found.ssim_fitted) > 0.99

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import os
+import shutil
 import sys
 from pathlib import Path
 from typing import Any
@@ -91,7 +92,6 @@ def write_spec(folder: Path, covers: list[str], seeds: int, more: str = "") -> P
         if not (folder / name).exists():
             (folder / name).write_text(name)
     pairs = "\n".join(f"  - {{cover: {name}, secrets: [secret.ply]}}" for name in covers)
-    (folder / "master.txt").write_text("q7Rv2LxT9bWm4KzDq7Rv2L\n")
     text = f"pairs:\n{pairs}\nmethods:\n  - {{method: carry, options: {{publish: any}}}}\n"
     return spec_of(folder, f"{text}seeds: {list(range(seeds))}\n{more}")
 
@@ -201,8 +201,9 @@ def test_a_local_cluster_runs_the_same_trials(tmp_path: Path) -> None:
     spec.write_text(
         spec.read_text().replace("methods:", "  - {cover: broken.ply, secrets: [a.ply]}\nmethods:")
     )
-    here = run(spec, tmp_path / "here", master_key_file=tmp_path / "master.txt")
-    there = run(spec, tmp_path / "there", master_key_file=tmp_path / "master.txt", ray="local")
+    here = run(spec, tmp_path / "here")
+    shutil.copytree(tmp_path / "here" / "private", tmp_path / "there" / "private")
+    there = run(spec, tmp_path / "there", ray="local")
     assert [each.error for each in there.outcomes] == [each.error for each in here.outcomes]
     assert len(there.errors) == 2
     for name in here.tables:

@@ -124,7 +124,7 @@ def _leaks(audit: Audit) -> Iterator[Verdict]:
     of = f"{numbered('secret', index, len(secrets))}, " if len(secrets) > 1 else ""
     leak = worst.best_leak
     value = f"{difference(leak.psnr_fitted)} dB, {difference(leak.ssim_fitted, 3)} SSIM, "
-    value += f"{difference(leak.gradient_coarse)} gradients ({of}{worst.attack}: {worst.best})"
+    value += f"{difference(leak.gradient)} gradients ({of}{worst.attack}: {worst.best})"
     limit = f"at most {decibel(PSNR_LIMIT, 1)}, {SSIM_LIMIT} and {GRADIENT_LIMIT}"
     beside = "0, plain models; colours fitted"
     yield Verdict("leaks without the key", value, beside, limit, _word(leak.evidence() <= 1), "leaks")

@@ -38,8 +38,7 @@ class LeakScores:
 
     psnr_fitted: float  # dB
     ssim_fitted: float  # 3DGS's SSIM
-    gradient: float  # `gradient_correlation`
-    gradient_coarse: float  # `gradient_correlation` of `coarse` images
+    gradient: float  # `gradient_correlation` of `coarse` images
 
     @staticmethod
     def combine(function: Callable[[Sequence[float]], float], rows: Sequence[LeakScores]) -> LeakScores:
@@ -51,7 +50,7 @@ class LeakScores:
         return max(
             self.psnr_fitted / PSNR_LIMIT,
             self.ssim_fitted / SSIM_LIMIT,
-            self.gradient_coarse / GRADIENT_LIMIT,
+            self.gradient / GRADIENT_LIMIT,
         )
 
     def __sub__(self, other: LeakScores) -> LeakScores:
@@ -97,10 +96,9 @@ def leak_scores(model: Gaussians, views: Sequence[View], background: Tensor) -> 
         photo = view.photo(model.device)
         image = render(model, view.camera, background).clamp(0, 1)
         fitted = fit_colours(image, photo).clamp(0, 1)
-        gradient = gradient_correlation(image, photo)
-        gradient_coarse = gradient_correlation(coarse(image), coarse(photo))
+        gradient = gradient_correlation(coarse(image), coarse(photo))
         similarity = float(ssim(fitted, Target.of(photo)))
-        rows.append(LeakScores(psnr(fitted, photo), similarity, gradient, gradient_coarse))
+        rows.append(LeakScores(psnr(fitted, photo), similarity, gradient))
     return LeakScores.combine(fmean, rows)
 
 

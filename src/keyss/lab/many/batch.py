@@ -29,7 +29,6 @@ from keyss.keys import MasterKey, read_key
 from keyss.lab.many.engine import ManyResult, Outcome, claim_folder, run_tasks
 from keyss.lab.many.result_tables import csv_bytes
 from keyss.lab.many.trial import modification_times
-from keyss.lab.many.trial_folder import check_master_key
 from keyss.methods import MethodOptions, registry
 from keyss.progress import Reporter
 from keyss.rendering import Backend
@@ -152,8 +151,6 @@ def hide_batch(
         times = modification_times(inputs.values())
         assets[out / name] = Asset(name=name, times=times, **inputs, **common)
     with claim_folder(out, mode=0o777):
-        if master is not None:
-            check_master_key(out, master)
         done = {place for place, asset in assets.items() if asset.is_done(place)}
         found = {place: Outcome(assets[place].name, place, skipped=True) for place in done}
         due = {place: asset for place, asset in assets.items() if place not in done}

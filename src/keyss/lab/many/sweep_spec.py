@@ -19,7 +19,6 @@ from keyss.core.errors import did_you_mean
 from keyss.files.reading import read_text
 from keyss.fitting import PRESETS
 from keyss.fitting.config import MAX_SEED
-from keyss.keys import read_key
 from keyss.lab.audits import PARTS
 from keyss.lab.many.engine import ManyResult
 from keyss.lab.many.option_changes import known_changes, with_changes
@@ -83,14 +82,9 @@ def read_spec(path: Path) -> SweepSpec:
     except (yaml.YAMLError, msgspec.ValidationError, ValueError, RecursionError) as error:
         raise InputError(f"{path}: expected YAML of a sweep: {' '.join(str(error).split())}") from error
     most = min(registry.get(entry.method).max_secrets for entry in spec.methods)
-    spec = msgspec.structs.replace(
-        spec,
-        pairs=tuple(
-            _resolve_pair(f"{path}: pairs[{index}]", path, pair, most)
-            for index, pair in enumerate(spec.pairs)
-        ),
-        methods=tuple(msgspec.structs.replace(each, name=each.name or each.method) for each in spec.methods),
-    )
+    pairs = [_resolve_pair(path, index, pair, most) for index, pair in enumerate(spec.pairs)]
+    methods = [msgspec.structs.replace(each, name=each.name or each.method) for each in spec.methods]
+    spec = msgspec.structs.replace(spec, pairs=tuple(pairs), methods=tuple(methods))
     unique: dict[str, list[Any]] = {"seeds": list(spec.seeds)}
     unique |= {"pairs": [each.name for each in spec.pairs], "methods": [each.name for each in spec.methods]}
     for what, values in unique.items():
@@ -151,7 +145,6 @@ def sweep(
     spec: PathLike,
     out: PathLike,
     *,
-    master_key_file: PathLike | None = None,
     ray: str | None = None,
     cores: int = 1,
     dry_run: bool = False,
@@ -161,16 +154,13 @@ def sweep(
 
     Trials run one after the other in this process, or in parallel on a Ray cluster. `ray`: its address, or
     "local" for one on this machine; `cores`: cores per trial there. `dry_run`: only return the plans of the
-    trials. Keys are derived from a master key (in `master_key_file`, or a new one in the private part of
-    `out`) and the trials' names. Raises KeyssError and KeyboardInterrupt; the result has the errors of failed
+    trials. Keys are derived from the trials' names and a master key in the private part of `out`, which is
+    made if there is none. Raises KeyssError and KeyboardInterrupt; the result has the errors of failed
     trials.
     """
     path = Path(spec)
     found = read_spec(path)
-    master = None if master_key_file is None else Path(master_key_file).absolute()
-    if master is not None:
-        read_key(master)
-    folder = TrialFolder(Path(out), master, found.common)
+    folder = TrialFolder(Path(out), found.common)
     rows: dict[Path, tuple[dict[str, Any], list[str], int]] = {}  # labels, scenes and seed
     for pair, (method, preset, choices), seed in product(found.pairs, variants(path, found), found.seeds):
         options = preset.with_fit(seed=seed)

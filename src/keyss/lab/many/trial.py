@@ -34,11 +34,12 @@ from keyss.progress import Reporter
 from keyss.rendering import Backend, resolve_device
 from keyss.runs import FitMetrics, HideMetrics, Manifest, read_manifest, read_record, record_bytes
 from keyss.runs.files import METRICS, as_scene
-from keyss.runs.folder import make_private
+from keyss.runs.folder import PRIVATE, make_private
 from keyss.runs.open_run import open_run
 from keyss.runs.planning import plan_fit
 
 TRIAL, RESULT, RUN = "trial.json", "result.json", "run"
+MASTER_KEY = f"{PRIVATE}/master-key.txt"  # relative to the folder of all trials
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,15 +62,11 @@ class Trial:
     bound: bool = False
     device: Backend = "auto"
     measures: tuple[str, ...] = ()  # beyond those of `keyss hide`
-    master_key_file: str | None = None
 
     @property
     def identity(self) -> str:
-        """SHA-256 (hexadecimal) of the version of keyss, options, and paths and times of the inputs.
-
-        Measures and the master key are not included, because the run does not depend on them.
-        """
-        same = replace(self, name="", measures=(), master_key_file=None)
+        """SHA-256 (hexadecimal) of all that the run depends on: not of its measures."""
+        same = replace(self, name="", measures=())
         models = [each for each in self.models if each and os.path.isabs(each)]
         times = modification_times([self.cover, *self.secrets, *models])
         return hashlib.sha256(record_bytes(same) + msgspec.json.encode(times)).hexdigest()
@@ -143,9 +140,9 @@ def plan_of(trial: Trial, folder: Path) -> Plan:
 
 def keys_of(trial: Trial, folder: Path) -> list[str]:
     """A key per secret, derived from the master key, or "" if the method has no keys."""
-    if not registry.get(trial.method).capabilities.keys or trial.master_key_file is None:
+    if not registry.get(trial.method).capabilities.keys:
         return [""] * len(trial.secrets)
-    master = MasterKey(read_key(Path(trial.master_key_file)))
+    master = MasterKey(read_key(folder.parents[1] / MASTER_KEY))
     return [master.key_of(f"trial/{folder.name}/{index}") for index, _ in enumerate(trial.secrets, start=1)]
 
 

@@ -3,27 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from keyss.core import KeyssError, OutputError
+from keyss.core import KeyssError
 from keyss.files import write_bytes
 from keyss.fitting import FitConfig
-from keyss.keys import MasterKey, generate_key, read_key
+from keyss.keys import generate_key
 from keyss.keys.key_file import KEY_LENGTH
 from keyss.lab.audits.trial_measures import check_extras
 from keyss.lab.many.engine import Outcome, claim_folder, run_tasks
-from keyss.lab.many.trial import RUN, Trial, finished_result, plan_of, run_trial
+from keyss.lab.many.trial import MASTER_KEY, RUN, Trial, finished_result, plan_of, run_trial
 from keyss.methods import MethodOptions
 from keyss.methods.base import Plan
 from keyss.progress import Reporter
 from keyss.runs.files import MODEL
-from keyss.runs.folder import PRIVATE
 
 TRIALS = "trials"
-MASTER_KEY = f"{PRIVATE}/master-key.txt"
-_CHECK = f"{PRIVATE}/master-key-check.txt"
 
 
 @dataclass(frozen=True)
@@ -35,27 +32,11 @@ class Forecast:
     refused: Mapping[Path, str]  # reasons why trials cannot run
 
 
-def check_master_key(out: Path, given: Path | None) -> None:
-    """Create a master key if none is given. Raises OutputError if existing results have another one."""
-    own, kept = out / MASTER_KEY, out / _CHECK
-    if given is None and not own.exists():
-        write_bytes(own, f"{generate_key(KEY_LENGTH)}\n".encode())
-    check = MasterKey(read_key(given or own)).check()
-    if not kept.exists():
-        write_bytes(kept, check.encode())
-    elif read_key(kept) != check:
-        raise OutputError(
-            f"{out} holds results with keys of another master key: give the same `master_key_file`, or "
-            "choose another folder"
-        )
-
-
 @dataclass
 class TrialFolder:
     """Trials by their folders in `out`; equal trials share a folder."""
 
     out: Path
-    master_key_file: Path | None = None
     common: Mapping[str, Any] = field(default_factory=dict)  # fields of all trials
     trials: dict[Path, Trial] = field(default_factory=dict)
 
@@ -96,9 +77,8 @@ class TrialFolder:
         return self._add(trial)
 
     def _add(self, trial: Trial) -> Path:
-        key_file = self.master_key_file or (self.out / MASTER_KEY).absolute()
         place = self.out / TRIALS / trial.identity
-        self.trials.setdefault(place, replace(trial, master_key_file=str(key_file)))
+        self.trials.setdefault(place, trial)
         return place
 
     def run(
@@ -110,7 +90,8 @@ class TrialFolder:
         """
         found: dict[Path, Outcome] = {}
         with claim_folder(self.out):
-            check_master_key(self.out, self.master_key_file)
+            if not (self.out / MASTER_KEY).exists():
+                write_bytes(self.out / MASTER_KEY, f"{generate_key(KEY_LENGTH)}\n".encode())
             for folder, trial in self.trials.items():
                 if (result := finished_result(trial, folder)) is not None:
                     found[folder] = Outcome(trial.name, folder, result, skipped=True)

@@ -256,10 +256,6 @@ def sweep(
     out: OutFolder,
     ray: Ray = None,
     cores: Cores = 1,
-    master_key_file: Annotated[
-        Path | None,
-        optional("FILE", "Key file to derive the trials' keys from (`keyss keygen --asset`).", "a new one"),
-    ] = None,
     dry_run: DryRun = False,
 ) -> None:
     """Hide over a grid of scenes, methods, options and seeds, and tabulate the results.
@@ -278,7 +274,6 @@ def sweep(
     result = keyss.sweep(
         spec,
         out,
-        master_key_file=master_key_file,
         ray=ray,
         cores=cores,
         dry_run=dry_run,
