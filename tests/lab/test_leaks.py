@@ -22,7 +22,6 @@ from keyss.lab import (
     gradient_correlation,
     leak_scores,
     look_for_secret,
-    with_the_key,
 )
 from keyss.methods import Decoder, DecoderShape, KeyssSecret
 from tiny_scenes import random_gaussians, tiny_scene
@@ -134,15 +133,6 @@ def test_a_decoder_is_searched() -> None:
     as_it_is = Attack("as it is", "", lambda model: iter([("as it is", model)]))
     searched, shown = look_for_secret(PLAINS[0], PLAINS, SECRET_IN_COVER, [search, as_it_is])[0]
     assert asdict(searched.scores) == pytest.approx(asdict(shown.scores))
-
-
-def test_the_secret_with_its_key_is_the_reference() -> None:
-    opened = _secret(15.0)  # every Gaussian that is decoded becomes one of the secret's cloud, opaque
-    stego = replace(HIDDEN, opacity_logits=HIDDEN.opacity_logits - 15)
-    rows = _look(stego, [with_the_key(lambda model: opened.reveal(model, frame="cover", force=True))])
-    assert [row.attack for row in rows.values() if row.with_key] == ["with the key"]
-    assert rows["with the key"].scores.psnr_fitted > 30
-    assert rows["with the key"].leak.gradient > 0.8
 
 
 def test_nothing_to_compare_with_is_refused() -> None:

@@ -54,7 +54,7 @@ def test_every_score_is_that_of_the_original_program(real_data: Path) -> None:
         assert str((scores["fusion"] or 0) > 0.2).lower() == row["flagged"], row["file"]
 
 
-@pytest.mark.parametrize("rate", [0.0, 0.2, 0.5])
+@pytest.mark.parametrize("rate", [0.0, 0.1, 0.2])
 def test_estimated_rates_are_those_of_the_payload(rate: float) -> None:
     scores = score_image(with_payload(smooth(), rate))
     for name in ("primary_sets", "sample_pairs", "rs"):

@@ -10,7 +10,6 @@ from .leaks.attacks import (
     decoder_attack as decoder_attack,
     file_attacks as file_attacks,
     search_embeddings as search_embeddings,
-    with_the_key as with_the_key,
 )
 from .leaks.leak_scores import (
     AttackResult as AttackResult,
@@ -21,6 +20,7 @@ from .leaks.leak_scores import (
     leak_scores as leak_scores,
     look_for_secret as look_for_secret,
 )
+from .render_time import RenderTime as RenderTime, measure_render_time as measure_render_time
 from .robustness.changes import (
     Change as Change,
     cropping as cropping,
@@ -43,7 +43,6 @@ from .robustness.survival import (
     transform as transform,
 )
 from .sinkhorn import composite_score as composite_score, sinkhorn_3d as sinkhorn_3d
-from .speed import SpeedResult as SpeedResult, measure_speed as measure_speed
 from .stealth.confirmation import candidate_scores as candidate_scores, changed_low_bits as changed_low_bits
 from .stealth.judging import judge as judge, stealth_statistics as stealth_statistics
 from .stegexpose import score_image as score_image, stegexpose_auc as stegexpose_auc

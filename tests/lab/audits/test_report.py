@@ -80,7 +80,7 @@ def test_numbers_of_every_part_are_shown(page: Parsed, data: dict[str, Any]) -> 
     shown += [f"{parameters['sinkhorn']['sum']:.4f}", f"{parameters['score']:.2f}"]
     shown += [f"{data['stegexpose']['control']['auc']:.2f}"]
     shown += [f"{robustness[1]['secrets'][1]['psnr']:.2f}"]
-    shown += [f"{data['speed']['render']['stego']['ratio']:.2f}×", "does not open", "Mean over 3 seeds."]
+    shown += [f"{data['speed']['stego model']['ratio']:.2f}×", "does not open", "Mean over 3 seeds."]
     assert [number for number in shown if number.replace("-", "−") not in page.text] == []
     assert "16 bits a number" in page.text
 

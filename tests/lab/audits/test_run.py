@@ -14,7 +14,7 @@ import torch
 import keyss
 from keyss import Secret
 from keyss.core import InputError, Interrupted, OutputError, UsageError, WrongKeyError
-from keyss.lab import SpeedResult
+from keyss.lab import RenderTime
 from keyss.lab.audits import Audit, audit, read_audit
 from lab.audits.audited import KEYS
 from test_api import ANY, write_nerfstudio
@@ -42,10 +42,10 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Two parts that only note that they were called; the second can be told to fail."""
     called: list[str] = []
 
-    def speed(subject: Any, seed: int, progress: Any) -> tuple[SpeedResult, Any]:
+    def speed(subject: Any, seed: int, progress: Any) -> tuple[dict[str, RenderTime], Any]:
         called.append("speed")
         progress(1, 2)
-        result = SpeedResult({}, (), {"stego": len(subject.stego)})
+        result = {"stego model": RenderTime(len(subject.stego), 1.0)}
         return result, {"a.png": torch.zeros(4, 5, 3, dtype=torch.uint8)}
 
     def leaks(subject: Any, seed: int, progress: Any) -> tuple[Any, Any]:
@@ -58,10 +58,10 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return called
 
 
-def gaussians_of(found: Audit) -> int:
+def gaussians_of(found: Audit) -> float:
     """What the first of the parts noted."""
     assert found.speed is not None
-    return found.speed.bytes["stego"]
+    return found.speed["stego model"].seconds
 
 
 def test_it_writes_what_the_parts_found(run: Path, calls: list[str]) -> None:

@@ -117,14 +117,6 @@ def test_each_threshold(fine: Data, measure: str, place: str, within: Any, beyon
     assert judged(changed(fine, (place, beyond)))[measure].word == word
 
 
-def test_with_the_key_the_secret_is_expected_to_show(fine: Data) -> None:
-    row = fine["leaks"][0][1]
-    row["best_leak"] |= {"psnr_fitted": 20.0, "ssim_fitted": 0.7}
-    assert judged(changed(fine))["leaks without the key"].word == "visible"
-    row["with_key"] = True
-    assert judged(changed(fine))["leaks without the key"].word == "fine"
-
-
 def test_what_was_not_measured_is_not_judged(fine: Data) -> None:
     parts = ("images", "wrong_key", "leaks", "parameters", "stealth", "stegexpose", "robustness", "speed")
     assert judged(changed(fine, *((part, None) for part in parts))) == {}

@@ -13,15 +13,15 @@ from keyss._version import __version__
 from keyss.core import Interrupted, UsageError, import_extra, signal_of
 from keyss.files import write_bytes
 from keyss.files.images import png_bytes
-from keyss.lab.audits.parts import NEED_A_3DGS_MODEL, PARTS, PartProgress, subject_of
+from keyss.lab.audits.parts import NEED_A_3DGS_MODEL, PARTS, PartProgress
 from keyss.lab.audits.record import AUDIT, PICTURES, Audit, AuditedRun, read_audit
-from keyss.methods import registry
+from keyss.lab.audits.subject import Subject
 from keyss.progress import Reporter
 from keyss.rendering import Backend, resolve_device
 from keyss.runs import read_record, write_record
 from keyss.runs.files import REPORT, PathLike
 from keyss.runs.folder import RunFolder, write_again
-from keyss.runs.open_run import HidingRun, open_run
+from keyss.runs.open_run import open_run
 
 EXTRA = ("jinja2", "ot", "sklearn")
 KEPT = ("hide", "demo", "controls")  # stages of a run whose files an audit keeps
@@ -62,18 +62,17 @@ def audit(
         import_extra(module, "audit", "audit a run")
     started, reporter = time.monotonic(), reporter or Reporter()
     opened = open_run(run, keys)
-    standard = registry.get(opened.config.method).capabilities.standard
-    if impossible := sorted(set(only) & NEED_A_3DGS_MODEL) if not standard else []:
+    subject = Subject(opened, resolve_device(device), given_original=original)
+    if impossible := sorted(set(only) & NEED_A_3DGS_MODEL) if not subject.standard else []:
         raise UsageError(
             f"the method {opened.config.method} does not publish a 3DGS model, which "
             f"{' and '.join(impossible)} measure: leave out `only`, or name other parts"
         )
-    target = resolve_device(device)
     settings = {"original": original and os.path.realpath(original), "controls": controls, "only": only}
     folder = RunFolder(
         opened.folder,
         "audit",
-        settings | {"seed": seed, "device": target.type, "payloads": opened.config.payloads},
+        settings | {"seed": seed, "device": subject.device.type, "payloads": opened.config.payloads},
         onto=KEPT,
         writes=(AUDIT, REPORT),
         overwrite=overwrite,
@@ -82,13 +81,11 @@ def audit(
     from keyss.lab.audits.report import report_bytes
 
     with folder.work(), _resumable(folder.checkpoints):
-        subject = subject_of(opened, original, controls, seed, target, reporter, folder)
+        seeds = [opened.config.options.fit.seed_of(f"control {seed + index}") for index in range(controls)]
+        subject.fit_controls(seeds, folder, reporter)
         record, pictures = folder.checkpoints / "audit.json", folder.checkpoints / "pictures"
-        if record.exists():
-            result = read_record(record, Audit)
-        else:
-            result = _nothing_measured(opened, subject.seeds, standard)
-        chosen = [name for name in PARTS if _is_chosen(name, only, standard)]
+        result = read_record(record, Audit) if record.exists() else _nothing_measured(subject, seeds)
+        chosen = [name for name in PARTS if _is_chosen(name, only, subject.standard)]
         for index, name in enumerate(chosen):
             if getattr(result, name) is not None:
                 continue
@@ -133,7 +130,8 @@ def _is_chosen(name: str, only: Sequence[str], standard: bool) -> bool:
     return (standard or name not in NEED_A_3DGS_MODEL) and (not only or name in only)
 
 
-def _nothing_measured(run: HidingRun, seeds: tuple[int, ...], standard: bool) -> Audit:
+def _nothing_measured(subject: Subject, seeds: Sequence[int]) -> Audit:
+    run = subject.run
     cover, *secrets = run.sources
     return Audit(
         keyss=__version__,
@@ -145,9 +143,9 @@ def _nothing_measured(run: HidingRun, seeds: tuple[int, ...], standard: bool) ->
             secrets=tuple(secrets),
             width=run.config.views.width,
             gaussians=len(run.stego),
-            standard=standard,
+            standard=subject.standard,
         ),
-        controls=seeds,
+        controls=tuple(seeds),
         wrong_key=run.metrics.wrong_key,
         chance_level=run.metrics.chance_level,
     )

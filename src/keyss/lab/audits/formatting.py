@@ -49,9 +49,5 @@ def numbered(name: str, index: int, count: int) -> str:
     return f"{name} {index + 1}" if count > 1 else name
 
 
-def megabytes(value: float) -> str:
-    return f"{number(value / 1e6, 2)} MB"
-
-
 def seconds_text(value: float) -> str:
     return f"{number(value / 60, 1)} min" if value >= 100 else f"{significant(value)} s"

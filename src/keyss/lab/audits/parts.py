@@ -2,25 +2,15 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
-from functools import partial
-from pathlib import Path
+from dataclasses import replace
 from statistics import fmean
 from typing import Any
 
-import torch
 from torch import Tensor
 
-from keyss.core.errors import UsageError
-from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
-from keyss.files.models import read_model
-from keyss.fitting.config import FitConfig
 from keyss.fitting.image_metrics import mean_quality, view_quality
-from keyss.fitting.plain import fit_scene
 from keyss.lab.audits.formatting import numbered
 from keyss.lab.audits.record import (
     ImageComparison,
@@ -29,106 +19,20 @@ from keyss.lab.audits.record import (
     ParametersResult,
     StegExposeResult,
 )
+from keyss.lab.audits.subject import Subject
 from keyss.lab.distances import against_controls
-from keyss.lab.leaks.attacks import decoder_attack, file_attacks, with_the_key
+from keyss.lab.leaks.attacks import decoder_attack, file_attacks
 from keyss.lab.leaks.leak_scores import AttackResult, look_for_secret
+from keyss.lab.render_time import RenderTime, measure_render_time
 from keyss.lab.robustness.survival import ChangeResult, measure_robustness
 from keyss.lab.sinkhorn import composite_score, sinkhorn_3d
-from keyss.lab.speed import SpeedResult, measure_speed
 from keyss.lab.stealth.judging import StealthResult, judge
 from keyss.lab.stegexpose import stegexpose_auc
 from keyss.lab.two_sample import auc_beside_controls
-from keyss.measure.hide_quality import in_cover
 from keyss.measure.renders import renders_of, select_views
 from keyss.progress import Reporter
-from keyss.runs.files import CONTROLS, as_model, stego_in
-from keyss.runs.folder import RunFolder
-from keyss.runs.open_run import HidingRun
 
 PICTURED_VIEWS = 3
-
-
-@dataclass(frozen=True)
-class AuditSubject:
-    """The input of the parts of an audit; models on `device`."""
-
-    run: HidingRun
-    scenes: tuple[Scene, ...]  # the cover, then the secrets, each in its own frame
-    in_cover: tuple[Scene, ...]  # the secrets with their test cameras in the cover's frame
-    stego: Gaussians
-    revealed: tuple[Gaussians, ...]  # the secrets, in their own frames
-    original: Gaussians  # plain model of the cover
-    baselines: tuple[Gaussians | None, ...]  # plain models of the secrets, if there are any
-    controls: tuple[Gaussians, ...]  # plain models of the cover from other seeds
-    seeds: tuple[int, ...]  # seeds of the controls
-    device: torch.device
-
-
-def subject_of(
-    run: HidingRun,
-    original: Path | str | None,
-    controls: int,
-    seed: int,
-    device: torch.device,
-    reporter: Reporter,
-    folder: RunFolder,
-) -> AuditSubject:
-    """Read, reveal and fit the input of an audit; fitted models are kept in the run's `folder` for reuse.
-
-    `original`: a plain model of the cover, by default the run's own. `controls`: number of models to train,
-    with seeds derived from the run's and `seed`. Raises UsageError without a plain model of the cover.
-    """
-    scenes = run.scenes()
-    plain, *_ = run.plain_models()
-    _, *baselines = run.baselines()
-    if original is not None:
-        plain = as_model(original)
-    if plain is None:
-        raise UsageError(f"{run.folder} has no plain model of the cover to compare with: give `original`")
-    stego = run.stego.to(device)
-    config = run.config.options.fit
-    if original is not None or run.config.models_given[0]:  # the run's maximum is not for this model
-        config = replace(config, max_gaussians=max(len(plain), 16))
-    seeds = tuple(run.config.options.fit.seed_of(f"control {seed + index}") for index in range(controls))
-    return AuditSubject(
-        run=run,
-        scenes=tuple(scenes),
-        in_cover=tuple(in_cover(*pair, scenes[0]) for pair in zip(run.opened, scenes[1:], strict=True)),
-        stego=stego,
-        revealed=tuple(secret.reveal(stego).to(device) for secret in run.opened),
-        original=plain.to(device),
-        baselines=tuple(None if model is None else model.to(device) for model in baselines),
-        controls=tuple(
-            _plain_model(scenes[0], replace(config, seed=own), folder, device, reporter).to(device)
-            for own in seeds
-        ),
-        seeds=seeds,
-        device=device,
-    )
-
-
-def _plain_model(
-    scene: Scene, config: FitConfig, folder: RunFolder, device: torch.device, reporter: Reporter
-) -> Gaussians:
-    """Fit a plain model of a scene, or read it from the run's folder."""
-    made_of = json.dumps({"scene": scene.digest(), "config": asdict(config)}, sort_keys=True)
-    name = f"seed-{config.seed}-{hashlib.sha256(made_of.encode()).hexdigest()[:12]}"
-    model = f"{CONTROLS}/{name}.ply"
-    if (folder.path / model).exists():
-        return read_model(folder.path / model)
-    checkpoint = folder.checkpoints / f"{name}.safetensors"
-    result = fit_scene(
-        scene,
-        config,
-        device=device,
-        title=f"plain model of the cover, seed {config.seed}",
-        checkpoint=checkpoint,
-        resume=True,
-        reporter=reporter,
-    )
-    folder.keep("controls", model, result.gaussians)
-    checkpoint.unlink(missing_ok=True)
-    return result.gaussians
 
 
 class PartProgress:
@@ -155,10 +59,10 @@ class PartProgress:
 
 Pictures = dict[str, Tensor]  # [H, W, 3] uint8 by file name
 # Returns a field of `Audit`, and pictures.
-AuditPart = Callable[[AuditSubject, int, PartProgress], tuple[Any, Pictures]]
+AuditPart = Callable[[Subject, int, PartProgress], tuple[Any, Pictures]]
 
 
-def images(subject: AuditSubject, seed: int, progress: PartProgress) -> tuple[ImagesResult, Pictures]:
+def images(subject: Subject, seed: int, progress: PartProgress) -> tuple[ImagesResult, Pictures]:
     """Compare cover and secrets with the test views, and plain models as baselines; keep some images."""
     models = [subject.stego, *subject.revealed]
     plains = [subject.original, *subject.baselines]
@@ -201,7 +105,7 @@ def _compare(renders: Sequence[tuple[str, Tensor]], scene: Scene) -> ImageCompar
     return ImageComparison(views, mean_quality(list(views.values())))
 
 
-def parameters(subject: AuditSubject, seed: int, progress: PartProgress) -> tuple[ParametersResult, Pictures]:
+def parameters(subject: Subject, seed: int, progress: PartProgress) -> tuple[ParametersResult, Pictures]:
     """Distances of the parameters from plain models: published 3D-Sinkhorn, Wasserstein, a classifier."""
     original, stego, controls = subject.original, subject.stego, subject.controls
     progress(0, 3)
@@ -217,14 +121,14 @@ def parameters(subject: AuditSubject, seed: int, progress: PartProgress) -> tupl
     return ParametersResult(sinkhorn, between, score, distances, two_sample), {}
 
 
-def stealth(subject: AuditSubject, seed: int, progress: PartProgress) -> tuple[StealthResult, Pictures]:
+def stealth(subject: Subject, seed: int, progress: PartProgress) -> tuple[StealthResult, Pictures]:
     """Compare statistics of the file with plain models, and try to confirm guessed secrets."""
     progress(0, 1)
     baselines, original = subject.baselines, subject.original
     return judge(subject.stego, subject.controls, original=original, candidates=baselines), {}
 
 
-def stegexpose(subject: AuditSubject, seed: int, progress: PartProgress) -> tuple[StegExposeResult, Pictures]:
+def stegexpose(subject: Subject, seed: int, progress: PartProgress) -> tuple[StegExposeResult, Pictures]:
     """StegExpose on renders of the stego model and of plain models."""
     cover = subject.scenes[0]
     views = select_views(cover.views)
@@ -239,7 +143,7 @@ def stegexpose(subject: AuditSubject, seed: int, progress: PartProgress) -> tupl
 
 
 def leaks(
-    subject: AuditSubject, seed: int, progress: PartProgress
+    subject: Subject, seed: int, progress: PartProgress
 ) -> tuple[tuple[tuple[AttackResult, ...], ...], Pictures]:
     """Attacks without the key on each secret, with the file or with its decoder."""
     results: list[tuple[AttackResult, ...]] = []
@@ -249,7 +153,6 @@ def leaks(
         attacks = file_attacks(subject.scenes[0], seed=seed)
         if opened.decode is not None:
             attacks.append(decoder_attack(opened.decode, opened.key_size, seed=seed))
-            attacks.append(with_the_key(partial(opened.reveal, frame="cover", force=True)))
         rows, shown = look_for_secret(subject.stego, subject.controls, secret, attacks)
         files = [f"leak-{index + 1}-{number:02}.png" for number in range(1, len(rows) + 1)]
         pictures |= {file: shown[row.attack] for file, row in zip(files, rows, strict=True)}
@@ -258,7 +161,7 @@ def leaks(
 
 
 def robustness(
-    subject: AuditSubject, seed: int, progress: PartProgress
+    subject: Subject, seed: int, progress: PartProgress
 ) -> tuple[tuple[ChangeResult, ...], Pictures]:
     """PSNR loss of the cover and the secrets when the stego model changes."""
     cover, *secrets = subject.scenes
@@ -268,19 +171,16 @@ def robustness(
     return tuple(rows), {}
 
 
-def speed(subject: AuditSubject, seed: int, progress: PartProgress) -> tuple[SpeedResult, Pictures]:
-    """Rendering and revealing times, and file sizes."""
+def speed(subject: Subject, seed: int, progress: PartProgress) -> tuple[dict[str, RenderTime], Pictures]:
+    """Rendering times of the stego model and of the revealed secrets."""
     models = [subject.stego, *subject.revealed]
     plains = [subject.original, *subject.baselines]
-    result = measure_speed(
-        stego_in(subject.run.folder),
-        subject.run.openers,
-        subject.scenes,
-        [plain if plain is not None else model for plain, model in zip(plains, models, strict=True)],
-        device=subject.device,
-        progress=progress,
-    )
-    return result, {}
+    found: dict[str, RenderTime] = {}
+    for index, (scene, model, plain) in enumerate(zip(subject.scenes, models, plains, strict=True)):
+        progress(index, len(models))
+        name = numbered("secret", index - 1, len(models) - 1) if index else "stego model"
+        found[name] = measure_render_time(model, model if plain is None else plain, scene)
+    return found, {}
 
 
 NEED_A_3DGS_MODEL = frozenset({"parameters", "stealth", "leaks", "robustness"})

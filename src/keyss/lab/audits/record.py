@@ -10,9 +10,9 @@ from keyss.fitting.image_metrics import ImageQuality
 from keyss.lab.auc import Auc
 from keyss.lab.distances import AttributeDistance
 from keyss.lab.leaks.leak_scores import AttackResult
+from keyss.lab.render_time import RenderTime
 from keyss.lab.robustness.survival import ChangeResult
 from keyss.lab.sinkhorn import Sinkhorn3D
-from keyss.lab.speed import SpeedResult
 from keyss.lab.stealth.judging import StealthResult
 from keyss.lab.two_sample import TwoSampleAucs
 from keyss.measure.hide_quality import WrongKeys
@@ -100,7 +100,7 @@ class Audit:
     stegexpose: StegExposeResult | None = None
     leaks: tuple[tuple[AttackResult, ...], ...] | None = None  # attacks on each secret
     robustness: tuple[ChangeResult, ...] | None = None
-    speed: SpeedResult | None = None
+    speed: dict[str, RenderTime] | None = None
 
 
 def read_audit(run: Path) -> Audit:

@@ -30,7 +30,7 @@ _PARTS = {
     "parameters": ("statistics", "Statistics of the model"),
     "stegexpose": ("renders", "StegExpose on renders"),
     "robustness": ("robustness", "Robustness"),
-    "speed": ("speed", "Speed and files"),
+    "speed": ("speed", "Speed"),
 }
 
 

@@ -8,31 +8,25 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, replace
-from functools import cached_property
-from pathlib import Path
+from dataclasses import replace
 from statistics import fmean
 
 from keyss.channels import is_appended
-from keyss.core.errors import InputError, UsageError, import_extra
+from keyss.core.errors import UsageError, import_extra
 from keyss.core.gaussians import Gaussians
 from keyss.core.picture_network import DecodedGaussians
-from keyss.core.scene import Scene
-from keyss.files.models import read_model
 from keyss.lab.audits import PARTS
 from keyss.lab.audits.audit_run import EXTRA
+from keyss.lab.audits.subject import Subject
+from keyss.lab.render_time import measure_render_time
 from keyss.lab.robustness.changes import Change, opacity_pruning, purification, random_pruning
 from keyss.lab.robustness.survival import converters, measure_robustness
 from keyss.lab.sinkhorn import composite_score, sinkhorn_3d
-from keyss.lab.speed import render_time
 from keyss.lab.stealth.judging import judge
 from keyss.lab.stegexpose import stegexpose_auc
 from keyss.lab.two_sample import two_sample_auc
 from keyss.measure.renders import renders_of, select_views
-from keyss.methods import registry
-from keyss.rendering import Backend, resolve_device
 from keyss.runs.files import HANDED, stego_in
-from keyss.runs.open_run import HidingRun
 
 Numbers = dict[str, float | str]
 
@@ -46,113 +40,63 @@ _ROLES = ("cover", "secret")
 _ATTRIBUTES = {"opacity": "op", "scale": "sc", "rotation": "ro", "position": "xyz", "colour": "sh"}
 
 
-@dataclass(frozen=True)
-class MeasuredTrial:
-    """A run, and data that its measures share."""
-
-    run: HidingRun
-    backend: Backend
-    controls: tuple[Path, ...] = ()  # plain models of the cover from other seeds
-
-    @cached_property
-    def scenes(self) -> list[Scene]:
-        """The cover and the secrets."""
-        return self.run.scenes()
-
-    @cached_property
-    def stego(self) -> Gaussians:
-        """The published model, on the device."""
-        return self.run.stego.to(resolve_device(self.backend))
-
-    @property
-    def standard(self) -> bool:
-        """True if the published file is a 3DGS model."""
-        return registry.get(self.run.config.method).capabilities.standard
-
-    def render_times(self, stego: Gaussians) -> Numbers:
-        """Speed of rendering the cover and the first secret, and time over plain 3DGS."""
-        models = [stego, self.run.opened[0].reveal(self.stego).to(stego.device)]
-        found: Numbers = {}
-        for role, model, plain, scene in zip(
-            _ROLES, models, self.run.plain_models(), self.scenes, strict=False
-        ):
-            beside = model if plain is None else plain.to(model.device)
-            time = render_time(model, beside, scene, rounds=_ROUNDS)
-            found |= {f"pictures/s, {role}": 1 / time.seconds, f"time over 3DGS, {role}": time.ratio}
-        return found
-
-    def robustness(self, changes: Mapping[str, Change], max_views: int = 8) -> Numbers:
-        """PSNR of the cover and the first secret after each change by name; none for lost secrets.
-
-        The name of the unchanged model is `whole`.
-        """
-        cover, *secrets = self.scenes
-        results = measure_robustness(
-            self.stego,
-            self.run.openers,
-            cover,
-            secrets,
-            changes=list(changes.values()),
-            max_views=max_views,
-        )
-        found: Numbers = {}
-        for name, result in zip(["whole", *changes], results, strict=True):
-            if result.skipped is not None:
-                found[name] = result.skipped
-            for role, quality in zip(_ROLES, (result.cover, *result.secrets), strict=False):
-                if quality is not None and quality.opens:
-                    found[f"{name}, {role}"] = quality.psnr
-        return found
-
-
-def files(trial: MeasuredTrial) -> Numbers:
+def files(subject: Subject) -> Numbers:
     """Megabytes of the published and the handed-over files."""
-    handed = (trial.run.folder / HANDED).glob("*")
+    handed = (subject.run.folder / HANDED).glob("*")
     return {
-        "published_mb": stego_in(trial.run.folder).stat().st_size / 1e6,
+        "published_mb": stego_in(subject.run.folder).stat().st_size / 1e6,
         "handed_mb": sum(path.stat().st_size for path in handed) / 1e6,
     }
 
 
-def pictures(trial: MeasuredTrial) -> Numbers:
+def pictures(subject: Subject) -> Numbers:
     """Speed of rendering the published model and the first secret."""
-    return trial.render_times(trial.stego)
+    return _render_times(subject, subject.stego)
 
 
-def rendering(trial: MeasuredTrial) -> Numbers:
+def rendering(subject: Subject) -> Numbers:
     """Speed of rendering without appended Gaussians; 1 for a published 3DGS model, else 0."""
-    return trial.render_times(own_gaussians(trial.stego)) | {"standard": float(trial.standard)}
+    times = _render_times(subject, own_gaussians(subject.stego))
+    return times | {"standard": float(subject.standard)}
 
 
-def secrecy(trial: MeasuredTrial) -> Numbers:
+def _render_times(subject: Subject, stego: Gaussians) -> Numbers:
+    models, plains = [stego, subject.revealed[0]], subject.run.plain_models()
+    found: Numbers = {}
+    for role, model, plain, scene in zip(_ROLES, models, plains, subject.scenes, strict=False):
+        beside = model if plain is None else plain.to(model.device)
+        time = measure_render_time(model, beside, scene, rounds=_ROUNDS)
+        found |= {f"pictures/s, {role}": 1 / time.seconds, f"time over 3DGS, {role}": time.ratio}
+    return found
+
+
+def secrecy(subject: Subject) -> Numbers:
     """Detection of the published model among plain models of the cover from other seeds.
 
     AUC of StegExpose on renders and, if a 3DGS model is published, mean AUC of trees that separate its
     Gaussians from the controls', and minimum p-value of its statistics, corrected for their number.
     """
-    cover = trial.scenes[0]
-    controls = [read_model(path).to(trial.stego.device) for path in trial.controls]
+    cover, stego, controls = subject.scenes[0], subject.stego, subject.controls
     views = select_views(cover.views)
-    plain, stego = (
-        [image.numpy() for _, image in renders_of(model, cover, views)]
-        for model in (controls[0], trial.stego)
-    )
-    found: Numbers = {"stegexpose": stegexpose_auc(plain, stego).auc}
-    if trial.standard:
-        found["stealth"] = judge(trial.stego, controls).least
+    renders = [
+        [image.numpy() for _, image in renders_of(model, cover, views)] for model in (controls[0], stego)
+    ]
+    found: Numbers = {"stegexpose": stegexpose_auc(*renders).auc}
+    if subject.standard:
+        found["stealth"] = judge(stego, controls).least
         with suppress(UsageError):  # too few Gaussians, or all in a corner
-            found["classifier"] = fmean(two_sample_auc(each, trial.stego).auc for each in controls)
+            found["classifier"] = fmean(two_sample_auc(each, stego).auc for each in controls)
     return found
 
 
-def survival(trial: MeasuredTrial) -> Numbers:
+def survival(subject: Subject) -> Numbers:
     """Changes in dB of cover and secret by pruning, conversion and purification; none for lost secrets."""
     tools = {(each.format, each.tool): each for each in converters()}
     changes = {"pruned": random_pruning(_LOST)}
-    if trial.standard:
+    if subject.standard:
         changes |= {format: tools[format, tool].change() for format, tool in CONVERSIONS.items()}
-        changes["purified"] = purification(trial.scenes[0], _GIVEN_UP)
-    found = trial.robustness(changes)
+        changes["purified"] = purification(subject.scenes[0], _GIVEN_UP)
+    found = _psnr_after(subject, changes)
     before = {role: found.pop(f"whole, {role}") for role in _ROLES}
     for name, value in found.items():
         if not isinstance(value, str):
@@ -160,7 +104,7 @@ def survival(trial: MeasuredTrial) -> Numbers:
     return found
 
 
-def pruning(trial: MeasuredTrial) -> Numbers:
+def pruning(subject: Subject) -> Numbers:
     """PSNR in dB of the cover and the first secret after pruning; none for lost secrets."""
     kinds = {"by opacity": opacity_pruning, "random": random_pruning}
     changes = {
@@ -168,28 +112,46 @@ def pruning(trial: MeasuredTrial) -> Numbers:
         for how, change in kinds.items()
         for share in PRUNED_SHARES
     }
-    return trial.robustness(changes, _EVERY_VIEW)
+    return _psnr_after(subject, changes, _EVERY_VIEW)
 
 
-def sinkhorn(trial: MeasuredTrial) -> Numbers:
-    """3D-Sinkhorn from the cover's plain model to the published one: sum, attributes, composite score.
+def _psnr_after(subject: Subject, changes: Mapping[str, Change], max_views: int = 8) -> Numbers:
+    """PSNR of cover and first secret after changes, by name; none for lost secrets.
 
-    Raises InputError without a plain model.
+    The name of the unchanged model is `whole`.
     """
-    run = trial.run
-    plain = run.plain_models()[0]
-    if plain is None:
-        raise InputError(f"{run.folder}: expected the plain model of the cover, found none")
-    distances = sinkhorn_3d(plain, own_gaussians(run.stego))
-    psnr = fmean(each.psnr for each in run.metrics.secrets)
-    score = composite_score(run.metrics.cover.psnr, psnr, distances.sum)
+    cover, *secrets = subject.scenes
+    results = measure_robustness(
+        subject.stego,
+        subject.run.openers,
+        cover,
+        secrets,
+        changes=list(changes.values()),
+        max_views=max_views,
+    )
+    found: Numbers = {}
+    for name, result in zip(["whole", *changes], results, strict=True):
+        if result.skipped is not None:
+            found[name] = result.skipped
+        for role, quality in zip(_ROLES, (result.cover, *result.secrets), strict=False):
+            if quality is not None and quality.opens:
+                found[f"{name}, {role}"] = quality.psnr
+    return found
+
+
+def sinkhorn(subject: Subject) -> Numbers:
+    """3D-Sinkhorn from the cover's plain model to the published one: sum, attributes, composite score."""
+    distances = sinkhorn_3d(subject.original, own_gaussians(subject.stego))
+    metrics = subject.run.metrics
+    secret = fmean(each.psnr for each in metrics.secrets)
+    score = composite_score(metrics.cover.psnr, secret, distances.sum)
     found: Numbers = {f"sinkhorn {short}": getattr(distances, name) for name, short in _ATTRIBUTES.items()}
     return found | {"sinkhorn": distances.sum, "score": score}
 
 
 # Modules of optional packages that measures import.
 _MODULES = {"secrecy": ("sklearn",), "sinkhorn": ("ot",), **dict.fromkeys(PARTS, EXTRA)}
-MEASURES: Mapping[str, Callable[[MeasuredTrial], Numbers]] = {
+MEASURES: Mapping[str, Callable[[Subject], Numbers]] = {
     each.__name__: each for each in (files, pictures, secrecy, survival, rendering, pruning, sinkhorn)
 }
 

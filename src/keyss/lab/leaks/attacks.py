@@ -49,7 +49,6 @@ class Attack:
     name: str
     sentence: str
     show: Callable[[Gaussians], Variants]
-    with_key: bool = False  # not an attack, but the reference: the revealed secret
 
 
 def file_attacks(cover: Scene, *, cover_views: int = 32, seed: int = 0) -> list[Attack]:
@@ -159,16 +158,6 @@ def search_embeddings(
             scored.append((float(exchange(direction)), F.normalize(direction.detach(), dim=0).cpu()))
     scored.sort(key=lambda pair: -pair[0])
     return torch.stack([embedding for _, embedding in scored])
-
-
-def with_the_key(reveal: Callable[[Gaussians], Gaussians]) -> Attack:
-    """The reference: the secret revealed with its key, in the cover's frame."""
-    return Attack(
-        "with the key",
-        "Not an attack: the secret itself.",
-        lambda model: iter([("revealed", reveal(model))]),
-        with_key=True,
-    )
 
 
 def _make_opaque(model: Gaussians) -> Gaussians:

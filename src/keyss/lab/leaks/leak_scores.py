@@ -119,7 +119,6 @@ class AttackResult:
 
     attack: str
     sentence: str
-    with_key: bool  # not an attack, but the revealed secret
     scores: LeakScores  # maximum of each score over the variants
     leak: LeakScores  # `scores` minus those of the controls
     best: str  # variant with the maximum `LeakScores.evidence`, which is pictured and judged
@@ -167,9 +166,7 @@ def look_for_secret(
         best = max(leaks, key=lambda label: leaks[label].evidence())
         scored = LeakScores.combine(max, [own for own, _ in variants.values()])
         results.append(
-            AttackResult(
-                attack.name, attack.sentence, attack.with_key, scored, scored - control, best, leaks[best]
-            )
+            AttackResult(attack.name, attack.sentence, scored, scored - control, best, leaks[best])
         )
         pictures[attack.name] = _side_by_side([variants[best][1], of_controls[0][best][1], views[0].image])
     return results, pictures

@@ -22,11 +22,12 @@ from keyss.api.fit import fit
 from keyss.api.hide import hide
 from keyss.api.hide_arguments import Secret
 from keyss.core import ViewOptions
-from keyss.files import write_bytes
+from keyss.files import read_model, write_bytes
 from keyss.fitting import FitConfig
 from keyss.keys import MasterKey, read_key
 from keyss.lab.audits import PARTS, audit
-from keyss.lab.audits.trial_measures import MEASURES, MeasuredTrial
+from keyss.lab.audits.subject import Subject
+from keyss.lab.audits.trial_measures import MEASURES
 from keyss.methods import MethodOptions, registry
 from keyss.methods.base import Plan, role_of
 from keyss.methods.plain_models import plain_stage
@@ -208,8 +209,9 @@ def _measure(trial: Trial, names: list[str], folder: Path, reporter: Reporter) -
         for part in parts:
             found |= flat(msgspec.to_builtins(getattr(audited, part)), f"audit.{part}")
     if others := [name for name in names if name not in PARTS]:
-        controls = tuple(_place(folder, each) for each in trial.controls)
-        measured = MeasuredTrial(open_run(run, keys), trial.device, controls)
+        device = resolve_device(trial.device)
+        controls = [read_model(_place(folder, each)).to(device) for each in trial.controls]
+        subject = Subject(open_run(run, keys), device, controls)
         for name in others:
-            found |= {f"{name}.{each}": value for each, value in MEASURES[name](measured).items()}
+            found |= {f"{name}.{each}": value for each, value in MEASURES[name](subject).items()}
     return found
