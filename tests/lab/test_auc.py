@@ -1,4 +1,4 @@
-"""AUCs against pairs counted one by one; intervals by hand and by how often they hold the truth."""
+"""AUCs against pairs counted one by one; an interval by hand."""
 
 from __future__ import annotations
 
@@ -17,7 +17,9 @@ SCORES = st.lists(st.sampled_from([None, math.nan, -0.5, 0.0, 0.1, 0.2, 0.7, 1e3
 
 @given(SCORES, SCORES)
 @settings(deadline=None)
-def test_the_auc_counts_pairs_in_order(negatives: list[float | None], positives: list[float | None]) -> None:
+def test_auc_is_the_share_of_ordered_pairs(
+    negatives: list[float | None], positives: list[float | None]
+) -> None:
     def number(score: float | None) -> float:
         return -math.inf if score is None or math.isnan(score) else score
 
@@ -29,7 +31,7 @@ def test_the_auc_counts_pairs_in_order(negatives: list[float | None], positives:
     assert found.auc - 1e-12 <= found.high <= 1
 
 
-def test_three_against_three_by_hand() -> None:
+def test_delong_interval_by_hand() -> None:
     found = auc_between([1, 2, 3], [2, 3, 4])
     components = [1 / 2, 5 / 6, 1]  # of 2, 3, 4 against the others; those of 3, 2, 1 are the same
     variance = 2 * np.var(components, ddof=1) / 3
@@ -40,6 +42,6 @@ def test_three_against_three_by_hand() -> None:
 
 
 @pytest.mark.parametrize(("negatives", "positives"), [([], [1.0]), ([1.0], []), ([], [])])
-def test_a_class_without_scores_is_refused(negatives: list[float], positives: list[float]) -> None:
+def test_empty_class(negatives: list[float], positives: list[float]) -> None:
     with pytest.raises(UsageError, match="both classes"):
         auc_between(negatives, positives)

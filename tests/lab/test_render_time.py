@@ -6,7 +6,7 @@ from keyss.lab import measure_render_time
 from tiny_scenes import random_gaussians, tiny_scene
 
 
-def test_a_model_takes_as_long_as_itself_and_longer_than_a_smaller_one() -> None:
+def test_ratio_of_equal_and_of_smaller_models() -> None:
     scene, model = tiny_scene(0, views=8), random_gaussians(4000)
     same = measure_render_time(model, model, scene, rounds=4)
     more = measure_render_time(model, model[:10], scene, rounds=4)

@@ -38,7 +38,7 @@ def with_payload(image: Pixels, rate: float) -> Pixels:
     return np.where(random.random(image.shape) < rate, image & 254 | bits, image)
 
 
-def test_every_score_is_that_of_the_original_program(real_data: Path) -> None:
+def test_scores_of_the_original_program(real_data: Path) -> None:
     folder = real_data / "stegexpose"
     with (folder / "reference_scores.csv").open() as file:
         expected = list(csv.DictReader(file))
@@ -55,13 +55,13 @@ def test_every_score_is_that_of_the_original_program(real_data: Path) -> None:
 
 
 @pytest.mark.parametrize("rate", [0.0, 0.1, 0.2])
-def test_estimated_rates_are_those_of_the_payload(rate: float) -> None:
+def test_estimated_embedding_rates(rate: float) -> None:
     scores = score_image(with_payload(smooth(), rate))
     for name in ("primary_sets", "sample_pairs", "rs"):
         assert scores[name] == pytest.approx(rate, abs=0.1), name
 
 
-def test_images_that_the_original_does_not_accept() -> None:
+def test_unsuitable_images() -> None:
     image = smooth((296, 297))
     assert score_image(image)["chi_square"] is not None
     assert score_image(image[:-1, :-2])["chi_square"] is None
@@ -86,7 +86,7 @@ def test_replaced_last_bits_are_detected() -> None:
         np.zeros((0, 4, 3), dtype=np.uint8),
     ],
 )
-def test_other_arrays_are_refused(image: npt.NDArray[np.uint8]) -> None:
+def test_invalid_arrays(image: npt.NDArray[np.uint8]) -> None:
     with pytest.raises(UsageError, match="uint8"):
         score_image(image)
 

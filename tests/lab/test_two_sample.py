@@ -26,11 +26,11 @@ MODEL = lifelike(800).with_sh_degree(1)
 OTHER = lifelike(800, seed=1).with_sh_degree(1)
 
 
-def test_a_model_cannot_be_told_from_itself() -> None:
+def test_auc_of_a_model_against_itself() -> None:
     assert two_sample_auc(MODEL, MODEL) == Auc(0.5, 0.5, 0.5)
 
 
-def test_nor_from_independent_samples_of_the_same_and_it_is_not_sure() -> None:
+def test_auc_of_independent_samples() -> None:
     found = two_sample_auc(MODEL, rescaled_quaternions(OTHER))
     width = found.high - found.low
     assert found.auc == pytest.approx(0.5, abs=0.75 * width)  # 3 standard errors, for any random draw
@@ -47,11 +47,11 @@ def test_nor_from_independent_samples_of_the_same_and_it_is_not_sure() -> None:
         (stronger_harmonics, 0.99),
     ],
 )
-def test_what_differs_is_told_apart(change: Callable[[Gaussians], Gaussians], least: float) -> None:
+def test_changed_models_are_separated(change: Callable[[Gaussians], Gaussians], least: float) -> None:
     assert two_sample_auc(MODEL, change(OTHER)).low > least
 
 
-def test_delong_is_what_it_is_defined_as() -> None:
+def test_delong_against_its_definition() -> None:
     generator = np.random.default_rng(0)
     negatives = generator.standard_normal(40).round(1)
     positives = (0.7 + generator.standard_normal(60)).round(1)  # rounded, so that there are ties
@@ -61,7 +61,7 @@ def test_delong_is_what_it_is_defined_as() -> None:
     assert delong(negatives, positives) == pytest.approx((expected, variance), rel=1e-12)
 
 
-def test_another_way_to_write_the_same_gaussians_has_the_same_features() -> None:
+def test_features_ignore_quaternion_sign_and_axis_order() -> None:
     """Negated quaternions; axes in another order, which a turn by 90 degrees about one of them makes good."""
     w, x, y, z = MODEL.quats.unbind(1)
     turned = torch.stack([w - z, x + y, y - x, w + z], dim=1)  # q (1, 0, 0, 1): x and y change places

@@ -1,4 +1,4 @@
-"""A small run that was really hidden and audited, and changes of its record."""
+"""A small audited run, and changes of its record."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ from test_api import CONFIG, write_nerfstudio
 from tiny_scenes import random_gaussians, tiny_scene
 
 KEYS = ("the key of a treasure", "the key of a map")
-# There are decoders then, and so there is something to be measured of wrong keys.
+# A method with decoders, for measures of wrong keys.
 JOINT = small("published", CONFIG.fit)
 
 
 def audited_run(root: Path) -> None:
-    """`run`: two secrets in a garden, 40 x 30 pixels, audited by all parts; one converter is missing."""
+    """Make `run`: two secrets in a garden, 40 x 30 pixels, audited by all parts; one converter is missing."""
     scenes = [
         write_nerfstudio(root / name, tiny_scene(seed))
         for seed, name in enumerate(("garden", "treasure", "map"))

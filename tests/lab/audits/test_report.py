@@ -60,9 +60,7 @@ def sections_of(page: Parsed) -> list[str]:
     return [name for name in page.values("id") if name in SECTIONS]
 
 
-def test_every_section_is_there_once_and_linked(
-    data: dict[str, Any], run_folder: Path, tmp_path: Path
-) -> None:
+def test_sections_and_links(data: dict[str, Any], run_folder: Path, tmp_path: Path) -> None:
     page = parsed(run_with(run_folder, tmp_path, data))
     ids = page.values("id")
     assert sections_of(page) == SECTIONS
@@ -70,7 +68,7 @@ def test_every_section_is_there_once_and_linked(
     assert {link[1:] for link in page.values("href")} <= set(ids)
 
 
-def test_numbers_of_every_part_are_shown(page: Parsed, data: dict[str, Any]) -> None:
+def test_numbers_of_every_part(page: Parsed, data: dict[str, Any]) -> None:
     images, parameters, robustness = data["images"], data["parameters"], data["robustness"]
     psnrs = [model["images"]["mean"]["psnr"] for model in images["models"]]
     psnrs += [images["models"][0]["baseline"]["mean"]["psnr"]]
@@ -85,7 +83,7 @@ def test_numbers_of_every_part_are_shown(page: Parsed, data: dict[str, Any]) -> 
     assert "16 bits a number" in page.text
 
 
-def test_nothing_is_loaded_from_elsewhere(page: Parsed, run_folder: Path) -> None:
+def test_no_external_resources(page: Parsed, run_folder: Path) -> None:
     assert page.loads() == []
     html = (run_folder / "private" / "report.html").read_text()
     assert "@import" not in html
@@ -94,7 +92,7 @@ def test_nothing_is_loaded_from_elsewhere(page: Parsed, run_folder: Path) -> Non
     assert "https://" not in html
 
 
-def test_the_policy_allows_the_one_script_and_nothing_else(page: Parsed) -> None:
+def test_content_security_policy(page: Parsed) -> None:
     (policy,) = (value for value in page.values("content") if "default-src" in value)
     (script,) = page.scripts
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
@@ -104,14 +102,12 @@ def test_the_policy_allows_the_one_script_and_nothing_else(page: Parsed) -> None
     assert page.handlers() == []
 
 
-def test_the_same_audit_gives_the_same_bytes(run_folder: Path, tmp_path: Path) -> None:
+def test_report_is_deterministic(run_folder: Path, tmp_path: Path) -> None:
     again = run_with(run_folder, tmp_path, found_in(run_folder))
     assert write_report(again).read_bytes() == write_report(run_folder).read_bytes()
 
 
-def test_parts_that_did_not_run_are_left_out_and_named(
-    run_folder: Path, data: dict[str, Any], tmp_path: Path
-) -> None:
+def test_missing_parts(run_folder: Path, data: dict[str, Any], tmp_path: Path) -> None:
     for name in PARTS:
         page = parsed(run_with(run_folder, tmp_path, data | {name: None}))
         assert set(SECTIONS) - set(sections_of(page)) == set(PARTS[name])
@@ -123,7 +119,7 @@ def test_parts_that_did_not_run_are_left_out_and_named(
 @pytest.mark.parametrize(
     "name", ["../outside.png", "/etc/passwd", "link.png", "missing.png", "drawing.png", "a\0b.png", ""]
 )
-def test_only_the_audits_own_pictures_are_embedded(tmp_path: Path, name: str) -> None:
+def test_foreign_and_broken_pictures(tmp_path: Path, name: str) -> None:
     folder = tmp_path / "pictures"
     folder.mkdir()
     (folder / "drawing.png").write_text('<svg xmlns="http://www.w3.org/2000/svg"><script/></svg>')
@@ -134,14 +130,14 @@ def test_only_the_audits_own_pictures_are_embedded(tmp_path: Path, name: str) ->
 
 
 @pytest.mark.parametrize("text", ["", "[]", '{"version": 1}', '{"version": 5, "run": {}}'])
-def test_broken_audits_are_refused(tmp_path: Path, text: str) -> None:
+def test_broken_audits(tmp_path: Path, text: str) -> None:
     (tmp_path / "private" / "audit").mkdir(parents=True)
     (tmp_path / "private" / "audit" / "audit.json").write_text(text)
     with pytest.raises(InputError, match=r"audit\.json: expected"):
         read_audit(tmp_path)
 
 
-def test_a_broken_audit_leaves_the_old_report(run_folder: Path, data: dict[str, Any], tmp_path: Path) -> None:
+def test_broken_audit_keeps_the_old_report(run_folder: Path, data: dict[str, Any], tmp_path: Path) -> None:
     run = run_with(run_folder, tmp_path, data | {"images": "none"})
     (run / "private" / "report.html").write_text("old")
     with pytest.raises(InputError, match=r"audit\.json: .*`\$\.images`"):
@@ -161,7 +157,9 @@ ATTACKS = [
 
 
 @pytest.mark.parametrize("text", ATTACKS)
-def test_texts_of_others_stay_text(run_folder: Path, data: dict[str, Any], tmp_path: Path, text: str) -> None:
+def test_markup_in_texts_is_escaped(
+    run_folder: Path, data: dict[str, Any], tmp_path: Path, text: str
+) -> None:
     """Every text and every free name of the audit, all at once."""
     data = with_all_texts(data, text, keep=("picture", "pictures"))
     files = [file for files in data["images"]["pictures"].values() for file in files.values()]

@@ -39,7 +39,7 @@ def run(hidden: Path, tmp_path: Path) -> Path:
 
 @pytest.fixture
 def calls(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """Two parts that only note that they were called; the second can be told to fail."""
+    """Record the calls of two parts; the second fails once after "fail"."""
     called: list[str] = []
 
     def speed(subject: Any, seed: int, progress: Any) -> tuple[dict[str, RenderTime], Any]:
@@ -59,12 +59,12 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 
 def gaussians_of(found: Audit) -> float:
-    """What the first of the parts noted."""
+    """The number that the part `speed` stored."""
     assert found.speed is not None
     return found.speed["stego model"].seconds
 
 
-def test_it_writes_what_the_parts_found(run: Path, calls: list[str]) -> None:
+def test_results_of_parts_are_written(run: Path, calls: list[str]) -> None:
     found = audit(run, [KEY], controls=2)
     assert calls == ["speed", "leaks"]
     assert read_audit(run) == found
@@ -77,7 +77,7 @@ def test_it_writes_what_the_parts_found(run: Path, calls: list[str]) -> None:
     assert KEY not in (run / "private" / "audit" / "audit.json").read_text()
 
 
-def test_an_interrupted_audit_goes_on_after_what_it_has(run: Path, calls: list[str]) -> None:
+def test_resume(run: Path, calls: list[str]) -> None:
     calls.append("fail")
     with pytest.raises(Interrupted):
         audit(run, [KEY], controls=2)
@@ -94,7 +94,7 @@ def test_an_interrupted_audit_goes_on_after_what_it_has(run: Path, calls: list[s
     assert (run / "private" / "audit" / "pictures" / "a.png").exists()
 
 
-def test_what_it_refuses(run: Path, tmp_path: Path, calls: list[str]) -> None:
+def test_invalid_arguments(run: Path, tmp_path: Path, calls: list[str]) -> None:
     with pytest.raises(WrongKeyError):
         audit(run, ["another"])
     with pytest.raises(UsageError, match="at least 2"):
@@ -108,7 +108,7 @@ def test_what_it_refuses(run: Path, tmp_path: Path, calls: list[str]) -> None:
         audit(run, [KEY], controls=2)
 
 
-def test_a_whole_audit_measures_what_it_says(run_folder: Path) -> None:
+def test_whole_audit(run_folder: Path) -> None:
     found = read_audit(run_folder)
     assert found.parameters is not None
     assert set(found.parameters.distances) >= {"position", "scale", "rotation", "opacity", "joint"}

@@ -71,7 +71,7 @@ def fine(data: Data) -> Data:
     return data
 
 
-def test_the_whole_audit(fine: Data) -> None:
+def test_verdicts_of_a_whole_audit(fine: Data) -> None:
     lines = judged(changed(fine, (IMAGES.format(2), 25.5)))
     assert {name: line.word for name, line in lines.items()} == {
         "cover on test photos": "fine",
@@ -117,7 +117,7 @@ def test_each_threshold(fine: Data, measure: str, place: str, within: Any, beyon
     assert judged(changed(fine, (place, beyond)))[measure].word == word
 
 
-def test_what_was_not_measured_is_not_judged(fine: Data) -> None:
+def test_missing_parts_have_no_verdict(fine: Data) -> None:
     parts = ("images", "wrong_key", "leaks", "parameters", "stealth", "stegexpose", "robustness", "speed")
     assert judged(changed(fine, *((part, None) for part in parts))) == {}
     for each in fine["parameters"]["distances"].values():

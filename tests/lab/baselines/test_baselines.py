@@ -58,7 +58,7 @@ def made(
     return Made(name, out, result)
 
 
-def test_what_is_written_is_what_was_measured(made: Made) -> None:
+def test_files_and_metrics_of_a_hiding(made: Made) -> None:
     files = {str(path.relative_to(made.out)) for path in made.out.rglob("*") if path.is_file()}
     assert files == {
         str(stego_in(made.out).relative_to(made.out)),
@@ -72,7 +72,9 @@ def test_what_is_written_is_what_was_measured(made: Made) -> None:
         assert each.psnr > each.nothing + 5
 
 
-def test_both_files_show_the_secret(made: Made, folders: tuple[Path, Path], tmp_path: Path) -> None:
+def test_published_and_handed_over_file_reveal_the_secret(
+    made: Made, folders: tuple[Path, Path], tmp_path: Path
+) -> None:
     capabilities = registry.get(made.name).capabilities
     stego = stego_in(made.out)
     assert (stego.suffix == ".ply") == capabilities.standard
@@ -98,7 +100,7 @@ def test_truncated_files_are_refused(made: Made, tmp_path: Path, at: int) -> Non
         keyss.reveal(stego_in(made.out), handed=path)
 
 
-def test_the_command_line(keyss: Run, made: Made, tmp_path: Path) -> None:
+def test_command_line(keyss: Run, made: Made, tmp_path: Path) -> None:
     said = keyss("evaluate", made.out)
     assert said.status == 0
     assert f"{made.result.metrics.secrets[0].psnr:.2f}" in said.out
@@ -113,7 +115,7 @@ def test_the_command_line(keyss: Run, made: Made, tmp_path: Path) -> None:
     assert_refused(keyss("reveal", stego, "--handed", stego, "-o", tmp_path / "b.ply"), 4, "handed over")
 
 
-def test_a_key_for_what_has_none_and_what_it_cannot_do_are_refused(folders: tuple[Path, Path]) -> None:
+def test_invalid_arguments(folders: tuple[Path, Path]) -> None:
     with pytest.raises(UsageError, match="no keys"):
         keyss.hide(folders[0], [Secret(folders[1], KEY)], method="3dgs-sh")
     with pytest.raises(UsageError, match="1 to 1 secrets"):
@@ -125,7 +127,7 @@ def test_a_key_for_what_has_none_and_what_it_cannot_do_are_refused(folders: tupl
 
 
 @pytest.mark.parametrize("name", TRAINED)
-def test_an_interrupted_training_goes_on_bit_for_bit(name: str) -> None:
+def test_resumed_training_is_bit_identical(name: str) -> None:
     """All state is in checkpoints: parameters that a baseline adds, networks, moments, the order of poses."""
     scenes = [tiny_scene(0), tiny_scene(1)]
     placed = [PlacedScene.of(scene, random_gaussians(50), Similarity()) for scene in scenes]
@@ -147,7 +149,7 @@ def test_an_interrupted_training_goes_on_bit_for_bit(name: str) -> None:
     assert whole.evaluate() == resumed.evaluate()
 
 
-def test_audits_measure_what_there_is(made: Made) -> None:
+def test_audit_of_methods_with_networks(made: Made) -> None:
     if made.name not in ("3dgs-decoder", "gs-hider"):  # the others are 3DGS models throughout
         return
     standard = registry.get(made.name).capabilities.standard

@@ -1,4 +1,4 @@
-"""Methods side by side: one table, resumed where it was, and a sentence where something is not possible."""
+"""Comparisons of methods."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from keyss.methods import registry
 SMALL = ["--iterations", "60", "--max-gaussians", "240", "--seed", "3"]
 
 
-def test_a_table_a_picture_and_a_second_start(
+def test_comparison_and_resume(
     folders: tuple[Path, Path],
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
@@ -79,7 +79,7 @@ def test_a_table_a_picture_and_a_second_start(
     assert (out / "private" / "master-key.txt").stat().st_mode & 0o77 == 0
 
 
-def test_what_it_does_not_know_is_refused(folders: tuple[Path, Path], tmp_path: Path) -> None:
+def test_invalid_arguments(folders: tuple[Path, Path], tmp_path: Path) -> None:
     for methods, words in ((["3dgs", "lerned"], "lerned"), (["carry:worst"], "worst")):
         with pytest.raises(UsageError, match=words):
             compare(*folders, methods=methods, out=tmp_path / "out")
@@ -90,7 +90,7 @@ def test_what_it_does_not_know_is_refused(folders: tuple[Path, Path], tmp_path: 
 
 
 @pytest.mark.parametrize("verb", ["hide", "fit"])
-def test_where_no_method_works_the_reasons_are_said_and_there_is_no_picture(
+def test_all_methods_fail(
     folders: tuple[Path, Path],
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
@@ -112,8 +112,8 @@ def test_where_no_method_works_the_reasons_are_said_and_there_is_no_picture(
     assert not (out / "comparison.png").exists()
 
 
-def test_one_budget_and_one_process_for_a_folder(folders: tuple[Path, Path], tmp_path: Path) -> None:
-    """Without numbers the budget is that of the first method's preset."""
+def test_default_budget_and_lock(folders: tuple[Path, Path], tmp_path: Path) -> None:
+    """The default budget is that of the first method's preset."""
     found = compare(*folders, methods=["carry:quick", "3dgs"], out=tmp_path / "out", dry_run=True)
     assert isinstance(found, Forecast)
     assert {each.partition(", ")[2] for each in found.names.values()} >= {"500 steps, seed 0"}

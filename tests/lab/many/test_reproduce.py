@@ -1,4 +1,4 @@
-"""A table from photos to claims, at a size where it takes seconds."""
+"""A table from photos to claims, at a tiny size."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ FLAGS = ("--iterations", 20, "--max-gaussians", 150, "--pairs", "a,b", "--seed",
 
 @pytest.fixture(scope="module")
 def out(folders: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with the table "pruning", which others use the run of."""
+    """A folder with the table "pruning", whose run other tables share."""
     folder = tmp_path_factory.mktemp("tables") / "paper"
     with pytest.MonkeyPatch.context() as patch:  # opening what was pruned takes long
         patch.setattr(trial_measures, "PRUNED_SHARES", (0.25,))
@@ -42,7 +42,7 @@ def run_of(trial: str, out: Path) -> Path:
     return path.parent / "run"
 
 
-def test_a_table_lies_beside_the_papers(out: Path) -> None:
+def test_table(out: Path) -> None:
     found = json.loads((out / "pruning.json").read_text())
     assert found["pairs"] == ["a-b"]
     row, ours = found["rows"]
@@ -64,9 +64,7 @@ def test_a_table_lies_beside_the_papers(out: Path) -> None:
     assert "| whole, cover | 25.98 / " in (out / "pruning.md").read_text()
 
 
-def test_what_is_done_is_not_done_again(
-    out: Path, folders: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_resume(out: Path, folders: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch) -> None:
     before = listing(out / "trials")
 
     def refused(*arguments: object, **more: object) -> None:
@@ -86,7 +84,7 @@ def test_what_is_done_is_not_done_again(
     assert len(other.plans) == len(other.names)
 
 
-def test_a_run_that_fails_is_said_and_the_others_go_on(
+def test_failed_trials(
     out: Path, folders: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch, keyss: Run
 ) -> None:
     def failing(*arguments: object, **more: object) -> None:
@@ -103,7 +101,7 @@ def test_a_run_that_fails_is_said_and_the_others_go_on(
     assert "not today" in said.out
 
 
-def test_the_command(keyss: Run, out: Path, folders: tuple[Path, Path], tmp_path: Path) -> None:
+def test_command(keyss: Run, out: Path, folders: tuple[Path, Path], tmp_path: Path) -> None:
     said = keyss("reproduce", "pruning", *folders, *FLAGS, "-o", out)
     assert said.status == 0, said.err
     assert "25% random, secret" in said.out

@@ -1,4 +1,4 @@
-"""Which scenes hide which."""
+"""Pairs of scenes."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from keyss.core import UsageError
 from keyss.lab.many import reproduction
 
 
-def test_every_scene_hides_the_next() -> None:
+def test_groups_are_cyclic_by_default() -> None:
     groups_of = reproduction.groups_of
     assert groups_of(["a", "b"], 1, (), ()) == [("a", "b"), ("b", "a")]
     assert groups_of(["a", "b", "c"], 2, (), ()) == [("a", "b", "c"), ("b", "c", "a"), ("c", "a", "b")]
@@ -33,9 +33,7 @@ def test_every_scene_hides_the_next() -> None:
         ({"table": "single", "scenes": ["a.ply", "b"]}, "models have none"),
     ],
 )
-def test_what_cannot_be_is_refused_before_anything_is_written(
-    tmp_path: Path, arguments: dict[str, object], words: str
-) -> None:
+def test_invalid_arguments_write_nothing(tmp_path: Path, arguments: dict[str, object], words: str) -> None:
     for dry_run in (True, False):
         with pytest.raises(UsageError, match=words):
             reproduce(**arguments, dry_run=dry_run, out=tmp_path / "out")  # type: ignore[arg-type]

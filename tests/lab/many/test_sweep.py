@@ -1,4 +1,4 @@
-"""A sweep: what it refuses, what it runs once, and what is left where it was interrupted."""
+"""Sweeps: specifications, trials, tables."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def files(tmp_path: Path) -> Path:
 
 
 def run(*arguments: Any, **options: Any) -> ManyResult:
-    """A sweep that is no dry run."""
+    """Run a sweep."""
     found = sweep(*arguments, **options)
     assert isinstance(found, ManyResult)
     return found
@@ -75,9 +75,7 @@ def spec_of(folder: Path, text: str) -> Path:
         ("methods:", "methods:\n  - {method: carry, preset: default}", "methods: two are called 'carry'"),
     ],
 )
-def test_what_is_wrong_in_a_specification_is_said_before_anything_runs(
-    files: Path, old: str, new: str, words: str
-) -> None:
+def test_invalid_specifications(files: Path, old: str, new: str, words: str) -> None:
     assert old in GOOD
     path = spec_of(files, GOOD.replace(old, new))
     with pytest.raises(InputError) as caught:
@@ -87,7 +85,7 @@ def test_what_is_wrong_in_a_specification_is_said_before_anything_runs(
 
 
 def write_spec(folder: Path, covers: list[str], seeds: int, more: str = "") -> Path:
-    """A sweep of files that need not be models."""
+    """A specification, and files for it that are no models."""
     for name in (*covers, "secret.ply"):
         if not (folder / name).exists():
             (folder / name).write_text(name)
@@ -97,7 +95,7 @@ def write_spec(folder: Path, covers: list[str], seeds: int, more: str = "") -> P
 
 
 def real_spec(folder: Path, seeds: int) -> Path:
-    """A sweep of real models, of almost no size."""
+    """A specification with tiny models."""
     library.write_model(folder / "a.ply", random_gaussians(300, seed=0))
     library.write_model(folder / "secret.ply", random_gaussians(40, seed=1))
     return write_spec(folder, ["a.ply"], seeds, "width: 32\n")
@@ -108,7 +106,7 @@ def skipped(found: ManyResult) -> list[bool]:
 
 
 @fake_runs
-def test_every_trial_runs_once_and_equal_sweeps_have_equal_tables(tmp_path: Path) -> None:
+def test_trials_run_once_and_tables_are_deterministic(tmp_path: Path) -> None:
     spec = write_spec(tmp_path, ["a.ply", "b.ply"], seeds=3)
     first = run(spec, tmp_path / "out")
     assert first.tables == ("results.csv", "trials.csv", "scenes.csv", "scenes.tex")
@@ -136,7 +134,7 @@ def test_every_trial_runs_once_and_equal_sweeps_have_equal_tables(tmp_path: Path
 
 
 @fake_runs
-def test_a_trial_runs_again_when_its_files_or_options_change(tmp_path: Path) -> None:
+def test_changed_files_and_options(tmp_path: Path) -> None:
     spec = write_spec(tmp_path, ["a.ply"], seeds=2)
     out = tmp_path / "out"
     assert skipped(run(spec, out)) == [False, False]
@@ -148,10 +146,8 @@ def test_a_trial_runs_again_when_its_files_or_options_change(tmp_path: Path) -> 
 
 
 @fake_runs
-def test_a_trial_that_fails_does_not_end_the_others(
-    tmp_path: Path, keyss: Run, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Neither with an error that keyss expects nor with another."""
+def test_failed_trials(tmp_path: Path, keyss: Run, capsys: pytest.CaptureFixture[str]) -> None:
+    """Errors of users and internal errors."""
     spec = write_spec(tmp_path, ["broken.ply", "odd.ply", "a.ply"], seeds=1)
     broken, odd, good = run(spec, tmp_path / "out").outcomes
     assert "nothing of it can be read" in str(broken.error)
@@ -164,7 +160,7 @@ def test_a_trial_that_fails_does_not_end_the_others(
     assert "failed: broken-secret carry seed 0: " in said.out
 
 
-def test_the_key_of_a_trial_opens_it(tmp_path: Path, keyss: Run) -> None:
+def test_key_of_a_trial(tmp_path: Path, keyss: Run) -> None:
     (trial,) = run(real_spec(tmp_path, 1), tmp_path / "out").outcomes
     name, master = f"trial/{trial.folder.name}/1", tmp_path / "out" / "private" / "master-key.txt"
     key = keyss("keygen", "--asset", name, "--master-key-file", master).out.strip()
@@ -172,7 +168,7 @@ def test_the_key_of_a_trial_opens_it(tmp_path: Path, keyss: Run) -> None:
     assert json.loads((trial.folder / "trial.json").read_text())["method"] == "carry"
 
 
-def test_a_dry_run_writes_nothing_and_names_what_cannot_work(keyss: Run, tmp_path: Path) -> None:
+def test_dry_run(keyss: Run, tmp_path: Path) -> None:
     spec, out = real_spec(tmp_path, 2), tmp_path / "out"
     before = sorted(tmp_path.rglob("*"))
     found = sweep(spec, out, dry_run=True)
@@ -194,7 +190,7 @@ def test_a_dry_run_writes_nothing_and_names_what_cannot_work(keyss: Run, tmp_pat
 @pytest.mark.slow
 @pytest.mark.filterwarnings("default")
 @pytest.mark.argon2  # as in the processes of Ray
-def test_a_local_cluster_runs_the_same_trials(tmp_path: Path) -> None:
+def test_local_ray_cluster(tmp_path: Path) -> None:
     pytest.importorskip("ray", reason="ray is not installed")
     spec = real_spec(tmp_path, 2)
     (tmp_path / "broken.ply").write_text("no model")
@@ -211,7 +207,7 @@ def test_a_local_cluster_runs_the_same_trials(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("package", "ray"), [("ray", "local"), ("yaml", None)])
-def test_without_a_package_one_sentence_says_what_to_install(
+def test_missing_packages(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, package: str, ray: str | None
 ) -> None:
     monkeypatch.setitem(sys.modules, package, None)
