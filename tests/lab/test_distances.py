@@ -64,5 +64,3 @@ def test_ratio_to_seed_to_seed_variation() -> None:
 def test_too_little_is_refused() -> None:
     with pytest.raises(UsageError, match="empty"):
         attribute_distances(MODEL, MODEL[:0])
-    with pytest.raises(UsageError, match="two control models"):
-        against_controls(MODEL, [MODEL])

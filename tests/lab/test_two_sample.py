@@ -11,7 +11,7 @@ import torch
 from sklearn.metrics import roc_auc_score
 
 from keyss.core import Gaussians, UsageError
-from keyss.lab import Auc, auc_beside_controls, delong, features, two_sample_auc
+from keyss.lab import Auc, delong, features, two_sample_auc
 from lab.lifelike import (
     doubled_scales,
     lifelike,
@@ -74,8 +74,6 @@ def test_features_ignore_quaternion_sign_and_axis_order() -> None:
 def test_too_little_is_refused() -> None:
     with pytest.raises(UsageError, match="empty"):
         features(MODEL[:0])
-    with pytest.raises(UsageError, match="two control models"):
-        auc_beside_controls(MODEL, [OTHER], MODEL)
     with pytest.raises(UsageError, match="at least 100"):
         two_sample_auc(MODEL, MODEL[:99])
     with pytest.raises(UsageError, match="too few places"):

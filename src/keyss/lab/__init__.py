@@ -1,4 +1,4 @@
-"""The laboratory: what measures, attacks and compares hidings. The product imports nothing of it.
+"""The laboratory: measures, attacks and comparisons of hidings. The product imports nothing of it.
 
 Stealth, leaks, robustness and speed of one run make an audit (`audits/`); `many/` compares methods, and
 reproduces the paper's tables; `baselines/` has published methods to compare with.

@@ -32,15 +32,13 @@ from .robustness.changes import (
     purification as purification,
     random_pruning as random_pruning,
 )
+from .robustness.converters import Converter as Converter, converters as converters, transform as transform
 from .robustness.survival import (
     ChangedQuality as ChangedQuality,
     ChangeResult as ChangeResult,
-    Converter as Converter,
-    converters as converters,
     default_changes as default_changes,
     measure_robustness as measure_robustness,
     reveal_changed as reveal_changed,
-    transform as transform,
 )
 from .sinkhorn import composite_score as composite_score, sinkhorn_3d as sinkhorn_3d
 from .stealth.confirmation import candidate_scores as candidate_scores, changed_low_bits as changed_low_bits

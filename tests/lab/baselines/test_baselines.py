@@ -102,16 +102,9 @@ def test_truncated_files_are_refused(made: Made, tmp_path: Path, at: int) -> Non
 
 def test_command_line(keyss: Run, made: Made, tmp_path: Path) -> None:
     said = keyss("evaluate", made.out)
-    assert said.status == 0
     assert f"{made.result.metrics.secrets[0].psnr:.2f}" in said.out
-    models = registry.get(made.name).capabilities.models
-    out = tmp_path / ("a.ply" if models else "a.3dgs.safetensors")
+    assert made.name in keyss("info", made.out).out
     stego = stego_in(made.out)
-    assert keyss("reveal", stego, "--handed", made.handed, "-o", out).status == 0
-    assert keyss("info", out).status == 0
-    said = keyss("info", made.out)
-    assert said.status == 0
-    assert made.name in said.out
     assert_refused(keyss("reveal", stego, "--handed", stego, "-o", tmp_path / "b.ply"), 4, "handed over")
 
 

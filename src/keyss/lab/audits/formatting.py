@@ -45,7 +45,7 @@ def integer(value: float | None) -> str:
 
 
 def numbered(name: str, index: int, count: int) -> str:
-    """A name, with its number if there is more than one."""
+    """A name, numbered if `count` is above 1."""
     return f"{name} {index + 1}" if count > 1 else name
 
 

@@ -1,4 +1,4 @@
-"""What is measured: a run, its scenes and models, and plain models of its cover."""
+"""The input of measures: a run, its scenes and models, and plain models of its cover."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ class Subject:
 
     @cached_property
     def baselines(self) -> list[Gaussians | None]:
-        """Plain models of the secrets, if there are any."""
+        """Plain models of the secrets; None for missing ones."""
         _, *models = self.run.baselines()
         return [None if model is None else model.to(self.device) for model in models]
 

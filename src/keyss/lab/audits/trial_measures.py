@@ -20,7 +20,8 @@ from keyss.lab.audits.audit_run import EXTRA
 from keyss.lab.audits.subject import Subject
 from keyss.lab.render_time import measure_render_time
 from keyss.lab.robustness.changes import Change, opacity_pruning, purification, random_pruning
-from keyss.lab.robustness.survival import converters, measure_robustness
+from keyss.lab.robustness.converters import converters
+from keyss.lab.robustness.survival import measure_robustness
 from keyss.lab.sinkhorn import composite_score, sinkhorn_3d
 from keyss.lab.stealth.judging import judge
 from keyss.lab.stegexpose import stegexpose_auc

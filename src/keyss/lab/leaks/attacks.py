@@ -123,7 +123,7 @@ def search_embeddings(
     balance: float = 2.0,
     seed: int = 0,
 ) -> Tensor:
-    """[restarts, key_size] unit vectors for which the decoder seems to show another scene, best first.
+    """[restarts, key_size] unit vectors that change opacities most, best first.
 
     In the published scheme, the key is a vector that enters the decoder's first layers. An attacker with the
     network can search for the vector that exchanges most Gaussians: by gradient ascent from random starts, on
