@@ -32,7 +32,6 @@ if TYPE_CHECKING:
 
 PartName = Literal["images", "parameters", "stealth", "stegexpose", "leaks", "robustness", "speed"]
 TableName = Literal["single", "multi", "masks", "combined", "pruning", "sinkhorn", "speed"]
-_SCENES = "PSNR, SSIM and LPIPS, a row for each scene: mean and standard deviation over seeds"
 QUICK = {"iterations": 500, "max_gaussians": 3000, "width": 100}
 Seeds = Annotated[
     UseAppendAction[tuple[int, ...]],
@@ -45,9 +44,6 @@ def audit(
     run: Run,
     *,
     key_file: KeyFiles = (),
-    original: Annotated[
-        Path | None, optional("FILE", "Plain model of the cover to compare with.", "the run's own")
-    ] = None,
     controls: Annotated[
         int, arg(metavar="N", help="Plain models of the cover from other seeds, as controls; at least 2.")
     ] = 3,
@@ -79,7 +75,6 @@ def audit(
         found = keyss.audit(
             run,
             keys_of_run(run, key_file),
-            original=original,
             controls=controls,
             only=only,
             seed=check_seed(seed),
@@ -152,8 +147,7 @@ def compare(
     described = {
         "comparison.png": "a row for each method: cover, secret, error; it shows the secret",
         "comparison.md": "the tables, in Markdown",
-        "comparison.csv": _SCENES,
-        "comparison.tex": "the same, for LaTeX (booktabs)",
+        **_scene_tables("comparison"),
         "comparison.json": "all numbers, for programs",
     }
     print(*comparison_notes(comparison), sep="\n")
@@ -237,8 +231,7 @@ def reproduce(
     means = f"Published and measured figures, on test views; means over {len(reproduction.pairs)} pair(s)."
     described = {
         f"{table}.md": "the table and the verdicts, in Markdown",
-        f"{table}.csv": _SCENES,
-        f"{table}.tex": "the same, for LaTeX (booktabs)",
+        **_scene_tables(table),
         f"{table}.json": "all figures, for programs",
         "trials": "the runs, which other tables share",
     }
@@ -283,14 +276,19 @@ def sweep(
         _print_forecast(result)
         return
     described = {
-        "scenes.csv": _SCENES,
-        "scenes.tex": "the same, for LaTeX (booktabs)",
+        **_scene_tables("scenes"),
         "results.csv": "all measures: mean and standard deviation over seeds",
         "trials.csv": "the numbers of each trial",
         "private/master-key.txt": "the key from which those of the trials are derived",
     }
     print_files(out, described)
     print_outcome(result.errors, len(result.outcomes), "trials")
+
+
+def _scene_tables(stem: str) -> dict[str, str]:
+    """Descriptions of two files."""
+    scenes = "PSNR, SSIM and LPIPS, a row for each scene: mean and standard deviation over seeds"
+    return {f"{stem}.csv": scenes, f"{stem}.tex": "the same, for LaTeX (booktabs)"}
 
 
 def _print_verdicts(audit: Audit) -> None:

@@ -104,7 +104,7 @@ def test_invalid_arguments(run: Path, tmp_path: Path, calls: list[str]) -> None:
     with pytest.raises(InputError):
         audit(tmp_path, [KEY])
     (run / "private" / "cover.ply").unlink()
-    with pytest.raises(UsageError, match="`original`"):
+    with pytest.raises(InputError, match="plain model of the cover"):
         audit(run, [KEY], controls=2)
 
 

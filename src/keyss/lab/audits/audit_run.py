@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -32,7 +31,6 @@ def audit(
     keys: Sequence[str] = (),
     *,
     report_only: bool = False,
-    original: PathLike | None = None,
     controls: int = 3,
     only: Sequence[str] = (),
     seed: int = 0,
@@ -44,9 +42,8 @@ def audit(
     """Measure quality, stealth, leaks, robustness and speed of a folder of `hide`.
 
     `keys`: one per secret, in any order. `report_only`: only write `private/report.html` again, from the
-    run's audit; needs no keys. `original`: a plain model of the cover, by default the run's own. `controls`:
-    number of plain models of the cover with other seeds to compare with; at least 2, kept in
-    `private/controls/`. `only`: names of parts, by default all.
+    run's audit; needs no keys. `controls`: number of plain models of the cover with other seeds to compare
+    with; at least 2, kept in `private/controls/`. `only`: names of parts, by default all.
 
     The folder gets `private/audit/` with pictures and `audit.json`, which is also returned, and
     `private/report.html`. `resume` continues an interrupted audit after its finished parts. Raises KeyssError
@@ -62,17 +59,17 @@ def audit(
         import_extra(module, "audit", "audit a run")
     started, reporter = time.monotonic(), reporter or Reporter()
     opened = open_run(run, keys)
-    subject = Subject(opened, resolve_device(device), given_original=original)
+    subject = Subject(opened, resolve_device(device))
     if impossible := sorted(set(only) & NEED_A_3DGS_MODEL) if not subject.standard else []:
         raise UsageError(
             f"the method {opened.config.method} does not publish a 3DGS model, which "
             f"{' and '.join(impossible)} measure: leave out `only`, or name other parts"
         )
-    settings = {"original": original and os.path.realpath(original), "controls": controls, "only": only}
+    settings = {"controls": controls, "only": only, "seed": seed, "device": subject.device.type}
     folder = RunFolder(
         opened.folder,
         "audit",
-        settings | {"seed": seed, "device": subject.device.type, "payloads": opened.config.payloads},
+        settings | {"payloads": opened.config.payloads},
         onto=KEPT,
         writes=(AUDIT, REPORT),
         overwrite=overwrite,

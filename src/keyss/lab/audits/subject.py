@@ -10,7 +10,7 @@ from functools import cached_property
 
 import torch
 
-from keyss.core.errors import UsageError
+from keyss.core.errors import InputError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
 from keyss.files.models import read_model
@@ -19,7 +19,7 @@ from keyss.fitting.plain import fit_scene
 from keyss.measure.hide_quality import in_cover
 from keyss.methods import registry
 from keyss.progress import Reporter
-from keyss.runs.files import CONTROLS, PathLike, as_model
+from keyss.runs.files import CONTROLS
 from keyss.runs.folder import RunFolder
 from keyss.runs.open_run import HidingRun
 
@@ -31,7 +31,6 @@ class Subject:
     run: HidingRun
     device: torch.device
     controls: Sequence[Gaussians] = ()  # plain models of the cover from other seeds
-    given_original: PathLike | None = None  # plain model of the cover; None: the run's own
 
     @property
     def standard(self) -> bool:
@@ -61,14 +60,10 @@ class Subject:
 
     @cached_property
     def original(self) -> Gaussians:
-        """The plain model of the cover. Raises UsageError without one."""
+        """The plain model of the cover. Raises InputError without one."""
         plain, *_ = self.run.plain_models()
-        if self.given_original is not None:
-            plain = as_model(self.given_original)
         if plain is None:
-            raise UsageError(
-                f"{self.run.folder} has no plain model of the cover to compare with: give `original`"
-            )
+            raise InputError(f"{self.run.folder}: expected the plain model of the cover, found none")
         return plain.to(self.device)
 
     @cached_property
@@ -80,10 +75,10 @@ class Subject:
     def fit_controls(self, seeds: Sequence[int], folder: RunFolder, reporter: Reporter) -> None:
         """Fit plain models of the cover with these seeds; they are kept in the run's `folder` for reuse.
 
-        Raises UsageError without a plain model of the cover.
+        Raises InputError without a plain model of the cover.
         """
         config, count = self.run.config.options.fit, len(self.original)
-        if self.given_original or self.run.config.models_given[0]:  # the run's maximum is not for this model
+        if self.run.config.models_given[0]:  # the run's maximum is not for this model
             config = replace(config, max_gaussians=max(count, 16))
         models = [self._fit_control(replace(config, seed=seed), folder, reporter) for seed in seeds]
         self.controls = [model.to(self.device) for model in models]

@@ -102,6 +102,8 @@ def survival(subject: Subject) -> Numbers:
     for name, value in found.items():
         if not isinstance(value, str):
             found[name] = value - float(before[name.rpartition(", ")[2]])
+    if not subject.standard:
+        found |= dict.fromkeys((*CONVERSIONS, "purified"), "the method publishes no 3DGS model")
     return found
 
 
