@@ -80,7 +80,7 @@ def auc_text(auc: Auc) -> str:
 
 def worst_leak(attacks: Iterable[AttackResult]) -> AttackResult | None:
     """The attack without the key that shows the most of the secret."""
-    return max(attacks, key=lambda attack: attack.best_leak.evidence(), default=None)
+    return max(attacks, key=lambda attack: attack.leak.evidence(), default=None)
 
 
 def _word(within: bool, otherwise: Word = "visible") -> Word:
@@ -121,7 +121,7 @@ def _leaks(audit: Audit) -> Iterator[Verdict]:
         return
     index = next(index for index, attacks in enumerate(secrets) if worst in attacks)
     of = f"{numbered('secret', index, len(secrets))}, " if len(secrets) > 1 else ""
-    leak = worst.best_leak
+    leak = worst.leak
     value = f"{difference(leak.psnr_fitted)} dB, {difference(leak.ssim_fitted, 3)} SSIM, "
     value += f"{difference(leak.gradient)} gradients ({of}{worst.attack}: {worst.best})"
     limit = f"at most {decibel(PSNR_LIMIT, 1)}, {SSIM_LIMIT} and {GRADIENT_LIMIT}"

@@ -113,16 +113,15 @@ def _gradients(image: Tensor) -> Tensor:
 class AttackResult:
     """Scores of an attack on the stego model, and their excess over control models.
 
-    An attack has variants: thresholds, shares, clusters. The maximum over them counts, because an attacker
-    recognises the best one.
+    An attack has variants: thresholds, shares, clusters. The best one counts, because an attacker recognises
+    it.
     """
 
     attack: str
     sentence: str
-    scores: LeakScores  # maximum of each score over the variants
-    leak: LeakScores  # `scores` minus those of the controls
-    best: str  # variant with the maximum `LeakScores.evidence`, which is pictured and judged
-    best_leak: LeakScores  # scores of the best variant minus those of the controls
+    best: str  # the variant with the maximum `LeakScores.evidence`
+    scores: LeakScores  # of the best variant
+    leak: LeakScores  # `scores` minus the controls' maxima over the variants
     picture: str | None = None  # name of a file, in an audit
 
 
@@ -164,11 +163,9 @@ def look_for_secret(
         control = LeakScores.combine(fmean, highest)
         leaks = {label: own - control for label, (own, _) in variants.items()}
         best = max(leaks, key=lambda label: leaks[label].evidence())
-        scored = LeakScores.combine(max, [own for own, _ in variants.values()])
-        results.append(
-            AttackResult(attack.name, attack.sentence, scored, scored - control, best, leaks[best])
-        )
-        pictures[attack.name] = _side_by_side([variants[best][1], of_controls[0][best][1], views[0].image])
+        scores, picture = variants[best]
+        results.append(AttackResult(attack.name, attack.sentence, best, scores, leaks[best]))
+        pictures[attack.name] = _side_by_side([picture, of_controls[0][best][1], views[0].image])
     return results, pictures
 
 
