@@ -142,11 +142,10 @@ def compare(
     if isinstance(comparison, Forecast):
         _print_forecast(comparison)
         return
-    for heads, *rows in comparison_tables(comparison).values():
+    for heads, *rows in comparison_tables(comparison):
         print_table(heads, rows)
     described = {
         "comparison.png": "a row for each method: cover, secret, error; it shows the secret",
-        "comparison.md": "the tables, in Markdown",
         **_scene_tables("comparison"),
         "comparison.json": "all numbers, for programs",
     }
@@ -230,7 +229,6 @@ def reproduce(
     print_table(heads, rows)
     means = f"Published and measured figures, on test views; means over {len(reproduction.pairs)} pair(s)."
     described = {
-        f"{table}.md": "the table and the verdicts, in Markdown",
         **_scene_tables(table),
         f"{table}.json": "all figures, for programs",
         "trials": "the runs, which other tables share",

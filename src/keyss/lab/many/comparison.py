@@ -22,7 +22,7 @@ from keyss.fitting import PRESETS, FitConfig
 from keyss.fitting.lpips import HOW_TO_GET
 from keyss.lab.audits.trial_measures import CONVERSIONS
 from keyss.lab.many.engine import Outcome
-from keyss.lab.many.result_tables import TrialNumbers, markdown_rows, write_scene_tables
+from keyss.lab.many.result_tables import TrialNumbers, write_scene_tables
 from keyss.lab.many.trial import RUN, keys_of
 from keyss.lab.many.trial_folder import Forecast, TrialFolder
 from keyss.measure.contact_sheet import contact_sheet
@@ -134,8 +134,8 @@ def compare(
     that continues the training of a plain model starts with one of half the steps. Thus `3dgs` is an upper
     bound for all: plain 3DGS with equal Gaussians and training steps. Numbers are means over `seeds`.
 
-    `out` (a folder) gets the trials, and `comparison.json`, `.md`, `.csv` and `.tex` (PSNR, SSIM and LPIPS
-    per scene, with standard deviations over seeds) and `.png` (a row per method: cover, secret, and the
+    `out` (a folder) gets the trials, and `comparison.json`, `.csv` and `.tex` (PSNR, SSIM and LPIPS per
+    scene, with standard deviations over seeds) and `.png` (a row per method: cover, secret, and the
     secret's error). Finished trials are skipped. `dry_run`: only return their plans. A failed method has a
     row with the error. Raises UsageError before training if one of `methods` is not possible with these
     settings, other KeyssErrors, and KeyboardInterrupt.
@@ -167,7 +167,6 @@ def compare(
     rows = [_row(name, [outcomes[places[name, seed]] for seed in seeds], folder) for name in chosen]
     found = Comparison(arguments=arguments, methods=tuple(rows))
     write_record(folder.out / f"{STEM}.json", found)
-    write_bytes(folder.out / f"{STEM}.md", comparison_text(found).encode())
     names = [os.path.basename(scene) for scene in scenes]
     done = {each: outcomes[place] for each, place in places.items() if outcomes[place].result}
     numbers = [TrialNumbers.of(each, {"method": name}, names, seed) for (name, seed), each in done.items()]
@@ -253,16 +252,16 @@ def comparison_sheet(runs: Mapping[str, HidingRun], device: Backend) -> Image.Im
     return contact_sheet(["cover", "secret", "error of the secret, x4"], rows)
 
 
-def comparison_tables(found: Comparison) -> dict[str, list[list[str]]]:
-    """Rows of text by title, heads first: fidelity and cost, secrecy and survival; without failed methods."""
+def comparison_tables(found: Comparison) -> list[list[list[str]]]:
+    """Two tables of text, heads first: fidelity and cost, secrecy and survival; without failed methods."""
     rows = [each for each in found.methods if each.error is None]
-    return {
-        title: [
+    return [
+        [
             ["method", *(head.rstrip() for head in columns)],
             *([row.name, *(_format(row, formats) for formats in columns.values())] for row in rows),
         ]
-        for title, columns in (("Fidelity and cost", _FIDELITY), ("Secrecy and survival", _SECRECY))
-    }
+        for columns in (_FIDELITY, _SECRECY)
+    ]
 
 
 def _format(row: ComparedMethod, formats: list[str]) -> str:
@@ -285,12 +284,3 @@ def comparison_notes(comparison: Comparison) -> list[str]:
     if any("cover.lpips" not in row.numbers for row in comparison.methods if row.numbers):
         skipped.append(f"no LPIPS: {HOW_TO_GET}")
     return [*failures, *skipped, *_LEGEND]
-
-
-def comparison_text(comparison: Comparison) -> str:
-    """Both tables and the notes in Markdown."""
-    lines = []
-    for title, rows in comparison_tables(comparison).items():
-        lines += [f"## {title}", "", *markdown_rows(rows), ""]
-    lines += [f"- {note}" for note in comparison_notes(comparison)]
-    return "\n".join(lines) + "\n"

@@ -12,9 +12,8 @@ from typing import Any
 
 from keyss.core import UsageError, ViewOptions
 from keyss.core.errors import did_you_mean
-from keyss.files import write_bytes
 from keyss.lab.many.option_changes import with_changes
-from keyss.lab.many.paper import PAPER, Group, Reproduction, Run, figure_rows, judge_claim, reproduction_text
+from keyss.lab.many.paper import PAPER, Group, Reproduction, Run, figure_rows, judge_claim
 from keyss.lab.many.result_tables import TrialNumbers, write_scene_tables
 from keyss.lab.many.trial_folder import Forecast, TrialFolder
 from keyss.methods import MethodOptions, registry
@@ -50,7 +49,7 @@ def reproduce(
     published, and have 30,000 steps and 500,000 Gaussians. `pairs`: covers and secrets, as "COVER,SECRET" or
     "COVER,SECRET,SECRET" by the names of their folders; by default each scene hides the next.
 
-    `out` (a folder) gets `TABLE.json`, `.md`, `.csv` and `.tex` (PSNR, SSIM and LPIPS per scene, with
+    `out` (a folder) gets `TABLE.json`, `.csv` and `.tex` (PSNR, SSIM and LPIPS per scene, with
     standard deviations over `seeds`), and the trials, which tables in one folder share. Finished trials are
     skipped. `dry_run`: only return their plans. The result lists failed trials. Raises KeyssError for
     impossible scenes and arguments; KeyboardInterrupt.
@@ -97,7 +96,6 @@ def reproduce(
         failures={each.name: each.error for each in outcomes.values() if each.error},
     )
     write_record(folder.out / f"{table}.json", reproduction)
-    write_bytes(folder.out / f"{table}.md", reproduction_text(reproduction).encode())
     order = list(spec.runs)
     write_scene_tables(folder.out, table, sorted(rows, key=lambda row: order.index(row.labels["run"])))
     return reproduction

@@ -1,4 +1,4 @@
-"""Tables of results: means and standard deviations over seeds, as CSV, LaTeX (booktabs) and Markdown."""
+"""Tables of results: means and standard deviations over seeds, as CSV and LaTeX (booktabs)."""
 
 from __future__ import annotations
 
@@ -135,13 +135,6 @@ def latex(rows: Sequence[Mapping[str, Any]]) -> str:
             cells.append("--" if math.isnan(mean) else f"{mean:.{decimals}f}{spread}")
         lines.append(" & ".join(cells) + r" \\")
     return "\n".join([*lines, r"\bottomrule", r"\end{tabular}", ""])
-
-
-def markdown_rows(rows: Sequence[Sequence[str]]) -> list[str]:
-    """Lines of a Markdown table; the first row is the head."""
-    lines = [" | ".join(cell.replace("|", "/") for cell in row) for row in rows]
-    lines.insert(1, " | ".join("---" for _ in rows[0]))
-    return [f"| {line} |" for line in lines]
 
 
 def csv_bytes(rows: Sequence[Mapping[str, Any]]) -> bytes:
