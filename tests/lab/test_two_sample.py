@@ -8,10 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from sklearn.metrics import roc_auc_score
 
 from keyss.core import Gaussians, UsageError
-from keyss.lab import Auc, delong, features, two_sample_auc
+from keyss.lab import Auc, features, two_sample_auc
 from lab.lifelike import (
     doubled_scales,
     lifelike,
@@ -49,16 +48,6 @@ def test_auc_of_independent_samples() -> None:
 )
 def test_changed_models_are_separated(change: Callable[[Gaussians], Gaussians], least: float) -> None:
     assert two_sample_auc(MODEL, change(OTHER)).low > least
-
-
-def test_delong_against_its_definition() -> None:
-    generator = np.random.default_rng(0)
-    negatives = generator.standard_normal(40).round(1)
-    positives = (0.7 + generator.standard_normal(60)).round(1)  # rounded, so that there are ties
-    wins = (positives[:, None] > negatives) + 0.5 * (positives[:, None] == negatives)
-    variance = wins.mean(axis=1).var(ddof=1) / 60 + wins.mean(axis=0).var(ddof=1) / 40
-    expected = roc_auc_score(np.repeat([0, 1], [40, 60]), np.concatenate([negatives, positives]))
-    assert delong(negatives, positives) == pytest.approx((expected, variance), rel=1e-12)
 
 
 def test_features_ignore_quaternion_sign_and_axis_order() -> None:

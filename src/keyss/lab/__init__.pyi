@@ -1,4 +1,4 @@
-from .auc import Auc as Auc, auc_between as auc_between, delong as delong
+from .auc import Auc as Auc, auc_between as auc_between
 from .baselines.baseline_options import BaselineOptions as BaselineOptions
 from .distances import (
     AttributeDistance as AttributeDistance,
@@ -44,8 +44,4 @@ from .sinkhorn import composite_score as composite_score, sinkhorn_3d as sinkhor
 from .stealth.confirmation import candidate_scores as candidate_scores, changed_low_bits as changed_low_bits
 from .stealth.judging import judge as judge, stealth_statistics as stealth_statistics
 from .stegexpose import score_image as score_image, stegexpose_auc as stegexpose_auc
-from .two_sample import (
-    auc_beside_controls as auc_beside_controls,
-    features as features,
-    two_sample_auc as two_sample_auc,
-)
+from .two_sample import features as features, two_sample_auc as two_sample_auc

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import hashlib
-import math
 import re
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,7 @@ import pytest
 from PIL import Image
 
 from keyss.core import InputError
-from keyss.lab.audits import audit, formatting, read_audit
+from keyss.lab.audits import audit, read_audit
 from keyss.lab.audits.report import embed_picture
 from lab.audits.audited import found_in, run_with, with_all_texts
 from lab.audits.pages import Parsed
@@ -172,21 +171,3 @@ def test_markup_in_texts_is_escaped(
     assert len(page.scripts) == page.tags.count("script") == 1
     assert page.tags.count("style") == page.tags.count("title") == 1
     assert not {"iframe", "object", "embed", "link", "base", "form"} & set(page.tags)
-
-
-@pytest.mark.parametrize(
-    ("value", "digits", "text"),
-    [
-        (27.2715, 2, "27.27"),
-        (-0.5, 1, "−0.5"),
-        (-0.001, 2, "0.00"),
-        (12345, 0, "12,345"),
-        (1e12, 2, "1.00e+12"),
-        (math.inf, 2, "∞"),
-        (-math.inf, 2, "−∞"),
-        (None, 2, "–"),
-        (math.nan, 2, "–"),
-    ],
-)
-def test_number(value: float | None, digits: int, text: str) -> None:
-    assert formatting.number(value, digits) == text
