@@ -113,7 +113,7 @@ def test_carried_secret_does_not_leak() -> None:
         if not row.attack.endswith("opacities"):
             assert row.leak.gradient < 0.15, row.attack  # a low bit may change the selection
             continue
-        assert all(abs(leak) < 5e-3 for leak in asdict(row.leak).values()), row.attack
+        assert max(asdict(row.leak).values()) < 5e-3, row.attack
         picture = pictures[row.attack].int()
         assert (picture[:, :40] - picture[:, 44:84]).abs().max() <= 2, row.attack
 
