@@ -33,7 +33,9 @@ from tiny_scenes import tiny_scene
 
 KEY = "a key of the tests: 3kV-9q"
 STEPS = replace(FIT, iterations=4, max_gaussians=300, sh_degree=3, grow_stop=0.8, grow_every=2)
-PEERS = [name for name, where in registry.METHODS.items() if ".peers." in where.hiding and name != "3dgs"]
+BASELINES = [
+    name for name, where in registry.METHODS.items() if ".baselines." in where.hiding and name != "3dgs"
+]
 
 
 @pytest.fixture
@@ -84,7 +86,7 @@ def test_nothing_is_seen(gpu: torch.device) -> None:
 
 
 def training(name: str, config: FitConfig, device: torch.device) -> Any:
-    """Of a plain model, a design, or a peer."""
+    """Of a plain model, a design, or a baseline."""
     if name == "plain":
         return PlainRun(tiny_scene(), config, device)
     if name not in DESIGNS:
@@ -97,7 +99,7 @@ def training(name: str, config: FitConfig, device: torch.device) -> Any:
     )
 
 
-@pytest.mark.parametrize("name", ["plain", *DESIGNS, *PEERS])
+@pytest.mark.parametrize("name", ["plain", *DESIGNS, *BASELINES])
 def test_trainings_have_the_gradients_of_the_cpu(name: str, gpu: torch.device) -> None:
     here, there = (training(name, STEPS, device) for device in (torch.device("cpu"), gpu))
     for run in (here, there):

@@ -18,7 +18,6 @@ from keyss.core.errors import BackendError, KeyssError
 EXTRAS = {
     "audit": ("scikit-learn", "keyss audit, compare and reproduce"),
     "clip": ("transformers", "the paper's key encoder"),
-    "reproduce": ("pooch", "downloading the paper's scenes"),
     "sweep": ("ray", "sweeps and batches on a cluster"),
     "video": ("av", "keyss render --video"),
 }

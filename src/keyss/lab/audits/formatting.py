@@ -1,4 +1,4 @@
-"""Numbers as text."""
+"""Numbers as text; all functions are filters of the report's templates."""
 
 from __future__ import annotations
 
@@ -45,25 +45,9 @@ def integer(value: float | None) -> str:
 
 
 def numbered(name: str, index: int, count: int) -> str:
-    """A name, with its number if there is more than one."""
+    """A name, numbered if `count` is above 1."""
     return f"{name} {index + 1}" if count > 1 else name
 
 
-def bytes_text(value: float | None) -> str:
-    """A file size, in powers of 1000."""
-    if value is None or not math.isfinite(value):
-        return number(value, 0)
-    if abs(value) < 1000:
-        return f"{number(value, 0)} B"
-    return f"{number(value / 1e3, 1)} kB" if abs(value) < 1e6 else f"{number(value / 1e6, 2)} MB"
-
-
-def seconds_text(value: float | None) -> str:
-    """A duration: 0.021 s, 3.1 s, 10.2 min, 2.5 h."""
-    if value is None or not math.isfinite(value):
-        return number(value, 0)
-    if value < 1:
-        return f"{significant(value)} s"
-    if value < 100:
-        return f"{number(value, 1)} s"
-    return f"{number(value / 60, 1)} min" if value < 6000 else f"{number(value / 3600, 1)} h"
+def seconds_text(value: float) -> str:
+    return f"{number(value / 60, 1)} min" if value >= 100 else f"{significant(value)} s"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from abc import abstractmethod
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -16,14 +16,14 @@ from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Camera
 from keyss.core.similarity import Similarity
 from keyss.fitting.adam import RowAdam
-from keyss.lab.peers.options import PeerOptions
+from keyss.lab.baselines.baseline_options import BaselineOptions
 from keyss.methods.base import Capabilities, Context, Plan, Source, Stego
 from keyss.methods.keyss.combined import PlacedScene
 from keyss.methods.keyss.training import KeyssTraining, Picture
 from keyss.methods.opened import Frame, Remains
 from keyss.methods.tensors import Header, pack_tensors, refuse_damage, unpack_tensors
 
-FORMAT, VERSION = "keyss-peer", 1
+FORMAT, VERSION = "keyss-baseline", 1
 DAMAGED = "what was handed over is damaged"
 
 
@@ -37,7 +37,7 @@ class _Header(Header):
 class HandedTensors:
     """Tensors to hand over, and the placement of the secret in the cover's frame."""
 
-    tensors: Mapping[str, Tensor]  # float32 or uint8
+    tensors: Mapping[str, Tensor]  # float32
     frame: Similarity | None = None  # secret frame to cover frame; None: never placed there
     rows: int | None = None  # Gaussians of the published model, if their order matters
 
@@ -55,12 +55,9 @@ class HandedTensors:
             header, tensors = unpack_tensors(content.data, _Header, FORMAT, VERSION)
         return HandedTensors(tensors, header.frame, header.rows)
 
-    def take(self, names: Iterable[str], *, of_bytes: Collection[str] = ()) -> list[Tensor]:
-        """The tensors of these names: uint8 for those in `of_bytes`, else float32.
-
-        Raises InputError for other types, and for missing or further tensors.
-        """
-        expected = {name: torch.uint8 if name in of_bytes else torch.float32 for name in names}
+    def take(self, names: Iterable[str]) -> list[Tensor]:
+        """The tensors of these names. Raises InputError for others, and for missing ones."""
+        expected = dict.fromkeys(names, torch.float32)
         if expected != {name: value.dtype for name, value in self.tensors.items()}:
             found = ", ".join(sorted(self.tensors))[:200]
             raise InputError(f"{DAMAGED}: expected {', '.join(expected)}, found {found}")
@@ -104,15 +101,15 @@ class HandedSecret:
         return Remains(len(revealed), len(revealed))
 
     def fingerprint(self) -> str:
-        return hashlib.sha256(self.handed.payload("peer").data).hexdigest()[:16]
+        return hashlib.sha256(self.handed.payload("baseline").data).hexdigest()[:16]
 
 
-class PeerTraining(KeyssTraining):
+class BaselineTraining(KeyssTraining):
     """The joint training of a baseline: `prepare` adds parameters and networks, `draw` renders scenes."""
 
-    options: PeerOptions
+    options: BaselineOptions
 
-    def __init__(self, scenes: Sequence[PlacedScene], options: PeerOptions, device: torch.device) -> None:
+    def __init__(self, scenes: Sequence[PlacedScene], options: BaselineOptions, device: torch.device) -> None:
         super().__init__(scenes, [], options, options.design, device)
 
     @abstractmethod
@@ -155,28 +152,30 @@ class PeerTraining(KeyssTraining):
 
 
 @dataclass(frozen=True)
-class Peer:
+class Baseline:
     """A `Method` with a joint training, one secret and one handed-over file."""
 
-    options: type[PeerOptions]
+    options: type[BaselineOptions]
     capabilities: Capabilities
     open: Callable[[HandedTensors], Show]  # raises InputError and ValueError for damage
-    training: type[PeerTraining] | None = None  # None: a subclass overrides `hide`
+    training: type[BaselineTraining] | None = None  # None: a subclass overrides `hide`
     max_secrets: int = 1
 
     @property
     def name(self) -> str:
         return self.options.method
 
-    def prepare(self, sources: Sequence[Source], options: PeerOptions) -> PeerOptions:
+    def prepare(self, sources: Sequence[Source], options: BaselineOptions) -> BaselineOptions:
         """Accept all scenes."""
         return options
 
-    def plan(self, sources: Sequence[Source], options: PeerOptions) -> Plan:
+    def plan(self, sources: Sequence[Source], options: BaselineOptions) -> Plan:
         """Both scenes share the Gaussians of one model."""
         return options.joint_plan(1)
 
-    def hide(self, cover: Source, secrets: Sequence[Source], options: PeerOptions, context: Context) -> Stego:
+    def hide(
+        self, cover: Source, secrets: Sequence[Source], options: BaselineOptions, context: Context
+    ) -> Stego:
         """Train both scenes jointly. Raises Interrupted, and InputError for another run's checkpoint."""
         training = self.training
         assert training is not None

@@ -12,15 +12,15 @@ from dataclasses import replace
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Camera
 from keyss.fitting.parameters import make_optimizers, to_gaussians
-from keyss.lab.peers.method import HandedTensors, Peer, PeerTraining, Show
-from keyss.lab.peers.options import ShOptions
+from keyss.lab.baselines.baseline import Baseline, BaselineTraining, HandedTensors, Show
+from keyss.lab.baselines.baseline_options import ShOptions
 from keyss.methods.base import Capabilities
 from keyss.methods.keyss.training import Picture
 
 _NAMES = ("sh", "secret_sh")  # parameters with the colours of the cover and of the secret
 
 
-class ShTraining(PeerTraining):
+class ShTraining(BaselineTraining):
     """The training of two sets of harmonics; everything else is shared."""
 
     def prepare(self, start: Gaussians) -> None:
@@ -44,10 +44,9 @@ def _open(handed: HandedTensors) -> Show:
     return lambda stego: replace(stego, sh=sh)
 
 
-METHOD = Peer(
+METHOD = Baseline(
     options=ShOptions,
-    capabilities=Capabilities(keys=False, hands_over=True),
+    capabilities=Capabilities(keys=False),
     open=_open,
     training=ShTraining,
 )
-unpack = METHOD.unpack

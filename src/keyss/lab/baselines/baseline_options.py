@@ -5,13 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated, ClassVar
 
-from keyss.core.errors import UsageError
 from keyss.methods.base import CommandLineOption, MethodOptions, Training, check_above_zero
 from keyss.methods.keyss.options import DecoderShape, Design, Scenes
 
 
 @dataclass(frozen=True, kw_only=True)
-class PeerOptions(MethodOptions):
+class BaselineOptions(MethodOptions):
     """Options of all baselines: joint training has the steps and Gaussians of plain models.
 
     It combines poses, points and densification like KeySS's. Each baseline has its own class, which
@@ -55,7 +54,7 @@ class PeerOptions(MethodOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
-class BoundOptions(PeerOptions):
+class BoundOptions(BaselineOptions):
     """Options of the plain models."""
 
     method: ClassVar[str] = "3dgs"
@@ -66,7 +65,7 @@ class BoundOptions(PeerOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
-class DecoderOptions(PeerOptions):
+class DecoderOptions(BaselineOptions):
     """The Gaussians show the cover only, so they start from its points."""
 
     method: ClassVar[str] = "3dgs-decoder"
@@ -75,29 +74,14 @@ class DecoderOptions(PeerOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
-class GsHiderOptions(PeerOptions):
-    """See `PeerOptions`."""
+class GsHiderOptions(BaselineOptions):
+    """See `BaselineOptions`."""
 
     method: ClassVar[str] = "gs-hider"
 
 
 @dataclass(frozen=True, kw_only=True)
-class ShOptions(PeerOptions):
-    """See `PeerOptions`."""
+class ShOptions(BaselineOptions):
+    """See `BaselineOptions`."""
 
     method: ClassVar[str] = "3dgs-sh"
-
-
-@dataclass(frozen=True, kw_only=True)
-class WaterGsOptions(PeerOptions):
-    """See `PeerOptions`."""
-
-    method: ClassVar[str] = "watergs"
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if int(self.fit.iterations * self.fit.grow_stop) < 1:
-            raise UsageError(
-                "`fit`: expected at least one step before growth stops and opacities are mapped; got "
-                f"{self.fit.iterations} steps, and growth in {self.fit.grow_stop:g} of them"
-            )

@@ -6,25 +6,27 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 from keyss.core.gaussians import Gaussians
-from keyss.lab.peers.method import HandedTensors, Peer, Show
-from keyss.lab.peers.options import BoundOptions, PeerOptions
+from keyss.lab.baselines.baseline import Baseline, HandedTensors, Show
+from keyss.lab.baselines.baseline_options import BaselineOptions, BoundOptions
 from keyss.methods.base import Capabilities, Context, Plan, Source, Stego
 
 _NAMES = tuple(each.name for each in fields(Gaussians))
 
 
 @dataclass(frozen=True)
-class BoundMethod(Peer):
+class BoundMethod(Baseline):
     """See `keyss.methods.base.Method`."""
 
-    def plan(self, sources: Sequence[Source], options: PeerOptions) -> Plan:
+    def plan(self, sources: Sequence[Source], options: BaselineOptions) -> Plan:
         """Both models, unchanged."""
         fit = options.fit
         cover, secret = (fit.max_gaussians if each.given is None else len(each.given) for each in sources)
         degree = fit.sh_degree if sources[0].given is None else sources[0].given.sh_degree
         return Plan(gaussians=cover, sh_degree=degree, secret_gaussians=secret, capacity=secret)
 
-    def hide(self, cover: Source, secrets: Sequence[Source], options: PeerOptions, context: Context) -> Stego:
+    def hide(
+        self, cover: Source, secrets: Sequence[Source], options: BaselineOptions, context: Context
+    ) -> Stego:
         """Hand over the secret's model."""
         (secret,) = secrets
         return self.stego(cover.model, HandedTensors(vars(secret.model)))
@@ -37,7 +39,6 @@ def _open(handed: HandedTensors) -> Show:
 
 METHOD = BoundMethod(
     options=BoundOptions,
-    capabilities=Capabilities(keys=False, hands_over=True),
+    capabilities=Capabilities(keys=False),
     open=_open,
 )
-unpack = METHOD.unpack

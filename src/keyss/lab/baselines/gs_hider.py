@@ -14,9 +14,9 @@ from keyss.core.errors import InputError
 from keyss.core.gaussians import SH_C0, Gaussians
 from keyss.core.picture_network import DecodedGaussians
 from keyss.core.scene import Camera
-from keyss.lab.peers.decoder import Convolutions, network_of, network_tensors
-from keyss.lab.peers.method import HandedTensors, Peer, PeerTraining, Show
-from keyss.lab.peers.options import GsHiderOptions
+from keyss.lab.baselines.baseline import Baseline, BaselineTraining, HandedTensors, Show
+from keyss.lab.baselines.baseline_options import GsHiderOptions
+from keyss.lab.baselines.picture_decoder import Convolutions, network_of, network_tensors
 from keyss.methods.base import Capabilities
 from keyss.methods.keyss.training import Picture
 from keyss.rendering import decode_picture, render_features
@@ -25,7 +25,7 @@ FEATURES = 16
 _NOISE = 0.1  # standard deviation of the features that start as noise
 
 
-class GsHiderTraining(PeerTraining):
+class GsHiderTraining(BaselineTraining):
     """The training of features instead of harmonics, a scene decoder and a message decoder."""
 
     def prepare(self, start: Gaussians) -> None:
@@ -71,10 +71,9 @@ def _open(handed: HandedTensors) -> Show:
     return show
 
 
-METHOD = Peer(
+METHOD = Baseline(
     options=GsHiderOptions,
-    capabilities=Capabilities(keys=False, hands_over=True, standard=False, models=False),
+    capabilities=Capabilities(keys=False, standard=False, models=False),
     open=_open,
     training=GsHiderTraining,
 )
-unpack = METHOD.unpack

@@ -32,7 +32,6 @@ if TYPE_CHECKING:
 
 PartName = Literal["images", "parameters", "stealth", "stegexpose", "leaks", "robustness", "speed"]
 TableName = Literal["single", "multi", "masks", "combined", "pruning", "sinkhorn", "speed"]
-_SCENES = "PSNR, SSIM and LPIPS, a row for each scene: mean and standard deviation over seeds"
 QUICK = {"iterations": 500, "max_gaussians": 3000, "width": 100}
 Seeds = Annotated[
     UseAppendAction[tuple[int, ...]],
@@ -45,9 +44,6 @@ def audit(
     run: Run,
     *,
     key_file: KeyFiles = (),
-    original: Annotated[
-        Path | None, optional("FILE", "Plain model of the cover to compare with.", "the run's own")
-    ] = None,
     controls: Annotated[
         int, arg(metavar="N", help="Plain models of the cover from other seeds, as controls; at least 2.")
     ] = 3,
@@ -55,7 +51,7 @@ def audit(
         UseAppendAction[tuple[PartName, ...]],
         optional("PART", f"Part to audit: {', '.join(get_args(PartName))}; repeat for more.", "all"),
     ] = (),
-    report_only: Annotated[bool, switch("Write the report again, of an interrupted audit too.")] = False,
+    report_only: Annotated[bool, switch("Write the report again, from the stored measurements.")] = False,
     resume: Resume = False,
     overwrite: Overwrite = False,
     device: Device = "auto",
@@ -79,7 +75,6 @@ def audit(
         found = keyss.audit(
             run,
             keys_of_run(run, key_file),
-            original=original,
             controls=controls,
             only=only,
             seed=check_seed(seed),
@@ -147,13 +142,11 @@ def compare(
     if isinstance(comparison, Forecast):
         _print_forecast(comparison)
         return
-    for heads, *rows in comparison_tables(comparison).values():
+    for heads, *rows in comparison_tables(comparison):
         print_table(heads, rows)
     described = {
         "comparison.png": "a row for each method: cover, secret, error; it shows the secret",
-        "comparison.md": "the tables, in Markdown",
-        "comparison.csv": _SCENES,
-        "comparison.tex": "the same, for LaTeX (booktabs)",
+        **_scene_tables("comparison"),
         "comparison.json": "all numbers, for programs",
     }
     print(*comparison_notes(comparison), sep="\n")
@@ -173,34 +166,28 @@ def reproduce(
         ),
     ] = (),
     *,
-    data: Annotated[
-        Path | None,
-        optional(
-            "FOLDER",
-            "Folder of the paper's scenes (Mip-NeRF 360, and playroom), for its own sizes: 30,000 steps and "
-            "500,000 Gaussians.",
-            "the given scenes, with 1,000 steps, 9,000 Gaussians, 120 pixels",
+    full: Annotated[
+        bool,
+        switch(
+            "The scenes are the paper's: its pairs, 30,000 steps and 500,000 Gaussians, photos as they are."
         ),
-    ] = None,
+    ] = False,
     pairs: Annotated[
         UseAppendAction[tuple[str, ...]],
         optional(
             "COVER,SECRET",
             "Names of a cover and its secret, for multi COVER,SECRET,SECRET; repeat for more.",
-            "each hides the next; with --data as published",
+            "each hides the next; with --full as published",
         ),
     ] = (),
     out: OutFolder,
-    download: Annotated[
-        bool, switch("Download scenes that are missing in --data from their authors, up to 13 GB.")
-    ] = False,
     dry_run: DryRun = False,
-    iterations: Annotated[int | None, optional("N", "Training steps.", "see --data")] = None,
+    iterations: Annotated[int | None, optional("N", "Training steps.", "1,000, or see --full")] = None,
     max_gaussians: Annotated[
-        int | None, optional("N", "Maximum number of Gaussians of a model.", "see --data")
+        int | None, optional("N", "Maximum number of Gaussians of a model.", "9,000, or see --full")
     ] = None,
     width: Annotated[
-        int | None, optional("PIXELS", "Downscale wider photos to this width.", "see --data")
+        int | None, optional("PIXELS", "Downscale wider photos to this width.", "120, or see --full")
     ] = None,
     device: Device = "auto",
     seed: Seeds = (),
@@ -212,22 +199,19 @@ def reproduce(
 
     example: keyss reproduce single SCENE_A SCENE_B -o runs/paper
 
-    example: keyss reproduce multi --data 360_v2 --download -o runs/paper-full
+    example: keyss reproduce multi 360/* --full -o runs/paper-full
     """
     import keyss
     from keyss.cli.tables import print_files, print_table
-    from keyss.core.errors import InputError, UsageError
+    from keyss.core.errors import InputError
     from keyss.lab.many import Forecast
     from keyss.lab.many.paper import reproduction_notes, reproduction_rows
     from keyss.progress import reporter
 
-    if download and (dry_run or data is None):
-        raise UsageError("--download: needs --data, and no --dry-run")
     reproduction = keyss.reproduce(
         table,
         scenes,
-        data=data,
-        download=download,
+        full=full,
         pairs=pairs,
         iterations=iterations,
         max_gaussians=max_gaussians,
@@ -245,11 +229,9 @@ def reproduce(
     print_table(heads, rows)
     means = f"Published and measured figures, on test views; means over {len(reproduction.pairs)} pair(s)."
     described = {
-        f"{table}.md": "the table and the verdicts, in Markdown",
-        f"{table}.csv": _SCENES,
-        f"{table}.tex": "the same, for LaTeX (booktabs)",
+        **_scene_tables(table),
         f"{table}.json": "all figures, for programs",
-        "cells": "the runs, which other tables share",
+        "trials": "the runs, which other tables share",
     }
     print(*reproduction_notes(reproduction), means, sep="\n")
     print_files(out, described)
@@ -265,10 +247,6 @@ def sweep(
     out: OutFolder,
     ray: Ray = None,
     cores: Cores = 1,
-    master_key_file: Annotated[
-        Path | None,
-        optional("FILE", "Key file to derive the cells' keys from (`keyss keygen --asset`).", "a new one"),
-    ] = None,
     dry_run: DryRun = False,
 ) -> None:
     """Hide over a grid of scenes, methods, options and seeds, and tabulate the results.
@@ -287,7 +265,6 @@ def sweep(
     result = keyss.sweep(
         spec,
         out,
-        master_key_file=master_key_file,
         ray=ray,
         cores=cores,
         dry_run=dry_run,
@@ -297,14 +274,19 @@ def sweep(
         _print_forecast(result)
         return
     described = {
-        "scenes.csv": _SCENES,
-        "scenes.tex": "the same, for LaTeX (booktabs)",
+        **_scene_tables("scenes"),
         "results.csv": "all measures: mean and standard deviation over seeds",
-        "cells.csv": "the numbers of each cell",
-        "private/master-key.txt": "the key from which those of the cells are derived",
+        "trials.csv": "the numbers of each trial",
+        "private/master-key.txt": "the key from which those of the trials are derived",
     }
     print_files(out, described)
-    print_outcome(result.errors, len(result.outcomes), "cells")
+    print_outcome(result.errors, len(result.outcomes), "trials")
+
+
+def _scene_tables(stem: str) -> dict[str, str]:
+    """Descriptions of two files."""
+    scenes = "PSNR, SSIM and LPIPS, a row for each scene: mean and standard deviation over seeds"
+    return {f"{stem}.csv": scenes, f"{stem}.tex": "the same, for LaTeX (booktabs)"}
 
 
 def _print_verdicts(audit: Audit) -> None:
@@ -319,7 +301,7 @@ def _print_verdicts(audit: Audit) -> None:
 
 
 def _print_forecast(found: Forecast) -> None:
-    """Print the cells of a dry run, with estimates for those to do."""
+    """Print the trials of a dry run, with estimates for those to do."""
     from keyss.cli.tables import print_table
     from keyss.progress import about
 

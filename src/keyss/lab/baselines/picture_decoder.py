@@ -16,8 +16,8 @@ from keyss.core.gaussians import Gaussians
 from keyss.core.picture_network import DecodedGaussians, PictureNetwork
 from keyss.core.scene import Camera
 from keyss.fitting.parameters import to_gaussians
-from keyss.lab.peers.method import HandedTensors, Peer, PeerTraining, Show
-from keyss.lab.peers.options import DecoderOptions
+from keyss.lab.baselines.baseline import Baseline, BaselineTraining, HandedTensors, Show
+from keyss.lab.baselines.baseline_options import DecoderOptions
 from keyss.methods.base import Capabilities
 from keyss.methods.keyss.training import Picture
 from keyss.rendering import decode_picture
@@ -56,7 +56,7 @@ def network_of(handed: HandedTensors) -> PictureNetwork:
     return PictureNetwork(tuple(zip(rest[::2], rest[1::2], strict=True)), background)
 
 
-class DecoderTraining(PeerTraining):
+class DecoderTraining(BaselineTraining):
     """The training of plain Gaussians and a network."""
 
     def prepare(self, start: Gaussians) -> None:
@@ -84,10 +84,9 @@ def _open(handed: HandedTensors) -> Show:
     return lambda stego: DecodedGaussians.of(stego, network)
 
 
-METHOD = Peer(
+METHOD = Baseline(
     options=DecoderOptions,
-    capabilities=Capabilities(keys=False, hands_over=True, models=False),
+    capabilities=Capabilities(keys=False, models=False),
     open=_open,
     training=DecoderTraining,
 )
-unpack = METHOD.unpack
