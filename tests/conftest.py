@@ -123,7 +123,7 @@ def real_data() -> Path:
 def splat_transform() -> Callable[..., Path]:
     """Converts (source, target) -> target by splat-transform; skips if it is not installed."""
     from keyss.core import BackendError
-    from keyss.files.foreign import find_splat_transform
+    from keyss.files.file_kinds import find_splat_transform
     from keyss.lab import transform
 
     try:

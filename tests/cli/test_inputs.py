@@ -49,7 +49,7 @@ def test_a_key_file_in_place_of_a_model_is_not_quoted(keyss: Run, world: Path, t
         ("reveal", world / "key.txt", *key(world), "-o", tmp_path / "s.ply"),
     ):
         said = keyss(*arguments)
-        assert_refused(said, 4, "found a file of no kind that keyss knows")
+        assert_refused(said, 4, "found a file of unknown kind")
         assert text[:3] not in said.err
 
 
@@ -125,7 +125,7 @@ def test_a_missing_photo_is_named_and_left_out_on_demand(keyss: Run, tmp_path: P
     assert "--skip-missing" in said.err
     assert not (tmp_path / "out").exists()
     (warning,) = warnings_of(fitted(keyss, scene, tmp_path / "out", "--skip-missing"))
-    assert warning.endswith(f"1 of 4 photos are missing and left out: {name}")
+    assert warning.endswith(f"1 of 4 photos are missing, left out: {name}")
     described = keyss("info", scene, "--json")
     assert json.loads(described.out)["train_views"] == {"colmap": 2, "blender": 3, "nerfstudio": 2}[layout]
     assert warnings_of(described) == [warning]

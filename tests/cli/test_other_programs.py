@@ -120,7 +120,7 @@ def test_the_folder_of_a_training_is_a_cover(keyss: Run, tmp_path: Path, place: 
     run = tmp_path / "run"
     said = keyss("hide", "--cover", tmp_path / "training", *secret, "--width", 32, "-o", run)
     assert said.status == 0, said.err
-    assert f"training: a folder of a training; its model is {place}" in said.err
+    assert f"training: output of a training; its model is {place}" in said.err
     said = keyss("reveal", run / "publish" / "model.ply", "--key-file", key, "-o", tmp_path / "revealed.ply")
     assert said.status == 0, said.err
 

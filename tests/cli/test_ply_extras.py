@@ -12,7 +12,7 @@ from cli.said import Run, write_key
 from files.test_ply import columns_of, ply_bytes
 from keyss.core import Gaussians, same_bits
 from keyss.files import read_model, write_model
-from keyss.files.ply_table import read_vertex_table
+from keyss.files.ply_table import read_vertices
 
 COUNT = 1500
 COMMENTS = b"comment Exported by the studio's tool, 2\xe9\nobj_info taken in May\n"
@@ -40,8 +40,9 @@ def extended(model: Gaussians, path: Path, form: str = "binary_little_endian") -
 
 def check_extras(path: Path, extra: dict[str, np.ndarray], rows: slice = slice(None)) -> None:
     with path.open("rb") as file:
-        table, comments = read_vertex_table(file)
-    assert "\n".join(comments).encode("latin-1") + b"\n" == COMMENTS
+        vertices = read_vertices(file)
+        table = np.concatenate(list(vertices.blocks))
+    assert "\n".join(vertices.comments).encode("latin-1") + b"\n" == COMMENTS
     for name, values in extra.items():
         assert np.array_equal(table[name][: len(values[rows])], values[rows]), name
 

@@ -9,8 +9,8 @@ from keyss.channels import open_content
 from keyss.core.errors import KeyssWarning, UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.files.atomic import check_not_an_input, check_output_file, write_bytes
+from keyss.files.inputs import is_standard
 from keyss.files.models import check_model_output, is_model_path, write_model
-from keyss.files.reading import is_standard
 from keyss.methods.opened import Frame, HiddenFile, OpensAFileError
 from keyss.rendering import Backend, resolve_device
 from keyss.runs.files import PathLike, as_model

@@ -139,6 +139,6 @@ def _frame(device: Device) -> str:
 
 
 def _splat_transform() -> str:
-    from keyss.files.foreign import find_splat_transform
+    from keyss.files.file_kinds import find_splat_transform
 
     return find_splat_transform()

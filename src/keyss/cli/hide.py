@@ -224,13 +224,13 @@ def _secrets(args: HideArguments, method: Method) -> list[Any]:
     """The secrets with their keys and models."""
     import keyss
     from keyss.core.errors import InputError, UsageError
-    from keyss.files.foreign import what_it_is
+    from keyss.files.file_kinds import identify_file
     from keyss.files.models import is_model_path
 
     count, models = len(args.secret), args.details.secret_model
     for each in args.secret:
         if each.is_file() and not is_model_path(each):
-            found = f"{each}: expected a scene folder or a model, found {what_it_is(each)}"
+            found = f"{each}: expected a scene folder or a model, found {identify_file(each)}"
             raise InputError(f"{found}; --secret-file hides any file")
     if models and len(models) != count:
         raise UsageError(

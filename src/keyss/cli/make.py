@@ -181,7 +181,7 @@ def convert(
     import keyss
     from keyss.cli.keys import given_keys
     from keyss.cli.tables import print_conversion
-    from keyss.files.reading import is_standard
+    from keyss.files.inputs import is_standard
     from keyss.progress import waiting
 
     with waiting(f"converting {model.name}"):

@@ -51,7 +51,7 @@ def reveal(
     key: str | None = None
     if handed is None or key_file:
         (key,) = keys(key_file, 1)
-    from keyss.files.reading import is_standard
+    from keyss.files.inputs import is_standard
     from keyss.progress import waiting
 
     with waiting(f"opening {stego.name}"):

@@ -9,7 +9,7 @@ import torch
 
 from keyss.core.errors import InputError, UsageError
 from keyss.core.gaussians import DRAWN_OPACITY, Gaussians
-from keyss.files.reading import read_file
+from keyss.files.inputs import read_file
 from keyss.methods import handed as handing, registry
 from keyss.methods.opened import Frame, HiddenFile, Opened, OpensAFileError, Remains
 from keyss.runs.files import PathLike

@@ -14,7 +14,7 @@ from markupsafe import Markup, escape
 
 from keyss.core import InputError, import_extra
 from keyss.files.images import probe_image
-from keyss.files.reading import read_file
+from keyss.files.inputs import read_file
 from keyss.lab.audits import formatting
 from keyss.lab.audits.record import PICTURES, Audit, ImageComparison, ModelImages
 from keyss.lab.audits.summary import auc_text, headline, verdicts, worst_leak

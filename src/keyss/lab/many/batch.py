@@ -24,7 +24,7 @@ from keyss.api.hide_files import SecretFile, hide_files
 from keyss.core import InputError, KeyssWarning, ViewOptions
 from keyss.core.errors import did_you_mean
 from keyss.files import write_bytes
-from keyss.files.reading import read_text
+from keyss.files.inputs import read_text
 from keyss.keys import MasterKey, read_key
 from keyss.lab.many.engine import ManyResult, Outcome, claim_folder, run_tasks
 from keyss.lab.many.result_tables import csv_bytes

@@ -16,7 +16,7 @@ from msgspec import Meta
 
 from keyss.core import InputError, KeyssError, ViewOptions, import_extra
 from keyss.core.errors import did_you_mean
-from keyss.files.reading import read_text
+from keyss.files.inputs import read_text
 from keyss.fitting import PRESETS
 from keyss.fitting.config import MAX_SEED
 from keyss.lab.audits import PARTS

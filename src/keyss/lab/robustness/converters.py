@@ -16,7 +16,7 @@ from types import ModuleType
 
 from keyss.core.errors import BackendError, KeyssError
 from keyss.core.gaussians import Gaussians
-from keyss.files.foreign import find_splat_transform
+from keyss.files.file_kinds import find_splat_transform
 from keyss.files.models import read_model, write_model
 from keyss.lab.robustness.changes import Change
 

@@ -15,7 +15,7 @@ from PIL import Image
 
 from files.scene_files import photo
 from keyss.core import InputError
-from keyss.files import load_scene, read_model, what_it_is
+from keyss.files import identify_file, load_scene, read_model
 
 CONVERT = "convert it to .ply first, e.g. with `splat-transform IN OUT.ply`"
 
@@ -72,8 +72,8 @@ FILES = {  # name and content, and what they are
     "e.dat": (pictured("JPEG"), "a picture"),
     "f": (b"ply\nformat ascii 1.0\n", "a PLY file under another name; rename it to end in .ply"),
     "transforms.json": (b"{}", "a JSON file; give the folder that it lies in"),
-    "g.bin": (b"\x01\x02", "a file of no kind that keyss knows"),
-    "key.txt": (b"q7Rv2LxT9bWm4KzD", "a file of no kind that keyss knows"),
+    "g.bin": (b"\x01\x02", "a file of unknown kind"),
+    "key.txt": (b"q7Rv2LxT9bWm4KzD", "a file of unknown kind"),
     "h.spz": (b"", "an empty file"),
 }
 
@@ -82,11 +82,11 @@ READ = {"a.spz", "A.SPZ", "a.sog", "a.splat", "a.glb", "a.zip", "a", "b", "c", "
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_what_it_is_and_what_to_do(tmp_path: Path, name: str) -> None:
+def test_identify_file(tmp_path: Path, name: str) -> None:
     content, found = FILES[name]
     (tmp_path / name).write_bytes(content)
-    assert what_it_is(tmp_path / name).startswith(found)
-    assert "q7R" not in what_it_is(tmp_path / name)
+    assert identify_file(tmp_path / name).startswith(found)
+    assert "q7R" not in identify_file(tmp_path / name)
     with pytest.raises(InputError) as refused:
         load_scene(tmp_path / name)
     assert f"{tmp_path / name}: expected a scene folder, found {found}" in str(refused.value)
@@ -98,6 +98,6 @@ def test_what_it_is_and_what_to_do(tmp_path: Path, name: str) -> None:
     assert f"), found {found}" in str(refused.value)
 
 
-def test_a_pipe_is_not_waited_for(tmp_path: Path) -> None:
+def test_pipes_do_not_block(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
-    assert what_it_is(tmp_path / "pipe") == "neither a file nor a folder"
+    assert identify_file(tmp_path / "pipe") == "neither a file nor a folder"

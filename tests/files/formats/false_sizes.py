@@ -239,7 +239,7 @@ def colmap(data: bytes, rng: Random) -> bytes:
     return bytes(changed)
 
 
-LIES: dict[str, Callable[[bytes, Random], bytes]] = {
+FALSE_SIZES: dict[str, Callable[[bytes, Random], bytes]] = {
     "a.ply": ply,
     "a.compressed.ply": ply,
     "a.spz": lambda data, rng: (spz4 if data.startswith(b"NGSP") else spz)(data, rng),

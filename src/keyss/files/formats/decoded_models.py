@@ -1,4 +1,4 @@
-"""Models that a network decodes, as safetensors: our own format, without executable content.
+"""Models with a decoder network, as safetensors: our own format, without executable content.
 
 Tensors of single precision: `means` [N, 3], `quats` [N, 4], `log_scales` [N, 3], `opacity_logits` [N],
 `sh` [N, K, 3]; `features` [N, C] if they replace the harmonics; `background` [C]; and of each layer I from 0:
@@ -20,7 +20,7 @@ from keyss.core.picture_network import DecodedGaussians, PictureNetwork
 from keyss.files.formats.common import reason
 
 FORMAT = "keyss-decoded/1"
-_MAX_HEADER_BYTES = 1 << 17  # a tensor of no bytes takes 20 times its part of the header
+_MAX_HEADER_BYTES = 1 << 17  # an empty tensor takes 20 times its header entry in memory
 
 _NAMES = tuple(each.name for each in fields(Gaussians))
 

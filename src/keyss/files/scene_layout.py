@@ -1,10 +1,10 @@
-"""Scenes before their photos are decoded: the result of reading any scene layout."""
+"""Photos with poses, and points: what every scene layout is read into before photos are decoded."""
 
 from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -25,7 +25,7 @@ class Photo:
     name: str
     viewmat: Doubles  # [4, 4] world to camera, OpenCV axes, a rigid motion
     lens: Lens
-    mask: Path | None = None  # an image file, black where the photo does not count
+    mask: Path | None = None  # an image file, black where pixels are ignored
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class PointCloud:
 
     @staticmethod
     def checked(where: Path, xyz: Doubles, rgb: Bytes) -> PointCloud:
-        """The points. Raises InputError if a coordinate is not finite or beyond 1e15."""
+        """Raises InputError if a coordinate is not finite or beyond 1e15."""
         bad = ~(np.abs(xyz) <= MAX_COORDINATE).all(axis=1)
         if bad.any():
             first = int(bad.argmax())
@@ -58,9 +58,9 @@ class SceneLayout:
 
 
 def hold_out(where: Path, photos: Sequence[Photo]) -> tuple[tuple[Photo, ...], tuple[Photo, ...]]:
-    """(train, test): every 8th photo by name, starting with the first, is a test view.
+    """(train, test): every 8th photo by name is a test view, as for Mip-NeRF 360 and in 3DGS.
 
-    This is the split of Mip-NeRF 360 and of 3DGS. Raises InputError for fewer than 2 photos.
+    Raises InputError for fewer than 2 photos.
     """
     if len(photos) < 2:
         raise InputError(
@@ -70,46 +70,30 @@ def hold_out(where: Path, photos: Sequence[Photo]) -> tuple[tuple[Photo, ...], t
     return tuple(p for i, p in enumerate(ordered) if i % 8), tuple(ordered[::8])
 
 
-def leave_out_missing(where: Path, total: int, missing: Sequence[str], skip_missing: bool) -> None:
-    """Raise InputError if photos of a scene are missing, or, with `skip_missing`, warn (KeyssWarning).
+def leave_out(where: Path, total: int, why: str, photos: Sequence[str], skip_missing: bool) -> None:
+    """Raise InputError if `photos`, some of `total`, cannot be used.
 
-    `total` is the number of photos with the missing ones. If all are missing, InputError is raised anyway.
+    With `skip_missing`, a KeyssWarning, unless these are all photos.
     """
-    if not missing:
+    if not photos:
         return
-    listed = ", ".join(missing[:5]) + (f" and {len(missing) - 5:,} more" if len(missing) > 5 else "")
-    count = f"{len(missing):,} of {total:,} photos"
+    listed = ", ".join(photos[:5]) + (f" and {len(photos) - 5:,} more" if len(photos) > 5 else "")
+    count = f"{where}: {len(photos):,} of {total:,} photos {why}"
     if not skip_missing:
-        raise InputError(f"{where}: {count} are missing: {listed}; `skip_missing=True` leaves them out")
-    if len(missing) == total:
-        raise InputError(f"{where}: all of its {total:,} photos are missing: {listed}")
-    warnings.warn(f"{where}: {count} are missing and left out: {listed}", KeyssWarning, stacklevel=2)
+        raise InputError(f"{count}: {listed}; `skip_missing=True` leaves them out")
+    if len(photos) == total:
+        raise InputError(f"{count}: {listed}")
+    warnings.warn(f"{count}, left out: {listed}", KeyssWarning, stacklevel=2)
 
 
-def leave_out_broken(where: Path, total: int, broken: Mapping[str, str], skip_missing: bool) -> None:
-    """`leave_out_missing` for photos without a usable camera; `broken` has messages by name of the photo."""
-    if not broken:
-        return
-    first = next(iter(broken.values()))
-    if len(broken) == total:
-        raise InputError(first)
-    count = f"{len(broken):,} of {total:,} photos"
-    if not skip_missing:
-        raise InputError(f"{first}; `skip_missing=True` leaves out such photos ({count})")
-    listed = ", ".join(list(broken)[:5]) + (f" and {len(broken) - 5:,} more" if len(broken) > 5 else "")
-    warnings.warn(
-        f"{where}: {count} have no usable camera and are left out: {listed}", KeyssWarning, stacklevel=2
-    )
-
-
-class FileFinder:
-    """Finds files whose names have another case than those that a scene lists."""
+class CaseInsensitiveFinder:
+    """Finds files whose names differ from those in a scene by case only."""
 
     def __init__(self) -> None:
         self._listings: dict[Path, dict[str, list[str]]] = {}
 
     def find(self, folder: Path, name: str) -> str:
-        """`name`, relative to `folder`, as it is spelt on disk, if exactly one path matches; else `name`."""
+        """`name`, relative to `folder`, as spelt on disk if exactly one path matches, else unchanged."""
         if (folder / name).exists():
             return name
         found: list[str] = []
@@ -122,7 +106,7 @@ class FileFinder:
         return "/".join(found)
 
     def _listing(self, folder: Path) -> dict[str, list[str]]:
-        """The names in a folder by their spelling without case."""
+        """The names in a folder by their case-folded form."""
         if folder not in self._listings:
             names: dict[str, list[str]] = {}
             for each in os.listdir(folder) if folder.is_dir() else ():
@@ -132,7 +116,7 @@ class FileFinder:
 
 
 def refuse_duplicates(where: Path, photos: Sequence[Photo]) -> None:
-    """Raise InputError if two photos have one name: they could be in training and test set at once."""
+    """Raise InputError if two photos share a name: they could be in both training and test set."""
     seen: set[str] = set()
     for photo in photos:
         if photo.name in seen:

@@ -1,4 +1,4 @@
-"""Reading files, with errors that name the file."""
+"""Opens files and standard streams, with errors that name them."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ _CHUNK_BYTES = 1 << 20
 
 @contextmanager
 def open_input(path: Path) -> Iterator[BinaryIO]:
-    """Open a regular file. Any OSError or InputError in the block becomes an InputError that names it."""
+    """Open a regular file. OSErrors and InputErrors in the block become InputErrors that name the file."""
     try:
-        if not path.is_file():  # opening a pipe could block for ever
+        if not path.is_file():  # opening a pipe could block forever
             raise InputError(f"expected a file, found {'a folder' if path.is_dir() else 'nothing'}")
         with path.open("rb") as file:
             yield file

@@ -27,7 +27,7 @@ FOLDERS = {
 
 
 @pytest.mark.parametrize("program", FOLDERS)
-def test_the_latest_model_is_used_and_said(tmp_path: Path, program: str) -> None:
+def test_latest_model_is_used(tmp_path: Path, program: str) -> None:
     folder, models = tmp_path / "run", []
     (folder / "ckpts").mkdir(parents=True)
     (folder / "ckpts" / "ckpt_29999_rank0.pt").write_bytes(b"PK\3\4")
@@ -35,7 +35,7 @@ def test_the_latest_model_is_used_and_said(tmp_path: Path, program: str) -> None
         models.append(random_gaussians(20 + seed, seed))
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         write_model(folder / name, models[-1])
-    said = f"run: a folder of a training; its model is {FOLDERS[program][-1]}$"
+    said = f"run: output of a training; its model is {FOLDERS[program][-1]}$"
     assert is_model(folder)
     with pytest.warns(KeyssWarning, match=said):
         assert same_bits(read_model(folder), models[-1])
@@ -49,7 +49,7 @@ def test_the_latest_model_is_used_and_said(tmp_path: Path, program: str) -> None
 
 
 @pytest.mark.parametrize("place", ["ckpts/ckpt_6999_rank0.pt", "nerfstudio_models/step-000029999.ckpt"])
-def test_checkpoints_without_a_model_are_told_the_way_out(tmp_path: Path, place: str) -> None:
+def test_folders_of_checkpoints(tmp_path: Path, place: str) -> None:
     (tmp_path / place).parent.mkdir()
     (tmp_path / place).write_bytes(b"PK\3\4")
     assert not is_model(tmp_path)
@@ -58,14 +58,14 @@ def test_checkpoints_without_a_model_are_told_the_way_out(tmp_path: Path, place:
             read(tmp_path)
 
 
-def test_an_unpacked_sog_is_told_the_way_out(tmp_path: Path) -> None:
+def test_unpacked_sog(tmp_path: Path) -> None:
     (tmp_path / "meta.json").write_text("{}")
     for read in (read_model, load_scene):
         with pytest.raises(InputError, match=r"found an unpacked SOG model.*`splat-transform IN OUT\.ply`"):
             read(tmp_path)
 
 
-def test_a_scene_with_a_model_beside_its_photos_is_a_scene(tmp_path: Path) -> None:
+def test_scene_that_contains_a_model(tmp_path: Path) -> None:
     write_model(write_colmap(tmp_path) / "splat.ply", random_gaussians(3))
     assert not is_model(tmp_path)
     assert len(load_scene(tmp_path).views) == 3

@@ -1,4 +1,4 @@
-"""Names files that keyss does not read as models, and says what to do with them."""
+"""Identifies files by name and content, with advice for kinds that keyss does not read."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from keyss.core.errors import BackendError
-from keyss.files.reading import open_input
+from keyss.files.inputs import open_input
 
 CONVERT = "convert it to .ply first, e.g. with `splat-transform IN OUT.ply`"
 _MODEL = "give it where a model is asked for"
@@ -19,23 +19,23 @@ _CHECKPOINT = (
     "`simple_trainer.py --save_ply`, Nerfstudio with `ns-export gaussian-splat`, Inria's train.py writes "
     "point_cloud/iteration_N/point_cloud.ply by itself"
 )
-_UNPACK = "unpack it, and give the folder or the model that is in it"
-CHECKPOINTS = f"checkpoints of a training; {_CHECKPOINT}"  # in a folder
-START_BYTES = 256  # of a file, which tell its kind
+_UNPACK = "unpack it, and give the folder or the model inside"
+CHECKPOINTS = f"checkpoints of a training; {_CHECKPOINT}"
+START_BYTES = 256  # enough to identify a file
 _ZIP = b"PK\x03\x04"
 _POSES = "a scene is a folder of photos with their poses, e.g. from COLMAP"
 
 
 @dataclass(frozen=True)
 class _Kind:
-    name: str  # with its article
+    name: str  # with an article
     advice: str
     suffixes: tuple[str, ...] = ()
     magic: tuple[bytes, ...] = ()  # possible first bytes
-    member: tuple[bytes, ...] = ()  # how the name of the first file in a ZIP archive may end
+    member: tuple[bytes, ...] = ()  # possible suffixes of the first file in a ZIP archive
 
 
-# The first kind whose suffix fits, else the first whose content does.
+# The first matching suffix wins, else the first matching content.
 _KINDS = (
     _Kind("an SPZ model", _MODEL, (".spz",), (b"NGSP",)),
     _Kind("an SOG model", _MODEL, (".sog",)),
@@ -74,38 +74,35 @@ _KINDS = (
 )
 
 
-def what_it_is(path: Path) -> str:
-    """The kind of a file that keyss does not read, and what to do with it; to follow "expected ..., found".
-
-    Raises InputError if it cannot be read.
-    """
-    if not path.is_file():  # reading a pipe could block for ever
+def identify_file(path: Path) -> str:
+    """The kind of a file, and advice, to follow "expected ..., found". Raises InputError if unreadable."""
+    if not path.is_file():  # reading a pipe could block forever
         return "neither a file nor a folder"
     with open_input(path) as file:
-        return kind_of(path.name, file.read(START_BYTES))
+        return identify_content(path.name, file.read(START_BYTES))
 
 
-def kind_of(name: str, start: bytes) -> str:
-    """`what_it_is` for a file with this name and these first START_BYTES."""
+def identify_content(name: str, start: bytes) -> str:
+    """`identify_file` from a name and the first START_BYTES."""
     if not start:
         return "an empty file"
     by_suffix = (kind for kind in _KINDS if name.lower().endswith(kind.suffixes))
     by_magic = (kind for kind in _KINDS if start.startswith(kind.magic))
     kind = next(by_suffix, None) or _kind_in_zip(start) or next(by_magic, None)
     if kind is None:
-        return "a file of no kind that keyss knows"  # does not quote it: it may be a key
+        return "a file of unknown kind"  # not quoted: it may be a key
     if kind.advice == CONVERT:
         return f"{kind.name}, which keyss does not read; {CONVERT}"
     return f"{kind.name}; {kind.advice}"
 
 
 def is_foreign_zip(start: bytes) -> bool:
-    """True for a ZIP archive that is not a model, such as a checkpoint, from its first START_BYTES."""
+    """True for a ZIP archive other than a model, such as a checkpoint, from its first START_BYTES."""
     return _kind_in_zip(start) is not None
 
 
 def _kind_in_zip(start: bytes) -> _Kind | None:
-    """The kind of a ZIP archive, from the local header of its first file."""
+    """The kind of a ZIP archive, from the name of its first file."""
     if not start.startswith(_ZIP):
         return None
     member = start[30 : 30 + int.from_bytes(start[26:28], "little")]
@@ -113,7 +110,7 @@ def _kind_in_zip(start: bytes) -> _Kind | None:
 
 
 def find_splat_transform() -> str:
-    """The program: KEYSS_SPLAT_TRANSFORM, else node_modules here, else on the PATH. Raises BackendError."""
+    """The path in KEYSS_SPLAT_TRANSFORM, else in ./node_modules, else on the PATH. Raises BackendError."""
     here = Path("node_modules") / ".bin" / "splat-transform"
     named = os.environ.get("KEYSS_SPLAT_TRANSFORM")
     program = named or (str(here.absolute()) if here.exists() else shutil.which("splat-transform"))
