@@ -37,7 +37,7 @@ def pytest_sessionstart() -> None:
     derivation.hash_secret_raw = hash_secret_raw
 
 
-def choose_costs(item: pytest.Item) -> None:
+def set_key_cost(item: pytest.Item) -> None:
     """For the test and its fixtures from now on."""
     global _cheap
     _cheap = item.get_closest_marker("argon2") is None

@@ -13,22 +13,22 @@ import pytest
 from hypothesis import settings
 
 import keyss  # noqa: F401  before any test module imports torch: see keyss._threads
-import uncompiled  # noqa: F401  before any test module imports gsply
-from cheap_keys import choose_costs, pytest_sessionstart  # noqa: F401  hook
-from same_draws import begin_draws, draw_the_same, pytest_fixture_setup  # noqa: F401  hook
+import uncompiled_gsply  # noqa: F401  before any test module imports gsply
+from cheap_keys import set_key_cost, pytest_sessionstart  # noqa: F401  hook
+from seeding import seed_test, patch_random_sources, pytest_fixture_setup  # noqa: F401  hook
 from skip_policy import pytest_make_collect_report, pytest_runtest_makereport  # noqa: F401  hooks
 
 if TYPE_CHECKING:
     import torch
 
-    from cli.said import Run
+    from cli.harness import Run
 
 # What hypothesis makes up is the same in every run of CI, so that a failure comes with the change that made
 # it; on other machines it goes on searching. How long an example takes depends on what else a machine does.
 settings.register_profile("tests", derandomize="CI" in os.environ, deadline=None)
 settings.load_profile("tests")
 if "CI" in os.environ:
-    draw_the_same()
+    patch_random_sources()
 
 # A script that runs the tests in its background has them ignore Ctrl-C, which many of them send.
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
@@ -38,8 +38,8 @@ if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup(item: pytest.Item) -> None:
     """Before fixtures of any scope: those that are shared must not be mixed."""
-    begin_draws(item)
-    choose_costs(item)
+    seed_test(item)
+    set_key_cost(item)
 
 
 @pytest.fixture
@@ -53,7 +53,7 @@ def umask() -> Iterator[None]:
 @pytest.fixture(name="keyss")
 def _keyss(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Run:
     """Runs the command line in this process, without a key in the environment and without a terminal."""
-    from cli.said import Said
+    from cli.harness import Result
     from keyss.cli import main
 
     monkeypatch.delenv("KEYSS_KEY", raising=False)
@@ -61,13 +61,13 @@ def _keyss(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setenv("COLUMNS", "120")
     monkeypatch.setattr("sys.stdin", io.StringIO())
 
-    def run(*arguments: object) -> Said:
+    def run(*arguments: object) -> Result:
         capsys.readouterr()
         try:
             status = main([str(argument) for argument in arguments])
         except SystemExit as end:
             status = int(end.code or 0)
-        return Said(status, *capsys.readouterr())
+        return Result(status, *capsys.readouterr())
 
     return run
 

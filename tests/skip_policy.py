@@ -20,15 +20,15 @@ Report = TypeVar("Report", pytest.TestReport, pytest.CollectReport)
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_makereport() -> Generator[None, pytest.TestReport, pytest.TestReport]:
-    return judged((yield))
+    return fail_skips((yield))
 
 
 @pytest.hookimpl(wrapper=True)
 def pytest_make_collect_report() -> Generator[None, pytest.CollectReport, pytest.CollectReport]:
-    return judged((yield))
+    return fail_skips((yield))
 
 
-def judged(report: Report) -> Report:
+def fail_skips(report: Report) -> Report:
     """The report, made one of a failure where a skip is not allowed; what fails as expected is no skip."""
     if os.environ.get("CI") != "true" or not report.skipped or hasattr(report, "wasxfail"):
         return report

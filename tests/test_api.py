@@ -63,7 +63,7 @@ def run(folders: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory) ->
     return out
 
 
-def test_hide_writes_its_results_and_nothing_else(run: Path) -> None:
+def test_hide_output_files(run: Path) -> None:
     files = {str(path.relative_to(run)) for path in run.rglob("*") if path.is_file()}
     assert files == {
         "publish/model.ply",
@@ -77,7 +77,7 @@ def test_hide_writes_its_results_and_nothing_else(run: Path) -> None:
         assert "the key" not in path.read_text()
 
 
-def test_evaluate_measures_the_same_from_the_files(run: Path) -> None:
+def test_evaluate_reproduces_metrics(run: Path) -> None:
     before = json.loads((run / "private" / "metrics.json").read_text())
     after = keyss.evaluate(run, ["the key"])
     assert json.loads(msgspec.json.encode(after)) == before
@@ -86,7 +86,7 @@ def test_evaluate_measures_the_same_from_the_files(run: Path) -> None:
         keyss.evaluate(run, ["another"])
 
 
-def test_metrics_are_of_what_reveal_writes(run: Path, folders: tuple[Path, Path], tmp_path: Path) -> None:
+def test_metrics_match_revealed_file(run: Path, folders: tuple[Path, Path], tmp_path: Path) -> None:
     secret = keyss.reveal(run / "publish" / "model.ply", "the key", out=tmp_path / "secret.ply").gaussians
     again = keyss.read_model(tmp_path / "secret.ply")
     assert torch.equal(secret.means, again.means)
@@ -96,7 +96,7 @@ def test_metrics_are_of_what_reveal_writes(run: Path, folders: tuple[Path, Path]
     assert psnr == pytest.approx(metrics["secrets"][0]["psnr"], abs=0.1)
 
 
-def test_the_same_run_gives_the_same_bytes(run: Path, folders: tuple[Path, Path], tmp_path: Path) -> None:
+def test_hide_is_deterministic(run: Path, folders: tuple[Path, Path], tmp_path: Path) -> None:
     keyss.hide(folders[0], [Secret(folders[1], "the key")], method=ANY, out=tmp_path / "again")
     for name in ("publish/model.ply", "private/secret-1.ply"):
         assert (tmp_path / "again" / name).read_bytes() == (run / name).read_bytes()
@@ -108,7 +108,7 @@ def test_wrong_key_writes_nothing(run: Path, tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-def test_a_decoy_is_the_cover_in_a_file_like_a_revealed_secret(
+def test_decoy_file(
     run: Path, folders: tuple[Path, Path], tmp_path: Path
 ) -> None:
     """All of its numbers are others, a little, in the same way for one key every time."""
@@ -130,7 +130,7 @@ def test_a_decoy_is_the_cover_in_a_file_like_a_revealed_secret(
         assert (shown.float() - cover.float()).square().mean() < 255**2 * 1e-3  # 30 dB
 
 
-def test_outputs_that_exist_are_refused_before_any_work(
+def test_existing_outputs_are_refused(
     run: Path, folders: tuple[Path, Path], tmp_path: Path
 ) -> None:
     (tmp_path / "x.ply").write_text("mine")
@@ -145,7 +145,7 @@ def test_outputs_that_exist_are_refused_before_any_work(
     assert len(keyss.read_model(tmp_path / "x.ply"))
 
 
-def test_render_writes_a_picture_per_test_view(run: Path, folders: tuple[Path, Path], tmp_path: Path) -> None:
+def test_render_output_files(run: Path, folders: tuple[Path, Path], tmp_path: Path) -> None:
     pictures = keyss.render(run / "publish" / "model.ply", folders[0], out=tmp_path / "images")
     assert {p.name for p in (tmp_path / "images").iterdir()} == {"private", *(name for name, _ in pictures)}
     name, image = pictures[0]
@@ -154,7 +154,7 @@ def test_render_writes_a_picture_per_test_view(run: Path, folders: tuple[Path, P
     assert len(keyss.render(run / "publish" / "model.ply", folders[0], split="all")) == 16
 
 
-def test_info_describes_everything_keyss_reads_and_writes(run: Path, folders: tuple[Path, Path]) -> None:
+def test_info(run: Path, folders: tuple[Path, Path]) -> None:
     def found(path: Path) -> dict[str, Any]:
         facts: dict[str, Any] = msgspec.to_builtins(keyss.info(path))
         return facts
@@ -167,11 +167,11 @@ def test_info_describes_everything_keyss_reads_and_writes(run: Path, folders: tu
         keyss.info(run / "nothing")
 
 
-def test_a_secret_does_not_show_its_key() -> None:
+def test_secret_repr_omits_key() -> None:
     assert "hunter2" not in repr(Secret("scene", "hunter2")) + repr(keyss.SecretFile("file", "hunter2"))
 
 
-def test_keys_are_checked_before_any_work(folders: tuple[Path, Path], tmp_path: Path) -> None:
+def test_invalid_keys(folders: tuple[Path, Path], tmp_path: Path) -> None:
     scene, other = folders
     for keys, words in ((["key", "key"], "same key"), (["\u212b", "\u00c5"], "same key"), ([""], "empty")):
         with pytest.raises(UsageError, match=words):
@@ -181,7 +181,7 @@ def test_keys_are_checked_before_any_work(folders: tuple[Path, Path], tmp_path: 
     assert not (tmp_path / "run").exists()
 
 
-def test_python_and_command_line_write_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_command_line_matches_api(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """All defaults, and the size of what has no photos, are decided in one place."""
     monkeypatch.setenv("KEYSS_KEY", "the key")
     for index, count in enumerate((1500, 700)):

@@ -23,7 +23,7 @@ NOTEBOOKS = sorted((Path(__file__).parents[1] / "examples").glob("*.ipynb"))
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")  # of Jupyter's own
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-def test_a_notebook_runs(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_notebook(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """In a kernel of its own; a cell that fails, fails here with its traceback."""
     monkeypatch.setenv("MPLBACKEND", "module://matplotlib_inline.backend_inline")
     monkeypatch.setenv("TMPDIR", str(tmp_path))
@@ -36,7 +36,7 @@ def test_a_notebook_runs(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert not [output for output in outputs if output.get("name") == "stderr"]
 
 
-def test_a_design_of_ones_own(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_custom_design(monkeypatch: pytest.MonkeyPatch) -> None:
     """In at most 40 lines: it trains, is published, and reveals what its decoder says and no more."""
     path = Path(__file__).parents[1] / "examples" / "own_design.py"
     assert len(path.read_text().splitlines()) <= 40

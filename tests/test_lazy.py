@@ -17,7 +17,7 @@ FRONT_DOORS = [
 
 
 @pytest.mark.parametrize("package", FRONT_DOORS)
-def test_a_front_door_loads_what_its_stub_lists(package: str) -> None:
+def test_exports_match_stub(package: str) -> None:
     module = importlib.import_module(package)
     stub = ast.parse(Path(module.__file__ or "").with_suffix(".pyi").read_text())
     for node in stub.body:

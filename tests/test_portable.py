@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 import cheap_keys
-from cli.said import SMALL
+from cli.harness import SMALL
 
 # psutil and other libraries need some of these on Linux: psutil is loaded first, and what others need stays.
 WITHOUT = """
@@ -27,7 +27,7 @@ for name in (
 """
 
 
-def test_hide_and_reveal_without_what_windows_lacks(folders: tuple[Path, Path], tmp_path: Path) -> None:
+def test_hide_and_reveal_without_unix_only_apis(folders: tuple[Path, Path], tmp_path: Path) -> None:
     (tmp_path / "key.txt").write_text("q7Rv2LxT9bWm4KzD\n")
 
     def keyss(*arguments: object) -> None:

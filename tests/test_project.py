@@ -18,12 +18,12 @@ DOCUMENTS = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md")])
 
 
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
-def test_the_files_that_documents_link_to_exist(document: Path) -> None:
+def test_links_in_documents(document: Path) -> None:
     links = re.findall(r"\]\(([^)#\s]+)[^)]*\)", document.read_text())
     assert [link for link in links if "://" not in link and not (document.parent / link).exists()] == []
 
 
-def test_the_tests_that_documents_name_exist() -> None:
+def test_test_names_in_documents() -> None:
     """The threat model says which test shows what: a test's file, a function of one, or a folder."""
     files = list((ROOT / "tests").rglob("*.py"))
     functions = re.findall(r"^ *def (test_\w+)", "\n".join(path.read_text() for path in files), re.MULTILINE)
@@ -35,7 +35,7 @@ def test_the_tests_that_documents_name_exist() -> None:
     assert [path for path in re.findall(r"`(tests/[a-z_/.]+)`", text) if not (ROOT / path).exists()] == []
 
 
-def test_the_modules_that_documents_name_exist() -> None:
+def test_module_names_in_documents() -> None:
     text = "\n".join(path.read_text() for path in DOCUMENTS)
     names = set(re.findall(r"`(keyss(?:\.\w+)+)`", text))
     assert len(names) > 5
@@ -53,20 +53,20 @@ def exists(name: str) -> bool:
     return hasattr(importlib.import_module(home), attribute)
 
 
-def test_the_version_is_the_same_everywhere() -> None:
+def test_version_matches_citation() -> None:
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
     assert citation["version"] == keyss.__version__
     assert re.search(r"^## \[?Unreleased\]?$", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
 
 
-def least(requirement: str) -> tuple[str, str] | None:
-    """Name and least version of `name[extras]>=version,<next`."""
+def minimum(requirement: str) -> tuple[str, str] | None:
+    """Name and minimum version of `name[extras]>=version,<next`."""
     found = re.match(r"([a-zA-Z0-9_.-]+)(?:\[[^]]*])?>=([^,]+)", requirement)
     return (found[1].lower(), found[2]) if found else None
 
 
-def test_the_least_versions_are_those_that_are_tested() -> None:
-    """`make test-oldest` installs the least version of everything that the package declares."""
+def test_minimum_versions_are_pinned() -> None:
+    """`make test-oldest` installs the minimum version of everything that the package declares."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     extras = project["optional-dependencies"]
     declared = [*project["dependencies"], *(each for extra in TESTED for each in extras[extra])]
@@ -74,7 +74,7 @@ def test_the_least_versions_are_those_that_are_tested() -> None:
     pinned = dict(line.lower().split("==") for line in lines if line and not line.startswith("#"))
     different = {
         name: (version, pinned.get(name))
-        for name, version in filter(None, map(least, declared))
+        for name, version in filter(None, map(minimum, declared))
         if name != "torch" and not (pinned.get(name, "") + ".").startswith(version + ".")
     }
     assert different == {}

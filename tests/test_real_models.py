@@ -34,7 +34,7 @@ def models(real_data: Path) -> dict[str, Gaussians]:
         ("playbot_lod4", "biker", CarryOptions(), (40, 40)),
     ],
 )
-def test_what_is_accepted_comes_out_well(
+def test_quality_between_public_models(
     models: dict[str, Gaussians], cover: str, secret: str, options: MethodOptions, least: tuple[float, float]
 ) -> None:
     """PSNR in dB against renders of the models themselves."""

@@ -28,7 +28,7 @@ def psnr_against_photos(model: Path, scene: Path) -> float:
     return float((20 * math.log10(255) - 10 * torch.stack(errors).log10()).mean())
 
 
-def test_bonsai_hides_fox(real_data: Path, tmp_path: Path) -> None:
+def test_hide_fox_in_bonsai(real_data: Path, tmp_path: Path) -> None:
     bonsai, fox = real_data / "bonsai", real_data / "fox"
     key, other, out = tmp_path / "key", tmp_path / "other", tmp_path / "run"
     for file, text in ((key, "a key for a small fox"), (other, "a key for nothing here")):

@@ -29,7 +29,7 @@ CARRIED = CarryOptions(fit=FIT, publish="any")
 METHODS = [replace(CARRIED, refit="always"), CARRIED]
 
 
-def _hidden(options: MethodOptions) -> Gaussians:
+def _hide(options: MethodOptions) -> Gaussians:
     secret = Secret(tiny_scene(1), KEY)
     return keyss.hide(tiny_scene(0), [secret], method=options, min_psnr=0).stego
 
@@ -50,15 +50,15 @@ def _interrupted_seed(run: Path, *names: str) -> int:
 
 
 @pytest.mark.parametrize("options", METHODS, ids=["refitted", "carried"])
-def test_two_hidings_of_the_same_inputs_have_no_rotation_in_common(options: MethodOptions) -> None:
-    one, two = (_rotations(_hidden(options)) for _ in range(2))
+def test_repeated_hidings_share_no_rotation(options: MethodOptions) -> None:
+    one, two = (_rotations(_hide(options)) for _ in range(2))
     assert min(len(one), len(two)) > 100
     assert not one & two
 
 
 @pytest.mark.filterwarnings("ignore:.*appended Gaussians")
 @pytest.mark.parametrize("options", [CarryOptions(fit=FIT), JOINT], ids=["carry", "keyss"])
-def test_a_table_made_for_one_hiding_opens_no_other_of_its_seed(options: MethodOptions) -> None:
+def test_salts_differ_for_equal_seeds(options: MethodOptions) -> None:
     """Else one table of Argon2id, made in advance, would serve all files of that seed and cover.
 
     Readers try the salts of all channels. So files may have those in common under which nothing was written:
@@ -94,13 +94,13 @@ def _opens(reader: QuietReader | AppendedReader, salt: bytes) -> bool:
     return True
 
 
-def test_two_fits_have_no_rotation_in_common() -> None:
+def test_repeated_fits_share_no_rotation() -> None:
     one, two = (_rotations(keyss.fit(tiny_scene(), config=FIT).gaussians) for _ in range(2))
     assert not one & two
 
 
 @pytest.mark.parametrize("given", [None, 7])
-def test_a_resumed_fit_keeps_its_seed(tmp_path: Path, given: int | None) -> None:
+def test_resumed_fit_keeps_seed(tmp_path: Path, given: int | None) -> None:
     scene, run = tiny_scene(), tmp_path / "run"
     with pytest.raises(Interrupted):
         keyss.fit(scene, config=replace(FIT, seed=given), out=run, reporter=InterruptAt(10))
@@ -116,7 +116,7 @@ def test_a_resumed_fit_keeps_its_seed(tmp_path: Path, given: int | None) -> None
 
 @pytest.mark.filterwarnings("ignore:.*appended Gaussians")
 @pytest.mark.parametrize("stage", ["plain model", "hide"])
-def test_a_resumed_hiding_keeps_its_seed(tmp_path: Path, stage: str) -> None:
+def test_resumed_hiding_keeps_seed(tmp_path: Path, stage: str) -> None:
     """The files are equal to those of an uninterrupted run, to the byte."""
     scenes, run = (tiny_scene(0), [Secret(tiny_scene(1), KEY)]), tmp_path / "run"
     with pytest.raises(Interrupted):

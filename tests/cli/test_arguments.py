@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 import keyss as library
-from cli.said import METRICS, Run, assert_refused
+from cli.harness import METRICS, Run, assert_refused
 from keyss.fitting import PRESETS
 from tiny_scenes import random_gaussians
 
@@ -34,15 +34,15 @@ class TestArguments:
         monkeypatch.setenv("KEYSS_KEY", "k")
         return calls
 
-    def test_secrets_and_keys_pair_up_in_order(self, keyss: Run, hidden: list[Any], tmp_path: Path) -> None:
+    def test_secrets_are_paired_with_keys(self, keyss: Run, hidden: list[Any], tmp_path: Path) -> None:
         for name in "bc":
             (tmp_path / f"{name}.txt").write_text(f"key of {name}")
-        said = keyss(
+        result = keyss(
             *("hide", "--cover", "A", "-o", "out", "--secret", "B", "--key-file", tmp_path / "b.txt"),
             *("--secret", "C", "--key-file", tmp_path / "c.txt"),
             *("--secret-model", "mb", "--secret-model", "mc"),
         )
-        assert said.status == 0, said.err
+        assert result.status == 0, result.err
         (cover, secrets), _ = hidden[0]
         assert cover == Path("A")
         assert secrets == [
@@ -50,8 +50,8 @@ class TestArguments:
             library.Secret(Path("C"), "key of c", Path("mc")),
         ]
 
-    def test_options_override_the_preset(self, keyss: Run, hidden: list[Any]) -> None:
-        said = keyss(
+    def test_options_override_preset(self, keyss: Run, hidden: list[Any]) -> None:
+        result = keyss(
             *("hide", "--cover", "A", "--secret", "B", "-o", "out", "--preset", "quick", "--iterations", 7),
             *(
                 "--max-gaussians",
@@ -68,7 +68,7 @@ class TestArguments:
             *("--width", 10),
             *("--background", 1, 0.5, 0, "--cover-model", "m.ply", "--resume", "--device", "cpu"),
         )
-        assert said.status == 0, said.err
+        assert result.status == 0, result.err
         _, options = hidden[0]
         config = options.pop("method")
         assert (config.fit.iterations, config.fit.max_gaussians, config.fit.seed) == (7, 80, 9)
@@ -88,7 +88,7 @@ class TestArguments:
             "resume": True,
         }
 
-    def test_options_of_a_method_reach_it(self, keyss: Run, hidden: list[Any]) -> None:
+    def test_method_options(self, keyss: Run, hidden: list[Any]) -> None:
         scenes = ("hide", "--cover", "A", "--secret", "B", "-o", "out")
         clip = ("--key-encoder", "clip", "--clip-model", "C")
         assert keyss(*scenes, "--method", "keyss", "--design", "published", *clip).status == 0
@@ -110,7 +110,7 @@ class TestArguments:
             (("--secret", "C"), "KEYSS_KEY holds one key"),
         ],
     )
-    def test_what_makes_no_sense_is_refused(
+    def test_invalid_values(
         self, keyss: Run, hidden: list[Any], extra: tuple[object, ...], words: str
     ) -> None:
         assert_refused(keyss("hide", "--cover", "A", "--secret", "B", "-o", "out", *extra), 2, words)
@@ -126,7 +126,7 @@ class TestArguments:
             ),
         ],
     )
-    def test_what_has_no_effect_is_refused(
+    def test_options_without_effect(
         self, keyss: Run, hidden: list[Any], extra: tuple[object, ...], words: str
     ) -> None:
         carry = ("hide", "--refit", "never", "-o", "out", *extra)

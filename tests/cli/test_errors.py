@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from cli.said import SMALL, Run, assert_refused, listing
+from cli.harness import SMALL, Run, assert_refused, listing
 from files.scene_files import write_colmap
 
 STEGO = "hidden/publish/model.ply"
@@ -114,25 +114,25 @@ ERRORS: dict[str, tuple[int, str, Callable[[Path], list[object]]]] = {
 
 
 @pytest.mark.parametrize("name", ERRORS)
-def test_errors_are_a_line_and_leave_nothing(keyss: Run, world: Path, tmp_path: Path, name: str) -> None:
+def test_errors(keyss: Run, workspace: Path, tmp_path: Path, name: str) -> None:
     status, words, prepare = ERRORS[name]
-    shutil.copytree(world, tmp_path, dirs_exist_ok=True)
+    shutil.copytree(workspace, tmp_path, dirs_exist_ok=True)
     arguments = prepare(tmp_path)
     before = listing(tmp_path)
     assert_refused(keyss(*arguments), status, words)
     assert listing(tmp_path) == before
 
 
-def test_a_full_disk_is_a_line_and_leaves_nothing(
-    keyss: Run, world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_full_disk(
+    keyss: Run, workspace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def full(descriptor: int) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr("keyss.files.atomic.os.fsync", full)
-    arguments = [world / "hidden" / "publish" / "model.ply", "--key-file", world / "key.txt"]
+    arguments = [workspace / "hidden" / "publish" / "model.ply", "--key-file", workspace / "key.txt"]
     assert_refused(keyss("reveal", *arguments, "-o", tmp_path / "secret.ply"), 5, "No space left")
-    arguments = [world / "hidden" / "publish" / "model.ply", "--cameras", world / "a"]
+    arguments = [workspace / "hidden" / "publish" / "model.ply", "--cameras", workspace / "a"]
     assert_refused(keyss("render", *arguments, "-o", tmp_path / "images"), 5, "No space left")
     assert listing(tmp_path) == {}
 
@@ -148,15 +148,15 @@ class TestUnexpectedErrors:
 
         return fail_with
 
-    def test_ours_are_a_line_that_asks_for_a_report(
+    def test_internal_error(
         self, keyss: Run, failing: Callable[[BaseException], None]
     ) -> None:
         failing(ValueError("first\nsecond\x1b[31m"))
-        said = keyss("info", "x")
-        assert_refused(said, 70, "ValueError: first second [31m; please report")
-        assert "KEYSS_DEBUG=1" in said.err
+        result = keyss("info", "x")
+        assert_refused(result, 70, "ValueError: first second [31m; please report")
+        assert "KEYSS_DEBUG=1" in result.err
 
-    def test_ours_come_through_for_whoever_debugs(
+    def test_debug_reraises(
         self, keyss: Run, failing: Callable[[BaseException], None], monkeypatch: pytest.MonkeyPatch
     ) -> None:
         failing(ValueError("boom"))
@@ -173,7 +173,7 @@ class TestUnexpectedErrors:
             (KeyboardInterrupt(), 130, "interrupted"),
         ],
     )
-    def test_the_machines_are_explained(
+    def test_system_errors(
         self,
         keyss: Run,
         failing: Callable[[BaseException], None],

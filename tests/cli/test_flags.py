@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from cli.said import Run
+from cli.harness import Run
 from keyss.cli import entry
 from keyss.core import KeyssWarning, UsageError
 
@@ -15,7 +15,7 @@ OPTIONS = {"overwrite", "sh_degree", "key_file", "secret", "publish", "secret_mo
 
 
 @pytest.mark.parametrize(
-    ("message", "said"),
+    ("message", "expected"),
     [
         ("`overwrite=True` replaces it", "--overwrite replaces it"),
         ('`method="keyss"` can', "--method keyss can"),
@@ -31,8 +31,8 @@ OPTIONS = {"overwrite", "sh_degree", "key_file", "secret", "publish", "secret_mo
         ("x=`; overwrite=True", "x=`; overwrite=True"),
     ],
 )
-def test_arguments_become_flags(message: str, said: str) -> None:
-    assert entry.as_flags(message, OPTIONS) == said
+def test_argument_names_become_flags(message: str, expected: str) -> None:
+    assert entry.as_flags(message, OPTIONS) == expected
 
 
 class TestWarnings:
@@ -46,7 +46,7 @@ class TestWarnings:
         monkeypatch.setattr("keyss.runs.describe.info", info)
 
     @pytest.mark.usefixtures("warning")
-    def test_ours_are_a_line_each_once(self, keyss: Run) -> None:
+    def test_repeated_warnings_print_once(self, keyss: Run) -> None:
         assert keyss("info", "x").err.splitlines() == [
             "keyss: warning: no. 1 --overwrite",
             "keyss: warning: no. 2 --overwrite",

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from cli.said import COMMANDS, Run, Said
+from cli.harness import COMMANDS, Run, Result
 from keyss import __version__
 from keyss.files import write_model
 from keyss.fitting import PRESETS as FIT_PRESETS
@@ -36,24 +36,24 @@ assert not loaded("info", other) & {"numba", "scipy", "keyss.methods"}  # unpack
 
 
 class TestHelp:
-    def test_fits_on_a_page_with_a_line_for_each_command(self, keyss: Run) -> None:
-        said = keyss("--help")
-        assert (said.status, said.err) == (0, "")
-        lines = said.out.splitlines()
+    def test_overview(self, keyss: Run) -> None:
+        result = keyss("--help")
+        assert (result.status, result.err) == (0, "")
+        lines = result.out.splitlines()
         assert len(lines) <= 45
         assert max(map(len, lines)) <= 100
         assert [line.split()[0] for line in lines if re.match(r"  [a-z]+ ", line)] == COMMANDS
         assert len(COMMANDS) == 16
 
     @pytest.mark.parametrize("command", COMMANDS)
-    def test_shows_an_example(self, keyss: Run, command: str) -> None:
-        said = keyss(command, "--help")
-        assert said.status == 0
-        assert f"example: keyss {command}" in said.out
-        assert "default: None" not in said.out
+    def test_example(self, keyss: Run, command: str) -> None:
+        result = keyss(command, "--help")
+        assert result.status == 0
+        assert f"example: keyss {command}" in result.out
+        assert "default: None" not in result.out
 
     @pytest.mark.parametrize("command", COMMANDS)
-    def test_no_option_is_accepted_and_ignored(self, keyss: Run, command: str) -> None:
+    def test_common_options(self, keyss: Run, command: str) -> None:
         out = keyss(command, "--help").out
         random = {"fit", "hide", "audit", "compare", "reproduce", "demo"}
         assert ("--seed" in out) == (command in random)
@@ -62,19 +62,19 @@ class TestHelp:
         assert ("--device {auto,cpu,cuda}" in out) == (command in computing)
         assert "nothing here" not in out
 
-    def test_offers_the_presets_there_are(self, keyss: Run) -> None:
+    def test_presets(self, keyss: Run) -> None:
         assert f"--preset {{{','.join(FIT_PRESETS)}}}" in keyss("fit", "--help").out
         for name in registry.METHODS:
-            said = keyss("hide", "--method", name, "--help").out
-            assert f"--preset {{{','.join(FIT_PRESETS)}}}" in said
-            assert "(default: default)" in said
+            result = keyss("hide", "--method", name, "--help").out
+            assert f"--preset {{{','.join(FIT_PRESETS)}}}" in result
+            assert "(default: default)" in result
 
     @pytest.mark.parametrize("method", ["carry"])
-    def test_of_hide_is_as_it_was(self, keyss: Run, method: str) -> None:
+    def test_hide_snapshot(self, keyss: Run, method: str) -> None:
         """Names, defaults and sentences of all options; `hide_METHOD_help.txt` is what is meant."""
         meant = Path(__file__).with_name(f"hide_{method}_help.txt").read_text(encoding="utf-8")
-        said = keyss("hide", "--method", method, "--help").out
-        assert [line.rstrip() for line in said.splitlines()] == meant.splitlines()
+        result = keyss("hide", "--method", method, "--help").out
+        assert [line.rstrip() for line in result.splitlines()] == meant.splitlines()
 
     def test_what_needs_little_loads_little(self, tmp_path: Path) -> None:
         """Help, a new key and a wrong name answer at once, for torch takes seconds; methods take one more."""
@@ -87,12 +87,12 @@ class TestHelp:
         )
 
     @pytest.mark.parametrize("arguments", [("--version",), ("-V",)])
-    def test_of_the_version(self, keyss: Run, arguments: tuple[str, ...]) -> None:
-        assert keyss(*arguments) == Said(0, f"{__version__}\n", "")
+    def test_version(self, keyss: Run, arguments: tuple[str, ...]) -> None:
+        assert keyss(*arguments) == Result(0, f"{__version__}\n", "")
 
     @pytest.mark.parametrize("arguments", [("frobnicate",), ("fit",), ("info", "x", "--nonsense")])
-    def test_wrong_usage_exits_with_2(self, keyss: Run, arguments: tuple[str, ...]) -> None:
-        said = keyss(*arguments)
-        assert said.status == 2
-        assert said.out == ""
-        assert said.err
+    def test_usage_errors(self, keyss: Run, arguments: tuple[str, ...]) -> None:
+        result = keyss(*arguments)
+        assert result.status == 2
+        assert result.out == ""
+        assert result.err

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from cli.said import PROGRAM, write_world
+from cli.harness import PROGRAM, write_workspace
 
 SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
 SIZE = "--preset quick --iterations 150 --max-gaussians 240 --device cpu --seed 0"
@@ -83,9 +83,9 @@ def result_of(command: Command, out: Path, run: Path) -> list[object]:
 
 
 @pytest.fixture(scope="module")
-def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two scenes and a key."""
-    return write_world(tmp_path_factory.mktemp("killed"))
+    return write_workspace(tmp_path_factory.mktemp("killed"))
 
 
 class Undisturbed:
@@ -107,8 +107,8 @@ class Undisturbed:
 
 
 @pytest.fixture(scope="module")
-def undisturbed(world: Path) -> Undisturbed:
-    return Undisturbed(world)
+def undisturbed(workspace: Path) -> Undisturbed:
+    return Undisturbed(workspace)
 
 
 def prepared(folder: Path, name: str, which: str) -> tuple[Path, Path, list[str]]:
@@ -125,16 +125,16 @@ def prepared(folder: Path, name: str, which: str) -> tuple[Path, Path, list[str]
 
 
 def disturb(
-    world: Path, undisturbed: Callable[[str], tuple[list[object], float]], name: str, signum: int, seed: int
+    workspace: Path, undisturbed: Callable[[str], tuple[list[object], float]], name: str, signum: int, seed: int
 ) -> None:
     expected, seconds = undisturbed(name)
     rng = random.Random(seed)
-    out, run, arguments = prepared(world, name, str(seed))
+    out, run, arguments = prepared(workspace, name, str(seed))
     mine = out.parent / "mine.txt"
     mine.write_text("mine")
     again = arguments
     for _ in range(rng.choice((1, 1, 2))):  # some are disturbed once more
-        with started(again, world) as process:
+        with started(again, workspace) as process:
             try:
                 process.wait(rng.uniform(0, 1.1 * seconds))
             except subprocess.TimeoutExpired:
@@ -146,7 +146,7 @@ def disturb(
         if process.returncode == 0:
             break
     if process.returncode != 0:
-        with started(again, world) as process:
+        with started(again, workspace) as process:
             _, err = process.communicate(timeout=300)
         # It may have been done just before the signal came.
         assert process.returncode == 0 or "holds a finished run" in err, err
@@ -160,6 +160,6 @@ def disturb(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(50))
-def test_fifty_commands_are_disturbed(world: Path, undisturbed: Undisturbed, seed: int) -> None:
+def test_killed_commands_resume(workspace: Path, undisturbed: Undisturbed, seed: int) -> None:
     name = list(COMMANDS)[seed % len(COMMANDS)]
-    disturb(world, undisturbed, name, SIGNALS[seed // len(COMMANDS) % len(SIGNALS)], seed)
+    disturb(workspace, undisturbed, name, SIGNALS[seed // len(COMMANDS) % len(SIGNALS)], seed)

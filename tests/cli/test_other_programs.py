@@ -12,7 +12,7 @@ from numpy.lib.recfunctions import append_fields, repack_fields
 from plyfile import PlyData, PlyElement
 
 from channels.quiet.trained_like import trained_like
-from cli.said import SMALL, Run, write_key
+from cli.harness import SMALL, Run, write_key
 from files.scene_files import HEIGHT, WIDTH, save, write_colmap
 from keyss.files import read_model, write_model
 
@@ -93,46 +93,46 @@ def far_out(rows: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_the_first_commands_of_a_new_user(keyss: Run, tmp_path: Path, kind: str) -> None:
+def test_hide_reveal_view_convert(keyss: Run, tmp_path: Path, kind: str) -> None:
     model, run, revealed = tmp_path / "model.ply", tmp_path / "run", tmp_path / "revealed.ply"
     write_model(model, trained_like(COUNT, 0, 1))
     write_model(tmp_path / "secret.ply", trained_like(30, 1, 1))
     KINDS[kind](model, PlyData.read(str(model))["vertex"].data.copy())
     key = write_key(tmp_path / "key.txt")
     secret = ("--secret", tmp_path / "secret.ply", "--key-file", key)
-    said = keyss("hide", "--cover", model, *secret, "--width", 32, "-o", run)
-    assert said.status == 0, said.err
-    said = keyss("reveal", run / "publish" / "model.ply", "--key-file", key, "-o", revealed)
-    assert said.status == 0, said.err
+    result = keyss("hide", "--cover", model, *secret, "--width", 32, "-o", run)
+    assert result.status == 0, result.err
+    result = keyss("reveal", run / "publish" / "model.ply", "--key-file", key, "-o", revealed)
+    assert result.status == 0, result.err
     assert len(read_model(revealed)) == 30
     assert keyss("view", model, "-o", tmp_path / "page.html").status == 0
-    said = keyss("convert", model, tmp_path / "model.spz")
-    assert said.status == 0 or (kind == "one stray Gaussian" and "remove Gaussians far out" in said.err)
+    result = keyss("convert", model, tmp_path / "model.spz")
+    assert result.status == 0 or (kind == "one stray Gaussian" and "remove Gaussians far out" in result.err)
 
 
 @pytest.mark.parametrize("place", ["ply/point_cloud_29999.ply", "exports/splat/splat.ply"])
-def test_the_folder_of_a_training_is_a_cover(keyss: Run, tmp_path: Path, place: str) -> None:
+def test_training_folder_as_cover(keyss: Run, tmp_path: Path, place: str) -> None:
     model, key = tmp_path / "training" / place, write_key(tmp_path / "key.txt")
     model.parent.mkdir(parents=True)
     write_model(model, trained_like(COUNT, 0, 1))
     write_model(tmp_path / "secret.ply", trained_like(30, 1, 1))
     secret = ("--secret", tmp_path / "secret.ply", "--key-file", key)
     run = tmp_path / "run"
-    said = keyss("hide", "--cover", tmp_path / "training", *secret, "--width", 32, "-o", run)
-    assert said.status == 0, said.err
-    assert f"training: a folder of a training; its model is {place}" in said.err
-    said = keyss("reveal", run / "publish" / "model.ply", "--key-file", key, "-o", tmp_path / "revealed.ply")
-    assert said.status == 0, said.err
+    result = keyss("hide", "--cover", tmp_path / "training", *secret, "--width", 32, "-o", run)
+    assert result.status == 0, result.err
+    assert f"training: a folder of a training; its model is {place}" in result.err
+    result = keyss("reveal", run / "publish" / "model.ply", "--key-file", key, "-o", tmp_path / "revealed.ply")
+    assert result.status == 0, result.err
 
 
-def test_masks_are_left_out_of_a_fit_and_said(keyss: Run, tmp_path: Path) -> None:
+def test_fit_with_masks(keyss: Run, tmp_path: Path) -> None:
     scene = write_colmap(tmp_path / "scene")
     mask = np.zeros((HEIGHT, WIDTH), np.uint8)
     mask[:, :3] = 255
     for index in range(3):
         save(scene / "masks" / f"{index:02}.png.png", mask)
-    said = keyss("fit", scene, "-o", tmp_path / "fit", *SMALL)
-    assert said.status == 0, said.err
+    result = keyss("fit", scene, "-o", tmp_path / "fit", *SMALL)
+    assert result.status == 0, result.err
     assert (
-        "3 of 3 photos have masks, which leave 75% of their pixels out of training and measures" in said.err
+        "3 of 3 photos have masks, which leave 75% of their pixels out of training and measures" in result.err
     )

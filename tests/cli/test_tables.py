@@ -8,7 +8,7 @@ from dataclasses import replace
 
 from rich.console import Console
 
-from cli.said import METRICS
+from cli.harness import METRICS
 from keyss.cli.tables import print_hiding
 from keyss.fitting import ImageQuality
 from keyss.runs import HideMetrics
@@ -23,7 +23,7 @@ class TestNumbers:
         text: str = console.file.getvalue()  # type: ignore[attr-defined]
         return [re.split("  +", line.strip()) for line in text.splitlines()]
 
-    def test_a_row_for_each_and_what_the_method_adds(self) -> None:
+    def test_rows(self) -> None:
         rows = self.table(METRICS)
         assert rows[:4] == [
             ["on test photos", "PSNR", "SSIM", "bound", "loss", "Gaussians", "steps"],
@@ -33,12 +33,12 @@ class TestNumbers:
         ]
         assert rows[-1] == ["Room in the cover: 1,000 Gaussians."]
 
-    def test_what_is_left_of_a_secret_is_said(self) -> None:
+    def test_pruned_secret(self) -> None:
         baseline = replace(METRICS.baseline, gaussians=(10, 8406))
         fewer = replace(METRICS, baseline=baseline, secret_gaussians=(2480,), secret_degrees=((0, 3),))
         assert ["The secret kept 2,480 of 8,406 Gaussians, SH degree 0 of 3, 31.0 dB."] in self.table(fewer)
 
-    def test_a_plain_model_of_fewer_steps_is_no_bound(self) -> None:
+    def test_shorter_plain_model_is_no_bound(self) -> None:
         shorter = replace(METRICS.baseline, secrets=(ImageQuality(19.0, 0.2),))
         rows = self.table(replace(METRICS, baseline=shorter))
         assert rows[0] == [

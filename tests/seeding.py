@@ -19,12 +19,12 @@ _sources: list[random.Random] = []  # the innermost last: of the test, or of the
 _urandom, _randbelow = os.urandom, secrets.randbelow
 
 
-def draw_the_same() -> None:
+def patch_random_sources() -> None:
     """From now on."""
     os.urandom, secrets.randbelow = _bytes, _number
 
 
-def begin_draws(item: pytest.Item) -> None:
+def seed_test(item: pytest.Item) -> None:
     """Of a test: its name says what they are."""
     _sources[:] = [random.Random(item.nodeid)]
 

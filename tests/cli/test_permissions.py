@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from channels.quiet.trained_like import trained_like
-from cli.said import SMALL, Run, Said
+from cli.harness import SMALL, Run, Result
 from files.scene_files import write_blender, write_nerfstudio
 from keyss.demo import OPTIONS, run_demo
 from keyss.files import write_model
@@ -30,10 +30,10 @@ def mine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, umask: None) -> Path:
 def tour(keyss: Run) -> None:
     """Every verb, into the working folder."""
 
-    def done(line: str) -> Said:
-        said = keyss(*line.split())
-        assert said.status == 0, f"{line}: {said.err}"
-        return said
+    def done(line: str) -> Result:
+        result = keyss(*line.split())
+        assert result.status == 0, f"{line}: {result.err}"
+        return result
 
     small = " ".join(SMALL)
     done("keygen -o key.txt")
@@ -67,7 +67,7 @@ def published(folder: Path) -> set[str]:
 PUBLISHED = {"hidden/publish/model.ply", "carried/publish/model.ply"}
 
 
-def test_only_what_is_to_be_published_is_readable_by_others(keyss: Run, mine: Path) -> None:
+def test_only_published_files_are_readable(keyss: Run, mine: Path) -> None:
     tour(keyss)
     for own in ("a", "b"):
         assert readable_by_others(mine / own)  # the umask is one under which that means something
@@ -85,14 +85,14 @@ def test_only_what_is_to_be_published_is_readable_by_others(keyss: Run, mine: Pa
     assert {path.name for path in mine.iterdir()} == {"key.txt", *results}
 
 
-def test_nor_does_the_demo_show_more(
+def test_demo_permissions(
     keyss: Run, tmp_path: Path, umask: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A demo of a few steps on small photos."""
     small = {"options": OPTIONS.with_fit(iterations=20, max_gaussians=1500), "width": 32}
     monkeypatch.setattr(run_demo, "__kwdefaults__", run_demo.__kwdefaults__ | small)
-    said = keyss("demo", "-o", tmp_path / "demo", "--device", "cpu")
-    assert said.status == 0, said.err
+    result = keyss("demo", "-o", tmp_path / "demo", "--device", "cpu")
+    assert result.status == 0, result.err
     assert published(tmp_path) == {"demo/publish/model.ply"}
     assert readable_by_others(tmp_path) == {"demo/publish/model.ply", "demo/index.html"}
     assert stat.S_IMODE((tmp_path / "demo" / "private").stat().st_mode) == 0o700

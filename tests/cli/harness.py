@@ -37,7 +37,7 @@ COMMANDS = list(command_table.MODULES)
 PROGRAM = [sys.executable, "-c", cheap_keys.PROGRAM]
 
 
-class Said(NamedTuple):
+class Result(NamedTuple):
     """What a run of the command line came to."""
 
     status: int
@@ -45,7 +45,7 @@ class Said(NamedTuple):
     err: str
 
 
-Run = Callable[..., Said]  # of the fixture `keyss`
+Run = Callable[..., Result]  # of the fixture `keyss`
 
 
 def write_key(path: Path, key: str = "q7Rv2LxT9bWm4KzD") -> Path:
@@ -55,7 +55,7 @@ def write_key(path: Path, key: str = "q7Rv2LxT9bWm4KzD") -> Path:
     return path
 
 
-def write_world(folder: Path) -> Path:
+def write_workspace(folder: Path) -> Path:
     """Scenes `a` and `b`, and `key.txt`."""
     write_blender(folder / "a", count=3, channels=3)
     write_nerfstudio(folder / "b", count=4)
@@ -68,11 +68,11 @@ def listing(folder: Path) -> dict[str, int]:
     return {str(path.relative_to(folder)): path.lstat().st_mtime_ns for path in sorted(folder.rglob("*"))}
 
 
-def assert_refused(said: Said, status: int, words: str) -> None:
+def assert_refused(result: Result, status: int, words: str) -> None:
     """The exit status, and one or two lines that hold `words`."""
-    assert said.status == status, said.err
-    assert words in said.err
-    assert said.err.startswith("keyss: ")
-    assert 1 <= len(said.err.splitlines()) <= 2
-    assert "Traceback" not in said.err
-    assert said.out == ""
+    assert result.status == status, result.err
+    assert words in result.err
+    assert result.err.startswith("keyss: ")
+    assert 1 <= len(result.err.splitlines()) <= 2
+    assert "Traceback" not in result.err
+    assert result.out == ""
