@@ -1,4 +1,4 @@
-"""On CI (`CI=true`) a skipped test is a failed one: a tool is missing there that was to be installed."""
+"""With CI=true, a test that skips because a tool is missing fails."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import TypeVar
 
 import pytest
 
-# What may be missing on CI too, by the reason that the test gives.
+# Reasons for which tests may skip on CI.
 ALLOWED = (
     r"CUDA",  # CI has no GPU
     r"no real scenes in ",  # photos are not part of the repository
@@ -29,7 +29,7 @@ def pytest_make_collect_report() -> Generator[None, pytest.CollectReport, pytest
 
 
 def fail_skips(report: Report) -> Report:
-    """The report, made one of a failure where a skip is not allowed; what fails as expected is no skip."""
+    """Turn a skip that CI does not allow into a failure."""
     if os.environ.get("CI") != "true" or not report.skipped or hasattr(report, "wasxfail"):
         return report
     reason = report.longrepr[2] if isinstance(report.longrepr, tuple) else str(report.longrepr)

@@ -1,4 +1,4 @@
-"""A key is in its file and in memory: not among arguments, in messages, or in anything that is written."""
+"""Keys never appear in arguments, messages, logs or files."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ SPELLINGS = [
 
 
 class _InterruptHiding(Reporter):
-    """Presses it in the middle of hiding."""
+    """Send SIGINT while the secret is fitted."""
 
     hiding = False
 
@@ -67,7 +67,7 @@ def test_key_is_never_written_or_printed(
     caplog.set_level(logging.DEBUG)
     monkeypatch.setattr("sys.stdin", io.StringIO())
     run, key = folder / "run", ["--key-file", str(folder / "key.txt")]
-    (folder / "key.txt").chmod(0o644)  # so that there is a warning to look at
+    (folder / "key.txt").chmod(0o644)  # triggers a warning
     scenes = ["--cover", str(folder / "a"), "--secret", str(folder / "b"), "--publish", "any", "-o", str(run)]
     size = ["--preset", "quick", "--iterations", "20", "--max-gaussians", "100", "--device", "cpu"]
     with monkeypatch.context() as patch:

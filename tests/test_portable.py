@@ -1,4 +1,4 @@
-"""keyss needs nothing that only Unix has."""
+"""keyss uses no API that only Unix has."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 import cheap_keys
 from cli.harness import SMALL
 
-# psutil and other libraries need some of these on Linux: psutil is loaded first, and what others need stays.
+# Dependencies use some of these on Linux: psutil is imported first, the others keep what they need.
 WITHOUT = """
 import os, psutil, signal, sys
 for name in "fcntl resource pwd grp termios tty pty syslog".split():

@@ -11,7 +11,7 @@ from keyss.progress import ProgressLines, clock, reporter
 
 
 class Timer:
-    """A clock that the test sets."""
+    """A clock set by the test."""
 
     now = 100.0
 
@@ -79,7 +79,6 @@ def test_live_line(timer: Timer) -> None:
 
 @pytest.mark.parametrize("terminal", [True, False])
 def test_reporter_is_reusable(timer: Timer, terminal: bool) -> None:
-    """For the models of several scenes in turn."""
     screen = console(terminal)
     lines = ProgressLines(screen, timer=timer)
     for title in ("cover", "secret"):

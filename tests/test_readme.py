@@ -1,4 +1,4 @@
-"""What the README shows works."""
+"""The Python example in the README runs."""
 
 from __future__ import annotations
 

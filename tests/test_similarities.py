@@ -1,4 +1,4 @@
-"""A similarity of the world changes nothing that is measured, or there is a sentence why."""
+"""Fits and hiding are invariant to similarity transforms, or refuse with a reason."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ KEY = "a key of many characters: 93hXmQ2"
 
 
 def write_scene(folder: Path, shift: tuple[float, ...], scale: float) -> Path:
-    """A scene in Nerfstudio's layout, moved in double precision."""
+    """Write a scene in Nerfstudio's layout, moved in double precision."""
     scene = tiny_scene()
     folder.mkdir()
     frames = []
@@ -59,14 +59,14 @@ def psnr_of_fit(scene: Scene) -> float:
 
 @pytest.fixture(scope="module")
 def reference_psnr(tmp_path_factory: pytest.TempPathFactory) -> float:
-    return psnr_of_fit(load_scene(write_scene(tmp_path_factory.mktemp("worlds") / "usual", (0.0, 0.0, 0.0), 1.0)))
+    return psnr_of_fit(
+        load_scene(write_scene(tmp_path_factory.mktemp("worlds") / "usual", (0.0, 0.0, 0.0), 1.0))
+    )
 
 
 @pytest.mark.filterwarnings("ignore::keyss.core.KeyssWarning")
 @pytest.mark.parametrize("world", WORLDS)
-def test_fit_is_invariant_to_similarities(
-    world: str, reference_psnr: float, tmp_path: Path
-) -> None:
+def test_fit_is_invariant_to_similarities(world: str, reference_psnr: float, tmp_path: Path) -> None:
     moved = load_scene(write_scene(tmp_path / "moved", *WORLDS[world]))
     assert abs(psnr_of_fit(moved) - reference_psnr) < 0.3
 

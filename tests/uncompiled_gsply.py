@@ -1,7 +1,6 @@
-"""gsply as it is written, not compiled: for a few hundred Gaussians numba takes a minute on a new machine.
+"""Import gsply without numba, whose compilation takes a minute on a new machine.
 
-But for its reader of .sog, which it loads by and by: that one counts on numbers of more bits than numpy's.
-Imported before anything imports gsply.
+gsply imports its .sog reader later, which relies on numba's wider integers and stays compiled.
 """
 
 from __future__ import annotations

@@ -11,7 +11,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from cli.harness import Run, Result
+from cli.harness import Result, Run
 from keyss import __version__, rendering
 from keyss.core import Camera, Gaussians
 
@@ -40,9 +40,7 @@ def test_missing_device(keyss: Run) -> None:
 
 
 @pytest.mark.parametrize(("where", "factor"), [("middle", 0.999), ("corner", 0.0)])
-def test_wrong_render(
-    keyss: Run, monkeypatch: pytest.MonkeyPatch, where: str, factor: float
-) -> None:
+def test_wrong_render(keyss: Run, monkeypatch: pytest.MonkeyPatch, where: str, factor: float) -> None:
     real = rendering.render
 
     def wrong(model: Gaussians, camera: Camera, **options: Any) -> Tensor:

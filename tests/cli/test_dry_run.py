@@ -7,14 +7,16 @@ import re
 import shutil
 from pathlib import Path
 
-from cli.harness import SMALL, Run, Result, assert_refused, listing
+from cli.harness import SMALL, Result, Run, assert_refused, listing
 from keyss.files import read_model
 
 
 class TestTheWholePath:
     def test_reveal_render_evaluate_info(self, keyss: Run, workspace: Path, tmp_path: Path) -> None:
         secret, images, key = tmp_path / "secret.ply", tmp_path / "images", workspace / "key.txt"
-        result = keyss("reveal", workspace / "hidden" / "publish" / "model.ply", "--key-file", key, "-o", secret)
+        result = keyss(
+            "reveal", workspace / "hidden" / "publish" / "model.ply", "--key-file", key, "-o", secret
+        )
         left = len(read_model(secret))
         assert 0 < left <= 100
         assert result == Result(0, f"{secret}: {left} of {left} Gaussians\n", "")

@@ -123,9 +123,7 @@ def test_errors(keyss: Run, workspace: Path, tmp_path: Path, name: str) -> None:
     assert listing(tmp_path) == before
 
 
-def test_full_disk(
-    keyss: Run, workspace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_full_disk(keyss: Run, workspace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(descriptor: int) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
@@ -148,9 +146,7 @@ class TestUnexpectedErrors:
 
         return fail_with
 
-    def test_internal_error(
-        self, keyss: Run, failing: Callable[[BaseException], None]
-    ) -> None:
+    def test_internal_error(self, keyss: Run, failing: Callable[[BaseException], None]) -> None:
         failing(ValueError("first\nsecond\x1b[31m"))
         result = keyss("info", "x")
         assert_refused(result, 70, "ValueError: first second [31m; please report")

@@ -24,9 +24,7 @@ def mine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def test_key_sources_are_equivalent(
-    keyss: Run, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_key_sources_are_equivalent(keyss: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     text = Path("key.txt").read_text()
     assert text.endswith("\n")
     library.hide("cover.ply", [library.Secret("small.ply", text)], out="run")

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from cli.harness import COMMANDS, Run, Result
+from cli.harness import COMMANDS, Result, Run
 from keyss import __version__
 from keyss.files import write_model
 from keyss.fitting import PRESETS as FIT_PRESETS

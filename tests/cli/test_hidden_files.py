@@ -78,9 +78,7 @@ def test_file_too_large(tmp_path: Path) -> None:
         library.hide_files(trained_like(2000), [library.SecretFile(os.urandom(90_000), KEYS[0])])
 
 
-def test_hidden_file_survives_conversion(
-    keyss: Run, folder: Path, tmp_path: Path
-) -> None:
+def test_hidden_file_survives_conversion(keyss: Run, folder: Path, tmp_path: Path) -> None:
     write_model(tmp_path / "cover.ply", cover(6000))
     (tmp_path / "note.txt").write_text("Meet me at the golden knot. " * 20)
     key, out = ("--key-file", folder / "key0"), tmp_path / "out"

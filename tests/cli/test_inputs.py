@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from cli.harness import SMALL, Run, Result, assert_refused, listing
+from cli.harness import SMALL, Result, Run, assert_refused, listing
 from files.scene_files import write_blender, write_colmap, write_nerfstudio
 
 
@@ -20,9 +20,7 @@ def key(folder: Path) -> tuple[str, Path]:
 
 
 @pytest.mark.parametrize("inside", ["", "publish"])
-def test_run_folder_as_model(
-    keyss: Run, workspace: Path, tmp_path: Path, inside: str
-) -> None:
+def test_run_folder_as_model(keyss: Run, workspace: Path, tmp_path: Path, inside: str) -> None:
     run, out = workspace / "hidden" / inside, tmp_path / "out"
     give = f"found a folder; give {workspace / 'hidden' / 'publish' / 'model.ply'}"
     assert_refused(keyss("reveal", run, *key(workspace), "-o", tmp_path / "s.ply"), 4, give)
@@ -76,9 +74,7 @@ def open_folder() -> Iterator[Path]:
 
 
 @pytest.mark.parametrize("closed", ["", "images", "sparse/0"])
-def test_unreadable_scene(
-    keyss: Run, open_folder: Path, closed: str
-) -> None:
+def test_unreadable_scene(keyss: Run, open_folder: Path, closed: str) -> None:
     scene, key = write_colmap(open_folder / "scene"), ("--key-file", open_folder / "key")
     (scene / closed).chmod(0)
     commands = (

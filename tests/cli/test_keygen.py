@@ -41,9 +41,7 @@ class TestKeygen:
         assert_refused(keyss(*asset), 2, "--master-key-file")
         assert_refused(keyss(*asset, "--master-key-file", master, "--bits", 9), 2, "--bits")
 
-    def test_key_file(
-        self, keyss: Run, tmp_path: Path, umask: None
-    ) -> None:
+    def test_key_file(self, keyss: Run, tmp_path: Path, umask: None) -> None:
         path = tmp_path / "key.txt"
         result = keyss("keygen", "-o", path)
         key = read_key(path)

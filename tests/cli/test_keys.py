@@ -106,9 +106,7 @@ class TestPrompt:
             keys.keys([], 1, confirm=True)
 
 
-def test_readable_key_file_warning(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_readable_key_file_warning(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = write(tmp_path, b"tell nobody")
     path.chmod(0o600)
     keys.key_of_file(path)

@@ -125,7 +125,11 @@ def prepared(folder: Path, name: str, which: str) -> tuple[Path, Path, list[str]
 
 
 def disturb(
-    workspace: Path, undisturbed: Callable[[str], tuple[list[object], float]], name: str, signum: int, seed: int
+    workspace: Path,
+    undisturbed: Callable[[str], tuple[list[object], float]],
+    name: str,
+    signum: int,
+    seed: int,
 ) -> None:
     expected, seconds = undisturbed(name)
     rng = random.Random(seed)

@@ -35,9 +35,7 @@ def shell(redirection: str, *arguments: object, **environment: str) -> subproces
         ("| left", 141),
     ],
 )
-def test_broken_output_streams(
-    tmp_path: Path, redirection: str, status: int
-) -> None:
+def test_broken_output_streams(tmp_path: Path, redirection: str, status: int) -> None:
     """Of a command that says where its result is, and starts at once."""
     key = tmp_path / "key.txt"
     arguments: list[object] = ["keygen", "-o", key]

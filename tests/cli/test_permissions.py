@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from channels.quiet.trained_like import trained_like
-from cli.harness import SMALL, Run, Result
+from cli.harness import SMALL, Result, Run
 from files.scene_files import write_blender, write_nerfstudio
 from keyss.demo import OPTIONS, run_demo
 from keyss.files import write_model
@@ -85,9 +85,7 @@ def test_only_published_files_are_readable(keyss: Run, mine: Path) -> None:
     assert {path.name for path in mine.iterdir()} == {"key.txt", *results}
 
 
-def test_demo_permissions(
-    keyss: Run, tmp_path: Path, umask: None, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_demo_permissions(keyss: Run, tmp_path: Path, umask: None, monkeypatch: pytest.MonkeyPatch) -> None:
     """A demo of a few steps on small photos."""
     small = {"options": OPTIONS.with_fit(iterations=20, max_gaussians=1500), "width": 32}
     monkeypatch.setattr(run_demo, "__kwdefaults__", run_demo.__kwdefaults__ | small)

@@ -13,9 +13,7 @@ from cli.harness import SMALL, Run, assert_refused, write_key
 from keyss.files import read_model, write_model
 
 
-def test_min_psnr(
-    keyss: Run, workspace: Path, tmp_path: Path
-) -> None:
+def test_min_psnr(keyss: Run, workspace: Path, tmp_path: Path) -> None:
     scenes = ["--cover", workspace / "a", "--secret", workspace / "b", "--key-file", workspace / "key.txt"]
     hide = ["hide", *scenes, "--publish", "any", "-o", tmp_path / "run", *SMALL]
     result = keyss(*hide, "--min-psnr", 90)
@@ -51,18 +49,14 @@ def _carry(folder: Path, *more: object) -> list[object]:
 
 
 @pytest.mark.parametrize("dry_run", [(), ("--dry-run",)])
-def test_ignored_training_options(
-    keyss: Run, models: Path, dry_run: tuple[str, ...]
-) -> None:
+def test_ignored_training_options(keyss: Run, models: Path, dry_run: tuple[str, ...]) -> None:
     result = keyss(*_carry(models, "--preset", "quick", "--iterations", 7, "--seed", 1, *dry_run))
     assert result.status == 0
     assert "warning: --preset and --iterations had no effect" in result.err
     assert "had no effect" not in keyss(*_carry(models, "--seed", 1, "--overwrite", *dry_run)).err
 
 
-def test_empty_secret_is_not_published(
-    keyss: Run, models: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_empty_secret_is_not_published(keyss: Run, models: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Even where empty pictures would be near enough: the limit is far below what they reach."""
     from keyss.methods import CarriedSecret
 

@@ -15,7 +15,7 @@ import pytest
 
 from channels.quiet.coded import codes_of, model_of
 from channels.quiet.trained_like import trained_like
-from cli.harness import PROGRAM, Run, Result, assert_refused, listing, write_key
+from cli.harness import PROGRAM, Result, Run, assert_refused, listing, write_key
 from keyss.channels import LOW_BITS, CodesCover, Payload, base
 from keyss.channels.colours import salts
 from keyss.channels.quiet import cells
@@ -214,9 +214,7 @@ class TestVerify:
         assert "Gaussians of SH degree" in result.out
 
     @pytest.mark.parametrize("where", ["file", "environment"])
-    def test_whole_secret(
-        self, keyss: Run, files: Path, monkeypatch: pytest.MonkeyPatch, where: str
-    ) -> None:
+    def test_whole_secret(self, keyss: Run, files: Path, monkeypatch: pytest.MonkeyPatch, where: str) -> None:
         arguments = ["--key-file", files / "key"]
         if where == "environment":
             monkeypatch.setenv("KEYSS_KEY", f"{KEY}\n")

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from cli.harness import PROGRAM, Run, Result, assert_refused, listing
+from cli.harness import PROGRAM, Result, Run, assert_refused, listing
 
 WORDS = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated", signal.SIGHUP: "terminated"}
 
@@ -130,9 +130,7 @@ def test_ctrl_c_during_work(body: str, printed: str) -> None:
 
 
 @pytest.mark.parametrize("signum", [signal.SIGINT, signal.SIGTERM])
-def test_signal_during_training(
-    keyss: Run, workspace: Path, tmp_path: Path, signum: signal.Signals
-) -> None:
+def test_signal_during_training(keyss: Run, workspace: Path, tmp_path: Path, signum: signal.Signals) -> None:
     small = ("--max-gaussians", 100, "--device", "cpu")
 
     def arguments(out: Path) -> list[object]:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from cli.harness import SMALL, Run, Result
+from cli.harness import SMALL, Result, Run
 from keyss import progress
 
 
@@ -52,7 +52,14 @@ class TestEstimate:
         assert "about" not in fit(keyss, scene, "-q", "--overwrite").err
 
     def test_hide(self, keyss: Run, workspace: Path, tmp_path: Path) -> None:
-        scenes = ("--cover", workspace / "a", "--secret", workspace / "b", "--key-file", workspace / "key.txt")
+        scenes = (
+            "--cover",
+            workspace / "a",
+            "--secret",
+            workspace / "b",
+            "--key-file",
+            workspace / "key.txt",
+        )
         result = keyss("hide", "--publish", "any", *scenes, "-o", tmp_path / "out", *SMALL, "--min-psnr", 0)
         assert result.status == 0, result.err
         assert re.search(rf"^hide: {self.WORDS}\n", result.err, re.MULTILINE)

@@ -100,9 +100,7 @@ def test_invalid_arguments(
     assert not (files / "film.mp4").exists()
 
 
-def test_interrupt_leaves_no_file(
-    files: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_interrupt_leaves_no_file(files: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def interrupted(*given: object) -> None:
         raise KeyboardInterrupt
 

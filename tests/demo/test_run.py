@@ -54,9 +54,7 @@ def test_the_key_opens_the_file_for_the_web_too(run: tuple[Path, demo.DemoResult
     assert len(found) == len(keyss.reveal(run[0] / "publish" / "model.ply", "demo-key-3").gaussians)
 
 
-def test_existing_folder(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_existing_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "stego.ply").write_text("old")
     (tmp_path / "notes.txt").write_text("mine")
     with pytest.raises(OutputError, match="`overwrite=True`"):

@@ -159,9 +159,7 @@ def test_command_line(
     assert "whole" in result.out
 
 
-def test_unknown_method(
-    models: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_unknown_method(models: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     cover, secret = models
     stego = keyss.hide(cover, [Secret(secret, KEY)], method="whole", width=24, out=tmp_path / "run").stego
     monkeypatch.delitem(registry.METHODS, "whole")

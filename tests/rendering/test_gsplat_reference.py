@@ -25,8 +25,8 @@ from keyss.methods import DESIGNS, registry
 from keyss.methods.keyss.method import training_of
 from keyss.runs import stego_in
 from methods.keyss.small import small
+from rendering.fake_cuda import GpuTensor, as_cpu, fake_cuda
 from rendering.gsplat_reference import COMPILED, NERFACC
-from rendering.fake_cuda import FakeCudaTensor, as_cpu, fake_cuda
 from rendering.scenes import SCENES, random_scene
 from rendering.test_cuda import IMAGE_ERROR, check_backends_agree, results_on
 from tiny_scenes import tiny_scene
@@ -113,7 +113,7 @@ def test_training_gradients_match_cpu(name: str, gpu: torch.device) -> None:
     for part, optimizer in here.optimizers.items():
         (expected,) = optimizer.state.values()  # moments: linear in the gradients, unlike Adam's first steps
         (found,) = there.optimizers[part].state.values()
-        assert isinstance(found["exp_avg"], FakeCudaTensor)
+        assert isinstance(found["exp_avg"], GpuTensor)
         error = (found["exp_avg"].cpu() - expected["exp_avg"]).norm()
         assert error <= 1e-3 * expected["exp_avg"].norm(), part
     while there.iteration < there.iterations:  # with density control, and what trainings do at their end
@@ -134,7 +134,7 @@ def test_hide_and_reveal(
         device="cuda", out=tmp_path / "run", min_psnr=0,
     )  # fmt: skip
     revealed = reveal(stego_in(tmp_path / "run"), KEY, device="cuda").gaussians
-    assert not isinstance(revealed.means, FakeCudaTensor)
+    assert not isinstance(revealed.means, GpuTensor)
     here = reveal(stego_in(tmp_path / "run"), KEY, device="cpu").gaussians
     assert (revealed.means - here.means).abs().max() < 1e-6
 

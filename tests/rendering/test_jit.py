@@ -33,9 +33,7 @@ def test_kernels_are_cached_in_the_folder_of_these_sources() -> None:
 
 
 @pytest.mark.skipif(not hasattr(os, "getuid"), reason="folders have no owners and modes here")
-def test_unsafe_cache_folders(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_unsafe_cache_folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     place = tmp_path / "shared"
     place.mkdir()
     monkeypatch.setattr(numba.config, "CACHE_DIR", str(place / "cache"))

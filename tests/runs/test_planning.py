@@ -59,9 +59,7 @@ def test_capacity(tmp_path: Path) -> None:
     assert [stage.steps for stage in plan.stages] == [0] * len(plan.stages)
 
 
-def test_full_disk(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[Path] = []
 
     def usage(path: Path) -> Usage:

@@ -16,7 +16,7 @@ from keyss.methods import HiddenFile, embed_models
 from keyss.viewer import export_html
 from lab.lifelike import lifelike
 from methods.keyss.small import latent_model
-from viewer.browser import CLOSE, IN_CHROMIUM, POSE, Visit, render_pose, bright_model, psnr
+from viewer.browser import CLOSE, IN_CHROMIUM, POSE, Visit, bright_model, psnr, render_pose
 
 pytestmark = IN_CHROMIUM
 
@@ -55,9 +55,7 @@ def published(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_keys(
-    tab: Visit, published: Callable[[str], Path], tmp_path: Path, kind: str
-) -> None:
+def test_keys(tab: Visit, published: Callable[[str], Path], tmp_path: Path, kind: str) -> None:
     """Every key takes as many derivations, which are nearly all of the time."""
     stego = published(kind)
     tab.goto(export_html(stego, tmp_path / "page.html")[0].as_uri() + POSE)

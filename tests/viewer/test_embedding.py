@@ -42,9 +42,7 @@ def foreign(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, st
 
 
 @pytest.mark.slow
-def test_element_on_another_site(
-    tab: Visit, stego: Path, foreign: tuple[Path, str], tmp_path: Path
-) -> None:
+def test_element_on_another_site(tab: Visit, stego: Path, foreign: tuple[Path, str], tmp_path: Path) -> None:
     folder, origin = foreign
     export_html(stego, tmp_path, look={"embedder": origin, "host": origin})
     write_model(folder / "other.ply", bright_model(300, 2))
@@ -72,9 +70,7 @@ def test_element_on_another_site(
 
 
 @pytest.mark.slow
-def test_sandboxed_frame(
-    tab: Visit, stego: Path, foreign: tuple[Path, str]
-) -> None:
+def test_sandboxed_frame(tab: Visit, stego: Path, foreign: tuple[Path, str]) -> None:
     folder, origin = foreign
     export_html(stego, folder / "page.html", look={"embedder": origin})
     (folder / "sandbox.html").write_text(
@@ -115,9 +111,7 @@ def test_invalid_origins(stego: Path, tmp_path: Path, wrong: str) -> None:
 @pytest.mark.slow
 @pytest.mark.skipif(not (WEB / "node_modules").exists(), reason="no web/node_modules: `make web` installs it")
 @pytest.mark.parametrize("engine", ["playcanvas", "spark"])
-def test_reader_in_other_engines(
-    chromium: Any, stego: Path, tmp_path: Path, engine: str
-) -> None:
+def test_reader_in_other_engines(chromium: Any, stego: Path, tmp_path: Path, engine: str) -> None:
     modules = tmp_path / "examples" / "node_modules"
     subprocess.run(["node", "build.mjs", "--reader", str(tmp_path)], cwd=WEB, check=True)
     for name in ("playcanvas", "three", "@sparkjsdev"):

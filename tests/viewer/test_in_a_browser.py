@@ -16,7 +16,7 @@ from keyss.core import Gaussians
 from keyss.files import read_model, write_model
 from keyss.viewer import export_html
 from methods.carry.carried import embed, extract
-from viewer.browser import CLOSE, IN_CHROMIUM, POSE, WEB, Visit, render_pose, bright_model, psnr
+from viewer.browser import CLOSE, IN_CHROMIUM, POSE, WEB, Visit, bright_model, psnr, render_pose
 
 pytestmark = IN_CHROMIUM
 
@@ -127,9 +127,7 @@ def test_damaged_files(tab: Visit, page_file: Path, tmp_path: Path) -> None:
     tab.page.wait_for_function("() => document.getElementById('problem').textContent === ''")
 
 
-def test_slider(
-    tab: Visit, page_file: Path, stego: Path, secrets: list[Gaussians], tmp_path: Path
-) -> None:
+def test_slider(tab: Visit, page_file: Path, stego: Path, secrets: list[Gaussians], tmp_path: Path) -> None:
     models = dict(zip(("first", "second"), secrets, strict=True))
     models |= {"published": read_model(stego), "other": bright_model(300, 5)}
     write_model(tmp_path / "other.ply", models["other"])
@@ -175,9 +173,7 @@ def test_slider(
 
 
 @pytest.mark.parametrize("kind", ["empty", "NaN", "activated"])
-def test_undrawable_files(
-    tab: Visit, page_file: Path, tmp_path: Path, kind: str
-) -> None:
+def test_undrawable_files(tab: Visit, page_file: Path, tmp_path: Path, kind: str) -> None:
     model = bright_model(200, 1)
     if kind == "activated":
         model = replace(model, log_scales=model.scales, opacity_logits=model.opacities)
@@ -243,9 +239,7 @@ def test_accessibility(tab: Visit, page_file: Path, width: int) -> None:
 
 
 @pytest.mark.slow
-def test_inspect_save_and_wipe(
-    tab: Visit, page_file: Path, secrets: list[Gaussians], tmp_path: Path
-) -> None:
+def test_inspect_save_and_wipe(tab: Visit, page_file: Path, secrets: list[Gaussians], tmp_path: Path) -> None:
     tab.goto(page_file.as_uri() + POSE)
     plain = tab.picture()
     tab.page.click("#keyless > summary")

@@ -70,9 +70,7 @@ def step_once(reporter: Reporter, iteration: int, model: Callable[[], Gaussians]
     reporter.look(model)
 
 
-def test_copies_only_while_watched(
-    training: LiveTraining, clock: Timer
-) -> None:
+def test_copies_only_while_watched(training: LiveTraining, clock: Timer) -> None:
     model, reporter = Copies(), training.reporter(Reporter())
     reporter.start("fit garden", 100, 0)
     for step in range(1, 10):

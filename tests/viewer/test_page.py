@@ -94,9 +94,7 @@ def test_folder_page(model: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("out", ["page.html", "site"])
-def test_undrawable_models(
-    model: Path, tmp_path: Path, out: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_undrawable_models(model: Path, tmp_path: Path, out: str, monkeypatch: pytest.MonkeyPatch) -> None:
     whole = model.read_bytes()
     start = whole.index(b"end_header\n") + len(b"end_header\n")
     nan = np.full(len(whole[start:]) // 4, np.nan, "<f4").tobytes()
@@ -120,9 +118,7 @@ def test_undrawable_models(
     assert not (tmp_path / out).exists()
 
 
-def test_server(
-    server: ModelServer, model: Path
-) -> None:
+def test_server(server: ModelServer, model: Path) -> None:
     where = urlsplit(server.address)
     assert re.fullmatch(r"/[\w-]{20,}/", where.path)
     with running(other := ModelServer(model)):

@@ -12,7 +12,7 @@ from keyss.files import read_model, write_model
 from keyss.viewer import export_html
 from methods.carry.carried import embed, extract
 from serving import serving
-from viewer.browser import CLOSE, IN_CHROMIUM, PANEL, Visit, render_pose, bright_model, psnr, visit
+from viewer.browser import CLOSE, IN_CHROMIUM, PANEL, Visit, bright_model, psnr, render_pose, visit
 
 pytestmark = IN_CHROMIUM
 

@@ -118,9 +118,7 @@ def test_randomness_comes_from_entropy(cover: Gaussians, secret: Gaussians) -> N
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_shuffling_and_pruning(
-    cover: Gaussians, secret: Gaussians, seed: int
-) -> None:
+def test_shuffling_and_pruning(cover: Gaussians, secret: Gaussians, seed: int) -> None:
     own = keys()
     stego = embed_derived(cover, [(own, secret)], entropy=ENTROPY)
     whole = rows_of(extract_derived(QuietReader.of(stego), own[0]).gaussians)
@@ -171,9 +169,7 @@ def _with_flipped_bit(model: Gaussians, row: int, column: int, bit: int) -> Gaus
     raise AssertionError("no such column")
 
 
-def test_foreign_gaussians_do_not_block_salts(
-    stego: Gaussians, secret: Gaussians
-) -> None:
+def test_foreign_gaussians_do_not_block_salts(stego: Gaussians, secret: Gaussians) -> None:
     """Three added Gaussians come before all of the model's own in the order of salts."""
     own = QuietReader.of(stego).salts
     added = trained_like(200, seed=9)

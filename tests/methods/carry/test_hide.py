@@ -79,9 +79,7 @@ def test_hide_and_reveal_files(run: Run, tmp_path: Path) -> None:
         (("--sh-degree=2", "--method=keyss"), "carry"),
     ],
 )
-def test_options_of_other_methods(
-    run: Run, tmp_path: Path, arguments: tuple[str, ...], having: str
-) -> None:
+def test_options_of_other_methods(run: Run, tmp_path: Path, arguments: tuple[str, ...], having: str) -> None:
     hide = ("hide", "--cover", "cover.ply", "--secret", "secret.ply", "--key-file", "key")
     status, _, err = run(*hide, "-o", tmp_path / "out", *arguments)
     assert status == 2

@@ -17,7 +17,7 @@ from keyss.fitting.losses import Target, ssim_torch
 from keyss.methods import DESIGNS, CombinedPoses, KeyssTraining, PlacedScene, Source, registry
 from keyss.rendering import render
 from methods.hiding import Hidden, check_resumes, hide_scenes, three_scenes
-from methods.keyss.small import FIT, KEYS, VECTORS, start_training, small
+from methods.keyss.small import FIT, KEYS, VECTORS, small, start_training
 from tiny_scenes import random_gaussians, tiny_scene
 
 
@@ -30,7 +30,9 @@ def hidden() -> Hidden:
 
 def _run(design: str = "published", **changes: Any) -> KeyssTraining:
     scenes = [tiny_scene(seed) for seed in range(3)]
-    return start_training(small(design, **changes), scenes, [random_gaussians(seed=seed) for seed in range(3)])
+    return start_training(
+        small(design, **changes), scenes, [random_gaussians(seed=seed) for seed in range(3)]
+    )
 
 
 def _loss(image: torch.Tensor, target: torch.Tensor, weight: float) -> torch.Tensor:

@@ -18,9 +18,7 @@ VALUES = arrays.arrays(np.float64, st.integers(1, 30), elements=FINITE)
 
 
 @given(VALUES, st.floats(0, 1e3), st.floats(0.01, 50), st.integers(1, 24))
-def test_line_error(
-    values: np.ndarray, spread: float, reach: float, bits: int
-) -> None:
+def test_line_error(values: np.ndarray, spread: float, reach: float, bits: int) -> None:
     line = Line(1.5, spread if spread > 1e-3 else 0.0, reach, far_reach=1.0)
 
     def position(x: np.ndarray) -> np.ndarray:
@@ -33,9 +31,7 @@ def test_line_error(
 
 @given(st.data(), st.integers(0, 3), st.sampled_from([0, 40, 500]))
 @settings(max_examples=25, deadline=None)
-def test_codec_error(
-    data: st.DataObject, degree: int, more: int
-) -> None:
+def test_codec_error(data: st.DataObject, degree: int, more: int) -> None:
     count = data.draw(st.integers(1, 12))
 
     def some(*shape: int) -> torch.Tensor:
