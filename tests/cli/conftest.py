@@ -1,4 +1,4 @@
-"""A small workspace to run the command line in."""
+"""Scenes and a hidden scene for tests of the command line."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from shared import make_once
 
 @pytest.fixture(scope="session")
 def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with scenes `a` and `b`, a key file, and `hidden`: b hidden in a; tests must not change it."""
+    """Scenes `a` and `b`, key files, and the run `hidden`, which hides b in a; read-only."""
     return make_once(tmp_path_factory, "workspace", _make_workspace)
 
 
@@ -26,5 +26,5 @@ def _make_workspace(folder: Path) -> None:
 
 @pytest.fixture
 def scene(tmp_path: Path) -> Path:
-    """A scene beside which results may lie."""
+    """A scene in a writable folder."""
     return write_nerfstudio(tmp_path / "b", count=4)

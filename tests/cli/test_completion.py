@@ -1,4 +1,4 @@
-"""What shells complete, asked of bash itself."""
+"""Completion in bash."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What `keyss doctor` finds, and that it notices what does not work."""
+"""`keyss doctor` on working and broken installations."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Without the extra `audit` everything works but what measures and reports, which says so."""
+"""Only the commands of the laboratory need the extra `audit`."""
 
 from __future__ import annotations
 

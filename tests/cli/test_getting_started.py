@@ -1,4 +1,4 @@
-"""What somebody tries in the first hour, and what the command line answers."""
+"""Typical first uses."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import pytest
 
 import keyss as library
 from channels.quiet.trained_like import trained_like
-from cli.harness import SMALL, Run, write_key
+from cli.harness import SMALL, Run, scene_arguments, write_key
 from keyss.files import write_model
 
 KEY = "q7Rv2LxT9bWm4KzD"
@@ -16,7 +16,7 @@ HIDE = ("hide", "--cover", "cover.ply", "--key-file", "key.txt", "--width", "16"
 
 
 @pytest.fixture(autouse=True)
-def mine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     for name, count, degree in (("cover", 1500, 3), ("flat", 1500, 0), ("small", 200, 2), ("large", 2500, 3)):
         write_model(tmp_path / f"{name}.ply", trained_like(count, count).with_sh_degree(degree))
     write_key(tmp_path / "key.txt", KEY)
@@ -52,9 +52,8 @@ def test_cover_without_harmonics(keyss: Run) -> None:
 
 def test_hide_from_few_photos(keyss: Run, workspace: Path) -> None:
     few = [word if word != "100" else "1200" for word in SMALL]
-    scenes = ("--cover", workspace / "a", "--secret", workspace / "b", "--key-file", "key.txt")
-    result = keyss("hide", *scenes, *few, "-o", "run")
+    result = keyss("hide", *scene_arguments(workspace), *few, "-o", "run")
     assert result.status == 0, result.err
-    assert "refit of the secret" in result.err  # the cover got half as many Gaussians
+    assert "refit of the secret" in result.err  # the cover has half as many Gaussians
     assert "The secret kept" in result.out
     assert keyss("verify", "run/publish/model.ply", "--key-file", "key.txt").status == 0

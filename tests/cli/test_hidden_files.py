@@ -1,4 +1,4 @@
-"""Files hidden by `keyss hide --secret-file` and brought back by `keyss reveal`."""
+"""Arbitrary files: `keyss hide --secret-file` and `keyss reveal`."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ KEYS = ("q7Rv2LxT9bWm4KzD", "W2mz8Qe5TnYc6LkA")
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A cover, two files, two keys, and `out`, where both are hidden in it."""
+    """A cover, two files, two keys, and `out`, which hides both."""
     made = tmp_path_factory.mktemp("files")
     write_model(made / "cover.ply", trained_like(3000))
     (made / "letter.pdf").write_bytes(os.urandom(3000))

@@ -1,4 +1,4 @@
-"""Files and folders as people have them: taken where they can be, else called what they are."""
+"""Unexpected files and folders: accepted, or named in the error."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from cli.harness import SMALL, Result, Run, assert_refused, listing
 from files.scene_files import write_blender, write_colmap, write_nerfstudio
 
 
-def key(folder: Path) -> tuple[str, Path]:
+def key_argument(folder: Path) -> tuple[str, Path]:
     return "--key-file", folder / "key.txt"
 
 
@@ -23,9 +23,18 @@ def key(folder: Path) -> tuple[str, Path]:
 def test_run_folder_as_model(keyss: Run, workspace: Path, tmp_path: Path, inside: str) -> None:
     run, out = workspace / "hidden" / inside, tmp_path / "out"
     give = f"found a folder; give {workspace / 'hidden' / 'publish' / 'model.ply'}"
-    assert_refused(keyss("reveal", run, *key(workspace), "-o", tmp_path / "s.ply"), 4, give)
+    assert_refused(keyss("reveal", run, *key_argument(workspace), "-o", tmp_path / "s.ply"), 4, give)
     assert_refused(keyss("render", run, "--cameras", workspace / "a", "-o", out), 4, give)
-    hide = ("hide", "--cover", workspace / "a", "--secret", workspace / "b", *key(workspace), "-o", out)
+    hide = (
+        "hide",
+        "--cover",
+        workspace / "a",
+        "--secret",
+        workspace / "b",
+        *key_argument(workspace),
+        "-o",
+        out,
+    )
     assert_refused(keyss(*hide, "--cover-model", run), 4, give)
     assert listing(tmp_path) == {}
 
@@ -34,7 +43,7 @@ def test_run_folder_as_model(keyss: Run, workspace: Path, tmp_path: Path, inside
 @pytest.mark.parametrize("command", ["evaluate", "audit", "audit --report-only"])
 def test_path_inside_run(keyss: Run, workspace: Path, command: str, inside: str) -> None:
     path = workspace / "hidden" / inside
-    result = keyss(*command.split(), path, *key(workspace))
+    result = keyss(*command.split(), path, *key_argument(workspace))
     kind = "a folder" if path.is_dir() else "a file"
     assert_refused(result, 4, f"{path}: expected the folder of a run")
     assert f"found {kind} in one; give {workspace / 'hidden'}" in result.err
@@ -44,7 +53,7 @@ def test_key_file_as_model(keyss: Run, workspace: Path, tmp_path: Path) -> None:
     (text,) = (workspace / "key.txt").read_text().split()
     for arguments in (
         ("info", workspace / "key.txt"),
-        ("reveal", workspace / "key.txt", *key(workspace), "-o", tmp_path / "s.ply"),
+        ("reveal", workspace / "key.txt", *key_argument(workspace), "-o", tmp_path / "s.ply"),
     ):
         result = keyss(*arguments)
         assert_refused(result, 4, "found a file of no kind that keyss knows")
@@ -53,7 +62,7 @@ def test_key_file_as_model(keyss: Run, workspace: Path, tmp_path: Path) -> None:
 
 @contextmanager
 def unprivileged() -> Iterator[None]:
-    """As somebody whom permissions bind: tests may run as root."""
+    """Drop root, whom permissions do not bind."""
     root = os.geteuid() == 0
     if root:
         os.seteuid(65534)
@@ -66,7 +75,7 @@ def unprivileged() -> Iterator[None]:
 
 @pytest.fixture
 def open_folder() -> Iterator[Path]:
-    """A folder that everybody may enter, as `tmp_path` is not, with a key that everybody may read."""
+    """A folder with a key that other users can read, unlike `tmp_path`."""
     with tempfile.TemporaryDirectory() as folder:
         os.chmod(folder, 0o755)
         (Path(folder) / "key").write_text("q7Rv2LxT9bWm4KzD")
@@ -84,7 +93,7 @@ def test_unreadable_scene(keyss: Run, open_folder: Path, closed: str) -> None:
         ("evaluate", scene, *key),
     )
     for command in commands:
-        # Imports all it needs.
+        # Import everything before dropping root.
         keyss(*[open_folder / "nowhere" if each is scene else each for each in command])
         with unprivileged():
             result = keyss(*command)
@@ -93,14 +102,14 @@ def test_unreadable_scene(keyss: Run, open_folder: Path, closed: str) -> None:
     (scene / closed).chmod(0o700)
 
 
-def fitted(keyss: Run, scene: Path, out: Path, *extra: object) -> Result:
+def fit(keyss: Run, scene: Path, out: Path, *extra: object) -> Result:
     result = keyss("fit", scene, "-o", out, *SMALL, *extra)
     assert result.status == 0, result.err
     assert (out / "model.ply").stat().st_size > 0
     return result
 
 
-def warnings_of(result: Result) -> list[str]:
+def warning_lines(result: Result) -> list[str]:
     return [line for line in result.err.splitlines() if line.startswith("keyss: warning: ")]
 
 
@@ -120,8 +129,8 @@ def test_missing_photo(keyss: Run, tmp_path: Path, layout: str) -> None:
     assert_refused(result, 4, f"1 of 4 photos are missing: {name};")
     assert "--skip-missing" in result.err
     assert not (tmp_path / "out").exists()
-    (warning,) = warnings_of(fitted(keyss, scene, tmp_path / "out", "--skip-missing"))
+    (warning,) = warning_lines(fit(keyss, scene, tmp_path / "out", "--skip-missing"))
     assert warning.endswith(f"1 of 4 photos are missing and left out: {name}")
     described = keyss("info", scene, "--json")
     assert json.loads(described.out)["train_views"] == {"colmap": 2, "blender": 3, "nerfstudio": 2}[layout]
-    assert warnings_of(described) == [warning]
+    assert warning_lines(described) == [warning]

@@ -1,4 +1,4 @@
-"""Where keys come from."""
+"""Keys from files, the environment and the prompt."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def write(folder: Path, data: bytes) -> Path:
 def test_white_space_is_stripped(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, data: bytes, key: str, warns: bool
 ) -> None:
-    """The file, the environment and whoever passes the text of a file in Python have the same key."""
+    """In files, in the environment and in Python."""
     with pytest.warns(KeyssWarning, match="white space") if warns else nullcontext():
         assert keys.keys([write(tmp_path, data)], 1) == [key]
     monkeypatch.setenv("KEYSS_KEY", data.decode())
@@ -84,7 +84,7 @@ def test_key_file_takes_precedence(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 class TestPrompt:
     @pytest.fixture
     def typed(self, monkeypatch: pytest.MonkeyPatch) -> list[str]:
-        """What a person types, to be filled by the test."""
+        """Answers at the prompt, filled by the test."""
         answers: list[str] = []
         monkeypatch.setattr("sys.stdin.isatty", lambda: True, raising=False)
         monkeypatch.setattr(getpass, "getpass", lambda prompt: answers.pop(0))

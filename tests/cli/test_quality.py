@@ -1,4 +1,4 @@
-"""What comes out too bad is not published, and nothing that was trained is lost by that."""
+"""--min-psnr: bad results are not published, and resuming skips training."""
 
 from __future__ import annotations
 
@@ -9,13 +9,12 @@ import pytest
 import torch
 
 from channels.quiet.trained_like import trained_like
-from cli.harness import SMALL, Run, assert_refused, write_key
+from cli.harness import SMALL, Run, assert_refused, scene_arguments, write_key
 from keyss.files import read_model, write_model
 
 
 def test_min_psnr(keyss: Run, workspace: Path, tmp_path: Path) -> None:
-    scenes = ["--cover", workspace / "a", "--secret", workspace / "b", "--key-file", workspace / "key.txt"]
-    hide = ["hide", *scenes, "--publish", "any", "-o", tmp_path / "run", *SMALL]
+    hide = ["hide", *scene_arguments(workspace), "--publish", "any", "-o", tmp_path / "run", *SMALL]
     result = keyss(*hide, "--min-psnr", 90)
     assert result.status == 7
     assert "below 90 dB: nothing was published; a lower --min-psnr" in result.err
@@ -29,7 +28,6 @@ def test_min_psnr(keyss: Run, workspace: Path, tmp_path: Path) -> None:
 
 @pytest.fixture
 def models(tmp_path: Path) -> Path:
-    """A cover and a secret as files."""
     write_model(tmp_path / "cover.ply", trained_like(3000))
     write_model(tmp_path / "secret.ply", trained_like(1500, 1))
     write_key(tmp_path / "key.txt")
@@ -57,7 +55,7 @@ def test_ignored_training_options(keyss: Run, models: Path, dry_run: tuple[str, 
 
 
 def test_empty_secret_is_not_published(keyss: Run, models: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Even where empty pictures would be near enough: the limit is far below what they reach."""
+    """Even if empty renders would exceed --min-psnr."""
     from keyss.methods import CarriedSecret
 
     reveal = CarriedSecret.reveal

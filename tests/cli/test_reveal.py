@@ -1,4 +1,4 @@
-"""`keyss reveal` and `keyss verify`: what they say they found, and what they refuse."""
+"""`keyss reveal` and `keyss verify`."""
 
 from __future__ import annotations
 
@@ -29,30 +29,30 @@ from keyss.methods.records.carried_secret import COUNT
 KEY = "q7Rv2LxT9bWm4KzD"
 
 
-def carried(cover: Gaussians, secret: Gaussians, claimed: int) -> Gaussians:
-    """`cover` with `secret` in it, as if `claimed` Gaussians had been hidden and the others were lost."""
-    prepared = LOW_BITS.prepare(cover)
-    (records,) = encode_all(prepared, [secret])
+def hide_claiming(cover: Gaussians, secret: Gaussians, claimed: int) -> Gaussians:
+    """Hide `secret` with a header that claims more Gaussians, as if the others were lost."""
+    room = LOW_BITS.prepare(cover)
+    (records,) = encode_all(room, [secret])
     records = replace(records, header=COUNT.pack(claimed) + records.header[COUNT.size :])
-    return prepared.embed([(KEY, records)])
+    return room.embed([(KEY, records)])
 
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Keys `key` and `other`; models with 500 Gaussians left of 500, 1,000 and 12,000."""
+    """Key files, and models with 500 Gaussians left of 500, 1,000 and 12,000."""
     folder = tmp_path_factory.mktemp("files")
     for name, key in (("key", KEY), ("other", KEY[::-1])):
         write_key(folder / name, key)
     cover, secret = trained_like(1500), trained_like(500, 1)
     write_model(folder / "plain.ply", cover)
     for name, claimed in (("whole", 500), ("half", 1000), ("few", 12_000)):
-        write_model(folder / f"{name}.ply", carried(cover, secret, claimed))
+        write_model(folder / f"{name}.ply", hide_claiming(cover, secret, claimed))
     return folder
 
 
 @pytest.fixture
 def reveal(keyss: Run, files: Path, tmp_path: Path) -> Run:
-    """Reveals a model with the key of that name into `s.ply` of the test's folder."""
+    """Reveal a model into `s.ply`."""
 
     def run(model: Path | str, *more: object, key: str = "key") -> Result:
         return keyss("reveal", files / model, "--key-file", files / key, "-o", tmp_path / "s.ply", *more)
@@ -90,11 +90,11 @@ class TestCounts:
 
 
 class TestOpensNothing:
-    """A plain model, a wrong key and a model whose low bits are gone: same words, same work."""
+    """A plain model, a wrong key and lost low bits give the same message after the same work."""
 
     @pytest.fixture
     def work(self, monkeypatch: pytest.MonkeyPatch) -> dict[str, int]:
-        """Counts derived keys, and blocks of AES."""
+        """Counts of derived keys and AES blocks."""
         done = {"keys": 0, "blocks": 0}
         encrypt, derive = cells.encrypted_blocks, DerivedKey.of
 
@@ -124,54 +124,53 @@ class TestOpensNothing:
             made.append(dict(work))
         assert result[0] == result[1] == result[2]
         assert made[0] == made[1] == made[2]
-        assert made[0]["keys"] == base.SALTS_TRIED + salts.SALTS + 1  # in low bits, then in colours
+        assert made[0]["keys"] == base.SALTS_TRIED + salts.SALTS + 1  # low bits, then colours
         assert_refused(result[0], 3, "opens nothing here")
         for word in ("another key", "converted or quantised", "moved", "trained on"):
             assert word in result[0].err
 
 
-class TestOutputs:
-    @pytest.mark.parametrize("how", ["same", "dots", "symlink", "hardlink"])
-    def test_input_is_never_overwritten(self, keyss: Run, files: Path, tmp_path: Path, how: str) -> None:
-        (tmp_path / "sub").mkdir()
-        model = tmp_path / "stego.ply"
-        shutil.copy(files / "whole.ply", model)
-        out = {
-            "same": model,
-            "dots": tmp_path / "sub" / ".." / "stego.ply",
-            "symlink": tmp_path / "link.ply",
-            "hardlink": tmp_path / "hard.ply",
-        }[how]
-        if how == "symlink":
-            out.symlink_to(model)
-        elif how == "hardlink":
-            os.link(model, out)
-        before = listing(tmp_path)
-        result = keyss("reveal", model, "--key-file", files / "key", "-o", out, "--overwrite")
-        assert_refused(result, 2, "is the input")
-        assert listing(tmp_path) == before
+@pytest.mark.parametrize("how", ["same", "dots", "symlink", "hardlink"])
+def test_input_is_never_overwritten(keyss: Run, files: Path, tmp_path: Path, how: str) -> None:
+    (tmp_path / "sub").mkdir()
+    model = tmp_path / "stego.ply"
+    shutil.copy(files / "whole.ply", model)
+    out = {
+        "same": model,
+        "dots": tmp_path / "sub" / ".." / "stego.ply",
+        "symlink": tmp_path / "link.ply",
+        "hardlink": tmp_path / "hard.ply",
+    }[how]
+    if how == "symlink":
+        out.symlink_to(model)
+    elif how == "hardlink":
+        os.link(model, out)
+    before = listing(tmp_path)
+    result = keyss("reveal", model, "--key-file", files / "key", "-o", out, "--overwrite")
+    assert_refused(result, 2, "is the input")
+    assert listing(tmp_path) == before
 
 
-class TestStreams:
-    def program(self, *arguments: object, data: bytes = b"", **more: str) -> tuple[int, bytes, str]:
-        done = subprocess.run(
-            [*PROGRAM, *map(str, arguments)],
-            input=data,
-            capture_output=True,
-            check=False,
-            env={**os.environ, **more},
-            timeout=120,
-        )
-        return done.returncode, done.stdout, done.stderr.decode()
+def program(*arguments: object, data: bytes = b"", **more: str) -> tuple[int, bytes, str]:
+    done = subprocess.run(
+        [*PROGRAM, *map(str, arguments)],
+        input=data,
+        capture_output=True,
+        check=False,
+        env={**os.environ, **more},
+        timeout=120,
+    )
+    return done.returncode, done.stdout, done.stderr.decode()
 
-    def test_pipes(self, files: Path, tmp_path: Path) -> None:
-        data = (files / "whole.ply").read_bytes()
-        status, out, err = self.program("reveal", "-", "-o", "-", data=data, KEYSS_KEY=KEY)
-        assert (status, err.splitlines()[-1]) == (0, "-: 500 of 500 Gaussians")
-        (tmp_path / "s.ply").write_bytes(out)
-        assert len(read_model(tmp_path / "s.ply")) == 500
-        status, out, err = self.program("info", "-", "--json", data=out)
-        assert (status, json.loads(out)["gaussians"]) == (0, 500)
+
+def test_pipes(files: Path, tmp_path: Path) -> None:
+    data = (files / "whole.ply").read_bytes()
+    status, out, err = program("reveal", "-", "-o", "-", data=data, KEYSS_KEY=KEY)
+    assert (status, err.splitlines()[-1]) == (0, "-: 500 of 500 Gaussians")
+    (tmp_path / "s.ply").write_bytes(out)
+    assert len(read_model(tmp_path / "s.ply")) == 500
+    status, out, err = program("info", "-", "--json", data=out)
+    assert (status, json.loads(out)["gaussians"]) == (0, 500)
 
 
 class TestVerify:
@@ -181,7 +180,7 @@ class TestVerify:
             result = keyss("verify", files / name, "--json")
             assert (result.status, result.err) == (0, "")
             facts.append(json.loads(result.out) | {"path": ""})
-        # Low bits can move single quaternions over the border of what counts as length 1.
+        # Low bits change the length of quaternions slightly.
         assert max(each["model"].pop("unit_quaternions") for each in facts) < 0.01
         assert facts[0] == facts[1]
         assert facts[0]["secret"] is None

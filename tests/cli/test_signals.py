@@ -1,4 +1,4 @@
-"""Ctrl-C and other signals, at any moment: one line, the status of a shell, and nothing lost."""
+"""Ctrl-C and other signals at any moment: one line, status 128 + signal, and no lost work."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from cli.harness import PROGRAM, Result, Run, assert_refused, listing
 WORDS = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated", signal.SIGHUP: "terminated"}
 
 
-def _started(arguments: list[object]) -> subprocess.Popen[str]:
-    """A process that has got as far as to provide for signals: what comes before is Python's own start."""
+def _start(arguments: list[object]) -> subprocess.Popen[str]:
+    """Start a process and wait until it handles signals."""
     command = [*PROGRAM, *map(str, arguments)]
     pipe = subprocess.PIPE
     process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=pipe, stderr=pipe, text=True)
     status = Path(f"/proc/{process.pid}/status")
-    # The last that is provided for, and not ignored, as under nohup.
+    # The last handler that is installed; nohup ignores SIGHUP.
     last = next(each for each in (signal.SIGHUP, signal.SIGTERM) if signal.getsignal(each) != signal.SIG_IGN)
     if not status.exists():
         time.sleep(0.5)
@@ -33,8 +33,8 @@ def _started(arguments: list[object]) -> subprocess.Popen[str]:
     return process
 
 
-def _assert_ended(process: subprocess.Popen[str], signum: signal.Signals, when: str) -> None:
-    """As the signal asks for, or as if it had not come where it came too late."""
+def _assert_stopped(process: subprocess.Popen[str], signum: signal.Signals, when: str) -> None:
+    """Stopped by the signal, or finished before it."""
     _, err = process.communicate(timeout=120)
     assert process.returncode in (0, 128 + signum), (when, err)
     lines = [line for line in err.splitlines() if line.startswith("keyss: ")]
@@ -61,15 +61,14 @@ def _commands(workspace: Path, folder: Path) -> dict[str, list[object]]:
 def test_signal_during_command(
     workspace: Path, tmp_path: Path, command: str, seconds: float, signum: signal.Signals
 ) -> None:
-    process = _started(_commands(workspace, tmp_path)[command])
+    process = _start(_commands(workspace, tmp_path)[command])
     time.sleep(seconds)
     process.send_signal(signum)
-    _assert_ended(process, signum, f"{command} after {seconds} s")
+    _assert_stopped(process, signum, f"{command} after {seconds} s")
     assert not [name for name in listing(tmp_path) if name.endswith(".unfinished")]
 
 
-def _ended(program: str, *arguments: str) -> Result:
-    """What a program in Python comes to."""
+def _run(program: str, *arguments: str) -> Result:
     command = [sys.executable, "-c", program, *arguments]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
     return Result(done.returncode, done.stdout, done.stderr)
@@ -94,10 +93,10 @@ _ALSO = ("keyss.cli.entry", "tyro", "torch.nn", "numba.core.types")
     "module", ["torch._C", *(pytest.param(name, marks=pytest.mark.slow) for name in _ALSO)]
 )
 def test_ctrl_c_during_import(workspace: Path, module: str) -> None:
-    """Where it comes up as an exception, torch is loaded half, and crashes when it is loaded again."""
+    """An exception would leave torch half imported, and the next import crashes."""
     stego, key = next((workspace / "hidden").rglob("publish/model.ply")), workspace / "key.txt"
-    verify = ["verify", str(stego), "--key-file", str(key)]  # loads as much as any command
-    assert _ended(LOADING.format(module=module), *verify) == Result(130, "", "keyss: interrupted\n")
+    verify = ["verify", str(stego), "--key-file", str(key)]  # imports as much as any command
+    assert _run(LOADING.format(module=module), *verify) == Result(130, "", "keyss: interrupted\n")
 
 
 IN_A_COMMAND = """
@@ -114,10 +113,10 @@ main()
 @pytest.mark.parametrize(
     ("body", "printed"),
     [
-        # What is to be cleaned up is, and a second signal does not wait for it.
+        # Cleanup runs; a second signal does not wait for it.
         ("try: time.sleep(60)\n    finally: print('cleaned', flush=True)", "cleaned\n"),
         ("try: time.sleep(60)\n    finally: os.kill(os.getpid(), signal.SIGTERM); time.sleep(60)", ""),
-        # An interrupt that something made an error of, or that was dropped, is one all the same.
+        # An interrupt that was replaced or swallowed still counts.
         ("try: time.sleep(60)\n    except BaseException: raise ValueError('boom')", ""),
         ("try: time.sleep(60)\n    except BaseException: pass", ""),
         ("class Dropping:\n        def __del__(self): time.sleep(60)\n    Dropping(); time.sleep(60)", ""),
@@ -126,7 +125,7 @@ main()
 def test_ctrl_c_during_work(body: str, printed: str) -> None:
     alarm = "signal.signal(signal.SIGALRM, lambda *_: os.kill(os.getpid(), signal.SIGINT)); signal.alarm(1)"
     program = IN_A_COMMAND.format(body=f"{alarm}\n    {body}")
-    assert _ended(program) == Result(130, printed, "keyss: interrupted\n")
+    assert _run(program) == Result(130, printed, "keyss: interrupted\n")
 
 
 @pytest.mark.parametrize("signum", [signal.SIGINT, signal.SIGTERM])

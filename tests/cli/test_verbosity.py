@@ -1,4 +1,4 @@
-"""-q, -v, and what is result before long work."""
+"""--quiet, --verbose, and estimates before long runs."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from cli.harness import SMALL, Result, Run
+from cli.harness import SMALL, Result, Run, scene_arguments
 from keyss import progress
 
 
@@ -38,10 +38,8 @@ def test_verbose_prints_duration(keyss: Run, scene: Path, flag: str) -> None:
 
 
 class TestEstimate:
-    """Long work begins with one; what is over in seconds does not."""
-
     @pytest.fixture(autouse=True)
-    def soon_long(self, monkeypatch: pytest.MonkeyPatch) -> None:
+    def low_threshold(self, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr("keyss.runs.planning._LONG", 20)
 
     WORDS = r"a file of up to \d+\.\d MB, about \d+ s, \d\.\d GB of memory, up to \d+ MB of disk"
@@ -52,14 +50,16 @@ class TestEstimate:
         assert "about" not in fit(keyss, scene, "-q", "--overwrite").err
 
     def test_hide(self, keyss: Run, workspace: Path, tmp_path: Path) -> None:
-        scenes = (
-            "--cover",
-            workspace / "a",
-            "--secret",
-            workspace / "b",
-            "--key-file",
-            workspace / "key.txt",
+        result = keyss(
+            "hide",
+            "--publish",
+            "any",
+            *scene_arguments(workspace),
+            "-o",
+            tmp_path / "out",
+            *SMALL,
+            "--min-psnr",
+            0,
         )
-        result = keyss("hide", "--publish", "any", *scenes, "-o", tmp_path / "out", *SMALL, "--min-psnr", 0)
         assert result.status == 0, result.err
         assert re.search(rf"^hide: {self.WORDS}\n", result.err, re.MULTILINE)

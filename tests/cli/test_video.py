@@ -1,4 +1,4 @@
-"""Films, read again by OpenCV's own FFmpeg."""
+"""Videos, decoded again by OpenCV."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def frames_of(path: Path) -> Frames:
     return found
 
 
-def picture(model: Gaussians, camera: Camera) -> npt.NDArray[np.uint8]:
+def render_uint8(model: Gaussians, camera: Camera) -> npt.NDArray[np.uint8]:
     with torch.no_grad():
         return (render(model, camera).clamp(0, 1) * 255).round().to(torch.uint8).numpy()
 
@@ -54,9 +54,11 @@ def test_orbit(keyss: Run, files: Path, tmp_path: Path) -> None:
     assert (result.status, result.out) == (0, f"{tmp_path / 'a.mp4'}: 10 frames\n")
     frames = frames_of(tmp_path / "a.mp4")
     assert [frame.shape for frame in frames] == [(96, 96, 3)] * 10
-    meant = [picture(random_gaussians(400, 0), each) for each in circle(random_gaussians(400, 0), 96, 10)]
+    meant = [
+        render_uint8(random_gaussians(400, 0), each) for each in circle(random_gaussians(400, 0), 96, 10)
+    ]
     assert min(map(psnr, frames, meant)) > 30
-    assert psnr(frames[0], meant[5]) < 25  # it moved
+    assert psnr(frames[0], meant[5]) < 25  # the camera moves
 
 
 def test_circle_cameras() -> None:

@@ -1,4 +1,4 @@
-"""`keyss view`, with `-o` too: what they refuse, and what they say."""
+"""`keyss view`."""
 
 from __future__ import annotations
 
