@@ -42,12 +42,8 @@ def _hide(folder: Path, **changes: object) -> list[object]:
 
 
 def _hide_models(folder: Path, *extra: object, **changes: object) -> list[object]:
-    files = {
-        "cover": _private_model(folder, "cover"),
-        "secret": _private_model(folder, "secret-1"),
-        "out": folder / "out",
-    }
-    files |= {"key_file": folder / "key.txt"} | changes
+    files = {"cover": _private_model(folder, "cover"), "secret": _private_model(folder, "secret-1")}
+    files |= {"out": folder / "out", "key_file": folder / "key.txt"} | changes
     options = [part for name, value in files.items() for part in (f"--{name.replace('_', '-')}", value)]
     return ["hide", "--publish", "any", *options, *extra]
 

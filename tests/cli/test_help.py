@@ -60,11 +60,16 @@ def test_hide_snapshot(keyss: Run) -> None:
 
 def test_help_does_not_import_torch() -> None:
     """torch takes seconds to load."""
-    program = (
-        "import sys; from keyss.cli import main; main(['{}', '--help']); sys.exit('torch' in sys.modules)"
-    )
-    for command in ("keygen", "hide"):
-        subprocess.run([sys.executable, "-c", program.format(command)], check=True, stdout=subprocess.DEVNULL)
+    program = """
+import sys
+from keyss.cli import main
+try:
+    main({})
+finally:
+    assert "torch" not in sys.modules
+"""
+    for arguments in (["--help"], ["keygen", "--help"]):
+        subprocess.run([sys.executable, "-c", program.format(arguments)], check=True, capture_output=True)
 
 
 @pytest.mark.parametrize("arguments", [("--version",), ("-V",)])

@@ -50,16 +50,7 @@ class TestEstimate:
         assert "about" not in fit(keyss, scene, "-q", "--overwrite").err
 
     def test_hide(self, keyss: Run, workspace: Path, tmp_path: Path) -> None:
-        result = keyss(
-            "hide",
-            "--publish",
-            "any",
-            *scene_arguments(workspace),
-            "-o",
-            tmp_path / "out",
-            *SMALL,
-            "--min-psnr",
-            0,
-        )
+        hide = ("hide", *scene_arguments(workspace), "--publish", "any", "-o", tmp_path / "out")
+        result = keyss(*hide, *SMALL, "--min-psnr", 0)
         assert result.status == 0, result.err
         assert re.search(rf"^hide: {self.WORDS}\n", result.err, re.MULTILINE)

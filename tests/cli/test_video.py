@@ -54,11 +54,10 @@ def test_orbit(keyss: Run, files: Path, tmp_path: Path) -> None:
     assert (result.status, result.out) == (0, f"{tmp_path / 'a.mp4'}: 10 frames\n")
     frames = frames_of(tmp_path / "a.mp4")
     assert [frame.shape for frame in frames] == [(96, 96, 3)] * 10
-    meant = [
-        render_uint8(random_gaussians(400, 0), each) for each in circle(random_gaussians(400, 0), 96, 10)
-    ]
-    assert min(map(psnr, frames, meant)) > 30
-    assert psnr(frames[0], meant[5]) < 25  # the camera moves
+    model = random_gaussians(400, 0)
+    expected = [render_uint8(model, camera) for camera in circle(model, 96, 10)]
+    assert min(map(psnr, frames, expected)) > 30
+    assert psnr(frames[0], expected[5]) < 25  # the camera moves
 
 
 def test_circle_cameras() -> None:
