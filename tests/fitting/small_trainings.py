@@ -46,8 +46,8 @@ RUNS: Mapping[str, Callable[[FitConfig, torch.device], Any]] = {
 }
 
 
-def trained(name: str, fit: FitConfig, device: str = "cpu", **options: Any) -> TrainingRun:
-    """One of RUNS, trained to its end."""
+def train_run(name: str, fit: FitConfig, device: str = "cpu", **options: Any) -> TrainingRun:
+    """One of RUNS, train_run to its end."""
     run: TrainingRun = RUNS[name](fit, torch.device(device))
     train(run, name, fit, fingerprint={}, **options)
     return run

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 import keyss
-from cli.said import Run, assert_refused
+from cli.harness import Run, assert_refused
 from keyss import FitConfig, Secret
 from keyss.cli import main
 from keyss.core import DecodedGaussians, InputError, Similarity, UsageError

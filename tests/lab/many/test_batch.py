@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 import keyss as library
-from cli.said import Run
+from cli.harness import Run
 from keyss import CarryOptions
 from keyss.core import InputError, KeyssWarning, WrongKeyError
 from keyss.keys import MasterKey

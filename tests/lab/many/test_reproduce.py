@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from cli.said import Run, listing
+from cli.harness import Run, listing
 from keyss import reproduce
 from keyss.core import InputError
 from keyss.lab.audits import trial_measures

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 import keyss as library
-from cli.said import Run
+from cli.harness import Run
 from keyss.core import BackendError, InputError
 from keyss.lab.many import Forecast, ManyResult, sweep
 from tiny_scenes import random_gaussians

@@ -1,4 +1,4 @@
-"""`keyss view`, with `-o` too: what they refuse, and what they say."""
+"""`keyss view`."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ from pathlib import Path
 
 import numpy as np
 
-from cli.said import Run, assert_refused
+from cli.harness import Run, assert_refused
 from keyss.core import Gaussians
 from keyss.files import read_model, write_model
 from tiny_scenes import random_gaussians
 
 
-def test_what_is_no_model_is_refused(keyss: Run, tmp_path: Path) -> None:
+def test_invalid_models(keyss: Run, tmp_path: Path) -> None:
     (tmp_path / "model.txt").write_text("not a model")
     (tmp_path / "text.ply").write_text("ply\nformat ascii 1.0\nelement vertex 1\nend_header\n")
     write_model(tmp_path / "cut.ply", random_gaussians(5))
@@ -30,15 +30,15 @@ def test_what_is_no_model_is_refused(keyss: Run, tmp_path: Path) -> None:
     assert_refused(keyss("view", str(tmp_path / "model.txt"), "--port", "70000"), 2, "--port")
 
 
-def test_what_the_page_does_not_read_is_converted_and_said(keyss: Run, tmp_path: Path) -> None:
+def test_unsupported_formats_are_converted(keyss: Run, tmp_path: Path) -> None:
     text = write_in_text(tmp_path / "text.ply", random_gaussians(5))
     gltf = tmp_path / "scene.glb"
     write_model(gltf, random_gaussians(5))
     for model, name in ((text, "text.ply"), (gltf, "scene.ply")):
         out = tmp_path / f"{name}-page"
-        said = keyss("view", model, "-o", out)
-        assert said.status == 0, said.err
-        assert f"the page does not read {'a .ply in text' if model == text else 'a .glb'}" in said.err
+        result = keyss("view", model, "-o", out)
+        assert result.status == 0, result.err
+        assert f"the page does not read {'a .ply in text' if model == text else 'a .glb'}" in result.err
         assert read_model(out / name).digest() == read_model(model).digest()
 
 
@@ -51,10 +51,10 @@ def write_in_text(path: Path, model: Gaussians) -> Path:
     return path
 
 
-def test_a_page_is_written_and_not_over_another(keyss: Run, tmp_path: Path) -> None:
+def test_page_output(keyss: Run, tmp_path: Path) -> None:
     write_model(tmp_path / "model.ply", random_gaussians(5))
     out = tmp_path / "page.html"
-    said = keyss("view", tmp_path / "model.ply", "-o", out)
-    assert said.status == 0, said.err
-    assert said.out == f"{out}: {out.stat().st_size / 1e6:.1f} MB; opens in any browser\n"
+    result = keyss("view", tmp_path / "model.ply", "-o", out)
+    assert result.status == 0, result.err
+    assert result.out == f"{out}: {out.stat().st_size / 1e6:.1f} MB; opens in any browser\n"
     assert_refused(keyss("view", tmp_path / "model.ply", "-o", out), 5, "--overwrite")

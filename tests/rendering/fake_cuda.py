@@ -24,21 +24,21 @@ _BACKWARD = (Tensor.backward, torch.autograd.backward, torch.autograd.grad)
 _TO_HOST = (Tensor.numpy, Tensor.__array__)
 
 
-class OnGpu(Tensor):
+class GpuTensor(Tensor):
     """A tensor on the GPU."""
 
-    __torch_function__ = torch._C._disabled_torch_function_impl  # `PretendedGpu` does all
+    __torch_function__ = torch._C._disabled_torch_function_impl  # `GpuMode` does all
 
     device = DEVICE  # type: ignore[assignment]
     is_cuda = True
 
 
-def held(tensor: Tensor) -> Tensor:
+def as_cpu(tensor: Tensor) -> Tensor:
     """The tensor as the CPU sees it, in the same memory."""
     return tensor.as_subclass(Tensor)
 
 
-class PretendedGpu(TorchFunctionMode):
+class GpuMode(TorchFunctionMode):
     """Makes every function of torch compute as if there were a GPU."""
 
     def __init__(self, *, checks: bool = True) -> None:
@@ -51,31 +51,31 @@ class PretendedGpu(TorchFunctionMode):
         if func is torch._C._nn._parse_to:  # of `Module.to`
             return func(*args, **kwargs)
         if func is torch._has_compatible_shallow_copy_type:
-            return isinstance(args[0], OnGpu) == isinstance(args[1], OnGpu)
+            return isinstance(args[0], GpuTensor) == isinstance(args[1], GpuTensor)
         if func in _BACKWARD and self.checks:
-            with PretendedGpu(checks=False):
+            with GpuMode(checks=False):
                 return func(*args, **kwargs)
         tensors = [each for each in tree_leaves((args, kwargs)) if isinstance(each, Tensor)]
-        there = any(isinstance(each, OnGpu) for each in tensors)
+        there = any(isinstance(each, GpuTensor) for each in tensors)
         if there and func in _TO_HOST:
             raise TypeError("can't convert cuda:0 device type tensor to numpy")
         wanted = [name for each in tree_leaves((args, kwargs)) if (name := _device(each)) is not None]
         if func is Tensor.to and len(tensors) == 2:
-            wanted.append("cuda" if isinstance(tensors[1], OnGpu) else "cpu")
+            wanted.append("cuda" if isinstance(tensors[1], GpuTensor) else "cpu")
         moves = bool(wanted) or func in (Tensor.cpu, Tensor.cuda)
         if self.checks and there and not moves and func not in _CROSSING:
-            foreign = [each.shape for each in tensors if not isinstance(each, OnGpu) and each.dim() > 0]
+            foreign = [each.shape for each in tensors if not isinstance(each, GpuTensor) and each.dim() > 0]
             if foreign:
                 raise RuntimeError(
                     f"{func}: expected all tensors to be on one device, got {foreign} on the CPU"
                 )
-        if self.checks and func is Tensor.__getitem__ and not isinstance(args[0], OnGpu) and there:
+        if self.checks and func is Tensor.__getitem__ and not isinstance(args[0], GpuTensor) and there:
             raise RuntimeError("indices should be either on cpu or on the same device as the indexed tensor")
         goes = there if not wanted else wanted[-1] == "cuda"
         goes = (goes and func is not Tensor.cpu) or func is Tensor.cuda
         here = tree_map(lambda each: torch.device("cpu") if _device(each) == "cuda" else each, (args, kwargs))
         result = func(*here[0], **here[1])
-        if moves and tensors and isinstance(result, Tensor) and goes != isinstance(args[0], OnGpu):
+        if moves and tensors and isinstance(result, Tensor) and goes != isinstance(args[0], GpuTensor):
             result = result.clone() if result.data_ptr() == args[0].data_ptr() else result
         if any(result is each for each in tensors):
             return result
@@ -92,13 +92,13 @@ def _device(value: object) -> str | None:
 
 
 def _placed(value: Any, there: bool) -> Any:
-    if not isinstance(value, Tensor) or isinstance(value, OnGpu) == there:
+    if not isinstance(value, Tensor) or isinstance(value, GpuTensor) == there:
         return value
-    return value.as_subclass(OnGpu if there else Tensor)
+    return value.as_subclass(GpuTensor if there else Tensor)
 
 
 @contextmanager
-def pretended_gpu() -> Iterator[torch.device]:
+def fake_cuda() -> Iterator[torch.device]:
     """The device, while it is there."""
-    with PretendedGpu():
+    with GpuMode():
         yield DEVICE

@@ -12,7 +12,7 @@ import torch
 
 import keyss
 from channels.quiet.trained_like import trained_like
-from cli.said import Run, write_key
+from cli.harness import Run, write_key
 from keyss import CarryOptions, FitConfig, Secret
 from keyss.core import UsageError
 from keyss.files import read_model, write_model
@@ -79,9 +79,7 @@ def test_hide_and_reveal_files(run: Run, tmp_path: Path) -> None:
         (("--sh-degree=2", "--method=keyss"), "carry"),
     ],
 )
-def test_options_of_the_other_method_are_refused(
-    run: Run, tmp_path: Path, arguments: tuple[str, ...], having: str
-) -> None:
+def test_options_of_other_methods(run: Run, tmp_path: Path, arguments: tuple[str, ...], having: str) -> None:
     hide = ("hide", "--cover", "cover.ply", "--secret", "secret.ply", "--key-file", "key")
     status, _, err = run(*hide, "-o", tmp_path / "out", *arguments)
     assert status == 2
@@ -89,7 +87,7 @@ def test_options_of_the_other_method_are_refused(
     assert not (tmp_path / "out").exists()
 
 
-def test_from_photos_a_model_is_fitted_first_and_photos_judge(tmp_path: Path) -> None:
+def test_secret_from_photos(tmp_path: Path) -> None:
     options = CarryOptions(fit=FitConfig(iterations=30, max_gaussians=300, evaluate_every=0, seed=0))
     result = keyss.hide(
         trained_like(1500),
@@ -110,7 +108,7 @@ def test_from_photos_a_model_is_fitted_first_and_photos_judge(tmp_path: Path) ->
 
 @pytest.mark.parametrize(("steps", "views"), [(5, 16), (15, 3)])
 @pytest.mark.filterwarnings("ignore::keyss.core.KeyssWarning")  # of appended Gaussians
-def test_however_short_its_training_a_fitted_cover_carries(steps: int, views: int) -> None:
+def test_hide_in_cover_of_few_steps(steps: int, views: int) -> None:
     """After few steps most Gaussians are round and grey, and the low bits of such numbers say something."""
     scene = tiny_scene(0, views)
     points = torch.randn(1500, 3, generator=torch.Generator().manual_seed(0))
@@ -122,7 +120,7 @@ def test_however_short_its_training_a_fitted_cover_carries(steps: int, views: in
     assert result.metrics.against_plain[0].psnr > 40
 
 
-def test_a_pruned_secret_that_is_not_recognised_is_refused(run: Run, tmp_path: Path) -> None:
+def test_min_psnr_of_pruned_secret(run: Run, tmp_path: Path) -> None:
     hide = (*HIDE, "--cover", "cover.ply", "--secret", "large.ply", "--format", "spz", "--refit=never")
     status, out, err = run(*hide, "-o", tmp_path / "out")
     assert status == 7

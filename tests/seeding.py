@@ -1,8 +1,6 @@
-"""What keyss draws at random is the same in every run of CI, whichever process runs a test, in which order.
+"""Seeds keyss's random numbers per test on CI, independently of the order and number of processes.
 
-So a failure comes with the change that made it. On other machines it is drawn anew each time, as hypothesis
-goes on searching there. What others draw (names of files, keys of servers) stays as it is, and so does what
-processes of their own draw.
+Elsewhere they stay random. Other packages and child processes keep their own randomness.
 """
 
 from __future__ import annotations
@@ -15,17 +13,17 @@ from collections.abc import Iterator
 
 import pytest
 
-_sources: list[random.Random] = []  # the innermost last: of the test, or of the fixture that is being set up
+_sources: list[random.Random] = []  # of the test and of the fixtures being set up, innermost last
 _urandom, _randbelow = os.urandom, secrets.randbelow
 
 
-def draw_the_same() -> None:
-    """From now on."""
+def patch_random_sources() -> None:
+    """Replace the sources that keyss draws from."""
     os.urandom, secrets.randbelow = _bytes, _number
 
 
-def begin_draws(item: pytest.Item) -> None:
-    """Of a test: its name says what they are."""
+def seed_test(item: pytest.Item) -> None:
+    """Seed with the name of the test."""
     _sources[:] = [random.Random(item.nodeid)]
 
 
@@ -33,7 +31,7 @@ def begin_draws(item: pytest.Item) -> None:
 def pytest_fixture_setup(
     fixturedef: pytest.FixtureDef[object], request: pytest.FixtureRequest
 ) -> Iterator[None]:
-    """A fixture of several tests draws the same, whichever of them comes first."""
+    """Seed shared fixtures with their own names."""
     parameter = getattr(request, "param_index", 0)
     _sources.append(random.Random(f"{fixturedef.baseid}::{fixturedef.argname}[{parameter}]"))
     try:

@@ -1,4 +1,4 @@
-"""What tests of the command line run and compare."""
+"""Runs the command line and checks its output."""
 
 from __future__ import annotations
 
@@ -37,25 +37,25 @@ COMMANDS = list(command_table.MODULES)
 PROGRAM = [sys.executable, "-c", cheap_keys.PROGRAM]
 
 
-class Said(NamedTuple):
-    """What a run of the command line came to."""
+class Result(NamedTuple):
+    """Exit status and output of a command."""
 
     status: int
     out: str
     err: str
 
 
-Run = Callable[..., Said]  # of the fixture `keyss`
+Run = Callable[..., Result]  # the type of the fixture `keyss`
 
 
 def write_key(path: Path, key: str = "q7Rv2LxT9bWm4KzD") -> Path:
-    """A file that nobody else can read."""
+    """Write a private key file."""
     path.touch(0o600)
     path.write_text(f"{key}\n")
     return path
 
 
-def write_world(folder: Path) -> Path:
+def write_workspace(folder: Path) -> Path:
     """Scenes `a` and `b`, and `key.txt`."""
     write_blender(folder / "a", count=3, channels=3)
     write_nerfstudio(folder / "b", count=4)
@@ -63,16 +63,21 @@ def write_world(folder: Path) -> Path:
     return folder
 
 
+def scene_arguments(workspace: Path) -> tuple[object, ...]:
+    """Arguments of `hide` that hide scene b in a."""
+    return "--cover", workspace / "a", "--secret", workspace / "b", "--key-file", workspace / "key.txt"
+
+
 def listing(folder: Path) -> dict[str, int]:
-    """Every file and folder below, hidden ones too, with its time of change."""
+    """All files and folders with their modification times."""
     return {str(path.relative_to(folder)): path.lstat().st_mtime_ns for path in sorted(folder.rglob("*"))}
 
 
-def assert_refused(said: Said, status: int, words: str) -> None:
-    """The exit status, and one or two lines that hold `words`."""
-    assert said.status == status, said.err
-    assert words in said.err
-    assert said.err.startswith("keyss: ")
-    assert 1 <= len(said.err.splitlines()) <= 2
-    assert "Traceback" not in said.err
-    assert said.out == ""
+def assert_refused(result: Result, status: int, words: str) -> None:
+    """Assert the exit status, and one or two lines of errors that contain `words`."""
+    assert result.status == status, result.err
+    assert words in result.err
+    assert result.err.startswith("keyss: ")
+    assert 1 <= len(result.err.splitlines()) <= 2
+    assert "Traceback" not in result.err
+    assert result.out == ""
