@@ -40,8 +40,9 @@ def extended(model: Gaussians, path: Path, form: str = "binary_little_endian") -
 
 def check_extras(path: Path, extra: dict[str, np.ndarray], rows: slice = slice(None)) -> None:
     with path.open("rb") as file:
-        table, comments = read_vertex_table(file)
-    assert "\n".join(comments).encode("latin-1") + b"\n" == COMMENTS
+        found = read_vertex_table(file)
+        table = np.concatenate(list(found.blocks))
+    assert "\n".join(found.comments).encode("latin-1") + b"\n" == COMMENTS
     for name, values in extra.items():
         assert np.array_equal(table[name][: len(values[rows])], values[rows]), name
 

@@ -207,6 +207,24 @@ def read_model(path: Path | str) -> Gaussians:
         return _read(file, path.name)
 
 
+def reads_as(path: Path, model: Gaussians) -> bool:
+    """True if `read_model` gives `model`, to the bit, for a .ply; takes no memory for a second model.
+
+    Raises InputError as `read_model` does.
+    """
+    if type(model) is not Gaussians or not keeps_low_bits(path):
+        return False
+    flat, start = model.detach().to("cpu"), 0
+    with open_input(path) as file:
+        for rows in read_model_rows(file).blocks:
+            own = np.delete(_rows(flat[start : start + len(rows)]), slice(3, 6), axis=1)  # normals
+            if own.shape != rows.shape or (own.view(np.uint32) != rows.view(np.uint32)).any():
+                return False
+            start += len(rows)
+    check_not_activated(*(each.numpy() for each in (flat.means, flat.log_scales, flat.opacity_logits)))
+    return start == len(flat)
+
+
 def model_of_bytes(path: Path | str, data: bytes) -> Gaussians:
     """The model that `read_model` would read if the file at `path` contained `data`."""
     try:

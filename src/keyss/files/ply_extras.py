@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from keyss.core.arrays import Numbers
 from keyss.core.errors import InputError
@@ -76,12 +75,15 @@ def _read_extras(path: Path, count: int) -> PlyExtras | None:
         file.seek(0)
         if has_packed_header(file):
             return None
-        table, comments = read_vertex_table(file)
-        if table.dtype.names is None or len(table) < count:
+        table = read_vertex_table(file)
+        names = [name for name in table.names if name not in model_properties(table.names)]
+        if table.count < count:
             raise InputError("it changed while it was read")
-    names = [name for name in table.dtype.names if name not in model_properties(table.dtype.names)]
-    names = [name for name in names if name not in NORMALS or table[name].any()]
-    if not names and not comments:
-        return None
-    rows: npt.NDArray[Any] = table[finite_gaussians(table)] if len(table) > count else table
-    return PlyExtras(tuple(comments), {name: np.ascontiguousarray(rows[name]) for name in names})
+        parts: dict[str, list[Numbers]] = {name: [] for name in names}
+        for block in table.blocks:
+            rows = block[finite_gaussians(block)] if table.count > count else block
+            for name, values in parts.items():
+                values.append(rows[name].copy())
+    every = {name: np.concatenate(values) for name, values in parts.items()}
+    kept = {name: values for name, values in every.items() if name not in NORMALS or values.any()}
+    return PlyExtras(tuple(table.comments), kept) if kept or table.comments else None

@@ -62,6 +62,16 @@ class Vertices:
 
 
 @dataclass
+class VertexTable:
+    """All properties of all vertices, read from the file a block of rows at a time."""
+
+    names: list[str]
+    count: int
+    blocks: Iterator[npt.NDArray[np.void]]  # structured arrays, `count` rows in total
+    comments: list[str]  # lines of the header
+
+
+@dataclass
 class _Element:
     name: str
     count: int
@@ -93,28 +103,26 @@ def read_vertices(
     return Vertices(names, vertex.count, _binary_blocks(file, byte_order, vertex, columns, dtype), dtype)
 
 
-def read_vertex_table(file: BinaryIO) -> tuple[npt.NDArray[np.void], list[str]]:
-    """All vertices as a structured array with the properties' own types, and the header's comment lines.
-
-    A binary file is mapped into memory. Raises InputError as `read_vertices` does.
-    """
+def read_vertex_table(file: BinaryIO) -> VertexTable:
+    """All vertices with the properties' own types. Raises InputError as `read_vertices` does."""
     byte_order, before, vertex, comments = _vertex_header(file)
     _check_vertices(file, byte_order, before, vertex)
-    if byte_order is not None:
+    dtype = np.dtype([(name, (byte_order or "=") + code) for name, code in vertex.properties.items()])
+    if byte_order is None:
+        rows = _ascii_blocks(file, before, vertex, list(range(len(vertex.properties))), np.float64)
+        blocks = (_typed(block, dtype) for block in rows)
+    else:
         _skip(file, before)
-        dtype = np.dtype([(name, byte_order + code) for name, code in vertex.properties.items()])
-        if not vertex.count:
-            return np.empty(0, dtype), comments
-        return np.memmap(file, dtype, "r", file.tell(), (vertex.count,)), comments
-    table = np.empty(vertex.count, np.dtype(list(vertex.properties.items())))
-    start = 0
-    every = list(range(len(vertex.properties)))
-    for block in _ascii_blocks(file, before, vertex, every, np.float64):
-        for name, values in zip(vertex.properties, block.T, strict=True):
-            with np.errstate(over="ignore", invalid="ignore"):
-                table[name][start : start + len(block)] = values
-        start += len(block)
-    return table, comments
+        blocks = (np.frombuffer(data, dtype) for data in _binary_rows(file, vertex))
+    return VertexTable(list(vertex.properties), vertex.count, blocks, comments)
+
+
+def _typed(rows: Numbers, dtype: np.dtype[np.void]) -> npt.NDArray[np.void]:
+    table = np.empty(len(rows), dtype)
+    for name, values in zip(dtype.names or (), rows.T, strict=True):
+        with np.errstate(over="ignore", invalid="ignore"):
+            table[name] = values
+    return table
 
 
 def _vertex_header(file: BinaryIO) -> tuple[str | None, list[_Element], _Element, list[str]]:
@@ -162,7 +170,7 @@ def read_tables(file: BinaryIO) -> dict[str, npt.NDArray[np.void]]:
 def ply_header(elements: Mapping[str, tuple[int, Iterable[str]]], comments: Iterable[str] = ()) -> bytes:
     """The header of a little-endian file, from each element's count and properties such as "float x".
 
-    `comments`: whole lines, as `read_vertex_table` returns them.
+    `comments`: whole lines, as in a `VertexTable`.
     """
     lines = ["ply", "format binary_little_endian 1.0", *comments]
     for name, (count, properties) in elements.items():
@@ -273,12 +281,8 @@ def _binary_blocks(
     dtype = np.dtype([(name, byte_order + code) for name, code in vertex.properties.items()])
     is_float32 = set(vertex.properties.values()) == {"f4"}
     names = [list(vertex.properties)[column] for column in columns]
-    step = max(1, _CHUNK_BYTES // max(1, vertex.stride))
-    for start in range(0, vertex.count, step):
-        count = min(step, vertex.count - start)
-        data = file.read(count * vertex.stride)
-        if len(data) != count * vertex.stride:
-            raise InputError("not a whole .ply file: it ends inside the data")
+    for data in _binary_rows(file, vertex):
+        count = len(data) // vertex.stride
         if is_float32:
             table = np.frombuffer(data, byte_order + "f4").reshape(count, -1)
             yield table.take(columns, axis=1).astype(into, copy=False)
@@ -289,6 +293,17 @@ def _binary_blocks(
             for column, name in enumerate(names):
                 rows[:, column] = table[name]
         yield rows
+
+
+def _binary_rows(file: BinaryIO, vertex: _Element) -> Iterator[bytes]:
+    """Whole rows, about _CHUNK_BYTES at a time."""
+    step = max(1, _CHUNK_BYTES // max(1, vertex.stride))
+    for start in range(0, vertex.count, step):
+        size = min(step, vertex.count - start) * vertex.stride
+        data = file.read(size)
+        if len(data) != size:
+            raise InputError("not a whole .ply file: it ends inside the data")
+        yield data
 
 
 def _ascii_blocks(
