@@ -15,7 +15,7 @@ import pytest
 from channels.quiet.trained_like import trained_like
 from files.scene_files import write_blender, write_nerfstudio
 from keyss.channels import QuietReader
-from keyss.cli import commands, entry, main
+from keyss.cli import command_table, entry, main
 from keyss.core import KeyssError
 from keyss.keys import DerivedKey
 from keyss.methods import registry
@@ -96,11 +96,11 @@ def test_nothing_that_is_written_or_said_holds_the_key(
 
 
 def test_no_command_takes_a_key_as_an_argument() -> None:
-    asked = [(name, []) for name in commands.MODULES] + [
+    asked = [(name, []) for name in command_table.MODULES] + [
         ("hide", ["--method", name, "--help"]) for name in registry.METHODS
     ]
     for name, arguments in asked:
-        options = entry.options_of(commands.parse_target(name, arguments))
+        options = entry.options_of(command_table.parse_target(name, arguments))
         keys = {name: hint for name, hint in options.items() if "key" in name}
         for name in keys.keys() - {"wrong_keys", "key_encoder"}:
             assert "Path" in str(keys[name]), name

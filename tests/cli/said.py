@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import cheap_keys
 from files.scene_files import write_blender, write_nerfstudio
-from keyss.cli import commands
+from keyss.cli import command_table
 from keyss.fitting import ImageQuality
 from keyss.measure import BaselineQuality, RenderFidelity
 from keyss.runs import HideMetrics
@@ -33,7 +33,7 @@ METRICS = HideMetrics(
     details={"capacity": 1000, "bits_per_gaussian": [568, 600]},
 )
 SMALL = ("--preset", "quick", "--iterations", "20", "--max-gaussians", "100", "--device", "cpu")
-COMMANDS = list(commands.MODULES)
+COMMANDS = list(command_table.MODULES)
 PROGRAM = [sys.executable, "-c", cheap_keys.PROGRAM]
 
 

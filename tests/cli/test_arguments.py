@@ -94,9 +94,9 @@ class TestArguments:
         assert keyss(*scenes, "--method", "keyss", "--design", "published", *clip).status == 0
         joint = hidden[0][1]["method"]
         assert (joint.design, joint.key_encoder, joint.clip_model) == ("published", "clip", "C")
-        assert keyss(*scenes, "--method", "carry", "--prune-to-fit", "--dither", "--seed", 5).status == 0
+        assert keyss(*scenes, "--refit", "never", "--sh-degree", 2, "--seed", 5).status == 0
         carry = hidden[1][1]["method"]
-        assert (carry.prune_to_fit, carry.dither, carry.fit.seed) == (True, True, 5)
+        assert (carry.refit, carry.sh_degree, carry.fit.seed) == ("never", 2, 5)
 
     @pytest.mark.parametrize(
         ("extra", "words"),

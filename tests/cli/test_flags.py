@@ -19,7 +19,7 @@ OPTIONS = {"overwrite", "sh_degree", "key_file", "secret", "publish", "secret_mo
     [
         ("`overwrite=True` replaces it", "--overwrite replaces it"),
         ('`method="keyss"` can', "--method keyss can"),
-        ('`method="carry", dither=True` has one', "--method carry --dither has one"),
+        ('`method="carry", overwrite=True` has one', "--method carry --overwrite has one"),
         ("`max_gaussians=30000` would do", "--max-gaussians 30000 would do"),
         ("`min_psnr=12.5`", "--min-psnr 12.5"),
         ("`decoy=False`", "no --decoy"),

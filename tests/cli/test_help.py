@@ -25,7 +25,7 @@ def loaded(*arguments):
         main(arguments)
     return set(sys.modules)
 
-assert not loaded("--version") & {"tyro", "rich", "keyss.cli.commands"}
+assert not loaded("--version") & {"tyro", "rich", "keyss.cli.command_table"}
 assert "keyss.cli.hide" not in loaded("keygen")
 for arguments in (["--help"], ["keygen", "--help"], ["info", "nowhere"], ["inof"]):
     assert not loaded(*arguments) & {"torch", "numpy", "keyss.methods"}, arguments

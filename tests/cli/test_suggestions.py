@@ -27,7 +27,7 @@ def test_a_misspelt_command(keyss: Run, arguments: tuple[str, ...], meant: str) 
     [
         (("reveal", "a", "--keyfile", "k", "-o", "b"), "--key-file FILE"),
         (("hide", "--cover", "a", "--seckret=b", "-o", "c"), "--secret SCENE"),
-        (("hide", "--method", "carry", "--prune-to-fitt", "-o", "c"), "--prune-to-fit"),
+        (("hide", "--method", "carry", "--min-psnrr", "-o", "c"), "--min-psnr"),
     ],
 )
 def test_a_misspelt_option(keyss: Run, arguments: tuple[str, ...], meant: str) -> None:

@@ -52,12 +52,9 @@ def test_a_bound_has_a_stage_where_one_is_fitted() -> None:
 
 def test_the_capacity_is_the_number_of_hidden_gaussians(tmp_path: Path) -> None:
     cover, secret = trained_like(2500), trained_like(6000, 2)
-    plan = keyss.hide(
-        cover, [Secret(secret, KEY)], method=CarryOptions(prune_to_fit=True), width=24, dry_run=True
-    ).plan
-    result = keyss.hide(
-        cover, [Secret(secret, KEY)], method=CarryOptions(prune_to_fit=True), width=24, min_psnr=0
-    )
+    options = CarryOptions(refit="never")
+    plan = keyss.hide(cover, [Secret(secret, KEY)], method=options, width=24, dry_run=True).plan
+    result = keyss.hide(cover, [Secret(secret, KEY)], method=options, width=24, min_psnr=0)
     assert (plan.secret_gaussians, plan.capacity) == (6000, *result.metrics.secret_gaussians)
     assert [stage.steps for stage in plan.stages] == [0] * len(plan.stages)
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import math
 import time
-import warnings
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
@@ -19,7 +18,7 @@ from keyss.api.fit import with_seed
 from keyss.api.hide_arguments import HideResult, Secret, method_for, sources_of
 from keyss.api.hide_checks import check_quality
 from keyss.channels import AnyChannel, Format, Publish
-from keyss.core.errors import KeyssWarning, UsageError
+from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene, ViewOptions
 from keyss.files.models import is_model_path, read_model, reads_as
@@ -36,7 +35,6 @@ from keyss.methods.registry import DEFAULT, open_handed, open_model
 from keyss.progress import Reporter
 from keyss.rendering import Backend, resolve_device
 from keyss.rendering.orbit import is_model
-from keyss.runs.config import FitMetrics, HideMetrics, RunConfig, secret_ids
 from keyss.runs.files import (
     CONFIG,
     METRICS,
@@ -52,8 +50,9 @@ from keyss.runs.files import (
     stego_name,
 )
 from keyss.runs.folder import RunFolder
+from keyss.runs.json_records import read_record, record_bytes
 from keyss.runs.planning import check_room, in_a_line, needs_of_hiding, plan_hiding, worth_planning
-from keyss.runs.records import read_record, record_bytes
+from keyss.runs.run_records import FitMetrics, HideMetrics, RunConfig, secret_ids
 
 
 def hide(
@@ -250,9 +249,7 @@ def _fit_models(
     if all(each.given is not None for each in sources):
         return sources, options
     fitted = fit_plain_models(sources, options.fits(len(sources)), context)
-    with warnings.catch_warnings():  # the first call has warned already
-        warnings.simplefilter("ignore", KeyssWarning)
-        return fitted, method.prepare(fitted, options)
+    return fitted, method.prepare(fitted, options)
 
 
 def _models_to_write(

@@ -22,12 +22,12 @@ from keyss.measure.hide_quality import WRONG_KEYS, compare, measure_hiding
 from keyss.measure.image_scores import renders_of
 from keyss.progress import Reporter
 from keyss.rendering import Backend, render as render_view, resolve_device
-from keyss.rendering.arguments import MAX_SIDE
 from keyss.rendering.orbit import IMAGE_SIZE, around, circle
-from keyss.runs.config import HideMetrics
+from keyss.rendering.rasterization_checks import MAX_SIDE
 from keyss.runs.files import METRICS, Background, PathLike, as_model, as_scene
 from keyss.runs.folder import RunFolder, write_again
 from keyss.runs.open_run import open_run
+from keyss.runs.run_records import HideMetrics
 
 Split = Literal["test", "train", "all"]
 FPS = 25

@@ -83,9 +83,9 @@ def fit(
     from keyss.cli.reporting import reporting
     from keyss.cli.tables import print_files, print_fit
     from keyss.fitting.config import PRESETS
-    from keyss.runs.config import FitMetrics
     from keyss.runs.files import METRICS
-    from keyss.runs.records import read_record
+    from keyss.runs.json_records import read_record
+    from keyss.runs.run_records import FitMetrics
 
     with reporting(out, scene, training) as reporter:
         keyss.fit(

@@ -169,10 +169,6 @@ class MethodOptions:
         """Options of further variants for comparisons, by name."""
         return {}
 
-    def for_fitted_cover(self) -> Self:
-        """Options for a cover that keyss fits, which may be changed to have room."""
-        return self
-
     def with_fit(self, **changes: Any) -> Self:
         """Options with changed fields of `fit`."""
         return replace(self, fit=replace(self.fit, **changes))

@@ -25,7 +25,7 @@ from keyss.core.scene import (
 from keyss.core.similarity import up_direction
 from keyss.files.models import is_model_source
 from keyss.kernels.memory import release
-from keyss.rendering.arguments import MAX_SIDE
+from keyss.rendering.rasterization_checks import MAX_SIDE
 from keyss.rendering.view import render
 
 VIEWS = 96

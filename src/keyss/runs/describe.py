@@ -15,7 +15,7 @@ from keyss.files.foreign import what_it_is
 from keyss.files.reading import is_standard
 
 if TYPE_CHECKING:
-    from keyss.runs.config import FitMetrics, HideMetrics
+    from keyss.runs.run_records import FitMetrics, HideMetrics
 
 _NAMED = 10  # runs in a message
 Corner = tuple[float, ...]  # [3] world units
@@ -74,9 +74,9 @@ def info(path: str | Path) -> RunInfo | ModelInfo | SceneInfo:
 def _folder_info(path: Path) -> RunInfo | ModelInfo | SceneInfo:
     from keyss.files.scenes import load_scene
     from keyss.files.trained import is_training, model_file
-    from keyss.runs.config import FitMetrics, HideMetrics
     from keyss.runs.files import METRICS, MODEL, is_run, stego_in
-    from keyss.runs.records import read_record
+    from keyss.runs.json_records import read_record
+    from keyss.runs.run_records import FitMetrics, HideMetrics
 
     if stego_in(path).exists():
         return RunInfo("hiding", str(path), read_record(path / METRICS, HideMetrics))

@@ -14,7 +14,6 @@ from keyss.methods import registry
 from keyss.methods.base import MethodOptions
 from keyss.methods.opened import Opened
 from keyss.rendering.orbit import is_model
-from keyss.runs.config import HideMetrics, RunConfig, read_config, secret_ids
 from keyss.runs.files import (
     CONFIG,
     METRICS,
@@ -26,8 +25,9 @@ from keyss.runs.files import (
     run_folder,
     stego_in,
 )
-from keyss.runs.records import read_record
+from keyss.runs.json_records import read_record
 from keyss.runs.revealing import read_handed
+from keyss.runs.run_records import HideMetrics, RunConfig, read_config, secret_ids
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from keyss.core import InputError
 from keyss.files.atomic import write_bytes
 from keyss.lab.many import cell, cell_folder
 from keyss.progress import Reporter
-from keyss.runs.records import record_bytes
+from keyss.runs.json_records import record_bytes
 
 
 def fake_run(job: cell.Cell, folder: Path, reporter: Reporter) -> cell.Result:

@@ -146,7 +146,7 @@ def test_a_cell_runs_again_when_its_files_options_or_result_changed(tmp_path: Pa
     os.utime(tmp_path / "a.ply", (written + 5, written + 5))
     assert skipped(run(spec, out)) == [False, False]
     os.utime(tmp_path / "a.ply", (written - 5, written - 5))
-    spec.write_text(spec.read_text().replace("publish: any", "publish: any, prune_to_fit: true"))
+    spec.write_text(spec.read_text().replace("publish: any", "publish: any, refit: never"))
     assert skipped(run(spec, out)) == [False, False]
     assert skipped(run(spec, out)) == [True, True]
     assert len(list((out / "cells").iterdir())) == 4

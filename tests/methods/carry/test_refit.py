@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +12,7 @@ import keyss
 from channels.quiet.trained_like import trained_like
 from keyss import CarryOptions, FitConfig, Secret
 from keyss.channels import identities
-from keyss.core import Gaussians, KeyssWarning, Scene, UsageError
+from keyss.core import Gaussians, KeyssWarning, Scene
 from keyss.methods import Source, Training, most_contributing, registry
 from methods.hiding import check_resumes, hide_scenes, psnr_in, three_scenes
 from tiny_scenes import random_gaussians, tiny_scene
@@ -66,20 +65,13 @@ def test_refits_that_are_asked_for_or_ruled_out() -> None:
     always, never = CarryOptions(refit="always"), CarryOptions(refit="never")
     assert _prepared(always, _given(cover), _given(secret)).refits == (400,)
     assert _prepared(never, _given(cover), _given(secret)).refits == (0,)
-    with pytest.raises(UsageError, match=r"room for .*`prune_to_fit=True`"):
-        _prepared(never, _given(cover), _given(large))
-    for pruning in (CarryOptions(prune_to_fit=True), replace(never, prune_to_fit=True)):
-        assert _prepared(pruning, _given(cover), _given(large)).refits == (0,)
-    with pytest.raises(UsageError, match="prune_to_fit"):
-        replace(always, prune_to_fit=True)
+    assert _prepared(never, _given(cover), _given(large)).refits == (0,)
 
 
 @pytest.mark.parametrize(("format", "secrets"), [("ply", 3), ("spz", 1)])
 def test_where_room_is_short_secrets_are_refitted(format: str, secrets: int) -> None:
     options = CarryOptions(fit=FIT, format=format)  # type: ignore[arg-type]
-    warned = pytest.warns(KeyssWarning, match="other secrets") if secrets > 1 else nullcontext()
-    with warned:
-        found = _prepared(options, *[PHOTOS] * (1 + secrets))
+    found = _prepared(options, *[PHOTOS] * (1 + secrets))
     assert found.refits == (1150,) * secrets
     assert [each.iterations for each in found.fits(1 + secrets)] == [1000] * (1 + secrets)
     assert found.training(1 + secrets) == (Training(), *[Training(1150)] * secrets)

@@ -50,8 +50,8 @@ from keyss.measure.image_scores import compare_images, masks_of, photos_of, rend
 from keyss.progress import Reporter
 from keyss.runs.files import CONTROLS, as_model, stego_in
 from keyss.runs.folder import RunFolder
+from keyss.runs.json_records import write_record
 from keyss.runs.open_run import HidingRun
-from keyss.runs.records import write_record
 
 T = TypeVar("T")
 PICTURED_VIEWS = 3

@@ -19,7 +19,7 @@ from keyss.measure.hide_quality import WrongKeys
 from keyss.measure.image_scores import ImageComparison
 from keyss.runs.files import run_folder
 from keyss.runs.folder import PRIVATE
-from keyss.runs.records import read_record
+from keyss.runs.json_records import read_record
 
 AUDIT_FOLDER, AUDIT_FILE = f"{PRIVATE}/audit", "audit.json"  # folder relative to the run
 PICTURES = "pictures"  # folder relative to the audit's

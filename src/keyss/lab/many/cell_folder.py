@@ -116,8 +116,6 @@ class CellFolder:
         Raises BackendError if packages for the measures are not installed.
         """
         check_extras(measures)
-        if models[0] is not None:  # a plain fit of the same folder
-            options = options.for_fitted_cover()
         cell = Cell(
             name=name,
             cover=sources[0],

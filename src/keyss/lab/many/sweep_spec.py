@@ -7,7 +7,7 @@ A specification is a YAML file with pairs, methods, options and seeds:
         secrets: [scenes/fox]
     methods:
       - method: carry
-        options: {prune_to_fit: true}
+        options: {refit: never}
       - method: keyss
         preset: quick
         grid: {design: [published, latent], fit.iterations: [500, 1000]}

@@ -69,7 +69,7 @@ def embed_models(
     stego = cover.embed(list(zip(keys, contents, strict=True)), entropy=entropy)
     del contents  # as large as the secrets
     opened = [unpack(open_content(stego, key)) for key in keys]
-    if [len(each.gaussians) for each in opened] != list(map(len, models)):
+    if [each.left for each in opened] != list(map(len, models)):
         raise RuntimeError("the embedded secrets do not open again as they should")
     details["bits_per_gaussian"] = [each.bits for each in opened]
     return Stego(stego, tuple(opened), details=details, verified=True)

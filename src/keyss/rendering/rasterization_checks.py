@@ -8,7 +8,7 @@ from typing import Any
 from torch import Tensor
 
 from keyss.core import UsageError
-from keyss.rendering.cpu.layout import CHANNEL_MAX, EPS2D_MIN
+from keyss.rendering.cpu.constants import CHANNEL_MAX, EPS2D_MIN
 
 MAX_SIDE = 2**16  # pixels
 MAX_CHANNELS = 32

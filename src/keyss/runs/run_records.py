@@ -17,7 +17,7 @@ from keyss.measure.hide_quality import HidingQuality, RenderFidelity
 from keyss.methods import registry
 from keyss.methods.base import MethodOptions
 from keyss.methods.opened import Opened
-from keyss.runs.records import read_record
+from keyss.runs.json_records import read_record
 
 OptionsT = TypeVar("OptionsT", bound=MethodOptions)
 
