@@ -43,8 +43,8 @@ def reveal(
     are valid; "cover" leaves it where it was hidden, unless it was carried. If Gaussians were lost, the
     others are enlarged to compensate (`keyss.core.gaussians`). `force` is for quantised or pruned models: it
     skips the check that a decoder belongs to the model, and accepts any loss. `handed`: the file handed over
-    for this secret, for methods that need one (`keyss.methods.handed`). Some of those have no keys, and some
-    give a model that a network decodes (`keyss.core.picture_network`), which is no 3DGS model.
+    for this secret, for methods without keys (`keyss.methods.handed`). Some give a model that a network
+    decodes (`keyss.core.picture_network`), which is no 3DGS model.
 
     `out` (a file) gets the secret: a scene for the suffix of a model (.ply, .spz, ...), else a file. Raises
     WrongKeyError for a key that opens nothing (`decoy` reveals the cover instead, see `keyss.methods.decoy`),

@@ -18,9 +18,7 @@ from keyss.core.errors import BackendError, KeyssError
 EXTRAS = {
     "audit": ("scikit-learn", "keyss audit, compare and reproduce"),
     "clip": ("transformers", "the paper's key encoder"),
-    "reproduce": ("pooch", "downloading the paper's scenes"),
     "sweep": ("ray", "sweeps and batches on a cluster"),
-    "tensorboard": ("tensorboard", "losses during training"),
     "video": ("av", "keyss render --video"),
 }
 LIBRARIES = ("torch", "gsplat", "numba", "numpy", "opencv-python-headless", "cryptography", "argon2-cffi")

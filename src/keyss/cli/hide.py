@@ -186,7 +186,7 @@ def _hide_scenes(args: HideArguments, cover: Path) -> None:
         print_plan(plan)
         _warn_of_idle(idle, sum(stage.steps for stage in plan.stages))
         return
-    with reporting(args.out, cover, args.training) as reporter:
+    with reporting(cover, args.training.live) as reporter:
         result = keyss.hide(
             cover,
             secrets,
@@ -214,10 +214,9 @@ def _hide_scenes(args: HideArguments, cover: Path) -> None:
     if not method.capabilities.keys:
         print(f"The method {method.name} has no keys: whoever has both files can see the secret.")
         return
-    files = "both files" if method.capabilities.hands_over else "the file"
     print(
         "Send the key over another channel, and keep a copy: without it the secret is lost. Whoever has "
-        f"{files} and the key runs `keyss reveal`; `keyss info {args.out}` prints all measurements."
+        f"the file and the key runs `keyss reveal`; `keyss info {args.out}` prints all measurements."
     )
 
 

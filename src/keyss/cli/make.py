@@ -87,7 +87,7 @@ def fit(
     from keyss.runs.json_records import read_record
     from keyss.runs.run_records import FitMetrics
 
-    with reporting(out, scene, training) as reporter:
+    with reporting(scene, training.live) as reporter:
         keyss.fit(
             scene,
             config=replace(PRESETS[preset], **training.schedule()),

@@ -127,6 +127,17 @@ def read_model(path: Path | str) -> Gaussians:
         return _read(file, path.name)
 
 
+def reads_as(path: Path, model: Gaussians) -> bool:
+    """True if `read_model` gives `model`, to the bit, for a .ply; takes no memory for a second model.
+
+    Raises InputError as `read_model` does.
+    """
+    if type(model) is not Gaussians or not keeps_low_bits(path):
+        return False
+    with open_input(path) as file:
+        return ply.holds(file, model)
+
+
 def model_of_bytes(path: Path | str, data: bytes) -> Gaussians:
     """The model that `read_model` would read if the file at `path` contained `data`."""
     try:

@@ -46,6 +46,18 @@ def read(file: BinaryIO) -> Gaussians:
     return Gaussians(*(torch.from_numpy(each[:start]) for each in arrays))
 
 
+def holds(file: BinaryIO, model: Gaussians) -> bool:
+    """True if `read` gives `model`, to the bit; takes no memory for a second model. Raises InputError."""
+    flat, start = model.detach().to("cpu"), 0
+    for rows, _ in read_rows(file).blocks:
+        own = np.delete(_rows(flat[start : start + len(rows)]), slice(3, 6), axis=1)  # normals
+        if own.shape != rows.shape or (own.view(np.uint32) != rows.view(np.uint32)).any():
+            return False
+        start += len(rows)
+    check_not_activated(*(each.numpy() for each in (flat.means, flat.log_scales, flat.opacity_logits)))
+    return start == len(flat)
+
+
 def write(model: Gaussians, file: BinaryIO) -> None:
     """Write a model as little-endian float32.
 

@@ -158,6 +158,7 @@ class CarryMethod:
             room.prune(models, viewpoints),
             viewpoints=viewpoints,
             entropy=context.entropy,
+            overwrite=context.overwrites_cover,
         )
         return replace(stego, iterations=max(options.refits), details={**details, **stego.details})
 

@@ -222,7 +222,7 @@ def to_degree(model: Gaussians, sh_degree: int, entropy: bytes) -> Gaussians:
     """
     count = (sh_degree + 1) ** 2 - model.sh.shape[1]
     if count <= 0:
-        return model.with_sh_degree(sh_degree)
+        return model.with_sh_degree(sh_degree) if count else model  # the same object was prepared before
     seed = int.from_bytes(expand(entropy, "carry/raised", 8), "little") >> 1
     generator = torch.Generator().manual_seed(seed)
     # Scale before rounding: products in single precision keep a trace of their factor.
