@@ -1,4 +1,4 @@
-"""Whether there is room in low bits is known before anything is trained."""
+"""Room in low bits is checked before training."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def _unit(model: Gaussians) -> Gaussians:
 def test_cover_without_harmonics(
     change: Callable[[Gaussians], Gaussians],
 ) -> None:
-    """What is promised before training holds when it is embedded into."""
+    """Hiding with the degree that the error names has the planned capacity."""
     cover, secret = change(trained_like(4000, sh_degree=0)), trained_like(9000, 1, 2)
     with pytest.raises(UsageError, match=r"degree 0 .*no room.*`publish=.any.`") as refusal:
         _prepare(CarryOptions(format="ply"), cover, secret)
@@ -43,7 +43,7 @@ def test_cover_without_harmonics(
     options = _prepare(CarryOptions(sh_degree=degree, refit="never"), cover, secret)
     sources = [Source(each, False, KEY, scene_of_model(each, "m", size=24)) for each in (cover, secret)]
     planned = registry.get("carry").plan(sources, options)
-    context = Context(torch.device("cpu"), entropy=bytes(32))  # as of the plan
+    context = Context(torch.device("cpu"), entropy=bytes(32))
     stego = registry.get("carry").hide(sources[0], sources[1:], options, context)
     (opened,) = stego.opened
     assert stego.gaussians.sh_degree == planned.sh_degree == degree
@@ -53,7 +53,7 @@ def test_cover_without_harmonics(
 
 
 def test_predictable_cover_is_refused() -> None:
-    """Round Gaussians of one colour: equal numbers, in which anything would be seen."""
+    """Round grey Gaussians: training leaves equal numbers, whose changes are visible."""
     model = trained_like(4000)
     grey = Gaussians(
         model.means,

@@ -1,4 +1,4 @@
-"""A known answer: what `tests/vectors` carries comes out the same ever after, and for its key only."""
+"""The frozen model in `tests/vectors`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Models in low bits, opened again from what was written."""
+"""Embedded records are verified."""
 
 from __future__ import annotations
 
