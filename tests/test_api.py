@@ -46,12 +46,12 @@ def write_nerfstudio(folder: Path, scene: Scene) -> Path:
     return folder
 
 
-def psnr_of_pictures(model: Path, scene: Path) -> float:
-    """Mean over the test views of a scene."""
-    pictures = dict(keyss.render(model, scene))
+def psnr_of_pictures(model: Path, scene: Path, width: int | None = None) -> float:
+    """Mean over the test views of a scene, independent of keyss's measures."""
+    pictures = dict(keyss.render(model, scene, width=width))
     errors = [
         (pictures[view.camera.name.replace("/", "_")].float() - view.image.float()).square().mean() / 255**2
-        for view in keyss.load_scene(scene).test
+        for view in keyss.load_scene(scene, width=width).test
     ]
     return float(-10 * torch.stack(errors).log10().mean())
 

@@ -2,16 +2,27 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
 
 from channels.quiet.trained_like import keys, trained_like
-from keyss.channels import LOW_BITS, QuietReader, identities, read_low_bits, salt_rows, usable_carriers
+from keyss.channels import (
+    LOW_BITS,
+    LowBitsCover,
+    QuietReader,
+    identities,
+    read_low_bits,
+    salt_rows,
+    usable_carriers,
+)
 from keyss.channels.quiet.parameters import key_cipher
 from keyss.core import Gaussians, UsageError, WrongKeyError
 from keyss.keys import DerivedKey
-from keyss.methods import record_request
+from keyss.methods import embed_models, record_request
 from methods.carry.carried import embed, embed_derived, extract, extract_derived
 
 KEY = "the right key"
@@ -151,3 +162,17 @@ def test_foreign_gaussians_do_not_block_salts(stego: Gaussians, secret: Gaussian
     assert not set(own) & set(QuietReader.of(crowded).salts[:3])
     assert rows_of(extract(crowded, KEY).gaussians) == rows_of(extract(stego, KEY).gaussians)
     assert len(extract(crowded, KEY).gaussians) == len(secret)
+
+
+def test_damaged_records_are_detected(monkeypatch: pytest.MonkeyPatch) -> None:
+    embed = LowBitsCover.embed
+
+    def broken(*arguments: Any, **options: Any) -> Gaussians:
+        found = embed(*arguments, **options)
+        sh = found.sh.clone()
+        sh[::5, 5].view(torch.int32).bitwise_xor_(8)
+        return replace(found, sh=sh)
+
+    monkeypatch.setattr(LowBitsCover, "embed", broken)
+    with pytest.raises(RuntimeError, match="do not open again"):
+        embed_models(LOW_BITS.prepare(trained_like(6000, 0)), [KEY], [trained_like(2000, 1)])
