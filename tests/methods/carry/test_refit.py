@@ -49,7 +49,7 @@ def test_refit_steps() -> None:
     options = CarryOptions(fit=FIT)
     assert _prepare(options, _source(cover), _source(large)).refits == (400,)
     assert _prepare(options, _source(cover), _source(large, photos=True)).refits == (1150,)
-    with pytest.warns(KeyssWarning, match="other secrets"):
+    with pytest.warns(KeyssWarning, match="can notice that there are other secrets"):
         assert _prepare(options, _source(cover), _source(small), _source(large)).refits == (0, 400)
     asked = options.with_fit(iterations=900)
     assert _prepare(asked, _source(cover), _source(large)).refits == (900,)
