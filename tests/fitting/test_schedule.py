@@ -1,4 +1,4 @@
-"""Rates of 3DGS in long runs, larger ones in short runs, and positions that move in units of pixels."""
+"""Learning rates: those of 3DGS in long runs, larger ones in short runs."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ EXTENT = 4.0
 
 
 def _cameras(zoom: float = 1.15) -> list[Camera]:
-    """At (0, 0, -1) and (0, 0, -5); `zoom` is the focal length for a picture of area 1."""
+    """Cameras at (0, 0, -1) and (0, 0, -5); `zoom` is the focal length for an image of unit area."""
     K = torch.tensor([[20 * zoom, 0, 10], [0, 20 * zoom, 20], [0, 0, 1]])
     poses = [torch.eye(4), torch.eye(4)]
     for pose, z in zip(poses, (1.0, 5.0), strict=True):
