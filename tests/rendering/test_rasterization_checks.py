@@ -89,12 +89,12 @@ def test_sh_degree_needs_its_coefficients() -> None:
         ("viewmats_rs", torch.eye(4)[None]),
     ],
 )
-def test_what_is_not_supported_is_named(name: str, value: object) -> None:
+def test_unsupported_arguments(name: str, value: object) -> None:
     with pytest.raises(UsageError, match=f"^{name}:"):
         rasterization(**{**good_arguments(), name: value})
 
 
-def test_every_argument_of_gsplat_is_supported_ignored_or_refused() -> None:
+def test_signature_matches_gsplat() -> None:
     """Fails when a release of gsplat has a new argument."""
     theirs = inspect.signature(gsplat.rasterization).parameters
     ours = {
@@ -123,14 +123,14 @@ def test_every_argument_of_gsplat_is_supported_ignored_or_refused() -> None:
         {"sparse_grad": False, "distributed": False, "camera_model": "pinhole", "covars": None},
     ],
 )
-def test_options_of_gsplat_that_only_say_how_it_computes_change_nothing(options: dict[str, Any]) -> None:
+def test_performance_options_change_nothing(options: dict[str, Any]) -> None:
     scene = random_scene()
     expected = scene.results()
     for name, tensor in scene.results(**options).items():
         assert torch.equal(tensor, expected[name]), name
 
 
-def test_mixed_devices_and_unknown_devices() -> None:
+def test_devices() -> None:
     with pytest.raises(ValueError, match="quats: is on meta"):
         rasterization(**{**good_arguments(), "quats": torch.ones(2, 4, device="meta")})
     everything = {

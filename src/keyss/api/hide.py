@@ -287,8 +287,8 @@ def _write_and_read(
     stego: Stego, published: Gaussians, keys: Sequence[str], folder: RunFolder | None
 ) -> list[Gaussians]:
     """Write the files to give away, `published` among them, and read the stego model and the secrets back."""
-    model, same, given = stego.gaussians, type(stego.gaussians) is Gaussians, bool(stego.handed)
-    packed = [pack(payload, key or None) for payload, key in zip(stego.handed, keys, strict=given)]
+    model, same = stego.gaussians, type(stego.gaussians) is Gaussians
+    packed = [pack(payload) for payload in stego.handed]
     if folder:
         handed = dict(zip(handed_names(len(packed)), packed, strict=True))
         name = stego_name(model)
@@ -297,7 +297,7 @@ def _write_and_read(
         model = model if same else read_model(path)
     opened: Sequence[Opened]
     if packed:
-        opened = [open_handed(data, key or None) for data, key in zip(packed, keys, strict=True)]
+        opened = [open_handed(data) for data in packed]
     elif stego.verified and same:
         opened = stego.opened  # opening the same bits again would change nothing
     else:

@@ -19,7 +19,7 @@ from keyss.core.scene import Camera, Scene, View, ViewOptions, checked_backgroun
 from keyss.files.atomic import check_not_an_input, check_output_file
 from keyss.files.images import check_video, png_bytes, write_video
 from keyss.measure.hide_quality import WRONG_KEYS, compare, measure_hiding
-from keyss.measure.image_scores import renders_of
+from keyss.measure.renders import renders_of
 from keyss.progress import Reporter
 from keyss.rendering import Backend, render as render_view, resolve_device
 from keyss.rendering.orbit import IMAGE_SIZE, around, circle

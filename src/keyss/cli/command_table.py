@@ -19,8 +19,8 @@ GROUPS = {
     },
     "open": {"reveal": "cli.reveal", "verify": "cli.reveal"},
     "look": {"view": "cli.show", "render": "cli.show", "info": "cli.show"},
-    "measure": {"evaluate": "cli.show", "audit": "lab.commands"},
-    "many": dict.fromkeys(("compare", "reproduce", "sweep"), "lab.commands"),
+    "measure": {"evaluate": "cli.show", "audit": "lab.lab_commands"},
+    "many": dict.fromkeys(("compare", "reproduce", "sweep"), "lab.lab_commands"),
     "check": {"doctor": "cli.doctor"},
 }
 MODULES = {name: module for group in GROUPS.values() for name, module in group.items()}

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene, View
-from keyss.files.images import shrink
+from keyss.files.images import downscale
 from keyss.fitting.checkpoint import State, pack_model, unpack_model
 from keyss.fitting.config import FitConfig
 from keyss.fitting.density import CappedStrategy, Rendered
@@ -125,9 +125,9 @@ def _target(view: View, size: tuple[int, int], device: torch.device) -> Target:
     """The target of a photo, shrunk to `size` (width, height) if it is larger."""
     image, mask = view.image, view.mask
     if size != (view.camera.width, view.camera.height):
-        image = torch.from_numpy(shrink(image.numpy(), *size))
+        image = torch.from_numpy(downscale(image.numpy(), *size))
         if mask is not None:
-            shares = shrink(np.uint8(255) * mask.numpy(), *size)
+            shares = downscale(np.uint8(255) * mask.numpy(), *size)
             mask = torch.from_numpy(shares >= min(128, shares.max()))  # which leaves some pixels
     return Target.of(image.to(device), mask)
 

@@ -87,8 +87,7 @@ class Stego:
 class Capabilities:
     """The capabilities of a method."""
 
-    keys: bool = True  # a key opens each secret; else whoever has the handed-over file sees it
-    hands_over: bool = False  # each secret has a file beside the published model
+    keys: bool = True  # a key opens each secret; else a file that is handed over beside the model shows it
     standard: bool = True  # the published model is a 3DGS model, which every viewer renders
     models: bool = True  # revealed secrets are 3DGS models; else a network renders their images
 

@@ -13,7 +13,7 @@ import msgspec
 
 from keyss.core.errors import InputError
 from keyss.files.atomic import write_bytes
-from keyss.files.reading import read_file
+from keyss.files.inputs import read_file
 
 MAX_BYTES = 16 * 2**20
 

@@ -38,7 +38,7 @@ def test_hide_reveal_verify_and_info(format: str, tmp_path: Path) -> None:
 
 
 @EVERY
-def test_too_large_secrets_are_pruned(format: str) -> None:
+def test_large_secrets_are_pruned(format: str) -> None:
     cover, asked = model_of(2500), [keyss.Secret(model_of(1500, 1), "key one")]
     pruning = CarryOptions(format=format, refit="never")  # type: ignore[arg-type]
     hidden = keyss.hide(cover, asked, method=pruning, width=32, min_psnr=0)
@@ -46,7 +46,7 @@ def test_too_large_secrets_are_pruned(format: str) -> None:
 
 
 @EVERY
-def test_a_published_file_as_cover_is_taken_as_it_is(format: str, tmp_path: Path) -> None:
+def test_quantised_cover_keeps_its_codes(format: str, tmp_path: Path) -> None:
     path = tmp_path / f"cover{SUFFIXES[format]}"
     write_model(path, model_of(3000))
     model = read_model(path)

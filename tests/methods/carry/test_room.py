@@ -28,7 +28,7 @@ def _unit(model: Gaussians) -> Gaussians:
 
 
 @pytest.mark.parametrize("change", [lambda model: model, _unit])
-def test_a_cover_without_harmonics_gets_the_degree_that_its_refusal_names(
+def test_cover_without_harmonics(
     change: Callable[[Gaussians], Gaussians],
 ) -> None:
     """What is promised before training holds when it is embedded into."""
@@ -52,7 +52,7 @@ def test_a_cover_without_harmonics_gets_the_degree_that_its_refusal_names(
     assert _prepare(CarryOptions(publish="any"), cover, secret).fit.sh_degree == 0
 
 
-def test_what_training_will_not_make_random_is_refused() -> None:
+def test_predictable_cover_is_refused() -> None:
     """Round Gaussians of one colour: equal numbers, in which anything would be seen."""
     model = trained_like(4000)
     grey = Gaussians(
@@ -70,7 +70,7 @@ def test_what_training_will_not_make_random_is_refused() -> None:
     _prepare(CarryOptions(publish="any"), grey, grey)
 
 
-def test_the_cover_keeps_all_but_low_bits() -> None:
+def test_only_low_bits_change() -> None:
     cover, secret = trained_like(2000), trained_like(900, 1)
     result = keyss.hide(cover, [Secret(secret, KEY)], width=24, min_psnr=0)
     assert len(keyss.reveal(result.stego, KEY).gaussians) == len(secret)
@@ -81,7 +81,7 @@ def test_the_cover_keeps_all_but_low_bits() -> None:
         assert int((ours ^ theirs).min()) >= 0  # neither sign nor exponent
 
 
-def test_secrets_that_get_less_because_of_others_are_warned_of() -> None:
+def test_crowding_warning() -> None:
     cover, large, small = trained_like(4000), trained_like(8000, 1), trained_like(900, 2)
     with pytest.warns(KeyssWarning, match="can notice that there are other secrets"):
         _prepare(CarryOptions(), cover, large, small)

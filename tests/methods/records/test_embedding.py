@@ -14,7 +14,7 @@ from keyss.core import Gaussians, same_bits
 from keyss.methods.records.embedding import embed_models
 
 
-def test_records_that_were_written_wrongly_are_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_damaged_records_are_detected(monkeypatch: pytest.MonkeyPatch) -> None:
     embed = LowBitsCover.embed
 
     def broken(*arguments: Any, **options: Any) -> Gaussians:
@@ -30,7 +30,7 @@ def test_records_that_were_written_wrongly_are_noticed(monkeypatch: pytest.Monke
         )
 
 
-def test_overwriting_the_cover_gives_the_same_model_in_its_memory() -> None:
+def test_overwritten_cover() -> None:
     cover, keys, secrets = trained_like(3000, 0), ["7Vw3-Qp of the first"], [trained_like(900, 1)]
     before = cover.map(torch.clone)
     stego = embed_models(LOW_BITS.prepare(cover), keys, secrets, entropy=bytes(32)).gaussians
