@@ -19,6 +19,7 @@ from keyss.fitting import (
     photometric_loss,
     save_checkpoint,
 )
+from keyss.fitting.schedule import shrinking
 from keyss.progress import Reporter
 from keyss.rendering import render_with_meta
 from tiny_scenes import tiny_scene
@@ -72,6 +73,28 @@ def test_masked_pixels_are_ignored() -> None:
     assert same_bits(with_masks, same)
     good, bad = (mean_psnr(model, scene.test, scene.background) for model in (with_masks, without))
     assert good > bad + 2
+
+
+def test_large_photos_are_shrunk() -> None:
+    """The loss of the first step follows from the means of blocks of pixels."""
+    scene, config = tiny_scene(), replace(CONFIG, iterations=20)
+    generator = torch.Generator().manual_seed(3)
+    view = scene.train[0]
+    width, height = 600, 400
+    factor = shrinking(config, 1, width * height)
+    assert factor == 2
+    image = torch.randint(0, 256, (height, width, 3), generator=generator, dtype=torch.uint8)
+    mask = torch.rand(height // factor, width // factor, generator=generator) < 0.7
+    whole = mask.repeat_interleave(factor, 0).repeat_interleave(factor, 1)
+    large = replace(view, image=image, camera=view.camera.resized(width, height), mask=whole)
+    run = PlainRun(replace(scene, train=(large,)), config, torch.device("cpu"))
+    means = image.float().reshape(height // factor, factor, width // factor, factor, 3).mean((1, 3))
+    target = Target.of(means.round() / 255, mask)
+    small = view.camera.resized(width // factor, height // factor)
+    shown, _ = render_with_meta(run.gaussians(), small, scene.background, sh_degree=0)
+    expected = float(photometric_loss(shown, target, config.ssim_weight))
+    run.step()
+    assert float(run.loss) == pytest.approx(expected, rel=1e-3)  # halves are rounded up or down
 
 
 def test_loss_is_mean_over_views() -> None:
