@@ -111,4 +111,4 @@ def test_misspelt_command(keyss: Run, arguments: tuple[str, ...], expected: str)
 def test_misspelt_option(keyss: Run, arguments: tuple[str, ...], expected: str) -> None:
     result = keyss(*arguments)
     assert (result.status, result.out) == (2, "")
-    assert expected in result.err.partition("Perhaps you expected")[2]
+    assert expected in result.err.partition("Perhaps you meant")[2]
