@@ -1,4 +1,4 @@
-"""Tables of integers as few bytes."""
+"""Entropy coding of integer tables."""
 
 from __future__ import annotations
 
