@@ -139,7 +139,7 @@ def _command(step: str, folder: Path, options: argparse.Namespace) -> list[str]:
     if step == "hide":
         models = ["--cover", str(folder / "cover.ply"), "--secret", str(folder / "secret.ply")]
         published = ["--publish", "any"] if options.format == "any" else ["--format", options.format]
-        carry = ["--method", "carry", *published, *["--prune-to-fit"][: options.prune]]
+        carry = ["--method", "carry", *published, *["--refit=never"][: options.prune]]
         return [*run, *carry, *models, *key, "-o", f"{folder}/run"]
     suffix = "ply" if options.format == "any" else options.format.replace("-", ".")
     return [*run, f"{folder}/run/publish/model.{suffix}", *key, "-o", f"{folder}/revealed.ply"]

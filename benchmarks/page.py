@@ -32,7 +32,7 @@ from playwright.sync_api import sync_playwright
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
-from viewer.browser import PANEL, PROGRAM, SWITCHES, Visit, made, visit
+from viewer.browser import PANEL, PROGRAM, SWITCHES, Visit, bright_model, visit
 
 WIDTH, HEIGHT = 800, 600
 KEY = "correct horse battery staple 99"
@@ -58,7 +58,7 @@ def sized_model(count: int, seed: int) -> Gaussians:
 
     In standard deviations of the positions: a median of 0.004 to 0.01, and 10 % above 0.04 to 0.06.
     """
-    model = made(count, seed)
+    model = bright_model(count, seed)
     generator = torch.Generator().manual_seed(seed)
     normal = torch.randn(count, 3, generator=generator, dtype=torch.float64)  # random in all bits
     return replace(model, log_scales=(math.log(0.006 * float(model.means.std())) + 1.5 * normal).float())
@@ -92,7 +92,7 @@ def key_times(pairs: list[str], runs: int) -> None:
         for number, pair in enumerate(pairs):
             folder = Path(name) / str(number)
             cover, secret = pair.split(":")
-            method = CarryOptions(prune_to_fit=True, dither=True)
+            method = CarryOptions(refit="never")
             keyss.hide(
                 cover, [keyss.Secret(secret, KEY)], method=method, width=32, min_psnr=0, out=folder / "run"
             )

@@ -1,10 +1,9 @@
-"""Argon2id at almost no cost, for all tests but those marked `argon2`.
+"""Cheap Argon2id for all tests except those marked `argon2`.
 
-At its cost a key takes 0.1 s of two cores, sixteen times as long in low bits, and most of the time of the
-tests would be spent there. What a key becomes is as sensitive to all that goes in, costs included, so that
-nothing opens here what would not open what it does at full cost; what is expected of the real costs (vectors,
-files of before, other implementations) is marked. A fixture that several tests share is made at the cost of
-the first of them: a marked test makes what it opens itself.
+At full cost a key takes 0.1 s on two cores, and one attempt on low bits takes 16 keys. The cheap hash still
+depends on the key, the salt and the requested costs. Tests that need the real hash (vectors, frozen files,
+other implementations) are marked. Shared fixtures use the cost of the first test that requests them, so a
+marked test creates its own inputs.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ _cheap = True
 def hash_secret_raw(
     secret: bytes, salt: bytes, *, time_cost: int, memory_cost: int, parallelism: int, **rest: Any
 ) -> bytes:
-    """Argon2id as it is asked for, or of 8 KiB and a salt that depends on what was asked for."""
+    """Argon2id, or a hash of 8 KiB whose salt depends on the requested costs."""
     if _cheap:
         salt = hashlib.sha256(salt + repr((time_cost, memory_cost, parallelism)).encode()).digest()
         time_cost, memory_cost, parallelism = 1, 8, 1
@@ -37,13 +36,13 @@ def pytest_sessionstart() -> None:
     derivation.hash_secret_raw = hash_secret_raw
 
 
-def choose_costs(item: pytest.Item) -> None:
-    """For the test and its fixtures from now on."""
+def set_key_cost(item: pytest.Item) -> None:
+    """Set the cost for a test and its fixtures."""
     global _cheap
     _cheap = item.get_closest_marker("argon2") is None
 
 
-# A process of `keyss` in which keys are as cheap as they are in tests: `python -c PROGRAM ARGUMENTS`.
+# `python -c PROGRAM ARGUMENTS` runs keyss with cheap keys.
 PROGRAM = f"""
 import sys
 sys.path.append({str(__file__).rpartition("/")[0]!r})

@@ -1,4 +1,4 @@
-"""Fixtures that every test may use."""
+"""Shared fixtures and hooks."""
 
 from __future__ import annotations
 
@@ -13,38 +13,37 @@ import pytest
 from hypothesis import settings
 
 import keyss  # noqa: F401  before any test module imports torch: see keyss._threads
-import uncompiled  # noqa: F401  before any test module imports gsply
-from cheap_keys import choose_costs, pytest_sessionstart  # noqa: F401  hook
-from same_draws import begin_draws, draw_the_same, pytest_fixture_setup  # noqa: F401  hook
+import uncompiled_gsply  # noqa: F401  before any test module imports gsply
+from cheap_keys import pytest_sessionstart, set_key_cost  # noqa: F401  hook
+from seeding import patch_random_sources, pytest_fixture_setup, seed_test  # noqa: F401  hook
 from skip_policy import pytest_make_collect_report, pytest_runtest_makereport  # noqa: F401  hooks
 
 if TYPE_CHECKING:
     import torch
 
-    from cli.said import Run
+    from cli.harness import Run
 
-# What hypothesis makes up is the same in every run of CI, so that a failure comes with the change that made
-# it; on other machines it goes on searching. How long an example takes depends on what else a machine does.
+# CI repeats the same examples, so that only a change can break it. No deadline: machines are shared.
 settings.register_profile("tests", derandomize="CI" in os.environ, deadline=None)
 settings.load_profile("tests")
 if "CI" in os.environ:
-    draw_the_same()
+    patch_random_sources()
 
-# A script that runs the tests in its background has them ignore Ctrl-C, which many of them send.
+# Background jobs of a shell ignore SIGINT, which many tests send.
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup(item: pytest.Item) -> None:
-    """Before fixtures of any scope: those that are shared must not be mixed."""
-    begin_draws(item)
-    choose_costs(item)
+    """Runs before fixtures of any scope are set up."""
+    seed_test(item)
+    set_key_cost(item)
 
 
 @pytest.fixture
 def umask() -> Iterator[None]:
-    """The usual umask, under which new files are readable by everybody; a test may set another."""
+    """Umask 022, restored afterwards."""
     before = os.umask(0o022)
     yield
     os.umask(before)
@@ -52,8 +51,8 @@ def umask() -> Iterator[None]:
 
 @pytest.fixture(name="keyss")
 def _keyss(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Run:
-    """Runs the command line in this process, without a key in the environment and without a terminal."""
-    from cli.said import Said
+    """Run the command line in this process, without KEYSS_KEY and without a terminal."""
+    from cli.harness import Result
     from keyss.cli import main
 
     monkeypatch.delenv("KEYSS_KEY", raising=False)
@@ -61,20 +60,20 @@ def _keyss(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setenv("COLUMNS", "120")
     monkeypatch.setattr("sys.stdin", io.StringIO())
 
-    def run(*arguments: object) -> Said:
+    def run(*arguments: object) -> Result:
         capsys.readouterr()
         try:
             status = main([str(argument) for argument in arguments])
         except SystemExit as end:
             status = int(end.code or 0)
-        return Said(status, *capsys.readouterr())
+        return Result(status, *capsys.readouterr())
 
     return run
 
 
 @pytest.fixture(scope="module")
 def chromium() -> Iterator[Any]:
-    """A browser without a window."""
+    """Headless Chromium."""
     from viewer.browser import PATIENCE, PROGRAM, SWITCHES
 
     playwright = pytest.importorskip("playwright.sync_api", reason="needs playwright")
@@ -86,7 +85,7 @@ def chromium() -> Iterator[Any]:
 
 @pytest.fixture(scope="session")
 def cuda() -> torch.device:
-    """The GPU, or a skip where there is none that gsplat can use."""
+    """The GPU; skips without one that gsplat can use."""
     from keyss.core import BackendError
     from keyss.rendering import resolve_device
 
@@ -98,7 +97,7 @@ def cuda() -> torch.device:
 
 @pytest.fixture(scope="session")
 def folders(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """Folders of two tiny scenes, `a` and `b`; tests must not change them."""
+    """Two tiny scenes in Nerfstudio's layout; read-only."""
     from test_api import write_nerfstudio
     from tiny_scenes import tiny_scene
 
@@ -108,10 +107,7 @@ def folders(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 
 @pytest.fixture(scope="session")
 def real_data() -> Path:
-    """The folder of real scenes (`fox`, `lego`, ...), or a skip where there is none.
-
-    It is looked for in KEYSS_TEST_DATA, else in `../shared/data` beside the repository.
-    """
+    """Real scenes (`fox`, `lego`, ...) in KEYSS_TEST_DATA or `../shared/data`; skips without them."""
     beside = Path(__file__).resolve().parents[2] / "shared" / "data"
     folder = Path(os.environ.get("KEYSS_TEST_DATA", beside))
     if not folder.is_dir():
@@ -121,9 +117,9 @@ def real_data() -> Path:
 
 @pytest.fixture(scope="session")
 def splat_transform() -> Callable[..., Path]:
-    """Converts (source, target) -> target by splat-transform; skips if it is not installed."""
+    """Convert a model file with splat-transform; skips without it."""
     from keyss.core import BackendError
-    from keyss.files.foreign import find_splat_transform
+    from keyss.files.file_kinds import find_splat_transform
     from keyss.lab import transform
 
     try:

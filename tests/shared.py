@@ -1,4 +1,4 @@
-"""Folders that are made once for all processes of the tests, and that no test may change."""
+"""Read-only folders shared by all test processes."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from pathlib import Path
 import pytest
 
 
-def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], None]) -> Path:
-    """The folder, which `make` fills; who comes while another process makes it waits for it.
+def make_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], None]) -> Path:
+    """Fill a folder with `make` in the first process; the others wait for it.
 
-    What was left half made by an error is not taken: the next one makes another.
+    A folder left by a failed `make` is not reused.
     """
     base = factory.getbasetemp()
     if "PYTEST_XDIST_WORKER" in os.environ:
-        base = base.parent  # above the folders of its workers
+        base = base.parent  # shared by the workers
     with (base / f"{name}.lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         number = len(list(base.glob(f"{name}-[0-9]*")))

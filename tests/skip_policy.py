@@ -1,4 +1,4 @@
-"""On CI (`CI=true`) a skipped test is a failed one: a tool is missing there that was to be installed."""
+"""With CI=true, a test that skips because a tool is missing fails."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import TypeVar
 
 import pytest
 
-# What may be missing on CI too, by the reason that the test gives.
+# Reasons for which tests may skip on CI.
 ALLOWED = (
     r"CUDA",  # CI has no GPU
     r"no real scenes in ",  # photos are not part of the repository
@@ -20,16 +20,16 @@ Report = TypeVar("Report", pytest.TestReport, pytest.CollectReport)
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_makereport() -> Generator[None, pytest.TestReport, pytest.TestReport]:
-    return judged((yield))
+    return fail_skips((yield))
 
 
 @pytest.hookimpl(wrapper=True)
 def pytest_make_collect_report() -> Generator[None, pytest.CollectReport, pytest.CollectReport]:
-    return judged((yield))
+    return fail_skips((yield))
 
 
-def judged(report: Report) -> Report:
-    """The report, made one of a failure where a skip is not allowed; what fails as expected is no skip."""
+def fail_skips(report: Report) -> Report:
+    """Turn a skip that CI does not allow into a failure."""
     if os.environ.get("CI") != "true" or not report.skipped or hasattr(report, "wasxfail"):
         return report
     reason = report.longrepr[2] if isinstance(report.longrepr, tuple) else str(report.longrepr)

@@ -1,4 +1,4 @@
-"""The verbs over files: what is written is what is measured."""
+"""The public functions on files."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ ANY = replace(CONFIG, publish="any")  # so small a cover has no room
 
 
 def write_nerfstudio(folder: Path, scene: Scene) -> Path:
-    """A scene as Nerfstudio has it."""
+    """Write a scene in Nerfstudio's layout."""
     (folder / "images").mkdir(parents=True)
     flip = np.diag([1.0, -1.0, -1.0, 1.0])
     frames = []
@@ -47,7 +47,7 @@ def write_nerfstudio(folder: Path, scene: Scene) -> Path:
 
 
 def psnr_of_pictures(model: Path, scene: Path) -> float:
-    """Mean over test views of a scene."""
+    """Mean over the test views of a scene."""
     pictures = dict(keyss.render(model, scene))
     errors = [
         (pictures[view.camera.name.replace("/", "_")].float() - view.image.float()).square().mean() / 255**2
@@ -63,7 +63,7 @@ def run(folders: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory) ->
     return out
 
 
-def test_hide_writes_its_results_and_nothing_else(run: Path) -> None:
+def test_hide_output_files(run: Path) -> None:
     files = {str(path.relative_to(run)) for path in run.rglob("*") if path.is_file()}
     assert files == {
         "publish/model.ply",
@@ -77,7 +77,7 @@ def test_hide_writes_its_results_and_nothing_else(run: Path) -> None:
         assert "the key" not in path.read_text()
 
 
-def test_evaluate_measures_the_same_from_the_files(run: Path) -> None:
+def test_evaluate_reproduces_metrics(run: Path) -> None:
     before = json.loads((run / "private" / "metrics.json").read_text())
     after = keyss.evaluate(run, ["the key"])
     assert json.loads(msgspec.json.encode(after)) == before
@@ -86,7 +86,7 @@ def test_evaluate_measures_the_same_from_the_files(run: Path) -> None:
         keyss.evaluate(run, ["another"])
 
 
-def test_metrics_are_of_what_reveal_writes(run: Path, folders: tuple[Path, Path], tmp_path: Path) -> None:
+def test_metrics_match_revealed_file(run: Path, folders: tuple[Path, Path], tmp_path: Path) -> None:
     secret = keyss.reveal(run / "publish" / "model.ply", "the key", out=tmp_path / "secret.ply").gaussians
     again = keyss.read_model(tmp_path / "secret.ply")
     assert torch.equal(secret.means, again.means)
@@ -96,7 +96,7 @@ def test_metrics_are_of_what_reveal_writes(run: Path, folders: tuple[Path, Path]
     assert psnr == pytest.approx(metrics["secrets"][0]["psnr"], abs=0.1)
 
 
-def test_the_same_run_gives_the_same_bytes(run: Path, folders: tuple[Path, Path], tmp_path: Path) -> None:
+def test_hide_is_deterministic(run: Path, folders: tuple[Path, Path], tmp_path: Path) -> None:
     keyss.hide(folders[0], [Secret(folders[1], "the key")], method=ANY, out=tmp_path / "again")
     for name in ("publish/model.ply", "private/secret-1.ply"):
         assert (tmp_path / "again" / name).read_bytes() == (run / name).read_bytes()
@@ -108,10 +108,8 @@ def test_wrong_key_writes_nothing(run: Path, tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-def test_a_decoy_is_the_cover_in_a_file_like_a_revealed_secret(
-    run: Path, folders: tuple[Path, Path], tmp_path: Path
-) -> None:
-    """All of its numbers are others, a little, in the same way for one key every time."""
+def test_decoy_file(run: Path, folders: tuple[Path, Path], tmp_path: Path) -> None:
+    """A decoy is the cover, slightly changed by a generator seeded with the key."""
     paths = [tmp_path / f"{name}.ply" for name in ("right", "wrong", "again", "other")]
     for path, key in zip(paths, ("the key", "wrong", "wrong", "other"), strict=True):
         keyss.reveal(run / "publish" / "model.ply", key, decoy=True, out=path)
@@ -121,7 +119,7 @@ def test_a_decoy_is_the_cover_in_a_file_like_a_revealed_secret(
     heads = [data[: data.index(b"end_header")].splitlines() for data in (right, wrong)]
     assert heads[0][:2] + heads[0][3:] == heads[1][:2] + heads[1][3:]  # all but the number of Gaussians
     decoy, whole = keyss.read_model(paths[1]), keyss.read_model(run / "publish" / "model.ply")
-    stego = whole[whole.opacities > 1.6 / 255]  # without what is appended
+    stego = whole[whole.opacities > 1.6 / 255]  # without appended Gaussians
     assert 0.79 * len(stego) < len(decoy) <= len(stego)
     assert not set(decoy.means[:, 0].tolist()) & set(stego.means[:, 0].tolist())
     for (_, shown), (_, cover) in zip(
@@ -130,9 +128,7 @@ def test_a_decoy_is_the_cover_in_a_file_like_a_revealed_secret(
         assert (shown.float() - cover.float()).square().mean() < 255**2 * 1e-3  # 30 dB
 
 
-def test_outputs_that_exist_are_refused_before_any_work(
-    run: Path, folders: tuple[Path, Path], tmp_path: Path
-) -> None:
+def test_existing_outputs_are_refused(run: Path, folders: tuple[Path, Path], tmp_path: Path) -> None:
     (tmp_path / "x.ply").write_text("mine")
     with pytest.raises(OutputError, match="exists"):
         keyss.reveal(run / "publish" / "model.ply", "the key", out=tmp_path / "x.ply")
@@ -145,7 +141,7 @@ def test_outputs_that_exist_are_refused_before_any_work(
     assert len(keyss.read_model(tmp_path / "x.ply"))
 
 
-def test_render_writes_a_picture_per_test_view(run: Path, folders: tuple[Path, Path], tmp_path: Path) -> None:
+def test_render_output_files(run: Path, folders: tuple[Path, Path], tmp_path: Path) -> None:
     pictures = keyss.render(run / "publish" / "model.ply", folders[0], out=tmp_path / "images")
     assert {p.name for p in (tmp_path / "images").iterdir()} == {"private", *(name for name, _ in pictures)}
     name, image = pictures[0]
@@ -154,24 +150,24 @@ def test_render_writes_a_picture_per_test_view(run: Path, folders: tuple[Path, P
     assert len(keyss.render(run / "publish" / "model.ply", folders[0], split="all")) == 16
 
 
-def test_info_describes_everything_keyss_reads_and_writes(run: Path, folders: tuple[Path, Path]) -> None:
-    def found(path: Path) -> dict[str, Any]:
+def test_info(run: Path, folders: tuple[Path, Path]) -> None:
+    def info(path: Path) -> dict[str, Any]:
         facts: dict[str, Any] = msgspec.to_builtins(keyss.info(path))
         return facts
 
-    assert found(run / "publish" / "model.ply")["sh_degree"] == 3
-    assert found(run / "publish" / "model.ply").keys() == found(run / "private" / "cover.ply").keys()
-    assert found(folders[0])["test_views"] == 2
-    assert found(run)["metrics"]["gaussians"] == len(keyss.read_model(run / "publish" / "model.ply"))
+    assert info(run / "publish" / "model.ply")["sh_degree"] == 3
+    assert info(run / "publish" / "model.ply").keys() == info(run / "private" / "cover.ply").keys()
+    assert info(folders[0])["test_views"] == 2
+    assert info(run)["metrics"]["gaussians"] == len(keyss.read_model(run / "publish" / "model.ply"))
     with pytest.raises(InputError, match="no such"):
         keyss.info(run / "nothing")
 
 
-def test_a_secret_does_not_show_its_key() -> None:
+def test_secret_repr_omits_key() -> None:
     assert "hunter2" not in repr(Secret("scene", "hunter2")) + repr(keyss.SecretFile("file", "hunter2"))
 
 
-def test_keys_are_checked_before_any_work(folders: tuple[Path, Path], tmp_path: Path) -> None:
+def test_invalid_keys(folders: tuple[Path, Path], tmp_path: Path) -> None:
     scene, other = folders
     for keys, words in ((["key", "key"], "same key"), (["\u212b", "\u00c5"], "same key"), ([""], "empty")):
         with pytest.raises(UsageError, match=words):
@@ -181,8 +177,7 @@ def test_keys_are_checked_before_any_work(folders: tuple[Path, Path], tmp_path: 
     assert not (tmp_path / "run").exists()
 
 
-def test_python_and_command_line_write_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """All defaults, and the size of what has no photos, are decided in one place."""
+def test_command_line_matches_api(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("KEYSS_KEY", "the key")
     for index, count in enumerate((1500, 700)):
         keyss.write_model(tmp_path / f"{index}.ply", random_gaussians(count, seed=index))
@@ -201,7 +196,7 @@ def test_python_and_command_line_write_the_same(tmp_path: Path, monkeypatch: pyt
 
 
 def _signatures() -> str:
-    """The public names, what each takes and gives, and what it takes by default."""
+    """Public names with parameters, defaults and results."""
     lines = []
     for name in sorted(keyss.__all__):
         value = getattr(keyss, name)
@@ -224,7 +219,7 @@ def _default(value: object) -> str:
 
 
 def test_public_api() -> None:
-    """Names and signatures that programs rely on; change `public_api.txt` only for what is meant to break."""
+    """Change `public_api.txt` only for intended breaks."""
     frozen = Path(__file__).with_name("public_api.txt").read_text(encoding="utf-8")
     difference = difflib.unified_diff(frozen.splitlines(), _signatures().splitlines(), lineterm="")
     assert "\n".join(difference) == ""

@@ -1,4 +1,4 @@
-"""The examples run: notebooks from the first cell to the last, and a design of one's own."""
+"""The notebooks and the custom design in examples/ run."""
 
 from __future__ import annotations
 
@@ -23,11 +23,10 @@ NOTEBOOKS = sorted((Path(__file__).parents[1] / "examples").glob("*.ipynb"))
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")  # of Jupyter's own
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-def test_a_notebook_runs(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """In a kernel of its own; a cell that fails, fails here with its traceback."""
+def test_notebook(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MPLBACKEND", "module://matplotlib_inline.backend_inline")
     monkeypatch.setenv("TMPDIR", str(tmp_path))
-    # Small models have such a salt now and then, see pyproject.toml.
+    # As in pyproject.toml.
     monkeypatch.setenv("PYTHONWARNINGS", "ignore:the first salt of this model cannot be renewed")
     notebook = nbformat.read(path, as_version=4)
     nbclient.NotebookClient(notebook, timeout=120, resources={"metadata": {"path": str(tmp_path)}}).execute()
@@ -36,8 +35,7 @@ def test_a_notebook_runs(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert not [output for output in outputs if output.get("name") == "stderr"]
 
 
-def test_a_design_of_ones_own(monkeypatch: pytest.MonkeyPatch) -> None:
-    """In at most 40 lines: it trains, is published, and reveals what its decoder says and no more."""
+def test_custom_design(monkeypatch: pytest.MonkeyPatch) -> None:
     path = Path(__file__).parents[1] / "examples" / "own_design.py"
     assert len(path.read_text().splitlines()) <= 40
     monkeypatch.setitem(DECODERS, "bounded", DECODERS["mlp"])  # removed again after the test

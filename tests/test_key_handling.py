@@ -1,4 +1,4 @@
-"""A key is in its file and in memory: not among arguments, in messages, or in anything that is written."""
+"""Keys never appear in arguments, messages, logs or files."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import pytest
 from channels.quiet.trained_like import trained_like
 from files.scene_files import write_blender, write_nerfstudio
 from keyss.channels import QuietReader
-from keyss.cli import commands, entry, main
+from keyss.cli import command_table, entry, main
 from keyss.core import KeyssError
 from keyss.keys import DerivedKey
 from keyss.methods import registry
@@ -29,8 +29,8 @@ SPELLINGS = [
 ]
 
 
-class _CtrlC(Reporter):
-    """Presses it in the middle of hiding."""
+class _InterruptHiding(Reporter):
+    """Send SIGINT while the secret is fitted."""
 
     hiding = False
 
@@ -50,7 +50,7 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def _spelt(data: bytes) -> bool:
+def _contains_key(data: bytes) -> bool:
     return any(spelling.lower() in data.lower() for spelling in SPELLINGS)
 
 
@@ -58,7 +58,7 @@ def _files(folder: Path) -> Iterator[Path]:
     return (path for path in folder.rglob("*") if path.is_file() and path.name != "key.txt")
 
 
-def test_nothing_that_is_written_or_said_holds_the_key(
+def test_key_is_never_written_or_printed(
     folder: Path,
     capsys: pytest.CaptureFixture[str],
     caplog: pytest.LogCaptureFixture,
@@ -67,15 +67,15 @@ def test_nothing_that_is_written_or_said_holds_the_key(
     caplog.set_level(logging.DEBUG)
     monkeypatch.setattr("sys.stdin", io.StringIO())
     run, key = folder / "run", ["--key-file", str(folder / "key.txt")]
-    (folder / "key.txt").chmod(0o644)  # so that there is a warning to look at
+    (folder / "key.txt").chmod(0o644)  # triggers a warning
     scenes = ["--cover", str(folder / "a"), "--secret", str(folder / "b"), "--publish", "any", "-o", str(run)]
     size = ["--preset", "quick", "--iterations", "20", "--max-gaussians", "100", "--device", "cpu"]
     with monkeypatch.context() as patch:
-        patch.setattr("keyss.cli.reporting.lines", _CtrlC)
+        patch.setattr("keyss.cli.reporting.lines", _InterruptHiding)
         assert main(["hide", *scenes, *key, *size]) == 130
     checkpoints = list(_files(run / "private" / "checkpoint"))
     assert len(checkpoints) >= 2
-    assert not any(_spelt(path.read_bytes()) for path in checkpoints)
+    assert not any(_contains_key(path.read_bytes()) for path in checkpoints)
 
     (folder / "other.txt").write_text("another-key-for-7Qx2\n")
     other = ["--key-file", str(folder / "other.txt")]
@@ -89,18 +89,18 @@ def test_nothing_that_is_written_or_said_holds_the_key(
     assert main(["info", stego]) == 0
     written = list(_files(folder))
     assert {"model.ply", "config.json", "metrics.json"} <= {path.name for path in written}
-    assert [path for path in written if _spelt(path.read_bytes())] == []
-    said = capsys.readouterr()
-    assert "others can read this key file" in said.err
-    assert not _spelt((said.out + said.err + caplog.text).encode())
+    assert [path for path in written if _contains_key(path.read_bytes())] == []
+    captured = capsys.readouterr()
+    assert "others can read this key file" in captured.err
+    assert not _contains_key((captured.out + captured.err + caplog.text).encode())
 
 
-def test_no_command_takes_a_key_as_an_argument() -> None:
-    asked = [(name, []) for name in commands.MODULES] + [
+def test_no_option_takes_a_key() -> None:
+    asked = [(name, []) for name in command_table.MODULES] + [
         ("hide", ["--method", name, "--help"]) for name in registry.METHODS
     ]
     for name, arguments in asked:
-        options = entry.options_of(commands.parse_target(name, arguments))
+        options = entry.options_of(command_table.parse_target(name, arguments))
         keys = {name: hint for name, hint in options.items() if "key" in name}
         for name in keys.keys() - {"wrong_keys", "key_encoder"}:
             assert "Path" in str(keys[name]), name
@@ -108,19 +108,19 @@ def test_no_command_takes_a_key_as_an_argument() -> None:
 
 @pytest.mark.parametrize("option", [["--key", KEY], [f"--key={KEY}"], ["-k", KEY]])
 @pytest.mark.parametrize("command", [["reveal", "stego.ply", "-o", "out.ply"], ["hide", "-o", "out"]])
-def test_a_key_among_the_arguments_is_refused_and_not_repeated(
+def test_key_argument_is_refused(
     capsys: pytest.CaptureFixture[str], command: list[str], option: list[str]
 ) -> None:
     assert main([*command, *option]) == 2
-    said = capsys.readouterr()
-    assert "--key-file FILE" in said.err
-    assert not _spelt((said.out + said.err).encode())
+    captured = capsys.readouterr()
+    assert "--key-file FILE" in captured.err
+    assert not _contains_key((captured.out + captured.err).encode())
 
 
-def test_errors_and_representations_do_not_show_the_key() -> None:
+def test_repr_and_errors_omit_key() -> None:
     derived = DerivedKey.of(KEY, bytes(16))
     assert KEY not in repr(derived)
     assert derived.expand("writer", 32).hex() not in repr(derived)
     with pytest.raises(KeyssError) as caught:
         QuietReader.of(trained_like(50)).open(KEY)
-    assert not _spelt(str(caught.value).encode())
+    assert not _contains_key(str(caught.value).encode())

@@ -1,4 +1,4 @@
-"""keyss needs nothing that only Unix has."""
+"""keyss uses no API that only Unix has."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ import sys
 from pathlib import Path
 
 import cheap_keys
-from cli.said import SMALL
+from cli.harness import SMALL
 
-# psutil and other libraries need some of these on Linux: psutil is loaded first, and what others need stays.
+# Dependencies use some of these on Linux: psutil is imported first, the others keep what they need.
 WITHOUT = """
 import os, psutil, signal, sys
 for name in "fcntl resource pwd grp termios tty pty syslog".split():
@@ -27,7 +27,7 @@ for name in (
 """
 
 
-def test_hide_and_reveal_without_what_windows_lacks(folders: tuple[Path, Path], tmp_path: Path) -> None:
+def test_hide_and_reveal_without_unix_only_apis(folders: tuple[Path, Path], tmp_path: Path) -> None:
     (tmp_path / "key.txt").write_text("q7Rv2LxT9bWm4KzD\n")
 
     def keyss(*arguments: object) -> None:

@@ -11,7 +11,7 @@ from keyss.progress import ProgressLines, clock, reporter
 
 
 class Timer:
-    """A clock that the test sets."""
+    """A clock set by the test."""
 
     now = 100.0
 
@@ -33,7 +33,7 @@ def text(of: Console) -> str:
     return of.file.getvalue()
 
 
-def test_the_stream_decides() -> None:
+def test_live_only_on_terminals() -> None:
     assert reporter(console(True)).live
     assert not reporter(console(False)).live
 
@@ -45,7 +45,7 @@ def test_clock(seconds: float, shown: str) -> None:
     assert clock(seconds) == shown
 
 
-def test_plain_lines_come_now_and_then(timer: Timer) -> None:
+def test_log_lines(timer: Timer) -> None:
     log = console(False)
     lines = ProgressLines(log, timer=timer)
     lines.start("hide", 300, 0)
@@ -62,7 +62,7 @@ def test_plain_lines_come_now_and_then(timer: Timer) -> None:
     ]
 
 
-def test_the_live_line_is_redrawn_and_ends_with_the_time_taken(timer: Timer) -> None:
+def test_live_line(timer: Timer) -> None:
     screen = console(True)
     line = ProgressLines(screen, timer=timer)
     line.start("hide", 300, 0)
@@ -78,8 +78,7 @@ def test_the_live_line_is_redrawn_and_ends_with_the_time_taken(timer: Timer) -> 
 
 
 @pytest.mark.parametrize("terminal", [True, False])
-def test_a_reporter_can_be_used_again(timer: Timer, terminal: bool) -> None:
-    """For the models of several scenes in turn."""
+def test_reporter_is_reusable(timer: Timer, terminal: bool) -> None:
     screen = console(terminal)
     lines = ProgressLines(screen, timer=timer)
     for title in ("cover", "secret"):

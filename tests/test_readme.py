@@ -1,4 +1,4 @@
-"""What the README shows works."""
+"""The Python example in the README runs."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ README = (Path(__file__).parents[1] / "README.md").read_text()
 SHORT = 'method=keyss.CarryOptions(publish="any").with_fit(iterations=10, max_gaussians=100), width=200'
 
 
-def test_the_python_example_runs(
+def test_python_example(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (example,) = re.findall(r"```python\n(.*?)```", README, re.DOTALL)

@@ -24,18 +24,18 @@ from tiny_scenes import tiny_scene
 FIT = FitConfig(iterations=20, max_gaussians=300, grow_start=0.2, grow_every=5, evaluate_every=0)
 KEY = "a key of many characters: 93hXmQ2"
 JOINT = small("published", FIT)
-# In appended Gaussians: low bits of so small a cover have no room now and then, depending on the processor.
+# Appended Gaussians: whether so small a cover has room in low bits depends on the processor.
 CARRIED = CarryOptions(fit=FIT, publish="any")
 METHODS = [replace(CARRIED, refit="always"), CARRIED]
 
 
-def _hidden(options: MethodOptions) -> Gaussians:
+def _hide(options: MethodOptions) -> Gaussians:
     secret = Secret(tiny_scene(1), KEY)
     return keyss.hide(tiny_scene(0), [secret], method=options, min_psnr=0).stego
 
 
 def _rotations(model: Gaussians) -> set[bytes]:
-    """Trained rotations, without appended Gaussians and the low bits that hiding changes."""
+    """Trained rotations, without appended Gaussians and low bits."""
     bits = model[~is_appended(model)].quats.numpy().view(np.uint32) & ~np.uint32(0xFFF)
     start = np.array([1, 0, 0, 0], np.float32).view(np.uint32)
     return {row.tobytes() for row in bits if (row != start).any()}
@@ -50,21 +50,20 @@ def _interrupted_seed(run: Path, *names: str) -> int:
 
 
 @pytest.mark.parametrize("options", METHODS, ids=["refitted", "carried"])
-def test_two_hidings_of_the_same_inputs_have_no_rotation_in_common(options: MethodOptions) -> None:
-    one, two = (_rotations(_hidden(options)) for _ in range(2))
+def test_repeated_hidings_share_no_rotation(options: MethodOptions) -> None:
+    one, two = (_rotations(_hide(options)) for _ in range(2))
     assert min(len(one), len(two)) > 100
     assert not one & two
 
 
 @pytest.mark.filterwarnings("ignore:.*appended Gaussians")
 @pytest.mark.parametrize("options", [CarryOptions(fit=FIT), JOINT], ids=["carry", "keyss"])
-def test_a_table_made_for_one_hiding_opens_no_other_of_its_seed(options: MethodOptions) -> None:
-    """Else one table of Argon2id, made in advance, would serve all files of that seed and cover.
+def test_salts_differ_for_equal_seeds(options: MethodOptions) -> None:
+    """A table of Argon2id for one file must be useless for another with the same cover and seed.
 
-    Readers try the salts of all channels. So files may have those in common under which nothing was written:
-    of Gaussians that hiding leaves alone, and all in low bits where the secret lies in appended Gaussians.
+    Readers try the salts of all channels: files may share salts under which nothing is written.
     """
-    given = options.method == "carry"  # models with room, which do not depend on the processor
+    given = options.method == "carry"  # such covers have room on every processor
     salts, stegos = [], []
     for seed in (1, 2):
         secret = Secret(tiny_scene(seed), KEY, trained_like(60, seed) if given else None)
@@ -94,13 +93,13 @@ def _opens(reader: QuietReader | AppendedReader, salt: bytes) -> bool:
     return True
 
 
-def test_two_fits_have_no_rotation_in_common() -> None:
+def test_repeated_fits_share_no_rotation() -> None:
     one, two = (_rotations(keyss.fit(tiny_scene(), config=FIT).gaussians) for _ in range(2))
     assert not one & two
 
 
 @pytest.mark.parametrize("given", [None, 7])
-def test_a_resumed_fit_keeps_its_seed(tmp_path: Path, given: int | None) -> None:
+def test_resumed_fit_keeps_seed(tmp_path: Path, given: int | None) -> None:
     scene, run = tiny_scene(), tmp_path / "run"
     with pytest.raises(Interrupted):
         keyss.fit(scene, config=replace(FIT, seed=given), out=run, reporter=InterruptAt(10))
@@ -116,8 +115,8 @@ def test_a_resumed_fit_keeps_its_seed(tmp_path: Path, given: int | None) -> None
 
 @pytest.mark.filterwarnings("ignore:.*appended Gaussians")
 @pytest.mark.parametrize("stage", ["plain model", "hide"])
-def test_a_resumed_hiding_keeps_its_seed(tmp_path: Path, stage: str) -> None:
-    """The files are equal to those of an uninterrupted run, to the byte."""
+def test_resumed_hiding_keeps_seed(tmp_path: Path, stage: str) -> None:
+    """The files equal those of an uninterrupted run."""
     scenes, run = (tiny_scene(0), [Secret(tiny_scene(1), KEY)]), tmp_path / "run"
     with pytest.raises(Interrupted):
         keyss.hide(*scenes, method=JOINT, min_psnr=0, out=run, reporter=InterruptAt(10, stage))

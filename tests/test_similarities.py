@@ -1,4 +1,4 @@
-"""A similarity of the world changes nothing that is measured, or there is a sentence why."""
+"""Fits and hiding are invariant to similarity transforms, or refuse with a reason."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ WORLDS = {
 KEY = "a key of many characters: 93hXmQ2"
 
 
-def written(folder: Path, shift: tuple[float, ...], scale: float) -> Path:
-    """A scene in Nerfstudio's layout, moved in double precision."""
+def write_scene(folder: Path, shift: tuple[float, ...], scale: float) -> Path:
+    """Write a scene in Nerfstudio's layout, moved in double precision."""
     scene = tiny_scene()
     folder.mkdir()
     frames = []
@@ -58,22 +58,22 @@ def psnr_of_fit(scene: Scene) -> float:
 
 
 @pytest.fixture(scope="module")
-def usual_psnr(tmp_path_factory: pytest.TempPathFactory) -> float:
-    return psnr_of_fit(load_scene(written(tmp_path_factory.mktemp("worlds") / "usual", (0.0, 0.0, 0.0), 1.0)))
+def reference_psnr(tmp_path_factory: pytest.TempPathFactory) -> float:
+    return psnr_of_fit(
+        load_scene(write_scene(tmp_path_factory.mktemp("worlds") / "usual", (0.0, 0.0, 0.0), 1.0))
+    )
 
 
 @pytest.mark.filterwarnings("ignore::keyss.core.KeyssWarning")
 @pytest.mark.parametrize("world", WORLDS)
-def test_a_scene_of_any_unit_at_any_place_trains_as_well(
-    world: str, usual_psnr: float, tmp_path: Path
-) -> None:
-    moved = load_scene(written(tmp_path / "moved", *WORLDS[world]))
-    assert abs(psnr_of_fit(moved) - usual_psnr) < 0.3
+def test_fit_is_invariant_to_similarities(world: str, reference_psnr: float, tmp_path: Path) -> None:
+    moved = load_scene(write_scene(tmp_path / "moved", *WORLDS[world]))
+    assert abs(psnr_of_fit(moved) - reference_psnr) < 0.3
 
 
-def test_a_scene_far_out_says_where_it_is(tmp_path: Path) -> None:
+def test_distant_scene_is_recentred(tmp_path: Path) -> None:
     shift, scale = WORLDS["UTM"]
-    folder = written(tmp_path / "scene", shift, scale)
+    folder = write_scene(tmp_path / "scene", shift, scale)
     with pytest.warns(KeyssWarning, match=r"moved by minus \(45678\d, 541234\d, "):
         scene = load_scene(folder)
     assert (scene.origin - torch.tensor(shift, dtype=torch.float64)).norm() < 10
@@ -85,7 +85,7 @@ def test_a_scene_far_out_says_where_it_is(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("scale", [1e-4, 1e6])
 @pytest.mark.parametrize("publish", ["as-is", "any"])
-def test_hiding_in_a_model_of_any_unit(publish: str, scale: float) -> None:
+def test_hide_at_any_scale(publish: str, scale: float) -> None:
     cover = Similarity(scale).apply_gaussians(random_gaussians(2500, seed=1))
     noise = torch.Generator().manual_seed(0)
     cover = cover.map(lambda v: (v * (1 + 1e-6 * torch.randn(v.shape, generator=noise))).float())
@@ -96,7 +96,7 @@ def test_hiding_in_a_model_of_any_unit(publish: str, scale: float) -> None:
     assert len(keyss.reveal(hidden.stego, KEY).gaussians) == 100
 
 
-def test_a_model_too_far_out_is_refused_with_the_cure() -> None:
+def test_distant_model_is_refused() -> None:
     cover = Similarity(1.0, translation=torch.tensor([456_789.0, 5_412_345.0, 0.0])).apply_gaussians(
         random_gaussians(500)
     )

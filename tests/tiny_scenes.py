@@ -1,4 +1,4 @@
-"""Scenes of a few Gaussians seen by a ring of small cameras, made in memory in milliseconds."""
+"""Synthetic scenes of a few Gaussians seen by a ring of small cameras."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def ring_cameras(count: int = 16, distance: float = 4.0, height: float = 1.0) ->
 
 
 def random_gaussians(count: int = 200, seed: int = 0, sh_degree: int = 3) -> Gaussians:
-    """Coloured blobs in the unit ball."""
+    """Coloured Gaussians in the unit ball."""
     generator = torch.Generator().manual_seed(seed)
     k = (sh_degree + 1) ** 2
     sh = 0.05 * torch.randn(count, k, 3, generator=generator)
@@ -44,7 +44,7 @@ def random_gaussians(count: int = 200, seed: int = 0, sh_degree: int = 3) -> Gau
         opacity_logits=_to_the_last_bit(1 + torch.randn(count, generator=generator)),
         sh=_to_the_last_bit(sh),
     )
-    # Multiples of numbers of single precision have low bits that depend on each other; trained ones have not.
+    # Noise in the low bits, as trained models have it: multiples of float32 numbers have correlated ones.
     return model.map(
         lambda values: (
             values * (1 + 1e-6 * torch.randn(values.shape, generator=generator, dtype=torch.float64))
@@ -53,13 +53,13 @@ def random_gaussians(count: int = 200, seed: int = 0, sh_degree: int = 3) -> Gau
 
 
 def _to_the_last_bit(values: Tensor) -> Tensor:
-    """`values` as training leaves them: a sum lies on the grid of its larger part, which low bits show."""
+    """Noise below the grid of float32: a rounded sum has the grid of its larger part."""
     noise = torch.rand(values.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
     return (values.double() + 2e-6 * (noise - 0.5)).float()
 
 
 def tiny_scene(seed: int = 0, views: int = 16, distance: float = 4.0) -> Scene:
-    """Photos of `random_gaussians(seed=seed)`; its means, slightly off, are the sparse points."""
+    """Photos of `random_gaussians(seed=seed)`, with its noisy means as sparse points."""
     model = random_gaussians(seed=seed)
     generator = torch.Generator().manual_seed(seed + 1000)
     shots = []

@@ -18,8 +18,6 @@ level = 0  # -1: silent, 1: more often; set by the command line
 class Reporter:
     """Displays the progress of trainings; this one displays nothing."""
 
-    loss_every = 0  # steps between two losses among the numbers; 0: none, since reading it slows a GPU down
-
     def start(self, title: str, iterations: int, iteration: int) -> None:
         """A training begins; a resumed one has done `iteration` of its `iterations` steps."""
 

@@ -1,4 +1,4 @@
-"""A small world to run the command line in."""
+"""Scenes and a hidden scene for tests of the command line."""
 
 from __future__ import annotations
 
@@ -6,25 +6,25 @@ from pathlib import Path
 
 import pytest
 
-from cli.said import SMALL, write_key, write_world
+from cli.harness import SMALL, write_key, write_workspace
 from files.scene_files import write_nerfstudio
 from keyss.cli import main
-from shared import made_once
+from shared import make_once
 
 
 @pytest.fixture(scope="session")
-def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with scenes `a` and `b`, a key file, and `hidden`: b hidden in a; tests must not change it."""
-    return made_once(tmp_path_factory, "world", _make_world)
+def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Scenes `a` and `b`, key files, and the run `hidden`, which hides b in a; read-only."""
+    return make_once(tmp_path_factory, "workspace", _make_workspace)
 
 
-def _make_world(folder: Path) -> None:
-    write_key(write_world(folder) / "wrong.txt", "fedcba9876543210")
+def _make_workspace(folder: Path) -> None:
+    write_key(write_workspace(folder) / "wrong.txt", "fedcba9876543210")
     scenes = ("--cover", folder / "a", "--secret", folder / "b", "--key-file", folder / "key.txt")
     assert main(["hide", "--publish", "any", *map(str, scenes), "-o", str(folder / "hidden"), *SMALL]) == 0
 
 
 @pytest.fixture
 def scene(tmp_path: Path) -> Path:
-    """A scene beside which results may lie."""
+    """A scene in a writable folder."""
     return write_nerfstudio(tmp_path / "b", count=4)

@@ -1,4 +1,4 @@
-"""What shells complete, asked of bash itself."""
+"""Completion in bash."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from cli.said import COMMANDS, Run
+from cli.harness import COMMANDS, Run
 from keyss.fitting import PRESETS
 
 
@@ -28,11 +28,11 @@ def script(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (["keyss", "fit", "x", "--preset", ""], set(PRESETS)),
     ],
 )
-def test_of_bash(keyss: Run, script: Path, words: list[str], completed: set[str]) -> None:
+def test_bash_completion(keyss: Run, script: Path, words: list[str], completed: set[str]) -> None:
     if not script.exists():
-        said = keyss("--completion", "bash")
-        assert (said.status, said.err) == (0, "")
-        script.write_text(said.out)
+        result = keyss("--completion", "bash")
+        assert (result.status, result.err) == (0, "")
+        script.write_text(result.out)
     line = (
         'source "$1"; shift; COMP_WORDS=("$@"); COMP_CWORD=$(($# - 1)); _tyro_keyss; echo "${COMPREPLY[@]}"'
     )

@@ -1,4 +1,4 @@
-"""`keyss convert`: other formats, what they cost, and what they would destroy."""
+"""`keyss convert`: quality, lost secrets, refusals."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import torch
 
 import keyss as package
 from channels.quiet.trained_like import trained_like
-from cli.said import Run, assert_refused, write_key
+from cli.harness import Run, assert_refused, write_key
 from keyss.core import Similarity
 from keyss.files import read_model, write_model
 from methods.carry.carried import embed
@@ -22,7 +22,7 @@ KEY = "W2mz8Qe5TnYc6LkA"
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """`key`, which opens carried.ply, `other`, which does not, and a plain model in several formats."""
+    """`key` opens carried.ply, `other` does not; a plain model in several formats."""
     folder = tmp_path_factory.mktemp("convert")
     write_model(folder / "carried.ply", embed(trained_like(1500), [(KEY, trained_like(COUNT, 1))]))
     write_key(folder / "key", KEY)
@@ -33,17 +33,17 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("suffix", ["spz", "glb", "ply"])
-def test_says_what_it_costs(keyss: Run, files: Path, tmp_path: Path, suffix: str) -> None:
+def test_reports_quality(keyss: Run, files: Path, tmp_path: Path, suffix: str) -> None:
     out = tmp_path / f"out.{suffix}"
-    said = keyss("convert", files / "plain.ply", out)
-    assert said.status == 0
-    first, *others = said.out.splitlines()
+    result = keyss("convert", files / "plain.ply", out)
+    assert result.status == 0
+    first, *others = result.out.splitlines()
     assert first.startswith(f"{out}: {COUNT} Gaussians, {out.stat().st_size / 1e3:.1f} kB, ")
     if suffix == "ply":
         assert first.endswith("renders unchanged")
         assert not others
     else:
-        if suffix == "glb":  # which has all numbers, in other units
+        if suffix == "glb":  # float32 in other units
             assert first.endswith("renders unchanged")
         else:
             assert 25 < float(first.split("renders at ")[1].split()[0]) < 100
@@ -54,25 +54,25 @@ def test_says_what_it_costs(keyss: Run, files: Path, tmp_path: Path, suffix: str
 
 
 @pytest.mark.parametrize("unit", [1e-4, 1e-3, 1.0, 1e3, 1e6])
-def test_sizes_beyond_spz_are_told_the_cure(keyss: Run, tmp_path: Path, unit: float) -> None:
+def test_spz_scale_warning(keyss: Run, tmp_path: Path, unit: float) -> None:
     write_model(tmp_path / "in.ply", Similarity(unit).apply_gaussians(random_gaussians(COUNT)))
-    said = keyss("convert", tmp_path / "in.ply", tmp_path / "out.spz")
-    assert said.status == 0
-    assert ("of the Gaussians are smaller" in said.err) == (unit in (1e-4, 1e6))
-    psnr = float(said.out.split("renders at ")[1].split()[0])
+    result = keyss("convert", tmp_path / "in.ply", tmp_path / "out.spz")
+    assert result.status == 0
+    assert ("of the Gaussians are smaller" in result.err) == (unit in (1e-4, 1e6))
+    psnr = float(result.out.split("renders at ")[1].split()[0])
     if unit in (1e-4, 1e6):
-        factor = float(said.err.split(" -s ")[1].split()[0])
+        factor = float(result.err.split(" -s ")[1].split()[0])
         write_model(tmp_path / "in.ply", Similarity(factor * unit).apply_gaussians(random_gaussians(COUNT)))
-        said = keyss("convert", tmp_path / "in.ply", tmp_path / "scaled.spz")
-        assert "smaller" not in said.err
-        assert float(said.out.split("renders at ")[1].split()[0]) > psnr + 10
+        result = keyss("convert", tmp_path / "in.ply", tmp_path / "scaled.spz")
+        assert "smaller" not in result.err
+        assert float(result.out.split("renders at ")[1].split()[0]) > psnr + 10
     else:
         assert psnr > 30
 
 
 @pytest.mark.parametrize("unit", [1e-5, 1e4])
-def test_the_cost_does_not_depend_on_the_unit(keyss: Run, tmp_path: Path, unit: float) -> None:
-    """Also of models that are smaller than the nearest distance that rasterizers draw."""
+def test_quality_is_scale_invariant(keyss: Run, tmp_path: Path, unit: float) -> None:
+    """Models smaller than the near plane of rasterizers included."""
     generator = torch.Generator().manual_seed(2)
     model = random_gaussians(COUNT)
     model = replace(model, log_scales=torch.randn(COUNT, 3, generator=generator) * 0.5 - 2)
@@ -80,16 +80,16 @@ def test_the_cost_does_not_depend_on_the_unit(keyss: Run, tmp_path: Path, unit: 
     for name, scale in (("one", 1.0), ("other", unit)):
         changed = Similarity(scale=scale).apply_gaussians(model)
         write_model(tmp_path / f"{name}.ply", changed)
-        said = keyss("convert", tmp_path / f"{name}.ply", tmp_path / f"{name}.compressed.ply").out
-        costs.append(float(said.split("renders at ")[1].split()[0]))
+        result = keyss("convert", tmp_path / f"{name}.ply", tmp_path / f"{name}.compressed.ply").out
+        costs.append(float(result.split("renders at ")[1].split()[0]))
     assert costs[0] == pytest.approx(costs[1], abs=1.0)
-    said = keyss("convert", tmp_path / "other.ply", tmp_path / "other.spz")
-    assert "unchanged" not in said.out
+    result = keyss("convert", tmp_path / "other.ply", tmp_path / "other.spz")
+    assert "unchanged" not in result.out
     assert len(read_model(tmp_path / "other.spz").means.unique(dim=0)) == COUNT or unit < 1e-4
 
 
 @pytest.mark.parametrize("suffix", ["sog", "compressed.ply"])
-def test_every_verb_that_takes_models_takes_each_format(keyss: Run, files: Path, suffix: str) -> None:
+def test_verbs_accept_every_format(keyss: Run, files: Path, suffix: str) -> None:
     path = files / f"plain.{suffix}"
     assert f"{COUNT:,}" in keyss("info", path).out
     assert keyss("verify", path).status == 0
@@ -99,7 +99,7 @@ def test_every_verb_that_takes_models_takes_each_format(keyss: Run, files: Path,
     assert list(out.iterdir())
 
 
-def test_a_secret_is_not_destroyed_unasked(keyss: Run, files: Path, tmp_path: Path) -> None:
+def test_losing_a_secret_needs_force(keyss: Run, files: Path, tmp_path: Path) -> None:
     out = tmp_path / "out.spz"
     convert = ("convert", files / "carried.ply", out, "--key-file", files / "key")
     refused = keyss(*convert)
@@ -112,15 +112,15 @@ def test_a_secret_is_not_destroyed_unasked(keyss: Run, files: Path, tmp_path: Pa
     assert out.exists()
 
 
-def test_a_secret_survives_from_ply_to_ply(keyss: Run, files: Path, tmp_path: Path) -> None:
+def test_secret_survives_ply_to_ply(keyss: Run, files: Path, tmp_path: Path) -> None:
     out = tmp_path / "out.ply"
-    said = keyss("convert", files / "carried.ply", out, "--key-file", files / "key")
-    assert said.status == 0
-    assert "Gaussians, survives" in said.out
+    result = keyss("convert", files / "carried.ply", out, "--key-file", files / "key")
+    assert result.status == 0
+    assert "Gaussians, survives" in result.out
     assert keyss("reveal", out, "--key-file", files / "key", "-o", tmp_path / "secret.ply").status == 0
 
 
-def test_a_hidden_file_is_not_destroyed_unasked(keyss: Run, files: Path, tmp_path: Path) -> None:
+def test_losing_a_hidden_file_needs_force(keyss: Run, files: Path, tmp_path: Path) -> None:
     stego = package.hide_files(
         trained_like(2500), [package.SecretFile(b"a letter" * 20, "q7Rv2LxT9bWm4KzD")]
     ).stego
@@ -128,16 +128,16 @@ def test_a_hidden_file_is_not_destroyed_unasked(keyss: Run, files: Path, tmp_pat
     key = ("--key-file", files / "other")
     refused = keyss("convert", tmp_path / "stego.ply", tmp_path / "out.sog", *key)
     assert_refused(refused, 7, "0 of its 160 bytes would be left in")
-    said = keyss("convert", tmp_path / "stego.ply", tmp_path / "out.ply", *key)
-    assert "160 bytes, survives" in said.out
+    result = keyss("convert", tmp_path / "stego.ply", tmp_path / "out.ply", *key)
+    assert "160 bytes, survives" in result.out
 
 
-def test_a_key_that_opens_nothing(keyss: Run, files: Path, tmp_path: Path) -> None:
-    said = keyss("convert", files / "carried.ply", tmp_path / "o.ply", "--key-file", files / "other")
-    assert_refused(said, 3, "opens nothing here")
+def test_wrong_key(keyss: Run, files: Path, tmp_path: Path) -> None:
+    result = keyss("convert", files / "carried.ply", tmp_path / "o.ply", "--key-file", files / "other")
+    assert_refused(result, 3, "opens nothing here")
 
 
-def test_what_is_refused(keyss: Run, files: Path, tmp_path: Path) -> None:
+def test_invalid_outputs(keyss: Run, files: Path, tmp_path: Path) -> None:
     plain = files / "plain.ply"
     assert_refused(keyss("convert", plain, tmp_path / "a.lcc"), 2, "expected a name that ends in")
     assert_refused(keyss("convert", files / "key", tmp_path / "a.ply"), 4, "expected a 3DGS model")
@@ -149,7 +149,7 @@ def test_what_is_refused(keyss: Run, files: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("mode", [0o600, 0o644])
-def test_others_can_read_what_is_made_of_what_they_can_read(keyss: Run, tmp_path: Path, mode: int) -> None:
+def test_output_keeps_permissions(keyss: Run, tmp_path: Path, mode: int) -> None:
     write_model(tmp_path / "m.ply", random_gaussians(50))
     (tmp_path / "m.ply").chmod(mode)
     assert keyss("convert", tmp_path / "m.ply", tmp_path / "m.spz").status == 0
@@ -159,19 +159,11 @@ def test_others_can_read_what_is_made_of_what_they_can_read(keyss: Run, tmp_path
     assert {path.stat().st_mode & 0o777 for path in made} == {mode}
 
 
-def test_the_folder_of_a_training_is_a_model(keyss: Run, tmp_path: Path) -> None:
+def test_training_folder_as_model(keyss: Run, tmp_path: Path) -> None:
     for number in (7000, 30000):
         folder = tmp_path / "trained" / "point_cloud" / f"iteration_{number}"
         folder.mkdir(parents=True)
         write_model(folder / "point_cloud.ply", trained_like(COUNT + number // 10))
-    said = keyss("convert", tmp_path / "trained", tmp_path / "a.spz")
-    assert said.err.count("its model is point_cloud/iteration_30000/point_cloud.ply") == 1
+    result = keyss("convert", tmp_path / "trained", tmp_path / "a.spz")
+    assert result.err.count("its model is point_cloud/iteration_30000/point_cloud.ply") == 1
     assert len(read_model(tmp_path / "a.spz")) == COUNT + 3000
-    write_model(tmp_path / "secret.ply", trained_like(60, 1))
-    key, run = write_key(tmp_path / "key"), tmp_path / "run"
-    options = ["--secret", tmp_path / "secret.ply", "--key-file", key, "--min-psnr", "0", "-o", run]
-    said = keyss("hide", "--cover", tmp_path / "trained", *options)
-    assert said.status == 0, said.err
-    assert said.err.count("its model is") == 1
-    assert len(read_model(run / "publish" / "model.ply")) == COUNT + 3000
-    assert keyss("evaluate", run, "--key-file", key).status == 0

@@ -1,4 +1,4 @@
-"""What `keyss doctor` finds, and that it notices what does not work."""
+"""`keyss doctor` on working and broken installations."""
 
 from __future__ import annotations
 
@@ -11,38 +11,36 @@ import pytest
 import torch
 from torch import Tensor
 
-from cli.said import Run, Said
+from cli.harness import Result, Run
 from keyss import __version__, rendering
 from keyss.core import Camera, Gaussians
 
 
-def states(said: Said) -> dict[str, str]:
-    return {name: each["state"] for name, each in json.loads(said.out).items()}
+def states(result: Result) -> dict[str, str]:
+    return {name: each["state"] for name, each in json.loads(result.out).items()}
 
 
-def test_a_sound_installation(keyss: Run) -> None:
-    said = keyss("doctor", "--device", "cpu")
-    assert (said.status, said.err) == (0, "")
-    lines = {line.split()[1]: line for line in said.out.splitlines()}
+def test_working_installation(keyss: Run) -> None:
+    result = keyss("doctor", "--device", "cpu")
+    assert (result.status, result.err) == (0, "")
+    lines = {line.split()[1]: line for line in result.out.splitlines()}
     assert __version__ in lines["keyss"]
     assert torch.__version__ in lines["torch"]
     assert lines["test"].startswith("ok ")
     found = states(keyss("doctor", "--device", "cpu", "--json"))
-    assert list(found.values()) == [line.split()[0] for line in said.out.splitlines()]
+    assert list(found.values()) == [line.split()[0] for line in result.out.splitlines()]
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA GPU")
-def test_a_device_that_is_not_there(keyss: Run) -> None:
-    said = keyss("doctor", "--device", "cuda", "--json")
-    assert said.status == 6
-    assert states(said)["test frame"] == "broken"
-    assert "keyss: error: required components are broken: test frame" in said.err
+def test_missing_device(keyss: Run) -> None:
+    result = keyss("doctor", "--device", "cuda", "--json")
+    assert result.status == 6
+    assert states(result)["test frame"] == "broken"
+    assert "keyss: error: required components are broken: test frame" in result.err
 
 
 @pytest.mark.parametrize(("where", "factor"), [("middle", 0.999), ("corner", 0.0)])
-def test_a_picture_that_is_wrong(
-    keyss: Run, monkeypatch: pytest.MonkeyPatch, where: str, factor: float
-) -> None:
+def test_wrong_render(keyss: Run, monkeypatch: pytest.MonkeyPatch, where: str, factor: float) -> None:
     real = rendering.render
 
     def wrong(model: Gaussians, camera: Camera, **options: Any) -> Tensor:
@@ -52,12 +50,12 @@ def test_a_picture_that_is_wrong(
         return image * (factor or 1)
 
     monkeypatch.setattr("keyss.rendering.render", wrong)
-    said = keyss("doctor", "--device", "cpu", "--json")
-    assert said.status == 6
-    assert [name for name, state in states(said).items() if state == "broken"] == ["test frame"]
+    result = keyss("doctor", "--device", "cpu", "--json")
+    assert result.status == 6
+    assert [name for name, state in states(result).items() if state == "broken"] == ["test frame"]
 
 
-def test_what_is_missing_and_how_to_get_it(keyss: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_packages(keyss: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     gone = {"av", "numba"}
     version = metadata.version
 
@@ -67,8 +65,8 @@ def test_what_is_missing_and_how_to_get_it(keyss: Run, monkeypatch: pytest.Monke
         return version(name)
 
     monkeypatch.setattr(metadata, "version", installed)
-    said = keyss("doctor", "--device", "cpu")
-    assert said.status == 6
-    assert re.search(r"^missing +\[video\] .*pip install 'keyss\[video\]'$", said.out, re.MULTILINE)
-    assert re.search(r"^broken +numba +pip install numba$", said.out, re.MULTILINE)
-    assert said.err.count("\n") == 1
+    result = keyss("doctor", "--device", "cpu")
+    assert result.status == 6
+    assert re.search(r"^missing +\[video\] .*pip install 'keyss\[video\]'$", result.out, re.MULTILINE)
+    assert re.search(r"^broken +numba +pip install numba$", result.out, re.MULTILINE)
+    assert result.err.count("\n") == 1

@@ -1,4 +1,4 @@
-"""What goes wrong is a line and an exit status, and leaves nothing."""
+"""Errors: one line, an exit status, and no files."""
 
 from __future__ import annotations
 
@@ -10,21 +10,20 @@ from pathlib import Path
 
 import pytest
 
-from cli.said import SMALL, Run, assert_refused, listing
+from cli.harness import SMALL, Run, assert_refused, listing
 from files.scene_files import write_colmap
 
 STEGO = "hidden/publish/model.ply"
 
 
-def _truncated_scene(folder: Path) -> list[object]:
-    """`fit` on a COLMAP scene."""
+def _fit_truncated(folder: Path) -> list[object]:
     points = write_colmap(folder / "scene", count=4) / "sparse" / "0" / "points3D.bin"
     points.write_bytes(points.read_bytes()[:40])
     return ["fit", folder / "scene", "-o", folder / "out", *SMALL]
 
 
-def _ply_with(change: Callable[[bytes], bytes]) -> Callable[[Path], list[object]]:
-    """`reveal` on a stego file after `change` of its bytes."""
+def _reveal_changed(change: Callable[[bytes], bytes]) -> Callable[[Path], list[object]]:
+    """`reveal` on a stego file with changed bytes."""
 
     def prepare(folder: Path) -> list[object]:
         stego = folder / "hidden" / "publish" / "model.ply"
@@ -42,31 +41,29 @@ def _hide(folder: Path, **changes: object) -> list[object]:
     return ["hide", "--publish", "any", *(part for option in options.items() for part in option), *SMALL]
 
 
-def _model_in_model(folder: Path, *extra: object, **changes: object) -> list[object]:
-    """`hide` of a model in a model."""
-    files = {"cover": _plain(folder, "cover"), "secret": _plain(folder, "secret-1"), "out": folder / "out"}
-    files |= {"key_file": folder / "key.txt"} | changes
+def _hide_models(folder: Path, *extra: object, **changes: object) -> list[object]:
+    files = {"cover": _private_model(folder, "cover"), "secret": _private_model(folder, "secret-1")}
+    files |= {"out": folder / "out", "key_file": folder / "key.txt"} | changes
     options = [part for name, value in files.items() for part in (f"--{name.replace('_', '-')}", value)]
     return ["hide", "--publish", "any", *options, *extra]
 
 
-def _loop(folder: Path) -> Path:
+def _link_loop(folder: Path) -> Path:
     (folder / "loop.ply").symlink_to("loop.ply")
     return folder
 
 
-def _without_clip(folder: Path) -> list[object]:
+def _hide_without_clip(folder: Path) -> list[object]:
     pytest.importorskip("transformers", reason="needs keyss[clip]")
-    return _jointly(folder, design="published", key_encoder="clip", clip_model=folder / "a")
+    return _hide_by_keyss(folder, design="published", key_encoder="clip", clip_model=folder / "a")
 
 
-def _jointly(folder: Path, **changes: object) -> list[object]:
-    """`hide` by a method that publishes low bits only."""
+def _hide_by_keyss(folder: Path, **changes: object) -> list[object]:
     command, _, _, *options = _hide(folder, method="keyss", **changes)
     return [command, *options]
 
 
-def _plain(folder: Path, name: str) -> Path:
+def _private_model(folder: Path, name: str) -> Path:
     return folder / "hidden" / "private" / f"{name}.ply"
 
 
@@ -76,7 +73,7 @@ def _reveal_to(folder: Path, out: str) -> list[object]:
 
 ERRORS: dict[str, tuple[int, str, Callable[[Path], list[object]]]] = {
     "unknown layout": (4, "Known layouts", lambda f: ["fit", f / "hidden/private", "-o", f / "out"]),
-    "truncated points": (4, "points3D", _truncated_scene),
+    "truncated points": (4, "points3D", _fit_truncated),
     "no cover": (4, "nowhere", lambda f: _hide(f, cover=f / "nowhere")),
     "too few Gaussians": (2, "--channel appended has room", lambda f: [*_hide(f), "--channel", "colours"]),
     "output exists": (5, "--overwrite", lambda f: _hide(f, out=f / "hidden")),
@@ -84,7 +81,7 @@ ERRORS: dict[str, tuple[int, str, Callable[[Path], list[object]]]] = {
     "key file missing": (4, "none.txt", lambda f: _hide(f, key_file=f / "none.txt")),
     "too few key files": (2, "--key-file", lambda f: [*_hide(f), "--secret", f / "b"]),
     "no key at all": (2, "KEYSS_KEY", lambda f: ["reveal", f / STEGO, "-o", f / "s.ply"]),
-    "data truncated": (4, "model.ply", _ply_with(lambda data: data[:-1])),
+    "data truncated": (4, "model.ply", _reveal_changed(lambda data: data[:-1])),
     "a secret among what is published": (
         5,
         "given away",
@@ -94,17 +91,17 @@ ERRORS: dict[str, tuple[int, str, Callable[[Path], list[object]]]] = {
     "a model of a model": (
         2,
         "leave out --cover-model",
-        lambda f: _hide(f, cover=_plain(f, "cover"), cover_model=_plain(f, "secret-1")),
+        lambda f: _hide(f, cover=_private_model(f, "cover"), cover_model=_private_model(f, "secret-1")),
     ),
-    "enormous pictures of a model": (2, "width", lambda f: _model_in_model(f, "--width", 10**10)),
-    "a link to itself": (4, "loop.ply", lambda f: _model_in_model(f, secret=_loop(f) / "loop.ply")),
+    "enormous pictures of a model": (2, "width", lambda f: _hide_models(f, "--width", 10**10)),
+    "a link to itself": (4, "loop.ply", lambda f: _hide_models(f, secret=_link_loop(f) / "loop.ply")),
     "a model of a secret model": (
         2,
         "leave out --secret-model",
-        lambda f: _hide(f, secret=_plain(f, "secret-1"), secret_model=_plain(f, "cover")),
+        lambda f: _hide(f, secret=_private_model(f, "secret-1"), secret_model=_private_model(f, "cover")),
     ),
     "info of nothing": (4, "nowhere", lambda f: ["info", f / "nowhere"]),
-    "clip without a model": (6, "--clip-model", _without_clip),
+    "clip without a model": (6, "--clip-model", _hide_without_clip),
     "background out of range": (
         2,
         "background",
@@ -114,32 +111,30 @@ ERRORS: dict[str, tuple[int, str, Callable[[Path], list[object]]]] = {
 
 
 @pytest.mark.parametrize("name", ERRORS)
-def test_errors_are_a_line_and_leave_nothing(keyss: Run, world: Path, tmp_path: Path, name: str) -> None:
+def test_errors(keyss: Run, workspace: Path, tmp_path: Path, name: str) -> None:
     status, words, prepare = ERRORS[name]
-    shutil.copytree(world, tmp_path, dirs_exist_ok=True)
+    shutil.copytree(workspace, tmp_path, dirs_exist_ok=True)
     arguments = prepare(tmp_path)
     before = listing(tmp_path)
     assert_refused(keyss(*arguments), status, words)
     assert listing(tmp_path) == before
 
 
-def test_a_full_disk_is_a_line_and_leaves_nothing(
-    keyss: Run, world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_full_disk(keyss: Run, workspace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(descriptor: int) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr("keyss.files.atomic.os.fsync", full)
-    arguments = [world / "hidden" / "publish" / "model.ply", "--key-file", world / "key.txt"]
+    arguments = [workspace / "hidden" / "publish" / "model.ply", "--key-file", workspace / "key.txt"]
     assert_refused(keyss("reveal", *arguments, "-o", tmp_path / "secret.ply"), 5, "No space left")
-    arguments = [world / "hidden" / "publish" / "model.ply", "--cameras", world / "a"]
+    arguments = [workspace / "hidden" / "publish" / "model.ply", "--cameras", workspace / "a"]
     assert_refused(keyss("render", *arguments, "-o", tmp_path / "images"), 5, "No space left")
     assert listing(tmp_path) == {}
 
 
 class TestUnexpectedErrors:
     @pytest.fixture
-    def failing(self, monkeypatch: pytest.MonkeyPatch) -> Callable[[BaseException], None]:
+    def fail_info(self, monkeypatch: pytest.MonkeyPatch) -> Callable[[BaseException], None]:
         def fail_with(error: BaseException) -> None:
             def info(path: Path) -> None:
                 raise error
@@ -148,18 +143,16 @@ class TestUnexpectedErrors:
 
         return fail_with
 
-    def test_ours_are_a_line_that_asks_for_a_report(
-        self, keyss: Run, failing: Callable[[BaseException], None]
-    ) -> None:
-        failing(ValueError("first\nsecond\x1b[31m"))
-        said = keyss("info", "x")
-        assert_refused(said, 70, "ValueError: first second [31m; please report")
-        assert "KEYSS_DEBUG=1" in said.err
+    def test_internal_error(self, keyss: Run, fail_info: Callable[[BaseException], None]) -> None:
+        fail_info(ValueError("first\nsecond\x1b[31m"))
+        result = keyss("info", "x")
+        assert_refused(result, 70, "ValueError: first second [31m; please report")
+        assert "KEYSS_DEBUG=1" in result.err
 
-    def test_ours_come_through_for_whoever_debugs(
-        self, keyss: Run, failing: Callable[[BaseException], None], monkeypatch: pytest.MonkeyPatch
+    def test_debug_reraises(
+        self, keyss: Run, fail_info: Callable[[BaseException], None], monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        failing(ValueError("boom"))
+        fail_info(ValueError("boom"))
         monkeypatch.setenv("KEYSS_DEBUG", "1")
         with pytest.raises(ValueError, match="boom"):
             keyss("info", "x")
@@ -173,13 +166,13 @@ class TestUnexpectedErrors:
             (KeyboardInterrupt(), 130, "interrupted"),
         ],
     )
-    def test_the_machines_are_explained(
+    def test_system_errors(
         self,
         keyss: Run,
-        failing: Callable[[BaseException], None],
+        fail_info: Callable[[BaseException], None],
         error: BaseException,
         status: int,
         words: str,
     ) -> None:
-        failing(error)
+        fail_info(error)
         assert_refused(keyss("info", "x"), status, words)

@@ -1,4 +1,4 @@
-"""Without the extra `audit` everything works but what measures and reports, which says so."""
+"""Only the commands of the laboratory need the extra `audit`."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ REFUSED = (
 )
 
 
-def test_only_audits_need_the_extra(tmp_path: Path) -> None:
+def test_without_audit_extra(tmp_path: Path) -> None:
     write_blender(tmp_path / "a", count=3, channels=3)
     write_nerfstudio(tmp_path / "b", count=4)
     write_model(tmp_path / "cover.ply", trained_like(1500))

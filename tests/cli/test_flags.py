@@ -1,4 +1,4 @@
-"""Messages name arguments as Python does below the command line, and as flags on it."""
+"""On the command line, messages name flags instead of Python arguments."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from cli.said import Run
+from cli.harness import Run
 from keyss.cli import entry
 from keyss.core import KeyssWarning, UsageError
 
@@ -15,40 +15,35 @@ OPTIONS = {"overwrite", "sh_degree", "key_file", "secret", "publish", "secret_mo
 
 
 @pytest.mark.parametrize(
-    ("message", "said"),
+    ("message", "expected"),
     [
         ("`overwrite=True` replaces it", "--overwrite replaces it"),
         ('`method="keyss"` can', "--method keyss can"),
-        ('`method="carry", dither=True` has one', "--method carry --dither has one"),
+        ('`method="carry", overwrite=True` has one', "--method carry --overwrite has one"),
         ("`max_gaussians=30000` would do", "--max-gaussians 30000 would do"),
         ("`min_psnr=12.5`", "--min-psnr 12.5"),
         ("`decoy=False`", "no --decoy"),
         ("give `sh_degree`, `publish`", "give --sh-degree, --publish"),
         ("`key`, `secrets` and `model`", "--key-file, --secret and --secret-model"),
-        # What is no option of the command stays, whatever it is.
+        # Other code stays as it is.
         ("`chmod 600` and `f_dc_0` and `reporter`", "`chmod 600` and `f_dc_0` and `reporter`"),
         ("`keyss keygen -o FILE`", "`keyss keygen -o FILE`"),
         ("x=`; overwrite=True", "x=`; overwrite=True"),
     ],
 )
-def test_arguments_become_flags(message: str, said: str) -> None:
-    assert entry.as_flags(message, OPTIONS) == said
+def test_argument_names_become_flags(message: str, expected: str) -> None:
+    assert entry.as_flags(message, OPTIONS) == expected
 
 
-class TestWarnings:
-    @pytest.fixture
-    def warning(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        def info(path: Path) -> None:
-            for number in (1, 1, 2):
-                warnings.warn(f"no. {number}\n`overwrite=True`", KeyssWarning, stacklevel=1)
-            raise UsageError("at last")
+def test_repeated_warnings_print_once(keyss: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    def info(path: Path) -> None:
+        for number in (1, 1, 2):
+            warnings.warn(f"no. {number}\n`overwrite=True`", KeyssWarning, stacklevel=1)
+        raise UsageError("at last")
 
-        monkeypatch.setattr("keyss.runs.describe.info", info)
-
-    @pytest.mark.usefixtures("warning")
-    def test_ours_are_a_line_each_once(self, keyss: Run) -> None:
-        assert keyss("info", "x").err.splitlines() == [
-            "keyss: warning: no. 1 --overwrite",
-            "keyss: warning: no. 2 --overwrite",
-            "keyss: error: at last",
-        ]
+    monkeypatch.setattr("keyss.runs.describe.info", info)
+    assert keyss("info", "x").err.splitlines() == [
+        "keyss: warning: no. 1 --overwrite",
+        "keyss: warning: no. 2 --overwrite",
+        "keyss: error: at last",
+    ]

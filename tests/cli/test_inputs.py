@@ -1,4 +1,4 @@
-"""Files and folders as people have them: taken where they can be, else called what they are."""
+"""Unexpected files and folders: accepted, or named in the error."""
 
 from __future__ import annotations
 
@@ -11,51 +11,49 @@ from pathlib import Path
 
 import pytest
 
-from cli.said import SMALL, Run, Said, assert_refused, listing
+from cli.harness import SMALL, Result, Run, assert_refused, listing, scene_arguments
 from files.scene_files import write_blender, write_colmap, write_nerfstudio
 
 
-def key(folder: Path) -> tuple[str, Path]:
+def key_argument(folder: Path) -> tuple[str, Path]:
     return "--key-file", folder / "key.txt"
 
 
 @pytest.mark.parametrize("inside", ["", "publish"])
-def test_a_run_in_place_of_a_model_is_told_its_file(
-    keyss: Run, world: Path, tmp_path: Path, inside: str
-) -> None:
-    run, out = world / "hidden" / inside, tmp_path / "out"
-    give = f"found a folder; give {world / 'hidden' / 'publish' / 'model.ply'}"
-    assert_refused(keyss("reveal", run, *key(world), "-o", tmp_path / "s.ply"), 4, give)
-    assert_refused(keyss("render", run, "--cameras", world / "a", "-o", out), 4, give)
-    hide = ("hide", "--cover", world / "a", "--secret", world / "b", *key(world), "-o", out)
+def test_run_folder_as_model(keyss: Run, workspace: Path, tmp_path: Path, inside: str) -> None:
+    run, out = workspace / "hidden" / inside, tmp_path / "out"
+    give = f"found a folder; give {workspace / 'hidden' / 'publish' / 'model.ply'}"
+    assert_refused(keyss("reveal", run, *key_argument(workspace), "-o", tmp_path / "s.ply"), 4, give)
+    assert_refused(keyss("render", run, "--cameras", workspace / "a", "-o", out), 4, give)
+    hide = ("hide", *scene_arguments(workspace), "-o", out)
     assert_refused(keyss(*hide, "--cover-model", run), 4, give)
     assert listing(tmp_path) == {}
 
 
 @pytest.mark.parametrize("inside", ["publish/model.ply", "publish", "private", "private/config.json"])
 @pytest.mark.parametrize("command", ["evaluate", "audit", "audit --report-only"])
-def test_what_lies_in_a_run_is_told_the_run(keyss: Run, world: Path, command: str, inside: str) -> None:
-    path = world / "hidden" / inside
-    said = keyss(*command.split(), path, *key(world))
+def test_path_inside_run(keyss: Run, workspace: Path, command: str, inside: str) -> None:
+    path = workspace / "hidden" / inside
+    result = keyss(*command.split(), path, *key_argument(workspace))
     kind = "a folder" if path.is_dir() else "a file"
-    assert_refused(said, 4, f"{path}: expected the folder of a run")
-    assert f"found {kind} in one; give {world / 'hidden'}" in said.err
+    assert_refused(result, 4, f"{path}: expected the folder of a run")
+    assert f"found {kind} in one; give {workspace / 'hidden'}" in result.err
 
 
-def test_a_key_file_in_place_of_a_model_is_not_quoted(keyss: Run, world: Path, tmp_path: Path) -> None:
-    (text,) = (world / "key.txt").read_text().split()
+def test_key_file_as_model(keyss: Run, workspace: Path, tmp_path: Path) -> None:
+    (text,) = (workspace / "key.txt").read_text().split()
     for arguments in (
-        ("info", world / "key.txt"),
-        ("reveal", world / "key.txt", *key(world), "-o", tmp_path / "s.ply"),
+        ("info", workspace / "key.txt"),
+        ("reveal", workspace / "key.txt", *key_argument(workspace), "-o", tmp_path / "s.ply"),
     ):
-        said = keyss(*arguments)
-        assert_refused(said, 4, "found a file of no kind that keyss knows")
-        assert text[:3] not in said.err
+        result = keyss(*arguments)
+        assert_refused(result, 4, "found a file of unknown kind")
+        assert text[:3] not in result.err
 
 
 @contextmanager
 def unprivileged() -> Iterator[None]:
-    """As somebody whom permissions bind: tests may run as root."""
+    """Drop root, whom permissions do not bind."""
     root = os.geteuid() == 0
     if root:
         os.seteuid(65534)
@@ -68,7 +66,7 @@ def unprivileged() -> Iterator[None]:
 
 @pytest.fixture
 def open_folder() -> Iterator[Path]:
-    """A folder that everybody may enter, as `tmp_path` is not, with a key that everybody may read."""
+    """A folder with a key that other users can read, unlike `tmp_path`."""
     with tempfile.TemporaryDirectory() as folder:
         os.chmod(folder, 0o755)
         (Path(folder) / "key").write_text("q7Rv2LxT9bWm4KzD")
@@ -76,9 +74,7 @@ def open_folder() -> Iterator[Path]:
 
 
 @pytest.mark.parametrize("closed", ["", "images", "sparse/0"])
-def test_an_unreadable_scene_is_an_input_that_cannot_be_read(
-    keyss: Run, open_folder: Path, closed: str
-) -> None:
+def test_unreadable_scene(keyss: Run, open_folder: Path, closed: str) -> None:
     scene, key = write_colmap(open_folder / "scene"), ("--key-file", open_folder / "key")
     (scene / closed).chmod(0)
     commands = (
@@ -88,24 +84,24 @@ def test_an_unreadable_scene_is_an_input_that_cannot_be_read(
         ("evaluate", scene, *key),
     )
     for command in commands:
-        # Imports all it needs.
+        # Import everything before dropping root.
         keyss(*[open_folder / "nowhere" if each is scene else each for each in command])
         with unprivileged():
-            said = keyss(*command)
-        assert_refused(said, 4, str(scene))
-        assert "ermission denied" in said.err or (command[0] == "evaluate" and closed)
+            result = keyss(*command)
+        assert_refused(result, 4, str(scene))
+        assert "ermission denied" in result.err or (command[0] == "evaluate" and closed)
     (scene / closed).chmod(0o700)
 
 
-def fitted(keyss: Run, scene: Path, out: Path, *extra: object) -> Said:
-    said = keyss("fit", scene, "-o", out, *SMALL, *extra)
-    assert said.status == 0, said.err
+def fit(keyss: Run, scene: Path, out: Path, *extra: object) -> Result:
+    result = keyss("fit", scene, "-o", out, *SMALL, *extra)
+    assert result.status == 0, result.err
     assert (out / "model.ply").stat().st_size > 0
-    return said
+    return result
 
 
-def warnings_of(said: Said) -> list[str]:
-    return [line for line in said.err.splitlines() if line.startswith("keyss: warning: ")]
+def warning_lines(result: Result) -> list[str]:
+    return [line for line in result.err.splitlines() if line.startswith("keyss: warning: ")]
 
 
 MISSING = {
@@ -116,16 +112,16 @@ MISSING = {
 
 
 @pytest.mark.parametrize("layout", MISSING)
-def test_a_missing_photo_is_named_and_left_out_on_demand(keyss: Run, tmp_path: Path, layout: str) -> None:
+def test_missing_photo(keyss: Run, tmp_path: Path, layout: str) -> None:
     write, path, name = MISSING[layout]
     scene = write(tmp_path / "scene", count=4)
     (scene / path).unlink()
-    said = keyss("fit", scene, "-o", tmp_path / "out", *SMALL)
-    assert_refused(said, 4, f"1 of 4 photos are missing: {name};")
-    assert "--skip-missing" in said.err
+    result = keyss("fit", scene, "-o", tmp_path / "out", *SMALL)
+    assert_refused(result, 4, f"1 of 4 photos are missing: {name};")
+    assert "--skip-missing" in result.err
     assert not (tmp_path / "out").exists()
-    (warning,) = warnings_of(fitted(keyss, scene, tmp_path / "out", "--skip-missing"))
-    assert warning.endswith(f"1 of 4 photos are missing and left out: {name}")
+    (warning,) = warning_lines(fit(keyss, scene, tmp_path / "out", "--skip-missing"))
+    assert warning.endswith(f"1 of 4 photos are missing, left out: {name}")
     described = keyss("info", scene, "--json")
     assert json.loads(described.out)["train_views"] == {"colmap": 2, "blender": 3, "nerfstudio": 2}[layout]
-    assert warnings_of(described) == [warning]
+    assert warning_lines(described) == [warning]

@@ -1,4 +1,4 @@
-"""Where keys come from."""
+"""Keys from files, the environment and the prompt."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def write(folder: Path, data: bytes) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("data", "key", "said"),
+    ("data", "key", "warns"),
     [
         (b"abc", "abc", False),
         (b"abc\n", "abc", False),
@@ -40,11 +40,11 @@ def write(folder: Path, data: bytes) -> Path:
     ],
 )
 @pytest.mark.filterwarnings("ignore:white space")
-def test_surrounding_white_space_never_counts(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, data: bytes, key: str, said: bool
+def test_white_space_is_stripped(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, data: bytes, key: str, warns: bool
 ) -> None:
-    """The file, the environment and whoever passes the text of a file in Python have the same key."""
-    with pytest.warns(KeyssWarning, match="white space") if said else nullcontext():
+    """In files, in the environment and in Python."""
+    with pytest.warns(KeyssWarning, match="white space") if warns else nullcontext():
         assert keys.keys([write(tmp_path, data)], 1) == [key]
     monkeypatch.setenv("KEYSS_KEY", data.decode())
     assert keys.keys([], 1) == [key]
@@ -62,12 +62,12 @@ def test_surrounding_white_space_never_counts(
         (b"\xff\xfe", "UTF-8"),
     ],
 )
-def test_files_that_hold_no_key_are_refused(tmp_path: Path, data: bytes, words: str) -> None:
+def test_invalid_key_files(tmp_path: Path, data: bytes, words: str) -> None:
     with pytest.raises(InputError, match=words):
         keys.key_of_file(write(tmp_path, data))
 
 
-def test_files_come_before_the_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_key_file_takes_precedence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("KEYSS_KEY", "from the environment")
     assert keys.keys([write(tmp_path, b"from the file\n")], 1) == ["from the file"]
     assert keys.keys([], 1) == ["from the environment"]
@@ -84,20 +84,20 @@ def test_files_come_before_the_environment(tmp_path: Path, monkeypatch: pytest.M
 class TestPrompt:
     @pytest.fixture
     def typed(self, monkeypatch: pytest.MonkeyPatch) -> list[str]:
-        """What a person types, to be filled by the test."""
+        """Answers at the prompt, filled by the test."""
         answers: list[str] = []
         monkeypatch.setattr("sys.stdin.isatty", lambda: True, raising=False)
         monkeypatch.setattr(getpass, "getpass", lambda prompt: answers.pop(0))
         return answers
 
-    def test_asks_once_to_open_and_twice_to_lock(self, typed: list[str]) -> None:
+    def test_confirms_when_hiding(self, typed: list[str]) -> None:
         typed += ["one", "one", "two", "two"]
         assert keys.keys([], 2, confirm=True) == ["one", "two"]
         typed += ["three"]
         assert keys.keys([], 1) == ["three"]
         assert typed == []
 
-    def test_refuses_a_slip(self, typed: list[str]) -> None:
+    def test_mismatch_is_refused(self, typed: list[str]) -> None:
         typed += ["one", "onw"]
         with pytest.raises(UsageError, match="differ"):
             keys.keys([], 1, confirm=True)
@@ -106,25 +106,23 @@ class TestPrompt:
             keys.keys([], 1, confirm=True)
 
 
-def test_a_key_file_that_others_can_read_gets_a_warning_without_the_key(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_readable_key_file_warning(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = write(tmp_path, b"tell nobody")
     path.chmod(0o600)
     keys.key_of_file(path)
     assert capsys.readouterr().err == ""
     path.chmod(0o640)
     keys.key_of_file(path)
-    said = capsys.readouterr().err
-    assert "others can read" in said
-    assert "tell nobody" not in said
+    err = capsys.readouterr().err
+    assert "others can read" in err
+    assert "tell nobody" not in err
 
 
-def test_weak_keys_get_a_warning_without_the_key(capsys: pytest.CaptureFixture[str]) -> None:
+def test_weak_key_warning(capsys: pytest.CaptureFixture[str]) -> None:
     keys.warn_of_weak_keys([generate_key(20)])
     assert capsys.readouterr().err == ""
     keys.warn_of_weak_keys([generate_key(20), "hunter2"])
-    said = capsys.readouterr().err
-    assert "key 2: " in said
-    assert "guesses" in said
-    assert "hunter2" not in said
+    err = capsys.readouterr().err
+    assert "key 2: " in err
+    assert "guesses" in err
+    assert "hunter2" not in err

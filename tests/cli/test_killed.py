@@ -1,4 +1,4 @@
-"""Whatever ends a command, and whenever: repeated, it ends in the result of one that nothing disturbed."""
+"""Commands killed at any moment and repeated give the result of an uninterrupted run."""
 
 from __future__ import annotations
 
@@ -10,27 +10,27 @@ import signal
 import subprocess
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 
-from cli.said import PROGRAM, write_world
+from cli.harness import PROGRAM, write_workspace
 
 SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
 SIZE = "--preset quick --iterations 150 --max-gaussians 240 --device cpu --seed 0"
-UNFINISHED = ("unfinished", "lock", "checkpoint")  # in names of what may not be left
+UNFINISHED = ("unfinished", "lock", "checkpoint")  # parts of the names of files that must not remain
 
 
 @dataclass(frozen=True)
 class Command:
-    """A command that is disturbed; OUT and RUN in its arguments stand for what it writes and works in."""
+    """A command; OUT and RUN in its arguments stand for its output and its run folder."""
 
     arguments: str
-    again: str  # option with which it is repeated
-    in_run: bool = False  # works in a copy of what `hide` comes to
-    results: tuple[str, ...] = field(default=())  # files that must be the same to the byte
-    numbers: tuple[str, ...] = field(default=())  # JSON that must be the same but for seconds
+    again: str  # the option to repeat it with
+    in_run: bool = False  # needs a copy of the run that `hide` writes
+    results: tuple[str, ...] = ()  # files compared byte by byte
+    numbers: tuple[str, ...] = ()  # JSON compared without times
 
 
 SCENES = "--cover a --secret b --key-file key.txt"
@@ -57,14 +57,14 @@ COMMANDS: Mapping[str, Command] = {
 }
 
 
-def started(arguments: list[str], folder: Path) -> subprocess.Popen[str]:
+def start(arguments: list[str], folder: Path) -> subprocess.Popen[str]:
     return subprocess.Popen(
         [*PROGRAM, *arguments], cwd=folder, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
     )
 
 
 def without_times(text: str) -> object:
-    """A record without what differs from run to run: how long it took, and where it lies."""
+    """Parsed JSON without durations and paths."""
 
     def plain(value: object) -> object:
         if isinstance(value, dict):
@@ -83,13 +83,12 @@ def result_of(command: Command, out: Path, run: Path) -> list[object]:
 
 
 @pytest.fixture(scope="module")
-def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two scenes and a key."""
-    return write_world(tmp_path_factory.mktemp("killed"))
+def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_workspace(tmp_path_factory.mktemp("killed"))
 
 
-class Undisturbed:
-    """Of each command what it comes to, and how long it takes."""
+class Reference:
+    """Results and durations of uninterrupted commands."""
 
     def __init__(self, folder: Path) -> None:
         self.folder, self.found = folder, dict[str, tuple[list[object], float]]()
@@ -97,9 +96,9 @@ class Undisturbed:
 
     def __call__(self, name: str) -> tuple[list[object], float]:
         if name not in self.found:
-            out, run, arguments = prepared(self.folder, name, "undisturbed")
+            out, run, arguments = prepare(self.folder, name, "reference")
             before = time.monotonic()
-            with started(arguments, self.folder) as process:
+            with start(arguments, self.folder) as process:
                 _, err = process.communicate()
             assert process.returncode == 0, err
             self.found[name] = result_of(COMMANDS[name], out, run), time.monotonic() - before
@@ -107,34 +106,38 @@ class Undisturbed:
 
 
 @pytest.fixture(scope="module")
-def undisturbed(world: Path) -> Undisturbed:
-    return Undisturbed(world)
+def reference(workspace: Path) -> Reference:
+    return Reference(workspace)
 
 
-def prepared(folder: Path, name: str, which: str) -> tuple[Path, Path, list[str]]:
-    """Output, run folder and arguments of a command that has a place of its own."""
+def prepare(folder: Path, name: str, which: str) -> tuple[Path, Path, list[str]]:
+    """Output, run folder and arguments of a command in its own folder."""
     place = folder / f"{name}-{which}"
     place.mkdir()
     out, run = place / ("out.ply" if name == "reveal" else "out"), place / "run"
     if COMMANDS[name].in_run:
-        shutil.copytree(folder / "hide-undisturbed" / "out", run)
+        shutil.copytree(folder / "hide-reference" / "out", run)
     parts = [
         part.replace("OUT", str(out)).replace("RUN", str(run)) for part in COMMANDS[name].arguments.split()
     ]
     return out, run, parts
 
 
-def disturb(
-    world: Path, undisturbed: Callable[[str], tuple[list[object], float]], name: str, signum: int, seed: int
+def check_resumes(
+    workspace: Path,
+    reference: Callable[[str], tuple[list[object], float]],
+    name: str,
+    signum: int,
+    seed: int,
 ) -> None:
-    expected, seconds = undisturbed(name)
+    expected, seconds = reference(name)
     rng = random.Random(seed)
-    out, run, arguments = prepared(world, name, str(seed))
+    out, run, arguments = prepare(workspace, name, str(seed))
     mine = out.parent / "mine.txt"
     mine.write_text("mine")
     again = arguments
-    for _ in range(rng.choice((1, 1, 2))):  # some are disturbed once more
-        with started(again, world) as process:
+    for _ in range(rng.choice((1, 1, 2))):  # some are killed twice
+        with start(again, workspace) as process:
             try:
                 process.wait(rng.uniform(0, 1.1 * seconds))
             except subprocess.TimeoutExpired:
@@ -146,9 +149,9 @@ def disturb(
         if process.returncode == 0:
             break
     if process.returncode != 0:
-        with started(again, world) as process:
+        with start(again, workspace) as process:
             _, err = process.communicate(timeout=300)
-        # It may have been done just before the signal came.
+        # It may have finished just before the signal.
         assert process.returncode == 0 or "holds a finished run" in err, err
         assert "Traceback" not in err
     assert result_of(COMMANDS[name], out, run) == expected
@@ -160,6 +163,6 @@ def disturb(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(50))
-def test_fifty_commands_are_disturbed(world: Path, undisturbed: Undisturbed, seed: int) -> None:
+def test_killed_commands_resume(workspace: Path, reference: Reference, seed: int) -> None:
     name = list(COMMANDS)[seed % len(COMMANDS)]
-    disturb(world, undisturbed, name, SIGNALS[seed // len(COMMANDS) % len(SIGNALS)], seed)
+    check_resumes(workspace, reference, name, SIGNALS[seed // len(COMMANDS) % len(SIGNALS)], seed)

@@ -1,4 +1,4 @@
-"""Models as other programs write them, by the commands that a new user tries first."""
+"""hide, reveal, view and convert on models as other programs write them."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from numpy.lib.recfunctions import append_fields, repack_fields
 from plyfile import PlyData, PlyElement
 
 from channels.quiet.trained_like import trained_like
-from cli.said import SMALL, Run, write_key
+from cli.harness import SMALL, Run, write_key
 from files.scene_files import HEIGHT, WIDTH, save, write_colmap
 from keyss.files import read_model, write_model
 
@@ -20,8 +20,8 @@ Write = Callable[[Path, np.ndarray], None]
 COUNT = 800
 
 
-def with_plyfile(*more: PlyElement, first: bool = False, **options: object) -> Write:
-    """With other elements before or after the Gaussians."""
+def plyfile_writer(*more: PlyElement, first: bool = False, **options: object) -> Write:
+    """Write with plyfile, with other elements before or after the Gaussians."""
 
     def write(path: Path, rows: np.ndarray) -> None:
         own = [PlyElement.describe(rows, "vertex")]
@@ -30,109 +30,117 @@ def with_plyfile(*more: PlyElement, first: bool = False, **options: object) -> W
     return write
 
 
-def doubles(path: Path, rows: np.ndarray) -> None:
-    with_plyfile(byte_order=">")(path, rows.astype([(name, "f8") for name in rows.dtype.names]))
+def write_doubles(path: Path, rows: np.ndarray) -> None:
+    plyfile_writer(byte_order=">")(path, rows.astype([(name, "f8") for name in rows.dtype.names]))
 
 
-def labels(path: Path, rows: np.ndarray) -> None:
-    """Colours of a point cloud and numbers of objects beside each Gaussian."""
+def write_labels(path: Path, rows: np.ndarray) -> None:
+    """Add point colours and object numbers."""
     kinds = {"red": "u1", "green": "u1", "blue": "u1", "segment": "i4"}
     values = [np.arange(len(rows)).astype(kind) for kind in kinds.values()]
-    with_plyfile()(path, append_fields(rows, list(kinds), values, usemask=False))
+    plyfile_writer()(path, append_fields(rows, list(kinds), values, usemask=False))
 
 
-def shuffled(path: Path, rows: np.ndarray) -> None:
+def write_sorted_properties(path: Path, rows: np.ndarray) -> None:
     names = [name for name in sorted(rows.dtype.names) if not name.startswith("n")]
-    with_plyfile()(path, repack_fields(rows[names]))
+    plyfile_writer()(path, repack_fields(rows[names]))
 
 
-def carriage_returns(path: Path, rows: np.ndarray) -> None:
-    with_plyfile()(path, rows)
+def write_crlf(path: Path, rows: np.ndarray) -> None:
+    plyfile_writer()(path, rows)
     header, end, data = path.read_bytes().partition(b"end_header\n")
     path.write_bytes((header + end).replace(b"\n", b"\r\n") + data)
 
 
-def changed(**values: float) -> Write:
-    """The first half of the Gaussians with these numbers."""
+def value_writer(**values: float) -> Write:
+    """Overwrite values of the first half of the Gaussians."""
 
     def write(path: Path, rows: np.ndarray) -> None:
         for name, value in values.items():
             rows[name][: len(rows) // 2] = value
-        with_plyfile()(path, rows)
+        plyfile_writer()(path, rows)
 
     return write
 
 
-def of_gsply(path: Path, rows: np.ndarray) -> None:
-    with_plyfile()(path, rows)
+def write_gsply(path: Path, rows: np.ndarray) -> None:
+    plyfile_writer()(path, rows)
     gsply.plywrite(str(path), gsply.plyread(str(path)))
 
 
 FACES = PlyElement.describe(np.array([([0, 1, 2],)], dtype=[("vertex_indices", "i4", (3,))]), "face")
 CAMERA = PlyElement.describe(np.zeros(1, [("view_px", "f4"), ("frame", "i4")]), "camera")
+TRAINING_OUTPUTS = (  # of Inria's program, gsplat and Nerfstudio
+    "point_cloud/iteration_30000/point_cloud.ply",
+    "ply/point_cloud_29999.ply",
+    "exports/splat/splat.ply",
+)
 KINDS: dict[str, Write] = {
-    "big-endian doubles": doubles,
-    "text": with_plyfile(text=True),
-    "a camera before the Gaussians": with_plyfile(CAMERA, first=True, comments=["SH degree 1"]),
-    "faces behind the Gaussians": with_plyfile(FACES),
-    "labels": labels,
-    "properties by name, no normals": shuffled,
-    "lines that end as on Windows": carriage_returns,
-    "gsply": of_gsply,
-    "quaternions of length 0": changed(rot_0=0, rot_1=0, rot_2=0, rot_3=0),
-    "round and opaque": changed(scale_0=-4, scale_1=-4, scale_2=-4, opacity=20),
-    "one stray Gaussian": lambda path, rows: changed(x=0)(path, np.append(rows, far_out(rows[:1]))),
-    "copies of one Gaussian": lambda path, rows: with_plyfile()(path, np.repeat(rows[:1], len(rows))),
+    "big-endian doubles": write_doubles,
+    "text": plyfile_writer(text=True),
+    "a camera before the Gaussians": plyfile_writer(CAMERA, first=True, comments=["SH degree 1"]),
+    "faces behind the Gaussians": plyfile_writer(FACES),
+    "labels": write_labels,
+    "properties by name, no normals": write_sorted_properties,
+    "lines that end as on Windows": write_crlf,
+    "gsply": write_gsply,
+    "quaternions of length 0": value_writer(rot_0=0, rot_1=0, rot_2=0, rot_3=0),
+    "round and opaque": value_writer(scale_0=-4, scale_1=-4, scale_2=-4, opacity=20),
+    "one stray Gaussian": lambda path, rows: value_writer(x=0)(path, np.append(rows, move_far_out(rows[:1]))),
+    "copies of one Gaussian": lambda path, rows: plyfile_writer()(path, np.repeat(rows[:1], len(rows))),
 }
 
 
-def far_out(rows: np.ndarray) -> np.ndarray:
+def move_far_out(rows: np.ndarray) -> np.ndarray:
     rows = rows.copy()
     rows["y"] = 1e9
     return rows
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_the_first_commands_of_a_new_user(keyss: Run, tmp_path: Path, kind: str) -> None:
+def test_hide_reveal_view_convert(keyss: Run, tmp_path: Path, kind: str) -> None:
     model, run, revealed = tmp_path / "model.ply", tmp_path / "run", tmp_path / "revealed.ply"
     write_model(model, trained_like(COUNT, 0, 1))
     write_model(tmp_path / "secret.ply", trained_like(30, 1, 1))
     KINDS[kind](model, PlyData.read(str(model))["vertex"].data.copy())
     key = write_key(tmp_path / "key.txt")
     secret = ("--secret", tmp_path / "secret.ply", "--key-file", key)
-    said = keyss("hide", "--cover", model, *secret, "--width", 32, "-o", run)
-    assert said.status == 0, said.err
-    said = keyss("reveal", run / "publish" / "model.ply", "--key-file", key, "-o", revealed)
-    assert said.status == 0, said.err
+    result = keyss("hide", "--cover", model, *secret, "--width", 32, "-o", run)
+    assert result.status == 0, result.err
+    result = keyss("reveal", run / "publish" / "model.ply", "--key-file", key, "-o", revealed)
+    assert result.status == 0, result.err
     assert len(read_model(revealed)) == 30
     assert keyss("view", model, "-o", tmp_path / "page.html").status == 0
-    said = keyss("convert", model, tmp_path / "model.spz")
-    assert said.status == 0 or (kind == "one stray Gaussian" and "remove Gaussians far out" in said.err)
+    result = keyss("convert", model, tmp_path / "model.spz")
+    assert result.status == 0 or (kind == "one stray Gaussian" and "remove Gaussians far out" in result.err)
 
 
-@pytest.mark.parametrize("place", ["ply/point_cloud_29999.ply", "exports/splat/splat.ply"])
-def test_the_folder_of_a_training_is_a_cover(keyss: Run, tmp_path: Path, place: str) -> None:
+@pytest.mark.parametrize(
+    "place",
+    TRAINING_OUTPUTS,
+)
+def test_training_folder_as_cover(keyss: Run, tmp_path: Path, place: str) -> None:
     model, key = tmp_path / "training" / place, write_key(tmp_path / "key.txt")
     model.parent.mkdir(parents=True)
     write_model(model, trained_like(COUNT, 0, 1))
     write_model(tmp_path / "secret.ply", trained_like(30, 1, 1))
     secret = ("--secret", tmp_path / "secret.ply", "--key-file", key)
     run = tmp_path / "run"
-    said = keyss("hide", "--cover", tmp_path / "training", *secret, "--width", 32, "-o", run)
-    assert said.status == 0, said.err
-    assert f"training: a folder of a training; its model is {place}" in said.err
-    said = keyss("reveal", run / "publish" / "model.ply", "--key-file", key, "-o", tmp_path / "revealed.ply")
-    assert said.status == 0, said.err
+    result = keyss("hide", "--cover", tmp_path / "training", *secret, "--width", 32, "-o", run)
+    assert result.status == 0, result.err
+    assert f"training: output of a training; its model is {place}" in result.err
+    stego = run / "publish" / "model.ply"
+    assert keyss("reveal", stego, "--key-file", key, "-o", tmp_path / "revealed.ply").status == 0
 
 
-def test_masks_are_left_out_of_a_fit_and_said(keyss: Run, tmp_path: Path) -> None:
+def test_fit_with_masks(keyss: Run, tmp_path: Path) -> None:
     scene = write_colmap(tmp_path / "scene")
     mask = np.zeros((HEIGHT, WIDTH), np.uint8)
     mask[:, :3] = 255
     for index in range(3):
         save(scene / "masks" / f"{index:02}.png.png", mask)
-    said = keyss("fit", scene, "-o", tmp_path / "fit", *SMALL)
-    assert said.status == 0, said.err
+    result = keyss("fit", scene, "-o", tmp_path / "fit", *SMALL)
+    assert result.status == 0, result.err
     assert (
-        "3 of 3 photos have masks, which leave 75% of their pixels out of training and measures" in said.err
+        "3 of 3 photos have masks, which leave 75% of their pixels out of training and measures" in result.err
     )

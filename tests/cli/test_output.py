@@ -1,4 +1,4 @@
-"""Standard streams as they may be: closed, full, left by their reader, or without most characters."""
+"""Closed, full and broken output streams; encodings other than UTF-8."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from cli.said import COMMANDS, PROGRAM, SMALL, Run
+from cli.harness import COMMANDS, PROGRAM, SMALL, Run
 from keyss.cli import main, process
 
 NARROW = ["ascii", "cp1252", *(pytest.param(name, marks=pytest.mark.slow) for name in ("latin-1", "cp437"))]
@@ -32,19 +32,13 @@ def shell(redirection: str, *arguments: object, **environment: str) -> subproces
         ("2>/dev/full", 0),
         ("<&- >&- 2>&-", 0),
         (">/dev/full", 5),
-        ("| left", 141),
+        ("", 141),
     ],
 )
-def test_results_are_whole_whatever_becomes_of_the_output(
-    tmp_path: Path, redirection: str, status: int
-) -> None:
-    """Of a command that says where its result is, and starts at once."""
+def test_broken_output_streams(tmp_path: Path, redirection: str, status: int) -> None:
     key = tmp_path / "key.txt"
     arguments: list[object] = ["keygen", "-o", key]
-    if redirection == "| left":
-        done = _with_a_reader_that_leaves(arguments)
-    else:
-        done = shell(redirection, *arguments)
+    done = shell(redirection, *arguments) if redirection else _run_with_closed_pipe(arguments)
     assert done.returncode == status, done.stderr
     assert b"Traceback" not in done.stderr
     assert b"internal error" not in done.stderr
@@ -52,7 +46,7 @@ def test_results_are_whole_whatever_becomes_of_the_output(
     assert [path.name for path in tmp_path.iterdir()] == ["key.txt"]
 
 
-def _with_a_reader_that_leaves(arguments: list[object]) -> subprocess.CompletedProcess[bytes]:
+def _run_with_closed_pipe(arguments: list[object]) -> subprocess.CompletedProcess[bytes]:
     pipe = subprocess.PIPE
     process = subprocess.Popen([*PROGRAM, *map(str, arguments)], stdout=pipe, stderr=pipe)
     assert process.stdout is not None
@@ -63,12 +57,12 @@ def _with_a_reader_that_leaves(arguments: list[object]) -> subprocess.CompletedP
 
 
 @pytest.mark.parametrize("command", ["keygen", "--help", "--version"])
-def test_a_reader_that_leaves_is_no_error(command: str) -> None:
-    assert _with_a_reader_that_leaves([command]).returncode == 141
+def test_closed_pipe(command: str) -> None:
+    assert _run_with_closed_pipe([command]).returncode == 141
 
 
 @pytest.mark.parametrize(("redirection", "status"), [("2>/dev/full", 4), ("2>&-", 4), ("2>&- >&-", 4)])
-def test_an_error_has_its_status_where_nobody_can_be_told(redirection: str, status: int) -> None:
+def test_exit_status_with_broken_stderr(redirection: str, status: int) -> None:
     assert shell(redirection, "info", "nowhere").returncode == status
 
 
@@ -76,38 +70,38 @@ def test_an_error_has_its_status_where_nobody_can_be_told(redirection: str, stat
 def test_help_and_errors_in_any_encoding(encoding: str) -> None:
     done = shell("", "--help", PYTHONIOENCODING=encoding)
     assert (done.returncode, done.stderr) == (0, b"")
-    said = done.stdout.decode(encoding)
-    assert all(f" {name} " in said for name in COMMANDS)
-    assert "?" not in said
+    result = done.stdout.decode(encoding)
+    assert all(f" {name} " in result for name in COMMANDS)
+    assert "?" not in result
     done = shell("", "info", "nowhere/ä鍵", PYTHONIOENCODING=encoding)
     assert done.returncode == 4
     assert done.stderr.decode(encoding).startswith("keyss: error: nowhere/")
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_help_is_made_of_characters_with_a_likeness_in_ascii(keyss: Run, command: str) -> None:
-    said = keyss(command, "--help").out
-    assert said.encode("ascii", process.REPLACING).count(b"?") == said.count("?")
+def test_help_degrades_to_ascii(keyss: Run, command: str) -> None:
+    result = keyss(command, "--help").out
+    assert result.encode("ascii", process.REPLACING).count(b"?") == result.count("?")
 
 
 @pytest.mark.slow
-def test_numbers_in_a_locale_without_characters(world: Path, tmp_path: Path) -> None:
-    """`fit` and `info`, progress included, where Python's own UTF-8 is switched off."""
+def test_c_locale(workspace: Path, tmp_path: Path) -> None:
+    """`fit` and `info` in the C locale without Python's UTF-8 mode."""
     plain = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
-    done = shell("", "fit", world / "b", "-o", tmp_path / "ä鍵", *SMALL[2:], **plain)
+    done = shell("", "fit", workspace / "b", "-o", tmp_path / "ä鍵", *SMALL[2:], **plain)
     assert done.returncode == 0, done.stderr
     assert done.stderr.startswith(b"fit b: 20 steps")
-    assert os.fsencode(tmp_path / "ä鍵" / "model.ply") in done.stdout  # a path comes out as it went in
+    assert os.fsencode(tmp_path / "ä鍵" / "model.ply") in done.stdout  # paths are printed unchanged
     done = shell("", "info", tmp_path / "ä鍵", "--json", **plain)
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout) != {}
 
 
 @pytest.mark.parametrize("encoding", ["ascii", "cp437"])
-def test_json_is_json_in_any_encoding(
-    keyss: Run, world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, encoding: str
+def test_json_in_any_encoding(
+    keyss: Run, workspace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, encoding: str
 ) -> None:
-    shutil.copytree(world / "b", tmp_path / "ä鍵")
+    shutil.copytree(workspace / "b", tmp_path / "ä鍵")
     stream = io.TextIOWrapper(io.BytesIO(), encoding, process.REPLACING)
     monkeypatch.setattr("sys.stdout", stream)
     assert main(["info", str(tmp_path / "ä鍵"), "--json"]) == 0

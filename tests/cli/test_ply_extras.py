@@ -1,4 +1,4 @@
-"""Properties and comments of other programs, which stay in what is made from their files."""
+"""Extra properties and comments of .ply files are kept."""
 
 from __future__ import annotations
 
@@ -8,18 +8,18 @@ import numpy as np
 import pytest
 
 from channels.quiet.trained_like import trained_like
-from cli.said import Run, write_key
+from cli.harness import Run, write_key
 from files.test_ply import columns_of, ply_bytes
 from keyss.core import Gaussians, same_bits
 from keyss.files import read_model, write_model
-from keyss.files.ply_table import read_vertex_table
+from keyss.files.ply_table import read_vertices
 
 COUNT = 1500
 COMMENTS = b"comment Exported by the studio's tool, 2\xe9\nobj_info taken in May\n"
 
 
-def extended(model: Gaussians, path: Path, form: str = "binary_little_endian") -> dict[str, np.ndarray]:
-    """Write `model` with properties of several types before, between and after its own."""
+def write_extended(model: Gaussians, path: Path, form: str = "binary_little_endian") -> dict[str, np.ndarray]:
+    """Write `model` with extra properties of several types among its own."""
     rng = np.random.default_rng(0)
     n = len(model)
     extra = {
@@ -40,21 +40,22 @@ def extended(model: Gaussians, path: Path, form: str = "binary_little_endian") -
 
 def check_extras(path: Path, extra: dict[str, np.ndarray], rows: slice = slice(None)) -> None:
     with path.open("rb") as file:
-        table, comments = read_vertex_table(file)
-    assert "\n".join(comments).encode("latin-1") + b"\n" == COMMENTS
+        vertices = read_vertices(file)
+        table = np.concatenate(list(vertices.blocks))
+    assert "\n".join(vertices.comments).encode("latin-1") + b"\n" == COMMENTS
     for name, values in extra.items():
         assert np.array_equal(table[name][: len(values[rows])], values[rows]), name
 
 
 @pytest.mark.parametrize("form", ["ascii", "binary_little_endian", "binary_big_endian"])
-def test_convert_keeps_them(keyss: Run, tmp_path: Path, form: str) -> None:
+def test_convert_keeps_extra_properties(keyss: Run, tmp_path: Path, form: str) -> None:
     model = trained_like(COUNT)
-    extra = extended(model, tmp_path / "a.ply", form)
-    said = keyss("convert", tmp_path / "a.ply", tmp_path / "b.ply")
-    assert "renders unchanged" in said.out
+    extra = write_extended(model, tmp_path / "a.ply", form)
+    result = keyss("convert", tmp_path / "a.ply", tmp_path / "b.ply")
+    assert "renders unchanged" in result.out
     check_extras(tmp_path / "b.ply", extra)
     assert same_bits(read_model(tmp_path / "b.ply"), model)
-    assert keyss("convert", tmp_path / "a.ply", tmp_path / "c.spz").status == 0  # which cannot hold them
+    assert keyss("convert", tmp_path / "a.ply", tmp_path / "c.spz").status == 0  # has no room for them
 
 
 @pytest.mark.parametrize(
@@ -67,8 +68,8 @@ def test_convert_keeps_them(keyss: Run, tmp_path: Path, form: str) -> None:
         ("--secret-file", ["any", "--channel", "colours"]),
     ],
 )
-def test_the_published_file_keeps_them(keyss: Run, tmp_path: Path, what: str, publish: list[str]) -> None:
-    extra = extended(trained_like(COUNT), tmp_path / "cover.ply")
+def test_hide_keeps_extra_properties(keyss: Run, tmp_path: Path, what: str, publish: list[str]) -> None:
+    extra = write_extended(trained_like(COUNT), tmp_path / "cover.ply")
     write_model(tmp_path / "secret.ply", trained_like(60, 1))
     (tmp_path / "secret.txt").write_bytes(b"seven words")
     secret = tmp_path / ("secret.ply" if what == "--secret" else "secret.txt")
@@ -76,8 +77,8 @@ def test_the_published_file_keeps_them(keyss: Run, tmp_path: Path, what: str, pu
     options = ["--publish", *publish, *(["--min-psnr", "0"] if what == "--secret" else [])]
     out = tmp_path / "run"
     cover = tmp_path / "cover.ply"
-    said = keyss("hide", "--cover", cover, what, secret, "--key-file", key, "-o", out, *options)
-    assert said.status == 0, said.err
+    result = keyss("hide", "--cover", cover, what, secret, "--key-file", key, "-o", out, *options)
+    assert result.status == 0, result.err
     stego = tmp_path / "run" / "publish" / "model.ply"
     check_extras(stego, extra)
     out = tmp_path / f"out{secret.suffix}"

@@ -1,4 +1,4 @@
-"""What comes out too bad is not published, and nothing that was trained is lost by that."""
+"""--min-psnr: bad results are not published, and resuming skips training."""
 
 from __future__ import annotations
 
@@ -9,29 +9,25 @@ import pytest
 import torch
 
 from channels.quiet.trained_like import trained_like
-from cli.said import SMALL, Run, assert_refused, write_key
+from cli.harness import SMALL, Run, assert_refused, scene_arguments, write_key
 from keyss.files import read_model, write_model
 
 
-def test_below_the_limit_nothing_is_published_and_a_lower_limit_needs_no_training(
-    keyss: Run, world: Path, tmp_path: Path
-) -> None:
-    scenes = ["--cover", world / "a", "--secret", world / "b", "--key-file", world / "key.txt"]
-    hide = ["hide", *scenes, "--publish", "any", "-o", tmp_path / "run", *SMALL]
-    said = keyss(*hide, "--min-psnr", 90)
-    assert said.status == 7
-    assert "below 90 dB: nothing was published; a lower --min-psnr" in said.err
-    assert "--resume skips finished training" in said.err
+def test_min_psnr(keyss: Run, workspace: Path, tmp_path: Path) -> None:
+    hide = ["hide", *scene_arguments(workspace), "--publish", "any", "-o", tmp_path / "run", *SMALL]
+    result = keyss(*hide, "--min-psnr", 90)
+    assert result.status == 7
+    assert "below 90 dB: nothing was published; a lower --min-psnr" in result.err
+    assert "--resume skips finished training" in result.err
     assert {path.name for path in (tmp_path / "run").iterdir()} == {"private"}
-    said = keyss(*hide, "--min-psnr", 0, "--resume")
-    assert said.status == 0
-    assert "plain model of the secret (b): 43 steps, continuing at 43" in said.err
+    result = keyss(*hide, "--min-psnr", 0, "--resume")
+    assert result.status == 0
+    assert "plain model of the secret (b): 43 steps, continuing at 43" in result.err
     assert (tmp_path / "run" / "publish" / "model.ply").exists()
 
 
 @pytest.fixture
 def models(tmp_path: Path) -> Path:
-    """A cover and a secret as files."""
     write_model(tmp_path / "cover.ply", trained_like(3000))
     write_model(tmp_path / "secret.ply", trained_like(1500, 1))
     write_key(tmp_path / "key.txt")
@@ -51,19 +47,15 @@ def _carry(folder: Path, *more: object) -> list[object]:
 
 
 @pytest.mark.parametrize("dry_run", [(), ("--dry-run",)])
-def test_options_of_training_that_had_no_effect_are_named(
-    keyss: Run, models: Path, dry_run: tuple[str, ...]
-) -> None:
-    said = keyss(*_carry(models, "--preset", "quick", "--iterations", 7, "--seed", 1, *dry_run))
-    assert said.status == 0
-    assert "warning: --preset and --iterations had no effect" in said.err
+def test_ignored_training_options(keyss: Run, models: Path, dry_run: tuple[str, ...]) -> None:
+    result = keyss(*_carry(models, "--preset", "quick", "--iterations", 7, "--seed", 1, *dry_run))
+    assert result.status == 0
+    assert "warning: --preset and --iterations had no effect" in result.err
     assert "had no effect" not in keyss(*_carry(models, "--seed", 1, "--overwrite", *dry_run)).err
 
 
-def test_a_secret_that_comes_back_empty_is_not_published(
-    keyss: Run, models: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Even where empty pictures would be near enough: the limit is far below what they reach."""
+def test_empty_secret_is_not_published(keyss: Run, models: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Even if empty renders would exceed --min-psnr."""
     from keyss.methods import CarriedSecret
 
     reveal = CarriedSecret.reveal
@@ -79,7 +71,7 @@ def test_a_secret_that_comes_back_empty_is_not_published(
 
 
 @pytest.mark.parametrize(("which", "who"), [("cover.ply", "the cover"), ("secret.ply", "the secret")])
-def test_what_cannot_be_seen_is_not_hidden(keyss: Run, models: Path, which: str, who: str) -> None:
+def test_invisible_models(keyss: Run, models: Path, which: str, who: str) -> None:
     model = read_model(models / which)
     write_model(models / which, replace(model, opacity_logits=torch.full_like(model.opacity_logits, -9)))
     assert_refused(keyss(*_carry(models)), 2, f"{who}'s model is invisible")

@@ -1,4 +1,4 @@
-"""`keyss reveal` and `keyss verify`: what they say they found, and what they refuse."""
+"""`keyss reveal` and `keyss verify`."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import pytest
 
 from channels.quiet.coded import codes_of, model_of
 from channels.quiet.trained_like import trained_like
-from cli.said import PROGRAM, Run, Said, assert_refused, listing, write_key
+from cli.harness import PROGRAM, Result, Run, assert_refused, listing, write_key
 from keyss.channels import LOW_BITS, CodesCover, Payload, base
 from keyss.channels.colours import salts
 from keyss.channels.quiet import cells
@@ -29,72 +29,72 @@ from keyss.methods.records.carried_secret import COUNT
 KEY = "q7Rv2LxT9bWm4KzD"
 
 
-def carried(cover: Gaussians, secret: Gaussians, claimed: int) -> Gaussians:
-    """`cover` with `secret` in it, as if `claimed` Gaussians had been hidden and the others were lost."""
-    prepared = LOW_BITS.prepare(cover)
-    (records,) = encode_all(prepared, [secret])
+def hide_claiming(cover: Gaussians, secret: Gaussians, claimed: int) -> Gaussians:
+    """Hide `secret` with a header that claims more Gaussians, as if the others were lost."""
+    room = LOW_BITS.prepare(cover)
+    (records,) = encode_all(room, [secret])
     records = replace(records, header=COUNT.pack(claimed) + records.header[COUNT.size :])
-    return prepared.embed([(KEY, records)])
+    return room.embed([(KEY, records)])
 
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Keys `key` and `other`; models with 500 Gaussians left of 500, 1,000 and 12,000."""
+    """Key files, and models with 500 Gaussians left of 500, 1,000 and 12,000."""
     folder = tmp_path_factory.mktemp("files")
     for name, key in (("key", KEY), ("other", KEY[::-1])):
         write_key(folder / name, key)
     cover, secret = trained_like(1500), trained_like(500, 1)
     write_model(folder / "plain.ply", cover)
     for name, claimed in (("whole", 500), ("half", 1000), ("few", 12_000)):
-        write_model(folder / f"{name}.ply", carried(cover, secret, claimed))
+        write_model(folder / f"{name}.ply", hide_claiming(cover, secret, claimed))
     return folder
 
 
 @pytest.fixture
 def reveal(keyss: Run, files: Path, tmp_path: Path) -> Run:
-    """Reveals a model with the key of that name into `s.ply` of the test's folder."""
+    """Reveal a model into `s.ply`."""
 
-    def run(model: Path | str, *more: object, key: str = "key") -> Said:
+    def run(model: Path | str, *more: object, key: str = "key") -> Result:
         return keyss("reveal", files / model, "--key-file", files / key, "-o", tmp_path / "s.ply", *more)
 
     return run
 
 
-def test_many_gaussians_in_a_small_file_are_refused(keyss: Run, files: Path, tmp_path: Path) -> None:
+def test_implausible_gaussian_count(keyss: Run, files: Path, tmp_path: Path) -> None:
     data = whole.encode(model_of(100, sh_degree=0))
     hostile = Payload("carry", (1 << 17).to_bytes(4, "little") + data[4:])
     write_model(tmp_path / "stego.spz", CodesCover.of(codes_of(".spz")).embed([(KEY, hostile)]))
     for command, *out in (("reveal", "-o", tmp_path / "s.ply"), ("verify",)):
-        said = keyss(command, tmp_path / "stego.spz", "--key-file", files / "key", *out)
-        assert_refused(said, 4, "announces 131,072 Gaussians, more than")
+        result = keyss(command, tmp_path / "stego.spz", "--key-file", files / "key", *out)
+        assert_refused(result, 4, "announces 131,072 Gaussians, more than")
 
 
 class TestCounts:
-    def test_a_whole_secret(self, reveal: Run, tmp_path: Path) -> None:
-        assert reveal("whole.ply") == Said(0, f"{tmp_path}/s.ply: 500 of 500 Gaussians\n", "")
+    def test_whole_secret(self, reveal: Run, tmp_path: Path) -> None:
+        assert reveal("whole.ply") == Result(0, f"{tmp_path}/s.ply: 500 of 500 Gaussians\n", "")
 
-    def test_a_warning_with_its_cause_where_much_is_missing(self, reveal: Run, tmp_path: Path) -> None:
-        said = reveal("half.ply")
-        assert (said.status, said.out) == (0, f"{tmp_path}/s.ply: 500 of 1,000 Gaussians\n")
-        assert said.err.startswith("keyss: warning: 500 of 1,000 Gaussians of the secret were found")
-        assert "pruning by opacity" in said.err
-        assert len(said.err.splitlines()) == 1
+    def test_partial_secret_warning(self, reveal: Run, tmp_path: Path) -> None:
+        result = reveal("half.ply")
+        assert (result.status, result.out) == (0, f"{tmp_path}/s.ply: 500 of 1,000 Gaussians\n")
+        assert result.err.startswith("keyss: warning: 500 of 1,000 Gaussians of the secret were found")
+        assert "pruning by opacity" in result.err
+        assert len(result.err.splitlines()) == 1
 
-    def test_too_little_is_refused_and_taken_by_force(self, reveal: Run, tmp_path: Path) -> None:
+    def test_small_remainder_needs_force(self, reveal: Run, tmp_path: Path) -> None:
         assert_refused(reveal("few.ply"), 4, "500 of 12,000 Gaussians")
         assert listing(tmp_path) == {}
         assert "--force" in reveal("few.ply").err
-        said = reveal("few.ply", "--force")
-        assert (said.status, len(read_model(tmp_path / "s.ply"))) == (0, 500)
-        assert "keyss: warning: 500 of 12,000" in said.err
+        result = reveal("few.ply", "--force")
+        assert (result.status, len(read_model(tmp_path / "s.ply"))) == (0, 500)
+        assert "keyss: warning: 500 of 12,000" in result.err
 
 
 class TestOpensNothing:
-    """A plain model, a wrong key and a model whose low bits are gone: same words, same work."""
+    """A plain model, a wrong key and lost low bits give the same message after the same work."""
 
     @pytest.fixture
     def work(self, monkeypatch: pytest.MonkeyPatch) -> dict[str, int]:
-        """Counts derived keys, and blocks of AES."""
+        """Counts of derived keys and AES blocks."""
         done = {"keys": 0, "blocks": 0}
         encrypt, derive = cells.encrypted_blocks, DerivedKey.of
 
@@ -110,78 +110,77 @@ class TestOpensNothing:
         monkeypatch.setattr(DerivedKey, "of", derived)
         return done
 
-    def test_in_the_same_words_after_the_same_work(
+    def test_failures_are_indistinguishable(
         self, reveal: Run, files: Path, tmp_path: Path, work: dict[str, int]
     ) -> None:
         erased = read_model(files / "whole.ply")
         rounded = erased.map(lambda values: (values * 2**10).round() / 2**10)
         write_model(tmp_path / "rounded.ply", rounded)
         attempts = [("plain.ply", "key"), ("whole.ply", "other"), (tmp_path / "rounded.ply", "key")]
-        said, made = [], []
+        result, made = [], []
         for model, key in attempts:
             work.update(keys=0, blocks=0)
-            said.append(reveal(model, key=key))
+            result.append(reveal(model, key=key))
             made.append(dict(work))
-        assert said[0] == said[1] == said[2]
+        assert result[0] == result[1] == result[2]
         assert made[0] == made[1] == made[2]
-        assert made[0]["keys"] == base.SALTS_TRIED + salts.SALTS + 1  # in low bits, then in colours
-        assert_refused(said[0], 3, "opens nothing here")
+        assert made[0]["keys"] == base.SALTS_TRIED + salts.SALTS + 1  # low bits, then colours
+        assert_refused(result[0], 3, "opens nothing here")
         for word in ("another key", "converted or quantised", "moved", "trained on"):
-            assert word in said[0].err
+            assert word in result[0].err
 
 
-class TestOutputs:
-    @pytest.mark.parametrize("how", ["same", "dots", "symlink", "hardlink"])
-    def test_an_input_is_never_overwritten(self, keyss: Run, files: Path, tmp_path: Path, how: str) -> None:
-        (tmp_path / "sub").mkdir()
-        model = tmp_path / "stego.ply"
-        shutil.copy(files / "whole.ply", model)
-        out = {
-            "same": model,
-            "dots": tmp_path / "sub" / ".." / "stego.ply",
-            "symlink": tmp_path / "link.ply",
-            "hardlink": tmp_path / "hard.ply",
-        }[how]
-        if how == "symlink":
-            out.symlink_to(model)
-        elif how == "hardlink":
-            os.link(model, out)
-        before = listing(tmp_path)
-        said = keyss("reveal", model, "--key-file", files / "key", "-o", out, "--overwrite")
-        assert_refused(said, 2, "is the input")
-        assert listing(tmp_path) == before
+@pytest.mark.parametrize("how", ["same", "dots", "symlink", "hardlink"])
+def test_input_is_never_overwritten(keyss: Run, files: Path, tmp_path: Path, how: str) -> None:
+    (tmp_path / "sub").mkdir()
+    model = tmp_path / "stego.ply"
+    shutil.copy(files / "whole.ply", model)
+    out = {
+        "same": model,
+        "dots": tmp_path / "sub" / ".." / "stego.ply",
+        "symlink": tmp_path / "link.ply",
+        "hardlink": tmp_path / "hard.ply",
+    }[how]
+    if how == "symlink":
+        out.symlink_to(model)
+    elif how == "hardlink":
+        os.link(model, out)
+    before = listing(tmp_path)
+    result = keyss("reveal", model, "--key-file", files / "key", "-o", out, "--overwrite")
+    assert_refused(result, 2, "is the input")
+    assert listing(tmp_path) == before
 
 
-class TestStreams:
-    def program(self, *arguments: object, data: bytes = b"", **more: str) -> tuple[int, bytes, str]:
-        done = subprocess.run(
-            [*PROGRAM, *map(str, arguments)],
-            input=data,
-            capture_output=True,
-            check=False,
-            env={**os.environ, **more},
-            timeout=120,
-        )
-        return done.returncode, done.stdout, done.stderr.decode()
+def program(*arguments: object, data: bytes = b"", **more: str) -> tuple[int, bytes, str]:
+    done = subprocess.run(
+        [*PROGRAM, *map(str, arguments)],
+        input=data,
+        capture_output=True,
+        check=False,
+        env={**os.environ, **more},
+        timeout=120,
+    )
+    return done.returncode, done.stdout, done.stderr.decode()
 
-    def test_a_secret_through_pipes(self, files: Path, tmp_path: Path) -> None:
-        data = (files / "whole.ply").read_bytes()
-        status, out, err = self.program("reveal", "-", "-o", "-", data=data, KEYSS_KEY=KEY)
-        assert (status, err.splitlines()[-1]) == (0, "-: 500 of 500 Gaussians")
-        (tmp_path / "s.ply").write_bytes(out)
-        assert len(read_model(tmp_path / "s.ply")) == 500
-        status, out, err = self.program("info", "-", "--json", data=out)
-        assert (status, json.loads(out)["gaussians"]) == (0, 500)
+
+def test_pipes(files: Path, tmp_path: Path) -> None:
+    data = (files / "whole.ply").read_bytes()
+    status, out, err = program("reveal", "-", "-o", "-", data=data, KEYSS_KEY=KEY)
+    assert (status, err.splitlines()[-1]) == (0, "-: 500 of 500 Gaussians")
+    (tmp_path / "s.ply").write_bytes(out)
+    assert len(read_model(tmp_path / "s.ply")) == 500
+    status, out, err = program("info", "-", "--json", data=out)
+    assert (status, json.loads(out)["gaussians"]) == (0, 500)
 
 
 class TestVerify:
-    def test_a_sound_model_whatever_is_in_it(self, keyss: Run, files: Path) -> None:
+    def test_valid_model(self, keyss: Run, files: Path) -> None:
         facts = []
         for name in ("plain.ply", "whole.ply"):
-            said = keyss("verify", files / name, "--json")
-            assert (said.status, said.err) == (0, "")
-            facts.append(json.loads(said.out) | {"path": ""})
-        # Low bits can move single quaternions over the border of what counts as length 1.
+            result = keyss("verify", files / name, "--json")
+            assert (result.status, result.err) == (0, "")
+            facts.append(json.loads(result.out) | {"path": ""})
+        # Low bits change the length of quaternions slightly.
         assert max(each["model"].pop("unit_quaternions") for each in facts) < 0.01
         assert facts[0] == facts[1]
         assert facts[0]["secret"] is None
@@ -202,34 +201,32 @@ class TestVerify:
             ),
         ],
     )
-    def test_a_model_that_is_not_sound(
+    def test_invalid_model(
         self, keyss: Run, files: Path, tmp_path: Path, change: Callable[[Gaussians], object], words: str
     ) -> None:
         model = read_model(files / "plain.ply")
         change(model)
         write_model(tmp_path / "m.ply", model)
-        said = keyss("verify", tmp_path / "m.ply")
-        assert said.status == 4
-        assert words in said.err
-        assert "Gaussians of SH degree" in said.out
+        result = keyss("verify", tmp_path / "m.ply")
+        assert result.status == 4
+        assert words in result.err
+        assert "Gaussians of SH degree" in result.out
 
     @pytest.mark.parametrize("where", ["file", "environment"])
-    def test_a_secret_that_is_whole(
-        self, keyss: Run, files: Path, monkeypatch: pytest.MonkeyPatch, where: str
-    ) -> None:
+    def test_whole_secret(self, keyss: Run, files: Path, monkeypatch: pytest.MonkeyPatch, where: str) -> None:
         arguments = ["--key-file", files / "key"]
         if where == "environment":
             monkeypatch.setenv("KEYSS_KEY", f"{KEY}\n")
             arguments = []
-        said = keyss("verify", files / "whole.ply", *arguments, "--json")
-        assert (said.status, said.err) == (0, "")
-        secret = json.loads(said.out)["secret"]
+        result = keyss("verify", files / "whole.ply", *arguments, "--json")
+        assert (result.status, result.err) == (0, "")
+        secret = json.loads(result.out)["secret"]
         assert (secret["found"], secret["hidden"]) == (500, 500)
 
-    def test_a_secret_that_is_not(self, keyss: Run, files: Path) -> None:
+    def test_partial_secret(self, keyss: Run, files: Path) -> None:
         for name in ("half", "few"):
-            said = keyss("verify", files / f"{name}.ply", "--key-file", files / "key")
-            assert said.status == 4
-            assert "pruning by opacity" in said.err
-        said = keyss("verify", files / "plain.ply", "--key-file", files / "key")
-        assert_refused(said, 3, "opens nothing")
+            result = keyss("verify", files / f"{name}.ply", "--key-file", files / "key")
+            assert result.status == 4
+            assert "pruning by opacity" in result.err
+        result = keyss("verify", files / "plain.ply", "--key-file", files / "key")
+        assert_refused(result, 3, "opens nothing")

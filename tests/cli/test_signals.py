@@ -1,4 +1,4 @@
-"""Ctrl-C and other signals, at any moment: one line, the status of a shell, and nothing lost."""
+"""Ctrl-C and other signals at any moment: one line, status 128 + signal, and no lost work."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from pathlib import Path
 
 import pytest
 
-from cli.said import PROGRAM, Run, Said, assert_refused, listing
+from cli.harness import PROGRAM, Result, Run, assert_refused, listing
 
 WORDS = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated", signal.SIGHUP: "terminated"}
 
 
-def _started(arguments: list[object]) -> subprocess.Popen[str]:
-    """A process that has got as far as to provide for signals: what comes before is Python's own start."""
+def _start(arguments: list[object]) -> subprocess.Popen[str]:
+    """Start a process and wait until it handles signals."""
     command = [*PROGRAM, *map(str, arguments)]
     pipe = subprocess.PIPE
     process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=pipe, stderr=pipe, text=True)
     status = Path(f"/proc/{process.pid}/status")
-    # The last that is provided for, and not ignored, as under nohup.
+    # The last handler that is installed; nohup ignores SIGHUP.
     last = next(each for each in (signal.SIGHUP, signal.SIGTERM) if signal.getsignal(each) != signal.SIG_IGN)
     if not status.exists():
         time.sleep(0.5)
@@ -33,8 +33,8 @@ def _started(arguments: list[object]) -> subprocess.Popen[str]:
     return process
 
 
-def _assert_ended(process: subprocess.Popen[str], signum: signal.Signals, when: str) -> None:
-    """As the signal asks for, or as if it had not come where it came too late."""
+def _assert_stopped(process: subprocess.Popen[str], signum: signal.Signals, when: str) -> None:
+    """Stopped by the signal, or finished before it."""
     _, err = process.communicate(timeout=120)
     assert process.returncode in (0, 128 + signum), (when, err)
     lines = [line for line in err.splitlines() if line.startswith("keyss: ")]
@@ -45,34 +45,33 @@ def _assert_ended(process: subprocess.Popen[str], signum: signal.Signals, when: 
     assert "ignored" not in err, when
 
 
-def _commands(world: Path, folder: Path) -> dict[str, list[object]]:
-    stego, key = next((world / "hidden").rglob("publish/model.ply")), world / "key.txt"
+def _commands(workspace: Path, folder: Path) -> dict[str, list[object]]:
+    stego, key = next((workspace / "hidden").rglob("publish/model.ply")), workspace / "key.txt"
     return {
         "help": ["--help"],
         "info": ["info", stego],
         "reveal": ["reveal", stego, "--key-file", key, "-o", folder / "secret.ply"],
-        "fit": ["fit", world / "b", "-o", folder / "out", "--iterations", 9999, "--device", "cpu"],
+        "fit": ["fit", workspace / "b", "-o", folder / "out", "--iterations", 9999, "--device", "cpu"],
     }
 
 
 @pytest.mark.parametrize(
     ("command", "seconds", "signum"), [("help", 0.05, signal.SIGINT), ("reveal", 0.9, signal.SIGTERM)]
 )
-def test_a_signal_ends_any_command_with_one_line(
-    world: Path, tmp_path: Path, command: str, seconds: float, signum: signal.Signals
+def test_signal_during_command(
+    workspace: Path, tmp_path: Path, command: str, seconds: float, signum: signal.Signals
 ) -> None:
-    process = _started(_commands(world, tmp_path)[command])
+    process = _start(_commands(workspace, tmp_path)[command])
     time.sleep(seconds)
     process.send_signal(signum)
-    _assert_ended(process, signum, f"{command} after {seconds} s")
+    _assert_stopped(process, signum, f"{command} after {seconds} s")
     assert not [name for name in listing(tmp_path) if name.endswith(".unfinished")]
 
 
-def _ended(program: str, *arguments: str) -> Said:
-    """What a program in Python comes to."""
+def _run(program: str, *arguments: str) -> Result:
     command = [sys.executable, "-c", program, *arguments]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
-    return Said(done.returncode, done.stdout, done.stderr)
+    return Result(done.returncode, done.stdout, done.stderr)
 
 
 LOADING = """
@@ -93,11 +92,11 @@ _ALSO = ("keyss.cli.entry", "tyro", "torch.nn", "numba.core.types")
 @pytest.mark.parametrize(
     "module", ["torch._C", *(pytest.param(name, marks=pytest.mark.slow) for name in _ALSO)]
 )
-def test_ctrl_c_in_the_middle_of_an_import(world: Path, module: str) -> None:
-    """Where it comes up as an exception, torch is loaded half, and crashes when it is loaded again."""
-    stego, key = next((world / "hidden").rglob("publish/model.ply")), world / "key.txt"
-    verify = ["verify", str(stego), "--key-file", str(key)]  # loads as much as any command
-    assert _ended(LOADING.format(module=module), *verify) == Said(130, "", "keyss: interrupted\n")
+def test_ctrl_c_during_import(workspace: Path, module: str) -> None:
+    """An exception would leave torch half imported, and the next import crashes."""
+    stego, key = next((workspace / "hidden").rglob("publish/model.ply")), workspace / "key.txt"
+    verify = ["verify", str(stego), "--key-file", str(key)]  # imports as much as any command
+    assert _run(LOADING.format(module=module), *verify) == Result(130, "", "keyss: interrupted\n")
 
 
 IN_A_COMMAND = """
@@ -112,31 +111,29 @@ main()
 
 
 @pytest.mark.parametrize(
-    ("body", "said"),
+    ("body", "printed"),
     [
-        # What is to be cleaned up is, and a second signal does not wait for it.
+        # Cleanup runs; a second signal does not wait for it.
         ("try: time.sleep(60)\n    finally: print('cleaned', flush=True)", "cleaned\n"),
         ("try: time.sleep(60)\n    finally: os.kill(os.getpid(), signal.SIGTERM); time.sleep(60)", ""),
-        # An interrupt that something made an error of, or that was dropped, is one all the same.
+        # An interrupt that was replaced or swallowed still counts.
         ("try: time.sleep(60)\n    except BaseException: raise ValueError('boom')", ""),
         ("try: time.sleep(60)\n    except BaseException: pass", ""),
         ("class Dropping:\n        def __del__(self): time.sleep(60)\n    Dropping(); time.sleep(60)", ""),
     ],
 )
-def test_ctrl_c_inside_a_command(body: str, said: str) -> None:
+def test_ctrl_c_during_work(body: str, printed: str) -> None:
     alarm = "signal.signal(signal.SIGALRM, lambda *_: os.kill(os.getpid(), signal.SIGINT)); signal.alarm(1)"
     program = IN_A_COMMAND.format(body=f"{alarm}\n    {body}")
-    assert _ended(program) == Said(130, said, "keyss: interrupted\n")
+    assert _run(program) == Result(130, printed, "keyss: interrupted\n")
 
 
 @pytest.mark.parametrize("signum", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_saves_training_and_resume_ends_in_the_same_files(
-    keyss: Run, world: Path, tmp_path: Path, signum: signal.Signals
-) -> None:
+def test_signal_during_training(keyss: Run, workspace: Path, tmp_path: Path, signum: signal.Signals) -> None:
     small = ("--max-gaussians", 100, "--device", "cpu")
 
     def arguments(out: Path) -> list[object]:
-        return ["fit", world / "b", "-o", out, "--iterations", 400, "--seed", 0, *small]
+        return ["fit", workspace / "b", "-o", out, "--iterations", 400, "--seed", 0, *small]
 
     whole, parts = tmp_path / "whole", tmp_path / "parts"
     command = [*PROGRAM, *map(str, arguments(parts))]
@@ -155,9 +152,9 @@ def test_a_signal_saves_training_and_resume_ends_in_the_same_files(
     assert not list(parts.rglob("model.ply"))
 
     assert_refused(keyss(*arguments(parts)), 5, "--resume")
-    said = keyss(*arguments(parts), "--resume")
-    assert said.status == 0, said.err
-    assert "continuing at" in said.err
+    result = keyss(*arguments(parts), "--resume")
+    assert result.status == 0, result.err
+    assert "continuing at" in result.err
     assert keyss(*arguments(whole)).status == 0
     assert (parts / "model.ply").read_bytes() == (whole / "model.ply").read_bytes()
     assert set(listing(parts)) == set(listing(whole))

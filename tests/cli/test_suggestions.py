@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from cli.said import Run, assert_refused
+from cli.harness import Run, assert_refused
 
 
 @pytest.mark.parametrize(
@@ -18,7 +18,7 @@ from cli.said import Run, assert_refused
         (("audit", "run", "-o", "x"), "results go into the folder of the run"),
     ],
 )
-def test_a_misspelt_command(keyss: Run, arguments: tuple[str, ...], meant: str) -> None:
+def test_misspelt_command(keyss: Run, arguments: tuple[str, ...], meant: str) -> None:
     assert_refused(keyss(*arguments), 2, meant)
 
 
@@ -27,10 +27,10 @@ def test_a_misspelt_command(keyss: Run, arguments: tuple[str, ...], meant: str) 
     [
         (("reveal", "a", "--keyfile", "k", "-o", "b"), "--key-file FILE"),
         (("hide", "--cover", "a", "--seckret=b", "-o", "c"), "--secret SCENE"),
-        (("hide", "--method", "carry", "--prune-to-fitt", "-o", "c"), "--prune-to-fit"),
+        (("hide", "--method", "carry", "--min-psnrr", "-o", "c"), "--min-psnr"),
     ],
 )
-def test_a_misspelt_option(keyss: Run, arguments: tuple[str, ...], meant: str) -> None:
-    said = keyss(*arguments)
-    assert (said.status, said.out) == (2, "")
-    assert meant in said.err.partition("Perhaps you meant")[2]
+def test_misspelt_option(keyss: Run, arguments: tuple[str, ...], meant: str) -> None:
+    result = keyss(*arguments)
+    assert (result.status, result.out) == (2, "")
+    assert meant in result.err.partition("Perhaps you meant")[2]

@@ -1,4 +1,4 @@
-"""What is printed when a command is done."""
+"""The table that `hide` prints."""
 
 from __future__ import annotations
 
@@ -8,45 +8,45 @@ from dataclasses import replace
 
 from rich.console import Console
 
-from cli.said import METRICS
+from cli.harness import METRICS
 from keyss.cli.tables import print_hiding
 from keyss.fitting import ImageQuality
 from keyss.runs import HideMetrics
 
 
-class TestNumbers:
-    """What is printed of a hiding, whatever its method."""
+def table(metrics: HideMetrics) -> list[list[str]]:
+    console = Console(file=io.StringIO(), width=80)
+    print_hiding(metrics, console)
+    text: str = console.file.getvalue()  # type: ignore[attr-defined]
+    return [re.split("  +", line.strip()) for line in text.splitlines()]
 
-    def table(self, metrics: HideMetrics) -> list[list[str]]:
-        console = Console(file=io.StringIO(), width=80)
-        print_hiding(metrics, console)
-        text: str = console.file.getvalue()  # type: ignore[attr-defined]
-        return [re.split("  +", line.strip()) for line in text.splitlines()]
 
-    def test_a_row_for_each_and_what_the_method_adds(self) -> None:
-        rows = self.table(METRICS)
-        assert rows[:4] == [
-            ["on test photos", "PSNR", "SSIM", "bound", "loss", "Gaussians", "steps"],
-            ["cover", "30.00", "0.500", "30.50", "0.50", "1,234", "10"],
-            ["secret", "20.00", "0.250", "567", "20"],
-            ["PSNR in dB."],
-        ]
-        assert rows[-1] == ["Room in the cover: 1,000 Gaussians."]
+def test_rows() -> None:
+    rows = table(METRICS)
+    assert rows[:4] == [
+        ["on test photos", "PSNR", "SSIM", "bound", "loss", "Gaussians", "steps"],
+        ["cover", "30.00", "0.500", "30.50", "0.50", "1,234", "10"],
+        ["secret", "20.00", "0.250", "567", "20"],
+        ["PSNR in dB."],
+    ]
+    assert rows[-1] == ["Room in the cover: 1,000 Gaussians."]
 
-    def test_what_is_left_of_a_secret_is_said(self) -> None:
-        baseline = replace(METRICS.baseline, gaussians=(10, 8406))
-        fewer = replace(METRICS, baseline=baseline, secret_gaussians=(2480,), secret_degrees=((0, 3),))
-        assert ["The secret kept 2,480 of 8,406 Gaussians, SH degree 0 of 3, 31.0 dB."] in self.table(fewer)
 
-    def test_a_plain_model_of_fewer_steps_is_no_bound(self) -> None:
-        shorter = replace(METRICS.baseline, secrets=(ImageQuality(19.0, 0.2),))
-        rows = self.table(replace(METRICS, baseline=shorter))
-        assert rows[0] == [
-            *("on test photos", "PSNR", "SSIM", "bound", "loss", "start"),
-            *("Gaussians", "steps"),
-        ]
-        assert rows[2] == ["secret", "20.00", "0.250", "19.00", "567", "20"]
-        assert any(row[0].startswith("Start:") and "10 training steps" in row[0] for row in rows)
-        old = replace(shorter, steps=(), equal=())  # a record that knows nothing of steps
-        rows = self.table(replace(METRICS, baseline=old, steps=()))
-        assert rows[0] == ["on test photos", "PSNR", "SSIM", "start", "Gaussians"]
+def test_pruned_secret() -> None:
+    baseline = replace(METRICS.baseline, gaussians=(10, 8406))
+    fewer = replace(METRICS, baseline=baseline, secret_gaussians=(2480,), secret_degrees=((0, 3),))
+    assert ["The secret kept 2,480 of 8,406 Gaussians, SH degree 0 of 3, 31.0 dB."] in table(fewer)
+
+
+def test_shorter_plain_model_is_no_bound() -> None:
+    shorter = replace(METRICS.baseline, secrets=(ImageQuality(19.0, 0.2),))
+    rows = table(replace(METRICS, baseline=shorter))
+    assert rows[0] == [
+        *("on test photos", "PSNR", "SSIM", "bound", "loss", "start"),
+        *("Gaussians", "steps"),
+    ]
+    assert rows[2] == ["secret", "20.00", "0.250", "19.00", "567", "20"]
+    assert any(row[0].startswith("Start:") and "10 training steps" in row[0] for row in rows)
+    old = replace(shorter, steps=(), equal=())  # a record without steps
+    rows = table(replace(METRICS, baseline=old, steps=()))
+    assert rows[0] == ["on test photos", "PSNR", "SSIM", "start", "Gaussians"]

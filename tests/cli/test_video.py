@@ -1,4 +1,4 @@
-"""Films, read again by OpenCV's own FFmpeg."""
+"""Videos, decoded again by OpenCV."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 import torch
 
 import keyss as library
-from cli.said import Run, assert_refused
+from cli.harness import Run, assert_refused
 from files.scene_files import write_nerfstudio
 from keyss import write_model
 from keyss.core import Camera, Gaussians
@@ -40,7 +40,7 @@ def frames_of(path: Path) -> Frames:
     return found
 
 
-def picture(model: Gaussians, camera: Camera) -> npt.NDArray[np.uint8]:
+def render_uint8(model: Gaussians, camera: Camera) -> npt.NDArray[np.uint8]:
     with torch.no_grad():
         return (render(model, camera).clamp(0, 1) * 255).round().to(torch.uint8).numpy()
 
@@ -49,17 +49,18 @@ def psnr(a: npt.NDArray[np.uint8], b: npt.NDArray[np.uint8]) -> float:
     return float(-10 * np.log10(((a / 255.0 - b / 255.0) ** 2).mean() + 1e-12))
 
 
-def test_once_around_a_model(keyss: Run, files: Path, tmp_path: Path) -> None:
-    said = keyss("render", files / "a.ply", "--video", tmp_path / "a.mp4", "--seconds", 0.4, "--width", 97)
-    assert (said.status, said.out) == (0, f"{tmp_path / 'a.mp4'}: 10 frames\n")
+def test_orbit(keyss: Run, files: Path, tmp_path: Path) -> None:
+    result = keyss("render", files / "a.ply", "--video", tmp_path / "a.mp4", "--seconds", 0.4, "--width", 97)
+    assert (result.status, result.out) == (0, f"{tmp_path / 'a.mp4'}: 10 frames\n")
     frames = frames_of(tmp_path / "a.mp4")
     assert [frame.shape for frame in frames] == [(96, 96, 3)] * 10
-    meant = [picture(random_gaussians(400, 0), each) for each in circle(random_gaussians(400, 0), 96, 10)]
-    assert min(map(psnr, frames, meant)) > 30
-    assert psnr(frames[0], meant[5]) < 25  # it moved
+    model = random_gaussians(400, 0)
+    expected = [render_uint8(model, camera) for camera in circle(model, 96, 10)]
+    assert min(map(psnr, frames, expected)) > 30
+    assert psnr(frames[0], expected[5]) < 25  # the camera moves
 
 
-def test_a_circle_looks_at_the_middle_from_above() -> None:
+def test_circle_cameras() -> None:
     model = random_gaussians(50)
     middle, _ = middle_and_radius(model)
     for camera in circle(model, 32, 7):
@@ -85,7 +86,7 @@ def test_a_circle_looks_at_the_middle_from_above() -> None:
         ((), 2, "--video FILE"),
     ],
 )
-def test_what_is_refused(
+def test_invalid_arguments(
     keyss: Run,
     files: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -100,9 +101,7 @@ def test_what_is_refused(
     assert not (files / "film.mp4").exists()
 
 
-def test_an_interrupted_film_leaves_nothing(
-    files: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_interrupt_leaves_no_file(files: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def interrupted(*given: object) -> None:
         raise KeyboardInterrupt
 

@@ -54,7 +54,7 @@ quick = settings(max_examples=25, deadline=None)
 
 @quick
 @given(seeds)
-def test_aligning_a_moved_half_ring_undoes_the_move(seed: int) -> None:
+def test_align_recovers_similarity(seed: int) -> None:
     cameras, moved_by = ring(seed, math.pi), random_similarity(seed)
     found = align([moved_by.apply_camera(camera) for camera in cameras], cameras)
     assert found.scale * moved_by.scale == pytest.approx(1, abs=1e-4)
@@ -65,7 +65,7 @@ def test_aligning_a_moved_half_ring_undoes_the_move(seed: int) -> None:
 
 @quick
 @given(seeds, st.sampled_from([math.pi, 1.5, 2 * math.pi]), st.sampled_from([math.pi, 2 * math.pi]))
-def test_focus_distance_and_up_coincide(seed: int, secret_turn: float, cover_turn: float) -> None:
+def test_align_matches_focus_distance_and_up(seed: int, secret_turn: float, cover_turn: float) -> None:
     world = random_similarity(seed)
     secret = [world.apply_camera(camera) for camera in ring(seed, secret_turn, height=0.3)]
     cover = ring(seed + 1, cover_turn, height=0.8)
@@ -80,7 +80,7 @@ def test_focus_distance_and_up_coincide(seed: int, secret_turn: float, cover_tur
 
 
 @pytest.mark.parametrize("turn", [1.5, math.pi, 2 * math.pi])
-def test_up_does_not_lean(turn: float) -> None:
+def test_up_direction_of_partial_ring(turn: float) -> None:
     """Unlike the mean of the cameras' up vectors on a part of a ring."""
     up = up_direction(ring(0, turn, height=1.0))
     assert up is not None

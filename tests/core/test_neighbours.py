@@ -11,7 +11,7 @@ from keyss.core.neighbours import nearest_neighbours
 
 @pytest.mark.parametrize("copies", [1, 3, 40])
 @pytest.mark.parametrize("count", [1, 4])
-def test_distances_are_those_of_all_pairs(copies: int, count: int) -> None:
+def test_matches_brute_force(copies: int, count: int) -> None:
     rng = np.random.default_rng(copies)
     points = rng.permutation(rng.normal(size=(30, 3)).repeat(copies, axis=0))
     distances, indices = nearest_neighbours(points, count)
@@ -21,7 +21,7 @@ def test_distances_are_those_of_all_pairs(copies: int, count: int) -> None:
     assert all(len(set(row)) == count for row in indices.tolist())
 
 
-def test_others_than_the_points_themselves() -> None:
+def test_separate_query_points() -> None:
     points, others = np.array([[0.0], [10.0]]), np.array([[9.0], [1.0], [1.0], [9.5]])
     distances, indices = nearest_neighbours(points, 2, others)
     assert distances.tolist() == [[1, 1], [0.5, 1]]

@@ -49,7 +49,7 @@ quick = settings(max_examples=40, deadline=None)
 
 @quick
 @given(seeds)
-def test_camera_sees_the_same_image_of_the_moved_world(seed: int) -> None:
+def test_cameras(seed: int) -> None:
     similarity, camera = random_similarity(seed), random_camera(seed)
     points = torch.randn(10, 3, generator=torch.Generator().manual_seed(seed))
 
@@ -68,7 +68,7 @@ def test_camera_sees_the_same_image_of_the_moved_world(seed: int) -> None:
 
 @quick
 @given(seeds)
-def test_covariances_and_quaternion_lengths(seed: int) -> None:
+def test_gaussians(seed: int) -> None:
     similarity, gaussians = random_similarity(seed), random_gaussians(seed)
     moved = similarity.apply_gaussians(gaussians)
     turn = similarity.rotation
@@ -81,7 +81,7 @@ def test_covariances_and_quaternion_lengths(seed: int) -> None:
 
 @quick
 @given(seeds, st.integers(0, 3))
-def test_colour_turns_with_the_world(seed: int, degree: int) -> None:
+def test_harmonics(seed: int, degree: int) -> None:
     similarity, gaussians = random_similarity(seed), random_gaussians(seed, degree)
     directions = torch.nn.functional.normalize(torch.randn(30, 3, dtype=torch.float64), dim=1)
     k = (degree + 1) ** 2
@@ -101,6 +101,6 @@ def test_colour_turns_with_the_world(seed: int, degree: int) -> None:
         (1.0, torch.diag(torch.tensor([1.0, 1.0, math.nan]))),
     ],
 )
-def test_invalid_similarities_are_refused(scale: float, rotation: Tensor) -> None:
+def test_invalid_similarities(scale: float, rotation: Tensor) -> None:
     with pytest.raises(ValueError, match="similarity: "):
         Similarity(scale, rotation.double())

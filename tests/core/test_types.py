@@ -12,7 +12,7 @@ from keyss.core import compensate_pruning
 from tiny_scenes import random_gaussians, tiny_scene
 
 
-def test_a_single_training_photo_has_an_extent_by_which_gaussians_can_move() -> None:
+def test_extent_of_single_photo() -> None:
     scene = tiny_scene()
     alone = replace(scene, train=scene.train[:1])
     centre = torch.linalg.inv(alone.train[0].camera.viewmat.double())[:3, 3]
@@ -23,13 +23,13 @@ def test_a_single_training_photo_has_an_extent_by_which_gaussians_can_move() -> 
 
 
 @pytest.mark.parametrize(("left", "count"), [(1000, 1000), (995, 1000), (10, 0)])
-def test_small_losses_change_nothing(left: int, count: int) -> None:
+def test_small_losses_are_not_compensated(left: int, count: int) -> None:
     model = random_gaussians(left)
     assert compensate_pruning(model, count) is model
 
 
 @pytest.mark.parametrize("share", [0.25, 0.5, 0.8])
-def test_transmittances_become_their_roots_and_sizes_grow(share: float) -> None:
+def test_compensate_pruning(share: float) -> None:
     model = random_gaussians(200)
     found = compensate_pruning(model, round(200 / share))
     expected = 1 - (1 - model.opacities.double()) ** (1 / share)
@@ -39,7 +39,7 @@ def test_transmittances_become_their_roots_and_sizes_grow(share: float) -> None:
 
 
 @pytest.mark.parametrize("logit", [-80.0, 0.0, 80.0])
-def test_compensated_models_stay_finite(logit: float) -> None:
+def test_compensation_stays_finite(logit: float) -> None:
     model = replace(random_gaussians(5), opacity_logits=torch.full((5,), logit))
     found = compensate_pruning(model, 10**9)
     assert found.opacity_logits.isfinite().all()

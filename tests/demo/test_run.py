@@ -29,7 +29,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, demo.DemoResult
     return out, demo.run_demo(out, seed=3, **SMALL)
 
 
-def test_it_leaves_everything_there_is_to_look_at(run: tuple[Path, demo.DemoResult]) -> None:
+def test_output_files(run: tuple[Path, demo.DemoResult]) -> None:
     out, result = run
     assert {path.name for path in out.iterdir()} == {
         *("publish", "private", "scenes", "secret.ply", "web.spz", "comparison.png", "key.txt", "index.html"),
@@ -54,9 +54,7 @@ def test_the_key_opens_the_file_for_the_web_too(run: tuple[Path, demo.DemoResult
     assert len(found) == len(keyss.reveal(run[0] / "publish" / "model.ply", "demo-key-3").gaussians)
 
 
-def test_a_folder_in_use_is_refused_and_overwrite_touches_only_its_own(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_existing_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "stego.ply").write_text("old")
     (tmp_path / "notes.txt").write_text("mine")
     with pytest.raises(OutputError, match="`overwrite=True`"):
@@ -77,7 +75,7 @@ def test_a_folder_in_use_is_refused_and_overwrite_touches_only_its_own(
 
 
 @pytest.mark.parametrize("which", [demo.COVER, demo.SECRET])
-def test_the_scenes_that_come_with_the_package(which: str) -> None:
+def test_bundled_scenes(which: str) -> None:
     scene = load_scene(demo.FOLDER / which)
     assert (len(scene.train), len(scene.test)) == (42, 6)
     assert {tuple(view.image.shape) for view in scene.views} == {(120, 160, 3)}

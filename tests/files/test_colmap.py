@@ -35,7 +35,7 @@ def text_scene(folder: Path) -> Path:
 
 
 @pytest.mark.parametrize("model", ["sparse/0", "sparse", ".", "colmap/sparse/0"])
-def test_the_model_is_found_in_each_of_its_places(tmp_path: Path, model: str) -> None:
+def test_model_locations(tmp_path: Path, model: str) -> None:
     scene = load_scene(write_colmap(tmp_path / "kitchen", model=model))
     assert scene.name == "kitchen"
     assert [v.camera.name for v in scene.test] == ["00.png"]
@@ -51,7 +51,7 @@ def test_the_model_is_found_in_each_of_its_places(tmp_path: Path, model: str) ->
     assert np.array_equal(scene.train[0].image.numpy(), photo(1))
 
 
-def test_agrees_with_pycolmap_on_a_real_scene(real_data: Path, tmp_path: Path) -> None:
+def test_agrees_with_pycolmap(real_data: Path, tmp_path: Path) -> None:
     reconstruction = pycolmap.Reconstruction(real_data / "fox" / "sparse" / "0")
     layout = read_colmap(real_data / "fox")
     by_name = {image.name: image for image in reconstruction.images.values()}
@@ -75,7 +75,7 @@ def test_agrees_with_pycolmap_on_a_real_scene(real_data: Path, tmp_path: Path) -
 
 
 @pytest.mark.parametrize("width", [200])
-def test_points_land_on_their_observations(real_data: Path, width: int | None) -> None:
+def test_points_project_to_their_observations(real_data: Path, width: int | None) -> None:
     reconstruction = pycolmap.Reconstruction(real_data / "fox" / "sparse" / "0")
     by_name = {image.name: image for image in reconstruction.images.values()}
     scene = load_scene(real_data / "fox", width=width)
@@ -91,7 +91,7 @@ def test_points_land_on_their_observations(real_data: Path, width: int | None) -
         assert view.image.shape == (view.camera.height, view.camera.width, 3)
 
 
-def test_text_models_with_comments_empty_lines_and_spaces_in_names(tmp_path: Path) -> None:
+def test_text_models(tmp_path: Path) -> None:
     folder = write_colmap(tmp_path / "scene")
     model = folder / "sparse" / "0"
     for name in BINARIES:
@@ -110,7 +110,7 @@ def test_text_models_with_comments_empty_lines_and_spaces_in_names(tmp_path: Pat
 
 
 @pytest.mark.parametrize("suffix", [".bin", ".txt"])
-def test_points_may_be_missing_altogether(tmp_path: Path, suffix: str) -> None:
+def test_missing_points(tmp_path: Path, suffix: str) -> None:
     write = text_scene if suffix == ".txt" else write_colmap
     write(tmp_path / "scene")
     model = tmp_path / "scene" / "sparse" / "0"
@@ -122,7 +122,7 @@ def test_points_may_be_missing_altogether(tmp_path: Path, suffix: str) -> None:
 
 
 @pytest.mark.parametrize("name", BINARIES)
-def test_every_truncation_is_an_input_error(tmp_path: Path, name: str) -> None:
+def test_truncated_files_are_refused(tmp_path: Path, name: str) -> None:
     path = write_colmap(tmp_path) / "sparse" / "0" / name
     data = path.read_bytes()
     for length in range(len(data)):
@@ -178,7 +178,7 @@ def one_camera(**fields: Any) -> dict[str, bytes]:
         ({"points3D": counted(point_bytes(1, (0, 1e200, 0)))}, "expected finite points"),
     ],
 )
-def test_impossible_values_are_named(tmp_path: Path, replaced: dict[str, bytes], message: str) -> None:
+def test_invalid_values(tmp_path: Path, replaced: dict[str, bytes], message: str) -> None:
     with pytest.raises(InputError, match=message):
         load_scene(write_colmap(tmp_path, **replaced))
 
@@ -199,18 +199,18 @@ def test_impossible_values_are_named(tmp_path: Path, replaced: dict[str, bytes],
         ("points3D.txt", "1 0 0 0 0 0 blue 0\n", "expected a number .*'blue'"),
     ],
 )
-def test_broken_text_names_the_line(tmp_path: Path, name: str, text: str, message: str) -> None:
+def test_broken_text_files(tmp_path: Path, name: str, text: str, message: str) -> None:
     (text_scene(tmp_path / "scene") / name).write_text(text)
     with pytest.raises(InputError, match=message):
         read_colmap(tmp_path / "scene")
 
 
 @pytest.mark.parametrize("place", ["sparse", "colmap/sparse"])
-def test_of_several_models_the_one_with_most_photos_is_used(tmp_path: Path, place: str) -> None:
+def test_largest_of_several_models_is_used(tmp_path: Path, place: str) -> None:
     write_colmap(tmp_path, 2, model=f"{place}/0")
     write_colmap(tmp_path, 5, model=f"{place}/1")
     write_colmap(tmp_path, 3, model=f"{place}/10")
-    said = rf"there are 3 sparse models; the one with most photos is used, {place}/1 \(5 photos\)"
+    said = rf"there are 3 sparse models; using the one with most photos, {place}/1 \(5 photos\)"
     with pytest.warns(KeyssWarning, match=said):
         scene = load_scene(tmp_path)
     assert len(scene.views) == 5

@@ -41,9 +41,7 @@ def scene_with(folder: Path, model: str, params: tuple[float, ...]) -> tuple[pyc
 
 
 @pytest.mark.parametrize(("model", "params"), MODELS)
-def test_undistorted_photos_show_what_the_camera_model_says(
-    tmp_path: Path, model: str, params: tuple[float, ...]
-) -> None:
+def test_undistortion_matches_pycolmap(tmp_path: Path, model: str, params: tuple[float, ...]) -> None:
     oracle, folder = scene_with(tmp_path, model, params)
     view = load_scene(folder).train[0]
     K = view.camera.K.double().numpy()
@@ -59,14 +57,14 @@ def test_undistorted_photos_show_what_the_camera_model_says(
     assert np.abs(error).max() < 0.6  # bytes are whole
 
 
-def test_zero_coefficients_leave_the_photo_alone(tmp_path: Path) -> None:
+def test_zero_distortion_keeps_the_photo(tmp_path: Path) -> None:
     _, folder = scene_with(tmp_path, "OPENCV", (130, 140, 77, 63, 0, 0, 0, 0))
     view = load_scene(folder).train[0]
     assert view.camera.K.tolist() == [[130, 0, 77], [0, 140, 63], [0, 0, 1]]
     assert view.image[5, 7].tolist() == [7, 5, 0]
 
 
-def test_distortion_that_cannot_be_undone_is_refused() -> None:
+def test_irreversible_distortion() -> None:
     lens = make_lens("here", W, H, {"f": 5, "cx": 80, "cy": 60, "k1": -100})
     with pytest.raises(InputError, match=r"here: the lens distortion .* cannot be undone"):
         undistortion(lens, "here")

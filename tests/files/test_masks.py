@@ -34,7 +34,7 @@ def masks_of(scene: Scene) -> list[torch.Tensor | None]:
 
 
 @pytest.mark.parametrize("values", ["0 and 255", "0 and 1", "colours", "Booleans"])
-def test_a_mask_in_transforms_json(tmp_path: Path, values: str) -> None:
+def test_mask_path_in_transforms_json(tmp_path: Path, values: str) -> None:
     kinds = {"0 and 1": LEFT // 255, "colours": np.dstack([LEFT] * 3), "Booleans": LEFT > 0}
     with pytest.warns(KeyssWarning, match="1 of 3 photos have masks, which leave 50% of their pixels out"):
         scene = load_scene(masked_nerfstudio(tmp_path, kinds.get(values, LEFT)))
@@ -44,7 +44,7 @@ def test_a_mask_in_transforms_json(tmp_path: Path, values: str) -> None:
     assert torch.equal(second, torch.from_numpy(LEFT > 0))
 
 
-def test_a_mask_counts_in_the_digest_of_a_scene(tmp_path: Path) -> None:
+def test_scene_digest_includes_masks(tmp_path: Path) -> None:
     digests = {load_scene(write_nerfstudio(tmp_path)).digest()}
     for mask in (LEFT, np.flip(LEFT, 1)):
         with pytest.warns(KeyssWarning, match="masks"):
@@ -53,21 +53,21 @@ def test_a_mask_counts_in_the_digest_of_a_scene(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["01.png.png", "01.png", "01.PNG"])
-def test_masks_beside_the_photos_of_colmap(tmp_path: Path, name: str) -> None:
+def test_masks_of_colmap(tmp_path: Path, name: str) -> None:
     save(write_colmap(tmp_path) / "masks" / name, LEFT)
     with pytest.warns(KeyssWarning, match="1 of 3 photos have masks"):
         scene = load_scene(tmp_path)
     assert [mask is not None for mask in masks_of(scene)] == [False, True, False]
 
 
-def test_masks_that_belong_to_no_photo_are_said(tmp_path: Path) -> None:
+def test_masks_without_photos(tmp_path: Path) -> None:
     save(write_colmap(tmp_path) / "masks" / "mask-1.png", LEFT)
     with pytest.warns(KeyssWarning, match=r"no mask is used.*expected 00\.png\.png"):
         scene = load_scene(tmp_path)
     assert masks_of(scene) == [None] * 3
 
 
-def test_a_resampled_pixel_with_a_masked_part_does_not_count(tmp_path: Path) -> None:
+def test_resampled_masks_cover_partly_masked_pixels(tmp_path: Path) -> None:
     hole = np.full((HEIGHT, WIDTH), 255, np.uint8)
     hole[3, 4] = 0
     with warnings.catch_warnings():
@@ -81,7 +81,7 @@ def test_a_resampled_pixel_with_a_masked_part_does_not_count(tmp_path: Path) -> 
     assert covered[2] == [[2, 4], [2, 5], [3, 4], [3, 5]]
 
 
-def test_masks_that_cannot_be_used_are_refused(tmp_path: Path) -> None:
+def test_unusable_masks(tmp_path: Path) -> None:
     wrong = {"black": np.zeros_like(LEFT), "another aspect": LEFT[:-2], "absent": None}
     said = (
         r"1\.png: .* found a black one",

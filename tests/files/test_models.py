@@ -34,7 +34,7 @@ def toy(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(models, "FORMATS", [*models.FORMATS, entry])
 
 
-def test_a_new_format_is_read_and_written(toy: None, tmp_path: Path) -> None:
+def test_new_format(toy: None, tmp_path: Path) -> None:
     model = random_gaussians(9, sh_degree=2)
     for name, kind in (("a.toy", "toy"), ("b.TOY.bin", "toy"), ("c.ply", "PLY"), ("d.Ply", "PLY")):
         path = tmp_path / name
@@ -44,7 +44,7 @@ def test_a_new_format_is_read_and_written(toy: None, tmp_path: Path) -> None:
         assert read_model(path).digest() == model.digest()
 
 
-def test_the_content_decides_where_the_name_says_nothing(toy: None, tmp_path: Path) -> None:
+def test_format_from_content(toy: None, tmp_path: Path) -> None:
     model = random_gaussians(5)
     for suffix in (".ply", ".toy"):
         write_model(tmp_path / f"a{suffix}", model)
@@ -53,7 +53,7 @@ def test_the_content_decides_where_the_name_says_nothing(toy: None, tmp_path: Pa
         assert read_model(renamed).digest() == model.digest()
 
 
-def test_a_name_of_another_format_is_refused(toy: None, tmp_path: Path) -> None:
+def test_suffix_of_another_format(toy: None, tmp_path: Path) -> None:
     write_model(tmp_path / "a.toy", random_gaussians(5))
     path = (tmp_path / "a.toy").rename(tmp_path / "a.ply")
     with pytest.raises(
@@ -63,7 +63,7 @@ def test_a_name_of_another_format_is_refused(toy: None, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["a.lcc", "a", "ply", "a.ply.txt"])
-def test_unknown_names_are_refused_before_anything_is_written(tmp_path: Path, name: str) -> None:
+def test_unknown_suffixes(tmp_path: Path, name: str) -> None:
     assert not is_model_path(name)
     for write in (lambda path: write_model(path, random_gaussians(5)), lambda p: check_model_output(p, True)):
         with pytest.raises(
@@ -75,7 +75,7 @@ def test_unknown_names_are_refused_before_anything_is_written(tmp_path: Path, na
 
 
 @pytest.mark.parametrize("suffix", [".spz", ".sog", ".compressed.ply", ".glb", ".splat"])
-def test_every_format_comes_and_goes(tmp_path: Path, suffix: str) -> None:
+def test_every_format_round_trips(tmp_path: Path, suffix: str) -> None:
     model = random_gaussians(40, sh_degree=1)
     path = tmp_path / f"a{suffix}"
     write_model(path, model)
@@ -87,7 +87,7 @@ def test_every_format_comes_and_goes(tmp_path: Path, suffix: str) -> None:
 
 
 @pytest.mark.parametrize("suffix", [".spz", ".sog", ".compressed.ply", ".glb", ".splat"])
-def test_what_cannot_be_read_is_not_written(tmp_path: Path, suffix: str) -> None:
+def test_invalid_models_are_not_written(tmp_path: Path, suffix: str) -> None:
     model = random_gaussians(40)
     with pytest.raises(OutputError, match="holds no Gaussians"):
         write_model(tmp_path / f"a{suffix}", model[:0])
@@ -102,7 +102,7 @@ def test_what_cannot_be_read_is_not_written(tmp_path: Path, suffix: str) -> None
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 @pytest.mark.parametrize("suffix", ["ply", "PLY", "compressed.ply", "glb"])
-def test_info_agrees_with_the_model(tmp_path: Path, suffix: str, degree: int) -> None:
+def test_info_matches_the_model(tmp_path: Path, suffix: str, degree: int) -> None:
     """A plain .ply is read without torch, other formats by `read_model`, which is the oracle."""
     path = tmp_path / f"model.{suffix}"
     made = random_gaussians(500, sh_degree=degree)

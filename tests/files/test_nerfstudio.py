@@ -18,13 +18,12 @@ from files.scene_files import frames, photo, write_json, write_nerfstudio
 from keyss.core import InputError
 from keyss.files import load_scene
 from keyss.files.lens import undistortion
-from keyss.files.ply_table import read_point_cloud
-from keyss.files.transforms import read_nerfstudio
+from keyss.files.transforms import read_nerfstudio, read_point_cloud
 
 FRAMES = [f"images/frame_{i:05}.png" for i in range(10)]
 
 
-def test_intrinsics_of_the_file_and_of_a_frame(tmp_path: Path) -> None:
+def test_frame_intrinsics_override_the_file(tmp_path: Path) -> None:
     write_nerfstudio(tmp_path / "desk")
     meta = json.loads((tmp_path / "desk" / "transforms.json").read_text())
     meta["frames"][1] |= {"fl_x": 20, "cx": 5.0, "w": 12.0}
@@ -39,7 +38,7 @@ def test_intrinsics_of_the_file_and_of_a_frame(tmp_path: Path) -> None:
     assert scene.test[0].camera.viewmat[2, :3].tolist() == pytest.approx([-1, 0, 0], abs=1e-6)
 
 
-def test_focal_lengths_from_angles_and_sizes_from_photos(tmp_path: Path) -> None:
+def test_intrinsics_from_angles_and_photos(tmp_path: Path) -> None:
     angle = 2 * np.arctan(0.5)
     cut = {"w": None, "h": None, "fl_x": None, "fl_y": None, "cx": None, "cy": None}
     for angles, fl_y in (({}, 12), ({"camera_angle_y": angle}, 8)):
@@ -61,7 +60,7 @@ def test_focal_lengths_from_angles_and_sizes_from_photos(tmp_path: Path) -> None
         ({"is_fisheye": True, "k1": 0.03}, "OPENCV_FISHEYE", [0.03, 0, 0, 0]),
     ],
 )
-def test_distortion_means_what_colmap_means(
+def test_distortion_matches_colmap(
     tmp_path: Path, keys: dict[str, object], model: str, params: list[float]
 ) -> None:
     lens = read_nerfstudio(write_nerfstudio(tmp_path, **keys)).train[0].lens
@@ -114,7 +113,7 @@ def names(folder: Path) -> tuple[list[str], list[str]]:
         ({"ply_file_path": "none.ply"}, "none.ply: expected a file, found nothing"),
     ],
 )
-def test_what_is_wrong_is_named(tmp_path: Path, extra: dict[str, object], message: str) -> None:
+def test_invalid_fields(tmp_path: Path, extra: dict[str, object], message: str) -> None:
     with pytest.raises(InputError, match=message):
         load_scene(write_nerfstudio(tmp_path, **extra))
 
@@ -123,13 +122,13 @@ def test_what_is_wrong_is_named(tmp_path: Path, extra: dict[str, object], messag
     "file_path",
     ["/etc/hostname", "../../x.png", "images/../../../x.png", "C:/x.png", "..\\..\\x.png", "a\0b", "..", ""],
 )
-def test_paths_that_leave_are_refused(tmp_path: Path, file_path: str) -> None:
+def test_paths_outside_of_the_scene(tmp_path: Path, file_path: str) -> None:
     with pytest.raises(InputError, match="expected paths in the scene's folder or its parent"):
         load_scene(write_nerfstudio(tmp_path, frames=frames(["images/frame_00000.png", file_path])))
 
 
 @pytest.mark.parametrize("start", ["/home/somebody/scenes/garden/", "C:\\data\\garden\\"])
-def test_paths_of_another_computer_are_found_in_the_folder(tmp_path: Path, start: str) -> None:
+def test_absolute_paths_from_another_computer(tmp_path: Path, start: str) -> None:
     paths = [f"images/frame_{index:05}.png" for index in range(3)]
     write_nerfstudio(tmp_path, frames=frames([start + path for path in paths]))
     assert sorted(view.camera.name for view in load_scene(tmp_path).views) == paths
@@ -138,7 +137,7 @@ def test_paths_of_another_computer_are_found_in_the_folder(tmp_path: Path, start
 @pytest.mark.parametrize(
     "text", ["", "{", "[]", "3", "null", "[" * 100_000, '{"frames": ' + "9" * 5000 + "}", "\xff"]
 )
-def test_files_that_are_no_json_object(tmp_path: Path, text: str) -> None:
+def test_invalid_json(tmp_path: Path, text: str) -> None:
     (tmp_path / "transforms.json").write_bytes(text.encode("latin-1"))
     with pytest.raises(InputError, match=r"transforms\.json: expected"):
         load_scene(tmp_path)
@@ -155,7 +154,7 @@ def replacements(value: Any, put: Any) -> Iterator[None]:
             yield from replacements(value[key], lambda new, at=key: value.__setitem__(at, new))
 
 
-def test_junk_anywhere_gives_an_input_error_or_a_scene(tmp_path: Path) -> None:
+def test_junk_values_are_refused_or_ignored(tmp_path: Path) -> None:
     write_nerfstudio(
         tmp_path, 2, k1=0.01, applied_transform=[[1, 0, 0, 0]], train_filenames=["images/frame_00000.png"]
     )
@@ -198,7 +197,7 @@ KINDS = ["ascii", "binary_little_endian", "binary_big_endian"]
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_points_come_from_the_ply(tmp_path: Path, kind: str) -> None:
+def test_points_from_ply(tmp_path: Path, kind: str) -> None:
     write_nerfstudio(tmp_path, ply_file_path="sparse_pc.ply")
     (tmp_path / "sparse_pc.ply").write_bytes(cloud(kind))
     scene = load_scene(tmp_path)
@@ -206,7 +205,7 @@ def test_points_come_from_the_ply(tmp_path: Path, kind: str) -> None:
     np.testing.assert_array_equal(scene.colors, RGB)
 
 
-def test_points_agree_with_colmaps_export(real_data: Path, tmp_path: Path) -> None:
+def test_points_match_colmaps_export(real_data: Path, tmp_path: Path) -> None:
     reconstruction = pycolmap.Reconstruction(real_data / "fox" / "sparse" / "0")
     reconstruction.export_PLY(tmp_path / "fox.ply")
     points = read_point_cloud(tmp_path / "fox.ply")

@@ -45,13 +45,13 @@ def child(program: str, path: Path) -> Iterator[subprocess.Popen[str]]:
         process.kill()
 
 
-def test_only_the_owner_may_read_what_is_written(tmp_path: Path, umask: None) -> None:
+def test_files_are_private(tmp_path: Path, umask: None) -> None:
     os.umask(0)
     write_bytes(tmp_path / "x", b"1")
     assert (tmp_path / "x").stat().st_mode & 0o777 == 0o600
 
 
-def test_what_a_killed_process_left_goes_with_the_next_write(tmp_path: Path) -> None:
+def test_leftovers_of_killed_processes_are_removed(tmp_path: Path) -> None:
     with child(WRITE_AND_WAIT, tmp_path / "x"):
         pass
     assert sorted(path.name for path in tmp_path.iterdir()) == [".x.lock", ".x.unfinished"]
@@ -60,7 +60,7 @@ def test_what_a_killed_process_left_goes_with_the_next_write(tmp_path: Path) -> 
     assert (tmp_path / "x").read_bytes() == b"whole"
 
 
-def test_two_processes_do_not_write_one_file(tmp_path: Path) -> None:
+def test_concurrent_writes_are_refused(tmp_path: Path) -> None:
     with (
         child(WRITE_AND_WAIT, tmp_path / "x"),
         pytest.raises(OutputError, match="another process is writing it"),
@@ -68,7 +68,7 @@ def test_two_processes_do_not_write_one_file(tmp_path: Path) -> None:
         write_bytes(tmp_path / "x", b"1")
 
 
-def test_a_link_in_the_place_of_the_temporary_file_is_not_followed(tmp_path: Path) -> None:
+def test_links_at_the_temporary_path_are_not_followed(tmp_path: Path) -> None:
     victim, temporary = tmp_path / "victim", tmp_path / ".x.unfinished"
     victim.write_bytes(b"mine")
     for link in (temporary.symlink_to, temporary.hardlink_to):
@@ -79,7 +79,7 @@ def test_a_link_in_the_place_of_the_temporary_file_is_not_followed(tmp_path: Pat
 
 
 @pytest.mark.parametrize("error", [OSError(28, "No space left"), KeyboardInterrupt()])
-def test_an_error_leaves_the_old_file(tmp_path: Path, error: BaseException) -> None:
+def test_errors_leave_the_old_file(tmp_path: Path, error: BaseException) -> None:
     def fail() -> None:
         with atomic_write(tmp_path / "x") as file:
             file.write(b"a part")
@@ -91,7 +91,7 @@ def test_an_error_leaves_the_old_file(tmp_path: Path, error: BaseException) -> N
     assert [path.read_bytes() for path in tmp_path.iterdir()] == [b"old"]
 
 
-def test_a_lock_dies_with_its_process(tmp_path: Path) -> None:
+def test_locks_end_with_their_process(tmp_path: Path) -> None:
     path = tmp_path / "lock"
     with (
         child(LOCK_AND_WAIT, path),

@@ -79,7 +79,7 @@ def model(tmp_path: Path) -> Path:
 # --- writing ---------------------------------------------------------------------------------------------
 
 
-def test_layout_is_inrias(tmp_path: Path) -> None:
+def test_inria_layout(tmp_path: Path) -> None:
     gaussians = random_gaussians(7, sh_degree=3)
     write_model(tmp_path / "a.ply", gaussians)
     expected = {name: columns_of(gaussians)[name] for name in names_of(3)}
@@ -94,7 +94,7 @@ finite = st.floats(width=32, allow_nan=False, allow_infinity=False)
 
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data(), n=st.integers(1, 3), degree=st.integers(0, 3))
-def test_round_trip_is_bit_exact(tmp_path: Path, data: st.DataObject, n: int, degree: int) -> None:
+def test_round_trip_is_exact(tmp_path: Path, data: st.DataObject, n: int, degree: int) -> None:
     size = n * len(names_of(degree, normals=False))
     values = torch.tensor(data.draw(st.lists(finite, min_size=size, max_size=size)), dtype=torch.float32)
     parts = values.split([3 * n, 4 * n, 3 * n, n, size - 11 * n])
@@ -108,7 +108,7 @@ def test_round_trip_is_bit_exact(tmp_path: Path, data: st.DataObject, n: int, de
 
 @pytest.mark.parametrize("form", ["binary_little_endian", "binary_big_endian", "ascii"])
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_reads_by_name(tmp_path: Path, form: str, degree: int) -> None:
+def test_property_order_and_types(tmp_path: Path, form: str, degree: int) -> None:
     """Any order, no normals, and properties of every size in between."""
     gaussians = random_gaussians(6, sh_degree=degree)
     columns = columns_of(gaussians)
@@ -131,7 +131,7 @@ def test_reads_by_name(tmp_path: Path, form: str, degree: int) -> None:
         ("y", 1e60, "double"),
     ],
 )
-def test_rows_that_are_not_finite_are_left_out(tmp_path: Path, name: str, value: float, kind: str) -> None:
+def test_rows_with_nan_or_infinity_are_left_out(tmp_path: Path, name: str, value: float, kind: str) -> None:
     model = random_gaussians(4, sh_degree=1)
     columns = columns_of(model)
     columns[name] = np.array([columns[name][0], value, value, columns[name][3]])
@@ -150,7 +150,7 @@ def test_rows_that_are_not_finite_are_left_out(tmp_path: Path, name: str, value:
         read_model(tmp_path / "a.ply")
 
 
-def test_flat_gaussians_are_kept(tmp_path: Path) -> None:
+def test_zero_scales_are_kept(tmp_path: Path) -> None:
     """Scales of 0 are log scales of minus infinity; they are drawn as discs."""
     model = random_gaussians(4, sh_degree=0)
     columns = columns_of(model)
@@ -168,7 +168,7 @@ def test_flat_gaussians_are_kept(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("unit", [0.001, 1e6])
 @pytest.mark.parametrize("which", ["scales", "opacities", "scales and opacities"])
-def test_activated_values_are_refused_in_any_unit(tmp_path: Path, unit: float, which: str) -> None:
+def test_activated_scales_and_opacities_are_refused(tmp_path: Path, unit: float, which: str) -> None:
     model = random_gaussians(400, sh_degree=0)
     generator = torch.Generator().manual_seed(0)
     scales = torch.exp(torch.randn(400, 3, generator=generator) - 3)
@@ -185,7 +185,7 @@ def test_activated_values_are_refused_in_any_unit(tmp_path: Path, unit: float, w
         read_model(tmp_path / "activated.ply")
 
 
-def test_models_of_other_kinds_are_told_the_way_out(tmp_path: Path) -> None:
+def test_2dgs_and_rgb_models(tmp_path: Path) -> None:
     columns = columns_of(random_gaussians(4, sh_degree=0))
     flat = {name: values for name, values in columns.items() if name != "scale_2"}
     (tmp_path / "a.ply").write_bytes(ply_bytes(flat))
@@ -223,9 +223,15 @@ BROKEN = {
     "list before": (header_of("element a 1", "property list uchar int f", *XYZ), "list property"),
     "point cloud": (header_of(*XYZ) + bytes(12), "point cloud, not a 3DGS model.*missing: f_dc_0"),
     "compressed": (header_of("element vertex 1", "property uint packed_position"), "compressed"),
-    "no model": (header_of("element vertex 1", "property float u"), "not a 3DGS model.*missing: x, y, z"),
-    "odd f_rest": (header_of(*XYZ, "property float f_rest_0"), "0, 9, 24 or 45"),
-    "gap in f_rest": (header_of(*XYZ, *(f"property float f_rest_{i + 1}" for i in range(9))), "0, 9, 24"),
+    "no model": (
+        header_of("element vertex 1", "property float u") + bytes(4),
+        "not a 3DGS model.*missing: x, y, z",
+    ),
+    "odd f_rest": (header_of(*XYZ, "property float f_rest_0") + bytes(16), "0, 9, 24 or 45"),
+    "gap in f_rest": (
+        header_of(*XYZ, *(f"property float f_rest_{i + 1}" for i in range(9))) + bytes(48),
+        "0, 9, 24",
+    ),
     "negative": (header_of("element vertex -1"), "cannot parse line"),
     "fraction": (header_of("element vertex 1.5"), "cannot parse line"),
     "underscore": (header_of("element vertex 1_0"), "cannot parse line"),
@@ -236,14 +242,14 @@ BROKEN = {
 
 
 @pytest.mark.parametrize("case", BROKEN)
-def test_refuses(tmp_path: Path, case: str) -> None:
+def test_invalid_files(tmp_path: Path, case: str) -> None:
     data, message = BROKEN[case]
     (tmp_path / "a.ply").write_bytes(data)
     with pytest.raises(InputError, match=message):
         read_model(tmp_path / "a.ply")
 
 
-def test_truncation_anywhere(model: Path) -> None:
+def test_truncation(model: Path) -> None:
     data = model.read_bytes()
     body = data.index(b"end_header\n") + len(b"end_header\n")
     stride = (len(data) - body) // 5
@@ -273,7 +279,7 @@ def test_real_models(real_data: Path, tmp_path: Path, name: str, count: int, deg
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_gsply_reads_ours_and_we_read_its(tmp_path: Path, degree: int) -> None:
+def test_gsply_round_trip(tmp_path: Path, degree: int) -> None:
     gaussians = random_gaussians(50, sh_degree=degree)
     write_model(tmp_path / "a.ply", gaussians)
     theirs = gsply.plyread(tmp_path / "a.ply")
@@ -297,7 +303,7 @@ def test_gsply_reads_ours_and_we_read_its(tmp_path: Path, degree: int) -> None:
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_splat_transform_copies_ours(splat_transform: Transform, tmp_path: Path, degree: int) -> None:
+def test_splat_transform_round_trip(splat_transform: Transform, tmp_path: Path, degree: int) -> None:
     gaussians = random_gaussians(40, sh_degree=degree)
     write_model(tmp_path / "in.ply", gaussians)
     copy = splat_transform(tmp_path / "in.ply", tmp_path / "out.ply")

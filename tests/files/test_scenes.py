@@ -28,14 +28,14 @@ from keyss.files import load_scene
 WRITERS = {"colmap": write_colmap, "blender": write_blender, "nerfstudio": write_nerfstudio}
 
 
-def test_every_eighth_photo_by_name_is_for_testing(tmp_path: Path) -> None:
+def test_every_eighth_photo_is_a_test_view(tmp_path: Path) -> None:
     images = counted(*(image_bytes(i, f"{i:02}.png") for i in reversed(range(20))))
     scene = load_scene(write_colmap(tmp_path, 20, images=images))
     assert [v.camera.name for v in scene.test] == ["00.png", "08.png", "16.png"]
     assert [v.camera.name for v in scene.train] == [f"{i:02}.png" for i in range(20) if i % 8]
 
 
-def test_unknown_layouts_are_told_what_is_known(tmp_path: Path) -> None:
+def test_unknown_layouts(tmp_path: Path) -> None:
     known = "Known layouts: COLMAP .*; Blender .*; Nerfstudio"
     with pytest.raises(InputError, match=f"found an empty folder.*{known}"):
         load_scene(tmp_path)
@@ -54,7 +54,7 @@ def test_unknown_layouts_are_told_what_is_known(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("width", "size"), [(6, (6, 4)), (5, (5, 3)), (1, (1, 1)), (12, (12, 8)), (100, (12, 8))]
 )
-def test_width_shrinks_and_never_enlarges(tmp_path: Path, width: int, size: tuple[int, int]) -> None:
+def test_width_never_enlarges(tmp_path: Path, width: int, size: tuple[int, int]) -> None:
     write_colmap(tmp_path)
     full, view = load_scene(tmp_path).train[0], load_scene(tmp_path, width=width).train[0]
     assert (view.camera.width, view.camera.height) == size
@@ -64,7 +64,7 @@ def test_width_shrinks_and_never_enlarges(tmp_path: Path, width: int, size: tupl
 
 
 @pytest.mark.parametrize("width", [6, 5, 7, 1])
-def test_shrinking_averages_areas(tmp_path: Path, width: int) -> None:
+def test_downscaling_averages_areas(tmp_path: Path, width: int) -> None:
     view = load_scene(write_colmap(tmp_path), width=width).train[0]
     height = view.camera.height
     columns, rows = area_weights(WIDTH, width), area_weights(HEIGHT, height)
@@ -81,7 +81,7 @@ def area_weights(old: int, new: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("size", [(18, 12), (6, 4), (17, 11), (30, 20)])
-def test_intrinsics_are_scaled_to_photos_of_the_same_aspect(tmp_path: Path, size: tuple[int, int]) -> None:
+def test_intrinsics_are_scaled_to_the_photos(tmp_path: Path, size: tuple[int, int]) -> None:
     width, height = size
     cameras = counted(camera_bytes(width=width, height=height, params=(40, 50, width / 2, height / 2)))
     folder = write_colmap(tmp_path, cameras=cameras)
@@ -100,7 +100,7 @@ def with_photo(folder: Path, image: Image.Image, **options: object) -> np.ndarra
     return load_scene(folder, background=(0, 0, 1)).train[0].image.numpy()
 
 
-def test_grey_palette_and_deep_photos_become_rgb(tmp_path: Path) -> None:
+def test_image_modes_become_rgb(tmp_path: Path) -> None:
     grey = photo(3, 1)[:, :, 0]
     rgb = np.repeat(grey[:, :, None], 3, axis=2)
     assert np.array_equal(with_photo(tmp_path, Image.fromarray(grey)), rgb)
@@ -115,7 +115,7 @@ def test_grey_palette_and_deep_photos_become_rgb(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("layout", WRITERS)
-def test_missing_photos_are_refused_or_left_out(tmp_path: Path, layout: str) -> None:
+def test_missing_photos(tmp_path: Path, layout: str) -> None:
     WRITERS[layout](tmp_path, count=10)
     train = load_scene(tmp_path).train
     folder = tmp_path / "images" if layout == "colmap" else tmp_path
@@ -127,7 +127,7 @@ def test_missing_photos_are_refused_or_left_out(tmp_path: Path, layout: str) -> 
     message = f"2 of 10 photos are missing: {gone[0]}, {gone[1]}; .*`skip_missing=True`"
     with pytest.raises(InputError, match=message):
         load_scene(tmp_path)
-    with pytest.warns(KeyssWarning, match=f"2 of 10 photos are missing and left out: {gone[0]}, {gone[1]}$"):
+    with pytest.warns(KeyssWarning, match=f"2 of 10 photos are missing, left out: {gone[0]}, {gone[1]}$"):
         left = load_scene(tmp_path, skip_missing=True)
     names = {view.camera.name for view in left.views}
     assert not names & {train[0].camera.name, train[-1].camera.name}
@@ -140,17 +140,17 @@ def test_missing_photos_are_refused_or_left_out(tmp_path: Path, layout: str) -> 
 
 
 @pytest.mark.parametrize("layout", WRITERS)
-def test_a_scene_without_any_photo_is_refused_in_any_case(tmp_path: Path, layout: str) -> None:
+def test_scene_without_photos(tmp_path: Path, layout: str) -> None:
     WRITERS[layout](tmp_path, count=7)
     for path in tmp_path.rglob("*.png"):
         path.unlink()
     with pytest.raises(InputError, match=r"7 of 7 photos are missing: .* and 2 more; `skip"):
         load_scene(tmp_path)
-    with pytest.raises(InputError, match="all of its 7 photos are missing"):
+    with pytest.raises(InputError, match=r"7 of 7 photos are missing: .* and 2 more$"):
         load_scene(tmp_path, skip_missing=True)
 
 
-def test_broken_photos_are_named(tmp_path: Path) -> None:
+def test_broken_photos(tmp_path: Path) -> None:
     path = write_colmap(tmp_path) / "images" / "01.png"
     data = path.read_bytes()
     for length in range(0, len(data) - 20, 7):  # the last 20 bytes are checksums and the end mark
@@ -167,7 +167,7 @@ def test_broken_photos_are_named(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("side", "limit"), [(5_000, "24"), (9_500, "89"), (30_000, "89")])
-def test_decompression_bombs_are_refused_unopened(tmp_path: Path, side: int, limit: str) -> None:
+def test_image_decompression_bombs(tmp_path: Path, side: int, limit: str) -> None:
     header = struct.pack(">IIBBBBB", side, side, 8, 2, 0, 0, 0)
     chunks = [(b"IHDR", header), (b"IDAT", zlib.compress(bytes(1000))), (b"IEND", b"")]
     png = b"\x89PNG\r\n\x1a\n" + b"".join(

@@ -15,7 +15,7 @@ from keyss.methods import KeyssTraining, PlacedScene, registry
 from methods.keyss.small import small
 from tiny_scenes import random_gaussians, tiny_scene
 
-# Densified at 20 and 30 of 50 steps; WaterGS trains its autoencoder from step 35 on.
+# Densified at 20 and 30 of 50 steps.
 FIT = FitConfig(
     iterations=50, max_gaussians=999, sh_degree=1, grow_start=0.2, grow_stop=0.7, grow_every=10, seed=3
 )
@@ -32,9 +32,9 @@ def joint(fit: FitConfig, device: torch.device) -> KeyssTraining:
     return KeyssTraining(placed(), keys, options, options.configuration, device)
 
 
-def watergs(fit: FitConfig, device: torch.device) -> KeyssTraining:
-    """A peer with a network, and with parameters that have no gradients at the end."""
-    method: Any = registry.get("watergs")
+def gs_hider(fit: FitConfig, device: torch.device) -> KeyssTraining:
+    """A baseline with networks, and with features in place of harmonics."""
+    method: Any = registry.get("gs-hider")
     options = method.options(fit=fit, common_poses=0.5)
     return method.training(placed(), options, device)  # type: ignore[no-any-return]
 
@@ -42,12 +42,12 @@ def watergs(fit: FitConfig, device: torch.device) -> KeyssTraining:
 RUNS: Mapping[str, Callable[[FitConfig, torch.device], Any]] = {
     "plain": plain,
     "joint": joint,
-    "watergs": watergs,
+    "gs-hider": gs_hider,
 }
 
 
-def trained(name: str, fit: FitConfig, device: str = "cpu", **options: Any) -> TrainingRun:
-    """One of RUNS, trained to its end."""
+def train_run(name: str, fit: FitConfig, device: str = "cpu", **options: Any) -> TrainingRun:
+    """One of RUNS, train_run to its end."""
     run: TrainingRun = RUNS[name](fit, torch.device(device))
     train(run, name, fit, fingerprint={}, **options)
     return run

@@ -34,7 +34,7 @@ def _run(make: Any, start: Tensor, gradients: Tensor) -> Tensor:
 
 
 @pytest.mark.parametrize("shape", [(1,), (2049, 4), (700, 16, 3)])
-def test_it_is_torchs_adam(shape: tuple[int, ...]) -> None:
+def test_matches_torch(shape: tuple[int, ...]) -> None:
     start, gradients = torch.rand(shape), _gradients(shape, 20)
     ours = _run(lambda p: RowAdam([p], lr=RATE, eps=EPS), start, gradients)
     theirs = _run(lambda p: torch.optim.Adam([p], lr=RATE, eps=EPS), start.double(), gradients)
@@ -43,7 +43,7 @@ def test_it_is_torchs_adam(shape: tuple[int, ...]) -> None:
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_each_number_of_a_row_has_its_rate(dtype: torch.dtype) -> None:
+def test_lr_scale(dtype: torch.dtype) -> None:
     """In float64 by torch's operations, as on a GPU."""
     start, gradients = torch.rand(500, 16, 3, dtype=torch.float64), _gradients((500, 16, 3), 20)
     ours = _run(
@@ -59,7 +59,7 @@ def test_each_number_of_a_row_has_its_rate(dtype: torch.dtype) -> None:
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_each_row_has_its_factor(dtype: torch.dtype) -> None:
+def test_row_scale(dtype: torch.dtype) -> None:
     start, gradients = torch.rand(3001, 3, dtype=torch.float64), _gradients((3001, 3), 20)
     factors = 2 * torch.rand(3001, dtype=torch.float64)
 
@@ -73,7 +73,7 @@ def test_each_row_has_its_factor(dtype: torch.dtype) -> None:
     assert (ours - (start + factors[:, None] * (whole - start))).abs().max() < 2e-6
 
 
-def test_densification_edits_its_state_like_that_of_torchs_adam() -> None:
+def test_densification() -> None:
     config, gaussians = FitConfig(), random_gaussians(120)
 
     def run(parameters: Parameters, optimizers: Any) -> dict[str, Tensor]:
@@ -108,7 +108,7 @@ def test_densification_edits_its_state_like_that_of_torchs_adam() -> None:
 
 
 @pytest.mark.cuda
-def test_a_gpu_gives_the_same_result(cuda: torch.device) -> None:
+def test_cuda_matches_cpu(cuda: torch.device) -> None:
     start, gradients = torch.rand(500, 16, 3), _gradients((500, 16, 3), 20)
     here, there = (
         _run(
@@ -123,7 +123,7 @@ def test_a_gpu_gives_the_same_result(cuda: torch.device) -> None:
     assert (here - there.cpu()).abs().max() < 1e-6
 
 
-def test_numbers_that_end_near_zero_have_uniform_low_bits() -> None:
+def test_low_bits_are_uniform() -> None:
     """A step that is rounded before it is subtracted leaves trailing zeros in the smaller result.
 
     By chance one of the four bits is beyond the bound once in 1.2 million times.

@@ -21,7 +21,7 @@ def _setup(max_gaussians: int) -> tuple[CappedStrategy, Parameters, Optimizers, 
     return strategy, parameters, optimizers, state
 
 
-def test_growth_stops_at_the_cap_and_prefers_the_largest_gradients() -> None:
+def test_growth_is_capped() -> None:
     strategy, parameters, optimizers, state = _setup(COUNT + 10)
     before = parameters["means"].detach().clone()
     strategy._grow_gs(parameters, optimizers, state, step=1000)

@@ -8,14 +8,14 @@ from pathlib import Path
 import pytest
 import torch
 
-from fitting.small_trainings import FIT, RUNS, trained
+from fitting.small_trainings import FIT, RUNS, train_run
 from fitting.test_plain import InterruptAt
 from keyss.core import Interrupted
 from keyss.fitting import fit_scene
 from tiny_scenes import tiny_scene
 
 
-def test_a_checkpoint_does_not_depend_on_the_name_of_the_device(tmp_path: Path) -> None:
+def test_device_alias(tmp_path: Path) -> None:
     """ "cpu:0" is another name of the same device."""
     scene, path = tiny_scene(), tmp_path / "checkpoint.safetensors"
     with pytest.raises(Interrupted):
@@ -27,15 +27,15 @@ def test_a_checkpoint_does_not_depend_on_the_name_of_the_device(tmp_path: Path) 
 
 @pytest.mark.cuda
 @pytest.mark.parametrize("name", RUNS)
-def test_a_run_resumes_on_a_gpu_and_back_on_the_cpu(tmp_path: Path, name: str, cuda: torch.device) -> None:
+def test_resume_across_devices(tmp_path: Path, name: str, cuda: torch.device) -> None:
     """The quality is near that of a run on the CPU; the order of sums on a GPU varies."""
     path, fit = tmp_path / "checkpoint.safetensors", replace(FIT, iterations=60)
     with pytest.raises(Interrupted):
-        trained(name, fit, checkpoint=path, reporter=InterruptAt(25))
+        train_run(name, fit, checkpoint=path, reporter=InterruptAt(25))
     with pytest.raises(Interrupted):
-        trained(name, fit, str(cuda), checkpoint=path, resume=True, reporter=InterruptAt(45))
-    found = trained(name, fit, checkpoint=path, resume=True)
-    stayed = trained(name, fit)
+        train_run(name, fit, str(cuda), checkpoint=path, resume=True, reporter=InterruptAt(45))
+    found = train_run(name, fit, checkpoint=path, resume=True)
+    stayed = train_run(name, fit)
     assert abs(len(found) - len(stayed)) <= 0.05 * len(stayed)
     for what, psnr in stayed.evaluate().items():
         assert found.evaluate()[what] > psnr - 0.5, what

@@ -41,14 +41,14 @@ def _ssim_by_definition(a: torch.Tensor, b: torch.Tensor, mask: torch.Tensor | N
     return float((found if mask is None else found[mask.flatten()]).mean())
 
 
-def test_ssim_is_what_its_definition_says() -> None:
+def test_ssim() -> None:
     a, b = _images(17, 14)
     expected = _ssim_by_definition(a, b)
     assert float(ssim(a, Target.of(b))) == pytest.approx(expected, abs=2e-6)
     assert float(ssim_torch(a, Target.of(b))) == pytest.approx(expected, abs=2e-6)
 
 
-def test_quality_is_that_of_what_masks_leave() -> None:
+def test_quality_with_mask() -> None:
     """Equal to a render where the mask is True, and noise elsewhere."""
     model, camera = random_gaussians(), ring_cameras(1)[0]
     image = (render(model, camera).clamp(0, 1) * 255).round().to(torch.uint8)
@@ -62,7 +62,7 @@ def test_quality_is_that_of_what_masks_leave() -> None:
     assert quality(model, [replace(view, mask=None)], torch.zeros(3)).ssim < 0.9
 
 
-def test_the_ssim_of_a_mask_is_the_mean_of_its_pixels() -> None:
+def test_ssim_with_mask() -> None:
     """Windows see the mean colour where it is False."""
     a, b = _images(17, 14)
     mask = torch.rand(17, 14, generator=torch.Generator().manual_seed(3)) > 0.3
@@ -75,7 +75,7 @@ def test_the_ssim_of_a_mask_is_the_mean_of_its_pixels() -> None:
 
 @settings(deadline=None, max_examples=20)
 @given(st.integers(1, 70), st.integers(1, 40), st.integers(0, 99))
-def test_kernel_and_its_gradient_agree_with_autograd_in_float64(height: int, width: int, seed: int) -> None:
+def test_ssim_gradient(height: int, width: int, seed: int) -> None:
     a, b = _images(height, width, seed)
     fast = a.clone().requires_grad_()
     slow = a.double().requires_grad_()
@@ -91,7 +91,7 @@ def test_kernel_and_its_gradient_agree_with_autograd_in_float64(height: int, wid
     assert (fast.grad - slow.grad).abs().max() <= 2e-4 * scale
 
 
-def test_photometric_loss_mixes_l1_and_ssim() -> None:
+def test_photometric_loss() -> None:
     a, b = _images(24, 24)
     target = Target.of(b)
     l1 = float((a - b).abs().mean())
@@ -102,7 +102,7 @@ def test_photometric_loss_mixes_l1_and_ssim() -> None:
 
 
 @pytest.mark.parametrize("weight", [0.2, 1.0])
-def test_gradient_of_the_photometric_loss_agrees_with_autograd(weight: float) -> None:
+def test_photometric_loss_gradient(weight: float) -> None:
     a, b = _images(37, 29)
     a[:5] = b[:5]  # |x| has no slope at 0
     target = Target.of(b)
@@ -114,7 +114,7 @@ def test_gradient_of_the_photometric_loss_agrees_with_autograd(weight: float) ->
     assert (fast.grad - slow.grad).abs().max() <= 1e-5 * slow.grad.abs().max()
 
 
-def test_psnr_is_what_its_definition_says() -> None:
+def test_psnr() -> None:
     rng = np.random.default_rng(0)
     a, b = rng.uniform(-0.5, 1.5, (2, 7, 5, 3))
     error = np.mean((a.clip(0, 1) - b.clip(0, 1)) ** 2)

@@ -48,7 +48,7 @@ class InterruptAt(Reporter):
             os.kill(os.getpid(), signal.SIGINT)
 
 
-def test_fitting_improves_psnr_on_test_views() -> None:
+def test_fit_improves_psnr() -> None:
     scene, config = tiny_scene(), replace(CONFIG, iterations=400)
     start = PlainRun(scene, config, torch.device("cpu")).gaussians()
     fitted = fit_scene(scene, config).gaussians
@@ -57,7 +57,7 @@ def test_fitting_improves_psnr_on_test_views() -> None:
     assert len(start) < len(fitted) <= config.max_gaussians
 
 
-def test_what_masks_cover_has_no_part_in_a_fit() -> None:
+def test_masked_pixels_are_ignored() -> None:
     scene, config = tiny_scene(views=32), replace(CONFIG, iterations=300)
     generator = torch.Generator().manual_seed(5)
     masked, occluded = [], []
@@ -79,7 +79,7 @@ def test_what_masks_cover_has_no_part_in_a_fit() -> None:
     assert good > bad + 2
 
 
-def test_a_step_minimises_the_mean_loss_of_its_views() -> None:
+def test_loss_is_mean_over_views() -> None:
     scene, config = tiny_scene(), replace(CONFIG, views_per_step=2)
     run, same = (PlainRun(scene, config, torch.device("cpu")) for _ in range(2))
     model, losses = same.gaussians(), []
@@ -93,7 +93,7 @@ def test_a_step_minimises_the_mean_loss_of_its_views() -> None:
         FitConfig(views_per_step=0)
 
 
-def test_one_seed_gives_one_model_and_leaves_the_global_random_state_alone() -> None:
+def test_seed() -> None:
     scene = tiny_scene()
     torch.manual_seed(1)
     state = torch.get_rng_state()
@@ -105,7 +105,7 @@ def test_one_seed_gives_one_model_and_leaves_the_global_random_state_alone() -> 
 
 
 @pytest.mark.parametrize("iteration", [1, 33])
-def test_an_interrupted_run_resumes_to_the_same_model(tmp_path: Path, iteration: int) -> None:
+def test_resume(tmp_path: Path, iteration: int) -> None:
     scene, path = tiny_scene(), tmp_path / "checkpoint.safetensors"
     with pytest.raises(Interrupted) as caught:
         fit_scene(scene, CONFIG, checkpoint=path, reporter=InterruptAt(iteration))
@@ -114,7 +114,7 @@ def test_an_interrupted_run_resumes_to_the_same_model(tmp_path: Path, iteration:
     assert _same(resumed, fit_scene(scene, CONFIG).gaussians)
 
 
-def test_a_checkpoint_of_other_settings_is_refused(tmp_path: Path) -> None:
+def test_checkpoint_of_other_settings(tmp_path: Path) -> None:
     scene, path = tiny_scene(), tmp_path / "checkpoint.safetensors"
     fit_scene(scene, replace(CONFIG, iterations=5), checkpoint=path)
     with pytest.raises(InputError, match="other settings"):
@@ -123,7 +123,7 @@ def test_a_checkpoint_of_other_settings_is_refused(tmp_path: Path) -> None:
         fit_scene(tiny_scene(3), replace(CONFIG, iterations=5), checkpoint=path, resume=True)
 
 
-def test_a_damaged_checkpoint_is_an_input_error(tmp_path: Path) -> None:
+def test_damaged_checkpoint(tmp_path: Path) -> None:
     path = tmp_path / "checkpoint.safetensors"
     save_checkpoint(path, {"a": torch.ones(3)}, {"iteration": 1})
     data = path.read_bytes()
@@ -133,13 +133,13 @@ def test_a_damaged_checkpoint_is_an_input_error(tmp_path: Path) -> None:
             load_checkpoint(path)
 
 
-def test_a_scene_without_points_starts_from_random_ones() -> None:
+def test_scene_without_points() -> None:
     scene = replace(tiny_scene(), points=torch.zeros(0, 3), colors=torch.zeros(0, 3, dtype=torch.uint8))
     fitted = fit_scene(scene, CONFIG).gaussians
     assert mean_psnr(fitted, scene.test, scene.background) > 18
 
 
 @pytest.mark.parametrize("changes", [{"iterations": 0}, {"max_gaussians": -5}, {"sh_degree": 4}])
-def test_settings_out_of_range_are_refused_by_name(changes: dict[str, int]) -> None:
+def test_invalid_settings(changes: dict[str, int]) -> None:
     with pytest.raises(UsageError, match=next(iter(changes))):
         FitConfig(**changes)  # type: ignore[arg-type]

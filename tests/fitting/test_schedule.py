@@ -35,14 +35,14 @@ def _rates(config: FitConfig, iteration: int, means: Tensor | None = None) -> tu
 
 @pytest.mark.parametrize("config", [FitConfig(iterations=30_000), FitConfig(iterations=900, boost=1.0)])
 @pytest.mark.parametrize("progress", [0.0, 0.5, 1.0])
-def test_long_runs_have_the_rates_of_3dgs(config: FitConfig, progress: float) -> None:
+def test_rates_of_long_runs(config: FitConfig, progress: float) -> None:
     found, optimizers = _rates(config, round(progress * config.iterations))
     expected = RATES | {"means": EXTENT * RATES["means"] * 0.01**progress}
     assert found == pytest.approx(expected)
     assert not optimizers["means"].state
 
 
-def test_short_runs_start_with_larger_rates_and_end_with_those_of_3dgs() -> None:
+def test_rates_of_short_runs() -> None:
     config = FitConfig(iterations=1000)
     start, _ = _rates(config, 0)
     ratios = {"means": EXTENT * 5**1.75, "quats": 5, "scales": 5, "opacities": 5 ** (1 / 4), "sh": 5}
@@ -53,7 +53,7 @@ def test_short_runs_start_with_larger_rates_and_end_with_those_of_3dgs() -> None
     )
 
 
-def test_positions_move_in_proportion_to_a_pixel_of_the_nearest_camera() -> None:
+def test_position_rates_follow_pixel_size() -> None:
     depths = torch.tensor([-0.9, 0.0, 1.0, 100.0, -3.1])
     means = torch.stack([torch.zeros(5), torch.zeros(5), depths], 1)
     _, optimizers = _rates(FitConfig(iterations=1000), 1, means)

@@ -26,7 +26,7 @@ def _expand(key: str, label: bytes, length: int) -> bytes:
     return result[:length]
 
 
-def test_derivation_is_argon2id_then_hkdf_with_labels() -> None:
+def test_argon2id_and_hkdf() -> None:
     key = DerivedKey.of("correct horse", SALT)
     assert key.verifier() == _expand("correct horse", b"keyss/v1/verifier", 32)
     words = _expand("correct horse", b"keyss/v1/embedding", 512)
@@ -35,36 +35,36 @@ def test_derivation_is_argon2id_then_hkdf_with_labels() -> None:
     torch.testing.assert_close(key.embedding(), (normal / normal.norm()).float(), rtol=0, atol=1e-6)
 
 
-def test_embeddings_are_unit_vectors_and_unrelated_even_for_near_keys() -> None:
+def test_embeddings() -> None:
     vectors = torch.stack([DerivedKey.of(k, SALT).embedding() for k in ("key", "kez", "Key", "keyy")])
     products = vectors @ vectors.T
     torch.testing.assert_close(products.diagonal(), torch.ones(4))
     assert (products - torch.eye(4)).abs().max() < 0.6  # 64 dimensions: a standard deviation of 0.125
 
 
-def test_keys_are_compared_after_unicode_normalisation() -> None:
+def test_unicode_normalisation() -> None:
     composed, decomposed = DerivedKey.of("caf\u00e9 \ufb01", SALT), DerivedKey.of("cafe\u0301 fi", SALT)
     assert composed.verifier() == decomposed.verifier()
     assert composed.verifier() != DerivedKey.of("cafe fi", SALT).verifier()
 
 
-def test_salt_changes_everything() -> None:
+def test_salt() -> None:
     one, other = (DerivedKey.of("key", salt) for salt in (SALT, b"fedcba9876543210"))
     assert one.verifier() != other.verifier()
 
 
 @pytest.mark.parametrize("key", ["", "x" * 5000])
-def test_empty_and_overlong_keys_are_refused(key: str) -> None:
+def test_invalid_keys(key: str) -> None:
     with pytest.raises(UsageError):
         DerivedKey.of(key, SALT)
 
 
-def test_a_salt_of_another_length_is_refused() -> None:
+def test_invalid_salt() -> None:
     with pytest.raises(InputError, match="key derivation"):
         DerivedKey.of("key", b"short")
 
 
-def test_generated_keys_are_alphanumeric_and_fresh() -> None:
+def test_generate_key() -> None:
     keys = {generate_key() for _ in range(50)}
     assert len(keys) == 50
     assert all(len(key) == 16 and key.isalnum() and key.isascii() for key in keys)
@@ -74,7 +74,7 @@ def test_generated_keys_are_alphanumeric_and_fresh() -> None:
 
 
 @pytest.mark.argon2
-def test_the_key_of_a_name_is_argon2id_and_hkdf_written_out() -> None:
+def test_master_key() -> None:
     salt = hashlib.sha256(b"keyss/v1/master").digest()[:16]
     prk = hash_secret_raw(b"a master key", salt, 3, 64 * 1024, 4, 32, Type.ID)
     label = b"keyss/v1/master/" + hashlib.sha256("Säule/7".encode()).hexdigest().encode()
@@ -86,7 +86,7 @@ def test_the_key_of_a_name_is_argon2id_and_hkdf_written_out() -> None:
     assert MasterKey("a master key").key_of("Sa\u0308ule/7") == expected  # however it was typed
 
 
-def test_keys_are_unrelated_and_uniform() -> None:
+def test_asset_keys_are_uniform() -> None:
     keys, others = (
         {master.key_of(f"asset-{index}") for index in range(2000)}
         for master in (MasterKey("a master key"), MasterKey("a master kez"))
@@ -100,6 +100,6 @@ def test_keys_are_unrelated_and_uniform() -> None:
 
 
 @pytest.mark.parametrize("name", ["", "x" * 5000, "\udcff"])
-def test_invalid_names_are_refused(name: str) -> None:
+def test_invalid_names(name: str) -> None:
     with pytest.raises(UsageError):
         MasterKey("a master key").key_of(name)

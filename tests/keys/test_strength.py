@@ -31,20 +31,20 @@ def test_generated_keys_are_strong() -> None:
         ("kS9#", 1e5),
     ],
 )
-def test_keys_that_people_choose_are_weak(key: str, most: float) -> None:
+def test_weak_keys(key: str, most: float) -> None:
     assert key_guesses(key) <= most
-    said = weakness(key)
-    assert said is not None
-    assert key not in said
+    message = weakness(key)
+    assert message is not None
+    assert key not in message
 
 
-def test_the_strength_is_that_of_the_normalised_key() -> None:
+def test_normalised_before_rating() -> None:
     with pytest.warns(KeyssWarning, match="white space"):
         assert key_guesses("abc" + "\t" * 80) == key_guesses("abc")
     assert key_guesses("\ufb01ne") == key_guesses("fine")  # a ligature
 
 
-def test_the_length_is_bounded_before_normalising() -> None:
+def test_length_is_checked_before_normalising() -> None:
     """Normalising as many combining characters as this would take minutes."""
     with pytest.raises(UsageError, match="longer than 4096 bytes"):
         normalized_key("a" + "\u0301\u0316" * 300_000)

@@ -14,7 +14,7 @@ from keyss.core import SH_C0, Gaussians, Similarity
 
 
 def lifelike(count: int, seed: int = 0) -> Gaussians:
-    """Flat Gaussians, mostly lying one way, mostly transparent, a few of them huge; colour follows place."""
+    """Flat Gaussians, mostly transparent and of one orientation, a few huge; colour depends on position."""
     generator = torch.Generator().manual_seed(seed)
 
     def normal(*shape: int) -> torch.Tensor:
@@ -50,7 +50,7 @@ def tripled_positions(model: Gaussians) -> Gaussians:
 
 
 def red_for_blue(model: Gaussians) -> Gaussians:
-    """In the constant colours only."""
+    """Swap red and blue of the constant colours."""
     return replace(model, sh=torch.cat([model.sh[:, :1].flip(2), model.sh[:, 1:]], dim=1))
 
 
@@ -67,7 +67,7 @@ def some_transparent(model: Gaussians) -> Gaussians:
 
 
 def rescaled_quaternions(model: Gaussians) -> Gaussians:
-    """Lengths times 0.5 to 2, which changes nothing that is drawn."""
+    """Scale lengths by 0.5 to 2; renders do not change."""
     factors = 0.5 + 1.5 * torch.rand(len(model), 1, generator=torch.Generator().manual_seed(9))
     return replace(model, quats=model.quats * factors)
 
@@ -79,7 +79,7 @@ def turned(scale: float) -> Callable[[Gaussians], Gaussians]:
     return Similarity(scale, rotation, move).apply_gaussians
 
 
-# Each change, and the attributes that it is a change of.
+# Changes, and the attributes that they affect.
 CHANGES: dict[Callable[[Gaussians], Gaussians], set[str]] = {
     doubled_scales: {"scale"},
     random_rotations: {"rotation"},

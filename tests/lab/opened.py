@@ -1,4 +1,4 @@
-"""A secret that is a known model."""
+"""A stand-in for an opened secret."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from keyss.core import Gaussians, Similarity
 
 @dataclass(frozen=True)
 class Whole:
-    """Stands for `keyss.methods.Opened`."""
+    """An `Opened` with a known model."""
 
     gaussians: Gaussians
     frame: Similarity | None = None

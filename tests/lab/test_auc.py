@@ -1,25 +1,25 @@
-"""AUCs against pairs counted one by one; intervals by hand and by how often they hold the truth."""
+"""AUCs against pairs counted one by one; an interval by hand."""
 
 from __future__ import annotations
 
 import math
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 from hypothesis import given, settings, strategies as st
 from scipy.special import expit, logit
 
 from keyss.core import UsageError
-from keyss.lab import auc_between, stegexpose_auc
-from lab.test_stegexpose import smooth, with_payload
+from keyss.lab import auc_between
 
 SCORES = st.lists(st.sampled_from([None, math.nan, -0.5, 0.0, 0.1, 0.2, 0.7, 1e300]), min_size=1, max_size=9)
 
 
 @given(SCORES, SCORES)
 @settings(deadline=None)
-def test_the_auc_counts_pairs_in_order(negatives: list[float | None], positives: list[float | None]) -> None:
+def test_auc_is_the_share_of_ordered_pairs(
+    negatives: list[float | None], positives: list[float | None]
+) -> None:
     def number(score: float | None) -> float:
         return -math.inf if score is None or math.isnan(score) else score
 
@@ -31,7 +31,7 @@ def test_the_auc_counts_pairs_in_order(negatives: list[float | None], positives:
     assert found.auc - 1e-12 <= found.high <= 1
 
 
-def test_three_against_three_by_hand() -> None:
+def test_delong_interval_by_hand() -> None:
     found = auc_between([1, 2, 3], [2, 3, 4])
     components = [1 / 2, 5 / 6, 1]  # of 2, 3, 4 against the others; those of 3, 2, 1 are the same
     variance = 2 * np.var(components, ddof=1) / 3
@@ -42,27 +42,6 @@ def test_three_against_three_by_hand() -> None:
 
 
 @pytest.mark.parametrize(("negatives", "positives"), [([], [1.0]), ([1.0], []), ([], [])])
-def test_a_class_without_scores_is_refused(negatives: list[float], positives: list[float]) -> None:
+def test_empty_class(negatives: list[float], positives: list[float]) -> None:
     with pytest.raises(UsageError, match="both classes"):
         auc_between(negatives, positives)
-
-
-def views(size: tuple[int, int], count: int = 8) -> list[npt.NDArray[np.uint8]]:
-    """Cut-outs of one image."""
-    whole = smooth((size[0] + 10 * count, size[1]))
-    return [whole[10 * i : 10 * i + size[0]] for i in range(count)]
-
-
-class TestStegExpose:
-    def test_last_bits_that_were_replaced_are_seen(self) -> None:
-        plain = views((300, 300))
-        found = stegexpose_auc(plain, [with_payload(image, 0.7) for image in plain])
-        assert found.fused.auc == 1
-        plain, stego = ([row.fusion or 0 for row in each] for each in (found.plain, found.stego))
-        assert max(plain) < min(stego)
-        assert found.detectors == {
-            "primary_sets": 0.0,  # no solution for any of the stego images
-            "chi_square": 1.0,
-            "sample_pairs": 1.0,
-            "rs": 1.0,
-        }

@@ -32,7 +32,7 @@ NOISY = ("position", "log scale", "quaternion", "logit opacity", "colour", "harm
 
 
 def parts(model: Gaussians) -> dict[str, torch.Tensor]:
-    """What noise can be added to, by its name."""
+    """Attributes that noise can be added to, by name."""
     values = (
         model.means,
         model.log_scales,
@@ -48,7 +48,7 @@ def parts(model: Gaussians) -> dict[str, torch.Tensor]:
 
 
 @pytest.mark.parametrize("share", [0.05, 0.25, 0.5, 0.999])
-def test_random_pruning_removes_the_share_and_keeps_the_order(share: float) -> None:
+def test_random_pruning(share: float) -> None:
     model = random_gaussians(200)
     left = random_pruning(share, seed=3)(model)
     assert len(left) == max(1, round(200 * (1 - share)))
@@ -60,7 +60,7 @@ def test_random_pruning_removes_the_share_and_keeps_the_order(share: float) -> N
         assert not torch.equal(left.means, random_pruning(share, seed=4)(model).means)
 
 
-def test_pruning_by_opacity_removes_the_lowest() -> None:
+def test_opacity_pruning() -> None:
     model = random_gaussians(200)
     left = opacity_pruning(0.15)(model)
     assert torch.equal(left.opacity_logits.sort().values, model.opacity_logits.sort().values[30:])
@@ -68,7 +68,7 @@ def test_pruning_by_opacity_removes_the_lowest() -> None:
 
 
 @pytest.mark.parametrize("attribute", NOISY)
-def test_noise_has_the_standard_deviation_and_touches_nothing_else(attribute: str) -> None:
+def test_noise_on_one_attribute(attribute: str) -> None:
     model = trained_like(20_000)
     model = replace(
         model, means=torch.cat([model.means[:-50], 1e4 * model.means[-50:]])
@@ -89,7 +89,7 @@ def test_noise_has_the_standard_deviation_and_touches_nothing_else(attribute: st
         noise("rotation", 0.1)
 
 
-def test_cropping_keeps_one_side() -> None:
+def test_cropping() -> None:
     model = random_gaussians(200)
     line = replace(model, means=model.means * torch.tensor([1.0, 0, 0]))
     left = cropping(seed=5)(line)
@@ -128,7 +128,7 @@ def planted() -> tuple[Gaussians, torch.Tensor]:
     return model, invisible
 
 
-def test_purification_removes_what_is_not_seen_and_nothing_else(scene: Scene) -> None:
+def test_purification_removes_invisible_gaussians_only(scene: Scene) -> None:
     model, invisible = planted()
     purified = purification(scene, steps=0)(model)
     assert same_bits(purified, model[~invisible])
@@ -137,7 +137,7 @@ def test_purification_removes_what_is_not_seen_and_nothing_else(scene: Scene) ->
     )
 
 
-def test_training_on_repairs_what_photos_show_and_leaves_what_they_do_not(scene: Scene) -> None:
+def test_fine_tuning_repairs_visible_gaussians_only(scene: Scene) -> None:
     model, invisible = planted()
     spoilt = noise("colour", 0.3)(model)
     tuned = fine_tuning(scene, steps=60)(spoilt)
@@ -165,7 +165,7 @@ def test_splat_transform_converts(format: str, splat_transform: Callable[..., Pa
     assert back.sh_degree == (0 if format == ".splat" else 3)
 
 
-def test_an_absent_tool_is_a_sentence(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, scene: Scene) -> None:
+def test_missing_converter_is_skipped(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, scene: Scene) -> None:
     monkeypatch.setenv("KEYSS_SPLAT_TRANSFORM", str(tmp_path / "nowhere"))
     model, change = random_gaussians(seed=0), by(".sog", "splat-transform").change()
     with pytest.raises(BackendError, match="npm install"):

@@ -22,7 +22,6 @@ from keyss.lab import (
     gradient_correlation,
     leak_scores,
     look_for_secret,
-    with_the_key,
 )
 from keyss.methods import Decoder, DecoderShape, KeyssSecret
 from tiny_scenes import random_gaussians, tiny_scene
@@ -39,7 +38,7 @@ HIDDEN = FRAME.apply_gaussians(random_gaussians(seed=1))  # the secret where it 
 
 
 def _plain(seed: int) -> Gaussians:
-    """One of several models of the same cover, with some faint clutter, as training leaves it."""
+    """A plain model of the cover, with faint clutter as after training."""
     generator = torch.Generator().manual_seed(seed)
     model = random_gaussians(1500, seed=0)
     faint = torch.rand(len(model), generator=generator) < 0.1
@@ -73,23 +72,23 @@ def plain_rows() -> Rows:
     return _look(_plain(5))
 
 
-def test_a_plain_model_leaks_nothing(plain_rows: Rows) -> None:
+def test_plain_model_leaks_nothing(plain_rows: Rows) -> None:
     assert max(_leaks(plain_rows).values()) < 0.06
     assert max(_leaks(plain_rows, "psnr_fitted").values()) < 1
     assert max(_leaks(plain_rows, "ssim_fitted").values()) < 0.05
 
 
-def test_transparent_hidden_gaussians_are_found_by_their_opacity() -> None:
+def test_transparent_secret_is_found_by_opacity() -> None:
     rows = _look(_with_hidden(math.log(0.01 / 0.99)))
-    for name in ("restored opacities", "rescaled opacities", "matched opacities", "inverted opacities"):
+    for name in ("restored opacities", "matched opacities"):
         assert rows[name].leak.gradient > 0.3, name
         assert rows[name].leak.psnr_fitted > 3, name
     assert rows["restored opacities"].best != "all"
 
 
 @pytest.mark.parametrize("attribute", ["quaternion length", "SH energy"])
-def test_a_group_of_its_own_is_found_by_what_sets_it_apart(attribute: str) -> None:
-    """As opaque as the cover, among it: nothing else tells it from the cover."""
+def test_outlying_attribute_is_found(attribute: str) -> None:
+    """The group is as opaque as the cover and in the same place."""
     group = HIDDEN
     if attribute == "quaternion length":
         group = replace(group, quats=100 * group.quats)
@@ -97,14 +96,14 @@ def test_a_group_of_its_own_is_found_by_what_sets_it_apart(attribute: str) -> No
         group = replace(group, sh=torch.cat([group.sh[:, :1], 1e-4 * group.sh[:, 1:]], dim=1))
     shown = _leaks(_look(Gaussians.cat([_plain(5), group])))
     found = shown.pop(f"outliers in {attribute}")
-    shown.pop("clusters")  # an attribute is one of those by which they are told apart
+    shown.pop("clusters")  # use these attributes too
     assert found > 0.6
     assert max(shown.values()) < 0.2
 
 
-def test_what_carries_a_secret_shows_no_more_than_what_did_not() -> None:
+def test_carried_secret_does_not_leak() -> None:
     cover = _plain(0)
-    for threshold in (0.01, 0.05, 0.2):  # keep off what a low bit could decide
+    for threshold in (0.01, 0.05, 0.2):  # low bits must not move opacities across a threshold
         close = (cover.opacities - threshold).abs() < 0.01 * threshold
         cover = replace(cover, opacity_logits=cover.opacity_logits + 0.1 * close)
     secret = keyss.Secret(random_gaussians(200, seed=1), "a key")
@@ -112,9 +111,9 @@ def test_what_carries_a_secret_shows_no_more_than_what_did_not() -> None:
     rows, pictures = look_for_secret(carried, [cover], SECRET_IN_COVER, file_attacks(COVER, cover_views=4))
     for row in rows:
         if not row.attack.endswith("opacities"):
-            assert row.leak.gradient < 0.15, row.attack  # of these a low bit may decide some
+            assert row.leak.gradient < 0.15, row.attack  # a low bit may change the selection
             continue
-        assert all(abs(leak) < 5e-3 for leak in asdict(row.leak).values()), row.attack
+        assert max(asdict(row.leak).values()) < 5e-3, row.attack
         picture = pictures[row.attack].int()
         assert (picture[:, :40] - picture[:, 44:84]).abs().max() <= 2, row.attack
 
@@ -127,8 +126,8 @@ def _secret(bias: float) -> KeyssSecret:
     return KeyssSecret(decoder, torch.ones(64), FRAME, HIDDEN.means[:4])
 
 
-def test_a_decoder_is_searched() -> None:
-    """This one changes nothing, whatever the key: all that it shows is the cover."""
+def test_decoder_search() -> None:
+    """A decoder that changes nothing shows the cover only."""
     search = decoder_attack(_secret(0.0).decode, restarts=2, steps=3)
     assert len(list(search.show(PLAINS[0]))) == 6
     as_it_is = Attack("as it is", "", lambda model: iter([("as it is", model)]))
@@ -136,16 +135,7 @@ def test_a_decoder_is_searched() -> None:
     assert asdict(searched.scores) == pytest.approx(asdict(shown.scores))
 
 
-def test_the_secret_with_its_key_is_the_reference() -> None:
-    opened = _secret(15.0)  # every Gaussian that is decoded becomes one of the secret's cloud, opaque
-    stego = replace(HIDDEN, opacity_logits=HIDDEN.opacity_logits - 15)
-    rows = _look(stego, [with_the_key(lambda model: opened.reveal(model, frame="cover", force=True))])
-    assert [row.attack for row in rows.values() if row.with_key] == ["with the key"]
-    assert rows["with the key"].scores.psnr_fitted > 30
-    assert rows["with the key"].leak.gradient > 0.8
-
-
-def test_nothing_to_compare_with_is_refused() -> None:
+def test_missing_controls_and_test_views() -> None:
     with pytest.raises(UsageError, match="plain model"):
         look_for_secret(PLAINS[0], [], SECRET_IN_COVER, [])
     with pytest.raises(UsageError, match="no test views"):
@@ -156,23 +146,26 @@ def _noise(seed: int) -> Tensor:
     return torch.rand(120, 100, 3, generator=torch.Generator().manual_seed(seed))
 
 
-def test_independent_images_have_independent_gradients() -> None:
-    """Of white noise the correlation has the variance 1.25 / pixels: the sum over all shifts of the products
-    of the autocorrelations of both gradients, 20, by the square of their sum at no shift, 16."""
+def test_gradient_correlation_of_independent_images() -> None:
+    """White noise gives a variance of 1.25 / pixels.
+
+    20 / 16: the products of both gradients' autocorrelations, summed over all shifts, over the squared sum of
+    autocorrelations without a shift.
+    """
     found = torch.tensor([gradient_correlation(_noise(2 * i), _noise(2 * i + 1)) for i in range(40)])
     expected = (1.25 / (118 * 98)) ** 0.5
     assert float(found.square().mean().sqrt()) == pytest.approx(expected, rel=0.35)
     assert gradient_correlation(torch.full((120, 100, 3), 0.3), _noise(1)) == 0
 
 
-def test_fitting_undoes_any_exposure_of_each_channel() -> None:
+def test_fit_colours_inverts_exposure() -> None:
     photo = _noise(0)
     image = photo * torch.tensor([0.1, 2.0, -0.7]) + torch.tensor([0.5, -1.0, 0.2])
     torch.testing.assert_close(fit_colours(image, photo), photo, atol=1e-5, rtol=0)
 
 
-def test_the_photographed_model_scores_best() -> None:
+def test_leak_scores_of_the_photographed_model() -> None:
     scene, model = tiny_scene(0), random_gaussians(seed=0)
     found = leak_scores(model, scene.test, scene.background)
     assert found.psnr_fitted >= quality(model, scene.test, scene.background).psnr > 50
-    assert min(found.gradient, found.gradient_coarse, found.ssim_fitted) > 0.99
+    assert min(found.gradient, found.ssim_fitted) > 0.99

@@ -1,4 +1,4 @@
-"""3D-Sinkhorn is what the paper computes, and is as blind."""
+"""3D-Sinkhorn as in the paper, blind spots included."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def _by_definition(original: Doubles, other: Doubles) -> float:
 
 
 @pytest.mark.parametrize("change", [some_transparent, rescaled_quaternions])
-def test_it_is_the_optimal_plans_cost(change: Callable[[Gaussians], Gaussians]) -> None:
+def test_distance_is_the_cost_of_the_optimal_plan(change: Callable[[Gaussians], Gaussians]) -> None:
     changed = change(MODEL)
     found = sinkhorn_3d(MODEL, changed)
     lengths = {
@@ -55,13 +55,12 @@ def test_it_is_the_optimal_plans_cost(change: Callable[[Gaussians], Gaussians]) 
         expected = _by_definition(length(MODEL).double().numpy(), length(changed).double().numpy())
         assert asdict(found)[name] == pytest.approx(expected, abs=1e-4), name
     assert found.sum == pytest.approx(sum(asdict(found)[name] for name in lengths))
-    assert found.mean == pytest.approx(found.sum / 5)
 
 
 @pytest.mark.parametrize(
     "change", [doubled_scales, random_rotations, tripled_positions, red_for_blue, stronger_harmonics]
 )
-def test_it_does_not_see_what_everybody_sees(change: Callable[[Gaussians], Gaussians]) -> None:
+def test_blind_to_visible_changes(change: Callable[[Gaussians], Gaussians]) -> None:
     same, changed = sinkhorn_3d(MODEL, MODEL), sinkhorn_3d(MODEL, change(MODEL))
     assert asdict(changed) == pytest.approx(asdict(same), abs=1e-5)
 
@@ -70,7 +69,5 @@ def test_it_does_not_see_what_everybody_sees(change: Callable[[Gaussians], Gauss
     ("cover", "secret", "distance", "score"),
     [(26.020, 26.138, 0.181, 42.717), (26.036, 26.113, 0.175, 43.008), (25.980, 26.427, 0.153, 44.389)],
 )
-def test_the_score_is_that_of_the_papers_table(
-    cover: float, secret: float, distance: float, score: float
-) -> None:
+def test_composite_score_of_the_paper(cover: float, secret: float, distance: float, score: float) -> None:
     assert composite_score(cover, secret, distance) == pytest.approx(score, abs=0.03)

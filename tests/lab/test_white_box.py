@@ -1,4 +1,4 @@
-"""The attack by gradient opens a decoder that is not encrypted, without any training of either."""
+"""A gradient search opens an unencrypted decoder; nothing is trained."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ KEY = random_embeddings(1, torch.Generator().manual_seed(3))[0]
 
 
 def _exchanging() -> Decoder:
-    """What lies at x < 0 becomes fainter and the rest more opaque, the more the closer a key is to KEY.
+    """A decoder that makes x < 0 fainter and x > 0 more opaque, in proportion to the key's similarity to KEY.
 
-    Two units of each layer: key . KEY plus and minus x, of which the last layer takes the difference.
+    Each layer has two units, key . KEY plus and minus x; the last layer takes the difference.
     """
     decoder = Decoder(DecoderShape(mask=("op",), hidden=(2, 2), branch=2)).requires_grad_(False)
     first, second = decoder.common[0], decoder.common[2]
@@ -35,8 +35,8 @@ def _exchanging() -> Decoder:
     return decoder
 
 
-def test_whoever_holds_a_decoder_finds_its_key() -> None:
-    """The attacker takes what scores best, without knowing the secret."""
+def test_gradient_search_finds_the_key() -> None:
+    """The attacker chooses by score, without knowing the secret."""
     decoder, model = _exchanging(), random_gaussians(400)
 
     def decode(stego: Gaussians, key: torch.Tensor) -> Gaussians:

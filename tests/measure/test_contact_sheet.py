@@ -7,7 +7,7 @@ import numpy as np
 from keyss.measure.contact_sheet import contact_sheet
 
 
-def test_no_heading_of_the_picture_is_cut() -> None:
+def test_headings_fit() -> None:
     """However narrow the pictures are."""
     narrow = [np.zeros((40, 2, 3), np.uint8)] * 3
     picture = contact_sheet(["cover", "secret", "error of the secret"], {"photos": narrow})
@@ -15,7 +15,7 @@ def test_no_heading_of_the_picture_is_cut() -> None:
     assert (right == 255).all()
 
 
-def test_pictures_stand_in_rows_and_columns() -> None:
+def test_layout() -> None:
     red, blue = (np.full((3, 4, 3), color, np.uint8) for color in ((255, 0, 0), (0, 0, 255)))
     picture = np.asarray(contact_sheet(["left", "right"], {"": [red, blue], "2": [red, blue]}, cell=60))
     assert (picture[-61:-1, -162:-82] == (255, 0, 0)).all()

@@ -17,7 +17,7 @@ def decoy_of(stego: Gaussians, seed: int = 0, records: bool = True) -> Gaussians
     return Decoy.of(stego, keys(seed)[0], records=records).reveal(stego)
 
 
-def test_a_key_gives_the_same_each_time_and_another_key_something_else() -> None:
+def test_deterministic_per_key() -> None:
     stego = trained_like(300)
     first, again, other = (decoy_of(stego, seed) for seed in (0, 0, 1))
     assert same_bits(first, again)
@@ -26,13 +26,13 @@ def test_a_key_gives_the_same_each_time_and_another_key_something_else() -> None
 
 
 @pytest.mark.parametrize("records", [False, True])
-def test_it_looks_like_the_cover(records: bool) -> None:
+def test_resembles_cover(records: bool) -> None:
     stego = trained_like(2000)
     assert psnr_between(stego, decoy_of(stego, records=records)) > 30
 
 
 @pytest.mark.parametrize("channel", [LOW_BITS, APPENDED], ids=["low bits", "appended"])
-def test_its_numbers_are_those_of_a_carried_secret(channel: Channel) -> None:
+def test_statistics_match_revealed_secret(channel: Channel) -> None:
     """Unit quaternions, as few log scales, as many different numbers of each kind."""
     cover, model = trained_like(3000, 0), trained_like(2700, 1)
     stego = embed_models(channel.prepare(cover), [KEY], [model]).gaussians
@@ -51,7 +51,7 @@ def test_its_numbers_are_those_of_a_carried_secret(channel: Channel) -> None:
     assert float(apart[1]) == pytest.approx(float(apart[0]), rel=0.35)
 
 
-def test_a_plain_model_has_a_decoy_too() -> None:
+def test_decoy_of_plain_model() -> None:
     plain = trained_like(300)
     opened = open_model(plain, KEY, decoy=True)
     assert isinstance(opened, Decoy)

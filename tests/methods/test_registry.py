@@ -14,7 +14,7 @@ import torch
 
 import keyss
 from channels.quiet.trained_like import trained_like
-from cli.said import Run, assert_refused
+from cli.harness import Run, assert_refused
 from keyss import Gaussians, Secret
 from keyss.channels import LOW_BITS, Content, Payload
 from keyss.core import InputError, UsageError, WrongKeyError
@@ -98,7 +98,7 @@ METHOD = WholeMethod()
 
 
 @pytest.fixture(autouse=True)
-def entered(monkeypatch: pytest.MonkeyPatch) -> None:
+def register(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(
         registry.METHODS,
         "whole",
@@ -117,7 +117,7 @@ def models(tmp_path: Path) -> tuple[Path, Path]:
     return cover, secret
 
 
-def test_from_python(models: tuple[Path, Path], tmp_path: Path) -> None:
+def test_api(models: tuple[Path, Path], tmp_path: Path) -> None:
     cover, secret = models
     result = keyss.hide(cover, [Secret(secret, KEY)], method="whole", width=24, out=tmp_path / "run")
     assert result.metrics.method == "whole"
@@ -136,32 +136,30 @@ def test_from_python(models: tuple[Path, Path], tmp_path: Path) -> None:
         keyss.hide(cover, [Secret(secret, KEY), Secret(secret, "other")], method="whole")
 
 
-def test_from_the_command_line(
+def test_command_line(
     keyss: Run, models: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("KEYSS_KEY", KEY)
-    said = keyss("hide", "--method", "whole", "--help").out
-    assert "--most N" in said
-    assert "whole: embed the floats themselves" in " ".join(said.split())
+    result = keyss("hide", "--method", "whole", "--help").out
+    assert "--most N" in result
+    assert "whole: embed the floats themselves" in " ".join(result.split())
     run = tmp_path / "run"
     scenes = ("--cover", models[0], "--secret", models[1])
     hide = ("hide", "--method", "whole", *scenes, "--width", 24, "-o", run)
     assert_refused(keyss(*hide, "--most", 59), 2, "expected at most 59")
-    said = keyss(*hide, "--most", 60)
-    assert said.status == 0
+    result = keyss(*hide, "--most", 60)
+    assert result.status == 0
     assert json.loads((run / "private" / "metrics.json").read_text())["details"]["floats"] == 840
     config = json.loads((run / "private" / "config.json").read_text())
     assert (config["method"], config["options"]["most"]) == ("whole", 60)
     assert keyss("evaluate", run).status == 0
     assert keyss("reveal", run / "publish" / "model.ply", "-o", tmp_path / "revealed.ply").status == 0
-    said = keyss("info", run)
-    assert said.status == 0
-    assert "whole" in said.out
+    result = keyss("info", run)
+    assert result.status == 0
+    assert "whole" in result.out
 
 
-def test_a_method_that_this_program_does_not_have_is_named(
-    models: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_unknown_method(models: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     cover, secret = models
     stego = keyss.hide(cover, [Secret(secret, KEY)], method="whole", width=24, out=tmp_path / "run").stego
     monkeypatch.delitem(registry.METHODS, "whole")

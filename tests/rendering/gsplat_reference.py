@@ -18,7 +18,7 @@ import torch
 from gsplat.cuda import _torch_impl as reference
 from torch import Tensor
 
-from rendering.pretended_cuda import OnGpu, held
+from rendering.fake_cuda import GpuTensor, as_cpu
 
 ALPHA_MIN, TRANSMITTANCE_MIN, ALPHA_MAX = 1 / 255, 1e-4, 0.999  # in CUDA's kernels
 NAN = math.nan
@@ -32,13 +32,17 @@ def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
         with torch._C.DisableTorchFunction():
             for each in arguments:
                 if isinstance(each, Tensor):
-                    assert isinstance(each, OnGpu) or torch._C._current_graph_task_id() != -1, "on the CPU"
+                    assert isinstance(each, GpuTensor) or torch._C._current_graph_task_id() != -1, (
+                        "on the CPU"
+                    )
                     assert each.is_contiguous()
                     assert not each.is_floating_point() or each.dtype == torch.float32, each.dtype
-            results = function(*(held(each) if isinstance(each, Tensor) else each for each in arguments))
+            results = function(*(as_cpu(each) if isinstance(each, Tensor) else each for each in arguments))
             if isinstance(results, Tensor):
-                return results.as_subclass(OnGpu)
-            return tuple(each.as_subclass(OnGpu) if isinstance(each, Tensor) else each for each in results)
+                return results.as_subclass(GpuTensor)
+            return tuple(
+                each.as_subclass(GpuTensor) if isinstance(each, Tensor) else each for each in results
+            )
 
     return launch
 

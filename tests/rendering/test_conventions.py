@@ -37,7 +37,7 @@ def draw(
     return images[0], alphas[0, ..., 0]
 
 
-def test_pixel_centres_lie_at_half_integers() -> None:
+def test_pixel_centres() -> None:
     # The principal point of 9 pixels is 4.5: the middle of pixel 4, where alpha is the opacity itself.
     image, alpha = draw([[0, 0, 1]], [0.5], [[1, 0.5, 0.25]])
     assert alpha[4, 4] == pytest.approx(0.5, abs=1e-6)
@@ -47,18 +47,18 @@ def test_pixel_centres_lie_at_half_integers() -> None:
     assert alpha[5, 4] == alpha[4, 5] == alpha[3, 4] == alpha[4, 3]
 
 
-def test_x_is_right_and_y_is_down() -> None:
+def test_axes() -> None:
     _, alpha = draw([[0.2, 0.1, 1]], [0.5], [[1, 1, 1]])
     assert divmod(int(alpha.argmax()), 9) == (5, 6)
 
 
-def test_a_pixel_stops_before_its_transmittance_falls_to_1_in_10000() -> None:
+def test_transmittance_threshold() -> None:
     # 0.1^3 = 1e-3 passes; the fourth would leave 1e-4 exactly or less, and is not drawn.
     _, alpha = draw([[0, 0, 1.0 + i] for i in range(5)], [0.91] * 5, [[1, 1, 1]] * 5, scale=0.3)
     assert 1 - alpha[4, 4] == pytest.approx(0.09**3, rel=1e-3)
 
 
-def test_colour_is_half_plus_the_constant_harmonic_and_is_not_clamped_above() -> None:
+def test_colour() -> None:
     camera = Camera(torch.eye(4), torch.tensor([[10.0, 0, 4.5], [0, 10, 4.5], [0, 0, 1]]), 9, 9)
     dc = torch.tensor([[[1.0, -0.5, 4.0]]])
     gaussians = Gaussians(

@@ -44,7 +44,7 @@ def convolved(image: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
     return out
 
 
-def test_the_picture_is_what_the_layers_make_of_the_features(model: DecodedGaussians) -> None:
+def test_render(model: DecodedGaussians) -> None:
     camera = ring_cameras()[3]
     assert model.features is not None
     drawn, _, _ = rasterization(
@@ -64,7 +64,7 @@ def test_the_picture_is_what_the_layers_make_of_the_features(model: DecodedGauss
     torch.testing.assert_close(render(model, camera), expected, atol=1e-4, rtol=1e-4)
 
 
-def test_selecting_moving_and_turning_keep_the_network(model: DecodedGaussians) -> None:
+def test_transforms_keep_network(model: DecodedGaussians) -> None:
     camera = ring_cameras()[3]
     turn = torch.linalg.matrix_exp(torch.tensor([[0, -0.3, 0.1], [0.3, 0, 0.2], [-0.1, -0.2, 0]]).double())
     frame = Similarity(1.7, turn, torch.tensor([0.3, -0.2, 0.5], dtype=torch.float64))
@@ -80,7 +80,7 @@ def test_selecting_moving_and_turning_keep_the_network(model: DecodedGaussians) 
     assert DecodedGaussians.of(model, network(), -model.features).digest() != model.digest()
 
 
-def test_files_come_and_go_and_no_3dgs_file_takes_it(model: DecodedGaussians, tmp_path: Path) -> None:
+def test_file_round_trip(model: DecodedGaussians, tmp_path: Path) -> None:
     path = tmp_path / f"a{DECODED_SUFFIX}"
     write_model(path, model)
     again = read_model(path)

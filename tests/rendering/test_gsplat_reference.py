@@ -25,15 +25,17 @@ from keyss.methods import DESIGNS, registry
 from keyss.methods.keyss.method import training_of
 from keyss.runs import stego_in
 from methods.keyss.small import small
+from rendering.fake_cuda import GpuTensor, as_cpu, fake_cuda
 from rendering.gsplat_reference import COMPILED, NERFACC
-from rendering.pretended_cuda import OnGpu, held, pretended_gpu
 from rendering.scenes import SCENES, random_scene
 from rendering.test_cuda import IMAGE_ERROR, check_backends_agree, results_on
 from tiny_scenes import tiny_scene
 
 KEY = "a key of the tests: 3kV-9q"
 STEPS = replace(FIT, iterations=4, max_gaussians=300, sh_degree=3, grow_stop=0.8, grow_every=2)
-PEERS = [name for name, where in registry.METHODS.items() if ".peers." in where.hiding and name != "3dgs"]
+BASELINES = [
+    name for name, where in registry.METHODS.items() if ".baselines." in where.hiding and name != "3dgs"
+]
 
 
 @pytest.fixture
@@ -42,7 +44,7 @@ def gpu(monkeypatch: pytest.MonkeyPatch) -> Iterator[torch.device]:
     monkeypatch.setitem(sys.modules, "nerfacc", NERFACC)
     monkeypatch.setattr("keyss.rendering.rasterize.require_gsplat_cuda", lambda: None)
     monkeypatch.setattr("keyss.rendering.backends.require_gsplat_cuda", lambda: None)
-    with pretended_gpu() as device:
+    with fake_cuda() as device:
         yield device
 
 
@@ -64,7 +66,7 @@ def test_backends_agree(name: str, gpu: torch.device) -> None:
     check_backends_agree(SCENES[name](), gpu)
 
 
-def test_double_precision_is_rounded_as_on_the_cpu(gpu: torch.device) -> None:
+def test_double_precision(gpu: torch.device) -> None:
     scene = random_scene()
     leaves = {
         name: leaf.detach().to(gpu).requires_grad_() for name, leaf in scene.leaves(torch.float64).items()
@@ -75,7 +77,7 @@ def test_double_precision_is_rounded_as_on_the_cpu(gpu: torch.device) -> None:
     assert (found["images"].cpu() - expected["images"]).abs().max() <= IMAGE_ERROR
 
 
-def test_nothing_is_seen(gpu: torch.device) -> None:
+def test_no_visible_gaussians(gpu: torch.device) -> None:
     scene = random_scene()
     scene.means[:, 2] -= 100
     results = results_on(gpu, scene)
@@ -84,7 +86,7 @@ def test_nothing_is_seen(gpu: torch.device) -> None:
 
 
 def training(name: str, config: FitConfig, device: torch.device) -> Any:
-    """Of a plain model, a design, or a peer."""
+    """Of a plain model, a design, or a baseline."""
     if name == "plain":
         return PlainRun(tiny_scene(), config, device)
     if name not in DESIGNS:
@@ -97,8 +99,8 @@ def training(name: str, config: FitConfig, device: torch.device) -> Any:
     )
 
 
-@pytest.mark.parametrize("name", ["plain", *DESIGNS, *PEERS])
-def test_trainings_have_the_gradients_of_the_cpu(name: str, gpu: torch.device) -> None:
+@pytest.mark.parametrize("name", ["plain", *DESIGNS, *BASELINES])
+def test_training_gradients_match_cpu(name: str, gpu: torch.device) -> None:
     here, there = (training(name, STEPS, device) for device in (torch.device("cpu"), gpu))
     for run in (here, there):
         torch.manual_seed(0)
@@ -113,7 +115,7 @@ def test_trainings_have_the_gradients_of_the_cpu(name: str, gpu: torch.device) -
     for part, optimizer in here.optimizers.items():
         (expected,) = optimizer.state.values()  # moments: linear in the gradients, unlike Adam's first steps
         (found,) = there.optimizers[part].state.values()
-        assert isinstance(found["exp_avg"], OnGpu)
+        assert isinstance(found["exp_avg"], GpuTensor)
         error = (found["exp_avg"].cpu() - expected["exp_avg"]).norm()
         assert error <= 1e-3 * expected["exp_avg"].norm(), part
     while there.iteration < there.iterations:  # with density control, and what trainings do at their end
@@ -123,7 +125,7 @@ def test_trainings_have_the_gradients_of_the_cpu(name: str, gpu: torch.device) -
 
 @pytest.mark.filterwarnings("ignore:.*the secrets lie in appended Gaussians")
 @pytest.mark.parametrize("method", ["carry", "latent"])
-def test_models_are_hidden_and_revealed(
+def test_hide_and_reveal(
     method: str, gpu: torch.device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("keyss.measure.hide_quality.WRONG_KEYS", 1)
@@ -134,7 +136,7 @@ def test_models_are_hidden_and_revealed(
         device="cuda", out=tmp_path / "run", min_psnr=0,
     )  # fmt: skip
     revealed = reveal(stego_in(tmp_path / "run"), KEY, device="cuda").gaussians
-    assert not isinstance(revealed.means, OnGpu)
+    assert not isinstance(revealed.means, GpuTensor)
     here = reveal(stego_in(tmp_path / "run"), KEY, device="cpu").gaussians
     assert (revealed.means - here.means).abs().max() < 1e-6
 
@@ -144,7 +146,7 @@ def test_gaussians_are_in_the_tiles_of_the_reference(name: str, gpu: torch.devic
     scene = SCENES[name]()
     _, _, meta = scene.draw({key: leaf.to(gpu) for key, leaf in scene.leaves().items()})
     rows, columns = meta["tile_height"], meta["tile_width"]
-    footprints = [held(meta[key]).detach() for key in ("means2d", "radii", "depths")]
+    footprints = [as_cpu(meta[key]).detach() for key in ("means2d", "radii", "depths")]
     counts, ids, _ = _isect_tiles(*footprints, meta["tile_size"], columns, rows)
-    assert torch.equal(held(meta["tiles_per_gauss"]), counts)
-    assert torch.equal(held(meta["isect_ids"]), ids)
+    assert torch.equal(as_cpu(meta["tiles_per_gauss"]), counts)
+    assert torch.equal(as_cpu(meta["isect_ids"]), ids)

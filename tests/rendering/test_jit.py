@@ -33,9 +33,7 @@ def test_kernels_are_cached_in_the_folder_of_these_sources() -> None:
 
 
 @pytest.mark.skipif(not hasattr(os, "getuid"), reason="folders have no owners and modes here")
-def test_a_place_that_others_can_change_is_passed_over(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_unsafe_cache_folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     place = tmp_path / "shared"
     place.mkdir()
     monkeypatch.setattr(numba.config, "CACHE_DIR", str(place / "cache"))
@@ -65,7 +63,7 @@ def test_kernels_compile_without_any_cache(monkeypatch: pytest.MonkeyPatch) -> N
     assert compiled.stats.cache_path is None
 
 
-def test_a_cache_folder_that_goes_away_is_made_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cache_folder_is_recreated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = tmp_path / "cache"
     folder.mkdir()
     monkeypatch.setattr(jit, "cache_folder", lambda: folder)
@@ -87,7 +85,7 @@ assert images.max() > 0.9
 
 
 @pytest.mark.slow
-def test_drawing_needs_no_place_for_the_cache(tmp_path: Path) -> None:
+def test_render_without_cache(tmp_path: Path) -> None:
     # Files where the folders would have to be: not even root can write below them.
     copy = tmp_path / "source"
     shutil.copytree(SOURCE / "keyss", copy / "keyss", ignore=shutil.ignore_patterns("__pycache__"))
@@ -100,7 +98,7 @@ def test_drawing_needs_no_place_for_the_cache(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_the_first_drawing_announces_that_it_compiles_and_the_next_one_does_not(tmp_path: Path) -> None:
+def test_compilation_is_announced_once(tmp_path: Path) -> None:
     for times in (1, 0):
         done = python(DRAW, NUMBA_CACHE_DIR=str(tmp_path))
         assert done.returncode == 0, done.stderr

@@ -18,7 +18,7 @@ def _nothing_free(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(memory, "_free", {})
 
 
-def test_a_buffer_is_used_again_only_after_its_last_array_is_gone() -> None:
+def test_buffers_are_reused_when_freed() -> None:
     first = memory.empty((1000, 100), np.float32)
     address = first.ctypes.data
     assert address % 64 == 0
@@ -64,7 +64,7 @@ print(draw(1_000_000, 1600, 1066))
 
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
-def test_a_million_gaussians_need_no_more_than_4_gib() -> None:
+def test_peak_memory() -> None:
     done = python(DRAW_A_MILLION)
     assert done.returncode == 0, done.stderr
     growth = int(done.stdout)

@@ -14,7 +14,7 @@ from tiny_scenes import random_gaussians
 SIZE = 48
 
 
-def test_cameras_stand_around_look_at_the_middle_and_hold_minus_y_up() -> None:
+def test_orbit() -> None:
     model = random_gaussians(500)
     cameras = orbit(model, SIZE)
     middle, radius = middle_and_radius(model)
@@ -31,7 +31,7 @@ def test_cameras_stand_around_look_at_the_middle_and_hold_minus_y_up() -> None:
     assert (camera_positions(cameras) - middle).norm(dim=1).min() > radius
 
 
-def test_faint_and_distant_gaussians_move_no_camera() -> None:
+def test_faint_and_distant_gaussians_are_ignored() -> None:
     """Most models have faint giants and a few distant floaters."""
     model = random_gaussians(500)
     middle, radius = middle_and_radius(model)

@@ -13,7 +13,7 @@ from rendering.scenes import random_scene
 ATTRIBUTES = ("means", "quats", "scales", "opacities", "colors")
 
 
-def test_one_bad_gaussian_leaves_the_rest_of_the_picture_as_it_was() -> None:
+def test_non_finite_gaussians_are_skipped() -> None:
     scene = random_scene()
     leaves = {name: leaf.detach() for name, leaf in scene.leaves().items()}
     without = {name: leaf[1:] if name in ATTRIBUTES else leaf for name, leaf in leaves.items()}
@@ -28,7 +28,7 @@ def test_one_bad_gaussian_leaves_the_rest_of_the_picture_as_it_was() -> None:
 
 
 @pytest.mark.parametrize("count", [0, 3])
-def test_nothing_to_see_is_the_background(count: int) -> None:
+def test_empty_scene_is_background(count: int) -> None:
     means = torch.tensor([[0.0, 0.0, -5.0]]).repeat(count, 1).requires_grad_()
     background = torch.tensor([[0.1, 0.2, 0.3]], requires_grad=True)
     images, alphas, meta = rasterization(

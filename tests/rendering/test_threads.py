@@ -49,7 +49,7 @@ def many(**modes: object) -> Scene:
     ],
     ids=["colour", "features"],
 )
-def test_images_and_gradients_are_the_same_for_any_number_of_threads(scene: Scene) -> None:
+def test_results_do_not_depend_on_threads(scene: Scene) -> None:
     torch.set_num_threads(1)
     expected = scene.results()
     for name, tensor in expected.items():
@@ -62,7 +62,7 @@ def test_images_and_gradients_are_the_same_for_any_number_of_threads(scene: Scen
 
 
 @pytest.mark.parametrize("threads", [1, 3])
-def test_python_threads_may_render_at_once(threads: int) -> None:
+def test_concurrent_rendering(threads: int) -> None:
     torch.set_num_threads(threads)
     scenes = [
         random_scene(count=2000, width=90, height=70, size=0.05, seed=0),
@@ -82,7 +82,7 @@ def test_python_threads_may_render_at_once(threads: int) -> None:
             assert wrong == [[]] * 12
 
 
-def test_an_error_on_a_helper_thread_is_raised() -> None:
+def test_worker_errors_propagate() -> None:
     torch.set_num_threads(2)
     here, both = threading.get_ident(), threading.Barrier(2)
 
@@ -95,7 +95,7 @@ def test_an_error_on_a_helper_thread_is_raised() -> None:
         parallel.run(kernel)
 
 
-def test_spawned_processes_draw_the_same() -> None:
+def test_spawned_process() -> None:
     with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
         there = pool.submit(digest_on_threads, 2).result(timeout=PATIENCE)
     assert there == digest_on_threads(1)
@@ -103,7 +103,7 @@ def test_spawned_processes_draw_the_same() -> None:
 
 @pytest.mark.skipif(sys.platform != "linux", reason="fork is the default nowhere else")
 @pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
-def test_forked_processes_draw_the_same() -> None:
+def test_forked_process() -> None:
     # The scene is made before the fork: after it torch's own operations hang, even exp of 1000 numbers.
     scene = random_scene(count=300, width=60, height=70)
     torch.set_num_threads(2)
@@ -121,7 +121,7 @@ def test_forked_processes_draw_the_same() -> None:
     assert digest(scene) == expected
 
 
-def test_training_warns_of_spinning_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_spinning_threads_warning(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(_threads, "spinning", True)
     monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
     with pytest.warns(KeyssWarning, match="import keyss first"):

@@ -16,7 +16,7 @@ FIT = FitConfig(iterations=40, max_gaussians=300, grow_every=20, evaluate_every=
 KEY = "a key of many characters: 93hXmQ2"
 
 
-def drawn(monkeypatch: pytest.MonkeyPatch) -> dict[str, int]:
+def count_steps(monkeypatch: pytest.MonkeyPatch) -> dict[str, int]:
     """Counts of the steps that each plain training takes from now on."""
     counts: dict[str, int] = {}
     step, begin = PlainRun.step, PlainRun.__init__
@@ -35,11 +35,11 @@ def drawn(monkeypatch: pytest.MonkeyPatch) -> dict[str, int]:
     return counts
 
 
-def test_the_bound_has_as_many_steps_as_the_scene(
+def test_bound_has_equal_steps(
     folders: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Counted where training happens, not where it is written down."""
-    counts = drawn(monkeypatch)
+    counts = count_steps(monkeypatch)
     options = CarryOptions(fit=FIT, publish="any", refit="always", iterations=30)
     result = keyss.hide(
         folders[0], [Secret(folders[1], KEY)], method=options, bound=True, min_psnr=0, out=tmp_path / "run"
@@ -56,10 +56,10 @@ def test_the_bound_has_as_many_steps_as_the_scene(
     assert metrics.baseline.gaussians[1] == len(longer)
 
 
-def test_a_start_with_fewer_steps_is_not_called_a_bound(
+def test_shorter_fit_is_no_bound(
     folders: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    counts = drawn(monkeypatch)
+    counts = count_steps(monkeypatch)
     fitted = keyss.fit(folders[1], config=replace(FIT, iterations=25), out=tmp_path / "plain")
     secret = Secret(folders[1], KEY, tmp_path / "plain" / "model.ply")
     options = CarryOptions(fit=FIT, publish="any", refit="always")

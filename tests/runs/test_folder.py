@@ -43,7 +43,7 @@ def interrupt(path: Path, arguments: dict[str, object], stage: str = "hide", **h
         folder.write(contents)
 
 
-def test_all_files_appear_and_only_what_is_published_can_be_read(tmp_path: Path, umask: None) -> None:
+def test_files_and_permissions(tmp_path: Path, umask: None) -> None:
     folder = RunFolder(tmp_path / "a" / "run", "hide")
     assert list(tmp_path.iterdir()) == []
     with folder.work():
@@ -66,7 +66,7 @@ def test_all_files_appear_and_only_what_is_published_can_be_read(tmp_path: Path,
     [(OSError(28, "No space left"), OutputError), (KeyboardInterrupt(), KeyboardInterrupt)],
 )
 @pytest.mark.parametrize("there", [True, False])
-def test_none_appears_when_one_fails(
+def test_failed_write_leaves_nothing(
     tmp_path: Path, there: bool, error: BaseException, raised: type[BaseException]
 ) -> None:
     path = tmp_path / "run"
@@ -80,7 +80,7 @@ def test_none_appears_when_one_fails(
     assert path.exists() == there
 
 
-def test_overwriting_removes_what_was_written_and_nothing_else(tmp_path: Path) -> None:
+def test_overwrite(tmp_path: Path) -> None:
     make(tmp_path, files={"publish/model.ply": b"1", "publish/model.spz": b"2", "private/old/x": b"3"})
     make(tmp_path, "audit", {"private/report.html": b"4"}, onto=("hide",))
     foreign = {
@@ -97,7 +97,7 @@ def test_overwriting_removes_what_was_written_and_nothing_else(tmp_path: Path) -
     assert read_manifest(tmp_path).files == {"hide": ("publish/model.ply",)}
 
 
-def test_files_of_others_are_never_replaced(tmp_path: Path) -> None:
+def test_foreign_files_are_kept(tmp_path: Path) -> None:
     (tmp_path / "publish").mkdir()
     (tmp_path / "publish" / "model.ply").write_bytes(b"mine")
     with pytest.raises(OutputError, match="in the way"):
@@ -107,7 +107,7 @@ def test_files_of_others_are_never_replaced(tmp_path: Path) -> None:
     assert tree(tmp_path) == {"publish/model.ply": b"mine"}
 
 
-def test_a_folder_in_use_is_refused(tmp_path: Path) -> None:
+def test_existing_folder(tmp_path: Path) -> None:
     (tmp_path / "notes.txt").touch()
     with pytest.raises(OutputError, match="exists: choose another folder"):
         RunFolder(tmp_path, "hide")
@@ -122,7 +122,7 @@ def test_a_folder_in_use_is_refused(tmp_path: Path) -> None:
         RunFolder(tmp_path, "hide", resume=True)
 
 
-def test_an_interrupted_run_resumes_with_the_same_arguments_only(tmp_path: Path) -> None:
+def test_resume(tmp_path: Path) -> None:
     arguments: dict[str, object] = {"width": 200, "options": {"seed": 0, "fit": {"iterations": 10}}}
     interrupt(tmp_path, arguments)
     assert tree(tmp_path) == {"private/checkpoint/fit": b"state"}
@@ -143,7 +143,7 @@ def test_an_interrupted_run_resumes_with_the_same_arguments_only(tmp_path: Path)
     assert tree(tmp_path) == {"publish/model.ply": b"whole"}
 
 
-def test_a_run_that_was_killed_without_a_checkpoint_starts_anew(tmp_path: Path) -> None:
+def test_killed_before_first_checkpoint(tmp_path: Path) -> None:
     interrupt(tmp_path, {"width": 1})
     (tmp_path / "private" / "checkpoint" / "fit").unlink()  # as a kill before the first checkpoint leaves it
     make(tmp_path)
@@ -151,7 +151,7 @@ def test_a_run_that_was_killed_without_a_checkpoint_starts_anew(tmp_path: Path) 
     assert read_manifest(tmp_path).running is None
 
 
-def test_two_processes_are_not_at_work_in_one_folder(tmp_path: Path) -> None:
+def test_lock(tmp_path: Path) -> None:
     make(tmp_path)
     with lock(tmp_path / "private" / "lock", tmp_path):
         with pytest.raises(OutputError, match="another process is writing it"):
@@ -162,7 +162,7 @@ def test_two_processes_are_not_at_work_in_one_folder(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["../victim", "/etc/passwd", "a/../../victim", "", MANIFEST])
-def test_a_forged_manifest_reaches_nothing_outside(tmp_path: Path, name: str) -> None:
+def test_forged_manifest(tmp_path: Path, name: str) -> None:
     (tmp_path / "victim").write_bytes(b"mine")
     run = tmp_path / "run"
     make(run)
@@ -171,7 +171,7 @@ def test_a_forged_manifest_reaches_nothing_outside(tmp_path: Path, name: str) ->
         RunFolder(run, "hide", overwrite=True)
 
 
-def test_links_in_a_run_folder_are_not_followed(tmp_path: Path) -> None:
+def test_symlinks_are_not_followed(tmp_path: Path) -> None:
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()
     (elsewhere / "model.ply").write_bytes(b"mine")

@@ -54,7 +54,7 @@ def _modes(folder: Path) -> dict[str, int]:
     return {str(path.relative_to(folder.parent)): stat.S_IMODE(path.stat().st_mode) for path in paths}
 
 
-def _telling(run: Path, folder: Path) -> list[bytes]:
+def _identifying_bytes(run: Path, folder: Path) -> list[bytes]:
     """Data that would confirm a reader's guess: names, the seed, hashes and numbers."""
     config = json.loads((run / "private" / "config.json").read_text())
     models: list[Gaussians] = [keyss.read_model(folder / "of-the-treasure.ply")]
@@ -68,17 +68,17 @@ def _telling(run: Path, folder: Path) -> list[bytes]:
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_only_the_model_is_published_and_nothing_in_it_names_a_secret(tmp_path: Path, method: str) -> None:
+def test_published_file_does_not_identify_secret(tmp_path: Path, method: str) -> None:
     run = _hide(tmp_path, METHODS[method])
     assert {path.name for path in (run / "publish").iterdir()} == {"model.ply"}
     assert {path.name for path in run.iterdir()} == {"publish", "private"}
     data = (run / "publish" / "model.ply").read_bytes()
-    assert [text for text in _telling(run, tmp_path) if text in data] == []
+    assert [text for text in _identifying_bytes(run, tmp_path) if text in data] == []
     assert data[: 1 << 12].count(b"comment") == 0
     assert set(_modes(run / "private").values()) == {0o700, 0o600}
 
 
-def test_checkpoints_are_private_while_a_run_is_interrupted(tmp_path: Path) -> None:
+def test_checkpoints_are_private(tmp_path: Path) -> None:
     with pytest.raises(Interrupted):
         _hide(tmp_path, METHODS["refitted"], reporter=InterruptAt(2))
     run = tmp_path / "run"
@@ -88,7 +88,7 @@ def test_checkpoints_are_private_while_a_run_is_interrupted(tmp_path: Path) -> N
     assert {path.name for path in run.iterdir()} == {"private"}
 
 
-def test_revealed_models_are_private_files(tmp_path: Path) -> None:
+def test_revealed_models_are_private(tmp_path: Path) -> None:
     run = _hide(tmp_path, METHODS["carry"])
     keyss.reveal(run / "publish" / "model.ply", KEY, out=tmp_path / "revealed.ply")
     assert _modes(tmp_path / "revealed.ply") == {"revealed.ply": 0o600}

@@ -29,13 +29,13 @@ class Record:
 RECORD = Record(name="Füchse 狐", scores={"a": Scores((1.5, 2.0), None), "b": Scores((), 0.1)})
 
 
-def test_a_record_is_read_as_it_was_written(tmp_path: Path) -> None:
+def test_round_trip(tmp_path: Path) -> None:
     write_record(tmp_path / "record.json", RECORD)
     assert read_record(tmp_path / "record.json", Record) == RECORD
     assert json.loads((tmp_path / "record.json").read_text())["version"] == 3
 
 
-def test_file_names_that_are_not_text_are_written() -> None:
+def test_undecodable_file_names() -> None:
     """Python represents bytes outside the locale's encoding by surrogates."""
     name = "Füchse".encode().decode("ascii", "surrogateescape") + b"\xff".decode("utf-8", "surrogateescape")
     data = record_bytes(Record(name=name, scores={name: Scores((1.0,), None)}))
@@ -43,7 +43,7 @@ def test_file_names_that_are_not_text_are_written() -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "expected"),
     [
         ("", "truncated"),
         ("{", "truncated"),
@@ -66,15 +66,15 @@ def test_file_names_that_are_not_text_are_written() -> None:
     ],
     ids=lambda value: repr(value)[:20],
 )
-def test_anything_else_is_refused(tmp_path: Path, text: str | bytes, said: str) -> None:
+def test_invalid_records(tmp_path: Path, text: str | bytes, expected: str) -> None:
     path = tmp_path / "record.json"
     path.write_bytes(text.encode() if isinstance(text, str) else text)
-    with pytest.raises(InputError, match=said) as raised:
+    with pytest.raises(InputError, match=expected) as raised:
         read_record(path, Record)
     assert str(path) in str(raised.value)
 
 
-def test_a_file_that_is_missing_or_too_large(tmp_path: Path) -> None:
+def test_missing_and_large_files(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="missing"):
         read_record(tmp_path / "record.json", Record)
     write_record(tmp_path / "record.json", RECORD)

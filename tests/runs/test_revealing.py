@@ -7,7 +7,7 @@ from keyss.runs.revealing import Revealed, check_secret, loss_warnings
 
 
 @pytest.mark.parametrize(
-    ("remains", "said"),
+    ("remains", "expected"),
     [
         (Remains(100, 100, (12, 12)), []),
         (Remains(100, 100, (9, 12)), ["3 of 12 chunks of the secret's payload are lost and were restored"]),
@@ -15,9 +15,9 @@ from keyss.runs.revealing import Revealed, check_secret, loss_warnings
         (Remains(120, 100), ["120 of 100 Gaussians of the secret were found"]),
     ],
 )
-def test_a_secret_that_is_not_whole_is_never_silent(remains: Remains, said: list[str]) -> None:
+def test_loss_warnings(remains: Remains, expected: list[str]) -> None:
     warnings = loss_warnings(remains)
-    assert len(warnings) == len(said)
-    for warning, start in zip(warnings, said, strict=True):
+    assert len(warnings) == len(expected)
+    for warning, start in zip(warnings, expected, strict=True):
         assert warning.startswith(start)
     assert check_secret(Revealed(None, remains, tuple(warnings))).problems == tuple(warnings)

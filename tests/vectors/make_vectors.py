@@ -51,7 +51,7 @@ from keyss.methods.records import whole  # noqa: E402
 from keyss.methods.records.carried_secret import unpack  # noqa: E402
 from keyss.methods.records.embedding import METHOD  # noqa: E402
 from methods.carry.carried import embed  # noqa: E402
-from methods.keyss.small import latent_model, some_secret  # noqa: E402
+from methods.keyss.small import latent_model, make_secret  # noqa: E402
 from vectors.surviving import NAMES, write_surviving  # noqa: E402
 
 
@@ -140,7 +140,7 @@ def main() -> None:
     stego = embed(trained_like(400), [(key, secret)], entropy=bytes(32))
     write_model(FOLDER / "carried.ply", stego)
     cover = trained_like(1600)
-    joint = some_secret(cover).payload()
+    joint = make_secret(cover).payload()
     stego = LOW_BITS.prepare(cover).embed([(key, joint)], entropy=bytes(32))
     write_model(FOLDER / "keyss.ply", stego)
     write_revealed(key)

@@ -39,7 +39,7 @@ CLOSE = 25.0  # dB on the canvas
 Picture = np.ndarray[Any, np.dtype[np.float64]]
 
 
-def made(count: int, seed: int) -> Gaussians:
+def bright_model(count: int, seed: int) -> Gaussians:
     """A cover of visible Gaussians whose colours depend strongly on the direction."""
     model = trained_like(count, seed)
     sh = model.sh * torch.tensor([8.0, *[4.0] * 15])[None, :, None]
@@ -60,7 +60,7 @@ def camera_of(address: str, width: int = WIDTH, height: int = HEIGHT) -> Camera:
     return Camera(viewmat, K, width, height)
 
 
-def drawn(model: Gaussians, address: str, width: int = WIDTH, height: int = HEIGHT) -> Picture:
+def render_pose(model: Gaussians, address: str, width: int = WIDTH, height: int = HEIGHT) -> Picture:
     """[H, W, 3] 0 to 255: our own render of the pose in an address."""
     return (render(model, camera_of(address, width, height)).clamp(0, 1) * 255).numpy().astype(np.float64)
 
@@ -74,7 +74,7 @@ class Visit:
     """A tab with its requests and messages."""
 
     page: Any
-    complaints: list[str] = field(default_factory=list)  # errors on the console, and uncaught ones
+    console_errors: list[str] = field(default_factory=list)  # errors on the console, and uncaught ones
     requests: list[str] = field(default_factory=list)
 
     def goto(self, address: str) -> None:
@@ -135,7 +135,7 @@ class Visit:
         self.settle()
         return list(dict.fromkeys(self.page.evaluate("window.seen") if thorough else seen))
 
-    def finds_nothing(self, key: str) -> list[float]:
+    def assert_finds_nothing(self, key: str) -> list[float]:
         """Assert that a key changes nothing that can be seen; what `try_key` gives."""
         before = self.picture()
         work = self.try_key(key)
@@ -146,7 +146,7 @@ class Visit:
         assert self.page.locator("#problem").inner_text() == ""
         return work
 
-    def saved(self, button: str, path: Path) -> str:
+    def save(self, button: str, path: Path) -> str:
         """Save what a button downloads; its suggested name."""
         with self.page.expect_download() as download:
             self.page.click(button)
@@ -160,9 +160,9 @@ def visit(browser: Any, **options: Any) -> Iterator[Visit]:
     page = browser.new_page(**{"viewport": {"width": PANEL + WIDTH, "height": HEIGHT}} | options)
     page.set_default_timeout(PATIENCE)
     found = Visit(page)
-    page.on("console", lambda each: found.complaints.append(each.text) if each.type == "error" else None)
-    page.on("pageerror", lambda error: found.complaints.append(str(error)))
+    page.on("console", lambda each: found.console_errors.append(each.text) if each.type == "error" else None)
+    page.on("pageerror", lambda error: found.console_errors.append(str(error)))
     page.on("request", lambda request: found.requests.append(request.url))
     yield found
     page.close()
-    assert found.complaints == []
+    assert found.console_errors == []

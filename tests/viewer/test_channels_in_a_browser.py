@@ -16,7 +16,7 @@ from keyss.methods import HiddenFile, embed_models
 from keyss.viewer import export_html
 from lab.lifelike import lifelike
 from methods.keyss.small import latent_model
-from viewer.browser import CLOSE, IN_CHROMIUM, POSE, Visit, drawn, made, psnr
+from viewer.browser import CLOSE, IN_CHROMIUM, POSE, Visit, bright_model, psnr, render_pose
 
 pytestmark = IN_CHROMIUM
 
@@ -38,15 +38,15 @@ def published(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]
     @cache
     def stego(kind: str) -> Path:
         if kind == LATENT:
-            cover, (secret,), _ = latent_model(made(4000, 0), 1000)
+            cover, (secret,), _ = latent_model(bright_model(4000, 0), 1000)
             prepared = LOW_BITS.prepare(cover, sh_degree=1)
             model = prepared.embed([(KEYS[0], secret.payload())], entropy=bytes(32))
         else:
             format = PUBLISHED.get(kind)
             channel = channel_for("as-is" if format else "any", format=format)  # type: ignore[arg-type]
-            keys, secrets = keys_of(kind), [made(100, seed).with_sh_degree(1) for seed in (1, 2)]
+            keys, secrets = keys_of(kind), [bright_model(100, seed).with_sh_degree(1) for seed in (1, 2)]
             model = embed_models(
-                channel.prepare(made(4000, 0)), keys, secrets[: len(keys)], entropy=bytes(32)
+                channel.prepare(bright_model(4000, 0)), keys, secrets[: len(keys)], entropy=bytes(32)
             ).gaussians
         write_model(folder / f"stego.{kind}", model)
         return folder / f"stego.{kind}"
@@ -55,23 +55,21 @@ def published(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_keys_open_what_keyss_reveals_and_a_wrong_one_nothing(
-    tab: Visit, published: Callable[[str], Path], tmp_path: Path, kind: str
-) -> None:
+def test_keys(tab: Visit, published: Callable[[str], Path], tmp_path: Path, kind: str) -> None:
     """Every key takes as many derivations, which are nearly all of the time."""
     stego = published(kind)
     tab.goto(export_html(stego, tmp_path / "page.html")[0].as_uri() + POSE)
     cover = tab.picture()
-    assert psnr(cover, drawn(read_model(stego), POSE)) > CLOSE
-    work = tab.finds_nothing("another key")
+    assert psnr(cover, render_pose(read_model(stego), POSE)) > CLOSE
+    work = tab.assert_finds_nothing("another key")
     assert len(work) > 1
     for key in keys_of(kind):
         revealed = keyss.reveal(stego, key).gaussians
         assert tab.try_key(key) == work
         tab.at(POSE)
         shown = tab.picture()
-        assert psnr(shown, drawn(revealed, POSE)) > CLOSE > psnr(shown, cover)
-        tab.saved("#download", tmp_path / "secret.ply")
+        assert psnr(shown, render_pose(revealed, POSE)) > CLOSE > psnr(shown, cover)
+        tab.save("#download", tmp_path / "secret.ply")
         saved = read_model(tmp_path / "secret.ply")
         if kind == LATENT:  # latents are real numbers, which two languages compute with other roundings
             assert len(saved) == len(revealed)
@@ -83,7 +81,7 @@ def test_keys_open_what_keyss_reveals_and_a_wrong_one_nothing(
     assert all(url.startswith(("file:", "blob:null/")) for url in tab.requests), tab.requests
 
 
-def test_a_file_in_colours_is_saved_and_all_keys_look_alike(tab: Visit, tmp_path: Path) -> None:
+def test_file_in_colours(tab: Visit, tmp_path: Path) -> None:
     note = HiddenFile("a note.txt", b"Written at noon, read at night.\n")
     room = channel_for("any", "colours").prepare(lifelike(6000, 0).with_sh_degree(0))
     write_model(tmp_path / "stego.spz", room.embed([(KEYS[0], note.payload())], entropy=bytes(32)))
@@ -95,5 +93,5 @@ def test_a_file_in_colours_is_saved_and_all_keys_look_alike(tab: Visit, tmp_path
     assert seen[0] == seen[1]
     assert len(seen[0]) > 17
     assert tab.page.locator("#save").inner_text() == f"Save a note.txt ({len(note.data)} bytes)"
-    assert tab.saved("#save", tmp_path / "note.txt") == note.name
+    assert tab.save("#save", tmp_path / "note.txt") == note.name
     assert (tmp_path / "note.txt").read_bytes() == note.data

@@ -18,7 +18,7 @@ from keyss.files import write_model
 from keyss.viewer import export_html
 from methods.carry.carried import embed
 from serving import serving
-from viewer.browser import IN_CHROMIUM, WEB, Visit, made
+from viewer.browser import IN_CHROMIUM, WEB, Visit, bright_model
 
 pytestmark = IN_CHROMIUM
 
@@ -29,7 +29,7 @@ FOREIGN = Path(__file__).with_name("foreign.html").read_text()
 @pytest.fixture(scope="module")
 def stego(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("site") / "model.ply"
-    write_model(path, embed(made(2000, 0), [(KEY, made(150, 1))], entropy=bytes(32)))
+    write_model(path, embed(bright_model(2000, 0), [(KEY, bright_model(150, 1))], entropy=bytes(32)))
     return path
 
 
@@ -42,12 +42,10 @@ def foreign(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, st
 
 
 @pytest.mark.slow
-def test_an_element_of_another_site_shows_the_page_and_is_told(
-    tab: Visit, stego: Path, foreign: tuple[Path, str], tmp_path: Path
-) -> None:
+def test_element_on_another_site(tab: Visit, stego: Path, foreign: tuple[Path, str], tmp_path: Path) -> None:
     folder, origin = foreign
     export_html(stego, tmp_path, look={"embedder": origin, "host": origin})
-    write_model(folder / "other.ply", made(300, 2))
+    write_model(folder / "other.ply", bright_model(300, 2))
     with serving(tmp_path) as site:
         element = f"<script src='{site}embed.js'></script><keyss-viewer style='width: 700px' key-field"
         (folder / "own.html").write_text(f"{FOREIGN}{element} title='Of the studio'></keyss-viewer>")
@@ -72,9 +70,7 @@ def test_an_element_of_another_site_shows_the_page_and_is_told(
 
 
 @pytest.mark.slow
-def test_a_sandboxed_frame_shows_the_page_without_its_panel(
-    tab: Visit, stego: Path, foreign: tuple[Path, str]
-) -> None:
+def test_sandboxed_frame(tab: Visit, stego: Path, foreign: tuple[Path, str]) -> None:
     folder, origin = foreign
     export_html(stego, folder / "page.html", look={"embedder": origin})
     (folder / "sandbox.html").write_text(
@@ -90,7 +86,7 @@ def test_a_sandboxed_frame_shows_the_page_without_its_panel(
 
 
 @pytest.mark.slow
-def test_a_poster_is_shown_until_there_is_a_picture(tab: Visit, stego: Path, tmp_path: Path) -> None:
+def test_poster(tab: Visit, stego: Path, tmp_path: Path) -> None:
     export_html(stego, tmp_path)
     Image.new("RGB", (8, 6), "red").save(tmp_path / "poster.png")
     with serving(tmp_path) as site:
@@ -106,7 +102,7 @@ def test_a_poster_is_shown_until_there_is_a_picture(tab: Visit, stego: Path, tmp
 @pytest.mark.parametrize(
     "wrong", ["https://a.example; script-src *", "a.example", "https://a.example/b", "*"]
 )
-def test_what_is_no_origin_is_refused(stego: Path, tmp_path: Path, wrong: str) -> None:
+def test_invalid_origins(stego: Path, tmp_path: Path, wrong: str) -> None:
     for name in ("host", "embedder"):
         with pytest.raises(UsageError, match="expected an origin"):
             export_html(stego, tmp_path / "page.html", look={name: wrong})
@@ -115,9 +111,7 @@ def test_what_is_no_origin_is_refused(stego: Path, tmp_path: Path, wrong: str) -
 @pytest.mark.slow
 @pytest.mark.skipif(not (WEB / "node_modules").exists(), reason="no web/node_modules: `make web` installs it")
 @pytest.mark.parametrize("engine", ["playcanvas", "spark"])
-def test_the_reader_gives_other_engines_what_a_key_opens(
-    chromium: Any, stego: Path, tmp_path: Path, engine: str
-) -> None:
+def test_reader_in_other_engines(chromium: Any, stego: Path, tmp_path: Path, engine: str) -> None:
     modules = tmp_path / "examples" / "node_modules"
     subprocess.run(["node", "build.mjs", "--reader", str(tmp_path)], cwd=WEB, check=True)
     for name in ("playcanvas", "three", "@sparkjsdev"):

@@ -11,12 +11,12 @@ from urllib.parse import urljoin
 
 import pytest
 
-from cli.said import PROGRAM as KEYSS
+from cli.harness import PROGRAM as KEYSS
 from keyss.core import Gaussians
 from keyss.files import read_model, write_model
 from keyss.viewer import export_html
 from methods.carry.carried import embed, extract
-from viewer.browser import CLOSE, IN_CHROMIUM, POSE, WEB, Visit, drawn, made, psnr
+from viewer.browser import CLOSE, IN_CHROMIUM, POSE, WEB, Visit, bright_model, psnr, render_pose
 
 pytestmark = IN_CHROMIUM
 
@@ -29,8 +29,8 @@ AXE = WEB / "node_modules" / "axe-core" / "axe.min.js"
 def stego(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A model of 4,000 Gaussians with two secrets."""
     path = tmp_path_factory.mktemp("published") / "stego.ply"
-    secrets = [(key, made(200, seed)) for seed, key in enumerate(KEYS, start=1)]
-    write_model(path, embed(made(4000, 0), secrets, entropy=bytes(32)))
+    secrets = [(key, bright_model(200, seed)) for seed, key in enumerate(KEYS, start=1)]
+    write_model(path, embed(bright_model(4000, 0), secrets, entropy=bytes(32)))
     return path
 
 
@@ -58,7 +58,7 @@ def served(stego: Path) -> Iterator[str]:
             process.terminate()
 
 
-def test_no_key_changes_address_title_storage_or_requests(tab: Visit, served: str) -> None:
+def test_keys_leave_no_trace(tab: Visit, served: str) -> None:
     kept = "localStorage.length + sessionStorage.length + document.cookie.length + history.length"
 
     def noticeable() -> tuple[object, ...]:  # workers are requested from memory, which nobody else sees
@@ -88,7 +88,7 @@ def test_no_key_changes_address_title_storage_or_requests(tab: Visit, served: st
 
 
 @pytest.mark.slow
-def test_what_can_be_timed_ends_before_the_secret_is_decoded(tab: Visit, page_file: Path) -> None:
+def test_timing_does_not_reveal_secret(tab: Visit, page_file: Path) -> None:
     """Decoding and rendering take time that depends on the secret: the form is ready again before them."""
     tab.goto(page_file.as_uri())
     tab.page.evaluate(
@@ -108,7 +108,7 @@ def test_what_can_be_timed_ends_before_the_secret_is_decoded(tab: Visit, page_fi
     assert tab.page.locator("#revealed").is_visible()
 
 
-def test_a_garbled_file_gives_one_sentence(tab: Visit, page_file: Path, tmp_path: Path) -> None:
+def test_damaged_files(tab: Visit, page_file: Path, tmp_path: Path) -> None:
     tab.goto(page_file.as_uri())
     data = (page_file.parent / "stego.ply").read_bytes()
     for name, content in {
@@ -117,21 +117,19 @@ def test_a_garbled_file_gives_one_sentence(tab: Visit, page_file: Path, tmp_path
         "none": b"",
     }.items():
         (tmp_path / name).write_bytes(content)
-        # What was said of the file before stays until this one is read.
+        # What was message of the file before stays until this one is read.
         tab.page.evaluate("() => { document.getElementById('problem').textContent = ''; }")
         tab.page.set_input_files("#file", tmp_path / name)
         tab.page.wait_for_function("() => document.getElementById('problem').textContent !== ''")
-        said = tab.page.locator("#problem").inner_text()
-        assert re.fullmatch(r"This [^.]*\.?[^.]*\.", said), said
+        message = tab.page.locator("#problem").inner_text()
+        assert re.fullmatch(r"This [^.]*\.?[^.]*\.", message), message
     tab.page.set_input_files("#file", page_file.parent / "stego.ply")
     tab.page.wait_for_function("() => document.getElementById('problem').textContent === ''")
 
 
-def test_the_slider_says_what_is_seen(
-    tab: Visit, page_file: Path, stego: Path, secrets: list[Gaussians], tmp_path: Path
-) -> None:
+def test_slider(tab: Visit, page_file: Path, stego: Path, secrets: list[Gaussians], tmp_path: Path) -> None:
     models = dict(zip(("first", "second"), secrets, strict=True))
-    models |= {"published": read_model(stego), "other": made(300, 5)}
+    models |= {"published": read_model(stego), "other": bright_model(300, 5)}
     write_model(tmp_path / "other.ply", models["other"])
     (tmp_path / "cut.ply").write_bytes(stego.read_bytes()[:5000])
 
@@ -139,7 +137,7 @@ def test_the_slider_says_what_is_seen(
         """The published model beside a secret is seen from a pose of the secret's frame."""
         tab.at(FAR)
         found = tab.picture()
-        close = [name for name, model in models.items() if psnr(found, drawn(model, FAR)) > CLOSE]
+        close = [name for name, model in models.items() if psnr(found, render_pose(model, FAR)) > CLOSE]
         assert close == ([] if slider == "0" else [expected])
         assert found.std() > 10
         assert tab.page.locator("#wiping").is_visible() == (slider is not None)
@@ -175,10 +173,8 @@ def test_the_slider_says_what_is_seen(
 
 
 @pytest.mark.parametrize("kind", ["empty", "NaN", "activated"])
-def test_a_dropped_file_that_cannot_be_drawn_names_the_cure(
-    tab: Visit, page_file: Path, tmp_path: Path, kind: str
-) -> None:
-    model = made(200, 1)
+def test_undrawable_files(tab: Visit, page_file: Path, tmp_path: Path, kind: str) -> None:
+    model = bright_model(200, 1)
     if kind == "activated":
         model = replace(model, log_scales=model.scales, opacity_logits=model.opacities)
     write_model(tmp_path / "model.ply", model)
@@ -202,7 +198,7 @@ def test_a_dropped_file_that_cannot_be_drawn_names_the_cure(
 
 
 @pytest.mark.slow
-def test_everything_goes_by_keyboard(tab: Visit, page_file: Path) -> None:
+def test_keyboard(tab: Visit, page_file: Path) -> None:
     tab.goto(page_file.as_uri())
     reached: list[str] = []
     tab.page.focus("#picture")
@@ -215,8 +211,8 @@ def test_everything_goes_by_keyboard(tab: Visit, page_file: Path) -> None:
     tab.page.keyboard.press("Enter")
     tab.page.wait_for_selector("#revealed:not([hidden])")
     tab.page.wait_for_selector("main[aria-busy=false]")
-    said = tab.page.locator("[role=status]").inner_text()
-    assert said.startswith("Key tried. It reveals a model of 200 Gaussians.")
+    message = tab.page.locator("[role=status]").inner_text()
+    assert message.startswith("Key tried. It reveals a model of 200 Gaussians.")
     assert tab.page.evaluate("document.activeElement.id") == "key"  # where the next one can be typed
     tab.page.focus("#close")
     tab.page.keyboard.press("Enter")
@@ -226,7 +222,7 @@ def test_everything_goes_by_keyboard(tab: Visit, page_file: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.skipif(not AXE.exists(), reason="no axe-core: `make test-web` installs it")
 @pytest.mark.parametrize("width", [390, 1280])
-def test_axe_finds_nothing(tab: Visit, page_file: Path, width: int) -> None:
+def test_accessibility(tab: Visit, page_file: Path, width: int) -> None:
     tab.page.set_viewport_size({"width": width, "height": 800})
     tab.goto(page_file.as_uri())
     if width < 600:
@@ -243,9 +239,7 @@ def test_axe_finds_nothing(tab: Visit, page_file: Path, width: int) -> None:
 
 
 @pytest.mark.slow
-def test_looking_saving_and_wiping(
-    tab: Visit, page_file: Path, secrets: list[Gaussians], tmp_path: Path
-) -> None:
+def test_inspect_save_and_wipe(tab: Visit, page_file: Path, secrets: list[Gaussians], tmp_path: Path) -> None:
     tab.goto(page_file.as_uri() + POSE)
     plain = tab.picture()
     tab.page.click("#keyless > summary")
@@ -258,7 +252,7 @@ def test_looking_saving_and_wiping(
         assert psnr(tab.picture(), plain) < CLOSE
     tab.page.select_option("#colouring", "as it is")
     tab.try_key(KEYS[0])
-    tab.saved("#download", tmp_path / "secret.ply")
+    tab.save("#download", tmp_path / "secret.ply")
     saved = read_model(tmp_path / "secret.ply")
     assert saved.digest() == secrets[0].digest()
     tab.at(POSE)
@@ -272,7 +266,7 @@ def test_looking_saving_and_wiping(
     border = half.shape[1] // 2
     assert psnr(half[:, border + 2 :], whole[:, border + 2 :]) > 40
     assert psnr(half[:, : border - 2], whole[:, : border - 2]) < CLOSE
-    assert tab.saved("#snapshot", tmp_path / "view.png") == "stego.png"
+    assert tab.save("#snapshot", tmp_path / "view.png") == "stego.png"
     assert (tmp_path / "view.png").read_bytes().startswith(b"\x89PNG")
     published = half[:, : border - 2]
     tab.page.click("#close")

@@ -65,7 +65,7 @@ def page(chromium: Any, folder: Path) -> Iterator[Any]:
         ("spark", "model.spz"),  # PlayCanvas's engine does not read it
     ],
 )
-def test_they_find_the_same_gaussians(page: Any, folder: Path, judge: str, name: str) -> None:
+def test_other_readers_agree(page: Any, folder: Path, judge: str, name: str) -> None:
     found = page.evaluate(f"judges.{judge}('{name}')")
     ours = read_model(folder / name).means.numpy().astype(np.float64)
     if name.endswith(".spz"):

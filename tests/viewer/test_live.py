@@ -14,7 +14,7 @@ from urllib.parse import urlsplit
 import pytest
 import torch
 
-from cli.said import PROGRAM as KEYSS, SMALL
+from cli.harness import PROGRAM as KEYSS, SMALL
 from files.scene_files import write_nerfstudio
 from keyss.core import Gaussians
 from keyss.files import model_of_bytes
@@ -65,26 +65,24 @@ class Copies:
         return self.model
 
 
-def stepped(reporter: Reporter, iteration: int, model: Callable[[], Gaussians]) -> None:
-    reporter.update(iteration, 5, {"PSNR": 20.0, "loss": 0.1})
+def step_once(reporter: Reporter, iteration: int, model: Callable[[], Gaussians]) -> None:
+    reporter.update(iteration, 5, {"PSNR": 20.0})
     reporter.look(model)
 
 
-def test_a_model_is_copied_only_while_somebody_watches_and_not_too_often(
-    training: LiveTraining, clock: Timer
-) -> None:
+def test_copies_only_while_watched(training: LiveTraining, clock: Timer) -> None:
     model, reporter = Copies(), training.reporter(Reporter())
     reporter.start("fit garden", 100, 0)
     for step in range(1, 10):
         clock.now += 1
-        stepped(reporter, step, model)
+        step_once(reporter, step, model)
     assert model.taken == 0
     assert state(training)["versions"] == {"published": 0, "secret": 0}
-    stepped(reporter, 10, model)
-    stepped(reporter, 11, model)
+    step_once(reporter, 10, model)
+    step_once(reporter, 11, model)
     assert model.taken == 1
     clock.now += EVERY
-    stepped(reporter, 12, model)
+    step_once(reporter, 12, model)
     assert model.taken == 2
     assert state(training) == {
         "title": "fit garden",
@@ -95,16 +93,16 @@ def test_a_model_is_copied_only_while_somebody_watches_and_not_too_often(
         "versions": {"published": 2, "secret": 0},
     }
     clock.now += 60
-    stepped(reporter, 13, model)
+    step_once(reporter, 13, model)
     assert model.taken == 2  # whoever looked has left
-    stepped(reporter, 100, model)
+    step_once(reporter, 100, model)
     assert model.taken == 3  # what comes after it goes on beside it
 
 
-def test_a_copy_stays_as_it_was(training: LiveTraining) -> None:
+def test_copies_are_independent(training: LiveTraining) -> None:
     model, reporter = Copies(), training.reporter(Reporter())
     reporter.start("fit", 1, 0)
-    stepped(reporter, 1, model)
+    step_once(reporter, 1, model)
     expected = model.model.digest()
     with torch.no_grad():
         model.model.means.add_(1.0)  # as optimisers do
@@ -113,18 +111,18 @@ def test_a_copy_stays_as_it_was(training: LiveTraining) -> None:
     assert model_of_bytes("a.ply", ply).digest() == expected != model.model.digest()
 
 
-def test_a_secret_is_not_taken_for_what_is_published(training: LiveTraining) -> None:
+def test_secret_is_served_separately(training: LiveTraining) -> None:
     reporter = training.reporter(Reporter())
     hidden = reporter.of_secret()
     model = Copies()
     hidden.start("plain model of the secret", 1, 0)
-    stepped(hidden, 1, model)
+    step_once(hidden, 1, model)
     assert state(training)["versions"] == {"published": 0, "secret": 1}
     assert get(training, "live/published.ply")[0] != 200
     assert get(training, "live/secret.ply")[0] == 200
 
 
-def test_nobody_gets_anything_without_the_address(training: LiveTraining) -> None:
+def test_address_is_required(training: LiveTraining) -> None:
     assert re.search(r"/[\w-]{20,}/$", training.address)
     assert get(training, "")[0] == 200
     for folder in ("/", "/live/", "/AAAAAAAAAAAAAAAAAAAAAA/"):
@@ -134,7 +132,7 @@ def test_nobody_gets_anything_without_the_address(training: LiveTraining) -> Non
 
 @pytest.mark.slow
 @pytest.mark.skipif(PROGRAM is None, reason="no Chromium on PATH")
-def test_a_fit_is_seen_while_it_goes_on(tab: Visit, tmp_path: Path) -> None:
+def test_live_fit(tab: Visit, tmp_path: Path) -> None:
     scene = write_nerfstudio(tmp_path / "scene", count=4)
     command = [*KEYSS, "fit", scene, "-o", tmp_path / "out", *SMALL[4:], "--live", "--iterations", 100_000]
     with subprocess.Popen([*map(str, command)], stdout=subprocess.PIPE, text=True) as process:
@@ -155,4 +153,4 @@ def test_a_fit_is_seen_while_it_goes_on(tab: Visit, tmp_path: Path) -> None:
         assert process.wait(60) == 143  # as without a page
         tab.page.wait_for_function(f"() => {status}.endsWith('The training has ended.')")
         # That the page asks on for a while is known to the browser's console only.
-        tab.complaints[:] = [each for each in tab.complaints if "ERR_CONNECTION_REFUSED" not in each]
+        tab.console_errors[:] = [each for each in tab.console_errors if "ERR_CONNECTION_REFUSED" not in each]

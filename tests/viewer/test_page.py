@@ -62,7 +62,7 @@ def get(
     return answer.status, answer.read(), dict(answer.getheaders())
 
 
-def test_one_file_has_everything_in_it_and_may_ask_nobody(model: Path, tmp_path: Path) -> None:
+def test_single_file_page(model: Path, tmp_path: Path) -> None:
     (out,) = export_html(model, tmp_path / "page.html")
     page = out.read_text()
     policy = re.search(r'http-equiv="Content-Security-Policy" content="([^"]*)"', page)
@@ -82,7 +82,7 @@ def test_one_file_has_everything_in_it_and_may_ask_nobody(model: Path, tmp_path:
     assert not re.search(r'(src|href)="', page)
 
 
-def test_a_folder_for_a_web_server(model: Path, tmp_path: Path) -> None:
+def test_folder_page(model: Path, tmp_path: Path) -> None:
     written = export_html(model, tmp_path / "site")
     names = {path.name for path in written}
     assert names == {"index.html", "viewer.js", "viewer.css", "embed.js", "licences.txt", model.name}
@@ -94,9 +94,7 @@ def test_a_folder_for_a_web_server(model: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("out", ["page.html", "site"])
-def test_what_no_page_can_show_is_refused_before_one_is_written(
-    model: Path, tmp_path: Path, out: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_undrawable_models(model: Path, tmp_path: Path, out: str, monkeypatch: pytest.MonkeyPatch) -> None:
     whole = model.read_bytes()
     start = whole.index(b"end_header\n") + len(b"end_header\n")
     nan = np.full(len(whole[start:]) // 4, np.nan, "<f4").tobytes()
@@ -108,10 +106,10 @@ def test_what_no_page_can_show_is_refused_before_one_is_written(
         empty: "holds no Gaussians",
         model.read_bytes(): "export it again without activating them",
     }
-    for content, said in refused.items():
+    for content, message in refused.items():
         model.write_bytes(content)
         for shown in (lambda: export_html(model, tmp_path / out), lambda: ModelServer(model)):
-            with pytest.raises(InputError, match=said):
+            with pytest.raises(InputError, match=message):
                 shown()
     model.write_bytes(whole)
     monkeypatch.setattr("keyss.viewer.page.MAX_BYTES", len(whole) - 1)
@@ -120,9 +118,7 @@ def test_what_no_page_can_show_is_refused_before_one_is_written(
     assert not (tmp_path / out).exists()
 
 
-def test_the_server_gives_out_the_page_and_the_model_and_nothing_else(
-    server: ModelServer, model: Path
-) -> None:
+def test_server(server: ModelServer, model: Path) -> None:
     where = urlsplit(server.address)
     assert re.fullmatch(r"/[\w-]{20,}/", where.path)
     with running(other := ModelServer(model)):
@@ -151,7 +147,7 @@ def test_the_server_gives_out_the_page_and_the_model_and_nothing_else(
         ("::1", ["[::1]", "localhost"]),
     ],
 )
-def test_only_hosts_that_are_served_get_the_model(model: Path, address: str, served: list[str]) -> None:
+def test_host_header(model: Path, address: str, served: list[str]) -> None:
     """Other names that resolve to the server (DNS rebinding) get nothing, whatever a parser makes of them."""
     try:
         found = ModelServer(model, address)
@@ -178,7 +174,7 @@ def test_only_hosts_that_are_served_get_the_model(model: Path, address: str, ser
 
 @pytest.mark.skipif(shutil.which("node") is None, reason="no node on PATH")
 @pytest.mark.skipif(not (WEB / "node_modules").exists(), reason="no web/node_modules: `make web` installs it")
-def test_a_fresh_build_is_what_is_shipped(tmp_path: Path) -> None:
+def test_assets_are_up_to_date(tmp_path: Path) -> None:
     subprocess.run(["node", "build.mjs", str(tmp_path)], cwd=WEB, check=True)
     shipped = ROOT / "src" / "keyss" / "viewer" / "assets"
     assert {path.name for path in tmp_path.iterdir()} == {path.name for path in shipped.iterdir()}

@@ -12,7 +12,7 @@ from keyss.files import read_model, write_model
 from keyss.viewer import export_html
 from methods.carry.carried import embed, extract
 from serving import serving
-from viewer.browser import CLOSE, IN_CHROMIUM, PANEL, Visit, drawn, made, psnr, visit
+from viewer.browser import CLOSE, IN_CHROMIUM, PANEL, Visit, bright_model, psnr, render_pose, visit
 
 pytestmark = IN_CHROMIUM
 
@@ -26,7 +26,7 @@ PORTRAIT, LANDSCAPE = {"width": 390, "height": 844}, {"width": 844, "height": 39
 @pytest.fixture(scope="module")
 def stego(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("published") / "stego.ply"
-    write_model(path, embed(made(4000, 0), [(KEY, made(200, 1))], entropy=bytes(32)))
+    write_model(path, embed(bright_model(4000, 0), [(KEY, bright_model(200, 1))], entropy=bytes(32)))
     return path
 
 
@@ -49,12 +49,12 @@ def assert_drawn(tab: Visit, model: Gaussians) -> tuple[int, int]:
     """Assert that the canvas shows what our own renderer draws at its width and height; return both."""
     found = tab.picture()
     height, width = found.shape[:2]
-    assert psnr(found, drawn(model, POSE, width, height)) > CLOSE
+    assert psnr(found, render_pose(model, POSE, width, height)) > CLOSE
     return width, height
 
 
 @pytest.mark.slow
-def test_the_secret_stays_when_the_search_has_ended(chromium: Any, page_file: Path) -> None:
+def test_secret_stays_after_search(chromium: Any, page_file: Path) -> None:
     """The panel gets lines and loses them, and the canvas another height, while pictures are drawn."""
     with visit(chromium, viewport=PORTRAIT, **PHONE) as tab:
         tab.goto(page_file.as_uri())
@@ -74,7 +74,7 @@ def test_the_secret_stays_when_the_search_has_ended(chromium: Any, page_file: Pa
 
 
 @pytest.mark.slow
-def test_a_phone_is_turned_and_its_panel_folded(chromium: Any, page_file: Path, published: Gaussians) -> None:
+def test_rotate_phone(chromium: Any, page_file: Path, published: Gaussians) -> None:
     fits = "(panel => panel.scrollWidth <= panel.clientWidth)(document.querySelector('.panel'))"
     with visit(chromium, viewport=PORTRAIT, **PHONE) as tab:
         tab.goto(page_file.as_uri() + POSE)
@@ -90,7 +90,7 @@ def test_a_phone_is_turned_and_its_panel_folded(chromium: Any, page_file: Path, 
             assert tab.page.evaluate(fits)
 
 
-def test_a_phone_is_turned_while_it_shows_a_secret(
+def test_rotate_phone_with_secret(
     chromium: Any, page_file: Path, secret: Gaussians, published: Gaussians
 ) -> None:
     with visit(chromium, viewport=PORTRAIT, **PHONE) as tab:
@@ -109,7 +109,7 @@ def test_a_phone_is_turned_while_it_shows_a_secret(
 
 
 @pytest.mark.slow
-def test_the_element_of_another_site_is_resized(
+def test_resize_element(
     tab: Visit, stego: Path, published: Gaussians, secret: Gaussians, tmp_path: Path
 ) -> None:
     export_html(stego, tmp_path / "site", look={"pose": POSE.removeprefix("#")})

@@ -27,7 +27,7 @@ PUBLISHED = json.loads((FOLDER / "published.json").read_text())
 
 @pytest.mark.argon2
 @pytest.mark.parametrize("expected", REVEALED, ids=lambda each: f"{each['file']} {each['key']}")
-def test_what_keys_open(expected: dict[str, Any]) -> None:
+def test_reveal(expected: dict[str, Any]) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", KeyssWarning)
         found = revealed(expected["file"], expected["key"])
@@ -43,22 +43,22 @@ def check(found: dict[str, Any], expected: dict[str, Any]) -> None:
 
 
 @pytest.mark.parametrize("name", PUBLISHED)
-def test_what_published_files_hold(name: str) -> None:
+def test_published_files(name: str) -> None:
     assert digests(read_model(FOLDER / name)) == PUBLISHED[name]
 
 
 @pytest.mark.parametrize("expected", WHOLE, ids=lambda each: f"{len(each['data']) // 2} bytes")
-def test_what_whole_models_hold(expected: dict[str, Any]) -> None:
+def test_whole_models(expected: dict[str, Any]) -> None:
     assert digests(whole.decode(bytes.fromhex(expected["data"]))) == expected["sha256"]
 
 
 @pytest.mark.parametrize("name", COUNTED["bits"])
-def test_which_bits_of_published_files_carry(name: str) -> None:
+def test_carrier_bits(name: str) -> None:
     assert counted(read_model(FOLDER / name)) == COUNTED["bits"][name]
 
 
 @pytest.mark.parametrize("expected", KEYSS, ids=lambda each: f"{each['file']} {each['count']}")
-def test_what_decoders_reveal(expected: dict[str, Any]) -> None:
+def test_decoders(expected: dict[str, Any]) -> None:
     found = decoded(bytes.fromhex(expected["payload"]), read_model(FOLDER / expected["file"]))
     assert found["count"] == expected["count"]
     for name, values in expected["rows"].items():
@@ -67,7 +67,7 @@ def test_what_decoders_reveal(expected: dict[str, Any]) -> None:
 
 @pytest.mark.parametrize("unit", [0.001, 1.0, 1e5])
 @pytest.mark.parametrize("activated", ["", "scales", "opacities", "scales and opacities"])
-def test_which_models_are_activated(tmp_path: Path, unit: float, activated: str) -> None:
+def test_activated_models(tmp_path: Path, unit: float, activated: str) -> None:
     scales, opacities = unit * ACTIVATED["scales"].reshape(-1, 3), ACTIVATED["opacities"]
     count = len(opacities)
     model = Gaussians(

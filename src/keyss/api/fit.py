@@ -13,10 +13,10 @@ from keyss.fitting.image_metrics import quality
 from keyss.fitting.plain import FitResult, fit_scene
 from keyss.progress import Reporter
 from keyss.rendering import Backend, resolve_device
-from keyss.runs.config import FitMetrics, FitRunConfig
 from keyss.runs.files import CONFIG, METRICS, MODEL, Background, PathLike, as_scene, path_of
 from keyss.runs.folder import RunFolder, recorded_number
 from keyss.runs.planning import check_room, in_a_line, needs_of_fit, plan_fit, worth_planning
+from keyss.runs.run_records import FitMetrics, FitRunConfig
 
 
 def with_seed(config: FitConfig, interrupted: Path | None, *names: str) -> FitConfig:

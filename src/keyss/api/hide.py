@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import math
 import time
-import warnings
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
@@ -19,10 +18,10 @@ from keyss.api.fit import with_seed
 from keyss.api.hide_arguments import HideResult, Secret, method_for, sources_of
 from keyss.api.hide_checks import check_quality
 from keyss.channels import AnyChannel, Format, Publish
-from keyss.core.errors import KeyssWarning, UsageError
-from keyss.core.gaussians import Gaussians, same_bits
+from keyss.core.errors import UsageError
+from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene, ViewOptions
-from keyss.files.models import is_model_path, read_model
+from keyss.files.models import is_model_path, read_model, reads_as
 from keyss.files.ply_extras import with_extras
 from keyss.fitting.image_metrics import quality
 from keyss.keys import DerivedKey
@@ -36,7 +35,6 @@ from keyss.methods.registry import DEFAULT, open_handed, open_model
 from keyss.progress import Reporter
 from keyss.rendering import Backend, resolve_device
 from keyss.rendering.orbit import is_model
-from keyss.runs.config import FitMetrics, HideMetrics, RunConfig, secret_ids
 from keyss.runs.files import (
     CONFIG,
     METRICS,
@@ -52,8 +50,9 @@ from keyss.runs.files import (
     stego_name,
 )
 from keyss.runs.folder import RunFolder
+from keyss.runs.json_records import read_record, record_bytes
 from keyss.runs.planning import check_room, in_a_line, needs_of_hiding, plan_hiding, worth_planning
-from keyss.runs.records import read_record, record_bytes
+from keyss.runs.run_records import FitMetrics, HideMetrics, RunConfig, secret_ids
 
 
 def hide(
@@ -139,26 +138,40 @@ def hide(
         context = Context(target, folder.checkpoints if folder and trains else None, resume, reporter)
         sources, options = _fit_models(chosen, sources, options, context)
         plain = [each.model for each in sources]
-        context = replace(context, entropy=_entropy(keys, options, plain))
+        context = replace(
+            context,
+            entropy=_entropy(keys, options, plain),
+            overwrites_cover=not (sources[0].photos or isinstance(cover, Gaussians)),
+        )
         stego = chosen.hide(sources[0], sources[1:], options, context)
 
         published = with_extras(stego.gaussians, cover if cover_model is None else cover_model, plain[0])
+        plain_sizes, made = [(len(each), each.sh_degree) for each in plain], _models_to_write(given, plain)
+        # Images of given models take their place from here on, which frees memory for the revealed ones.
+        sources = [each if each.photos else replace(each, given=None) for each in sources]
+        del plain
         read = _write_and_read(stego, published, keys, folder)
         shown = [
-            compare(model.to(target), each.model.to(target), each.scene, of_plain=not each.photos)
+            compare(
+                model.to(target), each.given and each.given.to(target), each.scene, of_plain=not each.photos
+            )
             for model, each in zip(read, sources, strict=True)
         ]
-        sizes = [(len(model), len(each)) for model, each in zip(read, plain, strict=True)]
+        sizes = [(len(model), count) for model, (count, _) in zip(read, plain_sizes, strict=True)]
         check_quality(shown, min_psnr, sizes, options, resumes=trains)
 
         bounds = list(map(Bound.of, options.training(len(sources)), plain_steps))
         longer = _fit_bounds(bounds, sources, stego, options, context) if bound else {}
-        metrics = _measure(stego, sources, options, shown, target, bounds, plain_steps, longer, began)
+        metrics = _measure(
+            stego, sources, options, shown, target, bounds, plain_steps, plain_sizes, longer, began
+        )
         if folder:
             settings = replace(
                 settings, options=options, payloads=secret_ids(options.fit.known_seed, stego.opened)
             )
-            folder.write({**_models_to_write(given, plain, longer), CONFIG: settings, METRICS: metrics})
+            names = bound_names(len(secrets))
+            made |= {names[index]: model for index, model in longer.items()}
+            folder.write({**made, CONFIG: settings, METRICS: metrics})
     return HideResult(stego.gaussians, metrics)
 
 
@@ -236,22 +249,18 @@ def _fit_models(
     if all(each.given is not None for each in sources):
         return sources, options
     fitted = fit_plain_models(sources, options.fits(len(sources)), context)
-    with warnings.catch_warnings():  # the first call has warned already
-        warnings.simplefilter("ignore", KeyssWarning)
-        return fitted, method.prepare(fitted, options)
+    return fitted, method.prepare(fitted, options)
 
 
 def _models_to_write(
-    given: Sequence[PathLike | Scene | Gaussians], plain: Sequence[Gaussians], bounds: Mapping[int, Gaussians]
+    given: Sequence[PathLike | Scene | Gaussians], plain: Sequence[Gaussians]
 ) -> dict[str, Gaussians]:
-    """Plain models and upper bounds by file name, without plain models that the user gave as files."""
-    secrets = len(given) - 1
-    made = {
+    """Plain models by file name, without those that the user gave as files."""
+    return {
         name: model
-        for name, model, source in zip(plain_names(secrets), plain, given, strict=True)
+        for name, model, source in zip(plain_names(len(given) - 1), plain, given, strict=True)
         if isinstance(source, Scene | Gaussians) or not is_model(source)
     }
-    return made | {bound_names(secrets)[index]: model for index, model in bounds.items()}
 
 
 def _key_checks(keys: Sequence[str], settings: RunConfig[MethodOptions]) -> list[str]:
@@ -278,16 +287,18 @@ def _write_and_read(
     stego: Stego, published: Gaussians, keys: Sequence[str], folder: RunFolder | None
 ) -> list[Gaussians]:
     """Write the files to give away, `published` among them, and read the stego model and the secrets back."""
-    model, given = stego.gaussians, bool(stego.handed)
-    packed = [pack(payload, key or None) for payload, key in zip(stego.handed, keys, strict=given)]
+    model, same = stego.gaussians, type(stego.gaussians) is Gaussians
+    packed = [pack(payload) for payload in stego.handed]
     if folder:
         handed = dict(zip(handed_names(len(packed)), packed, strict=True))
         name = stego_name(model)
-        model = read_model(folder.write({name: published, **handed}) / name)
+        path = folder.write({name: published, **handed}) / name
+        same = reads_as(path, model)
+        model = model if same else read_model(path)
     opened: Sequence[Opened]
     if packed:
-        opened = [open_handed(data, key or None) for data, key in zip(packed, keys, strict=True)]
-    elif stego.verified and same_bits(model, stego.gaussians):
+        opened = [open_handed(data) for data in packed]
+    elif stego.verified and same:
         opened = stego.opened  # opening the same bits again would change nothing
     else:
         opened = [open_model(model, key) for key in keys]
@@ -328,6 +339,7 @@ def _measure(
     device: torch.device,
     bounds: Sequence[Bound],
     plain_steps: Sequence[int | None],
+    plain_sizes: Sequence[tuple[int, int]],  # Gaussians and SH degrees of the plain models
     longer: Mapping[int, Gaussians],  # plain models with as many steps as the bounds
     began: float,  # time.monotonic() at the start of the run
 ) -> HideMetrics:
@@ -343,11 +355,11 @@ def _measure(
         stego.gaussians.to(device),
         stego.opened,
         scenes,
-        [longer.get(index, each.model) for index, each in enumerate(sources)],
+        beside_bounds,
+        [len(longer[index]) if index in longer else count for index, (count, _) in enumerate(plain_sizes)],
         steps=[each.steps if index in longer else plain_steps[index] for index, each in enumerate(bounds)],
         equal=[each.equal or index in longer for index, each in enumerate(bounds)],
         seed=options.fit.known_seed,
-        shown=beside_bounds,
     )
     return HideMetrics(
         **vars(measured),
@@ -356,8 +368,7 @@ def _measure(
         photos=tuple(each.photos for each in sources),
         secret_gaussians=tuple(map(len, secrets)),
         secret_degrees=tuple(
-            (each.sh_degree, source.model.sh_degree)
-            for each, source in zip(secrets, sources[1:], strict=True)
+            (each.sh_degree, degree) for each, (_, degree) in zip(secrets, plain_sizes[1:], strict=True)
         ),
         iterations=stego.iterations,
         steps=tuple(each.steps for each in bounds),

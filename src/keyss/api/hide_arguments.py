@@ -14,8 +14,8 @@ from keyss.keys import normalized_key
 from keyss.methods import registry
 from keyss.methods.base import Method, MethodOptions, Plan, Source
 from keyss.rendering.orbit import is_model
-from keyss.runs.config import HideMetrics
 from keyss.runs.files import PathLike, as_3dgs_model, as_scene, path_of
+from keyss.runs.run_records import HideMetrics
 
 _READERS = 2  # threads that read files
 

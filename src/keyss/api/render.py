@@ -18,16 +18,16 @@ from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Camera, Scene, View, ViewOptions, checked_background
 from keyss.files.atomic import check_not_an_input, check_output_file
 from keyss.files.images import check_video, png_bytes, write_video
-from keyss.measure.hide_quality import WRONG_KEYS, measure_hiding
-from keyss.measure.image_scores import renders_of
+from keyss.measure.hide_quality import WRONG_KEYS, compare, measure_hiding
+from keyss.measure.renders import renders_of
 from keyss.progress import Reporter
 from keyss.rendering import Backend, render as render_view, resolve_device
-from keyss.rendering.arguments import MAX_SIDE
 from keyss.rendering.orbit import IMAGE_SIZE, around, circle
-from keyss.runs.config import HideMetrics
+from keyss.rendering.rasterization_checks import MAX_SIDE
 from keyss.runs.files import METRICS, Background, PathLike, as_model, as_scene
 from keyss.runs.folder import RunFolder, write_again
 from keyss.runs.open_run import open_run
+from keyss.runs.run_records import HideMetrics
 
 Split = Literal["test", "train", "all"]
 FPS = 25
@@ -102,11 +102,15 @@ def evaluate(
             f"the method {opened.config.method} has no decoder, so wrong keys show nothing: leave out "
             "`wrong_keys` and `seed`"
         )
+    stego, scenes = opened.stego.to(target), opened.scenes(train_pictures=False)
+    models = [stego, *(secret.reveal(stego).to(target) for secret in opened.opened)]
+    baselines = [None if model is None else model.to(target) for model in opened.baselines()]
     measured = measure_hiding(
-        opened.stego.to(target),
+        stego,
         opened.opened,
-        opened.scenes(train_pictures=False),
-        [None if model is None else model.to(target) for model in opened.baselines()],
+        scenes,
+        list(map(compare, models, baselines, scenes)),
+        [None if model is None else len(model) for model in baselines],
         steps=opened.metrics.baseline.steps,
         equal=opened.metrics.baseline.equal,
         wrong_keys=WRONG_KEYS if wrong_keys is None else wrong_keys,

@@ -9,8 +9,8 @@ from keyss.channels import open_content
 from keyss.core.errors import KeyssWarning, UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.files.atomic import check_not_an_input, check_output_file, write_bytes
+from keyss.files.inputs import is_standard
 from keyss.files.models import check_model_output, is_model_path, write_model
-from keyss.files.reading import is_standard
 from keyss.methods.opened import Frame, HiddenFile, OpensAFileError
 from keyss.rendering import Backend, resolve_device
 from keyss.runs.files import PathLike, as_model
@@ -43,8 +43,8 @@ def reveal(
     are valid; "cover" leaves it where it was hidden, unless it was carried. If Gaussians were lost, the
     others are enlarged to compensate (`keyss.core.gaussians`). `force` is for quantised or pruned models: it
     skips the check that a decoder belongs to the model, and accepts any loss. `handed`: the file handed over
-    for this secret, for methods that need one (`keyss.methods.handed`). Some of those have no keys, and some
-    give a model that a network decodes (`keyss.core.picture_network`), which is no 3DGS model.
+    for this secret, for methods without keys (`keyss.methods.handed`). Some give a model that a network
+    decodes (`keyss.core.picture_network`), which is no 3DGS model.
 
     `out` (a file) gets the secret: a scene for the suffix of a model (.ply, .spz, ...), else a file. Raises
     WrongKeyError for a key that opens nothing (`decoy` reveals the cover instead, see `keyss.methods.decoy`),

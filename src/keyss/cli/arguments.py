@@ -72,7 +72,6 @@ class Training:
     iterations: Iterations = None
     max_gaussians: MaxGaussians = None
     seed: Seed = None
-    tensorboard: Annotated[bool, switch("Write losses to private/tensorboard in the results.")] = False
     live: Annotated[bool, switch("Show the model on a local page while it trains.")] = False
 
     def schedule(self) -> dict[str, int]:

@@ -18,9 +18,7 @@ from keyss.core.errors import BackendError, KeyssError
 EXTRAS = {
     "audit": ("scikit-learn", "keyss audit, compare and reproduce"),
     "clip": ("transformers", "the paper's key encoder"),
-    "reproduce": ("pooch", "downloading the paper's scenes"),
     "sweep": ("ray", "sweeps and batches on a cluster"),
-    "tensorboard": ("tensorboard", "losses during training"),
     "video": ("av", "keyss render --video"),
 }
 LIBRARIES = ("torch", "gsplat", "numba", "numpy", "opencv-python-headless", "cryptography", "argon2-cffi")
@@ -141,6 +139,6 @@ def _frame(device: Device) -> str:
 
 
 def _splat_transform() -> str:
-    from keyss.files.foreign import find_splat_transform
+    from keyss.files.file_kinds import find_splat_transform
 
     return find_splat_transform()

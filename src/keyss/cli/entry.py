@@ -32,7 +32,7 @@ INTERNAL_ERROR = 70  # EX_SOFTWARE
 NO_ROOM = OutputError.exit_status
 _LEVELS = {"-q": -1, "--quiet": -1, "-v": 1, "--verbose": 1}
 _KEY_OPTIONS = ("-k", "-p", "--key", "--keys", "--password", "--passphrase")  # options that people may expect
-# Between backticks: `overwrite=True`, `method="carry", dither=True`, `sh_degree`.
+# Between backticks: `overwrite=True`, `method="carry", refit="never"`, `sh_degree`.
 _VALUE = r"""(?:"[^"`]*"|'[^'`]*'|[\w.+-]+)"""
 _ASSIGNMENT = rf"([A-Za-z_]\w*)=({_VALUE})"
 _ASSIGNMENTS = re.compile(rf"`({_ASSIGNMENT}(?:, ?{_ASSIGNMENT})*)`")
@@ -78,16 +78,16 @@ def _run(arguments: list[str], options: set[str]) -> None:
 
     import tyro
 
-    from keyss.cli import commands
+    from keyss.cli import command_table
 
     if arguments in (["--help"], ["-h"]):
-        print(commands.help_page())
+        print(command_table.help_page())
         return
     if name == "--completion":
         _print_completion(rest)
         return
-    if name not in commands.MODULES:
-        near = nearest(name.lower(), commands.MODULES)
+    if name not in command_table.MODULES:
+        near = nearest(name.lower(), command_table.MODULES)
         hint = f"did you mean `keyss {near}`?" if near else "see `keyss --help`"
         raise UsageError(f"there is no command {name!r}: {hint}")
     if any(word.partition("=")[0] in _KEY_OPTIONS for word in rest):  # the parser would print its value
@@ -95,7 +95,7 @@ def _run(arguments: list[str], options: set[str]) -> None:
             "a key cannot be an argument, which other users could see: give --key-file FILE, set KEYSS_KEY, "
             "or type it at the prompt"
         )
-    command = commands.parse_target(name, rest)
+    command = command_table.parse_target(name, rest)
     options.update(options_of(command))
     if "out" not in options and {"-o", "--out"} & {word.partition("=")[0] for word in rest}:
         where = "name OUT after IN" if name == "convert" else "results go into the folder of the run, if any"
@@ -106,13 +106,13 @@ def _run(arguments: list[str], options: set[str]) -> None:
 def _print_completion(arguments: list[str]) -> None:
     import tyro
 
-    from keyss.cli import commands
+    from keyss.cli import command_table
 
     if arguments not in (["bash"], ["zsh"]):
         raise UsageError("--completion: expected bash or zsh")
     app = tyro.extras.SubcommandApp()
-    for name in commands.MODULES:
-        app.command(name=name)(commands.parse_target(name, []))
+    for name in command_table.MODULES:
+        app.command(name=name)(command_table.parse_target(name, []))
     printing = ["--tyro-print-completion", *arguments]
     app.cli(prog="keyss", args=printing, config=(tyro.conf.FlagCreatePairsOff,))
 

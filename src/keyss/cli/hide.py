@@ -186,7 +186,7 @@ def _hide_scenes(args: HideArguments, cover: Path) -> None:
         print_plan(plan)
         _warn_of_idle(idle, sum(stage.steps for stage in plan.stages))
         return
-    with reporting(args.out, cover, args.training) as reporter:
+    with reporting(cover, args.training.live) as reporter:
         result = keyss.hide(
             cover,
             secrets,
@@ -214,10 +214,9 @@ def _hide_scenes(args: HideArguments, cover: Path) -> None:
     if not method.capabilities.keys:
         print(f"The method {method.name} has no keys: whoever has both files can see the secret.")
         return
-    files = "both files" if method.capabilities.hands_over else "the file"
     print(
         "Send the key over another channel, and keep a copy: without it the secret is lost. Whoever has "
-        f"{files} and the key runs `keyss reveal`; `keyss info {args.out}` prints all measurements."
+        f"the file and the key runs `keyss reveal`; `keyss info {args.out}` prints all measurements."
     )
 
 
@@ -225,13 +224,13 @@ def _secrets(args: HideArguments, method: Method) -> list[Any]:
     """The secrets with their keys and models."""
     import keyss
     from keyss.core.errors import InputError, UsageError
-    from keyss.files.foreign import what_it_is
+    from keyss.files.file_kinds import identify_file
     from keyss.files.models import is_model_path
 
     count, models = len(args.secret), args.details.secret_model
     for each in args.secret:
         if each.is_file() and not is_model_path(each):
-            found = f"{each}: expected a scene folder or a model, found {what_it_is(each)}"
+            found = f"{each}: expected a scene folder or a model, found {identify_file(each)}"
             raise InputError(f"{found}; --secret-file hides any file")
     if models and len(models) != count:
         raise UsageError(

@@ -83,11 +83,11 @@ def fit(
     from keyss.cli.reporting import reporting
     from keyss.cli.tables import print_files, print_fit
     from keyss.fitting.config import PRESETS
-    from keyss.runs.config import FitMetrics
     from keyss.runs.files import METRICS
-    from keyss.runs.records import read_record
+    from keyss.runs.json_records import read_record
+    from keyss.runs.run_records import FitMetrics
 
-    with reporting(out, scene, training) as reporter:
+    with reporting(scene, training.live) as reporter:
         keyss.fit(
             scene,
             config=replace(PRESETS[preset], **training.schedule()),
@@ -181,7 +181,7 @@ def convert(
     import keyss
     from keyss.cli.keys import given_keys
     from keyss.cli.tables import print_conversion
-    from keyss.files.reading import is_standard
+    from keyss.files.inputs import is_standard
     from keyss.progress import waiting
 
     with waiting(f"converting {model.name}"):

@@ -49,11 +49,9 @@ def reveal(
     from keyss.cli.keys import keys
 
     key: str | None = None
-    if handed is not None:
-        from keyss.runs.revealing import is_encrypted  # imports torch
-    if handed is None or key_file or is_encrypted(handed):
+    if handed is None or key_file:
         (key,) = keys(key_file, 1)
-    from keyss.files.reading import is_standard
+    from keyss.files.inputs import is_standard
     from keyss.progress import waiting
 
     with waiting(f"opening {stego.name}"):

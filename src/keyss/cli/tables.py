@@ -16,14 +16,14 @@ from rich.text import Text
 
 from keyss.core.errors import InputError
 from keyss.progress import about, clock
-from keyss.runs.records import record_bytes
+from keyss.runs.json_records import record_bytes
 
 if TYPE_CHECKING:
     from keyss.api.convert import Conversion
     from keyss.methods.base import Plan
-    from keyss.runs.config import FitMetrics, HideMetrics
     from keyss.runs.describe import ModelInfo, RunInfo, SceneInfo
     from keyss.runs.revealing import Verification
+    from keyss.runs.run_records import FitMetrics, HideMetrics
 
 
 _HEADS = ("PSNR", "SSIM", "LPIPS", "bound", "loss", "start", "Gaussians", "plain", "steps")
@@ -200,7 +200,7 @@ def print_info(found: RunInfo | ModelInfo | SceneInfo) -> None:
     if not isinstance(found, RunInfo):
         _print_columns([(name.replace("_", " "), _text(value)) for name, value in vars(found).items()])
         return
-    from keyss.runs.config import HideMetrics
+    from keyss.runs.run_records import HideMetrics
 
     metrics = found.metrics
     how = f" by the method {metrics.method}" if isinstance(metrics, HideMetrics) else ""

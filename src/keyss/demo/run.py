@@ -18,9 +18,9 @@ from keyss.measure.contact_sheet import contact_sheet
 from keyss.methods import CarryOptions
 from keyss.progress import Reporter
 from keyss.rendering import Backend, resolve_device
-from keyss.runs.config import HideMetrics
 from keyss.runs.files import STEGO, plain_names
 from keyss.runs.folder import RunFolder, clear
+from keyss.runs.run_records import HideMetrics
 from keyss.viewer.look import look_of_scene
 from keyss.viewer.page import page_with
 

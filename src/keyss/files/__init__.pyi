@@ -4,7 +4,7 @@ from .atomic import (
     lock as lock,
     write_bytes as write_bytes,
 )
-from .foreign import what_it_is as what_it_is
+from .file_kinds import identify_file as identify_file
 from .models import (
     DECODED_SUFFIX as DECODED_SUFFIX,
     check_model_output as check_model_output,

@@ -1,6 +1,6 @@
-"""Atomic writes, lock files, and checks of where output may be written.
+"""Atomic writes, lock files, and checks of output paths.
 
-Windows ignores the modes of files: whoever may read a folder may read what is written into it.
+On Windows file modes have no effect: files inherit the permissions of their folder.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from keyss.core.errors import OutputError, UsageError
 def atomic_write(path: Path | str, mode: int = 0o600) -> Iterator[BinaryIO]:
     """Open a temporary file beside `path`; on success fsync it and rename it to `path`.
 
-    On failure the temporary file is removed and `path` is unchanged; the next write removes a temporary file
-    that a killed process left. Files have `mode`, by default 0600, since most of them are secrets or tell of
-    one. Raises OutputError when the system refuses (disk full, no permission, missing folder), and when
-    another process is writing the same file.
+    On failure the temporary file is removed and `path` is unchanged; the next write removes what a killed
+    process left behind. The default mode is 0600, since most files are secrets or describe one. Raises
+    OutputError on system errors (disk full, no permission, missing folder), and if another process is writing
+    the same file.
     """
     path = Path(path)
     temporary = path.with_name(f".{path.name}.unfinished")
@@ -51,23 +51,23 @@ def write_bytes(path: Path | str, data: bytes, mode: int = 0o600) -> None:
 
 
 def public_mode() -> int:
-    """The mode of files for everybody, as the umask sets it."""
+    """Permission bits of a public file under the current umask."""
     umask = os.umask(0)
     os.umask(umask)
     return 0o666 & ~umask
 
 
 def mode_like(source: Path) -> int:
-    """The mode of what is made from the file `source`: `public_mode` if others can read that, else 0600."""
+    """Permission bits of a file made from `source`: `public_mode` if others can read that, else 0600."""
     return public_mode() if source.stat().st_mode & stat.S_IROTH else 0o600
 
 
 @contextmanager
 def lock(path: Path, written: Path) -> Iterator[None]:
-    """Hold the lock file `path`, which stands for the file or folder `written`, and remove it afterwards.
+    """Hold the lock file `path` for the file or folder `written`, and remove it afterwards.
 
-    The system releases the lock if the process dies. Raises OutputError while another process holds the lock,
-    and when the system refuses.
+    The system releases the lock if the process dies. Raises OutputError if another process holds the lock,
+    and on system errors.
     """
     from filelock import FileLock, Timeout  # slow to import
 
@@ -87,15 +87,15 @@ def lock(path: Path, written: Path) -> Iterator[None]:
 
 
 def check_not_an_input(path: Path | str, inputs: Iterable[Path]) -> None:
-    """Raise UsageError if `path` is one of the `inputs`, under any name or link."""
+    """Raise UsageError if `path` and one of the `inputs` are the same file, links included."""
     for source in inputs:
-        with suppress(OSError):  # one of the two does not exist
+        with suppress(OSError):  # either does not exist
             if os.path.samefile(path, source):
                 raise UsageError(f"{path} is the input {source}: choose another name for the output")
 
 
 def check_output_file(path: Path | str, overwrite: bool) -> Path:
-    """`path`, if a file may be written there. Raises OutputError if it exists or its folder does not."""
+    """`path`, if a file can be written there. Raises OutputError if it exists or its folder does not."""
     path = Path(path)
     if path.is_dir():
         raise OutputError(f"{path} is a folder: name the file to write")
@@ -104,5 +104,5 @@ def check_output_file(path: Path | str, overwrite: bool) -> Path:
     if not path.parent.is_dir():
         raise OutputError(f"cannot write {path}: there is no folder {path.parent}")
     if not os.access(path.parent, os.W_OK):
-        raise OutputError(f"cannot write {path}: nothing can be written in {path.parent}")
+        raise OutputError(f"cannot write {path}: {path.parent} is not writable")
     return path

@@ -1,8 +1,8 @@
-"""Scenes in COLMAP's layout: a sparse model (cameras, images, points; `.bin` or `.txt`) beside `images/`.
+"""Reads COLMAP's layout: a sparse model (cameras, images, points; `.bin` or `.txt`) beside `images/`.
 
-The reader is our own because pycolmap is a large package for three small files, and trusts them. Files may be
-hostile: counts are compared with the remaining bytes before anything is allocated, and a file must end with
-its last record. Format: https://colmap.github.io/format.html
+The reader is our own because pycolmap is a large package for three small files, and trusts them. Input is
+untrusted: counts are checked against the remaining bytes before anything is allocated, and nothing may follow
+the last record. Format: https://colmap.github.io/format.html
 """
 
 from __future__ import annotations
@@ -22,31 +22,30 @@ from scipy.spatial.transform import Rotation
 
 from keyss.core.arrays import Doubles, Numbers
 from keyss.core.errors import InputError, KeyssWarning
-from keyss.files.layout import (
+from keyss.files.inputs import open_input, read_file, read_text
+from keyss.files.lens import Lens, make_lens
+from keyss.files.scene_layout import (
     MAX_COORDINATE,
     NO_POINTS,
-    FileFinder,
+    CaseInsensitiveFinder,
     Photo,
     PointCloud,
     SceneLayout,
     hold_out,
-    leave_out_broken,
-    leave_out_missing,
+    leave_out,
     refuse_duplicates,
 )
-from keyss.files.lens import Lens, make_lens
-from keyss.files.reading import open_input, read_file, read_text
 
-# Folders of the sparse model, best first; the last is that of Nerfstudio's scenes.
+# Folders of the sparse model in order of preference; the last is in Nerfstudio's scenes.
 MODEL_PLACES = ("sparse/0", "sparse", ".", "colmap/sparse/0")
-_IMAGE_BYTES = 73  # of an image in images.bin, at least
-_IMAGES_LAYOUT = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"  # of a line of images.txt
+_MIN_IMAGE_BYTES = 73  # per image in images.bin
+_IMAGE_LINE = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"  # in images.txt
 _IMAGE_FOLDERS = ("images", "images_2", "images_4", "images_8")
 
 _T = TypeVar("_T")
 _Image = tuple[str, int, Sequence[float]]  # name, camera id, quaternion wxyz and translation
 
-# Parameters in file order. The fisheye models with fewer coefficients are OPENCV_FISHEYE with zeros.
+# Parameters in file order. Missing fisheye coefficients are zero.
 _PARAMETERS = {
     "SIMPLE_PINHOLE": "f cx cy",
     "PINHOLE": "fx fy cx cy",
@@ -58,7 +57,7 @@ _PARAMETERS = {
     "SIMPLE_RADIAL_FISHEYE": "f cx cy k1",
     "RADIAL_FISHEYE": "f cx cy k1 k2",
 }
-# In the order of the model ids of cameras.bin.
+# Ordered by the model id in cameras.bin.
 _MODEL_NAMES = (
     *("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV"),
     *("FOV", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE"),
@@ -69,10 +68,10 @@ _MODEL_NAMES = (
 def read_colmap(folder: Path, *, skip_missing: bool = False) -> SceneLayout:
     """The photos in `images/` with the poses and points of the sparse model; every 8th is a test view.
 
-    If `images/` has no photos, the first of `images_2/`, `images_4/` and `images_8/` that has some is used.
+    If `images/` has no photos, the first of `images_2/`, `images_4/` and `images_8/` with photos is used.
     Points are sorted by id; without points there is a KeyssWarning. Files are `.bin` if `cameras.bin`
-    exists, else `.txt`. Image names may have subfolders, and another case than on disk. `skip_missing`: see
-    `leave_out_missing` and `leave_out_broken`. The mask of NAME.EXT is `masks/NAME.EXT.png`, as in COLMAP, or
+    exists, else `.txt`. Image names may have subfolders, and differ by case from those on disk.
+    `skip_missing`: see `leave_out`. The mask of NAME.EXT is `masks/NAME.EXT.png`, as in COLMAP, or
     `masks/NAME.png`.
 
     Raises InputError for names that are absolute or contain `..`, and if a file is missing, truncated, too
@@ -83,7 +82,7 @@ def read_colmap(folder: Path, *, skip_missing: bool = False) -> SceneLayout:
         raise InputError(f"{folder}: expected a COLMAP model (sparse/0/cameras.bin or .txt), found none")
     if len(beside := _models_at(model)) > 1:
         warnings.warn(
-            f"{folder}: there are {len(beside)} sparse models; the one with most photos is used, "
+            f"{folder}: there are {len(beside)} sparse models; using the one with most photos, "
             f"{model.relative_to(folder)} ({_photo_count(model):,} photos)",
             KeyssWarning,
             stacklevel=2,
@@ -99,31 +98,30 @@ def read_colmap(folder: Path, *, skip_missing: bool = False) -> SceneLayout:
         if camera_id in lenses:
             raise InputError(f"{model}: expected every camera once, found id {camera_id} twice")
         lenses[camera_id] = lens
-    photos, broken, total = [], {}, 0
+    photos, broken = [], []
     for name, camera_id, pose in images:
-        total += 1
         parsed = PureWindowsPath(name)  # splits at both kinds of slash and knows drives
         if not name.isprintable() or not parsed.parts or parsed.anchor or ".." in parsed.parts:
             raise InputError(f"{model}: expected image names inside images/, found {name!r}")
         if camera_id not in lenses:
             raise InputError(f"{model}: image {name!r} refers to camera {camera_id}, which does not exist")
         try:
-            viewmat = _viewmat(f"{model}: image {name!r}", pose)
+            viewmat = _viewmat(f"image {name!r}", pose)
             photos.append(Photo(folder / name, name, viewmat, lenses[camera_id]))
         except InputError as error:
-            broken[name] = str(error)
+            broken.append(str(error))
     refuse_duplicates(model, photos)
-    leave_out_broken(model, total, broken, skip_missing)
-    images_folder, existing = _existing(folder, photos)
+    leave_out(model, len(photos) + len(broken), "have no usable camera", broken, skip_missing)
+    images_folder, existing = _find_images(folder, photos)
     missing = sorted({photo.name for photo in photos} - {photo.name for photo in existing})
-    leave_out_missing(folder / images_folder, len(photos), missing, skip_missing)
+    leave_out(folder / images_folder, len(photos), "are missing", missing, skip_missing)
     return SceneLayout(*hold_out(model, _with_masks(folder, existing)), points)
 
 
 def colmap_model_folder(folder: Path, places: Sequence[str] = MODEL_PLACES) -> Path | None:
-    """The sparse model in the first of `places` in a scene's folder that has one, or None.
+    """The sparse model in the first of `places` that has one, or None.
 
-    Of several beside each other, as of photos that COLMAP could not connect, it is that of most photos.
+    COLMAP writes several side by side if it cannot connect all photos; the one with most photos is returned.
     """
     for place in places:
         if found := _models_at(folder / place):
@@ -132,7 +130,7 @@ def colmap_model_folder(folder: Path, places: Sequence[str] = MODEL_PLACES) -> P
 
 
 def _models_at(place: Path) -> list[Path]:
-    """The sparse model at a place, and those in numbered folders beside it if it is one of these."""
+    """The sparse model in a folder, or, for a numbered folder, all models in such folders beside it."""
     beside = place.parent.glob("[0-9]*") if place.parent.name == "sparse" else ()
     numbered = sorted((each for each in beside if each.name.isdecimal()), key=lambda each: int(each.name))
     return [
@@ -143,20 +141,20 @@ def _models_at(place: Path) -> list[Path]:
 
 
 def _photo_count(model: Path) -> int:
-    """The number of photos that a sparse model announces; 0 if it is damaged."""
+    """Number of photos that a sparse model declares; 0 if it is damaged."""
     try:
         if (model / "cameras.bin").is_file():
             with open_input(model / "images.bin") as file:
                 count = int.from_bytes(file.read(8), "little")
-                return count if _IMAGE_BYTES * count <= file.seek(0, os.SEEK_END) else 0
-        return sum(1 for _ in _rows(model / "images.txt", _IMAGES_LAYOUT, lines=2))
+                return count if _MIN_IMAGE_BYTES * count <= file.seek(0, os.SEEK_END) else 0
+        return sum(1 for _ in _rows(model / "images.txt", _IMAGE_LINE, lines=2))
     except InputError:
         return 0
 
 
-def _existing(folder: Path, photos: Sequence[Photo]) -> tuple[str, list[Photo]]:
-    """(the folder of images that is used, the photos in it)."""
-    finder = FileFinder()
+def _find_images(folder: Path, photos: Sequence[Photo]) -> tuple[str, list[Photo]]:
+    """(folder of images, the photos it contains)."""
+    finder = CaseInsensitiveFinder()
     for images in _IMAGE_FOLDERS:
         named = [folder / images / photo.name for photo in photos]
         exact = {path for path in named if path.exists()}
@@ -169,8 +167,8 @@ def _existing(folder: Path, photos: Sequence[Photo]) -> tuple[str, list[Photo]]:
 
 
 def _with_masks(folder: Path, photos: Sequence[Photo]) -> list[Photo]:
-    """The photos with those of their masks that exist. Warns where there are masks of other names only."""
-    masks, finder, found = folder / "masks", FileFinder(), []
+    """The photos with their masks, if any. Warns if no mask is named like a photo."""
+    masks, finder, found = folder / "masks", CaseInsensitiveFinder(), []
     for photo in photos if masks.is_dir() else ():
         names = (f"{photo.name}.png", f"{PurePosixPath(photo.name).with_suffix('.png')}", photo.name)
         paths = (masks / finder.find(masks, name) for name in names)
@@ -198,7 +196,7 @@ def _lens(where: str, model: str, width: int, height: int, read: Callable[[int],
 
 
 class _Records:
-    """A cursor over a binary file that never reads past its end."""
+    """A bounds-checked cursor over a binary file."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -223,7 +221,7 @@ class _Records:
         self.offset += size
 
     def count(self, record_size: int, what: str) -> int:
-        """A number of records of at least `record_size` bytes, which must fit into the rest of the file."""
+        """The number of records that follow; checks that the file has `record_size` bytes for each."""
         (count,) = self.take("<Q", f"the number of {what}")
         self.skip(count * record_size, f"{count} {what} of at least {record_size} bytes")
         self.offset -= count * record_size
@@ -272,7 +270,7 @@ def _cameras_bin(path: Path) -> Iterator[tuple[int, Lens]]:
 
 def _images_bin(path: Path) -> Iterator[_Image]:
     records = _Records(path)
-    for _ in range(records.count(_IMAGE_BYTES, "images")):
+    for _ in range(records.count(_MIN_IMAGE_BYTES, "images")):
         _, *pose, camera_id = records.take("<I7dI", "an image")
         yield records.name(), camera_id, pose
         records.skip(24 * records.count(24, "observations"), "observations")
@@ -286,7 +284,7 @@ def _points_bin(path: Path) -> PointCloud:
     offsets = np.empty(count, dtype=np.int64)
     offset, track_length = records.offset, struct.Struct("<Q").unpack_from
     try:
-        for i in range(count):  # offsets only, since there are millions of points with tracks to skip
+        for i in range(count):  # offsets only, as there may be millions of points
             offsets[i] = offset
             offset += 51 + 8 * track_length(data, offset + 43)[0]
     except (struct.error, OverflowError):
@@ -324,7 +322,7 @@ def _cameras_txt(path: Path) -> Iterator[tuple[int, Lens]]:
 
 
 def _images_txt(path: Path) -> Iterator[_Image]:
-    for where, words in _rows(path, _IMAGES_LAYOUT, lines=2):
+    for where, words in _rows(path, _IMAGE_LINE, lines=2):
         yield words[9], _number(int, where, words[8]), _floats(where, words[1:8], 7)
 
 
@@ -342,10 +340,10 @@ def _points_txt(path: Path) -> PointCloud:
 
 
 def _rows(path: Path, layout: str, lines: int = 1) -> Iterator[tuple[str, list[str]]]:
-    """(where, words) of each record, which has `lines` lines; the first has the given `layout`.
+    """(where, words) of the first of each record's `lines` lines, which has the given `layout`.
 
-    The last word is the rest of the line, since names of images may contain spaces; if the layout ends in
-    `...`, there may be any number of last words.
+    The last word is the rest of the line, since image names may contain spaces; a layout that ends in `...`
+    has any number of last words.
     """
     size = len(layout.split())
     is_open = layout.endswith("...")
@@ -358,7 +356,7 @@ def _rows(path: Path, layout: str, lines: int = 1) -> Iterator[tuple[str, list[s
             raise InputError(f"{path}, line {number}: expected `{layout}`, found {line[:80]!r}")
         yield f"{path}, line {number}", words
         for _ in range(lines - 1):
-            next(numbered, None)  # the line of an image's observations, which may be empty
+            next(numbered, None)  # an image's observations; may be empty
 
 
 def _number(kind: Callable[[str], _T], where: str, word: str) -> _T:

@@ -19,11 +19,11 @@ from keyss.core.errors import InputError, UsageError, import_extra
 from keyss.core.scene import Camera
 from keyss.files.atomic import write_bytes
 
-# Only formats of photos: some of Pillow's others start external programs.
+# Photo formats only: Pillow opens some others with external programs.
 _FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP")
 _MAX_PIXELS = 89_000_000  # just under Pillow's own limit for decompression bombs
-_ANY_PIXELS, _PER_BYTE = 24_000_000, 16  # pixels that any file may have, and that each of its bytes may give
-_BAND = 1 << 18  # pixels that are converted at a time
+_SMALL_PIXELS, _PIXELS_PER_BYTE = 24_000_000, 16  # larger images need file bytes in proportion
+_BAND = 1 << 18  # pixels converted at a time
 SUFFIX = ".mp4"
 _CODECS = (("libx264", {"crf": "18", "preset": "medium"}), ("mpeg4", {"qscale": "3"}))
 
@@ -46,7 +46,7 @@ def open_image(path: Path) -> Image.Image:
             raise InputError(f"{path}: expected an image ({kinds}), found an empty file") from error
         reason = getattr(error, "strerror", None) or error
         raise InputError(f"{path}: expected an image ({kinds}), but it cannot be read: {reason}") from error
-    limit = min(_MAX_PIXELS, max(_ANY_PIXELS, _PER_BYTE * os.path.getsize(path)))
+    limit = min(_MAX_PIXELS, max(_SMALL_PIXELS, _PIXELS_PER_BYTE * os.path.getsize(path)))
     if image.width * image.height > limit:
         image.close()
         raise InputError(
@@ -56,7 +56,7 @@ def open_image(path: Path) -> Image.Image:
 
 
 def probe_image(path: Path) -> tuple[int, int, bool]:
-    """(width, height, whether it may be transparent) of an image, from its header.
+    """(width, height, whether it has transparency) from the header of an image.
 
     Ignores the EXIF orientation, like COLMAP. Raises InputError as `open_image` does.
     """
@@ -64,7 +64,7 @@ def probe_image(path: Path) -> tuple[int, int, bool]:
         return image.width, image.height, image.has_transparency_data
 
 
-def is_turned(path: Path) -> bool:
+def is_rotated_by_exif(path: Path) -> bool:
     """True if the EXIF orientation rotates an image by 90 degrees. Raises InputError."""
     with open_image(path) as image:
         return image.getexif().get(0x0112, 1) in (5, 6, 7, 8)
@@ -86,9 +86,9 @@ def read_image(path: Path, background: Floats) -> Bytes:
 
 
 def read_mask(path: Path, width: int, height: int) -> Bytes:
-    """[height, width] of an image file of that aspect, to within a pixel: 0 where it is black, else 255.
+    """[height, width] an image file resized by nearest neighbour: 0 where it is black, else 255.
 
-    Raises InputError, as `open_image` does, and for another aspect.
+    Raises InputError as `open_image` does, and if the aspect differs by more than a pixel.
     """
     import cv2
 
@@ -105,19 +105,16 @@ def read_mask(path: Path, width: int, height: int) -> Bytes:
     return np.asarray(cv2.resize(np.uint8(255) * used, (width, height), interpolation=cv2.INTER_NEAREST))
 
 
-def shrink(image: Bytes, width: int, height: int) -> Bytes:
-    """Shrink an image [H, W, ...] to `width` and `height` by area averaging."""
+def downscale(image: Bytes, width: int, height: int) -> Bytes:
+    """Downscale an image [H, W, ...] by area averaging."""
     import cv2  # slow to import, and models do not need it
 
-    # Pillow's BOX filter rounds after each axis, which brightens by up to a level; this rounds once.
+    # Pillow's BOX filter rounds after each axis, which brightens by up to one level.
     return np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
 
-def picture_names(cameras: Iterable[Camera]) -> list[str]:
-    """A PNG file name for each camera, with folders joined by underscores.
-
-    Equal names are numbered: `a.png`, `a-2.png`.
-    """
+def png_names(cameras: Iterable[Camera]) -> list[str]:
+    """A PNG file name for each camera: folders joined by underscores, duplicates numbered (`a-2.png`)."""
     names: list[str] = []
     for camera in cameras:
         stem = Path(camera.name.replace("/", "_").replace("\\", "_")).stem
@@ -127,7 +124,7 @@ def picture_names(cameras: Iterable[Camera]) -> list[str]:
 
 
 def png_bytes(image: Tensor) -> bytes:
-    """A PNG file of an image [H, W, 3] uint8."""
+    """An image [H, W, 3] uint8 as a PNG file."""
     import cv2
 
     return bytes(cv2.imencode(".png", image.numpy()[:, :, ::-1])[1].tobytes())
@@ -154,14 +151,14 @@ def _rows_to_rgb(image: Image.Image, background: Floats) -> Numbers:
 
 
 def check_video(path: Path | str) -> None:
-    """Raise UsageError if a path does not end in .mp4, BackendError if PyAV is not installed."""
+    """Raise UsageError unless a path ends in .mp4, BackendError if PyAV is not installed."""
     if Path(path).suffix.lower() != SUFFIX:
         raise UsageError(f"cannot write a video as {path}: expected a name that ends in {SUFFIX}")
     import_extra("av", "video", "write videos")
 
 
 def write_video(path: Path | str, frames: Iterator[Bytes], fps: int) -> int:
-    """Atomically write frames [H, W, 3] of one even size at `fps` per second; returns their number.
+    """Atomically write frames [H, W, 3] of one even size; returns their number.
 
     Encodes H.264 if this build of FFmpeg has it, else MPEG-4, in sRGB with 4:2:0 subsampling.
     """

@@ -32,7 +32,7 @@ class Lens:
     cx: float
     cy: float
     distortion: tuple[float, ...] = ()  # k1 k2 p1 p2 k3 k4 k5 k6 (rational Brown), or fisheye k1 k2 k3 k4
-    fisheye: bool = False  # equidistant projection: distorted even where every coefficient is 0
+    fisheye: bool = False  # equidistant projection, with or without coefficients
 
     @property
     def is_pinhole(self) -> bool:
@@ -43,19 +43,19 @@ class Lens:
         """[3, 3] pixels."""
         return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]], dtype=np.float64)
 
-    def is_divided_for(self, width: int, height: int) -> bool:
-        """True for an image of the lens's size divided by a whole number, either side rounded up or down."""
+    def is_integer_downscale(self, width: int, height: int) -> bool:
+        """True if the image size is the lens's divided by an integer, each side rounded up or down."""
         factor = max(1, round(self.width / width))
         return abs(width * factor - self.width) < factor and abs(height * factor - self.height) < factor
 
-    def on_image(self, width: int, height: int) -> Lens | None:
-        """The lens for an image of the same aspect, to within a pixel, or None.
+    def scale_to(self, width: int, height: int) -> Lens | None:
+        """The lens scaled to an image of the same aspect, to within a pixel; None for another aspect.
 
-        Photos are often shrunk (`images_4`) after their cameras were computed.
+        Photos are often downscaled (`images_4`) after calibration.
         """
         if (width, height) == (self.width, self.height):
             return self
-        fits = self.is_divided_for(width, height) or (
+        fits = self.is_integer_downscale(width, height) or (
             abs(self.height * width / self.width - height) < 1
             or abs(self.width * height / self.height - width) < 1
         )
@@ -100,10 +100,10 @@ def make_lens(
 
 @dataclass(frozen=True)
 class Undistortion:
-    """Resamples photos of a distorted lens into those of a pinhole lens of the same size."""
+    """Resamples photos of a distorted lens to a pinhole lens of the same size."""
 
     pinhole: Lens
-    map_x: Floats  # [H, W] OpenCV column in the distorted photo, per pixel of the new one
+    map_x: Floats  # [H, W] OpenCV column in the distorted photo
     map_y: Floats  # [H, W] OpenCV row
 
     def __call__(self, image: Bytes) -> Bytes:
@@ -118,9 +118,9 @@ class Undistortion:
 def undistortion(lens: Lens, where: str) -> Undistortion:
     """The resampling from `lens` to a pinhole lens with the same principal point and size.
 
-    The focal lengths are scaled by the smallest factor from 1 to 8 at which every pixel of the new image is
-    visible in the photo. OpenCV's search would move the principal point and accept content that a lens shows
-    twice. Raises InputError, which starts with `where`, if there is no such factor.
+    Focal lengths are scaled by the smallest factor from 1 to 8 at which the photo covers every pixel of the
+    new image. OpenCV's search would move the principal point and accept content that a lens shows twice.
+    Raises InputError, which starts with `where`, if there is no such factor.
     """
     if _covers(lens, 1.0):
         zoom = 1.0
@@ -143,7 +143,7 @@ def _opencv_K(lens: Lens) -> Doubles:
 
 
 def _source_coordinates(lens: Lens, new_K: Doubles, size: tuple[int, int]) -> tuple[Floats, Floats]:
-    """The positions in the photo of the pixels of a pinhole image with `new_K`, in OpenCV's coordinates."""
+    """Photo coordinates (OpenCV's x and y) of each pixel of a pinhole image with `new_K`."""
     import cv2
 
     prepare = cv2.fisheye.initUndistortRectifyMap if lens.fisheye else cv2.initUndistortRectifyMap
@@ -152,10 +152,10 @@ def _source_coordinates(lens: Lens, new_K: Doubles, size: tuple[int, int]) -> tu
 
 
 def _covers(lens: Lens, zoom: float) -> bool:
-    """True if a pinhole with focal lengths times `zoom` sees only content of the photo, and only once.
+    """True if a pinhole with focal lengths times `zoom` sees only the photo's content, and only once.
 
-    Checks a grid of 128 x 128 cells that includes the corners. A polynomial distortion folds back far from
-    the axis and shows content a second time; there its Jacobian is negative.
+    Checks a grid of 128 x 128 cells including the corners. Polynomial distortion folds back far from the
+    axis, where it shows content twice and its Jacobian is negative.
     """
     cells = 128
     K = _opencv_K(replace(lens, fx=lens.fx * zoom, fy=lens.fy * zoom))

@@ -1,10 +1,7 @@
 """Reading and writing 3DGS models in all formats.
 
-A new format is a module with `read` and `write`, or codes that have both, and one entry in `FORMATS`.
-
-In the Inria PLY layout, one vertex is one Gaussian: x y z nx ny nz f_dc_0..2 f_rest_0..(3(K-1)-1) opacity
-scale_0..2 rot_0..3, raw parameters as `Gaussians` holds them; f_rest is channel-major (all red coefficients,
-then green, then blue).
+A new format is a module in `formats/` with `read` and `write`, or `Codes`, which have both, and an entry in
+`FORMATS`.
 """
 
 from __future__ import annotations
@@ -18,24 +15,14 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
-import torch
 
-from keyss.core.arrays import Floats
 from keyss.core.errors import InputError, OutputError, UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.picture_network import DecodedGaussians
 from keyss.files.atomic import atomic_write, check_not_an_input, check_output_file
-from keyss.files.foreign import START_BYTES, is_foreign_zip, kind_of
-from keyss.files.ply_extras import NORMALS, ExtendedGaussians, PlyExtras
-from keyss.files.ply_rows import (
-    check_not_activated,
-    finite_rows,
-    has_packed_header,
-    model_names,
-    read_model_rows,
-)
-from keyss.files.ply_table import TYPES, ply_header
-from keyss.files.reading import (
+from keyss.files.file_kinds import START_BYTES, identify_content, is_foreign_zip
+from keyss.files.formats import ply
+from keyss.files.inputs import (
     MAX_BYTES,
     check_standard_output,
     is_standard,
@@ -43,10 +30,11 @@ from keyss.files.reading import (
     read_standard_input,
     write_standard_output,
 )
-from keyss.files.trained import is_training, kind_of_folder, model_file
+from keyss.files.ply_rows import has_packed_header
+from keyss.files.training_outputs import identify_folder, is_training, model_file
 
 DECODED_SUFFIX = ".3dgs.safetensors"  # of models that a network decodes
-_BLOCK = 1 << 13  # Gaussians that are written at a time
+_PACKED = "compressed_ply:CompressedPlyCodes"
 
 
 @dataclass(frozen=True)
@@ -89,82 +77,14 @@ def _writer(name: str) -> Callable[[Gaussians, BinaryIO], None]:
     return write
 
 
-def write_ply(model: Gaussians, file: BinaryIO) -> None:
-    """Write `model` as little-endian float32 in the Inria layout.
-
-    Normals are zeros and there are no other properties, unless `model` has extras. Infinite opacity logits
-    become +-OPACITY_LOGIT_BOUND, and the bytes depend on the values only. Raises OutputError when there are
-    no Gaussians or a value is not finite.
-    """
-    n, k = model.sh.shape[:2]
-    names = model_names(k)
-    names[3:3] = NORMALS
-    flat = model.detach().to("cpu")
-    extras = model.extras if isinstance(model, ExtendedGaussians) else PlyExtras((), {})
-    further = {name: values for name, values in extras.properties.items() if name not in NORMALS}
-    properties = [f"float {name}" for name in names]
-    properties += [f"{TYPES[values.dtype.str[1:]]} {name}" for name, values in further.items()]
-    file.write(ply_header({"vertex": (n, properties)}, extras.comments))
-    blocks = (_rows(flat[start : start + _BLOCK]) for start in range(0, n, _BLOCK))
-    start = 0
-    for rows in finite_rows(blocks, names):
-        part = slice(start, start + len(rows))
-        for name in extras.properties.keys() & set(NORMALS):
-            rows[:, names.index(name)] = extras.properties[name][part]
-        columns = [rows, *(values[part, None] for values in further.values())]
-        little = (each.astype(each.dtype.newbyteorder("<"), copy=False) for each in columns)
-        file.write(np.concatenate([each.view(np.uint8) for each in little], axis=1).data)
-        start = part.stop
-
-
-def _rows(part: Gaussians) -> Floats:
-    """[N, 14 + 3 K] of some Gaussians, in the order of the file."""
-    n, k = part.sh.shape[:2]
-    rows = np.zeros((n, 14 + 3 * k), np.float32)
-    rows[:, :3] = part.means.numpy()
-    rows[:, 6:9] = part.sh[:, 0].numpy()
-    rows[:, 9:-8] = part.sh[:, 1:].numpy().transpose(0, 2, 1).reshape(n, 3 * (k - 1))
-    rows[:, -8] = part.opacity_logits.numpy()
-    rows[:, -7:-4] = part.log_scales.numpy()
-    rows[:, -4:] = part.quats.numpy()
-    return rows
-
-
-def read_ply(file: BinaryIO) -> Gaussians:
-    """Read a 3DGS model: float32 tensors on the CPU, SH of the file's own degree.
-
-    Properties are found by name, in any order and of any scalar type; normals, unknown properties,
-    comments, other elements and bytes after the data are ignored. Rows that are not finite are left out, see
-    `usable_rows`. Raises InputError if it is not a complete 3DGS model.
-    """
-    vertices = read_model_rows(file)
-    n, k = vertices.count, (len(vertices.names) - 11) // 3
-    means, quats, log_scales, opacity_logits, sh = (
-        np.empty((n, *shape), np.float32) for shape in ((3,), (4,), (3,), (), (k, 3))
-    )
-    start = 0
-    for rows in vertices.blocks:
-        part = slice(start, start + len(rows))
-        means[part], quats[part], log_scales[part] = rows[:, 0:3], rows[:, -4:], rows[:, -7:-4]
-        opacity_logits[part], sh[part, 0] = rows[:, -8], rows[:, 3:6]
-        rest = rows[:, 6:-8].reshape(len(rows), 3, -1)
-        for color in range(3):
-            sh[part, 1:, color] = rest[:, color]
-        start = part.stop
-    check_not_activated(means[:start], log_scales[:start], opacity_logits[:start])
-    arrays = (means, quats, log_scales, opacity_logits, sh)
-    return Gaussians(*(torch.from_numpy(each[:start]) for each in arrays))
-
-
 def _read_any_ply(file: BinaryIO) -> Gaussians:
-    return _reader(_PACKED)(file) if has_packed_header(file) else read_ply(file)
+    return _reader(_PACKED)(file) if has_packed_header(file) else ply.read(file)
 
 
-_PACKED = "compressed_ply:CompressedPlyCodes"
 # A file name belongs to the first format with a fitting suffix.
 FORMATS = [
     ModelFormat("compressed PLY", (".compressed.ply",), (b"ply",), _read_any_ply, _writer(_PACKED)),
-    ModelFormat("PLY", (".ply",), (b"ply",), _read_any_ply, write_ply, is_exact=True),
+    ModelFormat("PLY", (".ply",), (b"ply",), _read_any_ply, ply.write, is_exact=True),
     ModelFormat("SPZ", (".spz",), (b"NGSP", b"\x1f\x8b"), _reader("spz:SpzCodes"), _writer("spz:SpzCodes")),
     ModelFormat("SOG", (".sog",), (b"PK\x03\x04",), _reader("sog:SogCodes"), _writer("sog:SogCodes")),
     ModelFormat("glTF", (".glb",), (b"glTF",), _reader("glb"), _writer("glb")),
@@ -172,7 +92,7 @@ FORMATS = [
 ]
 # Not a format of 3DGS models, hence not among those that messages list.
 _DECODED = ModelFormat(
-    "decoded", (DECODED_SUFFIX,), (), _reader("decoded"), _writer("decoded"), is_exact=True
+    "decoded", (DECODED_SUFFIX,), (), _reader("decoded_models"), _writer("decoded_models"), is_exact=True
 )
 _PLY = FORMATS[1]
 
@@ -199,12 +119,23 @@ def read_model(path: Path | str) -> Gaussians:
         return model_of_bytes("standard input", read_standard_input())
     path = model_file(path)
     if os.path.isdir(path):
-        found = kind_of_folder(path) or "a folder"
+        found = identify_folder(path) or "a folder"
         raise InputError(f"{path}: expected the file of a 3DGS model ({known_suffixes()}), found {found}")
     if not os.path.isfile(path):
         raise InputError(f"{path}: expected a 3DGS model ({known_suffixes()}), but there is no such file")
     with open_input(path) as file:
         return _read(file, path.name)
+
+
+def reads_as(path: Path, model: Gaussians) -> bool:
+    """True if `read_model` gives `model`, to the bit, for a .ply; takes no memory for a second model.
+
+    Raises InputError as `read_model` does.
+    """
+    if type(model) is not Gaussians or not keeps_low_bits(path):
+        return False
+    with open_input(path) as file:
+        return ply.holds(file, model)
 
 
 def model_of_bytes(path: Path | str, data: bytes) -> Gaussians:
@@ -225,15 +156,15 @@ def write_model(path: Path | str, model: Gaussians) -> None:
     if is_standard(path):
         write_standard_output(model_bytes(path, model))
         return
-    write = _writer_for(path, model)
+    _for_writing(path)  # refuses unknown suffixes before a file is opened
     with atomic_write(path) as file:
-        _write(write, model, file, path)
+        _write(file, path, model)
 
 
 def model_bytes(path: Path | str, model: Gaussians) -> bytes:
     """The bytes that `write_model` would write to `path`. Raises as it does."""
     file = io.BytesIO()
-    _write(_writer_for(path, model), model, file, path)
+    _write(file, path, model)
     return file.getvalue()
 
 
@@ -273,8 +204,7 @@ def _for_writing(path: Path | str) -> ModelFormat:
     return found
 
 
-def _writer_for(path: Path | str, model: Gaussians) -> Callable[[Gaussians, BinaryIO], None]:
-    """The writer of the format of the suffix. Raises UsageError, also if it cannot hold the model."""
+def _write(file: BinaryIO, path: Path | str, model: Gaussians) -> None:
     found = _for_writing(path)
     if isinstance(model, DecodedGaussians) and found is not _DECODED:
         raise UsageError(
@@ -286,14 +216,8 @@ def _writer_for(path: Path | str, model: Gaussians) -> Callable[[Gaussians, Bina
             f"cannot write a 3DGS model as {path}: {DECODED_SUFFIX} is for models that a network decodes; "
             "use a name that ends in .ply"
         )
-    return found.write
-
-
-def _write(
-    write: Callable[[Gaussians, BinaryIO], None], model: Gaussians, file: BinaryIO, path: Path | str
-) -> None:
     try:
-        write(model, file)
+        found.write(model, file)
     except OutputError as error:
         raise OutputError(f"cannot write {path}: {error}") from error
 
@@ -309,7 +233,7 @@ def _read(file: BinaryIO, name: str) -> Gaussians:
     if named in fitting or (named and start and not named.magic and not fitting):
         return named.read(file)
     if not fitting:
-        raise InputError(f"expected a 3DGS model ({known_suffixes()}), found {kind_of(name, start)}")
+        raise InputError(f"expected a 3DGS model ({known_suffixes()}), found {identify_content(name, start)}")
     found = fitting[-1]
     if named is not None:
         raise InputError(

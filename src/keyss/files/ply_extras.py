@@ -1,25 +1,24 @@
-"""What other programs put into a 3DGS .ply: properties that are not part of a model, and comments."""
+"""Properties and comments that other programs add to a 3DGS .ply."""
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from keyss.core.arrays import Numbers
-from keyss.core.errors import InputError
+from keyss.core.errors import InputError, KeyssWarning
 from keyss.core.gaussians import Gaussians
-from keyss.files.ply_rows import finite_gaussians, has_packed_header, model_properties
-from keyss.files.ply_table import read_vertex_table
-from keyss.files.reading import open_input
-from keyss.files.trained import model_file
+from keyss.files.inputs import open_input
+from keyss.files.ply_rows import has_packed_header, read_rows
+from keyss.files.training_outputs import model_file
 
 NORMALS = ("nx", "ny", "nz")
-_SAME_PLACE = 0.01  # of the model's spread: how far hiding moves no Gaussian
+_MAX_MOVED = 0.01  # distance by which hiding moves Gaussians, relative to the model's standard deviation
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,51 +36,42 @@ class ExtendedGaussians(Gaussians):
 
     extras: PlyExtras
 
-    @staticmethod
-    def of(model: Gaussians, extras: PlyExtras) -> ExtendedGaussians:
-        found = ExtendedGaussians(*(getattr(model, each.name) for each in fields(Gaussians)))
-        object.__setattr__(found, "extras", extras)
-        return found
-
 
 def with_extras(model: Gaussians, source: Any, read: Gaussians) -> Gaussians:
-    """`model` with the extras of the .ply at `source`, from which `read` was read, if there are any.
+    """`model` with the extras of the .ply at `source`, from which `read` was read.
 
-    `model` has the Gaussians of `read` in the same order, and possibly more after them, whose extras are 0.
-    Otherwise, and for a source that is not the path of a .ply, the result is `model`. Raises InputError.
+    Returns `model` if there are none, or if it is not the Gaussians of `read` in their order, possibly with
+    more Gaussians appended, whose extras are 0. Raises InputError.
     """
     if type(model) is not Gaussians or not isinstance(source, str | Path):
         return model
-    path = model_file(source)
+    path, more = model_file(source), len(model) - len(read)
     extras = _read_extras(path, len(read)) if path.is_file() else None
-    if extras is None or not _begins_with(model, read):
+    if extras is None or more < 0:
         return model
-    missing = len(model) - len(read)
-    padded = {name: np.pad(values, (0, missing)) for name, values in extras.properties.items()}
-    return ExtendedGaussians.of(model, PlyExtras(extras.comments, padded))
-
-
-def _begins_with(model: Gaussians, read: Gaussians) -> bool:
-    if len(model) < len(read):
-        return False
     moved = (model.means[: len(read)].cpu() - read.means.cpu()).abs()
-    return bool((moved <= _SAME_PLACE * read.means.cpu().std(0, correction=0) + 1e-30).all())
+    if not bool((moved <= _MAX_MOVED * read.means.cpu().std(0, correction=0) + 1e-30).all()):
+        return model
+    extended = ExtendedGaussians(*(getattr(model, each.name) for each in fields(Gaussians)))
+    padded = {name: np.pad(values, (0, more)) for name, values in extras.properties.items()}
+    object.__setattr__(extended, "extras", PlyExtras(extras.comments, padded))
+    return extended
 
 
 def _read_extras(path: Path, count: int) -> PlyExtras | None:
-    """The extras of a .ply of which `count` Gaussians were read; None without any."""
-    with open_input(path) as file:
+    """The extras of a .ply of which `count` Gaussians were read; None if there are none."""
+    with open_input(path) as file, warnings.catch_warnings():
+        warnings.simplefilter("ignore", KeyssWarning)  # about Gaussians left out, which the first read gave
         if file.read(3) != b"ply":
             return None
         file.seek(0)
         if has_packed_header(file):
             return None
-        table, comments = read_vertex_table(file)
-        if table.dtype.names is None or len(table) < count:
-            raise InputError("it changed while it was read")
-    names = [name for name in table.dtype.names if name not in model_properties(table.dtype.names)]
-    names = [name for name in names if name not in NORMALS or table[name].any()]
-    if not names and not comments:
-        return None
-    rows: npt.NDArray[Any] = table[finite_gaussians(table)] if len(table) > count else table
-    return PlyExtras(tuple(comments), {name: np.ascontiguousarray(rows[name]) for name in names})
+        model = read_rows(file)
+        names = [name for name in model.dtype.names or () if name not in model.names]
+        blocks = [{name: table[name].copy() for name in names} for _, table in model.blocks]
+    values = {name: np.concatenate([block[name] for block in blocks]) for name in names}
+    values = {name: each for name, each in values.items() if name not in NORMALS or each.any()}
+    if any(len(each) != count for each in values.values()):
+        raise InputError(f"{path}: it changed while it was read")
+    return PlyExtras(tuple(model.comments), values) if values or model.comments else None

@@ -1,4 +1,4 @@
-"""A 3DGS model in PLY as a table: the names of its properties, and checks of their values.
+"""3DGS models in PLY files as NumPy arrays: names of properties, and checks of values.
 
 Does not import torch, which takes a second, so that `keyss info` is fast.
 """
@@ -7,18 +7,15 @@ from __future__ import annotations
 
 import re
 import warnings
-from collections.abc import Collection, Iterable, Iterator
-from dataclasses import replace
-from pathlib import Path
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass
 from typing import BinaryIO
 
 import numpy as np
-import numpy.typing as npt
 
-from keyss.core.arrays import Flags, Floats, Integers
-from keyss.core.errors import InputError, KeyssWarning, OutputError
-from keyss.files.ply_table import MAX_HEADER_BYTES, Vertices, read_vertices
-from keyss.files.reading import open_input
+from keyss.core.arrays import Floats
+from keyss.core.errors import InputError, KeyssWarning
+from keyss.files.ply_table import MAX_HEADER_BYTES, Table, Vertices, columns, read_vertices
 
 # Replaces an infinite opacity logit, which converters write for opacities of 0 and 1. A larger bound would
 # not help, since the float32 sigmoid rounds to exactly 1 from 16.64 on.
@@ -31,113 +28,64 @@ _NEARLY_ALL = 0.99  # share of the scales
 _SMALL_SCALE, _LARGE, _RATIO = 0.2, 0.3, 20.0
 
 
-def is_compressed(path: Path) -> bool:
-    """True if a .ply is a compressed model. Raises OSError."""
-    with path.open("rb") as file:
-        return has_packed_header(file)
-
-
 def has_packed_header(file: BinaryIO) -> bool:
-    """True if a .ply that is open at its start is a compressed model; the position stays."""
+    """True if a PLY file is a compressed model. The position stays at the start."""
     header = file.read(MAX_HEADER_BYTES).partition(b"end_header")[0]
     file.seek(0)
     return b" packed_position" in header
 
 
-def read_rows(path: Path) -> tuple[list[str], Floats]:
-    """Names and values [N, len(names)] of a model's properties in the order of `model_names`.
+@dataclass
+class ModelRows:
+    """The Gaussians of an open PLY file, a block of rows at a time, without those that cannot be drawn."""
 
-    Rows as of `usable_rows`. Raises InputError if it is not a complete 3DGS model in binary or ascii PLY.
+    names: list[str]  # `model_names`
+    count: int  # Gaussians in the file
+    comments: list[str]
+    dtype: np.dtype[np.void]  # of all properties in the file
+    blocks: Iterator[tuple[Floats, Table]]  # values of `names` [n, len(names)], and all properties [n]
+
+
+def read_rows(file: BinaryIO) -> ModelRows:
+    """The model in a PLY file that is open at its start.
+
+    Clamps infinite opacity logits to +-OPACITY_LOGIT_BOUND and log scales of minus infinity (flat Gaussians)
+    to LEAST_LOG_SCALE. Leaves out other Gaussians with NaN or infinite values, with a KeyssWarning at the
+    end. Raises InputError if it is not a complete 3DGS model, or if no Gaussians remain.
     """
-    with open_input(path) as file:
-        vertices = read_model_rows(file)
-        return vertices.names, vertices.rows()
+    vertices = read_vertices(file)
+    names = model_properties(vertices.dtype.names or ())
+    blocks = _finite_blocks(vertices, names, getattr(file, "name", "the model"))
+    return ModelRows(names, vertices.count, vertices.comments, vertices.dtype, blocks)
 
 
-def read_model_rows(file: BinaryIO) -> Vertices:
-    """The properties of a model in the order of `model_names`, as `usable_rows`. Raises InputError."""
-    vertices = read_vertices(file, model_properties)
-    return replace(vertices, blocks=usable_rows(vertices, getattr(file, "name", "the model")))
-
-
-def usable_rows(vertices: Vertices, where: str) -> Iterator[Floats]:
-    """The blocks of a model without rows that renderers cannot draw, of whose number a KeyssWarning tells.
-
-    Infinite opacity logits become +-OPACITY_LOGIT_BOUND, and log scales of minus infinity (flat Gaussians)
-    LEAST_LOG_SCALE. Raises InputError if no rows remain.
-    """
-    names = vertices.names
+def _finite_blocks(vertices: Vertices, names: list[str], where: str) -> Iterator[tuple[Floats, Table]]:
     kept, bad = 0, np.zeros(len(names), np.int64)
-    scales = slice(names.index("scale_0"), names.index("scale_0") + 3)
-    for rows in vertices.blocks:
+    for table in vertices.blocks:
+        rows = columns(table, names)
         if not np.isfinite(rows).all():
-            _clamp_opacities(rows, names)
-            log_scales = rows[:, scales]
+            logits, log_scales = rows[:, -8], rows[:, -7:-4]
+            logits[np.isposinf(logits)] = OPACITY_LOGIT_BOUND
+            logits[np.isneginf(logits)] = -OPACITY_LOGIT_BOUND
             log_scales[np.isneginf(log_scales)] = LEAST_LOG_SCALE
             finite = np.isfinite(rows)
             bad += np.count_nonzero(~finite, axis=0)
-            rows = rows[finite.all(axis=1)]
-        if len(rows):
-            kept += len(rows)
-            yield rows
+            rows, table = rows[finite.all(axis=1)], table[finite.all(axis=1)]
+        kept += len(rows)
+        yield rows, table
     if not vertices.count:
         raise InputError("it holds no Gaussians")
+    wrong = [f"{name} in {number:,}" for name, number in zip(names, bad, strict=True) if number]
+    said = ", ".join(wrong[:5]) + (f" and {len(wrong) - 5} more properties" if len(wrong) > 5 else "")
     if not kept:
-        raise InputError(_not_finite(vertices.count, names, bad))
+        raise InputError(f"NaN or infinite values among {vertices.count:,} Gaussians: {said}")
     if kept < vertices.count:
         warnings.warn(
             f"{where}: {vertices.count - kept:,} of {vertices.count:,} Gaussians are left out: they have NaN "
-            f"or infinite values ({_counts(names, bad)})",
+            f"or infinite values ({said})",
             KeyssWarning,
             stacklevel=2,
         )
-
-
-def finite_gaussians(table: npt.NDArray[np.void]) -> Flags:
-    """[N] the vertices that `usable_rows` keeps, of all in a file."""
-    names = model_properties(table.dtype.names or ())
-    finite = np.ones(len(table), np.bool_)
-    for name in names:
-        with np.errstate(over="ignore"):
-            values = table[name].astype(np.float32)
-        flat, opacity = name.startswith("scale_") & np.isneginf(values), name == "opacity"
-        finite &= np.isfinite(values) | flat | (opacity & ~np.isnan(values))
-    return finite
-
-
-def finite_rows(blocks: Iterable[Floats], names: list[str]) -> Iterator[Floats]:
-    """The blocks with infinite opacity logits clamped in place to +-OPACITY_LOGIT_BOUND, to be written.
-
-    At the end raises OutputError if there were no rows or if other values were not finite.
-    """
-    count, bad = 0, np.zeros(len(names), np.int64)
-    for rows in blocks:
-        count += len(rows)
-        if not np.isfinite(rows).all():
-            _clamp_opacities(rows, names)
-            bad += np.count_nonzero(~np.isfinite(rows), axis=0)
-        yield rows
-    if not count:
-        raise OutputError("it holds no Gaussians")
-    if bad.any():
-        raise OutputError(_not_finite(count, names, bad))
-
-
-def _clamp_opacities(rows: Floats, names: list[str]) -> None:
-    logits = rows[:, names.index("opacity")]
-    logits[np.isposinf(logits)] = OPACITY_LOGIT_BOUND
-    logits[np.isneginf(logits)] = -OPACITY_LOGIT_BOUND
-
-
-def _not_finite(count: int, names: list[str], bad: Integers) -> str:
-    return f"NaN or infinite values among {count:,} Gaussians: {_counts(names, bad)}"
-
-
-def _counts(names: list[str], bad: Integers) -> str:
-    """How many values of each property are not finite."""
-    wrong = [f"{name} in {number:,}" for name, number in zip(names, bad, strict=True) if number]
-    more = f" and {len(wrong) - 5} more properties" if len(wrong) > 5 else ""
-    return ", ".join(wrong[:5]) + more
 
 
 def check_not_activated(means: Floats, log_scales: Floats, opacity_logits: Floats) -> None:

@@ -1,35 +1,27 @@
-"""The vertices of a PLY file as a table of numbers: the basis of 3DGS models and of point clouds.
+"""Elements of PLY files as structured arrays, for 3DGS models and point clouds.
 
-The reader is our own because files come from strangers and the part of PLY in use is small: every length
-is compared with the file's size before anything is allocated, and every defect raises InputError. (The usual
-library, plyfile, is GPL.)
+The reader is our own because the usual library, plyfile, is GPL, and because input is untrusted: lengths are
+checked against the file size before anything is allocated, and every defect raises InputError.
 """
 
 from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO
+from typing import BinaryIO
 
 import numpy as np
 import numpy.typing as npt
 
 from keyss.core.arrays import Numbers
 from keyss.core.errors import InputError
-from keyss.files.reading import open_input
-
-if TYPE_CHECKING:
-    from keyss.files.layout import PointCloud
-
 
 MAX_HEADER_BYTES = 64 * 1024
 _MAX_HEADER_LINES = 1000
 _CHUNK_BYTES = 1 << 20
-_MAX_TOKEN_BYTES = 4096  # of one number in text
-_GREY = 128  # of points without colours
+_MAX_TOKEN_BYTES = 4096  # per number in text
 
 _SCALARS = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1",
@@ -39,26 +31,20 @@ _SCALARS = {
 }  # fmt: skip
 TYPES = {code: name for name, code in reversed(_SCALARS.items())}  # the first name of each code
 _LIST = "l0"  # in place of the code of a list property
-_BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": None}
+_TEXT = "="  # in place of the byte order of an ascii file, whose tables have the machine's
+_BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": _TEXT}
+
+Table = npt.NDArray[np.void]  # rows with a field for each property
 
 
 @dataclass
 class Vertices:
-    """Some properties of all vertices, read from the file a block of rows at a time."""
+    """The vertices of an open file, read a block of rows at a time."""
 
-    names: list[str]
     count: int
-    blocks: Iterator[Numbers]  # [n, len(names)] each; `count` rows at most; they may be changed
-    dtype: type  # of the rows
-
-    def rows(self) -> Numbers:
-        """[n, len(names)] all rows."""
-        rows: Numbers = np.empty((self.count, len(self.names)), self.dtype)
-        start = 0
-        for block in self.blocks:
-            rows[start : start + len(block)] = block
-            start += len(block)
-        return rows[:start]
+    dtype: np.dtype[np.void]  # the properties' own types
+    comments: list[str]  # whole lines of the header
+    blocks: Iterator[Table]  # `count` rows in total; raises InputError
 
 
 @dataclass
@@ -66,103 +52,78 @@ class _Element:
     name: str
     count: int
     properties: dict[str, str]  # name -> numpy scalar code without byte order
+    order: str = _TEXT
 
     @property
-    def stride(self) -> int:
-        """Bytes of one row in a binary file."""
-        return sum(int(code[1]) for code in self.properties.values())
+    def dtype(self) -> np.dtype[np.void]:
+        if _LIST in self.properties.values():
+            raise InputError(f"element {self.name!r} has a list property: it cannot be read")
+        return np.dtype([(name, self.order + code) for name, code in self.properties.items()])
+
+    @property
+    def values(self) -> int:
+        return self.count * len(self.properties)
+
+    @property
+    def size(self) -> int:
+        """Bytes in a binary file."""
+        return self.count * self.dtype.itemsize
 
 
-def read_vertices(
-    file: BinaryIO, choose: Callable[[dict[str, str]], list[str]], dtype: type = np.float32
-) -> Vertices:
-    """The vertex properties that `choose` picks, from an open PLY file.
+def read_vertices(file: BinaryIO) -> Vertices:
+    """The vertices of a PLY file that is open at its start, in ascii or either byte order.
 
-    `choose` gets the numpy codes of all scalar vertex properties by name ("f4", "u1", ...) and returns
-    names among them; it may raise InputError. Reads ascii and both binary byte orders; comments, other
-    elements and bytes after the data are ignored. Raises InputError for a file that is damaged or too short,
-    and for list properties in or before the vertices; so do the blocks.
+    Ignores elements and bytes after the vertices. Raises InputError for a file that is damaged or too short,
+    and for list properties in or before the vertices.
     """
-    byte_order, before, vertex, _ = _vertex_header(file)
-    names = choose(vertex.properties)
-    columns = [list(vertex.properties).index(name) for name in names]
-    _check_vertices(file, byte_order, before, vertex)
-    if byte_order is None:
-        return Vertices(names, vertex.count, _ascii_blocks(file, before, vertex, columns, dtype), dtype)
-    _skip(file, before)
-    return Vertices(names, vertex.count, _binary_blocks(file, byte_order, vertex, columns, dtype), dtype)
-
-
-def read_vertex_table(file: BinaryIO) -> tuple[npt.NDArray[np.void], list[str]]:
-    """All vertices as a structured array with the properties' own types, and the header's comment lines.
-
-    A binary file is mapped into memory. Raises InputError as `read_vertices` does.
-    """
-    byte_order, before, vertex, comments = _vertex_header(file)
-    _check_vertices(file, byte_order, before, vertex)
-    if byte_order is not None:
-        _skip(file, before)
-        dtype = np.dtype([(name, byte_order + code) for name, code in vertex.properties.items()])
-        if not vertex.count:
-            return np.empty(0, dtype), comments
-        return np.memmap(file, dtype, "r", file.tell(), (vertex.count,)), comments
-    table = np.empty(vertex.count, np.dtype(list(vertex.properties.items())))
-    start = 0
-    every = list(range(len(vertex.properties)))
-    for block in _ascii_blocks(file, before, vertex, every, np.float64):
-        for name, values in zip(vertex.properties, block.T, strict=True):
-            with np.errstate(over="ignore", invalid="ignore"):
-                table[name][start : start + len(block)] = values
-        start += len(block)
-    return table, comments
-
-
-def _vertex_header(file: BinaryIO) -> tuple[str | None, list[_Element], _Element, list[str]]:
-    """(byte order or None for ascii, elements before the vertices, the vertices, lines of comments)."""
-    byte_order, elements, comments = _read_header(file)
+    elements, comments = _read_header(file)
     index = [element.name for element in elements].index("vertex")
     before, vertex = elements[:index], elements[index]
-    _check_no_list([*before, vertex])
-    return byte_order, before, vertex, comments
-
-
-def _check_vertices(file: BinaryIO, byte_order: str | None, before: list[_Element], vertex: _Element) -> None:
-    """Raise InputError if what follows the header is too short for the vertices."""
-    parts = [*before, vertex]
-    if byte_order is None:
+    size, values = sum(each.size for each in before), sum(each.values for each in before)
+    if vertex.order == _TEXT:
         # Every value takes a digit and a separator; the file's last separator may be missing.
-        _check_size(file, 2 * sum(each.count * len(each.properties) for each in parts) - 1, vertex)
+        _check_size(file, 2 * (values + vertex.values) - 1, vertex)
+        blocks = _ascii_blocks(file, values, vertex)
     else:
-        _check_size(file, sum(each.count * each.stride for each in parts), vertex)
+        _check_size(file, size + vertex.size, vertex)
+        file.seek(size, os.SEEK_CUR)
+        blocks = _binary_blocks(file, vertex)
+    return Vertices(vertex.count, vertex.dtype, comments, blocks)
 
 
-def _skip(file: BinaryIO, before: list[_Element]) -> None:
-    """Move to the vertices of a binary file."""
-    file.seek(sum(element.count * element.stride for element in before), os.SEEK_CUR)
-
-
-def read_tables(file: BinaryIO) -> dict[str, npt.NDArray[np.void]]:
-    """All elements of a binary PLY by name, as structured arrays with the properties' own types.
+def read_tables(file: BinaryIO) -> dict[str, Table]:
+    """All elements of a binary PLY by name.
 
     Raises InputError for ascii, for list properties and for a file that is damaged or too short.
     """
-    byte_order, elements, _ = _read_header(file)
-    if byte_order is None:
+    elements, _ = _read_header(file)
+    if elements[0].order == _TEXT:
         raise InputError("expected a binary .ply file, found one in ascii")
-    _check_no_list(elements)
-    _check_size(file, sum(element.count * element.stride for element in elements), elements[-1])
+    _check_size(file, sum(element.size for element in elements), elements[-1])
     tables = {}
     for element in elements:
-        dtype = np.dtype([(name, byte_order + code) for name, code in element.properties.items()])
-        data = file.read(element.count * element.stride)
-        tables[element.name] = np.frombuffer(data, dtype) if element.stride else np.empty(0, dtype)
+        data = file.read(element.size)
+        tables[element.name] = np.frombuffer(data, element.dtype) if data else np.empty(0, element.dtype)
     return tables
+
+
+def columns(table: Table, names: Sequence[str], dtype: type = np.float32) -> Numbers:
+    """[N, len(names)] the values of some properties. Values beyond the range of `dtype` become infinite."""
+    kinds = {kind for kind, *_ in (table.dtype.fields or {}).values()}
+    if len(kinds) == 1:  # the usual case, and many times faster
+        indices = [(table.dtype.names or ()).index(name) for name in names]
+        return table.view(*kinds).reshape(len(table), -1).take(indices, axis=1).astype(dtype, copy=False)
+    rows: Numbers = np.empty((len(table), len(names)), dtype)
+    with np.errstate(over="ignore", invalid="ignore"):
+        for index, name in enumerate(names):
+            rows[:, index] = table[name]
+    return rows
 
 
 def ply_header(elements: Mapping[str, tuple[int, Iterable[str]]], comments: Iterable[str] = ()) -> bytes:
     """The header of a little-endian file, from each element's count and properties such as "float x".
 
-    `comments`: whole lines, as `read_vertex_table` returns them.
+    `comments`: whole lines, as in `Vertices`.
     """
     lines = ["ply", "format binary_little_endian 1.0", *comments]
     for name, (count, properties) in elements.items():
@@ -170,38 +131,12 @@ def ply_header(elements: Mapping[str, tuple[int, Iterable[str]]], comments: Iter
     return "\n".join([*lines, "end_header\n"]).encode("latin-1")
 
 
-def read_point_cloud(path: Path) -> PointCloud:
-    """The points of a PLY with `x y z` and, optionally, `red green blue` (uchar), else grey.
-
-    Raises InputError if the file is not such a PLY, is truncated or holds coordinates that are not finite.
-    """
-    from keyss.files.layout import PointCloud  # imports the lens code, which models do not need
-
-    def choose(properties: dict[str, str]) -> list[str]:
-        if missing := {"x", "y", "z"} - properties.keys():
-            raise InputError(f"expected vertices with x, y and z, found no {sorted(missing)}")
-        colors = {name: properties[name] for name in ("red", "green", "blue") if name in properties}
-        if list(colors.values()) not in ([], ["u1"] * 3):
-            raise InputError(f"expected red, green and blue of type uchar, found {colors}")
-        return ["x", "y", "z", *colors]
-
-    with open_input(path) as file:
-        rows = read_vertices(file, choose, np.float64).rows()
-    colors = rows[:, 3:] if rows.shape[1] > 3 else np.full((len(rows), 3), _GREY)
-    if not ((colors >= 0) & (colors <= 255)).all():  # possible in ascii
-        raise InputError(f"{path}: expected colours of 0 to 255, found others")
-    return PointCloud.checked(path, rows[:, :3], colors.astype(np.uint8))
-
-
-def _read_header(file: BinaryIO) -> tuple[str | None, list[_Element], list[str]]:
-    """(byte order or None for ascii, the elements, lines of comments); the data come next.
-
-    One element is the vertices.
-    """
+def _read_header(file: BinaryIO) -> tuple[list[_Element], list[str]]:
+    """(elements, one of which is called vertex; comment lines). Leaves the file at the data."""
     lines = _header_lines(file)
     if lines[0] != "ply":
         raise InputError("expected a .ply file, but it does not begin with a line 'ply'")
-    formats: list[str | None] = []
+    formats: list[str] = []
     elements: list[_Element] = []
     comments: list[str] = []
     for number, line in enumerate(lines[1:], start=2):
@@ -228,7 +163,9 @@ def _read_header(file: BinaryIO) -> tuple[str | None, list[_Element], list[str]]
             f"expected one 'format' line and one 'element vertex' in the PLY header, "
             f"got {len(formats)} and {names.count('vertex')}"
         )
-    return formats[0], elements, comments
+    for element in elements:
+        element.order = formats[0]
+    return elements, comments
 
 
 def _header_lines(file: BinaryIO) -> list[str]:
@@ -249,12 +186,6 @@ def _header_lines(file: BinaryIO) -> list[str]:
     raise InputError(f"header is longer than {MAX_HEADER_BYTES} bytes or {_MAX_HEADER_LINES} lines")
 
 
-def _check_no_list(elements: Iterable[_Element]) -> None:
-    for element in elements:
-        if _LIST in element.properties.values():
-            raise InputError(f"element {element.name!r} has a list property: it cannot be read")
-
-
 def _check_size(file: BinaryIO, needed: int, vertex: _Element) -> None:
     """Raise InputError if fewer than `needed` bytes follow the header."""
     start = file.tell()
@@ -267,48 +198,36 @@ def _check_size(file: BinaryIO, needed: int, vertex: _Element) -> None:
         )
 
 
-def _binary_blocks(
-    file: BinaryIO, byte_order: str, vertex: _Element, columns: list[int], into: type
-) -> Iterator[Numbers]:
-    dtype = np.dtype([(name, byte_order + code) for name, code in vertex.properties.items()])
-    is_float32 = set(vertex.properties.values()) == {"f4"}
-    names = [list(vertex.properties)[column] for column in columns]
-    step = max(1, _CHUNK_BYTES // max(1, vertex.stride))
+def _binary_blocks(file: BinaryIO, vertex: _Element) -> Iterator[Table]:
+    dtype = vertex.dtype
+    step = max(1, _CHUNK_BYTES // dtype.itemsize)
     for start in range(0, vertex.count, step):
-        count = min(step, vertex.count - start)
-        data = file.read(count * vertex.stride)
-        if len(data) != count * vertex.stride:
+        size = min(step, vertex.count - start) * dtype.itemsize
+        data = file.read(size)
+        if len(data) != size:
             raise InputError("not a whole .ply file: it ends inside the data")
-        if is_float32:
-            table = np.frombuffer(data, byte_order + "f4").reshape(count, -1)
-            yield table.take(columns, axis=1).astype(into, copy=False)
-            continue
-        table = np.frombuffer(data, dtype=dtype)
-        rows: Numbers = np.empty((count, len(names)), into)
-        with np.errstate(over="ignore", invalid="ignore"):  # float32 overflow is reported as infinite
-            for column, name in enumerate(names):
-                rows[:, column] = table[name]
-        yield rows
+        yield np.frombuffer(data, dtype)
 
 
-def _ascii_blocks(
-    file: BinaryIO, before: list[_Element], vertex: _Element, columns: list[int], into: type
-) -> Iterator[Numbers]:
-    """Rows in text, after other elements. Only the order of the values matters, not the lines."""
+def _ascii_blocks(file: BinaryIO, skipped: int, vertex: _Element) -> Iterator[Table]:
+    """Rows in text, after `skipped` values. Line breaks are white space like any other."""
     width = len(vertex.properties)
-    skipped = sum(element.count * len(element.properties) for element in before)
-    step = max(1, _CHUNK_BYTES // (8 * max(1, width)))
+    step = max(1, _CHUNK_BYTES // (8 * width))
     tokens = _tokens(file)
     try:
         for _ in range(skipped):
             next(tokens)
         for start in range(0, vertex.count, step):
-            count = min(step, vertex.count - start) * width
-            values = np.fromiter((float(token) for token in tokens), dtype=np.float64, count=count)
-            with np.errstate(over="ignore"):
-                yield values.reshape(-1, width)[:, columns].astype(into)
+            table = np.empty(min(step, vertex.count - start), vertex.dtype)
+            values = np.fromiter((float(token) for token in tokens), np.float64, count=len(table) * width)
+            for name, column in zip(vertex.properties, values.reshape(len(table), width).T, strict=True):
+                with np.errstate(over="ignore", invalid="ignore"):
+                    table[name] = column
+                if table[name].dtype.kind != "f" and not np.array_equal(table[name], column):
+                    raise ValueError("not an integer of this type")
+            yield table
     except (StopIteration, ValueError) as error:
-        raise InputError("the ascii data are cut short or hold something not a number") from error
+        raise InputError("the ascii data are cut short or hold values of another type") from error
 
 
 def _tokens(file: BinaryIO) -> Iterator[bytes]:

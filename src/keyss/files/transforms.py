@@ -1,4 +1,4 @@
-"""Scenes with posed frames in JSON: the layouts of NeRF-synthetic and Nerfstudio."""
+"""Reads the layouts of NeRF-synthetic and Nerfstudio: posed frames in JSON."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import json
 import math
 import os
 import warnings
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -16,23 +15,24 @@ import numpy as np
 from keyss.core.arrays import Doubles
 from keyss.core.errors import InputError, KeyssWarning
 from keyss.files.images import probe_image
-from keyss.files.layout import (
+from keyss.files.inputs import open_input, read_text
+from keyss.files.lens import Lens, make_lens
+from keyss.files.ply_table import columns, read_vertices
+from keyss.files.scene_layout import (
     MAX_COORDINATE,
-    FileFinder,
+    CaseInsensitiveFinder,
     Photo,
+    PointCloud,
     SceneLayout,
     hold_out,
-    leave_out_broken,
-    leave_out_missing,
+    leave_out,
     refuse_duplicates,
 )
-from keyss.files.lens import Lens, make_lens
-from keyss.files.ply_table import read_point_cloud
-from keyss.files.reading import read_text
 
 _MAX_JSON_BYTES = 256 * 2**20
 _EXTENSIONS = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG", ".webp")
 _PERSPECTIVE = ("OPENCV", "FULL_OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
+_RGB, _GREY = ("red", "green", "blue"), 128  # the colour of points without any
 _COEFFICIENTS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 
 _Row = tuple[float, float, float, float]
@@ -64,7 +64,7 @@ class _Intrinsics(msgspec.Struct):
 
 class _Frame(_Intrinsics, kw_only=True):
     file_path: str
-    transform_matrix: Any = None  # checked by itself, so that an error names the photo
+    transform_matrix: Any = None  # checked separately, so that errors name the photo
     mask_path: str | None = None
 
 
@@ -76,26 +76,17 @@ class _Transforms(_Intrinsics, kw_only=True):
     val_filenames: list[str] | None = None
 
 
-@dataclass(frozen=True)
-class _Posed:
-    """A JSON file, and its frames in file order."""
-
-    meta: _Transforms
-    names: tuple[str, ...]  # of all frames
-    photos: tuple[Photo, ...]  # without missing ones
-
-
 def read_blender(folder: Path, *, skip_missing: bool = False) -> SceneLayout:
     """The photos of `transforms_train.json` and `transforms_test.json`, without points.
 
-    Without a test file, the test views are those of the validation file, else every 8th training photo.
-    `skip_missing`: see `leave_out_missing`. Raises InputError, also if a photo is in both files.
+    Without a test file, test views come from the validation file, else they are every 8th training photo.
+    `skip_missing`: see `leave_out`. Raises InputError, also if a photo is in both files.
     """
-    train = _read(folder / "transforms_train.json", skip_missing).photos
+    _, train = _read(folder / "transforms_train.json", skip_missing)
     for split in ("test", "val"):
         path = folder / f"transforms_{split}.json"
         if path.is_file():
-            test = _read(path, skip_missing).photos
+            _, test = _read(path, skip_missing)
             refuse_duplicates(path, train + test)
             return SceneLayout(train, test)
     return SceneLayout(*hold_out(folder, train))
@@ -106,59 +97,85 @@ def read_nerfstudio(folder: Path, *, skip_missing: bool = False) -> SceneLayout:
 
     `train_filenames` and `test_filenames` (or `val_filenames`) define the split; with only one of them, the
     other photos are the other part. Without them, or with a KeyssWarning if `train_filenames` has all photos,
-    every 8th photo is a test view. `skip_missing`: see `leave_out_missing`. Poses and points are used as
-    stored, since `applied_transform` was applied to both. Raises InputError.
+    every 8th photo is a test view. `skip_missing`: see `leave_out`. Poses and points are used as stored,
+    since `applied_transform` was applied to both. Raises InputError.
     """
     path = folder / "transforms.json"
-    posed = _read(path, skip_missing)
-    train, test = _split(path, posed)
-    if posed.meta.ply_file_path is None:
+    meta, photos = _read(path, skip_missing)
+    train, test = _split(path, meta, photos)
+    if meta.ply_file_path is None:
         return SceneLayout(train, test)
-    return SceneLayout(train, test, read_point_cloud(folder / _inside(path, posed.meta.ply_file_path)))
+    return SceneLayout(train, test, read_point_cloud(folder / _relative_path(path, meta.ply_file_path)))
 
 
-def _read(path: Path, skip_missing: bool) -> _Posed:
-    """The frames of a JSON file as photos.
+def read_point_cloud(path: Path) -> PointCloud:
+    """The points of a PLY with `x y z` and, optionally, `red green blue` (uchar), else grey.
 
-    A frame's own intrinsics override those of the file. `file_path` is relative to the file's folder,
-    may lack its extension, and must stay inside that folder or its parent. Raises InputError.
+    Raises InputError if the file is not such a PLY, is truncated or holds coordinates that are not finite.
+    """
+    with open_input(path) as file:
+        vertices = read_vertices(file)
+        names = vertices.dtype.names or ()
+        if missing := {"x", "y", "z"} - set(names):
+            raise InputError(f"expected vertices with x, y and z, found no {sorted(missing)}")
+        colors = {name: str(vertices.dtype[name]) for name in _RGB if name in names}
+        if list(colors.values()) not in ([], ["uint8"] * 3):
+            raise InputError(f"expected red, green and blue of type uchar, found {colors}")
+        xyz, rgb = [np.empty((0, 3))], [np.empty((0, 3), np.uint8)]
+        for table in vertices.blocks:
+            xyz.append(columns(table, ("x", "y", "z"), np.float64))
+            rgb.append(columns(table, _RGB, np.uint8) if colors else np.full_like(xyz[-1], _GREY, np.uint8))
+    return PointCloud.checked(path, np.concatenate(xyz), np.concatenate(rgb))
+
+
+def _read(path: Path, skip_missing: bool) -> tuple[_Transforms, tuple[Photo, ...]]:
+    """A JSON file, and the photos of its frames that can be used.
+
+    A frame's intrinsics override those of the file. `file_path` is relative to the file's folder, may lack
+    its extension, and must stay inside that folder or its parent. Raises InputError.
     """
     try:
-        # Not by msgspec, which refuses the NaN and Infinity that Python writes. msgspec cannot convert
-        # integers beyond float64; such integers become infinite.
+        # Parsed by json because msgspec refuses NaN and Infinity, which Python writes, and integers beyond
+        # float64, which become infinite here.
         text = read_text(path, _MAX_JSON_BYTES)
-        meta = msgspec.convert(json.loads(text, parse_int=_number), type=_Transforms)
+        meta = msgspec.convert(json.loads(text, parse_int=_parse_int), type=_Transforms)
     except (msgspec.MsgspecError, ValueError, RecursionError) as error:
         raise InputError(f"{path}: expected JSON with posed frames: {error}") from error
     if not meta.frames:
         raise InputError(f"{path}: expected posed frames, found none")
-    finder = FileFinder()
+    finder = CaseInsensitiveFinder()
     names = [_image_name(path, frame.file_path, finder) for frame in meta.frames]
     missing = {name for name in names if not (path.parent / name).exists()}
-    leave_out_missing(path, len(names), sorted(missing), skip_missing)
-    photos, broken = [], {}
+    leave_out(path, len(names), "are missing", sorted(missing), skip_missing)
+    photos, broken = [], []
     for i, (name, frame) in enumerate(zip(names, meta.frames, strict=True)):
         if name in missing:
             continue
-        where = f"{path}: frame {i} ({name})"
+        where = f"frame {i} ({name})"
         try:
             viewmat = _viewmat(where, _matrix(where, frame.transform_matrix))
             lens = _lens(where, meta, frame, path.parent / name)
-            mask = frame.mask_path and path.parent / finder.find(path.parent, _inside(path, frame.mask_path))
+            mask = frame.mask_path and path.parent / finder.find(
+                path.parent, _relative_path(path, frame.mask_path)
+            )
             photos.append(Photo(path.parent / name, name, viewmat, lens, mask or None))
         except InputError as error:
-            broken[name] = str(error)
-    leave_out_broken(path, len(photos) + len(broken), broken, skip_missing)
+            broken.append(str(error))
+    leave_out(path, len(photos) + len(broken), "have no usable camera", broken, skip_missing)
     refuse_duplicates(path, photos)
-    return _Posed(meta, tuple(names), tuple(photos))
+    return meta, tuple(photos)
 
 
-def _number(digits: str) -> int | float:
+def _parse_int(digits: str) -> int | float:
     return int(digits) if len(digits) < 19 else float(digits)
 
 
-def _split(path: Path, posed: _Posed) -> tuple[tuple[Photo, ...], tuple[Photo, ...]]:
-    meta, photos, names, finder = posed.meta, posed.photos, set(posed.names), FileFinder()
+def _split(
+    path: Path, meta: _Transforms, photos: tuple[Photo, ...]
+) -> tuple[tuple[Photo, ...], tuple[Photo, ...]]:
+    """(train, test) by the lists of a JSON file, else every 8th photo."""
+    finder = CaseInsensitiveFinder()
+    names = {_image_name(path, frame.file_path, finder) for frame in meta.frames}
     train, test = (
         {_image_name(path, each, finder) for each in listed or ()}
         for listed in (meta.train_filenames, meta.test_filenames or meta.val_filenames)
@@ -180,10 +197,10 @@ def _split(path: Path, posed: _Posed) -> tuple[tuple[Photo, ...], tuple[Photo, .
     return tuple(p for p in photos if p.name in train), tuple(p for p in photos if p.name in test)
 
 
-def _inside(path: Path, file_path: str) -> str:
-    """A path from a JSON file, normalised: relative to the file's folder, inside it or its parent.
+def _relative_path(path: Path, file_path: str) -> str:
+    """A path in a JSON file, normalised, relative to the file's folder, and inside it or its parent.
 
-    An absolute path, as of another computer, is that of its longest end that exists in the file's folder.
+    For an absolute path, which may be from another computer, the longest suffix that exists in the folder.
     """
     name = os.path.normpath(file_path.replace("\\", "/")).replace(os.sep, "/")
     parts = name.split("/")
@@ -199,9 +216,9 @@ def _inside(path: Path, file_path: str) -> str:
     return name
 
 
-def _image_name(path: Path, file_path: str, finder: FileFinder) -> str:
-    """The name of an image beside a JSON file, spelt as on disk, with its extension added if necessary."""
-    name = _inside(path, file_path)
+def _image_name(path: Path, file_path: str, finder: CaseInsensitiveFinder) -> str:
+    """The name of an image as spelt on disk, with its extension added if necessary."""
+    name = _relative_path(path, file_path)
     names = (finder.find(path.parent, name + each) for each in ("", *_EXTENSIONS))
     return next((each for each in names if os.path.isfile(path.parent / each)), name)
 
@@ -262,7 +279,7 @@ def _lens(where: str, file: _Intrinsics, frame: _Intrinsics, image: Path) -> Len
     values = {key: meta[key] for key in _COEFFICIENTS if key in meta}
     rational = model == "FULL_OPENCV" or values.get("k5", 0.0) != 0.0 or values.get("k6", 0.0) != 0.0
     if not fisheye and not rational and values.pop("k4", 0.0) != 0.0:
-        # Nerfstudio's k4 is a 4th radial term, OpenCV's the first of a denominator, which k5 and k6 continue.
+        # In Nerfstudio a 4th radial term, in OpenCV the first term of a denominator.
         raise InputError(f"{where}: expected k4 = 0 for a lens that is not a fisheye, found {meta['k4']}")
     values["fx"], values["fy"] = fx if fx is not None else fy, fy if fy is not None else fx
     values["cx"], values["cy"] = meta.get("cx", width / 2), meta.get("cy", height / 2)

@@ -40,6 +40,9 @@ class FitConfig:
     # their optimum. It helps only models that do not grow (docs/performance.md).
     settle: float = 0.0
 
+    # First share of a growing run, in which large photos are shrunk, see `schedule.shrinking`; 0: never.
+    coarse: float = 0.5
+
     grow_start: float = 0.1  # densification starts here, or at 500 iterations if that is earlier
     grow_stop: float = 0.6
     grow_every: int | None = None  # steps; None: a thirtieth of the run, at most 100
@@ -58,6 +61,7 @@ class FitConfig:
             ("sh_degree", 0, 3),
             ("ssim_weight", 0, 1),
             ("settle", 0, 1),
+            ("coarse", 0, 1),
             ("boost", 1, 100),
         ):
             value = getattr(self, name)

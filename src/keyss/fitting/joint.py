@@ -14,9 +14,9 @@ from keyss.core.scene import Camera, Scene
 from keyss.fitting.checkpoint import State, pack_model, pack_network, unpack_model, unpack_network
 from keyss.fitting.config import FitConfig
 from keyss.fitting.density import CappedStrategy, Rendered
+from keyss.fitting.fixed_rows import of_scene
 from keyss.fitting.image_metrics import psnr, subsample_views
 from keyss.fitting.parameters import Optimizers, Parameters, make_optimizers, to_parameters
-from keyss.fitting.rows import of_scene
 from keyss.fitting.sampling import Shuffle, own_randomness
 from keyss.fitting.schedule import Schedule
 

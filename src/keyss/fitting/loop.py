@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import torch
-from torch import Tensor
 
 from keyss import _threads
 from keyss._interrupts import ENDING
@@ -28,10 +27,6 @@ class TrainingRun(Protocol):
 
     iterations: int
     iteration: int  # steps done
-
-    @property
-    def loss(self) -> float | Tensor:
-        """The loss of the last step."""
 
     def step(self) -> None:
         """Take one optimisation step, which increases `iteration`."""
@@ -94,9 +89,7 @@ def train(
                 run.step()
                 if config.evaluate_every and run.iteration % config.evaluate_every == 0:
                     numbers = run.evaluate()
-                with_loss = reporter.loss_every and run.iteration % reporter.loss_every == 0
-                loss = {"loss": float(run.loss)} if with_loss else {}
-                reporter.update(run.iteration, len(run), numbers | loss)
+                reporter.update(run.iteration, len(run), numbers)
                 if model is not None:
                     reporter.look(model)
                 if signum := interrupted():

@@ -97,10 +97,10 @@ class Targets:
         """Bytes of the cached targets of `views`."""
         return min(TARGET_BYTES, sum(12 * view.image.numel() for view in views))
 
-    def of(self, key: Hashable, image: Callable[[], Tensor], mask: Tensor | None = None) -> Target:
-        """The target of an `image` and a `mask`, which must be the same whenever `key` is."""
+    def of(self, key: Hashable, make: Callable[[], Target]) -> Target:
+        """The target that `make` returned for this `key`, or returns now."""
         if (target := self._kept.get(key)) is None:
-            target = Target.of(image(), mask)
+            target = make()
             needed = 12 * target.planes.numel()  # three tensors of float32
             if needed <= self._left:
                 self._kept[key] = target

@@ -6,17 +6,19 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from keyss.core.gaussians import Gaussians
-from keyss.core.scene import Scene
+from keyss.core.scene import Scene, View
+from keyss.files.images import downscale
 from keyss.fitting.checkpoint import State, pack_model, unpack_model
 from keyss.fitting.config import FitConfig
 from keyss.fitting.density import CappedStrategy, Rendered
 from keyss.fitting.image_metrics import mean_psnr, subsample_views
 from keyss.fitting.loop import train
-from keyss.fitting.losses import Targets, photometric_loss
+from keyss.fitting.losses import Target, Targets, photometric_loss
 from keyss.fitting.parameters import (
     initial_gaussians,
     initial_points,
@@ -25,7 +27,7 @@ from keyss.fitting.parameters import (
     to_parameters,
 )
 from keyss.fitting.sampling import Shuffle
-from keyss.fitting.schedule import Schedule
+from keyss.fitting.schedule import Schedule, shrinking
 from keyss.progress import Reporter
 from keyss.rendering import render_with_meta
 
@@ -67,7 +69,8 @@ class PlainRun:
         self.strategy = CappedStrategy(config)
         self.density: dict[str, Any] = self.strategy.initialize_state(scene.extent)
         self.shuffle = Shuffle(len(self.views), self.generator)
-        self.targets = Targets()
+        self.pixels = max(view.camera.width * view.camera.height for view in self.views)
+        self.shrunk, self.targets = 1, Targets()
 
     def __len__(self) -> int:
         return len(self.parameters["means"])
@@ -77,11 +80,17 @@ class PlainRun:
         chosen = [self.shuffle.sample() for _ in range(config.views_per_step)]
         self.iteration += 1
         degree = config.sh_degree_at(self.iteration) if self.grows else config.sh_degree
+        factor = shrinking(config, self.iteration, self.pixels) if self.grows else 1
+        if factor != self.shrunk:
+            self.shrunk, self.targets = factor, Targets()
 
         def loss_at(index: int) -> tuple[Tensor, list[Rendered]]:
             view, model = self.views[index], to_gaussians(self.parameters)
-            image, meta = render_with_meta(model, view.camera, self.background, sh_degree=degree)
-            target = self.targets.of(index, lambda: view.image.to(self.device), view.mask)
+            camera = view.camera
+            size = max(1, camera.width // factor), max(1, camera.height // factor)
+            camera = camera if factor == 1 else camera.resized(*size)
+            image, meta = render_with_meta(model, camera, self.background, sh_degree=degree)
+            target = self.targets.of(index, lambda: _target(view, size, self.device))
             return photometric_loss(image, target, config.ssim_weight), [(meta, None, 1.0)]
 
         self.loss, info = self.strategy.backward(chosen, loss_at, len(self))
@@ -110,6 +119,17 @@ class PlainRun:
         self.shuffle.load(tensors["order"])
         self.generator.set_state(tensors["generator"])
         self.iteration = int(meta["iteration"])
+
+
+def _target(view: View, size: tuple[int, int], device: torch.device) -> Target:
+    """The target of a photo, shrunk to `size` (width, height) if it is larger."""
+    image, mask = view.image, view.mask
+    if size != (view.camera.width, view.camera.height):
+        image = torch.from_numpy(downscale(image.numpy(), *size))
+        if mask is not None:
+            shares = downscale(np.uint8(255) * mask.numpy(), *size)
+            mask = torch.from_numpy(shares >= min(128, shares.max()))  # which leaves some pixels
+    return Target.of(image.to(device), mask)
 
 
 def fit_scene(

@@ -6,6 +6,7 @@ decay to those of 3DGS (benchmarks/recipe.py compares them).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import torch
@@ -23,6 +24,7 @@ _BOOSTED = 0.6  # share of a run with constant, larger rates
 _EXPONENTS = {"means": 7 / 4, "opacities": 1 / 4}  # exponents of the boost; 1 for other attributes
 _LARGE = 0.05  # size / distance to the nearest camera; larger Gaussians get a smaller boost
 _CAMERAS = 32  # cameras used to measure distances
+_LARGE_PHOTO, _COARSEST = 200_000, 20_000  # pixels: of photos that are shrunk, and of shrunk ones at least
 _FOCAL = 1.15  # focal length / sqrt(image area) at which rates equal 3DGS's; 47 degrees
 
 
@@ -80,6 +82,18 @@ class Schedule:
         For cameras of 47 degrees, it equals the distance.
         """
         return (torch.cdist(means, self.positions.to(means)) / self.zooms.to(means)).amin(1)
+
+
+def shrinking(config: FitConfig, iteration: int, pixels: int) -> int:
+    """The factor by which the sides of photos of `pixels` are divided at a step: powers of two, down to 1.
+
+    Shrunk photos have at least 20,000 pixels. Each factor is used for equally many steps.
+    """
+    if pixels <= _LARGE_PHOTO or iteration > config.coarse * config.iterations:
+        return 1
+    levels = int(math.log2(pixels / _COARSEST) / 2)
+    passed = int(levels * (iteration - 1) / (config.coarse * config.iterations))
+    return int(2 ** (levels - passed))
 
 
 def boost_of(config: FitConfig) -> float:

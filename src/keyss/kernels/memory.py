@@ -50,6 +50,12 @@ def empty(shape: tuple[int, ...], dtype: Any) -> Array:
     return array
 
 
+def release() -> None:
+    """Give all unused buffers back to the system; large models need hundreds of megabytes."""
+    _returns.clear()
+    _free.clear()
+
+
 def _buffer(size: int) -> Array:
     """The smallest free buffer that is at most twice as large as needed, or a new one."""
     step = 1 << max(0, size.bit_length() - 3)  # between capacities: an eighth to a quarter of the size

@@ -46,7 +46,3 @@ class MasterKey:
             number, digit = divmod(number, len(ALPHABET))
             characters.append(ALPHABET[digit])
         return "".join(characters)
-
-    def check(self) -> str:
-        """32 hexadecimal digits that identify this master key; each guess costs a key derivation."""
-        return self._derived.expand("master-check", 16).hex()

@@ -1,7 +1,7 @@
-"""The laboratory: what measures, attacks and compares hidings. The product imports nothing of it.
+"""The laboratory: measures, attacks and comparisons of hidings. The product imports nothing of it.
 
 Stealth, leaks, robustness and speed of one run make an audit (`audits/`); `many/` compares methods, and
-reproduces the paper's tables; `peers/` has published methods to compare with.
+reproduces the paper's tables; `baselines/` has published methods to compare with.
 """
 
 import lazy_loader

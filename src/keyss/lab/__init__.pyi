@@ -1,4 +1,5 @@
-from .auc import Auc as Auc, auc_between as auc_between, delong as delong
+from .auc import Auc as Auc, auc_between as auc_between
+from .baselines.baseline_options import BaselineOptions as BaselineOptions
 from .distances import (
     AttributeDistance as AttributeDistance,
     against_controls as against_controls,
@@ -9,7 +10,6 @@ from .leaks.attacks import (
     decoder_attack as decoder_attack,
     file_attacks as file_attacks,
     search_embeddings as search_embeddings,
-    with_the_key as with_the_key,
 )
 from .leaks.leak_scores import (
     AttackResult as AttackResult,
@@ -20,7 +20,7 @@ from .leaks.leak_scores import (
     leak_scores as leak_scores,
     look_for_secret as look_for_secret,
 )
-from .peers.options import PeerOptions as PeerOptions
+from .render_time import RenderTime as RenderTime, measure_render_time as measure_render_time
 from .robustness.changes import (
     Change as Change,
     cropping as cropping,
@@ -32,35 +32,16 @@ from .robustness.changes import (
     purification as purification,
     random_pruning as random_pruning,
 )
+from .robustness.converters import Converter as Converter, converters as converters, transform as transform
 from .robustness.survival import (
     ChangedQuality as ChangedQuality,
     ChangeResult as ChangeResult,
-    Converter as Converter,
-    converters as converters,
     default_changes as default_changes,
     measure_robustness as measure_robustness,
     reveal_changed as reveal_changed,
-    transform as transform,
 )
 from .sinkhorn import composite_score as composite_score, sinkhorn_3d as sinkhorn_3d
-from .speed import (
-    ReaderResult as ReaderResult,
-    SpeedResult as SpeedResult,
-    measure_speed as measure_speed,
-    readers as readers,
-    render_time as render_time,
-    reveal_seconds as reveal_seconds,
-)
 from .stealth.confirmation import candidate_scores as candidate_scores, changed_low_bits as changed_low_bits
 from .stealth.judging import judge as judge, stealth_statistics as stealth_statistics
-from .stegexpose import (
-    Scores as Scores,
-    StegExposeAuc as StegExposeAuc,
-    score_image as score_image,
-    stegexpose_auc as stegexpose_auc,
-)
-from .two_sample import (
-    auc_beside_controls as auc_beside_controls,
-    features as features,
-    two_sample_auc as two_sample_auc,
-)
+from .stegexpose import score_image as score_image, stegexpose_auc as stegexpose_auc
+from .two_sample import features as features, two_sample_auc as two_sample_auc

@@ -14,7 +14,7 @@ from statistics import fmean
 
 import numpy as np
 
-from keyss.core import Gaussians, UsageError, import_extra
+from keyss.core import Gaussians, import_extra
 from keyss.core.arrays import Floats
 from keyss.lab.two_sample import features
 
@@ -43,10 +43,8 @@ def against_controls(
     """`attribute_distances` of `model` and of `controls`, plain models of the same scene from other seeds.
 
     `original`: another plain model of the scene to compare with the controls, since it can be further from
-    them than they are from each other. Raises UsageError for fewer than two controls and for an empty model.
+    them than they are from each other. `controls`: at least two. Raises UsageError for an empty model.
     """
-    if len(controls) < 2:
-        raise UsageError(f"expected at least two control models of the scene, got {len(controls)}")
 
     def mean(pairs: Iterable[tuple[Gaussians, Gaussians]]) -> dict[str, float]:
         every = [attribute_distances(one, two, seed=seed) for one, two in pairs]
@@ -94,7 +92,7 @@ def attribute_distances(reference: Gaussians, other: Gaussians, *, seed: int = 0
 
 
 def _directions(generator: np.random.Generator, size: int) -> Floats:
-    """[SLICES, size] random unit vectors; none in one dimension, which has its axis."""
+    """[SLICES, size] random unit vectors; none in one dimension: the axis is enough."""
     vectors = generator.standard_normal((SLICES if size > 1 else 0, size))
     unit: Floats = (vectors / np.linalg.norm(vectors, axis=1, keepdims=True)).astype(np.float32)
     return unit

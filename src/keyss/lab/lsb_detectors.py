@@ -2,8 +2,7 @@
 
 - Chi-square: random last bits make values that differ only in the last bit equally frequent.
 - Primary sets and sample pairs: count pairs of neighbours (u, v), whose differences LSB replacement evens
-out,
-  and solve the same quadratic equation for the embedding rate.
+  out, and solve the same quadratic equation for the embedding rate.
 - RS: counts small blocks that become rougher (regular) or smoother (singular) when last bits are flipped.
 """
 
@@ -15,13 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaincc
 
-from keyss.core.arrays import Bytes, Doubles, Integers
+from keyss.core.arrays import Bytes, Integers
 
 _SAMPLES = 1024  # per block of chi-square
 _MIN_BLOCKS = 256  # the original program fails with fewer
 _FREEDOM = 127  # degrees of freedom: 128 terms - 1
-_AT_ONCE = 4096  # blocks per batch of histograms
-_ROWS = 128  # rows of RS's blocks per batch; even, so that disjoint blocks stay disjoint
 
 Plane = NDArray[np.int16]  # [H, W]
 Counts = Integers  # [2, 2]: under F1 and under F-1, the number of regular and of singular blocks
@@ -38,28 +35,14 @@ def chi_square(image: Bytes) -> float | None:
     blocks = len(samples) // _SAMPLES - 1
     if blocks < _MIN_BLOCKS:
         return None
-    histogram = np.ones(256, dtype=np.int64)
-    total = 0.0
-    for start in range(0, blocks, _AT_ONCE):
-        count = min(_AT_ONCE, blocks - start)
-        part = samples[start * _SAMPLES : (start + count) * _SAMPLES].reshape(count, _SAMPLES)
-        bins = part + 256 * np.arange(count)[:, None]
-        histograms = histogram + np.bincount(bins.reshape(-1), minlength=256 * count).reshape(
-            count, 256
-        ).cumsum(0)
-        histogram = histograms[-1]
-        total += float(_p_values(histograms).sum())
-    return total / blocks
-
-
-def _p_values(histograms: Integers) -> Doubles:
-    """[N] p-values of [N, 256] histograms without empty bins."""
+    bins = samples[: blocks * _SAMPLES].reshape(blocks, _SAMPLES) + 256 * np.arange(blocks)[:, None]
+    counts = np.bincount(bins.reshape(-1), minlength=256 * blocks).reshape(blocks, 256)
+    histograms = 1 + counts.cumsum(0)
     observed = histograms[:, 0::2].astype(np.float64)
     expected = ((histograms[:, 0::2] + histograms[:, 1::2]) // 2).astype(np.float64)
     expected *= (observed.sum(1) / expected.sum(1))[:, None]
     statistic = ((observed - expected) ** 2 / expected).sum(1)
-    p_values: Doubles = gammaincc(_FREEDOM / 2, statistic / 2)
-    return p_values
+    return float(gammaincc(_FREEDOM / 2, statistic / 2).mean())
 
 
 def primary_sets(image: Bytes) -> float:
@@ -124,23 +107,13 @@ def rs(image: Bytes) -> float:
     Unbounded; NaN for images without a block.
     """
     rates = np.zeros((2, 3))
-    for channel in range(3):
-        for kind, (counts, counts_of_flipped) in enumerate(_count_image(image[:, :, channel])):
-            rates[kind, channel] = _rate(counts, counts_of_flipped)
+    for channel, plane in enumerate(np.moveaxis(image, 2, 0).astype(np.int16)):
+        for kind, counts in enumerate(zip(_count_blocks(plane), _count_blocks(plane ^ 1), strict=True)):
+            rates[kind, channel] = _rate(*counts)
     return float((rates[0].sum() / 3 + rates[1].sum() / 3) / 2)
 
 
-def _count_image(plane: Bytes) -> Integers:
-    """[2, 2, 2, 2]: for overlapping and disjoint blocks, `Counts` of the image and its flip."""
-    counts = np.zeros((2, 2, 2, 2), dtype=np.int64)
-    for start in range(0, plane.shape[0] - 1, _ROWS):
-        strip = plane[start : start + _ROWS + 1].astype(np.int16)
-        for flipped, pixels in enumerate((strip, strip ^ 1)):
-            counts[:, flipped] += _count_strip(pixels)
-    return counts
-
-
-def _count_strip(pixels: Plane) -> Integers:
+def _count_blocks(pixels: Plane) -> Integers:
     """[2, 2, 2]: `Counts` of overlapping and disjoint blocks."""
     counts = np.zeros((2, 2, 2), dtype=np.int64)
     across, down = np.abs(pixels[:, :-1] - pixels[:, 1:]), np.abs(pixels[:-1] - pixels[1:])

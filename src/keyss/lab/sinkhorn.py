@@ -29,7 +29,6 @@ class Sinkhorn3D:
     scale: float
     position: float
     colour: float
-    mean: float
     sum: float  # KeySS, eq. 9; the paper's tables give sums
 
 
@@ -46,8 +45,7 @@ def sinkhorn_3d(original: Gaussians, other: Gaussians) -> Sinkhorn3D:
         raise UsageError("expected two models with Gaussians in them, got an empty one")
     ours, theirs = _magnitudes(original), _magnitudes(other)
     distances = {name: _sinkhorn(ours[name], theirs[name]) for name in ours}
-    total = sum(distances.values())
-    return Sinkhorn3D(**distances, mean=total / len(distances), sum=total)
+    return Sinkhorn3D(**distances, sum=sum(distances.values()))
 
 
 def composite_score(psnr_cover: float, psnr_secret: float, distance: float) -> float:

@@ -40,10 +40,8 @@ def auc_beside_controls(
     """`two_sample_auc` of `model` and of `controls`, plain models of the same scene from other seeds.
 
     `original`: another plain model of the scene to compare with the controls, since it can be further from
-    them than they are from each other. Raises UsageError for fewer than two controls.
+    them than they are from each other. `controls`: at least two.
     """
-    if len(controls) < 2:
-        raise UsageError(f"expected at least two control models of the scene, got {len(controls)}")
     return TwoSampleAucs(
         stego=tuple(two_sample_auc(control, model, seed=seed) for control in controls),
         control=tuple(two_sample_auc(one, two, seed=seed) for one, two in combinations(controls, 2)),

@@ -7,4 +7,3 @@ from .hide_quality import (
     in_cover as in_cover,
     measure_hiding as measure_hiding,
 )
-from .image_scores import ImageComparison as ImageComparison, compare_images as compare_images

@@ -13,6 +13,7 @@ from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
 from keyss.core.similarity import align
 from keyss.fitting.image_metrics import ImageQuality, mean_psnr, mean_quality, subsample_views, view_quality
+from keyss.kernels.memory import release
 from keyss.keys import random_embeddings
 from keyss.methods.opened import Opened
 from keyss.rendering import render
@@ -86,13 +87,15 @@ def measure_hiding(
     stego: Gaussians,
     opened: Sequence[Opened],
     scenes: Sequence[Scene],  # the cover, then the secrets in the order of `opened`, each in its own frame
-    baselines: Sequence[Gaussians | None],  # plain models of the scenes, each in its own frame
+    shown: Sequence[Shown],  # of `compare`: the stego model, then the secrets
+    gaussians: Sequence[int | None],  # of the plain models of the scenes
     *,
-    steps: Sequence[int | None] = (),  # training steps of the baselines, and whether their scenes had as many
+    steps: Sequence[
+        int | None
+    ] = (),  # training steps of the plain models, and whether their scenes had as many
     equal: Sequence[bool] = (),
     wrong_keys: int = WRONG_KEYS,
     seed: int = 0,
-    shown: Sequence[Shown] | None = None,  # stego model, then secrets; saves rendering them again
 ) -> HidingQuality:
     """Measure cover and secrets, their plain models, and renders under wrong keys.
 
@@ -102,9 +105,6 @@ def measure_hiding(
     """
     if wrong_keys < 1:
         raise UsageError(f"expected at least one wrong key, got {wrong_keys}")
-    if shown is None:
-        models = [stego, *(secret.reveal(stego).to(stego.device) for secret in opened)]
-        shown = list(map(compare, models, baselines, scenes))
     cover = scenes[0]
     placed = [in_cover(*pair, cover) for pair in zip(opened, scenes[1:], strict=True)]
     return HidingQuality(
@@ -113,7 +113,7 @@ def measure_hiding(
         baseline=BaselineQuality(
             shown[0].plain,
             tuple(secret.plain for secret in shown[1:]),
-            tuple(None if model is None else len(model) for model in baselines),
+            tuple(gaussians),
             tuple(steps),
             tuple(equal),
         ),
@@ -167,7 +167,7 @@ def compare(model: Gaussians, plain: Gaussians | None, scene: Scene, *, of_plain
     """Compare both models with the test views of their scene, rendering each view once.
 
     Fidelity compares the model with the plain model, without photos. `of_plain`: the scene has no photos; its
-    images are renders of the plain model, and are reused.
+    images are renders of the plain model, which is then not needed.
     """
     background = scene.background.to(model.device)
     compared = set(map(id, subsample_views(scene.test, _FIDELITY_VIEWS)))
@@ -177,17 +177,18 @@ def compare(model: Gaussians, plain: Gaussians | None, scene: Scene, *, of_plain
     for view in scene.test:
         image = render(model, view.camera, background).clamp(0, 1)
         qualities.append(view_quality(image, view))
-        if plain is None:
-            continue
         if of_plain and view.unrounded is not None:
             expected = view.unrounded.to(model.device)
+        elif plain is None:
+            continue
         else:
             expected = render(plain, view.camera, background).clamp(0, 1)
         plains.append(view_quality(expected, view))
         if id(view) in compared:
             errors.append((image - expected).square().mean())
             empty.append((background - expected).square().mean())
-    if plain is None:
+    release()
+    if not plains:
         return Shown(mean_quality(qualities), None, None)
     psnr, nothing = (-10 * torch.stack(mses).mean().clamp_min(1e-12).log10() for mses in (errors, empty))
     fidelity = RenderFidelity(round(float(psnr), 2), round(float(nothing), 2))

@@ -12,7 +12,6 @@ from .carry.method import most_contributing as most_contributing
 from .carry.options import CarryOptions as CarryOptions
 from .carry.room import RecordRoom as RecordRoom, SecretSize as SecretSize, to_degree as to_degree
 from .decoy import Decoy as Decoy
-from .dither import dither_model as dither_model
 from .keyss.combined import CombinedPoses as CombinedPoses, PlacedScene as PlacedScene
 from .keyss.decoder import Decoder as Decoder
 from .keyss.latent import LatentDecoder as LatentDecoder

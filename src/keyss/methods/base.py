@@ -66,6 +66,7 @@ class Context:
     checkpoints: Path | None = None  # folder for the state of interrupted trainings
     resume: bool = False
     reporter: Reporter | None = None
+    overwrites_cover: bool = False  # nothing needs the cover's model afterwards: its memory may be used
     # 32 secret bytes that seed all randomness: equal bytes give equal files. None: the system's randomness.
     entropy: bytes | None = field(default=None, repr=False)
 
@@ -86,8 +87,7 @@ class Stego:
 class Capabilities:
     """The capabilities of a method."""
 
-    keys: bool = True  # a key opens each secret; else whoever has the handed-over file sees it
-    hands_over: bool = False  # each secret has a file beside the published model
+    keys: bool = True  # a key opens each secret; else a file that is handed over beside the model shows it
     standard: bool = True  # the published model is a 3DGS model, which every viewer renders
     models: bool = True  # revealed secrets are 3DGS models; else a network renders their images
 
@@ -167,10 +167,6 @@ class MethodOptions:
     def variants(cls) -> Mapping[str, Self]:
         """Options of further variants for comparisons, by name."""
         return {}
-
-    def for_fitted_cover(self) -> Self:
-        """Options for a cover that keyss fits, which may be changed to have room."""
-        return self
 
     def with_fit(self, **changes: Any) -> Self:
         """Options with changed fields of `fit`."""

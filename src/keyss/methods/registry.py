@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from importlib import import_module
+from operator import attrgetter
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from keyss.core.errors import InputError, UsageError, WrongKeyError
@@ -25,8 +26,8 @@ class Modules(NamedTuple):
 
 
 def _baseline(module: str, options: str, summary: str) -> Modules:
-    room = "keyss.lab.peers"
-    return Modules(summary, f"{room}.options:{options}", f"{room}.{module}:METHOD", f"{room}.{module}:unpack")
+    place = f"keyss.lab.baselines.{module}:METHOD"
+    return Modules(summary, f"keyss.lab.baselines.baseline_options:{options}", place, f"{place}.unpack")
 
 
 DEFAULT = "carry"
@@ -43,27 +44,24 @@ METHODS = {
         "keyss.methods.keyss.method:METHOD",
         "keyss.methods.keyss.secret:unpack",
     ),
-    "3dgs": _baseline("bound", "BoundOptions", "upper bound: the secret is a separate file"),
-    "3dgs-sh": _baseline("sh", "ShOptions", "second harmonics for the secret, handed over (baseline)"),
+    "3dgs": _baseline("upper_bound", "BoundOptions", "upper bound: the secret is a separate file"),
+    "3dgs-sh": _baseline(
+        "second_harmonics", "ShOptions", "second harmonics for the secret, handed over (baseline)"
+    ),
     "3dgs-decoder": _baseline(
-        "decoder",
+        "picture_decoder",
         "DecoderOptions",
         "a network from the cover's picture to the secret's, handed over (baseline)",
     ),
     "gs-hider": _baseline(
         "gs_hider", "GsHiderOptions", "features in place of harmonics, and a network for each scene"
     ),
-    "watergs": _baseline(
-        "watergs",
-        "WaterGsOptions",
-        "harmonics in low bits of harmonics, opacities by an autoencoder (Splats in Splats)",
-    ),
 }
 
 
 def _load(place: str) -> Any:
     module, name = place.split(":")
-    return getattr(import_module(module), name)
+    return attrgetter(name)(import_module(module))
 
 
 def options_of(name: str) -> type[MethodOptions]:
@@ -111,14 +109,11 @@ def open_model(stego: Gaussians, key: str, *, decoy: bool = False) -> Opened:
     return _unpack(attempt.content)
 
 
-def open_handed(data: bytes, key: str | None) -> Opened:
-    """The secret in a handed-over file (see `keyss.methods.handed`).
-
-    Raises WrongKeyError, InputError, and UsageError for a missing or unneeded key.
-    """
+def open_handed(data: bytes) -> Opened:
+    """The secret in a handed-over file (see `keyss.methods.handed`). Raises InputError."""
     from keyss.methods import handed
 
-    return _unpack(handed.unpack(data, key))
+    return _unpack(handed.unpack(data))
 
 
 def _unpack(content: Content) -> Opened:

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from keyss.core.errors import InputError, UsageError
-from keyss.files.formats.decoded import load_tensors
+from keyss.files.formats.decoded_models import load_tensors
 
 _ENTRY = "keyss"
 # Errors from reading a damaged header or damaged tensors.

@@ -1,4 +1,3 @@
-from .arguments import IGNORED as IGNORED, ONLY_VALUES as ONLY_VALUES
 from .backends import Backend as Backend, resolve_device as resolve_device
 from .difference import Viewpoints as Viewpoints, psnr_between as psnr_between
 from .orbit import (
@@ -9,6 +8,7 @@ from .orbit import (
     middle_and_radius as middle_and_radius,
     scene_of_model as scene_of_model,
 )
+from .rasterization_checks import IGNORED as IGNORED, ONLY_VALUES as ONLY_VALUES
 from .rasterize import rasterization as rasterization
 from .view import (
     contributions as contributions,

@@ -24,7 +24,8 @@ from keyss.core.scene import (
 )
 from keyss.core.similarity import up_direction
 from keyss.files.models import is_model_source
-from keyss.rendering.arguments import MAX_SIDE
+from keyss.kernels.memory import release
+from keyss.rendering.rasterization_checks import MAX_SIDE
 from keyss.rendering.view import render
 
 VIEWS = 96
@@ -73,6 +74,7 @@ def scene_of_model(
             views.append(View(camera, (image * 255).round().to(torch.uint8), image if test else None))
         else:
             views.append(View(camera, torch.zeros(0, 0, 3, dtype=torch.uint8)))
+    release()
     colors = ((model.sh[:, 0] * SH_C0 + 0.5).clamp(0, 1) * 255).round().to(torch.uint8)
     return Scene(
         name,

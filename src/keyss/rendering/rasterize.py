@@ -9,10 +9,10 @@ import torch
 from torch import Tensor
 
 from keyss.core import UsageError
-from keyss.rendering.arguments import check_arguments
 from keyss.rendering.backends import require_gsplat_cuda
-from keyss.rendering.cpu.layout import EPS2D_MIN
+from keyss.rendering.cpu.constants import EPS2D_MIN
 from keyss.rendering.cpu.rasterization import Settings, rasterize as rasterize_on_cpu
+from keyss.rendering.rasterization_checks import check_arguments
 
 
 def rasterization(

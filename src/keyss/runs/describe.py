@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from keyss.core.errors import InputError
-from keyss.files.foreign import what_it_is
-from keyss.files.reading import is_standard
+from keyss.files.file_kinds import identify_file
+from keyss.files.inputs import is_standard, open_input
 
 if TYPE_CHECKING:
-    from keyss.runs.config import FitMetrics, HideMetrics
+    from keyss.runs.run_records import FitMetrics, HideMetrics
 
 _NAMED = 10  # runs in a message
 Corner = tuple[float, ...]  # [3] world units
@@ -73,10 +73,10 @@ def info(path: str | Path) -> RunInfo | ModelInfo | SceneInfo:
 
 def _folder_info(path: Path) -> RunInfo | ModelInfo | SceneInfo:
     from keyss.files.scenes import load_scene
-    from keyss.files.trained import is_training, model_file
-    from keyss.runs.config import FitMetrics, HideMetrics
+    from keyss.files.training_outputs import is_training, model_file
     from keyss.runs.files import METRICS, MODEL, is_run, stego_in
-    from keyss.runs.records import read_record
+    from keyss.runs.json_records import read_record
+    from keyss.runs.run_records import FitMetrics, HideMetrics
 
     if stego_in(path).exists():
         return RunInfo("hiding", str(path), read_record(path / METRICS, HideMetrics))
@@ -112,7 +112,7 @@ def _model_info(path: Path) -> ModelInfo:
         if not (is_standard(path) or is_model_path(path)):
             raise InputError(
                 f"{path}: expected a model ({known_suffixes()}), a scene folder or a result folder, found "
-                f"{what_it_is(path)}"
+                f"{identify_file(path)}"
             )
         model = read_model(path)
         means, logits, sh_degree = model.means.numpy(), model.opacity_logits.numpy(), model.sh_degree
@@ -129,15 +129,19 @@ def _model_info(path: Path) -> ModelInfo:
 
 def _ply_rows(path: Path) -> tuple[Any, Any, int] | None:
     """Means, opacity logits and SH degree of a plain PLY file, without torch; None for other files."""
-    from keyss.files.ply_rows import is_compressed, read_rows
+    import numpy as np
 
-    if path.suffix.lower() != ".ply" or is_compressed(path):
+    from keyss.files.ply_rows import has_packed_header, read_rows
+
+    if path.suffix.lower() != ".ply":
         return None
-    with path.open("rb") as file:
-        if file.read(3) != b"ply":
+    with open_input(path) as file:
+        if has_packed_header(file) or file.read(3) != b"ply":
             return None
-    names, rows = read_rows(path)
-    return rows[:, :3], rows[:, names.index("opacity")], round(((len(names) - 11) // 3) ** 0.5) - 1
+        file.seek(0)
+        model = read_rows(file)
+        rows = np.concatenate([rows[:, [0, 1, 2, -8]] for rows, _ in model.blocks])
+    return rows[:, :3], rows[:, 3], round(((len(model.names) - 11) // 3) ** 0.5) - 1
 
 
 def _round(values: Iterable[Any]) -> tuple[float, ...]:

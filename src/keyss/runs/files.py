@@ -13,7 +13,7 @@ from keyss.core.errors import InputError, UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.picture_network import DecodedGaussians
 from keyss.core.scene import Scene, ViewOptions
-from keyss.files.foreign import what_it_is
+from keyss.files.file_kinds import identify_file
 from keyss.files.models import DECODED_SUFFIX, is_model_source, known_suffixes, read_model
 from keyss.methods.handed import SUFFIX
 from keyss.runs.folder import PRIVATE, PUBLISH
@@ -113,7 +113,7 @@ def as_scene(
         if os.path.exists(source) and not os.path.isdir(source):
             raise InputError(
                 f"{source}: expected a scene folder or a 3DGS model ({known_suffixes()}), found "
-                f"{what_it_is(Path(source))}"
+                f"{identify_file(Path(source))}"
             )
         try:
             return load_scene(source, **vars(views))

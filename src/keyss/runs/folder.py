@@ -23,7 +23,7 @@ from keyss.core.errors import InputError, OutputError, UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.files.atomic import check_not_an_input, lock, public_mode, write_bytes
 from keyss.files.models import write_model
-from keyss.runs.records import read_record, write_record
+from keyss.runs.json_records import read_record, write_record
 
 PUBLISH, PRIVATE = "publish", "private"
 MANIFEST = f"{PRIVATE}/manifest.json"

@@ -14,7 +14,6 @@ from keyss.methods import registry
 from keyss.methods.base import MethodOptions
 from keyss.methods.opened import Opened
 from keyss.rendering.orbit import is_model
-from keyss.runs.config import HideMetrics, RunConfig, read_config, secret_ids
 from keyss.runs.files import (
     CONFIG,
     METRICS,
@@ -26,8 +25,9 @@ from keyss.runs.files import (
     run_folder,
     stego_in,
 )
-from keyss.runs.records import read_record
+from keyss.runs.json_records import read_record
 from keyss.runs.revealing import read_handed
+from keyss.runs.run_records import HideMetrics, RunConfig, read_config, secret_ids
 
 
 @dataclass(frozen=True)
@@ -45,9 +45,9 @@ class HidingRun:
     @property
     def openers(self) -> list[Callable[[Gaussians], Opened]]:
         """Functions that open the secrets in a changed model; handed-over files do not change."""
-        if registry.get(self.config.method).capabilities.hands_over:
-            return [lambda _, secret=secret: secret for secret in self.opened]  # type: ignore[misc]
-        return [lambda stego, key=key: registry.open_model(stego, key) for key in self.keys]  # type: ignore[misc]
+        if registry.get(self.config.method).capabilities.keys:
+            return [lambda stego, key=key: registry.open_model(stego, key) for key in self.keys]  # type: ignore[misc]
+        return [lambda _, secret=secret: secret for secret in self.opened]  # type: ignore[misc]
 
     def scenes(self, *, train_pictures: bool = True) -> list[Scene]:
         """The cover and the secrets with their photos, or with renders of given models."""
@@ -83,18 +83,13 @@ def open_run(run: PathLike, keys: Sequence[str]) -> HidingRun:
     if len(sources) <= len(config.secrets):
         raise UsageError(f"{folder} was made from scenes in memory: there are no photos to evaluate against")
     stego = read_model(stego_in(folder))
-    capabilities = registry.get(config.method).capabilities
-    if not capabilities.keys:
-        if keys:
-            raise UsageError(f"the method {config.method} has no keys: give none")
-        keys = [""] * len(config.payloads)
-    if capabilities.hands_over:
-        opened = [
-            read_handed(folder / name, key or None)
-            for name, key in zip(handed_names(len(config.payloads)), keys, strict=False)
-        ]
-    else:
+    if registry.get(config.method).capabilities.keys:
         opened = [registry.open_model(stego, key) for key in keys]
+    elif keys:
+        raise UsageError(f"the method {config.method} has no keys: give none")
+    else:
+        keys = [""] * len(config.payloads)
+        opened = [read_handed(folder / name) for name in handed_names(len(keys))]
     names = secret_ids(config.options.fit.known_seed, opened)
     by_name = dict(zip(names, zip(opened, keys, strict=False), strict=True))
     if set(by_name) != set(config.payloads):

@@ -9,7 +9,7 @@ import torch
 
 from keyss.core.errors import InputError, UsageError
 from keyss.core.gaussians import DRAWN_OPACITY, Gaussians
-from keyss.files.reading import read_file
+from keyss.files.inputs import read_file
 from keyss.methods import handed as handing, registry
 from keyss.methods.opened import Frame, HiddenFile, Opened, OpensAFileError, Remains
 from keyss.runs.files import PathLike
@@ -69,7 +69,9 @@ def reveal_model(
     if handed is not None:
         if decoy:
             raise UsageError("files that are handed over have no decoys: leave out `decoy=True`")
-        opened = read_handed(handed, key)
+        if key is not None:
+            raise UsageError("files that are handed over have no keys: whoever has one sees the secret")
+        opened = read_handed(handed)
     elif key is None:
         raise UsageError("expected `key`, or `handed` for a file that was handed over")
     else:
@@ -116,18 +118,13 @@ def _count(remains: Remains) -> str:
     return f"{remains.found:,} of {remains.hidden:,} Gaussians of the secret were found"
 
 
-def read_handed(path: PathLike, key: str | None) -> Opened:
+def read_handed(path: PathLike) -> Opened:
     """Open the secret in a file that was handed over; see `registry.open_handed`."""
     data = read_file(Path(path), handing.MAX_BYTES)
     try:
-        return registry.open_handed(data, key)
+        return registry.open_handed(data)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
-
-
-def is_encrypted(path: PathLike) -> bool:
-    """True if a file that was handed over needs a key. Raises InputError."""
-    return handing.is_encrypted(read_file(Path(path), handing.MAX_BYTES))
 
 
 @dataclass(frozen=True)

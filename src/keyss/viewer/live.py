@@ -131,7 +131,6 @@ class LiveReporter(Reporter):
     def __init__(self, training: LiveTraining, reporter: Reporter, side: Side) -> None:
         self._training, self._reporter, self._side = training, reporter, side
         self._known: dict[str, Any] = {}
-        self.loss_every = reporter.loss_every
 
     def start(self, title: str, iterations: int, iteration: int) -> None:
         self._reporter.start(title, iterations, iteration)
@@ -140,8 +139,7 @@ class LiveReporter(Reporter):
 
     def update(self, iteration: int, gaussians: int, numbers: dict[str, float]) -> None:
         self._reporter.update(iteration, gaussians, numbers)
-        decibels = {name: value for name, value in numbers.items() if name != "loss"}
-        self._training.progress(**self._known, iteration=iteration, gaussians=gaussians, numbers=decibels)
+        self._training.progress(**self._known, iteration=iteration, gaussians=gaussians, numbers=numbers)
 
     def look(self, model: Callable[[], Gaussians]) -> None:
         self._training.look(self._side, model)

@@ -22,7 +22,7 @@ from urllib.parse import quote
 import keyss.files
 from keyss.core.errors import InputError, KeyssWarning, OutputError, UsageError
 from keyss.files.atomic import check_not_an_input, check_output_file, mode_like, write_bytes
-from keyss.files.trained import model_file
+from keyss.files.training_outputs import model_file
 from keyss.viewer.look import Look
 
 SCRIPT, STYLE, LICENCES, INDEX = "viewer.js", "viewer.css", "licences.txt", "index.html"

@@ -173,11 +173,8 @@ def test_a_thousand_random_keys_open_nothing() -> None:
             extract_derived(reader, DerivedKey(number.to_bytes(32, "big")))
 
 
-def test_all_one_character_neighbours_open_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    """All the way from the text, with an Argon2id that takes 64 KiB and one pass.
-
-    At full cost the same is done by `test_wrong_keys_at_full_cost`.
-    """
+def test_keys_of_one_other_character(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A sample, with an Argon2id of 64 KiB and one pass; `test_wrong_keys_at_full_cost` tries all."""
 
     def cheap(secret: bytes, salt: bytes, **costs: object) -> bytes:
         return hash_secret_raw(secret, salt, 1, 64, 1, 32, Type.ID)
@@ -187,7 +184,7 @@ def test_all_one_character_neighbours_open_nothing(monkeypatch: pytest.MonkeyPat
     assert extract(stego, GENERATED) == b"x"
     neighbours = _neighbours(GENERATED)
     assert len(neighbours) == 16 * 61 + 3
-    for neighbour in neighbours:
+    for neighbour in neighbours[::8]:
         with pytest.raises(WrongKeyError):
             extract(stego, neighbour)
 

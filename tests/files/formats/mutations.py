@@ -1,12 +1,12 @@
 """Damaged files: each must be read or raise an InputError, quickly and in little memory.
 
     python tests/files/formats/mutations.py --count 100000
-    python tests/files/formats/mutations.py --count 10000 --lies             # only those that lie about sizes
+    python tests/files/formats/mutations.py --count 10000 --false-sizes      # only these
     python tests/files/formats/mutations.py --count 10000 --only a.payload   # written by an attacker
 
-Files of every format are damaged at random, before and after packing: bits, bytes, words with extreme values,
-cuts, repeats, megabytes of zeros; every other file declares false sizes (`lies.py`). Failures are printed
-with the seed that repeats them.
+Damages files of every format at random, before and after compression: bits, bytes, extreme words, cuts,
+repeats, megabytes of zeros; every other file declares false sizes (`false_sizes.py`). Prints failures with a
+seed to repeat them.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 import numpy as np
 import torch
 
-from files.formats.lies import LIES, image
+from files.formats.false_sizes import FALSE_SIZES, image
 from keyss.core import Gaussians, InputError
 from keyss.core.picture_network import DecodedGaussians, PictureNetwork
 from keyss.files import load_scene, model_bytes, model_of_bytes
@@ -77,10 +77,10 @@ def _colmap() -> dict[str, bytes]:
     }
 
 
-def damaged(name: str, data: bytes, rng: np.random.Generator, lies: float = 0.5) -> bytes:
-    """Damage `data` inside or outside of its packing, or (in the share `lies`) give it false sizes."""
-    if name in LIES and rng.random() < lies:
-        return LIES[name](data, rng)
+def damaged(name: str, data: bytes, rng: np.random.Generator, false_sizes: float = 0.5) -> bytes:
+    """Damage `data` before or after compression, or, with probability `false_sizes`, declare false sizes."""
+    if name in FALSE_SIZES and rng.random() < false_sizes:
+        return FALSE_SIZES[name](data, rng)
     if rng.random() < 0.7:
         if data.startswith(b"\x1f\x8b"):
             return gzip.compress(_damage_bytes(gzip.decompress(data), rng), 1)
@@ -198,17 +198,18 @@ def main() -> int:
     parser.add_argument("--count", type=int, default=100_000)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", help="name of one kind of file")
-    parser.add_argument("--lies", action="store_true", help="only files that lie about sizes")
+    parser.add_argument("--false-sizes", action="store_true", help="only files with false sizes")
     asked = parser.parse_args()
     files = [(name, data) for name, every in examples().items() for data in every]
-    files = [each for each in files if asked.only in (None, each[0]) and (not asked.lies or each[0] in LIES)]
+    if asked.only or asked.false_sizes:
+        files = [each for each in files if each[0] in ([asked.only] if asked.only else FALSE_SIZES)]
     for name, data in files:
         assert attempt(name, data) is None, (name, attempt(name, data))
     failures, start = 0, time.perf_counter()
     for number in range(asked.count):
         name, data = files[number % len(files)]
         rng = np.random.default_rng([asked.seed, number])
-        mutated = damaged(name, data, rng, 1.0 if asked.lies else 0.5)
+        mutated = damaged(name, data, rng, 1.0 if asked.false_sizes else 0.5)
         if problem := attempt(name, mutated):
             failures += 1
             print(f"{name}, seed {asked.seed}, number {number}: {problem}", flush=True)

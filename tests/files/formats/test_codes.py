@@ -27,14 +27,14 @@ SEEDS, COUNTS, DEGREES = st.integers(0, 2**32 - 1), st.integers(1, 300), st.samp
 @pytest.mark.parametrize("kind", KINDS)
 @settings(max_examples=15, deadline=None)
 @given(SEEDS, COUNTS, DEGREES)
-def test_parsing_inverts_serialising(kind: str, seed: int, count: int, k: int) -> None:
+def test_codes_round_trip(kind: str, seed: int, count: int, k: int) -> None:
     codes = random_codes(kind, np.random.default_rng(seed), count, k)
     again = type(codes).parse(codes.serialise())
     assert again == codes
     assert is_finite(again.dequantise())
 
 
-def test_extensions_of_an_spz_are_kept() -> None:
+def test_spz_extensions_are_kept() -> None:
     for version in (3, 4):
         codes = replace(random_spz(np.random.default_rng(0), version, 9, 3), flags=2, extensions=b"\1\2\3")
         assert SpzCodes.parse(codes.serialise()) == codes
@@ -51,7 +51,7 @@ def settings_of(data: bytes) -> list[tuple[int, int]]:
 
 
 @pytest.mark.parametrize(("level", "memory"), [(6, 9), (1, 8)])
-def test_an_spz_is_compressed_again_as_it_was(level: int, memory: int) -> None:
+def test_spz_keeps_its_gzip_settings(level: int, memory: int) -> None:
     """Otherwise compressing its content once more would tell that it was changed."""
     codes = random_spz(np.random.default_rng(0), 3, 30_000, 3)
     content = zlib.decompress(codes.serialise(), 31)
@@ -65,7 +65,7 @@ def test_an_spz_is_compressed_again_as_it_was(level: int, memory: int) -> None:
     assert SpzCodes.parse(again) == replace(read, alphas=read.alphas ^ 1)
 
 
-def test_a_new_spz_is_compressed_as_by_niantics_library() -> None:
+def test_new_spz_has_niantics_gzip_settings() -> None:
     found = settings_of(SpzCodes.quantise(model_of(20_000, 1)).serialise())
     assert (6, 9) in found
     assert (6, 8) not in found
@@ -96,7 +96,7 @@ def spz_harmonics_bound(degree: int) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_errors_of_spz_are_half_a_step(degree: int) -> None:
+def test_quantisation_error_of_spz(degree: int) -> None:
     model = model_of(400, degree)
     found = SpzCodes.quantise(model).dequantise()
     assert worst(found.means, model.means) <= 0.5 / 4096 + 1e-6
@@ -109,7 +109,7 @@ def test_errors_of_spz_are_half_a_step(degree: int) -> None:
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_errors_of_compressed_ply_are_half_a_step_of_its_chunk(degree: int) -> None:
+def test_quantisation_error_of_compressed_ply(degree: int) -> None:
     model = model_of(600, degree)
     found = CompressedPlyCodes.quantise(model).dequantise()
     for start in range(0, 600, 256):
@@ -128,7 +128,7 @@ def test_errors_of_compressed_ply_are_half_a_step_of_its_chunk(degree: int) -> N
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_errors_of_sog(degree: int) -> None:
+def test_quantisation_error_of_sog(degree: int) -> None:
     model = model_of(400, degree)
     codes = SogCodes.quantise(model)
     found = codes.dequantise()
@@ -144,7 +144,7 @@ def test_errors_of_sog(degree: int) -> None:
 
 
 @pytest.mark.parametrize("reach", [1.0, 3000.0, 100_000.0, 8_000_000.0])
-def test_spz_makes_room_for_large_models(reach: float) -> None:
+def test_spz_precision_of_large_models(reach: float) -> None:
     model = model_of(30, 0)
     model = replace(model, means=model.means / model.means.abs().max() * reach)
     codes = SpzCodes.quantise(model)
@@ -155,7 +155,7 @@ def test_spz_makes_room_for_large_models(reach: float) -> None:
 @pytest.mark.filterwarnings("ignore:.*between which .spz holds scales")
 @pytest.mark.parametrize("scale", [1.0, 0.1, 0.001, 0.0001])
 @pytest.mark.parametrize("offset", [0.0, 3.0])
-def test_spz_is_as_precise_in_small_units(scale: float, offset: float) -> None:
+def test_spz_precision_in_small_units(scale: float, offset: float) -> None:
     """Positions keep 1/2048 of the median distance from the middle, as far as 24 bits reach."""
     model = model_of(2000, 0)
     log_scales = model.log_scales + math.log(scale)
@@ -168,7 +168,7 @@ def test_spz_is_as_precise_in_small_units(scale: float, offset: float) -> None:
     assert SpzCodes.parse(codes.serialise()) == codes
 
 
-def test_spz_refuses_models_that_are_too_large() -> None:
+def test_spz_position_limit() -> None:
     model = model_of(3, 0)
     with pytest.raises(OutputError, match="up to 8,388,607 world units"):
         SpzCodes.quantise(replace(model, means=model.means * 1e9))
@@ -195,7 +195,7 @@ def test_smallest_three(seed: int) -> None:
     assert np.abs(np.abs((again * quats).sum(axis=1)) - 1).max() < 1e-12
 
 
-def test_palettes_of_few_vectors() -> None:
+def test_small_palettes() -> None:
     vectors = np.random.default_rng(0).normal(size=(100, 9)).astype(np.float32)
     palette, labels = palette_of(vectors, 128)
     assert np.allclose(palette[labels], vectors)

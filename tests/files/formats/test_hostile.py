@@ -19,7 +19,7 @@ import torch
 
 from files.formats.examples import model_of
 from files.formats.mutations import attempt, damaged, examples
-from keyss.core import Gaussians, InputError, KeyssWarning
+from keyss.core import InputError, KeyssWarning
 from keyss.files import model_bytes, model_of_bytes, read_model, write_model
 
 MODEL = model_of(60, 1)
@@ -58,36 +58,19 @@ def test_truncated_files(name: str) -> None:
             model_of_bytes(name, data[:end])
 
 
-# --- counts that no file can hold ------------------------------------------------------------------------
-
-
 def legacy_spz(count: int, body: bytes = b"", *, version: int = 3, degree: int = 0, bits: int = 12) -> bytes:
     return gzip.compress(struct.pack("<4sIIBBBB", b"NGSP", version, count, degree, bits, 0, 0) + body)
 
 
-# --- bombs -----------------------------------------------------------------------------------------------
-
-
-def archive(files: dict[str, bytes], compression: int = zipfile.ZIP_STORED) -> bytes:
+def with_meta(change: Callable[[dict], object]) -> bytes:
+    """A .sog with a changed meta.json."""
     data = io.BytesIO()
-    with zipfile.ZipFile(data, "w", compression) as found:
-        for name, content in files.items():
-            found.writestr(name, content)
+    with zipfile.ZipFile(io.BytesIO(model_bytes("a.sog", MODEL))) as old, zipfile.ZipFile(data, "w") as new:
+        meta = json.loads(old.read("meta.json"))
+        change(meta)
+        for name in old.namelist():
+            new.writestr(name, json.dumps(meta) if name == "meta.json" else old.read(name))
     return data.getvalue()
-
-
-def contents(data: bytes) -> dict[str, bytes]:
-    with zipfile.ZipFile(io.BytesIO(data)) as found:
-        return {name: found.read(name) for name in found.namelist()}
-
-
-def with_meta(change: Callable[[dict], object], **files: bytes) -> bytes:
-    """A .sog with a changed meta.json, and optionally with changed files."""
-    inside = contents(model_bytes("a.sog", MODEL))
-    meta = json.loads(inside["meta.json"])
-    change(meta)
-    inside["meta.json"] = json.dumps(meta).encode()
-    return archive(inside | {f"{name}.webp": content for name, content in files.items()})
 
 
 @pytest.mark.parametrize(
@@ -108,14 +91,11 @@ def with_meta(change: Callable[[dict], object], **files: bytes) -> bytes:
         (lambda meta: meta.pop("version"), "expected SOG of version 2, found 1"),
     ],
 )
-def test_a_meta_json_that_lies(change: Callable[[dict], object], words: str) -> None:
+def test_inconsistent_meta_json(change: Callable[[dict], object], words: str) -> None:
     refused("a.sog", with_meta(change), words)
 
 
-# --- versions, and numbers that are none -----------------------------------------------------------------
-
-
-def test_versions_that_are_not_read() -> None:
+def test_unsupported_versions() -> None:
     refused("a.spz", legacy_spz(1, bytes(100), version=1), "version 1")
     refused("a.spz", legacy_spz(1, bytes(100), version=9), "version 2 or 3")
     refused("a.spz", legacy_spz(1, bytes(900), degree=4), "degree 0 to 3")
@@ -123,7 +103,7 @@ def test_versions_that_are_not_read() -> None:
     refused("a.spz", gzip.compress(b"something else entirely"), "the gzip data do not hold one")
 
 
-def one_left_out(name: str, data: bytes, attribute: str) -> None:
+def check_one_left_out(name: str, data: bytes, attribute: str) -> None:
     said = rf"^1 of {len(MODEL)} Gaussians are left out: they have NaN or infinite values \({attribute}\)$"
     with pytest.warns(KeyssWarning, match=said):
         found = model_of_bytes(name, data)
@@ -132,23 +112,21 @@ def one_left_out(name: str, data: bytes, attribute: str) -> None:
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-def test_numbers_that_are_not_finite(value: float) -> None:
+def test_nan_and_infinity(value: float) -> None:
     splat = bytearray(model_bytes("a.splat", MODEL))
     splat[4:8] = struct.pack("<f", value)
-    one_left_out("a.splat", bytes(splat), "means")
+    check_one_left_out("a.splat", bytes(splat), "means")
     compressed = model_bytes("a.compressed.ply", MODEL)
     at = compressed.index(b"end_header\n") + 11
     refused("a.ply", compressed[:at] + struct.pack("<f", value) + compressed[at + 4 :], "NaN or infinite")
     binary = model_bytes("a.glb", MODEL)
     at = binary.index(b"BIN\0") + 4
-    one_left_out("a.glb", binary[:at] + struct.pack("<f", value) + binary[at + 4 :], "means")
+    check_one_left_out("a.glb", binary[:at] + struct.pack("<f", value) + binary[at + 4 :], "means")
 
 
-# --- glTF ------------------------------------------------------------------------------------------------
-
-
-def with_json(change: Callable[[dict], object], model: Gaussians = MODEL) -> bytes:
-    data = model_bytes("a.glb", model)
+def with_json(change: Callable[[dict], object]) -> bytes:
+    """A .glb with changed JSON."""
+    data = model_bytes("a.glb", MODEL)
     (size,) = struct.unpack_from("<I", data, 12)
     document = json.loads(data[20 : 20 + size])
     change(document)
@@ -163,13 +141,13 @@ def with_json(change: Callable[[dict], object], model: Gaussians = MODEL) -> byt
     ("change", "words"),
     [
         (lambda gltf: gltf["nodes"][0].update(children=[0]), "its nodes are not a tree"),
-        (lambda gltf: gltf["nodes"][0].update(children=[7]), "a part that is not there"),
+        (lambda gltf: gltf["nodes"][0].update(children=[7]), "a missing part"),
         (lambda gltf: gltf["nodes"][0].update(scale=[1, 2, 1]), "by more than a similarity"),
         (lambda gltf: gltf["nodes"][0].update(scale=[0, 0, 0]), "by more than a similarity"),
         (lambda gltf: gltf["nodes"][0].update(rotation=[0, 0, 0, 0]), "no proper transform"),
-        (lambda gltf: gltf["nodes"][0].update(mesh=3), "a part that is not there"),
+        (lambda gltf: gltf["nodes"][0].update(mesh=3), "a missing part"),
         (lambda gltf: gltf["meshes"][0]["primitives"][0].pop("extensions"), "without Gaussians"),
-        (lambda gltf: gltf["accessors"][2].update(bufferView=99), "buffer view that is not there"),
+        (lambda gltf: gltf["accessors"][2].update(bufferView=99), "a missing buffer view"),
         (lambda gltf: gltf["accessors"][0].update(byteOffset=-4), "exceeds its buffer view"),
         (lambda gltf: gltf["accessors"][2].update(type="VEC3"), "4 numbers each"),
         (lambda gltf: gltf["accessors"][3].update(count=3), "different lengths"),
@@ -177,11 +155,11 @@ def with_json(change: Callable[[dict], object], model: Gaussians = MODEL) -> byt
         (lambda gltf: gltf["bufferViews"][0].update(byteOffset=10**9), "exceeds its buffer view"),
     ],
 )
-def test_a_gltf_that_lies(change: Callable[[dict], object], words: str) -> None:
+def test_inconsistent_gltf(change: Callable[[dict], object], words: str) -> None:
     refused("a.glb", with_json(change), words)
 
 
-def test_a_large_sparse_model_is_believed(tmp_path: Path) -> None:
+def test_small_files_may_hold_many_equal_gaussians(tmp_path: Path) -> None:
     """Up to 131,072 equal Gaussians may be compressed to any size."""
     model = MODEL[torch.zeros(100_000, dtype=torch.long)]
     write_model(tmp_path / "a.spz", replace(model))

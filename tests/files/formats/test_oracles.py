@@ -14,7 +14,7 @@ import torch
 from files.formats.examples import assert_close, model_of
 from keyss.core import Gaussians
 from keyss.files import read_model, write_model
-from keyss.files.formats import glb, spz
+from keyss.files.formats import glb
 from keyss.files.formats.compressed_ply import CompressedPlyCodes
 from keyss.files.formats.spz import SpzCodes
 
@@ -25,63 +25,36 @@ SOME_DEGREES = pytest.mark.parametrize("degree", [0, 3])
 
 @SOME_DEGREES
 @pytest.mark.parametrize("suffix", ["spz", "sog", "compressed.ply", "splat"])
-def test_splat_transform_reads_ours(
-    splat_transform: Transform, tmp_path: Path, suffix: str, degree: int
+@pytest.mark.parametrize("version", [2, 3])
+def test_splat_transform_reads_ours_and_we_read_its(
+    request: pytest.FixtureRequest, tmp_path: Path, version: int, suffix: str, degree: int
 ) -> None:
+    transform = request.getfixturevalue("splat_transform" if version == 2 else "splat_transform_3")
+    turned = suffix == "spz" and version == 3
     ours = tmp_path / f"ours.{suffix}"
     write_model(ours, model_of(600, degree))
-    found = read_model(ours)
-    back = read_model(splat_transform(ours, tmp_path / "back.ply"))
-    # A byte b of a rotation in a .splat is b / 127.5 - 1 to it, b / 128 - 1 to the format's own viewer.
-    assert_close(back, found, 1e-4 if suffix == "splat" else 1e-6)
-
-
-@SOME_DEGREES
-@pytest.mark.parametrize("suffix", ["spz", "sog", "compressed.ply"])
-def test_we_read_splat_transforms(
-    splat_transform: Transform, tmp_path: Path, suffix: str, degree: int
-) -> None:
-    write_model(tmp_path / "in.ply", model_of(600, degree))
-    options = ["-i", "1"] if suffix == "sog" else []
-    theirs = splat_transform(tmp_path / "in.ply", tmp_path / f"theirs.{suffix}", *options)
-    back = read_model(splat_transform(theirs, tmp_path / "back.ply"))
-    assert_close(read_model(theirs), back, 1e-6)
-
-
-@SOME_DEGREES
-@pytest.mark.parametrize("suffix", ["spz", "sog", "compressed.ply", "splat"])
-def test_splat_transform_3_reads_ours_and_we_read_its(
-    splat_transform_3: Transform, tmp_path: Path, suffix: str, degree: int
-) -> None:
-    ours = tmp_path / f"ours.{suffix}"
-    write_model(ours, model_of(600, degree))
-    there = splat_transform_3(ours, tmp_path / "there.ply")
+    there = transform(ours, tmp_path / "there.ply")
+    # It decodes a byte b of a rotation in a .splat as b / 127.5 - 1, the format's own viewer as b / 128 - 1.
     tolerance = 1e-4 if suffix == "splat" else 1e-6
-    assert_close(as_it_turns(read_model(there), suffix), read_model(ours), tolerance)
+    assert_close(rotate(read_model(there)) if turned else read_model(there), read_model(ours), tolerance)
     if suffix != "splat":
         options = ["-i", "1"] if suffix == "sog" else []
-        theirs = splat_transform_3(there, tmp_path / f"theirs.{suffix}", *options)
-        back = read_model(splat_transform_3(theirs, tmp_path / "back.ply"))
-        assert_close(as_it_turns(back, suffix), read_model(theirs), 1e-6)
+        theirs = transform(there, tmp_path / f"theirs.{suffix}", *options)
+        back = read_model(transform(theirs, tmp_path / "back.ply"))
+        assert_close(rotate(back) if turned else back, read_model(theirs), 1e-6)
 
 
-def as_it_turns(model: Gaussians, suffix: str) -> Gaussians:
-    """Version 3 takes the axes of an .spz for those of a .ply; version 2 and the format's library turn it.
-
-    By 180 degrees about x, as `dequantise` does with codes.
-    """
-    if suffix != "spz":
-        return model
-    signs = spz._SH_SIGNS[: model.sh.shape[1] - 1, None]
-    sh = torch.cat([model.sh[:, :1], model.sh[:, 1:] * torch.from_numpy(signs)], dim=1)
+def rotate(model: Gaussians) -> Gaussians:
+    """`model` rotated by 180 degrees about x: version 3 takes the axes of an .spz for those of a .ply."""
+    signs = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.float32)
+    rest = model.sh[:, 1:] * torch.from_numpy(signs[: model.sh.shape[1] - 1, None])
     means = model.means * torch.tensor([1.0, -1.0, -1.0])
-    return replace(model, means=means, quats=model.quats * torch.tensor([1.0, 1.0, -1.0, -1.0]), sh=sh)
+    quats = model.quats * torch.tensor([1.0, 1.0, -1.0, -1.0])
+    return replace(model, means=means, quats=quats, sh=torch.cat([model.sh[:, :1], rest], dim=1))
 
 
 @DEGREES
-def test_spz_has_the_codes_of_splat_transforms(
-    splat_transform: Transform, tmp_path: Path, degree: int
-) -> None:
+def test_spz_codes_match_splat_transform(splat_transform: Transform, tmp_path: Path, degree: int) -> None:
     """It uses the format's own library."""
     model = model_of(600, degree)
     write_model(tmp_path / "in.ply", model)
@@ -90,7 +63,7 @@ def test_spz_has_the_codes_of_splat_transforms(
 
 
 @DEGREES
-def test_compressed_ply_has_the_codes_of_splat_transforms(
+def test_compressed_ply_codes_match_splat_transform(
     splat_transform: Transform, tmp_path: Path, degree: int
 ) -> None:
     model = model_of(600, degree)
@@ -102,9 +75,7 @@ def test_compressed_ply_has_the_codes_of_splat_transforms(
     assert CompressedPlyCodes.quantise(model[order]) == codes
 
 
-def test_the_order_in_chunks_is_as_good_as_splat_transforms(
-    splat_transform: Transform, tmp_path: Path
-) -> None:
+def test_chunks_are_as_compact_as_splat_transforms(splat_transform: Transform, tmp_path: Path) -> None:
     model = model_of(5000, 0)
     write_model(tmp_path / "in.ply", model)
     theirs = splat_transform(tmp_path / "in.ply", tmp_path / "a.compressed.ply").read_bytes()
@@ -129,15 +100,10 @@ def of_gsply(data: gsply.GSData, *, turned: bool = False) -> Gaussians:
     """A model from gsply; `turned` rotates it from the frame of an .spz to that of a .ply."""
     n = len(data.means)
     rest = np.empty((n, 0, 3), np.float32) if data.shN is None else data.shN.reshape(n, -1, 3)
-    means, quats = data.means.copy(), data.quats.copy()
-    if turned:
-        means[:, 1:] *= -1
-        quats[:, 2:] *= -1
-        signs = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.float32)
-        rest = rest * signs[: rest.shape[1], None]
     sh = np.concatenate([data.sh0[:, None], rest], axis=1)
-    arrays = (means, quats, data.scales, data.opacities, sh)
-    return Gaussians(*(torch.from_numpy(np.ascontiguousarray(each, np.float32)) for each in arrays))
+    arrays = (data.means, data.quats, data.scales, data.opacities, sh)
+    model = Gaussians(*(torch.from_numpy(np.ascontiguousarray(each, np.float32)) for each in arrays))
+    return rotate(model) if turned else model
 
 
 GSPLY: dict[str, Callable[[Path], gsply.GSData]] = {
@@ -165,19 +131,11 @@ def test_we_read_gsplys_spz(tmp_path: Path, version: int, degree: int) -> None:
     assert_close(read_model(tmp_path / "a.spz"), theirs, 1e-5)
 
 
-def test_gsplys_spz_stays_as_it_is_but_for_its_codes(tmp_path: Path) -> None:
+def test_spz_of_other_programs_is_serialised_unchanged(splat_transform: Transform, tmp_path: Path) -> None:
     write_model(tmp_path / "in.ply", model_of(2000, 2))
     gsply.write_spz(tmp_path / "a.spz", gsply.plyread(tmp_path / "in.ply"), version=3)
-    data = (tmp_path / "a.spz").read_bytes()
-    assert SpzCodes.parse(data).serialise() == data
-
-
-def test_splat_transforms_spz_stays_as_it_is_but_for_its_codes(
-    splat_transform: Transform, tmp_path: Path
-) -> None:
-    write_model(tmp_path / "in.ply", model_of(2000, 2))
-    data = splat_transform(tmp_path / "in.ply", tmp_path / "a.spz").read_bytes()
-    assert SpzCodes.parse(data).serialise() == data
+    for path in (tmp_path / "a.spz", splat_transform(tmp_path / "in.ply", tmp_path / "b.spz")):
+        assert SpzCodes.parse(path.read_bytes()).serialise() == path.read_bytes()
 
 
 def test_we_read_gsplys_spz_of_version_2(tmp_path: Path) -> None:
@@ -200,7 +158,7 @@ def test_we_read_gsplys_compressed_ply(tmp_path: Path, degree: int) -> None:
 
 
 @DEGREES
-def test_glb_comes_back(degree: int) -> None:
+def test_glb_round_trip(degree: int) -> None:
     model = model_of(150, degree)
     found = glb.read(glb.write(model))
     assert_close(found, model, 1e-6)

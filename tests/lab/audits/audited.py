@@ -1,4 +1,4 @@
-"""A small run that was really hidden and audited, and changes of its record."""
+"""A small audited run, and changes of its record."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import copy
 import json
 import shutil
 import warnings
-from collections.abc import Callable
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -24,12 +24,12 @@ from test_api import CONFIG, write_nerfstudio
 from tiny_scenes import random_gaussians, tiny_scene
 
 KEYS = ("the key of a treasure", "the key of a map")
-# There are decoders then, and so there is something to be measured of wrong keys.
+# A method with decoders, for measures of wrong keys.
 JOINT = small("published", CONFIG.fit)
 
 
 def audited_run(root: Path) -> None:
-    """`run`: two secrets in a garden, 40 x 30 pixels, audited by all parts; one converter is missing."""
+    """Make `run`: two secrets in a garden, 40 x 30 pixels, audited by all parts; one converter is missing."""
     scenes = [
         write_nerfstudio(root / name, tiny_scene(seed))
         for seed, name in enumerate(("garden", "treasure", "map"))
@@ -96,15 +96,14 @@ def put(data: dict[str, Any], *changes: tuple[str, Any]) -> None:
         at[last] = value
 
 
-def with_all_texts(value: Any, text: str, keep: Callable[[str], bool]) -> Any:
-    """JSON with every text replaced but those under names to be kept."""
-    match value:
-        case str():
-            return text
-        case list():
-            return [with_all_texts(item, text, keep) for item in value]
-        case dict():
-            return {
-                name: item if keep(name) else with_all_texts(item, text, keep) for name, item in value.items()
-            }
+def with_all_texts(value: Any, text: str, keep: Collection[str]) -> Any:
+    """JSON with every text replaced, except under the names in `keep`."""
+    if isinstance(value, str):
+        return text
+    if isinstance(value, list):
+        return [with_all_texts(item, text, keep) for item in value]
+    if isinstance(value, dict):
+        return {
+            name: item if name in keep else with_all_texts(item, text, keep) for name, item in value.items()
+        }
     return value

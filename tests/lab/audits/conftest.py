@@ -9,13 +9,13 @@ from typing import Any
 import pytest
 
 from lab.audits.audited import audited_run, found_in
-from shared import made_once
+from shared import make_once
 
 
 @pytest.fixture(scope="session")
 def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run with a whole audit; tests must not change it, but may write its report."""
-    made = made_once(tmp_path_factory, "audited", audited_run)
+    made = make_once(tmp_path_factory, "audited", audited_run)
     return shutil.copytree(made / "run", tmp_path_factory.mktemp("audited") / "run")
 
 

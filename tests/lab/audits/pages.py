@@ -51,7 +51,7 @@ class Parsed(HTMLParser):
         return [value for found, value in self.attributes if found == name]
 
     def loads(self) -> list[str]:
-        """What attributes name that a browser would fetch or go to outside the page."""
+        """External URLs in attributes."""
         found = [value for name, value in self.attributes if name in _LOADING]
         return [value for value in found if not value.startswith(("#", "data:image/png;base64,"))]
 

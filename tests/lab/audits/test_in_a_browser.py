@@ -1,4 +1,4 @@
-"""The page in a real browser: nothing is fetched, the slider moves, paper shows all of it."""
+"""The report in a real browser."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ SLIDER = ".stage input >> nth=0"
 
 @pytest.fixture(scope="module")
 def report(run_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Of the audit with pictures of one colour each in its first slider."""
+    """A report with pictures of one colour each in its first slider."""
     data = found_in(run_folder)
     run = run_with(run_folder, tmp_path_factory.mktemp("coloured"), data)
     items = next(iter(data["images"]["pictures"].values()))
     for label, colour in {"photo": RED, "stego model": BLUE, "plain model": GREEN}.items():
-        Image.new("RGB", (40, 30), colour).save(run / "private" / "audit" / items[label])
+        Image.new("RGB", (40, 30), colour).save(run / "private" / "audit" / "pictures" / items[label])
     audit(run, report_only=True)
     return run / "private" / "report.html"
 
@@ -46,7 +46,7 @@ def page(chromium: playwright.Browser, report: Path) -> Iterator[playwright.Page
 
 
 def colours(page: playwright.Page) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """What the first stage shows a quarter and three quarters of its width from the left."""
+    """Colours of the first stage at a quarter and at three quarters of its width."""
     picture = Image.open(io.BytesIO(page.locator(".stage").first.screenshot())).convert("RGB")
     left, right = (
         picture.getpixel((int(share * picture.width), picture.height // 4)) for share in (0.25, 0.75)
@@ -56,9 +56,7 @@ def colours(page: playwright.Page) -> tuple[tuple[int, ...], tuple[int, ...]]:
     return left, right
 
 
-def test_it_opens_from_disk_without_complaints_or_requests(
-    chromium: playwright.Browser, report: Path
-) -> None:
+def test_opens_from_disk_without_errors_or_requests(chromium: playwright.Browser, report: Path) -> None:
     page = chromium.new_page()
     complaints: list[str] = []
     requests: list[str] = []
@@ -88,7 +86,7 @@ def test_the_slider_moves_with_the_keyboard(page: playwright.Page) -> None:
 
 
 @pytest.mark.slow
-def test_all_pictures_are_shown_without_scripts_and_on_paper(
+def test_pictures_without_scripts_and_in_print(
     chromium: playwright.Browser, page: playwright.Page, report: Path
 ) -> None:
     boxes = """[...document.querySelector('.compare').querySelectorAll('.shot')].map((shot) => {
@@ -111,7 +109,7 @@ def test_all_pictures_are_shown_without_scripts_and_on_paper(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("guarded", [True, False], ids=["with the policy", "without, as a control"])
-def test_markup_that_slipped_in_could_do_nothing(
+def test_injected_markup_is_harmless(
     page: playwright.Page, report: Path, tmp_path: Path, guarded: bool
 ) -> None:
     html = report.read_text()

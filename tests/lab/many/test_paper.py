@@ -1,4 +1,4 @@
-"""The paper's figures against each other, its claims against its figures, and the rule for both."""
+"""Consistency of the paper's figures and claims."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ AVERAGES = {
 
 
 def published(name: str) -> dict[str, dict[str, float | None]]:
-    """The paper's figures of a table, as if they had been measured."""
+    """The paper's figures of a table, in the form of measured ones."""
     table = TABLES[name]
     return {
         label: {measure: paper.mean_figure(table, figure) for measure, figure in run.figures.items()}
@@ -34,13 +34,13 @@ def published(name: str) -> dict[str, dict[str, float | None]]:
     }
 
 
-def test_averages_are_those_that_the_paper_prints() -> None:
+def test_averages_of_the_paper() -> None:
     figures = published("single")
     for (run, measure), average in AVERAGES.items():
         assert figures[run][measure] == pytest.approx(average, abs=0.0011), (run, measure)
 
 
-def test_sums_and_scores_follow_from_the_other_figures() -> None:
+def test_sums_and_scores_are_consistent() -> None:
     for mask, figures in published("masks").items():
         cover, secret, mean, distance, score = (value or 0.0 for value in figures.values())
         # The distance is printed with three digits; half a unit of the last is 0.026 of the score.
@@ -57,8 +57,8 @@ def test_sums_and_scores_follow_from_the_other_figures() -> None:
 
 
 @pytest.mark.parametrize("name", TABLES)
-def test_claims_hold_for_the_papers_own_figures(name: str) -> None:
-    """All but one: with two secrets a wrong key shows 16.5 dB of the bicycle instead of 22.5."""
+def test_claims_hold_for_published_figures(name: str) -> None:
+    """Except one: with two secrets, a wrong key shows 16.5 dB of the bicycle instead of 22.5."""
     found = {claim.text: paper.judge_claim(claim, published(name)) for claim in TABLES[name].claims}
     assert all(each.parts for each in found.values())
     exceptions = {text: each for text, each in found.items() if each.verdict != "holds"}

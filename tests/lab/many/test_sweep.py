@@ -1,10 +1,11 @@
-"""A sweep: what it refuses, what it runs once, and what is left where it was interrupted."""
+"""Sweeps: specifications, trials, tables."""
 
 from __future__ import annotations
 
 import csv
 import json
 import os
+import shutil
 import sys
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ from typing import Any
 import pytest
 
 import keyss as library
-from cli.said import Run
+from cli.harness import Run
 from keyss.core import BackendError, InputError
 from keyss.lab.many import Forecast, ManyResult, sweep
 from tiny_scenes import random_gaussians
@@ -35,7 +36,7 @@ def files(tmp_path: Path) -> Path:
 
 
 def run(*arguments: Any, **options: Any) -> ManyResult:
-    """A sweep that is no dry run."""
+    """Run a sweep."""
     found = sweep(*arguments, **options)
     assert isinstance(found, ManyResult)
     return found
@@ -62,21 +63,19 @@ def spec_of(folder: Path, text: str) -> Path:
         ("method: carry", "method: carrry", "Invalid enum value 'carrry'"),
         ("preset: quick", "preset: quik", "Invalid enum value 'quik'"),
         ("secrets: [b.ply]", "secrets: []", "length >= 1 - at `$.pairs[0].secrets`"),
-        ("methods:", "seeds: [1, 1]\nmethods:", "got one twice"),
+        ("methods:", "seeds: [1, 1]\nmethods:", "two are called 1"),
         ("methods:", "evaluate: [stelth]\nmethods:", "Invalid enum value 'stelth'"),
         ("methods:", "width: !!python/object/apply:os.system [ls]\nmethods:", "expected YAML"),
         ("{cover", "{{{cover", "expected YAML"),
         (
             "methods:",
             "  - {cover: b.ply, secrets: [a.ply], name: a-b}\nmethods:",
-            "pairs: two have the name 'a-b'",
+            "pairs: two are called 'a-b'",
         ),
-        ("methods:", "methods:\n  - {method: carry, preset: default}", "methods: two have the name 'carry'"),
+        ("methods:", "methods:\n  - {method: carry, preset: default}", "methods: two are called 'carry'"),
     ],
 )
-def test_what_is_wrong_in_a_specification_is_said_before_anything_runs(
-    files: Path, old: str, new: str, words: str
-) -> None:
+def test_invalid_specifications(files: Path, old: str, new: str, words: str) -> None:
     assert old in GOOD
     path = spec_of(files, GOOD.replace(old, new))
     with pytest.raises(InputError) as caught:
@@ -86,18 +85,17 @@ def test_what_is_wrong_in_a_specification_is_said_before_anything_runs(
 
 
 def write_spec(folder: Path, covers: list[str], seeds: int, more: str = "") -> Path:
-    """A sweep of files that need not be models."""
+    """A specification, and files for it that are no models."""
     for name in (*covers, "secret.ply"):
         if not (folder / name).exists():
             (folder / name).write_text(name)
     pairs = "\n".join(f"  - {{cover: {name}, secrets: [secret.ply]}}" for name in covers)
-    (folder / "master.txt").write_text("q7Rv2LxT9bWm4KzDq7Rv2L\n")
     text = f"pairs:\n{pairs}\nmethods:\n  - {{method: carry, options: {{publish: any}}}}\n"
     return spec_of(folder, f"{text}seeds: {list(range(seeds))}\n{more}")
 
 
 def real_spec(folder: Path, seeds: int) -> Path:
-    """A sweep of real models, of almost no size."""
+    """A specification with tiny models."""
     library.write_model(folder / "a.ply", random_gaussians(300, seed=0))
     library.write_model(folder / "secret.ply", random_gaussians(40, seed=1))
     return write_spec(folder, ["a.ply"], seeds, "width: 32\n")
@@ -108,10 +106,10 @@ def skipped(found: ManyResult) -> list[bool]:
 
 
 @fake_runs
-def test_every_cell_runs_once_and_equal_sweeps_have_equal_tables(tmp_path: Path) -> None:
+def test_trials_run_once_and_tables_are_deterministic(tmp_path: Path) -> None:
     spec = write_spec(tmp_path, ["a.ply", "b.ply"], seeds=3)
     first = run(spec, tmp_path / "out")
-    assert first.tables == ("results.csv", "cells.csv", "scenes.csv", "scenes.tex")
+    assert first.tables == ("results.csv", "trials.csv", "scenes.csv", "scenes.tex")
     assert skipped(first) == [False] * 6
     assert skipped(run(spec, tmp_path / "out")) == [True] * 6
     run(spec, tmp_path / "other")
@@ -132,31 +130,24 @@ def test_every_cell_runs_once_and_equal_sweeps_have_equal_tables(tmp_path: Path)
         ("a", "cover", "31.0", "1.0", ""),
         ("secret", "secret", "20.0", "0.0", ""),
     ]
-    assert "seconds" not in (tmp_path / "out" / "cells.csv").read_text()  # they differ from run to run
+    assert "seconds" not in (tmp_path / "out" / "trials.csv").read_text()  # they differ from run to run
 
 
 @fake_runs
-def test_a_cell_runs_again_when_its_files_options_or_result_changed(tmp_path: Path) -> None:
+def test_changed_files_and_options(tmp_path: Path) -> None:
     spec = write_spec(tmp_path, ["a.ply"], seeds=2)
     out = tmp_path / "out"
-    cells = [each.folder for each in run(spec, out).outcomes]
-    (cells[0] / "run" / "publish" / "model.ply").unlink()
-    assert skipped(run(spec, out)) == [False, True]
-    written = (cells[0] / "result.json").stat().st_mtime
-    os.utime(tmp_path / "a.ply", (written + 5, written + 5))
     assert skipped(run(spec, out)) == [False, False]
-    os.utime(tmp_path / "a.ply", (written - 5, written - 5))
-    spec.write_text(spec.read_text().replace("publish: any", "publish: any, prune_to_fit: true"))
+    os.utime(tmp_path / "a.ply", (5, 5))
+    assert skipped(run(spec, out)) == [False, False]
+    spec.write_text(spec.read_text().replace("publish: any", "publish: any, refit: never"))
     assert skipped(run(spec, out)) == [False, False]
     assert skipped(run(spec, out)) == [True, True]
-    assert len(list((out / "cells").iterdir())) == 4
 
 
 @fake_runs
-def test_a_cell_that_fails_does_not_end_the_others(
-    tmp_path: Path, keyss: Run, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Neither with an error that keyss expects nor with another."""
+def test_failed_trials(tmp_path: Path, keyss: Run, capsys: pytest.CaptureFixture[str]) -> None:
+    """Errors of users and internal errors."""
     spec = write_spec(tmp_path, ["broken.ply", "odd.ply", "a.ply"], seeds=1)
     broken, odd, good = run(spec, tmp_path / "out").outcomes
     assert "nothing of it can be read" in str(broken.error)
@@ -165,19 +156,19 @@ def test_a_cell_that_fails_does_not_end_the_others(
     assert (good.error, good.result.numbers["cover.psnr"]) == (None, 30)
     said = keyss("sweep", spec, "-o", tmp_path / "out")
     assert said.status == 4
-    assert "1 of 3 cells are done" in said.out
+    assert "1 of 3 trials are done" in said.out
     assert "failed: broken-secret carry seed 0: " in said.out
 
 
-def test_the_key_of_a_cell_opens_it(tmp_path: Path, keyss: Run) -> None:
-    (cell,) = run(real_spec(tmp_path, 1), tmp_path / "out").outcomes
-    name, master = f"cell/{cell.folder.name}/1", tmp_path / "out" / "private" / "master-key.txt"
+def test_key_of_a_trial(tmp_path: Path, keyss: Run) -> None:
+    (trial,) = run(real_spec(tmp_path, 1), tmp_path / "out").outcomes
+    name, master = f"trial/{trial.folder.name}/1", tmp_path / "out" / "private" / "master-key.txt"
     key = keyss("keygen", "--asset", name, "--master-key-file", master).out.strip()
-    assert len(library.reveal(cell.folder / "run" / "publish" / "model.ply", key).gaussians) == 40
-    assert json.loads((cell.folder / "cell.json").read_text())["method"] == "carry"
+    assert len(library.reveal(trial.folder / "run" / "publish" / "model.ply", key).gaussians) == 40
+    assert json.loads((trial.folder / "trial.json").read_text())["method"] == "carry"
 
 
-def test_a_dry_run_writes_nothing_and_names_what_cannot_work(keyss: Run, tmp_path: Path) -> None:
+def test_dry_run(keyss: Run, tmp_path: Path) -> None:
     spec, out = real_spec(tmp_path, 2), tmp_path / "out"
     before = sorted(tmp_path.rglob("*"))
     found = sweep(spec, out, dry_run=True)
@@ -199,15 +190,16 @@ def test_a_dry_run_writes_nothing_and_names_what_cannot_work(keyss: Run, tmp_pat
 @pytest.mark.slow
 @pytest.mark.filterwarnings("default")
 @pytest.mark.argon2  # as in the processes of Ray
-def test_a_local_cluster_does_the_same_cells(tmp_path: Path) -> None:
+def test_local_ray_cluster(tmp_path: Path) -> None:
     pytest.importorskip("ray", reason="ray is not installed")
     spec = real_spec(tmp_path, 2)
     (tmp_path / "broken.ply").write_text("no model")
     spec.write_text(
         spec.read_text().replace("methods:", "  - {cover: broken.ply, secrets: [a.ply]}\nmethods:")
     )
-    here = run(spec, tmp_path / "here", master_key_file=tmp_path / "master.txt")
-    there = run(spec, tmp_path / "there", master_key_file=tmp_path / "master.txt", ray="local")
+    here = run(spec, tmp_path / "here")
+    shutil.copytree(tmp_path / "here" / "private", tmp_path / "there" / "private")
+    there = run(spec, tmp_path / "there", ray="local")
     assert [each.error for each in there.outcomes] == [each.error for each in here.outcomes]
     assert len(there.errors) == 2
     for name in here.tables:
@@ -215,7 +207,7 @@ def test_a_local_cluster_does_the_same_cells(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("package", "ray"), [("ray", "local"), ("yaml", None)])
-def test_without_a_package_one_sentence_says_what_to_install(
+def test_missing_packages(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, package: str, ray: str | None
 ) -> None:
     monkeypatch.setitem(sys.modules, package, None)

@@ -1,4 +1,4 @@
-"""Files as careless ways of hiding leave them, each with one tell, and plain models."""
+"""Files with one detectable weakness each, and plain models."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def plain(seed: int, count: int = COUNT) -> Gaussians:
     def normal(*shape: int) -> torch.Tensor:
         return torch.randn(*shape, generator=generator, dtype=torch.float64)
 
-    # In double precision and rounded once: single precision ends in other bits on other processors.
+    # Double precision, rounded once: single precision gives other last bits on other processors.
     strength = torch.exp(2.0 * normal(count, 1, 1) - 3.0)
     sh = torch.cat([model.sh[:, :1], (model.sh[:, 1:] * strength).float()], dim=1)
     # Low bits of their own, for subtracting leaves zeros in numbers near 0.
@@ -34,12 +34,12 @@ def plain(seed: int, count: int = COUNT) -> Gaussians:
 
 
 def plain_rounded(seed: int) -> Gaussians:
-    """By a trainer that rounds steps."""
+    """A plain model of a trainer that rounds steps."""
     return rounded(plain(seed), seed)
 
 
 def overwritten(model: Gaussians, seed: int = 0, bits: int = 8) -> Gaussians:
-    """New bits 1 to `bits` in scales, quaternions, opacities and harmonics, wherever they are."""
+    """Random bits 1 to `bits` in all scales, quaternions, opacities and harmonics."""
     random = np.random.default_rng(seed)
 
     def new(values: torch.Tensor) -> torch.Tensor:
@@ -58,26 +58,26 @@ def overwritten(model: Gaussians, seed: int = 0, bits: int = 8) -> Gaussians:
 
 
 def normalised(model: Gaussians) -> Gaussians:
-    """As tools leave quaternions that normalise them."""
+    """Unit quaternions, as some tools write them."""
     return replace(model, quats=torch.nn.functional.normalize(model.quats.double(), dim=1).float())
 
 
 def grey(model: Gaussians) -> Gaussians:
-    """A third of the Gaussians without colours in their harmonics, as of a grey wall."""
+    """A third of the Gaussians with grey harmonics."""
     sh = model.sh.clone()
     sh[::3, 1:] = sh[::3, 1:, :1]
     return replace(model, sh=sh)
 
 
 def with_siblings(model: Gaussians) -> Gaussians:
-    """Every tenth Gaussian split just before the end: its half shares all but position and scale."""
+    """Split every tenth Gaussian: halves differ in position and scale only."""
     halves = model[::10]
     moved = replace(halves, means=halves.means + 1e-3, log_scales=halves.log_scales - 0.47)
     return Gaussians.cat([model, moved])
 
 
 def banded(model: Gaussians, *secrets: Gaussians) -> Gaussians:
-    """Secrets at the end of the file, each too faint to be drawn, in a band of its own, in another frame."""
+    """Append secrets with invisible opacities, each in its own band and frame."""
     turned = []
     for index, secret in enumerate(secrets):
         logits = -8.2 - 3.7 * index + 0.25 * secret.opacity_logits.clamp(-4, 6)

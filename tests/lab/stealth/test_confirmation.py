@@ -1,4 +1,4 @@
-"""Scores of candidates tell the hidden one where a file shows it, and none where it does not."""
+"""Candidate scores confirm identical Gaussians, but not carried secrets."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from methods.carry.carried import embed_derived
 SECRETS = 4
 
 
-def test_identical_high_bits_confirm() -> None:
+def test_identical_high_bits() -> None:
     file = overwritten(plain(1))
     assert candidate_scores(file, plain(1))["identical high bits"] == 1
     assert candidate_scores(file, plain(2))["identical high bits"] == 0
@@ -23,7 +23,7 @@ def test_identical_high_bits_confirm() -> None:
 
 
 def test_carried_secrets_are_not_confirmed() -> None:
-    """Nearly chance for each score: half of 24 cases are right."""
+    """Embedding does not change the scores of candidates."""
     candidates = [plain(10 + index, 700) for index in range(SECRETS)]
     covers = [plain(index) for index in range(SECRETS)]
     before = [

@@ -1,4 +1,4 @@
-"""A file against control models: careless ones are unusual, plain ones are not. Trees predict bits."""
+"""A file against control models: weak ones are unusual, plain ones are not."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from lab.stealth.careless import banded, normalised, overwritten, plain, plain_r
 LIMIT = 0.01
 
 
-def test_a_plain_model_is_usual() -> None:
+def test_plain_model_passes() -> None:
     found = judge(plain(9), [plain(seed) for seed in range(3)], candidates=[plain(20, 800), None])
     assert found.least > LIMIT
     assert found.least_of_controls > LIMIT
@@ -20,7 +20,7 @@ def test_a_plain_model_is_usual() -> None:
     assert (found.invisible_groups, found.changed_low_bits) == (0, 0)
 
 
-def test_new_bits_of_a_rounding_trainer_are_unusual() -> None:
+def test_new_bits_after_a_rounding_trainer() -> None:
     cover = plain_rounded(9)
     found = judge(overwritten(cover), [plain_rounded(seed) for seed in range(3)], original=cover)
     assert found.least < 1e-6
@@ -28,13 +28,13 @@ def test_new_bits_of_a_rounding_trainer_are_unusual() -> None:
     assert found.changed_low_bits == 1
 
 
-def test_broken_unit_quaternions_are_unusual() -> None:
+def test_broken_unit_quaternions() -> None:
     found = judge(overwritten(normalised(plain(9))), [normalised(plain(seed)) for seed in range(3)])
     assert found.least < 1e-6
     assert "unit" in found.statistics[0].name
 
 
-def test_secrets_in_a_band_are_unusual_counted_and_confirmed() -> None:
+def test_secret_in_a_band() -> None:
     secret = plain(20, 800)
     found = judge(banded(plain(9), secret), [plain(seed) for seed in range(4)], candidates=[secret])
     assert found.least < 1e-6
@@ -42,6 +42,6 @@ def test_secrets_in_a_band_are_unusual_counted_and_confirmed() -> None:
     assert found.least_confirmation < LIMIT
 
 
-def test_it_takes_two_controls() -> None:
+def test_fewer_than_two_controls() -> None:
     with pytest.raises(UsageError, match="at least two"):
         judge(plain(1), [plain(2)])

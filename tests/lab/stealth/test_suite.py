@@ -1,4 +1,4 @@
-"""Every detector finds the tell that it is made for, and nothing in plain models."""
+"""Every detector finds its own kind of weakness, and nothing in plain models."""
 
 from __future__ import annotations
 
@@ -49,7 +49,9 @@ def p(name: str, model: Gaussians) -> float:
         ("invariants: repeated values, sh3", lambda seed: with_siblings(plain(seed))),
     ],
 )
-def test_new_low_bits_where_they_were_not_random(name: str, natural: Callable[[int], Gaussians]) -> None:
+def test_new_low_bits_are_detected_where_old_ones_were_not_random(
+    name: str, natural: Callable[[int], Gaussians]
+) -> None:
     model = natural(1)
     sealed = overwritten(model, bits=8)
     if "sharers" in name:
@@ -59,8 +61,8 @@ def test_new_low_bits_where_they_were_not_random(name: str, natural: Callable[[i
     assert z(name, model, natural(2)) < 4.5
 
 
-def test_low_bits_that_were_random_stay_so() -> None:
-    """The control of the test above: the same change, where there was nothing to destroy."""
+def test_random_low_bits_may_be_replaced() -> None:
+    """The control: the same change where bits were random before."""
     model = plain(1)
     before, after = stealth_statistics(model), stealth_statistics(overwritten(model))
     for name in before:
@@ -69,8 +71,8 @@ def test_low_bits_that_were_random_stay_so() -> None:
             assert abs(one.value - two.value) < 5 * (one.error**2 + (two.error or 0) ** 2) ** 0.5, name
 
 
-def test_exact_nulls_hold_in_models_with_random_bits() -> None:
-    """Of many p-values over some models about as many are small as should be."""
+def test_exact_nulls() -> None:
+    """Small p-values are as frequent as expected."""
     values = [
         each.p
         for seed in range(4)
@@ -82,7 +84,7 @@ def test_exact_nulls_hold_in_models_with_random_bits() -> None:
     assert min(values) > 0.01 / len(values)
 
 
-def test_secrets_in_bands_are_seen_and_counted() -> None:
+def test_bands_of_invisible_gaussians_are_counted() -> None:
     one, two = banded(plain(1), plain(2)), banded(plain(1), plain(2), plain(3))
     assert stealth_statistics(plain(1))["opacities: share of opacities, invisible"].value == 0
     assert stealth_statistics(one)["opacities: share of opacities, invisible"].value > 0.4
@@ -90,7 +92,7 @@ def test_secrets_in_bands_are_seen_and_counted() -> None:
     assert [judge(model, controls).invisible_groups for model in (plain(1), one, two)] == [0, 1, 2]
 
 
-def test_an_order_that_is_not_the_trainers_is_seen() -> None:
+def test_order_of_rows() -> None:
     name = "order: row and size, correlation"
     assert p(name, plain(1)) < 1e-20
     assert p(name, shuffled(plain(1))) > 1e-4
@@ -105,7 +107,7 @@ def test_small_models_have_fewer_statistics(count: int) -> None:
     assert set(some) < set(every)
 
 
-def test_frozen_values_of_clones_are_found_by_channel() -> None:
+def test_frozen_values_of_clones() -> None:
     """Harmonics of one channel, and saturated opacities, that differ after careless embedding alone."""
     model = plain(1)
     model.opacity_logits[:200] = 17.3

@@ -56,7 +56,7 @@ def test_round_trip(cover: Gaussians, secret: Gaussians) -> None:
 
 @pytest.mark.parametrize("cover_degree", [1, 3])
 @pytest.mark.parametrize("secret_degree", range(4))
-def test_every_degree_in_every_degree_that_has_the_room(cover_degree: int, secret_degree: int) -> None:
+def test_sh_degrees(cover_degree: int, secret_degree: int) -> None:
     model, hidden = trained_like(3000, sh_degree=cover_degree), trained_like(900, 1, secret_degree)
     own = keys()
     if (cover_degree, secret_degree) in ((1, 1), (1, 2), (1, 3)):
@@ -68,14 +68,14 @@ def test_every_degree_in_every_degree_that_has_the_room(cover_degree: int, secre
     assert len(carried.gaussians) == 900
 
 
-def test_a_cover_without_spherical_harmonics_is_refused() -> None:
+def test_cover_without_harmonics() -> None:
     with pytest.raises(UsageError, match="room for records of 0 bytes"):
         embed_derived(trained_like(1500, sh_degree=0), [(keys(), trained_like(50, 1, 0))])
     with pytest.raises(WrongKeyError):
         extract_derived(QuietReader.of(trained_like(50, sh_degree=0)), keys()[0])
 
 
-def test_every_usable_gaussian_is_written_whether_it_carries_or_not(cover: Gaussians) -> None:
+def test_every_usable_gaussian_is_written(cover: Gaussians) -> None:
     """So what the holder of one key sees does not depend on what else is hidden."""
     own, other = keys(1), keys(2)
     hidden = [trained_like(800, 5), trained_like(900, 6)]
@@ -96,7 +96,7 @@ def test_every_usable_gaussian_is_written_whether_it_carries_or_not(cover: Gauss
     assert seen[0] == seen[1]
 
 
-def test_two_secrets_open_with_their_own_keys_only(cover: Gaussians) -> None:
+def test_two_secrets(cover: Gaussians) -> None:
     """Two fifths of the cover each, as 40,000 and 40,000 in 100,000."""
     hidden, own = [trained_like(1200, 5), trained_like(1200, 6)], [keys(1), keys(2)]
     stego = embed_derived(cover, list(zip(own, hidden, strict=True)))
@@ -107,7 +107,7 @@ def test_two_secrets_open_with_their_own_keys_only(cover: Gaussians) -> None:
         embed_derived(cover, [(own[0], hidden[0]), (own[0], hidden[1])])
 
 
-def test_every_random_draw_depends_on_the_entropy_only(cover: Gaussians, secret: Gaussians) -> None:
+def test_randomness_comes_from_entropy(cover: Gaussians, secret: Gaussians) -> None:
     own = keys()
     same = [embed_derived(cover, [(own, secret)], entropy=ENTROPY) for _ in range(2)]
     assert same_bits(*same)
@@ -118,9 +118,7 @@ def test_every_random_draw_depends_on_the_entropy_only(cover: Gaussians, secret:
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_shuffling_changes_nothing_and_pruning_loses_one_for_one(
-    cover: Gaussians, secret: Gaussians, seed: int
-) -> None:
+def test_shuffling_and_pruning(cover: Gaussians, secret: Gaussians, seed: int) -> None:
     own = keys()
     stego = embed_derived(cover, [(own, secret)], entropy=ENTROPY)
     whole = rows_of(extract_derived(QuietReader.of(stego), own[0]).gaussians)
@@ -136,7 +134,7 @@ def test_shuffling_changes_nothing_and_pruning_loses_one_for_one(
     assert len(carried.gaussians) == pytest.approx(expected, abs=4 * (0.19 * 1200) ** 0.5)
 
 
-def test_a_single_bit_costs_one_carrier_at_most(cover: Gaussians, secret: Gaussians) -> None:
+def test_bit_flip_loses_one_carrier(cover: Gaussians, secret: Gaussians) -> None:
     """Any bit of any value: low ones, high ones, positions; through the whole key, both salts included."""
     stego = embed(cover, [(KEY, secret)], entropy=ENTROPY)
     own = list(QuietReader.of(stego).keys(KEY))[:3]
@@ -171,9 +169,7 @@ def _with_flipped_bit(model: Gaussians, row: int, column: int, bit: int) -> Gaus
     raise AssertionError("no such column")
 
 
-def test_strangers_in_the_places_of_the_first_salts_do_not_lock_out_the_key(
-    stego: Gaussians, secret: Gaussians
-) -> None:
+def test_foreign_gaussians_do_not_block_salts(stego: Gaussians, secret: Gaussians) -> None:
     """Three added Gaussians come before all of the model's own in the order of salts."""
     own = QuietReader.of(stego).salts
     added = trained_like(200, seed=9)

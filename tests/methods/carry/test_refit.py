@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +12,7 @@ import keyss
 from channels.quiet.trained_like import trained_like
 from keyss import CarryOptions, FitConfig, Secret
 from keyss.channels import identities
-from keyss.core import Gaussians, KeyssWarning, Scene, UsageError
+from keyss.core import Gaussians, KeyssWarning, Scene
 from keyss.methods import Source, Training, most_contributing, registry
 from methods.hiding import check_resumes, hide_scenes, psnr_in, three_scenes
 from tiny_scenes import random_gaussians, tiny_scene
@@ -25,18 +24,18 @@ KEYS = ("first key", "second key")
 PHOTOS = Source(None, photos=True)
 
 
-def _prepared(options: CarryOptions, *sources: Source) -> CarryOptions:
+def _prepare(options: CarryOptions, *sources: Source) -> CarryOptions:
     found: CarryOptions = registry.get("carry").prepare(sources, options)
     return found
 
 
-def _given(model: Gaussians, photos: bool = False) -> Source:
+def _source(model: Gaussians, photos: bool = False) -> Source:
     return Source(model, photos)
 
 
-def test_given_models_that_fit_are_carried_as_they_are() -> None:
+def test_no_refit_when_secret_fits() -> None:
     cover, secret = trained_like(2500), trained_like(900, 1, 2)
-    found = _prepared(CarryOptions(), _given(cover), _given(secret))
+    found = _prepare(CarryOptions(), _source(cover), _source(secret))
     assert found.refits == (0,)
     assert not found.trains
     result = keyss.hide(cover, [Secret(secret, KEY)], width=24)
@@ -45,15 +44,15 @@ def test_given_models_that_fit_are_carried_as_they_are() -> None:
     assert (len(revealed), revealed.sh_degree) == (900, 2)
 
 
-def test_too_large_models_are_refitted_for_a_short_time_without_photos() -> None:
+def test_refit_steps() -> None:
     cover, small, large = trained_like(2500), trained_like(300, 1), trained_like(6000, 2)
     options = CarryOptions(fit=FIT)
-    assert _prepared(options, _given(cover), _given(large)).refits == (400,)
-    assert _prepared(options, _given(cover), _given(large, photos=True)).refits == (1150,)
+    assert _prepare(options, _source(cover), _source(large)).refits == (400,)
+    assert _prepare(options, _source(cover), _source(large, photos=True)).refits == (1150,)
     with pytest.warns(KeyssWarning, match="other secrets"):
-        assert _prepared(options, _given(cover), _given(small), _given(large)).refits == (0, 400)
+        assert _prepare(options, _source(cover), _source(small), _source(large)).refits == (0, 400)
     asked = options.with_fit(iterations=900)
-    assert _prepared(asked, _given(cover), _given(large)).refits == (900,)
+    assert _prepare(asked, _source(cover), _source(large)).refits == (900,)
     result = keyss.hide(
         cover, [Secret(large, KEY)], method=options.with_fit(iterations=2), width=24, min_psnr=0
     )
@@ -61,31 +60,24 @@ def test_too_large_models_are_refitted_for_a_short_time_without_photos() -> None
     assert (len(keyss.reveal(result.stego, KEY).gaussians),) == result.metrics.secret_gaussians
 
 
-def test_refits_that_are_asked_for_or_ruled_out() -> None:
+def test_refit_option() -> None:
     cover, secret, large = trained_like(2500), trained_like(900, 1), trained_like(6000, 2)
     always, never = CarryOptions(refit="always"), CarryOptions(refit="never")
-    assert _prepared(always, _given(cover), _given(secret)).refits == (400,)
-    assert _prepared(never, _given(cover), _given(secret)).refits == (0,)
-    with pytest.raises(UsageError, match=r"room for .*`prune_to_fit=True`"):
-        _prepared(never, _given(cover), _given(large))
-    for pruning in (CarryOptions(prune_to_fit=True), replace(never, prune_to_fit=True)):
-        assert _prepared(pruning, _given(cover), _given(large)).refits == (0,)
-    with pytest.raises(UsageError, match="prune_to_fit"):
-        replace(always, prune_to_fit=True)
+    assert _prepare(always, _source(cover), _source(secret)).refits == (400,)
+    assert _prepare(never, _source(cover), _source(secret)).refits == (0,)
+    assert _prepare(never, _source(cover), _source(large)).refits == (0,)
 
 
 @pytest.mark.parametrize(("format", "secrets"), [("ply", 3), ("spz", 1)])
-def test_where_room_is_short_secrets_are_refitted(format: str, secrets: int) -> None:
+def test_refit_from_photos(format: str, secrets: int) -> None:
     options = CarryOptions(fit=FIT, format=format)  # type: ignore[arg-type]
-    warned = pytest.warns(KeyssWarning, match="other secrets") if secrets > 1 else nullcontext()
-    with warned:
-        found = _prepared(options, *[PHOTOS] * (1 + secrets))
+    found = _prepare(options, *[PHOTOS] * (1 + secrets))
     assert found.refits == (1150,) * secrets
     assert [each.iterations for each in found.fits(1 + secrets)] == [1000] * (1 + secrets)
     assert found.training(1 + secrets) == (Training(), *[Training(1150)] * secrets)
 
 
-def test_what_adds_nothing_to_the_pictures_is_left_out_first() -> None:
+def test_most_contributing() -> None:
     """Behind a wall, out of every view, transparent."""
     plain = random_gaussians(seed=0)
     wall = replace(plain, opacity_logits=torch.full((200,), 5.0))
@@ -97,7 +89,7 @@ def test_what_adds_nothing_to_the_pictures_is_left_out_first() -> None:
     assert (chosen.opacity_logits == 5).all()
 
 
-def test_two_secrets_are_refitted_to_their_shares() -> None:
+def test_refit_two_secrets() -> None:
     scenes, models = three_scenes()
     fit = replace(TINY, iterations=30, max_gaussians=3200)
     options = CarryOptions(fit=fit, refit="always")
@@ -109,7 +101,7 @@ def test_two_secrets_are_refitted_to_their_shares() -> None:
         assert psnr_in(revealed, scene) > 26
 
 
-def test_an_interrupted_refit_resumes_to_the_same_result(tmp_path: Path) -> None:
+def test_resume_refit(tmp_path: Path) -> None:
     check_resumes(CarryOptions(fit=TINY, refit="always"), tmp_path, "refit")
 
 
@@ -119,7 +111,7 @@ def pair() -> tuple[list[Scene], list[Gaussians]]:
     return [scenes[0], scenes[2]], [random_gaussians(1500, seed=0), random_gaussians(200, seed=2)]
 
 
-def test_what_the_cover_becomes_does_not_depend_on_the_secret_or_the_key(
+def test_cover_is_independent_of_secret_and_key(
     pair: tuple[list[Scene], list[Gaussians]],
 ) -> None:
     """But for low bits: whoever asks what the file says of the secret asks of those only."""

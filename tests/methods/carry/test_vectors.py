@@ -21,7 +21,7 @@ VECTOR = json.loads((FOLDER / "carried.json").read_text())
 STEGO = read_model(FOLDER / "carried.ply")
 
 
-def test_a_carried_model_opens() -> None:
+def test_known_answer() -> None:
     carried = extract(STEGO, VECTOR["key"])
     assert (carried.count, carried.bits) == (VECTOR["count"], VECTOR["bits"])
     found = carried.gaussians[carried.gaussians.means[:, 0].argsort()]
@@ -30,7 +30,7 @@ def test_a_carried_model_opens() -> None:
         torch.testing.assert_close(values, torch.tensor(VECTOR[name]).reshape(values.shape))
 
 
-def test_to_its_key_only() -> None:
+def test_wrong_key() -> None:
     with pytest.raises(WrongKeyError):
         extract(STEGO, VECTOR["wrong"])
 
@@ -44,12 +44,12 @@ def _quantised(stego: Gaussians) -> Gaussians:
 
 
 @pytest.mark.parametrize("change", [_moved, _quantised, lambda stego: stego.with_sh_degree(2)])
-def test_what_was_changed_opens_no_more(change: Callable[[Gaussians], Gaussians]) -> None:
+def test_modified_models_open_nothing(change: Callable[[Gaussians], Gaussians]) -> None:
     with pytest.raises(WrongKeyError, match="opens nothing"):
         extract(change(STEGO), VECTOR["key"])
 
 
-def test_what_is_left_of_it_opens() -> None:
+def test_pruned_model() -> None:
     order = torch.randperm(len(STEGO), generator=torch.Generator().manual_seed(0))
     carried = extract(STEGO[order[:360]], VECTOR["key"])
     assert 4 <= len(carried.gaussians) <= carried.count == VECTOR["count"]

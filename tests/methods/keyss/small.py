@@ -40,7 +40,7 @@ def small(design: str, fit: FitConfig = FIT, **changes: object) -> KeyssOptions:
     return KeyssOptions(fit=fit, design=replace(known, decoder=decoder, **changes))  # type: ignore[arg-type]
 
 
-def begun(options: KeyssOptions, scenes: list[Scene], models: list[Gaussians]) -> KeyssTraining:
+def start_training(options: KeyssOptions, scenes: list[Scene], models: list[Gaussians]) -> KeyssTraining:
     """A training of scenes that are in one frame, before its first step."""
     placed = [PlacedScene.of(scene, model, Similarity()) for scene, model in zip(scenes, models, strict=True)]
     design = options.configuration
@@ -50,7 +50,7 @@ def begun(options: KeyssOptions, scenes: list[Scene], models: list[Gaussians]) -
     return training_of(design)(placed, keys, options, design, torch.device("cpu"))
 
 
-def some_secret(stego: Gaussians) -> KeyssSecret:
+def make_secret(stego: Gaussians) -> KeyssSecret:
     """A secret that `stego` belongs to, whose decoder of few bytes changes opacities a little."""
     torch.manual_seed(0)
     shape = DecoderShape(mask=("op",), hidden=(8, 8), branch=8, sh_degree=stego.sh_degree)

@@ -59,32 +59,32 @@ def encoder(folder: Path) -> ClipKeys:
     return ClipKeys(folder)
 
 
-def test_like_keys_get_like_vectors_and_case_is_lost(encoder: ClipKeys) -> None:
+def test_similar_keys_have_similar_vectors(encoder: ClipKeys) -> None:
     """Why CLIP is for comparison and nothing is sealed with it."""
     assert torch.equal(encoder("Key"), encoder("key"))
     assert float(F.cosine_similarity(encoder(KEY), encoder("a" + KEY[1:]), dim=0)) > 0.5
 
 
-def test_keys_that_clip_would_cut_off_are_refused(encoder: ClipKeys) -> None:
+def test_long_keys(encoder: ClipKeys) -> None:
     encoder("7" * 75)
     with pytest.raises(UsageError, match="75 tokens"):
         encoder("7" * 76)
 
 
-def test_a_folder_without_clip_is_refused(tmp_path: Path, encoder: ClipKeys) -> None:
+def test_missing_model(tmp_path: Path, encoder: ClipKeys) -> None:
     with pytest.raises(BackendError, match="`clip_model`"):
         ClipKeys(tmp_path)
     with pytest.raises(BackendError, match="nothing is downloaded"):
         ClipKeys("nobody/nothing")
 
 
-def test_without_transformers_one_sentence_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "transformers", None)
     with pytest.raises(BackendError, match=r"keyss\[clip\]"):
         ClipKeys("anywhere")
 
 
-def test_hiding_tells_the_decoder_what_clip_gives(encoder: ClipKeys, folder: Path) -> None:
+def test_hide_with_clip_keys(encoder: ClipKeys, folder: Path) -> None:
     """Two keys that are the same to CLIP have the same vector and open different things."""
     fit = FitConfig(iterations=4, max_gaussians=200, grow_start=0.2, grow_every=5, evaluate_every=0, seed=0)
     config = replace(small("published", fit), key_encoder="clip", clip_model=str(folder))

@@ -25,7 +25,7 @@ def _distance(a: Gaussians, b: Gaussians, name: str) -> float:
 
 
 @pytest.mark.parametrize("released", [False, True])
-def test_equations_6_and_8_written_out(released: bool) -> None:
+def test_equations_6_and_8(released: bool) -> None:
     """In float64, for one Gaussian, from the weights alone."""
     model, decoder = random_gaussians(40), _decoder(released=released, hidden=(5, 7), branch=3)
     decoded = decoder(model, 3 * KEY)
@@ -57,14 +57,14 @@ def test_equations_6_and_8_written_out(released: bool) -> None:
 @pytest.mark.parametrize(
     "mask", [mask for size in range(1, 6) for mask in combinations(ATTRIBUTES, size)], ids=",".join
 )
-def test_theta_updates_its_attributes_and_no_others(mask: tuple[str, ...]) -> None:
+def test_mask(mask: tuple[str, ...]) -> None:
     gaussians = random_gaussians(40)
     decoded = _decoder(",".join(mask))(gaussians, KEY)
     for name, field in FIELD_OF.items():
         assert (_distance(decoded, gaussians, field) > 0) == (name in mask), name
 
 
-def test_every_gaussian_is_decoded_alone() -> None:
+def test_gaussians_are_decoded_independently() -> None:
     """Reordering and pruning change nothing for those that stay, except in the authors' program."""
     gaussians = random_gaussians()
     chosen = torch.randperm(len(gaussians))[:50]
@@ -80,7 +80,7 @@ def test_every_gaussian_is_decoded_alone() -> None:
         assert moved > 1e-3 if released else moved < 1e-4
 
 
-def test_decoding_in_parts_gives_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_chunked_decoding(monkeypatch: pytest.MonkeyPatch) -> None:
     """Sizes are the file's: otherwise 3 kB could ask for 34 kB for each Gaussian at once."""
     decoder, stego = _decoder(released=True), random_gaussians()
     whole, sizes = decoder(stego, KEY), []
@@ -92,7 +92,7 @@ def test_decoding_in_parts_gives_the_same(monkeypatch: pytest.MonkeyPatch) -> No
         torch.testing.assert_close(getattr(in_parts, name), values)
 
 
-def test_masks_are_read_in_any_order_and_refused_by_name() -> None:
+def test_parse_mask() -> None:
     assert parse_mask("xyz, op") == ("op", "xyz")
     with pytest.raises(UsageError, match="colour"):
         parse_mask("op,colour")

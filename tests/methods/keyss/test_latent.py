@@ -24,15 +24,15 @@ from methods.keyss.small import KEYS, VECTORS, latent_model, small
 from tiny_scenes import random_gaussians
 
 
-def _written(secrets: int = 1) -> tuple[Gaussians, list[LatentDecoder], list[Tensor]]:
+def _embed_latents(secrets: int = 1) -> tuple[Gaussians, list[LatentDecoder], list[Tensor]]:
     """Latents of `secrets` in 900 of 1,000 rows."""
     stego, found, latents = latent_model(heavy_tailed(1000), 900, secrets)
     return stego, [secret.decoder for secret in found], latents  # type: ignore[misc]
 
 
 @pytest.mark.parametrize("secrets", [1, 2])
-def test_every_secret_comes_back_under_its_key_alone(secrets: int) -> None:
-    stego, decoders, values = _written(secrets)
+def test_round_trip(secrets: int) -> None:
+    stego, decoders, values = _embed_latents(secrets)
     for index, (decoder, expected) in enumerate(zip(decoders, values, strict=True)):
         decoded = decoder.decode(stego, VECTORS[index])
         assert len(decoded) == 900
@@ -46,9 +46,9 @@ def test_every_secret_comes_back_under_its_key_alone(secrets: int) -> None:
             assert decoder.decode(stego, wrong) is stego
 
 
-def test_what_is_written_is_uniform_whatever_is_encrypted() -> None:
+def test_ciphertext_is_uniform() -> None:
     """Constant latents would come out as one rank without the pad."""
-    _, (decoder,), _ = _written()
+    _, (decoder,), _ = _embed_latents()
     names = row_names(trained_like(2000, seed=3))
     constant = np.tile(decoder.knots.double().numpy()[:, 16], (2000, 1))
     ranks = decoder.encrypt(constant, VECTORS[0], names)
@@ -56,8 +56,8 @@ def test_what_is_written_is_uniform_whatever_is_encrypted() -> None:
     assert kstest((ranks[:, 0] - ranks[:, 1]) % 1, "uniform").pvalue > 1e-6
 
 
-def test_nearly_the_key_is_as_wrong_as_any_and_a_search_finds_nothing() -> None:
-    stego, (decoder,), _ = _written()
+def test_nearby_keys_open_nothing() -> None:
+    stego, (decoder,), _ = _embed_latents()
     near = VECTORS[0].clone()
     near[0] = torch.nextafter(near[0], torch.tensor(2.0))
     assert decoder.decode(stego, near) is stego
@@ -65,8 +65,8 @@ def test_nearly_the_key_is_as_wrong_as_any_and_a_search_finds_nothing() -> None:
         assert decoder.decode(stego, found) is stego
 
 
-def test_rows_may_be_pruned_reordered_and_repeated_but_not_exchanged() -> None:
-    stego, (decoder,), _ = _written()
+def test_changed_rows() -> None:
+    stego, (decoder,), _ = _embed_latents()
     whole = decoder.decode(stego, VECTORS[0])
     assert same_bits(decoder.decode(Gaussians.cat([stego, stego]), VECTORS[0]), whole)
     backwards = decoder.decode(stego[torch.arange(999, -1, -2)], VECTORS[0])
@@ -78,7 +78,7 @@ def test_rows_may_be_pruned_reordered_and_repeated_but_not_exchanged() -> None:
         secret.reveal(exchanged)
 
 
-def test_a_gaussian_has_room_for_two_secrets_and_no_more() -> None:
+def test_capacity() -> None:
     assert [latents_of(3, 1), latents_of(3, 2), latents_of(2, 1)] == [24, 14, 13]
     for degree, secrets in ((3, 3), (2, 2), (1, 1), (0, 1)):
         with pytest.raises(UsageError, match="no room for one of each"):
@@ -92,7 +92,7 @@ def hidden() -> Hidden:
 
 
 @pytest.mark.parametrize("secret", [0, 1])
-def test_hiding_all_the_way(hidden: Hidden, secret: int) -> None:
+def test_hide_and_reveal(hidden: Hidden, secret: int) -> None:
     """A trained secret is opened as it was published, and the rest of the file is the cover's."""
     opened = registry.open_model(hidden.stego, KEYS[secret])
     assert opened.fingerprint() == hidden.opened[secret].fingerprint()
@@ -104,18 +104,18 @@ def test_hiding_all_the_way(hidden: Hidden, secret: int) -> None:
             registry.open_model(hidden.stego, key)
 
 
-def test_a_model_that_was_moved_is_refused(hidden: Hidden) -> None:
+def test_moved_model(hidden: Hidden) -> None:
     for other in (replace(hidden.stego, means=hidden.stego.means + 1e-2), random_gaussians(seed=9)):
         with pytest.raises(InputError, match="moved or rounded"):
             hidden.opened[0].reveal(other)
 
 
-def test_an_interrupted_training_resumes_to_the_same_result(tmp_path: Path) -> None:
+def test_resume(tmp_path: Path) -> None:
     options = small("latent").with_fit(iterations=40, grow_every=5)
     check_resumes(options, tmp_path, "hide", three_scenes()[1][:2])
 
 
-def test_a_cover_without_harmonics_is_refused() -> None:
+def test_cover_without_harmonics() -> None:
     scenes, models = three_scenes()
     with pytest.raises(InputError, match="train longer"):
         hide_scenes(

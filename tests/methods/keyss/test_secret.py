@@ -16,7 +16,7 @@ from keyss.channels import Payload
 from keyss.core import InputError
 from keyss.core.similarity import Similarity
 from keyss.methods import DECODERS, DecoderShape, KeyssSecret, choose_anchors
-from methods.keyss.small import VECTORS, some_secret
+from methods.keyss.small import VECTORS, make_secret
 from tiny_scenes import random_gaussians
 
 FRAME = Similarity(2.0, torch.eye(3, dtype=torch.float64), torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64))
@@ -29,7 +29,7 @@ def _secret(kind: str = "mlp") -> KeyssSecret:
     return KeyssSecret(decoder, VECTORS[0], FRAME, choose_anchors(random_gaussians(), 0), 100, 50.0)
 
 
-def _unpacked(data: bytes) -> KeyssSecret:
+def _unpack(data: bytes) -> KeyssSecret:
     return KeyssSecret.of(Payload("keyss", data))
 
 
@@ -55,10 +55,10 @@ def _with_header(**changes: object) -> bytes:
 
 
 @pytest.mark.parametrize("kind", DECODERS)
-def test_round_trip_in_half_precision_and_the_same_bytes_again(kind: str) -> None:
+def test_round_trip(kind: str) -> None:
     secret = _secret(kind)
     packed = secret.payload().data
-    opened = _unpacked(packed)
+    opened = _unpack(packed)
     assert opened.decoder.shape == secret.decoder.shape
     assert torch.equal(opened.key, secret.key)
     assert (opened.count, opened.visibility) == (100, 50.0)
@@ -73,9 +73,9 @@ def test_round_trip_in_half_precision_and_the_same_bytes_again(kind: str) -> Non
     assert opened.payload().data == packed
 
 
-def test_another_version_is_refused_by_number() -> None:
+def test_unknown_version() -> None:
     with pytest.raises(InputError, match=r"version 1.*version 10"):
-        _unpacked(_with_header(version=1))
+        _unpack(_with_header(version=1))
 
 
 @pytest.mark.parametrize(
@@ -109,22 +109,22 @@ def test_another_version_is_refused_by_number() -> None:
         ),
     ],
 )
-def test_hostile_headers_are_input_errors(changes: dict[str, object]) -> None:
+def test_hostile_headers(changes: dict[str, object]) -> None:
     with pytest.raises(InputError):
-        _unpacked(_with_header(**changes))
+        _unpack(_with_header(**changes))
 
 
 @settings(max_examples=60, deadline=None)
 @given(st.integers(0, len(PACKED) - 1), st.integers(0, 7), st.integers(0, len(PACKED)))
-def test_truncated_and_mutated_bytes_are_input_errors_or_secrets(at: int, bit: int, size: int) -> None:
+def test_damaged_bytes(at: int, bit: int, size: int) -> None:
     broken = bytearray(PACKED)
     broken[at] ^= 1 << bit
     for data in (bytes(broken), PACKED[:size], bytes(broken[:size])):
         with contextlib.suppress(InputError):
-            _unpacked(data)
+            _unpack(data)
 
 
-def test_anchors_survive_order_and_pruning_but_not_another_model() -> None:
+def test_anchors() -> None:
     secret, stego = _secret(), random_gaussians()
     secret.check_unchanged(stego)
     secret.check_unchanged(stego[torch.randperm(len(stego))[: len(stego) // 2]])
@@ -134,18 +134,18 @@ def test_anchors_survive_order_and_pruning_but_not_another_model() -> None:
         secret.check_unchanged(replace(stego, means=stego.means * 1.001))
 
 
-def test_positions_that_were_rounded_need_force() -> None:
+def test_rounded_positions_need_force() -> None:
     stego = trained_like(200)
-    secret = some_secret(stego)
+    secret = make_secret(stego)
     rounded = replace(stego, means=(stego.means * 500).round() / 500)
     with pytest.raises(InputError, match="`force=True`"):
         secret.reveal(rounded)
     assert len(secret.reveal(rounded, force=True)) == 200
 
 
-def test_what_is_left_makes_up_for_what_was_lost() -> None:
+def test_pruning_is_compensated() -> None:
     stego = trained_like(200)
-    secret = KeyssSecret.of(some_secret(stego).payload())
+    secret = KeyssSecret.of(make_secret(stego).payload())
     left = secret.reveal(stego[:150])
     alone = replace(secret, visibility=0.0).reveal(stego[:150])
     assert (left.opacities > alone.opacities).all()

@@ -17,7 +17,7 @@ from keyss.fitting.losses import Target, ssim_torch
 from keyss.methods import DESIGNS, CombinedPoses, KeyssTraining, PlacedScene, Source, registry
 from keyss.rendering import render
 from methods.hiding import Hidden, check_resumes, hide_scenes, three_scenes
-from methods.keyss.small import FIT, KEYS, VECTORS, begun, small
+from methods.keyss.small import FIT, KEYS, VECTORS, small, start_training
 from tiny_scenes import random_gaussians, tiny_scene
 
 
@@ -30,7 +30,9 @@ def hidden() -> Hidden:
 
 def _run(design: str = "published", **changes: Any) -> KeyssTraining:
     scenes = [tiny_scene(seed) for seed in range(3)]
-    return begun(small(design, **changes), scenes, [random_gaussians(seed=seed) for seed in range(3)])
+    return start_training(
+        small(design, **changes), scenes, [random_gaussians(seed=seed) for seed in range(3)]
+    )
 
 
 def _loss(image: torch.Tensor, target: torch.Tensor, weight: float) -> torch.Tensor:
@@ -38,7 +40,7 @@ def _loss(image: torch.Tensor, target: torch.Tensor, weight: float) -> torch.Ten
 
 
 @pytest.mark.parametrize(("design", "weight"), [("published", 0.5), ("released", 0.2)])
-def test_equation_11_written_out(design: str, weight: float) -> None:
+def test_equation_11(design: str, weight: float) -> None:
     run = _run(design, beta_cover=0.7, beta_secret=0.3, beta_incorrect=0.2)
     pose = (1, 4)
     camera, cover = run.poses.camera(*pose), run.cover()
@@ -57,7 +59,7 @@ def test_equation_11_written_out(design: str, weight: float) -> None:
     assert [each[2] for each in renders] == ([1.0] * 3 if design == "released" else [0.7, 0.3, 0.3])
 
 
-def test_frame_cover_leaves_the_secret_where_it_was_hidden(hidden: Hidden) -> None:
+def test_reveal_in_cover_frame(hidden: Hidden) -> None:
     scenes, _ = three_scenes()
     own = hidden.opened[0].reveal(hidden.stego)
     there = hidden.opened[0].reveal(hidden.stego, frame="cover")
@@ -70,7 +72,7 @@ def test_frame_cover_leaves_the_secret_where_it_was_hidden(hidden: Hidden) -> No
     assert difference.abs().mean() < 1e-4
 
 
-def test_keys_open_their_own_and_wrong_ones_nothing(hidden: Hidden) -> None:
+def test_keys(hidden: Hidden) -> None:
     for key, secret in zip(KEYS, hidden.opened, strict=True):
         assert registry.open_model(hidden.stego, key).fingerprint() == secret.fingerprint()
     for key in ("First key", "other"):
@@ -86,7 +88,7 @@ def test_appended_gaussians_are_not_decoded(hidden: Hidden) -> None:
         assert secret.remains(secret.reveal(hidden.stego)).whole
 
 
-def test_decoders_that_will_be_appended_are_told_of_before_any_work() -> None:
+def test_small_cover_warning() -> None:
     inputs = [Source(model, photos=True) for model in three_scenes()[1]]
     for design in ("published", "latent"):
         options = KeyssOptions(design=design, fit=FIT)  # type: ignore[arg-type]
@@ -95,7 +97,7 @@ def test_decoders_that_will_be_appended_are_told_of_before_any_work() -> None:
         registry.get("keyss").prepare(inputs[:2], options.with_fit(max_gaussians=20_000))
 
 
-def test_targets_are_photos_where_there_are_and_renders_elsewhere() -> None:
+def test_targets() -> None:
     scenes, models = three_scenes()
     mask = torch.ones(scenes[1].train[3].image.shape[:2], dtype=torch.bool)
     mask[:3, :4] = False
@@ -121,7 +123,7 @@ def test_targets_are_photos_where_there_are_and_renders_elsewhere() -> None:
 
 
 @pytest.mark.parametrize("which", ["cover", "secret"])
-def test_points_poses_and_densification_can_be_of_some_scenes_only(which: Any) -> None:
+def test_scene_subsets(which: Any) -> None:
     run = _run(points=which, poses=which, densification=which)
     owners = {pose[0] for _ in range(30) for pose in run.sample_poses()}
     assert owners == ({0} if which == "cover" else {1, 2})
@@ -129,12 +131,12 @@ def test_points_poses_and_densification_can_be_of_some_scenes_only(which: Any) -
 
 
 @pytest.mark.parametrize("design", ["published", "released"])
-def test_an_interrupted_training_resumes_to_the_same_result(tmp_path: Path, design: str) -> None:
+def test_resume(tmp_path: Path, design: str) -> None:
     options = small(design).with_fit(iterations=40, grow_every=5)
     check_resumes(options, tmp_path, "hide", three_scenes()[1][:2])
 
 
-def test_settings_that_contradict_each_other_are_refused() -> None:
+def test_invalid_options() -> None:
     for wrong, message in (
         ({"publish": "any"}, "bit for bit"),
         ({"design": "carriers"}, r"`carriers`|'carriers'.*latent, published, released"),

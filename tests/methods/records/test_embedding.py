@@ -14,7 +14,7 @@ from keyss.core import Gaussians
 from keyss.methods.records.embedding import embed_models
 
 
-def test_records_that_were_written_wrongly_are_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_damaged_records_are_detected(monkeypatch: pytest.MonkeyPatch) -> None:
     embed = LowBitsCover.embed
 
     def broken(*arguments: Any, **options: Any) -> Gaussians:

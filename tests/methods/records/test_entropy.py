@@ -17,7 +17,7 @@ from keyss.methods.records import entropy
     most=st.sampled_from([0, 1, 2, 7, 300, entropy.MAX_NUMBER]),
     seed=st.integers(0, 2**32 - 1),
 )
-def test_every_table_comes_back(rows: int, columns: int, most: int, seed: int) -> None:
+def test_round_trip(rows: int, columns: int, most: int, seed: int) -> None:
     random = np.random.default_rng(seed)
     table = random.integers(-most, most + 1, (rows, columns))
     shares, groups = random.integers(0, 9, columns), random.integers(0, columns, columns)
@@ -28,7 +28,7 @@ def test_every_table_comes_back(rows: int, columns: int, most: int, seed: int) -
             entropy.decode(other, rows, shares, groups)
 
 
-def test_it_comes_close_to_the_entropy_of_what_is_rare_or_follows_from_the_row_before() -> None:
+def test_compression_rate() -> None:
     random = np.random.default_rng(0)
     rare = random.random((20_000, 1)) < 0.02
     zero, one = np.zeros(1, np.int64), np.array([8])

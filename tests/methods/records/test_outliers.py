@@ -61,7 +61,7 @@ def _psnr(one: Gaussians, other: Gaussians) -> float:
 
 @pytest.mark.parametrize(("name", "value"), HOSTILE)
 @pytest.mark.parametrize("bits", [264])
-def test_one_outlier_costs_the_bulk_less_than_a_decibel(bits: int, name: str, value: float) -> None:
+def test_one_outlier_costs_under_1_db(bits: int, name: str, value: float) -> None:
     model = _bulk(1000)
     changed = _with(model, torch.tensor([17]), name, value)
     rest = torch.arange(1000) != 17
@@ -71,7 +71,7 @@ def test_one_outlier_costs_the_bulk_less_than_a_decibel(bits: int, name: str, va
     assert _psnr(changed, _coded(changed, bits)) > _psnr(model, plain) - 3
 
 
-def test_what_is_never_drawn_comes_back_transparent_and_within_bounds() -> None:
+def test_undrawable_gaussians() -> None:
     model = _with(_bulk(200), torch.tensor([3]), "means", 1e30)
     assert model.overflow.nonzero().tolist() == [[3]]
     back = _coded(model, 568)
@@ -80,7 +80,7 @@ def test_what_is_never_drawn_comes_back_transparent_and_within_bounds() -> None:
 
 
 @pytest.mark.parametrize("value", [1e10, 1e30])
-def test_a_secret_with_an_outlier_is_carried_from_file_to_file(tmp_path: Path, value: float) -> None:
+def test_hide_secret_with_outlier(tmp_path: Path, value: float) -> None:
     secret = _with(_bulk(900, 1), torch.tensor([5]), "means", value)
     write_model(tmp_path / "secret.ply", secret)
     write_model(tmp_path / "cover.ply", trained_like(2000))

@@ -18,9 +18,7 @@ VALUES = arrays.arrays(np.float64, st.integers(1, 30), elements=FINITE)
 
 
 @given(VALUES, st.floats(0, 1e3), st.floats(0.01, 50), st.integers(1, 24))
-def test_a_line_is_off_by_half_a_step_at_most_and_clips_beyond_its_ends(
-    values: np.ndarray, spread: float, reach: float, bits: int
-) -> None:
+def test_line_error(values: np.ndarray, spread: float, reach: float, bits: int) -> None:
     line = Line(1.5, spread if spread > 1e-3 else 0.0, reach, far_reach=1.0)
 
     def position(x: np.ndarray) -> np.ndarray:
@@ -33,9 +31,7 @@ def test_a_line_is_off_by_half_a_step_at_most_and_clips_beyond_its_ends(
 
 @given(st.data(), st.integers(0, 3), st.sampled_from([0, 40, 500]))
 @settings(max_examples=25, deadline=None)
-def test_every_attribute_comes_back_within_the_error_of_its_bits(
-    data: st.DataObject, degree: int, more: int
-) -> None:
+def test_codec_error(data: st.DataObject, degree: int, more: int) -> None:
     count = data.draw(st.integers(1, 12))
 
     def some(*shape: int) -> torch.Tensor:
@@ -73,7 +69,7 @@ def test_every_attribute_comes_back_within_the_error_of_its_bits(
     assert torch.allclose(back.quats.norm(dim=1), torch.ones(count), atol=1e-5)
 
 
-def test_quaternions_of_no_length_and_of_either_sign_mean_the_rotation_that_they_mean() -> None:
+def test_zero_and_negated_quaternions() -> None:
     model = trained_like(8, sh_degree=0)
     model.quats[0] = 0
     model.quats[1] = torch.tensor([0.0, -3.0, 0, 0])
@@ -82,7 +78,7 @@ def test_quaternions_of_no_length_and_of_either_sign_mean_the_rotation_that_they
     assert torch.allclose(quats[:2].abs(), torch.eye(4)[:2], atol=0.01)
 
 
-def test_half_and_whole_records_of_degree_3_are_as_near_as_promised() -> None:
+def test_render_quality() -> None:
     """Of a model with colours that go together, as those of trained ones do."""
     model = trained_like(2000, seed=4)
     sh = 0.25 * model.sh + 0.75 * model.sh[:, :, :1]
@@ -99,7 +95,7 @@ def test_half_and_whole_records_of_degree_3_are_as_near_as_promised() -> None:
 
 
 @given(st.binary(max_size=150))
-def test_damaged_parameters_are_an_input_error_or_bounded_numbers(data: bytes) -> None:
+def test_damaged_parameters(data: bytes) -> None:
     try:
         codec = Codec.unpack(data)
     except InputError:

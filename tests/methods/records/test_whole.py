@@ -20,7 +20,7 @@ def _scene(cameras: Sequence[Camera]) -> Scene:
     return Scene("scene", views, (), torch.zeros(0, 3), torch.zeros(0, 3), torch.ones(3))
 
 
-def test_a_whole_model_comes_back_as_its_records_would() -> None:
+def test_round_trip() -> None:
     model = model_of(3000, sh_degree=2)
     sizes, psnrs = [], []
     for octaves in (-1, 0, 1, 2):
@@ -36,7 +36,7 @@ def test_a_whole_model_comes_back_as_its_records_would() -> None:
     assert sizes[1] * 8 < 3000 * Table.floor(2).total
 
 
-def test_it_is_good_enough_from_where_it_is_looked_at() -> None:
+def test_choose_precision() -> None:
     """At about 43.75 dB, which a few renders estimate: 24 models got 43.71 to 44.01 dB, with a standard
     deviation of 0.07, and this one 43.65 with the kernels of an older processor.
     """
@@ -50,7 +50,7 @@ def test_it_is_good_enough_from_where_it_is_looked_at() -> None:
     assert encode_to_size(model, 1 << 20, short=True, viewpoints=viewpoints) == whole.encode(model, found)
 
 
-def test_what_is_seen_least_is_left_out_until_it_fits() -> None:
+def test_prune_to_size() -> None:
     model = model_of(800, sh_degree=1)
     kept = prune_to_size(model, 4000)
     assert 200 < len(kept) < 800

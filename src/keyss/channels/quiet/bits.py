@@ -16,11 +16,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from hashlib import blake2b
 
 import numpy as np
 import torch
+from torch.autograd.graph import increment_version
 
 from keyss.core.arrays import Bytes, Doubles, Integers, Words32
 from keyss.core.gaussians import Gaussians
@@ -135,20 +136,30 @@ def read_low_bits(gaussians: Gaussians, layout: Layout | None = None) -> Bytes:
 
 
 def write_low_bits(
-    gaussians: Gaussians, layout: Layout, parts: Iterable[tuple[Integers, Bytes]]
+    gaussians: Gaussians,
+    layout: Layout,
+    parts: Iterable[tuple[Integers, Bytes]],
+    *,
+    in_place: bool = False,
 ) -> Gaussians:
     """The same Gaussians with other low bits: for each part [R, B] in the rows [R], which are different ones.
 
-    Where a Gaussian's bits are no whole number of bytes, the last half byte stays as it is.
+    Where a Gaussian's bits are no whole number of bytes, the last half byte stays as it is. `in_place`: the
+    result may share its memory with `gaussians`, which are changed.
     """
-    written = gaussians.detach().to("cpu").map(torch.Tensor.contiguous).map(torch.clone)
-    fields, harmonics = _written_fields(written, layout)
+    written = gaussians.detach().to("cpu").map(torch.Tensor.contiguous)
+    if in_place:
+        for field in fields(written):
+            increment_version(getattr(written, field.name))  # NumPy writes, which PyTorch does not see
+    else:
+        written = written.map(torch.clone)
+    geometry, harmonics = _written_fields(written, layout)
 
     for rows, data in parts:
 
         def write(start: int, stop: int, rows: Integers = rows, data: Bytes = data) -> None:
             own, new, at = rows[start:stop], data[start:stop].astype(np.uint32), 0
-            for field in fields:
+            for field in geometry:
                 low = new[:, at : (at := at + field.shape[1])]
                 field[own] = field[own] & ~(_BYTE << _UNUSED) | low << _UNUSED
             low = harmonics[own] >> _UNUSED & _TWELVE

@@ -139,6 +139,7 @@ class LowBitsCover:
     usable: Flags  # [N]
     names: Bytes  # [N, 16] identities
     salt_rows: Integers  # [S] in the order of salts
+    overwrites: bool = False  # embedding changes the tensors of the cover instead of copies
 
     @property
     def room(self) -> Room:
@@ -173,7 +174,7 @@ class LowBitsCover:
         writer = Writer(self.names[self._rows], self.layout.width, entropy, len(self.cover))
         writer.write(contents)
         parts = [(self.salt_rows[self.fresh_salts], fresh), (self._rows[writer.order], writer.table)]
-        return write_low_bits(self.cover, self.layout, parts)
+        return write_low_bits(self.cover, self.layout, parts, in_place=self.overwrites)
 
     @cached_property
     def fresh_salts(self) -> Integers:

@@ -163,6 +163,8 @@ class QuietReader(SaltedReader):
             own = self.low[rows, slot * size : (slot + 1) * size]
             fits[rows], data = cipher.decrypt(self.names[rows], own, slot)
             found.append(data)
+        if cells == 1:
+            return found[0], fitting
         order = np.concatenate([*map(np.flatnonzero, fitting)]).argsort(kind="stable")
         return np.concatenate(found)[order], fitting
 

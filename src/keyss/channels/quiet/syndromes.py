@@ -7,6 +7,8 @@ as many bits as it has dry ones, less the few that random matrices lack in rank.
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 
 from keyss.core.arrays import Bits, Bytes, Integers, Words
@@ -65,14 +67,10 @@ def write(bits: Bits, dry: Bits, message: Bits, rows: Words) -> Bits | None:
     One elimination for all blocks: with as many columns of the matrix P as it has rows, and the others F,
     changes are x_P = P^-1 wanted + P^-1 F x_F. A block then needs an x_F by which x_P is 0 where bits stay.
     """
-    rate = len(rows)
-    reduced = np.concatenate([_unpacked(rows), np.eye(rate, dtype=np.uint8)], axis=1)
-    pivots = _reduced(reduced, BLOCK)
+    pivots, others, inverse, free = _eliminate(rows.tobytes())
     if (pivots < 0).any():
         return None
-    others = np.setdiff1d(np.arange(BLOCK), pivots)
-    free, inverse = reduced[:, others], reduced[:, BLOCK:]  # P^-1 F, P^-1
-    changed = _product((message ^ read(bits, rows)).reshape(-1, rate), inverse.T)
+    changed = _product((message ^ read(bits, rows)).reshape(-1, len(rows)), inverse.T)
     blocks, may = bits.reshape(-1, BLOCK).copy(), dry.reshape(-1, BLOCK) == 1
     rest = np.zeros((len(blocks), len(others)), np.uint8)
     for own, wanted, found in zip(may, changed, rest, strict=True):
@@ -85,6 +83,16 @@ def write(bits: Bits, dry: Bits, message: Bits, rows: Words) -> Bits | None:
     blocks[:, pivots] ^= changed ^ _product(rest, free.T)
     blocks[:, others] ^= rest
     return blocks.reshape(-1)
+
+
+@lru_cache(maxsize=1)  # it depends on the number of rows only
+def _eliminate(rows: bytes) -> tuple[Integers, Integers, Bits, Bits]:
+    """The columns of P (-1: none) and F in a matrix [R, BLOCK / 64], P^-1 [R, R] and P^-1 F; see `write`."""
+    own = _unpacked(np.frombuffer(rows, "<u8").reshape(-1, _WORDS))
+    reduced = np.concatenate([own, np.eye(len(own), dtype=np.uint8)], axis=1)
+    pivots = _reduced(reduced, BLOCK)
+    others = np.setdiff1d(np.arange(BLOCK), pivots)
+    return pivots, others, reduced[:, BLOCK:], reduced[:, others]
 
 
 def _product(left: Bits, right: Bits) -> Bits:

@@ -38,6 +38,7 @@ from keyss.keys.derivation import DerivedKey, expand, fill
 from keyss.keys.encryption import OVERHEAD, compressed_size, encrypt, encrypted_size
 
 ASSOCIATED = b"keyss/v1/quiet"  # authenticated with a payload
+_AT_ONCE = 1 << 18  # records that are encrypted at a time
 _NO_COPIES: Integers = np.zeros(0, np.int64)
 
 
@@ -159,8 +160,11 @@ class Writer:
         copies = content.records[content.copied]
         for label, records, at in (("record", content.records, 0), ("copy", copies, len(content.records))):
             cipher = CellCipher(self._data_key(index), label, records.shape[1])
-            own, which = rows[at : at + len(records)], slots[at : at + len(records)]
-            cells[own, which, : cipher.cell_bytes] = cipher.encrypt(self._names[own], records, which)
+            for start in range(0, len(records), _AT_ONCE):
+                part = records[start : start + _AT_ONCE]
+                places = slice(at + start, at + start + len(part))
+                own, which = rows[places], slots[places]
+                cells[own, which, : cipher.cell_bytes] = cipher.encrypt(self._names[own], part, which)
 
 
 def blocks_for(payload: Payload, width: int) -> int:

@@ -1,8 +1,8 @@
 """Codebooks of numbers and palettes of vectors.
 
-Numbers are quantised by Lloyd's method, which takes milliseconds in one dimension. Vectors are grouped by a
-tree that splits the worst group first: k-means with tens of thousands of clusters, which other writers run,
-takes minutes without a GPU and gains less than rounding to 8 bits loses.
+Numbers are quantised by Lloyd's method, which takes milliseconds in one dimension. Vectors are clustered by a
+tree that splits the worst group first: k-means with tens of thousands of clusters, as in other writers, takes
+minutes without a GPU and gains less than rounding to 8 bits loses.
 """
 
 from __future__ import annotations
@@ -15,19 +15,19 @@ import numpy as np
 
 from keyss.core.arrays import Bytes, Doubles, Floats, Integers, Shorts
 
-SIZE = 256  # numbers of a codebook
+SIZE = 256  # numbers in a codebook
 _ROUNDS = 50
-_BINS = 1024  # with equally many values each, to estimate the density
-_MIN_WIDTH = 1e-6  # of a bin, relative to the range, since values may be equal
-_AXES = 12  # principal axes by which groups are split
-_SAMPLE = 50_000  # vectors from which the axes are computed
+_BINS = 1024  # of equal counts, to estimate the density
+_MIN_WIDTH = 1e-6  # bin width relative to the range; values may be equal
+_AXES = 12  # principal axes to split along
+_SAMPLE = 50_000  # vectors for computing the axes
 
 
 def codebook_of(values: Floats) -> Floats:
     """[256] ascending numbers that approximate `values` of any shape.
 
-    Squared errors are weighted by the inverse square root of the density: rare values often belong to the few
-    Gaussians that cover most of the image. On six models, this gains 0 to 8 dB over equal weights.
+    Squared errors are weighted by density^(-1/2), since rare values often belong to the few Gaussians that
+    cover most of the image. On six models, this gains 0 to 8 dB over equal weights.
     """
     ordered = np.sort(values, axis=None).astype(np.float64)
     distinct = np.unique(ordered)

@@ -1,4 +1,4 @@
-"""Code shared by several formats: checks, quantisation of attributes, spatial order."""
+"""Shared by formats: checks, quantisation of attributes, spatial order."""
 
 from __future__ import annotations
 
@@ -15,25 +15,25 @@ from keyss.core.errors import InputError, KeyssWarning, OutputError
 from keyss.core.gaussians import SH_C0, Gaussians
 from keyss.files.ply_rows import OPACITY_LOGIT_BOUND
 
-# A packed file may announce more Gaussians than this only if it has LEAST_BYTES for each: published models
-# take at least 7.
-SMALL_COUNT, LEAST_BYTES = 1 << 17, 6
+# A compressed file of more Gaussians than SMALL_COUNT must have MIN_BYTES for each; published models take at
+# least 7.
+SMALL_COUNT, MIN_BYTES = 1 << 17, 6
 _MORTON_BITS = 21  # per axis
 
 
 class Codes(ABC):
-    """The numbers of a file in a lossy format: base of dataclasses of arrays, which compare by value.
+    """The integers of a file in a quantised format: base of dataclasses of arrays, which compare by value.
 
-    `parse` and `serialise` convert between bytes and codes, exactly; `quantise` and `dequantise` between
+    `parse` and `serialise` convert between bytes and codes, losslessly; `quantise` and `dequantise` between
     models and codes.
     """
 
-    name: ClassVar[str]  # of the format, as users know it
-    sorts: ClassVar[bool] = True  # its writer sorts models
+    name: ClassVar[str]  # for users
+    sorts: ClassVar[bool] = True  # whether `write` reorders Gaussians
 
     @abstractmethod
     def __len__(self) -> int:
-        """Gaussians."""
+        """Number of Gaussians."""
 
     @classmethod
     @abstractmethod
@@ -47,7 +47,7 @@ class Codes(ABC):
     @classmethod
     @abstractmethod
     def quantise(cls, model: Gaussians) -> Self:
-        """The codes nearest to a model, in its order. Raises OutputError for what the format cannot hold."""
+        """The codes nearest to a model, in its order. Raises OutputError for values out of range."""
 
     @abstractmethod
     def dequantise(self) -> Gaussians:
@@ -55,7 +55,7 @@ class Codes(ABC):
 
     @classmethod
     def of(cls, model: Gaussians) -> Self:
-        """The codes of the model's file if it has this format, else as a writer sorts and quantises it."""
+        """The codes of the model's file if it has this format, else of the quantised model."""
         if isinstance(model, CodedGaussians) and isinstance(model.codes, cls):
             return model.codes
         model = writable(model)
@@ -82,10 +82,7 @@ class Codes(ABC):
 
 
 class CodedGaussians(Gaussians):
-    """The model of a file with the file's codes.
-
-    Only `to` keeps the codes: every other method, and every derived model, gives `Gaussians` without them.
-    """
+    """The model of a file with its codes. Only `to` keeps them; derived models are plain `Gaussians`."""
 
     __slots__ = ("codes",)  # not in vars(), which holds the tensors
 
@@ -93,7 +90,7 @@ class CodedGaussians(Gaussians):
 
     @staticmethod
     def of(codes: Codes, model: Gaussians | None = None) -> CodedGaussians:
-        """The model that `codes` stand for; `model` is the same, decoded before."""
+        """The dequantised model; `model` is given if it has been decoded before."""
         model = codes.dequantise() if model is None else model
         found = CodedGaussians(*(getattr(model, each.name) for each in fields(model)))
         object.__setattr__(found, "codes", codes)
@@ -105,47 +102,49 @@ class CodedGaussians(Gaussians):
 
 
 def reason(error: Exception) -> str:
-    """The start of a library's message, which may quote the file at any length."""
+    """A library's message, truncated, since it may quote the file at any length."""
     return str(error)[:200]
 
 
 def check_count(count: int, size: int) -> None:
-    """Raise InputError if a packed file of `size` bytes cannot hold `count` Gaussians, or holds none."""
+    """Raise InputError if a compressed file of `size` bytes cannot hold `count` Gaussians, or holds none."""
     if count < 1:
         raise InputError("it holds no Gaussians")
-    if count > max(SMALL_COUNT, size // LEAST_BYTES):
+    if count > max(SMALL_COUNT, size // MIN_BYTES):
         raise InputError(f"it announces {count:,} Gaussians, more than {size:,} bytes hold")
 
 
 def check_sh_degree(degree: int) -> int:
-    """SH coefficients per channel without the constant one. Raises InputError above degree 3."""
+    """Number of SH coefficients without the constant one. Raises InputError above degree 3."""
     if not 0 <= degree <= 3:
         raise InputError(f"expected spherical harmonics of degree 0 to 3, found {degree}")
     return (degree + 1) ** 2 - 1
 
 
-def gaussians_of(*arrays: Numbers) -> Gaussians:
-    """A model from arrays, in the order of `_model`.
+def gaussians_of(
+    means: Numbers,
+    quats: Numbers,
+    log_scales: Numbers,
+    opacities: Numbers,  # [N] in [0, 1]
+    colors: Numbers,  # [N, 3], f_dc
+    rest: Numbers,  # [N, K - 1, 3], the other harmonics
+    *,
+    drop: bool = False,
+) -> Gaussians:
+    """A model from arrays. Raises InputError for values that are not finite in single precision.
 
-    Raises InputError for values that are not finite in single precision.
+    `drop`: leaves out Gaussians with such values, with a KeyssWarning, unless none would remain.
     """
-    model = _model(*arrays)
-    if wrong := _not_finite(model):
-        raise InputError(f"NaN or infinite values in {', '.join(wrong)}")
-    return model
-
-
-def usable_gaussians_of(*arrays: Numbers) -> Gaussians:
-    """`gaussians_of` without Gaussians that are not finite, of whose number a KeyssWarning tells.
-
-    Raises InputError if none remain.
-    """
-    model = _model(*arrays)
+    with np.errstate(over="ignore", invalid="ignore"):
+        sh = np.empty((len(rest), 1 + rest.shape[1], 3), np.float32)
+        sh[:, 0], sh[:, 1:] = colors, rest
+        parts = (means, quats, log_scales, _logits(opacities), sh)
+        model = Gaussians(*(torch.from_numpy(np.require(each, np.float32, ["C", "W"])) for each in parts))
     if not (wrong := _not_finite(model)):
         return model
-    parts = (getattr(model, each.name).reshape(len(model), -1) for each in fields(model))
-    finite = torch.cat(list(parts), dim=1).isfinite().all(1)
-    if not finite.any():
+    columns = [getattr(model, each.name).reshape(len(model), -1) for each in fields(model)]
+    finite = torch.cat(columns, dim=1).isfinite().all(1)
+    if not (drop and finite.any()):
         raise InputError(f"NaN or infinite values in {', '.join(wrong)}")
     warnings.warn(
         f"{int((~finite).sum()):,} of {len(model):,} Gaussians are left out: they have NaN or infinite "
@@ -156,38 +155,20 @@ def usable_gaussians_of(*arrays: Numbers) -> Gaussians:
     return model[finite]
 
 
-def _model(
-    means: Numbers,
-    quats: Numbers,
-    log_scales: Numbers,
-    opacities: Numbers,  # [N] in [0, 1]
-    colors: Numbers,  # [N, 3], f_dc
-    rest: Numbers,  # [N, K - 1, 3], the other harmonics
-) -> Gaussians:
-    with np.errstate(over="ignore", invalid="ignore"):
-        sh = np.empty((len(rest), 1 + rest.shape[1], 3), np.float32)
-        sh[:, 0], sh[:, 1:] = colors, rest
-        parts = (means, quats, log_scales, _logits(opacities), sh)
-        return Gaussians(*(torch.from_numpy(np.require(each, np.float32, ["C", "W"])) for each in parts))
-
-
 def _not_finite(model: Gaussians) -> list[str]:
-    """The attributes with values that are not finite."""
+    """Names of attributes with NaN or infinite values."""
     return [each.name for each in fields(model) if not bool(getattr(model, each.name).isfinite().all())]
 
 
 def writable(model: Gaussians) -> Gaussians:
     """`model` on the CPU with finite opacity logits. Raises OutputError if it is empty or not finite."""
-    if isinstance(model, CodedGaussians):  # read from a file, hence valid
-        return model
+    if isinstance(model, CodedGaussians):  # checked when it was read
+        return model.to("cpu")
     flat = model.detach().to("cpu")
     if len(flat) == 0:
         raise OutputError("it holds no Gaussians")
-    bound = OPACITY_LOGIT_BOUND
-    opacity_logits = flat.opacity_logits.where(
-        ~flat.opacity_logits.isinf(), flat.opacity_logits.clamp(-bound, bound)
-    )
-    flat = replace(flat, opacity_logits=opacity_logits)
+    logits, bound = flat.opacity_logits, OPACITY_LOGIT_BOUND
+    flat = replace(flat, opacity_logits=logits.where(~logits.isinf(), logits.clamp(-bound, bound)))
     if wrong := _not_finite(flat):
         raise OutputError(f"NaN or infinite values in {', '.join(wrong)}")
     return flat
@@ -211,15 +192,15 @@ def _logits(opacities: Numbers) -> Doubles:
     return found.clip(-OPACITY_LOGIT_BOUND, OPACITY_LOGIT_BOUND)
 
 
-def rounded(values: Numbers) -> Doubles:
-    """`values` rounded to integers, halves away from 0, like C's `round`."""
+def round_half_away(values: Numbers) -> Doubles:
+    """Integers nearest to `values`, halves away from 0, like C's `round`."""
     return np.copysign(np.floor(np.abs(values) + 0.5), values)
 
 
 def to_bytes(values: Numbers, maximum: int = 255) -> Numbers:
     """`values` rounded and clipped to 0 to `maximum`, as uint8 or, above 255, uint16."""
     kind = np.uint8 if maximum < 256 else np.uint16
-    return rounded(values).clip(0, maximum).astype(kind)
+    return round_half_away(values).clip(0, maximum).astype(kind)
 
 
 def colour_bytes(f_dc: Floats) -> Bytes:
@@ -233,7 +214,7 @@ def f_dc_of(colors: Numbers) -> Doubles:
 
 
 def log_scales_of(scales: Numbers) -> Doubles:
-    """Logarithms of scales: 0 counts as the smallest normal number; NaN for negative scales."""
+    """Logarithms of scales: 0 becomes the smallest normal number, negative scales NaN."""
     with np.errstate(invalid="ignore"):
         values = np.asarray(scales, dtype=np.float64)
         found: Doubles = np.log(np.where(values == 0, np.finfo(np.float32).tiny, values))
@@ -255,13 +236,13 @@ def unit(quats: Numbers) -> Doubles:
 
 
 def with_largest_w(quats: Doubles) -> Doubles:
-    """[N, 4] unit quaternions of the same ellipsoids, wxyz, whose largest part is w.
+    """[N, 4] unit quaternions wxyz of the same ellipsoids, with w the largest component.
 
-    Half a turn about one of its axes leaves an ellipsoid as it is, and some programs add one.
+    An ellipsoid is unchanged by 180 degrees about one of its axes, which some programs add.
     """
     quats = quats / np.linalg.norm(quats, axis=1, keepdims=True).clip(1e-30)
     largest = np.abs(quats).argmax(axis=1)
-    order = np.array([[0, 1, 2, 3], [1, 0, 3, 2], [2, 3, 0, 1], [3, 2, 1, 0]])  # of q, q i, q j, q k
+    order = np.array([[0, 1, 2, 3], [1, 0, 3, 2], [2, 3, 0, 1], [3, 2, 1, 0]])  # q, q i, q j, q k
     signs = np.array([[1, 1, 1, 1], [-1, 1, 1, -1], [-1, -1, 1, 1], [-1, 1, -1, 1]])
     turned = np.take_along_axis(quats, order[largest], 1) * signs[largest]
     found: Doubles = turned * np.where(turned[:, :1] < 0, -1.0, 1.0)
@@ -269,9 +250,9 @@ def with_largest_w(quats: Doubles) -> Doubles:
 
 
 def smallest_three(quats: Doubles) -> tuple[Bytes, Doubles]:
-    """The index of the largest component [N] of unit quaternions [N, 4], and the others [N, 3] in order.
+    """Index of the largest component [N] of unit quaternions [N, 4], and the other three [N, 3].
 
-    The signs make the largest component positive; the others are within +-sqrt(1/2).
+    Signs are such that the largest component is positive; the others are within +-sqrt(1/2).
     """
     largest = np.abs(quats).argmax(axis=1)
     sign = np.where(np.take_along_axis(quats, largest[:, None], axis=1) < 0, -1.0, 1.0)
@@ -279,7 +260,7 @@ def smallest_three(quats: Doubles) -> tuple[Bytes, Doubles]:
 
 
 def from_smallest_three(largest: Bytes, others: Doubles) -> Doubles:
-    """[N, 4] unit quaternions, the inverse of `smallest_three`; the largest is 0 if `others` are too long."""
+    """[N, 4] unit quaternions, inverse of `smallest_three`; the largest is 0 if `others` exceed length 1."""
     quats = np.empty((len(largest), 4))
     np.put_along_axis(quats, _OTHERS[largest], others, axis=1)
     rest = np.sqrt(np.maximum(0.0, 1 - np.square(others).sum(axis=1)))
@@ -287,7 +268,7 @@ def from_smallest_three(largest: Bytes, others: Doubles) -> Doubles:
     return quats
 
 
-_OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])  # indices without 0, 1, 2, 3
+_OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])  # than the largest
 
 
 def in_morton_order(model: Gaussians) -> Gaussians:
@@ -308,7 +289,7 @@ def morton_order(means: Floats) -> Integers:
 
 
 def _spread(values: Words) -> Words:
-    """The lowest 21 bits of `values` with two zero bits between neighbours."""
+    """The lowest 21 bits of `values`, with two zero bits between neighbours."""
     values = values & np.uint64(0x1FFFFF)
     for shift, mask in (
         (32, 0x1F00000000FFFF),

@@ -1,8 +1,7 @@
 """Compressed .ply, PlayCanvas's format: 16 bytes and 8-bit harmonics per Gaussian, in chunks of 256.
 
 https://developer.playcanvas.com/user-manual/gaussian-splatting/formats/ply/#compressed-ply. Positions, log
-scales and colours are quantised between the bounds of their chunk, hence the finer the closer the Gaussians
-of a chunk are: `write` sorts them.
+scales and colours are quantised between the bounds of their chunk, so `write` sorts Gaussians spatially.
 """
 
 from __future__ import annotations
@@ -32,7 +31,7 @@ from keyss.files.ply_table import ply_header, read_tables
 CHUNK = 256  # Gaussians
 _VECTOR = (11, 10, 11)  # bits of x, y, z
 _SCALE_LIMIT = 20.0  # log scales are clipped to +- this
-_MIN_RANGE = 1e-5  # of a chunk; below it, all of its values become the lower bound
+_MIN_RANGE = 1e-5  # in chunks of smaller range, all values become the lower bound
 
 _BOUNDS = [
     f"{end}_{name}"
@@ -45,13 +44,13 @@ _PACKED = ["packed_position", "packed_rotation", "packed_scale", "packed_color"]
 
 @dataclass(frozen=True, eq=False)
 class CompressedPlyCodes(Codes):
-    """All numbers of a file; Gaussian i is in chunk i // 256."""
+    """All values of a file; Gaussian i is in chunk i // 256."""
 
     name = "compressed-ply"
 
-    bounds: Floats  # [C, 18] smallest, then largest x y z; log scales; r g b (0 to 1: of f_dc * SH_C0 + 0.5)
+    bounds: Floats  # [C, 18] min, then max of x y z; log scales; r g b (f_dc * SH_C0 + 0.5)
     positions: Shorts  # [N, 3] 11, 10 and 11 bits, between the bounds
-    largest: Bytes  # [N] index of the component of wxyz that is not stored
+    largest: Bytes  # [N] index of the component of wxyz left out
     rotations: Shorts  # [N, 3] 10 bits each, the other components from -sqrt(1/2) to sqrt(1/2)
     scales: Shorts  # [N, 3] 11, 10 and 11 bits, between the bounds
     colors: Bytes  # [N, 3] between the bounds
@@ -63,7 +62,7 @@ class CompressedPlyCodes(Codes):
 
     @classmethod
     def parse(cls, data: bytes) -> Self:
-        """See `Codes`. Old files have no bounds of colours, which are then 0 and 1."""
+        """See `Codes`. Old files have no colour bounds; they are 0 and 1."""
         tables = read_tables(io.BytesIO(data))
         vertex, chunk = tables["vertex"], tables.get("chunk")
         n = len(vertex)
@@ -81,11 +80,11 @@ class CompressedPlyCodes(Codes):
         position, rotation, scale, color = (vertex[name].astype(np.uint32) for name in _PACKED)
         return cls(
             bounds=bounds,
-            positions=_fields(position, _VECTOR).astype(np.uint16),
+            positions=_unpack_fields(position, _VECTOR).astype(np.uint16),
             largest=(rotation >> 30).astype(np.uint8),
-            rotations=_fields(rotation, (10, 10, 10)).astype(np.uint16),
-            scales=_fields(scale, _VECTOR).astype(np.uint16),
-            colors=_fields(color >> 8, (8, 8, 8)).astype(np.uint8),
+            rotations=_unpack_fields(rotation, (10, 10, 10)).astype(np.uint16),
+            scales=_unpack_fields(scale, _VECTOR).astype(np.uint16),
+            colors=_unpack_fields(color >> 8, (8, 8, 8)).astype(np.uint8),
             alphas=(color & 255).astype(np.uint8),
             sh=_harmonics(tables.get("sh"), n),
         )
@@ -93,10 +92,10 @@ class CompressedPlyCodes(Codes):
     def serialise(self) -> bytes:
         n, k = self.sh.shape[:2]
         packed = np.empty((n, 4), dtype="<u4")
-        packed[:, 0] = _joined(self.positions, _VECTOR)
-        packed[:, 1] = self.largest.astype(np.uint32) << 30 | _joined(self.rotations, (10, 10, 10))
-        packed[:, 2] = _joined(self.scales, _VECTOR)
-        packed[:, 3] = _joined(self.colors, (8, 8, 8)) << np.uint32(8) | self.alphas
+        packed[:, 0] = _pack_fields(self.positions, _VECTOR)
+        packed[:, 1] = self.largest.astype(np.uint32) << 30 | _pack_fields(self.rotations, (10, 10, 10))
+        packed[:, 2] = _pack_fields(self.scales, _VECTOR)
+        packed[:, 3] = _pack_fields(self.colors, (8, 8, 8)) << np.uint32(8) | self.alphas
         elements = {
             "chunk": (len(self.bounds), [f"float {name}" for name in _BOUNDS]),
             "vertex": (n, [f"uint {name}" for name in _PACKED]),
@@ -116,7 +115,7 @@ class CompressedPlyCodes(Codes):
         bounds[:, 6:12] = bounds[:, 6:12].clip(-_SCALE_LIMIT, _SCALE_LIMIT)
         bounds = bounds.astype(np.float32)
         between = bounds.astype(np.float64).repeat(CHUNK, axis=0)[: len(model)].reshape(-1, 3, 2, 3)
-        position, scale, color = (_share(between[:, i], values) for i, values in enumerate(parts))
+        position, scale, color = (_inverse_lerp(between[:, i], values) for i, values in enumerate(parts))
         largest, others = smallest_three(quats)
         steps = 2.0 ** np.array(_VECTOR) - 1
         return cls(
@@ -136,11 +135,11 @@ class CompressedPlyCodes(Codes):
         rotations = (self.rotations / 1023 - 0.5) * np.sqrt(2)
         harmonics = np.where(self.sh == 0, 0.0, np.where(self.sh == 255, 256.0, self.sh + 0.5))
         return gaussians_of(
-            _between(bounds[:, 0], self.positions / steps),
+            _lerp(bounds[:, 0], self.positions / steps),
             from_smallest_three(self.largest, rotations),
-            _between(bounds[:, 1], self.scales / steps),
+            _lerp(bounds[:, 1], self.scales / steps),
             self.alphas / 255,
-            f_dc_of(_between(bounds[:, 2], self.colors / 255)),
+            f_dc_of(_lerp(bounds[:, 2], self.colors / 255)),
             harmonics / 32 - 4,
         )
 
@@ -151,7 +150,7 @@ def _has(table: npt.NDArray[np.void], names: list[str], code: str) -> bool:
 
 
 def _harmonics(table: npt.NDArray[np.void] | None, n: int) -> Bytes:
-    """[N, K - 1, 3] codes of the element `sh`, which has all red ones first; K = 1 without it."""
+    """[N, K - 1, 3] codes of the channel-major element `sh`; K = 1 without it."""
     if table is None:
         return np.empty((n, 0, 3), np.uint8)
     names = list(table.dtype.names or ())
@@ -162,27 +161,26 @@ def _harmonics(table: npt.NDArray[np.void] | None, n: int) -> Bytes:
     return np.ascontiguousarray(table).view(np.uint8).reshape(n, 3, -1).transpose(0, 2, 1).copy()
 
 
-def _fields(packed: Numbers, bits: tuple[int, int, int]) -> Words32:
+def _unpack_fields(packed: Numbers, bits: tuple[int, int, int]) -> Words32:
     """[N, 3] three bit fields of `packed` [N]; the last field has the lowest bits."""
     shifts = np.array([bits[1] + bits[2], bits[2], 0], dtype=np.uint32)
-    masks = np.array([2**each - 1 for each in bits], dtype=np.uint32)
-    return packed[:, None] >> shifts & masks
+    return packed[:, None] >> shifts & (2 ** np.array(bits, np.uint32) - np.uint32(1))
 
 
-def _joined(values: Numbers, bits: tuple[int, int, int]) -> Words32:
-    """[N] integers from their bit fields, the inverse of `_fields`."""
+def _pack_fields(values: Numbers, bits: tuple[int, int, int]) -> Words32:
+    """[N] integers from bit fields, inverse of `_unpack_fields`."""
     shifts = np.array([bits[1] + bits[2], bits[2], 0], dtype=np.uint32)
     fields: Words32 = np.bitwise_or.reduce(values.astype(np.uint32) << shifts, axis=1)
     return fields
 
 
-def _between(ends: Doubles, share: Doubles) -> Doubles:
+def _lerp(ends: Doubles, share: Doubles) -> Doubles:
     """[N, 3] linear interpolation at `share` [N, 3] between `ends` [N, 2, 3]."""
     return ends[:, 0] * (1 - share) + ends[:, 1] * share
 
 
-def _share(ends: Doubles, values: Doubles) -> Doubles:
-    """[N, 3] position of values between `ends` [N, 2, 3], in [0, 1]: the inverse of `_between`."""
+def _inverse_lerp(ends: Doubles, values: Doubles) -> Doubles:
+    """[N, 3] positions of values between `ends` [N, 2, 3], in [0, 1]; inverse of `_lerp`."""
     extent = ends[:, 1] - ends[:, 0]
     with np.errstate(divide="ignore", invalid="ignore"):
         share = np.where(extent < _MIN_RANGE, 0.0, (values - ends[:, 0]) / extent)

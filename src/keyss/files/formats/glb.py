@@ -2,11 +2,10 @@
 
 https://github.com/KhronosGroup/glTF/tree/main/extensions/2.0/Khronos/KHR_gaussian_splatting. Attributes are
 activated: scales and opacities, not their logarithms and logits. glTF has y up; like other converters, we
-take the frame of a .ply as rotated by 180 degrees about z. Files we write have this rotation in their node,
-and unchanged positions.
+rotate a .ply by 180 degrees about z. Written files have this rotation in their node, and unchanged positions.
 
-Of glTF 2.0 (https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html) this reads what Gaussians need. Python
-libraries for glTF leave buffers to their users and check no bounds.
+Reads the subset of glTF 2.0 (https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html) that Gaussians need;
+Python libraries for glTF do not decode buffers or check bounds.
 """
 
 from __future__ import annotations
@@ -26,16 +25,16 @@ from keyss.core.arrays import Doubles, Numbers
 from keyss.core.errors import InputError
 from keyss.core.gaussians import Gaussians
 from keyss.core.similarity import Similarity
-from keyss.files.foreign import FIT
+from keyss.files.file_kinds import FIT
 from keyss.files.formats.common import (
     arrays_of,
     colour_bytes,
+    gaussians_of,
     log_scales_of,
     reason,
     scales_of,
     to_bytes,
     unit,
-    usable_gaussians_of,
     writable,
 )
 
@@ -46,10 +45,10 @@ _FLOAT, _BYTE, _ARRAY_BUFFER, _POINTS = 5126, 5121, 34962, 0
 _COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 _TURN = (0.0, 0.0, 1.0, 0.0)  # 180 degrees about z, xyzw
-_MAX_JSON_BYTES = 1 << 20  # parsed, it takes up to 80 times as much
-_MAX_DEPTH = 64  # of nested nodes
+_MAX_JSON_BYTES = 1 << 20  # parsed, JSON takes up to 80 times as much memory
+_MAX_DEPTH = 64  # nested nodes
 _MAX_PARTS = 64  # primitives with Gaussians
-_AGAIN = "damaged glTF: the same Gaussians over and over"
+_REPEATED = "damaged glTF: the same Gaussians over and over"
 
 
 class _Accessor(msgspec.Struct, omit_defaults=True):
@@ -94,7 +93,7 @@ class _Mesh(msgspec.Struct):
 
 
 class _Document(msgspec.Struct, omit_defaults=True):
-    """The parts of a glTF document that are used here."""
+    """The part of a glTF document used here."""
 
     asset: dict[str, Any] = {}
     extensionsUsed: list[str] = []
@@ -110,20 +109,20 @@ class _Document(msgspec.Struct, omit_defaults=True):
 def read(data: bytes) -> Gaussians:
     """All Gaussians of a file's scene, as one model in the frame of a .ply.
 
-    Raises InputError for a file without Gaussians or with compressed ones.
+    Raises InputError, also for files without Gaussians or with compressed ones.
     """
     document, binary = _chunks(data)
     parts: list[Gaussians] = []
-    room = len(data)  # numbers, each of which takes a byte or more; counted once for each node
-    for to_scene, mesh in _placed(document):
+    room = len(data)  # values left to read, at a byte or more each, counted once per node
+    for to_scene, mesh in _meshes(document):
         for primitive in mesh.primitives:
             if EXTENSION not in primitive.extensions:
                 continue
             if len(parts) == _MAX_PARTS:
-                raise InputError(_AGAIN)
+                raise InputError(_REPEATED)
             model = _gaussians(document, primitive, binary, room)
             room -= sum(getattr(model, each.name).numel() for each in fields(model))
-            parts.append(_moved(model, to_scene))
+            parts.append(_to_ply_frame(model, to_scene))
     if not parts:
         _refuse_compressed(name for name in document.extensionsUsed if "spz" in name.lower())
         raise InputError(
@@ -134,7 +133,7 @@ def read(data: bytes) -> Gaussians:
 
 
 def write(model: Gaussians) -> bytes:
-    """A model as a file, with colours for programs that only know points."""
+    """A model as a file, with vertex colours for programs that show it as points."""
     means, quats, log_scales, alphas, f_dc, rest = arrays_of(writable(model))
     colors = np.concatenate([colour_bytes(f_dc), to_bytes(alphas * 255)[:, None]], axis=1)
     attributes = {
@@ -155,12 +154,10 @@ def write(model: Gaussians) -> bytes:
         content = array if is_color else array.astype("<f4")
         views.append(_BufferView(0, len(binary), content.nbytes, target=_ARRAY_BUFFER))
         kind = "SCALAR" if content.ndim == 1 else f"VEC{content.shape[1]}"
-        accessor = _Accessor(len(content), kind, _BYTE if is_color else _FLOAT, len(accessors))
-        accessor.normalized = is_color
-        if name == "POSITION":
-            accessor.min, accessor.max = means.min(axis=0).tolist(), means.max(axis=0).tolist()
-        accessors.append(accessor)
+        component = _BYTE if is_color else _FLOAT
+        accessors.append(_Accessor(len(content), kind, component, len(accessors), normalized=is_color))
         binary += content.tobytes()
+    accessors[0].min, accessors[0].max = means.min(axis=0).tolist(), means.max(axis=0).tolist()
     settings = {
         "kernel": "ellipse",
         "colorSpace": "srgb_rec709_display",
@@ -187,7 +184,7 @@ def write(model: Gaussians) -> bytes:
 
 
 def _refuse_compressed(extensions: Iterable[str]) -> None:
-    """Raise InputError if Gaussians are compressed by glTF extensions of these names."""
+    """Raise InputError if there are `extensions`, which compress Gaussians."""
     if names := ", ".join(extensions)[:80]:
         raise InputError(
             f"its Gaussians are compressed ({names}), which keyss does not read in a glTF file; export a "
@@ -221,8 +218,8 @@ def _chunks(data: bytes) -> tuple[_Document, bytes]:
         raise InputError(f"cannot parse the JSON of the .glb: {reason(error)}") from error
 
 
-def _placed(document: _Document) -> Iterator[tuple[Doubles, _Mesh]]:
-    """The meshes of the scene, each with the transform [4, 4] from its coordinates to the scene's."""
+def _meshes(document: _Document) -> Iterator[tuple[Doubles, _Mesh]]:
+    """The meshes of the scene, each with its transform [4, 4] to the scene's coordinates."""
     try:
         roots = range(len(document.nodes))
         if document.scenes:
@@ -240,7 +237,7 @@ def _placed(document: _Document) -> Iterator[tuple[Doubles, _Mesh]]:
             if node.mesh is not None:
                 yield here, document.meshes[node.mesh]
     except (IndexError, TypeError) as error:
-        raise InputError("damaged glTF: it names a part that is not there") from error
+        raise InputError("damaged glTF: it refers to a missing part") from error
 
 
 def _transform(node: _Node) -> Doubles:
@@ -249,7 +246,7 @@ def _transform(node: _Node) -> Doubles:
     try:
         if node.matrix is not None:
             transform = np.array(node.matrix, np.float64).reshape(4, 4).T
-        elif node.rotation or node.scale or node.translation:  # slow
+        elif node.rotation or node.scale or node.translation:  # Rotation is slow
             rotation = Rotation.from_quat(node.rotation or [0, 0, 0, 1]).as_matrix()
             transform[:3, :3] = rotation * np.array(node.scale or [1, 1, 1], np.float64).reshape(3)
             transform[:3, 3] = node.translation or [0, 0, 0]
@@ -261,7 +258,7 @@ def _transform(node: _Node) -> Doubles:
 
 
 def _gaussians(document: _Document, primitive: _Primitive, binary: bytes, room: int) -> Gaussians:
-    """The Gaussians of a primitive, in its own coordinates, if they have at most `room` numbers."""
+    """The Gaussians of a primitive in its own coordinates, at most `room` values."""
     compressed = primitive.extensions[EXTENSION].get("extensions", {})
     _refuse_compressed(compressed if isinstance(compressed, dict) else ["unknown"])
 
@@ -273,7 +270,7 @@ def _gaussians(document: _Document, primitive: _Primitive, binary: bytes, room: 
     degree = max(d for d in range(4) if d == 0 or f"{EXTENSION}:SH_DEGREE_{d}_COEF_0" in primitive.attributes)
     means = attribute("POSITION", 3)
     if len(means) * (11 + 3 * (degree + 1) ** 2) > room:
-        raise InputError(_AGAIN)
+        raise InputError(_REPEATED)
     sh = [attribute(name, 3) for name in _coefficients(degree)]
     quats = attribute(f"{EXTENSION}:ROTATION", 4)
     scales = attribute(f"{EXTENSION}:SCALE", 3)
@@ -284,19 +281,19 @@ def _gaussians(document: _Document, primitive: _Primitive, binary: bytes, room: 
         raise InputError("damaged glTF: opacities outside of 0 to 1")
     rest = np.stack(sh[1:], axis=1) if degree else np.empty((len(means), 0, 3))
     wxyz = unit(np.roll(quats, 1, axis=1))
-    return usable_gaussians_of(means, wxyz, log_scales_of(scales), alphas, sh[0], rest)
+    return gaussians_of(means, wxyz, log_scales_of(scales), alphas, sh[0], rest, drop=True)
 
 
 def _values(document: _Document, index: int, width: int, binary: bytes) -> Numbers:
     """[N, width] the values of an accessor into the binary chunk."""
     if not 0 <= index < len(document.accessors):
-        raise InputError("damaged glTF: it names an accessor that is not there")
+        raise InputError("damaged glTF: it refers to a missing accessor")
     accessor = document.accessors[index]
     code = _COMPONENTS.get(accessor.componentType)
     if accessor.sparse is not None or code is None or _WIDTHS.get(accessor.type) != width:
         raise InputError(f"damaged glTF: expected an accessor of {width} numbers each")
     if accessor.bufferView is None or not 0 <= accessor.bufferView < len(document.bufferViews):
-        raise InputError("damaged glTF: it names a buffer view that is not there")
+        raise InputError("damaged glTF: it refers to a missing buffer view")
     view = document.bufferViews[accessor.bufferView]
     if view.buffer != 0 or any("uri" in each for each in document.buffers[:1]):
         raise InputError("expected a .glb that contains its data, found one that refers to other files")
@@ -317,8 +314,8 @@ def _values(document: _Document, index: int, width: int, binary: bytes) -> Numbe
     return np.maximum(numbers / np.iinfo(dtype).max, -1.0) if accessor.normalized else numbers
 
 
-def _moved(model: Gaussians, to_scene: Doubles) -> Gaussians:
-    """`model` moved by `to_scene` into a scene with y up, then into the frame of a .ply."""
+def _to_ply_frame(model: Gaussians, to_scene: Doubles) -> Gaussians:
+    """`model` transformed by `to_scene` to a scene with y up, then to the frame of a .ply."""
     turn = np.eye(4)
     turn[:3, :3] = Rotation.from_quat(_TURN).as_matrix().round()
     whole = turn @ to_scene
@@ -340,5 +337,5 @@ def _moved(model: Gaussians, to_scene: Doubles) -> Gaussians:
 
 
 def _coefficients(degree: int) -> list[str]:
-    """Names of the attributes of harmonics, in order."""
+    """Attribute names of harmonics, in order."""
     return [f"{EXTENSION}:SH_DEGREE_{d}_COEF_{i}" for d in range(degree + 1) for i in range(2 * d + 1)]

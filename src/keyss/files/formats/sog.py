@@ -1,6 +1,6 @@
-"""SOG, PlayCanvas's format that stores attributes as images: reads and writes version 2.
+"""SOG, PlayCanvas's format with attributes in images: reads and writes version 2.
 
-https://developer.playcanvas.com/user-manual/gaussian-splatting/formats/sog/.
+https://developer.playcanvas.com/user-manual/gaussian-splatting/formats/sog/
 """
 
 from __future__ import annotations
@@ -28,30 +28,30 @@ from keyss.files.formats.common import (
     to_bytes,
 )
 
-_MAX_POSITION = 65535  # the largest code of a position
-_LARGEST = 252  # plus the index (wxyz) of the component that is not stored: a quaternion's fourth byte
-_ROW = 64  # palette vectors in a row of pixels
+_MAX_POSITION = 65535  # largest position code
+_LARGEST = 252  # a quaternion's fourth byte: this plus the index (wxyz) of the component left out
+_ROW = 64  # palette vectors per row of pixels
 _MAX_LABELS = 65536
 
 
 @dataclass(frozen=True, eq=False)
 class SogCodes(Codes):
-    """All numbers of a file."""
+    """All values of a file."""
 
     name = "sog"
 
-    mins: Doubles  # [3] smallest positions, as sign(x) ln(|x| + 1)
-    maxs: Doubles  # [3] largest positions, likewise
-    positions: Shorts  # [N, 3] in 65535ths between them
-    largest: Bytes  # [N] index of the component of wxyz that is not stored
+    mins: Doubles  # [3] bounds of positions, as sign(x) ln(|x| + 1)
+    maxs: Doubles  # [3]
+    positions: Shorts  # [N, 3] 65535ths between the bounds
+    largest: Bytes  # [N] index of the component of wxyz left out
     rotations: Bytes  # [N, 3] the other components, from -sqrt(1/2) to sqrt(1/2)
     scale_codebook: Floats  # [256] log scales
-    scales: Bytes  # [N, 3] indices into it
+    scales: Bytes  # [N, 3] codebook indices
     color_codebook: Floats  # [256] f_dc
-    colors: Bytes  # [N, 3] indices into it
+    colors: Bytes  # [N, 3] codebook indices
     alphas: Bytes  # [N] opacities in 255ths
     sh_codebook: Floats  # [256] harmonics; [0] for degree 0
-    palette: Bytes  # [P, K - 1, 3] indices into it
+    palette: Bytes  # [P, K - 1, 3] codebook indices
     labels: Shorts  # [N] indices into the palette; 0 for degree 0
 
     def __len__(self) -> int:
@@ -59,15 +59,15 @@ class SogCodes(Codes):
 
     @classmethod
     def parse(cls, data: bytes) -> Self:
-        """See `Codes`: of version 2."""
-        file = bundle.opened(data)
+        """See `Codes`."""
+        file = bundle.open_archive(data)
         meta = bundle.read_meta(file("meta.json"))
         n = meta.count
         check_count(n, len(data))
 
         def image(names: list[str], index: int = 0) -> Bytes:
             """[N, 4] the first N pixels, RGBA."""
-            return bundle.pixels(file(names[index]), n)
+            return bundle.decode_webp(file(names[index]), n)
 
         low, high = image(meta.means.files), image(meta.means.files, 1)
         quats, colors = image(meta.quats.files), image(meta.sh0.files)
@@ -78,16 +78,16 @@ class SogCodes(Codes):
             k = check_sh_degree(meta.shN.bands)
             sh_codebook = _codebook(meta.shN.codebook)
             pair = image(meta.shN.files, 1)
-            labels = _joined(pair[:, 0], pair[:, 1])
+            labels = _uint16(pair[:, 0], pair[:, 1])
             if not int(labels.max()) < meta.shN.count <= _MAX_LABELS:
                 raise InputError("damaged SOG: labels beyond the end of its palette")
             size = -(-meta.shN.count // _ROW) * _ROW
-            rows = bundle.pixels(file(meta.shN.files[0]), size * k, width=_ROW * k)
+            rows = bundle.decode_webp(file(meta.shN.files[0]), size * k, width=_ROW * k)
             palette = rows[: meta.shN.count * k, :3].reshape(-1, k, 3).copy()
         return cls(
             mins=np.array(meta.means.mins, np.float64),
             maxs=np.array(meta.means.maxs, np.float64),
-            positions=_joined(low[:, :3], high[:, :3]),
+            positions=_uint16(low[:, :3], high[:, :3]),
             largest=quats[:, 3] - np.uint8(_LARGEST),
             rotations=quats[:, :3].copy(),
             scale_codebook=_codebook(meta.scales.codebook),
@@ -109,19 +109,18 @@ class SogCodes(Codes):
             "scales.webp": _rgba(self.scales),
             "sh0.webp": _rgba(self.colors, self.alphas),
         }
-        width = math.ceil(math.sqrt(n) / 4) * 4
-        files = {
-            name: bundle.webp(pixels, width, math.ceil(n / width / 4) * 4) for name, pixels in images.items()
-        }
-        harmonics = None
         if k:
             labels = np.stack([self.labels & 255, self.labels >> 8, np.zeros_like(self.labels)], axis=1)
-            files["shN_labels.webp"] = bundle.webp(_rgba(labels), width, math.ceil(n / width / 4) * 4)
+            images["shN_labels.webp"] = _rgba(labels)
+        width = math.ceil(math.sqrt(n) / 4) * 4
+        height = math.ceil(n / width / 4) * 4
+        files = {name: bundle.encode_webp(pixels, width, height) for name, pixels in images.items()}
+        harmonics = None
+        if k:
             palette = _rgba(self.palette.reshape(-1, 3))
-            files["shN_centroids.webp"] = bundle.webp(palette, _ROW * k, -(-p // _ROW))
-            degree = {3: 1, 8: 2, 15: 3}[k]
+            files["shN_centroids.webp"] = bundle.encode_webp(palette, _ROW * k, -(-p // _ROW))
             names = ["shN_centroids.webp", "shN_labels.webp"]
-            harmonics = bundle.Harmonics(p, degree, self.sh_codebook.tolist(), names)
+            harmonics = bundle.Harmonics(p, {3: 1, 8: 2, 15: 3}[k], self.sh_codebook.tolist(), names)
         meta = bundle.Meta(
             version=2,
             count=n,
@@ -131,11 +130,11 @@ class SogCodes(Codes):
             sh0=bundle.Book(self.color_codebook.tolist(), ["sh0.webp"]),
             shN=harmonics,
         )
-        return bundle.packed({**files, "meta.json": msgspec.json.encode(meta)})
+        return bundle.pack_archive({**files, "meta.json": msgspec.json.encode(meta)})
 
     @classmethod
     def quantise(cls, model: Gaussians) -> Self:
-        """See `Codes`: with a palette of N / 2 to N vectors, at most 65,536."""
+        """See `Codes`. The palette has N / 2 to N vectors, at most 65,536."""
         means, quats, log_scales, opacities, f_dc, rest = arrays_of(model)
         n, k = rest.shape[:2]
         logs = np.copysign(np.log1p(np.abs(means.astype(np.float64))), means)
@@ -178,7 +177,7 @@ class SogCodes(Codes):
         )
 
     def positions_at(self, levels: Numbers) -> Doubles:
-        """[N, 3] world positions for the codes `levels`, 0 to 65535, which may be fractional."""
+        """[N, 3] world positions of codes `levels`, 0 to 65535, which may be fractional."""
         extent = np.where(self.maxs == self.mins, 1.0, self.maxs - self.mins)
         logs = self.mins + extent * (levels / _MAX_POSITION)
         with np.errstate(over="ignore"):
@@ -192,7 +191,7 @@ def _no_harmonics(count: int) -> tuple[Floats, Bytes, Shorts]:
 
 
 def _codebook(values: list[float]) -> Floats:
-    """[256] numbers, padded with 0. Raises InputError for more than 256, and if they are not finite."""
+    """[256] finite numbers, padded with 0. Raises InputError."""
     if len(values) > SIZE:
         raise InputError(f"damaged SOG: expected codebooks of at most {SIZE} numbers, found {len(values):,}")
     with np.errstate(over="ignore"):
@@ -202,7 +201,7 @@ def _codebook(values: list[float]) -> Floats:
     return numbers
 
 
-def _joined(low: Bytes, high: Bytes) -> Shorts:
+def _uint16(low: Bytes, high: Bytes) -> Shorts:
     """16-bit integers from their low and high bytes."""
     return low.astype(np.uint16) | (high.astype(np.uint16) << np.uint16(8))
 

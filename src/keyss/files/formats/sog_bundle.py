@@ -1,4 +1,4 @@
-"""The archive of a SOG: a ZIP of meta.json and lossless WebP images. Its content is untrusted."""
+"""The container of SOG: a ZIP of meta.json and lossless WebP images. Input is untrusted."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from keyss.files.formats.common import reason
 _MAX_META_BYTES = 1 << 20
 _MAX_MEMBERS = 64
 _SMALL_IMAGE = 1 << 16  # pixels; larger images may have at most four times the pixels needed
-_DATE = (1980, 1, 1, 0, 0, 0)  # equal models make equal files
+_DATE = (1980, 1, 1, 0, 0, 0)  # constant, so that equal models make equal files
 
-# Raised by zipfile for archives that are damaged or use unknown compression.
+# Raised by zipfile for damaged archives and unknown compression.
 _BROKEN = (
     *(zipfile.BadZipFile, zlib.error, struct.error, EOFError, OSError),
     *(ValueError, NotImplementedError, RuntimeError, OverflowError),
@@ -72,7 +72,7 @@ class Meta(msgspec.Struct, omit_defaults=True):
 
 
 class _Version(msgspec.Struct):
-    version: int = 1  # without the field
+    version: int = 1  # if missing
 
 
 def read_meta(data: bytes) -> Meta:
@@ -95,10 +95,10 @@ def read_meta(data: bytes) -> Meta:
     return meta
 
 
-def opened(data: bytes) -> Callable[[str], bytes]:
-    """A function that reads a file of the archive by name. Raises InputError, as the function does.
+def open_archive(data: bytes) -> Callable[[str], bytes]:
+    """A function that reads a file in the archive by name. Both raise InputError.
 
-    Together the files unpack to at most 1 MiB more than twice the bytes of the archive.
+    All files together may unpack to twice the size of the archive plus 1 MiB.
     """
     try:
         archive = zipfile.ZipFile(io.BytesIO(data))
@@ -130,8 +130,8 @@ def opened(data: bytes) -> Callable[[str], bytes]:
     return read
 
 
-def packed(files: Mapping[str, bytes]) -> bytes:
-    """An archive of files, which are compressed already."""
+def pack_archive(files: Mapping[str, bytes]) -> bytes:
+    """An archive of files, stored, since they are compressed already."""
     data = io.BytesIO()
     with zipfile.ZipFile(data, "w", zipfile.ZIP_STORED) as archive:
         for name, content in files.items():
@@ -139,12 +139,12 @@ def packed(files: Mapping[str, bytes]) -> bytes:
     return data.getvalue()
 
 
-def pixels(data: bytes, count: int, width: int | None = None) -> Bytes:
-    """[count, 4] RGBA of the first pixels of a lossless WebP, which must have this `width` if given.
+def decode_webp(data: bytes, count: int, width: int | None = None) -> Bytes:
+    """[count, 4] RGBA of the first pixels of a lossless WebP, of this `width` if given.
 
     Checks the size before decoding. Raises InputError.
     """
-    size = _size(data)
+    size = _webp_size(data)
     area = size[0] * size[1]
     if area < count or (width is not None and size[0] != width):
         raise InputError(f"damaged SOG: expected an image of {count:,} pixels, found {size[0]} x {size[1]}")
@@ -162,8 +162,8 @@ def pixels(data: bytes, count: int, width: int | None = None) -> Bytes:
     return decoded[:count]
 
 
-def webp(values: Bytes, width: int, height: int) -> bytes:
-    """[M, 4] RGBA as the first pixels of a lossless WebP, which keeps colours where alpha is 0."""
+def encode_webp(values: Bytes, width: int, height: int) -> bytes:
+    """[M, 4] RGBA as the first pixels of a lossless WebP that keeps colours where alpha is 0."""
     canvas = np.zeros((height * width, 4), np.uint8)
     canvas[: len(values)] = values
     data = io.BytesIO()
@@ -172,11 +172,10 @@ def webp(values: Bytes, width: int, height: int) -> bytes:
     return data.getvalue()
 
 
-def _size(data: bytes) -> tuple[int, int]:
-    """Width and height in pixels from the header of a lossless WebP.
+def _webp_size(data: bytes) -> tuple[int, int]:
+    """(width, height) from the header of a lossless WebP; Pillow allocates a canvas when it opens a file.
 
-    https://developers.google.com/speed/webp/docs/riff_container. Pillow would allocate a
-    canvas when it opens a file.
+    https://developers.google.com/speed/webp/docs/riff_container
     """
     if len(data) < 30 or data[:4] != b"RIFF" or data[8:12] != b"WEBP":
         raise InputError("damaged SOG: an image is not WebP")

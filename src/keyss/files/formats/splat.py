@@ -1,7 +1,7 @@
-"""The .splat of antimatter15: 32 bytes for each Gaussian, no header, no harmonics.
+"""antimatter15's .splat: 32 bytes per Gaussian, no header, no harmonics.
 
-https://github.com/antimatter15/splat. Positions and scales are floats; colours, opacity and rotation are
-bytes. Colours are clipped to 0 to 1.
+https://github.com/antimatter15/splat. Positions and scales are floats; opacity, rotation and colours, which
+are clipped, are bytes.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ from keyss.files.formats.common import (
     arrays_of,
     colour_bytes,
     f_dc_of,
+    gaussians_of,
     log_scales_of,
     scales_of,
     to_bytes,
     unit,
-    usable_gaussians_of,
     writable,
 )
 
@@ -30,22 +30,21 @@ _ROW = np.dtype(
 def read(data: bytes) -> Gaussians:
     """The model in a file, of SH degree 0. Raises InputError."""
     if not data or len(data) % _ROW.itemsize:
-        raise InputError(
-            f"not a whole .splat: expected 32 bytes for each Gaussian, found {len(data):,} in total"
-        )
+        raise InputError(f"not a whole .splat: expected 32 bytes per Gaussian, found {len(data):,} in total")
     rows = np.frombuffer(data, _ROW)
-    return usable_gaussians_of(
+    return gaussians_of(
         rows["mean"],
         unit(rows["quat"].astype(np.float64) / 128 - 1),
         log_scales_of(rows["scale"]),
         rows["alpha"] / 255,
         f_dc_of(rows["rgb"] / 255),
         np.empty((len(rows), 0, 3), np.float32),
+        drop=True,
     )
 
 
 def write(model: Gaussians) -> bytes:
-    """A model as a file, the most visible Gaussians first, as viewers show a file while it loads."""
+    """A model as a file, most visible Gaussians first, since viewers show files while they load."""
     means, quats, log_scales, opacities, f_dc, _ = arrays_of(writable(model))
     size = np.exp(log_scales.astype(np.float64).sum(axis=1))
     order = np.argsort(-opacities * size, kind="stable")

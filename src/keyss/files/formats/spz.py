@@ -1,9 +1,8 @@
 """SPZ, Niantic's compressed format: reads versions 2, 3 and 4, writes models in version 3.
 
-https://github.com/nianticlabs/spz. SPZ has y up and z towards the viewer (RUB), a .ply y down and z forward
-(RDF): `quantise` and `dequantise` rotate models by 180 degrees about x, like Niantic's library.
-
-The container is a header and six byte sections, compressed by gzip or, in version 4, zstd.
+https://github.com/nianticlabs/spz. A header and six byte sections, compressed by gzip or, in version 4, zstd.
+SPZ has y up and z towards the viewer (RUB), a .ply y down and z forward (RDF): like Niantic's library,
+`quantise` and `dequantise` rotate models by 180 degrees about x.
 """
 
 from __future__ import annotations
@@ -32,34 +31,36 @@ from keyss.files.formats.common import (
     from_smallest_three,
     gaussians_of,
     reason,
-    rounded,
+    round_half_away,
     smallest_three,
     to_bytes,
 )
 
 GZIP, NGSP = b"\x1f\x8b", b"NGSP"
-_GZIP_HEADER = b"\x1f\x8b\x08\0\0\0\0\0\0\x03"  # without time and name, as zlib writes it
+_GZIP_HEADER = b"\x1f\x8b\x08\0\0\0\0\0\0\x03"  # zlib's, without time and name
 _GZIP_BYTES, _PART = len(_GZIP_HEADER), 1 << 18
 _NIANTIC = 6, 9  # zlib's level and memory
-EXTENSIONS = 2  # flag: the file has extensions
+EXTENSIONS = 2  # flag
 _MAX_EXTENSION_BYTES = 1 << 20
 MAX_FRACTIONAL_BITS = 24
 _LEGACY = struct.Struct("<4sIIBBBB")  # magic, version, count, SH degree, fractional bits, flags, reserved
 _HEADER = struct.Struct("<4sIIBBBBI12s")  # ..., flags, number of streams, offset of the table, reserved
-_ENTRY = struct.Struct("<QQ")  # of the table: compressed and uncompressed bytes
-_ZSTD_LEVEL = 12  # as in Niantic's library
+_ENTRY = struct.Struct("<QQ")  # compressed and uncompressed bytes of a stream
+_ZSTD_LEVEL = 12  # Niantic's library
 _ZSTD_WINDOW = 1 << 23  # bytes that decoders should support (RFC 8878)
-VERSION = 3  # has 10-bit rotations, and more programs read it than the newer 4
+VERSION = 3  # written; has 10-bit rotations, and more programs read it than version 4
 _FRACTIONAL_BITS = 12  # steps of 1/4096 world unit, as in Niantic's library; small scenes get more
-_LEAST_STEPS, _STEPS_PER_GAUSSIAN = 1024, 8  # across half of the model, and the median size of Gaussians
-MAX_POSITION = 2**23 - 1  # the largest code of a position
-_LOG_SCALES, _FEW = (-10.0, 255 / 16 - 10), 0.01
-_USUAL = -4.0  # log scale of Gaussians in usual units
-_COLOR_SCALE = 0.15  # 0.15 f_dc + 0.5 is within 0 to 1
-_MAGNITUDE = 2**9 - 1  # a component of a rotation has a sign and 9 bits
-_SH_STEPS = np.array([8] * 3 + [16] * 12)  # 5 bits for degree 1, 4 above, as in Niantic's library
+_MIN_STEPS, _STEPS_PER_GAUSSIAN = 1024, 8  # across half the model, and across a Gaussian of median size
+MAX_POSITION = 2**23 - 1  # largest position code
+_LOG_SCALES = -10.0, 255 / 16 - 10
+_MAX_CLIPPED = 0.01  # share of Gaussians with clipped scales above which there is a warning
+_TYPICAL_LOG_SCALE = -4.0
+_COLOR_SCALE = 0.15  # colours are 0.15 f_dc + 0.5
+_MAGNITUDE = 2**9 - 1  # rotation components have a sign and 9 bits
+_ROTATION_SHIFTS = np.array([20, 10, 0], np.uint32)
+_SH_STEPS = np.array([8] * 3 + [16] * 12)  # 5 bits for degree 1, 4 bits above, as in Niantic's library
 
-# Signs of the harmonics of degrees 1 to 3 under (x, -y, -z).
+# Signs of the harmonics of degrees 1 to 3 under (x, y, z) -> (x, -y, -z).
 _SH_SIGNS = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], dtype=np.float32)
 _MEAN_SIGNS = np.array([1, -1, -1], dtype=np.float32)
 _QUAT_SIGNS = np.array([1, 1, -1, -1], dtype=np.float32)  # wxyz
@@ -67,7 +68,7 @@ _QUAT_SIGNS = np.array([1, 1, -1, -1], dtype=np.float32)  # wxyz
 
 @dataclass(frozen=True)
 class Header:
-    """The header fields of all versions."""
+    """Header fields common to all versions."""
 
     version: int
     count: int
@@ -78,7 +79,7 @@ class Header:
 
     @property
     def sizes(self) -> list[int]:
-        """Bytes of the sections: positions, alphas, colours, scales, rotations and harmonics."""
+        """Bytes in each section: positions, alphas, colours, scales, rotations, harmonics."""
         rotation = 3 if self.version == 2 else 4
         return [self.count * each for each in (9, 1, 3, 3, rotation, 3 * check_sh_degree(self.sh_degree))]
 
@@ -93,7 +94,7 @@ def unpack(data: bytes) -> tuple[Header, list[Bytes]]:
 
 
 def pack(header: Header, sections: Sequence[bytes], like: bytes = b"") -> bytes:
-    """A file of the six sections, compressed as the file `like` of another version of the model was."""
+    """A file of the six sections, with the compression settings of the file `like`."""
     common = (NGSP, header.version, header.count, header.sh_degree, header.fractional_bits, header.flags)
     if header.version < 4:
         content = _LEGACY.pack(*common, 0) + b"".join(sections) + header.extensions
@@ -109,7 +110,7 @@ def pack(header: Header, sections: Sequence[bytes], like: bytes = b"") -> bytes:
 def _gzip(content: bytes, like: bytes) -> bytes:
     """`content` in gzip, with the header and settings of `like`, else those of Niantic's library.
 
-    Other settings, which compressing once more reveals, would tell that the file was written again.
+    Recompressing a file reveals its settings; other settings would show that it was rewritten.
     """
     packer = _packer(*_settings_of(like))
     header = like[:_GZIP_BYTES] if like and not like[3] else _GZIP_HEADER
@@ -122,8 +123,8 @@ def _packer(level: int, memory: int) -> zlib._Compress:
 
 
 def _settings_of(packed: bytes) -> tuple[int, int]:
-    """Level and memory with which zlib writes `packed`; those of Niantic's library if there are none."""
-    if packed and not packed[3]:  # no header with a name or other fields
+    """zlib's level and memory that reproduce `packed`, else those of Niantic's library."""
+    if packed and not packed[3]:  # no optional header fields
         content = zlib.decompress(packed, 31)
         for settings in product((6, 9, *range(1, 6), 7, 8), (9, 8)):
             if _is_packed_with(packed, content, settings):
@@ -133,7 +134,7 @@ def _settings_of(packed: bytes) -> tuple[int, int]:
 
 def _is_packed_with(packed: bytes, content: bytes, settings: tuple[int, int]) -> bool:
     packer, at = _packer(*settings), _GZIP_BYTES
-    for start in range(0, len(content), _PART):  # the first parts tell
+    for start in range(0, len(content), _PART):  # wrong settings fail in the first parts
         part = packer.compress(content[start : start + _PART])
         if not packed.startswith(part, at):
             return False
@@ -152,7 +153,7 @@ def _unpack_gzip(data: bytes) -> tuple[Header, list[Bytes]]:
             raise InputError("SPZ of version 1, which was never published; expected 2, 3 or 4")
         if version not in (2, 3):
             raise InputError(f"expected SPZ of version 2 or 3 in gzip data, found {version}")
-        header = _checked(Header(version, count, degree, bits, flags, b""), len(data))
+        header = _check_header(Header(version, count, degree, bits, flags, b""), len(data))
         limit = sum(header.sizes) + _MAX_EXTENSION_BYTES
         body = stream.decompress(stream.unconsumed_tail, limit)
         if not stream.eof:  # zlib checks the trailing checksum in a further call
@@ -175,7 +176,7 @@ def _unpack_zstd(data: bytes) -> tuple[Header, list[Bytes]]:
     _, version, count, degree, bits, flags, streams, at, _ = _HEADER.unpack_from(data)
     if version != 4:
         raise InputError(f"expected SPZ of version 4 after NGSP, found {version}")
-    header = _checked(Header(version, count, degree, bits, flags, data[_HEADER.size : at]), len(data))
+    header = _check_header(Header(version, count, degree, bits, flags, data[_HEADER.size : at]), len(data))
     sizes = header.sizes
     if streams != sum(size > 0 for size in sizes):
         raise InputError(f"damaged SPZ: expected {sum(size > 0 for size in sizes)} streams, found {streams}")
@@ -194,7 +195,7 @@ def _unpack_zstd(data: bytes) -> tuple[Header, list[Bytes]]:
 
 
 def _zstd(packed: bytes, size: int) -> Bytes:
-    """[size] the first bytes of a stream. Raises InputError if there are fewer."""
+    """[size] the first bytes of a stream. Raises InputError if it is shorter."""
     unpacker = zstandard.ZstdDecompressor(max_window_size=max(_ZSTD_WINDOW, 2 * size))
     try:
         with unpacker.stream_reader(packed) as reader:
@@ -206,7 +207,7 @@ def _zstd(packed: bytes, size: int) -> Bytes:
     return np.frombuffer(body, np.uint8)
 
 
-def _checked(header: Header, size: int) -> Header:
+def _check_header(header: Header, size: int) -> Header:
     check_sh_degree(header.sh_degree)
     check_count(header.count, size)
     if header.fractional_bits > MAX_FRACTIONAL_BITS:
@@ -231,19 +232,19 @@ class SpzCodes(Codes):
     alphas: Bytes  # [N] opacities in 255ths
     colors: Bytes  # [N, 3] f_dc in steps of 1/38.25; 127.5 is 0
     scales: Bytes  # [N, 3] log scales in 16ths from -10 on
-    largest: Bytes  # [N] index of the component of xyzw that is not stored; always 3 in version 2
-    # [N, 3] the other components: 512 (negative) + magnitude in 511ths of sqrt(1/2); version 2: 8 bits
+    largest: Bytes  # [N] index of the component of xyzw left out; always 3 in version 2
+    # [N, 3] the other components: 512 (if negative) + magnitude in 511ths of sqrt(1/2); version 2: 8 bits
     rotations: Shorts
     sh: Bytes  # [N, K - 1, 3] harmonics in 128ths from -1 on
-    extensions: bytes = b""  # kept, not parsed
-    packed: bytes = field(default=b"", repr=False, compare=False)  # the file that was read
+    extensions: bytes = b""  # not parsed
+    packed: bytes = field(default=b"", repr=False, compare=False)  # the original file
 
     def __len__(self) -> int:
         return len(self.positions)
 
     @classmethod
     def parse(cls, data: bytes) -> Self:
-        """See `Codes`: of version 2, 3 or 4."""
+        """See `Codes`."""
         header, sections = unpack(data)
         n = header.count
         triples = sections[0].reshape(n, 3, 3).astype(np.int32)
@@ -254,9 +255,7 @@ class SpzCodes(Codes):
         else:
             packed = sections[4].reshape(n, 4).view("<u4")[:, 0]
             largest = (packed >> 30).astype(np.uint8)
-            rotations = np.stack([packed >> 20 & 1023, packed >> 10 & 1023, packed & 1023], 1).astype(
-                np.uint16
-            )
+            rotations = (packed[:, None] >> _ROTATION_SHIFTS & np.uint32(1023)).astype(np.uint16)
         return cls(
             version=header.version,
             fractional_bits=header.fractional_bits,
@@ -273,17 +272,14 @@ class SpzCodes(Codes):
         )
 
     def serialise(self) -> bytes:
-        """See `Codes`: of the codes' own version."""
+        """See `Codes`. Keeps the version."""
         n = len(self)
         fixed = self.positions.astype("<i4").view(np.uint8).reshape(n, 3, 4)[..., :3]
         if self.version == 2:
             rotations = self.rotations.astype(np.uint8).tobytes()
         else:
-            parts = self.rotations.astype(np.uint32)
-            packed = (
-                self.largest.astype(np.uint32) << 30 | parts[:, 0] << 20 | parts[:, 1] << 10 | parts[:, 2]
-            )
-            rotations = packed.astype("<u4").tobytes()
+            parts = np.bitwise_or.reduce(self.rotations.astype(np.uint32) << _ROTATION_SHIFTS, axis=1)
+            rotations = (self.largest.astype(np.uint32) << 30 | parts).astype("<u4").tobytes()
         sections = [fixed.tobytes(), self.alphas.tobytes(), self.colors.tobytes(), self.scales.tobytes()]
         degree = {0: 0, 3: 1, 8: 2, 15: 3}[self.sh.shape[1]]
         header = Header(self.version, n, degree, self.fractional_bits, self.flags, self.extensions)
@@ -291,20 +287,20 @@ class SpzCodes(Codes):
 
     @classmethod
     def quantise(cls, model: Gaussians, fractional_bits: int | None = None) -> Self:
-        """See `Codes`: in version 3. Raises OutputError for positions beyond 8 million.
+        """See `Codes`. Writes version 3. Raises OutputError for positions beyond 8 million.
 
-        Tells of Gaussians that get another size, by a KeyssWarning.
+        Warns (KeyssWarning) of clipped scales.
         """
         means, quats, log_scales, opacities, f_dc, rest = arrays_of(model)
         bits = _fractional_bits(means, log_scales) if fractional_bits is None else fractional_bits
-        _warn_of_sizes(log_scales)
+        _warn_of_clipped_scales(log_scales)
         largest, xyz = smallest_three(np.roll(quats * _QUAT_SIGNS, -1, axis=1))
         magnitudes = np.floor(np.abs(xyz) * (_MAGNITUDE / np.sqrt(0.5)) + 0.5).clip(0, _MAGNITUDE)
         return cls(
             version=VERSION,
             fractional_bits=bits,
             flags=0,
-            positions=rounded(np.ldexp(means.astype(np.float64), bits) * _MEAN_SIGNS).astype(np.int32),
+            positions=round_half_away(np.ldexp(means.astype(float), bits) * _MEAN_SIGNS).astype(np.int32),
             alphas=to_bytes(opacities * 255),
             colors=to_bytes(f_dc.astype(np.float64) * (_COLOR_SCALE * 255) + 127.5),
             scales=to_bytes((log_scales.astype(np.float64) + 10) * 16),
@@ -321,7 +317,7 @@ class SpzCodes(Codes):
             xyz = np.where(self.rotations & 512, -1.0, 1.0) * (self.rotations & _MAGNITUDE)
             xyz *= np.sqrt(0.5) / _MAGNITUDE
         quats = np.roll(from_smallest_three(self.largest, xyz), 1, axis=1) * _QUAT_SIGNS
-        rest = self.sh.astype(np.float32)  # changed in place: of hostile files it takes the most memory
+        rest = self.sh.astype(np.float32)  # modified in place: the largest array of hostile files
         rest -= 128
         rest *= _SH_SIGNS[: self.sh.shape[1], None] / 128
         return gaussians_of(
@@ -335,11 +331,11 @@ class SpzCodes(Codes):
 
 
 def _fractional_bits(means: Floats, log_scales: Floats) -> int:
-    """The default, or more for a model in small units, or as many as the largest position leaves."""
+    """12, more for models in small units, or fewer for distant positions."""
     extent = float(np.abs(means).max())
     spread = float(np.median(np.abs(means - np.median(means, axis=0)).max(axis=1)))
     size = math.exp(float(np.median(log_scales.max(axis=1)).clip(-60, 60)))
-    wanted = math.ceil(math.log2(max(_LEAST_STEPS / max(spread, 1e-20), _STEPS_PER_GAUSSIAN / size)))
+    wanted = math.ceil(math.log2(max(_MIN_STEPS / max(spread, 1e-20), _STEPS_PER_GAUSSIAN / size)))
     if not extent < MAX_POSITION:
         raise OutputError(
             f"SPZ holds positions up to {MAX_POSITION:,} world units, and this model reaches {extent:.3g}: "
@@ -349,15 +345,16 @@ def _fractional_bits(means: Floats, log_scales: Floats) -> int:
     return next(bits for bits in range(most, -1, -1) if extent * 2**bits < MAX_POSITION)
 
 
-def _warn_of_sizes(log_scales: Floats) -> None:
-    """Tell where more than _FEW of the Gaussians are smaller or larger than codes hold, in two axes."""
+def _warn_of_clipped_scales(log_scales: Floats) -> None:
+    """Warn if more than _MAX_CLIPPED of the Gaussians have two axes out of range."""
     size = np.sort(log_scales, axis=1)[:, 1]
-    if (share := float(((size < _LOG_SCALES[0]) | (size > _LOG_SCALES[1])).mean())) > _FEW:
+    if (share := float(((size < _LOG_SCALES[0]) | (size > _LOG_SCALES[1])).mean())) > _MAX_CLIPPED:
         least, most = np.exp(_LOG_SCALES)
+        factor = np.exp(_TYPICAL_LOG_SCALE - np.median(size))
         warnings.warn(
             f"{share:.0%} of the Gaussians are smaller than {least:.2g} or larger than {most:.3g} world "
             "units, between which .spz holds scales, and change: write another format, or scale the model "
-            f"first, e.g. with `splat-transform IN -s {np.exp(_USUAL - np.median(size)):.2g} OUT.ply`",
+            f"first, e.g. with `splat-transform IN -s {factor:.2g} OUT.ply`",
             KeyssWarning,
             stacklevel=2,
         )
@@ -366,7 +363,7 @@ def _warn_of_sizes(log_scales: Floats) -> None:
 def _quantised_harmonics(rest: Floats) -> Bytes:
     """[N, K - 1, 3] codes that are multiples of `_SH_STEPS`, which compresses better."""
     signed = rest * _SH_SIGNS[: rest.shape[1], None]
-    codes = rounded(signed.astype(np.float64) * 128) + 128
+    codes = round_half_away(signed.astype(np.float64) * 128) + 128
     step = _SH_STEPS[: rest.shape[1], None]
     multiples: Bytes = (np.floor((codes + step // 2) / step) * step).clip(0, 255).astype(np.uint8)
     return multiples

@@ -2,32 +2,30 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from keyss.core.errors import InputError
+from keyss.fitting.image_metrics import ImageQuality
+from keyss.lab.auc import Auc
 from keyss.lab.distances import AttributeDistance
 from keyss.lab.leaks.leak_scores import AttackResult
+from keyss.lab.render_time import RenderTime
 from keyss.lab.robustness.survival import ChangeResult
 from keyss.lab.sinkhorn import Sinkhorn3D
-from keyss.lab.speed import SpeedResult
 from keyss.lab.stealth.judging import StealthResult
-from keyss.lab.stegexpose import StegExposeAuc
 from keyss.lab.two_sample import TwoSampleAucs
 from keyss.measure.hide_quality import WrongKeys
-from keyss.measure.image_scores import ImageComparison
 from keyss.runs.files import run_folder
 from keyss.runs.folder import PRIVATE
-from keyss.runs.records import read_record
+from keyss.runs.json_records import read_record
 
-AUDIT_FOLDER, AUDIT_FILE = f"{PRIVATE}/audit", "audit.json"  # folder relative to the run
-PICTURES = "pictures"  # folder relative to the audit's
+AUDIT, PICTURES = f"{PRIVATE}/audit/audit.json", f"{PRIVATE}/audit/pictures"  # relative to the run
 
 
 @dataclass(frozen=True)
 class AuditedRun:
-    """The audited run, and the versions that audited it."""
+    """The audited run."""
 
     path: str
     method: str
@@ -36,8 +34,14 @@ class AuditedRun:
     width: int | None  # pixels, if photos were shrunk
     gaussians: int  # Gaussians of the stego model
     standard: bool = True  # True if a 3DGS model is published
-    config: dict[str, Any] = field(default_factory=dict)
-    versions: dict[str, str] = field(default_factory=dict)  # Python and libraries, by name
+
+
+@dataclass(frozen=True)
+class ImageComparison:
+    """8-bit renders of a model against the test views."""
+
+    views: dict[str, ImageQuality]  # by name
+    mean: ImageQuality  # over the views
 
 
 @dataclass(frozen=True)
@@ -57,7 +61,7 @@ class ImagesResult:
     """Cover and secrets against the test views."""
 
     models: tuple[ModelImages, ...]  # cover, then secrets
-    pictures: dict[str, dict[str, str]]  # files in the audit's folder by view and by model
+    pictures: dict[str, dict[str, str]]  # files of PICTURES by view and by model
 
 
 @dataclass(frozen=True)
@@ -72,19 +76,18 @@ class ParametersResult:
 
 
 @dataclass(frozen=True)
-class RendersResult:
+class StegExposeResult:
     """StegExpose on renders."""
 
-    views: tuple[str, ...]
-    stego: StegExposeAuc  # the stego model against a control
-    control: StegExposeAuc  # one control against another
+    stego: Auc  # the stego model against a control
+    control: Auc  # one control against another
 
 
 @dataclass(frozen=True, kw_only=True)
 class Audit:
     """The result of an audit; parts that did not run are None."""
 
-    version: int = 4
+    version: int = 5
     keyss: str  # version of the program
     seconds: float
     run: AuditedRun
@@ -94,15 +97,15 @@ class Audit:
     images: ImagesResult | None = None
     parameters: ParametersResult | None = None
     stealth: StealthResult | None = None
-    stegexpose: RendersResult | None = None
+    stegexpose: StegExposeResult | None = None
     leaks: tuple[tuple[AttackResult, ...], ...] | None = None  # attacks on each secret
     robustness: tuple[ChangeResult, ...] | None = None
-    speed: SpeedResult | None = None
+    speed: dict[str, RenderTime] | None = None
 
 
 def read_audit(run: Path) -> Audit:
     """Read a run's audit. Raises InputError if it is missing, broken, too large or of another version."""
-    path = run / AUDIT_FOLDER / AUDIT_FILE
+    path = run / AUDIT
     if not path.exists():
         run_folder(run)
         raise InputError(f"{path}: there is no audit; `keyss audit {run}` makes one")

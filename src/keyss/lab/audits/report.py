@@ -1,43 +1,26 @@
-"""The report: one HTML file that opens from disk and loads nothing, enforced by its policy.
-
-Texts, images and size of an audit are untrusted.
-"""
+"""The report: one HTML file that opens from disk and loads nothing, enforced by its policy."""
 
 from __future__ import annotations
 
 import hashlib
 from base64 import b64encode
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass
+from functools import partial
 from importlib.resources import files
 from pathlib import Path, PurePath
-from typing import TYPE_CHECKING
 
-import msgspec
-from markupsafe import Markup
+from markupsafe import Markup, escape
 
 from keyss.core import InputError, import_extra
 from keyss.files.images import probe_image
-from keyss.files.reading import read_file
-from keyss.lab.audits import numbers
-from keyss.lab.audits.parts import OF_3DGS_MODELS
-from keyss.lab.audits.record import AUDIT_FOLDER, Audit, ModelImages
+from keyss.files.inputs import read_file
+from keyss.lab.audits import formatting
+from keyss.lab.audits.record import PICTURES, Audit, ImageComparison, ModelImages
 from keyss.lab.audits.summary import auc_text, headline, verdicts, worst_leak
-from keyss.measure.image_scores import ImageComparison
-
-if TYPE_CHECKING:
-    from jinja2 import Environment
 
 _STYLES = ("page.css", "pictures.css", "print.css")
-_AUDIT = "`keyss audit RUN --key-file KEY` measures it"
-_EVALUATE = "`keyss evaluate RUN --key-file KEY` measures it, and a new audit includes it"
-_NO_MODEL = "the method does not publish a 3DGS model"
-_MAX_PICTURE = 32 * 2**20
-_MAX_PICTURES = 256 * 2**20  # bytes of all pictures; browsers cannot show more
-_MAX_ENTRIES = 10_000
-_MAX_NUMBER = 1e15
-_MAX_TEXT = 1_000
-_PNG = b"\x89PNG\r\n\x1a\n"
+_MAX_PICTURE = 32 * 2**20  # bytes
 # By field of `Audit`, in the order of the page: the id of the section and its title.
 _PARTS = {
     "images": ("images", "Against the test views"),
@@ -47,51 +30,49 @@ _PARTS = {
     "parameters": ("statistics", "Statistics of the model"),
     "stegexpose": ("renders", "StegExpose on renders"),
     "robustness": ("robustness", "Robustness"),
-    "speed": ("speed", "Speed and files"),
+    "speed": ("speed", "Speed"),
 }
 
 
-def report_bytes(audit: Audit, folder: Path) -> bytes:
+def report_bytes(audit: Audit, run: Path) -> bytes:
     """The content of the report.
 
-    Pictures, style and script are embedded. Deterministic. `folder` holds the audit's pictures, like a run's.
-    Raises InputError for an audit that is too large or names pictures outside the folder.
+    Pictures, style and script are embedded. Deterministic. `run` is a folder laid out like a run's, with the
+    audit's pictures. Raises InputError for names outside their folder.
     """
-    try:
-        check_bounds(audit)
-    except RecursionError as error:
-        raise InputError(f"{folder}: the audit's configuration is nested too deeply") from error
-    script = _asset("slider.js")
-    lines, notes = verdicts(audit), _missing_parts(audit)
+    script, lines = _asset("slider.js"), verdicts(audit)
     models = audit.images.models if audit.images else ()
     sections = {"verdict": "Verdict"} if lines else {}
     if audit.images and audit.images.pictures:
         sections["pictures"] = "Pictures"
     sections |= {id: title for name, (id, title) in _PARTS.items() if getattr(audit, name)}
-    if notes:
-        sections["not-measured"] = "Not measured"
-    if audit.run.config or audit.run.versions:
-        sections["configuration"] = "Configuration and versions"
-    page = (
-        _environment()
-        .get_template("page.html")
-        .render(
-            audit=audit,
-            title=_title(audit),
-            sections=sections,
-            pictures=AuditPictures(folder),
-            lines=lines,
-            headline=headline(lines),
-            notes=notes,
-            comparisons=_comparisons(models),
-            worst_leak=worst_leak,
-            all_photos=all(model.photos for model in models),
-            style=Markup("".join(map(_asset, _STYLES))),
-            script=Markup(script),
-            policy=_policy(script),
-        )
+    jinja2 = import_extra("jinja2", "audit", "write a report")
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("keyss.lab.audits"),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        finalize=lambda value: "" if value is None else value,
+        trim_blocks=True,
+        lstrip_blocks=True,
     )
-    return page.encode()
+    formats = [*filter(callable, vars(formatting).values()), auc_text, prose]
+    environment.filters |= {each.__name__: each for each in formats}
+    page: str = environment.get_template("page.html").render(
+        audit=audit,
+        title=_title(audit),
+        sections=sections,
+        missing=[title for name, (_, title) in _PARTS.items() if not getattr(audit, name)],
+        picture=partial(embed_picture, run / PICTURES),
+        lines=lines,
+        headline=headline(lines),
+        comparisons=_comparisons(models),
+        worst_leak=worst_leak,
+        all_photos=all(model.photos for model in models),
+        style=Markup("".join(map(_asset, _STYLES))),
+        script=Markup(script),
+        policy=_policy(script),
+    )
+    return page.encode(errors="replace")
 
 
 def _policy(script: str) -> str:
@@ -103,40 +84,12 @@ def _policy(script: str) -> str:
     )
 
 
-def prose(text: str) -> Markup:
+def prose(sentence: str) -> Markup:
     """Format text with `backquotes` as code."""
-    code = Markup("<code>{}</code>")
+    parts = enumerate(sentence.split("`"))
     return Markup("").join(
-        code.format(part) if i % 2 else part for i, part in enumerate(clean(text).split("`"))
+        Markup("<code>{}</code>").format(each) if i % 2 else escape(each) for i, each in parts
     )
-
-
-def as_json(value: object) -> Markup:
-    """A record as indented JSON."""
-    lines = msgspec.json.format(msgspec.json.encode(value).decode(), indent=2).splitlines()
-    return Markup("\n").join(map(clean, lines))
-
-
-def _environment() -> Environment:
-    jinja2 = import_extra("jinja2", "audit", "write a report")
-    environment: Environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("keyss.lab.audits"),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        finalize=_finalize,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    formats = [*filter(callable, vars(numbers).values()), auc_text, as_json, prose]
-    environment.filters |= {each.__name__: each for each in formats}
-    return environment
-
-
-def _finalize(value: object) -> object:
-    """Convert the value of an expression in a template; untrusted text becomes one printable line."""
-    if isinstance(value, str) and not isinstance(value, Markup):
-        return clean(value)
-    return "" if value is None else value
 
 
 def _title(audit: Audit) -> str:
@@ -156,44 +109,8 @@ def _comparisons(models: Sequence[ModelImages]) -> list[tuple[str, ImageComparis
     return rows
 
 
-def _missing_parts(audit: Audit) -> list[str]:
-    """Sentences on missing parts of the audit, and how to get them."""
-    notes = []
-    for name, (_, title) in _PARTS.items():
-        if not getattr(audit, name):
-            how = _EVALUATE if name == "wrong_key" else _AUDIT
-            impossible = name in OF_3DGS_MODELS and not audit.run.standard
-            notes.append(f"{title}: {_NO_MODEL if impossible else how}.")
-    return notes
-
-
 def _asset(name: str) -> str:
     return files("keyss.lab.audits").joinpath("assets", name).read_text(encoding="utf-8")
-
-
-def check_bounds(value: object, place: str = "audit") -> None:
-    """Raise InputError for a list of more than 10,000 entries or a number beyond 1e15 in a record."""
-    entries: dict[object, object] = {}
-    if is_dataclass(value):
-        entries = {f".{each.name}": getattr(value, each.name) for each in fields(value)}
-    elif isinstance(value, dict):
-        entries = {f".{clean(str(name))}": item for name, item in value.items()}
-    elif isinstance(value, list | tuple):
-        entries = {f"[{index}]": item for index, item in enumerate(value)}
-    elif isinstance(value, int | float) and abs(value) > _MAX_NUMBER:
-        raise InputError(f"{place}: expected a number of at most {_MAX_NUMBER:g} in size")
-    if len(entries) > _MAX_ENTRIES:
-        raise InputError(f"{place}: expected at most {_MAX_ENTRIES:,} entries, found {len(entries):,}")
-    for name, item in entries.items():
-        check_bounds(item, f"{place}{name}")
-
-
-def clean(text: str) -> str:
-    """One line of at most 1,000 printable characters: no control or bidirectional characters."""
-    text = text[: _MAX_TEXT - 1] + "…" if len(text) > _MAX_TEXT else text
-    return "".join(
-        c if c.isprintable() else " " if c.isspace() else "\N{REPLACEMENT CHARACTER}" for c in text
-    )
 
 
 @dataclass(frozen=True)
@@ -205,28 +122,11 @@ class EmbeddedPicture:
     url: str  # data:
 
 
-class AuditPictures:
-    """The pictures of an audit: PNG files in its folder."""
-
-    def __init__(self, run: Path) -> None:
-        self._folder = run / AUDIT_FOLDER
-        self._left = _MAX_PICTURES
-
-    def read(self, name: str) -> EmbeddedPicture:
-        """Read a picture that the audit names.
-
-        Raises InputError if it is outside the audit's folder, missing, not a PNG or too large.
-        """
-        try:
-            folder = self._folder.resolve()
-            path = (folder / name).resolve()
-        except (OSError, RuntimeError, ValueError) as error:  # loops of links, invalid names
-            raise InputError(f"expected the name of a picture, found {name!r}") from error
-        if not path.is_relative_to(folder):
-            raise InputError(f"expected a picture in {self._folder}, found {name!r}")
-        data = read_file(path, min(_MAX_PICTURE, self._left))
-        if not data.startswith(_PNG):
-            raise InputError(f"{path}: expected a PNG picture")
-        width, height, _ = probe_image(path)
-        self._left -= len(data)
-        return EmbeddedPicture(width, height, "data:image/png;base64," + b64encode(data).decode())
+def embed_picture(folder: Path, name: str) -> EmbeddedPicture:
+    """Read a picture. Raises InputError if it is outside the folder, missing, unreadable or too large."""
+    path = folder / name
+    if name != PurePath(name).name or path.is_symlink():
+        raise InputError(f"expected a picture in {folder}, found {name!r}")
+    data = read_file(path, _MAX_PICTURE)
+    width, height, _ = probe_image(path)
+    return EmbeddedPicture(width, height, "data:image/png;base64," + b64encode(data).decode())

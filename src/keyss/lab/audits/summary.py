@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from keyss.lab.auc import Auc
-from keyss.lab.audits.numbers import decibel, difference, number, numbered, significant, times
+from keyss.lab.audits.formatting import decibel, difference, number, numbered, significant, times
 from keyss.lab.audits.record import Audit
 from keyss.lab.leaks.leak_scores import GRADIENT_LIMIT, PSNR_LIMIT, SSIM_LIMIT, AttackResult
 
@@ -80,8 +80,7 @@ def auc_text(auc: Auc) -> str:
 
 def worst_leak(attacks: Iterable[AttackResult]) -> AttackResult | None:
     """The attack without the key that shows the most of the secret."""
-    without_key = (attack for attack in attacks if not attack.with_key)
-    return max(without_key, key=lambda attack: attack.best_leak.evidence(), default=None)
+    return max(attacks, key=lambda attack: attack.leak.evidence(), default=None)
 
 
 def _word(within: bool, otherwise: Word = "visible") -> Word:
@@ -122,9 +121,9 @@ def _leaks(audit: Audit) -> Iterator[Verdict]:
         return
     index = next(index for index, attacks in enumerate(secrets) if worst in attacks)
     of = f"{numbered('secret', index, len(secrets))}, " if len(secrets) > 1 else ""
-    leak = worst.best_leak
+    leak = worst.leak
     value = f"{difference(leak.psnr_fitted)} dB, {difference(leak.ssim_fitted, 3)} SSIM, "
-    value += f"{difference(leak.gradient_coarse)} gradients ({of}{worst.attack}: {worst.best})"
+    value += f"{difference(leak.gradient)} gradients ({of}{worst.attack}: {worst.best})"
     limit = f"at most {decibel(PSNR_LIMIT, 1)}, {SSIM_LIMIT} and {GRADIENT_LIMIT}"
     beside = "0, plain models; colours fitted"
     yield Verdict("leaks without the key", value, beside, limit, _word(leak.evidence() <= 1), "leaks")
@@ -178,7 +177,7 @@ def _two_sample(audit: Audit) -> Iterator[Verdict]:
 def _renders(audit: Audit) -> Iterator[Verdict]:
     if audit.stegexpose is None:
         return
-    stego, control = audit.stegexpose.stego.fused, audit.stegexpose.control.fused
+    stego, control = audit.stegexpose.stego, audit.stegexpose.control
     excess = abs(stego.auc - 0.5) - abs(control.auc - 0.5)
     undecided = stego.low <= 0.5 <= stego.high
     value, beside = f"AUC {auc_text(stego)}", f"{auc_text(control)}, between plain models"

@@ -38,8 +38,7 @@ class LeakScores:
 
     psnr_fitted: float  # dB
     ssim_fitted: float  # 3DGS's SSIM
-    gradient: float  # `gradient_correlation`
-    gradient_coarse: float  # `gradient_correlation` of `coarse` images
+    gradient: float  # `gradient_correlation` of `coarse` images
 
     @staticmethod
     def combine(function: Callable[[Sequence[float]], float], rows: Sequence[LeakScores]) -> LeakScores:
@@ -51,7 +50,7 @@ class LeakScores:
         return max(
             self.psnr_fitted / PSNR_LIMIT,
             self.ssim_fitted / SSIM_LIMIT,
-            self.gradient_coarse / GRADIENT_LIMIT,
+            self.gradient / GRADIENT_LIMIT,
         )
 
     def __sub__(self, other: LeakScores) -> LeakScores:
@@ -97,10 +96,9 @@ def leak_scores(model: Gaussians, views: Sequence[View], background: Tensor) -> 
         photo = view.photo(model.device)
         image = render(model, view.camera, background).clamp(0, 1)
         fitted = fit_colours(image, photo).clamp(0, 1)
-        gradient = gradient_correlation(image, photo)
-        gradient_coarse = gradient_correlation(coarse(image), coarse(photo))
+        gradient = gradient_correlation(coarse(image), coarse(photo))
         similarity = float(ssim(fitted, Target.of(photo)))
-        rows.append(LeakScores(psnr(fitted, photo), similarity, gradient, gradient_coarse))
+        rows.append(LeakScores(psnr(fitted, photo), similarity, gradient))
     return LeakScores.combine(fmean, rows)
 
 
@@ -115,17 +113,15 @@ def _gradients(image: Tensor) -> Tensor:
 class AttackResult:
     """Scores of an attack on the stego model, and their excess over control models.
 
-    An attack has variants: thresholds, shares, clusters. The maximum over them counts, because an attacker
-    recognises the best one.
+    An attack has variants: thresholds, shares, clusters. The best one counts, because an attacker recognises
+    it.
     """
 
     attack: str
     sentence: str
-    with_key: bool  # not an attack, but the revealed secret
-    scores: LeakScores  # maximum of each score over the variants
-    leak: LeakScores  # `scores` minus those of the controls
-    best: str  # variant with the maximum `LeakScores.evidence`, which is pictured and judged
-    best_leak: LeakScores  # scores of the best variant minus those of the controls
+    best: str  # the variant with the maximum `LeakScores.evidence`
+    scores: LeakScores  # of the best variant
+    leak: LeakScores  # `scores` minus the controls' maxima over the variants
     picture: str | None = None  # name of a file, in an audit
 
 
@@ -167,13 +163,9 @@ def look_for_secret(
         control = LeakScores.combine(fmean, highest)
         leaks = {label: own - control for label, (own, _) in variants.items()}
         best = max(leaks, key=lambda label: leaks[label].evidence())
-        scored = LeakScores.combine(max, [own for own, _ in variants.values()])
-        results.append(
-            AttackResult(
-                attack.name, attack.sentence, attack.with_key, scored, scored - control, best, leaks[best]
-            )
-        )
-        pictures[attack.name] = _side_by_side([variants[best][1], of_controls[0][best][1], views[0].image])
+        scores, picture = variants[best]
+        results.append(AttackResult(attack.name, attack.sentence, best, scores, leaks[best]))
+        pictures[attack.name] = _side_by_side([picture, of_controls[0][best][1], views[0].image])
     return results, pictures
 
 

@@ -1,8 +1,8 @@
 """Many runs: sweeps, batches, comparisons of methods, and the paper's tables.
 
-A *cell* is a plain fit, or a hiding and its measures, in a folder of its own (`cell`). Cells run one after
+A *trial* is a plain fit, or a hiding and its measures, in a folder of its own (`trial`). Trials run one after
 the other in this process, or on a Ray cluster (`engine`), and never run again once they are done. A sweep
-(YAML), a comparison of methods and a table of the paper each add cells to a folder (`cell_folder`) and
+(YAML), a comparison of methods and a table of the paper each add trials to a folder (`trial_folder`) and
 tabulate the results; a batch (CSV) runs on the same engine.
 """
 

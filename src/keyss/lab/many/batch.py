@@ -1,13 +1,6 @@
 """`hide_batch`: one hiding per asset of a table; a failed asset does not stop the others.
 
-The table is a CSV file with a row for each asset:
-
-| column | what |
-| --- | --- |
-| `cover` | public model or scene |
-| `secret`, or `secret_file` | scene or model to hide in it, or any file |
-| `out` | folder of its results, in the batch's; it is also the asset's name under a master key |
-| `key_file` | file with its key; none with a master key |
+The table is a CSV file with the columns COLUMNS (docs/experiments.md).
 """
 
 from __future__ import annotations
@@ -16,13 +9,11 @@ import csv
 import hashlib
 import io
 import os
-import unicodedata
 import warnings
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from itertools import pairwise
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -33,12 +24,11 @@ from keyss.api.hide_files import SecretFile, hide_files
 from keyss.core import InputError, KeyssWarning, ViewOptions
 from keyss.core.errors import did_you_mean
 from keyss.files import write_bytes
-from keyss.files.reading import read_text
+from keyss.files.inputs import read_text
 from keyss.keys import MasterKey, read_key
-from keyss.lab.many.cell import changed_since
-from keyss.lab.many.cell_folder import ManyResult, Outcome, check_master_key
-from keyss.lab.many.engine import claim_folder, engine
+from keyss.lab.many.engine import ManyResult, Outcome, claim_folder, run_tasks
 from keyss.lab.many.result_tables import csv_bytes
+from keyss.lab.many.trial import modification_times
 from keyss.methods import MethodOptions, registry
 from keyss.progress import Reporter
 from keyss.rendering import Backend
@@ -48,6 +38,8 @@ from keyss.runs.files import PathLike
 from keyss.runs.folder import PRIVATE
 
 MAX_BYTES = 64 << 20
+# A row has a secret (a scene or model) or a secret file, and a key file unless there is a master key. `out`
+# is the folder of its results, and its name under the master key.
 COLUMNS = ("cover", "secret", "secret_file", "out", "key_file")
 SUMMARY = f"{PRIVATE}/batch.csv"
 _RECORD = f"{PRIVATE}/asset.json"  # relative to the folder of a finished asset
@@ -67,23 +59,22 @@ class Asset:
     views: ViewOptions
     min_psnr: float | None
     device: Backend
+    times: dict[str, int]  # of modification, by input
 
     def is_done(self, place: Path) -> bool:
         """True if it was made from equal files and options by this version of keyss."""
         record = place / _RECORD
-        inputs = [each for each in (self.cover, self.secret, self.secret_file, self.key_file) if each]
-        same = os.path.exists(record) and record.read_bytes() == record_bytes(self)
-        return same and stego_in(place).exists() and not changed_since(record, inputs)
+        return record.exists() and record.read_bytes() == record_bytes(self) and stego_in(place).exists()
 
 
-def read_rows(path: Path, *, master: bool) -> list[dict[str, str]]:
-    """Read all rows without empty values; paths, except `out`, become absolute.
+def read_rows(path: Path, *, master: bool) -> dict[str, dict[str, str]]:
+    """Read all rows, by `out`; other paths become absolute, and empty values are left out.
 
     `master`: keys are derived, and rows have no key file. Missing files are no error here, but fail their
     asset. Raises InputError with the line.
     """
     reader = csv.DictReader(io.StringIO(read_text(path, MAX_BYTES)), strict=True)
-    found, lines = [], {}
+    found: dict[str, dict[str, str]] = {}
     try:
         heads = reader.fieldnames = [head.strip() for head in reader.fieldnames or ()]
         for head in heads:
@@ -92,26 +83,22 @@ def read_rows(path: Path, *, master: bool) -> list[dict[str, str]]:
                 raise InputError(f"{path}: {head[:60]!r} is no column, or one twice; {near}")
         for row in reader:
             where = f"{path}, line {reader.line_num}"
-            found.append(_check_row(where, path.absolute().parent, row, master))
-            # File systems may treat two spellings as the same name.
-            place = PurePosixPath(unicodedata.normalize("NFC", found[-1]["out"]).casefold())
-            lines[where] = place
+            out, paths = _check_row(where, row, master)
+            if out in found:
+                raise InputError(f"{where}: out: {out!r} is the folder of an earlier line")
+            found[out] = {name: os.path.realpath(path.parent / value) for name, value in paths.items()}
     except csv.Error as error:
         raise InputError(f"{path}: expected CSV: {error}") from error
     if not found:
         raise InputError(f"{path}: expected the names of columns, and at least one asset")
-    for (where, place), (other, inner) in pairwise(sorted(lines.items(), key=lambda each: each[1])):
-        if inner.is_relative_to(place):
-            raise InputError(f"{other}: out: is the folder of {where}, or lies in it")
     return found
 
 
-def _check_row(where: str, base: Path, row: dict[str, str], master: bool) -> dict[str, str]:
+def _check_row(where: str, row: dict[str, str], master: bool) -> tuple[str, dict[str, str]]:
+    """The folder of the results, and the other values that are not empty. Raises InputError."""
     if None in row or None in row.values():
         raise InputError(f"{where}: expected as many columns as there are names of them")
     given = {name: value.strip() for name, value in row.items() if value.strip()}
-    if any("\0" in value for value in given.values()):
-        raise InputError(f"{where}: expected paths, got a NUL character")
     if master == ("key_file" in given):
         what = "leave out the column key_file with a master key" if master else "expected a key_file"
         raise InputError(f"{where}: {what}: keys come from it or from `master_key_file`")
@@ -119,9 +106,9 @@ def _check_row(where: str, base: Path, row: dict[str, str], master: bool) -> dic
         raise InputError(f"{where}: expected a cover, out, and either a secret or a secret_file")
     out = given.pop("out")
     parts = PurePosixPath(out).parts
-    if ".." in parts or out.startswith("/") or parts[:1] == () or parts[0].casefold() == PRIVATE:
+    if ".." in parts or out.startswith("/") or not parts or parts[0].casefold() == PRIVATE:
         raise InputError(f"{where}: out: expected a folder in the batch's, and not {PRIVATE}, got {out!r}")
-    return {name: os.path.realpath(base / value) for name, value in given.items()} | {"out": out}
+    return out, given
 
 
 def hide_batch(
@@ -151,7 +138,7 @@ def hide_batch(
     rows, out = read_rows(Path(manifest), master=master is not None), Path(out)
     if master is not None:
         read_key(master)
-    _warn_of_covers([row["cover"] for row in rows if is_model(row["cover"])])
+    _warn_of_covers([row["cover"] for row in rows.values() if is_model(row["cover"])])
     common: dict[str, Any] = {
         "options": registry.get(method).options() if isinstance(method, str) else method,
         "views": ViewOptions.of(width, background, skip_missing),
@@ -159,20 +146,17 @@ def hide_batch(
         "device": device,
     }
     assets: dict[Path, Asset] = {}
-    for row in rows:
-        name = row.pop("out")
-        assets[out / name] = Asset(name=name, **{"key_file": str(master), **row, **common})
+    for name, row in rows.items():
+        inputs: dict[str, Any] = {"key_file": str(master), **row}
+        times = modification_times(inputs.values())
+        assets[out / name] = Asset(name=name, times=times, **inputs, **common)
     with claim_folder(out, mode=0o777):
-        if master is not None:
-            check_master_key(out, master)
         done = {place for place, asset in assets.items() if asset.is_done(place)}
         found = {place: Outcome(assets[place].name, place, skipped=True) for place in done}
         due = {place: asset for place, asset in assets.items() if place not in done}
-        if due:
-            work = partial(_hide, derived=master is not None, overwrite=overwrite)
-            with engine(ray, cores, reporter) as run:
-                for place, _, error in run(work, due):
-                    found[place] = Outcome(due[place].name, place, error=error)
+        work = partial(_hide, derived=master is not None, overwrite=overwrite)
+        for outcome in run_tasks(work, due, ray=ray, cores=cores, reporter=reporter):
+            found[outcome.folder] = outcome
         outcomes = [found[place] for place in assets]
         write_bytes(out / SUMMARY, _summary(out, outcomes))
     return ManyResult(tuple(outcomes), (SUMMARY,))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import os
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from statistics import fmean
@@ -19,12 +20,13 @@ from keyss.core.arrays import Bytes
 from keyss.files import write_bytes
 from keyss.fitting import PRESETS, FitConfig
 from keyss.fitting.lpips import HOW_TO_GET
-from keyss.lab.audits.comparison_measures import CONVERSIONS, OWN
-from keyss.lab.many.cell import RUN, keys_of
-from keyss.lab.many.cell_folder import CellFolder, Forecast, Outcome
-from keyss.lab.many.result_tables import markdown_rows, write_scene_tables
+from keyss.lab.audits.trial_measures import CONVERSIONS
+from keyss.lab.many.engine import Outcome
+from keyss.lab.many.result_tables import TrialNumbers, write_scene_tables
+from keyss.lab.many.trial import RUN, keys_of
+from keyss.lab.many.trial_folder import Forecast, TrialFolder
 from keyss.measure.contact_sheet import contact_sheet
-from keyss.measure.image_scores import renders_of
+from keyss.measure.renders import renders_of
 from keyss.methods import MethodOptions, registry
 from keyss.progress import Reporter
 from keyss.rendering import Backend, resolve_device
@@ -35,10 +37,7 @@ from keyss.runs.open_run import HidingRun, open_run
 
 STEM = "comparison"  # file names without their suffix
 MEASURES = ("files", "pictures", "secrecy", "survival")
-CONTROLS = (
-    "control-1",
-    "control-2",
-)  # plain models of the cover from other seeds, as a comparison for published ones
+CONTROLS = ("control-1", "control-2")  # names of the seeds of plain models of the cover
 
 # Every method, and its variants.
 EVERY = tuple(
@@ -47,7 +46,7 @@ EVERY = tuple(
     for name in (each, *(f"{each}:{variant}" for variant in registry.get(each).options.variants()))
 )
 
-# %-formats of cells by column. The first one whose numbers were all measured is used.
+# %-formats by column. The first one whose numbers were all measured is used.
 _FIDELITY = {
     "cover": ["%(cover.psnr).2f"],
     "SSIM": ["%(cover.ssim).3f"],
@@ -57,8 +56,8 @@ _FIDELITY = {
     "LPIPS ": ["%(secrets.1.lpips).3f"],
     "published, MB": ["%(files.published_mb).2f"],
     "handed over, MB": ["%(files.handed_mb).2f"],
-    "cover, ms": ["%(pictures.cover.ms).0f (%(pictures.cover.ratio).1fx)"],
-    "secret, ms": ["%(pictures.secret.ms).0f (%(pictures.secret.ratio).1fx)"],
+    "cover, pictures/s": ["%(pictures.pictures/s, cover).0f (%(pictures.time over 3DGS, cover).1f)"],
+    "secret, pictures/s": ["%(pictures.pictures/s, secret).0f (%(pictures.time over 3DGS, secret).1f)"],
     "seconds": ["%(seconds).0f"],
     "steps": ["%(steps.1)d, %(steps.2)d", "unknown"],
 }
@@ -67,19 +66,13 @@ _SECRECY = {
         "%(wrong_key.vs_cover.mean).1f, %(wrong_key.vs_secrets.1.max).1f (%(chance_level.1).1f)",
         "%(wrong keys)s",
     ],
-    "standard .ply": ["%(files.readers that load)d of %(files.readers)d readers", f"{OWN} reader *"],
-    **{
-        head: [f"%(secrecy.{name}){form} (%(secrecy.{name}_plain){form})", "no 3DGS"]
-        for head, name, form in (
-            ("classifier", "classifier", ".2f"),
-            ("p", "stealth", ".1g"),
-            ("StegExpose", "stegexpose", ".2f"),
-        )
-    },
+    "classifier": ["%(secrecy.classifier).2f", "no 3DGS"],
+    "p": ["%(secrecy.stealth).1g", "no 3DGS"],
+    "StegExpose": ["%(secrecy.stegexpose).2f"],
     **{
         head: [
-            f"%(survival.{head}.cover)+.1f, %(survival.{head}.secret)+.1f",
-            f"%(survival.{head}.cover)+.1f, lost",
+            f"%(survival.{head}, cover)+.1f, %(survival.{head}, secret)+.1f",
+            f"%(survival.{head}, cover)+.1f, lost",
             "not tried",
         ]
         for head in ("pruned", *CONVERSIONS, "purified")
@@ -87,12 +80,12 @@ _SECRECY = {
 }
 _LEGEND = (
     "Test views: photos that were not trained on. Steps: those in which cover and secret were rendered, in "
-    "total. 3dgs is the upper bound: plain 3DGS with equal numbers of Gaussians and training steps. ms: time "
-    "per picture, and its ratio to that of plain 3DGS. Seconds: time of hiding, after plain models.",
+    "total. 3dgs is the upper bound: plain 3DGS with equal numbers of Gaussians and training steps. "
+    "Pictures/s: in brackets, the time over that of plain 3DGS. Seconds: time of hiding, after plain models.",
     "Wrong keys: mean PSNR in dB of their renders against the cover, and maximum against the secret; in "
     "brackets, the published model itself against the secret. Classifier and StegExpose: area under the ROC "
     "curve against plain models of the cover with other seeds; 0.5 if indistinguishable. p: minimum p-value "
-    "of the file's statistics against those models. In brackets: a plain model of the cover.",
+    "of the file's statistics against those models. The file of 3dgs is a plain model of the cover.",
     "Pruned (a random quarter), converted and back, purified (GSPure): change of cover and secret in dB. "
     "Lost: the secret no longer opens.",
 )
@@ -106,7 +99,7 @@ class ComparedMethod:
     name: str  # METHOD, METHOD:PRESET or METHOD:VARIANT
     error: str | None = None
     keys: bool = True  # whether a key opens the secret
-    numbers: dict[str, float] = field(default_factory=dict)  # see `Result` of cell.py; means over seeds
+    numbers: dict[str, float] = field(default_factory=dict)  # see `Result` of trial.py; means over seeds
     notes: dict[str, str] = field(default_factory=dict)
 
 
@@ -114,7 +107,7 @@ class ComparedMethod:
 class Comparison:
     """`comparison.json`."""
 
-    version: int = 4
+    version: int = 5
     keyss: str = __version__
     arguments: dict[str, Any]
     methods: tuple[ComparedMethod, ...] = ()
@@ -141,11 +134,11 @@ def compare(
     that continues the training of a plain model starts with one of half the steps. Thus `3dgs` is an upper
     bound for all: plain 3DGS with equal Gaussians and training steps. Numbers are means over `seeds`.
 
-    `out` (a folder) gets the cells, and `comparison.json`, `.md`, `.csv` and `.tex` (PSNR, SSIM and LPIPS per
-    scene, with standard deviations over seeds) and `.png` (a row per method: cover, secret, and the secret's
-    error). Finished cells are skipped. `dry_run`: only return their plans. A failed method has a row with the
-    error. Raises UsageError before training if one of `methods` is not possible with these settings, other
-    KeyssErrors, and KeyboardInterrupt.
+    `out` (a folder) gets the trials, and `comparison.json`, `.csv` and `.tex` (PSNR, SSIM and LPIPS per
+    scene, with standard deviations over seeds) and `.png` (a row per method: cover, secret, and the
+    secret's error). Finished trials are skipped. `dry_run`: only return their plans. A failed method has a
+    row with the error. Raises UsageError before training if one of `methods` is not possible with these
+    settings, other KeyssErrors, and KeyboardInterrupt.
     """
     if is_model(cover) or is_model(secret):
         raise UsageError("comparing takes scenes, folders of photos: models have none to compare with")
@@ -154,37 +147,31 @@ def compare(
     given = {name: size for name, size in sizes.items() if size is not None}
     fit = replace(next(iter(chosen.values())).fit, seed=seeds[0], **given)
     scenes = [os.path.realpath(cover), os.path.realpath(secret)]
-    folder = CellFolder(Path(out), common={"views": ViewOptions(width), "device": device})
+    folder = TrialFolder(Path(out), common={"views": ViewOptions(width), "device": device})
     controls = [folder.plain(scenes[0], replace(fit, seed=fit.seed_of(each))) for each in CONTROLS]
     places = {
-        name: [_add(folder, name, scenes, preset, replace(fit, seed=seed), controls) for seed in seeds]
+        (name, seed): _add(folder, name, scenes, preset, replace(fit, seed=seed), controls)
         for name, preset in chosen.items()
+        for seed in seeds
     }
     if dry_run or methods:
         forecast = folder.forecast()
         for name in methods:
-            if places[name][0] in forecast.refused:
-                raise UsageError(f"{name}: not possible: {forecast.refused[places[name][0]]}")
+            if reason := forecast.refused.get(places[name, seeds[0]]):
+                raise UsageError(f"{name}: not possible: {reason}")
         if dry_run:
             return forecast
     outcomes = folder.run(reporter=reporter)
     arguments = {"cover": scenes[0], "secret": scenes[1], "iterations": fit.iterations}
     arguments |= {"max_gaussians": fit.max_gaussians, "width": width, "seeds": list(seeds)}
-    rows = [_row(name, [outcomes[place] for place in each], folder) for name, each in places.items()]
+    rows = [_row(name, [outcomes[places[name, seed]] for seed in seeds], folder) for name in chosen]
     found = Comparison(arguments=arguments, methods=tuple(rows))
     write_record(folder.out / f"{STEM}.json", found)
-    write_bytes(folder.out / f"{STEM}.md", comparison_text(found).encode())
-    done = [
-        (name, seed, outcomes[place])
-        for name, each in places.items()
-        for seed, place in zip(seeds, each, strict=True)
-        if outcomes[place].result
-    ]
     names = [os.path.basename(scene) for scene in scenes]
-    write_scene_tables(
-        folder.out, STEM, [each.row({"method": name}, names, seed) for name, seed, each in done]
-    )
-    runs = {name: _open_run(folder, each[0]) for name, each in places.items() if outcomes[each[0]].result}
+    done = {each: outcomes[place] for each, place in places.items() if outcomes[place].result}
+    numbers = [TrialNumbers.of(each, {"method": name}, names, seed) for (name, seed), each in done.items()]
+    write_scene_tables(folder.out, STEM, numbers)
+    runs = {name: _open_run(folder, each.folder) for (name, seed), each in done.items() if seed == seeds[0]}
     if runs:
         picture = io.BytesIO()
         comparison_sheet(runs, device).save(picture, "PNG", optimize=True)
@@ -202,7 +189,7 @@ def split_budget(iterations: int, options: OptionsT) -> tuple[OptionsT, list[int
 
 
 def _add(
-    folder: CellFolder,
+    folder: TrialFolder,
     name: str,
     scenes: Sequence[str],
     preset: MethodOptions,
@@ -216,7 +203,6 @@ def _add(
         folder.plain(scene, replace(fit, iterations=count, sh_degree=each.sh_degree))
         for scene, count, each in zip(scenes, steps, options.fits(2), strict=True)
     ]
-    controls = [folder.plain(scenes[0], fit), *controls]
     return folder.hiding(name, scenes, options, models, measures=MEASURES, controls=controls)
 
 
@@ -230,9 +216,9 @@ def _parse_method(text: str) -> MethodOptions:
     return variants[kind] if kind in variants else method.options.preset(kind or "default")
 
 
-def _row(name: str, outcomes: Sequence[Outcome], folder: CellFolder) -> ComparedMethod:
+def _row(name: str, outcomes: Sequence[Outcome], folder: TrialFolder) -> ComparedMethod:
     """The means of the numbers that all seeds have."""
-    method = registry.get(folder.cells[outcomes[0].folder].method)
+    method = registry.get(folder.trials[outcomes[0].folder].method)
     row = ComparedMethod(name=name, keys=method.capabilities.keys)
     results = [each.result for each in outcomes if each.result is not None]
     if len(results) < len(outcomes):
@@ -244,8 +230,8 @@ def _row(name: str, outcomes: Sequence[Outcome], folder: CellFolder) -> Compared
     return replace(row, numbers=numbers, notes=results[0].notes)
 
 
-def _open_run(folder: CellFolder, place: Path) -> HidingRun:
-    return open_run(place / RUN, [key for key in keys_of(folder.cells[place], place) if key])
+def _open_run(folder: TrialFolder, place: Path) -> HidingRun:
+    return open_run(place / RUN, [key for key in keys_of(folder.trials[place], place) if key])
 
 
 def comparison_sheet(runs: Mapping[str, HidingRun], device: Backend) -> Image.Image:
@@ -266,47 +252,35 @@ def comparison_sheet(runs: Mapping[str, HidingRun], device: Backend) -> Image.Im
     return contact_sheet(["cover", "secret", "error of the secret, x4"], rows)
 
 
-def comparison_tables(found: Comparison) -> dict[str, list[list[str]]]:
-    """Rows of text by title, heads first: fidelity and cost, secrecy and survival; without failed methods."""
+def comparison_tables(found: Comparison) -> list[list[list[str]]]:
+    """Two tables of text, heads first: fidelity and cost, secrecy and survival; without failed methods."""
     rows = [each for each in found.methods if each.error is None]
-    return {
-        title: [
+    return [
+        [
             ["method", *(head.rstrip() for head in columns)],
-            *([row.name, *(_cell(row, head, formats) for head, formats in columns.items())] for row in rows),
+            *([row.name, *(_format(row, formats) for formats in columns.values())] for row in rows),
         ]
-        for title, columns in (("Fidelity and cost", _FIDELITY), ("Secrecy and survival", _SECRECY))
-    }
+        for columns in (_FIDELITY, _SECRECY)
+    ]
 
 
-def _cell(row: ComparedMethod, head: str, formats: list[str]) -> str:
+def _format(row: ComparedMethod, formats: list[str]) -> str:
     values = row.numbers | {"wrong keys": "open nothing" if row.keys else "no keys"}
     for each in formats:
-        try:
-            text = each % values
-        except KeyError:
-            continue
-        return f"{text} *" if row.notes.get(f"survival.{head}", "").startswith(OWN) else text
+        with suppress(KeyError):
+            return each % values
     return ""
 
 
 def comparison_notes(comparison: Comparison) -> list[str]:
-    """Lines on failed methods and on skipped or replaced measures, and the legend."""
+    """Lines on failed methods and on skipped measures, and the legend."""
     failures = [f"{row.name}: not possible: {row.error}" for row in comparison.methods if row.error]
     reasons: dict[str, list[str]] = {}
     for row in comparison.methods:
         for measure, reason in row.notes.items():
-            how = "*" if reason.startswith(OWN) else "not tried:"
-            reasons.setdefault(f"{how} {measure.partition('.')[2]}: {reason}", []).append(row.name)
+            what = measure.partition(".")[2]
+            reasons.setdefault(f"not tried: {what}: {reason}", []).append(row.name)
     skipped = [f"{reason} ({', '.join(names)})" for reason, names in reasons.items()]
     if any("cover.lpips" not in row.numbers for row in comparison.methods if row.numbers):
         skipped.append(f"no LPIPS: {HOW_TO_GET}")
     return [*failures, *skipped, *_LEGEND]
-
-
-def comparison_text(comparison: Comparison) -> str:
-    """Both tables and the notes in Markdown."""
-    lines = []
-    for title, rows in comparison_tables(comparison).items():
-        lines += [f"## {title}", "", *markdown_rows(rows), ""]
-    lines += [f"- {note}" for note in comparison_notes(comparison)]
-    return "\n".join(lines) + "\n"

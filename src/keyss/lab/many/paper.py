@@ -12,7 +12,6 @@ from typing import Any, Literal
 import msgspec
 
 from keyss._version import __version__
-from keyss.lab.many.result_tables import markdown_rows
 
 Group = tuple[str, ...]  # names of a cover and of its secrets
 Figure = float | tuple[float, ...]  # one number, or one for each published group
@@ -112,15 +111,14 @@ class Reproduction:
 
 def figure_rows(
     table: Table,
-    numbers: Mapping[str, Sequence[Mapping[str, float]]],
-    count: int,
+    numbers: Mapping[str, Sequence[Mapping[str, float]]],  # by run, for each group with a result
+    count: int,  # of groups
     covers: Collection[str] = (),
 ) -> tuple[FigureRow, ...]:
     """Published figures beside measured ones, a row for each run.
 
-    `numbers`: by run, for each group of scenes with a result. `count`: number of groups; a figure must be
-    measured on all of them, because means over different groups are not comparable. `covers`: covers of the
-    published groups that were run; if empty, published figures are means over all.
+    A figure must be measured on all groups, because means over different groups are not comparable.
+    `covers`: covers of the published groups that were run; if empty, published figures are means over all.
     """
     rows = []
     for name, run in table.runs.items():
@@ -192,17 +190,6 @@ def reproduction_notes(reproduction: Reproduction) -> list[str]:
     """A line per claim and per failed run."""
     lines = [f"{each.verdict} ({each.holding} of {each.parts}): {each.text}" for each in reproduction.claims]
     return [*lines, *(f"failed: {name}: {error}" for name, error in reproduction.failures.items())]
-
-
-def reproduction_text(reproduction: Reproduction) -> str:
-    """The table, its verdicts and arguments in Markdown."""
-    lines = [f"# {reproduction.title}", "", *markdown_rows(reproduction_rows(reproduction)), ""]
-    lines += [f"- {line}" for line in reproduction_notes(reproduction)]
-    given = {name: value for name, value in reproduction.arguments.items() if value is not None}
-    arguments = ", ".join(f"{name} {value}" for name, value in given.items())
-    pairs = reproduction.pairs
-    lines += ["", f"Means over {len(pairs)} pair(s): {', '.join(pairs)}. {arguments}.", ""]
-    return "\n".join(lines)
 
 
 def _number(value: float | None) -> str:

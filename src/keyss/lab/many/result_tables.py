@@ -1,4 +1,4 @@
-"""Tables of results: means and standard deviations over seeds, as CSV, LaTeX (booktabs) and Markdown."""
+"""Tables of results: means and standard deviations over seeds, as CSV and LaTeX (booktabs)."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from statistics import fmean, stdev
 from typing import Any
 
 from keyss.files import write_bytes
+from keyss.lab.many.engine import Outcome
 
 # Decimals and heads of the usual metrics.
 _METRICS = {
@@ -20,25 +21,38 @@ _METRICS = {
     "ssim": (3, "SSIM $\\uparrow$"),
     "lpips": (3, "LPIPS $\\downarrow$"),
 }
+_NO_MEASURES = {"seconds", "seed", "version", "width"}
 _LATEX = {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
 _LATEX |= {character: f"\\{character}" for character in "&%$#_{}"}
 
 
 @dataclass(frozen=True, kw_only=True)
-class CellNumbers:
-    """The numbers of one cell."""
+class TrialNumbers:
+    """The numbers of one trial."""
 
     labels: Mapping[str, Any]  # the columns that name it, except the seed
     scenes: Sequence[str]  # names of the cover and the secrets
     seed: int
-    cell: str  # the name of its folder
+    trial: str  # the name of its folder
     numbers: Mapping[str, float]
 
+    @staticmethod
+    def of(outcome: Outcome, labels: Mapping[str, Any], scenes: Sequence[str], seed: int) -> TrialNumbers:
+        """The numbers of a finished trial, without times and arguments."""
+        numbers = {
+            name: value
+            for name, value in outcome.result.numbers.items()
+            if _NO_MEASURES.isdisjoint(name.split("."))
+        }
+        return TrialNumbers(
+            labels=labels, scenes=scenes, seed=seed, trial=outcome.folder.name, numbers=numbers
+        )
 
-def summaries(cells: Iterable[CellNumbers]) -> list[dict[str, Any]]:
-    """Rows of means and standard deviations over seeds, in the order of cells, then by measure."""
+
+def summaries(trials: Iterable[TrialNumbers]) -> list[dict[str, Any]]:
+    """Rows of means and standard deviations over seeds, in the order of trials, then by measure."""
     rows = []
-    for labels, group in _groups(cells):
+    for labels, group in _group(trials):
         for measure in sorted({name for each in group for name in each.numbers}):
             values = [each.numbers[measure] for each in group if measure in each.numbers]
             mean, std = mean_and_std(values)
@@ -46,10 +60,10 @@ def summaries(cells: Iterable[CellNumbers]) -> list[dict[str, Any]]:
     return rows
 
 
-def scene_rows(cells: Iterable[CellNumbers]) -> list[dict[str, Any]]:
+def scene_rows(trials: Iterable[TrialNumbers]) -> list[dict[str, Any]]:
     """Rows of PSNR in dB, SSIM and LPIPS per scene: means and standard deviations over seeds."""
     rows = []
-    for labels, group in _groups(cells):
+    for labels, group in _group(trials):
         for index, scene in enumerate(group[0].scenes):
             part, role = (f"secrets.{index}", "secret") if index else ("cover", "cover")
             row = {**labels, "scene": scene, "role": role, "seeds": len(group)}
@@ -67,39 +81,39 @@ def mean_and_std(values: Sequence[float]) -> tuple[float, float]:
     return mean, stdev(values) if len(values) > 1 else math.nan
 
 
-def _groups(cells: Iterable[CellNumbers]) -> list[tuple[dict[str, str], list[CellNumbers]]]:
-    """Group cells by labels, in their order; missing labels are empty."""
-    every = list(cells)
-    blank = dict.fromkeys((name for cell in every for name in cell.labels), "")
-    groups: dict[str, tuple[dict[str, str], list[CellNumbers]]] = {}
-    for cell in every:
-        labels = blank | {name: _text(value) for name, value in cell.labels.items()}
-        groups.setdefault(json.dumps(labels), (labels, []))[1].append(cell)
+def _group(trials: Iterable[TrialNumbers]) -> list[tuple[dict[str, str], list[TrialNumbers]]]:
+    """Group trials by labels, in their order; missing labels are empty."""
+    every = list(trials)
+    blank = dict.fromkeys((name for trial in every for name in trial.labels), "")
+    groups: dict[str, tuple[dict[str, str], list[TrialNumbers]]] = {}
+    for trial in every:
+        labels = blank | {name: _text(value) for name, value in trial.labels.items()}
+        groups.setdefault(json.dumps(labels), (labels, []))[1].append(trial)
     return list(groups.values())
 
 
-def write_scene_tables(out: Path, stem: str, cells: Sequence[CellNumbers]) -> list[str]:
+def write_scene_tables(out: Path, stem: str, trials: Sequence[TrialNumbers]) -> list[str]:
     """Write `scene_rows` to `STEM.csv` and `STEM.tex`; returns their names. Raises OutputError."""
-    rows = scene_rows(cells)
+    rows = scene_rows(trials)
     write_bytes(out / f"{stem}.csv", csv_bytes(rows))
     write_bytes(out / f"{stem}.tex", latex(rows).encode())
     return [f"{stem}.csv", f"{stem}.tex"]
 
 
-def write_sweep_tables(out: Path, cells: Sequence[CellNumbers]) -> list[str]:
-    """Write `results.csv` and `cells.csv` with all measures, and `scenes`; returns their names.
+def write_sweep_tables(out: Path, trials: Sequence[TrialNumbers]) -> list[str]:
+    """Write `results.csv` and `trials.csv` with all measures, and `scenes`; returns their names.
 
     Deterministic. Raises OutputError.
     """
     rows = [
-        {**labels, "seed": cell.seed, "cell": cell.cell, "measure": measure, "value": value}
-        for labels, group in _groups(cells)
-        for cell in group
-        for measure, value in sorted(cell.numbers.items())
+        {**labels, "seed": each.seed, "trial": each.trial, "measure": measure, "value": value}
+        for labels, group in _group(trials)
+        for each in group
+        for measure, value in sorted(each.numbers.items())
     ]
-    write_bytes(out / "results.csv", csv_bytes(summaries(cells)))
-    write_bytes(out / "cells.csv", csv_bytes(rows))
-    return ["results.csv", "cells.csv", *write_scene_tables(out, "scenes", cells)]
+    write_bytes(out / "results.csv", csv_bytes(summaries(trials)))
+    write_bytes(out / "trials.csv", csv_bytes(rows))
+    return ["results.csv", "trials.csv", *write_scene_tables(out, "scenes", trials)]
 
 
 def latex(rows: Sequence[Mapping[str, Any]]) -> str:
@@ -121,13 +135,6 @@ def latex(rows: Sequence[Mapping[str, Any]]) -> str:
             cells.append("--" if math.isnan(mean) else f"{mean:.{decimals}f}{spread}")
         lines.append(" & ".join(cells) + r" \\")
     return "\n".join([*lines, r"\bottomrule", r"\end{tabular}", ""])
-
-
-def markdown_rows(rows: Sequence[Sequence[str]]) -> list[str]:
-    """Lines of a Markdown table; the first row is the head."""
-    lines = [" | ".join(cell.replace("|", "/") for cell in row) for row in rows]
-    lines.insert(1, " | ".join("---" for _ in rows[0]))
-    return [f"| {line} |" for line in lines]
 
 
 def csv_bytes(rows: Sequence[Mapping[str, Any]]) -> bytes:

@@ -1,20 +1,6 @@
-"""`sweep`: run the cells of a specification, and tabulate their results.
+"""`sweep`: run the trials of a specification (YAML, docs/experiments.md), and tabulate their results.
 
-A specification is a YAML file with pairs, methods, options and seeds:
-
-    pairs:
-      - cover: scenes/bonsai
-        secrets: [scenes/fox]
-    methods:
-      - method: carry
-        options: {prune_to_fit: true}
-      - method: keyss
-        preset: quick
-        grid: {design: [published, latent], fit.iterations: [500, 1000]}
-    seeds: [0, 1, 2]
-
-Names of fields, types, options of methods and the existence of files are checked before anything runs. Paths
-are relative to the folder of the file.
+Names of fields, types, options of methods and the existence of files are checked before anything runs.
 """
 
 from __future__ import annotations
@@ -30,14 +16,14 @@ from msgspec import Meta
 
 from keyss.core import InputError, KeyssError, ViewOptions, import_extra
 from keyss.core.errors import did_you_mean
-from keyss.files.reading import read_text
+from keyss.files.inputs import read_text
 from keyss.fitting import PRESETS
 from keyss.fitting.config import MAX_SEED
-from keyss.keys import read_key
 from keyss.lab.audits import PARTS
-from keyss.lab.many.cell_folder import CellFolder, Forecast, ManyResult
+from keyss.lab.many.engine import ManyResult
 from keyss.lab.many.option_changes import known_changes, with_changes
-from keyss.lab.many.result_tables import write_sweep_tables
+from keyss.lab.many.result_tables import TrialNumbers, write_sweep_tables
+from keyss.lab.many.trial_folder import Forecast, TrialFolder
 from keyss.methods import MethodOptions, registry
 from keyss.progress import Reporter
 from keyss.rendering.orbit import is_model
@@ -45,37 +31,26 @@ from keyss.runs.files import PathLike
 
 MAX_BYTES = 1 << 20  # size of the file
 _AT_LEAST_ONE = Meta(min_length=1)
-Row = tuple[dict[str, Any], list[str], int]  # labels, scenes and seed of a cell in tables
 
 
 class Pair(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A cover and its secrets: scenes or models."""
+    """A cover and its secrets: scenes or models. Paths are relative to the folder of the file."""
 
     cover: str
     secrets: Annotated[tuple[str, ...], _AT_LEAST_ONE]
-    name: str | None = None
+    name: str | None = None  # in tables; None: the names of the scenes
     cover_model: str | None = None  # plain models of scenes; None: fitted
     secret_models: tuple[str, ...] = ()
-
-    @property
-    def label(self) -> str:
-        """The name of the pair in tables."""
-        return self.name or "-".join(Path(source).stem for source in (self.cover, *self.secrets))
 
 
 class MethodSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A method, and options that override its preset."""
 
     method: Literal[tuple(registry.METHODS)]  # type: ignore[valid-type]
-    name: str | None = None
+    name: str | None = None  # in tables; None: that of the method
     preset: Literal[tuple(PRESETS)] = "default"  # type: ignore[valid-type]
     options: dict[str, Any] = {}
     grid: dict[str, Annotated[list[Any], _AT_LEAST_ONE]] = {}  # values of options, in all combinations
-
-    @property
-    def label(self) -> str:
-        """The name of the method in tables."""
-        return self.name or self.method
 
 
 class SweepSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -94,7 +69,7 @@ class SweepSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
 
     @property
     def common(self) -> dict[str, Any]:
-        """The fields of all cells."""
+        """The fields of all trials."""
         views = ViewOptions(self.width, self.background, self.skip_missing)
         return {"views": views, "min_psnr": self.min_psnr, "bound": self.bound, "device": self.device}
 
@@ -106,19 +81,16 @@ def read_spec(path: Path) -> SweepSpec:
         spec = msgspec.convert(yaml.safe_load(read_text(path, MAX_BYTES)), SweepSpec)
     except (yaml.YAMLError, msgspec.ValidationError, ValueError, RecursionError) as error:
         raise InputError(f"{path}: expected YAML of a sweep: {' '.join(str(error).split())}") from error
-    if len(set(spec.seeds)) < len(spec.seeds):
-        raise InputError(f"{path}: seeds: expected different ones, got one twice")
-    names = {"pairs": [each.label for each in spec.pairs], "methods": [each.label for each in spec.methods]}
-    for what, labels in names.items():
-        if same := [label for label in labels if labels.count(label) > 1]:  # tables would merge them
-            raise InputError(f"{path}: {what}: two have the name {same[0]!r}: give one another `name`")
     most = min(registry.get(entry.method).max_secrets for entry in spec.methods)
-    pairs = tuple(
-        _resolve_pair(f"{path}: pairs[{index}]", path, pair, most) for index, pair in enumerate(spec.pairs)
-    )
-    for _ in variants(path, spec):  # raises InputError
-        pass
-    return msgspec.structs.replace(spec, pairs=pairs)
+    pairs = [_resolve_pair(path, index, pair, most) for index, pair in enumerate(spec.pairs)]
+    methods = [msgspec.structs.replace(each, name=each.name or each.method) for each in spec.methods]
+    spec = msgspec.structs.replace(spec, pairs=tuple(pairs), methods=tuple(methods))
+    unique: dict[str, list[Any]] = {"seeds": list(spec.seeds)}
+    unique |= {"pairs": [each.name for each in spec.pairs], "methods": [each.name for each in spec.methods]}
+    for what, values in unique.items():
+        if same := [value for value in values if values.count(value) > 1]:  # tables would merge them
+            raise InputError(f"{path}: {what}: two are called {same[0]!r}: give one another `name`, or seed")
+    return spec
 
 
 def variants(path: Path, spec: SweepSpec) -> Iterator[tuple[str, MethodOptions, dict[str, Any]]]:
@@ -141,11 +113,12 @@ def variants(path: Path, spec: SweepSpec) -> Iterator[tuple[str, MethodOptions, 
                 options = with_changes(preset, {**entry.options, **choices})
             except (KeyssError, msgspec.ValidationError) as error:
                 raise InputError(f"{where}: {error}") from error
-            yield entry.label, options, choices
+            yield str(entry.name), options, choices
 
 
-def _resolve_pair(where: str, path: Path, pair: Pair, most: int) -> Pair:
+def _resolve_pair(path: Path, index: int, pair: Pair, most: int) -> Pair:
     """Make paths absolute. Raises InputError for missing files, and for more secrets than `most`."""
+    where = f"{path}: pairs[{index}]"
     secrets, models = len(pair.secrets), len(pair.secret_models)
     if secrets > most:
         raise InputError(f"{where}.secrets: expected at most {most}, got {secrets}")
@@ -153,14 +126,14 @@ def _resolve_pair(where: str, path: Path, pair: Pair, most: int) -> Pair:
         raise InputError(f"{where}.secret_models: expected none or one for each secret, got {models}")
 
     def absolute(name: str, value: str) -> str:
-        whole = os.path.realpath(os.path.join(path.absolute().parent, os.path.expanduser(value)))
+        whole = os.path.realpath(path.parent / os.path.expanduser(value))
         if not os.path.exists(whole):
             raise InputError(f"{where}.{name}: there is no {value}")
         return whole
 
     return msgspec.structs.replace(
         pair,
-        name=pair.label,
+        name=pair.name or "-".join(Path(source).stem for source in (pair.cover, *pair.secrets)),
         cover=absolute("cover", pair.cover),
         secrets=tuple(absolute("secrets", each) for each in pair.secrets),
         cover_model=pair.cover_model and absolute("cover_model", pair.cover_model),
@@ -172,41 +145,24 @@ def sweep(
     spec: PathLike,
     out: PathLike,
     *,
-    master_key_file: PathLike | None = None,
     ray: str | None = None,
     cores: int = 1,
     dry_run: bool = False,
     reporter: Reporter | None = None,
 ) -> ManyResult | Forecast:
-    """Run all unfinished cells of a specification, and write tables of all results.
+    """Run all unfinished trials of a specification, and write tables of all results.
 
-    Cells run sequentially in this process, or in parallel on a Ray cluster. `ray`: its address, or "local"
-    for one on this machine; `cores`: cores per cell there. `dry_run`: only return the plans of the cells.
-    Keys are derived from a master key (in `master_key_file`, or a new one in the private part of `out`) and
-    the cells' names. Raises KeyssError and KeyboardInterrupt; the result has the errors of failed cells.
+    Trials run one after the other in this process, or in parallel on a Ray cluster. `ray`: its address, or
+    "local" for one on this machine; `cores`: cores per trial there. `dry_run`: only return the plans of the
+    trials. Keys are derived from the trials' names and a master key in the private part of `out`, which is
+    made if there is none. Raises KeyssError and KeyboardInterrupt; the result has the errors of failed
+    trials.
     """
     path = Path(spec)
     found = read_spec(path)
-    master = None if master_key_file is None else Path(master_key_file).absolute()
-    if master is not None:
-        read_key(master)
-    folder = CellFolder(Path(out), master, found.common)
-    rows = _add(path, found, folder)
-    if dry_run:
-        return folder.forecast()
-    outcomes = folder.run(ray=ray, cores=cores, reporter=reporter)
-    ended = [outcomes[place].row(*row) for place, row in rows.items() if outcomes[place].result]
-    tables = write_sweep_tables(folder.out, ended)
-    return ManyResult(tuple(outcomes[place] for place in rows), tuple(tables))
-
-
-def _add(path: Path, spec: SweepSpec, folder: CellFolder) -> dict[Path, Row]:
-    """Add all cells, in the order of pairs, methods, choices and seeds; returns their rows of tables.
-
-    Scenes without plain models share fits.
-    """
-    found: dict[Path, Row] = {}
-    for pair, (method, preset, choices), seed in product(spec.pairs, variants(path, spec), spec.seeds):
+    folder = TrialFolder(Path(out), found.common)
+    rows: dict[Path, tuple[dict[str, Any], list[str], int]] = {}  # labels, scenes and seed
+    for pair, (method, preset, choices), seed in product(found.pairs, variants(path, found), found.seeds):
         options = preset.with_fit(seed=seed)
         sources = [pair.cover, *pair.secrets]
         given = [pair.cover_model, *(pair.secret_models or [None] * len(pair.secrets))]
@@ -215,9 +171,13 @@ def _add(path: Path, spec: SweepSpec, folder: CellFolder) -> dict[Path, Row]:
             for source, model, config in zip(sources, given, options.fits(len(sources)), strict=True)
         ]
         chosen = "".join(f" {name}={value}" for name, value in choices.items())
-        name = f"{pair.label} {method}{chosen} seed {seed}"
-        place = folder.hiding(name, sources, options, models, measures=spec.evaluate)
-        labels = {"pair": pair.label, "method": method, **choices}
-        scenes = [Path(source).stem for source in sources]
-        found.setdefault(place, (labels, scenes, seed))
-    return found
+        name = f"{pair.name} {method}{chosen} seed {seed}"
+        place = folder.hiding(name, sources, options, models, measures=found.evaluate)
+        labels = {"pair": pair.name, "method": method, **choices}
+        rows.setdefault(place, (labels, [Path(source).stem for source in sources], seed))
+    if dry_run:
+        return folder.forecast()
+    outcomes = folder.run(ray=ray, cores=cores, reporter=reporter)
+    done = [TrialNumbers.of(outcomes[place], *row) for place, row in rows.items() if outcomes[place].result]
+    tables = write_sweep_tables(folder.out, done)
+    return ManyResult(tuple(outcomes[place] for place in rows), tuple(tables))

@@ -1,1 +1,1 @@
-"""Changes of a published model, and what they cost its cover and its secrets."""
+"""Changes of a published model, and the losses of its cover and secrets."""

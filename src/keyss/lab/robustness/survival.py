@@ -1,31 +1,18 @@
-"""PSNR loss of cover and secrets when the published model changes.
-
-Changes include conversions to other formats and back by third-party programs: gsply (PyPI) and
-splat-transform (npm).
-
-pip install gsply
-npm install --no-save @playcanvas/splat-transform@2.7.1
-"""
+"""PSNR loss of cover and secrets when the published model changes."""
 
 from __future__ import annotations
 
-import subprocess
-import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from importlib import import_module
-from pathlib import Path
 from statistics import fmean
-from types import ModuleType
 
 from keyss.core.errors import BackendError, InputError, KeyssError, UsageError, WrongKeyError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
-from keyss.files.foreign import find_splat_transform
-from keyss.files.models import read_model, write_model
 from keyss.fitting.image_metrics import mean_psnr, subsample_views
 from keyss.lab.robustness import changes as change
 from keyss.lab.robustness.changes import Change
+from keyss.lab.robustness.converters import converters
 from keyss.measure.hide_quality import in_cover
 from keyss.methods.opened import Opened
 
@@ -36,7 +23,6 @@ UNCHANGED = "none"
 
 # Opens a secret in a stego model on the CPU; raises KeyssError if it does not open.
 Opener = Callable[[Gaussians], Opened]
-TIMEOUT = 600.0  # seconds for one conversion
 
 
 @dataclass(frozen=True)
@@ -168,127 +154,3 @@ def _mean_quality(qualities: Sequence[ChangedQuality]) -> ChangedQuality:
         all(each.opens for each in qualities),
         next((each.error for each in qualities if each.error), None),
     )
-
-
-@dataclass(frozen=True)
-class Converter:
-    """Converts models to a format and back."""
-
-    format: str
-    tool: str
-    note: str  # a remark on this conversion, or nothing
-    round_trip: Callable[[Path, Path], tuple[Path, Path]]  # .ply, folder -> other file, .ply
-
-    def __call__(self, model: Gaussians) -> Gaussians:
-        """Raises BackendError if the tool is missing or fails."""
-        with tempfile.TemporaryDirectory() as folder:
-            source = Path(folder) / "source.ply"
-            write_model(source, model)
-            try:
-                return read_model(self.round_trip(source, Path(folder))[1])
-            except BackendError:
-                raise
-            except (KeyssError, OSError, ValueError) as error:
-                reason = (str(error) or type(error).__name__).splitlines()[0]
-                raise BackendError(f"{self.tool} failed on {self.format}: {reason}") from error
-
-    def change(self) -> Change:
-        sentence = f"Converted to {self.format} and back by {self.tool}{self.note}."
-        attack = f"conversion to {self.format} by {self.tool}"
-        return Change(attack, 1, "times", sentence, lambda model: self(model).to(model.device))
-
-
-def converters(sog_iterations: int = 1) -> list[Converter]:
-    """All known conversions, whether or not their tools are installed.
-
-    `sog_iterations`: rounds of clustering harmonics in .sog; splat-transform's default is ten, at half a
-    minute each for 20,000 Gaussians without a GPU.
-    """
-    rounds = "one round" if sog_iterations == 1 else f"{sog_iterations} rounds"
-    return [
-        Converter("compressed .ply", "gsply", "", _gsply_compressed),
-        Converter(".spz", "gsply", " (version 3)", _gsply_spz),
-        Converter("compressed .ply", "splat-transform", "", _convert_through("there.compressed.ply")),
-        Converter(".spz", "splat-transform", " (version 4)", _convert_through("there.spz")),
-        Converter(
-            ".sog",
-            "splat-transform",
-            f", with {rounds} of clustering harmonics",
-            _convert_through("there.sog", "-i", str(sog_iterations)),
-        ),
-        Converter(".splat", "splat-transform", ", which only reads this format", _splat),
-    ]
-
-
-def own_converter(format: str) -> Converter:
-    """A conversion by keyss itself, if a tool is missing; `format` is .spz or compressed .ply."""
-    name = {".spz": "there.spz", "compressed .ply": "there.compressed.ply"}[format]
-
-    def round_trip(source: Path, folder: Path) -> tuple[Path, Path]:
-        there, back = folder / name, folder / "back.ply"
-        write_model(there, read_model(source))
-        write_model(back, read_model(there))
-        return there, back
-
-    return Converter(format, "keyss", "", round_trip)
-
-
-def why_missing(tool: str) -> str | None:
-    """The reason why splat-transform or a Python package is unusable; None if it is installed."""
-    try:
-        find_splat_transform() if tool == "splat-transform" else find_package(tool)
-    except BackendError as error:
-        return str(error)
-    return None
-
-
-def find_package(name: str) -> ModuleType:
-    """A third-party Python package. Raises BackendError."""
-    try:
-        return import_module(name)
-    except ImportError as error:
-        raise BackendError(f"{name} is not installed (pip install {name})") from error
-
-
-def transform(source: Path, target: Path, *options: str) -> Path:
-    """Convert `source` to `target` with splat-transform; returns `target`. Raises BackendError."""
-    tool = find_splat_transform()
-    command = [tool, "-q", "-w", "-g", "cpu", *options, str(source), str(target)]
-    try:
-        subprocess.run(command, check=True, capture_output=True, text=True, timeout=TIMEOUT)
-    except subprocess.TimeoutExpired as error:
-        raise BackendError(f"splat-transform took more than {TIMEOUT:.0f} s for {target.name}") from error
-    except (OSError, subprocess.CalledProcessError) as error:
-        message = getattr(error, "stderr", None) or str(error)
-        raise BackendError(
-            f"splat-transform failed on {target.name}: {message.strip().splitlines()[-1]}"
-        ) from error
-    return target
-
-
-def _convert_through(name: str, *options: str) -> Callable[[Path, Path], tuple[Path, Path]]:
-    def round_trip(source: Path, folder: Path) -> tuple[Path, Path]:
-        there = transform(source, folder / name, *options)
-        return there, transform(there, folder / "back.ply")
-
-    return round_trip
-
-
-def _gsply_compressed(source: Path, folder: Path) -> tuple[Path, Path]:
-    gsply, there, back = find_package("gsply"), folder / "there.compressed.ply", folder / "back.ply"
-    gsply.plywrite(there, gsply.plyread(source), compressed=True)
-    gsply.plywrite(back, gsply.plyread(there))
-    return there, back
-
-
-def _gsply_spz(source: Path, folder: Path) -> tuple[Path, Path]:
-    gsply, there, back = find_package("gsply"), folder / "there.spz", folder / "back.ply"
-    gsply.write_spz(there, gsply.plyread(source), version=3)
-    gsply.plywrite(back, gsply.read_spz(there))
-    return there, back
-
-
-def _splat(source: Path, folder: Path) -> tuple[Path, Path]:
-    there = folder / "there.splat"
-    write_model(there, read_model(source))
-    return there, transform(there, folder / "back.ply")

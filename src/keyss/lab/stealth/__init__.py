@@ -1,1 +1,1 @@
-"""Attacks with the source code, but no key: is something hidden, what, and how many secrets?"""
+"""Detection by an attacker with the source code, but no key: hidden content, its identity, and count."""

@@ -12,7 +12,7 @@ from scipy.stats import ks_2samp, spearmanr
 from keyss.core.arrays import Doubles, Numbers, doubles
 from keyss.core.gaussians import Gaussians
 from keyss.core.neighbours import nearest_neighbours
-from keyss.lab.stealth.colours import INVISIBLE, shapes_of
+from keyss.lab.stealth.colours_and_opacities import INVISIBLE, shapes_of
 from keyss.lab.stealth.statistic import BitPatterns
 
 MAX_GAUSSIANS = 20_000  # Gaussians per model

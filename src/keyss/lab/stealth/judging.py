@@ -10,10 +10,10 @@ import numpy as np
 
 from keyss.core import Gaussians, UsageError
 from keyss.lab.stealth.agreement import agreement, coincidences
-from keyss.lab.stealth.bits import bits
-from keyss.lab.stealth.colours import colours, invisible_modes, opacities
+from keyss.lab.stealth.colours_and_opacities import colours, invisible_modes, opacities
 from keyss.lab.stealth.confirmation import candidate_scores, changed_low_bits
 from keyss.lab.stealth.invariants import invariants, order
+from keyss.lab.stealth.mantissa_bits import bits
 from keyss.lab.stealth.statistic import BitPatterns, Statistic
 from keyss.lab.stealth.steps import steps
 

@@ -48,16 +48,13 @@ class CarryMethod:
     def prepare(self, sources: Sequence[Source], options: CarryOptions) -> CarryOptions:
         """Choose the secrets to refit: once all are fitted, also those that do not fit the cover.
 
-        Raises UsageError for a given cover without room, and for given secrets that neither fit nor may be
-        changed. Secrets that keyss fits are made to fit.
+        Raises UsageError for a given cover without room.
         """
         cover, *secrets = sources
         degree = options.sh_degree
         if degree is None:
             degree = options.fit.sh_degree if cover.given is None else cover.given.sh_degree
         options = options.with_fit(sh_degree=degree)
-        if cover.given is None:
-            options = options.for_fitted_cover()
         try:
             room = room_for(cover.given, options, _PLANNED)
             options = replace(options, max_secret_degree=room.max_secret_degree)
@@ -73,12 +70,12 @@ class CarryMethod:
         cut = [size != secret.size for size, secret in zip(sizes, secret_sizes, strict=True)]
         if options.refit == "always":
             cut = [True] * len(cut)
-        elif options.prune_to_fit or options.refit == "never":
-            if not options.prune_to_fit and not options.refits:
-                _check_fit(secret_sizes, sizes, room.more_room)
+        elif options.refit == "never":
             cut = [False] * len(cut)
-        elif any(cut) and sizes != [room.sizes([secret])[0] for secret in secret_sizes]:
-            warnings.warn(_FEWER, KeyssWarning, stacklevel=2)
+        elif any(cut) and all(each.given is not None for each in sources):
+            alone = [room.sizes([secret])[0] for secret in secret_sizes]
+            if sizes != alone:
+                warnings.warn(_FEWER, KeyssWarning, stacklevel=2)
         steps = round(REFIT * options.fit.iterations)
         refits = [
             options.iterations or (steps if secret.photos else min(options.fit.iterations, _MODEL_ITERATIONS))
@@ -97,7 +94,7 @@ class CarryMethod:
         appended, notes = room.appended(secret_sizes), []
         if cover.given is not None and room.cover is not None and room.cover is not cover.given:
             psnr = psnr_between(cover.given, room.cover)
-            notes.append(f"other harmonics or low bits leave the cover at {psnr:.1f} dB PSNR against itself")
+            notes.append(f"other harmonics leave the cover at {psnr:.1f} dB PSNR against itself")
         for index, (secret, (_, degree)) in enumerate(zip(secrets, sizes, strict=True)):
             if secret.given is not None and secret.given.sh_degree > degree:
                 psnr = psnr_between(secret.given, secret.given.with_sh_degree(degree))
@@ -161,6 +158,7 @@ class CarryMethod:
             room.prune(models, viewpoints),
             viewpoints=viewpoints,
             entropy=context.entropy,
+            overwrite=context.overwrites_cover,
         )
         return replace(stego, iterations=max(options.refits), details={**details, **stego.details})
 
@@ -178,17 +176,6 @@ def _check_share(secrets: Sequence[SecretSize], sizes: Sequence[tuple[int, int]]
     for secret, (count, _) in zip(secrets, sizes, strict=True):
         if secret.model is not None and count < _MIN_SHARE * secret.count:
             raise UsageError(f"a secret of {secret.count:,} Gaussians would be cut down to {count:,}")
-
-
-def _check_fit(secrets: Sequence[SecretSize], sizes: Sequence[tuple[int, int]], more_room: str) -> None:
-    """Raise UsageError for given secrets that do not fit unchanged."""
-    for secret, (count, degree) in zip(secrets, sizes, strict=True):
-        if secret.model is not None and secret.size != (count, degree):
-            raise UsageError(
-                f"a secret of {secret.count:,} Gaussians of SH degree {secret.sh_degree} does not fit as it "
-                f"is: there is room for {count:,} of degree {degree}; `prune_to_fit=True` leaves out the "
-                f'least visible, `refit="auto"` refits it, {more_room}'
-            )
 
 
 METHOD = CarryMethod()

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Annotated, Any, ClassVar, Literal, Self
 
-from keyss.core.errors import UsageError
 from keyss.fitting.config import FitConfig
 from keyss.methods.base import CommandLineOption, MethodOptions, Training
 
@@ -20,15 +19,11 @@ class CarryOptions(MethodOptions):
 
     refit: Annotated[
         Literal["auto", "always", "never"],
-        CommandLineOption("Refit secrets to the room in the cover; auto: those that do not fit into it."),
+        CommandLineOption(
+            "Train a secret again after pruning it to the room in the cover: always, if it does not fit, or "
+            "never."
+        ),
     ] = "auto"
-    prune_to_fit: Annotated[
-        bool,
-        CommandLineOption("Leave out the least visible Gaussians of too large a secret, without a refit."),
-    ] = False
-    dither: Annotated[bool, CommandLineOption("Give the cover new low bits where they are not random.")] = (
-        False
-    )
     sh_degree: Annotated[
         int | None,
         CommandLineOption(
@@ -42,21 +37,15 @@ class CarryOptions(MethodOptions):
     max_secret_degree: int = 3
     refits: tuple[int, ...] = ()
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.refit == "always" and self.prune_to_fit:
-            raise UsageError('`prune_to_fit` is instead of a refit: leave it out, or `refit="always"`')
-
     @property
     def may_train(self) -> bool:
         """True unless the options exclude refits."""
-        return self.refit != "never" and not self.prune_to_fit
+        return self.refit != "never"
 
     @property
     def may_show(self) -> bool:
         """True if secrets that cannot be hidden unnoticed may be hidden visibly."""
-        asked = self.prune_to_fit or self.dither or self.format is not None
-        return self.publish == "as-is" and self.refit == "auto" and not asked
+        return self.publish == "as-is" and self.refit == "auto" and self.format is None
 
     def fits(self, scenes: int) -> list[FitConfig]:
         """Secrets get the steps of a refit if none follows, and at most the harmonics that fit."""
@@ -71,10 +60,6 @@ class CarryOptions(MethodOptions):
     def training(self, scenes: int) -> tuple[Training, ...]:
         """The refits."""
         return (Training(), *map(Training, self.refits or (0,) * (scenes - 1)))
-
-    def for_fitted_cover(self) -> Self:
-        """Dither the cover if the channel needs random low bits: few training steps may not make them."""
-        return replace(self, dither=True) if self.place.records else self
 
     def with_fit(self, **changes: Any) -> Self:
         """Options with changed fields of `fit`; `iterations` also changes those of refits."""

@@ -7,6 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
+import torch
+
 from keyss.channels import (
     APPENDED,
     LOW_BITS,
@@ -17,21 +19,19 @@ from keyss.channels import (
     LowBitsRoom,
     PreparedCover,
     Room,
-    usable_carriers,
 )
 from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.keys.derivation import expand
 from keyss.methods.base import divide
 from keyss.methods.carry.options import CarryOptions
-from keyss.methods.dither import add_noise, dither_model, raise_degree
 from keyss.methods.records.embedding import largest_degree, record_request, shares
 from keyss.methods.records.precision import most_visible, prune_to_size
 from keyss.methods.records.whole import encode
 from keyss.rendering.difference import Viewpoints
 
 _BITS_PER_GAUSSIAN = 150  # payload estimate for a secret that is not fitted yet
-_DRAWS = 3  # attempts at new low bits: in covers of few bits, one in five has stale salts or nonrandom bits
+_FAINT = 1e-3  # standard deviation of added harmonics
 _TINY = 16  # Gaussians; secrets are not pruned to fewer
 _ANY = '`publish="any"` has room for all'
 
@@ -79,11 +79,10 @@ class RecordRoom:
     room: LowBitsRoom
     prepared: LowBitsCover | None = None  # None: not fitted yet
     refit_share = 1.0  # refit size / Gaussians that fit
-    more_room = _ANY
 
     @staticmethod
     def of(cover: Gaussians | None, options: CarryOptions, entropy: bytes | None = None) -> RecordRoom:
-        """The room in `cover` after the changes of harmonics and low bits in `options`.
+        """The room in `cover` after the change of harmonics in `options`.
 
         Raises UsageError if a record does not fit into a Gaussian, and if low bits are not random.
         """
@@ -103,7 +102,7 @@ class RecordRoom:
             raise UsageError(f"a cover of SH degree {degree}{unit} has no room for anything in its low bits")
         if cover is None:
             return RecordRoom(count, degree, LowBitsRoom(int(TYPICAL_SHARE * count), layout.width))
-        prepared = _prepare(cover, expand(entropy, "carry/dither", 32) if options.dither else None)
+        prepared = LOW_BITS.prepare(cover)
         return RecordRoom(len(cover), degree, prepared.cells, prepared)
 
     @property
@@ -158,7 +157,6 @@ class WholeRoom:
     prepared: PreparedCover | None = None
     max_secret_degree = 3
     refit_share = 0.97  # refit size / Gaussians that fit: refitted Gaussians compress a little worse
-    more_room = _ANY
 
     @staticmethod
     def of(cover: Gaussians | None, options: CarryOptions, channel: Channel) -> WholeRoom:
@@ -201,53 +199,32 @@ def room_for(
 
     Raises UsageError for a cover without room.
     """
-    place = options.place if options.dither else options.place_in(cover)
+    place = options.place_in(cover)
     return RecordRoom.of(cover, options, entropy) if place.records else WholeRoom.of(cover, options, place)
 
 
 def _ways(cover: Gaussians | None, options: CarryOptions) -> str:
-    """For messages: the smallest change of the options that gives `cover` room, and one that always works."""
-    entropy = os.urandom(32)
-    degrees = [degree for degree in (1, 2) if degree > options.fit.sh_degree]
-    for degree in (None, *degrees):
-        for dither in (False, True):
-            if degree is None and dither <= options.dither:
-                continue  # refused already
-            changed = options if degree is None else options.with_fit(sh_degree=degree)
-            try:
-                room = RecordRoom._of(cover, replace(changed, dither=dither or options.dither), entropy)
-            except UsageError:
-                continue
-            if room.room.carriers:
-                changes = [f"sh_degree={degree}"] * (degree is not None) + ["dither=True"] * dither
-                return f"`{', '.join(changes)}` makes room, {_ANY}"
+    """For messages: the least SH degree that gives `cover` room, and what always works."""
+    for degree in range(options.fit.sh_degree + 1, 3):
+        try:
+            room = RecordRoom._of(cover, options.with_fit(sh_degree=degree), os.urandom(32))
+        except UsageError:
+            continue
+        if room.room.carriers:
+            return f"`sh_degree={degree}` makes room, {_ANY}"
     return _ANY
 
 
-def _prepare(cover: Gaussians, entropy: bytes | None) -> LowBitsCover:
-    """Prepare the cover, dithered by `entropy` if needed. Raises UsageError if low bits are not random."""
-    try:
-        return LOW_BITS.prepare(cover)
-    except UsageError as error:
-        if entropy is None:
-            raise
-        refused = error
-    for draw in range(_DRAWS):
-        noise = expand(entropy, f"carry/draw/{draw}", 32)
-        dithered = dither_model(cover, noise)
-        try:
-            return LOW_BITS.prepare(dithered)
-        except UsageError:
-            pass
-        try:
-            return LOW_BITS.prepare(add_noise(dithered, usable_carriers(dithered), noise))
-        except UsageError as error:
-            refused = error
-    raise refused
-
-
 def to_degree(model: Gaussians, sh_degree: int, entropy: bytes) -> Gaussians:
-    """`model` with harmonics of `sh_degree`; added ones are imperceptible."""
-    if model.sh_degree > sh_degree:
-        return model.with_sh_degree(sh_degree)
-    return raise_degree(model, sh_degree, expand(entropy, "carry/raised", 32))
+    """`model` with harmonics of `sh_degree`; added ones are small random numbers.
+
+    (Zeros have no low bits to replace.)
+    """
+    count = (sh_degree + 1) ** 2 - model.sh.shape[1]
+    if count <= 0:
+        return model.with_sh_degree(sh_degree) if count else model  # the same object was prepared before
+    seed = int.from_bytes(expand(entropy, "carry/raised", 8), "little") >> 1
+    generator = torch.Generator().manual_seed(seed)
+    # Scale before rounding: products in single precision keep a trace of their factor.
+    noise = _FAINT * torch.randn(len(model), count, 3, generator=generator, dtype=torch.float64)
+    return replace(model, sh=torch.cat([model.sh, noise.to(model.sh)], dim=1))

@@ -80,10 +80,11 @@ class CombinedPoses:
         """The target of `scene` at training pose `index` of `owner`."""
         own = self.scenes[owner].scene.train[index] if scene == owner else None
 
-        def image() -> Tensor:
-            return (own.image if own else self._render(scene, owner, index)).to(self.device)
+        def make() -> Target:
+            image = own.image if own else self._render(scene, owner, index)
+            return Target.of(image.to(self.device), own.mask if own else None)
 
-        return self._targets.of((scene, owner, index), image, own.mask if own else None)
+        return self._targets.of((scene, owner, index), make)
 
     def _render(self, scene: int, owner: int, index: int) -> Tensor:
         """Render once, and cache as 8-bit pixels, like photos, up to CACHE_BYTES."""

@@ -23,10 +23,10 @@ from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Camera
 from keyss.fitting.adam import RowAdam
 from keyss.fitting.density import CappedStrategy
+from keyss.fitting.fixed_rows import EMPTY, FixedRows, of_scene
 from keyss.fitting.image_metrics import subsample_views
 from keyss.fitting.parameters import make_optimizers, to_parameters
 from keyss.fitting.plain import without_faint
-from keyss.fitting.rows import EMPTY, FixedRows, of_scene
 from keyss.fitting.schedule import Schedule
 from keyss.keys.derivation import stream
 from keyss.methods.keyss.combined import combined_points

@@ -2,7 +2,7 @@
 
 Read `options` (the paper's symbols and values), `decoder` (equations 3, 6 and 8), `combined` (poses and
 points) and `training` (losses 4, 5 and 7, their sum 11, one step, publishing). `latent`, `latent_training`
-and `keyss.fitting.rows` are the default design (ours); `secret` is the hidden payload.
+and `keyss.fitting.fixed_rows` are the default design (ours); `secret` is the hidden payload.
 """
 
 from __future__ import annotations

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import struct
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property, partial
 
 from keyss.channels.base import Content, Records
 from keyss.core.errors import InputError, UsageError
@@ -20,12 +22,18 @@ COUNT = struct.Struct("<I")  # number of Gaussians, before the codec in the head
 class CarriedSecret:
     """A carried secret; see `keyss.methods.opened.Opened`."""
 
-    gaussians: Gaussians  # those that are left, in the order of their carriers
+    left: int  # Gaussians that are left
     count: int  # Gaussians that were embedded
     bits: int  # bits per record, or per Gaussian of a payload
+    decoded: Callable[[], Gaussians]
     frame: None = None
     decode: None = None
     key_size: int = 0
+
+    @cached_property
+    def gaussians(self) -> Gaussians:
+        """Those that are left, in the order of their carriers; decoded late, since they can be large."""
+        return self.decoded()
 
     def reveal(self, stego: Gaussians, *, frame: Frame = "secret", force: bool = False) -> Gaussians:
         """The Gaussians that are left, enlarged to compensate for those lost with their carriers."""
@@ -46,7 +54,8 @@ def unpack(content: Content) -> CarriedSecret:
     """The Gaussians that are left; records may be in any order. Raises InputError for damage."""
     if not isinstance(content, Records):
         gaussians = whole.decode(content.data, content.carriers)
-        return CarriedSecret(gaussians, len(gaussians), round(8 * len(content.data) / len(gaussians)))
+        count = len(gaussians)
+        return CarriedSecret(count, count, round(8 * len(content.data) / count), lambda: gaussians)
     if len(content.header) < COUNT.size:
         raise InputError("the hidden parameters are damaged: they are too short")
     (count,) = COUNT.unpack_from(content.header)
@@ -54,4 +63,5 @@ def unpack(content: Content) -> CarriedSecret:
     expected, found = codec.table.record_bytes, content.records.shape[1]
     if found != expected:
         raise InputError(f"the hidden parameters are damaged: records of {found} bytes, expected {expected}")
-    return CarriedSecret(codec.decode(content.records), count, codec.table.total)
+    decoded = partial(codec.decode, content.records)
+    return CarriedSecret(len(content.records), count, codec.table.total, decoded)

@@ -8,6 +8,7 @@ Free room is filled with copies of the most visible Gaussians. All other channel
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 from keyss.channels import (
@@ -39,14 +40,17 @@ def embed_models(
     *,
     viewpoints: Sequence[Viewpoints] | None = None,
     entropy: bytes | None = None,
+    overwrite: bool = False,
 ) -> Stego:
     """Embed all Gaussians of each model under its key, and open them again.
 
     `viewpoints`: views of each model that determine the precision of a payload; by default, four around it.
-    Raises UsageError if the models do not fit.
+    `overwrite`: the tensors of a cover of low bits may be changed, which saves a copy. Raises UsageError if
+    the models do not fit.
     """
     contents: Sequence[Content]
     if isinstance(cover, LowBitsCover):
+        cover = replace(cover, overwrites=overwrite)
         contents = encode_all(cover, models)
         requests = [record_request(len(model), model.sh_degree) for model in models]
         details: dict[str, Any] = {
@@ -63,8 +67,9 @@ def embed_models(
             details["capacity_bytes"] = cover.room.capacity
             details["capacity_bits_per_gaussian"] = round(8 * cover.room.capacity / len(cover.cover), 2)
     stego = cover.embed(list(zip(keys, contents, strict=True)), entropy=entropy)
+    del contents  # as large as the secrets
     opened = [unpack(open_content(stego, key)) for key in keys]
-    if [len(each.gaussians) for each in opened] != list(map(len, models)):
+    if [each.left for each in opened] != list(map(len, models)):
         raise RuntimeError("the embedded secrets do not open again as they should")
     details["bits_per_gaussian"] = [each.bits for each in opened]
     return Stego(stego, tuple(opened), details=details, verified=True)

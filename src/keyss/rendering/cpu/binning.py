@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 
 from keyss.kernels.jit import inline, kernel
-from keyss.rendering.cpu.layout import (
+from keyss.rendering.cpu.constants import (
     ENTRY_ROWS_SHIFT,
     EXTENT_X,
     EXTENT_Y,

@@ -22,7 +22,7 @@ from __future__ import annotations
 import numpy as np
 
 from keyss.kernels.jit import finite_inline, finite_kernel
-from keyss.rendering.cpu.layout import (
+from keyss.rendering.cpu.constants import (
     ALPHA_MAX,
     ALPHA_MIN,
     BLUE,

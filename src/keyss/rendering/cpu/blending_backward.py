@@ -20,7 +20,7 @@ from keyss.rendering.cpu.blending import (
     blend_row,
     list_strips,
 )
-from keyss.rendering.cpu.layout import (
+from keyss.rendering.cpu.constants import (
     BLUE,
     DECAY,
     GREEN,

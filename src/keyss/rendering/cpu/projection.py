@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from keyss.kernels.jit import inline, kernel
-from keyss.rendering.cpu.layout import (
+from keyss.rendering.cpu.constants import (
     ALPHA_MIN,
     CHANNEL_MAX,
     CHUNK,
@@ -41,7 +41,7 @@ from keyss.rendering.cpu.layout import (
     ZERO,
     f32,
 )
-from keyss.rendering.cpu.rows import gather1, gather3, gather4, scatter
+from keyss.rendering.cpu.gather import gather1, gather3, gather4, scatter
 from keyss.rendering.cpu.shading import inverse_length, prefetch_coefficients, shade
 from keyss.rendering.cpu.simd8 import (
     absolute,

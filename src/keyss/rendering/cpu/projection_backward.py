@@ -11,9 +11,9 @@ from __future__ import annotations
 import numpy as np
 
 from keyss.kernels.jit import inline, kernel
-from keyss.rendering.cpu.layout import CHUNK, HALF, HUGE, MOMENTS, NORM_MIN, ONE, PACKED, RED, TWO, ZERO
+from keyss.rendering.cpu.constants import CHUNK, HALF, HUGE, MOMENTS, NORM_MIN, ONE, PACKED, RED, TWO, ZERO
+from keyss.rendering.cpu.gather import gather1, gather3, gather8, load_transposed, scatter
 from keyss.rendering.cpu.projection import PREFETCH, dot, linearise, times
-from keyss.rendering.cpu.rows import gather1, gather3, gather8, load_transposed, scatter
 from keyss.rendering.cpu.shading import prefetch_coefficients, shade_backward
 from keyss.rendering.cpu.simd8 import (
     absolute,

@@ -16,7 +16,7 @@ from keyss.kernels.jit import announce_compilation
 from keyss.kernels.memory import Array
 from keyss.kernels.parallel import run
 from keyss.rendering.cpu import binning, blending, blending_backward, projection, projection_backward
-from keyss.rendering.cpu.layout import CAMERA, FX, MOMENTS, PACKED, POSITION, TILE_HEIGHT, TILE_WIDTH, TX
+from keyss.rendering.cpu.constants import CAMERA, FX, MOMENTS, PACKED, POSITION, TILE_HEIGHT, TILE_WIDTH, TX
 
 MAX_PAIRS = 2**31 - 1  # positions in the lists of tiles are int32
 

@@ -10,8 +10,8 @@ vector at 8 k.
 from __future__ import annotations
 
 from keyss.kernels.jit import inline
-from keyss.rendering.cpu.layout import HALF, NORM_MIN, ONE, POSITION, TWO, ZERO, f32
-from keyss.rendering.cpu.rows import gather3, gather8, scatter
+from keyss.rendering.cpu.constants import HALF, NORM_MIN, ONE, POSITION, TWO, ZERO, f32
+from keyss.rendering.cpu.gather import gather3, gather8, scatter
 from keyss.rendering.cpu.simd8 import (
     at,
     divide,

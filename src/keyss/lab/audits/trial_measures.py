@@ -1,0 +1,182 @@
+"""Measures of a finished hiding for `compare` and `reproduce`, beside those of `hide` and `audit`.
+
+Each is a function from a run to numbers by name. A string instead of a number is the reason why it is
+missing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
+from dataclasses import replace
+from statistics import fmean
+
+from keyss.channels import is_appended
+from keyss.core.errors import UsageError, import_extra
+from keyss.core.gaussians import Gaussians
+from keyss.core.picture_network import DecodedGaussians
+from keyss.lab.audits import PARTS
+from keyss.lab.audits.audit_run import EXTRA
+from keyss.lab.audits.subject import Subject
+from keyss.lab.render_time import measure_render_time
+from keyss.lab.robustness.changes import Change, opacity_pruning, purification, random_pruning
+from keyss.lab.robustness.converters import converters
+from keyss.lab.robustness.survival import measure_robustness
+from keyss.lab.sinkhorn import composite_score, sinkhorn_3d
+from keyss.lab.stealth.judging import judge
+from keyss.lab.stegexpose import stegexpose_auc
+from keyss.lab.two_sample import two_sample_auc
+from keyss.measure.renders import renders_of, select_views
+from keyss.runs.files import HANDED, stego_in
+
+Numbers = dict[str, float | str]
+
+PRUNED_SHARES = (0.05, 0.10, 0.15, 0.25)  # fractions of the Gaussians
+_LOST = 0.25  # fraction of the Gaussians
+_GIVEN_UP = 0.01  # fraction of the blending weight in the cover's views that purification removes
+CONVERSIONS = {".spz": "gsply", "compressed .ply": "splat-transform"}  # format and the program that writes it
+_EVERY_VIEW = 10**6
+_ROUNDS = 5  # repetitions when timing renders
+_ROLES = ("cover", "secret")
+_ATTRIBUTES = {"opacity": "op", "scale": "sc", "rotation": "ro", "position": "xyz", "colour": "sh"}
+
+
+def files(subject: Subject) -> Numbers:
+    """Megabytes of the published and the handed-over files."""
+    handed = (subject.run.folder / HANDED).glob("*")
+    return {
+        "published_mb": stego_in(subject.run.folder).stat().st_size / 1e6,
+        "handed_mb": sum(path.stat().st_size for path in handed) / 1e6,
+    }
+
+
+def pictures(subject: Subject) -> Numbers:
+    """Speed of rendering the published model and the first secret."""
+    return _render_times(subject, subject.stego)
+
+
+def rendering(subject: Subject) -> Numbers:
+    """Speed of rendering without appended Gaussians; 1 for a published 3DGS model, else 0."""
+    times = _render_times(subject, own_gaussians(subject.stego))
+    return times | {"standard": float(subject.standard)}
+
+
+def _render_times(subject: Subject, stego: Gaussians) -> Numbers:
+    models, plains = [stego, subject.revealed[0]], subject.run.plain_models()
+    found: Numbers = {}
+    for role, model, plain, scene in zip(_ROLES, models, plains, subject.scenes, strict=False):
+        beside = model if plain is None else plain.to(model.device)
+        time = measure_render_time(model, beside, scene, rounds=_ROUNDS)
+        found |= {f"pictures/s, {role}": 1 / time.seconds, f"time over 3DGS, {role}": time.ratio}
+    return found
+
+
+def secrecy(subject: Subject) -> Numbers:
+    """Detection of the published model among plain models of the cover from other seeds.
+
+    AUC of StegExpose on renders and, if a 3DGS model is published, mean AUC of trees that separate its
+    Gaussians from the controls', and minimum p-value of its statistics, corrected for their number.
+    """
+    cover, stego, controls = subject.scenes[0], subject.stego, subject.controls
+    views = select_views(cover.views)
+    renders = [
+        [image.numpy() for _, image in renders_of(model, cover, views)] for model in (controls[0], stego)
+    ]
+    found: Numbers = {"stegexpose": stegexpose_auc(*renders).auc}
+    if subject.standard:
+        found["stealth"] = judge(stego, controls).least
+        with suppress(UsageError):  # too few Gaussians, or all in a corner
+            found["classifier"] = fmean(two_sample_auc(each, stego).auc for each in controls)
+    return found
+
+
+def survival(subject: Subject) -> Numbers:
+    """Changes in dB of cover and secret by pruning, conversion and purification; none for lost secrets."""
+    tools = {(each.format, each.tool): each for each in converters()}
+    changes = {"pruned": random_pruning(_LOST)}
+    if subject.standard:
+        changes |= {format: tools[format, tool].change() for format, tool in CONVERSIONS.items()}
+        changes["purified"] = purification(subject.scenes[0], _GIVEN_UP)
+    found = _psnr_after(subject, changes)
+    before = {role: found.pop(f"whole, {role}") for role in _ROLES}
+    for name, value in found.items():
+        if not isinstance(value, str):
+            found[name] = value - float(before[name.rpartition(", ")[2]])
+    if not subject.standard:
+        found |= dict.fromkeys((*CONVERSIONS, "purified"), "the method publishes no 3DGS model")
+    return found
+
+
+def pruning(subject: Subject) -> Numbers:
+    """PSNR in dB of the cover and the first secret after pruning; none for lost secrets."""
+    kinds = {"by opacity": opacity_pruning, "random": random_pruning}
+    changes = {
+        f"{share:.0%} {how}": spare_appended(change(share))
+        for how, change in kinds.items()
+        for share in PRUNED_SHARES
+    }
+    return _psnr_after(subject, changes, _EVERY_VIEW)
+
+
+def _psnr_after(subject: Subject, changes: Mapping[str, Change], max_views: int = 8) -> Numbers:
+    """PSNR of cover and first secret after changes, by name; none for lost secrets.
+
+    The name of the unchanged model is `whole`.
+    """
+    cover, *secrets = subject.scenes
+    results = measure_robustness(
+        subject.stego,
+        subject.run.openers,
+        cover,
+        secrets,
+        changes=list(changes.values()),
+        max_views=max_views,
+    )
+    found: Numbers = {}
+    for name, result in zip(["whole", *changes], results, strict=True):
+        if result.skipped is not None:
+            found[name] = result.skipped
+        for role, quality in zip(_ROLES, (result.cover, *result.secrets), strict=False):
+            if quality is not None and quality.opens:
+                found[f"{name}, {role}"] = quality.psnr
+    return found
+
+
+def sinkhorn(subject: Subject) -> Numbers:
+    """3D-Sinkhorn from the cover's plain model to the published one: sum, attributes, composite score."""
+    distances = sinkhorn_3d(subject.original, own_gaussians(subject.stego))
+    metrics = subject.run.metrics
+    secret = fmean(each.psnr for each in metrics.secrets)
+    score = composite_score(metrics.cover.psnr, secret, distances.sum)
+    found: Numbers = {f"sinkhorn {short}": getattr(distances, name) for name, short in _ATTRIBUTES.items()}
+    return found | {"sinkhorn": distances.sum, "score": score}
+
+
+# Modules of optional packages that measures import.
+_MODULES = {"secrecy": ("sklearn",), "sinkhorn": ("ot",), **dict.fromkeys(PARTS, EXTRA)}
+MEASURES: Mapping[str, Callable[[Subject], Numbers]] = {
+    each.__name__: each for each in (files, pictures, secrecy, survival, rendering, pruning, sinkhorn)
+}
+
+
+def check_extras(measures: Iterable[str]) -> None:
+    """Raise BackendError if a package of one of the measures is not installed."""
+    for name in measures:
+        for module in _MODULES.get(name, ()):
+            import_extra(module, "audit", f"measure {name}")
+
+
+def own_gaussians(stego: Gaussians) -> Gaussians:
+    """A published model without appended Gaussians."""
+    return stego if isinstance(stego, DecodedGaussians) else stego[~is_appended(stego)]
+
+
+def spare_appended(change: Change) -> Change:
+    """The change without appended Gaussians."""
+
+    def apply(model: Gaussians) -> Gaussians:
+        if isinstance(model, DecodedGaussians) or not bool(is_appended(model).any()):
+            return change(model)
+        return Gaussians.cat([change(own_gaussians(model)), model[is_appended(model)]])
+
+    return replace(change, apply=apply)

@@ -1,0 +1,196 @@
+"""The common part of the baselines: one secret, one joint training, one handed-over file."""
+
+from __future__ import annotations
+
+import hashlib
+from abc import abstractmethod
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from keyss.channels import Content, Payload
+from keyss.core.errors import InputError, UsageError
+from keyss.core.gaussians import Gaussians
+from keyss.core.scene import Camera
+from keyss.core.similarity import Similarity
+from keyss.fitting.adam import RowAdam
+from keyss.lab.baselines.baseline_options import BaselineOptions
+from keyss.methods.base import Capabilities, Context, Plan, Source, Stego
+from keyss.methods.keyss.combined import PlacedScene
+from keyss.methods.keyss.training import KeyssTraining, Picture
+from keyss.methods.opened import Frame, Remains
+from keyss.methods.tensors import Header, pack_tensors, refuse_damage, unpack_tensors
+
+FORMAT, VERSION = "keyss-baseline", 1
+DAMAGED = "what was handed over is damaged"
+
+
+@dataclass(frozen=True)
+class _Header(Header):
+    rows: int | None
+    frame: Similarity | None
+
+
+@dataclass(frozen=True)
+class HandedTensors:
+    """Tensors to hand over, and the placement of the secret in the cover's frame."""
+
+    tensors: Mapping[str, Tensor]  # float32
+    frame: Similarity | None = None  # secret frame to cover frame; None: never placed there
+    rows: int | None = None  # Gaussians of the published model, if their order matters
+
+    def payload(self, method: str) -> Payload:
+        """The file to hand over; `method`: name of the method."""
+        header = _Header(FORMAT, VERSION, self.rows, self.frame)
+        return Payload(method, pack_tensors(self.tensors, header))
+
+    @staticmethod
+    def of(content: Content) -> HandedTensors:
+        """Read a payload. Raises InputError for other content."""
+        with refuse_damage(DAMAGED):
+            if not isinstance(content, Payload):
+                raise ValueError("expected one string of bytes, got records")
+            header, tensors = unpack_tensors(content.data, _Header, FORMAT, VERSION)
+        return HandedTensors(tensors, header.frame, header.rows)
+
+    def take(self, names: Iterable[str]) -> list[Tensor]:
+        """The tensors of these names. Raises InputError for others, and for missing ones."""
+        expected = dict.fromkeys(names, torch.float32)
+        if expected != {name: value.dtype for name, value in self.tensors.items()}:
+            found = ", ".join(sorted(self.tensors))[:200]
+            raise InputError(f"{DAMAGED}: expected {', '.join(expected)}, found {found}")
+        return [self.tensors[name] for name in expected]
+
+
+Show = Callable[[Gaussians], Gaussians]  # takes a model on the CPU in the cover's frame; raises ValueError
+
+
+@dataclass(frozen=True)
+class HandedSecret:
+    """An `Opened`: a handed-over file applied to the published model."""
+
+    handed: HandedTensors
+    show: Show
+    decode: None = None
+    key_size: int = 0
+
+    @property
+    def frame(self) -> Similarity | None:
+        return self.handed.frame
+
+    def reveal(self, stego: Gaussians, *, frame: Frame = "secret", force: bool = False) -> Gaussians:
+        """See `Opened.reveal`; raises InputError for a model with other Gaussians."""
+        rows = self.handed.rows
+        if rows is not None and len(stego) != rows:
+            raise InputError(
+                f"expected the {rows:,} Gaussians that were published, in their order, got {len(stego):,}: "
+                "each row of the handed-over file belongs to one of them"
+            )
+        if frame == "cover" and self.frame is None:
+            raise UsageError('this secret never was in the cover\'s frame: leave out `frame="cover"`')
+        with refuse_damage("what was handed over does not fit"):
+            shown = self.show(stego.detach().to("cpu"))
+        if self.frame is None or frame == "cover":
+            return shown
+        return self.frame.inverse().apply_gaussians(shown)
+
+    def remains(self, revealed: Gaussians) -> Remains:
+        """A handed-over secret is complete or does not open."""
+        return Remains(len(revealed), len(revealed))
+
+    def fingerprint(self) -> str:
+        return hashlib.sha256(self.handed.payload("baseline").data).hexdigest()[:16]
+
+
+class BaselineTraining(KeyssTraining):
+    """The joint training of a baseline: `prepare` adds parameters and networks, `draw` renders scenes."""
+
+    options: BaselineOptions
+
+    def __init__(self, scenes: Sequence[PlacedScene], options: BaselineOptions, device: torch.device) -> None:
+        super().__init__(scenes, [], options, options.design, device)
+
+    @abstractmethod
+    def prepare(self, start: Gaussians) -> None:
+        """Add parameters (`add`) and networks (`networks`); their random numbers are the run's own."""
+
+    @abstractmethod
+    def draw(self, scenes: Sequence[int], camera: Camera, sh_degree: int) -> list[Picture]:
+        """Render scenes in the given order; they may share a render."""
+
+    @abstractmethod
+    def result(self) -> tuple[Gaussians, HandedTensors]:
+        """The published model, on the CPU, and the tensors to hand over, after the training."""
+
+    def add(self, name: str, values: Tensor, optimizer: RowAdam | float) -> None:
+        """Add a parameter [N, ...] of the Gaussians, with its optimiser or a rate for a new one."""
+        self.parameters[name] = parameter = torch.nn.Parameter(values.to(self.device).contiguous())
+        if isinstance(optimizer, RowAdam):
+            optimizer.param_groups[0]["params"] = [parameter]
+            self.optimizers[name] = optimizer
+        else:
+            fused = self.device.type == "cuda"
+            self.optimizers[name] = RowAdam(
+                [{"params": [parameter], "lr": optimizer}], eps=1e-15, fused=fused
+            )
+
+    def opacity_for_pruning(self) -> Tensor:
+        """[N] maximum opacity over the scenes."""
+        return self.parameters["opacities"].detach().sigmoid()
+
+    @property
+    def frame(self) -> Similarity:
+        """Secret frame to cover frame."""
+        return self.scenes[1].frame
+
+    def visible(self) -> Tensor:
+        """[N] True for Gaussians above the opacity limit of pruning; all True if none is."""
+        visible = self.opacity_for_pruning() >= self.options.fit.prune_opacity
+        return visible if bool(visible.any()) else torch.ones_like(visible)
+
+
+@dataclass(frozen=True)
+class Baseline:
+    """A `Method` with a joint training, one secret and one handed-over file."""
+
+    options: type[BaselineOptions]
+    capabilities: Capabilities
+    open: Callable[[HandedTensors], Show]  # raises InputError and ValueError for damage
+    training: type[BaselineTraining] | None = None  # None: a subclass overrides `hide`
+    max_secrets: int = 1
+
+    @property
+    def name(self) -> str:
+        return self.options.method
+
+    def prepare(self, sources: Sequence[Source], options: BaselineOptions) -> BaselineOptions:
+        """Accept all scenes."""
+        return options
+
+    def plan(self, sources: Sequence[Source], options: BaselineOptions) -> Plan:
+        """Both scenes share the Gaussians of one model."""
+        return options.joint_plan(1)
+
+    def hide(
+        self, cover: Source, secrets: Sequence[Source], options: BaselineOptions, context: Context
+    ) -> Stego:
+        """Train both scenes jointly. Raises Interrupted, and InputError for another run's checkpoint."""
+        training = self.training
+        assert training is not None
+        sources = [cover, *secrets]
+        run = training(PlacedScene.all_of(sources), options, context.device)
+        run.train(sources, context)
+        return self.stego(*run.result(), run.iterations)
+
+    def stego(self, published: Gaussians, handed: HandedTensors, iterations: int = 0) -> Stego:
+        """The result of hiding, opened from the handed-over payload."""
+        payload = handed.payload(self.name)
+        return Stego(published, (self.unpack(payload),), iterations, handed=(payload,))
+
+    def unpack(self, content: Content) -> HandedSecret:
+        """The secret of a handed-over file. Raises InputError for damage."""
+        handed = HandedTensors.of(content)
+        with refuse_damage(DAMAGED):
+            return HandedSecret(handed, self.open(handed))

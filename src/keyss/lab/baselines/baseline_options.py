@@ -1,0 +1,87 @@
+"""Options of the baselines."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated, ClassVar
+
+from keyss.methods.base import CommandLineOption, MethodOptions, Training, check_above_zero
+from keyss.methods.keyss.options import DecoderShape, Design, Scenes
+
+
+@dataclass(frozen=True, kw_only=True)
+class BaselineOptions(MethodOptions):
+    """Options of all baselines: joint training has the steps and Gaussians of plain models.
+
+    It combines poses, points and densification like KeySS's. Each baseline has its own class, which
+    identifies it.
+    """
+
+    points: ClassVar[Scenes] = "both"  # scenes whose sparse points start the model
+
+    common_poses: Annotated[
+        float,
+        CommandLineOption(
+            "Share of steps that render both scenes from one pose, 0 to 1; the papers': 1.",
+            metavar="SHARE",
+        ),
+    ] = 1.0
+    network_rate: float = 1e-3  # Adam; decays to 5 %
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_above_zero(self, "network_rate")
+        self.check_published_exactly()
+        _ = self.design  # raises for values out of range
+
+    @property
+    def design(self) -> Design:
+        """The configuration of the joint training, without a decoder of Gaussians and keys."""
+        return Design(
+            name=self.method,
+            decoder=DecoderShape(),
+            ssim_weight=None,
+            beta_incorrect=0.0,
+            points=self.points,
+            common_poses=self.common_poses,
+            decoder_rate=self.network_rate,
+            weight_decay=0.0,
+        )
+
+    def training(self, scenes: int) -> tuple[Training, ...]:
+        """Every step renders all scenes."""
+        return (Training(self.fit.iterations, continues=False),) * scenes
+
+
+@dataclass(frozen=True, kw_only=True)
+class BoundOptions(BaselineOptions):
+    """Options of the plain models."""
+
+    method: ClassVar[str] = "3dgs"
+
+    def training(self, scenes: int) -> tuple[Training, ...]:
+        """No training beside that of plain models."""
+        return (Training(),) * scenes
+
+
+@dataclass(frozen=True, kw_only=True)
+class DecoderOptions(BaselineOptions):
+    """The Gaussians show the cover only, so they start from its points."""
+
+    method: ClassVar[str] = "3dgs-decoder"
+
+    points: ClassVar[Scenes] = "cover"
+
+
+@dataclass(frozen=True, kw_only=True)
+class GsHiderOptions(BaselineOptions):
+    """See `BaselineOptions`."""
+
+    method: ClassVar[str] = "gs-hider"
+
+
+@dataclass(frozen=True, kw_only=True)
+class ShOptions(BaselineOptions):
+    """See `BaselineOptions`."""
+
+    method: ClassVar[str] = "3dgs-sh"

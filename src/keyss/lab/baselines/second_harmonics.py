@@ -1,0 +1,52 @@
+"""3DGS+SH: a second set of harmonics on the same Gaussians (a baseline of GS-Hider, 2024, and KeySS).
+
+The published model is a 3DGS model of the cover. The secret's harmonics are handed over; they replace its own
+to show the secret.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from keyss.core.gaussians import Gaussians
+from keyss.core.scene import Camera
+from keyss.fitting.parameters import make_optimizers, to_gaussians
+from keyss.lab.baselines.baseline import Baseline, BaselineTraining, HandedTensors, Show
+from keyss.lab.baselines.baseline_options import ShOptions
+from keyss.methods.base import Capabilities
+from keyss.methods.keyss.training import Picture
+
+_NAMES = ("sh", "secret_sh")  # parameters with the colours of the cover and of the secret
+
+
+class ShTraining(BaselineTraining):
+    """The training of two sets of harmonics; everything else is shared."""
+
+    def prepare(self, start: Gaussians) -> None:
+        """Both sets start equal: every point has the colour of its own scene."""
+        optimizer = make_optimizers(self.parameters, self.options.fit, self.extent)["sh"]
+        self.add(_NAMES[1], start.sh.clone(), optimizer)
+
+    def draw(self, scenes: Sequence[int], camera: Camera, sh_degree: int) -> list[Picture]:
+        model = to_gaussians(self.parameters)
+        models = [replace(model, sh=self.parameters[_NAMES[scene]]) for scene in scenes]
+        return [self.render(*each, camera, sh_degree) for each in zip(models, scenes, strict=True)]
+
+    def result(self) -> tuple[Gaussians, HandedTensors]:
+        visible, secret_sh = self.visible(), self.parameters[_NAMES[1]].detach()
+        stego = to_gaussians(self.parameters).detach()[visible].to("cpu")
+        return stego, HandedTensors({_NAMES[1]: secret_sh[visible]}, self.frame, rows=len(stego))
+
+
+def _open(handed: HandedTensors) -> Show:
+    (sh,) = handed.take([_NAMES[1]])
+    return lambda stego: replace(stego, sh=sh)
+
+
+METHOD = Baseline(
+    options=ShOptions,
+    capabilities=Capabilities(keys=False),
+    open=_open,
+    training=ShTraining,
+)

@@ -1,0 +1,44 @@
+"""The upper bound: two plain 3DGS models (Kerbl et al. 2023), one published, one handed over."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+
+from keyss.core.gaussians import Gaussians
+from keyss.lab.baselines.baseline import Baseline, HandedTensors, Show
+from keyss.lab.baselines.baseline_options import BaselineOptions, BoundOptions
+from keyss.methods.base import Capabilities, Context, Plan, Source, Stego
+
+_NAMES = tuple(each.name for each in fields(Gaussians))
+
+
+@dataclass(frozen=True)
+class BoundMethod(Baseline):
+    """See `keyss.methods.base.Method`."""
+
+    def plan(self, sources: Sequence[Source], options: BaselineOptions) -> Plan:
+        """Both models, unchanged."""
+        fit = options.fit
+        cover, secret = (fit.max_gaussians if each.given is None else len(each.given) for each in sources)
+        degree = fit.sh_degree if sources[0].given is None else sources[0].given.sh_degree
+        return Plan(gaussians=cover, sh_degree=degree, secret_gaussians=secret, capacity=secret)
+
+    def hide(
+        self, cover: Source, secrets: Sequence[Source], options: BaselineOptions, context: Context
+    ) -> Stego:
+        """Hand over the secret's model."""
+        (secret,) = secrets
+        return self.stego(cover.model, HandedTensors(vars(secret.model)))
+
+
+def _open(handed: HandedTensors) -> Show:
+    model = Gaussians(*handed.take(_NAMES))
+    return lambda stego: model
+
+
+METHOD = BoundMethod(
+    options=BoundOptions,
+    capabilities=Capabilities(keys=False),
+    open=_open,
+)

@@ -1,0 +1,217 @@
+"""A trial: one plain fit, or one hiding and its measures, in a folder of its own.
+
+The folder holds the trial (`trial.json`), the results of `keyss fit` or `keyss hide` (`run/`) and, once it is
+done, its numbers (`result.json`). A key is in none of these files.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import time
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass, field, replace
+from math import isfinite
+from pathlib import Path
+from typing import Any, cast
+
+import msgspec
+
+from keyss._version import __version__
+from keyss.api.fit import fit
+from keyss.api.hide import hide
+from keyss.api.hide_arguments import Secret
+from keyss.core import ViewOptions
+from keyss.files import read_model, write_bytes
+from keyss.fitting import FitConfig
+from keyss.keys import MasterKey, read_key
+from keyss.lab.audits import PARTS, audit
+from keyss.lab.audits.subject import Subject
+from keyss.lab.audits.trial_measures import MEASURES
+from keyss.methods import MethodOptions, registry
+from keyss.methods.base import Plan, role_of
+from keyss.methods.plain_models import plain_stage
+from keyss.progress import Reporter
+from keyss.rendering import Backend, resolve_device
+from keyss.runs import FitMetrics, HideMetrics, Manifest, read_manifest, read_record, record_bytes
+from keyss.runs.files import METRICS, as_scene
+from keyss.runs.folder import PRIVATE, make_private
+from keyss.runs.open_run import open_run
+from keyss.runs.planning import plan_fit
+
+TRIAL, RESULT, RUN = "trial.json", "result.json", "run"
+MASTER_KEY = f"{PRIVATE}/master-key.txt"  # relative to the folder of all trials
+
+
+@dataclass(frozen=True, kw_only=True)
+class Trial:
+    """A hiding or, without secrets, a plain fit of the cover. Paths are absolute.
+
+    Paths of plain models of other trials are relative to the trial's folder.
+    """
+
+    keyss: str = __version__
+    name: str  # display name
+    cover: str  # a scene, or a model
+    secrets: tuple[str, ...] = ()
+    models: tuple[str | None, ...] = ()  # plain models of the cover and of each secret
+    controls: tuple[str, ...] = ()  # plain models of the cover that some measures compare with
+    method: str = ""
+    options: MethodOptions | FitConfig
+    views: ViewOptions = field(default_factory=ViewOptions)
+    min_psnr: float | None = 0.0
+    bound: bool = False
+    device: Backend = "auto"
+    measures: tuple[str, ...] = ()  # beyond those of `keyss hide`
+
+    @property
+    def identity(self) -> str:
+        """SHA-256 (hexadecimal) of all that the run depends on: not of its measures."""
+        same = replace(self, name="", measures=())
+        models = [each for each in self.models if each and os.path.isabs(each)]
+        times = modification_times([self.cover, *self.secrets, *models])
+        return hashlib.sha256(record_bytes(same) + msgspec.json.encode(times)).hexdigest()
+
+    @property
+    def needs(self) -> list[str]:
+        """Names of the trials whose models it uses."""
+        models = [each for each in (*self.models, *self.controls) if each and not os.path.isabs(each)]
+        return [Path(each).parts[1] for each in models]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Result:
+    """The measured numbers of a finished trial: `result.json`."""
+
+    version: int = 4
+    keyss: str = __version__
+    seconds: float  # duration of the attempt that finished it
+    numbers: dict[str, float] = field(default_factory=dict)  # everything measured, by names with dots
+    notes: dict[str, str] = field(default_factory=dict)  # on measures that were skipped
+    measures: tuple[str, ...] = ()  # measures of the trial that are in `numbers`
+
+
+def modification_times(inputs: Iterable[str]) -> dict[str, int]:
+    """Nanoseconds by path; 0 for missing files."""
+    return {each: os.stat(each).st_mtime_ns if os.path.exists(each) else 0 for each in inputs}
+
+
+def finished_result(trial: Trial, folder: Path) -> Result | None:
+    """The result of a finished trial with all measures; None if it has to run."""
+    result = _earlier_result(folder)
+    return result if result is not None and {*trial.measures} <= {*result.measures} else None
+
+
+def _earlier_result(folder: Path) -> Result | None:
+    """The result in a trial's folder, possibly without some measures."""
+    return read_record(folder / RESULT, Result) if (folder / RESULT).exists() else None
+
+
+def run_trial(trial: Trial, folder: Path, reporter: Reporter) -> Result:
+    """Fit or hide, measure, and write `result.json`; resumes an interrupted attempt. Raises KeyssError."""
+    start, before = time.monotonic(), _earlier_result(folder)
+    make_private(folder)
+    write_bytes(folder / TRIAL, record_bytes(trial))
+    if before is None:
+        before = Result(seconds=0.0, numbers=_fit_or_hide(trial, folder, reporter))
+    missing = [each for each in trial.measures if each not in before.measures]
+    measured = _measure(trial, missing, folder, reporter) if missing else {}
+    result = Result(
+        seconds=round(time.monotonic() - start, 1),
+        numbers=before.numbers | {name: each for name, each in measured.items() if not isinstance(each, str)},
+        notes=before.notes | {name: each for name, each in measured.items() if isinstance(each, str)},
+        measures=tuple(dict.fromkeys((*before.measures, *trial.measures))),
+    )
+    write_bytes(folder / RESULT, record_bytes(result))
+    return result
+
+
+def plan_of(trial: Trial, folder: Path) -> Plan:
+    """The plan of a trial, without the plain fits of other trials. Raises KeyssError."""
+    if isinstance(trial.options, FitConfig):
+        scene = as_scene(trial.cover, trial.views, train_pictures=False)
+        return plan_fit(scene, trial.options, resolve_device(trial.device))
+    has_keys, count = registry.get(trial.method).capabilities.keys, len(trial.secrets)
+    keys = [f"key {index}" if has_keys else "" for index in range(count)]
+    found = hide(**_hide_arguments(trial, folder, keys), dry_run=True).plan
+    assert found is not None  # a dry run always has a plan
+    fits = {plain_stage(role_of(index, 1 + count)) for index, each in enumerate(trial.models) if each}
+    return replace(found, stages=tuple(each for each in found.stages if each.name not in fits))
+
+
+def keys_of(trial: Trial, folder: Path) -> list[str]:
+    """A key per secret, derived from the master key, or "" if the method has no keys."""
+    if not registry.get(trial.method).capabilities.keys:
+        return [""] * len(trial.secrets)
+    master = MasterKey(read_key(folder.parents[1] / MASTER_KEY))
+    return [master.key_of(f"trial/{folder.name}/{index}") for index, _ in enumerate(trial.secrets, start=1)]
+
+
+def _fit_or_hide(trial: Trial, folder: Path, reporter: Reporter) -> dict[str, float]:
+    run = folder / RUN
+    manifest = read_manifest(run)
+    if manifest.running is not None or manifest == Manifest():  # else it ended before the trial did
+        more: dict[str, Any] = {"out": run, "resume": manifest.running is not None, "reporter": reporter}
+        if trial.secrets:
+            hide(**_hide_arguments(trial, folder, keys_of(trial, folder)), **more)
+        else:
+            config = cast(FitConfig, trial.options)
+            fit(trial.cover, config=config, **vars(trial.views), device=trial.device, **more)
+    kind: type[Any] = HideMetrics if trial.secrets else FitMetrics
+    return flat(asdict(read_record(run / METRICS, kind)))
+
+
+def flat(record: Any, prefix: str = "") -> dict[str, float]:
+    """All finite numbers of a nested record, by dotted names."""
+    if isinstance(record, int | float) and not isinstance(record, bool) and isfinite(record):
+        return {prefix: float(record)}
+    pairs: list[tuple[Any, Any]] = []
+    if isinstance(record, dict):
+        pairs = list(record.items())
+    elif isinstance(record, list | tuple):
+        pairs = list(enumerate(record, start=1))
+    found: dict[str, float] = {}
+    for name, each in pairs:
+        found |= flat(each, f"{prefix}.{name}" if prefix else str(name))
+    return found
+
+
+def _hide_arguments(trial: Trial, folder: Path, keys: list[str]) -> dict[str, Any]:
+    """The arguments of `hide`, without models that do not exist yet."""
+    places = [each and _place(folder, each) for each in trial.models or (None,) * (1 + len(trial.secrets))]
+    cover, *models = (place if place and place.exists() else None for place in places)
+    return {
+        "cover": trial.cover,
+        "secrets": [Secret(*each) for each in zip(trial.secrets, keys, models, strict=True)],
+        "method": trial.options,
+        **vars(trial.views),
+        "cover_model": cover,
+        "bound": trial.bound,
+        "min_psnr": trial.min_psnr,
+        "device": trial.device,
+    }
+
+
+def _place(folder: Path, path: str) -> Path:
+    return Path(os.path.normpath(folder.absolute() / path))
+
+
+def _measure(trial: Trial, names: list[str], folder: Path, reporter: Reporter) -> dict[str, float | str]:
+    """Numbers of measures, or notes on them."""
+    keys, run = [key for key in keys_of(trial, folder) if key], folder / RUN
+    found: dict[str, float | str] = {}
+    if parts := [name for name in names if name in PARTS]:
+        manifest = read_manifest(run)
+        done = "audit" in manifest.files
+        resume = not done and manifest.running is not None
+        more: dict[str, Any] = {"device": trial.device, "overwrite": done, "resume": resume}
+        audited = audit(run, keys, only=parts, reporter=reporter, **more)
+        for part in parts:
+            found |= flat(msgspec.to_builtins(getattr(audited, part)), f"audit.{part}")
+    if others := [name for name in names if name not in PARTS]:
+        device = resolve_device(trial.device)
+        controls = [read_model(_place(folder, each)).to(device) for each in trial.controls]
+        subject = Subject(open_run(run, keys), device, controls)
+        for name in others:
+            found |= {f"{name}.{each}": value for each, value in MEASURES[name](subject).items()}
+    return found

@@ -1,0 +1,25 @@
+"""`keyss hide --dry-run` prints the plan and writes nothing."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from cli.harness import SMALL, Run, assert_refused, listing, scene_arguments
+
+
+def test_dry_run(keyss: Run, workspace: Path, tmp_path: Path) -> None:
+    scenes = scene_arguments(workspace)
+    result = keyss("hide", "--publish", "any", *scenes, "-o", tmp_path / "out", *SMALL, "--dry-run")
+    assert result.status == 0, result.err
+    stages = ("plain model of the cover", "plain model of the secret", "measuring")
+    for words in (*stages, "all ", "room ", "memory ", "disk "):
+        assert words in result.out, words
+    assert re.search(r"up to [5-9]\d\d Gaussians of SH degree 3", result.out)
+    assert "appended to the cover's 100" in result.out
+    assert listing(tmp_path) == {}
+    result = keyss("hide", *scenes, "-o", tmp_path / "out", *SMALL, "--dry-run")  # too few
+    assert_refused(result, 2, "--publish any has room")
+    assert listing(tmp_path) == {}
+    result = keyss("hide", *scenes, "-o", tmp_path / "out", *SMALL, "--sh-degree", 0, "--dry-run")
+    assert_refused(result, 2, "--sh-degree 1 makes room")  # 0 is a degree, not a default

@@ -1,0 +1,103 @@
+"""Arbitrary files: `keyss hide --secret-file` and `keyss reveal`."""
+
+from __future__ import annotations
+
+import os
+import stat
+from pathlib import Path
+
+import pytest
+from hypothesis import given, strategies as st
+
+import keyss as library
+from channels.colours.made import cover
+from channels.quiet.trained_like import trained_like
+from cli.harness import Run, assert_refused, listing, write_key
+from keyss import write_model
+from keyss.channels import Payload
+from keyss.cli import main
+from keyss.core import InputError, UsageError
+from keyss.methods import HiddenFile
+
+KEYS = ("q7Rv2LxT9bWm4KzD", "W2mz8Qe5TnYc6LkA")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A cover, two files, two keys, and `out`, which hides both."""
+    made = tmp_path_factory.mktemp("files")
+    write_model(made / "cover.ply", trained_like(3000))
+    (made / "letter.pdf").write_bytes(os.urandom(3000))
+    (made / "empty").write_bytes(b"")
+    for index, key in enumerate(KEYS):
+        write_key(made / f"key{index}", key)
+    assert main([str(each) for each in _arguments(made, made / "out")]) == 0
+    return made
+
+
+def _arguments(folder: Path, out: Path) -> list[object]:
+    keys = ["--key-file", folder / "key0", "--key-file", folder / "key1"]
+    files = ["--secret-file", folder / "letter.pdf", "--secret-file", folder / "empty"]
+    return ["hide", "--cover", folder / "cover.ply", *files, *keys, "-o", out]
+
+
+def test_round_trip(keyss: Run, folder: Path, tmp_path: Path) -> None:
+    stego = folder / "out" / "publish" / "model.ply"
+    assert stego.stat().st_size == (folder / "cover.ply").stat().st_size
+    for index, name in enumerate(("letter.pdf", "empty")):
+        out = tmp_path / f"back{index}"
+        result = keyss("reveal", stego, "--key-file", folder / f"key{index}", "-o", out)
+        assert result.status == 0
+        assert repr(name) in result.out
+        assert out.read_bytes() == (folder / name).read_bytes()
+        assert stat.S_IMODE(out.stat().st_mode) == 0o600
+
+
+def test_invalid_combinations(keyss: Run, folder: Path, workspace: Path, tmp_path: Path) -> None:
+    out, back = tmp_path / "out", tmp_path / "back"
+    hide = _arguments(folder, out)
+    assert_refused(keyss(*hide, "--secret", folder / "cover.ply"), 2, "leave out --secret")
+    planned = keyss(*hide, "--dry-run")
+    assert (planned.status, planned.out.splitlines()[-1]) == (0, "Dry run: nothing was written.")
+    letter = (*_arguments(folder, out)[:3], "--secret", folder / "letter.pdf", *hide[-6:])
+    assert_refused(keyss(*letter), 4, "--secret-file hides any file")
+    for flag, value in (("--min-psnr", 60), ("--seed", 0), ("--width", 100), ("--sh-degree", 1)):
+        assert_refused(keyss(*hide, flag, value), 2, f"leave out {flag}")
+    photos = ("hide", "--cover", workspace / "a", "--secret-file", folder / "empty", "-o", out)
+    assert_refused(keyss(*photos, "--key-file", folder / "key0"), 2, "needs a model as the cover")
+    stego, key = folder / "out" / "publish" / "model.ply", ("--key-file", folder / "key0")
+    assert_refused(keyss("reveal", stego, *key, "-o", tmp_path / "s.ply"), 4, "a file of 3,000 bytes")
+    assert_refused(keyss("reveal", stego, *key, "-o", back, "--decoy"), 2, "--decoy")
+    assert_refused(keyss("reveal", folder / "cover.ply", *key, "-o", back), 3, "opens nothing")
+    assert_refused(keyss("reveal", stego, *key, "-o", stego.parent / "back"), 5, "given away")
+    assert listing(tmp_path) == {}
+
+
+def test_file_too_large(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=r"too small to carry .* Gaussians would do; .*channel="):
+        library.hide_files(trained_like(2000), [library.SecretFile(os.urandom(90_000), KEYS[0])])
+
+
+def test_hidden_file_survives_conversion(keyss: Run, folder: Path, tmp_path: Path) -> None:
+    write_model(tmp_path / "cover.ply", cover(6000))
+    (tmp_path / "note.txt").write_text("Meet me at the golden knot. " * 20)
+    key, out = ("--key-file", folder / "key0"), tmp_path / "out"
+    hide = ("hide", "--cover", tmp_path / "cover.ply", "--secret-file", tmp_path / "note.txt", *key)
+    result = keyss(*hide, "--publish", "any", "-o", out)
+    assert (result.status, result.err) == (0, "")
+    assert "may be converted" in result.out
+    result = keyss("convert", out / "publish" / "model.ply", tmp_path / "web.spz", *key)
+    assert (result.status, result.err) == (0, "")
+    assert keyss("reveal", tmp_path / "web.spz", *key, "-o", tmp_path / "back").status == 0
+    assert (tmp_path / "back").read_bytes() == (tmp_path / "note.txt").read_bytes()
+    result = keyss("reveal", tmp_path / "web.spz", "--key-file", folder / "key1", "-o", tmp_path / "none")
+    assert_refused(result, 3, "opens nothing")
+
+
+@given(st.binary(max_size=300))
+def test_foreign_payloads(data: bytes) -> None:
+    try:
+        found = HiddenFile.of(Payload("file", data))
+    except InputError:
+        return
+    assert len(found.data) <= len(data)
