@@ -25,7 +25,7 @@ export interface Answer {
   readonly id: number;
   readonly model?: Gaussians;
   readonly leftOut?: number; // Gaussians of its file
-  readonly foreign?: number; // Gaussians that were added to the secret's file, or changed, where they are many
+  readonly foreign?: number; // Gaussians that were added to the secret's file, or changed
   readonly file?: HiddenFile;
   readonly error?: string; // one sentence
   readonly stopped?: boolean; // a search, before its end

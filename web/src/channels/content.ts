@@ -4,7 +4,7 @@ import { damaged } from '../core/errors.ts';
 import type { Derive } from '../keys/keys.ts';
 
 interface Opened {
-  readonly foreign?: number; // Gaussians that were added to the secret's file, or changed, where they are many
+  readonly foreign?: number; // Gaussians that were added to the secret's file, or changed
 }
 
 /** Small pieces of one size that are found one by one. */
