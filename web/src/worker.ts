@@ -24,7 +24,7 @@ export interface Answer {
   readonly id: number;
   readonly model?: Gaussians;
   readonly leftOut?: number; // Gaussians dropped from the file
-  readonly foreign?: number; // Gaussians added to or changed in the published file, if many
+  readonly foreign?: number; // Gaussians added to or changed in the published file
   readonly file?: HiddenFile;
   readonly error?: string; // one sentence
   readonly stopped?: boolean; // the search was cancelled

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import torch
 
 from keyss.core.arrays import Doubles, Integers
 
@@ -20,5 +21,6 @@ def nearest_neighbours(points: Doubles, count: int, among: Doubles | None = None
     starts = np.append(True, (among[rows[1:]] != among[rows[:-1]]).any(axis=1))
     copies = np.arange(len(rows)) - np.flatnonzero(starts)[np.cumsum(starts) - 1]
     kept = np.sort(rows[copies < count])
-    distances, nearest = cKDTree(among[kept]).query(points, k=np.arange(1, count + 1))
+    threads = torch.get_num_threads()
+    distances, nearest = cKDTree(among[kept]).query(points, k=np.arange(1, count + 1), workers=threads)
     return distances, kept[nearest]

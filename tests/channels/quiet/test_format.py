@@ -107,8 +107,8 @@ def test_a_reader_written_from_the_description_opens_the_carried_model() -> None
     packed = b"".join(parts[number] for number in sorted(parts))
     version, service, method = struct.unpack_from("<BB15s", packed)
     cells, size, header_bytes = struct.unpack_from("<BHH", packed, 17)
-    assert (version, service, method.rstrip(b"\0")) == (4, 2, b"carry")
-    header = packed[30 : 30 + header_bytes]
+    assert (version, service, method.rstrip(b"\0")) == (5, 2, b"carry")
+    header = packed[62 : 62 + header_bytes]
     (count,) = struct.unpack_from("<I", header)
     assert count == EXPECTED["count"]
 

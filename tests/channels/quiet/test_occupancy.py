@@ -46,7 +46,7 @@ def _payloads(sizes: Sequence[int]) -> list[Content]:
 
 def _seen(contents: Sequence[Content]) -> list[float]:
     """What the holder of the first key can count of its own cells, and of all others together."""
-    writer = Writer(NAMES, WIDTH, os.urandom(32), CARRIERS)
+    writer = Writer(NAMES, WIDTH, os.urandom(32), NAMES)
     keyed = [([each] * SALTS, content) for each, content in zip([OWN[0], *OWN[1:]], contents, strict=False)]
     writer.write(keyed)
     low = np.empty_like(writer.table)

@@ -17,6 +17,7 @@ from keyss.channels.quiet.bits import Layout, used_words, write_low_bits
 from keyss.channels.quiet.predictability import count_trailing_zeros, least_exponent
 from keyss.channels.quiet.usable import GIVEN_AWAY, check_usable
 from keyss.core import Gaussians, UsageError, same_bits
+from keyss.lab.stealth.judging import stealth_statistics
 
 STEP = 2.0**-12  # scale of the last steps of the optimiser that rounds them
 MODELS = 16
@@ -210,3 +211,47 @@ def test_gaussians_that_share_harmonics_of_one_channel_stay_as_they_are(shared: 
     assert not usable[:60].any()
     assert not usable[1000:1060].any()
     assert usable[60:1000].mean() > 0.92
+
+
+def siblings_like(count: int, pairs: int, seed: int) -> tuple[Gaussians, np.ndarray]:
+    """A model in which some Gaussians moved away from their clones by equal steps; and [2, pairs] which."""
+    random = np.random.default_rng(seed)
+    model = trained_like(count, seed)
+    both = random.permutation(count)[: 2 * pairs].reshape(2, pairs)
+    sh, means = model.sh.numpy().copy(), model.means.numpy().copy()
+    steps = random.uniform(0.002, 0.02, (pairs, 1, 3)) * random.choice([-1, 1], (pairs, 16, 3))
+    steps[:, 0] *= 20
+    sh[both[1]] = sh[both[0]] + steps.astype(np.float32)
+    means[both[1]] = means[both[0]] + random.normal(0, 1e-3, (pairs, 3)).astype(np.float32)
+    return replace(model, sh=torch.from_numpy(sh), means=torch.from_numpy(means)), both
+
+
+def test_siblings_that_moved_apart_by_equal_steps_stay_as_they_are() -> None:
+    """Their harmonics follow from constant colours, which are never written. By chance none is left alone."""
+    model, both = siblings_like(3000, 40, 0)
+    alone = trained_like(3000, 0)
+    assert not usable_carriers(model)[both].any()
+    others = np.setdiff1d(np.arange(3000), both)
+    left = usable_carriers(alone)[others] & ~usable_carriers(model)[others]
+    assert left.sum() <= 20
+    plain = stealth_statistics(model)["steps: differences of siblings"]
+    published = stealth_statistics(embed_derived(model, [(keys(), bytes(100))]))
+    assert plain.value > 8
+    assert published["steps: differences of siblings"].value > 8
+    # The control: new bits in every Gaussian.
+    noise = np.random.default_rng(0).integers(0, 256, (3000, 75), np.uint8)
+    careless = write_low_bits(model, Layout.of(model), [(np.arange(3000), noise)])
+    assert abs(stealth_statistics(careless)["steps: differences of siblings"].value) < 5
+
+
+def test_no_opacity_crosses_the_threshold_of_pruning() -> None:
+    """Trainers remove opacities below 0.005. Its own cell is left alone, and no other."""
+    edge = np.float32(np.log(0.005 / 0.995))
+    words = edge.view(np.uint32) + np.arange(-1536, 1536, 3, np.int32).astype(np.uint32)
+    model = trained_like(1024, 0)
+    model = replace(model, opacity_logits=torch.from_numpy(words.view(np.float32).copy()))
+    chosen = usable_carriers(model)
+    noise = np.random.default_rng(0).integers(0, 256, (chosen.sum(), 75), np.uint8)
+    new = write_low_bits(model, Layout.of(model), [(np.flatnonzero(chosen), noise)])
+    assert np.array_equal(new.opacity_logits.numpy() < edge, model.opacity_logits.numpy() < edge)
+    assert chosen.mean() > 0.7

@@ -4,7 +4,7 @@ import { damaged } from '../core/errors.ts';
 import type { Derive } from '../keys/keys.ts';
 
 interface Opened {
-  readonly foreign?: number; // Gaussians added to or changed in the published file, if many
+  readonly foreign?: number; // Gaussians added to or changed in the published file
 }
 
 /** Records of one size, each read on its own. */

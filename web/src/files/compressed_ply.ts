@@ -17,6 +17,7 @@ export interface CompressedPlyCodes {
   readonly scaleBounds: Float64Array[][]; // [axis][min, max][C] log scales; a chunk is 256 Gaussians
   readonly scales: Float64Array; // [N] 11, 10 and 11 bits between the bounds
   readonly rotations: Float64Array; // [N] index of the component left out (2 bits), then the others (10 bits each)
+  readonly colours: Float64Array; // [N] three colours and opacity, 8 bits each
 }
 
 export const VECTOR = [2047, 1023, 2047]; // largest x, y and z
@@ -84,6 +85,6 @@ export function readCompressedPly(
       model.sh[3 * (k * row + each) + channel] = level / 32 - 4;
     });
   }
-  const codes = { kind: 'compressed-ply', count: vertex.count, scaleBounds: sizes, scales: scale, rotations: rotation } as const;
-  return { ...checkFinite(model), codes };
+  const packed = { scales: scale, rotations: rotation, colours: colour };
+  return { ...checkFinite(model), codes: { kind: 'compressed-ply', count: vertex.count, scaleBounds: sizes, ...packed } };
 }

@@ -41,7 +41,7 @@ from keyss.channels.quiet import syndromes
 from keyss.channels.quiet.bits import Layout, read_low_bits, write_low_bits
 from keyss.channels.quiet.decoded import Decoded
 from keyss.channels.quiet.fields import FORMATS, Field, Levels, carrying, last_bits
-from keyss.channels.quiet.kept import changeable, file_order, in_counted_order, in_rows
+from keyss.channels.quiet.kept import changeable, file_order, host_of, in_counted_order, in_rows
 from keyss.channels.quiet.layout import BLOCK_HEADER, LEAST_BYTES, MIN_BLOCKS, LowBitsRoom
 from keyss.channels.quiet.salts import salt, salt_rows
 from keyss.channels.quiet.usable import check_usable, named_carriers
@@ -171,7 +171,7 @@ class LowBitsCover:
         """
         check_keys([keys[0].verifier() for keys, _ in contents])
         fresh, _ = self._salts(entropy)
-        writer = Writer(self.names[self._rows], self.layout.width, entropy, len(self.cover))
+        writer = Writer(self.names[self._rows], self.layout.width, entropy, self.names)
         writer.write(contents)
         parts = [(self.salt_rows[self.fresh_salts], fresh), (self._rows[writer.order], writer.table)]
         return write_low_bits(self.cover, self.layout, parts, in_place=self.overwrites)
@@ -205,6 +205,7 @@ class CodesCover:
     codes: Codes  # in the order in which bits are counted
     fields: list[Field]
     free: list[Flags]  # of each field, which levels may be changed
+    host: bytes  # of `host_of`
     decoded: Decoded | None = None  # the model that is published in the place of the codes, in that order
 
     @staticmethod
@@ -212,7 +213,8 @@ class CodesCover:
         """Raises UsageError for codes without room. `decoded`: the model that is published, not the codes."""
         rows, ordered, own = in_counted_order(codes, decoded.exact if decoded else None)
         model = decoded[rows] if decoded else None
-        cover = CodesCover(ordered, own, changeable(ordered, own, _digest(codes)), model)
+        host = host_of(ordered, model.model if model else None)
+        cover = CodesCover(ordered, own, changeable(ordered, own, _digest(codes)), host, model)
         if len(cover.names) < MIN_BLOCKS or cover.width < LEAST_BYTES:
             raise UsageError(
                 f"a cover of {len(codes):,} Gaussians has no room for secrets in the codes of {codes.name} "
@@ -239,7 +241,7 @@ class CodesCover:
     @property
     def names(self) -> Bytes:
         """[C, 16] identities of the blocks, the first of which gives the salt."""
-        return syndromes.block_names(len(self.places) // syndromes.BLOCK)
+        return syndromes.block_names(len(self.places) // syndromes.BLOCK, self.host)
 
     @cached_property
     def room(self) -> Room:
@@ -260,7 +262,7 @@ class CodesCover:
             salts = [salt(self.names[0], first[:LEAST_BYTES])]
             derived = [(_derived(key, salts), content) for key, content in contents]
             check_keys([keys[0].verifier() for keys, _ in derived])
-            writer = Writer(self.names[1:], self.width, own, len(self.codes), blocks=True)
+            writer = Writer(self.names[1:], self.width, own, len(self.codes))
             writer.write(derived)
             if (bits := self._solved(np.concatenate([first[None], writer.table]), own)) is not None:
                 return self._published(self._written(bits, own), own)

@@ -11,15 +11,18 @@ are counted in an order of codes that are not written.
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import torch
 
 from keyss.channels.mixing import random_fractions, row_hashes
 from keyss.channels.quiet.fields import Field, Levels, carrying, sog_distances
 from keyss.channels.quiet.usable import repeated
 from keyss.core.arrays import Doubles, Flags, Floats, Integers, Words
+from keyss.core.gaussians import Gaussians
 from keyss.core.neighbours import nearest_neighbours
 from keyss.files.formats.common import Codes, morton_order
 from keyss.files.formats.compressed_ply import CompressedPlyCodes
@@ -149,6 +152,21 @@ def in_counted_order(codes: Codes, exact: Flags | None = None) -> tuple[Integers
     codes, silent = in_rows(codes, rows), silent[rows]
     fields = carrying(codes).fields(codes)
     return rows, codes, [replace(each, bits=np.where(silent, 0, each.bits)) for each in fields]
+
+
+def host_of(codes: Any, decoded: Gaussians | None = None) -> bytes:
+    """12 bytes of a hash of colours and opacities, which are never written; those of the model if `decoded`.
+
+    So that the blocks of one model, which everybody can read, are of no use in another one. Both in the order
+    in which bits are counted. Gaussians of a .sog that are alike count for nothing, as in that order.
+    """
+    if decoded is None:
+        words = np.column_stack([codes.colors, codes.alphas]).astype("<u4")
+    else:
+        words = torch.column_stack([decoded.sh[:, 0], decoded.opacity_logits]).float().numpy().view("<u4")
+    if isinstance(codes, SogCodes):
+        words = words[~repeated(_sog_names(codes))]
+    return hashlib.sha256(b"keyss/v1/host" + words.tobytes()).digest()[:12]
 
 
 def file_order(codes: Codes, within: Doubles) -> Integers:

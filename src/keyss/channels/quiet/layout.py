@@ -35,6 +35,7 @@ import numpy as np
 from keyss.channels.base import RecordPlan, RecordRequest, Room
 from keyss.channels.quiet.bits import Layout
 from keyss.channels.quiet.cells import TAG_BYTES
+from keyss.channels.quiet.sketch import SKETCH_BYTES
 from keyss.channels.reed_solomon import SYMBOL_BYTES, Codewords
 from keyss.core.arrays import Bytes, Integers
 from keyss.core.errors import UsageError
@@ -44,7 +45,7 @@ DATA_KEY_BYTES = 16
 SALTS = 12  # Gaussians that may serve as the salt: random pruning of a quarter removes all with p = 6e-8
 KEY_COPIES = 12  # of the data key, for each salt
 PARAMETER_COPIES = 24  # of each part: all are removed with a quarter of the model with p = 4e-15
-PREFIX_BYTES = 30  # of the parameters before a method's own header (see `parameters`)
+PREFIX_BYTES = 30  # of the parameters before the sketch and a method's own header (see `parameters`)
 LEAST_BYTES = 48  # that every block of codes holds: a key cell, or the parameters
 BLOCK_HEADER = 2  # blocks of codes that a secret's header takes
 MIN_BLOCKS = 4  # a salt, a header, and data
@@ -97,7 +98,7 @@ class LowBitsRoom:
 
     def header_carriers(self, header_bytes: int) -> int:
         """Carriers that a secret's header takes; `header_bytes`: what the method adds to the parameters."""
-        parts = -(-(PREFIX_BYTES + header_bytes) // max(1, self.part_bytes))
+        parts = -(-(PREFIX_BYTES + SKETCH_BYTES + header_bytes) // max(1, self.part_bytes))
         return SALTS * KEY_COPIES + parts * PARAMETER_COPIES
 
     def set_aside(self, header_bytes: Sequence[int], as_alone: bool) -> int:

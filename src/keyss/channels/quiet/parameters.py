@@ -1,7 +1,8 @@
 """The header of a hidden secret: cells with its data key, and cells with the parameters to read the rest.
 
     version (1 byte), service (1), method (15, padded with zeros), cells of a carrier (1), bytes of a record
-    (2), bytes of the method's own header (2), Gaussians of the model (4), records (4); then that header
+    (2), bytes of the method's own header (2), Gaussians of the model (4), records (4); in low bits a sketch
+    of these Gaussians (32, see `sketch`); then that header
 
 Parameters are cut into numbered parts, one in each cell. Numbers are little-endian.
 """
@@ -23,12 +24,13 @@ from keyss.channels.quiet.layout import (
     NUMBER_BYTES,
     PREFIX_BYTES,
 )
+from keyss.channels.quiet.sketch import SKETCH_BYTES
 from keyss.channels.reed_solomon import LOST, Codewords
 from keyss.core.arrays import Bytes
 from keyss.core.errors import InputError
 from keyss.keys.derivation import DerivedKey
 
-VERSION = 4
+VERSION = 5
 MAX_HEADER_BYTES = 4096
 PAYLOAD, RECORDS = 1, 2  # services
 _PAYLOAD = struct.Struct("<IIHH")  # bytes of the encrypted payload, codewords, chunks of one, data chunks
@@ -56,19 +58,27 @@ class Parameters:
     gaussians: int  # of the model in which the secret was hidden
     count: int
     header: bytes
+    sketch: bytes = b""  # of the Gaussians; empty in blocks
 
     def parts(self, width: int) -> Bytes:
         """[P, width - TAG_BYTES] numbered parts."""
         numbers = self.cells, self.record_bytes, len(self.header), self.gaussians, self.count
-        packed = _PREFIX.pack(VERSION, self.service, pack_method(self.method), *numbers) + self.header
+        packed = (
+            _PREFIX.pack(VERSION, self.service, pack_method(self.method), *numbers)
+            + self.sketch
+            + self.header
+        )
         size = width - TAG_BYTES - 1
         count = -(-len(packed) // size)
         parts = np.frombuffer(packed.ljust(count * size, b"\0"), np.uint8).reshape(count, size)
         return np.concatenate([np.arange(count, dtype=np.uint8)[:, None], parts], axis=1)
 
 
-def unpack(parts: Bytes) -> Parameters:
-    """From decrypted parts [P, 1 + part] in any order. Raises InputError for damaged or lost ones."""
+def unpack(parts: Bytes, sketch_bytes: int = SKETCH_BYTES) -> Parameters:
+    """From decrypted parts [P, 1 + part] in any order. Raises InputError for damaged or lost ones.
+
+    `sketch_bytes`: 0 in blocks.
+    """
     numbered = {int(row[0]): row[1:].tobytes() for row in parts}
     packed = _joined(numbered, PREFIX_BYTES)
     version, service, name, cells, size, length, gaussians, count = _PREFIX.unpack(packed)
@@ -83,8 +93,10 @@ def unpack(parts: Bytes) -> Parameters:
         method = unpack_method(name)
     except ValueError as error:
         raise InputError(f"the hidden parameters are damaged: {error}") from error
-    header = _joined(numbered, PREFIX_BYTES + length)[PREFIX_BYTES:]
-    return Parameters(service, method, cells, size, gaussians, count, header)
+    rest = _joined(numbered, PREFIX_BYTES + sketch_bytes + length)[PREFIX_BYTES:]
+    return Parameters(
+        service, method, cells, size, gaussians, count, rest[sketch_bytes:], rest[:sketch_bytes]
+    )
 
 
 def pack_codewords(size: int, codewords: Codewords) -> bytes:

@@ -18,10 +18,11 @@ from keyss.channels.quiet.bits import Layout, identities, read_low_bits
 from keyss.channels.quiet.cells import CellCipher
 from keyss.channels.quiet.decoded import Decoded
 from keyss.channels.quiet.fields import last_bits
-from keyss.channels.quiet.kept import in_counted_order
+from keyss.channels.quiet.kept import host_of, in_counted_order
 from keyss.channels.quiet.layout import DATA_KEY_BYTES, LEAST_BYTES, MIN_BLOCKS, LowBitsRoom, split_numbers
 from keyss.channels.quiet.parameters import Parameters, key_cipher, parameter_cipher
 from keyss.channels.quiet.salts import salt, salt_rows
+from keyss.channels.quiet.sketch import SKETCH_BYTES, foreign
 from keyss.channels.quiet.syndromes import block_names, held
 from keyss.channels.quiet.usable import among, repeated
 from keyss.channels.quiet.writing import ASSOCIATED, payload_key
@@ -32,8 +33,6 @@ from keyss.files.formats.common import CodedGaussians, Codes
 from keyss.keys.derivation import DerivedKey
 from keyss.keys.encryption import decrypt
 
-_FOREIGN = 1 / 4  # share of the Gaussians that may be foreign without a warning
-_DEVIATIONS = 5  # by which more Gaussians may be left than cells tell
 _ADDED = (
     "about {:,} of {:,} Gaussians were added to the file in which this secret was hidden, or changed, and "
     "who did that may have chosen what the key opens: reveal each secret from the file as it was published"
@@ -56,7 +55,7 @@ class QuietReader(SaltedReader):
         if isinstance(stego, CodedGaussians):
             return QuietReader.of_codes(stego.codes)
         if decoded := Decoded.of(stego):
-            return QuietReader.of_codes(decoded.codes, decoded.exact)
+            return QuietReader.of_codes(decoded.codes, decoded)
         layout = Layout.of(stego)
         names, low = identities(stego, layout), read_low_bits(stego, layout)
         rows = _first_of_each(names, low)
@@ -68,21 +67,22 @@ class QuietReader(SaltedReader):
         return QuietReader(names, low, salts, [each for each in widths if LowBitsRoom(0, each).part_bytes])
 
     @staticmethod
-    def of_codes(codes: Codes, exact: Flags | None = None) -> QuietReader | None:
-        """None for codes without room. `exact`: of a model that was decoded from the codes."""
-        low = held(last_bits(in_counted_order(codes, exact)[2]))
+    def of_codes(codes: Codes, decoded: Decoded | None = None) -> QuietReader | None:
+        """None for codes without room. `decoded`: the model that was decoded from them."""
+        rows, ordered, fields = in_counted_order(codes, decoded.exact if decoded else None)
+        low = held(last_bits(fields))
         if len(low) < MIN_BLOCKS:
             return None
-        names = block_names(len(low))
+        names = block_names(len(low), host_of(ordered, decoded[rows].model if decoded else None))
         return QuietReader(names[1:], low[1:], [salt(names[0], low[0, :LEAST_BYTES])], [LEAST_BYTES], True)
 
     def open(self, key: str) -> Content:
-        """See `Reader`. Warns (KeyssWarning) if many Gaussians are not those of the file of the secret."""
+        """See `Reader`. Warns (KeyssWarning) if Gaussians are not those of the file of the secret."""
         for derived in self.keys(key):
             with suppress(WrongKeyError):
-                content, foreign = self._opened(derived)
-                if foreign > _FOREIGN * len(self.names):
-                    warnings.warn(_ADDED.format(foreign, len(self.names)), KeyssWarning, stacklevel=3)
+                content, strangers = self._opened(derived)
+                if strangers:
+                    warnings.warn(_ADDED.format(strangers, len(self.names)), KeyssWarning, stacklevel=3)
                 return content
         raise WrongKeyError()
 
@@ -94,10 +94,11 @@ class QuietReader(SaltedReader):
         return self._opened(key)[0]
 
     def _opened(self, key: DerivedKey) -> tuple[Content, int]:
-        """The content, and at least how many Gaussians are not those of its file."""
+        """The content, and about how many Gaussians are not those of its file."""
         data_key, found, width, at = self._parameters(key)
         if self.blocks:
             return self._in_blocks(data_key, found, at), 0
+        strangers = foreign(data_key, self.names, found.sketch, found.gaussians)
         room = LowBitsRoom(0, width).record_bytes(found.cells)
         if not 0 < found.record_bytes <= room:
             raise InputError("the hidden parameters are damaged: records larger than their cells")
@@ -109,15 +110,14 @@ class QuietReader(SaltedReader):
             encrypted = codewords.decode(numbers, chunks)[:size]
             left = len(np.unique(numbers[numbers < codewords.chunks]))
             data = decrypt(payload_key(data_key), encrypted, ASSOCIATED)
-            return Payload(found.method, data, (left, codewords.chunks)), self._foreign(found, len(records))
+            return Payload(found.method, data, (left, codewords.chunks)), strangers
         cipher = CellCipher(data_key, "copy", found.record_bytes)
         copies, _ = self._decrypt(cipher, width, found.cells, full)
-        foreign = self._foreign(found, len(records) + len(copies))
         records = np.concatenate([records, copies[~_are_among(copies, records)]])
         if not len(records):
             raise InputError("the key is right, but nothing is left of what it opens")
         plan = RecordPlan(room, 0, found.cells)
-        return Records(found.method, found.header, records, plan, np.zeros(0, np.int64)), foreign
+        return Records(found.method, found.header, records, plan, np.zeros(0, np.int64)), strangers
 
     def _in_blocks(self, data_key: bytes, found: Parameters, at: int) -> Payload:
         """The payload in the blocks after `at`, where its parameters are."""
@@ -137,16 +137,11 @@ class QuietReader(SaltedReader):
         found = [self._decrypt(parameter_cipher(data_key, width), whole) for width in self.widths]
         for width, (parts, fitting) in zip(self.widths, found, strict=True):
             if len(parts):
-                return data_key, parameters.unpack(parts), width, int(np.flatnonzero(fitting)[-1])
+                unpacked = parameters.unpack(parts, 0 if self.blocks else SKETCH_BYTES)
+                return data_key, unpacked, width, int(np.flatnonzero(fitting)[-1])
         # By chance the tag of a key cell fits once in 2^32.
         self._decrypt(CellCipher(data_key, "record", LowBitsRoom(0, whole).record_bytes(1)), whole)
         raise WrongKeyError()
-
-    def _foreign(self, found: Parameters, cells: int) -> int:
-        """At least how many Gaussians were added or changed, where `cells` are left of the secret."""
-        left = min(1.0, cells / max(1, found.count))
-        left += _DEVIATIONS * (left * (1 - left) / max(1, found.count)) ** 0.5
-        return len(self.names) - int(left * found.gaussians)
 
     def _decrypt(
         self, cipher: CellCipher, width: int, cells: int = 1, full: Flags | None = None

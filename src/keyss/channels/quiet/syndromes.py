@@ -47,11 +47,10 @@ def held(bits: Bits) -> Bytes:
     return np.packbits(product, bitorder="little").reshape(-1, BLOCK // 8)
 
 
-def block_names(count: int) -> Bytes:
-    """[count, 16] the identities of blocks: their numbers."""
-    numbers = np.zeros((count, 4), "<u4")
-    numbers[:, 0] = np.arange(count)
-    return numbers.view(np.uint8)
+def block_names(count: int, host: bytes) -> Bytes:
+    """[count, 16] the identities of blocks: their numbers, and the 12 bytes `host` of their model."""
+    numbers = np.arange(count, dtype="<u4")[:, None].view(np.uint8)
+    return np.concatenate([numbers, np.tile(np.frombuffer(host, np.uint8), (count, 1))], axis=1)
 
 
 def read(bits: Bits, rows: Words) -> Bits:

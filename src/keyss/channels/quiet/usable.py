@@ -12,6 +12,8 @@ A Gaussian is left alone as a whole, so that its numbers do not contradict each 
   times (a Gaussian that few views show gets equal steps), Gaussians that share their scales, their quaternion
   or harmonics of one channel (clones, and channels that training freezes), unit quaternions, and Gaussians
   that occur twice.
+- *Equal steps* away from a neighbour: see `siblings`.
+- *Opacities at the edge* below which trainers remove Gaussians: no trained model has smaller ones.
 - *Small even numbers*, which an optimiser may have left on a coarser grid: see `predictability`.
 
 Coincidences are found in bits that embedding never changes. A Gaussian whose bits are random must hardly ever
@@ -32,6 +34,7 @@ from keyss.channels.mixing import row_hashes
 from keyss.channels.quiet.bits import (
     BLOCK,
     GEOMETRY,
+    GEOMETRY_BITS,
     QUATS,
     UNIT_TOLERANCE,
     UNUSED_BITS,
@@ -41,6 +44,7 @@ from keyss.channels.quiet.bits import (
     used_words,
 )
 from keyss.channels.quiet.predictability import count_trailing_zeros, least_exponent
+from keyss.channels.quiet.siblings import moved_apart
 from keyss.core.arrays import Bytes, Doubles, Flags, Integers, Numbers, Words, Words32
 from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
@@ -70,6 +74,8 @@ _MAGNITUDE = np.uint32(0x7FFFFFFF)
 _OPACITY = 7
 # Bit patterns of logits from 16 on. The sigmoid is 1 from 16.64 on, but only the exponent surely stays.
 _SATURATED = np.uint32(0x41800000), np.uint32(0x80000000)
+# The logit of 0.005, which trainers prune below, without the bits that may be written.
+_PRUNED = np.float32(math.log(0.005 / 0.995)).view(np.uint32) >> np.uint32(GEOMETRY_BITS + UNUSED_BITS)
 # Harmonics of a channel in a row: 0.3 % of 20,000 Gaussians share two by chance. Then of larger models.
 _FEW_GAUSSIANS, _SHARED_BY_FEW, _SHARED_BY_MANY = 50_000, 2, 3
 
@@ -103,6 +109,7 @@ def named_carriers(gaussians: Gaussians, layout: Layout) -> tuple[Flags, Bytes]:
     parts = in_blocks(judge, len(gaussians), BLOCK)
     if not parts:
         return usable, names
+    usable &= ~moved_apart(gaussians, usable)
     least = [least_exponent(counts, GIVEN_AWAY / len(_GROUPS)) for counts in np.sum(parts, axis=0)]
 
     def leave_small(start: int, stop: int) -> None:
@@ -201,13 +208,15 @@ def among(values: Numbers, ordered: Numbers) -> Flags:
 
 
 def _are_measured(used: Words32, layout: Layout, often: list[Words32], short: bool) -> Flags:
-    """[N] whether no number in use is subnormal, frequent or a saturated opacity, and few have many zeros.
+    """[N] whether no number is subnormal, frequent, a saturated or pruned opacity, and few have many zeros.
 
     If `short`, none has.
     """
     large = exponents(used)
     fine = (large > 0) & (large < 254)
-    fine[:, _OPACITY] &= ~((used[:, _OPACITY] >= _SATURATED[0]) & (used[:, _OPACITY] < _SATURATED[1]))
+    opacity = used[:, _OPACITY]
+    fine[:, _OPACITY] &= ~((opacity >= _SATURATED[0]) & (opacity < _SATURATED[1]))
+    fine[:, _OPACITY] &= opacity >> np.uint32(GEOMETRY_BITS + UNUSED_BITS) != _PRUNED
     if short:
         fine &= (used & _SHORT) != 0
     for group, values in zip(_GROUPS.values(), often, strict=True):

@@ -32,6 +32,7 @@ from keyss.channels.quiet.parameters import (
     pack_codewords,
     parameter_cipher,
 )
+from keyss.channels.quiet.sketch import sketch
 from keyss.core.arrays import Bytes, Integers
 from keyss.core.errors import KeyssWarning, UsageError
 from keyss.keys.derivation import DerivedKey, expand, fill
@@ -45,15 +46,18 @@ _NO_COPIES: Integers = np.zeros(0, np.int64)
 class Writer:
     """The bytes of carriers with identities `names` [C, 16], `width` of each.
 
-    `entropy`: 32 bytes that nobody else knows. `gaussians`: of the model. `blocks`: carriers are blocks.
+    `entropy`: 32 bytes that nobody else knows. `gaussians`: identities [N, 16] of all Gaussians of the model,
+    or their number if carriers are blocks.
     """
 
-    def __init__(
-        self, names: Bytes, width: int, entropy: bytes, gaussians: int, *, blocks: bool = False
-    ) -> None:
-        self._entropy, self._gaussians, self._blocks = entropy, gaussians, blocks
+    def __init__(self, names: Bytes, width: int, entropy: bytes, gaussians: Bytes | int) -> None:
+        self._entropy, self._every = entropy, gaussians
+        self._blocks = isinstance(gaussians, int)
+        self._gaussians = gaussians if isinstance(gaussians, int) else len(gaussians)
         self._room = LowBitsRoom(len(names), width)
-        self.order = np.arange(len(names)) if blocks else random_order(entropy, "quiet/order", len(names))
+        self.order = np.arange(len(names))
+        if not self._blocks:
+            self.order = random_order(entropy, "quiet/order", len(names))
         self._names = names[self.order]  # [C, 16] as in all below
         self.table = np.empty((len(names), width), np.uint8)
         fill(entropy, "quiet/noise", self.table)
@@ -129,6 +133,7 @@ class Writer:
             self._gaussians,
             count + len(content.copied),
             content.header,
+            b"" if isinstance(self._every, int) else sketch(data_key, self._every),
         )
         copies = np.frombuffer(data_key * key_copies, np.uint8).reshape(key_copies, -1)
         cells = [(key_cipher(key), copies) for key in keys]

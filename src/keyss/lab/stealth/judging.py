@@ -15,12 +15,14 @@ from keyss.lab.stealth.confirmation import candidate_scores, changed_low_bits
 from keyss.lab.stealth.invariants import invariants, order
 from keyss.lab.stealth.mantissa_bits import bits
 from keyss.lab.stealth.statistic import BitPatterns, Statistic
+from keyss.lab.stealth.steps import steps
 
 # Detectors by kind: functions of a model and its bit patterns that give statistics by name.
 KINDS: dict[str, Callable[[Gaussians, BitPatterns], dict[str, Statistic]]] = {
     "bits": bits,
     "agreement": agreement,
     "coincidences": coincidences,
+    "steps": steps,
     "invariants": invariants,
     "opacities": opacities,
     "order": order,

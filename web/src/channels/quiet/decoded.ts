@@ -7,7 +7,7 @@ import { opacity } from '../../core/gaussians.ts';
 import { fromSmallestThree } from '../../files/coded.ts';
 import { CHUNK, VECTOR } from '../../files/compressed_ply.ts';
 import { FINEST } from '../../files/sog.ts';
-import { byRow, compressedPlyLevels, type Levels, type OfAxis, sogLevels, spzLevels } from './fields.ts';
+import { byRow, compressedPlyLevels, type Counted, type Levels, type OfAxis, sogLevels, spzLevels } from './fields.ts';
 
 const [SIZE, SAMPLE, MOST, CLOSE] = [256, 1024, 0.9, 1e-5];
 const [MAX_FRACTIONAL_BITS, MAX_POSITION] = [24, 2 ** 23 - 1];
@@ -22,7 +22,7 @@ export interface Decoded {
 
 /** Levels, and what they stand for. */
 interface Guess {
-  readonly levels: Levels;
+  readonly levels: Counted;
   readonly mean: OfAxis;
   readonly logScale: OfAxis;
   readonly quat: (row: number) => number[];
@@ -36,9 +36,16 @@ export function decodedFrom(model: Gaussians): Decoded | null {
     const found = guess(model);
     if (!found) continue;
     const silent = Uint8Array.from({ length: count }, (_, row) => (follows(model, row, found) ? 0 : 1));
-    if (silent.reduce((sum, each) => sum + 1 - each, 0) >= MOST * count) return { levels: found.levels, silent };
+    if (silent.reduce((sum, each) => sum + 1 - each, 0) >= MOST * count) {
+      return { levels: { ...found.levels, unwritten: unwritten(model) }, silent };
+    }
   }
   return null;
+}
+
+function unwritten({ count, sh, opacityLogits }: Gaussians): OfAxis {
+  const [width, words] = [sh.length / count, [sh, opacityLogits].map((each) => new Uint32Array(Float32Array.from(each).buffer))];
+  return (row, part) => (part < 3 ? words[0][width * row + part] : words[1][row]);
 }
 
 /** In ascending order, null for more than 256. */

@@ -6,6 +6,8 @@
  * All of it is arithmetic that is the same on every machine, in the same order as there, and no logarithms: a bit more or
  * less anywhere, and nothing could be read.
  */
+import { sha256 } from '@noble/hashes/sha2.js';
+import { ascii, joined } from '../../core/bytes.ts';
 import { highProduct, runs, sortingOrder, type Words } from '../../core/words.ts';
 import { CHUNK, rotationPart as pliedPart, VECTOR, vectorPart } from '../../files/compressed_ply.ts';
 import type { Codes } from '../../files/models.ts';
@@ -17,6 +19,7 @@ const SHARE = -3; // 2 to this: the range of what is written, in sizes of the Ga
 const LOG_SCALE = -4; // 2 to this: the range of what is written in log scales
 const LOG2_E = 1.4426950408889634;
 const MAX_DISTANCE = 64; // powers of 2
+const HOST_BYTES = 12;
 const AXES = [0, 1, 2];
 const [FACTOR_HIGH, FACTOR_LOW] = [0x9e3779b9, 0x7f4a7c15];
 
@@ -31,16 +34,20 @@ interface Field {
 
 /** The integers of a rounded model. */
 export interface Levels {
+  readonly unwritten: OfAxis; // three constant colours and the opacity, as words of 32 bits
   readonly fields: Field[];
   readonly rows: ArrayLike<number>; // of Gaussians, in the order in which bits are counted
 }
+
+export type Counted = Omit<Levels, 'unwritten'>;
 
 /** Those of a file. */
 export function levelsOf(codes: Codes): Levels {
   if (codes.kind === 'spz') {
     const turn = (row: number, part: number): number => rotationPart(rotationWord(codes, row), part);
     const [scale, place] = [byRow(codes.scales, 3), (row: number, axis: number) => positionCode(codes, row, axis)];
-    return spzLevels(codes.count, codes.fractionalBits, scale, place, codes.version === 2 ? null : turn);
+    const unwritten: OfAxis = (row, part) => (part < 3 ? codes.colours[3 * row + part] : codes.alphas[row]);
+    return { ...spzLevels(codes.count, codes.fractionalBits, scale, place, codes.version === 2 ? null : turn), unwritten };
   }
   if (codes.kind === 'sog') {
     const [index, colour, quat] = [codes.scales, codes.colours, codes.quats].map((each) => byRow(each, 4));
@@ -49,10 +56,12 @@ export function levelsOf(codes: Codes): Levels {
       codes.labels[row], quat(row, 3) - LARGEST,
     ];
     const scale = (row: number, axis: number): number => codes.scaleBook[index(row, axis)];
-    return sogLevels(codes, scale, byRow(codes.positions, 3), quat, unwritten);
+    return { ...sogLevels(codes, scale, byRow(codes.positions, 3), quat, unwritten), unwritten: colour };
   }
   const scale = (row: number, axis: number): number => vectorPart(codes.scales[row], axis);
-  return compressedPlyLevels(codes.count, codes.scaleBounds, scale, (row, part) => pliedPart(codes.rotations[row], part));
+  const turn = (row: number, part: number): number => pliedPart(codes.rotations[row], part);
+  const unwritten: OfAxis = (row, part) => (codes.colours[row] >>> (24 - 8 * part)) & 255;
+  return { ...compressedPlyLevels(codes.count, codes.scaleBounds, scale, turn), unwritten };
 }
 
 export function byRow(table: ArrayLike<number>, width: number): OfAxis {
@@ -60,7 +69,7 @@ export function byRow(table: ArrayLike<number>, width: number): OfAxis {
 }
 
 /** Of a .spz; `turn` is null where rotations carry nothing. */
-export function spzLevels(count: number, fractionalBits: number, scale: OfAxis, place: OfAxis, turn: OfAxis | null): Levels {
+export function spzLevels(count: number, fractionalBits: number, scale: OfAxis, place: OfAxis, turn: OfAxis | null): Counted {
   const bits = Uint8Array.from({ length: count }, (_, row) => {
     const size = (middle(row, scale) / 16 - 10) * LOG2_E;
     return fitting(size + fractionalBits + SHARE);
@@ -73,7 +82,7 @@ export function spzLevels(count: number, fractionalBits: number, scale: OfAxis, 
 export function sogLevels(
   { count, mins, maxs }: { count: number; mins: readonly number[]; maxs: readonly number[] },
   scale: OfAxis, place: OfAxis, turn: OfAxis, unwritten: (row: number) => number[],
-): Levels {
+): Counted {
   const extent = AXES.map((axis) => (maxs[axis] > mins[axis] ? maxs[axis] - mins[axis] : 1));
   /** By how many powers of 2 steps are larger at a position than at 0. */
   const distance = (row: number, axis: number): number => {
@@ -90,7 +99,7 @@ export function sogLevels(
 }
 
 /** Of a compressed .ply; `bounds` [3, 2, C]: least and largest log scales of each chunk. */
-export function compressedPlyLevels(count: number, bounds: Float64Array[][], scale: OfAxis, turn: OfAxis): Levels {
+export function compressedPlyLevels(count: number, bounds: Float64Array[][], scale: OfAxis, turn: OfAxis): Counted {
   const bits = bounds.map(([low, high], axis) =>
     Uint8Array.from(low, (least, chunk) => fitting(LOG_SCALE - log2((high[chunk] - least) / VECTOR[axis]))),
   );
@@ -131,7 +140,7 @@ export function log2(value: number): number {
 }
 
 /** The last bits of all levels, each 0 or 1, in the order in which they are counted; `silent` [N] rows have none. */
-export function lastBits({ fields, rows }: Levels, silent?: Uint8Array): Uint8Array {
+export function lastBits({ fields, rows }: Counted, silent?: Uint8Array): Uint8Array {
   const count = ({ bits }: Field, row: number): number => (silent?.[row] ? 0 : bits(row));
   let size = 0;
   for (const field of fields) for (let index = 0; index < rows.length; index++) size += count(field, rows[index]);
@@ -144,6 +153,12 @@ export function lastBits({ fields, rows }: Levels, silent?: Uint8Array): Uint8Ar
     }
   }
   return found;
+}
+
+/** 12 bytes of a hash of what is never written, so that the blocks of one model are of no use in another one. */
+export function hostOf({ unwritten, rows }: Levels): Uint8Array {
+  const words = Uint32Array.from({ length: 4 * rows.length }, (_, at) => unwritten(rows[at >>> 2], at & 3));
+  return sha256(joined(ascii('keyss/v1/host'), new Uint8Array(words.buffer))).subarray(0, HOST_BYTES);
 }
 
 /** Rows by the order of their hashes, without those that share one: these carry nothing. */

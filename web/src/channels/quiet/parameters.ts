@@ -3,8 +3,9 @@ import { bytesKey, joined, viewOf } from '../../core/bytes.ts';
 import { damaged, otherVersion, tooMuchLost } from '../../core/errors.ts';
 import type { Codewords } from '../reed_solomon.ts';
 
-const VERSION = 4;
+const VERSION = 5;
 const PREFIX_BYTES = 30;
+export const SKETCH_BYTES = 32;
 const NUMBERS = 17; // where cells, bytes of a record and of the header, Gaussians and records begin
 const MAX_CELLS = 4;
 const MAX_HEADER_BYTES = 4096;
@@ -20,10 +21,11 @@ export interface Parameters {
   readonly gaussians: number; // of the model in which the secret was hidden
   readonly count: number;
   readonly header: Uint8Array;
+  readonly sketch: Uint8Array; // of these Gaussians; empty in blocks
 }
 
-/** From decrypted parts in any order. Raises InputError. */
-export function unpackParameters(parts: Uint8Array[]): Parameters {
+/** From decrypted parts in any order; `sketched`: bytes of the sketch. Raises InputError. */
+export function unpackParameters(parts: Uint8Array[], sketched: number): Parameters {
   const numbered = new Map(parts.map((part) => [part[0], part.subarray(1)]));
   const prefix = firstBytes(numbered, PREFIX_BYTES);
   const [version, service] = prefix;
@@ -33,8 +35,9 @@ export function unpackParameters(parts: Uint8Array[]): Parameters {
   const [gaussians, count] = [view.getUint32(NUMBERS + 5, true), view.getUint32(NUMBERS + 9, true)];
   if (service < 1 || service > 2 || cells < 1 || cells > MAX_CELLS || length > MAX_HEADER_BYTES) throw damaged();
   const method = bytesKey(prefix.subarray(2, NUMBERS)).replace(/\0+$/, '');
-  const header = firstBytes(numbered, PREFIX_BYTES + length).subarray(PREFIX_BYTES);
-  return { isPayload: service === 1, method, cells, recordBytes, gaussians, count, header };
+  const rest = firstBytes(numbered, PREFIX_BYTES + sketched + length).subarray(PREFIX_BYTES);
+  const [sketch, header] = [rest.subarray(0, sketched), rest.subarray(sketched)];
+  return { isPayload: service === 1, method, cells, recordBytes, gaussians, count, header, sketch };
 }
 
 /** Bytes of the encrypted payload, and its codewords, from the header of a payload. Raises InputError. */

@@ -4,7 +4,7 @@
  * A key that opens nothing makes the same passes over all cells as one that opens a secret, and all salts are always
  * tried, so that how long it takes tells next to nothing.
  */
-import { ascii, bytesKey, mostFrequent, rowsOf } from '../../core/bytes.ts';
+import { ascii, bytesKey, mostFrequent, rowsOf, viewOf } from '../../core/bytes.ts';
 import { damaged, tooMuchLost } from '../../core/errors.ts';
 import { type Gaussians, selected } from '../../core/gaussians.ts';
 import type { ReadModel } from '../../files/models.ts';
@@ -13,10 +13,10 @@ import { here } from '../../keys/pool.ts';
 import type { Content, Reader } from '../content.ts';
 import { decoded } from '../reed_solomon.ts';
 import { fieldsOf, IDENTITY_BYTES, identities, lowBits, lowWidth } from './bits.ts';
-import { CellCipher, TAG_BYTES } from './cells.ts';
+import { CellCipher, encrypted, TAG_BYTES } from './cells.ts';
 import { decodedFrom } from './decoded.ts';
-import { lastBits, type Levels, levelsOf } from './fields.ts';
-import { NUMBER_BYTES, type Parameters, unpackCodewords, unpackParameters } from './parameters.ts';
+import { hostOf, lastBits, type Levels, levelsOf } from './fields.ts';
+import { NUMBER_BYTES, type Parameters, SKETCH_BYTES, unpackCodewords, unpackParameters } from './parameters.ts';
 import { saltOf, salts } from './salts.ts';
 import { BLOCK_BYTES, held } from './syndromes.ts';
 
@@ -27,7 +27,6 @@ const SALTS_TRIED = 4;
 const DUMMY_CELLS = 2; // of a carrier that a key which opens nothing looks into
 const NARROW_HARMONICS = 9; // of degree 1: some secrets leave the low bits of the others as they are
 const [LEAST_BYTES, MIN_BLOCKS] = [48, 4]; // of a block of codes, of a file with room
-const [FOREIGN, DEVIATIONS] = [1 / 4, 5]; // share of the Gaussians that may be foreign; of what is left
 const MAX_BITS = 2 ** 30; // of codes; more would take more memory than tabs have
 
 /** The data of a cell, and its carrier. */
@@ -73,8 +72,11 @@ export class QuietReader implements Reader {
     if (bits.length < MIN_BLOCKS * 8 * BLOCK_BYTES || bits.length > MAX_BITS) return null;
     const low = held(bits);
     const numbers = new Uint32Array((IDENTITY_BYTES / 4) * (low.length / BLOCK_BYTES));
-    for (let block = 0; 4 * block < numbers.length; block++) numbers[4 * block] = block;
-    const names = new Uint8Array(numbers.buffer);
+    const [names, host] = [new Uint8Array(numbers.buffer), hostOf(levels)];
+    for (let block = 0; 4 * block < numbers.length; block++) {
+      numbers[4 * block] = block;
+      names.set(host, IDENTITY_BYTES * block + 4);
+    }
     const salt = saltOf(names.subarray(0, IDENTITY_BYTES), low.subarray(0, LEAST_BYTES));
     const [others, rest] = [names.subarray(IDENTITY_BYTES), low.subarray(BLOCK_BYTES)];
     return new QuietReader(others, rest, BLOCK_BYTES, [LEAST_BYTES], [salt], true);
@@ -101,7 +103,7 @@ export class QuietReader implements Reader {
       for (const width of this.widths) {
         const parts = this.parts(dataKey, width);
         if (!parts.length) continue;
-        const parameters = unpackParameters(parts.map(({ data }) => data));
+        const parameters = unpackParameters(parts.map(({ data }) => data), this.blocks ? 0 : SKETCH_BYTES);
         if (!this.blocks) return this.content(dataKey, parameters, width);
         return this.payload(dataKey, parameters, this.inBlocks(parameters, parts[parts.length - 1].row));
       }
@@ -126,27 +128,33 @@ export class QuietReader implements Reader {
       this.cells(new CellCipher(dataKey, label, recordBytes), width, cells).map(({ data }) => data),
     );
     if (width < this.width) this.passesForNothing(dataKey, this.width - width);
+    const foreign = this.foreign(dataKey, parameters);
     if (isPayload) {
       const [size, codewords] = unpackCodewords(parameters);
       const chunks = records.map((each): [number, Uint8Array] => [
         each[0] | (each[1] << 8) | (each[2] << 16), each.subarray(NUMBER_BYTES),
       ]);
       const payload = await this.payload(dataKey, parameters, decoded(codewords, chunks).subarray(0, size));
-      return { ...payload, foreign: this.foreign(parameters, records.length) };
+      return { ...payload, foreign };
     }
     const known = new Set(records.map(bytesKey));
     const all = [...records, ...copies.filter((each) => !known.has(bytesKey(each)))];
     if (!all.length) throw tooMuchLost();
-    const foreign = this.foreign(parameters, records.length + copies.length);
     return { service: 'records', method, header, records: all, foreign };
   }
 
-  /** Where `cells` are left of a secret. */
-  private foreign({ gaussians, count }: Parameters, cells: number): number | undefined {
-    const [rows, all] = [this.names.length / IDENTITY_BYTES, Math.max(1, count)];
-    const left = Math.min(1, cells / all);
-    const found = rows - Math.floor((left + DEVIATIONS * Math.sqrt((left * (1 - left)) / all)) * gaussians);
-    return found > FOREIGN * rows ? found : undefined;
+  /** About how many Gaussians have no place in the sketch; undefined for none. */
+  private foreign(dataKey: Uint8Array, { gaussians, sketch }: Parameters): number | undefined {
+    const isSet = (place: number): boolean => ((sketch[place >>> 3] >>> (place & 7)) & 1) === 1;
+    const bits = Math.min(8 * SKETCH_BYTES, gaussians);
+    const unset = Array.from({ length: bits }, (_, place) => place).filter((place) => !isSet(place)).length;
+    const [rows, hashed] = [this.names.length / IDENTITY_BYTES, viewOf(encrypted(expand(dataKey, 'sketch', 32), this.names))];
+    let seen = 0;
+    for (let row = 0; row < rows; row++) {
+      const place = hashed.getUint32(IDENTITY_BYTES * row, true) % Math.max(1, gaussians);
+      if (place < 8 * SKETCH_BYTES && !isSet(place)) seen++;
+    }
+    return Math.min(rows, Math.round((seen * gaussians) / Math.max(1, unset))) || undefined;
   }
 
   private async payload(dataKey: Uint8Array, { method }: Parameters, encrypted: Uint8Array): Promise<Content> {
