@@ -105,7 +105,7 @@ def _readers(stego: Gaussians) -> Iterator[Reader]:
     for reader in (_quiet, _appended):
         if own := reader(stego):
             yield own
-    from keyss.channels.colours.reading import ColoursReader
+    from keyss.channels.colours.colours_reader import ColoursReader
 
     yield ColoursReader.of(stego)
 

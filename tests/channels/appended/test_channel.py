@@ -15,7 +15,7 @@ from hypothesis import given, settings, strategies as st
 
 from keyss.channels import APPENDED, AppendedReader, Payload
 from keyss.channels.appended import pilots
-from keyss.channels.appended.lattice import WORD_BITS, to_gaussians
+from keyss.channels.appended.words import WORD_BITS, to_gaussians
 from keyss.channels.base import pack_payload
 from keyss.core import (
     DRAWN_OPACITY,

@@ -19,7 +19,7 @@ import numpy as np
 import torch
 
 from keyss.channels.appended import packets, pilots
-from keyss.channels.appended.lattice import (
+from keyss.channels.appended.words import (
     WORD_BITS,
     all_shifts,
     check_place,

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from keyss.channels.appended.lattice import WORD_BITS, bits_of, number
+from keyss.channels.appended.words import WORD_BITS, bits_of, number
 from keyss.channels.mixing import encrypted_blocks
 from keyss.core.arrays import Bits, Bytes, Words
 

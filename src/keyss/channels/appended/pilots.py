@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from keyss.channels.appended.lattice import (
+from keyss.channels.appended.words import (
     COLOUR_BITS,
     INVARIANT_BITS,
     POSITION_BITS,

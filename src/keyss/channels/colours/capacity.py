@@ -20,9 +20,9 @@ import numpy as np
 
 from keyss.channels.colours.carriers import Carriers
 from keyss.channels.colours.header import PLACES, SHARES, bucket_bytes
-from keyss.channels.colours.lattice import COLUMNS, LEVELS, ONE, SPACING, bit_counts
 from keyss.channels.colours.likeness import Likeness
-from keyss.channels.colours.salts import SALTS
+from keyss.channels.colours.qim import COLUMNS, LEVELS, ONE, SPACING, bit_counts
+from keyss.channels.colours.salt_gaussians import SALTS
 from keyss.core.arrays import Doubles, Flags, Floats, Integers, doubles
 from keyss.core.gaussians import Gaussians
 from keyss.keys.encryption import OVERHEAD

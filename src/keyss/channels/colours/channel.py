@@ -29,6 +29,7 @@ from keyss.channels.base import (
 )
 from keyss.channels.colours.capacity import UNNOTICED, Capacity, Layout, bucket_of
 from keyss.channels.colours.carriers import Carriers
+from keyss.channels.colours.colours_reader import ASSOCIATED
 from keyss.channels.colours.fountain import Fountain
 from keyss.channels.colours.header import (
     FILE_KEY_BYTES,
@@ -40,9 +41,8 @@ from keyss.channels.colours.header import (
     median,
     places,
 )
-from keyss.channels.colours.lattice import ONE, bit_counts, seeds, write
-from keyss.channels.colours.reading import ASSOCIATED
-from keyss.channels.colours.salts import SALTS, Salts, renewed
+from keyss.channels.colours.qim import ONE, bit_counts, seeds, write
+from keyss.channels.colours.salt_gaussians import SALTS, Salts, renewed
 from keyss.core.arrays import Doubles, Flags
 from keyss.core.errors import KeyssWarning, UsageError
 from keyss.core.gaussians import Gaussians

@@ -20,7 +20,7 @@ import numpy as np
 
 from keyss.channels.colours.carriers import Carriers, fractions
 from keyss.channels.colours.fountain import NOISY, Fountain
-from keyss.channels.colours.lattice import COLUMNS, ONE, read, seeds, write
+from keyss.channels.colours.qim import COLUMNS, ONE, read, seeds, write
 from keyss.core.arrays import Bits, Doubles, Flags, Integers
 from keyss.keys.derivation import SALT_BYTES, DerivedKey, expand
 

@@ -10,9 +10,9 @@ import torch
 from scipy.stats import kstest
 
 from channels.colours.made import cover
-from keyss.channels.colours import lattice
+from keyss.channels.colours import qim
 from keyss.channels.colours.carriers import Carriers
-from keyss.channels.colours.salts import SALTS, Salts, renewed
+from keyss.channels.colours.salt_gaussians import SALTS, Salts, renewed
 from keyss.core import Gaussians
 from lab.lifelike import turned
 
@@ -24,38 +24,38 @@ def _written(level: int = LEVEL):
     """Names [C, 4], values before and after [C, 2], bits of each [C], and code [B]."""
     carriers = Carriers.of(cover())
     names, before = carriers.names[carriers.own], carriers.colours[carriers.own, 1:]
-    bits = lattice.bit_counts(carriers.impact[carriers.own], level)
-    code = np.random.default_rng(0).integers(0, 2, lattice.COLUMNS * bits.sum()).astype(np.uint8)
-    return names, before, lattice.write(SECRET, names, before, bits, code), bits, code
+    bits = qim.bit_counts(carriers.impact[carriers.own], level)
+    code = np.random.default_rng(0).integers(0, 2, qim.COLUMNS * bits.sum()).astype(np.uint8)
+    return names, before, qim.write(SECRET, names, before, bits, code), bits, code
 
 
-@pytest.mark.parametrize("level", [lattice.ONE, 4, 24, 40])
+@pytest.mark.parametrize("level", [qim.ONE, 4, 24, 40])
 def test_bits_come_back_after_noise_below_half_of_the_spacing(level: int) -> None:
     names, _, written, bits, code = _written(level)
     noise = np.random.default_rng(1).uniform(-0.0131, 0.0131, written.shape)  # as .spz rounds
-    assert ((lattice.read(SECRET, names, written + noise, bits) < 0) == code).all()
+    assert ((qim.read(SECRET, names, written + noise, bits) < 0) == code).all()
 
 
 def test_what_is_added_is_uniform_noise_of_the_stated_variance() -> None:
     _, before, written, bits, _ = _written()
-    moved = (written - before)[bits > 0] / (lattice.SPACING * 2.0**bits)[bits > 0, None]
+    moved = (written - before)[bits > 0] / (qim.SPACING * 2.0**bits)[bits > 0, None]
     assert kstest(moved.ravel() + 0.5, "uniform").pvalue > 0.001
     assert abs(np.corrcoef(moved.T)[0, 1]) < 0.06
     assert (written[bits == 0] == before[bits == 0]).all()
 
 
 def test_without_the_secret_nothing_lies_on_a_lattice() -> None:
-    names, _, written, bits, _ = _written(lattice.ONE)
-    sure = np.abs(lattice.read(SECRET, names, written, bits)).mean()
-    assert np.abs(lattice.read(bytes(16), names, written, bits)).mean() < 0.9 * sure
-    assert kstest(written.ravel() / lattice.SPACING % 1, "uniform").pvalue > 0.001
+    names, _, written, bits, _ = _written(qim.ONE)
+    sure = np.abs(qim.read(SECRET, names, written, bits)).mean()
+    assert np.abs(qim.read(bytes(16), names, written, bits)).mean() < 0.9 * sure
+    assert kstest(written.ravel() / qim.SPACING % 1, "uniform").pvalue > 0.001
 
 
 def test_a_visible_gaussian_carries_less() -> None:
     impact = np.sort(Carriers.of(cover()).impact)
     for level in (10, 30):
-        assert (np.diff(lattice.bit_counts(impact, level)) <= 0).all()
-    totals = [int(lattice.bit_counts(impact, level).sum()) for level in range(1, lattice.LEVELS)]
+        assert (np.diff(qim.bit_counts(impact, level)) <= 0).all()
+    totals = [int(qim.bit_counts(impact, level).sum()) for level in range(1, qim.LEVELS)]
     assert totals == sorted(totals)
 
 

@@ -10,8 +10,8 @@ from keyss.channels.base import Payload, unpack_payload
 from keyss.channels.colours.carriers import Carriers
 from keyss.channels.colours.fountain import Fountain
 from keyss.channels.colours.header import IDLE, Header, Secrets, bucket_bytes, places
-from keyss.channels.colours.lattice import COLUMNS, ONE, bit_counts, read, seeds
-from keyss.channels.colours.salts import Salts
+from keyss.channels.colours.qim import COLUMNS, ONE, bit_counts, read, seeds
+from keyss.channels.colours.salt_gaussians import Salts
 from keyss.channels.reed_solomon import LOST
 from keyss.core.errors import InputError, WrongKeyError
 from keyss.core.gaussians import Gaussians
