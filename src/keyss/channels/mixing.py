@@ -13,7 +13,7 @@ from keyss.keys.derivation import stream
 _ODD = np.uint64(0x9E3779B97F4A7C15)  # 2^64 over the golden ratio: the high bits of multiples are scattered
 
 
-def mixed(words: Words) -> Words:
+def mix(words: Words) -> Words:
     """[...] numbers that look random for different ones: the finaliser of splitmix64 (Steele et al. 2014)."""
     state = words.astype(np.uint64) + _ODD
     state = (state ^ state >> np.uint64(30)) * np.uint64(0xBF58476D1CE4E5B9)

@@ -74,12 +74,12 @@ class Codewords:
             chosen = chunks[first]
             sure = np.ones(left, bool)
             sure[of_own[(chunks != chosen[of_own]).any(axis=1)]] = False
-            data = self._decoded(own[sure], chosen[sure], errors)
+            data = self._decode(own[sure], chosen[sure], errors)
         if data is None:
             raise InputError(f"{LOST}: {left:,} of {self.chunks:,} chunks are left")
         return data.tobytes()
 
-    def _decoded(self, numbers: Integers, chunks: Bytes, errors: bool) -> Bytes | None:
+    def _decode(self, numbers: Integers, chunks: Bytes, errors: bool) -> Bytes | None:
         data = np.empty((self.k, self.count, self.width), np.uint8)
         rows, codewords = np.divmod(numbers, self.count)
         for codeword in range(self.count):
@@ -96,7 +96,7 @@ def encode(data: Bytes, n: int) -> Bytes:
     k = len(data)
     if not 1 <= k <= n <= MAX_CHUNKS:
         raise ValueError(f"expected 1 <= k <= n <= {MAX_CHUNKS}, got k = {k}, n = {n}")
-    return np.concatenate([data, _interpolated(np.arange(k), data, np.arange(k, n), k)])
+    return np.concatenate([data, _interpolate(np.arange(k), data, np.arange(k, n), k)])
 
 
 def decode(numbers: Integers, rows: Bytes, k: int, n: int, *, errors: bool = False) -> Bytes | None:
@@ -105,7 +105,7 @@ def decode(numbers: Integers, rows: Bytes, k: int, n: int, *, errors: bool = Fal
     `errors`: some of the rows may be those of other codewords. None if too few are left.
     """
     if errors and len(rows) > k:
-        right = _are_right(numbers, rows, k, n)
+        right = _consistent_rows(numbers, rows, k, n)
         numbers, rows = numbers[right], rows[right]
     if len(rows) < k:
         return None
@@ -115,7 +115,7 @@ def decode(numbers: Integers, rows: Bytes, k: int, n: int, *, errors: bool = Fal
     known = numbers < k
     data[numbers[known]] = rows[known]
     lost = np.setdiff1d(np.arange(k), numbers)
-    data[lost] = _interpolated(numbers, rows, lost, n)
+    data[lost] = _interpolate(numbers, rows, lost, n)
     return data
 
 
@@ -134,7 +134,7 @@ def _tables() -> tuple[Shorts, Integers]:
 _POWERS, _LOGARITHMS = _tables()
 
 
-def _interpolated(numbers: Integers, rows: Bytes, wanted: Integers, n: int) -> Bytes:
+def _interpolate(numbers: Integers, rows: Bytes, wanted: Integers, n: int) -> Bytes:
     """Rows [W, width] of the numbers `wanted` [W], from as many rows [k, width] as determine them.
 
     `n`: more than any of the `numbers` [k].
@@ -145,7 +145,7 @@ def _interpolated(numbers: Integers, rows: Bytes, wanted: Integers, n: int) -> B
     found = np.zeros((len(wanted), rows.shape[1] // SYMBOL_BYTES), np.uint16)
     if len(wanted):
         points, at = numbers + 1, wanted + 1
-        values = _scaled(rows, -_own_products(numbers, n))
+        values = _scale(rows, -_own_products(numbers, n))
         outside = _products(at, points)
         step = max(1, _AT_ONCE // values.size)
         for low in range(0, len(at), step):
@@ -155,7 +155,7 @@ def _interpolated(numbers: Integers, rows: Bytes, wanted: Integers, n: int) -> B
     return found.astype(">u2").view(np.uint8)
 
 
-def _scaled(rows: Bytes, logarithms: Integers) -> Integers:
+def _scale(rows: Bytes, logarithms: Integers) -> Integers:
     """[C, width / 2] logarithms of the symbols of rows [C, width] times factors of `logarithms` [C]."""
     symbols = _LOGARITHMS[np.ascontiguousarray(rows).view(">u2")]
     return np.where(symbols == _ZERO, _ZERO, (symbols + logarithms[:, None]) % _ORDER)
@@ -183,7 +183,7 @@ def _products(at: Integers, points: Integers) -> Integers:
     return np.concatenate(parts) % _ORDER
 
 
-def _are_right(numbers: Integers, rows: Bytes, k: int, n: int) -> Flags:
+def _consistent_rows(numbers: Integers, rows: Bytes, k: int, n: int) -> Flags:
     """[C] which rows [C, width] belong to the codeword that most do; more than k.
 
     The sums of v a^t / P'(a), t = 0, 1, ... (see `_interpolated`) over all rows vanish for a codeword as long
@@ -191,7 +191,7 @@ def _are_right(numbers: Integers, rows: Bytes, k: int, n: int) -> Flags:
     1969). Where there are too many errors, none is found.
     """
     points = numbers + 1
-    values = _scaled(rows, -_own_products(numbers, n))
+    values = _scale(rows, -_own_products(numbers, n))
     mixed = np.bitwise_xor.reduce(_POWERS[values + np.arange(values.shape[1])], axis=1)  # of all columns
     terms, powers = _LOGARITHMS[mixed], _LOGARITHMS[points]
     times = np.arange(min(len(rows) - k, 2 * _MAX_ERRORS))[:, None]

@@ -12,7 +12,7 @@ from scipy.stats import kstest
 from channels.colours.made import cover
 from keyss.channels.colours import qim
 from keyss.channels.colours.carriers import Carriers
-from keyss.channels.colours.salt_gaussians import SALTS, Salts, renewed
+from keyss.channels.colours.salt_gaussians import SALTS, Salts, renew_salts
 from keyss.core import Gaussians
 from lab.lifelike import turned
 
@@ -23,8 +23,8 @@ LEVEL = 24
 def _written(level: int = LEVEL):
     """Names [C, 4], values before and after [C, 2], bits of each [C], and code [B]."""
     carriers = Carriers.of(cover())
-    names, before = carriers.names[carriers.own], carriers.colours[carriers.own, 1:]
-    bits = qim.bit_counts(carriers.impact[carriers.own], level)
+    names, before = carriers.names[carriers.representatives], carriers.colours[carriers.representatives, 1:]
+    bits = qim.bit_counts(carriers.impact[carriers.representatives], level)
     code = np.random.default_rng(0).integers(0, 2, qim.COLUMNS * bits.sum()).astype(np.uint8)
     return names, before, qim.write(SECRET, names, before, bits, code), bits, code
 
@@ -81,7 +81,7 @@ def test_names_that_are_not_in_doubt_survive_noise() -> None:
     before, after = Carriers.of(model), Carriers.of(moved)
     changed = (before.names != after.names).any(axis=1)
     assert changed.mean() == pytest.approx(0.07, rel=0.15)  # 3 numbers, 0.144 / 2 of them to other sixteenths
-    assert changed[after.doubt == 0].mean() < 0.003  # both scales of a ratio changed, 0.07 squared
+    assert changed[after.error_probability == 0].mean() < 0.003  # both scales of a ratio changed, 0.07 squared
 
 
 @pytest.mark.parametrize("scale", [1.0, 1.37, 0.4])
@@ -98,15 +98,15 @@ def test_names_do_not_depend_on_order_or_frame(scale: float) -> None:
 
 def test_one_of_each_name_is_written() -> None:
     carriers = Carriers.of(Gaussians.cat([cover(300)] * 2))
-    names = carriers.names[carriers.own]
+    names = carriers.names[carriers.representatives]
     assert len(np.unique(names, axis=0)) == len(names) == len(np.unique(carriers.names, axis=0))
-    assert (carriers.namesakes >= 2).all()
+    assert (carriers.name_counts >= 2).all()
 
 
 def test_salts_are_new_and_are_found_again_after_rounding_and_pruning() -> None:
     model = cover(6000)
     carriers = Carriers.of(model)
-    first, second = (renewed(carriers, np.random.default_rng(seed)) for seed in (1, 2))
+    first, second = (renew_salts(carriers, np.random.default_rng(seed)) for seed in (1, 2))
     one, other = Salts.of(first), Salts.of(second)
     assert len(one.salts) >= SALTS
     assert len(set(one.salts) & set(other.salts)) <= 2  # 1/49 of 16 are expected
@@ -119,7 +119,7 @@ def test_salts_are_new_and_are_found_again_after_rounding_and_pruning() -> None:
 
 def test_new_salts_leave_each_number_where_it_lies_in_its_cell() -> None:
     carriers = Carriers.of(cover())
-    moved = renewed(carriers, np.random.default_rng(1)).colours - carriers.colours
+    moved = renew_salts(carriers, np.random.default_rng(1)).colours - carriers.colours
     cells = moved * 38.25 / 5
     assert np.abs(cells - cells.round()).max() < 1e-9
     assert 1 <= (moved != 0).any(axis=1).sum() <= SALTS

@@ -3,7 +3,7 @@
 A payload is detected by the variance that writing adds. Per byte, that is least with one bit in each number
 (level `ONE`). So a payload gets as large a share of the carriers as it needs at that level. A payload that
 needs more gets all carriers, and the least level that holds it. A small payload is written only where that
-leaves the model as likely as it was (`likeness`).
+leaves the model as likely as it was (`likelihood`).
 
 A writer leaves some Gaussians alone. Readers need not know which: a number that was left alone reads as lost.
 """
@@ -20,7 +20,7 @@ import numpy as np
 
 from keyss.channels.colours.carriers import Carriers
 from keyss.channels.colours.header import PLACES, SHARES, bucket_bytes
-from keyss.channels.colours.likeness import Likeness
+from keyss.channels.colours.likelihood import Likelihood
 from keyss.channels.colours.qim import COLUMNS, LEVELS, ONE, SPACING, bit_counts
 from keyss.channels.colours.salt_gaussians import SALTS
 from keyss.core.arrays import Doubles, Flags, Floats, Integers, doubles
@@ -105,7 +105,7 @@ class Capacity:
 
     def _psnr(self, level: int) -> float:
         """PSNR in dB that views keep beside a payload in all carriers."""
-        rows = self.carriers.own[~self.alone[self.carriers.own]]
+        rows = self.carriers.representatives[~self.excluded[self.carriers.representatives]]
         bits = bit_counts(self.carriers.impact[rows], level)[:, None]
         places = np.random.default_rng(0).uniform(-0.5, 0.5, (len(rows), COLUMNS))  # in steps
         sh = self.model.sh.detach().clone()
@@ -115,53 +115,53 @@ class Capacity:
 
     def _room(self, level: int, likely: bool = False) -> float:
         """Bytes that all carriers hold, from the information that a reader is expected to get."""
-        rows = self.carriers.own
+        rows = self.carriers.representatives
         if not len(rows):
             return 0.0
-        sure = (1 - _GARBAGE) * (1 - self.carriers.doubt[rows]) / self.carriers.namesakes[rows]
-        chance = ((1 - (self.admission if likely else 1.0) * sure) / 2).clip(1e-12, 0.5)  # of a wrong bit
+        sure = (1 - _GARBAGE) * (1 - self.carriers.error_probability[rows]) / self.carriers.name_counts[rows]
+        chance = ((1 - (self.acceptance if likely else 1.0) * sure) / 2).clip(1e-12, 0.5)  # of a wrong bit
         information = 1 + chance * np.log2(chance) + (1 - chance) * np.log2(1 - chance)
-        bits = COLUMNS * bit_counts(self.carriers.impact[rows], level) * information * ~self.alone[rows]
+        bits = COLUMNS * bit_counts(self.carriers.impact[rows], level) * information * ~self.excluded[rows]
         headers = SALTS * PLACES * (UNNOTICED if level == ONE else 1)
         return float(_RATE * np.exp(-headers / len(rows)) * bits.sum() / 8)
 
     @cached_property
-    def quiet(self) -> Quiet:
-        return Quiet(self.model, self.carriers.rows)
+    def statistics(self) -> ColourStatistics:
+        return ColourStatistics(self.model, self.carriers.rows)
 
     @cached_property
-    def alone(self) -> Flags:
+    def excluded(self) -> Flags:
         """[C] carriers that are left alone."""
-        return self.quiet.alone()
+        return self.statistics.excluded()
 
     @cached_property
-    def likeness(self) -> Likeness:
-        """The likeness of the carriers, for changes as writing makes them."""
+    def likelihood(self) -> Likelihood:
+        """The likelihood of the carriers, for changes as writing makes them."""
         means = np.nan_to_num(doubles(self.model.means)[self.carriers.rows]).clip(-1e15, 1e15)
-        return Likeness.of(self.carriers.colours, means, self._example)
+        return Likelihood.of(self.carriers.colours, means, self._example)
 
     @cached_property
-    def admission(self) -> float:
+    def acceptance(self) -> float:
         """Share of the written numbers that get another value where only likely ones do."""
-        rows = self.carriers.own[~self.alone[self.carriers.own]]
+        rows = self.carriers.representatives[~self.excluded[self.carriers.representatives]]
         if not len(rows):
             return 0.0
         changed = self.carriers.colours.copy()
         changed[rows] = self._example[rows]
-        admitted = self.likeness.admitted(self.carriers.colours, changed, np.random.default_rng(2))
-        return float(admitted[rows].mean())
+        accepted = self.likelihood.accept(self.carriers.colours, changed, np.random.default_rng(2))
+        return float(accepted[rows].mean())
 
     @cached_property
-    def gaps(self) -> bool:
+    def headers_may_skip(self) -> bool:
         """True if headers may do without unlikely numbers: enough of their places are still written."""
-        return self.admission * (1 - float(self.alone[self.carriers.own].mean())) > _WRITTEN
+        return self.acceptance * (1 - float(self.excluded[self.carriers.representatives].mean())) > _WRITTEN
 
     @cached_property
     def _example(self) -> Doubles:
         """[C, 3] colours with noise in green and blue as writing adds it."""
         noise = np.random.default_rng(1).uniform(-SPACING, SPACING, (len(self.carriers), COLUMNS))
         colours = self.carriers.colours
-        return np.hstack([colours[:, :1], self.quiet.fitted(colours[:, 1:] + noise)])
+        return np.hstack([colours[:, :1], self.statistics.imitate(colours[:, 1:] + noise)])
 
 
 def bucket_of(size: int) -> int:
@@ -169,7 +169,7 @@ def bucket_of(size: int) -> int:
     return bisect_left(range(255), size, key=bucket_bytes)
 
 
-class Quiet:
+class ColourStatistics:
     """The constant colours of a model's carriers in `rows` [C], as training or rounding left them."""
 
     def __init__(self, model: Gaussians, rows: Integers) -> None:
@@ -180,7 +180,7 @@ class Quiet:
         self._rounded = bool(len(repeated)) and float(repeated.mean()) > _ROUNDED
         self._colours, self._repeated = colours[rows], repeated[rows].any(axis=1)
 
-    def alone(self) -> Flags:
+    def excluded(self) -> Flags:
         """[C] carriers with a colour that is repeated, typed, or equal in two channels.
 
         None of a rounded model, where all are repeated. Colours that are nearly equal are not left alone:
@@ -193,7 +193,7 @@ class Quiet:
         alone: Flags = self._repeated | typed | grey
         return alone
 
-    def fitted(self, new: Doubles) -> Floats:
+    def imitate(self, new: Doubles) -> Floats:
         """[C, 2] `new` greens and blues as this model would have them; those that are the old ones stay.
 
         In a rounded model: the nearest value that it has, if a reader reads the same from it. In others: with

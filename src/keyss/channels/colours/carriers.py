@@ -8,7 +8,7 @@ these, and none depends on the model's position, rotation, scale or order.
 Borders of cells are borders between rounded values of 8-bit formats (`.spz`: log scales in sixteenths,
 colours in steps of 1 / 38.25; opacities in 255ths nearly everywhere), so that rounding moves no number across
 one. In a model that was scaled, rounded values lie elsewhere: a reader tries several *alignments*.
-`Carriers.doubt` is the chance that a format has moved a number into another cell.
+`Carriers.error_probability` is the chance that a format has moved a number into another cell.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class Carriers:
     opacities: Doubles  # [C]
     colours: Doubles  # [C, 3] constant coefficients
     names: Names  # [C, 4] numbers of cells: ratios of scales, opacity, red
-    doubt: Doubles  # [C] chance that the name has changed since it was written
+    error_probability: Doubles  # [C] chance that the name has changed since it was written
 
     @staticmethod
     def of(model: Gaussians, alignment: float = 0.0) -> Carriers:
@@ -75,15 +75,15 @@ class Carriers:
         return impact
 
     @cached_property
-    def namesakes(self) -> Integers:
+    def name_counts(self) -> Integers:
         """[C] how many carriers have the same name, itself included."""
         _, inverse, counts = np.unique(row_hashes(self.names), return_inverse=True, return_counts=True)
         return counts[inverse].astype(np.int64)
 
     @cached_property
-    def own(self) -> Integers:
+    def representatives(self) -> Integers:
         """[D] the carrier of each name that is least in doubt: only this one is written."""
-        order = np.argsort(self.doubt, kind="stable")
+        order = np.argsort(self.error_probability, kind="stable")
         _, first = np.unique(row_hashes(self.names)[order], return_index=True)
         return np.sort(order[first])
 

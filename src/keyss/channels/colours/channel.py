@@ -42,7 +42,7 @@ from keyss.channels.colours.header import (
     places,
 )
 from keyss.channels.colours.qim import ONE, bit_counts, seeds, write
-from keyss.channels.colours.salt_gaussians import SALTS, Salts, renewed
+from keyss.channels.colours.salt_gaussians import SALTS, Salts, renew_salts
 from keyss.core.arrays import Doubles, Flags
 from keyss.core.errors import KeyssWarning, UsageError
 from keyss.core.gaussians import Gaussians
@@ -98,14 +98,14 @@ class ColoursCover:
 
     @cached_property
     def room(self) -> Room:
-        return Room(len(self.capacity.carriers.own), self.capacity.bytes, _OVERHEAD)
+        return Room(len(self.capacity.carriers.representatives), self.capacity.bytes, _OVERHEAD)
 
     def embed(self, contents: Sequence[tuple[str, Content]], *, entropy: bytes | None = None) -> Gaussians:
         """See `PreparedCover`. Raises UsageError for a model that can carry nothing, too."""
         payloads = [pack_payload(content) for _, content in contents]
         secret = randomness(entropy, *payloads)
         random = np.random.default_rng(np.frombuffer(stream(secret, "colours/random", 32), np.uint32))
-        carriers = renewed(self.capacity.carriers, random)
+        carriers = renew_salts(self.capacity.carriers, random)
         salts = Salts.of(carriers)
         if len(salts.salts) < SALTS:
             raise UsageError(_TOO_FEW)
@@ -119,13 +119,13 @@ class ColoursCover:
             static, *salted = (expand(secret, label, MASTER_BYTES) for label in labels)
             secrets.append(Secrets(static, tuple(salted)))
         free = np.zeros(len(carriers), bool)
-        free[carriers.own] = True
+        free[carriers.representatives] = True
         free[salts.rows] = False
-        draft = _Draft(self.capacity, carriers, free & ~self.capacity.alone)
+        draft = _Draft(self.capacity, carriers, free & ~self.capacity.excluded)
         file_key = expand(secret, "colours/file-key", FILE_KEY_BYTES)
         for lower in range(_LOWER + 1):  # the cost of headers and salts is known only now
             headers = _headers(layouts, sizes, file_key, carriers, lower)
-            stego = draft.written(secrets, headers, [each.likely for each in layouts], payloads, random)
+            stego = draft.write(secrets, headers, [each.likely for each in layouts], payloads, random)
             if layouts[0].level == ONE or psnr_between(self.cover, stego) >= self.capacity.strength:
                 break
         return stego
@@ -165,7 +165,7 @@ class _Draft:
     carriers: Carriers
     free: Flags
 
-    def written(
+    def write(
         self,
         secrets: Sequence[Secrets],
         headers: Sequence[Header],
@@ -186,34 +186,34 @@ class _Draft:
                 holds[places(secret, carriers)[0]] = False
         final = []
         for header, some in zip(headers, likely, strict=True):
-            share = float(holds[header.own(carriers)].mean()) if header.own(carriers).any() else 0.0
-            idle = 1 - share * (self.capacity.admission if some else 1.0)
+            share = float(holds[header.carrier_mask(carriers)].mean()) if header.carrier_mask(carriers).any() else 0.0
+            idle = 1 - share * (self.capacity.acceptance if some else 1.0)
             final.append(replace(header, idle=round(idle / IDLE)))
         for salt in range(SALTS):  # a salt of every secret at a time: later ones find places taken
             for index, each in enumerate(secrets):
                 own = min(index, len(final) - 1)  # a decoy without a payload looks like the last header
                 rows, new = final[own].write(each, salt, carriers)
                 new, rows = new[free[rows]], rows[free[rows]]
-                values[rows], chosen[rows], free[rows] = new, likely[own] and self.capacity.gaps, False
+                values[rows], chosen[rows], free[rows] = new, likely[own] and self.capacity.headers_may_skip, False
         for each, header, some, payload in zip(secrets, final, likely, payloads, strict=False):
-            rows, key = np.flatnonzero(free & header.own(carriers)), each.data_key(header)
+            rows, key = np.flatnonzero(free & header.carrier_mask(carriers)), each.data_key(header)
             encrypted = encrypt(key, payload, ASSOCIATED, size=bucket_bytes(header.bucket))
             names, bits = carriers.names[rows], bit_counts(carriers.impact[rows], header.level)
             data = np.unpackbits(np.frombuffer(encrypted, np.uint8))
             code = Fountain(len(data)).encode(data, seeds(key, "seeds", names, bits))
             values[rows], chosen[rows] = write(key, names, values[rows], bits, code), some
-        return self._with_colours(values, chosen, random)
+        return self._replace_colours(values, chosen, random)
 
-    def _with_colours(self, values: Doubles, chosen: Flags, random: np.random.Generator) -> Gaussians:
+    def _replace_colours(self, values: Doubles, chosen: Flags, random: np.random.Generator) -> Gaussians:
         """The model with other greens and blues [C, 2].
 
         `chosen` [C]: carriers that change only where the new colour is as likely as the old one.
         """
         capacity, old = self.capacity, self.capacity.carriers.colours
-        new = np.hstack([old[:, :1], capacity.quiet.fitted(values)])
+        new = np.hstack([old[:, :1], capacity.statistics.imitate(values)])
         if chosen.any():
             base = np.where(chosen[:, None], old, new)
-            new[:, 1:] = np.where(capacity.likeness.admitted(base, new, random), new[:, 1:], base[:, 1:])
+            new[:, 1:] = np.where(capacity.likelihood.accept(base, new, random), new[:, 1:], base[:, 1:])
         sh = capacity.model.sh.detach().clone()
         rows = torch.from_numpy(self.carriers.rows).to(sh.device)
         sh[rows, 0, 1:] = torch.from_numpy(new[:, 1:]).to(sh)

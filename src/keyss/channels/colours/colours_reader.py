@@ -56,7 +56,7 @@ class ColoursReader:
 
 def _payload(header: Header, secrets: Secrets, carriers: Carriers, shift: float) -> bytes | None:
     """The payload that the header's data key decrypts, or None."""
-    mine = header.own(carriers)
+    mine = header.carrier_mask(carriers)
     for secret in secrets.salted:
         mine[places(secret, carriers)[0]] = False
     rows = np.flatnonzero(mine)
@@ -64,7 +64,7 @@ def _payload(header: Header, secrets: Secrets, carriers: Carriers, shift: float)
     bits = bit_counts(carriers.impact[rows] - shift, header.level)
     if not len(rows) or 8 * size > _MAX_RATE * COLUMNS * bits.sum():
         return None
-    sure = (1 - header.idle * IDLE) * (1 - _CHANGED) * (1 - carriers.doubt[rows]) / carriers.namesakes[rows]
+    sure = (1 - header.idle * IDLE) * (1 - _CHANGED) * (1 - carriers.error_probability[rows]) / carriers.name_counts[rows]
     hints = np.repeat(sure, COLUMNS * bits) * read(key, names, carriers.colours[rows, 1:], bits)
     found = Fountain(8 * size).decode(seeds(key, "seeds", names, bits), hints)
     try:

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from keyss.channels.mixing import mixed
+from keyss.channels.mixing import mix
 from keyss.core.arrays import Bits, Doubles, Integers, Words
 
 # Of 128 code bits, how many are sums of 1, 2, ... intermediate bits: Shokrollahi 2006, table I, k = 65,536.
@@ -79,23 +79,23 @@ class Fountain:
         """[m] members of all code bits, [n] where each code bit's begin, [m] which code bit's each is."""
         length = self.size + self.parity
         every = np.repeat(*np.transpose(self.degrees)).clip(1, length // 4)
-        degrees = every[(mixed(seeds) >> np.uint64(57)).astype(np.int64)]
-        return _drawn(seeds, degrees, length), np.cumsum(degrees) - degrees, _rows(degrees)
+        degrees = every[(mix(seeds) >> np.uint64(57)).astype(np.int64)]
+        return _draw(seeds, degrees, length), np.cumsum(degrees) - degrees, _rows(degrees)
 
     def _checks(self) -> Integers:
         """[parity, k] the data bits that each parity bit is the sum of: every one in _REPEATS of them."""
-        order = np.argsort(mixed(np.arange(_REPEATS * self.size, dtype=np.uint64)), kind="stable") // _REPEATS
+        order = np.argsort(mix(np.arange(_REPEATS * self.size, dtype=np.uint64)), kind="stable") // _REPEATS
         return np.resize(order, (self.parity, -(-len(order) // self.parity)))
 
 
-def _drawn(seeds: Words, degrees: Integers, length: int) -> Integers:
+def _draw(seeds: Words, degrees: Integers, length: int) -> Integers:
     """[m] for each of the seeds [n] as many numbers below `length` as its degree.
 
     A number that is drawn twice cancels itself, in writing as in reading.
     """
     rows = _rows(degrees)
     rank = np.arange(1, len(rows) + 1) - (np.cumsum(degrees) - degrees)[rows]
-    drawn = mixed(seeds[rows] ^ rank.astype(np.uint64) * _RANK) >> np.uint64(32)
+    drawn = mix(seeds[rows] ^ rank.astype(np.uint64) * _RANK) >> np.uint64(32)
     return (drawn * np.uint64(length) >> np.uint64(32)).astype(np.int64)
 
 

@@ -79,7 +79,7 @@ class Header:
     idle: int  # share of its carriers that hold nothing, in units of IDLE
     median: int  # see `median`
 
-    def own(self, carriers: Carriers) -> Flags:
+    def carrier_mask(self, carriers: Carriers) -> Flags:
         """[C] which carriers the payload has, by a hash of their names that holders of keys know."""
         part = np.floor(SHARES * fractions(self.file_key, "partition", carriers.names)[:, 0])
         return (part >= self.first) & (part <= self.last)
@@ -120,7 +120,7 @@ def _read(
     for salt, (secret, (rows, pilots)) in enumerate(zip(secrets.salted, found, strict=True)):
         names, counts = carriers.names[rows], np.full(len(rows), depth)
         known = np.repeat(pilots, COLUMNS * depth)
-        sure = np.repeat(_HELD * (1 - carriers.doubt[rows]) / carriers.namesakes[rows], COLUMNS * depth)
+        sure = np.repeat(_HELD * (1 - carriers.error_probability[rows]) / carriers.name_counts[rows], COLUMNS * depth)
         every = sure * read(secret, names, carriers.colours[rows, 1:], counts)
         odds.append(_PRIOR + np.log1p(every[known]).sum())
         hints.append(every[~known])

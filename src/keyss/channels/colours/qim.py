@@ -13,7 +13,7 @@ import math
 import numpy as np
 
 from keyss.channels.colours.carriers import Names, fractions, random_pairs
-from keyss.channels.mixing import mixed
+from keyss.channels.mixing import mix
 from keyss.core.arrays import Bits, Doubles, Flags, Integers, Words
 
 COLUMNS = 2  # numbers of a Gaussian that are written
@@ -39,13 +39,13 @@ def bit_counts(impact: Doubles, level: int) -> Integers:
 
 def seeds(secret: bytes, label: str, names: Names, bits: Integers) -> Words:
     """[B] the seeds of all bits of Gaussians with these names, for `Fountain`; `bits` [C]: of each number."""
-    order = mixed(np.arange(COLUMNS * MAX_BITS, dtype=np.uint64)).reshape(COLUMNS, MAX_BITS)
-    return mixed(random_pairs(secret, label, names)[:, :1, None] ^ order)[_carried(bits)]
+    order = mix(np.arange(COLUMNS * MAX_BITS, dtype=np.uint64)).reshape(COLUMNS, MAX_BITS)
+    return mix(random_pairs(secret, label, names)[:, :1, None] ^ order)[_bit_mask(bits)]
 
 
 def write(secret: bytes, names: Names, values: Doubles, bits: Integers, code: Bits) -> Doubles:
     """[C, 2] new `values` of carriers that hold the bits `code` [B], `bits` [C] in each number."""
-    carried, step = _carried(bits), 2.0 ** bits[:, None]
+    carried, step = _bit_mask(bits), 2.0 ** bits[:, None]
     gray = np.zeros(carried.shape, np.uint8)
     gray[carried] = code
     weights = 2.0 ** (bits[:, None, None] - 1 - np.arange(MAX_BITS))
@@ -65,10 +65,10 @@ def read(secret: bytes, names: Names, values: Doubles, bits: Integers) -> Double
     shifts = (bits[:, None] - 1 - np.arange(MAX_BITS)).clip(0)[:, None, None]
     signs = 1 - 2 * ((label ^ label >> 1)[..., None] >> shifts & 1)  # [C, 2, points, bits]
     hints: Doubles = (weight[..., None] * signs).sum(axis=2) / weight.sum(axis=2)[..., None]
-    return hints[_carried(bits)]
+    return hints[_bit_mask(bits)]
 
 
-def _carried(bits: Integers) -> Flags:
+def _bit_mask(bits: Integers) -> Flags:
     """[C, COLUMNS, MAX_BITS] which bits there are."""
     carried: Flags = np.arange(MAX_BITS) < bits[:, None, None]
     return np.repeat(carried, COLUMNS, axis=1)

@@ -67,7 +67,7 @@ class Salts:
         return Salts(rows, list(dict.fromkeys(salts)))
 
 
-def renewed(carriers: Carriers, random: np.random.Generator) -> Carriers:
+def renew_salts(carriers: Carriers, random: np.random.Generator) -> Carriers:
     """The carriers with another green and blue of listed ones, so that all salts are new."""
     rows, colours = Salts.of(carriers).rows, carriers.colours.copy()
     cells = random.integers(-_MAX_MOVED, _MAX_MOVED + 1, (len(rows), 2))

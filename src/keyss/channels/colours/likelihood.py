@@ -29,14 +29,14 @@ _BATCHES = 16  # of numbers that are decided at a time, as if none were another'
 
 
 @dataclass(frozen=True)
-class Likeness:
+class Likelihood:
     """How likely changes of one kind are in the colours [N, 3] of a model."""
 
     pairs: tuple[Integers, ...]  # [P, 2] in both directions: nearest in space, further ones, next in the file
     weights: tuple[Doubles, ...]  # [F] of the logarithm of p, of green and of blue
 
     @staticmethod
-    def of(colours: Doubles, positions: Doubles, example: Doubles) -> Likeness:
+    def of(colours: Doubles, positions: Doubles, example: Doubles) -> Likelihood:
         """`colours`, `positions` [N, 3], finite, N above 1.
 
         `example` [N, 3]: the colours with changes of this kind in greens and blues.
@@ -46,13 +46,13 @@ class Likeness:
         further = near[:, 2:].ravel()
         ends = ((row, near[:, 1]), (np.repeat(row, near.shape[1] - 2), further), (row[1:], row[:-1]))
         pairs = tuple(_both_ways(*each) for each in ends)
-        weights = tuple(_learned(pairs, colours, column, example[:, column]) for column in (1, 2))
-        return Likeness(pairs, weights)
+        weights = tuple(_fit_weights(pairs, colours, column, example[:, column]) for column in (1, 2))
+        return Likelihood(pairs, weights)
 
-    def admitted(self, colours: Doubles, new: Doubles, random: np.random.Generator) -> Flags:
+    def accept(self, colours: Doubles, new: Doubles, random: np.random.Generator) -> Flags:
         """[N, 2] which greens and blues get the value in `new` [N, 3], one after the other."""
         colours, changed = colours.copy(), new != colours
-        admitted = np.zeros((len(colours), 2), bool)
+        accepted = np.zeros((len(colours), 2), bool)
         batch = random.integers(0, _BATCHES, len(colours))
         for index in range(_BATCHES):
             for column, weights in enumerate(self.weights, start=1):
@@ -64,8 +64,8 @@ class Likeness:
                 ratio = (after - before) @ weights  # log of p(new) / p(old)
                 fine = rows[np.log(random.uniform(1e-300, 1, len(rows))) < ratio]
                 colours[fine, column] = new[fine, column]
-                admitted[fine, column - 1] = True
-        return admitted
+                accepted[fine, column - 1] = True
+        return accepted
 
 
 def _both_ways(one: Integers, other: Integers) -> Integers:
@@ -96,7 +96,7 @@ def _logs(apart: Doubles) -> list[Doubles]:
     return [np.log(apart * apart + size * size) / 2 for size in _SIZES]
 
 
-def _learned(every: Sequence[Integers], colours: Doubles, column: int, example: Doubles) -> Doubles:
+def _fit_weights(every: Sequence[Integers], colours: Doubles, column: int, example: Doubles) -> Doubles:
     """[F] weights of a logistic regression that tells the colours from the example."""
     rows = np.random.default_rng(0).permutation(len(colours))[:_LEARNED_FROM]
     true, changed = (
