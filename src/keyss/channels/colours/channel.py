@@ -27,7 +27,7 @@ from keyss.channels.base import (
     pack_payload,
     randomness,
 )
-from keyss.channels.colours.capacity import UNNOTICED, Capacity, Layout, bucket_of
+from keyss.channels.colours.capacity import MIN_HEADERS, Capacity, Layout, bucket_of
 from keyss.channels.colours.carriers import Carriers
 from keyss.channels.colours.colours_reader import ASSOCIATED
 from keyss.channels.colours.fountain import Fountain
@@ -114,7 +114,7 @@ class ColoursCover:
         sizes = [compressed_size(payload) + OVERHEAD for payload in payloads]
         layouts = self._layouts(sizes)
         # With more than one bit in a number, another secret would be noticed.
-        for index in range(len(secrets), UNNOTICED if layouts[0].level == ONE else 0):  # of nobody
+        for index in range(len(secrets), MIN_HEADERS if layouts[0].level == ONE else 0):  # of nobody
             labels = [f"colours/nobody/{index}/{each}" for each in range(SALTS + 1)]
             static, *salted = (expand(secret, label, MASTER_BYTES) for label in labels)
             secrets.append(Secrets(static, tuple(salted)))

@@ -18,7 +18,7 @@ import numpy as np
 from keyss.channels.mixing import mix
 from keyss.core.arrays import Bits, Doubles, Integers, Words
 
-# Degree distribution, (degree, code bits of 128): Shokrollahi 2006, table I, k = 65,536.
+# Degree distribution as (degree, count per 128 code bits): Shokrollahi 2006, table I, k = 65,536.
 _RAPTOR = ((1, 3), (2, 62), (3, 21), (4, 9), (5, 10), (8, 7), (9, 5), (19, 7), (65, 4))
 # The same for a few hundred data bits if most code bits are lost or wrong; found by experiment.
 NOISY = ((1, 19), (2, 64), (3, 32), (4, 13))

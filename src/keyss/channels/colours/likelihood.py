@@ -1,14 +1,13 @@
-"""Which changes of colour leave a model as training might have left it.
+"""Accept changes of colour so that the distribution of colours stays the same.
 
-Colours are not independent: neighbours in space, Gaussians that were split from one, and the channels of a
-grey one differ by little. Noise shows where they differ least. So a number gets its new value with the
-probability of Metropolis (1953), p(new) / p(old) if that is less than one, and keeps the old one otherwise:
-this leaves the distribution p as it was. Readers need not know: a number that kept its value reads as lost.
+Colours are correlated: neighbours in space, Gaussians split from one parent, and the channels of a grey
+Gaussian differ by little, so noise is easy to detect there. A value therefore changes with the Metropolis
+(1953) probability min(1, p(new) / p(old)), which leaves the distribution p invariant. Readers need not know
+which values changed: an unchanged one reads as lost.
 
-The ratio p(new) / p(old) is learned from the model itself by logistic regression on the difference between
-the model and the same model with changes (noise-contrastive estimation, Gutmann and Hyvärinen 2010). Features
-are logarithms of distances in colour, softened at several sizes, which sum to the heavy tails of such
-differences.
+Logistic regression between the model and a copy with such changes learns p(new) / p(old)
+(noise-contrastive estimation, Gutmann and Hyvärinen 2010). Features are logarithms of colour distances,
+softened at several sizes; their sums model the heavy tails of such differences.
 """
 
 from __future__ import annotations
@@ -22,24 +21,24 @@ from keyss.core.arrays import Doubles, Flags, Integers
 from keyss.core.neighbours import nearest_neighbours
 
 _NEIGHBOURS = 3  # in space
-_SIZES = (3e-6, 3e-4, 0.002, 0.008, 0.03, 0.12)  # of differences in colour, below which all count as the same
-_LEARNED_FROM = 5_000  # Gaussians
-_RIDGE, _STEPS = 3.0, 8  # of Newton's method
-_BATCHES = 16  # of numbers that are decided at a time, as if none were another's neighbour
+_SIZES = (3e-6, 3e-4, 0.002, 0.008, 0.03, 0.12)  # colour differences at which the logarithm levels off
+_SAMPLE = 5_000  # Gaussians for the regression
+_RIDGE, _STEPS = 3.0, 8  # penalty; steps of Newton's method
+_BATCHES = 16  # values in one batch are decided as if none were neighbours
 
 
 @dataclass(frozen=True)
 class Likelihood:
-    """How likely changes of one kind are in the colours [N, 3] of a model."""
+    """A model of log p for changes of one kind in colours [N, 3]."""
 
-    pairs: tuple[Integers, ...]  # [P, 2] in both directions: nearest in space, further ones, next in the file
-    weights: tuple[Doubles, ...]  # [F] of the logarithm of p, of green and of blue
+    pairs: tuple[Integers, ...]  # [P, 2] in both directions: nearest in space, others in space, next in file
+    weights: tuple[Doubles, ...]  # [F] for green and for blue
 
     @staticmethod
     def of(colours: Doubles, positions: Doubles, example: Doubles) -> Likelihood:
-        """`colours`, `positions` [N, 3], finite, N above 1.
+        """Learn from finite `colours` and `positions` [N, 3], N above 1.
 
-        `example` [N, 3]: the colours with changes of this kind in greens and blues.
+        `example` [N, 3]: the colours with such changes in green and blue.
         """
         count = len(colours)
         row, near = np.arange(count), nearest_neighbours(positions, min(_NEIGHBOURS + 1, count))[1]
@@ -50,7 +49,7 @@ class Likelihood:
         return Likelihood(pairs, weights)
 
     def accept(self, colours: Doubles, new: Doubles, random: np.random.Generator) -> Flags:
-        """[N, 2] which greens and blues get the value in `new` [N, 3], one after the other."""
+        """Mask [N, 2] of the greens and blues that take their value in `new` [N, 3], decided in sequence."""
         colours, changed = colours.copy(), new != colours
         accepted = np.zeros((len(colours), 2), bool)
         batch = random.integers(0, _BATCHES, len(colours))
@@ -69,7 +68,7 @@ class Likelihood:
 
 
 def _both_ways(one: Integers, other: Integers) -> Integers:
-    """[P, 2] each pair of different Gaussians once in each direction."""
+    """Pairs [P, 2] of different Gaussians, each once per direction."""
     both = np.concatenate([np.stack([one, other], axis=1), np.stack([other, one], axis=1)])
     return np.unique(both[both[:, 0] != both[:, 1]], axis=0).astype(np.int64)
 
@@ -77,38 +76,38 @@ def _both_ways(one: Integers, other: Integers) -> Integers:
 def _features(
     every: Sequence[Integers], colours: Doubles, rows: Integers, column: int, values: Doubles
 ) -> Doubles:
-    """[R, F] of rows [R] whose number in this column is `values` [R]."""
+    """Features [R, F] of `rows` [R] with `values` [R] in `column`."""
     others, place = (0, 3 - column), np.full(len(colours), -1)
     place[rows] = np.arange(len(rows))
     features = [_logs(values - colours[rows, other]) for other in others]
     for pairs in every:
         which, other = place[pairs[:, 0]], pairs[:, 1]
         which, other = which[which >= 0], other[which >= 0]
-        apart = values[which] - colours[other, column]
-        inside = [apart - (colours[rows[which], each] - colours[other, each]) for each in others]
-        for difference in (apart, *inside):
-            sums = [np.bincount(which, each, len(rows)) for each in _logs(difference)]
+        difference = values[which] - colours[other, column]
+        inside = [difference - (colours[rows[which], each] - colours[other, each]) for each in others]
+        for apart in (difference, *inside):
+            sums = [np.bincount(which, each, len(rows)) for each in _logs(apart)]
             features.append([each.astype(np.float64) for each in sums])
     return np.concatenate(features).T
 
 
-def _logs(apart: Doubles) -> list[Doubles]:
-    return [np.log(apart * apart + size * size) / 2 for size in _SIZES]
+def _logs(difference: Doubles) -> list[Doubles]:
+    return [np.log(difference * difference + size * size) / 2 for size in _SIZES]
 
 
 def _fit_weights(every: Sequence[Integers], colours: Doubles, column: int, example: Doubles) -> Doubles:
-    """[F] weights of a logistic regression that tells the colours from the example."""
-    rows = np.random.default_rng(0).permutation(len(colours))[:_LEARNED_FROM]
+    """Weights [F] of a logistic regression between the colours and the example."""
+    rows = np.random.default_rng(0).permutation(len(colours))[:_SAMPLE]
     true, changed = (
         _features(every, colours, rows, column, each[rows]) for each in (colours[:, column], example)
     )
-    apart = true - changed
-    spread = apart.std(axis=0) + 1e-9
-    apart /= spread
-    weights = np.zeros(apart.shape[1])
+    difference = true - changed
+    spread = difference.std(axis=0) + 1e-9
+    difference /= spread
+    weights = np.zeros(difference.shape[1])
     for _ in range(_STEPS):
-        doubt = 1 / (1 + np.exp((apart @ weights).clip(-50, 50)))
-        bent = (apart * (doubt * (1 - doubt))[:, None]).T @ apart + _RIDGE * np.eye(len(weights))
-        weights += np.linalg.solve(bent, apart.T @ doubt - _RIDGE * weights)
+        error = 1 / (1 + np.exp((difference @ weights).clip(-50, 50)))
+        hessian = (difference * (error * (1 - error))[:, None]).T @ difference + _RIDGE * np.eye(len(weights))
+        weights += np.linalg.solve(hessian, difference.T @ error - _RIDGE * weights)
     found: Doubles = weights / spread
     return found
