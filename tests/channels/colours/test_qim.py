@@ -81,7 +81,7 @@ def test_names_that_are_not_in_doubt_survive_noise() -> None:
     before, after = Carriers.of(model), Carriers.of(moved)
     changed = (before.names != after.names).any(axis=1)
     assert changed.mean() == pytest.approx(0.07, rel=0.15)  # 3 numbers, 0.144 / 2 of them to other sixteenths
-    assert changed[after.error_probability == 0].mean() < 0.003  # both scales of a ratio changed, 0.07 squared
+    assert changed[after.error_probability == 0].mean() < 0.003  # both scales of a ratio change: 0.07^2
 
 
 @pytest.mark.parametrize("scale", [1.0, 1.37, 0.4])

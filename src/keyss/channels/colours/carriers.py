@@ -101,7 +101,7 @@ def fractions(secret: bytes, label: str, names: Names) -> Doubles:
 
 
 def cells_of(values: Doubles, steps: int, noise: float) -> tuple[Doubles, Doubles]:
-    """Cells of `steps` steps for values [C, k] in steps, and the probabilities that noise changed the cell."""
+    """Cells of `steps` steps for values [C, k] in steps; probabilities that noise changed the cell."""
     cells = np.floor(values / steps)
     inside = values - cells * steps
     nearest = np.minimum(inside, steps - inside)

@@ -2,8 +2,8 @@
 
 A Raptor code (Shokrollahi 2006) for noisy channels (Etesami and Shokrollahi 2006). The *intermediate* bits
 are the data bits and parity bits, which are sums of many data bits. Every *code bit* is the sum of a few
-intermediate bits, chosen by a 64-bit seed that writer and reader know, so code bits need no index. Decoding is
-belief propagation.
+intermediate bits, chosen by a 64-bit seed that writer and reader know, so code bits need no index. The
+decoder is belief propagation.
 
 Reed-Solomon needs a position for every symbol. A hash of names fills a position with no Gaussian or with
 several, so Reed-Solomon holds a fifth to a half as much at equal losses (`benchmarks/colours_code.py`).
@@ -76,7 +76,7 @@ class Fountain:
         return (total[: self.size] < 0).astype(np.uint8)
 
     def _equations(self, seeds: Words) -> tuple[Integers, Integers, Integers]:
-        """Members [m] of all code bits, the first index [n] of each code bit, and the code bit [m] of each."""
+        """Members [m] of all code bits; start [n] of each code bit's members; code bit [m] of each member."""
         length = self.size + self.parity
         every = np.repeat(*np.transpose(self.degrees)).clip(1, length // 4)
         degrees = every[(mix(seeds) >> np.uint64(57)).astype(np.int64)]

@@ -1,9 +1,9 @@
 """Dithered quantisation index modulation (Chen and Wornell 2001) with soft decisions.
 
 A value that carries b bits moves to the nearest point of one of 2^b lattices of step 2^b x SPACING. The
-lattices are SPACING apart and share a *dither*, an offset derived from key and name. Without the key, the
-change is therefore independent noise, uniform over one step, of variance step^2 / 12, and no value is likelier
-than another.
+lattices are SPACING apart and share a *dither*, an offset derived from key and name. To others, the change is
+therefore independent noise, uniform over one step, of variance step^2 / 12, and no value is likelier than
+another.
 """
 
 from __future__ import annotations
