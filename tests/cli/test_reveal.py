@@ -66,7 +66,7 @@ def test_implausible_gaussian_count(keyss: Run, files: Path, tmp_path: Path) -> 
     write_model(tmp_path / "stego.spz", CodesCover.of(codes_of(".spz")).embed([(KEY, hostile)]))
     for command, *out in (("reveal", "-o", tmp_path / "s.ply"), ("verify",)):
         result = keyss(command, tmp_path / "stego.spz", "--key-file", files / "key", *out)
-        assert_refused(result, 4, "announces 131,072 Gaussians, more than")
+        assert_refused(result, 4, "declares 131,072 Gaussians, more than")
 
 
 class TestCounts:
