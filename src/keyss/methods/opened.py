@@ -91,7 +91,7 @@ class HiddenFile:
         """Read a payload. Raises InputError for other content and damage."""
         if content.method != FILE or not isinstance(content, Payload):
             raise InputError(
-                "this key opens a scene, not a file: name the output like a model, e.g. secret.ply"
+                "this key opens a scene, not a file: give a model as output, e.g. secret.ply"
             )
         size = content.data[0] if content.data else 0
         name, data = content.data[1 : 1 + size], content.data[1 + size :]
