@@ -1,6 +1,6 @@
 /**
  * Words of 84 bits in faint Gaussians, read after a format has rounded them (docs/channels.md); counterpart of
- * `keyss.channels.appended.lattice`.
+ * `keyss.channels.appended.words`.
  */
 import { COLUMNS, type Gaussians, opacity, where, withDegree } from '../../core/gaussians.ts';
 import { moved, type Similarity } from '../../core/similarity.ts';

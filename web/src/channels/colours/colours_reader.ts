@@ -1,4 +1,4 @@
-/** Reader of colours (docs/channels.md); counterpart of `keyss.channels.colours.reading`. */
+/** Reader of colours (docs/channels.md); counterpart of `keyss.channels.colours.colours_reader`. */
 import { ascii } from '../../core/bytes.ts';
 import { InputError, tooMuchLost } from '../../core/errors.ts';
 import type { Gaussians } from '../../core/gaussians.ts';

@@ -1,4 +1,4 @@
-/** Dithered quantisation index modulation with soft decisions; counterpart of `keyss.channels.colours.lattice`. */
+/** Dithered quantisation index modulation with soft decisions; counterpart of `keyss.channels.colours.qim`. */
 import { mix, type Words } from '../../core/words.ts';
 import { type Carriers, fractions, randomPairs } from './carriers.ts';
 

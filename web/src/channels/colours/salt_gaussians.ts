@@ -1,4 +1,4 @@
-/** Salts of Argon2id derived from Gaussians; counterpart of `keyss.channels.colours.salts`. */
+/** Salts of Argon2id derived from Gaussians; counterpart of `keyss.channels.colours.salt_gaussians`. */
 import { sha256 } from '@noble/hashes/sha2.js';
 import { ascii, bytesKey, joined } from '../../core/bytes.ts';
 import { SALT_BYTES } from '../../keys/keys.ts';
