@@ -90,9 +90,7 @@ class HiddenFile:
     def of(content: Content) -> HiddenFile:
         """Read a payload. Raises InputError for other content and damage."""
         if content.method != FILE or not isinstance(content, Payload):
-            raise InputError(
-                "this key opens a scene, not a file: give a model as output, e.g. secret.ply"
-            )
+            raise InputError("this key opens a scene, not a file: give a model as output, e.g. secret.ply")
         size = content.data[0] if content.data else 0
         name, data = content.data[1 : 1 + size], content.data[1 + size :]
         if not content.data or len(name) < size:
