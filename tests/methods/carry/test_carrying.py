@@ -79,9 +79,9 @@ def test_sh_degrees(cover_degree: int, secret_degree: int) -> None:
     assert len(carried.gaussians) == 900
 
 
-def test_every_usable_gaussian_is_written(cover: Gaussians) -> None:
+def test_every_usable_gaussian_is_written() -> None:
     """The holder of one key sees the same whatever else is hidden."""
-    own, other = keys(1), keys(2)
+    cover, own, other = trained_like(4000), keys(1), keys(2)
     hidden = [trained_like(700, 5), trained_like(800, 6)]
     before = read_low_bits(cover)
     seen = []
