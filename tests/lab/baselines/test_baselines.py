@@ -105,7 +105,7 @@ def test_command_line(keyss: Run, made: Made, tmp_path: Path) -> None:
     assert f"{made.result.metrics.secrets[0].psnr:.2f}" in said.out
     assert made.name in keyss("info", made.out).out
     stego = stego_in(made.out)
-    assert_refused(keyss("reveal", stego, "--handed", stego, "-o", tmp_path / "b.ply"), 4, "handed over")
+    assert_refused(keyss("reveal", stego, "--handed", stego, "-o", tmp_path / "b.ply"), 4, "`.keyss` file")
 
 
 def test_invalid_arguments(folders: tuple[Path, Path]) -> None:
