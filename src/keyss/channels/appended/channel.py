@@ -11,9 +11,10 @@ secrets are nor how many.
 from __future__ import annotations
 
 import math
+import struct
 import warnings
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -47,9 +48,11 @@ from keyss.channels.base import (
     randomness,
     unpack_payload,
 )
+from keyss.channels.colours.carriers import Carriers
 from keyss.channels.reed_solomon import Codewords
-from keyss.core.arrays import Bits, Doubles, Integers
-from keyss.core.errors import KeyssWarning, UsageError, WrongKeyError
+from keyss.channels.sketch import foreign, sketch
+from keyss.core.arrays import Bits, Bytes, Doubles, Integers
+from keyss.core.errors import InputError, KeyssWarning, UsageError, WrongKeyError
 from keyss.core.gaussians import Gaussians
 from keyss.keys.derivation import SALT_BYTES, DerivedKey, expand, stream
 from keyss.keys.encryption import OVERHEAD, bucket, compressed_size, decrypt, encrypt
@@ -60,14 +63,18 @@ _LEFT, _DEVIATIONS, _MAX_DATA = 0.74, 4.2, 5895
 # Bytes of a packet: the longer its tag, the fewer words of others pass for packets.
 _WIDE, _NARROW, _WIDE_PACKETS = 8, 6, 90_000
 _MAX_PACKETS = 1_000_000  # of data; a header tells up to 2^20
-MAX_BYTES = _MAX_PACKETS * _NARROW - OVERHEAD - METHOD_BYTES
 _STEP = 256  # Gaussians by which small numbers of appended ones differ
-_OVERHEAD = 128  # bytes of a payload beside its data, at most
+_OVERHEAD = 260  # bytes of a payload beside its data, at most
 
 # Gaussians in which pilots are counted; places of the lattice that are tried then, with so many deviations
 # more of them than by chance.
 _SAMPLE, _TRIED, _NOT_BY_CHANCE = 8000, 8, 3.0
 _ASSOCIATED = b"keyss/v1/appended/data"
+# The cover: how many of its Gaussians are seen, and their sketch. A format changes up to a fifth of names;
+# another model of the same scene shares two fifths of them, one of another scene a tenth.
+_SKETCH_BYTES, _FOREIGN = 128, 0.4
+_HOST = struct.Struct(f"<I{_SKETCH_BYTES}s")
+MAX_BYTES = _MAX_PACKETS * _NARROW - OVERHEAD - METHOD_BYTES - _HOST.size
 _NOTICED = (
     "the number of appended Gaussians tells how much is hidden in all: whoever holds one of the keys sees "
     "that there are other secrets"
@@ -93,7 +100,8 @@ class Appended(Channel):
     def appended(self, sizes: Sequence[int]) -> int:
         """Gaussians that payloads of so many compressed bytes take together."""
         alone = len(sizes) == 1
-        return _padded(sum(packets.HEADERS + _codewords_for(size, alone).chunks for size in sizes))
+        every = [_codewords_for(size + _HOST.size, alone) for size in sizes]
+        return _padded(sum(packets.HEADERS + each.chunks for each in every))
 
 
 APPENDED = Appended()
@@ -111,6 +119,8 @@ class AppendedCover:
 
     def embed(self, contents: Sequence[tuple[str, Content]], *, entropy: bytes | None = None) -> Gaussians:
         """The cover with Gaussians after its own. Warns where there is more than one secret."""
+        model = self.cover.detach().to("cpu")
+        names = _names(model)
         packed = [pack_payload(content) for _, content in contents]
         secret = randomness(entropy, *packed)
         salt = expand(secret, "appended/salt", SALT_BYTES)
@@ -120,14 +130,15 @@ class AppendedCover:
         if len(keys) > 1:
             warnings.warn(_NOTICED, KeyssWarning, stacklevel=2)
         alone = len(keys) == 1
-        words = [_words(*each, alone, random) for each in zip(keys, packed, strict=True)]
+        bound = [_HOST.pack(len(names), sketch(_sketch_key(key), names, _SKETCH_BYTES)) for key in keys]
+        tied = [host + data for host, data in zip(bound, packed, strict=True)]
+        words = [_words(*each, alone, random) for each in zip(keys, tied, strict=True)]
         used = sum(map(len, words))
         total = _padded(used)
         words.append(pilots.write(salt, pilots.count_for(total), random))
         rest = total - used - pilots.count_for(total)
         words.append(random.integers(0, 2, (rest, WORD_BITS), np.uint8))
         every = in_order(np.concatenate(words))
-        model = self.cover.detach().to("cpu")
         return Gaussians.cat([model, to_gaussians(every, own_frame(model), model.sh_degree)])
 
 
@@ -137,6 +148,7 @@ class AppendedReader(SaltedReader):
 
     salts: Sequence[bytes]
     words: Bits
+    names: Bytes  # [M, 16] of the Gaussians that are seen
 
     @staticmethod
     def of(model: Gaussians) -> AppendedReader | None:
@@ -157,7 +169,7 @@ class AppendedReader(SaltedReader):
             if best is not None:
                 found, scales = best
                 words = joined(colours, scales, in_own_frame(faint, found.to_own))
-                return AppendedReader([found.salt], words)
+                return AppendedReader([found.salt], words, _names(model))
         return None
 
     def extract(self, key: DerivedKey) -> Payload:
@@ -167,8 +179,23 @@ class AppendedReader(SaltedReader):
             if header:
                 numbers, data = packets.read(key.expand("appended/packets", 32), self.words, width)
                 encrypted = _codewords(header, width).decode(numbers.astype(np.int64), data, errors=True)
-                return unpack_payload(decrypt(key.expand("appended/data", 32), encrypted, _ASSOCIATED))
+                whole = decrypt(key.expand("appended/data", 32), encrypted, _ASSOCIATED)
+                if len(whole) < _HOST.size:
+                    raise InputError("the hidden data are damaged: they are incomplete")
+                strangers = foreign(_sketch_key(key), self.names, *reversed(_HOST.unpack_from(whole)))
+                told = strangers if strangers > _FOREIGN * len(self.names) else 0
+                return replace(unpack_payload(whole[_HOST.size :]), foreign=told)
         raise WrongKeyError()
+
+
+def _names(model: Gaussians) -> Bytes:
+    """[M, 16] of the Gaussians that are seen, coarse numbers that hardly any format or motion changes."""
+    names = Carriers.of(model).names
+    return np.hstack([names, np.zeros_like(names)]).astype("<i2").view(np.uint8)
+
+
+def _sketch_key(key: DerivedKey) -> bytes:
+    return key.expand("appended/host", 32)
 
 
 def _padded(used: int) -> int:
