@@ -15,6 +15,8 @@ import msgspec
 import numpy as np
 import pytest
 import torch
+from numpy.lib.recfunctions import unstructured_to_structured
+from plyfile import PlyData, PlyElement
 
 import keyss
 from keyss import CarryOptions, FitConfig, Secret
@@ -29,29 +31,45 @@ CONFIG = CarryOptions(
 ANY = replace(CONFIG, publish="any")  # so small a cover has no room
 
 
-def write_nerfstudio(folder: Path, scene: Scene) -> Path:
-    """Write a scene in Nerfstudio's layout."""
+def write_nerfstudio(
+    folder: Path,
+    scene: Scene,
+    *,
+    scale: float = 1.0,
+    rotation: np.ndarray | None = None,
+    shift: tuple[float, ...] = (0.0, 0.0, 0.0),
+    points: bool = False,
+) -> Path:
+    """Write a scene in Nerfstudio's layout, transformed in double precision."""
     (folder / "images").mkdir(parents=True)
+    rotation = np.eye(3) if rotation is None else rotation
     flip = np.diag([1.0, -1.0, -1.0, 1.0])
     frames = []
     for view in sorted(scene.views, key=lambda view: view.camera.name):
         camera = view.camera
         cv2.imwrite(str(folder / "images" / camera.name), view.image.numpy()[:, :, ::-1])
-        pose = np.linalg.inv(camera.viewmat.double().numpy()) @ flip
-        frames.append({"file_path": f"images/{camera.name}", "transform_matrix": pose.tolist()})
+        pose = np.linalg.inv(camera.viewmat.double().numpy())
+        pose[:3, :3] = rotation @ pose[:3, :3]
+        pose[:3, 3] = scale * rotation @ pose[:3, 3] + shift
+        frames.append({"file_path": f"images/{camera.name}", "transform_matrix": (pose @ flip).tolist()})
     K = scene.train[0].camera.K
     intrinsics = {"fl_x": float(K[0, 0]), "fl_y": float(K[1, 1]), "cx": float(K[0, 2]), "cy": float(K[1, 2])}
     data = {"w": WIDTH, "h": HEIGHT, **intrinsics, "frames": frames}
+    if points:
+        data["ply_file_path"] = "points.ply"
+        moved = scale * scene.points.double().numpy() @ rotation.T + shift
+        rows = unstructured_to_structured(moved, names=list("xyz"))
+        PlyData([PlyElement.describe(rows, "vertex")]).write(str(folder / "points.ply"))
     (folder / "transforms.json").write_text(json.dumps(data))
     return folder
 
 
-def psnr_of_pictures(model: Path, scene: Path) -> float:
-    """Mean over the test views of a scene."""
-    pictures = dict(keyss.render(model, scene))
+def psnr_of_pictures(model: Path, scene: Path, width: int | None = None) -> float:
+    """Mean over the test views of a scene, independent of keyss's measures."""
+    pictures = dict(keyss.render(model, scene, width=width))
     errors = [
         (pictures[view.camera.name.replace("/", "_")].float() - view.image.float()).square().mean() / 255**2
-        for view in keyss.load_scene(scene).test
+        for view in keyss.load_scene(scene, width=width).test
     ]
     return float(-10 * torch.stack(errors).log10().mean())
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from channels.quiet.trained_like import trained_like
-from files.scene_files import write_blender, write_nerfstudio
+from cli.harness import SMALL, write_workspace
 from keyss.channels import QuietReader
 from keyss.cli import command_table, entry, main
 from keyss.core import KeyssError
@@ -42,14 +42,6 @@ class _InterruptHiding(Reporter):
             os.kill(os.getpid(), signal.SIGINT)
 
 
-@pytest.fixture
-def folder(tmp_path: Path) -> Path:
-    write_blender(tmp_path / "a", count=3, channels=3)
-    write_nerfstudio(tmp_path / "b", count=4)
-    (tmp_path / "key.txt").write_text(KEY)
-    return tmp_path
-
-
 def _contains_key(data: bytes) -> bool:
     return any(spelling.lower() in data.lower() for spelling in SPELLINGS)
 
@@ -59,29 +51,29 @@ def _files(folder: Path) -> Iterator[Path]:
 
 
 def test_key_is_never_written_or_printed(
-    folder: Path,
+    tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
     caplog: pytest.LogCaptureFixture,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     caplog.set_level(logging.DEBUG)
     monkeypatch.setattr("sys.stdin", io.StringIO())
+    folder = write_workspace(tmp_path)
     run, key = folder / "run", ["--key-file", str(folder / "key.txt")]
     (folder / "key.txt").chmod(0o644)  # triggers a warning
     scenes = ["--cover", str(folder / "a"), "--secret", str(folder / "b"), "--publish", "any", "-o", str(run)]
-    size = ["--preset", "quick", "--iterations", "20", "--max-gaussians", "100", "--device", "cpu"]
     with monkeypatch.context() as patch:
         patch.setattr("keyss.cli.reporting.lines", _InterruptHiding)
-        assert main(["hide", *scenes, *key, *size]) == 130
+        assert main(["hide", *scenes, *key, *SMALL]) == 130
     checkpoints = list(_files(run / "private" / "checkpoint"))
     assert len(checkpoints) >= 2
     assert not any(_contains_key(path.read_bytes()) for path in checkpoints)
 
     (folder / "other.txt").write_text("another-key-for-7Qx2\n")
     other = ["--key-file", str(folder / "other.txt")]
-    assert main(["hide", *scenes, *other, *size, "--resume"]) == 5
+    assert main(["hide", *scenes, *other, *SMALL, "--resume"]) == 5
     assert "other arguments (keys: not the same)" in capsys.readouterr().err
-    assert main(["hide", *scenes, *key, *size, "--resume"]) == 0
+    assert main(["hide", *scenes, *key, *SMALL, "--resume"]) == 0
     stego = str(run / "publish" / "model.ply")
     assert main(["reveal", stego, *key, "-o", str(folder / "secret.ply")]) == 0
     assert main(["evaluate", str(run), *key]) == 0

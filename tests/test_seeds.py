@@ -93,11 +93,6 @@ def _opens(reader: QuietReader | AppendedReader, salt: bytes) -> bool:
     return True
 
 
-def test_repeated_fits_share_no_rotation() -> None:
-    one, two = (_rotations(keyss.fit(tiny_scene(), config=FIT).gaussians) for _ in range(2))
-    assert not one & two
-
-
 @pytest.mark.parametrize("given", [None, 7])
 def test_resumed_fit_keeps_seed(tmp_path: Path, given: int | None) -> None:
     scene, run = tiny_scene(), tmp_path / "run"

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
-from PIL import Image
 from scipy.spatial.transform import Rotation
 
 import keyss
@@ -16,6 +13,7 @@ from keyss import FitConfig, Secret
 from keyss.core import KeyssWarning, Scene, Similarity, UsageError
 from keyss.files.scenes import load_scene
 from keyss.fitting import mean_psnr
+from test_api import write_nerfstudio
 from tiny_scenes import random_gaussians, tiny_scene
 
 TURN = Rotation.from_rotvec([0.3, -0.8, 1.9]).as_matrix()
@@ -27,29 +25,9 @@ WORLDS = {
 KEY = "a key of many characters: 93hXmQ2"
 
 
-def write_scene(folder: Path, shift: tuple[float, ...], scale: float) -> Path:
-    """Write a scene in Nerfstudio's layout, moved in double precision."""
-    scene = tiny_scene()
-    folder.mkdir()
-    frames = []
-    for view in scene.views:
-        camera = view.camera
-        pose = np.linalg.inv(camera.viewmat.double().numpy())
-        pose[:3, :3] = TURN @ pose[:3, :3]
-        pose[:3, 3] = scale * TURN @ pose[:3, 3] + shift
-        pose[:3, 1:3] *= -1  # OpenGL's axes
-        Image.fromarray(view.image.numpy()).save(folder / camera.name)
-        (fx, _, cx), (_, fy, cy), _ = camera.K.tolist()
-        lens = {"w": camera.width, "h": camera.height, "fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy}
-        frames.append({"file_path": camera.name, "transform_matrix": pose.tolist(), **lens})
-    points = scale * scene.points.double().numpy() @ TURN.T + shift
-    rows = [f"{x!r} {y!r} {z!r}" for x, y, z in points.tolist()]
-    header = f"ply\nformat ascii 1.0\nelement vertex {len(rows)}\n"
-    header += "".join(f"property double {axis}\n" for axis in "xyz")
-    (folder / "points.ply").write_text("\n".join([header + "end_header", *rows, ""]))
-    meta = {"camera_model": "PINHOLE", "ply_file_path": "points.ply", "frames": frames}
-    (folder / "transforms.json").write_text(json.dumps(meta))
-    return folder
+def load_moved(folder: Path, shift: tuple[float, ...] = (0.0, 0.0, 0.0), scale: float = 1.0) -> Scene:
+    written = write_nerfstudio(folder, tiny_scene(), shift=shift, scale=scale, rotation=TURN, points=True)
+    return load_scene(written)
 
 
 def psnr_of_fit(scene: Scene) -> float:
@@ -59,23 +37,20 @@ def psnr_of_fit(scene: Scene) -> float:
 
 @pytest.fixture(scope="module")
 def reference_psnr(tmp_path_factory: pytest.TempPathFactory) -> float:
-    return psnr_of_fit(
-        load_scene(write_scene(tmp_path_factory.mktemp("worlds") / "usual", (0.0, 0.0, 0.0), 1.0))
-    )
+    return psnr_of_fit(load_moved(tmp_path_factory.mktemp("worlds") / "usual"))
 
 
 @pytest.mark.filterwarnings("ignore::keyss.core.KeyssWarning")
 @pytest.mark.parametrize("world", WORLDS)
 def test_fit_is_invariant_to_similarities(world: str, reference_psnr: float, tmp_path: Path) -> None:
-    moved = load_scene(write_scene(tmp_path / "moved", *WORLDS[world]))
+    moved = load_moved(tmp_path / "moved", *WORLDS[world])
     assert abs(psnr_of_fit(moved) - reference_psnr) < 0.3
 
 
 def test_distant_scene_is_recentred(tmp_path: Path) -> None:
     shift, scale = WORLDS["UTM"]
-    folder = write_scene(tmp_path / "scene", shift, scale)
     with pytest.warns(KeyssWarning, match=r"moved by minus \(45678\d, 541234\d, "):
-        scene = load_scene(folder)
+        scene = load_moved(tmp_path / "scene", shift, scale)
     assert (scene.origin - torch.tensor(shift, dtype=torch.float64)).norm() < 10
     local = random_gaussians()
     far = Similarity(1.0, translation=scene.origin).apply_gaussians(local)

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import cheap_keys
 from channels.quiet.trained_like import trained_like
-from files.scene_files import write_blender, write_nerfstudio
+from cli.harness import write_workspace
 from keyss.files import write_model
 
 WITHOUT = f"""
@@ -39,8 +39,7 @@ REFUSED = (
 
 
 def test_without_audit_extra(tmp_path: Path) -> None:
-    write_blender(tmp_path / "a", count=3, channels=3)
-    write_nerfstudio(tmp_path / "b", count=4)
+    write_workspace(tmp_path)
     write_model(tmp_path / "cover.ply", trained_like(1500))
     write_model(tmp_path / "secret.ply", trained_like(500, 1))
     command = [sys.executable, "-c", WITHOUT, *WORKING, *REFUSED]

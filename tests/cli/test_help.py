@@ -1,4 +1,4 @@
-"""--help, --version and usage errors."""
+"""--help, --version, usage errors and suggestions."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from cli.harness import COMMANDS, Result, Run
+from cli.harness import COMMANDS, Result, Run, assert_refused
 from keyss import __version__
 from keyss.fitting import PRESETS as FIT_PRESETS
 from keyss.methods import registry
@@ -83,3 +83,32 @@ def test_usage_errors(keyss: Run, arguments: tuple[str, ...]) -> None:
     assert result.status == 2
     assert result.out == ""
     assert result.err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (("revael", "x"), "did you mean `keyss reveal`?"),
+        (("Hide",), "did you mean `keyss hide`?"),
+        (("--quiet", "inof", "x"), "did you mean `keyss info`?"),
+        (("frobnicate",), "see `keyss --help`"),
+        (("convert", "a.ply", "-o", "b.spz"), "name OUT after IN"),
+        (("audit", "run", "-o", "x"), "results go into the folder of the run"),
+    ],
+)
+def test_misspelt_command(keyss: Run, arguments: tuple[str, ...], expected: str) -> None:
+    assert_refused(keyss(*arguments), 2, expected)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (("reveal", "a", "--keyfile", "k", "-o", "b"), "--key-file FILE"),
+        (("hide", "--cover", "a", "--seckret=b", "-o", "c"), "--secret SCENE"),
+        (("hide", "--method", "carry", "--min-psnrr", "-o", "c"), "--min-psnr"),
+    ],
+)
+def test_misspelt_option(keyss: Run, arguments: tuple[str, ...], expected: str) -> None:
+    result = keyss(*arguments)
+    assert (result.status, result.out) == (2, "")
+    assert expected in result.err.partition("Perhaps you meant")[2]

@@ -11,6 +11,7 @@ import subprocess
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -87,27 +88,22 @@ def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_workspace(tmp_path_factory.mktemp("killed"))
 
 
-class Reference:
+@pytest.fixture(scope="module")
+def reference(workspace: Path) -> Callable[[str], tuple[list[object], float]]:
     """Results and durations of uninterrupted commands."""
 
-    def __init__(self, folder: Path) -> None:
-        self.folder, self.found = folder, dict[str, tuple[list[object], float]]()
-        self("hide")
+    @cache
+    def run(name: str) -> tuple[list[object], float]:
+        if COMMANDS[name].in_run:
+            run("hide")
+        out, run_folder, arguments = prepare(workspace, name, "reference")
+        before = time.monotonic()
+        with start(arguments, workspace) as process:
+            _, err = process.communicate()
+        assert process.returncode == 0, err
+        return result_of(COMMANDS[name], out, run_folder), time.monotonic() - before
 
-    def __call__(self, name: str) -> tuple[list[object], float]:
-        if name not in self.found:
-            out, run, arguments = prepare(self.folder, name, "reference")
-            before = time.monotonic()
-            with start(arguments, self.folder) as process:
-                _, err = process.communicate()
-            assert process.returncode == 0, err
-            self.found[name] = result_of(COMMANDS[name], out, run), time.monotonic() - before
-        return self.found[name]
-
-
-@pytest.fixture(scope="module")
-def reference(workspace: Path) -> Reference:
-    return Reference(workspace)
+    return run
 
 
 def prepare(folder: Path, name: str, which: str) -> tuple[Path, Path, list[str]]:
@@ -123,13 +119,13 @@ def prepare(folder: Path, name: str, which: str) -> tuple[Path, Path, list[str]]
     return out, run, parts
 
 
-def check_resumes(
-    workspace: Path,
-    reference: Callable[[str], tuple[list[object], float]],
-    name: str,
-    signum: int,
-    seed: int,
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(50))
+def test_killed_commands_resume(
+    workspace: Path, reference: Callable[[str], tuple[list[object], float]], seed: int
 ) -> None:
+    name = list(COMMANDS)[seed % len(COMMANDS)]
+    signum = SIGNALS[seed // len(COMMANDS) % len(SIGNALS)]
     expected, seconds = reference(name)
     rng = random.Random(seed)
     out, run, arguments = prepare(workspace, name, str(seed))
@@ -159,10 +155,3 @@ def check_resumes(
     left = [path.name for path in out.parent.rglob("*") if any(word in path.name for word in UNFINISHED)]
     assert left == []
     shutil.rmtree(out.parent)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", range(50))
-def test_killed_commands_resume(workspace: Path, reference: Reference, seed: int) -> None:
-    name = list(COMMANDS)[seed % len(COMMANDS)]
-    check_resumes(workspace, reference, name, SIGNALS[seed // len(COMMANDS) % len(SIGNALS)], seed)

@@ -1,4 +1,4 @@
-"""Alignment: focus on focus, equal distances, up on up."""
+"""Alignment of scenes by their cameras."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def looking_at(position: np.ndarray, target: np.ndarray, up: np.ndarray) -> Came
 
 
 def ring(seed: int, turn: float, count: int = 30, height: float = 0.6, target: float = 0.0) -> list[Camera]:
-    """Cameras at radius 3 over `turn` radians, z up, looking roughly at (0, 0, target)."""
+    """Cameras at radius 3 over `turn` radians, z up, looking roughly at `target` on the z axis."""
     rng = np.random.default_rng(seed)
     cameras = []
     for i in range(count):
@@ -81,7 +81,7 @@ def test_align_matches_focus_distance_and_up(seed: int, secret_turn: float, cove
 
 @pytest.mark.parametrize("turn", [1.5, math.pi, 2 * math.pi])
 def test_up_direction_of_partial_ring(turn: float) -> None:
-    """Unlike the mean of the cameras' up vectors on a part of a ring."""
+    """The mean of the cameras' up vectors would lean."""
     up = up_direction(ring(0, turn, height=1.0))
     assert up is not None
     assert up[2] > 0.999

@@ -1,4 +1,4 @@
-"""Nearest neighbours of points, many of which may be equal."""
+"""Nearest neighbours, also of repeated points."""
 
 from __future__ import annotations
 

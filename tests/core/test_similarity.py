@@ -1,4 +1,4 @@
-"""Similarity transforms: moving everything together changes no image."""
+"""Similarity transforms of cameras and Gaussians."""
 
 from __future__ import annotations
 

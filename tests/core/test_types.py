@@ -1,4 +1,4 @@
-"""Models, extents of scenes, opponent colours, and compensation of lost Gaussians."""
+"""Extents of scenes, and compensation of lost Gaussians."""
 
 from __future__ import annotations
 

@@ -14,6 +14,7 @@ from hypothesis import HealthCheck, given, settings, strategies as st
 
 from keyss.core import Gaussians, InputError, KeyssWarning, same_bits
 from keyss.files import read_model, write_model
+from keyss.files.models import reads_as
 from keyss.files.ply_rows import LEAST_LOG_SCALE
 from keyss.runs.describe import ModelInfo, info
 from tiny_scenes import random_gaussians
@@ -104,6 +105,20 @@ def test_round_trip_is_exact(tmp_path: Path, data: st.DataObject, n: int, degree
     back = read_model(tmp_path / "a.ply")
     assert back.sh_degree == degree
     assert same_bits(back, gaussians)
+
+
+@pytest.mark.parametrize("degree", [0, 3])
+def test_reads_as(tmp_path: Path, degree: int) -> None:
+    model, path = random_gaussians(9000, sh_degree=degree), tmp_path / "a.ply"
+    write_model(path, model)
+    assert reads_as(path, model)
+    for field in ("means", "sh"):
+        other = model.map(torch.clone)
+        getattr(other, field)[8999].view(torch.int32).view(-1)[-1] ^= 1
+        assert not reads_as(path, other)
+    assert not reads_as(path, model[:8999])
+    assert not reads_as(path, Gaussians.cat([model, model[:1]]))
+    assert not reads_as(path, model.with_sh_degree(1))
 
 
 @pytest.mark.parametrize("form", ["binary_little_endian", "binary_big_endian", "ascii"])

@@ -26,7 +26,7 @@ def plain(fit: FitConfig, device: torch.device) -> PlainRun:
 
 
 def joint(fit: FitConfig, device: torch.device) -> KeyssTraining:
-    """With wrong keys, poses of both scenes, and all attributes decoded."""
+    """KeySS with wrong keys, poses of both scenes, and all attributes decoded."""
     options = small("published", fit, common_poses=0.5)
     keys = list(random_embeddings(1, torch.Generator().manual_seed(0)))
     return KeyssTraining(placed(), keys, options, options.configuration, device)
@@ -47,7 +47,7 @@ RUNS: Mapping[str, Callable[[FitConfig, torch.device], Any]] = {
 
 
 def train_run(name: str, fit: FitConfig, device: str = "cpu", **options: Any) -> TrainingRun:
-    """One of RUNS, train_run to its end."""
+    """Train one of RUNS to its end."""
     run: TrainingRun = RUNS[name](fit, torch.device(device))
     train(run, name, fit, fingerprint={}, **options)
     return run

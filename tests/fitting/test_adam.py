@@ -1,4 +1,4 @@
-"""Our Adam is torch's, with a learning rate for each SH coefficient."""
+"""RowAdam against torch's Adam."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ SCALE = torch.cat([torch.ones(1, 1), torch.full((15, 1), 0.05)])
 
 
 def _gradients(shape: tuple[int, ...], steps: int) -> Tensor:
-    """Gradients of very different sizes; some are exactly zero, like those of invisible Gaussians."""
+    """Gradients of very different magnitudes, some of them zero as for invisible Gaussians."""
     generator = torch.Generator().manual_seed(1)
     values = torch.randn(steps, *shape, generator=generator)
     values *= 10 ** torch.randint(-12, 2, (1, *shape), generator=generator).double()
@@ -44,7 +44,7 @@ def test_matches_torch(shape: tuple[int, ...]) -> None:
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_lr_scale(dtype: torch.dtype) -> None:
-    """In float64 by torch's operations, as on a GPU."""
+    """float64 uses torch's operations, as a GPU does."""
     start, gradients = torch.rand(500, 16, 3, dtype=torch.float64), _gradients((500, 16, 3), 20)
     ours = _run(
         lambda p: RowAdam([{"params": [p], "lr_scale": SCALE}], lr=RATE, eps=EPS), start.to(dtype), gradients
@@ -124,9 +124,9 @@ def test_cuda_matches_cpu(cuda: torch.device) -> None:
 
 
 def test_low_bits_are_uniform() -> None:
-    """A step that is rounded before it is subtracted leaves trailing zeros in the smaller result.
+    """Rounding the step before the subtraction would leave trailing zeros in small results.
 
-    By chance one of the four bits is beyond the bound once in 1.2 million times.
+    The bound of 5.2 standard deviations gives one false alarm in 1.2 million runs.
     """
     generator = torch.Generator().manual_seed(3)
     parameter = torch.nn.Parameter(1e-3 * torch.randn(400_000, generator=generator))

@@ -27,7 +27,7 @@ def test_growth_is_capped() -> None:
     strategy._grow_gs(parameters, optimizers, state, step=1000)
     assert len(parameters["means"]) == COUNT + 10
     kept = (parameters["means"].detach()[:, None] == before[None]).all(-1).any(0)
-    # A split replaces its Gaussian: only the ten with the largest gradients may be gone.
+    # Splits replace only the ten Gaussians with the largest gradients.
     assert kept[:-10].all()
 
 

@@ -1,4 +1,4 @@
-"""A run resumes on another device."""
+"""Runs resume on another device."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tiny_scenes import tiny_scene
 
 
 def test_device_alias(tmp_path: Path) -> None:
-    """ "cpu:0" is another name of the same device."""
+    """ "cpu:0" is the device "cpu"."""
     scene, path = tiny_scene(), tmp_path / "checkpoint.safetensors"
     with pytest.raises(Interrupted):
         fit_scene(scene, FIT, checkpoint=path, reporter=InterruptAt(25))
@@ -28,7 +28,7 @@ def test_device_alias(tmp_path: Path) -> None:
 @pytest.mark.cuda
 @pytest.mark.parametrize("name", RUNS)
 def test_resume_across_devices(tmp_path: Path, name: str, cuda: torch.device) -> None:
-    """The quality is near that of a run on the CPU; the order of sums on a GPU varies."""
+    """Results differ slightly: the order of sums on a GPU varies."""
     path, fit = tmp_path / "checkpoint.safetensors", replace(FIT, iterations=60)
     with pytest.raises(Interrupted):
         train_run(name, fit, checkpoint=path, reporter=InterruptAt(25))

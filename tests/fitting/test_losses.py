@@ -20,7 +20,7 @@ def _images(height: int, width: int, seed: int = 0) -> tuple[torch.Tensor, torch
 
 
 def _ssim_by_definition(a: torch.Tensor, b: torch.Tensor, mask: torch.Tensor | None = None) -> float:
-    """Window by window in float64, with zeros outside, straight from Wang et al. 2004."""
+    """Wang et al. 2004, window by window in float64, zero-padded."""
     offsets = torch.arange(-5, 6, dtype=torch.float64)
     weights = torch.exp(-(offsets[:, None] ** 2 + offsets[None] ** 2) / (2 * 1.5**2))
     weights = (weights / weights.sum())[..., None]
@@ -49,7 +49,7 @@ def test_ssim() -> None:
 
 
 def test_quality_with_mask() -> None:
-    """Equal to a render where the mask is True, and noise elsewhere."""
+    """The photo is a render where the mask is True, and noise elsewhere."""
     model, camera = random_gaussians(), ring_cameras(1)[0]
     image = (render(model, camera).clamp(0, 1) * 255).round().to(torch.uint8)
     mask = torch.rand(image.shape[:2], generator=torch.Generator().manual_seed(1)) > 0.3
@@ -63,7 +63,7 @@ def test_quality_with_mask() -> None:
 
 
 def test_ssim_with_mask() -> None:
-    """Windows see the mean colour where it is False."""
+    """Windows contain the mean colour where the mask is False."""
     a, b = _images(17, 14)
     mask = torch.rand(17, 14, generator=torch.Generator().manual_seed(3)) > 0.3
     mean = b[mask].mean(0)
@@ -104,7 +104,7 @@ def test_photometric_loss() -> None:
 @pytest.mark.parametrize("weight", [0.2, 1.0])
 def test_photometric_loss_gradient(weight: float) -> None:
     a, b = _images(37, 29)
-    a[:5] = b[:5]  # |x| has no slope at 0
+    a[:5] = b[:5]  # |x| is not differentiable at 0
     target = Target.of(b)
     fast, slow = a.clone().requires_grad_(), a.clone().requires_grad_()
     (3 * photometric_loss(fast, target, weight)).backward()

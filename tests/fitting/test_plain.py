@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from keyss.core import Gaussians, InputError, Interrupted, UsageError
+from keyss.core import InputError, Interrupted, UsageError, same_bits
 from keyss.fitting import (
     FitConfig,
     PlainRun,
@@ -19,6 +19,7 @@ from keyss.fitting import (
     photometric_loss,
     save_checkpoint,
 )
+from keyss.fitting.schedule import shrinking
 from keyss.progress import Reporter
 from keyss.rendering import render_with_meta
 from tiny_scenes import tiny_scene
@@ -28,13 +29,8 @@ CONFIG = FitConfig(
 )
 
 
-def _same(a: Gaussians, b: Gaussians) -> bool:
-    names = ("means", "quats", "log_scales", "opacity_logits", "sh")
-    return all(torch.equal(getattr(a, name), getattr(b, name)) for name in names)
-
-
 class InterruptAt(Reporter):
-    """Presses Ctrl-C at one iteration, of the training whose title begins with `stage`."""
+    """Send SIGINT at one iteration of the training whose title begins with `stage`."""
 
     def __init__(self, iteration: int, stage: str = "") -> None:
         self.iteration, self.stage = iteration, stage
@@ -63,7 +59,7 @@ def test_masked_pixels_are_ignored() -> None:
     masked, occluded = [], []
     for index, view in enumerate(scene.train):
         mask, image = torch.ones(view.image.shape[:2], dtype=torch.bool), view.image.clone()
-        if index % 3:  # something that moves before the scene
+        if index % 3:  # an occluder
             x, y = (int(torch.randint(low, low + 8, (1,), generator=generator)) for low in (8, 5))
             mask[y : y + 12, x : x + 14] = False
             image[~mask] = torch.tensor([255, 0, 255], dtype=torch.uint8)
@@ -74,9 +70,31 @@ def test_masked_pixels_are_ignored() -> None:
         fit_scene(replace(scene, train=tuple(views)), config).gaussians
         for views in (occluded, masked, unmasked)
     )
-    assert _same(with_masks, same)
+    assert same_bits(with_masks, same)
     good, bad = (mean_psnr(model, scene.test, scene.background) for model in (with_masks, without))
     assert good > bad + 2
+
+
+def test_large_photos_are_shrunk() -> None:
+    """The loss of the first step follows from the means of blocks of pixels."""
+    scene, config = tiny_scene(), replace(CONFIG, iterations=20)
+    generator = torch.Generator().manual_seed(3)
+    view = scene.train[0]
+    width, height = 600, 400
+    factor = shrinking(config, 1, width * height)
+    assert factor == 2
+    image = torch.randint(0, 256, (height, width, 3), generator=generator, dtype=torch.uint8)
+    mask = torch.rand(height // factor, width // factor, generator=generator) < 0.7
+    whole = mask.repeat_interleave(factor, 0).repeat_interleave(factor, 1)
+    large = replace(view, image=image, camera=view.camera.resized(width, height), mask=whole)
+    run = PlainRun(replace(scene, train=(large,)), config, torch.device("cpu"))
+    means = image.float().reshape(height // factor, factor, width // factor, factor, 3).mean((1, 3))
+    target = Target.of(means.round() / 255, mask)
+    small = view.camera.resized(width // factor, height // factor)
+    shown, _ = render_with_meta(run.gaussians(), small, scene.background, sh_degree=0)
+    expected = float(photometric_loss(shown, target, config.ssim_weight))
+    run.step()
+    assert float(run.loss) == pytest.approx(expected, rel=1e-3)  # halves are rounded up or down
 
 
 def test_loss_is_mean_over_views() -> None:
@@ -100,8 +118,8 @@ def test_seed() -> None:
     first = fit_scene(scene, CONFIG).gaussians
     assert torch.equal(state, torch.get_rng_state())
     torch.manual_seed(2)
-    assert _same(first, fit_scene(scene, CONFIG).gaussians)
-    assert not _same(first, fit_scene(scene, replace(CONFIG, seed=1)).gaussians)
+    assert same_bits(first, fit_scene(scene, CONFIG).gaussians)
+    assert not same_bits(first, fit_scene(scene, replace(CONFIG, seed=1)).gaussians)
 
 
 @pytest.mark.parametrize("iteration", [1, 33])
@@ -111,7 +129,7 @@ def test_resume(tmp_path: Path, iteration: int) -> None:
         fit_scene(scene, CONFIG, checkpoint=path, reporter=InterruptAt(iteration))
     assert caught.value.iteration == iteration
     resumed = fit_scene(scene, CONFIG, checkpoint=path, resume=True).gaussians
-    assert _same(resumed, fit_scene(scene, CONFIG).gaussians)
+    assert same_bits(resumed, fit_scene(scene, CONFIG).gaussians)
 
 
 def test_checkpoint_of_other_settings(tmp_path: Path) -> None:

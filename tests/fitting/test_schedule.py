@@ -1,4 +1,4 @@
-"""Rates of 3DGS in long runs, larger ones in short runs, and positions that move in units of pixels."""
+"""Learning rates: those of 3DGS in long runs, larger ones in short runs."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from torch import Tensor
 
 from keyss.core import Camera
 from keyss.fitting import FitConfig, Optimizers, Schedule, make_optimizers, to_parameters
+from keyss.fitting.schedule import shrinking
 from tiny_scenes import random_gaussians
 
 RATES = {"means": 1.6e-4, "quats": 1e-3, "scales": 5e-3, "opacities": 5e-2, "sh": 2.5e-3}
@@ -17,7 +18,7 @@ EXTENT = 4.0
 
 
 def _cameras(zoom: float = 1.15) -> list[Camera]:
-    """At (0, 0, -1) and (0, 0, -5); `zoom` is the focal length for a picture of area 1."""
+    """Cameras at (0, 0, -1) and (0, 0, -5); `zoom` is the focal length for an image of unit area."""
     K = torch.tensor([[20 * zoom, 0, 10], [0, 20 * zoom, 20], [0, 0, 1]])
     poses = [torch.eye(4), torch.eye(4)]
     for pose, z in zip(poses, (1.0, 5.0), strict=True):
@@ -63,3 +64,20 @@ def test_position_rates_follow_pixel_size() -> None:
     config = FitConfig(iterations=1000)
     narrow = Schedule(config, _cameras(zoom=2.3), EXTENT).pixel_sizes(means)
     assert torch.allclose(narrow, distances / 2, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("width", "height", "factors"),
+    [(200, 133, [1]), (400, 400, [1]), (780, 520, [4, 2, 1]), (3840, 2160, [16, 8, 4, 2, 1])],
+)
+def test_shrinking(width: int, height: int, factors: list[int]) -> None:
+    config = FitConfig(iterations=1000)
+    found = [shrinking(config, iteration, width * height) for iteration in range(1, 1001)]
+    assert list(dict.fromkeys(found)) == factors
+    assert found == sorted(found, reverse=True)
+    if len(factors) > 1:
+        steps = [found.count(factor) for factor in factors]
+        assert steps[-1] == 500
+        assert max(steps[:-1]) - min(steps[:-1]) <= 1
+        assert width * height / factors[0] ** 2 >= 20_000 > width * height / (2 * factors[0]) ** 2
+    assert {shrinking(replace(config, coarse=0), each, width * height) for each in (1, 1000)} == {1}

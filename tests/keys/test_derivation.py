@@ -17,7 +17,7 @@ SALT = b"0123456789abcdef"
 
 
 def _expand(key: str, label: bytes, length: int) -> bytes:
-    """RFC 5869's second step over Argon2id, written out with hashlib only."""
+    """HKDF-Expand (RFC 5869) of Argon2id with hashlib."""
     prk = hash_secret_raw(key.encode(), SALT, 3, 64 * 1024, 4, 32, Type.ID)
     block, result, counter = b"", b"", 1
     while len(result) < length:
@@ -51,17 +51,14 @@ def test_unicode_normalisation() -> None:
 def test_salt() -> None:
     one, other = (DerivedKey.of("key", salt) for salt in (SALT, b"fedcba9876543210"))
     assert one.verifier() != other.verifier()
+    with pytest.raises(InputError, match="key derivation"):
+        DerivedKey.of("key", b"short")
 
 
 @pytest.mark.parametrize("key", ["", "x" * 5000])
 def test_invalid_keys(key: str) -> None:
     with pytest.raises(UsageError):
         DerivedKey.of(key, SALT)
-
-
-def test_invalid_salt() -> None:
-    with pytest.raises(InputError, match="key derivation"):
-        DerivedKey.of("key", b"short")
 
 
 def test_generate_key() -> None:
@@ -73,7 +70,6 @@ def test_generate_key() -> None:
         generate_key(0)
 
 
-@pytest.mark.argon2
 def test_master_key() -> None:
     salt = hashlib.sha256(b"keyss/v1/master").digest()[:16]
     prk = hash_secret_raw(b"a master key", salt, 3, 64 * 1024, 4, 32, Type.ID)
@@ -83,7 +79,7 @@ def test_master_key() -> None:
     for place in range(22):
         expected += (string.ascii_letters + string.digits)[number // 62**place % 62]
     assert MasterKey("a master key").key_of("Säule/7") == expected
-    assert MasterKey("a master key").key_of("Sa\u0308ule/7") == expected  # however it was typed
+    assert MasterKey("a master key").key_of("Sa\u0308ule/7") == expected
 
 
 def test_asset_keys_are_uniform() -> None:

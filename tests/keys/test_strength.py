@@ -1,4 +1,4 @@
-"""Keys that people choose are weak, and generated ones are not."""
+"""Strength of chosen and generated keys."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from keyss.keys import ALPHABET, key_guesses, length_for, normalized_key, weakne
 
 
 def test_generated_keys_are_strong() -> None:
-    """Those of `keyss keygen`, with a fixed seed, also where they contain a word or a date."""
+    """Also if they contain a word or a date by chance."""
     rng = random.Random(0)
     keys = ["".join(rng.choices(ALPHABET, k=length_for(95))) for _ in range(100)]
     assert length_for(95) == 16
@@ -45,6 +45,6 @@ def test_normalised_before_rating() -> None:
 
 
 def test_length_is_checked_before_normalising() -> None:
-    """Normalising as many combining characters as this would take minutes."""
+    """Normalising so many combining characters takes minutes."""
     with pytest.raises(UsageError, match="longer than 4096 bytes"):
         normalized_key("a" + "\u0301\u0316" * 300_000)

@@ -1,4 +1,4 @@
-"""Pictures in rows and columns."""
+"""Contact sheets."""
 
 from __future__ import annotations
 
@@ -8,10 +8,9 @@ from keyss.measure.contact_sheet import contact_sheet
 
 
 def test_headings_fit() -> None:
-    """However narrow the pictures are."""
     narrow = [np.zeros((40, 2, 3), np.uint8)] * 3
     picture = contact_sheet(["cover", "secret", "error of the secret"], {"photos": narrow})
-    right = np.asarray(picture)[:25, -4:]  # a gap's worth of white right of the last heading
+    right = np.asarray(picture)[:25, -4:]  # the gap right of the last heading
     assert (right == 255).all()
 
 

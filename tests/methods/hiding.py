@@ -1,4 +1,4 @@
-"""Methods from scenes to a stego model and back, below the level of files, and tiny scenes to hide."""
+"""Hides and reveals in memory, and tiny scenes to hide."""
 
 from __future__ import annotations
 
@@ -21,8 +21,6 @@ from tiny_scenes import random_gaussians, tiny_scene
 
 @dataclass(frozen=True)
 class Hidden:
-    """What hiding gave."""
-
     stego: Gaussians
     opened: tuple[Opened, ...]
 
@@ -37,11 +35,7 @@ def hide_scenes(
     resume: bool = False,
     reporter: Reporter | None = None,
 ) -> Hidden:
-    """Hide `scenes[1:]` in `scenes[0]`, with seed 0 unless `options` have one.
-
-    Models are fitted where `plains` has none. The warning that decoders of such small models are appended is
-    ignored.
-    """
+    """Hide `scenes[1:]` in `scenes[0]`, with seed 0 by default; missing `plains` are fitted."""
     given = plains or [None] * len(scenes)
     method = registry.of_options(options)
     options = replace(options, fit=options.fit.with_seed(0))
@@ -60,9 +54,9 @@ def hide_scenes(
 def check_resumes(
     options: MethodOptions, checkpoints: Path, stage: str, plains: Sequence[Gaussians] | None = None
 ) -> None:
-    """Check that a run interrupted in a plain fit, unless `plains` are given, and in `stage` resumes.
+    """Check that interrupted hiding resumes to the same bits, and with the same options only.
 
-    It ends in the same bits. A run with other options does not resume it.
+    It is interrupted in `stage`, and before in a plain fit unless `plains` are given.
     """
     scenes, keys = three_scenes()[0][:2], ["a key"]
 
@@ -82,7 +76,7 @@ def check_resumes(
 
 
 def moved(scene: Scene, frame: Similarity) -> Scene:
-    """The same photos of a world that lies elsewhere."""
+    """Apply a similarity transform to a scene."""
     return replace(
         scene,
         train=tuple(replace(view, camera=frame.apply_camera(view.camera)) for view in scene.train),
@@ -92,7 +86,7 @@ def moved(scene: Scene, frame: Similarity) -> Scene:
 
 
 def three_scenes() -> tuple[list[Scene], list[Gaussians]]:
-    """A cover and two secrets, one of them in a frame of its own, and their true models."""
+    """A cover and two secrets, the first of them in another frame, and their true models."""
     quaternion = torch.linalg.qr(
         torch.randn(3, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     )[0]
@@ -108,5 +102,5 @@ def three_scenes() -> tuple[list[Scene], list[Gaussians]]:
 
 
 def psnr_in(model: Gaussians, scene: Scene) -> float:
-    """Mean PSNR of the model on the test views of a scene."""
+    """Mean PSNR on the test views of a scene."""
     return mean_psnr(model, scene.test, scene.background)

@@ -1,4 +1,4 @@
-"""What a wrong key opens with `decoy`, whichever method there is."""
+"""Decoys: what wrong keys open with `decoy`."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def test_resembles_cover(records: bool) -> None:
 
 @pytest.mark.parametrize("channel", [LOW_BITS, APPENDED], ids=["low bits", "appended"])
 def test_statistics_match_revealed_secret(channel: Channel) -> None:
-    """Unit quaternions, as few log scales, as many different numbers of each kind."""
+    """Unit quaternions and as many distinct values per attribute."""
     cover, model = trained_like(3000, 0), trained_like(2700, 1)
     stego = embed_models(channel.prepare(cover), [KEY], [model]).gaussians
     secret = open_model(stego, KEY, decoy=True).reveal(stego)
@@ -46,9 +46,9 @@ def test_statistics_match_revealed_secret(channel: Channel) -> None:
         of_secret, of_decoy = (getattr(each, name) for each in (secret, decoy))
         ratio = len(of_decoy.unique()) / len(of_secret.unique()) * of_secret.numel() / of_decoy.numel()
         assert 0.5 < ratio < 2, name
-    # Neighbours in the file are as near to each other as those of a secret.
-    apart = [each.means.diff(dim=0).norm(dim=1).median() / each.means.std() for each in (secret, decoy)]
-    assert float(apart[1]) == pytest.approx(float(apart[0]), rel=0.35)
+    # The order of Gaussians is as local.
+    distances = [each.means.diff(dim=0).norm(dim=1).median() / each.means.std() for each in (secret, decoy)]
+    assert float(distances[1]) == pytest.approx(float(distances[0]), rel=0.35)
 
 
 def test_decoy_of_plain_model() -> None:

@@ -1,4 +1,4 @@
-"""A method is a folder and a line in the registry: one that nobody knows does all that the others do."""
+"""A method that only the registry knows works in Python and on the command line."""
 
 from __future__ import annotations
 
@@ -36,8 +36,6 @@ KEY = "a key of many characters: 93hXmQ2"
 
 @dataclass(frozen=True, kw_only=True)
 class WholeOptions(MethodOptions):
-    """Of the method below."""
-
     method: ClassVar[str] = "whole"
 
     most: Annotated[int, CommandLineOption("Gaussians of a secret at most.", metavar="N")] = 100
@@ -45,8 +43,6 @@ class WholeOptions(MethodOptions):
 
 @dataclass(frozen=True)
 class OpenedWhole:
-    """A secret that was embedded as it is."""
-
     model: Gaussians
     frame: None = None
     decode: None = None

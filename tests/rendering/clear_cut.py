@@ -1,9 +1,8 @@
-"""Changes scenes until no decision of the rasterizer is a close call.
+"""Moves scenes away from the thresholds of the rasterizer.
 
-The rasterizer decides: whether an alpha is too faint, whether it is clamped, whether a pixel has stopped,
-what lies before the near plane, what comes first, where a colour is clamped at black. At a threshold the
-picture or its gradient jumps, so two right answers that differ by rounding may differ by much. Here the
-scene is changed until nothing is near to a threshold: then tests need neither masks nor loose tolerances.
+Images and gradients are discontinuous at thresholds: minimum and maximum alpha, the end of a pixel, the near
+plane, the depth order, the clamp at black. Two correct implementations may differ there by more than
+rounding. Scenes away from thresholds need neither masks nor loose tolerances.
 """
 
 from __future__ import annotations
@@ -14,8 +13,8 @@ from torch import Tensor
 from rendering.dense_reference import Margins, dense_rasterization
 from rendering.scenes import Scene
 
-# How far to stay away: several times the rounding errors of float32 in the quantity that is compared.
-# Alphas and transmittance relative to the threshold, the others absolute, in scenes a few units large.
+# Minimum distances: several float32 rounding errors. Alphas and transmittance are relative to the threshold,
+# the others absolute, in scenes a few units large.
 REQUIRED = {
     "alpha 1/255": 3e-4,
     "alpha 0.999": 3e-4,
@@ -29,7 +28,7 @@ ROUNDS = 60
 
 
 def margins(scene: Scene) -> Margins:
-    """The minimum distance [N] of each Gaussian to each threshold, over all cameras."""
+    """Minimum distance [N] of each Gaussian to each threshold, over all cameras."""
     least: Margins = {}
     leaves = scene.leaves(torch.float64)
     with torch.no_grad():
@@ -42,7 +41,7 @@ def margins(scene: Scene) -> Margins:
 
 
 def close_calls(scene: Scene) -> dict[str, Tensor]:
-    """The Gaussians that are too close to a threshold, by its name."""
+    """Gaussians too close to each threshold."""
     return {
         name: (values < REQUIRED[name]).nonzero()[:, 0]
         for name, values in margins(scene).items()
@@ -51,7 +50,7 @@ def close_calls(scene: Scene) -> dict[str, Tensor]:
 
 
 def clear_cut(scene: Scene) -> Scene:
-    """The scene with small changes to Gaussians until there are no close calls."""
+    """Perturb Gaussians until there are no close calls."""
     generator = torch.Generator().manual_seed(12345)
 
     def normal(like: Tensor) -> Tensor:

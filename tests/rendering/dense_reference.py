@@ -1,5 +1,7 @@
-"""The rasterizer written down once more, as slowly and plainly as possible: float64, every Gaussian at every
-pixel, gradients by autograd. Follows the 3DGS paper, eq. 3 to 5, with gsplat's constants."""
+"""A dense reference rasterizer: float64, every Gaussian at every pixel, gradients by autograd.
+
+Follows the 3DGS paper, eq. 3 to 5, with gsplat's constants.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,7 @@ def rotation_matrices(quats: Tensor) -> Tensor:
 
 
 def sh_basis(degree: int, directions: Tensor) -> Tensor:
-    """[N, (degree + 1)^2] from unit directions: the formulas as printed in the textbooks."""
+    """Real spherical harmonics [N, (degree + 1)^2] of unit directions."""
     x, y, z = directions.unbind(-1)
     pi = torch.pi
     bands = [
@@ -67,9 +69,9 @@ def dense_rasterization(
 ) -> tuple[Tensor, Tensor]:
     """Image [H, W, D] and alpha [H, W] of one camera.
 
-    A colour is SH coefficients where sh_degree is given. `shifts` [N, H * W, 2] moves each projected centre
-    as each pixel sees it: its gradient is that of means2d, pixel by pixel. `margins` gets for every kind of
-    decision how far each Gaussian [N] stays from where it would be taken otherwise; see `clear_cut`.
+    Colours are SH coefficients if `sh_degree` is given. `shifts` [N, H * W, 2] moves each projected centre
+    per pixel; its gradient is that of means2d. `margins` receives the distance [N] of each Gaussian to each
+    threshold; see `clear_cut`.
     """
     rotation, translation = viewmat[:3, :3], viewmat[:3, 3]
     if sh_degree is not None:
@@ -112,7 +114,7 @@ def dense_rasterization(
         found["the view where the perspective is linearised"] = torch.stack(
             [(x / z - limit).abs() for limit in limits_x] + [(y / z - limit).abs() for limit in limits_y]
         ).amin(0)
-        # A tie of depths is no close call: Gaussians at one place stay in the order of the arguments.
+        # Equal depths keep the order of the arguments.
         gaps = torch.diff(z)
         gaps = torch.where(gaps == 0, torch.inf, gaps)
         found["order"] = torch.minimum(
@@ -121,7 +123,7 @@ def dense_rasterization(
         )
         for name, values in found.items():
             margins[name] = infinity.index_copy(0, order, values).detach()
-        # Exactly on the near plane is no close call either, where the camera looks along an axis.
+        # Depths are exact where the camera looks along an axis.
         distance = (z_all - near_plane).abs()
         on_plane = (distance == 0) & ((rotation == 0) | (rotation.abs() == 1)).all()
         margins["near plane"] = torch.where(on_plane, torch.inf, distance).detach()
@@ -142,7 +144,7 @@ def dense_blending(
     shifts: Tensor | None = None,
     margins: Margins | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Image [H, W, D] and alpha [H, W] of 2D Gaussians from front to back, with conics [N, 2, 2]."""
+    """Blend 2D Gaussians with conics [N, 2, 2] front to back: image [H, W, D] and alpha [H, W]."""
     rows, columns = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
     pixels = torch.stack([columns, rows], -1).to(centres).reshape(-1, 2)
     offsets = pixels - centres[:, None]  # [N, P, 2]
@@ -154,7 +156,7 @@ def dense_blending(
     after = torch.cumprod(1 - unstopped, 0)
     alpha = unstopped * (after > TRANSMITTANCE_MIN)
     if margins is not None:
-        # Where a pixel had stopped before, or the Gaussian is too faint, nothing more is decided.
+        # No threshold applies after a pixel has stopped or to a Gaussian that is too faint.
         before = torch.cat([torch.ones_like(after[:1]), after])[:-1]
         decided = (before > TRANSMITTANCE_MIN) & (unstopped > 0)
         for name, values, threshold, asked in (

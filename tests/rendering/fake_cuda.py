@@ -1,8 +1,8 @@
-"""A GPU that is none: tensors that say they are on "cuda:0", while a CPU computes.
+"""Simulates a GPU on the CPU: tensors that report the device "cuda:0".
 
-They go where a GPU's would: tensors made on the device "cuda" and results of others. What a GPU refuses
-raises here too: tensors of both devices in one operation, and `numpy` of a tensor that is on the GPU. Copies
-between the devices are copies. Backward passes hand plain tensors to `Function.backward`, unchecked.
+Tensors created on "cuda", and results computed from them, are `GpuTensor`s. Mixing devices in one operation
+and `numpy()` of GPU tensors raise as on a GPU, and copies between devices are copies. Backward passes hand
+plain tensors to `Function.backward`, unchecked.
 """
 
 from __future__ import annotations
@@ -18,28 +18,26 @@ from torch.utils._pytree import tree_leaves, tree_map
 
 DEVICE = torch.device("cuda", 0)
 
-# Both devices are allowed: the indexed tensor decides, and copies go from one to the other.
+# Functions that accept both devices.
 _CROSSING = (Tensor.__getitem__, Tensor.__setitem__, Tensor.copy_, Tensor.index_put_, Tensor.grad.__set__)
 _BACKWARD = (Tensor.backward, torch.autograd.backward, torch.autograd.grad)
 _TO_HOST = (Tensor.numpy, Tensor.__array__)
 
 
 class GpuTensor(Tensor):
-    """A tensor on the GPU."""
-
-    __torch_function__ = torch._C._disabled_torch_function_impl  # `GpuMode` does all
+    __torch_function__ = torch._C._disabled_torch_function_impl  # `GpuMode` handles all functions
 
     device = DEVICE  # type: ignore[assignment]
     is_cuda = True
 
 
 def as_cpu(tensor: Tensor) -> Tensor:
-    """The tensor as the CPU sees it, in the same memory."""
+    """The same memory as a CPU tensor."""
     return tensor.as_subclass(Tensor)
 
 
 class GpuMode(TorchFunctionMode):
-    """Makes every function of torch compute as if there were a GPU."""
+    """Tracks the device of every tensor."""
 
     def __init__(self, *, checks: bool = True) -> None:
         self.checks = checks
@@ -83,7 +81,6 @@ class GpuMode(TorchFunctionMode):
 
 
 def _device(value: object) -> str | None:
-    """The type of a device, given as one or by its name."""
     if isinstance(value, torch.device):
         return value.type
     if isinstance(value, str) and value in ("cpu", "cuda", "cuda:0"):
@@ -99,6 +96,6 @@ def _placed(value: Any, there: bool) -> Any:
 
 @contextmanager
 def fake_cuda() -> Iterator[torch.device]:
-    """The device, while it is there."""
+    """Simulate a GPU; yields its device."""
     with GpuMode():
         yield DEVICE

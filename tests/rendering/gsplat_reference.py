@@ -1,8 +1,7 @@
-"""gsplat's compiled module with its reference implementation, `gsplat.cuda._torch_impl`, for kernels.
+"""A stand-in for gsplat's CUDA module, based on its reference implementation `gsplat.cuda._torch_impl`.
 
-Everything else of gsplat runs unchanged: `rasterization`, its autograd Functions, the order and the shapes
-of arguments. As in CUDA, tensors must be contiguous and float32 (`CHECK_INPUT` and `data_ptr<float>`). What
-CUDA leaves uninitialised is nan here.
+The rest of gsplat runs unchanged: `rasterization` and its autograd Functions. As in CUDA, tensors must be
+contiguous and float32 (`CHECK_INPUT` and `data_ptr<float>`). Values that CUDA leaves uninitialised are NaN.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ NAN = math.nan
 
 
 def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Takes and returns tensors of the GPU, as a kernel does."""
+    """Make a function take and return GPU tensors."""
 
     @wraps(function)
     def launch(*arguments: Any) -> Any:
@@ -62,12 +61,12 @@ def projection_ewa_3dgs_fused_fwd(
     compensate: bool, camera_model: str,
 ) -> tuple[Tensor | None, ...]:  # fmt: skip
     assert (covars, radius_clip, compensate, camera_model) == (None, 0.0, False, "pinhole")
-    # The kernels draw what is on the near plane, unlike the reference.
+    # Unlike the reference, the kernels draw Gaussians on the near plane.
     planes = {"near_plane": float(np.nextafter(np.float32(near), np.float32(0))), "far_plane": far}
     radii, means2d, depths, conics, _ = project(
         means, quats, scales, viewmats, Ks, width, height, eps2d, **planes
     )
-    # Where the kernels end footprints; the reference does at 3.33 standard deviations, whatever the opacity.
+    # The kernels' radii depend on the opacity; the reference always uses 3.33 standard deviations.
     reach = (2 * (opacities / ALPHA_MIN).log()).sqrt().nan_to_num(0).clamp_max(3.33)
     variances = torch.stack([conics[..., 2], conics[..., 0]], -1)
     variances = variances / (conics[..., 0] * conics[..., 2] - conics[..., 1] ** 2)[..., None]
@@ -129,7 +128,7 @@ def intersect_tile(
     means2d: Tensor, radii: Tensor, depths: Tensor, images: None, gaussians: None, count: int, size: int,
     columns: int, rows: int, sort: bool, segmented: bool,
 ) -> tuple[Tensor, ...]:  # fmt: skip
-    """As `reference._isect_tiles`, whose loops in Python take too long for trainings."""
+    """Vectorised `reference._isect_tiles`, which is too slow for trainings."""
     assert sort
     count_of_tiles = means2d.new_tensor([columns, rows])
     low = ((means2d - radii) / size).floor().nan_to_num(0).clamp_min(0).minimum(count_of_tiles).int()
@@ -183,10 +182,10 @@ def rasterize_to_pixels_3dgs_bwd(
 def pullback(
     function: Callable[..., tuple[Tensor, ...]], inputs: list[Tensor], upstream: list[Tensor]
 ) -> tuple[Tensor, ...]:
-    """The gradients of a function's inputs; zeros where it does not depend on any."""
+    """Gradients with respect to the inputs."""
     leaves = [each.detach().requires_grad_() for each in inputs]
     results = function(*leaves)
-    # Where nothing is drawn, a result depends on none of them.
+    # If nothing is drawn, the results do not depend on the inputs.
     total = sum((result * factor).sum() for result, factor in zip(results, upstream, strict=True))
     total = total + sum(0 * leaf.sum() for leaf in leaves)
     return torch.autograd.grad(total, leaves)
@@ -196,10 +195,7 @@ def rasterize_to_indices_3dgs(
     first: int, last: int, transmittances: Tensor, means2d: Tensor, conics: Tensor, opacities: Tensor,
     width: int, height: int, size: int, offsets: Tensor, ids: Tensor,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """The Gaussians [M] that contribute to pixels [M] of all images, and these; pixel by pixel, in order.
-
-    A pixel ends before the Gaussian that would leave a transmittance of 1e-4 or less.
-    """
+    """Pairs of contributing Gaussians [M] and pixels [M], in the order of pixels, then depth."""
     count, (_, rows, columns) = means2d.shape[-2], offsets.shape
     ends = torch.cat([offsets.flatten()[1:], offsets.new_tensor([len(ids)])]).tolist()
     gaussians, pixels = [ids.new_empty(0)], [ids.new_empty(0)]
@@ -224,7 +220,7 @@ def rasterize_to_indices_3dgs(
 
 
 def render_weight_from_alpha(alphas: Tensor, ray_indices: Tensor, n_rays: int) -> tuple[Tensor, Tensor]:
-    """nerfacc's function: the blending weight [M] of each alpha, and the transmittance before it."""
+    """As in nerfacc: blending weights [M] and transmittances [M]."""
     _, rays, lengths = ray_indices.unique_consecutive(return_inverse=True, return_counts=True)
     places = rays, torch.arange(len(rays)) - (lengths.cumsum(0) - lengths)[rays]
     left = torch.ones(len(lengths), int(lengths.max()) + 1)
@@ -234,7 +230,7 @@ def render_weight_from_alpha(alphas: Tensor, ray_indices: Tensor, n_rays: int) -
 
 
 def accumulate_along_rays(weights: Tensor, values: Tensor | None, ray_indices: Tensor, n_rays: int) -> Tensor:
-    """nerfacc's function: the sums [n_rays, D] of weighted values along rays."""
+    """As in nerfacc: sums [n_rays, D] of weighted values along rays."""
     weighted = weights[:, None] if values is None else weights[:, None] * values
     return torch.zeros(n_rays, weighted.shape[1]).index_add(0, ray_indices, weighted)
 

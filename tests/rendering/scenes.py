@@ -1,4 +1,4 @@
-"""Small scenes that together reach every branch of the rasterizer."""
+"""Small scenes that cover every branch of the rasterizer."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ CAMERAS = ("viewmats", "Ks")
 
 @dataclass
 class Scene:
-    """The arguments of `rasterization`, in float64 but rounded to float32, so that both see the same."""
+    """Arguments of `rasterization` in float64, rounded to float32 so that both precisions agree."""
 
     means: Tensor
     quats: Tensor
@@ -31,32 +31,30 @@ class Scene:
     height: int
     backgrounds: Tensor
     sh_degree: int | None
-    near_plane: float = 2.0**-6  # exact in float32, which the kernels use
+    near_plane: float = 2.0**-6  # exact in float32
 
     def __post_init__(self) -> None:
         self.round()
 
     def round(self) -> None:
-        """Round every tensor to the nearest float32 numbers."""
         for name in (*DIFFERENTIABLE, *CAMERAS):
             setattr(self, name, getattr(self, name).float().double())
 
     def leaves(self, dtype: torch.dtype = torch.float32) -> dict[str, Tensor]:
-        """Fresh copies of all differentiable inputs, each a leaf that requires its gradient."""
+        """Copies of the differentiable inputs that require gradients."""
         return {name: getattr(self, name).to(dtype).clone().requires_grad_() for name in DIFFERENTIABLE}
 
     def settings(self) -> dict[str, Any]:
-        """The keyword arguments that are not tensors."""
+        """Keyword arguments other than tensors."""
         names = ("width", "height", "sh_degree", "near_plane")
         return {name: getattr(self, name) for name in names}
 
     def draw(self, leaves: dict[str, Tensor], **changes: Any) -> tuple[Tensor, Tensor, dict[str, Any]]:
-        """`rasterization` of the leaves."""
         cameras = {name: getattr(self, name).to(leaves["means"]) for name in CAMERAS}
         return rasterization(**{**cameras, **leaves, **self.settings(), **changes})
 
     def results(self, leaves: dict[str, Tensor] | None = None, **changes: Any) -> dict[str, Tensor]:
-        """All results: images, alphas, meta and the gradients of a fixed random loss."""
+        """Images, alphas, meta and the gradients of a random loss."""
         leaves = self.leaves() if leaves is None else leaves
         images, alphas, meta = self.draw(leaves, **changes)
         meta["means2d"].retain_grad()
@@ -72,7 +70,7 @@ class Scene:
         return {name: tensor.detach() for name, tensor in found.items()}
 
     def dense_arguments(self, leaves: dict[str, Tensor], camera: int) -> dict[str, Any]:
-        """The arguments of `dense_rasterization` for one of the cameras."""
+        """Arguments of `dense_rasterization` for one camera."""
         arguments: dict[str, Any] = {**leaves, **self.settings()}
         backgrounds = arguments.pop("backgrounds")
         return {
@@ -96,7 +94,7 @@ def random_scene(
     size: float = 0.1,
     seed: int = 0,
 ) -> Scene:
-    """Random Gaussians seen by slightly rotated cameras with principal points off centre."""
+    """Random Gaussians and slightly rotated cameras with off-centre principal points."""
     generator = torch.Generator().manual_seed(seed)
 
     def normal(*shape: int) -> Tensor:
@@ -142,7 +140,7 @@ def opaque_walls_of_features() -> Scene:
 
 
 def coincident(**changes: Any) -> Scene:
-    """10,000 Gaussians at one place, so faint that thousands of them add to each pixel before it stops."""
+    """10,000 Gaussians at one place, faint enough that thousands contribute to each pixel."""
     scene = random_scene(count=10_000, width=6, height=5, size=0.5, seed=20, **changes)
     return replace(
         scene,
@@ -152,7 +150,7 @@ def coincident(**changes: Any) -> Scene:
 
 
 def needles() -> Scene:
-    """Long and thin, in all directions and along the rows: the exponential recurrence at its limit."""
+    """Long and thin, along the rows too: the limit of the exponential recurrence."""
     scene = random_scene(count=60, width=70, height=80, seed=2)
     half_turns = torch.linspace(-0.3, 0.3, 30).double() / 2
     scene.quats[:30] = torch.stack([half_turns.cos(), 0 * half_turns, 0 * half_turns, half_turns.sin()], -1)
@@ -177,13 +175,13 @@ def around_the_near_plane() -> Scene:
     means[:, 2] = torch.cat(
         [
             torch.linspace(-2, -0.01, 10),  # behind the camera
-            torch.linspace(0.01, 0.24, 10),  # before it, and not drawn
-            torch.full((10,), near),  # on the plane, which is drawn
+            torch.linspace(0.01, 0.24, 10),  # before the near plane, not drawn
+            torch.full((10,), near),  # on the near plane, drawn
             near * (1 + torch.tensor([-0.1, -1e-3, -1e-4, 1e-4, 1e-3, 0.01, 0.02, 0.05, 0.1, 0.2])),
             torch.linspace(0.3, 3, 10),
         ]
     )
-    # Looking straight along z from the origin, depths are exact.
+    # Depths are exact along the z axis.
     return replace(scene, means=means, viewmats=torch.eye(4)[None], near_plane=near)
 
 

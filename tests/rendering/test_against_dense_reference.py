@@ -1,4 +1,4 @@
-"""Images and all gradients against the dense float64 reference."""
+"""Images and gradients against the dense float64 reference."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ GRADIENT_ERROR = 1e-4  # the largest difference by the largest gradient
 def draw_densely(
     scene: Scene, leaves: dict[str, Tensor], shifts: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
-    """Images and alphas as `rasterization` returns them."""
+    """Images and alphas in the layout of `rasterization`."""
     drawn = [
         dense_rasterization(
             **scene.dense_arguments(leaves, camera), shifts=None if shifts is None else shifts[camera]
@@ -28,9 +28,9 @@ def draw_densely(
 
 
 def errors(scene: Scene) -> dict[str, float]:
-    """The absolute errors of image and alpha, and the relative ones of each gradient."""
+    """Absolute errors of images and alphas, relative errors of gradients."""
     exact, ours = scene.leaves(torch.float64), scene.leaves(torch.float32)
-    # For the gradients of the projected centres; the many coincident ones would need too much memory.
+    # For the gradients of means2d; too large for the scene with 10,000 Gaussians.
     shifts = None
     if len(scene.means) <= 200:
         pixels = scene.height * scene.width

@@ -1,4 +1,4 @@
-"""The conventions of 3DGS, each against numbers computed by hand."""
+"""Conventions of 3DGS against values computed by hand."""
 
 from __future__ import annotations
 
@@ -38,11 +38,11 @@ def draw(
 
 
 def test_pixel_centres() -> None:
-    # The principal point of 9 pixels is 4.5: the middle of pixel 4, where alpha is the opacity itself.
+    # The principal point 4.5 is the centre of pixel 4, where alpha is the opacity.
     image, alpha = draw([[0, 0, 1]], [0.5], [[1, 0.5, 0.25]])
     assert alpha[4, 4] == pytest.approx(0.5, abs=1e-6)
     assert image[4, 4].tolist() == pytest.approx([0.5, 0.25, 0.125], abs=1e-6)
-    # One pixel to the side: variance (10 * 0.01)^2 + 0.3 pixels^2.
+    # The next pixel: variance (10 * 0.01)^2 + 0.3 pixels^2.
     assert alpha[4, 5] == pytest.approx(0.5 * math.exp(-0.5 / 0.31), abs=1e-6)
     assert alpha[5, 4] == alpha[4, 5] == alpha[3, 4] == alpha[4, 3]
 
@@ -53,7 +53,7 @@ def test_axes() -> None:
 
 
 def test_transmittance_threshold() -> None:
-    # 0.1^3 = 1e-3 passes; the fourth would leave 1e-4 exactly or less, and is not drawn.
+    # The fourth Gaussian would leave less than 1e-4 and is not drawn.
     _, alpha = draw([[0, 0, 1.0 + i] for i in range(5)], [0.91] * 5, [[1, 1, 1]] * 5, scale=0.3)
     assert 1 - alpha[4, 4] == pytest.approx(0.09**3, rel=1e-3)
 

@@ -1,4 +1,4 @@
-"""Models that a network decodes: rendering, moving, selecting, writing and reading."""
+"""Models decoded by a network: rendering, transforms, files."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ def model() -> DecodedGaussians:
     return DecodedGaussians.of(random_gaussians(50, sh_degree=1), network(), features)
 
 
-def convolved(image: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
-    """A 3x3 convolution over [H, W, C], zeros outside, as nine sums: slow and plain."""
+def convolve(image: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+    """A zero-padded 3x3 convolution over [H, W, C] as nine sums."""
     height, width, _ = image.shape
     padded = torch.zeros(height + 2, width + 2, image.shape[2])
     padded[1:-1, 1:-1] = image
@@ -60,7 +60,7 @@ def test_render(model: DecodedGaussians) -> None:
         backgrounds=model.network.background[None],
     )
     (first, second) = model.network.layers
-    expected = convolved(convolved(drawn[0], *first).relu(), *second)
+    expected = convolve(convolve(drawn[0], *first).relu(), *second)
     torch.testing.assert_close(render(model, camera), expected, atol=1e-4, rtol=1e-4)
 
 

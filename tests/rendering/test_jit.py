@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 
 from keyss.kernels import jit
-from keyss.rendering.cpu import blending
 from rendering.child_process import SOURCE, python
 
 
@@ -21,15 +20,9 @@ def add_one(x: float) -> float:
 
 
 @pytest.fixture(autouse=True)
-def _forgotten_folder() -> Iterator[None]:
+def _clear_cache() -> Iterator[None]:
     yield
     jit.cache_folder.cache_clear()
-
-
-def test_kernels_are_cached_in_the_folder_of_these_sources() -> None:
-    folder = jit.cache_folder()
-    assert folder is not None
-    assert Path(blending.blend.stats.cache_path).is_relative_to(folder)
 
 
 @pytest.mark.skipif(not hasattr(os, "getuid"), reason="folders have no owners and modes here")
@@ -52,15 +45,8 @@ def test_unsafe_cache_folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     assert not is_used()
     folder.chmod(0o700)
     another = os.getuid() + 1
-    monkeypatch.setattr(os, "getuid", lambda: another)  # the folder was made by somebody else
+    monkeypatch.setattr(os, "getuid", lambda: another)  # as if another user owned the folder
     assert not is_used()
-
-
-def test_kernels_compile_without_any_cache(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(jit, "cache_folder", lambda: None)
-    compiled = jit.kernel(add_one)
-    assert compiled(np.float32(1)) == 2
-    assert compiled.stats.cache_path is None
 
 
 def test_cache_folder_is_recreated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -86,7 +72,7 @@ assert images.max() > 0.9
 
 @pytest.mark.slow
 def test_render_without_cache(tmp_path: Path) -> None:
-    # Files where the folders would have to be: not even root can write below them.
+    # Files in place of folders block even root.
     copy = tmp_path / "source"
     shutil.copytree(SOURCE / "keyss", copy / "keyss", ignore=shutil.ignore_patterns("__pycache__"))
     blocked = copy / "keyss" / "rendering" / "cpu" / "__pycache__"

@@ -1,40 +1,15 @@
-"""Memory for the kernels is recycled, never shared, and bounded."""
+"""Peak memory of the CPU rasterizer."""
 
 from __future__ import annotations
 
-import gc
 import sys
 
-import numpy as np
 import pytest
 
-from keyss.kernels import memory
 from rendering.child_process import python
 
-
-@pytest.fixture(autouse=True)
-def _nothing_free(monkeypatch: pytest.MonkeyPatch) -> None:
-    gc.collect()
-    monkeypatch.setattr(memory, "_free", {})
-
-
-def test_buffers_are_reused_when_freed() -> None:
-    first = memory.empty((1000, 100), np.float32)
-    address = first.ctypes.data
-    assert address % 64 == 0
-    view = first[10:].reshape(-1)
-    del first
-    other = memory.empty((1000, 100), np.float32)
-    assert not np.shares_memory(other, view)
-    del view
-    again = memory.empty((1000, 90), np.int32)
-    assert again.ctypes.data == address
-    assert again.shape == (1000, 90)
-    assert again.dtype == np.int32
-
-
-# A million Gaussians as in fitted scenes, nearly all of them visible. A few are drawn before, so that what
-# the compiler takes is not counted.
+# A million Gaussians as in fitted scenes, most of them visible. A small scene is drawn first, so that memory
+# of the compiler does not count.
 DRAW_A_MILLION = """
 import math, resource, torch
 from keyss.rendering import rasterization

@@ -25,14 +25,12 @@ def test_orbit() -> None:
         rotation = camera.viewmat[:3, :3].double()
         torch.testing.assert_close(rotation @ rotation.T, torch.eye(3).double(), atol=1e-6, rtol=0)
         assert torch.det(rotation) > 0
-    # No side of the model is left out.
     sides = torch.cat([torch.eye(3)[[0, 2]], -torch.eye(3)[[0, 2]]])
     assert ((outward @ sides.T) > 0.7).any(0).all()
     assert (camera_positions(cameras) - middle).norm(dim=1).min() > radius
 
 
 def test_faint_and_distant_gaussians_are_ignored() -> None:
-    """Most models have faint giants and a few distant floaters."""
     model = random_gaussians(500)
     middle, radius = middle_and_radius(model)
     far = replace(model[:20], means=model[:20].means * 1000 + 500)

@@ -1,4 +1,4 @@
-"""The arguments are those of gsplat; errors name wrong and unsupported ones."""
+"""The signature is gsplat's; errors name invalid and unsupported arguments."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def good_arguments() -> dict[str, Any]:
     ],
 )
 def test_wrong_types_and_values(name: str, value: object) -> None:
-    """Of wrong shapes see test_properties.py."""
+    """See test_properties.py for shapes."""
     with pytest.raises(ValueError, match=name):
         rasterization(**{**good_arguments(), name: value})
 
@@ -70,7 +70,7 @@ def test_sh_degree_needs_its_coefficients() -> None:
     [
         ("colors", torch.ones(2, 33)),
         ("colors", torch.ones(2, 0)),
-        ("colors", torch.ones(1, 2, 3)),  # of each camera
+        ("colors", torch.ones(1, 2, 3)),  # colours per camera
         ("means", torch.zeros(1, 2, 3)),
         ("viewmats", torch.eye(4).expand(1, 1, 4, 4)),
         ("sh_degree", 4),
@@ -95,7 +95,7 @@ def test_unsupported_arguments(name: str, value: object) -> None:
 
 
 def test_signature_matches_gsplat() -> None:
-    """Fails when a release of gsplat has a new argument."""
+    """Fails if a release of gsplat adds an argument."""
     theirs = inspect.signature(gsplat.rasterization).parameters
     ours = {
         name: parameter.default

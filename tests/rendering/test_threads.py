@@ -1,4 +1,4 @@
-"""Results do not depend on threads and processes; torch's threads are counted, and idle ones do not spin."""
+"""Results do not depend on threads and processes."""
 
 from __future__ import annotations
 
@@ -19,33 +19,33 @@ from rendering.child_process import digest, digest_on_threads
 from rendering.scenes import Scene, random_scene
 from tiny_scenes import tiny_scene
 
-PATIENCE = 120  # seconds until something hangs: far more than a busy machine needs
+PATIENCE = 120  # seconds; a timeout means a deadlock
 
 
 @pytest.fixture(autouse=True)
 def _eight_cores(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Allow as many helper threads as torch uses, on any machine."""
+    """Allow several helper threads on any machine."""
     monkeypatch.setattr(parallel, "_CORES", 8)
     threads = torch.get_num_threads()
     yield
     torch.set_num_threads(threads)
 
 
-def differing(first: dict[str, Tensor], second: dict[str, Tensor]) -> list[str]:
+def differences(first: dict[str, Tensor], second: dict[str, Tensor]) -> list[str]:
     assert first.keys() == second.keys()
     return [name for name in first if not torch.equal(first[name], second[name])]
 
 
-def many(**modes: object) -> Scene:
-    """More Gaussians than fit into one piece of work, seen from two sides, on many tiles."""
+def large_scene(**modes: object) -> Scene:
+    """Several chunks of Gaussians, two cameras, many tiles."""
     return random_scene(count=7000, width=150, height=130, size=0.05, cameras=2, **modes)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
     "scene",
     [
-        many(),
-        many(sh_degree=None, channels=7),
+        large_scene(),
+        large_scene(sh_degree=None, channels=7),
     ],
     ids=["colour", "features"],
 )
@@ -54,11 +54,11 @@ def test_results_do_not_depend_on_threads(scene: Scene) -> None:
     expected = scene.results()
     for name, tensor in expected.items():
         assert tensor.isfinite().all(), name
-    assert differing(scene.results(), expected) == []
+    assert differences(scene.results(), expected) == []
     for threads in (2, 3, 7):
         torch.set_num_threads(threads)
         for _ in range(2):
-            assert differing(scene.results(), expected) == []
+            assert differences(scene.results(), expected) == []
 
 
 @pytest.mark.parametrize("threads", [1, 3])
@@ -75,7 +75,7 @@ def test_concurrent_rendering(threads: int) -> None:
 
     def draw_repeatedly(some: list[int]) -> list[list[str]]:
         started.wait(PATIENCE)
-        return [differing(scenes[i].results(), expected[i]) for _ in range(3) for i in some]
+        return [differences(scenes[i].results(), expected[i]) for _ in range(3) for i in some]
 
     with ThreadPoolExecutor(2) as pool:
         for wrong in pool.map(draw_repeatedly, ([0, 1, 2, 3], [3, 2, 1, 0])):
@@ -104,11 +104,11 @@ def test_spawned_process() -> None:
 @pytest.mark.skipif(sys.platform != "linux", reason="fork is the default nowhere else")
 @pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
 def test_forked_process() -> None:
-    # The scene is made before the fork: after it torch's own operations hang, even exp of 1000 numbers.
+    # Create the scene before the fork: torch's own operations hang in a forked process.
     scene = random_scene(count=300, width=60, height=70)
     torch.set_num_threads(2)
     expected = digest(scene)
-    assert parallel._pools  # helper threads, none of which lives on in the child
+    assert parallel._pools  # threads do not survive the fork
     context = multiprocessing.get_context("fork")
     queue: multiprocessing.Queue[str] = context.Queue()
     child = context.Process(target=lambda: queue.put(digest(scene)))

@@ -1,4 +1,4 @@
-"""Bounds of hidden scenes: plain 3DGS of as many Gaussians and training steps."""
+"""Upper bounds: plain 3DGS with the same budget."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ KEY = "a key of many characters: 93hXmQ2"
 
 
 def count_steps(monkeypatch: pytest.MonkeyPatch) -> dict[str, int]:
-    """Counts of the steps that each plain training takes from now on."""
+    """Count the steps of each plain training."""
     counts: dict[str, int] = {}
     step, begin = PlainRun.step, PlainRun.__init__
 
@@ -38,14 +38,13 @@ def count_steps(monkeypatch: pytest.MonkeyPatch) -> dict[str, int]:
 def test_bound_has_equal_steps(
     folders: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Counted where training happens, not where it is written down."""
     counts = count_steps(monkeypatch)
     options = CarryOptions(fit=FIT, publish="any", refit="always", iterations=30)
     result = keyss.hide(
         folders[0], [Secret(folders[1], KEY)], method=options, bound=True, min_psnr=0, out=tmp_path / "run"
     )
     steps = list(counts.values())
-    assert steps == [40, 40, 30, 70]  # both plain models, the secret trained on, and its bound
+    assert steps == [40, 40, 30, 70]  # cover, secret, refit of the secret, bound
     metrics = result.metrics
     assert metrics.steps == metrics.baseline.steps == (steps[0], steps[1] + steps[2]) == (40, steps[3])
     assert metrics.baseline.equal == (True, True)
@@ -65,7 +64,7 @@ def test_shorter_fit_is_no_bound(
     options = CarryOptions(fit=FIT, publish="any", refit="always")
     metrics = keyss.hide(folders[0], [secret], method=options, min_psnr=0).metrics
     assert list(counts.values()) == [25, 40, 46]
-    assert metrics.steps == (40, 71)  # a model of `keyss fit` says how long it was trained
+    assert metrics.steps == (40, 71)  # recorded by `keyss fit`
     assert metrics.baseline.steps == (40, 25)
     assert metrics.baseline.equal == (True, False)
     unknown = Secret(folders[1], KEY, fitted.gaussians)
@@ -75,4 +74,4 @@ def test_shorter_fit_is_no_bound(
     carried = keyss.hide(
         folders[0], [unknown], method=CarryOptions(fit=FIT, publish="any"), bound=True, min_psnr=0
     ).metrics
-    assert carried.baseline.equal == (True, True)  # nothing is trained on
+    assert carried.baseline.equal == (True, True)  # no refit

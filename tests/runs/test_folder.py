@@ -1,4 +1,4 @@
-"""Folders of runs: all files or none, no changes to files of others, nothing stale."""
+"""Run folders: all files or none, foreign files stay."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from keyss.files import lock, write_bytes
 from keyss.runs import MANIFEST, Manifest, RunFolder, read_manifest, write_again
 
 
-def tree(folder: Path) -> dict[str, bytes]:
-    """All files but the manifest."""
+def read_files(folder: Path) -> dict[str, bytes]:
+    """All files except the manifest."""
     files = {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
     return {name: data for name, data in files.items() if not name.endswith(MANIFEST)}
 
 
-def failing(error: BaseException) -> Callable[[Path], None]:
+def fail_with(error: BaseException) -> Callable[[Path], None]:
     def write(path: Path) -> None:
         path.write_bytes(b"a part")
         raise error
@@ -27,7 +27,7 @@ def failing(error: BaseException) -> Callable[[Path], None]:
     return write
 
 
-def make(path: Path, stage: str = "hide", files: dict[str, bytes] | None = None, **how: object) -> None:
+def write_run(path: Path, stage: str = "hide", files: dict[str, bytes] | None = None, **how: object) -> None:
     folder = RunFolder(path, stage, **how)  # type: ignore[arg-type]
     with folder.work():
         names = {"publish/model.ply": b"1", "private/cover.ply": b"2"} if files is None else files
@@ -35,9 +35,9 @@ def make(path: Path, stage: str = "hide", files: dict[str, bytes] | None = None,
 
 
 def interrupt(path: Path, arguments: dict[str, object], stage: str = "hide", **how: bool) -> None:
-    """Leaves a checkpoint."""
+    """Interrupt a run after its checkpoint."""
     folder = RunFolder(path, stage, arguments, **how)
-    contents = {"publish/model.ply": b"half", "x": failing(KeyboardInterrupt())}
+    contents = {"publish/model.ply": b"half", "x": fail_with(KeyboardInterrupt())}
     with pytest.raises(KeyboardInterrupt), folder.work():  # noqa: PT012
         write_bytes(folder.checkpoints / "fit", b"state")
         folder.write(contents)
@@ -49,8 +49,8 @@ def test_files_and_permissions(tmp_path: Path, umask: None) -> None:
     with folder.work():
         (folder.checkpoints / "fit").touch()
         folder.write({"publish/model.ply": b"1", "private/cover.ply": b"2"})
-        assert tree(tmp_path).keys().isdisjoint({"a/run/publish/model.ply"})
-    assert tree(folder.path) == {"publish/model.ply": b"1", "private/cover.ply": b"2"}
+        assert read_files(tmp_path).keys().isdisjoint({"a/run/publish/model.ply"})
+    assert read_files(folder.path) == {"publish/model.ply": b"1", "private/cover.ply": b"2"}
     modes = {str(p.relative_to(folder.path)): p.stat().st_mode & 0o777 for p in folder.path.rglob("*")}
     assert modes == {
         "publish": 0o755,
@@ -71,18 +71,18 @@ def test_failed_write_leaves_nothing(
 ) -> None:
     path = tmp_path / "run"
     if there:
-        make(path)
-    before = tree(tmp_path), read_manifest(path)
+        write_run(path)
+    before = read_files(tmp_path), read_manifest(path)
     folder = RunFolder(path, "hide", overwrite=there)
     with pytest.raises(raised), folder.work():
-        folder.write({"publish/model.ply": b"new", "y": failing(error)})
-    assert (tree(tmp_path), read_manifest(path)) == before
+        folder.write({"publish/model.ply": b"new", "y": fail_with(error)})
+    assert (read_files(tmp_path), read_manifest(path)) == before
     assert path.exists() == there
 
 
 def test_overwrite(tmp_path: Path) -> None:
-    make(tmp_path, files={"publish/model.ply": b"1", "publish/model.spz": b"2", "private/old/x": b"3"})
-    make(tmp_path, "audit", {"private/report.html": b"4"}, onto=("hide",))
+    write_run(tmp_path, files={"publish/model.ply": b"1", "publish/model.spz": b"2", "private/old/x": b"3"})
+    write_run(tmp_path, "audit", {"private/report.html": b"4"}, onto=("hide",))
     foreign = {
         "notes.txt": b"mine",
         "checkpoint/x": b"my own",
@@ -92,8 +92,8 @@ def test_overwrite(tmp_path: Path) -> None:
     for name, data in foreign.items():
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_bytes(data)
-    make(tmp_path, files={"publish/model.ply": b"new"}, overwrite=True)
-    assert tree(tmp_path) == foreign | {"publish/model.ply": b"new"}
+    write_run(tmp_path, files={"publish/model.ply": b"new"}, overwrite=True)
+    assert read_files(tmp_path) == foreign | {"publish/model.ply": b"new"}
     assert read_manifest(tmp_path).files == {"hide": ("publish/model.ply",)}
 
 
@@ -103,8 +103,8 @@ def test_foreign_files_are_kept(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match="in the way"):
         RunFolder(tmp_path, "hide", writes=("publish/model.ply",), overwrite=True)
     with pytest.raises(OutputError, match="in the way"):
-        make(tmp_path, overwrite=True)
-    assert tree(tmp_path) == {"publish/model.ply": b"mine"}
+        write_run(tmp_path, overwrite=True)
+    assert read_files(tmp_path) == {"publish/model.ply": b"mine"}
 
 
 def test_existing_folder(tmp_path: Path) -> None:
@@ -117,7 +117,7 @@ def test_existing_folder(tmp_path: Path) -> None:
         RunFolder(tmp_path / "notes.txt", "hide")
     with pytest.raises(UsageError, match="give one of them"):
         RunFolder(tmp_path, "hide", overwrite=True, resume=True)
-    make(tmp_path, overwrite=True)
+    write_run(tmp_path, overwrite=True)
     with pytest.raises(OutputError, match=r"holds a finished run \(hide\)"):
         RunFolder(tmp_path, "hide", resume=True)
 
@@ -125,7 +125,7 @@ def test_existing_folder(tmp_path: Path) -> None:
 def test_resume(tmp_path: Path) -> None:
     arguments: dict[str, object] = {"width": 200, "options": {"seed": 0, "fit": {"iterations": 10}}}
     interrupt(tmp_path, arguments)
-    assert tree(tmp_path) == {"private/checkpoint/fit": b"state"}
+    assert read_files(tmp_path) == {"private/checkpoint/fit": b"state"}
     with pytest.raises(OutputError, match=r"interrupted run.*`resume=True`"):
         RunFolder(tmp_path, "hide", arguments)
     other = {"width": 160, "options": {"seed": 0, "fit": {"iterations": 20}}}
@@ -140,19 +140,19 @@ def test_resume(tmp_path: Path) -> None:
     with folder.work():
         assert (folder.checkpoints / "fit").read_bytes() == b"state"
         folder.write({"publish/model.ply": b"whole"})
-    assert tree(tmp_path) == {"publish/model.ply": b"whole"}
+    assert read_files(tmp_path) == {"publish/model.ply": b"whole"}
 
 
 def test_killed_before_first_checkpoint(tmp_path: Path) -> None:
     interrupt(tmp_path, {"width": 1})
-    (tmp_path / "private" / "checkpoint" / "fit").unlink()  # as a kill before the first checkpoint leaves it
-    make(tmp_path)
-    assert tree(tmp_path)["publish/model.ply"] == b"1"
+    (tmp_path / "private" / "checkpoint" / "fit").unlink()
+    write_run(tmp_path)
+    assert read_files(tmp_path)["publish/model.ply"] == b"1"
     assert read_manifest(tmp_path).running is None
 
 
 def test_lock(tmp_path: Path) -> None:
-    make(tmp_path)
+    write_run(tmp_path)
     with lock(tmp_path / "private" / "lock", tmp_path):
         with pytest.raises(OutputError, match="another process is writing it"):
             RunFolder(tmp_path, "hide", overwrite=True)
@@ -165,7 +165,7 @@ def test_lock(tmp_path: Path) -> None:
 def test_forged_manifest(tmp_path: Path, name: str) -> None:
     (tmp_path / "victim").write_bytes(b"mine")
     run = tmp_path / "run"
-    make(run)
+    write_run(run)
     (run / MANIFEST).write_bytes(msgspec.json.encode(Manifest(files={"hide": (name,)})))
     with pytest.raises(OutputError, match="is not a file in this folder"):
         RunFolder(run, "hide", overwrite=True)
@@ -176,10 +176,10 @@ def test_symlinks_are_not_followed(tmp_path: Path) -> None:
     elsewhere.mkdir()
     (elsewhere / "model.ply").write_bytes(b"mine")
     run = tmp_path / "run"
-    make(run)
+    write_run(run)
     (run / "publish" / "model.ply").unlink()
     (run / "publish").rmdir()
     (run / "publish").symlink_to(elsewhere)
     with pytest.raises(OutputError, match="leads out of"):
-        make(run, overwrite=True)
+        write_run(run, overwrite=True)
     assert (elsewhere / "model.ply").read_bytes() == b"mine"

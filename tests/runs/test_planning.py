@@ -1,4 +1,4 @@
-"""Plans of runs, compared with the runs."""
+"""Plans of runs."""
 
 from __future__ import annotations
 

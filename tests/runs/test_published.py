@@ -1,4 +1,4 @@
-"""Files beside the published model: with no method do they name or show a secret."""
+"""Published files do not identify a secret; all others are private."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ METHODS = {
 
 
 def _hide(folder: Path, options: MethodOptions, **how: object) -> Path:
-    """Hide models whose file names describe them."""
+    """Hide models with telling file names."""
     names = {"of-a-meadow.ply": trained_like(1500, 0), "of-the-treasure.ply": trained_like(100, 1)}
     for name, model in names.items():
         keyss.write_model(folder / name, model)
@@ -55,7 +55,7 @@ def _modes(folder: Path) -> dict[str, int]:
 
 
 def _identifying_bytes(run: Path, folder: Path) -> list[bytes]:
-    """Data that would confirm a reader's guess: names, the seed, hashes and numbers."""
+    """Names, the seed, hashes and numbers that would confirm a guess."""
     config = json.loads((run / "private" / "config.json").read_text())
     models: list[Gaussians] = [keyss.read_model(folder / "of-the-treasure.ply")]
     models += [keyss.read_model(path) for path in (run / "private").glob("*.ply")]
@@ -92,6 +92,6 @@ def test_revealed_models_are_private(tmp_path: Path) -> None:
     run = _hide(tmp_path, METHODS["carry"])
     keyss.reveal(run / "publish" / "model.ply", KEY, out=tmp_path / "revealed.ply")
     assert _modes(tmp_path / "revealed.ply") == {"revealed.ply": 0o600}
-    (run / "private").chmod(0o755)  # as an older program left it
+    (run / "private").chmod(0o755)
     keyss.evaluate(run, [KEY])
     assert set(_modes(run / "private").values()) == {0o700, 0o600}

@@ -1,4 +1,4 @@
-"""Records in JSON files, and errors that name the file."""
+"""JSON records."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def test_round_trip(tmp_path: Path) -> None:
 
 
 def test_undecodable_file_names() -> None:
-    """Python represents bytes outside the locale's encoding by surrogates."""
+    """Python represents undecodable bytes by surrogates."""
     name = "Füchse".encode().decode("ascii", "surrogateescape") + b"\xff".decode("utf-8", "surrogateescape")
     data = record_bytes(Record(name=name, scores={name: Scores((1.0,), None)}))
     assert list(json.loads(data)["scores"]) == [json.loads(data)["name"]] == ["Füchse\ufffd"]

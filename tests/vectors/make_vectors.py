@@ -1,9 +1,9 @@
-"""Write the known answers of this folder again, after a change of format that is meant.
+"""Regenerate the known answers in this folder after an intended change of format.
 
     python tests/vectors/make_vectors.py
 
-`carried.json` is not written here: what old files revealed, new ones must reveal too. `revealed.json` says
-what keys open in the models of this folder, and is what the reader in `web/` is tested against.
+`carried.json` stays: new files must reveal what old ones did. `revealed.json` holds what keys open in the
+models of this folder; the reader in `web/` is tested against it.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ from vectors.surviving import NAMES, write_surviving  # noqa: E402
 
 
 def cell() -> dict[str, object]:
-    """A cell as docs/format.md describes it, by the library's own modes of operation."""
+    """A cell as in docs/format.md, by the cipher modes of `cryptography`."""
     secret, identity = bytes(range(32)), bytes(range(16))
     label, data, slot, tag_bytes = "record", b"\x02\x01\x00record", 1, 4
 
@@ -81,7 +81,7 @@ def cell() -> dict[str, object]:
 
 
 def derivation() -> dict[str, object]:
-    """What keys become, by the libraries themselves."""
+    """Key derivation by argon2-cffi and `cryptography`."""
     vectors = json.loads((FOLDER / "derivation.json").read_text())
     for vector in vectors["valid"]:
         key, salt = unicodedata.normalize("NFKC", vector["key"]).encode(), bytes.fromhex(vector["salt"])
@@ -92,7 +92,7 @@ def derivation() -> dict[str, object]:
     return vectors
 
 
-def revealed(name: str, key: str) -> dict[str, Any]:
+def reveal_content(name: str, key: str) -> dict[str, Any]:
     """What `key` opens in a file of this folder: SHA-256 of float32 columns, or of a payload."""
     stego = read_model(FOLDER / name)
     content = open_content(stego, key)
@@ -101,23 +101,20 @@ def revealed(name: str, key: str) -> dict[str, Any]:
         return found | {"payload": hashlib.sha256(content.data).hexdigest()}
     secret = unpack(content)
     model = secret.reveal(stego)
-    return found | shown(model, secret.count, len(model) < secret.count)
+    return found | summary(model, secret.count, len(model) < secret.count)
 
 
-def shown(model: Gaussians, hidden: int, compensated: bool) -> dict[str, Any]:
-    """SHA-256 of float32 columns; opacities that make up for lost Gaussians as numbers."""
+def summary(model: Gaussians, hidden: int, compensated: bool) -> dict[str, Any]:
+    """SHA-256 of float32 columns; compensated opacities as numbers."""
     found: dict[str, Any] = {"count": len(model), "hidden": hidden, "sha256": digests(model)}
-    if compensated:  # by single precision, in which processors differ in the last bit
+    if compensated:  # processors differ in the last bit
         del found["sha256"]["opacity_logits"]
         found["opacity_logits"] = [round(each, 6) for each in model.opacity_logits.tolist()]
     return found
 
 
-def pruned() -> Gaussians:
-    """Two secrets that share carriers, in a model whose quaternions have unit length and are not in use.
-
-    Then some of its Gaussians are lost, some are there twice, and all are shuffled.
-    """
+def pruned_model() -> Gaussians:
+    """Two secrets that share carriers: unit quaternions, pruned, shuffled, with duplicates."""
     cover = trained_like(1000, 3, sh_degree=2)
     cover = replace(cover, quats=torch.nn.functional.normalize(cover.quats))
     secrets = [
@@ -153,7 +150,7 @@ def main() -> None:
 
 
 def write_published() -> None:
-    """One model in the formats that are published, and what Python reads of each."""
+    """A model in every published format, and what Python reads of each."""
     model = model_of(300, 2, seed=7)
     files = {
         "published.spz": SpzCodes.write(model),
@@ -171,7 +168,7 @@ def write_published() -> None:
 
 
 def write_coded(suffix: str) -> None:
-    """A model whose codes hold two secrets: a model, and another one or a file."""
+    """A model whose codes hold two secrets: two models, or a model and a file."""
     cover = coded.model_of(2300, 11, 0)
     other = {
         ".spz": Payload(METHOD, whole.encode(trained_like(25, 12, 2))),
@@ -185,7 +182,7 @@ def write_coded(suffix: str) -> None:
 
 
 def write_decoded(suffix: str) -> None:
-    """A .ply that was decoded from codes, with a secret in their place."""
+    """A .ply decoded from codes, with a secret."""
     codes = coded.FORMATS[suffix].of(coded.model_of(1500, 21, 0))
     model = codes.dequantise()
     payload = HiddenFile("a note.txt", b"Written at night, read at noon.\n").payload()
@@ -196,14 +193,14 @@ def write_decoded(suffix: str) -> None:
 
 
 def write_extremes() -> None:
-    """Numbers far from what training gives, in formats in which they tell how many bits carry."""
+    """Extreme values in formats where they determine how many bits carry."""
     random = np.random.default_rng(15)
     codes = random_sog(random, 60, 0)
     same = {
         name: getattr(codes, name).copy() for name in ("scales", "colors", "alphas", "largest", "positions")
     }
     for each in same.values():
-        each[40:] = each[:20]  # Gaussians alike in all that is not written
+        each[40:] = each[:20]  # equal except for written codes
     codes = replace(codes, **same, mins=np.array([-40.0, 1, 5e-310]), maxs=np.array([60.0, 1, 0]))
     codes = replace(codes, scale_codebook=(16 * codes.scale_codebook).astype(np.float32))
     (FOLDER / "extreme.sog").write_bytes(codes.serialise())
@@ -214,28 +211,28 @@ def write_extremes() -> None:
 
 
 def write_counted() -> None:
-    """How many bits carry in the codes of this folder's files, and which these are."""
+    """The carrier bits in the codes of this folder's files."""
     bits = {}
     for path in sorted([*FOLDER.glob("published*"), *FOLDER.glob("coded*"), *FOLDER.glob("extreme*")]):
         if path.suffix != ".json" and isinstance(model := read_model(path), CodedGaussians):
-            bits[path.name] = counted(model)
+            bits[path.name] = carrier_bits(model)
     numbers = [0.0, 1.0, -3.0, 0.75, 1e-5, 6.5e4, 5e-324, -1e-310, 2.0**-1022, 1.7e308, 2.0**-14 * 1.0001]
     logs = {repr(each): float(_log2(np.array([each]))[0]) for each in numbers}
     (FOLDER / "counted.json").write_text(json.dumps({"bits": bits, "log2": logs}, indent=1) + "\n")
 
 
-def counted(model: CodedGaussians) -> dict[str, Any]:
-    """The last bits of all levels: their number, and SHA-256 of a byte for each."""
+def carrier_bits(model: CodedGaussians) -> dict[str, Any]:
+    """Number and SHA-256 of the last bits of all levels."""
     bits = last_bits(in_counted_order(model.codes)[2])
     return {"count": len(bits), "sha256": hashlib.sha256(bits.tobytes()).hexdigest()}
 
 
 def write_whole() -> None:
-    """Models as one string of bytes."""
+    """Encoded whole models."""
     far = trained_like(40, 8, 0)
     far.means[3, 1] = -1e5  # an outlier
     seen = trained_like(40, 9, 3)
-    seen.log_scales[2] += 8  # its harmonics are as fine as they get, and those of the next as coarse
+    seen.log_scales[2] += 8  # the finest harmonics; the next has the coarsest
     seen.opacity_logits[3] = -14
     models = [seen, far, trained_like(10, 10, 1)[:1]]
     encoded = [whole.encode(each) for each in models]
@@ -244,7 +241,7 @@ def write_whole() -> None:
 
 
 def write_keyss() -> None:
-    """Some rows of what decoders of every kind make of models; some of their secrets were lost."""
+    """Rows decoded by decoders of every kind, partly from pruned secrets."""
     shapes = [
         DecoderShape(hidden=(6, 5), branch=4, sh_degree=1),
         DecoderShape(mask=("op", "sh"), hidden=(4, 4), branch=3, key_size=7, released=True),
@@ -260,14 +257,14 @@ def write_keyss() -> None:
             changed = replace(secret, frame=some_frame(), visibility=lost * secret.visibility)
             payloads.append((name, changed.payload().data))
     found = [
-        {"file": name, "payload": payload.hex()} | decoded(payload, read_model(FOLDER / name))
+        {"file": name, "payload": payload.hex()} | decode_rows(payload, read_model(FOLDER / name))
         for name, payload in payloads
     ]
     (FOLDER / "keyss.json").write_text(json.dumps(found, indent=1) + "\n")
 
 
 def write_activated() -> None:
-    """A model of unit size, with scales and opacities as renderers use them."""
+    """A model with activated scales and opacities."""
     random = np.random.default_rng(17)
     found = {
         "means": random.normal(size=330),
@@ -279,7 +276,7 @@ def write_activated() -> None:
 
 
 def decoder_of(shape: DecoderShape, stego: Gaussians) -> KeyssSecret:
-    """A secret with a decoder that changes much, in a frame of its own; a third of it was lost."""
+    """A pruned secret in another frame, whose decoder changes much."""
     generator = torch.Generator().manual_seed(16)
     decoder = Decoder(shape).requires_grad_(False)
     for weights in decoder.parameters():
@@ -289,13 +286,12 @@ def decoder_of(shape: DecoderShape, stego: Gaussians) -> KeyssSecret:
 
 
 def some_frame() -> Similarity:
-    """Moved, turned and scaled."""
     turn = torch.from_numpy(Rotation.from_rotvec([0.4, -1.1, 2.0]).as_matrix())
     return Similarity(0.8, turn, torch.tensor([1.0, -2.0, 0.5], dtype=torch.float64))
 
 
-def decoded(payload: bytes, stego: Gaussians) -> dict[str, Any]:
-    """How many Gaussians a payload reveals, and every 49th of them."""
+def decode_rows(payload: bytes, stego: Gaussians) -> dict[str, Any]:
+    """Number of Gaussians that a payload reveals, and every 49th of them."""
     model = KeyssSecret.of(Payload("keyss", payload)).reveal(stego)
     rows = {each.name: getattr(model[::STRIDE], each.name).flatten().tolist() for each in fields(Gaussians)}
     return {"count": len(model), "rows": {name: [round(v, 7) for v in each] for name, each in rows.items()}}
@@ -308,17 +304,17 @@ def digests(model: Gaussians) -> dict[str, str]:
 
 
 def write_revealed(key: str) -> None:
-    write_model(FOLDER / "pruned.ply", pruned())
-    opened = [revealed(name, key) for name in ("carried.ply", "keyss.ply")]
-    opened += [revealed("pruned.ply", each) for each in TWO_KEYS]
+    write_model(FOLDER / "pruned.ply", pruned_model())
+    opened = [reveal_content(name, key) for name in ("carried.ply", "keyss.ply")]
+    opened += [reveal_content("pruned.ply", each) for each in TWO_KEYS]
     for suffix in coded.FORMATS:
         write_coded(suffix)
-        opened += [revealed(f"coded{suffix}", each) for each in TWO_KEYS]
+        opened += [reveal_content(f"coded{suffix}", each) for each in TWO_KEYS]
         write_decoded(suffix)
-        opened.append(revealed(f"decoded-{suffix.split('.')[1]}.ply", TWO_KEYS[0]))
+        opened.append(reveal_content(f"decoded-{suffix.split('.')[1]}.ply", TWO_KEYS[0]))
     write_surviving(FOLDER, TWO_KEYS)
-    opened += [revealed(name, TWO_KEYS[0]) for name in NAMES]
-    opened += [revealed(name, TWO_KEYS[1]) for name in NAMES[:3:2]]
+    opened += [reveal_content(name, TWO_KEYS[0]) for name in NAMES]
+    opened += [reveal_content(name, TWO_KEYS[1]) for name in NAMES[:3:2]]
     (FOLDER / "revealed.json").write_text(json.dumps(opened, indent=1) + "\n")
 
 

@@ -1,4 +1,4 @@
-"""Models with secrets that survive other formats, as `make_vectors.py` writes them."""
+"""Models with secrets that survive conversion, for `make_vectors.py`."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ NOTE = HiddenFile("a note.txt", b"Written at noon, read at night.\n")
 
 
 def write_surviving(folder: Path, keys: tuple[str, str]) -> None:
-    """In Gaussians that were appended, and in colours: models, and files of other keys."""
+    """Models and files in appended Gaussians and in colours."""
     ply, spz, one, moved = (folder / name for name in NAMES)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", KeyssWarning)  # of more secrets than one
@@ -44,7 +44,7 @@ def write_surviving(folder: Path, keys: tuple[str, str]) -> None:
 
 
 def with_appended(keys: Sequence[str]) -> Gaussians:
-    """Among as many faint Gaussians of its own: places of lattices are not plain to see."""
+    """A cover in which half of the Gaussians are faint."""
     cover = trained_like(120, 23, 0)
     cover = replace(cover, opacity_logits=torch.where(torch.arange(120) % 2 == 0, -5.5, 2.0))
     payloads = [Payload(METHOD, whole.encode(trained_like(40, 24, 1))), NOTE.payload()]
@@ -52,6 +52,6 @@ def with_appended(keys: Sequence[str]) -> Gaussians:
 
 
 def elsewhere(model: Gaussians) -> Gaussians:
-    """Moved, turned and scaled."""
+    """Apply a similarity transform."""
     rotation = torch.from_numpy(Rotation.from_euler("xyz", [1.0, 2.0, 3.0]).as_matrix())
     return Similarity(math.pi / 2, rotation, torch.tensor([3.0, -2.0, 1.0])).apply_gaussians(model)

@@ -1,4 +1,4 @@
-"""The page in headless Chromium, and our own renders for comparison."""
+"""The page in headless Chromium, and renders of the same pose."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ SWITCHES = [
     *("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"),
 ]
 IN_CHROMIUM = [pytest.mark.argon2, pytest.mark.skipif(PROGRAM is None, reason="no Chromium on PATH")]
-PATIENCE = 120_000  # milliseconds for any one answer: other work may share the machine
+PATIENCE = 120_000  # milliseconds
 WIDTH, HEIGHT = 400, 300  # of the canvas, beside the panel
 PANEL = 340
 POSE = "#eye=1.5,-1.2,-6&target=0.2,0.1,0"
@@ -40,14 +40,14 @@ Picture = np.ndarray[Any, np.dtype[np.float64]]
 
 
 def bright_model(count: int, seed: int) -> Gaussians:
-    """A cover of visible Gaussians whose colours depend strongly on the direction."""
+    """Gaussians with strongly view-dependent colours."""
     model = trained_like(count, seed)
     sh = model.sh * torch.tensor([8.0, *[4.0] * 15])[None, :, None]
     return replace(model, log_scales=0.5 * model.log_scales, sh=sh)
 
 
 def camera_of(address: str, width: int = WIDTH, height: int = HEIGHT) -> Camera:
-    """The page's camera at the pose in its URL."""
+    """The camera of a pose in a URL."""
     found = parse_qs(address.partition("#")[2])
     eye, target = (torch.tensor([float(n) for n in found[name][0].split(",")]) for name in ("eye", "target"))
     forward = torch.nn.functional.normalize(target - eye, dim=0)
@@ -61,7 +61,7 @@ def camera_of(address: str, width: int = WIDTH, height: int = HEIGHT) -> Camera:
 
 
 def render_pose(model: Gaussians, address: str, width: int = WIDTH, height: int = HEIGHT) -> Picture:
-    """[H, W, 3] 0 to 255: our own render of the pose in an address."""
+    """Our render [H, W, 3], 0 to 255, of the pose in a URL."""
     return (render(model, camera_of(address, width, height)).clamp(0, 1) * 255).numpy().astype(np.float64)
 
 
@@ -74,7 +74,7 @@ class Visit:
     """A tab with its requests and messages."""
 
     page: Any
-    console_errors: list[str] = field(default_factory=list)  # errors on the console, and uncaught ones
+    console_errors: list[str] = field(default_factory=list)
     requests: list[str] = field(default_factory=list)
 
     def goto(self, address: str) -> None:
@@ -85,7 +85,7 @@ class Visit:
         self.page.wait_for_selector("main[data-picture=settled]")
 
     def at(self, pose: str) -> None:
-        """Move the camera there, also if the address has that pose already: it never has a secret's."""
+        """Move the camera, also if the URL has the pose already: secrets never change it."""
         self.page.frames[-1].evaluate(
             "pose => { location.hash = pose;"
             " dispatchEvent(new HashChangeEvent('hashchange', { newURL: location.href })) }",
@@ -93,7 +93,7 @@ class Visit:
         )
 
     def picture(self) -> Picture:
-        """[H, W, 3] 0 to 255 what is on the canvas, also in a frame, once it does not change any more."""
+        """The canvas [H, W, 3], 0 to 255, once it no longer changes."""
         frame = self.page.frames[-1]
         frame.evaluate("document.querySelector('.panel').style.visibility = 'hidden'")
         try:
@@ -109,9 +109,9 @@ class Visit:
         return np.asarray(Image.open(io.BytesIO(before)).convert("RGB")).astype(np.float64)
 
     def try_key(self, key: str, *, thorough: bool = False) -> list[float]:
-        """Returns when what the key opens is shown: the values of the progress bar, one for each derivation.
+        """Enter a key and wait for its result; returns the values of the progress bar.
 
-        The second search, of colours, takes four times as long as the first: it is stopped unless `thorough`.
+        The slow search of colours is stopped unless `thorough`.
         """
         self.page.fill("#key", key)
         seen = self.page.evaluate(
@@ -136,7 +136,7 @@ class Visit:
         return list(dict.fromkeys(self.page.evaluate("window.seen") if thorough else seen))
 
     def assert_finds_nothing(self, key: str) -> list[float]:
-        """Assert that a key changes nothing that can be seen; what `try_key` gives."""
+        """Assert that a key changes nothing visible; returns the result of `try_key`."""
         before = self.picture()
         work = self.try_key(key)
         assert np.abs(self.picture() - before).mean() < 0.01 * 255
@@ -147,7 +147,7 @@ class Visit:
         return work
 
     def save(self, button: str, path: Path) -> str:
-        """Save what a button downloads; its suggested name."""
+        """Save the download of a button; returns its suggested name."""
         with self.page.expect_download() as download:
             self.page.click(button)
         download.value.save_as(path)
@@ -156,7 +156,7 @@ class Visit:
 
 @contextmanager
 def visit(browser: Any, **options: Any) -> Iterator[Visit]:
-    """A new tab, which must not log errors; `options` are those of Playwright's `new_page`."""
+    """Open a tab, and assert that it logs no errors."""
     page = browser.new_page(**{"viewport": {"width": PANEL + WIDTH, "height": HEIGHT}} | options)
     page.set_default_timeout(PATIENCE)
     found = Visit(page)

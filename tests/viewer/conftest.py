@@ -1,4 +1,4 @@
-"""A new tab of Chromium for each test."""
+"""A tab of headless Chromium per test."""
 
 from __future__ import annotations
 

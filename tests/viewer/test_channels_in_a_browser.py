@@ -1,4 +1,4 @@
-"""Secrets of every channel, in pages that open from disk, end to end in headless Chromium."""
+"""Secrets of every channel in single-file pages, in headless Chromium."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def keys_of(kind: str) -> tuple[str, ...]:
 
 @pytest.fixture(scope="module")
 def published(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
-    """Gives the published model of a kind."""
+    """Hides secrets in a model of a kind."""
     folder = tmp_path_factory.mktemp("published")
 
     @cache
@@ -56,7 +56,7 @@ def published(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_keys(tab: Visit, published: Callable[[str], Path], tmp_path: Path, kind: str) -> None:
-    """Every key takes as many derivations, which are nearly all of the time."""
+    """Every key takes as many derivations."""
     stego = published(kind)
     tab.goto(export_html(stego, tmp_path / "page.html")[0].as_uri() + POSE)
     cover = tab.picture()
@@ -71,10 +71,10 @@ def test_keys(tab: Visit, published: Callable[[str], Path], tmp_path: Path, kind
         assert psnr(shown, render_pose(revealed, POSE)) > CLOSE > psnr(shown, cover)
         tab.save("#download", tmp_path / "secret.ply")
         saved = read_model(tmp_path / "secret.ply")
-        if kind == LATENT:  # latents are real numbers, which two languages compute with other roundings
+        if kind == LATENT:  # the languages round latents differently
             assert len(saved) == len(revealed)
             for name, values in vars(revealed).items():
-                loose = 1e-3 if name == "quats" else 1e-5  # w is the root of what x, y and z leave of 1
+                loose = 1e-3 if name == "quats" else 1e-5  # w is computed from x, y and z
                 torch.testing.assert_close(getattr(saved, name), values, atol=loose, rtol=1e-5)
         else:
             assert saved.digest() == revealed.digest()

@@ -1,4 +1,4 @@
-"""The page in frames of other sites, and its reader in other engines, in headless Chromium."""
+"""The page embedded in other sites, and its reader in other engines."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def stego(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def foreign(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, str]]:
-    """The folder and the origin of another site."""
+    """Folder and origin of another site."""
     folder = tmp_path_factory.mktemp("foreign")
     with serving(folder) as address:
         yield folder, address.rstrip("/")
@@ -129,5 +129,5 @@ def test_reader_in_other_engines(chromium: Any, stego: Path, tmp_path: Path, eng
         )
         page.wait_for_timeout(3000)
         picture = np.asarray(Image.open(io.BytesIO(page.locator("canvas").screenshot())).convert("RGB"))
-    assert picture.max() > 60  # it is black where nothing is drawn
+    assert picture.max() > 60  # the background is black
     page.close()

@@ -1,4 +1,4 @@
-"""The viewer end to end: headless Chromium, from disk and from `keyss view`, against our own renders."""
+"""The viewer in headless Chromium, from disk and from `keyss view`, against our renders."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from viewer.browser import CLOSE, IN_CHROMIUM, POSE, WEB, Visit, bright_model, p
 pytestmark = IN_CHROMIUM
 
 KEYS = ("the first key", "ein zweiter Schlüssel")
-FAR = "#eye=3,-2.4,-12&target=0.2,0.1,0"  # where no Gaussian is larger than engines draw
+FAR = "#eye=3,-2.4,-12&target=0.2,0.1,0"  # engines limit the size of near Gaussians
 AXE = WEB / "node_modules" / "axe-core" / "axe.min.js"
 
 
@@ -61,14 +61,14 @@ def served(stego: Path) -> Iterator[str]:
 def test_keys_leave_no_trace(tab: Visit, served: str) -> None:
     kept = "localStorage.length + sessionStorage.length + document.cookie.length + history.length"
 
-    def noticeable() -> tuple[object, ...]:  # workers are requested from memory, which nobody else sees
+    def noticeable() -> tuple[object, ...]:  # blob: URLs are not network requests
         asked = [url for url in tab.requests if not url.startswith("blob:")]
         return tab.page.title(), tab.page.evaluate(kept), asked
 
     tab.goto(served)
     tab.page.focus("#picture")
     for key in ("another key", KEYS[0]):
-        tab.page.keyboard.press("ArrowLeft")  # the address is written later, whatever the key opens
+        tab.page.keyboard.press("ArrowLeft")  # the URL is updated later, whatever the key opens
         before = noticeable()
         tab.page.fill("#key", key)
         tab.page.press("#key", "Enter")
@@ -89,7 +89,7 @@ def test_keys_leave_no_trace(tab: Visit, served: str) -> None:
 
 @pytest.mark.slow
 def test_timing_does_not_reveal_secret(tab: Visit, page_file: Path) -> None:
-    """Decoding and rendering take time that depends on the secret: the form is ready again before them."""
+    """The form is ready before decoding and rendering, whose time depends on the secret."""
     tab.goto(page_file.as_uri())
     tab.page.evaluate(
         """() => {
@@ -117,7 +117,7 @@ def test_damaged_files(tab: Visit, page_file: Path, tmp_path: Path) -> None:
         "none": b"",
     }.items():
         (tmp_path / name).write_bytes(content)
-        # What was message of the file before stays until this one is read.
+        # The message of the previous file stays until this one is read.
         tab.page.evaluate("() => { document.getElementById('problem').textContent = ''; }")
         tab.page.set_input_files("#file", tmp_path / name)
         tab.page.wait_for_function("() => document.getElementById('problem').textContent !== ''")
@@ -134,7 +134,6 @@ def test_slider(tab: Visit, page_file: Path, stego: Path, secrets: list[Gaussian
     (tmp_path / "cut.ply").write_bytes(stego.read_bytes()[:5000])
 
     def assert_seen(expected: str, slider: str | None) -> None:
-        """The published model beside a secret is seen from a pose of the secret's frame."""
         tab.at(FAR)
         found = tab.picture()
         close = [name for name, model in models.items() if psnr(found, render_pose(model, FAR)) > CLOSE]
@@ -152,7 +151,7 @@ def test_slider(tab: Visit, page_file: Path, stego: Path, secrets: list[Gaussian
     tab.try_key(KEYS[1])
     assert_seen("second", "100")
     tab.page.click("#keyless > summary")
-    tab.page.check("#faint")  # the published model is looked at
+    tab.page.check("#faint")  # shows the published model
     tab.page.wait_for_function("() => document.getElementById('count').textContent !== ''")
     tab.page.uncheck("#faint")
     tab.page.fill("#threshold", "0")
@@ -213,7 +212,7 @@ def test_keyboard(tab: Visit, page_file: Path) -> None:
     tab.page.wait_for_selector("main[aria-busy=false]")
     message = tab.page.locator("[role=status]").inner_text()
     assert message.startswith("Key tried. It reveals a model of 200 Gaussians.")
-    assert tab.page.evaluate("document.activeElement.id") == "key"  # where the next one can be typed
+    assert tab.page.evaluate("document.activeElement.id") == "key"  # ready for the next key
     tab.page.focus("#close")
     tab.page.keyboard.press("Enter")
     assert tab.page.locator("#revealed").is_hidden()
@@ -257,7 +256,7 @@ def test_inspect_save_and_wipe(tab: Visit, page_file: Path, secrets: list[Gaussi
     assert saved.digest() == secrets[0].digest()
     tab.at(POSE)
     whole = tab.picture()
-    assert tab.page.input_value("#wipe") == "100"  # at "Secret", which is what is seen
+    assert tab.page.input_value("#wipe") == "100"  # the secret is shown
     tab.page.fill("#wipe", "0")
     assert psnr(tab.picture(), whole) < CLOSE  # the published model
     tab.page.fill("#wipe", "50")
@@ -271,4 +270,4 @@ def test_inspect_save_and_wipe(tab: Visit, page_file: Path, secrets: list[Gaussi
     published = half[:, : border - 2]
     tab.page.click("#close")
     assert tab.page.locator("#revealed").is_hidden()
-    assert psnr(tab.picture()[:, : border - 2], published) > 40  # from where it was seen beside the secret
+    assert psnr(tab.picture()[:, : border - 2], published) > 40  # the pose stays

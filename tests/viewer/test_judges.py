@@ -1,4 +1,4 @@
-"""spark and PlayCanvas read our files to the same values as keyss."""
+"""Spark and PlayCanvas read our files."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ HALF = 2e-3  # spark keeps positions in half precision
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A model in every format, one with a secret, and the page with the readers."""
+    """Models in every format, one with a secret, and a page with the readers."""
     folder = tmp_path_factory.mktemp("judged")
     for suffix in FORMATS:
         write_model(folder / f"model.{suffix}", model_of(500, 3))

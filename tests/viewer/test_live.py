@@ -1,4 +1,4 @@
-"""`--live`: a page that shows a running training."""
+"""`--live`: a page that shows training progress."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def state(training: LiveTraining) -> dict[str, Any]:
 
 
 class Copies:
-    """A model in training that counts its copies."""
+    """Counts copies of a model in training."""
 
     def __init__(self) -> None:
         self.model = random_gaussians(5)
@@ -94,9 +94,9 @@ def test_copies_only_while_watched(training: LiveTraining, clock: Timer) -> None
     }
     clock.now += 60
     step_once(reporter, 13, model)
-    assert model.taken == 2  # whoever looked has left
+    assert model.taken == 2  # the viewer has left
     step_once(reporter, 100, model)
-    assert model.taken == 3  # what comes after it goes on beside it
+    assert model.taken == 3  # the last step is always copied
 
 
 def test_copies_are_independent(training: LiveTraining) -> None:
@@ -105,7 +105,7 @@ def test_copies_are_independent(training: LiveTraining) -> None:
     step_once(reporter, 1, model)
     expected = model.model.digest()
     with torch.no_grad():
-        model.model.means.add_(1.0)  # as optimisers do
+        model.model.means.add_(1.0)  # as an optimiser does
     status, ply = get(training, "live/published.ply")
     assert status == 200
     assert model_of_bytes("a.ply", ply).digest() == expected != model.model.digest()
@@ -152,5 +152,5 @@ def test_live_fit(tab: Visit, tmp_path: Path) -> None:
         process.terminate()
         assert process.wait(60) == 143  # as without a page
         tab.page.wait_for_function(f"() => {status}.endsWith('The training has ended.')")
-        # That the page asks on for a while is known to the browser's console only.
+        # The page still polls for a while.
         tab.console_errors[:] = [each for each in tab.console_errors if "ERR_CONNECTION_REFUSED" not in each]

@@ -51,7 +51,7 @@ def server(model: Path) -> Iterator[ModelServer]:
 def get(
     server: ModelServer, path: str, *, folder: str | None = None, hosts: list[str] | None = None
 ) -> tuple[int, bytes, dict[str, str]]:
-    """Status, content and headers of a request with these headers `Host`, by default the right one."""
+    """Status, content and headers of a request with the given `Host` headers."""
     where = urlsplit(server.address)
     connection = http.client.HTTPConnection(where.hostname or "", where.port, timeout=10)
     connection.putrequest("GET", (where.path if folder is None else folder) + path, skip_host=True)
@@ -69,7 +69,7 @@ def test_single_file_page(model: Path, tmp_path: Path) -> None:
     assert policy is not None
     script = re.search(r"<script>(.*?)</script>", page, re.DOTALL)
     assert script is not None
-    assert script[1] == asset("viewer.js").decode()  # no end of a script within it
+    assert script[1] == asset("viewer.js").decode()  # contains no </script>
     digest = b64encode(hashlib.sha256(script[1].encode()).digest()).decode()
     assert f"script-src &#x27;sha256-{digest}&#x27;" in policy[1]
     assert policy[1].startswith("default-src &#x27;none&#x27;;")
@@ -132,7 +132,7 @@ def test_server(server: ModelServer, model: Path) -> None:
     assert get(server, "viewer.js")[1] == asset("viewer.js")
     for path in ("model/", "model/..%2f..%2fetc/passwd", "../../etc/passwd", "page.html", "a/b"):
         assert get(server, path)[0] == 404, path
-    for path in ("/", "/viewer.js", f"/{name[1].decode()}", "/live"):  # what other users could guess
+    for path in ("/", "/viewer.js", f"/{name[1].decode()}", "/live"):  # guessable without the secret path
         assert get(server, path, folder="")[0] == 404, path
     with pytest.raises(OutputError, match="cannot serve"):
         ModelServer(model, port=where.port or 0)
@@ -148,7 +148,7 @@ def test_server(server: ModelServer, model: Path) -> None:
     ],
 )
 def test_host_header(model: Path, address: str, served: list[str]) -> None:
-    """Other names that resolve to the server (DNS rebinding) get nothing, whatever a parser makes of them."""
+    """Other names (DNS rebinding) are refused, however they parse."""
     try:
         found = ModelServer(model, address)
     except OutputError:

@@ -1,4 +1,4 @@
-"""The picture when its place on the page gets another size: phones, a folded panel, frames of other sites."""
+"""The canvas after changes of its size: phones, a folded panel, frames of other sites."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from viewer.browser import CLOSE, IN_CHROMIUM, PANEL, Visit, bright_model, psnr,
 pytestmark = IN_CHROMIUM
 
 KEY = "the key on the phone"
-# Far enough that no Gaussian is larger than engines draw.
+# Engines limit the size of near Gaussians.
 POSE = "#eye=3,-2.4,-12&target=0.2,0.1,0"
 PHONE = {"has_touch": True, "is_mobile": True}
 PORTRAIT, LANDSCAPE = {"width": 390, "height": 844}, {"width": 844, "height": 390}
@@ -46,7 +46,7 @@ def page_file(stego: Path) -> Path:
 
 
 def assert_drawn(tab: Visit, model: Gaussians) -> tuple[int, int]:
-    """Assert that the canvas shows what our own renderer draws at its width and height; return both."""
+    """Assert that the canvas shows our render at its size; returns width and height."""
     found = tab.picture()
     height, width = found.shape[:2]
     assert psnr(found, render_pose(model, POSE, width, height)) > CLOSE
@@ -55,14 +55,14 @@ def assert_drawn(tab: Visit, model: Gaussians) -> tuple[int, int]:
 
 @pytest.mark.slow
 def test_secret_stays_after_search(chromium: Any, page_file: Path) -> None:
-    """The panel gets lines and loses them, and the canvas another height, while pictures are drawn."""
+    """The panel and the canvas change their heights while frames are drawn."""
     with visit(chromium, viewport=PORTRAIT, **PHONE) as tab:
         tab.goto(page_file.as_uri())
         published = tab.picture()
         tab.page.tap("#keying > summary")
         tab.try_key(KEY, thorough=True)
         focused = "document.activeElement.id"
-        assert tab.page.evaluate(focused) != "key"  # whose keyboard covers the picture
+        assert tab.page.evaluate(focused) != "key"  # the on-screen keyboard would cover the canvas
         shown = tab.picture()
         tab.page.evaluate("document.getElementById('wipe').dispatchEvent(new Event('input'))")  # draws again
         assert shown.std() > 10
@@ -90,9 +90,7 @@ def test_rotate_phone(chromium: Any, page_file: Path, published: Gaussians) -> N
             assert tab.page.evaluate(fits)
 
 
-def test_rotate_phone_with_secret(
-    chromium: Any, page_file: Path, secret: Gaussians, published: Gaussians
-) -> None:
+def test_rotate_phone_with_secret(chromium: Any, page_file: Path, secret: Gaussians) -> None:
     with visit(chromium, viewport=PORTRAIT, **PHONE) as tab:
         tab.goto(page_file.as_uri())
         tab.page.tap("#keying > summary")

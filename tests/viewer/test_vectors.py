@@ -1,4 +1,4 @@
-"""This program reads the frozen vectors that the page's reader is tested with."""
+"""The frozen vectors of the page's reader, read by Python."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import torch
 from keyss.core import Gaussians, InputError, KeyssWarning
 from keyss.files import read_model, write_model
 from keyss.methods.records import whole
-from vectors.make_vectors import FOLDER, counted, decoded, digests, revealed
+from vectors.make_vectors import FOLDER, carrier_bits, decode_rows, digests, reveal_content
 
 REVEALED = json.loads((FOLDER / "revealed.json").read_text())
 WHOLE = json.loads((FOLDER / "whole.json").read_text())
@@ -30,12 +30,12 @@ PUBLISHED = json.loads((FOLDER / "published.json").read_text())
 def test_reveal(expected: dict[str, Any]) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", KeyssWarning)
-        found = revealed(expected["file"], expected["key"])
+        found = reveal_content(expected["file"], expected["key"])
     check(found, expected)
 
 
 def check(found: dict[str, Any], expected: dict[str, Any]) -> None:
-    """Equal, but for opacities that make up for lost Gaussians."""
+    """Equal, except for compensated opacities."""
     expected = dict(expected)
     if "opacity_logits" in expected:
         assert found.pop("opacity_logits") == pytest.approx(expected.pop("opacity_logits"), abs=1e-4)
@@ -54,12 +54,12 @@ def test_whole_models(expected: dict[str, Any]) -> None:
 
 @pytest.mark.parametrize("name", COUNTED["bits"])
 def test_carrier_bits(name: str) -> None:
-    assert counted(read_model(FOLDER / name)) == COUNTED["bits"][name]
+    assert carrier_bits(read_model(FOLDER / name)) == COUNTED["bits"][name]
 
 
 @pytest.mark.parametrize("expected", KEYSS, ids=lambda each: f"{each['file']} {each['count']}")
 def test_decoders(expected: dict[str, Any]) -> None:
-    found = decoded(bytes.fromhex(expected["payload"]), read_model(FOLDER / expected["file"]))
+    found = decode_rows(bytes.fromhex(expected["payload"]), read_model(FOLDER / expected["file"]))
     assert found["count"] == expected["count"]
     for name, values in expected["rows"].items():
         assert found["rows"][name] == pytest.approx(values, abs=1e-5, rel=1e-5)

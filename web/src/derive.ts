@@ -1,4 +1,4 @@
-/** Argon2id in workers of its own, beside the one that looks through the channels. */
+/** Worker that derives keys by Argon2id. */
 import { here } from './keys/pool.ts';
 
 self.onmessage = ({ data }: MessageEvent<{ key: string; salt: Uint8Array }>) => {

@@ -1,5 +1,5 @@
-/** `<keyss-viewer src="model.ply" key-field>` for other sites: the page that lies beside this script, in a frame. */
-import type { Told } from './page/embedding.ts';
+/** The custom element `<keyss-viewer src="model.ply" key-field>`: the page beside this script, in a frame. */
+import type { EmbedEvent } from './page/embedding.ts';
 
 const PAGE = new URL('index.html', (document.currentScript as HTMLScriptElement).src);
 const STYLE = new CSSStyleSheet();
@@ -18,12 +18,12 @@ class KeyssViewer extends HTMLElement {
   }
 
   connectedCallback(): void {
-    window.addEventListener('message', this.told);
+    window.addEventListener('message', this.onMessage);
     this.show();
   }
 
   disconnectedCallback(): void {
-    window.removeEventListener('message', this.told);
+    window.removeEventListener('message', this.onMessage);
   }
 
   attributeChangedCallback(): void {
@@ -42,8 +42,8 @@ class KeyssViewer extends HTMLElement {
     if (this.frame.src !== url.href) this.frame.src = url.href;
   }
 
-  /** What the page says becomes an event of the element. */
-  private readonly told = ({ source, origin, data }: MessageEvent<Told & { source: string }>): void => {
+  /** Dispatches the page's messages as events. */
+  private readonly onMessage = ({ source, origin, data }: MessageEvent<EmbedEvent & { source: string }>): void => {
     if (source !== this.frame.contentWindow || origin !== PAGE.origin || data?.source !== 'keyss') return;
     this.dispatchEvent(new CustomEvent(data.event, { detail: data }));
   };

@@ -1,25 +1,24 @@
-/** The package `keyss-reader`: what a key opens in a published model, without the page; its types stand in web/reader. */
+/** Entry point of the package `keyss-reader`: reveals without the page. Its types are in web/reader. */
 import type { Reveal } from '../reader/index.d.ts';
 import { preparedFor } from './channels/opening.ts';
 import { readModel } from './files/models.ts';
 import { writePly } from './files/ply.ts';
 import { type Derive, keyBytes, master } from './keys/keys.ts';
-import { oneByOne } from './keys/pool.ts';
-import { fileOf } from './records/file.ts';
-import { secretOf } from './records/secret.ts';
+import { sequential } from './keys/pool.ts';
+import { fileOf, secretOf } from './records/reveal.ts';
 
-const QUICK = 0.2; // of the progress: colours, which come second, take four times as long as all else
+const QUICK = 0.2; // share of the progress: colours, searched last, take four times as long as all else
 
 export const reveal: Reveal = async (bytes, key, { name, decodeWebP, signal, onProgress } = {}) => {
-  keyBytes(key); // refuses what is no key
+  keyBytes(key); // validates
   signal?.throwIfAborted();
   const stego = await readModel(bytes, name, decodeWebP);
   const channels = preparedFor(stego);
   for (const [thorough, from, to] of [[false, 0, QUICK], [true, QUICK, 1]] as const) {
     const reader = channels(thorough);
     let done = 0;
-    const derive: Derive = oneByOne(async (...asked) => {
-      await new Promise((resolve) => setTimeout(resolve, 0)); // other events have their turn, an abort too
+    const derive: Derive = sequential(async (...asked) => {
+      await new Promise((resolve) => setTimeout(resolve, 0)); // lets other events run, such as an abort
       signal?.throwIfAborted();
       const found = await master(...asked);
       onProgress?.(from + ((to - from) * ++done) / reader.derivations);

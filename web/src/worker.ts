@@ -1,4 +1,4 @@
-/** What takes time: files into models, and what keys open in them. Nothing of it outlives the page. */
+/** The page's worker: reads models and tries keys. Nothing is stored. */
 import { InputError } from './core/errors.ts';
 import DERIVE from 'source:./derive.ts';
 import type { Reader } from './channels/content.ts';
@@ -6,40 +6,39 @@ import { preparedFor } from './channels/opening.ts';
 import { buffersOf, type Gaussians } from './core/gaussians.ts';
 import { readModel } from './files/models.ts';
 import type { Derive } from './keys/keys.ts';
-import { derivedBy, inTurn, oneByOne, started } from './keys/pool.ts';
-import { fileOf, type HiddenFile } from './records/file.ts';
-import { secretOf } from './records/secret.ts';
+import { deriveInWorker, roundRobin, sequential, startWorker } from './keys/pool.ts';
+import { fileOf, type HiddenFile, secretOf } from './records/reveal.ts';
 
-/** Bytes of a file to be read, or a key to be tried on the one before. */
+/** A file to read, or a key to try on the last file. */
 export interface Question {
   readonly id?: number;
   readonly bytes?: Uint8Array;
-  readonly name?: string; // of the file; some formats are known by it only
-  readonly keyless?: boolean; // no key will be tried on these bytes
+  readonly name?: string; // some formats have no magic bytes
+  readonly keyless?: boolean; // no key will be tried
   readonly key?: string;
-  readonly thorough?: boolean; // the key is tried on the channels that take long
-  readonly stop?: boolean; // the search that goes on
+  readonly thorough?: boolean; // searches the slow channels
+  readonly stop?: boolean; // cancels the current search
 }
 
 export interface Answer {
   readonly id: number;
   readonly model?: Gaussians;
-  readonly leftOut?: number; // Gaussians of its file
-  readonly foreign?: number; // Gaussians that were added to the secret's file, or changed
+  readonly leftOut?: number; // Gaussians dropped from the file
+  readonly foreign?: number; // Gaussians added to or changed in the published file
   readonly file?: HiddenFile;
   readonly error?: string; // one sentence
-  readonly stopped?: boolean; // a search, before its end
-  readonly progress?: number; // 0 to 1: not the answer yet, and the same for every key
+  readonly stopped?: boolean; // the search was cancelled
+  readonly progress?: number; // 0 to 1: an interim message, the same for every key
 }
 
-// Keys are derived side by side: each takes 64 MiB, and most of the time of an attempt.
+// Derivation dominates the time of an attempt, so several run in parallel, at 64 MiB each.
 const DERIVERS = Math.max(1, Math.min(4, navigator.hardwareConcurrency || 2));
-const derive = inTurn(Array.from({ length: DERIVERS }, () => oneByOne(whileSearched(derivedBy(started(DERIVE))))));
-let searched: string | null = null; // the key of now
+const derive = roundRobin(Array.from({ length: DERIVERS }, () => sequential(whileSearched(deriveInWorker(startWorker(DERIVE))))));
+let searched: string | null = null; // the current key
 let stego: Gaussians | null = null;
 let prepared: Promise<((thorough: boolean) => Reader) | null> = Promise.resolve(null);
 
-/** The keys of a search that was stopped are not derived. */
+/** Rejects derivations of cancelled searches. */
 function whileSearched(derive: Derive): Derive {
   return async (key, salt) => (key === searched ? derive(key, salt) : Promise.reject(new Error('stopped')));
 }
@@ -54,7 +53,7 @@ async function load({ id = 0, name, keyless }: Question, bytes: Uint8Array): Pro
   answer({ id, model, leftOut }, keyless ? buffersOf(model) : []);
   if (keyless) return;
   stego = model;
-  // Afterwards: the picture comes first. Where there is no memory nothing opens, and the page goes on.
+  // After the answer, so that the picture comes first. Without enough memory no key opens anything.
   prepared = new Promise((resolve) => setTimeout(resolve, 0)).then(() => preparedFor(read)).catch(() => null);
 }
 
@@ -62,19 +61,19 @@ async function unlock(id: number, key: string, thorough: boolean): Promise<void>
   const reader = (await prepared)?.(thorough);
   searched = key;
   const content = reader ? await reader.open(key, counted(id, reader.derivations)) : null;
-  answer({ id, progress: 1 }); // before the secret is decoded, which wrong keys have no part in
+  answer({ id, progress: 1 }); // before decoding, which only right keys reach
   const model = content && stego && secretOf(content, stego)?.gaussians;
   const foreign = content?.foreign;
   if (model) answer({ id, model, foreign }, buffersOf(model));
   else answer({ id, file: (content && fileOf(content)) ?? undefined, foreign });
 }
 
-/** `derive`, telling the page how many of so many keys have been derived. */
+/** `derive` that reports progress over `all` derivations. */
 function counted(id: number, all: number): Derive {
   let done = 0;
   return async (key, salt) => {
     const found = await derive(key, salt);
-    answer({ id, progress: ++done / (all + 1) }); // what comes after takes as long as one more
+    answer({ id, progress: ++done / (all + 1) }); // the rest takes about as long as one derivation
     return found;
   };
 }
@@ -87,7 +86,7 @@ self.onmessage = async ({ data }: MessageEvent<Question>) => {
     else await unlock(id, data.key ?? '', data.thorough ?? false);
   } catch (error) {
     const message = error instanceof InputError ? error.message : 'This file cannot be read.';
-    // A key's failures say no more than a key that opens nothing does.
+    // Errors of a key are indistinguishable from a wrong key.
     answer(data.bytes ? { id, error: message } : { id });
   }
 };

@@ -17,25 +17,25 @@ async function codesOf(name: string): Promise<Codes> {
   return (await modelOf(name)).codes!;
 }
 
-test.each(Object.entries(COUNTED.bits))('the bits that carry in %s', async (name, { count, sha256 }) => {
+test.each(Object.entries(COUNTED.bits))('carrying bits of %s match Python', async (name, { count, sha256 }) => {
   const bits = lastBits(levelsOf(await codesOf(name)));
   expect([bits.length, digest(bits)]).toEqual([count, sha256]);
 });
 
-test.each(Object.entries(COUNTED.log2))('about the logarithm of %s', (value, expected) => {
+test.each(Object.entries(COUNTED.log2))('approximate logarithm of %s', (value, expected) => {
   expect(log2(Number(value))).toBe(expected);
 });
 
-test('logarithms of what is no number', () => {
+test('logarithm of NaN', () => {
   expect([log2(Infinity), log2(NaN)]).toEqual([Infinity, NaN]);
 });
 
-test('rows are sorted by the last word first, equal ones in their order', () => {
+test('stable sort, last column most significant', () => {
   const words = Uint32Array.of(5, 1, 2 ** 32 - 1, 0, 0, 2 ** 31, 5, 1, 65536, 1);
   expect([...sortingOrder(words)]).toEqual([1, 0, 3, 4, 2]);
 });
 
-test.each(FILES)('another key opens nothing in %s, and derives as much', async (name) => {
+test.each(FILES)('wrong keys open nothing in %s with as many derivations', async (name) => {
   const salts: string[] = [];
   const derive = async (_: string, salt: Uint8Array): Promise<Uint8Array> => {
     salts.push(digest(salt));
@@ -45,6 +45,6 @@ test.each(FILES)('another key opens nothing in %s, and derives as much', async (
   expect(salts.length).toBe(1);
 });
 
-test('codes without room have no reader', async () => {
+test('codes without capacity have no reader', async () => {
   expect(QuietReader.of(await modelOf('published-2.spz'))).toBeNull();
 });

@@ -12,18 +12,18 @@ interface Vector {
 
 const { valid } = jsonVector<{ valid: Vector[] }>('derivation.json');
 
-test.each(valid)('a key becomes what it becomes in Python: $key', async (vector) => {
+test.each(valid)('key derivation matches Python: $key', async (vector) => {
   const secret = await master(vector.key, hex(vector.salt));
   for (const label of ['writer', 'verifier', 'quiet/key'] as const) {
     expect(Buffer.from(expand(secret, label, 32)).toString('hex')).toBe(vector[label]);
   }
 });
 
-test('white space around a key does not count', async () => {
+test('surrounding white space of a key is ignored', async () => {
   const [{ key, salt }] = valid as [Vector];
   expect(await master(`\uFEFF ${key}\u3000\n`, hex(salt))).toEqual(await master(key, hex(salt)));
 });
 
-test.each(['', ' \n', 'k'.repeat(4097)])('a key of no or too many bytes is refused', async (key) => {
+test.each(['', ' \n', 'k'.repeat(4097)])('empty and long keys are refused', async (key) => {
   await expect(async () => master(key, new Uint8Array(16))).rejects.toThrow();
 });

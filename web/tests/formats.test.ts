@@ -9,11 +9,11 @@ import { columns, jsonVector, modelOf, vector } from './vectors.ts';
 const PUBLISHED = jsonVector<Record<string, Record<string, string>>>('published.json');
 const HERE = Object.keys(PUBLISHED).filter((name) => !name.endsWith('.sog')); // its images only browsers decode
 
-test.each(HERE)('%s is what Python reads, bit for bit', async (name) => {
+test.each(HERE)('%s matches Python bit for bit', async (name) => {
   expect(columns(await readModel(vector(name), name))).toEqual(PUBLISHED[name]);
 });
 
-test.each(HERE)('%s cut short or garbled ends in one sentence', async (name) => {
+test.each(HERE)('damaged %s raises InputError', async (name) => {
   const bytes = vector(name);
   const sentence = /^This [^.]*(\.\w+)?[^.]*\.$/;
   for (const share of [0, 0.01, 0.1, 0.5, 0.9, 0.999]) {
@@ -27,11 +27,11 @@ test.each(HERE)('%s cut short or garbled ends in one sentence', async (name) => 
   }
 });
 
-test('a .splat is known by its name only', async () => {
+test('.splat is identified by its suffix', async () => {
   await expect(readModel(vector('published.splat'))).rejects.toThrow(/^This is not a file of a 3D Gaussian Splatting model/);
 });
 
-test('a .ply of text is what the binary one is, bit for bit', async () => {
+test('ascii .ply equals binary .ply bit for bit', async () => {
   const bytes = vector('carried.ply');
   const header = plyHeader(bytes);
   const [vertex] = header.elements;
@@ -58,7 +58,7 @@ function withNumbers(file: Uint8Array, row: number, numbers: Record<string, numb
   return bytes;
 }
 
-test('Gaussians that are not finite are left out of a .ply, and counted', async () => {
+test('non-finite Gaussians of a .ply are dropped and counted', async () => {
   const whole = await readModel(vector('carried.ply'));
   let bytes = vector('carried.ply');
   for (const [row, name] of ['x', 'f_dc_1', 'f_rest_44', 'opacity', 'scale_2', 'rot_3'].entries()) {
@@ -70,7 +70,7 @@ test('Gaussians that are not finite are left out of a .ply, and counted', async 
   expect(columns(found)).toEqual(columns(selected(whole, rows)));
 });
 
-test('infinities that stand for flat, opaque and invisible Gaussians are numbers', async () => {
+test('infinite log scales and opacity logits are clamped', async () => {
   const flat = withNumbers(vector('carried.ply'), 1, { scale_0: -Infinity, opacity: Infinity });
   const found = await readModel(withNumbers(flat, 2, { opacity: -Infinity }));
   expect(found.leftOut).toBe(0);
@@ -78,7 +78,7 @@ test('infinities that stand for flat, opaque and invisible Gaussians are numbers
   expect([...found.opacityLogits.subarray(1, 3)]).toEqual([16, -16]);
 });
 
-test('a file without a Gaussian that can be drawn says what to do', async () => {
+test('files without drawable Gaussians are refused with advice', async () => {
   const bytes = vector('carried.ply');
   const [vertex] = plyHeader(bytes).elements;
   const header = new TextDecoder('latin1').decode(bytes.subarray(0, vertex.start));
@@ -93,7 +93,7 @@ const ACTIVATED = jsonVector<Record<'means' | 'scales' | 'opacities', number[]>>
 const KINDS = ['', 'scales', 'opacities', 'scales and opacities'];
 
 test.each([0.001, 1, 1e5].flatMap((unit) => KINDS.map((activated) => [activated, unit] as const)))(
-  'activated %s are refused as in Python, in units of %d',
+  'activated %s are refused in units of %d',
   async (activated, unit) => {
     const { means, scales, opacities } = ACTIVATED;
     const [isScale, isOpacity] = ['scales', 'opacities'].map((each) => activated.includes(each));
@@ -108,13 +108,13 @@ test.each([0.001, 1, 1e5].flatMap((unit) => KINDS.map((activated) => [activated,
   },
 );
 
-test('the files of an archive', async () => {
+test('reads ZIP archives', async () => {
   const file = openZip(vector('published.sog'));
   expect(JSON.parse(new TextDecoder().decode(await file('meta.json'))).version).toBe(2);
   await expect(file('nothing')).rejects.toThrow();
 });
 
-test('an archive whose files are listed again or claim more than there is', async () => {
+test('archives with repeated members or false sizes are refused', async () => {
   const bytes = vector('published.sog');
   const view = new DataView(bytes.buffer.slice(bytes.byteOffset, bytes.byteOffset + bytes.length));
   const [end, size] = [bytes.length - 22, view.getUint32(bytes.length - 10, true)];
@@ -139,11 +139,11 @@ test('an archive whose files are listed again or claim more than there is', asyn
   expect(() => openZip(changed(named('x', 2 * bytes.length + (1 << 20), directory)))).toThrow();
 });
 
-test('rows that have no properties make no room', async () => {
+test('rows without properties allocate nothing', async () => {
   const header = 'ply\nformat binary_little_endian 1.0\nelement vertex 999999999\nend_header\n';
   await expect(readModel(new TextEncoder().encode(header))).rejects.toThrow('is not a 3D Gaussian Splatting model');
 });
 
-test('a .sog is what Python reads, bit for bit', async () => {
+test('.sog matches Python bit for bit', async () => {
   expect(columns(await modelOf('published.sog'))).toEqual(PUBLISHED['published.sog']);
 });

@@ -15,7 +15,7 @@ const KEYSS = jsonVector<Revealed[]>('keyss.json');
 const LATENT = KEYSS.filter(({ file }) => file.startsWith('latent'));
 const STRIDE = 49;
 
-test.each(KEYSS)('a decoder makes of $file what Python makes of it, $count Gaussians, to 1e-5', async (expected) => {
+test.each(KEYSS)('decoding $file matches Python to 1e-5, $count Gaussians', async (expected) => {
   const { gaussians } = decodeKeyss(hex(expected.payload), await modelOf(expected.file));
   expect(gaussians.count).toBe(expected.count);
   const { means, quats, logScales, opacityLogits, sh } = gaussians;
@@ -29,7 +29,7 @@ test.each(KEYSS)('a decoder makes of $file what Python makes of it, $count Gauss
   }
 });
 
-test('rows that were lost or stand in another order change nothing of the others', async () => {
+test('lost and reordered rows leave the others unchanged', async () => {
   const { file, payload } = LATENT[0];
   const model = await modelOf(file);
   const all = decodeKeyss(hex(payload), model).gaussians;
@@ -40,7 +40,7 @@ test('rows that were lost or stand in another order change nothing of the others
   expect([...all.means].map(String)).toEqual(expect.arrayContaining(names));
 });
 
-test.each([KEYSS[0], LATENT[1]])('a model that was rounded is refused, and so is damage', async ({ file, payload }) => {
+test.each([KEYSS[0], LATENT[1]])('rounded models and damage are refused', async ({ file, payload }) => {
   const model = await modelOf(file);
   const rounded = { ...model, means: model.means.map((each) => Math.round(each * 1000) / 1000) };
   expect(() => decodeKeyss(hex(payload), rounded)).toThrow(/^The model was moved or rounded/);
@@ -56,7 +56,7 @@ test.each([KEYSS[0], LATENT[1]])('a model that was rounded is refused, and so is
   }
 });
 
-test.each([KEYSS[0], LATENT[1]])('a header that breaks one of its bounds is damage: $file', async ({ file, payload }) => {
+test.each([KEYSS[0], LATENT[1]])('out-of-range headers are refused: $file', async ({ file, payload }) => {
   const [model, bytes] = [await modelOf(file), Buffer.from(payload, 'hex')];
   const end = 8 + Number(bytes.readBigUInt64LE());
   const header = bytes.toString('latin1', 8, end).replaceAll('\\"', "'");
@@ -81,7 +81,7 @@ test.each([KEYSS[0], LATENT[1]])('a header that breaks one of its bounds is dama
   expect(() => decode(/'version':10/, "'version':11")).toThrow(/another version/);
 });
 
-test('what is moved and moved back is as it was', async () => {
+test('a similarity and its inverse cancel', async () => {
   const model = await modelOf('carried.ply');
   const turn = [0, -0.6, 0.8, 1, 0, 0, 0, 0.8, 0.6];
   const similarity = { scale: 2.5, rotation: turn, translation: [3, -4, 0.1] };

@@ -2,7 +2,7 @@ import { expect, test } from 'vitest';
 import { emptyGaussians, type Gaussians } from '../src/core/gaussians.ts';
 import { dot } from '../src/core/similarity.ts';
 import {
-  add, alike, axes, difference, FIELD_OF_VIEW, firstPose, length, picked, poseOfHash, poseToHash, rolled, turned, UPS, upName,
+  add, transferPose, axes, difference, FIELD_OF_VIEW, firstPose, length, pick, poseOfHash, poseToHash, orbit, UPS, upName,
   type Vector,
 } from '../src/page/pose.ts';
 
@@ -32,7 +32,7 @@ function shareInView(model: Gaussians, pose: ReturnType<typeof firstPose>, aspec
   return inside / model.count;
 }
 
-test.each([[0.5], [1], [1.6]])('the first pose has a model in view whose picture is %f times as wide as high', (aspect) => {
+test.each([[0.5], [1], [1.6]])('the first pose frames a model at aspect %f', (aspect) => {
   for (const size of [[1, 1, 1], [9, 1, 1], [1, 9, 1], [1, 1, 9]] as Vector[]) {
     const model = box([5, -3, 8], size);
     const pose = firstPose(model, aspect);
@@ -41,13 +41,13 @@ test.each([[0.5], [1], [1.6]])('the first pose has a model in view whose picture
   }
 });
 
-test('a floor across z has z up, and a way up that is asked for counts more', () => {
+test('a floor across z means z up, unless given', () => {
   expect(upName(firstPose(box([0, 0, 0], [1, 1, 1], 2), 1).up)).toBe('z');
   expect(upName(firstPose(box([0, 0, 0], [1, 1, 1], 1), 1).up)).toBe('-y');
   for (const [name, up] of Object.entries(UPS)) expect(upName(firstPose(box([0, 0, 0], [1, 1, 1], 2), 1, up).up)).toBe(name);
 });
 
-test('the camera of the photos gives side and tilt, and bounds the distance', () => {
+test('training cameras set direction and tilt, and bound the distance', () => {
   const up: Vector = [0.6, -0.8, 0];
   const captured = { eye: [0, 0, -2] as Vector, target: [0, 0, 0] as Vector, up };
   const pose = firstPose(box([0, 0, 0], [100, 100, 100]), 1, undefined, captured);
@@ -57,7 +57,7 @@ test('the camera of the photos gives side and tilt, and bounds the distance', ()
   expect(length(difference(portrait.eye, [0, 0, -10]))).toBeLessThan(1e-9);
 });
 
-test('an address gives the pose back that it was made of', () => {
+test('poses round trip through the address', () => {
   for (const up of [...Object.values(UPS), [0.6, -0.8, 0] as Vector]) {
     const pose = { eye: [1.5, -2.25, 1e-3] as Vector, target: [0.125, 3, -400] as Vector, up };
     expect(poseOfHash(poseToHash(pose))).toEqual(pose);
@@ -69,29 +69,25 @@ test('an address gives the pose back that it was made of', () => {
   }
 });
 
-test('another model is seen as the first one is', () => {
+test('poses transfer between models', () => {
   const [from, to] = [firstPose(box([0, 0, 0], [1, 1, 1]), 1), firstPose(box([7, 7, 7], [3, 3, 3], 2), 1)];
-  const same = alike(from, from, to);
+  const same = transferPose(from, from, to);
   for (const part of ['eye', 'target', 'up'] as const) expect(length(difference(same[part], to[part]))).toBeLessThan(1e-6);
   const elsewhere = { ...from, eye: add(from.eye, [0.3, -0.2, 0.5]) };
-  const back = alike(alike(elsewhere, from, to), to, from);
+  const back = transferPose(transferPose(elsewhere, from, to), to, from);
   for (const part of ['eye', 'target', 'up'] as const) expect(length(difference(back[part], elsewhere[part]))).toBeLessThan(1e-6);
 });
 
-test('turning keeps the distance and stops before it is above, rolling keeps the view', () => {
-  const offset = turned([0, 0, -4], UPS['-y'], 1, 10);
+test('orbiting keeps the distance and stops below the pole', () => {
+  const offset = orbit([0, 0, -4], UPS['-y'], 1, 10);
   expect(length(offset)).toBeCloseTo(4);
   expect(dot(offset, UPS['-y'])).toBeLessThan(4);
-  const pose = { eye: [0, 0, -4] as Vector, target: [0, 0, 0] as Vector, up: UPS['-y'] };
-  const right = rolled(pose, Math.PI / 2);
-  expect(length(difference(right.up, axes(pose).right))).toBeLessThan(1e-9);
-  expect(axes(right).forward).toEqual(axes(pose).forward);
 });
 
-test('a click finds the nearest Gaussian on its ray', () => {
+test('picking returns the nearest Gaussian on a ray', () => {
   const model = emptyGaussians(3, 0);
   model.means.set([0, 0, 5, 0, 0, 2, 1, 0, 1]);
   model.opacityLogits.set([3, 3, 3]);
-  expect(picked(model, [0, 0, 0], [0, 0, 3])).toEqual([0, 0, 2]);
-  expect(picked(model, [0, 0, 0], [0, 1, 0])).toBeNull();
+  expect(pick(model, [0, 0, 0], [0, 0, 3])).toEqual([0, 0, 2]);
+  expect(pick(model, [0, 0, 0], [0, 1, 0])).toBeNull();
 });

@@ -4,18 +4,18 @@ import { QuietReader } from '../src/channels/quiet/reading.ts';
 import { selected } from '../src/core/gaussians.ts';
 import { readPly, writePly } from '../src/files/ply.ts';
 import { decrypted } from '../src/keys/keys.ts';
-import { secretOf } from '../src/records/secret.ts';
+import { secretOf } from '../src/records/reveal.ts';
 import { digest, hex, jsonVector, vector } from './vectors.ts';
 
 const REVEALED = jsonVector<{ file: string; key: string; payload?: string }[]>('revealed.json');
 const CARRIED = jsonVector<{ key: string; wrong: string }>('carried.json');
 
-test('another key opens nothing', async () => {
+test('wrong keys open nothing', async () => {
   const reader = QuietReader.of(readPly(vector('carried.ply')))!;
   expect(await reader.open(CARRIED.wrong)).toBeNull();
 });
 
-test('a payload comes out whole when a tenth of the model is gone, in any order', async () => {
+test('payloads survive pruning of a tenth and any order', async () => {
   const { key, payload } = REVEALED.find((each) => each.file === 'keyss.ply')!;
   const model = readPly(vector('keyss.ply'));
   const rows = Array.from({ length: model.count }, (_, row) => (row * 701) % model.count);
@@ -23,14 +23,14 @@ test('a payload comes out whole when a tenth of the model is gone, in any order'
   expect(content?.service === 'payload' && digest(content.data)).toBe(payload);
 });
 
-test('one changed bit costs one Gaussian at most', async () => {
+test('one changed bit costs at most one Gaussian', async () => {
   const model = readPly(vector('carried.ply'));
   new Uint32Array(model.sh.buffer)[5 * 48 + 20] ^= 1 << 6;
   const content = await QuietReader.of(model)!.open(CARRIED.key);
   expect(secretOf(content!, model)!.gaussians.count).toBeGreaterThanOrEqual(7);
 });
 
-test('Gaussians that were added are counted', async () => {
+test('added Gaussians are counted', async () => {
   const model = readPly(vector('carried.ply'));
   const rows = Array.from({ length: model.count }, (_, row) => row);
   const more = selected(model, [...rows, ...rows]);
@@ -39,7 +39,7 @@ test('Gaussians that were added are counted', async () => {
   expect((await QuietReader.of(model)!.open(CARRIED.key))?.foreign).toBeUndefined();
 });
 
-test('a cell', () => {
+test('encrypted cells match Python', () => {
   const { cell } = jsonVector<{ cell: Record<string, string> & { slot: number } }>('sealing.json');
   const data = hex(cell.data);
   const cipher = new CellCipher(hex(cell.secret), cell.label, data.length);
@@ -49,7 +49,7 @@ test('a cell', () => {
   expect(cipher.decrypt(hex(cell.identity), low, low.length, 0, cell.slot).rows).toEqual([]);
 });
 
-test('encrypted payloads', async () => {
+test('encrypted payloads match Python', async () => {
   const sealing = jsonVector<{ sealed: Record<string, string>; invalid: { why: string; sealed: string }[] }>('sealing.json');
   const [dataKey, associated] = [hex(sealing.sealed.data_key), hex(sealing.sealed.associated)];
   expect(await decrypted(dataKey, hex(sealing.sealed.sealed), associated)).toEqual(hex(sealing.sealed.payload));
@@ -59,12 +59,12 @@ test('encrypted payloads', async () => {
   }
 });
 
-test('a model is written as it was read', () => {
+test('.ply round trip', () => {
   const bytes = vector('carried.ply');
   expect(writePly(readPly(bytes))).toEqual(bytes);
 });
 
-test('garbled files end in one sentence', () => {
+test('damaged files raise InputError', () => {
   const bytes = vector('carried.ply');
   for (const end of [0, 3, 60, 900, 2000, bytes.length - 1]) {
     expect(() => readPly(bytes.subarray(0, end))).toThrow(/^This .*\.$/);

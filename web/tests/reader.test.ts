@@ -27,7 +27,7 @@ beforeAll(async () => {
   ({ reveal } = (await import(/* @vite-ignore */ join(out, 'index.js'))) as typeof Reader);
 });
 
-test.each(REVEALED)('$file gives $key what Python reveals', async ({ file, key, sha256, count, payload }) => {
+test.each(REVEALED)('revealing $file with $key matches Python', async ({ file, key, sha256, count, payload }) => {
   const shares: number[] = [];
   const found = await reveal(vector(file), key, { name: file, decodeWebP, onProgress: (share) => shares.push(share) });
   expect(shares).toEqual(shares.slice().sort((a, b) => a - b));
@@ -41,11 +41,11 @@ test.each(REVEALED)('$file gives $key what Python reveals', async ({ file, key, 
   } else expect(readPly(found!.ply).count).toBe(found!.gaussians); // a decoder's numbers differ in their last bits
 });
 
-test('another key opens nothing', async () => {
+test('wrong keys open nothing', async () => {
   expect(await reveal(vector('carried.ply'), 'another key')).toBeNull();
 });
 
-test('a search can be ended, before it and while it goes on', async () => {
+test('searches can be aborted before and while they run', async () => {
   const bytes = vector('carried.ply');
   await expect(reveal(bytes, 'any', { signal: AbortSignal.abort(new Error('enough')) })).rejects.toThrow('enough');
   const stop = new AbortController();
@@ -53,14 +53,14 @@ test('a search can be ended, before it and while it goes on', async () => {
   await expect(reveal(bytes, 'any', { signal: stop.signal, onProgress })).rejects.toThrow('enough');
 });
 
-test('what is no model and what is no key is refused by an InputError', async () => {
+test('invalid models and keys raise InputError', async () => {
   for (const [bytes, key] of [[new Uint8Array(9), 'key'], [vector('carried.ply'), ' ']] as const) {
     await expect(reveal(bytes, key)).rejects.toMatchObject({ name: 'InputError' });
   }
   await expect(reveal(vector('coded.sog'), 'key')).rejects.toThrow(/only browsers/);
 });
 
-test('the archive has what it needs and no more, in at most 70 kB', () => {
+test('the package is complete and at most 70 kB', () => {
   const [packed] = JSON.parse(execFileSync('npm', ['pack', '--dry-run', '--json'], { cwd: out, encoding: 'utf8' }));
   const names = (packed.files as { path: string }[]).map(({ path }) => path).sort();
   const examples = ['opening.js', 'playcanvas.html', 'spark.html', 'worker.js'].map((name) => `examples/${name}`);

@@ -19,7 +19,7 @@ function chunksOf(n: number, k: number, draw: () => number): Uint8Array[] {
 }
 
 test.each([[1, 9, 3, 2], [12, 40, 9, 10], [100, 180, 20, 40], [30, 30, 0, 0]])(
-  '%i of %i chunks, %i of them wrong and %i lost',
+  '%i of %i chunks, %i wrong and %i lost',
   (k, n, wrong, lost) => {
     const draw = random(k);
     const two = [chunksOf(n, k, draw), chunksOf(n, k, draw)];

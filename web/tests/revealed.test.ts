@@ -2,7 +2,7 @@ import { expect, test } from 'vitest';
 import type { Content } from '../src/channels/content.ts';
 import { preparedFor } from '../src/channels/opening.ts';
 import type { ReadModel } from '../src/files/models.ts';
-import { secretOf } from '../src/records/secret.ts';
+import { secretOf } from '../src/records/reveal.ts';
 import { digest, expectRevealed, jsonVector, modelOf, type Shown } from './vectors.ts';
 
 interface Revealed extends Shown {
@@ -24,7 +24,7 @@ async function opened(stego: ReadModel, key: string): Promise<Content | null> {
   return null;
 }
 
-test.each(REVEALED)('$file gives $key what Python reveals, bit for bit', async (expected) => {
+test.each(REVEALED)('revealing $file with $key matches Python bit for bit', async (expected) => {
   const stego = await modelOf(expected.file);
   const content = await opened(stego, expected.key);
   expect(content?.method).toBe(expected.method);

@@ -1,8 +1,8 @@
 import { expect, test } from 'vitest';
-import { AppendedReader } from '../src/channels/appended/reader.ts';
+import { AppendedReader } from '../src/channels/appended/appended_reader.ts';
 import { fittedSimilarity } from '../src/channels/appended/fitting.ts';
 import { Fountain, NOISY } from '../src/channels/colours/fountain.ts';
-import { ColoursReader } from '../src/channels/colours/reading.ts';
+import { ColoursReader } from '../src/channels/colours/colours_reader.ts';
 import type { Content, Reader } from '../src/channels/content.ts';
 import { Channels, preparedFor } from '../src/channels/opening.ts';
 import { unpackPayload } from '../src/channels/content.ts';
@@ -10,7 +10,7 @@ import { type Gaussians, selected } from '../src/core/gaussians.ts';
 import { movedPoint } from '../src/core/similarity.ts';
 import { mixed, namesakes, sortingOrder } from '../src/core/words.ts';
 import { type Derive, expand } from '../src/keys/keys.ts';
-import { here, inTurn, oneByOne } from '../src/keys/pool.ts';
+import { here, roundRobin, sequential } from '../src/keys/pool.ts';
 import { digest, hex, jsonVector, modelOf, random } from './vectors.ts';
 
 const OPENED = jsonVector<{ file: string; key: string; payload?: string }[]>('revealed.json');
@@ -36,7 +36,7 @@ function remembered(derive: Derive): Derive {
 /** Something of Argon2id's size that takes no time. */
 const quick: Derive = async (key, salt) => expand(salt, `test/${key}`, 32);
 
-test('the hash is that of Python', () => {
+test('the hash matches Python', () => {
   const numbers = [0n, 1n, 2n ** 64n - 1n, 0x123456789abcdef0n, 2n ** 32n, 2n ** 63n];
   expect([...new BigUint64Array(mixed(new Uint32Array(new BigUint64Array(numbers).buffer)).buffer)]).toEqual([
     0xe220a8397b1dcdafn, 0x910a2dec89025cc1n, 0xe4d971771b652c20n, 0x161922c645ce50e8n, 0xc42c5a1aa3820138n,
@@ -44,7 +44,7 @@ test('the hash is that of Python', () => {
   ]);
 });
 
-test('words are sorted as BigInt sorts them, equal ones in their order', () => {
+test('words sort stably like BigInt', () => {
   const draw = random(1);
   const numbers = Array.from({ length: 300 }, () => BigInt(Math.floor(draw() * 40)) << BigInt(Math.floor(draw() * 59)));
   const words = new Uint32Array(new BigUint64Array(numbers).buffer);
@@ -54,7 +54,7 @@ test('words are sorted as BigInt sorts them, equal ones in their order', () => {
 });
 
 test.each([[112, NOISY, 3, 0.05], [2000, undefined, 1.9, 0.05], [40_000, undefined, 1.8, 0.05]])(
-  'a fountain of %i bits gives them back when some are wrong',
+  'a fountain code of %i bits corrects errors',
   (size, degrees, rate, wrong) => {
     const draw = random(size);
     const data = Uint8Array.from({ length: size }, () => Math.floor(2 * draw()));
@@ -65,7 +65,7 @@ test.each([[112, NOISY, 3, 0.05], [2000, undefined, 1.9, 0.05], [40_000, undefin
   },
 );
 
-test('a similarity is found again', () => {
+test('a similarity is recovered from points', () => {
   const draw = random(5);
   const turned = { scale: 0.3, rotation: [0, 0, 1, -0.6, 0.8, 0, -0.8, -0.6, 0], translation: [3, -2, 1] };
   const points = Array.from({ length: 30 }, draw);
@@ -77,7 +77,7 @@ test('a similarity is found again', () => {
   expect(fittedSimilarity([1, 1, 1, 1, 1, 1], points, [0, 1])).toBeNull();
 });
 
-test('appended Gaussians survive the loss of a fifth, in any order, and no more than they can', async () => {
+test('appended Gaussians survive pruning of a fifth and any order', async () => {
   const model = await modelOf('appended.ply');
   const [wanted, larger] = [true, false].map((file) => OPENED.find((each) => each.file === 'appended.ply' && file === 'payload' in each)!);
   const derive = remembered(here);
@@ -88,7 +88,7 @@ test('appended Gaussians survive the loss of a fifth, in any order, and no more 
   expect(AppendedReader.of(selected(model, [...Array(120).keys()]))).toBeNull(); // the cover alone
 });
 
-test('colours survive another scale, another order and the loss of a fifth', async () => {
+test('colours survive scaling, any order and pruning of a fifth', async () => {
   const model = await modelOf(NOTE.file);
   const derive = remembered(here);
   const fewer = some(model, 0.8, 9);
@@ -99,7 +99,7 @@ test('colours survive another scale, another order and the loss of a fifth', asy
   }
 });
 
-test('another key opens nothing in colours, nor in models that have none', async () => {
+test('wrong keys open nothing in colours, nor in models without them', async () => {
   const model = await modelOf(NOTE.file);
   expect(await ColoursReader.of(model).open('another key', quick)).toBeNull();
   for (const count of [0, 1, 20]) {
@@ -109,7 +109,7 @@ test('another key opens nothing in colours, nor in models that have none', async
   expect(await ColoursReader.of(broken).open(NOTE.key, quick)).toBeNull();
 });
 
-test('all channels derive as many keys as they say, whatever opens', async () => {
+test('channels report their number of derivations', async () => {
   for (const [file, channels] of Object.entries({ 'appended.ply': 3, 'colours.spz': 2, 'carried.ply': 2 })) {
     const prepared = preparedFor(await modelOf(file));
     const readers = [...prepared(false).readers, ...prepared(true).readers];
@@ -124,7 +124,7 @@ test('all channels derive as many keys as they say, whatever opens', async () =>
   }
 });
 
-test('the first channel that opens counts, and the others are looked through', async () => {
+test('the first channel that opens wins, and all are searched', async () => {
   const asked: string[] = [];
   const reader = (name: string, found: Content | null | Error): Reader => ({
     derivations: 1,
@@ -142,7 +142,7 @@ test('the first channel that opens counts, and the others are looked through', a
   expect(await new Channels([none]).open('key')).toBeNull();
 });
 
-test('keys are derived one by one, and by each of several in turn', async () => {
+test('derivations run sequentially, or round robin over several', async () => {
   let [running, most] = [0, 0];
   const slow: Derive = async (key, salt) => {
     most = Math.max(most, ++running);
@@ -152,17 +152,17 @@ test('keys are derived one by one, and by each of several in turn', async () => 
     return salt;
   };
   const salts = Array.from({ length: 6 }, (_, index) => Uint8Array.of(index));
-  const single = oneByOne(slow);
+  const single = sequential(slow);
   const bad = expect(single('bad', salts[0])).rejects.toThrow();
   expect(await Promise.all(salts.map((salt) => single('key', salt)))).toEqual(salts);
   await bad;
   expect(most).toBe(1);
-  const several = inTurn([oneByOne(slow), oneByOne(slow)]);
+  const several = roundRobin([sequential(slow), sequential(slow)]);
   expect(await Promise.all(salts.map((salt) => several('key', salt)))).toEqual(salts);
   expect(most).toBe(2);
 });
 
-test('packed payloads', () => {
+test('payload packing', () => {
   expect(unpackPayload(hex('66696c6500616263'))).toEqual({ service: 'payload', method: 'file', data: hex('616263') });
   for (const damaged of ['', '00', '0066', '66696c65', '80696c6500', '30313233343536373839303132333435' + '00']) {
     expect(() => unpackPayload(hex(damaged))).toThrow(/damaged\.$/);

@@ -5,11 +5,11 @@ import { columns, hex, jsonVector } from './vectors.ts';
 const models = jsonVector<{ data: string; sha256: Record<string, string> }[]>('whole.json');
 const DAMAGED = /^[^.]* damaged\.$/;
 
-test.each(models)('a whole model is what Python reads, bit for bit', ({ data, sha256 }) => {
+test.each(models)('whole models match Python bit for bit', ({ data, sha256 }) => {
   expect(columns(decodeWhole(hex(data), 0))).toEqual(sha256);
 });
 
-test.each(models)('a damaged model ends in one sentence or is one', ({ data }) => {
+test.each(models)('damaged models raise InputError or decode', ({ data }) => {
   const bytes = hex(data);
   for (let end = 0; end < bytes.length; end += end < 130 ? 1 : 37) {
     expect(() => decodeWhole(bytes.slice(0, end), 0)).toThrow(DAMAGED);
@@ -34,7 +34,7 @@ function expectModelOrSentence(decode: () => { means: Float32Array }): void {
 }
 
 test.each([[1 << 22, 0], [1 << 22, 1 << 20], [(1 << 16) + 1, 1 << 16], [0xffffffff, 0xffffffff]])(
-  'a model of %i Gaussians in one of %i takes no memory', (count, carriers) => {
+  'false counts of %i Gaussians in a model of %i allocate nothing', (count, carriers) => {
     const bytes = new Uint8Array(3 << 20);
     bytes.set(hex(models[0].data).subarray(0, 49));
     new DataView(bytes.buffer).setUint32(0, count, true);

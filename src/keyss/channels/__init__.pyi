@@ -1,5 +1,5 @@
 from .appended.channel import APPENDED as APPENDED, AppendedReader as AppendedReader
-from .appended.lattice import is_appended as is_appended
+from .appended.words import is_appended as is_appended
 from .base import (
     METHOD_BYTES as METHOD_BYTES,
     Channel as Channel,
@@ -15,8 +15,8 @@ from .base import (
     unpack_payload as unpack_payload,
 )
 from .colours.channel import COLOURS as COLOURS, Colours as Colours, ColoursCover as ColoursCover
+from .colours.colours_reader import ColoursReader as ColoursReader
 from .colours.fountain import Fountain as Fountain
-from .colours.reading import ColoursReader as ColoursReader
 from .names import AnyChannel as AnyChannel, Format as Format, Publish as Publish
 from .publishing import (
     SUFFIXES as SUFFIXES,

@@ -1,10 +1,10 @@
 """The protocol of all channels: places in a published model where bits are stored and found with a key.
 
-A channel does not interpret its bits. Every channel carries *payloads*: bytes that come out whole or not at
-all. Low bits carry *records* too: many small pieces of one size that are found one by one. A model that
-lost Gaussians has lost as many records and no more.
+A channel does not interpret its bits. Every channel carries *payloads*, bytes that are read completely or not
+at all. Low bits also carry *records*, many small pieces of one size, each found on its own: a lost Gaussian
+costs its own record only.
 
-The place of publication determines the channel of a hiding (`publishing`); readers try them all.
+The way of publication determines the channel (`publishing`); readers try all channels.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from keyss.core.errors import InputError, KeyssWarning, UsageError, WrongKeyErro
 from keyss.core.gaussians import Gaussians
 from keyss.keys.derivation import DerivedKey
 
-METHOD_BYTES = 15  # of the name of a method in files
+METHOD_BYTES = 15  # maximum length of a method's name
 SALTS_TRIED = 4  # with half of the Gaussians changed, 15 of 16 models still open
 NOTICED = (
     "the secrets are too large, or too many, to be placed independently of each other: whoever holds one of "
@@ -37,22 +37,21 @@ _ADDED = (
 
 @dataclass(frozen=True)
 class Payload:
-    """Bytes that come out whole or not at all."""
+    """Bytes that are read completely or not at all."""
 
     method: str  # 1 to METHOD_BYTES ASCII characters
     data: bytes
-    # For a payload that was cut into chunks: the number read and the number written.
-    chunks: tuple[int, int] | None = field(default=None, compare=False)
-    carriers: int | None = field(default=None, compare=False)  # Gaussians of the model that it was read from
+    chunks: tuple[int, int] | None = field(default=None, compare=False)  # read and written; None: not divided
+    carriers: int | None = field(default=None, compare=False)  # Gaussians in the model it was read from
     foreign: int = field(default=0, compare=False)  # about how many of these are not of the secret's file
 
 
 @dataclass(frozen=True)
 class RecordRequest:
-    """Records to be embedded, before they are encoded: the channel chooses their size."""
+    """Records to embed, whose size the channel chooses."""
 
     count: int
-    least_bytes: int  # of a record
+    least_bytes: int  # minimum size of a record
     header_bytes: int
 
 
@@ -60,21 +59,20 @@ class RecordRequest:
 class RecordPlan:
     """The channel's answer to a `RecordRequest`."""
 
-    record_bytes: int  # the largest size of a record
-    copies: int  # the most records that may be embedded a second time
-    cells_per_carrier: int  # records that share one Gaussian
+    record_bytes: int  # maximum size of a record
+    copies: int  # maximum number of records to embed twice
+    cells_per_carrier: int  # records per Gaussian
 
 
 @dataclass(frozen=True)
 class Records:
-    """Pieces of one size that are found one by one, in any order."""
+    """Pieces of one size, each found on its own, in any order."""
 
     method: str  # 1 to METHOD_BYTES ASCII characters
-    header: bytes  # what the method needs to read them; comes out whole or not at all
+    header: bytes  # parameters of the method, read completely or not at all
     records: Bytes  # [R, size]
-    plan: RecordPlan  # as the channel gave it
-    # [C] indices of records that are embedded a second time, because losing them costs most; empty when read.
-    copied: Integers
+    plan: RecordPlan
+    copied: Integers  # [C] indices of the most important records, embedded twice; empty when read
     foreign: int = 0  # as of `Payload`
 
 
@@ -90,27 +88,27 @@ def check_method(name: str) -> bytes:
 
 
 def pack_method(name: str) -> bytes:
-    """METHOD_BYTES of the name of a method."""
+    """The name of a method, padded to METHOD_BYTES."""
     return check_method(name).ljust(METHOD_BYTES, b"\0")
 
 
 def unpack_method(packed: bytes) -> str:
-    """The name of `pack_method`. Raises ValueError for anything else."""
+    """Invert `pack_method`. Raises ValueError for anything else."""
     return packed[:METHOD_BYTES].rstrip(b"\0").decode("ascii")
 
 
 @dataclass(frozen=True)
 class Room:
-    """How much fits into a cover: exact for a prepared one, estimated for one not fitted yet."""
+    """How much fits into a cover: exact for a prepared cover, an estimate before it is fitted."""
 
     carriers: int  # Gaussians that can carry something
     capacity: int  # bytes of all payloads together
-    overhead: int  # bytes that a payload takes beside its data, at most
-    grows: bool = False  # True if the model grows with the hidden data, which should be short then
+    overhead: int  # maximum bytes of a payload beside its data
+    grows: bool = False  # True if the model grows with the hidden data, which should then be short
 
 
 class PreparedCover(Protocol):
-    """A cover whose room in a channel is known before anything else runs."""
+    """A cover with known room in a channel."""
 
     @property
     def cover(self) -> Gaussians:
@@ -121,36 +119,36 @@ class PreparedCover(Protocol):
         """The room for payloads."""
 
     def embed(self, contents: Sequence[tuple[str, Content]], *, entropy: bytes | None = None) -> Gaussians:
-        """Embed one (key, content) for each secret; all contents are payloads, or all are records.
+        """Embed one (key, content) per secret; contents are all payloads or all records.
 
         `entropy`: at least 32 secret bytes from which all randomness is derived; by default the system's.
-        Raises UsageError for equal keys and for contents that do not fit. Warns (KeyssWarning) where the
-        holder of one key can notice that there are other secrets.
+        Raises UsageError for equal keys and for contents that do not fit. Warns (KeyssWarning) if the holder
+        of one key can tell that there are other secrets.
         """
 
 
 class Reader(Protocol):
-    """A stego model as a channel reads it."""
+    """Reads the secrets of a stego model from one channel."""
 
     def open(self, key: str) -> Content:
         """The content that `key` opens. Raises WrongKeyError if it opens nothing, InputError for damage."""
 
 
 class SaltedReader(ABC):
-    """A `Reader` that tries a key under one salt of Argon2id at a time."""
+    """A `Reader` that tries a key with one salt of Argon2id after another."""
 
     salts: Sequence[bytes]  # the likeliest first
 
     @abstractmethod
     def extract(self, key: DerivedKey) -> Content:
-        """`open` after key derivation under one salt."""
+        """`open`, after key derivation with one salt."""
 
     def keys(self, key: str) -> Iterator[DerivedKey]:
-        """`key` under each salt to be tried; each takes 0.1 s."""
+        """Derive `key` with each salt to try; each takes 0.1 s."""
         return (DerivedKey.of(key, salt) for salt in self.salts[:SALTS_TRIED])
 
     def open(self, key: str) -> Content:
-        """See `Reader`. Changed or added Gaussians may have taken the place of the first salt.
+        """See `Reader`. Changed or added Gaussians can replace the first salt, so several are tried.
 
         Warns (KeyssWarning) of Gaussians that are not those of the file in which the secret was hidden.
         """
@@ -168,31 +166,31 @@ class Channel(ABC):
 
     name: ClassVar[str]  # `quiet`, `appended` or `colours`
     place: str  # in messages: "low bits", "codes of the spz file" and so on
-    survives: ClassVar[bool] = False  # secrets survive other formats; else the file is passed on unchanged
+    survives: ClassVar[bool] = False  # True if secrets survive conversion to other formats
     grows: ClassVar[bool] = False  # see `Room`
-    records: ClassVar[bool] = False  # the channel carries records
+    records: ClassVar[bool] = False  # True if the channel carries records
 
     @abstractmethod
     def prepare(self, cover: Gaussians) -> PreparedCover:
-        """Find the carriers. Raises UsageError for a cover without room, or where a change would be seen.
+        """Find the carriers. Raises UsageError for a cover without room, or whose changes would be visible.
 
-        Raises OutputError for a cover that the format of the published file does not hold.
+        Raises OutputError for a cover that the published format cannot hold.
         """
 
     @abstractmethod
     def room(self, gaussians: int, sh_degree: int) -> Room:
-        """An estimate of what fits into a cover with so many Gaussians that can carry something."""
+        """Estimate the room of a cover in which `gaussians` can carry something."""
 
 
 def pack_payload(content: Content) -> bytes:
-    """The name of the method, a zero, the data. Raises TypeError for records."""
+    """Pack a payload: name of the method, zero byte, data. Raises TypeError for records."""
     if not isinstance(content, Payload):
         raise TypeError("expected a payload: this channel carries no records")
     return check_method(content.method) + b"\0" + content.data
 
 
 def unpack_payload(packed: bytes) -> Payload:
-    """The payload of `pack_payload`. Raises InputError for anything else."""
+    """Invert `pack_payload`. Raises InputError for anything else."""
     name, zero, data = packed.partition(b"\0")
     try:
         check_method(name.decode("ascii"))
@@ -204,7 +202,7 @@ def unpack_payload(packed: bytes) -> Payload:
 
 
 def randomness(entropy: bytes | None, *parts: bytes) -> bytes:
-    """32 bytes that depend on `entropy` and on all hidden data, so that no two files share derived values.
+    """32 bytes derived from `entropy` and all hidden data, so that no two files share derived values.
 
     `entropy`: at least 32 secret bytes; None: the system's.
     """

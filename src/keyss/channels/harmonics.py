@@ -1,9 +1,8 @@
-"""Real numbers in the harmonics of a model, in the directions that matter least to it.
+"""Real numbers in the harmonics of a model, in the directions of least variance.
 
-Every Gaussian holds a *rank* in (0, 1) in each of R directions. What is written is the number of that rank
-among those that a plain model has there, given the Gaussian's other harmonics: if ranks are uniform, each
-number has the spread that it would have in a plain model, Gaussian by Gaussian. Harmonics up to KEPT_DEGREE
-stay as they are, so that their low bits are free.
+Every Gaussian holds a *rank* in (0, 1) in each of R directions. The coefficient written there is the quantile
+of that rank in the distribution of a plain model, conditioned on the Gaussian's other harmonics: uniform
+ranks give the distribution of a plain model. Harmonics up to KEPT_DEGREE stay, so their low bits are free.
 """
 
 from __future__ import annotations
@@ -21,47 +20,47 @@ from keyss.core.errors import InputError
 from keyss.core.gaussians import Gaussians
 
 KEPT_DEGREE = 1
-# Probabilities of the quantiles that describe a distribution; close to each other at the ends.
+# Probabilities of the quantiles that describe a distribution, denser at the ends.
 RANKS = np.concatenate([[0.0], 1 / (1 + np.exp(-np.linspace(-7, 7, 31))), [1.0]])
-_ROUNDING = 1e-10  # share of a row's squares that rounding alone leaves in directions without anything
+_ROUNDING = 1e-10  # relative squared norm that rounding leaves in empty directions
 
 
 def harmonics_above(sh_degree: int) -> int:
-    """H, the numbers of the harmonics above KEPT_DEGREE, of three colours."""
+    """H, the number of coefficients above KEPT_DEGREE, of three colours."""
     return max(0, 3 * ((sh_degree + 1) ** 2 - (KEPT_DEGREE + 1) ** 2))
 
 
 def high_harmonics(model: Gaussians) -> Doubles:
-    """[N, H] the harmonics above KEPT_DEGREE."""
+    """The harmonics [N, H] above KEPT_DEGREE."""
     return doubles(model.sh[:, (KEPT_DEGREE + 1) ** 2 :].flatten(1))
 
 
 def with_high_harmonics(model: Gaussians, harmonics: Doubles) -> Gaussians:
-    """`model` with other harmonics [N, H] above KEPT_DEGREE."""
+    """`model` with new harmonics [N, H] above KEPT_DEGREE."""
     high = torch.from_numpy(harmonics).to(model.sh).view(len(model), -1, 3)
     return replace(model, sh=torch.cat([model.sh[:, : (KEPT_DEGREE + 1) ** 2], high], dim=1))
 
 
 def row_names(model: Gaussians) -> Bytes:
-    """[N, 16] the identity of each Gaussian, which neither harmonics nor new low bits change."""
+    """The identity [N, 16] of each Gaussian, independent of harmonics and low bits."""
     return identities(model.with_sh_degree(0))
 
 
 def pads(secret: bytes, names: Bytes, count: int) -> Doubles:
-    """[N, count] in [0, 1): a pseudo-random function of a secret and the identity of a Gaussian."""
+    """Numbers [N, count] in [0, 1): a pseudo-random function of a secret and each Gaussian's identity."""
     size = 4 * count
     stream = CellCipher(secret, "pad", size).encrypt(names, np.zeros((len(names), size), np.uint8))
     return np.ascontiguousarray(stream[:, -size:]).view("<u4") / 2.0**32
 
 
 class Harmonics(nn.Module):
-    """R directions, and what plain models have in them."""
+    """R directions, and the distribution of a plain model's coefficients in them."""
 
     directions: Tensor  # [H, R] orthonormal
-    # [3, R] number j spreads like exp(a + b log(kept) + c log(before)): the root mean squares of what stays
-    # as it is, and of numbers 0 to j - 1
+    # [3, R] a, b, c: coefficient j has the spread exp(a + b log(kept) + c log(before)), from the root mean
+    # squares of the unchanged directions and of coefficients 0 to j - 1
     slopes: Tensor
-    quantiles: Tensor  # [R, 33] of a number over its spread, at RANKS
+    quantiles: Tensor  # [R, 33] of coefficient / spread, at RANKS
 
     def __init__(self, width: int, count: int) -> None:
         super().__init__()
@@ -70,9 +69,9 @@ class Harmonics(nn.Module):
         self.register_buffer("quantiles", torch.linspace(-1, 1, len(RANKS)).repeat(count, 1))
 
     def fit(self, plain: Gaussians) -> Tensor:
-        """Learn all from a plain model; returns [H, H - R] the directions that stay as they are.
+        """Fit to a plain model; returns the unchanged directions [H, H - R].
 
-        Raises InputError for a model that has hardly any harmonics.
+        Raises InputError for a model with hardly any harmonics.
         """
         harmonics = high_harmonics(plain)
         chosen = (harmonics != 0).any(axis=1)
@@ -94,14 +93,14 @@ class Harmonics(nn.Module):
             solution = np.linalg.lstsq(levels, np.log(np.abs(column[seen])), rcond=None)[0]
             self.slopes[:, j] = torch.from_numpy(solution)
             spread = self._spread(kept[seen], before[seen], j)
-            self.quantiles[j] = increasing(np.quantile(column[seen] / spread, RANKS))
+            self.quantiles[j] = make_increasing(np.quantile(column[seen] / spread, RANKS))
             before = before + column**2
         return torch.from_numpy(vectors[:, count:]).float()
 
     def write(self, harmonics: Doubles, ranks: Doubles) -> Doubles:
-        """[N, H] harmonics [N, H] with numbers of the `ranks` [N, R] in the directions.
+        """Write `ranks` [N, R] into `harmonics` [N, H].
 
-        Rows without anything in other directions, because no view ever showed them, stay as they are.
+        Rows that are zero in all other directions, because no view ever showed them, do not change.
         """
         directions = doubles(self.directions)
         kept = harmonics - (harmonics @ directions) @ directions.T
@@ -115,7 +114,7 @@ class Harmonics(nn.Module):
         return np.where(alive[:, None], kept + written @ directions.T, harmonics)
 
     def read(self, harmonics: Doubles) -> tuple[Doubles, Flags]:
-        """[N, R] the ranks that `write` wrote into [N, H]; [N] which rows have any."""
+        """The ranks [N, R] from `write`, and a mask [N] of the rows that have any."""
         written, power = self._split(harmonics)
         alive, ranks, before = power > 0, np.empty_like(written), np.zeros(len(written))
         power = np.where(alive, power, 1.0)
@@ -126,14 +125,14 @@ class Harmonics(nn.Module):
         return ranks, alive
 
     def _split(self, harmonics: Doubles) -> tuple[Doubles, Doubles]:
-        """[N, R] the numbers in the directions; [N] the squares of the rest, summed."""
+        """The coefficients [N, R] in the directions, and the squared norm [N] of the rest."""
         directions = doubles(self.directions)
         written = harmonics @ directions
         power = ((harmonics - written @ directions.T) ** 2).sum(axis=1)
         return written, np.where(power > _ROUNDING * (harmonics**2).sum(axis=1), power, 0.0)
 
     def _levels(self, kept: Doubles, before: Doubles, j: int) -> Doubles:
-        """[N, 3] 1 and the two logarithms of `slopes` for number j, from sums of squares [N]."""
+        """Regressors [N, 3] of `slopes` for coefficient j, from sums of squares [N]: 1 and two logarithms."""
         width, count = self.directions.shape
         own = np.zeros_like(kept) if j == 0 else np.log(np.maximum(before, _ROUNDING * kept) / j) / 2
         return np.stack([np.ones_like(kept), np.log(kept / (width - count)) / 2, own], axis=1)
@@ -144,7 +143,7 @@ class Harmonics(nn.Module):
         return spread
 
 
-def increasing(values: Doubles) -> Tensor:
-    """float32 of sorted `values` [33], made strictly increasing."""
+def make_increasing(values: Doubles) -> Tensor:
+    """Sorted `values` [33] as float32, made strictly increasing."""
     span = max(float(np.ptp(values)), float(np.abs(values).max()), 1e-6)
     return torch.from_numpy(values + span * 1e-5 * np.arange(len(values))).float()

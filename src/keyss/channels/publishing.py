@@ -1,4 +1,4 @@
-"""The channel for each place of publication, and opening with a key in whichever channel a secret lies."""
+"""Select the channel for a way of publication; open a key in whichever channel holds its secret."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from keyss.core.gaussians import Gaussians
 from keyss.files.formats.common import CodedGaussians
 from keyss.keys.derivation import DerivedKey
 
-SUFFIXES = {"spz": ".spz", "sog": ".sog", "compressed-ply": ".compressed.ply"}  # of files whose codes carry
+SUFFIXES = {"spz": ".spz", "sog": ".sog", "compressed-ply": ".compressed.ply"}  # of quantised formats
 
 
 def channel_for(
@@ -23,11 +23,10 @@ def channel_for(
     format: Format | None = None,
     cover: Gaussians | None = None,
 ) -> Channel:
-    """The channel for a model that is published "as-is", in a `format`, or as "any".
+    """The channel for a model that is published "as-is", in `format`, or in "any" format.
 
-    As is, `cover` has one place that is quiet: the codes of its file's format, if that is the one published,
-    or those that it was decoded from, else low bits. Loads that channel only. Raises UsageError for unknown
-    names.
+    Published as is, a quantised `format` has its codes, and so does a `cover` that was decoded from one;
+    otherwise low bits. Imports that channel only. Raises UsageError for unknown names.
     """
     choices = {"publish": (publish, Publish), "channel": (channel, AnyChannel), "format": (format, Format)}
     for name, (value, known) in choices.items():
@@ -53,7 +52,7 @@ def channel_for(
 
 
 def suffix_of(stego: Gaussians) -> str:
-    """The suffix of a file that keeps everything a published model carries."""
+    """The suffix of a file that keeps the secrets of a published model."""
     if not isinstance(stego, CodedGaussians):
         return ".ply"
     return SUFFIXES[stego.codes.name]
@@ -63,22 +62,22 @@ def open_content(stego: Gaussians, key: str) -> Content:
     """The content that `key` opens in any channel. Raises WrongKeyError, and InputError for damage."""
     for reader in _readers(stego):
         with suppress(WrongKeyError):
-            return _read_from(stego, reader.open(key))
+            return _with_carriers(stego, reader.open(key))
     raise WrongKeyError()
 
 
 @dataclass(frozen=True)
 class Attempt:
-    """A key under the likeliest salt, and what it opens in low bits, codes or appended Gaussians."""
+    """A key derived with the likeliest salt, and what it opens in low bits, codes or appended Gaussians."""
 
     key: DerivedKey
     content: Content | None
     appended: bool  # True if there are appended Gaussians
-    records: bool  # True if scenes lie there as records, else as one payload
+    records: bool  # True if the channel stores scenes as records, else as one payload
 
 
 def quick_attempt(stego: Gaussians, key: str) -> Attempt | None:
-    """A single attempt, which takes as long for a wrong key as for a right one; None without a salt.
+    """A single attempt, which takes equally long for right and wrong keys; None without a salt.
 
     Raises InputError for damage.
     """
@@ -93,21 +92,21 @@ def quick_attempt(stego: Gaussians, key: str) -> Attempt | None:
     opened: list[Content] = []
     for reader, each in zip(readers, derived, strict=True):
         with suppress(WrongKeyError):
-            opened.append(_read_from(stego, reader.extract(each)))
+            opened.append(_with_carriers(stego, reader.extract(each)))
     records = isinstance(quiet, QuietReader) and not quiet.blocks and appended is None
     return Attempt(derived[0], opened[0] if opened else None, appended is not None, records)
 
 
-def _read_from(stego: Gaussians, content: Content) -> Content:
+def _with_carriers(stego: Gaussians, content: Content) -> Content:
     return replace(content, carriers=len(stego)) if isinstance(content, Payload) else content
 
 
 def _readers(stego: Gaussians) -> Iterator[Reader]:
-    """The readers of a model; each channel is loaded when the ones before opened nothing."""
-    for reader in (_quiet, _appended):
-        if own := reader(stego):
-            yield own
-    from keyss.channels.colours.reading import ColoursReader
+    """The readers of a model. Each channel is imported when the previous ones opened nothing."""
+    for find in (_quiet, _appended):
+        if reader := find(stego):
+            yield reader
+    from keyss.channels.colours.colours_reader import ColoursReader
 
     yield ColoursReader.of(stego)
 

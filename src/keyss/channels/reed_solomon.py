@@ -1,12 +1,12 @@
-"""Reed-Solomon over GF(2^16): any k of n chunks give the data back (Reed and Solomon 1960).
+"""Reed-Solomon over GF(2^16): any k of n chunks recover the data (Reed and Solomon 1960).
 
-A chunk is a row of symbols of 16 bits, the higher byte first. The symbols of one column are values of one
-polynomial of degree below k, in chunk i at the field element i + 1, and the first k chunks are the data: what
-is missing follows by Lagrange's interpolation. The field has the polynomial x^16 + x^12 + x^3 + x + 1. A
-library would code one column at a time, symbol by symbol, and takes minutes for the payload of a model.
+A chunk is a row of 16-bit symbols, big-endian. A column holds the values of a polynomial of degree below k,
+chunk i that at the field element i + 1. The first k chunks are the data; Lagrange interpolation gives the
+others. The field polynomial is x^16 + x^12 + x^3 + x + 1. Libraries code one column at a time, symbol by
+symbol, and take minutes for the payload of a model.
 
-Every chunk carries its number, so that the lost ones are known. Where some chunks are there by chance, they
-are located as errors: two chunks more than k for each of them.
+Every chunk has its number, so lost chunks are erasures. False chunks are located as errors, each of which
+takes two chunks more than k.
 """
 
 from __future__ import annotations
@@ -20,21 +20,21 @@ import numpy as np
 from keyss.core.arrays import Bytes, Flags, Integers, Shorts
 from keyss.core.errors import InputError
 
-MAX_CHUNKS = 1 << 13  # of one codeword: the field has room for more, which would take long
+MAX_CHUNKS = 1 << 13  # per codeword; the field would allow more, at a cost in time
 SYMBOL_BYTES = 2
 LOST = "the key is right, but too much of the model was lost or changed since the secret was hidden in it"
 _POLYNOMIAL = 0x1100B
 _ORDER = (1 << 16) - 1  # of the generator 2
-_ZERO = 4 * _ORDER  # stands for the logarithm of 0: its sums with others are exponents of 0
-_AT_ONCE = 1 << 18  # products
-_MAX_ERRORS = 128  # of a codeword that are looked for
+_ZERO = 4 * _ORDER  # logarithm of 0: sums with other logarithms are exponents of 0
+_AT_ONCE = 1 << 18  # products per step, which bounds memory
+_MAX_ERRORS = 128  # maximum number of errors to locate per codeword
 
 
 @dataclass(frozen=True)
 class Codewords:
-    """Data in `count` codewords of `n` chunks of `width` bytes, any `k` of which give a codeword back.
+    """Data in `count` codewords of `n` chunks of `width` bytes; any `k` chunks recover a codeword.
 
-    Chunk i of codeword c has the number i * count + c. Raises ValueError for impossible numbers.
+    Chunk i of codeword c has the number i * count + c. Raises ValueError for impossible values.
     """
 
     count: int
@@ -56,30 +56,30 @@ class Codewords:
         return self.count * self.k * self.width
 
     def encode(self, data: bytes) -> Bytes:
-        """[chunks, width] of at most `size` bytes, in the order of their numbers."""
+        """Encode at most `size` bytes as chunks [chunks, width] in the order of their numbers."""
         rows = np.frombuffer(data.ljust(self.size, b"\0"), np.uint8).reshape(self.k, -1)
         return encode(rows, self.n).reshape(-1, self.width)
 
     def decode(self, numbers: Integers, chunks: Bytes, *, errors: bool = False) -> bytes:
-        """The data from chunks [C, width] with `numbers` [C], in any order.
+        """Decode chunks [C, width] with `numbers` [C], in any order.
 
-        Different chunks with one number are left out: one of them is there by chance. `errors`: so may be
-        others. Raises InputError if too few are left.
+        Ignores numbers with contradictory chunks. `errors`: other chunks may be false too. Raises InputError
+        if too few are left.
         """
         inside = numbers < self.chunks
-        own, first, of_own = np.unique(numbers[inside], return_index=True, return_inverse=True)
-        chunks, left = chunks[inside], len(own)
+        unique, first, inverse = np.unique(numbers[inside], return_index=True, return_inverse=True)
+        chunks, left = chunks[inside], len(unique)
         data = None
-        if left >= self.count * self.k:  # else there is no need for as much memory
+        if left >= self.count * self.k:  # otherwise save the memory
             chosen = chunks[first]
             sure = np.ones(left, bool)
-            sure[of_own[(chunks != chosen[of_own]).any(axis=1)]] = False
-            data = self._decoded(own[sure], chosen[sure], errors)
+            sure[inverse[(chunks != chosen[inverse]).any(axis=1)]] = False
+            data = self._decode(unique[sure], chosen[sure], errors)
         if data is None:
             raise InputError(f"{LOST}: {left:,} of {self.chunks:,} chunks are left")
         return data.tobytes()
 
-    def _decoded(self, numbers: Integers, chunks: Bytes, errors: bool) -> Bytes | None:
+    def _decode(self, numbers: Integers, chunks: Bytes, errors: bool) -> Bytes | None:
         data = np.empty((self.k, self.count, self.width), np.uint8)
         rows, codewords = np.divmod(numbers, self.count)
         for codeword in range(self.count):
@@ -92,21 +92,24 @@ class Codewords:
 
 
 def encode(data: Bytes, n: int) -> Bytes:
-    """[n, width] of data [k, width], width even: k rows, then n - k of parity; k <= n <= 8192."""
+    """Codeword [n, width] of data [k, width], width even: the data, then n - k rows of parity.
+
+    Raises ValueError unless 1 <= k <= n <= MAX_CHUNKS.
+    """
     k = len(data)
     if not 1 <= k <= n <= MAX_CHUNKS:
         raise ValueError(f"expected 1 <= k <= n <= {MAX_CHUNKS}, got k = {k}, n = {n}")
-    return np.concatenate([data, _interpolated(np.arange(k), data, np.arange(k, n), k)])
+    return np.concatenate([data, _interpolate(np.arange(k), data, np.arange(k, n), k)])
 
 
 def decode(numbers: Integers, rows: Bytes, k: int, n: int, *, errors: bool = False) -> Bytes | None:
-    """The data [k, width] from rows [C, width] of a codeword of n with different `numbers` [C].
+    """The data [k, width] from rows [C, width] of a codeword [n, width] with distinct `numbers` [C].
 
-    `errors`: some of the rows may be those of other codewords. None if too few are left.
+    `errors`: some rows may be false. None if too few are left.
     """
     if errors and len(rows) > k:
-        right = _are_right(numbers, rows, k, n)
-        numbers, rows = numbers[right], rows[right]
+        consistent = _consistent_rows(numbers, rows, k, n)
+        numbers, rows = numbers[consistent], rows[consistent]
     if len(rows) < k:
         return None
     order = np.argsort(numbers)[:k]  # data first
@@ -115,12 +118,12 @@ def decode(numbers: Integers, rows: Bytes, k: int, n: int, *, errors: bool = Fal
     known = numbers < k
     data[numbers[known]] = rows[known]
     lost = np.setdiff1d(np.arange(k), numbers)
-    data[lost] = _interpolated(numbers, rows, lost, n)
+    data[lost] = _interpolate(numbers, rows, lost, n)
     return data
 
 
 def _tables() -> tuple[Shorts, Integers]:
-    """Powers of 2, with zeros from `_ZERO` - `_ORDER` on; logarithms [2^16]."""
+    """Powers of 2, zeros from `_ZERO` - `_ORDER` on; and logarithms [2^16]."""
     powers = np.zeros(2 * _ZERO + 1, np.uint16)
     logarithms = np.full(1 << 16, _ZERO)
     value = 1
@@ -134,18 +137,16 @@ def _tables() -> tuple[Shorts, Integers]:
 _POWERS, _LOGARITHMS = _tables()
 
 
-def _interpolated(numbers: Integers, rows: Bytes, wanted: Integers, n: int) -> Bytes:
-    """Rows [W, width] of the numbers `wanted` [W], from as many rows [k, width] as determine them.
+def _interpolate(numbers: Integers, rows: Bytes, wanted: Integers, n: int) -> Bytes:
+    """Interpolate rows [W, width] with numbers `wanted` [W] from k rows [k, width] with `numbers` below `n`.
 
-    `n`: more than any of the `numbers` [k].
-
-    At x it is the sum over all points a with a value v of P(x) v / ((x - a) P'(a)), P(x) the product of all
-    x - a, and P'(a) that of a and the other points.
+    The value at x is the sum of P(x) v / ((x - a) P'(a)) over all points a with values v. P(x) is the product
+    of x - a over all points, P'(a) the product of a - b over all other points b.
     """
     found = np.zeros((len(wanted), rows.shape[1] // SYMBOL_BYTES), np.uint16)
     if len(wanted):
         points, at = numbers + 1, wanted + 1
-        values = _scaled(rows, -_own_products(numbers, n))
+        values = _scale(rows, -_own_products(numbers, n))
         outside = _products(at, points)
         step = max(1, _AT_ONCE // values.size)
         for low in range(0, len(at), step):
@@ -155,27 +156,27 @@ def _interpolated(numbers: Integers, rows: Bytes, wanted: Integers, n: int) -> B
     return found.astype(">u2").view(np.uint8)
 
 
-def _scaled(rows: Bytes, logarithms: Integers) -> Integers:
-    """[C, width / 2] logarithms of the symbols of rows [C, width] times factors of `logarithms` [C]."""
+def _scale(rows: Bytes, logarithms: Integers) -> Integers:
+    """Logarithms [C, width / 2] of the symbols of rows [C, width] times factors with `logarithms` [C]."""
     symbols = _LOGARITHMS[np.ascontiguousarray(rows).view(">u2")]
     return np.where(symbols == _ZERO, _ZERO, (symbols + logarithms[:, None]) % _ORDER)
 
 
 def _own_products(numbers: Integers, n: int) -> Integers:
-    """[C] `_products` of the points of `numbers` [C] below n among themselves: of few that are missing."""
+    """`_products` [C] of the points of `numbers` [C] among themselves, from the few missing ones below n."""
     missing = np.setdiff1d(np.arange(n), numbers)
     return (_all_products(n)[numbers] - _products(numbers + 1, missing + 1)) % _ORDER
 
 
 @lru_cache(maxsize=4)
 def _all_products(n: int) -> Integers:
-    """[n] `_products` of the first n points among themselves."""
+    """`_products` [n] of the first n points among themselves."""
     points = np.arange(1, n + 1)
     return _products(points, points)
 
 
 def _products(at: Integers, points: Integers) -> Integers:
-    """[A] logarithms of the products of the differences to `points` [P] other than itself."""
+    """Logarithms [A] of the products of differences between each of `at` [A] and all other `points` [P]."""
     logarithms = _LOGARITHMS.copy()
     logarithms[0] = 0
     step = max(1, _AT_ONCE // max(1, len(points)))
@@ -183,25 +184,25 @@ def _products(at: Integers, points: Integers) -> Integers:
     return np.concatenate(parts) % _ORDER
 
 
-def _are_right(numbers: Integers, rows: Bytes, k: int, n: int) -> Flags:
-    """[C] which rows [C, width] belong to the codeword that most do; more than k.
+def _consistent_rows(numbers: Integers, rows: Bytes, k: int, n: int) -> Flags:
+    """Mask [C] of the rows [C, width] that belong to the codeword of the majority; C is more than k.
 
-    The sums of v a^t / P'(a), t = 0, 1, ... (see `_interpolated`) over all rows vanish for a codeword as long
-    as t < C - k. From those that do not, the shortest linear recurrence gives the points in error (Massey
-    1969). Where there are too many errors, none is found.
+    For a codeword, the syndromes, the sums of v a^t / P'(a) over all rows (see `_interpolate`), vanish for
+    t < C - k. Otherwise their shortest linear recurrence locates the errors (Massey 1969); if there are too
+    many, it finds none.
     """
     points = numbers + 1
-    values = _scaled(rows, -_own_products(numbers, n))
-    mixed = np.bitwise_xor.reduce(_POWERS[values + np.arange(values.shape[1])], axis=1)  # of all columns
-    terms, powers = _LOGARITHMS[mixed], _LOGARITHMS[points]
+    values = _scale(rows, -_own_products(numbers, n))
+    combined = np.bitwise_xor.reduce(_POWERS[values + np.arange(values.shape[1])], axis=1)  # over columns
+    terms, powers = _LOGARITHMS[combined], _LOGARITHMS[points]
     times = np.arange(min(len(rows) - k, 2 * _MAX_ERRORS))[:, None]
-    sums = np.bitwise_xor.reduce(_POWERS[terms + times * powers % _ORDER], axis=1)
-    locator = _recurrence(sums.tolist()) if sums.any() else [1]
-    values_of = np.zeros(len(rows), np.uint16)  # the locator at 1 / a
+    syndromes = np.bitwise_xor.reduce(_POWERS[terms + times * powers % _ORDER], axis=1)
+    locator = _recurrence(syndromes.tolist()) if syndromes.any() else [1]
+    located = np.zeros(len(rows), np.uint16)  # the locator at 1 / a
     for power, coefficient in enumerate(locator):
-        values_of ^= _POWERS[_LOGARITHMS[coefficient] + -power * powers % _ORDER]
-    right: Flags = values_of != 0
-    return right
+        located ^= _POWERS[_LOGARITHMS[coefficient] + -power * powers % _ORDER]
+    consistent: Flags = located != 0
+    return consistent
 
 
 def _recurrence(sums: list[int]) -> list[int]:

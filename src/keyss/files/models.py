@@ -10,9 +10,9 @@ import io
 import os
 import pkgutil
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import BinaryIO
 
 import numpy as np
 
@@ -33,8 +33,7 @@ from keyss.files.inputs import (
 from keyss.files.ply_rows import has_packed_header
 from keyss.files.training_outputs import identify_folder, is_training, model_file
 
-DECODED_SUFFIX = ".3dgs.safetensors"  # of models that a network decodes
-_PACKED = "compressed_ply:CompressedPlyCodes"
+DECODED_SUFFIX = ".3dgs.safetensors"  # models with a decoder network
 
 
 @dataclass(frozen=True)
@@ -42,58 +41,51 @@ class ModelFormat:
     """One file format of 3DGS models."""
 
     name: str
-    suffixes: tuple[str, ...]  # lower case, with the dot; the first is the usual one
-    magic: tuple[bytes, ...]  # possible first bytes; empty: recognised by name only
-    read: Callable[[BinaryIO], Gaussians]  # onto the CPU; raises InputError
+    suffixes: tuple[str, ...]  # lower case, with the dot; the first is preferred
+    magic: tuple[bytes, ...]  # possible first bytes; empty: identified by suffix
+    read: Callable[[BinaryIO], Gaussians]  # to the CPU; raises InputError
     write: Callable[[Gaussians, BinaryIO], None]  # raises OutputError
-    is_exact: bool = False  # True if all numbers are kept to the last bit
+    is_exact: bool = False  # keeps every bit
 
 
-def _format(name: str) -> Any:
-    """The module or class of a format, imported on first use since some import slow libraries."""
-    return pkgutil.resolve_name(f"keyss.files.formats.{name}")
+def _by_module(
+    name: str, suffixes: tuple[str, ...], magic: tuple[bytes, ...], module: str, is_exact: bool = False
+) -> ModelFormat:
+    """A format with `read(data)` and `write(model)` in a module or class of `formats/`.
 
-
-def _reader(name: str) -> Callable[[BinaryIO], Gaussians]:
-    """A reader that calls the format's `read(data)`."""
+    Imports it on first use, since some import slow libraries.
+    """
 
     def read(file: BinaryIO) -> Gaussians:
         data = file.read(MAX_BYTES + 1)
         if len(data) > MAX_BYTES:
             raise InputError(f"expected at most {MAX_BYTES:,} bytes, found more")
-        with np.errstate(all="ignore"):  # values that are not finite are reported in the end
-            model: Gaussians = _format(name).read(data)
+        with np.errstate(all="ignore"):  # values that are not finite are reported at the end
+            model: Gaussians = pkgutil.resolve_name(f"keyss.files.formats.{module}").read(data)
         return model
 
-    return read
-
-
-def _writer(name: str) -> Callable[[Gaussians, BinaryIO], None]:
-    """A writer that calls the format's `write(model)`."""
-
     def write(model: Gaussians, file: BinaryIO) -> None:
-        file.write(_format(name).write(model))
+        file.write(pkgutil.resolve_name(f"keyss.files.formats.{module}").write(model))
 
-    return write
+    return ModelFormat(name, suffixes, magic, read, write, is_exact)
 
 
 def _read_any_ply(file: BinaryIO) -> Gaussians:
-    return _reader(_PACKED)(file) if has_packed_header(file) else ply.read(file)
+    return _PACKED.read(file) if has_packed_header(file) else ply.read(file)
 
 
-# A file name belongs to the first format with a fitting suffix.
+_PACKED = _by_module("compressed PLY", (".compressed.ply",), (b"ply",), "compressed_ply:CompressedPlyCodes")
+# A file name belongs to the first format with a matching suffix.
 FORMATS = [
-    ModelFormat("compressed PLY", (".compressed.ply",), (b"ply",), _read_any_ply, _writer(_PACKED)),
+    replace(_PACKED, read=_read_any_ply),
     ModelFormat("PLY", (".ply",), (b"ply",), _read_any_ply, ply.write, is_exact=True),
-    ModelFormat("SPZ", (".spz",), (b"NGSP", b"\x1f\x8b"), _reader("spz:SpzCodes"), _writer("spz:SpzCodes")),
-    ModelFormat("SOG", (".sog",), (b"PK\x03\x04",), _reader("sog:SogCodes"), _writer("sog:SogCodes")),
-    ModelFormat("glTF", (".glb",), (b"glTF",), _reader("glb"), _writer("glb")),
-    ModelFormat(".splat", (".splat",), (), _reader("splat"), _writer("splat")),
+    _by_module("SPZ", (".spz",), (b"NGSP", b"\x1f\x8b"), "spz:SpzCodes"),
+    _by_module("SOG", (".sog",), (b"PK\x03\x04",), "sog:SogCodes"),
+    _by_module("glTF", (".glb",), (b"glTF",), "glb"),
+    _by_module(".splat", (".splat",), (), "splat"),
 ]
-# Not a format of 3DGS models, hence not among those that messages list.
-_DECODED = ModelFormat(
-    "decoded", (DECODED_SUFFIX,), (), _reader("decoded_models"), _writer("decoded_models"), is_exact=True
-)
+# Not a format of 3DGS models, so messages do not list it.
+_DECODED = _by_module("decoded", (DECODED_SUFFIX,), (), "decoded_models", is_exact=True)
 _PLY = FORMATS[1]
 
 
@@ -103,17 +95,16 @@ def is_model_path(path: Path | str) -> bool:
 
 
 def is_model_source(path: Path | str) -> bool:
-    """True if `read_model` reads a model at a path: by its suffix, or in the folder of a training."""
+    """True if `read_model` accepts a path: a model suffix, or a training's output folder."""
     return is_model_path(path) or is_training(path)
 
 
 def read_model(path: Path | str) -> Gaussians:
-    """The model at `path`, on the CPU; "-" is standard input. The first bytes tell the format.
+    """The model at `path`, on the CPU; "-" is standard input. The first bytes identify the format.
 
-    Of the folder of another program's training it is the latest model, with a KeyssWarning.
-
-    Raises InputError for a file that is missing, of unknown format, named like another format, or not a
-    complete and finite model.
+    In the output folder of another program's training, the latest model, with a KeyssWarning. Raises
+    InputError for a file that is missing, of unknown format, named like another format, or not a complete
+    and finite model.
     """
     if is_standard(path):
         return model_of_bytes("standard input", read_standard_input())
@@ -139,7 +130,7 @@ def reads_as(path: Path, model: Gaussians) -> bool:
 
 
 def model_of_bytes(path: Path | str, data: bytes) -> Gaussians:
-    """The model that `read_model` would read if the file at `path` contained `data`."""
+    """`read_model` for a file at `path` that contains `data`."""
     try:
         return _read(io.BytesIO(data), Path(path).name)
     except InputError as error:
@@ -150,8 +141,8 @@ def write_model(path: Path | str, model: Gaussians) -> None:
     """Atomically write `model` in the format of the suffix; "-" is standard output, in PLY.
 
     PLY keeps every number; the others round, and most of them sort: see docs/formats.md. Raises UsageError
-    for an unknown suffix, OutputError for a model that is empty, not finite or beyond the format's range, and
-    when the system refuses.
+    for an unknown suffix, OutputError for a model that is empty, not finite or out of the format's range, and
+    on system errors.
     """
     if is_standard(path):
         write_standard_output(model_bytes(path, model))
@@ -169,7 +160,7 @@ def model_bytes(path: Path | str, model: Gaussians) -> bytes:
 
 
 def keeps_low_bits(path: Path | str) -> bool:
-    """True if the format of the suffix keeps all numbers to the last bit. Raises UsageError if unknown."""
+    """True if the format of the suffix keeps every bit. Raises UsageError for unknown suffixes."""
     return _for_writing(path).is_exact
 
 
@@ -223,7 +214,7 @@ def _write(file: BinaryIO, path: Path | str, model: Gaussians) -> None:
 
 
 def _read(file: BinaryIO, name: str) -> Gaussians:
-    """The model in an open file, in the format of its first bytes, which `name` must not contradict."""
+    """The model in an open file, in the format of its first bytes, which must not contradict `name`."""
     start = file.read(START_BYTES)
     file.seek(0)
     fitting = [each for each in FORMATS if each.magic and start.startswith(each.magic)]

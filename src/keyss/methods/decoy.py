@@ -1,4 +1,4 @@
-"""Decoys: with `decoy`, a wrong key opens the cover, encoded like a carried secret."""
+"""Decoys: with `reveal --decoy`, a wrong key opens the cover, encoded like a carried secret."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from keyss.methods.records.lines import Table
 from keyss.methods.records.quantise import Codec
 
 _STRENGTH = 0.02  # standard deviation of changes of opacity logits
-_MOVE = 1e-4  # standard deviation of rotations (radians), shifts (of the model's size) and changes of scale
+_MOVE = 1e-4  # standard deviation of rotation (radians), shift (relative to the model's size) and scale
 _FAINT = 1.6 * DRAWN_OPACITY  # upper limit of opacities of appended Gaussians
 _KNOTS, _LOGITS = 16, 10.0  # changes are piecewise linear in logits from -10 to 10
 _FINER = -0.5  # octaves: about the precision of appended payloads
@@ -28,23 +28,23 @@ _MIN_SHARE = 0.8  # minimum share of the cover's Gaussians that are left
 class Decoy:
     """An `Opened` that shows the cover, imperceptibly changed.
 
-    A smooth function changes opacities, a similarity moves everything, and the faintest Gaussians are left
-    out. The derived key seeds all of it, so that nobody can compute the bytes without the key. The rest is
-    encoded and decoded like a carried secret, which quantises its numbers.
+    A smooth function changes opacities, a similarity moves all Gaussians, and the faintest ones are removed.
+    The derived key seeds these changes, so nobody can compute the bytes without it. The result is encoded and
+    decoded like a carried secret, which quantises its numbers.
     """
 
     frame: Similarity
     changes: torch.Tensor  # [_KNOTS] of opacity logits
     share: float  # fraction of the rendered Gaussians that is left
-    order: int  # seed of their order
-    appended: bool = False  # True if the model has appended Gaussians, which are left out
-    records: bool = True  # True if a secret would lie in records, else in one payload
+    order: int  # seed of the order of records
+    appended: bool = False  # True if the model has appended Gaussians, which are removed
+    records: bool = True  # True if a secret would be records, else one payload
     decode: None = None
     key_size: int = 0
 
     @staticmethod
     def of(stego: Gaussians, key: DerivedKey, *, appended: bool = False, records: bool = True) -> Decoy:
-        """The decoy of a wrong key; a deterministic function of model and key."""
+        """The decoy for a wrong key, a deterministic function of model and key."""
         generator = torch.Generator().manual_seed(int.from_bytes(key.expand("decoy", 8), "little") >> 1)
         changes = _STRENGTH * torch.randn(_KNOTS, generator=generator)
         rotation, shift = _MOVE * torch.randn(2, 3, generator=generator, dtype=torch.float64)
@@ -76,8 +76,8 @@ class Decoy:
     def _encode_and_decode(self, model: Gaussians, stego: Gaussians) -> Gaussians:
         """Encode and decode `model` like a secret carried by `stego`."""
         room = LowBitsRoom.of(int(TYPICAL_SHARE * len(stego)), stego.sh_degree)
-        ways = product(range(stego.sh_degree, -1, -1), (2, 1))  # SH degree, records in a carrier
-        found = ((cells, Table.of_size(8 * room.record_bytes(cells), degree)) for degree, cells in ways)
+        options = product(range(stego.sh_degree, -1, -1), (2, 1))  # SH degree, records per carrier
+        found = ((cells, Table.of_size(8 * room.record_bytes(cells), degree)) for degree, cells in options)
         cells, table = next((each for each in found if each[1]), (0, None))
         if table is None or not self.records:
             precision = whole.Precision.usual(model)
@@ -92,5 +92,5 @@ class Decoy:
         return Remains(len(revealed), len(revealed))
 
     def fingerprint(self) -> str:
-        """A constant that no secret has."""
+        """A constant that differs from the fingerprint of every secret."""
         return "decoy"

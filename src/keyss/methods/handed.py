@@ -1,6 +1,6 @@
-"""Handed-over files: each shows a secret together with the published model, without a key.
+"""Handed-over files: with one, the published model shows a secret without a key.
 
-Methods that do not store all of a secret in the published model have one per secret.
+Methods that do not store a whole secret in the published model write one per secret.
 
     magic (16 bytes) | method (15) | content
 """
@@ -14,16 +14,16 @@ SUFFIX = ".keyss"
 MAX_BYTES = 1 << 30
 _MAGIC = b"keyss handed 2\0\0"
 _HEADER = len(_MAGIC) + METHOD_BYTES
-_EXPECTED = "expected a file that was handed over, as `keyss hide` writes them for some methods"
+_EXPECTED = "expected a `.keyss` file, as `keyss hide` writes for some methods"
 
 
 def pack(payload: Payload) -> bytes:
-    """The bytes of the file."""
+    """The bytes of a file."""
     return _MAGIC + pack_method(payload.method) + payload.data
 
 
 def unpack(data: bytes) -> Payload:
-    """The payload of `pack`. Raises InputError."""
+    """Invert `pack`. Raises InputError."""
     if len(data) < _HEADER or not data.startswith(_MAGIC):
         raise InputError(f"{_EXPECTED}, got something else")
     try:

@@ -1,4 +1,4 @@
-"""The results of opening with a key: the protocol of hidden scenes, and hidden files."""
+"""What a key opens: the protocol of hidden scenes, and hidden files."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from keyss.core.similarity import Similarity
 
 Frame = Literal["secret", "cover"]
 
-FILE = "file"  # replaces the name of a method
+FILE = "file"  # in place of a method's name
 MAX_NAME_BYTES = 255
 
 
@@ -26,11 +26,11 @@ class Remains:
     found: int  # Gaussians that are left
     hidden: int  # Gaussians that were hidden; 0: unknown
     chunks: tuple[int, int] | None = None  # payload chunks left and written; None: not divided
-    slack: float = 0.0  # share by which `found` and `hidden` may differ without a loss
+    slack: float = 0.0  # relative difference of `found` and `hidden` that is not a loss
 
     @property
     def share(self) -> float:
-        """The share of the hidden Gaussians that is left: 0 to 1, more if Gaussians were added."""
+        """The share of the hidden Gaussians that is left; above 1 if Gaussians were added."""
         return self.found / self.hidden if self.hidden else float(self.found > 0)
 
     @property
@@ -40,32 +40,33 @@ class Remains:
 
 
 class Opened(Protocol):
-    """A secret opened by its key, but not revealed yet."""
+    """A secret that its key has opened, not yet revealed."""
 
     @property
     def frame(self) -> Similarity | None:
-        """Secret frame to cover frame; None if the secret was never in the cover's."""
+        """Secret frame to cover frame; None if the secret has no position in the cover."""
 
     @property
     def decode(self) -> Callable[[Gaussians, Tensor], Gaussians] | None:
-        """The decoder: a stego model and a key's vector [`key_size`] give Gaussians in the cover's frame.
+        """The decoder: maps a stego model and a key's vector [`key_size`] to Gaussians in the cover's frame.
 
-        Differentiable in the vector, for white-box attacks. None if keys condition no decoder: wrong keys
-        then show nothing at all.
+        Differentiable in the vector, for white-box attacks. None if no decoder is conditioned on keys: wrong
+        keys then show nothing at all.
         """
 
     @property
     def key_size(self) -> int:
-        """Numbers of a key's vector; 0 without a decoder."""
+        """The size of a key's vector; 0 without a decoder."""
 
     def reveal(self, stego: Gaussians, *, frame: Frame = "secret", force: bool = False) -> Gaussians:
         """The secret as a standalone model on the CPU; `force`: even from a changed model.
 
-        Raises InputError if it does not belong to the model, UsageError for a frame that it never was in.
+        Raises InputError if it does not belong to the model, UsageError for a frame in which it has no
+        position.
         """
 
     def remains(self, revealed: Gaussians) -> Remains:
-        """The part of the secret in the result of `reveal`."""
+        """The part of the secret that the result of `reveal` contains."""
 
     def fingerprint(self) -> str:
         """16 hexadecimal digits that identify the secret in a run, and reveal nothing about it."""
@@ -73,7 +74,7 @@ class Opened(Protocol):
 
 @dataclass(frozen=True)
 class HiddenFile:
-    """A hidden file and its name, which is displayed and never used as a path."""
+    """A hidden file and its name, which is for display only, never a path."""
 
     name: str
     data: bytes = field(repr=False)
@@ -89,7 +90,7 @@ class HiddenFile:
     def of(content: Content) -> HiddenFile:
         """Read a payload. Raises InputError for other content and damage."""
         if content.method != FILE or not isinstance(content, Payload):
-            raise InputError("this key opens a scene, not a file: give it a model's name, such as secret.ply")
+            raise InputError("this key opens a scene, not a file: give a model as output, e.g. secret.ply")
         size = content.data[0] if content.data else 0
         name, data = content.data[1 : 1 + size], content.data[1 + size :]
         if not content.data or len(name) < size:
@@ -102,7 +103,7 @@ class OpensAFileError(InputError):
 
     def __init__(self, file: HiddenFile) -> None:
         super().__init__(
-            f"this key opens a file of {len(file.data):,} bytes, not a scene: give it a name that is not a "
-            "model's"
+            f"this key opens a file of {len(file.data):,} bytes, not a scene: give the output a name that is "
+            "not a model's"
         )
         self.file = file

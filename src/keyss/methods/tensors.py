@@ -17,14 +17,14 @@ from keyss.core.errors import InputError, UsageError
 from keyss.files.formats.decoded_models import load_tensors
 
 _ENTRY = "keyss"
-# Errors from reading a damaged header or damaged tensors.
+# Errors from damaged headers and tensors.
 _LIBRARY_ERRORS = (safetensors.SafetensorError, msgspec.MsgspecError)
 _DAMAGE = (*_LIBRARY_ERRORS, KeyError, TypeError, ValueError, OverflowError, RuntimeError, UsageError)
 
 
 @dataclass(frozen=True)
 class Header:
-    """The common part of all headers."""
+    """The fields that all headers share."""
 
     format: str
     version: int
@@ -34,7 +34,7 @@ HeaderT = TypeVar("HeaderT", bound=Header)
 
 
 def pack_tensors(tensors: Mapping[str, Tensor], header: Header) -> bytes:
-    """Serialise tensors and a header. Deterministic."""
+    """Serialise tensors and a header deterministically."""
     kept = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
     return safetensors.torch.save(kept, {_ENTRY: _encode_header(header).decode()})
 
@@ -42,7 +42,7 @@ def pack_tensors(tensors: Mapping[str, Tensor], header: Header) -> bytes:
 def unpack_tensors(
     data: bytes, kind: type[HeaderT], format: str, version: int
 ) -> tuple[HeaderT, dict[str, Tensor]]:
-    """The header and the tensors of `pack_tensors`, all finite. Call it within `refuse_damage`.
+    """Invert `pack_tensors`; requires finite tensors. Call it within `refuse_damage`.
 
     `kind`: the header's class, with types and bounds. Raises InputError for another version.
     """
@@ -60,7 +60,7 @@ def unpack_tensors(
         text, type=kind, dec_hook=lambda _, numbers: torch.tensor(numbers, dtype=torch.float64)
     )
     if _encode_header(header) != text:
-        raise ValueError("its header has more or other fields")
+        raise ValueError("its header has unexpected fields")
     if not all(value.isfinite().all() for value in tensors.values()):
         raise ValueError("expected finite numbers")
     return header, tensors

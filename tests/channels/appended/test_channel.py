@@ -15,7 +15,7 @@ from hypothesis import given, settings, strategies as st
 
 from keyss.channels import APPENDED, AppendedReader, Payload
 from keyss.channels.appended import pilots
-from keyss.channels.appended.lattice import WORD_BITS, to_gaussians
+from keyss.channels.appended.words import WORD_BITS, to_gaussians
 from keyss.channels.base import pack_payload
 from keyss.core import (
     DRAWN_OPACITY,
@@ -72,15 +72,15 @@ def test_every_size_comes_back(cover: Gaussians, size: int, seed: int) -> None:
     assert reader is not None
     assert reader.open(KEY) == Payload("carry", data)
     packed = compressed_size(pack_payload(Payload("carry", data)))
-    assert len(stego) - len(cover) == APPENDED.appended([packed])
+    assert len(stego) - len(cover) == APPENDED.appended_count([packed])
 
 
 def test_how_many_are_appended_tells_neither_a_size_nor_how_many_secrets_there_are() -> None:
     sizes = range(200, 100_000, 61)
-    alone = {APPENDED.appended([size]) for size in sizes}
-    assert len({APPENDED.appended([size]) for size in range(40_000, 80_000, 61)}) <= 9
-    assert {APPENDED.appended([size, 300]) for size in sizes if size < 60_000} <= alone
-    assert {APPENDED.appended([size, size // 2, 900]) for size in sizes if size < 40_000} <= alone
+    alone = {APPENDED.appended_count([size]) for size in sizes}
+    assert len({APPENDED.appended_count([size]) for size in range(40_000, 80_000, 61)}) <= 9
+    assert {APPENDED.appended_count([size, 300]) for size in sizes if size < 60_000} <= alone
+    assert {APPENDED.appended_count([size, size // 2, 900]) for size in sizes if size < 40_000} <= alone
 
 
 def test_the_cover_stays_and_looks_the_same(cover: Gaussians, stego: Gaussians) -> None:

@@ -16,10 +16,10 @@ from hypothesis import given, settings, strategies as st
 
 from channels.colours.made import PACKED, cover, embed, extract
 from keyss.channels import COLOURS, Colours, ColoursCover
-from keyss.channels.colours import header, reading
+from keyss.channels.colours import colours_reader, header
 from keyss.channels.colours.carriers import Carriers
 from keyss.channels.colours.header import FILE_KEY_BYTES, Header, places
-from keyss.channels.colours.salts import Salts
+from keyss.channels.colours.salt_gaussians import Salts
 from keyss.core import Gaussians, InputError, KeyssError, KeyssWarning, UsageError, WrongKeyError
 from keyss.lab import converters, cropping, half_floats, noise, opacity_pruning, random_pruning
 from keyss.rendering import psnr_between
@@ -252,7 +252,7 @@ def test_a_wrong_key_does_the_work_of_a_right_one(stego: Gaussians, monkeypatch:
     """Counted in searches for places, one for each salt of each header and payload that is looked for."""
     searches = []
     monkeypatch.setattr(header, "places", lambda *args: searches.append(0) or places(*args))
-    monkeypatch.setattr(reading, "places", header.places)
+    monkeypatch.setattr(colours_reader, "places", header.places)
     extract(stego, "a")
     right = len(searches)
     with pytest.raises(WrongKeyError):
@@ -265,14 +265,14 @@ def test_false_acceptance_is_rarer_than_two_to_the_minus_64(monkeypatch: pytest.
     payload there can be, and as often as a reader tries to decrypt.
     """
     stego = embed(cover(6000), [("a", b"x")], entropy=bytes(32))
-    sizes, decrypt = [], reading.decrypt
+    sizes, decrypt = [], colours_reader.decrypt
 
     def counted(data_key: bytes, encrypted: bytes, associated: bytes) -> bytes:
         sizes.append(len(encrypted))
         decrypt(data_key, encrypted, associated) if len(sizes) == 1 else None
         raise InputError("so that all is tried that ever is")
 
-    monkeypatch.setattr(reading, "decrypt", counted)
+    monkeypatch.setattr(colours_reader, "decrypt", counted)
     for name in "ab":
         with pytest.raises(Exception, match="the key is right" if name == "a" else "opens nothing"):
             extract(stego, name)

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 from keyss.channels import Fountain
-from keyss.channels.mixing import mixed
+from keyss.channels.mixing import mix
 
 
 def _random_bits(count: int, seed: int) -> np.ndarray:
@@ -26,10 +26,10 @@ def _noisy(code: np.ndarray, errors: float, seed: int) -> np.ndarray:
     return (1 - 2 * errors) * (1 - 2.0 * flipped)
 
 
-def test_mixed_is_splitmix64() -> None:
+def test_mix_is_splitmix64() -> None:
     """The first outputs of the reference implementation (Vigna) seeded with 1234567."""
     states = np.uint64(1234567) + np.arange(3, dtype=np.uint64) * np.uint64(0x9E3779B97F4A7C15)
-    assert mixed(states).tolist() == [6457827717110365317, 3203168211198807973, 9817491932198370423]
+    assert mix(states).tolist() == [6457827717110365317, 3203168211198807973, 9817491932198370423]
 
 
 def test_the_code_is_linear() -> None:

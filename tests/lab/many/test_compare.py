@@ -35,10 +35,15 @@ def test_comparison_and_resume(
         "two_sample_auc",
         lambda a, b: Auc(float((a.means - b.means).abs().mean()), 0, 0),
     )
+
+    def refuse(*_: object) -> None:
+        raise UsageError("no room")
+
+    monkeypatch.setattr(type(registry.get("carry")), "prepare", refuse)
     command = ["compare", "--cover", str(folders[0]), "--secret", str(folders[1]), *SMALL, "-o", str(out)]
     monkeypatch.setattr(comparison, "EVERY", tuple(names.split(",")))
     assert main([*command, "--methods", names]) == 2
-    assert "carry: not possible" in capsys.readouterr().err  # so small a cover has no room
+    assert "carry: not possible: no room" in capsys.readouterr().err
     assert main([*command, "--dry-run"]) == 0
     assert not out.exists()
     assert "7 runs, 6 to do" in capsys.readouterr().out  # four plain models and three methods
@@ -53,7 +58,7 @@ def test_comparison_and_resume(
     found = json.loads((out / "comparison.json").read_text())
     rows = {row["name"]: row for row in found["methods"]}
     assert list(rows) == names.split(",")
-    assert "any" in rows["carry"]["error"]
+    assert rows["carry"]["error"] == "no room"
     numbers = {name: row["numbers"] for name, row in rows.items() if not row["error"]}
     assert numbers["3dgs"]["cover.psnr"] >= numbers["3dgs-sh"]["cover.psnr"] - 1
     assert 1e6 * numbers["3dgs-sh"]["files.handed_mb"] > numbers["3dgs-sh"]["gaussians"] * 16 * 3 * 4
@@ -102,6 +107,11 @@ def test_all_methods_fail(
         raise InputError("the disk is full")
 
     monkeypatch.setattr(trial, verb, full)
+
+    def refuse(*_: object) -> None:
+        raise UsageError("no room")
+
+    monkeypatch.setattr(type(registry.get("carry")), "prepare", refuse)
     command = ["compare", "--cover", str(folders[0]), "--secret", str(folders[1]), *SMALL, "-o", str(out)]
     assert main([*command, "--methods", "3dgs"]) == 4
     said = capsys.readouterr()

@@ -1,4 +1,4 @@
-"""Carrying below the level of files: models into a model's low bits, and out again."""
+"""Embeds models in the low bits of a model in memory, and extracts them."""
 
 from __future__ import annotations
 

@@ -1,17 +1,28 @@
-"""Models in a model's low bits: what comes back, what they survive, who can read them, what can be seen."""
+"""Models in low bits: round trips, damage, keys, independence of other secrets."""
 
 from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
 from channels.quiet.trained_like import keys, trained_like
-from keyss.channels import LOW_BITS, QuietReader, identities, read_low_bits, salt_rows, usable_carriers
+from keyss.channels import (
+    LOW_BITS,
+    LowBitsCover,
+    QuietReader,
+    identities,
+    read_low_bits,
+    salt_rows,
+    usable_carriers,
+)
 from keyss.channels.quiet.parameters import key_cipher
-from keyss.core import Gaussians, UsageError, WrongKeyError, same_bits
+from keyss.core import Gaussians, UsageError, WrongKeyError
 from keyss.keys import DerivedKey
-from keyss.methods import record_request
+from keyss.methods import embed_models, record_request
 from methods.carry.carried import embed, embed_derived, extract, extract_derived
 
 KEY = "the right key"
@@ -34,7 +45,7 @@ def stego(cover: Gaussians, secret: Gaussians) -> Gaussians:
 
 
 def rows_of(model: Gaussians) -> set[bytes]:
-    """Its Gaussians as a set: what is revealed has another order."""
+    """Gaussians as a set: revealing changes their order."""
     flat = [value.reshape(len(model), -1) for value in vars(model).values()]
     return {row.tobytes() for row in torch.cat(flat, 1).numpy()}
 
@@ -68,17 +79,10 @@ def test_sh_degrees(cover_degree: int, secret_degree: int) -> None:
     assert len(carried.gaussians) == 900
 
 
-def test_cover_without_harmonics() -> None:
-    with pytest.raises(UsageError, match="room for records of 0 bytes"):
-        embed_derived(trained_like(1500, sh_degree=0), [(keys(), trained_like(50, 1, 0))])
-    with pytest.raises(WrongKeyError):
-        extract_derived(QuietReader.of(trained_like(50, sh_degree=0)), keys()[0])
-
-
-def test_every_usable_gaussian_is_written(cover: Gaussians) -> None:
-    """So what the holder of one key sees does not depend on what else is hidden."""
-    own, other = keys(1), keys(2)
-    hidden = [trained_like(800, 5), trained_like(900, 6)]
+def test_every_usable_gaussian_is_written() -> None:
+    """The holder of one key sees the same whatever else is hidden."""
+    cover, own, other = trained_like(4000), keys(1), keys(2)
+    hidden = [trained_like(700, 5), trained_like(800, 6)]
     before = read_low_bits(cover)
     seen = []
     for secrets in ([(own, hidden[0])], [(own, hidden[0]), (other, hidden[1])]):
@@ -92,29 +96,8 @@ def test_every_usable_gaussian_is_written(cover: Gaussians) -> None:
         cells, _ = key_cipher(own[0]).decrypt(carriers.names, carriers.low)
         seen.append((carried.count, len(carried.gaussians), int(cells.sum())))
         with pytest.raises(WrongKeyError):
-            extract_derived(carriers, keys(3)[0])  # a third key hides nothing
+            extract_derived(carriers, keys(3)[0])
     assert seen[0] == seen[1]
-
-
-def test_two_secrets(cover: Gaussians) -> None:
-    """Two fifths of the cover each, as 40,000 and 40,000 in 100,000."""
-    hidden, own = [trained_like(1200, 5), trained_like(1200, 6)], [keys(1), keys(2)]
-    stego = embed_derived(cover, list(zip(own, hidden, strict=True)))
-    found = [extract_derived(QuietReader.of(stego), each[0]).gaussians for each in own]
-    for got, want in zip(found, hidden, strict=True):
-        assert torch.allclose(got.means.sort(0).values, want.means.sort(0).values, atol=1e-3)
-    with pytest.raises(UsageError, match="same key"):
-        embed_derived(cover, [(own[0], hidden[0]), (own[0], hidden[1])])
-
-
-def test_randomness_comes_from_entropy(cover: Gaussians, secret: Gaussians) -> None:
-    own = keys()
-    same = [embed_derived(cover, [(own, secret)], entropy=ENTROPY) for _ in range(2)]
-    assert same_bits(*same)
-    other = embed_derived(cover, [(own, secret)])
-    written = usable_carriers(cover)
-    equal = read_low_bits(other)[written] == read_low_bits(same[0])[written]
-    assert equal.mean() == pytest.approx(1 / 256, abs=2e-3)
 
 
 @pytest.mark.parametrize("seed", range(2))
@@ -135,7 +118,7 @@ def test_shuffling_and_pruning(cover: Gaussians, secret: Gaussians, seed: int) -
 
 
 def test_bit_flip_loses_one_carrier(cover: Gaussians, secret: Gaussians) -> None:
-    """Any bit of any value: low ones, high ones, positions; through the whole key, both salts included."""
+    """Any bit of any attribute, including Gaussians that hold a salt."""
     stego = embed(cover, [(KEY, secret)], entropy=ENTROPY)
     own = list(QuietReader.of(stego).keys(KEY))[:3]
     whole = rows_of(extract(stego, KEY).gaussians)
@@ -153,12 +136,12 @@ def test_bit_flip_loses_one_carrier(cover: Gaussians, secret: Gaussians) -> None
             if name in names[:3]:
                 found = rows_of(extract_derived(carriers, own[names.index(name)]).gaussians)
                 break
-        assert len(whole - found) <= 2  # that divide the carrier
+        assert len(whole - found) <= 2  # secret Gaussians in one carrier
         assert found <= whole
 
 
 def _with_flipped_bit(model: Gaussians, row: int, column: int, bit: int) -> Gaussians | None:
-    """None where the value would not be finite."""
+    """None if the value becomes non-finite."""
     changed = model.map(torch.clone)
     for values in vars(changed).values():
         flat = values.view(len(values), -1).numpy().view(np.uint32)
@@ -169,8 +152,9 @@ def _with_flipped_bit(model: Gaussians, row: int, column: int, bit: int) -> Gaus
     raise AssertionError("no such column")
 
 
+@pytest.mark.filterwarnings("ignore::keyss.core.KeyssWarning")  # of added Gaussians
 def test_foreign_gaussians_do_not_block_salts(stego: Gaussians, secret: Gaussians) -> None:
-    """Three added Gaussians come before all of the model's own in the order of salts."""
+    """Three inserted Gaussians come first in the order of salts."""
     own = QuietReader.of(stego).salts
     added = trained_like(200, seed=9)
     added.sh[:, 1:] *= 20
@@ -179,3 +163,17 @@ def test_foreign_gaussians_do_not_block_salts(stego: Gaussians, secret: Gaussian
     assert not set(own) & set(QuietReader.of(crowded).salts[:3])
     assert rows_of(extract(crowded, KEY).gaussians) == rows_of(extract(stego, KEY).gaussians)
     assert len(extract(crowded, KEY).gaussians) == len(secret)
+
+
+def test_damaged_records_are_detected(monkeypatch: pytest.MonkeyPatch) -> None:
+    embed = LowBitsCover.embed
+
+    def broken(*arguments: Any, **options: Any) -> Gaussians:
+        found = embed(*arguments, **options)
+        sh = found.sh.clone()
+        sh[::5, 5].view(torch.int32).bitwise_xor_(8)
+        return replace(found, sh=sh)
+
+    monkeypatch.setattr(LowBitsCover, "embed", broken)
+    with pytest.raises(RuntimeError, match="do not open again"):
+        embed_models(LOW_BITS.prepare(trained_like(6000, 0)), [KEY], [trained_like(2000, 1)])

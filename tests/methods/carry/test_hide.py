@@ -1,4 +1,4 @@
-"""Carrying as a person does it: files, scenes, folders, the command line."""
+"""Carrying from files and scenes, on the command line and in Python."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def run(files: Path, keyss: Run, monkeypatch: pytest.MonkeyPatch) -> Run:
-    """The command line in the folder of the files."""
+    """Run the command line in the folder of the files."""
     monkeypatch.chdir(files)
     return keyss
 
@@ -109,7 +109,7 @@ def test_secret_from_photos(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("steps", "views"), [(5, 16), (15, 3)])
 @pytest.mark.filterwarnings("ignore::keyss.core.KeyssWarning")  # of appended Gaussians
 def test_hide_in_cover_of_few_steps(steps: int, views: int) -> None:
-    """After few steps most Gaussians are round and grey, and the low bits of such numbers say something."""
+    """After few steps most Gaussians are round and grey, with predictable low bits."""
     scene = tiny_scene(0, views)
     points = torch.randn(1500, 3, generator=torch.Generator().manual_seed(0))
     cover = replace(scene, points=points, colors=(255 * points.sigmoid()).to(torch.uint8))
@@ -125,7 +125,7 @@ def test_min_psnr_of_pruned_secret(run: Run, tmp_path: Path) -> None:
     status, out, err = run(*hide, "-o", tmp_path / "out")
     assert status == 7
     assert re.search(r"the secret with [\d,]+ of 6,000 Gaussians is at .* below 25 dB: nothing was", err)
-    assert "--resume" not in err  # nothing was trained, and no folder is left
+    assert "--resume" not in err  # no training to resume
     assert "below 24 dB" in run(*hide, "-o", tmp_path / "out", "--min-psnr", 24)[2]
     status, out, _ = run(*hide, "-o", tmp_path / "out", "--min-psnr", 0)
     assert status == 0

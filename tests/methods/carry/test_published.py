@@ -1,4 +1,4 @@
-"""Carrying in published .spz, .sog and compressed .ply files, from `hide` to `reveal`."""
+"""Carrying in .spz, .sog and compressed .ply files."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from keyss import CarryOptions
 from keyss.channels import SUFFIXES, channel_for, in_counted_order
 from keyss.files import read_model, write_model
 
-EVERY = pytest.mark.parametrize("format", SUFFIXES)
+every_format = pytest.mark.parametrize("format", SUFFIXES)
 
 
-@EVERY
+@every_format
 def test_hide_reveal_verify_and_info(format: str, tmp_path: Path) -> None:
     cover, secrets = model_of(4000), [model_of(140, seed) for seed in (1, 2)]
     options = CarryOptions(format=format)  # type: ignore[arg-type]
@@ -27,7 +27,7 @@ def test_hide_reveal_verify_and_info(format: str, tmp_path: Path) -> None:
     for index, secret in enumerate(secrets):
         found = keyss.reveal(stego, f"key number {index}").gaussians
         assert len(found) == 140
-        # In another order: sorted, as they were packed.
+        # Packing sorts them.
         nearest = torch.cdist(found.means, secret.means).min(dim=1).values
         assert float(nearest.max()) < 0.01
         assert keyss.verify(stego, f"key number {index}").secret is not None
@@ -37,7 +37,7 @@ def test_hide_reveal_verify_and_info(format: str, tmp_path: Path) -> None:
     assert keyss.info(tmp_path / "run").kind == "hiding"
 
 
-@EVERY
+@every_format
 def test_large_secrets_are_pruned(format: str) -> None:
     cover, asked = model_of(2500), [keyss.Secret(model_of(1500, 1), "key one")]
     pruning = CarryOptions(format=format, refit="never")  # type: ignore[arg-type]
@@ -45,7 +45,7 @@ def test_large_secrets_are_pruned(format: str) -> None:
     assert 250 < hidden.metrics.secret_gaussians[0] < 1000
 
 
-@EVERY
+@every_format
 def test_quantised_cover_keeps_its_codes(format: str, tmp_path: Path) -> None:
     path = tmp_path / f"cover{SUFFIXES[format]}"
     write_model(path, model_of(3000))

@@ -1,4 +1,4 @@
-"""Which secrets are refitted, for how long, what a refit keeps, and what a refitted cover shows."""
+"""When secrets are refitted, for how long, and with which result."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def test_refit_steps() -> None:
     options = CarryOptions(fit=FIT)
     assert _prepare(options, _source(cover), _source(large)).refits == (400,)
     assert _prepare(options, _source(cover), _source(large, photos=True)).refits == (1150,)
-    with pytest.warns(KeyssWarning, match="other secrets"):
+    with pytest.warns(KeyssWarning, match="can notice that there are other secrets"):
         assert _prepare(options, _source(cover), _source(small), _source(large)).refits == (0, 400)
     asked = options.with_fit(iterations=900)
     assert _prepare(asked, _source(cover), _source(large)).refits == (900,)
@@ -78,7 +78,6 @@ def test_refit_from_photos(format: str, secrets: int) -> None:
 
 
 def test_most_contributing() -> None:
-    """Behind a wall, out of every view, transparent."""
     plain = random_gaussians(seed=0)
     wall = replace(plain, opacity_logits=torch.full((200,), 5.0))
     useless = replace(wall, means=wall.means + 1000)
@@ -114,7 +113,7 @@ def pair() -> tuple[list[Scene], list[Gaussians]]:
 def test_cover_is_independent_of_secret_and_key(
     pair: tuple[list[Scene], list[Gaussians]],
 ) -> None:
-    """But for low bits: whoever asks what the file says of the secret asks of those only."""
+    """Except for low bits."""
     scenes, models = pair
     config = CarryOptions(fit=replace(TINY, iterations=30, max_gaussians=2000), refit="always")
     others = [scenes[0], tiny_scene(5, views=11, distance=3.0)]

@@ -1,4 +1,4 @@
-"""Small options of KeySS."""
+"""Small KeySS options, trainings and secrets."""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ VECTORS = random_embeddings(3, torch.Generator().manual_seed(1234))
 
 
 def small(design: str, fit: FitConfig = FIT, **changes: object) -> KeyssOptions:
-    """A design with a decoder of few bytes, a few steps, and changed fields of the design."""
+    """Options of a design with a tiny decoder."""
     known = DESIGNS[design]
     decoder = replace(known.decoder, hidden=(8, 8), branch=8)
     return KeyssOptions(fit=fit, design=replace(known, decoder=decoder, **changes))  # type: ignore[arg-type]
 
 
 def start_training(options: KeyssOptions, scenes: list[Scene], models: list[Gaussians]) -> KeyssTraining:
-    """A training of scenes that are in one frame, before its first step."""
+    """A training of scenes in one frame, before its first step."""
     placed = [PlacedScene.of(scene, model, Similarity()) for scene, model in zip(scenes, models, strict=True)]
     design = options.configuration
     if design.ssim_weight is not None:
@@ -51,7 +51,7 @@ def start_training(options: KeyssOptions, scenes: list[Scene], models: list[Gaus
 
 
 def make_secret(stego: Gaussians) -> KeyssSecret:
-    """A secret that `stego` belongs to, whose decoder of few bytes changes opacities a little."""
+    """A secret in `stego` whose decoder changes opacities slightly."""
     torch.manual_seed(0)
     shape = DecoderShape(mask=("op",), hidden=(8, 8), branch=8, sh_degree=stego.sh_degree)
     decoder = Decoder(shape).requires_grad_(False)
@@ -65,7 +65,7 @@ def make_secret(stego: Gaussians) -> KeyssSecret:
 def latent_model(
     cover: Gaussians, count: int, secrets: int = 1
 ) -> tuple[Gaussians, list[KeyssSecret], list[Tensor]]:
-    """`cover` with latents in its first `count` rows, the secrets, and the latents [count, D] of each."""
+    """`cover` with latents in its first `count` rows, the secrets, and their latents [count, D]."""
     size = latents_of(3, secrets)
     ranks = np.random.default_rng(0).random((len(cover), size * secrets))
     decoders, values = [], []
@@ -73,7 +73,7 @@ def latent_model(
         decoder = LatentDecoder(DecoderShape(kind="latent", secrets=secrets, secret=secret))
         decoder.place.fit(cover)
         torch.nn.init.normal_(decoder.basis, generator=torch.Generator().manual_seed(secret))
-        decoder.basis.data = decoder.basis.data.half().float()  # as a payload has it
+        decoder.basis.data = decoder.basis.data.half().float()  # as in a payload
         model = trained_like(count, seed=10 + secret)
         colours = torch.cat([model.sh[:, 0], model.sh[:, 1:].flatten(1)[:, : size - 13]], dim=1)
         latents = decoder.requires_grad_(False).to_latents(model, colours)

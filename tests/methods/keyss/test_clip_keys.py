@@ -1,4 +1,4 @@
-"""Keys through CLIP: a small random text encoder of the real architecture, with the real vocabulary."""
+"""CLIP keys, with a small random text encoder and the real vocabulary."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ TOKENS = 49408
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """CLIP as `transformers` saves it: ViT-L/14's text encoder, but two layers of 32 numbers."""
+    """A model folder of `transformers` with two layers of width 32."""
     transformers = pytest.importorskip("transformers", reason="needs keyss[clip]")
     found = importlib.util.find_spec("clip")
     shipped = (
@@ -60,7 +60,6 @@ def encoder(folder: Path) -> ClipKeys:
 
 
 def test_similar_keys_have_similar_vectors(encoder: ClipKeys) -> None:
-    """Why CLIP is for comparison and nothing is sealed with it."""
     assert torch.equal(encoder("Key"), encoder("key"))
     assert float(F.cosine_similarity(encoder(KEY), encoder("a" + KEY[1:]), dim=0)) > 0.5
 
@@ -85,7 +84,7 @@ def test_missing_extra(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_hide_with_clip_keys(encoder: ClipKeys, folder: Path) -> None:
-    """Two keys that are the same to CLIP have the same vector and open different things."""
+    """Keys with equal CLIP vectors open different secrets."""
     fit = FitConfig(iterations=4, max_gaussians=200, grow_start=0.2, grow_every=5, evaluate_every=0, seed=0)
     config = replace(small("published", fit), key_encoder="clip", clip_model=str(folder))
     scenes = [tiny_scene(seed) for seed in range(3)]

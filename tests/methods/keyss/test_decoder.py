@@ -26,7 +26,7 @@ def _distance(a: Gaussians, b: Gaussians, name: str) -> float:
 
 @pytest.mark.parametrize("released", [False, True])
 def test_equations_6_and_8(released: bool) -> None:
-    """In float64, for one Gaussian, from the weights alone."""
+    """In float64 from the weights."""
     model, decoder = random_gaussians(40), _decoder(released=released, hidden=(5, 7), branch=3)
     decoded = decoder(model, 3 * KEY)
     weights = {name: value.double() for name, value in decoder.state_dict().items()}
@@ -65,7 +65,7 @@ def test_mask(mask: tuple[str, ...]) -> None:
 
 
 def test_gaussians_are_decoded_independently() -> None:
-    """Reordering and pruning change nothing for those that stay, except in the authors' program."""
+    """Except in the authors' program, which normalises over all Gaussians."""
     gaussians = random_gaussians()
     chosen = torch.randperm(len(gaussians))[:50]
     for released in (False, True):
@@ -81,7 +81,7 @@ def test_gaussians_are_decoded_independently() -> None:
 
 
 def test_chunked_decoding(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Sizes are the file's: otherwise 3 kB could ask for 34 kB for each Gaussian at once."""
+    """Chunks bound the memory that a hostile file can request."""
     decoder, stego = _decoder(released=True), random_gaussians()
     whole, sizes = decoder(stego, KEY), []
     decoder.register_forward_pre_hook(lambda _, given: sizes.append(len(given[0])))

@@ -1,9 +1,8 @@
-"""The design `latent`: what is encrypted, what a row gives back, and its training."""
+"""The design `latent`: encryption, decoding, training."""
 
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,13 +18,13 @@ from keyss.core import InputError, UsageError, same_bits
 from keyss.lab import search_embeddings
 from keyss.methods import LatentDecoder, registry
 from keyss.methods.keyss.latent import latents_of
-from methods.hiding import Hidden, check_resumes, hide_scenes, three_scenes
+from methods.hiding import Hidden, hide_scenes, three_scenes
 from methods.keyss.small import KEYS, VECTORS, latent_model, small
 from tiny_scenes import random_gaussians
 
 
 def _embed_latents(secrets: int = 1) -> tuple[Gaussians, list[LatentDecoder], list[Tensor]]:
-    """Latents of `secrets` in 900 of 1,000 rows."""
+    """Write latents of `secrets` secrets in 900 of 1,000 rows."""
     stego, found, latents = latent_model(heavy_tailed(1000), 900, secrets)
     return stego, [secret.decoder for secret in found], latents  # type: ignore[misc]
 
@@ -47,7 +46,7 @@ def test_round_trip(secrets: int) -> None:
 
 
 def test_ciphertext_is_uniform() -> None:
-    """Constant latents would come out as one rank without the pad."""
+    """Even for constant latents."""
     _, (decoder,), _ = _embed_latents()
     names = row_names(trained_like(2000, seed=3))
     constant = np.tile(decoder.knots.double().numpy()[:, 16], (2000, 1))
@@ -93,7 +92,6 @@ def hidden() -> Hidden:
 
 @pytest.mark.parametrize("secret", [0, 1])
 def test_hide_and_reveal(hidden: Hidden, secret: int) -> None:
-    """A trained secret is opened as it was published, and the rest of the file is the cover's."""
     opened = registry.open_model(hidden.stego, KEYS[secret])
     assert opened.fingerprint() == hidden.opened[secret].fingerprint()
     revealed = opened.reveal(hidden.stego)
@@ -108,11 +106,6 @@ def test_moved_model(hidden: Hidden) -> None:
     for other in (replace(hidden.stego, means=hidden.stego.means + 1e-2), random_gaussians(seed=9)):
         with pytest.raises(InputError, match="moved or rounded"):
             hidden.opened[0].reveal(other)
-
-
-def test_resume(tmp_path: Path) -> None:
-    options = small("latent").with_fit(iterations=40, grow_every=5)
-    check_resumes(options, tmp_path, "hide", three_scenes()[1][:2])
 
 
 def test_cover_without_harmonics() -> None:

@@ -1,4 +1,4 @@
-"""A secret's bytes, damage that ends in InputError, and models that were rounded or pruned."""
+"""Serialisation of secrets, damaged payloads, and rounded or pruned models."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ SHAPE = asdict(_secret().decoder.shape)
 
 
 def _with_header(**changes: object) -> bytes:
-    """The same with another JSON header, keeping the tensors."""
+    """Replace fields of the JSON header."""
     (size,) = struct.unpack("<Q", PACKED[:8])
     outer = json.loads(PACKED[8 : 8 + size])
     inner = json.loads(outer["__metadata__"]["keyss"])
@@ -86,11 +86,11 @@ def test_unknown_version() -> None:
         {"shape": SHAPE | {"hidden": [10**9, 16]}},
         {"shape": SHAPE | {"hidden": [16]}},
         {"shape": SHAPE | {"kind": "eval"}},
-        {"shape": SHAPE | {"kind": "latent"}},  # whose tensors have other names
+        {"shape": SHAPE | {"kind": "latent"}},  # other tensors
         {"shape": SHAPE | {"key_size": 63}},
         {"shape": SHAPE | {"secrets": 0}},
         {"visibility": -1.0},
-        {"shape": SHAPE | {"mask": ["op"]}},  # fewer branches than there are weights for
+        {"shape": SHAPE | {"mask": ["op"]}},  # fewer branches than weights
         {"shape": SHAPE | {"hidden": [4096, 4096], "branch": 4096}},  # half a gigabyte of weights
         {"count": -1},
         {"count": 2**40},

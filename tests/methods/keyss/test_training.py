@@ -1,4 +1,4 @@
-"""The paper's training on tiny scenes: the same code as for real ones, in seconds."""
+"""KeySS training on tiny scenes."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def test_reveal_in_cover_frame(hidden: Hidden) -> None:
     assert frame.scale != pytest.approx(1, abs=0.1)
     camera = scenes[1].test[0].camera
     difference = render(own, camera) - render(there, frame.apply_camera(camera))
-    # Single pixels at the rim of a Gaussian may jump.
+    # Single pixels at the border of a Gaussian may differ.
     assert difference.abs().mean() < 1e-4
 
 
@@ -111,13 +111,13 @@ def test_targets() -> None:
     poses = CombinedPoses(placed, torch.device("cpu"))
     own = poses.target(1, owner=1, index=3)
     assert torch.equal(own.image[mask], scenes[1].train[3].image[mask].float() / 255)
-    # The model moved into the cover's frame shows from a moved camera what its photo shows.
+    # The transformed model matches the photo from the transformed camera.
     rendered = render(placed[1].plain, poses.camera(1, 3)).clamp(0, 1)
     assert (rendered - own.image)[mask].abs().mean() < 4e-3
     assert own.mask is not None
     assert torch.equal(own.mask, mask)
     foreign = poses.target(0, owner=1, index=3)
-    assert foreign.mask is None  # what stands before one scene does not stand before another
+    assert foreign.mask is None  # masks apply to their own scene only
     expected = render(models[0], poses.camera(1, 3)).clamp(0, 1)
     assert (foreign.image - expected).abs().max() <= 0.5 / 255 + 1e-6
 
@@ -130,7 +130,7 @@ def test_scene_subsets(which: Any) -> None:
     run.step()
 
 
-@pytest.mark.parametrize("design", ["published", "released"])
+@pytest.mark.parametrize("design", ["published", "released", "latent"])
 def test_resume(tmp_path: Path, design: str) -> None:
     options = small(design).with_fit(iterations=40, grow_every=5)
     check_resumes(options, tmp_path, "hide", three_scenes()[1][:2])

@@ -1,4 +1,4 @@
-"""Tables of integers as few bytes."""
+"""Entropy coding of integer tables."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def test_round_trip(rows: int, columns: int, most: int, seed: int) -> None:
     data = entropy.encode(table, shares, groups)
     assert (entropy.decode(data, rows, shares, groups) == table).all()
     for other in (data[:-1], data + b"\0", b""):
-        with pytest.raises(InputError, match="not whole"):
+        with pytest.raises(InputError, match="length is wrong"):
             entropy.decode(other, rows, shares, groups)
 
 

@@ -1,4 +1,4 @@
-"""Records of Gaussians: how far off what comes back may be, whatever goes in."""
+"""Error bounds of quantised records."""
 
 from __future__ import annotations
 
@@ -57,14 +57,14 @@ def test_codec_error(data: st.DataObject, degree: int, more: int) -> None:
             error = np.arcsinh((was - line.centre) / line.spread) - np.arcsinh(
                 (now - line.centre) / line.spread
             )
-            # What comes back is rounded to single precision, half a unit in the last place.
+            # Rounding to float32.
             rounded = np.spacing(np.abs(now).astype(np.float32)).astype(np.float64) / 2 / line.spread
             assert (np.abs(error) <= 1.1 * reach / ((1 << table.bits[0]) - 1) + rounded + 1e-5).all()
     assert torch.isfinite(back.sh).all()
     length = model.quats.double().norm(dim=1)
     unit = model.quats.double() / length[:, None].clamp_min(1e-60)
-    same = (unit * back.quats.double()).sum(1).abs()[length > 1e-11]  # what is shorter turns nothing
-    # Each of the three is off by half a step of sqrt(2) / (2^bits - 1), and the fourth by as much as follows.
+    same = (unit * back.quats.double()).sum(1).abs()[length > 1e-11]  # shorter ones are zero
+    # Half a step of sqrt(2) / (2^bits - 1) for three components; the fourth follows.
     assert (1 - same <= 6 * (0.5**0.5 / ((1 << table.bits[2]) - 1)) ** 2 + 1e-6).all()
     assert torch.allclose(back.quats.norm(dim=1), torch.ones(count), atol=1e-5)
 
@@ -79,7 +79,7 @@ def test_zero_and_negated_quaternions() -> None:
 
 
 def test_render_quality() -> None:
-    """Of a model with colours that go together, as those of trained ones do."""
+    """With correlated colours, as in trained models."""
     model = trained_like(2000, seed=4)
     sh = 0.25 * model.sh + 0.75 * model.sh[:, :, :1]
     model = Gaussians(model.means / 4, model.quats, model.log_scales + 1, model.opacity_logits, sh)

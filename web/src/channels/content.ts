@@ -1,21 +1,21 @@
-/** What every channel of a model gives. */
+/** The content of channels. */
 import { bytesKey } from '../core/bytes.ts';
 import { damaged } from '../core/errors.ts';
 import type { Derive } from '../keys/keys.ts';
 
 interface Opened {
-  readonly foreign?: number; // Gaussians that were added to the secret's file, or changed
+  readonly foreign?: number; // Gaussians added to or changed in the published file
 }
 
-/** Small pieces of one size that are found one by one. */
+/** Records of one size, each read on its own. */
 export interface Records extends Opened {
   readonly service: 'records';
   readonly method: string;
   readonly header: Uint8Array;
-  readonly records: Uint8Array[]; // in the order of their carriers
+  readonly records: Uint8Array[]; // in carrier order
 }
 
-/** Bytes that come out whole or not at all. */
+/** Bytes that are read completely or not at all. */
 export interface Payload extends Opened {
   readonly service: 'payload';
   readonly method: string;
@@ -26,7 +26,7 @@ export type Content = Records | Payload;
 
 /** A channel of one model, prepared for any number of keys. */
 export interface Reader {
-  /** Keys that each attempt derives, whatever it opens. */
+  /** Number of key derivations per attempt, whatever it opens. */
   readonly derivations: number;
 
   /** What `key` opens, null for nothing. Raises InputError for damage. */
@@ -35,7 +35,7 @@ export interface Reader {
 
 const METHOD_BYTES = 15;
 
-/** Of the method's name, a zero, the data; `keyss.channels.payloads` on the other side. */
+/** Parses method name, zero byte, data; counterpart of `keyss.channels.payloads`. */
 export function unpackPayload(packed: Uint8Array): Payload {
   const length = packed.indexOf(0);
   const name = packed.subarray(0, length);

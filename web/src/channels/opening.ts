@@ -1,25 +1,24 @@
 /**
- * Opening with a key, in whichever channel of a model the secret lies; `keyss.channels.opening` on the other side.
+ * Opens a secret with a key in any channel of a model; counterpart of `keyss.channels.opening`.
  *
- * All channels are looked through for every key, also when one of them has opened already: how long it takes tells
- * neither whether a key opens something nor where. Colours come second, with whatever key: they take four times as long as
- * all others together.
+ * Every key searches all channels, even after one has opened, so that timing reveals neither whether a key opens
+ * something nor where. Colours are searched last, as they take four times as long as all others together.
  */
 import type { ReadModel } from '../files/models.ts';
 import type { Derive } from '../keys/keys.ts';
-import { AppendedReader } from './appended/reader.ts';
-import { ColoursReader } from './colours/reading.ts';
+import { AppendedReader } from './appended/appended_reader.ts';
+import { ColoursReader } from './colours/colours_reader.ts';
 import type { Content, Reader } from './content.ts';
 import { QuietReader } from './quiet/reading.ts';
 
-/** A model's channels, prepared for any number of keys: those that are quick to search, and what is left. */
+/** A model's channels, prepared for any number of keys: the quick ones, or the thorough search of colours. */
 export function preparedFor(model: ReadModel): (thorough: boolean) => Channels {
   const quick = [QuietReader.of(model), AppendedReader.of(model)].filter((each) => each !== null);
   let colours: Reader | null = null;
   return (thorough) => new Channels(thorough ? [(colours ??= ColoursReader.of(model))] : quick);
 }
 
-/** Several channels; the first one that opens counts. */
+/** Several channels; the first that opens wins. */
 export class Channels implements Reader {
   constructor(readonly readers: readonly Reader[]) {}
 

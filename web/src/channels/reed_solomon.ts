@@ -1,9 +1,9 @@
-/** Reed-Solomon over GF(2^16), with lost and wrong chunks; `keyss.channels.reed_solomon` on the other side. */
+/** Reed-Solomon decoder over GF(2^16) for erasures and errors; counterpart of `keyss.channels.reed_solomon`. */
 import { tooMuchLost } from '../core/errors.ts';
 
 const ORDER = 65535; // of the generator 2
-const ZERO = 4 * ORDER; // stands for the logarithm of 0: its sums with others are exponents of 0
-const MAX_ERRORS = 128; // of a codeword that are looked for
+const ZERO = 4 * ORDER; // logarithm of 0; POWERS of its sums with others are 0
+const MAX_ERRORS = 128; // per codeword
 
 const POWERS = new Uint16Array(2 * ZERO + 1);
 const LOGARITHMS = new Uint32Array(ORDER + 1).fill(ZERO);
@@ -18,8 +18,8 @@ function product(a: number, b: number): number {
 }
 
 /**
- * Data in `count` codewords of `n` chunks of `width` bytes, an even number, any `k` of which give a codeword back. Chunk
- * i of codeword c has the number i x `count` + c.
+ * Data in `count` codewords of `n` chunks of `width` bytes (even), any `k` of which determine the codeword. Chunk i of
+ * codeword c has the number i x `count` + c.
  */
 export interface Codewords {
   readonly count: number;
@@ -35,19 +35,18 @@ interface Chunk {
 }
 
 /**
- * The data from numbered chunks in any order. `errors`: some may be there by chance. Raises InputError where too few are
- * left.
+ * The data from numbered chunks in any order. `errors`: some chunks may be wrong. Raises InputError for too few chunks.
  */
 export function decoded(
   { count, n, k, width }: Codewords, chunks: Iterable<readonly [number, Uint8Array]>, errors = false,
 ): Uint8Array {
-  const left = new Map<number, Uint8Array | null>(); // null: of different chunks with one number, one is there by chance
+  const left = new Map<number, Uint8Array | null>(); // null: different chunks claim this number
   for (const [number, chunk] of chunks) {
     const other = left.get(number);
     const alike = other === undefined || (other?.every((each, at) => each === chunk[at]) ?? false);
     if (number < count * n) left.set(number, alike ? chunk : null);
   }
-  if (left.size < count * k) throw tooMuchLost(); // before there is memory for that many
+  if (left.size < count * k) throw tooMuchLost(); // before allocating
   const data = new Uint8Array(count * k * width);
   for (let codeword = 0; codeword < count; codeword++) {
     let own: Chunk[] = [];
@@ -67,7 +66,7 @@ export function decoded(
   return data;
 }
 
-/** What as many chunks of a codeword of n as determine the polynomials make of them at other points. */
+/** The chunks at the `wanted` points, interpolated from k chunks of a codeword of n. */
 function interpolated(chunks: Chunk[], wanted: number[], n: number): Uint8Array[] {
   const [points, values] = [chunks.map(({ point }) => point), scaled(chunks, n)];
   const columns = values.length / points.length;
@@ -82,12 +81,12 @@ function interpolated(chunks: Chunk[], wanted: number[], n: number): Uint8Array[
   });
 }
 
-/** [C, columns] logarithms of the chunks' symbols, each divided by the differences of its point to all others. */
+/** [C, columns] logarithms of the chunks' symbols divided by the product of their points' differences. */
 function scaled(chunks: Chunk[], n: number): Uint32Array {
   const points = chunks.map(({ point }) => point);
   const columns = chunks[0].bytes.length / 2;
   const found = new Uint32Array(chunks.length * columns);
-  const [whole, own] = [productsOfAll(n), new Set(points)]; // divided by those of few that are missing
+  const [whole, own] = [productsOfAll(n), new Set(points)]; // divided by the few missing ones
   const missing = logarithmsOfProducts(points, whole.points.filter((point) => !own.has(point)));
   chunks.forEach(({ bytes }, row) => {
     for (let column = 0; column < columns; column++) {
@@ -100,7 +99,7 @@ function scaled(chunks: Chunk[], n: number): Uint32Array {
 
 let latest: { points: number[]; logarithms: Uint32Array } = { points: [], logarithms: new Uint32Array(0) };
 
-/** All points of a codeword of n, and `logarithmsOfProducts` of them. */
+/** All points of a codeword of n, and their `logarithmsOfProducts`; the last result is cached. */
 function productsOfAll(n: number): typeof latest {
   if (latest.points.length !== n) {
     const points = Array.from({ length: n }, (_, row) => row + 1);
@@ -109,7 +108,7 @@ function productsOfAll(n: number): typeof latest {
   return latest;
 }
 
-/** Logarithms of the products of the differences to all `points` but itself. */
+/** Logarithms of the products of differences to all other `points`. */
 function logarithmsOfProducts(at: number[], points: number[]): Uint32Array {
   const others = Uint16Array.from(points);
   return Uint32Array.from(at, (own) => {
@@ -119,7 +118,7 @@ function logarithmsOfProducts(at: number[], points: number[]): Uint32Array {
   });
 }
 
-/** Of more than k chunks those that belong to the codeword that most do; none where too many do not. */
+/** The chunks that belong to the codeword, given more than k; none if there are too many errors. */
 function rightOf(chunks: Chunk[], k: number, n: number): Chunk[] {
   const values = scaled(chunks, n);
   const columns = values.length / chunks.length;

@@ -1,4 +1,4 @@
-/** Bytes put together, compared, read and unpacked. */
+/** Bytes put together, compared, read and inflate. */
 import { damaged } from './errors.ts';
 
 export function joined(...parts: Uint8Array[]): Uint8Array {
@@ -15,7 +15,7 @@ export function ascii(text: string): Uint8Array {
   return new TextEncoder().encode(text);
 }
 
-/** A string that is equal for equal bytes only: a key for maps. */
+/** A string key for maps, equal for equal bytes only. */
 export function bytesKey(bytes: Uint8Array): string {
   let text = '';
   for (const byte of bytes) text += String.fromCharCode(byte);
@@ -26,7 +26,7 @@ export function viewOf(bytes: Uint8Array): DataView {
   return new DataView(bytes.buffer, bytes.byteOffset, bytes.byteLength);
 }
 
-/** What an IEEE 754 half-precision number of these 16 bits is. */
+/** The value of an IEEE 754 half-precision number. */
 export function halfFloat(bits: number): number {
   const sign = bits & 0x8000 ? -1 : 1;
   const exponent = (bits >> 10) & 31;
@@ -35,7 +35,7 @@ export function halfFloat(bits: number): number {
   return sign * (exponent ? 2 ** (exponent - 15) * (1 + fraction / 1024) : (2 ** -14 * fraction) / 1024);
 }
 
-/** Rows of a table with `width` numbers in each, in this order. */
+/** The given rows of a table with `width` columns. */
 export function rowsOf<T extends Uint8Array | Int16Array | Float32Array | Float64Array>(
   table: T, rows: ArrayLike<number>, width: number,
 ): T {
@@ -44,7 +44,7 @@ export function rowsOf<T extends Uint8Array | Int16Array | Float32Array | Float6
   return found;
 }
 
-/** 0 of no values. */
+/** 0 for no values. */
 export function median(values: Float64Array): number {
   if (!values.length) return 0;
   const sorted = Float64Array.from(values).sort();
@@ -52,41 +52,34 @@ export function median(values: Float64Array): number {
   return sorted.length % 2 ? sorted[middle] : (sorted[middle - 1] + sorted[middle]) / 2;
 }
 
-/** The value that occurs most, the first of several, and how often; undefined of none. */
+/** [most frequent value, its count], the first in case of ties; undefined for no values. */
 export function mostFrequent<T>(values: Iterable<T>): [T, number] | undefined {
   const votes = new Map<T, number>();
   for (const each of values) votes.set(each, (votes.get(each) ?? 0) + 1);
   return [...votes].reduce<[T, number] | undefined>((best, each) => (best && best[1] >= each[1] ? best : each), undefined);
 }
 
-/** What a stream becomes, at most `most` bytes. Raises InputError for more and for damage. */
-export async function unpacked(
-  bytes: Uint8Array, format: 'gzip' | 'deflate' | 'deflate-raw', most: number,
+/** All bytes of a stream. `received`: called with the number of bytes so far. */
+export async function readAll(
+  stream: ReadableStream<Uint8Array>, received: (bytes: number) => void = () => undefined,
 ): Promise<Uint8Array> {
-  const found = new Parts(most);
-  try {
-    const reader = new Blob([bytes as BlobPart]).stream().pipeThrough(new DecompressionStream(format)).getReader();
-    for (let { done, value } = await reader.read(); !done; { done, value } = await reader.read()) found.add(value!);
-  } catch {
-    throw damaged();
+  const [reader, parts] = [stream.getReader(), [] as Uint8Array[]];
+  let size = 0;
+  for (let { done, value } = await reader.read(); !done; { done, value } = await reader.read()) {
+    parts.push(value!);
+    received((size += value!.length));
   }
-  return found.whole();
+  return joined(...parts);
 }
 
-/** Parts of a whole that may have at most `most` bytes. */
-class Parts {
-  size = 0;
-  private readonly parts: Uint8Array[] = [];
-
-  constructor(private readonly most: number) {}
-
-  add(part: Uint8Array): void {
-    this.size += part.length;
-    if (this.size > this.most) throw damaged();
-    this.parts.push(part);
-  }
-
-  whole(): Uint8Array {
-    return joined(...this.parts);
-  }
+/** Decompresses at most `most` bytes. Raises InputError for more and for damage. */
+export async function inflate(
+  bytes: Uint8Array, format: 'gzip' | 'deflate' | 'deflate-raw', most: number,
+): Promise<Uint8Array> {
+  const stream = new Blob([bytes as BlobPart]).stream().pipeThrough(new DecompressionStream(format));
+  return readAll(stream, (size) => {
+    if (size > most) throw damaged();
+  }).catch(() => {
+    throw damaged();
+  });
 }

@@ -1,4 +1,4 @@
-/** An error in a file, said to a person in one sentence. */
+/** A defect of the input; its message is one sentence for users. */
 export class InputError extends Error {
   override name = 'InputError';
 }

@@ -11,7 +11,7 @@ export interface Gaussians {
   readonly sh: Float32Array; // [N, K, 3], K = (shDegree + 1)^2
 }
 
-/** The columns as wide in every model; harmonics are not. */
+/** Columns whose width does not depend on the SH degree. */
 const FIXED = ['means', 'quats', 'logScales', 'opacityLogits'] as const;
 export const COLUMNS = [...FIXED, 'sh'] as const;
 
@@ -19,7 +19,7 @@ export function coefficients(shDegree: number): number {
   return (shDegree + 1) ** 2;
 }
 
-/** Room for `count` Gaussians, all numbers zero. */
+/** `count` Gaussians of zeros. */
 export function emptyGaussians(count: number, shDegree: number): Gaussians {
   return {
     count,
@@ -32,12 +32,12 @@ export function emptyGaussians(count: number, shDegree: number): Gaussians {
   };
 }
 
-/** The buffers, to be moved between threads instead of copied. */
+/** The buffers, to be transferred between threads. */
 export function buffersOf(gaussians: Gaussians): ArrayBuffer[] {
   return COLUMNS.map((column) => gaussians[column].buffer as ArrayBuffer);
 }
 
-/** A copy with harmonics of another degree: cut off, or filled up with zeros. */
+/** A copy with another SH degree: truncated, or padded with zeros. */
 export function withDegree(gaussians: Gaussians, shDegree: number): Gaussians {
   const found = emptyGaussians(gaussians.count, shDegree);
   for (const column of FIXED) found[column].set(gaussians[column]);
@@ -67,7 +67,7 @@ export function opacity(logit: number): number {
   return 1 / (1 + Math.exp(-logit));
 }
 
-/** About the `count` Gaussians that are seen most, by opacity and cross-section, in their order. */
+/** The `count` most visible Gaussians by opacity and cross-section, in their order. */
 export function mostVisible(gaussians: Gaussians, count: number): Gaussians {
   const visibility = Float32Array.from({ length: gaussians.count }, (_, row) => {
     const [a, b, c] = gaussians.logScales.subarray(3 * row, 3 * row + 3);
@@ -82,7 +82,7 @@ const GROWTH = 0.25;
 const MAX_LOST = 0.9;
 const MIN_LOST = 0.01;
 
-/** The Gaussians that remain of `count`, denser and larger, so that they cover as much; see docs/format.md. */
+/** The Gaussians left of `count`, made denser and larger to compensate for pruning; see docs/format.md. */
 export function compensated(gaussians: Gaussians, count: number): Gaussians {
   const share = Math.max(gaussians.count / Math.max(count, 1), 1 - MAX_LOST);
   if (share >= 1 - MIN_LOST) return gaussians;

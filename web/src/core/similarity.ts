@@ -1,10 +1,10 @@
-/** Similarity transforms of the world, applied to Gaussians; `keyss.core.similarity` on the other side. */
+/** Similarity transforms of Gaussians; counterpart of `keyss.core.similarity`. */
 import { coefficients, type Gaussians } from './gaussians.ts';
 
 /** x -> scale * rotation x + translation. */
 export interface Similarity {
   readonly scale: number;
-  readonly rotation: readonly number[]; // [9] by rows
+  readonly rotation: readonly number[]; // [9] row-major
   readonly translation: readonly number[]; // [3]
 }
 
@@ -13,7 +13,7 @@ export function inverse({ scale, rotation: r, translation: t }: Similarity): Sim
   return { scale: 1 / scale, rotation, translation: times(rotation, t).map((each) => -each / scale) };
 }
 
-/** Whether it is finite, its scale positive, and its rotation one, to 1e-6. */
+/** Whether it is finite, with positive scale and a rotation matrix to within 1e-6. */
 export function isSimilarity({ scale, rotation: r, translation }: Similarity): boolean {
   const rows = [0, 3, 6].map((at) => r.slice(at, at + 3));
   const off = rows.flatMap((a, i) => rows.map((b, j) => Math.abs(dot(a, b) - Number(i === j))));
@@ -21,12 +21,12 @@ export function isSimilarity({ scale, rotation: r, translation }: Similarity): b
   return [scale, ...r, ...translation].every(Number.isFinite) && scale > 0 && Math.max(...off) <= 1e-6 && turns;
 }
 
-/** Where it takes a point [3]. */
+/** The transformed point [3]. */
 export function movedPoint({ scale, rotation, translation }: Similarity, point: ArrayLike<number>): number[] {
   return times(rotation, point).map((each, axis) => scale * each + translation[axis]);
 }
 
-/** The Gaussians moved along with the world, their view-dependent colour included. */
+/** The transformed Gaussians, view-dependent colour included. */
 export function moved(by: Similarity, model: Gaussians): Gaussians {
   const [w, x, y, z] = quaternion(by.rotation);
   const blocks = Array.from({ length: model.shDegree }, (_, band) => rotatedBand(by.rotation, band + 1));
@@ -66,7 +66,7 @@ export function cross(a: readonly number[], b: readonly number[]): [number, numb
   return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
 }
 
-/** [9] by rows, of a quaternion wxyz of length 1. */
+/** Rotation matrix [9], row-major, of a unit quaternion wxyz. */
 export function rotationOf([w, x, y, z]: readonly number[]): number[] {
   return [
     1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
@@ -75,7 +75,7 @@ export function rotationOf([w, x, y, z]: readonly number[]): number[] {
   ];
 }
 
-/** wxyz, of length 1, of a rotation matrix (Shepperd 1978). */
+/** Unit quaternion wxyz of a rotation matrix (Shepperd 1978). */
 function quaternion(r: readonly number[]): number[] {
   const squares = [
     1 + r[0] + r[4] + r[8], 1 + r[0] - r[4] - r[8], 1 - r[0] + r[4] - r[8], 1 - r[0] - r[4] + r[8],
@@ -91,7 +91,7 @@ function quaternion(r: readonly number[]): number[] {
   return found.map((each) => each / length);
 }
 
-// [32, 4] directions and weights whose sums are integrals over the sphere, exact up to degree 7 (Gauss, and even steps).
+// [32, 4] quadrature on the sphere, directions and weights, exact up to degree 7 (Gauss-Legendre by azimuth steps).
 const GAUSS = [[0.3399810435848563, 0.6521451548625461], [0.8611363115940526, 0.3478548451374538]];
 const SPHERE = GAUSS.flatMap(([z, weight]) => [z, -z].flatMap((height) =>
   Array.from({ length: 8 }, (_, step) => {
@@ -99,7 +99,7 @@ const SPHERE = GAUSS.flatMap(([z, weight]) => [z, -z].flatMap((height) =>
     return [radius * Math.cos(angle), radius * Math.sin(angle), height, (weight * Math.PI) / 4];
   })));
 
-/** [2 band + 1]^2: what turns the coefficients of one degree of harmonics, whose basis is orthonormal. */
+/** [2 band + 1]^2 rotation matrix for the SH coefficients of one degree. */
 function rotatedBand(r: readonly number[], band: number): number[][] {
   const found = Array.from({ length: 2 * band + 1 }, () => new Array<number>(2 * band + 1).fill(0));
   const back = [r[0], r[3], r[6], r[1], r[4], r[7], r[2], r[5], r[8]];
@@ -110,7 +110,7 @@ function rotatedBand(r: readonly number[], band: number): number[][] {
   return found;
 }
 
-/** The real basis of one degree, with the signs of 3DGS. */
+/** The real SH basis of one degree, with the signs of 3DGS. */
 function harmonics([x, y, z]: readonly number[], band: number): number[] {
   const [xx, yy, zz] = [x * x, y * y, z * z];
   if (band === 1) return [-0.4886025119029199 * y, 0.4886025119029199 * z, -0.4886025119029199 * x];

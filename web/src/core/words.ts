@@ -1,18 +1,12 @@
-/**
- * Numbers of 64 bits, as their low and their high 32 bits beside each other in a Uint32Array [2 N]: the layout of
- * little-endian bytes, and many times faster than BigInt.
- */
+/** 64-bit integers as pairs of low and high 32 bits, little-endian [2 N]; many times faster than BigInt. */
 export type Words = Uint32Array;
 
-/** The words of little-endian bytes, which have to begin at a multiple of four. */
+/** The words of little-endian bytes, which must be aligned to four bytes. */
 export function wordsOf(bytes: Uint8Array): Words {
   return new Uint32Array(bytes.buffer, bytes.byteOffset, bytes.length >> 2);
 }
 
-/**
- * The rows [N] of `words` [N, width] in ascending order, equal ones in their order; the last number of a row counts most.
- * A radix sort, 16 bits at a time.
- */
+/** Stable ascending order [N] of `words` [N, width], last column most significant. Radix sort by 16 bits. */
 export function sortingOrder(words: Uint32Array, width = 2): Uint32Array {
   const count = words.length / width;
   let [rows, next] = [new Uint32Array(count), new Uint32Array(count)];
@@ -31,7 +25,7 @@ export function sortingOrder(words: Uint32Array, width = 2): Uint32Array {
   return rows;
 }
 
-/** [R + 1] where each run of equal words begins in a sorted `order` of them, and where the last one ends. */
+/** [R + 1] starts of the runs of equal words in a sorted `order`, and the end of the last. */
 export function runs(words: Words, order: Uint32Array): Uint32Array {
   const starts = new Uint32Array(order.length + 1);
   let size = 0;
@@ -43,7 +37,7 @@ export function runs(words: Words, order: Uint32Array): Uint32Array {
   return starts.subarray(0, size + 1);
 }
 
-/** [N] how many of the words are equal to each, itself included. */
+/** [N] number of words equal to each, itself included. */
 export function namesakes(words: Words): Uint32Array {
   const order = sortingOrder(words);
   const starts = runs(words, order);
@@ -54,7 +48,7 @@ export function namesakes(words: Words): Uint32Array {
   return found;
 }
 
-/** Replaces the word at `at` by its hash, the finaliser of splitmix64 (Steele et al. 2014), which anybody can compute. */
+/** Replaces the word at `at` by its hash, the finaliser of splitmix64 (Steele et al. 2014); no secret is involved. */
 function mixAt(words: Words, at: number): void {
   let low = words[2 * at] + 0x7f4a7c15;
   let high = (words[2 * at + 1] + 0x9e3779b9 + (low > 0xffffffff ? 1 : 0)) >>> 0;
@@ -73,7 +67,7 @@ function mixAt(words: Words, at: number): void {
 
 const SCRATCH = new Uint32Array(2);
 
-/** The same of one word; the next call replaces what it gives. */
+/** The hash of one word, in a buffer that the next call overwrites. */
 export function mix(low: number, high = 0): Words {
   SCRATCH[0] = low;
   SCRATCH[1] = high;
@@ -81,7 +75,7 @@ export function mix(low: number, high = 0): Words {
   return SCRATCH;
 }
 
-/** The same for all of them, which are replaced; returns them. */
+/** Hashes all words in place; returns them. */
 export function mixed(words: Words): Words {
   for (let at = 0; at < words.length >> 1; at++) mixAt(words, at);
   return words;

@@ -1,8 +1,8 @@
-/** Reader of PlayCanvas's compressed .ply; `keyss.files.formats.compressed_ply` on the other side. */
+/** Reader of PlayCanvas's compressed .ply; counterpart of `keyss.files.formats.compressed_ply`. */
 import { damaged } from '../core/errors.ts';
 import { coefficients, emptyGaussians, type Gaussians } from '../core/gaussians.ts';
 import { fromSmallestThree, logit, SH_C0 } from './coded.ts';
-import { checkedFinite, column, type PlyHeader } from './ply.ts';
+import { checkFinite, column, type PlyHeader } from './ply.ts';
 
 export const CHUNK = 256; // Gaussians
 const ENDS = ['min', 'max'];
@@ -10,13 +10,13 @@ const AXES = ['x', 'y', 'z'].map((axis) => ENDS.map((end) => `${end}_${axis}`));
 const SCALES = ['x', 'y', 'z'].map((axis) => ENDS.map((end) => `${end}_scale_${axis}`));
 const COLOURS = ['r', 'g', 'b'].map((colour) => ENDS.map((end) => `${end}_${colour}`));
 
-/** What of a file's numbers can carry secrets. */
+/** The codes that can carry secrets. */
 export interface CompressedPlyCodes {
   readonly kind: 'compressed-ply';
   readonly count: number;
-  readonly scaleBounds: Float64Array[][]; // of each axis smallest and largest log scales [C]; a chunk is 256 Gaussians
+  readonly scaleBounds: Float64Array[][]; // [axis][min, max][C] log scales; a chunk is 256 Gaussians
   readonly scales: Float64Array; // [N] 11, 10 and 11 bits between the bounds
-  readonly rotations: Float64Array; // [N] which part is left out (2 bits), the others (10 bits each)
+  readonly rotations: Float64Array; // [N] index of the component left out (2 bits), then the others (10 bits each)
   readonly colours: Float64Array; // [N] three colours and opacity, 8 bits each
 }
 
@@ -27,7 +27,7 @@ export function vectorPart(packed: number, axis: number): number {
   return (packed >>> [21, 11, 0][axis]) & VECTOR[axis];
 }
 
-/** Of a packed rotation a part that is there, 0 to 1023. */
+/** A stored component of a packed rotation, 0 to 1023. */
 export function rotationPart(packed: number, part: number): number {
   return (packed >>> (20 - 10 * part)) & 1023;
 }
@@ -86,5 +86,5 @@ export function readCompressedPly(
     });
   }
   const packed = { scales: scale, rotations: rotation, colours: colour };
-  return { ...checkedFinite(model), codes: { kind: 'compressed-ply', count: vertex.count, scaleBounds: sizes, ...packed } };
+  return { ...checkFinite(model), codes: { kind: 'compressed-ply', count: vertex.count, scaleBounds: sizes, ...packed } };
 }

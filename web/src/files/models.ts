@@ -1,4 +1,4 @@
-/** Models of any format that can be read, told by their first bytes, or by their names where those tell nothing. */
+/** Reads models of any format, identified by their first bytes, or by name if they have no magic bytes. */
 import { InputError } from '../core/errors.ts';
 import type { Gaussians } from '../core/gaussians.ts';
 import { type CompressedPlyCodes, isCompressed, readCompressedPly } from './compressed_ply.ts';
@@ -8,16 +8,16 @@ import { readSog, type SogCodes } from './sog.ts';
 import { readSplat } from './splat.ts';
 import { readSpz, type SpzCodes } from './spz.ts';
 
-/** The integers of formats whose last bits can carry; only the very file has them. */
+/** The codes of formats whose low bits can carry secrets. */
 export type Codes = SpzCodes | SogCodes | CompressedPlyCodes;
 
-/** A file's model. Whatever makes another one of it must leave out the codes. */
+/** A file's model. Derived models must not keep the codes. */
 export interface ReadModel extends Gaussians {
   readonly codes?: Codes;
-  readonly leftOut?: number; // Gaussians of the file that are not finite
+  readonly leftOut?: number; // Gaussians dropped because they are not finite
 }
 
-/** `decode`: what decodes the images of a .sog. Raises InputError for a file that is none of them, or damaged. */
+/** `decode`: decoder for the images of a .sog. Raises InputError for unknown formats and damaged files. */
 export async function readModel(bytes: Uint8Array, name = '', decode?: Decode): Promise<ReadModel> {
   const start = [...bytes.subarray(0, 4)].map((byte) => String.fromCharCode(byte)).join('');
   if (start.startsWith('ply')) {

@@ -1,20 +1,17 @@
-/**
- * What a .sog is packed in: a ZIP archive, stored or deflated, and lossless WebP images, whose pixels the browser decodes;
- * exactly, because they are never multiplied by their alpha.
- */
-import { unpacked, viewOf } from '../core/bytes.ts';
+/** The container of .sog: a ZIP archive, stored or deflated, of lossless WebP images. */
+import { inflate, viewOf } from '../core/bytes.ts';
 import { damaged, InputError } from '../core/errors.ts';
 
 const [END, CENTRAL, LOCAL] = [0x06054b50, 0x02014b50, 0x04034b50];
 const MAX_MEMBERS = 64;
-const MAX_COMMENT = 65557; // bytes of the end of the directory, its comment included
-export const SMALL = 1 << 20; // bytes that a member may unpack to in an archive of any size
+const MAX_END_BYTES = 65557; // of the end record with its comment
+export const SMALL = 1 << 20; // bytes that archives of any size may inflate to
 
-/** What gives a member by its name. Raises InputError for what is no whole archive. */
+/** A function that reads a member by name. Raises InputError for damaged archives. */
 export function openZip(bytes: Uint8Array): (name: string) => Promise<Uint8Array> {
   const view = viewOf(bytes);
   let end = bytes.length - 22;
-  const last = Math.max(0, bytes.length - MAX_COMMENT);
+  const last = Math.max(0, bytes.length - MAX_END_BYTES);
   while (end >= last && view.getUint32(end, true) !== END) end--;
   if (end < last) throw damaged();
   const count = view.getUint16(end + 10, true);
@@ -41,20 +38,20 @@ export function openZip(bytes: Uint8Array): (name: string) => Promise<Uint8Array
     const data = bytes.subarray(start, start + found.packed);
     if (data.length !== found.packed) throw damaged();
     if (found.method === 0) return data;
-    if (found.method === 8) return unpacked(data, 'deflate-raw', found.size);
+    if (found.method === 8) return inflate(data, 'deflate-raw', found.size);
     throw damaged();
   };
 }
 
-const SMALL_IMAGE = 1 << 16; // pixels; larger ones may have four times the pixels that are needed
+const SMALL_IMAGE = 1 << 16; // pixels; larger images may have at most four times the pixels needed
 
-/** All pixels of a lossless WebP: RGBA by rows, not multiplied by alpha. */
+/** Decodes a lossless WebP to RGBA, row by row, not premultiplied by alpha. */
 export type Decode = (webp: Uint8Array) => Promise<Uint8Array>;
 
-/** [count, 4] RGBA of the first pixels; `width`: what it has to have. Raises InputError. */
+/** [count, 4] RGBA of the first pixels of an image, of this `width` if given. Raises InputError. */
 export type Pixels = (data: Uint8Array, count: number, width?: number) => Promise<Uint8Array>;
 
-export function pixelsBy(decode: Decode): Pixels {
+export function pixelReader(decode: Decode): Pixels {
   return async (data, count, width) => {
     const [w, h] = sizeOf(data);
     const fits = w * h >= count && (width === undefined || w === width);
@@ -65,7 +62,8 @@ export function pixelsBy(decode: Decode): Pixels {
   };
 }
 
-export const inBrowser: Decode = async (webp) => {
+/** By WebGL: a 2D canvas would premultiply by alpha. */
+export const decodeInBrowser: Decode = async (webp) => {
   if (typeof OffscreenCanvas === 'undefined') throw new InputError('This .sog has images, which only browsers decode.');
   let image: ImageBitmap;
   try {
@@ -92,8 +90,8 @@ export const inBrowser: Decode = async (webp) => {
   return pixels;
 };
 
-/** Width and height of the header. Raises InputError for what is no lossless WebP. */
-export function sizeOf(data: Uint8Array): [number, number] {
+/** [width, height] from the header of a lossless WebP. Raises InputError. */
+function sizeOf(data: Uint8Array): [number, number] {
   const text = (at: number): string => String.fromCharCode(...data.subarray(at, at + 4));
   if (data.length < 30 || text(0) !== 'RIFF' || text(8) !== 'WEBP') throw damaged();
   if (text(12) === 'VP8L') {

@@ -1,16 +1,16 @@
-/** Reader and writer of models in the Inria .ply layout; hostile files end in an InputError. */
+/** Reader and writer of the Inria .ply layout. Input is untrusted: defects raise InputError. */
 import { ascii, joined, viewOf } from '../core/bytes.ts';
 import { InputError } from '../core/errors.ts';
 import { coefficients, COLUMNS, emptyGaussians, type Gaussians, where } from '../core/gaussians.ts';
 
 const MAX_HEADER_BYTES = 65536;
-const [SPACE, MAX_DIGITS] = [32, 100]; // of text
-const OPACITY_LOGIT_BOUND = 16; // in the place of infinities
-const LEAST_LOG_SCALE = -87.33654; // in the place of minus infinity
-// What tells scales from their logarithms, as in keyss.files.ply_rows.
+const [SPACE, MAX_DIGITS] = [32, 100];
+const OPACITY_LOGIT_BOUND = 16; // replaces infinity
+const LEAST_LOG_SCALE = -87.33654; // replaces minus infinity
+// Criteria for activated scales, as in keyss.files.ply_rows.
 const [ENOUGH, NEARLY_ALL, SMALL_SCALE, LARGE, RATIO] = [100, 0.99, 0.2, 0.3, 20];
 
-/** Of a type by either of its names the bytes that it takes, and what reads it. */
+/** Size in bytes and DataView method of each type, by both of its names. */
 const TYPES = new Map(([
   ['char', 'int8', 1, 'Int8'], ['uchar', 'uint8', 1, 'Uint8'], ['short', 'int16', 2, 'Int16'], ['ushort', 'uint16', 2, 'Uint16'],
   ['int', 'int32', 4, 'Int32'], ['uint', 'uint32', 4, 'Uint32'], ['float', 'float32', 4, 'Float32'],
@@ -72,7 +72,7 @@ function elementsOf(header: string): Omit<Element, 'start'>[] {
   return elements;
 }
 
-/** A text .ply as a binary one, of doubles; any other file as it is. Raises InputError for one that is cut short. */
+/** An ascii .ply as a binary one of doubles; any other file unchanged. Raises InputError for truncated files. */
 export function binaryPly(bytes: Uint8Array): Uint8Array {
   const text = new TextDecoder('latin1').decode(bytes.subarray(0, MAX_HEADER_BYTES));
   const header = /^ply\r?\n(?:comment.*\n)*format ascii [^]*?\nend_header\r?\n/.exec(text)?.[0];
@@ -91,7 +91,7 @@ export function binaryPly(bytes: Uint8Array): Uint8Array {
   return joined(ascii(binary), new Uint8Array(values.buffer));
 }
 
-/** A number as programs write it. Raises InputError for what is none. */
+/** Parses a number, NaN and infinities included. Raises InputError. */
 function numberOf(text: string): number {
   const found = Number(text);
   if (!Number.isNaN(found) || /^[+-]?nan$/i.test(text)) return found;
@@ -100,7 +100,7 @@ function numberOf(text: string): number {
   return sign === '-' ? -Infinity : Infinity;
 }
 
-/** Numbers of one property of all rows. */
+/** The values of a property; null if there is none. */
 export function column(bytes: Uint8Array, header: PlyHeader, element: Element, name: string): Float64Array | null {
   const property = element.properties.find((each) => each.name === name);
   if (property === undefined) return null;
@@ -112,14 +112,14 @@ export function column(bytes: Uint8Array, header: PlyHeader, element: Element, n
   return values;
 }
 
-/** A model without rows that are not finite. Raises InputError for anything that is not a whole 3DGS model. */
-export function readPly(bytes: Uint8Array): UsableGaussians {
+/** The finite Gaussians of a file. Raises InputError for anything other than a complete 3DGS model. */
+export function readPly(bytes: Uint8Array): FiniteGaussians {
   const header = plyHeader(bytes);
   const vertex = header.elements.find((each) => each.name === 'vertex');
   const rest = vertex?.properties.filter((each) => /^f_rest_[0-9]+$/.test(each.name)).length ?? 0;
   const shDegree = [0, 9, 24, 45].indexOf(rest);
   if (vertex === undefined || shDegree < 0) throw noModel();
-  const names = new Set(vertex.properties.map(({ name }) => name)); // rows without any take no bytes
+  const names = new Set(vertex.properties.map(({ name }) => name)); // rows without properties take no bytes
   if (!plyColumns(shDegree).every(({ name }) => names.has(name))) throw noModel();
   if (vertex.count === 0) throw new InputError(`This file holds no Gaussians${CURE}`);
   const found = emptyGaussians(vertex.count, shDegree);
@@ -134,12 +134,12 @@ export function readPly(bytes: Uint8Array): UsableGaussians {
   for (const [at, logScale] of found.logScales.entries()) {
     if (logScale === -Infinity) found.logScales[at] = LEAST_LOG_SCALE;
   }
-  const kept = usable(found);
+  const kept = withoutNonFinite(found);
   checkNotActivated(kept);
   return kept;
 }
 
-/** Raises InputError for scales or opacities that renderers use, in the place of logarithms and logits. */
+/** Raises InputError for scales and opacities where logarithms and logits are expected. */
 function checkNotActivated({ count, means, logScales, opacityLogits }: Gaussians): void {
   if (count < ENOUGH) return;
   const step = Math.floor(count / ENOUGH);
@@ -158,7 +158,7 @@ function checkNotActivated({ count, means, logScales, opacityLogits }: Gaussians
   throw new InputError(`This file's ${wrong.join(' and ')} are those that renderers use: export it again without activating them.`);
 }
 
-/** Of numbers at least one, with linear interpolation. */
+/** Linearly interpolated quantile of at least one value. */
 function quantile(values: number[], share: number): number {
   const sorted = Float64Array.from(values).sort();
   const at = share * (sorted.length - 1);
@@ -166,12 +166,12 @@ function quantile(values: number[], share: number): number {
   return below + (at - Math.floor(at)) * (above - below);
 }
 
-export interface UsableGaussians extends Gaussians {
-  readonly leftOut: number; // Gaussians of the file
+export interface FiniteGaussians extends Gaussians {
+  readonly leftOut: number; // Gaussians dropped
 }
 
-/** The Gaussians whose numbers are finite, which alone can be drawn. Raises InputError if there are none. */
-export function usable(gaussians: Gaussians): UsableGaussians {
+/** The Gaussians with finite values only. Raises InputError if there are none. */
+export function withoutNonFinite(gaussians: Gaussians): FiniteGaussians {
   if (isFinite(gaussians)) return { ...gaussians, leftOut: 0 };
   const widths = COLUMNS.map((each) => [gaussians[each], gaussians[each].length / gaussians.count] as const);
   const found = where(gaussians, (row) =>
@@ -181,8 +181,8 @@ export function usable(gaussians: Gaussians): UsableGaussians {
   return { ...found, leftOut: gaussians.count - found.count };
 }
 
-/** Raises InputError for numbers that are not finite. */
-export function checkedFinite(gaussians: Gaussians): Gaussians {
+/** Raises InputError for values that are not finite. */
+export function checkFinite(gaussians: Gaussians): Gaussians {
   if (isFinite(gaussians)) return gaussians;
   throw notFinite();
 }
@@ -191,7 +191,7 @@ function isFinite(gaussians: Gaussians): boolean {
   return COLUMNS.every((each) => gaussians[each].every(Number.isFinite));
 }
 
-/** The properties of a .ply in the order in which keyss writes them: where each lies in a row of which column. */
+/** The properties of a .ply in the order written: the column that holds each, and its offset in a row. */
 export function plyColumns(shDegree: number): { name: string; to: (typeof COLUMNS)[number]; offset: number }[] {
   const rest = coefficients(shDegree) - 1;
   const numbers = (prefix: string, count: number): string[] => Array.from({ length: count }, (_, at) => `${prefix}_${at}`);

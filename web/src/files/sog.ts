@@ -1,13 +1,13 @@
-/** Reader of SOG, version 2; `keyss.files.formats.sog` on the other side. */
+/** Reader of SOG, version 2; counterpart of `keyss.files.formats.sog`. */
 import { damaged, InputError } from '../core/errors.ts';
 import { coefficients, emptyGaussians, type Gaussians } from '../core/gaussians.ts';
 import { fromSmallestThree, holds, logit } from './coded.ts';
-import { checkedFinite } from './ply.ts';
-import { type Decode, inBrowser, openZip, type Pixels, pixelsBy, SMALL } from './packed.ts';
+import { checkFinite } from './ply.ts';
+import { type Decode, decodeInBrowser, openZip, type Pixels, pixelReader, SMALL } from './packed.ts';
 
-export const FINEST = 65535; // a position's largest code
-export const LARGEST = 252; // of the fourth byte of a quaternion: w, x, y or z is not stored
-const ROW = 64; // vectors of the palette in a row of pixels
+export const FINEST = 65535; // largest position code
+export const LARGEST = 252; // a quaternion's fourth byte: this plus the index (wxyz) of the component left out
+const ROW = 64; // palette vectors per row of pixels
 const BOOK = 256;
 const MAX_LABELS = 65536;
 
@@ -21,34 +21,34 @@ interface Meta {
   shN?: { count: number; bands: number; codebook: number[]; files: string[] };
 }
 
-/** All numbers of a file. */
+/** All values of a file. */
 export interface SogCodes {
   readonly kind: 'sog';
   readonly count: number;
-  readonly mins: readonly number[]; // [3] smallest positions, as sign(x) ln(|x| + 1)
-  readonly maxs: readonly number[]; // [3] largest ones
-  readonly positions: Uint16Array; // [N, 3] in 65535ths between them
-  readonly quats: Uint8Array; // [N, 4] three parts of a quaternion, then 252 + which one is left out
+  readonly mins: readonly number[]; // [3] bounds of positions, as sign(x) ln(|x| + 1)
+  readonly maxs: readonly number[]; // [3]
+  readonly positions: Uint16Array; // [N, 3] 65535ths between the bounds
+  readonly quats: Uint8Array; // [N, 4] three components of a quaternion, then 252 + the index of the fourth
   readonly scaleBook: Float32Array; // [256] log scales
-  readonly scales: Uint8Array; // [N, 4] three indices into it
+  readonly scales: Uint8Array; // [N, 4] three codebook indices
   readonly colourBook: Float32Array; // [256] constant harmonics
-  readonly colours: Uint8Array; // [N, 4] three indices into it, then opacity in 255ths
+  readonly colours: Uint8Array; // [N, 4] three codebook indices, then opacity in 255ths
   readonly shDegree: number;
-  readonly labels: Uint16Array; // [N] indices into the palette; of a model without harmonics 0
+  readonly labels: Uint16Array; // [N] palette indices; 0 without harmonics
   readonly harmonicBook: Float32Array; // [256]
-  readonly palette: Uint8Array; // [P, K - 1, 4] three indices into it
+  readonly palette: Uint8Array; // [P, K - 1, 4] three codebook indices
 }
 
 export async function readSog(
-  bytes: Uint8Array, decode: Decode = inBrowser,
+  bytes: Uint8Array, decode: Decode = decodeInBrowser,
 ): Promise<Gaussians & { readonly codes: SogCodes }> {
-  const codes = await parsed(bytes, pixelsBy(decode));
-  return { ...checkedFinite(dequantised(codes)), codes };
+  const codes = await parse(bytes, pixelReader(decode));
+  return { ...checkFinite(dequantise(codes)), codes };
 }
 
-async function parsed(bytes: Uint8Array, pixels: Pixels): Promise<SogCodes> {
+async function parse(bytes: Uint8Array, pixels: Pixels): Promise<SogCodes> {
   const file = openZip(bytes);
-  const { count, means, quats, scales, sh0, shN } = checkedMeta(await file('meta.json'), bytes.length);
+  const { count, means, quats, scales, sh0, shN } = parseMeta(await file('meta.json'), bytes.length);
   const image = async (name: string): Promise<Uint8Array> => pixels(await file(name), count);
   const [low, high] = [await image(means.files[0]), await image(means.files[1])];
   const positions = new Uint16Array(3 * count);
@@ -71,7 +71,7 @@ async function parsed(bytes: Uint8Array, pixels: Pixels): Promise<SogCodes> {
   };
 }
 
-function dequantised(codes: SogCodes): Gaussians {
+function dequantise(codes: SogCodes): Gaussians {
   const { count, mins, maxs, positions, quats, scales, colours, shDegree, labels, palette } = codes;
   const model = emptyGaussians(count, shDegree);
   const k = coefficients(shDegree);
@@ -98,7 +98,7 @@ function dequantised(codes: SogCodes): Gaussians {
   return model;
 }
 
-function checkedMeta(bytes: Uint8Array, size: number): Meta {
+function parseMeta(bytes: Uint8Array, size: number): Meta {
   let meta: Meta;
   if (bytes.length > SMALL) throw damaged();
   try {
@@ -109,7 +109,7 @@ function checkedMeta(bytes: Uint8Array, size: number): Meta {
     if (shN) images.push([shN.files, 2]);
     const named = images.every(([names, count]) => Array.isArray(names) && names.length >= count);
     if (!named || means.mins.length !== 3 || means.maxs.length !== 3) throw damaged();
-    for (const book of [scales, sh0, ...(shN ? [shN] : [])]) book.codebook = checkedBook(book.codebook);
+    for (const book of [scales, sh0, ...(shN ? [shN] : [])]) book.codebook = paddedBook(book.codebook);
     const bands = shN?.bands ?? 0;
     if (shN && !(bands in [0, 1, 2, 3] && shN.count > 0 && shN.count <= MAX_LABELS)) throw damaged();
   } catch (error) {
@@ -119,7 +119,7 @@ function checkedMeta(bytes: Uint8Array, size: number): Meta {
   return meta;
 }
 
-function checkedBook(book: number[]): number[] {
+function paddedBook(book: number[]): number[] {
   const fine = Array.isArray(book) && book.length <= BOOK && book.every((each) => Number.isFinite(each));
   if (!fine) throw damaged();
   return [...book, ...new Array<number>(BOOK - book.length).fill(0)];

@@ -1,14 +1,14 @@
-/** Reader of .splat, 32 bytes for each Gaussian; `keyss.files.formats.splat` on the other side. */
+/** Reader of .splat, 32 bytes per Gaussian; counterpart of `keyss.files.formats.splat`. */
 import { viewOf } from '../core/bytes.ts';
 import { damaged } from '../core/errors.ts';
 import { emptyGaussians } from '../core/gaussians.ts';
 import { logit, logScale, SH_C0, unitQuat } from './coded.ts';
-import { usable, type UsableGaussians } from './ply.ts';
+import { withoutNonFinite, type FiniteGaussians } from './ply.ts';
 
-const ROW = 32; // bytes: mean and scale in floats, red, green, blue, opacity and the quaternion in bytes
+const ROW = 32; // bytes: mean and scale as floats; red, green, blue, opacity and quaternion as bytes
 
-/** A model without rows that are not finite. Raises InputError. */
-export function readSplat(bytes: Uint8Array): UsableGaussians {
+/** The finite Gaussians of a file. Raises InputError. */
+export function readSplat(bytes: Uint8Array): FiniteGaussians {
   if (bytes.length === 0 || bytes.length % ROW) throw damaged();
   const view = viewOf(bytes);
   const model = emptyGaussians(bytes.length / ROW, 0);
@@ -22,5 +22,5 @@ export function readSplat(bytes: Uint8Array): UsableGaussians {
     const [w, x, y, z] = bytes.subarray(at + 28, at + ROW);
     model.quats.set(unitQuat(w / 128 - 1, x / 128 - 1, y / 128 - 1, z / 128 - 1), 4 * row);
   }
-  return usable(model);
+  return withoutNonFinite(model);
 }

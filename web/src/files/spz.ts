@@ -1,6 +1,6 @@
-/** Reader of SPZ, versions 2 to 4; `keyss.files.formats.spz` on the other side. */
+/** Reader of SPZ, versions 2 to 4; counterpart of `keyss.files.formats.spz`. */
 import { decompress } from 'fzstd';
-import { unpacked, viewOf } from '../core/bytes.ts';
+import { inflate, viewOf } from '../core/bytes.ts';
 import { damaged, InputError } from '../core/errors.ts';
 import { coefficients, emptyGaussians, type Gaussians } from '../core/gaussians.ts';
 import { fromSmallestThree, holds, logit, mostHeld } from './coded.ts';
@@ -9,7 +9,7 @@ const [LEGACY_BYTES, HEADER_BYTES] = [16, 32];
 const MAX_EXTENSION_BYTES = 1 << 20;
 const [MAX_UNPACKED, GAUSSIAN_BYTES] = [2 ** 31, 65];
 const MAGNITUDE = 511;
-// Signs of the harmonics of degrees 1 to 3 where y and z change theirs: SPZ has y up, a .ply y down.
+// Signs of the harmonics of degrees 1 to 3 under (x, y, z) -> (x, -y, -z): SPZ has y up, a .ply y down.
 const SH_SIGNS = [-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1];
 
 interface Header {
@@ -19,7 +19,7 @@ interface Header {
   readonly fractionalBits: number; // of positions
 }
 
-/** All integers of a file, as their bytes. */
+/** All integers of a file, as bytes. */
 export interface SpzCodes extends Header {
   readonly kind: 'spz';
   readonly positions: Uint8Array; // [N, 3, 3] 24 bits each
@@ -32,22 +32,22 @@ export interface SpzCodes extends Header {
 
 export async function readSpz(bytes: Uint8Array): Promise<Gaussians & { readonly codes: SpzCodes }> {
   const codes = bytes[0] === 0x1f ? await legacy(bytes) : version4(bytes);
-  return { ...dequantised(codes), codes };
+  return { ...dequantise(codes), codes };
 }
 
-/** The code of a coordinate: multiples of 2^-fractionalBits. */
+/** The code of a coordinate, in multiples of 2^-fractionalBits. */
 export function positionCode({ positions }: SpzCodes, row: number, axis: number): number {
   const at = 9 * row + 3 * axis;
   return ((positions[at] | (positions[at + 1] << 8) | (positions[at + 2] << 16)) << 8) >> 8;
 }
 
-/** Of a rotation since version 3 its word of 32 bits. */
+/** The 32-bit word of a rotation (versions 3 and 4). */
 export function rotationWord({ rotations }: SpzCodes, row: number): number {
   const at = 4 * row;
   return (rotations[at] | (rotations[at + 1] << 8) | (rotations[at + 2] << 16) | (rotations[at + 3] << 24)) >>> 0;
 }
 
-/** A part of it, the last being the lowest bits: a signed magnitude of 0 to 511. */
+/** A component of a rotation word, the last in the lowest bits: -511 to 511. */
 export function rotationPart(word: number, part: number): number {
   const bits = (word >>> (20 - 10 * part)) & 1023;
   return (bits & 512 ? -1 : 1) * (bits & MAGNITUDE);
@@ -66,22 +66,15 @@ function header(bytes: Uint8Array, versions: number[], size: number): Header & {
   return { version, count, shDegree, fractionalBits, sizes };
 }
 
-function codesOf(header: Header, [positions, alphas, colours, scales, rotations, harmonics]: Uint8Array[]): SpzCodes {
-  return { kind: 'spz', ...header, positions, alphas, colours, scales, rotations, harmonics };
-}
-
 async function legacy(bytes: Uint8Array): Promise<SpzCodes> {
   const most = Math.min(MAX_UNPACKED, GAUSSIAN_BYTES * mostHeld(bytes.length)) + MAX_EXTENSION_BYTES;
-  const data = await unpacked(bytes, 'gzip', most);
+  const data = await inflate(bytes, 'gzip', most);
   const found = header(data, [2, 3], bytes.length);
-  const parts: Uint8Array[] = [];
   let at = LEGACY_BYTES;
-  for (const size of found.sizes) {
+  return codesOf(found, (size) => {
     if (at + size > data.length) throw damaged();
-    parts.push(data.subarray(at, at + size));
-    at += size;
-  }
-  return codesOf(found, parts);
+    return data.subarray(at, (at += size));
+  });
 }
 
 function version4(bytes: Uint8Array): SpzCodes {
@@ -92,13 +85,12 @@ function version4(bytes: Uint8Array): SpzCodes {
   let at = table + 16 * streams;
   if (streams !== found.sizes.filter(Boolean).length || table < HEADER_BYTES || at > bytes.length) throw damaged();
   let entry = table;
-  const parts = found.sizes.map((size) => {
+  return codesOf(found, (size) => {
     if (!size) return new Uint8Array(0);
     const [packed, whole] = [Number(view.getBigUint64(entry, true)), Number(view.getBigUint64(entry + 8, true))];
     entry += 16;
     if (whole !== size || at + packed > bytes.length) throw damaged();
-    const stream = bytes.subarray(at, at + packed);
-    at += packed;
+    const stream = bytes.subarray(at, (at += packed));
     try {
       const out = decompress(stream, new Uint8Array(size));
       if (out.length !== size) throw damaged();
@@ -107,10 +99,15 @@ function version4(bytes: Uint8Array): SpzCodes {
       throw damaged();
     }
   });
-  return codesOf(found, parts);
 }
 
-function dequantised(codes: SpzCodes): Gaussians {
+/** `section` returns the next section, which has `size` bytes. */
+function codesOf({ sizes, ...header }: Header & { sizes: number[] }, section: (size: number) => Uint8Array): SpzCodes {
+  const [positions, alphas, colours, scales, rotations, harmonics] = sizes.map(section);
+  return { kind: 'spz', ...header, positions, alphas, colours, scales, rotations, harmonics };
+}
+
+function dequantise(codes: SpzCodes): Gaussians {
   const { count, shDegree, fractionalBits, alphas, colours, scales, harmonics } = codes;
   const model = emptyGaussians(count, shDegree);
   const k = coefficients(shDegree);

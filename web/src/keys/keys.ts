@@ -1,13 +1,12 @@
 /**
- * From what a person types to derived keys, as docs/format.md has it: Argon2id (RFC 9106) of the key in NFKC and
- * without surrounding white space, then HKDF-Expand with SHA-256 (RFC 5869) with a label for each use; and what they
- * decrypt. `keyss.keys` on the other side.
+ * Key derivation and decryption (docs/format.md); counterpart of `keyss.keys`. Argon2id (RFC 9106) of the key in NFKC
+ * without surrounding white space, then HKDF-Expand with SHA-256 (RFC 5869) with a label for each use.
  */
 import { chacha20, chacha20poly1305 } from '@noble/ciphers/chacha.js';
 import { hmac } from '@noble/hashes/hmac.js';
 import { sha256 } from '@noble/hashes/sha2.js';
 import { argon2id } from 'hash-wasm';
-import { ascii, joined, unpacked, viewOf } from '../core/bytes.ts';
+import { ascii, joined, inflate, viewOf } from '../core/bytes.ts';
 import { damaged, InputError } from '../core/errors.ts';
 
 export const SALT_BYTES = 16;
@@ -22,7 +21,7 @@ export function keyBytes(key: string): Uint8Array {
   return bytes;
 }
 
-/** `master`, or what asks another worker for it. */
+/** `master`, here or in another worker. */
 export type Derive = (key: string, salt: Uint8Array) => Promise<Uint8Array>;
 
 /** 32 bytes. Takes some tenths of a second and 64 MiB. */
@@ -33,7 +32,7 @@ export function master(key: string, salt: Uint8Array): Promise<Uint8Array> {
 
 /** `length` bytes for one use of a uniformly random `secret`. */
 export function expand(secret: Uint8Array, label: string, length: number): Uint8Array {
-  // By hand, because the library's refuses secrets of less than 32 bytes, and data keys have 16.
+  // Not by the library, which refuses secrets of less than 32 bytes; data keys have 16.
   let [block, found] = [new Uint8Array(0), new Uint8Array(0)] as Uint8Array[];
   for (let counter = 1; found.length < length; counter++) {
     block = hmac(sha256, secret, joined(block, ascii(`keyss/v1/${label}`), Uint8Array.of(counter)));
@@ -44,10 +43,7 @@ export function expand(secret: Uint8Array, label: string, length: number): Uint8
 
 const AT_ONCE = 1 << 16; // bytes of a stream
 
-/**
- * The same for more bytes than HKDF gives: the key stream of ChaCha20 (RFC 8439) under a derived key, as little-endian
- * words of 32 bits, one after the other.
- */
+/** Expands beyond the limit of HKDF: little-endian 32-bit words of ChaCha20's key stream (RFC 8439) under a derived key. */
 export function streamWords(
   secret: Uint8Array, label: string, count: number, take: (word: number, at: number) => void,
 ): void {
@@ -63,9 +59,9 @@ export function streamWords(
 }
 
 const MAX_PAYLOAD_BYTES = 64 << 20;
-const [MAX_RATIO, SMALL_PAYLOAD] = [16, 1 << 20]; // n bytes become MAX_RATIO n + SMALL_PAYLOAD at most
+const [MAX_RATIO, SMALL_PAYLOAD] = [16, 1 << 20]; // n bytes inflate to at most MAX_RATIO n + SMALL_PAYLOAD
 
-/** The inverse of `keyss.keys.encryption.encrypt`. Raises InputError when anything is not as it left it. */
+/** Inverse of `keyss.keys.encryption.encrypt`. Raises InputError for any modification. */
 export async function decrypted(
   dataKey: Uint8Array, encrypted: Uint8Array, associated: Uint8Array,
 ): Promise<Uint8Array> {
@@ -78,5 +74,5 @@ export async function decrypted(
   const length = plain.length >= 4 ? viewOf(plain).getUint32(0, true) : plain.length;
   if (4 + length > plain.length) throw damaged();
   const most = Math.min(MAX_PAYLOAD_BYTES, MAX_RATIO * length + SMALL_PAYLOAD);
-  return unpacked(plain.subarray(4, 4 + length), 'deflate', most);
+  return inflate(plain.subarray(4, 4 + length), 'deflate', most);
 }

@@ -1,8 +1,8 @@
-/** Deriving many keys: one after the other, or several side by side. */
+/** Scheduling of key derivations: sequential, or in several workers. */
 import { type Derive, master } from './keys.ts';
 
-/** `derive` for one key after the other, however many are asked for at once: each takes 64 MiB. */
-export function oneByOne(derive: Derive): Derive {
+/** `derive` with at most one derivation at a time, since each takes 64 MiB. */
+export function sequential(derive: Derive): Derive {
   let last: Promise<unknown> = Promise.resolve();
   return (key, salt) => {
     const own = last.then(() => derive(key, salt));
@@ -11,17 +11,17 @@ export function oneByOne(derive: Derive): Derive {
   };
 }
 
-/** Several that derive keys, each in turn. */
-export function inTurn(derives: readonly Derive[]): Derive {
+/** Distributes derivations over several. */
+export function roundRobin(derives: readonly Derive[]): Derive {
   let next = 0;
   return (key, salt) => derives[next++ % derives.length](key, salt);
 }
 
 /** In this thread. */
-export const here: Derive = oneByOne(master);
+export const here: Derive = sequential(master);
 
-/** By a worker that answers in order: with 32 bytes, or null. */
-export function derivedBy(worker: Worker): Derive {
+/** By a worker that answers in order, with 32 bytes or null. */
+export function deriveInWorker(worker: Worker): Derive {
   const waiting: ((found: Uint8Array | null) => void)[] = [];
   worker.onmessage = ({ data }: MessageEvent<Uint8Array | null>) => waiting.shift()?.(data);
   return (key, salt) =>
@@ -31,7 +31,7 @@ export function derivedBy(worker: Worker): Derive {
     });
 }
 
-/** A worker from a blob: a page that is one file and opens from disk can have no other. */
-export function started(source: string): Worker {
+/** A worker from a blob, the only kind in a single-file page that opens from disk. */
+export function startWorker(source: string): Worker {
   return new Worker(URL.createObjectURL(new Blob([source], { type: 'text/javascript' })));
 }

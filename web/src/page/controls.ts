@@ -1,26 +1,26 @@
-/** Moving the camera by mouse, touch and keyboard: around what it looks at, or flying. */
-import { add, axes, difference, length, type Pose, turned, type Vector } from './pose.ts';
+/** Camera controls by mouse, touch and keyboard: orbiting the target, or flying. */
+import { add, axes, difference, length, type Pose, orbit, type Vector } from './pose.ts';
 
-const TURN = 0.005; // radians for each pixel
-const KEY_TURN = 0.08; // radians for each press of an arrow key
-const KEY_STEP = 0.06; // of the distance for each press
+const TURN = 0.005; // radians per pixel
+const KEY_TURN = 0.08; // radians per press of an arrow key
+const KEY_STEP = 0.06; // of the distance per press
 const KEY_ZOOM = 1.1;
-const ROTATION = 0.0003; // radians for each millisecond
-const [GLIDE, RELEASED, STILL] = [150, 80, 1e-5]; // ms to a third of the speed; ms since a movement; radians for each ms
+const ROTATION = 0.0003; // radians per ms
+const [DECAY, RELEASED, STILL] = [150, 80, 1e-5]; // inertia: time constant; ms since the last movement; radians per ms
 const [NEAREST, FURTHEST] = [1e-4, 1e5];
 
 export class Controls {
   flying = false;
-  touched = false; // whether somebody moved the camera
-  rotating = (_: boolean): void => undefined; // is told whether it goes around by itself
+  touched = false; // whether the user moved the camera
+  onRotate = (_: boolean): void => undefined; // receives whether auto-rotation is on
   isRotating = false;
-  private turning = 0; // the next animation frame
-  private dragging = { azimuth: 0, elevation: 0, at: 0 }; // radians for each millisecond, of the last movement
+  private frame = 0; // the next animation frame
+  private velocity = { azimuth: 0, elevation: 0, at: 0 }; // radians per ms in the last movement
   private readonly pointers = new Map<number, { x: number; y: number }>();
 
-  /** `moved` is told of every new pose; `home` gives the first one again. */
+  /** `onPose` receives every new pose; `home` returns the first one. */
   constructor(
-    canvas: HTMLCanvasElement, private pose: Pose, private readonly moved: (pose: Pose) => void,
+    canvas: HTMLCanvasElement, private pose: Pose, private readonly onPose: (pose: Pose) => void,
     private readonly home: () => Pose,
   ) {
     canvas.style.touchAction = 'none';
@@ -29,7 +29,7 @@ export class Controls {
       this.touch();
       this.pointers.set(event.pointerId, { x: event.clientX, y: event.clientY });
     });
-    canvas.addEventListener('pointermove', (event) => this.dragged(event, canvas.clientHeight));
+    canvas.addEventListener('pointermove', (event) => this.drag(event, canvas.clientHeight));
     for (const name of ['pointerup', 'pointercancel'] as const) {
       canvas.addEventListener(name, (event) => {
         if (this.pointers.delete(event.pointerId) && !this.pointers.size) this.glide();
@@ -39,20 +39,20 @@ export class Controls {
     canvas.addEventListener('wheel', (event) => {
       event.preventDefault();
       this.touch();
-      // Browsers give a pinch on a trackpad as a wheel with Ctrl, and some give lines in the place of pixels.
+      // Browsers report a trackpad pinch as a wheel with Ctrl, and some report lines instead of pixels.
       this.zoom(Math.exp(event.deltaY * (event.ctrlKey ? 0.01 : 0.001) * (event.deltaMode ? 16 : 1)));
     }, { passive: false });
-    canvas.addEventListener('keydown', (event) => this.pressed(event));
+    canvas.addEventListener('keydown', (event) => this.press(event));
   }
 
   setPose(pose: Pose): void {
     this.pose = pose;
-    this.moved(pose);
+    this.onPose(pose);
   }
 
-  /** Goes around by itself until somebody moves the camera. */
+  /** Auto-rotates until the user moves the camera. */
   rotate(on: boolean): void {
-    cancelAnimationFrame(this.turning);
+    cancelAnimationFrame(this.frame);
     if (on) {
       this.animate((passed) => {
         this.turn(passed * ROTATION, 0);
@@ -60,16 +60,16 @@ export class Controls {
       });
     }
     this.isRotating = on;
-    this.rotating(on);
+    this.onRotate(on);
   }
 
-  /** A drag that was let go in motion goes on for a moment. */
+  /** Inertia after a drag. */
   private glide(): void {
-    const { azimuth, elevation, at } = this.dragging;
+    const { azimuth, elevation, at } = this.velocity;
     if (performance.now() - at > RELEASED || window.matchMedia('(prefers-reduced-motion: reduce)').matches) return;
     let share = 1;
     this.animate((passed) => {
-      share *= Math.exp(-passed / GLIDE);
+      share *= Math.exp(-passed / DECAY);
       this.turn(passed * share * azimuth, passed * share * elevation);
       return share * Math.hypot(azimuth, elevation) > STILL;
     });
@@ -77,38 +77,38 @@ export class Controls {
 
   /** Calls `step` with the milliseconds since the last frame until it returns false. */
   private animate(step: (passed: number) => boolean): void {
-    cancelAnimationFrame(this.turning);
+    cancelAnimationFrame(this.frame);
     let before = performance.now();
     const next = (now: number): void => {
       const more = step(Math.max(0, now - before));
       before = now;
-      if (more) this.turning = requestAnimationFrame(next);
+      if (more) this.frame = requestAnimationFrame(next);
     };
-    this.turning = requestAnimationFrame(next);
+    this.frame = requestAnimationFrame(next);
   }
 
   private touch(): void {
     this.touched = true;
-    cancelAnimationFrame(this.turning);
+    cancelAnimationFrame(this.frame);
     if (this.isRotating) this.rotate(false);
   }
 
-  private dragged(event: PointerEvent, height: number): void {
+  private drag(event: PointerEvent, height: number): void {
     const before = this.pointers.get(event.pointerId);
     if (before === undefined) return;
     const [dx, dy] = [event.clientX - before.x, event.clientY - before.y];
-    if (this.pointers.size === 2) this.pinched(event, dx, dy, height);
+    if (this.pointers.size === 2) this.pinch(event, dx, dy, height);
     else if (event.shiftKey || event.buttons & 6) this.fly(-dx / height, -dy / height, 0);
     else {
       const [azimuth, elevation] = [dx * TURN, (this.flying ? -dy : dy) * TURN];
-      const passed = Math.max(1, event.timeStamp - this.dragging.at);
-      this.dragging = { azimuth: azimuth / passed, elevation: elevation / passed, at: event.timeStamp };
+      const passed = Math.max(1, event.timeStamp - this.velocity.at);
+      this.velocity = { azimuth: azimuth / passed, elevation: elevation / passed, at: event.timeStamp };
       this.turn(azimuth, elevation);
     }
     this.pointers.set(event.pointerId, { x: event.clientX, y: event.clientY });
   }
 
-  private pinched(event: PointerEvent, dx: number, dy: number, height: number): void {
+  private pinch(event: PointerEvent, dx: number, dy: number, height: number): void {
     const other = [...this.pointers].find(([id]) => id !== event.pointerId)![1];
     const own = this.pointers.get(event.pointerId)!;
     const span = (x: number, y: number): number => Math.max(1, Math.hypot(x - other.x, y - other.y));
@@ -116,7 +116,7 @@ export class Controls {
     this.fly(-dx / (2 * height), -dy / (2 * height), 0);
   }
 
-  private pressed(event: KeyboardEvent): void {
+  private press(event: KeyboardEvent): void {
     if (event.ctrlKey || event.metaKey || event.altKey) return;
     const actions: Record<string, () => void> = {
       ArrowLeft: () => this.turn(KEY_TURN, 0),
@@ -141,11 +141,11 @@ export class Controls {
     action();
   }
 
-  /** Around what the camera looks at; in flight, of the head. */
+  /** Orbits the target or, when flying, looks around. */
   private turn(azimuth: number, elevation: number): void {
     const { eye, target, up } = this.pose;
-    if (this.flying) this.setPose({ eye, target: add(eye, turned(difference(target, eye), up, azimuth, elevation)), up });
-    else this.setPose({ eye: add(target, turned(difference(eye, target), up, azimuth, elevation)), target, up });
+    if (this.flying) this.setPose({ eye, target: add(eye, orbit(difference(target, eye), up, azimuth, elevation)), up });
+    else this.setPose({ eye: add(target, orbit(difference(eye, target), up, azimuth, elevation)), target, up });
   }
 
   private zoom(factor: number): void {
@@ -157,7 +157,7 @@ export class Controls {
     else this.setPose({ ...this.pose, eye: add(target, offset, bounded / distance) });
   }
 
-  /** By shares of the distance of what the camera looks at. */
+  /** Moves by shares of the distance to the target. */
   private fly(right: number, down: number, forward: number): void {
     const { eye, target } = this.pose;
     const directions = axes(this.pose);

@@ -1,10 +1,10 @@
-/** A training that goes on: its models as they are now, whenever there are newer ones; `keyss.viewer.live` has them. */
-import { fetched } from './sources.ts';
+/** Shows the models of a running training, served by `keyss.viewer.live`. */
+import { fetchBytes } from './sources.ts';
 
-const AGAIN = 2000; // milliseconds from one answer to the next question
-const PATIENCE = 3; // questions without an answer after which the training has ended
+const INTERVAL = 2000; // ms between polls
+const PATIENCE = 3; // failed polls after which the training has ended
 
-export const SIDES = ['published', 'secret'] as const;
+const SIDES = ['published', 'secret'] as const;
 export type TrainedSide = (typeof SIDES)[number];
 
 interface State {
@@ -13,12 +13,10 @@ interface State {
   readonly iterations: number;
   readonly gaussians: number;
   readonly numbers: Record<string, number>; // decibels
-  readonly versions: Record<TrainedSide, number>; // 0: not there
+  readonly versions: Record<TrainedSide, number>; // 0: no model yet
 }
 
-/**
- * Resolves when the training has ended. `tell`: how far it is; `trained`: a newer model can be seen; `anew`: the first one.
- */
+/** Resolves when the training has ended. `tell` receives its state, `trained` every new model; `anew`: it is the first. */
 export async function watch(
   address: string, tell: (text: string) => void, trained: (side: TrainedSide, ply: Uint8Array, anew: boolean) => Promise<void>,
 ): Promise<void> {
@@ -27,12 +25,12 @@ export async function watch(
   let state: State | null = null;
   for (let failures = 0; failures < PATIENCE; ) {
     try {
-      state = JSON.parse(new TextDecoder().decode(await fetched(address))) as State;
+      state = JSON.parse(new TextDecoder().decode(await fetchBytes(address))) as State;
       failures = 0;
       tell(textOf(state));
       for (const side of SIDES) {
         if (state.versions[side] <= shown[side]) continue;
-        const ply = await fetched(`${address}/${side}.ply`);
+        const ply = await fetchBytes(`${address}/${side}.ply`);
         await trained(side, ply, titles[side] !== state.title);
         shown[side] = state.versions[side];
         titles[side] = state.title;
@@ -40,7 +38,7 @@ export async function watch(
     } catch {
       failures++;
     }
-    await new Promise((resolve) => setTimeout(resolve, AGAIN));
+    await new Promise((resolve) => setTimeout(resolve, INTERVAL));
   }
   tell(`${state ? `${textOf(state)} ` : ''}The training has ended.`);
 }

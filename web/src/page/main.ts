@@ -1,22 +1,22 @@
 /** The page: a published model, a field for a key, and what the key opens. */
 import type { Gaussians } from '../core/gaussians.ts';
 import { writePly } from '../files/ply.ts';
-import type { HiddenFile } from '../records/file.ts';
+import type { HiddenFile } from '../records/reveal.ts';
 import { Controls } from './controls.ts';
-import { asked, tell } from './embedding.ts';
+import { notifyParent, params } from './embedding.ts';
 import { type TrainedSide, watch } from './live.ts';
-import { listenToLooks, looked } from './looking.ts';
+import { inspected, listenToInspection } from './inspection.ts';
 import { Opener } from './opener.ts';
 import { count, page, placeBorder, preparePanel, save, showKey } from './panel.ts';
 import {
-  add, alike, axes, FIELD_OF_VIEW, firstPose, picked, type Pose, poseOfHash, poseToHash, rolled, UPS, upName, type Vector,
+  add, transferPose, axes, FIELD_OF_VIEW, firstPose, pick, type Pose, poseOfHash, poseToHash, UPS, upName, type Vector,
 } from './pose.ts';
 import { givenModel } from './sources.ts';
 import { Viewer } from './viewer.ts';
 
-const ADDRESS_AFTER = 400; // milliseconds after the last movement
+const ADDRESS_AFTER = 400; // ms after the last movement
 const MAX_BYTES = 2 ** 31;
-const KEYBOARD_COVERS = window.matchMedia('(pointer: coarse)'); // the picture, while the key's field has the focus
+const HAS_SCREEN_KEYBOARD = window.matchMedia('(pointer: coarse)'); // which covers the picture
 const NO_WEBGL = "Your browser doesn't support WebGL 2, which is needed to show the model.";
 const INTERRUPTED = 'The browser interrupted graphics. The picture comes back by itself; if not, reload the page.';
 
@@ -26,19 +26,18 @@ class Page {
   private secret: Gaussians | null = null;
   private readonly opener = new Opener((share) => {
     if (share < 1) page.progress.value = share;
-    else this.searches('');
+    else this.showSearch('');
   });
   private readonly controls: Controls;
   private pose: Pose = { eye: [0, 0, -1], target: [0, 0, 0], up: UPS['-y'] };
-  private readonly homes = new WeakMap<Gaussians, Pose>(); // the first poses
-  private roll = 0; // degrees, of the slider
+  private readonly homes = new WeakMap<Gaussians, Pose>(); // first poses
   private addressTimer = 0;
-  private asked = location.hash; // by whoever opened the page; later ones are written by the page itself
-  private work = 0; // loads and attempts so far: what another one has followed is dropped
+  private hash = location.hash; // as the user opened it; the page writes its own later
+  private work = 0; // number of loads and attempts; results of outdated ones are dropped
 
-  /** Without a viewer keys can be tried, and nothing is drawn. */
+  /** Without a viewer, keys can be tried and nothing is drawn. */
   constructor(private readonly viewer: Viewer | null) {
-    this.controls = new Controls(page.picture, this.pose, (pose) => this.moved(pose), () => this.firstPose());
+    this.controls = new Controls(page.picture, this.pose, (pose) => this.setPose(pose), () => this.firstPose());
     this.listen();
     page.drawn.disabled = page.wipe.disabled = viewer === null;
   }
@@ -54,12 +53,7 @@ class Page {
       page.fly.setAttribute('aria-pressed', String(this.controls.flying));
     });
     page.up.addEventListener('input', () => this.controls.setPose(this.firstPose(UPS[page.up.value])));
-    page.roll.addEventListener('input', () => {
-      const before = this.roll;
-      this.roll = Number(page.roll.value);
-      this.controls.setPose(rolled(this.pose, ((this.roll - before) * Math.PI) / 180));
-    });
-    this.controls.rotating = (on) => page.rotate.setAttribute('aria-pressed', String(on));
+    this.controls.onRotate = (on) => page.rotate.setAttribute('aria-pressed', String(on));
     page.rotate.addEventListener('click', () => this.controls.rotate(!this.controls.isRotating));
     page.link.hidden = !navigator.clipboard;
     page.link.addEventListener('click', () => void this.copyLink());
@@ -83,25 +77,25 @@ class Page {
     page.wipe.addEventListener('input', () => this.split(1 - Number(page.wipe.value) / 100));
     if (page.main.dataset.background) page.background.value = page.main.dataset.background;
     this.viewer?.setBackground(page.background.value);
-    listenToLooks(() => {
+    listenToInspection(() => {
       this.showPublished();
-      if (this.secret) this.split(1); // it is the published one that is looked at
+      if (this.secret) this.split(1); // shows the public model
     });
     window.addEventListener('hashchange', ({ newURL }) => {
-      this.asked = new URL(newURL).hash; // that of now may be one that was written meanwhile
-      const pose = poseOfHash(this.asked);
+      this.hash = new URL(newURL).hash; // location.hash may have been overwritten by the page
+      const pose = poseOfHash(this.hash);
       if (pose) this.controls.setPose(pose);
     });
   }
 
-  /** A training that goes on, or a model of the page itself, beside it, or in the address. */
+  /** Opens a running training, or the model in the page, beside it, or in its address. */
   async start(): Promise<void> {
     const live = document.querySelector<HTMLMetaElement>('meta[name="keyss-live"]')?.content;
     if (live) return this.watch(live);
     const source = givenModel();
     if (source === null) return this.say('Open a file, or drop one here.');
-    if (asked.poster) page.poster.src = asked.poster;
-    page.poster.hidden = !asked.poster;
+    if (params.poster) page.poster.src = params.poster;
+    page.poster.hidden = !params.poster;
     this.say('Loading …');
     const bytes = await source.bytes((share) => this.say(`Loading … ${Math.floor(100 * share)} %`)).catch(() => null);
     return bytes ? this.load(bytes, source.name) : this.fail('The file in the address could not be loaded.');
@@ -110,41 +104,41 @@ class Page {
   private async openFile(file: File): Promise<void> {
     if (page.main.dataset.live !== undefined) return;
     if (file.size > MAX_BYTES) return this.fail('This file is larger than 2 GiB.');
-    for (const given of ['pose', 'camera', 'up', 'title']) delete page.main.dataset[given]; // were the first file's
+    for (const given of ['pose', 'camera', 'up', 'title']) delete page.main.dataset[given]; // of the first file
     return this.load(new Uint8Array(await file.arrayBuffer()), file.name);
   }
 
   private async load(bytes: Uint8Array, name: string): Promise<void> {
-    const own = this.begun();
+    const own = this.startWork();
     this.say('Reading …');
     page.problem.textContent = this.viewer ? '' : NO_WEBGL;
     const { model, leftOut, error } = await this.opener.ask({ bytes, name }, [bytes.buffer]);
     if (own !== this.work) return;
     if (model === undefined) return this.fail(error ?? 'This file cannot be read.');
-    [this.name, this.published] = [(this.work === 1 && asked.title) || (page.main.dataset.title ?? name), model];
+    [this.name, this.published] = [(this.work === 1 && params.title) || (page.main.dataset.title ?? name), model];
     this.hideSecret();
     page.open.disabled = page.key.disabled = false;
     page.facts.textContent = `${this.name}\n${count(model.count)} Gaussians, SH degree ${model.shDegree}`;
     if (leftOut) page.facts.textContent += `\n${count(leftOut)} are left out: their numbers are not finite`;
     document.title = `${this.name} · keyss viewer`;
     this.showPublished();
-    this.controls.setPose(poseOfHash(this.asked) ?? poseOfHash(page.main.dataset.pose ?? '') ?? this.firstPose());
-    await this.picture();
+    this.controls.setPose(poseOfHash(this.hash) ?? poseOfHash(page.main.dataset.pose ?? '') ?? this.firstPose());
+    await this.settle();
     this.say('');
     page.poster.hidden = true;
-    tell({ event: 'load', gaussians: model.count });
-    this.controls.rotate(asked.autorotate && !window.matchMedia('(prefers-reduced-motion: reduce)').matches);
+    notifyParent({ event: 'load', gaussians: model.count });
+    this.controls.rotate(params.autorotate && !window.matchMedia('(prefers-reduced-motion: reduce)').matches);
   }
 
-  /** The models of a training as they are now, and no field for keys. */
+  /** Shows the models of a running training, without a field for keys. */
   private async watch(address: string): Promise<void> {
     page.main.dataset.live = '';
     document.title = 'keyss, training';
     page.facts.textContent = 'A training, as it is now';
-    await watch(address, (text) => this.say(text), (side, ply, anew) => this.trained(side, ply, anew));
+    await watch(address, (text) => this.say(text), (side, ply, anew) => this.showTrained(side, ply, anew));
   }
 
-  private async trained(side: TrainedSide, ply: Uint8Array, anew: boolean): Promise<void> {
+  private async showTrained(side: TrainedSide, ply: Uint8Array, anew: boolean): Promise<void> {
     const { model } = await this.opener.ask({ bytes: ply, keyless: true }, [ply.buffer]);
     if (model === undefined) return;
     const share = this.secret ? 1 - Number(page.wipe.value) / 100 : 0;
@@ -156,48 +150,48 @@ class Page {
     }
     const looks = side === 'secret' || this.secret === null;
     if (looks && (anew || !this.controls.touched)) this.controls.setPose(this.firstPose());
-    else this.moved(this.pose);
-    await this.picture();
+    else this.setPose(this.pose);
+    await this.settle();
   }
 
   /**
-   * A key that opens nothing changes nothing, and one line is said after every key. The form is ready again when the
-   * quick search ends, before a secret is decoded and rendered; the thorough one follows by itself, for every key.
+   * Wrong keys change nothing, and the same line follows every key. The form is ready again after the quick search,
+   * before a secret is decoded and rendered; the thorough search follows for every key.
    */
   private async unlock(): Promise<void> {
     const key = page.key.value;
     if (!key || this.published === null || page.open.disabled) return;
-    const own = this.begun();
-    if (KEYBOARD_COVERS.matches) page.key.blur();
+    const own = this.startWork();
+    if (HAS_SCREEN_KEYBOARD.matches) page.key.blur();
     this.controls.rotate(false);
-    this.writeAddress(); // now, so that it is the same whatever the key opens
+    this.writeAddress(); // before the key opens anything
     let said = 'Key tried.';
     for (const search of ['quick', 'thorough'] as const) {
-      this.searches(search);
+      this.showSearch(search);
       this.say(search === 'quick' ? 'Trying the key …' : `${said} Searching more thoroughly …`);
       delete page.main.dataset.picture;
       const { model, file, foreign, stopped } = await this.opener.ask({ key, thorough: search === 'thorough' });
       if (own !== this.work) return;
-      this.searches('');
-      if (search === 'quick') tell({ event: 'key-tried' });
-      if (file || model) tell({ event: 'opened', kind: file ? 'file' : 'model' });
+      this.showSearch('');
+      if (search === 'quick') notifyParent({ event: 'key-tried' });
+      if (file || model) notifyParent({ event: 'opened', kind: file ? 'file' : 'model' });
       if (file) said += this.offer(file);
       if (model) said += this.reveal(model);
       if (foreign) said += ` About ${count(foreign)} Gaussians of the file were added or changed: it may not be its secret.`;
       this.say(stopped ? `${said} Search stopped.` : said);
-      await this.picture();
+      await this.settle();
       if (own !== this.work) return;
     }
   }
 
-  /** A new piece of work, which ends the search that goes on. */
-  private begun(): number {
+  /** Starts a load or an attempt, and cancels the current search. */
+  private startWork(): number {
     this.opener.stop();
-    this.searches('');
+    this.showSearch('');
     return ++this.work;
   }
 
-  private searches(search: 'quick' | 'thorough' | ''): void {
+  private showSearch(search: 'quick' | 'thorough' | ''): void {
     const isBusy = search === 'quick';
     page.main.dataset.searching = search;
     page.progress.value = 0;
@@ -217,21 +211,21 @@ class Page {
     return ' It reveals a file.';
   }
 
-  /** Seen as what was there before was. */
+  /** Shows the secret from where the last model was seen. */
   private reveal(model: Gaussians): string {
-    const pose = this.likewise(this.pose, this.secret ?? this.published ?? model, model);
+    const pose = this.sameView(this.pose, this.secret ?? this.published ?? model, model);
     this.showSecret(model, 0);
     this.controls.setPose(pose);
     return ` It reveals a model of ${count(model.count)} Gaussians.`;
   }
 
   private closeSecret(): void {
-    const pose = this.secret && this.published ? this.likewise(this.pose, this.secret, this.published) : this.pose;
+    const pose = this.secret && this.published ? this.sameView(this.pose, this.secret, this.published) : this.pose;
     this.hideSecret();
     this.controls.setPose(pose);
     this.writeAddress();
     this.say('');
-    if (!KEYBOARD_COVERS.matches) page.key.focus();
+    if (!HAS_SCREEN_KEYBOARD.matches) page.key.focus();
   }
 
   private hideSecret(): void {
@@ -245,7 +239,7 @@ class Page {
     this.split(share);
   }
 
-  /** How much of the width shows the published model, beside the secret: 0 to 1. */
+  /** Sets the share of the width for the published model beside the secret. */
   private split(share: number): void {
     page.revealed.hidden = this.secret === null || this.published === null; // nothing to wipe with
     page.wipe.value = String(100 * (1 - share));
@@ -254,7 +248,7 @@ class Page {
   }
 
   private async snapshot(): Promise<void> {
-    this.controls.rotate(false); // there is no picture at rest else
+    this.controls.rotate(false); // otherwise no picture is at rest
     const picture = await this.viewer?.snapshot();
     if (picture) save(`${this.name.replace(/\.\w+$/, '') || 'view'}.png`, picture);
   }
@@ -264,16 +258,15 @@ class Page {
     await navigator.clipboard.writeText(location.href).then(() => this.say('Link copied.'), () => this.say(location.href));
   }
 
-  /** Of the model that is shown: anew, since the window's size or the way up may be others. */
+  /** The first pose of the model shown, recomputed, as the window size or the up axis may have changed. */
   private firstPose(up?: Vector): Pose {
-    page.roll.value = String((this.roll = 0));
     const model = this.secret ?? this.published;
     if (model === null) return this.pose;
     this.homes.delete(model);
     return this.home(model, up);
   }
 
-  /** A model's first pose; that of the published one from the side of the cameras that it was made with. */
+  /** A model's first pose; the published model is seen from the side of its training cameras. */
   private home(model: Gaussians, up?: Vector): Pose {
     const { camera, up: given } = page.main.dataset;
     const aspect = page.picture.clientWidth / Math.max(1, page.picture.clientHeight) || 1;
@@ -284,31 +277,31 @@ class Page {
     return found;
   }
 
-  private likewise(pose: Pose, from: Gaussians, to: Gaussians): Pose {
-    return from === to ? pose : alike(pose, this.home(from), this.home(to));
+  private sameView(pose: Pose, from: Gaussians, to: Gaussians): Pose {
+    return from === to ? pose : transferPose(pose, this.home(from), this.home(to));
   }
 
-  /** Turns the camera to what was clicked, which it goes around from now on. */
+  /** Makes the clicked point the target. */
   private lookAt({ offsetX, offsetY }: MouseEvent): void {
     const { clientWidth: width, clientHeight: height } = page.picture;
     const { right, down, forward } = axes(this.pose);
     const scale = (2 * Math.tan((FIELD_OF_VIEW * Math.PI) / 360)) / height;
     const ray = add(add(forward, right, (offsetX - width / 2) * scale), down, (offsetY - height / 2) * scale);
     const model = this.secret ?? this.published;
-    const target = model && picked(model, this.pose.eye, ray);
+    const target = model && pick(model, this.pose.eye, ray);
     if (target) this.controls.setPose({ ...this.pose, target });
   }
 
-  private moved(pose: Pose): void {
+  private setPose(pose: Pose): void {
     this.pose = pose;
     page.up.value = upName(pose.up) ?? '';
     if (this.secret) this.viewer?.setPose(pose, 'right');
-    this.viewer?.setPose(this.secret && this.published ? this.likewise(pose, this.secret, this.published) : pose);
+    this.viewer?.setPose(this.secret && this.published ? this.sameView(pose, this.secret, this.published) : pose);
     clearTimeout(this.addressTimer);
     this.addressTimer = window.setTimeout(() => this.writeAddress(), ADDRESS_AFTER);
   }
 
-  /** Not while a secret is shown: a pose in its coordinates would tell of it to whoever gets the address. */
+  /** Not while a secret is shown, whose coordinates would be in the address. */
   private writeAddress(): void {
     clearTimeout(this.addressTimer);
     const hash = poseToHash(this.pose);
@@ -317,11 +310,11 @@ class Page {
 
   private showPublished(): void {
     if (this.published === null) return;
-    const model = looked(this.published);
+    const model = inspected(this.published);
     this.viewer?.show(model.count ? model : null);
   }
 
-  private async picture(): Promise<void> {
+  private async settle(): Promise<void> {
     delete page.main.dataset.picture;
     await this.viewer?.settled();
     page.main.dataset.picture = 'settled';
@@ -338,11 +331,11 @@ class Page {
 }
 
 async function main(): Promise<void> {
-  page.main.dataset.panel = asked.panel;
-  const viewer = await Viewer.on(page.picture).catch(() => null);
+  page.main.dataset.panel = params.panel;
+  const viewer = await Viewer.create(page.picture).catch(() => null);
   page.problem.textContent = viewer ? '' : NO_WEBGL;
   const shown = new Page(viewer);
-  if (asked.panel === 'key') page.keying.open = true; // which is folded on phones else
+  if (params.panel === 'key') page.keying.open = true; // folded on phones by default
   await shown.start();
 }
 

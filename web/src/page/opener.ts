@@ -1,14 +1,14 @@
-/** The worker that reads files and tries keys, as functions. */
+/** Promises over the worker that reads files and tries keys. */
 import WORKER from 'source:../worker.ts';
-import { started } from '../keys/pool.ts';
+import { startWorker } from '../keys/pool.ts';
 import type { Answer, Question } from '../worker.ts';
 
 export class Opener {
-  private readonly worker = started(WORKER);
+  private readonly worker = startWorker(WORKER);
   private readonly waiting = new Map<number, (answer: Answer) => void>();
   private next = 0;
 
-  /** `onProgress` gets the share of an attempt that is done, 0 to 1, at the same times for every key. */
+  /** `onProgress` receives the progress of an attempt, 0 to 1, at the same times for every key. */
   constructor(private readonly onProgress: (share: number) => void) {
     this.worker.onmessage = ({ data }: MessageEvent<Answer>) => {
       const resolve = this.waiting.get(data.id);
@@ -22,15 +22,15 @@ export class Opener {
     };
   }
 
-  /** The model in a file, or what a key opens. `moved`: memory that the worker takes over. */
-  ask(question: Question, moved: Transferable[] = []): Promise<Answer> {
+  /** The model in a file, or what a key opens. `transfer`: memory to hand over to the worker. */
+  ask(question: Question, transfer: Transferable[] = []): Promise<Answer> {
     return new Promise((resolve) => {
       this.waiting.set(this.next, resolve);
-      this.worker.postMessage({ ...question, id: this.next++ }, moved);
+      this.worker.postMessage({ ...question, id: this.next++ }, transfer);
     });
   }
 
-  /** Ends what goes on. */
+  /** Cancels everything pending. */
   stop(): void {
     this.worker.postMessage({ stop: true } satisfies Question);
     for (const [id, resolve] of this.waiting) resolve({ id, stopped: true });

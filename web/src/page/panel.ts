@@ -1,6 +1,5 @@
-/** What index.html has, by name, and what it does by itself: showing the key, taking a file that is dropped. */
+/** The elements of index.html by id, and the behaviour that needs no model: showing the key, dropping files. */
 
-/** The elements of one kind. */
 function all<T extends HTMLElement>() {
   return <Name extends string>(...names: Name[]) =>
     Object.fromEntries(names.map((name) => [name, document.getElementById(name)])) as Record<Name, T>;
@@ -8,7 +7,7 @@ function all<T extends HTMLElement>() {
 
 export const page = {
   ...all()('main', 'border', 'drop', 'view', 'status', 'problem', 'facts', 'revealed', 'count'),
-  ...all<HTMLInputElement>()('file', 'key', 'wipe', 'threshold', 'faint', 'opaque', 'roll', 'background'),
+  ...all<HTMLInputElement>()('file', 'key', 'wipe', 'threshold', 'faint', 'opaque', 'background'),
   ...all<HTMLButtonElement>()('show', 'open', 'stop', 'fly', 'home', 'snapshot', 'download', 'close', 'save', 'rotate', 'fullscreen', 'link'),
   ...all<HTMLSelectElement>()('up', 'colouring'),
   ...all<HTMLCanvasElement>()('picture'),
@@ -20,9 +19,9 @@ export const page = {
   ...all<HTMLImageElement>()('poster'),
 };
 
-const NARROW = '(max-width: 600px)'; // where the panel would cover the scene
+const NARROW = '(max-width: 600px)'; // the panel would cover the scene
 
-/** `opened` gets files that are chosen or dropped. */
+/** `opened` receives chosen and dropped files. */
 export function preparePanel(opened: (file: File) => void): void {
   page.controls.open = page.keying.open = !window.matchMedia(NARROW).matches;
   page.fullscreen.hidden = !document.fullscreenEnabled;
@@ -32,7 +31,7 @@ export function preparePanel(opened: (file: File) => void): void {
   page.show.addEventListener('click', () => showKey(page.key.type === 'password'));
   page.file.addEventListener('change', () => {
     const file = page.file.files?.[0];
-    page.file.value = ''; // so that the same file can be chosen again
+    page.file.value = ''; // allows choosing the same file again
     if (file) opened(file);
   });
   document.addEventListener('dragover', (event) => {
@@ -55,7 +54,7 @@ export function showKey(shown: boolean): void {
   page.show.setAttribute('aria-pressed', String(shown));
 }
 
-/** The border between the two models, at a share of the width. */
+/** Places the border between the models at a share of the width. */
 export function placeBorder(share: number): void {
   page.border.hidden = share <= 0 || share >= 1;
   page.border.style.left = `${100 * share}%`;

@@ -1,4 +1,4 @@
-/** Where the camera is, what it looks at, and which way is up. */
+/** Camera poses: eye, target and up vector. */
 import { type Gaussians, opacity } from '../core/gaussians.ts';
 import { cross, dot } from '../core/similarity.ts';
 
@@ -10,19 +10,19 @@ export interface Pose {
   readonly up: Vector; // of length 1
 }
 
-/** -y as captures made with COLMAP have it, z as those of Blender. */
+/** -y in captures by COLMAP, z in Blender's. */
 export const UPS: Record<string, Vector> = {
   '-y': [0, -1, 0], z: [0, 0, 1], y: [0, 1, 0], '-z': [0, 0, -1], x: [1, 0, 0], '-x': [-1, 0, 0],
 };
 
 export const FIELD_OF_VIEW = 50; // degrees, vertical
-const SAMPLE = 8_000; // Gaussians that the first pose is found by
-const HEIGHT = 0.2; // of the first pose, as the sine of its elevation
-const [MOST, ALL] = [0.93, 0.995]; // shares of the visible Gaussians: in the first picture, and if that costs little
-const LITTLE = 1.15; // of the distance
-const FURTHEST = 2.5; // times the distance of the cameras that took the photos
+const SAMPLE = 8_000; // Gaussians for the first pose
+const HEIGHT = 0.2; // sine of the first pose's elevation
+const [MOST, ALL] = [0.93, 0.995]; // shares of visible Gaussians in the first picture: at least, and at most LITTLE further away
+const LITTLE = 1.15; // times the distance
+const FURTHEST = 2.5; // times the distance of the training cameras
 const MARGIN = 0.94; // of half the picture
-const NEAR = 0.01; // from a ray, by the depth
+const NEAR = 0.01; // distance from a ray relative to the depth
 const STEEPEST = (85 * Math.PI) / 180;
 
 export const add = (a: Vector, b: Vector, scale = 1): Vector => [
@@ -42,9 +42,8 @@ export function axes({ eye, target, up }: Pose): { right: Vector; down: Vector; 
 }
 
 /**
- * From where nearly all that is visible of a model is in view, and its middle in the middle. `aspect`: the picture's
- * width by its height. With the pose of the cameras that `captured` it, it is seen from their side and upright as they
- * saw it, and not from much further away: what is all around a room is not worth seeing the room from outside.
+ * A pose that frames nearly all visible Gaussians. `aspect`: width / height of the picture. `captured`: the pose of the
+ * training cameras, which then gives direction and up vector, and bounds the distance: rooms are seen from inside.
  */
 export function firstPose(model: Gaussians, aspect: number, up?: Vector, captured?: Pose | null): Pose {
   const step = Math.max(1, Math.ceil(model.count / SAMPLE));
@@ -59,7 +58,7 @@ export function firstPose(model: Gaussians, aspect: number, up?: Vector, capture
   const places = basis.map((axis) => rows.map((row) => dot(axis, [...model.means.subarray(3 * row, 3 * row + 3)])));
   const middle = places.map((values, axis) => captured ? dot(basis[axis], captured.target)
     : (quantile(values, weights, 1 - ALL) + quantile(values, weights, ALL)) / 2);
-  // The distance at which each Gaussian is at the edge of the picture.
+  // Distances at which each Gaussian is at the edge of the picture.
   const half = MARGIN * Math.tan((FIELD_OF_VIEW * Math.PI) / 360);
   const distances = rows.map((_, index) => {
     const [x, y, z] = places.map((values, axis) => values[index] - middle[axis]);
@@ -73,9 +72,9 @@ export function firstPose(model: Gaussians, aspect: number, up?: Vector, capture
   return { eye: add(target, forward, -distance), target, up: pose.up };
 }
 
-const [SLABS, DOMINANT] = [40, 0.1]; // across the most of a model, and the share that lies on a floor
+const [SLABS, DOMINANT] = [40, 0.1]; // across most of a model; minimum share in the slab of a floor
 
-/** Whether Gaussians lie on a floor across z, as in scenes of Blender, rather than across y. */
+/** Whether there is a floor across z, as in Blender's scenes, rather than across y. */
 function isZUp(model: Gaussians, rows: number[], weights: number[]): boolean {
   const [y, z] = [1, 2].map((axis) => {
     const places = rows.map((row) => model.means[3 * row + axis]);
@@ -98,8 +97,8 @@ function quantile(values: number[], weights: number[], share: number): number {
   return values[order.at(-1) ?? 0] ?? 0;
 }
 
-/** The pose that is to `to` as `pose` is to `from`: another model has coordinates of its own. */
-export function alike(pose: Pose, from: Pose, to: Pose): Pose {
+/** The pose relative to `to` as `pose` is to `from`: each model has its own coordinates. */
+export function transferPose(pose: Pose, from: Pose, to: Pose): Pose {
   const basis = (each: Pose): Vector[] => [axes(each).right, each.up, cross(axes(each).right, each.up)];
   const [before, after] = [basis(from), basis(to)];
   const turn = (vector: Vector): Vector => combined(before.map((axis) => dot(axis, vector)), after);
@@ -108,8 +107,8 @@ export function alike(pose: Pose, from: Pose, to: Pose): Pose {
   return { eye: place(pose.eye), target: place(pose.target), up: turn(pose.up) };
 }
 
-/** An offset turned about the vertical axis, and towards it as far as it may; angles in radians. */
-export function turned(offset: Vector, up: Vector, azimuth: number, elevation: number): Vector {
+/** An offset rotated about `up` and towards it, within limits; angles in radians. */
+export function orbit(offset: Vector, up: Vector, azimuth: number, elevation: number): Vector {
   const distance = length(offset);
   const sine = dot(offset, up) / distance;
   const bounded = Math.max(-STEEPEST, Math.min(STEEPEST, Math.asin(Math.max(-1, Math.min(1, sine))) + elevation));
@@ -118,14 +117,8 @@ export function turned(offset: Vector, up: Vector, azimuth: number, elevation: n
   return combined([cosine * Math.cos(azimuth), cosine * Math.sin(azimuth), Math.sin(bounded) * distance], [flat, side, up]);
 }
 
-/** The camera turned about its own axis, clockwise by so many radians; its way up comes along. */
-export function rolled(pose: Pose, angle: number): Pose {
-  const { right, down } = axes(pose);
-  return { ...pose, up: add(add([0, 0, 0], right, Math.sin(angle)), down, -Math.cos(angle)) };
-}
-
-/** The place in a model that is seen along a ray from the eye, null for none: the nearest one that hides much. */
-export function picked(model: Gaussians, eye: Vector, ray: Vector): Vector | null {
+/** The nearest mostly opaque point of a model along a ray from the eye; null if there is none. */
+export function pick(model: Gaussians, eye: Vector, ray: Vector): Vector | null {
   let [found, nearest]: [Vector | null, number] = [null, Infinity];
   const direction = unit(ray);
   for (let row = 0; row < model.count; row++) {
@@ -138,7 +131,7 @@ export function picked(model: Gaussians, eye: Vector, ray: Vector): Vector | nul
   return found;
 }
 
-/** `#eye=x,y,z&target=x,y,z`, with `&up=z` or `&up=x,y,z` where up is not -y, and back; null for anything else. */
+/** `#eye=x,y,z&target=x,y,z`, with `&up=z` or `&up=x,y,z` unless up is -y. `poseOfHash` is the inverse, null on errors. */
 export function poseToHash(pose: Pose): string {
   const text = (values: Vector): string => values.map((each) => Number(each.toPrecision(6))).join(',');
   const up = upName(pose.up) ?? text(pose.up);
@@ -156,7 +149,7 @@ export function poseOfHash(hash: string): Pose | null {
   return eye && target && length(difference(eye, target)) > 1e-9 ? { eye, target, up } : null;
 }
 
-/** The axis of the world that a way up is, undefined for a tilted one. */
+/** The name of an up vector along a world axis; undefined for others. */
 export function upName(up: Vector): string | undefined {
   return Object.keys(UPS).find((name) => dot(UPS[name], up) > 1 - 1e-9);
 }

@@ -1,41 +1,34 @@
-/** Where the page has its model from: within itself, beside it, or in its address. */
-import { joined } from '../core/bytes.ts';
-import { asked } from './embedding.ts';
+/** The source of the page's model: embedded, beside the page, or given in its address. */
+import { readAll } from '../core/bytes.ts';
+import { params } from './embedding.ts';
 
 export interface Source {
   readonly name: string;
   readonly bytes: (loaded: (share: number) => void) => Promise<Uint8Array>;
 }
 
-/** Null where there is none. */
+/** Null if there is none. */
 export function givenModel(): Source | null {
   const inside = document.getElementById('model');
   const beside = document.querySelector<HTMLMetaElement>('meta[name="keyss-model"]')?.content;
-  if (inside?.textContent && !asked.file) {
+  if (inside?.textContent && !params.file) {
     const text = inside.textContent;
-    inside.remove(); // the text is not needed twice
+    inside.remove(); // frees memory
     return { name: inside.dataset.name ?? 'model', bytes: async () => bytesOfBase64(text) };
   }
-  const address = asked.file ?? beside;
+  const address = params.file ?? beside;
   if (!address) return null;
   const url = new URL(address, document.baseURI);
   const named = url.pathname.split('/').pop()!.replaceAll('+', '%2B');
-  return { name: new URLSearchParams(`name=${named}`).get('name') || 'model', bytes: (loaded) => fetched(url, loaded) };
+  return { name: new URLSearchParams(`name=${named}`).get('name') || 'model', bytes: (loaded) => fetchBytes(url, loaded) };
 }
 
-/** `loaded` gets the share that is there. Raises an error for what is not there, or on a host that is not allowed. */
-export async function fetched(url: URL | string, loaded: (share: number) => void = () => undefined): Promise<Uint8Array> {
+/** `loaded` receives the share loaded so far. Throws for missing files and hosts that are not allowed. */
+export async function fetchBytes(url: URL | string, loaded: (share: number) => void = () => undefined): Promise<Uint8Array> {
   const response = await fetch(url, { credentials: 'omit' });
   if (!response.ok || response.body === null) throw new Error(String(response.status));
-  const size = Number(response.headers.get('content-length')); // of what may be compressed
-  const parts: Uint8Array[] = [];
-  const reader = response.body.getReader();
-  for (let [bytes, { done, value }] = [0, await reader.read()]; !done; { done, value } = await reader.read()) {
-    parts.push(value!);
-    bytes += value!.length;
-    if (size) loaded(Math.min(1, bytes / size));
-  }
-  return joined(...parts);
+  const size = Number(response.headers.get('content-length')); // possibly compressed
+  return readAll(response.body, (bytes) => size && loaded(Math.min(1, bytes / size)));
 }
 
 function bytesOfBase64(text: string): Uint8Array {

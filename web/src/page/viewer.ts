@@ -1,4 +1,4 @@
-/** The picture: PlayCanvas draws one model, or two of them side by side. */
+/** Renders one model, or two side by side, with PlayCanvas. */
 import {
   AppBase, AppOptions, CameraComponentSystem, Color, createGraphicsDevice, Entity, GAMMA_SRGB, GSplatComponentSystem,
   GSplatData, GSplatResource, Layer, RESOLUTION_FIXED, TONEMAP_NONE, Vec3, Vec4,
@@ -7,15 +7,14 @@ import { type Gaussians, mostVisible } from '../core/gaussians.ts';
 import { plyColumns } from '../files/ply.ts';
 import { FIELD_OF_VIEW, type Pose } from './pose.ts';
 
-const NEAREST = 1e-3; // of the distance of what the camera looks at
-const FURTHEST = 1e4;
-const SLOW = 120; // milliseconds of a frame beyond which pictures in motion are coarser
-const COARSE = 0.5; // of the resolution, then
-const COARSE_COUNT = 15_000; // and so many Gaussians at most, those that are seen most
-const LARGE = 100_000; // Gaussians of models that are coarse at first: all of them take seconds
-const POLL = 4; // milliseconds
-const AT_REST = 250; // milliseconds without a change after which pictures are fine
-const ASLEEP = 500; // milliseconds without a frame after which the engine has no more to do
+const [NEAREST, FURTHEST] = [1e-3, 1e4]; // clip planes relative to the target's distance
+const SLOW = 120; // ms per frame above which motion is drawn coarsely,
+const COARSE = 0.5; // at this share of the resolution,
+const COARSE_COUNT = 15_000; // with at most this many Gaussians, the most visible ones
+const LARGE = 100_000; // Gaussians; larger models are coarse at first, as all of them take seconds
+const POLL = 4; // ms
+const AT_REST = 250; // ms without a change until the fine picture
+const ASLEEP = 500; // ms without a frame until the engine stops
 export type Side = 'left' | 'right';
 
 interface Half {
@@ -23,7 +22,7 @@ interface Half {
   readonly camera: Entity;
   model: Gaussians | null;
   splats: Entity | null;
-  coarse: Entity | null; // few of its Gaussians
+  coarse: Entity | null; // its most visible Gaussians
 }
 
 export class Viewer {
@@ -31,14 +30,14 @@ export class Viewer {
   private scale = 1;
   private moving = false;
   private lastChange = 0;
-  private inFlight = false; // a frame that is being drawn
-  private drawing = false; // in the frame of the engine that is going on
-  private wanted = false; // another one after it
+  private inFlight = false; // a frame is being drawn
+  private drawing = false; // the engine's current frame draws
+  private wanted = false; // another frame should follow
   private started = 0;
-  private asleep = false; // without a GPU the engine's empty frames alone would take half of two cores
+  private asleep = false; // without a GPU, the engine's empty frames take a whole core
   private slowFrames = 0;
-  private slow = false; // the last picture at rest took so long that motion is coarse from its beginning on
-  private split = 1; // share of the width that the left model has
+  private slow = false; // the last picture at rest was slow, so motion starts coarse
+  private split = 1; // share of the width for the left model
   private whenReady: (() => void)[] = [];
   private ready = false;
 
@@ -49,20 +48,20 @@ export class Viewer {
     system.on('frame:request', () => this.draw());
     system.on('frame:ready', (_camera: unknown, _layer: unknown, ready: boolean) => (this.ready = ready));
     app.on('framerender', () => {
-      this.drawing = app.renderNextFrame; // the engine's other frames draw nothing
+      this.drawing = app.renderNextFrame; // other frames draw nothing
       if (this.drawing) this.resize();
     });
     app.on('frameend', () => {
       if (this.drawing) this.afterFrame();
     });
     app.on('update', () => this.rest());
-    app.graphicsDevice.on('devicerestored', () => this.restored());
+    app.graphicsDevice.on('devicerestored', () => this.restore());
     app.start();
     new ResizeObserver(() => this.draw()).observe(canvas);
   }
 
-  /** Raises an error where there is no WebGL 2. */
-  static async on(canvas: HTMLCanvasElement): Promise<Viewer> {
+  /** Throws without WebGL 2. */
+  static async create(canvas: HTMLCanvasElement): Promise<Viewer> {
     const device = await createGraphicsDevice(canvas, {
       deviceTypes: ['webgl2'], antialias: false, depth: true, alpha: false,
     } as object);
@@ -78,7 +77,7 @@ export class Viewer {
     return new Viewer(app, canvas);
   }
 
-  /** Shows a model, or nothing, on one side; the right side is hidden while it has none. */
+  /** Shows a model, or nothing, on one side; an empty right side is hidden. */
   show(model: Gaussians | null, side: Side = 'left'): void {
     const half = this.halves[side];
     for (const entity of [half.splats, half.coarse]) {
@@ -95,13 +94,13 @@ export class Viewer {
     this.touch();
   }
 
-  /** Everything that the graphics card held is gone. */
-  private restored(): void {
+  /** After a lost context. */
+  private restore(): void {
     this.inFlight = false;
     for (const side of ['left', 'right'] as const) this.show(this.halves[side].model, side);
   }
 
-  /** `colour`: as #rrggbb. */
+  /** `colour`: #rrggbb. */
   setBackground(colour: string): void {
     for (const { camera } of Object.values(this.halves)) camera.camera!.clearColor = new Color().fromString(colour);
     this.touch();
@@ -111,13 +110,13 @@ export class Viewer {
     const entity = new Entity();
     entity.addComponent('gsplat', { layers: [layer.id] });
     (entity.gsplat as unknown as { resource: unknown }).resource = new GSplatResource(
-      this.app.graphicsDevice, elements(model),
+      this.app.graphicsDevice, gsplatData(model),
     );
     this.app.root.addChild(entity);
     return entity;
   }
 
-  /** Where the border between the two models lies, 0 to 1 of the width from the left. */
+  /** Places the border between the models at a share of the width. */
   setSplit(share: number): void {
     this.split = share;
     this.layOut();
@@ -135,7 +134,7 @@ export class Viewer {
     this.touch();
   }
 
-  /** When a fine picture of the model and the pose of now is on the canvas. */
+  /** Resolves when a fine picture of the current models and poses is drawn. */
   settled(): Promise<void> {
     return new Promise((resolve) => {
       this.whenReady.push(resolve);
@@ -143,14 +142,14 @@ export class Viewer {
     });
   }
 
-  /** The picture of now in full resolution, as PNG. */
+  /** The current picture in full resolution, as PNG. */
   async snapshot(): Promise<Blob> {
     await this.settled();
     return new Promise((resolve, reject) => {
       this.app.once('frameend', () =>
         this.canvas.toBlob((blob) => (blob ? resolve(blob) : reject(new Error('no picture'))), 'image/png'),
       );
-      this.draw(); // into the buffer, which is empty between frames
+      this.draw(); // the buffer is empty between frames
     });
   }
 
@@ -162,7 +161,7 @@ export class Viewer {
       clearColor: new Color(0, 0, 0, 1), fov: FIELD_OF_VIEW, layers: [layer.id], priority: order,
       gammaCorrection: GAMMA_SRGB, toneMapping: TONEMAP_NONE,
     });
-    // Without this internal switch the engine leaves the scissor rectangle aside.
+    // The engine ignores the scissor rectangle unless this internal flag is set.
     (camera.camera as unknown as { camera: { _scissorRectClear: boolean } }).camera._scissorRectClear = true;
     this.app.root.addChild(camera);
     return { layer, camera, model: null, splats: null, coarse: null };
@@ -194,14 +193,14 @@ export class Viewer {
     this.asleep = false;
   }
 
-  /** No frames of the engine until there is something to draw. */
+  /** Stops the engine until there is something to draw. */
   private rest(): void {
     if (this.inFlight || performance.now() - this.started < ASLEEP) return;
     AppBase.cancelTick(this.app);
     this.asleep = true;
   }
 
-  /** Only right before a frame is drawn: a canvas that gets another size loses its picture. */
+  /** Called right before a frame, since resizing clears the canvas. */
   private resize(): void {
     const ratio = Math.min(window.devicePixelRatio || 1, 2) * this.scale;
     const [width, height] = [this.canvas.clientWidth, this.canvas.clientHeight];
@@ -215,7 +214,7 @@ export class Viewer {
     for (const half of Object.values(this.halves)) this.place(half);
   }
 
-  /** The Gaussians that belong to the resolution of now; they are made when they are needed first. */
+  /** Enables the Gaussians for the current resolution; creates them on first use. */
   private place(half: Half): void {
     const { model, layer } = half;
     if (model === null) return;
@@ -226,7 +225,7 @@ export class Viewer {
     if (half.splats) half.splats.enabled = !coarse;
   }
 
-  /** The next frame is drawn when this one is: else a slow GPU would have a queue of them, and lag behind. */
+  /** Waits for the GPU, so that frames do not queue up on slow ones. */
   private afterFrame(): void {
     const gl = (this.app.graphicsDevice as unknown as { gl: WebGL2RenderingContext }).gl;
     const fence = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
@@ -237,12 +236,12 @@ export class Viewer {
         return;
       }
       gl.deleteSync(fence);
-      this.drawn();
+      this.finishFrame();
     };
     setTimeout(poll, 0);
   }
 
-  private drawn(): void {
+  private finishFrame(): void {
     const now = performance.now();
     this.inFlight = false;
     this.canvas.dataset.frames = String(Number(this.canvas.dataset.frames ?? 0) + 1);
@@ -261,8 +260,8 @@ export class Viewer {
   }
 }
 
-/** A model as PlayCanvas has it: columns by the names of the .ply. */
-function elements(model: Gaussians): GSplatData {
+/** A model as PlayCanvas's data: columns by .ply property name. */
+function gsplatData(model: Gaussians): GSplatData {
   const { count } = model;
   const properties = plyColumns(model.shDegree).map(({ name, to, offset }) => {
     const width = model[to].length / count;

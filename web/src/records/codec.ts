@@ -1,23 +1,23 @@
-/** From records to Gaussians; see docs/format.md, "Records of Gaussians". */
+/** Decodes records to Gaussians; see docs/format.md, "Records of Gaussians". */
 import { halfFloat, viewOf } from '../core/bytes.ts';
 import { damaged } from '../core/errors.ts';
 import { coefficients, emptyGaussians, type Gaussians } from '../core/gaussians.ts';
 import { fromSmallestThree } from '../files/coded.ts';
 
 const BANDS = [1, 3, 5, 7]; // coefficients of each degree
-const CHROMA_FEWER = 2; // bits of the differences of colours
+const CHROMA_FEWER = 2; // bits less for colour differences
 const MAX_BITS = 24;
 const TABLE_BYTES = 8;
 const LINE_BYTES = 12;
-const FURTHEST = 1e30; // no number that a line may give is larger
+const MAX_VALUE = 1e30;
 const [BRIGHTNESS, RED_GREEN, BLUE] = [1 / Math.sqrt(3), 1 / Math.sqrt(2), 1 / Math.sqrt(6)];
 
-/** Codes 0 to 2^bits - 1 for numbers around a centre, evenly or by sinh. */
-export class Line {
+/** Quantiser of values around a centre to codes 0 to 2^bits - 1, uniform or by sinh. */
+class Line {
   constructor(readonly centre: number, readonly spread: number, readonly reach: number) {
     const bounded =
-      Math.abs(centre) < FURTHEST && spread >= 0 && spread < FURTHEST && reach > 0 && reach < FURTHEST;
-    const steep = spread > 0 && (reach > 60 || spread * Math.sinh(reach) > FURTHEST);
+      Math.abs(centre) < MAX_VALUE && spread >= 0 && spread < MAX_VALUE && reach > 0 && reach < MAX_VALUE;
+    const steep = spread > 0 && (reach > 60 || spread * Math.sinh(reach) > MAX_VALUE);
     if (!bounded || steep) throw damaged();
   }
 
@@ -29,18 +29,18 @@ export class Line {
 
 const QUAT_LINE = new Line(0, 0, Math.sqrt(0.5));
 
-/** (columns, bits) in the order of a record. */
-export type Layout = readonly (readonly [number, number])[];
+/** (columns, bits of each) in the order of a record. */
+type Layout = readonly (readonly [number, number])[];
 
-/** How the Gaussians of one secret are written. */
+/** The format of one secret's records. */
 export class Codec {
   private constructor(
     readonly bits: readonly number[], // of positions, log scales, quaternions, opacity, then of each degree
     private readonly lines: readonly Line[],
-    private readonly far: readonly Line[], // with the reach that outliers have
+    private readonly far: readonly Line[], // for outliers
   ) {}
 
-  /** From the start of a header; the rest is ignored. Raises InputError. */
+  /** From the start of a header. Raises InputError. */
   static unpack(data: Uint8Array): Codec {
     if (data.length < TABLE_BYTES) throw damaged();
     let count = TABLE_BYTES;
@@ -48,7 +48,7 @@ export class Codec {
     const bits = [...data.subarray(0, count)];
     const impossible = bits.length < 5 || bits.some((each) => each < 1 || each > MAX_BITS);
     if (impossible || Math.min(...bits.slice(4)) <= CHROMA_FEWER) throw damaged();
-    const size = Codec.packedSize(bits.length - 5);
+    const size = TABLE_BYTES + LINE_BYTES * (2 * bits.length - 3);
     if (data.length < size) throw damaged();
     const view = viewOf(data);
     const [lines, far]: Line[][] = [[], []];
@@ -60,15 +60,7 @@ export class Codec {
     return new Codec(bits, lines, far);
   }
 
-  static packedSize(shDegree: number): number {
-    return TABLE_BYTES + LINE_BYTES * (7 + 2 * shDegree);
-  }
-
-  get shDegree(): number {
-    return this.bits.length - 5;
-  }
-
-  get layout(): Layout {
+  private get layout(): Layout {
     const [means, logScales, quats, opacity, ...colours] = this.bits;
     const shape: [number, number][] = [
       [1, 1], [1, 2], [3, quats], [1, means], [1, means], [1, means], [3, logScales], [1, opacity],
@@ -81,19 +73,19 @@ export class Codec {
     return Math.ceil(this.layout.reduce((sum, [columns, bits]) => sum + columns * bits, 0) / 8);
   }
 
-  /** Writes the Gaussians of records, whatever bytes they are, into the rows from `first` on, which it returns. */
-  decode(records: readonly Uint8Array[], to = emptyGaussians(records.length, this.shDegree), first = 0): Gaussians {
-    const { layout } = this;
+  /** The Gaussians of records of any bytes. */
+  decode(records: readonly Uint8Array[]): Gaussians {
+    const [{ layout }, found] = [this, emptyGaussians(records.length, this.bits.length - 5)];
     const codes = new Uint32Array(layout.reduce((sum, [count]) => sum + count, 0));
     records.forEach((record, row) => {
       unpackCodes(record, layout, codes);
-      this.put(to, first + row, codes);
+      this.put(found, row, codes);
     });
-    return to;
+    return found;
   }
 
-  /** Writes the Gaussian of these codes, one for each column of the layout, into a row; further harmonics stay. */
-  put(to: Gaussians, row: number, codes: ArrayLike<number>): void {
+  /** Writes the Gaussian of `codes`, one for each column of the layout, to a row. */
+  private put(to: Gaussians, row: number, codes: ArrayLike<number>): void {
     const [means, logScales, quatBits, opacity, ...colours] = this.bits;
     const lines = codes[0] ? this.far : this.lines;
     const quat = wholeQuat(codes[1], [2, 3, 4].map((at) => QUAT_LINE.value(codes[at], quatBits)));
@@ -129,7 +121,7 @@ function unpackCodes(record: Uint8Array, layout: Layout, codes: Uint32Array): vo
   }
 }
 
-/** Red, green and blue of brightness and two differences. */
+/** Writes red, green and blue from brightness and two colour differences. */
 export function putColours(to: Float32Array, at: number, brightness: number, first: number, second: number): void {
   to[at] = brightness * BRIGHTNESS + first * RED_GREEN + second * BLUE;
   to[at + 1] = brightness * BRIGHTNESS - first * RED_GREEN + second * BLUE;

@@ -1,11 +1,11 @@
-/** Tables of integers from an adaptive binary range coder; `keyss.methods.records.entropy` on the other side. */
+/** Adaptive binary range decoder for tables of integers; counterpart of `keyss.methods.records.entropy`. */
 import { damaged } from '../core/errors.ts';
 
 const MOST = 31; // bits of a difference
-const CONTEXTS = 16; // of counts of bits; one more is that of the first bits
-const [FAST, SLOW] = [4, 7]; // shifts by which chances adapt
+const CONTEXTS = 16; // for the number of bits; one more for the first bit
+const [FAST, SLOW] = [4, 7]; // adaptation shifts
 
-/** Bits, each by a chance of a 0 that adapts: the mean of a fast and a slow estimate, in 65,536ths. */
+/** Decodes bits by adaptive probabilities of 0: the mean of a fast and a slow estimate, in 65,536ths. */
 class Decoder {
   private at = 0;
   private place = 0;
@@ -23,12 +23,12 @@ class Decoder {
     return this.at > this.data.length + 4;
   }
 
-  /** An even one. */
+  /** A bit of probability 1/2. */
   bit(): number {
     return this.within(this.range >>> 1);
   }
 
-  /** One by the chance of this number. */
+  /** A bit by the adaptive probability at an index. */
   likelyBit(chance: number): number {
     const { chances } = this;
     const [fast, slow] = [2 * chance, 2 * chance + 1];
@@ -52,8 +52,8 @@ class Decoder {
 }
 
 /**
- * [columns][count] numbers. `shares`: eighths of the number before that a number is coded as a difference to; columns of
- * the same group share their chances. Raises InputError for bytes that are too few or too many.
+ * [columns][count] integers. `shares`: predictor weight of the previous row, in eighths, per column; columns of a group
+ * share probabilities. Raises InputError for too few or too many bytes.
  */
 export function decodeTable(data: Uint8Array, count: number, shares: number[], groups: number[]): Int32Array[] {
   const ofGroup = (CONTEXTS + 1) * (MOST + 1);

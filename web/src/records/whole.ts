@@ -1,24 +1,24 @@
-/** A model as one string of bytes; `keyss.methods.records.whole` on the other side. */
+/** Decodes a model from one string of bytes; counterpart of `keyss.methods.records.whole`. */
 import { viewOf } from '../core/bytes.ts';
 import { damaged } from '../core/errors.ts';
 import { coefficients, emptyGaussians, type Gaussians } from '../core/gaussians.ts';
 import { putColours } from './codec.ts';
 import { decodeTable } from './entropy.ts';
 
-const ALWAYS = 1 << 16; // Gaussians, whatever announces them
-const MIN_BYTES = 2; // of each Gaussian in larger models
+const ALWAYS = 1 << 16; // Gaussians allowed in any payload
+const MIN_BYTES = 2; // per Gaussian in larger models
 const HEAD_BYTES = 49; // Gaussians (4), SH degree (1), centres (20), steps (24)
 const [MAX_CENTRE, MAX_STEP] = [1e30, 1e6];
-const DIFFERENCE = 1.5; // steps of differences of constant colours, in those of their brightness
+const DIFFERENCE = 1.5; // step of constant colour differences relative to brightness
 const PER_OCTAVE = 0.5 / Math.LN2; // half octaves of the step
-const FINER = 6; // half octaves by which a step is finer or coarser, at most
-const LEAST_W = 1 / 16; // its square
-// Of x, y, z, log scales, opacity, colours and quaternion; harmonics have two more groups and no shares.
+const FINER = 6; // half octaves: maximum change of a step
+const LEAST_W = 1 / 16; // minimum of w squared
+// For x, y, z, log scales, opacity, colours and quaternion; harmonics have two more groups and no shares.
 const [SHARES, GROUPS] = [[8, 8, 8, 2, 2, 2, 2, 6, 6, 6, 0, 0, 0], [0, 0, 0, 1, 1, 1, 2, 3, 4, 4, 5, 5, 5]];
 
 /**
- * The model, read from a model of `carriers` Gaussians. Raises InputError for damage. Above 2^16 Gaussians, each takes
- * at least 2 bytes of `data`, and there are no more than `carriers`.
+ * The model in a payload that a model of `carriers` Gaussians holds. Raises InputError for damage, and for more than
+ * 2^16 Gaussians if they exceed `carriers` or take less than 2 bytes each.
  */
 export function decodeWhole(data: Uint8Array, carriers: number): Gaussians {
   if (data.length < HEAD_BYTES) throw damaged();
@@ -61,7 +61,7 @@ export function decodeWhole(data: Uint8Array, carriers: number): Gaussians {
   return found;
 }
 
-/** [N] half octaves by which the steps of each Gaussian are finer than those of the middle one, by area and opacity. */
+/** [N] half octaves by which a Gaussian's steps are finer than the median one's, by area and opacity. */
 function finerSteps({ count, logScales, opacityLogits }: Gaussians): Int8Array {
   const seen = Float64Array.from({ length: count }, (_, row) => {
     const [, second, third] = logScales.slice(3 * row, 3 * row + 3).sort();

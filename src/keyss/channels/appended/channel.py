@@ -1,11 +1,10 @@
-"""Secrets in appended Gaussians, too faint and too small to be seen.
+"""Secrets in appended Gaussians, too faint and too small to see.
 
-They survive every publication format, and moving, rotating and scaling of the whole model. Everybody sees
-that they are there; reading them takes the key. A payload is encrypted as a whole (ChaCha20-Poly1305 under a
-key that Argon2id gives with the file's salt), cut into packets, and given parity by Reed-Solomon in codewords
-of at most 8192 packets, any 5895 of which suffice. Every packet is a Gaussian. A header tells how many of
-them hold data. Random words pad all that is appended to one of few numbers, which tell neither how large
-secrets are nor how many.
+They survive every publication format, and moving, rotating and scaling of the whole model. Everybody can see
+that they are there; only the key reads them. A payload is encrypted as a whole (ChaCha20-Poly1305, with a key
+from Argon2id and the file's salt) and cut into packets, one per Gaussian. Reed-Solomon adds parity: any 5895
+packets of a codeword of at most 8192 suffice. A header holds the number of data packets. Random words pad the
+total to one of few numbers, which reveal neither the size nor the number of secrets.
 """
 
 from __future__ import annotations
@@ -20,20 +19,20 @@ import numpy as np
 import torch
 
 from keyss.channels.appended import packets, pilots
-from keyss.channels.appended.lattice import (
+from keyss.channels.appended.words import (
     WORD_BITS,
     all_shifts,
+    candidate_mask,
     check_place,
     colours_of,
-    in_order,
-    in_own_frame,
     invariants_of,
-    is_candidate,
-    joined,
     likely_shifts,
     own_frame,
+    pack_words,
+    points_in_frame,
     scale_steps,
     scales_at,
+    sort_by_rotation,
     to_gaussians,
 )
 from keyss.channels.base import (
@@ -57,18 +56,18 @@ from keyss.core.gaussians import Gaussians
 from keyss.keys.derivation import SALT_BYTES, DerivedKey, expand, stream
 from keyss.keys.encryption import OVERHEAD, bucket, compressed_size, decrypt, encrypt
 
-# A quarter of the packets may be lost, and some of the others garbled, with so many deviations more. Longer
-# codewords need fewer packets and more time: these are of 8192.
+# Expected share of intact packets after the loss of a quarter, and the margin in standard deviations. Longer
+# codewords need fewer packets and more time; 5895 data packets make a codeword of 8192.
 _LEFT, _DEVIATIONS, _MAX_DATA = 0.74, 4.2, 5895
-# Bytes of a packet: the longer its tag, the fewer words of others pass for packets.
+# Data bytes per packet. Narrow packets have longer tags, which fewer words of other secrets match by chance.
 _WIDE, _NARROW, _WIDE_PACKETS = 8, 6, 90_000
-_MAX_PACKETS = 1_000_000  # of data; a header tells up to 2^20
-_STEP = 256  # Gaussians by which small numbers of appended ones differ
-_OVERHEAD = 260  # bytes of a payload beside its data, at most
+_MAX_PACKETS = 1_000_000  # data packets; a header holds up to 2^20
+_STEP = 256  # smallest difference between numbers of appended Gaussians
+_OVERHEAD = 260  # maximum bytes of a payload beside its data
 
-# Gaussians in which pilots are counted; places of the lattice that are tried then, with so many deviations
-# more of them than by chance.
-_SAMPLE, _TRIED, _NOT_BY_CHANCE = 8000, 8, 3.0
+# Search for the lattice's offset: Gaussians in which pilots are counted, maximum number of offsets, and
+# standard deviations by which pilots must outnumber accidental ones.
+_SAMPLE, _MAX_OFFSETS, _SIGNIFICANT = 8000, 8, 3.0
 _ASSOCIATED = b"keyss/v1/appended/data"
 # The cover: how many of its Gaussians are seen, and their sketch. A format changes up to a fifth of names;
 # another model of the same scene shares two fifths of them, one of another scene a tenth.
@@ -76,8 +75,8 @@ _SKETCH_BYTES, _FOREIGN = 128, 0.4
 _HOST = struct.Struct(f"<I{_SKETCH_BYTES}s")
 MAX_BYTES = _MAX_PACKETS * _NARROW - OVERHEAD - METHOD_BYTES - _HOST.size
 _NOTICED = (
-    "the number of appended Gaussians tells how much is hidden in all: whoever holds one of the keys sees "
-    "that there are other secrets"
+    "the number of appended Gaussians reveals the total size: the holder of one key can tell that there are "
+    "other secrets"
 )
 
 
@@ -90,18 +89,18 @@ class Appended(Channel):
     grows = True
 
     def prepare(self, cover: Gaussians) -> AppendedCover:
-        """See `Channel`. Raises UsageError for a cover so far out that float32 is too coarse."""
+        """See `Channel`. Raises UsageError for a cover too far from the origin for float32."""
         check_place(own_frame(cover))
         return AppendedCover(cover)
 
     def room(self, gaussians: int, sh_degree: int) -> Room:
         return Room(gaussians, MAX_BYTES, _OVERHEAD, grows=True)
 
-    def appended(self, sizes: Sequence[int]) -> int:
-        """Gaussians that payloads of so many compressed bytes take together."""
-        alone = len(sizes) == 1
-        every = [_codewords_for(size + _HOST.size, alone) for size in sizes]
-        return _padded(sum(packets.HEADERS + each.chunks for each in every))
+    def appended_count(self, sizes: Sequence[int]) -> int:
+        """The number of Gaussians appended for payloads of these compressed sizes in bytes."""
+        single = len(sizes) == 1
+        every = [_codewords_for(size + _HOST.size, single) for size in sizes]
+        return _padded_count(sum(packets.HEADERS + each.chunks for each in every))
 
 
 APPENDED = Appended()
@@ -118,7 +117,7 @@ class AppendedCover:
         return APPENDED.room(len(self.cover), self.cover.sh_degree)
 
     def embed(self, contents: Sequence[tuple[str, Content]], *, entropy: bytes | None = None) -> Gaussians:
-        """The cover with Gaussians after its own. Warns where there is more than one secret."""
+        """The cover followed by the appended Gaussians. Warns if there is more than one secret."""
         model = self.cover.detach().to("cpu")
         names = _names(model)
         packed = [pack_payload(content) for _, content in contents]
@@ -129,22 +128,22 @@ class AppendedCover:
         check_keys([key.verifier() for key in keys])
         if len(keys) > 1:
             warnings.warn(_NOTICED, KeyssWarning, stacklevel=2)
-        alone = len(keys) == 1
+        single = len(keys) == 1
         bound = [_HOST.pack(len(names), sketch(_sketch_key(key), names, _SKETCH_BYTES)) for key in keys]
         tied = [host + data for host, data in zip(bound, packed, strict=True)]
-        words = [_words(*each, alone, random) for each in zip(keys, tied, strict=True)]
+        words = [_words(*each, single, random) for each in zip(keys, tied, strict=True)]
         used = sum(map(len, words))
-        total = _padded(used)
+        total = _padded_count(used)
         words.append(pilots.write(salt, pilots.count_for(total), random))
         rest = total - used - pilots.count_for(total)
         words.append(random.integers(0, 2, (rest, WORD_BITS), np.uint8))
-        every = in_order(np.concatenate(words))
+        every = sort_by_rotation(np.concatenate(words))
         return Gaussians.cat([model, to_gaussians(every, own_frame(model), model.sh_degree)])
 
 
 @dataclass(frozen=True)
 class AppendedReader(SaltedReader):
-    """A model's appended Gaussians as a reader sees them."""
+    """Reads the appended Gaussians of a model."""
 
     salts: Sequence[bytes]
     words: Bits
@@ -152,23 +151,23 @@ class AppendedReader(SaltedReader):
 
     @staticmethod
     def of(model: Gaussians) -> AppendedReader | None:
-        """None where there are none, or where their frame cannot be found."""
-        candidates = is_candidate(model)
+        """None if there are none, or if their frame cannot be found."""
+        candidates = candidate_mask(model)
         if candidates.sum() < pilots.MIN // 4:
             return None
         faint = model.detach().to("cpu")[torch.from_numpy(candidates)]
         colours, steps = colours_of(faint), scale_steps(faint)
         few = np.random.default_rng(0).permutation(len(faint))[:_SAMPLE]
         for shifts in (likely_shifts(steps), _shifts_with_pilots(steps[few], colours[few])):
-            best: tuple[pilots.Found, Integers] | None = None
+            best: tuple[pilots.PilotFit, Integers] | None = None
             for shift in shifts:
                 scales = scales_at(steps, shift)
                 found = pilots.read(invariants_of(colours, scales), faint.means.double().numpy())
-                if found and (best is None or found.agreeing > best[0].agreeing):
+                if found and (best is None or found.inliers > best[0].inliers):
                     best = found, scales
             if best is not None:
                 found, scales = best
-                words = joined(colours, scales, in_own_frame(faint, found.to_own))
+                words = pack_words(colours, scales, points_in_frame(faint, found.to_own))
                 return AppendedReader([found.salt], words, _names(model))
         return None
 
@@ -189,7 +188,7 @@ class AppendedReader(SaltedReader):
 
 
 def _names(model: Gaussians) -> Bytes:
-    """[M, 16] of the Gaussians that are seen, coarse numbers that hardly any format or motion changes."""
+    """[M, 16] names of the visible Gaussians, coarse numbers that formats and motions hardly change."""
     names = Carriers.of(model).names
     return np.hstack([names, np.zeros_like(names)]).astype("<i2").view(np.uint8)
 
@@ -198,17 +197,17 @@ def _sketch_key(key: DerivedKey) -> bytes:
     return key.expand("appended/host", 32)
 
 
-def _padded(used: int) -> int:
-    """How many Gaussians are appended where `used` carry data: one of few numbers, which says little."""
+def _padded_count(used: int) -> int:
+    """The number of Gaussians to append if `used` carry data: one of few numbers, which reveal little."""
     total = bucket(used, _STEP)
     while total - pilots.count_for(total) < used:
         total = bucket(total + 1, _STEP)
     return total
 
 
-def _codewords_for(size: int, alone: bool) -> Codewords:
-    """The codewords of `size` bytes of compressed payload. Raises UsageError for more than fit."""
-    for width, most in ((_WIDE, _WIDE_PACKETS * alone), (_NARROW, _MAX_PACKETS)):
+def _codewords_for(size: int, single: bool) -> Codewords:
+    """The codewords for a compressed payload of `size` bytes. Raises UsageError if it does not fit."""
+    for width, most in ((_WIDE, _WIDE_PACKETS * single), (_NARROW, _MAX_PACKETS)):
         needed = -(-(size + OVERHEAD) // width)
         if needed <= most:
             return _codewords(needed, width)
@@ -216,7 +215,7 @@ def _codewords_for(size: int, alone: bool) -> Codewords:
 
 
 def _codewords(needed: int, width: int) -> Codewords:
-    """Codewords for `needed` packets of data, so long that enough of their packets are left."""
+    """The shortest codewords for `needed` data packets that survive the loss of a quarter."""
     count = -(-needed // _MAX_DATA)
     length = data = -(-needed // count)
     while length * _LEFT - _DEVIATIONS * math.sqrt(length * _LEFT * (1 - _LEFT)) < data:
@@ -225,18 +224,18 @@ def _codewords(needed: int, width: int) -> Codewords:
 
 
 def _shifts_with_pilots(steps: Doubles, colours: Integers) -> Iterator[float]:
-    """The places where the lattice of log scales may begin with most pilots among the Gaussians."""
+    """Offsets of the lattice of log scales with significantly many pilots, most first."""
     shifts = all_shifts(steps)
     counts = np.array([pilots.count(invariants_of(colours, scales_at(steps, each))) for each in shifts])
-    by_chance = len(steps) / pilots.ONE_IN
-    for index in np.argsort(counts)[::-1][:_TRIED]:
-        if counts[index] > by_chance + _NOT_BY_CHANCE * math.sqrt(by_chance):
+    expected = len(steps) / pilots.ONE_IN
+    for index in np.argsort(counts)[::-1][:_MAX_OFFSETS]:
+        if counts[index] > expected + _SIGNIFICANT * math.sqrt(expected):
             yield float(shifts[index])
 
 
-def _words(key: DerivedKey, packed: bytes, alone: bool, random: np.random.Generator) -> Bits:
-    """[N, WORD_BITS] header and packets of one secret; `alone`: there is no other."""
-    codewords = _codewords_for(compressed_size(packed), alone)
+def _words(key: DerivedKey, packed: bytes, single: bool, random: np.random.Generator) -> Bits:
+    """Words [N, WORD_BITS] of one secret's headers and packets; `single`: it is the only secret."""
+    codewords = _codewords_for(compressed_size(packed), single)
     width, needed = codewords.width, codewords.count * codewords.k
     encrypted = encrypt(key.expand("appended/data", 32), packed, _ASSOCIATED, size=codewords.size)
     numbers = np.arange(codewords.chunks, dtype=np.uint64)

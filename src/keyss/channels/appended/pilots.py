@@ -1,9 +1,9 @@
-"""Pilots: appended Gaussians that everybody can read. They tell the salt, and where the own frame is.
+"""Pilots: appended Gaussians that everybody can read. They give the salt and the own frame.
 
-A public hash of the 39 bits that no similarity changes decides whether a word is a pilot: one random word in
-64 is, and some are written. The hash also gives a pilot's position and rotation in the own frame. However a
-model was moved, rotated and scaled, the similarity that most pilots agree on leads back to that frame
-(RANSAC, Fischler and Bolles 1981; least squares by Umeyama 1991).
+A public hash of a word's 39 invariant bits decides whether it is a pilot: some are written as pilots, and one
+random word in 64 is one. The hash also gives a pilot's position and rotation in the own frame. RANSAC
+(Fischler and Bolles 1981; least squares by Umeyama 1991) finds the similarity on which most pilots agree. It
+maps a moved, rotated or scaled model back to that frame.
 """
 
 from __future__ import annotations
@@ -14,46 +14,46 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from keyss.channels.appended.lattice import (
+from keyss.channels.appended.words import (
     COLOUR_BITS,
     INVARIANT_BITS,
     POSITION_BITS,
+    ROTATION_BITS,
     SCALE_BITS,
-    TURN_BITS,
     bits_of,
 )
-from keyss.channels.mixing import mixed
+from keyss.channels.mixing import mix
 from keyss.core.arrays import Bits, Doubles, Flags, Integers, Words
 from keyss.core.similarity import Similarity
 from keyss.keys.derivation import SALT_BYTES
 
-MIN = 128  # pilots of a model
-SHARE = 1 / 33  # of the appended Gaussians
-_PUBLIC = np.uint64(0x6B65797373_617070)  # distinguishes this hash from others
-ONE_IN = 64  # one in so many random words is a pilot
+MIN = 128  # minimum number of pilots per model
+SHARE = 1 / 33  # pilots per appended Gaussian
+_PUBLIC = np.uint64(0x6B65797373_617070)  # domain separation of the hash
+ONE_IN = 64  # words per accidental pilot
 _PART_BITS, _PARTS = 16, SALT_BYTES // 2
-_RANDOM_BITS = 3 * COLOUR_BITS - 3 - _PART_BITS  # beside the part of the salt and its number
-_TRIES, _AGREE = 300, 12  # of three pilots; that have to agree
-_SAMPLE = 1024  # pilots that are tried first, so that many that disagree cost no more than few
+_RANDOM_BITS = 3 * COLOUR_BITS - 3 - _PART_BITS  # per pilot, beside a part of the salt and its index
+_TRIES, _MIN_INLIERS = 300, 12  # triples of pilots to try; inliers of a valid similarity
+_SAMPLE = 1024  # pilots to try first, which bounds the time if most are outliers
 _NEAR = 1.5 / 2**POSITION_BITS  # in the own frame
 
 
 @dataclass(frozen=True)
-class Found:
-    """The common result of all pilots."""
+class PilotFit:
+    """Frame and salt from all pilots."""
 
-    to_own: Similarity  # from the world to the own frame
-    agreeing: int  # pilots
+    to_own: Similarity  # world to own frame
+    inliers: int
     salt: bytes
 
 
 def count_for(appended: int) -> int:
-    """How many of so many appended Gaussians are pilots."""
+    """The number of pilots among `appended` Gaussians."""
     return max(MIN, round(appended * SHARE))
 
 
 def write(salt: bytes, count: int, random: np.random.Generator) -> Bits:
-    """[count, WORD_BITS] words of pilots."""
+    """Words [count, WORD_BITS] of pilots."""
     parts = np.frombuffer(salt, ">u2").astype(np.uint64)
     which = np.arange(count) % _PARTS
     found = np.zeros(count, np.uint64)
@@ -67,66 +67,66 @@ def write(salt: bytes, count: int, random: np.random.Generator) -> Bits:
         good = _is_pilot(invariants)
         found[missing[good]] = invariants[good]
         missing = missing[~good]
-    places = mixed(mixed(found ^ _PUBLIC))
-    width = 3 * (POSITION_BITS + TURN_BITS)
+    places = mix(mix(found ^ _PUBLIC))
+    width = 3 * (POSITION_BITS + ROTATION_BITS)
     others = bits_of(places >> np.uint64(64 - width), width)
     return np.concatenate([bits_of(found, INVARIANT_BITS), others], axis=1)
 
 
 def count(invariants: Words) -> int:
-    """How many of `invariants` [N] are those of pilots."""
+    """The number of pilots among words with `invariants` [N]."""
     return int(_is_pilot(invariants).sum())
 
 
-def read(invariants: Words, means: Doubles) -> Found | None:
-    """The result of the pilots among candidates: `invariants` [N] as read, `means` [N, 3] in the world.
+def read(invariants: Words, means: Doubles) -> PilotFit | None:
+    """Fit the pilots among candidates with `invariants` [N] and `means` [N, 3] in the world.
 
     None if too few agree.
     """
     random = np.random.default_rng(0)
     own = np.flatnonzero(_is_pilot(invariants))
-    if len(own) < _AGREE:
+    if len(own) < _MIN_INLIERS:
         return None
-    places = mixed(mixed(invariants[own] ^ _PUBLIC))
+    places = mix(mix(invariants[own] ^ _PUBLIC))
     shifts = np.uint64(64) - np.arange(1, 4, dtype=np.uint64) * np.uint64(POSITION_BITS)
     points = places[:, None] >> shifts & np.uint64(2**POSITION_BITS - 1)
     expected = (points.astype(np.float64) + 0.5) / 2**POSITION_BITS
-    there = means[own]
+    world = means[own]
     some = np.arange(min(len(own), _SAMPLE)) * len(own) // min(len(own), _SAMPLE)
     best = some[:0]
     for _ in range(_TRIES):
         three = random.choice(some, 3, replace=False)
-        agreeing = some[_agreeing(there, expected, three, some)]
-        if len(agreeing) > len(best):
-            best = agreeing
-        if len(best) > max(_AGREE, 0.5 * len(some)):
+        inliers = some[_inliers(world, expected, three, some)]
+        if len(inliers) > len(best):
+            best = inliers
+        if len(best) > max(_MIN_INLIERS, 0.5 * len(some)):
             break
     for _ in range(3):
-        if len(best) < _AGREE:
+        if len(best) < _MIN_INLIERS:
             return None
-        best = np.flatnonzero(_agreeing(there, expected, best))
-    if len(best) < _AGREE:
+        best = np.flatnonzero(_inliers(world, expected, best))
+    if len(best) < _MIN_INLIERS:
         return None
-    moved = _similarity(there[best], expected[best])
+    similarity = _similarity(world[best], expected[best])
     salt = _salt(invariants[own[best]])
-    return None if moved is None or salt is None else Found(moved, len(best), salt)
+    return None if similarity is None or salt is None else PilotFit(similarity, len(best), salt)
 
 
-def _agreeing(
-    there: Doubles, expected: Doubles, chosen: Integers, among: Integers | slice = slice(None)
+def _inliers(
+    world: Doubles, expected: Doubles, chosen: Integers, among: Integers | slice = slice(None)
 ) -> Flags:
-    """Which pilots `among` [P] come to lie where they should by the similarity of the chosen ones."""
-    moved = _similarity(there[chosen], expected[chosen])
-    there, expected = there[among], expected[among]
-    if moved is None:
-        return np.zeros(len(there), bool)
-    off = moved.apply_points(torch.from_numpy(there)).numpy() - expected
+    """Mask [P] of the pilots `among` all that the similarity fitted to `chosen` maps to their positions."""
+    similarity = _similarity(world[chosen], expected[chosen])
+    world, expected = world[among], expected[among]
+    if similarity is None:
+        return np.zeros(len(world), bool)
+    off = similarity.apply_points(torch.from_numpy(world)).numpy() - expected
     near: Flags = (np.abs(off) < _NEAR).all(axis=1)
     return near
 
 
 def _similarity(source: Doubles, target: Doubles) -> Similarity | None:
-    """From `source` [P, 3] to `target` with the least squares (Umeyama 1991); None where there is none."""
+    """Least-squares similarity from `source` [P, 3] to `target` (Umeyama 1991); None if degenerate."""
     centre, goal = source.mean(axis=0), target.mean(axis=0)
     a, b = source - centre, target - goal
     spread = float(np.square(a).sum())
@@ -146,11 +146,11 @@ def _similarity(source: Doubles, target: Doubles) -> Similarity | None:
 
 
 def _salt(invariants: Words) -> bytes | None:
-    """The majority vote of the pilots for each part; None if a part has no pilot left."""
+    """The salt by majority for each part; None if a part has no pilot left."""
     scales = invariants & np.uint64((1 << 3 * SCALE_BITS) - 1)
-    said = (invariants >> np.uint64(3 * SCALE_BITS) ^ _whitening(scales)) >> np.uint64(_RANDOM_BITS)
+    parts = (invariants >> np.uint64(3 * SCALE_BITS) ^ _whitening(scales)) >> np.uint64(_RANDOM_BITS)
     votes = [Counter[int]() for _ in range(_PARTS)]
-    for each in said.tolist():
+    for each in parts.tolist():
         votes[each >> _PART_BITS][each & (1 << _PART_BITS) - 1] += 1
     if not all(votes):
         return None
@@ -158,10 +158,10 @@ def _salt(invariants: Words) -> bytes | None:
 
 
 def _is_pilot(invariants: Words) -> Flags:
-    pilot: Flags = mixed(invariants ^ _PUBLIC) & np.uint64(ONE_IN - 1) == 0
+    pilot: Flags = mix(invariants ^ _PUBLIC) & np.uint64(ONE_IN - 1) == 0
     return pilot
 
 
 def _whitening(scales: Words) -> Words:
-    """[N] 21 bits that make the colours of pilots look random."""
-    return mixed(scales ^ _PUBLIC) >> np.uint64(64 - 3 * COLOUR_BITS)
+    """Masks [N] of 21 bits that make the colours of pilots look random."""
+    return mix(scales ^ _PUBLIC) >> np.uint64(64 - 3 * COLOUR_BITS)

@@ -1,11 +1,11 @@
-"""The capacity of a model, and where a payload goes to be least visible and least detectable.
+"""The capacity of a model, and the least visible and least detectable layout of a payload.
 
-A payload is detected by the variance that writing adds. Per byte, that is least with one bit in each number
-(level `ONE`). So a payload gets as large a share of the carriers as it needs at that level. A payload that
-needs more gets all carriers, and the least level that holds it. A small payload is written only where that
-leaves the model as likely as it was (`likeness`).
+A payload is detectable by the variance that writing adds, which is smallest per byte with one bit per value
+(level `ONE`). A payload gets the share of the carriers that it needs at that level. If it needs more than may
+be changed, it gets all carriers and the lowest level that holds it. A small payload changes only values whose
+new value is as likely as the old one (`likelihood`).
 
-A writer leaves some Gaussians alone. Readers need not know which: a number that was left alone reads as lost.
+A writer excludes some Gaussians. Readers need not know which: an unchanged value reads as lost.
 """
 
 from __future__ import annotations
@@ -20,39 +20,39 @@ import numpy as np
 
 from keyss.channels.colours.carriers import Carriers
 from keyss.channels.colours.header import PLACES, SHARES, bucket_bytes
-from keyss.channels.colours.lattice import COLUMNS, LEVELS, ONE, SPACING, bit_counts
-from keyss.channels.colours.likeness import Likeness
-from keyss.channels.colours.salts import SALTS
+from keyss.channels.colours.likelihood import Likelihood
+from keyss.channels.colours.qim import COLUMNS, LEVELS, ONE, SPACING, bit_counts
+from keyss.channels.colours.salt_gaussians import SALTS
 from keyss.core.arrays import Doubles, Flags, Floats, Integers, doubles
 from keyss.core.gaussians import Gaussians
 from keyss.keys.encryption import OVERHEAD
 from keyss.rendering.difference import psnr_between
 
-UNNOTICED = 2  # secrets whose headers are always there at level ONE, if only as noise
-_RATE = 0.42  # data bits for each bit of information that is expected to be read
+MIN_HEADERS = 2  # minimum number of headers in a file at level ONE; those without a secret are noise
+_RATE = 0.42  # data bits per expected bit of information
 _GARBAGE = 0.02  # share of carriers whose name changes although it seemed stable
-_COMFORTABLE = 0.8  # how full a share is at level ONE, if there is room; the rest makes up for losses
-_ROBUST = 0.5  # the same at other levels, if there is room: such a payload is detectable anyway
-_MARGIN = 0.5  # dB by which the cost of a payload may exceed the predicted one
-_INCOMPRESSIBLE = 11  # bytes by which zlib lengthens data that it cannot compress
-_ROUNDED = 0.25  # share of repeated colours from which on a model is a rounded one
-_WRITTEN = 0.7  # of the places of a header, at least
+_COMFORTABLE = 0.8  # load of a share at level ONE, if there is room; the rest compensates for losses
+_ROBUST = 0.5  # the same at other levels: such a payload is detectable anyway
+_MARGIN = 0.5  # dB by which the actual cost of a payload may exceed the predicted cost
+_INCOMPRESSIBLE = 11  # bytes that zlib adds to incompressible data
+_ROUNDED = 0.25  # minimum share of repeated colours in a rounded model
+_WRITTEN = 0.7  # minimum share of a header's places that are written
 _LOW = np.uint32(1023)  # bits of a float that stay
-_SHORT = np.uint32((1 << 20) - 1)  # a number whose last bits are all zero was typed, not trained
+_SHORT = np.uint32((1 << 20) - 1)  # floats in which these bits are zero were typed, not trained
 
 
 @dataclass(frozen=True)
 class Layout:
-    """Where a payload goes."""
+    """The level of a payload, and its share of the carriers."""
 
     level: int  # see `bit_counts`
-    share: float  # of the carriers
-    likely: bool = False  # True if numbers keep their values where others would be less likely
+    share: float
+    likely: bool = False  # True if only likely values are written
 
 
 @dataclass(frozen=True, eq=False)
 class Capacity:
-    """The capacity of a model whose views keep a PSNR of `strength` dB."""
+    """The capacity of a model if its views keep a PSNR of `strength` dB."""
 
     model: Gaussians
     carriers: Carriers
@@ -63,20 +63,20 @@ class Capacity:
         """The largest packed payload; 0 if none fits."""
         if not len(self.carriers):
             return 0
-        room = max(self._room(ONE) * self._affordable, self._room(self._highest))
+        room = max(self._room(ONE) * self._max_share, self._room(self._max_level))
         largest = max((bucket_bytes(each) for each in range(256) if bucket_bytes(each) <= room), default=0)
         return max(0, largest - OVERHEAD - _INCOMPRESSIBLE)
 
     def layouts(self, sizes: Sequence[int]) -> tuple[list[Layout], bool] | None:
-        """The layouts of encrypted payloads of these sizes in bytes, and whether one tells of others.
+        """The layouts of encrypted payloads of these sizes in bytes, and True if one reveals others.
 
         None if they do not fit.
         """
         padded = [bucket_bytes(bucket_of(size)) for size in sizes]
-        alone = [self._layout(size) for size in padded]
-        found = [each for each in alone if each is not None]
-        if len(found) == len(alone) and sum(each.share for each in found) <= 1:
-            return found, len(sizes) > UNNOTICED
+        independent = [self._layout(size) for size in padded]
+        found = [each for each in independent if each is not None]
+        if len(found) == len(independent) and sum(each.share for each in found) <= 1:
+            return found, len(sizes) > MIN_HEADERS
         together = self._layout(sum(padded))
         if together is None:
             return None
@@ -85,27 +85,27 @@ class Capacity:
     def _layout(self, size: int) -> Layout | None:
         for likely, comfort in product((True, False), (_COMFORTABLE, 1.0)):
             share = size / max(comfort * self._room(ONE, likely), 1e-3)
-            if share <= self._affordable:
+            if share <= self._max_share:
                 return Layout(ONE, share, likely)
-        holds = (size <= _ROBUST * self._room(level) for level in range(1, self._highest))
-        level = next((level for level, enough in enumerate(holds, start=1) if enough), self._highest)
-        return Layout(level, 1.0) if self._highest and size <= self._room(level) else None
+        holds = (size <= _ROBUST * self._room(level) for level in range(1, self._max_level))
+        level = next((level for level, enough in enumerate(holds, start=1) if enough), self._max_level)
+        return Layout(level, 1.0) if self._max_level and size <= self._room(level) else None
 
     @cached_property
-    def _affordable(self) -> float:
-        """Share of the carriers that may carry one bit in each number."""
-        affordable = 10 ** ((self._psnr(ONE) - self.strength - _MARGIN) / 10)
-        return float(min(1.0, affordable)) - 1 / SHARES  # shares are rounded up
+    def _max_share(self) -> float:
+        """The maximum share of the carriers at level ONE that keeps `strength`."""
+        share = 10 ** ((self._psnr(ONE) - self.strength - _MARGIN) / 10)
+        return float(min(1.0, share)) - 1 / SHARES  # shares are rounded up
 
     @cached_property
-    def _highest(self) -> int:
-        """The highest level at which all carriers may carry, or the level ONE."""
+    def _max_level(self) -> int:
+        """The highest level that keeps `strength` with all carriers; ONE if there is none."""
         levels = range(1, LEVELS)
         return bisect_left(levels, True, key=lambda each: self._psnr(each) < self.strength + _MARGIN)
 
     def _psnr(self, level: int) -> float:
-        """PSNR in dB that views keep beside a payload in all carriers."""
-        rows = self.carriers.own[~self.alone[self.carriers.own]]
+        """PSNR of the model's views, in dB, after writing all carriers at `level`."""
+        rows = self.carriers.representatives[~self.excluded[self.carriers.representatives]]
         bits = bit_counts(self.carriers.impact[rows], level)[:, None]
         places = np.random.default_rng(0).uniform(-0.5, 0.5, (len(rows), COLUMNS))  # in steps
         sh = self.model.sh.detach().clone()
@@ -114,63 +114,63 @@ class Capacity:
         return psnr_between(self.model, replace(self.model.detach(), sh=sh))
 
     def _room(self, level: int, likely: bool = False) -> float:
-        """Bytes that all carriers hold, from the information that a reader is expected to get."""
-        rows = self.carriers.own
+        """Bytes that all carriers hold, from the expected information of a reader."""
+        rows = self.carriers.representatives
         if not len(rows):
             return 0.0
-        sure = (1 - _GARBAGE) * (1 - self.carriers.doubt[rows]) / self.carriers.namesakes[rows]
-        chance = ((1 - (self.admission if likely else 1.0) * sure) / 2).clip(1e-12, 0.5)  # of a wrong bit
-        information = 1 + chance * np.log2(chance) + (1 - chance) * np.log2(1 - chance)
-        bits = COLUMNS * bit_counts(self.carriers.impact[rows], level) * information * ~self.alone[rows]
-        headers = SALTS * PLACES * (UNNOTICED if level == ONE else 1)
+        sure = (1 - _GARBAGE) * (1 - self.carriers.error_probability[rows]) / self.carriers.name_counts[rows]
+        error = ((1 - (self.acceptance if likely else 1.0) * sure) / 2).clip(1e-12, 0.5)  # per bit
+        information = 1 + error * np.log2(error) + (1 - error) * np.log2(1 - error)
+        bits = COLUMNS * bit_counts(self.carriers.impact[rows], level) * information * ~self.excluded[rows]
+        headers = SALTS * PLACES * (MIN_HEADERS if level == ONE else 1)
         return float(_RATE * np.exp(-headers / len(rows)) * bits.sum() / 8)
 
     @cached_property
-    def quiet(self) -> Quiet:
-        return Quiet(self.model, self.carriers.rows)
+    def statistics(self) -> ColourStatistics:
+        return ColourStatistics(self.model, self.carriers.rows)
 
     @cached_property
-    def alone(self) -> Flags:
-        """[C] carriers that are left alone."""
-        return self.quiet.alone()
+    def excluded(self) -> Flags:
+        """Mask [C] of the carriers that are never written."""
+        return self.statistics.excluded()
 
     @cached_property
-    def likeness(self) -> Likeness:
-        """The likeness of the carriers, for changes as writing makes them."""
+    def likelihood(self) -> Likelihood:
+        """The likelihood of changes such as writing makes."""
         means = np.nan_to_num(doubles(self.model.means)[self.carriers.rows]).clip(-1e15, 1e15)
-        return Likeness.of(self.carriers.colours, means, self._example)
+        return Likelihood.of(self.carriers.colours, means, self._noisy_colours)
 
     @cached_property
-    def admission(self) -> float:
-        """Share of the written numbers that get another value where only likely ones do."""
-        rows = self.carriers.own[~self.alone[self.carriers.own]]
+    def acceptance(self) -> float:
+        """The share of new values that `likelihood` accepts."""
+        rows = self.carriers.representatives[~self.excluded[self.carriers.representatives]]
         if not len(rows):
             return 0.0
         changed = self.carriers.colours.copy()
-        changed[rows] = self._example[rows]
-        admitted = self.likeness.admitted(self.carriers.colours, changed, np.random.default_rng(2))
-        return float(admitted[rows].mean())
+        changed[rows] = self._noisy_colours[rows]
+        accepted = self.likelihood.accept(self.carriers.colours, changed, np.random.default_rng(2))
+        return float(accepted[rows].mean())
 
     @cached_property
-    def gaps(self) -> bool:
-        """True if headers may do without unlikely numbers: enough of their places are still written."""
-        return self.admission * (1 - float(self.alone[self.carriers.own].mean())) > _WRITTEN
+    def headers_may_skip(self) -> bool:
+        """True if headers may skip unlikely values, because enough of their places are still written."""
+        return self.acceptance * (1 - float(self.excluded[self.carriers.representatives].mean())) > _WRITTEN
 
     @cached_property
-    def _example(self) -> Doubles:
-        """[C, 3] colours with noise in green and blue as writing adds it."""
+    def _noisy_colours(self) -> Doubles:
+        """Colours [C, 3] with noise in green and blue such as writing adds."""
         noise = np.random.default_rng(1).uniform(-SPACING, SPACING, (len(self.carriers), COLUMNS))
         colours = self.carriers.colours
-        return np.hstack([colours[:, :1], self.quiet.fitted(colours[:, 1:] + noise)])
+        return np.hstack([colours[:, :1], self.statistics.imitate(colours[:, 1:] + noise)])
 
 
 def bucket_of(size: int) -> int:
-    """The least bucket that holds `size` bytes, or the largest of all."""
+    """The smallest bucket that holds `size` bytes; the largest of all if none does."""
     return bisect_left(range(255), size, key=bucket_bytes)
 
 
-class Quiet:
-    """The constant colours of a model's carriers in `rows` [C], as training or rounding left them."""
+class ColourStatistics:
+    """Statistics of constant colours that training or rounding left; carriers are in `rows` [C]."""
 
     def __init__(self, model: Gaussians, rows: Integers) -> None:
         colours: Floats = model.sh[:, 0].detach().cpu().float().numpy()
@@ -180,31 +180,31 @@ class Quiet:
         self._rounded = bool(len(repeated)) and float(repeated.mean()) > _ROUNDED
         self._colours, self._repeated = colours[rows], repeated[rows].any(axis=1)
 
-    def alone(self) -> Flags:
-        """[C] carriers with a colour that is repeated, typed, or equal in two channels.
+    def excluded(self) -> Flags:
+        """Mask [C] of carriers with a colour that is repeated, typed, or equal in two channels.
 
-        None of a rounded model, where all are repeated. Colours that are nearly equal are not left alone:
-        there would be too many of them beside those that the others were moved away from.
+        Empty for a rounded model, where all are repeated. Nearly equal colours are not excluded: unchanged,
+        they would be conspicuously many among the changed ones.
         """
         if self._rounded:
             return np.zeros(len(self._colours), bool)
         typed = ((self._colours.view(np.uint32) & _SHORT) == 0).any(axis=1)
         grey = (self._colours == np.roll(self._colours, 1, axis=1)).any(axis=1)
-        alone: Flags = self._repeated | typed | grey
-        return alone
+        excluded: Flags = self._repeated | typed | grey
+        return excluded
 
-    def fitted(self, new: Doubles) -> Floats:
-        """[C, 2] `new` greens and blues as this model would have them; those that are the old ones stay.
+    def imitate(self, new: Doubles) -> Floats:
+        """Give `new` greens and blues [C, 2] the statistics of the model; unchanged ones stay.
 
-        In a rounded model: the nearest value that it has, if a reader reads the same from it. In others: with
-        the last bits of the old values, which are not quite random after training.
+        In a rounded model, they take the nearest of its values from which a reader reads the same. In others,
+        they keep the last bits of the old values, which are not quite random after training.
         """
         old = np.ascontiguousarray(self._colours[:, 1:])
         low = old.view(np.uint32) & _LOW
-        fitted: Floats = (new.astype(np.float32).view(np.uint32) & ~_LOW | low).view(np.float32)
+        values: Floats = (new.astype(np.float32).view(np.uint32) & ~_LOW | low).view(np.float32)
         if self._rounded:
-            for column, values in enumerate(self._values[1:]):
-                own = new[:, column]
-                nearest = values[np.searchsorted((values[1:] + values[:-1]) / 2, own)]
-                fitted[:, column] = np.where(np.abs(nearest - own) <= SPACING / 2, nearest, own)
-        return np.where(new == old, old, fitted)
+            for column, existing in enumerate(self._values[1:]):
+                wanted = new[:, column]
+                nearest = existing[np.searchsorted((existing[1:] + existing[:-1]) / 2, wanted)]
+                values[:, column] = np.where(np.abs(nearest - wanted) <= SPACING / 2, nearest, wanted)
+        return np.where(new == old, old, values)

@@ -1,9 +1,9 @@
-"""Payloads in colours: they survive formats that round, and changes of order and frame.
+"""Payloads in colours, which survive rounding formats and changes of order and frame.
 
-A payload is encrypted and authenticated (ChaCha20-Poly1305), made into code bits (`fountain`), and written
-into colours (`lattice`) of Gaussians that are identified by their other numbers (`carriers`). A *header*
-under a few *salts* tells how it is read. Nothing in the model tells how many secrets there are, or that there
-are any.
+A payload is encrypted and authenticated (ChaCha20-Poly1305), encoded (`fountain`) and written into the
+colours (`qim`) of Gaussians identified by their other numbers (`carriers`). A *header* under a few *salts*
+holds the parameters for reading. Nothing in the model reveals how many secrets there are, or that there is
+one.
 """
 
 from __future__ import annotations
@@ -27,8 +27,9 @@ from keyss.channels.base import (
     pack_payload,
     randomness,
 )
-from keyss.channels.colours.capacity import UNNOTICED, Capacity, Layout, bucket_of
+from keyss.channels.colours.capacity import MIN_HEADERS, Capacity, Layout, bucket_of
 from keyss.channels.colours.carriers import Carriers
+from keyss.channels.colours.colours_reader import ASSOCIATED
 from keyss.channels.colours.fountain import Fountain
 from keyss.channels.colours.header import (
     FILE_KEY_BYTES,
@@ -40,9 +41,8 @@ from keyss.channels.colours.header import (
     median,
     places,
 )
-from keyss.channels.colours.lattice import ONE, bit_counts, seeds, write
-from keyss.channels.colours.reading import ASSOCIATED
-from keyss.channels.colours.salts import SALTS, Salts, renewed
+from keyss.channels.colours.qim import ONE, bit_counts, seeds, write
+from keyss.channels.colours.salt_gaussians import SALTS, Salts, renew_salts
 from keyss.core.arrays import Doubles, Flags
 from keyss.core.errors import KeyssWarning, UsageError
 from keyss.core.gaussians import Gaussians
@@ -51,17 +51,17 @@ from keyss.keys.encryption import OVERHEAD, compressed_size, encrypt
 from keyss.rendering.difference import psnr_between
 
 _TOO_FEW = "this cover has too few Gaussians to hide anything in colours that would survive other formats"
-_LOWER = 3  # levels, each a quarter of a bit, by which a payload may lie lower than planned
-_BITS_PER_GAUSSIAN = 1  # of room, about, beside headers
-_HEADERS = 100  # bytes, about
-_OVERHEAD = METHOD_BYTES + 1  # bytes of a payload beside its data, at most
+_LOWER = 3  # maximum number of levels, each a quarter of a bit, below the planned one
+_BITS_PER_GAUSSIAN = 1  # approximate room
+_HEADERS = 100  # approximate bytes
+_OVERHEAD = METHOD_BYTES + 1  # maximum bytes of a payload beside its data
 
 
 @dataclass(frozen=True)
 class Colours(Channel):
     """The channel; see `keyss.channels.base.Channel`. Raises UsageError for a `strength` of 0 dB or less."""
 
-    strength: float = 45.0  # dB PSNR that views of a model keep at least, compared with those of the cover
+    strength: float = 45.0  # minimum PSNR in dB between views of the stego model and of the cover
 
     name = "colours"
     place = "colours"
@@ -84,10 +84,10 @@ COLOURS = Colours()
 
 @dataclass(frozen=True)
 class ColoursCover:
-    """A cover whose room is known; see `keyss.channels.base.PreparedCover`.
+    """A cover with known room; see `keyss.channels.base.PreparedCover`.
 
-    Order and all numbers but some greens and blues stay. A payload changes as little as it needs; `strength`
-    is a limit.
+    Writing changes some greens and blues and nothing else. A payload changes as little as it needs;
+    `strength` is the limit.
     """
 
     capacity: Capacity
@@ -98,14 +98,14 @@ class ColoursCover:
 
     @cached_property
     def room(self) -> Room:
-        return Room(len(self.capacity.carriers.own), self.capacity.bytes, _OVERHEAD)
+        return Room(len(self.capacity.carriers.representatives), self.capacity.bytes, _OVERHEAD)
 
     def embed(self, contents: Sequence[tuple[str, Content]], *, entropy: bytes | None = None) -> Gaussians:
-        """See `PreparedCover`. Raises UsageError for a model that can carry nothing, too."""
+        """See `PreparedCover`. Also raises UsageError for a model that can carry nothing."""
         payloads = [pack_payload(content) for _, content in contents]
         secret = randomness(entropy, *payloads)
         random = np.random.default_rng(np.frombuffer(stream(secret, "colours/random", 32), np.uint32))
-        carriers = renewed(self.capacity.carriers, random)
+        carriers = renew_salts(self.capacity.carriers, random)
         salts = Salts.of(carriers)
         if len(salts.salts) < SALTS:
             raise UsageError(_TOO_FEW)
@@ -113,19 +113,19 @@ class ColoursCover:
         check_keys([each.static for each in secrets])
         sizes = [compressed_size(payload) + OVERHEAD for payload in payloads]
         layouts = self._layouts(sizes)
-        # With more than one bit in a number, another secret would be noticed.
-        for index in range(len(secrets), UNNOTICED if layouts[0].level == ONE else 0):  # of nobody
+        # Headers without a secret hide the number of secrets. Above level ONE, others are noticed anyway.
+        for index in range(len(secrets), MIN_HEADERS if layouts[0].level == ONE else 0):
             labels = [f"colours/nobody/{index}/{each}" for each in range(SALTS + 1)]
             static, *salted = (expand(secret, label, MASTER_BYTES) for label in labels)
             secrets.append(Secrets(static, tuple(salted)))
         free = np.zeros(len(carriers), bool)
-        free[carriers.own] = True
+        free[carriers.representatives] = True
         free[salts.rows] = False
-        draft = _Draft(self.capacity, carriers, free & ~self.capacity.alone)
+        draft = _Draft(self.capacity, carriers, free & ~self.capacity.excluded)
         file_key = expand(secret, "colours/file-key", FILE_KEY_BYTES)
-        for lower in range(_LOWER + 1):  # the cost of headers and salts is known only now
+        for lower in range(_LOWER + 1):  # the plan does not include the cost of headers and salts
             headers = _headers(layouts, sizes, file_key, carriers, lower)
-            stego = draft.written(secrets, headers, [each.likely for each in layouts], payloads, random)
+            stego = draft.write(secrets, headers, [each.likely for each in layouts], payloads, random)
             if layouts[0].level == ONE or psnr_between(self.cover, stego) >= self.capacity.strength:
                 break
         return stego
@@ -146,7 +146,7 @@ class ColoursCover:
 def _headers(
     layouts: Sequence[Layout], sizes: Sequence[int], file_key: bytes, carriers: Carriers, lower: int
 ) -> list[Header]:
-    """The header of each payload, whose `idle` is still to be counted."""
+    """The header of each payload, with `idle` still to be set."""
     headers, first = [], 0
     for layout, size in zip(layouts, sizes, strict=True):
         last = min(first + max(1, math.ceil(SHARES * layout.share)), SHARES) - 1
@@ -159,13 +159,13 @@ def _headers(
 
 @dataclass(frozen=True, eq=False)
 class _Draft:
-    """A cover that is written: its carriers with new salts, and which of them [C] are free."""
+    """A cover to be written."""
 
     capacity: Capacity
-    carriers: Carriers
-    free: Flags
+    carriers: Carriers  # with new salts
+    free: Flags  # [C] mask of carriers that may be written
 
-    def written(
+    def write(
         self,
         secrets: Sequence[Secrets],
         headers: Sequence[Header],
@@ -173,10 +173,9 @@ class _Draft:
         payloads: Sequence[bytes],
         random: np.random.Generator,
     ) -> Gaussians:
-        """The model with headers for all `secrets`, and payloads of those that have one.
+        """The model with headers for all `secrets`, and the payloads of the first ones.
 
-        Of `likely` payloads, and of their headers in a model with `gaps`, only numbers that leave the model
-        as likely as it was are written.
+        Only likely values are written for `likely` payloads, and for their headers if these may skip values.
         """
         carriers, free = self.carriers, self.free.copy()
         values, chosen = carriers.colours[:, 1:].copy(), np.zeros(len(carriers), bool)
@@ -186,34 +185,36 @@ class _Draft:
                 holds[places(secret, carriers)[0]] = False
         final = []
         for header, some in zip(headers, likely, strict=True):
-            share = float(holds[header.own(carriers)].mean()) if header.own(carriers).any() else 0.0
-            idle = 1 - share * (self.capacity.admission if some else 1.0)
+            mask = header.carrier_mask(carriers)
+            share = float(holds[mask].mean()) if mask.any() else 0.0
+            idle = 1 - share * (self.capacity.acceptance if some else 1.0)
             final.append(replace(header, idle=round(idle / IDLE)))
-        for salt in range(SALTS):  # a salt of every secret at a time: later ones find places taken
+        for salt in range(SALTS):  # alternate between secrets, because later headers find fewer free places
             for index, each in enumerate(secrets):
-                own = min(index, len(final) - 1)  # a decoy without a payload looks like the last header
-                rows, new = final[own].write(each, salt, carriers)
-                new, rows = new[free[rows]], rows[free[rows]]
-                values[rows], chosen[rows], free[rows] = new, likely[own] and self.capacity.gaps, False
+                like = min(index, len(final) - 1)  # headers without a secret resemble the last one
+                rows, new = final[like].write(each, salt, carriers)
+                rows, new = rows[free[rows]], new[free[rows]]
+                values[rows], free[rows] = new, False
+                chosen[rows] = likely[like] and self.capacity.headers_may_skip
         for each, header, some, payload in zip(secrets, final, likely, payloads, strict=False):
-            rows, key = np.flatnonzero(free & header.own(carriers)), each.data_key(header)
+            rows, key = np.flatnonzero(free & header.carrier_mask(carriers)), each.data_key(header)
             encrypted = encrypt(key, payload, ASSOCIATED, size=bucket_bytes(header.bucket))
             names, bits = carriers.names[rows], bit_counts(carriers.impact[rows], header.level)
             data = np.unpackbits(np.frombuffer(encrypted, np.uint8))
             code = Fountain(len(data)).encode(data, seeds(key, "seeds", names, bits))
             values[rows], chosen[rows] = write(key, names, values[rows], bits, code), some
-        return self._with_colours(values, chosen, random)
+        return self._replace_colours(values, chosen, random)
 
-    def _with_colours(self, values: Doubles, chosen: Flags, random: np.random.Generator) -> Gaussians:
-        """The model with other greens and blues [C, 2].
+    def _replace_colours(self, values: Doubles, chosen: Flags, random: np.random.Generator) -> Gaussians:
+        """The model with greens and blues `values` [C, 2].
 
-        `chosen` [C]: carriers that change only where the new colour is as likely as the old one.
+        `chosen` [C]: mask of the carriers that change only if the new colour is likely enough.
         """
         capacity, old = self.capacity, self.capacity.carriers.colours
-        new = np.hstack([old[:, :1], capacity.quiet.fitted(values)])
+        new = np.hstack([old[:, :1], capacity.statistics.imitate(values)])
         if chosen.any():
             base = np.where(chosen[:, None], old, new)
-            new[:, 1:] = np.where(capacity.likeness.admitted(base, new, random), new[:, 1:], base[:, 1:])
+            new[:, 1:] = np.where(capacity.likelihood.accept(base, new, random), new[:, 1:], base[:, 1:])
         sh = capacity.model.sh.detach().clone()
         rows = torch.from_numpy(self.carriers.rows).to(sh.device)
         sh[rows, 0, 1:] = torch.from_numpy(new[:, 1:]).to(sh)

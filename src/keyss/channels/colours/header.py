@@ -1,11 +1,11 @@
-"""The header, on which a key is tried first: how to read the rest, in a few Gaussians that the key chooses.
+"""The header: how to read the payload, in a few Gaussians that the key chooses.
 
-There is a *header* under each of a few salts, and all are equal. So they are parts of one code (`fountain`)
-and are read together: one salt's Gaussians replace the lost ones of another. *Pilots*, a few known bits of
-each part, tell which salts were lost, and then what was decoded does.
+A key is first tried on the header, which is written once under each of a few salts. The copies are parts of
+one fountain code and are decoded together: one salt's Gaussians replace another's lost ones. *Pilots*, a few
+known bits of each part, show which salts are lost; agreement with the decoded bits refines that.
 
-The key chooses the Gaussians whose names it gives the least random numbers: a lost one costs its own place
-and no other.
+A key assigns pseudo-random numbers to names and chooses the Gaussians with the smallest, so that a lost
+Gaussian costs its own place only.
 """
 
 from __future__ import annotations
@@ -20,25 +20,25 @@ import numpy as np
 
 from keyss.channels.colours.carriers import Carriers, fractions
 from keyss.channels.colours.fountain import NOISY, Fountain
-from keyss.channels.colours.lattice import COLUMNS, ONE, read, seeds, write
+from keyss.channels.colours.qim import COLUMNS, ONE, read, seeds, write
 from keyss.core.arrays import Bits, Doubles, Flags, Integers
 from keyss.keys.derivation import SALT_BYTES, DerivedKey, expand
 
 PLACES = 80  # Gaussians of a header under each salt
-DEPTHS = (1, 2)  # bits of each of their numbers beside a payload at level ONE, and beside one at any other
-SHARES = 256  # parts of the carriers; a payload has some of them
-IDLE = 1 / 255  # unit of the share of carriers that were left alone
+DEPTHS = (1, 2)  # bits per value of a header, for payloads at level ONE and at other levels
+SHARES = 256  # parts of the carriers, divided among payloads
+IDLE = 1 / 255  # unit of the share of unchanged carriers
 FILE_KEY_BYTES = 5
 _PILOTS = 10  # of the places
 _FORMAT = f"{FILE_KEY_BYTES}s6B"
 _CHECK_BYTES = 2
-_PRIOR = 0.4  # logarithm of the odds that a salt is one, before anything else is known
-_TRIES = 3  # to tell salts that were lost
-_DECODED = 0.3  # weight of a bit that was decoded beside one that was known
-_HELD = 0.5  # chance that a place under a salt holds what was written
+_PRIOR = 0.4  # prior log odds that a salt is genuine
+_TRIES = 3  # rounds of reweighting salts
+_DECODED = 0.3  # weight of decoded bits relative to known ones
+_HELD = 0.5  # probability that a place is intact
 _STATIC_SALT = hashlib.sha256(b"keyss/v1/colours-static").digest()[:SALT_BYTES]
 _CODE = Fountain(8 * (struct.calcsize(_FORMAT) + _CHECK_BYTES), NOISY)
-_MEDIAN_STEPS = 8  # of impact, in one
+_MEDIAN_STEPS = 8  # per unit of impact
 
 
 @dataclass(frozen=True)
@@ -46,57 +46,57 @@ class Secrets:
     """The secrets of one key in one file."""
 
     static: bytes  # the same in every file
-    salted: tuple[bytes, ...]  # under each salt
+    salted: tuple[bytes, ...]  # one per salt
 
     @staticmethod
     def of(key: str, salts: Sequence[bytes]) -> Secrets:
-        """Takes about 0.1 s for each salt and one more.
+        """Derive the secrets, which takes about 0.1 s per salt and 0.1 s more.
 
-        The salts make every guess cost Argon2id anew for each file. The static secret makes up for the few
-        bytes of a header: an attacker has to guess both.
+        Because of the salts, an attacker pays for Argon2id again in every file. The static secret compensates
+        for the small redundancy of a header: an attacker must guess both.
         """
         salted = tuple(DerivedKey.of(key, salt).expand("colours/header", 32) for salt in salts)
         return Secrets(DerivedKey.of(key, _STATIC_SALT).expand("colours/static", 32), salted)
 
     def data_key(self, header: Header) -> bytes:
-        """The key that encrypts a payload, different in every file."""
+        """The key that encrypts the payload in this file."""
         return expand(self.static + header.file_key, "colours/data-key", 32)
 
     def check(self, plain: bytes) -> bytes:
-        """_CHECK_BYTES that recognise a header."""
+        """A MAC of _CHECK_BYTES, which recognises a header."""
         return hmac.digest(expand(self.static, "colours/check", 32), plain, "sha256")[:_CHECK_BYTES]
 
 
 @dataclass(frozen=True)
 class Header:
-    """How a payload is read; numbers are below 256."""
+    """How to read a payload; numbers are below 256."""
 
     file_key: bytes  # the same for all secrets of a file
     level: int  # see `bit_counts`
-    first: int  # of SHARES that the payload has,
-    last: int  # this one included
+    first: int  # first of the payload's parts of the carriers
+    last: int  # last one, inclusive
     bucket: int  # see `bucket_bytes`
-    idle: int  # share of its carriers that hold nothing, in units of IDLE
+    idle: int  # share of the payload's carriers that hold nothing, in units of IDLE
     median: int  # see `median`
 
-    def own(self, carriers: Carriers) -> Flags:
-        """[C] which carriers the payload has, by a hash of their names that holders of keys know."""
+    def carrier_mask(self, carriers: Carriers) -> Flags:
+        """Mask [C] of the payload's carriers, from a keyed hash of their names."""
         part = np.floor(SHARES * fractions(self.file_key, "partition", carriers.names)[:, 0])
         return (part >= self.first) & (part <= self.last)
 
     def shift(self, carriers: Carriers) -> float:
-        """How much larger impacts are than when the header was written, from their median."""
+        """The change of the median impact since the header was written."""
         off = (median(carriers) - self.median + 128) % 256 - 128
         return off / _MEDIAN_STEPS
 
     def bits(self, secrets: Secrets) -> Bits:
-        """The header and what recognises it, as zeros and ones."""
+        """The bits of the header and its MAC."""
         numbers = (self.level, self.first, self.last, self.bucket, self.idle, self.median)
         plain = struct.pack(_FORMAT, self.file_key, *numbers)
         return np.unpackbits(np.frombuffer(plain + secrets.check(plain), np.uint8))
 
     def write(self, secrets: Secrets, salt: int, carriers: Carriers) -> tuple[Integers, Doubles]:
-        """[P] the carriers that hold the header under one salt, and [P, 2] their new values."""
+        """The carriers [P] of the header under one salt, and their new values [P, 2]."""
         secret, depth = secrets.salted[salt], DEPTHS[self.level != ONE]
         rows, pilots = places(secret, carriers)
         names, counts = carriers.names[rows], np.full(len(rows), depth)
@@ -106,7 +106,7 @@ class Header:
 
     @staticmethod
     def read(secrets: Secrets, carriers: Carriers) -> Header | None:
-        """None where there is none; one attempt in 2^16 finds one by chance, which opens nothing."""
+        """None if there is none. One attempt in 2^16 finds a false header, which opens nothing."""
         found = [places(secret, carriers) for secret in secrets.salted]
         headers = [_read(secrets, carriers, found, depth) for depth in DEPTHS]
         return headers[0] or headers[1]
@@ -115,20 +115,20 @@ class Header:
 def _read(
     secrets: Secrets, carriers: Carriers, found: Sequence[tuple[Integers, Flags]], depth: int
 ) -> Header | None:
-    """The header with `depth` bits in each number of the places `found`."""
+    """The header with `depth` bits per value of the places `found`."""
     words, hints, owners, odds = [np.zeros(0, np.uint64)], [np.zeros(0)], [np.zeros(0, np.int64)], []
     for salt, (secret, (rows, pilots)) in enumerate(zip(secrets.salted, found, strict=True)):
         names, counts = carriers.names[rows], np.full(len(rows), depth)
         known = np.repeat(pilots, COLUMNS * depth)
-        sure = np.repeat(_HELD * (1 - carriers.doubt[rows]) / carriers.namesakes[rows], COLUMNS * depth)
-        every = sure * read(secret, names, carriers.colours[rows, 1:], counts)
+        sure = _HELD * (1 - carriers.error_probability[rows]) / carriers.name_counts[rows]
+        every = np.repeat(sure, COLUMNS * depth) * read(secret, names, carriers.colours[rows, 1:], counts)
         odds.append(_PRIOR + np.log1p(every[known]).sum())
         hints.append(every[~known])
         words.append(seeds(secret, "header-seeds", names, counts)[~known])
         owners.append(np.full(len(hints[-1]), salt))
     word, hint, owner = np.concatenate(words), np.concatenate(hints), np.concatenate(owners)
     header, agreement = None, np.zeros(len(odds))
-    for _ in range(_TRIES):  # all of them, so that a right key takes as long as a wrong one
+    for _ in range(_TRIES):  # no early exit, so that right and wrong keys take equally long
         trust = 1 / (1 + np.exp(-np.array(odds) - _DECODED * agreement))
         data = _CODE.decode(word, hint * trust[owner])
         packed = np.packbits(data).tobytes()
@@ -141,7 +141,7 @@ def _read(
 
 
 def places(secret: bytes, carriers: Carriers) -> tuple[Integers, Flags]:
-    """[P] the carriers with the PLACES names that a secret chooses, and which of them are pilots."""
+    """The carriers [P] with the PLACES names that a secret chooses, and a mask [P] of pilots."""
     numbers = fractions(secret, "places", carriers.names)[:, 0]
     least = np.append(np.unique(numbers), 1.0)
     rows = np.flatnonzero(numbers < least[: PLACES + 1][-1])
@@ -149,10 +149,10 @@ def places(secret: bytes, carriers: Carriers) -> tuple[Integers, Flags]:
 
 
 def median(carriers: Carriers) -> float:
-    """The median impact, in steps; headers state its remainder by 256."""
+    """The median impact, in steps; headers store it modulo 256."""
     return _MEDIAN_STEPS * float(np.median(carriers.impact)) if len(carriers) else 0.0
 
 
 def bucket_bytes(bucket: int) -> int:
-    """The size that a number of one byte stands for: 32 to 2 million bytes in steps of 3 to 6 %."""
+    """The size of a bucket, 0 to 255: 32 bytes to 2 million, in steps of 3 to 6 %."""
     return (16 + bucket % 16) << (bucket // 16 + 1)

@@ -48,7 +48,7 @@ class CarryMethod:
     def prepare(self, sources: Sequence[Source], options: CarryOptions) -> CarryOptions:
         """Choose the secrets to refit: once all are fitted, also those that do not fit the cover.
 
-        Raises UsageError for a given cover without room.
+        Raises UsageError for a cover without room.
         """
         cover, *secrets = sources
         degree = options.sh_degree
@@ -63,7 +63,7 @@ class CarryMethod:
             if options.may_show and cover.given is not None:
                 _check_share(secret_sizes, sizes)
         except UsageError as refused:
-            if not options.may_show or cover.given is None:
+            if not options.may_show:
                 raise
             warnings.warn(_VISIBLE.format(refused), KeyssWarning, stacklevel=2)
             return self.prepare(sources, replace(options, publish="any"))

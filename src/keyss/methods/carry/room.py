@@ -189,7 +189,7 @@ class WholeRoom:
         """Approximate number of Gaussians by which the model grows."""
         if not self.room.grows:
             return 0
-        return APPENDED.appended([secret.payload_bytes for secret in secrets])
+        return APPENDED.appended_count([secret.payload_bytes for secret in secrets])
 
 
 def room_for(

@@ -24,7 +24,7 @@ from keyss.channels.harmonics import (
     Harmonics,
     harmonics_above,
     high_harmonics,
-    increasing,
+    make_increasing,
     pads,
     row_names,
 )
@@ -92,7 +92,7 @@ class LatentDecoder(Decoder):
     def fit_secret(self, latents: Doubles) -> None:
         """Learn the quantiles of latents [N, D], and a nonce that no other secret has."""
         for j, column in enumerate(latents.T):
-            self.knots[j] = increasing(np.quantile(column, RANKS))
+            self.knots[j] = make_increasing(np.quantile(column, RANKS))
         digest = hashlib.sha256(np.ascontiguousarray(latents).tobytes()).digest()[:NONCE_BYTES]
         self.nonce.copy_(torch.frombuffer(bytearray(digest), dtype=torch.uint8))
 

@@ -24,22 +24,22 @@ class CarriedSecret:
 
     left: int  # Gaussians that are left
     count: int  # Gaussians that were embedded
-    bits: int  # bits per record, or per Gaussian of a payload
-    decoded: Callable[[], Gaussians]
+    bits: int  # per record, or per Gaussian of a payload
+    load: Callable[[], Gaussians]
     frame: None = None
     decode: None = None
     key_size: int = 0
 
     @cached_property
     def gaussians(self) -> Gaussians:
-        """Those that are left, in the order of their carriers; decoded late, since they can be large."""
-        return self.decoded()
+        """The Gaussians that are left, in the order of their carriers; decoded on first use."""
+        return self.load()
 
     def reveal(self, stego: Gaussians, *, frame: Frame = "secret", force: bool = False) -> Gaussians:
-        """The Gaussians that are left, enlarged to compensate for those lost with their carriers."""
+        """The Gaussians that are left, with pruning compensation for those lost with their carriers."""
         if frame == "cover":
             raise UsageError(
-                'a carried secret never lay in the cover\'s coordinates: leave out `frame="cover"`'
+                'a carried secret has no position in the cover\'s coordinates: leave out `frame="cover"`'
             )
         return compensate_pruning(self.gaussians, self.count)
 
@@ -51,7 +51,7 @@ class CarriedSecret:
 
 
 def unpack(content: Content) -> CarriedSecret:
-    """The Gaussians that are left; records may be in any order. Raises InputError for damage."""
+    """Open records, in any order, or a payload. Raises InputError for damage."""
     if not isinstance(content, Records):
         gaussians = whole.decode(content.data, content.carriers)
         count = len(gaussians)
@@ -63,5 +63,5 @@ def unpack(content: Content) -> CarriedSecret:
     expected, found = codec.table.record_bytes, content.records.shape[1]
     if found != expected:
         raise InputError(f"the hidden parameters are damaged: records of {found} bytes, expected {expected}")
-    decoded = partial(codec.decode, content.records)
-    return CarriedSecret(len(content.records), count, codec.table.total, decoded)
+    load = partial(codec.decode, content.records)
+    return CarriedSecret(len(content.records), count, codec.table.total, load)

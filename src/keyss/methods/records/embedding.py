@@ -1,8 +1,8 @@
-"""Embed models in a prepared cover, as records or payloads, and open them again to check.
+"""Embed models in a prepared cover, as records or payloads, and verify that they open.
 
-In low bits a Gaussian is a record (see `quantise`); the header holds the codec and the number of records.
-Free room is filled with copies of the most visible Gaussians. All other channels carry a model as one payload
-(see `whole`).
+In low bits a Gaussian is a record (see `quantise`); the header holds the number of records and the codec.
+Copies of the most visible Gaussians fill free room. All other channels carry a model as one payload (see
+`whole`).
 """
 
 from __future__ import annotations
@@ -42,11 +42,11 @@ def embed_models(
     entropy: bytes | None = None,
     overwrite: bool = False,
 ) -> Stego:
-    """Embed all Gaussians of each model under its key, and open them again.
+    """Embed all Gaussians of each model under its key, and verify that they open.
 
     `viewpoints`: views of each model that determine the precision of a payload; by default, four around it.
-    `overwrite`: the tensors of a cover of low bits may be changed, which saves a copy. Raises UsageError if
-    the models do not fit.
+    `overwrite`: write low bits into the cover's own tensors, which saves a copy. Raises UsageError if the
+    models do not fit.
     """
     contents: Sequence[Content]
     if isinstance(cover, LowBitsCover):
@@ -76,12 +76,12 @@ def embed_models(
 
 
 def encode_all(cover: LowBitsCover, models: Sequence[Gaussians]) -> list[Records]:
-    """The records of all models, as precise as fits into `cover`. Raises UsageError if they do not fit."""
+    """The records of all models, at the best precision that fits. Raises UsageError if none does."""
     plans = cover.cells.plan_records([record_request(len(model), model.sh_degree) for model in models])
     found = []
     for model, plan in zip(models, plans, strict=True):
         table = Table.of_size(8 * plan.record_bytes, model.sh_degree)
-        assert table is not None  # the plan has room for the floor
+        assert table is not None  # the plan has room for `Table.floor`
         codec, outlier = Codec.fit_with_outliers(model, table)
         header = COUNT.pack(len(model)) + codec.pack()
         copied = most_visible_rows(model, plan.copies)
@@ -103,8 +103,9 @@ def largest_degree(record_bytes: int) -> int | None:
 def shares(room: Room, needed: Sequence[int]) -> list[int]:
     """Maximum bytes of each secret's payload, for secrets that need `needed` bytes.
 
-    A quarter of the capacity, half of it or all, whichever suffices: a secret is then as precise as alone,
-    and its key does not reveal others. If these exceed the capacity, or the model grows, equal shares.
+    The first of a quarter, a half and all of the capacity that suffices: a secret's precision then does not
+    depend on the others, and its key does not reveal them. Equal shares if these exceed the capacity, or if
+    the model grows.
     """
     parts = [
         next((each for each in (4, 2) if size <= room.capacity // each - room.overhead), 1) for size in needed

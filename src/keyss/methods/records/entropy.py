@@ -1,9 +1,9 @@
-"""Compression of integer tables: an adaptive binary range coder.
+"""Compression of integer tables by an adaptive binary range coder.
 
-Each number is predicted as a fraction of the previous number in its column. The residual is coded as its bit
-count in unary, its sign, and its bits. Adaptive probabilities code the skewed decisions; the contexts of the
-count are the sizes of earlier residuals in the row and the column. The coder is LZMA's, with probabilities of
-12 instead of 11 bits: the mean of a fast and a slow estimate (as in AV1 and CABAC's successors).
+The prediction of a number is a fraction of the previous one in its column. The residual is coded as its bit
+count in unary, its sign and its bits. Skewed decisions have adaptive probabilities; the context of the count
+is the size of earlier residuals in the row and the column. The coder is LZMA's, with probabilities of 12
+instead of 11 bits: the mean of a fast and a slow estimate (as in AV1 and successors of CABAC).
 """
 
 from __future__ import annotations
@@ -18,31 +18,31 @@ from keyss.kernels.jit import inline, kernel
 
 MAX_NUMBER = 1 << 29  # differences have at most 31 bits
 _MAX_BITS = 31
-_CONTEXTS = 16  # contexts for counts; one more is for first bits
+_CONTEXTS = 16  # for bit counts; one more is for first bits
 
 
 def encode(table: Integers, shares: Integers, groups: Integers) -> bytes:
-    """Compress `table` [N, C]; no absolute value may exceed MAX_NUMBER.
+    """Compress `table` [N, C] with absolute values of at most MAX_NUMBER.
 
-    `shares` [C]: prediction coefficients of the columns, in eighths. `groups` [C]: indices from 0; columns
-    with the same one share their probabilities.
+    `shares` [C]: prediction coefficients of the columns, in eighths. `groups` [C]: indices from 0; columns of
+    one group share their probabilities.
     """
     coded, size = _code(table.copy(), shares, groups, np.empty(table.size + 1024, np.uint8), False)
     return bytes(coded[:size])
 
 
 def decode(data: bytes, count: int, shares: Integers, groups: Integers) -> Integers:
-    """[count, C] table from the bytes of `encode`. Raises InputError for too few or too many bytes."""
+    """Decompress a table [count, C]. Raises InputError for too few or too many bytes."""
     table = np.zeros((count, len(shares)), np.int64)
     _, size = _code(table, shares, groups, np.frombuffer(data + b"\0", np.uint8).copy(), True)
     if size != len(data):
-        raise InputError("the hidden secret is damaged: it is not whole")
+        raise InputError("the hidden secret is damaged: its length is wrong")
     return table
 
 
 @inline
 def _byte(coder: Any, data: Any, reading: bool) -> None:
-    """Read or write a byte. `coder`: low end of the range (reading: offset in it), range, bytes so far."""
+    """Read or write a byte. `coder`: low end of the range (reading: offset into it), range, bytes so far."""
     at = coder[2]
     coder[2] += 1
     if reading:
@@ -60,7 +60,7 @@ def _byte(coder: Any, data: Any, reading: bool) -> None:
 
 @inline
 def _raw_bit(coder: Any, data: Any, reading: bool, bit: int, bound: int) -> int:
-    """Write or read a bit; `bound`: the part of the range for 0."""
+    """Read or write a bit; `bound`: the part of the range for 0."""
     if reading:
         bit = int(coder[0] >= bound)
     if bit:
@@ -74,7 +74,7 @@ def _raw_bit(coder: Any, data: Any, reading: bool, bit: int, bound: int) -> int:
 
 @inline
 def _bit(coder: Any, data: Any, reading: bool, bit: int, estimates: Any) -> int:
-    """`_bit` with two adaptive `estimates` [2] of the probability of 0, in 65,536ths; their mean is used."""
+    """`_raw_bit` with a probability of 0 that is the mean of two adaptive `estimates` [2], in 65,536ths."""
     bit = _raw_bit(coder, data, reading, bit, (coder[1] >> 12) * ((estimates[0] + estimates[1]) >> 5))
     for each, speed in ((0, 4), (1, 7)):
         estimates[each] += -(estimates[each] >> speed) if bit else (65536 - estimates[each]) >> speed
@@ -83,7 +83,7 @@ def _bit(coder: Any, data: Any, reading: bool, bit: int, estimates: Any) -> int:
 
 @kernel
 def _code(table: Any, shares: Any, groups: Any, data: Any, reading: bool) -> Any:
-    """Encode `table`, or decode it from zero-terminated `data`. Returns the data and their length."""
+    """Encode `table`, or decode it from zero-terminated `data`. Returns the data and its length."""
     count, columns = table.shape
     probabilities = np.full((groups.max() + 1, _CONTEXTS + 1, _MAX_BITS + 1, 2), 1 << 15, np.int64)
     coder = np.array([0, (1 << 32) - 1, 0], np.int64)

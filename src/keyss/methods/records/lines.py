@@ -15,19 +15,19 @@ _EVEN_MARGIN = 0.75  # evenly spaced lines: distance to the first outlier / widt
 _FAR = 8.0  # asinh lines: distance from the median to the first outlier / that to the end of the bulk
 _FURTHEST = 1e30  # lines give no larger numbers
 _MIN_SPREAD = 1e-9
-_HALF = 1e-3  # maximum relative rounding error of reaches, which are stored in half precision
+_HALF = 1e-3  # maximum relative rounding error of half precision, which stores reaches
 _SAMPLE = 20_000  # numbers for comparing candidate lines
 LINE = struct.Struct("<2f2e")  # centre, spread, reach, far reach
-# The line with the minimum square error shrinks numbers on average, which costs more against photos than
-# errors independent of the numbers. Weight of the error's shrinking part.
+# Weight of the part of the error that shrinks numbers on average. Lines of minimum square error shrink them,
+# which lowers quality against photos more than errors independent of the numbers.
 _SHRINKING_WEIGHT = 20.0
 MAX_BITS = 24  # bits per number: float32 has no more
 CHROMA_FEWER = 2  # bits
 BANDS = (1, 3, 5, 7)  # spherical harmonics of degrees 0 to 3; each of three colours
 
 # Bits at which quantising one attribute gives 60 dB against the unquantised model, measured on models of
-# bonsai and fox (200 px, 20,000 Gaussians). A bit is 6 dB. Spherical harmonics get 0.8 more, and at least
-# what highlights need, measured by PSNR against photos.
+# bonsai and fox (200 px, 20,000 Gaussians). A bit is 6 dB. Spherical harmonics get 0.8 bits more, and at
+# least as many as highlights need, by PSNR against photos.
 _BITS_FOR_60_DB = (15.5, 8.8, 8.2, 7.2, 8.2, 5.2, 5.4, 5.4)
 _NUMBERS = (3, 3, 3, 1, *(3 * count for count in BANDS))
 _FLOOR = (15, 8, 8, 7, 8, 4, 4, 4)
@@ -35,9 +35,9 @@ _FLOOR = (15, 8, 8, 7, 8, 4, 4, 4)
 
 @dataclass(frozen=True)
 class Line:
-    """Codes 0 .. 2^bits - 1 for evenly spaced positions from -reach to reach.
+    """Codes 0 to 2^bits - 1 for evenly spaced positions from -reach to reach.
 
-    The position of a number is its distance from the centre, or the asinh of that distance in spreads.
+    The position of a number is its distance from the centre, or asinh(distance / spread).
     """
 
     centre: float
@@ -46,7 +46,7 @@ class Line:
     far_reach: float  # the largest position of outliers
 
     def __post_init__(self) -> None:
-        """Raise ValueError unless every code stands for a number of bounded size."""
+        """Raise ValueError unless all codes decode to bounded numbers."""
         reach, least = max(self.reach, self.far_reach), min(self.reach, self.far_reach)
         bounded = abs(self.centre) < _FURTHEST and 0 <= self.spread < _FURTHEST
         if not (bounded and 0 < least <= reach < _FURTHEST):
@@ -55,22 +55,22 @@ class Line:
             raise ValueError(f"no such line: {self}")
 
     def encode(self, values: Doubles, bits: int, outlier: Flags | None = None) -> Words32:
-        """The nearest codes of `values` [N, C], clipped at the ends; `outlier` [N]: use the far reach."""
+        """The nearest codes of `values` [N, C], clipped; `outlier` [N]: use the far reach."""
         return self.codes(self.positions(values), bits, outlier)
 
     def positions(self, values: Doubles) -> Doubles:
-        """The positions of `values`, whatever the reach."""
+        """The positions of `values`, independent of the reach."""
         offset: Doubles = values - self.centre
         return np.arcsinh(offset / self.spread) if self.spread > 0 else offset
 
     def codes(self, positions: Doubles, bits: int, outlier: Flags | None = None) -> Words32:
-        """`encode` of values at these positions."""
+        """`encode`, for values at `positions`."""
         last = (1 << bits) - 1
         codes = np.rint((positions / self._reaches(outlier) + 1) * (last / 2)).clip(0, last)
         return codes.astype(np.uint32)
 
     def decode(self, codes: Words32, bits: int, outlier: Flags | None = None) -> Doubles:
-        """The values that `codes` [N, C] stand for; see `encode`."""
+        """The values of `codes` [N, C]; see `encode`."""
         positions = (codes.astype(np.float64) * (2 / ((1 << bits) - 1)) - 1) * self._reaches(outlier)
         offset: Doubles = np.sinh(positions) * self.spread if self.spread > 0 else positions
         return offset + self.centre
@@ -92,11 +92,11 @@ COLOUR, HARMONIC = Kind(clips=True), Kind(clips=True, centred=True)
 
 
 def inlier_range(values: Doubles, kind: Kind) -> tuple[float, float]:
-    """The range of inliers of `values`, as minimum and maximum.
+    """Minimum and maximum of the inliers of `values`.
 
-    It follows from quantiles, which a share of values below `_TAIL` cannot move beyond the others. Outliers
-    therefore lengthen an evenly spaced line at most 2.5 times (the bulk and two margins), and cost the same
-    factor in precision.
+    The range follows from quantiles, which a share of values below `_TAIL` cannot move beyond the others.
+    Outliers therefore lengthen an evenly spaced line at most 2.5 times (the bulk and two margins), and cost
+    at most that factor in precision.
     """
     if kind.even:
         low = float(np.quantile(values, _TAIL, method="higher"))
@@ -109,7 +109,7 @@ def inlier_range(values: Doubles, kind: Kind) -> tuple[float, float]:
 
 
 def fit_line(kind: Kind, bits: int, sample: Doubles, bulk: Doubles, outliers: Doubles) -> Line:
-    """Fit a line to the bulk, given a `sample` [N, C] of it, with a far reach for the outliers.
+    """Fit a line to a `sample` [N, C] of the bulk, with a far reach for the outliers.
 
     `bulk` and `outliers` [2]: minimum and maximum of each, infinities if empty.
     """
@@ -126,7 +126,7 @@ def fit_line(kind: Kind, bits: int, sample: Doubles, bulk: Doubles, outliers: Do
 
 
 def _best_line(whole: Line, bits: int, values: Doubles, bulk: Doubles) -> Line:
-    """The line with the minimum error among candidates of other spreads and reaches up to that of `whole`."""
+    """The line of minimum error among other spreads, and reaches up to that of `whole`."""
     sample = values[:: max(1, values.size // _SAMPLE)].ravel()
     furthest = _furthest(whole, bulk) or 1.0
     best, least = whole, np.inf
@@ -144,22 +144,22 @@ def _best_line(whole: Line, bits: int, values: Doubles, bulk: Doubles) -> Line:
 
 
 def _furthest(line: Line, extent: Doubles) -> float:
-    """The largest distance from the centre; 0 where there are no values."""
+    """The largest distance from the centre; 0 if there are no values."""
     return max(0.0, line.centre - float(extent[0]), float(extent[1]) - line.centre)
 
 
 def _reach_of(line: Line, distance: float) -> float:
-    """The reach that covers numbers at this distance from the centre, as `LINE` stores it."""
+    """The reach that covers numbers up to `distance` from the centre, as `LINE` stores it."""
     position = line.positions(np.array([line.centre + distance]))[0]
     return float(np.float16(max((1 + _HALF) * position, _HALF)))
 
 
 @dataclass(frozen=True)
 class Table:
-    """Bits of one number of positions, log scales, quaternions and opacity, then of each band of harmonics.
+    """Bits per number of positions, log scales, quaternions, opacity and each band of harmonics.
 
-    For harmonics, constant ones included, these are the bits of the brightness; the two colour differences,
-    with a tenth of the energy, get two fewer. Raises ValueError for bits out of range.
+    For harmonics, including the constant ones, these are the bits of the brightness. The two colour
+    differences, which have a tenth of the energy, get two fewer. Raises ValueError for bits out of range.
     """
 
     bits: tuple[int, ...]
@@ -182,9 +182,9 @@ class Table:
 
     @staticmethod
     def of_size(bits: int, sh_degree: int, start: Table | None = None) -> Table | None:
-        """The table of at most `bits` with the minimum error; None if `start` does not fit.
+        """The table of minimum error with at most `bits`; None if `start` does not fit.
 
-        `start`: by default the floor. Each further bit goes where it reduces the error most.
+        `start`: by default the floor. Each further bit goes to the attribute whose error it reduces most.
         """
         table = start or Table.floor(sh_degree)
         while (room := bits - table.total) >= 0:
@@ -202,18 +202,18 @@ class Table:
 
     @property
     def total(self) -> int:
-        """Bits of a record: its numbers, one for outliers, and two for the largest part of the quaternion."""
+        """Bits per record: its numbers, 1 for outliers, 2 for the largest component of the quaternion."""
         numbers = sum(each * count for each, count in zip(self.bits, _NUMBERS, strict=False))
         return 3 + numbers - 2 * CHROMA_FEWER * sum(BANDS[: self.sh_degree + 1])
 
     @property
     def record_bytes(self) -> int:
-        """Whole bytes of a record."""
+        """Bytes per record."""
         return -(-self.total // 8)
 
     @property
     def layout(self) -> list[tuple[int, int]]:
-        """(columns, bits) of codes in the order of records: outlier, largest part of the quaternion, ..."""
+        """(columns, bits) of a record's codes: outlier, largest component of the quaternion, ..."""
         means, log_scales, quats, opacity, *colours = self.bits
         positions = [(1, means)] * 3
         layout = [(1, 1), (1, 2), (3, quats), *positions, (3, log_scales), (1, opacity)]

@@ -1,4 +1,4 @@
-"""Choose Gaussians of a secret, and their precision, to fit a size."""
+"""Choose Gaussians of a secret, and their precision, for a given size."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from keyss.files.formats.common import in_morton_order
 from keyss.methods.records.whole import Precision, decode, encode
 from keyss.rendering.difference import Viewpoints, psnr_between
 
-_GOOD_ENOUGH = 43.75  # dB between renders; PSNRs against photos of 30 dB drop by 0.1 to 0.3
+_GOOD_ENOUGH = 43.75  # dB between renders; costs 0.1 to 0.3 dB at 30 dB against photos
 _ATTRIBUTES = ("means", "log_scales", "opacity_logits", "colours", "quats", "harmonics")
-# Shares of the squared error: counts of (nonzero) numbers. At the minimum total, a finer step has the same
-# gain per bit for each attribute.
+# Shares of the squared error, proportional to counts of nonzero numbers: at the optimum, a finer step gains
+# the same per bit for each attribute.
 _SHARES = (3, 3, 1, 3, 3, 18)
 _TRIES, _CLOSE, _BIT = 6, 0.15, 6.02  # dB
-_COARSEST = 0.1  # maximum step of harmonics, whose errors do not show in distant renders
+_COARSEST = 0.1  # maximum step of harmonics, whose errors are invisible from afar
 _FINEST = 2.0  # octaves below the usual steps: about 58 dB
-_BITS_OF_OCTAVE = 13  # bits per Gaussian and octave, without harmonics
+_BITS_PER_OCTAVE = 13  # per Gaussian, without harmonics
 
 
 def choose_precision(model: Gaussians, viewpoints: Viewpoints | None = None) -> Precision:
-    """The coarsest precision whose renders are good enough, from few renders.
+    """The coarsest precision with good enough renders.
 
-    Measures the cost of each attribute once, then scales all steps together.
+    Measures the cost of each attribute once, then scales all steps together, to save renders.
     """
     rough = Precision.usual(model).finer(-1)
     model = in_morton_order(model)
@@ -52,7 +52,7 @@ def choose_precision(model: Gaussians, viewpoints: Viewpoints | None = None) -> 
 
 
 def prune_to_size(model: Gaussians, room: int, viewpoints: Viewpoints | None = None) -> Gaussians:
-    """`model` if it fits into `room` bytes, else its most visible Gaussians, at the best-looking SH degree.
+    """`model` if it fits into `room` bytes, else its most visible Gaussians at the best SH degree.
 
     Raises UsageError if nothing fits.
     """
@@ -79,7 +79,7 @@ def encode_to_size(
         raise UsageError(
             f"a secret of {len(model):,} Gaussians takes {len(usual):,} bytes, and there is room for {room:,}"
         )
-    octaves = min(_FINEST, 8 * (room - len(usual)) / len(model) / _BITS_OF_OCTAVE)
+    octaves = min(_FINEST, 8 * (room - len(usual)) / len(model) / _BITS_PER_OCTAVE)
     while octaves > 0:
         data = encode(model, Precision.usual(model).finer(octaves))
         if len(data) <= room:
@@ -96,10 +96,10 @@ def most_visible(gaussians: Gaussians, count: int) -> Gaussians:
 
 
 def most_visible_rows(gaussians: Gaussians, count: int) -> Integers:
-    """[count] indices of the Gaussians with the largest opacity times size, in ascending order.
+    """Indices [count] of the Gaussians with the largest opacity times size, in ascending order.
 
-    Size is the square root of the cross-section, clamped at that of a typical large Gaussian: a few huge
-    faint ones must not replace all detail.
+    Size is the square root of the cross-section, clamped to that of a typical large Gaussian: a few huge
+    faint Gaussians must not replace all detail.
     """
     size = gaussians.log_scales.sort(dim=1).values[:, 1:].mean(1)  # log, of the larger two axes
     at_most = size.kthvalue(int(0.9 * len(size)) + 1).values

@@ -1,19 +1,18 @@
-"""Gaussians as records of a fixed number of bits, and back.
+"""Quantise Gaussians to records of a fixed number of bits.
 
 A record holds position, log scales, opacity logit, unit quaternion, colour and spherical harmonics. A `Line`
 maps numbers to codes:
 
-- log scales and opacity logits are evenly spaced between their extremes;
-- positions, colours and harmonics are spaced by asinh((value - centre) / spread): fine near the centre, and
-in
-  proportion to the distance further out. Lines of positions reach all of them; others may clip a few numbers
+- log scales and opacity logits: evenly spaced between their extremes;
+- positions, colours and harmonics: spaced by asinh((value - centre) / spread), which is linear near the
+  centre and logarithmic further out. Lines of positions reach all of them; other lines may clip a few numbers
   if that reduces the mean square error;
-- three colours become brightness and two differences, which are small, on a line of their own;
-- a quaternion becomes its three smallest components, none above sqrt(1/2), and the index of the largest.
+- three colours: brightness and two small differences, each on a line of its own;
+- quaternions: the three smallest components, none above sqrt(1/2), and the index of the largest.
 
 Lines are fitted to the bulk. A Gaussian with a number far outside of it is an *outlier*: one bit of its
 record is set, and its numbers use the same lines with a longer reach. Outliers thus cost the bulk one bit,
-whatever their numbers. Extreme numbers, which hide everything or nothing, are clamped.
+whatever their numbers. Extreme numbers, which occlude everything or are invisible, are clamped.
 """
 
 from __future__ import annotations
@@ -48,25 +47,25 @@ from keyss.methods.records.lines import (
 )
 
 MAX_LOGIT = 16.0  # beyond it the float32 sigmoid is exactly 0 or 1
-_MAX_HARMONIC = 1e6  # beyond it a colour is black or white wherever it is rendered at all
-_MIN_LENGTH = 1e-12  # shorter quaternions have no rotation
+_MAX_HARMONIC = 1e6  # beyond it every rendered colour is black or white
+_MIN_LENGTH = 1e-12  # shorter quaternions define no rotation
 _SAMPLE = 20_000  # Gaussians for finding the range of inliers, and for fitting lines
-_TABLE_BITS = 14  # codes up to this size are decoded by a table, faster than by `sinh`
+_TABLE_BITS = 14  # codes of at most this size use a lookup table, which is faster than `sinh`
 _BLOCK = 1 << 12  # Gaussians per block, which fits into the cache
-_TABLE_BYTES = 8  # a byte per number of bits; 0 for missing bands of harmonics
-_QUAT_LINE = Line(0, 0, 0.5**0.5, 0.5**0.5)  # quaternion's three smaller components
+_TABLE_BYTES = 8  # one per attribute or band; 0 for missing bands of harmonics
+_QUAT_LINE = Line(0, 0, 0.5**0.5, 0.5**0.5)  # three smallest components of quaternions
 
 
 @dataclass(frozen=True)
 class Codec:
-    """The encoding of one secret's Gaussians: a table of bits, and a line for each kind of number."""
+    """The encoding of one secret's Gaussians: a table of bits, and lines for their numbers."""
 
     table: Table
     lines: tuple[Line, ...]  # x, y, z, log scales, opacity logits; two per band, the constant one first
 
     @staticmethod
     def fit(gaussians: Gaussians, table: Table) -> Codec:
-        """Fit lines to `gaussians`, which must have the SH degree of the table."""
+        """Fit lines to `gaussians`. Raises ValueError unless they have the SH degree of the table."""
         return Codec.fit_with_outliers(gaussians, table)[0]
 
     @staticmethod
@@ -123,8 +122,10 @@ class Codec:
         return Gaussians(*map(torch.from_numpy, fields))
 
     def _tables(self) -> tuple[Doubles, Integers, Doubles]:
-        """Lookup tables of `_decode`: numbers of all codes with few bits, bulk then outliers; [C] start of
-        each code's numbers, -1 for more bits; [C, 4] lines.
+        """Tables for `_decode`.
+
+        Numbers of all codes of few bits, bulk then outliers; start [C] of each code's numbers, -1 for codes
+        of more bits; lines [C, 4].
         """
         numbers, starts, lines, size = [np.zeros(0)], [-1, -1], [_QUAT_LINE] * 2, 0
         for line, (columns, bits) in zip((_QUAT_LINE, *self.lines), self.table.layout[2:], strict=True):
@@ -150,7 +151,7 @@ class Codec:
 
     @staticmethod
     def unpack(data: bytes) -> Codec:
-        """Read the bytes of `pack`; ignores further bytes. Raises InputError for damage."""
+        """Invert `pack`; ignores further bytes. Raises InputError for damage."""
         try:
             table = Table(tuple(data[:_TABLE_BYTES].rstrip(b"\0")))
             numbers = data[_TABLE_BYTES : Codec.packed_size(table.sh_degree)]
@@ -164,7 +165,7 @@ class Codec:
 
 @kernel
 def _pack(codes: Any, bits: Any, records: Any) -> None:
-    """Write the codes [N, C] of `bits` [C] into `records` [N, bytes], which are zero."""
+    """Pack codes [N, C] of `bits` [C] into zero-initialised `records` [N, bytes]."""
     for i in range(len(codes)):
         held, count, at = np.uint64(0), 0, 0  # the lowest `count` bits of `held` are pending
         for j in range(len(bits)):
@@ -194,8 +195,8 @@ def _decode(
 ) -> None:
     """Decode records into the fields of Gaussians; `numbers`, `starts`, `lines`: see `_tables`.
 
-    A record has the codes of `Codec.codes`: outlier, left out, 3 of the quaternion, 3 of the position, 3
-    scales, opacity; then, for each band, the brightness and two differences of each harmonic.
+    Codes of a record, as from `Codec.codes`: outlier, left out, 3 of the quaternion, 3 of the position, 3
+    scales, opacity; then, for each band, brightness and two differences of each harmonic.
     """
     values = np.empty(len(bits))
     for i in range(len(records)):
@@ -238,24 +239,24 @@ def _decode(
 
 
 def outliers(gaussians: Gaussians) -> Flags:
-    """[N] True for Gaussians with a number far outside of the bulk; all False if that were all of them."""
+    """Mask [N] of Gaussians with a number far outside of the bulk; empty if that were all of them."""
     return _bulk(gaussians)[0]
 
 
 def _bulk(gaussians: Gaussians) -> tuple[Flags, list[tuple[Doubles, Doubles, Doubles]]]:
-    """The `outliers` [N]; for each line a sample of the bulk's numbers, and extents of bulk and outliers."""
+    """The `outliers` [N]; per line, a sample of the bulk's numbers, the bulk's extent and the outliers'."""
     found, every = np.zeros(len(gaussians), bool), max(1, len(gaussians) // _SAMPLE)
     sample = numbers_of(gaussians[::every])
     ends = list(map(inlier_range, sample, _kinds(gaussians.sh_degree)))
 
-    def judge(start: int, stop: int) -> list[list[tuple[float, float]]]:
+    def scan(start: int, stop: int) -> list[list[tuple[float, float]]]:
         numbers, own = numbers_of(gaussians[start:stop]), found[start:stop]
         for values, (least, largest) in zip(numbers, ends, strict=True):
             own |= ((values < least) | (values > largest)).any(axis=1)
         parts = ((values[~own], values[own]) for values in numbers)
         return [[(x.min(initial=np.inf), -x.max(initial=-np.inf)) for x in each] for each in parts]
 
-    extents = np.min(in_blocks(judge, len(gaussians), _BLOCK), axis=0) * (1, -1)  # [lines, 2, 2]
+    extents = np.min(in_blocks(scan, len(gaussians), _BLOCK), axis=0) * (1, -1)  # [lines, 2, 2]
     if found.all():
         found, extents = ~found, extents[:, ::-1]
     return found, [(x[~found[::every]], *each) for x, each in zip(sample, extents, strict=True)]
@@ -282,10 +283,10 @@ def _bits(table: Table) -> list[int]:
 
 
 def numbers_of(gaussians: Gaussians) -> list[Doubles]:
-    """[N, count] the numbers of each line.
+    """The numbers [N, count] of each line.
 
-    Rasterizers skip Gaussians whose numbers overflow; since clamping would make them visible, they become
-    transparent.
+    Rasterizers skip Gaussians whose numbers overflow. Clamped numbers would make these visible, so they
+    become transparent.
     """
     own = gaussians.detach().to("cpu")
     fields = (own.means, own.log_scales, own.opacity_logits, own.sh, own.overflow)
@@ -299,7 +300,7 @@ def numbers_of(gaussians: Gaussians) -> list[Doubles]:
 def _find_numbers(
     means: Any, log_scales: Any, opacity_logits: Any, sh: Any, overflow: Any, opponent: Any, found: Any
 ) -> None:
-    """`found` [N, 7 + 3 K]: the numbers of all lines, clamped."""
+    """Write the clamped numbers of all lines into `found` [N, 7 + 3 K]."""
     for i in range(len(found)):
         for j in range(3):
             found[i, j] = min(max(means[i, j], -MAX_COORDINATE), MAX_COORDINATE)

@@ -3,13 +3,13 @@
     number of Gaussians (4 bytes), SH degree (1), centres (20), steps (24), all numbers (see `entropy`)
 
 Gaussians are sorted along a Z-order curve. Every number is divided by a step and rounded, so outliers cost
-more bits and no precision. Colours become brightness and two differences. Of the quaternions of an ellipsoid,
-the one with the largest w is stored, without w.
+more bits and no precision. Colours become brightness and two differences. Several quaternions describe the
+same ellipsoid; the one with the largest w is stored, without w.
 
-Errors in quaternions and harmonics cost more in Gaussians that cover more of an image. Their steps therefore
-shrink by a quarter of an octave for each octave of area times opacity squared above the median. (Equal errors
-in an image would need half an octave, but small Gaussians are seen from nearer; a quarter measured best.)
-Encoder and decoder compute the steps from scales and opacity.
+Errors in quaternions and harmonics are more visible in Gaussians that cover more of an image. Their steps
+shrink by a quarter of an octave for each octave of area x opacity^2 above the median. (Equal errors in an
+image need half an octave, but small Gaussians are seen from nearer; a quarter measured best.) Encoder and
+decoder compute the steps from scales and opacity.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from keyss.files.formats.common import in_morton_order, with_largest_w
 from keyss.methods.records import entropy
 from keyss.methods.records.quantise import numbers_of
 
-_ALWAYS = 1 << 16  # Gaussians that a payload of any size may declare
+_ALWAYS = 1 << 16  # number of Gaussians that a payload of any size may declare
 _MIN_BYTES = 2  # minimum bytes per Gaussian of a larger model
 _HEAD = struct.Struct("<IB5f6f")
 _POSITION_STEP = 0.03  # relative to the median size of Gaussians
@@ -37,7 +37,7 @@ _PER_OCTAVE = 0.5 / math.log(2)  # half octaves of the step
 _FINER = 6  # maximum change of a step, in half octaves
 _MAX_STEP = 1e6
 _LEAST_W = 1 / 16  # minimum w^2
-# Columns of x, y, z, log scales, opacity, colours, quaternion: `shares` and `groups` of `entropy.encode`.
+# `shares` and `groups` of `entropy.encode` for the columns x, y, z, log scales, opacity, colours, quaternion.
 # Harmonics have two more groups and no prediction.
 _SHARES = (8, 8, 8, 2, 2, 2, 2, 6, 6, 6, 0, 0, 0)
 _GROUPS = (0, 0, 0, 1, 1, 1, 2, 3, 4, 4, 5, 5, 5)
@@ -61,12 +61,12 @@ class Precision:
         return Precision(_POSITION_STEP * math.exp(min(max(size, -20), 15)))
 
     def finer(self, octaves: float) -> Precision:
-        """All steps divided by 2^octaves."""
+        """Divide all steps by 2^octaves."""
         return Precision(*(step * 2**-octaves for step in self.steps))
 
     @property
     def steps(self) -> list[float]:
-        """The steps in the file."""
+        """The steps as stored: float32, clamped."""
         steps = np.array([getattr(self, field.name) for field in fields(self)], np.float32)
         return [float(each) for each in steps.clip(1e-12, _MAX_STEP)]
 
@@ -89,9 +89,9 @@ def encode(model: Gaussians, precision: Precision | None = None) -> bytes:
 
 
 def decode(data: bytes, carriers: int | None = None) -> Gaussians:
-    """The model of `encode`, read from a model of `carriers` Gaussians. Raises InputError for damage.
+    """Invert `encode`; `carriers`: Gaussians of the stego model. Raises InputError for damage.
 
-    Memory is bounded: above 2^16 Gaussians, each needs at least 2 bytes of `data`, and `carriers` is the
+    Memory is bounded: above 2^16 Gaussians, each takes at least 2 bytes of `data`, and `carriers` is the
     maximum.
     """
     if len(data) < _HEAD.size:
@@ -101,13 +101,13 @@ def decode(data: bytes, carriers: int | None = None) -> Gaussians:
     bounded = all(abs(each) < 1e30 for each in centres) and all(0 < each <= _MAX_STEP for each in steps)
     if not (count > 0 and sh_degree <= 3 and bounded):
         raise InputError(
-            f"the hidden secret is damaged: it announces {count:,} Gaussians of SH degree {sh_degree}"
+            f"the hidden secret is damaged: it declares {count:,} Gaussians of SH degree {sh_degree}"
         )
     largest = len(data) // _MIN_BYTES
     if count > max(_ALWAYS, largest if carriers is None else min(largest, carriers)):
         held_by = f"{len(data):,} bytes" + ("" if carriers is None else f" in {carriers:,} Gaussians")
         raise InputError(
-            f"the hidden secret is damaged: it announces {count:,} Gaussians, more than {held_by} hold"
+            f"the hidden secret is damaged: it declares {count:,} Gaussians, more than {held_by} can hold"
         )
     codes = entropy.decode(data[_HEAD.size :], count, *_columns(sh_degree))
     means, log_scales, logits, colours = _even_numbers(codes[:, :10], centres, steps)
@@ -121,7 +121,7 @@ def decode(data: bytes, carriers: int | None = None) -> Gaussians:
 
 
 def _columns(sh_degree: int) -> tuple[Integers, Integers]:
-    """Shares and groups of all columns."""
+    """`shares` and `groups` of all columns."""
     others = (sh_degree + 1) ** 2 - 1
     return np.array([*_SHARES, *[0, 0, 0] * others]), np.array([*_GROUPS, *[6, 7, 7] * others])
 
@@ -133,36 +133,35 @@ def _round(numbers: Doubles) -> Integers:
 
 
 def _even_steps(steps: list[float]) -> Doubles:
-    """[10] steps of the columns whose steps are equal for all Gaussians."""
+    """Steps [10] of the columns whose steps are the same for all Gaussians."""
     means, log_scales, opacity, colours, *_ = steps
     return np.array([*[means] * 3, *[log_scales] * 3, opacity, *colours * _DIFFERENCES])
 
 
 def _even_numbers(codes: Integers, centres: list[float], steps: list[float]) -> list[Doubles]:
-    """Means [N, 3], log scales [N, 3], opacity logits [N], colours [N, 3] of the codes [N, 10]."""
+    """Means [N, 3], log scales [N, 3], opacity logits [N] and colours [N, 3] from codes [N, 10]."""
     x, y, z, scales, logit = centres
     numbers = codes * _even_steps(steps) + np.array([x, y, z, scales, scales, scales, logit, 0, 0, 0])
     return [numbers[:, :3], numbers[:, 3:6], numbers[:, 6], numbers[:, 7:]]
 
 
 def _from_opponents(parts: Doubles) -> Doubles:
-    """[N, K, 3] colours from brightness and two differences, in a fixed order of operations."""
+    """Colours [N, K, 3] from brightness and two differences, in a fixed order of operations."""
     bright, first, second = (parts[:, :, row, None] * OPPONENT[row] for row in range(3))
     colours: Doubles = bright + first + second
     return colours
 
 
 def _refinement(log_scales: Doubles, logits: Doubles) -> Integers:
-    """[N] half octaves by which each Gaussian's steps are finer than the median Gaussian's."""
+    """Half octaves [N] by which each Gaussian's steps are finer than the median Gaussian's."""
     scales = np.sort(log_scales, axis=1)
-    # log(opacity) is about min(logit, 0).
-    weight = scales[:, 2] + scales[:, 1] + 2 * np.minimum(logits, 0)
+    weight = scales[:, 2] + scales[:, 1] + 2 * np.minimum(logits, 0)  # log(opacity) is about min(logit, 0)
     median = np.sort(weight)[(len(weight) - 1) // 2]
     found: Integers = np.floor((weight - median) * _PER_OCTAVE + 0.5).astype(np.int64)
     return found.clip(-_FINER, _FINER)
 
 
 def _steps(step: float, finer: Integers) -> Doubles:
-    """[N, 1] steps, exact products of `step`, a power of two and the square root of two or one."""
+    """Steps [N, 1]: `step` times a power of two, and the square root of two for odd `finer`."""
     steps: Doubles = step * np.where(finer % 2, math.sqrt(2), 1.0) * 2.0 ** -((finer + 1) // 2)
     return steps[:, None]

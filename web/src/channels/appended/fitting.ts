@@ -1,12 +1,12 @@
-/** Similarity transforms, found by least squares. */
+/** Least-squares fit of similarity transforms. */
 import { movedPoint, rotationOf, type Similarity } from '../../core/similarity.ts';
 
 const SQUARINGS = 50;
 
 /**
- * From points of `source` [P, 3] to those of `target` with the least squares; null where there is none. The rotation is
- * the eigenvector of the largest eigenvalue of a symmetric matrix of four rows (Horn 1987), and the scale is that value
- * by the spread of `source`, as in Umeyama (1991).
+ * The similarity from `source` [P, 3] to `target` with least squared error; null if degenerate. The rotation is the
+ * eigenvector of the largest eigenvalue of a symmetric 4 x 4 matrix (Horn 1987), the scale that eigenvalue divided by the
+ * spread of `source` (Umeyama 1991).
  */
 export function fittedSimilarity(
   source: ArrayLike<number>, target: ArrayLike<number>, rows: ArrayLike<number>,
@@ -43,11 +43,11 @@ function middle(points: ArrayLike<number>, rows: ArrayLike<number>): number[] {
   });
 }
 
-/** The largest eigenvalue of a symmetric matrix [4, 4] and its unit vector, by squaring the matrix again and again. */
+/** The largest eigenvalue of a symmetric matrix [4, 4] and its unit eigenvector, by repeated squaring. */
 function largestEigen(matrix: number[][]): { value: number; vector: number[] } {
   const bound = Math.max(...matrix.map((row) => row.reduce((sum, each) => sum + Math.abs(each), 0)));
   const four = [0, 1, 2, 3];
-  let power = matrix.map((row, i) => row.map((each, j) => each / bound + Number(i === j))); // no eigenvalue below 0
+  let power = matrix.map((row, i) => row.map((each, j) => each / bound + Number(i === j))); // shifted to non-negative eigenvalues
   for (let round = 0; round < SQUARINGS; round++) {
     const largest = Math.max(...power.flat().map(Math.abs));
     const scaled = power.map((row) => row.map((each) => each / largest));

@@ -1,6 +1,6 @@
 /**
- * Words of 84 bits that lie in faint Gaussians, after a format has rounded them (docs/channels.md);
- * `keyss.channels.appended.lattice` on the other side.
+ * Words of 84 bits in faint Gaussians, read after a format has rounded them (docs/channels.md); counterpart of
+ * `keyss.channels.appended.words`.
  */
 import { COLUMNS, type Gaussians, opacity, where, withDegree } from '../../core/gaussians.ts';
 import { moved, type Similarity } from '../../core/similarity.ts';
@@ -9,10 +9,10 @@ import type { Words } from '../../core/words.ts';
 export const [COLOUR_BITS, SCALE_BITS, POSITION_BITS, TURN_BITS] = [7, 6, 10, 5];
 const [FAINTEST, STRONGEST] = [0.4 / 255, 1.6 / 255]; // after rounding
 const [COLOUR_STEP, SCALE_STEP] = [0.0275, 0.08];
-const TURNS_REACH = (256 / 511) * Math.SQRT1_2; // x, y and z of quaternions are below it, so that w is never smaller
-const [FARTHEST, MAX_SHIFTS] = [1 << 12, 500]; // steps of log scales: that are looked at, and that are tried
+const TURNS_REACH = (256 / 511) * Math.SQRT1_2; // bound of x, y and z, so that w is the largest
+const [FARTHEST, MAX_SHIFTS] = [1 << 12, 500]; // steps of log scales: range, and number of offsets tried
 
-/** The Gaussians that are as faint as appended ones, without harmonics. */
+/** The Gaussians as faint as appended ones, without harmonics. */
 export function candidates(model: Gaussians): Gaussians {
   const faint = where(model, (row) => {
     const own = opacity(model.opacityLogits[row]);
@@ -58,7 +58,7 @@ export function likelyShifts(steps: Float64Array): number[] {
   return [0, 1, -1, 2, -2].map((each) => first + phase + each);
 }
 
-/** Where the lattice may begin if only some of the log scales lie on it. */
+/** Possible offsets of the lattice if only some log scales lie on it. */
 export function allShifts(steps: Float64Array): number[] {
   const sorted = steps.map((each) => Math.max(-FARTHEST, Math.min(FARTHEST, each))).sort();
   const [low, high] = [0.01, 0.99].map((share) => sorted[Math.round(share * (sorted.length - 1))]);
@@ -68,7 +68,7 @@ export function allShifts(steps: Float64Array): number[] {
   return found;
 }
 
-/** [N] the first 39 bits of words: colours and scales [N, 3], which stay however a model is moved, turned or scaled. */
+/** [N] the first 39 bits of words, colours and scales [N, 3]: invariant under similarity transforms. */
 export function invariantsOf(colours: Uint8Array, scales: Uint8Array): Words {
   const found = new Uint32Array((2 * colours.length) / 3);
   for (let row = 0; row < colours.length / 3; row++) {
@@ -81,7 +81,7 @@ export function invariantsOf(colours: Uint8Array, scales: Uint8Array): Words {
   return found;
 }
 
-/** [N, 6] the nearest lattice points of positions and turns; `toOwn`: from the world to the own frame. */
+/** [N, 6] nearest lattice points of positions and rotations; `toOwn`: from the world to the own frame. */
 export function inOwnFrame(faint: Gaussians, toOwn: Similarity): Uint16Array {
   const found = new Uint16Array(6 * faint.count);
   const { means, quats } = moved(toOwn, faint);
@@ -97,10 +97,10 @@ export function inOwnFrame(faint: Gaussians, toOwn: Similarity): Uint16Array {
   return found;
 }
 
-const ORDER = [[0, 1, 2, 3], [1, 0, 3, 2], [2, 3, 0, 1], [3, 2, 1, 0]]; // of q, q i, q j, q k
+const ORDER = [[0, 1, 2, 3], [1, 0, 3, 2], [2, 3, 0, 1], [3, 2, 1, 0]]; // q, q i, q j, q k
 const SIGNS = [[1, 1, 1, 1], [-1, 1, 1, -1], [-1, -1, 1, 1], [-1, 1, -1, 1]];
 
-/** The unit quaternion wxyz of the same ellipsoid whose largest part is w: half a turn about an axis is nothing. */
+/** The unit quaternion wxyz of the same ellipsoid with w the largest component. */
 function withLargestW(quat: number[]): number[] {
   const length = Math.max(1e-30, Math.hypot(...quat));
   const largest = [0, 1, 2, 3].reduce((a, b) => (Math.abs(quat[b]) > Math.abs(quat[a]) ? b : a));

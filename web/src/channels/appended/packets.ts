@@ -1,18 +1,18 @@
-/** Packets: some bytes and their number in words of 84 bits; `keyss.channels.appended.packets` on the other side. */
+/** Packets: data bytes and a number in words of 84 bits; counterpart of `keyss.channels.appended.packets`. */
 import { ecb } from '@noble/ciphers/aes.js';
 import type { Codewords } from '../reed_solomon.ts';
 
-export const WIDTHS = [8, 6]; // bytes of a packet
+export const WIDTHS = [8, 6]; // data bytes per packet
 const HEADER_BITS = 20;
 const WORD_BYTES = 11;
-const MAX_DATA = 5895; // packets of a codeword
-const [LEFT, DEVIATIONS] = [0.74, 4.2]; // of packets that may be relied upon
-const AGREEING_HEADERS = 12; // fewer may agree by chance among a million words
+const MAX_DATA = 5895; // packets per codeword
+const [LEFT, DEVIATIONS] = [0.74, 4.2]; // expected share of surviving packets, and the margin
+const AGREEING_HEADERS = 12; // fewer agree by chance among a million words
 
-/** N words: bytes, of which the first are data, and a tag in the rest. */
+/** N words: data bytes, then a tag. */
 export interface TaggedWords {
   readonly count: number;
-  readonly bytes: Uint8Array; // [N, 11] whose last four bits are zero
+  readonly bytes: Uint8Array; // [N, 11]; the last four bits are zero
 }
 
 /** Words of colours, scales [N, 3] and positions and turns [N, 6]. */
@@ -34,7 +34,7 @@ export function wordsOfPoints(colours: Uint8Array, scales: Uint8Array, others: U
   return { count, bytes };
 }
 
-/** The number of each word, as if all were packets, and its data. */
+/** [number, data] of each word, as if all were packets. */
 export function readPackets(key: Uint8Array, { count, bytes }: TaggedWords, width: number): [number, Uint8Array][] {
   const found: [number, Uint8Array][] = [];
   if (!count) return found;
@@ -51,7 +51,7 @@ export function readPackets(key: Uint8Array, { count, bytes }: TaggedWords, widt
   return found;
 }
 
-/** The codewords that most headers tell; null where too few agree. */
+/** The codewords by majority of the headers; null if too few agree. */
 export function readHeader(key: Uint8Array, words: TaggedWords, width: number): Codewords | null {
   const votes = new Uint32Array(1 << HEADER_BITS);
   for (const [number] of readPackets(key, words, width)) if (number < votes.length) votes[number]++;

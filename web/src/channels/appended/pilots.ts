@@ -1,4 +1,4 @@
-/** Pilots: appended Gaussians that everybody can read; `keyss.channels.appended.pilots` on the other side. */
+/** Pilots: appended Gaussians readable without a key; counterpart of `keyss.channels.appended.pilots`. */
 import { mostFrequent, rowsOf } from '../../core/bytes.ts';
 import { movedPoint, type Similarity } from '../../core/similarity.ts';
 import { mix, type Words } from '../../core/words.ts';
@@ -6,23 +6,23 @@ import { SALT_BYTES } from '../../keys/keys.ts';
 import { fittedSimilarity } from './fitting.ts';
 import { POSITION_BITS } from './lattice.ts';
 
-export const LEAST = 128; // of a model
-export const ONE_IN = 64; // words is a pilot by chance
-const [PUBLIC_LOW, PUBLIC_HIGH] = [0x73617070, 0x6b657973]; // what tells this hash from others
+export const LEAST = 128; // pilots per model
+export const ONE_IN = 64; // words are pilots by chance
+const [PUBLIC_LOW, PUBLIC_HIGH] = [0x73617070, 0x6b657973]; // domain separation of the hash
 const PARTS = SALT_BYTES / 2;
-const RANDOM_BITS = 2; // of a pilot's colours, beside the part of the salt and its number
-const [TRIES, AGREE] = [300, 12]; // of three pilots; that have to agree
-const SAMPLE = 1024; // pilots that are tried first
+const RANDOM_BITS = 2; // per pilot, beside the salt's part and its index
+const [TRIES, AGREE] = [300, 12]; // triples of pilots; pilots that must agree
+const SAMPLE = 1024; // pilots tried first
 const NEAR = 1.5 / 2 ** POSITION_BITS; // in the own frame
 
-/** What pilots tell. */
+/** What the pilots encode. */
 export interface Found {
   readonly toOwn: Similarity; // from the world to the own frame
   readonly agreeing: number; // pilots
   readonly salt: Uint8Array;
 }
 
-/** What the pilots among candidates tell: `invariants` [N] as they were read, `means` [N, 3] in the world. */
+/** Frame and salt from the pilots among candidates with `invariants` [N] and world `means` [N, 3]. */
 export function readPilots(invariants: Words, means: Float32Array): Found | null {
   const own = pilotsOf(invariants);
   if (own.length < AGREE) return null;
@@ -43,7 +43,7 @@ export function readPilots(invariants: Words, means: Float32Array): Found | null
   return toOwn && salt && { toOwn, agreeing: best.length, salt };
 }
 
-/** Which pilots `among` all come to lie where they should by the similarity of the chosen ones. */
+/** The pilots `among` all that the similarity fitted to `chosen` maps to their places. */
 function agreeing(
   there: Float32Array, expected: Float64Array, chosen: number[], among: Iterable<number>,
 ): number[] {
@@ -57,13 +57,13 @@ function agreeing(
   return found;
 }
 
-/** Numbers below `count` that are drawn at random, the same ones every time. */
+/** Deterministic pseudo-random numbers below `count`. */
 function drawing(count: number): () => number {
   let drawn = 0;
   return () => Math.floor((mix(++drawn)[1] / 2 ** 32) * count);
 }
 
-/** What most pilots say of each part; null where one has nobody left. */
+/** The salt by majority for each part; null if a part is missing. */
 function saltOf(invariants: Words, rows: number[]): Uint8Array | null {
   const parts = Array.from({ length: PARTS }, (): number[] => []);
   for (const row of rows) {
@@ -81,7 +81,7 @@ function saltOf(invariants: Words, rows: number[]): Uint8Array | null {
   return salt;
 }
 
-/** The rows of `invariants` [N] that are those of pilots. */
+/** The rows of `invariants` [N] that are pilots. */
 export function pilotsOf(invariants: Words): number[] {
   const rows: number[] = [];
   for (let row = 0; row < invariants.length >> 1; row++) if (publicHash(invariants, row)[0] % ONE_IN === 0) rows.push(row);
@@ -92,7 +92,7 @@ function publicHash(invariants: Words, row: number): Words {
   return mix(invariants[2 * row] ^ PUBLIC_LOW, invariants[2 * row + 1] ^ PUBLIC_HIGH);
 }
 
-/** Where a pilot lies in the own frame: by a hash of its invariants. */
+/** A pilot's place in the own frame, a hash of its invariants. */
 function placeOf(invariants: Words, row: number): number[] {
   const [low, high] = publicHash(invariants, row);
   const place = mix(low, high)[1];

@@ -1,17 +1,17 @@
-/** Gaussians that carry bits, and the names by which they are known again; `keyss.channels.colours.carriers`. */
+/** Gaussians that carry bits, and names that identify them; counterpart of `keyss.channels.colours.carriers`. */
 import { ecb } from '@noble/ciphers/aes.js';
 import { rowsOf } from '../../core/bytes.ts';
 import { type Gaussians, opacity, where, withDegree } from '../../core/gaussians.ts';
 import { namesakes, type Words, wordsOf } from '../../core/words.ts';
 import { expand } from '../../keys/keys.ts';
 
-export const [SCALE_STEPS, COLOUR_STEPS, OPACITY_STEPS] = [16, 38.25, 255]; // of 8-bit formats, in one
-export const [COLOUR_NOISE, OPACITY_NOISE] = [0.344, 1.02]; // what formats move these by, in steps, at most
+export const [SCALE_STEPS, COLOUR_STEPS, OPACITY_STEPS] = [16, 38.25, 255]; // quantisation steps of 8-bit formats per unit
+export const [COLOUR_NOISE, OPACITY_NOISE] = [0.344, 1.02]; // maximum rounding error, in steps
 const SCALE_NOISE = 0.144;
 const [RATIO_CELL, OPACITY_CELL, RED_CELL] = [4, 8, 3]; // steps
 const MIN_OPACITY = 2.5 / 255;
 const CELLS = 30_000; // on either side of zero
-const NAME = 8; // numbers of a name: four, and zeros up to a block of AES
+const NAME = 8; // values of a name: four, zero-padded to a block of AES
 
 /** C Gaussians as a reader sees them. */
 export interface Carriers {
@@ -19,17 +19,17 @@ export interface Carriers {
   readonly logScales: Float64Array; // [C, 3]
   readonly opacities: Float64Array; // [C]
   readonly colours: Float64Array; // [C, 3] constant coefficients
-  readonly names: Int16Array; // [C, NAME] numbers of cells: two ratios of scales, opacity, red; zeros
-  readonly doubt: Float64Array; // [C] chance that the name is not what it was when it was written
-  readonly impact: Float64Array; // [C] how much a change of colour shows
-  readonly alike: Float64Array; // [C] how many carriers have the same name, itself included
+  readonly names: Int16Array; // [C, NAME] cell indices: two scale ratios, opacity, red; zeros
+  readonly doubt: Float64Array; // [C] probability that the name has changed since writing
+  readonly impact: Float64Array; // [C] visibility of a colour change
+  readonly alike: Float64Array; // [C] carriers with the same name, itself included
 }
 
-/** The visible and finite Gaussians. `alignment`: steps of log scales that make up for a scaling of the model. */
+/** The visible and finite Gaussians. `alignment`: offset of log scales, in steps, to undo a scaling of the model. */
 export function carriersOf(model: Gaussians, alignment = 0): Carriers {
   const bare = withDegree(model, 0);
   const seen = where(bare, (row) => {
-    let sum = 0; // finite where all are
+    let sum = 0; // finite if all are
     for (let axis = 0; axis < 3; axis++) sum += bare.logScales[3 * row + axis] + bare.sh[3 * row + axis];
     return Number.isFinite(sum) && Math.fround(opacity(bare.opacityLogits[row])) > MIN_OPACITY;
   });
@@ -50,11 +50,11 @@ export function carriersOf(model: Gaussians, alignment = 0): Carriers {
     doubt[row] = 1 - cells.reduce((product, [, each]) => product * (1 - each), 1);
     impact[row] = Math.max(a + b, a + c, b + c) + 2 * Math.log(Math.max(1e-3, ((seenAs[0] + 0.5) * OPACITY_CELL) / OPACITY_STEPS));
   }
-  const alike = Float64Array.from(namesakes(new Uint32Array(names.buffer).filter((_, at) => at % 4 < 2))); // by four numbers
+  const alike = Float64Array.from(namesakes(new Uint32Array(names.buffer).filter((_, at) => at % 4 < 2))); // by the four values
   return { count: seen.count, logScales, opacities, colours, names, doubt, impact, alike };
 }
 
-/** The cell of `steps` steps that a value lies in, and the chance that noise has moved it there. */
+/** The cell of width `steps` of a value, and the probability that noise moved it there. */
 export function cellOf(value: number, steps: number, noise: number): [number, number] {
   const cell = Math.floor(value / steps);
   const inside = value - cell * steps;

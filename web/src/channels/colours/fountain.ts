@@ -1,19 +1,19 @@
-/** A rateless code, read softly (Shokrollahi 2006; Etesami and Shokrollahi 2006); `keyss.channels.colours.fountain`. */
+/** A rateless code with soft decoding (Shokrollahi 2006; Etesami and Shokrollahi 2006); `keyss.channels.colours.fountain`. */
 import { mix, mixed, sortingOrder, type Words } from '../../core/words.ts';
 
-// How many intermediate bits each of 128 code bits is the sum of.
+// Degree distribution: the number of intermediate bits in the sum of each of 128 code bits.
 const RAPTOR = repeated([[1, 3], [2, 62], [3, 21], [4, 9], [5, 10], [8, 7], [9, 5], [19, 7], [65, 4]]);
 export const NOISY = repeated([[1, 19], [2, 64], [3, 32], [4, 13]]);
-const REPEATS = 4; // parity bits that each data bit takes part in
+const REPEATS = 4; // parity bits per data bit
 const [ROUNDS, SETTLED] = [60, 3];
 const [SURE, LEAST] = [1 - 1e-6, 1e-12]; // limits of |P(0) - P(1)|
-const [RANK_LOW, RANK_HIGH] = [0xd192ed03, 0xd1b54a32]; // of one odd constant
+const [RANK_LOW, RANK_HIGH] = [0xd192ed03, 0xd1b54a32]; // halves of an odd constant
 
 function repeated(counts: readonly (readonly [number, number])[]): number[] {
   return counts.flatMap(([degree, count]) => new Array<number>(count).fill(degree));
 }
 
-/** Sums of intermediate bits: equation i has the `degrees[i]` members after those of the ones before. */
+/** Sums of intermediate bits; equation i has the next `degrees[i]` members. */
 interface Equations {
   readonly degrees: Uint16Array;
   readonly members: Uint32Array;
@@ -52,10 +52,10 @@ export class Fountain {
         const known = row < hints.length ? Math.max(-SURE, Math.min(SURE, hints[row])) : SURE;
         let [size, sign] = [Math.log(Math.abs(known) + LEAST), known < 0 ? -1 : 1];
         for (let at = start; at < start + degrees[row]; at++) {
-          const belief = 1 - 2 / (Math.exp(total[members[at]] - sent[at]) + 1); // tanh of the half, several times faster
+          const belief = 1 - 2 / (Math.exp(total[members[at]] - sent[at]) + 1); // tanh(x / 2), several times faster
           sizes[at] = Math.log(Math.abs(belief) + LEAST);
           size += sizes[at];
-          sent[at] = belief < 0 ? -1 : 1; // the sign, until the sum over all is known
+          sent[at] = belief < 0 ? -1 : 1; // the sign only, until the sum is known
           sign *= sent[at];
         }
         for (let at = start; at < start + degrees[row]; at++) {
@@ -78,7 +78,7 @@ export class Fountain {
     return { degrees, members: drawn(seeds, degrees, length) };
   }
 
-  /** The data bits that each parity bit is the sum of. */
+  /** The data bits summed in each parity bit. */
   private checks(): Equations {
     const all = REPEATS * this.size;
     const order = sortingOrder(mixed(Uint32Array.from({ length: 2 * all }, (_, at) => (at % 2 ? 0 : at / 2))));
@@ -97,12 +97,12 @@ function sums(bits: Uint8Array, { degrees, members }: Equations): Uint8Array {
   });
 }
 
-/** For each of the seeds as many numbers below `length` as its degree. */
+/** For each seed, `degrees` pseudo-random numbers below `length`. */
 function drawn(seeds: Words, degrees: Uint16Array, length: number): Uint32Array {
   const found = new Uint32Array(degrees.reduce((sum, each) => sum + each, 0));
   let at = 0;
   degrees.forEach((degree, row) => {
-    let [low, high] = [0, 0]; // the product of the rank, from 1 on, and the constant
+    let [low, high] = [0, 0]; // rank (from 1) times the constant
     for (let end = at + degree; at < end; at++) {
       low += RANK_LOW;
       high = (high + RANK_HIGH + (low > 0xffffffff ? 1 : 0)) >>> 0;

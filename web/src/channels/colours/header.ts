@@ -1,35 +1,35 @@
-/** The header, on which a key is tried first: how to read the rest; `keyss.channels.colours.header`. */
+/** The header, which describes how to read the payload; counterpart of `keyss.channels.colours.header`. */
 import { hmac } from '@noble/hashes/hmac.js';
 import { sha256 } from '@noble/hashes/sha2.js';
 import { ascii, joined, median } from '../../core/bytes.ts';
 import { expand, SALT_BYTES } from '../../keys/keys.ts';
 import { type Carriers, chosen, fractions } from './carriers.ts';
 import { Fountain, NOISY } from './fountain.ts';
-import { COLUMNS, readBits, seedsOf } from './lattice.ts';
+import { COLUMNS, readBits, seedsOf } from './qim.ts';
 
 export const STATIC_SALT = sha256(ascii('keyss/v1/colours-static')).slice(0, SALT_BYTES);
 const FILE_KEY_BYTES = 5;
-const SHARES = 256; // parts of the carriers; a payload has some of them
-const IDLE = 1 / 255; // unit of the share of carriers that were left alone
+const SHARES = 256; // parts of the carriers, shared out to payloads
+const IDLE = 1 / 255; // unit of the share of unmodified carriers
 const PLACES = 80; // Gaussians of a header under each salt
 const PILOTS = 10; // of the places
-const DEPTHS = [1, 2]; // bits of each of their numbers
+const DEPTHS = [1, 2]; // bits per value
 const PLAIN_BYTES = FILE_KEY_BYTES + 6;
 const CHECK_BYTES = 2;
-const PRIOR = 0.4; // logarithm of the odds that a salt is one, before anything else is known
-const TRIES = 3; // to tell salts that were lost
-const DECODED = 0.3; // weight of a bit that was decoded beside one that was known
-const HELD = 0.5; // chance that a place under a salt holds what was written
-const MEDIAN_STEPS = 8; // of the median impact, in one
+const PRIOR = 0.4; // prior log odds that a salt is genuine
+const TRIES = 3; // rounds of reweighting salts
+const DECODED = 0.3; // weight of decoded bits relative to known ones
+const HELD = 0.5; // probability that a place is intact
+const MEDIAN_STEPS = 8; // per unit of the median impact
 const CODE = new Fountain(8 * (PLAIN_BYTES + CHECK_BYTES), NOISY);
 
-/** The secrets of one key in one file: the same in every file, and under each salt. */
+/** The secrets of one key in one file: one shared by all files, and one per salt. */
 export interface Secrets {
   readonly fixed: Uint8Array;
   readonly salted: readonly Uint8Array[];
 }
 
-/** From the key derived under STATIC_SALT and under each salt. */
+/** From the keys derived under STATIC_SALT and under each salt. */
 export function secretsOf([first, ...others]: readonly Uint8Array[]): Secrets {
   return { fixed: expand(first, 'colours/static', 32), salted: others.map((each) => expand(each, 'colours/header', 32)) };
 }
@@ -37,7 +37,7 @@ export function secretsOf([first, ...others]: readonly Uint8Array[]): Secrets {
 /** How a payload is read. */
 export interface Header {
   readonly key: Uint8Array; // of the payload
-  readonly partition: Uint8Array; // by which carriers are shared out
+  readonly partition: Uint8Array; // assigns carriers to parts
   readonly level: number; // of `bitCounts`
   readonly first: number; // of SHARES that the payload has,
   readonly last: number; // this one included
@@ -46,7 +46,7 @@ export interface Header {
   readonly median: number; // of impacts when it was written, in MEDIAN_STEPS, without multiples of 256
 }
 
-/** null where there is none; one attempt in 2^16 finds one by chance, which opens nothing. */
+/** Null if there is none; one attempt in 2^16 finds one by chance, which opens nothing. */
 export function readHeader(secrets: Secrets, carriers: Carriers): Header | null {
   const places = secrets.salted.map((secret) => placesOf(secret, carriers));
   const [one, two] = DEPTHS.map((depth) => readAt(depth, secrets, carriers, places));
@@ -78,7 +78,7 @@ function readAt(depth: number, { fixed, salted }: Secrets, carriers: Carriers, p
   const seeds = Uint32Array.from(words);
   const agreement = new Float64Array(odds.length);
   let header: Header | null = null;
-  for (let attempt = 0; attempt < TRIES; attempt++) { // all of them, so that a right key takes as long as a wrong one
+  for (let attempt = 0; attempt < TRIES; attempt++) { // no early exit, so that right and wrong keys take equally long
     const trust = odds.map((each, salt) => 1 / (1 + Math.exp(-each - DECODED * agreement[salt])));
     const decoded = CODE.decode(seeds, hints.map((hint, at) => hint * trust[owners[at]]));
     const data = packBits(decoded);
@@ -98,7 +98,7 @@ function unpacked(fixed: Uint8Array, data: Uint8Array): Header {
   return { key, partition, level, first, last, size, held: 1 - idle * IDLE, median: middle };
 }
 
-/** [C] which carriers the payload has: its share, without those of headers. */
+/** [C] the payload's carriers, without those of headers. */
 export function ownRows(header: Header, { salted }: Secrets, carriers: Carriers): number[] {
   const taken = new Set(salted.flatMap((secret) => placesOf(secret, carriers).rows));
   const parts = fractions(header.partition, 'partition', carriers.names);
@@ -114,7 +114,7 @@ export function shiftOf(header: Header, { impact }: Carriers): number {
   return (off - Math.floor(off / 256) * 256 - 128) / MEDIAN_STEPS;
 }
 
-/** The carriers with the PLACES names that a secret chooses, and which of them are pilots. */
+/** The carriers with the PLACES names chosen by a secret, and which of them are pilots. */
 interface Places {
   readonly rows: readonly number[];
   readonly pilots: readonly boolean[];
@@ -130,7 +130,7 @@ function placesOf(secret: Uint8Array, { names }: Carriers): Places {
   return { rows, pilots: rows.map((row) => numbers[row] < (least[PILOTS] ?? 1)) };
 }
 
-/** Bytes of bits, the highest first. */
+/** Packs bits into bytes, most significant first. */
 export function packBits(bits: Uint8Array): Uint8Array {
   const bytes = new Uint8Array(Math.ceil(bits.length / 8));
   bits.forEach((bit, at) => (bytes[at >> 3] |= bit << (7 - (at & 7))));

@@ -1,17 +1,17 @@
-/** Bits in numbers: dithered quantisation index modulation, read softly; `keyss.channels.colours.lattice`. */
+/** Dithered quantisation index modulation with soft decisions; counterpart of `keyss.channels.colours.qim`. */
 import { mix, type Words } from '../../core/words.ts';
 import { type Carriers, fractions, randomPairs } from './carriers.ts';
 
-export const COLUMNS = 2; // numbers of a Gaussian that are written
-export const ONE = 0; // the level at which every number carries one bit
-const MAX_BITS = 5; // of a number
+export const COLUMNS = 2; // modulated values per Gaussian
+export const ONE = 0; // level at which every value carries one bit
+const MAX_BITS = 5; // per value
 const SPACING = 0.0275; // between neighbouring points
-const BIT = Math.log(4); // of impact; a level is a quarter of a bit
-const MIDDLE = 24; // level at which an impact of zero carries nothing any more
-const NOISE = 0.23; // standard deviation of a format's rounding, in spacings
-const POINTS = [-1, 0, 1, 2]; // that a number may have come from, from the one below on
+const BIT = Math.log(4); // in impact; a level is a quarter of a bit
+const MIDDLE = 24; // level at which an impact of zero carries nothing
+const NOISE = 0.23; // standard deviation of rounding, in spacings
+const POINTS = [-1, 0, 1, 2]; // candidate points, relative to the one below
 
-/** [C] bits of each number of carriers: more at a higher level, and one less for four times the impact. */
+/** [C] bits per value of carriers: more at higher levels, one less per factor 4 of impact. */
 export function bitCounts(impact: Float64Array, level: number): Uint8Array {
   if (level === ONE) return new Uint8Array(impact.length).fill(1);
   return Uint8Array.from(impact, (each) => Math.max(0, Math.min(MAX_BITS, Math.floor((level - MIDDLE) / 4 - each / BIT))));

@@ -1,4 +1,4 @@
-/** Secrets in appended Gaussians (docs/channels.md); `keyss.channels.appended.channel` on the other side. */
+/** Reader of appended Gaussians (docs/channels.md); counterpart of `keyss.channels.appended.channel`. */
 import { ascii, rowsOf, viewOf } from '../../core/bytes.ts';
 import { damaged } from '../../core/errors.ts';
 import type { Gaussians } from '../../core/gaussians.ts';
@@ -14,8 +14,8 @@ import {
 import { readHeader, readPackets, type TaggedWords, WIDTHS, wordsOfPoints } from './packets.ts';
 import { type Found, LEAST, ONE_IN, pilotsOf, readPilots } from './pilots.ts';
 
-// Gaussians in which pilots are counted; places of the lattice that are tried then, with so many deviations more of
-// them than by chance.
+// Gaussians sampled for pilots; number of lattice offsets tried, with at least this many standard deviations more pilots
+// than by chance.
 const [SAMPLE, TRIED, NOT_BY_CHANCE] = [8000, 8, 3];
 const [HOST_BYTES, FOREIGN] = [132, 0.4]; // how many Gaussians of the cover are seen, and their sketch
 const ASSOCIATED = ascii('keyss/v1/appended/data');
@@ -28,7 +28,7 @@ export class AppendedReader implements Reader {
     readonly salt: Uint8Array, private readonly words: TaggedWords, private readonly names: Uint8Array,
   ) {}
 
-  /** null where there are none, or where their frame cannot be found. */
+  /** Null if there are none, or if their frame cannot be found. */
   static of(model: Gaussians): AppendedReader | null {
     const faint = candidates(model);
     if (faint.count < LEAST / 4) return null;
@@ -49,7 +49,7 @@ export class AppendedReader implements Reader {
     return null;
   }
 
-  /** What `key` opens, null for nothing. Raises InputError where too much was lost or changed. */
+  /** What `key` opens, null for nothing. Raises InputError if too much was lost or changed. */
   async open(key: string, derive: Derive = here): Promise<Payload | null> {
     const secret = await derive(key, this.salt);
     for (const width of WIDTHS) {
@@ -68,7 +68,7 @@ export class AppendedReader implements Reader {
   }
 }
 
-/** Of all places where the lattice of log scales may begin those with most pilots among the Gaussians. */
+/** The offsets of the log-scale lattice with the most pilots. */
 function shiftsWithPilots(steps: Float64Array, colours: Uint8Array): number[] {
   const count = Math.min(SAMPLE, steps.length / 3);
   const every = steps.length / 3 / count;

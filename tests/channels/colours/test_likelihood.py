@@ -7,7 +7,7 @@ import numpy.typing as npt
 import pytest
 from scipy.spatial import cKDTree
 
-from keyss.channels.colours.likeness import Likeness
+from keyss.channels.colours.likelihood import Likelihood
 
 NOISE = 0.0275
 Doubles = npt.NDArray[np.float64]
@@ -41,8 +41,8 @@ def test_what_is_admitted_leaves_differences_between_neighbours_as_they_were(
     model: tuple[Doubles, Doubles],
 ) -> None:
     colours, positions = model
-    likeness, new = Likeness.of(colours, positions, noisy(colours, 1)), noisy(colours, 2)
-    which = likeness.admitted(colours, new, np.random.default_rng(3))
+    likelihood, new = Likelihood.of(colours, positions, noisy(colours, 1)), noisy(colours, 2)
+    which = likelihood.accept(colours, new, np.random.default_rng(3))
     stego = colours.copy()
     stego[:, 1:] = np.where(which, new[:, 1:], colours[:, 1:])
     before = apart(colours, positions)
@@ -53,11 +53,11 @@ def test_what_is_admitted_leaves_differences_between_neighbours_as_they_were(
 
 def test_numbers_that_should_stay_are_not_admitted(model: tuple[Doubles, Doubles]) -> None:
     colours, positions = model
-    likeness = Likeness.of(colours, positions, noisy(colours, 1))
-    assert not likeness.admitted(colours, colours, np.random.default_rng(0)).any()
+    likelihood = Likelihood.of(colours, positions, noisy(colours, 1))
+    assert not likelihood.accept(colours, colours, np.random.default_rng(0)).any()
     few = colours.copy()
     few[:200] = noisy(colours, 2)[:200]
-    which = likeness.admitted(colours, few, np.random.default_rng(0))
+    which = likelihood.accept(colours, few, np.random.default_rng(0))
     assert which[:200].any()
     assert not which[200:].any()
 
@@ -65,12 +65,12 @@ def test_numbers_that_should_stay_are_not_admitted(model: tuple[Doubles, Doubles
 def test_independent_colours_may_all_change() -> None:
     random = np.random.default_rng(0)
     colours, positions = random.normal(size=(3000, 3)), random.normal(size=(3000, 3))
-    likeness = Likeness.of(colours, positions, noisy(colours, 1))
-    assert likeness.admitted(colours, noisy(colours, 2), random).mean() > 0.9
+    likelihood = Likelihood.of(colours, positions, noisy(colours, 1))
+    assert likelihood.accept(colours, noisy(colours, 2), random).mean() > 0.9
 
 
 @pytest.mark.parametrize("count", [2, 3, 5])
 def test_few_gaussians_and_equal_ones_are_no_trouble(count: int) -> None:
     colours, positions = np.zeros((count, 3)), np.zeros((count, 3))
-    likeness = Likeness.of(colours, positions, noisy(colours, 1))
-    assert likeness.admitted(colours, noisy(colours, 2), np.random.default_rng(0)).shape == (count, 2)
+    likelihood = Likelihood.of(colours, positions, noisy(colours, 1))
+    assert likelihood.accept(colours, noisy(colours, 2), np.random.default_rng(0)).shape == (count, 2)

@@ -10,9 +10,9 @@ import torch
 from scipy.stats import kstest
 
 from channels.colours.made import cover
-from keyss.channels.colours import lattice
+from keyss.channels.colours import qim
 from keyss.channels.colours.carriers import Carriers
-from keyss.channels.colours.salts import SALTS, Salts, renewed
+from keyss.channels.colours.salt_gaussians import SALTS, Salts, renew_salts
 from keyss.core import Gaussians
 from lab.lifelike import turned
 
@@ -23,39 +23,39 @@ LEVEL = 24
 def _written(level: int = LEVEL):
     """Names [C, 4], values before and after [C, 2], bits of each [C], and code [B]."""
     carriers = Carriers.of(cover())
-    names, before = carriers.names[carriers.own], carriers.colours[carriers.own, 1:]
-    bits = lattice.bit_counts(carriers.impact[carriers.own], level)
-    code = np.random.default_rng(0).integers(0, 2, lattice.COLUMNS * bits.sum()).astype(np.uint8)
-    return names, before, lattice.write(SECRET, names, before, bits, code), bits, code
+    names, before = carriers.names[carriers.representatives], carriers.colours[carriers.representatives, 1:]
+    bits = qim.bit_counts(carriers.impact[carriers.representatives], level)
+    code = np.random.default_rng(0).integers(0, 2, qim.COLUMNS * bits.sum()).astype(np.uint8)
+    return names, before, qim.write(SECRET, names, before, bits, code), bits, code
 
 
-@pytest.mark.parametrize("level", [lattice.ONE, 4, 24, 40])
+@pytest.mark.parametrize("level", [qim.ONE, 4, 24, 40])
 def test_bits_come_back_after_noise_below_half_of_the_spacing(level: int) -> None:
     names, _, written, bits, code = _written(level)
     noise = np.random.default_rng(1).uniform(-0.0131, 0.0131, written.shape)  # as .spz rounds
-    assert ((lattice.read(SECRET, names, written + noise, bits) < 0) == code).all()
+    assert ((qim.read(SECRET, names, written + noise, bits) < 0) == code).all()
 
 
 def test_what_is_added_is_uniform_noise_of_the_stated_variance() -> None:
     _, before, written, bits, _ = _written()
-    moved = (written - before)[bits > 0] / (lattice.SPACING * 2.0**bits)[bits > 0, None]
+    moved = (written - before)[bits > 0] / (qim.SPACING * 2.0**bits)[bits > 0, None]
     assert kstest(moved.ravel() + 0.5, "uniform").pvalue > 0.001
     assert abs(np.corrcoef(moved.T)[0, 1]) < 0.06
     assert (written[bits == 0] == before[bits == 0]).all()
 
 
 def test_without_the_secret_nothing_lies_on_a_lattice() -> None:
-    names, _, written, bits, _ = _written(lattice.ONE)
-    sure = np.abs(lattice.read(SECRET, names, written, bits)).mean()
-    assert np.abs(lattice.read(bytes(16), names, written, bits)).mean() < 0.9 * sure
-    assert kstest(written.ravel() / lattice.SPACING % 1, "uniform").pvalue > 0.001
+    names, _, written, bits, _ = _written(qim.ONE)
+    sure = np.abs(qim.read(SECRET, names, written, bits)).mean()
+    assert np.abs(qim.read(bytes(16), names, written, bits)).mean() < 0.9 * sure
+    assert kstest(written.ravel() / qim.SPACING % 1, "uniform").pvalue > 0.001
 
 
 def test_a_visible_gaussian_carries_less() -> None:
     impact = np.sort(Carriers.of(cover()).impact)
     for level in (10, 30):
-        assert (np.diff(lattice.bit_counts(impact, level)) <= 0).all()
-    totals = [int(lattice.bit_counts(impact, level).sum()) for level in range(1, lattice.LEVELS)]
+        assert (np.diff(qim.bit_counts(impact, level)) <= 0).all()
+    totals = [int(qim.bit_counts(impact, level).sum()) for level in range(1, qim.LEVELS)]
     assert totals == sorted(totals)
 
 
@@ -81,7 +81,7 @@ def test_names_that_are_not_in_doubt_survive_noise() -> None:
     before, after = Carriers.of(model), Carriers.of(moved)
     changed = (before.names != after.names).any(axis=1)
     assert changed.mean() == pytest.approx(0.07, rel=0.15)  # 3 numbers, 0.144 / 2 of them to other sixteenths
-    assert changed[after.doubt == 0].mean() < 0.003  # both scales of a ratio changed, 0.07 squared
+    assert changed[after.error_probability == 0].mean() < 0.003  # both scales of a ratio change: 0.07^2
 
 
 @pytest.mark.parametrize("scale", [1.0, 1.37, 0.4])
@@ -98,15 +98,15 @@ def test_names_do_not_depend_on_order_or_frame(scale: float) -> None:
 
 def test_one_of_each_name_is_written() -> None:
     carriers = Carriers.of(Gaussians.cat([cover(300)] * 2))
-    names = carriers.names[carriers.own]
+    names = carriers.names[carriers.representatives]
     assert len(np.unique(names, axis=0)) == len(names) == len(np.unique(carriers.names, axis=0))
-    assert (carriers.namesakes >= 2).all()
+    assert (carriers.name_counts >= 2).all()
 
 
 def test_salts_are_new_and_are_found_again_after_rounding_and_pruning() -> None:
     model = cover(6000)
     carriers = Carriers.of(model)
-    first, second = (renewed(carriers, np.random.default_rng(seed)) for seed in (1, 2))
+    first, second = (renew_salts(carriers, np.random.default_rng(seed)) for seed in (1, 2))
     one, other = Salts.of(first), Salts.of(second)
     assert len(one.salts) >= SALTS
     assert len(set(one.salts) & set(other.salts)) <= 2  # 1/49 of 16 are expected
@@ -119,7 +119,7 @@ def test_salts_are_new_and_are_found_again_after_rounding_and_pruning() -> None:
 
 def test_new_salts_leave_each_number_where_it_lies_in_its_cell() -> None:
     carriers = Carriers.of(cover())
-    moved = renewed(carriers, np.random.default_rng(1)).colours - carriers.colours
+    moved = renew_salts(carriers, np.random.default_rng(1)).colours - carriers.colours
     cells = moved * 38.25 / 5
     assert np.abs(cells - cells.round()).max() < 1e-9
     assert 1 <= (moved != 0).any(axis=1).sum() <= SALTS

@@ -1,4 +1,4 @@
-/** A secret that is a model, as `keyss reveal` gives it. */
+/** From the content of a channel to what `keyss reveal` gives: a model or a file. */
 import { damaged } from '../core/errors.ts';
 import type { Content } from '../channels/content.ts';
 import { viewOf } from '../core/bytes.ts';
@@ -7,15 +7,26 @@ import { decodeKeyss } from '../keyss/secret.ts';
 import { Codec } from './codec.ts';
 import { decodeWhole } from './whole.ts';
 
-const WHOLE = 'carry'; // the method of models that are hidden whole, whoever trained them
-const KEYSS = 'keyss';
+const [WHOLE, KEYSS, FILE] = ['carry', 'keyss', 'file']; // methods
 
 export interface Secret {
   readonly gaussians: Gaussians;
-  readonly hidden: number; // how many there were
+  readonly hidden: number; // Gaussians before any were lost
 }
 
-/** The Gaussians that are left; null for what is no model. `stego`: where it was. Raises InputError for damage. */
+export interface HiddenFile {
+  readonly name: string; // from the sender: to be shown, never to be used as a path
+  readonly bytes: Uint8Array;
+}
+
+/** Null if the content is not a file. */
+export function fileOf(content: Content): HiddenFile | null {
+  if (content.service !== 'payload' || content.method !== FILE) return null;
+  const size = content.data[0];
+  return { name: new TextDecoder().decode(content.data.subarray(1, 1 + size)), bytes: content.data.slice(1 + size) };
+}
+
+/** The model, found in `stego`; null if the content is not a model. Raises InputError for damage. */
 export function secretOf(content: Content, stego: Gaussians): Secret | null {
   if (content.service === 'payload') {
     if (content.method === KEYSS) return decodeKeyss(content.data, stego);

@@ -1,4 +1,4 @@
-/** The Gaussians that serve as salts of Argon2id; `keyss.channels.colours.salts`. */
+/** Salts of Argon2id derived from Gaussians; counterpart of `keyss.channels.colours.salt_gaussians`. */
 import { sha256 } from '@noble/hashes/sha2.js';
 import { ascii, bytesKey, joined } from '../../core/bytes.ts';
 import { SALT_BYTES } from '../../keys/keys.ts';
@@ -7,14 +7,14 @@ import {
 } from './carriers.ts';
 
 const SALTS = 16; // at most
-const BANDS = [0.08, 0.4, 1.01]; // limits of two bands of opacity, with half of the salts each
+const BANDS = [0.08, 0.4, 1.01]; // limits of two opacity bands with half of the salts each
 const [OPACITY_CELL, RATIO_CELL, COLOUR_CELL] = [16, 8, 5]; // steps
 const LABEL = ascii('keyss/v1/colours-salt');
 
 /** Up to 16 salts of 16 bytes. */
 export function saltsOf({ count, logScales, opacities, colours }: Carriers): Uint8Array[] {
   const cells = new Int16Array(6 * count);
-  const names = new Int16Array(8 * count); // the first four cells, and zeros up to a block of AES
+  const names = new Int16Array(8 * count); // the first four cells, zero-padded to a block of AES
   const stable = Array.from({ length: count }, (_, row) => {
     const ratio = (axis: number) => (logScales[3 * row + axis + 1] - logScales[3 * row + axis]) * SCALE_STEPS - 0.5;
     const own = [

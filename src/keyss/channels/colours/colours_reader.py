@@ -1,4 +1,4 @@
-"""Reading a payload with nothing but a model and a key."""
+"""Reader of payloads in colours."""
 
 from __future__ import annotations
 
@@ -10,23 +10,23 @@ from keyss.channels.base import Payload, unpack_payload
 from keyss.channels.colours.carriers import Carriers
 from keyss.channels.colours.fountain import Fountain
 from keyss.channels.colours.header import IDLE, Header, Secrets, bucket_bytes, places
-from keyss.channels.colours.lattice import COLUMNS, ONE, bit_counts, read, seeds
-from keyss.channels.colours.salts import Salts
+from keyss.channels.colours.qim import COLUMNS, ONE, bit_counts, read, seeds
+from keyss.channels.colours.salt_gaussians import Salts
 from keyss.channels.reed_solomon import LOST
 from keyss.core.errors import InputError, WrongKeyError
 from keyss.core.gaussians import Gaussians
 from keyss.keys.encryption import decrypt
 
-ASSOCIATED = b"keyss/v1/colours"  # authenticated with a payload
-_CHANGED = 0.03  # share of the other carriers that may hold something else
-_MAX_RATE = 4.0  # data bits for each code bit; a writer stays below a half of one
-_ALIGNMENTS = 4  # of rounded log scales: in a model that was scaled they are wrong by an eighth at most
-_NOTHING = Header(bytes(5), ONE, 0, 63, 64, 0, 0)  # that a key that opens nothing looks for
+ASSOCIATED = b"keyss/v1/colours"  # associated data of a payload's authentication
+_CHANGED = 0.03  # share of carriers overwritten since
+_MAX_RATE = 4.0  # data bits per code bit; a writer stays below 0.5
+_ALIGNMENTS = 4  # offsets of log scales; the best one is wrong by at most 1/8 step in a scaled model
+_NOTHING = Header(bytes(5), ONE, 0, 63, 64, 0, 0)  # read for wrong keys, so that all keys take equally long
 
 
 @dataclass(frozen=True)
 class ColoursReader:
-    """A model as a reader sees it."""
+    """Reads the colours of a model."""
 
     alignments: tuple[Carriers, ...]
 
@@ -37,7 +37,7 @@ class ColoursReader:
     def open(self, key: str) -> Payload:
         """See `keyss.channels.base.Reader`.
 
-        Takes about 0.1 s for each of 17 salts, and as long for a key that opens nothing as for one that does.
+        Takes about 0.1 s for each of 17 salts, for right and wrong keys alike.
         """
         secrets = Secrets.of(key, Salts.of(self.alignments[0]).salts)
         headers = [Header.read(secrets, carriers) for carriers in self.alignments]
@@ -55,16 +55,17 @@ class ColoursReader:
 
 
 def _payload(header: Header, secrets: Secrets, carriers: Carriers, shift: float) -> bytes | None:
-    """The payload that the header's data key decrypts, or None."""
-    mine = header.own(carriers)
+    """The payload decrypted by the header's data key, or None."""
+    mask = header.carrier_mask(carriers)
     for secret in secrets.salted:
-        mine[places(secret, carriers)[0]] = False
-    rows = np.flatnonzero(mine)
+        mask[places(secret, carriers)[0]] = False
+    rows = np.flatnonzero(mask)
     size, key, names = bucket_bytes(header.bucket), secrets.data_key(header), carriers.names[rows]
     bits = bit_counts(carriers.impact[rows] - shift, header.level)
     if not len(rows) or 8 * size > _MAX_RATE * COLUMNS * bits.sum():
         return None
-    sure = (1 - header.idle * IDLE) * (1 - _CHANGED) * (1 - carriers.doubt[rows]) / carriers.namesakes[rows]
+    written = (1 - header.idle * IDLE) * (1 - _CHANGED)
+    sure = written * (1 - carriers.error_probability[rows]) / carriers.name_counts[rows]
     hints = np.repeat(sure, COLUMNS * bits) * read(key, names, carriers.colours[rows, 1:], bits)
     found = Fountain(8 * size).decode(seeds(key, "seeds", names, bits), hints)
     try:

@@ -1,4 +1,4 @@
-/** What a key opens in the colours of a model (docs/channels.md); `keyss.channels.colours.reading`. */
+/** Reader of colours (docs/channels.md); counterpart of `keyss.channels.colours.colours_reader`. */
 import { ascii } from '../../core/bytes.ts';
 import { InputError, tooMuchLost } from '../../core/errors.ts';
 import type { Gaussians } from '../../core/gaussians.ts';
@@ -8,13 +8,13 @@ import { type Payload, type Reader, unpackPayload } from '../content.ts';
 import { type Carriers, carriersOf, chosen } from './carriers.ts';
 import { Fountain } from './fountain.ts';
 import { type Header, ownRows, packBits, readHeader, type Secrets, secretsOf, shiftOf, STATIC_SALT } from './header.ts';
-import { bitCounts, COLUMNS, ONE, readBits, seedsOf } from './lattice.ts';
-import { saltsOf } from './salts.ts';
+import { bitCounts, COLUMNS, ONE, readBits, seedsOf } from './qim.ts';
+import { saltsOf } from './salt_gaussians.ts';
 
 const ASSOCIATED = ascii('keyss/v1/colours');
-const CHANGED = 0.03; // share of carriers that may hold something else
-const MAX_RATE = 4; // data bits for each code bit
-const ALIGNMENTS = 4; // of rounded log scales
+const CHANGED = 0.03; // share of carriers overwritten since
+const MAX_RATE = 4; // data bits per code bit
+const ALIGNMENTS = 4; // offsets of log scales tried
 
 /** The colours of a model, prepared for any number of keys. */
 export class ColoursReader implements Reader {
@@ -46,7 +46,7 @@ export class ColoursReader implements Reader {
   }
 }
 
-/** What the header's key decrypts, or null. */
+/** The payload decrypted by the header's key, or null. */
 async function payload(header: Header, secrets: Secrets, carriers: Carriers, shift: number): Promise<Uint8Array | null> {
   const own = chosen(carriers, ownRows(header, secrets, carriers));
   const bits = bitCounts(own.impact.map((each) => each - shift), header.level);

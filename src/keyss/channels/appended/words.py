@@ -1,13 +1,12 @@
-"""Words of 84 bits as Gaussians, and back after a format has rounded them.
+"""Words of 84 bits as Gaussians, readable after a format has rounded them.
 
-Every number of such a Gaussian is a point of a lattice that is coarser than what formats do to it
-(docs/channels.md):
+Every number is a point of a lattice coarser than the rounding of any format (docs/channels.md):
 
-    39 bits  that stay when a model is moved, turned or scaled: three colours of 7 bits, three log scales of 6
-    45 bits  in the *own frame*, a cube around the model: three positions of 10 bits, and of the quaternion,
-             whose w is the largest part and positive, x, y and z, 5 bits each
+    39 bits  invariant under similarities: three colours of 7 bits, three log scales of 6
+    45 bits  in the *own frame*, a cube around the model: three positions of 10 bits; x, y and z of the
+             quaternion, whose w is positive and the largest, of 5 bits each
 
-Opacity is just above 1/255; 8 bits keep it as 1.
+Opacity is just above 1/255, which 8 bits round to 1.
 """
 
 from __future__ import annotations
@@ -24,26 +23,26 @@ from keyss.core.gaussians import DRAWN_OPACITY, Gaussians
 from keyss.core.similarity import Similarity
 from keyss.files.formats.common import with_largest_w
 
-COLOUR_BITS, SCALE_BITS, POSITION_BITS, TURN_BITS = 7, 6, 10, 5
+COLOUR_BITS, SCALE_BITS, POSITION_BITS, ROTATION_BITS = 7, 6, 10, 5
 INVARIANT_BITS = 3 * (COLOUR_BITS + SCALE_BITS)
-WORD_BITS = INVARIANT_BITS + 3 * (POSITION_BITS + TURN_BITS)
+WORD_BITS = INVARIANT_BITS + 3 * (POSITION_BITS + ROTATION_BITS)
 
-# Programs remove what is below 1/255, and rasterizers draw what is above: here only a hundredth of a standard
-# deviation around the centre. With 1.1/255, 360,000 of them would leave a cover at 40 dB.
+# Programs remove Gaussians below 1/255; rasterizers draw those above, here to a hundredth of a standard
+# deviation from the centre. At 1.1/255, 360,000 of them would lower the cover to 40 dB.
 _OPACITY = 1.00001 * DRAWN_OPACITY
 _LOGIT = math.log(_OPACITY / (1 - _OPACITY))
 _FAINTEST, _STRONGEST = 0.4 * DRAWN_OPACITY, 1.6 * DRAWN_OPACITY  # after rounding
-_COLOUR_STEP = 0.0275  # twice what formats move constant colours by, and a little
+_COLOUR_STEP = 0.0275  # a little above twice the largest rounding error of formats
 _SCALE_STEP = 0.08  # the same for log scales
-_MIN_LOG_SCALE = -9.9  # of `.spz`, whose least is -10
-_SMALL = -9.0  # log scales of the smallest, beside that of the cube
-# x, y and z are below it, so that w is never smaller. A step is 16 of `.spz`, which packs that better.
-_TURNS_REACH = 256 / 511 * 0.5**0.5
-_FARTHEST, _MAX_SHIFTS = 1 << 12, 500  # steps of log scales: that are looked at, and that are tried
+_MIN_LOG_SCALE = -9.9  # `.spz` stores -10 and more
+_SMALL = -9.0  # smallest log scale, relative to the cube's
+# Bound of x, y and z, so that w is the largest. A step is 16 of `.spz`, which compress better.
+_ROTATION_REACH = 256 / 511 * 0.5**0.5
+_FARTHEST, _MAX_SHIFTS = 1 << 12, 500  # range of log scales, in steps; maximum number of offsets to try
 
 
-def is_candidate(model: Gaussians) -> Flags:
-    """[N] which Gaussians are as faint as appended ones."""
+def candidate_mask(model: Gaussians) -> Flags:
+    """Mask [N] of finite Gaussians as faint as appended ones."""
     opacities = model.opacities.detach().cpu().numpy()
     found: Flags = (opacities > _FAINTEST) & (opacities < _STRONGEST)
     for values in (model.means, model.quats, model.log_scales, model.sh):
@@ -52,17 +51,17 @@ def is_candidate(model: Gaussians) -> Flags:
 
 
 def is_appended(model: Gaussians) -> Tensor:
-    """[N] which Gaussians were appended to a model that no format has rounded since.
+    """Mask [N] of appended Gaussians in a model that no format has rounded since.
 
-    They have one opacity, which others have to the last bit by chance only: once in millions.
+    They share one opacity. Another Gaussian has it to the last bit with a probability below 10^-6.
     """
     return model.opacity_logits == float(np.float32(_LOGIT))
 
 
 def own_frame(model: Gaussians) -> Similarity:
-    """From the own frame to the world: its unit cube becomes about as large as most of the model.
+    """Own frame to world: the unit cube covers most of the model.
 
-    Size and place are such that coordinates of lattice points have few digits, which `.spz` packs better.
+    Scale and translation give lattice points coordinates of few bits, which `.spz` compresses better.
     """
     means = doubles(model.means)
     means = means[np.isfinite(means).all(axis=1)]
@@ -74,32 +73,32 @@ def own_frame(model: Gaussians) -> Similarity:
 
 
 def check_place(to_world: Similarity) -> None:
-    """Raise UsageError if float32 does not hold positions in that frame to a quarter of a step."""
+    """Raise UsageError if float32 rounds positions in the own frame by more than a quarter of a step."""
     corner = to_world.translation.numpy()
     step = to_world.scale / 2**POSITION_BITS
     if float(np.spacing(np.float32(np.abs(corner).max()))) > step / 4:
         x, y, z = corner
-        away = f"{x:.9g},{y:.9g},{-z:.9g}"  # its axes are turned by half a turn about z
+        away = f"{x:.9g},{y:.9g},{-z:.9g}"  # splat-transform's axes are rotated by 180 degrees about z
         raise UsageError(
             "the cover is too far from the origin for the single precision of its file: move it, e.g. with "
             f"`splat-transform IN -t {away} OUT.ply`"
         )
 
 
-def in_order(words: Bits) -> Bits:
-    """`words` by the z of their turns, then y, then x: `.spz` packs runs of equal rotations."""
-    turns = words[:, -3 * TURN_BITS :].reshape(-1, 3, TURN_BITS)[:, ::-1]  # the highest bit of z first
-    return words[np.lexsort(turns.reshape(len(words), -1).T[::-1])]
+def sort_by_rotation(words: Bits) -> Bits:
+    """Sort `words` by z, y and x of their quaternions: `.spz` compresses runs of equal rotations."""
+    rotations = words[:, -3 * ROTATION_BITS :].reshape(-1, 3, ROTATION_BITS)[:, ::-1]
+    return words[np.lexsort(rotations.reshape(len(words), -1).T[::-1])]  # primary key: the highest bit of z
 
 
 def to_gaussians(words: Bits, to_world: Similarity, sh_degree: int) -> Gaussians:
-    """N Gaussians of words [N, WORD_BITS]; `to_world`: of `own_frame`."""
+    """N Gaussians from words [N, WORD_BITS]; `to_world`: the result of `own_frame`."""
     least_log_scale = max(_SMALL, _MIN_LOG_SCALE - math.log(to_world.scale))
     fields = _split(words)
     colours = (fields[0] + 0.5) * _COLOUR_STEP - _COLOUR_STEP * 2 ** (COLOUR_BITS - 1)
     scales = fields[1] * _SCALE_STEP + least_log_scale
     positions = (fields[2] + 0.5) / 2**POSITION_BITS
-    parts = (fields[3] + 0.5) / 2**TURN_BITS * 2 * _TURNS_REACH - _TURNS_REACH
+    parts = (fields[3] + 0.5) / 2**ROTATION_BITS * 2 * _ROTATION_REACH - _ROTATION_REACH
     w = np.sqrt(1 - np.square(parts).sum(axis=1, keepdims=True))
     sh = np.zeros((len(words), (sh_degree + 1) ** 2, 3))
     sh[:, 0] = colours
@@ -110,85 +109,85 @@ def to_gaussians(words: Bits, to_world: Similarity, sh_degree: int) -> Gaussians
 
 
 def colours_of(model: Gaussians) -> Integers:
-    """[N, 3] the nearest lattice points of colours."""
+    """Nearest lattice points [N, 3] of colours."""
     colours = doubles(model.sh[:, 0])
     return _nearest(colours / _COLOUR_STEP + 2 ** (COLOUR_BITS - 1) - 0.5, COLOUR_BITS)
 
 
 def scale_steps(model: Gaussians) -> Doubles:
-    """[N, 3] log scales in steps of their lattice, which lies anywhere: see `likely_shifts`."""
+    """Log scales [N, 3] in lattice steps; the offset of the lattice is unknown, see `likely_shifts`."""
     return doubles(model.log_scales) / _SCALE_STEP
 
 
 def scales_at(steps: Doubles, shift: float) -> Integers:
-    """[N, 3] the nearest lattice points of log scales, of a lattice that begins at `shift`."""
+    """Nearest lattice points [N, 3] of log scales, for a lattice with offset `shift`."""
     return _nearest(steps - shift, SCALE_BITS)
 
 
 def likely_shifts(steps: Doubles) -> list[float]:
-    """Where the lattice may begin if most of the log scales lie on it, the likeliest first.
+    """Offsets of the lattice if most log scales lie on it, the likeliest first.
 
-    A model that was scaled has all log scales shifted by one number: the lattice is where they lie.
+    Scaling a model shifts all log scales by one number.
     """
     phase = float(np.angle(np.exp(2j * np.pi * steps).mean())) / (2 * np.pi)
     whole = np.rint(steps - phase).clip(-_FARTHEST, _FARTHEST).astype(np.int64)
     found = np.bincount((whole + _FARTHEST).ravel(), minlength=2 * _FARTHEST)
-    inside = np.convolve(found, np.ones(2**SCALE_BITS, np.int64))  # at i: those in the levels up to i
+    inside = np.convolve(found, np.ones(2**SCALE_BITS, np.int64))  # at i: scales on a lattice that ends at i
     best = int(inside.argmax()) - 2**SCALE_BITS + 1 - _FARTHEST
     return [best + phase + each for each in (0, 1, -1, 2, -2)]
 
 
 def all_shifts(steps: Doubles) -> Doubles:
-    """[S] where the lattice may begin if only some of the log scales lie on it."""
+    """Offsets [S] of the lattice to try if only some log scales lie on it."""
     low, high = np.quantile(steps.clip(-_FARTHEST, _FARTHEST), [0.01, 0.99])
     most = min(high - 2 ** (SCALE_BITS - 2), low + _MAX_SHIFTS)
     return np.arange(low - 2 ** (SCALE_BITS - 1), max(most, low), 0.25)
 
 
-def in_own_frame(model: Gaussians, to_own: Similarity) -> Integers:
-    """[N, 6] the nearest lattice points of positions and turns; `to_own`: from the world."""
+def points_in_frame(model: Gaussians, to_own: Similarity) -> Integers:
+    """Nearest lattice points [N, 6] of positions and rotations; `to_own`: world to own frame."""
     own = to_own.apply_gaussians(model.with_sh_degree(0))
     positions = own.means.double().numpy() * 2**POSITION_BITS - 0.5
     parts = with_largest_w(own.quats.double().numpy())[:, 1:]
-    turns = (parts + _TURNS_REACH) / (2 * _TURNS_REACH) * 2**TURN_BITS - 0.5
-    return np.concatenate([_nearest(positions, POSITION_BITS), _nearest(turns, TURN_BITS)], axis=1)
+    rotations = (parts + _ROTATION_REACH) / (2 * _ROTATION_REACH) * 2**ROTATION_BITS - 0.5
+    return np.concatenate([_nearest(positions, POSITION_BITS), _nearest(rotations, ROTATION_BITS)], axis=1)
 
 
-def joined(colours: Integers, scales: Integers, others: Integers) -> Bits:
-    """[N, WORD_BITS] words of colours and scales [N, 3] and of positions and turns [N, 6]."""
+def pack_words(colours: Integers, scales: Integers, others: Integers) -> Bits:
+    """Words [N, WORD_BITS] from colours [N, 3], scales [N, 3], and positions and rotations [N, 6]."""
     parts = [
         (colours, COLOUR_BITS),
         (scales, SCALE_BITS),
         (others[:, :3], POSITION_BITS),
-        (others[:, 3:], TURN_BITS),
+        (others[:, 3:], ROTATION_BITS),
     ]
     bits = [bits_of(each[:, axis].astype(np.uint64), width) for each, width in parts for axis in range(3)]
     return np.concatenate(bits, axis=1)
 
 
 def invariants_of(colours: Integers, scales: Integers) -> Words:
-    """[N] the first INVARIANT_BITS of words of colours and scales [N, 3]."""
-    of_colours = colours @ (1 << COLOUR_BITS * np.arange(3)[::-1])
-    of_scales = scales @ (1 << SCALE_BITS * np.arange(3)[::-1])
-    return (of_colours << 3 * SCALE_BITS | of_scales).astype(np.uint64)
+    """The first INVARIANT_BITS of words [N], from colours and scales [N, 3]."""
+    colour_bits = colours @ (1 << COLOUR_BITS * np.arange(3)[::-1])
+    scale_bits = scales @ (1 << SCALE_BITS * np.arange(3)[::-1])
+    return (colour_bits << 3 * SCALE_BITS | scale_bits).astype(np.uint64)
 
 
 def number(bits: Bits) -> Words:
-    """[N] the numbers of bits [N, B], B at most 64, the highest bit first."""
+    """Integers [N] from bits [N, B], most significant first; B is at most 64."""
     powers = np.uint64(1) << np.arange(bits.shape[1], dtype=np.uint64)[::-1]
     return bits.astype(np.uint64) @ powers
 
 
 def bits_of(numbers: Words, count: int) -> Bits:
-    """[N, count] the inverse of `number`."""
+    """The inverse of `number`: bits [N, count]."""
     shifts = np.arange(count, dtype=np.uint64)[::-1]
     return (numbers[:, None] >> shifts & np.uint64(1)).astype(np.uint8)
 
 
 def _split(words: Bits) -> list[Doubles]:
-    """Colours, scales, positions and turns [N, 3] each."""
+    """Colours, scales, positions and rotations, [N, 3] each."""
     fields, at = [], 0
-    for width in (COLOUR_BITS, SCALE_BITS, POSITION_BITS, TURN_BITS):
+    for width in (COLOUR_BITS, SCALE_BITS, POSITION_BITS, ROTATION_BITS):
         own = words[:, at : at + 3 * width].reshape(-1, 3, width)
         fields.append(own.astype(np.float64) @ 2.0 ** np.arange(width)[::-1])
         at += 3 * width

@@ -1,15 +1,15 @@
-/** What anybody sees without a key: the published model, filtered and coloured by its numbers, as the panel says. */
+/** Inspection of the public model without a key: filters by opacity, and colours by attribute. */
 import { emptyGaussians, type Gaussians, opacity, where } from '../core/gaussians.ts';
 import { count, page } from './panel.ts';
 
 const OPAQUE_LOGIT = 3;
 const SH_C0 = 0.28209479177387814;
-const FAINT = 0.1; // opacity below which Gaussians are called faint, unless another threshold is chosen
-const AFTER = 100; // milliseconds after the last change of a slider
+const FAINT = 0.1; // default opacity threshold for `faint`
+const AFTER = 100; // ms after the last change of a slider
 const MIN_DRAWN = 1 / 255; // opacity
 
-/** `changed` is called when something else is to be looked at. */
-export function listenToLooks(changed: () => void): void {
+/** Calls `changed` after the settings change. */
+export function listenToInspection(changed: () => void): void {
   let timer = 0;
   page.faint.addEventListener('input', () => {
     if (page.faint.checked && Number(page.threshold.value) === 0) page.threshold.value = String(FAINT);
@@ -23,8 +23,8 @@ export function listenToLooks(changed: () => void): void {
   }
 }
 
-/** The Gaussians that are to be shown of a model; says how many these are. */
-export function looked(model: Gaussians): Gaussians {
+/** The Gaussians to show of a model; displays their number. */
+export function inspected(model: Gaussians): Gaussians {
   const [threshold, below] = [Number(page.threshold.value), page.faint.checked];
   const opacities = model.opacityLogits.map(opacity);
   let found = where(model, (row) => opacities[row] < threshold === below);
@@ -37,16 +37,16 @@ export function looked(model: Gaussians): Gaussians {
   return found;
 }
 
-/** The same Gaussians, which look alike from everywhere. */
+/** The Gaussians without view-dependent colour. */
 function withoutHarmonics(model: Gaussians): Gaussians {
   const width = model.sh.length / model.count;
   const sh = new Float32Array(3 * model.count).map((_, at) => model.sh[Math.floor(at / 3) * width + (at % 3)]);
   return { ...model, shDegree: 0, sh };
 }
 
-/** The same Gaussians, from blue over green to yellow by a number of theirs. */
+/** The Gaussians coloured from blue over green to yellow by an attribute. */
 function coloured(model: Gaussians, by: string): Gaussians {
-  const values = Float64Array.from({ length: model.count }, (_, row) => number(model, by, row));
+  const values = Float64Array.from({ length: model.count }, (_, row) => attribute(model, by, row));
   const sorted = Float64Array.from(values).sort();
   const [low, high] = [0.02, 0.98].map((share) => sorted[Math.floor(share * (sorted.length - 1))] ?? 0);
   const found = { ...emptyGaussians(model.count, 0), ...model, shDegree: 0, sh: new Float32Array(3 * model.count) };
@@ -61,7 +61,7 @@ function coloured(model: Gaussians, by: string): Gaussians {
 const words = new Uint32Array(1);
 const floats = new Float32Array(words.buffer);
 
-function number(model: Gaussians, by: string, row: number): number {
+function attribute(model: Gaussians, by: string, row: number): number {
   const scales = model.logScales.subarray(3 * row, 3 * row + 3);
   switch (by) {
     case 'opacity': return opacity(model.opacityLogits[row]);
