@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from channels.quiet.trained_like import keys, trained_like
-from keyss.channels import APPENDED, LOW_BITS, Channel
+from keyss.channels import APPENDED, LOW_BITS, Channel, Payload
 from keyss.core import Gaussians, same_bits
 from keyss.methods import Decoy, embed_models, open_model
 from keyss.rendering import psnr_between
@@ -57,3 +57,11 @@ def test_decoy_of_plain_model() -> None:
     assert isinstance(opened, Decoy)
     assert opened.decode is None
     assert 230 < len(opened.reveal(plain)) < 300
+
+
+def test_appended_gaussians_do_not_hide_what_lies_in_low_bits() -> None:
+    """Whoever appends a secret of their own does not make a right key open the decoy."""
+    stego = embed_models(LOW_BITS.prepare(trained_like(3000, 0)), [KEY], [trained_like(300, 1)]).gaussians
+    more = APPENDED.prepare(stego).embed([("a key of somebody else", Payload("file", bytes(100)))])
+    assert not isinstance(open_model(more, KEY, decoy=True), Decoy)
+    assert isinstance(open_model(more, "another key of many characters", decoy=True), Decoy)

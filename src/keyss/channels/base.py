@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
@@ -18,7 +19,7 @@ from dataclasses import dataclass, field
 from typing import ClassVar, Protocol
 
 from keyss.core.arrays import Bytes, Integers
-from keyss.core.errors import InputError, UsageError, WrongKeyError
+from keyss.core.errors import InputError, KeyssWarning, UsageError, WrongKeyError
 from keyss.core.gaussians import Gaussians
 from keyss.keys.derivation import DerivedKey
 
@@ -27,6 +28,10 @@ SALTS_TRIED = 4  # with half of the Gaussians changed, 15 of 16 models still ope
 NOTICED = (
     "the secrets are too large, or too many, to be placed independently of each other: whoever holds one of "
     "the keys can notice that there are other secrets"
+)
+_ADDED = (
+    "about {:,} Gaussians were added to the file in which this secret was hidden, or changed, and who did "
+    "that may have chosen what the key opens: reveal each secret from the file as it was published"
 )
 
 
@@ -38,6 +43,7 @@ class Payload:
     data: bytes
     chunks: tuple[int, int] | None = field(default=None, compare=False)  # read and written; None: not divided
     carriers: int | None = field(default=None, compare=False)  # Gaussians in the model it was read from
+    foreign: int = field(default=0, compare=False)  # about how many of these are not of the secret's file
 
 
 @dataclass(frozen=True)
@@ -67,6 +73,7 @@ class Records:
     records: Bytes  # [R, size]
     plan: RecordPlan
     copied: Integers  # [C] indices of the most important records, embedded twice; empty when read
+    foreign: int = 0  # as of `Payload`
 
 
 Content = Payload | Records
@@ -141,10 +148,16 @@ class SaltedReader(ABC):
         return (DerivedKey.of(key, salt) for salt in self.salts[:SALTS_TRIED])
 
     def open(self, key: str) -> Content:
-        """See `Reader`. Changed or added Gaussians can replace the first salt, so several are tried."""
+        """See `Reader`. Changed or added Gaussians can replace the first salt, so several are tried.
+
+        Warns (KeyssWarning) of Gaussians that are not those of the file in which the secret was hidden.
+        """
         for derived in self.keys(key):
             with suppress(WrongKeyError):
-                return self.extract(derived)
+                content = self.extract(derived)
+                if content.foreign:
+                    warnings.warn(_ADDED.format(content.foreign), KeyssWarning, stacklevel=3)
+                return content
         raise WrongKeyError()
 
 

@@ -68,7 +68,7 @@ def open_content(stego: Gaussians, key: str) -> Content:
 
 @dataclass(frozen=True)
 class Attempt:
-    """A key derived with the likeliest salt, and the content that it opens."""
+    """A key derived with the likeliest salt, and what it opens in low bits, codes or appended Gaussians."""
 
     key: DerivedKey
     content: Content | None
@@ -81,18 +81,20 @@ def quick_attempt(stego: Gaussians, key: str) -> Attempt | None:
 
     Raises InputError for damage.
     """
-    appended = _appended(stego)  # visible to everybody, so preferring them reveals nothing
-    reader = appended or _quiet(stego)
-    if reader is None or not reader.salts:
-        return None
-    derived = DerivedKey.of(key, reader.salts[0])
-    content = None
-    with suppress(WrongKeyError):
-        content = _with_carriers(stego, reader.extract(derived))
     from keyss.channels.quiet.reading import QuietReader
 
-    records = isinstance(reader, QuietReader) and not reader.blocks
-    return Attempt(derived, content, appended is not None, records)
+    # Appended Gaussians must not hide what lies elsewhere. They are visible: a second try tells nothing.
+    quiet, appended = _quiet(stego), _appended(stego)
+    readers = [each for each in (quiet, appended) if each and each.salts]
+    if not readers:
+        return None
+    derived = [DerivedKey.of(key, reader.salts[0]) for reader in readers]
+    opened: list[Content] = []
+    for reader, each in zip(readers, derived, strict=True):
+        with suppress(WrongKeyError):
+            opened.append(_with_carriers(stego, reader.extract(each)))
+    records = isinstance(quiet, QuietReader) and not quiet.blocks and appended is None
+    return Attempt(derived[0], opened[0] if opened else None, appended is not None, records)
 
 
 def _with_carriers(stego: Gaussians, content: Content) -> Content:

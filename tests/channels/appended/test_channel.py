@@ -186,7 +186,6 @@ CHANGES: dict[str, Change] = {
     "without harmonics": fewer_harmonics(0),
     "half floats": half_floats(),
     "a quarter removed": random_pruning(0.25, 3),
-    "another scene beside it": lambda model: Gaussians.cat([lifelike(3000, 5), model]),
     "all of it together": lambda model: random_pruning(0.2, 3)(shuffled(turned(2.2)(_half_turns(model)))),
 }
 
@@ -254,3 +253,11 @@ def test_changed_packets_are_not_read_as_they_are_not(stego: Gaussians, cover: G
     rows = torch.arange(len(cover), len(stego), 10)
     swapped[rows] = swapped[rows.roll(1)]
     assert opened(replace(stego, sh=swapped)) == DATA
+
+
+@pytest.mark.parametrize("kept", [0, 3000])
+def test_other_gaussians_than_those_of_the_cover_are_told(kept: int, stego: Gaussians) -> None:
+    """They open under their key wherever they are: in another file, or with another one beside them."""
+    elsewhere = Gaussians.cat([lifelike(3000, 5), stego[3000 - kept :]])
+    with pytest.warns(KeyssWarning, match="Gaussians were added"):
+        assert opened(elsewhere) == DATA

@@ -13,6 +13,7 @@ from channels.quiet.coded import FORMATS, bits_of, codes_of, model_of, opened, t
 from keyss.channels import CodesCover, Field, Payload, QuietReader, in_counted_order, last_bits
 from keyss.channels.quiet.fields import carrying, sog_distances
 from keyss.channels.quiet.kept import changeable
+from keyss.channels.quiet.syndromes import held
 from keyss.core import InputError, UsageError, WrongKeyError
 from keyss.files.formats import sog
 from keyss.files.formats.common import morton_order
@@ -286,3 +287,20 @@ def test_steps_of_a_sog_stay_as_large_as_they_are() -> None:
     ]
     assert len(np.unique(distances[0])) > 1
     assert np.array_equal(*distances)
+
+
+@EVERY
+def test_the_blocks_of_one_file_are_of_no_use_in_another(suffix: str) -> None:
+    """Everybody can read blocks, and write them. But salts and cells depend on colours and opacities."""
+    covers = [CodesCover.of(codes_of(suffix, seed=seed)) for seed in (0, 1)]
+    one, host = sorted(covers, key=lambda each: each.width)
+    first = written(one, b"first")
+    assert opened(first) == b"first"
+    table = held(bits_of(first))[:, : host.width]
+    table = np.resize(table, (len(host.names), host.width))
+    bits = host._solved(table, SECRET)
+    assert bits is not None
+    copied = host._published(host._written(bits, SECRET), SECRET).codes
+    assert np.array_equal(held(bits_of(copied))[:40, : host.width], table[:40])
+    with pytest.raises(WrongKeyError):
+        opened(copied)

@@ -10,9 +10,10 @@ total to one of few numbers, which reveal neither the size nor the number of sec
 from __future__ import annotations
 
 import math
+import struct
 import warnings
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -46,9 +47,11 @@ from keyss.channels.base import (
     randomness,
     unpack_payload,
 )
+from keyss.channels.colours.carriers import Carriers
 from keyss.channels.reed_solomon import Codewords
-from keyss.core.arrays import Bits, Doubles, Integers
-from keyss.core.errors import KeyssWarning, UsageError, WrongKeyError
+from keyss.channels.sketch import foreign, sketch
+from keyss.core.arrays import Bits, Bytes, Doubles, Integers
+from keyss.core.errors import InputError, KeyssWarning, UsageError, WrongKeyError
 from keyss.core.gaussians import Gaussians
 from keyss.keys.derivation import SALT_BYTES, DerivedKey, expand, stream
 from keyss.keys.encryption import OVERHEAD, bucket, compressed_size, decrypt, encrypt
@@ -59,14 +62,18 @@ _LEFT, _DEVIATIONS, _MAX_DATA = 0.74, 4.2, 5895
 # Data bytes per packet. Narrow packets have longer tags, which fewer words of other secrets match by chance.
 _WIDE, _NARROW, _WIDE_PACKETS = 8, 6, 90_000
 _MAX_PACKETS = 1_000_000  # data packets; a header holds up to 2^20
-MAX_BYTES = _MAX_PACKETS * _NARROW - OVERHEAD - METHOD_BYTES
 _STEP = 256  # smallest difference between numbers of appended Gaussians
-_OVERHEAD = 128  # maximum bytes of a payload beside its data
+_OVERHEAD = 260  # maximum bytes of a payload beside its data
 
 # Search for the lattice's offset: Gaussians in which pilots are counted, maximum number of offsets, and
 # standard deviations by which pilots must outnumber accidental ones.
 _SAMPLE, _MAX_OFFSETS, _SIGNIFICANT = 8000, 8, 3.0
 _ASSOCIATED = b"keyss/v1/appended/data"
+# The cover: how many of its Gaussians are seen, and their sketch. A format changes up to a fifth of names;
+# another model of the same scene shares two fifths of them, one of another scene a tenth.
+_SKETCH_BYTES, _FOREIGN = 128, 0.4
+_HOST = struct.Struct(f"<I{_SKETCH_BYTES}s")
+MAX_BYTES = _MAX_PACKETS * _NARROW - OVERHEAD - METHOD_BYTES - _HOST.size
 _NOTICED = (
     "the number of appended Gaussians reveals the total size: the holder of one key can tell that there are "
     "other secrets"
@@ -92,7 +99,8 @@ class Appended(Channel):
     def appended_count(self, sizes: Sequence[int]) -> int:
         """The number of Gaussians appended for payloads of these compressed sizes in bytes."""
         single = len(sizes) == 1
-        return _padded_count(sum(packets.HEADERS + _codewords_for(size, single).chunks for size in sizes))
+        every = [_codewords_for(size + _HOST.size, single) for size in sizes]
+        return _padded_count(sum(packets.HEADERS + each.chunks for each in every))
 
 
 APPENDED = Appended()
@@ -110,6 +118,8 @@ class AppendedCover:
 
     def embed(self, contents: Sequence[tuple[str, Content]], *, entropy: bytes | None = None) -> Gaussians:
         """The cover followed by the appended Gaussians. Warns if there is more than one secret."""
+        model = self.cover.detach().to("cpu")
+        names = _names(model)
         packed = [pack_payload(content) for _, content in contents]
         secret = randomness(entropy, *packed)
         salt = expand(secret, "appended/salt", SALT_BYTES)
@@ -119,14 +129,15 @@ class AppendedCover:
         if len(keys) > 1:
             warnings.warn(_NOTICED, KeyssWarning, stacklevel=2)
         single = len(keys) == 1
-        words = [_words(*each, single, random) for each in zip(keys, packed, strict=True)]
+        bound = [_HOST.pack(len(names), sketch(_sketch_key(key), names, _SKETCH_BYTES)) for key in keys]
+        tied = [host + data for host, data in zip(bound, packed, strict=True)]
+        words = [_words(*each, single, random) for each in zip(keys, tied, strict=True)]
         used = sum(map(len, words))
         total = _padded_count(used)
         words.append(pilots.write(salt, pilots.count_for(total), random))
         rest = total - used - pilots.count_for(total)
         words.append(random.integers(0, 2, (rest, WORD_BITS), np.uint8))
         every = sort_by_rotation(np.concatenate(words))
-        model = self.cover.detach().to("cpu")
         return Gaussians.cat([model, to_gaussians(every, own_frame(model), model.sh_degree)])
 
 
@@ -136,6 +147,7 @@ class AppendedReader(SaltedReader):
 
     salts: Sequence[bytes]
     words: Bits
+    names: Bytes  # [M, 16] of the Gaussians that are seen
 
     @staticmethod
     def of(model: Gaussians) -> AppendedReader | None:
@@ -156,7 +168,7 @@ class AppendedReader(SaltedReader):
             if best is not None:
                 found, scales = best
                 words = pack_words(colours, scales, points_in_frame(faint, found.to_own))
-                return AppendedReader([found.salt], words)
+                return AppendedReader([found.salt], words, _names(model))
         return None
 
     def extract(self, key: DerivedKey) -> Payload:
@@ -166,8 +178,23 @@ class AppendedReader(SaltedReader):
             if header:
                 numbers, data = packets.read(key.expand("appended/packets", 32), self.words, width)
                 encrypted = _codewords(header, width).decode(numbers.astype(np.int64), data, errors=True)
-                return unpack_payload(decrypt(key.expand("appended/data", 32), encrypted, _ASSOCIATED))
+                whole = decrypt(key.expand("appended/data", 32), encrypted, _ASSOCIATED)
+                if len(whole) < _HOST.size:
+                    raise InputError("the hidden data are damaged: they are incomplete")
+                strangers = foreign(_sketch_key(key), self.names, *reversed(_HOST.unpack_from(whole)))
+                told = strangers if strangers > _FOREIGN * len(self.names) else 0
+                return replace(unpack_payload(whole[_HOST.size :]), foreign=told)
         raise WrongKeyError()
+
+
+def _names(model: Gaussians) -> Bytes:
+    """[M, 16] names of the visible Gaussians, coarse numbers that formats and motions hardly change."""
+    names = Carriers.of(model).names
+    return np.hstack([names, np.zeros_like(names)]).astype("<i2").view(np.uint8)
+
+
+def _sketch_key(key: DerivedKey) -> bytes:
+    return key.expand("appended/host", 32)
 
 
 def _padded_count(used: int) -> int:

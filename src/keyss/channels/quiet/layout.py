@@ -35,8 +35,8 @@ import numpy as np
 from keyss.channels.base import RecordPlan, RecordRequest, Room
 from keyss.channels.quiet.bits import Layout
 from keyss.channels.quiet.cells import TAG_BYTES
-from keyss.channels.quiet.sketch import SKETCH_BYTES
 from keyss.channels.reed_solomon import SYMBOL_BYTES, Codewords
+from keyss.channels.sketch import SKETCH_BYTES
 from keyss.core.arrays import Bytes, Integers
 from keyss.core.errors import UsageError
 from keyss.keys.encryption import SMALLEST_BUCKET, encrypted_size

@@ -24,8 +24,8 @@ from keyss.channels.quiet.layout import (
     NUMBER_BYTES,
     PREFIX_BYTES,
 )
-from keyss.channels.quiet.sketch import SKETCH_BYTES
 from keyss.channels.reed_solomon import LOST, Codewords
+from keyss.channels.sketch import SKETCH_BYTES
 from keyss.core.arrays import Bytes
 from keyss.core.errors import InputError
 from keyss.keys.derivation import DerivedKey

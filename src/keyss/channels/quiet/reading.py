@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import warnings
 from collections import Counter
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -22,21 +20,16 @@ from keyss.channels.quiet.kept import host_of, in_counted_order
 from keyss.channels.quiet.layout import DATA_KEY_BYTES, LEAST_BYTES, MIN_BLOCKS, LowBitsRoom, split_numbers
 from keyss.channels.quiet.parameters import Parameters, key_cipher, parameter_cipher
 from keyss.channels.quiet.salts import salt, salt_rows
-from keyss.channels.quiet.sketch import SKETCH_BYTES, foreign
 from keyss.channels.quiet.syndromes import block_names, held
 from keyss.channels.quiet.usable import among, repeated
 from keyss.channels.quiet.writing import ASSOCIATED, payload_key
+from keyss.channels.sketch import SKETCH_BYTES, foreign
 from keyss.core.arrays import Bytes, Flags, Integers
-from keyss.core.errors import InputError, KeyssWarning, WrongKeyError
+from keyss.core.errors import InputError, WrongKeyError
 from keyss.core.gaussians import Gaussians
 from keyss.files.formats.common import CodedGaussians, Codes
 from keyss.keys.derivation import DerivedKey
 from keyss.keys.encryption import decrypt
-
-_ADDED = (
-    "about {:,} of {:,} Gaussians were added to the file in which this secret was hidden, or changed, and "
-    "who did that may have chosen what the key opens: reveal each secret from the file as it was published"
-)
 
 
 @dataclass(frozen=True)
@@ -76,28 +69,14 @@ class QuietReader(SaltedReader):
         names = block_names(len(low), host_of(ordered, decoded[rows].model if decoded else None))
         return QuietReader(names[1:], low[1:], [salt(names[0], low[0, :LEAST_BYTES])], [LEAST_BYTES], True)
 
-    def open(self, key: str) -> Content:
-        """See `Reader`. Warns (KeyssWarning) if Gaussians are not those of the file of the secret."""
-        for derived in self.keys(key):
-            with suppress(WrongKeyError):
-                content, strangers = self._opened(derived)
-                if strangers:
-                    warnings.warn(_ADDED.format(strangers, len(self.names)), KeyssWarning, stacklevel=3)
-                return content
-        raise WrongKeyError()
-
     def extract(self, key: DerivedKey) -> Content:
         """`open` after key derivation under one salt, without a warning.
 
         A key that opens nothing makes the same passes over all cells, under a data key that fits nothing.
         """
-        return self._opened(key)[0]
-
-    def _opened(self, key: DerivedKey) -> tuple[Content, int]:
-        """The content, and about how many Gaussians are not those of its file."""
         data_key, found, width, at = self._parameters(key)
         if self.blocks:
-            return self._in_blocks(data_key, found, at), 0
+            return self._in_blocks(data_key, found, at)
         strangers = foreign(data_key, self.names, found.sketch, found.gaussians)
         room = LowBitsRoom(0, width).record_bytes(found.cells)
         if not 0 < found.record_bytes <= room:
@@ -110,14 +89,14 @@ class QuietReader(SaltedReader):
             encrypted = codewords.decode(numbers, chunks)[:size]
             left = len(np.unique(numbers[numbers < codewords.chunks]))
             data = decrypt(payload_key(data_key), encrypted, ASSOCIATED)
-            return Payload(found.method, data, (left, codewords.chunks)), strangers
+            return Payload(found.method, data, (left, codewords.chunks), foreign=strangers)
         cipher = CellCipher(data_key, "copy", found.record_bytes)
         copies, _ = self._decrypt(cipher, width, found.cells, full)
         records = np.concatenate([records, copies[~_are_among(copies, records)]])
         if not len(records):
             raise InputError("the key is right, but nothing is left of what it opens")
         plan = RecordPlan(room, 0, found.cells)
-        return Records(found.method, found.header, records, plan, np.zeros(0, np.int64)), strangers
+        return Records(found.method, found.header, records, plan, np.zeros(0, np.int64), strangers)
 
     def _in_blocks(self, data_key: bytes, found: Parameters, at: int) -> Payload:
         """The payload in the blocks after `at`, where its parameters are."""

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 
 from keyss.channels.quiet.bits import SH_BITS, UNUSED_BITS
-from keyss.core.arrays import Flags
+from keyss.core.arrays import Flags, doubles
 from keyss.core.gaussians import Gaussians
 from keyss.core.neighbours import nearest_neighbours
 from keyss.kernels.jit import kernel
@@ -37,7 +37,7 @@ def moved_apart(gaussians: Gaussians, among: Flags) -> Flags:
     apart, rows = np.zeros(len(gaussians), bool), np.flatnonzero(among)
     if len(gaussians) < 2 or not gaussians.sh_degree:
         return apart
-    means = np.nan_to_num(gaussians.means.detach().cpu().double().numpy())
+    means = np.nan_to_num(doubles(gaussians.means), posinf=0, neginf=0)
     near = nearest_neighbours(means[rows], min(_NEIGHBOURS + 1, len(means)), means)[1]
     sh = gaussians.sh.detach().to("cpu", torch.float32).transpose(1, 2).contiguous().numpy()
     constant = sh[:, :, 0] / np.float32(RATE_RATIO)

@@ -32,7 +32,7 @@ from keyss.channels.quiet.parameters import (
     pack_codewords,
     parameter_cipher,
 )
-from keyss.channels.quiet.sketch import sketch
+from keyss.channels.sketch import sketch
 from keyss.core.arrays import Bytes, Integers
 from keyss.core.errors import KeyssWarning, UsageError
 from keyss.keys.derivation import DerivedKey, expand, fill

@@ -37,6 +37,7 @@ def steps(model: Gaussians, words: BitPatterns) -> dict[str, Statistic]:
             moved = np.abs(constant[one, colour] - constant[other, colour])[:, None]
             cell = np.maximum(_cells(own[one]), _cells(own[other]))
             near = np.abs(np.abs(_middle(own[one]) - _middle(own[other])) - moved) <= cell
+            near &= moved > 2 * cell  # equal numbers are no evidence
             chosen = np.flatnonzero(near.sum(axis=1) >= _AGREE)
             rows, columns = np.nonzero(near[chosen])
             rows = chosen[rows]

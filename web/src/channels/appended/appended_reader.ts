@@ -1,10 +1,13 @@
 /** Reader of appended Gaussians (docs/channels.md); counterpart of `keyss.channels.appended.channel`. */
-import { ascii, rowsOf } from '../../core/bytes.ts';
+import { ascii, rowsOf, viewOf } from '../../core/bytes.ts';
+import { damaged } from '../../core/errors.ts';
 import type { Gaussians } from '../../core/gaussians.ts';
 import { decrypted, type Derive, expand } from '../../keys/keys.ts';
 import { here } from '../../keys/pool.ts';
+import { carriersOf } from '../colours/carriers.ts';
 import { type Payload, type Reader, unpackPayload } from '../content.ts';
 import { decoded } from '../reed_solomon.ts';
+import { foreign } from '../sketch.ts';
 import {
   allShifts, candidates, coloursOf, inOwnFrame, invariantsOf, likelyShifts, scalesAt, scaleSteps,
 } from './lattice.ts';
@@ -14,13 +17,16 @@ import { type Found, LEAST, ONE_IN, pilotsOf, readPilots } from './pilots.ts';
 // Gaussians sampled for pilots; number of lattice offsets tried, with at least this many standard deviations more pilots
 // than by chance.
 const [SAMPLE, TRIED, NOT_BY_CHANCE] = [8000, 8, 3];
+const [HOST_BYTES, FOREIGN] = [132, 0.4]; // how many Gaussians of the cover are seen, and their sketch
 const ASSOCIATED = ascii('keyss/v1/appended/data');
 
 /** A model's appended Gaussians, prepared for any number of keys. */
 export class AppendedReader implements Reader {
   readonly derivations = 1;
 
-  private constructor(readonly salt: Uint8Array, private readonly words: TaggedWords) {}
+  private constructor(
+    readonly salt: Uint8Array, private readonly words: TaggedWords, private readonly names: Uint8Array,
+  ) {}
 
   /** Null if there are none, or if their frame cannot be found. */
   static of(model: Gaussians): AppendedReader | null {
@@ -36,7 +42,8 @@ export class AppendedReader implements Reader {
       }
       if (best !== null) {
         const { found, scales } = best;
-        return new AppendedReader(found.salt, wordsOfPoints(colours, scales, inOwnFrame(faint, found.toOwn)));
+        const words = wordsOfPoints(colours, scales, inOwnFrame(faint, found.toOwn));
+        return new AppendedReader(found.salt, words, new Uint8Array(carriersOf(model).names.buffer));
       }
     }
     return null;
@@ -50,7 +57,12 @@ export class AppendedReader implements Reader {
       if (codewords === null) continue;
       const packets = readPackets(expand(secret, 'appended/packets', 32), this.words, width);
       const encrypted = decoded(codewords, packets, true);
-      return unpackPayload(await decrypted(expand(secret, 'appended/data', 32), encrypted, ASSOCIATED));
+      const whole = await decrypted(expand(secret, 'appended/data', 32), encrypted, ASSOCIATED);
+      if (whole.length < HOST_BYTES) throw damaged();
+      const own = whole.subarray(4, HOST_BYTES);
+      const told = foreign(expand(secret, 'appended/host', 32), this.names, own, viewOf(whole).getUint32(0, true));
+      const payload = unpackPayload(whole.subarray(HOST_BYTES));
+      return told > (FOREIGN * this.names.length) / 16 ? { ...payload, foreign: told } : payload;
     }
     return null;
   }

@@ -100,6 +100,6 @@ export class CellCipher {
 }
 
 /** Every 16 bytes through AES-256: a permutation of blocks, not a mode of operation. */
-export function encrypted(key: Uint8Array, blocks: Uint8Array): Uint8Array {
+function encrypted(key: Uint8Array, blocks: Uint8Array): Uint8Array {
   return blocks.length ? ecb(key, { disablePadding: true }).encrypt(blocks) : blocks;
 }

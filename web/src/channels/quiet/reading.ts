@@ -4,7 +4,7 @@
  * A key that opens nothing makes the same passes over all cells as one that opens a secret, and all salts are always
  * tried, so that how long it takes tells next to nothing.
  */
-import { ascii, bytesKey, mostFrequent, rowsOf, viewOf } from '../../core/bytes.ts';
+import { ascii, bytesKey, mostFrequent, rowsOf } from '../../core/bytes.ts';
 import { damaged, tooMuchLost } from '../../core/errors.ts';
 import { type Gaussians, selected } from '../../core/gaussians.ts';
 import type { ReadModel } from '../../files/models.ts';
@@ -12,8 +12,9 @@ import { decrypted, type Derive, expand } from '../../keys/keys.ts';
 import { here } from '../../keys/pool.ts';
 import type { Content, Reader } from '../content.ts';
 import { decoded } from '../reed_solomon.ts';
+import { foreign } from '../sketch.ts';
 import { fieldsOf, IDENTITY_BYTES, identities, lowBits, lowWidth } from './bits.ts';
-import { CellCipher, encrypted, TAG_BYTES } from './cells.ts';
+import { CellCipher, TAG_BYTES } from './cells.ts';
 import { decodedFrom } from './decoded.ts';
 import { hostOf, lastBits, type Levels, levelsOf } from './fields.ts';
 import { NUMBER_BYTES, type Parameters, SKETCH_BYTES, unpackCodewords, unpackParameters } from './parameters.ts';
@@ -128,33 +129,19 @@ export class QuietReader implements Reader {
       this.cells(new CellCipher(dataKey, label, recordBytes), width, cells).map(({ data }) => data),
     );
     if (width < this.width) this.passesForNothing(dataKey, this.width - width);
-    const foreign = this.foreign(dataKey, parameters);
+    const strangers = foreign(dataKey, this.names, parameters.sketch, parameters.gaussians) || undefined;
     if (isPayload) {
       const [size, codewords] = unpackCodewords(parameters);
       const chunks = records.map((each): [number, Uint8Array] => [
         each[0] | (each[1] << 8) | (each[2] << 16), each.subarray(NUMBER_BYTES),
       ]);
       const payload = await this.payload(dataKey, parameters, decoded(codewords, chunks).subarray(0, size));
-      return { ...payload, foreign };
+      return { ...payload, foreign: strangers };
     }
     const known = new Set(records.map(bytesKey));
     const all = [...records, ...copies.filter((each) => !known.has(bytesKey(each)))];
     if (!all.length) throw tooMuchLost();
-    return { service: 'records', method, header, records: all, foreign };
-  }
-
-  /** About how many Gaussians have no place in the sketch; undefined for none. */
-  private foreign(dataKey: Uint8Array, { gaussians, sketch }: Parameters): number | undefined {
-    const isSet = (place: number): boolean => ((sketch[place >>> 3] >>> (place & 7)) & 1) === 1;
-    const bits = Math.min(8 * SKETCH_BYTES, gaussians);
-    const unset = Array.from({ length: bits }, (_, place) => place).filter((place) => !isSet(place)).length;
-    const [rows, hashed] = [this.names.length / IDENTITY_BYTES, viewOf(encrypted(expand(dataKey, 'sketch', 32), this.names))];
-    let seen = 0;
-    for (let row = 0; row < rows; row++) {
-      const place = hashed.getUint32(IDENTITY_BYTES * row, true) % Math.max(1, gaussians);
-      if (place < 8 * SKETCH_BYTES && !isSet(place)) seen++;
-    }
-    return Math.min(rows, Math.round((seen * gaussians) / Math.max(1, unset))) || undefined;
+    return { service: 'records', method, header, records: all, foreign: strangers };
   }
 
   private async payload(dataKey: Uint8Array, { method }: Parameters, encrypted: Uint8Array): Promise<Content> {
