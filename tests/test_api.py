@@ -66,10 +66,10 @@ def write_nerfstudio(
 
 def psnr_of_pictures(model: Path, scene: Path, width: int | None = None) -> float:
     """Mean over the test views of a scene, independent of keyss's measures."""
-    pictures = dict(keyss.render(model, scene, width=width))
+    pictures = [picture for _, picture in keyss.render(model, scene, width=width)]
     errors = [
-        (pictures[view.camera.name.replace("/", "_")].float() - view.image.float()).square().mean() / 255**2
-        for view in keyss.load_scene(scene, width=width).test
+        (picture.float() - view.image.float()).square().mean() / 255**2
+        for picture, view in zip(pictures, keyss.load_scene(scene, width=width).test, strict=True)
     ]
     return float(-10 * torch.stack(errors).log10().mean())
 
