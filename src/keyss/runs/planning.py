@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
+from statistics import fmean
 from typing import NamedTuple
 
 import psutil
@@ -18,12 +19,14 @@ from keyss.core.errors import KeyssWarning, OutputError
 from keyss.core.scene import Scene
 from keyss.fitting.config import FitConfig
 from keyss.fitting.losses import Targets
+from keyss.fitting.schedule import shrinking
 from keyss.methods.base import Method, MethodOptions, Plan, Source, Stage, role_of
 from keyss.methods.plain_models import Bound, plain_stage
 from keyss.progress import about
 
 _LONG = 1000  # steps
 _STEP_SECONDS = {"cpu": 5e-7, "cuda": 6e-9}  # per training step, Gaussian and two pixels
+_PARTS = 40  # of a fit: the sizes of its photos are those at their middles
 _KEY_SECONDS = 3.0  # deriving a secret's key for every salt, and opening the secret again
 _RENDERS = 2  # training steps that take as long as measuring a test view
 _STATE_COPIES = 3  # checkpoint / model: parameters and two moments of Adam
@@ -52,7 +55,8 @@ def plan_hiding(
         role, size, step = role_of(index, count), sizes[index], steps[index]
         own = config.iterations if source.given is None else None
         if own is not None:
-            stages.append(Stage(plain_stage(role), own, size, own * step))
+            seconds = _fit_seconds(device, size, source.scene, config)
+            stages.append(Stage(plain_stage(role), own, size, seconds))
         longer = Bound.of(training, own)
         if bound and source.photos and not longer.equal and longer.steps is not None:
             bounds.append(Stage(f"upper bound of the {role}", longer.steps, size, longer.steps * step))
@@ -78,7 +82,7 @@ def plan_hiding(
 def plan_fit(scene: Scene, config: FitConfig, device: torch.device) -> Plan:
     """The plan of a plain fit."""
     gaussians, degree = config.max_gaussians, config.sh_degree
-    seconds = config.iterations * config.views_per_step * _step(device, gaussians, scene)
+    seconds = _fit_seconds(device, gaussians, scene, config)
     needs = needs_of_fit(scene, config)
     return Plan(
         gaussians=gaussians,
@@ -185,10 +189,26 @@ def _free_bytes(out: Path) -> int:
     return shutil.disk_usage(folder).free
 
 
+def _fit_seconds(device: torch.device, gaussians: int, scene: Scene, config: FitConfig) -> float:
+    """Seconds of a plain fit, which shrinks large photos at first."""
+    pixels = _pixels(scene)
+    middles = (int(config.iterations * (part + 0.5) / _PARTS) + 1 for part in range(_PARTS))
+    shown = fmean(pixels / shrinking(config, iteration, pixels) ** 2 for iteration in middles)
+    return config.iterations * config.views_per_step * _seconds(device, gaussians, shown)
+
+
 def _step(device: torch.device, gaussians: int, scene: Scene) -> float:
     """Seconds of a training step with one view."""
+    return _seconds(device, gaussians, _pixels(scene))
+
+
+def _seconds(device: torch.device, gaussians: int, pixels: float) -> float:
+    return _STEP_SECONDS[device.type] * (gaussians + pixels / 2)
+
+
+def _pixels(scene: Scene) -> int:
     camera = scene.test[0].camera
-    return _STEP_SECONDS[device.type] * (gaussians + camera.width * camera.height / 2)
+    return camera.width * camera.height
 
 
 def _ply_bytes(gaussians: int, sh_degree: int) -> int:
