@@ -126,9 +126,10 @@ def prepare_streams() -> None:
             os.fstat(number)
         except OSError:
             os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)
-    encoding = getattr(sys.stderr, "encoding", None) or "utf-8"
-    file = io.BufferedWriter(_Unfailing(2, "w", closefd=False))
-    sys.stderr = io.TextIOWrapper(file, encoding, "backslashreplace", line_buffering=True)
+    if os.name == "posix":  # a console of Windows takes UTF-16, not the bytes of a file
+        encoding = getattr(sys.stderr, "encoding", None) or "utf-8"
+        file = io.BufferedWriter(_Unfailing(2, "w", closefd=False))
+        sys.stderr = io.TextIOWrapper(file, encoding, "backslashreplace", line_buffering=True)
     if sys.stdin is None:
         sys.stdin = open(0, closefd=False)  # noqa: SIM115
     if sys.stdout is None:
