@@ -36,6 +36,9 @@ def test_pruned_secret() -> None:
     baseline = replace(METRICS.baseline, gaussians=(10, 8406))
     fewer = replace(METRICS, baseline=baseline, secret_gaussians=(2480,), secret_degrees=((0, 3),))
     assert ["The secret kept 2,480 of 8,406 Gaussians, SH degree 0 of 3, 31.0 dB."] in table(fewer)
+    assert not any(
+        "kept" in row[0] for row in table(replace(METRICS, baseline=replace(baseline, gaussians=(10, 567))))
+    )
 
 
 def test_shorter_plain_model_is_no_bound() -> None:

@@ -165,7 +165,7 @@ def _explanations(metrics: HideMetrics, names: Sequence[str], heads: Sequence[st
 
 
 def _lines_on_files(metrics: HideMetrics, names: Sequence[str]) -> list[str]:
-    """A line on the published file, and one on each secret."""
+    """A line on the published file, and one on each secret that lost something."""
     lines = []
     reached = (f"{name} {each.psnr:.1f}" for name, each in zip(names, metrics.against_plain, strict=True))
     lines.append(f"Revealed from the published file, PSNR to the plain models: {', '.join(reached)} dB.")
@@ -178,6 +178,8 @@ def _lines_on_files(metrics: HideMetrics, names: Sequence[str]) -> list[str]:
         strict=True,
     )
     for name, count, before, (degree, full), each in kept:
+        if degree == full and before in (None, count):
+            continue
         of = f" of {before:,}" if before and before >= count else ""
         cut = f", SH degree {degree} of {full}" if degree < full else ""
         lines.append(f"The {name} kept {count:,}{of} Gaussians{cut}, {each.psnr:.1f} dB.")
