@@ -12,8 +12,6 @@
 #   make test-web      the viewer: types, its reader against the vectors, and end to end in headless Chromium
 #   make docs          the documentation as a site, in site/
 #   make pictures      the pictures of the documents, from the demo
-#   make benchmark-check        a quick benchmark against the stored one; fails where something got slower
-#   make benchmark-baseline     store what the quick benchmark measures as the next baseline
 #   make benchmark-rasterizer   time the CPU rasterizer (ARGS="--large", "--models FOLDER")
 # On Linux, PyPI's torch brings the CUDA libraries, several gigabytes. For a machine without a GPU:
 #   make demo PIP_EXTRA="--extra-index-url https://download.pytorch.org/whl/cpu"
@@ -61,7 +59,7 @@ unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: demo test web reader test-web test-web-units test-real test-slow test-cuda test-oldest test-oldest-quick \
   test-processors test-on-baseline test-on-avx2 coverage lint format docs pictures venv clean \
-  benchmark-check benchmark-baseline benchmark-rasterizer
+  benchmark-rasterizer
 
 demo: $(PACKAGE)
 	$(BIN)/keyss demo -o out/demo --overwrite $(ARGS)
@@ -124,12 +122,6 @@ docs: $(DEV)
 
 pictures: $(DEV) demo
 	$(BIN)/python docs/pictures.py out/demo
-
-benchmark-check: $(DEV)
-	$(BIN)/python benchmarks/quick.py --check $(ARGS)
-
-benchmark-baseline: $(DEV)
-	$(BIN)/python benchmarks/quick.py --baseline $(ARGS)
 
 benchmark-rasterizer: $(DEV)
 	$(BIN)/python benchmarks/rasterizer.py $(ARGS)

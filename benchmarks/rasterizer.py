@@ -19,7 +19,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from benchmark_record import make_record, numbers_of_table, processor_name, write_record
 from keyss.core import Camera, Gaussians
 from keyss.files import read_model
 from keyss.fitting.config import FitConfig
@@ -299,19 +298,11 @@ def main() -> None:
         ),
     ]  # fmt: skip
     heading = (
-        f"{processor_name()}, {os.cpu_count()} cores; Python {platform.python_version()}, torch "
+        f"{platform.machine()}, {os.cpu_count()} cores; Python {platform.python_version()}, torch "
         f"{torch.__version__}. Milliseconds of wall time: the smallest of {n} repeats, and in brackets the "
         "median."
     )
-    text = "\n\n".join([heading, *(table(titles, rows) for titles, rows in tables)])
-    print(text)
-    numbers = {
-        f"{titles[0]}: {name}": value  # two tables have a column `backward`
-        for titles, rows in tables
-        for name, value in numbers_of_table(titles, rows).items()
-    }
-    ratios = {name: value for name, value in numbers.items() if name.endswith("step / rasterizer")}
-    print(write_record(make_record("rasterizer", numbers, ratios)))
+    print("\n\n".join([heading, *(table(titles, rows) for titles, rows in tables)]))
 
 
 if __name__ == "__main__":
