@@ -54,7 +54,7 @@ LEAST = """
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from keyss.api import hide as hiding
-from keyss.channels import identities
+from keyss.channels import gaussian_ids
 from keyss.files.models import read_model, write_model
 from keyss.rendering.orbit import scene_of_model
 folder = sys.argv[1]
@@ -63,7 +63,7 @@ with ThreadPoolExecutor(2) as workers:
     scenes = [scene_of_model(model, "", train_pictures=False) for model in models]
     list(workers.map(hiding.Gaussians.digest, models))
     list(workers.map(lambda number: hiding.DerivedKey.of("key", bytes([number]) * 16), range(15)))
-identities(models[0])
+gaussian_ids(models[0])
 write_model(f"{folder}/least.ply", models[0])
 models[0] = read_model(f"{folder}/least.ply")
 for model, scene in zip(models, scenes):
@@ -180,7 +180,7 @@ def _step(step: str, folder: Path, options: argparse.Namespace) -> None:
             channel = channel_for("any") if any_format else channel_for("as-is", format=options.format)
             prepared = channel.prepare(cover)
             if options.prune:
-                secret = prune_to_size(secret, prepared.room.capacity - prepared.room.overhead)
+                secret = prune_to_size(secret, prepared.capacity.bytes - prepared.capacity.overhead)
         write_model(published, embed_models(prepared, [KEY], [secret]).gaussians)
     else:
         revealed = reveal_model(read_model(published), KEY, device=torch.device("cpu")).gaussians

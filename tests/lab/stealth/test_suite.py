@@ -53,11 +53,11 @@ def test_new_low_bits_are_detected_where_old_ones_were_not_random(
     name: str, natural: Callable[[int], Gaussians]
 ) -> None:
     model = natural(1)
-    sealed = overwritten(model, bits=8)
+    stego = overwritten(model, bits=8)
     if "sharers" in name:
         # Siblings share constant colours, which stay as they are; the rest is near now, not equal.
-        assert stealth_statistics(sealed)[name].value > 0.1
-    assert z(name, model, sealed) > 5
+        assert stealth_statistics(stego)[name].value > 0.1
+    assert z(name, model, stego) > 5
     assert z(name, model, natural(2)) < 4.5
 
 
