@@ -85,7 +85,7 @@ def hide(
     integers of an "spz", "sog" or "compressed-ply", or of a model decoded from one. By default `format` is
     the cover's; if nothing can be hidden in it unnoticed, `publish` becomes "any", with a warning. "any"
     survives conversion: in the channel "appended" (more Gaussians, which are visible in the file) or
-    "colours" (less room). `width`, `background`, `skip_missing`: see `load_scene`.
+    "colours" (less capacity). `width`, `background`, `skip_missing`: see `load_scene`.
 
     `out` (a folder) gets `publish/` with the stego model, and `private/` with fitted models, `config.json`,
     `metrics.json`, the files to hand over for methods that need them (`keyss.methods.handed`), and

@@ -8,9 +8,9 @@ from .base import (
     Training as Training,
     divide as divide,
 )
+from .carry.capacity import RecordCapacity as RecordCapacity, SecretSize as SecretSize, to_degree as to_degree
 from .carry.method import most_contributing as most_contributing
 from .carry.options import CarryOptions as CarryOptions
-from .carry.room import RecordRoom as RecordRoom, SecretSize as SecretSize, to_degree as to_degree
 from .decoy import Decoy as Decoy
 from .keyss.combined import CombinedPoses as CombinedPoses, PlacedScene as PlacedScene
 from .keyss.decoder import Decoder as Decoder

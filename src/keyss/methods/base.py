@@ -114,8 +114,8 @@ class MethodOptions:
     fit: FitConfig = field(default_factory=FitConfig)  # plain models, and joint training
     publish: Publish = "as-is"  # or any: the published model may be converted
     format: Format | None = None  # for `publish="as-is"`; None: the cover's format
-    # For `publish="any"`: appended Gaussians have unlimited room but are visible in the file; colours have
-    # little room and are less visible.
+    # For `publish="any"`: appended Gaussians have unlimited capacity but are visible in the file; colours are
+    # less visible but have little capacity.
     channel: AnyChannel = "appended"
 
     def __post_init__(self) -> None:

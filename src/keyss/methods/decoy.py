@@ -7,7 +7,7 @@ from itertools import product
 
 import torch
 
-from keyss.channels import TYPICAL_SHARE, LowBitsRoom
+from keyss.channels import TYPICAL_SHARE, LowBitsCapacity
 from keyss.core.gaussians import DRAWN_OPACITY, Gaussians
 from keyss.core.similarity import Similarity
 from keyss.keys.derivation import DerivedKey
@@ -75,15 +75,17 @@ class Decoy:
 
     def _encode_and_decode(self, model: Gaussians, stego: Gaussians) -> Gaussians:
         """Encode and decode `model` like a secret carried by `stego`."""
-        room = LowBitsRoom.of(int(TYPICAL_SHARE * len(stego)), stego.sh_degree)
+        capacity = LowBitsCapacity.of(int(TYPICAL_SHARE * len(stego)), stego.sh_degree)
         options = product(range(stego.sh_degree, -1, -1), (2, 1))  # SH degree, records per carrier
-        found = ((cells, Table.of_size(8 * room.record_bytes(cells), degree)) for degree, cells in options)
+        found = (
+            (cells, Table.of_size(8 * capacity.record_bytes(cells), degree)) for degree, cells in options
+        )
         cells, table = next((each for each in found if each[1]), (0, None))
         if table is None or not self.records:
             precision = whole.Precision.usual(model)
             return whole.decode(whole.encode(model, precision.finer(_FINER * self.appended)))
         order = torch.randperm(len(model), generator=torch.Generator().manual_seed(self.order))
-        model = model[order[: cells * room.carriers]].with_sh_degree(table.sh_degree)
+        model = model[order[: cells * capacity.carriers]].with_sh_degree(table.sh_degree)
         codec, outliers = Codec.fit_with_outliers(model, table)
         return codec.decode(codec.encode(model, outliers))
 

@@ -2,7 +2,7 @@
 
 The payload holds the decoder (weights in half precision, constants in single), the vector of the key, the
 similarity from the secret's frame to the cover's, and *anchors*: positions of some Gaussians of the stego
-model, to detect a moved or rounded model. docs/format.md lists the bytes.
+model, to detect a moved or rounded model. docs/byte-layout.md lists the bytes.
 """
 
 from __future__ import annotations

@@ -53,7 +53,7 @@ class CarriedSecret:
 def unpack(content: Content) -> CarriedSecret:
     """Open records, in any order, or a payload. Raises InputError for damage."""
     if not isinstance(content, Records):
-        gaussians = whole.decode(content.data, content.carriers)
+        gaussians = whole.decode(content.data, content.model_size)
         count = len(gaussians)
         return CarriedSecret(count, count, round(8 * len(content.data) / count), lambda: gaussians)
     if len(content.header) < COUNT.size:

@@ -52,7 +52,7 @@ async function payload(header: Header, secrets: Secrets, carriers: Carriers, shi
   const bits = bitCounts(own.impact.map((each) => each - shift), header.level);
   const sure: number[] = [];
   bits.forEach((count, row) => {
-    const each = (header.held * (1 - CHANGED) * (1 - own.doubt[row])) / own.alike[row];
+    const each = (header.occupancy * (1 - CHANGED) * (1 - own.errorProbability[row])) / own.idCounts[row];
     for (let bit = 0; bit < COLUMNS * count; bit++) sure.push(each);
   });
   if (8 * header.size > MAX_RATE * sure.length) return null;

@@ -1,4 +1,4 @@
-/** How what a key decrypts is to be read; see docs/format.md, "Parameters". */
+/** How what a key decrypts is to be read; see docs/byte-layout.md, "Parameters". */
 import { bytesKey, joined, viewOf } from '../../core/bytes.ts';
 import { damaged, otherVersion, tooMuchLost } from '../../core/errors.ts';
 import type { Codewords } from '../reed_solomon.ts';
