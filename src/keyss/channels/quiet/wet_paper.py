@@ -106,7 +106,7 @@ def _unpacked(rows: Words) -> Bits:
 
 
 def _reduced(rows: Bits, count: int) -> tuple[Integers, Bits]:
-    """Eliminate, modulo 2: for each row [R] the column, of the first `count`, where only it is 1, and the rows.
+    """Eliminate modulo 2: the pivot column of each row [R] among the first `count` columns, and the rows.
 
     -1 for rows that become 0 there.
     """
