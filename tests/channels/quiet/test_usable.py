@@ -244,6 +244,30 @@ def test_siblings_that_moved_apart_by_equal_steps_stay_as_they_are() -> None:
     assert abs(stealth_statistics(careless)["steps: differences of siblings"].value) < 5
 
 
+@pytest.mark.parametrize("sh_degree", [1, 2, 3])
+def test_siblings_are_those_of_a_plain_search(sh_degree: int) -> None:
+    """All pairs of a Gaussian and its 12 nearest neighbours, in NumPy; numbers are known to a cell."""
+    model, _ = siblings_like(400, 120, sh_degree)
+    model = replace(model, sh=model.sh[:, : (sh_degree + 1) ** 2])
+    model.sh[:100, -1] += 1e-3 * torch.arange(1, 101)[:, None]  # no steps
+    colours = model.sh.clone()
+    colours[:, 0] = 50 + torch.arange(400)[:, None] * 7.3  # no steps of harmonics are as large
+    known = usable_carriers(replace(model, sh=colours))
+    means, sh = model.means.double().numpy(), model.sh.numpy()
+    cells = (sh.view(np.uint32) & ~np.uint32(8191) | np.uint32(4096)).view(np.float32).astype(float)
+    apart = np.zeros(400, bool)
+    for row in np.flatnonzero(known):
+        for other in np.argsort(((means - means[row]) ** 2).sum(axis=1), kind="stable")[1:13]:
+            for colour in range(3):
+                steps = abs(float(sh[row, 0, colour]) - float(sh[other, 0, colour])) / 20
+                own, its = cells[row, 1:, colour], cells[other, 1:, colour]
+                near = np.abs(np.abs(own - its) - steps) <= np.maximum(np.abs(own), np.abs(its)) / 1024
+                if near.sum() >= max(3, len(own) / 3):
+                    apart[[row, other]] = True
+    assert min((known & apart).sum(), (known & ~apart).sum()) > 30
+    assert np.array_equal(usable_carriers(model), known & ~apart)
+
+
 def test_no_opacity_crosses_the_threshold_of_pruning() -> None:
     """Trainers remove opacities below 0.005. Its own cell is left alone, and no other."""
     edge = np.float32(np.log(0.005 / 0.995))

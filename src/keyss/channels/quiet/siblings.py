@@ -21,6 +21,7 @@ from keyss.channels.quiet.bits import SH_BITS, UNUSED_BITS
 from keyss.core.arrays import Flags, doubles
 from keyss.core.gaussians import Gaussians
 from keyss.core.neighbours import nearest_neighbours
+from keyss.files.formats.common import morton_order
 from keyss.kernels.jit import kernel
 from keyss.kernels.parallel import in_blocks
 
@@ -33,36 +34,45 @@ _CELL_SHARE = np.float32(2.0 ** (SH_BITS + UNUSED_BITS - 23))  # cell width / nu
 
 
 def find_siblings(gaussians: Gaussians, among: Flags) -> Flags:
-    """Mask [N] of the siblings `among` [N], found by bits that embedding never changes."""
-    apart, rows = np.zeros(len(gaussians), bool), np.flatnonzero(among)
+    """[N] which Gaussians `among` [N] moved away from a neighbour by equal steps, as fixed bits tell."""
     if len(gaussians) < 2 or not gaussians.sh_degree:
-        return apart
+        return np.zeros(len(gaussians), bool)
     means = np.nan_to_num(doubles(gaussians.means), posinf=0, neginf=0)
+    order = morton_order(means.astype(np.float32))  # neighbours are near in memory, too
+    means, rows = means[order], np.flatnonzero(among[order])
     near = nearest_neighbours(means[rows], min(_NEIGHBOURS + 1, len(means)), means)[1]
-    sh = gaussians.sh.detach().to("cpu", torch.float32).transpose(1, 2).contiguous().numpy()
-    constant = sh[:, :, 0] / np.float32(RATE_RATIO)
-    middles = (sh[:, :, 1:].view(np.uint32) & ~_CELL | (_CELL + 1) >> 1).view(np.float32)
-    needed = max(_SHARE, -(-middles.shape[2] // _SHARE))
+    sh = gaussians.sh.detach().to("cpu", torch.float32).numpy()[order].transpose(0, 2, 1)
+    middles = np.ascontiguousarray(sh.view(np.uint32) & ~_CELL | (_CELL + 1) >> 1).view(np.float32)
+    middles[:, :, 0] = sh[:, :, 0] / np.float32(RATE_RATIO)
+    needed = 1 + max(_SHARE, -(-(middles.shape[2] - 1) // _SHARE))
+    apart = np.zeros(len(means), bool)
 
     def mark(start: int, stop: int) -> None:
-        _mark(rows[start:stop], near[start:stop], constant, middles, needed, apart)
+        _mark(rows[start:stop], near[start:stop], middles, needed, apart)
 
     in_blocks(mark, len(rows), _ROWS)
-    return apart & among
+    siblings = np.zeros(len(means), bool)
+    siblings[order] = apart
+    return siblings & among
 
 
 @kernel
-def _mark(rows: Any, near: Any, constant: Any, middles: Any, needed: int, apart: Any) -> None:
-    """Set `apart` for both Gaussians of pairs of `rows` [R] and their neighbours `near` [R, K]."""
+def _mark(rows: Any, near: Any, middles: Any, needed: int, apart: Any) -> None:
+    """Set `apart` for both Gaussians of pairs of `rows` [R] and their neighbours `near` [R, K].
+
+    `middles` [N, 3, C]: the first harmonic is the constant one, by the ratio of rates; it always agrees.
+    """
     for row in range(len(rows)):
         one = rows[row]
         for other in near[row]:
+            if other == one or (apart[one] and apart[other]):
+                continue
             for colour in range(3):
-                steps = abs(constant[one, colour] - constant[other, colour])
+                own, its = middles[one, colour], middles[other, colour]
+                steps = abs(own[0] - its[0])
                 agree = np.float32(0)
-                for at in range(middles.shape[2]):
-                    own, its = middles[one, colour, at], middles[other, colour, at]
-                    cell = max(abs(own), abs(its)) * _CELL_SHARE
-                    agree += np.float32(1 if abs(abs(own - its) - steps) <= cell else 0)
-                if agree >= needed and other != one:
+                for at in range(len(own)):
+                    cell = max(abs(own[at]), abs(its[at])) * _CELL_SHARE
+                    agree += np.float32(1 if abs(abs(own[at] - its[at]) - steps) <= cell else 0)
+                if agree >= needed:
                     apart[one] = apart[other] = True
