@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import cache
 
 import torch
 from torch import Tensor
@@ -58,6 +59,7 @@ def _to_the_last_bit(values: Tensor) -> Tensor:
     return (values.double() + 2e-6 * (noise - 0.5)).float()
 
 
+@cache
 def tiny_scene(seed: int = 0, views: int = 16, distance: float = 4.0) -> Scene:
     """Photos of `random_gaussians(seed=seed)`, with its noisy means as sparse points."""
     model = random_gaussians(seed=seed)

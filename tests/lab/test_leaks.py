@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import asdict, replace
+from functools import cache
 
 import pytest
 import torch
 from torch import Tensor
 
 import keyss
-from keyss.core import Gaussians, Similarity, UsageError
+from keyss.core import Gaussians, Scene, Similarity, UsageError
 from keyss.fitting import quality
 from keyss.lab import (
     Attack,
@@ -28,13 +28,17 @@ from tiny_scenes import random_gaussians, tiny_scene
 
 Rows = dict[str, AttackResult]
 
-COVER, SECRET = tiny_scene(0), tiny_scene(1)
 TURN = torch.linalg.qr(torch.randn(3, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(1)))[0]
 FRAME = Similarity(0.8, TURN * TURN.det().sign(), torch.tensor([0.3, -0.2, 0.1], dtype=torch.float64))
-SECRET_IN_COVER = replace(
-    SECRET, test=tuple(replace(view, camera=FRAME.apply_camera(view.camera)) for view in SECRET.test)
-)
 HIDDEN = FRAME.apply_gaussians(random_gaussians(seed=1))  # the secret where it lies in the cover's frame
+
+
+@cache
+def _secret_in_cover() -> Scene:
+    """The secret's photos, from cameras in the cover's frame."""
+    scene = tiny_scene(1)
+    moved = (replace(view, camera=FRAME.apply_camera(view.camera)) for view in scene.test)
+    return replace(scene, test=tuple(moved))
 
 
 def _plain(seed: int) -> Gaussians:
@@ -51,9 +55,13 @@ def _plain(seed: int) -> Gaussians:
 PLAINS = [_plain(seed) for seed in range(2)]
 
 
-def _look(stego: Gaussians, more: Sequence[Attack] = ()) -> Rows:
-    attacks = [*file_attacks(COVER, cover_views=4), *more]
-    rows, _ = look_for_secret(stego, PLAINS, SECRET_IN_COVER, attacks)
+@cache
+def _attacks() -> list[Attack]:
+    return file_attacks(tiny_scene(0), cover_views=4)
+
+
+def _look(stego: Gaussians) -> Rows:
+    rows, _ = look_for_secret(stego, PLAINS, _secret_in_cover(), _attacks())
     return {row.attack: row for row in rows}
 
 
@@ -108,7 +116,7 @@ def test_carried_secret_does_not_leak() -> None:
         cover = replace(cover, opacity_logits=cover.opacity_logits + 0.1 * close)
     secret = keyss.Secret(random_gaussians(200, seed=1), "a key")
     carried = keyss.hide(cover, [secret], method="carry", width=40).stego
-    rows, pictures = look_for_secret(carried, [cover], SECRET_IN_COVER, file_attacks(COVER, cover_views=4))
+    rows, pictures = look_for_secret(carried, [cover], _secret_in_cover(), _attacks())
     for row in rows:
         if not row.attack.endswith("opacities"):
             assert row.leak.gradient < 0.15, row.attack  # a low bit may change the selection
@@ -131,15 +139,15 @@ def test_decoder_search() -> None:
     search = decoder_attack(_secret(0.0).decode, restarts=2, steps=3)
     assert len(list(search.show(PLAINS[0]))) == 6
     as_it_is = Attack("as it is", "", lambda model: iter([("as it is", model)]))
-    searched, shown = look_for_secret(PLAINS[0], PLAINS, SECRET_IN_COVER, [search, as_it_is])[0]
+    searched, shown = look_for_secret(PLAINS[0], PLAINS, _secret_in_cover(), [search, as_it_is])[0]
     assert asdict(searched.scores) == pytest.approx(asdict(shown.scores))
 
 
 def test_missing_controls_and_test_views() -> None:
     with pytest.raises(UsageError, match="plain model"):
-        look_for_secret(PLAINS[0], [], SECRET_IN_COVER, [])
+        look_for_secret(PLAINS[0], [], _secret_in_cover(), [])
     with pytest.raises(UsageError, match="no test views"):
-        look_for_secret(PLAINS[0], PLAINS, replace(SECRET, test=()), [])
+        look_for_secret(PLAINS[0], PLAINS, replace(tiny_scene(1), test=()), [])
 
 
 def _noise(seed: int) -> Tensor:

@@ -35,6 +35,7 @@ STEPS = replace(FIT, iterations=4, max_gaussians=300, sh_degree=3, grow_stop=0.8
 BASELINES = [
     name for name, where in registry.METHODS.items() if ".baselines." in where.hiding and name != "3dgs"
 ]
+OTHERS = [name for name in (*DESIGNS, *BASELINES) if name != "latent"]
 
 
 @pytest.fixture
@@ -85,7 +86,9 @@ def training(name: str, config: FitConfig, device: torch.device) -> Any:
     )
 
 
-@pytest.mark.parametrize("name", ["plain", *DESIGNS, *BASELINES])
+@pytest.mark.parametrize(
+    "name", ["plain", "latent", *(pytest.param(name, marks=pytest.mark.slow) for name in OTHERS)]
+)
 def test_training_gradients_match_cpu(name: str, gpu: torch.device) -> None:
     here, there = (training(name, STEPS, device) for device in (torch.device("cpu"), gpu))
     for run in (here, there):
@@ -110,7 +113,7 @@ def test_training_gradients_match_cpu(name: str, gpu: torch.device) -> None:
 
 
 @pytest.mark.filterwarnings("ignore:.*the secrets lie in appended Gaussians")
-@pytest.mark.parametrize("method", ["carry", "latent"])
+@pytest.mark.parametrize("method", ["carry", pytest.param("latent", marks=pytest.mark.slow)])
 def test_hide_and_reveal(
     method: str, gpu: torch.device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

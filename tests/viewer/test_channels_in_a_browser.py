@@ -23,7 +23,7 @@ pytestmark = IN_CHROMIUM
 KEYS = ("the first key", "ein zweiter Schlüssel")
 PUBLISHED = {"ply": "ply"} | {suffix.removeprefix("."): publish for publish, suffix in SUFFIXES.items()}
 LATENT = "latent.ply"  # of the method keyss, in harmonics and low bits
-KINDS = (*PUBLISHED, "appended.ply", "appended.spz", "appended.sog", LATENT)
+OTHERS = (*list(PUBLISHED)[1:], "appended.ply", "appended.spz", "appended.sog", LATENT)
 
 
 def keys_of(kind: str) -> tuple[str, ...]:
@@ -54,7 +54,7 @@ def published(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]
     return stego
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", ["ply", *(pytest.param(kind, marks=pytest.mark.slow) for kind in OTHERS)])
 def test_keys(tab: Visit, published: Callable[[str], Path], tmp_path: Path, kind: str) -> None:
     """Every key takes as many derivations."""
     stego = published(kind)
@@ -81,6 +81,7 @@ def test_keys(tab: Visit, published: Callable[[str], Path], tmp_path: Path, kind
     assert all(url.startswith(("file:", "blob:null/")) for url in tab.requests), tab.requests
 
 
+@pytest.mark.slow
 def test_file_in_colours(tab: Visit, tmp_path: Path) -> None:
     note = HiddenFile("a note.txt", b"Written at noon, read at night.\n")
     prepared = channel_for("any", "colours").prepare(lifelike(6000, 0).with_sh_degree(0))

@@ -13,7 +13,7 @@ import pytest
 
 from cli.harness import PROGRAM as KEYSS
 from keyss.core import Gaussians
-from keyss.files import read_model, write_model
+from keyss.files import model_bytes, read_model, write_model
 from keyss.viewer import export_html
 from methods.carry.carried import embed, extract
 from viewer.browser import CLOSE, IN_CHROMIUM, POSE, WEB, Visit, bright_model, psnr, render_pose
@@ -108,25 +108,39 @@ def test_timing_does_not_reveal_secret(tab: Visit, page_file: Path) -> None:
     assert tab.page.locator("#revealed").is_visible()
 
 
-def test_damaged_files(tab: Visit, page_file: Path, tmp_path: Path) -> None:
-    tab.goto(page_file.as_uri())
-    data = (page_file.parent / "stego.ply").read_bytes()
-    for name, content in {
-        "cut.ply": data[:5000],
-        "noise.ply": b"ply" + bytes(range(256)),
-        "none": b"",
-    }.items():
-        (tmp_path / name).write_bytes(content)
+def test_damaged_files(tab: Visit, page_file: Path, stego: Path, tmp_path: Path) -> None:
+    def problem(data: bytes) -> str:
+        """The message about a file."""
+        (tmp_path / "model.ply").write_bytes(data)
         # The message of the previous file stays until this one is read.
         tab.page.evaluate("() => { document.getElementById('problem').textContent = ''; }")
-        tab.page.set_input_files("#file", tmp_path / name)
+        tab.page.set_input_files("#file", tmp_path / "model.ply")
         tab.page.wait_for_function("() => document.getElementById('problem').textContent !== ''")
-        message = tab.page.locator("#problem").inner_text()
+        return str(tab.page.locator("#problem").inner_text())
+
+    tab.goto(page_file.as_uri())
+    whole = stego.read_bytes()
+    for data in (whole[:5000], b"ply" + bytes(range(256)), b""):
+        message = problem(data)
         assert re.fullmatch(r"This [^.]*\.?[^.]*\.", message), message
-    tab.page.set_input_files("#file", page_file.parent / "stego.ply")
+    model = bright_model(200, 1)
+    activated = replace(model, log_scales=model.scales, opacity_logits=model.opacities)
+    header, _, rows = model_bytes("a.ply", model).partition(b"end_header\n")
+    nan = header + b"end_header\n" + b"\xff" * len(rows)
+    empty = header.replace(b"vertex 200", b"vertex 0") + b"end_header\n"
+    for data in (nan, empty, model_bytes("a.ply", activated)):
+        assert re.search("^This file.*: export it again ", problem(data))
+    drop = """([name, bytes]) => {
+        const data = new DataTransfer();
+        data.items.add(new File([Uint8Array.from(bytes)], name));
+        const how = {dataTransfer: data, bubbles: true, cancelable: true};
+        document.body.dispatchEvent(new DragEvent('drop', how));
+    }"""
+    tab.page.evaluate(drop, ["model.ply", list(whole)])
     tab.page.wait_for_function("() => document.getElementById('problem').textContent === ''")
 
 
+@pytest.mark.slow
 def test_slider(tab: Visit, page_file: Path, stego: Path, secrets: list[Gaussians], tmp_path: Path) -> None:
     models = dict(zip(("first", "second"), secrets, strict=True))
     models |= {"published": read_model(stego), "other": bright_model(300, 5)}
@@ -169,31 +183,6 @@ def test_slider(tab: Visit, page_file: Path, stego: Path, secrets: list[Gaussian
     tab.page.wait_for_function("() => document.getElementById('facts').textContent.includes('other')")
     tab.settle()
     assert_seen("other", None)
-
-
-@pytest.mark.parametrize("kind", ["empty", "NaN", "activated"])
-def test_undrawable_files(tab: Visit, page_file: Path, tmp_path: Path, kind: str) -> None:
-    model = bright_model(200, 1)
-    if kind == "activated":
-        model = replace(model, log_scales=model.scales, opacity_logits=model.opacities)
-    write_model(tmp_path / "model.ply", model)
-    data = (tmp_path / "model.ply").read_bytes()
-    header, _, rows = data.partition(b"end_header\n")
-    if kind == "NaN":
-        data = header + b"end_header\n" + b"\xff" * len(rows)
-    if kind == "empty":
-        data = header.replace(b"vertex 200", b"vertex 0") + b"end_header\n"
-    (tmp_path / "model.ply").write_bytes(data)
-    tab.goto(page_file.as_uri())
-    drop = """([name, bytes]) => {
-        const data = new DataTransfer();
-        data.items.add(new File([Uint8Array.from(bytes)], name));
-        const how = {dataTransfer: data, bubbles: true, cancelable: true};
-        document.body.dispatchEvent(new DragEvent('drop', how));
-    }"""
-    tab.page.evaluate(drop, ["model.ply", list(data)])
-    tab.page.wait_for_function("() => document.getElementById('problem').textContent !== ''")
-    assert re.search("^This file.*: export it again ", tab.page.locator("#problem").inner_text())
 
 
 @pytest.mark.slow

@@ -90,6 +90,7 @@ def test_rotate_phone(chromium: Any, page_file: Path, published: Gaussians) -> N
             assert tab.page.evaluate(fits)
 
 
+@pytest.mark.slow
 def test_rotate_phone_with_secret(chromium: Any, page_file: Path, secret: Gaussians) -> None:
     with visit(chromium, viewport=PORTRAIT, **PHONE) as tab:
         tab.goto(page_file.as_uri())

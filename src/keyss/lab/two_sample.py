@@ -22,7 +22,7 @@ from keyss.lab.auc import Auc, delong
 MIN_GAUSSIANS, MAX_GAUSSIANS = 100, 10_000  # Gaussians per model
 FOLDS = 5
 _CELLS = 8  # along each axis
-_TREES, _LEAVES = 50, 16
+TREES, _LEAVES = 50, 16
 
 
 @dataclass(frozen=True)
@@ -127,7 +127,7 @@ def _held_out_auc(values: Floats, is_b: Flags, held_out: Flags, seed: int) -> tu
     ensemble = import_extra("sklearn.ensemble", "audit", "train classifiers")
     threadpoolctl = import_extra("threadpoolctl", "audit", "train classifiers")
     trees = ensemble.HistGradientBoostingClassifier(
-        max_iter=_TREES, max_leaf_nodes=_LEAVES, early_stopping=False, random_state=seed
+        max_iter=TREES, max_leaf_nodes=_LEAVES, early_stopping=False, random_state=seed
     )
     with threadpoolctl.threadpool_limits(1, "openmp"):  # too few rows for several threads
         trees.fit(values[~held_out], is_b[~held_out])

@@ -27,7 +27,7 @@ from keyss.keys import encryption
 EVERY = pytest.mark.parametrize("suffix", FORMATS)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=10, deadline=None)
 @given(seed=st.integers(0, 10_000), kind=st.sampled_from(KINDS))
 def test_random_codes_open_nothing(seed: int, kind: str) -> None:
     rng = np.random.default_rng(seed)

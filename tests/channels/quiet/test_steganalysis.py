@@ -15,7 +15,7 @@ from channels.quiet.trained_like import keys, trained_like
 from keyss.core import Gaussians
 
 MODELS = 24
-TREES = 100  # of so few models three times as many learn no more
+TREES = 40  # of so few models seven times as many learn no more
 
 
 @pytest.fixture(scope="module")

@@ -23,6 +23,7 @@ import warnings
 import zipfile
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
@@ -42,19 +43,25 @@ from keyss.methods.tensors import Header, pack_tensors, refuse_damage, unpack_te
 SECONDS = 2.0  # time limit for a file of a few kilobytes
 CARRIERS = 6000  # Gaussians of the published model that holds a payload
 MEMORY, PER_BYTE = 200 << 20, 32  # memory limit for reading a file: bytes, and bytes per byte of the file
+NAMES = (
+    *("a.ply", "a.compressed.ply", "a.spz", "a.sog", "a.glb", "a.splat"),
+    *("a.payload", "a.3dgs.safetensors", "a.tensors", "a.png"),
+    *("cameras.bin", "images.bin", "points3D.bin"),
+)
 _EXTREMES = (0, 1, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF, 0x7F800000, 0x7FC00000, 0x3F800000, 0x10000, 0xFF)
 
 
-def examples(count: int = 60) -> dict[str, list[bytes]]:
-    """Small files of each format, by a name with its suffix."""
+@cache
+def examples() -> dict[str, list[bytes]]:
+    """Small files of each format, by a name of NAMES."""
+    count = 60
     generator = torch.Generator().manual_seed(0)
 
     def model(degree: int) -> Gaussians:
         shapes = ((3,), (4,), (3,), (), ((degree + 1) ** 2, 3))
         return Gaussians(*(torch.randn(count, *shape, generator=generator) for shape in shapes))
 
-    names = ("a.ply", "a.compressed.ply", "a.spz", "a.sog", "a.glb", "a.splat")
-    found = {name: [model_bytes(name, model(degree)) for degree in (0, 2)] for name in names}
+    found = {name: [model_bytes(name, model(degree)) for degree in (0, 2)] for name in NAMES[:6]}
     found["a.spz"].append(replace(SpzCodes.quantise(model(1)), version=4).serialise())
     found["a.payload"] = [whole.encode(model(degree)) for degree in range(4)]
     layers = ((torch.randn(3, 4, 3, 3, generator=generator), torch.zeros(3)),)

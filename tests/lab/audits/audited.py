@@ -7,6 +7,7 @@ import json
 import shutil
 import warnings
 from collections.abc import Collection
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +17,8 @@ import pytest
 import keyss
 from keyss import Secret
 from keyss.core import KeyssWarning
-from keyss.lab import Change, converters, half_floats, random_pruning
-from keyss.lab.audits import Audit, audit
+from keyss.lab import Change, converters, decoder_attack, half_floats, random_pruning, two_sample
+from keyss.lab.audits import Audit, audit, parts
 from keyss.lab.robustness import survival
 from methods.keyss.small import small
 from test_api import CONFIG, write_nerfstudio
@@ -50,6 +51,8 @@ def audited_run(root: Path) -> None:
             out=root / "run",
         )
     with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(parts, "decoder_attack", partial(decoder_attack, steps=10))
+        patch.setattr(two_sample, "TREES", 5)
         patch.setattr(survival, "default_changes", lambda *_, **__: _few_changes())
         patch.setenv("KEYSS_SPLAT_TRANSFORM", str(root / "nowhere"))
         audit(root / "run", KEYS, controls=2)

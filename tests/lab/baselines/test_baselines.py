@@ -119,7 +119,7 @@ def test_invalid_arguments(folders: tuple[Path, Path]) -> None:
         keyss.hide(folders[0], [Secret(folders[1])], method="carry")
 
 
-@pytest.mark.parametrize("name", TRAINED)
+@pytest.mark.parametrize("name", [*TRAINED[:2], pytest.param("gs-hider", marks=pytest.mark.slow)])
 def test_resumed_training_is_bit_identical(name: str) -> None:
     """All state is in checkpoints: parameters that a baseline adds, networks, moments, the order of poses."""
     scenes = [tiny_scene(0), tiny_scene(1)]

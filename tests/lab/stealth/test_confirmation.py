@@ -11,7 +11,7 @@ from keyss.lab import candidate_scores, changed_low_bits
 from lab.stealth.careless import overwritten, plain
 from methods.carry.carried import embed_derived
 
-SECRETS = 4
+SECRETS = 2
 
 
 def test_identical_high_bits() -> None:

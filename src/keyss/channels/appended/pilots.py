@@ -93,56 +93,54 @@ def read(invariants: Words, means: Doubles) -> PilotFit | None:
     expected = (points.astype(np.float64) + 0.5) / 2**POSITION_BITS
     world = means[own]
     some = np.arange(min(len(own), _SAMPLE)) * len(own) // min(len(own), _SAMPLE)
-    best = some[:0]
-    for _ in range(_TRIES):
-        three = random.choice(some, 3, replace=False)
-        inliers = some[_inliers(world, expected, three, some)]
-        if len(inliers) > len(best):
-            best = inliers
-        if len(best) > max(_MIN_INLIERS, 0.5 * len(some)):
-            break
+    triples = some[random.integers(0, len(some), (_TRIES, 3))]
+    inliers = _inliers(world, expected, triples, some)
+    best = some[inliers[inliers.sum(axis=1).argmax()]]
     for _ in range(3):
         if len(best) < _MIN_INLIERS:
             return None
         best = np.flatnonzero(_inliers(world, expected, best))
     if len(best) < _MIN_INLIERS:
         return None
-    similarity = _similarity(world[best], expected[best])
+    scale, rotation, translation = _similarities(world[best], expected[best])
     salt = _salt(invariants[own[best]])
-    return None if similarity is None or salt is None else PilotFit(similarity, len(best), salt)
+    if salt is None:
+        return None
+    to_own = Similarity(float(scale), torch.from_numpy(rotation), torch.from_numpy(translation))
+    return PilotFit(to_own, len(best), salt)
 
 
 def _inliers(
     world: Doubles, expected: Doubles, chosen: Integers, among: Integers | slice = slice(None)
 ) -> Flags:
-    """Mask [P] of the pilots `among` all that the similarity fitted to `chosen` maps to their positions."""
-    similarity = _similarity(world[chosen], expected[chosen])
-    world, expected = world[among], expected[among]
-    if similarity is None:
-        return np.zeros(len(world), bool)
-    off = similarity.apply_points(torch.from_numpy(world)).numpy() - expected
-    near: Flags = (np.abs(off) < _NEAR).all(axis=1)
+    """Masks [..., A] of the pilots `among` all that the similarity fitted to `chosen` [..., P] maps to their
+    positions.
+    """
+    scales, rotations, translations = _similarities(world[chosen], expected[chosen])
+    turned = world[among] @ rotations.swapaxes(-1, -2)
+    off = scales[..., None, None] * turned + translations[..., None, :] - expected[among]
+    near: Flags = (np.abs(off) < _NEAR).all(axis=-1)
     return near
 
 
-def _similarity(source: Doubles, target: Doubles) -> Similarity | None:
-    """Least-squares similarity from `source` [P, 3] to `target` (Umeyama 1991); None if degenerate."""
-    centre, goal = source.mean(axis=0), target.mean(axis=0)
-    a, b = source - centre, target - goal
-    spread = float(np.square(a).sum())
-    if not (np.isfinite(spread) and spread > 0):
-        return None
-    u, values, v = np.linalg.svd(b.T @ a)
-    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ v))])
-    rotation = u @ np.diag(signs) @ v
-    scale = float((values * signs).sum()) / spread
-    if not (np.isfinite(scale) and scale > 0):
-        return None
-    translation = goal - scale * rotation @ centre
-    try:
-        return Similarity(scale, torch.from_numpy(rotation), torch.from_numpy(translation))
-    except ValueError:
-        return None
+def _similarities(source: Doubles, target: Doubles) -> tuple[Doubles, Doubles, Doubles]:
+    """Least-squares similarities from `source` [..., P, 3] to `target` (Umeyama 1991).
+
+    Scales [...], NaN for degenerate points, rotations [..., 3, 3] and translations [..., 3].
+    """
+    centre, goal = source.mean(axis=-2), target.mean(axis=-2)
+    a, b = source - centre[..., None, :], target - goal[..., None, :]
+    spread = np.square(a).sum(axis=(-2, -1))
+    good = np.isfinite(spread) & (spread > 0)
+    u, values, v = np.linalg.svd(np.where(good[..., None, None], b.swapaxes(-1, -2) @ a, 0))
+    signs = np.sign(np.linalg.det(u @ v))[..., None]
+    u[..., 2] *= signs  # no reflection
+    values[..., 2:] *= signs
+    total = values.sum(axis=-1)
+    scales = np.where(good & (total > 0), total, np.nan) / np.where(good, spread, 1)
+    rotations = u @ v
+    translations = goal - scales[..., None] * (rotations @ centre[..., None])[..., 0]
+    return scales, rotations, translations
 
 
 def _salt(invariants: Words) -> bytes | None:

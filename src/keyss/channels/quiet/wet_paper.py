@@ -75,7 +75,7 @@ def write(bits: Bits, dry: Bits, message: Bits, rows: Words) -> Bits | None:
     for own, wanted, found in zip(may, changed, rest, strict=True):
         stay, inside = ~own[pivots], np.flatnonzero(own[others])
         system = np.concatenate([free[stay][:, inside], wanted[stay, None]], axis=1)
-        columns = _reduced(system, len(inside))
+        columns, system = _reduced(system, len(inside))
         if system[columns < 0, -1].any():
             return None
         found[inside[columns[columns >= 0]]] = system[columns >= 0, -1]
@@ -88,8 +88,7 @@ def write(bits: Bits, dry: Bits, message: Bits, rows: Words) -> Bits | None:
 def _eliminate(rows: bytes) -> tuple[Integers, Integers, Bits, Bits]:
     """The columns of P (-1: none) and F in a matrix [R, BLOCK / 64], P^-1 [R, R] and P^-1 F; see `write`."""
     own = _unpacked(np.frombuffer(rows, "<u8").reshape(-1, _WORDS))
-    reduced = np.concatenate([own, np.eye(len(own), dtype=np.uint8)], axis=1)
-    pivots = _reduced(reduced, BLOCK)
+    pivots, reduced = _reduced(np.concatenate([own, np.eye(len(own), dtype=np.uint8)], axis=1), BLOCK)
     others = np.setdiff1d(np.arange(BLOCK), pivots)
     return pivots, others, reduced[:, BLOCK:], reduced[:, others]
 
@@ -106,19 +105,27 @@ def _unpacked(rows: Words) -> Bits:
     return np.unpackbits(rows.view(np.uint8).reshape(len(rows), -1), axis=1, bitorder="little")
 
 
-@kernel
-def _reduced(own, count):  # type: ignore[no-untyped-def]
-    """Eliminate, modulo 2: for each row [R] of `own` the column, of the first `count`, where only it is 1.
+def _reduced(rows: Bits, count: int) -> tuple[Integers, Bits]:
+    """Eliminate modulo 2: the pivot column of each row [R] among the first `count` columns, and the rows.
 
     -1 for rows that become 0 there.
     """
+    packed = np.packbits(rows, axis=1)
+    columns: Integers = _eliminate_packed(packed, count)
+    return columns, np.unpackbits(packed, axis=1, count=rows.shape[1])
+
+
+@kernel
+def _eliminate_packed(own, count):  # type: ignore[no-untyped-def]
+    """`_reduced` in place, with eight columns to a byte, the first in its highest bit."""
     columns = np.full(len(own), -1)
     for row in range(len(own)):
         for column in range(count):
-            if own[row, column]:
+            byte, bit = column >> 3, np.uint8(128 >> (column & 7))
+            if own[row, byte] & bit:
                 columns[row] = column
                 for other in range(len(own)):
-                    if other != row and own[other, column]:
+                    if other != row and own[other, byte] & bit:
                         for at in range(own.shape[1]):  # takes a fifth of what slices do
                             own[other, at] ^= own[row, at]
                 break
