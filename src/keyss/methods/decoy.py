@@ -11,7 +11,7 @@ from keyss.channels import TYPICAL_SHARE, LowBitsCapacity
 from keyss.core.gaussians import DRAWN_OPACITY, Gaussians
 from keyss.core.similarity import Similarity
 from keyss.keys.derivation import DerivedKey
-from keyss.methods.opened import Frame, Remains
+from keyss.methods.hidden import Frame, Remains
 from keyss.methods.records import whole
 from keyss.methods.records.lines import Table
 from keyss.methods.records.quantise import Codec
@@ -26,7 +26,7 @@ _MIN_SHARE = 0.8  # minimum share of the cover's Gaussians that are left
 
 @dataclass(frozen=True)
 class Decoy:
-    """An `Opened` that shows the cover, imperceptibly changed.
+    """A `HiddenScene` that shows the cover, imperceptibly changed.
 
     A smooth function changes opacities, a similarity moves all Gaussians, and the faintest ones are removed.
     The derived key seeds these changes, so nobody can compute the bytes without it. The result is encoded and
@@ -58,7 +58,7 @@ class Decoy:
         return Decoy(frame, changes, share, order, appended, records)
 
     def reveal(self, stego: Gaussians, *, frame: Frame = "secret", force: bool = False) -> Gaussians:
-        """The rendered Gaussians of the cover, all changed; see `Opened.reveal`."""
+        """The rendered Gaussians of the cover, all changed; see `HiddenScene.reveal`."""
         stego = stego.to("cpu")
         position = (stego.opacity_logits / _LOGITS).clamp(-1, 1).add(1).mul((_KNOTS - 1) / 2)
         left = position.long().clamp_max(_KNOTS - 2)

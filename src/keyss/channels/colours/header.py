@@ -29,7 +29,7 @@ DEPTHS = (1, 2)  # bits per value of a header, for payloads at level ONE and at 
 SHARES = 256  # parts of the carriers, divided among payloads
 IDLE = 1 / 255  # unit of the share of unchanged carriers
 FILE_KEY_BYTES = 5
-_PILOTS = 10  # of the places
+_PILOTS = 10  # places whose bits are known
 _FORMAT = f"{FILE_KEY_BYTES}s6B"
 _CHECK_BYTES = 2
 _PRIOR = 0.4  # prior log odds that a salt is genuine
@@ -69,7 +69,7 @@ class Secrets:
 
 @dataclass(frozen=True)
 class Header:
-    """How to read a payload; numbers are below 256."""
+    """Parameters for reading a payload; numbers are below 256."""
 
     file_key: bytes  # the same for all secrets of a file
     level: int  # see `bit_counts`

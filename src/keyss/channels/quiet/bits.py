@@ -47,7 +47,7 @@ class Layout:
 
     sh_degree: int
     quats: bool = True
-    written_degree: int | None = None  # of the harmonics whose low bits are read and written; None: all
+    written_degree: int | None = None  # SH degree up to which low bits are read and written; None: all
 
     @staticmethod
     def of(gaussians: Gaussians) -> Layout:

@@ -308,7 +308,7 @@ def _overhead(width: int) -> int:
 
 
 def _versions(model: Gaussians) -> list[int]:
-    """How often each tensor was changed in place."""
+    """The number of in-place changes of each tensor."""
     tensors: list[Tensor] = [getattr(model, each.name) for each in fields(model)]
     return [0 if each.is_inference() else each._version for each in tensors]
 

@@ -59,7 +59,7 @@ class Decoded:
 
     @property
     def is_sorted(self) -> bool:
-        """Whether the file is in the order of `morton_order`, but for a few Gaussians."""
+        """True if the file is in Morton order, up to a few Gaussians."""
         places = np.empty(len(self.order))
         places[self.order[morton_order(self.model.means.numpy())]] = np.arange(len(self.order))
         return bool((np.diff(places) > 0).mean() >= _MOST)
@@ -77,7 +77,7 @@ class Decoded:
 
 
 def _opacities_are_bytes(model: Gaussians) -> bool:
-    """Whether opacities have at most 256 values, as in all of the formats."""
+    """True if there are at most 256 different opacities, as in all of the formats."""
     parts = model.opacity_logits[:_SAMPLE], model.opacity_logits
     return all(len(each.detach().unique()) <= _OPACITIES for each in parts)
 

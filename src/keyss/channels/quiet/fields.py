@@ -30,7 +30,7 @@ Levels = npt.NDArray[np.int32]
 MAX_BITS = 10
 _SHARE = -3.0  # log2 of the range of written positions, in sizes of the Gaussian
 _LOG_SCALE = -4.0  # log2 of the range of written log scales
-_SIGN, _MAGNITUDE = 512, 511  # of the rotations of an SPZ of version 3 or newer
+_SIGN, _MAGNITUDE = 512, 511  # masks of a rotation's component in SPZ 3 and newer
 _LOG2_E = 1.4426950408889634
 _VECTOR = np.array([2047, 1023, 2047])  # largest levels of x, y, z in a compressed .ply
 

@@ -55,10 +55,10 @@ class Parameters:
     method: str
     cells: int
     record_bytes: int
-    gaussians: int  # of the model in which the secret was hidden
+    gaussians: int  # size of the published model
     count: int
     header: bytes
-    sketch: bytes = b""  # of the Gaussians; empty in blocks
+    sketch: bytes = b""  # empty in blocks
 
     def parts(self, width: int) -> Bytes:
         """[P, width - TAG_BYTES] numbered parts."""

@@ -56,7 +56,7 @@ def _not_clones(codes: Codes, fields: list[Field], random: Doubles) -> Flags:
     sizes = np.exp(np.sort(log_scales, axis=1)[:, 1])
     distance, near = nearest_neighbours(means, min(_NEIGHBOURS + 1, len(means)))
     ratio = distance[:, 1] / sizes / _CLONES
-    both = np.minimum(np.arange(len(means)), near[:, 1])  # of two nearest to each other, both or none
+    both = np.minimum(np.arange(len(means)), near[:, 1])  # mutual nearest neighbours share one decision
     single: Flags = random[both] * (1 + ratio**3) < ratio**3
     for name in {each.name for each in fields}:
         levels = np.stack([each.levels for each in fields if each.name == name], axis=1)

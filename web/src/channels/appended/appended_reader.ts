@@ -49,7 +49,7 @@ export class AppendedReader implements Reader {
     return null;
   }
 
-  /** What `key` opens, null for nothing. Raises InputError if too much was lost or changed. */
+  /** The content that `key` opens, or null. Raises InputError if too much was lost or changed. */
   async open(key: string, derive: Derive = here): Promise<Payload | null> {
     const secret = await derive(key, this.salt);
     for (const width of WIDTHS) {

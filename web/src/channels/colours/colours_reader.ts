@@ -29,7 +29,7 @@ export class ColoursReader implements Reader {
     return 1 + this.salts.length;
   }
 
-  /** What `key` opens, null for nothing. Raises InputError for damage. */
+  /** The content that `key` opens, or null. Raises InputError for damage. */
   async open(key: string, derive: Derive = here): Promise<Payload | null> {
     const secrets = secretsOf(await Promise.all([STATIC_SALT, ...this.salts].map((salt) => derive(key, salt))));
     const headers = this.alignments.map((carriers) => readHeader(secrets, carriers));

@@ -12,7 +12,7 @@ const FILE_KEY_BYTES = 5;
 const SHARES = 256; // parts of the carriers, shared out to payloads
 const IDLE = 1 / 255; // unit of the share of unmodified carriers
 const PLACES = 80; // Gaussians of a header under each salt
-const PILOTS = 10; // of the places
+const PILOTS = 10; // places whose bits are known
 const DEPTHS = [1, 2]; // bits per value
 const PLAIN_BYTES = FILE_KEY_BYTES + 6;
 const CHECK_BYTES = 2;
@@ -34,7 +34,7 @@ export function secretsOf([first, ...others]: readonly Uint8Array[]): Secrets {
   return { fixed: expand(first, 'colours/static', 32), salted: others.map((each) => expand(each, 'colours/header', 32)) };
 }
 
-/** How a payload is read. */
+/** Parameters for reading a payload. */
 export interface Header {
   readonly key: Uint8Array; // of the payload
   readonly partition: Uint8Array; // assigns carriers to parts
@@ -108,7 +108,7 @@ export function ownRows(header: Header, { salted }: Secrets, carriers: Carriers)
   });
 }
 
-/** How much larger impacts are than when the header was written. */
+/** Increase of the median impact since the header was written. */
 export function shiftOf(header: Header, { impact }: Carriers): number {
   const off = MEDIAN_STEPS * median(impact) - header.median + 128;
   return (off - Math.floor(off / 256) * 256 - 128) / MEDIAN_STEPS;

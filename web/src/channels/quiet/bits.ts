@@ -78,7 +78,7 @@ export function gaussianIds(gaussians: Gaussians, fields: Fields): Uint8Array {
   return found;
 }
 
-/** How many bytes the low bits of one Gaussian make, or those before so many of its harmonics. */
+/** Bytes in the low bits of one Gaussian, with all harmonics or only `harmonics` of them. */
 export function lowWidth(fields: Fields, harmonics = Infinity): number {
   const used = Math.min(harmonics, fields.width - GEOMETRY);
   return (fields.quatsInUse ? GEOMETRY : GEOMETRY - 4) + Math.floor((3 * used) / 2);

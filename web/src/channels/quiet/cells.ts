@@ -6,7 +6,7 @@ export const TAG_BYTES = 4;
 const BLOCK = 16; // bytes of a block of AES, and of an ID
 const CELLS = 1 << 14; // at a time
 
-/** What was found: rows of Gaussians, and the data of each. */
+/** Decrypted cells: rows of their carriers, and the data of each. */
 export interface Found {
   readonly rows: number[];
   readonly data: Uint8Array[];
