@@ -268,6 +268,24 @@ def test_siblings_are_those_of_a_plain_search(sh_degree: int) -> None:
     assert np.array_equal(usable_carriers(model), known & ~apart)
 
 
+@pytest.mark.parametrize("two", [(1, 5), (0, 2)])
+def test_covers_whose_harmonics_follow_each_other_are_refused(two: tuple[int, int]) -> None:
+    """As where training saw most Gaussians from one direction. Equal steps of two do not make siblings."""
+    model = trained_like(4000)
+    sh = model.sh.numpy().copy()
+    steps = np.random.default_rng(0).uniform(0.002, 0.02, (2000, 3)).astype(np.float32)
+    for harmonic in two:
+        sh[2000:, harmonic] = sh[:2000, harmonic] + steps * (20 if harmonic == 0 else 1)
+    near = model.means[:2000] + 1e-4
+    model = replace(model, sh=torch.from_numpy(sh), means=torch.cat([model.means[:2000], near]))
+    usable = usable_carriers(model)
+    assert usable.mean() > 0.9
+    with pytest.raises(UsageError, match="harmonics of this cover"):
+        LOW_BITS.prepare(model)
+    noise = np.random.default_rng(1).integers(0, 256, (usable.sum(), 75), np.uint8)
+    LOW_BITS.prepare(write_low_bits(model, Layout.of(model), [(np.flatnonzero(usable), noise)]))
+
+
 def test_no_opacity_crosses_the_threshold_of_pruning() -> None:
     """Trainers remove opacities below 0.005. Its own cell is left alone, and no other."""
     edge = np.float32(np.log(0.005 / 0.995))

@@ -8,6 +8,10 @@ direction, all harmonics x of a colour move apart by the same amount, and its co
 
 to a few units in the last place. Constant colours are never written. Siblings are near neighbours; where they
 moved in few directions, a part of their harmonics agrees. By chance two or three harmonics of a pair do.
+
+Where all views of a Gaussian have nearly one direction, as those of a far background, the gradients of some
+harmonics keep their ratio throughout: of those of equal order m, if the direction is the axis z. Then two or
+three of a colour move by equal steps in most Gaussians, too few to tell which ones: such a cover is refused.
 """
 
 from __future__ import annotations
@@ -18,7 +22,7 @@ import numpy as np
 import torch
 
 from keyss.channels.quiet.bits import SH_BITS, UNUSED_BITS
-from keyss.core.arrays import Flags, doubles
+from keyss.core.arrays import Flags, Floats, doubles
 from keyss.core.gaussians import Gaussians
 from keyss.core.neighbours import nearest_neighbours
 from keyss.files.formats.common import morton_order
@@ -29,6 +33,8 @@ RATE_RATIO = 20  # learning rate of constant colours / harmonics
 _NEIGHBOURS = 12  # siblings were among the nearest 10 in models of 20,000 to 200,000 Gaussians
 _SHARE = 3  # a third of the harmonics of a colour agree, and at least three
 _ROWS = 1 << 12
+_SAMPLE, _NEAR = 5000, 8  # Gaussians whose pairs of harmonics are tested, and neighbours of each
+_PART = 16  # of a cell, within which steps are equal
 _CELL = np.uint32((1 << SH_BITS + UNUSED_BITS) - 1)
 _CELL_SHARE = np.float32(2.0 ** (SH_BITS + UNUSED_BITS - 23))  # cell width / number, up to a factor of 2
 
@@ -42,7 +48,7 @@ def find_siblings(gaussians: Gaussians, among: Flags) -> Flags:
     means, rows = means[order], np.flatnonzero(among[order])
     near = nearest_neighbours(means[rows], min(_NEIGHBOURS + 1, len(means)), means)[1]
     sh = gaussians.sh.detach().to("cpu", torch.float32).numpy()[order].transpose(0, 2, 1)
-    middles = np.ascontiguousarray(sh.view(np.uint32) & ~_CELL | (_CELL + 1) >> 1).view(np.float32)
+    middles = np.ascontiguousarray(_middles(sh))
     middles[:, :, 0] = sh[:, :, 0] / np.float32(RATE_RATIO)
     needed = 1 + max(_SHARE, -(-(middles.shape[2] - 1) // _SHARE))
     apart = np.zeros(len(means), bool)
@@ -54,6 +60,33 @@ def find_siblings(gaussians: Gaussians, among: Flags) -> Flags:
     siblings = np.zeros(len(means), bool)
     siblings[order] = apart
     return siblings & among
+
+
+def chance_of_equal_steps(gaussians: Gaussians, usable: Flags) -> float:
+    """p-value of equal steps of two harmonics under the null hypothesis of uniform low bits of `usable` [N].
+
+    Of differences between neighbours that agree as far as fixed bits tell, those within a sixteenth of a cell
+    are as many as those from one to two sixteenths. Exact binomial tests, Bonferroni-corrected.
+    """
+    from scipy.special import bdtr  # takes long to load
+
+    rows = np.flatnonzero(usable)
+    if len(rows) < 2 or not gaussians.sh_degree:
+        return 1.0
+    means = np.nan_to_num(doubles(gaussians.means), posinf=0, neginf=0)[rows]
+    sample = np.arange(0, len(rows), -(-len(rows) // _SAMPLE))
+    near = nearest_neighbours(means[sample], min(_NEAR + 1, len(rows)), means)[1]
+    sh = gaussians.sh.detach().to("cpu", torch.float32).contiguous().numpy()
+    counts = np.zeros((2, sh.shape[1], sh.shape[1]), np.int64)
+    _count_equal(rows[sample], rows[near], sh, _middles(sh), counts)
+    equal, other = counts[:, counts.any(axis=0)]
+    chances = bdtr(other.astype(np.float64), equal + other, 0.5)
+    return min(1.0, float(chances.min(initial=1.0)) * len(chances))
+
+
+def _middles(numbers: Floats) -> Floats:
+    """[...] float32 numbers, as far as fixed bits tell."""
+    return (numbers.view(np.uint32) & ~_CELL | (_CELL + 1) >> 1).view(np.float32)
 
 
 @kernel
@@ -76,3 +109,29 @@ def _mark(rows: Any, near: Any, middles: Any, needed: int, apart: Any) -> None:
                     agree += np.float32(1 if abs(abs(own[at] - its[at]) - steps) <= cell else 0)
                 if agree >= needed:
                     apart[one] = apart[other] = True
+
+
+@kernel
+def _count_equal(rows: Any, near: Any, sh: Any, middles: Any, counts: Any) -> None:
+    """Add to `counts` [2, C, C] pairs of harmonics whose steps from `rows` [R] to `near` [R, K] are equal.
+
+    Then those whose steps differ by up to twice as much. `sh` [N, C, 3] and its `middles`.
+    """
+    size = sh.shape[1]
+    steps, known, cells = np.empty(size), np.empty(size), np.empty(size)
+    for row in range(len(rows)):
+        for other in near[row]:
+            for colour in range(3):
+                for at in range(size):
+                    steps[at] = abs(sh[rows[row], at, colour] - sh[other, at, colour])
+                    own, its = middles[rows[row], at, colour], middles[other, at, colour]
+                    known[at] = abs(own - its)
+                    cells[at] = max(abs(own), abs(its)) * _CELL_SHARE
+                steps[0], known[0], cells[0] = steps[0] / RATE_RATIO, steps[0] / RATE_RATIO, 0.0
+                for one in range(size):
+                    for two in range(one + 1, size):
+                        cell = max(cells[one], cells[two])
+                        if known[one] > 2 * cell and abs(known[one] - known[two]) <= cell < known[two] / 2:
+                            off = abs(steps[one] - steps[two]) * _PART
+                            if off < 2 * cell:
+                                counts[0 if off < cell else 1, one, two] += 1

@@ -43,7 +43,7 @@ from keyss.channels.quiet.bits import (
     used_words,
 )
 from keyss.channels.quiet.predictability import count_trailing_zeros, least_exponent
-from keyss.channels.quiet.siblings import find_siblings
+from keyss.channels.quiet.siblings import chance_of_equal_steps, find_siblings
 from keyss.core.arrays import Bytes, Doubles, Flags, Integers, Numbers, Words, Words32
 from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
@@ -126,7 +126,7 @@ def usable_with_ids(gaussians: Gaussians, layout: Layout) -> tuple[Flags, Bytes]
 def check_usable(gaussians: Gaussians, usable: Flags, layout: Layout | None = None) -> None:
     """Raise UsageError unless half of the Gaussians are `usable` [N], and their low bits uniform.
 
-    Tested on at most 20,000 Gaussians: see `chance_of_bits`.
+    Tested on at most 20,000 Gaussians: see `chance_of_bits` and `chance_of_equal_steps`.
     """
     share = float(usable.mean()) if len(usable) else 0.0
     if share < MIN_USABLE:
@@ -143,6 +143,11 @@ def check_usable(gaussians: Gaussians, usable: Flags, layout: Layout | None = No
                 f"the low bits of {name} in this cover are not random (p < {_CHANCE:g}), and nothing can be "
                 "hidden in them: the cover was quantised, scaled or moved after its training"
             )
+    if chance_of_equal_steps(gaussians, usable) < _CHANCE:
+        raise UsageError(
+            f"harmonics of this cover tell each other's low bits (p < {_CHANCE:g}), and new bits would be "
+            "seen: training saw most Gaussians from one direction"
+        )
 
 
 def chance_of_bits(words: Words32, bits: int) -> float:
