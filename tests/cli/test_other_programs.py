@@ -105,7 +105,7 @@ def test_hide_reveal_view_convert(keyss: Run, tmp_path: Path, kind: str) -> None
     KINDS[kind](model, PlyData.read(str(model))["vertex"].data.copy())
     key = write_key(tmp_path / "key.txt")
     secret = ("--secret", tmp_path / "secret.ply", "--key-file", key)
-    result = keyss("hide", "--cover", model, *secret, "--width", 32, "-o", run)
+    result = keyss("hide", "--cover", model, *secret, "--width", 24, "--iterations", 5, "-o", run)
     assert result.status == 0, result.err
     result = keyss("reveal", run / "publish" / "model.ply", "--key-file", key, "-o", revealed)
     assert result.status == 0, result.err
@@ -126,7 +126,9 @@ def test_training_folder_as_cover(keyss: Run, tmp_path: Path, place: str) -> Non
     write_model(tmp_path / "secret.ply", trained_like(30, 1, 1))
     secret = ("--secret", tmp_path / "secret.ply", "--key-file", key)
     run = tmp_path / "run"
-    result = keyss("hide", "--cover", tmp_path / "training", *secret, "--width", 32, "-o", run)
+    result = keyss(
+        "hide", "--cover", tmp_path / "training", *secret, "--width", 24, "--iterations", 5, "-o", run
+    )
     assert result.status == 0, result.err
     assert f"training: output of a training; its model is {place}" in result.err
     stego = run / "publish" / "model.ply"

@@ -74,7 +74,7 @@ def test_hide_keeps_extra_properties(keyss: Run, tmp_path: Path, what: str, publ
     (tmp_path / "secret.txt").write_bytes(b"seven words")
     secret = tmp_path / ("secret.ply" if what == "--secret" else "secret.txt")
     key = write_key(tmp_path / "key")
-    options = ["--publish", *publish, *(["--min-psnr", "0"] if what == "--secret" else [])]
+    options = ["--publish", *publish, *(["--min-psnr", "0", "--width", "24"] if what == "--secret" else [])]
     out = tmp_path / "run"
     cover = tmp_path / "cover.ply"
     result = keyss("hide", "--cover", cover, what, secret, "--key-file", key, "-o", out, *options)

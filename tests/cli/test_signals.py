@@ -115,7 +115,7 @@ def test_ctrl_c_during_work(body: str, printed: str) -> None:
     assert _run(program) == Result(130, printed, "keyss: interrupted\n")
 
 
-@pytest.mark.parametrize("signum", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("signum", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)])
 def test_signal_during_training(keyss: Run, workspace: Path, tmp_path: Path, signum: signal.Signals) -> None:
     small = ("--max-gaussians", 100, "--device", "cpu")
 

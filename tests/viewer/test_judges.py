@@ -60,9 +60,21 @@ def page(chromium: Any, folder: Path) -> Iterator[Any]:
 @pytest.mark.parametrize(
     ("judge", "name"),
     [
-        *((judge, name) for judge in ("spark", "playcanvas") for name in ("model.ply", WITH_A_SECRET)),
-        *((judge, f"model.{suffix}") for judge in ("spark", "playcanvas") for suffix in FORMATS[1:3]),
-        ("spark", "model.spz"),  # PlayCanvas's engine does not read it
+        ("spark", "model.sog"),
+        ("spark", WITH_A_SECRET),
+        ("playcanvas", WITH_A_SECRET),
+        *(
+            pytest.param(judge, name, marks=pytest.mark.slow)
+            for judge, name in (
+                *(
+                    (judge, name)
+                    for judge in ("spark", "playcanvas")
+                    for name in ("model.ply", "model.compressed.ply")
+                ),
+                ("playcanvas", "model.sog"),
+                ("spark", "model.spz"),  # PlayCanvas's engine does not read it
+            )
+        ),
     ],
 )
 def test_other_readers_agree(page: Any, folder: Path, judge: str, name: str) -> None:

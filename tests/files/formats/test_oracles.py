@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 
 import gsply
@@ -20,12 +21,14 @@ from keyss.files.formats.spz import SpzCodes
 
 Transform = Callable[..., Path]
 DEGREES = pytest.mark.parametrize("degree", [0, 1, 2, 3])
-SOME_DEGREES = pytest.mark.parametrize("degree", [0, 3])
+TRANSFORMS = [
+    *product((2, 3), ("spz", "compressed.ply", "splat"), (0, 3)),
+    (2, "sog", 3),
+    *(pytest.param(*each, marks=pytest.mark.slow) for each in ((2, "sog", 0), (3, "sog", 0), (3, "sog", 3))),
+]
 
 
-@SOME_DEGREES
-@pytest.mark.parametrize("suffix", ["spz", "sog", "compressed.ply", "splat"])
-@pytest.mark.parametrize("version", [2, 3])
+@pytest.mark.parametrize(("version", "suffix", "degree"), TRANSFORMS)
 def test_splat_transform_reads_ours_and_we_read_its(
     request: pytest.FixtureRequest, tmp_path: Path, version: int, suffix: str, degree: int
 ) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -58,16 +59,22 @@ def _psnr(one: Gaussians, other: Gaussians) -> float:
     return float(-10 * torch.log10(error))
 
 
+@cache
+def _psnr_without_outlier() -> tuple[float, float]:
+    """Of a model without one of its Gaussians, and of all."""
+    model, rest = _bulk(1000), torch.arange(1000) != 17
+    plain = _round_trip(model, 264)
+    return _psnr(model[rest], plain[rest]), _psnr(model, plain)
+
+
 @pytest.mark.parametrize(("name", "value"), HOSTILE)
-@pytest.mark.parametrize("bits", [264])
-def test_one_outlier_costs_under_1_db(bits: int, name: str, value: float) -> None:
-    model = _bulk(1000)
+def test_one_outlier_costs_under_1_db(name: str, value: float) -> None:
+    model, rest = _bulk(1000), torch.arange(1000) != 17
     changed = _with(model, torch.tensor([17]), name, value)
-    rest = torch.arange(1000) != 17
-    plain = _round_trip(model, bits)
-    assert _psnr(model[rest], _round_trip(changed, bits)[rest]) > _psnr(model[rest], plain[rest]) - 1
+    found, (others, every) = _round_trip(changed, 264), _psnr_without_outlier()
+    assert _psnr(model[rest], found[rest]) > others - 1
     # The outlier itself renders as before.
-    assert _psnr(changed, _round_trip(changed, bits)) > _psnr(model, plain) - 3
+    assert _psnr(changed, found) > every - 3
 
 
 def test_undrawable_gaussians() -> None:

@@ -75,7 +75,7 @@ def write(bits: Bits, dry: Bits, message: Bits, rows: Words) -> Bits | None:
     for own, wanted, found in zip(may, changed, rest, strict=True):
         stay, inside = ~own[pivots], np.flatnonzero(own[others])
         system = np.concatenate([free[stay][:, inside], wanted[stay, None]], axis=1)
-        columns, system = _reduced(system, len(inside))
+        system, columns = _reduced(system, len(inside))
         if system[columns < 0, -1].any():
             return None
         found[inside[columns[columns >= 0]]] = system[columns >= 0, -1]
@@ -88,7 +88,7 @@ def write(bits: Bits, dry: Bits, message: Bits, rows: Words) -> Bits | None:
 def _eliminate(rows: bytes) -> tuple[Integers, Integers, Bits, Bits]:
     """The columns of P (-1: none) and F in a matrix [R, BLOCK / 64], P^-1 [R, R] and P^-1 F; see `write`."""
     own = _unpacked(np.frombuffer(rows, "<u8").reshape(-1, _WORDS))
-    pivots, reduced = _reduced(np.concatenate([own, np.eye(len(own), dtype=np.uint8)], axis=1), BLOCK)
+    reduced, pivots = _reduced(np.concatenate([own, np.eye(len(own), dtype=np.uint8)], axis=1), BLOCK)
     others = np.setdiff1d(np.arange(BLOCK), pivots)
     return pivots, others, reduced[:, BLOCK:], reduced[:, others]
 
@@ -105,14 +105,14 @@ def _unpacked(rows: Words) -> Bits:
     return np.unpackbits(rows.view(np.uint8).reshape(len(rows), -1), axis=1, bitorder="little")
 
 
-def _reduced(rows: Bits, count: int) -> tuple[Integers, Bits]:
-    """Eliminate modulo 2: the pivot column of each row [R] among the first `count` columns, and the rows.
+def _reduced(rows: Bits, count: int) -> tuple[Bits, Integers]:
+    """Eliminate modulo 2: the rows, and the pivot column of each [R] among the first `count` columns.
 
     -1 for rows that become 0 there.
     """
     packed = np.packbits(rows, axis=1)
     columns: Integers = _eliminate_packed(packed, count)
-    return columns, np.unpackbits(packed, axis=1, count=rows.shape[1])
+    return np.unpackbits(packed, axis=1, count=rows.shape[1]), columns
 
 
 @kernel
