@@ -3,7 +3,7 @@
     python benchmarks/opensplat.py ../shared/data/fox PATH/OF/opensplat
     python benchmarks/opensplat.py ../shared/data/fox PATH/OF/opensplat --sizes 200,12000,200 400,12000,500
 
-OpenSplat (github.com/pierotofy/OpenSplat) is not a part of keyss. On Debian, with libopencv-dev, cmake and g++:
+OpenSplat (github.com/pierotofy/OpenSplat) is not a part of keyss. On Debian, with libopencv-dev and cmake:
 
     cmake -B build -DGPU_RUNTIME=CPU -DCMAKE_BUILD_TYPE=Release \\
         -DCMAKE_PREFIX_PATH=$(python -c 'import torch; print(torch.utils.cmake_prefix_path)')
