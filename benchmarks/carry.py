@@ -19,7 +19,7 @@ import torch
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
 from keyss import read_model
-from keyss.channels import LowBitsRoom, usable_carriers
+from keyss.channels import LowBitsCapacity, usable_carriers
 from keyss.core import Gaussians, KeyssError, Scene
 from keyss.core.gaussians import compensate_pruning
 from keyss.files.scenes import load_scene
@@ -50,7 +50,8 @@ def _capacities() -> None:
     print("Gaussians that fit in 100,000 carriers, by SH degree of the secret (0, 1, 2, 3):")
     for degree in range(4):
         fits = [
-            LowBitsRoom.of(100_000, degree).record_capacity([record_request(1, other)]) for other in range(4)
+            LowBitsCapacity.of(100_000, degree).record_capacity([record_request(1, other)])
+            for other in range(4)
         ]
         print(f"  cover of degree {degree}: " + ", ".join(f"{number:,}" for number in fits))
 

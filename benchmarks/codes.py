@@ -78,7 +78,7 @@ def rows(cover: tuple[str, Gaussians], secret: tuple[str, Gaussians], data: Path
         untouched = format_.quantise(model).dequantise()
         start = time.monotonic()
         prepared = InCodes(name).prepare(cover[1])
-        left = prepared.room.capacity - prepared.room.overhead
+        left = prepared.capacity.bytes - prepared.capacity.overhead
         kept = prune_to_size(own, left)
         encoded = encode_to_size(kept, left)
         stego = prepared.embed([(KEY, Payload("carry", encoded))])
@@ -113,7 +113,9 @@ def attributes(name: str, model: Gaussians) -> None:
         for attribute in dict.fromkeys(each.name for each in cover.fields):
             own = [each.name == attribute for each in cover.fields]
             free = [each & one for each, one in zip(cover.free, own, strict=True)]
-            bits = sum(each.room for each, one in zip(cover.fields, own, strict=True) if one) / len(model)
+            bits = sum(each.total_bits for each, one in zip(cover.fields, own, strict=True) if one) / len(
+                model
+            )
             # Other attributes must not change; their free bits, too few to hold anything, get noise.
             noise = np.random.default_rng(0).integers(0, 2, len(cover.dry)).astype(np.uint8)
             changed = replace(cover, codes=replace(cover, free=free)._written(noise, os.urandom(32))).cover
@@ -131,7 +133,7 @@ def files(folder: Path, format_name: str, models: list[str]) -> None:
         plain, stego = (
             folder / f"{Path(path).stem}-{kind}{SUFFIXES[format_name]}" for kind in ("plain", "stego")
         )
-        payload = Payload("carry", os.urandom(cover.room.capacity * 9 // 10))
+        payload = Payload("carry", os.urandom(cover.capacity.bytes * 9 // 10))
         write_model(plain, read_model(path))
         write_model(stego, cover.embed([(KEY, payload)]))
         found.append(f"{scene}={plain}:{stego}")

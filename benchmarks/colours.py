@@ -105,7 +105,7 @@ def main() -> None:
             prepared = Colours(strength).prepare(model)
             name = f"{path.stem} | {len(prepared.cover):,} | {strength:.0f}"
             formats = {what: change for what, change in FORMATS.items() if asked.only in what}
-            share = 1.0 if asked.size is None else asked.size / prepared.room.capacity
+            share = 1.0 if asked.size is None else asked.size / prepared.capacity.bytes
             _measure(prepared, name, formats, asked.payloads, asked.seed, share, pruned=True)
             if asked.changes:
                 _measure(prepared, name, OTHERS, asked.payloads, asked.seed)
@@ -132,7 +132,7 @@ def _measure(
     pruned: bool = False,
 ) -> None:
     """Print a row for each change in `wanted`."""
-    size, failures, psnrs = round(share * (prepared.room.capacity - PACKED)), Counter[str](), []
+    size, failures, psnrs = round(share * (prepared.capacity.bytes - PACKED)), Counter[str](), []
     missing: set[str] = set()
     for seed in range(first, first + payloads):
         data = np.random.default_rng(seed).bytes(size)
@@ -168,7 +168,7 @@ def _write_pairs(
         scene, prepared = path.stem.rsplit("-", 1)[0], Colours(strength).prepare(read_model(path))
         made = {"plain": prepared.cover}
         for share in shares:
-            size = int(share * (prepared.room.capacity - PACKED))
+            size = int(share * (prepared.capacity.bytes - PACKED))
             data = np.random.default_rng(number).bytes(size)
             stego = made[f"{share:g}"] = _embed(prepared, number, data)
             print(

@@ -50,7 +50,7 @@ def run_payloads(
         if name not in prepared:
             prepared[name] = Colours(strength).prepare(read())
         cover, started = prepared[name], time.monotonic()
-        data = np.random.default_rng(number).bytes(cover.room.capacity - 2)
+        data = np.random.default_rng(number).bytes(cover.capacity.bytes - 2)
         stego = embed(cover, number, data)
         opened: dict[str, bool] = {}
         ways: dict[str, Change] = {f"`{suffix}`": _convert_by_keyss(suffix) for suffix in OWN}

@@ -39,7 +39,7 @@ from stealth_detection import Examples, learned_detectors, single_detectors
 MAX_OTHERS = 3
 SHARE = 8  # secrets have at most 1 / SHARE of the cover's Gaussians
 PAYLOAD_BYTES = (500, 3000)
-KINDS = ("carried", "sealed")
+KINDS = ("carried", "payload")
 SHOWN = 3  # single statistics in the table
 
 

@@ -17,13 +17,9 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import struct
-import subprocess
 import sys
 import tempfile
-import time
-from dataclasses import dataclass
 from pathlib import Path
 
 import keyss  # noqa: F401  before torch, see `ruff.toml`
@@ -31,6 +27,7 @@ from keyss import read_model
 from keyss.core import Scene
 from keyss.files import load_scene
 from keyss.fitting import mean_psnr
+from process_cost import Cost, run
 
 import numpy as np
 import torch
@@ -38,17 +35,9 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 SIZES = ("200,12000,200", "300,12000,400", "400,12000,600")
-THREADS = 2
+TWO_THREADS = {"OMP_NUM_THREADS": "2", "NUMBA_NUM_THREADS": "2"}
 MOST_STEPS = 30_000
 BACKGROUND = (0.6130, 0.0101, 0.3984)  # OpenSplat's
-
-
-@dataclass(frozen=True)
-class Cost:
-    """The cost of one process."""
-
-    seconds: float
-    processor: float  # seconds of all threads, system time included
 
 
 def main() -> None:
@@ -69,7 +58,8 @@ def main() -> None:
             write_colmap(scene, points, folder / "scene")
             fit(options.scene, folder / "warm", width, points, 20)  # compiles kernels
             theirs = run(
-                [options.opensplat, folder / "scene", "-n", steps, "-o", folder / "splat.ply", *PLAIN]
+                [options.opensplat, folder / "scene", "-n", steps, "-o", folder / "splat.ply", *PLAIN],
+                TWO_THREADS,
             )
             found["OpenSplat"] = steps, theirs, folder / "splat.ply"
             ours = fit(options.scene, folder / "ours", width, points, steps)
@@ -98,19 +88,7 @@ PLAIN = ("--keep-crs", "--cpu", "--num-downscales", "0")
 def fit(scene: Path, out: Path, width: int, gaussians: int, steps: int) -> Cost:
     """`keyss fit`, with a seed."""
     options = ["--width", width, "--max-gaussians", gaussians, "--iterations", steps, "--seed", 0]
-    return run([sys.executable, "-m", "keyss", "fit", scene, *options, "-o", out])
-
-
-def run(command: list[object]) -> Cost:
-    """Run a command. Raises SystemExit if it fails."""
-    words, threads = [str(word) for word in command], str(THREADS)
-    environment = os.environ | {"OMP_NUM_THREADS": threads, "NUMBA_NUM_THREADS": threads}
-    start = time.perf_counter()
-    process = subprocess.Popen(words, stdout=subprocess.DEVNULL, env=environment)
-    _, status, usage = os.wait4(process.pid, 0)
-    if code := os.waitstatus_to_exitcode(status):
-        raise SystemExit(f"{' '.join(words)}: status {code}")
-    return Cost(time.perf_counter() - start, usage.ru_utime + usage.ru_stime)
+    return run([sys.executable, "-m", "keyss", "fit", scene, *options, "-o", out], TWO_THREADS)
 
 
 def write_colmap(scene: Scene, points: int, folder: Path) -> None:

@@ -40,8 +40,8 @@ from channels.quiet.payloads import embed_derived
 from channels.quiet.trained_like import keys, rounded
 from keyss.core import Gaussians, UsageError
 from keyss.lab import candidate_scores, stealth_statistics
+from keyss.methods.carry.capacity import RecordCapacity
 from keyss.methods.carry.options import CarryOptions
-from keyss.methods.carry.room import RecordRoom
 from methods.carry import carried
 from stealth_detection import Detection, Examples, confirmed, learned_detectors, single_detectors
 from stealth_predictor import BitPredictor, sample
@@ -57,7 +57,7 @@ SHOWN = 8  # single statistics in the table
 class File:
     """One file to judge; `pair` names the plain model from which it was made."""
 
-    kind: str  # "plain", "carried", "sealed" (encrypted payload), "refitted" or "given"
+    kind: str  # "plain", "carried", "payload" (encrypted), "refitted" or "given"
     scene: str
     pair: str
     model: Gaussians
@@ -154,13 +154,13 @@ def _make(job: Job) -> list[File]:
     if job.rounded:
         cover = rounded(cover, job.index)
     made = [File("plain", job.scene, job.path, cover)]
-    room = RecordRoom.of(cover, CarryOptions().with_fit(sh_degree=cover.sh_degree))
-    (secret,) = room.prune([read_model(job.secret)], [])
+    capacity = RecordCapacity.of(cover, CarryOptions().with_fit(sh_degree=cover.sh_degree))
+    (secret,) = capacity.prune([read_model(job.secret)], [])
     stego = carried.embed_derived(cover, [(keys(2 * job.index), secret)], os.urandom(32))
     made.append(File("carried", job.scene, job.path, stego, job.secret))
     with suppress(UsageError):  # a small model has no room for a payload
-        sealed = embed_derived(cover, [(keys(2 * job.index + 1), os.urandom(PAYLOAD_BYTES))], os.urandom(32))
-        made.append(File("sealed", job.scene, job.path, sealed))
+        payload = embed_derived(cover, [(keys(2 * job.index + 1), os.urandom(PAYLOAD_BYTES))], os.urandom(32))
+        made.append(File("payload", job.scene, job.path, payload))
     return made
 
 

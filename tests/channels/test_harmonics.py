@@ -9,7 +9,7 @@ from scipy.stats import kstest, spearmanr
 
 from channels.quiet.trained_like import trained_like
 from keyss.channels import Payload, QuietReader
-from keyss.channels.harmonics import RANKS, Harmonics, high_harmonics, pads, row_names, with_high_harmonics
+from keyss.channels.harmonics import RANKS, Harmonics, high_harmonics, pads, row_ids, with_high_harmonics
 from keyss.channels.quiet.bits import read_low_bits
 from keyss.channels.quiet.channel import LOW_BITS
 from keyss.core import Gaussians, InputError
@@ -93,12 +93,12 @@ def test_a_model_without_harmonics_is_refused() -> None:
 
 
 def test_pads_are_uniform_and_follow_from_the_secret_and_the_row() -> None:
-    names = row_names(trained_like(2000))
-    found = pads(bytes(32), names, COUNT)
+    ids = row_ids(trained_like(2000))
+    found = pads(bytes(32), ids, COUNT)
     assert found.shape == (2000, COUNT)
     assert kstest(found.ravel(), "uniform").pvalue > 1e-6
-    assert np.array_equal(found[::-1], pads(bytes(32), names[::-1].copy(), COUNT))
-    assert not np.isin(found, pads(b"\1" + bytes(31), names, COUNT)).any()
+    assert np.array_equal(found[::-1], pads(bytes(32), ids[::-1].copy(), COUNT))
+    assert not np.isin(found, pads(b"\1" + bytes(31), ids, COUNT)).any()
     assert abs(np.corrcoef(found[:, 0], found[:, 1])[0, 1]) < 5 / 2000**0.5
 
 

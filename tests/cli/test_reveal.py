@@ -31,10 +31,10 @@ KEY = "q7Rv2LxT9bWm4KzD"
 
 def hide_claiming(cover: Gaussians, secret: Gaussians, claimed: int) -> Gaussians:
     """Hide `secret` with a header that claims more Gaussians, as if the others were lost."""
-    room = LOW_BITS.prepare(cover)
-    (records,) = encode_all(room, [secret])
+    prepared = LOW_BITS.prepare(cover)
+    (records,) = encode_all(prepared, [secret])
     records = replace(records, header=COUNT.pack(claimed) + records.header[COUNT.size :])
-    return room.embed([(KEY, records)])
+    return prepared.embed([(KEY, records)])
 
 
 @pytest.fixture(scope="module")

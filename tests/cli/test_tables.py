@@ -29,7 +29,7 @@ def test_rows() -> None:
         ["secret", "20.00", "0.250", "567", "20"],
         ["PSNR in dB."],
     ]
-    assert rows[-1] == ["Room in the cover: 1,000 Gaussians."]
+    assert rows[-1] == ["Capacity of the cover: 1,000 Gaussians."]
 
 
 def test_pruned_secret() -> None:

@@ -25,7 +25,7 @@ from keyss.lab import (
     purification,
     random_pruning,
 )
-from lab.opened import Whole
+from lab.known_scene import Whole
 from tiny_scenes import random_gaussians, tiny_scene
 
 NOISY = ("position", "log scale", "quaternion", "logit opacity", "colour", "harmonics")

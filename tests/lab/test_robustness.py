@@ -21,8 +21,8 @@ from keyss.lab import (
     random_pruning,
     reveal_changed,
 )
-from keyss.methods import Opened, open_model
-from lab.opened import Whole
+from keyss.methods import HiddenScene, open_model
+from lab.known_scene import Whole
 from methods.carry.test_refit import TINY
 from methods.hiding import hide_scenes, moved, three_scenes
 from tiny_scenes import random_gaussians, tiny_scene
@@ -81,7 +81,7 @@ def test_lost_secret_is_at_chance_level(scene: Scene) -> None:
 # --- hidden secrets --------------------------------------------------------------------------------------
 
 
-def opener(stego: Gaussians) -> Opened:
+def opener(stego: Gaussians) -> HiddenScene:
     return open_model(stego, KEY)
 
 

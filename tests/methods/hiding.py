@@ -14,7 +14,7 @@ import torch
 from fitting.test_plain import InterruptAt
 from keyss.core import Gaussians, InputError, Interrupted, KeyssWarning, Scene, Similarity, same_bits
 from keyss.fitting import mean_psnr
-from keyss.methods import Context, MethodOptions, Opened, Source, fit_plain_models, registry
+from keyss.methods import Context, HiddenScene, MethodOptions, Source, fit_plain_models, registry
 from keyss.progress import Reporter
 from tiny_scenes import random_gaussians, tiny_scene
 
@@ -22,7 +22,7 @@ from tiny_scenes import random_gaussians, tiny_scene
 @dataclass(frozen=True)
 class Hidden:
     stego: Gaussians
-    opened: tuple[Opened, ...]
+    opened: tuple[HiddenScene, ...]
 
 
 def hide_scenes(

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from keyss.methods.opened import Remains
+from keyss.methods.hidden import Remains
 from keyss.runs.revealing import Revealed, check_secret, loss_warnings
 
 

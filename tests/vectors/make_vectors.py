@@ -56,8 +56,8 @@ from vectors.surviving import NAMES, write_surviving  # noqa: E402
 
 
 def cell() -> dict[str, object]:
-    """A cell as in docs/format.md, by the cipher modes of `cryptography`."""
-    secret, identity = bytes(range(32)), bytes(range(16))
+    """A cell as in docs/byte-layout.md, by the cipher modes of `cryptography`."""
+    secret, carrier_id = bytes(range(32)), bytes(range(16))
     label, data, slot, tag_bytes = "record", b"\x02\x01\x00record", 1, 4
 
     def key(use: str) -> bytes:
@@ -66,14 +66,14 @@ def cell() -> dict[str, object]:
     def aes(use: str, block: bytes) -> bytes:
         return Cipher(AES(key(use)), ECB()).encryptor().update(block)
 
-    message = identity + (bytes([slot]) + data).ljust(16, b"\0")
+    message = carrier_id + (bytes([slot]) + data).ljust(16, b"\0")
     tag = Cipher(AES(key("tag")), CBC(bytes(16))).encryptor().update(message)[-16:][:tag_bytes]
-    nonce = bytes(a ^ b for a, b in zip(identity, (tag + bytes([slot])).ljust(16, b"\0"), strict=True))
+    nonce = bytes(a ^ b for a, b in zip(carrier_id, (tag + bytes([slot])).ljust(16, b"\0"), strict=True))
     stream = aes("stream", aes("seed", nonce))
     return {
         "secret": secret.hex(),
         "label": label,
-        "identity": identity.hex(),
+        "id": carrier_id.hex(),
         "slot": slot,
         "data": data.hex(),
         "cell": (tag + bytes(a ^ b for a, b in zip(data, stream, strict=False))).hex(),
@@ -128,9 +128,9 @@ def pruned_model() -> Gaussians:
 
 def main() -> None:
     (FOLDER / "derivation.json").write_text(json.dumps(derivation(), indent=1) + "\n")
-    sealing = json.loads((FOLDER / "sealing.json").read_text())
-    sealing["cell"] = cell()
-    (FOLDER / "sealing.json").write_text(json.dumps(sealing, indent=1) + "\n")
+    encryption = json.loads((FOLDER / "encryption.json").read_text())
+    encryption["cell"] = cell()
+    (FOLDER / "encryption.json").write_text(json.dumps(encryption, indent=1) + "\n")
     key = json.loads((FOLDER / "carried.json").read_text())["key"]
     secret = trained_like(8, 1, 1)
     secret.means[0, 0] = 1e6  # an outlier

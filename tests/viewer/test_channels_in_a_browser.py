@@ -84,8 +84,8 @@ def test_keys(tab: Visit, published: Callable[[str], Path], tmp_path: Path, kind
 @pytest.mark.slow
 def test_file_in_colours(tab: Visit, tmp_path: Path) -> None:
     note = HiddenFile("a note.txt", b"Written at noon, read at night.\n")
-    room = channel_for("any", "colours").prepare(lifelike(6000, 0).with_sh_degree(0))
-    write_model(tmp_path / "stego.spz", room.embed([(KEYS[0], note.payload())], entropy=bytes(32)))
+    prepared = channel_for("any", "colours").prepare(lifelike(6000, 0).with_sh_degree(0))
+    write_model(tmp_path / "stego.spz", prepared.embed([(KEYS[0], note.payload())], entropy=bytes(32)))
     tab.goto(export_html(tmp_path / "stego.spz", tmp_path / "page.html")[0].as_uri())
     seen = []
     for key in ("another key", KEYS[0]):

@@ -40,22 +40,22 @@ test('added Gaussians are counted', async () => {
 });
 
 test('encrypted cells match Python', () => {
-  const { cell } = jsonVector<{ cell: Record<string, string> & { slot: number } }>('sealing.json');
+  const { cell } = jsonVector<{ cell: Record<string, string> & { slot: number } }>('encryption.json');
   const data = hex(cell.data);
   const cipher = new CellCipher(hex(cell.secret), cell.label, data.length);
   const low = hex(cell.cell);
-  expect(cipher.decrypt(hex(cell.identity), low, low.length, 0, cell.slot)).toEqual({ rows: [0], data: [data] });
+  expect(cipher.decrypt(hex(cell.id), low, low.length, 0, cell.slot)).toEqual({ rows: [0], data: [data] });
   low[0] ^= 1;
-  expect(cipher.decrypt(hex(cell.identity), low, low.length, 0, cell.slot).rows).toEqual([]);
+  expect(cipher.decrypt(hex(cell.id), low, low.length, 0, cell.slot).rows).toEqual([]);
 });
 
 test('encrypted payloads match Python', async () => {
-  const sealing = jsonVector<{ sealed: Record<string, string>; invalid: { why: string; sealed: string }[] }>('sealing.json');
-  const [dataKey, associated] = [hex(sealing.sealed.data_key), hex(sealing.sealed.associated)];
-  expect(await decrypted(dataKey, hex(sealing.sealed.sealed), associated)).toEqual(hex(sealing.sealed.payload));
-  for (const { why, sealed } of sealing.invalid) {
+  const encryption = jsonVector<{ valid: Record<string, string>; invalid: { why: string; encrypted: string }[] }>('encryption.json');
+  const [dataKey, associated] = [hex(encryption.valid.data_key), hex(encryption.valid.associated)];
+  expect(await decrypted(dataKey, hex(encryption.valid.encrypted), associated)).toEqual(hex(encryption.valid.payload));
+  for (const { why, encrypted } of encryption.invalid) {
     if (why === 'bytes after the stream') continue; // browsers refuse them, Node 20 does not
-    await expect(decrypted(dataKey, hex(sealed), associated)).rejects.toThrow();
+    await expect(decrypted(dataKey, hex(encrypted), associated)).rejects.toThrow();
   }
 });
 

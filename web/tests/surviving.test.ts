@@ -8,7 +8,7 @@ import { Channels, preparedFor } from '../src/channels/opening.ts';
 import { unpackPayload } from '../src/channels/content.ts';
 import { type Gaussians, selected } from '../src/core/gaussians.ts';
 import { movedPoint } from '../src/core/similarity.ts';
-import { mixed, namesakes, sortingOrder } from '../src/core/words.ts';
+import { mixed, multiplicities, sortingOrder } from '../src/core/words.ts';
 import { type Derive, expand } from '../src/keys/keys.ts';
 import { here, roundRobin, sequential } from '../src/keys/pool.ts';
 import { digest, hex, jsonVector, modelOf, random } from './vectors.ts';
@@ -50,7 +50,7 @@ test('words sort stably like BigInt', () => {
   const words = new Uint32Array(new BigUint64Array(numbers).buffer);
   const expected = [...numbers.keys()].sort((a, b) => (numbers[a] < numbers[b] ? -1 : numbers[a] > numbers[b] ? 1 : a - b));
   expect([...sortingOrder(words)]).toEqual(expected);
-  expect([...namesakes(words)]).toEqual(numbers.map((each) => numbers.filter((other) => other === each).length));
+  expect([...multiplicities(words)]).toEqual(numbers.map((each) => numbers.filter((other) => other === each).length));
 });
 
 test.each([[112, NOISY, 3, 0.05], [2000, undefined, 1.9, 0.05], [40_000, undefined, 1.8, 0.05]])(

@@ -28,10 +28,10 @@ from keyss.keys import DerivedKey
 from keyss.keys.derivation import SALT_BYTES
 from keyss.measure.hide_quality import Shown, compare, measure_hiding
 from keyss.methods.base import Context, Method, MethodOptions, Source, Stego
-from keyss.methods.handed import pack
-from keyss.methods.opened import Opened
+from keyss.methods.companion import pack
+from keyss.methods.hidden import HiddenScene
 from keyss.methods.plain_models import Bound, fit_bounds, fit_plain_models
-from keyss.methods.registry import DEFAULT, open_handed, open_model
+from keyss.methods.registry import DEFAULT, open_companion, open_model
 from keyss.progress import Reporter
 from keyss.rendering import Backend, resolve_device
 from keyss.rendering.orbit import is_model
@@ -44,7 +44,7 @@ from keyss.runs.files import (
     PathLike,
     as_scene,
     bound_names,
-    handed_names,
+    companion_names,
     path_of,
     plain_names,
     stego_name,
@@ -85,10 +85,10 @@ def hide(
     integers of an "spz", "sog" or "compressed-ply", or of a model decoded from one. By default `format` is
     the cover's; if nothing can be hidden in it unnoticed, `publish` becomes "any", with a warning. "any"
     survives conversion: in the channel "appended" (more Gaussians, which are visible in the file) or
-    "colours" (less room). `width`, `background`, `skip_missing`: see `load_scene`.
+    "colours" (less capacity). `width`, `background`, `skip_missing`: see `load_scene`.
 
     `out` (a folder) gets `publish/` with the stego model, and `private/` with fitted models, `config.json`,
-    `metrics.json`, the files to hand over for methods that need them (`keyss.methods.handed`), and
+    `metrics.json`, companion files for methods that need them (`keyss.methods.companion`), and
     checkpoints, from which `resume` continues. Without a seed in the options' `fit` the run uses a random
     one, which `config.json` records. With a seed, the same arguments and number of threads give the same
     bytes on a CPU.
@@ -288,16 +288,16 @@ def _write_and_read(
 ) -> list[Gaussians]:
     """Write the files to give away, `published` among them, and read the stego model and the secrets back."""
     model, same = stego.gaussians, type(stego.gaussians) is Gaussians
-    packed = [pack(payload) for payload in stego.handed]
+    packed = [pack(payload) for payload in stego.companions]
     if folder:
-        handed = dict(zip(handed_names(len(packed)), packed, strict=True))
+        companion = dict(zip(companion_names(len(packed)), packed, strict=True))
         name = stego_name(model)
-        path = folder.write({name: published, **handed}) / name
+        path = folder.write({name: published, **companion}) / name
         same = reads_as(path, model)
         model = model if same else read_model(path)
-    opened: Sequence[Opened]
+    opened: Sequence[HiddenScene]
     if packed:
-        opened = [open_handed(data) for data in packed]
+        opened = [open_companion(data) for data in packed]
     elif stego.verified and same:
         opened = stego.opened  # opening the same bits again would change nothing
     else:

@@ -16,7 +16,7 @@ from keyss.files.inputs import read_file
 from keyss.files.models import read_model
 from keyss.files.ply_extras import with_extras
 from keyss.keys.encryption import MAX_PAYLOAD_BYTES
-from keyss.methods.opened import HiddenFile
+from keyss.methods.hidden import HiddenFile
 from keyss.rendering.difference import psnr_between
 from keyss.rendering.orbit import is_model
 from keyss.runs.files import STEGOS, PathLike, as_3dgs_model, stego_name

@@ -11,7 +11,7 @@ from keyss.core.gaussians import Gaussians
 from keyss.files.atomic import check_not_an_input, check_output_file, write_bytes
 from keyss.files.inputs import is_standard
 from keyss.files.models import check_model_output, is_model_path, write_model
-from keyss.methods.opened import Frame, HiddenFile, OpensAFileError
+from keyss.methods.hidden import Frame, HiddenFile, OpensAFileError
 from keyss.rendering import Backend, resolve_device
 from keyss.runs.files import PathLike, as_model
 from keyss.runs.folder import check_not_published
@@ -29,7 +29,7 @@ def reveal(
     stego: PathLike | Gaussians,
     key: str | None = None,
     *,
-    handed: PathLike | None = None,
+    companion: PathLike | None = None,
     frame: Frame = "secret",
     decoy: bool = False,
     force: bool = False,
@@ -42,9 +42,9 @@ def reveal(
     The model determines the method. `frame`: "secret" gives a scene in its own frame, in which its cameras
     are valid; "cover" leaves it where it was hidden, unless it was carried. If Gaussians were lost, the
     others are enlarged to compensate (`keyss.core.gaussians`). `force` is for quantised or pruned models: it
-    skips the check that a decoder belongs to the model, and accepts any loss. `handed`: the file handed over
-    for this secret, for methods without keys (`keyss.methods.handed`). Some give a model that a network
-    decodes (`keyss.core.picture_network`), which is no 3DGS model.
+    skips the check that a decoder belongs to the model, and accepts any loss. `companion`: the companion
+    file of this secret, for methods without keys (`keyss.methods.companion`). Some give a model that a
+    network decodes (`keyss.core.picture_network`), which is no 3DGS model.
 
     `out` (a file) gets the secret: a scene for the suffix of a model (.ply, .spz, ...), else a file. Raises
     WrongKeyError for a key that opens nothing (`decoy` reveals the cover instead, see `keyss.methods.decoy`),
@@ -54,9 +54,9 @@ def reveal(
     target = resolve_device(device)
     inputs = [] if isinstance(stego, Gaussians) else [Path(stego)]
     if out is not None and not is_standard(out) and not is_model_path(out):
-        if key is None or handed or decoy or force or frame != "secret":
+        if key is None or companion or decoy or force or frame != "secret":
             raise UsageError(
-                f"{out}: expected the name of a model, such as one that ends in .ply; `handed`, `decoy`, "
+                f"{out}: expected the name of a model, such as one that ends in .ply; `companion`, `decoy`, "
                 "`force` and `frame` are not for hidden files"
             )
         return _reveal_file(stego, key, Path(out), overwrite, inputs)
@@ -65,7 +65,7 @@ def reveal(
         check_not_published(path)
     try:
         found = reveal_model(
-            as_model(stego), key, device=target, frame=frame, decoy=decoy, force=force, handed=handed
+            as_model(stego), key, device=target, frame=frame, decoy=decoy, force=force, companion=companion
         )
     except OpensAFileError as error:
         if path is None:

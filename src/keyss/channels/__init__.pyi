@@ -2,13 +2,13 @@ from .appended.channel import APPENDED as APPENDED, AppendedReader as AppendedRe
 from .appended.words import is_appended as is_appended
 from .base import (
     METHOD_BYTES as METHOD_BYTES,
+    Capacity as Capacity,
     Channel as Channel,
     Content as Content,
     Payload as Payload,
     PreparedCover as PreparedCover,
     RecordRequest as RecordRequest,
     Records as Records,
-    Room as Room,
     pack_method as pack_method,
     pack_payload as pack_payload,
     unpack_method as unpack_method,
@@ -27,7 +27,7 @@ from .publishing import (
 )
 from .quiet.bits import (
     Layout as Layout,
-    identities as identities,
+    gaussian_ids as gaussian_ids,
     read_low_bits as read_low_bits,
     used_words as used_words,
     write_low_bits as write_low_bits,
@@ -40,12 +40,12 @@ from .quiet.channel import (
     LowBitsCover as LowBitsCover,
 )
 from .quiet.fields import Field as Field, last_bits as last_bits
-from .quiet.kept import in_counted_order as in_counted_order
 from .quiet.layout import (
     TYPICAL_SHARE as TYPICAL_SHARE,
-    LowBitsRoom as LowBitsRoom,
+    LowBitsCapacity as LowBitsCapacity,
     check_payload_fits as check_payload_fits,
 )
+from .quiet.order import in_counted_order as in_counted_order
 from .quiet.parameters import key_cipher as key_cipher
 from .quiet.reading import QuietReader as QuietReader
 from .quiet.salts import salt_rows as salt_rows

@@ -25,11 +25,11 @@ from keyss.keys.derivation import DerivedKey
 
 METHOD_BYTES = 15  # maximum length of a method's name
 SALTS_TRIED = 4  # with half of the Gaussians changed, 15 of 16 models still open
-NOTICED = (
+NOT_INDEPENDENT = (
     "the secrets are too large, or too many, to be placed independently of each other: whoever holds one of "
     "the keys can notice that there are other secrets"
 )
-_ADDED = (
+_FOREIGN = (
     "about {:,} Gaussians were added to the file in which this secret was hidden, or changed, and who did "
     "that may have chosen what the key opens: reveal each secret from the file as it was published"
 )
@@ -42,8 +42,8 @@ class Payload:
     method: str  # 1 to METHOD_BYTES ASCII characters
     data: bytes
     chunks: tuple[int, int] | None = field(default=None, compare=False)  # read and written; None: not divided
-    carriers: int | None = field(default=None, compare=False)  # Gaussians in the model it was read from
-    foreign: int = field(default=0, compare=False)  # about how many of these are not of the secret's file
+    model_size: int | None = field(default=None, compare=False)  # Gaussians of the model it was read from
+    foreign: int = field(default=0, compare=False)  # estimate of those added or changed after hiding
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ class Records:
     records: Bytes  # [R, size]
     plan: RecordPlan
     copied: Integers  # [C] indices of the most important records, embedded twice; empty when read
-    foreign: int = 0  # as of `Payload`
+    foreign: int = 0  # see `Payload`
 
 
 Content = Payload | Records
@@ -98,25 +98,25 @@ def unpack_method(packed: bytes) -> str:
 
 
 @dataclass(frozen=True)
-class Room:
-    """How much fits into a cover: exact for a prepared cover, an estimate before it is fitted."""
+class Capacity:
+    """The capacity of a cover: exact for a prepared cover, an estimate before it is fitted."""
 
-    carriers: int  # Gaussians that can carry something
-    capacity: int  # bytes of all payloads together
+    carriers: int
+    bytes: int  # of all payloads together
     overhead: int  # maximum bytes of a payload beside its data
     grows: bool = False  # True if the model grows with the hidden data, which should then be short
 
 
 class PreparedCover(Protocol):
-    """A cover with known room in a channel."""
+    """A cover with known capacity in a channel."""
 
     @property
     def cover(self) -> Gaussians:
         """The cover."""
 
     @property
-    def room(self) -> Room:
-        """The room for payloads."""
+    def capacity(self) -> Capacity:
+        """The capacity for payloads."""
 
     def embed(self, contents: Sequence[tuple[str, Content]], *, entropy: bytes | None = None) -> Gaussians:
         """Embed one (key, content) per secret; contents are all payloads or all records.
@@ -150,13 +150,13 @@ class SaltedReader(ABC):
     def open(self, key: str) -> Content:
         """See `Reader`. Changed or added Gaussians can replace the first salt, so several are tried.
 
-        Warns (KeyssWarning) of Gaussians that are not those of the file in which the secret was hidden.
+        Warns (KeyssWarning) of Gaussians that were added or changed after hiding.
         """
         for derived in self.keys(key):
             with suppress(WrongKeyError):
                 content = self.extract(derived)
                 if content.foreign:
-                    warnings.warn(_ADDED.format(content.foreign), KeyssWarning, stacklevel=3)
+                    warnings.warn(_FOREIGN.format(content.foreign), KeyssWarning, stacklevel=3)
                 return content
         raise WrongKeyError()
 
@@ -167,19 +167,19 @@ class Channel(ABC):
     name: ClassVar[str]  # `quiet`, `appended` or `colours`
     place: str  # in messages: "low bits", "codes of the spz file" and so on
     survives: ClassVar[bool] = False  # True if secrets survive conversion to other formats
-    grows: ClassVar[bool] = False  # see `Room`
+    grows: ClassVar[bool] = False  # see `Capacity`
     records: ClassVar[bool] = False  # True if the channel carries records
 
     @abstractmethod
     def prepare(self, cover: Gaussians) -> PreparedCover:
-        """Find the carriers. Raises UsageError for a cover without room, or whose changes would be visible.
+        """Find the carriers. Raises UsageError for a cover without capacity, or if changes would be visible.
 
         Raises OutputError for a cover that the published format cannot hold.
         """
 
     @abstractmethod
-    def room(self, gaussians: int, sh_degree: int) -> Room:
-        """Estimate the room of a cover in which `gaussians` can carry something."""
+    def estimate_capacity(self, gaussians: int, sh_degree: int) -> Capacity:
+        """Estimate the capacity of a cover with `gaussians` carriers."""
 
 
 def pack_payload(content: Content) -> bytes:

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from keyss.channels.quiet.bits import identities
+from keyss.channels.quiet.bits import gaussian_ids
 from keyss.channels.quiet.cells import CellCipher
 from keyss.core.arrays import Bytes, Doubles, Flags, doubles
 from keyss.core.errors import InputError
@@ -41,15 +41,15 @@ def with_high_harmonics(model: Gaussians, harmonics: Doubles) -> Gaussians:
     return replace(model, sh=torch.cat([model.sh[:, : (KEPT_DEGREE + 1) ** 2], high], dim=1))
 
 
-def row_names(model: Gaussians) -> Bytes:
-    """The identity [N, 16] of each Gaussian, independent of harmonics and low bits."""
-    return identities(model.with_sh_degree(0))
+def row_ids(model: Gaussians) -> Bytes:
+    """The ID [N, 16] of each Gaussian, independent of harmonics and low bits."""
+    return gaussian_ids(model.with_sh_degree(0))
 
 
-def pads(secret: bytes, names: Bytes, count: int) -> Doubles:
-    """Numbers [N, count] in [0, 1): a pseudo-random function of a secret and each Gaussian's identity."""
+def pads(secret: bytes, ids: Bytes, count: int) -> Doubles:
+    """Numbers [N, count] in [0, 1): a pseudo-random function of a secret and each Gaussian's ID."""
     size = 4 * count
-    stream = CellCipher(secret, "pad", size).encrypt(names, np.zeros((len(names), size), np.uint8))
+    stream = CellCipher(secret, "pad", size).encrypt(ids, np.zeros((len(ids), size), np.uint8))
     return np.ascontiguousarray(stream[:, -size:]).view("<u4") / 2.0**32
 
 

@@ -62,7 +62,7 @@ def open_content(stego: Gaussians, key: str) -> Content:
     """The content that `key` opens in any channel. Raises WrongKeyError, and InputError for damage."""
     for reader in _readers(stego):
         with suppress(WrongKeyError):
-            return _with_carriers(stego, reader.open(key))
+            return _with_model_size(stego, reader.open(key))
     raise WrongKeyError()
 
 
@@ -92,13 +92,13 @@ def quick_attempt(stego: Gaussians, key: str) -> Attempt | None:
     opened: list[Content] = []
     for reader, each in zip(readers, derived, strict=True):
         with suppress(WrongKeyError):
-            opened.append(_with_carriers(stego, reader.extract(each)))
+            opened.append(_with_model_size(stego, reader.extract(each)))
     records = isinstance(quiet, QuietReader) and not quiet.blocks and appended is None
     return Attempt(derived[0], opened[0] if opened else None, appended is not None, records)
 
 
-def _with_carriers(stego: Gaussians, content: Content) -> Content:
-    return replace(content, carriers=len(stego)) if isinstance(content, Payload) else content
+def _with_model_size(stego: Gaussians, content: Content) -> Content:
+    return replace(content, model_size=len(stego)) if isinstance(content, Payload) else content
 
 
 def _readers(stego: Gaussians) -> Iterator[Reader]:

@@ -163,7 +163,7 @@ def _hide_scenes(args: HideArguments, cover: Path) -> None:
     from keyss.cli.tables import print_files, print_hiding, print_plan
     from keyss.core.errors import UsageError
     from keyss.methods import registry
-    from keyss.runs.files import HANDED, STEGOS
+    from keyss.runs.files import COMPANIONS, STEGOS
 
     method = registry.get(args.method)
     options, secrets = _method_options(args), _secrets(args, method)
@@ -207,7 +207,7 @@ def _hide_scenes(args: HideArguments, cover: Path) -> None:
         args.out,
         {
             **dict.fromkeys(STEGOS, f"{how}: {what}"),
-            HANDED: "hand this over to whoever may see the secret: `keyss reveal --handed`",
+            COMPANIONS: "hand this over to whoever may see the secret: `keyss reveal --companion`",
             "private": "keep this private, or delete it: measurements, configuration, fitted models",
         },
     )

@@ -25,8 +25,8 @@ def reveal(
             help="Model to write (.ply, .spz, ...), or - for stdout; any other name for a hidden file.",
         ),
     ],
-    handed: Annotated[
-        Path | None, optional("FILE", "File handed over beside the model, for methods that need one.")
+    companion: Annotated[
+        Path | None, optional("FILE", "Companion file of the model, for methods that need one.")
     ] = None,
     frame: Annotated[
         Literal["secret", "cover"], arg(help="Coordinates: the secret's own, or those it was hidden in.")
@@ -44,12 +44,12 @@ def reveal(
 
     example: keyss reveal - --key-file key.txt -o - < model.ply > secret.ply
     """
-    check_exists(stego, handed, *key_file)
+    check_exists(stego, companion, *key_file)
     import keyss
     from keyss.cli.keys import keys
 
     key: str | None = None
-    if handed is None or key_file:
+    if companion is None or key_file:
         (key,) = keys(key_file, 1)
     from keyss.files.inputs import is_standard
     from keyss.progress import waiting
@@ -58,7 +58,7 @@ def reveal(
         revealed = keyss.reveal(
             stego,
             key,
-            handed=handed,
+            companion=companion,
             frame=frame,
             decoy=decoy,
             force=force,

@@ -57,7 +57,7 @@ def print_hiding(metrics: HideMetrics, console: Console | None = None, *, brief:
         return
     for name, unit in {"capacity": "Gaussians", "capacity_bytes": "bytes"}.items():
         if name in metrics.details:
-            console.print(f"Room in the cover: {metrics.details[name]:,} {unit}.", highlight=False)
+            console.print(f"Capacity of the cover: {metrics.details[name]:,} {unit}.", highlight=False)
 
 
 def _scene_rows(metrics: HideMetrics) -> list[dict[str, str]]:
@@ -100,7 +100,7 @@ def _sizes_differ(metrics: HideMetrics, tolerance: float = 0.0) -> bool:
 
 
 def print_plan(plan: Plan) -> None:
-    """Print stages, room and estimates of a run."""
+    """Print stages, capacity and estimates of a run."""
     rows = [
         (
             stage.name,
@@ -116,7 +116,7 @@ def print_plan(plan: Plan) -> None:
     _print_columns(
         [
             ("method", plan.method),
-            ("room", f"{plan.capacity:,} of the secrets' {plan.secret_gaussians:,} Gaussians"),
+            ("capacity", f"{plan.capacity:,} of the secrets' {plan.secret_gaussians:,} Gaussians"),
             (
                 "published",
                 f"up to {plan.gaussians:,} Gaussians of SH degree {plan.sh_degree}, "

@@ -16,7 +16,7 @@ MAX_KEY_BYTES = 4096
 _TOO_LONG = f"the key is longer than {MAX_KEY_BYTES} bytes"
 ALPHABET = string.ascii_letters + string.digits
 KEY_LENGTH = 22  # characters of 5.95 bits: 131 bits
-_SPACES = "\t\n\v\f\r \u1680\u2028\u2029\ufeff"  # those of JavaScript's `trim`; NFKC replaces the others
+_SPACES = "\t\n\v\f\r \u1680\u2028\u2029\ufeff"  # as JavaScript's `trim`, without those that NFKC replaces
 
 
 def normalized_key(text: str) -> str:

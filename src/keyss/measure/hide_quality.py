@@ -15,7 +15,7 @@ from keyss.core.similarity import align
 from keyss.fitting.image_metrics import ImageQuality, mean_psnr, mean_quality, subsample_views, view_quality
 from keyss.kernels.memory import release
 from keyss.keys import random_embeddings
-from keyss.methods.opened import Opened
+from keyss.methods.hidden import HiddenScene
 from keyss.rendering import render
 
 WRONG_KEYS = 32
@@ -85,7 +85,7 @@ class HidingQuality:
 
 def measure_hiding(
     stego: Gaussians,
-    opened: Sequence[Opened],
+    opened: Sequence[HiddenScene],
     scenes: Sequence[Scene],  # the cover, then the secrets in the order of `opened`, each in its own frame
     shown: Sequence[Shown],  # of `compare`: the stego model, then the secrets
     gaussians: Sequence[int | None],  # of the plain models of the scenes
@@ -122,7 +122,7 @@ def measure_hiding(
     )
 
 
-def in_cover(opened: Opened, secret: Scene, cover: Scene) -> Scene:
+def in_cover(opened: HiddenScene, secret: Scene, cover: Scene) -> Scene:
     """The secret's scene with its test cameras in the cover's frame.
 
     A secret without a frame there is placed by aligning its training cameras with the cover's.
@@ -137,7 +137,7 @@ def in_cover(opened: Opened, secret: Scene, cover: Scene) -> Scene:
 @torch.no_grad()
 def _wrong_keys(
     stego: Gaussians,
-    opened: Sequence[Opened],
+    opened: Sequence[HiddenScene],
     cover: Scene,
     secrets: Sequence[Scene],  # placed in the cover's frame
     count: int,

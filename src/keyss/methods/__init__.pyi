@@ -8,10 +8,11 @@ from .base import (
     Training as Training,
     divide as divide,
 )
+from .carry.capacity import RecordCapacity as RecordCapacity, SecretSize as SecretSize, to_degree as to_degree
 from .carry.method import most_contributing as most_contributing
 from .carry.options import CarryOptions as CarryOptions
-from .carry.room import RecordRoom as RecordRoom, SecretSize as SecretSize, to_degree as to_degree
 from .decoy import Decoy as Decoy
+from .hidden import Frame as Frame, HiddenFile as HiddenFile, HiddenScene as HiddenScene, Remains as Remains
 from .keyss.combined import CombinedPoses as CombinedPoses, PlacedScene as PlacedScene
 from .keyss.decoder import Decoder as Decoder
 from .keyss.latent import LatentDecoder as LatentDecoder
@@ -26,7 +27,6 @@ from .keyss.options import (
 )
 from .keyss.secret import DECODERS as DECODERS, KeyssSecret as KeyssSecret, choose_anchors as choose_anchors
 from .keyss.training import KeyssTraining as KeyssTraining
-from .opened import Frame as Frame, HiddenFile as HiddenFile, Opened as Opened, Remains as Remains
 from .plain_models import Bound as Bound, fit_plain_models as fit_plain_models
 from .records.carried_secret import CarriedSecret as CarriedSecret, unpack as unpack
 from .records.embedding import (

@@ -22,7 +22,7 @@ if TYPE_CHECKING:  # the command line reads options without torch
     from keyss.channels import Channel, Payload
     from keyss.core.gaussians import Gaussians
     from keyss.core.scene import Scene
-    from keyss.methods.opened import Opened
+    from keyss.methods.hidden import HiddenScene
     from keyss.progress import Reporter
 
 
@@ -76,18 +76,18 @@ class Stego:
     """The result of hiding."""
 
     gaussians: Gaussians  # the published model
-    opened: tuple[Opened, ...]  # the secrets, opened with their keys
+    opened: tuple[HiddenScene, ...]  # the secrets, opened with their keys
     iterations: int = 0  # joint training steps
     details: Mapping[str, Any] = field(default_factory=dict)  # the method's own numbers, for metrics.json
     verified: bool = False  # True if `opened` was read from `gaussians` with the keys
-    handed: tuple[Payload, ...] = ()  # files to hand over, one per secret, if the method has any
+    companions: tuple[Payload, ...] = ()  # companion files, one per secret, if the method has any
 
 
 @dataclass(frozen=True, kw_only=True)
 class Capabilities:
     """The capabilities of a method."""
 
-    keys: bool = True  # a key opens each secret; else a file that is handed over beside the model shows it
+    keys: bool = True  # a key opens each secret; else a companion file of the model shows it
     standard: bool = True  # the published model is a 3DGS model, which every viewer renders
     models: bool = True  # revealed secrets are 3DGS models; else a network renders their images
 
@@ -114,8 +114,8 @@ class MethodOptions:
     fit: FitConfig = field(default_factory=FitConfig)  # plain models, and joint training
     publish: Publish = "as-is"  # or any: the published model may be converted
     format: Format | None = None  # for `publish="as-is"`; None: the cover's format
-    # For `publish="any"`: appended Gaussians have unlimited room but are visible in the file; colours have
-    # little room and are less visible.
+    # For `publish="any"`: appended Gaussians have unlimited capacity but are visible in the file; colours are
+    # less visible but have little capacity.
     channel: AnyChannel = "appended"
 
     def __post_init__(self) -> None:

@@ -7,11 +7,11 @@ from itertools import product
 
 import torch
 
-from keyss.channels import TYPICAL_SHARE, LowBitsRoom
+from keyss.channels import TYPICAL_SHARE, LowBitsCapacity
 from keyss.core.gaussians import DRAWN_OPACITY, Gaussians
 from keyss.core.similarity import Similarity
 from keyss.keys.derivation import DerivedKey
-from keyss.methods.opened import Frame, Remains
+from keyss.methods.hidden import Frame, Remains
 from keyss.methods.records import whole
 from keyss.methods.records.lines import Table
 from keyss.methods.records.quantise import Codec
@@ -26,7 +26,7 @@ _MIN_SHARE = 0.8  # minimum share of the cover's Gaussians that are left
 
 @dataclass(frozen=True)
 class Decoy:
-    """An `Opened` that shows the cover, imperceptibly changed.
+    """A `HiddenScene` that shows the cover, imperceptibly changed.
 
     A smooth function changes opacities, a similarity moves all Gaussians, and the faintest ones are removed.
     The derived key seeds these changes, so nobody can compute the bytes without it. The result is encoded and
@@ -58,7 +58,7 @@ class Decoy:
         return Decoy(frame, changes, share, order, appended, records)
 
     def reveal(self, stego: Gaussians, *, frame: Frame = "secret", force: bool = False) -> Gaussians:
-        """The rendered Gaussians of the cover, all changed; see `Opened.reveal`."""
+        """The rendered Gaussians of the cover, all changed; see `HiddenScene.reveal`."""
         stego = stego.to("cpu")
         position = (stego.opacity_logits / _LOGITS).clamp(-1, 1).add(1).mul((_KNOTS - 1) / 2)
         left = position.long().clamp_max(_KNOTS - 2)
@@ -75,15 +75,17 @@ class Decoy:
 
     def _encode_and_decode(self, model: Gaussians, stego: Gaussians) -> Gaussians:
         """Encode and decode `model` like a secret carried by `stego`."""
-        room = LowBitsRoom.of(int(TYPICAL_SHARE * len(stego)), stego.sh_degree)
+        capacity = LowBitsCapacity.of(int(TYPICAL_SHARE * len(stego)), stego.sh_degree)
         options = product(range(stego.sh_degree, -1, -1), (2, 1))  # SH degree, records per carrier
-        found = ((cells, Table.of_size(8 * room.record_bytes(cells), degree)) for degree, cells in options)
+        found = (
+            (cells, Table.of_size(8 * capacity.record_bytes(cells), degree)) for degree, cells in options
+        )
         cells, table = next((each for each in found if each[1]), (0, None))
         if table is None or not self.records:
             precision = whole.Precision.usual(model)
             return whole.decode(whole.encode(model, precision.finer(_FINER * self.appended)))
         order = torch.randperm(len(model), generator=torch.Generator().manual_seed(self.order))
-        model = model[order[: cells * room.carriers]].with_sh_degree(table.sh_degree)
+        model = model[order[: cells * capacity.carriers]].with_sh_degree(table.sh_degree)
         codec, outliers = Codec.fit_with_outliers(model, table)
         return codec.decode(codec.encode(model, outliers))
 

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from keyss.channels import Content
     from keyss.core.gaussians import Gaussians
     from keyss.methods.base import Method, MethodOptions
-    from keyss.methods.opened import Opened
+    from keyss.methods.hidden import HiddenScene
 
 
 class Modules(NamedTuple):
@@ -22,7 +22,7 @@ class Modules(NamedTuple):
     summary: str  # one line, printed after the name
     options: str  # a `MethodOptions`, in a module that does not import torch
     hiding: str  # a `keyss.methods.base.Method`
-    opening: str  # turns content of a channel or a handed-over file into an `Opened`
+    opening: str  # turns content of a channel or a companion file into a `HiddenScene`
 
 
 def _baseline(module: str, options: str, summary: str) -> Modules:
@@ -46,12 +46,12 @@ METHODS = {
     ),
     "3dgs": _baseline("upper_bound", "BoundOptions", "upper bound: the secret is a separate file"),
     "3dgs-sh": _baseline(
-        "second_harmonics", "ShOptions", "second harmonics for the secret, handed over (baseline)"
+        "second_harmonics", "ShOptions", "second harmonics for the secret, in a companion file (baseline)"
     ),
     "3dgs-decoder": _baseline(
         "picture_decoder",
         "DecoderOptions",
-        "a network from the cover's picture to the secret's, handed over (baseline)",
+        "a network from the cover's picture to the secret's, in a companion file (baseline)",
     ),
     "gs-hider": _baseline(
         "gs_hider", "GsHiderOptions", "features in place of harmonics, and a network for each scene"
@@ -90,7 +90,7 @@ def of_options(options: MethodOptions) -> Method:
     return get(name)
 
 
-def open_model(stego: Gaussians, key: str, *, decoy: bool = False) -> Opened:
+def open_model(stego: Gaussians, key: str, *, decoy: bool = False) -> HiddenScene:
     """The secret that `key` opens in a model (see `keyss.channels.publishing`).
 
     Raises WrongKeyError for a key that opens nothing, InputError for damage. With `decoy`, such a key gives a
@@ -109,15 +109,15 @@ def open_model(stego: Gaussians, key: str, *, decoy: bool = False) -> Opened:
     return _unpack(attempt.content)
 
 
-def open_handed(data: bytes) -> Opened:
-    """The secret in a handed-over file (see `keyss.methods.handed`). Raises InputError."""
-    from keyss.methods import handed
+def open_companion(data: bytes) -> HiddenScene:
+    """The secret in a companion file (see `keyss.methods.companion`). Raises InputError."""
+    from keyss.methods import companion
 
-    return _unpack(handed.unpack(data))
+    return _unpack(companion.unpack(data))
 
 
-def _unpack(content: Content) -> Opened:
-    from keyss.methods.opened import FILE, HiddenFile, OpensAFileError
+def _unpack(content: Content) -> HiddenScene:
+    from keyss.methods.hidden import FILE, HiddenFile, OpensAFileError
 
     name = content.method
     if name == FILE:
@@ -126,5 +126,5 @@ def _unpack(content: Content) -> Opened:
         raise InputError(
             f"the secret was hidden by the method {name!r}; this program has {', '.join(METHODS)}"
         )
-    unpack: Callable[[Content], Opened] = _load(METHODS[name].opening)
+    unpack: Callable[[Content], HiddenScene] = _load(METHODS[name].opening)
     return unpack(content)

@@ -15,14 +15,14 @@ from keyss.core.picture_network import DecodedGaussians
 from keyss.core.scene import Scene, ViewOptions
 from keyss.files.file_kinds import identify_file
 from keyss.files.models import DECODED_SUFFIX, is_model_source, known_suffixes, read_model
-from keyss.methods.handed import SUFFIX
+from keyss.methods.companion import SUFFIX
 from keyss.runs.folder import PRIVATE, PUBLISH
 
 STEGO = f"{PUBLISH}/model.ply"  # an innocuous name
 STEGOS = (STEGO, *(f"{PUBLISH}/model{suffix}" for suffix in (*SUFFIXES.values(), DECODED_SUFFIX)))
 MODEL = "model.ply"  # result of a plain fit
 CONFIG, METRICS, REPORT = f"{PRIVATE}/config.json", f"{PRIVATE}/metrics.json", f"{PRIVATE}/report.html"
-HANDED = f"{PRIVATE}/hand-over"  # files for those who may see a secret
+COMPANIONS = f"{PRIVATE}/companion"  # companion files, for those who may see a secret
 CONTROLS = f"{PRIVATE}/controls"  # plain models of the cover from other seeds, for audits
 PathLike = str | Path
 Background = Tensor | Sequence[float] | None
@@ -84,9 +84,9 @@ def bound_names(secrets: int) -> list[str]:
     return [f"{PRIVATE}/bound-{index}.ply" for index in ("cover", *range(1, secrets + 1))]
 
 
-def handed_names(secrets: int) -> list[str]:
-    """Files to hand over for the secrets, with methods that need them."""
-    return [f"{HANDED}/secret-{index}{SUFFIX}" for index in range(1, secrets + 1)]
+def companion_names(secrets: int) -> list[str]:
+    """Companion files of the secrets, for methods that need them."""
+    return [f"{COMPANIONS}/secret-{index}{SUFFIX}" for index in range(1, secrets + 1)]
 
 
 def path_of(source: PathLike | Scene | Gaussians) -> str | None:

@@ -12,7 +12,7 @@ from keyss.core.scene import Scene
 from keyss.files.models import read_model
 from keyss.methods import registry
 from keyss.methods.base import MethodOptions
-from keyss.methods.opened import Opened
+from keyss.methods.hidden import HiddenScene
 from keyss.rendering.orbit import is_model
 from keyss.runs.files import (
     CONFIG,
@@ -20,13 +20,13 @@ from keyss.runs.files import (
     PathLike,
     as_scene,
     bound_names,
-    handed_names,
+    companion_names,
     plain_names,
     run_folder,
     stego_in,
 )
 from keyss.runs.json_records import read_record
-from keyss.runs.revealing import read_handed
+from keyss.runs.revealing import read_companion
 from keyss.runs.run_records import HideMetrics, RunConfig, read_config, secret_ids
 
 
@@ -38,13 +38,13 @@ class HidingRun:
     config: RunConfig[MethodOptions]
     metrics: HideMetrics
     stego: Gaussians
-    opened: tuple[Opened, ...]  # one per secret, in order
+    opened: tuple[HiddenScene, ...]  # one per secret, in order
     keys: tuple[str, ...] = field(repr=False)  # one per secret; "" if the method has no keys
     sources: tuple[str, ...]  # cover, then secrets: scene folders, or models without photos
 
     @property
-    def openers(self) -> list[Callable[[Gaussians], Opened]]:
-        """Functions that open the secrets in a changed model; handed-over files do not change."""
+    def openers(self) -> list[Callable[[Gaussians], HiddenScene]]:
+        """Functions that open the secrets in a changed model; companion files do not change."""
         if registry.get(self.config.method).capabilities.keys:
             return [lambda stego, key=key: registry.open_model(stego, key) for key in self.keys]  # type: ignore[misc]
         return [lambda _, secret=secret: secret for secret in self.opened]  # type: ignore[misc]
@@ -89,7 +89,7 @@ def open_run(run: PathLike, keys: Sequence[str]) -> HidingRun:
         raise UsageError(f"the method {config.method} has no keys: give none")
     else:
         keys = [""] * len(config.payloads)
-        opened = [read_handed(folder / name) for name in handed_names(len(keys))]
+        opened = [read_companion(folder / name) for name in companion_names(len(keys))]
     names = secret_ids(config.options.fit.known_seed, opened)
     by_name = dict(zip(names, zip(opened, keys, strict=False), strict=True))
     if set(by_name) != set(config.payloads):

@@ -1,4 +1,4 @@
-"""Plans of runs: room, disk and memory follow from models and options; times are rough."""
+"""Plans of runs: capacity, disk and memory follow from models and options; times are rough."""
 
 from __future__ import annotations
 

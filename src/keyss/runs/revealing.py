@@ -10,8 +10,8 @@ import torch
 from keyss.core.errors import InputError, UsageError
 from keyss.core.gaussians import DRAWN_OPACITY, Gaussians
 from keyss.files.inputs import read_file
-from keyss.methods import handed as handing, registry
-from keyss.methods.opened import Frame, HiddenFile, Opened, OpensAFileError, Remains
+from keyss.methods import companion as companions, registry
+from keyss.methods.hidden import Frame, HiddenFile, HiddenScene, OpensAFileError, Remains
 from keyss.runs.files import PathLike
 
 MIN_LEFT = 0.1  # share; pruning compensation stops there (`keyss.core.gaussians`), and renders become empty
@@ -63,17 +63,17 @@ def reveal_model(
     frame: Frame = "secret",
     decoy: bool = False,
     force: bool = False,
-    handed: PathLike | None = None,
+    companion: PathLike | None = None,
 ) -> Revealed:
     """The secret that `key` opens in a stego model, however little is left; raises as `keyss.reveal` does."""
-    if handed is not None:
+    if companion is not None:
         if decoy:
-            raise UsageError("files that are handed over have no decoys: leave out `decoy=True`")
+            raise UsageError("companion files have no decoys: leave out `decoy=True`")
         if key is not None:
-            raise UsageError("files that are handed over have no keys: whoever has one sees the secret")
-        opened = read_handed(handed)
+            raise UsageError("companion files have no keys: whoever has one sees the secret")
+        opened = read_companion(companion)
     elif key is None:
-        raise UsageError("expected `key`, or `handed` for a file that was handed over")
+        raise UsageError("expected `key`, or `companion` for a companion file")
     else:
         opened = registry.open_model(model, key, decoy=decoy)
     revealed = opened.reveal(model.to(device), frame=frame, force=force)
@@ -118,11 +118,11 @@ def _count(remains: Remains) -> str:
     return f"{remains.found:,} of {remains.hidden:,} Gaussians of the secret were found"
 
 
-def read_handed(path: PathLike) -> Opened:
-    """Open the secret in a file that was handed over; see `registry.open_handed`."""
-    data = read_file(Path(path), handing.MAX_BYTES)
+def read_companion(path: PathLike) -> HiddenScene:
+    """Open the secret in a companion file; see `registry.open_companion`."""
+    data = read_file(Path(path), companions.MAX_BYTES)
     try:
-        return registry.open_handed(data)
+        return registry.open_companion(data)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
 

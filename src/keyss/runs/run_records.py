@@ -16,7 +16,7 @@ from keyss.fitting.image_metrics import ImageQuality
 from keyss.measure.hide_quality import HidingQuality, RenderFidelity
 from keyss.methods import registry
 from keyss.methods.base import MethodOptions
-from keyss.methods.opened import Opened
+from keyss.methods.hidden import HiddenScene
 from keyss.runs.json_records import read_record
 
 OptionsT = TypeVar("OptionsT", bound=MethodOptions)
@@ -61,7 +61,7 @@ def read_config(path: Path) -> RunConfig[MethodOptions]:
     return config
 
 
-def secret_ids(seed: int, opened: Iterable[Opened]) -> tuple[str, ...]:
+def secret_ids(seed: int, opened: Iterable[HiddenScene]) -> tuple[str, ...]:
     """Identifiers of the secrets; the same secret has another identifier in a run with another seed."""
     texts = (f"keyss/v1/secret {seed} {secret.fingerprint()}" for secret in opened)
     return tuple(hashlib.sha256(text.encode()).hexdigest()[:16] for text in texts)

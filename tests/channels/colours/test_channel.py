@@ -37,7 +37,7 @@ def prepared() -> ColoursCover:
 
 @pytest.fixture(scope="module")
 def payload(prepared: ColoursCover) -> bytes:
-    return np.random.default_rng(0).bytes(prepared.room.capacity - PACKED)
+    return np.random.default_rng(0).bytes(prepared.capacity.bytes - PACKED)
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +48,7 @@ def stego(prepared: ColoursCover, payload: bytes) -> Gaussians:
 @settings(max_examples=8, deadline=None)
 @given(share=st.floats(0, 1), seed=st.integers(0, 2**32))
 def test_every_size_up_to_capacity_comes_back(prepared: ColoursCover, share: float, seed: int) -> None:
-    data = np.random.default_rng(seed).bytes(int(share * (prepared.room.capacity - PACKED)))
+    data = np.random.default_rng(seed).bytes(int(share * (prepared.capacity.bytes - PACKED)))
     stego = embed(prepared, [("a", data)], entropy=seed.to_bytes(32, "little"))
     assert extract(stego, "a") == data
 
@@ -63,7 +63,7 @@ def test_a_header_made_up_by_chance_hides_no_other(
 
 
 def test_what_does_not_fit_is_refused_with_what_would(prepared: ColoursCover, payload: bytes) -> None:
-    with pytest.raises(UsageError, match=f"{prepared.room.capacity:,} bytes in all"):
+    with pytest.raises(UsageError, match=f"{prepared.capacity.bytes:,} bytes in all"):
         embed(prepared, [("a", payload + b"x")])
     with pytest.raises(UsageError, match="`strength`"):
         Colours(math.nan)
@@ -80,7 +80,7 @@ def test_only_green_and_blue_of_some_gaussians_change(prepared: ColoursCover, st
 
 def test_it_costs_no_more_than_was_asked_for(prepared: ColoursCover, stego: Gaussians) -> None:
     assert psnr_between(prepared.cover, stego) > STRENGTH
-    sizes = [Colours(strength).prepare(prepared.cover).room.capacity for strength in (40.0, 50.0, 60.0)]
+    sizes = [Colours(strength).prepare(prepared.cover).capacity.bytes for strength in (40.0, 50.0, 60.0)]
     assert sizes == sorted(sizes, reverse=True)
     assert sizes[0] > 1.3 * sizes[2]
 
@@ -133,7 +133,7 @@ HARDER: dict[str, Callable[[Gaussians], Gaussians]] = {
 def test_a_fifth_of_the_capacity_opens_after(prepared: ColoursCover, name: str) -> None:
     if "spz" in name:
         pytest.importorskip("gsply")
-    data = np.random.default_rng(1).bytes((prepared.room.capacity - PACKED) // 5)
+    data = np.random.default_rng(1).bytes((prepared.capacity.bytes - PACKED) // 5)
     stego = embed(prepared, [("a", data)], entropy=ENTROPY)
     assert extract(HARDER[name](stego), "a") == data
 
@@ -152,7 +152,7 @@ def test_formats_of_other_programs(index: int, stego: Gaussians, payload: bytes)
 
 
 def test_two_keys_open_their_own_and_a_third_nothing(prepared: ColoursCover) -> None:
-    size = prepared.room.capacity // 60  # small enough for both to lie as each would alone
+    size = prepared.capacity.bytes // 60  # small enough for both to lie as each would alone
     data = {name: os.urandom(size) for name in "ab"}
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -202,7 +202,7 @@ def test_small_models_are_refused_or_carry(count: int) -> None:
     model = cover(max(count, 1))[:count]
     with pytest.raises(UsageError):
         embed(model, [("a", bytes(100))])
-    assert COLOURS.prepare(model).room.capacity < 100
+    assert COLOURS.prepare(model).capacity.bytes < 100
     with pytest.raises(WrongKeyError):
         extract(model, "a")
 

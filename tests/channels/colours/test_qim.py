@@ -1,4 +1,4 @@
-"""Numbers on lattices, names of Gaussians, and salts: one property each."""
+"""Numbers on lattices, IDs of Gaussians, and salts: one property each."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ LEVEL = 24
 
 
 def _written(level: int = LEVEL):
-    """Names [C, 4], values before and after [C, 2], bits of each [C], and code [B]."""
+    """IDs [C, 4], values before and after [C, 2], bits of each [C], and code [B]."""
     carriers = Carriers.of(cover())
-    names, before = carriers.names[carriers.representatives], carriers.colours[carriers.representatives, 1:]
+    ids, before = carriers.ids[carriers.representatives], carriers.colours[carriers.representatives, 1:]
     bits = qim.bit_counts(carriers.impact[carriers.representatives], level)
     code = np.random.default_rng(0).integers(0, 2, qim.COLUMNS * bits.sum()).astype(np.uint8)
-    return names, before, qim.write(SECRET, names, before, bits, code), bits, code
+    return ids, before, qim.write(SECRET, ids, before, bits, code), bits, code
 
 
 @pytest.mark.parametrize("level", [qim.ONE, 4, 24, 40])
 def test_bits_come_back_after_noise_below_half_of_the_spacing(level: int) -> None:
-    names, _, written, bits, code = _written(level)
+    ids, _, written, bits, code = _written(level)
     noise = np.random.default_rng(1).uniform(-0.0131, 0.0131, written.shape)  # as .spz rounds
-    assert ((qim.read(SECRET, names, written + noise, bits) < 0) == code).all()
+    assert ((qim.read(SECRET, ids, written + noise, bits) < 0) == code).all()
 
 
 def test_what_is_added_is_uniform_noise_of_the_stated_variance() -> None:
@@ -45,9 +45,9 @@ def test_what_is_added_is_uniform_noise_of_the_stated_variance() -> None:
 
 
 def test_without_the_secret_nothing_lies_on_a_lattice() -> None:
-    names, _, written, bits, _ = _written(qim.ONE)
-    sure = np.abs(qim.read(SECRET, names, written, bits)).mean()
-    assert np.abs(qim.read(bytes(16), names, written, bits)).mean() < 0.9 * sure
+    ids, _, written, bits, _ = _written(qim.ONE)
+    sure = np.abs(qim.read(SECRET, ids, written, bits)).mean()
+    assert np.abs(qim.read(bytes(16), ids, written, bits)).mean() < 0.9 * sure
     assert kstest(written.ravel() / qim.SPACING % 1, "uniform").pvalue > 0.001
 
 
@@ -71,7 +71,7 @@ def test_names_survive_the_rounding_of_spz() -> None:
     before, after = (Carriers.of(each) for each in (model, rounded))
     rows, mine, others = np.intersect1d(before.rows, after.rows, return_indices=True)
     assert len(rows) > 0.97 * len(before)
-    assert (before.names[mine] == after.names[others]).all(axis=1).mean() > 0.99
+    assert (before.ids[mine] == after.ids[others]).all(axis=1).mean() > 0.99
 
 
 def test_names_that_are_not_in_doubt_survive_noise() -> None:
@@ -79,7 +79,7 @@ def test_names_that_are_not_in_doubt_survive_noise() -> None:
     noise = 0.009 * (2 * torch.rand(model.log_scales.shape, generator=torch.Generator().manual_seed(1)) - 1)
     moved = replace(model, log_scales=model.log_scales + noise)
     before, after = Carriers.of(model), Carriers.of(moved)
-    changed = (before.names != after.names).any(axis=1)
+    changed = (before.ids != after.ids).any(axis=1)
     assert changed.mean() == pytest.approx(0.07, rel=0.15)  # 3 numbers, 0.144 / 2 of them to other sixteenths
     assert changed[after.error_probability == 0].mean() < 0.003  # both scales of a ratio change: 0.07^2
 
@@ -91,16 +91,16 @@ def test_names_do_not_depend_on_order_or_frame(scale: float) -> None:
     order = torch.randperm(2000, generator=torch.Generator().manual_seed(0))
     before, moved = Carriers.of(model), turned(scale)(model)
     after = [Carriers.of(moved, each / 4) for each in range(4)]
-    best = max((each.names == before.names).all(axis=1).mean() for each in after)
+    best = max((each.ids == before.ids).all(axis=1).mean() for each in after)
     assert best == 1.0 if scale == 1 else best > 0.85
-    assert sorted(map(bytes, Carriers.of(model[order]).names)) == sorted(map(bytes, before.names))
+    assert sorted(map(bytes, Carriers.of(model[order]).ids)) == sorted(map(bytes, before.ids))
 
 
 def test_one_of_each_name_is_written() -> None:
     carriers = Carriers.of(Gaussians.cat([cover(300)] * 2))
-    names = carriers.names[carriers.representatives]
-    assert len(np.unique(names, axis=0)) == len(names) == len(np.unique(carriers.names, axis=0))
-    assert (carriers.name_counts >= 2).all()
+    ids = carriers.ids[carriers.representatives]
+    assert len(np.unique(ids, axis=0)) == len(ids) == len(np.unique(carriers.ids, axis=0))
+    assert (carriers.id_counts >= 2).all()
 
 
 def test_salts_are_new_and_are_found_again_after_rounding_and_pruning() -> None:

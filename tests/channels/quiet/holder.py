@@ -49,8 +49,8 @@ def _opened(stego: Gaussians, key: DerivedKey) -> tuple[Any, dict[tuple[int, int
     cells: dict[tuple[int, int], list[npt.NDArray[np.bool_]]] = {}
     original = CellCipher.decrypt
 
-    def decrypt(self: CellCipher, names: Any, data: Any, slot: Any = 0) -> Any:
-        fits, plain = original(self, names, data, slot)
+    def decrypt(self: CellCipher, ids: Any, data: Any, slot: Any = 0) -> Any:
+        fits, plain = original(self, ids, data, slot)
         if not any(each is self for each in ciphers):
             ciphers.append(self)
         index = next(at for at, each in enumerate(ciphers) if each is self)

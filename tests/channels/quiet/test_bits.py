@@ -1,4 +1,4 @@
-"""Low bits and identities against hashlib and the text of the format, for any words that a file may hold."""
+"""Low bits and IDs against hashlib and the text of the format, for any words that a file may hold."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import torch
 from hypothesis import given, settings, strategies as st
 from hypothesis.extra import numpy as arrays
 
-from keyss.channels import Layout, identities, read_low_bits, used_words, write_low_bits
-from keyss.channels.quiet.reading import _are_among
+from keyss.channels import Layout, gaussian_ids, read_low_bits, used_words, write_low_bits
+from keyss.channels.quiet.reading import _rows_in
 from keyss.channels.quiet.usable import repeated
 from keyss.core import Gaussians
 from keyss.kernels.parallel import in_blocks
@@ -48,7 +48,7 @@ def test_identities_are_those_of_hashlib(model: Gaussians) -> None:
         hashlib.blake2b(row.astype("<u4").tobytes(), digest_size=16, person=b"keyss/identity").digest()
         for row in rows
     ]
-    assert [each.tobytes() for each in identities(model)] == hashes
+    assert [each.tobytes() for each in gaussian_ids(model)] == hashes
 
 
 @given(models(), st.data())
@@ -88,7 +88,7 @@ def test_what_occurs_twice_is_found_whatever_it_is(values: np.ndarray, shift: in
 def test_rows_among_others(rows: np.ndarray, split: int) -> None:
     own, others = rows[:split], rows[split:]
     known = {row.tobytes() for row in others}
-    assert _are_among(own, others).tolist() == [row.tobytes() in known for row in own]
+    assert _rows_in(own, others).tolist() == [row.tobytes() in known for row in own]
 
 
 @pytest.mark.parametrize("threads", [1, 2, 5])

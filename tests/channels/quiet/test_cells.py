@@ -22,10 +22,10 @@ def _bytes(*shape: int) -> np.ndarray:
 
 @pytest.mark.parametrize("size", [1, 15, 16, 33, 71])
 def test_round_trip_and_what_is_behind_a_cell_is_ignored(size: int) -> None:
-    names, data = _bytes(50, 16), _bytes(50, size)
+    ids, data = _bytes(50, 16), _bytes(50, size)
     cipher = CellCipher(SECRET, "x", size)
-    cells = cipher.encrypt(names, data)
-    fits, opened = cipher.decrypt(names, np.concatenate([cells, _bytes(50, 3)], axis=1))
+    cells = cipher.encrypt(ids, data)
+    fits, opened = cipher.decrypt(ids, np.concatenate([cells, _bytes(50, 3)], axis=1))
     assert fits.all()
     assert (opened == data).all()
 
@@ -33,9 +33,9 @@ def test_round_trip_and_what_is_behind_a_cell_is_ignored(size: int) -> None:
 def test_the_construction_is_the_documented_one() -> None:
     """Cell by cell, with the library's own CBC."""
     size, slot = 40, 2
-    names, data = _bytes(5, 16), _bytes(5, size)
-    cells = CellCipher(SECRET, "x", size).encrypt(names, data, slot)
-    for name, plain, cell in zip(names, data, cells, strict=True):
+    ids, data = _bytes(5, 16), _bytes(5, size)
+    cells = CellCipher(SECRET, "x", size).encrypt(ids, data, slot)
+    for name, plain, cell in zip(ids, data, cells, strict=True):
         message = name.tobytes() + (bytes([slot]) + plain.tobytes()).ljust(48, b"\0")
         tag = Cipher(AES(expand(SECRET, "x/tag", 32)), CBC(bytes(16))).encryptor().update(message)[-16:]
         assert cell[:TAG_BYTES].tobytes() == tag[:TAG_BYTES]
@@ -50,30 +50,30 @@ def _aes(label: str, block: bytes) -> bytes:
 
 
 def test_other_keys_labels_slots_and_gaussians_open_nothing() -> None:
-    names, data = _bytes(2000, 16), _bytes(2000, 20)
-    cells = CellCipher(SECRET, "x", 20).encrypt(names, data)
-    assert not CellCipher(bytes(32), "x", 20).decrypt(names, cells)[0].any()
-    assert not CellCipher(SECRET, "y", 20).decrypt(names, cells)[0].any()
-    assert not CellCipher(SECRET, "x", 20).decrypt(names, cells, 1)[0].any()
-    assert not CellCipher(SECRET, "x", 20).decrypt(names[::-1], cells)[0].any()
+    ids, data = _bytes(2000, 16), _bytes(2000, 20)
+    cells = CellCipher(SECRET, "x", 20).encrypt(ids, data)
+    assert not CellCipher(bytes(32), "x", 20).decrypt(ids, cells)[0].any()
+    assert not CellCipher(SECRET, "y", 20).decrypt(ids, cells)[0].any()
+    assert not CellCipher(SECRET, "x", 20).decrypt(ids, cells, 1)[0].any()
+    assert not CellCipher(SECRET, "x", 20).decrypt(ids[::-1], cells)[0].any()
 
 
 def test_every_single_flipped_bit_is_noticed() -> None:
-    names, data = _bytes(1, 16), _bytes(1, 20)
+    ids, data = _bytes(1, 16), _bytes(1, 20)
     cipher = CellCipher(SECRET, "x", 20)
-    bits = np.unpackbits(cipher.encrypt(names, data)) ^ np.eye(8 * 24, dtype=np.uint8)
-    fits, _ = cipher.decrypt(np.repeat(names, len(bits), axis=0), np.packbits(bits, axis=1))
+    bits = np.unpackbits(cipher.encrypt(ids, data)) ^ np.eye(8 * 24, dtype=np.uint8)
+    fits, _ = cipher.decrypt(np.repeat(ids, len(bits), axis=0), np.packbits(bits, axis=1))
     assert not fits.any()
 
 
 def test_no_key_stream_comes_twice() -> None:
     """Zeros encrypted: the same in many Gaussians and slots, other data in the same Gaussian."""
-    cipher, names = CellCipher(SECRET, "x", 32), _bytes(1000, 16)
+    cipher, ids = CellCipher(SECRET, "x", 32), _bytes(1000, 16)
     zeros = np.zeros((1000, 32), np.uint8)
-    streams = [cipher.encrypt(names, zeros, slot)[:, TAG_BYTES:] for slot in range(4)]
+    streams = [cipher.encrypt(ids, zeros, slot)[:, TAG_BYTES:] for slot in range(4)]
     other = zeros.copy()
     other[:, -1] = 1
-    streams.append(cipher.encrypt(names, other)[:, TAG_BYTES:] ^ other)
+    streams.append(cipher.encrypt(ids, other)[:, TAG_BYTES:] ^ other)
     halves = np.concatenate(streams).reshape(-1, 16)
     assert len(np.unique(halves, axis=0)) == len(halves)
 

@@ -12,8 +12,8 @@ from hypothesis import given, settings, strategies as st
 from channels.quiet.coded import FORMATS, bits_of, codes_of, model_of, opened, there_and_back, written
 from keyss.channels import CodesCover, Field, Payload, QuietReader, in_counted_order, last_bits
 from keyss.channels.quiet.fields import carrying, sog_distances
-from keyss.channels.quiet.kept import changeable
-from keyss.channels.quiet.syndromes import held
+from keyss.channels.quiet.wet_paper import read_blocks
+from keyss.channels.quiet.writable_levels import writable_levels
 from keyss.core import InputError, UsageError, WrongKeyError
 from keyss.files.formats import sog
 from keyss.files.formats.common import morton_order
@@ -35,11 +35,11 @@ def blocks(data: bytes, width: int) -> int:
 @given(data=st.data())
 def test_any_payloads_of_any_sizes(suffix: str, data: st.DataObject) -> None:
     cover = CodesCover.of(codes_of(suffix, 3000))
-    some = st.integers(0, cover.room.capacity // 4)
+    some = st.integers(0, cover.capacity.bytes // 4)
     sizes = data.draw(st.lists(some, min_size=1, max_size=8))
     rng = np.random.default_rng(data.draw(st.integers(0, 99)))
     payloads = [rng.bytes(size) for size in sizes]
-    if sum(blocks(payload, cover.width) for payload in payloads) >= len(cover.names):
+    if sum(blocks(payload, cover.width) for payload in payloads) >= len(cover.ids):
         with pytest.raises(UsageError, match="room for"):
             written(cover, *payloads)
         return
@@ -52,11 +52,11 @@ def test_any_payloads_of_any_sizes(suffix: str, data: st.DataObject) -> None:
 @EVERY
 def test_capacity_is_exact(suffix: str) -> None:
     cover = CodesCover.of(codes_of(suffix))
-    left = len(cover.names) - 1  # one gives the salt
+    left = len(cover.ids) - 1  # one gives the salt
     full = np.random.default_rng(1).bytes((left - 2) * cover.width)
     while blocks(full, cover.width) > left:
         full = full[:-1]
-    assert cover.room.capacity - cover.room.overhead <= len(full) < cover.room.capacity
+    assert cover.capacity.bytes - cover.capacity.overhead <= len(full) < cover.capacity.bytes
     assert opened(there_and_back(suffix, written(cover, full))) == full
     with pytest.raises(UsageError, match="room for"):
         written(cover, full + b"\x55")
@@ -128,7 +128,7 @@ def test_equal_inputs_give_equal_files_and_others_no_salt_in_common(suffix: str)
 def test_damage_is_told_from_a_wrong_key(suffix: str) -> None:
     """But for the few bits that hold salt and slots, or nothing."""
     cover = CodesCover.of(codes_of(suffix))
-    data = np.random.default_rng(0).bytes(cover.room.capacity * 9 // 10)
+    data = np.random.default_rng(0).bytes(cover.capacity.bytes * 9 // 10)
     file = written(cover, data)
     damaged = 0
     for row in range(0, 6000, 400):
@@ -150,7 +150,7 @@ def test_equal_keys_no_secrets_and_too_many() -> None:
         with pytest.raises(UsageError, match="each with its own"):
             cover.embed(secrets)
     with pytest.raises(UsageError, match="room for"):
-        cover.embed([(str(i), payload) for i in range(len(cover.names) // 3 + 1)])
+        cover.embed([(str(i), payload) for i in range(len(cover.ids) // 3 + 1)])
     with pytest.raises(ValueError, match="32 bytes"):
         cover.embed([("key", payload)], entropy=b"short")
 
@@ -247,9 +247,9 @@ def test_gaussians_nearer_to_each_other_than_by_chance_stay() -> None:
     positions = codes.positions.copy()
     positions[1000:1200] = positions[:200] + np.array([1, 0, 0])
     near = replace(codes, positions=positions)
-    free = np.stack(changeable(near, in_counted_order(near)[2], SECRET)[:3])
+    free = np.stack(writable_levels(near, in_counted_order(near)[2], SECRET)[:3])
     assert free[:, :200].mean() < 0.1 > free[:, 1000:1200].mean()
-    apart = np.stack(changeable(codes, fields, SECRET)[:3])
+    apart = np.stack(writable_levels(codes, fields, SECRET)[:3])
     assert apart[:, :200].mean() > 0.8 < free[:, 2000:].mean()
 
 
@@ -261,7 +261,7 @@ def test_neighbours_with_equal_rotations_keep_them(suffix: str) -> None:
         nearest = int(np.linalg.norm(means - means[row], axis=1).argsort()[1])
         rotations = codes.rotations.copy()
         rotations[nearest] = rotations[row]
-        free = np.stack(changeable(*in_counted_order(replace(codes, rotations=rotations))[1:], SECRET))
+        free = np.stack(writable_levels(*in_counted_order(replace(codes, rotations=rotations))[1:], SECRET))
         assert not free[:, [row, nearest]].any()
         assert free.any(axis=0).mean() > 0.8
 
@@ -296,11 +296,11 @@ def test_the_blocks_of_one_file_are_of_no_use_in_another(suffix: str) -> None:
     one, host = sorted(covers, key=lambda each: each.width)
     first = written(one, b"first")
     assert opened(first) == b"first"
-    table = held(bits_of(first))[:, : host.width]
-    table = np.resize(table, (len(host.names), host.width))
+    table = read_blocks(bits_of(first))[:, : host.width]
+    table = np.resize(table, (len(host.ids), host.width))
     bits = host._solved(table, SECRET)
     assert bits is not None
     copied = host._published(host._written(bits, SECRET), SECRET).codes
-    assert np.array_equal(held(bits_of(copied))[:40, : host.width], table[:40])
+    assert np.array_equal(read_blocks(bits_of(copied))[:40, : host.width], table[:40])
     with pytest.raises(WrongKeyError):
         opened(copied)

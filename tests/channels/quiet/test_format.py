@@ -1,4 +1,4 @@
-"""A second reader, written from docs/format.md with other libraries only, opens what this program wrote."""
+"""A second reader, written from docs/byte-layout.md with other libraries only, opens what keyss wrote."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ def _aes(key: bytes, block: bytes) -> bytes:
     return Cipher(AES(key), ECB()).encryptor().update(block)
 
 
-def _decrypted(secret: bytes, label: str, identity: bytes, cell: bytes, slot: int = 0) -> bytes | None:
+def _decrypted(secret: bytes, label: str, carrier_id: bytes, cell: bytes, slot: int = 0) -> bytes | None:
     tag, hidden = cell[:4], cell[4:]
-    nonce = bytes(a ^ b for a, b in zip(identity, (tag + bytes([slot])).ljust(16, b"\0"), strict=True))
+    nonce = bytes(a ^ b for a, b in zip(carrier_id, (tag + bytes([slot])).ljust(16, b"\0"), strict=True))
     seed = _aes(_hkdf(secret, f"{label}/seed"), nonce)
     blocks = range(-(-len(hidden) // 16))
     stream = b"".join(
@@ -44,13 +44,13 @@ def _decrypted(secret: bytes, label: str, identity: bytes, cell: bytes, slot: in
     )
     data = bytes(a ^ b for a, b in zip(hidden, stream, strict=False))
     message = bytes([slot]) + data
-    message = identity + message.ljust(-(-len(message) // 16) * 16, b"\0")
+    message = carrier_id + message.ljust(-(-len(message) // 16) * 16, b"\0")
     mac = Cipher(AES(_hkdf(secret, f"{label}/tag")), CBC(bytes(16))).encryptor().update(message)[-16:]
     return data if mac[:4] == tag else None
 
 
 def _gaussians() -> list[tuple[tuple[bool, int], bytes, bytes]]:
-    """Place in the order of salts, identity and low bits of each."""
+    """Place in the order of salts, carrier_id and low bits of each."""
     vertices = plyfile.PlyData.read(FOLDER / "carried.ply")["vertex"]
     harmonics = [f"f_rest_{15 * colour + k}" for k in range(15) for colour in range(3)]
     names = ["scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3", "opacity", *harmonics]
@@ -63,12 +63,12 @@ def _gaussians() -> list[tuple[tuple[bool, int], bytes, bytes]]:
         kept = [int(np.float32(vertices[axis][index]).view(np.uint32)) for axis in "xyz"]
         kept += [word & ~mask for word, mask in zip(words, masks, strict=True)]
         public = struct.pack(f"<{len(kept)}I", *kept)
-        identity = hashlib.blake2b(public, digest_size=16, person=b"keyss/identity").digest()
+        carrier_id = hashlib.blake2b(public, digest_size=16, person=b"keyss/identity").digest()
         low = [(word & mask) >> 1 for word, mask in zip(words, masks, strict=True)]
         data = bytes(low[:8])
         for a, b in zip(low[8::2], [*low[9::2], 0], strict=False):
             data += bytes([a >> 4, (a & 15) << 4 | b >> 8, b & 255])
-        found.append(((_is_doubtful(words, masks, lengths[-1]), -_least(words)), identity, data[:WIDTH]))
+        found.append(((_is_doubtful(words, masks, lengths[-1]), -_least(words)), carrier_id, data[:WIDTH]))
     assert abs(np.median(lengths) - 1) > 1e-4  # quaternions are in use
     return found
 
@@ -91,18 +91,18 @@ def _is_doubtful(words: list[int], masks: list[int], length: float) -> bool:
 
 def test_a_reader_written_from_the_description_opens_the_carried_model() -> None:
     ordered = sorted(_gaussians())
-    gaussians = [(identity, low) for _, identity, low in ordered]
+    gaussians = [(carrier_id, low) for _, carrier_id, low in ordered]
     salts = [hashlib.sha256(b"keyss/v2/salt" + b"".join(each)).digest()[:16] for each in gaussians[:12]]
     salt = salts[0]
     master = hash_secret_raw(EXPECTED["key"].encode(), salt, 3, 65_536, 4, 32, Type.ID)
     key_secret = _hkdf(master, "quiet/key")
-    data_keys = [_decrypted(key_secret, "key", identity, low[:20]) for identity, low in gaussians]
+    data_keys = [_decrypted(key_secret, "key", carrier_id, low[:20]) for carrier_id, low in gaussians]
     ((data_key, times),) = Counter(filter(None, data_keys)).most_common(1)
     assert times == 12
 
     parts = {}
-    for identity, low in gaussians:
-        if (part := _decrypted(data_key, "parameters", identity, low)) is not None:
+    for carrier_id, low in gaussians:
+        if (part := _decrypted(data_key, "parameters", carrier_id, low)) is not None:
             parts[part[0]] = part[1:]
     packed = b"".join(parts[number] for number in sorted(parts))
     version, service, method = struct.unpack_from("<BB15s", packed)
@@ -115,11 +115,11 @@ def test_a_reader_written_from_the_description_opens_the_carried_model() -> None
     bits, skipped = header[4], 3 + 3 * header[6]  # of a coordinate; of outliers and quaternions before it
     lines = [struct.unpack_from("<2f2e", header, 12 + 12 * axis) for axis in range(3)]
     means = set()
-    for identity, low in gaussians:
+    for carrier_id, low in gaussians:
         for slot in range(cells):
             cell = low[slot * (WIDTH // cells) :][: 4 + size]
             for label in ("record", "copy"):
-                if (record := _decrypted(data_key, label, identity, cell, slot)) is not None:
+                if (record := _decrypted(data_key, label, carrier_id, cell, slot)) is not None:
                     whole = int.from_bytes(record, "big")
                     shifts = [8 * size - skipped - bits * (axis + 1) for axis in range(3)]
                     codes = [whole >> shift & (1 << bits) - 1 for shift in shifts]

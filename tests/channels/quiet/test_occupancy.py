@@ -11,14 +11,14 @@ import pytest
 from scipy.stats import ks_2samp
 
 from channels.quiet.trained_like import keys
-from keyss.channels import CellCipher, Content, LowBitsRoom, Payload, RecordRequest, Records, key_cipher
+from keyss.channels import CellCipher, Content, LowBitsCapacity, Payload, RecordRequest, Records, key_cipher
 from keyss.channels.quiet.layout import SALTS
 from keyss.channels.quiet.parameters import parameter_cipher, unpack
 from keyss.channels.quiet.writing import Writer
 from keyss.core import KeyssWarning
 
 CARRIERS, WIDTH = 3000, 75
-ROOM = LowBitsRoom(CARRIERS, WIDTH)
+CAPACITY = LowBitsCapacity(CARRIERS, WIDTH)
 NAMES = np.random.default_rng(0).integers(0, 256, (CARRIERS, 16), np.uint8)
 OWN = keys(0)
 HIDINGS = 40
@@ -26,7 +26,7 @@ HIDINGS = 40
 
 def _records(counts: Sequence[int]) -> list[Content]:
     requests = [RecordRequest(count, 33, 168) for count in counts]
-    plans = ROOM.plan_records(requests)
+    plans = CAPACITY.plan_records(requests)
     random = np.random.default_rng(0)
     return [
         Records(

@@ -79,9 +79,9 @@ def test_splat_transform_reads_it(
 
 @EVERY
 def test_it_opens_from_the_very_file_and_from_no_other(name: str, tmp_path: Path) -> None:
-    room, secret = channel_for("as-is", format=name).prepare(model_of()), model_of(200, seed=3)  # type: ignore[arg-type]
+    prepared, secret = channel_for("as-is", format=name).prepare(model_of()), model_of(200, seed=3)  # type: ignore[arg-type]
     _, stego = files(name, tmp_path)
-    made = embed_models(room, ["key"], [secret])
+    made = embed_models(prepared, ["key"], [secret])
     write_model(stego, made.gaussians)
     again = read_model(stego)
     found = registry.open_model(again, "key").reveal(again)

@@ -20,13 +20,13 @@ from channels.quiet.trained_like import UNNATURAL, keys, trained_like
 from keyss.channels import (
     LOW_BITS,
     Layout,
-    LowBitsRoom,
+    LowBitsCapacity,
     QuietReader,
     RecordRequest,
     Records,
     base,
     check_payload_fits,
-    identities,
+    gaussian_ids,
     read_low_bits,
     salt_rows,
     usable_carriers,
@@ -90,7 +90,7 @@ def test_only_low_bits_of_some_fields_change(plain: Gaussians, stego: Gaussians)
         assert not torch.equal(before, after)
         assert torch.equal(before >> bits, after >> bits), name
         assert torch.equal(before & 1, after & 1), name
-    assert np.array_equal(identities(plain), identities(stego))
+    assert np.array_equal(gaussian_ids(plain), gaussian_ids(stego))
 
 
 @pytest.mark.parametrize("seed", range(10))
@@ -108,10 +108,10 @@ def test_survives_shuffling_and_the_loss_of_a_quarter(stego: Gaussians, seed: in
 def test_too_much_pruning_is_said_to_the_holder_of_the_key_only() -> None:
     model = trained_like(4000)
     own, other = keys(), keys(1)
-    room = LOW_BITS.room(3500, 3).capacity
-    stego = embed_derived(model, [(own, os.urandom(room * 9 // 10))])
+    capacity = LOW_BITS.estimate_capacity(3500, 3).bytes
+    stego = embed_derived(model, [(own, os.urandom(capacity * 9 // 10))])
     order = torch.randperm(4000, generator=torch.Generator().manual_seed(0))
-    first = salt_rows(stego, identities(stego), read_low_bits(stego))[:1]
+    first = salt_rows(stego, gaussian_ids(stego), read_low_bits(stego))[:1]
     rest = stego[torch.cat([torch.from_numpy(first), order[:1500]])]
     with pytest.raises(InputError, match="too much of the model"):
         extract_derived(rest, own[0])
@@ -248,16 +248,16 @@ def test_models_too_small_are_refused_with_the_number_that_would_do() -> None:
 
 
 def test_capacity_grows_with_the_model_and_is_kept_to() -> None:
-    rooms = [LowBitsRoom.of(carriers, 3) for carriers in (100, 500, 1000, 5000, 20_000, 200_000)]
-    sizes = [room.for_payloads().capacity for room in rooms]
+    capacities = [LowBitsCapacity.of(carriers, 3) for carriers in (100, 500, 1000, 5000, 20_000, 200_000)]
+    sizes = [each.for_payloads().bytes for each in capacities]
     assert sizes == sorted(sizes)
     assert sizes[0] == 0
     assert sizes[-1] / 200_000 > 38
-    assert rooms[-1].payload_capacity(1) > 1.9 * rooms[-1].payload_capacity(2)
-    for room, capacity in zip(rooms[1:], sizes[1:], strict=True):
-        room.plan_payloads([capacity])
+    assert capacities[-1].payload_capacity(1) > 1.9 * capacities[-1].payload_capacity(2)
+    for capacity, size in zip(capacities[1:], sizes[1:], strict=True):
+        capacity.plan_payloads([size])
         with pytest.raises(UsageError, match="too small"):
-            room.plan_payloads([capacity + 1])
+            capacity.plan_payloads([size + 1])
 
 
 @pytest.mark.parametrize("change", UNNATURAL)
@@ -347,10 +347,10 @@ def replaced(first: Gaussians, second: Gaussians, kept: float) -> Gaussians:
 
     The salts of the second are overwritten, and the first loses Gaussians that give no salt.
     """
-    rows = salt_rows(second, identities(second), read_low_bits(second))
+    rows = salt_rows(second, gaussian_ids(second), read_low_bits(second))
     low = np.random.default_rng(0).integers(0, 256, (len(rows), 75), np.uint8)
     second = write_low_bits(second, Layout.of(second), [(rows, low)])
-    salts = salt_rows(first, identities(first), read_low_bits(first))
+    salts = salt_rows(first, gaussian_ids(first), read_low_bits(first))
     rest = np.setdiff1d(np.arange(len(first)), salts)[: int(kept * len(first))]
     return Gaussians.cat([second, first[torch.from_numpy(np.concatenate([salts, rest]))]])
 
@@ -384,9 +384,9 @@ def test_fewer_foreign_gaussians_than_a_quarter_are_noticed(cover: Gaussians, le
 
 
 def test_a_sketch_tells_foreign_gaussians_and_no_others() -> None:
-    names = np.random.default_rng(0).integers(0, 256, (40_000, 16), np.uint8)
+    ids = np.random.default_rng(0).integers(0, 256, (40_000, 16), np.uint8)
     for count in (1, 100, 20_000):
-        own = sketch(KEY.encode().ljust(16), names[:count])
-        assert foreign(KEY.encode().ljust(16), names[:count], own, count) == 0
-    assert 15_000 < foreign(KEY.encode().ljust(16), names, own, 20_000) < 25_000
-    assert foreign(b"another data key", names[:20_000], own, 20_000) > 0
+        own = sketch(KEY.encode().ljust(16), ids[:count])
+        assert foreign(KEY.encode().ljust(16), ids[:count], own, count) == 0
+    assert 15_000 < foreign(KEY.encode().ljust(16), ids, own, 20_000) < 25_000
+    assert foreign(b"another data key", ids[:20_000], own, 20_000) > 0

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from hypothesis import given, settings, strategies as st
 
-from keyss.channels.quiet.syndromes import BLOCK, matrix, read, width_of, write
+from keyss.channels.quiet.wet_paper import BLOCK, matrix, read, width_of, write
 
 
 @settings(max_examples=40, deadline=None)

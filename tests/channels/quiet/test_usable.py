@@ -15,7 +15,7 @@ from keyss.channels import LOW_BITS, QuietReader, chance_of_bits, read_low_bits,
 from keyss.channels.quiet import usable
 from keyss.channels.quiet.bits import Layout, used_words, write_low_bits
 from keyss.channels.quiet.predictability import count_trailing_zeros, least_exponent
-from keyss.channels.quiet.usable import GIVEN_AWAY, check_usable
+from keyss.channels.quiet.usable import MAX_SEPARATION, check_usable
 from keyss.core import Gaussians, UsageError, same_bits
 from keyss.lab.stealth.judging import stealth_statistics
 
@@ -81,13 +81,13 @@ def test_what_is_given_away_keeps_to_its_share(step: float) -> None:
     """By the true probabilities of trailing zeros, which the limit is to be safe for."""
     words = np.concatenate([used_words(rounded_like(4000, seed, step))[:, 8:] for seed in (1, 2)])
     counts = count_trailing_zeros(words, np.ones(len(words), bool))
-    least = least_exponent(counts, GIVEN_AWAY)
+    least = least_exponent(counts, MAX_SEPARATION)
     exponents = np.arange(256)
     # A step is larger than 2^(e + 2) with this probability: then bits 0 and 1 of a number are zero.
     forced = np.exp(-(2.0 ** (exponents - 127 + 2)) / step)
     even = counts[:, 1:].sum(axis=1)
     given_away = (even * (2 * forced) ** 2)[least:].sum()
-    assert given_away <= GIVEN_AWAY
+    assert given_away <= MAX_SEPARATION
     assert least < 127 + np.log2(step) + 4  # not much more is left alone than has to be
 
 
@@ -187,7 +187,7 @@ def test_a_cover_that_was_changed_in_place_is_looked_at_again() -> None:
     cover.log_scales[:10] = 0.5
     after = LOW_BITS.prepare(cover)
     assert not after.usable[:10].any()
-    assert (after.names[:10] != before.names[:10]).any()
+    assert (after.ids[:10] != before.ids[:10]).any()
 
 
 def test_saturated_opacities_stay_as_they_are() -> None:

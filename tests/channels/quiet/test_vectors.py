@@ -17,7 +17,7 @@ pytestmark = pytest.mark.argon2
 
 FOLDER = Path(__file__).parents[3] / "tests" / "vectors"
 DERIVATION = json.loads((FOLDER / "derivation.json").read_text())
-SEALING = json.loads((FOLDER / "sealing.json").read_text())
+ENCRYPTION = json.loads((FOLDER / "encryption.json").read_text())
 
 
 def _derived(vector: dict[str, Any]) -> DerivedKey:
@@ -39,31 +39,31 @@ def test_derivation_that_must_fail(vector: dict[str, Any]) -> None:
         _derived(vector)
 
 
-def test_sealing() -> None:
-    vector = SEALING["sealed"]
-    parts = (bytes.fromhex(vector[name]) for name in ("data_key", "sealed", "associated"))
+def test_encryption() -> None:
+    vector = ENCRYPTION["valid"]
+    parts = (bytes.fromhex(vector[name]) for name in ("data_key", "encrypted", "associated"))
     assert encryption.decrypt(*parts).hex() == vector["payload"]
 
 
-@pytest.mark.parametrize("vector", SEALING["invalid"], ids=lambda vector: vector["why"])
-def test_sealing_that_must_fail(vector: dict[str, Any]) -> None:
-    good = SEALING["sealed"]
+@pytest.mark.parametrize("vector", ENCRYPTION["invalid"], ids=lambda vector: vector["why"])
+def test_invalid_encrypted_data(vector: dict[str, Any]) -> None:
+    good = ENCRYPTION["valid"]
     with pytest.raises(getattr(errors, vector["error"]), match=vector["words"]):
         encryption.decrypt(
             bytes.fromhex(good["data_key"]),
-            bytes.fromhex(vector["sealed"]),
+            bytes.fromhex(vector["encrypted"]),
             bytes.fromhex(good["associated"]),
         )
 
 
 def test_cell() -> None:
-    vector = SEALING["cell"]
-    identity, data, cell = (
-        np.frombuffer(bytes.fromhex(vector[name]), np.uint8)[None] for name in ("identity", "data", "cell")
+    vector = ENCRYPTION["cell"]
+    carrier_id, data, cell = (
+        np.frombuffer(bytes.fromhex(vector[name]), np.uint8)[None] for name in ("id", "data", "cell")
     )
     secret, label = bytes.fromhex(vector["secret"]), vector["label"]
     cipher = CellCipher(secret, label, data.shape[1])
-    assert (cipher.encrypt(identity, data, vector["slot"]) == cell).all()
-    fits, decrypted = cipher.decrypt(identity, cell, vector["slot"])
+    assert (cipher.encrypt(carrier_id, data, vector["slot"]) == cell).all()
+    fits, decrypted = cipher.decrypt(carrier_id, cell, vector["slot"])
     assert fits.all()
     assert (decrypted == data).all()

@@ -19,7 +19,7 @@ from keyss.lab import BaselineOptions
 from keyss.lab.audits import audit
 from keyss.methods import KeyssTraining, PlacedScene, registry
 from keyss.runs import stego_in
-from keyss.runs.files import handed_names
+from keyss.runs.files import companion_names
 from test_api import psnr_of_pictures
 from tiny_scenes import random_gaussians, tiny_scene
 
@@ -44,8 +44,8 @@ class Made:
     result: keyss.HideResult
 
     @property
-    def handed(self) -> Path:
-        return self.out / handed_names(1)[0]
+    def companion(self) -> Path:
+        return self.out / companion_names(1)[0]
 
 
 @pytest.fixture(scope="module", params=BASELINES)
@@ -62,7 +62,7 @@ def test_files_and_metrics_of_a_hiding(made: Made) -> None:
     files = {str(path.relative_to(made.out)) for path in made.out.rglob("*") if path.is_file()}
     assert files == {
         str(stego_in(made.out).relative_to(made.out)),
-        *handed_names(1),
+        *companion_names(1),
         *(f"private/{name}" for name in ("config.json", "metrics.json", "manifest.json")),
         *(f"private/{name}.ply" for name in ("cover", "secret-1")),
     }
@@ -72,22 +72,22 @@ def test_files_and_metrics_of_a_hiding(made: Made) -> None:
         assert each.psnr > each.nothing + 5
 
 
-def test_published_and_handed_over_file_reveal_the_secret(
+def test_published_and_companion_file_reveal_the_secret(
     made: Made, folders: tuple[Path, Path], tmp_path: Path
 ) -> None:
     capabilities = registry.get(made.name).capabilities
     stego = stego_in(made.out)
     assert (stego.suffix == ".ply") == capabilities.standard
     out = tmp_path / ("secret.ply" if capabilities.models else "secret.3dgs.safetensors")
-    keyss.reveal(stego, handed=made.handed, out=out)
+    keyss.reveal(stego, companion=made.companion, out=out)
     assert isinstance(keyss.read_model(out), DecodedGaussians) != capabilities.models
     psnr = psnr_of_pictures(out, folders[1])
     assert psnr == pytest.approx(made.result.metrics.secrets[0].psnr, abs=0.1)
     if not capabilities.models:
         with pytest.raises(UsageError, match="network"):
-            keyss.reveal(stego, handed=made.handed, out=tmp_path / "secret.ply")
+            keyss.reveal(stego, companion=made.companion, out=tmp_path / "secret.ply")
     with pytest.raises(UsageError, match="no keys"):
-        keyss.reveal(stego, KEY, handed=made.handed)
+        keyss.reveal(stego, KEY, companion=made.companion)
     with pytest.raises(UsageError, match="no keys"):
         keyss.evaluate(made.out, [KEY])
 
@@ -95,9 +95,9 @@ def test_published_and_handed_over_file_reveal_the_secret(
 @pytest.mark.parametrize("at", [0, 31, -1])
 def test_truncated_files_are_refused(made: Made, tmp_path: Path, at: int) -> None:
     path = tmp_path / "truncated.keyss"
-    path.write_bytes(made.handed.read_bytes()[:at])
+    path.write_bytes(made.companion.read_bytes()[:at])
     with pytest.raises(InputError):
-        keyss.reveal(stego_in(made.out), handed=path)
+        keyss.reveal(stego_in(made.out), companion=path)
 
 
 def test_command_line(keyss: Run, made: Made, tmp_path: Path) -> None:
@@ -105,7 +105,7 @@ def test_command_line(keyss: Run, made: Made, tmp_path: Path) -> None:
     assert f"{made.result.metrics.secrets[0].psnr:.2f}" in said.out
     assert made.name in keyss("info", made.out).out
     stego = stego_in(made.out)
-    assert_refused(keyss("reveal", stego, "--handed", stego, "-o", tmp_path / "b.ply"), 4, "`.keyss` file")
+    assert_refused(keyss("reveal", stego, "--companion", stego, "-o", tmp_path / "b.ply"), 4, "`.keyss` file")
 
 
 def test_invalid_arguments(folders: tuple[Path, Path]) -> None:

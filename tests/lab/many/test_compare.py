@@ -61,10 +61,10 @@ def test_comparison_and_resume(
     assert rows["carry"]["error"] == "no room"
     numbers = {name: row["numbers"] for name, row in rows.items() if not row["error"]}
     assert numbers["3dgs"]["cover.psnr"] >= numbers["3dgs-sh"]["cover.psnr"] - 1
-    assert 1e6 * numbers["3dgs-sh"]["files.handed_mb"] > numbers["3dgs-sh"]["gaussians"] * 16 * 3 * 4
+    assert 1e6 * numbers["3dgs-sh"]["files.companion_mb"] > numbers["3dgs-sh"]["gaussians"] * 16 * 3 * 4
     assert [rows[name]["keys"] for name in names.split(",")] == [False, False, True]
     assert {(each["steps.1"], each["steps.2"]) for each in numbers.values()} == {(60, 60)}
-    # The handed files belong to every row, and those of `3dgs` have other places.
+    # The companion files belong to every row, and those of `3dgs` have other places.
     assert "survival.pruned, cover" in numbers["3dgs-sh"]
     assert "survival.pruned, secret" not in numbers["3dgs-sh"]
     kept = {name: value for name, value in numbers["3dgs"].items() if name.startswith("survival.")}

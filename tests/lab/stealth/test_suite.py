@@ -71,12 +71,12 @@ def test_new_low_bits_are_detected_where_old_ones_were_not_random(
     natural: Callable[[int], Gaussians], names: tuple[str, ...]
 ) -> None:
     model = natural(1)
-    before, other, sealed = map(stealth_statistics, (model, natural(2), overwritten(model, bits=8)))
+    before, other, stego = map(stealth_statistics, (model, natural(2), overwritten(model, bits=8)))
     for name in names:
         if "sharers" in name:
             # Siblings share constant colours, which stay as they are; the rest is near now, not equal.
-            assert sealed[name].value > 0.1
-        assert z(before[name], sealed[name]) > 5, name
+            assert stego[name].value > 0.1
+        assert z(before[name], stego[name]) > 5, name
         assert z(before[name], other[name]) < 4.5, name
 
 

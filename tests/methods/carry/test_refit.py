@@ -11,7 +11,7 @@ import torch
 import keyss
 from channels.quiet.trained_like import trained_like
 from keyss import CarryOptions, FitConfig, Secret
-from keyss.channels import identities
+from keyss.channels import gaussian_ids
 from keyss.core import Gaussians, KeyssWarning, Scene
 from keyss.methods import Source, Training, most_contributing, registry
 from methods.hiding import check_resumes, hide_scenes, psnr_in, three_scenes
@@ -121,5 +121,5 @@ def test_cover_is_independent_of_secret_and_key(
     two = hide_scenes(others, ["k"], config, plains=[models[0], random_gaussians(900, seed=5)]).stego
     assert torch.equal(one.means, two.means)
     assert torch.equal(one.sh[:, 0], two.sh[:, 0])
-    assert [row.tobytes() for row in identities(one)] == [row.tobytes() for row in identities(two)]
+    assert [row.tobytes() for row in gaussian_ids(one)] == [row.tobytes() for row in gaussian_ids(two)]
     assert not torch.equal(one.quats, two.quats)

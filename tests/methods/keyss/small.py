@@ -10,7 +10,7 @@ from torch import Tensor
 
 from channels.quiet.trained_like import trained_like
 from keyss import FitConfig, Gaussians, KeyssOptions
-from keyss.channels.harmonics import high_harmonics, row_names, with_high_harmonics
+from keyss.channels.harmonics import high_harmonics, row_ids, with_high_harmonics
 from keyss.core import Scene
 from keyss.core.similarity import Similarity
 from keyss.keys import random_embeddings
@@ -78,8 +78,8 @@ def latent_model(
         colours = torch.cat([model.sh[:, 0], model.sh[:, 1:].flatten(1)[:, : size - 13]], dim=1)
         latents = decoder.requires_grad_(False).to_latents(model, colours)
         decoder.fit_secret(latents.double().numpy())
-        names = row_names(cover)[:count]
-        ranks[:count, decoder.own] = decoder.encrypt(latents.double().numpy(), VECTORS[secret], names)
+        ids = row_ids(cover)[:count]
+        ranks[:count, decoder.own] = decoder.encrypt(latents.double().numpy(), VECTORS[secret], ids)
         decoders.append(decoder)
         values.append(latents)
     stego = with_high_harmonics(cover, decoders[0].place.write(high_harmonics(cover), ranks))

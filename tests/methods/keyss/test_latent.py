@@ -13,7 +13,7 @@ from torch import Tensor
 from channels.quiet.trained_like import trained_like
 from channels.test_harmonics import heavy_tailed
 from keyss import Gaussians, WrongKeyError
-from keyss.channels.harmonics import row_names
+from keyss.channels.harmonics import row_ids
 from keyss.core import InputError, UsageError, same_bits
 from keyss.lab import search_embeddings
 from keyss.methods import LatentDecoder, registry
@@ -48,9 +48,9 @@ def test_round_trip(secrets: int) -> None:
 def test_ciphertext_is_uniform() -> None:
     """Even for constant latents."""
     _, (decoder,), _ = _embed_latents()
-    names = row_names(trained_like(2000, seed=3))
+    ids = row_ids(trained_like(2000, seed=3))
     constant = np.tile(decoder.knots.double().numpy()[:, 16], (2000, 1))
-    ranks = decoder.encrypt(constant, VECTORS[0], names)
+    ranks = decoder.encrypt(constant, VECTORS[0], ids)
     assert kstest(ranks.ravel(), "uniform").pvalue > 1e-6
     assert kstest((ranks[:, 0] - ranks[:, 1]) % 1, "uniform").pvalue > 1e-6
 

@@ -29,7 +29,7 @@ export interface Reader {
   /** Number of key derivations per attempt, whatever it opens. */
   readonly derivations: number;
 
-  /** What `key` opens, null for nothing. Raises InputError for damage. */
+  /** The content that `key` opens, or null. Raises InputError for damage. */
   open(key: string, derive?: Derive): Promise<Content | null>;
 }
 

@@ -13,7 +13,7 @@ export function inverse({ scale, rotation: r, translation: t }: Similarity): Sim
   return { scale: 1 / scale, rotation, translation: times(rotation, t).map((each) => -each / scale) };
 }
 
-/** Whether it is finite, with positive scale and a rotation matrix to within 1e-6. */
+/** True for finite numbers, a positive scale and a rotation matrix to within 1e-6. */
 export function isSimilarity({ scale, rotation: r, translation }: Similarity): boolean {
   const rows = [0, 3, 6].map((at) => r.slice(at, at + 3));
   const off = rows.flatMap((a, i) => rows.map((b, j) => Math.abs(dot(a, b) - Number(i === j))));

@@ -38,7 +38,7 @@ export function runs(words: Words, order: Uint32Array): Uint32Array {
 }
 
 /** [N] number of words equal to each, itself included. */
-export function namesakes(words: Words): Uint32Array {
+export function multiplicities(words: Words): Uint32Array {
   const order = sortingOrder(words);
   const starts = runs(words, order);
   const found = new Uint32Array(order.length);

@@ -1,5 +1,5 @@
 /**
- * Key derivation and decryption (docs/format.md); counterpart of `keyss.keys`. Argon2id (RFC 9106) of the key in NFKC
+ * Key derivation and decryption (docs/byte-layout.md); counterpart of `keyss.keys`. Argon2id (RFC 9106) of the key in NFKC
  * without surrounding white space, then HKDF-Expand with SHA-256 (RFC 5869) with a label for each use.
  */
 import { chacha20, chacha20poly1305 } from '@noble/ciphers/chacha.js';

@@ -20,10 +20,10 @@ export interface Shape {
   readonly keySize: number;
   readonly released: boolean; // inputs and residuals as the paper's authors have them
   readonly secrets: number; // of the model
-  readonly secret: number; // which of them
+  readonly secret: number; // index of the secret
 }
 
-/** What makes a secret's Gaussians, for the key that it was made with, of a model that it may change. */
+/** Maps a model, which it may change, to a secret's Gaussians. */
 export type Decode = (model: Gaussians) => Gaussians;
 
 interface Layer {

@@ -1,6 +1,6 @@
 /** The design `latent`: `keyss.methods.keyss.latent` and `keyss.channels.harmonics` in Python say why. */
 import { sha256 } from '@noble/hashes/sha2.js';
-import { fieldsOf, IDENTITY_BYTES, identities } from '../channels/quiet/bits.ts';
+import { fieldsOf, gaussianIds, ID_BYTES } from '../channels/quiet/bits.ts';
 import { CellCipher } from '../channels/quiet/cells.ts';
 import { bytesKey, joined } from '../core/bytes.ts';
 import { changed, damaged } from '../core/errors.ts';
@@ -65,15 +65,15 @@ export function latentOf({ shDegree, secrets, secret }: Shape, tensors: Tensors,
 
   return (model) => {
     const bare = withDegree(model, 0);
-    const names = identities(bare, fieldsOf(bare));
+    const ids = gaussianIds(bare, fieldsOf(bare));
     const [found, seen] = [emptyGaussians(model.count, shDegree), new Set<string>()];
     let pads: Uint32Array = new Uint32Array(0);
     for (let row = 0; row < model.count; row++) {
       const at = row % ROWS;
-      if (!at) pads = wordsOf(cipher.pads(names.subarray(IDENTITY_BYTES * row, IDENTITY_BYTES * (row + ROWS))));
+      if (!at) pads = wordsOf(cipher.pads(ids.subarray(ID_BYTES * row, ID_BYTES * (row + ROWS))));
       const numbers = model.sh.subarray(harmonics * row + KEPT, harmonics * (row + 1));
       if (!decrypt(numbers, pads.subarray(count * at, count * (at + 1)))) continue;
-      const [to, name] = [seen.size, bytesKey(names.subarray(IDENTITY_BYTES * row, IDENTITY_BYTES * (row + 1)))];
+      const [to, name] = [seen.size, bytesKey(ids.subarray(ID_BYTES * row, ID_BYTES * (row + 1)))];
       if (seen.has(name)) continue; // a copy of another row
       seen.add(name);
       const [opacity, x, y, z] = latents;

@@ -15,7 +15,7 @@ const DRAWN_OPACITY = Math.fround(1 / 255);
 const APPENDED_OPACITY = 1.00001 / 255;
 const APPENDED_LOGIT = Math.fround(Math.log(APPENDED_OPACITY / (1 - APPENDED_OPACITY)));
 
-/** What the payload reveals of a model, and how many Gaussians there were. Raises InputError. */
+/** The Gaussians that a payload reveals of a model, and the number that were hidden. Raises InputError. */
 export function decodeKeyss(payload: Uint8Array, stego: Gaussians): { gaussians: Gaussians; hidden: number } {
   const tensors = Tensors.of(payload);
   const header = objectOf(parsed(ascii(String(tensors.metadata.keyss))));

@@ -1,4 +1,4 @@
-/** Decodes records to Gaussians; see docs/format.md, "Records of Gaussians". */
+/** Decodes records to Gaussians; see docs/byte-layout.md, "Records of Gaussians". */
 import { halfFloat, viewOf } from '../core/bytes.ts';
 import { damaged } from '../core/errors.ts';
 import { coefficients, emptyGaussians, type Gaussians } from '../core/gaussians.ts';

@@ -37,10 +37,10 @@ from keyss.channels.appended.words import (
 )
 from keyss.channels.base import (
     METHOD_BYTES,
+    Capacity,
     Channel,
     Content,
     Payload,
-    Room,
     SaltedReader,
     check_keys,
     pack_payload,
@@ -69,12 +69,12 @@ _OVERHEAD = 260  # maximum bytes of a payload beside its data
 # standard deviations by which pilots must outnumber accidental ones.
 _SAMPLE, _MAX_OFFSETS, _SIGNIFICANT = 8000, 8, 3.0
 _ASSOCIATED = b"keyss/v1/appended/data"
-# The cover: how many of its Gaussians are seen, and their sketch. A format changes up to a fifth of names;
+# The cover: how many of its Gaussians are seen, and their sketch. A format changes up to a fifth of the IDs;
 # another model of the same scene shares two fifths of them, one of another scene a tenth.
 _SKETCH_BYTES, _FOREIGN = 128, 0.4
 _HOST = struct.Struct(f"<I{_SKETCH_BYTES}s")
 MAX_BYTES = _MAX_PACKETS * _NARROW - OVERHEAD - METHOD_BYTES - _HOST.size
-_NOTICED = (
+_VISIBLE_SECRETS = (
     "the number of appended Gaussians reveals the total size: the holder of one key can tell that there are "
     "other secrets"
 )
@@ -93,8 +93,8 @@ class Appended(Channel):
         check_place(own_frame(cover))
         return AppendedCover(cover)
 
-    def room(self, gaussians: int, sh_degree: int) -> Room:
-        return Room(gaussians, MAX_BYTES, _OVERHEAD, grows=True)
+    def estimate_capacity(self, gaussians: int, sh_degree: int) -> Capacity:
+        return Capacity(gaussians, MAX_BYTES, _OVERHEAD, grows=True)
 
     def appended_count(self, sizes: Sequence[int]) -> int:
         """The number of Gaussians appended for payloads of these compressed sizes in bytes."""
@@ -113,13 +113,13 @@ class AppendedCover:
     cover: Gaussians
 
     @property
-    def room(self) -> Room:
-        return APPENDED.room(len(self.cover), self.cover.sh_degree)
+    def capacity(self) -> Capacity:
+        return APPENDED.estimate_capacity(len(self.cover), self.cover.sh_degree)
 
     def embed(self, contents: Sequence[tuple[str, Content]], *, entropy: bytes | None = None) -> Gaussians:
         """The cover followed by the appended Gaussians. Warns if there is more than one secret."""
         model = self.cover.detach().to("cpu")
-        names = _names(model)
+        ids = _coarse_ids(model)
         packed = [pack_payload(content) for _, content in contents]
         secret = randomness(entropy, *packed)
         salt = expand(secret, "appended/salt", SALT_BYTES)
@@ -127,10 +127,10 @@ class AppendedCover:
         keys = [DerivedKey.of(key, salt) for key, _ in contents]
         check_keys([key.verifier() for key in keys])
         if len(keys) > 1:
-            warnings.warn(_NOTICED, KeyssWarning, stacklevel=2)
+            warnings.warn(_VISIBLE_SECRETS, KeyssWarning, stacklevel=2)
         single = len(keys) == 1
-        bound = [_HOST.pack(len(names), sketch(_sketch_key(key), names, _SKETCH_BYTES)) for key in keys]
-        tied = [host + data for host, data in zip(bound, packed, strict=True)]
+        bound = [_HOST.pack(len(ids), sketch(_sketch_key(key), ids, _SKETCH_BYTES)) for key in keys]
+        tied = [cover + data for cover, data in zip(bound, packed, strict=True)]
         words = [_words(*each, single, random) for each in zip(keys, tied, strict=True)]
         used = sum(map(len, words))
         total = _padded_count(used)
@@ -147,7 +147,7 @@ class AppendedReader(SaltedReader):
 
     salts: Sequence[bytes]
     words: Bits
-    names: Bytes  # [M, 16] of the Gaussians that are seen
+    ids: Bytes  # [M, 16] of the Gaussians that are seen
 
     @staticmethod
     def of(model: Gaussians) -> AppendedReader | None:
@@ -168,7 +168,7 @@ class AppendedReader(SaltedReader):
             if best is not None:
                 found, scales = best
                 words = pack_words(colours, scales, points_in_frame(faint, found.to_own))
-                return AppendedReader([found.salt], words, _names(model))
+                return AppendedReader([found.salt], words, _coarse_ids(model))
         return None
 
     def extract(self, key: DerivedKey) -> Payload:
@@ -181,16 +181,16 @@ class AppendedReader(SaltedReader):
                 whole = decrypt(key.expand("appended/data", 32), encrypted, _ASSOCIATED)
                 if len(whole) < _HOST.size:
                     raise InputError("the hidden data are damaged: they are incomplete")
-                strangers = foreign(_sketch_key(key), self.names, *reversed(_HOST.unpack_from(whole)))
-                told = strangers if strangers > _FOREIGN * len(self.names) else 0
+                foreign_count = foreign(_sketch_key(key), self.ids, *reversed(_HOST.unpack_from(whole)))
+                told = foreign_count if foreign_count > _FOREIGN * len(self.ids) else 0
                 return replace(unpack_payload(whole[_HOST.size :]), foreign=told)
         raise WrongKeyError()
 
 
-def _names(model: Gaussians) -> Bytes:
-    """[M, 16] names of the visible Gaussians, coarse numbers that formats and motions hardly change."""
-    names = Carriers.of(model).names
-    return np.hstack([names, np.zeros_like(names)]).astype("<i2").view(np.uint8)
+def _coarse_ids(model: Gaussians) -> Bytes:
+    """[M, 16] IDs of the visible Gaussians, coarse numbers that formats and motions hardly change."""
+    ids = Carriers.of(model).ids
+    return np.hstack([ids, np.zeros_like(ids)]).astype("<i2").view(np.uint8)
 
 
 def _sketch_key(key: DerivedKey) -> bytes:

@@ -1,9 +1,9 @@
-"""Gaussians that carry bits, and names that identify them.
+"""Gaussians that carry bits, and their IDs.
 
 The bits go into the constant green and blue coefficients (`f_dc_1`, `f_dc_2`), which are the least visible
-numbers to change among those that survive every format. A Gaussian's *name* is the cells of two ratios of its
-scales, its opacity and its red coefficient. Writing changes none of these, and none depends on the model's
-position, rotation, scale or order.
+numbers to change among those that survive every format. The *ID* of a Gaussian is four cell indices: of two
+ratios of its scales, its opacity and its red coefficient. Writing changes none of these, and none depends on
+the model's position, rotation, scale or order.
 
 Cells begin and end between the rounded values of 8-bit formats (`.spz`: log scales in sixteenths, colours in
 steps of 1 / 38.25; most formats: opacities in 255ths), so rounding moves no number into another cell. Scaling
@@ -30,7 +30,7 @@ _RATIO_CELL, _OPACITY_CELL, _RED_CELL = 4, 8, 3  # steps
 _MIN_OPACITY = 2.5 / 255  # formats drop the colours of fainter Gaussians
 _CELLS = 30_000  # maximum absolute index, which fits into 16 bits
 
-Names = npt.NDArray[np.int16]
+Ids = npt.NDArray[np.int16]
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,8 +41,8 @@ class Carriers:
     log_scales: Doubles  # [C, 3]
     opacities: Doubles  # [C]
     colours: Doubles  # [C, 3] constant coefficients
-    names: Names  # [C, 4] cell indices: two ratios of scales, opacity, red
-    error_probability: Doubles  # [C] that a format has changed the name since writing
+    ids: Ids  # [C, 4] cell indices: two ratios of scales, opacity, red
+    error_probability: Doubles  # [C] that a format has changed the ID since writing
 
     @staticmethod
     def of(model: Gaussians, alignment: float = 0.0) -> Carriers:
@@ -60,8 +60,8 @@ class Carriers:
         opacity, faint = cells_of(opacities[:, None] * OPACITY_STEPS - 0.5, _OPACITY_CELL, OPACITY_NOISE)
         red, off = cells_of(colours[:, :1] * COLOUR_STEPS, _RED_CELL, COLOUR_NOISE)
         errors = np.hstack([2 * edge * (loose[:, 1:] + loose[:, :-1]), faint, off])
-        names = np.hstack([ratios, opacity, red]).astype(np.int16)
-        return Carriers(rows, log_scales, opacities, colours, names, 1 - (1 - errors).prod(axis=1))
+        ids = np.hstack([ratios, opacity, red]).astype(np.int16)
+        return Carriers(rows, log_scales, opacities, colours, ids, 1 - (1 - errors).prod(axis=1))
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -69,35 +69,35 @@ class Carriers:
     @cached_property
     def impact(self) -> Doubles:
         """Visibility [C] of a colour change: log(area x opacity^2), with the opacity of the cell."""
-        opacities = (self.names[:, 2] + 0.5) * _OPACITY_CELL / OPACITY_STEPS
+        opacities = (self.ids[:, 2] + 0.5) * _OPACITY_CELL / OPACITY_STEPS
         impact: Doubles = np.sort(self.log_scales)[:, 1:].sum(axis=1) + 2 * np.log(opacities.clip(1e-3))
         return impact
 
     @cached_property
-    def name_counts(self) -> Integers:
-        """The number of carriers [C] with the same name, the carrier itself included."""
-        _, inverse, counts = np.unique(row_hashes(self.names), return_inverse=True, return_counts=True)
+    def id_counts(self) -> Integers:
+        """The number of carriers [C] with the same ID, the carrier itself included."""
+        _, inverse, counts = np.unique(row_hashes(self.ids), return_inverse=True, return_counts=True)
         return counts[inverse].astype(np.int64)
 
     @cached_property
     def representatives(self) -> Integers:
-        """Indices [D] of one carrier per name, the most stable one: only these are written."""
+        """Indices [D] of one carrier per ID, the most stable one: only these are written."""
         order = np.argsort(self.error_probability, kind="stable")
-        _, first = np.unique(row_hashes(self.names)[order], return_index=True)
+        _, first = np.unique(row_hashes(self.ids)[order], return_index=True)
         return np.sort(order[first])
 
 
-def random_pairs(secret: bytes, label: str, names: Names) -> Words:
-    """Words [C, 2] for names [C, 4], pseudo-random without the secret: AES-256 of the names."""
-    blocks = np.zeros((len(names), 8), "<i2")
-    blocks[:, : names.shape[1]] = names
+def random_pairs(secret: bytes, label: str, ids: Ids) -> Words:
+    """Words [C, 2] for `ids` [C, 4], pseudo-random without the secret: AES-256 of the IDs."""
+    blocks = np.zeros((len(ids), 8), "<i2")
+    blocks[:, : ids.shape[1]] = ids
     key = expand(secret, f"colours/{label}", 32)
     return encrypted_blocks(key, blocks.view(np.uint8)).view("<u8").astype(np.uint64)
 
 
-def fractions(secret: bytes, label: str, names: Names) -> Doubles:
-    """Pseudo-random numbers [C, 2] in [0, 1) for names [C, 4]."""
-    return (random_pairs(secret, label, names) >> np.uint64(11)) / 2.0**53
+def fractions(secret: bytes, label: str, ids: Ids) -> Doubles:
+    """Pseudo-random numbers [C, 2] in [0, 1) for `ids` [C, 4]."""
+    return (random_pairs(secret, label, ids) >> np.uint64(11)) / 2.0**53
 
 
 def cells_of(values: Doubles, steps: int, noise: float) -> tuple[Doubles, Doubles]:

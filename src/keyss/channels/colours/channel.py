@@ -19,15 +19,14 @@ import torch
 
 from keyss.channels.base import (
     METHOD_BYTES,
-    NOTICED,
+    NOT_INDEPENDENT,
+    Capacity,
     Channel,
     Content,
-    Room,
     check_keys,
     pack_payload,
     randomness,
 )
-from keyss.channels.colours.capacity import MIN_HEADERS, Capacity, Layout, bucket_of
 from keyss.channels.colours.carriers import Carriers
 from keyss.channels.colours.colours_reader import ASSOCIATED
 from keyss.channels.colours.fountain import Fountain
@@ -41,6 +40,7 @@ from keyss.channels.colours.header import (
     median,
     places,
 )
+from keyss.channels.colours.planner import MIN_HEADERS, Layout, Planner, bucket_of
 from keyss.channels.colours.qim import ONE, bit_counts, seeds, write
 from keyss.channels.colours.salt_gaussians import SALTS, Salts, renew_salts
 from keyss.core.arrays import Doubles, Flags
@@ -52,7 +52,7 @@ from keyss.rendering.difference import psnr_between
 
 _TOO_FEW = "this cover has too few Gaussians to hide anything in colours that would survive other formats"
 _LOWER = 3  # maximum number of levels, each a quarter of a bit, below the planned one
-_BITS_PER_GAUSSIAN = 1  # approximate room
+_BITS_PER_GAUSSIAN = 1  # approximate capacity
 _HEADERS = 100  # approximate bytes
 _OVERHEAD = METHOD_BYTES + 1  # maximum bytes of a payload beside its data
 
@@ -72,11 +72,11 @@ class Colours(Channel):
             raise UsageError(f"expected a `strength` above 0 dB, got {self.strength}")
 
     def prepare(self, cover: Gaussians) -> ColoursCover:
-        return ColoursCover(Capacity(cover, Carriers.of(cover), self.strength))
+        return ColoursCover(Planner(cover, Carriers.of(cover), self.strength))
 
-    def room(self, gaussians: int, sh_degree: int) -> Room:
+    def estimate_capacity(self, gaussians: int, sh_degree: int) -> Capacity:
         capacity = gaussians * _BITS_PER_GAUSSIAN // 8 - _HEADERS
-        return Room(gaussians, max(0, capacity), _OVERHEAD)
+        return Capacity(gaussians, max(0, capacity), _OVERHEAD)
 
 
 COLOURS = Colours()
@@ -84,28 +84,28 @@ COLOURS = Colours()
 
 @dataclass(frozen=True)
 class ColoursCover:
-    """A cover with known room; see `keyss.channels.base.PreparedCover`.
+    """A cover with known capacity; see `keyss.channels.base.PreparedCover`.
 
     Writing changes some greens and blues and nothing else. A payload changes as little as it needs;
     `strength` is the limit.
     """
 
-    capacity: Capacity
+    planner: Planner
 
     @property
     def cover(self) -> Gaussians:
-        return self.capacity.model
+        return self.planner.model
 
     @cached_property
-    def room(self) -> Room:
-        return Room(len(self.capacity.carriers.representatives), self.capacity.bytes, _OVERHEAD)
+    def capacity(self) -> Capacity:
+        return Capacity(len(self.planner.carriers.representatives), self.planner.bytes, _OVERHEAD)
 
     def embed(self, contents: Sequence[tuple[str, Content]], *, entropy: bytes | None = None) -> Gaussians:
         """See `PreparedCover`. Also raises UsageError for a model that can carry nothing."""
         payloads = [pack_payload(content) for _, content in contents]
         secret = randomness(entropy, *payloads)
         random = np.random.default_rng(np.frombuffer(stream(secret, "colours/random", 32), np.uint32))
-        carriers = renew_salts(self.capacity.carriers, random)
+        carriers = renew_salts(self.planner.carriers, random)
         salts = Salts.of(carriers)
         if len(salts.salts) < SALTS:
             raise UsageError(_TOO_FEW)
@@ -121,25 +121,25 @@ class ColoursCover:
         free = np.zeros(len(carriers), bool)
         free[carriers.representatives] = True
         free[salts.rows] = False
-        draft = _Draft(self.capacity, carriers, free & ~self.capacity.excluded)
+        draft = _Draft(self.planner, carriers, free & ~self.planner.excluded)
         file_key = expand(secret, "colours/file-key", FILE_KEY_BYTES)
         for lower in range(_LOWER + 1):  # the plan does not include the cost of headers and salts
             headers = _headers(layouts, sizes, file_key, carriers, lower)
             stego = draft.write(secrets, headers, [each.likely for each in layouts], payloads, random)
-            if layouts[0].level == ONE or psnr_between(self.cover, stego) >= self.capacity.strength:
+            if layouts[0].level == ONE or psnr_between(self.cover, stego) >= self.planner.strength:
                 break
         return stego
 
     def _layouts(self, sizes: Sequence[int]) -> list[Layout]:
         """The layout of each payload."""
-        found = self.capacity.layouts(sizes)
+        found = self.planner.layouts(sizes)
         if found is None:
             raise UsageError(
-                f"the colours of this cover hold {self.room.capacity:,} bytes in all, and the secrets "
+                f"the colours of this cover hold {self.planner.bytes:,} bytes in all, and the secrets "
                 f"take {sum(sizes) - OVERHEAD * len(sizes):,}"
             )
         if found[1]:
-            warnings.warn(NOTICED, KeyssWarning, stacklevel=4)
+            warnings.warn(NOT_INDEPENDENT, KeyssWarning, stacklevel=4)
         return found[0]
 
 
@@ -161,7 +161,7 @@ def _headers(
 class _Draft:
     """A cover to be written."""
 
-    capacity: Capacity
+    planner: Planner
     carriers: Carriers  # with new salts
     free: Flags  # [C] mask of carriers that may be written
 
@@ -187,7 +187,7 @@ class _Draft:
         for header, some in zip(headers, likely, strict=True):
             mask = header.carrier_mask(carriers)
             share = float(holds[mask].mean()) if mask.any() else 0.0
-            idle = 1 - share * (self.capacity.acceptance if some else 1.0)
+            idle = 1 - share * (self.planner.acceptance if some else 1.0)
             final.append(replace(header, idle=round(idle / IDLE)))
         for salt in range(SALTS):  # alternate between secrets, because later headers find fewer free places
             for index, each in enumerate(secrets):
@@ -195,14 +195,14 @@ class _Draft:
                 rows, new = final[like].write(each, salt, carriers)
                 rows, new = rows[free[rows]], new[free[rows]]
                 values[rows], free[rows] = new, False
-                chosen[rows] = likely[like] and self.capacity.headers_may_skip
+                chosen[rows] = likely[like] and self.planner.headers_may_skip
         for each, header, some, payload in zip(secrets, final, likely, payloads, strict=False):
             rows, key = np.flatnonzero(free & header.carrier_mask(carriers)), each.data_key(header)
             encrypted = encrypt(key, payload, ASSOCIATED, size=bucket_bytes(header.bucket))
-            names, bits = carriers.names[rows], bit_counts(carriers.impact[rows], header.level)
+            ids, bits = carriers.ids[rows], bit_counts(carriers.impact[rows], header.level)
             data = np.unpackbits(np.frombuffer(encrypted, np.uint8))
-            code = Fountain(len(data)).encode(data, seeds(key, "seeds", names, bits))
-            values[rows], chosen[rows] = write(key, names, values[rows], bits, code), some
+            code = Fountain(len(data)).encode(data, seeds(key, "seeds", ids, bits))
+            values[rows], chosen[rows] = write(key, ids, values[rows], bits, code), some
         return self._replace_colours(values, chosen, random)
 
     def _replace_colours(self, values: Doubles, chosen: Flags, random: np.random.Generator) -> Gaussians:
@@ -210,7 +210,7 @@ class _Draft:
 
         `chosen` [C]: mask of the carriers that change only if the new colour is likely enough.
         """
-        capacity, old = self.capacity, self.capacity.carriers.colours
+        capacity, old = self.planner, self.planner.carriers.colours
         new = np.hstack([old[:, :1], capacity.statistics.imitate(values)])
         if chosen.any():
             base = np.where(chosen[:, None], old, new)

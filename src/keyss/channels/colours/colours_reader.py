@@ -60,14 +60,14 @@ def _payload(header: Header, secrets: Secrets, carriers: Carriers, shift: float)
     for secret in secrets.salted:
         mask[places(secret, carriers)[0]] = False
     rows = np.flatnonzero(mask)
-    size, key, names = bucket_bytes(header.bucket), secrets.data_key(header), carriers.names[rows]
+    size, key, ids = bucket_bytes(header.bucket), secrets.data_key(header), carriers.ids[rows]
     bits = bit_counts(carriers.impact[rows] - shift, header.level)
     if not len(rows) or 8 * size > _MAX_RATE * COLUMNS * bits.sum():
         return None
     written = (1 - header.idle * IDLE) * (1 - _CHANGED)
-    sure = written * (1 - carriers.error_probability[rows]) / carriers.name_counts[rows]
-    hints = np.repeat(sure, COLUMNS * bits) * read(key, names, carriers.colours[rows, 1:], bits)
-    found = Fountain(8 * size).decode(seeds(key, "seeds", names, bits), hints)
+    sure = written * (1 - carriers.error_probability[rows]) / carriers.id_counts[rows]
+    hints = np.repeat(sure, COLUMNS * bits) * read(key, ids, carriers.colours[rows, 1:], bits)
+    found = Fountain(8 * size).decode(seeds(key, "seeds", ids, bits), hints)
     try:
         return decrypt(key, np.packbits(found).tobytes(), ASSOCIATED)
     except InputError:

@@ -5,7 +5,7 @@ are the data bits and parity bits, which are sums of many data bits. Every *code
 intermediate bits, chosen by a 64-bit seed that writer and reader know, so code bits need no index. The
 decoder is belief propagation.
 
-Reed-Solomon needs a position for every symbol. A hash of names fills many positions with no Gaussian or with
+Reed-Solomon needs a position for every symbol. A hash of IDs fills many positions with no Gaussian or with
 several, which are erasures before anything is lost.
 """
 

@@ -4,7 +4,7 @@ A key is first tried on the header, which is written once under each of a few sa
 one fountain code and are decoded together: one salt's Gaussians replace another's lost ones. *Pilots*, a few
 known bits of each part, show which salts are lost; agreement with the decoded bits refines that.
 
-A key assigns pseudo-random numbers to names and chooses the Gaussians with the smallest, so that a lost
+A key assigns pseudo-random numbers to IDs and chooses the Gaussians with the smallest, so that a lost
 Gaussian costs its own place only.
 """
 
@@ -29,7 +29,7 @@ DEPTHS = (1, 2)  # bits per value of a header, for payloads at level ONE and at 
 SHARES = 256  # parts of the carriers, divided among payloads
 IDLE = 1 / 255  # unit of the share of unchanged carriers
 FILE_KEY_BYTES = 5
-_PILOTS = 10  # of the places
+_PILOTS = 10  # places whose bits are known
 _FORMAT = f"{FILE_KEY_BYTES}s6B"
 _CHECK_BYTES = 2
 _PRIOR = 0.4  # prior log odds that a salt is genuine
@@ -69,7 +69,7 @@ class Secrets:
 
 @dataclass(frozen=True)
 class Header:
-    """How to read a payload; numbers are below 256."""
+    """Parameters for reading a payload; numbers are below 256."""
 
     file_key: bytes  # the same for all secrets of a file
     level: int  # see `bit_counts`
@@ -80,8 +80,8 @@ class Header:
     median: int  # see `median`
 
     def carrier_mask(self, carriers: Carriers) -> Flags:
-        """Mask [C] of the payload's carriers, from a keyed hash of their names."""
-        part = np.floor(SHARES * fractions(self.file_key, "partition", carriers.names)[:, 0])
+        """Mask [C] of the payload's carriers, from a keyed hash of their IDs."""
+        part = np.floor(SHARES * fractions(self.file_key, "partition", carriers.ids)[:, 0])
         return (part >= self.first) & (part <= self.last)
 
     def shift(self, carriers: Carriers) -> float:
@@ -99,10 +99,10 @@ class Header:
         """The carriers [P] of the header under one salt, and their new values [P, 2]."""
         secret, depth = secrets.salted[salt], DEPTHS[self.level != ONE]
         rows, pilots = places(secret, carriers)
-        names, counts = carriers.names[rows], np.full(len(rows), depth)
-        code = _CODE.encode(self.bits(secrets), seeds(secret, "header-seeds", names, counts))
+        ids, counts = carriers.ids[rows], np.full(len(rows), depth)
+        code = _CODE.encode(self.bits(secrets), seeds(secret, "header-seeds", ids, counts))
         code[np.repeat(pilots, COLUMNS * depth)] = 0
-        return rows, write(secret, names, carriers.colours[rows, 1:], counts, code)
+        return rows, write(secret, ids, carriers.colours[rows, 1:], counts, code)
 
     @staticmethod
     def read(secrets: Secrets, carriers: Carriers) -> Header | None:
@@ -118,13 +118,13 @@ def _read(
     """The header with `depth` bits per value of the places `found`."""
     words, hints, owners, odds = [np.zeros(0, np.uint64)], [np.zeros(0)], [np.zeros(0, np.int64)], []
     for salt, (secret, (rows, pilots)) in enumerate(zip(secrets.salted, found, strict=True)):
-        names, counts = carriers.names[rows], np.full(len(rows), depth)
+        ids, counts = carriers.ids[rows], np.full(len(rows), depth)
         known = np.repeat(pilots, COLUMNS * depth)
-        sure = _HELD * (1 - carriers.error_probability[rows]) / carriers.name_counts[rows]
-        every = np.repeat(sure, COLUMNS * depth) * read(secret, names, carriers.colours[rows, 1:], counts)
+        sure = _HELD * (1 - carriers.error_probability[rows]) / carriers.id_counts[rows]
+        every = np.repeat(sure, COLUMNS * depth) * read(secret, ids, carriers.colours[rows, 1:], counts)
         odds.append(_PRIOR + np.log1p(every[known]).sum())
         hints.append(every[~known])
-        words.append(seeds(secret, "header-seeds", names, counts)[~known])
+        words.append(seeds(secret, "header-seeds", ids, counts)[~known])
         owners.append(np.full(len(hints[-1]), salt))
     word, hint, owner = np.concatenate(words), np.concatenate(hints), np.concatenate(owners)
     header, agreement = None, np.zeros(len(odds))
@@ -141,8 +141,8 @@ def _read(
 
 
 def places(secret: bytes, carriers: Carriers) -> tuple[Integers, Flags]:
-    """The carriers [P] with the PLACES names that a secret chooses, and a mask [P] of pilots."""
-    numbers = fractions(secret, "places", carriers.names)[:, 0]
+    """The carriers [P] with the PLACES IDs that a secret chooses, and a mask [P] of pilots."""
+    numbers = fractions(secret, "places", carriers.ids)[:, 0]
     least = np.append(np.unique(numbers), 1.0)
     rows = np.flatnonzero(numbers < least[: PLACES + 1][-1])
     return rows, numbers[rows] < least[: _PILOTS + 1][-1]

@@ -1,7 +1,7 @@
 """Dithered quantisation index modulation (Chen and Wornell 2001) with soft decisions.
 
 A value that carries b bits moves to the nearest point of one of 2^b lattices of step 2^b x SPACING. The
-lattices are SPACING apart and share a *dither*, an offset derived from key and name. To others, the change is
+lattices are SPACING apart and share a *dither*, an offset derived from key and ID. To others, the change is
 therefore independent noise, uniform over one step, of variance step^2 / 12, and no value is likelier than
 another.
 """
@@ -12,7 +12,7 @@ import math
 
 import numpy as np
 
-from keyss.channels.colours.carriers import Names, fractions, random_pairs
+from keyss.channels.colours.carriers import Ids, fractions, random_pairs
 from keyss.channels.mixing import mix
 from keyss.core.arrays import Bits, Doubles, Flags, Integers, Words
 
@@ -37,28 +37,28 @@ def bit_counts(impact: Doubles, level: int) -> Integers:
     return np.floor((level - _MIDDLE) / 4 - impact / _BIT).clip(0, MAX_BITS).astype(np.int64)
 
 
-def seeds(secret: bytes, label: str, names: Names, bits: Integers) -> Words:
-    """Seeds [B] for `Fountain` of all bits of Gaussians with `names`; `bits` [C]: per value."""
+def seeds(secret: bytes, label: str, ids: Ids, bits: Integers) -> Words:
+    """Seeds [B] for `Fountain` of all bits of Gaussians with `ids`; `bits` [C]: per value."""
     order = mix(np.arange(COLUMNS * MAX_BITS, dtype=np.uint64)).reshape(COLUMNS, MAX_BITS)
-    return mix(random_pairs(secret, label, names)[:, :1, None] ^ order)[_bit_mask(bits)]
+    return mix(random_pairs(secret, label, ids)[:, :1, None] ^ order)[_bit_mask(bits)]
 
 
-def write(secret: bytes, names: Names, values: Doubles, bits: Integers, code: Bits) -> Doubles:
+def write(secret: bytes, ids: Ids, values: Doubles, bits: Integers, code: Bits) -> Doubles:
     """Modulate `values` [C, 2] with the bits `code` [B], `bits` [C] per value."""
     mask, step = _bit_mask(bits), 2.0 ** bits[:, None]
     gray = np.zeros(mask.shape, np.uint8)
     gray[mask] = code
     weights = 2.0 ** (bits[:, None, None] - 1 - np.arange(MAX_BITS))
     label = (np.bitwise_xor.accumulate(gray, axis=2) * weights * mask).sum(axis=2)
-    points = fractions(secret, "dither", names) * step + label
+    points = fractions(secret, "dither", ids) * step + label
     new = (np.round((values / SPACING - points) / step) * step + points) * SPACING
     return np.where(bits[:, None] > 0, new, values)
 
 
-def read(secret: bytes, names: Names, values: Doubles, bits: Integers) -> Doubles:
+def read(secret: bytes, ids: Ids, values: Doubles, bits: Integers) -> Doubles:
     """Soft decisions [B], P(0) - P(1), for all bits from `write`."""
     period = 2 ** bits[:, None]
-    place = np.mod(values / SPACING - fractions(secret, "dither", names) * period, period)[..., None]
+    place = np.mod(values / SPACING - fractions(secret, "dither", ids) * period, period)[..., None]
     points = np.floor(place) + _POINTS
     weight = np.exp(-((place - points) ** 2) / (2 * _NOISE**2))
     label = points.astype(np.int64) % period[..., None]

@@ -8,8 +8,8 @@ Positions are not used: the least change can swap two Gaussians of nearly equal 
 few digits that they were initialised with. Nor are the quaternions of a model whose quaternions have unit
 length, as tools leave them that normalise: new low bits would change the length, which is known exactly.
 
-What stays of a Gaussian, its position and the high bits, is its *identity*, by which it is known in any
-order. Sign and exponent never change. Which Gaussians can be written: `usable`.
+The *ID* of a Gaussian is a hash of its position and high bits, which embedding never changes: it replaces the
+index, so the order of Gaussians does not matter. `usable` selects the Gaussians that may be written.
 """
 
 from __future__ import annotations
@@ -29,25 +29,25 @@ from keyss.kernels.parallel import in_blocks
 
 FIELDS = ("scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3", "opacity")
 GEOMETRY = len(FIELDS)  # fields of a Gaussian before the spherical harmonics
-QUATS = slice(3, 7)  # of these
+QUATS = slice(3, 7)  # their columns in FIELDS
 GEOMETRY_BITS, SH_BITS = 8, 12
-UNUSED_BITS = 1  # below them
+UNUSED_BITS = 1  # lowest bits of the mantissa, never written
 _UNUSED = np.uint32(UNUSED_BITS)
 _BYTE, _TWELVE = np.uint32((1 << GEOMETRY_BITS) - 1), np.uint32((1 << SH_BITS) - 1)
-UNIT_TOLERANCE = 1e-4  # of a length that is known without the low bits, to 2e-5 on average
+UNIT_TOLERANCE = 1e-4  # of a quaternion's length; without low bits it has an error of 2e-5 on average
 
-IDENTITY_BYTES = 16
+ID_BYTES = 16
 _PERSON = b"keyss/identity"
 BLOCK = 1 << 13  # Gaussians that a thread takes at a time
 
 
 @dataclass(frozen=True)
 class Layout:
-    """Which fields of every Gaussian are in use. It follows from what embedding leaves as it is."""
+    """The fields in use, a function of the bits that embedding never changes."""
 
     sh_degree: int
     quats: bool = True
-    written_degree: int | None = None  # of the harmonics whose low bits are read and written; None: all
+    written_degree: int | None = None  # SH degree up to which low bits are read and written; None: all
 
     @staticmethod
     def of(gaussians: Gaussians) -> Layout:
@@ -59,7 +59,7 @@ class Layout:
 
     @property
     def width(self) -> int:
-        """Whole bytes that the low bits of one Gaussian hold: 8, 21, 44 and 75 at degrees 0 to 3."""
+        """Whole bytes in the low bits of one Gaussian: 8, 21, 44 and 75 at degrees 0 to 3."""
         return GEOMETRY - 4 * (not self.quats) + self.harmonics * 3 // 2
 
     @property
@@ -69,13 +69,13 @@ class Layout:
 
     @property
     def columns(self) -> Integers:
-        """[F'] the fields in use, of those that `used_words` has."""
+        """[F'] the columns of `used_words` in use."""
         every = np.arange(GEOMETRY + _sh_count(self.sh_degree))
         return every if self.quats else np.delete(every, QUATS)
 
     @property
     def mask(self) -> Words32:
-        """[F] the bits in use of all fields that `used_words` has."""
+        """[F] masks of the bits in use, for the columns of `used_words`."""
         bits = [GEOMETRY_BITS] * GEOMETRY + [SH_BITS] * _sh_count(self.sh_degree)
         mask = np.array([((1 << count) - 1) << UNUSED_BITS for count in bits], np.uint32)
         if not self.quats:
@@ -84,12 +84,12 @@ class Layout:
 
     @property
     def shifts(self) -> Words32:
-        """[F] by which a word is shifted so that the bits in use, and those below them, are gone."""
+        """[F] right shifts that drop the bits in use and those below."""
         return np.array([int(each).bit_length() for each in self.mask], np.uint32)
 
 
 def coarse_lengths(quats: Words32) -> Doubles:
-    """[N] of quaternions [N, 4] with the middle of all low bits that they could have."""
+    """[N] lengths of quaternions [N, 4] whose low bits are replaced by the middle of their range."""
     low = np.uint32((1 << UNUSED_BITS + GEOMETRY_BITS) - 1)
     with np.errstate(over="ignore", invalid="ignore"):
         middle = (quats & ~low | (low + 1) >> 1).view(np.float32).astype(np.float64)
@@ -97,25 +97,25 @@ def coarse_lengths(quats: Words32) -> Doubles:
     return lengths
 
 
-def identities(gaussians: Gaussians, layout: Layout | None = None) -> Bytes:
-    """[N, 16] for each Gaussian a public hash (BLAKE2b) of all that embedding leaves as it is."""
+def gaussian_ids(gaussians: Gaussians, layout: Layout | None = None) -> Bytes:
+    """[N, 16] IDs of the Gaussians: public hashes (BLAKE2b) of the bits that embedding never changes."""
     stays, hashes = ~(layout or Layout.of(gaussians)).mask, []
     size = 4 * (3 + len(stays))
     for start in range(0, len(gaussians), BLOCK):
         own = gaussians[start : start + BLOCK]
         data = np.concatenate([_words(own.means), used_words(own) & stays], axis=1).astype("<u4").tobytes()
         each = (
-            blake2b(data[at : at + size], digest_size=IDENTITY_BYTES, person=_PERSON).digest()
+            blake2b(data[at : at + size], digest_size=ID_BYTES, person=_PERSON).digest()
             for at in range(0, len(data), size)
         )
         hashes.append(b"".join(each))
-    return np.frombuffer(b"".join(hashes), np.uint8).reshape(-1, IDENTITY_BYTES)
+    return np.frombuffer(b"".join(hashes), np.uint8).reshape(-1, ID_BYTES)
 
 
 def read_low_bits(gaussians: Gaussians, layout: Layout | None = None) -> Bytes:
-    """[N, B] the low bits of each Gaussian as bytes, as many as its `Layout` is wide.
+    """[N, B] the low bits of each Gaussian, B = `layout.width`.
 
-    8 bits of each field before the harmonics are a byte; two times 12 bits of harmonics are three.
+    A field before the harmonics gives one byte, two harmonics of 12 bits give three.
     """
     layout = layout or Layout.of(gaussians)
     fields, harmonics = _written_fields(gaussians, layout)
@@ -142,10 +142,10 @@ def write_low_bits(
     *,
     in_place: bool = False,
 ) -> Gaussians:
-    """The same Gaussians with other low bits: for each part [R, B] in the rows [R], which are different ones.
+    """Replace low bits: each of `parts` has distinct rows [R] and their new bytes [R, B].
 
-    Where a Gaussian's bits are no whole number of bytes, the last half byte stays as it is. `in_place`: the
-    result may share its memory with `gaussians`, which are changed.
+    If a Gaussian has half a byte more, that half byte keeps its value. `in_place`: change `gaussians`, whose
+    memory the result may share, instead of a copy.
     """
     written = gaussians.detach().to("cpu").map(torch.Tensor.contiguous)
     if in_place:
@@ -175,7 +175,7 @@ def write_low_bits(
 
 
 def used_words(gaussians: Gaussians) -> Words32:
-    """[N, F] bit patterns of scales, quaternions, opacity and harmonics above the constant ones; a copy."""
+    """[N, F] bit patterns of scales, quaternions, opacity and harmonics above degree 0; a copy."""
     return np.concatenate([_words(values) for values in _used_fields(gaussians)], axis=1)
 
 
@@ -184,18 +184,18 @@ def _used_fields(gaussians: Gaussians) -> tuple[torch.Tensor, ...]:
 
 
 def _written_fields(gaussians: Gaussians, layout: Layout) -> tuple[list[Words32], Words32]:
-    """The bit patterns of scales, of quaternions if in use, and of opacities; then those of harmonics."""
+    """Bit patterns of scales, quaternions (if in use) and opacities; and of harmonics."""
     *geometry, harmonics = map(_words, _used_fields(gaussians))
     kept = [each for each in geometry if layout.quats or each.shape[1] != 4]
     return kept, harmonics[:, : layout.harmonics]
 
 
 def _sh_count(sh_degree: int) -> int:
-    """Spherical harmonics above the constant ones, of three colours."""
+    """Number of coefficients above degree 0, three colours each."""
     return 3 * ((sh_degree + 1) ** 2 - 1)
 
 
 def _words(values: torch.Tensor) -> Words32:
-    """[N, C] bit patterns: of a tensor on the CPU whose rows are contiguous its own memory."""
+    """[N, C] bit patterns; a view for contiguous float32 tensors on the CPU."""
     flat = values.detach().to("cpu", torch.float32).reshape(len(values), math.prod(values.shape[1:]))
     return flat.numpy().view(np.uint32)

@@ -1,18 +1,18 @@
-"""Cells: a few bytes of each Gaussian, recognisable with the key and noise without. All Gaussians at once.
+"""Cells: a few bytes of each carrier, recognisable with the key and indistinguishable from noise without it.
 
     tag (4 bytes), then encrypted: data
 
 A synthetic initialisation vector, as in RFC 5297, for many short messages in one call of AES-256, which takes
 20 million blocks a second where hashes take a million Gaussians:
 
-- tag: the first bytes of the CBC-MAC of identity, slot and data. CBC-MAC is a pseudo-random function for
+- tag: the first bytes of the CBC-MAC of carrier ID, slot and data. CBC-MAC is a pseudo-random function for
   messages of one length (Bellare, Kilian, Rogaway 2000), and a `CellCipher` takes no others.
-- key stream: AES of (seed xor counter), where the seed is AES under another key of (identity xor tag and
-  slot). Equal key streams would need equal data in the same Gaussian, or a collision of 128 bits.
+- key stream: AES of (seed xor counter), where the seed is AES under another key of (ID xor tag and slot).
+  Equal key streams would need equal data in the same carrier, or a collision of 128 bits.
 
-Identities are public and differ between Gaussians (see `bits`). So one key may encrypt different data in one
-Gaussian, as happens when a model is embedded into twice; an observer notices nothing but a repetition of the
-very same bytes. A reader decrypts every cell and keeps those whose tag fits: one foreign cell in 2^32.
+Carrier IDs are public and unique (see `bits`). One key may encrypt different data in the same carrier, as
+when a model is embedded into twice: only a repetition of identical data shows. A reader decrypts every cell
+and keeps those with a valid tag; a cell of another key has one with probability 2^-32.
 
 The mode is written by hand because no library encrypts a million messages of 70 bytes in one call; the
 primitive is the library's.
@@ -46,52 +46,52 @@ class CellCipher:
         """Bytes of tag and data."""
         return TAG_BYTES + self.size
 
-    def encrypt(self, identities: Bytes, data: Bytes, slots: Integers | int = 0) -> Bytes:
-        """[N, cell_bytes] cells of `data` [N, size] for identities [N, 16].
+    def encrypt(self, ids: Bytes, data: Bytes, slots: Integers | int = 0) -> Bytes:
+        """[N, cell_bytes] cells of `data` [N, size] for carrier `ids` [N, 16].
 
         `slots` [N], or one for all: the number of the cell in its Gaussian.
         """
-        if data.shape != (len(identities), self.size):
-            raise ValueError(f"expected data of shape {(len(identities), self.size)}, got {data.shape}")
+        if data.shape != (len(ids), self.size):
+            raise ValueError(f"expected data of shape {(len(ids), self.size)}, got {data.shape}")
         numbers = np.broadcast_to(np.asarray(slots, np.uint8), len(data))
         cells = np.empty((len(data), self.cell_bytes), np.uint8)
 
         def work(start: int, stop: int) -> None:
-            names, own, which = identities[start:stop], data[start:stop], numbers[start:stop]
-            tags = self._tags(names, own, which)
+            part, own, which = ids[start:stop], data[start:stop], numbers[start:stop]
+            tags = self._tags(part, own, which)
             cells[start:stop, :TAG_BYTES] = tags
-            cells[start:stop, TAG_BYTES:] = own ^ self._stream(names, which, tags)
+            cells[start:stop, TAG_BYTES:] = own ^ self._stream(part, which, tags)
 
         in_blocks(work, len(data), _CELLS)
         return cells
 
-    def decrypt(self, identities: Bytes, cells: Bytes, slot: int = 0) -> tuple[Flags, Bytes]:
+    def decrypt(self, ids: Bytes, cells: Bytes, slot: int = 0) -> tuple[Flags, Bytes]:
         """[N] which of the cells [N, cell_bytes or more] fit this secret, and the data [M, size] of these."""
         fits = np.zeros(len(cells), bool)
 
         def work(start: int, stop: int) -> Bytes:
-            names, own = identities[start:stop], cells[start:stop, : self.cell_bytes]
-            which, tags = np.full(len(names), slot, np.uint8), own[:, :TAG_BYTES]
-            data = own[:, TAG_BYTES:] ^ self._stream(names, which, tags)
-            fits[start:stop] = (self._tags(names, data, which) == tags).all(axis=1)
+            part, own = ids[start:stop], cells[start:stop, : self.cell_bytes]
+            which, tags = np.full(len(part), slot, np.uint8), own[:, :TAG_BYTES]
+            data = own[:, TAG_BYTES:] ^ self._stream(part, which, tags)
+            fits[start:stop] = (self._tags(part, data, which) == tags).all(axis=1)
             return data[fits[start:stop]]
 
         every = in_blocks(work, len(cells), _CELLS)
         return fits, np.concatenate([np.zeros((0, self.size), np.uint8), *every])
 
-    def _tags(self, identities: Bytes, data: Bytes, slots: Bytes) -> Bytes:
+    def _tags(self, ids: Bytes, data: Bytes, slots: Bytes) -> Bytes:
         """[N, TAG_BYTES] of data [N, size] in the `slots` [N]."""
         messages = np.zeros((len(data), -(-(1 + self.size) // _BLOCK), _BLOCK), np.uint8)
         flat = messages.reshape(len(data), -1)
         flat[:, 0], flat[:, 1 : 1 + self.size] = slots, data
-        states = encrypted_blocks(self._tag_key, identities)
+        states = encrypted_blocks(self._tag_key, ids)
         for block in range(messages.shape[1]):
             states = encrypted_blocks(self._tag_key, states ^ messages[:, block])
         return states[:, :TAG_BYTES]
 
-    def _stream(self, identities: Bytes, slots: Bytes, tags: Bytes) -> Bytes:
+    def _stream(self, ids: Bytes, slots: Bytes, tags: Bytes) -> Bytes:
         """[N, size] the key streams; `tags` [N, TAG_BYTES]."""
-        seeds = identities.copy()
+        seeds = ids.copy()
         seeds[:, :TAG_BYTES] ^= tags
         seeds[:, TAG_BYTES] ^= slots
         counted = np.repeat(encrypted_blocks(self._seed_key, seeds)[:, None], -(-self.size // _BLOCK), axis=1)

@@ -1,25 +1,23 @@
-"""Secrets in bits of a model that nobody sees, to be found again with nothing but the model and a key.
+"""The quiet channel: secrets in low bits of floats, or in last bits of the integers of a quantised format.
 
-Nothing can be recognised: there is no magic number, no table. The bits lie in *carriers*: the low bits of a
-Gaussian of floats, or a block of last bits of a rounded model's codes (see `syndromes`). A reader tries the
-cell of every carrier and keeps those whose tag fits.
+A file has no magic number and no index of its secrets. Bits are stored in *carriers*: the low bits of one
+Gaussian, or one block of last bits of codes (see `wet_paper`). A carrier holds encrypted *cells*, each with a
+tag: a reader decrypts all of them and keeps those with a valid tag.
 
-- The *salt* of Argon2id is a hash of one carrier that holds nothing else. Because a Gaussian may be removed,
-  there are SALTS of them (see `salts`). A salt whose Gaussian is not usable is *stale*: the author of the
-  cover knows it in advance. There are key cells for the others. A reader tries SALTS_TRIED salts, and covers
-  with as many stale ones are refused.
-- *Key cells*, encrypted under the key and a salt, hold the secret's data key.
-- *Parameter cells*, encrypted under the data key, tell how the rest is read (see `parameters`).
-- *Records* are encrypted under the data key too; the numbered chunks of an encrypted payload are records (see
-  `layout`). Other records need no number: shuffling and cropping are harmless, and a removed carrier takes
-  only its own record with it. *Copies* of some have another label; they count where the record is gone.
-  Of codes nothing may be lost or reordered: the encrypted payload lies in the blocks after its header.
+- The *salt* of Argon2id is a hash of one carrier without cells. Gaussians may be removed, so there are SALTS
+  salts (see `salts`). A salt is *stale* if its Gaussian is not usable: the author of the cover knows it in
+  advance, so no key cell is written for it. A reader tries SALTS_TRIED salts; covers with as many stale salts
+  are refused.
+- *Key cells*, encrypted under the key and a salt, hold the data key of a secret.
+- *Parameter cells*, encrypted under the data key, tell how to read the rest (see `parameters`).
+- *Records* are encrypted under the data key: Gaussians, or numbered chunks of an encrypted payload (see
+  `layout`). Shuffling is harmless, and a removed Gaussian loses its own record only. *Copies* replace lost
+  records. In codes nothing may be lost or reordered: the payload is stored in the blocks after its header.
 
-All of it lies in random carriers, and every usable one gets new bits, noise if nothing else: cells of other
-secrets and of none look alike. All randomness comes from `entropy`, which must be secret: if it followed from
-the cover and one secret, the holder of that secret's key could compute the file without the others. No key
-stream is used twice: data keys depend on entropy and on all contents, and the key stream of a cell on the
-data in it (see `cells`).
+Carriers are chosen at random, and unused usable carriers get noise, so the number of secrets does not show.
+All randomness is derived from `entropy`, which must be secret: otherwise the holder of one key could compute
+the file without the other secrets and compare. No key stream is used twice: data keys depend on entropy and
+all contents, and the key stream of a cell depends on its data (see `cells`).
 """
 
 from __future__ import annotations
@@ -35,16 +33,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from keyss.channels.base import SALTS_TRIED, Channel, Content, Room, check_keys, randomness
+from keyss.channels.base import SALTS_TRIED, Capacity, Channel, Content, check_keys, randomness
 from keyss.channels.mixing import random_fractions
-from keyss.channels.quiet import syndromes
+from keyss.channels.quiet import wet_paper
 from keyss.channels.quiet.bits import Layout, read_low_bits, write_low_bits
 from keyss.channels.quiet.decoded import Decoded
 from keyss.channels.quiet.fields import FORMATS, Field, Levels, carrying, last_bits
-from keyss.channels.quiet.kept import changeable, file_order, host_of, in_counted_order, in_rows
-from keyss.channels.quiet.layout import BLOCK_HEADER, LEAST_BYTES, MIN_BLOCKS, LowBitsRoom
+from keyss.channels.quiet.layout import BLOCK_HEADER, LEAST_BYTES, MIN_BLOCKS, LowBitsCapacity
+from keyss.channels.quiet.order import file_order, in_counted_order, in_rows, model_hash
 from keyss.channels.quiet.salts import salt, salt_rows
-from keyss.channels.quiet.usable import check_usable, named_carriers
+from keyss.channels.quiet.usable import check_usable, usable_with_ids
+from keyss.channels.quiet.writable_levels import writable_levels
 from keyss.channels.quiet.writing import Writer, bytes_of
 from keyss.core.arrays import Bits, Bytes, Flags, Integers
 from keyss.core.errors import KeyssWarning, UsageError
@@ -54,11 +53,11 @@ from keyss.kernels.parallel import in_blocks
 from keyss.keys.derivation import DerivedKey, expand, stream
 from keyss.keys.encryption import OVERHEAD
 
-_ATTEMPTS = 30  # at writing blocks; one in a thousand covers or fewer needs a second one, each time
-_BITS_PER_GAUSSIAN = 18  # of room in codes, about
+_ATTEMPTS = 30  # to solve all blocks; each fails for at most one cover in a thousand
+_BITS_PER_GAUSSIAN = 18  # approximate capacity of codes
 _FIRST_IS_STALE = (
     "the first salt of this model cannot be renewed: keys open it as usual, but not with `decoy=True`, which "
-    "tries no other"
+    "tries the first salt only"
 )
 
 
@@ -70,7 +69,7 @@ class LowBits(Channel):
     records = True
 
     def __init__(self) -> None:
-        # By cover, while it lives and does not change: (versions, usable, names, rows of salts).
+        # Cache by cover, valid while its tensors keep their versions: (versions, usable, ids, rows of salts).
         self._found: WeakKeyDictionary[Gaussians, tuple[list[int], Flags, Bytes, Integers]] = (
             WeakKeyDictionary()
         )
@@ -82,22 +81,22 @@ class LowBits(Channel):
         """
         layout, versions = Layout.of(cover), _versions(cover)
         if (found := self._found.get(cover)) is None or found[0] != versions:
-            usable, names = named_carriers(cover, layout)
+            usable, ids = usable_with_ids(cover, layout)
             check_usable(cover, usable, layout)
-            rows = salt_rows(cover, names, layout=layout)
+            rows = salt_rows(cover, ids, layout=layout)
             stale = int((~usable[rows]).sum())
             if stale >= SALTS_TRIED:
                 raise UsageError(
                     f"{stale} of the {len(rows)} salts of this cover cannot be renewed, and whoever made it "
                     "could try keys in advance"
                 )
-            found = self._found[cover] = versions, usable, names, rows
+            found = self._found[cover] = versions, usable, ids, rows
         if sh_degree is not None:
             layout = replace(layout, written_degree=min(sh_degree, layout.sh_degree))
         return LowBitsCover(cover, layout, *found[1:])
 
-    def room(self, gaussians: int, sh_degree: int) -> Room:
-        return LowBitsRoom.of(gaussians, sh_degree).for_payloads()
+    def estimate_capacity(self, gaussians: int, sh_degree: int) -> Capacity:
+        return LowBitsCapacity.of(gaussians, sh_degree).for_payloads()
 
 
 LOW_BITS = LowBits()
@@ -118,37 +117,37 @@ class InCodes(Channel):
             self.place = f"steps of its numbers, which are those of a {format} file"
 
     def prepare(self, cover: Gaussians) -> CodesCover:
-        """The room in the codes of a model; a model read from a file of this format keeps its codes.
+        """The capacity of the codes of a model; a model read from a file of this format keeps its codes.
 
-        `cover`: of `decoded` the model, or the same with fewer harmonics.
+        `cover`: the model of `decoded`, perhaps with fewer harmonics.
         """
         if self.decoded is None:
             return CodesCover.of(FORMATS[self.format].of(cover))
         return CodesCover.of(self.decoded.codes, replace(self.decoded, model=cover.detach().to("cpu")))
 
-    def room(self, gaussians: int, sh_degree: int) -> Room:
-        return Room(gaussians, gaussians * _BITS_PER_GAUSSIAN // 8, _overhead(syndromes.BLOCK // 8))
+    def estimate_capacity(self, gaussians: int, sh_degree: int) -> Capacity:
+        return Capacity(gaussians, gaussians * _BITS_PER_GAUSSIAN // 8, _overhead(wet_paper.BLOCK // 8))
 
 
 @dataclass(frozen=True)
 class LowBitsCover:
-    """A cover and which of its Gaussians can be written; see `keyss.channels.base.PreparedCover`."""
+    """A cover and its usable Gaussians; see `keyss.channels.base.PreparedCover`."""
 
     cover: Gaussians
     layout: Layout
     usable: Flags  # [N]
-    names: Bytes  # [N, 16] identities
-    salt_rows: Integers  # [S] in the order of salts
+    ids: Bytes  # [N, 16] of all Gaussians
+    salt_rows: Integers  # [S] rows of the salts' Gaussians, in order
     overwrites: bool = False  # embedding changes the tensors of the cover instead of copies
 
     @property
-    def room(self) -> Room:
+    def capacity(self) -> Capacity:
         return self.cells.for_payloads()
 
     @property
-    def cells(self) -> LowBitsRoom:
-        """The room for records."""
-        return LowBitsRoom(len(self._rows), self.layout.width)
+    def cells(self) -> LowBitsCapacity:
+        """The capacity for records."""
+        return LowBitsCapacity(len(self._rows), self.layout.width)
 
     def embed(self, contents: Sequence[tuple[str, Content]], *, entropy: bytes | None = None) -> Gaussians:
         """See `PreparedCover`. Takes 1.6 s for each secret for key derivation.
@@ -165,57 +164,57 @@ class LowBitsCover:
     def embed_derived(
         self, contents: Sequence[tuple[Sequence[DerivedKey], Content]], entropy: bytes
     ) -> Gaussians:
-        """`embed` after key derivation: for each secret its key under each of the `fresh_salts`.
+        """`embed` after key derivation: each secret comes with its key under each of the `fresh_salts`.
 
-        `entropy`: of `randomness`, for no other file.
+        `entropy`: the result of `randomness`, used for this file only.
         """
         check_keys([keys[0].verifier() for keys, _ in contents])
         fresh, _ = self._salts(entropy)
-        writer = Writer(self.names[self._rows], self.layout.width, entropy, self.names)
+        writer = Writer(self.ids[self._rows], self.layout.width, entropy, self.ids)
         writer.write(contents)
         parts = [(self.salt_rows[self.fresh_salts], fresh), (self._rows[writer.order], writer.table)]
         return write_low_bits(self.cover, self.layout, parts, in_place=self.overwrites)
 
     @cached_property
     def fresh_salts(self) -> Integers:
-        """[F] the numbers of the salts whose Gaussians get new bits."""
+        """[F] indices of the salts that are not stale."""
         return np.flatnonzero(self.usable[self.salt_rows])
 
     @cached_property
     def _rows(self) -> Integers:
-        """[C] the carriers."""
+        """[C] rows of the carriers."""
         carriers = self.usable.copy()
         carriers[self.salt_rows] = False
         return np.flatnonzero(carriers)
 
     def _salts(self, entropy: bytes) -> tuple[Bytes, list[bytes]]:
-        """New low bits [F, B] of the Gaussians of fresh salts, and all salts with them."""
+        """New low bits [F, B] of the Gaussians of fresh salts, and the resulting salts (all)."""
         noise = stream(entropy, "quiet/salts", len(self.fresh_salts) * self.layout.width)
         fresh = np.frombuffer(noise, np.uint8).reshape(len(self.fresh_salts), self.layout.width)
         whole = replace(self.layout, written_degree=None)
         low = read_low_bits(self.cover[torch.from_numpy(self.salt_rows)], whole)
         low[self.fresh_salts, : self.layout.width] = fresh
-        return fresh, [salt(*each) for each in zip(self.names[self.salt_rows], low, strict=True)]
+        return fresh, [salt(*each) for each in zip(self.ids[self.salt_rows], low, strict=True)]
 
 
 @dataclass(frozen=True)
 class CodesCover:
-    """Codes and which of their levels can be written; see `keyss.channels.base.PreparedCover`."""
+    """Codes and their writable levels; see `keyss.channels.base.PreparedCover`."""
 
     codes: Codes  # in the order in which bits are counted
     fields: list[Field]
-    free: list[Flags]  # of each field, which levels may be changed
-    host: bytes  # of `host_of`
-    decoded: Decoded | None = None  # the model that is published in the place of the codes, in that order
+    free: list[Flags]  # [N] per field: levels that may be written
+    model_hash: bytes
+    decoded: Decoded | None = None  # published instead of the codes, in the same order
 
     @staticmethod
     def of(codes: Codes, decoded: Decoded | None = None) -> CodesCover:
-        """Raises UsageError for codes without room. `decoded`: the model that is published, not the codes."""
+        """Raises UsageError for codes without capacity. `decoded`: published instead of the codes."""
         rows, ordered, own = in_counted_order(codes, decoded.exact if decoded else None)
         model = decoded[rows] if decoded else None
-        host = host_of(ordered, model.model if model else None)
-        cover = CodesCover(ordered, own, changeable(ordered, own, _digest(codes)), host, model)
-        if len(cover.names) < MIN_BLOCKS or cover.width < LEAST_BYTES:
+        own_hash = model_hash(ordered, model.model if model else None)
+        cover = CodesCover(ordered, own, writable_levels(ordered, own, _digest(codes)), own_hash, model)
+        if len(cover.ids) < MIN_BLOCKS or cover.width < LEAST_BYTES:
             raise UsageError(
                 f"a cover of {len(codes):,} Gaussians has no room for secrets in the codes of {codes.name} "
                 "files"
@@ -224,30 +223,30 @@ class CodesCover:
 
     @cached_property
     def dry(self) -> Bits:
-        """1 where a last bit may be changed."""
+        """1 for last bits that may be written."""
         parts = [np.repeat(free, each.bits) for free, each in zip(self.free, self.fields, strict=True)]
         return np.concatenate(parts).astype(np.uint8)
 
     @cached_property
     def places(self) -> Integers:
-        """Which of these bits those of the blocks are."""
-        return syndromes.places(len(self.dry))
+        """Indices of the blocks' bits; see `wet_paper.places`."""
+        return wet_paper.places(len(self.dry))
 
     @cached_property
     def width(self) -> int:
-        """Bytes that a block holds."""
-        return syndromes.width_of(self.dry[self.places])
+        """Bytes per block."""
+        return wet_paper.width_of(self.dry[self.places])
 
     @property
-    def names(self) -> Bytes:
-        """[C, 16] identities of the blocks, the first of which gives the salt."""
-        return syndromes.block_names(len(self.places) // syndromes.BLOCK, self.host)
+    def ids(self) -> Bytes:
+        """[C, 16] IDs of the blocks; the first block is the salt."""
+        return wet_paper.block_ids(len(self.places) // wet_paper.BLOCK, self.model_hash)
 
     @cached_property
-    def room(self) -> Room:
-        size = (len(self.names) - 1) * self.width
+    def capacity(self) -> Capacity:
+        size = (len(self.ids) - 1) * self.width
         # Incompressible data grow by less than a thousandth.
-        return Room(len(self.codes), int(size * (1 - 2**-10)), _overhead(self.width))
+        return Capacity(len(self.codes), int(size * (1 - 2**-10)), _overhead(self.width))
 
     @property
     def cover(self) -> Gaussians:
@@ -259,24 +258,24 @@ class CodesCover:
         for attempt in range(_ATTEMPTS):
             own = expand(mixed, f"quiet/attempt/{attempt}", 32)
             first = np.frombuffer(stream(own, "quiet/salts", self.width), np.uint8)
-            salts = [salt(self.names[0], first[:LEAST_BYTES])]
+            salts = [salt(self.ids[0], first[:LEAST_BYTES])]
             derived = [(_derived(key, salts), content) for key, content in contents]
             check_keys([keys[0].verifier() for keys, _ in derived])
-            writer = Writer(self.names[1:], self.width, own, len(self.codes))
+            writer = Writer(self.ids[1:], self.width, own, len(self.codes))
             writer.write(derived)
             if (bits := self._solved(np.concatenate([first[None], writer.table]), own)) is not None:
                 return self._published(self._written(bits, own), own)
-        raise RuntimeError("the blocks of this cover do not hold what they should")
+        raise RuntimeError("the blocks of this cover cannot be solved")
 
     def _solved(self, table: Bytes, entropy: bytes) -> Bits | None:
-        """The last bits of all levels, random where they may change; blocks hold `table` [C, width].
+        """The last bits of all levels, so that blocks hold `table` [C, width]; free bits are random.
 
-        None if a block cannot hold its bytes.
+        None if a block has no solution.
         """
         noise = np.frombuffer(stream(entropy, "codes/free", -(-len(self.dry) // 8)), np.uint8)
         bits = np.where(self.dry, np.unpackbits(noise)[: len(self.dry)], last_bits(self.fields))
-        message, rows = np.unpackbits(table, bitorder="little"), syndromes.matrix(8 * self.width)
-        solved = syndromes.write(bits[self.places], self.dry[self.places], message, rows)
+        message, rows = np.unpackbits(table, bitorder="little"), wet_paper.matrix(8 * self.width)
+        solved = wet_paper.write(bits[self.places], self.dry[self.places], message, rows)
         if solved is not None:
             bits[self.places] = solved
         return None if solved is None else bits
@@ -284,7 +283,7 @@ class CodesCover:
     def _written(self, bits: Bits, entropy: bytes) -> Codes:
         columns: dict[str, list[Levels]] = {}
         for field, free in zip(self.fields, self.free, strict=True):
-            own, bits = bits[: field.room], bits[field.room :]
+            own, bits = bits[: field.total_bits], bits[field.total_bits :]
             ties = random_fractions(entropy, f"codes/ties/{field.name}/{field.column}", len(free)) - 0.5
             levels = np.where(free, field.with_bits(own, ties), field.levels)
             columns.setdefault(field.name, []).append(levels)
@@ -293,7 +292,7 @@ class CodesCover:
         return written
 
     def _published(self, codes: Codes, entropy: bytes) -> Gaussians:
-        """A file of `codes`, or the model decoded from them, in the order of such files or of the cover."""
+        """A file of `codes`, or the model decoded from them: in the order of the format, or of the cover."""
         within = random_fractions(entropy, "codes/file-order", 3 * len(codes)).reshape(-1, 3) - 0.5
         order = file_order(codes, within)
         if self.decoded is None:
@@ -304,12 +303,12 @@ class CodesCover:
 
 
 def _overhead(width: int) -> int:
-    """Bytes that a payload in blocks of `width` bytes takes beside its data, at most."""
+    """Maximum bytes of a payload beside its data, in blocks of `width` bytes."""
     return (BLOCK_HEADER + 1) * width + OVERHEAD
 
 
 def _versions(model: Gaussians) -> list[int]:
-    """How often each tensor was changed in place."""
+    """The number of in-place changes of each tensor."""
     tensors: list[Tensor] = [getattr(model, each.name) for each in fields(model)]
     return [0 if each.is_inference() else each._version for each in tensors]
 

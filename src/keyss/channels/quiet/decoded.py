@@ -1,8 +1,8 @@
-"""Models that a program decoded from a .spz, .sog or compressed .ply, as most of those on the web are.
+"""Models that were decoded from a .spz, .sog or compressed .ply, as most models on the web.
 
-Their low bits follow from the codes of that file, so that new ones would show. But the codes can be computed
-from the numbers: `quantise` finds them, and decoding them gives the same numbers. The secret goes into the
-codes, and the published model is decoded from these.
+Their low bits are determined by the codes of that file, so new low bits would show. The codes can be computed
+from the numbers by `quantise`. The secret is embedded in the codes, and the published model is decoded from
+them.
 """
 
 from __future__ import annotations
@@ -22,32 +22,32 @@ from keyss.files.formats.compressed_ply import CompressedPlyCodes
 from keyss.files.formats.sog import SogCodes
 from keyss.files.formats.spz import MAX_FRACTIONAL_BITS, MAX_POSITION, SpzCodes
 
-_WRITTEN = ("means", "quats", "log_scales")  # attributes that carry bits in some format
+_WRITTEN = ("means", "quats", "log_scales")  # attributes that carry bits in any format
 _OPACITIES = 256
-_SAMPLE = 1024  # Gaussians that are looked at first
-_CLOSE = 1e-5  # relative: the same number, computed by another program
-_MOST = 0.9  # share of the Gaussians whose numbers follow from codes
+_SAMPLE = 1024  # Gaussians of a first check
+_CLOSE = 1e-5  # maximum relative difference between decoders
+_MOST = 0.9  # minimum share of exact Gaussians
 
 
 @dataclass(frozen=True)
 class Decoded:
-    """A model and the codes that it was decoded from."""
+    """A model and the codes from which it was decoded."""
 
     model: Gaussians
     codes: Codes
-    exact: Flags  # [N] whether the numbers of a Gaussian follow from its codes; the others carry nothing
-    order: Integers  # [N] of each Gaussian its place in the file
+    exact: Flags  # [N] True if decoding the codes gives the Gaussian's numbers; others carry nothing
+    order: Integers  # [N] position of each Gaussian in the file
 
     @staticmethod
     def of(model: Gaussians) -> Decoded | None:
-        """None for a model whose numbers lie on the steps of no format."""
+        """None if the model was decoded from none of the formats."""
         if isinstance(model, CodedGaussians) or not len(model) or not _opacities_are_bytes(model):
             return None
         model = model.detach().to("cpu")
         for quantise in (_spz, _sog, _compressed_ply):
             codes = quantise(model)
             if codes is not None:
-                exact = _follow(model, codes.dequantise())
+                exact = _are_exact(model, codes.dequantise())
                 if exact.mean() >= _MOST:
                     return Decoded(model, codes, exact, np.arange(len(model)))
         return None
@@ -59,7 +59,7 @@ class Decoded:
 
     @property
     def is_sorted(self) -> bool:
-        """Whether the file is in the order of `morton_order`, but for a few Gaussians."""
+        """True if the file is in Morton order, up to a few Gaussians."""
         places = np.empty(len(self.order))
         places[self.order[morton_order(self.model.means.numpy())]] = np.arange(len(self.order))
         return bool((np.diff(places) > 0).mean() >= _MOST)
@@ -77,7 +77,7 @@ class Decoded:
 
 
 def _opacities_are_bytes(model: Gaussians) -> bool:
-    """Whether opacities have at most 256 values, as in all of the formats."""
+    """True if there are at most 256 different opacities, as in all of the formats."""
     parts = model.opacity_logits[:_SAMPLE], model.opacity_logits
     return all(len(each.detach().unique()) <= _OPACITIES for each in parts)
 
@@ -108,8 +108,8 @@ def _compressed_ply(model: Gaussians) -> Codes | None:
         return None
 
 
-def _follow(model: Gaussians, decoded: Gaussians) -> Flags:
-    """[N] whether what carries bits is the same in both, as far as programs agree."""
+def _are_exact(model: Gaussians, decoded: Gaussians) -> Flags:
+    """Mask [N] of Gaussians with the same attributes in both, up to differences between decoders."""
     signs = _signs(model.quats, decoded.quats)
     exact = ((model.quats - signs * decoded.quats).abs() < _CLOSE).all(1)
     for name in ("means", "log_scales"):

@@ -1,9 +1,9 @@
-"""Which numbers of a format's codes carry bits, and how many each: measured, see docs/channels.md.
+"""The numbers of a format's codes that carry bits, and how many bits each (measured: docs/channels.md).
 
 A *level* is an integer that grows with the number it stands for; a *field* is one coordinate of an attribute
 of all Gaussians. The number of bits that a level carries follows from codes that are never written: from the
 Gaussian's size and the format's step, so that positions move by a fraction of that size. The arithmetic is
-the same on every machine and uses no logarithms: with one bit more or less, nothing can be read.
+the same on every machine and uses no logarithms: a reader must find the same numbers of bits.
 
 Writing matches levels (Sharp 2001) instead of overwriting their bits. Overwriting moves even levels up and
 odd ones down only, which makes pairs of them equally frequent: the attacks of Westfeld and Pfitzmann (1999)
@@ -30,7 +30,7 @@ Levels = npt.NDArray[np.int32]
 MAX_BITS = 10
 _SHARE = -3.0  # log2 of the range of written positions, in sizes of the Gaussian
 _LOG_SCALE = -4.0  # log2 of the range of written log scales
-_SIGN, _MAGNITUDE = 512, 511  # of the rotations of an SPZ of version 3 or newer
+_SIGN, _MAGNITUDE = 512, 511  # masks of a rotation's component in SPZ 3 and newer
 _LOG2_E = 1.4426950408889634
 _VECTOR = np.array([2047, 1023, 2047])  # largest levels of x, y, z in a compressed .ply
 
@@ -39,30 +39,30 @@ _VECTOR = np.array([2047, 1023, 2047])  # largest levels of x, y, z in a compres
 class Field:
     """One coordinate of an attribute of N Gaussians."""
 
-    name: str  # of the attribute in the codes
+    name: str  # name of the attribute in the codes
     column: int
     levels: Levels  # [N]
-    bits: Levels  # [N] that each carries, 0 to MAX_BITS
+    bits: Levels  # [N] bits that each level carries, 0 to MAX_BITS
 
     @property
-    def room(self) -> int:
+    def total_bits(self) -> int:
         """Bits of all levels together."""
         return int(self.bits.sum())
 
     def read(self) -> Bytes:
-        """[room] the last bits of all levels, the lowest first."""
+        """[total_bits] the last bits of all levels, the lowest first."""
         bits = self.levels[:, None] >> np.arange(MAX_BITS, dtype=np.int32) & 1
         return bits[self._places()].astype(np.uint8)
 
     @property
     def reach(self) -> Levels:
-        """[N] by how many levels `with_bits` moves each at most."""
+        """[N] maximum change of each level by `with_bits`."""
         return (1 << self.bits) // 2
 
     def with_bits(self, bits: Bytes, ties: Doubles) -> Levels:
-        """[N] the nearest levels from which `read` gives `bits` [room].
+        """[N] the nearest levels from which `read` gives `bits` [total_bits].
 
-        `ties` [N] in [-0.5, 0.5]: which of two equally near ones is taken.
+        `ties` [N] in [-0.5, 0.5]: break ties between equally near levels.
         """
         places = np.zeros((len(self.levels), MAX_BITS), np.int32)
         places[self._places()] = bits
@@ -81,7 +81,7 @@ class Carrying:
 
     fields: Callable[[Any], list[Field]]
     with_levels: Callable[[Any, Mapping[str, Levels]], Any]  # codes with new levels of some fields
-    # Least and largest level of a rotation's parts: -sqrt(1/2) and sqrt(1/2).
+    # Levels of -sqrt(1/2) and sqrt(1/2), the range of a rotation's components.
     rotations: tuple[int, int]
 
 
@@ -91,9 +91,9 @@ def carrying(codes: Codes) -> Carrying:
 
 
 def sog_distances(codes: SogCodes, levels: Numbers) -> Integers:
-    """[N, 3] by how many powers of 2 a .sog's steps are larger at these levels of positions than at 0."""
+    """[N, 3] log2 of the step of a .sog at these `levels` of positions, relative to the step at 0."""
     extent = np.where(codes.maxs > codes.mins, codes.maxs - codes.mins, 1.0)
-    logs = np.abs(codes.mins + extent * (levels / 65535))  # of 1 + a coordinate
+    logs = np.abs(codes.mins + extent * (levels / 65535))  # ln(1 + |coordinate|)
     return np.floor(logs * _LOG2_E).clip(0, 64).astype(np.int64)
 
 
@@ -104,7 +104,7 @@ def last_bits(fields: Sequence[Field]) -> Bytes:
 
 def _spz_fields(codes: SpzCodes) -> list[Field]:
     """Rotations of version 2, which no program writes any more, carry nothing."""
-    sizes = (_middle(codes.scales) / 16 - 10) * _LOG2_E
+    sizes = (_medians(codes.scales) / 16 - 10) * _LOG2_E
     bits = _fitting(sizes[:, None] + codes.fractional_bits + _SHARE)
     positions = _fields("positions", codes.positions, bits)
     if codes.version == 2:
@@ -125,7 +125,7 @@ def _spz_with_levels(codes: SpzCodes, levels: Mapping[str, Levels]) -> SpzCodes:
 
 
 def _sog_fields(codes: SogCodes) -> list[Field]:
-    sizes = _middle(codes.scale_codebook.astype(np.float64)[codes.scales]) * _LOG2_E
+    sizes = _medians(codes.scale_codebook.astype(np.float64)[codes.scales]) * _LOG2_E
     extent = np.where(codes.maxs > codes.mins, codes.maxs - codes.mins, 1.0)
     steps = _log2(extent / 65535) + sog_distances(codes, codes.positions) + 0.5
     return [
@@ -156,13 +156,13 @@ _CARRYING: dict[type[Codes], Carrying] = {
 FORMATS = {each.name: each for each in _CARRYING}
 
 
-def _middle(values: Numbers) -> Doubles:
-    """[N] the second of the three numbers of each row, by size."""
+def _medians(values: Numbers) -> Doubles:
+    """[N] medians of rows [N, 3]."""
     return np.sort(values.astype(np.float64), axis=1)[:, 1]
 
 
 def _log2(values: Doubles) -> Doubles:
-    """About the logarithm to base 2, too small by up to 0.09: straight lines between the powers of 2."""
+    """Approximate log2, too small by up to 0.09: linear between powers of 2."""
     mantissa, exponent = np.frexp(values)
     found: Doubles = exponent + 2 * (mantissa - 1)
     return found

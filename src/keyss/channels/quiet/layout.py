@@ -1,25 +1,19 @@
-"""How many cells each secret gets among the carriers, and how many cells divide one.
+"""Allocation of the carriers' cells to secrets.
 
 Every secret has a *header* in a few whole carriers: its data key for each salt, and the parameters for
-reading the rest. Beside it come *records*, one in each cell; numbered chunks of a payload are records too.
+reading the rest. Its *records* take one cell each; the numbered chunks of a payload are records too.
 
-A key must not tell whether there are other secrets: what a secret gets follows from its own size. There are
-size classes, in which several secrets fit beside each other as each would alone: a fifth of the carriers, for
-one record each; then a quarter, half and all of the cells that divide carriers into halves (or thirds,
-quarters).
+A key must not reveal whether there are other secrets, so each secret is allocated cells by its own size only:
+an *independent* plan. It gets the first size class that holds it: a fifth of the carriers with one record
+each; then a quarter, a half and all of the cells that divide carriers into halves (thirds, quarters).
 
-- *Records* take as many cells of the first class that has room as there are. Up to a quarter of them, those
-  whose loss costs most, are embedded twice if the class has room for that: a copy of 10 % takes away half of
-  the cost of random pruning.
-- A *payload* fills its class with redundancy.
+- *Records* take one cell each. If the class has cells left, up to a quarter of the records, those whose loss
+  costs most, are embedded twice: copies of 10 % halve the cost of random pruning.
+- A *payload* is cut into numbered chunks and fills its class with Reed-Solomon redundancy: any quarter of all
+  Gaussians may be lost. The number of cells does not reveal its size.
 
-Carriers for the headers of four secrets are set aside, whether there are so many or not. Secrets that do not
-fit like that get what there is, without copies or in smaller cells, and the holder of one key can notice the
-others.
-
-An encrypted payload is cut into numbered chunks, coded with Reed-Solomon so that the loss of a quarter of all
-Gaussians, whichever they are, leaves enough of every codeword. A payload fills all cells that it gets: those
-that it does not need become redundancy, and the number of cells tells nothing.
+Carriers for the headers of MAX_INDEPENDENT secrets are always reserved. Secrets that do not fit independently
+share all cells in a joint plan, with fewer copies or smaller cells: the holder of one key can notice others.
 """
 
 from __future__ import annotations
@@ -32,7 +26,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from keyss.channels.base import RecordPlan, RecordRequest, Room
+from keyss.channels.base import Capacity, RecordPlan, RecordRequest
 from keyss.channels.quiet.bits import Layout
 from keyss.channels.quiet.cells import TAG_BYTES
 from keyss.channels.reed_solomon import SYMBOL_BYTES, Codewords
@@ -42,31 +36,31 @@ from keyss.core.errors import UsageError
 from keyss.keys.encryption import SMALLEST_BUCKET, encrypted_size
 
 DATA_KEY_BYTES = 16
-SALTS = 12  # Gaussians that may serve as the salt: random pruning of a quarter removes all with p = 6e-8
-KEY_COPIES = 12  # of the data key, for each salt
-PARAMETER_COPIES = 24  # of each part: all are removed with a quarter of the model with p = 4e-15
-PREFIX_BYTES = 30  # of the parameters before the sketch and a method's own header (see `parameters`)
-LEAST_BYTES = 48  # that every block of codes holds: a key cell, or the parameters
-BLOCK_HEADER = 2  # blocks of codes that a secret's header takes
+SALTS = 12  # random pruning of a quarter removes all their Gaussians with p = 6e-8
+KEY_COPIES = 12  # copies of the data key for each salt
+PARAMETER_COPIES = 24  # copies of each part; pruning a quarter removes all of them with p = 4e-15
+PREFIX_BYTES = 30  # parameters before the sketch and the method's header (see `parameters`)
+LEAST_BYTES = 48  # minimum bytes of a block of codes: a key cell, or the parameters
+BLOCK_HEADER = 2  # blocks of a secret's header
 MIN_BLOCKS = 4  # a salt, a header, and data
-MAX_CELLS = 4  # of a carrier
-MAX_COPIES = 0.25  # of a secret's records
-UNNOTICED = 4  # secrets that fit beside each other, if they are small enough, as each would alone
-TYPICAL_SHARE = 0.75  # Gaussians whose low bits are random, of a trained model; 0.58 to 0.94 were measured
+MAX_CELLS = 4  # cells per carrier
+MAX_COPIES = 0.25  # share of a secret's records
+MAX_INDEPENDENT = 4  # maximum number of secrets with independent plans
+TYPICAL_SHARE = 0.75  # usable Gaussians of a trained model; 0.58 to 0.94 were measured
 
-_TYPICAL_HEADER = 168  # bytes that the methods' own headers take at most
-_MAX_SET_ASIDE = 1 / 3  # of the carriers, for headers of secrets that there may not be
-_DEVIATIONS = 6  # by which carriers that are left untouched may be fewer than expected
+_TYPICAL_HEADER = 168  # maximum bytes of a method's header in an independent plan
+_MAX_RESERVED = 1 / 3  # maximum share of the carriers reserved for headers
+_DEVIATIONS = 6  # margin of the number of untouched carriers, in standard deviations
 REMOVAL = 0.25  # share of the Gaussians that may be removed at random
-FAILURE = 1e-7  # probability that a payload is lost all the same
-NUMBER_BYTES = 3  # of a chunk
-MAX_CHUNKS = 1024  # of a codeword: longer ones hold a little more and take longer
+FAILURE = 1e-7  # probability of losing a payload to such removal
+NUMBER_BYTES = 3  # size of a chunk's number
+MAX_CHUNKS = 1024  # chunks per codeword; longer codewords hold little more and are slower
 MAX_CODEWORDS = (1 << 8 * NUMBER_BYTES) // MAX_CHUNKS
 
 
 @dataclass(frozen=True)
 class PayloadPlan:
-    """The cells of a payload."""
+    """The cells allocated to a payload."""
 
     cells_per_carrier: int
     cells: int
@@ -74,43 +68,43 @@ class PayloadPlan:
 
 
 @dataclass(frozen=True)
-class LowBitsRoom:
-    """The room in carriers of `width` bytes each."""
+class LowBitsCapacity:
+    """The capacity of carriers of `width` bytes each, and plans that use it."""
 
     carriers: int
     width: int
 
     @staticmethod
-    def of(carriers: int, sh_degree: int) -> LowBitsRoom:
-        return LowBitsRoom(carriers, Layout(sh_degree).width)
+    def of(carriers: int, sh_degree: int) -> LowBitsCapacity:
+        return LowBitsCapacity(carriers, Layout(sh_degree).width)
 
-    def for_payloads(self) -> Room:
-        return Room(self.carriers, self.payload_capacity(1), SMALLEST_BUCKET)
+    def for_payloads(self) -> Capacity:
+        return Capacity(self.carriers, self.payload_capacity(1), SMALLEST_BUCKET)
 
     @property
     def part_bytes(self) -> int:
-        """Bytes of parameters in one cell, beside its tag and its number; 0 where nothing fits at all."""
+        """Bytes of parameters per cell, without tag and number; 0 if not even a key fits."""
         return self.width - TAG_BYTES - 1 if self.width >= TAG_BYTES + DATA_KEY_BYTES else 0
 
     def record_bytes(self, cells: int) -> int:
-        """Bytes of a record where `cells` of them divide a carrier; 0 where nothing fits."""
+        """Bytes of a record with `cells` cells per carrier; 0 if nothing fits."""
         return max(0, self.width // cells - TAG_BYTES) if self.part_bytes else 0
 
     def header_carriers(self, header_bytes: int) -> int:
-        """Carriers that a secret's header takes; `header_bytes`: what the method adds to the parameters."""
+        """Carriers of a secret's header; `header_bytes`: size of the method's header."""
         parts = -(-(PREFIX_BYTES + SKETCH_BYTES + header_bytes) // max(1, self.part_bytes))
         return SALTS * KEY_COPIES + parts * PARAMETER_COPIES
 
-    def set_aside(self, header_bytes: Sequence[int], as_alone: bool) -> int:
-        """Carriers for the headers of all secrets."""
-        if as_alone:
-            return UNNOTICED * self.header_carriers(_TYPICAL_HEADER)
+    def reserved(self, header_bytes: Sequence[int], independent: bool) -> int:
+        """Carriers reserved for the headers of all secrets."""
+        if independent:
+            return MAX_INDEPENDENT * self.header_carriers(_TYPICAL_HEADER)
         return sum(self.header_carriers(each) for each in header_bytes)
 
     def plan_records(self, requests: Sequence[RecordRequest]) -> list[RecordPlan]:
-        """A plan for each of the requests; those with more than one cell of a carrier have equally many.
+        """A plan for each request; plans with several cells per carrier all have the same number.
 
-        Raises UsageError with the number of records that fits.
+        Raises UsageError, with the number of records that fit.
         """
         least, largest = max(request.least_bytes for request in requests), self.record_bytes(1)
         if least > largest:
@@ -118,48 +112,48 @@ class LowBitsRoom:
                 f"a Gaussian of this cover has room for records of {largest} bytes, and at least {least} are "
                 "needed"
             )
-        plans = [plan for plan in map(self._alone, requests) if plan is not None]
-        return plans if self.is_independent_layout(plans, requests) else self._tight(requests)
+        plans = [plan for plan in map(self._independent_plan, requests) if plan is not None]
+        return plans if self.is_independent_layout(plans, requests) else self._joint_plans(requests)
 
     def is_independent_layout(self, plans: Sequence[RecordPlan], requests: Sequence[RecordRequest]) -> bool:
-        """True if each secret's records are placed as they would be without the others."""
-        if list(map(self._alone, requests)) != list(plans):
+        """True if each secret's records are placed independently of the others."""
+        if list(map(self._independent_plan, requests)) != list(plans):
             return False
         both = zip(plans, requests, strict=True)
-        return self._fit([(plan.cells_per_carrier, request.count + plan.copies) for plan, request in both])
+        return self._fits([(plan.cells_per_carrier, request.count + plan.copies) for plan, request in both])
 
     def record_capacity(self, requests: Sequence[RecordRequest]) -> int:
-        """Records of the smallest useful size that fit for all requests together; 0 if none."""
-        left = self.carriers - self.set_aside([each.header_bytes for each in requests], as_alone=False)
+        """The number of records of the minimum size that fit for all requests together."""
+        left = self.carriers - self.reserved([each.header_bytes for each in requests], independent=False)
         return max(0, left) * self._most_cells(max(request.least_bytes for request in requests))
 
-    def unnoticed_records(self, least_bytes: int, secrets: int) -> int:
-        """The most records of `least_bytes` for each secret that are placed as without the others; or 0."""
-        if secrets > UNNOTICED or not self._classes():
+    def max_independent_records(self, least_bytes: int, secrets: int) -> int:
+        """The maximum number of records of `least_bytes` for each secret in independent plans."""
+        if secrets > MAX_INDEPENDENT or not self._classes():
             return 0
         cells = self._most_cells(least_bytes)
-        return cells * self._shared // (1 << (secrets - 1).bit_length())
+        return cells * self._independent_carriers // (1 << (secrets - 1).bit_length())
 
     def plan_payloads(self, sizes: Sequence[int]) -> tuple[list[PayloadPlan], bool]:
-        """A plan for each encrypted payload of so many bytes; whether each is placed as without the others.
+        """A plan for each encrypted payload of `sizes` bytes, and True if the plans are independent.
 
-        Raises UsageError with the number of carriers that would do.
+        Raises UsageError, with the number of Gaussians that would suffice.
         """
         alone = [
             next((each for each in self._classes() if self._codewords(*each, size)), None) for size in sizes
         ]
         cells = [each for each in alone if each is not None]
-        if not (as_alone := len(cells) == len(sizes) and self._fit(cells)):
+        if not (independent := len(cells) == len(sizes) and self._fits(cells)):
             cells = [(1, self._payload_cells(len(sizes)))] * len(sizes)
         plans = []
         for each, size in zip(cells, sizes, strict=True):
             if (codewords := self._codewords(*each, size)) is None:
                 raise UsageError(self.too_small(self.carriers, "usable Gaussians", size, len(sizes)))
             plans.append(PayloadPlan(*each, codewords))
-        return plans, as_alone
+        return plans, independent
 
     def payload_capacity(self, secrets: int) -> int:
-        """Bytes of encrypted payload for each of `secrets`; may be 0."""
+        """Maximum bytes of each encrypted payload for `secrets` payloads; may be 0."""
         codewords = self._codewords(1, self._payload_cells(secrets))
         return codewords.size if codewords else 0
 
@@ -171,7 +165,7 @@ class LowBitsRoom:
                 "there are 8 at SH degree 0, 21 at degree 1, and 4 less where quaternions have unit length"
             )
         need = bisect_left(
-            range(1 << 30), size, key=lambda each: LowBitsRoom(each, self.width).payload_capacity(secrets)
+            range(1 << 30), size, key=lambda each: LowBitsCapacity(each, self.width).payload_capacity(secrets)
         )
         need = math.ceil(need * count / max(1, self.carriers))
         digits = max(0, len(str(need)) - 2)
@@ -183,9 +177,9 @@ class LowBitsRoom:
         )
 
     def _codewords(self, cells: int, count: int, size: int | None = None) -> Codewords | None:
-        """The most redundant way to spread `size` bytes, or as many as can be, over `count` such cells.
+        """The most redundant code of `size` bytes (None: the maximum) in `count` cells.
 
-        None: not safe.
+        None if the probability of loss exceeds FAILURE.
         """
         chunk = (self.record_bytes(cells) - NUMBER_BYTES) // SYMBOL_BYTES * SYMBOL_BYTES
         if count < 1 or chunk < 1:
@@ -197,53 +191,53 @@ class LowBitsRoom:
         return Codewords(number, n, k, chunk) if 0 < k <= most else None
 
     @property
-    def _shared(self) -> int:
-        """Carriers that the headers leave where each secret is placed as without the others."""
-        return self.carriers - self.set_aside((), as_alone=True)
+    def _independent_carriers(self) -> int:
+        """Carriers for the records of independent plans."""
+        return self.carriers - self.reserved((), independent=True)
 
     def _classes(self) -> list[tuple[int, int]]:
-        """Cells of a carrier, and cells in all; none where headers take too much."""
-        shared = self._shared
-        if self.carriers - shared > _MAX_SET_ASIDE * self.carriers:
+        """Size classes: (cells per carrier, cells); empty if headers would take too many carriers."""
+        shared = self._independent_carriers
+        if self.carriers - shared > _MAX_RESERVED * self.carriers:
             return []
         divided = [(cells, cells * shared // part) for cells in range(2, MAX_CELLS + 1) for part in (4, 2, 1)]
         return [(1, shared // 5), *divided]
 
     def _most_cells(self, least_bytes: int) -> int:
-        """Into how many cells a carrier can be divided for records of so many bytes; 0 if they do not fit."""
+        """The maximum number of cells per carrier for records of `least_bytes`; 0 if none fits."""
         cells = [each for each in range(1, MAX_CELLS + 1) if self.record_bytes(each) >= least_bytes]
         return max(cells, default=0)
 
-    def _alone(self, request: RecordRequest) -> RecordPlan | None:
-        """The plan of a secret for itself; None where it needs what is set aside for others."""
-        for cells, room in self._classes() if request.header_bytes <= _TYPICAL_HEADER else ():
+    def _independent_plan(self, request: RecordRequest) -> RecordPlan | None:
+        """The plan that depends on this secret only; None if it does not fit."""
+        for cells, count in self._classes() if request.header_bytes <= _TYPICAL_HEADER else ():
             size = self.record_bytes(cells)
-            if room >= request.count and size >= request.least_bytes:
-                return RecordPlan(size, min(int(MAX_COPIES * request.count), room - request.count), cells)
+            if count >= request.count and size >= request.least_bytes:
+                return RecordPlan(size, min(int(MAX_COPIES * request.count), count - request.count), cells)
         return None
 
     def _payload_cells(self, secrets: int) -> int:
-        """Whole carriers for each of so many payloads that do not fit as they would without the others."""
+        """Whole carriers for each of `secrets` payloads in a joint plan."""
         return (self.carriers - secrets * self.header_carriers(_TYPICAL_HEADER)) // secrets
 
-    def _fit(self, cells: Sequence[tuple[int, int]]) -> bool:
-        """True if the cells of all secrets fit: of each those of a carrier, and their number.
+    def _fits(self, cells: Sequence[tuple[int, int]]) -> bool:
+        """True if independent plans fit together; `cells`: (cells per carrier, cells) of each secret.
 
-        Cells that divide carriers come first, anywhere; then the others on carriers left untouched.
+        Cells that divide carriers are placed first, anywhere; whole carriers then must be untouched.
         """
         shared, whole = (
             sum(count for each, count in cells if (each > 1) == divides) for divides in (True, False)
         )
-        carriers, parts = self._shared, max(each for each, _ in cells)
-        if len(cells) > UNNOTICED or len({each for each, _ in cells if each > 1}) > 1:
+        carriers, parts = self._independent_carriers, max(each for each, _ in cells)
+        if len(cells) > MAX_INDEPENDENT or len({each for each, _ in cells if each > 1}) > 1:
             return False
         untouched = max(0.0, 1 - shared / (parts * carriers)) ** parts if shared else 1.0
         spare = _DEVIATIONS * (carriers * untouched * (1 - untouched)) ** 0.5
         return shared <= parts * carriers and (not whole or whole <= carriers * untouched - spare)
 
-    def _tight(self, requests: Sequence[RecordRequest]) -> list[RecordPlan]:
-        """All that there is for these secrets: whole carriers, then fewer copies, then smaller cells."""
-        left = self.carriers - self.set_aside([each.header_bytes for each in requests], as_alone=False)
+    def _joint_plans(self, requests: Sequence[RecordRequest]) -> list[RecordPlan]:
+        """Plans that share all cells: whole carriers, then fewer copies, then smaller cells."""
+        left = self.carriers - self.reserved([each.header_bytes for each in requests], independent=False)
         count = sum(request.count for request in requests)
         least = max(request.least_bytes for request in requests)
         for cells in range(1, self._most_cells(least) + 1):
@@ -255,20 +249,20 @@ class LowBitsRoom:
                 ]
         raise UsageError(
             f"{count:,} Gaussians are too many for this cover: {self.carriers:,} of its Gaussians can carry "
-            f"something, and {self.record_capacity(requests):,} would fit"
+            f"one, and {self.record_capacity(requests):,} would fit"
         )
 
 
 def check_payload_fits(compressed: int, gaussians: int, secrets: int, sh_degree: int) -> None:
-    """Raise UsageError if `compressed` bytes for each secret will hardly fit into a model to be trained."""
+    """Raise UsageError if `compressed` bytes per secret will probably not fit into a model to be trained."""
     size = encrypted_size(compressed)
-    room = LowBitsRoom.of(int(gaussians * TYPICAL_SHARE), sh_degree)
-    if room.payload_capacity(secrets) < size:
-        raise UsageError(room.too_small(gaussians, "Gaussians", size, secrets))
+    capacity = LowBitsCapacity.of(int(gaussians * TYPICAL_SHARE), sh_degree)
+    if capacity.payload_capacity(secrets) < size:
+        raise UsageError(capacity.too_small(gaussians, "Gaussians", size, secrets))
 
 
 def numbered_chunks(codewords: Codewords, data: bytes, cells: int) -> Bytes:
-    """[cells, NUMBER_BYTES + width] numbered chunks; those that are left over repeat the first ones."""
+    """[cells, NUMBER_BYTES + width] numbered chunks; spare cells repeat the first ones."""
     numbers = np.arange(cells, dtype="<u4") % codewords.chunks
     chunks = codewords.encode(data)[numbers]
     return np.concatenate([numbers.view(np.uint8).reshape(-1, 4)[:, :NUMBER_BYTES], chunks], axis=1)

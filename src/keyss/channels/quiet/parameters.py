@@ -49,16 +49,16 @@ def parameter_cipher(data_key: bytes, width: int) -> CellCipher:
 
 @dataclass(frozen=True)
 class Parameters:
-    """The parameters of `count` records and copies of `record_bytes`; a carrier holds `cells` of them."""
+    """Parameters of a secret: `count` records and copies of `record_bytes`, `cells` per carrier."""
 
     service: int
     method: str
     cells: int
     record_bytes: int
-    gaussians: int  # of the model in which the secret was hidden
+    gaussians: int  # size of the published model
     count: int
     header: bytes
-    sketch: bytes = b""  # of the Gaussians; empty in blocks
+    sketch: bytes = b""  # empty in blocks
 
     def parts(self, width: int) -> Bytes:
         """[P, width - TAG_BYTES] numbered parts."""
@@ -75,7 +75,7 @@ class Parameters:
 
 
 def unpack(parts: Bytes, sketch_bytes: int = SKETCH_BYTES) -> Parameters:
-    """From decrypted parts [P, 1 + part] in any order. Raises InputError for damaged or lost ones.
+    """Parameters from decrypted parts [P, 1 + part] in any order. Raises InputError for damage or loss.
 
     `sketch_bytes`: 0 in blocks.
     """
@@ -105,7 +105,7 @@ def pack_codewords(size: int, codewords: Codewords) -> bytes:
 
 
 def unpack_codewords(header: bytes, record_bytes: int) -> tuple[int, Codewords]:
-    """What `pack_codewords` packed. Raises InputError for impossible numbers."""
+    """Invert `pack_codewords`. Raises InputError for impossible numbers."""
     try:
         size, count, n, k = _PAYLOAD.unpack(header)
         codewords = Codewords(count, n, k, record_bytes - NUMBER_BYTES)

@@ -1,4 +1,4 @@
-"""How far the low bits of small numbers can be predicted, measured on the model itself.
+"""Predictability of the low bits of small numbers, estimated from the model itself.
 
 An optimiser that rounds its step before subtracting it leaves numbers on the grid of the larger ones that
 they came from: a number that the last step brought near zero has as many trailing zeros as it is smaller than
@@ -11,9 +11,9 @@ Beside it the last bit alone is forced to zero with the probability min(1, t 2^-
 above those forced are uniform. Hence only the number of trailing zeros carries information, and odd numbers
 carry none. Both were measured on models that were trained with either rounding.
 
-From the counts of trailing zeros a confidence limit of s follows. It limits how well an attacker who knows
-the trainer, and sees the bit that is never replaced, can predict the replaced bits: the chi-square distance
-of the former bits from uniform ones. The least exponent that is used bounds this distance.
+The counts of trailing zeros give an upper confidence limit of s, which bounds how well an attacker who knows
+the trainer and the last bit predicts the replaced bits: the chi-square distance of the original bits from
+uniform ones. Numbers below a least exponent are excluded to keep this distance small.
 """
 
 from __future__ import annotations
@@ -22,24 +22,24 @@ import numpy as np
 
 from keyss.core.arrays import Doubles, Flags, Integers, Words32
 
-MAX_ZEROS = 12  # that are counted: more are rare, or a short number
+MAX_ZEROS = 12  # counted at most; numbers with more are rare, or short
 EXPONENTS = 256
 _NUMBERS = np.arange(1 << MAX_ZEROS, dtype=np.uint32)[:, None] | np.uint32(1 << MAX_ZEROS)
 _ZEROS = (
     (_NUMBERS >> np.arange(MAX_ZEROS + 1, dtype=np.uint32) & 1).argmax(axis=1).astype(np.uint32)
 )  # [4096], trailing
-# Of the log-likelihood below its maximum, at the confidence limit: one-sided, one in 200 at worst.
+# Drop of the log-likelihood at the confidence limit: one-sided, one in 200.
 _DROP = 3.3
-_MARGIN = 8  # octaves beyond the numbers' own in which the scale is looked for
-_STEP = 0.25  # octave, to which the limit is found
+_MARGIN = 8  # octaves beyond the numbers' exponents in the search for s
+_STEP = 0.25  # octaves, resolution of the search
 _LARGEST = 4  # octaves of the scale below the median number: steps of a sixteenth would never converge
 _ROUNDED = np.concatenate([[0.0], 2.0 ** np.arange(-20, 20.5, 0.5)])  # t in units of the smallest exponent
 
 
 def count_trailing_zeros(words: Words32, chosen: Flags) -> Integers:
-    """[EXPONENTS, MAX_ZEROS + 1] how many numbers have which exponent and trailing zeros.
+    """[EXPONENTS, MAX_ZEROS + 1] counts of numbers by exponent and trailing zeros.
 
-    Of `words` [N, C] those of the `chosen` rows [N].
+    `words` [N, C]; `chosen` [N]: mask of the rows to count.
     """
     own = words[chosen].ravel()
     kinds = (own >> np.uint32(23) & np.uint32(255)) * np.uint32(MAX_ZEROS + 1) + _ZEROS[own & np.uint32(4095)]
@@ -47,10 +47,10 @@ def count_trailing_zeros(words: Words32, chosen: Flags) -> Integers:
 
 
 def least_exponent(counts: Integers, share: float) -> int:
-    """The least exponent e so that even numbers from e on give away at most `share`.
+    """The least exponent e such that even numbers of exponents from e on give away at most `share`.
 
-    `counts`: of `count_trailing_zeros`. `share`: of the squared separation (d') of two files, one as it was
-    and one with new bits.
+    `counts`: the result of `count_trailing_zeros`. `share`: maximum squared separation (d') of the plain file
+    and the file with new bits.
     """
     present = np.flatnonzero(counts.sum(axis=1))
     if not len(present):
@@ -64,15 +64,15 @@ def least_exponent(counts: Integers, share: float) -> int:
 
 
 def _confidence_limit(counts: Doubles, exponents: Integers) -> float:
-    """The upper confidence limit of s for counts [E, MAX_ZEROS + 1] of the numbers of `exponents` [E].
+    """The upper confidence limit of s for counts [E, MAX_ZEROS + 1] by `exponents` [E].
 
-    Where too few small numbers are there to tell, s is no larger than steps can be.
+    If there are too few small numbers for an estimate, the largest plausible s.
     """
     scales = np.arange(exponents[0] - _MARGIN, exponents[-1] + _MARGIN + 1, _STEP)
     likelihoods = np.array([_log_likelihood(counts, exponents, scale) for scale in scales])
     likely = likelihoods >= likelihoods.max() - _DROP
     limit = float(scales[likely][-1])
-    if not likely[0]:  # there are such steps
+    if not likely[0]:  # the lower end of the range is excluded
         return limit
     numbers = counts.sum(axis=1).cumsum()
     return min(limit, float(exponents[np.searchsorted(numbers, numbers[-1] / 2)]) - _LARGEST)
@@ -88,11 +88,11 @@ def _forced(exponents: Integers, scale: float) -> Doubles:
 
 
 def _zeros(forced: Doubles) -> Doubles:
-    """[E, MAX_ZEROS + 1] how likely z trailing zeros are where F(z) are forced; the last: or more."""
+    """[E, MAX_ZEROS + 1] probabilities of z trailing zeros given F(z); the last: MAX_ZEROS or more."""
     exactly = forced - np.append(forced[:, 1:], np.zeros((len(forced), 1)), axis=1)
     at_least = np.zeros_like(forced)
     at_least[:, 0] = 1
-    below = np.zeros(len(forced))  # of those with fewer forced ones, how many have z zeros by chance
+    below = np.zeros(len(forced))  # probability of fewer than z forced zeros but z by chance
     for z in range(1, forced.shape[1]):
         below = (below + exactly[:, z - 1]) / 2
         at_least[:, z] = below + forced[:, z]
@@ -112,7 +112,7 @@ def _log_likelihood(counts: Doubles, exponents: Integers, scale: float) -> float
 
 
 def _distance(exponents: Integers, scale: float) -> Doubles:
-    """[E] chi-square distance of the other bits of an even number from uniform ones."""
+    """[E] chi-square distance from uniform of the bits above the last one, of even numbers."""
     chances = _zeros(_forced(exponents, scale))[:, 1:]
     given = chances / chances.sum(axis=1, keepdims=True)
     uniform = 0.5 ** np.arange(1, MAX_ZEROS + 1)

@@ -1,9 +1,9 @@
-"""The Gaussians that serve as the salt of Argon2id, and the salts that they give.
+"""Salts of Argon2id, and the Gaussians that they are hashes of.
 
-A salt is a hash of one Gaussian, low bits included. These are new random bits for every file, so that two
-files of one cover have no salt in common, and carry nothing else. Because Gaussians may be removed there are
-several, in an order that embedding leaves as it is: first those without small harmonics and coincidences,
-because they are hardly ever left alone (see `usable`), and of these the smallest identities.
+A salt is a hash of one Gaussian and its low bits, which are new random bits for every file and carry nothing
+else: no two files of one cover share a salt. There are several salts because Gaussians may be removed. Their
+order does not change by embedding: first Gaussians without small harmonics and coincidences, which are rarely
+excluded (see `usable`), and among these the smallest IDs.
 """
 
 from __future__ import annotations
@@ -35,31 +35,28 @@ _MANTISSA = np.uint32((1 << 23) - 1)
 
 
 def salt_rows(
-    gaussians: Gaussians, names: Bytes, low: Bytes | None = None, layout: Layout | None = None
+    gaussians: Gaussians, ids: Bytes, low: Bytes | None = None, layout: Layout | None = None
 ) -> Integers:
-    """[SALTS or less] the Gaussians, the first first, of identities `names` [N, 16].
-
-    `low` [N, B]: their low bits, where they are known.
-    """
+    """Rows of the salts' Gaussians, at most SALTS, in order; `ids` [N, 16], `low` bits [N, B] if known."""
     layout = layout or Layout.of(gaussians)
     ranks = _ranks(gaussians, layout)
-    # 9 bits of rank, 55 of the identity.
-    keys = ranks << np.uint64(55) | names[:, :8].copy().view(">u8")[:, 0].astype(np.uint64) >> np.uint64(9)
+    # 9 bits of rank, 55 of the ID.
+    keys = ranks << np.uint64(55) | ids[:, :8].copy().view(">u8")[:, 0].astype(np.uint64) >> np.uint64(9)
     best = np.argpartition(keys, SALTS - 1)[:SALTS] if len(keys) > SALTS else np.arange(len(keys))
     bits = read_low_bits(gaussians[torch.from_numpy(best)], layout) if low is None else low[best]
     order = sorted(
-        range(len(best)), key=lambda i: (ranks[best[i]], names[best[i]].tobytes(), bits[i].tobytes())
+        range(len(best)), key=lambda i: (ranks[best[i]], ids[best[i]].tobytes(), bits[i].tobytes())
     )
     return best[order]
 
 
-def salt(identity: Bytes, low: Bytes) -> bytes:
-    """SALT_BYTES of one Gaussian."""
-    return hashlib.sha256(_LABEL + identity.tobytes() + low.tobytes()).digest()[:SALT_BYTES]
+def salt(carrier_id: Bytes, low: Bytes) -> bytes:
+    """The salt of one carrier: SALT_BYTES."""
+    return hashlib.sha256(_LABEL + carrier_id.tobytes() + low.tobytes()).digest()[:SALT_BYTES]
 
 
 def _ranks(gaussians: Gaussians, layout: Layout) -> Words:
-    """[N] 0 to 511: 256 for what may well be left alone, and less the larger the least harmonic is."""
+    """[N] 0 to 511, lower first: 256 if doubtful, plus 255 minus the exponent of the least harmonic."""
     columns = layout.columns
     stays = layout.mask[columns] | np.uint32(1)
 

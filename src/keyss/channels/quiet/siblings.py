@@ -1,4 +1,4 @@
-"""Gaussians whose harmonics state their own low bits, because density control made two of one.
+"""Siblings: Gaussians that density control split, whose constant colours predict low bits of harmonics.
 
 Adam's steps do not depend on the size of a gradient. While one of two siblings is seen alone, or both in one
 direction, all harmonics x of a colour move apart by the same amount, and its constant colour c, whose rate is
@@ -24,16 +24,16 @@ from keyss.core.neighbours import nearest_neighbours
 from keyss.kernels.jit import kernel
 from keyss.kernels.parallel import in_blocks
 
-RATE_RATIO = 20  # of constant colours and harmonics
-_NEIGHBOURS = 12  # of a Gaussian; siblings were among the nearest 10 in models of 20,000 to 200,000
-_SHARE = 3  # a third of the harmonics of a colour agree, and at least so many
+RATE_RATIO = 20  # learning rate of constant colours / harmonics
+_NEIGHBOURS = 12  # siblings were among the nearest 10 in models of 20,000 to 200,000 Gaussians
+_SHARE = 3  # a third of the harmonics of a colour agree, and at least three
 _ROWS = 1 << 12
 _CELL = np.uint32((1 << SH_BITS + UNUSED_BITS) - 1)
-_CELL_SHARE = np.float32(2.0 ** (SH_BITS + UNUSED_BITS - 23))  # of a number: from one to two cells
+_CELL_SHARE = np.float32(2.0 ** (SH_BITS + UNUSED_BITS - 23))  # cell width / number, up to a factor of 2
 
 
-def moved_apart(gaussians: Gaussians, among: Flags) -> Flags:
-    """[N] which Gaussians `among` [N] moved away from a neighbour by equal steps, as fixed bits tell."""
+def find_siblings(gaussians: Gaussians, among: Flags) -> Flags:
+    """Mask [N] of the siblings `among` [N], found by bits that embedding never changes."""
     apart, rows = np.zeros(len(gaussians), bool), np.flatnonzero(among)
     if len(gaussians) < 2 or not gaussians.sh_degree:
         return apart

@@ -1,10 +1,10 @@
-"""Which Gaussians of a model can get new low bits without anybody noticing.
+"""Usable Gaussians: those whose low bits can be replaced without a trace.
 
 In a trained model most low bits are uniformly random to anybody who does not know the training, but not all.
-A Gaussian is left alone as a whole, so that its numbers do not contradict each other, because of:
+A Gaussian is excluded as a whole, so that its numbers stay consistent, because of:
 
-- *Numbers that are no measurement*: zeros, integers and short fractions, subnormal numbers, and values that
-  occur too often (after a few steps of training many are the same small multiple of the learning rate).
+- *Untrained numbers*: zeros, integers and short fractions, subnormal numbers, and values that occur too
+  often (after few training steps many are the same small multiple of the learning rate).
 - *Saturated opacities*: where float32's sigmoid is 1 its gradient is 0, so that logits of clones stay equal
   while everything else about them changes.
 - *Coincidences*: numbers that agree in all bits above the written ones would differ in these afterwards. They
@@ -16,9 +16,8 @@ A Gaussian is left alone as a whole, so that its numbers do not contradict each 
 - *Opacities at the edge* below which trainers remove Gaussians: no trained model has smaller ones.
 - *Small even numbers*, which an optimiser may have left on a coarser grid: see `predictability`.
 
-Coincidences are found in bits that embedding never changes. A Gaussian whose bits are random must hardly ever
-be left alone for another reason: embedding makes more such Gaussians by chance, and twice as many as expected
-would be noticed.
+Coincidences are found in bits that embedding never changes. Otherwise false exclusions must be rare:
+embedding makes as many such Gaussians again by chance, and twice the expected number would be noticed.
 """
 
 from __future__ import annotations
@@ -40,20 +39,20 @@ from keyss.channels.quiet.bits import (
     UNUSED_BITS,
     Layout,
     coarse_lengths,
-    identities,
+    gaussian_ids,
     used_words,
 )
 from keyss.channels.quiet.predictability import count_trailing_zeros, least_exponent
-from keyss.channels.quiet.siblings import moved_apart
+from keyss.channels.quiet.siblings import find_siblings
 from keyss.core.arrays import Bytes, Doubles, Flags, Integers, Numbers, Words, Words32
 from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.kernels.parallel import in_blocks
 
 MIN_USABLE = 0.5  # share of the Gaussians of a cover
-# Bound of what small numbers give away: squared separation (d') of a plain file and one with new bits, to
-# somebody who knows the trainer and the plain file's statistics. 0.03 is an AUC of 0.55.
-GIVEN_AWAY = 0.03
+# Maximum squared separation (d') of a plain file and one with new bits by small numbers, for an attacker who
+# knows the trainer and the plain file's statistics. 0.03 is an AUC of 0.55.
+MAX_SEPARATION = 0.03
 
 _GROUPS = {
     "log scales": slice(0, 3),
@@ -62,65 +61,66 @@ _GROUPS = {
     "harmonics": slice(GEOMETRY, None),
 }
 
-# A value is a short number when at least so many low bits of its mantissa are zero. By chance one value in a
-# million is: only where there are more, these are left alone.
+# A short number has at least this many trailing zeros. One in a million does by chance: short numbers are
+# excluded only if there are more.
 _SHORT_BITS = 20
 _SHORT = np.uint32((1 << _SHORT_BITS) - 1)
-# A Gaussian is no measurement when so many of its values have 12 zeros; by chance one in three million is.
+# A Gaussian is untrained if this many values have 12 trailing zeros; by chance one in three million is.
 _ZEROS, _ZERO_FIELDS = np.uint32((1 << 12) - 1), 3
 _EQUAL_HARMONICS = 2  # pairs
 _MAGNITUDE = np.uint32(0x7FFFFFFF)
 
 _OPACITY = 7
-# Bit patterns of logits from 16 on. The sigmoid is 1 from 16.64 on, but only the exponent surely stays.
+# Bit patterns of logits above 16. The sigmoid is 1 above 16.64, but only the exponent never changes.
 _SATURATED = np.uint32(0x41800000), np.uint32(0x80000000)
-# The logit of 0.005, which trainers prune below, without the bits that may be written.
+# The logit of 0.005, below which trainers prune, without the bits that may be written.
 _PRUNED = np.float32(math.log(0.005 / 0.995)).view(np.uint32) >> np.uint32(GEOMETRY_BITS + UNUSED_BITS)
-# Harmonics of a channel in a row: 0.3 % of 20,000 Gaussians share two by chance. Then of larger models.
+# Consecutive harmonics of a channel that clones share, in small and large models. By chance 0.3 % of 20,000
+# Gaussians share two.
 _FEW_GAUSSIANS, _SHARED_BY_FEW, _SHARED_BY_MANY = 50_000, 2, 3
 
-_EXACT = 1e-6  # of the length of a unit quaternion in single precision
-# Sets of equal values that there may be by chance: they are left alone, and embedding makes as many again.
+_EXACT = 1e-6  # error of the length of a unit quaternion in single precision
+# Maximum expected number of sets of equal values by chance.
 _SETS_BY_CHANCE = 0.1
 _SAMPLE = 20_000  # Gaussians whose bits are tested
-_CHANCE = 1e-6  # that a model with uniform bits is refused
+_CHANCE = 1e-6  # probability of refusing a model with uniform bits
 
 
 def usable_carriers(gaussians: Gaussians) -> Flags:
-    """[N] which Gaussians have low bits that look like those of trained values, and can be replaced."""
-    return named_carriers(gaussians, Layout.of(gaussians))[0]
+    """Mask [N] of the usable Gaussians."""
+    return usable_with_ids(gaussians, Layout.of(gaussians))[0]
 
 
-def named_carriers(gaussians: Gaussians, layout: Layout) -> tuple[Flags, Bytes]:
-    """`usable_carriers` [N], and all `identities` [N, 16]."""
+def usable_with_ids(gaussians: Gaussians, layout: Layout) -> tuple[Flags, Bytes]:
+    """`usable_carriers` [N], and all `gaussian_ids` [N, 16]."""
     with ThreadPoolExecutor(1) as helper:
-        counting = helper.submit(_frequent_values, gaussians)  # most of which is done without Python's lock
-        names = identities(gaussians, layout)
-        often = counting.result()
-    usable, short = _apart(gaussians, layout, names)
+        counting = helper.submit(_frequent_values, gaussians)  # mostly without the GIL
+        ids = gaussian_ids(gaussians, layout)
+        common = counting.result()
+    usable, short = _are_unique(gaussians, layout, ids)
 
     def judge(start: int, stop: int) -> Integers:
         used, own = used_words(gaussians[start:stop]), usable[start:stop]
-        own &= _are_measured(used, layout, often, short) & ~near_equal(used, layout)
+        own &= _are_trained(used, layout, common, short) & ~near_equal(used, layout)
         if layout.quats:
             own &= ~_have_unit_length(used)
         return np.stack([count_trailing_zeros(used[:, group], own) for group in _GROUPS.values()])
 
     parts = in_blocks(judge, len(gaussians), BLOCK)
     if not parts:
-        return usable, names
-    usable &= ~moved_apart(gaussians, usable)
-    least = [least_exponent(counts, GIVEN_AWAY / len(_GROUPS)) for counts in np.sum(parts, axis=0)]
+        return usable, ids
+    usable &= ~find_siblings(gaussians, usable)
+    least = [least_exponent(counts, MAX_SEPARATION / len(_GROUPS)) for counts in np.sum(parts, axis=0)]
 
-    def leave_small(start: int, stop: int) -> None:
+    def exclude_small(start: int, stop: int) -> None:
         used = used_words(gaussians[start:stop])
         for group, bound in zip(_GROUPS.values(), least, strict=True):
             if layout.quats or group != QUATS:
                 values = used[:, group]
                 usable[start:stop] &= ~((exponents(values) < bound) & (values & 1 == 0)).any(axis=1)
 
-    in_blocks(leave_small, len(gaussians), BLOCK)
-    return usable, names
+    in_blocks(exclude_small, len(gaussians), BLOCK)
+    return usable, ids
 
 
 def check_usable(gaussians: Gaussians, usable: Flags, layout: Layout | None = None) -> None:
@@ -146,9 +146,9 @@ def check_usable(gaussians: Gaussians, usable: Flags, layout: Layout | None = No
 
 
 def chance_of_bits(words: Words32, bits: int) -> float:
-    """The probability of bits 1 to `bits` - 1 of words [...] if all of them are uniform.
+    """p-value of bits 1 to `bits` - 1 of words [...] under the null hypothesis of uniform bits.
 
-    Exactly, of the most unlikely one given exponent, last bit and the bit below it; times their number.
+    Exact binomial tests of each bit given exponent, last bit and the bit below, Bonferroni-corrected.
     """
     from scipy.special import bdtr  # takes long to load
 
@@ -172,10 +172,10 @@ def exponents(words: Words32) -> Bytes:
 
 
 def near_equal(used: Words32, layout: Layout) -> Flags:
-    """[N] whether two scales, two components of a quaternion or two channels of a colour are nearly equal.
+    """Mask [N] of Gaussians with nearly equal scales, quaternion components or channels of a harmonic.
 
-    Or two pairs of one colour's harmonics equal. By chance some 4 % of all Gaussians are. `used` [N, F]: of
-    `used_words`.
+    Or with two equal pairs among the harmonics of two channels. By chance about 4 % of all Gaussians are.
+    `used` [N, F]: the result of `used_words`.
     """
     high = np.ascontiguousarray(((used & _MAGNITUDE) >> layout.shifts).astype(np.int32).T)
     harmonics = high[GEOMETRY:].reshape(-1, 3, len(used))
@@ -189,28 +189,28 @@ def near_equal(used: Words32, layout: Layout) -> Flags:
 
 
 def frequent(words: Numbers, times: int) -> Numbers:
-    """[V] which values at least `times` of the unsigned integers [...] have, in ascending order."""
+    """[V] values that occur at least `times` times among `words` [...], in ascending order."""
     ordered, further = np.sort(words, axis=None), times - 1
     return np.unique(ordered[further:][ordered[further:] == ordered[: max(0, len(ordered) - further)]])
 
 
 def repeated(values: Words) -> Flags:
-    """[N] which of the values [N] occur at least twice."""
+    """Mask [N] of the values [N] that occur at least twice."""
     return among(values, frequent(values, 2))
 
 
 def among(values: Numbers, ordered: Numbers) -> Flags:
-    """[...] which of the values [...] are among others in ascending order; faster than `np.isin`."""
+    """Mask [...] of the values [...] that are in `ordered`, in ascending order; faster than `np.isin`."""
     if not len(ordered):
         return np.zeros(values.shape, bool)
     result: Flags = ordered[np.searchsorted(ordered, values).clip(max=len(ordered) - 1)] == values
     return result
 
 
-def _are_measured(used: Words32, layout: Layout, often: list[Words32], short: bool) -> Flags:
-    """[N] whether no number is subnormal, frequent, a saturated or pruned opacity, and few have many zeros.
+def _are_trained(used: Words32, layout: Layout, common: list[Words32], short: bool) -> Flags:
+    """Mask [N] of Gaussians without subnormal or frequent numbers, or a saturated or pruned opacity.
 
-    If `short`, none has.
+    Few numbers may end in many zeros; if `short`, none may be short.
     """
     large = exponents(used)
     fine = (large > 0) & (large < 254)
@@ -219,15 +219,15 @@ def _are_measured(used: Words32, layout: Layout, often: list[Words32], short: bo
     fine[:, _OPACITY] &= opacity >> np.uint32(GEOMETRY_BITS + UNUSED_BITS) != _PRUNED
     if short:
         fine &= (used & _SHORT) != 0
-    for group, values in zip(_GROUPS.values(), often, strict=True):
+    for group, values in zip(_GROUPS.values(), common, strict=True):
         fine[:, group] &= ~among(used[:, group], values)
     zeros = ((used & _ZEROS) == 0)[:, layout.columns].sum(axis=1)
-    measured: Flags = fine[:, layout.columns].all(axis=1) & (zeros < _ZERO_FIELDS)
-    return measured
+    trained: Flags = fine[:, layout.columns].all(axis=1) & (zeros < _ZERO_FIELDS)
+    return trained
 
 
 def _have_unit_length(used: Words32) -> Flags:
-    """[N] which quaternions have unit length, and could have it with any low bits."""
+    """Mask [N] of quaternions of unit length."""
     words = np.ascontiguousarray(used[:, QUATS])
     near = np.abs(coarse_lengths(words) - 1) < UNIT_TOLERANCE
     lengths = np.linalg.norm(np.where(near[:, None], words.view(np.float32).astype(np.float64), 0), axis=1)
@@ -235,37 +235,37 @@ def _have_unit_length(used: Words32) -> Flags:
     return unit
 
 
-def _apart(gaussians: Gaussians, layout: Layout, names: Bytes) -> tuple[Flags, bool]:
-    """[N] whether neither the Gaussian, its scales, its quaternion nor harmonics of a channel occur twice.
+def _are_unique(gaussians: Gaussians, layout: Layout, ids: Bytes) -> tuple[Flags, bool]:
+    """Mask [N] of Gaussians that share no scales, quaternion or harmonics of a channel with another one.
 
-    Harmonics: two in a row, numbers 1 and 2, 3 and 4 and so on, or three in large models. Then whether there
-    are more short values than by chance.
+    Harmonics are compared in consecutive pairs, in large models in triples. Also returns whether there are
+    more short values than by chance.
     """
-    together = [slice(0, 3), *([QUATS] if layout.quats else [])]
+    shared_columns = [slice(0, 3), *([QUATS] if layout.quats else [])]
     width = 3 * (_SHARED_BY_FEW if len(gaussians) <= _FEW_GAUSSIANS else _SHARED_BY_MANY)
     for first in range(GEOMETRY, len(layout.mask) - width + 1, width):
-        together += [slice(first + channel, first + width, 3) for channel in range(3)]
-    keys = np.empty((len(together) + 1, len(gaussians)), np.uint64)
-    keys[-1] = names.view("<u8")[:, 0]
+        shared_columns += [slice(first + channel, first + width, 3) for channel in range(3)]
+    keys = np.empty((len(shared_columns) + 1, len(gaussians)), np.uint64)
+    keys[-1] = ids.view("<u8")[:, 0]
 
     stays, used_fields = ~layout.mask & ~np.uint32(1), np.isin(np.arange(len(layout.mask)), layout.columns)
 
     def hash_some(start: int, stop: int) -> int:
         used = used_words(gaussians[start:stop])
         high = used & stays
-        for key, columns in zip(keys, together, strict=False):
+        for key, columns in zip(keys, shared_columns, strict=False):
             key[start:stop] = row_hashes(high[:, columns])
         rows, fields = np.nonzero(used & _SHORT == 0)  # few
         return int(np.count_nonzero(used_fields[fields] & (exponents(used[rows, fields]) > 0)))
 
     short = sum(in_blocks(hash_some, len(gaussians), BLOCK))
-    apart = ~np.logical_or.reduce(in_blocks(lambda index, _: repeated(keys[index]), len(keys), 1))
+    unique = ~np.logical_or.reduce(in_blocks(lambda index, _: repeated(keys[index]), len(keys), 1))
     expected = len(gaussians) * len(layout.columns) / 2.0**_SHORT_BITS
-    return apart, short > expected + 5 * (expected + 1) ** 0.5
+    return unique, short > expected + 5 * (expected + 1) ** 0.5
 
 
 def _frequent_values(gaussians: Gaussians) -> list[Words32]:
-    """For each group of fields [V] the values that occur more often than is likely, in ascending order."""
+    """For each group of fields the values [V] that occur too often, in ascending order."""
     fields = (gaussians.log_scales, gaussians.quats, gaussians.opacity_logits, gaussians.sh[:, 1:])
     every = [field.detach().to("cpu", torch.float32).numpy().view(np.uint32) for field in fields]
     return [
@@ -275,9 +275,9 @@ def _frequent_values(gaussians: Gaussians) -> list[Words32]:
 
 
 def _unlikely_copies(count: int) -> int:
-    """The least c from 3 on so that sets of c equal ones are rare among `count` values.
+    """The least c >= 3 for which sets of c equal values are rare among `count` values.
 
-    For 2^26 equally likely values there would be count^c / c! / 2^(26 (c - 1)) such sets.
+    With 2^26 equally likely values, count^c / c! / 2^(26 (c - 1)) such sets are expected.
     """
     copies = 3
     while count**copies / math.factorial(copies) > _SETS_BY_CHANCE * 2 ** (26 * (copies - 1)):

@@ -1,7 +1,7 @@
-"""Filling the carriers of a cover: headers, records, and noise in all the rest.
+"""Fill the carriers of a cover: headers, records, and noise everywhere else.
 
-Gaussians are taken in random order, and may be lost: headers have copies, and records lie in cells of their
-own. Blocks of codes are all there: a secret is a header and the payload in the blocks after it, as they are.
+Gaussians are filled in random order and may be lost: headers have copies, and each record has its own cell.
+Blocks of codes are never lost: a secret is a header, followed by the blocks of its payload.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.lib.stride_tricks import as_strided
 
-from keyss.channels.base import NOTICED, Content, Payload, RecordPlan, RecordRequest, Records
+from keyss.channels.base import NOT_INDEPENDENT, Content, Payload, RecordPlan, RecordRequest, Records
 from keyss.channels.mixing import random_order, random_words
 from keyss.channels.quiet.cells import CellCipher
 from keyss.channels.quiet.layout import (
@@ -21,7 +21,7 @@ from keyss.channels.quiet.layout import (
     KEY_COPIES,
     LEAST_BYTES,
     PARAMETER_COPIES,
-    LowBitsRoom,
+    LowBitsCapacity,
     numbered_chunks,
 )
 from keyss.channels.quiet.parameters import (
@@ -44,29 +44,29 @@ _NO_COPIES: Integers = np.zeros(0, np.int64)
 
 
 class Writer:
-    """The bytes of carriers with identities `names` [C, 16], `width` of each.
+    """The bytes of carriers with `ids` [C, 16], `width` bytes each.
 
-    `entropy`: 32 bytes that nobody else knows. `gaussians`: identities [N, 16] of all Gaussians of the model,
+    `entropy`: 32 secret bytes. `gaussians`: IDs [N, 16] of all Gaussians of the model,
     or their number if carriers are blocks.
     """
 
-    def __init__(self, names: Bytes, width: int, entropy: bytes, gaussians: Bytes | int) -> None:
-        self._entropy, self._every = entropy, gaussians
+    def __init__(self, ids: Bytes, width: int, entropy: bytes, gaussians: Bytes | int) -> None:
+        self._entropy, self._all_ids = entropy, gaussians
         self._blocks = isinstance(gaussians, int)
         self._gaussians = gaussians if isinstance(gaussians, int) else len(gaussians)
-        self._room = LowBitsRoom(len(names), width)
-        self.order = np.arange(len(names))
+        self._capacity = LowBitsCapacity(len(ids), width)
+        self.order = np.arange(len(ids))
         if not self._blocks:
-            self.order = random_order(entropy, "quiet/order", len(names))
-        self._names = names[self.order]  # [C, 16] as in all below
-        self.table = np.empty((len(names), width), np.uint8)
+            self.order = random_order(entropy, "quiet/order", len(ids))
+        self._ids = ids[self.order]  # [C, 16] in the order of `table`
+        self.table = np.empty((len(ids), width), np.uint8)
         fill(entropy, "quiet/noise", self.table)
-        self.headers = 0  # carriers of headers, which are the first
+        self.headers = 0  # number of carriers with headers, which come first
 
     def write(self, contents: Sequence[tuple[Sequence[DerivedKey], Content]]) -> None:
         """Headers in the first carriers, records in the others. Raises UsageError for too large payloads.
 
-        Keys: of each secret one under each salt that is not stale.
+        Each secret comes with its key under every salt that is not stale.
         """
         payloads = [each for _, each in contents if isinstance(each, Payload)]
         records = [each for _, each in contents if isinstance(each, Records)]
@@ -77,7 +77,7 @@ class Writer:
             return
         if payloads:
             sizes = [encrypted_size(compressed_size(each.data)) for each in payloads]
-            plans, as_alone = self._room.plan_payloads(sizes)
+            plans, independent = self._capacity.plan_payloads(sizes)
             for index, (payload, plan, size) in enumerate(zip(payloads, plans, sizes, strict=True)):
                 chunks = numbered_chunks(plan.codewords, self._encrypted(index, payload, size), plan.cells)
                 cells = RecordPlan(chunks.shape[1], 0, plan.cells_per_carrier)
@@ -87,17 +87,17 @@ class Writer:
             requests = [
                 RecordRequest(len(each.records), each.records.shape[1], len(each.header)) for each in records
             ]
-            as_alone = self._room.is_independent_layout([each.plan for each in records], requests)
+            independent = self._capacity.is_independent_layout([each.plan for each in records], requests)
         service = PAYLOAD if payloads else RECORDS
         for index, ((keys, _), each) in enumerate(zip(contents, records, strict=True)):
             self.headers = self._header(self.headers, index, keys, each, service)
-        self._place_all(records, self._room.set_aside([len(each.header) for each in records], as_alone))
-        if not as_alone and len(contents) > 1:
-            warnings.warn(NOTICED, KeyssWarning, stacklevel=4)
+        self._place_all(records, self._capacity.reserved([len(each.header) for each in records], independent))
+        if not independent and len(contents) > 1:
+            warnings.warn(NOT_INDEPENDENT, KeyssWarning, stacklevel=4)
 
     def _write_blocks(self, keys: Sequence[DerivedKey], payloads: Sequence[Payload]) -> None:
-        """Each secret in blocks that follow each other, in a circle; all arrangements are equally likely."""
-        width, count = self._room.width, self._room.carriers
+        """Each secret takes consecutive blocks, cyclically; all arrangements are equally likely."""
+        width, count = self._capacity.width, self._capacity.carriers
         takes = [blocks_for(each, width) for each in payloads]
         if (free := count - sum(takes)) < 0:
             raise UsageError(
@@ -121,10 +121,10 @@ class Writer:
         return expand(self._entropy, f"quiet/data-key/{index}", DATA_KEY_BYTES)
 
     def _header(self, at: int, index: int, keys: Sequence[DerivedKey], content: Records, service: int) -> int:
-        """Cells in the carriers from `at` on, one in each, the rest of which stays noise; where they end."""
+        """Write a header into the carriers from `at` on, one cell each; returns the carrier after it."""
         data_key, (count, size) = self._data_key(index), content.records.shape
         key_copies, part_copies = (1, 1) if self._blocks else (KEY_COPIES, PARAMETER_COPIES)
-        width = LEAST_BYTES if self._blocks else self._room.width
+        width = LEAST_BYTES if self._blocks else self._capacity.width
         parameters = Parameters(
             service,
             content.method,
@@ -133,20 +133,20 @@ class Writer:
             self._gaussians,
             count + len(content.copied),
             content.header,
-            b"" if isinstance(self._every, int) else sketch(data_key, self._every),
+            b"" if isinstance(self._all_ids, int) else sketch(data_key, self._all_ids),
         )
         copies = np.frombuffer(data_key * key_copies, np.uint8).reshape(key_copies, -1)
         cells = [(key_cipher(key), copies) for key in keys]
         parts = np.tile(parameters.parts(width), (part_copies, 1))
         for cipher, data in (*cells, (parameter_cipher(data_key, width), parts)):
             rows = (at + np.arange(len(data))) % len(self.table)
-            self.table[rows, : cipher.cell_bytes] = cipher.encrypt(self._names[rows], data)
+            self.table[rows, : cipher.cell_bytes] = cipher.encrypt(self._ids[rows], data)
             at += len(data)
         return at
 
     def _place_all(self, contents: Sequence[Records], headers: int) -> None:
-        """Each secret's records in random cells; large ones in carriers that smaller ones leave."""
-        carriers = np.arange(headers, self._room.carriers)
+        """Place records in random cells, smaller cells first; the larger ones take untouched carriers."""
+        carriers = np.arange(headers, self._capacity.carriers)
         for cells in sorted({each.plan.cells_per_carrier for each in contents}, reverse=True):
             free = random_order(self._entropy, f"quiet/cells/{cells}", cells * len(carriers))
             touched = np.zeros(len(carriers), bool)
@@ -160,7 +160,7 @@ class Writer:
 
     def _place(self, index: int, content: Records, rows: Integers, slots: Integers) -> None:
         """Records, then copies, in the cells `slots` [R] of the carriers `rows` [R]."""
-        count, width = content.plan.cells_per_carrier, self._room.width
+        count, width = content.plan.cells_per_carrier, self._capacity.width
         cells = as_strided(self.table, (len(self.table), count, width // count), (width, width // count, 1))
         copies = content.records[content.copied]
         for label, records, at in (("record", content.records, 0), ("copy", copies, len(content.records))):
@@ -169,7 +169,7 @@ class Writer:
                 part = records[start : start + _AT_ONCE]
                 places = slice(at + start, at + start + len(part))
                 own, which = rows[places], slots[places]
-                cells[own, which, : cipher.cell_bytes] = cipher.encrypt(self._names[own], part, which)
+                cells[own, which, : cipher.cell_bytes] = cipher.encrypt(self._ids[own], part, which)
 
 
 def blocks_for(payload: Payload, width: int) -> int:
@@ -183,5 +183,5 @@ def payload_key(data_key: bytes) -> bytes:
 
 
 def bytes_of(content: Content) -> bytes:
-    """All that a content hides."""
+    """The bytes of a content."""
     return content.data if isinstance(content, Payload) else content.header + content.records.tobytes()

@@ -10,10 +10,10 @@ from __future__ import annotations
 import heapq
 from typing import Any
 
-import numba
 import numpy as np
 
 from keyss.core.arrays import Bytes, Doubles, Floats, Integers, Shorts
+from keyss.kernels.jit import kernel
 
 SIZE = 256  # numbers in a codebook
 _ROUNDS = 50
@@ -93,16 +93,7 @@ def groups(points: Doubles, size: int) -> tuple[Integers, Integers]:
     return order, np.sort(np.array(done + [each[1] for each in heap]))
 
 
-def _compiled(function: Any) -> Any:
-    """Compile at the first call, and cache the code if a cache folder is writable."""
-    jit: Any = numba.njit  # typed in some versions only
-    try:
-        return jit(function, cache=True, nogil=True)
-    except RuntimeError:
-        return jit(function, nogil=True)
-
-
-@_compiled
+@kernel
 def _widest(points: Any, order: Any, start: int, end: int) -> Any:
     """(axis of the largest spread of a group, mean along it, squared error of the group)."""
     dimensions = points.shape[1]
@@ -118,7 +109,7 @@ def _widest(points: Any, order: Any, start: int, end: int) -> Any:
     return axis, sums[axis] / (end - start), error
 
 
-@_compiled
+@kernel
 def _split(points: Any, order: Any, start: int, end: int, axis: int, mean: float) -> int:
     """Partition a group at `mean` along `axis`; returns where the upper part starts."""
     low, high = start, end - 1

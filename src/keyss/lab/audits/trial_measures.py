@@ -27,7 +27,7 @@ from keyss.lab.stealth.judging import judge
 from keyss.lab.stegexpose import stegexpose_auc
 from keyss.lab.two_sample import two_sample_auc
 from keyss.measure.renders import renders_of, select_views
-from keyss.runs.files import HANDED, stego_in
+from keyss.runs.files import COMPANIONS, stego_in
 
 Numbers = dict[str, float | str]
 
@@ -42,11 +42,11 @@ _ATTRIBUTES = {"opacity": "op", "scale": "sc", "rotation": "ro", "position": "xy
 
 
 def files(subject: Subject) -> Numbers:
-    """Megabytes of the published and the handed-over files."""
-    handed = (subject.run.folder / HANDED).glob("*")
+    """Megabytes of the published and the companion files."""
+    companion = (subject.run.folder / COMPANIONS).glob("*")
     return {
         "published_mb": stego_in(subject.run.folder).stat().st_size / 1e6,
-        "handed_mb": sum(path.stat().st_size for path in handed) / 1e6,
+        "companion_mb": sum(path.stat().st_size for path in companion) / 1e6,
     }
 
 

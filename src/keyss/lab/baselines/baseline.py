@@ -1,4 +1,4 @@
-"""The common part of the baselines: one secret, one joint training, one handed-over file."""
+"""The common part of the baselines: one secret, one joint training, one companion file."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from keyss.core.similarity import Similarity
 from keyss.fitting.adam import RowAdam
 from keyss.lab.baselines.baseline_options import BaselineOptions
 from keyss.methods.base import Capabilities, Context, Plan, Source, Stego
+from keyss.methods.hidden import Frame, Remains
 from keyss.methods.keyss.combined import PlacedScene
 from keyss.methods.keyss.training import KeyssTraining, Picture
-from keyss.methods.opened import Frame, Remains
 from keyss.methods.tensors import Header, pack_tensors, refuse_damage, unpack_tensors
 
 FORMAT, VERSION = "keyss-baseline", 1
-DAMAGED = "what was handed over is damaged"
+DAMAGED = "the companion file is damaged"
 
 
 @dataclass(frozen=True)
@@ -34,26 +34,26 @@ class _Header(Header):
 
 
 @dataclass(frozen=True)
-class HandedTensors:
-    """Tensors to hand over, and the placement of the secret in the cover's frame."""
+class CompanionTensors:
+    """Tensors of a companion file, and the placement of the secret in the cover's frame."""
 
     tensors: Mapping[str, Tensor]  # float32
     frame: Similarity | None = None  # secret frame to cover frame; None: never placed there
     rows: int | None = None  # Gaussians of the published model, if their order matters
 
     def payload(self, method: str) -> Payload:
-        """The file to hand over; `method`: name of the method."""
+        """The companion file; `method`: name of the method."""
         header = _Header(FORMAT, VERSION, self.rows, self.frame)
         return Payload(method, pack_tensors(self.tensors, header))
 
     @staticmethod
-    def of(content: Content) -> HandedTensors:
+    def of(content: Content) -> CompanionTensors:
         """Read a payload. Raises InputError for other content."""
         with refuse_damage(DAMAGED):
             if not isinstance(content, Payload):
                 raise ValueError("expected one string of bytes, got records")
             header, tensors = unpack_tensors(content.data, _Header, FORMAT, VERSION)
-        return HandedTensors(tensors, header.frame, header.rows)
+        return CompanionTensors(tensors, header.frame, header.rows)
 
     def take(self, names: Iterable[str]) -> list[Tensor]:
         """The tensors of these names. Raises InputError for others, and for missing ones."""
@@ -68,40 +68,40 @@ Show = Callable[[Gaussians], Gaussians]  # takes a model on the CPU in the cover
 
 
 @dataclass(frozen=True)
-class HandedSecret:
-    """An `Opened`: a handed-over file applied to the published model."""
+class CompanionSecret:
+    """A `HiddenScene`: a companion file applied to the published model."""
 
-    handed: HandedTensors
+    companion: CompanionTensors
     show: Show
     decode: None = None
     key_size: int = 0
 
     @property
     def frame(self) -> Similarity | None:
-        return self.handed.frame
+        return self.companion.frame
 
     def reveal(self, stego: Gaussians, *, frame: Frame = "secret", force: bool = False) -> Gaussians:
-        """See `Opened.reveal`; raises InputError for a model with other Gaussians."""
-        rows = self.handed.rows
+        """See `HiddenScene.reveal`; raises InputError for a model with other Gaussians."""
+        rows = self.companion.rows
         if rows is not None and len(stego) != rows:
             raise InputError(
                 f"expected the {rows:,} Gaussians that were published, in their order, got {len(stego):,}: "
-                "each row of the handed-over file belongs to one of them"
+                "each row of the companion file belongs to one of them"
             )
         if frame == "cover" and self.frame is None:
             raise UsageError('this secret never was in the cover\'s frame: leave out `frame="cover"`')
-        with refuse_damage("what was handed over does not fit"):
+        with refuse_damage("the companion file does not fit"):
             shown = self.show(stego.detach().to("cpu"))
         if self.frame is None or frame == "cover":
             return shown
         return self.frame.inverse().apply_gaussians(shown)
 
     def remains(self, revealed: Gaussians) -> Remains:
-        """A handed-over secret is complete or does not open."""
+        """A secret in a companion file is complete or does not open."""
         return Remains(len(revealed), len(revealed))
 
     def fingerprint(self) -> str:
-        return hashlib.sha256(self.handed.payload("baseline").data).hexdigest()[:16]
+        return hashlib.sha256(self.companion.payload("baseline").data).hexdigest()[:16]
 
 
 class BaselineTraining(KeyssTraining):
@@ -121,8 +121,8 @@ class BaselineTraining(KeyssTraining):
         """Render scenes in the given order; they may share a render."""
 
     @abstractmethod
-    def result(self) -> tuple[Gaussians, HandedTensors]:
-        """The published model, on the CPU, and the tensors to hand over, after the training."""
+    def result(self) -> tuple[Gaussians, CompanionTensors]:
+        """The published model, on the CPU, and the tensors of the companion file, after the training."""
 
     def add(self, name: str, values: Tensor, optimizer: RowAdam | float) -> None:
         """Add a parameter [N, ...] of the Gaussians, with its optimiser or a rate for a new one."""
@@ -153,11 +153,11 @@ class BaselineTraining(KeyssTraining):
 
 @dataclass(frozen=True)
 class Baseline:
-    """A `Method` with a joint training, one secret and one handed-over file."""
+    """A `Method` with a joint training, one secret and one companion file."""
 
     options: type[BaselineOptions]
     capabilities: Capabilities
-    open: Callable[[HandedTensors], Show]  # raises InputError and ValueError for damage
+    open: Callable[[CompanionTensors], Show]  # raises InputError and ValueError for damage
     training: type[BaselineTraining] | None = None  # None: a subclass overrides `hide`
     max_secrets: int = 1
 
@@ -184,13 +184,13 @@ class Baseline:
         run.train(sources, context)
         return self.stego(*run.result(), run.iterations)
 
-    def stego(self, published: Gaussians, handed: HandedTensors, iterations: int = 0) -> Stego:
-        """The result of hiding, opened from the handed-over payload."""
-        payload = handed.payload(self.name)
-        return Stego(published, (self.unpack(payload),), iterations, handed=(payload,))
+    def stego(self, published: Gaussians, companion: CompanionTensors, iterations: int = 0) -> Stego:
+        """The result of hiding, opened from the companion payload."""
+        payload = companion.payload(self.name)
+        return Stego(published, (self.unpack(payload),), iterations, companions=(payload,))
 
-    def unpack(self, content: Content) -> HandedSecret:
-        """The secret of a handed-over file. Raises InputError for damage."""
-        handed = HandedTensors.of(content)
+    def unpack(self, content: Content) -> CompanionSecret:
+        """The secret of a companion file. Raises InputError for damage."""
+        companion = CompanionTensors.of(content)
         with refuse_damage(DAMAGED):
-            return HandedSecret(handed, self.open(handed))
+            return CompanionSecret(companion, self.open(companion))

@@ -1,7 +1,7 @@
 """GS-Hider (Zhang et al., NeurIPS 2024): coupled features in place of harmonics, and two networks.
 
 The Gaussians' 16 features are rendered like colours. A published scene decoder maps rendered features to the
-cover's image, a handed-over message decoder to the secret's. Viewers of 3DGS models show neither.
+cover's image, a message decoder in a companion file to the secret's. Viewers of 3DGS models show neither.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from keyss.core.errors import InputError
 from keyss.core.gaussians import SH_C0, Gaussians
 from keyss.core.picture_network import DecodedGaussians
 from keyss.core.scene import Camera
-from keyss.lab.baselines.baseline import Baseline, BaselineTraining, HandedTensors, Show
+from keyss.lab.baselines.baseline import Baseline, BaselineTraining, CompanionTensors, Show
 from keyss.lab.baselines.baseline_options import GsHiderOptions
 from keyss.lab.baselines.picture_decoder import Convolutions, network_of, network_tensors
 from keyss.methods.base import Capabilities
@@ -49,7 +49,7 @@ class GsHiderTraining(BaselineTraining):
         sh = torch.zeros(len(self), 1, 3, device=self.device)
         return Gaussians(own["means"], own["quats"], own["scales"], own["opacities"], sh)
 
-    def result(self) -> tuple[Gaussians, HandedTensors]:
+    def result(self) -> tuple[Gaussians, CompanionTensors]:
         visible = self.visible()
         background = torch.zeros(FEATURES, device=self.device)
         cover, secret = (
@@ -57,11 +57,11 @@ class GsHiderTraining(BaselineTraining):
         )
         features = self.parameters["features"].detach()[visible].cpu()
         stego = DecodedGaussians.of(self.gaussians().detach()[visible].to("cpu"), cover, features)
-        return stego, HandedTensors(network_tensors(secret), self.frame)
+        return stego, CompanionTensors(network_tensors(secret), self.frame)
 
 
-def _open(handed: HandedTensors) -> Show:
-    network = network_of(handed)
+def _open(companion: CompanionTensors) -> Show:
+    network = network_of(companion)
 
     def show(stego: Gaussians) -> Gaussians:
         if not isinstance(stego, DecodedGaussians) or stego.features is None:

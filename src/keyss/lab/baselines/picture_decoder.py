@@ -1,7 +1,7 @@
 """3DGS+Decoder: a network from the rendered cover to the secret (a baseline of GS-Hider and KeySS).
 
 The published model is a 3DGS model of the cover, trained jointly with a network that maps its renders to the
-secret's images. The network is handed over; it has the size of one of GS-Hider's decoders.
+secret's images. The network is a companion file; it has the size of one of GS-Hider's decoders.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from keyss.core.gaussians import Gaussians
 from keyss.core.picture_network import DecodedGaussians, PictureNetwork
 from keyss.core.scene import Camera
 from keyss.fitting.parameters import to_gaussians
-from keyss.lab.baselines.baseline import Baseline, BaselineTraining, HandedTensors, Show
+from keyss.lab.baselines.baseline import Baseline, BaselineTraining, CompanionTensors, Show
 from keyss.lab.baselines.baseline_options import DecoderOptions
 from keyss.methods.base import Capabilities
 from keyss.methods.keyss.training import Picture
@@ -49,10 +49,10 @@ def network_tensors(network: PictureNetwork) -> dict[str, Tensor]:
     return tensors
 
 
-def network_of(handed: HandedTensors) -> PictureNetwork:
+def network_of(companion: CompanionTensors) -> PictureNetwork:
     """Read a network from `network_tensors`. Raises InputError, ValueError and TypeError for damage."""
     names = [f"{kind}.{index}" for index in range(LAYERS) for kind in ("weight", "bias")]
-    background, *rest = handed.take(["background", *names])
+    background, *rest = companion.take(["background", *names])
     return PictureNetwork(tuple(zip(rest[::2], rest[1::2], strict=True)), background)
 
 
@@ -71,14 +71,14 @@ class DecoderTraining(BaselineTraining):
             Picture(decode_picture(cover.image, network), cover.meta) if scene else cover for scene in scenes
         ]
 
-    def result(self) -> tuple[Gaussians, HandedTensors]:
+    def result(self) -> tuple[Gaussians, CompanionTensors]:
         network = self.network.network(self.backgrounds[0])
         stego = to_gaussians(self.parameters).detach()[self.visible()].to("cpu")
-        return stego, HandedTensors(network_tensors(network), self.frame)
+        return stego, CompanionTensors(network_tensors(network), self.frame)
 
 
-def _open(handed: HandedTensors) -> Show:
-    network = network_of(handed)
+def _open(companion: CompanionTensors) -> Show:
+    network = network_of(companion)
     if len(network.background) != 3:
         raise ValueError("expected a network for pictures in colour")
     return lambda stego: DecodedGaussians.of(stego, network)

@@ -1,7 +1,7 @@
 """3DGS+SH: a second set of harmonics on the same Gaussians (a baseline of GS-Hider, 2024, and KeySS).
 
-The published model is a 3DGS model of the cover. The secret's harmonics are handed over; they replace its own
-to show the secret.
+The published model is a 3DGS model of the cover. The secret's harmonics are a companion file and replace the
+cover's to show the secret.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from dataclasses import replace
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Camera
 from keyss.fitting.parameters import make_optimizers, to_gaussians
-from keyss.lab.baselines.baseline import Baseline, BaselineTraining, HandedTensors, Show
+from keyss.lab.baselines.baseline import Baseline, BaselineTraining, CompanionTensors, Show
 from keyss.lab.baselines.baseline_options import ShOptions
 from keyss.methods.base import Capabilities
 from keyss.methods.keyss.training import Picture
@@ -33,14 +33,14 @@ class ShTraining(BaselineTraining):
         models = [replace(model, sh=self.parameters[_NAMES[scene]]) for scene in scenes]
         return [self.render(*each, camera, sh_degree) for each in zip(models, scenes, strict=True)]
 
-    def result(self) -> tuple[Gaussians, HandedTensors]:
+    def result(self) -> tuple[Gaussians, CompanionTensors]:
         visible, secret_sh = self.visible(), self.parameters[_NAMES[1]].detach()
         stego = to_gaussians(self.parameters).detach()[visible].to("cpu")
-        return stego, HandedTensors({_NAMES[1]: secret_sh[visible]}, self.frame, rows=len(stego))
+        return stego, CompanionTensors({_NAMES[1]: secret_sh[visible]}, self.frame, rows=len(stego))
 
 
-def _open(handed: HandedTensors) -> Show:
-    (sh,) = handed.take([_NAMES[1]])
+def _open(companion: CompanionTensors) -> Show:
+    (sh,) = companion.take([_NAMES[1]])
     return lambda stego: replace(stego, sh=sh)
 
 

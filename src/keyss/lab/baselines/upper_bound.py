@@ -1,4 +1,4 @@
-"""The upper bound: two plain 3DGS models (Kerbl et al. 2023), one published, one handed over."""
+"""The upper bound: two plain 3DGS models (Kerbl et al. 2023), one published, one a companion file."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 from keyss.core.gaussians import Gaussians
-from keyss.lab.baselines.baseline import Baseline, HandedTensors, Show
+from keyss.lab.baselines.baseline import Baseline, CompanionTensors, Show
 from keyss.lab.baselines.baseline_options import BaselineOptions, BoundOptions
 from keyss.methods.base import Capabilities, Context, Plan, Source, Stego
 
@@ -27,13 +27,13 @@ class BoundMethod(Baseline):
     def hide(
         self, cover: Source, secrets: Sequence[Source], options: BaselineOptions, context: Context
     ) -> Stego:
-        """Hand over the secret's model."""
+        """Write the secret's model to a companion file."""
         (secret,) = secrets
-        return self.stego(cover.model, HandedTensors(vars(secret.model)))
+        return self.stego(cover.model, CompanionTensors(vars(secret.model)))
 
 
-def _open(handed: HandedTensors) -> Show:
-    model = Gaussians(*handed.take(_NAMES))
+def _open(companion: CompanionTensors) -> Show:
+    model = Gaussians(*companion.take(_NAMES))
     return lambda stego: model
 
 

@@ -39,7 +39,7 @@ _CLUSTER_SAMPLE = 5000  # Gaussians used to find clusters
 _MIN_CLUSTERED = 10
 
 Variants = Iterator[tuple[str, Gaussians]]  # labelled models to render
-Decode = Callable[[Gaussians, Tensor], Gaussians]  # `keyss.methods.opened.Opened.decode`
+Decode = Callable[[Gaussians, Tensor], Gaussians]  # `keyss.methods.hidden.HiddenScene.decode`
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ def decoder_attack(
 ) -> Attack:
     """The attack with a secret's decoder, but without the key.
 
-    `decode`: see `keyss.methods.opened.Opened`; if it has no gradient in the embedding, the search is random.
+    `decode`: see `HiddenScene`; without a gradient in the embedding, the search is random.
     """
 
     def show(model: Gaussians) -> Variants:

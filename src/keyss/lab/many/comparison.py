@@ -55,7 +55,7 @@ _FIDELITY = {
     "SSIM ": ["%(secrets.1.ssim).3f"],
     "LPIPS ": ["%(secrets.1.lpips).3f"],
     "published, MB": ["%(files.published_mb).2f"],
-    "handed over, MB": ["%(files.handed_mb).2f"],
+    "companion files, MB": ["%(files.companion_mb).2f"],
     "cover, pictures/s": ["%(pictures.pictures/s, cover).0f (%(pictures.time over 3DGS, cover).1f)"],
     "secret, pictures/s": ["%(pictures.pictures/s, secret).0f (%(pictures.time over 3DGS, secret).1f)"],
     "seconds": ["%(seconds).0f"],

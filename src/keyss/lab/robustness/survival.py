@@ -14,7 +14,7 @@ from keyss.lab.robustness import changes as change
 from keyss.lab.robustness.changes import Change
 from keyss.lab.robustness.converters import converters
 from keyss.measure.hide_quality import in_cover
-from keyss.methods.opened import Opened
+from keyss.methods.hidden import HiddenScene
 
 PRUNED = (0.05, 0.10, 0.15, 0.25, 0.50)
 NOISE = (0.001, 0.01, 0.1)
@@ -22,7 +22,7 @@ SEEDS = 3  # repetitions per random removal; results vary by a dB or two
 UNCHANGED = "none"
 
 # Opens a secret in a stego model on the CPU; raises KeyssError if it does not open.
-Opener = Callable[[Gaussians], Opened]
+Opener = Callable[[Gaussians], HiddenScene]
 
 
 @dataclass(frozen=True)

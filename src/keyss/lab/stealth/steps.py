@@ -1,8 +1,8 @@
-"""Siblings that moved apart by equal steps of Adam, so that constant colours state low bits of harmonics.
+"""Siblings that moved apart by equal steps of Adam, so that constant colours predict low bits of harmonics.
 
-See `keyss.channels.quiet.siblings`. Pairs are found in the high bits and constant colours. A difference that
-should be a twentieth of that of the constant colours, and is so to a sixteenth of what low bits amount to, is
-a hit; the null is the same file with other low bits.
+See `keyss.channels.quiet.siblings`. Pairs are found by high bits and constant colours. A hit is a difference
+of harmonics within 1/16 of a cell (the range of low bits) of a twentieth of that of the constant colours.
+The null distribution comes from the same file with other low bits.
 """
 
 from __future__ import annotations
@@ -15,15 +15,15 @@ from keyss.lab.stealth.agreement import nearest_pairs
 from keyss.lab.stealth.statistic import ATTRIBUTES, BitPatterns, Statistic, normal
 
 _LOW = np.uint32((1 << 13) - 1)
-_RATIO = 20.0  # of the learning rates of constant colours and harmonics
+_RATIO = 20.0  # learning rate of constant colours / harmonics
 _NEAREST = 16
-_AGREE = 4  # harmonics of a colour of a pair
-_PART = 16  # of a cell, in which a difference is right
+_AGREE = 4  # minimum agreeing harmonics of a colour
+_PART = 16  # a hit is within cell / 16 of the prediction
 _DRAWS, _MAX_DIFFERENCES, _MIN_EXPECTED = 200, 16_000, 5.0
 
 
 def steps(model: Gaussians, words: BitPatterns) -> dict[str, Statistic]:
-    """Standard deviations by which right differences are more than with random low bits."""
+    """Excess of hits over random low bits, in standard deviations."""
     harmonics = words.bits[:, words.attribute >= ATTRIBUTES.index("sh1")]
     if not harmonics.shape[1] or len(model) < 2:
         return {}
@@ -72,5 +72,5 @@ def _middle(words: Words32) -> Doubles:
 
 
 def _cells(words: Words32) -> Doubles:
-    """What the low bits of each number amount to."""
+    """The range of each number's low bits."""
     return 2 * np.abs(_middle(words) - _numbers(words & ~_LOW))

@@ -15,8 +15,8 @@ from keyss.fitting.image_metrics import subsample_views
 from keyss.fitting.plain import fit_scene
 from keyss.fitting.schedule import boost_of
 from keyss.methods.base import Capabilities, Context, Plan, Source, Stego, role_of
+from keyss.methods.carry.capacity import PayloadCapacity, SecretSize, capacity_for
 from keyss.methods.carry.options import REFIT, CarryOptions
-from keyss.methods.carry.room import SecretSize, WholeRoom, room_for
 from keyss.methods.records.embedding import embed_models
 from keyss.methods.records.quantise import out_of_range
 from keyss.rendering import contributions
@@ -32,8 +32,8 @@ _VISIBLE = (
 )
 _MIN_SHARE = 1 / 6  # fraction of a secret's Gaussians; refits of public models with fewer are below 30 dB
 _FEWER = (
-    "the secrets share the room, and each has fewer Gaussians than it could have alone: whoever has one of "
-    "the keys can notice that there are other secrets"
+    "the secrets share the capacity, and each has fewer Gaussians than it could have alone: whoever has one "
+    "of the keys can notice that there are other secrets"
 )
 
 
@@ -48,7 +48,7 @@ class CarryMethod:
     def prepare(self, sources: Sequence[Source], options: CarryOptions) -> CarryOptions:
         """Choose the secrets to refit: once all are fitted, also those that do not fit the cover.
 
-        Raises UsageError for a cover without room.
+        Raises UsageError for a cover without capacity.
         """
         cover, *secrets = sources
         degree = options.sh_degree
@@ -56,10 +56,10 @@ class CarryMethod:
             degree = options.fit.sh_degree if cover.given is None else cover.given.sh_degree
         options = options.with_fit(sh_degree=degree)
         try:
-            room = room_for(cover.given, options, _PLANNED)
-            options = replace(options, max_secret_degree=room.max_secret_degree)
+            capacity = capacity_for(cover.given, options, _PLANNED)
+            options = replace(options, max_secret_degree=capacity.max_secret_degree)
             secret_sizes = _secret_sizes(secrets, options)
-            sizes = room.sizes(secret_sizes)
+            sizes = capacity.sizes(secret_sizes)
             if options.may_show and cover.given is not None:
                 _check_share(secret_sizes, sizes)
         except UsageError as refused:
@@ -73,7 +73,7 @@ class CarryMethod:
         elif options.refit == "never":
             cut = [False] * len(cut)
         elif any(cut) and all(each.given is not None for each in sources):
-            alone = [room.sizes([secret])[0] for secret in secret_sizes]
+            alone = [capacity.sizes([secret])[0] for secret in secret_sizes]
             if sizes != alone:
                 warnings.warn(_FEWER, KeyssWarning, stacklevel=2)
         steps = round(REFIT * options.fit.iterations)
@@ -87,13 +87,13 @@ class CarryMethod:
         )
 
     def plan(self, sources: Sequence[Source], options: CarryOptions) -> Plan:
-        """The room in the cover before refits; notes list the losses of the cover and the secrets."""
+        """The capacity of the cover before refits; notes list the losses of the cover and the secrets."""
         cover, *secrets = sources
-        room, secret_sizes = room_for(cover.given, options, _PLANNED), _secret_sizes(secrets, options)
-        sizes = room.sizes(secret_sizes)
-        appended, notes = room.appended(secret_sizes), []
-        if cover.given is not None and room.cover is not None and room.cover is not cover.given:
-            psnr = psnr_between(cover.given, room.cover)
+        capacity, secret_sizes = capacity_for(cover.given, options, _PLANNED), _secret_sizes(secrets, options)
+        sizes = capacity.sizes(secret_sizes)
+        appended, notes = capacity.appended(secret_sizes), []
+        if cover.given is not None and capacity.cover is not None and capacity.cover is not cover.given:
+            psnr = psnr_between(cover.given, capacity.cover)
             notes.append(f"other harmonics leave the cover at {psnr:.1f} dB PSNR against itself")
         for index, (secret, (_, degree)) in enumerate(zip(secrets, sizes, strict=True)):
             if secret.given is not None and secret.given.sh_degree > degree:
@@ -104,17 +104,19 @@ class CarryMethod:
                 )
         if appended:
             notes.append(
-                f"about {appended:,} invisible Gaussians are appended to the cover's {room.gaussians:,}; "
+                f"about {appended:,} invisible Gaussians are appended to the cover's {capacity.gaussians:,}; "
                 "fewer Gaussians or a lower SH degree of a secret take less"
             )
-        elif isinstance(room, WholeRoom):
-            how = "about" if room.prepared is None else "exactly"
-            notes.append(f"the {room.channel.place} have room for {how} {room.room.capacity:,} bytes")
+        elif isinstance(capacity, PayloadCapacity):
+            how = "about" if capacity.prepared is None else "exactly"
+            notes.append(
+                f"the {capacity.channel.place} have room for {how} {capacity.payloads.bytes:,} bytes"
+            )
         counts = [count for count, _ in sizes]
         rendered = (count if steps else 0 for steps, count in zip(options.refits, counts, strict=True))
         return Plan(
-            gaussians=room.gaussians + appended,
-            sh_degree=room.sh_degree,
+            gaussians=capacity.gaussians + appended,
+            sh_degree=capacity.sh_degree,
             secret_gaussians=sum(secret.count for secret in secret_sizes),
             capacity=sum(counts),
             steps=max(options.refits),
@@ -127,23 +129,23 @@ class CarryMethod:
     ) -> Stego:
         """Refit the secrets that need it, embed all, and open each again to check.
 
-        Raises UsageError for a cover without room, Interrupted on Ctrl-C, and InputError for a
+        Raises UsageError for a cover without capacity, Interrupted on Ctrl-C, and InputError for a
         checkpoint of another run.
         """
-        room = room_for(cover.model, options, context.entropy)
-        assert room.prepared is not None  # the cover is fitted
+        capacity = capacity_for(cover.model, options, context.entropy)
+        assert capacity.prepared is not None  # the cover is fitted
         plain = [secret.model for secret in secrets]
         viewpoints = [Viewpoints.of(secret.scene) for secret in secrets]
         models = list(plain)
         if any(options.refits):
-            fitting = room.prune(plain, viewpoints)
+            fitting = capacity.prune(plain, viewpoints)
             for index, (secret, steps, fits) in enumerate(zip(secrets, options.refits, fitting, strict=True)):
                 if steps:
                     cut = len(fits) < len(secret.model)
                     models[index] = refit(
                         secret.model.with_sh_degree(fits.sh_degree),
                         secret.scene,
-                        max(1, int(room.refit_share * len(fits))) if cut else len(fits),
+                        max(1, int(capacity.refit_share * len(fits))) if cut else len(fits),
                         replace(options.fit, iterations=steps),
                         context,
                         photos=secret.photos,
@@ -153,9 +155,9 @@ class CarryMethod:
         if any(clamped := [out_of_range(model) for model in models]):
             details["gaussians_with_clamped_numbers"] = clamped
         stego = embed_models(
-            room.prepared,
+            capacity.prepared,
             [secret.key for secret in secrets],
-            room.prune(models, viewpoints),
+            capacity.prune(models, viewpoints),
             viewpoints=viewpoints,
             entropy=context.entropy,
             overwrite=context.overwrites_cover,

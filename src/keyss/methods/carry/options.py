@@ -20,7 +20,7 @@ class CarryOptions(MethodOptions):
     refit: Annotated[
         Literal["auto", "always", "never"],
         CommandLineOption(
-            "Train a secret again after pruning it to the room in the cover: always, if it does not fit, or "
+            "Train a secret again after pruning it to the cover's capacity: always, if it does not fit, or "
             "never."
         ),
     ] = "auto"

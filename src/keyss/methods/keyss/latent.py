@@ -26,7 +26,7 @@ from keyss.channels.harmonics import (
     high_harmonics,
     make_increasing,
     pads,
-    row_names,
+    row_ids,
 )
 from keyss.core.arrays import Bytes, Doubles, Flags, doubles
 from keyss.core.errors import UsageError
@@ -44,7 +44,7 @@ NONCE_BYTES = 16
 
 
 def latents_of(sh_degree: int, secrets: int) -> int:
-    """D, the latents of each of `secrets`. Raises UsageError if a row has no room for them."""
+    """D, the latents of each of `secrets`. Raises UsageError if a row cannot hold them."""
     count = min(MAX_LATENTS[min(secrets, 2) - 1], (harmonics_above(sh_degree) - MIN_KEPT) // secrets)
     if count < OWN:
         raise UsageError(
@@ -78,11 +78,11 @@ class LatentDecoder(Decoder):
 
     def forward(self, cover: Gaussians, key: Tensor, whole: Gaussians | None = None) -> Gaussians:
         """The secret's Gaussians in the rows that belong to `key`; `cover` itself if there are none."""
-        names, (ranks, alive) = row_names(cover), self.place.read(high_harmonics(cover))
-        latents, fits = self.decrypt(ranks[alive][:, self.own], key, names[alive])
+        ids, (ranks, alive) = row_ids(cover), self.place.read(high_harmonics(cover))
+        latents, fits = self.decrypt(ranks[alive][:, self.own], key, ids[alive])
         if not fits.any():
             return cover
-        _, first = np.unique(names[alive][fits], axis=0, return_index=True)  # copies of a row count once
+        _, first = np.unique(ids[alive][fits], axis=0, return_index=True)  # copies of a row count once
         return self.to_gaussians(torch.from_numpy(latents[np.sort(first)]).to(self.basis))
 
     @torch.no_grad()
@@ -96,24 +96,24 @@ class LatentDecoder(Decoder):
         digest = hashlib.sha256(np.ascontiguousarray(latents).tobytes()).digest()[:NONCE_BYTES]
         self.nonce.copy_(torch.frombuffer(bytearray(digest), dtype=torch.uint8))
 
-    def encrypt(self, latents: Doubles, key: Tensor, names: Bytes) -> Doubles:
-        """[N, D] ranks in [0, 1) for latents [N, D] in rows with the identities `names` [N, 16]."""
+    def encrypt(self, latents: Doubles, key: Tensor, ids: Bytes) -> Doubles:
+        """[N, D] ranks in [0, 1) for latents [N, D] in rows with the `ids` [N, 16]."""
         knots = doubles(self.knots)
         ranks = np.stack([np.interp(*each, RANKS) for each in zip(latents.T, knots, strict=True)], axis=1)
         inside: Doubles = (GUARD + (1 - 2 * GUARD) * ranks) / SHARE
-        return (inside + self._pads(key, names)) % 1
+        return (inside + self._pads(key, ids)) % 1
 
-    def decrypt(self, ranks: Doubles, key: Tensor, names: Bytes) -> tuple[Doubles, Flags]:
+    def decrypt(self, ranks: Doubles, key: Tensor, ids: Bytes) -> tuple[Doubles, Flags]:
         """[M, D] latents in the rows that belong to `key`, and [N] which rows these are."""
-        inside = SHARE * ((ranks - self._pads(key, names)) % 1)
+        inside = SHARE * ((ranks - self._pads(key, ids)) % 1)
         fits: Flags = np.all(inside <= 1, axis=1)
         own = ((inside[fits] - GUARD) / (1 - 2 * GUARD)).clip(0, 1)
         knots = doubles(self.knots)
         return np.stack([np.interp(x, RANKS, y) for x, y in zip(own.T, knots, strict=True)], axis=1), fits
 
-    def _pads(self, key: Tensor, names: Bytes) -> Doubles:
+    def _pads(self, key: Tensor, ids: Bytes) -> Doubles:
         seed = key.detach().cpu().numpy().astype("<f4").tobytes() + self.nonce.cpu().numpy().tobytes()
-        return pads(expand(hashlib.sha256(seed).digest(), "latents", 32), names, len(self.knots))
+        return pads(expand(hashlib.sha256(seed).digest(), "latents", 32), ids, len(self.knots))
 
     def to_latents(self, model: Gaussians, colours: Tensor) -> Tensor:
         """[N, D] the latents of Gaussians whose harmonics are `self.colours(colours)`."""

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from keyss.channels.harmonics import KEPT_DEGREE, high_harmonics, row_names, with_high_harmonics
+from keyss.channels.harmonics import KEPT_DEGREE, high_harmonics, row_ids, with_high_harmonics
 from keyss.core.arrays import Doubles
 from keyss.core.errors import InputError
 from keyss.core.gaussians import Gaussians
@@ -146,8 +146,8 @@ class LatentTraining(KeyssTraining):
     def usable_rows(self) -> Tensor:
         """[M] rows that can hide a Gaussian, most opaque first."""
         cover = self.gaussians_of(0).detach()
-        # Equal identities would reuse a pad.
-        _, index, counts = np.unique(row_names(cover), axis=0, return_inverse=True, return_counts=True)
+        # Equal IDs would reuse a pad.
+        _, index, counts = np.unique(row_ids(cover), axis=0, return_inverse=True, return_counts=True)
         once = torch.from_numpy(counts[index.reshape(-1)] == 1).to(self.device)
         high = (cover.sh[:, (KEPT_DEGREE + 1) ** 2 :] != 0).flatten(1).any(1)
         usable = once & high & (cover.opacities >= self.fit.prune_opacity)
@@ -166,9 +166,9 @@ class LatentTraining(KeyssTraining):
         count = self.decoders[0].place.directions.shape[1]
         words = np.frombuffer(stream(entropy, "latents", 8 * len(self) * count), "<u8")
         ranks: Doubles = ((words >> np.uint64(11)) / 2.0**53).reshape(len(self), count)
-        rows, names = self.usable_rows().cpu().numpy(), row_names(self.gaussians_of(0))
+        rows, ids = self.usable_rows().cpu().numpy(), row_ids(self.gaussians_of(0))
         for scene, (decoder, key) in enumerate(zip(self.decoders, self.keys, strict=True), 1):
-            ranks[rows, decoder.own] = decoder.encrypt(self.latents(scene)[rows], key, names[rows])
+            ranks[rows, decoder.own] = decoder.encrypt(self.latents(scene)[rows], key, ids[rows])
         return ranks
 
     def set_rates(self) -> None:

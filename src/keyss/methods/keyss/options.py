@@ -139,7 +139,7 @@ def parse_design(text: str) -> DesignName:
     for name in get_args(DesignName):
         if text == name:
             return name  # type: ignore[no-any-return]
-    raise UsageError(f"design {text!r}: expected one of {', '.join(DESIGNS)}; {did_you_mean(text, DESIGNS)}")
+    raise UsageError(f"there is no design {text!r}; {did_you_mean(text, DESIGNS)}")
 
 
 @dataclass(frozen=True, kw_only=True)

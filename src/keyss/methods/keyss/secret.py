@@ -2,7 +2,7 @@
 
 The payload holds the decoder (weights in half precision, constants in single), the vector of the key, the
 similarity from the secret's frame to the cover's, and *anchors*: positions of some Gaussians of the stego
-model, to detect a moved or rounded model. docs/format.md lists the bytes.
+model, to detect a moved or rounded model. docs/byte-layout.md lists the bytes.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from keyss.channels import Content, Payload, is_appended
 from keyss.core.errors import InputError
 from keyss.core.gaussians import DRAWN_OPACITY, Gaussians, compensate_pruning
 from keyss.core.similarity import Similarity
+from keyss.methods.hidden import Frame, Remains
 from keyss.methods.keyss.decoder import Decoder
 from keyss.methods.keyss.latent import LatentDecoder
 from keyss.methods.keyss.options import DecoderShape, parse_mask
-from keyss.methods.opened import Frame, Remains
 from keyss.methods.tensors import Header, pack_tensors, refuse_damage, unpack_tensors
 
 NAME = "keyss"
@@ -49,7 +49,7 @@ class _Header(Header):
 
 @dataclass(frozen=True)
 class KeyssSecret:
-    """Everything beside the stego model that reveals one secret; see `keyss.methods.opened.Opened`."""
+    """Everything beside the stego model that reveals one secret; see `keyss.methods.hidden.HiddenScene`."""
 
     decoder: Decoder
     key: Tensor = field(repr=False)  # [K] the vector of its key
@@ -100,7 +100,7 @@ class KeyssSecret:
 
     @torch.no_grad()
     def reveal(self, stego: Gaussians, *, frame: Frame = "secret", force: bool = False) -> Gaussians:
-        """The secret as a standalone model, without invisible Gaussians; see `Opened.reveal`.
+        """The secret as a standalone model, without invisible Gaussians; see `HiddenScene.reveal`.
 
         If Gaussians were lost, the others are enlarged to compensate.
         """
@@ -130,7 +130,7 @@ class KeyssSecret:
         return stego if decoded is own else decoded
 
     def remains(self, revealed: Gaussians) -> Remains:
-        """See `Opened.remains`; Gaussians that are never rendered do not count."""
+        """See `HiddenScene.remains`; Gaussians that are never rendered do not count."""
         return Remains(visibility(revealed)[0], self.count, self.chunks, _SLACK)
 
     def fingerprint(self) -> str:

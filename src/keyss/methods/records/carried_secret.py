@@ -11,7 +11,7 @@ from functools import cached_property, partial
 from keyss.channels.base import Content, Records
 from keyss.core.errors import InputError, UsageError
 from keyss.core.gaussians import Gaussians, compensate_pruning
-from keyss.methods.opened import Frame, Remains
+from keyss.methods.hidden import Frame, Remains
 from keyss.methods.records import whole
 from keyss.methods.records.quantise import Codec
 
@@ -20,7 +20,7 @@ COUNT = struct.Struct("<I")  # number of Gaussians, before the codec in the head
 
 @dataclass(frozen=True)
 class CarriedSecret:
-    """A carried secret; see `keyss.methods.opened.Opened`."""
+    """A carried secret; see `keyss.methods.hidden.HiddenScene`."""
 
     left: int  # Gaussians that are left
     count: int  # Gaussians that were embedded
@@ -53,7 +53,7 @@ class CarriedSecret:
 def unpack(content: Content) -> CarriedSecret:
     """Open records, in any order, or a payload. Raises InputError for damage."""
     if not isinstance(content, Records):
-        gaussians = whole.decode(content.data, content.carriers)
+        gaussians = whole.decode(content.data, content.model_size)
         count = len(gaussians)
         return CarriedSecret(count, count, round(8 * len(content.data) / count), lambda: gaussians)
     if len(content.header) < COUNT.size:

@@ -1,7 +1,7 @@
 """Embed models in a prepared cover, as records or payloads, and verify that they open.
 
 In low bits a Gaussian is a record (see `quantise`); the header holds the number of records and the codec.
-Copies of the most visible Gaussians fill free room. All other channels carry a model as one payload (see
+Copies of the most visible Gaussians fill free cells. All other channels carry a model as one payload (see
 `whole`).
 """
 
@@ -12,13 +12,13 @@ from dataclasses import replace
 from typing import Any
 
 from keyss.channels import (
+    Capacity,
     Content,
     LowBitsCover,
     Payload,
     PreparedCover,
     RecordRequest,
     Records,
-    Room,
     open_content,
 )
 from keyss.core.gaussians import Gaussians
@@ -63,9 +63,9 @@ def embed_models(
             "secret_bytes": [len(each.data) for each in payloads],
             "sh_degrees": [each.sh_degree for each in models],
         }
-        if not cover.room.grows:
-            details["capacity_bytes"] = cover.room.capacity
-            details["capacity_bits_per_gaussian"] = round(8 * cover.room.capacity / len(cover.cover), 2)
+        if not cover.capacity.grows:
+            details["capacity_bytes"] = cover.capacity.bytes
+            details["capacity_bits_per_gaussian"] = round(8 * cover.capacity.bytes / len(cover.cover), 2)
     stego = cover.embed(list(zip(keys, contents, strict=True)), entropy=entropy)
     del contents  # as large as the secrets
     opened = [unpack(open_content(stego, key)) for key in keys]
@@ -100,7 +100,7 @@ def largest_degree(record_bytes: int) -> int | None:
     return next((each for each in (3, 2, 1, 0) if Table.floor(each).record_bytes <= record_bytes), None)
 
 
-def shares(room: Room, needed: Sequence[int]) -> list[int]:
+def shares(capacity: Capacity, needed: Sequence[int]) -> list[int]:
     """Maximum bytes of each secret's payload, for secrets that need `needed` bytes.
 
     The first of a quarter, a half and all of the capacity that suffices: a secret's precision then does not
@@ -108,18 +108,19 @@ def shares(room: Room, needed: Sequence[int]) -> list[int]:
     the model grows.
     """
     parts = [
-        next((each for each in (4, 2) if size <= room.capacity // each - room.overhead), 1) for size in needed
+        next((each for each in (4, 2) if size <= capacity.bytes // each - capacity.overhead), 1)
+        for size in needed
     ]
-    if room.grows or sum(1 / each for each in parts) > 1:
+    if capacity.grows or sum(1 / each for each in parts) > 1:
         parts = [len(needed)] * len(needed)
-    return [max(0, room.capacity // each - room.overhead) for each in parts]
+    return [max(0, capacity.bytes // each - capacity.overhead) for each in parts]
 
 
 def _payloads(
     cover: PreparedCover, models: Sequence[Gaussians], viewpoints: Sequence[Viewpoints]
 ) -> list[Payload]:
-    rooms = shares(cover.room, [len(encode(model)) for model in models])
+    limits = shares(cover.capacity, [len(encode(model)) for model in models])
     return [
-        Payload(METHOD, encode_to_size(model, room, short=cover.room.grows, viewpoints=views))
-        for model, room, views in zip(models, rooms, viewpoints, strict=True)
+        Payload(METHOD, encode_to_size(model, limit, short=cover.capacity.grows, viewpoints=views))
+        for model, limit, views in zip(models, limits, viewpoints, strict=True)
     ]

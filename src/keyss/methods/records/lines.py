@@ -187,9 +187,9 @@ class Table:
         `start`: by default the floor. Each further bit goes to the attribute whose error it reduces most.
         """
         table = start or Table.floor(sh_degree)
-        while (room := bits - table.total) >= 0:
+        while (left := bits - table.total) >= 0:
             given = table.bits
-            grow = [i for i, each in enumerate(given) if _NUMBERS[i] <= room and each < MAX_BITS]
+            grow = [i for i, each in enumerate(given) if _NUMBERS[i] <= left and each < MAX_BITS]
             if not grow:
                 return table
             best = max(grow, key=lambda i: 4 ** (_BITS_FOR_60_DB[i] - given[i]) / _NUMBERS[i])

@@ -51,38 +51,42 @@ def choose_precision(model: Gaussians, viewpoints: Viewpoints | None = None) -> 
     return precision
 
 
-def prune_to_size(model: Gaussians, room: int, viewpoints: Viewpoints | None = None) -> Gaussians:
-    """`model` if it fits into `room` bytes, else its most visible Gaussians at the best SH degree.
+def prune_to_size(model: Gaussians, max_bytes: int, viewpoints: Viewpoints | None = None) -> Gaussians:
+    """`model` if it fits into `max_bytes` bytes, else its most visible Gaussians at the best SH degree.
 
     Raises UsageError if nothing fits.
     """
-    if len(encode(model)) <= room:
+    if len(encode(model)) <= max_bytes:
         return model
     degrees = range(model.sh_degree + 1)
-    candidates = [found for each in degrees if (found := _prune_to_size(model.with_sh_degree(each), room))]
+    candidates = [
+        found for each in degrees if (found := _prune_to_size(model.with_sh_degree(each), max_bytes))
+    ]
     if not candidates:
-        raise UsageError(f"nothing of a secret fits into {room:,} bytes")
+        raise UsageError(f"nothing of a secret fits into {max_bytes:,} bytes")
     return max(candidates, key=lambda each: psnr_between(model, each, viewpoints))
 
 
 def encode_to_size(
-    model: Gaussians, room: int, *, short: bool = False, viewpoints: Viewpoints | None = None
+    model: Gaussians, max_bytes: int, *, short: bool = False, viewpoints: Viewpoints | None = None
 ) -> bytes:
-    """Encode `model` in at most `room` bytes, as precisely as possible.
+    """Encode `model` in at most `max_bytes` bytes, as precisely as possible.
 
     `short`: use no more bytes than `choose_precision` needs. Raises UsageError if it does not fit.
     """
-    if short and len(data := encode(model, choose_precision(model, viewpoints))) <= room:
+    if short and len(data := encode(model, choose_precision(model, viewpoints))) <= max_bytes:
         return data
     usual = encode(model)
-    if len(usual) > room:
+    if len(usual) > max_bytes:
         raise UsageError(
-            f"a secret of {len(model):,} Gaussians takes {len(usual):,} bytes, and there is room for {room:,}"
+            f"a secret of {len(model):,} Gaussians takes {len(usual):,} bytes, and there is room for "
+            f"{max_bytes:,}"
         )
-    octaves = min(_FINEST, 8 * (room - len(usual)) / len(model) / _BITS_PER_OCTAVE)
+    spare = max_bytes - len(usual)
+    octaves = min(_FINEST, 8 * spare / len(model) / _BITS_PER_OCTAVE)
     while octaves > 0:
         data = encode(model, Precision.usual(model).finer(octaves))
-        if len(data) <= room:
+        if len(data) <= max_bytes:
             return data
         octaves -= 0.125
     return usual
@@ -108,13 +112,13 @@ def most_visible_rows(gaussians: Gaussians, count: int) -> Integers:
     return rows
 
 
-def _prune_to_size(model: Gaussians, room: int) -> Gaussians | None:
-    """The most visible Gaussians that fit into `room` bytes; None if none fits."""
+def _prune_to_size(model: Gaussians, max_bytes: int) -> Gaussians | None:
+    """The most visible Gaussians that fit into `max_bytes` bytes; None if none fits."""
     count = len(model)
     while count > 0:
         kept = most_visible(model, count)
         size = len(encode(kept))
-        if size <= room:
+        if size <= max_bytes:
             return kept
-        count = min(count - 1, int(0.995 * count * room / size))
+        count = min(count - 1, int(0.995 * count * max_bytes / size))
     return None

@@ -88,10 +88,10 @@ def encode(model: Gaussians, precision: Precision | None = None) -> bytes:
     return head + entropy.encode(codes, *_columns(model.sh_degree))
 
 
-def decode(data: bytes, carriers: int | None = None) -> Gaussians:
-    """Invert `encode`; `carriers`: Gaussians of the stego model. Raises InputError for damage.
+def decode(data: bytes, model_size: int | None = None) -> Gaussians:
+    """Invert `encode`; `model_size`: Gaussians of the stego model. Raises InputError for damage.
 
-    Memory is bounded: above 2^16 Gaussians, each takes at least 2 bytes of `data`, and `carriers` is the
+    Memory is bounded: above 2^16 Gaussians, each takes at least 2 bytes of `data`, and `model_size` is the
     maximum.
     """
     if len(data) < _HEAD.size:
@@ -104,8 +104,8 @@ def decode(data: bytes, carriers: int | None = None) -> Gaussians:
             f"the hidden secret is damaged: it declares {count:,} Gaussians of SH degree {sh_degree}"
         )
     largest = len(data) // _MIN_BYTES
-    if count > max(_ALWAYS, largest if carriers is None else min(largest, carriers)):
-        held_by = f"{len(data):,} bytes" + ("" if carriers is None else f" in {carriers:,} Gaussians")
+    if count > max(_ALWAYS, largest if model_size is None else min(largest, model_size)):
+        held_by = f"{len(data):,} bytes" + ("" if model_size is None else f" in {model_size:,} Gaussians")
         raise InputError(
             f"the hidden secret is damaged: it declares {count:,} Gaussians, more than {held_by} can hold"
         )

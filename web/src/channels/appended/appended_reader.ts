@@ -25,7 +25,7 @@ export class AppendedReader implements Reader {
   readonly derivations = 1;
 
   private constructor(
-    readonly salt: Uint8Array, private readonly words: TaggedWords, private readonly names: Uint8Array,
+    readonly salt: Uint8Array, private readonly words: TaggedWords, private readonly ids: Uint8Array,
   ) {}
 
   /** Null if there are none, or if their frame cannot be found. */
@@ -43,13 +43,13 @@ export class AppendedReader implements Reader {
       if (best !== null) {
         const { found, scales } = best;
         const words = wordsOfPoints(colours, scales, inOwnFrame(faint, found.toOwn));
-        return new AppendedReader(found.salt, words, new Uint8Array(carriersOf(model).names.buffer));
+        return new AppendedReader(found.salt, words, new Uint8Array(carriersOf(model).ids.buffer));
       }
     }
     return null;
   }
 
-  /** What `key` opens, null for nothing. Raises InputError if too much was lost or changed. */
+  /** The content that `key` opens, or null. Raises InputError if too much was lost or changed. */
   async open(key: string, derive: Derive = here): Promise<Payload | null> {
     const secret = await derive(key, this.salt);
     for (const width of WIDTHS) {
@@ -60,9 +60,9 @@ export class AppendedReader implements Reader {
       const whole = await decrypted(expand(secret, 'appended/data', 32), encrypted, ASSOCIATED);
       if (whole.length < HOST_BYTES) throw damaged();
       const own = whole.subarray(4, HOST_BYTES);
-      const told = foreign(expand(secret, 'appended/host', 32), this.names, own, viewOf(whole).getUint32(0, true));
+      const told = foreign(expand(secret, 'appended/host', 32), this.ids, own, viewOf(whole).getUint32(0, true));
       const payload = unpackPayload(whole.subarray(HOST_BYTES));
-      return told > (FOREIGN * this.names.length) / 16 ? { ...payload, foreign: told } : payload;
+      return told > (FOREIGN * this.ids.length) / 16 ? { ...payload, foreign: told } : payload;
     }
     return null;
   }

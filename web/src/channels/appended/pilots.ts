@@ -15,7 +15,7 @@ const [TRIES, AGREE] = [300, 12]; // triples of pilots; pilots that must agree
 const SAMPLE = 1024; // pilots tried first
 const NEAR = 1.5 / 2 ** POSITION_BITS; // in the own frame
 
-/** What the pilots encode. */
+/** The data that pilots encode. */
 export interface Found {
   readonly toOwn: Similarity; // from the world to the own frame
   readonly agreeing: number; // pilots

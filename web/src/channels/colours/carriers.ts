@@ -1,8 +1,8 @@
-/** Gaussians that carry bits, and names that identify them; counterpart of `keyss.channels.colours.carriers`. */
+/** Gaussians that carry bits, and IDs; counterpart of `keyss.channels.colours.carriers`. */
 import { ecb } from '@noble/ciphers/aes.js';
 import { rowsOf } from '../../core/bytes.ts';
 import { type Gaussians, opacity, where, withDegree } from '../../core/gaussians.ts';
-import { namesakes, type Words, wordsOf } from '../../core/words.ts';
+import { multiplicities, type Words, wordsOf } from '../../core/words.ts';
 import { expand } from '../../keys/keys.ts';
 
 export const [SCALE_STEPS, COLOUR_STEPS, OPACITY_STEPS] = [16, 38.25, 255]; // quantisation steps of 8-bit formats per unit
@@ -11,7 +11,7 @@ const SCALE_NOISE = 0.144;
 const [RATIO_CELL, OPACITY_CELL, RED_CELL] = [4, 8, 3]; // steps
 const MIN_OPACITY = 2.5 / 255;
 const CELLS = 30_000; // on either side of zero
-const NAME = 8; // values of a name: four, zero-padded to a block of AES
+const ID_VALUES = 8; // values of an ID: four, zero-padded to a block of AES
 
 /** C Gaussians as a reader sees them. */
 export interface Carriers {
@@ -19,10 +19,10 @@ export interface Carriers {
   readonly logScales: Float64Array; // [C, 3]
   readonly opacities: Float64Array; // [C]
   readonly colours: Float64Array; // [C, 3] constant coefficients
-  readonly names: Int16Array; // [C, NAME] cell indices: two scale ratios, opacity, red; zeros
-  readonly doubt: Float64Array; // [C] probability that the name has changed since writing
+  readonly ids: Int16Array; // [C, ID_VALUES] cell indices: two scale ratios, opacity, red; zeros
+  readonly errorProbability: Float64Array; // [C] probability that the ID has changed since writing
   readonly impact: Float64Array; // [C] visibility of a colour change
-  readonly alike: Float64Array; // [C] carriers with the same name, itself included
+  readonly idCounts: Float64Array; // [C] carriers with the same ID, itself included
 }
 
 /** The visible and finite Gaussians. `alignment`: offset of log scales, in steps, to undo a scaling of the model. */
@@ -35,8 +35,8 @@ export function carriersOf(model: Gaussians, alignment = 0): Carriers {
   });
   const [logScales, colours] = [Float64Array.from(seen.logScales), Float64Array.from(seen.sh)];
   const opacities = Float64Array.from(seen.opacityLogits, (logit) => Math.fround(opacity(logit)));
-  const names = new Int16Array(NAME * seen.count);
-  const [doubt, impact] = [new Float64Array(seen.count), new Float64Array(seen.count)];
+  const ids = new Int16Array(ID_VALUES * seen.count);
+  const [errorProbability, impact] = [new Float64Array(seen.count), new Float64Array(seen.count)];
   for (let row = 0; row < seen.count; row++) {
     const [a, b, c] = logScales.subarray(3 * row, 3 * row + 3);
     const whole = [a, b, c].map((each) => cellOf(each * SCALE_STEPS + 0.5 + alignment, 1, SCALE_NOISE));
@@ -46,12 +46,12 @@ export function carriersOf(model: Gaussians, alignment = 0): Carriers {
     });
     const seenAs = cellOf(opacities[row] * OPACITY_STEPS - 0.5, OPACITY_CELL, OPACITY_NOISE);
     const cells = [...ratios, seenAs, cellOf(colours[3 * row] * COLOUR_STEPS, RED_CELL, COLOUR_NOISE)];
-    cells.forEach(([cell], column) => (names[NAME * row + column] = cell));
-    doubt[row] = 1 - cells.reduce((product, [, each]) => product * (1 - each), 1);
+    cells.forEach(([cell], column) => (ids[ID_VALUES * row + column] = cell));
+    errorProbability[row] = 1 - cells.reduce((product, [, each]) => product * (1 - each), 1);
     impact[row] = Math.max(a + b, a + c, b + c) + 2 * Math.log(Math.max(1e-3, ((seenAs[0] + 0.5) * OPACITY_CELL) / OPACITY_STEPS));
   }
-  const alike = Float64Array.from(namesakes(new Uint32Array(names.buffer).filter((_, at) => at % 4 < 2))); // by the four values
-  return { count: seen.count, logScales, opacities, colours, names, doubt, impact, alike };
+  const idCounts = Float64Array.from(multiplicities(new Uint32Array(ids.buffer).filter((_, at) => at % 4 < 2))); // by the four values
+  return { count: seen.count, logScales, opacities, colours, ids, errorProbability, impact, idCounts };
 }
 
 /** The cell of width `steps` of a value, and the probability that noise moved it there. */
@@ -63,24 +63,24 @@ export function cellOf(value: number, steps: number, noise: number): [number, nu
 }
 
 /** The carriers of these rows. */
-export function chosen({ logScales, opacities, colours, names, doubt, impact, alike }: Carriers, rows: ArrayLike<number>): Carriers {
+export function chosen({ logScales, opacities, colours, ids, errorProbability, impact, idCounts }: Carriers, rows: ArrayLike<number>): Carriers {
   return {
     count: rows.length, logScales: rowsOf(logScales, rows, 3), opacities: rowsOf(opacities, rows, 1),
-    colours: rowsOf(colours, rows, 3), names: rowsOf(names, rows, NAME), doubt: rowsOf(doubt, rows, 1),
-    impact: rowsOf(impact, rows, 1), alike: rowsOf(alike, rows, 1),
+    colours: rowsOf(colours, rows, 3), ids: rowsOf(ids, rows, ID_VALUES), errorProbability: rowsOf(errorProbability, rows, 1),
+    impact: rowsOf(impact, rows, 1), idCounts: rowsOf(idCounts, rows, 1),
   };
 }
 
-/** [C, 2] words for names [C, NAME], pseudo-random without the secret: AES-256 of the names. */
-export function randomPairs(secret: Uint8Array, label: string, names: Int16Array): Words {
-  const bytes = new Uint8Array(names.buffer, names.byteOffset, names.byteLength);
+/** [C, 2] words for ids [C, ID_VALUES], pseudo-random without the secret: AES-256 of the IDs. */
+export function randomPairs(secret: Uint8Array, label: string, ids: Int16Array): Words {
+  const bytes = new Uint8Array(ids.buffer, ids.byteOffset, ids.byteLength);
   if (!bytes.length) return new Uint32Array(0);
   return wordsOf(ecb(expand(secret, `colours/${label}`, 32), { disablePadding: true }).encrypt(bytes));
 }
 
-/** [C, 2] numbers in [0, 1) for names [C, NAME]. */
-export function fractions(secret: Uint8Array, label: string, names: Int16Array): Float64Array {
-  const words = randomPairs(secret, label, names);
+/** [C, 2] numbers in [0, 1) for ids [C, ID_VALUES]. */
+export function fractions(secret: Uint8Array, label: string, ids: Int16Array): Float64Array {
+  const words = randomPairs(secret, label, ids);
   return Float64Array.from({ length: words.length >> 1 }, (_, at) => {
     return (words[2 * at + 1] * 2 ** 21 + (words[2 * at] >>> 11)) / 2 ** 53;
   });

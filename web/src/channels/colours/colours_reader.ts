@@ -29,7 +29,7 @@ export class ColoursReader implements Reader {
     return 1 + this.salts.length;
   }
 
-  /** What `key` opens, null for nothing. Raises InputError for damage. */
+  /** The content that `key` opens, or null. Raises InputError for damage. */
   async open(key: string, derive: Derive = here): Promise<Payload | null> {
     const secrets = secretsOf(await Promise.all([STATIC_SALT, ...this.salts].map((salt) => derive(key, salt))));
     const headers = this.alignments.map((carriers) => readHeader(secrets, carriers));
@@ -52,7 +52,7 @@ async function payload(header: Header, secrets: Secrets, carriers: Carriers, shi
   const bits = bitCounts(own.impact.map((each) => each - shift), header.level);
   const sure: number[] = [];
   bits.forEach((count, row) => {
-    const each = (header.held * (1 - CHANGED) * (1 - own.doubt[row])) / own.alike[row];
+    const each = (header.occupancy * (1 - CHANGED) * (1 - own.errorProbability[row])) / own.idCounts[row];
     for (let bit = 0; bit < COLUMNS * count; bit++) sure.push(each);
   });
   if (8 * header.size > MAX_RATE * sure.length) return null;

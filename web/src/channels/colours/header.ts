@@ -12,7 +12,7 @@ const FILE_KEY_BYTES = 5;
 const SHARES = 256; // parts of the carriers, shared out to payloads
 const IDLE = 1 / 255; // unit of the share of unmodified carriers
 const PLACES = 80; // Gaussians of a header under each salt
-const PILOTS = 10; // of the places
+const PILOTS = 10; // places whose bits are known
 const DEPTHS = [1, 2]; // bits per value
 const PLAIN_BYTES = FILE_KEY_BYTES + 6;
 const CHECK_BYTES = 2;
@@ -34,7 +34,7 @@ export function secretsOf([first, ...others]: readonly Uint8Array[]): Secrets {
   return { fixed: expand(first, 'colours/static', 32), salted: others.map((each) => expand(each, 'colours/header', 32)) };
 }
 
-/** How a payload is read. */
+/** Parameters for reading a payload. */
 export interface Header {
   readonly key: Uint8Array; // of the payload
   readonly partition: Uint8Array; // assigns carriers to parts
@@ -42,7 +42,7 @@ export interface Header {
   readonly first: number; // of SHARES that the payload has,
   readonly last: number; // this one included
   readonly size: number; // bytes of the payload
-  readonly held: number; // share of its carriers that hold something
+  readonly occupancy: number; // share of its carriers in use
   readonly median: number; // of impacts when it was written, in MEDIAN_STEPS, without multiples of 256
 }
 
@@ -64,7 +64,7 @@ function readAt(depth: number, { fixed, salted }: Secrets, carriers: Carriers, p
     let sum = PRIOR;
     readBits(secret, own, bits).forEach((read, at) => {
       const place = Math.floor(at / (COLUMNS * depth));
-      const hint = (HELD * (1 - own.doubt[place]) * read) / own.alike[place];
+      const hint = (HELD * (1 - own.errorProbability[place]) * read) / own.idCounts[place];
       if (pilots[place]) {
         sum += Math.log1p(hint);
       } else {
@@ -95,33 +95,33 @@ function unpacked(fixed: Uint8Array, data: Uint8Array): Header {
   const partition = data.slice(0, FILE_KEY_BYTES);
   const key = expand(joined(fixed, partition), 'colours/data-key', 32);
   const size = (16 + (bucket % 16)) << (Math.floor(bucket / 16) + 1); // 32 to 2 million
-  return { key, partition, level, first, last, size, held: 1 - idle * IDLE, median: middle };
+  return { key, partition, level, first, last, size, occupancy: 1 - idle * IDLE, median: middle };
 }
 
 /** [C] the payload's carriers, without those of headers. */
 export function ownRows(header: Header, { salted }: Secrets, carriers: Carriers): number[] {
   const taken = new Set(salted.flatMap((secret) => placesOf(secret, carriers).rows));
-  const parts = fractions(header.partition, 'partition', carriers.names);
+  const parts = fractions(header.partition, 'partition', carriers.ids);
   return [...Array(carriers.count).keys()].filter((row) => {
     const part = Math.floor(SHARES * parts[2 * row]);
     return part >= header.first && part <= header.last && !taken.has(row);
   });
 }
 
-/** How much larger impacts are than when the header was written. */
+/** Increase of the median impact since the header was written. */
 export function shiftOf(header: Header, { impact }: Carriers): number {
   const off = MEDIAN_STEPS * median(impact) - header.median + 128;
   return (off - Math.floor(off / 256) * 256 - 128) / MEDIAN_STEPS;
 }
 
-/** The carriers with the PLACES names chosen by a secret, and which of them are pilots. */
+/** The carriers with the PLACES IDs chosen by a secret, and which of them are pilots. */
 interface Places {
   readonly rows: readonly number[];
   readonly pilots: readonly boolean[];
 }
 
-function placesOf(secret: Uint8Array, { names }: Carriers): Places {
-  const numbers = fractions(secret, 'places', names).filter((_, at) => at % 2 === 0);
+function placesOf(secret: Uint8Array, { ids }: Carriers): Places {
+  const numbers = fractions(secret, 'places', ids).filter((_, at) => at % 2 === 0);
   const least: number[] = [];
   for (const each of numbers.slice().sort()) {
     if (each !== least.at(-1) && least.push(each) > PLACES) break;

@@ -18,8 +18,8 @@ export function bitCounts(impact: Float64Array, level: number): Uint8Array {
 }
 
 /** [B] the seeds of all bits of carriers, for the fountain; `bits` [C]: of each number. */
-export function seedsOf(secret: Uint8Array, label: string, { names }: Carriers, bits: Uint8Array): Words {
-  const [pairs, found] = [randomPairs(secret, label, names), [] as number[]];
+export function seedsOf(secret: Uint8Array, label: string, { ids }: Carriers, bits: Uint8Array): Words {
+  const [pairs, found] = [randomPairs(secret, label, ids), [] as number[]];
   bits.forEach((count, row) => {
     for (let column = 0; column < COLUMNS; column++) {
       for (let bit = 0; bit < count; bit++) {
@@ -32,8 +32,8 @@ export function seedsOf(secret: Uint8Array, label: string, { names }: Carriers, 
 }
 
 /** [B] P(0) - P(1) of all bits of carriers, `bits` [C] in each number. */
-export function readBits(secret: Uint8Array, { names, colours }: Carriers, bits: Uint8Array): Float64Array {
-  const [dithers, found] = [fractions(secret, 'dither', names), [] as number[]];
+export function readBits(secret: Uint8Array, { ids, colours }: Carriers, bits: Uint8Array): Float64Array {
+  const [dithers, found] = [fractions(secret, 'dither', ids), [] as number[]];
   bits.forEach((count, row) => {
     const period = 2 ** count;
     for (let column = 0; column < COLUMNS; column++) {

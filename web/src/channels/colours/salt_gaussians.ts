@@ -14,7 +14,7 @@ const LABEL = ascii('keyss/v1/colours-salt');
 /** Up to 16 salts of 16 bytes. */
 export function saltsOf({ count, logScales, opacities, colours }: Carriers): Uint8Array[] {
   const cells = new Int16Array(6 * count);
-  const names = new Int16Array(8 * count); // the first four cells, zero-padded to a block of AES
+  const ids = new Int16Array(8 * count); // the first four cells, zero-padded to a block of AES
   const stable = Array.from({ length: count }, (_, row) => {
     const ratio = (axis: number) => (logScales[3 * row + axis + 1] - logScales[3 * row + axis]) * SCALE_STEPS - 0.5;
     const own = [
@@ -23,10 +23,10 @@ export function saltsOf({ count, logScales, opacities, colours }: Carriers): Uin
       ...[0, 1, 2].map((column) => cellOf(colours[3 * row + column] * COLOUR_STEPS, COLOUR_CELL, COLOUR_NOISE)),
     ];
     own.forEach(([cell], column) => (cells[6 * row + column] = cell));
-    names.set(cells.subarray(6 * row, 6 * row + 4), 8 * row);
-    return own.slice(0, 4).every(([, doubt]) => doubt === 0);
+    ids.set(cells.subarray(6 * row, 6 * row + 4), 8 * row);
+    return own.slice(0, 4).every(([, errorProbability]) => errorProbability === 0);
   });
-  const hashes = fractions(sha256(LABEL), 'salt', names);
+  const hashes = fractions(sha256(LABEL), 'salt', ids);
   const salts = new Map<string, Uint8Array>();
   BANDS.slice(1).forEach((high, band) => {
     const listed = new Map<number, number>(); // the first Gaussian with each hash

@@ -1,12 +1,12 @@
 /**
- * The low mantissa bits of a model: where they are, and the identities of Gaussians, which are all the rest.
- * See docs/format.md, "Low bits".
+ * The low mantissa bits of a model: where they are, and IDs of Gaussians, hashes of all other bits.
+ * See docs/byte-layout.md, "Low bits".
  */
 import { blake2b } from '@noble/hashes/blake2.js';
 import { ascii, median } from '../../core/bytes.ts';
 import { coefficients, type Gaussians } from '../../core/gaussians.ts';
 
-export const IDENTITY_BYTES = 16;
+export const ID_BYTES = 16;
 export const GEOMETRY = 8; // fields before the harmonics: three scales, four parts of a quaternion, opacity
 export const UNIT_TOLERANCE = 1e-4;
 const FIRST_QUAT = 3;
@@ -61,9 +61,9 @@ export function coarseLength(words: Uint32Array, at: number): number {
 }
 
 /** [N, 16] a public hash of all of a Gaussian that embedding leaves as it is. */
-export function identities(gaussians: Gaussians, fields: Fields): Uint8Array {
+export function gaussianIds(gaussians: Gaussians, fields: Fields): Uint8Array {
   const { count, width, words, masks } = fields;
-  const found = new Uint8Array(count * IDENTITY_BYTES);
+  const found = new Uint8Array(count * ID_BYTES);
   const means = new Uint32Array(gaussians.means.buffer, gaussians.means.byteOffset, 3 * count);
   const row = new Uint32Array(3 + width);
   const bytes = new Uint8Array(row.buffer);
@@ -72,13 +72,13 @@ export function identities(gaussians: Gaussians, fields: Fields): Uint8Array {
     for (let field = 0; field < width; field++) {
       row[3 + field] = words[index * width + field] & ~masks[field];
     }
-    const hash = blake2b(bytes, { dkLen: IDENTITY_BYTES, personalization: PERSONALISATION });
-    found.set(hash, index * IDENTITY_BYTES);
+    const hash = blake2b(bytes, { dkLen: ID_BYTES, personalization: PERSONALISATION });
+    found.set(hash, index * ID_BYTES);
   }
   return found;
 }
 
-/** How many bytes the low bits of one Gaussian make, or those before so many of its harmonics. */
+/** Bytes in the low bits of one Gaussian, with all harmonics or only `harmonics` of them. */
 export function lowWidth(fields: Fields, harmonics = Infinity): number {
   const used = Math.min(harmonics, fields.width - GEOMETRY);
   return (fields.quatsInUse ? GEOMETRY : GEOMETRY - 4) + Math.floor((3 * used) / 2);

@@ -1,12 +1,12 @@
-/** Cells: a few bytes of each Gaussian, recognisable with the key and noise without; see docs/format.md, "Cells". */
+/** Cells: a few bytes of each Gaussian, recognisable with the key and noise without; see docs/byte-layout.md, "Cells". */
 import { ecb } from '@noble/ciphers/aes.js';
 import { expand } from '../../keys/keys.ts';
 
 export const TAG_BYTES = 4;
-const BLOCK = 16; // of AES, and an identity
+const BLOCK = 16; // bytes of a block of AES, and of an ID
 const CELLS = 1 << 14; // at a time
 
-/** What was found: rows of Gaussians, and the data of each. */
+/** Decrypted cells: rows of their carriers, and the data of each. */
 export interface Found {
   readonly rows: number[];
   readonly data: Uint8Array[];
@@ -25,20 +25,20 @@ export class CellCipher {
   }
 
   /** Tries the bytes from `offset` on of every row of `low` [N, width]. */
-  decrypt(names: Uint8Array, low: Uint8Array, width: number, offset: number, slot: number): Found {
+  decrypt(ids: Uint8Array, low: Uint8Array, width: number, offset: number, slot: number): Found {
     const found: Found = { rows: [], data: [] };
-    const count = names.length / BLOCK;
+    const count = ids.length / BLOCK;
     for (let start = 0; start < count; start += CELLS) {
-      const own = names.subarray(start * BLOCK, (start + CELLS) * BLOCK);
+      const own = ids.subarray(start * BLOCK, (start + CELLS) * BLOCK);
       this.decryptSome(found, start, own, low.subarray(start * width + offset), width, slot);
     }
     return found;
   }
 
-  /** [N, size] the key streams of cells in slot 0 whose data are zeros: a pseudo-random function of `names`. */
-  pads(names: Uint8Array): Uint8Array {
-    const states = this.states(names, new Uint8Array((names.length / BLOCK) * this.stride));
-    return this.streams(names, states, BLOCK, 0);
+  /** [N, size] the key streams of cells in slot 0 whose data are zeros: a pseudo-random function of `ids`. */
+  pads(ids: Uint8Array): Uint8Array {
+    const states = this.states(ids, new Uint8Array((ids.length / BLOCK) * this.stride));
+    return this.streams(ids, states, BLOCK, 0);
   }
 
   /** Of Gaussians from `start` on; every `width` bytes of `cells` begin with a cell. */
@@ -66,9 +66,9 @@ export class CellCipher {
   }
 
   /** [N, 16] that begin with the tags of `messages` [N, stride]. */
-  private states(names: Uint8Array, messages: Uint8Array): Uint8Array {
+  private states(ids: Uint8Array, messages: Uint8Array): Uint8Array {
     const { stride } = this;
-    let state = encrypted(this.tagKey, names);
+    let state = encrypted(this.tagKey, ids);
     for (let block = 0; block < stride; block += BLOCK) {
       for (let at = 0; at < state.length; at++) state[at] ^= messages[Math.floor(at / BLOCK) * stride + block + (at % BLOCK)];
       state = encrypted(this.tagKey, state);
@@ -77,10 +77,10 @@ export class CellCipher {
   }
 
   /** [N, size] the key streams; every `width` bytes of `cells` begin with a tag. */
-  private streams(names: Uint8Array, cells: Uint8Array, width: number, slot: number): Uint8Array {
-    const [{ size }, count] = [this, names.length / BLOCK];
+  private streams(ids: Uint8Array, cells: Uint8Array, width: number, slot: number): Uint8Array {
+    const [{ size }, count] = [this, ids.length / BLOCK];
     const found = new Uint8Array(count * size);
-    let seeds: Uint8Array = names.slice();
+    let seeds: Uint8Array = ids.slice();
     for (let cell = 0; cell < count; cell++) {
       for (let at = 0; at < TAG_BYTES; at++) seeds[cell * BLOCK + at] ^= cells[cell * width + at];
       seeds[cell * BLOCK + TAG_BYTES] ^= slot;

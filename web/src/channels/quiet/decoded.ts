@@ -1,6 +1,6 @@
 /**
- * The levels behind a .ply that a program decoded from a .spz, .sog or compressed .ply; `keyss.channels.quiet.decoded` on
- * the other side.
+ * The levels of a .ply that was decoded from a .spz, .sog or compressed .ply; counterpart of
+ * `keyss.channels.quiet.decoded`.
  */
 import type { Gaussians } from '../../core/gaussians.ts';
 import { opacity } from '../../core/gaussians.ts';
@@ -14,13 +14,13 @@ const [MAX_FRACTIONAL_BITS, MAX_POSITION] = [24, 2 ** 23 - 1];
 const [SCALE_LIMIT, MIN_RANGE] = [20, 1e-5];
 const AXES = [0, 1, 2];
 
-/** Levels, and which Gaussians do not follow from them: these carry nothing. */
+/** Levels, and a mask of the Gaussians that are not exact decodings: they carry nothing. */
 export interface Decoded {
   readonly levels: Levels;
   readonly silent: Uint8Array; // [N]
 }
 
-/** Levels, and what they stand for. */
+/** Levels, and the numbers that they decode to. */
 interface Guess {
   readonly levels: Counted;
   readonly mean: OfAxis;
@@ -28,7 +28,7 @@ interface Guess {
   readonly quat: (row: number) => number[];
 }
 
-/** Null for a model whose numbers lie on the steps of no format. */
+/** The decoded model; null if the model was decoded from none of the formats. */
 export function decodedFrom(model: Gaussians): Decoded | null {
   const { count, opacityLogits } = model;
   if (!count || !distinct(opacityLogits.subarray(0, SAMPLE)) || !distinct(opacityLogits)) return null;
@@ -48,7 +48,7 @@ function unwritten({ count, sh, opacityLogits }: Gaussians): OfAxis {
   return (row, part) => (part < 3 ? words[0][width * row + part] : words[1][row]);
 }
 
-/** In ascending order, null for more than 256. */
+/** Distinct values in ascending order; null if there are more than 256. */
 function distinct(values: Float32Array): Float32Array | null {
   const found = new Set<number>();
   for (const each of values) if (found.add(each).size > SIZE) return null;

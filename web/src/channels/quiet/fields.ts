@@ -1,10 +1,9 @@
 /**
- * Which numbers of a rounded model carry bits, how many each, and in which order these are counted;
- * `keyss.channels.quiet.fields` and `kept` on the other side. A .sog is sorted by what is written; its bits are counted
- * in an order of what is not.
+ * The integers of a quantised model that carry bits, how many bits each, and the order in which they are counted;
+ * counterpart of `keyss.channels.quiet.fields` and `order`.
  *
- * All of it is arithmetic that is the same on every machine, in the same order as there, and no logarithms: a bit more or
- * less anywhere, and nothing could be read.
+ * The arithmetic gives the same result on every machine, in the same order of operations as in Python, without
+ * logarithms: a reader must find the same numbers of bits as the writer.
  */
 import { sha256 } from '@noble/hashes/sha2.js';
 import { ascii, joined } from '../../core/bytes.ts';
@@ -15,33 +14,33 @@ import { FINEST, LARGEST } from '../../files/sog.ts';
 import { positionCode, rotationPart, rotationWord } from '../../files/spz.ts';
 
 const MAX_BITS = 10;
-const SHARE = -3; // 2 to this: the range of what is written, in sizes of the Gaussian
-const LOG_SCALE = -4; // 2 to this: the range of what is written in log scales
+const SHARE = -3; // log2 of the range of written positions, in sizes of the Gaussian
+const LOG_SCALE = -4; // log2 of the range of written log scales
 const LOG2_E = 1.4426950408889634;
 const MAX_DISTANCE = 64; // powers of 2
-const HOST_BYTES = 12;
+const HASH_BYTES = 12;
 const AXES = [0, 1, 2];
 const [FACTOR_HIGH, FACTOR_LOW] = [0x9e3779b9, 0x7f4a7c15];
 
-/** A number of a Gaussian: of an axis, or of a part of its rotation. */
+/** One number of a Gaussian per axis, or per component of its rotation. */
 export type OfAxis = (row: number, axis: number) => number;
 
-/** One coordinate of an attribute: of each Gaussian an integer that grows with what it stands for, and its bits, 0 to 10. */
+/** One coordinate of an attribute: the level (integer) of each Gaussian, and the bits that it carries, 0 to 10. */
 interface Field {
   readonly level: (row: number) => number;
   readonly bits: (row: number) => number;
 }
 
-/** The integers of a rounded model. */
+/** The integers of a quantised model. */
 export interface Levels {
-  readonly unwritten: OfAxis; // three constant colours and the opacity, as words of 32 bits
+  readonly unwritten: OfAxis; // three constant colours and the opacity as 32-bit words, which never change
   readonly fields: Field[];
-  readonly rows: ArrayLike<number>; // of Gaussians, in the order in which bits are counted
+  readonly rows: ArrayLike<number>; // Gaussians in the order in which bits are counted
 }
 
 export type Counted = Omit<Levels, 'unwritten'>;
 
-/** Those of a file. */
+/** The levels of a file. */
 export function levelsOf(codes: Codes): Levels {
   if (codes.kind === 'spz') {
     const turn = (row: number, part: number): number => rotationPart(rotationWord(codes, row), part);
@@ -68,23 +67,23 @@ export function byRow(table: ArrayLike<number>, width: number): OfAxis {
   return (row, axis) => table[width * row + axis];
 }
 
-/** Of a .spz; `turn` is null where rotations carry nothing. */
+/** The levels of a .spz; `turn` is null if rotations carry nothing. */
 export function spzLevels(count: number, fractionalBits: number, scale: OfAxis, place: OfAxis, turn: OfAxis | null): Counted {
   const bits = Uint8Array.from({ length: count }, (_, row) => {
-    const size = (middle(row, scale) / 16 - 10) * LOG2_E;
+    const size = (median(row, scale) / 16 - 10) * LOG2_E;
     return fitting(size + fractionalBits + SHARE);
   });
   const places = fieldsOf(place, (row) => bits[row]);
   return { fields: turn ? [...places, ...fieldsOf(turn, () => 3)] : places, rows: inOrder(count) };
 }
 
-/** Of a .sog; `unwritten`: numbers that are not written, by which Gaussians are known, but for distances. */
+/** The levels of a .sog; `unwritten`: the numbers of a Gaussian that never change, without distances. */
 export function sogLevels(
   { count, mins, maxs }: { count: number; mins: readonly number[]; maxs: readonly number[] },
   scale: OfAxis, place: OfAxis, turn: OfAxis, unwritten: (row: number) => number[],
 ): Counted {
   const extent = AXES.map((axis) => (maxs[axis] > mins[axis] ? maxs[axis] - mins[axis] : 1));
-  /** By how many powers of 2 steps are larger at a position than at 0. */
+  /** log2 of the step at a position, relative to the step at 0. */
   const distance = (row: number, axis: number): number => {
     const log = Math.abs(mins[axis] + extent[axis] * (place(row, axis) / FINEST));
     return Math.min(Math.max(Math.floor(log * LOG2_E), 0), MAX_DISTANCE);
@@ -92,13 +91,13 @@ export function sogLevels(
   const finest = extent.map((each) => log2(each / FINEST));
   const places = fieldsOf(place, (row, axis) => {
     const step = finest[axis] + distance(row, axis) + 0.5;
-    return fitting(middle(row, scale) * LOG2_E + SHARE - step);
+    return fitting(median(row, scale) * LOG2_E + SHARE - step);
   });
-  const names = hashes(count, (row) => [...unwritten(row), ...AXES.map((axis) => distance(row, axis))]);
-  return { fields: [...places, ...fieldsOf(turn, () => 2)], rows: unique(names) };
+  const own = hashes(count, (row) => [...unwritten(row), ...AXES.map((axis) => distance(row, axis))]);
+  return { fields: [...places, ...fieldsOf(turn, () => 2)], rows: unique(own) };
 }
 
-/** Of a compressed .ply; `bounds` [3, 2, C]: least and largest log scales of each chunk. */
+/** The levels of a compressed .ply; `bounds` [3, 2, C]: least and largest log scales of each chunk. */
 export function compressedPlyLevels(count: number, bounds: Float64Array[][], scale: OfAxis, turn: OfAxis): Counted {
   const bits = bounds.map(([low, high], axis) =>
     Uint8Array.from(low, (least, chunk) => fitting(LOG_SCALE - log2((high[chunk] - least) / VECTOR[axis]))),
@@ -115,8 +114,8 @@ function inOrder(count: number): Uint32Array {
   return Uint32Array.from({ length: count }, (_, row) => row);
 }
 
-/** The second by size of the numbers of three axes. */
-function middle(row: number, of: OfAxis): number {
+/** The median of the numbers of three axes. */
+function median(row: number, of: OfAxis): number {
   const [a, b, c] = [of(row, 0), of(row, 1), of(row, 2)];
   return Math.max(Math.min(a, b), Math.min(Math.max(a, b), c));
 }
@@ -129,7 +128,7 @@ function fitting(log: number): number {
 const NUMBER = new Float64Array(1);
 const HALVES = new Uint32Array(NUMBER.buffer); // the lower one first, as on all machines that have browsers
 
-/** About the logarithm to base 2, too small by up to 0.09: straight lines between the powers of 2. */
+/** Approximate log2, too small by up to 0.09: linear between powers of 2. */
 export function log2(value: number): number {
   if (value === 0 || !Number.isFinite(value)) return 2 * (value - 1);
   const small = Math.abs(value) < 2 ** -1022; // without an exponent of its own
@@ -155,20 +154,20 @@ export function lastBits({ fields, rows }: Counted, silent?: Uint8Array): Uint8A
   return found;
 }
 
-/** 12 bytes of a hash of what is never written, so that the blocks of one model are of no use in another one. */
-export function hostOf({ unwritten, rows }: Levels): Uint8Array {
+/** 12 bytes of a hash of colours and opacities, which never change: it binds blocks to their model. */
+export function modelHash({ unwritten, rows }: Levels): Uint8Array {
   const words = Uint32Array.from({ length: 4 * rows.length }, (_, at) => unwritten(rows[at >>> 2], at & 3));
-  return sha256(joined(ascii('keyss/v1/host'), new Uint8Array(words.buffer))).subarray(0, HOST_BYTES);
+  return sha256(joined(ascii('keyss/v1/host'), new Uint8Array(words.buffer))).subarray(0, HASH_BYTES);
 }
 
-/** Rows by the order of their hashes, without those that share one: these carry nothing. */
+/** Rows in the order of their hashes, without rows that share one: they carry nothing. */
 function unique(words: Words): Uint32Array {
   const order = sortingOrder(words);
   const starts = runs(words, order);
   return starts.filter((start, run) => starts[run + 1] === start + 1).map((start) => order[start]);
 }
 
-/** [N] a hash of the numbers of each row: times a constant, and the upper bits added to the lower ones. */
+/** [N] hashes of the numbers of each row; counterpart of `row_hashes`. */
 function hashes(count: number, numbers: (row: number) => number[]): Words {
   const words = new Uint32Array(2 * count);
   for (let row = 0; row < count; row++) {

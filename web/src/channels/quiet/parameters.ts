@@ -1,4 +1,4 @@
-/** How what a key decrypts is to be read; see docs/format.md, "Parameters". */
+/** Parameters for reading a secret; see docs/byte-layout.md, "Parameters". */
 import { bytesKey, joined, viewOf } from '../../core/bytes.ts';
 import { damaged, otherVersion, tooMuchLost } from '../../core/errors.ts';
 import type { Codewords } from '../reed_solomon.ts';
@@ -6,25 +6,25 @@ import type { Codewords } from '../reed_solomon.ts';
 const VERSION = 5;
 const PREFIX_BYTES = 30;
 export const SKETCH_BYTES = 32;
-const NUMBERS = 17; // where cells, bytes of a record and of the header, Gaussians and records begin
+const NUMBERS = 17; // offset of cells, bytes of a record and of the header, Gaussians, records
 const MAX_CELLS = 4;
 const MAX_HEADER_BYTES = 4096;
-const [MAX_LENGTH, MAX_CHUNKS] = [1 << 13, 1 << 24]; // of one codeword, of all
-export const NUMBER_BYTES = 3; // of a chunk of a payload
+const [MAX_LENGTH, MAX_CHUNKS] = [1 << 13, 1 << 24]; // chunks of one codeword, of all
+export const NUMBER_BYTES = 3; // size of a chunk's number
 
-/** The parameters of `count` records and copies; a carrier holds `cells` of them. */
+/** Parameters of a secret: `count` records and copies, `cells` per carrier. */
 export interface Parameters {
-  readonly isPayload: boolean; // whose records are numbered chunks
+  readonly isPayload: boolean; // records are numbered chunks of a payload
   readonly method: string;
   readonly cells: number;
   readonly recordBytes: number;
-  readonly gaussians: number; // of the model in which the secret was hidden
+  readonly gaussians: number; // size of the published model
   readonly count: number;
   readonly header: Uint8Array;
-  readonly sketch: Uint8Array; // of these Gaussians; empty in blocks
+  readonly sketch: Uint8Array; // empty in blocks
 }
 
-/** From decrypted parts in any order; `sketched`: bytes of the sketch. Raises InputError. */
+/** Parameters from decrypted parts in any order; `sketched`: bytes of the sketch. Raises InputError. */
 export function unpackParameters(parts: Uint8Array[], sketched: number): Parameters {
   const numbered = new Map(parts.map((part) => [part[0], part.subarray(1)]));
   const prefix = firstBytes(numbered, PREFIX_BYTES);

@@ -1,8 +1,8 @@
 /**
- * What a key opens in the low bits of a model, or in the codes of a file; `keyss.channels.quiet.reading` on the other side.
+ * Reads the low bits of a model, or the codes of a file, with a key; counterpart of `keyss.channels.quiet.reading`.
  *
- * A key that opens nothing makes the same passes over all cells as one that opens a secret, and all salts are always
- * tried, so that how long it takes tells next to nothing.
+ * A wrong key makes the same passes over all cells as a right one, and all salts are always tried, so the time taken
+ * reveals next to nothing.
  */
 import { ascii, bytesKey, mostFrequent, rowsOf } from '../../core/bytes.ts';
 import { damaged, tooMuchLost } from '../../core/errors.ts';
@@ -13,22 +13,22 @@ import { here } from '../../keys/pool.ts';
 import type { Content, Reader } from '../content.ts';
 import { decoded } from '../reed_solomon.ts';
 import { foreign } from '../sketch.ts';
-import { fieldsOf, IDENTITY_BYTES, identities, lowBits, lowWidth } from './bits.ts';
+import { fieldsOf, gaussianIds, ID_BYTES, lowBits, lowWidth } from './bits.ts';
 import { CellCipher, TAG_BYTES } from './cells.ts';
 import { decodedFrom } from './decoded.ts';
-import { hostOf, lastBits, type Levels, levelsOf } from './fields.ts';
+import { lastBits, type Levels, levelsOf, modelHash } from './fields.ts';
 import { NUMBER_BYTES, type Parameters, SKETCH_BYTES, unpackCodewords, unpackParameters } from './parameters.ts';
 import { saltOf, salts } from './salts.ts';
-import { BLOCK_BYTES, held } from './syndromes.ts';
+import { BLOCK_BYTES, readBlocks } from './wet_paper.ts';
 
 const ASSOCIATED = ascii('keyss/v1/quiet');
 const DATA_KEY_BYTES = 16;
 const LEAST_WIDTH = TAG_BYTES + DATA_KEY_BYTES;
 const SALTS_TRIED = 4;
-const DUMMY_CELLS = 2; // of a carrier that a key which opens nothing looks into
-const NARROW_HARMONICS = 9; // of degree 1: some secrets leave the low bits of the others as they are
-const [LEAST_BYTES, MIN_BLOCKS] = [48, 4]; // of a block of codes, of a file with room
-const MAX_BITS = 2 ** 30; // of codes; more would take more memory than tabs have
+const DUMMY_CELLS = 2; // cells per carrier that a wrong key decrypts
+const NARROW_HARMONICS = 9; // of degree 1: some secrets do not write the others
+const [LEAST_BYTES, MIN_BLOCKS] = [48, 4]; // minimum bytes of a block; minimum blocks of a file
+const MAX_BITS = 2 ** 30; // bits in codes; more would exceed the memory of a tab
 
 /** The data of a cell, and its carrier. */
 interface Cell {
@@ -39,7 +39,7 @@ interface Cell {
 /** The carriers of a model, prepared for any number of keys. */
 export class QuietReader implements Reader {
   private constructor(
-    private readonly names: Uint8Array, // [C, 16] identities
+    private readonly ids: Uint8Array, // [C, 16]
     private readonly low: Uint8Array, // [C, width]
     private readonly width: number,
     private readonly widths: readonly number[], // of parameters
@@ -47,7 +47,7 @@ export class QuietReader implements Reader {
     private readonly blocks = false, // the carriers are blocks of codes
   ) {}
 
-  /** In the codes of a coded or decoded model, else in low bits; null without room. */
+  /** The reader of the codes of a coded or decoded model, else of low bits; null without capacity. */
   static of(model: ReadModel): QuietReader | null {
     if (model.codes) return QuietReader.ofCodes(levelsOf(model.codes));
     const decoded = decodedFrom(model);
@@ -56,30 +56,30 @@ export class QuietReader implements Reader {
 
   private static ofLowBits(model: Gaussians): QuietReader {
     let fields = fieldsOf(model);
-    let [names, low] = [identities(model, fields), lowBits(fields)];
+    let [ids, low] = [gaussianIds(model, fields), lowBits(fields)];
     const width = lowWidth(fields);
-    const rows = firstOfEach(names, low, width);
+    const rows = uniqueRows(ids, low, width);
     if (rows.length < model.count) {
       fields = fieldsOf(selected(model, rows));
-      [names, low] = [rowsOf(names, rows, IDENTITY_BYTES), rowsOf(low, rows, width)];
+      [ids, low] = [rowsOf(ids, rows, ID_BYTES), rowsOf(low, rows, width)];
     }
     const widths = [...new Set([width, lowWidth(fields, NARROW_HARMONICS)])].filter((each) => each >= LEAST_WIDTH);
-    return new QuietReader(names, low, width, widths, salts(fields, names, low, width));
+    return new QuietReader(ids, low, width, widths, salts(fields, ids, low, width));
   }
 
   /** `silent` [N]: Gaussians that carry nothing. */
   private static ofCodes(levels: Levels, silent?: Uint8Array): QuietReader | null {
     const bits = lastBits(levels, silent);
     if (bits.length < MIN_BLOCKS * 8 * BLOCK_BYTES || bits.length > MAX_BITS) return null;
-    const low = held(bits);
-    const numbers = new Uint32Array((IDENTITY_BYTES / 4) * (low.length / BLOCK_BYTES));
-    const [names, host] = [new Uint8Array(numbers.buffer), hostOf(levels)];
+    const low = readBlocks(bits);
+    const numbers = new Uint32Array((ID_BYTES / 4) * (low.length / BLOCK_BYTES));
+    const [ids, hash] = [new Uint8Array(numbers.buffer), modelHash(levels)];
     for (let block = 0; 4 * block < numbers.length; block++) {
       numbers[4 * block] = block;
-      names.set(host, IDENTITY_BYTES * block + 4);
+      ids.set(hash, ID_BYTES * block + 4);
     }
-    const salt = saltOf(names.subarray(0, IDENTITY_BYTES), low.subarray(0, LEAST_BYTES));
-    const [others, rest] = [names.subarray(IDENTITY_BYTES), low.subarray(BLOCK_BYTES)];
+    const salt = saltOf(ids.subarray(0, ID_BYTES), low.subarray(0, LEAST_BYTES));
+    const [others, rest] = [ids.subarray(ID_BYTES), low.subarray(BLOCK_BYTES)];
     return new QuietReader(others, rest, BLOCK_BYTES, [LEAST_BYTES], [salt], true);
   }
 
@@ -87,11 +87,11 @@ export class QuietReader implements Reader {
     return Math.min(SALTS_TRIED, this.salts.length);
   }
 
-  /** What `key` opens, null for nothing. Raises InputError for damage. */
+  /** The content that `key` opens, or null. Raises InputError for damage. */
   async open(key: string, derive: Derive = here): Promise<Content | null> {
     const dataKeys: Uint8Array[] = [];
     let secret = new Uint8Array(32);
-    // Other workers derive what comes next while this one looks through the cells.
+    // Other workers derive the next keys while this one reads cells.
     const masters = this.salts.slice(0, this.derivations).map((salt) => derive(key, salt));
     for (const each of masters) {
       secret = new Uint8Array(expand(await each, 'quiet/key', 32));
@@ -112,12 +112,12 @@ export class QuietReader implements Reader {
     if (dataKeys.length === 0 && this.widths.length) {
       const none = expand(secret, 'quiet/none', DATA_KEY_BYTES);
       for (const width of this.widths) this.parts(none, width);
-      this.passesForNothing(none, this.width);
+      this.dummyPasses(none, this.width);
     }
     return null;
   }
 
-  private passesForNothing(dataKey: Uint8Array, width: number): void {
+  private dummyPasses(dataKey: Uint8Array, width: number): void {
     const size = Math.floor(width / DUMMY_CELLS) - TAG_BYTES;
     for (const label of ['record', 'copy']) this.cells(new CellCipher(dataKey, label, size), width, DUMMY_CELLS);
   }
@@ -128,20 +128,20 @@ export class QuietReader implements Reader {
     const [records, copies] = ['record', 'copy'].map((label) =>
       this.cells(new CellCipher(dataKey, label, recordBytes), width, cells).map(({ data }) => data),
     );
-    if (width < this.width) this.passesForNothing(dataKey, this.width - width);
-    const strangers = foreign(dataKey, this.names, parameters.sketch, parameters.gaussians) || undefined;
+    if (width < this.width) this.dummyPasses(dataKey, this.width - width);
+    const foreignCount = foreign(dataKey, this.ids, parameters.sketch, parameters.gaussians) || undefined;
     if (isPayload) {
       const [size, codewords] = unpackCodewords(parameters);
       const chunks = records.map((each): [number, Uint8Array] => [
         each[0] | (each[1] << 8) | (each[2] << 16), each.subarray(NUMBER_BYTES),
       ]);
       const payload = await this.payload(dataKey, parameters, decoded(codewords, chunks).subarray(0, size));
-      return { ...payload, foreign: strangers };
+      return { ...payload, foreign: foreignCount };
     }
     const known = new Set(records.map(bytesKey));
     const all = [...records, ...copies.filter((each) => !known.has(bytesKey(each)))];
     if (!all.length) throw tooMuchLost();
-    return { service: 'records', method, header, records: all, foreign: strangers };
+    return { service: 'records', method, header, records: all, foreign: foreignCount };
   }
 
   private async payload(dataKey: Uint8Array, { method }: Parameters, encrypted: Uint8Array): Promise<Content> {
@@ -149,7 +149,7 @@ export class QuietReader implements Reader {
     return { service: 'payload', method, data };
   }
 
-  /** What the blocks after `row` hold, where the parameters are. */
+  /** The bytes of the blocks after block `row`, which holds the parameters. */
   private inBlocks({ count, recordBytes }: Parameters, row: number): Uint8Array {
     const blocks = this.low.length / BLOCK_BYTES;
     if (count > blocks || recordBytes < 1 || recordBytes > BLOCK_BYTES) throw damaged();
@@ -163,25 +163,25 @@ export class QuietReader implements Reader {
     return this.cells(new CellCipher(dataKey, 'parameters', width - TAG_BYTES));
   }
 
-  /** The cells of each carrier that the cipher decrypts, in the order of these. */
+  /** The cells with a valid tag, in the order of carriers. */
   private cells(cipher: CellCipher, width = this.width, cells = 1): Cell[] {
     const size = Math.floor(width / cells);
     const found: Cell[] = [];
     for (let slot = 0; slot < cells; slot++) {
-      const { rows, data } = cipher.decrypt(this.names, this.low, this.width, slot * size, slot);
+      const { rows, data } = cipher.decrypt(this.ids, this.low, this.width, slot * size, slot);
       rows.forEach((row, index) => found.push({ row, data: data[index] }));
     }
     return found.sort((a, b) => a.row - b.row);
   }
 }
 
-/** Rows of Gaussians, those that agree in identity and low bits only once. */
-function firstOfEach(names: Uint8Array, low: Uint8Array, width: number): number[] {
+/** Rows that differ in ID or low bits. */
+function uniqueRows(ids: Uint8Array, low: Uint8Array, width: number): number[] {
   const seen = new Set<string>();
   const rows: number[] = [];
-  for (let row = 0; row < names.length / IDENTITY_BYTES; row++) {
-    const name = names.subarray(row * IDENTITY_BYTES, (row + 1) * IDENTITY_BYTES);
-    const all = bytesKey(name) + bytesKey(low.subarray(row * width, (row + 1) * width));
+  for (let row = 0; row < ids.length / ID_BYTES; row++) {
+    const id = ids.subarray(row * ID_BYTES, (row + 1) * ID_BYTES);
+    const all = bytesKey(id) + bytesKey(low.subarray(row * width, (row + 1) * width));
     if (!seen.has(all)) rows.push(row);
     seen.add(all);
   }

@@ -1,29 +1,29 @@
-/** The Gaussians that serve as the salt of Argon2id; see docs/format.md, "From a key to a data key". */
+/** The Gaussians that serve as the salt of Argon2id; see docs/byte-layout.md, "From a key to a data key". */
 import { sha256 } from '@noble/hashes/sha2.js';
 import { ascii, joined } from '../../core/bytes.ts';
-import { coarseLength, type Fields, GEOMETRY, IDENTITY_BYTES, UNIT_TOLERANCE } from './bits.ts';
+import { coarseLength, type Fields, GEOMETRY, ID_BYTES, UNIT_TOLERANCE } from './bits.ts';
 
 export const SALTS = 12;
 const LABEL = ascii('keyss/v2/salt');
 const EQUAL_HARMONICS = 2; // pairs of one colour that make a Gaussian doubtful
 
 /** Up to 12 salts of 16 bytes, the likeliest first; `low` has rows of `size` bytes. */
-export function salts(fields: Fields, names: Uint8Array, low: Uint8Array, size: number): Uint8Array[] {
+export function salts(fields: Fields, ids: Uint8Array, low: Uint8Array, size: number): Uint8Array[] {
   const ranks = new Uint16Array(fields.count);
   for (let row = 0; row < fields.count; row++) ranks[row] = rank(fields, row);
   const compare = (a: number, b: number): number =>
     ranks[a] - ranks[b] ||
-    compared(names, a, b, IDENTITY_BYTES) ||
+    compared(ids, a, b, ID_BYTES) ||
     compared(low, a, b, size);
   const order = Array.from(ranks.keys()).sort(compare);
   return order.slice(0, SALTS).map((row) =>
-    saltOf(names.subarray(row * IDENTITY_BYTES, (row + 1) * IDENTITY_BYTES), low.subarray(row * size, (row + 1) * size)),
+    saltOf(ids.subarray(row * ID_BYTES, (row + 1) * ID_BYTES), low.subarray(row * size, (row + 1) * size)),
   );
 }
 
 /** The salt of one carrier. */
-export function saltOf(name: Uint8Array, low: Uint8Array): Uint8Array {
-  return sha256(joined(LABEL, name, low)).slice(0, 16);
+export function saltOf(id: Uint8Array, low: Uint8Array): Uint8Array {
+  return sha256(joined(LABEL, id, low)).slice(0, 16);
 }
 
 function compared(rows: Uint8Array, a: number, b: number, width: number): number {

@@ -1,8 +1,8 @@
-"""Wet paper codes (Fridrich, Goljan, Lisonek and Soukal 2005): some bits must stay, unknown to the reader.
+"""Wet paper codes (Fridrich et al. 2005): some bits must not change, and the reader does not know which.
 
-The bits, in a public random order, are cut into blocks. A block holds its product with a public random
-matrix, modulo 2. The writer solves for the bits that may change ("dry"); the reader multiplies. A block holds
-as many bits as it has dry ones, less the few that random matrices lack in rank.
+The bits are put in a public random order and cut into blocks. The message of a block is its product with a
+public random matrix, modulo 2. The writer solves for the bits that may change ("dry"); the reader multiplies.
+The capacity of a block is its number of dry bits, less the few by which random matrices lack full rank.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from keyss.keys.derivation import stream
 
 BLOCK = 1024  # bits
 _WORDS = BLOCK // 64
-_SPARE = 10  # dry bits beyond those that a block holds: one matrix in 1000 lacks as much in rank
+_SPARE = 10  # dry bits beyond a block's message: one matrix in 1000 lacks so much rank
 _AT_ONCE = 1024  # blocks
 _PUBLIC = bytes(32)  # seed
 
 
 def places(count: int) -> Integers:
-    """[B BLOCK] which of `count` bits are those of the blocks, one block after the other."""
+    """[B BLOCK] indices of the bits of all blocks, a public permutation of `count` bits."""
     numbers = np.frombuffer(stream(_PUBLIC, "codes/order", 8 * count), "<u8")
     # Sorted with their numbers in the lower half: the same on all machines, and faster than `argsort`.
     lower = np.uint64(2**32 - 1)
@@ -32,7 +32,7 @@ def places(count: int) -> Integers:
 
 
 def width_of(dry: Bits) -> int:
-    """Whole bytes that each of the blocks [B BLOCK] holds; `dry`: 1 for bits that may change."""
+    """Whole bytes that every block can hold; `dry` [B BLOCK]: 1 for bits that may change."""
     return max(0, int(dry.reshape(-1, BLOCK).sum(axis=1).min(initial=BLOCK)) - _SPARE) // 8
 
 
@@ -41,16 +41,16 @@ def matrix(rate: int = BLOCK) -> Words:
     return np.frombuffer(stream(_PUBLIC, "codes/matrix", rate * BLOCK // 8), "<u8").reshape(rate, _WORDS)
 
 
-def held(bits: Bits) -> Bytes:
-    """[B, BLOCK / 8] what each block of all `bits` holds, and as much noise as it could not hold."""
+def read_blocks(bits: Bits) -> Bytes:
+    """[B, BLOCK / 8] the messages of all blocks of `bits`, each padded with noise."""
     product = read(bits[places(len(bits))], matrix())
     return np.packbits(product, bitorder="little").reshape(-1, BLOCK // 8)
 
 
-def block_names(count: int, host: bytes) -> Bytes:
-    """[count, 16] the identities of blocks: their numbers, and the 12 bytes `host` of their model."""
+def block_ids(count: int, model_hash: bytes) -> Bytes:
+    """[count, 16] IDs of blocks: their numbers, and the `model_hash` (12 bytes)."""
     numbers = np.arange(count, dtype="<u4")[:, None].view(np.uint8)
-    return np.concatenate([numbers, np.tile(np.frombuffer(host, np.uint8), (count, 1))], axis=1)
+    return np.concatenate([numbers, np.tile(np.frombuffer(model_hash, np.uint8), (count, 1))], axis=1)
 
 
 def read(bits: Bits, rows: Words) -> Bits:
@@ -61,7 +61,7 @@ def read(bits: Bits, rows: Words) -> Bits:
 def write(bits: Bits, dry: Bits, message: Bits, rows: Words) -> Bits | None:
     """[B BLOCK] `bits` with `dry` ones changed so that `read` gives the `message` [B rate].
 
-    All solutions are equally likely if dry bits were random. None if a block has too few of them.
+    All solutions are equally likely if dry bits were random. None if a block has too few dry bits.
 
     One elimination for all blocks: with as many columns of the matrix P as it has rows, and the others F,
     changes are x_P = P^-1 wanted + P^-1 F x_F. A block then needs an x_F by which x_P is 0 where bits stay.
@@ -106,7 +106,7 @@ def _unpacked(rows: Words) -> Bits:
 
 
 def _reduced(rows: Bits, count: int) -> tuple[Bits, Integers]:
-    """Eliminate, modulo 2: the rows, and for each [R] the column, of the first `count`, where only it is 1.
+    """Eliminate modulo 2: the rows, and the pivot column of each [R] among the first `count` columns.
 
     -1 for rows that become 0 there.
     """

@@ -1,4 +1,4 @@
-"""The capacity of a model, and the least visible and least detectable layout of a payload.
+"""The capacity of a model's colours, and the least visible and least detectable layout of a payload.
 
 A payload is detectable by the variance that writing adds, which is smallest per byte with one bit per value
 (level `ONE`). A payload gets the share of the carriers that it needs at that level. If it needs more than may
@@ -30,8 +30,8 @@ from keyss.rendering.difference import psnr_between
 
 MIN_HEADERS = 2  # minimum number of headers in a file at level ONE; those without a secret are noise
 _RATE = 0.42  # data bits per expected bit of information
-_GARBAGE = 0.02  # share of carriers whose name changes although it seemed stable
-_COMFORTABLE = 0.8  # load of a share at level ONE, if there is room; the rest compensates for losses
+_GARBAGE = 0.02  # share of carriers whose ID changes although it seemed stable
+_COMFORTABLE = 0.8  # load of a share at level ONE, if that is enough; the rest compensates for losses
 _ROBUST = 0.5  # the same at other levels: such a payload is detectable anyway
 _MARGIN = 0.5  # dB by which the actual cost of a payload may exceed the predicted cost
 _INCOMPRESSIBLE = 11  # bytes that zlib adds to incompressible data
@@ -51,8 +51,8 @@ class Layout:
 
 
 @dataclass(frozen=True, eq=False)
-class Capacity:
-    """The capacity of a model if its views keep a PSNR of `strength` dB."""
+class Planner:
+    """Plans payloads for a model whose views keep a PSNR of `strength` dB."""
 
     model: Gaussians
     carriers: Carriers
@@ -63,8 +63,8 @@ class Capacity:
         """The largest packed payload; 0 if none fits."""
         if not len(self.carriers):
             return 0
-        room = max(self._room(ONE) * self._max_share, self._room(self._max_level))
-        largest = max((bucket_bytes(each) for each in range(256) if bucket_bytes(each) <= room), default=0)
+        limit = max(self._level_bytes(ONE) * self._max_share, self._level_bytes(self._max_level))
+        largest = max((bucket_bytes(each) for each in range(256) if bucket_bytes(each) <= limit), default=0)
         return max(0, largest - OVERHEAD - _INCOMPRESSIBLE)
 
     def layouts(self, sizes: Sequence[int]) -> tuple[list[Layout], bool] | None:
@@ -84,12 +84,12 @@ class Capacity:
 
     def _layout(self, size: int) -> Layout | None:
         for likely, comfort in product((True, False), (_COMFORTABLE, 1.0)):
-            share = size / max(comfort * self._room(ONE, likely), 1e-3)
+            share = size / max(comfort * self._level_bytes(ONE, likely), 1e-3)
             if share <= self._max_share:
                 return Layout(ONE, share, likely)
-        holds = (size <= _ROBUST * self._room(level) for level in range(1, self._max_level))
+        holds = (size <= _ROBUST * self._level_bytes(level) for level in range(1, self._max_level))
         level = next((level for level, enough in enumerate(holds, start=1) if enough), self._max_level)
-        return Layout(level, 1.0) if self._max_level and size <= self._room(level) else None
+        return Layout(level, 1.0) if self._max_level and size <= self._level_bytes(level) else None
 
     @cached_property
     def _max_share(self) -> float:
@@ -113,12 +113,12 @@ class Capacity:
         sh[self.carriers.rows[rows], 0, 1:] += sh.new_tensor(noise)
         return psnr_between(self.model, replace(self.model.detach(), sh=sh))
 
-    def _room(self, level: int, likely: bool = False) -> float:
+    def _level_bytes(self, level: int, likely: bool = False) -> float:
         """Bytes that all carriers hold, from the expected information of a reader."""
         rows = self.carriers.representatives
         if not len(rows):
             return 0.0
-        sure = (1 - _GARBAGE) * (1 - self.carriers.error_probability[rows]) / self.carriers.name_counts[rows]
+        sure = (1 - _GARBAGE) * (1 - self.carriers.error_probability[rows]) / self.carriers.id_counts[rows]
         error = ((1 - (self.acceptance if likely else 1.0) * sure) / 2).clip(1e-12, 0.5)  # per bit
         information = 1 + error * np.log2(error) + (1 - error) * np.log2(1 - error)
         bits = COLUMNS * bit_counts(self.carriers.impact[rows], level) * information * ~self.excluded[rows]

@@ -1,4 +1,4 @@
-"""Handed-over files: with one, the published model shows a secret without a key.
+"""Companion files: with one, the published model shows a secret without a key.
 
 Methods that do not store a whole secret in the published model write one per secret.
 

@@ -1,4 +1,4 @@
-"""What a key opens: the protocol of hidden scenes, and hidden files."""
+"""Hidden scenes (a protocol) and hidden files, which keys open."""
 
 from __future__ import annotations
 
@@ -39,8 +39,8 @@ class Remains:
         return abs(self.share - 1) <= self.slack and (self.chunks is None or self.chunks[0] == self.chunks[1])
 
 
-class Opened(Protocol):
-    """A secret that its key has opened, not yet revealed."""
+class HiddenScene(Protocol):
+    """A secret scene after its key has opened it, and before `reveal`."""
 
     @property
     def frame(self) -> Similarity | None:

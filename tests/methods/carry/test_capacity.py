@@ -1,4 +1,4 @@
-"""Room in low bits is checked before training."""
+"""The capacity of low bits is checked before training."""
 
 from __future__ import annotations
 

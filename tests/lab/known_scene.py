@@ -10,7 +10,7 @@ from keyss.core import Gaussians, Similarity
 
 @dataclass(frozen=True)
 class Whole:
-    """An `Opened` with a known model."""
+    """A `HiddenScene` with a known model."""
 
     gaussians: Gaussians
     frame: Similarity | None = None

@@ -1,6 +1,6 @@
 /**
- * Wet paper codes, as their reader sees them (Fridrich, Goljan, Lisonek and Soukal 2005): what is written is, of each
- * block of bits, the product with a random matrix modulo 2; `keyss.channels.quiet.syndromes` on the other side.
+ * Reader of wet paper codes (Fridrich et al. 2005): the message of a block of bits is its product with a public random
+ * matrix, modulo 2; counterpart of `keyss.channels.quiet.wet_paper`.
  */
 import { sortingOrder } from '../../core/words.ts';
 import { streamWords } from '../../keys/keys.ts';
@@ -10,8 +10,8 @@ export const BLOCK_BYTES = BLOCK / 8;
 const WORDS = BLOCK / 32;
 const PUBLIC = new Uint8Array(32); // the seed of order and matrix
 
-/** [B, BLOCK_BYTES] what each block of `bits`, 0 or 1 each, holds, and as much noise as it could not hold. */
-export function held(bits: Uint8Array): Uint8Array {
+/** [B, BLOCK_BYTES] the messages of all blocks of `bits` (0 or 1), each padded with noise. */
+export function readBlocks(bits: Uint8Array): Uint8Array {
   const high = new Uint32Array(bits.length);
   streamWords(PUBLIC, 'codes/order', 2 * bits.length, (word, at) => {
     if (at & 1) high[at >>> 1] = word;

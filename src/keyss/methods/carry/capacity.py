@@ -1,4 +1,4 @@
-"""The room for secrets in a cover: records of Gaussians in low bits, or a payload per secret."""
+"""The capacity of a cover for secrets: records of Gaussians in low bits, or a payload per secret."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from keyss.channels import (
     APPENDED,
     LOW_BITS,
     TYPICAL_SHARE,
+    Capacity,
     Channel,
     Layout,
+    LowBitsCapacity,
     LowBitsCover,
-    LowBitsRoom,
     PreparedCover,
-    Room,
 )
 from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
@@ -60,50 +60,50 @@ class SecretSize:
 
 
 def _check_not_tiny(
-    counts: Sequence[int], secrets: Sequence[SecretSize], cover: int, place: str, more_room: str
+    counts: Sequence[int], secrets: Sequence[SecretSize], cover: int, place: str, alternative: str
 ) -> None:
     """Raise UsageError if fewer than _TINY Gaussians of a secret fit into a cover of `cover` Gaussians."""
     if any(count < min(_TINY, secret.count) for count, secret in zip(counts, secrets, strict=True)):
         raise UsageError(
             f"a cover of {cover:,} Gaussians is too small to hide {len(secrets)} "
-            f"{'secrets' if len(secrets) > 1 else 'secret'} in its {place}; {more_room}"
+            f"{'secrets' if len(secrets) > 1 else 'secret'} in its {place}; {alternative}"
         )
 
 
 @dataclass(frozen=True)
-class RecordRoom:
-    """The room for records in low bits: exact for a prepared cover, estimated for one not fitted yet."""
+class RecordCapacity:
+    """The capacity for records in low bits: exact for a prepared cover, estimated for one not fitted yet."""
 
     gaussians: int  # Gaussians of the cover
     sh_degree: int  # SH degree of the cover
-    room: LowBitsRoom
+    cells: LowBitsCapacity
     prepared: LowBitsCover | None = None  # None: not fitted yet
     refit_share = 1.0  # refit size / Gaussians that fit
 
     @staticmethod
-    def of(cover: Gaussians | None, options: CarryOptions, entropy: bytes | None = None) -> RecordRoom:
-        """The room in `cover` after the change of harmonics in `options`.
+    def of(cover: Gaussians | None, options: CarryOptions, entropy: bytes | None = None) -> RecordCapacity:
+        """The capacity of `cover` after the change of harmonics in `options`.
 
         Raises UsageError if a record does not fit into a Gaussian, and if low bits are not random.
         """
         try:
-            return RecordRoom._of(cover, options, os.urandom(32) if entropy is None else entropy)
+            return RecordCapacity._of(cover, options, os.urandom(32) if entropy is None else entropy)
         except UsageError as error:
             raise UsageError(f"{error}; {_ways(cover, options)}") from error
 
     @staticmethod
-    def _of(cover: Gaussians | None, options: CarryOptions, entropy: bytes) -> RecordRoom:
+    def _of(cover: Gaussians | None, options: CarryOptions, entropy: bytes) -> RecordCapacity:
         degree, count = options.fit.sh_degree, options.fit.max_gaussians
         if cover is not None:
             cover = to_degree(cover, degree, entropy)
         layout = Layout(degree) if cover is None else Layout.of(cover)
-        if largest_degree(LowBitsRoom(0, layout.width).record_bytes(1)) is None:
+        if largest_degree(LowBitsCapacity(0, layout.width).record_bytes(1)) is None:
             unit = "" if layout.quats else " with unit quaternions"
             raise UsageError(f"a cover of SH degree {degree}{unit} has no room for anything in its low bits")
         if cover is None:
-            return RecordRoom(count, degree, LowBitsRoom(int(TYPICAL_SHARE * count), layout.width))
+            return RecordCapacity(count, degree, LowBitsCapacity(int(TYPICAL_SHARE * count), layout.width))
         prepared = LOW_BITS.prepare(cover)
-        return RecordRoom(len(cover), degree, prepared.cells, prepared)
+        return RecordCapacity(len(cover), degree, prepared.cells, prepared)
 
     @property
     def cover(self) -> Gaussians | None:
@@ -113,7 +113,7 @@ class RecordRoom:
     @property
     def max_secret_degree(self) -> int:
         """The maximum SH degree of secrets whose records fit into a Gaussian."""
-        return largest_degree(self.room.record_bytes(1)) or 0
+        return largest_degree(self.cells.record_bytes(1)) or 0
 
     def sizes(self, secrets: Sequence[SecretSize]) -> list[tuple[int, int]]:
         """Gaussians and SH degree that fit for each secret, at most its own.
@@ -123,13 +123,13 @@ class RecordRoom:
         counts = [secret.count for secret in secrets]
         degrees = [min(secret.sh_degree, self.max_secret_degree) for secret in secrets]
         requests = [record_request(*size) for size in zip(counts, degrees, strict=True)]
-        capacity = self.room.record_capacity(requests)
+        capacity = self.cells.record_capacity(requests)
         if sum(counts) > capacity:
             # A key must not reveal whether there are other secrets, unless one of them would have no room.
             largest = max(request.least_bytes for request in requests)
-            share = self.room.unnoticed_records(largest, len(secrets)) if len(secrets) > 1 else 0
+            share = self.cells.max_independent_records(largest, len(secrets)) if len(secrets) > 1 else 0
             counts = [min(count, share) for count in counts] if share else divide(counts, capacity)
-        place = f"low bits, {self.room.carriers:,} of them random"
+        place = f"low bits, {self.cells.carriers:,} of them random"
         _check_not_tiny(counts, secrets, self.gaussians, place, _ANY)
         return list(zip(counts, degrees, strict=True))
 
@@ -146,71 +146,75 @@ class RecordRoom:
 
 
 @dataclass(frozen=True)
-class WholeRoom:
-    """The room for payloads: exact for a prepared cover, estimated for one not fitted yet."""
+class PayloadCapacity:
+    """The capacity for payloads: exact for a prepared cover, estimated for one not fitted yet."""
 
     gaussians: int  # Gaussians of the cover
     sh_degree: int  # SH degree of the published model
     channel: Channel
-    room: Room
+    payloads: Capacity
     cover: Gaussians | None = None  # before embedding; None: not fitted yet
     prepared: PreparedCover | None = None
     max_secret_degree = 3
     refit_share = 0.97  # refit size / Gaussians that fit: refitted Gaussians compress a little worse
 
     @staticmethod
-    def of(cover: Gaussians | None, options: CarryOptions, channel: Channel) -> WholeRoom:
-        """The room in `cover`. Raises UsageError for a cover without room."""
+    def of(cover: Gaussians | None, options: CarryOptions, channel: Channel) -> PayloadCapacity:
+        """The capacity of `cover`. Raises UsageError for a cover without capacity."""
         degree, count = options.fit.sh_degree, options.fit.max_gaussians
         if cover is None:
-            return WholeRoom(count, degree, channel, channel.room(count, degree))
+            return PayloadCapacity(count, degree, channel, channel.estimate_capacity(count, degree))
         if cover.sh_degree > degree:
             cover = cover.with_sh_degree(degree)
         prepared = channel.prepare(cover)
-        return WholeRoom(len(cover), cover.sh_degree, channel, prepared.room, cover, prepared)
+        return PayloadCapacity(len(cover), cover.sh_degree, channel, prepared.capacity, cover, prepared)
 
     def sizes(self, secrets: Sequence[SecretSize]) -> list[tuple[int, int]]:
-        """See `RecordRoom.sizes`; an estimate for secrets that do not fit."""
-        rooms = shares(self.room, [secret.payload_bytes for secret in secrets])
+        """See `RecordCapacity.sizes`; an estimate for secrets that do not fit."""
+        limits = shares(self.payloads, [secret.payload_bytes for secret in secrets])
         counts = [
-            min(secret.count, secret.count * room // secret.payload_bytes)
-            for secret, room in zip(secrets, rooms, strict=True)
+            min(secret.count, secret.count * limit // secret.payload_bytes)
+            for secret, limit in zip(secrets, limits, strict=True)
         ]
-        more_room = '`channel="appended"` has room for all' if self.channel.survives else _ANY
-        _check_not_tiny(counts, secrets, self.gaussians, self.channel.place, more_room)
+        alternative = '`channel="appended"` has room for all' if self.channel.survives else _ANY
+        _check_not_tiny(counts, secrets, self.gaussians, self.channel.place, alternative)
         return [(count, secret.sh_degree) for count, secret in zip(counts, secrets, strict=True)]
 
     def prune(self, models: Sequence[Gaussians], viewpoints: Sequence[Viewpoints]) -> list[Gaussians]:
-        """See `RecordRoom.prune`; the SH degree is the one that renders most like the model."""
-        rooms = shares(self.room, [len(encode(model)) for model in models])
-        return [prune_to_size(*each) for each in zip(models, rooms, viewpoints, strict=True)]
+        """See `RecordCapacity.prune`; the SH degree is the one that renders most like the model."""
+        limits = shares(self.payloads, [len(encode(model)) for model in models])
+        return [prune_to_size(*each) for each in zip(models, limits, viewpoints, strict=True)]
 
     def appended(self, secrets: Sequence[SecretSize]) -> int:
         """Approximate number of Gaussians by which the model grows."""
-        if not self.room.grows:
+        if not self.payloads.grows:
             return 0
         return APPENDED.appended_count([secret.payload_bytes for secret in secrets])
 
 
-def room_for(
+def capacity_for(
     cover: Gaussians | None, options: CarryOptions, entropy: bytes | None = None
-) -> RecordRoom | WholeRoom:
-    """The room in a cover: exact for a fitted one, otherwise estimated.
+) -> RecordCapacity | PayloadCapacity:
+    """The capacity of a cover: exact for a fitted one, otherwise estimated.
 
-    Raises UsageError for a cover without room.
+    Raises UsageError for a cover without capacity.
     """
     place = options.place_in(cover)
-    return RecordRoom.of(cover, options, entropy) if place.records else WholeRoom.of(cover, options, place)
+    return (
+        RecordCapacity.of(cover, options, entropy)
+        if place.records
+        else PayloadCapacity.of(cover, options, place)
+    )
 
 
 def _ways(cover: Gaussians | None, options: CarryOptions) -> str:
-    """For messages: the least SH degree that gives `cover` room, and what always works."""
+    """For messages: the least SH degree that gives `cover` capacity, and what always works."""
     for degree in range(options.fit.sh_degree + 1, 3):
         try:
-            room = RecordRoom._of(cover, options.with_fit(sh_degree=degree), os.urandom(32))
+            capacity = RecordCapacity._of(cover, options.with_fit(sh_degree=degree), os.urandom(32))
         except UsageError:
             continue
-        if room.room.carriers:
+        if capacity.cells.carriers:
             return f"`sh_degree={degree}` makes room, {_ANY}"
     return _ANY
 

@@ -1,0 +1,126 @@
+"""Levels that may be written without a visible trace.
+
+Readers need not know which levels these are (`wet_paper`). Towards a limit that levels may not cross, the
+share of writable levels falls gradually, at random: at a sharp border they would pile up. The randomness is
+derived from the cover, which only the writer has.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from keyss.channels.mixing import random_fractions
+from keyss.channels.quiet.fields import Field, Levels, carrying, sog_distances
+from keyss.core.arrays import Doubles, Flags, Integers
+from keyss.core.neighbours import nearest_neighbours
+from keyss.files.formats.common import Codes
+from keyss.files.formats.compressed_ply import CompressedPlyCodes
+from keyss.files.formats.sog import SogCodes
+
+# Distance to the nearest neighbour, in sizes of the Gaussian, at which half of the Gaussians are left single.
+# Clones lie nearer to each other, and there are more of them than by chance.
+_CLONES = 1 / 8
+_NEIGHBOURS = 4  # nearest neighbours searched for clones
+_RAMP = 3  # width of the ramp before a limit, in units of 2^bits levels
+_NEAR = 8  # maximum distance of levels whose frequencies are compared
+_ROUGH = 0.25  # maximum relative excess of pairs of equal levels over pairs of near ones
+_EQUAL = 0.02  # excess that is always allowed, as a share of the Gaussians
+_DEVIATIONS = 6  # standard deviations of that excess by chance
+_BIAS = 0.02  # maximum bias of last bits
+
+
+def writable_levels(codes: Codes, fields: list[Field], secret: bytes) -> list[Flags]:
+    """For each field a mask [N] of the levels that may be written. `secret`: 32 secret bytes."""
+    count = len(fields[0].levels)
+    single = _not_clones(codes, fields, random_fractions(secret, "kept/clones", count))
+    stable = _keep_largest(codes, fields, random_fractions(secret, "kept/turns", count))
+    free = []
+    for field in fields:
+        random = random_fractions(secret, f"kept/{field.name}/{field.column}", count)
+        own = single & (_margin(codes, field) > random * _RAMP * (1 << field.bits)) & (field.bits > 0)
+        if field.name == "rotations":
+            own &= stable
+        free.append(own if _is_natural(field.levels[own]) else np.zeros_like(own))
+    return free
+
+
+def _not_clones(codes: Codes, fields: list[Field], random: Doubles) -> Flags:
+    """[N] which Gaussians are not clones.
+
+    Training moves clones apart slowly, so there are more near pairs than by chance, and writing would move
+    them further apart. The share of writable Gaussians grows smoothly with the distance from the nearest
+    neighbour, relative to their size. Gaussians that share a written attribute with a neighbour never change.
+    """
+    model = codes.dequantise()
+    means, log_scales = (each.double().numpy() for each in (model.means, model.log_scales))
+    sizes = np.exp(np.sort(log_scales, axis=1)[:, 1])
+    distance, near = nearest_neighbours(means, min(_NEIGHBOURS + 1, len(means)))
+    ratio = distance[:, 1] / sizes / _CLONES
+    both = np.minimum(np.arange(len(means)), near[:, 1])  # mutual nearest neighbours share one decision
+    single: Flags = random[both] * (1 + ratio**3) < ratio**3
+    for name in {each.name for each in fields}:
+        levels = np.stack([each.levels for each in fields if each.name == name], axis=1)
+        single &= ~(levels[near[:, 1:]] == levels[:, None]).all(axis=2).any(axis=1)
+    return single
+
+
+def _margin(codes: Codes, field: Field) -> Doubles:
+    """[N] levels between the nearest limit and the range that writing reaches; negative if it crosses."""
+    least, largest = field.levels.min(), field.levels.max()
+    if field.name == "rotations":
+        least, largest = carrying(codes).rotations
+    elif isinstance(codes, CompressedPlyCodes):
+        least, largest = 0, (2047, 1023, 2047)[field.column]
+    margin: Doubles = np.minimum(field.levels - least, largest - field.levels) - 1.0
+    if isinstance(codes, SogCodes) and field.name == "positions":
+        margin = np.minimum(margin, _to_next_distance(codes, field))
+    return margin - field.reach
+
+
+def _to_next_distance(codes: SogCodes, field: Field) -> Doubles:
+    """[N] distance of each level from the nearest change of `sog_distances`, which determines `bits`."""
+    every = np.zeros((65536, 3), np.int64)
+    every[:, field.column] = np.arange(65536)
+    borders = np.flatnonzero(np.diff(sog_distances(codes, every)[:, field.column])) + 0.5
+    borders = np.concatenate([[-np.inf], borders, [np.inf]])
+    after = np.searchsorted(borders, field.levels)
+    gaps: Doubles = np.minimum(field.levels - borders[after - 1], borders[after] - field.levels) - 0.5
+    return gaps
+
+
+def _keep_largest(codes: Codes, fields: list[Field], random: Doubles) -> Flags:
+    """[N] which rotations keep their largest component, the one that is not stored."""
+    own = [each for each in fields if each.name == "rotations"]
+    if not own:
+        return np.ones(len(random), np.bool_)
+    least, largest = carrying(codes).rotations
+    parts = np.abs(np.stack([each.levels for each in own], axis=1) - (least + largest) / 2)
+    parts += np.stack([each.reach for each in own], axis=1)
+    rest = np.sqrt(np.maximum(0.0, (largest - least) ** 2 / 2 - np.square(parts).sum(axis=1)))
+    stable: Flags = rest - parts.max(axis=1) > random * _RAMP * (1 << own[0].bits)
+    return stable
+
+
+def _is_natural(levels: Levels) -> bool:
+    """True if matching leaves no trace in levels [N].
+
+    Pairs of equal levels are about as frequent as pairs of near ones, and even levels as odd ones.
+    """
+    if len(levels) < 2:
+        return True
+    values, found = np.unique(levels.astype(np.int64), return_counts=True)
+    counts = found.astype(np.int64)
+    equal = float((counts * (counts - 1)).sum())
+    near = [_pairs(values, counts, distance) for distance in range(1, _NEAR + 1)]
+    expected = float(np.mean(near))
+    if equal - expected > max(_ROUGH * expected, _EQUAL * len(levels), _DEVIATIONS * expected**0.5):
+        return False
+    odd = float((levels & 1).mean())
+    return bool(abs(odd - 0.5) < _BIAS + _DEVIATIONS / 2 / len(levels) ** 0.5)
+
+
+def _pairs(values: Integers, counts: Integers, distance: int) -> float:
+    """The number of pairs of levels that differ by `distance`."""
+    at = np.searchsorted(values, values + distance).clip(max=len(values) - 1)
+    there = values[at] == values + distance
+    return float((counts[there] * counts[at[there]]).sum())
