@@ -3,7 +3,12 @@
     python benchmarks/opensplat.py ../shared/data/fox PATH/OF/opensplat
     python benchmarks/opensplat.py ../shared/data/fox PATH/OF/opensplat --sizes 200,12000,200 400,12000,500
 
-OpenSplat (github.com/pierotofy/OpenSplat) is not a part of keyss; its README tells how to build it for a CPU.
+OpenSplat (github.com/pierotofy/OpenSplat) is not a part of keyss. On Debian, with libopencv-dev and cmake:
+
+    cmake -B build -DGPU_RUNTIME=CPU -DCMAKE_BUILD_TYPE=Release \\
+        -DCMAKE_PREFIX_PATH=$(python -c 'import torch; print(torch.utils.cmake_prefix_path)')
+    make -C build
+
 Sizes are the width of the photos in pixels, the number of points, which is also the limit for keyss's
 Gaussians, and the number of steps. Both use two threads, start from the scene's points, and read and write
 files. OpenSplat gets the training photos in their final size (`--num-downscales 0`); keyss renders its
@@ -34,7 +39,7 @@ import torch
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-SIZES = ("200,12000,200", "300,12000,400", "400,12000,600")
+SIZES = ("200,12000,200", "300,12000,400", "400,12000,150")
 TWO_THREADS = {"OMP_NUM_THREADS": "2", "NUMBA_NUM_THREADS": "2"}
 MOST_STEPS = 30_000
 BACKGROUND = (0.6130, 0.0101, 0.3984)  # OpenSplat's

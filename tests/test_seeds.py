@@ -109,7 +109,7 @@ def test_resumed_fit_keeps_seed(tmp_path: Path, given: int | None) -> None:
 
 
 @pytest.mark.filterwarnings("ignore:.*appended Gaussians")
-@pytest.mark.parametrize("stage", ["plain model", "hide"])
+@pytest.mark.parametrize("stage", [pytest.param("plain model", marks=pytest.mark.slow), "hide"])
 def test_resumed_hiding_keeps_seed(tmp_path: Path, stage: str) -> None:
     """The files equal those of an uninterrupted run."""
     scenes, run = (tiny_scene(0), [Secret(tiny_scene(1), KEY)]), tmp_path / "run"

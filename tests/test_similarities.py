@@ -58,8 +58,7 @@ def test_distant_scene_is_recentred(tmp_path: Path) -> None:
         assert (scene.to_scene_frame(model).means - local.means).abs().max() < 1  # single precision far out
 
 
-@pytest.mark.parametrize("scale", [1e-4, 1e6])
-@pytest.mark.parametrize("publish", ["as-is", "any"])
+@pytest.mark.parametrize(("publish", "scale"), [("as-is", 1e-4), ("as-is", 1e6), ("any", 1e6)])
 def test_hide_at_any_scale(publish: str, scale: float) -> None:
     cover = Similarity(scale).apply_gaussians(random_gaussians(2500, seed=1))
     noise = torch.Generator().manual_seed(0)

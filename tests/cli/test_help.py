@@ -26,16 +26,11 @@ def test_overview(keyss: Run) -> None:
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_example(keyss: Run, command: str) -> None:
-    result = keyss(command, "--help")
-    assert result.status == 0
-    assert f"example: keyss {command}" in result.out
-    assert "default: None" not in result.out
-
-
-@pytest.mark.parametrize("command", COMMANDS)
-def test_common_options(keyss: Run, command: str) -> None:
-    out = keyss(command, "--help").out
+def test_example_and_common_options(keyss: Run, command: str) -> None:
+    status, out, _ = keyss(command, "--help")
+    assert status == 0
+    assert f"example: keyss {command}" in out
+    assert "default: None" not in out
     random = {"fit", "hide", "audit", "compare", "reproduce", "demo"}
     assert ("--seed" in out) == (command in random)
     computing = {"fit", "hide", "reveal", "verify", "render", "convert", "evaluate", "audit", "demo"}

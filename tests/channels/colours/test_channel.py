@@ -138,7 +138,10 @@ def test_a_fifth_of_the_capacity_opens_after(prepared: ColoursCover, name: str) 
     assert extract(HARDER[name](stego), "a") == data
 
 
-@pytest.mark.parametrize("index", range(6))
+SLOW = pytest.param(4, marks=pytest.mark.slow)  # .sog by splat-transform
+
+
+@pytest.mark.parametrize("index", [*range(4), SLOW, 5])
 def test_formats_of_other_programs(index: int, stego: Gaussians, payload: bytes) -> None:
     converter = converters()[index]
     try:
