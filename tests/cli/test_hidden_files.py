@@ -53,6 +53,14 @@ def test_round_trip(keyss: Run, folder: Path, tmp_path: Path) -> None:
         assert stat.S_IMODE(out.stat().st_mode) == 0o600
 
 
+def test_verify(keyss: Run, folder: Path) -> None:
+    stego = folder / "out" / "publish" / "model.ply"
+    for index, count in enumerate(("3,000 of 3,000", "0")):
+        result = keyss("verify", stego, "--key-file", folder / f"key{index}")
+        assert (result.status, result.err) == (0, "")
+        assert f"secret  {count} bytes: complete" in result.out
+
+
 def test_invalid_combinations(keyss: Run, folder: Path, workspace: Path, tmp_path: Path) -> None:
     out, back = tmp_path / "out", tmp_path / "back"
     hide = _arguments(folder, out)
