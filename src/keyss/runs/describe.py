@@ -74,14 +74,16 @@ def info(path: str | Path) -> RunInfo | ModelInfo | SceneInfo:
 def _folder_info(path: Path) -> RunInfo | ModelInfo | SceneInfo:
     from keyss.files.scenes import load_scene
     from keyss.files.training_outputs import is_training, model_file
-    from keyss.runs.files import METRICS, MODEL, is_run, stego_in
+    from keyss.runs.files import METRICS, MODEL, is_run, model_in
     from keyss.runs.json_records import read_record
     from keyss.runs.run_records import FitMetrics, HideMetrics
 
-    if stego_in(path).exists():
+    if inside := model_in(path):
+        if not (path / METRICS).exists():  # hidden files have none, and `private/` may have been deleted
+            return _model_info(inside)
+        if inside == path / MODEL:
+            return RunInfo("plain model", str(path), read_record(path / METRICS, FitMetrics))
         return RunInfo("hiding", str(path), read_record(path / METRICS, HideMetrics))
-    if (path / MODEL).exists():
-        return RunInfo("plain model", str(path), read_record(path / METRICS, FitMetrics))
     if runs := sorted(each for each in path.iterdir() if is_run(each)):
         named = ", ".join(map(str, runs[:_NAMED])) + f" and {len(runs) - _NAMED} more" * (len(runs) > _NAMED)
         raise InputError(f"{path} is not a run, but a folder of runs: name one of {named}")
