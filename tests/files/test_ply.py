@@ -236,7 +236,7 @@ BROKEN = {
     "unknown type": (header_of("element vertex 1", "property half x"), "cannot parse line"),
     "list in vertex": (header_of(*XYZ, "property list uchar int f"), "list property"),
     "list before": (header_of("element a 1", "property list uchar int f", *XYZ), "list property"),
-    "point cloud": (header_of(*XYZ) + bytes(12), "point cloud, not a 3DGS model.*missing: f_dc_0"),
+    "point cloud": (header_of(*XYZ) + bytes(12), "a mesh or point cloud, not a 3DGS model.*missing: f_dc_0"),
     "compressed": (header_of("element vertex 1", "property uint packed_position"), "compressed"),
     "no model": (
         header_of("element vertex 1", "property float u") + bytes(4),
