@@ -165,8 +165,8 @@ class Verification:
 
     @property
     def problems(self) -> tuple[str, ...]:
-        """Problems of the secret if there is a key, else of the model."""
-        return self.model.problems if self.secret is None else self.secret.problems
+        """Problems of the model and, with a key, of the secret."""
+        return self.model.problems + (() if self.secret is None else self.secret.problems)
 
 
 def check_model(model: Gaussians) -> ModelCheck:
