@@ -25,6 +25,7 @@ def test_run_folder_as_model(keyss: Run, workspace: Path, tmp_path: Path, inside
     give = f"found a folder; give {workspace / 'hidden' / 'publish' / 'model.ply'}"
     assert_refused(keyss("reveal", run, *key_argument(workspace), "-o", tmp_path / "s.ply"), 4, give)
     assert_refused(keyss("render", run, "--cameras", workspace / "a", "-o", out), 4, give)
+    assert_refused(keyss("view", run, "-o", out), 4, give)
     hide = ("hide", *scene_arguments(workspace), "-o", out)
     assert_refused(keyss(*hide, "--cover-model", run), 4, give)
     assert listing(tmp_path) == {}
