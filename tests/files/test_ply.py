@@ -196,8 +196,9 @@ def test_activated_scales_and_opacities_are_refused(tmp_path: Path, unit: float,
     if "opacities" in which:
         plain = replace(plain, opacity_logits=plain.opacities)
     write_model(tmp_path / "activated.ply", plain)
-    with pytest.raises(InputError, match=f"its {which} are those that renderers use.* apply log to"):
-        read_model(tmp_path / "activated.ply")
+    for read in (read_model, info):
+        with pytest.raises(InputError, match=f"its {which} are those that renderers use.* apply log to"):
+            read(tmp_path / "activated.ply")
 
 
 def test_2dgs_and_rgb_models(tmp_path: Path) -> None:

@@ -133,7 +133,7 @@ def _ply_rows(path: Path) -> tuple[Any, Any, int] | None:
     """Means, opacity logits and SH degree of a plain PLY file, without torch; None for other files."""
     import numpy as np
 
-    from keyss.files.ply_rows import has_packed_header, read_rows
+    from keyss.files.ply_rows import check_not_activated, has_packed_header, read_rows
 
     if path.suffix.lower() != ".ply":
         return None
@@ -142,7 +142,8 @@ def _ply_rows(path: Path) -> tuple[Any, Any, int] | None:
             return None
         file.seek(0)
         model = read_rows(file)
-        rows = np.concatenate([rows[:, [0, 1, 2, -8]] for rows, _ in model.blocks])
+        rows = np.concatenate([rows[:, [0, 1, 2, -8, -7, -6, -5]] for rows, _ in model.blocks])
+        check_not_activated(rows[:, :3], rows[:, 4:], rows[:, 3])
     return rows[:, :3], rows[:, 3], round(((len(model.names) - 11) // 3) ** 0.5) - 1
 
 
