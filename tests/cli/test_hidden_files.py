@@ -81,6 +81,16 @@ def test_invalid_combinations(keyss: Run, folder: Path, workspace: Path, tmp_pat
     assert listing(tmp_path) == {}
 
 
+def test_names_that_are_not_text(folder: Path, tmp_path: Path) -> None:
+    named = tmp_path / os.fsdecode(b"K\xfcche.pdf")
+    named.write_bytes(b"plan")
+    hidden = library.hide_files(folder / "cover.ply", [library.SecretFile(named, KEYS[0])])
+    assert hidden.stego is not None
+    assert library.reveal(hidden.stego, KEYS[0]).file == HiddenFile(
+        "K\N{REPLACEMENT CHARACTER}che.pdf", b"plan"
+    )
+
+
 def test_file_too_large(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"too small to carry .* Gaussians would do; .*channel="):
         library.hide_files(trained_like(2000), [library.SecretFile(os.urandom(90_000), KEYS[0])])
