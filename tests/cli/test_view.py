@@ -28,6 +28,7 @@ def test_invalid_models(keyss: Run, tmp_path: Path) -> None:
         assert_refused(keyss(*command, str(tmp_path / "nowhere.ply")), 4, "no such file")
         assert_refused(keyss(*command, str(tmp_path)), 4, "found a folder")
     assert_refused(keyss("view", str(tmp_path / "model.txt"), "--port", "70000"), 2, "--port")
+    assert_refused(keyss("view", str(tmp_path / "model.txt"), "--pose", "1,2,3"), 2, "--pose: expected eye=")
 
 
 def test_unsupported_formats_are_converted(keyss: Run, tmp_path: Path) -> None:

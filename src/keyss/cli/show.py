@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -64,6 +65,8 @@ def view(
     from keyss.core.errors import UsageError
     from keyss.viewer import ModelServer, export_html, look_of_model
 
+    if pose and not re.fullmatch(r"#?eye=[^&]+&target=[^&]+(&up=[^&]+)?", pose):
+        raise UsageError(f"--pose: expected eye=X,Y,Z&target=X,Y,Z as in the page's address, got {pose}")
     given = {"pose": pose, "up": up, "title": title, "host": allow_host, "embedder": embed_in}
     look = look_of_model(model) | {name: value for name, value in given.items() if value}
     if out is not None:
