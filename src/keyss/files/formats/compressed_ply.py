@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Self
 
 import numpy as np
@@ -39,6 +39,7 @@ _BOUNDS = [
     for end in ("min", "max")
     for name in names.split()
 ]
+_COLOR_BOUNDS = np.repeat(np.array([0, 1], np.float32), 3)  # of old files, which do not state them
 _PACKED = ["packed_position", "packed_rotation", "packed_scale", "packed_color"]
 
 
@@ -56,14 +57,15 @@ class CompressedPlyCodes(Codes):
     colors: Bytes  # [N, 3] between the bounds
     alphas: Bytes  # [N] opacities in 255ths
     sh: Bytes  # [N, K - 1, 3] harmonics in 32nds from -4 on
+    comments: tuple[str, ...] = field(default=(), compare=False)  # whole lines of the header
 
     def __len__(self) -> int:
         return len(self.positions)
 
     @classmethod
     def parse(cls, data: bytes) -> Self:
-        """See `Codes`. Old files have no colour bounds; they are 0 and 1."""
-        tables = read_tables(io.BytesIO(data))
+        """See `Codes`."""
+        tables, comments = read_tables(io.BytesIO(data))
         vertex, chunk = tables["vertex"], tables.get("chunk")
         n = len(vertex)
         if chunk is None or not _has(vertex, _PACKED, "u4") or not _has(chunk, _BOUNDS[:12], "f4"):
@@ -74,7 +76,7 @@ class CompressedPlyCodes(Codes):
             raise InputError("it holds no Gaussians")
         if len(chunk) != -(-n // CHUNK):
             raise InputError(f"expected {-(-n // CHUNK):,} chunks of {n:,} Gaussians, found {len(chunk):,}")
-        bounds = np.tile(np.repeat(np.array([0, 1], np.float32), 3), (len(chunk), 3))
+        bounds = np.tile(_COLOR_BOUNDS, (len(chunk), 3))
         for column, name in enumerate(_BOUNDS if _has(chunk, _BOUNDS, "f4") else _BOUNDS[:12]):
             bounds[:, column] = chunk[name]
         position, rotation, scale, color = (vertex[name].astype(np.uint32) for name in _PACKED)
@@ -87,6 +89,7 @@ class CompressedPlyCodes(Codes):
             colors=_unpack_fields(color >> 8, (8, 8, 8)).astype(np.uint8),
             alphas=(color & 255).astype(np.uint8),
             sh=_harmonics(tables.get("sh"), n),
+            comments=tuple(comments),
         )
 
     def serialise(self) -> bytes:
@@ -96,14 +99,17 @@ class CompressedPlyCodes(Codes):
         packed[:, 1] = self.largest.astype(np.uint32) << 30 | _pack_fields(self.rotations, (10, 10, 10))
         packed[:, 2] = _pack_fields(self.scales, _VECTOR)
         packed[:, 3] = _pack_fields(self.colors, (8, 8, 8)) << np.uint32(8) | self.alphas
+        has_colors = bool((self.bounds[:, 12:] != _COLOR_BOUNDS).any())  # not in old files
+        names = _BOUNDS if has_colors else _BOUNDS[:12]
         elements = {
-            "chunk": (len(self.bounds), [f"float {name}" for name in _BOUNDS]),
+            "chunk": (len(self.bounds), [f"float {name}" for name in names]),
             "vertex": (n, [f"uint {name}" for name in _PACKED]),
         }
         if k:
             elements["sh"] = (n, [f"uchar f_rest_{i}" for i in range(3 * k)])
         harmonics = self.sh.transpose(0, 2, 1).tobytes()
-        return ply_header(elements) + self.bounds.astype("<f4").tobytes() + packed.tobytes() + harmonics
+        bounds = self.bounds[:, : len(names)].astype("<f4").tobytes()
+        return ply_header(elements, self.comments) + bounds + packed.tobytes() + harmonics
 
     @classmethod
     def quantise(cls, model: Gaussians) -> Self:
