@@ -14,9 +14,10 @@ from keyss.channels.quiet.excess import DEVIATIONS, ROUGH, without_excess
 from keyss.channels.quiet.fields import Field, Levels, carrying, sog_distances
 from keyss.core.arrays import Doubles, Flags, Integers
 from keyss.core.neighbours import nearest_neighbours
-from keyss.files.formats.common import Codes
-from keyss.files.formats.compressed_ply import CompressedPlyCodes
+from keyss.files.formats.common import Codes, is_in_morton_order
+from keyss.files.formats.compressed_ply import CHUNK, VECTOR, CompressedPlyCodes
 from keyss.files.formats.sog import SogCodes
+from keyss.files.formats.spz import SpzCodes
 
 # Distance to the nearest neighbour, in sizes of the Gaussian, at which half of the Gaussians are left single.
 # Clones lie nearer to each other, and there are more of them than by chance.
@@ -26,10 +27,14 @@ _RAMP = 3  # width of the ramp before a limit, in units of 2^bits levels
 _NEAR = 8  # maximum distance of levels whose frequencies are compared
 _EQUAL = 0.02  # excess that is always allowed, as a share of the Gaussians
 _BIAS = 0.02  # maximum bias of last bits
+_OFF_LATTICE = 0.24  # minimum mean distance from a lattice, in steps; by chance it is 0.248
 
 
-def writable_levels(codes: Codes, fields: list[Field], secret: bytes) -> list[Flags]:
-    """For each field a mask [N] of the levels that may be written. `secret`: 32 secret bytes."""
+def writable_levels(codes: Codes, fields: list[Field], fixed: Flags, secret: bytes) -> list[Flags]:
+    """For each field a mask [N] of the levels that may be written.
+
+    `fixed` [3]: the result of `fixed_axes`. `secret`: 32 secret bytes.
+    """
     count = len(fields[0].levels)
     means = codes.dequantise().means.double().numpy()
     distance, near = nearest_neighbours(means, min(_NEIGHBOURS + 1, count))
@@ -43,8 +48,28 @@ def writable_levels(codes: Codes, fields: list[Field], secret: bytes) -> list[Fl
         own &= _margin(codes, field) > random * _RAMP * (1 << field.bits)
         if field.name == "rotations":
             own &= stable
+        elif field.name == "positions" and fixed[field.column]:
+            own[:] = False
         free.append(own if _is_natural(field.levels[own]) else np.zeros_like(own))
     return free
+
+
+def fixed_axes(codes: Codes) -> Flags:
+    """[3] axes along which no position may change. `codes`: in the order of their file.
+
+    All axes of an .spz in Morton order: it would be less in order than rounding explains. (A .sog is sorted
+    again.) Those along which positions are on the lattices of the chunks of a compressed .ply.
+    """
+    means = codes.dequantise().means.numpy()
+    if isinstance(codes, SpzCodes) and is_in_morton_order(means):
+        return np.ones(3, np.bool_)
+    chunks = means[: len(means) // CHUNK * CHUNK].astype(np.float64).reshape(-1, CHUNK, 3)
+    low, high = chunks.min(axis=1, keepdims=True), chunks.max(axis=1, keepdims=True)
+    levels = (chunks - low) / np.where(high > low, high - low, 1.0) * (2.0 ** np.array(VECTOR) - 1)
+    distances = np.abs(levels - np.rint(levels)).reshape(-1, 3)
+    expected = _OFF_LATTICE - DEVIATIONS / (12 * max(1, len(distances))) ** 0.5
+    fixed: Flags = distances.sum(axis=0) < expected * len(distances)
+    return fixed
 
 
 def _not_clones(

@@ -29,7 +29,7 @@ from keyss.files.formats.common import (
 from keyss.files.ply_table import ply_header, read_tables
 
 CHUNK = 256  # Gaussians
-_VECTOR = (11, 10, 11)  # bits of x, y, z
+VECTOR = (11, 10, 11)  # bits of x, y, z
 _SCALE_LIMIT = 20.0  # log scales are clipped to +- this
 _MIN_RANGE = 1e-5  # in chunks of smaller range, all values become the lower bound
 
@@ -82,10 +82,10 @@ class CompressedPlyCodes(Codes):
         position, rotation, scale, color = (vertex[name].astype(np.uint32) for name in _PACKED)
         return cls(
             bounds=bounds,
-            positions=_unpack_fields(position, _VECTOR).astype(np.uint16),
+            positions=_unpack_fields(position, VECTOR).astype(np.uint16),
             largest=(rotation >> 30).astype(np.uint8),
             rotations=_unpack_fields(rotation, (10, 10, 10)).astype(np.uint16),
-            scales=_unpack_fields(scale, _VECTOR).astype(np.uint16),
+            scales=_unpack_fields(scale, VECTOR).astype(np.uint16),
             colors=_unpack_fields(color >> 8, (8, 8, 8)).astype(np.uint8),
             alphas=(color & 255).astype(np.uint8),
             sh=_harmonics(tables.get("sh"), n),
@@ -95,9 +95,9 @@ class CompressedPlyCodes(Codes):
     def serialise(self) -> bytes:
         n, k = self.sh.shape[:2]
         packed = np.empty((n, 4), dtype="<u4")
-        packed[:, 0] = _pack_fields(self.positions, _VECTOR)
+        packed[:, 0] = _pack_fields(self.positions, VECTOR)
         packed[:, 1] = self.largest.astype(np.uint32) << 30 | _pack_fields(self.rotations, (10, 10, 10))
-        packed[:, 2] = _pack_fields(self.scales, _VECTOR)
+        packed[:, 2] = _pack_fields(self.scales, VECTOR)
         packed[:, 3] = _pack_fields(self.colors, (8, 8, 8)) << np.uint32(8) | self.alphas
         has_colors = bool((self.bounds[:, 12:] != _COLOR_BOUNDS).any())  # not in old files
         names = _BOUNDS if has_colors else _BOUNDS[:12]
@@ -123,7 +123,7 @@ class CompressedPlyCodes(Codes):
         between = bounds.astype(np.float64).repeat(CHUNK, axis=0)[: len(model)].reshape(-1, 3, 2, 3)
         position, scale, color = (_inverse_lerp(between[:, i], values) for i, values in enumerate(parts))
         largest, others = smallest_three(quats)
-        steps = 2.0 ** np.array(_VECTOR) - 1
+        steps = 2.0 ** np.array(VECTOR) - 1
         return cls(
             bounds=bounds,
             positions=np.floor(position * steps + 0.5).astype(np.uint16),
@@ -137,7 +137,7 @@ class CompressedPlyCodes(Codes):
 
     def dequantise(self) -> Gaussians:
         bounds = self.bounds.astype(np.float64).repeat(CHUNK, axis=0)[: len(self)].reshape(-1, 3, 2, 3)
-        steps = 2.0 ** np.array(_VECTOR) - 1
+        steps = 2.0 ** np.array(VECTOR) - 1
         rotations = (self.rotations / 1023 - 0.5) * np.sqrt(2)
         harmonics = np.where(self.sh == 0, 0.0, np.where(self.sh == 255, 256.0, self.sh + 0.5))
         return gaussians_of(
