@@ -44,7 +44,9 @@ def check_extras(path: Path, extra: dict[str, np.ndarray], rows: slice = slice(N
         vertices = read_vertices(file)
         table = np.concatenate(list(vertices.blocks))
     assert "\n".join(vertices.comments).encode("latin-1") + b"\n" == COMMENTS
-    assert list(table.dtype.names or ()) == list(dict.fromkeys(["label", *columns_of(trained_like(1)), *extra]))
+    assert list(table.dtype.names or ()) == list(
+        dict.fromkeys(["label", *columns_of(trained_like(1)), *extra])
+    )
     for name, values in extra.items():
         assert np.array_equal(table[name][: len(values[rows])], values[rows]), name
 

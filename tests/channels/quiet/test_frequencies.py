@@ -80,7 +80,7 @@ def test_ends_of_ranges_stay(file: tuple[str, CodesCover, Any]) -> None:
 
 
 def hardly_trained(count: int = 20_000) -> Gaussians:
-    """A fortieth is nearly round, with a rotation by nearly 0 degrees, as trainers start and few views leave it."""
+    """A fortieth is nearly round and hardly rotated, as before training."""
     model = trained_like(count, sh_degree=0)
     few, small = slice(count // 40), trained_like(count // 40, 1, 0)
     model.log_scales[few] = model.log_scales[few, :1] + 2e-3 * (small.log_scales + 4)

@@ -1,9 +1,8 @@
-"""Gaussians whose codes are nearly equal more often than by chance.
+"""Coincidences of codes that are more frequent than by chance.
 
-Trainers start with round Gaussians, some with rotations by 0 degrees, and Gaussians that few views show hardly
-change these. Clones begin with equal rotations and scales, halves of split ones on a common plane. Writing
-would spread all such coincidences. Of each kind a random part stays as it is, the excess over what the
-frequency of slightly larger differences lets expect: the others are spread, and their frequency is unchanged.
+Trainers start with round Gaussians, some with rotations by 0 degrees, and where few views show them they stay
+nearly so. Clones start with equal rotations and scales. Writing would spread all of these. Of each kind of
+coincidence a random part stays, the excess over chance: writing makes as many of the others as it spreads.
 """
 
 from __future__ import annotations
@@ -20,22 +19,22 @@ from keyss.core.arrays import Doubles, Flags, Integers
 from keyss.files.formats.common import Codes
 
 ROUGH = 0.25  # relative excess that is ignored
-DEVIATIONS = 6  # standard deviations of an excess by chance
+DEVIATIONS = 6  # of an excess by chance, in standard deviations
 _NAMES = ("positions", "rotations", "scales")  # attributes that carry bits in any format
 _LEVELS = (0.5, 1.5, 2.5, 3.5, 5.5, 7.5, 15.5)  # upper ends of the bins of differences of levels
-_LOG_SCALES = 2.0 ** (LOG_SCALE_RANGE + np.arange(-6, 2))  # and of log scales
+_LOG_SCALES: Doubles = np.exp2(LOG_SCALE_RANGE + np.arange(-6.0, 2.0))  # and of log scales
 
 
 @dataclass(frozen=True)
 class _Kind:
-    """A kind of coincidences: small `gaps` [P], of Gaussians `one` [P] and `other` [P] if of two."""
+    """Differences, of which the small ones are coincidences."""
 
     fields: list[int]  # indices of the fields that stay
-    gaps: Doubles
-    ends: Doubles  # [B] upper ends of bins; the last one has the frequency to expect
-    dimensions: int  # a gap is the maximum of so many differences
-    one: Integers
-    other: Integers | None = None
+    gaps: Doubles  # [P] each the maximum of `dimensions` differences
+    ends: Doubles  # [B] upper ends of bins; the frequency in the last one is that by chance
+    dimensions: int
+    one: Integers  # [P] rows of the Gaussians
+    other: Integers | None = None  # [P] of their neighbours, if compared with these
 
 
 def without_excess(
@@ -57,6 +56,7 @@ def without_excess(
 
 
 def _kinds(codes: Codes, fields: Sequence[Field], near: Integers) -> Iterator[_Kind]:
+    """Equal coordinates of neighbours, small and equal parts of rotations, round Gaussians, and clones."""
     every = np.arange(len(near))
     one, other = np.repeat(every, near.shape[1]), near.ravel()
     at = {name: [index for index, each in enumerate(fields) if each.name == name] for name in _NAMES}
@@ -79,15 +79,15 @@ def _kinds(codes: Codes, fields: Sequence[Field], near: Integers) -> Iterator[_K
         gaps = np.abs(turns[one[same]] - turns[other[same]]).max(axis=1)
         yield _Kind(own, gaps, ends, 3, one[same], other[same])
     if own := at["scales"]:
-        sizes = codes.dequantise().log_scales.double().numpy()
+        sizes: Doubles = codes.dequantise().log_scales.double().numpy()
         for a, b in combinations(sizes.T, 2):
             yield _Kind(own, np.abs(a - b), _LOG_SCALES, 1, every)
-        yield _Kind(own, np.ptp(sizes, axis=1), _LOG_SCALES, 2, every)
+        yield _Kind(own, sizes.max(axis=1) - sizes.min(axis=1), _LOG_SCALES, 2, every)
         yield _Kind(own, np.abs(sizes[one] - sizes[other]).max(axis=1), _LOG_SCALES, 3, one, other)
 
 
 def _excess_share(gaps: Doubles, ends: Doubles, dimensions: int) -> Doubles:
-    """[P] share of the gaps in the same bin that exceeds what the last bin lets expect, 0 if it may be chance."""
+    """[P] the share of the gaps in the same bin that is more than by chance; 0 for little."""
     edges = np.append(0.0, ends)
     counts, volumes = np.histogram(gaps, edges)[0], np.diff(edges**dimensions)
     expected = counts[-1] / volumes[-1] * volumes

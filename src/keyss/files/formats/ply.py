@@ -70,7 +70,7 @@ def write(model: Gaussians, file: BinaryIO) -> None:
     n, needed = len(flat), model_names(flat.sh.shape[1])
     names = names_with_normals(needed)
     further = {name: values for name, values in extras.properties.items() if name not in NORMALS}
-    types = {name: "f4" for name in names} | {name: each.dtype.str[1:] for name, each in further.items()}
+    types = dict.fromkeys(names, "f4") | {name: each.dtype.str[1:] for name, each in further.items()}
     order = [name for name in extras.order if name in types]
     if not set(needed) <= set(order):
         order = list(types)
