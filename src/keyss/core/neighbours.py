@@ -13,14 +13,39 @@ def nearest_neighbours(points: Doubles, count: int, among: Doubles | None = None
 
     Among equal points, the first ones win. `count` must be at most M.
     """
-    from scipy.spatial import cKDTree  # slow to import
+    return Neighbours(points if among is None else among, count).of(points, torch.get_num_threads())
 
-    among = points if among is None else among
-    # A tree cannot split equal points: each query would compare all of them.
-    rows = np.lexsort(among.T)
-    starts = np.append(True, (among[rows[1:]] != among[rows[:-1]]).any(axis=1))
+
+class Neighbours:
+    """A tree of points [M, D] that answers queries for their `count` nearest, at most M."""
+
+    def __init__(self, points: Doubles, count: int) -> None:
+        from scipy.spatial import cKDTree  # slow to import
+
+        self.count, self.kept = count, _without_copies(points, count)
+        self.tree = cKDTree(points[self.kept])
+
+    def of(self, points: Doubles, threads: int = 1) -> tuple[Doubles, Integers]:
+        """Distances and indices [N, count] of the nearest to points [N, D]."""
+        distances, nearest = self.tree.query(points, k=np.arange(1, self.count + 1), workers=threads)
+        return distances, self.kept[nearest]
+
+
+def _without_copies(points: Doubles, count: int) -> Integers:
+    """The rows of `points` [M, D] in ascending order, of equal ones only the first `count`.
+
+    A tree cannot split equal points: each query would compare all of them.
+    """
+    first = points[:, 0]
+    rows = np.argsort(first, kind="stable")
+    starts = np.flatnonzero(np.append(True, first[rows[1:]] != first[rows[:-1]]))
+    repeated = np.repeat(np.diff(starts, append=len(rows)) > count, np.diff(starts, append=len(rows)))
+    if not repeated.any():
+        return np.arange(len(points))
+    suspects = np.sort(rows[repeated])
+    rows = suspects[np.lexsort(points[suspects].T)]
+    starts = np.append(True, (points[rows[1:]] != points[rows[:-1]]).any(axis=1))
     copies = np.arange(len(rows)) - np.flatnonzero(starts)[np.cumsum(starts) - 1]
-    kept = np.sort(rows[copies < count])
-    threads = torch.get_num_threads()
-    distances, nearest = cKDTree(among[kept]).query(points, k=np.arange(1, count + 1), workers=threads)
-    return distances, kept[nearest]
+    kept = np.ones(len(points), bool)
+    kept[rows[copies >= count]] = False
+    return np.flatnonzero(kept)

@@ -41,7 +41,7 @@ from keyss.methods import encode_all
 from keyss.rendering import render
 from tiny_scenes import ring_cameras
 
-PAYLOAD = bytes(range(256)) * 4 + os.urandom(3000)
+PAYLOAD = bytes(range(256)) * 4 + os.urandom(2999) + b"."
 KEY = "the right key"
 GENERATED = "q7Rv2LxT9bWm4KzD"
 SMALLEST = 700  # Gaussians that carry a byte

@@ -15,6 +15,7 @@ from keyss.channels import LOW_BITS, QuietReader, chance_of_bits, read_low_bits,
 from keyss.channels.quiet import usable
 from keyss.channels.quiet.bits import Layout, used_words, write_low_bits
 from keyss.channels.quiet.predictability import count_trailing_zeros, least_exponent
+from keyss.channels.quiet.siblings import chance_of_equal_steps
 from keyss.channels.quiet.usable import MAX_SEPARATION, check_usable
 from keyss.core import Gaussians, UsageError, same_bits
 from keyss.lab.stealth.judging import stealth_statistics
@@ -268,16 +269,26 @@ def test_siblings_are_those_of_a_plain_search(sh_degree: int) -> None:
     assert np.array_equal(usable_carriers(model), known & ~apart)
 
 
+def in_equal_steps(pairs: int, two: tuple[int, int]) -> Gaussians:
+    """Pairs of near Gaussians of which `two` harmonics differ by equal steps."""
+    model = trained_like(2 * pairs)
+    sh = model.sh.numpy().copy()
+    steps = np.random.default_rng(0).uniform(0.002, 0.02, (pairs, 3)).astype(np.float32)
+    for harmonic in two:
+        sh[pairs:, harmonic] = sh[:pairs, harmonic] + steps * (20 if harmonic == 0 else 1)
+    near = model.means[:pairs] + 1e-4
+    return replace(model, sh=torch.from_numpy(sh), means=torch.cat([model.means[:pairs], near]))
+
+
+def test_harmonics_that_follow_each_other_are_found_in_parts_of_large_covers() -> None:
+    pairs = 110_000
+    assert chance_of_equal_steps(in_equal_steps(pairs, (1, 5)), np.ones(2 * pairs, bool)) < 1e-6
+
+
 @pytest.mark.parametrize("two", [(1, 5), (0, 2)])
 def test_covers_whose_harmonics_follow_each_other_are_refused(two: tuple[int, int]) -> None:
     """As where training saw most Gaussians from one direction. Equal steps of two do not make siblings."""
-    model = trained_like(4000)
-    sh = model.sh.numpy().copy()
-    steps = np.random.default_rng(0).uniform(0.002, 0.02, (2000, 3)).astype(np.float32)
-    for harmonic in two:
-        sh[2000:, harmonic] = sh[:2000, harmonic] + steps * (20 if harmonic == 0 else 1)
-    near = model.means[:2000] + 1e-4
-    model = replace(model, sh=torch.from_numpy(sh), means=torch.cat([model.means[:2000], near]))
+    model = in_equal_steps(2000, two)
     usable = usable_carriers(model)
     assert usable.mean() > 0.9
     with pytest.raises(UsageError, match="harmonics of this cover"):

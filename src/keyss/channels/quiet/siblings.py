@@ -24,7 +24,7 @@ import torch
 from keyss.channels.quiet.bits import SH_BITS, UNUSED_BITS
 from keyss.core.arrays import Flags, Floats, doubles
 from keyss.core.gaussians import Gaussians
-from keyss.core.neighbours import nearest_neighbours
+from keyss.core.neighbours import Neighbours, nearest_neighbours
 from keyss.files.formats.common import morton_order
 from keyss.kernels.jit import kernel
 from keyss.kernels.parallel import in_blocks
@@ -34,6 +34,7 @@ _NEIGHBOURS = 12  # siblings were among the nearest 10 in models of 20,000 to 20
 _SHARE = 3  # a third of the harmonics of a colour agree, and at least three
 _ROWS = 1 << 12
 _SAMPLE, _NEAR = 5000, 8  # Gaussians whose pairs of harmonics are tested, and neighbours of each
+_COMPACT, _RUN = 100_000, 2000  # Gaussians that are looked at in larger models, in runs along a Z-order curve
 _PART = 16  # of a cell, within which steps are equal
 _CELL = np.uint32((1 << SH_BITS + UNUSED_BITS) - 1)
 _CELL_SHARE = np.float32(2.0 ** (SH_BITS + UNUSED_BITS - 23))  # cell width / number, up to a factor of 2
@@ -46,15 +47,22 @@ def find_siblings(gaussians: Gaussians, among: Flags) -> Flags:
     means = np.nan_to_num(doubles(gaussians.means), posinf=0, neginf=0)
     order = morton_order(means.astype(np.float32))  # neighbours are near in memory, too
     means, rows = means[order], np.flatnonzero(among[order])
-    near = nearest_neighbours(means[rows], min(_NEIGHBOURS + 1, len(means)), means)[1]
-    sh = gaussians.sh.detach().to("cpu", torch.float32).numpy()[order].transpose(0, 2, 1)
-    middles = np.ascontiguousarray(_middles(sh))
-    middles[:, :, 0] = sh[:, :, 0] / np.float32(RATE_RATIO)
+    neighbours = Neighbours(means, min(_NEIGHBOURS + 1, len(means)))
+    numbers = gaussians.sh.detach().to("cpu", torch.float32).numpy()
+    middles = np.empty((len(means), 3, numbers.shape[1]), np.float32)
+
+    def gather(start: int, stop: int) -> None:
+        sh = numbers[order[start:stop]].transpose(0, 2, 1)
+        middles[start:stop] = _middles(sh)
+        middles[start:stop, :, 0] = sh[:, :, 0] / np.float32(RATE_RATIO)
+
+    in_blocks(gather, len(means), _ROWS)
     needed = 1 + max(_SHARE, -(-(middles.shape[2] - 1) // _SHARE))
     apart = np.zeros(len(means), bool)
 
     def mark(start: int, stop: int) -> None:
-        _mark(rows[start:stop], near[start:stop], middles, needed, apart)
+        some = rows[start:stop]
+        _mark(some, neighbours.of(means[some])[1], middles, needed, apart)
 
     in_blocks(mark, len(rows), _ROWS)
     siblings = np.zeros(len(means), bool)
@@ -74,6 +82,10 @@ def chance_of_equal_steps(gaussians: Gaussians, usable: Flags) -> float:
     if len(rows) < 2 or not gaussians.sh_degree:
         return 1.0
     means = np.nan_to_num(doubles(gaussians.means), posinf=0, neginf=0)[rows]
+    if len(rows) > 2 * _COMPACT:  # parts of the space with all their Gaussians, as neighbours are needed
+        order = morton_order(means.astype(np.float32))
+        kept = np.concatenate([part[:_RUN] for part in np.array_split(order, _COMPACT // _RUN)])
+        rows, means = rows[kept], means[kept]
     sample = np.arange(0, len(rows), -(-len(rows) // _SAMPLE))
     near = nearest_neighbours(means[sample], min(_NEAR + 1, len(rows)), means)[1]
     sh = gaussians.sh.detach().to("cpu", torch.float32).contiguous().numpy()
