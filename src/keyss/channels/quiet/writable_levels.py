@@ -22,7 +22,7 @@ from keyss.files.formats.spz import SpzCodes
 # Distance to the nearest neighbour, in sizes of the Gaussian, at which half of the Gaussians are left single.
 # Clones lie nearer to each other, and there are more of them than by chance.
 _CLONES = 1 / 8
-_NEIGHBOURS = 12  # nearest neighbours searched for clones
+_NEIGHBOURS = 4  # nearest neighbours searched for clones
 _RAMP = 3  # width of the ramp before a limit, in units of 2^bits levels
 _NEAR = 8  # maximum distance of levels whose frequencies are compared
 _EQUAL = 0.02  # excess that is always allowed, as a share of the Gaussians
