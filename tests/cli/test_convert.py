@@ -166,3 +166,18 @@ def test_training_folder_as_model(keyss: Run, tmp_path: Path) -> None:
     result = keyss("convert", tmp_path / "trained", tmp_path / "a.spz")
     assert result.err.count("its model is point_cloud/iteration_30000/point_cloud.ply") == 1
     assert len(read_model(tmp_path / "a.spz")) == COUNT + 3000
+
+
+def test_low_bits_beside_appended_gaussians_must_not_be_converted(
+    keyss: Run, files: Path, tmp_path: Path
+) -> None:
+    write_model(tmp_path / "cover.ply", trained_like(1500))
+    write_model(tmp_path / "secret.ply", trained_like(20, 1))
+    cover = tmp_path / "cover.ply"
+    for name, publish, how in (("a", "any", "; it may be converted"), ("b", "as-is", " unchanged")):
+        scenes = ("--cover", cover, "--secret", tmp_path / "secret.ply", "--key-file", files / "key")
+        options = ("--publish", publish, "--width", 24, "--min-psnr", 0)
+        result = keyss("hide", *scenes, *options, "-o", tmp_path / name)
+        assert result.status == 0, result.err
+        assert f"publish this file{how}: " in result.out
+        cover = tmp_path / name / "publish" / "model.ply"

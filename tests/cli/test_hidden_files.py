@@ -53,6 +53,14 @@ def test_round_trip(keyss: Run, folder: Path, tmp_path: Path) -> None:
         assert stat.S_IMODE(out.stat().st_mode) == 0o600
 
 
+def test_verify(keyss: Run, folder: Path) -> None:
+    stego = folder / "out" / "publish" / "model.ply"
+    for index, count in enumerate(("3,000 of 3,000", "0")):
+        result = keyss("verify", stego, "--key-file", folder / f"key{index}")
+        assert (result.status, result.err) == (0, "")
+        assert f"secret  {count} bytes: complete" in result.out
+
+
 def test_invalid_combinations(keyss: Run, folder: Path, workspace: Path, tmp_path: Path) -> None:
     out, back = tmp_path / "out", tmp_path / "back"
     hide = _arguments(folder, out)
@@ -71,6 +79,16 @@ def test_invalid_combinations(keyss: Run, folder: Path, workspace: Path, tmp_pat
     assert_refused(keyss("reveal", folder / "cover.ply", *key, "-o", back), 3, "opens nothing")
     assert_refused(keyss("reveal", stego, *key, "-o", stego.parent / "back"), 5, "given away")
     assert listing(tmp_path) == {}
+
+
+def test_names_that_are_not_text(folder: Path, tmp_path: Path) -> None:
+    named = tmp_path / os.fsdecode(b"K\xfcche.pdf")
+    named.write_bytes(b"plan")
+    hidden = library.hide_files(folder / "cover.ply", [library.SecretFile(named, KEYS[0])])
+    assert hidden.stego is not None
+    assert library.reveal(hidden.stego, KEYS[0]).file == HiddenFile(
+        "K\N{REPLACEMENT CHARACTER}che.pdf", b"plan"
+    )
 
 
 def test_file_too_large(tmp_path: Path) -> None:

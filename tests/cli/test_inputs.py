@@ -25,6 +25,7 @@ def test_run_folder_as_model(keyss: Run, workspace: Path, tmp_path: Path, inside
     give = f"found a folder; give {workspace / 'hidden' / 'publish' / 'model.ply'}"
     assert_refused(keyss("reveal", run, *key_argument(workspace), "-o", tmp_path / "s.ply"), 4, give)
     assert_refused(keyss("render", run, "--cameras", workspace / "a", "-o", out), 4, give)
+    assert_refused(keyss("view", run, "-o", out), 4, give)
     hide = ("hide", *scene_arguments(workspace), "-o", out)
     assert_refused(keyss(*hide, "--cover-model", run), 4, give)
     assert listing(tmp_path) == {}
@@ -38,6 +39,23 @@ def test_path_inside_run(keyss: Run, workspace: Path, command: str, inside: str)
     kind = "a folder" if path.is_dir() else "a file"
     assert_refused(result, 4, f"{path}: expected the folder of a run")
     assert f"found {kind} in one; give {workspace / 'hidden'}" in result.err
+
+
+@pytest.mark.parametrize("command", ["evaluate", "audit"])
+def test_folder_of_a_fit(keyss: Run, tmp_path: Path, command: str) -> None:
+    (tmp_path / "private").mkdir()
+    for name in ("model.ply", "private/config.json"):
+        (tmp_path / name).write_text("{}")
+    assert_refused(keyss(command, tmp_path), 4, "found one that `keyss fit` wrote")
+
+
+def test_info_on_published_model_alone(keyss: Run, workspace: Path, tmp_path: Path) -> None:
+    (tmp_path / "publish").mkdir()
+    model = tmp_path / "publish" / "model.ply"
+    model.write_bytes((workspace / "hidden" / "publish" / "model.ply").read_bytes())
+    for folder in (tmp_path, model.parent):
+        result = keyss("info", folder, "--json")
+        assert json.loads(result.out)["path"] == str(model)
 
 
 def test_key_file_as_model(keyss: Run, workspace: Path, tmp_path: Path) -> None:

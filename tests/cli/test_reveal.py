@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from channels.quiet.coded import codes_of, model_of
 from channels.quiet.trained_like import trained_like
@@ -222,6 +223,14 @@ class TestVerify:
         assert (result.status, result.err) == (0, "")
         secret = json.loads(result.out)["secret"]
         assert (secret["found"], secret["hidden"]) == (500, 500)
+
+    def test_invalid_model_with_whole_secret(self, keyss: Run, files: Path, tmp_path: Path) -> None:
+        model = read_model(files / "whole.ply")
+        write_model(tmp_path / "twice.ply", model[torch.arange(len(model)).repeat(2)])
+        result = keyss("verify", tmp_path / "twice.ply", "--key-file", files / "key")
+        assert result.status == 4
+        assert "500 of 500 Gaussians: complete" in result.out
+        assert "equal to others" in result.err
 
     def test_partial_secret(self, keyss: Run, files: Path) -> None:
         for name in ("half", "few"):

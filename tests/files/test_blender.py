@@ -71,7 +71,7 @@ def changed(row: int, column: int, value: object) -> list[list[object]]:
         ([[1, 0, 0]] * 4, r"Expected `array` of length 4, got 3 - at `\$\[0\]`"),
         ([1, 2, 3, 4], r"Expected `array`, got `int` - at `\$\[0\]`"),
         (changed(0, 0, "one"), r"Expected `float`, got `str` - at `\$\[0\]\[0\]`"),
-        (changed(0, 3, math.nan), "finite `transform_matrix`"),
+        (changed(0, 3, math.nan), "finite `transform_matrix`, found NaN or"),
         (changed(3, 0, math.nan), "ends in 0 0 0 1"),
         (changed(0, 3, 10**400), "finite `transform_matrix`"),
         (changed(0, 3, 1e300), "finite `transform_matrix`"),

@@ -78,7 +78,7 @@ FILES = {  # name and content, and what they are
 }
 
 
-READ = {"a.spz", "A.SPZ", "a.sog", "a.splat", "a.glb", "a.zip", "a", "b", "c", "f"}
+READ = {"a.spz", "A.SPZ", "a.sog", "a.splat", "a.glb", "a.zip", "b", "c", "f"}
 
 
 @pytest.mark.parametrize("name", FILES)
@@ -98,6 +98,22 @@ def test_identify_file(tmp_path: Path, name: str) -> None:
     assert f"), found {found}" in str(refused.value)
 
 
+@pytest.mark.parametrize(
+    ("name", "content", "found"),
+    [
+        ("page.spz", b"<!DOCTYPE html>", "a web page"),
+        ("random.sog", bytes(range(99)), "a file of unknown kind"),
+        ("sent.ply", gzip.compress(b"ply\nformat ascii 1.0\n"), "gzip data; unpack it"),
+    ],
+)
+def test_content_contradicts_the_name(tmp_path: Path, name: str, content: bytes, found: str) -> None:
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(InputError, match=rf"{name}: expected a 3DGS model .*, found {found}"):
+        read_model(tmp_path / name)
+
+
 def test_pipes_do_not_block(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     assert identify_file(tmp_path / "pipe") == "neither a file nor a folder"
+    with pytest.raises(InputError, match=r"expected a 3DGS model .*, found neither a file nor a folder"):
+        read_model(tmp_path / "pipe")

@@ -196,8 +196,9 @@ def test_activated_scales_and_opacities_are_refused(tmp_path: Path, unit: float,
     if "opacities" in which:
         plain = replace(plain, opacity_logits=plain.opacities)
     write_model(tmp_path / "activated.ply", plain)
-    with pytest.raises(InputError, match=f"its {which} are those that renderers use.* apply log to"):
-        read_model(tmp_path / "activated.ply")
+    for read in (read_model, info):
+        with pytest.raises(InputError, match=f"its {which} are those that renderers use.* apply log to"):
+            read(tmp_path / "activated.ply")
 
 
 def test_2dgs_and_rgb_models(tmp_path: Path) -> None:
@@ -236,7 +237,7 @@ BROKEN = {
     "unknown type": (header_of("element vertex 1", "property half x"), "cannot parse line"),
     "list in vertex": (header_of(*XYZ, "property list uchar int f"), "list property"),
     "list before": (header_of("element a 1", "property list uchar int f", *XYZ), "list property"),
-    "point cloud": (header_of(*XYZ) + bytes(12), "point cloud, not a 3DGS model.*missing: f_dc_0"),
+    "point cloud": (header_of(*XYZ) + bytes(12), "a mesh or point cloud, not a 3DGS model.*missing: f_dc_0"),
     "compressed": (header_of("element vertex 1", "property uint packed_position"), "compressed"),
     "no model": (
         header_of("element vertex 1", "property float u") + bytes(4),

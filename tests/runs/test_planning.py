@@ -14,6 +14,7 @@ from channels.quiet.trained_like import trained_like
 from keyss import CarryOptions, FitConfig, Secret
 from keyss.core import OutputError
 from keyss.files import write_model
+from keyss.methods import registry
 from methods.keyss.small import small
 from tiny_scenes import tiny_scene
 
@@ -38,6 +39,17 @@ def test_stages(tmp_path: Path) -> None:
     assert plan.capacity < plan.secret_gaussians == 800
     assert plan.free_bytes is not None
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.filterwarnings("ignore:.*appended Gaussians")
+def test_steps_with_networks_take_longer() -> None:
+    seconds = []
+    hider = registry.get("gs-hider").options(fit=FIT)
+    for options, key in ((small("latent", FIT), KEY), (small("published", FIT), KEY), (hider, "")):
+        plan = keyss.hide(tiny_scene(0), [Secret(tiny_scene(1), key)], method=options, dry_run=True).plan
+        seconds += [stage.seconds for stage in plan.stages if stage.name == "hiding"]
+    latent, published, networks = seconds
+    assert 4 * latent < published < networks
 
 
 def test_bound_stage() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import http.client
+import os
 import re
 import shutil
 import subprocess
@@ -13,7 +14,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from urllib.parse import urlsplit
+from urllib.parse import unquote, urlsplit
 
 import numpy as np
 import pytest
@@ -91,6 +92,13 @@ def test_folder_page(model: Path, tmp_path: Path) -> None:
     with pytest.raises(OutputError, match="exists"):
         export_html(model, tmp_path / "site")
     export_html(model, tmp_path / "site", overwrite=True)
+
+
+@pytest.mark.parametrize(("out", "page"), [("page.html", "page.html"), ("site", "site/index.html")])
+def test_names_that_are_not_text(model: Path, tmp_path: Path, out: str, page: str) -> None:
+    named = model.rename(tmp_path / os.fsdecode(b"K\xfcche.ply"))
+    export_html(named, tmp_path / out)
+    assert "K\N{REPLACEMENT CHARACTER}che.ply" in unquote((tmp_path / page).read_text("utf-8"))
 
 
 @pytest.mark.parametrize("out", ["page.html", "site"])

@@ -172,7 +172,7 @@ def hide(
             names = bound_names(len(secrets))
             made |= {names[index]: model for index, model in longer.items()}
             folder.write({**made, CONFIG: settings, METRICS: metrics})
-    return HideResult(stego.gaussians, metrics)
+    return HideResult(stego.gaussians, metrics, survives=options.place.survives)
 
 
 def _check_arguments(out: PathLike | None, min_psnr: float | None) -> None:

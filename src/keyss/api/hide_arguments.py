@@ -36,6 +36,7 @@ class HideResult:
     stego: Gaussians | None = None  # publish this; None after a dry run
     metrics: HideMetrics | None = None  # None of a dry run
     plan: Plan | None = None  # only of a dry run
+    survives: bool = False  # whether the secrets survive conversion to other formats
 
 
 def method_for(chosen: str | MethodOptions, secrets: Sequence[Secret]) -> tuple[Method, MethodOptions]:

@@ -12,7 +12,7 @@ from keyss.channels import AnyChannel, Format, Publish, channel_for, open_conten
 from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
-from keyss.files.inputs import read_file
+from keyss.files.inputs import as_text, read_file
 from keyss.files.models import read_model
 from keyss.files.ply_extras import with_extras
 from keyss.keys.encryption import MAX_PAYLOAD_BYTES
@@ -89,4 +89,4 @@ def _read(secret: SecretFile) -> HiddenFile:
     if isinstance(secret.file, bytes):
         return HiddenFile(secret.name, secret.file)
     path = Path(secret.file)
-    return HiddenFile(secret.name or path.name, read_file(path, MAX_PAYLOAD_BYTES))
+    return HiddenFile(secret.name or as_text(path.name), read_file(path, MAX_PAYLOAD_BYTES))

@@ -20,6 +20,7 @@ from keyss.runs.revealing import (
     Verification,
     check_model,
     check_secret,
+    reveal_any,
     reveal_model,
     revealed_file,
 )
@@ -106,5 +107,5 @@ def verify(
     target = resolve_device(device)
     name = "model" if isinstance(model, Gaussians) else str(model)
     gaussians = as_model(model)
-    secret = None if key is None else check_secret(reveal_model(gaussians, key, device=target))
+    secret = None if key is None else check_secret(reveal_any(gaussians, key, target))
     return Verification(name, check_model(gaussians), secret)

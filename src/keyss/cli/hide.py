@@ -107,7 +107,7 @@ class HideArguments:
     publish: Annotated[
         Literal["as-is", "any"],
         arg(
-            help="as-is: a file that must stay unchanged, in which the secret goes unnoticed; where it "
+            help="as-is: a file that must stay unchanged, in which the secret goes unnoticed; where a scene "
             "cannot, any with a warning. any: a .ply that may be converted later; whoever inspects it sees "
             "that it holds something."
         ),
@@ -158,7 +158,6 @@ def hide(args: HideArguments) -> None:
 def _hide_scenes(args: HideArguments, cover: Path) -> None:
     import keyss
     from keyss import progress
-    from keyss.channels import is_appended
     from keyss.cli.reporting import reporting
     from keyss.cli.tables import print_files, print_hiding, print_plan
     from keyss.core.errors import UsageError
@@ -200,9 +199,7 @@ def _hide_scenes(args: HideArguments, cover: Path) -> None:
     print_hiding(result.metrics, brief=progress.level < 1)
     _warn_of_idle(idle, result.metrics.iterations)
     what = "the cover with the secret in it" if options.trains or method.capabilities.keys else "the cover"
-    assert result.stego is not None
-    appended = bool(is_appended(result.stego).any())  # true if "as-is" fell back to "any"
-    how = _HOW_TO_PUBLISH[options.place.survives or appended]
+    how = _HOW_TO_PUBLISH[result.survives]
     print_files(
         args.out,
         {

@@ -49,11 +49,13 @@ def given_keys(files: Sequence[Path]) -> list[str]:
 def keys_of_run(run: Path, files: Sequence[Path]) -> list[str]:
     """The keys of a run's secrets: one per file, else one; none if its method has no keys."""
     from keyss.methods import registry
-    from keyss.runs.files import CONFIG, is_run
+    from keyss.runs.files import CONFIG, run_folder
     from keyss.runs.run_records import read_config
 
-    if not files and is_run(run) and not registry.get(read_config(run / CONFIG).method).capabilities.keys:
-        return []
+    if not files:
+        method = read_config(run_folder(run) / CONFIG).method
+        if not registry.get(method).capabilities.keys:
+            return []
     return keys(files, len(files) or 1)
 
 

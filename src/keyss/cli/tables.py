@@ -220,7 +220,7 @@ def print_verification(found: Verification) -> None:
     problems = "; ".join(model.problems) or "sound"
     if secret is not None:
         of = f" of {secret.hidden:,}" if secret.hidden else ""
-        what = f"{secret.found:,}{of} Gaussians: {'; '.join(secret.problems) or 'complete'}"
+        what = f"{secret.found:,}{of} {secret.unit}: {'; '.join(secret.problems) or 'complete'}"
     about_model = f"{model.gaussians:,} Gaussians of SH degree {model.sh_degree}: {problems}"
     _print_columns([("model", about_model), ("secret", what)])
 

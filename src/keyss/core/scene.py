@@ -16,6 +16,7 @@ from keyss.core.gaussians import Gaussians
 # Near plane, in world units, of scenes with at least ORDINARY_EXTENT between cameras. Smaller scenes have a
 # proportionally smaller one.
 NEAR, ORDINARY_EXTENT = 0.01, 0.5
+_ROUNDING = 1e-6  # relative error of a camera's position in single precision
 
 # Weight of the fallback point in `focus_point`, against a mean of projections with eigenvalues of at most 1:
 # it dominates if the viewing axes differ by less than about two degrees.
@@ -98,15 +99,15 @@ class Scene:
     def extent(self) -> float:
         """1.1 x the largest distance of a training camera from their mean (3DGS's `cameras_extent`).
 
-        If all cameras are in one place, 1.1 x their distance from the scene: an extent of 0 would stop
-        training.
+        If all cameras are in one place, 1.1 x their median distance from the points: an extent of 0 would
+        stop training.
         """
         cameras = [view.camera for view in self.train]
         positions = camera_positions(cameras)
         reach = float((positions - positions.mean(0)).norm(dim=1).max())
-        if reach == 0:
-            centre = self.points.double().mean(0) if len(self.points) else focus_point(cameras)
-            reach = float((positions[0].double() - centre).norm())
+        if reach <= _ROUNDING * float(positions.norm(dim=1).max()):
+            seen = self.points.double() if len(self.points) else focus_point(cameras)[None]
+            reach = float((seen - positions[0].double()).norm(dim=1).median())
         return 1.1 * reach
 
     def to_scene_frame(self, model: Gaussians) -> Gaussians:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import shutil
+import zlib
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,7 +24,7 @@ _CHECKPOINT = (
 _UNPACK = "unpack it, and give the folder or the model inside"
 CHECKPOINTS = f"checkpoints of a training; {_CHECKPOINT}"
 START_BYTES = 256  # enough to identify a file
-_ZIP = b"PK\x03\x04"
+_ZIP, _GZIP = b"PK\x03\x04", b"\x1f\x8b"
 _POSES = "a scene is a folder of photos with their poses, e.g. from COLMAP"
 
 
@@ -61,7 +63,7 @@ _KINDS = (
     _Kind("a web page", _EXPORT, (".html", ".htm"), (b"<!DOCTYPE", b"<html")),
     _Kind("a JSON file", "give the folder that it lies in", (".json",)),
     _Kind("a PLY file under another name", "rename it to end in .ply", magic=(b"ply\n", b"ply\r")),
-    _Kind("gzip data", _UNPACK, (".gz",), (b"\x1f\x8b",)),
+    _Kind("gzip data", _UNPACK, (".gz",), (_GZIP,)),
     _Kind("a ZIP archive", _UNPACK, (".zip",), (_ZIP,)),
     _Kind("an archive", _UNPACK, (".tar", ".tgz", ".7z", ".rar"), (b"7z\xbc\xaf\x27\x1c", b"Rar!")),
     _Kind(
@@ -96,8 +98,11 @@ def identify_content(name: str, start: bytes) -> str:
     return f"{kind.name}; {kind.advice}"
 
 
-def is_foreign_zip(start: bytes) -> bool:
-    """True for a ZIP archive other than a model, such as a checkpoint, from its first START_BYTES."""
+def is_foreign_archive(start: bytes) -> bool:
+    """True for ZIP or gzip data other than a model, such as a checkpoint, from the first START_BYTES."""
+    with suppress(zlib.error):
+        if start.startswith(_GZIP):
+            return zlib.decompressobj(31).decompress(start, 4) != b"NGSP"
     return _kind_in_zip(start) is not None
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image
+from PIL import Image, UnidentifiedImageError
 from torch import Tensor
 
 from keyss.core.arrays import Bytes, Floats, Numbers
@@ -45,6 +45,8 @@ def open_image(path: Path) -> Image.Image:
         if os.path.isfile(path) and os.path.getsize(path) == 0:
             raise InputError(f"{path}: expected an image ({kinds}), found an empty file") from error
         reason = getattr(error, "strerror", None) or error
+        if isinstance(error, UnidentifiedImageError):  # such as HEIC
+            reason = "it is damaged, or has another format and must be converted"
         raise InputError(f"{path}: expected an image ({kinds}), but it cannot be read: {reason}") from error
     limit = min(_MAX_PIXELS, max(_SMALL_PIXELS, _PIXELS_PER_BYTE * os.path.getsize(path)))
     if image.width * image.height > limit:

@@ -47,6 +47,11 @@ def read_text(path: Path, limit: int | None = None) -> str:
         ) from error
 
 
+def as_text(name: str) -> str:
+    """A file name with U+FFFD for what is not text: Python represents undecodable bytes by surrogates."""
+    return name.encode("utf-8", "surrogateescape").decode("utf-8", "replace")
+
+
 def is_standard(path: Path | str) -> bool:
     """True if a path names standard input or output."""
     return str(path) == STANDARD

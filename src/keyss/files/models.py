@@ -20,7 +20,7 @@ from keyss.core.errors import InputError, OutputError, UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.picture_network import DecodedGaussians
 from keyss.files.atomic import atomic_write, check_not_an_input, check_output_file
-from keyss.files.file_kinds import START_BYTES, identify_content, is_foreign_zip
+from keyss.files.file_kinds import START_BYTES, identify_content, is_foreign_archive
 from keyss.files.formats import ply
 from keyss.files.inputs import (
     MAX_BYTES,
@@ -113,7 +113,8 @@ def read_model(path: Path | str) -> Gaussians:
         found = identify_folder(path) or "a folder"
         raise InputError(f"{path}: expected the file of a 3DGS model ({known_suffixes()}), found {found}")
     if not os.path.isfile(path):
-        raise InputError(f"{path}: expected a 3DGS model ({known_suffixes()}), but there is no such file")
+        found = "found neither a file nor a folder" if os.path.exists(path) else "but there is no such file"
+        raise InputError(f"{path}: expected a 3DGS model ({known_suffixes()}), {found}")
     with open_input(path) as file:
         return _read(file, path.name)
 
@@ -218,13 +219,14 @@ def _read(file: BinaryIO, name: str) -> Gaussians:
     start = file.read(START_BYTES)
     file.seek(0)
     fitting = [each for each in FORMATS if each.magic and start.startswith(each.magic)]
-    if is_foreign_zip(start):
+    if is_foreign_archive(start):
         fitting = []
     named = _by_suffix(name)
     if named in fitting or (named and start and not named.magic and not fitting):
         return named.read(file)
     if not fitting:
-        raise InputError(f"expected a 3DGS model ({known_suffixes()}), found {identify_content(name, start)}")
+        kind = identify_content("" if named else name, start)  # the content refutes the name of a model
+        raise InputError(f"expected a 3DGS model ({known_suffixes()}), found {kind}")
     found = fitting[-1]
     if named is not None:
         raise InputError(

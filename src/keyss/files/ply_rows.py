@@ -136,7 +136,7 @@ def model_properties(found: Collection[str]) -> list[str]:
             "`ns-export gaussian-splat --ply-color-mode sh_coeffs`"
         )
     if missing:
-        kind = "a point cloud, not a 3DGS model" if missing == names[3:] else "not a 3DGS model"
+        kind = "a mesh or point cloud, not a 3DGS model" if missing == names[3:] else "not a 3DGS model"
         raise InputError(f"this is {kind}: properties missing: {', '.join(missing)}")
     return names
 

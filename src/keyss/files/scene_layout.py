@@ -79,10 +79,10 @@ def leave_out(where: Path, total: int, why: str, photos: Sequence[str], skip_mis
         return
     listed = ", ".join(photos[:5]) + (f" and {len(photos) - 5:,} more" if len(photos) > 5 else "")
     count = f"{where}: {len(photos):,} of {total:,} photos {why}"
-    if not skip_missing:
-        raise InputError(f"{count}: {listed}; `skip_missing=True` leaves them out")
     if len(photos) == total:
         raise InputError(f"{count}: {listed}")
+    if not skip_missing:
+        raise InputError(f"{count}: {listed}; `skip_missing=True` leaves them out")
     warnings.warn(f"{count}, left out: {listed}", KeyssWarning, stacklevel=2)
 
 

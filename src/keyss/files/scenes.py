@@ -25,6 +25,7 @@ from keyss.files.scene_layout import Photo, SceneLayout
 from keyss.files.training_outputs import identify_folder
 from keyss.files.transforms import read_blender, read_nerfstudio
 
+_ROUNDING = 1e-12  # relative error of a camera's position
 _FAR = 1000  # extents from the origin, where single precision resolves 1e-4 extents
 _KNOWN = (
     "COLMAP (sparse/0/cameras.bin or .txt, images/); Blender / NeRF-synthetic (transforms_train.json); "
@@ -118,9 +119,11 @@ def _origin_and_extent(viewmats: Sequence[Doubles]) -> tuple[Doubles, float]:
     """The origin [3] of the scene's frame, 0 unless the cameras [4, 4] are far from it, and their extent."""
     centres = np.array([-each[:3, :3].T @ each[:3, 3] for each in viewmats])
     centre = centres.mean(axis=0)
-    extent = float(np.linalg.norm(centres - centre, axis=1).max())
-    if not 0 < extent < np.linalg.norm(centre) / _FAR:
-        return np.zeros(3), extent or ORDINARY_EXTENT
+    extent, distance = float(np.linalg.norm(centres - centre, axis=1).max()), np.linalg.norm(centre)
+    if extent <= _ROUNDING * distance:  # all cameras are in one place
+        extent = ORDINARY_EXTENT
+    if extent >= distance / _FAR:
+        return np.zeros(3), extent
     step = 2.0 ** np.floor(np.log2(extent))
     return np.rint(centre / step) * step, extent
 

@@ -239,7 +239,9 @@ def _viewmat(where: str, values: Doubles) -> Doubles:
         raise InputError(f"{where}: expected a `transform_matrix` that ends in 0 0 0 1, found {values[3]}")
     rotation, position = values[:3, :3], values[:3, 3]
     if not (np.abs(values[:3]) <= MAX_COORDINATE).all():
-        raise InputError(f"{where}: expected a finite `transform_matrix`, found over {MAX_COORDINATE:g}")
+        raise InputError(
+            f"{where}: expected a finite `transform_matrix`, found NaN or over {MAX_COORDINATE:g}"
+        )
     scale = float(np.sqrt((rotation**2).sum() / 3))
     gram = rotation.T @ rotation / max(scale, 1e-12) ** 2
     if scale < 1e-9 or np.abs(gram - np.eye(3)).max() > 1e-2 or np.linalg.det(rotation / scale) < 0:

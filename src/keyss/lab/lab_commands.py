@@ -318,4 +318,4 @@ def _print_forecast(found: Forecast) -> None:
         f"{len(rows)} run{'s' * (len(rows) != 1)}, {len(found.plans)} to do: about "
         f"{about(sum(plan.seconds for plan in found.plans.values()))} on this machine."
     )
-    print("Dry run: nothing was written. Times are rough.")
+    print("Dry run: nothing was written. Times are rough, and leave out the measurements afterwards.")

@@ -172,8 +172,8 @@ class MethodOptions:
         """Options with changed fields of `fit`."""
         return replace(self, fit=replace(self.fit, **changes))
 
-    def joint_plan(self, secrets: int) -> Plan:
-        """The plan of a joint training with the size of one plain model."""
+    def joint_plan(self, secrets: int, step_cost: float = 1.0) -> Plan:
+        """The plan of a joint training with the size of one plain model; `step_cost` as in `Plan`."""
         fit = self.fit
         return Plan(
             gaussians=fit.max_gaussians,
@@ -181,6 +181,7 @@ class MethodOptions:
             secret_gaussians=secrets * fit.max_gaussians,
             capacity=fit.max_gaussians,
             steps=fit.iterations,
+            step_cost=step_cost,
             rendered=(fit.max_gaussians,) * (1 + secrets),
         )
 
@@ -216,6 +217,7 @@ class Plan:
     secret_gaussians: int  # total over the secrets
     capacity: int  # Gaussians of the secrets that fit
     steps: int = 0  # joint training steps
+    step_cost: float = 1.0  # time of a joint step over that of steps of plain 3DGS of all scenes
     rendered: tuple[int, ...] = ()  # Gaussians of the cover and of each secret in a step
     notes: tuple[str, ...] = ()  # sentences on the costs of options
 

@@ -74,14 +74,16 @@ def info(path: str | Path) -> RunInfo | ModelInfo | SceneInfo:
 def _folder_info(path: Path) -> RunInfo | ModelInfo | SceneInfo:
     from keyss.files.scenes import load_scene
     from keyss.files.training_outputs import is_training, model_file
-    from keyss.runs.files import METRICS, MODEL, is_run, stego_in
+    from keyss.runs.files import METRICS, MODEL, is_run, model_in
     from keyss.runs.json_records import read_record
     from keyss.runs.run_records import FitMetrics, HideMetrics
 
-    if stego_in(path).exists():
+    if inside := model_in(path):
+        if not (path / METRICS).exists():  # hidden files have none, and `private/` may have been deleted
+            return _model_info(inside)
+        if inside == path / MODEL:
+            return RunInfo("plain model", str(path), read_record(path / METRICS, FitMetrics))
         return RunInfo("hiding", str(path), read_record(path / METRICS, HideMetrics))
-    if (path / MODEL).exists():
-        return RunInfo("plain model", str(path), read_record(path / METRICS, FitMetrics))
     if runs := sorted(each for each in path.iterdir() if is_run(each)):
         named = ", ".join(map(str, runs[:_NAMED])) + f" and {len(runs) - _NAMED} more" * (len(runs) > _NAMED)
         raise InputError(f"{path} is not a run, but a folder of runs: name one of {named}")
@@ -131,7 +133,7 @@ def _ply_rows(path: Path) -> tuple[Any, Any, int] | None:
     """Means, opacity logits and SH degree of a plain PLY file, without torch; None for other files."""
     import numpy as np
 
-    from keyss.files.ply_rows import has_packed_header, read_rows
+    from keyss.files.ply_rows import check_not_activated, has_packed_header, read_rows
 
     if path.suffix.lower() != ".ply":
         return None
@@ -140,7 +142,8 @@ def _ply_rows(path: Path) -> tuple[Any, Any, int] | None:
             return None
         file.seek(0)
         model = read_rows(file)
-        rows = np.concatenate([rows[:, [0, 1, 2, -8]] for rows, _ in model.blocks])
+        rows = np.concatenate([rows[:, [0, 1, 2, -8, -7, -6, -5]] for rows, _ in model.blocks])
+        check_not_activated(rows[:, :3], rows[:, 4:], rows[:, 3])
     return rows[:, :3], rows[:, 3], round(((len(model.names) - 11) // 3) ** 0.5) - 1
 
 

@@ -52,11 +52,14 @@ def stego_in(folder: Path) -> Path:
 
 
 def run_folder(path: Path) -> Path:
-    """`path`, if it is the folder of a run.
+    """`path`, if it is the folder of a hiding.
 
     Otherwise raises InputError, which names the run that contains `path` if there is one.
     """
+    expected = f"{path}: expected the folder of a run, as `keyss hide --secret` writes it"
     if is_run(path):
+        if os.path.isfile(path / MODEL):
+            raise InputError(f"{expected}, found one that `keyss fit` wrote")
         return path
     try:
         (path / CONFIG).stat()
@@ -64,7 +67,6 @@ def run_folder(path: Path) -> Path:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from error
     except OSError:
         pass
-    expected = f"{path}: expected the folder of a run, as `keyss hide` writes it"
     if not os.path.lexists(path):
         raise InputError(f"{expected}; there is nothing of that name")
     kind = "a folder" if os.path.isdir(path) else "a file"

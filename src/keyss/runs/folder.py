@@ -23,7 +23,7 @@ from keyss.core.errors import InputError, OutputError, UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.files.atomic import check_not_an_input, lock, public_mode, write_bytes
 from keyss.files.models import write_model
-from keyss.runs.json_records import read_record, write_record
+from keyss.runs.json_records import read_record, record_bytes, write_record
 
 PUBLISH, PRIVATE = "publish", "private"
 MANIFEST = f"{PRIVATE}/manifest.json"
@@ -76,7 +76,7 @@ class RunFolder:
     ) -> None:
         self.path, self.stage, self.onto = Path(path), stage, frozenset(onto)
         # Equal to what a manifest returns: tuples become lists.
-        self.arguments: dict[str, Any] = msgspec.json.decode(msgspec.json.encode(dict(arguments or {})))
+        self.arguments: dict[str, Any] = msgspec.json.decode(record_bytes(dict(arguments or {})))
         if overwrite and resume:
             raise UsageError("`overwrite=True` starts anew and `resume=True` continues: give one of them")
         check_not_published(self.path)

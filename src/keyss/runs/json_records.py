@@ -13,7 +13,7 @@ import msgspec
 
 from keyss.core.errors import InputError
 from keyss.files.atomic import write_bytes
-from keyss.files.inputs import read_file
+from keyss.files.inputs import as_text, read_file
 
 MAX_BYTES = 16 * 2**20
 
@@ -64,16 +64,16 @@ def record_bytes(record: Any) -> bytes:
     try:
         data = msgspec.json.encode(record)
     except UnicodeEncodeError:
-        data = msgspec.json.encode(_as_text(msgspec.to_builtins(record)))
+        data = msgspec.json.encode(_all_as_text(msgspec.to_builtins(record)))
     return msgspec.json.format(data, indent=2) + b"\n"
 
 
-def _as_text(value: Any) -> Any:
+def _all_as_text(value: Any) -> Any:
     match value:
         case str():
-            return value.encode("utf-8", "surrogateescape").decode("utf-8", "replace")
+            return as_text(value)
         case dict():
-            return {_as_text(key): _as_text(item) for key, item in value.items()}
+            return {_all_as_text(key): _all_as_text(item) for key, item in value.items()}
         case list() | tuple():
-            return [_as_text(item) for item in value]
+            return [_all_as_text(item) for item in value]
     return value

@@ -63,7 +63,7 @@ def plan_hiding(
     if plan.steps:
         rendered = zip(plan.rendered, scenes, strict=True)
         step = options.fit.views_per_step * sum(_step(device, *each) for each in rendered if each[0])
-        stages.append(Stage("hiding", plan.steps, sum(plan.rendered), plan.steps * step))
+        stages.append(Stage("hiding", plan.steps, sum(plan.rendered), plan.steps * plan.step_cost * step))
     measuring = sum(_RENDERS * len(scene.test) * each for scene, each in zip(scenes, renders, strict=True))
     measuring += _KEY_SECONDS * (count - 1)
     stages += [*bounds, Stage("encrypting, opening, measuring", 0, plan.gaussians, measuring)]

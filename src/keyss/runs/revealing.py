@@ -146,8 +146,9 @@ class ModelCheck:
 class SecretCheck:
     """Checks of the secret of a key."""
 
-    found: int  # Gaussians
-    hidden: int  # Gaussians in all; 0: unknown
+    found: int
+    hidden: int  # in all; 0: unknown
+    unit: str  # of both: Gaussians, or bytes of a hidden file
     share: float  # found / hidden
     chunks: int | None  # chunks of the payload; None if it is not divided
     chunks_lost: int | None  # restored by error correction
@@ -164,8 +165,8 @@ class Verification:
 
     @property
     def problems(self) -> tuple[str, ...]:
-        """Problems of the secret if there is a key, else of the model."""
-        return self.model.problems if self.secret is None else self.secret.problems
+        """Problems of the model and, with a key, of the secret."""
+        return self.model.problems + (() if self.secret is None else self.secret.problems)
 
 
 def check_model(model: Gaussians) -> ModelCheck:
@@ -211,11 +212,12 @@ def check_secret(revealed: Revealed) -> SecretCheck:
     left, chunks = remains.chunks or (None, None)
     lost = None if left is None or chunks is None else chunks - left
     problems = list(revealed.warnings)
-    if not remains.whole and not problems:
+    if revealed.file is None and not remains.whole and not problems:
         problems.append(f"{remains.found:,} of {remains.hidden:,} Gaussians of the secret were found")
     return SecretCheck(
         found=remains.found,
         hidden=remains.hidden,
+        unit="Gaussians" if revealed.file is None else "bytes",
         share=round(remains.share, 4),
         chunks=chunks,
         chunks_lost=lost,

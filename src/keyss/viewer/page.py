@@ -19,9 +19,9 @@ from pathlib import Path
 from typing import BinaryIO
 from urllib.parse import quote
 
-import keyss.files
 from keyss.core.errors import InputError, KeyssWarning, OutputError, UsageError
 from keyss.files.atomic import check_not_an_input, check_output_file, mode_like, write_bytes
+from keyss.files.inputs import as_text
 from keyss.files.training_outputs import model_file
 from keyss.viewer.look import Look
 
@@ -158,6 +158,8 @@ def readable(model: Path) -> Readable:
 
     Warns and raises as `read_model`, and UsageError for a file that is too large.
     """
+    from keyss.runs.files import as_model  # imports torch
+
     model = model_file(model)
     try:
         with model.open("rb") as file:
@@ -167,14 +169,14 @@ def readable(model: Path) -> Readable:
         header, size = b"", 0  # read_model raises the InputError
     if size > MAX_BYTES:
         raise UsageError(f"{model} has {size:,} bytes, more than the {MAX_BYTES:,} that a page loads")
-    gaussians = keyss.files.read_model(model)
+    gaussians = as_model(model)
     is_text = header.startswith(b"ply") and b"\nformat ascii" in header.partition(b"end_header")[0]
     if not is_text and (header.startswith(_MAGIC) or model.name.lower().endswith(".splat")):
-        return Readable(model.name, lambda: model.open("rb"), size)
+        return Readable(as_text(model.name), lambda: model.open("rb"), size)
 
     from keyss.files.models import model_bytes
 
-    name, kind = f"{model.stem}.ply", "a .ply in text" if is_text else f"a {model.suffix}"
+    name, kind = as_text(f"{model.stem}.ply"), "a .ply in text" if is_text else f"a {model.suffix}"
     data = model_bytes(name, gaussians)
     warnings.warn(
         f"{model}: the page does not read {kind}; it shows a lossless copy, {name}",

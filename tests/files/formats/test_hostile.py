@@ -100,7 +100,7 @@ def test_unsupported_versions() -> None:
     refused("a.spz", legacy_spz(1, bytes(100), version=9), "version 2 or 3")
     refused("a.spz", legacy_spz(1, bytes(900), degree=4), "degree 0 to 3")
     refused("a.spz", legacy_spz(1, bytes(100), bits=60), "fractional bits")
-    refused("a.spz", gzip.compress(b"something else entirely"), "the gzip data do not hold one")
+    refused("a.spz", gzip.compress(b"something else entirely"), "found gzip data; unpack it")
 
 
 def check_one_left_out(name: str, data: bytes, attribute: str) -> None:

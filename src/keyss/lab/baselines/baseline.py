@@ -171,7 +171,7 @@ class Baseline:
 
     def plan(self, sources: Sequence[Source], options: BaselineOptions) -> Plan:
         """Both scenes share the Gaussians of one model."""
-        return options.joint_plan(1)
+        return options.joint_plan(1, options.step_cost)
 
     def hide(
         self, cover: Source, secrets: Sequence[Source], options: BaselineOptions, context: Context

@@ -69,7 +69,7 @@ class KeyssMethod:
 
     def plan(self, sources: Sequence[Source], options: KeyssOptions) -> Plan:
         """All scenes share the Gaussians of one model."""
-        return options.joint_plan(len(sources) - 1)
+        return options.joint_plan(len(sources) - 1, options.step_cost)
 
     def hide(
         self, cover: Source, secrets: Sequence[Source], options: KeyssOptions, context: Context
