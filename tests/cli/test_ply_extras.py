@@ -12,6 +12,7 @@ from cli.harness import Run, write_key
 from files.test_ply import columns_of, ply_bytes
 from keyss.core import Gaussians, same_bits
 from keyss.files import read_model, write_model
+from keyss.files.formats.common import in_morton_order
 from keyss.files.ply_table import read_vertices
 
 COUNT = 1500
@@ -43,6 +44,9 @@ def check_extras(path: Path, extra: dict[str, np.ndarray], rows: slice = slice(N
         vertices = read_vertices(file)
         table = np.concatenate(list(vertices.blocks))
     assert "\n".join(vertices.comments).encode("latin-1") + b"\n" == COMMENTS
+    assert list(table.dtype.names or ()) == list(
+        dict.fromkeys(["label", *columns_of(trained_like(1)), *extra])
+    )
     for name, values in extra.items():
         assert np.array_equal(table[name][: len(values[rows])], values[rows]), name
 
@@ -83,3 +87,37 @@ def test_hide_keeps_extra_properties(keyss: Run, tmp_path: Path, what: str, publ
     check_extras(stego, extra)
     out = tmp_path / f"out{secret.suffix}"
     assert keyss("reveal", stego, "--key-file", key, "-o", out).status == 0
+
+
+@pytest.mark.parametrize("start", ["scale_0", "opacity"])
+def test_hide_keeps_the_header_of_another_program(keyss: Run, tmp_path: Path, start: str) -> None:
+    """Properties in another order, and no normals, as gsply and trainers write them."""
+    columns = columns_of(trained_like(COUNT))
+    names = [name for name in columns if name not in ("nx", "ny", "nz")]
+    at = names.index(start)
+    data = ply_bytes({name: columns[name] for name in [*names[:3], *names[at:], *names[3:at]]})
+    (tmp_path / "cover.ply").write_bytes(data)
+    (tmp_path / "secret.txt").write_bytes(b"seven words")
+    key = write_key(tmp_path / "key")
+    arguments = ["--cover", tmp_path / "cover.ply", "--secret-file", tmp_path / "secret.txt"]
+    result = keyss("hide", *arguments, "--key-file", key, "-o", tmp_path / "run")
+    assert result.status == 0, result.err
+    published = (tmp_path / "run" / "publish" / "model.ply").read_bytes()
+    assert published.partition(b"end_header")[0] == data.partition(b"end_header")[0]
+    assert published != data
+    stego = tmp_path / "run" / "publish" / "model.ply"
+    assert keyss("reveal", stego, "--key-file", key, "-o", tmp_path / "out").status == 0
+
+
+def test_hide_keeps_comments_where_gaussians_change_places(keyss: Run, tmp_path: Path) -> None:
+    """As in a .ply that was decoded from a .sog, which stays in the order of its positions."""
+    write_model(tmp_path / "coded.sog", in_morton_order(trained_like(COUNT)))
+    write_model(tmp_path / "cover.ply", Gaussians(*vars(read_model(tmp_path / "coded.sog")).values()))
+    data = (tmp_path / "cover.ply").read_bytes().replace(b"element vertex", COMMENTS + b"element vertex", 1)
+    (tmp_path / "cover.ply").write_bytes(data)
+    (tmp_path / "secret.txt").write_bytes(b"seven words")
+    arguments = ["--cover", tmp_path / "cover.ply", "--secret-file", tmp_path / "secret.txt"]
+    key = write_key(tmp_path / "key")
+    assert keyss("hide", *arguments, "--key-file", key, "-o", tmp_path / "run").status == 0
+    published = (tmp_path / "run" / "publish" / "model.ply").read_bytes()
+    assert published.partition(b"end_header")[0] == data.partition(b"end_header")[0]

@@ -79,6 +79,12 @@ class Records:
 Content = Payload | Records
 
 
+def warn_of_foreign(content: Content) -> None:
+    """Warn (KeyssWarning) if Gaussians were added or changed after hiding."""
+    if content.foreign:
+        warnings.warn(_FOREIGN.format(content.foreign), KeyssWarning, stacklevel=4)
+
+
 def check_method(name: str) -> bytes:
     """The name of a method in ASCII. Raises ValueError unless it has 1 to METHOD_BYTES characters."""
     encoded = name.encode("ascii")
@@ -155,8 +161,7 @@ class SaltedReader(ABC):
         for derived in self.keys(key):
             with suppress(WrongKeyError):
                 content = self.extract(derived)
-                if content.foreign:
-                    warnings.warn(_FOREIGN.format(content.foreign), KeyssWarning, stacklevel=3)
+                warn_of_foreign(content)
                 return content
         raise WrongKeyError()
 

@@ -7,7 +7,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import get_args
 
-from keyss.channels.base import Channel, Content, Payload, Reader, SaltedReader
+from keyss.channels.base import Channel, Content, Payload, Reader, SaltedReader, warn_of_foreign
 from keyss.channels.names import AnyChannel, Format, Publish
 from keyss.core.errors import UsageError, WrongKeyError
 from keyss.core.gaussians import Gaussians
@@ -79,7 +79,7 @@ class Attempt:
 def quick_attempt(stego: Gaussians, key: str) -> Attempt | None:
     """A single attempt, which takes equally long for right and wrong keys; None without a salt.
 
-    Raises InputError for damage.
+    Raises InputError for damage. Warns (KeyssWarning) of Gaussians that were added or changed after hiding.
     """
     from keyss.channels.quiet.reading import QuietReader
 
@@ -93,6 +93,8 @@ def quick_attempt(stego: Gaussians, key: str) -> Attempt | None:
     for reader, each in zip(readers, derived, strict=True):
         with suppress(WrongKeyError):
             opened.append(_with_model_size(stego, reader.extract(each)))
+    if opened:
+        warn_of_foreign(opened[0])
     records = isinstance(quiet, QuietReader) and not quiet.blocks and appended is None
     return Attempt(derived[0], opened[0] if opened else None, appended is not None, records)
 

@@ -1,10 +1,10 @@
-"""Properties and comments that other programs add to a 3DGS .ply."""
+"""Properties, comments and the order of properties in a 3DGS .ply of another program."""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,10 +23,11 @@ _MAX_MOVED = 0.01  # distance by which hiding moves Gaussians, relative to the m
 
 @dataclass(frozen=True, eq=False)
 class PlyExtras:
-    """Comments, and values [N] of further properties by name, in the order and types of the file."""
+    """Comments, the order of all properties, and values [N] of further ones, in the types of the file."""
 
-    comments: tuple[str, ...]  # whole lines
-    properties: Mapping[str, Numbers]
+    comments: tuple[str, ...] = ()  # whole lines
+    order: tuple[str, ...] = ()  # names; empty: that of Inria's layout
+    properties: Mapping[str, Numbers] = field(default_factory=dict)  # by name
 
 
 class ExtendedGaussians(Gaussians):
@@ -38,24 +39,30 @@ class ExtendedGaussians(Gaussians):
 
 
 def with_extras(model: Gaussians, source: Any, read: Gaussians) -> Gaussians:
-    """`model` with the extras of the .ply at `source`, from which `read` was read.
+    """`model` with the extras of the .ply at `source`, from which `read` was read; `model` if there are none.
 
-    Returns `model` if there are none, or if it is not the Gaussians of `read` in their order, possibly with
-    more Gaussians appended, whose extras are 0. Raises InputError.
+    Further properties stay only if it is the Gaussians of `read` in their order, possibly with more Gaussians
+    appended, whose properties are 0. Raises InputError.
     """
     if type(model) is not Gaussians or not isinstance(source, str | Path):
         return model
     path, more = model_file(source), len(model) - len(read)
     extras = _read_extras(path, len(read)) if path.is_file() else None
-    if extras is None or more < 0:
+    if extras is None:
         return model
-    moved = (model.means[: len(read)].cpu() - read.means.cpu()).abs()
-    if not bool((moved <= _MAX_MOVED * read.means.cpu().std(0, correction=0) + 1e-30).all()):
-        return model
+    kept = extras.properties if _has_rows_of(model, read) else {}
     extended = ExtendedGaussians(*(getattr(model, each.name) for each in fields(Gaussians)))
-    padded = {name: np.pad(values, (0, more)) for name, values in extras.properties.items()}
-    object.__setattr__(extended, "extras", PlyExtras(extras.comments, padded))
+    padded = {name: np.pad(values, (0, more)) for name, values in kept.items()}
+    object.__setattr__(extended, "extras", replace(extras, properties=padded))
     return extended
+
+
+def _has_rows_of(model: Gaussians, read: Gaussians) -> bool:
+    """True if a model begins with the Gaussians of `read`, in their order."""
+    if len(model) < len(read):
+        return False
+    moved = (model.means[: len(read)].cpu() - read.means.cpu()).abs()
+    return bool((moved <= _MAX_MOVED * read.means.cpu().std(0, correction=0) + 1e-30).all())
 
 
 def _read_extras(path: Path, count: int) -> PlyExtras | None:
@@ -74,4 +81,12 @@ def _read_extras(path: Path, count: int) -> PlyExtras | None:
     values = {name: each for name, each in values.items() if name not in NORMALS or each.any()}
     if any(len(each) != count for each in values.values()):
         raise InputError(f"{path}: it changed while it was read")
-    return PlyExtras(tuple(model.comments), values) if values or model.comments else None
+    order = model.dtype.names or ()
+    if not (values or model.comments) and list(order) == names_with_normals(model.names):
+        return None
+    return PlyExtras(tuple(model.comments), order, values)
+
+
+def names_with_normals(names: Sequence[str]) -> list[str]:
+    """All properties of Inria's layout, from those that make a model."""
+    return [*names[:3], *NORMALS, *names[3:]]

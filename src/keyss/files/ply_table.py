@@ -91,12 +91,12 @@ def read_vertices(file: BinaryIO) -> Vertices:
     return Vertices(vertex.count, vertex.dtype, comments, blocks)
 
 
-def read_tables(file: BinaryIO) -> dict[str, Table]:
-    """All elements of a binary PLY by name.
+def read_tables(file: BinaryIO) -> tuple[dict[str, Table], list[str]]:
+    """All elements of a binary PLY by name, and the comments.
 
     Raises InputError for ascii, for list properties and for a file that is damaged or too short.
     """
-    elements, _ = _read_header(file)
+    elements, comments = _read_header(file)
     if elements[0].order == _TEXT:
         raise InputError("expected a binary .ply file, found one in ascii")
     _check_size(file, sum(element.size for element in elements), elements[-1])
@@ -104,7 +104,7 @@ def read_tables(file: BinaryIO) -> dict[str, Table]:
     for element in elements:
         data = file.read(element.size)
         tables[element.name] = np.frombuffer(data, element.dtype) if data else np.empty(0, element.dtype)
-    return tables
+    return tables, comments
 
 
 def columns(table: Table, names: Sequence[str], dtype: type = np.float32) -> Numbers:

@@ -32,7 +32,10 @@ def model_of(count: int = 6000, seed: int = 0, sh_degree: int = 1) -> Gaussians:
 
 
 def codes_of(suffix: str, count: int = 6000, seed: int = 0, sh_degree: int = 1) -> Any:
-    return FORMATS[suffix].quantise(model_of(count, seed, sh_degree))
+    model = model_of(count, seed, sh_degree)
+    if suffix == ".spz":  # in no order, as after training
+        model = model[torch.randperm(count, generator=torch.Generator().manual_seed(seed))]
+    return FORMATS[suffix].quantise(model)
 
 
 def written(cover: CodesCover, *payloads: bytes, entropy: bytes = bytes(range(32))) -> Any:

@@ -7,16 +7,18 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import given, settings, strategies as st
 
 from channels.quiet.coded import FORMATS, bits_of, codes_of, model_of, opened, there_and_back, written
 from keyss.channels import CodesCover, Field, Payload, QuietReader, in_counted_order, last_bits
 from keyss.channels.quiet.fields import carrying, sog_distances
 from keyss.channels.quiet.wet_paper import read_blocks
-from keyss.channels.quiet.writable_levels import writable_levels
+from keyss.channels.quiet.writable_levels import fixed_axes, writable_levels
 from keyss.core import InputError, UsageError, WrongKeyError
 from keyss.files.formats import sog
 from keyss.files.formats.common import morton_order
+from keyss.files.formats.compressed_ply import CompressedPlyCodes
 from keyss.files.formats.sog import SogCodes
 from keyss.files.formats.spz import SpzCodes
 from keyss.keys import encryption
@@ -213,7 +215,7 @@ def test_the_largest_part_of_a_quaternion_stays_the_largest(suffix: str) -> None
 
 
 def test_rotations_of_an_old_spz_stay() -> None:
-    codes = SpzCodes.quantise(model_of())
+    codes = codes_of(".spz")
     old = replace(
         codes,
         version=2,
@@ -238,7 +240,27 @@ def test_sog_stays_in_the_order_of_its_positions() -> None:
     assert abs(found - expected) < 6 * expected**0.5
 
 
-SECRET = bytes(32)
+def test_an_spz_in_the_order_of_space_keeps_its_positions() -> None:
+    """Otherwise it would be less in order than before."""
+    codes = SpzCodes.quantise(model_of())
+    file = written(CodesCover.of(codes), b"data" * 99)
+    assert np.array_equal(file.positions, codes.positions)
+    assert (file.rotations != codes.rotations).mean() > 0.5
+    assert opened(file) == b"data" * 99
+
+
+@pytest.mark.parametrize("other", [SpzCodes, SogCodes])
+def test_positions_of_another_format_stay(other: type[SpzCodes | SogCodes]) -> None:
+    """Those decoded from a compressed .ply are on the lattices of its chunks."""
+    model = CompressedPlyCodes.quantise(model_of(20_000)).dequantise()
+    codes = other.quantise(model)
+    assert fixed_axes(codes).all()
+    assert not fixed_axes(other.quantise(model[torch.randperm(20_000)])).any()
+    free = writable_levels(*in_counted_order(codes)[1:], fixed_axes(codes), SECRET)
+    assert [each.any() for each in free] == [False] * 3 + [True] * 3
+
+
+SECRET, NO_AXIS = bytes(32), np.zeros(3, np.bool_)
 
 
 def test_gaussians_nearer_to_each_other_than_by_chance_stay() -> None:
@@ -247,9 +269,9 @@ def test_gaussians_nearer_to_each_other_than_by_chance_stay() -> None:
     positions = codes.positions.copy()
     positions[1000:1200] = positions[:200] + np.array([1, 0, 0])
     near = replace(codes, positions=positions)
-    free = np.stack(writable_levels(near, in_counted_order(near)[2], SECRET)[:3])
+    free = np.stack(writable_levels(near, in_counted_order(near)[2], NO_AXIS, SECRET)[:3])
     assert free[:, :200].mean() < 0.1 > free[:, 1000:1200].mean()
-    apart = np.stack(writable_levels(codes, fields, SECRET)[:3])
+    apart = np.stack(writable_levels(codes, fields, NO_AXIS, SECRET)[:3])
     assert apart[:, :200].mean() > 0.8 < free[:, 2000:].mean()
 
 
@@ -261,7 +283,8 @@ def test_neighbours_with_equal_rotations_keep_them(suffix: str) -> None:
         nearest = int(np.linalg.norm(means - means[row], axis=1).argsort()[1])
         rotations = codes.rotations.copy()
         rotations[nearest] = rotations[row]
-        free = np.stack(writable_levels(*in_counted_order(replace(codes, rotations=rotations))[1:], SECRET))
+        changed = in_counted_order(replace(codes, rotations=rotations))[1:]
+        free = np.stack(writable_levels(*changed, NO_AXIS, SECRET))
         assert not free[:, [row, nearest]].any()
         assert free.any(axis=0).mean() > 0.8
 

@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import pytest
+import torch
 from scipy import stats
 
 from channels.quiet.coded import FORMATS, bits_of, codes_of, written
+from channels.quiet.trained_like import trained_like
 from keyss.channels import CodesCover, Field, in_counted_order
+from keyss.channels.quiet.fields import carrying
+from keyss.core import Gaussians
+from keyss.files.formats.common import in_morton_order
 
 COUNT = 30_000
 
@@ -71,3 +77,34 @@ def test_ends_of_ranges_stay(file: tuple[str, CodesCover, Any]) -> None:
             continue  # whose ends are those of the format
         for end in (old.levels.min(), old.levels.max()):
             assert np.array_equal(old.levels == end, new.levels == end), old.name
+
+
+def hardly_trained(count: int = 20_000) -> Gaussians:
+    """A fortieth is nearly round and hardly rotated, as before training."""
+    model = trained_like(count, sh_degree=0)
+    few, small = slice(count // 40), trained_like(count // 40, 1, 0)
+    model.log_scales[few] = model.log_scales[few, :1] + 2e-3 * (small.log_scales + 4)
+    model.quats[few] = torch.tensor([1.0, 0, 0, 0]) + 2e-3 * small.quats
+    return in_morton_order(replace(model, opacity_logits=model.opacity_logits.clamp_min(-4)))
+
+
+def coincidences(codes: Any) -> dict[str, int]:
+    """The numbers of small rotations, of rotations with equal parts, and of round Gaussians."""
+    middle = sum(carrying(codes).rotations) / 2
+    fields = in_counted_order(codes)[2]
+    parts = np.abs(np.stack([each.levels for each in fields if each.name == "rotations"], axis=1) - middle)
+    sizes = np.ptp(codes.dequantise().log_scales.numpy(), axis=1)
+    return {
+        "small": int((parts.max(axis=1) < 2).sum()),
+        "equal": int((parts[:, 0] == parts[:, 1]).sum()),
+        "round": int((sizes < 4e-3).sum()),
+    }
+
+
+@pytest.mark.parametrize("suffix", FORMATS)
+def test_there_are_as_many_coincidences_as_before(suffix: str) -> None:
+    cover = CodesCover.of(FORMATS[suffix].quantise(hardly_trained()))
+    before, after = coincidences(cover.codes), coincidences(written(cover, b"x" * 5000))
+    for name, count in before.items():
+        assert count > 80
+        assert abs(after[name] - count) < 6 * count**0.5, name

@@ -8,6 +8,7 @@ from itertools import product
 from pathlib import Path
 
 import gsply
+import gsply.spz
 import numpy as np
 import pytest
 import torch
@@ -167,3 +168,22 @@ def test_glb_round_trip(degree: int) -> None:
     assert_close(found, model, 1e-6)
     assert torch.equal(found.means, model.means)
     assert torch.equal(found.sh, model.sh)
+
+
+@pytest.mark.parametrize("name", ["spz", "compressed.ply"])
+def test_parsed_files_of_splat_transform_stay_to_the_byte(
+    splat_transform: Transform, tmp_path: Path, name: str
+) -> None:
+    write_model(tmp_path / "model.ply", model_of(5000, 3))
+    data = splat_transform(tmp_path / "model.ply", tmp_path / f"file.{name}").read_bytes()
+    kind = SpzCodes if name == "spz" else CompressedPlyCodes
+    assert kind.parse(data).serialise() == data
+
+
+@pytest.mark.parametrize(("version", "count"), [(3, 5000), (3, 40_000), (4, 5000)])
+def test_parsed_files_of_gsply_stay_to_the_byte(tmp_path: Path, version: int, count: int) -> None:
+    """Above 1 MiB, gsply compresses blocks on their own."""
+    write_model(tmp_path / "model.ply", model_of(count, 3))
+    gsply.spz.write_spz(tmp_path / "file.spz", gsply.plyread(str(tmp_path / "model.ply")), version=version)
+    data = (tmp_path / "file.spz").read_bytes()
+    assert SpzCodes.parse(data).serialise() == data

@@ -43,7 +43,7 @@ from keyss.channels.quiet.layout import BLOCK_HEADER, LEAST_BYTES, MIN_BLOCKS, L
 from keyss.channels.quiet.order import file_order, in_counted_order, in_rows, model_hash
 from keyss.channels.quiet.salts import salt, salt_rows
 from keyss.channels.quiet.usable import check_usable, usable_with_ids
-from keyss.channels.quiet.writable_levels import writable_levels
+from keyss.channels.quiet.writable_levels import fixed_axes, writable_levels
 from keyss.channels.quiet.writing import Writer, bytes_of
 from keyss.core.arrays import Bits, Bytes, Flags, Integers
 from keyss.core.errors import KeyssWarning, UsageError
@@ -213,7 +213,8 @@ class CodesCover:
         rows, ordered, own = in_counted_order(codes, decoded.exact if decoded else None)
         model = decoded[rows] if decoded else None
         own_hash = model_hash(ordered, model.model if model else None)
-        cover = CodesCover(ordered, own, writable_levels(ordered, own, _digest(codes)), own_hash, model)
+        free = writable_levels(ordered, own, fixed_axes(codes), _digest(codes))
+        cover = CodesCover(ordered, own, free, own_hash, model)
         if len(cover.ids) < MIN_BLOCKS or cover.width < LEAST_BYTES:
             raise UsageError(
                 f"a cover of {len(codes):,} Gaussians has no room for secrets in the codes of {codes.name} "

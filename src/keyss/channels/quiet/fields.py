@@ -29,7 +29,7 @@ Levels = npt.NDArray[np.int32]
 
 MAX_BITS = 10
 _SHARE = -3.0  # log2 of the range of written positions, in sizes of the Gaussian
-_LOG_SCALE = -4.0  # log2 of the range of written log scales
+LOG_SCALE_RANGE = -4.0  # log2 of the range of written log scales
 _SIGN, _MAGNITUDE = 512, 511  # masks of a rotation's component in SPZ 3 and newer
 _LOG2_E = 1.4426950408889634
 _VECTOR = np.array([2047, 1023, 2047])  # largest levels of x, y, z in a compressed .ply
@@ -136,7 +136,7 @@ def _sog_fields(codes: SogCodes) -> list[Field]:
 
 def _compressed_ply_fields(codes: CompressedPlyCodes) -> list[Field]:
     low, high = codes.bounds[:, 6:9].astype(np.float64), codes.bounds[:, 9:12].astype(np.float64)
-    bits = _fitting(_LOG_SCALE - _log2((high - low) / _VECTOR)).repeat(CHUNK, axis=0)[: len(codes)]
+    bits = _fitting(LOG_SCALE_RANGE - _log2((high - low) / _VECTOR)).repeat(CHUNK, axis=0)[: len(codes)]
     return [*_fields("scales", codes.scales, bits), *_fields("rotations", codes.rotations, 3)]
 
 

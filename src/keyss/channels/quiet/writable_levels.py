@@ -10,12 +10,14 @@ from __future__ import annotations
 import numpy as np
 
 from keyss.channels.mixing import random_fractions
+from keyss.channels.quiet.excess import DEVIATIONS, ROUGH, without_excess
 from keyss.channels.quiet.fields import Field, Levels, carrying, sog_distances
 from keyss.core.arrays import Doubles, Flags, Integers
 from keyss.core.neighbours import nearest_neighbours
-from keyss.files.formats.common import Codes
-from keyss.files.formats.compressed_ply import CompressedPlyCodes
+from keyss.files.formats.common import Codes, is_in_morton_order
+from keyss.files.formats.compressed_ply import CHUNK, VECTOR, CompressedPlyCodes
 from keyss.files.formats.sog import SogCodes
+from keyss.files.formats.spz import SpzCodes
 
 # Distance to the nearest neighbour, in sizes of the Gaussian, at which half of the Gaussians are left single.
 # Clones lie nearer to each other, and there are more of them than by chance.
@@ -23,40 +25,66 @@ _CLONES = 1 / 8
 _NEIGHBOURS = 4  # nearest neighbours searched for clones
 _RAMP = 3  # width of the ramp before a limit, in units of 2^bits levels
 _NEAR = 8  # maximum distance of levels whose frequencies are compared
-_ROUGH = 0.25  # maximum relative excess of pairs of equal levels over pairs of near ones
 _EQUAL = 0.02  # excess that is always allowed, as a share of the Gaussians
-_DEVIATIONS = 6  # standard deviations of that excess by chance
 _BIAS = 0.02  # maximum bias of last bits
+_OFF_LATTICE = 0.24  # minimum mean distance from a lattice, in steps; by chance it is 0.248
 
 
-def writable_levels(codes: Codes, fields: list[Field], secret: bytes) -> list[Flags]:
-    """For each field a mask [N] of the levels that may be written. `secret`: 32 secret bytes."""
+def writable_levels(codes: Codes, fields: list[Field], fixed: Flags, secret: bytes) -> list[Flags]:
+    """For each field a mask [N] of the levels that may be written.
+
+    `fixed` [3]: the result of `fixed_axes`. `secret`: 32 secret bytes.
+    """
     count = len(fields[0].levels)
-    single = _not_clones(codes, fields, random_fractions(secret, "kept/clones", count))
+    means = codes.dequantise().means.double().numpy()
+    distance, near = nearest_neighbours(means, min(_NEIGHBOURS + 1, count))
+    single = _not_clones(codes, fields, distance, near, random_fractions(secret, "kept/clones", count))
+    left = without_excess(codes, fields, single, near[:, 1:], secret)
     stable = _keep_largest(codes, fields, random_fractions(secret, "kept/turns", count))
     free = []
-    for field in fields:
+    for field, own in zip(fields, left, strict=True):
         random = random_fractions(secret, f"kept/{field.name}/{field.column}", count)
-        own = single & (_margin(codes, field) > random * _RAMP * (1 << field.bits)) & (field.bits > 0)
+        own &= field.bits > 0
+        own &= _margin(codes, field) > random * _RAMP * (1 << field.bits)
         if field.name == "rotations":
             own &= stable
+        elif field.name == "positions" and fixed[field.column]:
+            own[:] = False
         free.append(own if _is_natural(field.levels[own]) else np.zeros_like(own))
     return free
 
 
-def _not_clones(codes: Codes, fields: list[Field], random: Doubles) -> Flags:
+def fixed_axes(codes: Codes) -> Flags:
+    """[3] axes along which no position may change. `codes`: in the order of their file.
+
+    All axes of an .spz in Morton order: it would be less in order than rounding explains. (A .sog is sorted
+    again.) Those along which positions are on the lattices of the chunks of a compressed .ply.
+    """
+    means = codes.dequantise().means.numpy()
+    if isinstance(codes, SpzCodes) and is_in_morton_order(means):
+        return np.ones(3, np.bool_)
+    chunks = means[: len(means) // CHUNK * CHUNK].astype(np.float64).reshape(-1, CHUNK, 3)
+    low, high = chunks.min(axis=1, keepdims=True), chunks.max(axis=1, keepdims=True)
+    levels = (chunks - low) / np.where(high > low, high - low, 1.0) * (2.0 ** np.array(VECTOR) - 1)
+    distances = np.abs(levels - np.rint(levels)).reshape(-1, 3)
+    expected = _OFF_LATTICE - DEVIATIONS / (12 * max(1, len(distances))) ** 0.5
+    fixed: Flags = distances.sum(axis=0) < expected * len(distances)
+    return fixed
+
+
+def _not_clones(
+    codes: Codes, fields: list[Field], distance: Doubles, near: Integers, random: Doubles
+) -> Flags:
     """[N] which Gaussians are not clones.
 
     Training moves clones apart slowly, so there are more near pairs than by chance, and writing would move
     them further apart. The share of writable Gaussians grows smoothly with the distance from the nearest
     neighbour, relative to their size. Gaussians that share a written attribute with a neighbour never change.
     """
-    model = codes.dequantise()
-    means, log_scales = (each.double().numpy() for each in (model.means, model.log_scales))
+    log_scales = codes.dequantise().log_scales.double().numpy()
     sizes = np.exp(np.sort(log_scales, axis=1)[:, 1])
-    distance, near = nearest_neighbours(means, min(_NEIGHBOURS + 1, len(means)))
     ratio = distance[:, 1] / sizes / _CLONES
-    both = np.minimum(np.arange(len(means)), near[:, 1])  # mutual nearest neighbours share one decision
+    both = np.minimum(np.arange(len(near)), near[:, 1])  # mutual nearest neighbours share one decision
     single: Flags = random[both] * (1 + ratio**3) < ratio**3
     for name in {each.name for each in fields}:
         levels = np.stack([each.levels for each in fields if each.name == name], axis=1)
@@ -113,10 +141,10 @@ def _is_natural(levels: Levels) -> bool:
     equal = float((counts * (counts - 1)).sum())
     near = [_pairs(values, counts, distance) for distance in range(1, _NEAR + 1)]
     expected = float(np.mean(near))
-    if equal - expected > max(_ROUGH * expected, _EQUAL * len(levels), _DEVIATIONS * expected**0.5):
+    if equal - expected > max(ROUGH * expected, _EQUAL * len(levels), DEVIATIONS * expected**0.5):
         return False
     odd = float((levels & 1).mean())
-    return bool(abs(odd - 0.5) < _BIAS + _DEVIATIONS / 2 / len(levels) ** 0.5)
+    return bool(abs(odd - 0.5) < _BIAS + DEVIATIONS / 2 / len(levels) ** 0.5)
 
 
 def _pairs(values: Integers, counts: Integers, distance: int) -> float:

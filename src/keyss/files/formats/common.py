@@ -19,6 +19,7 @@ from keyss.files.ply_rows import OPACITY_LOGIT_BOUND
 # least 7.
 SMALL_COUNT, MIN_BYTES = 1 << 17, 6
 _MORTON_BITS = 21  # per axis
+_SORTED = 0.9  # minimum share of ascending neighbours
 
 
 class Codes(ABC):
@@ -286,6 +287,13 @@ def morton_order(means: Floats) -> Integers:
     for axis in range(3):
         key |= _spread(cells[:, axis]) << np.uint64(axis)
     return np.argsort(key, kind="stable")
+
+
+def is_in_morton_order(means: Floats) -> bool:
+    """True for positions in `morton_order`, up to a few."""
+    places = np.empty(len(means))
+    places[morton_order(means)] = np.arange(len(means))
+    return len(means) > 1 and bool((np.diff(places) > 0).mean() >= _SORTED)
 
 
 def _spread(values: Words) -> Words:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Self
 
 import numpy as np
@@ -29,7 +29,7 @@ from keyss.files.formats.common import (
 from keyss.files.ply_table import ply_header, read_tables
 
 CHUNK = 256  # Gaussians
-_VECTOR = (11, 10, 11)  # bits of x, y, z
+VECTOR = (11, 10, 11)  # bits of x, y, z
 _SCALE_LIMIT = 20.0  # log scales are clipped to +- this
 _MIN_RANGE = 1e-5  # in chunks of smaller range, all values become the lower bound
 
@@ -39,6 +39,7 @@ _BOUNDS = [
     for end in ("min", "max")
     for name in names.split()
 ]
+_COLOR_BOUNDS = np.repeat(np.array([0, 1], np.float32), 3)  # of old files, which do not state them
 _PACKED = ["packed_position", "packed_rotation", "packed_scale", "packed_color"]
 
 
@@ -56,14 +57,15 @@ class CompressedPlyCodes(Codes):
     colors: Bytes  # [N, 3] between the bounds
     alphas: Bytes  # [N] opacities in 255ths
     sh: Bytes  # [N, K - 1, 3] harmonics in 32nds from -4 on
+    comments: tuple[str, ...] = field(default=(), compare=False)  # whole lines of the header
 
     def __len__(self) -> int:
         return len(self.positions)
 
     @classmethod
     def parse(cls, data: bytes) -> Self:
-        """See `Codes`. Old files have no colour bounds; they are 0 and 1."""
-        tables = read_tables(io.BytesIO(data))
+        """See `Codes`."""
+        tables, comments = read_tables(io.BytesIO(data))
         vertex, chunk = tables["vertex"], tables.get("chunk")
         n = len(vertex)
         if chunk is None or not _has(vertex, _PACKED, "u4") or not _has(chunk, _BOUNDS[:12], "f4"):
@@ -74,36 +76,40 @@ class CompressedPlyCodes(Codes):
             raise InputError("it holds no Gaussians")
         if len(chunk) != -(-n // CHUNK):
             raise InputError(f"expected {-(-n // CHUNK):,} chunks of {n:,} Gaussians, found {len(chunk):,}")
-        bounds = np.tile(np.repeat(np.array([0, 1], np.float32), 3), (len(chunk), 3))
+        bounds = np.tile(_COLOR_BOUNDS, (len(chunk), 3))
         for column, name in enumerate(_BOUNDS if _has(chunk, _BOUNDS, "f4") else _BOUNDS[:12]):
             bounds[:, column] = chunk[name]
         position, rotation, scale, color = (vertex[name].astype(np.uint32) for name in _PACKED)
         return cls(
             bounds=bounds,
-            positions=_unpack_fields(position, _VECTOR).astype(np.uint16),
+            positions=_unpack_fields(position, VECTOR).astype(np.uint16),
             largest=(rotation >> 30).astype(np.uint8),
             rotations=_unpack_fields(rotation, (10, 10, 10)).astype(np.uint16),
-            scales=_unpack_fields(scale, _VECTOR).astype(np.uint16),
+            scales=_unpack_fields(scale, VECTOR).astype(np.uint16),
             colors=_unpack_fields(color >> 8, (8, 8, 8)).astype(np.uint8),
             alphas=(color & 255).astype(np.uint8),
             sh=_harmonics(tables.get("sh"), n),
+            comments=tuple(comments),
         )
 
     def serialise(self) -> bytes:
         n, k = self.sh.shape[:2]
         packed = np.empty((n, 4), dtype="<u4")
-        packed[:, 0] = _pack_fields(self.positions, _VECTOR)
+        packed[:, 0] = _pack_fields(self.positions, VECTOR)
         packed[:, 1] = self.largest.astype(np.uint32) << 30 | _pack_fields(self.rotations, (10, 10, 10))
-        packed[:, 2] = _pack_fields(self.scales, _VECTOR)
+        packed[:, 2] = _pack_fields(self.scales, VECTOR)
         packed[:, 3] = _pack_fields(self.colors, (8, 8, 8)) << np.uint32(8) | self.alphas
+        has_colors = bool((self.bounds[:, 12:] != _COLOR_BOUNDS).any())  # not in old files
+        names = _BOUNDS if has_colors else _BOUNDS[:12]
         elements = {
-            "chunk": (len(self.bounds), [f"float {name}" for name in _BOUNDS]),
+            "chunk": (len(self.bounds), [f"float {name}" for name in names]),
             "vertex": (n, [f"uint {name}" for name in _PACKED]),
         }
         if k:
             elements["sh"] = (n, [f"uchar f_rest_{i}" for i in range(3 * k)])
         harmonics = self.sh.transpose(0, 2, 1).tobytes()
-        return ply_header(elements) + self.bounds.astype("<f4").tobytes() + packed.tobytes() + harmonics
+        bounds = self.bounds[:, : len(names)].astype("<f4").tobytes()
+        return ply_header(elements, self.comments) + bounds + packed.tobytes() + harmonics
 
     @classmethod
     def quantise(cls, model: Gaussians) -> Self:
@@ -117,7 +123,7 @@ class CompressedPlyCodes(Codes):
         between = bounds.astype(np.float64).repeat(CHUNK, axis=0)[: len(model)].reshape(-1, 3, 2, 3)
         position, scale, color = (_inverse_lerp(between[:, i], values) for i, values in enumerate(parts))
         largest, others = smallest_three(quats)
-        steps = 2.0 ** np.array(_VECTOR) - 1
+        steps = 2.0 ** np.array(VECTOR) - 1
         return cls(
             bounds=bounds,
             positions=np.floor(position * steps + 0.5).astype(np.uint16),
@@ -131,7 +137,7 @@ class CompressedPlyCodes(Codes):
 
     def dequantise(self) -> Gaussians:
         bounds = self.bounds.astype(np.float64).repeat(CHUNK, axis=0)[: len(self)].reshape(-1, 3, 2, 3)
-        steps = 2.0 ** np.array(_VECTOR) - 1
+        steps = 2.0 ** np.array(VECTOR) - 1
         rotations = (self.rotations / 1023 - 0.5) * np.sqrt(2)
         harmonics = np.where(self.sh == 0, 0.0, np.where(self.sh == 255, 256.0, self.sh + 0.5))
         return gaussians_of(

@@ -11,7 +11,7 @@ import math
 import struct
 import warnings
 import zlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise, product
 from typing import Self
@@ -39,7 +39,8 @@ from keyss.files.formats.common import (
 GZIP, NGSP = b"\x1f\x8b", b"NGSP"
 _GZIP_HEADER = b"\x1f\x8b\x08\0\0\0\0\0\0\x03"  # zlib's, without time and name
 _GZIP_BYTES, _PART = len(_GZIP_HEADER), 1 << 18
-_NIANTIC = 6, 9  # zlib's level and memory
+# zlib's level and memory, and the bytes that are compressed on their own; Niantic's library, gsply, others.
+_SETTINGS = ((6, 9, 1 << 32), (6, 8, 1 << 18), *product((6, 9, *range(1, 6), 7, 8), (9, 8), (1 << 32,)))
 EXTENSIONS = 2  # flag
 _MAX_EXTENSION_BYTES = 1 << 20
 MAX_FRACTIONAL_BITS = 24
@@ -112,34 +113,38 @@ def _gzip(content: bytes, like: bytes) -> bytes:
 
     Recompressing a file reveals its settings; other settings would show that it was rewritten.
     """
-    packer = _packer(*_settings_of(like))
     header = like[:_GZIP_BYTES] if like and not like[3] else _GZIP_HEADER
     end = struct.pack("<II", zlib.crc32(content), len(content) & 0xFFFFFFFF)
-    return header + packer.compress(content) + packer.flush() + end
+    return header + b"".join(_deflated(content, *_settings_of(like))) + end
 
 
-def _packer(level: int, memory: int) -> zlib._Compress:
-    return zlib.compressobj(level, zlib.DEFLATED, -zlib.MAX_WBITS, memory)
+def _deflated(content: bytes, level: int, memory: int, block: int) -> Iterator[bytes]:
+    """Parts of the deflated `content`, each `block` of which is compressed on its own."""
+    for start in range(0, len(content), block):
+        own = memoryview(content)[start : start + block]
+        packer = zlib.compressobj(level, zlib.DEFLATED, -zlib.MAX_WBITS, memory)
+        for at in range(0, len(own), _PART):
+            yield packer.compress(own[at : at + _PART])
+        yield packer.flush(zlib.Z_FINISH if start + block >= len(content) else zlib.Z_SYNC_FLUSH)
 
 
-def _settings_of(packed: bytes) -> tuple[int, int]:
-    """zlib's level and memory that reproduce `packed`, else those of Niantic's library."""
+def _settings_of(packed: bytes) -> tuple[int, int, int]:
+    """zlib's level and memory, and the block, that reproduce `packed`, else those of Niantic's library."""
     if packed and not packed[3]:  # no optional header fields
         content = zlib.decompress(packed, 31)
-        for settings in product((6, 9, *range(1, 6), 7, 8), (9, 8)):
+        for settings in _SETTINGS:
             if _is_packed_with(packed, content, settings):
                 return settings
-    return _NIANTIC
+    return _SETTINGS[0]
 
 
-def _is_packed_with(packed: bytes, content: bytes, settings: tuple[int, int]) -> bool:
-    packer, at = _packer(*settings), _GZIP_BYTES
-    for start in range(0, len(content), _PART):  # wrong settings fail in the first parts
-        part = packer.compress(content[start : start + _PART])
+def _is_packed_with(packed: bytes, content: bytes, settings: tuple[int, int, int]) -> bool:
+    at = _GZIP_BYTES
+    for part in _deflated(content, *settings):  # wrong settings fail in the first parts
         if not packed.startswith(part, at):
             return False
         at += len(part)
-    return packed.startswith(packer.flush(), at)
+    return True
 
 
 def _unpack_gzip(data: bytes) -> tuple[Header, list[Bytes]]:
