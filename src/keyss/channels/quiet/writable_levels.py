@@ -14,7 +14,7 @@ from keyss.channels.quiet.excess import DEVIATIONS, ROUGH, without_excess
 from keyss.channels.quiet.fields import Field, Levels, carrying, sog_distances
 from keyss.core.arrays import Doubles, Flags, Integers
 from keyss.core.neighbours import nearest_neighbours
-from keyss.files.formats.common import Codes, is_in_morton_order
+from keyss.files.formats.common import Codes, is_in_morton_order, morton_keys
 from keyss.files.formats.compressed_ply import CHUNK, VECTOR, CompressedPlyCodes
 from keyss.files.formats.sog import SogCodes
 from keyss.files.formats.spz import SpzCodes
@@ -41,6 +41,7 @@ def writable_levels(codes: Codes, fields: list[Field], fixed: Flags, secret: byt
     single = _not_clones(codes, fields, distance, near, random_fractions(secret, "kept/clones", count))
     left = without_excess(codes, fields, single, near[:, 1:], secret)
     stable = _keep_largest(codes, fields, random_fractions(secret, "kept/turns", count))
+    ordered = _keep_order(codes, fields, means)
     free = []
     for field, own in zip(fields, left, strict=True):
         random = random_fractions(secret, f"kept/{field.name}/{field.column}", count)
@@ -48,8 +49,8 @@ def writable_levels(codes: Codes, fields: list[Field], fixed: Flags, secret: byt
         own &= _margin(codes, field) > random * _RAMP * (1 << field.bits)
         if field.name == "rotations":
             own &= stable
-        elif field.name == "positions" and fixed[field.column]:
-            own[:] = False
+        elif field.name == "positions":
+            own &= ordered & ~fixed[field.column]
         free.append(own if _is_natural(field.levels[own]) else np.zeros_like(own))
     return free
 
@@ -57,12 +58,9 @@ def writable_levels(codes: Codes, fields: list[Field], fixed: Flags, secret: byt
 def fixed_axes(codes: Codes) -> Flags:
     """[3] axes along which no position may change. `codes`: in the order of their file.
 
-    All axes of an .spz in Morton order: it would be less in order than rounding explains. (A .sog is sorted
-    again.) Those along which positions are on the lattices of the chunks of a compressed .ply.
+    Those along which positions are on the lattices of the chunks of a compressed .ply.
     """
     means = codes.dequantise().means.numpy()
-    if isinstance(codes, SpzCodes) and is_in_morton_order(means):
-        return np.ones(3, np.bool_)
     chunks = means[: len(means) // CHUNK * CHUNK].astype(np.float64).reshape(-1, CHUNK, 3)
     low, high = chunks.min(axis=1, keepdims=True), chunks.max(axis=1, keepdims=True)
     levels = (chunks - low) / np.where(high > low, high - low, 1.0) * (2.0 ** np.array(VECTOR) - 1)
@@ -70,6 +68,22 @@ def fixed_axes(codes: Codes) -> Flags:
     expected = _OFF_LATTICE - DEVIATIONS / (12 * max(1, len(distances))) ** 0.5
     fixed: Flags = distances.sum(axis=0) < expected * len(distances)
     return fixed
+
+
+def _keep_order(codes: Codes, fields: list[Field], means: Doubles) -> Flags:
+    """[N] which positions can change without a new place in a file in Morton order.
+
+    Such an .spz would be less in order than rounding explains. (A .sog is sorted again.)
+    """
+    if not isinstance(codes, SpzCodes) or not is_in_morton_order(means.astype(np.float32)):
+        return np.ones(len(means), np.bool_)
+    reach = np.stack([each.reach for each in fields if each.name == "positions"], axis=1)
+    least, largest = (
+        morton_keys(means + sign * reach * 2.0**-codes.fractional_bits, means) for sign in (-1, 1)
+    )
+    crosses = largest[:-1] > least[1:]
+    kept: Flags = ~(np.append(crosses, False) | np.append(False, crosses))
+    return kept
 
 
 def _not_clones(

@@ -280,13 +280,21 @@ def in_morton_order(model: Gaussians) -> Gaussians:
 
 def morton_order(means: Floats) -> Integers:
     """[N] indices that sort positions along a Z-order curve."""
-    low, high = means.min(axis=0).astype(np.float64), means.max(axis=0).astype(np.float64)
+    return np.argsort(morton_keys(means, means), kind="stable")
+
+
+def morton_keys(positions: Floats | Doubles, within: Floats | Doubles) -> Words:
+    """[N] places of positions on the Z-order curve through the bounding box of `within` [M, 3].
+
+    Positions outside count as on its border. A place never falls as a coordinate grows.
+    """
+    low, high = within.min(axis=0).astype(np.float64), within.max(axis=0).astype(np.float64)
     extent = np.where(high > low, high - low, 1.0)
-    cells = ((means - low) / extent * (2**_MORTON_BITS - 1)).astype(np.uint64)
-    key = np.zeros(len(means), dtype=np.uint64)
+    cells = (((positions - low) / extent).clip(0, 1) * (2**_MORTON_BITS - 1)).astype(np.uint64)
+    key = np.zeros(len(positions), dtype=np.uint64)
     for axis in range(3):
         key |= _spread(cells[:, axis]) << np.uint64(axis)
-    return np.argsort(key, kind="stable")
+    return key
 
 
 def is_in_morton_order(means: Floats) -> bool:
