@@ -43,7 +43,7 @@ FAST := -m "not slow and not cuda and not real"
 PARALLEL := -n $(JOBS) --dist worksteal
 # Each has one thread: those of BLAS and OpenMP wait for each other busily where others need the cores. Tests of
 # threads ask for several.
-test coverage test-on-baseline test-on-avx2: export OMP_NUM_THREADS = 1
+test coverage test-real test-oldest-quick test-on-baseline test-on-avx2: export OMP_NUM_THREADS = 1
 
 # Last bits differ from processor to processor and trainings amplify them, which no test may depend on. torch
 # and numba are held to the instructions that every 64-bit processor has, and to those of 2013. numba takes the
@@ -76,7 +76,7 @@ test-on-avx2: $(DEV)
 	$(AS_AVX2) $(BIN)/python -m pytest $(FAST) $(PARALLEL) $(ARGS)
 
 test-real: $(DEV)
-	$(BIN)/python -m pytest -m real $(ARGS)
+	$(BIN)/python -m pytest -m real $(PARALLEL) $(ARGS)
 
 test-slow: $(DEV)
 	$(BIN)/python -m pytest -m slow $(ARGS)
@@ -88,7 +88,7 @@ test-oldest: $(OLDEST_DEV)
 	$(OLDEST)/bin/python -m pytest $(FAST) -p no:cacheprovider $(ARGS)
 
 test-oldest-quick: $(OLDEST_DEV)
-	$(OLDEST)/bin/python -m pytest $(FAST) -p no:cacheprovider $(OLDEST_QUICK) $(ARGS)
+	$(OLDEST)/bin/python -m pytest $(FAST) $(PARALLEL) -p no:cacheprovider $(OLDEST_QUICK) $(ARGS)
 
 web: $(WEB_MODULES)
 	npm --prefix web run --silent build
@@ -157,5 +157,5 @@ $(DEV): $(PINS) | $(BIN)/python
 
 $(OLDEST_DEV): pyproject.toml requirements/oldest.txt | $(OLDEST)/bin/python
 	$(OLDEST_PIP) setuptools
-	$(OLDEST_PIP) --no-build-isolation --editable ".[test]"
+	$(OLDEST_PIP) --no-build-isolation --editable ".[test]" pytest-xdist
 	@touch $@
