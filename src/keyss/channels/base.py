@@ -30,8 +30,8 @@ NOT_INDEPENDENT = (
     "the keys can notice that there are other secrets"
 )
 _FOREIGN = (
-    "about {:,} Gaussians were added to the file in which this secret was hidden, or changed, and who did "
-    "that may have chosen what the key opens: reveal each secret from the file as it was published"
+    "about {:,} Gaussians were added to the file or changed after the secret was hidden, so an attacker may "
+    "have chosen which secret the key opens: reveal it from the file as it was published"
 )
 
 

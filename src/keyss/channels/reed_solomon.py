@@ -5,8 +5,8 @@ chunk i that at the field element i + 1. The first k chunks are the data; Lagran
 others. The field polynomial is x^16 + x^12 + x^3 + x + 1. Libraries code one column at a time, symbol by
 symbol, and take minutes for the payload of a model.
 
-Every chunk has its number, so lost chunks are erasures. False chunks are located as errors, each of which
-takes two chunks more than k.
+Every chunk has its number, so lost chunks are erasures. Correcting a false chunk, an error, takes two chunks
+more than k.
 """
 
 from __future__ import annotations

@@ -21,6 +21,9 @@ from keyss.cli.arguments import (
     switch,
 )
 
+_VECTOR = r"[-+.\de]+(,[-+.\de]+){2}"
+_POSE = rf"#?eye={_VECTOR}&target={_VECTOR}(&up=({_VECTOR}|-?[xyz]))?"
+
 
 def view(
     model: Annotated[Positional[Path], arg(metavar="FILE", help="Published model, of any format.")],
@@ -65,7 +68,7 @@ def view(
     from keyss.core.errors import UsageError
     from keyss.viewer import ModelServer, export_html, look_of_model
 
-    if pose and not re.fullmatch(r"#?eye=[^&]+&target=[^&]+(&up=[^&]+)?", pose):
+    if pose and not re.fullmatch(_POSE, pose):
         raise UsageError(f"--pose: expected eye=X,Y,Z&target=X,Y,Z as in the page's address, got {pose}")
     given = {"pose": pose, "up": up, "title": title, "host": allow_host, "embedder": embed_in}
     look = look_of_model(model) | {name: value for name, value in given.items() if value}

@@ -4,9 +4,9 @@ Used are 8 bits of log scales, quaternions and opacity logits, and 12 bits of th
 the constant ones, of the 23 bits of a mantissa. The last bit of all is left alone: rounding to even makes it
 a zero more often than a one, by a third of a percent in spherical harmonics, which a classifier notices.
 Positions are not used: the least change can swap two Gaussians of nearly equal depth, and a swap is visible
-(48 dB in a view where everything else stays above 79 dB). Nor are constant colours, of which many keep the
-few digits that they were initialised with. Nor are the quaternions of a model whose quaternions have unit
-length, as tools leave them that normalise: new low bits would change the length, which is known exactly.
+(48 dB in a view where everything else stays above 79 dB). Constant colours are not used: many keep the few
+digits of their initial values. Unit quaternions, which some tools write, are not used: new low bits would
+change their length, which is known exactly.
 
 The *ID* of a Gaussian is a hash of its position and high bits, which embedding never changes: it replaces the
 index, so the order of Gaussians does not matter. `usable` selects the Gaussians that may be written.

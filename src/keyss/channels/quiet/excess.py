@@ -27,7 +27,7 @@ _LOG_SCALES: Doubles = np.exp2(LOG_SCALE_RANGE + np.arange(-6.0, 2.0))  # and of
 
 @dataclass(frozen=True)
 class _Kind:
-    """Differences, of which the small ones are coincidences."""
+    """Differences between numbers of a Gaussian or of two neighbours; small ones are coincidences."""
 
     fields: list[int]  # indices of the fields that stay
     gaps: Doubles  # [P] each the maximum of `dimensions` differences
@@ -38,14 +38,14 @@ class _Kind:
 
 
 def without_excess(
-    codes: Codes, fields: Sequence[Field], free: Flags, near: Integers, secret: bytes
+    codes: Codes, fields: Sequence[Field], log_scales: Doubles, free: Flags, near: Integers, secret: bytes
 ) -> list[Flags]:
     """For each field a mask [N] of the Gaussians that may be written, among those that are `free` [N].
 
-    `near` [N, K]: nearest neighbours. `secret`: 32 secret bytes.
+    `log_scales` [N, 3]: decoded. `near` [N, K]: nearest neighbours. `secret`: 32 secret bytes.
     """
     left = [free.copy() for _ in fields]
-    for index, kind in enumerate(_kinds(codes, fields, near)):
+    for index, kind in enumerate(_kinds(codes, fields, log_scales, near)):
         own, pairs = left[kind.fields[0]], [kind.one] if kind.other is None else [kind.one, kind.other]
         moved = np.flatnonzero(np.any([own[rows] for rows in pairs], axis=0))
         random = random_fractions(secret, f"kept/excess/{index}", len(moved))
@@ -55,7 +55,7 @@ def without_excess(
     return left
 
 
-def _kinds(codes: Codes, fields: Sequence[Field], near: Integers) -> Iterator[_Kind]:
+def _kinds(codes: Codes, fields: Sequence[Field], log_scales: Doubles, near: Integers) -> Iterator[_Kind]:
     """Equal coordinates of neighbours, small and equal parts of rotations, round Gaussians, and clones."""
     every = np.arange(len(near))
     one, other = np.repeat(every, near.shape[1]), near.ravel()
@@ -79,11 +79,10 @@ def _kinds(codes: Codes, fields: Sequence[Field], near: Integers) -> Iterator[_K
         gaps = np.abs(turns[one[same]] - turns[other[same]]).max(axis=1)
         yield _Kind(own, gaps, ends, 3, one[same], other[same])
     if own := at["scales"]:
-        sizes: Doubles = codes.dequantise().log_scales.double().numpy()
-        for a, b in combinations(sizes.T, 2):
+        for a, b in combinations(log_scales.T, 2):
             yield _Kind(own, np.abs(a - b), _LOG_SCALES, 1, every)
-        yield _Kind(own, sizes.max(axis=1) - sizes.min(axis=1), _LOG_SCALES, 2, every)
-        yield _Kind(own, np.abs(sizes[one] - sizes[other]).max(axis=1), _LOG_SCALES, 3, one, other)
+        yield _Kind(own, log_scales.max(axis=1) - log_scales.min(axis=1), _LOG_SCALES, 2, every)
+        yield _Kind(own, np.abs(log_scales[one] - log_scales[other]).max(axis=1), _LOG_SCALES, 3, one, other)
 
 
 def _excess_share(gaps: Doubles, ends: Doubles, dimensions: int) -> Doubles:

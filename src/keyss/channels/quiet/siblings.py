@@ -88,9 +88,9 @@ def chance_of_equal_steps(gaussians: Gaussians, usable: Flags) -> float:
         rows, means = rows[kept], means[kept]
     sample = np.arange(0, len(rows), -(-len(rows) // _SAMPLE))
     near = nearest_neighbours(means[sample], min(_NEAR + 1, len(rows)), means)[1]
-    sh = gaussians.sh.detach().to("cpu", torch.float32).contiguous().numpy()
+    sh = gaussians.sh.detach().to("cpu", torch.float32).numpy()[rows]
     counts = np.zeros((2, sh.shape[1], sh.shape[1]), np.int64)
-    _count_equal(rows[sample], rows[near], sh, _middles(sh), counts)
+    _count_equal(sample, near, sh, _middles(sh), counts)
     equal, other = counts[:, counts.any(axis=0)]
     chances = bdtr(other.astype(np.float64), equal + other, 0.5)
     return min(1.0, float(chances.min(initial=1.0)) * len(chances))

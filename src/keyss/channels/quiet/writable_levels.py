@@ -36,10 +36,12 @@ def writable_levels(codes: Codes, fields: list[Field], fixed: Flags, secret: byt
     `fixed` [3]: the result of `fixed_axes`. `secret`: 32 secret bytes.
     """
     count = len(fields[0].levels)
-    means = codes.dequantise().means.double().numpy()
+    model = codes.dequantise()
+    means, log_scales = model.means.double().numpy(), model.log_scales.double().numpy()
     distance, near = nearest_neighbours(means, min(_NEIGHBOURS + 1, count))
-    single = _not_clones(codes, fields, distance, near, random_fractions(secret, "kept/clones", count))
-    left = without_excess(codes, fields, single, near[:, 1:], secret)
+    ratio = distance[:, 1] / np.exp(np.median(log_scales, axis=1)) / _CLONES
+    single = _not_clones(fields, ratio, near, random_fractions(secret, "kept/clones", count))
+    left = without_excess(codes, fields, log_scales, single, near[:, 1:], secret)
     stable = _keep_largest(codes, fields, random_fractions(secret, "kept/turns", count))
     ordered = _keep_order(codes, fields, means)
     free = []
@@ -86,18 +88,13 @@ def _keep_order(codes: Codes, fields: list[Field], means: Doubles) -> Flags:
     return kept
 
 
-def _not_clones(
-    codes: Codes, fields: list[Field], distance: Doubles, near: Integers, random: Doubles
-) -> Flags:
-    """[N] which Gaussians are not clones.
+def _not_clones(fields: list[Field], ratio: Doubles, near: Integers, random: Doubles) -> Flags:
+    """[N] which Gaussians are not clones. `ratio` [N]: nearest distance / size / `_CLONES`.
 
     Training moves clones apart slowly, so there are more near pairs than by chance, and writing would move
     them further apart. The share of writable Gaussians grows smoothly with the distance from the nearest
     neighbour, relative to their size. Gaussians that share a written attribute with a neighbour never change.
     """
-    log_scales = codes.dequantise().log_scales.double().numpy()
-    sizes = np.exp(np.sort(log_scales, axis=1)[:, 1])
-    ratio = distance[:, 1] / sizes / _CLONES
     both = np.minimum(np.arange(len(near)), near[:, 1])  # mutual nearest neighbours share one decision
     single: Flags = random[both] * (1 + ratio**3) < ratio**3
     for name in {each.name for each in fields}:
