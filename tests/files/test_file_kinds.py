@@ -105,6 +105,7 @@ def test_identify_file(tmp_path: Path, name: str) -> None:
         ("random.sog", bytes(range(99)), "a file of unknown kind"),
         ("sent.ply", gzip.compress(b"ply\nformat ascii 1.0\n"), "gzip data; unpack it"),
     ],
+    ids=["web page", "noise", "gzip"],  # not the contents: gzip's has the time
 )
 def test_content_contradicts_the_name(tmp_path: Path, name: str, content: bytes, found: str) -> None:
     (tmp_path / name).write_bytes(content)
