@@ -63,7 +63,7 @@ def test_key_is_never_written_or_printed(
     (folder / "key.txt").chmod(0o644)  # triggers a warning
     scenes = ["--cover", str(folder / "a"), "--secret", str(folder / "b"), "--publish", "any", "-o", str(run)]
     with monkeypatch.context() as patch:
-        patch.setattr("keyss.cli.reporting.lines", _InterruptHiding)
+        patch.setattr("keyss.progress.reporter", _InterruptHiding)
         assert main(["hide", *scenes, *key, *SMALL]) == 130
     checkpoints = list(_files(run / "private" / "checkpoint"))
     assert len(checkpoints) >= 2

@@ -24,18 +24,11 @@ class Reporter:
     def update(self, iteration: int, gaussians: int, numbers: dict[str, float]) -> None:
         """`iteration` steps are done; `gaussians` is 0 and `numbers` empty if unknown."""
 
-    def look(self, model: Callable[[], Any]) -> None:
-        """A step is done; `model` returns the present Gaussians, whose tensors later steps change."""
-
     def note(self, line: str) -> None:
         """Display a line before the training begins."""
 
     def finish(self) -> None:
         """The training has ended or was interrupted."""
-
-    def of_secret(self) -> Reporter:
-        """A reporter for the training of a secret."""
-        return self
 
 
 def reporter(console: Console | None = None) -> ProgressLines:

@@ -140,7 +140,7 @@ def test_server(server: ModelServer, model: Path) -> None:
     assert get(server, "viewer.js")[1] == asset("viewer.js")
     for path in ("model/", "model/..%2f..%2fetc/passwd", "../../etc/passwd", "page.html", "a/b"):
         assert get(server, path)[0] == 404, path
-    for path in ("/", "/viewer.js", f"/{name[1].decode()}", "/live"):  # guessable without the secret path
+    for path in ("/", "/viewer.js", f"/{name[1].decode()}"):  # guessable without the secret path
         assert get(server, path, folder="")[0] == 404, path
     with pytest.raises(OutputError, match="cannot serve"):
         ModelServer(model, port=where.port or 0)

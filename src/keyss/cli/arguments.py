@@ -72,7 +72,6 @@ class Training:
     iterations: Iterations = None
     max_gaussians: MaxGaussians = None
     seed: Seed = None
-    live: Annotated[bool, switch("Show the model on a local page while it trains.")] = False
 
     def schedule(self) -> dict[str, int]:
         """The fields of `FitConfig` that are given."""

@@ -158,7 +158,6 @@ def hide(args: HideArguments) -> None:
 def _hide_scenes(args: HideArguments, cover: Path) -> None:
     import keyss
     from keyss import progress
-    from keyss.cli.reporting import reporting
     from keyss.cli.tables import print_files, print_hiding, print_plan
     from keyss.core.errors import UsageError
     from keyss.methods import registry
@@ -185,16 +184,15 @@ def _hide_scenes(args: HideArguments, cover: Path) -> None:
         print_plan(plan)
         _warn_of_idle(idle, sum(stage.steps for stage in plan.stages))
         return
-    with reporting(cover, args.training.live) as reporter:
-        result = keyss.hide(
-            cover,
-            secrets,
-            min_psnr=args.details.min_psnr,
-            overwrite=args.overwrite,
-            resume=args.resume,
-            reporter=reporter,
-            **described,
-        )
+    result = keyss.hide(
+        cover,
+        secrets,
+        min_psnr=args.details.min_psnr,
+        overwrite=args.overwrite,
+        resume=args.resume,
+        reporter=progress.reporter(),
+        **described,
+    )
     assert result.metrics is not None
     print_hiding(result.metrics, brief=progress.level < 1)
     _warn_of_idle(idle, result.metrics.iterations)
@@ -254,9 +252,7 @@ def _ignored_training_flags(args: HideArguments, cover: Path) -> str:
     if not all(map(is_model, sources)):
         return ""
     preset = ["--preset"] if args.preset != "default" else []
-    flags = (
-        flag for flag in changed_flags(args.training) if flag in ("--iterations", "--max-gaussians", "--live")
-    )
+    flags = (flag for flag in changed_flags(args.training) if flag in ("--iterations", "--max-gaussians"))
     return " and ".join([*preset, *flags])
 
 

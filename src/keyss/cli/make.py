@@ -74,30 +74,29 @@ def fit(
 
     example: keyss fit SCENE -o runs/cover
 
-    example: keyss fit SCENE -o runs/cover --live
+    example: keyss fit SCENE -o runs/cover
     """
     check_exists(scene)
     from dataclasses import replace
 
     import keyss
-    from keyss.cli.reporting import reporting
     from keyss.cli.tables import print_files, print_fit
     from keyss.fitting.config import PRESETS
+    from keyss.progress import reporter
     from keyss.runs.files import METRICS
     from keyss.runs.json_records import read_record
     from keyss.runs.run_records import FitMetrics
 
-    with reporting(scene, training.live) as reporter:
-        keyss.fit(
-            scene,
-            config=replace(PRESETS[preset], **training.schedule()),
-            **vars(photos),
-            device=device,
-            out=out,
-            overwrite=overwrite,
-            resume=resume,
-            reporter=reporter,
-        )
+    keyss.fit(
+        scene,
+        config=replace(PRESETS[preset], **training.schedule()),
+        **vars(photos),
+        device=device,
+        out=out,
+        overwrite=overwrite,
+        resume=resume,
+        reporter=reporter(),
+    )
     print_fit(read_record(out / METRICS, FitMetrics))
     print_files(out, {"model.ply": "the model", "private": "measurements and configuration"})
 

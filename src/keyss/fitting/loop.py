@@ -82,7 +82,6 @@ def train(
             _resume(run, checkpoint, fingerprint)
         saved = time.monotonic()
         numbers: dict[str, float] = {}
-        model = getattr(run, "gaussians", None)  # some runs have no model to display
         reporter.start(title, run.iterations, run.iteration)
         try:
             while run.iteration < run.iterations:
@@ -90,8 +89,6 @@ def train(
                 if config.evaluate_every and run.iteration % config.evaluate_every == 0:
                     numbers = run.evaluate()
                 reporter.update(run.iteration, len(run), numbers)
-                if model is not None:
-                    reporter.look(model)
                 if signum := interrupted():
                     save()
                     raise Interrupted(checkpoint, run.iteration, signum)

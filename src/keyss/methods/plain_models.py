@@ -80,7 +80,7 @@ def _fit_all(
             replace(config, seed=config.seed_of(f"{kind} {index}")),
             title=f"{titles[index]} ({scene.name})",
             checkpoint=folder / f"{kind.split()[0]}-{index}.safetensors" if folder else None,
-            reporter=context.reporter if index == 0 else context.reporter and context.reporter.of_secret(),
+            reporter=context.reporter,
             device=context.device,
             resume=context.resume,
         ).gaussians

@@ -44,15 +44,12 @@ def served_policy() -> str:
     return f"default-src {_SELF}; {scripts}; img-src {_SELF} blob: data:; {_NOTHING}"
 
 
-def served_page(kind: str, url: str, look: Look) -> bytes:
-    """The page with separate style and script.
-
-    `url`: of a model for the kind "keyss-model", of the JSON of `LiveTraining` for "keyss-live".
-    """
+def served_page(url: str, look: Look) -> bytes:
+    """The page with separate style and script; `url`: of the model."""
     return _page(
         policy=served_policy(),
         style=f'<link rel="stylesheet" href="{STYLE}">',
-        model=f'<meta name="{kind}" content="{html.escape(url)}">',
+        model=f'<meta name="keyss-model" content="{html.escape(url)}">',
         script=f'<script src="{SCRIPT}"></script>',
         look=look,
     )
@@ -104,7 +101,7 @@ def export_html(
         check_not_an_input(out, [model])
         write_bytes(check_output_file(out, overwrite), page_with(data, file.name, look), mode)
         return (out,)
-    contents = {INDEX: served_page("keyss-model", quote(file.name), look), file.name: data}
+    contents = {INDEX: served_page(quote(file.name), look), file.name: data}
     contents |= {name: asset(name) for name in (SCRIPT, STYLE, LICENCES, EMBED)}
     if len(contents) < 6:
         raise UsageError(f"{model} has the name of a file of the viewer: rename it")

@@ -31,19 +31,26 @@ class _ServerIPv6(ThreadingHTTPServer):
     address_family = socket.AF_INET6
 
 
-class PageServer:
-    """Serves the page and `contents`, and nothing else."""
+class ModelServer:
+    """Serves the page and one model, and nothing else."""
 
-    def __init__(self, page: bytes, contents: Contents, host: str = LOCALHOST, port: int = 0) -> None:
-        """`port` 0 takes any free port. Raises OutputError if the port is in use."""
-        application: Contents = {
-            "": ("text/html; charset=utf-8", lambda: BytesIO(page)),
-            SCRIPT: ("text/javascript; charset=utf-8", lambda: BytesIO(asset(SCRIPT))),
-            STYLE: ("text/css; charset=utf-8", lambda: BytesIO(asset(STYLE))),
-        }
+    def __init__(
+        self, model: Path | str, host: str = LOCALHOST, port: int = 0, look: Look | None = None
+    ) -> None:
+        """`port` 0 takes any free port. Warns (KeyssWarning) if the model is converted for the page.
+
+        Raises InputError if `model` is not a model, OutputError if the port is in use.
+        """
+        file = readable(Path(model))
+        page = served_page(f"model/{quote(file.name)}", look or {})
         self._folder = f"/{secrets.token_urlsafe(16)}/"
-        everything = {self._folder + name: each for name, each in {**application, **contents}.items()}
-        everything["/favicon.ico"] = ("image/x-icon", lambda: BytesIO())
+        contents: Contents = {
+            self._folder: ("text/html; charset=utf-8", lambda: BytesIO(page)),
+            self._folder + SCRIPT: ("text/javascript; charset=utf-8", lambda: BytesIO(asset(SCRIPT))),
+            self._folder + STYLE: ("text/css; charset=utf-8", lambda: BytesIO(asset(STYLE))),
+            f"{self._folder}model/{file.name}": ("application/octet-stream", file.open),
+            "/favicon.ico": ("image/x-icon", lambda: BytesIO()),
+        }
         try:
             kind = _ServerIPv6 if ":" in host else ThreadingHTTPServer
             self._server = kind((host, port), BaseHTTPRequestHandler)
@@ -51,7 +58,7 @@ class PageServer:
             raise OutputError(f"cannot serve on {host}, port {port}: {error}") from error
         self._server.daemon_threads = True
         self._ip = ipaddress.ip_address(str(self._server.server_address[0]))
-        self._server.RequestHandlerClass = _handler(everything, self._names(host))
+        self._server.RequestHandlerClass = _handler(contents, self._names(host))
 
     @property
     def address(self) -> str:
@@ -79,21 +86,6 @@ class PageServer:
     def close(self) -> None:
         """End `run`."""
         self._server.shutdown()
-
-
-class ModelServer(PageServer):
-    """Serves the page and one model."""
-
-    def __init__(
-        self, model: Path | str, host: str = LOCALHOST, port: int = 0, look: Look | None = None
-    ) -> None:
-        """`port` 0 takes any free port. Warns (KeyssWarning) if the model is converted for the page.
-
-        Raises InputError if `model` is not a model, OutputError if the port is in use.
-        """
-        file = readable(Path(model))
-        page = served_page("keyss-model", f"model/{quote(file.name)}", look or {})
-        super().__init__(page, {f"model/{file.name}": ("application/octet-stream", file.open)}, host, port)
 
 
 def _in_url(ip: ipaddress.IPv4Address | ipaddress.IPv6Address) -> str:

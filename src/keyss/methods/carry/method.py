@@ -209,7 +209,7 @@ def refit(
         if context.checkpoints
         else None,
         resume=context.resume,
-        reporter=context.reporter and context.reporter.of_secret(),
+        reporter=context.reporter,
     ).gaussians
 
 
