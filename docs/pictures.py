@@ -1,8 +1,7 @@
 """The pictures of the documents, all from the demo: `make pictures`.
 
-demo.jpg is the demo's own comparison; wipe.webp a film around the published model, over which the secret
-comes and goes, each seen from the cameras of its own scene; viewer.png the demo's page in Chromium, while its
-key is typed and afterwards.
+demo.jpg is the demo's own comparison; viewer.png the demo's page in Chromium, while its key is typed and
+afterwards.
 """
 
 from __future__ import annotations
@@ -12,19 +11,11 @@ import io
 import shutil
 from pathlib import Path
 
-import numpy as np
-import torch
 from PIL import Image
 
-from keyss import load_scene, read_model
-from keyss.api.render import shown, wiped
-from keyss.demo import COMPARISON, COVER, KEY, SCENES, SECRET, SECRET_PLY, VIEWER
-from keyss.rendering.orbit import around
-from keyss.rendering.view import render as picture_of
-from keyss.runs.files import STEGO
+from keyss.demo import COMPARISON, KEY, VIEWER
 
 FOLDER = Path(__file__).parent
-FRAMES, MILLISECONDS = 60, 100
 CHROMIUM = ("chromium-headless-shell", "chromium", "google-chrome", "chromium-browser")
 SWITCHES = (
     "--no-sandbox",
@@ -45,17 +36,6 @@ def main() -> None:
     arguments = parser.parse_args()
     with Image.open(arguments.demo / COMPARISON) as comparison:
         comparison.convert("RGB").save(arguments.o / "demo.jpg", quality=85, optimize=True)
-    frames = film(arguments.demo)
-    first, *others = (Image.fromarray(frame) for frame in frames)
-    first.save(
-        arguments.o / "wipe.webp",
-        save_all=True,
-        append_images=others,
-        duration=MILLISECONDS,
-        loop=0,
-        quality=50,
-        method=6,
-    )
     (arguments.o / "viewer.png").write_bytes(page(arguments.demo))
 
 
@@ -94,19 +74,6 @@ def page(demo: Path) -> bytes:
         if data.tell() <= MAX_BYTES:
             return data.getvalue()
     raise SystemExit(f"viewer.png has more than {MAX_BYTES:,} bytes in 32 colours")
-
-
-@torch.no_grad()
-def film(demo: Path) -> list[np.ndarray]:
-    """Frames [H, W, 3]."""
-    sides = []
-    for model, name in ((STEGO, COVER), (SECRET_PLY, SECRET)):
-        gaussians, scene = read_model(demo / model), load_scene(demo / SCENES / name)
-        cameras = around([view.camera for view in scene.views], FRAMES)
-        cameras = [camera.resized(2 * camera.width, 2 * camera.height) for camera in cameras]
-        pictures = [picture_of(gaussians, camera, scene.background) for camera in cameras]
-        sides.append([(each.clamp(0, 1) * 255).round().to(torch.uint8).numpy() for each in pictures])
-    return [wiped(*pair, shown(index / FRAMES)) for index, pair in enumerate(zip(*sides, strict=True))]
 
 
 if __name__ == "__main__":

@@ -56,7 +56,7 @@ def test_wrong_render(keyss: Run, monkeypatch: pytest.MonkeyPatch, where: str, f
 
 
 def test_missing_packages(keyss: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    gone = {"av", "numba"}
+    gone = {"ray", "numba"}
     version = metadata.version
 
     def installed(name: str) -> str:
@@ -67,6 +67,6 @@ def test_missing_packages(keyss: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(metadata, "version", installed)
     result = keyss("doctor", "--device", "cpu")
     assert result.status == 6
-    assert re.search(r"^missing +\[video\] .*pip install 'keyss\[video\]'$", result.out, re.MULTILINE)
+    assert re.search(r"^missing +\[sweep\] .*pip install 'keyss\[sweep\]'$", result.out, re.MULTILINE)
     assert re.search(r"^broken +numba +pip install numba$", result.out, re.MULTILINE)
     assert result.err.count("\n") == 1

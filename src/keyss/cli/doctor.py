@@ -19,7 +19,6 @@ EXTRAS = {
     "audit": ("scikit-learn", "keyss audit, compare and reproduce"),
     "clip": ("transformers", "the paper's key encoder"),
     "sweep": ("ray", "sweeps and batches on a cluster"),
-    "video": ("av", "keyss render --video"),
 }
 LIBRARIES = ("torch", "gsplat", "numba", "numpy", "opencv-python-headless", "cryptography", "argon2-cffi")
 OPTIONAL = ("GPU", "kernel cache", "splat-transform", *(f"[{name}]" for name in EXTRAS))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
@@ -93,46 +93,24 @@ def view(
 def render(
     model: Annotated[Positional[Path], arg(metavar="FILE", help="Model (.ply, .spz, ...), or - for stdin.")],
     *,
-    cameras: Annotated[
-        Path | None,
-        optional("SCENE", "Scene whose cameras are used.", "for a video, a circle around the model"),
-    ] = None,
-    out: Annotated[Path | None, optional("FOLDER", "Folder for the images.", aliases=["-o"])] = None,
+    cameras: Annotated[Path, arg(metavar="SCENE", help="Scene whose cameras are used.")],
+    out: Annotated[Path, arg(metavar="FOLDER", help="Folder for the images.", aliases=["-o"])],
     split: Annotated[Literal["test", "train", "all"], arg(help="Which cameras of the scene.")] = "test",
-    video: Annotated[Path | None, optional("FILE", "Write a video (.mp4) instead of images.")] = None,
-    wipe: Annotated[
-        Path | None, optional("FILE", "Second model, which a wipe uncovers in the video.")
-    ] = None,
-    seconds: Annotated[float, arg(metavar="S", help="Length of the video.")] = 8.0,
     photos: OmitArgPrefixes[Photos] = PHOTOS,
     overwrite: Overwrite = False,
     device: Device = "auto",
 ) -> None:
-    """Render a model to images from the cameras of a scene, or to a video.
+    """Render a model to images from the cameras of a scene.
 
     example: keyss render secret.ply --cameras SCENE_B -o images/
-
-    example: keyss render model.ply --wipe secret.ply --cameras SCENE_A --video video.mp4
     """
     check_exists(model, cameras)
-    from keyss.core.errors import UsageError
-
-    if video is not None and (out is not None or split != "test"):
-        raise UsageError("--video writes no images: leave out -o and --split")
-    if video is None and (cameras is None or out is None):
-        raise UsageError("images need --cameras SCENE and -o FOLDER; a video needs --video FILE")
-    if video is None and (wipe is not None or seconds != 8.0):
-        raise UsageError("--wipe and --seconds are for videos: give --video FILE")
     import keyss
-    from keyss.api.render import frame_count
-    from keyss.progress import reporter
 
-    film: dict[str, Any] = {"video": video, "wipe": wipe, "seconds": seconds, "reporter": reporter()}
     images = keyss.render(
-        model, cameras, split=split, **vars(photos), **film, device=device, out=out, overwrite=overwrite
+        model, cameras, split=split, **vars(photos), device=device, out=out, overwrite=overwrite
     )
-    wrote = f"{len(images)} image{'' if len(images) == 1 else 's'}"
-    print(f"{video}: {frame_count(seconds)} frames" if video else f"{out}: {wrote}")
+    print(f"{out}: {len(images)} image{'' if len(images) == 1 else 's'}")
 
 
 def info(

@@ -1,31 +1,25 @@
-"""Reads photos as RGB, encodes PNG files, and writes videos as MP4 with PyAV (extra `video`)."""
+"""Reads photos as RGB and encodes PNG files."""
 
 from __future__ import annotations
 
-import io
 import itertools
 import os
-from collections.abc import Iterable, Iterator
-from fractions import Fraction
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from PIL import Image, UnidentifiedImageError
 from torch import Tensor
 
 from keyss.core.arrays import Bytes, Floats, Numbers
-from keyss.core.errors import InputError, UsageError, import_extra
+from keyss.core.errors import InputError
 from keyss.core.scene import Camera
-from keyss.files.atomic import write_bytes
 
 # Photo formats only: Pillow opens some others with external programs.
 _FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP")
 _MAX_PIXELS = 89_000_000  # just under Pillow's own limit for decompression bombs
 _SMALL_PIXELS, _PIXELS_PER_BYTE = 24_000_000, 16  # larger images need file bytes in proportion
 _BAND = 1 << 18  # pixels converted at a time
-SUFFIX = ".mp4"
-_CODECS = (("libx264", {"crf": "18", "preset": "medium"}), ("mpeg4", {"qscale": "3"}))
 
 
 def open_image(path: Path) -> Image.Image:
@@ -150,38 +144,3 @@ def _rows_to_rgb(image: Image.Image, background: Floats) -> Numbers:
         alpha = rgba[:, :, 3:] / 255
         return np.rint(rgba[:, :, :3] * alpha + 255 * background * (1 - alpha))
     return np.asarray(image.convert("RGB"))
-
-
-def check_video(path: Path | str) -> None:
-    """Raise UsageError unless a path ends in .mp4, BackendError if PyAV is not installed."""
-    if Path(path).suffix.lower() != SUFFIX:
-        raise UsageError(f"cannot write a video as {path}: expected a name that ends in {SUFFIX}")
-    import_extra("av", "video", "write videos")
-
-
-def write_video(path: Path | str, frames: Iterator[Bytes], fps: int) -> int:
-    """Atomically write frames [H, W, 3] of one even size; returns their number.
-
-    Encodes H.264 if this build of FFmpeg has it, else MPEG-4, in sRGB with 4:2:0 subsampling.
-    """
-    av = import_extra("av", "video", "write videos")
-    data, count = io.BytesIO(), 0
-    with av.open(data, "w", format="mp4") as container:
-        stream = None
-        for pixels in frames:
-            if stream is None:
-                stream = _stream(av, container, fps, *pixels.shape[1::-1])
-            for packet in stream.encode(av.VideoFrame.from_ndarray(pixels, format="rgb24")):
-                container.mux(packet)
-            count += 1
-        for packet in stream.encode() if stream else ():
-            container.mux(packet)
-    write_bytes(Path(path), data.getvalue())
-    return count
-
-
-def _stream(av: Any, container: Any, fps: int, width: int, height: int) -> Any:
-    codec, options = next((each for each in _CODECS if each[0] in av.codecs_available), _CODECS[-1])
-    stream = container.add_stream(codec, rate=Fraction(fps), options=options)
-    stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
-    return stream

@@ -2,8 +2,6 @@ from .backends import Backend as Backend, resolve_device as resolve_device
 from .difference import Viewpoints as Viewpoints, psnr_between as psnr_between
 from .orbit import (
     VIEWS as VIEWS,
-    around as around,
-    circle as circle,
     look_at as look_at,
     middle_and_radius as middle_and_radius,
     scene_of_model as scene_of_model,

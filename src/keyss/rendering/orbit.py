@@ -1,10 +1,9 @@
-"""Cameras around a model or a scene, for videos and for renders that replace photos."""
+"""Cameras around a model, whose renders replace photos."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -12,17 +11,7 @@ from torch import Tensor
 
 from keyss.core.errors import UsageError
 from keyss.core.gaussians import SH_C0, Gaussians
-from keyss.core.scene import (
-    NEAR,
-    ORDINARY_EXTENT,
-    Camera,
-    Scene,
-    View,
-    camera_positions,
-    checked_background,
-    focus_point,
-)
-from keyss.core.similarity import up_direction
+from keyss.core.scene import NEAR, ORDINARY_EXTENT, Camera, Scene, View, checked_background
 from keyss.files.models import is_model_source
 from keyss.kernels.memory import release
 from keyss.rendering.rasterization_checks import MAX_SIDE
@@ -37,9 +26,6 @@ DISTANCES = (1.0, 0.75, 1.0, 0.5)
 TEST_EVERY, _LARGE = 12, 500_000  # views; minimum Gaussians of a model with slow renders
 _QUANTILE, _MAX_RATIO = 0.95, 10.0  # weights are clamped to this multiple of this quantile
 _SAMPLE = 200_000  # maximum Gaussians for computing `middle_and_radius`
-ELEVATION = 20.0  # degrees
-_GAP = math.pi / 2  # a larger gap between cameras makes a path turn back
-_DISTANCE = 0.8  # relative to the distance from which the whole model is visible
 
 
 def is_model(source: str | Path | Gaussians) -> bool:
@@ -152,60 +138,3 @@ def look_at(position: Tensor, forward: Tensor, up: Tensor) -> Tensor:
     viewmat[:3, :3] = torch.stack([right, down, forward])
     viewmat[:3, 3] = -viewmat[:3, :3] @ position
     return viewmat
-
-
-def circle(model: Gaussians, size: int, frames: int) -> list[Camera]:
-    """Cameras on a level circle around the visible part of a model, from slightly above; up is -y.
-
-    Images of size x size pixels; the last frame is one step before the first, so that the video loops.
-    """
-    middle, radius = middle_and_radius(model)
-    reach = _DISTANCE * radius / math.sin(math.radians(FIELD_OF_VIEW / 2))
-    height, flat = math.sin(math.radians(ELEVATION)), math.cos(math.radians(ELEVATION))
-    near = _near(radius)
-    cameras = []
-    for index in range(frames):
-        azimuth = 2 * math.pi * index / frames
-        outward = torch.tensor([flat * math.cos(azimuth), -height, flat * math.sin(azimuth)])
-        cameras.append(
-            camera_along(middle + outward * reach, -outward, size, f"circle_{index:04d}.png", near)
-        )
-    return cameras
-
-
-def around(cameras: Sequence[Camera], frames: int) -> list[Camera]:
-    """A level circle around the focus of `cameras`, at their median distance and height, with their up.
-
-    If they leave a gap of a quarter circle or more, the path swings between the ends of the photographed arc
-    instead. Intrinsics and size are those of the first camera by name. Raises UsageError without cameras.
-    """
-    if not cameras:
-        raise UsageError("expected a scene with cameras, found none")
-    first = min(cameras, key=lambda camera: camera.name)
-    middle, up = focus_point(cameras), up_direction(cameras)
-    if up is None:
-        up = -first.viewmat[1, :3].double()
-    offsets = camera_positions(cameras).double() - middle
-    heights = offsets @ up
-    flat = offsets - heights[:, None] * up
-    forward = torch.nn.functional.normalize(flat[flat.norm(dim=1).argmax()], dim=0)
-    sideways = torch.linalg.cross(up, forward)
-    reach, height = float(flat.norm(dim=1).median()), float(heights.median())
-    found = []
-    for index, angle in enumerate(_angles(torch.atan2(flat @ sideways, flat @ forward), frames)):
-        outward = reach * (math.cos(angle) * forward + math.sin(angle) * sideways) + height * up
-        pose = look_at(middle + outward, torch.nn.functional.normalize(-outward, dim=0), up).float()
-        found.append(replace(first, viewmat=pose, name=f"around_{index:04d}.png"))
-    return found
-
-
-def _angles(seen: Tensor, frames: int) -> list[float]:
-    """Angles of frames around the full circle, or back and forth on the arc of the cameras' angles `seen`."""
-    ordered = seen.sort().values
-    gaps = torch.cat([ordered[1:] - ordered[:-1], ordered[:1] + 2 * math.pi - ordered[-1:]])
-    widest = int(gaps.argmax())
-    start = float(ordered[(widest + 1) % len(ordered)])
-    if float(gaps[widest]) < _GAP:
-        return [start + 2 * math.pi * index / frames for index in range(frames)]
-    arc = 2 * math.pi - float(gaps[widest])
-    return [start + arc * (0.5 - 0.5 * math.cos(2 * math.pi * index / frames)) for index in range(frames)]

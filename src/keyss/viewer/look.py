@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 
 import numpy as np
 import torch
 
 from keyss.core.errors import InputError
-from keyss.core.scene import Camera, focus_point
+from keyss.core.scene import Camera, camera_positions, focus_point
 from keyss.core.similarity import up_direction
 from keyss.files.images import probe_image
 from keyss.files.scenes import read_layout
-from keyss.rendering.orbit import around
 from keyss.runs.files import CONFIG, is_run
 
 # Keys: `pose`, as in the page's address ("eye=X,Y,Z&target=X,Y,Z", and "&up=z" or "&up=X,Y,Z"); `camera`, a
@@ -34,7 +34,7 @@ def look_of_model(model: Path) -> Look:
 
 
 def look_of_scene(scene: Path) -> Look:
-    """The middle of the cameras' arc, at their median height; empty if the path is not a scene."""
+    """A photo at the cameras' median height, in the middle of an arc; empty if the path is not a scene."""
     try:
         layout = read_layout(scene, skip_missing=True)
         is_white = probe_image(layout.train[0].path)[2]  # `load_scene` does the same
@@ -42,9 +42,13 @@ def look_of_scene(scene: Path) -> Look:
         return {}
     poses = [torch.from_numpy(photo.viewmat.astype(np.float32)) for photo in layout.train]
     cameras = [Camera(pose, torch.eye(3), 1, 1, str(index)) for index, pose in enumerate(poses)]
-    middle = around(cameras, 4)[1]  # on an arc, the path goes to the end and back
     up = up_direction(cameras)
-    up = -middle.viewmat[1, :3] if up is None else up
+    up = -cameras[0].viewmat[1, :3] if up is None else up
+    positions = camera_positions(cameras)
+    heights = positions @ up.float()
+    offsets = (heights - heights.median()).abs()
+    distances = torch.cdist(positions, positions[:: len(positions) // 500 + 1]).sum(1)
+    middle = cameras[int(distances.where(offsets <= offsets.median(), math.inf).argmin())]
     vectors = {"eye": middle.position, "target": focus_point(cameras), "up": up}
     texts = [f"{name}={','.join(f'{each:.6g}' for each in v.tolist())}" for name, v in vectors.items()]
     return {"camera": "&".join(texts), "background": "#ffffff" if is_white else "#000000"}
