@@ -38,10 +38,6 @@ def test_verbose_prints_duration(keyss: Run, scene: Path, flag: str) -> None:
 
 
 class TestEstimate:
-    @pytest.fixture(autouse=True)
-    def low_threshold(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr("keyss.runs.planning._LONG", 20)
-
     WORDS = r"a file of up to \d+\.\d MB, about \d+ s, \d\.\d GB of memory, up to \d+ MB of disk"
 
     def test_fit(self, keyss: Run, scene: Path) -> None:

@@ -51,7 +51,7 @@ from keyss.runs.files import (
 )
 from keyss.runs.folder import RunFolder
 from keyss.runs.json_records import read_record, record_bytes
-from keyss.runs.planning import check_room, in_a_line, needs_of_hiding, plan_hiding, worth_planning
+from keyss.runs.planning import check_room, in_a_line, needs_of_hiding, plan_hiding
 from keyss.runs.run_records import FitMetrics, HideMetrics, RunConfig, secret_ids
 
 
@@ -128,11 +128,11 @@ def hide(
     ]
     check_room(needs_of_hiding(options, sources), place)
     if dry_run:
-        return HideResult(plan=plan_hiding(chosen, options, sources, target, place, bound=bound))
+        return HideResult(plan=plan_hiding(chosen, options, sources, target, bound=bound))
 
     with folder.work() if folder else nullcontext():
-        if reporter and not resume and (options.place.grows or (trains and worth_planning(options.fit))):
-            plan = plan_hiding(chosen, options, sources, target, place, bound=bound)
+        if reporter and not resume and (options.place.grows or trains):
+            plan = plan_hiding(chosen, options, sources, target, bound=bound)
             for line in (f"hide: {in_a_line(plan)}", *plan.notes):
                 reporter.note(line)
         context = Context(target, folder.checkpoints if folder and trains else None, resume, reporter)

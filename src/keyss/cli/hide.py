@@ -182,7 +182,7 @@ def _hide_scenes(args: HideArguments, cover: Path) -> None:
         plan = keyss.hide(cover, secrets, dry_run=True, **described).plan
         assert plan is not None
         print_plan(plan)
-        _warn_of_idle(idle, sum(stage.steps for stage in plan.stages))
+        _warn_of_idle(idle, plan.steps)
         return
     result = keyss.hide(
         cover,

@@ -100,19 +100,8 @@ def _sizes_differ(metrics: HideMetrics, tolerance: float = 0.0) -> bool:
 
 
 def print_plan(plan: Plan) -> None:
-    """Print stages, capacity and estimates of a run."""
-    rows = [
-        (
-            stage.name,
-            f"{stage.steps:,}" if stage.steps else "",
-            f"{stage.gaussians:,}",
-            about(stage.seconds),
-        )
-        for stage in plan.stages
-    ]
-    total = ("all", "", "", about(plan.seconds))
-    print_table(("stage", "steps", "Gaussians", "time, about"), [*rows, total])
-    free = "" if plan.free_bytes is None else f", {plan.free_bytes / 1e6:,.0f} MB free"
+    """Print capacity and estimates of a run."""
+    steps = f", {plan.steps:,} training steps" if plan.steps else ""
     _print_columns(
         [
             ("method", plan.method),
@@ -122,8 +111,9 @@ def print_plan(plan: Plan) -> None:
                 f"up to {plan.gaussians:,} Gaussians of SH degree {plan.sh_degree}, "
                 f"{plan.file_bytes / 1e6:,.1f} MB",
             ),
+            ("time", f"about {about(plan.seconds)}{steps}"),
             ("memory", f"about {plan.memory_bytes / 1e9:.1f} GB"),
-            ("disk", f"up to {plan.disk_bytes / 1e6:,.0f} MB at once, checkpoints included{free}"),
+            ("disk", f"up to {plan.disk_bytes / 1e6:,.0f} MB at once, checkpoints included"),
             *(("note", note) for note in plan.notes),
         ]
     )

@@ -195,16 +195,6 @@ class MethodOptions:
             )
 
 
-@dataclass(frozen=True)
-class Stage:
-    """A part of a run."""
-
-    name: str
-    steps: int  # 0 without training
-    gaussians: int  # upper limit at its end
-    seconds: float  # a rough estimate
-
-
 @dataclass(frozen=True, kw_only=True)
 class Plan:
     """The plan of a hiding: the method sets the first fields, `keyss.runs.planning` the others.
@@ -216,21 +206,21 @@ class Plan:
     sh_degree: int  # SH degree of the published model
     secret_gaussians: int  # total over the secrets
     capacity: int  # Gaussians of the secrets that fit
-    steps: int = 0  # joint training steps
+    steps: int = 0  # training steps: joint ones from the method, then all
     step_cost: float = 1.0  # time of a joint step over that of steps of plain 3DGS of all scenes
     rendered: tuple[int, ...] = ()  # Gaussians of the cover and of each secret in a step
     notes: tuple[str, ...] = ()  # sentences on the costs of options
 
     method: str = ""
-    stages: tuple[Stage, ...] = ()
+    fit_seconds: tuple[float, ...] = ()  # of plain fits, the cover's first; rough estimates
+    other_seconds: float = 0.0
     file_bytes: int = 0  # upper limit for the published model
     disk_bytes: int = 0  # maximum on disk at one time, checkpoints included
-    free_bytes: int | None = None  # on their disk; None if nothing is written
     memory_bytes: int = 0  # a rough estimate
 
     @property
     def seconds(self) -> float:
-        return sum(stage.seconds for stage in self.stages)
+        return sum(self.fit_seconds) + self.other_seconds
 
 
 class Method(Protocol):

@@ -27,14 +27,9 @@ def fit_plain_models(
         for index, (source, config) in enumerate(zip(sources, configs, strict=True))
         if source.given is None
     }
-    titles = [plain_stage(role_of(index, len(sources))) for index in range(len(sources))]
+    titles = [f"plain model of the {role_of(index, len(sources))}" for index in range(len(sources))]
     fitted = _fit_all(missing, "plain model", titles, context)
     return [replace(source, given=fitted.get(index, source.given)) for index, source in enumerate(sources)]
-
-
-def plain_stage(role: str) -> str:
-    """The title of the fit of a plain model; `role`: see `role_of`."""
-    return f"plain model of the {role}"
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,6 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from statistics import fmean
 from typing import NamedTuple
 
 import psutil
@@ -19,14 +18,11 @@ from keyss.core.errors import KeyssWarning, OutputError
 from keyss.core.scene import Scene
 from keyss.fitting.config import FitConfig
 from keyss.fitting.losses import Targets
-from keyss.fitting.schedule import shrinking
-from keyss.methods.base import Method, MethodOptions, Plan, Source, Stage, role_of
-from keyss.methods.plain_models import Bound, plain_stage
+from keyss.methods.base import Method, MethodOptions, Plan, Source
+from keyss.methods.plain_models import Bound
 from keyss.progress import about
 
-_LONG = 1000  # steps
 _STEP_SECONDS = {"cpu": 5e-7, "cuda": 6e-9}  # per training step, Gaussian and two pixels
-_PARTS = 40  # of a fit: the sizes of its photos are those at their middles
 _KEY_SECONDS = 3.0  # deriving a secret's key for every salt, and opening the secret again
 _RENDERS = 2  # training steps that take as long as measuring a test view
 _STATE_COPIES = 3  # checkpoint / model: parameters and two moments of Adam
@@ -34,74 +30,66 @@ _MAX_APPENDED = 7  # Gaussians that hold one Gaussian of a secret of SH degree 3
 _OTHER_BYTES = 4 << 20  # JSON files, locks, and the overhead of the file system
 
 
+class Needs(NamedTuple):
+    """Upper limits of a run's disk space and memory."""
+
+    disk_bytes: int
+    memory_bytes: int
+
+
 def plan_hiding(
     method: Method,
     options: MethodOptions,  # prepared
     sources: Sequence[Source],  # the cover, then the secrets, loaded at least with their test images
     device: torch.device,
-    out: Path | None,
     *,
     bound: bool = False,  # also fit the upper bounds
 ) -> Plan:
     """The plan of a hiding. Writes nothing."""
-    plan, count = method.plan(sources, options), len(sources)
-    scenes, sizes = [source.scene for source in sources], _sizes(options, sources)
-    renders = [_step(device, size, scene) for size, scene in zip(sizes, scenes, strict=True)]
-    steps = [options.fit.views_per_step * each for each in renders]
-    stages, bounds = [], []
-    for index, (source, config, training) in enumerate(
-        zip(sources, options.fits(count), options.training(count), strict=True)
+    plan, count, views = method.plan(sources, options), len(sources), options.fit.views_per_step
+    steps, seconds, fits = plan.steps, _KEY_SECONDS * (count - 1), []
+    rendered = plan.rendered or (0,) * count
+    for source, size, joint, config, training in zip(
+        sources, _sizes(options, sources), rendered, options.fits(count), options.training(count), strict=True
     ):
-        role, size, step = role_of(index, count), sizes[index], steps[index]
-        own = config.iterations if source.given is None else None
-        if own is not None:
-            seconds = _fit_seconds(device, size, source.scene, config)
-            stages.append(Stage(plain_stage(role), own, size, seconds))
-        longer = Bound.of(training, own)
-        if bound and source.photos and not longer.equal and longer.steps is not None:
-            bounds.append(Stage(f"upper bound of the {role}", longer.steps, size, longer.steps * step))
-    if plan.steps:
-        rendered = zip(plan.rendered, scenes, strict=True)
-        step = options.fit.views_per_step * sum(_step(device, *each) for each in rendered if each[0])
-        stages.append(Stage("hiding", plan.steps, sum(plan.rendered), plan.steps * plan.step_cost * step))
-    measuring = sum(_RENDERS * len(scene.test) * each for scene, each in zip(scenes, renders, strict=True))
-    measuring += _KEY_SECONDS * (count - 1)
-    stages += [*bounds, Stage("encrypting, opening, measuring", 0, plan.gaussians, measuring)]
+        step = views * _view_seconds(device, size, source.scene)
+        own = config.iterations if source.given is None else 0
+        steps += own
+        fits.append(own * step)
+        seconds += _RENDERS * len(source.scene.test) * step / views
+        if joint:
+            seconds += plan.steps * plan.step_cost * views * _view_seconds(device, joint, source.scene)
+        longer = Bound.of(training, own or None)
+        if bound and source.photos and not longer.equal:
+            seconds += (longer.steps or 0) * step
     needs = needs_of_hiding(options, sources)
     return replace(
         plan,
         method=method.name,
-        stages=tuple(stages),
+        steps=steps,
+        fit_seconds=tuple(fits),
+        other_seconds=seconds,
         file_bytes=_ply_bytes(plan.gaussians, plan.sh_degree),
         disk_bytes=needs.disk_bytes,
-        free_bytes=None if out is None else _free_bytes(out),
         memory_bytes=needs.memory_bytes,
     )
 
 
 def plan_fit(scene: Scene, config: FitConfig, device: torch.device) -> Plan:
     """The plan of a plain fit."""
-    gaussians, degree = config.max_gaussians, config.sh_degree
-    seconds = _fit_seconds(device, gaussians, scene, config)
-    needs = needs_of_fit(scene, config)
+    gaussians, degree, needs = config.max_gaussians, config.sh_degree, needs_of_fit(scene, config)
+    step = config.views_per_step * _view_seconds(device, gaussians, scene)
     return Plan(
         gaussians=gaussians,
         sh_degree=degree,
         secret_gaussians=0,
         capacity=0,
         steps=config.iterations,
-        stages=(Stage("fit", config.iterations, gaussians, seconds),),
+        fit_seconds=(config.iterations * step,),
         file_bytes=_ply_bytes(gaussians, degree),
         disk_bytes=needs.disk_bytes,
         memory_bytes=needs.memory_bytes,
     )
-
-
-class Needs(NamedTuple):
-    """Upper limits of a run's disk space and memory."""
-
-    disk_bytes: int
-    memory_bytes: int
 
 
 def needs_of_hiding(options: MethodOptions, sources: Sequence[Source]) -> Needs:
@@ -131,11 +119,6 @@ def _needs(largest: int, written: int, trained: int, degree: int, photos: Sequen
         _ply_bytes(written + 2 * _STATE_COPIES * trained, degree) + _OTHER_BYTES,
         resident + copies * _ply_bytes(largest, degree) + targets,
     )
-
-
-def worth_planning(config: FitConfig) -> bool:
-    """True if a training is long enough to report an estimate."""
-    return config.iterations >= _LONG
 
 
 def in_a_line(plan: Plan) -> str:
@@ -189,26 +172,10 @@ def _free_bytes(out: Path) -> int:
     return shutil.disk_usage(folder).free
 
 
-def _fit_seconds(device: torch.device, gaussians: int, scene: Scene, config: FitConfig) -> float:
-    """Seconds of a plain fit, which shrinks large photos at first."""
-    pixels = _pixels(scene)
-    middles = (int(config.iterations * (part + 0.5) / _PARTS) + 1 for part in range(_PARTS))
-    shown = fmean(pixels / shrinking(config, iteration, pixels) ** 2 for iteration in middles)
-    return config.iterations * config.views_per_step * _seconds(device, gaussians, shown)
-
-
-def _step(device: torch.device, gaussians: int, scene: Scene) -> float:
+def _view_seconds(device: torch.device, gaussians: int, scene: Scene) -> float:
     """Seconds of a training step with one view."""
-    return _seconds(device, gaussians, _pixels(scene))
-
-
-def _seconds(device: torch.device, gaussians: int, pixels: float) -> float:
-    return _STEP_SECONDS[device.type] * (gaussians + pixels / 2)
-
-
-def _pixels(scene: Scene) -> int:
     camera = scene.test[0].camera
-    return camera.width * camera.height
+    return _STEP_SECONDS[device.type] * (gaussians + camera.width * camera.height / 2)
 
 
 def _ply_bytes(gaussians: int, sh_degree: int) -> int:

@@ -11,6 +11,7 @@ import os
 import time
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field, replace
+from itertools import zip_longest
 from math import isfinite
 from pathlib import Path
 from typing import Any, cast
@@ -29,8 +30,7 @@ from keyss.lab.audits import PARTS, audit
 from keyss.lab.audits.subject import Subject
 from keyss.lab.audits.trial_measures import MEASURES
 from keyss.methods import MethodOptions, registry
-from keyss.methods.base import Plan, role_of
-from keyss.methods.plain_models import plain_stage
+from keyss.methods.base import Plan
 from keyss.progress import Reporter
 from keyss.rendering import Backend, resolve_device
 from keyss.runs import FitMetrics, HideMetrics, Manifest, read_manifest, read_record, record_bytes
@@ -135,8 +135,8 @@ def plan_of(trial: Trial, folder: Path) -> Plan:
     keys = [f"key {index}" if has_keys else "" for index in range(count)]
     found = hide(**_hide_arguments(trial, folder, keys), dry_run=True).plan
     assert found is not None  # a dry run always has a plan
-    fits = {plain_stage(role_of(index, 1 + count)) for index, each in enumerate(trial.models) if each}
-    return replace(found, stages=tuple(each for each in found.stages if each.name not in fits))
+    fits = zip_longest(found.fit_seconds, trial.models)
+    return replace(found, fit_seconds=tuple(0.0 if model else each for each, model in fits))
 
 
 def keys_of(trial: Trial, folder: Path) -> list[str]:
