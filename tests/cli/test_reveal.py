@@ -232,6 +232,14 @@ class TestVerify:
         assert "500 of 500 Gaussians: complete" in result.out
         assert "equal to others" in result.err
 
+    def test_merged_model_with_whole_secret(self, keyss: Run, files: Path, tmp_path: Path) -> None:
+        merged = Gaussians.cat([read_model(files / "whole.ply"), trained_like(1500, 9)])
+        write_model(tmp_path / "merged.ply", merged)
+        result = keyss("verify", tmp_path / "merged.ply", "--key-file", files / "key")
+        assert result.status == 4
+        assert "500 of 500 Gaussians" in result.out
+        assert "Gaussians were added to the file" in result.err
+
     def test_partial_secret(self, keyss: Run, files: Path) -> None:
         for name in ("half", "few"):
             result = keyss("verify", files / f"{name}.ply", "--key-file", files / "key")

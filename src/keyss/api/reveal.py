@@ -107,5 +107,10 @@ def verify(
     target = resolve_device(device)
     name = "model" if isinstance(model, Gaussians) else str(model)
     gaussians = as_model(model)
-    secret = None if key is None else check_secret(reveal_any(gaussians, key, target))
-    return Verification(name, check_model(gaussians), secret)
+    if key is None:
+        return Verification(name, check_model(gaussians), None)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", KeyssWarning)
+        revealed = reveal_any(gaussians, key, target)
+    problems = [str(each.message) for each in caught if issubclass(each.category, KeyssWarning)]
+    return Verification(name, check_model(gaussians), check_secret(revealed, problems))

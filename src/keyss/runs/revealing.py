@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -206,12 +207,12 @@ def check_model(model: Gaussians) -> ModelCheck:
     )
 
 
-def check_secret(revealed: Revealed) -> SecretCheck:
-    """Count what is missing of a revealed secret."""
+def check_secret(revealed: Revealed, warned: Sequence[str] = ()) -> SecretCheck:
+    """Count what is missing of a revealed secret; `warned`: what opening it warned of."""
     remains = revealed.remains
     left, chunks = remains.chunks or (None, None)
     lost = None if left is None or chunks is None else chunks - left
-    problems = list(revealed.warnings)
+    problems = [*warned, *revealed.warnings]
     if revealed.file is None and not remains.whole and not problems:
         problems.append(f"{remains.found:,} of {remains.hidden:,} Gaussians of the secret were found")
     return SecretCheck(
