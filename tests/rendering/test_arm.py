@@ -12,7 +12,7 @@ import torch
 from llvmlite import binding as llvm
 
 from keyss.rendering import render
-from keyss.rendering.cpu import blending_backward, projection
+from keyss.rendering.cpu import blending, projection
 from rendering import child_process
 from tiny_scenes import random_gaussians, tiny_scene
 
@@ -32,7 +32,7 @@ def count_vector_instructions() -> list[int]:
     render(model, tiny_scene(0).train[0].camera, torch.zeros(3)).sum().backward()
     machine = llvm.Target.from_triple(TARGET).create_target_machine(opt=2)
     found = []
-    for kernel in (projection.project, blending_backward.blend_backward):
+    for kernel in (projection.project, blending.blend_backward):
         compiled = numba.njit(**kernel.targetoptions)(kernel.py_func)  # code from the cache has no IR
         compiled.compile(kernel.signatures[0])
         (overload,) = compiled.overloads.values()

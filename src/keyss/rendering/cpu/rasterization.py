@@ -15,7 +15,7 @@ from keyss.kernels import memory
 from keyss.kernels.jit import announce_compilation
 from keyss.kernels.memory import Array
 from keyss.kernels.parallel import run
-from keyss.rendering.cpu import binning, blending, blending_backward, projection, projection_backward
+from keyss.rendering.cpu import binning, blending, projection, projection_backward
 from keyss.rendering.cpu.constants import CAMERA, FX, MOMENTS, PACKED, POSITION, TILE_HEIGHT, TILE_WIDTH, TX
 
 MAX_PAIRS = 2**31 - 1  # positions in the lists of tiles are int32
@@ -156,7 +156,7 @@ class _Rasterize(torch.autograd.Function):
             moments = memory.empty((slots * MOMENTS,), np.float32)
             extras = memory.empty((slots * max(channels, 1),), np.float32)
             run(
-                blending_backward.blend_backward, rendering.footprints, rendering.features,
+                blending.blend_backward, rendering.footprints, rendering.features,
                 rendering.entries, rendering.entry_slots, rendering.tile_starts, rendering.ends,
                 -(-settings.width // TILE_WIDTH), images[c].numpy(), transmittances[c].numpy(),
                 images_gradient[c].numpy(), alphas_gradient[c].numpy(), moments, extras,
