@@ -1,21 +1,27 @@
-"""SOG, PlayCanvas's format with attributes in images: reads and writes version 2.
+"""SOG, PlayCanvas's format: a ZIP of meta.json and lossless WebP images; reads and writes version 2.
 
 https://developer.playcanvas.com/user-manual/gaussian-splatting/formats/sog/
 """
 
 from __future__ import annotations
 
+import io
 import math
+import struct
+import warnings
+import zipfile
+import zlib
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Self
 
 import msgspec
 import numpy as np
+from PIL import Image
 
 from keyss.core.arrays import Bytes, Doubles, Floats, Numbers, Shorts
 from keyss.core.errors import InputError
 from keyss.core.gaussians import Gaussians
-from keyss.files.formats import sog_bundle as bundle
 from keyss.files.formats.codebooks import SIZE, codebook_of, nearest, palette_of
 from keyss.files.formats.common import (
     Codes,
@@ -24,6 +30,7 @@ from keyss.files.formats.common import (
     check_sh_degree,
     from_smallest_three,
     gaussians_of,
+    reason,
     smallest_three,
     to_bytes,
 )
@@ -32,6 +39,62 @@ _MAX_POSITION = 65535  # largest position code
 _LARGEST = 252  # a quaternion's fourth byte: this plus the index (wxyz) of the component left out
 _ROW = 64  # palette vectors per row of pixels
 _MAX_LABELS = 65536
+_MAX_META_BYTES = 1 << 20
+_MAX_MEMBERS = 64
+_SMALL_IMAGE = 1 << 16  # pixels; larger images may have at most four times the pixels needed
+_DATE = (1980, 1, 1, 0, 0, 0)  # constant, so that equal models make equal files
+
+# Raised by zipfile for damaged archives and unknown compression.
+_BROKEN = (
+    *(zipfile.BadZipFile, zlib.error, struct.error, EOFError, OSError),
+    *(ValueError, NotImplementedError, RuntimeError, OverflowError),
+)
+
+
+class _Images(msgspec.Struct):
+    """Names of image files."""
+
+    files: list[str]
+
+
+class _Book(msgspec.Struct):
+    """Images of indices into a codebook."""
+
+    codebook: list[float]
+    files: list[str]
+
+
+class _Means(msgspec.Struct):
+    """Positions: bounds [3], and images of the low and high bytes."""
+
+    mins: list[float]
+    maxs: list[float]
+    files: list[str]
+
+
+class _Harmonics(msgspec.Struct):
+    """A palette of `count` vectors, and each Gaussian's index into it."""
+
+    count: int
+    bands: int
+    codebook: list[float]
+    files: list[str]
+
+
+class _Meta(msgspec.Struct, omit_defaults=True):
+    """The meta.json of version 2."""
+
+    version: int
+    count: int
+    means: _Means
+    scales: _Book
+    quats: _Images
+    sh0: _Book
+    shN: _Harmonics | None = None
+
+
+class _Version(msgspec.Struct):
+    version: int = 1  # if missing
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,14 +123,14 @@ class SogCodes(Codes):
     @classmethod
     def parse(cls, data: bytes) -> Self:
         """See `Codes`."""
-        file = bundle.open_archive(data)
-        meta = bundle.read_meta(file("meta.json"))
+        file = _open_archive(data)
+        meta = _read_meta(file("meta.json"))
         n = meta.count
         check_count(n, len(data))
 
         def image(names: list[str], index: int = 0) -> Bytes:
             """[N, 4] the first N pixels, RGBA."""
-            return bundle.decode_webp(file(names[index]), n)
+            return _decode_webp(file(names[index]), n)
 
         low, high = image(meta.means.files), image(meta.means.files, 1)
         quats, colors = image(meta.quats.files), image(meta.sh0.files)
@@ -82,7 +145,7 @@ class SogCodes(Codes):
             if not int(labels.max()) < meta.shN.count <= _MAX_LABELS:
                 raise InputError("damaged SOG: labels beyond the end of its palette")
             size = -(-meta.shN.count // _ROW) * _ROW
-            rows = bundle.decode_webp(file(meta.shN.files[0]), size * k, width=_ROW * k)
+            rows = _decode_webp(file(meta.shN.files[0]), size * k, width=_ROW * k)
             palette = rows[: meta.shN.count * k, :3].reshape(-1, k, 3).copy()
         return cls(
             mins=np.array(meta.means.mins, np.float64),
@@ -114,23 +177,23 @@ class SogCodes(Codes):
             images["shN_labels.webp"] = _rgba(labels)
         width = math.ceil(math.sqrt(n) / 4) * 4
         height = math.ceil(n / width / 4) * 4
-        files = {name: bundle.encode_webp(pixels, width, height) for name, pixels in images.items()}
+        files = {name: _encode_webp(pixels, width, height) for name, pixels in images.items()}
         harmonics = None
         if k:
             palette = _rgba(self.palette.reshape(-1, 3))
-            files["shN_centroids.webp"] = bundle.encode_webp(palette, _ROW * k, -(-p // _ROW))
+            files["shN_centroids.webp"] = _encode_webp(palette, _ROW * k, -(-p // _ROW))
             names = ["shN_centroids.webp", "shN_labels.webp"]
-            harmonics = bundle.Harmonics(p, {3: 1, 8: 2, 15: 3}[k], self.sh_codebook.tolist(), names)
-        meta = bundle.Meta(
+            harmonics = _Harmonics(p, {3: 1, 8: 2, 15: 3}[k], self.sh_codebook.tolist(), names)
+        meta = _Meta(
             version=2,
             count=n,
-            means=bundle.Means(self.mins.tolist(), self.maxs.tolist(), ["means_l.webp", "means_u.webp"]),
-            scales=bundle.Book(self.scale_codebook.tolist(), ["scales.webp"]),
-            quats=bundle.Images(["quats.webp"]),
-            sh0=bundle.Book(self.color_codebook.tolist(), ["sh0.webp"]),
+            means=_Means(self.mins.tolist(), self.maxs.tolist(), ["means_l.webp", "means_u.webp"]),
+            scales=_Book(self.scale_codebook.tolist(), ["scales.webp"]),
+            quats=_Images(["quats.webp"]),
+            sh0=_Book(self.color_codebook.tolist(), ["sh0.webp"]),
             shN=harmonics,
         )
-        return bundle.pack_archive({**files, "meta.json": msgspec.json.encode(meta)})
+        return _pack_archive({**files, "meta.json": msgspec.json.encode(meta)})
 
     @classmethod
     def quantise(cls, model: Gaussians) -> Self:
@@ -213,3 +276,115 @@ def _rgba(colors: Numbers, alpha: Bytes | None = None) -> Bytes:
     if alpha is not None:
         found[:, 3] = alpha
     return found
+
+
+def _read_meta(data: bytes) -> _Meta:
+    """A meta.json with all file names and bounds. Raises InputError."""
+    if len(data) > _MAX_META_BYTES:
+        raise InputError(f"expected a meta.json of at most {_MAX_META_BYTES:,} bytes, found {len(data):,}")
+    try:
+        version = msgspec.json.decode(data, type=_Version).version
+        if version != 2:
+            raise InputError(f"expected SOG of version 2, found {version}")
+        meta = msgspec.json.decode(data, type=_Meta)
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+        raise InputError(f"cannot parse the meta.json of a SOG: {reason(error)}") from error
+    needed = [(meta.means.files, 2), (meta.scales.files, 1), (meta.quats.files, 1), (meta.sh0.files, 1)]
+    needed += [(meta.shN.files, 2)] if meta.shN else []
+    if any(len(files) < count for files, count in needed):
+        raise InputError("the meta.json of a SOG names fewer images than it needs")
+    if not len(meta.means.mins) == len(meta.means.maxs) == 3:
+        raise InputError("the meta.json of a SOG has no bounds of three coordinates")
+    return meta
+
+
+def _open_archive(data: bytes) -> Callable[[str], bytes]:
+    """A function that reads a file in the archive by name. Both raise InputError.
+
+    All files together may unpack to twice the size of the archive plus 1 MiB.
+    """
+    try:
+        archive = zipfile.ZipFile(io.BytesIO(data))
+    except _BROKEN as error:
+        raise InputError(f"not a whole SOG: {reason(error)}") from error
+    members = archive.infolist()
+    if len(members) > _MAX_MEMBERS:
+        raise InputError(f"expected a SOG of at most {_MAX_MEMBERS} files, found {len(members):,}")
+    if len({info.header_offset for info in members}) < len(members):
+        raise InputError("damaged SOG: two of its files are at the same place")
+    unpacked = sum(info.file_size for info in members)
+    if unpacked > 2 * len(data) + _MAX_META_BYTES:
+        raise InputError(f"damaged SOG: {len(data):,} bytes that unpack to {unpacked:,}")
+
+    def read(name: str) -> bytes:
+        try:
+            info = archive.getinfo(name)
+            if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+                raise InputError(f"damaged SOG: {name[:80]!r} has an unsupported ZIP compression")
+            with archive.open(info) as file:
+                return file.read(info.file_size)
+        except KeyError as error:
+            raise InputError(
+                f"not a SOG: there is no {name[:80]!r} in the archive; unpack it if it is another"
+            ) from error
+        except _BROKEN as error:
+            raise InputError(f"damaged SOG: {name[:80]!r}: {reason(error)}") from error
+
+    return read
+
+
+def _pack_archive(files: Mapping[str, bytes]) -> bytes:
+    """An archive of files, stored, since they are compressed already."""
+    data = io.BytesIO()
+    with zipfile.ZipFile(data, "w", zipfile.ZIP_STORED) as archive:
+        for name, content in files.items():
+            archive.writestr(zipfile.ZipInfo(name, _DATE), content)
+    return data.getvalue()
+
+
+def _decode_webp(data: bytes, count: int, width: int | None = None) -> Bytes:
+    """[count, 4] RGBA of the first pixels of a lossless WebP, of this `width` if given.
+
+    Checks the size before decoding. Raises InputError.
+    """
+    size = _webp_size(data)
+    area = size[0] * size[1]
+    if area < count or (width is not None and size[0] != width):
+        raise InputError(f"damaged SOG: expected an image of {count:,} pixels, found {size[0]} x {size[1]}")
+    if area > max(_SMALL_IMAGE, 4 * count):
+        raise InputError(f"damaged SOG: an image of {size[0]} x {size[1]} for {count:,} pixels")
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            with Image.open(io.BytesIO(data), formats=("WEBP",)) as image:
+                if image.size != size:
+                    raise InputError("damaged SOG: an image with two sizes")
+                decoded = np.asarray(image.convert("RGBA")).reshape(-1, 4)
+    except (OSError, ValueError, SyntaxError, EOFError, MemoryError, Image.DecompressionBombError) as error:
+        raise InputError(f"damaged SOG: an image cannot be read: {reason(error)}") from error
+    return decoded[:count]
+
+
+def _encode_webp(values: Bytes, width: int, height: int) -> bytes:
+    """[M, 4] RGBA as the first pixels of a lossless WebP that keeps colours where alpha is 0."""
+    canvas = np.zeros((height * width, 4), np.uint8)
+    canvas[: len(values)] = values
+    data = io.BytesIO()
+    image = Image.fromarray(canvas.reshape(height, width, 4), "RGBA")
+    image.save(data, "WEBP", lossless=True, exact=True, quality=50, method=1)
+    return data.getvalue()
+
+
+def _webp_size(data: bytes) -> tuple[int, int]:
+    """(width, height) from the header of a lossless WebP; Pillow allocates a canvas when it opens a file.
+
+    https://developers.google.com/speed/webp/docs/riff_container
+    """
+    if len(data) < 30 or data[:4] != b"RIFF" or data[8:12] != b"WEBP":
+        raise InputError("damaged SOG: an image is not WebP")
+    if data[12:16] == b"VP8L":
+        (bits,) = struct.unpack_from("<I", data, 21)
+        return (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1
+    if data[12:16] == b"VP8X" and b"VP8L" in data[30:]:
+        return int.from_bytes(data[24:27], "little") + 1, int.from_bytes(data[27:30], "little") + 1
+    raise InputError("damaged SOG: expected lossless WebP images, found others")
