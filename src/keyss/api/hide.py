@@ -21,8 +21,8 @@ from keyss.channels import AnyChannel, Format, Publish
 from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene, ViewOptions
+from keyss.files.formats.ply import with_extras
 from keyss.files.models import is_model_path, read_model, reads_as
-from keyss.files.ply_extras import with_extras
 from keyss.fitting.image_metrics import quality
 from keyss.keys import DerivedKey
 from keyss.keys.derivation import SALT_BYTES

@@ -12,9 +12,9 @@ from keyss.channels import AnyChannel, Format, Publish, channel_for, open_conten
 from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
+from keyss.files.formats.ply import with_extras
 from keyss.files.inputs import as_text, read_file
 from keyss.files.models import read_model
-from keyss.files.ply_extras import with_extras
 from keyss.keys.encryption import MAX_PAYLOAD_BYTES
 from keyss.methods.hidden import HiddenFile
 from keyss.rendering.difference import psnr_between
