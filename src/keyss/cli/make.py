@@ -135,7 +135,7 @@ def keygen(
     if master_key_file is not None and asset is not None:
         if bits != 95:
             raise UsageError("--bits is for random keys: leave it out with --asset")
-        from keyss.keys.master import MasterKey
+        from keyss.keys import MasterKey
 
         key = MasterKey(key_of_file(master_key_file)).key_of(asset)
         what = f"the key of {asset}"

@@ -2,10 +2,13 @@
 
 Argon2id (RFC 9106) makes guessing a key expensive. HKDF-SHA256 (RFC 5869) derives everything else from its
 result, with labels: no derived value reveals anything about another. Keys are normalised by `normalized_key`.
+A master key derives the keys of many named assets.
 """
 
 from __future__ import annotations
 
+import hashlib
+import unicodedata
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -18,8 +21,8 @@ from cryptography.hazmat.primitives.hashes import SHA256
 from cryptography.hazmat.primitives.kdf.hkdf import HKDFExpand
 
 from keyss.core.arrays import Bytes
-from keyss.core.errors import InputError
-from keyss.keys.key_file import normalized_key
+from keyss.core.errors import InputError, UsageError
+from keyss.keys.key_file import ALPHABET, KEY_LENGTH, normalized_key
 
 if TYPE_CHECKING:  # the command line reads options without torch
     import torch
@@ -29,6 +32,8 @@ SALT_BYTES = 16
 MASTER_BYTES = 32
 EMBEDDING_SIZE = 64
 _STREAM_BLOCK = 1 << 16  # bytes
+_MASTER_SALT = hashlib.sha256(b"keyss/v1/master").digest()[:SALT_BYTES]
+_MAX_NAME_BYTES = 4096
 TIME_COST, MEMORY_KIB, PARALLELISM = 3, 64 * 1024, 4  # Argon2id: passes, KiB, lanes
 
 
@@ -97,6 +102,40 @@ class DerivedKey:
         words = np.frombuffer(self.expand("embedding", 8 * EMBEDDING_SIZE), "<u8")
         uniform = (words.astype(np.float64) + 0.5) / 2.0**64
         return unit_vector(torch.from_numpy(ndtri(uniform.clip(1e-16, 1 - 1e-16))))
+
+
+class MasterKey:
+    """One key from which the keys of many named assets derive, each in next to no time.
+
+    A fixed salt lets the master key and a name suffice to open an asset; guessing the master key from a
+    derived key is as slow as guessing any key. Equal master keys give equal keys everywhere, and a fixed salt
+    allows guesses in advance: use a key of `keyss keygen` as a master key, not a password.
+    """
+
+    def __init__(self, key: str) -> None:
+        self._derived = DerivedKey.of(key, _MASTER_SALT)
+
+    def key_of(self, name: str) -> str:
+        """The key of a name: 22 letters and digits.
+
+        Names are normalised to NFC. Raises UsageError for a name that is empty, not text, or too long.
+        """
+        if len(name) > _MAX_NAME_BYTES:  # normalising takes quadratic time
+            raise UsageError(f"expected a name of 1 to {_MAX_NAME_BYTES} bytes, got {len(name)} characters")
+        try:
+            data = unicodedata.normalize("NFC", name).encode()
+        except UnicodeEncodeError as error:
+            raise UsageError(f"{name!r}: expected a name in UTF-8") from error
+        if not 1 <= len(data) <= _MAX_NAME_BYTES:
+            raise UsageError(f"expected a name of 1 to {_MAX_NAME_BYTES} bytes, got {len(data)}")
+        # Hashed, so that no name can imitate the label of another use.
+        label = f"master/{hashlib.sha256(data).hexdigest()}"
+        number = int.from_bytes(self._derived.expand(label, 32), "big")
+        characters = []
+        for _ in range(KEY_LENGTH):  # 131 of 256 bits: uniform to 2^-125
+            number, digit = divmod(number, len(ALPHABET))
+            characters.append(ALPHABET[digit])
+        return "".join(characters)
 
 
 def unit_vector(normal: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""Normalisation of keys, random keys, and key files."""
+"""Normalisation of keys, random keys, their strength, and key files."""
 
 from __future__ import annotations
 
@@ -16,6 +16,9 @@ MAX_KEY_BYTES = 4096
 _TOO_LONG = f"the key is longer than {MAX_KEY_BYTES} bytes"
 ALPHABET = string.ascii_letters + string.digits
 KEY_LENGTH = 22  # characters of 5.95 bits: 131 bits
+# Argon2id costs 0.1 s of a core and 64 MiB per guess: these take three hundred thousand years of one core.
+_ENOUGH_GUESSES = 1e14
+_MAX_RATED = 100  # characters; zxcvbn takes superlinear time
 _SPACES = "\t\n\v\f\r \u1680\u2028\u2029\ufeff"  # as JavaScript's `trim`, without those that NFKC replaces
 
 
@@ -93,3 +96,26 @@ def generate_key(length: int = 16) -> str:
 def length_for(bits: int) -> int:
     """Minimum length for which `generate_key` gives `bits` of entropy."""
     return math.ceil(bits / math.log2(len(ALPHABET)))
+
+
+def key_guesses(key: str) -> float:
+    """The number of guesses that find `key` after `normalized_key`. Raises UsageError for an invalid key.
+
+    zxcvbn (Wheeler 2016) estimates guesses from patterns in chosen passwords: words, names, dates, keyboards,
+    repetitions. It counts a random character, even a letter, as ten guesses: 10^16 for a generated key of 16.
+    It cannot detect a key reused from elsewhere.
+    """
+    from zxcvbn import zxcvbn  # slow to import
+
+    return float(zxcvbn(normalized_key(key)[:_MAX_RATED], max_length=_MAX_RATED)["guesses"])
+
+
+def weakness(key: str) -> str | None:
+    """A warning for a weak key, None for a strong one."""
+    guesses = key_guesses(key)
+    if guesses >= _ENOUGH_GUESSES:
+        return None
+    return (
+        f"about 10^{math.log10(guesses):.0f} guesses find this key, and whoever has the published file can "
+        "make them; `keyss keygen` makes keys that nobody guesses"
+    )

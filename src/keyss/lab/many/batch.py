@@ -130,7 +130,7 @@ def hide_batch(
     """Hide a secret in each cover of a table (see this module), each in its own folder below `out`.
 
     Finished assets are skipped; those with changed files or options fail without `overwrite`.
-    `master_key_file`: derive each asset's key from this key and the column `out` (`keyss.keys.master`).
+    `master_key_file`: derive each asset's key from this key and the column `out` (`keyss.keys.MasterKey`).
     `ray`, `cores`: see `keyss.sweep`; the other arguments are those of `hide`. Raises KeyssError for errors
     that concern all assets; the result has those of single assets.
     """
