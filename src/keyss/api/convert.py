@@ -12,10 +12,10 @@ import torch
 from keyss.core.errors import InputError, QualityError, UsageError, WrongKeyError
 from keyss.core.gaussians import Gaussians
 from keyss.files.atomic import mode_like, write_bytes
+from keyss.files.file_kinds import model_file
 from keyss.files.formats.ply import with_extras
 from keyss.files.inputs import is_standard, write_standard_output
 from keyss.files.models import check_model_output, keeps_low_bits, model_bytes, model_of_bytes
-from keyss.files.training_outputs import model_file
 from keyss.rendering import Backend, resolve_device
 from keyss.rendering.difference import is_visible, psnr_between
 from keyss.runs.files import PathLike, as_model

@@ -20,7 +20,14 @@ from keyss.core.errors import InputError, OutputError, UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.picture_network import DecodedGaussians
 from keyss.files.atomic import atomic_write, check_not_an_input, check_output_file
-from keyss.files.file_kinds import START_BYTES, identify_content, is_foreign_archive
+from keyss.files.file_kinds import (
+    START_BYTES,
+    identify_content,
+    identify_folder,
+    is_foreign_archive,
+    is_training,
+    model_file,
+)
 from keyss.files.formats import ply
 from keyss.files.inputs import (
     MAX_BYTES,
@@ -31,7 +38,6 @@ from keyss.files.inputs import (
     write_standard_output,
 )
 from keyss.files.ply_rows import has_packed_header
-from keyss.files.training_outputs import identify_folder, is_training, model_file
 
 DECODED_SUFFIX = ".3dgs.safetensors"  # models with a decoder network
 

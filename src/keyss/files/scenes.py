@@ -18,11 +18,10 @@ from keyss.core.arrays import Doubles, Floats
 from keyss.core.errors import InputError, KeyssWarning, UsageError
 from keyss.core.scene import NEAR, ORDINARY_EXTENT, Camera, Scene, View, checked_background
 from keyss.files.colmap import MODEL_PLACES, colmap_model_folder, read_colmap
-from keyss.files.file_kinds import identify_file
+from keyss.files.file_kinds import identify_file, identify_folder
 from keyss.files.images import downscale, is_rotated_by_exif, probe_image, read_image, read_mask
 from keyss.files.lens import Lens, Undistortion, undistortion
 from keyss.files.scene_layout import Photo, SceneLayout
-from keyss.files.training_outputs import identify_folder
 from keyss.files.transforms import read_blender, read_nerfstudio
 
 _ROUNDING = 1e-12  # relative error of a camera's position

@@ -72,8 +72,8 @@ def info(path: str | Path) -> RunInfo | ModelInfo | SceneInfo:
 
 
 def _folder_info(path: Path) -> RunInfo | ModelInfo | SceneInfo:
+    from keyss.files.file_kinds import is_training, model_file
     from keyss.files.scenes import load_scene
-    from keyss.files.training_outputs import is_training, model_file
     from keyss.runs.files import METRICS, MODEL, is_run, model_in
     from keyss.runs.json_records import read_record
     from keyss.runs.run_records import FitMetrics, HideMetrics

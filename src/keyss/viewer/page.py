@@ -21,8 +21,8 @@ from urllib.parse import quote
 
 from keyss.core.errors import InputError, KeyssWarning, OutputError, UsageError
 from keyss.files.atomic import check_not_an_input, check_output_file, mode_like, write_bytes
+from keyss.files.file_kinds import model_file
 from keyss.files.inputs import as_text
-from keyss.files.training_outputs import model_file
 from keyss.viewer.look import Look
 
 SCRIPT, STYLE, LICENCES, INDEX = "viewer.js", "viewer.css", "licences.txt", "index.html"

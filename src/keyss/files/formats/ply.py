@@ -18,11 +18,11 @@ import torch
 from keyss.core.arrays import Floats, Numbers
 from keyss.core.errors import InputError, KeyssWarning
 from keyss.core.gaussians import Gaussians
+from keyss.files.file_kinds import model_file
 from keyss.files.formats.common import writable
 from keyss.files.inputs import open_input
 from keyss.files.ply_rows import check_not_activated, has_packed_header, model_names, read_rows
 from keyss.files.ply_table import TYPES, ply_header
-from keyss.files.training_outputs import model_file
 
 _BLOCK = 1 << 13  # Gaussians written at a time
 _NORMALS = ("nx", "ny", "nz")
