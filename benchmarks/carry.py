@@ -26,7 +26,7 @@ from keyss.files.scenes import load_scene
 from keyss.fitting.image_metrics import mean_psnr
 from keyss.methods import record_request
 from keyss.rendering import render
-from keyss.rendering.difference import psnr_between
+from keyss.rendering.orbit import psnr_between
 from methods.carry.carried import embed, extract
 
 KEY = "the key of the benchmark"

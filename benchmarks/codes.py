@@ -34,8 +34,7 @@ from keyss.fitting import psnr
 from keyss.methods import encode_to_size, most_visible, prune_to_size
 from keyss.methods.records import whole
 from keyss.rendering import render
-from keyss.rendering.difference import psnr_between
-from keyss.rendering.orbit import scene_of_model
+from keyss.rendering.orbit import psnr_between, scene_of_model
 
 import numpy as np
 import torch

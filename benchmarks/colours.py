@@ -45,7 +45,7 @@ from keyss.core.errors import BackendError, InputError, WrongKeyError
 from keyss.core.gaussians import Gaussians
 from keyss.core.similarity import Similarity
 from keyss.files.models import read_model, write_model
-from keyss.rendering.difference import psnr_between
+from keyss.rendering.orbit import psnr_between
 
 import numpy as np
 import torch

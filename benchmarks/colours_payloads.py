@@ -20,7 +20,7 @@ from keyss.channels import Colours, ColoursCover
 from keyss.core.errors import BackendError
 from keyss.core.gaussians import Gaussians
 from keyss.files.models import read_model, write_model
-from keyss.rendering.difference import psnr_between
+from keyss.rendering.orbit import psnr_between
 
 import numpy as np
 

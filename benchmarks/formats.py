@@ -21,7 +21,7 @@ from keyss.core import BackendError, Gaussians
 from keyss.core.similarity import Similarity
 from keyss.files.models import read_model, write_model
 from keyss.lab import transform
-from keyss.rendering.difference import psnr_between
+from keyss.rendering.orbit import psnr_between
 
 import numpy as np
 import torch

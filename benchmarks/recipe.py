@@ -212,7 +212,7 @@ def ring(
         azimuth, elevation = 2 * math.pi * turn * index / VIEWS, math.radians(15 + 20 * (index % 7) / 6)
         flat = math.cos(elevation)
         outward = torch.tensor([flat * math.cos(azimuth), -math.sin(elevation), flat * math.sin(azimuth)])
-        pose = look_at(middle + outward * radius * distance, -outward, torch.tensor([0.0, -1.0, 0.0]))
+        pose = look_at(middle + outward * radius * distance, -outward)
         camera = Camera(pose, K, wide, high, f"{index:03d}")
         image = render(model, camera, torch.zeros(3)).clamp(0, 1)
         views.append(View(camera, (image * 255).round().to(torch.uint8)))

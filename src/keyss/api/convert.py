@@ -17,7 +17,7 @@ from keyss.files.formats.ply import with_extras
 from keyss.files.inputs import is_standard, write_standard_output
 from keyss.files.models import check_model_output, keeps_low_bits, model_bytes, model_of_bytes
 from keyss.rendering import Backend, resolve_device
-from keyss.rendering.difference import is_visible, psnr_between
+from keyss.rendering.orbit import is_visible, psnr_between
 from keyss.runs.files import PathLike, as_model
 from keyss.runs.folder import check_not_published
 from keyss.runs.revealing import reveal_any

@@ -17,8 +17,7 @@ from keyss.files.inputs import as_text, read_file
 from keyss.files.models import read_model
 from keyss.keys.encryption import MAX_PAYLOAD_BYTES
 from keyss.methods.hidden import HiddenFile
-from keyss.rendering.difference import psnr_between
-from keyss.rendering.orbit import is_model
+from keyss.rendering.orbit import is_model, psnr_between
 from keyss.runs.files import STEGOS, PathLike, as_3dgs_model, stego_name
 from keyss.runs.folder import RunFolder
 

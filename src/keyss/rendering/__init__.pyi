@@ -1,9 +1,9 @@
 from .backends import Backend as Backend, resolve_device as resolve_device
-from .difference import Viewpoints as Viewpoints, psnr_between as psnr_between
 from .orbit import (
     VIEWS as VIEWS,
-    look_at as look_at,
+    Viewpoints as Viewpoints,
     middle_and_radius as middle_and_radius,
+    psnr_between as psnr_between,
     scene_of_model as scene_of_model,
 )
 from .rasterization_checks import IGNORED as IGNORED, ONLY_VALUES as ONLY_VALUES

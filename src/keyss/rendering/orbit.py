@@ -1,9 +1,10 @@
-"""Cameras around a model, whose renders replace photos."""
+"""Cameras around a model: renders that replace photos, and the difference between renders of two models."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
@@ -25,6 +26,7 @@ MAX_ELEVATION = 60.0  # degrees, up and down
 DISTANCES = (1.0, 0.75, 1.0, 0.5)
 TEST_EVERY, _LARGE = 12, 500_000  # views; minimum Gaussians of a model with slow renders
 _QUANTILE, _MAX_RATIO = 0.95, 10.0  # weights are clamped to this multiple of this quantile
+_ORBIT_VIEWS, _SCENE_VIEWS, _SIZE = 4, 8, 256  # for comparing models
 _SAMPLE = 200_000  # maximum Gaussians for computing `middle_and_radius`
 
 
@@ -78,9 +80,11 @@ def orbit(model: Gaussians, size: int, views: int = VIEWS) -> list[Camera]:
     All look at the middle of the visible model. Up is -y, as in COLMAP's scenes and in viewers.
     """
     middle, radius = middle_and_radius(model)
+    tangent = math.tan(math.radians(FIELD_OF_VIEW / 2))
+    K = torch.tensor([[size / 2 / tangent, 0, size / 2], [0, size / 2 / tangent, size / 2], [0, 0, 1]])
     reach = radius / math.sin(math.radians(FIELD_OF_VIEW / 2))
     limit = math.sin(math.radians(MAX_ELEVATION))
-    near = _near(radius)
+    near = NEAR * min(1.0, radius / ORDINARY_EXTENT)
     cameras = []
     for index in range(views):
         # A Fibonacci lattice: equal steps of the sine of the elevation, golden angles of the azimuth.
@@ -88,8 +92,8 @@ def orbit(model: Gaussians, size: int, views: int = VIEWS) -> list[Camera]:
         azimuth = index * math.pi * (3 - math.sqrt(5))
         flat = math.sqrt(1 - height * height)
         outward = torch.tensor([flat * math.cos(azimuth), -height, flat * math.sin(azimuth)])
-        position = middle + outward * reach * DISTANCES[index % len(DISTANCES)]
-        cameras.append(camera_along(position, -outward, size, f"orbit_{index:03d}.png", near))
+        pose = look_at(middle + outward * reach * DISTANCES[index % len(DISTANCES)], -outward)
+        cameras.append(Camera(pose, K, size, size, f"orbit_{index:03d}.png", near))
     return cameras
 
 
@@ -117,24 +121,56 @@ def _quantile(values: Tensor, weight: Tensor, share: float) -> Tensor:
     return values[int(torch.searchsorted(total, share * total[-1]).clamp_max(len(values) - 1))]
 
 
-def _near(radius: float) -> float:
-    """The near plane for a model of this radius."""
-    return NEAR * min(1.0, radius / ORDINARY_EXTENT)
-
-
-def camera_along(position: Tensor, forward: Tensor, size: int, name: str, near: float = NEAR) -> Camera:
-    """A square camera at `position` that looks along the unit vector `forward`, with -y up."""
-    focal = 0.5 * size / math.tan(math.radians(FIELD_OF_VIEW / 2))
-    K = torch.tensor([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1]])
-    return Camera(look_at(position, forward, torch.tensor([0.0, -1.0, 0.0])), K, size, size, name, near)
-
-
-def look_at(position: Tensor, forward: Tensor, up: Tensor) -> Tensor:
-    """[4, 4] world to camera, from `position` along the unit vector `forward`, not parallel to `up`."""
+def look_at(position: Tensor, forward: Tensor) -> Tensor:
+    """[4, 4] world to camera, from `position` along the unit vector `forward`, with -y up."""
+    up = torch.tensor([0.0, -1.0, 0.0])
     right = torch.linalg.cross(-up, forward)
     right = right / right.norm()
     down = torch.linalg.cross(forward, right)
-    viewmat = torch.eye(4, dtype=position.dtype)
+    viewmat = torch.eye(4)
     viewmat[:3, :3] = torch.stack([right, down, forward])
     viewmat[:3, 3] = -viewmat[:3, :3] @ position
     return viewmat
+
+
+@dataclass(frozen=True)
+class Viewpoints:
+    """The cameras from which models are compared, and the background."""
+
+    cameras: Sequence[Camera]
+    background: Tensor = field(default_factory=lambda: torch.zeros(3))  # [3] in [0, 1]
+
+    @staticmethod
+    def around(model: Gaussians) -> Viewpoints:
+        """Four views around a model, for models without cameras."""
+        return Viewpoints(orbit(model, _SIZE, _ORBIT_VIEWS))
+
+    @staticmethod
+    def of(scene: Scene) -> Viewpoints:
+        """Up to eight downscaled training views of a scene."""
+        views = scene.train[:: max(1, -(-len(scene.train) // _SCENE_VIEWS))]
+        return Viewpoints([_shrink(view.camera) for view in views], scene.background)
+
+
+@torch.no_grad()
+def psnr_between(before: Gaussians, after: Gaussians, viewpoints: Viewpoints | None = None) -> float:
+    """PSNR in dB between renders of two models, at most 120; by default from views around the first."""
+    views = viewpoints or Viewpoints.around(before)
+    errors, background = [], views.background.to(before.device)
+    for camera in views.cameras:
+        one, other = (render(model, camera, background).clamp(0, 1) for model in (before, after))
+        errors.append((one - other).square().mean())
+    return float(-10 * torch.log10(torch.stack(errors).mean().clamp_min(1e-12)))
+
+
+@torch.no_grad()
+def is_visible(model: Gaussians) -> bool:
+    """True if renders around a model show more than the background."""
+    views = Viewpoints.around(model)
+    background = views.background.to(model.device)
+    return any(bool((render(model, each, background) != background).any()) for each in views.cameras)
+
+
+def _shrink(camera: Camera) -> Camera:
+    scale = min(1.0, _SIZE / max(camera.width, camera.height))
+    return camera.resized(max(1, round(scale * camera.width)), max(1, round(scale * camera.height)))

@@ -48,7 +48,7 @@ from keyss.core.errors import KeyssWarning, UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.keys.derivation import MASTER_BYTES, expand, stream
 from keyss.keys.encryption import OVERHEAD, compressed_size, encrypt
-from keyss.rendering.difference import psnr_between
+from keyss.rendering.orbit import psnr_between
 
 _TOO_FEW = "this cover has too few Gaussians to hide anything in colours that would survive other formats"
 _LOWER = 3  # maximum number of levels, each a quarter of a bit, below the planned one

@@ -26,7 +26,7 @@ from keyss.channels.colours.salt_gaussians import SALTS
 from keyss.core.arrays import Doubles, Flags, Floats, Integers, doubles
 from keyss.core.gaussians import Gaussians
 from keyss.keys.encryption import OVERHEAD
-from keyss.rendering.difference import psnr_between
+from keyss.rendering.orbit import psnr_between
 
 MIN_HEADERS = 2  # minimum number of headers in a file at level ONE; those without a secret are noise
 _RATE = 0.42  # data bits per expected bit of information

@@ -28,7 +28,7 @@ from keyss.methods.carry.options import CarryOptions
 from keyss.methods.records.embedding import largest_degree, record_request, shares
 from keyss.methods.records.precision import most_visible, prune_to_size
 from keyss.methods.records.whole import encode
-from keyss.rendering.difference import Viewpoints
+from keyss.rendering.orbit import Viewpoints
 
 _BITS_PER_GAUSSIAN = 150  # payload estimate for a secret that is not fitted yet
 _FAINT = 1e-3  # standard deviation of added harmonics

@@ -20,7 +20,7 @@ from keyss.methods.carry.options import REFIT, CarryOptions
 from keyss.methods.records.embedding import embed_models
 from keyss.methods.records.quantise import out_of_range
 from keyss.rendering import contributions
-from keyss.rendering.difference import Viewpoints, psnr_between
+from keyss.rendering.orbit import Viewpoints, psnr_between
 
 # Refits to renders start near the optimum: maximum steps, and factor on the rates.
 _MODEL_ITERATIONS, _MODEL_RATE = 400, 0.1

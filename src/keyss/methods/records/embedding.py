@@ -28,7 +28,7 @@ from keyss.methods.records.lines import Table
 from keyss.methods.records.precision import encode_to_size, most_visible_rows
 from keyss.methods.records.quantise import Codec
 from keyss.methods.records.whole import encode
-from keyss.rendering.difference import Viewpoints
+from keyss.rendering.orbit import Viewpoints
 
 METHOD = "carry"  # the method that opens what is embedded
 

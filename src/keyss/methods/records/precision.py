@@ -12,7 +12,7 @@ from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.files.formats.common import in_morton_order
 from keyss.methods.records.whole import Precision, decode, encode
-from keyss.rendering.difference import Viewpoints, psnr_between
+from keyss.rendering.orbit import Viewpoints, psnr_between
 
 _GOOD_ENOUGH = 43.75  # dB between renders; costs 0.1 to 0.3 dB at 30 dB against photos
 _ATTRIBUTES = ("means", "log_scales", "opacity_logits", "colours", "quats", "harmonics")
