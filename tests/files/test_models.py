@@ -1,63 +1,32 @@
-"""The choice of a model format, new formats, and `info` on models."""
+"""The choice of a model format, and `info` on models."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import BinaryIO
 
 import pytest
 import torch
-from safetensors.torch import load, save
 
 from keyss import info
 from keyss.core import Gaussians, InputError, OutputError, UsageError
-from keyss.files import check_model_output, is_model_path, keeps_low_bits, models, read_model, write_model
-from keyss.files.models import ModelFormat
+from keyss.files import check_model_output, is_model_path, keeps_low_bits, read_model, write_model
 from keyss.runs import ModelInfo
 from tiny_scenes import random_gaussians
 
-FIELDS = ("means", "quats", "log_scales", "opacity_logits", "sh")
+
+@pytest.mark.parametrize("name", ["a.ply", "b.PLY", "c.Ply"])
+def test_suffixes_in_any_case(tmp_path: Path, name: str) -> None:
+    assert is_model_path(name)
+    assert keeps_low_bits(name)
+    write_model(tmp_path / name, random_gaussians(9))
+    assert (tmp_path / name).read_bytes().startswith(b"ply\n")
 
 
-def write_toy(model: Gaussians, file: BinaryIO) -> None:
-    file.write(b"TOY!" + save({name: getattr(model, name).contiguous() for name in FIELDS}))
-
-
-def read_toy(file: BinaryIO) -> Gaussians:
-    return Gaussians(**load(file.read().removeprefix(b"TOY!")))
-
-
-@pytest.fixture
-def toy(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A new format: one more entry of the list."""
-    entry = ModelFormat("toy", (".toy", ".toy.bin"), (b"TOY!",), read_toy, write_toy)
-    monkeypatch.setattr(models, "FORMATS", [*models.FORMATS, entry])
-
-
-def test_new_format(toy: None, tmp_path: Path) -> None:
-    model = random_gaussians(9, sh_degree=2)
-    for name, kind in (("a.toy", "toy"), ("b.TOY.bin", "toy"), ("c.ply", "PLY"), ("d.Ply", "PLY")):
-        path = tmp_path / name
-        assert is_model_path(path)
-        write_model(path, model)
-        assert path.read_bytes().startswith(b"TOY!" if kind == "toy" else b"ply\n")
-        assert read_model(path).digest() == model.digest()
-
-
-def test_format_from_content(toy: None, tmp_path: Path) -> None:
-    model = random_gaussians(5)
-    for suffix in (".ply", ".toy"):
-        write_model(tmp_path / f"a{suffix}", model)
-        renamed = (tmp_path / f"a{suffix}").rename(tmp_path / "download")
-        assert not is_model_path(renamed)
-        assert read_model(renamed).digest() == model.digest()
-
-
-def test_suffix_of_another_format(toy: None, tmp_path: Path) -> None:
-    write_model(tmp_path / "a.toy", random_gaussians(5))
-    path = (tmp_path / "a.toy").rename(tmp_path / "a.ply")
+def test_suffix_of_another_format(tmp_path: Path) -> None:
+    write_model(tmp_path / "a.spz", random_gaussians(5))
+    path = (tmp_path / "a.spz").rename(tmp_path / "a.ply")
     with pytest.raises(
-        InputError, match=r"a\.ply: the name says PLY, but the content is toy; .* end in \.toy"
+        InputError, match=r"a\.ply: the name says PLY, but the content is SPZ; .* end in \.spz"
     ):
         read_model(path)
 
@@ -74,13 +43,13 @@ def test_unknown_suffixes(tmp_path: Path, name: str) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("suffix", [".spz", ".sog", ".compressed.ply", ".glb", ".splat"])
+@pytest.mark.parametrize("suffix", [".ply", ".spz", ".sog", ".compressed.ply", ".glb", ".splat"])
 def test_every_format_round_trips(tmp_path: Path, suffix: str) -> None:
     model = random_gaussians(40, sh_degree=1)
     path = tmp_path / f"a{suffix}"
     write_model(path, model)
     assert is_model_path(path)
-    assert not keeps_low_bits(path)
+    assert keeps_low_bits(path) == (suffix == ".ply")
     assert len(read_model(path)) == 40
     if suffix != ".splat":  # which has no first bytes of its own
         assert read_model(path).digest() == read_model(path.rename(tmp_path / "download")).digest()
