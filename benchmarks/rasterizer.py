@@ -122,11 +122,11 @@ def measure_rasterizer(case: Case, threads: int, repeats: int) -> list[str]:
     weights = torch.randn(camera.height, camera.width, 3, generator=torch.Generator().manual_seed(1))
 
     def draw() -> Tensor:
-        images, _, _ = rasterization(
-            *leaves, camera.viewmat[None], camera.K[None], camera.width, camera.height,
+        image, _, _ = rasterization(
+            *leaves, camera.viewmat, camera.K, camera.width, camera.height,
             sh_degree=gaussians.sh_degree,
         )  # fmt: skip
-        return images[0]
+        return image
 
     only, forward, backward = Times(), Times(), Times()
     before = _memory()
@@ -175,14 +175,14 @@ def measure_step(case: Case, threads: int, repeats: int) -> list[str]:
             times = {name: Times() for name in names}
         g = to_gaussians(parameters)
         leaves = [t.detach().requires_grad_() for t in (g.means, g.quats, g.scales, g.opacities, g.sh)]
-        images, _, _ = times["rasterizer forward"].measure(
+        image, _, _ = times["rasterizer forward"].measure(
             lambda leaves=leaves, g=g: rasterization(
-                *leaves, camera.viewmat[None], camera.K[None], camera.width, camera.height,
+                *leaves, camera.viewmat, camera.K, camera.width, camera.height,
                 sh_degree=g.sh_degree,
             )
         )  # type: ignore[misc]  # fmt: skip
-        times["rasterizer backward"].measure(lambda images=images: images[0].backward(weights))
-        del leaves, g, images
+        times["rasterizer backward"].measure(lambda image=image: image.backward(weights))
+        del leaves, g, image
         image = times["render"].measure(lambda: render(to_gaussians(parameters), camera))
         loss = times["loss"].measure(lambda image=image: photometric_loss(image, target, config.ssim_weight))
         times["backward"].measure(loss.backward)  # type: ignore[attr-defined]
@@ -211,7 +211,7 @@ def measure_against_torch(threads: int, repeats: int) -> list[str]:
 
     def ours() -> Tensor:
         size = (camera.width, camera.height)
-        return rasterization(*leaves, camera.viewmat[None], camera.K[None], *size, sh_degree=3)[0][0]
+        return rasterization(*leaves, camera.viewmat, camera.K, *size, sh_degree=3)[0]
 
     def dense() -> Tensor:
         view = (camera.viewmat, camera.K, camera.width, camera.height)

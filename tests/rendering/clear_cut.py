@@ -28,16 +28,11 @@ ROUNDS = 60
 
 
 def margins(scene: Scene) -> Margins:
-    """Minimum distance [N] of each Gaussian to each threshold, over all cameras."""
-    least: Margins = {}
-    leaves = scene.leaves(torch.float64)
+    """Minimum distance [N] of each Gaussian to each threshold."""
+    found: Margins = {}
     with torch.no_grad():
-        for camera in range(len(scene.viewmats)):
-            found: Margins = {}
-            dense_rasterization(**scene.dense_arguments(leaves, camera), margins=found)
-            for name, values in found.items():
-                least[name] = torch.minimum(values, least.get(name, values))
-    return least
+        dense_rasterization(**scene.dense_arguments(scene.leaves(torch.float64)), margins=found)
+    return found
 
 
 def close_calls(scene: Scene) -> dict[str, Tensor]:

@@ -12,8 +12,8 @@ from torch import Tensor
 
 from keyss.rendering import rasterization
 
-DIFFERENTIABLE = ("means", "quats", "scales", "opacities", "colors", "backgrounds")
-CAMERAS = ("viewmats", "Ks")
+DIFFERENTIABLE = ("means", "quats", "scales", "opacities", "colors", "background")
+CAMERA = ("viewmat", "K")
 
 
 @dataclass
@@ -25,11 +25,11 @@ class Scene:
     scales: Tensor
     opacities: Tensor
     colors: Tensor  # [N, 16, 3], or [N, D] where sh_degree is None
-    viewmats: Tensor
-    Ks: Tensor
+    viewmat: Tensor
+    K: Tensor
     width: int
     height: int
-    backgrounds: Tensor
+    background: Tensor
     sh_degree: int | None
     near_plane: float = 2.0**-6  # exact in float32
 
@@ -37,7 +37,7 @@ class Scene:
         self.round()
 
     def round(self) -> None:
-        for name in (*DIFFERENTIABLE, *CAMERAS):
+        for name in (*DIFFERENTIABLE, *CAMERA):
             setattr(self, name, getattr(self, name).float().double())
 
     def leaves(self, dtype: torch.dtype = torch.float32) -> dict[str, Tensor]:
@@ -50,18 +50,16 @@ class Scene:
         return {name: getattr(self, name) for name in names}
 
     def draw(self, leaves: dict[str, Tensor], **changes: Any) -> tuple[Tensor, Tensor, dict[str, Any]]:
-        cameras = {name: getattr(self, name).to(leaves["means"]) for name in CAMERAS}
-        return rasterization(**{**cameras, **leaves, **self.settings(), **changes})
+        camera = {name: getattr(self, name).to(leaves["means"]) for name in CAMERA}
+        return rasterization(**{**camera, **leaves, **self.settings(), **changes})
 
     def results(self, leaves: dict[str, Tensor] | None = None, **changes: Any) -> dict[str, Tensor]:
-        """Images, alphas, meta and the gradients of a random loss."""
+        """Image, alpha, meta and the gradients of a random loss."""
         leaves = self.leaves() if leaves is None else leaves
-        images, alphas, meta = self.draw(leaves, **changes)
+        image, alpha, meta = self.draw(leaves, **changes)
         meta["means2d"].retain_grad()
-        generator = torch.Generator().manual_seed(1)
-        weights = [torch.randn(t.shape, generator=generator).to(t.device) for t in (images, alphas)]
-        torch.autograd.backward([images, alphas], weights)
-        found = {"images": images, "alphas": alphas, "radii": meta["radii"], "depths": meta["depths"]}
+        torch.autograd.backward([image, alpha], [each.to(image) for each in self.weights()])
+        found = {"image": image, "alpha": alpha, "radii": meta["radii"], "depths": meta["depths"]}
         found["means2d"] = meta["means2d"]
         found["gradient of means2d"] = meta["means2d"].grad
         for name in DIFFERENTIABLE:
@@ -69,16 +67,15 @@ class Scene:
             found[f"gradient of {name}"] = torch.zeros_like(leaf) if leaf.grad is None else leaf.grad
         return {name: tensor.detach() for name, tensor in found.items()}
 
-    def dense_arguments(self, leaves: dict[str, Tensor], camera: int) -> dict[str, Any]:
-        """Arguments of `dense_rasterization` for one camera."""
-        arguments: dict[str, Any] = {**leaves, **self.settings()}
-        backgrounds = arguments.pop("backgrounds")
-        return {
-            **arguments,
-            "viewmat": self.viewmats[camera],
-            "K": self.Ks[camera],
-            "background": backgrounds[camera],
-        }
+    def weights(self) -> tuple[Tensor, Tensor]:
+        """Of the image and alpha in a random loss."""
+        generator = torch.Generator().manual_seed(99)
+        shape = (self.height, self.width)
+        return tuple(torch.randn(*shape, *last, generator=generator) for last in (self.background.shape, ()))  # type: ignore[return-value]
+
+    def dense_arguments(self, leaves: dict[str, Tensor]) -> dict[str, Any]:
+        """Arguments of `dense_rasterization`."""
+        return {**leaves, **self.settings(), "viewmat": self.viewmat, "K": self.K}
 
 
 def random_scene(
@@ -86,7 +83,6 @@ def random_scene(
     width: int = 48,
     height: int = 40,
     *,
-    cameras: int = 1,
     sh_degree: int | None = 3,
     channels: int = 3,
     distance: float = 4.0,
@@ -94,7 +90,7 @@ def random_scene(
     size: float = 0.1,
     seed: int = 0,
 ) -> Scene:
-    """Random Gaussians and slightly rotated cameras with off-centre principal points."""
+    """Random Gaussians before a slightly rotated camera with an off-centre principal point."""
     generator = torch.Generator().manual_seed(seed)
 
     def normal(*shape: int) -> Tensor:
@@ -103,26 +99,20 @@ def random_scene(
     def uniform(*shape: int) -> Tensor:
         return torch.rand(*shape, generator=generator, dtype=torch.float64)
 
-    viewmats, Ks = [], []
-    for camera in range(cameras):
-        cosine, sine = math.cos(0.3 - 0.5 * camera), math.sin(0.3 - 0.5 * camera)
-        viewmats.append(
-            [[cosine, 0, sine, 0.1], [0, 1, 0, -0.05], [-sine, 0, cosine, distance], [0, 0, 0, 1]]
-        )
-        Ks.append(
-            [[(0.9 + 0.1 * camera) * width, 0, 0.52 * width], [0, 1.1 * height, 0.47 * height], [0, 0, 1]]
-        )
+    cosine, sine = math.cos(0.3), math.sin(0.3)
+    viewmat = [[cosine, 0, sine, 0.1], [0, 1, 0, -0.05], [-sine, 0, cosine, distance], [0, 0, 0, 1]]
+    K = [[0.9 * width, 0, 0.52 * width], [0, 1.1 * height, 0.47 * height], [0, 0, 1]]
     return Scene(
         means=spread * normal(count, 3),
         quats=normal(count, 4),
         scales=size * (0.3 * normal(count, 3)).exp(),
         opacities=0.05 + 0.9 * uniform(count),
         colors=uniform(count, channels) if sh_degree is None else 0.3 * normal(count, 16, 3),
-        viewmats=torch.tensor(viewmats, dtype=torch.float64).reshape(-1, 4, 4),
-        Ks=torch.tensor(Ks, dtype=torch.float64).reshape(-1, 3, 3),
+        viewmat=torch.tensor(viewmat, dtype=torch.float64),
+        K=torch.tensor(K, dtype=torch.float64),
         width=width,
         height=height,
-        backgrounds=uniform(cameras, channels),
+        background=uniform(channels),
         sh_degree=sh_degree,
     )
 
@@ -136,7 +126,7 @@ def opaque_walls() -> Scene:
 def opaque_walls_of_features() -> Scene:
     """Pixels that stop early, and alphas at the clamp, with many channels."""
     features = random_scene(count=80, sh_degree=None, channels=5)
-    return replace(opaque_walls(), colors=features.colors, backgrounds=features.backgrounds, sh_degree=None)
+    return replace(opaque_walls(), colors=features.colors, background=features.background, sh_degree=None)
 
 
 def coincident(**changes: Any) -> Scene:
@@ -182,7 +172,7 @@ def around_the_near_plane() -> Scene:
         ]
     )
     # Depths are exact along the z axis.
-    return replace(scene, means=means, viewmats=torch.eye(4)[None], near_plane=near)
+    return replace(scene, means=means, viewmat=torch.eye(4), near_plane=near)
 
 
 SCENES: dict[str, Callable[[], Scene]] = {
@@ -207,6 +197,4 @@ SCENES: dict[str, Callable[[], Scene]] = {
     ),
     "5 channels": lambda: random_scene(sh_degree=None, channels=5, seed=19),
     "32 channels": lambda: random_scene(sh_degree=None, channels=32, seed=14),
-    "three cameras": lambda: random_scene(cameras=3, seed=22),
-    "three cameras, features": lambda: random_scene(cameras=3, sh_degree=None, channels=4, seed=23),
 }

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import pytest
 import torch
-from torch import Tensor
 
 from rendering.clear_cut import clear_cut
 from rendering.dense_reference import dense_rasterization
@@ -14,50 +13,24 @@ IMAGE_ERROR = 1e-5  # absolute
 GRADIENT_ERROR = 1e-4  # the largest difference by the largest gradient
 
 
-def draw_densely(
-    scene: Scene, leaves: dict[str, Tensor], shifts: Tensor | None = None
-) -> tuple[Tensor, Tensor]:
-    """Images and alphas in the layout of `rasterization`."""
-    drawn = [
-        dense_rasterization(
-            **scene.dense_arguments(leaves, camera), shifts=None if shifts is None else shifts[camera]
-        )
-        for camera in range(len(scene.viewmats))
-    ]
-    return torch.stack([image for image, _ in drawn]), torch.stack([alpha[..., None] for _, alpha in drawn])
-
-
 def errors(scene: Scene) -> dict[str, float]:
-    """Absolute errors of images and alphas, relative errors of gradients."""
-    exact, ours = scene.leaves(torch.float64), scene.leaves(torch.float32)
-    # For the gradients of means2d; too large for the scene with 10,000 Gaussians.
-    shifts = None
-    if len(scene.means) <= 200:
-        pixels = scene.height * scene.width
-        shifts = torch.zeros(len(scene.viewmats), len(scene.means), pixels, 2, dtype=torch.float64)
+    """Absolute errors of image and alpha, relative errors of gradients."""
+    leaves, shifts = scene.leaves(torch.float64), None
+    if len(scene.means) <= 200:  # for the gradient of means2d; too large for the scene with 10,000 Gaussians
+        shifts = torch.zeros(len(scene.means), scene.height * scene.width, 2, dtype=torch.float64)
         shifts.requires_grad_()
-    image, alpha = draw_densely(scene, exact, shifts)
-    images, alphas, meta = scene.draw(ours)
-    assert images.shape == image.shape
-    found = {
-        "image": float((images - image).detach().abs().max()),
-        "alpha": float((alphas - alpha).detach().abs().max()),
-    }
-
-    generator = torch.Generator().manual_seed(99)
-    image_weights = torch.randn(image.shape, generator=generator)
-    alpha_weights = torch.randn(alpha.shape, generator=generator)
-    ((image * image_weights).sum() + (alpha * alpha_weights).sum()).backward()
-    ((images * image_weights).sum() + (alphas * alpha_weights).sum()).backward()
-    gradients = {name: (ours[name].grad, exact[name].grad) for name in DIFFERENTIABLE}
-    if shifts is not None:
-        assert shifts.grad is not None
-        gradients["means2d"] = (meta["means2d"].grad, shifts.grad.sum(2))
-    for name, (gradient, expected) in gradients.items():
-        assert gradient is not None
+    image, alpha = dense_rasterization(**scene.dense_arguments(leaves), shifts=shifts)
+    torch.autograd.backward([image, alpha], [each.to(image) for each in scene.weights()])
+    exact = {f"gradient of {name}": leaves[name].grad for name in DIFFERENTIABLE}
+    if shifts is not None and shifts.grad is not None:
+        exact["gradient of means2d"] = shifts.grad.sum(1)[None]
+    ours = scene.results()
+    found = {}
+    for name, expected in {"image": image.detach(), "alpha": alpha.detach(), **exact}.items():
         assert expected is not None
-        largest = expected.abs().max()
-        found[f"gradient of {name}"] = float((gradient - expected).abs().max() / largest)
+        assert ours[name].shape == expected.shape
+        largest = float(expected.abs().max()) if name in exact else 1.0
+        found[name] = float((ours[name] - expected).abs().max()) / largest
     return found
 
 

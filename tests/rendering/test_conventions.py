@@ -22,19 +22,19 @@ def draw(
 ) -> tuple[Tensor, Tensor]:
     """Draw small round Gaussians with a camera at the origin looking along z, focal length 10."""
     count = len(means)
-    images, alphas, _ = rasterization(
+    image, alpha, _ = rasterization(
         torch.tensor(means, dtype=torch.float32),
         torch.tensor([[1.0, 0, 0, 0]]).expand(count, 4),
         torch.full((count, 3), scale),
         torch.tensor(opacities),
         torch.tensor(colors, dtype=torch.float32),
-        torch.eye(4)[None],
-        torch.tensor([[[10.0, 0, size / 2], [0, 10, size / 2], [0, 0, 1]]]),
+        torch.eye(4),
+        torch.tensor([[10.0, 0, size / 2], [0, 10, size / 2], [0, 0, 1]]),
         size,
         size,
-        backgrounds=None if background is None else torch.tensor([background], dtype=torch.float32),
+        background=None if background is None else torch.tensor(background, dtype=torch.float32),
     )
-    return images[0], alphas[0, ..., 0]
+    return image, alpha
 
 
 def test_pixel_centres() -> None:

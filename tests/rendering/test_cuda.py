@@ -39,7 +39,7 @@ def check_backends_agree(scene: Scene, cuda: torch.device) -> None:
             continue
         if name in ("depths", "means2d", "gradient of means2d"):
             mine, other = mine[drawn], other[drawn]  # undefined elsewhere in gsplat
-        if name in ("images", "alphas"):
+        if name in ("image", "alpha"):
             scale = max(1.0, float(other.abs().max()))
             assert (mine - other).abs().max() <= IMAGE_ERROR * scale, name
         else:

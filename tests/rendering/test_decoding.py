@@ -53,14 +53,14 @@ def test_render(model: DecodedGaussians) -> None:
         model.scales,
         model.opacities,
         model.features,
-        camera.viewmat[None],
-        camera.K[None],
+        camera.viewmat,
+        camera.K,
         camera.width,
         camera.height,
-        backgrounds=model.network.background[None],
+        background=model.network.background,
     )
     (first, second) = model.network.layers
-    expected = convolve(convolve(drawn[0], *first).relu(), *second)
+    expected = convolve(convolve(drawn, *first).relu(), *second)
     torch.testing.assert_close(render(model, camera), expected, atol=1e-4, rtol=1e-4)
 
 

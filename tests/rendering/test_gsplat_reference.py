@@ -59,9 +59,9 @@ def test_double_precision(gpu: torch.device) -> None:
         name: leaf.detach().to(gpu).requires_grad_() for name, leaf in scene.leaves(torch.float64).items()
     }
     found, expected = scene.results(leaves), scene.results(scene.leaves(torch.float64))
-    assert found["images"].dtype == torch.float32
+    assert found["image"].dtype == torch.float32
     assert found["gradient of means"].dtype == torch.float64
-    assert (found["images"].cpu() - expected["images"]).abs().max() <= IMAGE_ERROR
+    assert (found["image"].cpu() - expected["image"]).abs().max() <= IMAGE_ERROR
 
 
 def test_no_visible_gaussians(gpu: torch.device) -> None:
@@ -69,7 +69,7 @@ def test_no_visible_gaussians(gpu: torch.device) -> None:
     scene.means[:, 2] -= 100
     results = results_on(gpu, scene)
     assert not results["radii"].any()
-    assert torch.equal(results["images"], scene.backgrounds[:, None, None].float().expand(1, 40, 48, 3))
+    assert torch.equal(results["image"], scene.background.float().expand(40, 48, 3))
 
 
 def training(name: str, config: FitConfig, device: torch.device) -> Any:

@@ -62,11 +62,11 @@ def test_cache_folder_is_recreated(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 DRAW = """
 import torch
 from keyss.rendering import rasterization
-images, _, _ = rasterization(
+image, _, _ = rasterization(
     torch.tensor([[0.0, 0, 1]]), torch.ones(1, 4), torch.ones(1, 3), torch.ones(1), torch.ones(1, 3),
-    torch.eye(4)[None], torch.tensor([[[4.0, 0, 4], [0, 4, 4], [0, 0, 1]]]), 8, 8,
+    torch.eye(4), torch.tensor([[4.0, 0, 4], [0, 4, 4], [0, 0, 1]]), 8, 8,
 )
-assert images.max() > 0.9
+assert image.max() > 0.9
 """
 
 

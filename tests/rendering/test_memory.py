@@ -27,8 +27,8 @@ def draw(count, width, height):
     inputs = [tensor.requires_grad_() for tensor in inputs]
     with open("/proc/self/statm") as file:
         before = int(file.read().split()[1]) * resource.getpagesize()
-    images, _, meta = rasterization(*inputs, viewmat[None], K[None], width, height, sh_degree=3)
-    images.sum().backward()
+    image, _, meta = rasterization(*inputs, viewmat, K, width, height, sh_degree=3)
+    image.sum().backward()
     assert (meta["radii"] > 0).all(-1).sum() > 0.5 * count
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 - before
 

@@ -14,9 +14,8 @@ import torch
 from hypothesis import assume, given, settings
 from torch import Tensor
 
-from keyss.core import UsageError
 from keyss.rendering import rasterization
-from rendering.scenes import CAMERAS, DIFFERENTIABLE, random_scene
+from rendering.scenes import CAMERA, DIFFERENTIABLE, random_scene
 
 HOSTILE = (
     *(math.nan, math.inf, -math.inf, 0.0, -0.0, 1e-45, -1e-40, 1e-38, -1e-12, 1e-6),
@@ -43,7 +42,7 @@ def check_finite(results: dict[str, Tensor]) -> None:
     for name, tensor in results.items():
         if name != "means2d":  # may overflow far outside the image
             assert tensor.isfinite().all(), name
-    assert ((results["alphas"] >= 0) & (results["alphas"] <= 1)).all()
+    assert ((results["alpha"] >= 0) & (results["alpha"] <= 1)).all()
     hidden = (results["radii"] == 0).any(-1)
     assert (results["gradient of means2d"][hidden] == 0).all()
     unseen = hidden.all(0)
@@ -59,7 +58,6 @@ def test_hostile_gaussians(data: st.DataObject) -> None:
         width=data.draw(st.integers(1, 40)),
         height=data.draw(st.integers(1, 40)),
         size=0.3,
-        cameras=data.draw(st.integers(1, 2)),
         seed=data.draw(st.integers(0, 5)),
         **data.draw(colors),
     )
@@ -84,21 +82,19 @@ def test_huge_needles(seed: int, size: float) -> None:
 def test_hostile_cameras(data: st.DataObject) -> None:
     scene = random_scene(count=12, width=21, height=35, size=0.3, **data.draw(colors))
     arguments = {name: guarded(leaf.detach()) for name, leaf in scene.leaves().items()}
-    arguments |= {name: guarded(getattr(scene, name).float()) for name in CAMERAS}
-    spoiled = data.draw(st.lists(st.sampled_from(["viewmats", "Ks", "backgrounds"]), min_size=1, max_size=3))
+    arguments |= {name: guarded(getattr(scene, name).float()) for name in CAMERA}
+    spoiled = data.draw(st.lists(st.sampled_from(["viewmat", "K", "background"]), min_size=1, max_size=3))
     for name in spoiled:
         numbers = arguments[name].view(-1)
         numbers[data.draw(st.integers(0, len(numbers) - 1))] = data.draw(st.sampled_from(HOSTILE))
     leaves = {name: arguments[name].requires_grad_() for name in DIFFERENTIABLE}
     message, results = "", {}
     try:
-        results = scene.results(leaves, **{name: arguments[name] for name in CAMERAS})
+        results = scene.results(leaves, **{name: arguments[name] for name in CAMERA})
     except ValueError as error:
         message = str(error)
     if message:
-        assert any(
-            message.startswith(f"{name}:") and str(list(arguments[name].shape)) in message for name in spoiled
-        )
+        assert any(message.startswith(f"{name}:") for name in spoiled)
     else:
         check_finite(results)
 
@@ -107,9 +103,9 @@ def test_hostile_cameras(data: st.DataObject) -> None:
 @given(st.data())
 def test_wrong_shapes(data: st.DataObject) -> None:
     scene = random_scene(count=4, sh_degree=data.draw(st.sampled_from([None, 2])))
-    cameras = {name: getattr(scene, name).float() for name in CAMERAS}
-    arguments: dict[str, Any] = {**scene.leaves(), **cameras, **scene.settings()}
-    name = data.draw(st.sampled_from((*DIFFERENTIABLE, *CAMERAS)))
+    camera = {name: getattr(scene, name).float() for name in CAMERA}
+    arguments: dict[str, Any] = {**scene.leaves(), **camera, **scene.settings()}
+    name = data.draw(st.sampled_from((*DIFFERENTIABLE, *CAMERA)))
     right = tuple(arguments[name].shape)
     shape = list(data.draw(st.one_of(st.permutations(right), st.lists(st.integers(0, 5), max_size=4))))
     if data.draw(st.booleans()):
@@ -118,11 +114,10 @@ def test_wrong_shapes(data: st.DataObject) -> None:
     if name == "colors":  # any number of channels or coefficients is valid
         assume(not (len(shape) == len(right) and shape[0] == right[0]))
     arguments[name] = torch.zeros(shape)
-    with pytest.raises((ValueError, UsageError)) as refused:
+    with pytest.raises(ValueError, match="expected") as refused:
         rasterization(**arguments)
     message = str(refused.value)
-    if name in ("means", "viewmats") and shape[:1] != list(right[:1]):
-        # With another number of Gaussians or cameras, any of the arguments may be named.
+    if name == "means" and shape[:1] != list(right[:1]):  # any of the arguments may be named
         assert any(message.startswith(f"{other}:") for other in arguments)
     else:
         assert message.startswith(f"{name}:")
@@ -160,32 +155,32 @@ def test_non_finite_gaussians_are_skipped() -> None:
         for value in (math.nan, math.inf, -math.inf):
             bad = {**leaves, spoiled: leaves[spoiled].clone()}
             bad[spoiled][0] = value
-            images, _, meta = scene.draw(bad)
-            assert torch.equal(images, expected)
+            image, _, meta = scene.draw(bad)
+            assert torch.equal(image, expected)
             assert (meta["radii"][0, 0] == 0).all()
 
 
 @pytest.mark.parametrize("count", [0, 3])
 def test_empty_scene_is_background(count: int) -> None:
     means = torch.tensor([[0.0, 0.0, -5.0]]).repeat(count, 1).requires_grad_()
-    background = torch.tensor([[0.1, 0.2, 0.3]], requires_grad=True)
-    images, alphas, meta = rasterization(
+    background = torch.tensor([0.1, 0.2, 0.3], requires_grad=True)
+    image, alpha, meta = rasterization(
         means,
         torch.zeros(count, 4),
         torch.ones(count, 3),
         torch.ones(count),
         torch.ones(count, 3),
-        torch.eye(4)[None],
-        torch.eye(3)[None],
+        torch.eye(4),
+        torch.eye(3),
         9,
         5,
-        backgrounds=background,
+        background=background,
     )
-    assert (images == background[0]).all()
-    assert (alphas == 0).all()
-    images.sum().backward()
+    assert (image == background).all()
+    assert (alpha == 0).all()
+    image.sum().backward()
     assert meta["means2d"].grad.shape == (1, count, 2)
     assert means.grad is not None
     assert (means.grad == 0).all()
     assert background.grad is not None
-    assert background.grad.tolist() == [[45.0, 45.0, 45.0]]
+    assert background.grad.tolist() == [45.0, 45.0, 45.0]

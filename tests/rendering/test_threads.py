@@ -37,8 +37,8 @@ def differences(first: dict[str, Tensor], second: dict[str, Tensor]) -> list[str
 
 
 def large_scene(**modes: object) -> Scene:
-    """Several chunks of Gaussians, two cameras, many tiles."""
-    return random_scene(count=7000, width=150, height=130, size=0.05, cameras=2, **modes)  # type: ignore[arg-type]
+    """Several chunks of Gaussians, many tiles."""
+    return random_scene(count=7000, width=150, height=130, size=0.05, **modes)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
@@ -68,7 +68,7 @@ def test_concurrent_rendering(threads: int) -> None:
         random_scene(count=2000, width=90, height=70, size=0.05, seed=0),
         random_scene(count=900, width=33, height=120, size=0.05, seed=1, sh_degree=None, channels=5),
         random_scene(count=2000, width=90, height=70, size=0.05, seed=2, sh_degree=1),
-        random_scene(count=3000, width=64, height=64, size=0.02, seed=3, cameras=2),
+        random_scene(count=3000, width=64, height=64, size=0.02, seed=3),
     ]
     expected = [scene.results() for scene in scenes]
     started = threading.Barrier(2)

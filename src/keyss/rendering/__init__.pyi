@@ -6,7 +6,6 @@ from .orbit import (
     psnr_between as psnr_between,
     scene_of_model as scene_of_model,
 )
-from .rasterization_checks import IGNORED as IGNORED, ONLY_VALUES as ONLY_VALUES
 from .rasterize import rasterization as rasterization
 from .view import (
     contributions as contributions,

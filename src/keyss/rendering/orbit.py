@@ -15,7 +15,7 @@ from keyss.core.gaussians import SH_C0, Gaussians
 from keyss.core.scene import NEAR, ORDINARY_EXTENT, Camera, Scene, View, checked_background
 from keyss.files.models import is_model_source
 from keyss.kernels.memory import release
-from keyss.rendering.rasterization_checks import MAX_SIDE
+from keyss.rendering.rasterize import MAX_SIDE
 from keyss.rendering.view import render
 
 VIEWS = 96

@@ -1,18 +1,21 @@
-"""`rasterization`: gsplat's function of that name, on the device of the Gaussians."""
+"""`rasterization`: on the CPU by the kernels in `keyss.rendering.cpu`, on a GPU by gsplat."""
 
 from __future__ import annotations
 
 from typing import Any
 
 import numpy as np
-import torch
 from torch import Tensor
 
-from keyss.core import UsageError
 from keyss.rendering.backends import require_gsplat_cuda
-from keyss.rendering.cpu.constants import EPS2D_MIN
+from keyss.rendering.cpu.constants import CHANNEL_MAX, EPS2D
 from keyss.rendering.cpu.rasterization import Settings, rasterize as rasterize_on_cpu
-from keyss.rendering.rasterization_checks import check_arguments
+
+MAX_SIDE = 2**16  # pixels
+MAX_CHANNELS = 32
+CAMERA_MAX = 1e12  # bounds viewmats and Ks, so that products do not overflow
+FOCAL_LENGTH_MIN = 1e-6  # pixels
+_FAR_PLANE = 1e10  # gsplat's default
 
 
 def rasterization(
@@ -21,21 +24,16 @@ def rasterization(
     scales: Tensor,  # [N, 3]
     opacities: Tensor,  # [N]
     colors: Tensor,  # [N, K, 3] or [N, D]
-    viewmats: Tensor,  # [C, 4, 4]
-    Ks: Tensor,  # [C, 3, 3]
+    viewmat: Tensor,  # [4, 4]
+    K: Tensor,  # [3, 3]
     width: int,
     height: int,
     *,
     near_plane: float = 0.01,
-    far_plane: float = 1e10,
-    eps2d: float = EPS2D_MIN,
     sh_degree: int | None = None,
-    backgrounds: Tensor | None = None,  # [C, D]
-    **others: Any,
+    background: Tensor | None = None,  # [D]
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
-    """Render N Gaussians into C images (3DGS, Kerbl et al. 2023, eq. 3 to 5), like `gsplat.rasterization`.
-
-    Gaussians on the CPU are rendered by the kernels in `keyss.rendering.cpu`, those on a GPU by gsplat.
+    """Render N Gaussians into an image (3DGS, Kerbl et al. 2023, eq. 3 to 5), like `gsplat.rasterization`.
 
     Args:
         means: centres in the world.
@@ -44,31 +42,26 @@ def rasterization(
         opacities: in [0, 1].
         colors: SH coefficients where `sh_degree` is given, with colour = max(0.5 + basis . colors, 0);
             else 1 to 32 feature channels, rendered without an activation.
-        viewmats: world to camera, rigid motions, OpenCV axes.
-        Ks: pinhole intrinsics in pixels, without skew; pixel centres are at half-integers.
+        viewmat: world to camera, a rigid motion, OpenCV axes.
+        K: pinhole intrinsics in pixels, without skew; pixel centres are at half-integers.
         width: pixels.
         height: pixels.
         near_plane: minimum depth, positive.
-        far_plane: maximum depth.
-        eps2d: variance in pixels^2 added to every footprint, 0.3 or more.
         sh_degree: degree up to which to use the SH coefficients, 0 to 3, with K >= (sh_degree + 1)^2.
-        backgrounds: colour behind everything; black when None.
-        others: gsplat's other arguments. `packed`, `tile_size`, `channel_chunk` and `segmented`, which do not
-            affect results, are ignored; all others must have gsplat's default.
+        background: colour behind everything; black when None.
 
     Returns:
-        Images [C, H, W, D], not clamped above, with D = 3 for SH; alphas [C, H, W, 1] in [0, 1]; and a
-        dictionary with the entries that gsplat's strategies read with `packed=False`: means2d [C, N, 2] in
-        pixels (after backward its `.grad` holds dL/d(means2d)), radii [C, N, 2] int32 in pixels (0 for
-        invisible Gaussians), depths [C, N], width, height, n_cameras, gaussian_ids (None).
+        The image [H, W, D], not clamped above, with D = 3 for SH; alpha [H, W] in [0, 1]; and a dictionary
+        with the entries that gsplat's strategies read: means2d [1, N, 2] in pixels (after backward its
+        `.grad` holds dL/d(means2d)), radii [1, N, 2] int32 in pixels (0 for invisible Gaussians), depths
+        [1, N], width, height, n_cameras.
 
-    All tensors but the cameras have gradients. Everything is computed in float32. On the CPU, results are
+    All tensors but the camera have gradients. Everything is computed in float32. On the CPU, results are
     bit-identical for any number of threads; Gaussians that are not finite or have a colour of 1e12 or more
     are skipped; and means2d is a leaf: losses on it do not reach the means.
 
     Raises:
         ValueError: a shape, dtype or number is invalid.
-        UsageError: gsplat may support an option, shape or device, but this function does not.
         BackendError: gsplat's CUDA kernels are missing, or the lists of tiles would take too much memory.
     """
     tensors = {
@@ -77,52 +70,77 @@ def rasterization(
         "scales": scales,
         "opacities": opacities,
         "colors": colors,
-        "viewmats": viewmats,
-        "Ks": Ks,
+        "viewmat": viewmat,
+        "K": K,
+        "background": means.new_zeros(colors.shape[-1:]) if background is None else background,
     }
-    if backgrounds is not None:
-        tensors["backgrounds"] = backgrounds
-    check_arguments(tensors, width, height, near_plane, far_plane, eps2d, sh_degree, others)
-    tensors = {name: tensor.float() for name, tensor in tensors.items()}
+    _check(tensors, width, height, near_plane, sh_degree)
+    tensors = {name: tensor.float().contiguous() for name, tensor in tensors.items()}
+    camera = [tensors.pop(name) for name in ("viewmat", "K", "background")]
     if means.device.type == "cuda":
         require_gsplat_cuda()
         import gsplat
 
+        names = ("viewmats", "Ks", "backgrounds")
         images, alphas, meta = gsplat.rasterization(
             **tensors,
+            **{name: tensor[None] for name, tensor in zip(names, camera, strict=True)},
             width=width,
             height=height,
             near_plane=near_plane,
-            far_plane=far_plane,
-            eps2d=eps2d,
+            far_plane=_FAR_PLANE,
+            eps2d=EPS2D,
             sh_degree=sh_degree,
             packed=False,
         )
-        return images, alphas, meta
-    if means.device.type != "cpu":
-        raise UsageError(f"means: expected a tensor on 'cpu' or 'cuda', got {means.device}")
+        # squeeze, unlike indexing, needs no copy in the backward pass.
+        return images.squeeze(0), alphas.squeeze(0).squeeze(-1), meta
     if sh_degree is None:
         tensors["colors"] = tensors["colors"][:, None]
-    if backgrounds is None:
-        tensors["backgrounds"] = torch.zeros(len(viewmats), colors.shape[-1])
     settings = Settings(
         int(width),
         int(height),
         np.float32(near_plane),
-        np.float32(far_plane),
-        np.float32(eps2d),
+        np.float32(_FAR_PLANE),
+        np.float32(EPS2D),
         sh_count=0 if sh_degree is None else (sh_degree + 1) ** 2,
     )
-    names = ("viewmats", "Ks", "backgrounds", "means", "quats", "scales", "opacities", "colors")
-    images, alphas, meta = rasterize_on_cpu(settings, *(tensors[each].contiguous() for each in names))
-    meta.update(
-        width=settings.width,
-        height=settings.height,
-        n_cameras=len(viewmats),
-        n_batches=1,
-        batch_ids=None,
-        camera_ids=None,
-        gaussian_ids=None,
-        opacities=tensors["opacities"].expand(len(viewmats), -1),
-    )
-    return images, alphas, meta
+    image, alpha, meta = rasterize_on_cpu(settings, *camera, *tensors.values())
+    return image, alpha, meta | {"width": settings.width, "height": settings.height, "n_cameras": 1}
+
+
+def _check(
+    tensors: dict[str, Tensor], width: int, height: int, near_plane: float, sh_degree: int | None
+) -> None:
+    """Raise ValueError for shapes with which kernels would read other memory, and for senseless numbers."""
+    colors, count = tensors["colors"], tensors["means"].shape[:1]
+    least, most, rgb = (1, MAX_CHANNELS, ()) if sh_degree is None else ((sh_degree + 1) ** 2, 16, (3,))
+    size = colors.shape[1] if colors.dim() > 1 else 0
+    if sh_degree not in (None, 0, 1, 2, 3) or not least <= size <= most:
+        raise ValueError(f"colors: unexpected shape {list(colors.shape)} with sh_degree {sh_degree}")
+    expected = {
+        "means": (*count, 3),
+        "quats": (*count, 4),
+        "scales": (*count, 3),
+        "opacities": count,
+        "colors": (*count, size, *rgb),
+        "viewmat": (4, 4),
+        "K": (3, 3),
+        "background": colors.shape[-1:],
+    }
+    for name, shape in expected.items():
+        if tuple(tensors[name].shape) != shape:
+            raise ValueError(f"{name}: expected shape {list(shape)}, got {list(tensors[name].shape)}")
+    for name, side in (("width", width), ("height", height)):
+        if not 1 <= side <= MAX_SIDE:
+            raise ValueError(f"{name}: expected 1 to {MAX_SIDE} pixels, got {side}")
+    if not 0 < near_plane < _FAR_PLANE:
+        raise ValueError(f"near_plane: expected 0 to {_FAR_PLANE:g}, got {near_plane}")
+    if tensors["means"].device.type != "cpu":  # on a GPU the other checks would wait for it
+        return
+    # Numbers that affect every pixel; invalid Gaussians are only skipped.
+    for name, limit in (("viewmat", CAMERA_MAX), ("K", CAMERA_MAX), ("background", float(CHANNEL_MAX))):
+        if not bool((tensors[name].detach().abs() < limit).all()):
+            raise ValueError(f"{name}: expected finite numbers below {limit:g}, got others")
+    if not bool((tensors["K"].diagonal()[:2] > FOCAL_LENGTH_MIN).all()):
+        raise ValueError(f"K: expected focal lengths above {FOCAL_LENGTH_MIN:g} pixels, got others")

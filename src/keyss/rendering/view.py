@@ -74,19 +74,18 @@ def _render(
     gaussians: Gaussians, colors: Tensor, camera: Camera, background: Tensor | None, sh_degree: int | None
 ) -> tuple[Tensor, dict[str, Any]]:
     device = gaussians.device
-    images, alphas, meta = rasterization(
+    image, alpha, meta = rasterization(
         gaussians.means,
         gaussians.quats,
         gaussians.scales,
         gaussians.opacities,
         colors,
-        camera.viewmat.to(device)[None],
-        camera.K.to(device)[None],
+        camera.viewmat.to(device),
+        camera.K.to(device),
         camera.width,
         camera.height,
         near_plane=camera.near,
         sh_degree=sh_degree,
-        backgrounds=None if background is None else background.to(device)[None],
+        background=None if background is None else background.to(device),
     )
-    # squeeze, unlike indexing, needs no copy in the backward pass.
-    return images.squeeze(0), meta | {"alpha": alphas.squeeze(0).squeeze(-1)}
+    return image, meta | {"alpha": alpha}

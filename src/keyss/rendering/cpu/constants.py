@@ -13,7 +13,7 @@ ALPHA_MAX = f32(0.999)  # alpha is clamped to this; no gradient passes a clamped
 TRANSMITTANCE_MIN = f32(1e-4)  # a Gaussian that would leave less ends its pixel and is skipped
 RADIUS_SIGMAS = f32(3.33)  # maximum reported radii in standard deviations
 FOV_MARGIN = f32(0.15)  # the Jacobian is clamped beyond this share of the image on each side
-EPS2D_MIN = 0.3  # minimum for an exact recurrence down the rows of a tile
+EPS2D = 0.3  # variance added to footprints; with less, the recurrence down the rows would be inexact
 
 # A tile is as wide as a vector, and tall to amortise the recurrence down its rows.
 TILE_WIDTH = 8
