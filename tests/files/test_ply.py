@@ -15,7 +15,7 @@ from hypothesis import HealthCheck, given, settings, strategies as st
 from keyss.core import Gaussians, InputError, KeyssWarning, same_bits
 from keyss.files import read_model, write_model
 from keyss.files.models import reads_as
-from keyss.files.ply_rows import LEAST_LOG_SCALE
+from keyss.files.ply_table import LEAST_LOG_SCALE
 from keyss.runs.describe import ModelInfo, info
 from tiny_scenes import random_gaussians
 

@@ -37,7 +37,7 @@ from keyss.files.inputs import (
     read_standard_input,
     write_standard_output,
 )
-from keyss.files.ply_rows import has_packed_header
+from keyss.files.ply_table import is_plain
 
 DECODED_SUFFIX = ".3dgs.safetensors"  # models with a decoder network
 
@@ -77,7 +77,7 @@ def _by_module(
 
 
 def _read_any_ply(file: BinaryIO) -> Gaussians:
-    return _PACKED.read(file) if has_packed_header(file) else ply.read(file)
+    return ply.read(file) if is_plain(file) else _PACKED.read(file)
 
 
 _PACKED = _by_module("compressed PLY", (".compressed.ply",), (b"ply",), "compressed_ply:CompressedPlyCodes")

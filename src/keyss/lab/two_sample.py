@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from keyss.core import SH_C0, Gaussians, UsageError, import_extra
 from keyss.core.arrays import Doubles, Flags, Floats, Integers, Numbers
-from keyss.files.ply_rows import OPACITY_LOGIT_BOUND
+from keyss.files.ply_table import OPACITY_LOGIT_BOUND
 from keyss.lab.auc import Auc, delong
 
 MIN_GAUSSIANS, MAX_GAUSSIANS = 100, 10_000  # Gaussians per model

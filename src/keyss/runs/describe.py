@@ -133,18 +133,17 @@ def _ply_rows(path: Path) -> tuple[Any, Any, int] | None:
     """Means, opacity logits and SH degree of a plain PLY file, without torch; None for other files."""
     import numpy as np
 
-    from keyss.files.ply_rows import check_not_activated, has_packed_header, read_rows
+    from keyss.files.ply_table import check_not_activated, is_plain, read_rows
 
     if path.suffix.lower() != ".ply":
         return None
     with open_input(path) as file:
-        if has_packed_header(file) or file.read(3) != b"ply":
+        if not is_plain(file):
             return None
-        file.seek(0)
-        model = read_rows(file)
-        rows = np.concatenate([rows[:, [0, 1, 2, -8, -7, -6, -5]] for rows, _ in model.blocks])
+        _, names, blocks = read_rows(file)
+        rows = np.concatenate([rows[:, [0, 1, 2, -8, -7, -6, -5]] for rows, _ in blocks])
         check_not_activated(rows[:, :3], rows[:, 4:], rows[:, 3])
-    return rows[:, :3], rows[:, 3], round(((len(model.names) - 11) // 3) ** 0.5) - 1
+    return rows[:, :3], rows[:, 3], round(((len(names) - 11) // 3) ** 0.5) - 1
 
 
 def _round(values: Iterable[Any]) -> tuple[float, ...]:

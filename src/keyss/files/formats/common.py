@@ -13,7 +13,7 @@ import torch
 from keyss.core.arrays import Bytes, Doubles, Floats, Integers, Numbers, Words
 from keyss.core.errors import InputError, KeyssWarning, OutputError
 from keyss.core.gaussians import SH_C0, Gaussians
-from keyss.files.ply_rows import OPACITY_LOGIT_BOUND
+from keyss.files.ply_table import OPACITY_LOGIT_BOUND
 
 # A compressed file of more Gaussians than SMALL_COUNT must have MIN_BYTES for each; published models take at
 # least 7.

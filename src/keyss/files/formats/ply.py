@@ -21,8 +21,7 @@ from keyss.core.gaussians import Gaussians
 from keyss.files.file_kinds import model_file
 from keyss.files.formats.common import writable
 from keyss.files.inputs import open_input
-from keyss.files.ply_rows import check_not_activated, has_packed_header, model_names, read_rows
-from keyss.files.ply_table import TYPES, ply_header
+from keyss.files.ply_table import TYPES, check_not_activated, is_plain, model_names, ply_header, read_rows
 
 _BLOCK = 1 << 13  # Gaussians written at a time
 _NORMALS = ("nx", "ny", "nz")
@@ -52,13 +51,13 @@ def read(file: BinaryIO) -> Gaussians:
     Properties may have any order and any scalar type; all others are ignored. See `read_rows` for values that
     are not finite. Raises InputError if it is not a complete 3DGS model.
     """
-    model = read_rows(file)
-    n, k = model.count, (len(model.names) - 11) // 3
+    vertices, names, blocks = read_rows(file)
+    n, k = vertices.count, (len(names) - 11) // 3
     means, quats, log_scales, opacity_logits, sh = (
         np.empty((n, *shape), np.float32) for shape in ((3,), (4,), (3,), (), (k, 3))
     )
     start = 0
-    for rows, _ in model.blocks:
+    for rows, _ in blocks:
         part = slice(start, start + len(rows))
         means[part], quats[part], log_scales[part] = rows[:, 0:3], rows[:, -4:], rows[:, -7:-4]
         opacity_logits[part], sh[part, 0] = rows[:, -8], rows[:, 3:6]
@@ -74,7 +73,7 @@ def read(file: BinaryIO) -> Gaussians:
 def holds(file: BinaryIO, model: Gaussians) -> bool:
     """True if `read` gives `model`, to the bit; takes no memory for a second model. Raises InputError."""
     flat, start = model.detach().to("cpu"), 0
-    for rows, _ in read_rows(file).blocks:
+    for rows, _ in read_rows(file)[2]:
         own = np.delete(_rows(flat[start : start + len(rows)]), slice(3, 6), axis=1)  # normals
         if own.shape != rows.shape or (own.view(np.uint32) != rows.view(np.uint32)).any():
             return False
@@ -159,22 +158,19 @@ def _read_extras(path: Path, count: int) -> _Extras | None:
     """The extras of a .ply of which `count` Gaussians were read; None if there are none."""
     with open_input(path) as file, warnings.catch_warnings():
         warnings.simplefilter("ignore", KeyssWarning)  # about Gaussians left out, which the first read gave
-        if file.read(3) != b"ply":
+        if not is_plain(file):
             return None
-        file.seek(0)
-        if has_packed_header(file):
-            return None
-        model = read_rows(file)
-        names = [name for name in model.dtype.names or () if name not in model.names]
-        blocks = [{name: table[name].copy() for name in names} for _, table in model.blocks]
+        vertices, needed, rows = read_rows(file)
+        order = vertices.dtype.names or ()
+        names = [name for name in order if name not in needed]
+        blocks = [{name: table[name].copy() for name in names} for _, table in rows]
     values = {name: np.concatenate([block[name] for block in blocks]) for name in names}
     values = {name: each for name, each in values.items() if name not in _NORMALS or each.any()}
     if any(len(each) != count for each in values.values()):
         raise InputError(f"{path}: it changed while it was read")
-    order = model.dtype.names or ()
-    if not (values or model.comments) and list(order) == _names_with_normals(model.names):
+    if not (values or vertices.comments) and list(order) == _names_with_normals(needed):
         return None
-    return _Extras(tuple(model.comments), order, values)
+    return _Extras(tuple(vertices.comments), order, values)
 
 
 def _names_with_normals(names: Sequence[str]) -> list[str]:
