@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import json
 import math
-import struct
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ import pycolmap
 import pytest
 
 from files.scene_files import frames, photo, write_json, write_nerfstudio
+from files.test_ply import ply_bytes
 from keyss.core import InputError
 from keyss.files import load_scene
 from keyss.files.lens import undistortion
@@ -172,25 +172,15 @@ def test_junk_values_are_refused_or_ignored(tmp_path: Path) -> None:
 
 XYZ = np.array([[0, 1, 2], [3, 4, 5.5], [-1, 0, 7]], np.float32)
 RGB = np.array([[1, 2, 3], [255, 0, 128], [9, 9, 9]], np.uint8)
-HEADER = (
-    "ply\nformat {} 1.0\ncomment made by hand\nelement vertex 3\n"
-    "property float x\nproperty float y\nproperty float z\n"
-    "property double extra\nproperty uchar red\nproperty uchar green\nproperty uchar blue\n"
-    "element face 0\nproperty list uchar int vertex_index\nend_header\n"
-)
 
 
 def cloud(kind: str) -> bytes:
-    header = HEADER.format(kind).encode()
-    if kind == "ascii":
-        rows = [
-            " ".join(map(str, [*xyz, 0.25, *rgb]))
-            for xyz, rgb in zip(XYZ.tolist(), RGB.tolist(), strict=True)
-        ]
-        return header + "\n".join(rows).encode() + b"\n"
-    order = "<" if "little" in kind else ">"
-    rows = [struct.pack(order + "fffdBBB", *xyz, 0.25, *rgb) for xyz, rgb in zip(XYZ, RGB, strict=True)]
-    return header + b"".join(rows)
+    """The points, an unknown property, and an element of lists after them."""
+    columns = dict(zip("xyz", XYZ.T, strict=True)) | {"extra": np.full(3, 0.25)}
+    columns |= dict(zip(("red", "green", "blue"), RGB.T, strict=True))
+    types = dict.fromkeys(("red", "green", "blue"), "uchar") | {"extra": "double"}
+    faces = b"element face 0\nproperty list uchar int vertex_index\nend_header"
+    return ply_bytes(columns, form=kind, kinds=types).replace(b"end_header", faces)
 
 
 KINDS = ["ascii", "binary_little_endian", "binary_big_endian"]

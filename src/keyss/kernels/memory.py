@@ -6,7 +6,6 @@ arithmetic.
 
 from __future__ import annotations
 
-import itertools
 import math
 from contextlib import suppress
 from typing import Any
@@ -19,12 +18,9 @@ Array = np.ndarray[Any, Any]
 MAX_FREE = 40  # unused buffers to keep: slightly more than one call needs
 MIN_BYTES = 2**15  # smaller arrays come from numpy
 
-# Free buffers by the number of their return (least recently used first), and these numbers by capacity, since
-# a linear search would nearly double the time of an allocation. The garbage collector may end a loan at any
-# moment, so there is no lock: all operations are atomic.
-_free: dict[int, Array] = {}
-_returns: dict[int, list[int]] = {}
-_numbers = itertools.count()
+# Free buffers by capacity, in the order in which the capacities were needed. The garbage collector may end a
+# loan at any moment, so there is no lock: all operations are atomic.
+_free: dict[int, list[Array]] = {}
 
 
 class _Loan:
@@ -36,9 +32,7 @@ class _Loan:
 
     def __del__(self) -> None:
         if _free is not None:  # it is None at interpreter exit
-            number = next(_numbers)
-            _free[number] = self.buffer
-            _returns.setdefault(len(self.buffer), []).append(number)
+            _free.setdefault(len(self.buffer), []).append(self.buffer)
 
 
 def empty(shape: tuple[int, ...], dtype: Any) -> Array:
@@ -52,7 +46,6 @@ def empty(shape: tuple[int, ...], dtype: Any) -> Array:
 
 def release() -> None:
     """Give all unused buffers back to the system; large models need hundreds of megabytes."""
-    _returns.clear()
     _free.clear()
 
 
@@ -61,17 +54,11 @@ def _buffer(size: int) -> Array:
     step = 1 << max(0, size.bit_length() - 3)  # between capacities: an eighth to a quarter of the size
     capacity = -(-size // step) * step
     for fitting in range(capacity, 2 * size + 1, step):
-        numbers = _returns.get(fitting)
-        while numbers:
-            try:
-                buffer = _free.pop(numbers.pop(), None)
-            except IndexError:  # another thread took the last one
-                break
-            if buffer is not None:
-                return buffer
-    for number in list(_free)[:-MAX_FREE]:
-        if (unused := _free.pop(number, None)) is not None:
-            with suppress(ValueError):  # another thread took it
-                _returns[len(unused)].remove(number)
+        with suppress(KeyError, IndexError):
+            return _free[fitting].pop()
+    for stale in list(_free):  # the oldest first: models grow
+        if sum(len(each) for each in list(_free.values())) <= MAX_FREE:
+            break
+        _free.pop(stale, None)
     new: Array = torch.empty(capacity, dtype=torch.uint8).numpy()
     return new

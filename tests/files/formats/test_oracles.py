@@ -135,13 +135,6 @@ def test_we_read_gsplys_spz(tmp_path: Path, version: int, degree: int) -> None:
     assert_close(read_model(tmp_path / "a.spz"), theirs, 1e-5)
 
 
-def test_spz_of_other_programs_is_serialised_unchanged(splat_transform: Transform, tmp_path: Path) -> None:
-    write_model(tmp_path / "in.ply", model_of(2000, 2))
-    gsply.write_spz(tmp_path / "a.spz", gsply.plyread(tmp_path / "in.ply"), version=3)
-    for path in (tmp_path / "a.spz", splat_transform(tmp_path / "in.ply", tmp_path / "b.spz")):
-        assert SpzCodes.parse(path.read_bytes()).serialise() == path.read_bytes()
-
-
 def test_we_read_gsplys_spz_of_version_2(tmp_path: Path) -> None:
     """It reads this version and does not write it."""
     codes = SpzCodes.quantise(model_of(300, 1))
