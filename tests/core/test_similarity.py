@@ -13,18 +13,13 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from keyss.core import Camera, Gaussians, Similarity
+from tiny_scenes import random_gaussians
 
 
 def random_similarity(seed: int) -> Similarity:
     rng = np.random.default_rng(seed)
     rotation = torch.from_numpy(Rotation.random(None, rng).as_matrix())
     return Similarity(float(np.exp(rng.normal())), rotation, torch.from_numpy(rng.normal(size=3)))
-
-
-def random_gaussians(seed: int, degree: int = 3, n: int = 20) -> Gaussians:
-    generator = torch.Generator().manual_seed(seed)
-    shapes = [(n, 3), (n, 4), (n, 3), (n,), (n, (degree + 1) ** 2, 3)]
-    return Gaussians(*(torch.randn(shape, generator=generator) for shape in shapes))
 
 
 def random_camera(seed: int) -> Camera:
@@ -69,7 +64,7 @@ def test_cameras(seed: int) -> None:
 @quick
 @given(seeds)
 def test_gaussians(seed: int) -> None:
-    similarity, gaussians = random_similarity(seed), random_gaussians(seed)
+    similarity, gaussians = random_similarity(seed), random_gaussians(20, seed)
     moved = similarity.apply_gaussians(gaussians)
     turn = similarity.rotation
     expected = similarity.scale**2 * turn @ covariances(gaussians) @ turn.T
@@ -82,7 +77,7 @@ def test_gaussians(seed: int) -> None:
 @quick
 @given(seeds, st.integers(0, 3))
 def test_harmonics(seed: int, degree: int) -> None:
-    similarity, gaussians = random_similarity(seed), random_gaussians(seed, degree)
+    similarity, gaussians = random_similarity(seed), random_gaussians(20, seed, degree)
     directions = torch.nn.functional.normalize(torch.randn(30, 3, dtype=torch.float64), dim=1)
     k = (degree + 1) ** 2
     before = _eval_sh_bases_fast(k, directions @ similarity.rotation) @ gaussians.sh.double()

@@ -15,7 +15,6 @@ import argparse
 import ctypes
 import gzip
 import io
-import struct
 import sys
 import tempfile
 import time
@@ -32,6 +31,7 @@ import numpy as np
 import torch
 
 from files.formats.false_sizes import FALSE_SIZES, image
+from files.scene_files import camera_bytes, counted, image_bytes, point_bytes
 from keyss.core import Gaussians, InputError
 from keyss.core.picture_network import DecodedGaussians, PictureNetwork
 from keyss.files import load_scene, model_bytes, model_of_bytes
@@ -39,6 +39,7 @@ from keyss.files.formats.spz import SpzCodes
 from keyss.files.images import read_image
 from keyss.methods.records import whole
 from keyss.methods.tensors import Header, pack_tensors, refuse_damage, unpack_tensors
+from tiny_scenes import random_gaussians
 
 SECONDS = 2.0  # time limit for a file of a few kilobytes
 CARRIERS = 6000  # Gaussians of the published model that holds a payload
@@ -55,16 +56,14 @@ _EXTREMES = (0, 1, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF, 0x7F800000, 0x7FC00000, 0
 def examples() -> dict[str, list[bytes]]:
     """Small files of each format, by a name of NAMES."""
     count = 60
-    generator = torch.Generator().manual_seed(0)
 
     def model(degree: int) -> Gaussians:
-        shapes = ((3,), (4,), (3,), (), ((degree + 1) ** 2, 3))
-        return Gaussians(*(torch.randn(count, *shape, generator=generator) for shape in shapes))
+        return random_gaussians(count, degree, degree)
 
     found = {name: [model_bytes(name, model(degree)) for degree in (0, 2)] for name in NAMES[:6]}
     found["a.spz"].append(replace(SpzCodes.quantise(model(1)), version=4).serialise())
     found["a.payload"] = [whole.encode(model(degree)) for degree in range(4)]
-    layers = ((torch.randn(3, 4, 3, 3, generator=generator), torch.zeros(3)),)
+    layers = ((torch.ones(3, 4, 3, 3), torch.zeros(3)),)
     decoded = DecodedGaussians.of(model(0), PictureNetwork(layers, torch.zeros(4)), torch.zeros(count, 4))
     found["a.3dgs.safetensors"] = [model_bytes("a.3dgs.safetensors", decoded)]
     found["a.tensors"] = [pack_tensors({"a": torch.ones(3), "b": torch.ones(2, 2)}, Header("test", 1))]
@@ -74,13 +73,10 @@ def examples() -> dict[str, list[bytes]]:
 
 def _colmap() -> dict[str, bytes]:
     """The files of a scene of four photos."""
-    image_of = struct.Struct("<I7dI6sQ")
-    images = [image_of.pack(i, 1, 0, 0, 0, 0, 0, 4, 1, b"%d.png\0" % i, 0) for i in range(4)]
-    points = [struct.pack("<QdddBBBdQ", i, 1, 2, i, 0, 0, 0, 0.5, 1) + bytes(8) for i in range(9)]
     return {
-        "cameras.bin": struct.pack("<QIiQQ4d", 1, 1, 1, 16, 16, 16, 16, 8, 8),
-        "images.bin": struct.pack("<Q", 4) + b"".join(images),
-        "points3D.bin": struct.pack("<Q", 9) + b"".join(points),
+        "cameras.bin": counted(camera_bytes(params=(16, 16, 8, 8), width=16, height=16)),
+        "images.bin": counted(*(image_bytes(i, f"{i}.png", observations=0) for i in range(4))),
+        "points3D.bin": counted(*(point_bytes(i, (1, 2, i)) for i in range(9))),
     }
 
 
