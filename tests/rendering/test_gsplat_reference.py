@@ -42,8 +42,7 @@ OTHERS = [name for name in (*DESIGNS, *BASELINES) if name != "latent"]
 def gpu(monkeypatch: pytest.MonkeyPatch) -> Iterator[torch.device]:
     monkeypatch.setitem(sys.modules, "gsplat.cuda._backend", SimpleNamespace(_C=COMPILED))
     monkeypatch.setitem(sys.modules, "nerfacc", NERFACC)
-    monkeypatch.setattr("keyss.rendering.rasterize.require_gsplat_cuda", lambda: None)
-    monkeypatch.setattr("keyss.rendering.backends.require_gsplat_cuda", lambda: None)
+    monkeypatch.setattr("keyss.rendering.rasterize._require_gsplat", lambda: None)
     with fake_cuda() as device:
         yield device
 

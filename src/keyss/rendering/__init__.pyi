@@ -1,4 +1,3 @@
-from .backends import Backend as Backend, resolve_device as resolve_device
 from .orbit import (
     VIEWS as VIEWS,
     Viewpoints as Viewpoints,
@@ -6,7 +5,7 @@ from .orbit import (
     psnr_between as psnr_between,
     scene_of_model as scene_of_model,
 )
-from .rasterize import rasterization as rasterization
+from .rasterize import Backend as Backend, rasterization as rasterization, resolve_device as resolve_device
 from .view import (
     contributions as contributions,
     decode_picture as decode_picture,

@@ -1,16 +1,19 @@
-"""`rasterization`: on the CPU by the kernels in `keyss.rendering.cpu`, on a GPU by gsplat."""
+"""`rasterization`: on the CPU by the kernels in `keyss.rendering.cpu`, on a GPU by gsplat; and the device."""
 
 from __future__ import annotations
 
-from typing import Any
+import warnings
+from typing import Any, Literal
 
 import numpy as np
+import torch
 from torch import Tensor
 
-from keyss.rendering.backends import require_gsplat_cuda
+from keyss.core import BackendError, UsageError
 from keyss.rendering.cpu.constants import CHANNEL_MAX, EPS2D
 from keyss.rendering.cpu.rasterization import Settings, rasterize as rasterize_on_cpu
 
+Backend = Literal["auto", "cpu", "cuda"]
 MAX_SIDE = 2**16  # pixels
 MAX_CHANNELS = 32
 CAMERA_MAX = 1e12  # bounds viewmats and Ks, so that products do not overflow
@@ -78,7 +81,7 @@ def rasterization(
     tensors = {name: tensor.float().contiguous() for name, tensor in tensors.items()}
     camera = [tensors.pop(name) for name in ("viewmat", "K", "background")]
     if means.device.type == "cuda":
-        require_gsplat_cuda()
+        _require_gsplat()
         import gsplat
 
         names = ("viewmats", "Ks", "backgrounds")
@@ -144,3 +147,38 @@ def _check(
             raise ValueError(f"{name}: expected finite numbers below {limit:g}, got others")
     if not bool((tensors["K"].diagonal()[:2] > FOCAL_LENGTH_MIN).all()):
         raise ValueError(f"K: expected focal lengths above {FOCAL_LENGTH_MIN:g} pixels, got others")
+
+
+def resolve_device(backend: Backend = "auto") -> torch.device:
+    """The device for the Gaussians, which also selects the rasterizer.
+
+    "auto" is CUDA if torch sees a GPU, else the CPU; a GPU that gsplat cannot use is skipped with a
+    RuntimeWarning. Raises BackendError if "cuda" cannot be used.
+    """
+    if backend not in ("auto", "cpu", "cuda"):
+        raise UsageError(f"device: expected 'auto', 'cpu' or 'cuda', got {backend!r}")
+    if backend == "cpu" or (backend == "auto" and not torch.cuda.is_available()):
+        return torch.device("cpu")
+    try:
+        _require_gsplat()
+    except BackendError as error:
+        if backend == "cuda":
+            raise
+        warnings.warn(f"rendering on the CPU: {error}", RuntimeWarning, stacklevel=2)
+        return torch.device("cpu")
+    return torch.device("cuda")
+
+
+def _require_gsplat() -> None:
+    """Raise BackendError unless gsplat can render on a GPU. May compile its kernels, which takes minutes."""
+    if not torch.cuda.is_available():
+        raise BackendError("torch sees no CUDA GPU on this machine; use device 'auto' or 'cpu'")
+    try:
+        from gsplat.cuda._backend import _C
+    except (ImportError, OSError, RuntimeError) as error:
+        raise BackendError(f"gsplat's CUDA kernels cannot be loaded ({error}); use device 'cpu'") from error
+    if _C is None:
+        raise BackendError(
+            "gsplat's CUDA kernels are missing, and without a CUDA toolkit (nvcc) they cannot be built; "
+            "use device 'cpu'"
+        )
