@@ -39,13 +39,12 @@ from .quiet.channel import (
     InCodes as InCodes,
     LowBitsCover as LowBitsCover,
 )
-from .quiet.fields import Field as Field, last_bits as last_bits
+from .quiet.fields import Field as Field, in_counted_order as in_counted_order, last_bits as last_bits
 from .quiet.layout import (
     TYPICAL_SHARE as TYPICAL_SHARE,
     LowBitsCapacity as LowBitsCapacity,
     check_payload_fits as check_payload_fits,
 )
-from .quiet.order import in_counted_order as in_counted_order
 from .quiet.parameters import key_cipher as key_cipher
 from .quiet.reading import QuietReader as QuietReader
 from .quiet.salts import salt_rows as salt_rows

@@ -38,9 +38,18 @@ from keyss.channels.mixing import random_fractions
 from keyss.channels.quiet import wet_paper
 from keyss.channels.quiet.bits import Layout, read_low_bits, write_low_bits
 from keyss.channels.quiet.decoded import Decoded
-from keyss.channels.quiet.fields import FORMATS, Field, Levels, carrying, last_bits
+from keyss.channels.quiet.fields import (
+    FORMATS,
+    Field,
+    Levels,
+    file_order,
+    in_counted_order,
+    in_rows,
+    last_bits,
+    model_hash,
+    with_levels,
+)
 from keyss.channels.quiet.layout import BLOCK_HEADER, LEAST_BYTES, MIN_BLOCKS, LowBitsCapacity
-from keyss.channels.quiet.order import file_order, in_counted_order, in_rows, model_hash
 from keyss.channels.quiet.salts import salt, salt_rows
 from keyss.channels.quiet.usable import check_usable, usable_with_ids
 from keyss.channels.quiet.writable_levels import fixed_axes, writable_levels
@@ -289,7 +298,7 @@ class CodesCover:
             levels = np.where(free, field.with_bits(own, ties), field.levels)
             columns.setdefault(field.name, []).append(levels)
         attributes = {name: np.stack(each, axis=1) for name, each in columns.items()}
-        written: Codes = carrying(self.codes).with_levels(self.codes, attributes)
+        written: Codes = with_levels(self.codes, attributes)
         return written
 
     def _published(self, codes: Codes, entropy: bytes) -> Gaussians:

@@ -15,7 +15,7 @@ from keyss.channels.quiet import parameters
 from keyss.channels.quiet.bits import Layout, gaussian_ids, read_low_bits
 from keyss.channels.quiet.cells import CellCipher
 from keyss.channels.quiet.decoded import Decoded
-from keyss.channels.quiet.fields import last_bits
+from keyss.channels.quiet.fields import in_counted_order, last_bits, model_hash
 from keyss.channels.quiet.layout import (
     DATA_KEY_BYTES,
     LEAST_BYTES,
@@ -23,7 +23,6 @@ from keyss.channels.quiet.layout import (
     LowBitsCapacity,
     split_numbers,
 )
-from keyss.channels.quiet.order import in_counted_order, model_hash
 from keyss.channels.quiet.parameters import Parameters, key_cipher, parameter_cipher
 from keyss.channels.quiet.salts import salt, salt_rows
 from keyss.channels.quiet.usable import among, repeated
