@@ -47,6 +47,9 @@ from .quiet.layout import (
 )
 from .quiet.parameters import key_cipher as key_cipher
 from .quiet.reading import QuietReader as QuietReader
-from .quiet.salts import salt_rows as salt_rows
-from .quiet.usable import chance_of_bits as chance_of_bits, usable_carriers as usable_carriers
+from .quiet.usable import (
+    chance_of_bits as chance_of_bits,
+    salt_rows as salt_rows,
+    usable_carriers as usable_carriers,
+)
 from .reed_solomon import Codewords as Codewords

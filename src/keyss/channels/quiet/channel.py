@@ -5,7 +5,7 @@ Gaussian, or one block of last bits of codes (see `wet_paper`). A carrier holds 
 tag: a reader decrypts all of them and keeps those with a valid tag.
 
 - The *salt* of Argon2id is a hash of one carrier without cells. Gaussians may be removed, so there are SALTS
-  salts (see `salts`). A salt is *stale* if its Gaussian is not usable: the author of the cover knows it in
+  salts (see `usable`). A salt is *stale* if its Gaussian is not usable: the author of the cover knows it in
   advance, so no key cell is written for it. A reader tries SALTS_TRIED salts; covers with as many stale salts
   are refused.
 - *Key cells*, encrypted under the key and a salt, hold the data key of a secret.
@@ -50,8 +50,7 @@ from keyss.channels.quiet.fields import (
     with_levels,
 )
 from keyss.channels.quiet.layout import BLOCK_HEADER, LEAST_BYTES, MIN_BLOCKS, LowBitsCapacity
-from keyss.channels.quiet.salts import salt, salt_rows
-from keyss.channels.quiet.usable import check_usable, usable_with_ids
+from keyss.channels.quiet.usable import check_usable, salt, salt_rows, usable_with_ids
 from keyss.channels.quiet.writable_levels import fixed_axes, writable_levels
 from keyss.channels.quiet.writing import Writer, bytes_of
 from keyss.core.arrays import Bits, Bytes, Flags, Integers
@@ -92,7 +91,7 @@ class LowBits(Channel):
         if (found := self._found.get(cover)) is None or found[0] != versions:
             usable, ids = usable_with_ids(cover, layout)
             check_usable(cover, usable, layout)
-            rows = salt_rows(cover, ids, layout=layout)
+            rows = salt_rows(cover, ids, layout)
             stale = int((~usable[rows]).sum())
             if stale >= SALTS_TRIED:
                 raise UsageError(

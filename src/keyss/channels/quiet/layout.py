@@ -29,6 +29,7 @@ import numpy as np
 from keyss.channels.base import Capacity, RecordPlan, RecordRequest
 from keyss.channels.quiet.bits import Layout
 from keyss.channels.quiet.cells import TAG_BYTES
+from keyss.channels.quiet.usable import SALTS
 from keyss.channels.reed_solomon import SYMBOL_BYTES, Codewords
 from keyss.channels.sketch import SKETCH_BYTES
 from keyss.core.arrays import Bytes, Integers
@@ -36,7 +37,6 @@ from keyss.core.errors import UsageError
 from keyss.keys.encryption import SMALLEST_BUCKET, encrypted_size
 
 DATA_KEY_BYTES = 16
-SALTS = 12  # random pruning of a quarter removes all their Gaussians with p = 6e-8
 KEY_COPIES = 12  # copies of the data key for each salt
 PARAMETER_COPIES = 24  # copies of each part; pruning a quarter removes all of them with p = 4e-15
 PREFIX_BYTES = 30  # parameters before the sketch and the method's header (see `parameters`)

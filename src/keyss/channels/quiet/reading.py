@@ -24,8 +24,7 @@ from keyss.channels.quiet.layout import (
     split_numbers,
 )
 from keyss.channels.quiet.parameters import Parameters, key_cipher, parameter_cipher
-from keyss.channels.quiet.salts import salt, salt_rows
-from keyss.channels.quiet.usable import among, repeated
+from keyss.channels.quiet.usable import among, repeated, salt, salt_rows
 from keyss.channels.quiet.wet_paper import block_ids, read_blocks
 from keyss.channels.quiet.writing import ASSOCIATED, payload_key
 from keyss.channels.sketch import SKETCH_BYTES, foreign
@@ -59,7 +58,7 @@ class QuietReader(SaltedReader):
         rows = _unique_rows(ids, low)
         if len(rows) < len(ids):
             stego, ids, low = stego[torch.from_numpy(rows)], ids[rows], low[rows]
-        salts = [salt(ids[row], low[row]) for row in salt_rows(stego, ids, low, layout)]
+        salts = [salt(ids[row], low[row]) for row in salt_rows(stego, ids, layout)]
         narrow = replace(layout, written_degree=min(1, layout.sh_degree))
         widths = dict.fromkeys((layout.width, narrow.width))
         return QuietReader(ids, low, salts, [each for each in widths if LowBitsCapacity(0, each).part_bytes])
