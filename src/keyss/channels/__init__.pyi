@@ -39,6 +39,7 @@ from .quiet.channel import (
     InCodes as InCodes,
     LowBitsCover as LowBitsCover,
 )
+from .quiet.contents import QuietReader as QuietReader
 from .quiet.fields import Field as Field, in_counted_order as in_counted_order, last_bits as last_bits
 from .quiet.layout import (
     TYPICAL_SHARE as TYPICAL_SHARE,
@@ -46,7 +47,6 @@ from .quiet.layout import (
     check_payload_fits as check_payload_fits,
 )
 from .quiet.parameters import key_cipher as key_cipher
-from .quiet.reading import QuietReader as QuietReader
 from .quiet.usable import (
     chance_of_bits as chance_of_bits,
     salt_rows as salt_rows,

@@ -81,7 +81,7 @@ def quick_attempt(stego: Gaussians, key: str) -> Attempt | None:
 
     Raises InputError for damage. Warns (KeyssWarning) of Gaussians that were added or changed after hiding.
     """
-    from keyss.channels.quiet.reading import QuietReader
+    from keyss.channels.quiet.contents import QuietReader
 
     # Appended Gaussians must not hide what lies elsewhere. They are visible: a second try tells nothing.
     quiet, appended = _quiet(stego), _appended(stego)
@@ -114,7 +114,7 @@ def _readers(stego: Gaussians) -> Iterator[Reader]:
 
 
 def _quiet(stego: Gaussians) -> SaltedReader | None:
-    from keyss.channels.quiet.reading import QuietReader
+    from keyss.channels.quiet.contents import QuietReader
 
     return QuietReader.of(stego)
 

@@ -37,6 +37,7 @@ from keyss.channels.base import SALTS_TRIED, Capacity, Channel, Content, check_k
 from keyss.channels.mixing import random_fractions
 from keyss.channels.quiet import wet_paper
 from keyss.channels.quiet.bits import Layout, read_low_bits, write_low_bits
+from keyss.channels.quiet.contents import Writer, bytes_of
 from keyss.channels.quiet.decoded import Decoded
 from keyss.channels.quiet.fields import (
     FORMATS,
@@ -52,7 +53,6 @@ from keyss.channels.quiet.fields import (
 from keyss.channels.quiet.layout import BLOCK_HEADER, LEAST_BYTES, MIN_BLOCKS, LowBitsCapacity
 from keyss.channels.quiet.usable import check_usable, salt, salt_rows, usable_with_ids
 from keyss.channels.quiet.writable_levels import fixed_axes, writable_levels
-from keyss.channels.quiet.writing import Writer, bytes_of
 from keyss.core.arrays import Bits, Bytes, Flags, Integers
 from keyss.core.errors import KeyssWarning, UsageError
 from keyss.core.gaussians import Gaussians
@@ -178,7 +178,7 @@ class LowBitsCover:
         """
         check_keys([keys[0].verifier() for keys, _ in contents])
         fresh, _ = self._salts(entropy)
-        writer = Writer(self.ids[self._rows], self.layout.width, entropy, self.ids)
+        writer = Writer(self.ids[self._rows], self.layout.width, entropy, len(self.ids), self.ids)
         writer.write(contents)
         parts = [(self.salt_rows[self.fresh_salts], fresh), (self._rows[writer.order], writer.table)]
         return write_low_bits(self.cover, self.layout, parts, in_place=self.overwrites)
