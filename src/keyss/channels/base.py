@@ -169,7 +169,6 @@ class SaltedReader(ABC):
 class Channel(ABC):
     """A place for bits in a model."""
 
-    name: ClassVar[str]  # `quiet`, `appended` or `colours`
     place: str  # in messages: "low bits", "codes of the spz file" and so on
     survives: ClassVar[bool] = False  # True if secrets survive conversion to other formats
     grows: ClassVar[bool] = False  # see `Capacity`

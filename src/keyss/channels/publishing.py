@@ -108,7 +108,7 @@ def _readers(stego: Gaussians) -> Iterator[Reader]:
     for find in (_quiet, _appended):
         if reader := find(stego):
             yield reader
-    from keyss.channels.colours.colours_reader import ColoursReader
+    from keyss.channels.colours.channel import ColoursReader
 
     yield ColoursReader.of(stego)
 

@@ -120,8 +120,9 @@ def _read(
     for salt, (secret, (rows, pilots)) in enumerate(zip(secrets.salted, found, strict=True)):
         ids, counts = carriers.ids[rows], np.full(len(rows), depth)
         known = np.repeat(pilots, COLUMNS * depth)
-        sure = _HELD * (1 - carriers.error_probability[rows]) / carriers.id_counts[rows]
-        every = np.repeat(sure, COLUMNS * depth) * read(secret, ids, carriers.colours[rows, 1:], counts)
+        every = np.repeat(_HELD * carriers.certainty[rows], COLUMNS * depth) * read(
+            secret, ids, carriers.colours[rows, 1:], counts
+        )
         odds.append(_PRIOR + np.log1p(every[known]).sum())
         hints.append(every[~known])
         words.append(seeds(secret, "header-seeds", ids, counts)[~known])

@@ -72,7 +72,6 @@ _FIRST_IS_STALE = (
 class LowBits(Channel):
     """The channel in the low bits of floats; see `keyss.channels.base.Channel`."""
 
-    name = "quiet"
     place = "low bits"
     records = True
 
@@ -115,8 +114,6 @@ class InCodes(Channel):
 
     The file of these codes is published, or a model that was `decoded` from them.
     """
-
-    name = "quiet"
 
     def __init__(self, format: str, decoded: Decoded | None = None) -> None:
         self.format, self.decoded = format, decoded
