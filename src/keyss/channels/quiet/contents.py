@@ -99,11 +99,12 @@ class Writer:
         if payloads:
             sizes = [encrypted_size(compressed_size(each.data)) for each in payloads]
             plans, independent = self._capacity.plan_payloads(sizes)
-            for index, (payload, plan, size) in enumerate(zip(payloads, plans, sizes, strict=True)):
-                chunks = numbered_chunks(plan.codewords, self._encrypted(index, payload, size), plan.cells)
-                cells = RecordPlan(chunks.shape[1], 0, plan.cells_per_carrier)
-                header = pack_codewords(size, plan.codewords)
-                records.append(Records(payload.method, header, chunks, cells, _NO_COPIES))
+            for index, (payload, size) in enumerate(zip(payloads, sizes, strict=True)):
+                per_carrier, cells, codewords = plans[index]
+                chunks = numbered_chunks(codewords, self._encrypted(index, payload, size), cells)
+                plan = RecordPlan(chunks.shape[1], 0, per_carrier)
+                header = pack_codewords(size, codewords)
+                records.append(Records(payload.method, header, chunks, plan, _NO_COPIES))
         else:
             requests = [
                 RecordRequest(len(each.records), each.records.shape[1], len(each.header)) for each in records
