@@ -14,12 +14,7 @@ from .base import (
     unpack_method as unpack_method,
     unpack_payload as unpack_payload,
 )
-from .colours.channel import (
-    COLOURS as COLOURS,
-    Colours as Colours,
-    ColoursCover as ColoursCover,
-    ColoursReader as ColoursReader,
-)
+from .colours.channel import COLOURS as COLOURS, ColoursCover as ColoursCover, ColoursReader as ColoursReader
 from .colours.fountain import Fountain as Fountain
 from .names import AnyChannel as AnyChannel, Format as Format, Publish as Publish
 from .publishing import (

@@ -15,10 +15,11 @@ import torch
 from hypothesis import given, settings, strategies as st
 
 from channels.colours.made import PACKED, cover, embed, extract
-from keyss.channels import COLOURS, Colours, ColoursCover
+from keyss.channels import COLOURS, ColoursCover
 from keyss.channels.colours import channel, header
 from keyss.channels.colours.carriers import Carriers, find_salts
 from keyss.channels.colours.header import FILE_KEY_BYTES, Header, places
+from keyss.channels.colours.planner import STRENGTH
 from keyss.core import Gaussians, InputError, KeyssError, KeyssWarning, UsageError, WrongKeyError
 from keyss.lab import converters, cropping, half_floats, noise, opacity_pruning, random_pruning
 from keyss.rendering import psnr_between
@@ -26,7 +27,6 @@ from lab.lifelike import turned
 from lab.stealth.careless import shuffled
 
 ENTROPY = bytes(range(32))
-STRENGTH = 45.0
 
 
 @pytest.fixture(scope="module")
@@ -64,8 +64,6 @@ def test_a_header_made_up_by_chance_hides_no_other(
 def test_what_does_not_fit_is_refused_with_what_would(prepared: ColoursCover, payload: bytes) -> None:
     with pytest.raises(UsageError, match=f"{prepared.capacity.bytes:,} bytes in all"):
         embed(prepared, [("a", payload + b"x")])
-    with pytest.raises(UsageError, match="`strength`"):
-        Colours(math.nan)
 
 
 def test_only_green_and_blue_of_some_gaussians_change(prepared: ColoursCover, stego: Gaussians) -> None:
@@ -79,9 +77,6 @@ def test_only_green_and_blue_of_some_gaussians_change(prepared: ColoursCover, st
 
 def test_it_costs_no_more_than_was_asked_for(prepared: ColoursCover, stego: Gaussians) -> None:
     assert psnr_between(prepared.cover, stego) > STRENGTH
-    sizes = [Colours(strength).prepare(prepared.cover).capacity.bytes for strength in (40.0, 50.0, 60.0)]
-    assert sizes == sorted(sizes, reverse=True)
-    assert sizes[0] > 1.3 * sizes[2]
 
 
 def test_a_small_payload_changes_far_less_than_a_large_one(prepared: ColoursCover, stego: Gaussians) -> None:

@@ -49,7 +49,6 @@ from keyss.core.errors import InputError, KeyssWarning, UsageError, WrongKeyErro
 from keyss.core.gaussians import Gaussians
 from keyss.keys.derivation import MASTER_BYTES, expand, stream
 from keyss.keys.encryption import OVERHEAD, compressed_size, decrypt, encrypt
-from keyss.rendering.difference import psnr_between
 
 _TOO_FEW = "this cover has too few Gaussians to hide anything in colours that would survive other formats"
 _LOWER = 3  # maximum number of levels, each a quarter of a bit, below the planned one
@@ -63,21 +62,14 @@ _ALIGNMENTS = 4  # offsets of log scales; the best one is wrong by at most 1/8 s
 _NOTHING = Header(bytes(5), ONE, 0, 63, 64, 0, 0)  # read for wrong keys, so that all keys take equally long
 
 
-@dataclass(frozen=True)
 class Colours(Channel):
-    """The channel; see `keyss.channels.base.Channel`. Raises UsageError for a `strength` of 0 dB or less."""
-
-    strength: float = 45.0  # minimum PSNR in dB between views of the stego model and of the cover
+    """The channel; see `keyss.channels.base.Channel`."""
 
     place = "colours"
     survives = True
 
-    def __post_init__(self) -> None:
-        if not (math.isfinite(self.strength) and self.strength > 0):
-            raise UsageError(f"expected a `strength` above 0 dB, got {self.strength}")
-
     def prepare(self, cover: Gaussians) -> ColoursCover:
-        return ColoursCover(Planner(cover, Carriers.of(cover), self.strength))
+        return ColoursCover(Planner(cover, Carriers.of(cover)))
 
     def estimate_capacity(self, gaussians: int, sh_degree: int) -> Capacity:
         capacity = gaussians * _BITS_PER_GAUSSIAN // 8 - _HEADERS
@@ -91,8 +83,7 @@ COLOURS = Colours()
 class ColoursCover:
     """A cover with known capacity; see `keyss.channels.base.PreparedCover`.
 
-    Writing changes some greens and blues and nothing else. A payload changes as little as it needs;
-    `strength` is the limit.
+    Writing changes some greens and blues and nothing else. A payload changes as little as it needs.
     """
 
     planner: Planner
@@ -139,7 +130,7 @@ class ColoursCover:
         for lower in range(_LOWER + 1):  # the plan does not include the cost of headers and salts
             lowered = [replace(each, level=each.level and max(1, each.level - lower)) for each in headers]
             stego = self._write(secrets, lowered, layouts, payloads, carriers, free, random)
-            if layouts[0].level == ONE or psnr_between(self.cover, stego) >= self.planner.strength:
+            if layouts[0].level == ONE or not self.planner.is_visible(stego):
                 break
         return stego
 

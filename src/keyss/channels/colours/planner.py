@@ -30,6 +30,7 @@ from keyss.rendering.difference import psnr_between
 MIN_HEADERS = 2  # minimum number of headers in a file at level ONE; those without a secret are noise
 _RATE = 0.42  # data bits per expected bit of information
 _GARBAGE = 0.02  # share of carriers whose ID changes although it seemed stable
+STRENGTH = 45.0  # minimum PSNR in dB between views of the stego model and of the cover
 _COMFORTABLE = 0.8  # load of a share at level ONE, if that is enough; the rest compensates for losses
 _ROBUST = 0.5  # the same at other levels: such a payload is detectable anyway
 _MARGIN = 0.5  # dB by which the actual cost of a payload may exceed the predicted cost
@@ -51,11 +52,10 @@ class Layout:
 
 @dataclass(frozen=True, eq=False)
 class Planner:
-    """Plans payloads for a model whose views keep a PSNR of `strength` dB."""
+    """Plans payloads for a model whose views keep a PSNR of STRENGTH."""
 
     model: Gaussians
     carriers: Carriers
-    strength: float
 
     @cached_property
     def bytes(self) -> int:
@@ -92,15 +92,19 @@ class Planner:
 
     @cached_property
     def _max_share(self) -> float:
-        """The maximum share of the carriers at level ONE that keeps `strength`."""
-        share = 10 ** ((self._psnr(ONE) - self.strength - _MARGIN) / 10)
+        """The maximum share of the carriers at level ONE that keeps STRENGTH."""
+        share = 10 ** ((self._psnr(ONE) - STRENGTH - _MARGIN) / 10)
         return float(min(1.0, share)) - 1 / SHARES  # shares are rounded up
 
     @cached_property
     def _max_level(self) -> int:
-        """The highest level that keeps `strength` with all carriers; ONE if there is none."""
+        """The highest level that keeps STRENGTH with all carriers; ONE if there is none."""
         levels = range(1, LEVELS)
-        return bisect_left(levels, True, key=lambda each: self._psnr(each) < self.strength + _MARGIN)
+        return bisect_left(levels, True, key=lambda each: self._psnr(each) < STRENGTH + _MARGIN)
+
+    def is_visible(self, stego: Gaussians) -> bool:
+        """True if views of `stego` do not keep STRENGTH."""
+        return psnr_between(self.model, stego) < STRENGTH
 
     def _psnr(self, level: int) -> float:
         """PSNR of the model's views, in dB, after writing all carriers at `level`."""
