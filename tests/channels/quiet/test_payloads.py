@@ -214,11 +214,10 @@ def test_a_wrong_key_makes_the_same_work_as_a_right_one(
 
     monkeypatch.setattr(cells, "encrypted_blocks", counted)
     reader = QuietReader.of(stego)
-    right = next(reader.keys(KEY))
-    assert extract_derived(reader, right) == PAYLOAD
+    assert extract_derived(reader, DerivedKey.of(KEY, reader.salts[0])) == PAYLOAD
     needed, blocks = blocks, 0
     with pytest.raises(WrongKeyError):
-        reader.extract(next(reader.keys("The right key")))
+        reader.extract(DerivedKey.of("The right key", reader.salts[0]))
     assert blocks == needed > 0
 
 

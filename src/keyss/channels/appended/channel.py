@@ -171,7 +171,7 @@ class AppendedReader(SaltedReader):
                     best = found, scales
             if best is not None:
                 found, scales = best
-                words = pack_words(colours, scales, points_in_frame(faint, found.to_own))
+                words = pack_words(colours, scales, *points_in_frame(faint, found.to_own))
                 return AppendedReader([found.salt], words, _coarse_ids(model))
         return None
 

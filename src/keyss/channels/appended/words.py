@@ -28,7 +28,7 @@ from keyss.core.gaussians import DRAWN_OPACITY, Gaussians
 from keyss.core.similarity import Similarity
 from keyss.files.formats.common import with_largest_w
 
-COLOUR_BITS, SCALE_BITS, POSITION_BITS, ROTATION_BITS = 7, 6, 10, 5
+_WIDTHS = COLOUR_BITS, SCALE_BITS, POSITION_BITS, ROTATION_BITS = 7, 6, 10, 5
 INVARIANT_BITS = 3 * (COLOUR_BITS + SCALE_BITS)
 WORD_BITS = INVARIANT_BITS + 3 * (POSITION_BITS + ROTATION_BITS)
 
@@ -152,24 +152,19 @@ def all_shifts(steps: Doubles) -> Doubles:
     return np.arange(low - 2 ** (SCALE_BITS - 1), max(most, low), 0.25)
 
 
-def points_in_frame(model: Gaussians, to_own: Similarity) -> Integers:
-    """Nearest lattice points [N, 6] of positions and rotations; `to_own`: world to own frame."""
+def points_in_frame(model: Gaussians, to_own: Similarity) -> tuple[Integers, Integers]:
+    """Nearest lattice points [N, 3] of positions and of rotations; `to_own`: world to own frame."""
     own = to_own.apply_gaussians(model.with_sh_degree(0))
     positions = own.means.double().numpy() * 2**POSITION_BITS - 0.5
     parts = with_largest_w(own.quats.double().numpy())[:, 1:]
     rotations = (parts + _ROTATION_REACH) / (2 * _ROTATION_REACH) * 2**ROTATION_BITS - 0.5
-    return np.concatenate([_nearest(positions, POSITION_BITS), _nearest(rotations, ROTATION_BITS)], axis=1)
+    return _nearest(positions, POSITION_BITS), _nearest(rotations, ROTATION_BITS)
 
 
-def pack_words(colours: Integers, scales: Integers, others: Integers) -> Bits:
-    """Words [N, WORD_BITS] from colours [N, 3], scales [N, 3], and positions and rotations [N, 6]."""
-    parts = [
-        (colours, COLOUR_BITS),
-        (scales, SCALE_BITS),
-        (others[:, :3], POSITION_BITS),
-        (others[:, 3:], ROTATION_BITS),
-    ]
-    bits = [bits_of(each[:, axis].astype(np.uint64), width) for each, width in parts for axis in range(3)]
+def pack_words(*fields: Integers) -> Bits:
+    """Words [N, WORD_BITS] from colours, scales, positions and rotations, [N, 3] each."""
+    both = zip(fields, _WIDTHS, strict=True)
+    bits = [bits_of(column.astype(np.uint64), width) for each, width in both for column in each.T]
     return np.concatenate(bits, axis=1)
 
 
@@ -229,7 +224,7 @@ def _masks(key: bytes, data: Bytes, bits: int) -> Words:
 def _split(words: Bits) -> list[Doubles]:
     """Colours, scales, positions and rotations, [N, 3] each."""
     fields, at = [], 0
-    for width in (COLOUR_BITS, SCALE_BITS, POSITION_BITS, ROTATION_BITS):
+    for width in _WIDTHS:
         own = words[:, at : at + 3 * width].reshape(-1, 3, width)
         fields.append(own.astype(np.float64) @ 2.0 ** np.arange(width)[::-1])
         at += 3 * width

@@ -280,11 +280,12 @@ class CodesCover:
         """
         noise = np.frombuffer(stream(entropy, "codes/free", -(-len(self.dry) // 8)), np.uint8)
         bits = np.where(self.dry, np.unpackbits(noise)[: len(self.dry)], last_bits(self.fields))
-        message, rows = np.unpackbits(table, bitorder="little"), wet_paper.matrix(8 * self.width)
-        solved = wet_paper.write(bits[self.places], self.dry[self.places], message, rows)
-        if solved is not None:
-            bits[self.places] = solved
-        return None if solved is None else bits
+        messages = np.unpackbits(table, axis=1, bitorder="little")
+        solved = wet_paper.write(bits[self.places], self.dry[self.places], messages)
+        if solved is None:
+            return None
+        bits[self.places] = solved
+        return bits
 
     def _written(self, bits: Bits, entropy: bytes) -> Codes:
         columns: dict[str, list[Levels]] = {}

@@ -120,7 +120,7 @@ class Writer:
     def _write_blocks(self, keys: Sequence[DerivedKey], payloads: Sequence[Payload]) -> None:
         """Each secret takes consecutive blocks, cyclically; all arrangements are equally likely."""
         width, count = self._capacity.width, self._capacity.carriers
-        takes = [blocks_for(each, width) for each in payloads]
+        takes = [BLOCK_HEADER + -(-(compressed_size(each.data) + OVERHEAD) // width) for each in payloads]
         if (free := count - sum(takes)) < 0:
             raise UsageError(
                 f"the secrets take {width * sum(takes):,} bytes, and this cover of {self._gaussians:,} "
@@ -302,11 +302,6 @@ class QuietReader(SaltedReader):
             return found[0], fitting
         order = np.concatenate([*map(np.flatnonzero, fitting)]).argsort(kind="stable")
         return np.concatenate(found)[order], fitting
-
-
-def blocks_for(payload: Payload, width: int) -> int:
-    """The number of blocks of `width` bytes that a payload takes."""
-    return BLOCK_HEADER + -(-(compressed_size(payload.data) + OVERHEAD) // width)
 
 
 def payload_key(data_key: bytes) -> bytes:
