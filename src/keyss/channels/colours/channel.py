@@ -184,10 +184,9 @@ class ColoursCover:
             data = np.unpackbits(np.frombuffer(encrypted, np.uint8))
             code = Fountain(len(data)).encode(data, seeds(key, "seeds", ids, bits))
             values[rows], chosen[rows] = write(key, ids, values[rows], bits, code), layout.likely
-        old = self.planner.carriers.colours
-        new = np.hstack([old[:, :1], self.planner.statistics.imitate(values)])
+        new = self.planner.statistics.imitate(values)
         if chosen.any():
-            base = np.where(chosen[:, None], old, new)
+            base = np.where(chosen[:, None], self.planner.carriers.colours, new)
             accepted = self.planner.likelihood.accept(base, new, random)
             new[:, 1:] = np.where(accepted, new[:, 1:], base[:, 1:])
         sh = self.cover.sh.detach().clone()

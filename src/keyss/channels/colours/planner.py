@@ -163,8 +163,7 @@ class Planner:
     def _noisy_colours(self) -> Doubles:
         """Colours [C, 3] with noise in green and blue such as writing adds."""
         noise = np.random.default_rng(1).uniform(-SPACING, SPACING, (len(self.carriers), COLUMNS))
-        colours = self.carriers.colours
-        return np.hstack([colours[:, :1], self.statistics.imitate(colours[:, 1:] + noise)])
+        return self.statistics.imitate(self.carriers.colours[:, 1:] + noise)
 
 
 def bucket_of(size: int) -> int:
@@ -196,8 +195,8 @@ class ColourStatistics:
         found: Flags = self._repeated | typed | grey
         return found
 
-    def imitate(self, new: Doubles) -> Floats:
-        """Give `new` greens and blues [C, 2] the statistics of the model; unchanged ones stay.
+    def imitate(self, new: Doubles) -> Doubles:
+        """The colours [C, 3] with `new` greens and blues [C, 2], given the statistics of the model.
 
         In a rounded model, they take the nearest of its values from which a reader reads the same. In others,
         they keep the last bits of the old values, which are not quite random after training.
@@ -210,4 +209,5 @@ class ColourStatistics:
                 wanted = new[:, column]
                 nearest = existing[np.searchsorted((existing[1:] + existing[:-1]) / 2, wanted)]
                 values[:, column] = np.where(np.abs(nearest - wanted) <= SPACING / 2, nearest, wanted)
-        return np.where(new == old, old, values)
+        values = np.where(new == old, old, values)
+        return np.hstack([self._colours[:, :1], values]).astype(np.float64)

@@ -46,6 +46,7 @@ from keyss.channels.quiet.bits import (
     Layout,
     coarse_lengths,
     gaussian_ids,
+    group_words,
     read_low_bits,
     used_words,
 )
@@ -301,12 +302,7 @@ def _are_unique(gaussians: Gaussians, layout: Layout, ids: Bytes) -> tuple[Flags
 
 def _frequent_values(gaussians: Gaussians) -> list[Words32]:
     """For each group of fields the values [V] that occur too often, in ascending order."""
-    fields = (gaussians.log_scales, gaussians.quats, gaussians.opacity_logits, gaussians.sh[:, 1:])
-    every = [field.detach().to("cpu", torch.float32).numpy().view(np.uint32) for field in fields]
-    return [
-        frequent(words.reshape(len(words), math.prod(words.shape[1:])), _unlikely_copies(words.size))
-        for words in every
-    ]
+    return [frequent(words, _unlikely_copies(words.size)) for words in group_words(gaussians)]
 
 
 def _unlikely_copies(count: int) -> int:
