@@ -1,12 +1,12 @@
 """Capacity, cost and robustness of the channel `colours`.
 
-python benchmarks/colours.py MODEL.ply ... [--gaussians N] [--payloads P] [--strengths 45 55] [--changes]
+python benchmarks/colours.py MODEL.ply ... [--gaussians N] [--payloads P] [--changes]
                                 [--only FORMAT] [--size BYTES]
 python benchmarks/colours.py MODEL.ply ... --payloads N --log FILE [--gaussians N] [--foreign-each M]
 python benchmarks/colours.py SCENE-1.ply SCENE-2.ply ... --pairs FOLDER [--shares 1 0.5 0.2 0.05]
 python benchmarks/colours.py MODEL.ply --speed [--gaussians N]
 
-For each model and strength: net bits per Gaussian, the cost of a full model, and how many of P payloads, each
+For each model: net bits per Gaussian, the cost of a full model, and how many of P payloads, each
 with a new key and new entropy, are lost in each format, alone and with a quarter of the Gaussians removed at
 random. With --changes, also other changes, at full capacity and at a fifth of it. Argon2id is replaced by a
 cheap function, except with --speed.
@@ -16,7 +16,7 @@ each M-th also through third-party programs. Each payload appends a line of JSON
 skipped.
 
 With --pairs, nothing is measured: each model, with and without a payload of a share of its capacity, is
-converted to each format and back, and `FOLDER/STRENGTH-FORMAT-SHARE.txt` lists the files for `xargs python
+converted to each format and back, and `FOLDER/FORMAT-SHARE.txt` lists the files for `xargs python
 benchmarks/stealth.py --quick --pairs < FILE`. With --speed: seconds and memory of writing 200 bytes, and of
 reading with a right and a wrong key, Argon2id included. `--gaussians` samples each model to this size (with
 --speed, even beyond its own).
@@ -40,7 +40,7 @@ from pathlib import Path
 
 from keyss import lab
 from colours_payloads import run_payloads
-from keyss.channels import Colours, ColoursCover, ColoursReader, Payload
+from keyss.channels import COLOURS, ColoursCover, ColoursReader, Payload
 from keyss.core.errors import BackendError, InputError, WrongKeyError
 from keyss.core.gaussians import Gaussians
 from keyss.core.similarity import Similarity
@@ -67,7 +67,6 @@ def main() -> None:
     parser.add_argument("--payloads", type=int, default=5)
     parser.add_argument("--log", type=Path, metavar="FILE")
     parser.add_argument("--foreign-each", type=int, default=10)
-    parser.add_argument("--strengths", type=float, nargs="+", default=[45.0])
     parser.add_argument("--seed", type=int, default=0, help="seed of keys, payloads and removals")
     parser.add_argument("--size", type=int, help="bytes of a payload (default: the capacity)")
     parser.add_argument("--changes", action="store_true")
@@ -79,8 +78,7 @@ def main() -> None:
     if not asked.speed:
         cheap_keys.pytest_sessionstart()
     if asked.pairs:
-        for strength in asked.strengths:
-            _write_pairs(asked.models, asked.pairs, asked.shares, strength, asked.only)
+        _write_pairs(asked.models, asked.pairs, asked.shares, asked.only)
         return
     if asked.speed:
         _measure_speed(asked.models, asked.gaussians)
@@ -90,26 +88,24 @@ def main() -> None:
             [(path.stem, partial(_read, path, asked.gaussians)) for path in asked.models],
             asked.payloads,
             asked.log,
-            strength=asked.strengths[0],
             foreign={what: change for what, change in _BY_TOOL.items() if asked.only in what},
             each=asked.foreign_each,
             embed=_embed,
             opens=_opens,
         )
         return
-    print("| model | Gaussians | asked, dB | cost, dB | bytes | bits per Gaussian | what | failures |")
-    print("| --- | --- | --- | --- | --- | --- | --- | --- |")
+    print("| model | Gaussians | cost, dB | bytes | bits per Gaussian | what | failures |")
+    print("| --- | --- | --- | --- | --- | --- | --- |")
     for path in asked.models:
         model = _read(path, asked.gaussians)
-        for strength in asked.strengths:
-            prepared = Colours(strength).prepare(model)
-            name = f"{path.stem} | {len(prepared.cover):,} | {strength:.0f}"
-            formats = {what: change for what, change in FORMATS.items() if asked.only in what}
-            share = 1.0 if asked.size is None else asked.size / prepared.capacity.bytes
-            _measure(prepared, name, formats, asked.payloads, asked.seed, share, pruned=True)
-            if asked.changes:
-                _measure(prepared, name, OTHERS, asked.payloads, asked.seed)
-                _measure(prepared, name, OTHERS, asked.payloads, asked.seed, FIFTH)
+        prepared = COLOURS.prepare(model)
+        name = f"{path.stem} | {len(prepared.cover):,}"
+        formats = {what: change for what, change in FORMATS.items() if asked.only in what}
+        share = 1.0 if asked.size is None else asked.size / prepared.capacity.bytes
+        _measure(prepared, name, formats, asked.payloads, asked.seed, share, pruned=True)
+        if asked.changes:
+            _measure(prepared, name, OTHERS, asked.payloads, asked.seed)
+            _measure(prepared, name, OTHERS, asked.payloads, asked.seed, FIFTH)
 
 
 def _read(path: Path, gaussians: int | None) -> Gaussians:
@@ -159,13 +155,11 @@ def _measure(
             print(f"{start} | {row} | {failures[row]} of {payloads} |", flush=True)
 
 
-def _write_pairs(
-    models: Sequence[Path], folder: Path, shares: Sequence[float], strength: float, only: str
-) -> None:
+def _write_pairs(models: Sequence[Path], folder: Path, shares: Sequence[float], only: str) -> None:
     wanted = {what: change for what, change in FORMATS.items() if only in what}
     lines: dict[str, list[str]] = {}
     for number, path in enumerate(models):
-        scene, prepared = path.stem.rsplit("-", 1)[0], Colours(strength).prepare(read_model(path))
+        scene, prepared = path.stem.rsplit("-", 1)[0], COLOURS.prepare(read_model(path))
         made = {"plain": prepared.cover}
         for share in shares:
             size = int(share * (prepared.capacity.bytes - PACKED))
@@ -176,7 +170,7 @@ def _write_pairs(
                 flush=True,
             )
         for what, change in wanted.items():
-            own = folder / f"{strength:g}-{re.sub('[^a-z]+', '-', what).strip('-')}"
+            own = folder / re.sub("[^a-z]+", "-", what).strip("-")
             own.mkdir(parents=True, exist_ok=True)
             for name, model in made.items():
                 write_model(own / f"{path.stem}-{name}.ply", change(model))
@@ -197,9 +191,7 @@ def _measure_speed(models: Sequence[Path], gaussians: int | None) -> None:
         for step in ("embed", "right", "wrong"):
             start = time.monotonic()
             if step == "embed":
-                stego = (
-                    Colours().prepare(model).embed([("a key of some length", Payload(METHOD, bytes(200)))])
-                )
+                stego = COLOURS.prepare(model).embed([("a key of some length", Payload(METHOD, bytes(200)))])
             elif step == "right":
                 ColoursReader.of(stego).open("a key of some length")
             else:

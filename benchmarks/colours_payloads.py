@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from keyss import lab
-from keyss.channels import Colours, ColoursCover
+from keyss.channels import COLOURS, ColoursCover
 from keyss.core.errors import BackendError
 from keyss.core.gaussians import Gaussians
 from keyss.files.models import read_model, write_model
@@ -36,7 +36,6 @@ def run_payloads(
     count: int,
     log: Path,
     *,
-    strength: float,
     foreign: Mapping[str, Change],
     each: int,
     embed: Embed,
@@ -48,7 +47,7 @@ def run_payloads(
     for number in range(len(done), count):
         name, read = covers[number % len(covers)]
         if name not in prepared:
-            prepared[name] = Colours(strength).prepare(read())
+            prepared[name] = COLOURS.prepare(read())
         cover, started = prepared[name], time.monotonic()
         data = np.random.default_rng(number).bytes(cover.capacity.bytes - 2)
         stego = embed(cover, number, data)

@@ -18,7 +18,7 @@ from channels.quiet.coded import codes_of, model_of
 from channels.quiet.trained_like import trained_like
 from cli.harness import PROGRAM, Result, Run, assert_refused, listing, write_key
 from keyss.channels import LOW_BITS, CodesCover, Payload, base
-from keyss.channels.colours import salt_gaussians
+from keyss.channels.colours import carriers
 from keyss.channels.quiet import cells
 from keyss.core import Gaussians
 from keyss.files import read_model, write_model
@@ -125,7 +125,7 @@ class TestOpensNothing:
             made.append(dict(work))
         assert result[0] == result[1] == result[2]
         assert made[0] == made[1] == made[2]
-        assert made[0]["keys"] == base.SALTS_TRIED + salt_gaussians.SALTS + 1  # low bits, then colours
+        assert made[0]["keys"] == base.SALTS_TRIED + carriers.SALTS + 1  # low bits, then colours
         assert_refused(result[0], 3, "opens nothing here")
         for word in ("another key", "converted or quantised", "moved", "trained on"):
             assert word in result[0].err

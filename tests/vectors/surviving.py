@@ -7,12 +7,14 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from unittest import mock
 
 import torch
 from scipy.spatial.transform import Rotation
 
 from channels.quiet.trained_like import trained_like
-from keyss.channels import APPENDED, COLOURS, Colours, Payload
+from keyss.channels import APPENDED, COLOURS, Payload
+from keyss.channels.colours import planner
 from keyss.core.errors import KeyssWarning
 from keyss.core.gaussians import Gaussians
 from keyss.core.similarity import Similarity
@@ -39,8 +41,9 @@ def write_surviving(folder: Path, keys: tuple[str, str]) -> None:
     notes = [(keys[0], NOTE.payload()), (keys[1], Payload("file", b"\0" + b"?" * 9))]
     write_model(one, COLOURS.prepare(cover).embed(notes, entropy=bytes(32)))
     secret = Payload(METHOD, whole.encode(trained_like(12, 25, 0)))
-    small = Colours(strength=40).prepare(cover[:2300])
-    write_model(moved, elsewhere(small.embed([(keys[0], secret)], entropy=bytes(32))))
+    with mock.patch.object(planner, "STRENGTH", 40.0):
+        small = COLOURS.prepare(cover[:2300]).embed([(keys[0], secret)], entropy=bytes(32))
+    write_model(moved, elsewhere(small))
 
 
 def with_appended(keys: Sequence[str]) -> Gaussians:

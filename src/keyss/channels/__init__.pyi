@@ -14,8 +14,7 @@ from .base import (
     unpack_method as unpack_method,
     unpack_payload as unpack_payload,
 )
-from .colours.channel import COLOURS as COLOURS, Colours as Colours, ColoursCover as ColoursCover
-from .colours.colours_reader import ColoursReader as ColoursReader
+from .colours.channel import COLOURS as COLOURS, ColoursCover as ColoursCover, ColoursReader as ColoursReader
 from .colours.fountain import Fountain as Fountain
 from .names import AnyChannel as AnyChannel, Format as Format, Publish as Publish
 from .publishing import (
@@ -39,15 +38,17 @@ from .quiet.channel import (
     InCodes as InCodes,
     LowBitsCover as LowBitsCover,
 )
-from .quiet.fields import Field as Field, last_bits as last_bits
+from .quiet.contents import QuietReader as QuietReader
+from .quiet.fields import Field as Field, in_counted_order as in_counted_order, last_bits as last_bits
 from .quiet.layout import (
     TYPICAL_SHARE as TYPICAL_SHARE,
     LowBitsCapacity as LowBitsCapacity,
     check_payload_fits as check_payload_fits,
 )
-from .quiet.order import in_counted_order as in_counted_order
 from .quiet.parameters import key_cipher as key_cipher
-from .quiet.reading import QuietReader as QuietReader
-from .quiet.salts import salt_rows as salt_rows
-from .quiet.usable import chance_of_bits as chance_of_bits, usable_carriers as usable_carriers
+from .quiet.usable import (
+    chance_of_bits as chance_of_bits,
+    salt_rows as salt_rows,
+    usable_carriers as usable_carriers,
+)
 from .reed_solomon import Codewords as Codewords

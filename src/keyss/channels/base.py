@@ -13,7 +13,7 @@ import hashlib
 import os
 import warnings
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import ClassVar, Protocol
@@ -149,18 +149,14 @@ class SaltedReader(ABC):
     def extract(self, key: DerivedKey) -> Content:
         """`open`, after key derivation with one salt."""
 
-    def keys(self, key: str) -> Iterator[DerivedKey]:
-        """Derive `key` with each salt to try; each takes 0.1 s."""
-        return (DerivedKey.of(key, salt) for salt in self.salts[:SALTS_TRIED])
-
     def open(self, key: str) -> Content:
         """See `Reader`. Changed or added Gaussians can replace the first salt, so several are tried.
 
-        Warns (KeyssWarning) of Gaussians that were added or changed after hiding.
+        Each takes 0.1 s. Warns (KeyssWarning) of Gaussians that were added or changed after hiding.
         """
-        for derived in self.keys(key):
+        for salt in self.salts[:SALTS_TRIED]:
             with suppress(WrongKeyError):
-                content = self.extract(derived)
+                content = self.extract(DerivedKey.of(key, salt))
                 warn_of_foreign(content)
                 return content
         raise WrongKeyError()
@@ -169,7 +165,6 @@ class SaltedReader(ABC):
 class Channel(ABC):
     """A place for bits in a model."""
 
-    name: ClassVar[str]  # `quiet`, `appended` or `colours`
     place: str  # in messages: "low bits", "codes of the spz file" and so on
     survives: ClassVar[bool] = False  # True if secrets survive conversion to other formats
     grows: ClassVar[bool] = False  # see `Capacity`

@@ -7,7 +7,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import get_args
 
-from keyss.channels.base import Channel, Content, Payload, Reader, SaltedReader, warn_of_foreign
+from keyss.channels.base import Channel, Content, Payload, Reader, warn_of_foreign
 from keyss.channels.names import AnyChannel, Format, Publish
 from keyss.core.errors import UsageError, WrongKeyError
 from keyss.core.gaussians import Gaussians
@@ -62,8 +62,22 @@ def open_content(stego: Gaussians, key: str) -> Content:
     """The content that `key` opens in any channel. Raises WrongKeyError, and InputError for damage."""
     for reader in _readers(stego):
         with suppress(WrongKeyError):
-            return _with_model_size(stego, reader.open(key))
+            if reader is not None:
+                return _with_model_size(stego, reader.open(key))
     raise WrongKeyError()
+
+
+def _readers(stego: Gaussians) -> Iterator[Reader | None]:
+    """The readers of a model. Each channel is imported when the previous ones opened nothing."""
+    from keyss.channels.quiet.contents import QuietReader
+
+    yield QuietReader.of(stego)
+    from keyss.channels.appended.channel import AppendedReader
+
+    yield AppendedReader.of(stego)
+    from keyss.channels.colours.channel import ColoursReader
+
+    yield ColoursReader.of(stego)
 
 
 @dataclass(frozen=True)
@@ -81,45 +95,23 @@ def quick_attempt(stego: Gaussians, key: str) -> Attempt | None:
 
     Raises InputError for damage. Warns (KeyssWarning) of Gaussians that were added or changed after hiding.
     """
-    from keyss.channels.quiet.reading import QuietReader
+    from keyss.channels.appended.channel import AppendedReader
+    from keyss.channels.quiet.contents import QuietReader
 
     # Appended Gaussians must not hide what lies elsewhere. They are visible: a second try tells nothing.
-    quiet, appended = _quiet(stego), _appended(stego)
+    quiet, appended = QuietReader.of(stego), AppendedReader.of(stego)
     readers = [each for each in (quiet, appended) if each and each.salts]
     if not readers:
         return None
-    derived = [DerivedKey.of(key, reader.salts[0]) for reader in readers]
-    opened: list[Content] = []
-    for reader, each in zip(readers, derived, strict=True):
+    derived, opened = [DerivedKey.of(key, each.salts[0]) for each in readers], list[Content]()
+    for reader, own in zip(readers, derived, strict=True):
         with suppress(WrongKeyError):
-            opened.append(_with_model_size(stego, reader.extract(each)))
+            opened.append(_with_model_size(stego, reader.extract(own)))
     if opened:
         warn_of_foreign(opened[0])
-    records = isinstance(quiet, QuietReader) and not quiet.blocks and appended is None
+    records = quiet is not None and not quiet.blocks and appended is None
     return Attempt(derived[0], opened[0] if opened else None, appended is not None, records)
 
 
 def _with_model_size(stego: Gaussians, content: Content) -> Content:
     return replace(content, model_size=len(stego)) if isinstance(content, Payload) else content
-
-
-def _readers(stego: Gaussians) -> Iterator[Reader]:
-    """The readers of a model. Each channel is imported when the previous ones opened nothing."""
-    for find in (_quiet, _appended):
-        if reader := find(stego):
-            yield reader
-    from keyss.channels.colours.colours_reader import ColoursReader
-
-    yield ColoursReader.of(stego)
-
-
-def _quiet(stego: Gaussians) -> SaltedReader | None:
-    from keyss.channels.quiet.reading import QuietReader
-
-    return QuietReader.of(stego)
-
-
-def _appended(stego: Gaussians) -> SaltedReader | None:
-    from keyss.channels.appended.channel import AppendedReader
-
-    return AppendedReader.of(stego)

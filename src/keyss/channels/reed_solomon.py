@@ -58,7 +58,8 @@ class Codewords:
     def encode(self, data: bytes) -> Bytes:
         """Encode at most `size` bytes as chunks [chunks, width] in the order of their numbers."""
         rows = np.frombuffer(data.ljust(self.size, b"\0"), np.uint8).reshape(self.k, -1)
-        return encode(rows, self.n).reshape(-1, self.width)
+        parity = _interpolate(np.arange(self.k), rows, np.arange(self.k, self.n), self.k)
+        return np.concatenate([rows, parity]).reshape(-1, self.width)
 
     def decode(self, numbers: Integers, chunks: Bytes, *, errors: bool = False) -> bytes:
         """Decode chunks [C, width] with `numbers` [C], in any order.
@@ -69,57 +70,34 @@ class Codewords:
         inside = numbers < self.chunks
         unique, first, inverse = np.unique(numbers[inside], return_index=True, return_inverse=True)
         chunks, left = chunks[inside], len(unique)
-        data = None
         if left >= self.count * self.k:  # otherwise save the memory
             chosen = chunks[first]
             sure = np.ones(left, bool)
             sure[inverse[(chunks != chosen[inverse]).any(axis=1)]] = False
-            data = self._decode(unique[sure], chosen[sure], errors)
-        if data is None:
-            raise InputError(f"{LOST}: {left:,} of {self.chunks:,} chunks are left")
-        return data.tobytes()
+            rows, codewords = np.divmod(unique[sure], self.count)
+            data, chosen = np.empty((self.k, self.count, self.width), np.uint8), chosen[sure]
+            own = (codewords == each for each in range(self.count))
+            if all(self._decode(rows[o], chosen[o], data[:, at], errors) for at, o in enumerate(own)):
+                return data.tobytes()
+        raise InputError(f"{LOST}: {left:,} of {self.chunks:,} chunks are left")
 
-    def _decode(self, numbers: Integers, chunks: Bytes, errors: bool) -> Bytes | None:
-        data = np.empty((self.k, self.count, self.width), np.uint8)
-        rows, codewords = np.divmod(numbers, self.count)
-        for codeword in range(self.count):
-            own = codewords == codeword
-            decoded = decode(rows[own], chunks[own], self.k, self.n, errors=errors)
-            if decoded is None:
-                return None
-            data[:, codeword] = decoded
-        return data
+    def _decode(self, numbers: Integers, rows: Bytes, data: Bytes, errors: bool) -> bool:
+        """Decode the codeword of rows [C, width] with `numbers` [C] into `data` [k, width].
 
-
-def encode(data: Bytes, n: int) -> Bytes:
-    """Codeword [n, width] of data [k, width], width even: the data, then n - k rows of parity.
-
-    Raises ValueError unless 1 <= k <= n <= MAX_CHUNKS.
-    """
-    k = len(data)
-    if not 1 <= k <= n <= MAX_CHUNKS:
-        raise ValueError(f"expected 1 <= k <= n <= {MAX_CHUNKS}, got k = {k}, n = {n}")
-    return np.concatenate([data, _interpolate(np.arange(k), data, np.arange(k, n), k)])
-
-
-def decode(numbers: Integers, rows: Bytes, k: int, n: int, *, errors: bool = False) -> Bytes | None:
-    """The data [k, width] from rows [C, width] of a codeword [n, width] with distinct `numbers` [C].
-
-    `errors`: some rows may be false. None if too few are left.
-    """
-    if errors and len(rows) > k:
-        consistent = _consistent_rows(numbers, rows, k, n)
-        numbers, rows = numbers[consistent], rows[consistent]
-    if len(rows) < k:
-        return None
-    order = np.argsort(numbers)[:k]  # data first
-    numbers, rows = numbers[order], rows[order]
-    data = np.empty((k, rows.shape[1]), np.uint8)
-    known = numbers < k
-    data[numbers[known]] = rows[known]
-    lost = np.setdiff1d(np.arange(k), numbers)
-    data[lost] = _interpolate(numbers, rows, lost, n)
-    return data
+        False if too few are left.
+        """
+        if errors and len(rows) > self.k:
+            consistent = _consistent_rows(numbers, rows, self.k, self.n)
+            numbers, rows = numbers[consistent], rows[consistent]
+        if len(rows) < self.k:
+            return False
+        order = np.argsort(numbers)[: self.k]  # data first
+        numbers, rows = numbers[order], rows[order]
+        known = numbers < self.k
+        data[numbers[known]] = rows[known]
+        lost = np.setdiff1d(np.arange(self.k), numbers)
+        data[lost] = _interpolate(numbers, rows, lost, self.n)
+        return True
 
 
 def _tables() -> tuple[Shorts, Integers]:

@@ -11,8 +11,7 @@ from scipy.stats import kstest
 
 from channels.colours.made import cover
 from keyss.channels.colours import qim
-from keyss.channels.colours.carriers import Carriers
-from keyss.channels.colours.salt_gaussians import SALTS, Salts, renew_salts
+from keyss.channels.colours.carriers import SALTS, Carriers, find_salts, renew_salts
 from keyss.core import Gaussians
 from lab.lifelike import turned
 
@@ -100,21 +99,21 @@ def test_one_of_each_name_is_written() -> None:
     carriers = Carriers.of(Gaussians.cat([cover(300)] * 2))
     ids = carriers.ids[carriers.representatives]
     assert len(np.unique(ids, axis=0)) == len(ids) == len(np.unique(carriers.ids, axis=0))
-    assert (carriers.id_counts >= 2).all()
+    assert (carriers.certainty <= 0.5).all()
 
 
 def test_salts_are_new_and_are_found_again_after_rounding_and_pruning() -> None:
     model = cover(6000)
     carriers = Carriers.of(model)
     first, second = (renew_salts(carriers, np.random.default_rng(seed)) for seed in (1, 2))
-    one, other = Salts.of(first), Salts.of(second)
-    assert len(one.salts) >= SALTS
-    assert len(set(one.salts) & set(other.salts)) <= 2  # 1/49 of 16 are expected
+    one, other = find_salts(first)[1], find_salts(second)[1]
+    assert len(one) >= SALTS
+    assert len(set(one) & set(other)) <= 2  # 1/49 of 16 are expected
     sh = model.sh.clone()
     sh[carriers.rows, 0] = torch.from_numpy((np.round(first.colours * 38.25 + 127.5) - 127.5) / 38.25).float()
     kept = torch.rand(6000, generator=torch.Generator().manual_seed(3)) < 0.75
     rounded = replace(model, log_scales=(model.log_scales * 16).round() / 16, sh=sh)[kept]
-    assert len(set(Salts.of(Carriers.of(turned(1.37)(rounded))).salts) & set(one.salts)) >= 3
+    assert len(set(find_salts(Carriers.of(turned(1.37)(rounded)))[1]) & set(one)) >= 3
 
 
 def test_new_salts_leave_each_number_where_it_lies_in_its_cell() -> None:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from keyss.channels import LOW_BITS, Content, LowBitsCover, Payload, QuietReader
 from keyss.channels.base import randomness
-from keyss.channels.quiet.writing import bytes_of
+from keyss.channels.quiet.contents import bytes_of
 from keyss.core import Gaussians
 from keyss.keys import DerivedKey
 

@@ -11,7 +11,7 @@ from hypothesis import given, settings, strategies as st
 from hypothesis.extra import numpy as arrays
 
 from keyss.channels import Layout, gaussian_ids, read_low_bits, used_words, write_low_bits
-from keyss.channels.quiet.reading import _rows_in
+from keyss.channels.quiet.contents import _rows_in
 from keyss.channels.quiet.usable import repeated
 from keyss.core import Gaussians
 from keyss.kernels.parallel import in_blocks

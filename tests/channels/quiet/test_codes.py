@@ -12,7 +12,7 @@ from hypothesis import given, settings, strategies as st
 
 from channels.quiet.coded import FORMATS, bits_of, codes_of, model_of, opened, there_and_back, written
 from keyss.channels import CodesCover, Field, Payload, QuietReader, in_counted_order, last_bits
-from keyss.channels.quiet.fields import carrying, sog_distances
+from keyss.channels.quiet.fields import ROTATIONS, sog_distances
 from keyss.channels.quiet.wet_paper import read_blocks
 from keyss.channels.quiet.writable_levels import fixed_axes, writable_levels
 from keyss.core import InputError, UsageError, WrongKeyError
@@ -202,7 +202,7 @@ def test_the_largest_part_of_a_quaternion_stays_the_largest(suffix: str) -> None
     """But for those that rounding alone makes, which stay, too."""
     cover = CodesCover.of(codes_of(suffix, 20_000))
     after = in_counted_order(written(cover, b"data"))[2]
-    least, largest = carrying(cover.codes).rotations
+    least, largest = ROTATIONS[type(cover.codes)]
 
     def wrong(fields: list[Field]) -> Any:
         levels = np.stack([each.levels for each in fields if each.name == "rotations"], axis=1)

@@ -14,7 +14,7 @@ from scipy import stats
 from channels.quiet.coded import FORMATS, bits_of, codes_of, written
 from channels.quiet.trained_like import trained_like
 from keyss.channels import CodesCover, Field, in_counted_order
-from keyss.channels.quiet.fields import carrying
+from keyss.channels.quiet.fields import ROTATIONS
 from keyss.core import Gaussians
 from keyss.files.formats.common import in_morton_order
 
@@ -90,7 +90,7 @@ def hardly_trained(count: int = 20_000) -> Gaussians:
 
 def coincidences(codes: Any) -> dict[str, int]:
     """The numbers of small rotations, of rotations with equal parts, and of round Gaussians."""
-    middle = sum(carrying(codes).rotations) / 2
+    middle = sum(ROTATIONS[type(codes)]) / 2
     fields = in_counted_order(codes)[2]
     parts = np.abs(np.stack([each.levels for each in fields if each.name == "rotations"], axis=1) - middle)
     sizes = np.ptp(codes.dequantise().log_scales.numpy(), axis=1)

@@ -18,7 +18,7 @@ from channels.quiet.payloads import embed_contents
 from channels.quiet.trained_like import keys, trained_like
 from files.formats.examples import KINDS, random_codes
 from keyss.channels import LOW_BITS, CodesCover, Codewords, Payload, QuietReader
-from keyss.channels.quiet import layout, writing
+from keyss.channels.quiet import contents, layout
 from keyss.channels.quiet.parameters import PAYLOAD, RECORDS, Parameters, pack_codewords
 from keyss.channels.reed_solomon import MAX_CHUNKS
 from keyss.core import Gaussians, InputError, UsageError, WrongKeyError
@@ -66,7 +66,7 @@ def test_parameters_that_name_more_than_there_is(
     count: int, size: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     hostile = Parameters(PAYLOAD, "carry", 1, size, 2500, count, b"")
-    monkeypatch.setattr(writing, "Parameters", lambda *_: hostile)
+    monkeypatch.setattr(contents, "Parameters", lambda *_: hostile)
     file = written(CodesCover.of(codes_of(".spz", 2500)), b"data")
     with pytest.raises(InputError, match="exceed the file"):
         opened(file)
@@ -132,7 +132,7 @@ def cover() -> Gaussians:
 def test_hostile_parameters_end_in_a_sentence(
     cover: Gaussians, hostile: Parameters, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(writing, "Parameters", lambda *_: hostile)
+    monkeypatch.setattr(contents, "Parameters", lambda *_: hostile)
     stego = embed_contents(LOW_BITS.prepare(cover), [(keys(), Payload("carry", b"x"))])
     reader = QuietReader.of(stego)
     with at_most(10), pytest.raises(InputError, match=r"the key is right|are damaged"):

@@ -12,9 +12,9 @@ from scipy.stats import ks_2samp
 
 from channels.quiet.trained_like import keys
 from keyss.channels import CellCipher, Content, LowBitsCapacity, Payload, RecordRequest, Records, key_cipher
-from keyss.channels.quiet.layout import SALTS
+from keyss.channels.quiet.contents import Writer
 from keyss.channels.quiet.parameters import parameter_cipher, unpack
-from keyss.channels.quiet.writing import Writer
+from keyss.channels.quiet.usable import SALTS
 from keyss.core import KeyssWarning
 
 CARRIERS, WIDTH = 3000, 75
@@ -46,7 +46,7 @@ def _payloads(sizes: Sequence[int]) -> list[Content]:
 
 def _seen(contents: Sequence[Content]) -> list[float]:
     """What the holder of the first key can count of its own cells, and of all others together."""
-    writer = Writer(NAMES, WIDTH, os.urandom(32), NAMES)
+    writer = Writer(NAMES, WIDTH, os.urandom(32), len(NAMES), NAMES)
     keyed = [([each] * SALTS, content) for each, content in zip([OWN[0], *OWN[1:]], contents, strict=False)]
     writer.write(keyed)
     low = np.empty_like(writer.table)

@@ -11,7 +11,7 @@ import torch
 
 from channels.quiet.payloads import embed, embed_derived, extract_derived
 from channels.quiet.trained_like import keys, trained_like
-from keyss.channels import QuietReader, gaussian_ids, read_low_bits, salt_rows, usable_carriers
+from keyss.channels import Layout, QuietReader, gaussian_ids, salt_rows, usable_carriers
 from keyss.core import Gaussians, KeyssWarning, UsageError, WrongKeyError
 
 
@@ -69,8 +69,8 @@ def test_a_cover_with_stale_salts_opens_from_what_pruning_leaves() -> None:
 
 def test_salts_of_ordinary_models_are_fresh() -> None:
     cover = trained_like(3000)
-    rows = salt_rows(cover, gaussian_ids(cover))
+    rows = salt_rows(cover, gaussian_ids(cover), Layout.of(cover))
     assert usable_carriers(cover)[rows].all()
     stego = embed_derived(cover, [(keys(), b"secret")])
-    assert np.array_equal(salt_rows(stego, gaussian_ids(stego), read_low_bits(stego)), rows)
+    assert np.array_equal(salt_rows(stego, gaussian_ids(stego), Layout.of(stego)), rows)
     assert not set(salts_of(cover)) & set(salts_of(stego))

@@ -14,8 +14,7 @@ from channels.quiet.trained_like import keys, trained_like
 from keyss.channels import LOW_BITS, QuietReader, chance_of_bits, read_low_bits, usable_carriers
 from keyss.channels.quiet import usable
 from keyss.channels.quiet.bits import Layout, used_words, write_low_bits
-from keyss.channels.quiet.predictability import count_trailing_zeros, least_exponent
-from keyss.channels.quiet.siblings import chance_of_equal_steps
+from keyss.channels.quiet.predictability import chance_of_equal_steps, count_trailing_zeros, least_exponent
 from keyss.channels.quiet.usable import MAX_SEPARATION, check_usable
 from keyss.core import Gaussians, UsageError, same_bits
 from keyss.lab.stealth.judging import stealth_statistics
@@ -125,7 +124,7 @@ def test_bits_that_depend_on_each_other_are_refused() -> None:
     with pytest.raises(UsageError, match=r"low bits of (f_rest|harmonics) in this cover are not random"):
         LOW_BITS.prepare(model)
     usable = np.ones(4000, bool)
-    check_usable(trained_like(4000, 2), usable)
+    check_usable(trained_like(4000, 2), usable, Layout(3))
 
 
 def test_clones_stay_as_they_are() -> None:

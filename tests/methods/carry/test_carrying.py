@@ -12,6 +12,7 @@ import torch
 from channels.quiet.trained_like import keys, trained_like
 from keyss.channels import (
     LOW_BITS,
+    Layout,
     LowBitsCover,
     QuietReader,
     gaussian_ids,
@@ -124,7 +125,7 @@ def test_bit_flip_loses_one_carrier(cover: Gaussians, secret: Gaussians) -> None
     whole = rows_of(extract(stego, KEY).gaussians)
     random = np.random.default_rng(0)
     names = QuietReader.of(stego).salts
-    first = int(salt_rows(stego, gaussian_ids(stego), read_low_bits(stego))[0])
+    first = int(salt_rows(stego, gaussian_ids(stego), Layout.of(stego))[0])
     for trial in range(60):
         row = first if trial < 5 else int(random.integers(len(stego)))
         changed = _with_flipped_bit(stego, row, int(random.integers(59)), int(random.integers(31)))
@@ -158,7 +159,7 @@ def test_foreign_gaussians_do_not_block_salts(stego: Gaussians, secret: Gaussian
     own = QuietReader.of(stego).salts
     added = trained_like(200, seed=9)
     added.sh[:, 1:] *= 20
-    added = added[torch.from_numpy(salt_rows(added, gaussian_ids(added), read_low_bits(added))[:3])]
+    added = added[torch.from_numpy(salt_rows(added, gaussian_ids(added), Layout.of(added))[:3])]
     crowded = Gaussians.cat([added, stego])
     assert not set(own) & set(QuietReader.of(crowded).salts[:3])
     assert rows_of(extract(crowded, KEY).gaussians) == rows_of(extract(stego, KEY).gaussians)

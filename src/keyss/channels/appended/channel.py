@@ -18,8 +18,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from keyss.channels.appended import packets, pilots
+from keyss.channels.appended import pilots
 from keyss.channels.appended.words import (
+    HEADERS,
     WORD_BITS,
     all_shifts,
     candidate_mask,
@@ -30,10 +31,14 @@ from keyss.channels.appended.words import (
     own_frame,
     pack_words,
     points_in_frame,
+    read_header,
+    read_packets,
     scale_steps,
     scales_at,
     sort_by_rotation,
     to_gaussians,
+    write_header,
+    write_packets,
 )
 from keyss.channels.base import (
     METHOD_BYTES,
@@ -83,7 +88,6 @@ _VISIBLE_SECRETS = (
 class Appended(Channel):
     """The channel; see `keyss.channels.base.Channel`."""
 
-    name = "appended"
     place = "appended Gaussians"
     survives = True
     grows = True
@@ -100,7 +104,7 @@ class Appended(Channel):
         """The number of Gaussians appended for payloads of these compressed sizes in bytes."""
         single = len(sizes) == 1
         every = [_codewords_for(size + _HOST.size, single) for size in sizes]
-        return _padded_count(sum(packets.HEADERS + each.chunks for each in every))
+        return _padded_count(sum(HEADERS + each.chunks for each in every))
 
 
 APPENDED = Appended()
@@ -167,16 +171,16 @@ class AppendedReader(SaltedReader):
                     best = found, scales
             if best is not None:
                 found, scales = best
-                words = pack_words(colours, scales, points_in_frame(faint, found.to_own))
+                words = pack_words(colours, scales, *points_in_frame(faint, found.to_own))
                 return AppendedReader([found.salt], words, _coarse_ids(model))
         return None
 
     def extract(self, key: DerivedKey) -> Payload:
         """`open` after key derivation."""
         for width in (_WIDE, _NARROW):
-            header = packets.read_header(key.expand(f"appended/header/{width}", 32), self.words, width)
+            header = read_header(key.expand(f"appended/header/{width}", 32), self.words, width)
             if header:
-                numbers, data = packets.read(key.expand("appended/packets", 32), self.words, width)
+                numbers, data = read_packets(key.expand("appended/packets", 32), self.words, width)
                 encrypted = _codewords(header, width).decode(numbers.astype(np.int64), data, errors=True)
                 whole = decrypt(key.expand("appended/data", 32), encrypted, _ASSOCIATED)
                 if len(whole) < _HOST.size:
@@ -241,7 +245,7 @@ def _words(key: DerivedKey, packed: bytes, single: bool, random: np.random.Gener
     numbers = np.arange(codewords.chunks, dtype=np.uint64)
     return np.concatenate(
         [
-            packets.write_header(key.expand(f"appended/header/{width}", 32), needed, width, random),
-            packets.write(key.expand("appended/packets", 32), numbers, codewords.encode(encrypted)),
+            write_header(key.expand(f"appended/header/{width}", 32), needed, width, random),
+            write_packets(key.expand("appended/packets", 32), numbers, codewords.encode(encrypted)),
         ]
     )

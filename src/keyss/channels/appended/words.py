@@ -7,6 +7,10 @@ Every number is a point of a lattice coarser than the rounding of any format (do
              quaternion, whose w is positive and the largest, of 5 bits each
 
 Opacity is just above 1/255, which 8 bits round to 1.
+
+A *packet* is a word of 6 or 8 bytes of data and a tag, which looks random without the key. The tag fills the
+word: it is the packet's number, masked with the AES-256 encryption of the data. Under the right key, packets
+have valid numbers and other words rarely do; Reed-Solomon corrects the few that do.
 """
 
 from __future__ import annotations
@@ -17,13 +21,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from keyss.core.arrays import Bits, Doubles, Flags, Integers, Words, doubles
+from keyss.channels.mixing import encrypted_blocks
+from keyss.core.arrays import Bits, Bytes, Doubles, Flags, Integers, Words, doubles
 from keyss.core.errors import UsageError
 from keyss.core.gaussians import DRAWN_OPACITY, Gaussians
 from keyss.core.similarity import Similarity
 from keyss.files.formats.common import with_largest_w
 
-COLOUR_BITS, SCALE_BITS, POSITION_BITS, ROTATION_BITS = 7, 6, 10, 5
+_WIDTHS = COLOUR_BITS, SCALE_BITS, POSITION_BITS, ROTATION_BITS = 7, 6, 10, 5
 INVARIANT_BITS = 3 * (COLOUR_BITS + SCALE_BITS)
 WORD_BITS = INVARIANT_BITS + 3 * (POSITION_BITS + ROTATION_BITS)
 
@@ -39,6 +44,9 @@ _SMALL = -9.0  # smallest log scale, relative to the cube's
 # Bound of x, y and z, so that w is the largest. A step is 16 of `.spz`, which compress better.
 _ROTATION_REACH = 256 / 511 * 0.5**0.5
 _FARTHEST, _MAX_SHIFTS = 1 << 12, 500  # range of log scales, in steps; maximum number of offsets to try
+HEADERS = 40  # copies of a header
+HEADER_BITS = 20
+_MIN_VOTES = 12  # headers; fewer can agree by chance among a million words
 
 
 def candidate_mask(model: Gaussians) -> Flags:
@@ -144,24 +152,19 @@ def all_shifts(steps: Doubles) -> Doubles:
     return np.arange(low - 2 ** (SCALE_BITS - 1), max(most, low), 0.25)
 
 
-def points_in_frame(model: Gaussians, to_own: Similarity) -> Integers:
-    """Nearest lattice points [N, 6] of positions and rotations; `to_own`: world to own frame."""
+def points_in_frame(model: Gaussians, to_own: Similarity) -> tuple[Integers, Integers]:
+    """Nearest lattice points [N, 3] of positions and of rotations; `to_own`: world to own frame."""
     own = to_own.apply_gaussians(model.with_sh_degree(0))
     positions = own.means.double().numpy() * 2**POSITION_BITS - 0.5
     parts = with_largest_w(own.quats.double().numpy())[:, 1:]
     rotations = (parts + _ROTATION_REACH) / (2 * _ROTATION_REACH) * 2**ROTATION_BITS - 0.5
-    return np.concatenate([_nearest(positions, POSITION_BITS), _nearest(rotations, ROTATION_BITS)], axis=1)
+    return _nearest(positions, POSITION_BITS), _nearest(rotations, ROTATION_BITS)
 
 
-def pack_words(colours: Integers, scales: Integers, others: Integers) -> Bits:
-    """Words [N, WORD_BITS] from colours [N, 3], scales [N, 3], and positions and rotations [N, 6]."""
-    parts = [
-        (colours, COLOUR_BITS),
-        (scales, SCALE_BITS),
-        (others[:, :3], POSITION_BITS),
-        (others[:, 3:], ROTATION_BITS),
-    ]
-    bits = [bits_of(each[:, axis].astype(np.uint64), width) for each, width in parts for axis in range(3)]
+def pack_words(*fields: Integers) -> Bits:
+    """Words [N, WORD_BITS] from colours, scales, positions and rotations, [N, 3] each."""
+    both = zip(fields, _WIDTHS, strict=True)
+    bits = [bits_of(column.astype(np.uint64), width) for each, width in both for column in each.T]
     return np.concatenate(bits, axis=1)
 
 
@@ -172,22 +175,56 @@ def invariants_of(colours: Integers, scales: Integers) -> Words:
     return (colour_bits << 3 * SCALE_BITS | scale_bits).astype(np.uint64)
 
 
-def number(bits: Bits) -> Words:
+def bits_of(numbers: Words, count: int) -> Bits:
+    """The inverse of `_number`: bits [N, count]."""
+    shifts = np.arange(count, dtype=np.uint64)[::-1]
+    return (numbers[:, None] >> shifts & np.uint64(1)).astype(np.uint8)
+
+
+def write_packets(key: bytes, numbers: Words, data: Bytes) -> Bits:
+    """Words [N, WORD_BITS] of packets with `numbers` [N] and `data` [N, width]; `key`: 32 bytes."""
+    tag_bits = WORD_BITS - 8 * data.shape[1]
+    tags = bits_of(_masks(key, data, tag_bits) ^ numbers, tag_bits)
+    return np.concatenate([np.unpackbits(data, axis=1), tags], axis=1)
+
+
+def read_packets(key: bytes, words: Bits, width: int) -> tuple[Words, Bytes]:
+    """Numbers [N] and data [N, width] of words [N, WORD_BITS], as if all were packets."""
+    data = np.packbits(words[:, : 8 * width], axis=1)
+    tags = words[:, 8 * width :]
+    return _number(tags) ^ _masks(key, data, tags.shape[1]), data
+
+
+def write_header(key: bytes, value: int, width: int, random: np.random.Generator) -> Bits:
+    """Words [HEADERS, WORD_BITS] that all hold `value`, a number of HEADER_BITS."""
+    data = random.integers(0, 256, (HEADERS, width), np.uint8)
+    return write_packets(key, np.full(HEADERS, value, np.uint64), data)
+
+
+def read_header(key: bytes, words: Bits, width: int) -> int | None:
+    """The value of the headers by majority; None if too few agree."""
+    numbers, _ = read_packets(key, words, width)
+    votes = np.bincount(numbers[numbers < 1 << HEADER_BITS].astype(np.int64), minlength=1)
+    return int(votes.argmax()) if votes.max() >= _MIN_VOTES else None
+
+
+def _number(bits: Bits) -> Words:
     """Integers [N] from bits [N, B], most significant first; B is at most 64."""
     powers = np.uint64(1) << np.arange(bits.shape[1], dtype=np.uint64)[::-1]
     return bits.astype(np.uint64) @ powers
 
 
-def bits_of(numbers: Words, count: int) -> Bits:
-    """The inverse of `number`: bits [N, count]."""
-    shifts = np.arange(count, dtype=np.uint64)[::-1]
-    return (numbers[:, None] >> shifts & np.uint64(1)).astype(np.uint8)
+def _masks(key: bytes, data: Bytes, bits: int) -> Words:
+    """Masks [N] of tags."""
+    blocks = np.zeros((len(data), 16), np.uint8)
+    blocks[:, : data.shape[1]] = data
+    return encrypted_blocks(key, blocks).view(">u8")[:, 0].astype(np.uint64) >> np.uint64(64 - bits)
 
 
 def _split(words: Bits) -> list[Doubles]:
     """Colours, scales, positions and rotations, [N, 3] each."""
     fields, at = [], 0
-    for width in (COLOUR_BITS, SCALE_BITS, POSITION_BITS, ROTATION_BITS):
+    for width in _WIDTHS:
         own = words[:, at : at + 3 * width].reshape(-1, 3, width)
         fields.append(own.astype(np.float64) @ 2.0 ** np.arange(width)[::-1])
         at += 3 * width

@@ -76,28 +76,19 @@ class Fountain:
         return (total[: self.size] < 0).astype(np.uint8)
 
     def _equations(self, seeds: Words) -> tuple[Integers, Integers, Integers]:
-        """Members [m] of all code bits; start [n] of each code bit's members; code bit [m] of each member."""
+        """Members [m] of all code bits; start [n] of each code bit's members; code bit [m] of each member.
+
+        A member drawn twice cancels itself, in encoding and decoding alike.
+        """
         length = self.size + self.parity
         every = np.repeat(*np.transpose(self.degrees)).clip(1, length // 4)
         degrees = every[(mix(seeds) >> np.uint64(57)).astype(np.int64)]
-        return _draw(seeds, degrees, length), np.cumsum(degrees) - degrees, _rows(degrees)
+        starts, rows = np.cumsum(degrees) - degrees, np.repeat(np.arange(len(degrees)), degrees)
+        rank = np.arange(1, len(rows) + 1) - starts[rows]
+        drawn = mix(seeds[rows] ^ rank.astype(np.uint64) * _RANK) >> np.uint64(32)
+        return (drawn * np.uint64(length) >> np.uint64(32)).astype(np.int64), starts, rows
 
     def _checks(self) -> Integers:
         """Data bits [parity, k] of each parity bit; each data bit is in _REPEATS of them."""
         order = np.argsort(mix(np.arange(_REPEATS * self.size, dtype=np.uint64)), kind="stable") // _REPEATS
         return np.resize(order, (self.parity, -(-len(order) // self.parity)))
-
-
-def _draw(seeds: Words, degrees: Integers, length: int) -> Integers:
-    """For each of the seeds [n], draw as many numbers below `length` as its degree: [m] in all.
-
-    A number drawn twice cancels itself, in encoding and decoding alike.
-    """
-    rows = _rows(degrees)
-    rank = np.arange(1, len(rows) + 1) - (np.cumsum(degrees) - degrees)[rows]
-    drawn = mix(seeds[rows] ^ rank.astype(np.uint64) * _RANK) >> np.uint64(32)
-    return (drawn * np.uint64(length) >> np.uint64(32)).astype(np.int64)
-
-
-def _rows(degrees: Integers) -> Integers:
-    return np.repeat(np.arange(len(degrees)), degrees)

@@ -14,14 +14,14 @@ import hashlib
 import hmac
 import struct
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 
 import numpy as np
 
 from keyss.channels.colours.carriers import Carriers, fractions
 from keyss.channels.colours.fountain import NOISY, Fountain
 from keyss.channels.colours.qim import COLUMNS, ONE, read, seeds, write
-from keyss.core.arrays import Bits, Doubles, Flags, Integers
+from keyss.core.arrays import Doubles, Flags, Integers
 from keyss.keys.derivation import SALT_BYTES, DerivedKey, expand
 
 PLACES = 80  # Gaussians of a header under each salt
@@ -89,18 +89,14 @@ class Header:
         off = (median(carriers) - self.median + 128) % 256 - 128
         return off / _MEDIAN_STEPS
 
-    def bits(self, secrets: Secrets) -> Bits:
-        """The bits of the header and its MAC."""
-        numbers = (self.level, self.first, self.last, self.bucket, self.idle, self.median)
-        plain = struct.pack(_FORMAT, self.file_key, *numbers)
-        return np.unpackbits(np.frombuffer(plain + secrets.check(plain), np.uint8))
-
     def write(self, secrets: Secrets, salt: int, carriers: Carriers) -> tuple[Integers, Doubles]:
         """The carriers [P] of the header under one salt, and their new values [P, 2]."""
         secret, depth = secrets.salted[salt], DEPTHS[self.level != ONE]
         rows, pilots = places(secret, carriers)
         ids, counts = carriers.ids[rows], np.full(len(rows), depth)
-        code = _CODE.encode(self.bits(secrets), seeds(secret, "header-seeds", ids, counts))
+        plain = struct.pack(_FORMAT, *astuple(self))
+        data = np.unpackbits(np.frombuffer(plain + secrets.check(plain), np.uint8))
+        code = _CODE.encode(data, seeds(secret, "header-seeds", ids, counts))
         code[np.repeat(pilots, COLUMNS * depth)] = 0
         return rows, write(secret, ids, carriers.colours[rows, 1:], counts, code)
 
@@ -120,8 +116,9 @@ def _read(
     for salt, (secret, (rows, pilots)) in enumerate(zip(secrets.salted, found, strict=True)):
         ids, counts = carriers.ids[rows], np.full(len(rows), depth)
         known = np.repeat(pilots, COLUMNS * depth)
-        sure = _HELD * (1 - carriers.error_probability[rows]) / carriers.id_counts[rows]
-        every = np.repeat(sure, COLUMNS * depth) * read(secret, ids, carriers.colours[rows, 1:], counts)
+        every = np.repeat(_HELD * carriers.certainty[rows], COLUMNS * depth) * read(
+            secret, ids, carriers.colours[rows, 1:], counts
+        )
         odds.append(_PRIOR + np.log1p(every[known]).sum())
         hints.append(every[~known])
         words.append(seeds(secret, "header-seeds", ids, counts)[~known])

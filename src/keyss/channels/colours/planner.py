@@ -5,7 +5,7 @@ A payload is detectable by the variance that writing adds, which is smallest per
 be changed, it gets all carriers and the lowest level that holds it. A small payload changes only values whose
 new value is as likely as the old one (`likelihood`).
 
-A writer excludes some Gaussians. Readers need not know which: an unchanged value reads as lost.
+A writer excludes conspicuous Gaussians. Readers need not know which: an unchanged value reads as lost.
 """
 
 from __future__ import annotations
@@ -18,11 +18,10 @@ from itertools import product
 
 import numpy as np
 
-from keyss.channels.colours.carriers import Carriers
+from keyss.channels.colours.carriers import SALTS, Carriers
 from keyss.channels.colours.header import PLACES, SHARES, bucket_bytes
 from keyss.channels.colours.likelihood import Likelihood
 from keyss.channels.colours.qim import COLUMNS, LEVELS, ONE, SPACING, bit_counts
-from keyss.channels.colours.salt_gaussians import SALTS
 from keyss.core.arrays import Doubles, Flags, Floats, Integers, doubles
 from keyss.core.gaussians import Gaussians
 from keyss.keys.encryption import OVERHEAD
@@ -31,6 +30,7 @@ from keyss.rendering.orbit import psnr_between
 MIN_HEADERS = 2  # minimum number of headers in a file at level ONE; those without a secret are noise
 _RATE = 0.42  # data bits per expected bit of information
 _GARBAGE = 0.02  # share of carriers whose ID changes although it seemed stable
+STRENGTH = 45.0  # minimum PSNR in dB between views of the stego model and of the cover
 _COMFORTABLE = 0.8  # load of a share at level ONE, if that is enough; the rest compensates for losses
 _ROBUST = 0.5  # the same at other levels: such a payload is detectable anyway
 _MARGIN = 0.5  # dB by which the actual cost of a payload may exceed the predicted cost
@@ -52,11 +52,10 @@ class Layout:
 
 @dataclass(frozen=True, eq=False)
 class Planner:
-    """Plans payloads for a model whose views keep a PSNR of `strength` dB."""
+    """Plans payloads for a model whose views keep a PSNR of STRENGTH."""
 
     model: Gaussians
     carriers: Carriers
-    strength: float
 
     @cached_property
     def bytes(self) -> int:
@@ -93,19 +92,23 @@ class Planner:
 
     @cached_property
     def _max_share(self) -> float:
-        """The maximum share of the carriers at level ONE that keeps `strength`."""
-        share = 10 ** ((self._psnr(ONE) - self.strength - _MARGIN) / 10)
+        """The maximum share of the carriers at level ONE that keeps STRENGTH."""
+        share = 10 ** ((self._psnr(ONE) - STRENGTH - _MARGIN) / 10)
         return float(min(1.0, share)) - 1 / SHARES  # shares are rounded up
 
     @cached_property
     def _max_level(self) -> int:
-        """The highest level that keeps `strength` with all carriers; ONE if there is none."""
+        """The highest level that keeps STRENGTH with all carriers; ONE if there is none."""
         levels = range(1, LEVELS)
-        return bisect_left(levels, True, key=lambda each: self._psnr(each) < self.strength + _MARGIN)
+        return bisect_left(levels, True, key=lambda each: self._psnr(each) < STRENGTH + _MARGIN)
+
+    def is_visible(self, stego: Gaussians) -> bool:
+        """True if views of `stego` do not keep STRENGTH."""
+        return psnr_between(self.model, stego) < STRENGTH
 
     def _psnr(self, level: int) -> float:
         """PSNR of the model's views, in dB, after writing all carriers at `level`."""
-        rows = self.carriers.representatives[~self.excluded[self.carriers.representatives]]
+        rows = self.writable
         bits = bit_counts(self.carriers.impact[rows], level)[:, None]
         places = np.random.default_rng(0).uniform(-0.5, 0.5, (len(rows), COLUMNS))  # in steps
         sh = self.model.sh.detach().clone()
@@ -115,24 +118,25 @@ class Planner:
 
     def _level_bytes(self, level: int, likely: bool = False) -> float:
         """Bytes that all carriers hold, from the expected information of a reader."""
-        rows = self.carriers.representatives
-        if not len(rows):
+        rows, ids = self.writable, len(self.carriers.representatives)
+        if not ids:
             return 0.0
-        sure = (1 - _GARBAGE) * (1 - self.carriers.error_probability[rows]) / self.carriers.id_counts[rows]
-        error = ((1 - (self.acceptance if likely else 1.0) * sure) / 2).clip(1e-12, 0.5)  # per bit
+        sure = (1 - _GARBAGE) * self.carriers.certainty[rows] * (self.acceptance if likely else 1.0)
+        error = ((1 - sure) / 2).clip(1e-12, 0.5)  # per bit
         information = 1 + error * np.log2(error) + (1 - error) * np.log2(1 - error)
-        bits = COLUMNS * bit_counts(self.carriers.impact[rows], level) * information * ~self.excluded[rows]
+        bits = COLUMNS * bit_counts(self.carriers.impact[rows], level) * information
         headers = SALTS * PLACES * (MIN_HEADERS if level == ONE else 1)
-        return float(_RATE * np.exp(-headers / len(rows)) * bits.sum() / 8)
+        return float(_RATE * np.exp(-headers / ids) * bits.sum() / 8)
 
     @cached_property
     def statistics(self) -> ColourStatistics:
         return ColourStatistics(self.model, self.carriers.rows)
 
     @cached_property
-    def excluded(self) -> Flags:
-        """Mask [C] of the carriers that are never written."""
-        return self.statistics.excluded()
+    def writable(self) -> Integers:
+        """The carriers [W] that may be written: of each ID one, unless its colour is conspicuous."""
+        rows = self.carriers.representatives
+        return rows[~self.statistics.conspicuous()[rows]]
 
     @cached_property
     def likelihood(self) -> Likelihood:
@@ -143,25 +147,23 @@ class Planner:
     @cached_property
     def acceptance(self) -> float:
         """The share of new values that `likelihood` accepts."""
-        rows = self.carriers.representatives[~self.excluded[self.carriers.representatives]]
-        if not len(rows):
+        if not len(self.writable):
             return 0.0
         changed = self.carriers.colours.copy()
-        changed[rows] = self._noisy_colours[rows]
+        changed[self.writable] = self._noisy_colours[self.writable]
         accepted = self.likelihood.accept(self.carriers.colours, changed, np.random.default_rng(2))
-        return float(accepted[rows].mean())
+        return float(accepted[self.writable].mean())
 
     @cached_property
     def headers_may_skip(self) -> bool:
         """True if headers may skip unlikely values, because enough of their places are still written."""
-        return self.acceptance * (1 - float(self.excluded[self.carriers.representatives].mean())) > _WRITTEN
+        return self.acceptance * len(self.writable) > _WRITTEN * len(self.carriers.representatives)
 
     @cached_property
     def _noisy_colours(self) -> Doubles:
         """Colours [C, 3] with noise in green and blue such as writing adds."""
         noise = np.random.default_rng(1).uniform(-SPACING, SPACING, (len(self.carriers), COLUMNS))
-        colours = self.carriers.colours
-        return np.hstack([colours[:, :1], self.statistics.imitate(colours[:, 1:] + noise)])
+        return self.statistics.imitate(self.carriers.colours[:, 1:] + noise)
 
 
 def bucket_of(size: int) -> int:
@@ -180,7 +182,7 @@ class ColourStatistics:
         self._rounded = bool(len(repeated)) and float(repeated.mean()) > _ROUNDED
         self._colours, self._repeated = colours[rows], repeated[rows].any(axis=1)
 
-    def excluded(self) -> Flags:
+    def conspicuous(self) -> Flags:
         """Mask [C] of carriers with a colour that is repeated, typed, or equal in two channels.
 
         Empty for a rounded model, where all are repeated. Nearly equal colours are not excluded: unchanged,
@@ -190,11 +192,11 @@ class ColourStatistics:
             return np.zeros(len(self._colours), bool)
         typed = ((self._colours.view(np.uint32) & _SHORT) == 0).any(axis=1)
         grey = (self._colours == np.roll(self._colours, 1, axis=1)).any(axis=1)
-        excluded: Flags = self._repeated | typed | grey
-        return excluded
+        found: Flags = self._repeated | typed | grey
+        return found
 
-    def imitate(self, new: Doubles) -> Floats:
-        """Give `new` greens and blues [C, 2] the statistics of the model; unchanged ones stay.
+    def imitate(self, new: Doubles) -> Doubles:
+        """The colours [C, 3] with `new` greens and blues [C, 2], given the statistics of the model.
 
         In a rounded model, they take the nearest of its values from which a reader reads the same. In others,
         they keep the last bits of the old values, which are not quite random after training.
@@ -207,4 +209,5 @@ class ColourStatistics:
                 wanted = new[:, column]
                 nearest = existing[np.searchsorted((existing[1:] + existing[:-1]) / 2, wanted)]
                 values[:, column] = np.where(np.abs(nearest - wanted) <= SPACING / 2, nearest, wanted)
-        return np.where(new == old, old, values)
+        values = np.where(new == old, old, values)
+        return np.hstack([self._colours[:, :1], values]).astype(np.float64)

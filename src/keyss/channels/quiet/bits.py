@@ -176,16 +176,18 @@ def write_low_bits(
 
 def used_words(gaussians: Gaussians) -> Words32:
     """[N, F] bit patterns of scales, quaternions, opacity and harmonics above degree 0; a copy."""
-    return np.concatenate([_words(values) for values in _used_fields(gaussians)], axis=1)
+    return np.concatenate(group_words(gaussians), axis=1)
 
 
-def _used_fields(gaussians: Gaussians) -> tuple[torch.Tensor, ...]:
-    return gaussians.log_scales, gaussians.quats, gaussians.opacity_logits, gaussians.sh[:, 1:]
+def group_words(gaussians: Gaussians) -> list[Words32]:
+    """The columns [N, C] of `used_words` by group; views where possible."""
+    groups = gaussians.log_scales, gaussians.quats, gaussians.opacity_logits, gaussians.sh[:, 1:]
+    return list(map(_words, groups))
 
 
 def _written_fields(gaussians: Gaussians, layout: Layout) -> tuple[list[Words32], Words32]:
     """Bit patterns of scales, quaternions (if in use) and opacities; and of harmonics."""
-    *geometry, harmonics = map(_words, _used_fields(gaussians))
+    *geometry, harmonics = group_words(gaussians)
     kept = [each for each in geometry if layout.quats or each.shape[1] != 4]
     return kept, harmonics[:, : layout.harmonics]
 

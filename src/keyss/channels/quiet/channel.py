@@ -4,10 +4,9 @@ A file has no magic number and no index of its secrets. Bits are stored in *carr
 Gaussian, or one block of last bits of codes (see `wet_paper`). A carrier holds encrypted *cells*, each with a
 tag: a reader decrypts all of them and keeps those with a valid tag.
 
-- The *salt* of Argon2id is a hash of one carrier without cells. Gaussians may be removed, so there are SALTS
-  salts (see `salts`). A salt is *stale* if its Gaussian is not usable: the author of the cover knows it in
-  advance, so no key cell is written for it. A reader tries SALTS_TRIED salts; covers with as many stale salts
-  are refused.
+- A *salt* of Argon2id is a hash of one carrier without cells (see `usable`). It is *stale* if that Gaussian is
+  not usable: the author of the cover knows it in advance, so no key cell is written for it. A reader tries
+  SALTS_TRIED salts; covers with as many stale salts are refused.
 - *Key cells*, encrypted under the key and a salt, hold the data key of a secret.
 - *Parameter cells*, encrypted under the data key, tell how to read the rest (see `parameters`).
 - *Records* are encrypted under the data key: Gaussians, or numbered chunks of an encrypted payload (see
@@ -37,14 +36,22 @@ from keyss.channels.base import SALTS_TRIED, Capacity, Channel, Content, check_k
 from keyss.channels.mixing import random_fractions
 from keyss.channels.quiet import wet_paper
 from keyss.channels.quiet.bits import Layout, read_low_bits, write_low_bits
+from keyss.channels.quiet.contents import Writer, bytes_of
 from keyss.channels.quiet.decoded import Decoded
-from keyss.channels.quiet.fields import FORMATS, Field, Levels, carrying, last_bits
+from keyss.channels.quiet.fields import (
+    FORMATS,
+    Field,
+    Levels,
+    file_order,
+    in_counted_order,
+    in_rows,
+    last_bits,
+    model_hash,
+    with_levels,
+)
 from keyss.channels.quiet.layout import BLOCK_HEADER, LEAST_BYTES, MIN_BLOCKS, LowBitsCapacity
-from keyss.channels.quiet.order import file_order, in_counted_order, in_rows, model_hash
-from keyss.channels.quiet.salts import salt, salt_rows
-from keyss.channels.quiet.usable import check_usable, usable_with_ids
+from keyss.channels.quiet.usable import check_usable, salt, salt_rows, usable_with_ids
 from keyss.channels.quiet.writable_levels import fixed_axes, writable_levels
-from keyss.channels.quiet.writing import Writer, bytes_of
 from keyss.core.arrays import Bits, Bytes, Flags, Integers
 from keyss.core.errors import KeyssWarning, UsageError
 from keyss.core.gaussians import Gaussians
@@ -64,7 +71,6 @@ _FIRST_IS_STALE = (
 class LowBits(Channel):
     """The channel in the low bits of floats; see `keyss.channels.base.Channel`."""
 
-    name = "quiet"
     place = "low bits"
     records = True
 
@@ -83,7 +89,7 @@ class LowBits(Channel):
         if (found := self._found.get(cover)) is None or found[0] != versions:
             usable, ids = usable_with_ids(cover, layout)
             check_usable(cover, usable, layout)
-            rows = salt_rows(cover, ids, layout=layout)
+            rows = salt_rows(cover, ids, layout)
             stale = int((~usable[rows]).sum())
             if stale >= SALTS_TRIED:
                 raise UsageError(
@@ -107,8 +113,6 @@ class InCodes(Channel):
 
     The file of these codes is published, or a model that was `decoded` from them.
     """
-
-    name = "quiet"
 
     def __init__(self, format: str, decoded: Decoded | None = None) -> None:
         self.format, self.decoded = format, decoded
@@ -170,7 +174,7 @@ class LowBitsCover:
         """
         check_keys([keys[0].verifier() for keys, _ in contents])
         fresh, _ = self._salts(entropy)
-        writer = Writer(self.ids[self._rows], self.layout.width, entropy, self.ids)
+        writer = Writer(self.ids[self._rows], self.layout.width, entropy, len(self.ids), self.ids)
         writer.write(contents)
         parts = [(self.salt_rows[self.fresh_salts], fresh), (self._rows[writer.order], writer.table)]
         return write_low_bits(self.cover, self.layout, parts, in_place=self.overwrites)
@@ -275,11 +279,12 @@ class CodesCover:
         """
         noise = np.frombuffer(stream(entropy, "codes/free", -(-len(self.dry) // 8)), np.uint8)
         bits = np.where(self.dry, np.unpackbits(noise)[: len(self.dry)], last_bits(self.fields))
-        message, rows = np.unpackbits(table, bitorder="little"), wet_paper.matrix(8 * self.width)
-        solved = wet_paper.write(bits[self.places], self.dry[self.places], message, rows)
-        if solved is not None:
-            bits[self.places] = solved
-        return None if solved is None else bits
+        messages = np.unpackbits(table, axis=1, bitorder="little")
+        solved = wet_paper.write(bits[self.places], self.dry[self.places], messages)
+        if solved is None:
+            return None
+        bits[self.places] = solved
+        return bits
 
     def _written(self, bits: Bits, entropy: bytes) -> Codes:
         columns: dict[str, list[Levels]] = {}
@@ -289,7 +294,7 @@ class CodesCover:
             levels = np.where(free, field.with_bits(own, ties), field.levels)
             columns.setdefault(field.name, []).append(levels)
         attributes = {name: np.stack(each, axis=1) for name, each in columns.items()}
-        written: Codes = carrying(self.codes).with_levels(self.codes, attributes)
+        written: Codes = with_levels(self.codes, attributes)
         return written
 
     def _published(self, codes: Codes, entropy: bytes) -> Gaussians:

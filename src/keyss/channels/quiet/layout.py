@@ -29,6 +29,7 @@ import numpy as np
 from keyss.channels.base import Capacity, RecordPlan, RecordRequest
 from keyss.channels.quiet.bits import Layout
 from keyss.channels.quiet.cells import TAG_BYTES
+from keyss.channels.quiet.usable import SALTS
 from keyss.channels.reed_solomon import SYMBOL_BYTES, Codewords
 from keyss.channels.sketch import SKETCH_BYTES
 from keyss.core.arrays import Bytes, Integers
@@ -36,7 +37,6 @@ from keyss.core.errors import UsageError
 from keyss.keys.encryption import SMALLEST_BUCKET, encrypted_size
 
 DATA_KEY_BYTES = 16
-SALTS = 12  # random pruning of a quarter removes all their Gaussians with p = 6e-8
 KEY_COPIES = 12  # copies of the data key for each salt
 PARAMETER_COPIES = 24  # copies of each part; pruning a quarter removes all of them with p = 4e-15
 PREFIX_BYTES = 30  # parameters before the sketch and the method's header (see `parameters`)
@@ -56,15 +56,6 @@ FAILURE = 1e-7  # probability of losing a payload to such removal
 NUMBER_BYTES = 3  # size of a chunk's number
 MAX_CHUNKS = 1024  # chunks per codeword; longer codewords hold little more and are slower
 MAX_CODEWORDS = (1 << 8 * NUMBER_BYTES) // MAX_CHUNKS
-
-
-@dataclass(frozen=True)
-class PayloadPlan:
-    """The cells allocated to a payload."""
-
-    cells_per_carrier: int
-    cells: int
-    codewords: Codewords
 
 
 @dataclass(frozen=True)
@@ -124,8 +115,8 @@ class LowBitsCapacity:
 
     def record_capacity(self, requests: Sequence[RecordRequest]) -> int:
         """The number of records of the minimum size that fit for all requests together."""
-        left = self.carriers - self.reserved([each.header_bytes for each in requests], independent=False)
-        return max(0, left) * self._most_cells(max(request.least_bytes for request in requests))
+        carriers, cells = self._joint(requests)
+        return max(0, carriers) * cells
 
     def max_independent_records(self, least_bytes: int, secrets: int) -> int:
         """The maximum number of records of `least_bytes` for each secret in independent plans."""
@@ -134,10 +125,11 @@ class LowBitsCapacity:
         cells = self._most_cells(least_bytes)
         return cells * self._independent_carriers // (1 << (secrets - 1).bit_length())
 
-    def plan_payloads(self, sizes: Sequence[int]) -> tuple[list[PayloadPlan], bool]:
-        """A plan for each encrypted payload of `sizes` bytes, and True if the plans are independent.
+    def plan_payloads(self, sizes: Sequence[int]) -> tuple[list[tuple[int, int, Codewords]], bool]:
+        """Cells per carrier, cells and codewords for each encrypted payload of `sizes` bytes.
 
-        Raises UsageError, with the number of Gaussians that would suffice.
+        And True if these plans are independent. Raises UsageError, with the number of Gaussians that would
+        suffice.
         """
         alone = [
             next((each for each in self._classes() if self._codewords(*each, size)), None) for size in sizes
@@ -149,7 +141,7 @@ class LowBitsCapacity:
         for each, size in zip(cells, sizes, strict=True):
             if (codewords := self._codewords(*each, size)) is None:
                 raise UsageError(self.too_small(self.carriers, "usable Gaussians", size, len(sizes)))
-            plans.append(PayloadPlan(*each, codewords))
+            plans.append((*each, codewords))
         return plans, independent
 
     def payload_capacity(self, secrets: int) -> int:
@@ -205,8 +197,7 @@ class LowBitsCapacity:
 
     def _most_cells(self, least_bytes: int) -> int:
         """The maximum number of cells per carrier for records of `least_bytes`; 0 if none fits."""
-        cells = [each for each in range(1, MAX_CELLS + 1) if self.record_bytes(each) >= least_bytes]
-        return max(cells, default=0)
+        return min(MAX_CELLS, self.width // (TAG_BYTES + least_bytes)) if self.part_bytes else 0
 
     def _independent_plan(self, request: RecordRequest) -> RecordPlan | None:
         """The plan that depends on this secret only; None if it does not fit."""
@@ -235,18 +226,20 @@ class LowBitsCapacity:
         spare = _DEVIATIONS * (carriers * untouched * (1 - untouched)) ** 0.5
         return shared <= parts * carriers and (not whole or whole <= carriers * untouched - spare)
 
+    def _joint(self, requests: Sequence[RecordRequest]) -> tuple[int, int]:
+        """Carriers for the records of joint plans (may be negative), and the maximum of cells in each."""
+        headers = self.reserved([each.header_bytes for each in requests], independent=False)
+        return self.carriers - headers, self._most_cells(max(each.least_bytes for each in requests))
+
     def _joint_plans(self, requests: Sequence[RecordRequest]) -> list[RecordPlan]:
         """Plans that share all cells: whole carriers, then fewer copies, then smaller cells."""
-        left = self.carriers - self.reserved([each.header_bytes for each in requests], independent=False)
         count = sum(request.count for request in requests)
-        least = max(request.least_bytes for request in requests)
-        for cells in range(1, self._most_cells(least) + 1):
-            if count <= cells * left:
-                copies = min(MAX_COPIES, (cells * left - count) / max(1, count))
-                return [
-                    RecordPlan(self.record_bytes(cells), int(copies * request.count), cells)
-                    for request in requests
-                ]
+        carriers, most = self._joint(requests)
+        for cells in range(1, most + 1):
+            if count <= cells * carriers:
+                copies = min(MAX_COPIES, (cells * carriers - count) / max(1, count))
+                size = self.record_bytes(cells)
+                return [RecordPlan(size, int(copies * request.count), cells) for request in requests]
         raise UsageError(
             f"{count:,} Gaussians are too many for this cover: {self.carriers:,} of its Gaussians can carry "
             f"one, and {self.record_capacity(requests):,} would fit"

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import struct
 from dataclasses import dataclass
+from itertools import takewhile
 
 import numpy as np
 
@@ -80,8 +81,10 @@ def unpack(parts: Bytes, sketch_bytes: int = SKETCH_BYTES) -> Parameters:
     `sketch_bytes`: 0 in blocks.
     """
     numbered = {int(row[0]): row[1:].tobytes() for row in parts}
-    packed = _joined(numbered, PREFIX_BYTES)
-    version, service, name, cells, size, length, gaussians, count = _PREFIX.unpack(packed)
+    packed = b"".join(numbered[each] for each in takewhile(numbered.__contains__, range(len(numbered))))
+    if len(packed) < PREFIX_BYTES:
+        raise InputError(LOST)
+    version, service, name, cells, size, length, gaussians, count = _PREFIX.unpack_from(packed)
     if version != VERSION:
         raise InputError(f"hidden secret of version {version}; this program reads version {VERSION}")
     if service not in (PAYLOAD, RECORDS) or not 1 <= cells <= MAX_CELLS or length > MAX_HEADER_BYTES:
@@ -93,10 +96,11 @@ def unpack(parts: Bytes, sketch_bytes: int = SKETCH_BYTES) -> Parameters:
         method = unpack_method(name)
     except ValueError as error:
         raise InputError(f"the hidden parameters are damaged: {error}") from error
-    rest = _joined(numbered, PREFIX_BYTES + sketch_bytes + length)[PREFIX_BYTES:]
-    return Parameters(
-        service, method, cells, size, gaussians, count, rest[sketch_bytes:], rest[:sketch_bytes]
-    )
+    header, end = PREFIX_BYTES + sketch_bytes, PREFIX_BYTES + sketch_bytes + length
+    if len(packed) < end:
+        raise InputError(LOST)
+    own, sketch = packed[header:end], packed[PREFIX_BYTES:header]
+    return Parameters(service, method, cells, size, gaussians, count, own, sketch)
 
 
 def pack_codewords(size: int, codewords: Codewords) -> bytes:
@@ -114,14 +118,3 @@ def unpack_codewords(header: bytes, record_bytes: int) -> tuple[int, Codewords]:
     except (ValueError, struct.error) as error:
         raise InputError(f"the hidden parameters are damaged: {error}") from error
     return size, codewords
-
-
-def _joined(parts: dict[int, bytes], length: int) -> bytes:
-    """The first `length` bytes. Raises InputError if a part is missing."""
-    data, number = b"", 0
-    while len(data) < length:
-        if number not in parts:
-            raise InputError(LOST)
-        data += parts[number]
-        number += 1
-    return data[:length]

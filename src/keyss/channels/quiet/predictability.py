@@ -1,9 +1,10 @@
-"""Predictability of the low bits of small numbers, estimated from the model itself.
+"""Low bits that an attacker predicts from other bits of the model: of small numbers, and of siblings.
 
-An optimiser that rounds its step before subtracting it leaves numbers on the grid of the larger ones that
-they came from: a number that the last step brought near zero has as many trailing zeros as it is smaller than
-that step. Steps are about exponentially distributed, because Adam bounds them: with the scale 2^(s + 1) of a
-group of fields, a number of binary exponent e has at least z zeros forced upon it with the probability
+*Small numbers*: an optimiser that rounds its step before subtracting it leaves numbers on the grid of the
+larger ones that they came from: a number that the last step brought near zero has as many trailing zeros as
+it is smaller than that step. Steps are about exponentially distributed, because Adam bounds them: with the
+scale 2^(s + 1) of a group of fields, a number of binary exponent e has at least z zeros forced upon it with
+the probability
 
     F(z) = exp(-2^(e + z - 1 - s)), z >= 1
 
@@ -14,13 +15,36 @@ carry none. Both were measured on models that were trained with either rounding.
 The counts of trailing zeros give an upper confidence limit of s, which bounds how well an attacker who knows
 the trainer and the last bit predicts the replaced bits: the chi-square distance of the original bits from
 uniform ones. Numbers below a least exponent are excluded to keep this distance small.
+
+*Siblings* are Gaussians that density control split, whose constant colours predict low bits of harmonics.
+Adam's steps do not depend on the size of a gradient. While one of two siblings is seen alone, or both in one
+direction, all harmonics x of a colour move apart by the same amount, and its constant colour c, whose rate is
+20 times as large in common trainers, by 20 times as much:
+
+    |x(i) - x(j)| = |c(i) - c(j)| / 20
+
+to a few units in the last place. Constant colours are never written. Siblings are near neighbours; where they
+moved in few directions, a part of their harmonics agrees. By chance two or three harmonics of a pair do.
+
+Where all views of a Gaussian have nearly one direction, as those of a far background, the gradients of some
+harmonics keep their ratio throughout: of those of equal order m, if the direction is the axis z. Then two or
+three of a colour move by equal steps in most Gaussians, too few to tell which ones: such a cover is refused.
 """
 
 from __future__ import annotations
 
-import numpy as np
+from typing import Any
 
-from keyss.core.arrays import Doubles, Flags, Integers, Words32
+import numpy as np
+import torch
+
+from keyss.channels.quiet.bits import SH_BITS, UNUSED_BITS
+from keyss.core.arrays import Doubles, Flags, Floats, Integers, Words32, doubles
+from keyss.core.gaussians import Gaussians
+from keyss.core.neighbours import Neighbours, nearest_neighbours
+from keyss.files.formats.common import morton_order
+from keyss.kernels.jit import kernel
+from keyss.kernels.parallel import in_blocks
 
 MAX_ZEROS = 12  # counted at most; numbers with more are rare, or short
 EXPONENTS = 256
@@ -34,6 +58,15 @@ _MARGIN = 8  # octaves beyond the numbers' exponents in the search for s
 _STEP = 0.25  # octaves, resolution of the search
 _LARGEST = 4  # octaves of the scale below the median number: steps of a sixteenth would never converge
 _ROUNDED = np.concatenate([[0.0], 2.0 ** np.arange(-20, 20.5, 0.5)])  # t in units of the smallest exponent
+RATE_RATIO = 20  # learning rate of constant colours / harmonics
+_NEIGHBOURS = 12  # siblings were among the nearest 10 in models of 20,000 to 200,000 Gaussians
+_SHARE = 3  # a third of the harmonics of a colour agree, and at least three
+_ROWS = 1 << 12
+_SAMPLE, _NEAR = 5000, 8  # Gaussians whose pairs of harmonics are tested, and neighbours of each
+_COMPACT, _RUN = 100_000, 2000  # Gaussians that are looked at in larger models, in runs along a Z-order curve
+_PART = 16  # of a cell, within which steps are equal
+_CELL = np.uint32((1 << SH_BITS + UNUSED_BITS) - 1)
+_CELL_SHARE = np.float32(2.0 ** (SH_BITS + UNUSED_BITS - 23))  # cell width / number, up to a factor of 2
 
 
 def count_trailing_zeros(words: Words32, chosen: Flags) -> Integers:
@@ -63,6 +96,62 @@ def least_exponent(counts: Integers, share: float) -> int:
     return int(present[enough[0]]) if len(enough) else int(present[-1]) + 1
 
 
+def find_siblings(gaussians: Gaussians, among: Flags) -> Flags:
+    """[N] which Gaussians `among` [N] moved away from a neighbour by equal steps, as fixed bits tell."""
+    if len(gaussians) < 2 or not gaussians.sh_degree:
+        return np.zeros(len(gaussians), bool)
+    means = np.nan_to_num(doubles(gaussians.means), posinf=0, neginf=0)
+    order = morton_order(means.astype(np.float32))  # neighbours are near in memory, too
+    means, rows = means[order], np.flatnonzero(among[order])
+    neighbours = Neighbours(means, min(_NEIGHBOURS + 1, len(means)))
+    numbers = gaussians.sh.detach().to("cpu", torch.float32).numpy()
+    middles = np.empty((len(means), 3, numbers.shape[1]), np.float32)
+
+    def gather(start: int, stop: int) -> None:
+        sh = numbers[order[start:stop]].transpose(0, 2, 1)
+        middles[start:stop] = _middles(sh)
+        middles[start:stop, :, 0] = sh[:, :, 0] / np.float32(RATE_RATIO)
+
+    in_blocks(gather, len(means), _ROWS)
+    needed = 1 + max(_SHARE, -(-(middles.shape[2] - 1) // _SHARE))
+    apart = np.zeros(len(means), bool)
+
+    def mark(start: int, stop: int) -> None:
+        some = rows[start:stop]
+        _mark(some, neighbours.of(means[some])[1], middles, needed, apart)
+
+    in_blocks(mark, len(rows), _ROWS)
+    siblings = np.zeros(len(means), bool)
+    siblings[order] = apart
+    return siblings & among
+
+
+def chance_of_equal_steps(gaussians: Gaussians, usable: Flags) -> float:
+    """p-value of equal steps of two harmonics under the null hypothesis of uniform low bits of `usable` [N].
+
+    Of differences between neighbours that agree as far as fixed bits tell, those within a sixteenth of a cell
+    are as many as those from one to two sixteenths. Exact binomial tests, Bonferroni-corrected.
+    """
+    from scipy.special import bdtr  # takes long to load
+
+    rows = np.flatnonzero(usable)
+    if len(rows) < 2 or not gaussians.sh_degree:
+        return 1.0
+    means = np.nan_to_num(doubles(gaussians.means), posinf=0, neginf=0)[rows]
+    if len(rows) > 2 * _COMPACT:  # parts of the space with all their Gaussians, as neighbours are needed
+        order = morton_order(means.astype(np.float32))
+        kept = np.concatenate([part[:_RUN] for part in np.array_split(order, _COMPACT // _RUN)])
+        rows, means = rows[kept], means[kept]
+    sample = np.arange(0, len(rows), -(-len(rows) // _SAMPLE))
+    near = nearest_neighbours(means[sample], min(_NEAR + 1, len(rows)), means)[1]
+    sh = gaussians.sh.detach().to("cpu", torch.float32).numpy()[rows]
+    counts = np.zeros((2, sh.shape[1], sh.shape[1]), np.int64)
+    _count_equal(sample, near, sh, _middles(sh), counts)
+    equal, other = counts[:, counts.any(axis=0)]
+    chances = bdtr(other.astype(np.float64), equal + other, 0.5)
+    return min(1.0, float(chances.min(initial=1.0)) * len(chances))
+
+
 def _confidence_limit(counts: Doubles, exponents: Integers) -> float:
     """The upper confidence limit of s for counts [E, MAX_ZEROS + 1] by `exponents` [E].
 
@@ -78,30 +167,23 @@ def _confidence_limit(counts: Doubles, exponents: Integers) -> float:
     return min(limit, float(exponents[np.searchsorted(numbers, numbers[-1] / 2)]) - _LARGEST)
 
 
-def _forced(exponents: Integers, scale: float) -> Doubles:
-    """[E, MAX_ZEROS + 1] F(z): the probability that z zeros or more are forced."""
-    zeros = np.arange(MAX_ZEROS + 1)
-    steps = exponents[:, None] + zeros - 1.0 - scale
-    forced: Doubles = np.exp(-(2.0 ** steps.clip(-60, 10)))
+def _zeros(exponents: Integers, scale: float) -> Doubles:
+    """[E, MAX_ZEROS + 1] probabilities of z trailing zeros; the last: MAX_ZEROS or more."""
+    steps = exponents[:, None] + np.arange(MAX_ZEROS + 1) - 1.0 - scale
+    forced = np.exp(-(2.0 ** steps.clip(-60, 10)))  # F(z)
     forced[:, 0] = 1
-    return forced
-
-
-def _zeros(forced: Doubles) -> Doubles:
-    """[E, MAX_ZEROS + 1] probabilities of z trailing zeros given F(z); the last: MAX_ZEROS or more."""
-    exactly = forced - np.append(forced[:, 1:], np.zeros((len(forced), 1)), axis=1)
-    at_least = np.zeros_like(forced)
-    at_least[:, 0] = 1
+    exactly = -np.diff(forced, append=0)
+    at_least = np.ones_like(forced)
     below = np.zeros(len(forced))  # probability of fewer than z forced zeros but z by chance
     for z in range(1, forced.shape[1]):
         below = (below + exactly[:, z - 1]) / 2
         at_least[:, z] = below + forced[:, z]
-    return at_least - np.append(at_least[:, 1:], np.zeros((len(forced), 1)), axis=1)
+    return -np.diff(at_least, append=0)
 
 
 def _log_likelihood(counts: Doubles, exponents: Integers, scale: float) -> float:
     """The log-likelihood of counts [E, MAX_ZEROS + 1], with the best probability of rounding to even."""
-    chances = _zeros(_forced(exponents, scale)).clip(1e-12)
+    chances = _zeros(exponents, scale).clip(1e-12)
     even = 1 - chances[:, 0]
     inside = float((counts[:, 1:] * np.log(chances[:, 1:] / even[:, None])).sum())
     rounded = (_ROUNDED[:, None] * 2.0 ** -(exponents - exponents[0]).astype(np.float64)).clip(0, 1)
@@ -113,9 +195,62 @@ def _log_likelihood(counts: Doubles, exponents: Integers, scale: float) -> float
 
 def _distance(exponents: Integers, scale: float) -> Doubles:
     """[E] chi-square distance from uniform of the bits above the last one, of even numbers."""
-    chances = _zeros(_forced(exponents, scale))[:, 1:]
+    chances = _zeros(exponents, scale)[:, 1:]
     given = chances / chances.sum(axis=1, keepdims=True)
     uniform = 0.5 ** np.arange(1, MAX_ZEROS + 1)
     uniform[-1] *= 2
     result: Doubles = ((given - uniform) ** 2 / uniform).sum(axis=1)
     return result
+
+
+def _middles(numbers: Floats) -> Floats:
+    """[...] float32 numbers, as far as fixed bits tell."""
+    return (numbers.view(np.uint32) & ~_CELL | (_CELL + 1) >> 1).view(np.float32)
+
+
+@kernel
+def _mark(rows: Any, near: Any, middles: Any, needed: int, apart: Any) -> None:
+    """Set `apart` for both Gaussians of pairs of `rows` [R] and their neighbours `near` [R, K].
+
+    `middles` [N, 3, C]: the first harmonic is the constant one, by the ratio of rates; it always agrees.
+    """
+    for row in range(len(rows)):
+        one = rows[row]
+        for other in near[row]:
+            if other == one or (apart[one] and apart[other]):
+                continue
+            for colour in range(3):
+                own, its = middles[one, colour], middles[other, colour]
+                steps = abs(own[0] - its[0])
+                agree = np.float32(0)
+                for at in range(len(own)):
+                    cell = max(abs(own[at]), abs(its[at])) * _CELL_SHARE
+                    agree += np.float32(1 if abs(abs(own[at] - its[at]) - steps) <= cell else 0)
+                if agree >= needed:
+                    apart[one] = apart[other] = True
+
+
+@kernel
+def _count_equal(rows: Any, near: Any, sh: Any, middles: Any, counts: Any) -> None:
+    """Add to `counts` [2, C, C] pairs of harmonics whose steps from `rows` [R] to `near` [R, K] are equal.
+
+    Then those whose steps differ by up to twice as much. `sh` [N, C, 3] and its `middles`.
+    """
+    size = sh.shape[1]
+    steps, known, cells = np.empty(size), np.empty(size), np.empty(size)
+    for row in range(len(rows)):
+        for other in near[row]:
+            for colour in range(3):
+                for at in range(size):
+                    steps[at] = abs(sh[rows[row], at, colour] - sh[other, at, colour])
+                    own, its = middles[rows[row], at, colour], middles[other, at, colour]
+                    known[at] = abs(own - its)
+                    cells[at] = max(abs(own), abs(its)) * _CELL_SHARE
+                steps[0], known[0], cells[0] = steps[0] / RATE_RATIO, steps[0] / RATE_RATIO, 0.0
+                for one in range(size):
+                    for two in range(one + 1, size):
+                        cell = max(cells[one], cells[two])
+                        if known[one] > 2 * cell and abs(known[one] - known[two]) <= cell < known[two] / 2:
+                            off = abs(steps[one] - steps[two]) * _PART
+                            if off < 2 * cell:
+                                counts[0 if off < cell else 1, one, two] += 1

@@ -1,4 +1,4 @@
-"""Usable Gaussians: those whose low bits can be replaced without a trace.
+"""Usable Gaussians, whose low bits can be replaced without a trace, and those that give the salts.
 
 In a trained model most low bits are uniformly random to anybody who does not know the training, but not all.
 A Gaussian is excluded as a whole, so that its numbers stay consistent, because of:
@@ -12,16 +12,22 @@ A Gaussian is excluded as a whole, so that its numbers stay consistent, because 
   times (a Gaussian that few views show gets equal steps), Gaussians that share their scales, their quaternion
   or harmonics of one channel (clones, and channels that training freezes), unit quaternions, and Gaussians
   that occur twice.
-- *Equal steps* away from a neighbour: see `siblings`.
+- *Equal steps* away from a neighbour: see `predictability`.
 - *Opacities at the edge* below which trainers remove Gaussians: no trained model has smaller ones.
 - *Small even numbers*, which an optimiser may have left on a coarser grid: see `predictability`.
 
 Coincidences are found in bits that embedding never changes. Otherwise false exclusions must be rare:
 embedding makes as many such Gaussians again by chance, and twice the expected number would be noticed.
+
+A *salt* of Argon2id is a hash of one Gaussian and its low bits, which are new random bits for every file and
+carry nothing else: no two files of one cover share a salt. There are several salts because Gaussians may be
+removed. Their order does not change by embedding: first Gaussians without small harmonics and coincidences,
+which are rarely excluded, and among these the smallest IDs.
 """
 
 from __future__ import annotations
 
+import hashlib
 import math
 from concurrent.futures import ThreadPoolExecutor
 from itertools import combinations
@@ -40,15 +46,24 @@ from keyss.channels.quiet.bits import (
     Layout,
     coarse_lengths,
     gaussian_ids,
+    group_words,
+    read_low_bits,
     used_words,
 )
-from keyss.channels.quiet.predictability import count_trailing_zeros, least_exponent
-from keyss.channels.quiet.siblings import chance_of_equal_steps, find_siblings
+from keyss.channels.quiet.predictability import (
+    chance_of_equal_steps,
+    count_trailing_zeros,
+    find_siblings,
+    least_exponent,
+)
 from keyss.core.arrays import Bytes, Doubles, Flags, Integers, Numbers, Words, Words32
 from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.kernels.parallel import in_blocks
+from keyss.keys.derivation import SALT_BYTES
 
+SALTS = 12  # random pruning of a quarter removes all their Gaussians with p = 6e-8
+_LABEL = b"keyss/v2/salt"
 MIN_USABLE = 0.5  # share of the Gaussians of a cover
 # Maximum squared separation (d') of a plain file and one with new bits by small numbers, for an attacker who
 # knows the trainer and the plain file's statistics. 0.03 is an AUC of 0.55.
@@ -68,7 +83,7 @@ _SHORT = np.uint32((1 << _SHORT_BITS) - 1)
 # A Gaussian is untrained if this many values have 12 trailing zeros; by chance one in three million is.
 _ZEROS, _ZERO_FIELDS = np.uint32((1 << 12) - 1), 3
 _EQUAL_HARMONICS = 2  # pairs
-_MAGNITUDE = np.uint32(0x7FFFFFFF)
+_MAGNITUDE, _MANTISSA = np.uint32(0x7FFFFFFF), np.uint32((1 << 23) - 1)
 
 _OPACITY = 7
 # Bit patterns of logits above 16. The sigmoid is 1 above 16.64, but only the exponent never changes.
@@ -123,7 +138,7 @@ def usable_with_ids(gaussians: Gaussians, layout: Layout) -> tuple[Flags, Bytes]
     return usable, ids
 
 
-def check_usable(gaussians: Gaussians, usable: Flags, layout: Layout | None = None) -> None:
+def check_usable(gaussians: Gaussians, usable: Flags, layout: Layout) -> None:
     """Raise UsageError unless half of the Gaussians are `usable` [N], and their low bits uniform.
 
     Tested on at most 20,000 Gaussians: see `chance_of_bits` and `chance_of_equal_steps`.
@@ -134,7 +149,7 @@ def check_usable(gaussians: Gaussians, usable: Flags, layout: Layout | None = No
             f"only {share:.0%} of the cover's Gaussians have random low bits; the others hold short, "
             "repeated or predictable values: it was quantised or hardly trained, and new bits would be seen"
         )
-    layout, rows = layout or Layout.of(gaussians), np.flatnonzero(usable)
+    rows = np.flatnonzero(usable)
     used = used_words(gaussians[torch.from_numpy(rows[:: max(1, len(rows) // _SAMPLE)])])
     for name, group in _GROUPS.items():
         bits = int(layout.mask[group][:1].max(initial=0)).bit_length()
@@ -169,6 +184,22 @@ def chance_of_bits(words: Words32, bits: int) -> float:
         chances.append(np.minimum(1, 2 * bdtr(smaller.astype(np.float64), times, 0.5)))
     every = np.concatenate(chances)
     return min(1.0, float(every.min() * len(every)))
+
+
+def salt_rows(gaussians: Gaussians, ids: Bytes, layout: Layout) -> Integers:
+    """Rows of the salts' Gaussians, at most SALTS, in order; `ids` [N, 16]."""
+    ranks = _ranks(gaussians, layout)
+    # 9 bits of rank, 55 of the ID.
+    keys = ranks << np.uint64(55) | ids[:, :8].copy().view(">u8")[:, 0].astype(np.uint64) >> np.uint64(9)
+    best = np.argpartition(keys, SALTS - 1)[:SALTS] if len(keys) > SALTS else np.arange(len(keys))
+    low = read_low_bits(gaussians[torch.from_numpy(best)], layout)
+    order = sorted(range(len(best)), key=lambda i: (ranks[best[i]], ids[best[i]].tobytes(), low[i].tobytes()))
+    return best[order]
+
+
+def salt(carrier_id: Bytes, low: Bytes) -> bytes:
+    """The salt of one carrier: SALT_BYTES."""
+    return hashlib.sha256(_LABEL + carrier_id.tobytes() + low.tobytes()).digest()[:SALT_BYTES]
 
 
 def exponents(words: Words32) -> Bytes:
@@ -271,12 +302,7 @@ def _are_unique(gaussians: Gaussians, layout: Layout, ids: Bytes) -> tuple[Flags
 
 def _frequent_values(gaussians: Gaussians) -> list[Words32]:
     """For each group of fields the values [V] that occur too often, in ascending order."""
-    fields = (gaussians.log_scales, gaussians.quats, gaussians.opacity_logits, gaussians.sh[:, 1:])
-    every = [field.detach().to("cpu", torch.float32).numpy().view(np.uint32) for field in fields]
-    return [
-        frequent(words.reshape(len(words), math.prod(words.shape[1:])), _unlikely_copies(words.size))
-        for words in every
-    ]
+    return [frequent(words, _unlikely_copies(words.size)) for words in group_words(gaussians)]
 
 
 def _unlikely_copies(count: int) -> int:
@@ -288,3 +314,22 @@ def _unlikely_copies(count: int) -> int:
     while count**copies / math.factorial(copies) > _SETS_BY_CHANCE * 2 ** (26 * (copies - 1)):
         copies += 1
     return copies
+
+
+def _ranks(gaussians: Gaussians, layout: Layout) -> Words:
+    """[N] 0 to 511, lower first: 256 if doubtful, plus 255 minus the exponent of the least harmonic."""
+    columns = layout.columns
+    stays = layout.mask[columns] | np.uint32(1)
+
+    def ranked(start: int, stop: int) -> Words:
+        used = used_words(gaussians[start:stop])
+        chosen = used[:, columns]
+        large = exponents(chosen)
+        doubtful = ((large == 0) | (chosen & _MANTISSA & ~stays == 0)).any(axis=1) | near_equal(used, layout)
+        if layout.quats:
+            doubtful |= np.abs(coarse_lengths(used[:, QUATS]) - 1) < UNIT_TOLERANCE
+        harmonics = exponents(used[:, GEOMETRY:]) if used.shape[1] > GEOMETRY else large
+        rank: Words = (255 - harmonics.min(axis=1) + 256 * doubtful).astype(np.uint64)
+        return rank
+
+    return np.concatenate([np.zeros(0, np.uint64), *in_blocks(ranked, len(gaussians), BLOCK)])

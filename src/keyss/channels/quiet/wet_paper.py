@@ -11,12 +11,11 @@ from functools import lru_cache
 
 import numpy as np
 
-from keyss.core.arrays import Bits, Bytes, Integers, Words
+from keyss.core.arrays import Bits, Bytes, Integers
 from keyss.kernels.jit import kernel
 from keyss.keys.derivation import stream
 
 BLOCK = 1024  # bits
-_WORDS = BLOCK // 64
 _SPARE = 10  # dry bits beyond a block's message: one matrix in 1000 lacks so much rank
 _AT_ONCE = 1024  # blocks
 _PUBLIC = bytes(32)  # seed
@@ -36,15 +35,15 @@ def width_of(dry: Bits) -> int:
     return max(0, int(dry.reshape(-1, BLOCK).sum(axis=1).min(initial=BLOCK)) - _SPARE) // 8
 
 
-def matrix(rate: int = BLOCK) -> Words:
-    """[rate, BLOCK / 64] random bits, 64 to a word."""
-    return np.frombuffer(stream(_PUBLIC, "codes/matrix", rate * BLOCK // 8), "<u8").reshape(rate, _WORDS)
+def matrix(rate: int) -> Bits:
+    """[rate, BLOCK] random bits."""
+    rows = np.frombuffer(stream(_PUBLIC, "codes/matrix", rate * BLOCK // 8), np.uint8)
+    return np.unpackbits(rows.reshape(rate, -1), axis=1, bitorder="little")
 
 
 def read_blocks(bits: Bits) -> Bytes:
     """[B, BLOCK / 8] the messages of all blocks of `bits`, each padded with noise."""
-    product = read(bits[places(len(bits))], matrix())
-    return np.packbits(product, bitorder="little").reshape(-1, BLOCK // 8)
+    return np.packbits(read(bits[places(len(bits))], BLOCK), axis=1, bitorder="little")
 
 
 def block_ids(count: int, model_hash: bytes) -> Bytes:
@@ -53,23 +52,23 @@ def block_ids(count: int, model_hash: bytes) -> Bytes:
     return np.concatenate([numbers, np.tile(np.frombuffer(model_hash, np.uint8), (count, 1))], axis=1)
 
 
-def read(bits: Bits, rows: Words) -> Bits:
-    """[B rate] the message in blocks [B BLOCK]."""
-    return _product(bits.reshape(-1, BLOCK), _unpacked(rows).T).reshape(-1)
+def read(bits: Bits, rate: int) -> Bits:
+    """[B, rate] the first bits of the messages in blocks [B BLOCK]."""
+    return _product(bits.reshape(-1, BLOCK), matrix(rate).T)
 
 
-def write(bits: Bits, dry: Bits, message: Bits, rows: Words) -> Bits | None:
-    """[B BLOCK] `bits` with `dry` ones changed so that `read` gives the `message` [B rate].
+def write(bits: Bits, dry: Bits, messages: Bits) -> Bits | None:
+    """[B BLOCK] `bits` with `dry` ones changed so that `read` gives the `messages` [B, rate].
 
     All solutions are equally likely if dry bits were random. None if a block has too few dry bits.
 
     One elimination for all blocks: with as many columns of the matrix P as it has rows, and the others F,
     changes are x_P = P^-1 wanted + P^-1 F x_F. A block then needs an x_F by which x_P is 0 where bits stay.
     """
-    pivots, others, inverse, free = _eliminate(rows.tobytes())
+    pivots, others, inverse, free = _eliminate(messages.shape[1])
     if (pivots < 0).any():
         return None
-    changed = _product((message ^ read(bits, rows)).reshape(-1, len(rows)), inverse.T)
+    changed = _product(messages ^ read(bits, messages.shape[1]), inverse.T)
     blocks, may = bits.reshape(-1, BLOCK).copy(), dry.reshape(-1, BLOCK) == 1
     rest = np.zeros((len(blocks), len(others)), np.uint8)
     for own, wanted, found in zip(may, changed, rest, strict=True):
@@ -84,11 +83,11 @@ def write(bits: Bits, dry: Bits, message: Bits, rows: Words) -> Bits | None:
     return blocks.reshape(-1)
 
 
-@lru_cache(maxsize=1)  # it depends on the number of rows only
-def _eliminate(rows: bytes) -> tuple[Integers, Integers, Bits, Bits]:
-    """The columns of P (-1: none) and F in a matrix [R, BLOCK / 64], P^-1 [R, R] and P^-1 F; see `write`."""
-    own = _unpacked(np.frombuffer(rows, "<u8").reshape(-1, _WORDS))
-    reduced, pivots = _reduced(np.concatenate([own, np.eye(len(own), dtype=np.uint8)], axis=1), BLOCK)
+@lru_cache(maxsize=1)
+def _eliminate(rate: int) -> tuple[Integers, Integers, Bits, Bits]:
+    """The columns of P (-1: none) and F in a matrix [R, BLOCK], P^-1 [R, R] and P^-1 F; see `write`."""
+    rows = np.concatenate([matrix(rate), np.eye(rate, dtype=np.uint8)], axis=1)
+    reduced, pivots = _reduced(rows, BLOCK)
     others = np.setdiff1d(np.arange(BLOCK), pivots)
     return pivots, others, reduced[:, BLOCK:], reduced[:, others]
 
@@ -99,10 +98,6 @@ def _product(left: Bits, right: Bits) -> Bits:
     parts = [left[at : at + _AT_ONCE].astype(np.float32) @ columns for at in range(0, len(left), _AT_ONCE)]
     every = np.concatenate([np.empty((0, right.shape[1]), np.float32), *parts])
     return (every.astype(np.int32) & 1).astype(np.uint8)
-
-
-def _unpacked(rows: Words) -> Bits:
-    return np.unpackbits(rows.view(np.uint8).reshape(len(rows), -1), axis=1, bitorder="little")
 
 
 def _reduced(rows: Bits, count: int) -> tuple[Bits, Integers]:

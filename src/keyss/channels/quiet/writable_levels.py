@@ -3,15 +3,23 @@
 Readers need not know which levels these are (`wet_paper`). Towards a limit that levels may not cross, the
 share of writable levels falls gradually, at random: at a sharp border they would pile up. The randomness is
 derived from the cover, which only the writer has.
+
+Coincidences are more frequent than by chance. Trainers start with round Gaussians, some with rotations by 0
+degrees, and where few views show them they stay nearly so. Clones start with equal rotations and scales.
+Writing would spread all of these. Of each kind of coincidence a random part stays, the excess over chance:
+writing makes as many of the others as it spreads.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import combinations, product
+
 import numpy as np
 
 from keyss.channels.mixing import random_fractions
-from keyss.channels.quiet.excess import DEVIATIONS, ROUGH, without_excess
-from keyss.channels.quiet.fields import Field, Levels, carrying, sog_distances
+from keyss.channels.quiet.fields import LOG_SCALE_RANGE, ROTATIONS, Field, Levels, sog_distances
 from keyss.core.arrays import Doubles, Flags, Integers
 from keyss.core.neighbours import nearest_neighbours
 from keyss.files.formats.common import Codes, is_in_morton_order, morton_keys
@@ -28,6 +36,10 @@ _NEAR = 8  # maximum distance of levels whose frequencies are compared
 _EQUAL = 0.02  # excess that is always allowed, as a share of the Gaussians
 _BIAS = 0.02  # maximum bias of last bits
 _OFF_LATTICE = 0.24  # minimum mean distance from a lattice, in steps; by chance it is 0.248
+_ROUGH, _DEVIATIONS = 0.25, 6  # an excess that is ignored: relative, and in standard deviations
+_NAMES = ("positions", "rotations", "scales")  # attributes that carry bits in any format
+_LEVELS = (0.5, 1.5, 2.5, 3.5, 5.5, 7.5, 15.5)  # upper ends of the bins of differences of levels
+_LOG_SCALES: Doubles = np.exp2(LOG_SCALE_RANGE + np.arange(-6.0, 2.0))  # and of log scales
 
 
 def writable_levels(codes: Codes, fields: list[Field], fixed: Flags, secret: bytes) -> list[Flags]:
@@ -41,7 +53,7 @@ def writable_levels(codes: Codes, fields: list[Field], fixed: Flags, secret: byt
     distance, near = nearest_neighbours(means, min(_NEIGHBOURS + 1, count))
     ratio = distance[:, 1] / np.exp(np.median(log_scales, axis=1)) / _CLONES
     single = _not_clones(fields, ratio, near, random_fractions(secret, "kept/clones", count))
-    left = without_excess(codes, fields, log_scales, single, near[:, 1:], secret)
+    left = _without_excess(codes, fields, log_scales, single, near[:, 1:], secret)
     stable = _keep_largest(codes, fields, random_fractions(secret, "kept/turns", count))
     ordered = _keep_order(codes, fields, means)
     free = []
@@ -67,9 +79,80 @@ def fixed_axes(codes: Codes) -> Flags:
     low, high = chunks.min(axis=1, keepdims=True), chunks.max(axis=1, keepdims=True)
     levels = (chunks - low) / np.where(high > low, high - low, 1.0) * (2.0 ** np.array(VECTOR) - 1)
     distances = np.abs(levels - np.rint(levels)).reshape(-1, 3)
-    expected = _OFF_LATTICE - DEVIATIONS / (12 * max(1, len(distances))) ** 0.5
+    expected = _OFF_LATTICE - _DEVIATIONS / (12 * max(1, len(distances))) ** 0.5
     fixed: Flags = distances.sum(axis=0) < expected * len(distances)
     return fixed
+
+
+@dataclass(frozen=True)
+class _Kind:
+    """Differences between numbers of a Gaussian or of two neighbours; small ones are coincidences."""
+
+    fields: list[int]  # indices of the fields that stay
+    gaps: Doubles  # [P] each the maximum of `dimensions` differences
+    ends: Doubles  # [B] upper ends of bins; the frequency in the last one is that by chance
+    dimensions: int
+    one: Integers  # [P] rows of the Gaussians
+    other: Integers | None = None  # [P] of their neighbours, if compared with these
+
+
+def _without_excess(
+    codes: Codes, fields: Sequence[Field], log_scales: Doubles, free: Flags, near: Integers, secret: bytes
+) -> list[Flags]:
+    """For each field a mask [N] of the Gaussians that may be written, among those that are `free` [N].
+
+    `log_scales` [N, 3]: decoded. `near` [N, K]: nearest neighbours. `secret`: 32 secret bytes.
+    """
+    left = [free.copy() for _ in fields]
+    for index, kind in enumerate(_kinds(codes, fields, log_scales, near)):
+        own, pairs = left[kind.fields[0]], [kind.one] if kind.other is None else [kind.one, kind.other]
+        moved = np.flatnonzero(np.any([own[rows] for rows in pairs], axis=0))
+        random = random_fractions(secret, f"kept/excess/{index}", len(moved))
+        stays = moved[random < _excess_share(kind.gaps[moved], kind.ends, kind.dimensions)]
+        for field, rows in product(kind.fields, pairs):
+            left[field][rows[stays]] = False
+    return left
+
+
+def _kinds(codes: Codes, fields: Sequence[Field], log_scales: Doubles, near: Integers) -> Iterator[_Kind]:
+    """Equal coordinates of neighbours, small and equal parts of rotations, round Gaussians, and clones."""
+    every = np.arange(len(near))
+    one, other = np.repeat(every, near.shape[1]), near.ravel()
+    at = {name: [index for index, each in enumerate(fields) if each.name == name] for name in _NAMES}
+    for index in at["positions"]:
+        levels, bits = fields[index].levels, fields[index].bits
+        free = np.flatnonzero((bits[one] > 0) & (bits[other] > 0))
+        gaps = np.abs(levels[one[free]] - levels[other[free]]).astype(np.float64)
+        yield _Kind([index], gaps, np.array(_LEVELS[:4]), 1, one[free], other[free])
+    if own := at["rotations"]:
+        turns = np.stack([fields[index].levels for index in own], axis=1).astype(np.float64)
+        ends = np.array(_LEVELS[: 5 + 2 * int(fields[own[0]].bits.max() > 2)])
+        parts = np.abs(turns - sum(ROTATIONS[type(codes)]) / 2)
+        from_zero = ends + parts.flat[0] % 1  # the middle lies between two levels in some formats
+        for part in parts.T:
+            yield _Kind(own, part, from_zero, 1, every)
+        yield _Kind(own, parts.max(axis=1), from_zero, 3, every)
+        for a, b in combinations(parts.T, 2):
+            yield _Kind(own, np.abs(a - b), ends, 1, every)
+        same = np.flatnonzero(codes.largest[one] == codes.largest[other])  # type: ignore[attr-defined]
+        gaps = np.abs(turns[one[same]] - turns[other[same]]).max(axis=1)
+        yield _Kind(own, gaps, ends, 3, one[same], other[same])
+    if own := at["scales"]:
+        for a, b in combinations(log_scales.T, 2):
+            yield _Kind(own, np.abs(a - b), _LOG_SCALES, 1, every)
+        yield _Kind(own, log_scales.max(axis=1) - log_scales.min(axis=1), _LOG_SCALES, 2, every)
+        yield _Kind(own, np.abs(log_scales[one] - log_scales[other]).max(axis=1), _LOG_SCALES, 3, one, other)
+
+
+def _excess_share(gaps: Doubles, ends: Doubles, dimensions: int) -> Doubles:
+    """[P] the share of the gaps in the same bin that is more than by chance; 0 for little."""
+    edges = np.append(0.0, ends)
+    counts, volumes = np.histogram(gaps, edges)[0], np.diff(edges**dimensions)
+    expected = counts[-1] / volumes[-1] * volumes
+    large = counts - expected > np.maximum(_ROUGH * expected, _DEVIATIONS * expected**0.5)
+    share = np.where(large, 1 - expected / np.maximum(counts, 1), 0.0)
+    found: Doubles = np.append(share, 0.0)[np.searchsorted(ends, gaps)]
+    return found
 
 
 def _keep_order(codes: Codes, fields: list[Field], means: Doubles) -> Flags:
@@ -107,7 +190,7 @@ def _margin(codes: Codes, field: Field) -> Doubles:
     """[N] levels between the nearest limit and the range that writing reaches; negative if it crosses."""
     least, largest = field.levels.min(), field.levels.max()
     if field.name == "rotations":
-        least, largest = carrying(codes).rotations
+        least, largest = ROTATIONS[type(codes)]
     elif isinstance(codes, CompressedPlyCodes):
         least, largest = 0, (2047, 1023, 2047)[field.column]
     margin: Doubles = np.minimum(field.levels - least, largest - field.levels) - 1.0
@@ -132,7 +215,7 @@ def _keep_largest(codes: Codes, fields: list[Field], random: Doubles) -> Flags:
     own = [each for each in fields if each.name == "rotations"]
     if not own:
         return np.ones(len(random), np.bool_)
-    least, largest = carrying(codes).rotations
+    least, largest = ROTATIONS[type(codes)]
     parts = np.abs(np.stack([each.levels for each in own], axis=1) - (least + largest) / 2)
     parts += np.stack([each.reach for each in own], axis=1)
     rest = np.sqrt(np.maximum(0.0, (largest - least) ** 2 / 2 - np.square(parts).sum(axis=1)))
@@ -152,10 +235,10 @@ def _is_natural(levels: Levels) -> bool:
     equal = float((counts * (counts - 1)).sum())
     near = [_pairs(values, counts, distance) for distance in range(1, _NEAR + 1)]
     expected = float(np.mean(near))
-    if equal - expected > max(ROUGH * expected, _EQUAL * len(levels), DEVIATIONS * expected**0.5):
+    if equal - expected > max(_ROUGH * expected, _EQUAL * len(levels), _DEVIATIONS * expected**0.5):
         return False
     odd = float((levels & 1).mean())
-    return bool(abs(odd - 0.5) < _BIAS + DEVIATIONS / 2 / len(levels) ** 0.5)
+    return bool(abs(odd - 0.5) < _BIAS + _DEVIATIONS / 2 / len(levels) ** 0.5)
 
 
 def _pairs(values: Integers, counts: Integers, distance: int) -> float:

@@ -1,8 +1,8 @@
 """Siblings that moved apart by equal steps of Adam, so that constant colours predict low bits of harmonics.
 
-See `keyss.channels.quiet.siblings`. Pairs are found by high bits and constant colours. A hit is a difference
-of harmonics within 1/16 of a cell (the range of low bits) of a twentieth of that of the constant colours.
-The null distribution comes from the same file with other low bits.
+See `keyss.channels.quiet.predictability`. Pairs are found by high bits and constant colours. A hit is a
+difference of harmonics within 1/16 of a cell (the range of low bits) of a twentieth of that of the constant
+colours. The null distribution comes from the same file with other low bits.
 """
 
 from __future__ import annotations
