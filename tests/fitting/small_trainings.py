@@ -29,7 +29,7 @@ def joint(fit: FitConfig, device: torch.device) -> KeyssTraining:
     """KeySS with wrong keys, poses of both scenes, and all attributes decoded."""
     options = small("published", fit, common_poses=0.5)
     keys = list(random_embeddings(1, torch.Generator().manual_seed(0)))
-    return KeyssTraining(placed(), keys, options, options.configuration, device)
+    return KeyssTraining(placed(), keys, options, device)
 
 
 def gs_hider(fit: FitConfig, device: torch.device) -> KeyssTraining:
@@ -49,7 +49,7 @@ RUNS: Mapping[str, Callable[[FitConfig, torch.device], Any]] = {
 def train_run(name: str, fit: FitConfig, device: str = "cpu", **options: Any) -> TrainingRun:
     """Train one of RUNS to its end."""
     run: TrainingRun = RUNS[name](fit, torch.device(device))
-    train(run, name, fit, fingerprint={}, **options)
+    train(run, name, fingerprint={}, **options)
     return run
 
 

@@ -101,7 +101,7 @@ def test_loss_is_mean_over_views() -> None:
     scene, config = tiny_scene(), replace(CONFIG, views_per_step=2)
     run, same = (PlainRun(scene, config, torch.device("cpu")) for _ in range(2))
     model, losses = same.gaussians(), []
-    for view in [scene.train[same.shuffle.sample()] for _ in range(2)]:
+    for view in [scene.train[same.order.sample()] for _ in range(2)]:
         image, _ = render_with_meta(model, view.camera, scene.background, sh_degree=0)
         losses.append(float(photometric_loss(image, Target.of(view.image), config.ssim_weight)))
     run.step()

@@ -81,9 +81,7 @@ def training(name: str, config: FitConfig, device: torch.device) -> Any:
         return method.training(placed(sh_degree=3), method.options(fit=config, common_poses=0.5), device)
     options = small(name, config)
     vectors = list(random_embeddings(1, torch.Generator().manual_seed(0)))
-    return training_of(options.configuration)(
-        placed(sh_degree=3), vectors, options, options.configuration, device
-    )
+    return training_of(options.configuration)(placed(sh_degree=3), vectors, options, device)
 
 
 @pytest.mark.parametrize(

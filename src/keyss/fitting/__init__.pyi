@@ -9,7 +9,7 @@ from .image_metrics import (
     quality as quality,
     subsample_views as subsample_views,
 )
-from .loop import TrainingRun as TrainingRun, train as train
+from .loop import TrainingRun as TrainingRun, own_randomness as own_randomness, train as train
 from .losses import (
     Target as Target,
     photometric_loss as photometric_loss,
@@ -23,5 +23,4 @@ from .parameters import (
     to_parameters as to_parameters,
 )
 from .plain import FitResult as FitResult, PlainRun as PlainRun, fit_scene as fit_scene
-from .sampling import own_randomness as own_randomness
 from .schedule import Schedule as Schedule

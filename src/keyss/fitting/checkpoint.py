@@ -69,21 +69,19 @@ def unpack_model(
     density |= {key: value.to(device) for key, value in _with_prefix(state, "density.").items()}
 
 
-def pack_network(prefix: str, network: torch.nn.Module, optimizer: torch.optim.Optimizer) -> State:
-    """Weights and Adam moments of a network with an optimizer of its own."""
-    state: State = {f"{prefix}.{name}": value for name, value in network.state_dict().items()}
+def pack_network(network: torch.nn.Module, optimizer: torch.optim.Optimizer) -> State:
+    """Weights and Adam moments of networks with an optimizer of their own."""
+    state: State = {f"networks.{name}": value for name, value in network.state_dict().items()}
     for index, moments in optimizer.state_dict()["state"].items():
-        state |= {f"{prefix}_adam.{index}.{name}": value for name, value in moments.items()}
+        state |= {f"networks_adam.{index}.{name}": value for name, value in moments.items()}
     return state
 
 
-def unpack_network(
-    state: State, prefix: str, network: torch.nn.Module, optimizer: torch.optim.Optimizer
-) -> None:
+def unpack_network(state: State, network: torch.nn.Module, optimizer: torch.optim.Optimizer) -> None:
     """Restore the result of `pack_network`."""
-    network.load_state_dict(_with_prefix(state, f"{prefix}."))
+    network.load_state_dict(_with_prefix(state, "networks."))
     adam = optimizer.state_dict()
-    for name, value in _with_prefix(state, f"{prefix}_adam.").items():
+    for name, value in _with_prefix(state, "networks_adam.").items():
         index, key = name.split(".")
         adam["state"].setdefault(int(index), {})[key] = value
     optimizer.load_state_dict(adam)

@@ -13,7 +13,6 @@ from .carry.method import most_contributing as most_contributing
 from .carry.options import CarryOptions as CarryOptions
 from .decoy import Decoy as Decoy
 from .hidden import Frame as Frame, HiddenFile as HiddenFile, HiddenScene as HiddenScene, Remains as Remains
-from .keyss.combined import CombinedPoses as CombinedPoses, PlacedScene as PlacedScene
 from .keyss.decoder import Decoder as Decoder
 from .keyss.latent import LatentDecoder as LatentDecoder
 from .keyss.options import (
@@ -26,7 +25,11 @@ from .keyss.options import (
     parse_mask as parse_mask,
 )
 from .keyss.secret import DECODERS as DECODERS, KeyssSecret as KeyssSecret, choose_anchors as choose_anchors
-from .keyss.training import KeyssTraining as KeyssTraining
+from .keyss.training import (
+    CombinedPoses as CombinedPoses,
+    KeyssTraining as KeyssTraining,
+    PlacedScene as PlacedScene,
+)
 from .plain_models import Bound as Bound, fit_plain_models as fit_plain_models
 from .records.carried_secret import CarriedSecret as CarriedSecret, unpack as unpack
 from .records.embedding import (

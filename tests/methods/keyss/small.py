@@ -47,7 +47,7 @@ def start_training(options: KeyssOptions, scenes: list[Scene], models: list[Gaus
     if design.ssim_weight is not None:
         options = options.with_fit(ssim_weight=design.ssim_weight)
     keys = list(VECTORS[: len(scenes) - 1])
-    return training_of(design)(placed, keys, options, design, torch.device("cpu"))
+    return training_of(design)(placed, keys, options, torch.device("cpu"))
 
 
 def make_secret(stego: Gaussians) -> KeyssSecret:

@@ -19,8 +19,7 @@ from keyss.fitting.adam import RowAdam
 from keyss.lab.baselines.baseline_options import BaselineOptions
 from keyss.methods.base import Capabilities, Context, Plan, Source, Stego
 from keyss.methods.hidden import Frame, Remains
-from keyss.methods.keyss.combined import PlacedScene
-from keyss.methods.keyss.training import KeyssTraining, Picture
+from keyss.methods.keyss.training import KeyssTraining, Picture, PlacedScene
 from keyss.methods.tensors import Header, pack_tensors, refuse_damage, unpack_tensors
 
 FORMAT, VERSION = "keyss-baseline", 1
@@ -110,7 +109,7 @@ class BaselineTraining(KeyssTraining):
     options: BaselineOptions
 
     def __init__(self, scenes: Sequence[PlacedScene], options: BaselineOptions, device: torch.device) -> None:
-        super().__init__(scenes, [], options, options.design, device)
+        super().__init__(scenes, [], options, device)
 
     @abstractmethod
     def prepare(self, start: Gaussians) -> None:

@@ -19,9 +19,9 @@ from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
 from keyss.fitting.config import FitConfig
 from keyss.fitting.image_metrics import subsample_views
+from keyss.fitting.loop import Shuffle
 from keyss.fitting.losses import Target, photometric_loss
 from keyss.fitting.parameters import make_optimizers, to_gaussians, to_parameters
-from keyss.fitting.sampling import Shuffle
 from keyss.fitting.schedule import Schedule
 from keyss.rendering import contributions, render
 

@@ -22,17 +22,15 @@ from keyss.core.errors import InputError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Camera
 from keyss.fitting.adam import RowAdam
-from keyss.fitting.density import CappedStrategy
-from keyss.fitting.fixed_rows import EMPTY, FixedRows, of_scene
+from keyss.fitting.density import EMPTY, CappedStrategy, FixedRows, of_scene
 from keyss.fitting.image_metrics import subsample_views
 from keyss.fitting.parameters import make_optimizers, to_parameters
 from keyss.fitting.plain import without_faint
 from keyss.fitting.schedule import Schedule
 from keyss.keys.derivation import stream
-from keyss.methods.keyss.combined import combined_points
 from keyss.methods.keyss.latent import Colours, LatentDecoder
 from keyss.methods.keyss.secret import KeyssSecret, choose_anchors, visibility
-from keyss.methods.keyss.training import KeyssTraining, Picture
+from keyss.methods.keyss.training import KeyssTraining, Picture, combined_points
 from keyss.rendering.view import contributions
 
 PRUNED_SHARE = 0.25  # fraction of the published rows, faintest first, that pruned steps leave out
@@ -60,9 +58,8 @@ class LatentTraining(KeyssTraining):
         return Gaussians.cat([model, rest])
 
     def prepare(self, start: Gaussians) -> None:
-        fit, count = self.fit, len(self.keys)
-        shape = self.design.decoder.with_sizes(fit.sh_degree, len(self.keys[0]), count)
-        self.decoders = [LatentDecoder(replace(shape, secret=secret)) for secret in range(count)]
+        fit = self.fit
+        self.decoders = [LatentDecoder(replace(self.shape, secret=each)) for each in range(len(self.keys))]
         self.kept = self.decoders[0].place.fit(self.scenes[0].plain).T.contiguous().to(self.device)
         place = self.decoders[0].place.state_dict()
         for decoder, placed in zip(self.decoders, self.scenes[1:], strict=True):

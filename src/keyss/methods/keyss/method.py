@@ -1,8 +1,8 @@
 """KeySS, *Key-Secured 3D Secrets within 3D Gaussian Splatting*.
 
-Read `options` (the paper's symbols and values), `decoder` (equations 3, 6 and 8), `combined` (poses and
-points) and `training` (losses 4, 5 and 7, their sum 11, one step, publishing). `latent`, `latent_training`
-and `keyss.fitting.fixed_rows` are the default design (ours); `secret` is the hidden payload.
+Read `options` (the paper's symbols and values), `decoder` (equations 3, 6 and 8) and `training` (poses and
+points, losses 4, 5 and 7, their sum 11, one step, publishing). `latent`, `latent_training` and
+`keyss.fitting.density.FixedRows` are the default design (ours); `secret` is the hidden payload.
 """
 
 from __future__ import annotations
@@ -23,12 +23,11 @@ from keyss.keys import DerivedKey
 from keyss.keys.clip import MODEL, ClipKeys, clip_keys
 from keyss.keys.derivation import SALT_BYTES, expand
 from keyss.methods.base import Capabilities, Context, Plan, Source, Stego
-from keyss.methods.keyss.combined import PlacedScene
 from keyss.methods.keyss.latent import latents_of
 from keyss.methods.keyss.latent_training import LatentTraining
 from keyss.methods.keyss.options import Design, KeyssOptions
 from keyss.methods.keyss.secret import ANCHORS, DECODERS, KeyssSecret, unpack
-from keyss.methods.keyss.training import KeyssTraining
+from keyss.methods.keyss.training import KeyssTraining, PlacedScene
 
 _APPENDED = "the secrets lie in appended Gaussians instead, which everybody can see in the file"
 
@@ -87,7 +86,7 @@ class KeyssMethod:
             vectors = [DerivedKey.of(key, salt).embedding() for key in keys]
         sources, random_key = [cover, *secrets], encoder.random if encoder else None
         placed = PlacedScene.all_of(sources)
-        run = training_of(design)(placed, vectors, options, design, context.device, random_key)
+        run = training_of(design)(placed, vectors, options, context.device, random_key)
         run.train(sources, context)
         stego, hidden = run.publish(entropy)
         payloads = [secret.payload() for secret in hidden]
