@@ -7,7 +7,6 @@ from .image_metrics import (
     mean_psnr as mean_psnr,
     psnr as psnr,
     quality as quality,
-    subsample_views as subsample_views,
 )
 from .loop import TrainingRun as TrainingRun, own_randomness as own_randomness, train as train
 from .losses import (
@@ -22,5 +21,5 @@ from .parameters import (
     make_optimizers as make_optimizers,
     to_parameters as to_parameters,
 )
-from .plain import FitResult as FitResult, PlainRun as PlainRun, fit_scene as fit_scene
+from .plain import PlainRun as PlainRun, fit_scene as fit_scene
 from .schedule import Schedule as Schedule

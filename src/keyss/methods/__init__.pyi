@@ -6,9 +6,7 @@ from .base import (
     Source as Source,
     Stego as Stego,
     Training as Training,
-    divide as divide,
 )
-from .carry.capacity import RecordCapacity as RecordCapacity, SecretSize as SecretSize, to_degree as to_degree
 from .carry.method import most_contributing as most_contributing
 from .carry.options import CarryOptions as CarryOptions
 from .decoy import Decoy as Decoy
@@ -20,7 +18,6 @@ from .keyss.options import (
     DESIGNS as DESIGNS,
     DecoderShape as DecoderShape,
     Design as Design,
-    DesignName as DesignName,
     KeyssOptions as KeyssOptions,
     parse_mask as parse_mask,
 )
@@ -30,7 +27,7 @@ from .keyss.training import (
     KeyssTraining as KeyssTraining,
     PlacedScene as PlacedScene,
 )
-from .plain_models import Bound as Bound, fit_plain_models as fit_plain_models
+from .plain_models import fit_plain_models as fit_plain_models
 from .records.carried_secret import CarriedSecret as CarriedSecret, unpack as unpack
 from .records.embedding import (
     embed_models as embed_models,
@@ -44,5 +41,5 @@ from .records.precision import (
     most_visible as most_visible,
     prune_to_size as prune_to_size,
 )
-from .records.quantise import Codec as Codec, outliers as outliers
+from .records.quantise import Codec as Codec
 from .registry import open_model as open_model

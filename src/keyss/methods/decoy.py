@@ -86,7 +86,7 @@ class Decoy:
             return whole.decode(whole.encode(model, precision.finer(_FINER * self.appended)))
         order = torch.randperm(len(model), generator=torch.Generator().manual_seed(self.order))
         model = model[order[: cells * capacity.carriers]].with_sh_degree(table.sh_degree)
-        codec, outliers = Codec.fit_with_outliers(model, table)
+        codec, outliers = Codec.fit(model, table)
         return codec.decode(codec.encode(model, outliers))
 
     def remains(self, revealed: Gaussians) -> Remains:

@@ -82,7 +82,7 @@ def encode_all(cover: LowBitsCover, models: Sequence[Gaussians]) -> list[Records
     for model, plan in zip(models, plans, strict=True):
         table = Table.of_size(8 * plan.record_bytes, model.sh_degree)
         assert table is not None  # the plan has room for `Table.floor`
-        codec, outlier = Codec.fit_with_outliers(model, table)
+        codec, outlier = Codec.fit(model, table)
         header = COUNT.pack(len(model)) + codec.pack()
         copied = most_visible_rows(model, plan.copies)
         found.append(Records(METHOD, header, codec.encode(model, outlier), plan, copied))

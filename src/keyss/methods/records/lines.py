@@ -176,17 +176,12 @@ class Table:
         return Table(_FLOOR[: 5 + sh_degree])
 
     @staticmethod
-    def short() -> Table:
-        """A smaller table of SH degree 0, for payloads: about 40 dB."""
-        return Table(tuple(each - 2 for each in _FLOOR[:5]))
+    def of_size(bits: int, sh_degree: int) -> Table | None:
+        """The table of minimum error with at most `bits`; None if the floor does not fit.
 
-    @staticmethod
-    def of_size(bits: int, sh_degree: int, start: Table | None = None) -> Table | None:
-        """The table of minimum error with at most `bits`; None if `start` does not fit.
-
-        `start`: by default the floor. Each further bit goes to the attribute whose error it reduces most.
+        Each further bit goes to the attribute whose error it reduces most.
         """
-        table = start or Table.floor(sh_degree)
+        table = Table.floor(sh_degree)
         while (left := bits - table.total) >= 0:
             given = table.bits
             grow = [i for i, each in enumerate(given) if _NUMBERS[i] <= left and each < MAX_BITS]

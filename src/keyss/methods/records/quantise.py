@@ -64,13 +64,11 @@ class Codec:
     lines: tuple[Line, ...]  # x, y, z, log scales, opacity logits; two per band, the constant one first
 
     @staticmethod
-    def fit(gaussians: Gaussians, table: Table) -> Codec:
-        """Fit lines to `gaussians`. Raises ValueError unless they have the SH degree of the table."""
-        return Codec.fit_with_outliers(gaussians, table)[0]
+    def fit(gaussians: Gaussians, table: Table) -> tuple[Codec, Flags]:
+        """Fit lines to `gaussians`, and find the outliers [N] among them; none if that were all.
 
-    @staticmethod
-    def fit_with_outliers(gaussians: Gaussians, table: Table) -> tuple[Codec, Flags]:
-        """`fit`, and the `outliers` [N]."""
+        Raises ValueError unless they have the SH degree of the table.
+        """
         if table.sh_degree != gaussians.sh_degree:
             raise ValueError(f"SH degree {gaussians.sh_degree}, but the table is for {table.sh_degree}")
         found, parts = _bulk(gaussians)
@@ -78,7 +76,7 @@ class Codec:
         return Codec(table, tuple(fit_line(kind, bits, *line) for kind, bits, line in every)), found
 
     def codes(self, gaussians: Gaussians, outlier: Flags) -> list[Words32]:
-        """Codes [N, columns] for each entry of `table.layout`; `outlier` [N]: their `outliers`."""
+        """Codes [N, columns] for each entry of `table.layout`; `outlier` [N]: see `fit`."""
         quats = doubles(gaussians.quats)
         quats[np.linalg.norm(quats, axis=1) <= _MIN_LENGTH] = 0
         left_out, three = smallest_three(unit(quats))
@@ -90,12 +88,11 @@ class Codec:
         every = zip(self.lines, _bits(self.table), numbers_of(gaussians), strict=True)
         return columns + [line.encode(values, bits, outlier) for line, bits, values in every]
 
-    def encode(self, gaussians: Gaussians, outlier: Flags | None = None) -> Bytes:
+    def encode(self, gaussians: Gaussians, outlier: Flags) -> Bytes:
         """[N, record_bytes] records: concatenated codes, most significant bit first, padded with zeros.
 
-        `outlier` [N]: `outliers(gaussians)`, if known.
+        `outlier` [N]: see `fit`.
         """
-        outlier = outliers(gaussians) if outlier is None else outlier
         bits, records = self._code_bits(), np.zeros((len(gaussians), self.table.record_bytes), np.uint8)
 
         def encode(start: int, stop: int) -> None:
@@ -238,13 +235,11 @@ def _decode(
             j, first, band = j + 3 * band, first + band, band + 2
 
 
-def outliers(gaussians: Gaussians) -> Flags:
-    """Mask [N] of Gaussians with a number far outside of the bulk; empty if that were all of them."""
-    return _bulk(gaussians)[0]
-
-
 def _bulk(gaussians: Gaussians) -> tuple[Flags, list[tuple[Doubles, Doubles, Doubles]]]:
-    """The `outliers` [N]; per line, a sample of the bulk's numbers, the bulk's extent and the outliers'."""
+    """The outliers [N], with a number far outside of the bulk.
+
+    Per line, a sample of the bulk's numbers, the bulk's extent and the outliers'.
+    """
     found, every = np.zeros(len(gaussians), bool), max(1, len(gaussians) // _SAMPLE)
     sample = numbers_of(gaussians[::every])
     ends = list(map(inlier_range, sample, _kinds(gaussians.sh_degree)))
