@@ -1,5 +1,4 @@
 from .adam import RowAdam as RowAdam
-from .checkpoint import State as State, load_checkpoint as load_checkpoint, save_checkpoint as save_checkpoint
 from .config import PRESETS as PRESETS, FitConfig as FitConfig
 from .density import CappedStrategy as CappedStrategy
 from .image_metrics import (
@@ -8,7 +7,14 @@ from .image_metrics import (
     psnr as psnr,
     quality as quality,
 )
-from .loop import TrainingRun as TrainingRun, own_randomness as own_randomness, train as train
+from .loop import (
+    State as State,
+    TrainingRun as TrainingRun,
+    load_checkpoint as load_checkpoint,
+    own_randomness as own_randomness,
+    save_checkpoint as save_checkpoint,
+    train as train,
+)
 from .losses import (
     Target as Target,
     photometric_loss as photometric_loss,

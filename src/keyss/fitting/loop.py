@@ -1,17 +1,23 @@
-"""Training runs: what they share, and their loop with progress, checkpoints, signals and resuming."""
+"""Training runs: what they share, and their loop with progress, checkpoints, signals and resuming.
+
+A checkpoint is the state of a run in one safetensors file: tensors and JSON, nothing executable.
+"""
 
 from __future__ import annotations
 
+import json
 import signal
 import threading
 import time
 import warnings
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
+import safetensors
+import safetensors.torch
 import torch
 from torch import Tensor
 
@@ -19,7 +25,7 @@ from keyss import _threads
 from keyss._interrupts import ENDING
 from keyss.core.errors import InputError, Interrupted, KeyssWarning
 from keyss.core.gaussians import Gaussians
-from keyss.fitting.checkpoint import State, load_checkpoint, pack_model, save_checkpoint, unpack_model
+from keyss.files.atomic import write_bytes
 from keyss.fitting.config import FitConfig
 from keyss.fitting.density import CappedStrategy, Rendered, of_scene
 from keyss.fitting.parameters import Optimizers, Parameters
@@ -27,6 +33,8 @@ from keyss.fitting.schedule import Schedule
 from keyss.progress import Reporter
 
 T = TypeVar("T")
+State = dict[str, Tensor]
+_UNREADABLE = (OSError, KeyError, ValueError, TypeError, safetensors.SafetensorError)
 
 
 @contextmanager
@@ -102,18 +110,58 @@ class TrainingRun(ABC):
             schedule.set(of_scene(self.optimizers, scene), self.iteration)
 
     def state(self) -> State:
-        """Tensors, not copied."""
-        state = pack_model(self.parameters, self.optimizers, self.density)
+        """Parameters, their Adam moments, and what else the future depends on; tensors are not copied."""
+        state: State = {}
+        for name, parameter in self.parameters.items():
+            state[name] = parameter.detach()
+            for key, value in self.optimizers[name].state[parameter].items():
+                state[f"{name}.{key}"] = torch.as_tensor(value)
+        density = {key: value for key, value in self.density.items() if isinstance(value, Tensor)}
+        state |= {f"density.{key}": value for key, value in density.items()}
         state |= {name: shuffle.remaining for name, shuffle in self.shuffles.items()}
         return state | {name: generator.get_state() for name, generator in self.generators.items()}
 
     def load(self, state: State) -> None:
-        """Restore the result of `state`; `iteration` is the caller's to set."""
-        unpack_model(state, self.parameters, self.optimizers, self.density)
+        """Restore the result of `state`, but not `iteration`; the number of Gaussians may differ."""
+        for name, old in list(self.parameters.items()):
+            parameter = torch.nn.Parameter(state[name].to(self.device))
+            (group,) = self.optimizers[name].param_groups
+            group["params"] = [parameter]
+            moments = with_prefix(state, f"{name}.")
+            self.optimizers[name].state.pop(old, None)
+            if moments:
+                self.optimizers[name].state[parameter] = {
+                    key: value if key == "step" and not group["fused"] else value.to(self.device)
+                    for key, value in moments.items()
+                }
+            self.parameters[name] = parameter
+        density = with_prefix(state, "density.").items()
+        self.density |= {key: value.to(self.device) for key, value in density}
         for name, shuffle in self.shuffles.items():
             shuffle.remaining = state[name]
         for name, generator in self.generators.items():
             generator.set_state(state[name])
+
+
+def save_checkpoint(path: Path, tensors: State, meta: Mapping[str, Any]) -> None:
+    """Atomically write `tensors` and the JSON-able `meta`; any device can load them. Raises OutputError."""
+    contiguous = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
+    write_bytes(path, safetensors.torch.save(contiguous, {"meta": json.dumps(meta)}))
+
+
+def load_checkpoint(path: Path) -> tuple[State, dict[str, Any]]:
+    """Tensors (on the CPU) and meta of a checkpoint. Raises InputError when it is missing or damaged."""
+    try:
+        with safetensors.safe_open(path, framework="pt") as file:
+            meta = json.loads((file.metadata() or {})["meta"])
+            return {name: file.get_tensor(name) for name in file.keys()}, meta  # noqa: SIM118
+    except _UNREADABLE as error:
+        raise InputError(f"{path}: not a checkpoint of this version ({error})") from error
+
+
+def with_prefix(state: State, prefix: str) -> State:
+    """The tensors whose names begin with `prefix`, named without it."""
+    return {key.removeprefix(prefix): value for key, value in state.items() if key.startswith(prefix)}
 
 
 _SPINNING = (

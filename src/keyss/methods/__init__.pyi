@@ -11,8 +11,7 @@ from .carry.method import most_contributing as most_contributing
 from .carry.options import CarryOptions as CarryOptions
 from .decoy import Decoy as Decoy
 from .hidden import Frame as Frame, HiddenFile as HiddenFile, HiddenScene as HiddenScene, Remains as Remains
-from .keyss.decoder import Decoder as Decoder
-from .keyss.latent import LatentDecoder as LatentDecoder
+from .keyss.decoder import DECODERS as DECODERS, Decoder as Decoder, LatentDecoder as LatentDecoder
 from .keyss.options import (
     ATTRIBUTES as ATTRIBUTES,
     DESIGNS as DESIGNS,
@@ -21,7 +20,7 @@ from .keyss.options import (
     KeyssOptions as KeyssOptions,
     parse_mask as parse_mask,
 )
-from .keyss.secret import DECODERS as DECODERS, KeyssSecret as KeyssSecret, choose_anchors as choose_anchors
+from .keyss.secret import KeyssSecret as KeyssSecret, choose_anchors as choose_anchors
 from .keyss.training import (
     CombinedPoses as CombinedPoses,
     KeyssTraining as KeyssTraining,

@@ -24,7 +24,7 @@ from keyss.methods import (
     PlacedScene,
     choose_anchors,
 )
-from keyss.methods.keyss.latent import latents_of
+from keyss.methods.keyss.decoder import latents_of
 from keyss.methods.keyss.method import training_of
 from keyss.methods.keyss.secret import visibility
 

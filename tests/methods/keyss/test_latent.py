@@ -17,7 +17,7 @@ from keyss.channels.harmonics import row_ids
 from keyss.core import InputError, UsageError, same_bits
 from keyss.lab import search_embeddings
 from keyss.methods import LatentDecoder, registry
-from keyss.methods.keyss.latent import latents_of
+from keyss.methods.keyss.decoder import latents_of
 from methods.hiding import Hidden, hide_scenes, three_scenes
 from methods.keyss.small import KEYS, VECTORS, latent_model, small
 from tiny_scenes import random_gaussians

@@ -123,17 +123,10 @@ class BaselineTraining(KeyssTraining):
     def result(self) -> tuple[Gaussians, CompanionTensors]:
         """The published model, on the CPU, and the tensors of the companion file, after the training."""
 
-    def add(self, name: str, values: Tensor, optimizer: RowAdam | float) -> None:
-        """Add a parameter [N, ...] of the Gaussians, with its optimiser or a rate for a new one."""
+    def add(self, name: str, values: Tensor, rate: float, scale: Tensor | None = None) -> None:
+        """Add a parameter [N, ...] of the Gaussians; its rates: see `RowAdam`."""
         self.parameters[name] = parameter = torch.nn.Parameter(values.to(self.device).contiguous())
-        if isinstance(optimizer, RowAdam):
-            optimizer.param_groups[0]["params"] = [parameter]
-            self.optimizers[name] = optimizer
-        else:
-            fused = self.device.type == "cuda"
-            self.optimizers[name] = RowAdam(
-                [{"params": [parameter], "lr": optimizer}], eps=1e-15, fused=fused
-            )
+        self.optimizers[name] = RowAdam(parameter, rate, scale)
 
     def opacity_for_pruning(self) -> Tensor:
         """[N] maximum opacity over the scenes."""

@@ -1,7 +1,7 @@
 """KeySS, *Key-Secured 3D Secrets within 3D Gaussian Splatting*.
 
 Read `options` (the paper's symbols and values), `decoder` (equations 3, 6 and 8) and `training` (poses and
-points, losses 4, 5 and 7, their sum 11, one step, publishing). `latent`, `latent_training` and
+points, losses 4, 5 and 7, their sum 11, one step, publishing). `LatentDecoder`, `latent` and
 `keyss.fitting.density.FixedRows` are the default design (ours); `secret` is the hidden payload.
 """
 
@@ -23,10 +23,10 @@ from keyss.keys import DerivedKey
 from keyss.keys.clip import MODEL, ClipKeys, clip_keys
 from keyss.keys.derivation import SALT_BYTES, expand
 from keyss.methods.base import Capabilities, Context, Plan, Source, Stego
-from keyss.methods.keyss.latent import latents_of
-from keyss.methods.keyss.latent_training import LatentTraining
+from keyss.methods.keyss.decoder import DECODERS, latents_of
+from keyss.methods.keyss.latent import LatentTraining
 from keyss.methods.keyss.options import Design, KeyssOptions
-from keyss.methods.keyss.secret import ANCHORS, DECODERS, KeyssSecret, unpack
+from keyss.methods.keyss.secret import ANCHORS, KeyssSecret
 from keyss.methods.keyss.training import KeyssTraining, PlacedScene
 
 _APPENDED = "the secrets lie in appended Gaussians instead, which everybody can see in the file"
@@ -100,7 +100,7 @@ class KeyssMethod:
             found = APPENDED.prepare(stego).embed(keyed, entropy=entropy)
             warnings.warn(f"{error}; {_APPENDED}", KeyssWarning, stacklevel=2)
             details["appended_because"] = str(error)
-        return Stego(found, tuple(map(unpack, payloads)), run.iterations, details)
+        return Stego(found, tuple(map(KeyssSecret.of, payloads)), run.iterations, details)
 
 
 def training_of(design: Design) -> type[KeyssTraining]:

@@ -36,7 +36,7 @@ class DecoderShape:
     """Kind and sizes of a decoder; appendix B: two layers for the common branch, two for each other."""
 
     kind: Annotated[str, Meta(min_length=1, max_length=32)] = (
-        "mlp"  # see `keyss.methods.keyss.secret.DECODERS`
+        "mlp"  # see `keyss.methods.keyss.decoder.DECODERS`
     )
     mask: Mask = ATTRIBUTES  # theta
     hidden: tuple[Width, Width] = (64, 128)  # common branch; from the authors' program, the paper gives none

@@ -20,11 +20,10 @@ from torch import Tensor
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Camera, Scene
 from keyss.core.similarity import Similarity, align
-from keyss.fitting.checkpoint import State, pack_network, unpack_network
 from keyss.fitting.config import FitConfig
 from keyss.fitting.density import CappedStrategy, Rendered
 from keyss.fitting.image_metrics import psnr, subsample_views
-from keyss.fitting.loop import Shuffle, TrainingRun, own_randomness, train
+from keyss.fitting.loop import Shuffle, State, TrainingRun, own_randomness, train, with_prefix
 from keyss.fitting.losses import Target, Targets, photometric_loss
 from keyss.fitting.parameters import (
     initial_gaussians,
@@ -36,8 +35,9 @@ from keyss.fitting.parameters import (
 from keyss.fitting.schedule import Schedule
 from keyss.keys.derivation import random_embeddings, stream
 from keyss.methods.base import Context, Source, divide, role_of
+from keyss.methods.keyss.decoder import DECODERS
 from keyss.methods.keyss.options import DecoderShape, JointOptions, Scenes
-from keyss.methods.keyss.secret import DECODERS, KeyssSecret, choose_anchors, visibility
+from keyss.methods.keyss.secret import KeyssSecret, choose_anchors, visibility
 from keyss.rendering import render, render_with_meta
 
 CACHE_BYTES = 2 << 30
@@ -344,8 +344,17 @@ class KeyssTraining(TrainingRun):
         )
 
     def state(self) -> State:
-        return super().state() | pack_network(self.networks, self.network_optimizers[0])
+        state = super().state()
+        state |= {f"networks.{name}": value for name, value in self.networks.state_dict().items()}
+        for index, moments in self.network_optimizers[0].state_dict()["state"].items():
+            state |= {f"networks_adam.{index}.{name}": value for name, value in moments.items()}
+        return state
 
     def load(self, state: State) -> None:
         super().load(state)
-        unpack_network(state, self.networks, self.network_optimizers[0])
+        self.networks.load_state_dict(with_prefix(state, "networks."))
+        adam = self.network_optimizers[0].state_dict()
+        for name, value in with_prefix(state, "networks_adam.").items():
+            index, key = name.split(".")
+            adam["state"].setdefault(int(index), {})[key] = value
+        self.network_optimizers[0].load_state_dict(adam)
