@@ -11,7 +11,7 @@ import torch
 
 from keyss import KeyssOptions, WrongKeyError
 from keyss.channels import is_appended
-from keyss.core import KeyssWarning, UsageError, same_bits
+from keyss.core import InputError, KeyssWarning, UsageError, same_bits
 from keyss.core.similarity import Similarity
 from keyss.fitting.losses import Target, ssim_torch
 from keyss.methods import DESIGNS, CombinedPoses, KeyssTraining, PlacedScene, Source, registry
@@ -21,11 +21,10 @@ from methods.keyss.small import FIT, KEYS, VECTORS, small, start_training
 from tiny_scenes import random_gaussians, tiny_scene
 
 
-@pytest.fixture(scope="module")
-def hidden() -> Hidden:
+@pytest.fixture(scope="module", params=["published", "latent"])
+def hidden(request: pytest.FixtureRequest) -> Hidden:
     scenes, models = three_scenes()
-    options = small("published", decoder_rate=3e-3)
-    return hide_scenes(scenes, KEYS, options.with_fit(iterations=60), plains=models)
+    return hide_scenes(scenes, KEYS, small(request.param, decoder_rate=3e-3), plains=models)
 
 
 def _run(design: str = "published", **changes: Any) -> KeyssTraining:
@@ -84,8 +83,16 @@ def test_appended_gaussians_are_not_decoded(hidden: Hidden) -> None:
     own = hidden.stego[~is_appended(hidden.stego)]
     assert len(own) < len(hidden.stego) - 1000
     for secret in hidden.opened:
-        assert same_bits(secret.reveal(hidden.stego), secret.reveal(own))
-        assert secret.remains(secret.reveal(hidden.stego)).whole
+        revealed = secret.reveal(hidden.stego)
+        assert same_bits(revealed, secret.reveal(own))
+        assert secret.remains(revealed).whole
+        assert len(revealed) > 100
+
+
+def test_moved_model(hidden: Hidden) -> None:
+    for other in (replace(hidden.stego, means=hidden.stego.means + 1e-2), random_gaussians(seed=9)):
+        with pytest.raises(InputError, match="moved or rounded"):
+            hidden.opened[0].reveal(other)
 
 
 def test_small_cover_warning() -> None:

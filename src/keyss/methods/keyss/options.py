@@ -231,11 +231,6 @@ class KeyssOptions(JointOptions):
             return design
         return replace(design, decoder=replace(design.decoder, mask=parse_mask(",".join(self.mask))))
 
-    @property
-    def step_cost(self) -> float:
-        """See `Plan`; measured at 2,000 to 30,000 Gaussians."""
-        return 1.0 if self.configuration.decoder.kind == "latent" else 8.0
-
     @classmethod
     def variants(cls) -> Mapping[str, KeyssOptions]:
         """The paper's text."""
