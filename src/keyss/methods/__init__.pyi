@@ -7,7 +7,12 @@ from .base import (
     Stego as Stego,
     Training as Training,
 )
-from .carry.method import most_contributing as most_contributing
+from .carry.capacity import record_request as record_request
+from .carry.method import (
+    embed_models as embed_models,
+    encode_all as encode_all,
+    most_contributing as most_contributing,
+)
 from .carry.options import CarryOptions as CarryOptions
 from .decoy import Decoy as Decoy
 from .hidden import Frame as Frame, HiddenFile as HiddenFile, HiddenScene as HiddenScene, Remains as Remains
@@ -28,11 +33,6 @@ from .keyss.training import (
 )
 from .plain_models import fit_plain_models as fit_plain_models
 from .records.carried_secret import CarriedSecret as CarriedSecret, unpack as unpack
-from .records.embedding import (
-    embed_models as embed_models,
-    encode_all as encode_all,
-    record_request as record_request,
-)
 from .records.lines import Line as Line, Table as Table
 from .records.precision import (
     choose_precision as choose_precision,

@@ -65,12 +65,7 @@ class Codec:
 
     @staticmethod
     def fit(gaussians: Gaussians, table: Table) -> tuple[Codec, Flags]:
-        """Fit lines to `gaussians`, and find the outliers [N] among them; none if that were all.
-
-        Raises ValueError unless they have the SH degree of the table.
-        """
-        if table.sh_degree != gaussians.sh_degree:
-            raise ValueError(f"SH degree {gaussians.sh_degree}, but the table is for {table.sh_degree}")
+        """Fit lines to `gaussians`, and find the outliers [N] among them; none if that were all."""
         found, parts = _bulk(gaussians)
         every = zip(_kinds(table.sh_degree), _bits(table), parts, strict=True)
         return Codec(table, tuple(fit_line(kind, bits, *line) for kind, bits, line in every)), found
