@@ -18,7 +18,7 @@ from keyss.core.similarity import Similarity
 from keyss.fitting.adam import RowAdam
 from keyss.lab.baselines.baseline_options import BaselineOptions
 from keyss.methods.base import Capabilities, Context, Plan, Source, Stego
-from keyss.methods.hidden import Frame, Remains
+from keyss.methods.hidden import Frame, HiddenScene
 from keyss.methods.keyss.training import KeyssTraining, Picture, PlacedScene
 from keyss.methods.tensors import Header, pack_tensors, refuse_damage, unpack_tensors
 
@@ -67,17 +67,12 @@ Show = Callable[[Gaussians], Gaussians]  # takes a model on the CPU in the cover
 
 
 @dataclass(frozen=True)
-class CompanionSecret:
-    """A `HiddenScene`: a companion file applied to the published model."""
+class CompanionSecret(HiddenScene):
+    """A companion file applied to the published model."""
 
+    frame: Similarity | None
     companion: CompanionTensors
     show: Show
-    decode: None = None
-    key_size: int = 0
-
-    @property
-    def frame(self) -> Similarity | None:
-        return self.companion.frame
 
     def reveal(self, stego: Gaussians, *, frame: Frame = "secret", force: bool = False) -> Gaussians:
         """See `HiddenScene.reveal`; raises InputError for a model with other Gaussians."""
@@ -94,10 +89,6 @@ class CompanionSecret:
         if self.frame is None or frame == "cover":
             return shown
         return self.frame.inverse().apply_gaussians(shown)
-
-    def remains(self, revealed: Gaussians) -> Remains:
-        """A secret in a companion file is complete or does not open."""
-        return Remains(len(revealed), len(revealed))
 
     def fingerprint(self) -> str:
         return hashlib.sha256(self.companion.payload("baseline").data).hexdigest()[:16]
@@ -185,4 +176,4 @@ class Baseline:
         """The secret of a companion file. Raises InputError for damage."""
         companion = CompanionTensors.of(content)
         with refuse_damage(DAMAGED):
-            return CompanionSecret(companion, self.open(companion))
+            return CompanionSecret(companion.frame, companion, self.open(companion))

@@ -21,7 +21,7 @@ from keyss.channels import Content, Payload, is_appended
 from keyss.core.errors import InputError
 from keyss.core.gaussians import DRAWN_OPACITY, Gaussians, compensate_pruning
 from keyss.core.similarity import Similarity
-from keyss.methods.hidden import Frame, Remains
+from keyss.methods.hidden import Frame, HiddenScene, Remains
 from keyss.methods.keyss.decoder import DECODERS, Decoder
 from keyss.methods.keyss.options import DecoderShape, parse_mask
 from keyss.methods.tensors import Header, pack_tensors, refuse_damage, unpack_tensors
@@ -46,8 +46,8 @@ class _Header(Header):
 
 
 @dataclass(frozen=True)
-class KeyssSecret:
-    """Everything beside the stego model that reveals one secret; see `keyss.methods.hidden.HiddenScene`."""
+class KeyssSecret(HiddenScene):
+    """Everything beside the stego model that reveals one secret."""
 
     decoder: Decoder
     key: Tensor = field(repr=False)  # [K] the vector of its key
