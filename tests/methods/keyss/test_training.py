@@ -17,7 +17,7 @@ from keyss.fitting.losses import Target, ssim_torch
 from keyss.methods import DESIGNS, CombinedPoses, KeyssTraining, PlacedScene, Source, registry
 from keyss.rendering import render
 from methods.hiding import Hidden, check_resumes, hide_scenes, three_scenes
-from methods.keyss.small import FIT, KEYS, VECTORS, small, start_training
+from methods.keyss.small import FIT, KEYS, VECTORS, small
 from tiny_scenes import random_gaussians, tiny_scene
 
 
@@ -28,10 +28,12 @@ def hidden(request: pytest.FixtureRequest) -> Hidden:
 
 
 def _run(design: str = "published", **changes: Any) -> KeyssTraining:
-    scenes = [tiny_scene(seed) for seed in range(3)]
-    return start_training(
-        small(design, **changes), scenes, [random_gaussians(seed=seed) for seed in range(3)]
-    )
+    options = small(design, **changes)
+    options = options.with_fit(ssim_weight=options.configuration.ssim_weight)
+    scenes = [
+        PlacedScene.of(tiny_scene(each), random_gaussians(seed=each), Similarity()) for each in range(3)
+    ]
+    return KeyssTraining(scenes, list(VECTORS[:2]), options, torch.device("cpu"))
 
 
 def _loss(image: torch.Tensor, target: torch.Tensor, weight: float) -> torch.Tensor:
