@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
 from typing import Any
 
 import torch
 
 import keyss  # noqa: F401  before anything imports torch
 from keyss.core import Similarity
-from keyss.fitting import FitConfig, PlainRun, TrainingRun, train
+from keyss.fitting import FitConfig, PlainRun
 from keyss.keys import random_embeddings
-from keyss.methods import KeyssTraining, PlacedScene, registry
+from keyss.methods import DESIGNS, PlacedScene, registry
+from keyss.methods.keyss.method import training_of
 from methods.keyss.small import small
 from tiny_scenes import random_gaussians, tiny_scene
 
@@ -21,40 +21,17 @@ FIT = FitConfig(
 )
 
 
-def plain(fit: FitConfig, device: torch.device) -> PlainRun:
-    return PlainRun(tiny_scene(), fit, device)
-
-
-def joint(fit: FitConfig, device: torch.device) -> KeyssTraining:
-    """KeySS with wrong keys, poses of both scenes, and all attributes decoded."""
-    options = small("published", fit, common_poses=0.5)
+def training(name: str, fit: FitConfig, device: torch.device) -> Any:
+    """The training of a plain model, or of two scenes in one frame by a design or a baseline."""
+    if name == "plain":
+        return PlainRun(tiny_scene(), fit, device)
+    scenes = [
+        PlacedScene.of(tiny_scene(seed), random_gaussians(seed=seed, sh_degree=fit.sh_degree), Similarity())
+        for seed in (0, 1)
+    ]
+    if name not in DESIGNS:
+        method: Any = registry.get(name)
+        return method.training(scenes, method.options(fit=fit, common_poses=0.5), device)
     keys = list(random_embeddings(1, torch.Generator().manual_seed(0)))
-    return KeyssTraining(placed(), keys, options, options.configuration, device)
-
-
-def gs_hider(fit: FitConfig, device: torch.device) -> KeyssTraining:
-    """A baseline with networks, and with features in place of harmonics."""
-    method: Any = registry.get("gs-hider")
-    options = method.options(fit=fit, common_poses=0.5)
-    return method.training(placed(), options, device)  # type: ignore[no-any-return]
-
-
-RUNS: Mapping[str, Callable[[FitConfig, torch.device], Any]] = {
-    "plain": plain,
-    "joint": joint,
-    "gs-hider": gs_hider,
-}
-
-
-def train_run(name: str, fit: FitConfig, device: str = "cpu", **options: Any) -> TrainingRun:
-    """Train one of RUNS to its end."""
-    run: TrainingRun = RUNS[name](fit, torch.device(device))
-    train(run, name, fit, fingerprint={}, **options)
-    return run
-
-
-def placed(sh_degree: int = 1) -> list[PlacedScene]:
-    """Two scenes in one frame."""
-    scenes = [tiny_scene(0), tiny_scene(1)]
-    models = [random_gaussians(seed=seed, sh_degree=sh_degree) for seed in (0, 1)]
-    return [PlacedScene.of(*each, Similarity()) for each in zip(scenes, models, strict=True)]
+    options = small(name, fit, **({} if name == "latent" else {"common_poses": 0.5}))
+    return training_of(options.configuration)(scenes, keys, options, device)

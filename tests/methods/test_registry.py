@@ -23,8 +23,8 @@ from keyss.methods import (
     CommandLineOption,
     Context,
     Frame,
+    HiddenScene,
     MethodOptions,
-    Remains,
     Source,
     Stego,
     registry,
@@ -42,16 +42,12 @@ class WholeOptions(MethodOptions):
 
 
 @dataclass(frozen=True)
-class OpenedWhole:
+class OpenedWhole(HiddenScene):
     model: Gaussians
-    frame: None = None
-    decode: None = None
+    frame = None
 
     def reveal(self, stego: Gaussians, *, frame: Frame = "secret", force: bool = False) -> Gaussians:
         return self.model
-
-    def remains(self, revealed: Gaussians) -> Remains:
-        return Remains(len(revealed), len(revealed))
 
     def fingerprint(self) -> str:
         return f"{len(self.model):016x}"

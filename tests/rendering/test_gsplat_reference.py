@@ -10,18 +10,14 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 import torch
 
 from channels.quiet.trained_like import trained_like
-from fitting.small_trainings import FIT, placed
-from keyss import CarryOptions, FitConfig, Secret, hide, reveal
-from keyss.fitting import PlainRun
-from keyss.keys import random_embeddings
+from fitting.small_trainings import FIT, training
+from keyss import CarryOptions, Secret, hide, reveal
 from keyss.methods import DESIGNS, registry
-from keyss.methods.keyss.method import training_of
 from keyss.runs import stego_in
 from methods.keyss.small import small
 from rendering.fake_cuda import GpuTensor, fake_cuda
@@ -69,20 +65,6 @@ def test_no_visible_gaussians(gpu: torch.device) -> None:
     results = results_on(gpu, scene)
     assert not results["radii"].any()
     assert torch.equal(results["image"], scene.background.float().expand(40, 48, 3))
-
-
-def training(name: str, config: FitConfig, device: torch.device) -> Any:
-    """Of a plain model, a design, or a baseline."""
-    if name == "plain":
-        return PlainRun(tiny_scene(), config, device)
-    if name not in DESIGNS:
-        method: Any = registry.get(name)
-        return method.training(placed(sh_degree=3), method.options(fit=config, common_poses=0.5), device)
-    options = small(name, config)
-    vectors = list(random_embeddings(1, torch.Generator().manual_seed(0)))
-    return training_of(options.configuration)(
-        placed(sh_degree=3), vectors, options, options.configuration, device
-    )
 
 
 @pytest.mark.parametrize(

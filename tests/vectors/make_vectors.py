@@ -49,7 +49,6 @@ from keyss.keys.derivation import random_embeddings  # noqa: E402
 from keyss.methods import Decoder, DecoderShape, HiddenFile, KeyssSecret, choose_anchors  # noqa: E402  # noqa: E402
 from keyss.methods.records import whole  # noqa: E402
 from keyss.methods.records.carried_secret import unpack  # noqa: E402
-from keyss.methods.records.embedding import METHOD  # noqa: E402
 from methods.carry.carried import embed  # noqa: E402
 from methods.keyss.small import latent_model, make_secret  # noqa: E402
 from vectors.surviving import NAMES, write_surviving  # noqa: E402
@@ -97,7 +96,7 @@ def reveal_content(name: str, key: str) -> dict[str, Any]:
     stego = read_model(FOLDER / name)
     content = open_content(stego, key)
     found: dict[str, Any] = {"file": name, "key": key, "method": content.method}
-    if isinstance(content, Payload) and content.method != METHOD:
+    if isinstance(content, Payload) and content.method != "carry":
         return found | {"payload": hashlib.sha256(content.data).hexdigest()}
     secret = unpack(content)
     model = secret.reveal(stego)
@@ -171,11 +170,11 @@ def write_coded(suffix: str) -> None:
     """A model whose codes hold two secrets: two models, or a model and a file."""
     cover = coded.model_of(2300, 11, 0)
     other = {
-        ".spz": Payload(METHOD, whole.encode(trained_like(25, 12, 2))),
-        ".sog": Payload(METHOD, whole.encode(trained_like(60, 13, 0))),
+        ".spz": Payload("carry", whole.encode(trained_like(25, 12, 2))),
+        ".sog": Payload("carry", whole.encode(trained_like(60, 13, 0))),
         ".compressed.ply": HiddenFile("a note.txt", b"Written at noon, read at night.\n").payload(),
     }[suffix]
-    secrets = [(TWO_KEYS[0], Payload(METHOD, whole.encode(trained_like(40, 14, 1)))), (TWO_KEYS[1], other)]
+    secrets = [(TWO_KEYS[0], Payload("carry", whole.encode(trained_like(40, 14, 1)))), (TWO_KEYS[1], other)]
     name = next(each for each, end in SUFFIXES.items() if end == suffix)
     model = channel_for("as-is", format=name).prepare(cover).embed(secrets, entropy=bytes(32))
     write_model(FOLDER / f"coded{suffix}", model)

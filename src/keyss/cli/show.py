@@ -153,7 +153,7 @@ def evaluate(
     import keyss
     from keyss.cli.keys import keys_of_run
     from keyss.cli.tables import print_files, print_hiding
-    from keyss.fitting.lpips import HOW_TO_GET, MIN_SIZE
+    from keyss.fitting.image_metrics import HOW_TO_GET, MIN_SIZE
 
     metrics = keyss.evaluate(run, keys_of_run(run, key_file), wrong_keys=wrong_keys, device=device)
     print_hiding(metrics)

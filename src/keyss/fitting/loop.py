@@ -1,46 +1,167 @@
-"""The loop of every training run: progress, checkpoints, signals, resume."""
+"""Training runs: what they share, and their loop with progress, checkpoints, signals and resuming.
+
+A checkpoint is the state of a run in one safetensors file: tensors and JSON, nothing executable.
+"""
 
 from __future__ import annotations
 
+import json
 import signal
 import threading
 import time
 import warnings
-from collections.abc import Callable, Iterator
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, TypeVar
 
+import safetensors
+import safetensors.torch
 import torch
+from torch import Tensor
 
 from keyss import _threads
 from keyss._interrupts import ENDING
 from keyss.core.errors import InputError, Interrupted, KeyssWarning
-from keyss.fitting.checkpoint import State, load_checkpoint, save_checkpoint
+from keyss.core.gaussians import Gaussians
+from keyss.files.atomic import write_bytes
 from keyss.fitting.config import FitConfig
-from keyss.fitting.sampling import own_randomness
+from keyss.fitting.density import CappedStrategy, Rendered, of_scene
+from keyss.fitting.parameters import Optimizers, Parameters
+from keyss.fitting.schedule import Schedule
 from keyss.progress import Reporter
 
+T = TypeVar("T")
+State = dict[str, Tensor]
+_UNREADABLE = (OSError, KeyError, ValueError, TypeError, safetensors.SafetensorError)
 
-class TrainingRun(Protocol):
-    """A training run. Its future depends only on the result of `state`."""
 
-    iterations: int
-    iteration: int  # steps done
+@contextmanager
+def own_randomness(seed: int) -> Iterator[None]:
+    """Seed torch's global generators, on the CPU and the current GPU, and restore them after the block."""
+    gpus = [torch.cuda.current_device()] if torch.cuda.is_available() else []
+    with torch.random.fork_rng(gpus):
+        torch.manual_seed(seed)
+        yield
 
+
+class Shuffle:
+    """Samples 0..count-1 without replacement, over and over."""
+
+    def __init__(self, count: int, generator: torch.Generator) -> None:
+        self.count = count
+        self.generator = generator
+        self.remaining = torch.empty(0, dtype=torch.int64)
+
+    def sample(self) -> int:
+        if len(self.remaining) == 0:
+            self.remaining = torch.randperm(self.count, generator=self.generator)
+        index = int(self.remaining[-1])
+        self.remaining = self.remaining[:-1]
+        return index
+
+
+class TrainingRun(ABC):
+    """A training of Gaussians. Its future depends only on the result of `state`."""
+
+    parameters: Parameters
+    optimizers: Optimizers
+    schedules: list[Schedule]  # for each scene that has parameters of its own
+    strategy: CappedStrategy
+    density: dict[str, Any]  # the state of `strategy`
+    network_optimizers: Sequence[torch.optim.Optimizer] = ()
+
+    def __init__(self, fit: FitConfig, device: torch.device) -> None:
+        self.fit, self.device = fit, device
+        self.iterations, self.iteration = fit.iterations, 0  # steps in all, steps done
+        self.generators = {"generator": torch.Generator().manual_seed(fit.known_seed)}
+        self.generator = self.generators["generator"]
+        self.shuffles: dict[str, Shuffle] = {}
+
+    @abstractmethod
     def step(self) -> None:
         """Take one optimisation step, which increases `iteration`."""
 
+    @abstractmethod
     def evaluate(self) -> dict[str, float]:
         """Quality on held-out views, by name."""
 
-    def state(self) -> tuple[State, dict[str, Any]]:
-        """Tensors (not copied) and JSON-able numbers."""
-
-    def load(self, tensors: State, meta: dict[str, Any]) -> None: ...
+    @abstractmethod
+    def gaussians(self) -> Gaussians:
+        """The model, detached."""
 
     def __len__(self) -> int:
         """Number of Gaussians."""
+        return len(self.parameters["means"])
+
+    def optimise(self, views: Sequence[T], loss_at: Callable[[T], tuple[Tensor, list[Rendered]]]) -> None:
+        """Take an optimisation step on the mean loss of `views`; see `CappedStrategy.backward`."""
+        self.loss, info = self.strategy.backward(views, loss_at, len(self))
+        self.set_rates()
+        for optimizer in (*self.optimizers.values(), *self.network_optimizers):
+            optimizer.step()
+            optimizer.zero_grad(set_to_none=True)
+        self.strategy.step_post_backward(self.parameters, self.optimizers, self.density, self.iteration, info)
+
+    def set_rates(self) -> None:
+        """Set the learning rates of the step `iteration`."""
+        for scene, schedule in enumerate(self.schedules):
+            schedule.set(of_scene(self.optimizers, scene), self.iteration)
+
+    def state(self) -> State:
+        """Parameters, their Adam moments, and what else the future depends on; tensors are not copied."""
+        state: State = {}
+        for name, parameter in self.parameters.items():
+            state[name] = parameter.detach()
+            for key, value in self.optimizers[name].state[parameter].items():
+                state[f"{name}.{key}"] = torch.as_tensor(value)
+        density = {key: value for key, value in self.density.items() if isinstance(value, Tensor)}
+        state |= {f"density.{key}": value for key, value in density.items()}
+        state |= {name: shuffle.remaining for name, shuffle in self.shuffles.items()}
+        return state | {name: generator.get_state() for name, generator in self.generators.items()}
+
+    def load(self, state: State) -> None:
+        """Restore the result of `state`, but not `iteration`; the number of Gaussians may differ."""
+        for name, old in list(self.parameters.items()):
+            parameter = torch.nn.Parameter(state[name].to(self.device))
+            (group,) = self.optimizers[name].param_groups
+            group["params"] = [parameter]
+            moments = with_prefix(state, f"{name}.")
+            self.optimizers[name].state.pop(old, None)
+            if moments:
+                self.optimizers[name].state[parameter] = {
+                    key: value if key == "step" and not group["fused"] else value.to(self.device)
+                    for key, value in moments.items()
+                }
+            self.parameters[name] = parameter
+        density = with_prefix(state, "density.").items()
+        self.density |= {key: value.to(self.device) for key, value in density}
+        for name, shuffle in self.shuffles.items():
+            shuffle.remaining = state[name]
+        for name, generator in self.generators.items():
+            generator.set_state(state[name])
+
+
+def save_checkpoint(path: Path, tensors: State, meta: Mapping[str, Any]) -> None:
+    """Atomically write `tensors` and the JSON-able `meta`; any device can load them. Raises OutputError."""
+    contiguous = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
+    write_bytes(path, safetensors.torch.save(contiguous, {"meta": json.dumps(meta)}))
+
+
+def load_checkpoint(path: Path) -> tuple[State, dict[str, Any]]:
+    """Tensors (on the CPU) and meta of a checkpoint. Raises InputError when it is missing or damaged."""
+    try:
+        with safetensors.safe_open(path, framework="pt") as file:
+            meta = json.loads((file.metadata() or {})["meta"])
+            return {name: file.get_tensor(name) for name in file.keys()}, meta  # noqa: SIM118
+    except _UNREADABLE as error:
+        raise InputError(f"{path}: not a checkpoint of this version ({error})") from error
+
+
+def with_prefix(state: State, prefix: str) -> State:
+    """The tensors whose names begin with `prefix`, named without it."""
+    return {key.removeprefix(prefix): value for key, value in state.items() if key.startswith(prefix)}
 
 
 _SPINNING = (
@@ -52,14 +173,13 @@ _SPINNING = (
 def train(
     run: TrainingRun,
     title: str,
-    config: FitConfig,
     *,
     fingerprint: dict[str, Any],
     checkpoint: Path | None = None,
     resume: bool = False,
     reporter: Reporter | None = None,
 ) -> None:
-    """Run all remaining iterations, with the seed and the intervals of `config`.
+    """Run all remaining iterations, with the seed and the intervals of the run's `fit`.
 
     With `checkpoint`, the state is saved there every `checkpoint_seconds`, on Ctrl-C, SIGTERM and SIGHUP
     (raises Interrupted), and at the end; with `resume`, training continues from it if the file exists.
@@ -73,11 +193,10 @@ def train(
 
     def save() -> None:
         if checkpoint is not None:
-            tensors, meta = run.state()
-            tensors |= {"rng": torch.get_rng_state()}
-            save_checkpoint(checkpoint, tensors, meta | {"fingerprint": fingerprint})
+            tensors = run.state() | {"rng": torch.get_rng_state()}
+            save_checkpoint(checkpoint, tensors, {"iteration": run.iteration, "fingerprint": fingerprint})
 
-    with defer_signals(saves=checkpoint is not None) as interrupted, own_randomness(config.known_seed):
+    with defer_signals(saves=checkpoint is not None) as interrupted, own_randomness(run.fit.known_seed):
         if checkpoint is not None and resume and checkpoint.exists():
             _resume(run, checkpoint, fingerprint)
         saved = time.monotonic()
@@ -86,13 +205,13 @@ def train(
         try:
             while run.iteration < run.iterations:
                 run.step()
-                if config.evaluate_every and run.iteration % config.evaluate_every == 0:
+                if run.fit.evaluate_every and run.iteration % run.fit.evaluate_every == 0:
                     numbers = run.evaluate()
                 reporter.update(run.iteration, len(run), numbers)
                 if signum := interrupted():
                     save()
                     raise Interrupted(checkpoint, run.iteration, signum)
-                if time.monotonic() - saved > config.checkpoint_seconds:
+                if time.monotonic() - saved > run.fit.checkpoint_seconds:
                     save()
                     saved = time.monotonic()
             save()
@@ -108,7 +227,8 @@ def _resume(run: TrainingRun, checkpoint: Path, fingerprint: dict[str, Any]) -> 
         raise InputError(f"{checkpoint}: belongs to a run with other settings or inputs; {remedy}")
     try:
         torch.set_rng_state(tensors.pop("rng"))
-        run.load(tensors, meta)
+        run.load(tensors)
+        run.iteration = int(meta["iteration"])
     except KeyError as error:
         raise InputError(f"{checkpoint}: not a checkpoint of this version (no {error})") from error
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import fields
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -45,17 +44,12 @@ def make_optimizers(parameters: Parameters, config: FitConfig, extent: float) ->
     sh_rate = max(config.sh0_rate, config.shN_rate) or 1.0
     sh_scale = parameters["sh"].new_full((parameters["sh"].shape[1], 1), config.shN_rate / sh_rate)
     sh_scale[0] = config.sh0_rate / sh_rate
-    groups: dict[str, dict[str, Any]] = {
-        "means": {"lr": config.means_rate * extent},
-        "quats": {"lr": config.quats_rate},
-        "scales": {"lr": config.scales_rate},
-        "opacities": {"lr": config.opacities_rate},
-        "sh": {"lr": sh_rate, "lr_scale": sh_scale},
-    }
-    fused = parameters["means"].device.type == "cuda"
     return {
-        name: RowAdam([{"params": [parameters[name]], **group}], eps=1e-15, fused=fused)
-        for name, group in groups.items()
+        "means": RowAdam(parameters["means"], config.means_rate * extent),
+        "quats": RowAdam(parameters["quats"], config.quats_rate),
+        "scales": RowAdam(parameters["scales"], config.scales_rate),
+        "opacities": RowAdam(parameters["opacities"], config.opacities_rate),
+        "sh": RowAdam(parameters["sh"], sh_rate, sh_scale),
     }
 
 

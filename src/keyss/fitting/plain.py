@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -13,11 +12,10 @@ from torch import Tensor
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene, View
 from keyss.files.images import downscale
-from keyss.fitting.checkpoint import State, pack_model, unpack_model
 from keyss.fitting.config import FitConfig
 from keyss.fitting.density import CappedStrategy, Rendered
 from keyss.fitting.image_metrics import mean_psnr, subsample_views
-from keyss.fitting.loop import train
+from keyss.fitting.loop import Shuffle, TrainingRun, train
 from keyss.fitting.losses import Target, Targets, photometric_loss
 from keyss.fitting.parameters import (
     initial_gaussians,
@@ -26,7 +24,6 @@ from keyss.fitting.parameters import (
     to_gaussians,
     to_parameters,
 )
-from keyss.fitting.sampling import Shuffle
 from keyss.fitting.schedule import Schedule, shrinking
 from keyss.progress import Reporter
 from keyss.rendering import render_with_meta
@@ -42,83 +39,55 @@ class FitResult:
     config: FitConfig  # includes the seed
 
 
-class PlainRun:
-    """A plain 3DGS training; see `keyss.fitting.loop.TrainingRun`.
-
-    With a `model`, training starts from it and keeps its number of Gaussians.
-    """
+class PlainRun(TrainingRun):
+    """A plain 3DGS training. With a `model`, it starts from it and keeps its number of Gaussians."""
 
     def __init__(
         self, scene: Scene, config: FitConfig, device: torch.device, model: Gaussians | None = None
     ) -> None:
-        self.config = config
+        super().__init__(config, device)
         self.grows = model is None
-        self.device = device
         self.views = scene.train
         self.watched = subsample_views(scene.test, 8)
         self.background = scene.background.to(device)
-        self.iterations = config.iterations
-        self.iteration = 0
-        self.generator = torch.Generator().manual_seed(config.known_seed)
         if model is None:
             points, colors = initial_points(scene, config.max_gaussians, self.generator)
             model = initial_gaussians(points, colors, config.sh_degree, config.max_gaussians, self.generator)
         self.parameters = to_parameters(model, device)
         self.optimizers = make_optimizers(self.parameters, config, scene.extent)
-        self.schedule = Schedule(config, [view.camera for view in self.views], scene.extent)
-        self.strategy = CappedStrategy(config)
-        self.density: dict[str, Any] = self.strategy.initialize_state(scene.extent)
-        self.shuffle = Shuffle(len(self.views), self.generator)
+        self.schedules = [Schedule(config, [view.camera for view in self.views], scene.extent)]
+        self.strategy = CappedStrategy(config if self.grows else replace(config, grow_stop=0.0))
+        self.density = self.strategy.initialize_state(scene.extent)
+        self.order = self.shuffles["order"] = Shuffle(len(self.views), self.generator)
         self.pixels = max(view.camera.width * view.camera.height for view in self.views)
         self.shrunk, self.targets = 1, Targets()
 
-    def __len__(self) -> int:
-        return len(self.parameters["means"])
-
     def step(self) -> None:
-        config = self.config
-        chosen = [self.shuffle.sample() for _ in range(config.views_per_step)]
+        fit = self.fit
+        chosen = [self.order.sample() for _ in range(fit.views_per_step)]
         self.iteration += 1
-        degree = config.sh_degree_at(self.iteration) if self.grows else config.sh_degree
-        factor = shrinking(config, self.iteration, self.pixels) if self.grows else 1
+        degree = fit.sh_degree_at(self.iteration) if self.grows else fit.sh_degree
+        factor = shrinking(fit, self.iteration, self.pixels) if self.grows else 1
         if factor != self.shrunk:
             self.shrunk, self.targets = factor, Targets()
 
         def loss_at(index: int) -> tuple[Tensor, list[Rendered]]:
-            view, model = self.views[index], to_gaussians(self.parameters)
+            view = self.views[index]
             camera = view.camera
             size = max(1, camera.width // factor), max(1, camera.height // factor)
             camera = camera if factor == 1 else camera.resized(*size)
+            model = to_gaussians(self.parameters)
             image, meta = render_with_meta(model, camera, self.background, sh_degree=degree)
             target = self.targets.of(index, lambda: _target(view, size, self.device))
-            return photometric_loss(image, target, config.ssim_weight), [(meta, None, 1.0)]
+            return photometric_loss(image, target, fit.ssim_weight), [(meta, None, 1.0)]
 
-        self.loss, info = self.strategy.backward(chosen, loss_at, len(self))
-        self.schedule.set(self.optimizers, self.iteration)
-        for optimizer in self.optimizers.values():
-            optimizer.step()
-            optimizer.zero_grad(set_to_none=True)
-        if self.grows:
-            self.strategy.step_post_backward(
-                self.parameters, self.optimizers, self.density, self.iteration, info
-            )
+        self.optimise(chosen, loss_at)
 
     def gaussians(self) -> Gaussians:
         return to_gaussians(self.parameters).detach()
 
     def evaluate(self) -> dict[str, float]:
         return {"PSNR": mean_psnr(self.gaussians(), self.watched, self.background)}
-
-    def state(self) -> tuple[State, dict[str, Any]]:
-        tensors = pack_model(self.parameters, self.optimizers, self.density)
-        tensors |= {"order": self.shuffle.state(), "generator": self.generator.get_state()}
-        return tensors, {"iteration": self.iteration}
-
-    def load(self, tensors: State, meta: dict[str, Any]) -> None:
-        unpack_model(tensors, self.parameters, self.optimizers, self.density)
-        self.shuffle.load(tensors["order"])
-        self.generator.set_state(tensors["generator"])
-        self.iteration = int(meta["iteration"])
 
 
 def _target(view: View, size: tuple[int, int], device: torch.device) -> Target:
@@ -157,9 +126,7 @@ def fit_scene(
         inputs["model"] = model.digest()
     run = PlainRun(scene, config, torch.device(device), model)
     fingerprint = {**inputs, "config": asdict(config)}
-    train(
-        run, title, config, fingerprint=fingerprint, checkpoint=checkpoint, resume=resume, reporter=reporter
-    )
+    train(run, title, fingerprint=fingerprint, checkpoint=checkpoint, resume=resume, reporter=reporter)
     fitted = run.gaussians().to("cpu")
     return FitResult(without_faint(fitted, config.prune_opacity) if run.grows else fitted, config)
 

@@ -172,28 +172,6 @@ class MethodOptions:
         """Options with changed fields of `fit`."""
         return replace(self, fit=replace(self.fit, **changes))
 
-    def joint_plan(self, secrets: int, step_cost: float = 1.0) -> Plan:
-        """The plan of a joint training with the size of one plain model; `step_cost` as in `Plan`."""
-        fit = self.fit
-        return Plan(
-            gaussians=fit.max_gaussians,
-            sh_degree=fit.sh_degree,
-            secret_gaussians=secrets * fit.max_gaussians,
-            capacity=fit.max_gaussians,
-            steps=fit.iterations,
-            step_cost=step_cost,
-            rendered=(fit.max_gaussians,) * (1 + secrets),
-        )
-
-    def check_published_exactly(self) -> None:
-        """Raise UsageError if a jointly trained model would be published in a lossy format."""
-        if self.publish == "any" or self.format not in (None, "ply"):
-            option = 'publish="any"' if self.publish == "any" else f'format="{self.format}"'
-            raise UsageError(
-                f"`{option}`: this method needs the published model bit for bit: leave it out, or use "
-                '`method="carry"`'
-            )
-
 
 @dataclass(frozen=True, kw_only=True)
 class Plan:

@@ -11,7 +11,7 @@ from keyss.channels import TYPICAL_SHARE, LowBitsCapacity
 from keyss.core.gaussians import DRAWN_OPACITY, Gaussians
 from keyss.core.similarity import Similarity
 from keyss.keys.derivation import DerivedKey
-from keyss.methods.hidden import Frame, Remains
+from keyss.methods.hidden import Frame, HiddenScene
 from keyss.methods.records import whole
 from keyss.methods.records.lines import Table
 from keyss.methods.records.quantise import Codec
@@ -25,8 +25,8 @@ _MIN_SHARE = 0.8  # minimum share of the cover's Gaussians that are left
 
 
 @dataclass(frozen=True)
-class Decoy:
-    """A `HiddenScene` that shows the cover, imperceptibly changed.
+class Decoy(HiddenScene):
+    """Shows the cover, imperceptibly changed.
 
     A smooth function changes opacities, a similarity moves all Gaussians, and the faintest ones are removed.
     The derived key seeds these changes, so nobody can compute the bytes without it. The result is encoded and
@@ -39,8 +39,6 @@ class Decoy:
     order: int  # seed of the order of records
     appended: bool = False  # True if the model has appended Gaussians, which are removed
     records: bool = True  # True if a secret would be records, else one payload
-    decode: None = None
-    key_size: int = 0
 
     @staticmethod
     def of(stego: Gaussians, key: DerivedKey, *, appended: bool = False, records: bool = True) -> Decoy:
@@ -86,12 +84,8 @@ class Decoy:
             return whole.decode(whole.encode(model, precision.finer(_FINER * self.appended)))
         order = torch.randperm(len(model), generator=torch.Generator().manual_seed(self.order))
         model = model[order[: cells * capacity.carriers]].with_sh_degree(table.sh_degree)
-        codec, outliers = Codec.fit_with_outliers(model, table)
+        codec, outliers = Codec.fit(model, table)
         return codec.decode(codec.encode(model, outliers))
-
-    def remains(self, revealed: Gaussians) -> Remains:
-        """A decoy is always complete."""
-        return Remains(len(revealed), len(revealed))
 
     def fingerprint(self) -> str:
         """A constant that differs from the fingerprint of every secret."""

@@ -1,10 +1,11 @@
-"""Hidden scenes (a protocol) and hidden files, which keys open."""
+"""Hidden scenes and hidden files, which keys open."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Literal, Protocol
+from typing import Literal
 
 from torch import Tensor
 
@@ -39,25 +40,22 @@ class Remains:
         return abs(self.share - 1) <= self.slack and (self.chunks is None or self.chunks[0] == self.chunks[1])
 
 
-class HiddenScene(Protocol):
+class HiddenScene(ABC):
     """A secret scene after its key has opened it, and before `reveal`."""
 
-    @property
-    def frame(self) -> Similarity | None:
-        """Secret frame to cover frame; None if the secret has no position in the cover."""
+    frame: Similarity | None  # secret frame to cover frame; None if it has no position in the cover
 
-    @property
-    def decode(self) -> Callable[[Gaussians, Tensor], Gaussians] | None:
-        """The decoder: maps a stego model and a key's vector [`key_size`] to Gaussians in the cover's frame.
-
-        Differentiable in the vector, for white-box attacks. None if no decoder is conditioned on keys: wrong
-        keys then show nothing at all.
-        """
+    # The decoder: maps a stego model and a key's vector [`key_size`] to Gaussians in the cover's frame.
+    # Differentiable in the vector, for white-box attacks. None if no decoder is conditioned on keys: wrong
+    # keys then show nothing at all.
+    decode: Callable[[Gaussians, Tensor], Gaussians] | None = None
 
     @property
     def key_size(self) -> int:
         """The size of a key's vector; 0 without a decoder."""
+        return 0
 
+    @abstractmethod
     def reveal(self, stego: Gaussians, *, frame: Frame = "secret", force: bool = False) -> Gaussians:
         """The secret as a standalone model on the CPU; `force`: even from a changed model.
 
@@ -66,8 +64,10 @@ class HiddenScene(Protocol):
         """
 
     def remains(self, revealed: Gaussians) -> Remains:
-        """The part of the secret that the result of `reveal` contains."""
+        """The part of the secret that the result of `reveal` contains; by default all of it."""
+        return Remains(len(revealed), len(revealed))
 
+    @abstractmethod
     def fingerprint(self) -> str:
         """16 hexadecimal digits that identify the secret in a run, and reveal nothing about it."""
 

@@ -49,9 +49,8 @@ class Bound:
         return Bound(None if plain_steps is None else plain_steps + training.steps, False)
 
     def config(self, fit: FitConfig, gaussians: int | None = None) -> FitConfig:
-        """The fit, with at most `gaussians`. Raises ValueError if `steps` is unknown."""
-        if self.steps is None:
-            raise ValueError("the number of steps is not known")
+        """The fit, with at most `gaussians`; `steps` must be known."""
+        assert self.steps is not None
         limit = fit.max_gaussians if gaussians is None else max(16, gaussians)
         return replace(fit, iterations=self.steps, max_gaussians=limit)
 

@@ -42,7 +42,7 @@ METHODS = {
         "train one model and a decoder for all keys jointly, as the paper does",
         "keyss.methods.keyss.options:KeyssOptions",
         "keyss.methods.keyss.method:METHOD",
-        "keyss.methods.keyss.secret:unpack",
+        "keyss.methods.keyss.secret:KeyssSecret.of",
     ),
     "3dgs": _baseline("upper_bound", "BoundOptions", "upper bound: the secret is a separate file"),
     "3dgs-sh": _baseline(

@@ -21,7 +21,7 @@ from keyss.channels import (
     usable_carriers,
 )
 from keyss.channels.quiet.parameters import key_cipher
-from keyss.core import Gaussians, UsageError, WrongKeyError
+from keyss.core import Gaussians, UsageError, WrongKeyError, same_bits
 from keyss.keys import DerivedKey
 from keyss.methods import embed_models, record_request
 from methods.carry.carried import embed, embed_derived, extract, extract_derived
@@ -178,3 +178,16 @@ def test_damaged_records_are_detected(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(LowBitsCover, "embed", broken)
     with pytest.raises(RuntimeError, match="do not open again"):
         embed_models(LOW_BITS.prepare(trained_like(6000, 0)), [KEY], [trained_like(2000, 1)])
+
+
+def test_overwritten_cover() -> None:
+    cover, keys, secrets = trained_like(3000, 0), ["7Vw3-Qp of the first"], [trained_like(900, 1)]
+    before = cover.map(torch.clone)
+    stego = embed_models(LOW_BITS.prepare(cover), keys, secrets, entropy=bytes(32)).gaussians
+    assert same_bits(cover, before)
+    prepared = LOW_BITS.prepare(cover)
+    assert prepared.usable is LOW_BITS.prepare(cover).usable  # found once
+    own = embed_models(prepared, keys, secrets, entropy=bytes(32), overwrite=True).gaussians
+    assert same_bits(own, stego)
+    assert same_bits(cover, stego)
+    assert prepared.usable is not LOW_BITS.prepare(cover).usable  # found again: the cover is another model

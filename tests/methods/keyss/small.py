@@ -1,4 +1,4 @@
-"""Small KeySS options, trainings and secrets."""
+"""Small KeySS options and secrets."""
 
 from __future__ import annotations
 
@@ -11,21 +11,10 @@ from torch import Tensor
 from channels.quiet.trained_like import trained_like
 from keyss import FitConfig, Gaussians, KeyssOptions
 from keyss.channels.harmonics import high_harmonics, row_ids, with_high_harmonics
-from keyss.core import Scene
 from keyss.core.similarity import Similarity
 from keyss.keys import random_embeddings
-from keyss.methods import (
-    DESIGNS,
-    Decoder,
-    DecoderShape,
-    KeyssSecret,
-    KeyssTraining,
-    LatentDecoder,
-    PlacedScene,
-    choose_anchors,
-)
-from keyss.methods.keyss.latent import latents_of
-from keyss.methods.keyss.method import training_of
+from keyss.methods import DESIGNS, Decoder, DecoderShape, KeyssSecret, LatentDecoder, choose_anchors
+from keyss.methods.keyss.decoder import latents_of
 from keyss.methods.keyss.secret import visibility
 
 FIT = FitConfig(iterations=60, max_gaussians=600, grow_start=0.2, grow_every=20, evaluate_every=0, seed=0)
@@ -38,16 +27,6 @@ def small(design: str, fit: FitConfig = FIT, **changes: object) -> KeyssOptions:
     known = DESIGNS[design]
     decoder = replace(known.decoder, hidden=(8, 8), branch=8)
     return KeyssOptions(fit=fit, design=replace(known, decoder=decoder, **changes))  # type: ignore[arg-type]
-
-
-def start_training(options: KeyssOptions, scenes: list[Scene], models: list[Gaussians]) -> KeyssTraining:
-    """A training of scenes in one frame, before its first step."""
-    placed = [PlacedScene.of(scene, model, Similarity()) for scene, model in zip(scenes, models, strict=True)]
-    design = options.configuration
-    if design.ssim_weight is not None:
-        options = options.with_fit(ssim_weight=design.ssim_weight)
-    keys = list(VECTORS[: len(scenes) - 1])
-    return training_of(design)(placed, keys, options, design, torch.device("cpu"))
 
 
 def make_secret(stego: Gaussians) -> KeyssSecret:

@@ -12,15 +12,14 @@ from torch import Tensor
 
 from channels.quiet.trained_like import trained_like
 from channels.test_harmonics import heavy_tailed
-from keyss import Gaussians, WrongKeyError
+from keyss import Gaussians
 from keyss.channels.harmonics import row_ids
 from keyss.core import InputError, UsageError, same_bits
 from keyss.lab import search_embeddings
-from keyss.methods import LatentDecoder, registry
-from keyss.methods.keyss.latent import latents_of
-from methods.hiding import Hidden, hide_scenes, three_scenes
+from keyss.methods import LatentDecoder
+from keyss.methods.keyss.decoder import latents_of
+from methods.hiding import hide_scenes, three_scenes
 from methods.keyss.small import KEYS, VECTORS, latent_model, small
-from tiny_scenes import random_gaussians
 
 
 def _embed_latents(secrets: int = 1) -> tuple[Gaussians, list[LatentDecoder], list[Tensor]]:
@@ -82,30 +81,6 @@ def test_capacity() -> None:
     for degree, secrets in ((3, 3), (2, 2), (1, 1), (0, 1)):
         with pytest.raises(UsageError, match="no room for one of each"):
             latents_of(degree, secrets)
-
-
-@pytest.fixture(scope="module")
-def hidden() -> Hidden:
-    scenes, models = three_scenes()
-    return hide_scenes(scenes, KEYS, small("latent"), plains=models)
-
-
-@pytest.mark.parametrize("secret", [0, 1])
-def test_hide_and_reveal(hidden: Hidden, secret: int) -> None:
-    opened = registry.open_model(hidden.stego, KEYS[secret])
-    assert opened.fingerprint() == hidden.opened[secret].fingerprint()
-    revealed = opened.reveal(hidden.stego)
-    assert opened.remains(revealed).whole
-    assert len(revealed) > 100
-    for key in ("First key", "other"):
-        with pytest.raises(WrongKeyError):
-            registry.open_model(hidden.stego, key)
-
-
-def test_moved_model(hidden: Hidden) -> None:
-    for other in (replace(hidden.stego, means=hidden.stego.means + 1e-2), random_gaussians(seed=9)):
-        with pytest.raises(InputError, match="moved or rounded"):
-            hidden.opened[0].reveal(other)
 
 
 def test_cover_without_harmonics() -> None:

@@ -11,28 +11,29 @@ import torch
 
 from keyss import KeyssOptions, WrongKeyError
 from keyss.channels import is_appended
-from keyss.core import KeyssWarning, UsageError, same_bits
+from keyss.core import InputError, KeyssWarning, UsageError, same_bits
 from keyss.core.similarity import Similarity
 from keyss.fitting.losses import Target, ssim_torch
 from keyss.methods import DESIGNS, CombinedPoses, KeyssTraining, PlacedScene, Source, registry
 from keyss.rendering import render
 from methods.hiding import Hidden, check_resumes, hide_scenes, three_scenes
-from methods.keyss.small import FIT, KEYS, VECTORS, small, start_training
+from methods.keyss.small import FIT, KEYS, VECTORS, small
 from tiny_scenes import random_gaussians, tiny_scene
 
 
-@pytest.fixture(scope="module")
-def hidden() -> Hidden:
+@pytest.fixture(scope="module", params=["published", "latent"])
+def hidden(request: pytest.FixtureRequest) -> Hidden:
     scenes, models = three_scenes()
-    options = small("published", decoder_rate=3e-3)
-    return hide_scenes(scenes, KEYS, options.with_fit(iterations=60), plains=models)
+    return hide_scenes(scenes, KEYS, small(request.param, decoder_rate=3e-3), plains=models)
 
 
 def _run(design: str = "published", **changes: Any) -> KeyssTraining:
-    scenes = [tiny_scene(seed) for seed in range(3)]
-    return start_training(
-        small(design, **changes), scenes, [random_gaussians(seed=seed) for seed in range(3)]
-    )
+    options = small(design, **changes)
+    options = options.with_fit(ssim_weight=options.configuration.ssim_weight)
+    scenes = [
+        PlacedScene.of(tiny_scene(each), random_gaussians(seed=each), Similarity()) for each in range(3)
+    ]
+    return KeyssTraining(scenes, list(VECTORS[:2]), options, torch.device("cpu"))
 
 
 def _loss(image: torch.Tensor, target: torch.Tensor, weight: float) -> torch.Tensor:
@@ -84,8 +85,16 @@ def test_appended_gaussians_are_not_decoded(hidden: Hidden) -> None:
     own = hidden.stego[~is_appended(hidden.stego)]
     assert len(own) < len(hidden.stego) - 1000
     for secret in hidden.opened:
-        assert same_bits(secret.reveal(hidden.stego), secret.reveal(own))
-        assert secret.remains(secret.reveal(hidden.stego)).whole
+        revealed = secret.reveal(hidden.stego)
+        assert same_bits(revealed, secret.reveal(own))
+        assert secret.remains(revealed).whole
+        assert len(revealed) > 100
+
+
+def test_moved_model(hidden: Hidden) -> None:
+    for other in (replace(hidden.stego, means=hidden.stego.means + 1e-2), random_gaussians(seed=9)):
+        with pytest.raises(InputError, match="moved or rounded"):
+            hidden.opened[0].reveal(other)
 
 
 def test_small_cover_warning() -> None:

@@ -1,4 +1,4 @@
-/** The design `latent`: `keyss.methods.keyss.latent` and `keyss.channels.harmonics` in Python say why. */
+/** The design `latent`: `keyss.methods.keyss.decoder` and `keyss.channels.harmonics` in Python say why. */
 import { sha256 } from '@noble/hashes/sha2.js';
 import { fieldsOf, gaussianIds, ID_BYTES } from '../channels/quiet/bits.ts';
 import { CellCipher } from '../channels/quiet/cells.ts';

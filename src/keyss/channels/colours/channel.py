@@ -49,7 +49,6 @@ from keyss.core.errors import InputError, KeyssWarning, UsageError, WrongKeyErro
 from keyss.core.gaussians import Gaussians
 from keyss.keys.derivation import MASTER_BYTES, expand, stream
 from keyss.keys.encryption import OVERHEAD, compressed_size, decrypt, encrypt
-from keyss.rendering.orbit import psnr_between
 
 _TOO_FEW = "this cover has too few Gaussians to hide anything in colours that would survive other formats"
 _LOWER = 3  # maximum number of levels, each a quarter of a bit, below the planned one

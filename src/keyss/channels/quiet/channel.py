@@ -4,8 +4,8 @@ A file has no magic number and no index of its secrets. Bits are stored in *carr
 Gaussian, or one block of last bits of codes (see `wet_paper`). A carrier holds encrypted *cells*, each with a
 tag: a reader decrypts all of them and keeps those with a valid tag.
 
-- A *salt* of Argon2id is a hash of one carrier without cells (see `usable`). It is *stale* if that Gaussian is
-  not usable: the author of the cover knows it in advance, so no key cell is written for it. A reader tries
+- A *salt* of Argon2id is a hash of one carrier without cells (see `usable`). It is *stale* if that Gaussian
+  is not usable: the author of the cover knows it in advance, so no key cell is written for it. A reader tries
   SALTS_TRIED salts; covers with as many stale salts are refused.
 - *Key cells*, encrypted under the key and a salt, hold the data key of a secret.
 - *Parameter cells*, encrypted under the data key, tell how to read the rest (see `parameters`).

@@ -18,9 +18,8 @@ from keyss.core.similarity import Similarity
 from keyss.fitting.adam import RowAdam
 from keyss.lab.baselines.baseline_options import BaselineOptions
 from keyss.methods.base import Capabilities, Context, Plan, Source, Stego
-from keyss.methods.hidden import Frame, Remains
-from keyss.methods.keyss.combined import PlacedScene
-from keyss.methods.keyss.training import KeyssTraining, Picture
+from keyss.methods.hidden import Frame, HiddenScene
+from keyss.methods.keyss.training import KeyssTraining, Picture, PlacedScene
 from keyss.methods.tensors import Header, pack_tensors, refuse_damage, unpack_tensors
 
 FORMAT, VERSION = "keyss-baseline", 1
@@ -68,17 +67,12 @@ Show = Callable[[Gaussians], Gaussians]  # takes a model on the CPU in the cover
 
 
 @dataclass(frozen=True)
-class CompanionSecret:
-    """A `HiddenScene`: a companion file applied to the published model."""
+class CompanionSecret(HiddenScene):
+    """A companion file applied to the published model."""
 
+    frame: Similarity | None
     companion: CompanionTensors
     show: Show
-    decode: None = None
-    key_size: int = 0
-
-    @property
-    def frame(self) -> Similarity | None:
-        return self.companion.frame
 
     def reveal(self, stego: Gaussians, *, frame: Frame = "secret", force: bool = False) -> Gaussians:
         """See `HiddenScene.reveal`; raises InputError for a model with other Gaussians."""
@@ -96,10 +90,6 @@ class CompanionSecret:
             return shown
         return self.frame.inverse().apply_gaussians(shown)
 
-    def remains(self, revealed: Gaussians) -> Remains:
-        """A secret in a companion file is complete or does not open."""
-        return Remains(len(revealed), len(revealed))
-
     def fingerprint(self) -> str:
         return hashlib.sha256(self.companion.payload("baseline").data).hexdigest()[:16]
 
@@ -110,7 +100,7 @@ class BaselineTraining(KeyssTraining):
     options: BaselineOptions
 
     def __init__(self, scenes: Sequence[PlacedScene], options: BaselineOptions, device: torch.device) -> None:
-        super().__init__(scenes, [], options, options.design, device)
+        super().__init__(scenes, [], options, device)
 
     @abstractmethod
     def prepare(self, start: Gaussians) -> None:
@@ -124,17 +114,10 @@ class BaselineTraining(KeyssTraining):
     def result(self) -> tuple[Gaussians, CompanionTensors]:
         """The published model, on the CPU, and the tensors of the companion file, after the training."""
 
-    def add(self, name: str, values: Tensor, optimizer: RowAdam | float) -> None:
-        """Add a parameter [N, ...] of the Gaussians, with its optimiser or a rate for a new one."""
+    def add(self, name: str, values: Tensor, rate: float, scale: Tensor | None = None) -> None:
+        """Add a parameter [N, ...] of the Gaussians; its rates: see `RowAdam`."""
         self.parameters[name] = parameter = torch.nn.Parameter(values.to(self.device).contiguous())
-        if isinstance(optimizer, RowAdam):
-            optimizer.param_groups[0]["params"] = [parameter]
-            self.optimizers[name] = optimizer
-        else:
-            fused = self.device.type == "cuda"
-            self.optimizers[name] = RowAdam(
-                [{"params": [parameter], "lr": optimizer}], eps=1e-15, fused=fused
-            )
+        self.optimizers[name] = RowAdam(parameter, rate, scale)
 
     def opacity_for_pruning(self) -> Tensor:
         """[N] maximum opacity over the scenes."""
@@ -193,4 +176,4 @@ class Baseline:
         """The secret of a companion file. Raises InputError for damage."""
         companion = CompanionTensors.of(content)
         with refuse_damage(DAMAGED):
-            return CompanionSecret(companion, self.open(companion))
+            return CompanionSecret(companion.frame, companion, self.open(companion))

@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated, ClassVar
 
-from keyss.methods.base import CommandLineOption, MethodOptions, Training, check_above_zero
-from keyss.methods.keyss.options import DecoderShape, Design, Scenes
+from keyss.methods.base import CommandLineOption, Training, check_above_zero
+from keyss.methods.keyss.options import DecoderShape, Design, JointOptions, Scenes
 
 
 @dataclass(frozen=True, kw_only=True)
-class BaselineOptions(MethodOptions):
+class BaselineOptions(JointOptions):
     """Options of all baselines: joint training has the steps and Gaussians of plain models.
 
     It combines poses, points and densification like KeySS's. Each baseline has its own class, which
@@ -32,11 +32,10 @@ class BaselineOptions(MethodOptions):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_above_zero(self, "network_rate")
-        self.check_published_exactly()
-        _ = self.design  # raises for values out of range
+        _ = self.configuration  # raises for values out of range
 
     @property
-    def design(self) -> Design:
+    def configuration(self) -> Design:
         """The configuration of the joint training, without a decoder of Gaussians and keys."""
         return Design(
             name=self.method,
@@ -48,10 +47,6 @@ class BaselineOptions(MethodOptions):
             decoder_rate=self.network_rate,
             weight_decay=0.0,
         )
-
-    def training(self, scenes: int) -> tuple[Training, ...]:
-        """Every step renders all scenes."""
-        return (Training(self.fit.iterations, continues=False),) * scenes
 
 
 @dataclass(frozen=True, kw_only=True)

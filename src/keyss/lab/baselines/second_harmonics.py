@@ -11,7 +11,7 @@ from dataclasses import replace
 
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Camera
-from keyss.fitting.parameters import make_optimizers, to_gaussians
+from keyss.fitting.parameters import to_gaussians
 from keyss.lab.baselines.baseline import Baseline, BaselineTraining, CompanionTensors, Show
 from keyss.lab.baselines.baseline_options import ShOptions
 from keyss.methods.base import Capabilities
@@ -25,8 +25,8 @@ class ShTraining(BaselineTraining):
 
     def prepare(self, start: Gaussians) -> None:
         """Both sets start equal: every point has the colour of its own scene."""
-        optimizer = make_optimizers(self.parameters, self.options.fit, self.extent)["sh"]
-        self.add(_NAMES[1], start.sh.clone(), optimizer)
+        (rates,) = self.optimizers["sh"].param_groups
+        self.add(_NAMES[1], start.sh.clone(), rates["lr"], rates["lr_scale"])
 
     def draw(self, scenes: Sequence[int], camera: Camera, sh_degree: int) -> list[Picture]:
         model = to_gaussians(self.parameters)

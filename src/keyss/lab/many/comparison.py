@@ -19,7 +19,7 @@ from keyss.core import UsageError, ViewOptions
 from keyss.core.arrays import Bytes
 from keyss.files import write_bytes
 from keyss.fitting import PRESETS, FitConfig
-from keyss.fitting.lpips import HOW_TO_GET
+from keyss.fitting.image_metrics import HOW_TO_GET
 from keyss.lab.audits.trial_measures import CONVERSIONS
 from keyss.lab.many.engine import Outcome
 from keyss.lab.many.result_tables import TrialNumbers, write_scene_tables

@@ -19,11 +19,8 @@ from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
 from keyss.fitting.config import FitConfig
 from keyss.fitting.image_metrics import subsample_views
-from keyss.fitting.losses import Target, photometric_loss
-from keyss.fitting.parameters import make_optimizers, to_gaussians, to_parameters
-from keyss.fitting.sampling import Shuffle
-from keyss.fitting.schedule import Schedule
-from keyss.rendering import contributions, render
+from keyss.fitting.plain import PlainRun
+from keyss.rendering import contributions
 
 _FIELDS = {"position": "means", "log scale": "log_scales", "quaternion": "quats"}
 _FIELDS |= {"logit opacity": "opacity_logits"}
@@ -174,22 +171,11 @@ def find_unused(model: Gaussians, cover: Scene, given_up: float = 0.0) -> Tensor
 
 def fine_tune(model: Gaussians, scene: Scene, steps: int, seed: int = 0) -> Gaussians:
     """Fine-tune `model` for `steps` steps of plain 3DGS on the training views."""
-    config = FitConfig(iterations=max(steps, 1), boost=1.0)
-    parameters = to_parameters(model, model.device)
-    optimizers = make_optimizers(parameters, config, scene.extent)
-    schedule = Schedule(config, [view.camera for view in scene.train], scene.extent)
-    background = scene.background.to(model.device)
-    shuffle = Shuffle(len(scene.train), torch.Generator().manual_seed(seed))
-    for step in range(1, steps + 1):
-        view = scene.train[shuffle.sample()]
-        image = render(to_gaussians(parameters), view.camera, background)
-        target = Target.of(view.image.to(model.device), view.mask)
-        photometric_loss(image, target, config.ssim_weight).backward()
-        schedule.set(optimizers, step)
-        for optimizer in optimizers.values():
-            optimizer.step()
-            optimizer.zero_grad(set_to_none=True)
-    return to_gaussians(parameters).detach()
+    config = FitConfig(iterations=max(steps, 1), boost=1.0, sh_degree=model.sh_degree, seed=seed)
+    run = PlainRun(scene, config, model.device, model)
+    for _ in range(steps):
+        run.step()
+    return run.gaussians()
 
 
 def _generator(use: str, seed: int) -> torch.Generator:

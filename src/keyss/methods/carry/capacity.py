@@ -19,14 +19,17 @@ from keyss.channels import (
     LowBitsCapacity,
     LowBitsCover,
     PreparedCover,
+    RecordRequest,
 )
 from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.keys.derivation import expand
 from keyss.methods.base import divide
 from keyss.methods.carry.options import CarryOptions
-from keyss.methods.records.embedding import largest_degree, record_request, shares
+from keyss.methods.records.carried_secret import COUNT
+from keyss.methods.records.lines import Table
 from keyss.methods.records.precision import most_visible, prune_to_size
+from keyss.methods.records.quantise import Codec
 from keyss.methods.records.whole import encode
 from keyss.rendering.orbit import Viewpoints
 
@@ -232,3 +235,30 @@ def to_degree(model: Gaussians, sh_degree: int, entropy: bytes) -> Gaussians:
     # Scale before rounding: products in single precision keep a trace of their factor.
     noise = _FAINT * torch.randn(len(model), count, 3, generator=generator, dtype=torch.float64)
     return replace(model, sh=torch.cat([model.sh, noise.to(model.sh)], dim=1))
+
+
+def record_request(count: int, sh_degree: int) -> RecordRequest:
+    """The request to a channel for a model of `count` Gaussians."""
+    header_bytes = COUNT.size + Codec.packed_size(sh_degree)
+    return RecordRequest(count, Table.floor(sh_degree).record_bytes, header_bytes)
+
+
+def largest_degree(record_bytes: int) -> int | None:
+    """The maximum SH degree of records of at most `record_bytes`; None if none fits."""
+    return next((each for each in (3, 2, 1, 0) if Table.floor(each).record_bytes <= record_bytes), None)
+
+
+def shares(capacity: Capacity, needed: Sequence[int]) -> list[int]:
+    """Maximum bytes of each secret's payload, for secrets that need `needed` bytes.
+
+    The first of a quarter, a half and all of the capacity that suffices: a secret's precision then does not
+    depend on the others, and its key does not reveal them. Equal shares if these exceed the capacity, or if
+    the model grows.
+    """
+    parts = [
+        next((each for each in (4, 2) if size <= capacity.bytes // each - capacity.overhead), 1)
+        for size in needed
+    ]
+    if capacity.grows or sum(1 / each for each in parts) > 1:
+        parts = [len(needed)] * len(needed)
+    return [max(0, capacity.bytes // each - capacity.overhead) for each in parts]

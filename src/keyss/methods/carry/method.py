@@ -1,4 +1,9 @@
-"""The method `carry`: encrypts the secrets' Gaussians in the published model."""
+"""The method `carry`: encrypts the secrets' Gaussians in the published model.
+
+In low bits a Gaussian is a record (see `quantise`); the header holds the number of records and the codec.
+Copies of the most visible Gaussians fill free cells. All other channels carry a model as one payload (see
+`whole`).
+"""
 
 from __future__ import annotations
 
@@ -7,6 +12,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
+from keyss.channels import Content, LowBitsCover, Payload, PreparedCover, Records, open_content
 from keyss.core.errors import KeyssWarning, UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
@@ -15,10 +21,13 @@ from keyss.fitting.image_metrics import subsample_views
 from keyss.fitting.plain import fit_scene
 from keyss.fitting.schedule import boost_of
 from keyss.methods.base import Capabilities, Context, Plan, Source, Stego, role_of
-from keyss.methods.carry.capacity import PayloadCapacity, SecretSize, capacity_for
+from keyss.methods.carry.capacity import PayloadCapacity, SecretSize, capacity_for, record_request, shares
 from keyss.methods.carry.options import REFIT, CarryOptions
-from keyss.methods.records.embedding import embed_models
-from keyss.methods.records.quantise import out_of_range
+from keyss.methods.records.carried_secret import COUNT, unpack
+from keyss.methods.records.lines import Table
+from keyss.methods.records.precision import encode_to_size, most_visible_rows
+from keyss.methods.records.quantise import Codec, out_of_range
+from keyss.methods.records.whole import encode
 from keyss.rendering import contributions
 from keyss.rendering.orbit import Viewpoints, psnr_between
 
@@ -219,3 +228,70 @@ def most_contributing(plain: Gaussians, scene: Scene, count: int) -> Gaussians:
         return plain
     cameras = [view.camera for view in subsample_views(scene.train, _SELECTION_VIEWS)]
     return plain[contributions(plain, cameras).topk(count).indices.sort().values]
+
+
+def embed_models(
+    cover: PreparedCover,
+    keys: Sequence[str],
+    models: Sequence[Gaussians],
+    *,
+    viewpoints: Sequence[Viewpoints] | None = None,
+    entropy: bytes | None = None,
+    overwrite: bool = False,
+) -> Stego:
+    """Embed all Gaussians of each model under its key, and verify that they open.
+
+    `viewpoints`: views of each model that determine the precision of a payload; by default, four around it.
+    `overwrite`: write low bits into the cover's own tensors, which saves a copy. Raises UsageError if the
+    models do not fit.
+    """
+    contents: Sequence[Content]
+    if isinstance(cover, LowBitsCover):
+        cover = replace(cover, overwrites=overwrite)
+        contents = encode_all(cover, models)
+        requests = [record_request(len(model), model.sh_degree) for model in models]
+        details: dict[str, Any] = {
+            "carriers": cover.cells.carriers,
+            "capacity": cover.cells.record_capacity(requests),
+        }
+    else:
+        contents = payloads = _payloads(cover, models, viewpoints or [*map(Viewpoints.around, models)])
+        details = {
+            "secret_bytes": [len(each.data) for each in payloads],
+            "sh_degrees": [each.sh_degree for each in models],
+        }
+        if not cover.capacity.grows:
+            details["capacity_bytes"] = cover.capacity.bytes
+            details["capacity_bits_per_gaussian"] = round(8 * cover.capacity.bytes / len(cover.cover), 2)
+    stego = cover.embed(list(zip(keys, contents, strict=True)), entropy=entropy)
+    del contents  # as large as the secrets
+    opened = [unpack(open_content(stego, key)) for key in keys]
+    if [each.left for each in opened] != list(map(len, models)):
+        raise RuntimeError("the embedded secrets do not open again as they should")
+    details["bits_per_gaussian"] = [each.bits for each in opened]
+    return Stego(stego, tuple(opened), details=details, verified=True)
+
+
+def encode_all(cover: LowBitsCover, models: Sequence[Gaussians]) -> list[Records]:
+    """The records of all models, at the best precision that fits. Raises UsageError if none does."""
+    plans = cover.cells.plan_records([record_request(len(model), model.sh_degree) for model in models])
+    found = []
+    for model, plan in zip(models, plans, strict=True):
+        table = Table.of_size(8 * plan.record_bytes, model.sh_degree)
+        assert table is not None  # the plan has room for `Table.floor`
+        codec, outlier = Codec.fit(model, table)
+        header = COUNT.pack(len(model)) + codec.pack()
+        copied = most_visible_rows(model, plan.copies)
+        found.append(Records(CarryOptions.method, header, codec.encode(model, outlier), plan, copied))
+    return found
+
+
+def _payloads(
+    cover: PreparedCover, models: Sequence[Gaussians], viewpoints: Sequence[Viewpoints]
+) -> list[Payload]:
+    grows = cover.capacity.grows
+    limits = shares(cover.capacity, [len(encode(model)) for model in models])
+    return [
+        Payload(CarryOptions.method, encode_to_size(model, limit, short=grows, viewpoints=views))
+        for model, limit, views in zip(models, limits, viewpoints, strict=True)
+    ]

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Annotated, ClassVar, Literal, get_args
+from typing import Annotated, ClassVar, Literal, cast, get_args
 
 from msgspec import Meta
 
 from keyss.core.errors import UsageError, did_you_mean
 from keyss.keys.derivation import EMBEDDING_SIZE
-from keyss.methods.base import CommandLineOption, MethodOptions, Training, check_above_zero
+from keyss.methods.base import CommandLineOption, MethodOptions, Plan, Training, check_above_zero
 
 Attribute = Literal["op", "ro", "sc", "xyz", "sh"]  # opacity, rotation, scale, position, colour
 Mask = tuple[Attribute, ...]  # the attributes where theta (equation 8) is 1
@@ -36,7 +36,7 @@ class DecoderShape:
     """Kind and sizes of a decoder; appendix B: two layers for the common branch, two for each other."""
 
     kind: Annotated[str, Meta(min_length=1, max_length=32)] = (
-        "mlp"  # see `keyss.methods.keyss.secret.DECODERS`
+        "mlp"  # see `keyss.methods.keyss.decoder.DECODERS`
     )
     mask: Mask = ATTRIBUTES  # theta
     hidden: tuple[Width, Width] = (64, 128)  # common branch; from the authors' program, the paper gives none
@@ -47,10 +47,6 @@ class DecoderShape:
     released: bool = False
     secrets: Annotated[int, Meta(ge=1, le=9)] = 1  # number of secrets in the model
     secret: Annotated[int, Meta(ge=0, le=8)] = 0  # index of the secret, if each has its own decoder
-
-    def with_sizes(self, sh_degree: int, key_size: int, secrets: int) -> DecoderShape:
-        """The decoder for models of this SH degree, keys of `key_size` numbers, and `secrets`."""
-        return replace(self, sh_degree=sh_degree, key_size=key_size, secrets=secrets)
 
     @property
     def inputs(self) -> int:
@@ -136,14 +132,50 @@ DESIGNS: dict[str, Design] = {
 
 def parse_design(text: str) -> DesignName:
     """The name of a design. Raises UsageError."""
-    for name in get_args(DesignName):
-        if text == name:
-            return name  # type: ignore[no-any-return]
-    raise UsageError(f"there is no design {text!r}; {did_you_mean(text, DESIGNS)}")
+    if text not in DESIGNS:
+        raise UsageError(f"there is no design {text!r}; {did_you_mean(text, DESIGNS)}")
+    return cast(DesignName, text)
 
 
 @dataclass(frozen=True, kw_only=True)
-class KeyssOptions(MethodOptions):
+class JointOptions(MethodOptions):
+    """Options of a joint training of all scenes, which share the Gaussians of one model."""
+
+    def __post_init__(self) -> None:
+        """Raise UsageError if the model would be published in a lossy format."""
+        super().__post_init__()
+        if self.publish == "any" or self.format not in (None, "ply"):
+            option = 'publish="any"' if self.publish == "any" else f'format="{self.format}"'
+            raise UsageError(
+                f"`{option}`: this method needs the published model bit for bit: leave it out, or use "
+                '`method="carry"`'
+            )
+
+    @property
+    def configuration(self) -> Design:
+        """The complete design. Raises UsageError for values out of range."""
+        raise NotImplementedError
+
+    def training(self, scenes: int) -> tuple[Training, ...]:
+        """Every step renders all scenes."""
+        return (Training(self.fit.iterations, continues=False),) * scenes
+
+    def joint_plan(self, secrets: int, step_cost: float) -> Plan:
+        """The plan of the training, whose model has the size of one plain model; `step_cost` as in `Plan`."""
+        fit = self.fit
+        return Plan(
+            gaussians=fit.max_gaussians,
+            sh_degree=fit.sh_degree,
+            secret_gaussians=secrets * fit.max_gaussians,
+            capacity=fit.max_gaussians,
+            steps=fit.iterations,
+            step_cost=step_cost,
+            rendered=(fit.max_gaussians,) * (1 + secrets),
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class KeyssOptions(JointOptions):
     """A design, and how keys become vectors; `fit` has the training's length, size and rates of Gaussians."""
 
     method: ClassVar[str] = "keyss"
@@ -179,7 +211,6 @@ class KeyssOptions(MethodOptions):
     def __post_init__(self) -> None:
         super().__post_init__()
         latent = self.configuration.decoder.kind == "latent"
-        self.check_published_exactly()
         if self.clip_model is not None and self.key_encoder != "clip":
             raise UsageError('`clip_model` needs `key_encoder="clip"`')
         if self.key_encoder == "clip" and latent:
@@ -199,15 +230,6 @@ class KeyssOptions(MethodOptions):
         if self.mask is None:
             return design
         return replace(design, decoder=replace(design.decoder, mask=parse_mask(",".join(self.mask))))
-
-    @property
-    def step_cost(self) -> float:
-        """See `Plan`; measured at 2,000 to 30,000 Gaussians."""
-        return 1.0 if self.configuration.decoder.kind == "latent" else 8.0
-
-    def training(self, scenes: int) -> tuple[Training, ...]:
-        """Every step renders all scenes."""
-        return (Training(self.fit.iterations, continues=False),) * scenes
 
     @classmethod
     def variants(cls) -> Mapping[str, KeyssOptions]:

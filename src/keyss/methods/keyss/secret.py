@@ -21,15 +21,13 @@ from keyss.channels import Content, Payload, is_appended
 from keyss.core.errors import InputError
 from keyss.core.gaussians import DRAWN_OPACITY, Gaussians, compensate_pruning
 from keyss.core.similarity import Similarity
-from keyss.methods.hidden import Frame, Remains
-from keyss.methods.keyss.decoder import Decoder
-from keyss.methods.keyss.latent import LatentDecoder
+from keyss.methods.hidden import Frame, HiddenScene, Remains
+from keyss.methods.keyss.decoder import DECODERS, Decoder
 from keyss.methods.keyss.options import DecoderShape, parse_mask
 from keyss.methods.tensors import Header, pack_tensors, refuse_damage, unpack_tensors
 
 NAME = "keyss"
 FORMAT, VERSION = "keyss-secret", 10
-DECODERS: dict[str, type[Decoder]] = {"mlp": Decoder, "latent": LatentDecoder}  # keys: `DecoderShape.kind`
 ANCHORS = 64
 ANCHORS_NEEDED = 0.25  # minimum share found
 ANCHOR_TOLERANCE = 1e-6  # fraction of the model's size
@@ -48,8 +46,8 @@ class _Header(Header):
 
 
 @dataclass(frozen=True)
-class KeyssSecret:
-    """Everything beside the stego model that reveals one secret; see `keyss.methods.hidden.HiddenScene`."""
+class KeyssSecret(HiddenScene):
+    """Everything beside the stego model that reveals one secret."""
 
     decoder: Decoder
     key: Tensor = field(repr=False)  # [K] the vector of its key
@@ -165,6 +163,3 @@ def visibility(model: Gaussians) -> tuple[int, float]:
     """The number of visible Gaussians, and the sum of their opacities."""
     visible = model.opacities[model.opacities >= DRAWN_OPACITY]
     return len(visible), float(visible.double().sum())
-
-
-unpack = KeyssSecret.of  # see `keyss.methods.registry`

@@ -1,13 +1,16 @@
 """Joint training of one model and one decoder, from scratch, with three losses (KeySS, sections 3.1 to 3.4).
 
-`KeyssTraining` is the paper's. The design `latent` and the baselines override parts of it.
+Every training pose of every scene supervises all scenes. A scene's target is its photo from that pose, or a
+render of its plain 3DGS model if there is none. Everything is in the cover's frame. `KeyssTraining` is the
+paper's; the design `latent` and the baselines override parts of it.
 """
 
 from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
+from statistics import fmean
 from typing import Any
 
 import numpy as np
@@ -15,21 +18,29 @@ import torch
 from torch import Tensor
 
 from keyss.core.gaussians import Gaussians
-from keyss.core.scene import Camera
-from keyss.fitting.checkpoint import State
+from keyss.core.scene import Camera, Scene
+from keyss.core.similarity import Similarity, align
+from keyss.fitting.config import FitConfig
 from keyss.fitting.density import CappedStrategy, Rendered
-from keyss.fitting.joint import JointRun
-from keyss.fitting.loop import train
-from keyss.fitting.losses import photometric_loss
-from keyss.fitting.parameters import to_gaussians
-from keyss.fitting.sampling import Shuffle
+from keyss.fitting.image_metrics import psnr, subsample_views
+from keyss.fitting.loop import Shuffle, State, TrainingRun, own_randomness, train, with_prefix
+from keyss.fitting.losses import Target, Targets, photometric_loss
+from keyss.fitting.parameters import (
+    initial_gaussians,
+    initial_points,
+    make_optimizers,
+    to_gaussians,
+    to_parameters,
+)
+from keyss.fitting.schedule import Schedule
 from keyss.keys.derivation import random_embeddings, stream
-from keyss.methods.base import Context, MethodOptions, Source, role_of
-from keyss.methods.keyss.combined import CombinedPoses, PlacedScene, combined_points
-from keyss.methods.keyss.options import Design, Scenes
-from keyss.methods.keyss.secret import DECODERS, KeyssSecret, choose_anchors, visibility
-from keyss.rendering import render_with_meta
+from keyss.methods.base import Context, Source, divide, role_of
+from keyss.methods.keyss.decoder import DECODERS
+from keyss.methods.keyss.options import DecoderShape, JointOptions, Scenes
+from keyss.methods.keyss.secret import KeyssSecret, choose_anchors, visibility
+from keyss.rendering import render, render_with_meta
 
+CACHE_BYTES = 2 << 30
 Pose = tuple[int, int]  # a scene and the index of its training view
 
 
@@ -47,29 +58,125 @@ class Picture:
     indices: Tensor | None = None  # Gaussians that were rendered; None: all
 
 
-class KeyssTraining(JointRun):
+@dataclass(frozen=True)
+class PlacedScene:
+    """A scene and its plain model, both moved into the cover's frame."""
+
+    scene: Scene
+    plain: Gaussians
+    frame: Similarity  # own frame to cover frame
+
+    @staticmethod
+    def of(scene: Scene, plain: Gaussians, frame: Similarity) -> PlacedScene:
+        """Move a scene and its plain model, both in the scene's own frame, by `frame`."""
+        train, test = (
+            tuple(replace(view, camera=frame.apply_camera(view.camera)) for view in views)
+            for views in (scene.train, scene.test)
+        )
+        placed = replace(scene, train=train, test=test, points=frame.apply_points(scene.points))
+        return PlacedScene(placed, frame.apply_gaussians(plain), frame)
+
+    @staticmethod
+    def all_of(sources: Sequence[Source]) -> list[PlacedScene]:
+        """The cover, then the secrets, aligned with it by their cameras (ours; see `align`)."""
+        cameras = [[view.camera for view in source.scene.train] for source in sources]
+        frames = [Similarity(), *(align(each, cameras[0]) for each in cameras[1:])]
+        return [PlacedScene.of(each.scene, each.model, at) for each, at in zip(sources, frames, strict=True)]
+
+
+def combined_points(scenes: Sequence[Scene], fit: FitConfig, generator: torch.Generator) -> Gaussians:
+    """Gaussians at the points of all scenes, in equal shares of the cap if there are enough points."""
+    clouds = [initial_points(scene, fit.max_gaussians, generator) for scene in scenes]
+    counts = divide([len(points) for points, _ in clouds], fit.max_gaussians)
+    parts = [
+        initial_gaussians(points, colors, fit.sh_degree, share, generator)
+        for (points, colors), share in zip(clouds, counts, strict=True)
+    ]
+    return Gaussians.cat(parts)
+
+
+class CombinedPoses:
+    """All training poses of all scenes, and every scene's target at each of them."""
+
+    def __init__(self, scenes: Sequence[PlacedScene], device: torch.device) -> None:
+        self.scenes, self.device = scenes, device
+        self.plains = [placed.plain.to(device) for placed in scenes]
+        self._rendered: dict[tuple[int, int, int], Tensor] = {}
+        self._left = CACHE_BYTES
+        self._targets = Targets()
+
+    def camera(self, owner: int, index: int) -> Camera:
+        """Training pose `index` of scene `owner`."""
+        return self.scenes[owner].scene.train[index].camera
+
+    def target(self, scene: int, owner: int, index: int) -> Target:
+        """The target of `scene` at training pose `index` of `owner`."""
+        own = self.scenes[owner].scene.train[index] if scene == owner else None
+
+        def make() -> Target:
+            image = own.image if own else self._render(scene, owner, index)
+            return Target.of(image.to(self.device), own.mask if own else None)
+
+        return self._targets.of((scene, owner, index), make)
+
+    def _render(self, scene: int, owner: int, index: int) -> Tensor:
+        """Render once, and cache as 8-bit pixels, like photos, up to CACHE_BYTES."""
+        cached = self._rendered.get((scene, owner, index))
+        if cached is not None:
+            return cached
+        with torch.no_grad():
+            background = self.scenes[scene].scene.background
+            image = render(self.plains[scene], self.camera(owner, index), background)
+        pixels = (image.clamp(0, 1) * 255).round().to(torch.uint8).cpu()
+        if pixels.numel() <= self._left:
+            self._rendered[scene, owner, index] = pixels
+            self._left -= pixels.numel()
+        return pixels
+
+
+class KeyssTraining(TrainingRun):
     """All scenes are in the cover's frame; scene 0 is the cover, scene s is secret s."""
 
     def __init__(
         self,
         scenes: Sequence[PlacedScene],
         keys: Sequence[Tensor],  # [K] k^s, the vector of each secret's key
-        options: MethodOptions,
-        design: Design,
+        options: JointOptions,
         device: torch.device,
         random_key: Callable[[torch.Generator], Tensor] | None = None,  # [K] vector of a random key
     ) -> None:
-        count = len(scenes)
-        names = [role_of(scene, count) for scene in range(count)]
-        super().__init__([placed.scene for placed in scenes], options.fit, device, names)
+        super().__init__(options.fit, device)
+        design, count = options.configuration, len(scenes)
         self.scenes, self.options, self.design = scenes, options, design
         self.keys, self.random_key = [key.to(device) for key in keys], random_key
         self.betas = [design.beta_cover, *[design.beta_secret] * (count - 1)]
         self.poses = CombinedPoses(scenes, device)
+        self.backgrounds = [placed.scene.background.to(device) for placed in scenes]
         self.owners = scene_indices(design.poses, count)
         self.growing = scene_indices(design.densification, count)
-        self.owner_order = Shuffle(len(self.owners), self.generator)
-        self.begin(self.start(), design.decoder_rate, design.weight_decay)
+        self.shuffles["owners"] = Shuffle(len(self.owners), self.generator)
+        for scene, placed in enumerate(scenes):
+            # Its own generator: the order of the cover's views must not depend on the secrets.
+            order = torch.Generator().manual_seed(self.fit.seed_of(f"views of scene {scene}"))
+            self.generators[f"order_generator.{scene}"] = order
+            self.shuffles[f"order.{scene}"] = Shuffle(len(placed.scene.train), order)
+        self.extent = scenes[0].scene.extent
+        cameras = [view.camera for placed in scenes for view in placed.scene.train]
+        self.schedules = [Schedule(self.fit, cameras, self.extent)]
+        start = self.start()
+        self.parameters = to_parameters(start, device)
+        self.optimizers = make_optimizers(self.parameters, self.fit, self.extent)
+        self.networks = torch.nn.ModuleList()
+        with own_randomness(self.fit.known_seed):
+            self.prepare(start)
+        self.networks.to(device)
+        # Without networks, the optimiser still needs a parameter.
+        weights = list(self.networks.parameters()) or [torch.nn.Parameter(torch.zeros(1))]
+        self.network_optimizers = [
+            torch.optim.AdamW(weights, lr=design.decoder_rate, weight_decay=design.weight_decay)
+        ]
+        self.strategy = self.density_control()
+        self.density = self.strategy.initialize_state(self.extent)
 
     def start(self) -> Gaussians:
         """G_cover at the first step: the combined SfM points (section 3.4)."""
@@ -77,10 +184,15 @@ class KeyssTraining(JointRun):
         return combined_points(chosen, self.fit, self.generator)
 
     def prepare(self, start: Gaussians) -> None:
-        """One decoder for all secrets."""
-        shape = self.design.decoder.with_sizes(self.fit.sh_degree, len(self.keys[0]), len(self.keys))
-        self.decoder = DECODERS[shape.kind](shape)
+        """Add what trains beside `start`: one decoder for all secrets. Random numbers are the run's own."""
+        self.decoder = DECODERS[self.shape.kind](self.shape)
         self.networks.append(self.decoder)
+
+    @property
+    def shape(self) -> DecoderShape:
+        """The shape of the decoder for these models, keys and secrets."""
+        degree, size = self.fit.sh_degree, len(self.keys[0])
+        return replace(self.design.decoder, sh_degree=degree, key_size=size, secrets=len(self.keys))
 
     def density_control(self) -> CappedStrategy:
         """Density control; the authors' program stops it at the cap."""
@@ -88,16 +200,21 @@ class KeyssTraining(JointRun):
 
     def step(self) -> None:
         self.iteration += 1
-        views = [(self.sample_poses(), self.wrong_key()) for _ in range(self.views_per_step)]
+        views = [(self.sample_poses(), self.wrong_key()) for _ in range(self.fit.views_per_step)]
         self.optimise(views, lambda view: self.losses(*view))
+
+    def set_rates(self) -> None:
+        super().set_rates()
+        rate = self.design.decoder_rate * 0.05 ** (self.iteration / self.iterations)
+        self.network_optimizers[0].param_groups[0]["lr"] = rate
 
     def sample_poses(self) -> list[Pose]:
         """The training pose for each scene: one of any scene (combined camera poses)."""
         count = len(self.scenes)
         if float(torch.rand((), generator=self.generator)) < self.design.common_poses:
-            owner = self.owners[self.owner_order.sample()]
-            return [(owner, self.shuffles[owner].sample())] * count
-        return [(scene, self.shuffles[scene].sample()) for scene in range(count)]
+            owner = self.owners[self.shuffles["owners"].sample()]
+            return [(owner, self.shuffles[f"order.{owner}"].sample())] * count
+        return [(scene, self.shuffles[f"order.{scene}"].sample()) for scene in range(count)]
 
     def wrong_key(self) -> Tensor | None:
         """[K] vector of a wrong key, sampled at every step."""
@@ -166,8 +283,21 @@ class KeyssTraining(JointRun):
         image, meta = render_with_meta(model, camera, self.backgrounds[scene], sh_degree=sh_degree)
         return Picture(image, meta, indices)
 
-    def show(self, scene: int, camera: Camera, sh_degree: int) -> Tensor:
-        return self.draw([scene], camera, sh_degree)[0].image
+    @torch.no_grad()
+    def evaluate(self) -> dict[str, float]:
+        """Mean PSNR of each scene on held-out views."""
+        found = {}
+        for scene, placed in enumerate(self.scenes):
+            views = subsample_views(placed.scene.test, 8)
+            found[role_of(scene, len(self.scenes))] = fmean(
+                psnr(
+                    self.draw([scene], view.camera, self.fit.sh_degree)[0].image,
+                    view.photo(self.device),
+                    view.mask,
+                )
+                for view in views
+            )
+        return found
 
     @torch.no_grad()
     def opacity_for_pruning(self) -> Tensor:
@@ -202,7 +332,6 @@ class KeyssTraining(JointRun):
         train(
             self,
             "hide",
-            self.fit,
             fingerprint={
                 "method": self.options.method,
                 "scenes": [source.scene.digest() for source in sources],
@@ -214,10 +343,18 @@ class KeyssTraining(JointRun):
             reporter=context.reporter,
         )
 
-    def state(self) -> tuple[State, dict[str, Any]]:
-        tensors, meta = super().state()
-        return tensors | {"owners": self.owner_order.state()}, meta
+    def state(self) -> State:
+        state = super().state()
+        state |= {f"networks.{name}": value for name, value in self.networks.state_dict().items()}
+        for index, moments in self.network_optimizers[0].state_dict()["state"].items():
+            state |= {f"networks_adam.{index}.{name}": value for name, value in moments.items()}
+        return state
 
-    def load(self, tensors: State, meta: dict[str, Any]) -> None:
-        super().load(tensors, meta)
-        self.owner_order.load(tensors["owners"])
+    def load(self, state: State) -> None:
+        super().load(state)
+        self.networks.load_state_dict(with_prefix(state, "networks."))
+        adam = self.network_optimizers[0].state_dict()
+        for name, value in with_prefix(state, "networks_adam.").items():
+            index, key = name.split(".")
+            adam["state"].setdefault(int(index), {})[key] = value
+        self.network_optimizers[0].load_state_dict(adam)

@@ -11,7 +11,7 @@ from functools import cached_property, partial
 from keyss.channels.base import Content, Records
 from keyss.core.errors import InputError, UsageError
 from keyss.core.gaussians import Gaussians, compensate_pruning
-from keyss.methods.hidden import Frame, Remains
+from keyss.methods.hidden import Frame, HiddenScene, Remains
 from keyss.methods.records import whole
 from keyss.methods.records.quantise import Codec
 
@@ -19,16 +19,14 @@ COUNT = struct.Struct("<I")  # number of Gaussians, before the codec in the head
 
 
 @dataclass(frozen=True)
-class CarriedSecret:
-    """A carried secret; see `keyss.methods.hidden.HiddenScene`."""
+class CarriedSecret(HiddenScene):
+    """A carried secret."""
 
     left: int  # Gaussians that are left
     count: int  # Gaussians that were embedded
     bits: int  # per record, or per Gaussian of a payload
     load: Callable[[], Gaussians]
-    frame: None = None
-    decode: None = None
-    key_size: int = 0
+    frame = None
 
     @cached_property
     def gaussians(self) -> Gaussians:

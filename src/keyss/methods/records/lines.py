@@ -65,18 +65,15 @@ class Line:
 
     def codes(self, positions: Doubles, bits: int, outlier: Flags | None = None) -> Words32:
         """`encode`, for values at `positions`."""
+        reach = self.reach if outlier is None else np.where(outlier, self.far_reach, self.reach)[:, None]
         last = (1 << bits) - 1
-        codes = np.rint((positions / self._reaches(outlier) + 1) * (last / 2)).clip(0, last)
-        return codes.astype(np.uint32)
+        return np.rint((positions / reach + 1) * (last / 2)).clip(0, last).astype(np.uint32)
 
-    def decode(self, codes: Words32, bits: int, outlier: Flags | None = None) -> Doubles:
+    def decode(self, codes: Words32, bits: int) -> Doubles:
         """The values of `codes` [N, C]; see `encode`."""
-        positions = (codes.astype(np.float64) * (2 / ((1 << bits) - 1)) - 1) * self._reaches(outlier)
+        positions = (codes.astype(np.float64) * (2 / ((1 << bits) - 1)) - 1) * self.reach
         offset: Doubles = np.sinh(positions) * self.spread if self.spread > 0 else positions
         return offset + self.centre
-
-    def _reaches(self, outlier: Flags | None) -> Doubles | float:
-        return self.reach if outlier is None else np.where(outlier, self.far_reach, self.reach)[:, None]
 
 
 class Kind(NamedTuple):
@@ -176,17 +173,12 @@ class Table:
         return Table(_FLOOR[: 5 + sh_degree])
 
     @staticmethod
-    def short() -> Table:
-        """A smaller table of SH degree 0, for payloads: about 40 dB."""
-        return Table(tuple(each - 2 for each in _FLOOR[:5]))
+    def of_size(bits: int, sh_degree: int) -> Table | None:
+        """The table of minimum error with at most `bits`; None if the floor does not fit.
 
-    @staticmethod
-    def of_size(bits: int, sh_degree: int, start: Table | None = None) -> Table | None:
-        """The table of minimum error with at most `bits`; None if `start` does not fit.
-
-        `start`: by default the floor. Each further bit goes to the attribute whose error it reduces most.
+        Each further bit goes to the attribute whose error it reduces most.
         """
-        table = start or Table.floor(sh_degree)
+        table = Table.floor(sh_degree)
         while (left := bits - table.total) >= 0:
             given = table.bits
             grow = [i for i, each in enumerate(given) if _NUMBERS[i] <= left and each < MAX_BITS]

@@ -58,10 +58,12 @@ def prune_to_size(model: Gaussians, max_bytes: int, viewpoints: Viewpoints | Non
     """
     if len(encode(model)) <= max_bytes:
         return model
-    degrees = range(model.sh_degree + 1)
-    candidates = [
-        found for each in degrees if (found := _prune_to_size(model.with_sh_degree(each), max_bytes))
-    ]
+    candidates = []
+    for degree in range(model.sh_degree + 1):
+        own = kept = model.with_sh_degree(degree)
+        while len(kept) and (size := len(encode(kept))) > max_bytes:
+            kept = most_visible(own, min(len(kept) - 1, int(0.995 * len(kept) * max_bytes / size)))
+        candidates += [kept] if len(kept) else []
     if not candidates:
         raise UsageError(f"nothing of a secret fits into {max_bytes:,} bytes")
     return max(candidates, key=lambda each: psnr_between(model, each, viewpoints))
@@ -110,15 +112,3 @@ def most_visible_rows(gaussians: Gaussians, count: int) -> Integers:
     visibility = gaussians.opacities * size.clamp_max(at_most).exp()
     rows: Integers = visibility.topk(count).indices.sort().values.numpy()
     return rows
-
-
-def _prune_to_size(model: Gaussians, max_bytes: int) -> Gaussians | None:
-    """The most visible Gaussians that fit into `max_bytes` bytes; None if none fits."""
-    count = len(model)
-    while count > 0:
-        kept = most_visible(model, count)
-        size = len(encode(kept))
-        if size <= max_bytes:
-            return kept
-        count = min(count - 1, int(0.995 * count * max_bytes / size))
-    return None

@@ -19,13 +19,13 @@ from __future__ import annotations
 
 import math
 import struct
-from dataclasses import astuple, dataclass
+from dataclasses import astuple, dataclass, replace
 from typing import Any
 
 import numpy as np
 import torch
 
-from keyss.core.arrays import Bytes, Doubles, Flags, Integers, Words32, doubles
+from keyss.core.arrays import Bytes, Doubles, Flags, Integers, doubles
 from keyss.core.errors import InputError
 from keyss.core.gaussians import MAX_COORDINATE, MAX_LOG_SCALE, OPPONENT, Gaussians, magnitude
 from keyss.files.formats.common import smallest_three, unit
@@ -33,7 +33,6 @@ from keyss.kernels.jit import kernel
 from keyss.kernels.parallel import in_blocks
 from keyss.methods.records.lines import (
     BANDS,
-    CHROMA_FEWER,
     COLOUR,
     EVEN,
     HARMONIC,
@@ -64,43 +63,29 @@ class Codec:
     lines: tuple[Line, ...]  # x, y, z, log scales, opacity logits; two per band, the constant one first
 
     @staticmethod
-    def fit(gaussians: Gaussians, table: Table) -> Codec:
-        """Fit lines to `gaussians`. Raises ValueError unless they have the SH degree of the table."""
-        return Codec.fit_with_outliers(gaussians, table)[0]
-
-    @staticmethod
-    def fit_with_outliers(gaussians: Gaussians, table: Table) -> tuple[Codec, Flags]:
-        """`fit`, and the `outliers` [N]."""
-        if table.sh_degree != gaussians.sh_degree:
-            raise ValueError(f"SH degree {gaussians.sh_degree}, but the table is for {table.sh_degree}")
+    def fit(gaussians: Gaussians, table: Table) -> tuple[Codec, Flags]:
+        """Fit lines to `gaussians`, and find the outliers [N] among them; none if that were all."""
         found, parts = _bulk(gaussians)
-        every = zip(_kinds(table.sh_degree), _bits(table), parts, strict=True)
-        return Codec(table, tuple(fit_line(kind, bits, *line) for kind, bits, line in every)), found
+        every = zip(_kinds(table.sh_degree), table.layout[3:], parts, strict=True)
+        return Codec(table, tuple(fit_line(kind, bits, *line) for kind, (_, bits), line in every)), found
 
-    def codes(self, gaussians: Gaussians, outlier: Flags) -> list[Words32]:
-        """Codes [N, columns] for each entry of `table.layout`; `outlier` [N]: their `outliers`."""
-        quats = doubles(gaussians.quats)
-        quats[np.linalg.norm(quats, axis=1) <= _MIN_LENGTH] = 0
-        left_out, three = smallest_three(unit(quats))
-        columns = [
-            outlier[:, None].astype(np.uint32),
-            left_out[:, None].astype(np.uint32),
-            _QUAT_LINE.encode(three, self.table.bits[2]),
-        ]
-        every = zip(self.lines, _bits(self.table), numbers_of(gaussians), strict=True)
-        return columns + [line.encode(values, bits, outlier) for line, bits, values in every]
-
-    def encode(self, gaussians: Gaussians, outlier: Flags | None = None) -> Bytes:
+    def encode(self, gaussians: Gaussians, outlier: Flags) -> Bytes:
         """[N, record_bytes] records: concatenated codes, most significant bit first, padded with zeros.
 
-        `outlier` [N]: `outliers(gaussians)`, if known.
+        `outlier` [N]: see `fit`.
         """
-        outlier = outliers(gaussians) if outlier is None else outlier
         bits, records = self._code_bits(), np.zeros((len(gaussians), self.table.record_bytes), np.uint8)
 
         def encode(start: int, stop: int) -> None:
-            codes = np.concatenate(self.codes(gaussians[start:stop], outlier[start:stop]), axis=1)
-            _pack(codes, bits, records[start:stop])
+            part, far = gaussians[start:stop], outlier[start:stop]
+            quats = doubles(part.quats)
+            quats[np.linalg.norm(quats, axis=1) <= _MIN_LENGTH] = 0
+            left_out, three = smallest_three(unit(quats))
+            columns = [each[:, None].astype(np.uint32) for each in (far, left_out)]
+            columns.append(_QUAT_LINE.encode(three, self.table.bits[2]))
+            every = zip(self.lines, self.table.layout[3:], numbers_of(part), strict=True)
+            columns += [line.encode(values, own, far) for line, (_, own), values in every]
+            _pack(np.concatenate(columns, axis=1), bits, records[start:stop])
 
         in_blocks(encode, len(gaussians), _BLOCK)
         return records
@@ -134,8 +119,8 @@ class Codec:
             lines += [line] * columns
             if few:
                 every_code = np.arange(1 << bits, dtype=np.uint32)[:, None]
-                for far in (False, True):
-                    numbers.append(line.decode(every_code, bits, np.full(len(every_code), far))[:, 0])
+                for each in (line, replace(line, reach=line.far_reach)):
+                    numbers.append(each.decode(every_code, bits)[:, 0])
                 size += 2 << bits
         return np.concatenate(numbers), np.array(starts), np.array([astuple(each) for each in lines])
 
@@ -195,7 +180,7 @@ def _decode(
 ) -> None:
     """Decode records into the fields of Gaussians; `numbers`, `starts`, `lines`: see `_tables`.
 
-    Codes of a record, as from `Codec.codes`: outlier, left out, 3 of the quaternion, 3 of the position, 3
+    Codes of a record, as from `Codec.encode`: outlier, left out, 3 of the quaternion, 3 of the position, 3
     scales, opacity; then, for each band, brightness and two differences of each harmonic.
     """
     values = np.empty(len(bits))
@@ -238,13 +223,11 @@ def _decode(
             j, first, band = j + 3 * band, first + band, band + 2
 
 
-def outliers(gaussians: Gaussians) -> Flags:
-    """Mask [N] of Gaussians with a number far outside of the bulk; empty if that were all of them."""
-    return _bulk(gaussians)[0]
-
-
 def _bulk(gaussians: Gaussians) -> tuple[Flags, list[tuple[Doubles, Doubles, Doubles]]]:
-    """The `outliers` [N]; per line, a sample of the bulk's numbers, the bulk's extent and the outliers'."""
+    """The outliers [N], with a number far outside of the bulk.
+
+    Per line, a sample of the bulk's numbers, the bulk's extent and the outliers'.
+    """
     found, every = np.zeros(len(gaussians), bool), max(1, len(gaussians) // _SAMPLE)
     sample = numbers_of(gaussians[::every])
     ends = list(map(inlier_range, sample, _kinds(gaussians.sh_degree)))
@@ -273,13 +256,6 @@ def out_of_range(gaussians: Gaussians) -> int:
 def _kinds(sh_degree: int) -> list[Kind]:
     """The kind of each line: x, y, z, log scales, opacity logits; two per band, the constant one first."""
     return [POSITION] * 3 + [EVEN] * 2 + [COLOUR] * 2 + [HARMONIC] * 2 * sh_degree
-
-
-def _bits(table: Table) -> list[int]:
-    """Bits of the codes of each line."""
-    means, log_scales, _, opacity, *colours = table.bits
-    harmonics = [bits - fewer for bits in colours for fewer in (0, CHROMA_FEWER)]
-    return [means, means, means, log_scales, opacity, *harmonics]
 
 
 def numbers_of(gaussians: Gaussians) -> list[Doubles]:
