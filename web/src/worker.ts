@@ -14,7 +14,6 @@ export interface Question {
   readonly id?: number;
   readonly bytes?: Uint8Array;
   readonly name?: string; // some formats have no magic bytes
-  readonly keyless?: boolean; // no key will be tried
   readonly key?: string;
   readonly thorough?: boolean; // searches the slow channels
   readonly stop?: boolean; // cancels the current search
@@ -47,11 +46,10 @@ function answer(message: Answer, moved: Transferable[] = []): void {
   (self as unknown as Worker).postMessage(message, moved);
 }
 
-async function load({ id = 0, name, keyless }: Question, bytes: Uint8Array): Promise<void> {
+async function load({ id = 0, name }: Question, bytes: Uint8Array): Promise<void> {
   const read = await readModel(bytes, name);
   const { codes, leftOut, ...model } = read;
-  answer({ id, model, leftOut }, keyless ? buffersOf(model) : []);
-  if (keyless) return;
+  answer({ id, model, leftOut });
   stego = model;
   // After the answer, so that the picture comes first. Without enough memory no key opens anything.
   prepared = new Promise((resolve) => setTimeout(resolve, 0)).then(() => preparedFor(read)).catch(() => null);

@@ -4,7 +4,6 @@ import { writePly } from '../files/ply.ts';
 import type { HiddenFile } from '../records/reveal.ts';
 import { Controls } from './controls.ts';
 import { notifyParent, params } from './embedding.ts';
-import { type TrainedSide, watch } from './live.ts';
 import { inspected, listenToInspection } from './inspection.ts';
 import { Opener } from './opener.ts';
 import { count, page, placeBorder, preparePanel, save, showKey } from './panel.ts';
@@ -88,10 +87,8 @@ class Page {
     });
   }
 
-  /** Opens a running training, or the model in the page, beside it, or in its address. */
+  /** Opens the model in the page, beside it, or in its address. */
   async start(): Promise<void> {
-    const live = document.querySelector<HTMLMetaElement>('meta[name="keyss-live"]')?.content;
-    if (live) return this.watch(live);
     const source = givenModel();
     if (source === null) return this.say('Open a file, or drop one here.');
     if (params.poster) page.poster.src = params.poster;
@@ -102,7 +99,6 @@ class Page {
   }
 
   private async openFile(file: File): Promise<void> {
-    if (page.main.dataset.live !== undefined) return;
     if (file.size > MAX_BYTES) return this.fail('This file is larger than 2 GiB.');
     for (const given of ['pose', 'camera', 'up', 'title']) delete page.main.dataset[given]; // of the first file
     return this.load(new Uint8Array(await file.arrayBuffer()), file.name);
@@ -128,30 +124,6 @@ class Page {
     page.poster.hidden = true;
     notifyParent({ event: 'load', gaussians: model.count });
     this.controls.rotate(params.autorotate && !window.matchMedia('(prefers-reduced-motion: reduce)').matches);
-  }
-
-  /** Shows the models of a running training, without a field for keys. */
-  private async watch(address: string): Promise<void> {
-    page.main.dataset.live = '';
-    document.title = 'keyss, training';
-    page.facts.textContent = 'A training, as it is now';
-    await watch(address, (text) => this.say(text), (side, ply, anew) => this.showTrained(side, ply, anew));
-  }
-
-  private async showTrained(side: TrainedSide, ply: Uint8Array, anew: boolean): Promise<void> {
-    const { model } = await this.opener.ask({ bytes: ply, keyless: true }, [ply.buffer]);
-    if (model === undefined) return;
-    const share = this.secret ? 1 - Number(page.wipe.value) / 100 : 0;
-    if (side === 'secret') this.showSecret(model, share);
-    else {
-      this.published = model;
-      this.showPublished();
-      this.split(this.secret ? share : 1);
-    }
-    const looks = side === 'secret' || this.secret === null;
-    if (looks && (anew || !this.controls.touched)) this.controls.setPose(this.firstPose());
-    else this.setPose(this.pose);
-    await this.settle();
   }
 
   /**
@@ -241,7 +213,7 @@ class Page {
 
   /** Sets the share of the width for the published model beside the secret. */
   private split(share: number): void {
-    page.revealed.hidden = this.secret === null || this.published === null; // nothing to wipe with
+    page.revealed.hidden = this.secret === null;
     page.wipe.value = String(100 * (1 - share));
     this.viewer?.setSplit(share);
     placeBorder(share);

@@ -24,7 +24,7 @@ export function givenModel(): Source | null {
 }
 
 /** `loaded` receives the share loaded so far. Throws for missing files and hosts that are not allowed. */
-export async function fetchBytes(url: URL | string, loaded: (share: number) => void = () => undefined): Promise<Uint8Array> {
+async function fetchBytes(url: URL, loaded: (share: number) => void): Promise<Uint8Array> {
   const response = await fetch(url, { credentials: 'omit' });
   if (!response.ok || response.body === null) throw new Error(String(response.status));
   const size = Number(response.headers.get('content-length')); // possibly compressed
