@@ -1,4 +1,5 @@
 /** Shared by quantised formats; counterpart of `keyss.files.formats.common`. */
+import { coefficients, emptyGaussians, type Gaussians } from '../core/gaussians.ts';
 
 export const SH_C0 = 0.28209479177387814;
 const OPACITY_LOGIT_BOUND = 16;
@@ -40,3 +41,33 @@ export function fromSmallestThree(largest: number, others: readonly number[]): n
   return quat;
 }
 
+/** One number of a Gaussian per axis, or per component of its rotation. */
+export type OfAxis = (row: number, axis: number) => number;
+
+export function byRow(table: ArrayLike<number>, width: number): OfAxis {
+  return (row, axis) => table[width * row + axis];
+}
+
+/** What the codes of a Gaussian mean. */
+interface Decoding {
+  readonly mean: OfAxis;
+  readonly logScale: OfAxis;
+  readonly quat: (row: number) => number[]; // wxyz
+  readonly opacity: (row: number) => number; // 255ths
+  readonly sh: (row: number, index: number, channel: number) => number; // index 0 to K - 1
+}
+
+export function gaussiansOf(count: number, shDegree: number, of: Decoding): Gaussians {
+  const model = emptyGaussians(count, shDegree);
+  const k = coefficients(shDegree);
+  for (let row = 0; row < count; row++) {
+    for (let axis = 0; axis < 3; axis++) {
+      model.means[3 * row + axis] = of.mean(row, axis);
+      model.logScales[3 * row + axis] = of.logScale(row, axis);
+      for (let index = 0; index < k; index++) model.sh[3 * (k * row + index) + axis] = of.sh(row, index, axis);
+    }
+    model.quats.set(of.quat(row), 4 * row);
+    model.opacityLogits[row] = logit(of.opacity(row));
+  }
+  return model;
+}

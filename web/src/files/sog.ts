@@ -1,7 +1,7 @@
 /** Reader of SOG, version 2; counterpart of `keyss.files.formats.sog`. */
 import { damaged, InputError } from '../core/errors.ts';
-import { coefficients, emptyGaussians, type Gaussians } from '../core/gaussians.ts';
-import { fromSmallestThree, holds, logit } from './coded.ts';
+import { coefficients, type Gaussians } from '../core/gaussians.ts';
+import { fromSmallestThree, gaussiansOf, holds } from './coded.ts';
 import { checkFinite } from './ply.ts';
 import { type Decode, decodeInBrowser, openZip, type Pixels, pixelReader, SMALL } from './packed.ts';
 
@@ -43,7 +43,7 @@ export async function readSog(
   bytes: Uint8Array, decode: Decode = decodeInBrowser,
 ): Promise<Gaussians & { readonly codes: SogCodes }> {
   const codes = await parse(bytes, pixelReader(decode));
-  return { ...checkFinite(dequantise(codes)), codes };
+  return { ...checkFinite(dequantiseSog(codes)), codes };
 }
 
 async function parse(bytes: Uint8Array, pixels: Pixels): Promise<SogCodes> {
@@ -71,31 +71,28 @@ async function parse(bytes: Uint8Array, pixels: Pixels): Promise<SogCodes> {
   };
 }
 
-function dequantise(codes: SogCodes): Gaussians {
-  const { count, mins, maxs, positions, quats, scales, colours, shDegree, labels, palette } = codes;
-  const model = emptyGaussians(count, shDegree);
-  const k = coefficients(shDegree);
-  for (let row = 0; row < count; row++) {
-    const largest = quats[4 * row + 3] - LARGEST;
-    if (largest < 0) throw damaged();
-    const others = [0, 1, 2].map((part) => ((quats[4 * row + part] / 255) * 2 - 1) * Math.sqrt(0.5));
-    model.quats.set(fromSmallestThree(largest, others), 4 * row);
-    for (let axis = 0; axis < 3; axis++) {
+/** Raises InputError for an impossible rotation. */
+export function dequantiseSog(codes: SogCodes): Gaussians {
+  const { count, mins, maxs, positions, quats, scaleBook, scales, colourBook, colours, labels, harmonicBook, palette } = codes;
+  const rest = coefficients(codes.shDegree) - 1;
+  return gaussiansOf(count, codes.shDegree, {
+    mean: (row, axis) => {
       const [min, max] = [mins[axis], maxs[axis]];
       const log = min + (min === max ? 1 : max - min) * (positions[3 * row + axis] / FINEST);
-      model.means[3 * row + axis] = Math.sign(log) * Math.expm1(Math.abs(log));
-      model.logScales[3 * row + axis] = codes.scaleBook[scales[4 * row + axis]];
-      model.sh[3 * k * row + axis] = codes.colourBook[colours[4 * row + axis]];
-    }
-    model.opacityLogits[row] = logit(colours[4 * row + 3]);
-    for (let each = 0; each < k - 1; each++) {
-      for (let colour = 0; colour < 3; colour++) {
-        const code = palette[4 * (labels[row] * (k - 1) + each) + colour];
-        model.sh[3 * (k * row + each + 1) + colour] = codes.harmonicBook[code];
-      }
-    }
-  }
-  return model;
+      return Math.sign(log) * Math.expm1(Math.abs(log));
+    },
+    logScale: (row, axis) => scaleBook[scales[4 * row + axis]],
+    quat: (row) => {
+      const [largest, three] = [quats[4 * row + 3] - LARGEST, quats.subarray(4 * row, 4 * row + 3)];
+      if (largest < 0) throw damaged();
+      return fromSmallestThree(largest, Array.from(three, (code) => ((code / 255) * 2 - 1) * Math.sqrt(0.5)));
+    },
+    opacity: (row) => colours[4 * row + 3],
+    sh: (row, index, channel) => {
+      if (index === 0) return colourBook[colours[4 * row + channel]];
+      return harmonicBook[palette[4 * (labels[row] * rest + index - 1) + channel]];
+    },
+  });
 }
 
 function parseMeta(bytes: Uint8Array, size: number): Meta {
