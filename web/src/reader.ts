@@ -31,7 +31,7 @@ export const reveal: Reveal = async (bytes, key, { name, decodeWebP, signal, onP
     const file = fileOf(content);
     if (file) return { kind: 'file', ...file };
     const secret = secretOf(content, stego);
-    if (secret) return { kind: 'model', ply: writePly(secret.gaussians), gaussians: secret.gaussians.count };
+    if (secret) return { kind: 'model', ply: writePly(secret), gaussians: secret.count };
   }
   onProgress?.(1);
   return null;

@@ -60,7 +60,7 @@ async function unlock(id: number, key: string, thorough: boolean): Promise<void>
   searched = key;
   const content = reader ? await reader.open(key, counted(id, reader.derivations)) : null;
   answer({ id, progress: 1 }); // before decoding, which only right keys reach
-  const model = content && stego && secretOf(content, stego)?.gaussians;
+  const model = content && stego && secretOf(content, stego);
   const foreign = content?.foreign;
   if (model) answer({ id, model, foreign }, buffersOf(model));
   else answer({ id, file: (content && fileOf(content)) ?? undefined, foreign });

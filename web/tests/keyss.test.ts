@@ -16,7 +16,7 @@ const LATENT = KEYSS.filter(({ file }) => file.startsWith('latent'));
 const STRIDE = 49;
 
 test.each(KEYSS)('decoding $file matches Python to 1e-5, $count Gaussians', async (expected) => {
-  const { gaussians } = decodeKeyss(hex(expected.payload), await modelOf(expected.file));
+  const gaussians = decodeKeyss(hex(expected.payload), await modelOf(expected.file));
   expect(gaussians.count).toBe(expected.count);
   const { means, quats, logScales, opacityLogits, sh } = gaussians;
   const columns = { means, quats, log_scales: logScales, opacity_logits: opacityLogits, sh };
@@ -32,9 +32,9 @@ test.each(KEYSS)('decoding $file matches Python to 1e-5, $count Gaussians', asyn
 test('lost and reordered rows leave the others unchanged', async () => {
   const { file, payload } = LATENT[0];
   const model = await modelOf(file);
-  const all = decodeKeyss(hex(payload), model).gaussians;
+  const all = decodeKeyss(hex(payload), model);
   const rows = [...Array(model.count).keys()].filter((row) => row % 8).reverse();
-  const some = decodeKeyss(hex(payload), selected(model, rows)).gaussians;
+  const some = decodeKeyss(hex(payload), selected(model, rows));
   const names = [...some.means].map(String);
   expect(some.count).toBeGreaterThan(all.count / 2);
   expect([...all.means].map(String)).toEqual(expect.arrayContaining(names));
@@ -48,7 +48,7 @@ test.each([KEYSS[0], LATENT[1]])('rounded models and damage are refused', async 
     for (const bytes of [hex(payload).slice(0, at), hex(payload)]) {
       if (bytes.length > at) bytes[at] ^= 1 << at % 8;
       try {
-        expect(decodeKeyss(bytes, model).gaussians.means.every(Number.isFinite)).toBe(true);
+        expect(decodeKeyss(bytes, model).means.every(Number.isFinite)).toBe(true);
       } catch (error) {
         expect((error as Error).message).toMatch(/^(This file|What this key opens|The model was).*\.$/);
       }

@@ -1,6 +1,8 @@
 /** Similarity transforms of Gaussians; counterpart of `keyss.core.similarity`. */
 import { coefficients, type Gaussians } from './gaussians.ts';
 
+const SQUARINGS = 50;
+
 /** x -> scale * rotation x + translation. */
 export interface Similarity {
   readonly scale: number;
@@ -9,7 +11,7 @@ export interface Similarity {
 }
 
 export function inverse({ scale, rotation: r, translation: t }: Similarity): Similarity {
-  const rotation = [r[0], r[3], r[6], r[1], r[4], r[7], r[2], r[5], r[8]];
+  const rotation = transposed(r);
   return { scale: 1 / scale, rotation, translation: times(rotation, t).map((each) => -each / scale) };
 }
 
@@ -28,7 +30,7 @@ export function movedPoint({ scale, rotation, translation }: Similarity, point: 
 
 /** The transformed Gaussians, view-dependent colour included. */
 export function moved(by: Similarity, model: Gaussians): Gaussians {
-  const [w, x, y, z] = quaternion(by.rotation);
+  const [w, x, y, z] = fittedRotation(transposed(by.rotation)).vector;
   const blocks = Array.from({ length: model.shDegree }, (_, band) => rotatedBand(by.rotation, band + 1));
   const k = coefficients(model.shDegree);
   const [means, quats, sh] = [model.means.slice(), model.quats.slice(), model.sh.slice()];
@@ -54,6 +56,10 @@ export function moved(by: Similarity, model: Gaussians): Gaussians {
   return { ...model, means, quats, sh, logScales: model.logScales.map((each) => each + larger) };
 }
 
+function transposed(r: readonly number[]): number[] {
+  return [r[0], r[3], r[6], r[1], r[4], r[7], r[2], r[5], r[8]];
+}
+
 function times(m: readonly number[], v: ArrayLike<number>): number[] {
   return [0, 3, 6].map((at) => m[at] * v[0] + m[at + 1] * v[1] + m[at + 2] * v[2]);
 }
@@ -75,20 +81,34 @@ export function rotationOf([w, x, y, z]: readonly number[]): number[] {
   ];
 }
 
-/** Unit quaternion wxyz of a rotation matrix (Shepperd 1978). */
-function quaternion(r: readonly number[]): number[] {
-  const squares = [
-    1 + r[0] + r[4] + r[8], 1 + r[0] - r[4] - r[8], 1 - r[0] + r[4] - r[8], 1 - r[0] - r[4] + r[8],
-  ];
-  const rows = [
-    [squares[0], r[7] - r[5], r[2] - r[6], r[3] - r[1]],
-    [r[7] - r[5], squares[1], r[1] + r[3], r[2] + r[6]],
-    [r[2] - r[6], r[1] + r[3], squares[2], r[5] + r[7]],
-    [r[3] - r[1], r[2] + r[6], r[5] + r[7], squares[3]],
-  ];
-  const found = rows[squares.indexOf(Math.max(...squares))];
-  const length = Math.hypot(...found);
-  return found.map((each) => each / length);
+/**
+ * The rotation that fits sums of products best, a unit quaternion wxyz: `m` [3, 3], of coordinates before and after it. It is
+ * the eigenvector of the largest eigenvalue, `value`, of a symmetric matrix (Horn 1987).
+ */
+export function fittedRotation(m: ArrayLike<number>): { value: number; vector: number[] } {
+  const [xx, xy, xz, yx, yy, yz, zx, zy, zz] = Array.from(m);
+  return largestEigen([
+    [xx + yy + zz, yz - zy, zx - xz, xy - yx],
+    [yz - zy, xx - yy - zz, xy + yx, zx + xz],
+    [zx - xz, xy + yx, yy - xx - zz, yz + zy],
+    [xy - yx, zx + xz, yz + zy, zz - xx - yy],
+  ]);
+}
+
+/** The largest eigenvalue of a symmetric matrix [4, 4] and its unit eigenvector, by repeated squaring. */
+function largestEigen(matrix: number[][]): { value: number; vector: number[] } {
+  const bound = Math.max(...matrix.map((row) => row.reduce((sum, each) => sum + Math.abs(each), 0)));
+  const four = [0, 1, 2, 3];
+  let power = matrix.map((row, i) => row.map((each, j) => each / bound + Number(i === j))); // shifted to non-negative eigenvalues
+  for (let round = 0; round < SQUARINGS; round++) {
+    const largest = Math.max(...power.flat().map(Math.abs));
+    const scaled = power.map((row) => row.map((each) => each / largest));
+    power = scaled.map((row) => four.map((j) => row.reduce((sum, each, k) => sum + each * scaled[k][j], 0)));
+  }
+  const column = power[four.reduce((a, b) => (power[b][b] > power[a][a] ? b : a))];
+  const vector = column.map((each) => each / Math.hypot(...column));
+  const value = vector.reduce((sum, a, i) => sum + vector.reduce((own, b, j) => own + a * b * matrix[i][j], 0), 0);
+  return { value, vector };
 }
 
 // [32, 4] quadrature on the sphere, directions and weights, exact up to degree 7 (Gauss-Legendre by azimuth steps).
@@ -102,7 +122,7 @@ const SPHERE = GAUSS.flatMap(([z, weight]) => [z, -z].flatMap((height) =>
 /** [2 band + 1]^2 rotation matrix for the SH coefficients of one degree. */
 function rotatedBand(r: readonly number[], band: number): number[][] {
   const found = Array.from({ length: 2 * band + 1 }, () => new Array<number>(2 * band + 1).fill(0));
-  const back = [r[0], r[3], r[6], r[1], r[4], r[7], r[2], r[5], r[8]];
+  const back = transposed(r);
   for (const [x, y, z, weight] of SPHERE) {
     const [there, here] = [harmonics([x, y, z], band), harmonics(times(back, [x, y, z]), band)];
     there.forEach((a, i) => here.forEach((b, j) => (found[i][j] += weight * a * b)));

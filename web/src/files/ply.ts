@@ -1,5 +1,5 @@
 /** Reader and writer of the Inria .ply layout. Input is untrusted: defects raise InputError. */
-import { ascii, joined, viewOf } from '../core/bytes.ts';
+import { ascii, joined, quantile, viewOf } from '../core/bytes.ts';
 import { InputError } from '../core/errors.ts';
 import { coefficients, COLUMNS, emptyGaussians, type Gaussians, where } from '../core/gaussians.ts';
 
@@ -156,14 +156,6 @@ function checkNotActivated({ count, means, logScales, opacityLogits }: Gaussians
   if (low >= 0 && high <= 1 && high - low > 0.5) wrong.push('opacities');
   if (wrong.length === 0) return;
   throw new InputError(`This file's ${wrong.join(' and ')} are those that renderers use: export it again without activating them.`);
-}
-
-/** Linearly interpolated quantile of at least one value. */
-function quantile(values: number[], share: number): number {
-  const sorted = Float64Array.from(values).sort();
-  const at = share * (sorted.length - 1);
-  const [below, above] = [sorted[Math.floor(at)], sorted[Math.ceil(at)]];
-  return below + (at - Math.floor(at)) * (above - below);
 }
 
 export interface FiniteGaussians extends Gaussians {

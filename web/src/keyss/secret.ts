@@ -15,15 +15,15 @@ const DRAWN_OPACITY = Math.fround(1 / 255);
 const APPENDED_OPACITY = 1.00001 / 255;
 const APPENDED_LOGIT = Math.fround(Math.log(APPENDED_OPACITY / (1 - APPENDED_OPACITY)));
 
-/** The Gaussians that a payload reveals of a model, and the number that were hidden. Raises InputError. */
-export function decodeKeyss(payload: Uint8Array, stego: Gaussians): { gaussians: Gaussians; hidden: number } {
+/** The Gaussians that a payload reveals of a model. Raises InputError. */
+export function decodeKeyss(payload: Uint8Array, stego: Gaussians): Gaussians {
   const tensors = Tensors.of(payload);
   const header = objectOf(parsed(ascii(String(tensors.metadata.keyss))));
   if (header.format !== FORMAT) throw damaged();
   if (header.version !== VERSION) throw otherVersion();
   objectOf(header, 'format', 'version', 'shape', 'frame', 'count', 'visibility');
-  const [shape, frame, hidden] = [shapeOf(header.shape), frameOf(header.frame), integerOf(header.count, 0, MAX_COUNT)];
-  const [visibility] = numbersOf([header.visibility], 1);
+  const [shape, frame, [visibility]] = [shapeOf(header.shape), frameOf(header.frame), numbersOf([header.visibility], 1)];
+  integerOf(header.count, 0, MAX_COUNT);
   const anchors = tensors.take('anchors', integerOf(tensors.shapeOf('anchors')[0], 1, MAX_ANCHORS), 3);
   const decode = DECODERS.get(shape.kind)?.(shape, tensors, tensors.take('key', shape.keySize));
   if (!decode || visibility < 0 || !tensors.done) throw damaged();
@@ -31,7 +31,7 @@ export function decodeKeyss(payload: Uint8Array, stego: Gaussians): { gaussians:
   // What was appended came after the training.
   const own = where(stego, (row) => stego.opacityLogits[row] !== APPENDED_LOGIT);
   const decoded = decode(withDegree(own, shape.shDegree));
-  return { gaussians: moved(inverse(frame), drawn(decoded, visibility)), hidden };
+  return moved(inverse(frame), drawn(decoded, visibility));
 }
 
 /** Without what is never drawn, unless that is all, making up for what was lost of the sum of opacities. */

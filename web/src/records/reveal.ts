@@ -9,11 +9,6 @@ import { decodeWhole } from './whole.ts';
 
 const [WHOLE, KEYSS, FILE] = ['carry', 'keyss', 'file']; // methods
 
-export interface Secret {
-  readonly gaussians: Gaussians;
-  readonly hidden: number; // Gaussians before any were lost
-}
-
 export interface HiddenFile {
   readonly name: string; // from the sender: to be shown, never to be used as a path
   readonly bytes: Uint8Array;
@@ -27,16 +22,14 @@ export function fileOf(content: Content): HiddenFile | null {
 }
 
 /** The model, found in `stego`; null if the content is not a model. Raises InputError for damage. */
-export function secretOf(content: Content, stego: Gaussians): Secret | null {
+export function secretOf(content: Content, stego: Gaussians): Gaussians | null {
   if (content.service === 'payload') {
     if (content.method === KEYSS) return decodeKeyss(content.data, stego);
-    if (content.method !== WHOLE) return null;
-    const gaussians = decodeWhole(content.data, stego.count);
-    return { gaussians, hidden: gaussians.count };
+    return content.method === WHOLE ? decodeWhole(content.data, stego.count) : null;
   }
   if (content.header.length < 4) throw damaged();
   const hidden = viewOf(content.header).getUint32(0, true);
   const codec = Codec.unpack(content.header.subarray(4));
   if (content.records[0].length !== codec.recordBytes) throw damaged();
-  return { gaussians: compensated(codec.decode(content.records), hidden), hidden };
+  return compensated(codec.decode(content.records), hidden);
 }

@@ -1,7 +1,7 @@
 /** The header, which describes how to read the payload; counterpart of `keyss.channels.colours.header`. */
 import { hmac } from '@noble/hashes/hmac.js';
 import { sha256 } from '@noble/hashes/sha2.js';
-import { ascii, joined, median } from '../../core/bytes.ts';
+import { ascii, joined, quantile } from '../../core/bytes.ts';
 import { expand, SALT_BYTES } from '../../keys/keys.ts';
 import { type Carriers, chosen, fractions } from './carriers.ts';
 import { Fountain, NOISY } from './fountain.ts';
@@ -110,7 +110,7 @@ export function ownRows(header: Header, { salted }: Secrets, carriers: Carriers)
 
 /** Increase of the median impact since the header was written. */
 export function shiftOf(header: Header, { impact }: Carriers): number {
-  const off = MEDIAN_STEPS * median(impact) - header.median + 128;
+  const off = MEDIAN_STEPS * quantile(impact, 0.5) - header.median + 128;
   return (off - Math.floor(off / 256) * 256 - 128) / MEDIAN_STEPS;
 }
 

@@ -3,7 +3,7 @@
  * See docs/byte-layout.md, "Low bits".
  */
 import { blake2b } from '@noble/hashes/blake2.js';
-import { ascii, median } from '../../core/bytes.ts';
+import { ascii, quantile } from '../../core/bytes.ts';
 import { coefficients, type Gaussians } from '../../core/gaussians.ts';
 
 export const ID_BYTES = 16;
@@ -41,7 +41,7 @@ export function fieldsOf(gaussians: Gaussians): Fields {
   }
   const lengths = new Float64Array(count);
   for (let row = 0; row < count; row++) lengths[row] = Math.abs(coarseLength(words, row * width) - 1);
-  const quatsInUse = count === 0 || median(lengths) > UNIT_TOLERANCE;
+  const quatsInUse = count === 0 || quantile(lengths, 0.5) > UNIT_TOLERANCE;
   const masks = new Uint32Array(width).fill(GEOMETRY_MASK, 0, GEOMETRY).fill(SH_MASK, GEOMETRY);
   if (!quatsInUse) masks.fill(0, FIRST_QUAT, FIRST_QUAT + 4);
   return { count, width, words, masks, quatsInUse };

@@ -6,10 +6,10 @@ export const TAG_BYTES = 4;
 const BLOCK = 16; // bytes of a block of AES, and of an ID
 const CELLS = 1 << 14; // at a time
 
-/** Decrypted cells: rows of their carriers, and the data of each. */
-export interface Found {
-  readonly rows: number[];
-  readonly data: Uint8Array[];
+/** The data of a cell, and its carrier. */
+export interface Cell {
+  readonly row: number;
+  readonly data: Uint8Array;
 }
 
 /** Decrypts cells of `size` bytes of data for one use of a secret. */
@@ -24,13 +24,26 @@ export class CellCipher {
     );
   }
 
-  /** Tries the bytes from `offset` on of every row of `low` [N, width]. */
-  decrypt(ids: Uint8Array, low: Uint8Array, width: number, offset: number, slot: number): Found {
-    const found: Found = { rows: [], data: [] };
-    const count = ids.length / BLOCK;
-    for (let start = 0; start < count; start += CELLS) {
+  /** The cells with a valid tag among the bytes from `offset` on of every row of `low` [N, width]. */
+  decrypt(ids: Uint8Array, low: Uint8Array, width: number, offset: number, slot: number): Cell[] {
+    const [{ size, stride }, found] = [this, [] as Cell[]];
+    for (let start = 0; start < ids.length / BLOCK; start += CELLS) {
       const own = ids.subarray(start * BLOCK, (start + CELLS) * BLOCK);
-      this.decryptSome(found, start, own, low.subarray(start * width + offset), width, slot);
+      const cells = low.subarray(start * width + offset); // every `width` bytes begin with a cell
+      const [count, streams] = [own.length / BLOCK, this.streams(own, cells, width, slot)];
+      const messages = new Uint8Array(count * stride); // slot, data, and zeros up to a block
+      for (let cell = 0; cell < count; cell++) {
+        const [to, from] = [cell * stride + 1, cell * width + TAG_BYTES];
+        messages[to - 1] = slot;
+        for (let at = 0; at < size; at++) messages[to + at] = cells[from + at] ^ streams[cell * size + at];
+      }
+      const states = this.states(own, messages);
+      for (let cell = 0; cell < count; cell++) {
+        let different = 0;
+        for (let at = 0; at < TAG_BYTES; at++) different |= states[cell * BLOCK + at] ^ cells[cell * width + at];
+        const first = cell * stride + 1;
+        if (different === 0) found.push({ row: start + cell, data: messages.slice(first, first + size) });
+      }
     }
     return found;
   }
@@ -39,26 +52,6 @@ export class CellCipher {
   pads(ids: Uint8Array): Uint8Array {
     const states = this.states(ids, new Uint8Array((ids.length / BLOCK) * this.stride));
     return this.streams(ids, states, BLOCK, 0);
-  }
-
-  /** Of Gaussians from `start` on; every `width` bytes of `cells` begin with a cell. */
-  private decryptSome(found: Found, start: number, own: Uint8Array, cells: Uint8Array, width: number, slot: number): void {
-    const [{ size, stride }, count] = [this, own.length / BLOCK];
-    const streams = this.streams(own, cells, width, slot);
-    const messages = new Uint8Array(count * stride); // slot, data, and zeros up to a block
-    for (let cell = 0; cell < count; cell++) {
-      const [to, from] = [cell * stride + 1, cell * width + TAG_BYTES];
-      messages[to - 1] = slot;
-      for (let at = 0; at < size; at++) messages[to + at] = cells[from + at] ^ streams[cell * size + at];
-    }
-    const states = this.states(own, messages);
-    for (let cell = 0; cell < count; cell++) {
-      let different = 0;
-      for (let at = 0; at < TAG_BYTES; at++) different |= states[cell * BLOCK + at] ^ cells[cell * width + at];
-      if (different !== 0) continue;
-      found.rows.push(start + cell);
-      found.data.push(messages.slice(cell * stride + 1, cell * stride + 1 + size));
-    }
   }
 
   private get stride(): number {

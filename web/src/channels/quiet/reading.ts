@@ -14,7 +14,7 @@ import type { Content, Reader } from '../content.ts';
 import { decoded } from '../reed_solomon.ts';
 import { foreign } from '../sketch.ts';
 import { fieldsOf, gaussianIds, ID_BYTES, lowBits, lowWidth } from './bits.ts';
-import { CellCipher, TAG_BYTES } from './cells.ts';
+import { type Cell, CellCipher, TAG_BYTES } from './cells.ts';
 import { decodedFrom } from './decoded.ts';
 import { lastBits, type Levels, levelsOf, modelHash } from './fields.ts';
 import { NUMBER_BYTES, type Parameters, SKETCH_BYTES, unpackCodewords, unpackParameters } from './parameters.ts';
@@ -29,12 +29,6 @@ const DUMMY_CELLS = 2; // cells per carrier that a wrong key decrypts
 const NARROW_HARMONICS = 9; // of degree 1: some secrets do not write the others
 const [LEAST_BYTES, MIN_BLOCKS] = [48, 4]; // minimum bytes of a block; minimum blocks of a file
 const MAX_BITS = 2 ** 30; // bits in codes; more would exceed the memory of a tab
-
-/** The data of a cell, and its carrier. */
-interface Cell {
-  readonly row: number;
-  readonly data: Uint8Array;
-}
 
 /** The carriers of a model, prepared for any number of keys. */
 export class QuietReader implements Reader {
@@ -166,12 +160,8 @@ export class QuietReader implements Reader {
   /** The cells with a valid tag, in the order of carriers. */
   private cells(cipher: CellCipher, width = this.width, cells = 1): Cell[] {
     const size = Math.floor(width / cells);
-    const found: Cell[] = [];
-    for (let slot = 0; slot < cells; slot++) {
-      const { rows, data } = cipher.decrypt(this.ids, this.low, this.width, slot * size, slot);
-      rows.forEach((row, index) => found.push({ row, data: data[index] }));
-    }
-    return found.sort((a, b) => a.row - b.row);
+    const slots = Array.from({ length: cells }, (_, slot) => cipher.decrypt(this.ids, this.low, this.width, slot * size, slot));
+    return slots.flat().sort((a, b) => a.row - b.row);
   }
 }
 
