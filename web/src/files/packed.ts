@@ -1,46 +1,25 @@
 /** The container of .sog: a ZIP archive, stored or deflated, of lossless WebP images. */
-import { inflate, viewOf } from '../core/bytes.ts';
+import { unzipSync } from 'fflate';
+import { viewOf } from '../core/bytes.ts';
 import { damaged, InputError } from '../core/errors.ts';
 
-const [END, CENTRAL, LOCAL] = [0x06054b50, 0x02014b50, 0x04034b50];
 const MAX_MEMBERS = 64;
-const MAX_END_BYTES = 65557; // of the end record with its comment
 export const SMALL = 1 << 20; // bytes that archives of any size may inflate to
 
-/** A function that reads a member by name. Raises InputError for damaged archives. */
-export function openZip(bytes: Uint8Array): (name: string) => Promise<Uint8Array> {
-  const view = viewOf(bytes);
-  let end = bytes.length - 22;
-  const last = Math.max(0, bytes.length - MAX_END_BYTES);
-  while (end >= last && view.getUint32(end, true) !== END) end--;
-  if (end < last) throw damaged();
-  const count = view.getUint16(end + 10, true);
-  if (count > MAX_MEMBERS) throw damaged();
-  const members = new Map<string, { method: number; packed: number; size: number; at: number }>();
-  let at = view.getUint32(end + 16, true);
-  for (let index = 0; index < count; index++) {
-    if (at + 46 > bytes.length || view.getUint32(at, true) !== CENTRAL) throw damaged();
-    const [nameSize, extra, comment] = [28, 30, 32].map((offset) => view.getUint16(at + offset, true));
-    const name = new TextDecoder().decode(bytes.subarray(at + 46, at + 46 + nameSize));
-    members.set(name, {
-      method: view.getUint16(at + 10, true), packed: view.getUint32(at + 20, true),
-      size: view.getUint32(at + 24, true), at: view.getUint32(at + 42, true),
+/** The members of an archive by name. Raises InputError for damaged archives. */
+export function unzipped(bytes: Uint8Array): Record<string, Uint8Array | undefined> {
+  let [members, whole] = [0, 0];
+  try {
+    return unzipSync(bytes, {
+      filter: ({ size, originalSize }) => {
+        whole += Math.max(size, originalSize); // before allocating
+        if (++members > MAX_MEMBERS || whole > 2 * bytes.length + SMALL) throw damaged();
+        return true;
+      },
     });
-    at += 46 + nameSize + extra + comment;
-  }
-  const whole = [...members.values()].reduce((sum, { size }) => sum + size, 0);
-  const places = new Set([...members.values()].map((each) => each.at));
-  if (places.size < members.size || whole > 2 * bytes.length + SMALL) throw damaged();
-  return async (name) => {
-    const found = members.get(name);
-    if (!found || found.at + 30 > bytes.length || view.getUint32(found.at, true) !== LOCAL) throw damaged();
-    const start = found.at + 30 + view.getUint16(found.at + 26, true) + view.getUint16(found.at + 28, true);
-    const data = bytes.subarray(start, start + found.packed);
-    if (data.length !== found.packed) throw damaged();
-    if (found.method === 0) return data;
-    if (found.method === 8) return inflate(data, 'deflate-raw', found.size);
+  } catch {
     throw damaged();
-  };
+  }
 }
 
 const SMALL_IMAGE = 1 << 16; // pixels; larger images may have at most four times the pixels needed

@@ -3,7 +3,7 @@ import { damaged, InputError } from '../core/errors.ts';
 import { coefficients, type Gaussians } from '../core/gaussians.ts';
 import { fromSmallestThree, gaussiansOf, holds } from './coded.ts';
 import { checkFinite } from './ply.ts';
-import { type Decode, decodeInBrowser, openZip, type Pixels, pixelReader, SMALL } from './packed.ts';
+import { type Decode, decodeInBrowser, type Pixels, pixelReader, SMALL, unzipped } from './packed.ts';
 
 export const FINEST = 65535; // largest position code
 export const LARGEST = 252; // a quaternion's fourth byte: this plus the index (wxyz) of the component left out
@@ -47,9 +47,10 @@ export async function readSog(
 }
 
 async function parse(bytes: Uint8Array, pixels: Pixels): Promise<SogCodes> {
-  const file = openZip(bytes);
-  const { count, means, quats, scales, sh0, shN } = parseMeta(await file('meta.json'), bytes.length);
-  const image = async (name: string): Promise<Uint8Array> => pixels(await file(name), count);
+  const members = unzipped(bytes);
+  const file = (name: string): Uint8Array => members[name] ?? new Uint8Array(0);
+  const { count, means, quats, scales, sh0, shN } = parseMeta(file('meta.json'), bytes.length);
+  const image = (name: string): Promise<Uint8Array> => pixels(file(name), count);
   const [low, high] = [await image(means.files[0]), await image(means.files[1])];
   const positions = new Uint16Array(3 * count);
   for (let row = 0; row < count; row++) {
@@ -61,7 +62,7 @@ async function parse(bytes: Uint8Array, pixels: Pixels): Promise<SogCodes> {
     const pairs = await image(shN.files[1]);
     labels = labels.map((_, row) => pairs[4 * row] | (pairs[4 * row + 1] << 8));
     if (labels.some((label) => label >= shN.count)) throw damaged();
-    palette = await pixels(await file(shN.files[0]), Math.ceil(shN.count / ROW) * ROW * rest, ROW * rest);
+    palette = await pixels(file(shN.files[0]), Math.ceil(shN.count / ROW) * ROW * rest, ROW * rest);
   }
   return {
     kind: 'sog', count, mins: means.mins, maxs: means.maxs, positions, quats: await image(quats.files[0]),
