@@ -3,8 +3,7 @@ import type { Reveal } from '../reader/index.d.ts';
 import { preparedFor } from './channels/opening.ts';
 import { readModel } from './files/models.ts';
 import { writePly } from './files/ply.ts';
-import { type Derive, keyBytes, master } from './keys/keys.ts';
-import { sequential } from './keys/pool.ts';
+import { type Derive, keyBytes, master, sequential } from './keys/keys.ts';
 import { fileOf, secretOf } from './records/reveal.ts';
 
 const QUICK = 0.2; // share of the progress: colours, searched last, take four times as long as all else

@@ -1,12 +1,11 @@
 /** The page's worker: reads models and tries keys. Nothing is stored. */
-import { InputError } from './core/errors.ts';
 import DERIVE from 'source:./derive.ts';
 import type { Reader } from './channels/content.ts';
 import { preparedFor } from './channels/opening.ts';
+import { InputError } from './core/errors.ts';
 import { buffersOf, type Gaussians } from './core/gaussians.ts';
 import { readModel } from './files/models.ts';
-import type { Derive } from './keys/keys.ts';
-import { deriveInWorker, roundRobin, sequential, startWorker } from './keys/pool.ts';
+import { type Derive, deriveInWorker, roundRobin, sequential, startWorker } from './keys/keys.ts';
 import { fileOf, type HiddenFile, secretOf } from './records/reveal.ts';
 
 /** A file to read, or a key to try on the last file. */

@@ -1,7 +1,6 @@
 /** A sketch of a model's Gaussians, in which those of other models are seen; counterpart of `keyss.channels.sketch`. */
-import { ecb } from '@noble/ciphers/aes.js';
 import { viewOf } from '../core/bytes.ts';
-import { expand } from '../keys/keys.ts';
+import { blockwise, expand } from '../keys/keys.ts';
 
 const ID_BYTES = 16;
 
@@ -10,8 +9,7 @@ export function foreign(secret: Uint8Array, ids: Uint8Array, own: Uint8Array, ga
   const kept = 8 * own.length;
   const isUnset = (place: number): boolean => ((own[place >>> 3] >>> (place & 7)) & 1) === 0;
   const places = Array.from({ length: Math.min(kept, gaussians) }, (_, place) => place);
-  const key = expand(secret, 'sketch', 32);
-  const hashed = viewOf(ids.length ? ecb(key, { disablePadding: true }).encrypt(ids) : ids);
+  const hashed = viewOf(blockwise(expand(secret, 'sketch'), ids));
   let seen = 0;
   for (let at = 0; at < ids.length; at += ID_BYTES) {
     const place = hashed.getUint32(at, true) % Math.max(1, gaussians);

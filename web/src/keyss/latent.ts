@@ -32,7 +32,7 @@ export function latentOf({ shDegree, secrets, secret }: Shape, tensors: Tensors,
   const knots = rows(tensors.take('decoder.knots', count, RANKS.length), RANKS.length);
   const nonce = Uint8Array.from(tensors.take('decoder.nonce', NONCE_BYTES));
   const seed = sha256(joined(new Uint8Array(key.buffer, key.byteOffset, 4 * key.length), nonce));
-  const cipher = new CellCipher(expand(seed, 'latents', 32), 'pad', 4 * count);
+  const cipher = new CellCipher(expand(seed, 'latents'), 'pad', 4 * count);
   const [along, latents] = [new Float64Array(written), new Float32Array(count)];
 
   /** Whether a row is the secret's: then its latents are in `latents`. */

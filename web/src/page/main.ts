@@ -3,14 +3,14 @@ import type { Gaussians } from '../core/gaussians.ts';
 import { writePly } from '../files/ply.ts';
 import type { HiddenFile } from '../records/reveal.ts';
 import { Controls } from './controls.ts';
-import { notifyParent, params } from './embedding.ts';
+import { givenModel, notifyParent, params } from './embedding.ts';
 import { inspected, listenToInspection } from './inspection.ts';
 import { Opener } from './opener.ts';
 import { count, page, placeBorder, preparePanel, save, showKey } from './panel.ts';
 import {
-  add, transferPose, axes, FIELD_OF_VIEW, firstPose, pick, type Pose, poseOfHash, poseToHash, UPS, upName, type Vector,
+  add, axes, FIELD_OF_VIEW, firstPose, pick, type Pose, poseOfHash, poseToHash, transferPose, upName, UPS,
+  type Vector,
 } from './pose.ts';
-import { givenModel } from './sources.ts';
 import { Viewer } from './viewer.ts';
 
 const ADDRESS_AFTER = 400; // ms after the last movement

@@ -1,6 +1,6 @@
 /** Promises over the worker that reads files and tries keys. */
 import WORKER from 'source:../worker.ts';
-import { startWorker } from '../keys/pool.ts';
+import { startWorker } from '../keys/keys.ts';
 import type { Answer, Question } from '../worker.ts';
 
 export class Opener {

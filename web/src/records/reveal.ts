@@ -1,7 +1,7 @@
 /** From the content of a channel to what `keyss reveal` gives: a model or a file. */
-import { damaged } from '../core/errors.ts';
 import type { Content } from '../channels/content.ts';
 import { viewOf } from '../core/bytes.ts';
+import { damaged } from '../core/errors.ts';
 import { compensated, type Gaussians } from '../core/gaussians.ts';
 import { decodeKeyss } from '../keyss/secret.ts';
 import { Codec } from './codec.ts';

@@ -1,17 +1,15 @@
-/** Reader of appended Gaussians (docs/channels.md); counterpart of `keyss.channels.appended.channel`. */
+/** Reader of appended Gaussians (docs/channels.md); counterpart of `keyss.channels.appended.channel` and `packets`. */
 import { ascii, rowsOf, viewOf } from '../../core/bytes.ts';
 import { damaged } from '../../core/errors.ts';
 import type { Gaussians } from '../../core/gaussians.ts';
-import { decrypted, type Derive, expand } from '../../keys/keys.ts';
-import { here } from '../../keys/pool.ts';
+import { blockwise, decrypted, type Derive, expand, here } from '../../keys/keys.ts';
 import { carriersOf } from '../colours/carriers.ts';
 import { type Payload, type Reader, unpackPayload } from '../content.ts';
-import { decoded } from '../reed_solomon.ts';
+import { type Codewords, decoded } from '../reed_solomon.ts';
 import { foreign } from '../sketch.ts';
 import {
   allShifts, candidates, coloursOf, inOwnFrame, invariantsOf, likelyShifts, scalesAt, scaleSteps,
 } from './lattice.ts';
-import { readHeader, readPackets, type TaggedWords, WIDTHS, wordsOfPoints } from './packets.ts';
 import { type Found, LEAST, ONE_IN, pilotsOf, readPilots } from './pilots.ts';
 
 // Gaussians sampled for pilots; number of lattice offsets tried, with at least this many standard deviations more pilots
@@ -53,14 +51,14 @@ export class AppendedReader implements Reader {
   async open(key: string, derive: Derive = here): Promise<Payload | null> {
     const secret = await derive(key, this.salt);
     for (const width of WIDTHS) {
-      const codewords = readHeader(expand(secret, `appended/header/${width}`, 32), this.words, width);
+      const codewords = readHeader(expand(secret, `appended/header/${width}`), this.words, width);
       if (codewords === null) continue;
-      const packets = readPackets(expand(secret, 'appended/packets', 32), this.words, width);
+      const packets = readPackets(expand(secret, 'appended/packets'), this.words, width);
       const encrypted = decoded(codewords, packets, true);
-      const whole = await decrypted(expand(secret, 'appended/data', 32), encrypted, ASSOCIATED);
+      const whole = await decrypted(expand(secret, 'appended/data'), encrypted, ASSOCIATED);
       if (whole.length < HOST_BYTES) throw damaged();
       const own = whole.subarray(4, HOST_BYTES);
-      const told = foreign(expand(secret, 'appended/host', 32), this.ids, own, viewOf(whole).getUint32(0, true));
+      const told = foreign(expand(secret, 'appended/host'), this.ids, own, viewOf(whole).getUint32(0, true));
       const payload = unpackPayload(whole.subarray(HOST_BYTES));
       return told > (FOREIGN * this.ids.length) / 16 ? { ...payload, foreign: told } : payload;
     }
@@ -81,4 +79,65 @@ function shiftsWithPilots(steps: Float64Array, colours: Uint8Array): number[] {
     .sort((a, b) => b.pilots - a.pilots)
     .slice(0, TRIED)
     .map(({ shift }) => shift);
+}
+
+const WIDTHS = [8, 6]; // data bytes per packet
+const HEADER_BITS = 20;
+const WORD_BYTES = 11;
+const MAX_DATA = 5895; // packets per codeword
+const [LEFT, DEVIATIONS] = [0.74, 4.2]; // expected share of surviving packets, and the margin
+const AGREEING_HEADERS = 12; // fewer agree by chance among a million words
+
+/** N words: data bytes, then a tag. */
+interface TaggedWords {
+  readonly count: number;
+  readonly bytes: Uint8Array; // [N, 11]; the last four bits are zero
+}
+
+/** Words of colours, scales [N, 3] and positions and turns [N, 6]. */
+function wordsOfPoints(colours: Uint8Array, scales: Uint8Array, others: Uint16Array): TaggedWords {
+  const count = colours.length / 3;
+  const bytes = new Uint8Array(WORD_BYTES * count);
+  const view = new DataView(bytes.buffer);
+  for (let row = 0; row < count; row++) {
+    const [r, g, b] = colours.subarray(3 * row, 3 * row + 3);
+    const [u, v, w] = scales.subarray(3 * row, 3 * row + 3);
+    const [x, y, z, i, j, k] = others.subarray(6 * row, 6 * row + 6);
+    const at = WORD_BYTES * row;
+    // 7 + 7 + 7 + 6 + 5 bits, then 1 + 6 + 10 + 10 + 5, then 5 + 5 + 5 + 1 and 4.
+    view.setUint32(at, (r << 25) | (g << 18) | (b << 11) | (u << 5) | (v >> 1));
+    view.setUint32(at + 4, ((v & 1) << 31) | (w << 25) | (x << 15) | (y << 5) | (z >> 5));
+    view.setUint16(at + 8, ((z & 31) << 11) | (i << 6) | (j << 1) | (k >> 4));
+    bytes[at + 10] = (k & 15) << 4;
+  }
+  return { count, bytes };
+}
+
+/** [number, data] of each word, as if all were packets. */
+function readPackets(key: Uint8Array, { count, bytes }: TaggedWords, width: number): [number, Uint8Array][] {
+  const found: [number, Uint8Array][] = [];
+  const blocks = new Uint8Array(16 * count);
+  for (let row = 0; row < count; row++) blocks.set(bytes.subarray(WORD_BYTES * row, WORD_BYTES * row + width), 16 * row);
+  const encrypted = blockwise(key, blocks);
+  for (let row = 0; row < count; row++) {
+    let tag = 0;
+    for (let byte = 0; byte < WORD_BYTES - width; byte++) {
+      tag = 256 * tag + (bytes[WORD_BYTES * row + width + byte] ^ encrypted[16 * row + byte]); // may pass 2^32
+    }
+    found.push([Math.floor(tag / 16), blocks.subarray(16 * row, 16 * row + width)]);
+  }
+  return found;
+}
+
+/** The codewords by majority of the headers; null if too few agree. */
+function readHeader(key: Uint8Array, words: TaggedWords, width: number): Codewords | null {
+  const votes = new Uint32Array(1 << HEADER_BITS);
+  for (const [number] of readPackets(key, words, width)) if (number < votes.length) votes[number]++;
+  const header = votes.reduce((best, each, value) => (each > votes[best] ? value : best), 0);
+  if (!(votes[header] >= AGREEING_HEADERS && header > 0)) return null;
+  const count = Math.ceil(header / MAX_DATA);
+  const k = Math.ceil(header / count);
+  let n = k;
+  while (n * LEFT - DEVIATIONS * Math.sqrt(n * LEFT * (1 - LEFT)) < k) n++;
+  return { count, n, k, width };
 }

@@ -1,6 +1,5 @@
 /** Cells: a few bytes of each Gaussian, recognisable with the key and noise without; see docs/byte-layout.md, "Cells". */
-import { ecb } from '@noble/ciphers/aes.js';
-import { expand } from '../../keys/keys.ts';
+import { blockwise, expand } from '../../keys/keys.ts';
 
 export const TAG_BYTES = 4;
 const BLOCK = 16; // bytes of a block of AES, and of an ID
@@ -19,9 +18,7 @@ export class CellCipher {
   private readonly streamKey: Uint8Array;
 
   constructor(secret: Uint8Array, label: string, readonly size: number) {
-    [this.tagKey, this.seedKey, this.streamKey] = ['tag', 'seed', 'stream'].map((use) =>
-      expand(secret, `${label}/${use}`, 32),
-    );
+    [this.tagKey, this.seedKey, this.streamKey] = ['tag', 'seed', 'stream'].map((use) => expand(secret, `${label}/${use}`));
   }
 
   /** The cells with a valid tag among the bytes from `offset` on of every row of `low` [N, width]. */
@@ -61,10 +58,10 @@ export class CellCipher {
   /** [N, 16] that begin with the tags of `messages` [N, stride]. */
   private states(ids: Uint8Array, messages: Uint8Array): Uint8Array {
     const { stride } = this;
-    let state = encrypted(this.tagKey, ids);
+    let state = blockwise(this.tagKey, ids);
     for (let block = 0; block < stride; block += BLOCK) {
       for (let at = 0; at < state.length; at++) state[at] ^= messages[Math.floor(at / BLOCK) * stride + block + (at % BLOCK)];
-      state = encrypted(this.tagKey, state);
+      state = blockwise(this.tagKey, state);
     }
     return state;
   }
@@ -78,11 +75,11 @@ export class CellCipher {
       for (let at = 0; at < TAG_BYTES; at++) seeds[cell * BLOCK + at] ^= cells[cell * width + at];
       seeds[cell * BLOCK + TAG_BYTES] ^= slot;
     }
-    seeds = encrypted(this.seedKey, seeds);
+    seeds = blockwise(this.seedKey, seeds);
     for (let start = 0; start < size; start += BLOCK) {
       const counted = seeds.slice();
       for (let cell = 0; cell < count; cell++) counted[(cell + 1) * BLOCK - 1] ^= start / BLOCK;
-      const stream = encrypted(this.streamKey, counted);
+      const stream = blockwise(this.streamKey, counted);
       const end = Math.min(BLOCK, size - start);
       for (let cell = 0; cell < count; cell++) {
         for (let at = 0; at < end; at++) found[cell * size + start + at] = stream[cell * BLOCK + at];
@@ -90,9 +87,4 @@ export class CellCipher {
     }
     return found;
   }
-}
-
-/** Every 16 bytes through AES-256: a permutation of blocks, not a mode of operation. */
-function encrypted(key: Uint8Array, blocks: Uint8Array): Uint8Array {
-  return blocks.length ? ecb(key, { disablePadding: true }).encrypt(blocks) : blocks;
 }

@@ -15,7 +15,7 @@ const [SCALE_LIMIT, MIN_RANGE] = [20, 1e-5];
 const AXES = [0, 1, 2];
 
 /** Levels, and a mask of the Gaussians that are not exact decodings: they carry nothing. */
-export interface Decoded {
+interface Decoded {
   readonly levels: Levels;
   readonly silent: Uint8Array; // [N]
 }

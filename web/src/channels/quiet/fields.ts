@@ -9,7 +9,9 @@ import { sha256 } from '@noble/hashes/sha2.js';
 import { ascii, joined } from '../../core/bytes.ts';
 import { highProduct, runs, sortingOrder, type Words } from '../../core/words.ts';
 import { byRow, type OfAxis } from '../../files/coded.ts';
-import { CHUNK, type CompressedPlyCodes, rotationPart as pliedPart, VECTOR, vectorPart } from '../../files/compressed_ply.ts';
+import {
+  CHUNK, type CompressedPlyCodes, rotationPart as pliedPart, VECTOR, vectorPart,
+} from '../../files/compressed_ply.ts';
 import type { Codes } from '../../files/models.ts';
 import { FINEST, LARGEST, type SogCodes } from '../../files/sog.ts';
 import { rotationPart, type SpzCodes } from '../../files/spz.ts';

@@ -1,24 +1,22 @@
 /**
- * Reads the low bits of a model, or the codes of a file, with a key; counterpart of `keyss.channels.quiet.reading`.
+ * Reads the low bits of a model, or the codes of a file, with a key; counterpart of `keyss.channels.quiet.reading` and
+ * `parameters` (docs/byte-layout.md, "Parameters").
  *
  * A wrong key makes the same passes over all cells as a right one, and all salts are always tried, so the time taken
  * reveals next to nothing.
  */
-import { ascii, bytesKey, mostFrequent, rowsOf } from '../../core/bytes.ts';
-import { damaged, tooMuchLost } from '../../core/errors.ts';
+import { ascii, bytesKey, joined, mostFrequent, rowsOf, viewOf } from '../../core/bytes.ts';
+import { damaged, otherVersion, tooMuchLost } from '../../core/errors.ts';
 import { type Gaussians, selected } from '../../core/gaussians.ts';
 import type { ReadModel } from '../../files/models.ts';
-import { decrypted, type Derive, expand } from '../../keys/keys.ts';
-import { here } from '../../keys/pool.ts';
+import { decrypted, type Derive, expand, here } from '../../keys/keys.ts';
 import type { Content, Reader } from '../content.ts';
-import { decoded } from '../reed_solomon.ts';
+import { type Codewords, decoded } from '../reed_solomon.ts';
 import { foreign } from '../sketch.ts';
-import { fieldsOf, gaussianIds, ID_BYTES, lowBits, lowWidth } from './bits.ts';
+import { fieldsOf, gaussianIds, ID_BYTES, lowBits, lowWidth, saltOf, salts } from './bits.ts';
 import { type Cell, CellCipher, TAG_BYTES } from './cells.ts';
 import { decodedFrom } from './decoded.ts';
 import { lastBits, type Levels, levelsOf, modelHash } from './fields.ts';
-import { NUMBER_BYTES, type Parameters, SKETCH_BYTES, unpackCodewords, unpackParameters } from './parameters.ts';
-import { saltOf, salts } from './salts.ts';
 import { BLOCK_BYTES, readBlocks } from './wet_paper.ts';
 
 const ASSOCIATED = ascii('keyss/v1/quiet');
@@ -88,7 +86,7 @@ export class QuietReader implements Reader {
     // Other workers derive the next keys while this one reads cells.
     const masters = this.salts.slice(0, this.derivations).map((salt) => derive(key, salt));
     for (const each of masters) {
-      secret = new Uint8Array(expand(await each, 'quiet/key', 32));
+      secret = new Uint8Array(expand(await each, 'quiet/key'));
       if (!this.widths.length) continue;
       const cells = this.cells(new CellCipher(secret, 'key', DATA_KEY_BYTES));
       const best = mostFrequent(cells.map(({ data }) => bytesKey(data)));
@@ -104,7 +102,7 @@ export class QuietReader implements Reader {
       }
     }
     if (dataKeys.length === 0 && this.widths.length) {
-      const none = expand(secret, 'quiet/none', DATA_KEY_BYTES);
+      const none = expand(secret, 'quiet/none').slice(0, DATA_KEY_BYTES);
       for (const width of this.widths) this.parts(none, width);
       this.dummyPasses(none, this.width);
     }
@@ -139,7 +137,7 @@ export class QuietReader implements Reader {
   }
 
   private async payload(dataKey: Uint8Array, { method }: Parameters, encrypted: Uint8Array): Promise<Content> {
-    const data = await decrypted(expand(dataKey, 'payload-key', 32), encrypted, ASSOCIATED);
+    const data = await decrypted(expand(dataKey, 'payload-key'), encrypted, ASSOCIATED);
     return { service: 'payload', method, data };
   }
 
@@ -176,4 +174,62 @@ function uniqueRows(ids: Uint8Array, low: Uint8Array, width: number): number[] {
     seen.add(all);
   }
   return rows;
+}
+
+const VERSION = 5;
+const PREFIX_BYTES = 30;
+const SKETCH_BYTES = 32;
+const NUMBERS = 17; // offset of cells, bytes of a record and of the header, Gaussians, records
+const MAX_CELLS = 4;
+const MAX_HEADER_BYTES = 4096;
+const [MAX_LENGTH, MAX_CHUNKS] = [1 << 13, 1 << 24]; // chunks of one codeword, of all
+const NUMBER_BYTES = 3; // size of a chunk's number
+
+/** Parameters of a secret: `count` records and copies, `cells` per carrier. */
+interface Parameters {
+  readonly isPayload: boolean; // records are numbered chunks of a payload
+  readonly method: string;
+  readonly cells: number;
+  readonly recordBytes: number;
+  readonly gaussians: number; // size of the published model
+  readonly count: number;
+  readonly header: Uint8Array;
+  readonly sketch: Uint8Array; // empty in blocks
+}
+
+/** Parameters from decrypted parts in any order; `sketched`: bytes of the sketch. Raises InputError. */
+function unpackParameters(parts: Uint8Array[], sketched: number): Parameters {
+  const numbered = new Map(parts.map((part) => [part[0], part.subarray(1)]));
+  const prefix = firstBytes(numbered, PREFIX_BYTES);
+  const [version, service] = prefix;
+  if (version !== VERSION) throw otherVersion();
+  const [cells, view] = [prefix[NUMBERS], viewOf(prefix)];
+  const [recordBytes, length] = [view.getUint16(NUMBERS + 1, true), view.getUint16(NUMBERS + 3, true)];
+  const [gaussians, count] = [view.getUint32(NUMBERS + 5, true), view.getUint32(NUMBERS + 9, true)];
+  if (service < 1 || service > 2 || cells < 1 || cells > MAX_CELLS || length > MAX_HEADER_BYTES) throw damaged();
+  const method = bytesKey(prefix.subarray(2, NUMBERS)).replace(/\0+$/, '');
+  const rest = firstBytes(numbered, PREFIX_BYTES + sketched + length).subarray(PREFIX_BYTES);
+  const [sketch, header] = [rest.subarray(0, sketched), rest.subarray(sketched)];
+  return { isPayload: service === 1, method, cells, recordBytes, gaussians, count, header, sketch };
+}
+
+/** Bytes of the encrypted payload, and its codewords, from the header of a payload. Raises InputError. */
+function unpackCodewords({ header, recordBytes }: Parameters): [number, Codewords] {
+  if (header.length !== 12) throw damaged();
+  const view = viewOf(header);
+  const [size, count] = [view.getUint32(0, true), view.getUint32(4, true)];
+  const [n, k, width] = [view.getUint16(8, true), view.getUint16(10, true), recordBytes - NUMBER_BYTES];
+  const possible = count >= 1 && count * n <= MAX_CHUNKS && k >= 1 && k <= n && n <= MAX_LENGTH && width % 2 === 0;
+  if (!possible || size < 1 || size > count * k * width) throw damaged();
+  return [size, { count, n, k, width }];
+}
+
+function firstBytes(parts: Map<number, Uint8Array>, length: number): Uint8Array {
+  let data = new Uint8Array(0);
+  for (let number = 0; data.length < length; number++) {
+    const part = parts.get(number);
+    if (part === undefined) throw tooMuchLost();
+    data = joined(data, part) as Uint8Array<ArrayBuffer>;
+  }
+  return data.slice(0, length);
 }
