@@ -24,6 +24,7 @@ export interface Answer {
   readonly leftOut?: number; // Gaussians dropped from the file
   readonly foreign?: number; // Gaussians added to or changed in the published file
   readonly file?: HiddenFile;
+  readonly elsewhere?: boolean; // only `keyss reveal` opens the content
   readonly error?: string; // one sentence
   readonly stopped?: boolean; // the search was cancelled
   readonly progress?: number; // 0 to 1: an interim message, the same for every key
@@ -59,10 +60,10 @@ async function unlock(id: number, key: string, thorough: boolean): Promise<void>
   searched = key;
   const content = reader ? await reader.open(key, counted(id, reader.derivations)) : null;
   answer({ id, progress: 1 }); // before decoding, which only right keys reach
-  const model = content && stego && secretOf(content, stego);
-  const foreign = content?.foreign;
+  if (!content || !stego) return answer({ id });
+  const [file, model, { foreign }] = [fileOf(content), secretOf(content, stego), content];
   if (model) answer({ id, model, foreign }, buffersOf(model));
-  else answer({ id, file: (content && fileOf(content)) ?? undefined, foreign });
+  else answer(file ? { id, file, foreign } : { id, elsewhere: true });
 }
 
 /** `derive` that reports progress over `all` derivations. */

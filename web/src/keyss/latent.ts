@@ -4,11 +4,10 @@ import { fieldsOf, gaussianIds, ID_BYTES } from '../channels/quiet/bits.ts';
 import { CellCipher } from '../channels/quiet/cells.ts';
 import { bytesKey, joined } from '../core/bytes.ts';
 import { changed, damaged } from '../core/errors.ts';
-import { coefficients, emptyGaussians, where, withDegree } from '../core/gaussians.ts';
+import { coefficients, emptyGaussians, type Gaussians, where, withDegree } from '../core/gaussians.ts';
 import { wordsOf } from '../core/words.ts';
 import { expand } from '../keys/keys.ts';
-import type { Decode, Shape } from './decoder.ts';
-import type { Tensors } from './safetensors.ts';
+import { integerOf, objectOf, type Tensors } from './safetensors.ts';
 
 const KEPT = 3 * coefficients(1); // numbers of the harmonics that hold nothing
 const [OWN, LEAST_KEPT] = [13, 2]; // latents without the code; directions that hold none
@@ -17,13 +16,22 @@ const [SHARE, GUARD, ROUNDING] = [4, 1 / 256, 1e-10];
 const [NONCE_BYTES, ROWS] = [16, 1 << 14]; // rows at a time
 const MAX_EXPONENT = 80; // of a spread
 const RANKS = [0, ...Array.from({ length: 31 }, (_, at) => 1 / (1 + Math.exp(7 - (14 * at) / 30))), 1];
+const MAX_KEY = 4096; // numbers
+const SHAPE = ['kind', 'mask', 'hidden', 'branch', 'sh_degree', 'key_size', 'released', 'secrets', 'secret'];
 
-/** Raises InputError for other tensors than the shape needs; decoding raises it where no row is the secret's. */
-export function latentOf({ shDegree, secrets, secret }: Shape, tensors: Tensors, key: Float32Array): Decode {
+/**
+ * A function that maps a model to the Gaussians of a secret. Raises InputError for other tensors than the `shape` needs, as does
+ * the function where no row is the secret's.
+ */
+export function latentOf(shape: unknown, tensors: Tensors): (model: Gaussians) => Gaussians {
+  const described = objectOf(shape, ...SHAPE);
+  const [shDegree, secrets] = [integerOf(described.sh_degree, 0, 3), integerOf(described.secrets, 1, 9)];
+  const secret = integerOf(described.secret, 0, secrets - 1);
+  const key = tensors.take('key', integerOf(described.key_size, 1, MAX_KEY));
   const harmonics = 3 * coefficients(shDegree);
   const high = Math.max(0, harmonics - KEPT);
   const count = Math.min(secrets > 1 ? TWO : ONE, Math.floor((high - LEAST_KEPT) / secrets));
-  if (count < OWN || secret >= secrets) throw damaged();
+  if (count < OWN) throw damaged();
   const [written, first] = [count * secrets, count * secret];
   const directions = tensors.take('decoder.place.directions', high, written);
   const slopes = tensors.take('decoder.place.slopes', 3, written);
@@ -63,8 +71,8 @@ export function latentOf({ shDegree, secrets, secret }: Shape, tensors: Tensors,
     return true;
   }
 
-  return (model) => {
-    const bare = withDegree(model, 0);
+  return (published) => {
+    const [model, bare] = [withDegree(published, shDegree), withDegree(published, 0)];
     const ids = gaussianIds(bare, fieldsOf(bare));
     const [found, seen] = [emptyGaussians(model.count, shDegree), new Set<string>()];
     let pads: Uint32Array = new Uint32Array(0);

@@ -1,37 +1,35 @@
 /** A secret of the method keyss; `keyss.methods.keyss.secret` in Python. */
 import { ascii } from '../core/bytes.ts';
 import { changed, damaged, otherVersion } from '../core/errors.ts';
-import { compensated, type Gaussians, opacity, where, withDegree } from '../core/gaussians.ts';
+import { compensated, type Gaussians, opacity, where } from '../core/gaussians.ts';
 import { inverse, isSimilarity, moved, type Similarity } from '../core/similarity.ts';
-import { networkOf, shapeOf } from './decoder.ts';
 import { latentOf } from './latent.ts';
 import { integerOf, numbersOf, objectOf, parsed, Tensors } from './safetensors.ts';
 
 const [FORMAT, VERSION] = ['keyss-secret', 10];
-const DECODERS = new Map<unknown, typeof networkOf>([['mlp', networkOf], ['latent', latentOf]]);
 const [MAX_ANCHORS, ANCHORS_NEEDED, ANCHOR_TOLERANCE] = [64, 0.25, 1e-6];
 const [MAX_COUNT, LEAST_LEFT] = [2 ** 31, 1e-6]; // of Gaussians; share of the visibility
 const DRAWN_OPACITY = Math.fround(1 / 255);
 const APPENDED_OPACITY = 1.00001 / 255;
 const APPENDED_LOGIT = Math.fround(Math.log(APPENDED_OPACITY / (1 - APPENDED_OPACITY)));
 
-/** The Gaussians that a payload reveals of a model. Raises InputError. */
-export function decodeKeyss(payload: Uint8Array, stego: Gaussians): Gaussians {
+/** The Gaussians that a payload reveals of a model; null for designs other than `latent`. Raises InputError. */
+export function decodeKeyss(payload: Uint8Array, stego: Gaussians): Gaussians | null {
   const tensors = Tensors.of(payload);
   const header = objectOf(parsed(ascii(String(tensors.metadata.keyss))));
   if (header.format !== FORMAT) throw damaged();
   if (header.version !== VERSION) throw otherVersion();
   objectOf(header, 'format', 'version', 'shape', 'frame', 'count', 'visibility');
-  const [shape, frame, [visibility]] = [shapeOf(header.shape), frameOf(header.frame), numbersOf([header.visibility], 1)];
+  if (objectOf(header.shape).kind !== 'latent') return null;
+  const [frame, [visibility]] = [frameOf(header.frame), numbersOf([header.visibility], 1)];
   integerOf(header.count, 0, MAX_COUNT);
   const anchors = tensors.take('anchors', integerOf(tensors.shapeOf('anchors')[0], 1, MAX_ANCHORS), 3);
-  const decode = DECODERS.get(shape.kind)?.(shape, tensors, tensors.take('key', shape.keySize));
-  if (!decode || visibility < 0 || !tensors.done) throw damaged();
+  const decode = latentOf(header.shape, tensors);
+  if (visibility < 0 || !tensors.done) throw damaged();
   checkAnchors(anchors, stego);
   // What was appended came after the training.
   const own = where(stego, (row) => stego.opacityLogits[row] !== APPENDED_LOGIT);
-  const decoded = decode(withDegree(own, shape.shDegree));
-  return moved(inverse(frame), drawn(decoded, visibility));
+  return moved(inverse(frame), drawn(decode(own), visibility));
 }
 
 /** Without what is never drawn, unless that is all, making up for what was lost of the sum of opacities. */

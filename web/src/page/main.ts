@@ -142,13 +142,14 @@ class Page {
       this.showSearch(search);
       this.say(search === 'quick' ? 'Trying the key …' : `${said} Searching more thoroughly …`);
       delete page.main.dataset.picture;
-      const { model, file, foreign, stopped } = await this.opener.ask({ key, thorough: search === 'thorough' });
+      const { model, file, elsewhere, foreign, stopped } = await this.opener.ask({ key, thorough: search === 'thorough' });
       if (own !== this.work) return;
       this.showSearch('');
       if (search === 'quick') notifyParent({ event: 'key-tried' });
       if (file || model) notifyParent({ event: 'opened', kind: file ? 'file' : 'model' });
       if (file) said += this.offer(file);
       if (model) said += this.reveal(model);
+      if (elsewhere) said += ' It reveals a model that only keyss reveal opens.';
       if (foreign) said += ` About ${count(foreign)} Gaussians of the file were added or changed: it may not be its secret.`;
       this.say(stopped ? `${said} Search stopped.` : said);
       await this.settle();

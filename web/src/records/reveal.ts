@@ -21,7 +21,7 @@ export function fileOf(content: Content): HiddenFile | null {
   return { name: new TextDecoder().decode(content.data.subarray(1, 1 + size)), bytes: content.data.slice(1 + size) };
 }
 
-/** The model, found in `stego`; null if the content is not a model. Raises InputError for damage. */
+/** The model, found in `stego`; null if the content is none, or none that is opened here. Raises InputError for damage. */
 export function secretOf(content: Content, stego: Gaussians): Gaussians | null {
   if (content.service === 'payload') {
     if (content.method === KEYSS) return decodeKeyss(content.data, stego);
