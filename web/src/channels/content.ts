@@ -3,26 +3,23 @@ import { bytesKey } from '../core/bytes.ts';
 import { damaged } from '../core/errors.ts';
 import type { Derive } from '../keys/keys.ts';
 
-interface Opened {
-  readonly foreign?: number; // Gaussians added to or changed in the published file
-}
+/** Records of one size, each read on its own, or bytes that are read completely or not at all. */
+export type Content = Records | Payload;
 
-/** Records of one size, each read on its own. */
-export interface Records extends Opened {
+interface Records {
   readonly service: 'records';
   readonly method: string;
   readonly header: Uint8Array;
   readonly records: Uint8Array[]; // in carrier order
+  readonly foreign?: number; // Gaussians added to or changed in the published file
 }
 
-/** Bytes that are read completely or not at all. */
-export interface Payload extends Opened {
+export interface Payload {
   readonly service: 'payload';
   readonly method: string;
   readonly data: Uint8Array;
+  readonly foreign?: number;
 }
-
-export type Content = Records | Payload;
 
 /** A channel of one model, prepared for any number of keys. */
 export interface Reader {

@@ -1,16 +1,18 @@
-/** Reader of appended Gaussians (docs/channels.md); counterpart of `keyss.channels.appended.channel` and `packets`. */
+/**
+ * Reader of appended Gaussians (docs/channels.md): words of 84 bits, read after a format has rounded them, and packets in words;
+ * counterpart of `keyss.channels.appended.channel`, `words` and `packets`.
+ */
 import { ascii, rowsOf, viewOf } from '../../core/bytes.ts';
 import { damaged } from '../../core/errors.ts';
-import type { Gaussians } from '../../core/gaussians.ts';
+import { COLUMNS, type Gaussians, opacity, where, withDegree } from '../../core/gaussians.ts';
+import { moved, type Similarity } from '../../core/similarity.ts';
+import type { Words } from '../../core/words.ts';
 import { blockwise, decrypted, type Derive, expand, here } from '../../keys/keys.ts';
 import { carriersOf } from '../colours/carriers.ts';
 import { type Payload, type Reader, unpackPayload } from '../content.ts';
 import { type Codewords, decoded } from '../reed_solomon.ts';
 import { foreign } from '../sketch.ts';
-import {
-  allShifts, candidates, coloursOf, inOwnFrame, invariantsOf, likelyShifts, scalesAt, scaleSteps,
-} from './lattice.ts';
-import { type Found, LEAST, ONE_IN, pilotsOf, readPilots } from './pilots.ts';
+import { type Found, LEAST, ONE_IN, pilotsOf, POSITION_BITS, readPilots } from './pilots.ts';
 
 // Gaussians sampled for pilots; number of lattice offsets tried, with at least this many standard deviations more pilots
 // than by chance.
@@ -22,15 +24,14 @@ const ASSOCIATED = ascii('keyss/v1/appended/data');
 export class AppendedReader implements Reader {
   readonly derivations = 1;
 
-  private constructor(
-    readonly salt: Uint8Array, private readonly words: TaggedWords, private readonly ids: Uint8Array,
-  ) {}
+  private constructor(readonly salt: Uint8Array, private readonly words: Uint8Array, private readonly ids: Uint8Array) {}
 
   /** Null if there are none, or if their frame cannot be found. */
   static of(model: Gaussians): AppendedReader | null {
     const faint = candidates(model);
     if (faint.count < LEAST / 4) return null;
-    const [colours, steps] = [coloursOf(faint), scaleSteps(faint)];
+    const colours = Uint8Array.from(faint.sh, (each) => nearest(each / COLOUR_STEP + 2 ** (COLOUR_BITS - 1) - 0.5, COLOUR_BITS));
+    const steps = Float64Array.from(faint.logScales, (each) => each / SCALE_STEP); // of their lattice, which lies anywhere
     for (const shifts of [likelyShifts, shiftsWithPilots]) {
       let best: { found: Found; scales: Uint8Array } | null = null;
       for (const shift of shifts(steps, colours)) {
@@ -88,14 +89,8 @@ const MAX_DATA = 5895; // packets per codeword
 const [LEFT, DEVIATIONS] = [0.74, 4.2]; // expected share of surviving packets, and the margin
 const AGREEING_HEADERS = 12; // fewer agree by chance among a million words
 
-/** N words: data bytes, then a tag. */
-interface TaggedWords {
-  readonly count: number;
-  readonly bytes: Uint8Array; // [N, 11]; the last four bits are zero
-}
-
-/** Words of colours, scales [N, 3] and positions and turns [N, 6]. */
-function wordsOfPoints(colours: Uint8Array, scales: Uint8Array, others: Uint16Array): TaggedWords {
+/** [N, WORD_BYTES] words of colours, scales [N, 3] and positions and turns [N, 6]; the last four bits are zero. */
+function wordsOfPoints(colours: Uint8Array, scales: Uint8Array, others: Uint16Array): Uint8Array {
   const count = colours.length / 3;
   const bytes = new Uint8Array(WORD_BYTES * count);
   const view = new DataView(bytes.buffer);
@@ -110,12 +105,12 @@ function wordsOfPoints(colours: Uint8Array, scales: Uint8Array, others: Uint16Ar
     view.setUint16(at + 8, ((z & 31) << 11) | (i << 6) | (j << 1) | (k >> 4));
     bytes[at + 10] = (k & 15) << 4;
   }
-  return { count, bytes };
+  return bytes;
 }
 
-/** [number, data] of each word, as if all were packets. */
-function readPackets(key: Uint8Array, { count, bytes }: TaggedWords, width: number): [number, Uint8Array][] {
-  const found: [number, Uint8Array][] = [];
+/** [number, data] of each word, data bytes and then a tag, as if all were packets. */
+function readPackets(key: Uint8Array, bytes: Uint8Array, width: number): [number, Uint8Array][] {
+  const [count, found] = [bytes.length / WORD_BYTES, [] as [number, Uint8Array][]];
   const blocks = new Uint8Array(16 * count);
   for (let row = 0; row < count; row++) blocks.set(bytes.subarray(WORD_BYTES * row, WORD_BYTES * row + width), 16 * row);
   const encrypted = blockwise(key, blocks);
@@ -130,7 +125,7 @@ function readPackets(key: Uint8Array, { count, bytes }: TaggedWords, width: numb
 }
 
 /** The codewords by majority of the headers; null if too few agree. */
-function readHeader(key: Uint8Array, words: TaggedWords, width: number): Codewords | null {
+function readHeader(key: Uint8Array, words: Uint8Array, width: number): Codewords | null {
   const votes = new Uint32Array(1 << HEADER_BITS);
   for (const [number] of readPackets(key, words, width)) if (number < votes.length) votes[number]++;
   const header = votes.reduce((best, each, value) => (each > votes[best] ? value : best), 0);
@@ -140,4 +135,100 @@ function readHeader(key: Uint8Array, words: TaggedWords, width: number): Codewor
   let n = k;
   while (n * LEFT - DEVIATIONS * Math.sqrt(n * LEFT * (1 - LEFT)) < k) n++;
   return { count, n, k, width };
+}
+
+const [COLOUR_BITS, SCALE_BITS, TURN_BITS] = [7, 6, 5];
+const [FAINTEST, STRONGEST] = [0.4 / 255, 1.6 / 255]; // after rounding
+const [COLOUR_STEP, SCALE_STEP] = [0.0275, 0.08];
+const TURNS_REACH = (256 / 511) * Math.SQRT1_2; // bound of x, y and z, so that w is the largest
+const [FARTHEST, MAX_SHIFTS] = [1 << 12, 500]; // steps of log scales: range, and number of offsets tried
+
+/** The Gaussians as faint as appended ones, without harmonics. */
+function candidates(model: Gaussians): Gaussians {
+  const faint = where(model, (row) => {
+    const own = opacity(model.opacityLogits[row]);
+    return own > FAINTEST && own < STRONGEST && COLUMNS.every((column) => {
+      const width = model[column].length / model.count;
+      return model[column].subarray(width * row, width * (row + 1)).every(Number.isFinite);
+    });
+  });
+  return withDegree(faint, 0);
+}
+
+/** [N, 3] the nearest lattice points of log scales, of a lattice that begins at `shift`. */
+function scalesAt(steps: Float64Array, shift: number): Uint8Array {
+  return Uint8Array.from(steps, (each) => nearest(each - shift, SCALE_BITS));
+}
+
+/** Where the lattice may begin if most of the log scales lie on it, the likeliest first. */
+function likelyShifts(steps: Float64Array): number[] {
+  let [cosines, sines] = [0, 0];
+  for (const each of steps) {
+    cosines += Math.cos(2 * Math.PI * each);
+    sines += Math.sin(2 * Math.PI * each);
+  }
+  const phase = Math.atan2(sines, cosines) / (2 * Math.PI);
+  const counts = new Uint32Array(2 * FARTHEST + 1);
+  for (const each of steps) counts[Math.max(-FARTHEST, Math.min(FARTHEST, Math.round(each - phase))) + FARTHEST]++;
+  let [inside, most, best] = [0, -1, 0]; // of the levels up to `last`
+  for (let last = 0; last < counts.length + 2 ** SCALE_BITS - 1; last++) {
+    inside += (counts[last] ?? 0) - (counts[last - 2 ** SCALE_BITS] ?? 0);
+    if (inside > most) [most, best] = [inside, last];
+  }
+  const first = best - 2 ** SCALE_BITS + 1 - FARTHEST;
+  return [0, 1, -1, 2, -2].map((each) => first + phase + each);
+}
+
+/** Possible offsets of the lattice if only some log scales lie on it. */
+function allShifts(steps: Float64Array): number[] {
+  const sorted = steps.map((each) => Math.max(-FARTHEST, Math.min(FARTHEST, each))).sort();
+  const [low, high] = [0.01, 0.99].map((share) => sorted[Math.round(share * (sorted.length - 1))]);
+  const end = Math.max(Math.min(high - 2 ** (SCALE_BITS - 2), low + MAX_SHIFTS), low);
+  const found: number[] = [];
+  for (let shift = low - 2 ** (SCALE_BITS - 1); shift < end; shift += 0.25) found.push(shift);
+  return found;
+}
+
+/** [N] the first 39 bits of words, colours and scales [N, 3]: invariant under similarity transforms. */
+function invariantsOf(colours: Uint8Array, scales: Uint8Array): Words {
+  const found = new Uint32Array((2 * colours.length) / 3);
+  for (let row = 0; row < colours.length / 3; row++) {
+    const at = 3 * row;
+    const colour = (colours[at] << 14) | (colours[at + 1] << 7) | colours[at + 2]; // 21 bits
+    const scale = (scales[at] << 12) | (scales[at + 1] << 6) | scales[at + 2]; // 18 bits
+    found[2 * row] = (colour << 18) | scale;
+    found[2 * row + 1] = colour >>> 14;
+  }
+  return found;
+}
+
+/** [N, 6] nearest lattice points of positions and rotations; `toOwn`: from the world to the own frame. */
+function inOwnFrame(faint: Gaussians, toOwn: Similarity): Uint16Array {
+  const found = new Uint16Array(6 * faint.count);
+  const { means, quats } = moved(toOwn, faint);
+  for (let row = 0; row < faint.count; row++) {
+    for (let axis = 0; axis < 3; axis++) {
+      found[6 * row + axis] = nearest(means[3 * row + axis] * 2 ** POSITION_BITS - 0.5, POSITION_BITS);
+    }
+    const turned = [...quats.subarray(4 * row, 4 * row + 4)];
+    withLargestW(turned).slice(1).forEach((part, axis) => {
+      found[6 * row + 3 + axis] = nearest(((part + TURNS_REACH) / (2 * TURNS_REACH)) * 2 ** TURN_BITS - 0.5, TURN_BITS);
+    });
+  }
+  return found;
+}
+
+const ORDER = [[0, 1, 2, 3], [1, 0, 3, 2], [2, 3, 0, 1], [3, 2, 1, 0]]; // q, q i, q j, q k
+const SIGNS = [[1, 1, 1, 1], [-1, 1, 1, -1], [-1, -1, 1, 1], [-1, 1, -1, 1]];
+
+/** The unit quaternion wxyz of the same ellipsoid with w the largest component. */
+function withLargestW(quat: number[]): number[] {
+  const length = Math.max(1e-30, Math.hypot(...quat));
+  const largest = [0, 1, 2, 3].reduce((a, b) => (Math.abs(quat[b]) > Math.abs(quat[a]) ? b : a));
+  const found = ORDER[largest].map((part, at) => (quat[part] / length) * SIGNS[largest][at]);
+  return found[0] < 0 ? found.map((each) => -each) : found;
+}
+
+function nearest(steps: number, bits: number): number {
+  return Math.max(0, Math.min(2 ** bits - 1, Math.round(steps)));
 }

@@ -3,9 +3,9 @@ import { mostFrequent, rowsOf } from '../../core/bytes.ts';
 import { fittedRotation, movedPoint, rotationOf, type Similarity } from '../../core/similarity.ts';
 import { mix, type Words } from '../../core/words.ts';
 import { SALT_BYTES } from '../../keys/keys.ts';
-import { POSITION_BITS } from './lattice.ts';
 
 export const LEAST = 128; // pilots per model
+export const POSITION_BITS = 10; // per axis of the own frame
 export const ONE_IN = 64; // words are pilots by chance
 const [PUBLIC_LOW, PUBLIC_HIGH] = [0x73617070, 0x6b657973]; // domain separation of the hash
 const PARTS = SALT_BYTES / 2;

@@ -7,7 +7,7 @@
  */
 import { sha256 } from '@noble/hashes/sha2.js';
 import { ascii, joined } from '../../core/bytes.ts';
-import { highProduct, runs, sortingOrder, type Words } from '../../core/words.ts';
+import { highProduct, multiplicities, sortingOrder, type Words } from '../../core/words.ts';
 import { byRow, type OfAxis } from '../../files/coded.ts';
 import {
   CHUNK, type CompressedPlyCodes, rotationPart as pliedPart, VECTOR, vectorPart,
@@ -143,8 +143,8 @@ export function modelHash({ unwritten, rows }: Levels): Uint8Array {
 /** Rows in the order of their hashes, without rows that share one: they carry nothing. */
 function unique(words: Words): Uint32Array {
   const order = sortingOrder(words);
-  const starts = runs(words, order);
-  return starts.filter((start, run) => starts[run + 1] === start + 1).map((start) => order[start]);
+  const counts = multiplicities(words, order);
+  return order.filter((row) => counts[row] === 1);
 }
 
 /** [N] hashes of the numbers of each row; counterpart of `row_hashes`. */
