@@ -1,11 +1,13 @@
 /** The page: a published model, a field for a key, and what the key opens. */
+import WORKER from 'source:../worker.ts';
 import type { Gaussians } from '../core/gaussians.ts';
 import { writePly } from '../files/ply.ts';
+import { startWorker } from '../keys/keys.ts';
 import type { HiddenFile } from '../records/reveal.ts';
+import type { Answer, Question } from '../worker.ts';
 import { Controls } from './controls.ts';
 import { givenModel, notifyParent, params } from './embedding.ts';
 import { inspected, listenToInspection } from './inspection.ts';
-import { Opener } from './opener.ts';
 import { count, page, placeBorder, preparePanel, save, showKey } from './panel.ts';
 import {
   add, axes, FIELD_OF_VIEW, firstPose, pick, type Pose, poseOfHash, poseToHash, transferPose, upName, UPS,
@@ -18,6 +20,39 @@ const MAX_BYTES = 2 ** 31;
 const HAS_SCREEN_KEYBOARD = window.matchMedia('(pointer: coarse)'); // which covers the picture
 const NO_WEBGL = "Your browser doesn't support WebGL 2, which is needed to show the model.";
 const INTERRUPTED = 'The browser interrupted graphics. The picture comes back by itself; if not, reload the page.';
+
+/** Passes questions to the worker that reads files and tries keys, one at a time. */
+class Opener {
+  private readonly worker = startWorker(WORKER);
+  private end = (_: Answer): void => undefined; // answers the pending question
+
+  /** `onProgress` receives the progress of an attempt, 0 to 1, at the same times for every key. */
+  constructor(private readonly onProgress: (share: number) => void) {
+    this.worker.onerror = () => this.end({ error: 'This file cannot be read.' });
+  }
+
+  /** The model in a file, or what a key opens. `transfer`: memory to hand over to the worker. */
+  ask(question: Question, transfer: Transferable[] = []): Promise<Answer> {
+    return new Promise((resolve) => {
+      const { port1, port2 } = new MessageChannel();
+      this.end = (answer) => {
+        port1.close();
+        resolve(answer);
+      };
+      port1.onmessage = ({ data }: MessageEvent<Answer>) => {
+        if (data.progress === undefined) this.end(data);
+        else this.onProgress(data.progress);
+      };
+      this.worker.postMessage(question, [port2, ...transfer]);
+    });
+  }
+
+  /** Cancels the pending question. */
+  stop(): void {
+    this.worker.postMessage({ stop: true } satisfies Question);
+    this.end({ stopped: true });
+  }
+}
 
 class Page {
   private name = 'model';

@@ -9,9 +9,8 @@ import { moved, type Similarity } from '../../core/similarity.ts';
 import type { Words } from '../../core/words.ts';
 import { blockwise, decrypted, type Derive, expand, here } from '../../keys/keys.ts';
 import { carriersOf } from '../colours/carriers.ts';
-import { type Payload, type Reader, unpackPayload } from '../content.ts';
+import { foreign, type Payload, type Reader, unpackPayload } from '../content.ts';
 import { type Codewords, decoded } from '../reed_solomon.ts';
-import { foreign } from '../sketch.ts';
 import { type Found, LEAST, ONE_IN, pilotsOf, POSITION_BITS, readPilots } from './pilots.ts';
 
 // Gaussians sampled for pilots; number of lattice offsets tried, with at least this many standard deviations more pilots

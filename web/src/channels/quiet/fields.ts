@@ -1,6 +1,6 @@
 /**
- * The integers of a quantised model that carry bits, how many bits each, and the order in which they are counted;
- * counterpart of `keyss.channels.quiet.fields` and `order`.
+ * The integers of a quantised model that carry bits, how many bits each, the order in which they are counted, and the messages
+ * of blocks of them; counterpart of `keyss.channels.quiet.fields`, `order` and `wet_paper`.
  *
  * The arithmetic gives the same result on every machine, in the same order of operations as in Python, without
  * logarithms: a reader must find the same numbers of bits as the writer.
@@ -15,6 +15,7 @@ import {
 import type { Codes } from '../../files/models.ts';
 import { FINEST, LARGEST, type SogCodes } from '../../files/sog.ts';
 import { rotationPart, type SpzCodes } from '../../files/spz.ts';
+import { streamWords } from '../../keys/keys.ts';
 
 const MAX_BITS = 10;
 const SHARE = -3; // log2 of the range of written positions, in sizes of the Gaussian
@@ -161,4 +162,38 @@ function hashes(count: number, numbers: (row: number) => number[]): Words {
     }
   }
   return words;
+}
+
+const BLOCK = 1024;
+export const BLOCK_BYTES = BLOCK / 8;
+const WORDS = BLOCK / 32;
+const PUBLIC = new Uint8Array(32); // the seed of order and matrix
+
+/**
+ * [B, BLOCK_BYTES] the messages of all blocks of `bits` (0 or 1), each padded with noise, by wet paper codes (Fridrich et al.
+ * 2005): a message is the product of its block with a public random matrix, modulo 2.
+ */
+export function readBlocks(bits: Uint8Array): Uint8Array {
+  const high = new Uint32Array(bits.length);
+  streamWords(PUBLIC, 'codes/order', 2 * bits.length, (word, at) => {
+    if (at & 1) high[at >>> 1] = word;
+  });
+  const [places, blocks] = [sortingOrder(high, 1), Math.floor(bits.length / BLOCK)];
+  const rows = new Uint32Array(BLOCK * WORDS);
+  streamWords(PUBLIC, 'codes/matrix', rows.length, (word, at) => (rows[at] = word));
+  const found = new Uint32Array(blocks * WORDS);
+  const own = new Uint32Array(WORDS);
+  for (let block = 0; block < blocks; block++) {
+    own.fill(0);
+    for (let at = 0; at < BLOCK; at++) own[at >> 5] |= bits[places[block * BLOCK + at]] << (at & 31);
+    for (let row = 0; row < BLOCK; row++) {
+      let sum = 0;
+      for (let word = 0, at = row * WORDS; word < WORDS; word++, at++) sum ^= own[word] & rows[at];
+      sum ^= sum >>> 16;
+      sum ^= sum >>> 8;
+      sum ^= sum >>> 4;
+      found[block * WORDS + (row >> 5)] |= ((0x6996 >>> (sum & 15)) & 1) << (row & 31);
+    }
+  }
+  return new Uint8Array(found.buffer);
 }

@@ -10,14 +10,12 @@ import { damaged, otherVersion, tooMuchLost } from '../../core/errors.ts';
 import { type Gaussians, selected } from '../../core/gaussians.ts';
 import type { ReadModel } from '../../files/models.ts';
 import { decrypted, type Derive, expand, here } from '../../keys/keys.ts';
-import type { Content, Reader } from '../content.ts';
+import { type Content, foreign, type Reader } from '../content.ts';
 import { type Codewords, decoded } from '../reed_solomon.ts';
-import { foreign } from '../sketch.ts';
 import { fieldsOf, gaussianIds, ID_BYTES, lowBits, lowWidth, saltOf, salts } from './bits.ts';
 import { type Cell, CellCipher, TAG_BYTES } from './cells.ts';
 import { decodedFrom } from './decoded.ts';
-import { lastBits, type Levels, levelsOf, modelHash } from './fields.ts';
-import { BLOCK_BYTES, readBlocks } from './wet_paper.ts';
+import { BLOCK_BYTES, lastBits, type Levels, levelsOf, modelHash, readBlocks } from './fields.ts';
 
 const ASSOCIATED = ascii('keyss/v1/quiet');
 const DATA_KEY_BYTES = 16;
