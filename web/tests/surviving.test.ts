@@ -103,12 +103,10 @@ test('wrong keys open nothing in colours, nor in models without them', async () 
   for (const count of [0, 1, 20]) {
     expect(await ColoursReader.of(selected(model, [...Array(count).keys()])).open(NOTE.key, quick)).toBeNull();
   }
-  const broken = { ...model, logScales: model.logScales.map((each, at) => (at % 5 ? each : NaN)) };
-  expect(await ColoursReader.of(broken).open(NOTE.key, quick)).toBeNull();
 });
 
 test('channels report their number of derivations', async () => {
-  for (const [file, channels] of Object.entries({ 'appended.ply': 3, 'colours.spz': 2, 'carried.ply': 2 })) {
+  for (const [file, channels] of Object.entries({ 'appended.ply': 2, 'colours.spz': 2, 'carried.ply': 2 })) {
     const prepared = preparedFor(await modelOf(file));
     const readers = [...prepared(false).readers, ...prepared(true).readers];
     expect(readers.length).toBe(channels);

@@ -4,7 +4,7 @@
  */
 import { ascii, rowsOf, viewOf } from '../../core/bytes.ts';
 import { damaged } from '../../core/errors.ts';
-import { COLUMNS, type Gaussians, opacity, where, withDegree } from '../../core/gaussians.ts';
+import { type Gaussians, opacity, where, withDegree } from '../../core/gaussians.ts';
 import { moved, type Similarity } from '../../core/similarity.ts';
 import type { Words } from '../../core/words.ts';
 import { blockwise, decrypted, type Derive, expand, here } from '../../keys/keys.ts';
@@ -146,10 +146,7 @@ const [FARTHEST, MAX_SHIFTS] = [1 << 12, 500]; // steps of log scales: range, an
 function candidates(model: Gaussians): Gaussians {
   const faint = where(model, (row) => {
     const own = opacity(model.opacityLogits[row]);
-    return own > FAINTEST && own < STRONGEST && COLUMNS.every((column) => {
-      const width = model[column].length / model.count;
-      return model[column].subarray(width * row, width * (row + 1)).every(Number.isFinite);
-    });
+    return own > FAINTEST && own < STRONGEST;
   });
   return withDegree(faint, 0);
 }

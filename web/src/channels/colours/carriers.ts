@@ -5,8 +5,8 @@ import { type Gaussians, opacity, where, withDegree } from '../../core/gaussians
 import { multiplicities, type Words, wordsOf } from '../../core/words.ts';
 import { blockwise, expand, SALT_BYTES } from '../../keys/keys.ts';
 
-export const [SCALE_STEPS, COLOUR_STEPS, OPACITY_STEPS] = [16, 38.25, 255]; // quantisation steps of 8-bit formats per unit
-export const [COLOUR_NOISE, OPACITY_NOISE] = [0.344, 1.02]; // maximum rounding error, in steps
+const [SCALE_STEPS, COLOUR_STEPS, OPACITY_STEPS] = [16, 38.25, 255]; // quantisation steps of 8-bit formats per unit
+const [COLOUR_NOISE, OPACITY_NOISE] = [0.344, 1.02]; // maximum rounding error, in steps
 const SCALE_NOISE = 0.144;
 const [RATIO_CELL, OPACITY_CELL, RED_CELL] = [4, 8, 3]; // steps
 const MIN_OPACITY = 2.5 / 255;
@@ -25,14 +25,10 @@ export interface Carriers {
   readonly idCounts: Float64Array; // [C] carriers with the same ID, itself included
 }
 
-/** The visible and finite Gaussians. `alignment`: offset of log scales, in steps, to undo a scaling of the model. */
+/** The visible Gaussians. `alignment`: offset of log scales, in steps, to undo a scaling of the model. */
 export function carriersOf(model: Gaussians, alignment = 0): Carriers {
   const bare = withDegree(model, 0);
-  const seen = where(bare, (row) => {
-    let sum = 0; // finite if all are
-    for (let axis = 0; axis < 3; axis++) sum += bare.logScales[3 * row + axis] + bare.sh[3 * row + axis];
-    return Number.isFinite(sum) && Math.fround(opacity(bare.opacityLogits[row])) > MIN_OPACITY;
-  });
+  const seen = where(bare, (row) => Math.fround(opacity(bare.opacityLogits[row])) > MIN_OPACITY);
   const [logScales, colours] = [Float64Array.from(seen.logScales), Float64Array.from(seen.sh)];
   const opacities = Float64Array.from(seen.opacityLogits, (logit) => Math.fround(opacity(logit)));
   const ids = new Int16Array(ID_VALUES * seen.count);

@@ -109,19 +109,17 @@ export function lowBits(fields: Fields): Uint8Array {
   return found;
 }
 
-export const SALTS = 12;
+const SALTS = 4; // tried
 const LABEL = ascii('keyss/v2/salt');
 const EQUAL_HARMONICS = 2; // pairs of one colour that make a Gaussian doubtful
 
-/** Up to 12 salts of 16 bytes, the likeliest first; `low` has rows of `size` bytes. */
+/** Up to 4 salts of 16 bytes, the likeliest first; `low` has rows of `size` bytes. */
 export function salts(fields: Fields, ids: Uint8Array, low: Uint8Array, size: number): Uint8Array[] {
   const ranks = new Uint16Array(fields.count);
   for (let row = 0; row < fields.count; row++) ranks[row] = rank(fields, row);
-  const compare = (a: number, b: number): number =>
-    ranks[a] - ranks[b] ||
-    compared(ids, a, b, ID_BYTES) ||
-    compared(low, a, b, size);
-  const order = Array.from(ranks.keys()).sort(compare);
+  const order = Array.from(ranks.keys()).sort((a, b) => {
+    return ranks[a] - ranks[b] || compared(ids, a, b, ID_BYTES) || compared(low, a, b, size);
+  });
   return order.slice(0, SALTS).map((row) =>
     saltOf(ids.subarray(row * ID_BYTES, (row + 1) * ID_BYTES), low.subarray(row * size, (row + 1) * size)),
   );
@@ -175,8 +173,7 @@ function isDoubtful(fields: Fields, at: number): boolean {
   for (let colour = 0; colour < 3; colour++) {
     const values: number[] = [];
     for (let field = GEOMETRY + colour; field < width; field += 3) values.push(high(field));
-    values.sort((a, b) => a - b);
-    for (let index = 1; index < values.length; index++) equal += Number(values[index] === values[index - 1]);
+    equal += values.length - new Set(values).size;
   }
   return equal >= EQUAL_HARMONICS;
 }

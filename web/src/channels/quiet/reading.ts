@@ -20,7 +20,6 @@ import { BLOCK_BYTES, lastBits, type Levels, levelsOf, modelHash, readBlocks } f
 const ASSOCIATED = ascii('keyss/v1/quiet');
 const DATA_KEY_BYTES = 16;
 const LEAST_WIDTH = TAG_BYTES + DATA_KEY_BYTES;
-const SALTS_TRIED = 4;
 const DUMMY_CELLS = 2; // cells per carrier that a wrong key decrypts
 const NARROW_HARMONICS = 9; // of degree 1: some secrets do not write the others
 const [LEAST_BYTES, MIN_BLOCKS] = [48, 4]; // minimum bytes of a block; minimum blocks of a file
@@ -33,7 +32,7 @@ export class QuietReader implements Reader {
     private readonly low: Uint8Array, // [C, width]
     private readonly width: number,
     private readonly widths: readonly number[], // of parameters
-    readonly salts: Uint8Array[], // the likeliest first
+    private readonly salts: readonly Uint8Array[],
     private readonly blocks = false, // the carriers are blocks of codes
   ) {}
 
@@ -44,10 +43,11 @@ export class QuietReader implements Reader {
     return decoded ? QuietReader.ofCodes(decoded.levels, decoded.silent) : QuietReader.ofLowBits(model);
   }
 
-  private static ofLowBits(model: Gaussians): QuietReader {
+  private static ofLowBits(model: Gaussians): QuietReader | null {
     let fields = fieldsOf(model);
     let [ids, low] = [gaussianIds(model, fields), lowBits(fields)];
     const width = lowWidth(fields);
+    if (width < LEAST_WIDTH) return null;
     const rows = uniqueRows(ids, low, width);
     if (rows.length < model.count) {
       fields = fieldsOf(selected(model, rows));
@@ -74,18 +74,17 @@ export class QuietReader implements Reader {
   }
 
   get derivations(): number {
-    return Math.min(SALTS_TRIED, this.salts.length);
+    return this.salts.length;
   }
 
   /** The content that `key` opens, or null. Raises InputError for damage. */
   async open(key: string, derive: Derive = here): Promise<Content | null> {
     const dataKeys: Uint8Array[] = [];
-    let secret = new Uint8Array(32);
+    let secret: Uint8Array = new Uint8Array(32);
     // Other workers derive the next keys while this one reads cells.
-    const masters = this.salts.slice(0, this.derivations).map((salt) => derive(key, salt));
+    const masters = this.salts.map((salt) => derive(key, salt));
     for (const each of masters) {
-      secret = new Uint8Array(expand(await each, 'quiet/key'));
-      if (!this.widths.length) continue;
+      secret = expand(await each, 'quiet/key');
       const cells = this.cells(new CellCipher(secret, 'key', DATA_KEY_BYTES));
       const best = mostFrequent(cells.map(({ data }) => bytesKey(data)));
       if (best) dataKeys.push(cells.find(({ data }) => bytesKey(data) === best[0])!.data);
@@ -99,7 +98,7 @@ export class QuietReader implements Reader {
         return this.payload(dataKey, parameters, this.inBlocks(parameters, parts[parts.length - 1].row));
       }
     }
-    if (dataKeys.length === 0 && this.widths.length) {
+    if (dataKeys.length === 0) {
       const none = expand(secret, 'quiet/none').slice(0, DATA_KEY_BYTES);
       for (const width of this.widths) this.parts(none, width);
       this.dummyPasses(none, this.width);
