@@ -2,7 +2,7 @@ import { expect, test } from 'vitest';
 import { emptyGaussians, selected } from '../src/core/gaussians.ts';
 import { readModel } from '../src/files/models.ts';
 import { joined } from '../src/core/bytes.ts';
-import { column, plyHeader, writePly } from '../src/files/ply.ts';
+import { column, openPly, writePly } from '../src/files/ply.ts';
 import { unzipped } from '../src/files/sog.ts';
 import { columns, jsonVector, modelOf, vector } from './vectors.ts';
 
@@ -33,9 +33,9 @@ test('.splat is identified by its suffix', async () => {
 
 test('ascii .ply equals binary .ply bit for bit', async () => {
   const bytes = vector('carried.ply');
-  const header = plyHeader(bytes);
-  const [vertex] = header.elements;
-  const values = vertex.properties.map(({ name }) => column(bytes, header, vertex, name)!);
+  const file = openPly(bytes);
+  const [vertex] = file.elements;
+  const values = vertex.properties.map(({ name }) => column(file, vertex, name)!);
   const rows = Array.from({ length: vertex.count }, (_, row) => values.map((each) => each[row]).join(' ')).join('\r\n');
   const head = new TextDecoder('latin1').decode(bytes.subarray(0, vertex.start)).replace('binary_little_endian', 'ascii');
   const text = (body: string): Uint8Array => new TextEncoder().encode(head + body);
@@ -50,7 +50,7 @@ test('ascii .ply equals binary .ply bit for bit', async () => {
 
 /** `file` with one number of one row of each of these properties replaced. */
 function withNumbers(file: Uint8Array, row: number, numbers: Record<string, number>): Uint8Array {
-  const [bytes, [vertex]] = [file.slice(), plyHeader(file).elements];
+  const [bytes, [vertex]] = [file.slice(), openPly(file).elements];
   for (const [name, value] of Object.entries(numbers)) {
     const { offset } = vertex.properties.find((each) => each.name === name)!;
     new DataView(bytes.buffer).setFloat32(vertex.start + row * vertex.stride + offset, value, true);
@@ -80,7 +80,7 @@ test('infinite log scales and opacity logits are clamped', async () => {
 
 test('files without drawable Gaussians are refused with advice', async () => {
   const bytes = vector('carried.ply');
-  const [vertex] = plyHeader(bytes).elements;
+  const [vertex] = openPly(bytes).elements;
   const header = new TextDecoder('latin1').decode(bytes.subarray(0, vertex.start));
   const empty = new TextEncoder().encode(header.replace(/element vertex \d+/, 'element vertex 0'));
   await expect(readModel(empty)).rejects.toThrow(/^This file holds no Gaussians: export it again/);

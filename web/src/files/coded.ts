@@ -3,7 +3,6 @@ import { coefficients, emptyGaussians, type Gaussians } from '../core/gaussians.
 
 export const SH_C0 = 0.28209479177387814;
 const OPACITY_LOGIT_BOUND = 16;
-const MIN_SCALE = 2 ** -126;
 const [SMALL_COUNT, MIN_BYTES] = [1 << 17, 6]; // bytes per Gaussian in larger files
 
 /** Maximum number of Gaussians in `size` compressed bytes. */
@@ -17,20 +16,9 @@ export function holds(size: number, count: number): boolean {
 }
 
 /** Opacity logit of `byte` 255ths; finite for 0 and 255 too. */
-export function logit(byte: number): number {
+function logit(byte: number): number {
   const found = Math.log(byte / 255) - Math.log1p(-byte / 255);
   return Math.max(-OPACITY_LOGIT_BOUND, Math.min(OPACITY_LOGIT_BOUND, found));
-}
-
-/** Logarithm of a scale: 0 becomes the smallest normal number, negative scales NaN. */
-export function logScale(scale: number): number {
-  return Math.log(scale === 0 ? MIN_SCALE : scale);
-}
-
-/** A normalised quaternion; zero becomes (1, 0, 0, 0), as in renderers. */
-export function unitQuat(w: number, x: number, y: number, z: number): number[] {
-  const length = Math.sqrt(w * w + x * x + y * y + z * z);
-  return length > 0 ? [w / length, x / length, y / length, z / length] : [1, 0, 0, 0];
 }
 
 /** A unit quaternion from the index of the component left out, and the other three. */

@@ -2,7 +2,7 @@
 import { damaged } from '../core/errors.ts';
 import { coefficients, type Gaussians } from '../core/gaussians.ts';
 import { fromSmallestThree, gaussiansOf, SH_C0 } from './coded.ts';
-import { checkFinite, column, type Element, type PlyHeader } from './ply.ts';
+import { checkFinite, column, type Element, type PlyFile } from './ply.ts';
 
 export const CHUNK = 256; // Gaussians
 const ENDS = ['min', 'max'];
@@ -37,20 +37,18 @@ export function rotationPart(packed: number, part: number): number {
   return (packed >>> (20 - 10 * part)) & 1023;
 }
 
-export function isCompressed(header: PlyHeader): boolean {
-  return header.elements.some((each) => each.properties.some(({ name }) => name === 'packed_position'));
+export function isCompressed(file: PlyFile): boolean {
+  return file.elements.some((each) => each.properties.some(({ name }) => name === 'packed_position'));
 }
 
-export function readCompressedPly(
-  bytes: Uint8Array, header: PlyHeader,
-): Gaussians & { readonly codes: CompressedPlyCodes } {
-  const element = (name: string) => header.elements.find((each) => each.name === name);
+export function readCompressedPly(file: PlyFile): Gaussians & { readonly codes: CompressedPlyCodes } {
+  const element = (name: string) => file.elements.find((each) => each.name === name);
   const [vertex, chunk, sh] = [element('vertex'), element('chunk'), element('sh')];
   if (!vertex?.count || !chunk || chunk.count !== Math.ceil(vertex.count / CHUNK)) throw damaged();
   const shDegree = [0, 9, 24, 45].indexOf(sh?.properties.length ?? 0);
   if (shDegree < 0 || (sh && sh.count !== vertex.count)) throw damaged();
   const columnOf = (of: Element, name: string): Float64Array => {
-    const values = column(bytes, header, of, name);
+    const values = column(file, of, name);
     if (values === null) throw damaged();
     return values;
   };
