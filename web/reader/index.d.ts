@@ -31,7 +31,8 @@ export interface RevealOptions {
  * What `key` opens in the bytes of a published model, or null for nothing. The bytes are not changed.
  *
  * Rejects with an `InputError` (an Error with this name and a message of one sentence) if the bytes are not a model, if the
- * key has no or more than 4,096 bytes, or if the key is right and the model was damaged too much.
+ * key has no or more than 4,096 bytes, or if the key is right and the model was damaged too much or needs
+ * `keyss reveal`.
  */
 export declare function reveal(
   bytes: Uint8Array, key: string, options?: RevealOptions,

@@ -1,10 +1,10 @@
 /** Entry point of the package `keyss-reader`: reveals without the page. Its types are in web/reader. */
 import type { Reveal } from '../reader/index.d.ts';
 import { preparedFor } from './channels/opening.ts';
+import { InputError } from './core/errors.ts';
 import { readModel } from './files/models.ts';
 import { writePly } from './files/ply.ts';
-import { type Derive, keyBytes, master } from './keys/keys.ts';
-import { sequential } from './keys/pool.ts';
+import { type Derive, keyBytes, master, sequential } from './keys/keys.ts';
 import { fileOf, secretOf } from './records/reveal.ts';
 
 const QUICK = 0.2; // share of the progress: colours, searched last, take four times as long as all else
@@ -31,7 +31,8 @@ export const reveal: Reveal = async (bytes, key, { name, decodeWebP, signal, onP
     const file = fileOf(content);
     if (file) return { kind: 'file', ...file };
     const secret = secretOf(content, stego);
-    if (secret) return { kind: 'model', ply: writePly(secret.gaussians), gaussians: secret.gaussians.count };
+    if (secret === null) throw new InputError('This key opens a model that only keyss reveal decodes.');
+    return { kind: 'model', ply: writePly(secret), gaussians: secret.count };
   }
   onProgress?.(1);
   return null;

@@ -1,35 +1,34 @@
 /** The page's worker: reads models and tries keys. Nothing is stored. */
-import { InputError } from './core/errors.ts';
 import DERIVE from 'source:./derive.ts';
 import type { Reader } from './channels/content.ts';
 import { preparedFor } from './channels/opening.ts';
+import { InputError } from './core/errors.ts';
 import { buffersOf, type Gaussians } from './core/gaussians.ts';
 import { readModel } from './files/models.ts';
-import type { Derive } from './keys/keys.ts';
-import { deriveInWorker, roundRobin, sequential, startWorker } from './keys/pool.ts';
+import { type Derive, deriveInWorker, roundRobin, sequential, startWorker } from './keys/keys.ts';
 import { fileOf, type HiddenFile, secretOf } from './records/reveal.ts';
 
-/** A file to read, or a key to try on the last file. */
+/** A file to read, or a key to try on the last file. The answers go to the port that comes with it. */
 export interface Question {
-  readonly id?: number;
   readonly bytes?: Uint8Array;
   readonly name?: string; // some formats have no magic bytes
-  readonly keyless?: boolean; // no key will be tried
   readonly key?: string;
   readonly thorough?: boolean; // searches the slow channels
   readonly stop?: boolean; // cancels the current search
 }
 
 export interface Answer {
-  readonly id: number;
   readonly model?: Gaussians;
   readonly leftOut?: number; // Gaussians dropped from the file
   readonly foreign?: number; // Gaussians added to or changed in the published file
   readonly file?: HiddenFile;
+  readonly elsewhere?: boolean; // only `keyss reveal` opens the content
   readonly error?: string; // one sentence
   readonly stopped?: boolean; // the search was cancelled
   readonly progress?: number; // 0 to 1: an interim message, the same for every key
 }
+
+type Tell = (answer: Answer, moved?: Transferable[]) => void;
 
 // Derivation dominates the time of an attempt, so several run in parallel, at 64 MiB each.
 const DERIVERS = Math.max(1, Math.min(4, navigator.hardwareConcurrency || 2));
@@ -43,51 +42,40 @@ function whileSearched(derive: Derive): Derive {
   return async (key, salt) => (key === searched ? derive(key, salt) : Promise.reject(new Error('stopped')));
 }
 
-function answer(message: Answer, moved: Transferable[] = []): void {
-  (self as unknown as Worker).postMessage(message, moved);
-}
-
-async function load({ id = 0, name, keyless }: Question, bytes: Uint8Array): Promise<void> {
+async function load(bytes: Uint8Array, name: string | undefined, tell: Tell): Promise<void> {
   const read = await readModel(bytes, name);
   const { codes, leftOut, ...model } = read;
-  answer({ id, model, leftOut }, keyless ? buffersOf(model) : []);
-  if (keyless) return;
+  tell({ model, leftOut });
   stego = model;
   // After the answer, so that the picture comes first. Without enough memory no key opens anything.
   prepared = new Promise((resolve) => setTimeout(resolve, 0)).then(() => preparedFor(read)).catch(() => null);
 }
 
-async function unlock(id: number, key: string, thorough: boolean): Promise<void> {
+async function unlock(key: string, thorough: boolean, tell: Tell): Promise<void> {
   const reader = (await prepared)?.(thorough);
   searched = key;
-  const content = reader ? await reader.open(key, counted(id, reader.derivations)) : null;
-  answer({ id, progress: 1 }); // before decoding, which only right keys reach
-  const model = content && stego && secretOf(content, stego)?.gaussians;
-  const foreign = content?.foreign;
-  if (model) answer({ id, model, foreign }, buffersOf(model));
-  else answer({ id, file: (content && fileOf(content)) ?? undefined, foreign });
-}
-
-/** `derive` that reports progress over `all` derivations. */
-function counted(id: number, all: number): Derive {
   let done = 0;
-  return async (key, salt) => {
-    const found = await derive(key, salt);
-    answer({ id, progress: ++done / (all + 1) }); // the rest takes about as long as one derivation
+  const content = await reader?.open(key, async (own, salt) => {
+    const found = await derive(own, salt);
+    tell({ progress: ++done / (reader.derivations + 1) }); // the rest takes about as long as one derivation
     return found;
-  };
+  });
+  tell({ progress: 1 }); // before decoding, which only right keys reach
+  if (!content || !stego) return tell({});
+  const [file, model, { foreign }] = [fileOf(content), secretOf(content, stego), content];
+  if (model) tell({ model, foreign }, buffersOf(model));
+  else tell(file ? { file, foreign } : { elsewhere: true });
 }
 
-self.onmessage = async ({ data }: MessageEvent<Question>) => {
-  const { id = 0 } = data;
+self.onmessage = async ({ data, ports: [port] }: MessageEvent<Question>) => {
+  const tell: Tell = (answer, moved = []) => port.postMessage(answer, moved);
   try {
     if (data.stop) searched = null;
-    else if (data.bytes) await load(data, data.bytes);
-    else await unlock(id, data.key ?? '', data.thorough ?? false);
+    else if (data.bytes) await load(data.bytes, data.name, tell);
+    else await unlock(data.key ?? '', data.thorough ?? false, tell);
   } catch (error) {
     const message = error instanceof InputError ? error.message : 'This file cannot be read.';
     // Errors of a key are indistinguishable from a wrong key.
-    answer(data.bytes ? { id, error: message } : { id });
+    tell(data.bytes ? { error: message } : {});
   }
 };
-

@@ -13,10 +13,11 @@ interface Revealed {
 
 const KEYSS = jsonVector<Revealed[]>('keyss.json');
 const LATENT = KEYSS.filter(({ file }) => file.startsWith('latent'));
+const OTHERS = KEYSS.filter(({ file }) => !file.startsWith('latent'));
 const STRIDE = 49;
 
-test.each(KEYSS)('decoding $file matches Python to 1e-5, $count Gaussians', async (expected) => {
-  const { gaussians } = decodeKeyss(hex(expected.payload), await modelOf(expected.file));
+test.each(LATENT)('decoding $file matches Python to 1e-5, $count Gaussians', async (expected) => {
+  const gaussians = decodeKeyss(hex(expected.payload), await modelOf(expected.file))!;
   expect(gaussians.count).toBe(expected.count);
   const { means, quats, logScales, opacityLogits, sh } = gaussians;
   const columns = { means, quats, log_scales: logScales, opacity_logits: opacityLogits, sh };
@@ -32,15 +33,15 @@ test.each(KEYSS)('decoding $file matches Python to 1e-5, $count Gaussians', asyn
 test('lost and reordered rows leave the others unchanged', async () => {
   const { file, payload } = LATENT[0];
   const model = await modelOf(file);
-  const all = decodeKeyss(hex(payload), model).gaussians;
+  const all = decodeKeyss(hex(payload), model)!;
   const rows = [...Array(model.count).keys()].filter((row) => row % 8).reverse();
-  const some = decodeKeyss(hex(payload), selected(model, rows)).gaussians;
+  const some = decodeKeyss(hex(payload), selected(model, rows))!;
   const names = [...some.means].map(String);
   expect(some.count).toBeGreaterThan(all.count / 2);
   expect([...all.means].map(String)).toEqual(expect.arrayContaining(names));
 });
 
-test.each([KEYSS[0], LATENT[1]])('rounded models and damage are refused', async ({ file, payload }) => {
+test.each(LATENT.slice(0, 2))('rounded models and damage are refused', async ({ file, payload }) => {
   const model = await modelOf(file);
   const rounded = { ...model, means: model.means.map((each) => Math.round(each * 1000) / 1000) };
   expect(() => decodeKeyss(hex(payload), rounded)).toThrow(/^The model was moved or rounded/);
@@ -48,7 +49,7 @@ test.each([KEYSS[0], LATENT[1]])('rounded models and damage are refused', async 
     for (const bytes of [hex(payload).slice(0, at), hex(payload)]) {
       if (bytes.length > at) bytes[at] ^= 1 << at % 8;
       try {
-        expect(decodeKeyss(bytes, model).gaussians.means.every(Number.isFinite)).toBe(true);
+        expect(decodeKeyss(bytes, model)!.means.every(Number.isFinite)).toBe(true);
       } catch (error) {
         expect((error as Error).message).toMatch(/^(This file|What this key opens|The model was).*\.$/);
       }
@@ -56,7 +57,7 @@ test.each([KEYSS[0], LATENT[1]])('rounded models and damage are refused', async 
   }
 });
 
-test.each([KEYSS[0], LATENT[1]])('out-of-range headers are refused: $file', async ({ file, payload }) => {
+test.each(LATENT.slice(0, 2))('out-of-range headers are refused: $file', async ({ file, payload }) => {
   const [model, bytes] = [await modelOf(file), Buffer.from(payload, 'hex')];
   const end = 8 + Number(bytes.readBigUInt64LE());
   const header = bytes.toString('latin1', 8, end).replaceAll('\\"', "'");
@@ -69,16 +70,19 @@ test.each([KEYSS[0], LATENT[1]])('out-of-range headers are refused: $file', asyn
     return decodeKeyss(Uint8Array.from(Buffer.concat([size, text, bytes.subarray(end)])), model);
   };
   const changes: [RegExp, string][] = [
-    [/keyss-secret/, 'keyss-secrets'], [/'kind':/, "'kind':1,'more':"], [/'(mlp|latent)'/, "'other'"], [/'op','ro'/, "'ro','op'"],
-    [/'op'/, "'oq'"], [/false/, '0'], [/'key_size':64/, "'key_size':65"], [/'sh_degree':\d/, "'sh_degree':4"],
-    [/'secret':\d/, "'secret':9"], [/'secrets':\d/, "'secrets':0"], [/'branch':\d+/, "'branch':0.5"], [/'hidden':./, "'hidden':[1,"],
-    [/'count':\d/, "'count':-1"], [/'visibility':/, "'visibility':-"], [/'visibility':/, "'visibility':1e999,'more':"],
+    [/keyss-secret/, 'keyss-secrets'], [/'mask':/, "'mask':1,'more':"],
+    [/'key_size':64/, "'key_size':65"], [/'sh_degree':\d/, "'sh_degree':4"],
+    [/'secret':\d/, "'secret':9"], [/'secrets':\d/, "'secrets':0"], [/'count':\d/, "'count':-1"], [/'visibility':/, "'visibility':-"], [/'visibility':/, "'visibility':1e999,'more':"],
     [/'scale':\d/, "'scale':-1"], [/'rotation':../, "'rotation':[[2"], [/"key"/, '"kex"'], [/decoder/, 'recoded'],
     [/"anchors".*?]/, '"anchors":{"dtype":"F32","shape":[0,3]'], [/"shape":\[64\]/, '"shape":[-4]'], [/"F16"/, '"I16"'],
     [/("decoder.*?offsets":\[)/, '$1-1'],
   ];
   for (const [from, to] of changes) expect(() => decode(from, to), String(from)).toThrow('This file is damaged.');
   expect(() => decode(/'version':10/, "'version':11")).toThrow(/another version/);
+});
+
+test.each(OTHERS)('other designs are left to Python: $count Gaussians', async ({ file, payload }) => {
+  expect(decodeKeyss(hex(payload), await modelOf(file))).toBeNull();
 });
 
 test('a similarity and its inverse cancel', async () => {

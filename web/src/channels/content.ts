@@ -1,28 +1,25 @@
-/** The content of channels. */
-import { bytesKey } from '../core/bytes.ts';
+/** The content of channels, and how many Gaussians are not of its model; counterpart of `keyss.channels.payloads` and `sketch`. */
+import { bytesKey, viewOf } from '../core/bytes.ts';
 import { damaged } from '../core/errors.ts';
-import type { Derive } from '../keys/keys.ts';
+import { blockwise, type Derive, expand } from '../keys/keys.ts';
 
-interface Opened {
-  readonly foreign?: number; // Gaussians added to or changed in the published file
-}
+/** Records of one size, each read on its own, or bytes that are read completely or not at all. */
+export type Content = Records | Payload;
 
-/** Records of one size, each read on its own. */
-export interface Records extends Opened {
+interface Records {
   readonly service: 'records';
   readonly method: string;
   readonly header: Uint8Array;
   readonly records: Uint8Array[]; // in carrier order
+  readonly foreign?: number; // Gaussians added to or changed in the published file
 }
 
-/** Bytes that are read completely or not at all. */
-export interface Payload extends Opened {
+export interface Payload {
   readonly service: 'payload';
   readonly method: string;
   readonly data: Uint8Array;
+  readonly foreign?: number;
 }
-
-export type Content = Records | Payload;
 
 /** A channel of one model, prepared for any number of keys. */
 export interface Reader {
@@ -41,4 +38,21 @@ export function unpackPayload(packed: Uint8Array): Payload {
   const name = packed.subarray(0, length);
   if (length < 1 || length > METHOD_BYTES || name.some((each) => each > 127)) throw damaged();
   return { service: 'payload', method: bytesKey(name), data: packed.slice(length + 1) };
+}
+
+const ID_BYTES = 16;
+
+/** About how many of `ids` [N, 16] are not among the `gaussians` of the sketch `own`. */
+export function foreign(secret: Uint8Array, ids: Uint8Array, own: Uint8Array, gaussians: number): number {
+  const kept = 8 * own.length;
+  const isUnset = (place: number): boolean => ((own[place >>> 3] >>> (place & 7)) & 1) === 0;
+  const places = Array.from({ length: Math.min(kept, gaussians) }, (_, place) => place);
+  const hashed = viewOf(blockwise(expand(secret, 'sketch'), ids));
+  let seen = 0;
+  for (let at = 0; at < ids.length; at += ID_BYTES) {
+    const place = hashed.getUint32(at, true) % Math.max(1, gaussians);
+    if (place < kept && isUnset(place)) seen++;
+  }
+  const found = Math.round((seen * gaussians) / Math.max(1, places.filter(isUnset).length));
+  return Math.min(ids.length / ID_BYTES, found);
 }

@@ -48,29 +48,35 @@ export function decoded(
   }
   if (left.size < count * k) throw tooMuchLost(); // before allocating
   const data = new Uint8Array(count * k * width);
+  const products = differences(pointsOf(n), pointsOf(n));
   for (let codeword = 0; codeword < count; codeword++) {
     let own: Chunk[] = [];
     for (let row = 0; row < n; row++) {
       const bytes = left.get(row * count + codeword);
       if (bytes) own.push({ point: row + 1, bytes });
     }
-    if (errors && own.length > k) own = rightOf(own, k, n);
+    if (errors && own.length > k) own = rightOf(own, k, products);
     if (own.length < k) throw tooMuchLost();
     own = own.slice(0, k);
     const put = (point: number, row: Uint8Array) => data.set(row, ((point - 1) * count + codeword) * width);
     const known = new Set(own.map(({ point }) => point));
     own.filter(({ point }) => point <= k).forEach(({ point, bytes }) => put(point, bytes));
-    const lost = Array.from({ length: k }, (_, row) => row + 1).filter((point) => !known.has(point));
-    if (lost.length) interpolated(own, lost, n).forEach((row, index) => put(lost[index], row));
+    const lost = pointsOf(k).filter((point) => !known.has(point));
+    if (lost.length) interpolated(own, lost, products).forEach((row, index) => put(lost[index], row));
   }
   return data;
 }
 
-/** The chunks at the `wanted` points, interpolated from k chunks of a codeword of n. */
-function interpolated(chunks: Chunk[], wanted: number[], n: number): Uint8Array[] {
-  const [points, values] = [chunks.map(({ point }) => point), scaled(chunks, n)];
+/** 1 to `count`. */
+function pointsOf(count: number): number[] {
+  return Array.from({ length: count }, (_, row) => row + 1);
+}
+
+/** The chunks at the `wanted` points, interpolated from k chunks of a codeword; see `scaled`. */
+function interpolated(chunks: Chunk[], wanted: number[], products: Uint32Array): Uint8Array[] {
+  const [points, values] = [chunks.map(({ point }) => point), scaled(chunks, products)];
   const columns = values.length / points.length;
-  const outside = logarithmsOfProducts(wanted, points);
+  const outside = differences(wanted, points);
   return wanted.map((at, index) => {
     const sums = new Uint16Array(columns);
     points.forEach((point, row) => {
@@ -81,35 +87,27 @@ function interpolated(chunks: Chunk[], wanted: number[], n: number): Uint8Array[
   });
 }
 
-/** [C, columns] logarithms of the chunks' symbols divided by the product of their points' differences. */
-function scaled(chunks: Chunk[], n: number): Uint32Array {
+/**
+ * [C, columns] logarithms of the chunks' symbols divided by the product of their points' differences. `products`: the
+ * `differences` of all points of the codeword, to be divided by those of the few missing ones.
+ */
+function scaled(chunks: Chunk[], products: Uint32Array): Uint32Array {
   const points = chunks.map(({ point }) => point);
   const columns = chunks[0].bytes.length / 2;
   const found = new Uint32Array(chunks.length * columns);
-  const [whole, own] = [productsOfAll(n), new Set(points)]; // divided by the few missing ones
-  const missing = logarithmsOfProducts(points, whole.points.filter((point) => !own.has(point)));
+  const own = new Set(points);
+  const missing = differences(points, pointsOf(products.length).filter((point) => !own.has(point)));
   chunks.forEach(({ bytes }, row) => {
     for (let column = 0; column < columns; column++) {
       const symbol = LOGARITHMS[(bytes[2 * column] << 8) | bytes[2 * column + 1]];
-      found[row * columns + column] = symbol === ZERO ? ZERO : (symbol + missing[row] + ORDER - whole.logarithms[points[row] - 1]) % ORDER;
+      found[row * columns + column] = symbol === ZERO ? ZERO : (symbol + missing[row] + ORDER - products[points[row] - 1]) % ORDER;
     }
   });
   return found;
 }
 
-let latest: { points: number[]; logarithms: Uint32Array } = { points: [], logarithms: new Uint32Array(0) };
-
-/** All points of a codeword of n, and their `logarithmsOfProducts`; the last result is cached. */
-function productsOfAll(n: number): typeof latest {
-  if (latest.points.length !== n) {
-    const points = Array.from({ length: n }, (_, row) => row + 1);
-    latest = { points, logarithms: logarithmsOfProducts(points, points) };
-  }
-  return latest;
-}
-
 /** Logarithms of the products of differences to all other `points`. */
-function logarithmsOfProducts(at: number[], points: number[]): Uint32Array {
+function differences(at: number[], points: number[]): Uint32Array {
   const others = Uint16Array.from(points);
   return Uint32Array.from(at, (own) => {
     let sum = 0; // exact: at most 2^16 logarithms of 2^16
@@ -119,8 +117,8 @@ function logarithmsOfProducts(at: number[], points: number[]): Uint32Array {
 }
 
 /** The chunks that belong to the codeword, given more than k; none if there are too many errors. */
-function rightOf(chunks: Chunk[], k: number, n: number): Chunk[] {
-  const values = scaled(chunks, n);
+function rightOf(chunks: Chunk[], k: number, products: Uint32Array): Chunk[] {
+  const values = scaled(chunks, products);
   const columns = values.length / chunks.length;
   const terms = chunks.map((_, row) => {
     let sum = 0;

@@ -44,12 +44,13 @@ export function rowsOf<T extends Uint8Array | Int16Array | Float32Array | Float6
   return found;
 }
 
-/** 0 for no values. */
-export function median(values: Float64Array): number {
+/** Linearly interpolated quantile; 0 for no values. */
+export function quantile(values: ArrayLike<number>, share: number): number {
   if (!values.length) return 0;
   const sorted = Float64Array.from(values).sort();
-  const middle = sorted.length >> 1;
-  return sorted.length % 2 ? sorted[middle] : (sorted[middle - 1] + sorted[middle]) / 2;
+  const at = share * (sorted.length - 1);
+  const [below, above] = [sorted[Math.floor(at)], sorted[Math.ceil(at)]];
+  return below + (at - Math.floor(at)) * (above - below);
 }
 
 /** [most frequent value, its count], the first in case of ties; undefined for no values. */

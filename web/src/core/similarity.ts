@@ -1,6 +1,8 @@
 /** Similarity transforms of Gaussians; counterpart of `keyss.core.similarity`. */
 import { coefficients, type Gaussians } from './gaussians.ts';
 
+const SQUARINGS = 50;
+
 /** x -> scale * rotation x + translation. */
 export interface Similarity {
   readonly scale: number;
@@ -9,7 +11,7 @@ export interface Similarity {
 }
 
 export function inverse({ scale, rotation: r, translation: t }: Similarity): Similarity {
-  const rotation = [r[0], r[3], r[6], r[1], r[4], r[7], r[2], r[5], r[8]];
+  const rotation = transposed(r);
   return { scale: 1 / scale, rotation, translation: times(rotation, t).map((each) => -each / scale) };
 }
 
@@ -28,9 +30,9 @@ export function movedPoint({ scale, rotation, translation }: Similarity, point: 
 
 /** The transformed Gaussians, view-dependent colour included. */
 export function moved(by: Similarity, model: Gaussians): Gaussians {
-  const [w, x, y, z] = quaternion(by.rotation);
-  const blocks = Array.from({ length: model.shDegree }, (_, band) => rotatedBand(by.rotation, band + 1));
+  const [w, x, y, z] = fittedRotation(transposed(by.rotation)).vector;
   const k = coefficients(model.shDegree);
+  const turned = rotatedHarmonics(by.rotation, k - 1);
   const [means, quats, sh] = [model.means.slice(), model.quats.slice(), model.sh.slice()];
   for (let row = 0; row < model.count; row++) {
     means.set(movedPoint(by, model.means.subarray(3 * row, 3 * row + 3)), 3 * row);
@@ -39,19 +41,17 @@ export function moved(by: Similarity, model: Gaussians): Gaussians {
       w * a - x * b - y * c - z * d, x * a + w * b - z * c + y * d,
       y * a + z * b + w * c - x * d, z * a - y * b + x * c + w * d,
     ], 4 * row);
-    blocks.forEach((block, index) => {
-      const [size, start] = [2 * index + 3, k * row + (index + 1) ** 2];
-      for (let i = 0; i < size; i++) {
-        for (let colour = 0; colour < 3; colour++) {
-          let sum = 0;
-          for (let j = 0; j < size; j++) sum += block[i][j] * model.sh[3 * (start + j) + colour];
-          sh[3 * (start + i) + colour] = sum;
-        }
-      }
-    });
+    for (let at = 3; at < 3 * k; at++) {
+      const [own, colour] = [turned[Math.floor(at / 3) - 1], at % 3];
+      sh[3 * k * row + at] = own.reduce((sum, each, j) => sum + each * model.sh[3 * (k * row + 1 + j) + colour], 0);
+    }
   }
   const larger = Math.fround(Math.log(by.scale));
   return { ...model, means, quats, sh, logScales: model.logScales.map((each) => each + larger) };
+}
+
+function transposed(r: readonly number[]): number[] {
+  return [r[0], r[3], r[6], r[1], r[4], r[7], r[2], r[5], r[8]];
 }
 
 function times(m: readonly number[], v: ArrayLike<number>): number[] {
@@ -75,20 +75,34 @@ export function rotationOf([w, x, y, z]: readonly number[]): number[] {
   ];
 }
 
-/** Unit quaternion wxyz of a rotation matrix (Shepperd 1978). */
-function quaternion(r: readonly number[]): number[] {
-  const squares = [
-    1 + r[0] + r[4] + r[8], 1 + r[0] - r[4] - r[8], 1 - r[0] + r[4] - r[8], 1 - r[0] - r[4] + r[8],
-  ];
-  const rows = [
-    [squares[0], r[7] - r[5], r[2] - r[6], r[3] - r[1]],
-    [r[7] - r[5], squares[1], r[1] + r[3], r[2] + r[6]],
-    [r[2] - r[6], r[1] + r[3], squares[2], r[5] + r[7]],
-    [r[3] - r[1], r[2] + r[6], r[5] + r[7], squares[3]],
-  ];
-  const found = rows[squares.indexOf(Math.max(...squares))];
-  const length = Math.hypot(...found);
-  return found.map((each) => each / length);
+/**
+ * The rotation that fits sums of products best, a unit quaternion wxyz: `m` [3, 3], of coordinates before and after it. It is
+ * the eigenvector of the largest eigenvalue, `value`, of a symmetric matrix (Horn 1987).
+ */
+export function fittedRotation(m: ArrayLike<number>): { value: number; vector: number[] } {
+  const [xx, xy, xz, yx, yy, yz, zx, zy, zz] = Array.from(m);
+  return largestEigen([
+    [xx + yy + zz, yz - zy, zx - xz, xy - yx],
+    [yz - zy, xx - yy - zz, xy + yx, zx + xz],
+    [zx - xz, xy + yx, yy - xx - zz, yz + zy],
+    [xy - yx, zx + xz, yz + zy, zz - xx - yy],
+  ]);
+}
+
+/** The largest eigenvalue of a symmetric matrix [4, 4] and its unit eigenvector, by repeated squaring. */
+function largestEigen(matrix: number[][]): { value: number; vector: number[] } {
+  const bound = Math.max(...matrix.map((row) => row.reduce((sum, each) => sum + Math.abs(each), 0)));
+  const four = [0, 1, 2, 3];
+  let power = matrix.map((row, i) => row.map((each, j) => each / bound + Number(i === j))); // shifted to non-negative eigenvalues
+  for (let round = 0; round < SQUARINGS; round++) {
+    const largest = Math.max(...power.flat().map(Math.abs));
+    const scaled = power.map((row) => row.map((each) => each / largest));
+    power = scaled.map((row) => four.map((j) => row.reduce((sum, each, k) => sum + each * scaled[k][j], 0)));
+  }
+  const column = power[four.reduce((a, b) => (power[b][b] > power[a][a] ? b : a))];
+  const vector = column.map((each) => each / Math.hypot(...column));
+  const value = vector.reduce((sum, a, i) => sum + vector.reduce((own, b, j) => own + a * b * matrix[i][j], 0), 0);
+  return { value, vector };
 }
 
 // [32, 4] quadrature on the sphere, directions and weights, exact up to degree 7 (Gauss-Legendre by azimuth steps).
@@ -99,28 +113,24 @@ const SPHERE = GAUSS.flatMap(([z, weight]) => [z, -z].flatMap((height) =>
     return [radius * Math.cos(angle), radius * Math.sin(angle), height, (weight * Math.PI) / 4];
   })));
 
-/** [2 band + 1]^2 rotation matrix for the SH coefficients of one degree. */
-function rotatedBand(r: readonly number[], band: number): number[][] {
-  const found = Array.from({ length: 2 * band + 1 }, () => new Array<number>(2 * band + 1).fill(0));
-  const back = [r[0], r[3], r[6], r[1], r[4], r[7], r[2], r[5], r[8]];
+/** [count, count] rotation matrix for the SH coefficients after the constant one. */
+function rotatedHarmonics(r: readonly number[], count: number): number[][] {
+  const found = Array.from({ length: count }, () => new Array<number>(count).fill(0));
+  const back = transposed(r);
   for (const [x, y, z, weight] of SPHERE) {
-    const [there, here] = [harmonics([x, y, z], band), harmonics(times(back, [x, y, z]), band)];
-    there.forEach((a, i) => here.forEach((b, j) => (found[i][j] += weight * a * b)));
+    const [there, here] = [harmonics([x, y, z]), harmonics(times(back, [x, y, z]))];
+    found.forEach((row, i) => row.forEach((_, j) => (row[j] += weight * there[i] * here[j])));
   }
   return found;
 }
 
-/** The real SH basis of one degree, with the signs of 3DGS. */
-function harmonics([x, y, z]: readonly number[], band: number): number[] {
+/** The real SH basis of degrees 1 to 3, with the signs of 3DGS. */
+function harmonics([x, y, z]: readonly number[]): number[] {
   const [xx, yy, zz] = [x * x, y * y, z * z];
-  if (band === 1) return [-0.4886025119029199 * y, 0.4886025119029199 * z, -0.4886025119029199 * x];
-  if (band === 2) {
-    return [
-      1.0925484305920792 * x * y, -1.0925484305920792 * y * z, 0.31539156525252005 * (2 * zz - xx - yy),
-      -1.0925484305920792 * x * z, 0.5462742152960396 * (xx - yy),
-    ];
-  }
   return [
+    -0.4886025119029199 * y, 0.4886025119029199 * z, -0.4886025119029199 * x,
+    1.0925484305920792 * x * y, -1.0925484305920792 * y * z, 0.31539156525252005 * (2 * zz - xx - yy),
+    -1.0925484305920792 * x * z, 0.5462742152960396 * (xx - yy),
     -0.5900435899266435 * y * (3 * xx - yy), 2.890611442640554 * x * y * z, -0.4570457994644658 * y * (4 * zz - xx - yy),
     0.3731763325901154 * z * (2 * zz - 3 * xx - 3 * yy), -0.4570457994644658 * x * (4 * zz - xx - yy),
     1.445305721320277 * z * (xx - yy), -0.5900435899266435 * x * (xx - 3 * yy),

@@ -25,25 +25,13 @@ export function sortingOrder(words: Uint32Array, width = 2): Uint32Array {
   return rows;
 }
 
-/** [R + 1] starts of the runs of equal words in a sorted `order`, and the end of the last. */
-export function runs(words: Words, order: Uint32Array): Uint32Array {
-  const starts = new Uint32Array(order.length + 1);
-  let size = 0;
-  for (let at = 0; at < order.length; at++) {
-    const [own, before] = [2 * order[at], 2 * order[at - 1]];
-    if (at === 0 || words[own] !== words[before] || words[own + 1] !== words[before + 1]) starts[size++] = at;
-  }
-  starts[size] = order.length;
-  return starts.subarray(0, size + 1);
-}
-
-/** [N] number of words equal to each, itself included. */
-export function multiplicities(words: Words): Uint32Array {
-  const order = sortingOrder(words);
-  const starts = runs(words, order);
+/** [N] number of words equal to each, itself included; `order`: their sorting order. */
+export function multiplicities(words: Words, order = sortingOrder(words)): Uint32Array {
   const found = new Uint32Array(order.length);
-  for (let run = 0; run < starts.length - 1; run++) {
-    for (let at = starts[run]; at < starts[run + 1]; at++) found[order[at]] = starts[run + 1] - starts[run];
+  for (let start = 0, end = 0; start < order.length; start = end) {
+    const [low, high] = [words[2 * order[start]], words[2 * order[start] + 1]];
+    while (end < order.length && words[2 * order[end]] === low && words[2 * order[end] + 1] === high) end++;
+    for (let at = start; at < end; at++) found[order[at]] = end - start;
   }
   return found;
 }

@@ -1,8 +1,8 @@
 /** Shared by quantised formats; counterpart of `keyss.files.formats.common`. */
+import { coefficients, emptyGaussians, type Gaussians } from '../core/gaussians.ts';
 
 export const SH_C0 = 0.28209479177387814;
 const OPACITY_LOGIT_BOUND = 16;
-const MIN_SCALE = 2 ** -126;
 const [SMALL_COUNT, MIN_BYTES] = [1 << 17, 6]; // bytes per Gaussian in larger files
 
 /** Maximum number of Gaussians in `size` compressed bytes. */
@@ -16,20 +16,9 @@ export function holds(size: number, count: number): boolean {
 }
 
 /** Opacity logit of `byte` 255ths; finite for 0 and 255 too. */
-export function logit(byte: number): number {
+function logit(byte: number): number {
   const found = Math.log(byte / 255) - Math.log1p(-byte / 255);
   return Math.max(-OPACITY_LOGIT_BOUND, Math.min(OPACITY_LOGIT_BOUND, found));
-}
-
-/** Logarithm of a scale: 0 becomes the smallest normal number, negative scales NaN. */
-export function logScale(scale: number): number {
-  return Math.log(scale === 0 ? MIN_SCALE : scale);
-}
-
-/** A normalised quaternion; zero becomes (1, 0, 0, 0), as in renderers. */
-export function unitQuat(w: number, x: number, y: number, z: number): number[] {
-  const length = Math.sqrt(w * w + x * x + y * y + z * z);
-  return length > 0 ? [w / length, x / length, y / length, z / length] : [1, 0, 0, 0];
 }
 
 /** A unit quaternion from the index of the component left out, and the other three. */
@@ -40,3 +29,33 @@ export function fromSmallestThree(largest: number, others: readonly number[]): n
   return quat;
 }
 
+/** One number of a Gaussian per axis, or per component of its rotation. */
+export type OfAxis = (row: number, axis: number) => number;
+
+export function byRow(table: ArrayLike<number>, width: number): OfAxis {
+  return (row, axis) => table[width * row + axis];
+}
+
+/** What the codes of a Gaussian mean. */
+interface Decoding {
+  readonly mean: OfAxis;
+  readonly logScale: OfAxis;
+  readonly quat: (row: number) => number[]; // wxyz
+  readonly opacity: (row: number) => number; // 255ths
+  readonly sh: (row: number, index: number, channel: number) => number; // index 0 to K - 1
+}
+
+export function gaussiansOf(count: number, shDegree: number, of: Decoding): Gaussians {
+  const model = emptyGaussians(count, shDegree);
+  const k = coefficients(shDegree);
+  for (let row = 0; row < count; row++) {
+    for (let axis = 0; axis < 3; axis++) {
+      model.means[3 * row + axis] = of.mean(row, axis);
+      model.logScales[3 * row + axis] = of.logScale(row, axis);
+      for (let index = 0; index < k; index++) model.sh[3 * (k * row + index) + axis] = of.sh(row, index, axis);
+    }
+    model.quats.set(of.quat(row), 4 * row);
+    model.opacityLogits[row] = logit(of.opacity(row));
+  }
+  return model;
+}

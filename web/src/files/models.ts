@@ -1,11 +1,11 @@
 /** Reads models of any format, identified by their first bytes, or by name if they have no magic bytes. */
-import { InputError } from '../core/errors.ts';
+import { viewOf } from '../core/bytes.ts';
+import { damaged, InputError } from '../core/errors.ts';
 import type { Gaussians } from '../core/gaussians.ts';
+import { gaussiansOf, SH_C0 } from './coded.ts';
 import { type CompressedPlyCodes, isCompressed, readCompressedPly } from './compressed_ply.ts';
-import type { Decode } from './packed.ts';
-import { binaryPly, plyHeader, readPly } from './ply.ts';
-import { readSog, type SogCodes } from './sog.ts';
-import { readSplat } from './splat.ts';
+import { type FiniteGaussians, openPly, readPly, withoutNonFinite } from './ply.ts';
+import { type Decode, readSog, type SogCodes } from './sog.ts';
 import { readSpz, type SpzCodes } from './spz.ts';
 
 /** The codes of formats whose low bits can carry secrets. */
@@ -21,12 +21,34 @@ export interface ReadModel extends Gaussians {
 export async function readModel(bytes: Uint8Array, name = '', decode?: Decode): Promise<ReadModel> {
   const start = [...bytes.subarray(0, 4)].map((byte) => String.fromCharCode(byte)).join('');
   if (start.startsWith('ply')) {
-    const file = binaryPly(bytes);
-    const header = plyHeader(file);
-    return isCompressed(header) ? readCompressedPly(file, header) : readPly(file);
+    const file = openPly(bytes);
+    return isCompressed(file) ? readCompressedPly(file) : readPly(file);
   }
   if (start === 'NGSP' || start.startsWith('\x1f\x8b')) return readSpz(bytes);
   if (start === 'PK\x03\x04') return readSog(bytes, decode);
   if (/\.splat$/i.test(name)) return readSplat(bytes);
   throw new InputError('This is not a file of a 3D Gaussian Splatting model that this page can read.');
+}
+
+const MIN_SCALE = 2 ** -126;
+const ROW = 32; // bytes: mean and scale as floats; red, green, blue, opacity and quaternion as bytes
+
+/** The finite Gaussians of a file. Raises InputError. */
+function readSplat(bytes: Uint8Array): FiniteGaussians {
+  if (bytes.length === 0 || bytes.length % ROW) throw damaged();
+  const view = viewOf(bytes);
+  return withoutNonFinite(gaussiansOf(bytes.length / ROW, 0, {
+    mean: (row, axis) => view.getFloat32(ROW * row + 4 * axis, true),
+    logScale: (row, axis) => {
+      const scale = view.getFloat32(ROW * row + 12 + 4 * axis, true);
+      return Math.log(scale === 0 ? MIN_SCALE : scale); // NaN if negative
+    },
+    sh: (row, _, channel) => (bytes[ROW * row + 24 + channel] / 255 - 0.5) / SH_C0,
+    opacity: (row) => bytes[ROW * row + 27],
+    quat: (row) => {
+      const quat = Array.from(bytes.subarray(ROW * row + 28, ROW * (row + 1)), (each) => each / 128 - 1);
+      const length = Math.sqrt(quat.reduce((sum, each) => sum + each * each, 0));
+      return length > 0 ? quat.map((each) => each / length) : [1, 0, 0, 0]; // as in renderers
+    },
+  }));
 }

@@ -1,5 +1,5 @@
 /** Reader and writer of the Inria .ply layout. Input is untrusted: defects raise InputError. */
-import { ascii, joined, viewOf } from '../core/bytes.ts';
+import { ascii, joined, quantile, viewOf } from '../core/bytes.ts';
 import { InputError } from '../core/errors.ts';
 import { coefficients, COLUMNS, emptyGaussians, type Gaussians, where } from '../core/gaussians.ts';
 
@@ -33,30 +33,33 @@ export interface Element {
   readonly start: number; // byte of the file
 }
 
-export interface PlyHeader {
+/** A binary .ply, or the numbers of an ascii one as doubles. */
+export interface PlyFile {
+  readonly bytes: Uint8Array;
   readonly littleEndian: boolean;
   readonly elements: readonly Element[];
 }
 
-/** The elements of a binary .ply that end inside the file. Raises InputError. */
-export function plyHeader(bytes: Uint8Array): PlyHeader {
+/** Finds the elements of a file, which end inside it. Raises InputError. */
+export function openPly(bytes: Uint8Array): PlyFile {
   const text = new TextDecoder('latin1').decode(bytes.subarray(0, MAX_HEADER_BYTES));
-  const end = /(^|\n)end_header\r?\n/.exec(text);
-  if (!/^ply\r?\n/.test(text) || end === null) throw notWhole();
-  const format = /\nformat (\S+)/.exec(text)?.[1] ?? '';
-  if (!['binary_little_endian', 'binary_big_endian'].includes(format)) throw notWhole();
-  let start = end.index + end[0].length;
-  const placed = elementsOf(text.slice(0, end.index)).map((each) => {
+  const header = /^ply\r?\n(?:[^]*?\n)?end_header\r?\n/.exec(text)?.[0] ?? '';
+  const format = /\nformat (\S+)/.exec(header)?.[1] ?? '';
+  if (!['ascii', 'binary_little_endian', 'binary_big_endian'].includes(format)) throw notWhole();
+  const isText = format === 'ascii';
+  let start = isText ? 0 : header.length;
+  const elements = elementsOf(header, isText).map((each) => {
     const element = { ...each, start };
     start += each.count * each.stride;
     return element;
   });
-  if (start > bytes.length) throw notWhole();
-  return { littleEndian: format === 'binary_little_endian', elements: placed };
+  const data = isText ? doublesOf(bytes.subarray(header.length), start / 8) : bytes;
+  if (start > data.length) throw notWhole();
+  return { bytes: data, littleEndian: format !== 'binary_big_endian', elements };
 }
 
 /** The elements of a header. Raises InputError. */
-function elementsOf(header: string): Omit<Element, 'start'>[] {
+function elementsOf(header: string, isText: boolean): Omit<Element, 'start'>[] {
   const elements: { name: string; count: number; properties: Property[]; stride: number }[] = [];
   for (const line of header.split(/\r?\n/).slice(1)) {
     const words = line.trim().split(/\s+/);
@@ -64,31 +67,27 @@ function elementsOf(header: string): Omit<Element, 'start'>[] {
     if (words[0] === 'element' && /^[0-9]{1,15}$/.test(words[2] ?? '')) {
       elements.push({ name: words[1], count: Number(words[2]), properties: [], stride: 0 });
     } else if (words[0] === 'property' && words.length === 3 && last && TYPES.has(words[1])) {
-      last.properties.push({ name: words[2], type: words[1], offset: last.stride });
-      last.stride += TYPES.get(words[1])!.size;
+      const type = isText ? 'double' : words[1];
+      last.properties.push({ name: words[2], type, offset: last.stride });
+      last.stride += TYPES.get(type)!.size;
     } else if (words[1] === 'list') throw noModel(); // a mesh
     else if (!['', 'comment', 'obj_info', 'format', 'end_header'].includes(words[0])) throw notWhole();
   }
   return elements;
 }
 
-/** An ascii .ply as a binary one of doubles; any other file unchanged. Raises InputError for truncated files. */
-export function binaryPly(bytes: Uint8Array): Uint8Array {
-  const text = new TextDecoder('latin1').decode(bytes.subarray(0, MAX_HEADER_BYTES));
-  const header = /^ply\r?\n(?:comment.*\n)*format ascii [^]*?\nend_header\r?\n/.exec(text)?.[0];
-  if (header === undefined) return bytes;
-  const numbers = elementsOf(header).reduce((sum, each) => sum + each.count * each.properties.length, 0);
-  if (2 * numbers - 1 > bytes.length - header.length) throw notWhole(); // each takes a digit and a separator
-  const values = new DataView(new ArrayBuffer(8 * numbers));
-  for (let index = 0, at = header.length; index < numbers; index++) {
-    while (bytes[at] <= SPACE) at++;
+/** The `count` first numbers of a text as little-endian doubles. Raises InputError for fewer. */
+function doublesOf(text: Uint8Array, count: number): Uint8Array {
+  if (2 * count - 1 > text.length) throw notWhole(); // each takes a digit and a separator
+  const values = new DataView(new ArrayBuffer(8 * count));
+  for (let index = 0, at = 0; index < count; index++) {
+    while (text[at] <= SPACE) at++;
     const start = at;
-    while (bytes[at] > SPACE) at++;
+    while (text[at] > SPACE) at++;
     if (at === start || at - start > MAX_DIGITS) throw notWhole();
-    values.setFloat64(8 * index, numberOf(String.fromCharCode(...bytes.subarray(start, at))), true);
+    values.setFloat64(8 * index, numberOf(String.fromCharCode(...text.subarray(start, at))), true);
   }
-  const binary = header.replace(/\nformat ascii/, '\nformat binary_little_endian').replace(/(\nproperty )\S+/g, '$1double');
-  return joined(ascii(binary), new Uint8Array(values.buffer));
+  return new Uint8Array(values.buffer);
 }
 
 /** Parses a number, NaN and infinities included. Raises InputError. */
@@ -101,21 +100,20 @@ function numberOf(text: string): number {
 }
 
 /** The values of a property; null if there is none. */
-export function column(bytes: Uint8Array, header: PlyHeader, element: Element, name: string): Float64Array | null {
+export function column({ bytes, littleEndian }: PlyFile, element: Element, name: string): Float64Array | null {
   const property = element.properties.find((each) => each.name === name);
   if (property === undefined) return null;
   const [view, { read }] = [viewOf(bytes), TYPES.get(property.type)!];
   const values = new Float64Array(element.count);
   for (let row = 0; row < element.count; row++) {
-    values[row] = view[read](element.start + row * element.stride + property.offset, header.littleEndian);
+    values[row] = view[read](element.start + row * element.stride + property.offset, littleEndian);
   }
   return values;
 }
 
 /** The finite Gaussians of a file. Raises InputError for anything other than a complete 3DGS model. */
-export function readPly(bytes: Uint8Array): FiniteGaussians {
-  const header = plyHeader(bytes);
-  const vertex = header.elements.find((each) => each.name === 'vertex');
+export function readPly(file: PlyFile): FiniteGaussians {
+  const vertex = file.elements.find((each) => each.name === 'vertex');
   const rest = vertex?.properties.filter((each) => /^f_rest_[0-9]+$/.test(each.name)).length ?? 0;
   const shDegree = [0, 9, 24, 45].indexOf(rest);
   if (vertex === undefined || shDegree < 0) throw noModel();
@@ -124,7 +122,7 @@ export function readPly(bytes: Uint8Array): FiniteGaussians {
   if (vertex.count === 0) throw new InputError(`This file holds no Gaussians${CURE}`);
   const found = emptyGaussians(vertex.count, shDegree);
   for (const { name, to, offset } of plyColumns(shDegree)) {
-    const values = column(bytes, header, vertex, name)!;
+    const values = column(file, vertex, name)!;
     const width = found[to].length / found.count;
     for (let row = 0; row < values.length; row++) found[to][row * width + offset] = values[row];
   }
@@ -156,14 +154,6 @@ function checkNotActivated({ count, means, logScales, opacityLogits }: Gaussians
   if (low >= 0 && high <= 1 && high - low > 0.5) wrong.push('opacities');
   if (wrong.length === 0) return;
   throw new InputError(`This file's ${wrong.join(' and ')} are those that renderers use: export it again without activating them.`);
-}
-
-/** Linearly interpolated quantile of at least one value. */
-function quantile(values: number[], share: number): number {
-  const sorted = Float64Array.from(values).sort();
-  const at = share * (sorted.length - 1);
-  const [below, above] = [sorted[Math.floor(at)], sorted[Math.ceil(at)]];
-  return below + (at - Math.floor(at)) * (above - below);
 }
 
 export interface FiniteGaussians extends Gaussians {

@@ -1,9 +1,10 @@
-/** Reader of SOG, version 2; counterpart of `keyss.files.formats.sog`. */
+/** Reader of SOG, version 2, a ZIP archive of lossless WebP images; counterpart of `keyss.files.formats.sog`. */
+import { unzipSync } from 'fflate';
+import { viewOf } from '../core/bytes.ts';
 import { damaged, InputError } from '../core/errors.ts';
-import { coefficients, emptyGaussians, type Gaussians } from '../core/gaussians.ts';
-import { fromSmallestThree, holds, logit } from './coded.ts';
+import { coefficients, type Gaussians } from '../core/gaussians.ts';
+import { fromSmallestThree, gaussiansOf, holds } from './coded.ts';
 import { checkFinite } from './ply.ts';
-import { type Decode, decodeInBrowser, openZip, type Pixels, pixelReader, SMALL } from './packed.ts';
 
 export const FINEST = 65535; // largest position code
 export const LARGEST = 252; // a quaternion's fourth byte: this plus the index (wxyz) of the component left out
@@ -42,14 +43,14 @@ export interface SogCodes {
 export async function readSog(
   bytes: Uint8Array, decode: Decode = decodeInBrowser,
 ): Promise<Gaussians & { readonly codes: SogCodes }> {
-  const codes = await parse(bytes, pixelReader(decode));
-  return { ...checkFinite(dequantise(codes)), codes };
+  const codes = await parse(bytes, decode);
+  return { ...checkFinite(dequantiseSog(codes)), codes };
 }
 
-async function parse(bytes: Uint8Array, pixels: Pixels): Promise<SogCodes> {
-  const file = openZip(bytes);
-  const { count, means, quats, scales, sh0, shN } = parseMeta(await file('meta.json'), bytes.length);
-  const image = async (name: string): Promise<Uint8Array> => pixels(await file(name), count);
+async function parse(bytes: Uint8Array, decode: Decode): Promise<SogCodes> {
+  const members = unzipped(bytes);
+  const { count, means, quats, scales, sh0, shN } = parseMeta(members.get('meta.json'), bytes.length);
+  const image = (name: string): Promise<Uint8Array> => pixelsOf(decode, members.get(name), count);
   const [low, high] = [await image(means.files[0]), await image(means.files[1])];
   const positions = new Uint16Array(3 * count);
   for (let row = 0; row < count; row++) {
@@ -61,7 +62,7 @@ async function parse(bytes: Uint8Array, pixels: Pixels): Promise<SogCodes> {
     const pairs = await image(shN.files[1]);
     labels = labels.map((_, row) => pairs[4 * row] | (pairs[4 * row + 1] << 8));
     if (labels.some((label) => label >= shN.count)) throw damaged();
-    palette = await pixels(await file(shN.files[0]), Math.ceil(shN.count / ROW) * ROW * rest, ROW * rest);
+    palette = await pixelsOf(decode, members.get(shN.files[0]), Math.ceil(shN.count / ROW) * ROW * rest, ROW * rest);
   }
   return {
     kind: 'sog', count, mins: means.mins, maxs: means.maxs, positions, quats: await image(quats.files[0]),
@@ -71,36 +72,33 @@ async function parse(bytes: Uint8Array, pixels: Pixels): Promise<SogCodes> {
   };
 }
 
-function dequantise(codes: SogCodes): Gaussians {
-  const { count, mins, maxs, positions, quats, scales, colours, shDegree, labels, palette } = codes;
-  const model = emptyGaussians(count, shDegree);
-  const k = coefficients(shDegree);
-  for (let row = 0; row < count; row++) {
-    const largest = quats[4 * row + 3] - LARGEST;
-    if (largest < 0) throw damaged();
-    const others = [0, 1, 2].map((part) => ((quats[4 * row + part] / 255) * 2 - 1) * Math.sqrt(0.5));
-    model.quats.set(fromSmallestThree(largest, others), 4 * row);
-    for (let axis = 0; axis < 3; axis++) {
+/** Raises InputError for an impossible rotation. */
+export function dequantiseSog(codes: SogCodes): Gaussians {
+  const { count, mins, maxs, positions, quats, scaleBook, scales, colourBook, colours, labels, harmonicBook, palette } = codes;
+  const rest = coefficients(codes.shDegree) - 1;
+  return gaussiansOf(count, codes.shDegree, {
+    mean: (row, axis) => {
       const [min, max] = [mins[axis], maxs[axis]];
       const log = min + (min === max ? 1 : max - min) * (positions[3 * row + axis] / FINEST);
-      model.means[3 * row + axis] = Math.sign(log) * Math.expm1(Math.abs(log));
-      model.logScales[3 * row + axis] = codes.scaleBook[scales[4 * row + axis]];
-      model.sh[3 * k * row + axis] = codes.colourBook[colours[4 * row + axis]];
-    }
-    model.opacityLogits[row] = logit(colours[4 * row + 3]);
-    for (let each = 0; each < k - 1; each++) {
-      for (let colour = 0; colour < 3; colour++) {
-        const code = palette[4 * (labels[row] * (k - 1) + each) + colour];
-        model.sh[3 * (k * row + each + 1) + colour] = codes.harmonicBook[code];
-      }
-    }
-  }
-  return model;
+      return Math.sign(log) * Math.expm1(Math.abs(log));
+    },
+    logScale: (row, axis) => scaleBook[scales[4 * row + axis]],
+    quat: (row) => {
+      const [largest, three] = [quats[4 * row + 3] - LARGEST, quats.subarray(4 * row, 4 * row + 3)];
+      if (largest < 0) throw damaged();
+      return fromSmallestThree(largest, Array.from(three, (code) => ((code / 255) * 2 - 1) * Math.sqrt(0.5)));
+    },
+    opacity: (row) => colours[4 * row + 3],
+    sh: (row, index, channel) => {
+      if (index === 0) return colourBook[colours[4 * row + channel]];
+      return harmonicBook[palette[4 * (labels[row] * rest + index - 1) + channel]];
+    },
+  });
 }
 
-function parseMeta(bytes: Uint8Array, size: number): Meta {
+function parseMeta(bytes: Uint8Array | undefined, size: number): Meta {
   let meta: Meta;
-  if (bytes.length > SMALL) throw damaged();
+  if (!bytes || bytes.length > SMALL) throw damaged();
   try {
     meta = JSON.parse(new TextDecoder().decode(bytes)) as Meta;
     if (meta.version !== 2) throw new InputError('This SOG is of a version that cannot be read.');
@@ -123,4 +121,81 @@ function paddedBook(book: number[]): number[] {
   const fine = Array.isArray(book) && book.length <= BOOK && book.every((each) => Number.isFinite(each));
   if (!fine) throw damaged();
   return [...book, ...new Array<number>(BOOK - book.length).fill(0)];
+}
+
+const MAX_MEMBERS = 64;
+const SMALL = 1 << 20; // bytes that archives of any size may inflate to
+
+/** The members of an archive by name. Raises InputError for damaged archives. */
+export function unzipped(bytes: Uint8Array): Map<string, Uint8Array> {
+  let [members, whole] = [0, 0];
+  try {
+    const found = unzipSync(bytes, {
+      filter: ({ size, originalSize }) => {
+        whole += Math.max(size, originalSize); // before allocating
+        if (++members > MAX_MEMBERS || whole > 2 * bytes.length + SMALL) throw damaged();
+        return true;
+      },
+    });
+    return new Map(Object.entries(found));
+  } catch {
+    throw damaged();
+  }
+}
+
+const SMALL_IMAGE = 1 << 16; // pixels; larger images may have at most four times the pixels needed
+
+/** Decodes a lossless WebP to RGBA, row by row, not premultiplied by alpha. */
+export type Decode = (webp: Uint8Array) => Promise<Uint8Array>;
+
+/** [count, 4] RGBA of the first pixels of an image, of this `width` if given. Raises InputError. */
+async function pixelsOf(decode: Decode, data: Uint8Array | undefined, count: number, width?: number): Promise<Uint8Array> {
+  if (!data) throw damaged();
+  const [w, h] = sizeOf(data);
+  const fits = w * h >= count && (width === undefined || w === width);
+  if (!fits || w * h > Math.max(SMALL_IMAGE, 4 * count)) throw damaged();
+  const pixels = await decode(data);
+  if (pixels.length !== 4 * w * h) throw damaged();
+  return pixels.subarray(0, 4 * count);
+}
+
+/** By WebGL: a 2D canvas would premultiply by alpha. */
+const decodeInBrowser: Decode = async (webp) => {
+  if (typeof OffscreenCanvas === 'undefined') throw new InputError('This .sog has images, which only browsers decode.');
+  let image: ImageBitmap;
+  try {
+    image = await createImageBitmap(new Blob([webp as BlobPart], { type: 'image/webp' }), {
+      premultiplyAlpha: 'none', colorSpaceConversion: 'none',
+    });
+  } catch {
+    throw damaged();
+  }
+  const gl = new OffscreenCanvas(1, 1).getContext('webgl2');
+  if (gl === null) throw damaged();
+  gl.pixelStorei(gl.UNPACK_PREMULTIPLY_ALPHA_WEBGL, false);
+  gl.pixelStorei(gl.UNPACK_COLORSPACE_CONVERSION_WEBGL, gl.NONE);
+  gl.bindTexture(gl.TEXTURE_2D, gl.createTexture());
+  gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA, gl.RGBA, gl.UNSIGNED_BYTE, image);
+  gl.bindFramebuffer(gl.FRAMEBUFFER, gl.createFramebuffer());
+  gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, gl.getParameter(gl.TEXTURE_BINDING_2D), 0);
+  const pixels = new Uint8Array(4 * image.width * image.height);
+  gl.readPixels(0, 0, image.width, image.height, gl.RGBA, gl.UNSIGNED_BYTE, pixels);
+  const failed = gl.getError() !== gl.NO_ERROR;
+  image.close();
+  gl.getExtension('WEBGL_lose_context')?.loseContext();
+  if (failed) throw damaged();
+  return pixels;
+};
+
+/** [width, height] from the header of a lossless WebP. Raises InputError. */
+function sizeOf(data: Uint8Array): [number, number] {
+  const text = (at: number): string => String.fromCharCode(...data.subarray(at, at + 4));
+  if (data.length < 30 || text(0) !== 'RIFF' || text(8) !== 'WEBP') throw damaged();
+  if (text(12) === 'VP8L') {
+    const bits = viewOf(data).getUint32(21, true);
+    return [(bits & 0x3fff) + 1, ((bits >>> 14) & 0x3fff) + 1];
+  }
+  const three = (at: number): number => data[at] | (data[at + 1] << 8) | (data[at + 2] << 16);
+  if (text(12) === 'VP8X') return [three(24) + 1, three(27) + 1];
+  throw damaged();
 }

@@ -2,8 +2,8 @@
 import { decompress } from 'fzstd';
 import { inflate, viewOf } from '../core/bytes.ts';
 import { damaged, InputError } from '../core/errors.ts';
-import { coefficients, emptyGaussians, type Gaussians } from '../core/gaussians.ts';
-import { fromSmallestThree, holds, logit, mostHeld } from './coded.ts';
+import { coefficients, type Gaussians } from '../core/gaussians.ts';
+import { fromSmallestThree, gaussiansOf, holds, mostHeld } from './coded.ts';
 
 const [LEGACY_BYTES, HEADER_BYTES] = [16, 32];
 const MAX_EXTENSION_BYTES = 1 << 20;
@@ -19,38 +19,26 @@ interface Header {
   readonly fractionalBits: number; // of positions
 }
 
-/** All integers of a file, as bytes. */
+/** All integers of a file. */
 export interface SpzCodes extends Header {
   readonly kind: 'spz';
-  readonly positions: Uint8Array; // [N, 3, 3] 24 bits each
+  readonly positions: Int32Array; // [N, 3] multiples of 2^-fractionalBits
   readonly alphas: Uint8Array; // [N]
   readonly colours: Uint8Array; // [N, 3]
   readonly scales: Uint8Array; // [N, 3] 16ths of log scales
-  readonly rotations: Uint8Array; // [N, 4] a word of 32 bits; version 2: [N, 3]
+  readonly largest: Uint8Array; // [N] index (xyzw) of the component left out
+  readonly rotations: Uint16Array; // [N, 3] the others: 512 (if negative) + magnitude; version 2: 8 bits
   readonly harmonics: Uint8Array; // [N, K - 1, 3]
 }
 
 export async function readSpz(bytes: Uint8Array): Promise<Gaussians & { readonly codes: SpzCodes }> {
   const codes = bytes[0] === 0x1f ? await legacy(bytes) : version4(bytes);
-  return { ...dequantise(codes), codes };
+  return { ...dequantiseSpz(codes), codes };
 }
 
-/** The code of a coordinate, in multiples of 2^-fractionalBits. */
-export function positionCode({ positions }: SpzCodes, row: number, axis: number): number {
-  const at = 9 * row + 3 * axis;
-  return ((positions[at] | (positions[at + 1] << 8) | (positions[at + 2] << 16)) << 8) >> 8;
-}
-
-/** The 32-bit word of a rotation (versions 3 and 4). */
-export function rotationWord({ rotations }: SpzCodes, row: number): number {
-  const at = 4 * row;
-  return (rotations[at] | (rotations[at + 1] << 8) | (rotations[at + 2] << 16) | (rotations[at + 3] << 24)) >>> 0;
-}
-
-/** A component of a rotation word, the last in the lowest bits: -511 to 511. */
-export function rotationPart(word: number, part: number): number {
-  const bits = (word >>> (20 - 10 * part)) & 1023;
-  return (bits & 512 ? -1 : 1) * (bits & MAGNITUDE);
+/** A component of a rotation: -511 to 511. */
+export function rotationPart(code: number): number {
+  return (code & 512 ? -1 : 1) * (code & MAGNITUDE);
 }
 
 function header(bytes: Uint8Array, versions: number[], size: number): Header & { sizes: number[] } {
@@ -103,38 +91,37 @@ function version4(bytes: Uint8Array): SpzCodes {
 
 /** `section` returns the next section, which has `size` bytes. */
 function codesOf({ sizes, ...header }: Header & { sizes: number[] }, section: (size: number) => Uint8Array): SpzCodes {
-  const [positions, alphas, colours, scales, rotations, harmonics] = sizes.map(section);
-  return { kind: 'spz', ...header, positions, alphas, colours, scales, rotations, harmonics };
+  const [places, alphas, colours, scales, words, harmonics] = sizes.map(section);
+  const { count, version } = header;
+  const positions = Int32Array.from({ length: 3 * count }, (_, at) => {
+    return ((places[3 * at] | (places[3 * at + 1] << 8) | (places[3 * at + 2] << 16)) << 8) >> 8;
+  });
+  const [largest, rotations] = [new Uint8Array(count).fill(3), new Uint16Array(3 * count)];
+  if (version === 2) rotations.set(words);
+  for (let row = 0; row < count && version > 2; row++) {
+    const word = viewOf(words).getUint32(4 * row, true);
+    largest[row] = word >>> 30;
+    rotations.set([20, 10, 0].map((shift) => (word >>> shift) & 1023), 3 * row);
+  }
+  return { kind: 'spz', ...header, positions, alphas, colours, scales, largest, rotations, harmonics };
 }
 
-function dequantise(codes: SpzCodes): Gaussians {
-  const { count, shDegree, fractionalBits, alphas, colours, scales, harmonics } = codes;
-  const model = emptyGaussians(count, shDegree);
-  const k = coefficients(shDegree);
-  for (let row = 0; row < count; row++) {
-    for (let axis = 0; axis < 3; axis++) {
-      model.means[3 * row + axis] = positionCode(codes, row, axis) * 2 ** -fractionalBits * (axis ? -1 : 1);
-      model.logScales[3 * row + axis] = scales[3 * row + axis] / 16 - 10;
-      model.sh[3 * k * row + axis] = (colours[3 * row + axis] / 255 - 0.5) / 0.15;
-    }
-    model.opacityLogits[row] = logit(alphas[row]);
-    const [x, y, z, w] = quaternion(codes, row);
-    model.quats.set([w, x, -y, -z], 4 * row);
-    for (let each = 0; each < k - 1; each++) {
-      for (let colour = 0; colour < 3; colour++) {
-        const code = harmonics[3 * ((k - 1) * row + each) + colour];
-        model.sh[3 * (k * row + each + 1) + colour] = ((code - 128) / 128) * SH_SIGNS[each];
-      }
-    }
-  }
-  return model;
-}
-
-function quaternion(codes: SpzCodes, row: number): number[] {
-  if (codes.version === 2) {
-    return fromSmallestThree(3, [0, 1, 2].map((part) => codes.rotations[3 * row + part] / 127.5 - 1));
-  }
-  const word = rotationWord(codes, row);
-  const others = [0, 1, 2].map((part) => rotationPart(word, part) * (Math.sqrt(0.5) / MAGNITUDE));
-  return fromSmallestThree(word >>> 30, others);
+export function dequantiseSpz(codes: SpzCodes): Gaussians {
+  const { count, version, shDegree, fractionalBits, positions, alphas, colours, scales, largest, rotations, harmonics } = codes;
+  const rest = coefficients(shDegree) - 1;
+  const part = (code: number): number =>
+    version === 2 ? code / 127.5 - 1 : rotationPart(code) * (Math.sqrt(0.5) / MAGNITUDE);
+  return gaussiansOf(count, shDegree, {
+    mean: (row, axis) => positions[3 * row + axis] * 2 ** -fractionalBits * (axis ? -1 : 1),
+    logScale: (row, axis) => scales[3 * row + axis] / 16 - 10,
+    quat: (row) => {
+      const [x, y, z, w] = fromSmallestThree(largest[row], Array.from(rotations.subarray(3 * row, 3 * row + 3), part));
+      return [w, x, -y, -z];
+    },
+    opacity: (row) => alphas[row],
+    sh: (row, index, channel) => {
+      if (index === 0) return (colours[3 * row + channel] / 255 - 0.5) / 0.15;
+      return ((harmonics[3 * (rest * row + index - 1) + channel] - 128) / 128) * SH_SIGNS[index - 1];
+    },
+  });
 }

@@ -2,11 +2,12 @@
  * Key derivation and decryption (docs/byte-layout.md); counterpart of `keyss.keys`. Argon2id (RFC 9106) of the key in NFKC
  * without surrounding white space, then HKDF-Expand with SHA-256 (RFC 5869) with a label for each use.
  */
+import { ecb } from '@noble/ciphers/aes.js';
 import { chacha20, chacha20poly1305 } from '@noble/ciphers/chacha.js';
 import { hmac } from '@noble/hashes/hmac.js';
 import { sha256 } from '@noble/hashes/sha2.js';
 import { argon2id } from 'hash-wasm';
-import { ascii, joined, inflate, viewOf } from '../core/bytes.ts';
+import { ascii, inflate, joined, viewOf } from '../core/bytes.ts';
 import { damaged, InputError } from '../core/errors.ts';
 
 export const SALT_BYTES = 16;
@@ -30,15 +31,15 @@ export function master(key: string, salt: Uint8Array): Promise<Uint8Array> {
   return argon2id({ password, salt, iterations: 3, memorySize: 65536, parallelism: 4, hashLength: 32, outputType: 'binary' });
 }
 
-/** `length` bytes for one use of a uniformly random `secret`. */
-export function expand(secret: Uint8Array, label: string, length: number): Uint8Array {
+/** 32 bytes, the first block of HKDF-Expand, for one use of a uniformly random `secret`. */
+export function expand(secret: Uint8Array, label: string): Uint8Array {
   // Not by the library, which refuses secrets of less than 32 bytes; data keys have 16.
-  let [block, found] = [new Uint8Array(0), new Uint8Array(0)] as Uint8Array[];
-  for (let counter = 1; found.length < length; counter++) {
-    block = hmac(sha256, secret, joined(block, ascii(`keyss/v1/${label}`), Uint8Array.of(counter)));
-    found = joined(found, block);
-  }
-  return found.slice(0, length);
+  return hmac(sha256, secret, joined(ascii(`keyss/v1/${label}`), Uint8Array.of(1)));
+}
+
+/** Every 16 bytes through AES-256: a pseudorandom function of blocks, not a mode of operation. */
+export function blockwise(key: Uint8Array, blocks: Uint8Array): Uint8Array {
+  return blocks.length ? ecb(key, { disablePadding: true }).encrypt(blocks) : blocks;
 }
 
 const AT_ONCE = 1 << 16; // bytes of a stream
@@ -47,7 +48,7 @@ const AT_ONCE = 1 << 16; // bytes of a stream
 export function streamWords(
   secret: Uint8Array, label: string, count: number, take: (word: number, at: number) => void,
 ): void {
-  const [key, nonce] = [expand(secret, label, 32), new Uint8Array(12)];
+  const [key, nonce] = [expand(secret, label), new Uint8Array(12)];
   const zeros = new Uint8Array(AT_ONCE);
   const bytes = new Uint8Array(AT_ONCE);
   const view = viewOf(bytes);
@@ -67,7 +68,7 @@ export async function decrypted(
 ): Promise<Uint8Array> {
   let plain: Uint8Array;
   try {
-    plain = chacha20poly1305(expand(dataKey, 'payload', 32), new Uint8Array(12), associated).decrypt(encrypted);
+    plain = chacha20poly1305(expand(dataKey, 'payload'), new Uint8Array(12), associated).decrypt(encrypted);
   } catch {
     throw damaged();
   }
@@ -75,4 +76,37 @@ export async function decrypted(
   if (4 + length > plain.length) throw damaged();
   const most = Math.min(MAX_PAYLOAD_BYTES, MAX_RATIO * length + SMALL_PAYLOAD);
   return inflate(plain.subarray(4, 4 + length), 'deflate', most);
+}
+
+/** `derive` with at most one derivation at a time, since each takes 64 MiB. */
+export function sequential(derive: Derive): Derive {
+  let last: Promise<unknown> = Promise.resolve();
+  return (key, salt) => {
+    const own = last.then(() => derive(key, salt));
+    last = own.catch(() => undefined);
+    return own;
+  };
+}
+
+/** Distributes derivations over several. */
+export function roundRobin(derives: readonly Derive[]): Derive {
+  let next = 0;
+  return (key, salt) => derives[next++ % derives.length](key, salt);
+}
+
+/** In this thread. */
+export const here: Derive = sequential(master);
+
+/** By a worker that answers with 32 bytes or null, asked sequentially. */
+export function deriveInWorker(worker: Worker): Derive {
+  return (key, salt) =>
+    new Promise((resolve, reject) => {
+      worker.onmessage = ({ data }: MessageEvent<Uint8Array | null>) => (data ? resolve(data) : reject(new Error('no memory')));
+      worker.postMessage({ key, salt });
+    });
+}
+
+/** A worker from a blob, the only kind in a single-file page that opens from disk. */
+export function startWorker(source: string): Worker {
+  return new Worker(URL.createObjectURL(new Blob([source], { type: 'text/javascript' })));
 }

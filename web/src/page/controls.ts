@@ -11,7 +11,6 @@ const [NEAREST, FURTHEST] = [1e-4, 1e5];
 
 export class Controls {
   flying = false;
-  touched = false; // whether the user moved the camera
   onRotate = (_: boolean): void => undefined; // receives whether auto-rotation is on
   isRotating = false;
   private frame = 0; // the next animation frame
@@ -88,7 +87,6 @@ export class Controls {
   }
 
   private touch(): void {
-    this.touched = true;
     cancelAnimationFrame(this.frame);
     if (this.isRotating) this.rotate(false);
   }

@@ -1,9 +1,10 @@
 /** Inspection of the public model without a key: filters by opacity, and colours by attribute. */
-import { emptyGaussians, type Gaussians, opacity, where } from '../core/gaussians.ts';
+import { quantile } from '../core/bytes.ts';
+import { type Gaussians, opacity, where, withDegree } from '../core/gaussians.ts';
+import { SH_C0 } from '../files/coded.ts';
 import { count, page } from './panel.ts';
 
 const OPAQUE_LOGIT = 3;
-const SH_C0 = 0.28209479177387814;
 const FAINT = 0.1; // default opacity threshold for `faint`
 const AFTER = 100; // ms after the last change of a slider
 const MIN_DRAWN = 1 / 255; // opacity
@@ -28,7 +29,7 @@ export function inspected(model: Gaussians): Gaussians {
   const [threshold, below] = [Number(page.threshold.value), page.faint.checked];
   const opacities = model.opacityLogits.map(opacity);
   let found = where(model, (row) => opacities[row] < threshold === below);
-  if (page.colouring.value === 'constant colour') found = withoutHarmonics(found);
+  if (page.colouring.value === 'constant colour') found = withDegree(found, 0);
   else if (page.colouring.value !== 'as it is') found = coloured(found, page.colouring.value);
   if (page.opaque.checked) found = { ...found, opacityLogits: found.opacityLogits.map(() => OPAQUE_LOGIT) };
   const faint = opacities.filter((each) => each < MIN_DRAWN).length;
@@ -37,19 +38,11 @@ export function inspected(model: Gaussians): Gaussians {
   return found;
 }
 
-/** The Gaussians without view-dependent colour. */
-function withoutHarmonics(model: Gaussians): Gaussians {
-  const width = model.sh.length / model.count;
-  const sh = new Float32Array(3 * model.count).map((_, at) => model.sh[Math.floor(at / 3) * width + (at % 3)]);
-  return { ...model, shDegree: 0, sh };
-}
-
 /** The Gaussians coloured from blue over green to yellow by an attribute. */
 function coloured(model: Gaussians, by: string): Gaussians {
   const values = Float64Array.from({ length: model.count }, (_, row) => attribute(model, by, row));
-  const sorted = Float64Array.from(values).sort();
-  const [low, high] = [0.02, 0.98].map((share) => sorted[Math.floor(share * (sorted.length - 1))] ?? 0);
-  const found = { ...emptyGaussians(model.count, 0), ...model, shDegree: 0, sh: new Float32Array(3 * model.count) };
+  const [low, high] = [0.02, 0.98].map((share) => quantile(values, share));
+  const found = { ...model, shDegree: 0, sh: new Float32Array(3 * model.count) };
   for (let row = 0; row < model.count; row++) {
     const share = Math.min(1, Math.max(0, (values[row] - low) / (high - low || 1)));
     const colour = [share * share, 0.1 + 0.8 * share, 0.45 + 0.35 * Math.sin(Math.PI * share) - 0.3 * share];

@@ -1,17 +1,18 @@
 /** The page: a published model, a field for a key, and what the key opens. */
+import WORKER from 'source:../worker.ts';
 import type { Gaussians } from '../core/gaussians.ts';
 import { writePly } from '../files/ply.ts';
+import { startWorker } from '../keys/keys.ts';
 import type { HiddenFile } from '../records/reveal.ts';
+import type { Answer, Question } from '../worker.ts';
 import { Controls } from './controls.ts';
-import { notifyParent, params } from './embedding.ts';
-import { type TrainedSide, watch } from './live.ts';
+import { givenModel, notifyParent, params } from './embedding.ts';
 import { inspected, listenToInspection } from './inspection.ts';
-import { Opener } from './opener.ts';
 import { count, page, placeBorder, preparePanel, save, showKey } from './panel.ts';
 import {
-  add, transferPose, axes, FIELD_OF_VIEW, firstPose, pick, type Pose, poseOfHash, poseToHash, UPS, upName, type Vector,
+  add, axes, FIELD_OF_VIEW, firstPose, pick, type Pose, poseOfHash, poseToHash, transferPose, upName, UPS,
+  type Vector,
 } from './pose.ts';
-import { givenModel } from './sources.ts';
 import { Viewer } from './viewer.ts';
 
 const ADDRESS_AFTER = 400; // ms after the last movement
@@ -19,6 +20,39 @@ const MAX_BYTES = 2 ** 31;
 const HAS_SCREEN_KEYBOARD = window.matchMedia('(pointer: coarse)'); // which covers the picture
 const NO_WEBGL = "Your browser doesn't support WebGL 2, which is needed to show the model.";
 const INTERRUPTED = 'The browser interrupted graphics. The picture comes back by itself; if not, reload the page.';
+
+/** Passes questions to the worker that reads files and tries keys, one at a time. */
+class Opener {
+  private readonly worker = startWorker(WORKER);
+  private end = (_: Answer): void => undefined; // answers the pending question
+
+  /** `onProgress` receives the progress of an attempt, 0 to 1, at the same times for every key. */
+  constructor(private readonly onProgress: (share: number) => void) {
+    this.worker.onerror = () => this.end({ error: 'This file cannot be read.' });
+  }
+
+  /** The model in a file, or what a key opens. `transfer`: memory to hand over to the worker. */
+  ask(question: Question, transfer: Transferable[] = []): Promise<Answer> {
+    return new Promise((resolve) => {
+      const { port1, port2 } = new MessageChannel();
+      this.end = (answer) => {
+        port1.close();
+        resolve(answer);
+      };
+      port1.onmessage = ({ data }: MessageEvent<Answer>) => {
+        if (data.progress === undefined) this.end(data);
+        else this.onProgress(data.progress);
+      };
+      this.worker.postMessage(question, [port2, ...transfer]);
+    });
+  }
+
+  /** Cancels the pending question. */
+  stop(): void {
+    this.worker.postMessage({ stop: true } satisfies Question);
+    this.end({ stopped: true });
+  }
+}
 
 class Page {
   private name = 'model';
@@ -88,10 +122,8 @@ class Page {
     });
   }
 
-  /** Opens a running training, or the model in the page, beside it, or in its address. */
+  /** Opens the model in the page, beside it, or in its address. */
   async start(): Promise<void> {
-    const live = document.querySelector<HTMLMetaElement>('meta[name="keyss-live"]')?.content;
-    if (live) return this.watch(live);
     const source = givenModel();
     if (source === null) return this.say('Open a file, or drop one here.');
     if (params.poster) page.poster.src = params.poster;
@@ -102,7 +134,6 @@ class Page {
   }
 
   private async openFile(file: File): Promise<void> {
-    if (page.main.dataset.live !== undefined) return;
     if (file.size > MAX_BYTES) return this.fail('This file is larger than 2 GiB.');
     for (const given of ['pose', 'camera', 'up', 'title']) delete page.main.dataset[given]; // of the first file
     return this.load(new Uint8Array(await file.arrayBuffer()), file.name);
@@ -130,30 +161,6 @@ class Page {
     this.controls.rotate(params.autorotate && !window.matchMedia('(prefers-reduced-motion: reduce)').matches);
   }
 
-  /** Shows the models of a running training, without a field for keys. */
-  private async watch(address: string): Promise<void> {
-    page.main.dataset.live = '';
-    document.title = 'keyss, training';
-    page.facts.textContent = 'A training, as it is now';
-    await watch(address, (text) => this.say(text), (side, ply, anew) => this.showTrained(side, ply, anew));
-  }
-
-  private async showTrained(side: TrainedSide, ply: Uint8Array, anew: boolean): Promise<void> {
-    const { model } = await this.opener.ask({ bytes: ply, keyless: true }, [ply.buffer]);
-    if (model === undefined) return;
-    const share = this.secret ? 1 - Number(page.wipe.value) / 100 : 0;
-    if (side === 'secret') this.showSecret(model, share);
-    else {
-      this.published = model;
-      this.showPublished();
-      this.split(this.secret ? share : 1);
-    }
-    const looks = side === 'secret' || this.secret === null;
-    if (looks && (anew || !this.controls.touched)) this.controls.setPose(this.firstPose());
-    else this.setPose(this.pose);
-    await this.settle();
-  }
-
   /**
    * Wrong keys change nothing, and the same line follows every key. The form is ready again after the quick search,
    * before a secret is decoded and rendered; the thorough search follows for every key.
@@ -170,13 +177,14 @@ class Page {
       this.showSearch(search);
       this.say(search === 'quick' ? 'Trying the key …' : `${said} Searching more thoroughly …`);
       delete page.main.dataset.picture;
-      const { model, file, foreign, stopped } = await this.opener.ask({ key, thorough: search === 'thorough' });
+      const { model, file, elsewhere, foreign, stopped } = await this.opener.ask({ key, thorough: search === 'thorough' });
       if (own !== this.work) return;
       this.showSearch('');
       if (search === 'quick') notifyParent({ event: 'key-tried' });
       if (file || model) notifyParent({ event: 'opened', kind: file ? 'file' : 'model' });
       if (file) said += this.offer(file);
       if (model) said += this.reveal(model);
+      if (elsewhere) said += ' It reveals a model that only keyss reveal opens.';
       if (foreign) said += ` About ${count(foreign)} Gaussians of the file were added or changed: it may not be its secret.`;
       this.say(stopped ? `${said} Search stopped.` : said);
       await this.settle();
@@ -241,7 +249,7 @@ class Page {
 
   /** Sets the share of the width for the published model beside the secret. */
   private split(share: number): void {
-    page.revealed.hidden = this.secret === null || this.published === null; // nothing to wipe with
+    page.revealed.hidden = this.secret === null;
     page.wipe.value = String(100 * (1 - share));
     this.viewer?.setSplit(share);
     placeBorder(share);

@@ -15,7 +15,7 @@ const LARGE = 100_000; // Gaussians; larger models are coarse at first, as all o
 const POLL = 4; // ms
 const AT_REST = 250; // ms without a change until the fine picture
 const ASLEEP = 500; // ms without a frame until the engine stops
-export type Side = 'left' | 'right';
+type Side = 'left' | 'right';
 
 interface Half {
   readonly layer: Layer;

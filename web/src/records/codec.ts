@@ -29,9 +29,6 @@ class Line {
 
 const QUAT_LINE = new Line(0, 0, Math.sqrt(0.5));
 
-/** (columns, bits of each) in the order of a record. */
-type Layout = readonly (readonly [number, number])[];
-
 /** The format of one secret's records. */
 export class Codec {
   private constructor(
@@ -60,65 +57,45 @@ export class Codec {
     return new Codec(bits, lines, far);
   }
 
-  private get layout(): Layout {
-    const [means, logScales, quats, opacity, ...colours] = this.bits;
-    const shape: [number, number][] = [
-      [1, 1], [1, 2], [3, quats], [1, means], [1, means], [1, means], [3, logScales], [1, opacity],
-    ];
-    colours.forEach((bits, band) => shape.push([BANDS[band], bits], [2 * BANDS[band], bits - CHROMA_FEWER]));
-    return shape;
-  }
-
   get recordBytes(): number {
-    return Math.ceil(this.layout.reduce((sum, [columns, bits]) => sum + columns * bits, 0) / 8);
+    const [means, logScales, quats, opacity, ...colours] = this.bits;
+    const geometry = 1 + 2 + 3 * (quats + means + logScales) + opacity;
+    return Math.ceil(colours.reduce((sum, bits, band) => sum + BANDS[band] * (3 * bits - 2 * CHROMA_FEWER), geometry) / 8);
   }
 
   /** The Gaussians of records of any bytes. */
   decode(records: readonly Uint8Array[]): Gaussians {
-    const [{ layout }, found] = [this, emptyGaussians(records.length, this.bits.length - 5)];
-    const codes = new Uint32Array(layout.reduce((sum, [count]) => sum + count, 0));
+    const [means, logScales, quats, opacity, ...colours] = this.bits;
+    const found = emptyGaussians(records.length, colours.length - 1);
     records.forEach((record, row) => {
-      unpackCodes(record, layout, codes);
-      this.put(found, row, codes);
+      const next = codesOf(record);
+      const lines = next(1) ? this.far : this.lines;
+      const decoded = (line: Line, bits: number): number => line.value(next(bits), bits);
+      found.quats.set(wholeQuat(next(2), [0, 1, 2].map(() => decoded(QUAT_LINE, quats))), 4 * row);
+      for (let axis = 0; axis < 3; axis++) found.means[3 * row + axis] = decoded(lines[axis], means);
+      for (let axis = 0; axis < 3; axis++) found.logScales[3 * row + axis] = decoded(lines[3], logScales);
+      found.opacityLogits[row] = decoded(lines[4], opacity);
+      let at = 3 * row * coefficients(found.shDegree);
+      colours.forEach((bits, band) => {
+        const [bright, different] = [lines[5 + 2 * band], lines[6 + 2 * band]];
+        for (const a of Array.from({ length: BANDS[band] }, () => decoded(bright, bits))) {
+          putColours(found.sh, at, a, decoded(different, bits - CHROMA_FEWER), decoded(different, bits - CHROMA_FEWER));
+          at += 3;
+        }
+      });
     });
     return found;
   }
-
-  /** Writes the Gaussian of `codes`, one for each column of the layout, to a row. */
-  private put(to: Gaussians, row: number, codes: ArrayLike<number>): void {
-    const [means, logScales, quatBits, opacity, ...colours] = this.bits;
-    const lines = codes[0] ? this.far : this.lines;
-    const quat = wholeQuat(codes[1], [2, 3, 4].map((at) => QUAT_LINE.value(codes[at], quatBits)));
-    to.quats.set(quat, 4 * row);
-    for (let axis = 0; axis < 3; axis++) {
-      to.means[3 * row + axis] = lines[axis].value(codes[5 + axis], means);
-      to.logScales[3 * row + axis] = lines[3].value(codes[8 + axis], logScales);
-    }
-    to.opacityLogits[row] = lines[4].value(codes[11], opacity);
-    let [at, coefficient] = [12, row * coefficients(to.shDegree)];
-    colours.forEach((bits, band) => {
-      const [bright, different] = [lines[5 + 2 * band], lines[6 + 2 * band]];
-      for (let index = 0; index < BANDS[band]; index++, coefficient++) {
-        const a = bright.value(codes[at + index], bits);
-        const first = at + BANDS[band] + 2 * index;
-        const b = different.value(codes[first], bits - CHROMA_FEWER);
-        const c = different.value(codes[first + 1], bits - CHROMA_FEWER);
-        putColours(to.sh, 3 * coefficient, a, b, c);
-      }
-      at += 3 * BANDS[band];
-    });
-  }
 }
 
-function unpackCodes(record: Uint8Array, layout: Layout, codes: Uint32Array): void {
-  let [bit, column] = [0, 0];
-  for (const [count, bits] of layout) {
-    for (let index = 0; index < count; index++) {
-      let code = 0;
-      for (let left = bits; left > 0; left--, bit++) code = code * 2 + ((record[bit >> 3] >> (7 - (bit & 7))) & 1);
-      codes[column++] = code;
-    }
-  }
+/** A function that returns the next code of so many bits, the most significant bit first. */
+function codesOf(record: Uint8Array): (bits: number) => number {
+  let bit = 0;
+  return (bits) => {
+    let code = 0;
+    for (let left = bits; left > 0; left--, bit++) code = code * 2 + ((record[bit >> 3] >> (7 - (bit & 7))) & 1);
+    return code;
+  };
 }
 
 /** Writes red, green and blue from brightness and two colour differences. */

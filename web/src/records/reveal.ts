@@ -1,18 +1,13 @@
 /** From the content of a channel to what `keyss reveal` gives: a model or a file. */
-import { damaged } from '../core/errors.ts';
 import type { Content } from '../channels/content.ts';
 import { viewOf } from '../core/bytes.ts';
+import { damaged } from '../core/errors.ts';
 import { compensated, type Gaussians } from '../core/gaussians.ts';
 import { decodeKeyss } from '../keyss/secret.ts';
 import { Codec } from './codec.ts';
 import { decodeWhole } from './whole.ts';
 
 const [WHOLE, KEYSS, FILE] = ['carry', 'keyss', 'file']; // methods
-
-export interface Secret {
-  readonly gaussians: Gaussians;
-  readonly hidden: number; // Gaussians before any were lost
-}
 
 export interface HiddenFile {
   readonly name: string; // from the sender: to be shown, never to be used as a path
@@ -26,17 +21,15 @@ export function fileOf(content: Content): HiddenFile | null {
   return { name: new TextDecoder().decode(content.data.subarray(1, 1 + size)), bytes: content.data.slice(1 + size) };
 }
 
-/** The model, found in `stego`; null if the content is not a model. Raises InputError for damage. */
-export function secretOf(content: Content, stego: Gaussians): Secret | null {
+/** The model, found in `stego`; null if the content is none, or none that is opened here. Raises InputError for damage. */
+export function secretOf(content: Content, stego: Gaussians): Gaussians | null {
   if (content.service === 'payload') {
     if (content.method === KEYSS) return decodeKeyss(content.data, stego);
-    if (content.method !== WHOLE) return null;
-    const gaussians = decodeWhole(content.data, stego.count);
-    return { gaussians, hidden: gaussians.count };
+    return content.method === WHOLE ? decodeWhole(content.data, stego.count) : null;
   }
   if (content.header.length < 4) throw damaged();
   const hidden = viewOf(content.header).getUint32(0, true);
   const codec = Codec.unpack(content.header.subarray(4));
   if (content.records[0].length !== codec.recordBytes) throw damaged();
-  return { gaussians: compensated(codec.decode(content.records), hidden), hidden };
+  return compensated(codec.decode(content.records), hidden);
 }

@@ -1,18 +1,17 @@
-/** Reader of appended Gaussians (docs/channels.md); counterpart of `keyss.channels.appended.channel`. */
+/**
+ * Reader of appended Gaussians (docs/channels.md): words of 84 bits, read after a format has rounded them, and packets in words;
+ * counterpart of `keyss.channels.appended.channel`, `words` and `packets`.
+ */
 import { ascii, rowsOf, viewOf } from '../../core/bytes.ts';
 import { damaged } from '../../core/errors.ts';
-import type { Gaussians } from '../../core/gaussians.ts';
-import { decrypted, type Derive, expand } from '../../keys/keys.ts';
-import { here } from '../../keys/pool.ts';
+import { type Gaussians, opacity, where, withDegree } from '../../core/gaussians.ts';
+import { moved, type Similarity } from '../../core/similarity.ts';
+import type { Words } from '../../core/words.ts';
+import { blockwise, decrypted, type Derive, expand, here } from '../../keys/keys.ts';
 import { carriersOf } from '../colours/carriers.ts';
-import { type Payload, type Reader, unpackPayload } from '../content.ts';
-import { decoded } from '../reed_solomon.ts';
-import { foreign } from '../sketch.ts';
-import {
-  allShifts, candidates, coloursOf, inOwnFrame, invariantsOf, likelyShifts, scalesAt, scaleSteps,
-} from './lattice.ts';
-import { readHeader, readPackets, type TaggedWords, WIDTHS, wordsOfPoints } from './packets.ts';
-import { type Found, LEAST, ONE_IN, pilotsOf, readPilots } from './pilots.ts';
+import { foreign, type Payload, type Reader, unpackPayload } from '../content.ts';
+import { type Codewords, decoded } from '../reed_solomon.ts';
+import { type Found, LEAST, ONE_IN, pilotsOf, POSITION_BITS, readPilots } from './pilots.ts';
 
 // Gaussians sampled for pilots; number of lattice offsets tried, with at least this many standard deviations more pilots
 // than by chance.
@@ -24,15 +23,14 @@ const ASSOCIATED = ascii('keyss/v1/appended/data');
 export class AppendedReader implements Reader {
   readonly derivations = 1;
 
-  private constructor(
-    readonly salt: Uint8Array, private readonly words: TaggedWords, private readonly ids: Uint8Array,
-  ) {}
+  private constructor(readonly salt: Uint8Array, private readonly words: Uint8Array, private readonly ids: Uint8Array) {}
 
   /** Null if there are none, or if their frame cannot be found. */
   static of(model: Gaussians): AppendedReader | null {
     const faint = candidates(model);
     if (faint.count < LEAST / 4) return null;
-    const [colours, steps] = [coloursOf(faint), scaleSteps(faint)];
+    const colours = Uint8Array.from(faint.sh, (each) => nearest(each / COLOUR_STEP + 2 ** (COLOUR_BITS - 1) - 0.5, COLOUR_BITS));
+    const steps = Float64Array.from(faint.logScales, (each) => each / SCALE_STEP); // of their lattice, which lies anywhere
     for (const shifts of [likelyShifts, shiftsWithPilots]) {
       let best: { found: Found; scales: Uint8Array } | null = null;
       for (const shift of shifts(steps, colours)) {
@@ -53,14 +51,14 @@ export class AppendedReader implements Reader {
   async open(key: string, derive: Derive = here): Promise<Payload | null> {
     const secret = await derive(key, this.salt);
     for (const width of WIDTHS) {
-      const codewords = readHeader(expand(secret, `appended/header/${width}`, 32), this.words, width);
+      const codewords = readHeader(expand(secret, `appended/header/${width}`), this.words, width);
       if (codewords === null) continue;
-      const packets = readPackets(expand(secret, 'appended/packets', 32), this.words, width);
+      const packets = readPackets(expand(secret, 'appended/packets'), this.words, width);
       const encrypted = decoded(codewords, packets, true);
-      const whole = await decrypted(expand(secret, 'appended/data', 32), encrypted, ASSOCIATED);
+      const whole = await decrypted(expand(secret, 'appended/data'), encrypted, ASSOCIATED);
       if (whole.length < HOST_BYTES) throw damaged();
       const own = whole.subarray(4, HOST_BYTES);
-      const told = foreign(expand(secret, 'appended/host', 32), this.ids, own, viewOf(whole).getUint32(0, true));
+      const told = foreign(expand(secret, 'appended/host'), this.ids, own, viewOf(whole).getUint32(0, true));
       const payload = unpackPayload(whole.subarray(HOST_BYTES));
       return told > (FOREIGN * this.ids.length) / 16 ? { ...payload, foreign: told } : payload;
     }
@@ -81,4 +79,152 @@ function shiftsWithPilots(steps: Float64Array, colours: Uint8Array): number[] {
     .sort((a, b) => b.pilots - a.pilots)
     .slice(0, TRIED)
     .map(({ shift }) => shift);
+}
+
+const WIDTHS = [8, 6]; // data bytes per packet
+const HEADER_BITS = 20;
+const WORD_BYTES = 11;
+const MAX_DATA = 5895; // packets per codeword
+const [LEFT, DEVIATIONS] = [0.74, 4.2]; // expected share of surviving packets, and the margin
+const AGREEING_HEADERS = 12; // fewer agree by chance among a million words
+
+/** [N, WORD_BYTES] words of colours, scales [N, 3] and positions and turns [N, 6]; the last four bits are zero. */
+function wordsOfPoints(colours: Uint8Array, scales: Uint8Array, others: Uint16Array): Uint8Array {
+  const count = colours.length / 3;
+  const bytes = new Uint8Array(WORD_BYTES * count);
+  const view = new DataView(bytes.buffer);
+  for (let row = 0; row < count; row++) {
+    const [r, g, b] = colours.subarray(3 * row, 3 * row + 3);
+    const [u, v, w] = scales.subarray(3 * row, 3 * row + 3);
+    const [x, y, z, i, j, k] = others.subarray(6 * row, 6 * row + 6);
+    const at = WORD_BYTES * row;
+    // 7 + 7 + 7 + 6 + 5 bits, then 1 + 6 + 10 + 10 + 5, then 5 + 5 + 5 + 1 and 4.
+    view.setUint32(at, (r << 25) | (g << 18) | (b << 11) | (u << 5) | (v >> 1));
+    view.setUint32(at + 4, ((v & 1) << 31) | (w << 25) | (x << 15) | (y << 5) | (z >> 5));
+    view.setUint16(at + 8, ((z & 31) << 11) | (i << 6) | (j << 1) | (k >> 4));
+    bytes[at + 10] = (k & 15) << 4;
+  }
+  return bytes;
+}
+
+/** [number, data] of each word, data bytes and then a tag, as if all were packets. */
+function readPackets(key: Uint8Array, bytes: Uint8Array, width: number): [number, Uint8Array][] {
+  const [count, found] = [bytes.length / WORD_BYTES, [] as [number, Uint8Array][]];
+  const blocks = new Uint8Array(16 * count);
+  for (let row = 0; row < count; row++) blocks.set(bytes.subarray(WORD_BYTES * row, WORD_BYTES * row + width), 16 * row);
+  const encrypted = blockwise(key, blocks);
+  for (let row = 0; row < count; row++) {
+    let tag = 0;
+    for (let byte = 0; byte < WORD_BYTES - width; byte++) {
+      tag = 256 * tag + (bytes[WORD_BYTES * row + width + byte] ^ encrypted[16 * row + byte]); // may pass 2^32
+    }
+    found.push([Math.floor(tag / 16), blocks.subarray(16 * row, 16 * row + width)]);
+  }
+  return found;
+}
+
+/** The codewords by majority of the headers; null if too few agree. */
+function readHeader(key: Uint8Array, words: Uint8Array, width: number): Codewords | null {
+  const votes = new Uint32Array(1 << HEADER_BITS);
+  for (const [number] of readPackets(key, words, width)) if (number < votes.length) votes[number]++;
+  const header = votes.reduce((best, each, value) => (each > votes[best] ? value : best), 0);
+  if (!(votes[header] >= AGREEING_HEADERS && header > 0)) return null;
+  const count = Math.ceil(header / MAX_DATA);
+  const k = Math.ceil(header / count);
+  let n = k;
+  while (n * LEFT - DEVIATIONS * Math.sqrt(n * LEFT * (1 - LEFT)) < k) n++;
+  return { count, n, k, width };
+}
+
+const [COLOUR_BITS, SCALE_BITS, TURN_BITS] = [7, 6, 5];
+const [FAINTEST, STRONGEST] = [0.4 / 255, 1.6 / 255]; // after rounding
+const [COLOUR_STEP, SCALE_STEP] = [0.0275, 0.08];
+const TURNS_REACH = (256 / 511) * Math.SQRT1_2; // bound of x, y and z, so that w is the largest
+const [FARTHEST, MAX_SHIFTS] = [1 << 12, 500]; // steps of log scales: range, and number of offsets tried
+
+/** The Gaussians as faint as appended ones, without harmonics. */
+function candidates(model: Gaussians): Gaussians {
+  const faint = where(model, (row) => {
+    const own = opacity(model.opacityLogits[row]);
+    return own > FAINTEST && own < STRONGEST;
+  });
+  return withDegree(faint, 0);
+}
+
+/** [N, 3] the nearest lattice points of log scales, of a lattice that begins at `shift`. */
+function scalesAt(steps: Float64Array, shift: number): Uint8Array {
+  return Uint8Array.from(steps, (each) => nearest(each - shift, SCALE_BITS));
+}
+
+/** Where the lattice may begin if most of the log scales lie on it, the likeliest first. */
+function likelyShifts(steps: Float64Array): number[] {
+  let [cosines, sines] = [0, 0];
+  for (const each of steps) {
+    cosines += Math.cos(2 * Math.PI * each);
+    sines += Math.sin(2 * Math.PI * each);
+  }
+  const phase = Math.atan2(sines, cosines) / (2 * Math.PI);
+  const counts = new Uint32Array(2 * FARTHEST + 1);
+  for (const each of steps) counts[Math.max(-FARTHEST, Math.min(FARTHEST, Math.round(each - phase))) + FARTHEST]++;
+  let [inside, most, best] = [0, -1, 0]; // of the levels up to `last`
+  for (let last = 0; last < counts.length + 2 ** SCALE_BITS - 1; last++) {
+    inside += (counts[last] ?? 0) - (counts[last - 2 ** SCALE_BITS] ?? 0);
+    if (inside > most) [most, best] = [inside, last];
+  }
+  const first = best - 2 ** SCALE_BITS + 1 - FARTHEST;
+  return [0, 1, -1, 2, -2].map((each) => first + phase + each);
+}
+
+/** Possible offsets of the lattice if only some log scales lie on it. */
+function allShifts(steps: Float64Array): number[] {
+  const sorted = steps.map((each) => Math.max(-FARTHEST, Math.min(FARTHEST, each))).sort();
+  const [low, high] = [0.01, 0.99].map((share) => sorted[Math.round(share * (sorted.length - 1))]);
+  const end = Math.max(Math.min(high - 2 ** (SCALE_BITS - 2), low + MAX_SHIFTS), low);
+  const found: number[] = [];
+  for (let shift = low - 2 ** (SCALE_BITS - 1); shift < end; shift += 0.25) found.push(shift);
+  return found;
+}
+
+/** [N] the first 39 bits of words, colours and scales [N, 3]: invariant under similarity transforms. */
+function invariantsOf(colours: Uint8Array, scales: Uint8Array): Words {
+  const found = new Uint32Array((2 * colours.length) / 3);
+  for (let row = 0; row < colours.length / 3; row++) {
+    const at = 3 * row;
+    const colour = (colours[at] << 14) | (colours[at + 1] << 7) | colours[at + 2]; // 21 bits
+    const scale = (scales[at] << 12) | (scales[at + 1] << 6) | scales[at + 2]; // 18 bits
+    found[2 * row] = (colour << 18) | scale;
+    found[2 * row + 1] = colour >>> 14;
+  }
+  return found;
+}
+
+/** [N, 6] nearest lattice points of positions and rotations; `toOwn`: from the world to the own frame. */
+function inOwnFrame(faint: Gaussians, toOwn: Similarity): Uint16Array {
+  const found = new Uint16Array(6 * faint.count);
+  const { means, quats } = moved(toOwn, faint);
+  for (let row = 0; row < faint.count; row++) {
+    for (let axis = 0; axis < 3; axis++) {
+      found[6 * row + axis] = nearest(means[3 * row + axis] * 2 ** POSITION_BITS - 0.5, POSITION_BITS);
+    }
+    const turned = [...quats.subarray(4 * row, 4 * row + 4)];
+    withLargestW(turned).slice(1).forEach((part, axis) => {
+      found[6 * row + 3 + axis] = nearest(((part + TURNS_REACH) / (2 * TURNS_REACH)) * 2 ** TURN_BITS - 0.5, TURN_BITS);
+    });
+  }
+  return found;
+}
+
+const ORDER = [[0, 1, 2, 3], [1, 0, 3, 2], [2, 3, 0, 1], [3, 2, 1, 0]]; // q, q i, q j, q k
+const SIGNS = [[1, 1, 1, 1], [-1, 1, 1, -1], [-1, -1, 1, 1], [-1, 1, -1, 1]];
+
+/** The unit quaternion wxyz of the same ellipsoid with w the largest component. */
+function withLargestW(quat: number[]): number[] {
+  const length = Math.max(1e-30, Math.hypot(...quat));
+  const largest = [0, 1, 2, 3].reduce((a, b) => (Math.abs(quat[b]) > Math.abs(quat[a]) ? b : a));
+  const found = ORDER[largest].map((part, at) => (quat[part] / length) * SIGNS[largest][at]);
+  return found[0] < 0 ? found.map((each) => -each) : found;
+}
+
+function nearest(steps: number, bits: number): number {
+  return Math.max(0, Math.min(2 ** bits - 1, Math.round(steps)));
 }

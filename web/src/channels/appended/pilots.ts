@@ -1,12 +1,11 @@
-/** Pilots: appended Gaussians readable without a key; counterpart of `keyss.channels.appended.pilots`. */
+/** Pilots: appended Gaussians readable without a key, and the frame that they give; counterpart of `keyss.channels.appended.pilots`. */
 import { mostFrequent, rowsOf } from '../../core/bytes.ts';
-import { movedPoint, type Similarity } from '../../core/similarity.ts';
+import { fittedRotation, movedPoint, rotationOf, type Similarity } from '../../core/similarity.ts';
 import { mix, type Words } from '../../core/words.ts';
 import { SALT_BYTES } from '../../keys/keys.ts';
-import { fittedSimilarity } from './fitting.ts';
-import { POSITION_BITS } from './lattice.ts';
 
 export const LEAST = 128; // pilots per model
+export const POSITION_BITS = 10; // per axis of the own frame
 export const ONE_IN = 64; // words are pilots by chance
 const [PUBLIC_LOW, PUBLIC_HIGH] = [0x73617070, 0x6b657973]; // domain separation of the hash
 const PARTS = SALT_BYTES / 2;
@@ -97,4 +96,37 @@ function placeOf(invariants: Words, row: number): number[] {
   const [low, high] = publicHash(invariants, row);
   const place = mix(low, high)[1];
   return [place >>> 22, (place >>> 12) & 1023, (place >>> 2) & 1023].map((each) => (each + 0.5) / 2 ** POSITION_BITS);
+}
+
+/**
+ * The similarity from `source` [P, 3] to `target` with least squared error; null if degenerate. The scale is
+ * the value of the rotation's fit divided by the spread of `source` (Umeyama 1991).
+ */
+export function fittedSimilarity(
+  source: ArrayLike<number>, target: ArrayLike<number>, rows: ArrayLike<number>,
+): Similarity | null {
+  const [centre, goal] = [middle(source, rows), middle(target, rows)];
+  const m = new Float64Array(9); // [3, 3] sums of products of source and target
+  let spread = 0;
+  for (let index = 0; index < rows.length; index++) {
+    for (let i = 0; i < 3; i++) {
+      const a = source[3 * rows[index] + i] - centre[i];
+      spread += a * a;
+      for (let j = 0; j < 3; j++) m[3 * i + j] += a * (target[3 * rows[index] + j] - goal[j]);
+    }
+  }
+  const { value, vector } = fittedRotation(m);
+  const scale = value / spread;
+  if (!(spread > 0 && scale > 0 && Number.isFinite(scale) && vector.every(Number.isFinite))) return null;
+  const turned = { scale, rotation: rotationOf(vector), translation: [0, 0, 0] };
+  const away = movedPoint(turned, centre);
+  return { ...turned, translation: goal.map((each, axis) => each - away[axis]) };
+}
+
+function middle(points: ArrayLike<number>, rows: ArrayLike<number>): number[] {
+  return [0, 1, 2].map((axis) => {
+    let sum = 0;
+    for (let index = 0; index < rows.length; index++) sum += points[3 * rows[index] + axis];
+    return sum / rows.length;
+  });
 }

@@ -1,12 +1,12 @@
-/** Gaussians that carry bits, and IDs; counterpart of `keyss.channels.colours.carriers`. */
-import { ecb } from '@noble/ciphers/aes.js';
-import { rowsOf } from '../../core/bytes.ts';
+/** Gaussians that carry bits, IDs, and salts; counterpart of `keyss.channels.colours.carriers` and `salt_gaussians`. */
+import { sha256 } from '@noble/hashes/sha2.js';
+import { ascii, bytesKey, joined, rowsOf } from '../../core/bytes.ts';
 import { type Gaussians, opacity, where, withDegree } from '../../core/gaussians.ts';
 import { multiplicities, type Words, wordsOf } from '../../core/words.ts';
-import { expand } from '../../keys/keys.ts';
+import { blockwise, expand, SALT_BYTES } from '../../keys/keys.ts';
 
-export const [SCALE_STEPS, COLOUR_STEPS, OPACITY_STEPS] = [16, 38.25, 255]; // quantisation steps of 8-bit formats per unit
-export const [COLOUR_NOISE, OPACITY_NOISE] = [0.344, 1.02]; // maximum rounding error, in steps
+const [SCALE_STEPS, COLOUR_STEPS, OPACITY_STEPS] = [16, 38.25, 255]; // quantisation steps of 8-bit formats per unit
+const [COLOUR_NOISE, OPACITY_NOISE] = [0.344, 1.02]; // maximum rounding error, in steps
 const SCALE_NOISE = 0.144;
 const [RATIO_CELL, OPACITY_CELL, RED_CELL] = [4, 8, 3]; // steps
 const MIN_OPACITY = 2.5 / 255;
@@ -25,14 +25,10 @@ export interface Carriers {
   readonly idCounts: Float64Array; // [C] carriers with the same ID, itself included
 }
 
-/** The visible and finite Gaussians. `alignment`: offset of log scales, in steps, to undo a scaling of the model. */
+/** The visible Gaussians. `alignment`: offset of log scales, in steps, to undo a scaling of the model. */
 export function carriersOf(model: Gaussians, alignment = 0): Carriers {
   const bare = withDegree(model, 0);
-  const seen = where(bare, (row) => {
-    let sum = 0; // finite if all are
-    for (let axis = 0; axis < 3; axis++) sum += bare.logScales[3 * row + axis] + bare.sh[3 * row + axis];
-    return Number.isFinite(sum) && Math.fround(opacity(bare.opacityLogits[row])) > MIN_OPACITY;
-  });
+  const seen = where(bare, (row) => Math.fround(opacity(bare.opacityLogits[row])) > MIN_OPACITY);
   const [logScales, colours] = [Float64Array.from(seen.logScales), Float64Array.from(seen.sh)];
   const opacities = Float64Array.from(seen.opacityLogits, (logit) => Math.fround(opacity(logit)));
   const ids = new Int16Array(ID_VALUES * seen.count);
@@ -55,7 +51,7 @@ export function carriersOf(model: Gaussians, alignment = 0): Carriers {
 }
 
 /** The cell of width `steps` of a value, and the probability that noise moved it there. */
-export function cellOf(value: number, steps: number, noise: number): [number, number] {
+function cellOf(value: number, steps: number, noise: number): [number, number] {
   const cell = Math.floor(value / steps);
   const inside = value - cell * steps;
   const nearest = Math.min(inside, steps - inside);
@@ -74,8 +70,7 @@ export function chosen({ logScales, opacities, colours, ids, errorProbability, i
 /** [C, 2] words for ids [C, ID_VALUES], pseudo-random without the secret: AES-256 of the IDs. */
 export function randomPairs(secret: Uint8Array, label: string, ids: Int16Array): Words {
   const bytes = new Uint8Array(ids.buffer, ids.byteOffset, ids.byteLength);
-  if (!bytes.length) return new Uint32Array(0);
-  return wordsOf(ecb(expand(secret, `colours/${label}`, 32), { disablePadding: true }).encrypt(bytes));
+  return wordsOf(blockwise(expand(secret, `colours/${label}`), bytes));
 }
 
 /** [C, 2] numbers in [0, 1) for ids [C, ID_VALUES]. */
@@ -84,4 +79,40 @@ export function fractions(secret: Uint8Array, label: string, ids: Int16Array): F
   return Float64Array.from({ length: words.length >> 1 }, (_, at) => {
     return (words[2 * at + 1] * 2 ** 21 + (words[2 * at] >>> 11)) / 2 ** 53;
   });
+}
+
+const SALTS = 16; // at most
+const BANDS = [0.08, 0.4, 1.01]; // limits of two opacity bands with half of the salts each
+const [SALT_OPACITY_CELL, SALT_RATIO_CELL, SALT_COLOUR_CELL] = [16, 8, 5]; // steps
+const LABEL = ascii('keyss/v1/colours-salt');
+
+/** Up to 16 salts of 16 bytes. */
+export function saltsOf({ count, logScales, opacities, colours }: Carriers): Uint8Array[] {
+  const cells = new Int16Array(6 * count);
+  const ids = new Int16Array(8 * count); // the first four cells, zero-padded to a block of AES
+  const stable = Array.from({ length: count }, (_, row) => {
+    const ratio = (axis: number) => (logScales[3 * row + axis + 1] - logScales[3 * row + axis]) * SCALE_STEPS - 0.5;
+    const own = [
+      cellOf(opacities[row] * OPACITY_STEPS - 0.5, SALT_OPACITY_CELL, OPACITY_NOISE),
+      ...[0, 1].map((axis) => cellOf(ratio(axis), SALT_RATIO_CELL, 1)),
+      ...[0, 1, 2].map((column) => cellOf(colours[3 * row + column] * COLOUR_STEPS, SALT_COLOUR_CELL, COLOUR_NOISE)),
+    ];
+    own.forEach(([cell], column) => (cells[6 * row + column] = cell));
+    ids.set(cells.subarray(6 * row, 6 * row + 4), 8 * row);
+    return own.slice(0, 4).every(([, errorProbability]) => errorProbability === 0);
+  });
+  const hashes = fractions(sha256(LABEL), 'salt', ids);
+  const salts = new Map<string, Uint8Array>();
+  BANDS.slice(1).forEach((high, band) => {
+    const listed = new Map<number, number>(); // the first Gaussian with each hash
+    opacities.forEach((each, row) => {
+      const hash = hashes[2 * row];
+      if (stable[row] && each > BANDS[band] && each <= high && !listed.has(hash)) listed.set(hash, row);
+    });
+    for (const [, row] of [...listed].sort(([a], [b]) => a - b).slice(0, SALTS / (BANDS.length - 1))) {
+      const salt = sha256(joined(LABEL, new Uint8Array(cells.slice(6 * row, 6 * row + 6).buffer))).slice(0, SALT_BYTES);
+      salts.set(bytesKey(salt), salt);
+    }
+  });
+  return [...salts.values()];
 }

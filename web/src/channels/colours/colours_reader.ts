@@ -1,15 +1,14 @@
-/** Reader of colours (docs/channels.md); counterpart of `keyss.channels.colours.colours_reader`. */
-import { ascii } from '../../core/bytes.ts';
+/** Reader of colours (docs/channels.md); counterpart of `keyss.channels.colours.colours_reader`, `header` and `qim`. */
+import { hmac } from '@noble/hashes/hmac.js';
+import { sha256 } from '@noble/hashes/sha2.js';
+import { ascii, joined, quantile } from '../../core/bytes.ts';
 import { InputError, tooMuchLost } from '../../core/errors.ts';
 import type { Gaussians } from '../../core/gaussians.ts';
-import { decrypted, type Derive } from '../../keys/keys.ts';
-import { here } from '../../keys/pool.ts';
+import { mix, type Words } from '../../core/words.ts';
+import { decrypted, type Derive, expand, here, SALT_BYTES } from '../../keys/keys.ts';
 import { type Payload, type Reader, unpackPayload } from '../content.ts';
-import { type Carriers, carriersOf, chosen } from './carriers.ts';
-import { Fountain } from './fountain.ts';
-import { type Header, ownRows, packBits, readHeader, type Secrets, secretsOf, shiftOf, STATIC_SALT } from './header.ts';
-import { bitCounts, COLUMNS, ONE, readBits, seedsOf } from './qim.ts';
-import { saltsOf } from './salt_gaussians.ts';
+import { type Carriers, carriersOf, chosen, fractions, randomPairs, saltsOf } from './carriers.ts';
+import { Fountain, NOISY } from './fountain.ts';
 
 const ASSOCIATED = ascii('keyss/v1/colours');
 const CHANGED = 0.03; // share of carriers overwritten since
@@ -64,4 +63,186 @@ async function payload(header: Header, secrets: Secrets, carriers: Carriers, shi
     if (error instanceof InputError) return null;
     throw error;
   }
+}
+
+const STATIC_SALT = sha256(ascii('keyss/v1/colours-static')).slice(0, SALT_BYTES);
+const FILE_KEY_BYTES = 5;
+const SHARES = 256; // parts of the carriers, shared out to payloads
+const IDLE = 1 / 255; // unit of the share of unmodified carriers
+const PLACES = 80; // Gaussians of a header under each salt
+const PILOTS = 10; // places whose bits are known
+const DEPTHS = [1, 2]; // bits per value
+const PLAIN_BYTES = FILE_KEY_BYTES + 6;
+const CHECK_BYTES = 2;
+const PRIOR = 0.4; // prior log odds that a salt is genuine
+const TRIES = 3; // rounds of reweighting salts
+const DECODED = 0.3; // weight of decoded bits relative to known ones
+const HELD = 0.5; // probability that a place is intact
+const MEDIAN_STEPS = 8; // per unit of the median impact
+const CODE = new Fountain(8 * (PLAIN_BYTES + CHECK_BYTES), NOISY);
+
+/** The secrets of one key in one file: one shared by all files, and one per salt. */
+interface Secrets {
+  readonly fixed: Uint8Array;
+  readonly salted: readonly Uint8Array[];
+}
+
+/** From the keys derived under STATIC_SALT and under each salt. */
+function secretsOf([first, ...others]: readonly Uint8Array[]): Secrets {
+  return { fixed: expand(first, 'colours/static'), salted: others.map((each) => expand(each, 'colours/header')) };
+}
+
+/** Parameters for reading a payload. */
+interface Header {
+  readonly key: Uint8Array; // of the payload
+  readonly partition: Uint8Array; // assigns carriers to parts
+  readonly level: number; // of `bitCounts`
+  readonly first: number; // of SHARES that the payload has,
+  readonly last: number; // this one included
+  readonly size: number; // bytes of the payload
+  readonly occupancy: number; // share of its carriers in use
+  readonly median: number; // of impacts when it was written, in MEDIAN_STEPS, without multiples of 256
+}
+
+/** Null if there is none; one attempt in 2^16 finds one by chance, which opens nothing. */
+function readHeader(secrets: Secrets, carriers: Carriers): Header | null {
+  const places = secrets.salted.map((secret) => placesOf(secret, carriers));
+  const [one, two] = DEPTHS.map((depth) => readAt(depth, secrets, carriers, places));
+  return one ?? two;
+}
+
+/** The header with `depth` bits in each number of its places. */
+function readAt(depth: number, { fixed, salted }: Secrets, carriers: Carriers, places: readonly Places[]): Header | null {
+  const [words, hints, owners]: [number[], number[], number[]] = [[], [], []];
+  const odds = salted.map((secret, salt) => {
+    const { rows, pilots } = places[salt];
+    const own = chosen(carriers, rows);
+    const bits = new Uint8Array(rows.length).fill(depth);
+    const seeds = seedsOf(secret, 'header-seeds', own, bits);
+    let sum = PRIOR;
+    readBits(secret, own, bits).forEach((read, at) => {
+      const place = Math.floor(at / (COLUMNS * depth));
+      const hint = (HELD * (1 - own.errorProbability[place]) * read) / own.idCounts[place];
+      if (pilots[place]) {
+        sum += Math.log1p(hint);
+      } else {
+        hints.push(hint);
+        words.push(seeds[2 * at], seeds[2 * at + 1]);
+        owners.push(salt);
+      }
+    });
+    return sum;
+  });
+  const seeds = Uint32Array.from(words);
+  const agreement = new Float64Array(odds.length);
+  let header: Header | null = null;
+  for (let attempt = 0; attempt < TRIES; attempt++) { // no early exit, so that right and wrong keys take equally long
+    const trust = odds.map((each, salt) => 1 / (1 + Math.exp(-each - DECODED * agreement[salt])));
+    const decoded = CODE.decode(seeds, hints.map((hint, at) => hint * trust[owners[at]]));
+    const data = packBits(decoded);
+    const check = hmac(sha256, expand(fixed, 'colours/check'), data.subarray(0, PLAIN_BYTES));
+    if (!header && data.subarray(PLAIN_BYTES).every((each, at) => each === check[at])) header = unpacked(fixed, data);
+    agreement.fill(0);
+    CODE.encode(decoded, seeds).forEach((bit, at) => (agreement[owners[at]] += Math.log1p(bit ? -hints[at] : hints[at])));
+  }
+  return header;
+}
+
+function unpacked(fixed: Uint8Array, data: Uint8Array): Header {
+  const [level, first, last, bucket, idle, middle] = data.subarray(FILE_KEY_BYTES, PLAIN_BYTES);
+  const partition = data.slice(0, FILE_KEY_BYTES);
+  const key = expand(joined(fixed, partition), 'colours/data-key');
+  const size = (16 + (bucket % 16)) << (Math.floor(bucket / 16) + 1); // 32 to 2 million
+  return { key, partition, level, first, last, size, occupancy: 1 - idle * IDLE, median: middle };
+}
+
+/** [C] the payload's carriers, without those of headers. */
+function ownRows(header: Header, { salted }: Secrets, carriers: Carriers): number[] {
+  const taken = new Set(salted.flatMap((secret) => placesOf(secret, carriers).rows));
+  const parts = fractions(header.partition, 'partition', carriers.ids);
+  return [...Array(carriers.count).keys()].filter((row) => {
+    const part = Math.floor(SHARES * parts[2 * row]);
+    return part >= header.first && part <= header.last && !taken.has(row);
+  });
+}
+
+/** Increase of the median impact since the header was written. */
+function shiftOf(header: Header, { impact }: Carriers): number {
+  const off = MEDIAN_STEPS * quantile(impact, 0.5) - header.median + 128;
+  return (off - Math.floor(off / 256) * 256 - 128) / MEDIAN_STEPS;
+}
+
+/** The carriers with the PLACES IDs chosen by a secret, and which of them are pilots. */
+interface Places {
+  readonly rows: readonly number[];
+  readonly pilots: readonly boolean[];
+}
+
+function placesOf(secret: Uint8Array, { ids }: Carriers): Places {
+  const numbers = fractions(secret, 'places', ids).filter((_, at) => at % 2 === 0);
+  const least: number[] = [];
+  for (const each of numbers.slice().sort()) {
+    if (each !== least.at(-1) && least.push(each) > PLACES) break;
+  }
+  const rows = [...numbers.keys()].filter((row) => numbers[row] < (least[PLACES] ?? 1));
+  return { rows, pilots: rows.map((row) => numbers[row] < (least[PILOTS] ?? 1)) };
+}
+
+/** Packs bits into bytes, most significant first. */
+function packBits(bits: Uint8Array): Uint8Array {
+  const bytes = new Uint8Array(Math.ceil(bits.length / 8));
+  bits.forEach((bit, at) => (bytes[at >> 3] |= bit << (7 - (at & 7))));
+  return bytes;
+}
+
+const COLUMNS = 2; // modulated values per Gaussian
+const ONE = 0; // level at which every value carries one bit
+const MAX_BITS = 5; // per value
+const SPACING = 0.0275; // between neighbouring points
+const BIT = Math.log(4); // in impact; a level is a quarter of a bit
+const MIDDLE = 24; // level at which an impact of zero carries nothing
+const NOISE = 0.23; // standard deviation of rounding, in spacings
+const POINTS = [-1, 0, 1, 2]; // candidate points, relative to the one below
+
+/** [C] bits per value of carriers: more at higher levels, one less per factor 4 of impact. */
+function bitCounts(impact: Float64Array, level: number): Uint8Array {
+  if (level === ONE) return new Uint8Array(impact.length).fill(1);
+  return Uint8Array.from(impact, (each) => Math.max(0, Math.min(MAX_BITS, Math.floor((level - MIDDLE) / 4 - each / BIT))));
+}
+
+/** [B] the seeds of all bits of carriers, for the fountain; `bits` [C]: of each number. */
+function seedsOf(secret: Uint8Array, label: string, { ids }: Carriers, bits: Uint8Array): Words {
+  const [pairs, found] = [randomPairs(secret, label, ids), [] as number[]];
+  bits.forEach((count, row) => {
+    for (let column = 0; column < COLUMNS; column++) {
+      for (let bit = 0; bit < count; bit++) {
+        const [low, high] = mix(column * MAX_BITS + bit);
+        found.push(...mix(pairs[4 * row] ^ low, pairs[4 * row + 1] ^ high));
+      }
+    }
+  });
+  return Uint32Array.from(found);
+}
+
+/** [B] P(0) - P(1) of all bits of carriers, `bits` [C] in each number. */
+function readBits(secret: Uint8Array, { ids, colours }: Carriers, bits: Uint8Array): Float64Array {
+  const [dithers, found] = [fractions(secret, 'dither', ids), [] as number[]];
+  bits.forEach((count, row) => {
+    const period = 2 ** count;
+    for (let column = 0; column < COLUMNS; column++) {
+      const off = colours[3 * row + 1 + column] / SPACING - dithers[COLUMNS * row + column] * period;
+      const place = off - Math.floor(off / period) * period;
+      const points = POINTS.map((each) => Math.floor(place) + each);
+      const weights = points.map((point) => Math.exp(-((place - point) ** 2) / (2 * NOISE ** 2)));
+      const all = weights.reduce((sum, each) => sum + each);
+      for (let bit = count - 1; bit >= 0; bit--) {
+        const signed = weights.map((weight, at) => {
+          const label = points[at] & (period - 1);
+          return ((label ^ (label >> 1)) >> bit) & 1 ? -weight : weight;
+        });
+        found.push(signed.reduce((sum, each) => sum + each) / all);
+      }
+    }
+  });
+  return Float64Array.from(found);
 }

@@ -1,15 +1,14 @@
 /** Cells: a few bytes of each Gaussian, recognisable with the key and noise without; see docs/byte-layout.md, "Cells". */
-import { ecb } from '@noble/ciphers/aes.js';
-import { expand } from '../../keys/keys.ts';
+import { blockwise, expand } from '../../keys/keys.ts';
 
 export const TAG_BYTES = 4;
 const BLOCK = 16; // bytes of a block of AES, and of an ID
 const CELLS = 1 << 14; // at a time
 
-/** Decrypted cells: rows of their carriers, and the data of each. */
-export interface Found {
-  readonly rows: number[];
-  readonly data: Uint8Array[];
+/** The data of a cell, and its carrier. */
+export interface Cell {
+  readonly row: number;
+  readonly data: Uint8Array;
 }
 
 /** Decrypts cells of `size` bytes of data for one use of a secret. */
@@ -19,18 +18,29 @@ export class CellCipher {
   private readonly streamKey: Uint8Array;
 
   constructor(secret: Uint8Array, label: string, readonly size: number) {
-    [this.tagKey, this.seedKey, this.streamKey] = ['tag', 'seed', 'stream'].map((use) =>
-      expand(secret, `${label}/${use}`, 32),
-    );
+    [this.tagKey, this.seedKey, this.streamKey] = ['tag', 'seed', 'stream'].map((use) => expand(secret, `${label}/${use}`));
   }
 
-  /** Tries the bytes from `offset` on of every row of `low` [N, width]. */
-  decrypt(ids: Uint8Array, low: Uint8Array, width: number, offset: number, slot: number): Found {
-    const found: Found = { rows: [], data: [] };
-    const count = ids.length / BLOCK;
-    for (let start = 0; start < count; start += CELLS) {
+  /** The cells with a valid tag among the bytes from `offset` on of every row of `low` [N, width]. */
+  decrypt(ids: Uint8Array, low: Uint8Array, width: number, offset: number, slot: number): Cell[] {
+    const [{ size, stride }, found] = [this, [] as Cell[]];
+    for (let start = 0; start < ids.length / BLOCK; start += CELLS) {
       const own = ids.subarray(start * BLOCK, (start + CELLS) * BLOCK);
-      this.decryptSome(found, start, own, low.subarray(start * width + offset), width, slot);
+      const cells = low.subarray(start * width + offset); // every `width` bytes begin with a cell
+      const [count, streams] = [own.length / BLOCK, this.streams(own, cells, width, slot)];
+      const messages = new Uint8Array(count * stride); // slot, data, and zeros up to a block
+      for (let cell = 0; cell < count; cell++) {
+        const [to, from] = [cell * stride + 1, cell * width + TAG_BYTES];
+        messages[to - 1] = slot;
+        for (let at = 0; at < size; at++) messages[to + at] = cells[from + at] ^ streams[cell * size + at];
+      }
+      const states = this.states(own, messages);
+      for (let cell = 0; cell < count; cell++) {
+        let different = 0;
+        for (let at = 0; at < TAG_BYTES; at++) different |= states[cell * BLOCK + at] ^ cells[cell * width + at];
+        const first = cell * stride + 1;
+        if (different === 0) found.push({ row: start + cell, data: messages.slice(first, first + size) });
+      }
     }
     return found;
   }
@@ -41,26 +51,6 @@ export class CellCipher {
     return this.streams(ids, states, BLOCK, 0);
   }
 
-  /** Of Gaussians from `start` on; every `width` bytes of `cells` begin with a cell. */
-  private decryptSome(found: Found, start: number, own: Uint8Array, cells: Uint8Array, width: number, slot: number): void {
-    const [{ size, stride }, count] = [this, own.length / BLOCK];
-    const streams = this.streams(own, cells, width, slot);
-    const messages = new Uint8Array(count * stride); // slot, data, and zeros up to a block
-    for (let cell = 0; cell < count; cell++) {
-      const [to, from] = [cell * stride + 1, cell * width + TAG_BYTES];
-      messages[to - 1] = slot;
-      for (let at = 0; at < size; at++) messages[to + at] = cells[from + at] ^ streams[cell * size + at];
-    }
-    const states = this.states(own, messages);
-    for (let cell = 0; cell < count; cell++) {
-      let different = 0;
-      for (let at = 0; at < TAG_BYTES; at++) different |= states[cell * BLOCK + at] ^ cells[cell * width + at];
-      if (different !== 0) continue;
-      found.rows.push(start + cell);
-      found.data.push(messages.slice(cell * stride + 1, cell * stride + 1 + size));
-    }
-  }
-
   private get stride(): number {
     return Math.ceil((1 + this.size) / BLOCK) * BLOCK;
   }
@@ -68,10 +58,10 @@ export class CellCipher {
   /** [N, 16] that begin with the tags of `messages` [N, stride]. */
   private states(ids: Uint8Array, messages: Uint8Array): Uint8Array {
     const { stride } = this;
-    let state = encrypted(this.tagKey, ids);
+    let state = blockwise(this.tagKey, ids);
     for (let block = 0; block < stride; block += BLOCK) {
       for (let at = 0; at < state.length; at++) state[at] ^= messages[Math.floor(at / BLOCK) * stride + block + (at % BLOCK)];
-      state = encrypted(this.tagKey, state);
+      state = blockwise(this.tagKey, state);
     }
     return state;
   }
@@ -85,11 +75,11 @@ export class CellCipher {
       for (let at = 0; at < TAG_BYTES; at++) seeds[cell * BLOCK + at] ^= cells[cell * width + at];
       seeds[cell * BLOCK + TAG_BYTES] ^= slot;
     }
-    seeds = encrypted(this.seedKey, seeds);
+    seeds = blockwise(this.seedKey, seeds);
     for (let start = 0; start < size; start += BLOCK) {
       const counted = seeds.slice();
       for (let cell = 0; cell < count; cell++) counted[(cell + 1) * BLOCK - 1] ^= start / BLOCK;
-      const stream = encrypted(this.streamKey, counted);
+      const stream = blockwise(this.streamKey, counted);
       const end = Math.min(BLOCK, size - start);
       for (let cell = 0; cell < count; cell++) {
         for (let at = 0; at < end; at++) found[cell * size + start + at] = stream[cell * BLOCK + at];
@@ -97,9 +87,4 @@ export class CellCipher {
     }
     return found;
   }
-}
-
-/** Every 16 bytes through AES-256: a permutation of blocks, not a mode of operation. */
-function encrypted(key: Uint8Array, blocks: Uint8Array): Uint8Array {
-  return blocks.length ? ecb(key, { disablePadding: true }).encrypt(blocks) : blocks;
 }

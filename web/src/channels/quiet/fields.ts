@@ -1,17 +1,21 @@
 /**
- * The integers of a quantised model that carry bits, how many bits each, and the order in which they are counted;
- * counterpart of `keyss.channels.quiet.fields` and `order`.
+ * The integers of a quantised model that carry bits, how many bits each, the order in which they are counted, and the messages
+ * of blocks of them; counterpart of `keyss.channels.quiet.fields`, `order` and `wet_paper`.
  *
  * The arithmetic gives the same result on every machine, in the same order of operations as in Python, without
  * logarithms: a reader must find the same numbers of bits as the writer.
  */
 import { sha256 } from '@noble/hashes/sha2.js';
 import { ascii, joined } from '../../core/bytes.ts';
-import { highProduct, runs, sortingOrder, type Words } from '../../core/words.ts';
-import { CHUNK, rotationPart as pliedPart, VECTOR, vectorPart } from '../../files/compressed_ply.ts';
+import { highProduct, multiplicities, sortingOrder, type Words } from '../../core/words.ts';
+import { byRow, type OfAxis } from '../../files/coded.ts';
+import {
+  CHUNK, type CompressedPlyCodes, rotationPart as pliedPart, VECTOR, vectorPart,
+} from '../../files/compressed_ply.ts';
 import type { Codes } from '../../files/models.ts';
-import { FINEST, LARGEST } from '../../files/sog.ts';
-import { positionCode, rotationPart, rotationWord } from '../../files/spz.ts';
+import { FINEST, LARGEST, type SogCodes } from '../../files/sog.ts';
+import { rotationPart, type SpzCodes } from '../../files/spz.ts';
+import { streamWords } from '../../keys/keys.ts';
 
 const MAX_BITS = 10;
 const SHARE = -3; // log2 of the range of written positions, in sizes of the Gaussian
@@ -21,9 +25,6 @@ const MAX_DISTANCE = 64; // powers of 2
 const HASH_BYTES = 12;
 const AXES = [0, 1, 2];
 const [FACTOR_HIGH, FACTOR_LOW] = [0x9e3779b9, 0x7f4a7c15];
-
-/** One number of a Gaussian per axis, or per component of its rotation. */
-export type OfAxis = (row: number, axis: number) => number;
 
 /** One coordinate of an attribute: the level (integer) of each Gaussian, and the bits that it carries, 0 to 10. */
 interface Field {
@@ -38,51 +39,27 @@ export interface Levels {
   readonly rows: ArrayLike<number>; // Gaussians in the order in which bits are counted
 }
 
-export type Counted = Omit<Levels, 'unwritten'>;
-
 /** The levels of a file. */
 export function levelsOf(codes: Codes): Levels {
-  if (codes.kind === 'spz') {
-    const turn = (row: number, part: number): number => rotationPart(rotationWord(codes, row), part);
-    const [scale, place] = [byRow(codes.scales, 3), (row: number, axis: number) => positionCode(codes, row, axis)];
-    const unwritten: OfAxis = (row, part) => (part < 3 ? codes.colours[3 * row + part] : codes.alphas[row]);
-    return { ...spzLevels(codes.count, codes.fractionalBits, scale, place, codes.version === 2 ? null : turn), unwritten };
-  }
-  if (codes.kind === 'sog') {
-    const [index, colour, quat] = [codes.scales, codes.colours, codes.quats].map((each) => byRow(each, 4));
-    const unwritten = (row: number): number[] => [
-      ...AXES.map((axis) => index(row, axis)), ...[0, 1, 2, 3].map((part) => colour(row, part)),
-      codes.labels[row], quat(row, 3) - LARGEST,
-    ];
-    const scale = (row: number, axis: number): number => codes.scaleBook[index(row, axis)];
-    return { ...sogLevels(codes, scale, byRow(codes.positions, 3), quat, unwritten), unwritten: colour };
-  }
-  const scale = (row: number, axis: number): number => vectorPart(codes.scales[row], axis);
-  const turn = (row: number, part: number): number => pliedPart(codes.rotations[row], part);
-  const unwritten: OfAxis = (row, part) => (codes.colours[row] >>> (24 - 8 * part)) & 255;
-  return { ...compressedPlyLevels(codes.count, codes.scaleBounds, scale, turn), unwritten };
+  if (codes.kind === 'spz') return spzLevels(codes);
+  return codes.kind === 'sog' ? sogLevels(codes) : compressedPlyLevels(codes);
 }
 
-export function byRow(table: ArrayLike<number>, width: number): OfAxis {
-  return (row, axis) => table[width * row + axis];
-}
-
-/** The levels of a .spz; `turn` is null if rotations carry nothing. */
-export function spzLevels(count: number, fractionalBits: number, scale: OfAxis, place: OfAxis, turn: OfAxis | null): Counted {
+function spzLevels(codes: SpzCodes): Levels {
+  const { count, fractionalBits, version, positions, scales, rotations, colours, alphas } = codes;
   const bits = Uint8Array.from({ length: count }, (_, row) => {
-    const size = (median(row, scale) / 16 - 10) * LOG2_E;
+    const size = (median(row, byRow(scales, 3)) / 16 - 10) * LOG2_E;
     return fitting(size + fractionalBits + SHARE);
   });
-  const places = fieldsOf(place, (row) => bits[row]);
-  return { fields: turn ? [...places, ...fieldsOf(turn, () => 3)] : places, rows: inOrder(count) };
+  const fields = fieldsOf(byRow(positions, 3), (row) => bits[row]);
+  // The rotations of version 2 carry nothing.
+  if (version > 2) fields.push(...fieldsOf((row, part) => rotationPart(rotations[3 * row + part]), () => 3));
+  return { fields, rows: inOrder(count), unwritten: (row, part) => (part < 3 ? colours[3 * row + part] : alphas[row]) };
 }
 
-/** The levels of a .sog; `unwritten`: the numbers of a Gaussian that never change, without distances. */
-export function sogLevels(
-  { count, mins, maxs }: { count: number; mins: readonly number[]; maxs: readonly number[] },
-  scale: OfAxis, place: OfAxis, turn: OfAxis, unwritten: (row: number) => number[],
-): Counted {
+function sogLevels({ count, mins, maxs, positions, quats, scaleBook, scales, colours, labels }: SogCodes): Levels {
   const extent = AXES.map((axis) => (maxs[axis] > mins[axis] ? maxs[axis] - mins[axis] : 1));
+  const [place, turn, scale, colour] = [byRow(positions, 3), byRow(quats, 4), byRow(scales, 4), byRow(colours, 4)];
   /** log2 of the step at a position, relative to the step at 0. */
   const distance = (row: number, axis: number): number => {
     const log = Math.abs(mins[axis] + extent[axis] * (place(row, axis) / FINEST));
@@ -91,19 +68,23 @@ export function sogLevels(
   const finest = extent.map((each) => log2(each / FINEST));
   const places = fieldsOf(place, (row, axis) => {
     const step = finest[axis] + distance(row, axis) + 0.5;
-    return fitting(median(row, scale) * LOG2_E + SHARE - step);
+    return fitting(median(row, (own, each) => scaleBook[scale(own, each)]) * LOG2_E + SHARE - step);
   });
-  const own = hashes(count, (row) => [...unwritten(row), ...AXES.map((axis) => distance(row, axis))]);
-  return { fields: [...places, ...fieldsOf(turn, () => 2)], rows: unique(own) };
+  const own = hashes(count, (row) => [
+    ...AXES.map((axis) => scale(row, axis)), ...[0, 1, 2, 3].map((part) => colour(row, part)),
+    labels[row], turn(row, 3) - LARGEST, ...AXES.map((axis) => distance(row, axis)),
+  ]);
+  return { fields: [...places, ...fieldsOf(turn, () => 2)], rows: unique(own), unwritten: colour };
 }
 
-/** The levels of a compressed .ply; `bounds` [3, 2, C]: least and largest log scales of each chunk. */
-export function compressedPlyLevels(count: number, bounds: Float64Array[][], scale: OfAxis, turn: OfAxis): Counted {
-  const bits = bounds.map(([low, high], axis) =>
+function compressedPlyLevels({ count, scaleBounds, scales, rotations, colours }: CompressedPlyCodes): Levels {
+  const bits = scaleBounds.map(([low, high], axis) =>
     Uint8Array.from(low, (least, chunk) => fitting(LOG_SCALE - log2((high[chunk] - least) / VECTOR[axis]))),
   );
-  const scales = fieldsOf(scale, (row, axis) => bits[axis][Math.floor(row / CHUNK)]);
-  return { fields: [...scales, ...fieldsOf(turn, () => 3)], rows: inOrder(count) };
+  const sizes = fieldsOf((row, axis) => vectorPart(scales[row], axis), (row, axis) => bits[axis][Math.floor(row / CHUNK)]);
+  const turns = fieldsOf((row, part) => pliedPart(rotations[row], part), () => 3);
+  const unwritten: OfAxis = (row, part) => (colours[row] >>> (24 - 8 * part)) & 255;
+  return { fields: [...sizes, ...turns], rows: inOrder(count), unwritten };
 }
 
 function fieldsOf(level: OfAxis, bits: OfAxis): Field[] {
@@ -139,7 +120,7 @@ export function log2(value: number): number {
 }
 
 /** The last bits of all levels, each 0 or 1, in the order in which they are counted; `silent` [N] rows have none. */
-export function lastBits({ fields, rows }: Counted, silent?: Uint8Array): Uint8Array {
+export function lastBits({ fields, rows }: Levels, silent?: Uint8Array): Uint8Array {
   const count = ({ bits }: Field, row: number): number => (silent?.[row] ? 0 : bits(row));
   let size = 0;
   for (const field of fields) for (let index = 0; index < rows.length; index++) size += count(field, rows[index]);
@@ -163,8 +144,8 @@ export function modelHash({ unwritten, rows }: Levels): Uint8Array {
 /** Rows in the order of their hashes, without rows that share one: they carry nothing. */
 function unique(words: Words): Uint32Array {
   const order = sortingOrder(words);
-  const starts = runs(words, order);
-  return starts.filter((start, run) => starts[run + 1] === start + 1).map((start) => order[start]);
+  const counts = multiplicities(words, order);
+  return order.filter((row) => counts[row] === 1);
 }
 
 /** [N] hashes of the numbers of each row; counterpart of `row_hashes`. */
@@ -181,4 +162,38 @@ function hashes(count: number, numbers: (row: number) => number[]): Words {
     }
   }
   return words;
+}
+
+const BLOCK = 1024;
+export const BLOCK_BYTES = BLOCK / 8;
+const WORDS = BLOCK / 32;
+const PUBLIC = new Uint8Array(32); // the seed of order and matrix
+
+/**
+ * [B, BLOCK_BYTES] the messages of all blocks of `bits` (0 or 1), each padded with noise, by wet paper codes (Fridrich et al.
+ * 2005): a message is the product of its block with a public random matrix, modulo 2.
+ */
+export function readBlocks(bits: Uint8Array): Uint8Array {
+  const high = new Uint32Array(bits.length);
+  streamWords(PUBLIC, 'codes/order', 2 * bits.length, (word, at) => {
+    if (at & 1) high[at >>> 1] = word;
+  });
+  const [places, blocks] = [sortingOrder(high, 1), Math.floor(bits.length / BLOCK)];
+  const rows = new Uint32Array(BLOCK * WORDS);
+  streamWords(PUBLIC, 'codes/matrix', rows.length, (word, at) => (rows[at] = word));
+  const found = new Uint32Array(blocks * WORDS);
+  const own = new Uint32Array(WORDS);
+  for (let block = 0; block < blocks; block++) {
+    own.fill(0);
+    for (let at = 0; at < BLOCK; at++) own[at >> 5] |= bits[places[block * BLOCK + at]] << (at & 31);
+    for (let row = 0; row < BLOCK; row++) {
+      let sum = 0;
+      for (let word = 0, at = row * WORDS; word < WORDS; word++, at++) sum ^= own[word] & rows[at];
+      sum ^= sum >>> 16;
+      sum ^= sum >>> 8;
+      sum ^= sum >>> 4;
+      found[block * WORDS + (row >> 5)] |= ((0x6996 >>> (sum & 15)) & 1) << (row & 31);
+    }
+  }
+  return new Uint8Array(found.buffer);
 }

@@ -1,40 +1,29 @@
 /**
- * Reads the low bits of a model, or the codes of a file, with a key; counterpart of `keyss.channels.quiet.reading`.
+ * Reads the low bits of a model, or the codes of a file, with a key; counterpart of `keyss.channels.quiet.reading` and
+ * `parameters` (docs/byte-layout.md, "Parameters").
  *
  * A wrong key makes the same passes over all cells as a right one, and all salts are always tried, so the time taken
  * reveals next to nothing.
  */
-import { ascii, bytesKey, mostFrequent, rowsOf } from '../../core/bytes.ts';
-import { damaged, tooMuchLost } from '../../core/errors.ts';
+import { ascii, bytesKey, joined, mostFrequent, rowsOf, viewOf } from '../../core/bytes.ts';
+import { damaged, otherVersion, tooMuchLost } from '../../core/errors.ts';
 import { type Gaussians, selected } from '../../core/gaussians.ts';
 import type { ReadModel } from '../../files/models.ts';
-import { decrypted, type Derive, expand } from '../../keys/keys.ts';
-import { here } from '../../keys/pool.ts';
-import type { Content, Reader } from '../content.ts';
-import { decoded } from '../reed_solomon.ts';
-import { foreign } from '../sketch.ts';
-import { fieldsOf, gaussianIds, ID_BYTES, lowBits, lowWidth } from './bits.ts';
-import { CellCipher, TAG_BYTES } from './cells.ts';
+import { decrypted, type Derive, expand, here } from '../../keys/keys.ts';
+import { type Content, foreign, type Reader } from '../content.ts';
+import { type Codewords, decoded } from '../reed_solomon.ts';
+import { fieldsOf, gaussianIds, ID_BYTES, lowBits, lowWidth, saltOf, salts } from './bits.ts';
+import { type Cell, CellCipher, TAG_BYTES } from './cells.ts';
 import { decodedFrom } from './decoded.ts';
-import { lastBits, type Levels, levelsOf, modelHash } from './fields.ts';
-import { NUMBER_BYTES, type Parameters, SKETCH_BYTES, unpackCodewords, unpackParameters } from './parameters.ts';
-import { saltOf, salts } from './salts.ts';
-import { BLOCK_BYTES, readBlocks } from './wet_paper.ts';
+import { BLOCK_BYTES, lastBits, type Levels, levelsOf, modelHash, readBlocks } from './fields.ts';
 
 const ASSOCIATED = ascii('keyss/v1/quiet');
 const DATA_KEY_BYTES = 16;
 const LEAST_WIDTH = TAG_BYTES + DATA_KEY_BYTES;
-const SALTS_TRIED = 4;
 const DUMMY_CELLS = 2; // cells per carrier that a wrong key decrypts
 const NARROW_HARMONICS = 9; // of degree 1: some secrets do not write the others
 const [LEAST_BYTES, MIN_BLOCKS] = [48, 4]; // minimum bytes of a block; minimum blocks of a file
 const MAX_BITS = 2 ** 30; // bits in codes; more would exceed the memory of a tab
-
-/** The data of a cell, and its carrier. */
-interface Cell {
-  readonly row: number;
-  readonly data: Uint8Array;
-}
 
 /** The carriers of a model, prepared for any number of keys. */
 export class QuietReader implements Reader {
@@ -43,7 +32,7 @@ export class QuietReader implements Reader {
     private readonly low: Uint8Array, // [C, width]
     private readonly width: number,
     private readonly widths: readonly number[], // of parameters
-    readonly salts: Uint8Array[], // the likeliest first
+    private readonly salts: readonly Uint8Array[],
     private readonly blocks = false, // the carriers are blocks of codes
   ) {}
 
@@ -54,10 +43,11 @@ export class QuietReader implements Reader {
     return decoded ? QuietReader.ofCodes(decoded.levels, decoded.silent) : QuietReader.ofLowBits(model);
   }
 
-  private static ofLowBits(model: Gaussians): QuietReader {
+  private static ofLowBits(model: Gaussians): QuietReader | null {
     let fields = fieldsOf(model);
     let [ids, low] = [gaussianIds(model, fields), lowBits(fields)];
     const width = lowWidth(fields);
+    if (width < LEAST_WIDTH) return null;
     const rows = uniqueRows(ids, low, width);
     if (rows.length < model.count) {
       fields = fieldsOf(selected(model, rows));
@@ -84,18 +74,17 @@ export class QuietReader implements Reader {
   }
 
   get derivations(): number {
-    return Math.min(SALTS_TRIED, this.salts.length);
+    return this.salts.length;
   }
 
   /** The content that `key` opens, or null. Raises InputError for damage. */
   async open(key: string, derive: Derive = here): Promise<Content | null> {
     const dataKeys: Uint8Array[] = [];
-    let secret = new Uint8Array(32);
+    let secret: Uint8Array = new Uint8Array(32);
     // Other workers derive the next keys while this one reads cells.
-    const masters = this.salts.slice(0, this.derivations).map((salt) => derive(key, salt));
+    const masters = this.salts.map((salt) => derive(key, salt));
     for (const each of masters) {
-      secret = new Uint8Array(expand(await each, 'quiet/key', 32));
-      if (!this.widths.length) continue;
+      secret = expand(await each, 'quiet/key');
       const cells = this.cells(new CellCipher(secret, 'key', DATA_KEY_BYTES));
       const best = mostFrequent(cells.map(({ data }) => bytesKey(data)));
       if (best) dataKeys.push(cells.find(({ data }) => bytesKey(data) === best[0])!.data);
@@ -109,8 +98,8 @@ export class QuietReader implements Reader {
         return this.payload(dataKey, parameters, this.inBlocks(parameters, parts[parts.length - 1].row));
       }
     }
-    if (dataKeys.length === 0 && this.widths.length) {
-      const none = expand(secret, 'quiet/none', DATA_KEY_BYTES);
+    if (dataKeys.length === 0) {
+      const none = expand(secret, 'quiet/none').slice(0, DATA_KEY_BYTES);
       for (const width of this.widths) this.parts(none, width);
       this.dummyPasses(none, this.width);
     }
@@ -145,7 +134,7 @@ export class QuietReader implements Reader {
   }
 
   private async payload(dataKey: Uint8Array, { method }: Parameters, encrypted: Uint8Array): Promise<Content> {
-    const data = await decrypted(expand(dataKey, 'payload-key', 32), encrypted, ASSOCIATED);
+    const data = await decrypted(expand(dataKey, 'payload-key'), encrypted, ASSOCIATED);
     return { service: 'payload', method, data };
   }
 
@@ -166,12 +155,8 @@ export class QuietReader implements Reader {
   /** The cells with a valid tag, in the order of carriers. */
   private cells(cipher: CellCipher, width = this.width, cells = 1): Cell[] {
     const size = Math.floor(width / cells);
-    const found: Cell[] = [];
-    for (let slot = 0; slot < cells; slot++) {
-      const { rows, data } = cipher.decrypt(this.ids, this.low, this.width, slot * size, slot);
-      rows.forEach((row, index) => found.push({ row, data: data[index] }));
-    }
-    return found.sort((a, b) => a.row - b.row);
+    const slots = Array.from({ length: cells }, (_, slot) => cipher.decrypt(this.ids, this.low, this.width, slot * size, slot));
+    return slots.flat().sort((a, b) => a.row - b.row);
   }
 }
 
@@ -186,4 +171,62 @@ function uniqueRows(ids: Uint8Array, low: Uint8Array, width: number): number[] {
     seen.add(all);
   }
   return rows;
+}
+
+const VERSION = 5;
+const PREFIX_BYTES = 30;
+const SKETCH_BYTES = 32;
+const NUMBERS = 17; // offset of cells, bytes of a record and of the header, Gaussians, records
+const MAX_CELLS = 4;
+const MAX_HEADER_BYTES = 4096;
+const [MAX_LENGTH, MAX_CHUNKS] = [1 << 13, 1 << 24]; // chunks of one codeword, of all
+const NUMBER_BYTES = 3; // size of a chunk's number
+
+/** Parameters of a secret: `count` records and copies, `cells` per carrier. */
+interface Parameters {
+  readonly isPayload: boolean; // records are numbered chunks of a payload
+  readonly method: string;
+  readonly cells: number;
+  readonly recordBytes: number;
+  readonly gaussians: number; // size of the published model
+  readonly count: number;
+  readonly header: Uint8Array;
+  readonly sketch: Uint8Array; // empty in blocks
+}
+
+/** Parameters from decrypted parts in any order; `sketched`: bytes of the sketch. Raises InputError. */
+function unpackParameters(parts: Uint8Array[], sketched: number): Parameters {
+  const numbered = new Map(parts.map((part) => [part[0], part.subarray(1)]));
+  const prefix = firstBytes(numbered, PREFIX_BYTES);
+  const [version, service] = prefix;
+  if (version !== VERSION) throw otherVersion();
+  const [cells, view] = [prefix[NUMBERS], viewOf(prefix)];
+  const [recordBytes, length] = [view.getUint16(NUMBERS + 1, true), view.getUint16(NUMBERS + 3, true)];
+  const [gaussians, count] = [view.getUint32(NUMBERS + 5, true), view.getUint32(NUMBERS + 9, true)];
+  if (service < 1 || service > 2 || cells < 1 || cells > MAX_CELLS || length > MAX_HEADER_BYTES) throw damaged();
+  const method = bytesKey(prefix.subarray(2, NUMBERS)).replace(/\0+$/, '');
+  const rest = firstBytes(numbered, PREFIX_BYTES + sketched + length).subarray(PREFIX_BYTES);
+  const [sketch, header] = [rest.subarray(0, sketched), rest.subarray(sketched)];
+  return { isPayload: service === 1, method, cells, recordBytes, gaussians, count, header, sketch };
+}
+
+/** Bytes of the encrypted payload, and its codewords, from the header of a payload. Raises InputError. */
+function unpackCodewords({ header, recordBytes }: Parameters): [number, Codewords] {
+  if (header.length !== 12) throw damaged();
+  const view = viewOf(header);
+  const [size, count] = [view.getUint32(0, true), view.getUint32(4, true)];
+  const [n, k, width] = [view.getUint16(8, true), view.getUint16(10, true), recordBytes - NUMBER_BYTES];
+  const possible = count >= 1 && count * n <= MAX_CHUNKS && k >= 1 && k <= n && n <= MAX_LENGTH && width % 2 === 0;
+  if (!possible || size < 1 || size > count * k * width) throw damaged();
+  return [size, { count, n, k, width }];
+}
+
+function firstBytes(parts: Map<number, Uint8Array>, length: number): Uint8Array {
+  let data = new Uint8Array(0);
+  for (let number = 0; data.length < length; number++) {
+    const part = parts.get(number);
+    if (part === undefined) throw tooMuchLost();
+    data = joined(data, part) as Uint8Array<ArrayBuffer>;
+  }
+  return data.slice(0, length);
 }
