@@ -8,7 +8,7 @@ tag: a reader decrypts all of them and keeps those with a valid tag.
   is not usable: the author of the cover knows it in advance, so no key cell is written for it. A reader tries
   SALTS_TRIED salts; covers with as many stale salts are refused.
 - *Key cells*, encrypted under the key and a salt, hold the data key of a secret.
-- *Parameter cells*, encrypted under the data key, tell how to read the rest (see `parameters`).
+- *Parameter cells*, encrypted under the data key, tell how to read the rest (see `layout`).
 - *Records* are encrypted under the data key: Gaussians, or numbered chunks of an encrypted payload (see
   `layout`). Shuffling is harmless, and a removed Gaussian loses its own record only. *Copies* replace lost
   records. In codes nothing may be lost or reordered: the payload is stored in the blocks after its header.

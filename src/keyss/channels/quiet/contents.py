@@ -24,7 +24,7 @@ from keyss.channels.base import (
     Records,
     SaltedReader,
 )
-from keyss.channels.mixing import random_order, random_words, row_hashes
+from keyss.channels.mixing import SKETCH_BYTES, foreign, random_order, random_words, row_hashes, sketch
 from keyss.channels.quiet.bits import Layout, gaussian_ids, read_low_bits
 from keyss.channels.quiet.cells import CellCipher
 from keyss.channels.quiet.decoded import Decoded
@@ -36,23 +36,20 @@ from keyss.channels.quiet.layout import (
     LEAST_BYTES,
     MIN_BLOCKS,
     PARAMETER_COPIES,
-    LowBitsCapacity,
-    numbered_chunks,
-    split_numbers,
-)
-from keyss.channels.quiet.parameters import (
     PAYLOAD,
     RECORDS,
+    LowBitsCapacity,
     Parameters,
     key_cipher,
+    numbered_chunks,
     pack_codewords,
     parameter_cipher,
+    split_numbers,
     unpack,
     unpack_codewords,
 )
 from keyss.channels.quiet.usable import among, repeated, salt, salt_rows
 from keyss.channels.quiet.wet_paper import block_ids, read_blocks
-from keyss.channels.sketch import SKETCH_BYTES, foreign, sketch
 from keyss.core.arrays import Bytes, Flags, Integers
 from keyss.core.errors import InputError, KeyssWarning, UsageError, WrongKeyError
 from keyss.core.gaussians import Gaussians
