@@ -288,8 +288,8 @@ class CodesCover:
 
     def _written(self, bits: Bits, entropy: bytes) -> Codes:
         columns: dict[str, list[Levels]] = {}
-        for field, free in zip(self.fields, self.free, strict=True):
-            own, bits = bits[: field.total_bits], bits[field.total_bits :]
+        parts = np.split(bits, np.cumsum([each.total_bits for each in self.fields])[:-1])
+        for field, free, own in zip(self.fields, self.free, parts, strict=True):
             ties = random_fractions(entropy, f"codes/ties/{field.name}/{field.column}", len(free)) - 0.5
             levels = np.where(free, field.with_bits(own, ties), field.levels)
             columns.setdefault(field.name, []).append(levels)

@@ -118,14 +118,11 @@ class LowBitsCapacity:
                 "needed"
             )
         plans = [plan for plan in map(self._independent_plan, requests) if plan is not None]
-        return plans if self.is_independent_layout(plans, requests) else self._joint_plans(requests)
-
-    def is_independent_layout(self, plans: Sequence[RecordPlan], requests: Sequence[RecordRequest]) -> bool:
-        """True if each secret's records are placed independently of the others."""
-        if list(map(self._independent_plan, requests)) != list(plans):
-            return False
+        if len(plans) < len(requests):
+            return self._joint_plans(requests)
         both = zip(plans, requests, strict=True)
-        return self._fits([(plan.cells_per_carrier, request.count + plan.copies) for plan, request in both])
+        cells = [(plan.cells_per_carrier, request.count + plan.copies) for plan, request in both]
+        return plans if self._fits(cells) else self._joint_plans(requests)
 
     def record_capacity(self, requests: Sequence[RecordRequest]) -> int:
         """The number of records of the minimum size that fit for all requests together."""
@@ -218,7 +215,8 @@ class LowBitsCapacity:
         for cells, count in self._classes() if request.header_bytes <= _TYPICAL_HEADER else ():
             size = self.record_bytes(cells)
             if count >= request.count and size >= request.least_bytes:
-                return RecordPlan(size, min(int(MAX_COPIES * request.count), count - request.count), cells)
+                copies = min(int(MAX_COPIES * request.count), count - request.count)
+                return RecordPlan(size, copies, cells, independent=True)
         return None
 
     def _payload_cells(self, secrets: int) -> int:
