@@ -68,7 +68,7 @@ MAX_CODEWORDS = (1 << 8 * NUMBER_BYTES) // MAX_CHUNKS
 VERSION = 5
 MAX_HEADER_BYTES = 4096
 PAYLOAD, RECORDS = 1, 2  # services
-_PAYLOAD = struct.Struct("<IIHH")  # bytes of the encrypted payload, codewords, chunks of one, data chunks
+_CODEWORDS = struct.Struct("<IIHH")  # bytes of the encrypted payload, codewords, chunks of one, data chunks
 _PREFIX = struct.Struct(f"<BB{METHOD_BYTES}sBHHII")  # parameters before the sketch and the method's header
 
 
@@ -333,13 +333,13 @@ def unpack(parts: Bytes, sketch_bytes: int = SKETCH_BYTES) -> Parameters:
 
 def pack_codewords(size: int, codewords: Codewords) -> bytes:
     """The header of a payload of `size` encrypted bytes in low bits."""
-    return _PAYLOAD.pack(size, codewords.count, codewords.n, codewords.k)
+    return _CODEWORDS.pack(size, codewords.count, codewords.n, codewords.k)
 
 
 def unpack_codewords(header: bytes, record_bytes: int) -> tuple[int, Codewords]:
     """Invert `pack_codewords`. Raises InputError for impossible numbers."""
     try:
-        size, count, n, k = _PAYLOAD.unpack(header)
+        size, count, n, k = _CODEWORDS.unpack(header)
         codewords = Codewords(count, n, k, record_bytes - NUMBER_BYTES)
         if codewords.chunks > MAX_CODEWORDS * MAX_CHUNKS or not 0 < size <= codewords.size:
             raise ValueError(f"{size} bytes in {codewords}")
