@@ -44,8 +44,8 @@ from .quiet.layout import (
     TYPICAL_SHARE as TYPICAL_SHARE,
     LowBitsCapacity as LowBitsCapacity,
     check_payload_fits as check_payload_fits,
+    key_cipher as key_cipher,
 )
-from .quiet.parameters import key_cipher as key_cipher
 from .quiet.usable import (
     chance_of_bits as chance_of_bits,
     salt_rows as salt_rows,

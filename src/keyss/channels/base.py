@@ -62,6 +62,7 @@ class RecordPlan:
     record_bytes: int  # maximum size of a record
     copies: int  # maximum number of records to embed twice
     cells_per_carrier: int  # records per Gaussian
+    independent: bool = False  # True if it does not depend on other secrets
 
 
 @dataclass(frozen=True)

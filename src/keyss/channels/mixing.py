@@ -1,4 +1,10 @@
-"""Public hashes, which hide nothing, and pseudo-random numbers and permutations derived from a secret."""
+"""Public hashes, which hide nothing; what is derived from a secret: pseudo-random numbers, and sketches.
+
+By a *sketch* of a model's Gaussians, a reader detects foreign ones: added or changed later. It is the first
+bits of a Bloom filter (Bloom 1970) of N bits with one keyed hash, for a model of N Gaussians. The bits of its
+own Gaussians are set, however many are lost. A foreign Gaussian hits an unset bit with probability
+bits / (e N).
+"""
 
 from __future__ import annotations
 
@@ -8,8 +14,9 @@ from cryptography.hazmat.primitives.ciphers.algorithms import AES
 from cryptography.hazmat.primitives.ciphers.modes import ECB
 
 from keyss.core.arrays import Bytes, Doubles, Integers, Numbers, Words
-from keyss.keys.derivation import stream
+from keyss.keys.derivation import expand, stream
 
+SKETCH_BYTES = 32  # in low bits
 _ODD = np.uint64(0x9E3779B97F4A7C15)  # 2^64 / golden ratio: multiples have well-distributed high bits
 
 
@@ -52,3 +59,25 @@ def random_fractions(secret: bytes, label: str, count: int) -> Doubles:
     """Uniform numbers [count] in (0, 1) derived from a secret."""
     words = random_words(secret, label, count) >> np.uint64(12)
     return (words.astype(np.float64) + 0.5) / 2.0**52
+
+
+def sketch(secret: bytes, ids: Bytes, size: int = SKETCH_BYTES) -> bytes:
+    """A sketch of `size` bytes of Gaussians with `ids` [N, 16]."""
+    bits = np.zeros(8 * size, np.uint8)
+    bits[_places(secret, ids, len(ids), len(bits))] = 1
+    return np.packbits(bits, bitorder="little").tobytes()
+
+
+def foreign(secret: bytes, ids: Bytes, own: bytes, gaussians: int) -> int:
+    """Estimated number of `ids` [M, 16] foreign to the sketch `own` of `gaussians` Gaussians."""
+    bits = np.unpackbits(np.frombuffer(own, np.uint8), bitorder="little")
+    unset = bits[_places(secret, ids, gaussians, len(bits))] == 0
+    ways = int((bits[:gaussians] == 0).sum())
+    return min(len(ids), round(int(unset.sum()) * gaussians / max(1, ways)))
+
+
+def _places(secret: bytes, ids: Bytes, count: int, kept: int) -> Integers:
+    """Bit positions below `kept` that the Gaussians hash to, of `count` positions."""
+    hashed = encrypted_blocks(expand(secret, "sketch", 32), ids)[:, :4].copy().view("<u4")[:, 0]
+    places = hashed.astype(np.int64) % max(1, count)
+    return places[places < kept]

@@ -7,7 +7,7 @@ import numpy.typing as npt
 import pytest
 from scipy.spatial import cKDTree
 
-from keyss.channels.colours.likelihood import Likelihood
+from keyss.channels.colours.planner import Likelihood
 
 NOISE = 0.0275
 Doubles = npt.NDArray[np.float64]

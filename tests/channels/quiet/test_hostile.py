@@ -19,7 +19,7 @@ from channels.quiet.trained_like import keys, trained_like
 from files.formats.examples import KINDS, random_codes
 from keyss.channels import LOW_BITS, CodesCover, Codewords, Payload, QuietReader
 from keyss.channels.quiet import contents, layout
-from keyss.channels.quiet.parameters import PAYLOAD, RECORDS, Parameters, pack_codewords
+from keyss.channels.quiet.layout import PAYLOAD, RECORDS, Parameters, pack_codewords
 from keyss.channels.reed_solomon import MAX_CHUNKS
 from keyss.core import Gaussians, InputError, UsageError, WrongKeyError
 from keyss.keys import encryption

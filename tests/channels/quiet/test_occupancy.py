@@ -13,7 +13,7 @@ from scipy.stats import ks_2samp
 from channels.quiet.trained_like import keys
 from keyss.channels import CellCipher, Content, LowBitsCapacity, Payload, RecordRequest, Records, key_cipher
 from keyss.channels.quiet.contents import Writer
-from keyss.channels.quiet.parameters import parameter_cipher, unpack
+from keyss.channels.quiet.layout import parameter_cipher, unpack
 from keyss.channels.quiet.usable import SALTS
 from keyss.core import KeyssWarning
 

@@ -32,8 +32,8 @@ from keyss.channels import (
     usable_carriers,
     write_low_bits,
 )
+from keyss.channels.mixing import foreign, sketch
 from keyss.channels.quiet import cells
-from keyss.channels.sketch import foreign, sketch
 from keyss.core import Gaussians, InputError, KeyssWarning, UsageError, WrongKeyError, same_bits
 from keyss.files import read_model, write_model
 from keyss.keys import ALPHABET, DerivedKey, generate_key

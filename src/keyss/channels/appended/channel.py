@@ -53,8 +53,8 @@ from keyss.channels.base import (
     unpack_payload,
 )
 from keyss.channels.colours.carriers import Carriers
+from keyss.channels.mixing import foreign, sketch
 from keyss.channels.reed_solomon import Codewords
-from keyss.channels.sketch import foreign, sketch
 from keyss.core.arrays import Bits, Bytes, Doubles, Integers
 from keyss.core.errors import InputError, KeyssWarning, UsageError, WrongKeyError
 from keyss.core.gaussians import Gaussians

@@ -15,7 +15,7 @@ index, so the order of Gaussians does not matter. `usable` selects the Gaussians
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, fields
 from hashlib import blake2b
 
@@ -176,13 +176,13 @@ def write_low_bits(
 
 def used_words(gaussians: Gaussians) -> Words32:
     """[N, F] bit patterns of scales, quaternions, opacity and harmonics above degree 0; a copy."""
-    return np.concatenate(group_words(gaussians), axis=1)
+    return np.concatenate(list(group_words(gaussians)), axis=1)
 
 
-def group_words(gaussians: Gaussians) -> list[Words32]:
+def group_words(gaussians: Gaussians) -> Iterator[Words32]:
     """The columns [N, C] of `used_words` by group; views where possible."""
     groups = gaussians.log_scales, gaussians.quats, gaussians.opacity_logits, gaussians.sh[:, 1:]
-    return list(map(_words, groups))
+    return map(_words, groups)
 
 
 def _written_fields(gaussians: Gaussians, layout: Layout) -> tuple[list[Words32], Words32]:

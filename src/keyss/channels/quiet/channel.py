@@ -8,7 +8,7 @@ tag: a reader decrypts all of them and keeps those with a valid tag.
   is not usable: the author of the cover knows it in advance, so no key cell is written for it. A reader tries
   SALTS_TRIED salts; covers with as many stale salts are refused.
 - *Key cells*, encrypted under the key and a salt, hold the data key of a secret.
-- *Parameter cells*, encrypted under the data key, tell how to read the rest (see `parameters`).
+- *Parameter cells*, encrypted under the data key, tell how to read the rest (see `layout`).
 - *Records* are encrypted under the data key: Gaussians, or numbered chunks of an encrypted payload (see
   `layout`). Shuffling is harmless, and a removed Gaussian loses its own record only. *Copies* replace lost
   records. In codes nothing may be lost or reordered: the payload is stored in the blocks after its header.
@@ -288,8 +288,8 @@ class CodesCover:
 
     def _written(self, bits: Bits, entropy: bytes) -> Codes:
         columns: dict[str, list[Levels]] = {}
-        for field, free in zip(self.fields, self.free, strict=True):
-            own, bits = bits[: field.total_bits], bits[field.total_bits :]
+        parts = np.split(bits, np.cumsum([each.total_bits for each in self.fields])[:-1])
+        for field, free, own in zip(self.fields, self.free, parts, strict=True):
             ties = random_fractions(entropy, f"codes/ties/{field.name}/{field.column}", len(free)) - 0.5
             levels = np.where(free, field.with_bits(own, ties), field.levels)
             columns.setdefault(field.name, []).append(levels)

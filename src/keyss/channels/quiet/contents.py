@@ -15,16 +15,8 @@ import numpy as np
 import torch
 from numpy.lib.stride_tricks import as_strided
 
-from keyss.channels.base import (
-    NOT_INDEPENDENT,
-    Content,
-    Payload,
-    RecordPlan,
-    RecordRequest,
-    Records,
-    SaltedReader,
-)
-from keyss.channels.mixing import random_order, random_words, row_hashes
+from keyss.channels.base import NOT_INDEPENDENT, Content, Payload, RecordPlan, Records, SaltedReader
+from keyss.channels.mixing import SKETCH_BYTES, foreign, random_order, random_words, row_hashes, sketch
 from keyss.channels.quiet.bits import Layout, gaussian_ids, read_low_bits
 from keyss.channels.quiet.cells import CellCipher
 from keyss.channels.quiet.decoded import Decoded
@@ -36,23 +28,20 @@ from keyss.channels.quiet.layout import (
     LEAST_BYTES,
     MIN_BLOCKS,
     PARAMETER_COPIES,
-    LowBitsCapacity,
-    numbered_chunks,
-    split_numbers,
-)
-from keyss.channels.quiet.parameters import (
     PAYLOAD,
     RECORDS,
+    LowBitsCapacity,
     Parameters,
     key_cipher,
+    numbered_chunks,
     pack_codewords,
     parameter_cipher,
+    split_numbers,
     unpack,
     unpack_codewords,
 )
 from keyss.channels.quiet.usable import among, repeated, salt, salt_rows
 from keyss.channels.quiet.wet_paper import block_ids, read_blocks
-from keyss.channels.sketch import SKETCH_BYTES, foreign, sketch
 from keyss.core.arrays import Bytes, Flags, Integers
 from keyss.core.errors import InputError, KeyssWarning, UsageError, WrongKeyError
 from keyss.core.gaussians import Gaussians
@@ -77,9 +66,7 @@ class Writer:
         self._entropy, self._gaussians, self._sketched = entropy, gaussians, sketched
         self._blocks = sketched is None
         self._capacity = LowBitsCapacity(len(ids), width)
-        self.order = np.arange(len(ids))
-        if not self._blocks:
-            self.order = random_order(entropy, "quiet/order", len(ids))
+        self.order = np.arange(len(ids)) if self._blocks else random_order(entropy, "quiet/order", len(ids))
         self._ids = ids[self.order]  # [C, 16] in the order of `table`
         self.table = np.empty((len(ids), width), np.uint8)
         fill(entropy, "quiet/noise", self.table)
@@ -96,6 +83,7 @@ class Writer:
         if self._blocks:
             self._write_blocks([keys[0] for keys, _ in contents], payloads)
             return
+        independent = all(each.plan.independent for each in records)
         if payloads:
             sizes = [encrypted_size(compressed_size(each.data)) for each in payloads]
             plans, independent = self._capacity.plan_payloads(sizes)
@@ -105,11 +93,6 @@ class Writer:
                 plan = RecordPlan(chunks.shape[1], 0, per_carrier)
                 header = pack_codewords(size, codewords)
                 records.append(Records(payload.method, header, chunks, plan, _NO_COPIES))
-        else:
-            requests = [
-                RecordRequest(len(each.records), each.records.shape[1], len(each.header)) for each in records
-            ]
-            independent = self._capacity.is_independent_layout([each.plan for each in records], requests)
         service, at = PAYLOAD if payloads else RECORDS, 0
         for index, ((keys, _), each) in enumerate(zip(contents, records, strict=True)):
             at = self._header(at, index, keys, each, service)

@@ -1,4 +1,4 @@
-"""Allocation of the carriers' cells to secrets.
+"""How carriers are laid out: the cells of each secret, and the header that tells how to read them.
 
 Every secret has a *header* in a few whole carriers: its data key for each salt, and the parameters for
 reading the rest. Its *records* take one cell each; the numbered chunks of a payload are records too.
@@ -14,32 +14,40 @@ each; then a quarter, a half and all of the cells that divide carriers into halv
 
 Carriers for the headers of MAX_INDEPENDENT secrets are always reserved. Secrets that do not fit independently
 share all cells in a joint plan, with fewer copies or smaller cells: the holder of one key can notice others.
+
+Parameters are cut into numbered parts, one in each cell. Numbers are little-endian:
+
+    version (1 byte), service (1), method (15, padded with zeros), cells of a carrier (1), bytes of a record
+    (2), bytes of the method's own header (2), Gaussians of the model (4), records (4); in low bits a sketch
+    of these Gaussians (32, see `mixing`); then that header
 """
 
 from __future__ import annotations
 
 import math
+import struct
 from bisect import bisect_left
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import takewhile
 
 import numpy as np
 
-from keyss.channels.base import Capacity, RecordPlan, RecordRequest
+from keyss.channels.base import METHOD_BYTES, Capacity, RecordPlan, RecordRequest, pack_method, unpack_method
+from keyss.channels.mixing import SKETCH_BYTES
 from keyss.channels.quiet.bits import Layout
-from keyss.channels.quiet.cells import TAG_BYTES
+from keyss.channels.quiet.cells import TAG_BYTES, CellCipher
 from keyss.channels.quiet.usable import SALTS
-from keyss.channels.reed_solomon import SYMBOL_BYTES, Codewords
-from keyss.channels.sketch import SKETCH_BYTES
+from keyss.channels.reed_solomon import LOST, SYMBOL_BYTES, Codewords
 from keyss.core.arrays import Bytes, Integers
-from keyss.core.errors import UsageError
+from keyss.core.errors import InputError, UsageError
+from keyss.keys.derivation import DerivedKey
 from keyss.keys.encryption import SMALLEST_BUCKET, encrypted_size
 
 DATA_KEY_BYTES = 16
 KEY_COPIES = 12  # copies of the data key for each salt
 PARAMETER_COPIES = 24  # copies of each part; pruning a quarter removes all of them with p = 4e-15
-PREFIX_BYTES = 30  # parameters before the sketch and the method's header (see `parameters`)
 LEAST_BYTES = 48  # minimum bytes of a block of codes: a key cell, or the parameters
 BLOCK_HEADER = 2  # blocks of a secret's header
 MIN_BLOCKS = 4  # a salt, a header, and data
@@ -56,6 +64,12 @@ FAILURE = 1e-7  # probability of losing a payload to such removal
 NUMBER_BYTES = 3  # size of a chunk's number
 MAX_CHUNKS = 1024  # chunks per codeword; longer codewords hold little more and are slower
 MAX_CODEWORDS = (1 << 8 * NUMBER_BYTES) // MAX_CHUNKS
+
+VERSION = 5
+MAX_HEADER_BYTES = 4096
+PAYLOAD, RECORDS = 1, 2  # services
+_CODEWORDS = struct.Struct("<IIHH")  # bytes of the encrypted payload, codewords, chunks of one, data chunks
+_PREFIX = struct.Struct(f"<BB{METHOD_BYTES}sBHHII")  # parameters before the sketch and the method's header
 
 
 @dataclass(frozen=True)
@@ -83,7 +97,7 @@ class LowBitsCapacity:
 
     def header_carriers(self, header_bytes: int) -> int:
         """Carriers of a secret's header; `header_bytes`: size of the method's header."""
-        parts = -(-(PREFIX_BYTES + SKETCH_BYTES + header_bytes) // max(1, self.part_bytes))
+        parts = -(-(_PREFIX.size + SKETCH_BYTES + header_bytes) // max(1, self.part_bytes))
         return SALTS * KEY_COPIES + parts * PARAMETER_COPIES
 
     def reserved(self, header_bytes: Sequence[int], independent: bool) -> int:
@@ -104,14 +118,11 @@ class LowBitsCapacity:
                 "needed"
             )
         plans = [plan for plan in map(self._independent_plan, requests) if plan is not None]
-        return plans if self.is_independent_layout(plans, requests) else self._joint_plans(requests)
-
-    def is_independent_layout(self, plans: Sequence[RecordPlan], requests: Sequence[RecordRequest]) -> bool:
-        """True if each secret's records are placed independently of the others."""
-        if list(map(self._independent_plan, requests)) != list(plans):
-            return False
+        if len(plans) < len(requests):
+            return self._joint_plans(requests)
         both = zip(plans, requests, strict=True)
-        return self._fits([(plan.cells_per_carrier, request.count + plan.copies) for plan, request in both])
+        cells = [(plan.cells_per_carrier, request.count + plan.copies) for plan, request in both]
+        return plans if self._fits(cells) else self._joint_plans(requests)
 
     def record_capacity(self, requests: Sequence[RecordRequest]) -> int:
         """The number of records of the minimum size that fit for all requests together."""
@@ -204,7 +215,8 @@ class LowBitsCapacity:
         for cells, count in self._classes() if request.header_bytes <= _TYPICAL_HEADER else ():
             size = self.record_bytes(cells)
             if count >= request.count and size >= request.least_bytes:
-                return RecordPlan(size, min(int(MAX_COPIES * request.count), count - request.count), cells)
+                copies = min(int(MAX_COPIES * request.count), count - request.count)
+                return RecordPlan(size, copies, cells, independent=True)
         return None
 
     def _payload_cells(self, secrets: int) -> int:
@@ -252,6 +264,88 @@ def check_payload_fits(compressed: int, gaussians: int, secrets: int, sh_degree:
     capacity = LowBitsCapacity.of(int(gaussians * TYPICAL_SHARE), sh_degree)
     if capacity.payload_capacity(secrets) < size:
         raise UsageError(capacity.too_small(gaussians, "Gaussians", size, secrets))
+
+
+def key_cipher(key: DerivedKey) -> CellCipher:
+    """The cipher of cells that hold a data key."""
+    return CellCipher(key.expand("quiet/key", 32), "key", DATA_KEY_BYTES)
+
+
+def parameter_cipher(data_key: bytes, width: int) -> CellCipher:
+    """The cipher of numbered parts of the parameters, in carriers of `width` bytes."""
+    return CellCipher(data_key, "parameters", width - TAG_BYTES)
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """Parameters of a secret: `count` records and copies of `record_bytes`, `cells` per carrier."""
+
+    service: int
+    method: str
+    cells: int
+    record_bytes: int
+    gaussians: int  # size of the published model
+    count: int
+    header: bytes
+    sketch: bytes = b""  # empty in blocks
+
+    def parts(self, width: int) -> Bytes:
+        """[P, width - TAG_BYTES] numbered parts."""
+        numbers = self.cells, self.record_bytes, len(self.header), self.gaussians, self.count
+        packed = (
+            _PREFIX.pack(VERSION, self.service, pack_method(self.method), *numbers)
+            + self.sketch
+            + self.header
+        )
+        size = width - TAG_BYTES - 1
+        count = -(-len(packed) // size)
+        parts = np.frombuffer(packed.ljust(count * size, b"\0"), np.uint8).reshape(count, size)
+        return np.concatenate([np.arange(count, dtype=np.uint8)[:, None], parts], axis=1)
+
+
+def unpack(parts: Bytes, sketch_bytes: int = SKETCH_BYTES) -> Parameters:
+    """Parameters from decrypted parts [P, 1 + part] in any order. Raises InputError for damage or loss.
+
+    `sketch_bytes`: 0 in blocks.
+    """
+    numbered = {int(row[0]): row[1:].tobytes() for row in parts}
+    packed = b"".join(numbered[each] for each in takewhile(numbered.__contains__, range(len(numbered))))
+    if len(packed) < _PREFIX.size:
+        raise InputError(LOST)
+    version, service, name, cells, size, length, gaussians, count = _PREFIX.unpack_from(packed)
+    if version != VERSION:
+        raise InputError(f"hidden secret of version {version}; this program reads version {VERSION}")
+    if service not in (PAYLOAD, RECORDS) or not 1 <= cells <= MAX_CELLS or length > MAX_HEADER_BYTES:
+        raise InputError(
+            f"the hidden parameters are damaged: service {service}, {cells} cells of a carrier, {length} "
+            "bytes of header"
+        )
+    try:
+        method = unpack_method(name)
+    except ValueError as error:
+        raise InputError(f"the hidden parameters are damaged: {error}") from error
+    header, end = _PREFIX.size + sketch_bytes, _PREFIX.size + sketch_bytes + length
+    if len(packed) < end:
+        raise InputError(LOST)
+    own, sketch = packed[header:end], packed[_PREFIX.size : header]
+    return Parameters(service, method, cells, size, gaussians, count, own, sketch)
+
+
+def pack_codewords(size: int, codewords: Codewords) -> bytes:
+    """The header of a payload of `size` encrypted bytes in low bits."""
+    return _CODEWORDS.pack(size, codewords.count, codewords.n, codewords.k)
+
+
+def unpack_codewords(header: bytes, record_bytes: int) -> tuple[int, Codewords]:
+    """Invert `pack_codewords`. Raises InputError for impossible numbers."""
+    try:
+        size, count, n, k = _CODEWORDS.unpack(header)
+        codewords = Codewords(count, n, k, record_bytes - NUMBER_BYTES)
+        if codewords.chunks > MAX_CODEWORDS * MAX_CHUNKS or not 0 < size <= codewords.size:
+            raise ValueError(f"{size} bytes in {codewords}")
+    except (ValueError, struct.error) as error:
+        raise InputError(f"the hidden parameters are damaged: {error}") from error
+    return size, codewords
 
 
 def numbered_chunks(codewords: Codewords, data: bytes, cells: int) -> Bytes:
