@@ -100,7 +100,8 @@ class CarryMethod:
         cover, *secrets = sources
         capacity, secret_sizes = capacity_for(cover.given, options, _PLANNED), _secret_sizes(secrets, options)
         sizes = capacity.sizes(secret_sizes)
-        appended, notes = capacity.appended(secret_sizes), []
+        appended = capacity.appended(secret_sizes) if isinstance(capacity, PayloadCapacity) else 0
+        notes = []
         if cover.given is not None and capacity.cover is not None and capacity.cover is not cover.given:
             psnr = psnr_between(cover.given, capacity.cover)
             notes.append(f"other harmonics leave the cover at {psnr:.1f} dB PSNR against itself")
