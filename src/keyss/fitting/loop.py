@@ -24,7 +24,6 @@ from torch import Tensor
 from keyss import _threads
 from keyss._interrupts import ENDING
 from keyss.core.errors import InputError, Interrupted, KeyssWarning
-from keyss.core.gaussians import Gaussians
 from keyss.files.atomic import write_bytes
 from keyss.fitting.config import FitConfig
 from keyss.fitting.density import CappedStrategy, Rendered, of_scene
@@ -86,10 +85,6 @@ class TrainingRun(ABC):
     @abstractmethod
     def evaluate(self) -> dict[str, float]:
         """Quality on held-out views, by name."""
-
-    @abstractmethod
-    def gaussians(self) -> Gaussians:
-        """The model, detached."""
 
     def __len__(self) -> int:
         """Number of Gaussians."""

@@ -215,11 +215,7 @@ def refit(
         rate=boost_of(fit) if photos else _MODEL_RATE,
         device=context.device,
         title=f"refit of the {name}",
-        checkpoint=context.checkpoints / f"{name.replace(' ', '-')}.safetensors"
-        if context.checkpoints
-        else None,
-        resume=context.resume,
-        reporter=context.reporter,
+        **context.keeping(name.replace(" ", "-")),
     ).gaussians
 
 
