@@ -63,12 +63,11 @@ class FitConfig:
             ("settle", 0, 1),
             ("coarse", 0, 1),
             ("boost", 1, 100),
+            ("seed", 0, MAX_SEED),
         ):
             value = getattr(self, name)
             if value is not None and not low <= value <= high:
                 raise UsageError(f"`{name}`: expected {low} to {high}, got {value}")
-        if self.seed is not None and not 0 <= self.seed <= MAX_SEED:
-            raise UsageError(f"`seed`: expected 0 to {MAX_SEED}, got {self.seed}")
 
     def with_seed(self, otherwise: int | None = None) -> FitConfig:
         """The config with a seed: its own, else `otherwise`, else one from the system's random source."""

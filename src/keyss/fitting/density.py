@@ -58,31 +58,26 @@ class CappedStrategy(DefaultStrategy):  # type: ignore[misc]
         self.opacity_for_pruning = opacity_for_pruning
         self.freeze = freeze
 
-    def backward(
-        self,
-        views: Sequence[T],
-        loss_at: Callable[[T], tuple[Tensor, list[Rendered]]],
-        count: int,
-    ) -> tuple[Tensor, list[Tensor]]:
-        """Compute the gradients of the mean loss of a step's `views` of `count` Gaussians.
-
-        `loss_at` renders one view and returns its loss and the renders that count for densification. Returns
-        the mean loss, and the info that `step_post_backward` takes.
-        """
-        losses: list[Tensor] = []
-        renders: list[Rendered] = []
-        for view in views:
-            loss, rendered = loss_at(view)
-            for meta, _, _ in rendered:
-                meta["means2d"].retain_grad()
-            (loss / len(views)).backward()
-            losses.append(loss.detach() / len(views))
-            renders += [(meta, indices, weight / len(views)) for meta, indices, weight in rendered]
-        return torch.stack(losses).sum(), self.statistics(renders, count)
-
     def statistics(self, renders: Sequence[Rendered], count: int) -> list[Tensor]:
-        """[2, N] for each of a step's renders of `count` Gaussians; see `statistics_of`."""
-        return statistics_of(renders, count)
+        """[2, `count`] for each render: norms of screen-space gradients, and 1 for visible Gaussians.
+
+        Combined densification (KeySS, section 3.4) adds them up over the renders of all scenes. Gradients
+        are for a screen from -1 to 1 as large as that of the first render, and divided by the weight of the
+        loss, to match the thresholds of plain 3DGS.
+        """
+        width, height = renders[0][0]["width"], renders[0][0]["height"]
+        found = []
+        for meta, indices, weight in renders:
+            gradients, radii = meta["means2d"].grad[0], meta["radii"][0]  # [M, 2]
+            size = gradients.new_tensor([meta["width"] / width, meta["height"] / height])
+            gradients = gradients * (size / weight) * gradients.new_tensor([width / 2, height / 2])
+            visible = (radii > 0).all(1)
+            values = gradients.new_zeros(2, count)
+            where = slice(None) if indices is None else indices
+            values[0, where] = torch.where(visible, torch.linalg.vector_norm(gradients, dim=1), 0)
+            values[1, where] = visible.float()
+            found.append(values)
+        return found
 
     def _update_state(
         self, params: Parameters, state: dict[str, Any], info: list[Tensor], packed: bool = False
@@ -121,28 +116,6 @@ class CappedStrategy(DefaultStrategy):  # type: ignore[misc]
         return count
 
 
-def statistics_of(renders: Sequence[Rendered], count: int) -> list[Tensor]:
-    """[2, N] for each render: norms of screen-space gradients, and 1 for visible Gaussians.
-
-    Combined densification (KeySS, section 3.4) adds them up over the renders of all scenes. Gradients are for
-    a screen from -1 to 1 as large as that of the first render, and divided by the weight of the loss, to
-    match the thresholds of plain 3DGS.
-    """
-    width, height = renders[0][0]["width"], renders[0][0]["height"]
-    found = []
-    for meta, indices, weight in renders:
-        gradients, radii = meta["means2d"].grad[0], meta["radii"][0]  # [M, 2]
-        size = gradients.new_tensor([meta["width"] / width, meta["height"] / height])
-        gradients = gradients * (size / weight) * gradients.new_tensor([width / 2, height / 2])
-        visible = (radii > 0).all(1)
-        values = gradients.new_zeros(2, count)
-        where = slice(None) if indices is None else indices
-        values[0, where] = torch.where(visible, torch.linalg.vector_norm(gradients, dim=1), 0)
-        values[1, where] = visible.float()
-        found.append(values)
-    return found
-
-
 def of_scene(named: dict[str, T], scene: int) -> dict[str, T]:
     """The entries of one scene, by their names in it: `means` is the cover's, `1/means` secret 1's."""
     own = str(scene) if scene else ""
@@ -169,7 +142,7 @@ class FixedRows(CappedStrategy):
     def statistics(self, renders: Sequence[Rendered], count: int) -> list[Tensor]:
         """[2, S, N] sums over each scene's own renders; `renders` cycle through the scenes."""
         scenes = len(self.extents)
-        own = [statistics_of(renders[scene::scenes], count) for scene in range(scenes)]
+        own = [CappedStrategy.statistics(self, renders[each::scenes], count) for each in range(scenes)]
         return [torch.stack([reduce(torch.add, each) for each in own], dim=1)]
 
     @torch.no_grad()

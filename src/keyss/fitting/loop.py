@@ -24,7 +24,6 @@ from torch import Tensor
 from keyss import _threads
 from keyss._interrupts import ENDING
 from keyss.core.errors import InputError, Interrupted, KeyssWarning
-from keyss.core.gaussians import Gaussians
 from keyss.files.atomic import write_bytes
 from keyss.fitting.config import FitConfig
 from keyss.fitting.density import CappedStrategy, Rendered, of_scene
@@ -87,17 +86,26 @@ class TrainingRun(ABC):
     def evaluate(self) -> dict[str, float]:
         """Quality on held-out views, by name."""
 
-    @abstractmethod
-    def gaussians(self) -> Gaussians:
-        """The model, detached."""
-
     def __len__(self) -> int:
         """Number of Gaussians."""
         return len(self.parameters["means"])
 
     def optimise(self, views: Sequence[T], loss_at: Callable[[T], tuple[Tensor, list[Rendered]]]) -> None:
-        """Take an optimisation step on the mean loss of `views`; see `CappedStrategy.backward`."""
-        self.loss, info = self.strategy.backward(views, loss_at, len(self))
+        """Take an optimisation step on the mean loss of `views`.
+
+        `loss_at` renders one view and returns its loss and the renders that count for densification.
+        """
+        losses: list[Tensor] = []
+        renders: list[Rendered] = []
+        for view in views:
+            loss, rendered = loss_at(view)
+            for meta, _, _ in rendered:
+                meta["means2d"].retain_grad()
+            (loss / len(views)).backward()
+            losses.append(loss.detach() / len(views))
+            renders += [(meta, indices, weight / len(views)) for meta, indices, weight in rendered]
+        self.loss = torch.stack(losses).sum()
+        info = self.strategy.statistics(renders, len(self))
         self.set_rates()
         for optimizer in (*self.optimizers.values(), *self.network_optimizers):
             optimizer.step()

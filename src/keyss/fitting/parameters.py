@@ -7,7 +7,6 @@ training only. Unlike in gsplat, all SH coefficients are one parameter, so no st
 from __future__ import annotations
 
 import math
-from dataclasses import fields
 
 import torch
 from torch import Tensor
@@ -30,8 +29,7 @@ def to_parameters(gaussians: Gaussians, device: torch.device) -> Parameters:
     """Copy the Gaussians into leaf parameters on `device`."""
     contiguous = torch.contiguous_format
     copy = gaussians.detach().to(device).map(lambda tensor: tensor.clone(memory_format=contiguous))
-    tensors = (getattr(copy, field.name) for field in fields(copy))
-    return {name: torch.nn.Parameter(tensor) for name, tensor in zip(_NAMES, tensors, strict=True)}
+    return {name: torch.nn.Parameter(each) for name, each in zip(_NAMES, vars(copy).values(), strict=True)}
 
 
 def to_gaussians(parameters: Parameters) -> Gaussians:

@@ -67,16 +67,13 @@ def _fit_all(
     fits: Mapping[int, tuple[Scene, FitConfig]], kind: str, titles: Sequence[str], context: Context
 ) -> dict[int, Gaussians]:
     """Fit scenes by index, the cover first; `kind` names the seeds and the checkpoints."""
-    folder = context.checkpoints
     return {
         index: fit_scene(
             scene,
             replace(config, seed=config.seed_of(f"{kind} {index}")),
             title=f"{titles[index]} ({scene.name})",
-            checkpoint=folder / f"{kind.split()[0]}-{index}.safetensors" if folder else None,
-            reporter=context.reporter,
             device=context.device,
-            resume=context.resume,
+            **context.keeping(f"{kind.split()[0]}-{index}"),
         ).gaussians
         for index, (scene, config) in fits.items()
     }

@@ -143,10 +143,6 @@ class RecordCapacity:
             for model, (count, degree) in zip(models, self.sizes([*map(SecretSize.of, models)]), strict=True)
         ]
 
-    def appended(self, secrets: Sequence[SecretSize]) -> int:
-        """Gaussians by which the model grows."""
-        return 0
-
 
 @dataclass(frozen=True)
 class PayloadCapacity:

@@ -100,7 +100,8 @@ class CarryMethod:
         cover, *secrets = sources
         capacity, secret_sizes = capacity_for(cover.given, options, _PLANNED), _secret_sizes(secrets, options)
         sizes = capacity.sizes(secret_sizes)
-        appended, notes = capacity.appended(secret_sizes), []
+        appended = capacity.appended(secret_sizes) if isinstance(capacity, PayloadCapacity) else 0
+        notes = []
         if cover.given is not None and capacity.cover is not None and capacity.cover is not cover.given:
             psnr = psnr_between(cover.given, capacity.cover)
             notes.append(f"other harmonics leave the cover at {psnr:.1f} dB PSNR against itself")
@@ -214,11 +215,7 @@ def refit(
         rate=boost_of(fit) if photos else _MODEL_RATE,
         device=context.device,
         title=f"refit of the {name}",
-        checkpoint=context.checkpoints / f"{name.replace(' ', '-')}.safetensors"
-        if context.checkpoints
-        else None,
-        resume=context.resume,
-        reporter=context.reporter,
+        **context.keeping(name.replace(" ", "-")),
     ).gaussians
 
 

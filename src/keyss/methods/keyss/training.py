@@ -313,7 +313,7 @@ class KeyssTraining(TrainingRun):
         `entropy`: 32 secret bytes that seed all randomness.
         """
         # Shuffle: in training, the points of each scene are contiguous.
-        stego = self.gaussians().to("cpu")
+        stego = self.cover().detach().to("cpu")
         numbers = np.frombuffer(stream(entropy, "order", 8 * len(stego)), "<u8")
         stego = stego[torch.from_numpy(numbers.argsort(kind="stable"))]
         anchors = choose_anchors(stego, self.fit.known_seed)
@@ -322,10 +322,6 @@ class KeyssTraining(TrainingRun):
             shown = visibility(decoder.decode(stego, key.cpu()))
             secrets.append(KeyssSecret(decoder, key.cpu(), placed.frame, anchors, *shown))
         return stego, secrets
-
-    def gaussians(self) -> Gaussians:
-        """The model to publish."""
-        return self.cover().detach()
 
     def train(self, sources: Sequence[Source], context: Context) -> None:
         """Take all steps. Raises Interrupted, and InputError for a checkpoint of another run."""
@@ -338,9 +334,7 @@ class KeyssTraining(TrainingRun):
                 "models": [source.model.digest() for source in sources],
                 "options": json.loads(json.dumps(asdict(self.options))),  # tuples become lists
             },
-            checkpoint=context.checkpoints / "joint.safetensors" if context.checkpoints else None,
-            resume=context.resume,
-            reporter=context.reporter,
+            **context.keeping("joint"),
         )
 
     def state(self) -> State:
