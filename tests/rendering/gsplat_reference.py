@@ -88,16 +88,14 @@ def projection_ewa_3dgs_fused_bwd(
 ) -> tuple[Tensor | None, ...]:  # fmt: skip
     assert not viewmats_too
     totals = [torch.zeros_like(each) for each in (means, quats, scales)]
-    for camera in range(len(viewmats)):
-        (seen,) = (radii[camera] > 0).all(-1).nonzero(as_tuple=True)
-        own = slice(camera, camera + 1)
-        gradients = pullback(
-            lambda *leaves, own=own: project(*leaves, viewmats[own], Ks[own], width, height, eps2d)[1:4],
-            [each[seen] for each in (means, quats, scales)],
-            [each[own, seen] for each in (v_means2d, v_depths, v_conics)],
-        )
-        for total, gradient in zip(totals, gradients, strict=True):
-            total.index_add_(0, seen, gradient)
+    (seen,) = (radii[0] > 0).all(-1).nonzero(as_tuple=True)
+    gradients = pullback(
+        lambda *leaves: project(*leaves, viewmats, Ks, width, height, eps2d)[1:4],
+        [each[seen] for each in (means, quats, scales)],
+        [each[:, seen] for each in (v_means2d, v_depths, v_conics)],
+    )
+    for total, gradient in zip(totals, gradients, strict=True):
+        total[seen] = gradient
     return totals[0], None, totals[1], totals[2], None
 
 
@@ -139,10 +137,8 @@ def intersect_tile(
     within = torch.arange(len(ids)) - (counts.flatten().cumsum(0) - counts.flatten())[ids]
     widths, starts = spans[..., 0].flatten()[ids], low.reshape(-1, 2)[ids]
     tiles = (starts[:, 1] + within // widths) * columns + starts[:, 0] + within % widths
-    tiles = (ids // means2d.shape[-2] << (columns * rows).bit_length()) | tiles
-    keys, order = ((tiles << 32) | depths.flatten()[ids].view(torch.int32)).sort(
-        stable=True
-    )  # as CUB's sort is
+    keys = (tiles << 32) | depths.flatten()[ids].view(torch.int32)
+    keys, order = keys.sort(stable=True)  # as CUB's sort is
     return counts, keys, ids[order].int()
 
 

@@ -32,9 +32,11 @@ class Codes(ABC):
     name: ClassVar[str]  # for users
     sorts: ClassVar[bool] = True  # whether `write` reorders Gaussians
 
-    @abstractmethod
+    positions: Numbers  # [N, 3]
+
     def __len__(self) -> int:
         """Number of Gaussians."""
+        return len(self.positions)
 
     @classmethod
     @abstractmethod

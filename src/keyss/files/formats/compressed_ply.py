@@ -59,9 +59,6 @@ class CompressedPlyCodes(Codes):
     sh: Bytes  # [N, K - 1, 3] harmonics in 32nds from -4 on
     comments: tuple[str, ...] = field(default=(), compare=False)  # whole lines of the header
 
-    def __len__(self) -> int:
-        return len(self.positions)
-
     @classmethod
     def parse(cls, data: bytes) -> Self:
         """See `Codes`."""

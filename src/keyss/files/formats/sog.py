@@ -117,9 +117,6 @@ class SogCodes(Codes):
     palette: Bytes  # [P, K - 1, 3] codebook indices
     labels: Shorts  # [N] indices into the palette; 0 for degree 0
 
-    def __len__(self) -> int:
-        return len(self.positions)
-
     @classmethod
     def parse(cls, data: bytes) -> Self:
         """See `Codes`."""

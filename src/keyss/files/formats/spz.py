@@ -244,9 +244,6 @@ class SpzCodes(Codes):
     extensions: bytes = b""  # not parsed
     packed: bytes = field(default=b"", repr=False, compare=False)  # the original file
 
-    def __len__(self) -> int:
-        return len(self.positions)
-
     @classmethod
     def parse(cls, data: bytes) -> Self:
         """See `Codes`."""
