@@ -1,4 +1,4 @@
-/** The content of channels, and how many Gaussians are not of its model; counterpart of `keyss.channels.payloads` and `sketch`. */
+/** The content of channels, and Gaussians of other models; counterpart of `keyss.channels.payloads` and `sketch`. */
 import { bytesKey, viewOf } from '../core/bytes.ts';
 import { damaged } from '../core/errors.ts';
 import { blockwise, type Derive, expand } from '../keys/keys.ts';

@@ -120,20 +120,22 @@ function sog(model: Gaussians): { codes: SogCodes; decoded: Gaussians } | null {
 
 function compressedPly({ count, means, logScales, quats }: Gaussians): { codes: CompressedPlyCodes; decoded: Gaussians } {
   const [placeBounds, scaleBounds] = [boundsOf(means, Infinity), boundsOf(logScales, SCALE_LIMIT)];
-  const packed = (values: Float32Array, bounds: Float64Array[][]): Float64Array => Float64Array.from({ length: count }, (_, row) => {
+  const packed = (row: number, values: Float32Array, bounds: Float64Array[][]): number => {
     const [x, y, z] = AXES.map((axis) => {
       const [low, high] = bounds[axis].map((each) => each[Math.floor(row / CHUNK)]);
       const share = high - low < MIN_RANGE ? 0 : (values[3 * row + axis] - low) / (high - low);
       return Math.floor(Math.min(1, Math.max(0, share)) * VECTOR[axis] + 0.5);
     });
     return ((x << 21) | (y << 11) | z) >>> 0;
-  });
+  };
   const { largest, others } = quantised(quats, (part) => {
     return Math.min(1023, Math.max(0, Math.round((part * Math.sqrt(0.5) + 0.5) * 1023)));
   });
   const codes: CompressedPlyCodes = {
     kind: 'compressed-ply', count, shDegree: 0, placeBounds, scaleBounds, colourBounds: placeBounds,
-    positions: packed(means, placeBounds), scales: packed(logScales, scaleBounds), colours: new Float64Array(count),
+    positions: Float64Array.from({ length: count }, (_, row) => packed(row, means, placeBounds)),
+    scales: Float64Array.from({ length: count }, (_, row) => packed(row, logScales, scaleBounds)),
+    colours: new Float64Array(count),
     rotations: Float64Array.from(largest, (index, row) => {
       const [a, b, c] = others.subarray(3 * row, 3 * row + 3);
       return ((index << 30) | (a << 20) | (b << 10) | c) >>> 0;
