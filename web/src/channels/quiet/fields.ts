@@ -1,6 +1,6 @@
 /**
  * The integers of a quantised model that carry bits, how many bits each, the order in which they are counted, and the messages
- * of blocks of them; counterpart of `keyss.channels.quiet.fields`, `order` and `wet_paper`.
+ * of blocks of them; counterpart of `keyss.channels.quiet.fields` and `wet_paper`.
  *
  * The arithmetic gives the same result on every machine, in the same order of operations as in Python, without
  * logarithms: a reader must find the same numbers of bits as the writer.
