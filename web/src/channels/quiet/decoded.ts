@@ -14,14 +14,8 @@ const [MAX_FRACTIONAL_BITS, MAX_POSITION] = [24, 2 ** 23 - 1];
 const [SCALE_LIMIT, MIN_RANGE] = [20, 1e-5];
 const AXES = [0, 1, 2];
 
-/** Levels, and a mask of the Gaussians that are not exact decodings: they carry nothing. */
-interface Decoded {
-  readonly levels: Levels;
-  readonly silent: Uint8Array; // [N]
-}
-
-/** The decoded model; null if the model was decoded from none of the formats. */
-export function decodedFrom(model: Gaussians): Decoded | null {
+/** Gaussians that are not exact decodings are silent. Null if the model was decoded from none of the formats. */
+export function decodedLevels(model: Gaussians): Levels | null {
   const { count, opacityLogits } = model;
   if (!count || !distinct(opacityLogits.subarray(0, SAMPLE)) || !distinct(opacityLogits)) return null;
   for (const attempt of [spz, sog, compressedPly]) {
@@ -29,7 +23,7 @@ export function decodedFrom(model: Gaussians): Decoded | null {
     if (!found) continue;
     const silent = Uint8Array.from({ length: count }, (_, row) => (follows(model, row, found.decoded) ? 0 : 1));
     if (silent.reduce((sum, each) => sum + 1 - each, 0) >= MOST * count) {
-      return { levels: { ...levelsOf(found.codes), unwritten: unwritten(model) }, silent };
+      return { ...levelsOf(found.codes), unwritten: unwritten(model), silent };
     }
   }
   return null;
