@@ -1,4 +1,4 @@
-/** The content of channels, and how many Gaussians are not of its model; counterpart of `keyss.channels.payloads` and `sketch`. */
+/** The content of channels, and Gaussians of other models; counterpart of `keyss.channels.base` and `sketch`. */
 import { bytesKey, viewOf } from '../core/bytes.ts';
 import { damaged } from '../core/errors.ts';
 import { blockwise, type Derive, expand } from '../keys/keys.ts';
@@ -32,7 +32,7 @@ export interface Reader {
 
 const METHOD_BYTES = 15;
 
-/** Parses method name, zero byte, data; counterpart of `keyss.channels.payloads`. */
+/** Parses method name, zero byte, data. */
 export function unpackPayload(packed: Uint8Array): Payload {
   const length = packed.indexOf(0);
   const name = packed.subarray(0, length);

@@ -1,5 +1,5 @@
 /**
- * Opens a secret with a key in any channel of a model; counterpart of `keyss.channels.opening`.
+ * Opens a secret with a key in any channel of a model; counterpart of `keyss.channels.publishing`.
  *
  * Every key searches all channels, even after one has opened, so that timing reveals neither whether a key opens
  * something nor where. Colours are searched last, as they take four times as long as all others together.

@@ -15,11 +15,9 @@ export function ascii(text: string): Uint8Array {
   return new TextEncoder().encode(text);
 }
 
-/** A string key for maps, equal for equal bytes only. */
+/** A string with a character for each of a few bytes: equal for equal bytes only. */
 export function bytesKey(bytes: Uint8Array): string {
-  let text = '';
-  for (const byte of bytes) text += String.fromCharCode(byte);
-  return text;
+  return String.fromCharCode(...bytes);
 }
 
 export function viewOf(bytes: Uint8Array): DataView {

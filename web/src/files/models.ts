@@ -1,5 +1,5 @@
 /** Reads models of any format, identified by their first bytes, or by name if they have no magic bytes. */
-import { viewOf } from '../core/bytes.ts';
+import { bytesKey, viewOf } from '../core/bytes.ts';
 import { damaged, InputError } from '../core/errors.ts';
 import type { Gaussians } from '../core/gaussians.ts';
 import { gaussiansOf, SH_C0 } from './coded.ts';
@@ -19,7 +19,7 @@ export interface ReadModel extends Gaussians {
 
 /** `decode`: decoder for the images of a .sog. Raises InputError for unknown formats and damaged files. */
 export async function readModel(bytes: Uint8Array, name = '', decode?: Decode): Promise<ReadModel> {
-  const start = [...bytes.subarray(0, 4)].map((byte) => String.fromCharCode(byte)).join('');
+  const start = bytesKey(bytes.subarray(0, 4));
   if (start.startsWith('ply')) {
     const file = openPly(bytes);
     return isCompressed(file) ? readCompressedPly(file) : readPly(file);

@@ -7,7 +7,7 @@ const MAX_HEADER_BYTES = 65536;
 const [SPACE, MAX_DIGITS] = [32, 100];
 const OPACITY_LOGIT_BOUND = 16; // replaces infinity
 const LEAST_LOG_SCALE = -87.33654; // replaces minus infinity
-// Criteria for activated scales, as in keyss.files.ply_rows.
+// Criteria for activated scales, as in keyss.files.ply_table.
 const [ENOUGH, NEARLY_ALL, SMALL_SCALE, LARGE, RATIO] = [100, 0.99, 0.2, 0.3, 20];
 
 /** Size in bytes and DataView method of each type, by both of its names. */

@@ -1,6 +1,6 @@
 /** Reader of SOG, version 2, a ZIP archive of lossless WebP images; counterpart of `keyss.files.formats.sog`. */
 import { unzipSync } from 'fflate';
-import { viewOf } from '../core/bytes.ts';
+import { bytesKey, viewOf } from '../core/bytes.ts';
 import { damaged, InputError } from '../core/errors.ts';
 import { coefficients, type Gaussians } from '../core/gaussians.ts';
 import { fromSmallestThree, gaussiansOf, holds } from './coded.ts';
@@ -189,7 +189,7 @@ const decodeInBrowser: Decode = async (webp) => {
 
 /** [width, height] from the header of a lossless WebP. Raises InputError. */
 function sizeOf(data: Uint8Array): [number, number] {
-  const text = (at: number): string => String.fromCharCode(...data.subarray(at, at + 4));
+  const text = (at: number): string => bytesKey(data.subarray(at, at + 4));
   if (data.length < 30 || text(0) !== 'RIFF' || text(8) !== 'WEBP') throw damaged();
   if (text(12) === 'VP8L') {
     const bits = viewOf(data).getUint32(21, true);

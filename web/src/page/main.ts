@@ -8,7 +8,7 @@ import type { Answer, Question } from '../worker.ts';
 import { Controls } from './controls.ts';
 import { givenModel, notifyParent, params } from './embedding.ts';
 import { inspected, listenToInspection } from './inspection.ts';
-import { count, page, placeBorder, preparePanel, save, showKey } from './panel.ts';
+import { count, page, preparePanel, save, showKey } from './panel.ts';
 import {
   add, axes, FIELD_OF_VIEW, firstPose, pick, type Pose, poseOfHash, poseToHash, transferPose, upName, UPS,
   type Vector,
@@ -252,7 +252,8 @@ class Page {
     page.revealed.hidden = this.secret === null;
     page.wipe.value = String(100 * (1 - share));
     this.viewer?.setSplit(share);
-    placeBorder(share);
+    page.border.hidden = share <= 0 || share >= 1;
+    page.border.style.left = `${100 * share}%`;
   }
 
   private async snapshot(): Promise<void> {

@@ -54,12 +54,6 @@ export function showKey(shown: boolean): void {
   page.show.setAttribute('aria-pressed', String(shown));
 }
 
-/** Places the border between the models at a share of the width. */
-export function placeBorder(share: number): void {
-  page.border.hidden = share <= 0 || share >= 1;
-  page.border.style.left = `${100 * share}%`;
-}
-
 export function count(number: number): string {
   return number.toLocaleString('en');
 }

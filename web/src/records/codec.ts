@@ -29,63 +29,52 @@ class Line {
 
 const QUAT_LINE = new Line(0, 0, Math.sqrt(0.5));
 
-/** The format of one secret's records. */
-export class Codec {
-  private constructor(
-    readonly bits: readonly number[], // of positions, log scales, quaternions, opacity, then of each degree
-    private readonly lines: readonly Line[],
-    private readonly far: readonly Line[], // for outliers
-  ) {}
-
-  /** From the start of a header. Raises InputError. */
-  static unpack(data: Uint8Array): Codec {
-    if (data.length < TABLE_BYTES) throw damaged();
-    let count = TABLE_BYTES;
-    while (count > 0 && data[count - 1] === 0) count--;
-    const bits = [...data.subarray(0, count)];
-    const impossible = bits.length < 5 || bits.some((each) => each < 1 || each > MAX_BITS);
-    if (impossible || Math.min(...bits.slice(4)) <= CHROMA_FEWER) throw damaged();
-    const size = TABLE_BYTES + LINE_BYTES * (2 * bits.length - 3);
-    if (data.length < size) throw damaged();
-    const view = viewOf(data);
-    const [lines, far]: Line[][] = [[], []];
-    for (let at = TABLE_BYTES; at < size; at += LINE_BYTES) {
-      const [centre, spread] = [view.getFloat32(at, true), view.getFloat32(at + 4, true)];
-      lines.push(new Line(centre, spread, halfFloat(view.getUint16(at + 8, true))));
-      far.push(new Line(centre, spread, halfFloat(view.getUint16(at + 10, true))));
-    }
-    return new Codec(bits, lines, far);
-  }
-
-  get recordBytes(): number {
-    const [means, logScales, quats, opacity, ...colours] = this.bits;
-    const geometry = 1 + 2 + 3 * (quats + means + logScales) + opacity;
-    return Math.ceil(colours.reduce((sum, bits, band) => sum + BANDS[band] * (3 * bits - 2 * CHROMA_FEWER), geometry) / 8);
-  }
-
-  /** The Gaussians of records of any bytes. */
-  decode(records: readonly Uint8Array[]): Gaussians {
-    const [means, logScales, quats, opacity, ...colours] = this.bits;
-    const found = emptyGaussians(records.length, colours.length - 1);
-    records.forEach((record, row) => {
-      const next = codesOf(record);
-      const lines = next(1) ? this.far : this.lines;
-      const decoded = (line: Line, bits: number): number => line.value(next(bits), bits);
-      found.quats.set(wholeQuat(next(2), [0, 1, 2].map(() => decoded(QUAT_LINE, quats))), 4 * row);
-      for (let axis = 0; axis < 3; axis++) found.means[3 * row + axis] = decoded(lines[axis], means);
-      for (let axis = 0; axis < 3; axis++) found.logScales[3 * row + axis] = decoded(lines[3], logScales);
-      found.opacityLogits[row] = decoded(lines[4], opacity);
-      let at = 3 * row * coefficients(found.shDegree);
-      colours.forEach((bits, band) => {
-        const [bright, different] = [lines[5 + 2 * band], lines[6 + 2 * band]];
-        for (const a of Array.from({ length: BANDS[band] }, () => decoded(bright, bits))) {
-          putColours(found.sh, at, a, decoded(different, bits - CHROMA_FEWER), decoded(different, bits - CHROMA_FEWER));
-          at += 3;
-        }
-      });
+/** The Gaussians of records of any bytes. Raises InputError for a header that is damaged or of other records. */
+export function decodeRecords(header: Uint8Array, records: readonly Uint8Array[]): Gaussians {
+  const [bits, lines, far] = parsed(header);
+  const [means, logScales, quats, opacity, ...colours] = bits;
+  const geometry = 1 + 2 + 3 * (quats + means + logScales) + opacity;
+  const size = colours.reduce((sum, each, band) => sum + BANDS[band] * (3 * each - 2 * CHROMA_FEWER), geometry);
+  if (records[0].length !== Math.ceil(size / 8)) throw damaged();
+  const found = emptyGaussians(records.length, colours.length - 1);
+  records.forEach((record, row) => {
+    const next = codesOf(record);
+    const own = next(1) ? far : lines;
+    const decoded = (line: Line, count: number): number => line.value(next(count), count);
+    found.quats.set(wholeQuat(next(2), [0, 1, 2].map(() => decoded(QUAT_LINE, quats))), 4 * row);
+    for (let axis = 0; axis < 3; axis++) found.means[3 * row + axis] = decoded(own[axis], means);
+    for (let axis = 0; axis < 3; axis++) found.logScales[3 * row + axis] = decoded(own[3], logScales);
+    found.opacityLogits[row] = decoded(own[4], opacity);
+    let at = 3 * row * coefficients(found.shDegree);
+    colours.forEach((each, band) => {
+      const [bright, different] = [own[5 + 2 * band], own[6 + 2 * band]];
+      for (const a of Array.from({ length: BANDS[band] }, () => decoded(bright, each))) {
+        putColours(found.sh, at, a, decoded(different, each - CHROMA_FEWER), decoded(different, each - CHROMA_FEWER));
+        at += 3;
+      }
     });
-    return found;
+  });
+  return found;
+}
+
+/** Bits of positions, log scales, quaternions, opacity, then of each degree; lines, and those for outliers. */
+function parsed(header: Uint8Array): [number[], Line[], Line[]] {
+  if (header.length < TABLE_BYTES) throw damaged();
+  let count = TABLE_BYTES;
+  while (count > 0 && header[count - 1] === 0) count--;
+  const bits = [...header.subarray(0, count)];
+  const impossible = bits.length < 5 || bits.some((each) => each < 1 || each > MAX_BITS);
+  if (impossible || Math.min(...bits.slice(4)) <= CHROMA_FEWER) throw damaged();
+  const size = TABLE_BYTES + LINE_BYTES * (2 * bits.length - 3);
+  if (header.length < size) throw damaged();
+  const view = viewOf(header);
+  const [lines, far]: Line[][] = [[], []];
+  for (let at = TABLE_BYTES; at < size; at += LINE_BYTES) {
+    const [centre, spread] = [view.getFloat32(at, true), view.getFloat32(at + 4, true)];
+    lines.push(new Line(centre, spread, halfFloat(view.getUint16(at + 8, true))));
+    far.push(new Line(centre, spread, halfFloat(view.getUint16(at + 10, true))));
   }
+  return [bits, lines, far];
 }
 
 /** A function that returns the next code of so many bits, the most significant bit first. */

@@ -4,7 +4,7 @@ import { viewOf } from '../core/bytes.ts';
 import { damaged } from '../core/errors.ts';
 import { compensated, type Gaussians } from '../core/gaussians.ts';
 import { decodeKeyss } from '../keyss/secret.ts';
-import { Codec } from './codec.ts';
+import { decodeRecords } from './codec.ts';
 import { decodeWhole } from './whole.ts';
 
 const [WHOLE, KEYSS, FILE] = ['carry', 'keyss', 'file']; // methods
@@ -29,7 +29,5 @@ export function secretOf(content: Content, stego: Gaussians): Gaussians | null {
   }
   if (content.header.length < 4) throw damaged();
   const hidden = viewOf(content.header).getUint32(0, true);
-  const codec = Codec.unpack(content.header.subarray(4));
-  if (content.records[0].length !== codec.recordBytes) throw damaged();
-  return compensated(codec.decode(content.records), hidden);
+  return compensated(decodeRecords(content.header.subarray(4), content.records), hidden);
 }

@@ -1,4 +1,4 @@
-/** Pilots: appended Gaussians readable without a key, and the frame that they give; counterpart of `keyss.channels.appended.pilots`. */
+/** Pilots: appended Gaussians readable without a key, and their frame; counterpart of `keyss.channels.appended.pilots`. */
 import { mostFrequent, rowsOf } from '../../core/bytes.ts';
 import { fittedRotation, movedPoint, rotationOf, type Similarity } from '../../core/similarity.ts';
 import { mix, type Words } from '../../core/words.ts';

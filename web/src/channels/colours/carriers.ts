@@ -1,4 +1,4 @@
-/** Gaussians that carry bits, IDs, and salts; counterpart of `keyss.channels.colours.carriers` and `salt_gaussians`. */
+/** Gaussians that carry bits, IDs, and salts; counterpart of `keyss.channels.colours.carriers`. */
 import { sha256 } from '@noble/hashes/sha2.js';
 import { ascii, bytesKey, joined, rowsOf } from '../../core/bytes.ts';
 import { type Gaussians, opacity, where, withDegree } from '../../core/gaussians.ts';

@@ -1,4 +1,4 @@
-/** Reader of colours (docs/channels.md); counterpart of `keyss.channels.colours.colours_reader`, `header` and `qim`. */
+/** Reader of colours (docs/channels.md); counterpart of `keyss.channels.colours.channel`, `header` and `qim`. */
 import { hmac } from '@noble/hashes/hmac.js';
 import { sha256 } from '@noble/hashes/sha2.js';
 import { ascii, joined, quantile } from '../../core/bytes.ts';
@@ -30,7 +30,9 @@ export class ColoursReader implements Reader {
 
   /** The content that `key` opens, or null. Raises InputError for damage. */
   async open(key: string, derive: Derive = here): Promise<Payload | null> {
-    const secrets = secretsOf(await Promise.all([STATIC_SALT, ...this.salts].map((salt) => derive(key, salt))));
+    const [first, ...others] = await Promise.all([STATIC_SALT, ...this.salts].map((salt) => derive(key, salt)));
+    const salted = others.map((each) => expand(each, 'colours/header'));
+    const secrets = { fixed: expand(first, 'colours/static'), salted };
     const headers = this.alignments.map((carriers) => readHeader(secrets, carriers));
     for (const [index, header] of headers.entries()) {
       if (header === null) continue;
@@ -85,11 +87,6 @@ const CODE = new Fountain(8 * (PLAIN_BYTES + CHECK_BYTES), NOISY);
 interface Secrets {
   readonly fixed: Uint8Array;
   readonly salted: readonly Uint8Array[];
-}
-
-/** From the keys derived under STATIC_SALT and under each salt. */
-function secretsOf([first, ...others]: readonly Uint8Array[]): Secrets {
-  return { fixed: expand(first, 'colours/static'), salted: others.map((each) => expand(each, 'colours/header')) };
 }
 
 /** Parameters for reading a payload. */
@@ -224,7 +221,9 @@ function seedsOf(secret: Uint8Array, label: string, { ids }: Carriers, bits: Uin
   return Uint32Array.from(found);
 }
 
-/** [B] P(0) - P(1) of all bits of carriers, `bits` [C] in each number. */
+/**
+ * [B] P(0) - P(1) of all bits of carriers, `bits` [C] in each number: dithered quantisation index modulation with soft decisions.
+ */
 function readBits(secret: Uint8Array, { ids, colours }: Carriers, bits: Uint8Array): Float64Array {
   const [dithers, found] = [fractions(secret, 'dither', ids), [] as number[]];
   bits.forEach((count, row) => {

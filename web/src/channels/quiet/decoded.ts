@@ -14,14 +14,8 @@ const [MAX_FRACTIONAL_BITS, MAX_POSITION] = [24, 2 ** 23 - 1];
 const [SCALE_LIMIT, MIN_RANGE] = [20, 1e-5];
 const AXES = [0, 1, 2];
 
-/** Levels, and a mask of the Gaussians that are not exact decodings: they carry nothing. */
-interface Decoded {
-  readonly levels: Levels;
-  readonly silent: Uint8Array; // [N]
-}
-
-/** The decoded model; null if the model was decoded from none of the formats. */
-export function decodedFrom(model: Gaussians): Decoded | null {
+/** Gaussians that are not exact decodings are silent. Null if the model was decoded from none of the formats. */
+export function decodedLevels(model: Gaussians): Levels | null {
   const { count, opacityLogits } = model;
   if (!count || !distinct(opacityLogits.subarray(0, SAMPLE)) || !distinct(opacityLogits)) return null;
   for (const attempt of [spz, sog, compressedPly]) {
@@ -29,7 +23,7 @@ export function decodedFrom(model: Gaussians): Decoded | null {
     if (!found) continue;
     const silent = Uint8Array.from({ length: count }, (_, row) => (follows(model, row, found.decoded) ? 0 : 1));
     if (silent.reduce((sum, each) => sum + 1 - each, 0) >= MOST * count) {
-      return { levels: { ...levelsOf(found.codes), unwritten: unwritten(model) }, silent };
+      return { ...levelsOf(found.codes), unwritten: unwritten(model), silent };
     }
   }
   return null;
@@ -120,20 +114,22 @@ function sog(model: Gaussians): { codes: SogCodes; decoded: Gaussians } | null {
 
 function compressedPly({ count, means, logScales, quats }: Gaussians): { codes: CompressedPlyCodes; decoded: Gaussians } {
   const [placeBounds, scaleBounds] = [boundsOf(means, Infinity), boundsOf(logScales, SCALE_LIMIT)];
-  const packed = (values: Float32Array, bounds: Float64Array[][]): Float64Array => Float64Array.from({ length: count }, (_, row) => {
+  const packed = (row: number, values: Float32Array, bounds: Float64Array[][]): number => {
     const [x, y, z] = AXES.map((axis) => {
       const [low, high] = bounds[axis].map((each) => each[Math.floor(row / CHUNK)]);
       const share = high - low < MIN_RANGE ? 0 : (values[3 * row + axis] - low) / (high - low);
       return Math.floor(Math.min(1, Math.max(0, share)) * VECTOR[axis] + 0.5);
     });
     return ((x << 21) | (y << 11) | z) >>> 0;
-  });
+  };
   const { largest, others } = quantised(quats, (part) => {
     return Math.min(1023, Math.max(0, Math.round((part * Math.sqrt(0.5) + 0.5) * 1023)));
   });
   const codes: CompressedPlyCodes = {
     kind: 'compressed-ply', count, shDegree: 0, placeBounds, scaleBounds, colourBounds: placeBounds,
-    positions: packed(means, placeBounds), scales: packed(logScales, scaleBounds), colours: new Float64Array(count),
+    positions: Float64Array.from({ length: count }, (_, row) => packed(row, means, placeBounds)),
+    scales: Float64Array.from({ length: count }, (_, row) => packed(row, logScales, scaleBounds)),
+    colours: new Float64Array(count),
     rotations: Float64Array.from(largest, (index, row) => {
       const [a, b, c] = others.subarray(3 * row, 3 * row + 3);
       return ((index << 30) | (a << 20) | (b << 10) | c) >>> 0;

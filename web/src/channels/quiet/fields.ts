@@ -1,6 +1,6 @@
 /**
  * The integers of a quantised model that carry bits, how many bits each, the order in which they are counted, and the messages
- * of blocks of them; counterpart of `keyss.channels.quiet.fields`, `order` and `wet_paper`.
+ * of blocks of them; counterpart of `keyss.channels.quiet.fields` and `wet_paper`.
  *
  * The arithmetic gives the same result on every machine, in the same order of operations as in Python, without
  * logarithms: a reader must find the same numbers of bits as the writer.
@@ -37,6 +37,7 @@ export interface Levels {
   readonly unwritten: OfAxis; // three constant colours and the opacity as 32-bit words, which never change
   readonly fields: Field[];
   readonly rows: ArrayLike<number>; // Gaussians in the order in which bits are counted
+  readonly silent?: Uint8Array; // [N] 1 for Gaussians that carry nothing
 }
 
 /** The levels of a file. */
@@ -119,8 +120,8 @@ export function log2(value: number): number {
   return exponent + 2 * (NUMBER[0] - 1); // of a mantissa of 0.5 to 1
 }
 
-/** The last bits of all levels, each 0 or 1, in the order in which they are counted; `silent` [N] rows have none. */
-export function lastBits({ fields, rows }: Levels, silent?: Uint8Array): Uint8Array {
+/** The last bits of all levels, each 0 or 1, in the order in which they are counted. */
+export function lastBits({ fields, rows, silent }: Levels): Uint8Array {
   const count = ({ bits }: Field, row: number): number => (silent?.[row] ? 0 : bits(row));
   let size = 0;
   for (const field of fields) for (let index = 0; index < rows.length; index++) size += count(field, rows[index]);

@@ -1,5 +1,5 @@
 /**
- * Reads the low bits of a model, or the codes of a file, with a key; counterpart of `keyss.channels.quiet.reading` and
+ * Reads the low bits of a model, or the codes of a file, with a key; counterpart of `keyss.channels.quiet.contents` and
  * `parameters` (docs/byte-layout.md, "Parameters").
  *
  * A wrong key makes the same passes over all cells as a right one, and all salts are always tried, so the time taken
@@ -14,7 +14,7 @@ import { type Content, foreign, type Reader } from '../content.ts';
 import { type Codewords, decoded } from '../reed_solomon.ts';
 import { fieldsOf, gaussianIds, ID_BYTES, lowBits, lowWidth, saltOf, salts } from './bits.ts';
 import { type Cell, CellCipher, TAG_BYTES } from './cells.ts';
-import { decodedFrom } from './decoded.ts';
+import { decodedLevels } from './decoded.ts';
 import { BLOCK_BYTES, lastBits, type Levels, levelsOf, modelHash, readBlocks } from './fields.ts';
 
 const ASSOCIATED = ascii('keyss/v1/quiet');
@@ -38,9 +38,8 @@ export class QuietReader implements Reader {
 
   /** The reader of the codes of a coded or decoded model, else of low bits; null without capacity. */
   static of(model: ReadModel): QuietReader | null {
-    if (model.codes) return QuietReader.ofCodes(levelsOf(model.codes));
-    const decoded = decodedFrom(model);
-    return decoded ? QuietReader.ofCodes(decoded.levels, decoded.silent) : QuietReader.ofLowBits(model);
+    const levels = model.codes ? levelsOf(model.codes) : decodedLevels(model);
+    return levels ? QuietReader.ofCodes(levels) : QuietReader.ofLowBits(model);
   }
 
   private static ofLowBits(model: Gaussians): QuietReader | null {
@@ -57,9 +56,8 @@ export class QuietReader implements Reader {
     return new QuietReader(ids, low, width, widths, salts(fields, ids, low, width));
   }
 
-  /** `silent` [N]: Gaussians that carry nothing. */
-  private static ofCodes(levels: Levels, silent?: Uint8Array): QuietReader | null {
-    const bits = lastBits(levels, silent);
+  private static ofCodes(levels: Levels): QuietReader | null {
+    const bits = lastBits(levels);
     if (bits.length < MIN_BLOCKS * 8 * BLOCK_BYTES || bits.length > MAX_BITS) return null;
     const low = readBlocks(bits);
     const numbers = new Uint32Array((ID_BYTES / 4) * (low.length / BLOCK_BYTES));
