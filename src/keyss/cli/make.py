@@ -73,8 +73,6 @@ def fit(
     """Fit a plain 3DGS model to the photos of a scene.
 
     example: keyss fit SCENE -o runs/cover
-
-    example: keyss fit SCENE -o runs/cover
     """
     check_exists(scene)
     from dataclasses import replace
