@@ -115,7 +115,7 @@ class Gaussians:
         sh = self.sh[:, :k]
         if sh.shape[1] < k:
             sh = torch.cat([sh, sh.new_zeros(len(sh), k - sh.shape[1], 3)], dim=1)
-        return replace(self, sh=sh)
+        return self.like(replace(self, sh=sh))
 
     @staticmethod
     def cat(parts: Sequence[Gaussians]) -> Gaussians:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Sequence
+import itertools
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -46,10 +47,6 @@ class PictureNetwork:
         layers = tuple((function(weight), function(bias)) for weight, bias in self.layers)
         return PictureNetwork(layers, function(self.background))
 
-    def tensors(self) -> Sequence[Tensor]:
-        """All tensors in a fixed order."""
-        return [self.background, *(tensor for layer in self.layers for tensor in layer)]
-
 
 class DecodedGaussians(Gaussians):
     """Gaussians with a network, and optionally with feature channels in place of colours.
@@ -86,14 +83,10 @@ class DecodedGaussians(Gaussians):
         assert isinstance(moved, DecodedGaussians)
         return DecodedGaussians.of(moved, self.network.map(lambda tensor: tensor.to(device)), moved.features)
 
-    def with_sh_degree(self, degree: int) -> Gaussians:
-        plain = Gaussians(self.means, self.quats, self.log_scales, self.opacity_logits, self.sh)
-        return self.like(plain.with_sh_degree(degree))
-
     def digest(self) -> str:
         state = hashlib.sha256(super().digest().encode())
         features = [] if self.features is None else [self.features]
-        for tensor in (*features, *self.network.tensors()):
+        for tensor in (*features, self.network.background, *itertools.chain(*self.network.layers)):
             data = tensor.detach().cpu().contiguous().numpy().tobytes()
             state.update(f"{list(tensor.shape)}".encode() + data)
         return state.hexdigest()

@@ -46,7 +46,6 @@ from keyss.rendering.cpu.simd8 import (
     put,
     ramp,
     select_ge,
-    select_le,
     square_root,
     store8,
 )
@@ -122,8 +121,8 @@ def _measure_columns(footprints, g, height, first_column, spans, place):
     right_half = square_root(maximum(level - right * right * curvature, ZERO)) + f32(1e-3)
     top = minimum(left * shear - left_half, right * shear - right_half)
     bottom = maximum(left * shear + left_half, right * shear + right_half)
-    top = select_ge(right, -lowest_x, select_le(left, -lowest_x, -extent_y, top), top)
-    bottom = select_ge(right, lowest_x, select_le(left, lowest_x, extent_y, bottom), bottom)
+    top = select_ge(right, -lowest_x, select_ge(-lowest_x, left, -extent_y, top), top)
+    bottom = select_ge(right, lowest_x, select_ge(lowest_x, left, extent_y, bottom), bottom)
     store8(spans, place, maximum(ceil8(maximum(top, -extent_y) + y), ZERO))
     store8(spans, place + 8, minimum(floor8(minimum(bottom, extent_y) + y), f32(height - 1)))
 

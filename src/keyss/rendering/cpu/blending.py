@@ -72,7 +72,6 @@ from keyss.rendering.cpu.simd8 import (
     ramp,
     select_ge,
     select_gt,
-    select_le,
     splat,
     store8,
     store_interleaved,
@@ -336,7 +335,7 @@ def _blend_tile_backward(
                     store8(planes, k + TILE_PIXELS, behind)
                     # alpha dL/d(alpha); the light from behind is dimmed by 1 - alpha.
                     s = own - behind * divide(alpha, SCALE - alpha)
-                    s = select_le(footprint, SCALED_ALPHA_MAX, s, ZERO)
+                    s = select_ge(SCALED_ALPHA_MAX, footprint, s, ZERO)
                     footprint = footprint * ratio
                     ratio = ratio * decay
                     s_dy = s * row_dy

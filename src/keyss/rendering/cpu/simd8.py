@@ -226,7 +226,6 @@ multiply_add = _vector_intrinsic(_multiply_add)  # a * b + c, one instruction wh
 divide = _vector_intrinsic(lambda builder, a, b: builder.fdiv(a, b))
 select_ge = _vector_intrinsic(partial(_select, ">="))  # (a, b, yes, no): `yes` where a >= b, else `no`
 select_gt = _vector_intrinsic(partial(_select, ">"))
-select_le = _vector_intrinsic(partial(_select, "<="))
 minimum = _vector_intrinsic(lambda builder, a, b: _select("<", builder, a, b, a, b))
 maximum = _vector_intrinsic(lambda builder, a, b: _select(">", builder, a, b, a, b))
 square_root = _vector_intrinsic(partial(_call, "llvm.sqrt.v8f32"))
