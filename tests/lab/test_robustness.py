@@ -11,7 +11,7 @@ import torch
 
 import keyss
 from keyss import CarryOptions
-from keyss.core import Gaussians, KeyssWarning, Scene, Similarity, UsageError, WrongKeyError, same_bits
+from keyss.core import Gaussians, KeyssWarning, Scene, Similarity, UsageError, WrongKeyError
 from keyss.fitting import mean_psnr
 from keyss.lab import (
     ChangedQuality,
@@ -101,7 +101,7 @@ def test_refitted_secret_after_changes(
     )
     hidden = hide_scenes(scenes, [KEY], config, plains=models)
     revealed = keyss.reveal(hidden.stego, KEY).gaussians
-    assert same_bits(reveal_changed(opener, hidden.stego), revealed)
+    assert reveal_changed(opener, hidden.stego).digest() == revealed.digest()
 
     changes = [random_pruning(0.1), half_floats(), purification(scenes[0], steps=0)]
     _, pruned, rounded, purified = measure_robustness(

@@ -17,7 +17,6 @@ from .gaussians import (
     SH_C0 as SH_C0,
     Gaussians as Gaussians,
     compensate_pruning as compensate_pruning,
-    same_bits as same_bits,
 )
 from .picture_network import DecodedGaussians as DecodedGaussians, PictureNetwork as PictureNetwork
 from .scene import (

@@ -129,16 +129,6 @@ def magnitude(values: Tensor) -> float:
     return float(torch.maximum(-low, high))
 
 
-def same_bits(one: Gaussians, other: Gaussians) -> bool:
-    """True if two plain models are bitwise equal, in the same order."""
-    if not type(one) is type(other) is Gaussians:
-        return False
-    if (len(one), one.sh_degree) != (len(other), other.sh_degree):
-        return False
-    pairs = ((getattr(one, field.name), getattr(other, field.name)) for field in fields(Gaussians))
-    return all(torch.equal(a.cpu().view(torch.int32), b.cpu().view(torch.int32)) for a, b in pairs)
-
-
 def compensate_pruning(gaussians: Gaussians, count: int) -> Gaussians:
     """Enlarge the remaining Gaussians of a pruned model that had `count`, and raise their opacities.
 

@@ -21,7 +21,7 @@ from keyss.channels import (
     usable_carriers,
 )
 from keyss.channels.quiet.layout import key_cipher
-from keyss.core import Gaussians, UsageError, WrongKeyError, same_bits
+from keyss.core import Gaussians, UsageError, WrongKeyError
 from keyss.keys import DerivedKey
 from keyss.methods import embed_models, record_request
 from methods.carry.carried import embed, embed_derived, extract, extract_derived
@@ -184,10 +184,10 @@ def test_overwritten_cover() -> None:
     cover, keys, secrets = trained_like(3000, 0), ["7Vw3-Qp of the first"], [trained_like(900, 1)]
     before = cover.map(torch.clone)
     stego = embed_models(LOW_BITS.prepare(cover), keys, secrets, entropy=bytes(32)).gaussians
-    assert same_bits(cover, before)
+    assert cover.digest() == before.digest()
     prepared = LOW_BITS.prepare(cover)
     assert prepared.usable is LOW_BITS.prepare(cover).usable  # found once
     own = embed_models(prepared, keys, secrets, entropy=bytes(32), overwrite=True).gaussians
-    assert same_bits(own, stego)
-    assert same_bits(cover, stego)
+    assert own.digest() == stego.digest()
+    assert cover.digest() == stego.digest()
     assert prepared.usable is not LOW_BITS.prepare(cover).usable  # found again: the cover is another model
