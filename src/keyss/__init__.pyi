@@ -11,7 +11,6 @@ from .files import load_scene as load_scene, read_model as read_model, write_mod
 from .fitting import FitConfig as FitConfig
 from .keys import generate_key as generate_key, read_key as read_key
 from .lab.audits.audit_run import audit as audit
-from .lab.many.batch import hide_batch as hide_batch
 from .lab.many.comparison import compare as compare
 from .lab.many.reproduction import reproduce as reproduce
 from .lab.many.sweep_spec import sweep as sweep

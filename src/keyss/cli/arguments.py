@@ -39,10 +39,6 @@ Iterations = Annotated[
     int | None, optional("N", "Training steps of a model, and of a refit.", "the preset's")
 ]
 MaxGaussians = Annotated[int | None, optional("N", "Maximum number of Gaussians of a model.", "the preset's")]
-Ray = Annotated[
-    str | None, optional("ADDRESS", "Ray cluster to run on, or `local`.", "one after the other, here")
-]
-Cores = Annotated[int, arg(metavar="N", help="With --ray: cores of each run.")]
 Overwrite = Annotated[bool, switch("Replace existing results.")]
 Resume = Annotated[bool, switch("Continue an interrupted run in the same folder.")]
 Run = Annotated[Positional[Path], arg(metavar="RUN", help="Result folder of `keyss hide`.")]

@@ -18,7 +18,7 @@ from keyss.core.errors import BackendError, KeyssError
 EXTRAS = {
     "audit": ("scikit-learn", "keyss audit, compare and reproduce"),
     "clip": ("transformers", "the paper's key encoder"),
-    "sweep": ("ray", "sweeps and batches on a cluster"),
+    "sweep": ("ray", "sweeps on a cluster"),
 }
 LIBRARIES = ("torch", "gsplat", "numba", "numpy", "opencv-python-headless", "cryptography", "argon2-cffi")
 OPTIONAL = ("GPU", "kernel cache", "splat-transform", *(f"[{name}]" for name in EXTRAS))

@@ -1,4 +1,4 @@
-"""The command `hide`: scenes, files, or a batch of either."""
+"""The command `hide`: scenes or files."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import sys
 from argparse import ArgumentParser
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields, make_dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
@@ -15,14 +14,12 @@ from tyro.conf import OmitArgPrefixes, UseAppendAction, arg
 from keyss.cli.arguments import (
     PHOTOS,
     TRAINING,
-    Cores,
     Device,
     KeyFiles,
     OutFolder,
     Overwrite,
     Photos,
     Preset,
-    Ray,
     Resume,
     Training,
     changed_flags,
@@ -73,28 +70,16 @@ class Details:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Batch:
-    """Many hidings."""
-
-    batch: Annotated[
-        Path | None,
-        optional("CSV", "Table of hidings: columns cover, secret or secret_file, out (below -o), key_file."),
-    ] = None
-    master_key_file: Annotated[
-        Path | None, optional("FILE", "Key file to derive each asset's key from (`keyss keygen --asset`).")
-    ] = None
-    ray: Ray = None
-    cores: Cores = 1
-
-
-@dataclass(frozen=True, kw_only=True)
 class HideArguments:
     """The options of `keyss hide`; `keyss.cli.hide` adds those of the method."""
 
     cover: Annotated[
-        Path | None,
-        optional("SCENE", "What everybody will see: folder of posed photos, or model (.ply, .spz, ...)."),
-    ] = None
+        Path,
+        arg(
+            metavar="SCENE",
+            help="What everybody will see: folder of posed photos, or model (.ply, .spz, ...).",
+        ),
+    ]
     secret: Annotated[
         UseAppendAction[tuple[Path, ...]],
         optional("SCENE", "Folder of photos or model to hide in it; repeat for more."),
@@ -130,7 +115,6 @@ class HideArguments:
     photos: OmitArgPrefixes[Photos] = PHOTOS
     training: OmitArgPrefixes[Training] = TRAINING
     details: OmitArgPrefixes[Details] = Details()
-    batch: OmitArgPrefixes[Batch] = Batch()
     own: Any  # options of the method alone
 
 
@@ -144,18 +128,12 @@ def hide(args: HideArguments) -> None:
     example: keyss hide --cover cover.ply --secret secret.ply --key-file key.txt -o runs/hidden
 
     example: keyss hide --cover cover.ply --secret-file letter.pdf --key-file key.txt -o runs/letter
-
-    example: keyss hide --batch assets.csv --method carry --master-key-file master.txt -o runs/assets
     """
     _check_without_torch(args)
-    if args.batch.batch is not None:
-        _hide_batch(args, args.batch.batch)
-        return
-    assert args.cover is not None
-    (_hide_files if args.secret_file else _hide_scenes)(args, args.cover)
+    (_hide_files if args.secret_file else _hide_scenes)(args)
 
 
-def _hide_scenes(args: HideArguments, cover: Path) -> None:
+def _hide_scenes(args: HideArguments) -> None:
     import keyss
     from keyss import progress
     from keyss.cli.tables import print_files, print_hiding, print_plan
@@ -165,7 +143,7 @@ def _hide_scenes(args: HideArguments, cover: Path) -> None:
 
     method = registry.get(args.method)
     options, secrets = _method_options(args), _secrets(args, method)
-    idle = _ignored_training_flags(args, cover)
+    idle = _ignored_training_flags(args)
     if idle and not options.may_train:
         raise UsageError(
             f"{idle}: nothing is trained, as models of all scenes are given and --method {options.method} "
@@ -179,13 +157,13 @@ def _hide_scenes(args: HideArguments, cover: Path) -> None:
         "out": args.out,
     }
     if args.dry_run:
-        plan = keyss.hide(cover, secrets, dry_run=True, **described).plan
+        plan = keyss.hide(args.cover, secrets, dry_run=True, **described).plan
         assert plan is not None
         print_plan(plan)
         _warn_of_idle(idle, plan.steps)
         return
     result = keyss.hide(
-        cover,
+        args.cover,
         secrets,
         min_psnr=args.details.min_psnr,
         overwrite=args.overwrite,
@@ -244,11 +222,11 @@ def _keys(args: HideArguments, count: int) -> list[str]:
     return found
 
 
-def _ignored_training_flags(args: HideArguments, cover: Path) -> str:
+def _ignored_training_flags(args: HideArguments) -> str:
     """The given options that only affect training, if all scenes are models; otherwise empty."""
     from keyss.rendering.orbit import is_model
 
-    sources = [args.details.cover_model or cover, *(args.details.secret_model or args.secret)]
+    sources = [args.details.cover_model or args.cover, *(args.details.secret_model or args.secret)]
     if not all(map(is_model, sources)):
         return ""
     preset = ["--preset"] if args.preset != "default" else []
@@ -281,21 +259,20 @@ def _method_options(args: HideArguments) -> MethodOptions:
     return options.with_fit(**args.training.schedule())
 
 
-def _hide_files(args: HideArguments, cover: Path) -> None:
+def _hide_files(args: HideArguments) -> None:
     import keyss
     from keyss.channels import channel_for
     from keyss.cli.tables import print_files
+    from keyss.core.errors import UsageError
     from keyss.runs.files import STEGOS
 
-    _refuse(
-        args,
-        "--secret-file",
-        "cover secret_file key_file publish format out overwrite device channel dry_run",
-    )
+    used = "cover secret_file key_file publish format out overwrite device channel dry_run"
+    if unused := [each for each in changed_flags(args) if each not in map(flag, used.split())]:
+        raise UsageError(f"--secret-file does not use {unused[0]}: leave out {unused[0]}")
     files, keys = args.secret_file, _keys(args, len(args.secret_file))
     channel = args.details.channel or "colours"
     result = keyss.hide_files(
-        cover,
+        args.cover,
         list(map(keyss.SecretFile, files, keys)),
         publish=args.publish,
         format=args.format,
@@ -312,50 +289,6 @@ def _hide_files(args: HideArguments, cover: Path) -> None:
         print("Dry run: nothing was written.")
         return
     print_files(args.out, dict.fromkeys(STEGOS, _HOW_TO_PUBLISH[channel_for(args.publish, channel).survives]))
-
-
-def _hide_batch(args: HideArguments, table: Path) -> None:
-    import keyss
-    from keyss.cli.entry import as_flags, options_of_group
-    from keyss.cli.keys import key_of_file, warn_of_weak_keys
-    from keyss.cli.tables import print_files, print_outcome
-    from keyss.progress import reporter
-
-    batch = args.batch
-    used = "batch master_key_file ray cores out publish format channel preset overwrite device min_psnr"
-    used += " width background skip_missing iterations max_gaussians seed"
-    _refuse(args, "--batch", used, vars(args.own))
-    if batch.master_key_file is not None:
-        warn_of_weak_keys([key_of_file(batch.master_key_file)])
-    result = keyss.hide_batch(
-        table,
-        args.out,
-        method=_method_options(args),
-        master_key_file=batch.master_key_file,
-        **vars(args.photos),
-        min_psnr=args.details.min_psnr,
-        device=args.device,
-        ray=batch.ray,
-        cores=batch.cores,
-        reporter=reporter(),
-        overwrite=args.overwrite,
-    )
-    if skipped := sum(each.skipped for each in result.outcomes):
-        print(f"{skipped} of {len(result.outcomes)} assets were done before")
-    print_files(args.out, {"private/batch.csv": "the outcome of each asset"})
-    print_outcome(
-        result.errors, len(result.outcomes), "assets", partial(as_flags, options=options_of_group(type(args)))
-    )
-
-
-def _refuse(args: HideArguments, mode: str, used: str, own: Sequence[str] = ()) -> None:
-    """Raise UsageError for a given option that `mode` does not use."""
-    from keyss.core.errors import UsageError
-
-    names = {flag.removeprefix("--").replace("-", "_"): flag for flag in changed_flags(args)}
-    if unused := [flag for name, flag in names.items() if name not in (*used.split(), *own)]:
-        instead = ", or give the cover and the secret of one row" * (unused[0] == "--dry-run")
-        raise UsageError(f"{mode} does not use {unused[0]}: leave out {unused[0]}{instead}")
 
 
 def with_options_of_method(arguments: Sequence[str]) -> Callable[..., None]:
@@ -401,15 +334,9 @@ def _check_without_torch(args: HideArguments) -> None:
     """Check options and files before the slow import of torch. Raises UsageError and InputError."""
     from keyss.core.errors import UsageError
 
-    check_exists(args.cover, args.details.cover_model, args.batch.batch, args.batch.master_key_file)
+    check_exists(args.cover, args.details.cover_model)
     check_exists(*args.secret, *args.secret_file, *args.key_file, *args.details.secret_model)
     _method_options(args)
-    if args.batch.batch is not None:
-        return
-    if args.cover is None:
-        raise UsageError("no cover: give --cover SCENE, or --batch CSV for many hidings")
-    if only_for_many := changed_flags(args.batch):
-        raise UsageError(f"{only_for_many[0]} is for many hidings: give --batch CSV, or leave it out")
     if not (args.secret_file or args.secret):
         raise UsageError("no secret: give --secret SCENE or --secret-file FILE, one for each secret")
 

@@ -111,13 +111,10 @@ def keygen(
         ),
     ] = None,
     bits: Annotated[int, arg(metavar="N", help="Strength in bits; each character has 5.95.")] = 95,
-    asset: Annotated[
-        str | None,
-        optional("NAME", "Derive the key of one asset of a batch, by its name in the column out."),
-    ] = None,
-    master_key_file: Annotated[Path | None, optional("FILE", "Master key file of that batch.")] = None,
+    asset: Annotated[str | None, optional("NAME", "Derive the key of this name from a master key.")] = None,
+    master_key_file: Annotated[Path | None, optional("FILE", "Key file with that master key.")] = None,
 ) -> None:
-    """Make a random key, or derive the key of one asset from a master key.
+    """Make a random key, or derive a key from a master key and a name.
 
     example: keyss keygen -o key.txt
 

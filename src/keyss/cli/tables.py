@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, TextIO
 
@@ -14,7 +14,6 @@ from rich.console import Console as RichConsole
 from rich.table import Table
 from rich.text import Text
 
-from keyss.core.errors import InputError
 from keyss.progress import about, clock
 from keyss.runs.json_records import record_bytes
 
@@ -238,17 +237,6 @@ def print_conversion(out: str, found: Conversion, *, dry_run: bool, file: TextIO
         print("a secret in low bits would be lost; --key-file checks that a secret survives", file=file)
     if dry_run:
         print("dry run: nothing was written", file=file)
-
-
-def print_outcome(
-    errors: Mapping[str, str], count: int, what: str, as_said: Callable[[str], str] = str
-) -> None:
-    """Print the number of results and the `errors` by name. Raises InputError if there are errors."""
-    print(f"{count - len(errors)} of {count} {what} are done")
-    for name, error in errors.items():
-        print(f"failed: {name}: {as_said(error)}")
-    if errors:
-        raise InputError(f"{len(errors)} of {count} {what} failed")
 
 
 def print_json(facts: object) -> None:

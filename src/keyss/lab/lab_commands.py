@@ -8,14 +8,12 @@ from typing import TYPE_CHECKING, Annotated, Literal, get_args
 from tyro.conf import Positional, UseAppendAction, arg
 
 from keyss.cli.arguments import (
-    Cores,
     Device,
     Iterations,
     KeyFiles,
     MaxGaussians,
     OutFolder,
     Overwrite,
-    Ray,
     Resume,
     Run,
     Width,
@@ -205,7 +203,7 @@ def reproduce(
     from keyss.cli.tables import print_files, print_table
     from keyss.core.errors import InputError
     from keyss.lab.many import Forecast
-    from keyss.lab.many.paper import reproduction_notes, reproduction_rows
+    from keyss.lab.many.reproduction import reproduction_notes, reproduction_rows
     from keyss.progress import reporter
 
     reproduction = keyss.reproduce(
@@ -245,8 +243,10 @@ def sweep(
     ],
     *,
     out: OutFolder,
-    ray: Ray = None,
-    cores: Cores = 1,
+    ray: Annotated[
+        str | None, optional("ADDRESS", "Ray cluster to run on, or `local`.", "one after the other, here")
+    ] = None,
+    cores: Annotated[int, arg(metavar="N", help="With --ray: cores of each run.")] = 1,
     dry_run: DryRun = False,
 ) -> None:
     """Hide over a grid of scenes, methods, options and seeds, and tabulate the results.
@@ -258,7 +258,8 @@ def sweep(
     example: keyss sweep sweep.yaml -o runs/sweep --dry-run
     """
     import keyss
-    from keyss.cli.tables import print_files, print_outcome
+    from keyss.cli.tables import print_files
+    from keyss.core.errors import InputError
     from keyss.lab.many import Forecast
     from keyss.progress import reporter
 
@@ -280,7 +281,12 @@ def sweep(
         "private/master-key.txt": "the key from which those of the trials are derived",
     }
     print_files(out, described)
-    print_outcome(result.errors, len(result.outcomes), "trials")
+    count, failed = len(result.outcomes), result.errors
+    print(f"{count - len(failed)} of {count} trials are done")
+    for name, error in failed.items():
+        print(f"failed: {name}: {error}")
+    if failed:
+        raise InputError(f"{len(failed)} of {count} trials failed")
 
 
 def _scene_tables(stem: str) -> dict[str, str]:

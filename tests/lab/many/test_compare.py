@@ -13,7 +13,7 @@ from keyss.cli import main
 from keyss.core import InputError, OutputError, UsageError
 from keyss.lab.audits import trial_measures
 from keyss.lab.many import Forecast, comparison, trial
-from keyss.lab.many.engine import claim_folder
+from keyss.lab.many.trial_folder import claim_folder
 from keyss.lab.two_sample import Auc
 from keyss.methods import registry
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from keyss.lab.many import paper
+from keyss.lab.many import reproduction as paper
 
 TABLES = paper.PAPER.tables
 

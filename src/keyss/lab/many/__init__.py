@@ -1,9 +1,8 @@
-"""Many runs: sweeps, batches, comparisons of methods, and the paper's tables.
+"""Many runs: sweeps, comparisons of methods, and the paper's tables.
 
-A *trial* is a plain fit, or a hiding and its measures, in a folder of its own (`trial`). Trials run one after
-the other in this process, or on a Ray cluster (`engine`), and never run again once they are done. A sweep
-(YAML), a comparison of methods and a table of the paper each add trials to a folder (`trial_folder`) and
-tabulate the results; a batch (CSV) runs on the same engine.
+A *trial* is a plain fit, or a hiding and its measures, in a folder of its own (`trial`). A sweep (YAML), a
+comparison of methods and a table of the paper each add trials to a folder, which runs them and never runs
+them again once they are done (`trial_folder`), and tabulate the results.
 """
 
 import lazy_loader

@@ -21,10 +21,9 @@ from keyss.files import write_bytes
 from keyss.fitting import PRESETS, FitConfig
 from keyss.fitting.image_metrics import HOW_TO_GET
 from keyss.lab.audits.trial_measures import CONVERSIONS
-from keyss.lab.many.engine import Outcome
 from keyss.lab.many.result_tables import TrialNumbers, write_scene_tables
 from keyss.lab.many.trial import RUN, keys_of
-from keyss.lab.many.trial_folder import Forecast, TrialFolder
+from keyss.lab.many.trial_folder import Forecast, Outcome, TrialFolder
 from keyss.measure.contact_sheet import contact_sheet
 from keyss.measure.renders import renders_of
 from keyss.methods import MethodOptions, registry

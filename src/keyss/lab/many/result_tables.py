@@ -6,14 +6,14 @@ import csv
 import io
 import json
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean, stdev
 from typing import Any
 
 from keyss.files import write_bytes
-from keyss.lab.many.engine import Outcome
+from keyss.lab.many.trial_folder import Outcome
 
 # Decimals and heads of the usual metrics.
 _METRICS = {
@@ -26,7 +26,7 @@ _LATEX = {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasci
 _LATEX |= {character: f"\\{character}" for character in "&%$#_{}"}
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class TrialNumbers:
     """The numbers of one trial."""
 
@@ -39,17 +39,13 @@ class TrialNumbers:
     @staticmethod
     def of(outcome: Outcome, labels: Mapping[str, Any], scenes: Sequence[str], seed: int) -> TrialNumbers:
         """The numbers of a finished trial, without times and arguments."""
-        numbers = {
-            name: value
-            for name, value in outcome.result.numbers.items()
-            if _NO_MEASURES.isdisjoint(name.split("."))
-        }
-        return TrialNumbers(
-            labels=labels, scenes=scenes, seed=seed, trial=outcome.folder.name, numbers=numbers
-        )
+        assert outcome.result is not None
+        every = outcome.result.numbers.items()
+        numbers = {name: value for name, value in every if _NO_MEASURES.isdisjoint(name.split("."))}
+        return TrialNumbers(labels, scenes, seed, outcome.folder.name, numbers)
 
 
-def summaries(trials: Iterable[TrialNumbers]) -> list[dict[str, Any]]:
+def summaries(trials: Sequence[TrialNumbers]) -> list[dict[str, Any]]:
     """Rows of means and standard deviations over seeds, in the order of trials, then by measure."""
     rows = []
     for labels, group in _group(trials):
@@ -60,7 +56,7 @@ def summaries(trials: Iterable[TrialNumbers]) -> list[dict[str, Any]]:
     return rows
 
 
-def scene_rows(trials: Iterable[TrialNumbers]) -> list[dict[str, Any]]:
+def scene_rows(trials: Sequence[TrialNumbers]) -> list[dict[str, Any]]:
     """Rows of PSNR in dB, SSIM and LPIPS per scene: means and standard deviations over seeds."""
     rows = []
     for labels, group in _group(trials):
@@ -81,30 +77,25 @@ def mean_and_std(values: Sequence[float]) -> tuple[float, float]:
     return mean, stdev(values) if len(values) > 1 else math.nan
 
 
-def _group(trials: Iterable[TrialNumbers]) -> list[tuple[dict[str, str], list[TrialNumbers]]]:
+def _group(trials: Sequence[TrialNumbers]) -> list[tuple[dict[str, str], list[TrialNumbers]]]:
     """Group trials by labels, in their order; missing labels are empty."""
-    every = list(trials)
-    blank = dict.fromkeys((name for trial in every for name in trial.labels), "")
+    blank = dict.fromkeys((name for trial in trials for name in trial.labels), "")
     groups: dict[str, tuple[dict[str, str], list[TrialNumbers]]] = {}
-    for trial in every:
+    for trial in trials:
         labels = blank | {name: _text(value) for name, value in trial.labels.items()}
         groups.setdefault(json.dumps(labels), (labels, []))[1].append(trial)
     return list(groups.values())
 
 
-def write_scene_tables(out: Path, stem: str, trials: Sequence[TrialNumbers]) -> list[str]:
-    """Write `scene_rows` to `STEM.csv` and `STEM.tex`; returns their names. Raises OutputError."""
+def write_scene_tables(out: Path, stem: str, trials: Sequence[TrialNumbers]) -> None:
+    """Write `scene_rows` to `STEM.csv` and `STEM.tex`. Raises OutputError."""
     rows = scene_rows(trials)
     write_bytes(out / f"{stem}.csv", csv_bytes(rows))
     write_bytes(out / f"{stem}.tex", latex(rows).encode())
-    return [f"{stem}.csv", f"{stem}.tex"]
 
 
-def write_sweep_tables(out: Path, trials: Sequence[TrialNumbers]) -> list[str]:
-    """Write `results.csv` and `trials.csv` with all measures, and `scenes`; returns their names.
-
-    Deterministic. Raises OutputError.
-    """
+def write_sweep_tables(out: Path, trials: Sequence[TrialNumbers]) -> None:
+    """Write `results.csv` and `trials.csv` with all measures, and `scenes`. Raises OutputError."""
     rows = [
         {**labels, "seed": each.seed, "trial": each.trial, "measure": measure, "value": value}
         for labels, group in _group(trials)
@@ -113,7 +104,7 @@ def write_sweep_tables(out: Path, trials: Sequence[TrialNumbers]) -> list[str]:
     ]
     write_bytes(out / "results.csv", csv_bytes(summaries(trials)))
     write_bytes(out / "trials.csv", csv_bytes(rows))
-    return ["results.csv", "trials.csv", *write_scene_tables(out, "scenes", trials)]
+    write_scene_tables(out, "scenes", trials)
 
 
 def latex(rows: Sequence[Mapping[str, Any]]) -> str:

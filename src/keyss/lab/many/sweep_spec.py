@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
+from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -20,10 +21,9 @@ from keyss.files.inputs import read_text
 from keyss.fitting import PRESETS
 from keyss.fitting.config import MAX_SEED
 from keyss.lab.audits import PARTS
-from keyss.lab.many.engine import ManyResult
 from keyss.lab.many.option_changes import known_changes, with_changes
 from keyss.lab.many.result_tables import TrialNumbers, write_sweep_tables
-from keyss.lab.many.trial_folder import Forecast, TrialFolder
+from keyss.lab.many.trial_folder import Forecast, Outcome, TrialFolder
 from keyss.methods import MethodOptions, registry
 from keyss.progress import Reporter
 from keyss.rendering.orbit import is_model
@@ -72,6 +72,18 @@ class SweepSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
         """The fields of all trials."""
         views = ViewOptions(self.width, self.background, self.skip_missing)
         return {"views": views, "min_psnr": self.min_psnr, "bound": self.bound, "device": self.device}
+
+
+@dataclass(frozen=True)
+class ManyResult:
+    """The outcomes of all trials, in their order."""
+
+    outcomes: tuple[Outcome, ...]
+
+    @property
+    def errors(self) -> dict[str, str]:
+        """Errors of failed trials, by name."""
+        return {each.name: each.error for each in self.outcomes if each.error is not None}
 
 
 def read_spec(path: Path) -> SweepSpec:
@@ -179,5 +191,5 @@ def sweep(
         return folder.forecast()
     outcomes = folder.run(ray=ray, cores=cores, reporter=reporter)
     done = [TrialNumbers.of(outcomes[place], *row) for place, row in rows.items() if outcomes[place].result]
-    tables = write_sweep_tables(folder.out, done)
-    return ManyResult(tuple(outcomes[place] for place in rows), tuple(tables))
+    write_sweep_tables(folder.out, done)
+    return ManyResult(tuple(outcomes[place] for place in rows))

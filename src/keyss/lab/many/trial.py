@@ -9,7 +9,6 @@ from __future__ import annotations
 import hashlib
 import os
 import time
-from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field, replace
 from itertools import zip_longest
 from math import isfinite
@@ -69,7 +68,8 @@ class Trial:
         """SHA-256 (hexadecimal) of all that the run depends on: not of its measures."""
         same = replace(self, name="", measures=())
         models = [each for each in self.models if each and os.path.isabs(each)]
-        times = modification_times([self.cover, *self.secrets, *models])
+        inputs = [self.cover, *self.secrets, *models]
+        times = {each: os.stat(each).st_mtime_ns if os.path.exists(each) else 0 for each in inputs}
         return hashlib.sha256(record_bytes(same) + msgspec.json.encode(times)).hexdigest()
 
     @property
@@ -89,11 +89,6 @@ class Result:
     numbers: dict[str, float] = field(default_factory=dict)  # everything measured, by names with dots
     notes: dict[str, str] = field(default_factory=dict)  # on measures that were skipped
     measures: tuple[str, ...] = ()  # measures of the trial that are in `numbers`
-
-
-def modification_times(inputs: Iterable[str]) -> dict[str, int]:
-    """Nanoseconds by path; 0 for missing files."""
-    return {each: os.stat(each).st_mtime_ns if os.path.exists(each) else 0 for each in inputs}
 
 
 def finished_result(trial: Trial, folder: Path) -> Result | None:

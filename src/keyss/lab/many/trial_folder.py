@@ -1,26 +1,45 @@
-"""The trials of one folder: plain fits, hidings that use their models, and their outcomes."""
+"""The trials of one folder: plain fits, hidings that use their models, and their outcomes.
+
+Trials run one after the other in this process, or in parallel on a Ray cluster, whose nodes must have folders
+and inputs under the same paths. Ray pickles trials between its own processes; keyss writes no pickles.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+import os
+import traceback
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from keyss.core import KeyssError
-from keyss.files import write_bytes
+from keyss.core import BackendError, Interrupted, KeyssError, OutputError, UsageError, import_extra
+from keyss.files import lock, write_bytes
 from keyss.fitting import FitConfig
 from keyss.keys import generate_key
 from keyss.keys.key_file import KEY_LENGTH
 from keyss.lab.audits.trial_measures import check_extras
-from keyss.lab.many.engine import Outcome, claim_folder, run_tasks
-from keyss.lab.many.trial import MASTER_KEY, RUN, Trial, finished_result, plan_of, run_trial
+from keyss.lab.many.trial import MASTER_KEY, RUN, Result, Trial, finished_result, plan_of, run_trial
 from keyss.methods import MethodOptions
 from keyss.methods.base import Plan
-from keyss.progress import Reporter
+from keyss.progress import Reporter, reporter as default_reporter
 from keyss.runs.files import MODEL
+from keyss.runs.folder import PRIVATE, check_not_published, make_private
 
 TRIALS = "trials"
+_LOCAL = "local"  # a cluster of this machine
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """The outcome of a trial."""
+
+    name: str
+    folder: Path
+    result: Result | None = None
+    error: str | None = None  # the reason for a missing result
+    skipped: bool = False  # True if it was finished before
 
 
 @dataclass(frozen=True)
@@ -82,22 +101,28 @@ class TrialFolder:
     def run(
         self, ray: str | None = None, cores: int = 1, reporter: Reporter | None = None
     ) -> dict[Path, Outcome]:
-        """Run all unfinished trials; returns outcomes by folder.
+        """Run all unfinished trials; returns outcomes by folder. An error of one does not stop the others.
 
-        The arguments are those of `run_tasks`. Raises KeyssError for errors that concern all trials.
+        `ray`: HOST:PORT, ray://HOST:PORT, auto, or local for a cluster on this machine; None: this process.
+        `cores`: cores per trial on Ray. Raises BackendError if the cluster cannot be reached, and KeyssError
+        for other errors that concern all trials.
         """
-        found: dict[Path, Outcome] = {}
+        if cores < 1:
+            raise UsageError(f"`cores`: expected at least 1, got {cores}")
+        reporter = reporter or default_reporter()
         with claim_folder(self.out):
             if not (self.out / MASTER_KEY).exists():
                 write_bytes(self.out / MASTER_KEY, f"{generate_key(KEY_LENGTH)}\n".encode())
-            for folder, trial in self.trials.items():
-                if (result := finished_result(trial, folder)) is not None:
-                    found[folder] = Outcome(trial.name, folder, result, skipped=True)
-            due = {folder: trial for folder, trial in self.trials.items() if folder not in found}
-            needs = {
-                folder: [folder.with_name(each) for each in trial.needs] for folder, trial in due.items()
+            found = {
+                folder: Outcome(trial.name, folder, result, skipped=True)
+                for folder, trial in self.trials.items()
+                if (result := finished_result(trial, folder)) is not None
             }
-            for outcome in run_tasks(run_trial, due, needs, ray=ray, cores=cores, reporter=reporter):
+            due = {folder: trial for folder, trial in self.trials.items() if folder not in found}
+            outcomes = _in_process(due, reporter) if ray is None or not due else _on_ray(due, ray, cores)
+            for number, outcome in enumerate(outcomes, start=1):
+                state = "failed" if outcome.error else "done"
+                reporter.note(f"[{number}/{len(due)}] {outcome.name}: {state}")
                 found[outcome.folder] = outcome
         return {folder: found[folder] for folder in self.trials}
 
@@ -111,3 +136,80 @@ class TrialFolder:
             except KeyssError as error:
                 refused[place] = str(error)
         return Forecast({place: trial.name for place, trial in self.trials.items()}, plans, refused)
+
+
+@contextmanager
+def claim_folder(out: Path) -> Iterator[None]:
+    """Create the folder if necessary, and lock it while the block runs.
+
+    Raises OutputError, also for folders inside `publish/`.
+    """
+    check_not_published(out)
+    try:
+        out.mkdir(parents=True, exist_ok=True, mode=0o700)
+    except OSError as error:
+        raise OutputError(f"cannot write {out}: {error.strerror}") from error
+    make_private(out / PRIVATE)
+    with lock(out / PRIVATE / "lock", out):
+        yield
+
+
+def _in_process(trials: Mapping[Path, Trial], reporter: Reporter) -> Iterator[Outcome]:
+    ended: dict[Path, Outcome] = {}
+    for folder, trial in trials.items():
+        try:
+            ended[folder] = _attempt(trial, folder, reporter, *_needed(trial, folder, ended))
+        except Interrupted as error:  # its message says how to resume a single run
+            reporter.note("interrupted: the same command resumes")
+            raise KeyboardInterrupt(*error.args) from error
+        yield ended[folder]
+
+
+def _needed(trial: Trial, folder: Path, started: Mapping[Path, Any]) -> list[Any]:
+    """What `started` has of the trials whose models this one uses."""
+    places = [folder.with_name(each) for each in trial.needs]
+    return [started[each] for each in places if each in started]
+
+
+def _attempt(trial: Trial, folder: Path, reporter: Reporter | None, *needed: Outcome) -> Outcome:
+    """Run one trial; an error becomes a part of its outcome."""
+    outcome = Outcome(trial.name, folder)
+    if failed := [each.error for each in needed if each.error]:
+        return replace(outcome, error=failed[0])
+    try:
+        return replace(outcome, result=run_trial(trial, folder, reporter or default_reporter()))
+    except (KeyssError, OSError) as error:
+        return replace(outcome, error=str(error))
+    except Exception as error:  # e.g. a GPU out of memory
+        traceback.print_exc()
+        return replace(outcome, error=f"{type(error).__name__}: {error}")
+
+
+def _on_ray(trials: Mapping[Path, Trial], address: str, cores: int) -> Iterator[Outcome]:
+    """Ray starts a trial when those that it needs have ended, and repeats trials of lost nodes."""
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    ray = import_extra("ray", "sweep", "run on a cluster")
+    where = {"include_dashboard": False} if address == _LOCAL else {"address": address}
+    variables = {name: str(cores) for name in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS")}
+    try:
+        ray.init(log_to_driver=False, runtime_env={"env_vars": variables}, **where)
+    except Exception as error:  # Ray raises many kinds of errors while it connects
+        raise BackendError(f"cannot reach a Ray cluster at {address}: {error}") from error
+    try:
+        attempt = ray.remote(_attempt)
+        started: dict[Path, Any] = {}
+        for folder, trial in trials.items():
+            chosen = attempt.options(name=trial.name, num_cpus=cores, num_gpus=int(trial.device == "cuda"))
+            needed = _needed(trial, folder, started)
+            started[folder] = chosen.remote(trial, folder.absolute(), None, *needed)
+        running = {each: folder for folder, each in started.items()}
+        while running:
+            (done,), _ = ray.wait(list(running))
+            folder = running.pop(done)
+            try:
+                yield replace(ray.get(done), folder=folder)
+            except ray.exceptions.RayError as error:
+                reason = f"lost by Ray: {str(error).strip().splitlines()[0]}"
+                yield Outcome(trials[folder].name, folder, error=reason)
+    finally:
+        ray.shutdown()
