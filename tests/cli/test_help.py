@@ -100,7 +100,7 @@ def test_misspelt_command(keyss: Run, arguments: tuple[str, ...], expected: str)
     [
         (("reveal", "a", "--keyfile", "k", "-o", "b"), "--key-file FILE"),
         (("hide", "--cover", "a", "--seckret=b", "-o", "c"), "--secret SCENE"),
-        (("hide", "--method", "carry", "--min-psnrr", "-o", "c"), "--min-psnr"),
+        (("hide", "--cover", "a", "--min-psnrr", "-o", "c"), "--min-psnr"),
     ],
 )
 def test_misspelt_option(keyss: Run, arguments: tuple[str, ...], expected: str) -> None:
