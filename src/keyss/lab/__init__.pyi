@@ -4,6 +4,8 @@ from .distances import (
     AttributeDistance as AttributeDistance,
     against_controls as against_controls,
     attribute_distances as attribute_distances,
+    composite_score as composite_score,
+    sinkhorn_3d as sinkhorn_3d,
 )
 from .leaks.attacks import (
     Attack as Attack,
@@ -40,8 +42,11 @@ from .robustness.survival import (
     measure_robustness as measure_robustness,
     reveal_changed as reveal_changed,
 )
-from .sinkhorn import composite_score as composite_score, sinkhorn_3d as sinkhorn_3d
-from .stealth.confirmation import candidate_scores as candidate_scores, changed_low_bits as changed_low_bits
-from .stealth.judging import judge as judge, stealth_statistics as stealth_statistics
+from .stealth.judging import (
+    candidate_scores as candidate_scores,
+    changed_low_bits as changed_low_bits,
+    judge as judge,
+    stealth_statistics as stealth_statistics,
+)
 from .stegexpose import score_image as score_image, stegexpose_auc as stegexpose_auc
 from .two_sample import features as features, two_sample_auc as two_sample_auc

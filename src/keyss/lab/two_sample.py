@@ -1,7 +1,7 @@
 """The classifier two-sample test (Lopez-Paz and Oquab, ICLR 2017) between the Gaussians of two models.
 
 Its statistic is the area under the ROC curve: 0.5 for two samples of one distribution, 1 for perfect
-separation. It detects what 3D-Sinkhorn misses: see `keyss.lab.sinkhorn`.
+separation. It detects what 3D-Sinkhorn misses: see `keyss.lab.distances`.
 """
 
 from __future__ import annotations

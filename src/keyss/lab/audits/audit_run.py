@@ -1,29 +1,83 @@
-"""The audit of a run: measures part by part, and stores each result at once."""
+"""The audit of a run: measures part by part, and stores each result at once in `audit/audit.json`."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from keyss._version import __version__
-from keyss.core import Interrupted, UsageError, import_extra, signal_of
+from keyss.core import InputError, Interrupted, UsageError, import_extra, signal_of
 from keyss.files import write_bytes
 from keyss.files.images import png_bytes
-from keyss.lab.audits.parts import NEED_A_3DGS_MODEL, PARTS, PartProgress
-from keyss.lab.audits.record import AUDIT, PICTURES, Audit, AuditedRun, read_audit
-from keyss.lab.audits.subject import Subject
+from keyss.lab.audits.parts import (
+    NEED_A_3DGS_MODEL,
+    PARTS,
+    ImagesResult,
+    ParametersResult,
+    StegExposeResult,
+    Subject,
+    part_progress,
+)
+from keyss.lab.leaks.leak_scores import AttackResult
+from keyss.lab.render_time import RenderTime
+from keyss.lab.robustness.survival import ChangeResult
+from keyss.lab.stealth.judging import StealthResult
+from keyss.measure.hide_quality import WrongKeys
 from keyss.progress import Reporter
 from keyss.rendering import Backend, resolve_device
 from keyss.runs import read_record, write_record
-from keyss.runs.files import REPORT, PathLike
-from keyss.runs.folder import RunFolder, write_again
+from keyss.runs.files import REPORT, PathLike, run_folder
+from keyss.runs.folder import PRIVATE, RunFolder, write_again
 from keyss.runs.open_run import open_run
 
+AUDIT, PICTURES = f"{PRIVATE}/audit/audit.json", f"{PRIVATE}/audit/pictures"  # relative to the run
 EXTRA = ("jinja2", "ot", "sklearn")
 KEPT = ("hide", "demo", "controls")  # stages of a run whose files an audit keeps
+
+
+@dataclass(frozen=True)
+class AuditedRun:
+    """The audited run."""
+
+    path: str
+    method: str
+    cover: str  # a scene folder, or a model without photos; `secrets` too
+    secrets: tuple[str, ...]
+    width: int | None  # pixels, if photos were shrunk
+    gaussians: int  # Gaussians of the stego model
+    standard: bool = True  # True if a 3DGS model is published
+
+
+@dataclass(frozen=True, kw_only=True)
+class Audit:
+    """The result of an audit; parts that did not run are None."""
+
+    version: int = 5
+    keyss: str  # version of the program
+    seconds: float
+    run: AuditedRun
+    controls: tuple[int, ...]  # seeds of the plain models of the cover to compare with
+    wrong_key: WrongKeys | None = None  # copied from the run's `metrics.json`, like the chance level
+    chance_level: tuple[float, ...] = ()  # dB, the stego model against each secret's test views
+    images: ImagesResult | None = None
+    parameters: ParametersResult | None = None
+    stealth: StealthResult | None = None
+    stegexpose: StegExposeResult | None = None
+    leaks: tuple[tuple[AttackResult, ...], ...] | None = None  # attacks on each secret
+    robustness: tuple[ChangeResult, ...] | None = None
+    speed: dict[str, RenderTime] | None = None
+
+
+def read_audit(run: Path) -> Audit:
+    """Read a run's audit. Raises InputError if it is missing, broken, too large or of another version."""
+    path = run / AUDIT
+    if not path.exists():
+        run_folder(run)
+        raise InputError(f"{path}: there is no audit; `keyss audit {run}` makes one")
+    return read_record(path, Audit)
 
 
 def audit(
@@ -86,7 +140,7 @@ def audit(
         for index, name in enumerate(chosen):
             if getattr(result, name) is not None:
                 continue
-            with PartProgress(reporter, f"audit, {index + 1} of {len(chosen)}: {name}") as progress:
+            with part_progress(reporter, f"audit, {index + 1} of {len(chosen)}: {name}") as progress:
                 section, shown = PARTS[name](subject, seed, progress)
             pictures.mkdir(exist_ok=True)
             for file, picture in shown.items():

@@ -1,68 +1,203 @@
-"""The parts of an audit: functions that measure a run against baselines and controls."""
+"""The parts of an audit: functions that measure a run against baselines and controls, and their results."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+import hashlib
+import json
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
 from statistics import fmean
 from typing import Any
 
+import torch
 from torch import Tensor
 
+from keyss.core.errors import InputError
+from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
-from keyss.fitting.image_metrics import mean_quality, view_quality
+from keyss.files.models import read_model
+from keyss.fitting.config import FitConfig
+from keyss.fitting.image_metrics import ImageQuality, mean_quality, view_quality
+from keyss.fitting.plain import fit_scene
+from keyss.lab.auc import Auc
 from keyss.lab.audits.formatting import numbered
-from keyss.lab.audits.record import (
-    ImageComparison,
-    ImagesResult,
-    ModelImages,
-    ParametersResult,
-    StegExposeResult,
-)
-from keyss.lab.audits.subject import Subject
-from keyss.lab.distances import against_controls
+from keyss.lab.distances import AttributeDistance, Sinkhorn3D, against_controls, composite_score, sinkhorn_3d
 from keyss.lab.leaks.attacks import decoder_attack, file_attacks
 from keyss.lab.leaks.leak_scores import AttackResult, look_for_secret
 from keyss.lab.render_time import RenderTime, measure_render_time
 from keyss.lab.robustness.survival import ChangeResult, measure_robustness
-from keyss.lab.sinkhorn import composite_score, sinkhorn_3d
 from keyss.lab.stealth.judging import StealthResult, judge
 from keyss.lab.stegexpose import stegexpose_auc
-from keyss.lab.two_sample import auc_beside_controls
+from keyss.lab.two_sample import TwoSampleAucs, auc_beside_controls
+from keyss.measure.hide_quality import in_cover
 from keyss.measure.renders import renders_of, select_views
+from keyss.methods import registry
 from keyss.progress import Reporter
+from keyss.runs.files import CONTROLS
+from keyss.runs.folder import RunFolder
+from keyss.runs.open_run import HidingRun
 
 PICTURED_VIEWS = 3
 
-
-class PartProgress:
-    """Progress of one part: call it with the number of finished items and the total."""
-
-    def __init__(self, reporter: Reporter, title: str) -> None:
-        self._reporter, self._title, self._total = reporter, title, 0
-
-    def __enter__(self) -> PartProgress:
-        return self
-
-    def __call__(self, done: int, total: int) -> None:
-        if not self._total:
-            self._reporter.start(self._title, total, 0)
-        self._total = total
-        self._reporter.update(done, 0, {})
-
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        if self._total:
-            if kind is None:
-                self._reporter.update(self._total, 0, {})
-            self._reporter.finish()
-
-
+Progress = Callable[[int, int], None]  # called with the number of finished items and the total
 Pictures = dict[str, Tensor]  # [H, W, 3] uint8 by file name
 # Returns a field of `Audit`, and pictures.
-AuditPart = Callable[[Subject, int, PartProgress], tuple[Any, Pictures]]
+AuditPart = Callable[["Subject", int, Progress], tuple[Any, Pictures]]
 
 
-def images(subject: Subject, seed: int, progress: PartProgress) -> tuple[ImagesResult, Pictures]:
+@dataclass
+class Subject:
+    """A run, and data that its measures share; models on `device`."""
+
+    run: HidingRun
+    device: torch.device
+    controls: Sequence[Gaussians] = ()  # plain models of the cover from other seeds
+
+    @property
+    def standard(self) -> bool:
+        """True if the published file is a 3DGS model."""
+        return registry.get(self.run.config.method).capabilities.standard
+
+    @cached_property
+    def scenes(self) -> list[Scene]:
+        """The cover, then the secrets, each in its own frame."""
+        return self.run.scenes()
+
+    @cached_property
+    def in_cover(self) -> list[Scene]:
+        """The secrets with their test cameras in the cover's frame."""
+        cover, *secrets = self.scenes
+        return [in_cover(*pair, cover) for pair in zip(self.run.opened, secrets, strict=True)]
+
+    @cached_property
+    def stego(self) -> Gaussians:
+        """The published model."""
+        return self.run.stego.to(self.device)
+
+    @cached_property
+    def revealed(self) -> list[Gaussians]:
+        """The secrets, in their own frames."""
+        return [secret.reveal(self.stego).to(self.device) for secret in self.run.opened]
+
+    @cached_property
+    def original(self) -> Gaussians:
+        """The plain model of the cover. Raises InputError without one."""
+        plain, *_ = self.run.plain_models()
+        if plain is None:
+            raise InputError(f"{self.run.folder}: expected the plain model of the cover, found none")
+        return plain.to(self.device)
+
+    @cached_property
+    def baselines(self) -> list[Gaussians | None]:
+        """Plain models of the secrets; None for missing ones."""
+        _, *models = self.run.baselines()
+        return [None if model is None else model.to(self.device) for model in models]
+
+    def fit_controls(self, seeds: Sequence[int], folder: RunFolder, reporter: Reporter) -> None:
+        """Fit plain models of the cover with these seeds; they are kept in the run's `folder` for reuse.
+
+        Raises InputError without a plain model of the cover.
+        """
+        config, count = self.run.config.options.fit, len(self.original)
+        if self.run.config.models_given[0]:  # the run's maximum is not for this model
+            config = replace(config, max_gaussians=max(count, 16))
+        models = [self._fit_control(replace(config, seed=seed), folder, reporter) for seed in seeds]
+        self.controls = [model.to(self.device) for model in models]
+
+    def _fit_control(self, config: FitConfig, folder: RunFolder, reporter: Reporter) -> Gaussians:
+        """Fit a plain model of the cover, or read it from the run's folder."""
+        cover = self.scenes[0]
+        inputs = json.dumps({"scene": cover.digest(), "config": asdict(config)}, sort_keys=True)
+        name = f"seed-{config.seed}-{hashlib.sha256(inputs.encode()).hexdigest()[:12]}"
+        model = f"{CONTROLS}/{name}.ply"
+        if (folder.path / model).exists():
+            return read_model(folder.path / model)
+        checkpoint = folder.checkpoints / f"{name}.safetensors"
+        result = fit_scene(
+            cover,
+            config,
+            device=self.device,
+            title=f"plain model of the cover, seed {config.seed}",
+            checkpoint=checkpoint,
+            resume=True,
+            reporter=reporter,
+        )
+        folder.keep("controls", model, result.gaussians)
+        checkpoint.unlink(missing_ok=True)
+        return result.gaussians
+
+
+@dataclass(frozen=True)
+class ImageComparison:
+    """8-bit renders of a model against the test views."""
+
+    views: dict[str, ImageQuality]  # by name
+    mean: ImageQuality  # over the views
+
+
+@dataclass(frozen=True)
+class ModelImages:
+    """The stego model or a revealed secret against the test views of its scene, beside a plain model."""
+
+    scene: str  # "cover", "secret", or "secret N" of several
+    photos: bool  # False: test views are renders of a given model
+    images: ImageComparison
+    gaussians: int
+    baseline: ImageComparison | None  # plain model; None without one, like `baseline_gaussians`
+    baseline_gaussians: int | None
+
+
+@dataclass(frozen=True)
+class ImagesResult:
+    """Cover and secrets against the test views."""
+
+    models: tuple[ModelImages, ...]  # cover, then secrets
+    pictures: dict[str, dict[str, str]]  # files of PICTURES by view and by model
+
+
+@dataclass(frozen=True)
+class ParametersResult:
+    """Distances of the stego model's parameters from those of plain models."""
+
+    sinkhorn: Sinkhorn3D  # published model against the cover's plain model
+    sinkhorn_controls: tuple[Sinkhorn3D, ...]
+    score: float  # composite score (KeySS, eq. 10)
+    distances: dict[str, AttributeDistance]
+    two_sample: TwoSampleAucs
+
+
+@dataclass(frozen=True)
+class StegExposeResult:
+    """StegExpose on renders."""
+
+    stego: Auc  # the stego model against a control
+    control: Auc  # one control against another
+
+
+@contextmanager
+def part_progress(reporter: Reporter, title: str) -> Iterator[Progress]:
+    """Report the progress of one part."""
+    total = 0
+
+    def show(done: int, of: int) -> None:
+        nonlocal total
+        if not total:
+            reporter.start(title, of, 0)
+        total = of
+        reporter.update(done, 0, {})
+
+    try:
+        yield show
+        if total:
+            reporter.update(total, 0, {})
+    finally:
+        if total:
+            reporter.finish()
+
+
+def images(subject: Subject, seed: int, progress: Progress) -> tuple[ImagesResult, Pictures]:
     """Compare cover and secrets with the test views, and plain models as baselines; keep some images."""
     models = [subject.stego, *subject.revealed]
     plains = [subject.original, *subject.baselines]
@@ -105,7 +240,7 @@ def _compare(renders: Sequence[tuple[str, Tensor]], scene: Scene) -> ImageCompar
     return ImageComparison(views, mean_quality(list(views.values())))
 
 
-def parameters(subject: Subject, seed: int, progress: PartProgress) -> tuple[ParametersResult, Pictures]:
+def parameters(subject: Subject, seed: int, progress: Progress) -> tuple[ParametersResult, Pictures]:
     """Distances of the parameters from plain models: published 3D-Sinkhorn, Wasserstein, a classifier."""
     original, stego, controls = subject.original, subject.stego, subject.controls
     progress(0, 3)
@@ -121,14 +256,14 @@ def parameters(subject: Subject, seed: int, progress: PartProgress) -> tuple[Par
     return ParametersResult(sinkhorn, between, score, distances, two_sample), {}
 
 
-def stealth(subject: Subject, seed: int, progress: PartProgress) -> tuple[StealthResult, Pictures]:
+def stealth(subject: Subject, seed: int, progress: Progress) -> tuple[StealthResult, Pictures]:
     """Compare statistics of the file with plain models, and try to confirm guessed secrets."""
     progress(0, 1)
     baselines, original = subject.baselines, subject.original
     return judge(subject.stego, subject.controls, original=original, candidates=baselines), {}
 
 
-def stegexpose(subject: Subject, seed: int, progress: PartProgress) -> tuple[StegExposeResult, Pictures]:
+def stegexpose(subject: Subject, seed: int, progress: Progress) -> tuple[StegExposeResult, Pictures]:
     """StegExpose on renders of the stego model and of plain models."""
     cover = subject.scenes[0]
     views = select_views(cover.views)
@@ -143,7 +278,7 @@ def stegexpose(subject: Subject, seed: int, progress: PartProgress) -> tuple[Ste
 
 
 def leaks(
-    subject: Subject, seed: int, progress: PartProgress
+    subject: Subject, seed: int, progress: Progress
 ) -> tuple[tuple[tuple[AttackResult, ...], ...], Pictures]:
     """Attacks without the key on each secret, with the file or with its decoder."""
     results: list[tuple[AttackResult, ...]] = []
@@ -160,9 +295,7 @@ def leaks(
     return tuple(results), pictures
 
 
-def robustness(
-    subject: Subject, seed: int, progress: PartProgress
-) -> tuple[tuple[ChangeResult, ...], Pictures]:
+def robustness(subject: Subject, seed: int, progress: Progress) -> tuple[tuple[ChangeResult, ...], Pictures]:
     """PSNR loss of the cover and the secrets when the stego model changes."""
     cover, *secrets = subject.scenes
     rows = measure_robustness(
@@ -171,7 +304,7 @@ def robustness(
     return tuple(rows), {}
 
 
-def speed(subject: Subject, seed: int, progress: PartProgress) -> tuple[dict[str, RenderTime], Pictures]:
+def speed(subject: Subject, seed: int, progress: Progress) -> tuple[dict[str, RenderTime], Pictures]:
     """Rendering times of the stego model and of the revealed secrets."""
     models = [subject.stego, *subject.revealed]
     plains = [subject.original, *subject.baselines]

@@ -16,7 +16,8 @@ from keyss.core import InputError, import_extra
 from keyss.files.images import probe_image
 from keyss.files.inputs import read_file
 from keyss.lab.audits import formatting
-from keyss.lab.audits.record import PICTURES, Audit, ImageComparison, ModelImages
+from keyss.lab.audits.audit_run import PICTURES, Audit
+from keyss.lab.audits.parts import ImageComparison, ModelImages
 from keyss.lab.audits.summary import auc_text, headline, verdicts, worst_leak
 
 _STYLES = ("page.css", "pictures.css", "print.css")

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 from keyss.lab.auc import Auc
+from keyss.lab.audits.audit_run import Audit
 from keyss.lab.audits.formatting import decibel, difference, number, numbered, significant, times
-from keyss.lab.audits.record import Audit
 from keyss.lab.leaks.leak_scores import GRADIENT_LIMIT, PSNR_LIMIT, SSIM_LIMIT, AttackResult
 
 QUALITY_LOSS = 1.0  # dB of cover or secret below the plain model of the same scene

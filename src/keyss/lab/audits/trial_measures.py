@@ -17,12 +17,12 @@ from keyss.core.gaussians import Gaussians
 from keyss.core.picture_network import DecodedGaussians
 from keyss.lab.audits import PARTS
 from keyss.lab.audits.audit_run import EXTRA
-from keyss.lab.audits.subject import Subject
+from keyss.lab.audits.parts import Subject
+from keyss.lab.distances import composite_score, sinkhorn_3d
 from keyss.lab.render_time import measure_render_time
 from keyss.lab.robustness.changes import Change, opacity_pruning, purification, random_pruning
 from keyss.lab.robustness.converters import converters
 from keyss.lab.robustness.survival import measure_robustness
-from keyss.lab.sinkhorn import composite_score, sinkhorn_3d
 from keyss.lab.stealth.judging import judge
 from keyss.lab.stegexpose import stegexpose_auc
 from keyss.lab.two_sample import two_sample_auc

@@ -26,7 +26,7 @@ from keyss.files import read_model, write_bytes
 from keyss.fitting import FitConfig
 from keyss.keys import MasterKey, read_key
 from keyss.lab.audits import PARTS, audit
-from keyss.lab.audits.subject import Subject
+from keyss.lab.audits.parts import Subject
 from keyss.lab.audits.trial_measures import MEASURES
 from keyss.methods import MethodOptions, registry
 from keyss.methods.base import Plan
