@@ -13,7 +13,6 @@ import argparse
 import os
 import sys
 import time
-from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from multiprocessing import get_context
@@ -51,11 +50,11 @@ class Job:
     others: tuple[str, ...]  # models of the secrets
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
+def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("plain", nargs="+", metavar="SCENE=FILE")
     parser.add_argument("--workers", type=int, default=os.cpu_count())
-    options = parser.parse_args(arguments)
+    options = parser.parse_args()
     named = [text.partition("=")[::2] for text in options.plain]
     jobs = [
         Job(index, scene, cover, tuple(other for each, other in named if each != scene))
@@ -75,10 +74,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
             [job.scene for job in jobs for _ in (0, 1)],
             [job.cover for job in jobs for _ in (0, 1)],
         )
-        single, chance = single_detectors(examples)
+        single, chance = single_detectors(examples, SHOWN)
         for row in learned_detectors(examples):
             print(f"| {kind} | {row.name} | {row.auc:.3f} | {row.error:.3f} | |")
-        for row in single[:SHOWN]:
+        for row in single:
             print(f"| {kind} | {row.name} | {row.auc:.3f} | {row.error:.3f} | {chance:.2f} |")
 
 

@@ -17,7 +17,9 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 from keyss.core import Camera, Gaussians
 from keyss.files import read_model
@@ -45,10 +47,7 @@ class Case:
     file: Path | None = None
 
     def scene(self) -> tuple[Gaussians, Camera]:
-        if self.file is not None:
-            gaussians = read_model(self.file)
-            return gaussians, camera_before(gaussians.means, self.width, self.height)
-        gaussians = synthetic_model(self.count)
+        gaussians = synthetic_model(self.count) if self.file is None else read_model(self.file)
         return gaussians, camera_before(gaussians.means, self.width, self.height)
 
 
@@ -92,24 +91,38 @@ def load_kernels() -> None:
     render(gaussians, camera_before(gaussians.means.detach(), 8, 8)).sum().backward()
 
 
-class Times:
-    """Milliseconds of one part, over the repeats."""
+class Clock:
+    """Milliseconds of each part of what is repeated; the first time is a warm-up."""
 
     def __init__(self) -> None:
-        self.values: list[float] = []
+        self.times: dict[str, list[float]] = {}
 
-    def measure(self, part: Callable[[], object]) -> object:
+    def __call__(self, part: str, work: Callable[[], Any]) -> Any:
         start = time.perf_counter()
-        result = part()
-        self.values.append(1e3 * (time.perf_counter() - start))
+        result = work()
+        self.times.setdefault(part, []).append(1e3 * (time.perf_counter() - start))
         return result
 
-    @property
-    def best(self) -> float:
-        return min(self.values)
+    def best(self, part: str) -> float:
+        return min(self.times[part][1:])
 
-    def __str__(self) -> str:
-        return f"{self.best:.1f} ({statistics.median(self.values):.1f})"
+    def text(self, part: str) -> str:
+        return f"{self.best(part):.1f} ({statistics.median(self.times[part][1:]):.1f})"
+
+
+def leaves_of(model: Gaussians) -> list[Tensor]:
+    tensors = (model.means, model.quats, model.scales, model.opacities, model.sh)
+    return [each.detach().requires_grad_() for each in tensors]
+
+
+def draw(leaves: list[Tensor], camera: Camera, sh_degree: int) -> Tensor:
+    size = (camera.width, camera.height)
+    return rasterization(*leaves, camera.viewmat, camera.K, *size, sh_degree=sh_degree)[0]
+
+
+def weights_for(camera: Camera) -> Tensor:
+    """Gradients of the pixels."""
+    return torch.randn(camera.height, camera.width, 3, generator=torch.Generator().manual_seed(1))
 
 
 def measure_rasterizer(case: Case, threads: int, repeats: int) -> list[str]:
@@ -117,39 +130,20 @@ def measure_rasterizer(case: Case, threads: int, repeats: int) -> list[str]:
     torch.set_num_threads(threads)
     load_kernels()  # not counted as peak memory
     gaussians, camera = case.scene()
-    tensors = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh)
-    leaves = [tensor.detach().requires_grad_() for tensor in tensors]
-    weights = torch.randn(camera.height, camera.width, 3, generator=torch.Generator().manual_seed(1))
-
-    def draw() -> Tensor:
-        image, _, _ = rasterization(
-            *leaves, camera.viewmat, camera.K, camera.width, camera.height,
-            sh_degree=gaussians.sh_degree,
-        )  # fmt: skip
-        return image
-
-    only, forward, backward = Times(), Times(), Times()
+    leaves, weights, clock = leaves_of(gaussians), weights_for(camera), Clock()
+    work = partial(draw, leaves, camera, gaussians.sh_degree)
     before = _memory()
-    for repeat in range(repeats + 1):
-        if repeat == 1:
-            only, forward, backward = Times(), Times(), Times()
+    for _ in range(repeats + 1):
         with torch.no_grad():
-            only.measure(draw)
-        image = forward.measure(draw)
-        assert isinstance(image, Tensor)
-        backward.measure(lambda image=image: image.backward(weights))
+            clock("only", work)
+        image = clock("forward", work)
+        clock("backward", partial(image.backward, weights))
         del image
         for leaf in leaves:
             leaf.grad = None
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 - before
-    return [
-        f"{case.name}, {case.width}x{case.height}",
-        str(threads),
-        str(only),
-        str(forward),
-        str(backward),
-        f"{peak / 2**20:.0f}",
-    ]
+    times = map(clock.text, ("only", "forward", "backward"))
+    return [f"{case.name}, {case.width}x{case.height}", str(threads), *times, f"{peak / 2**20:.0f}"]
 
 
 def measure_step(case: Case, threads: int, repeats: int) -> list[str]:
@@ -161,81 +155,49 @@ def measure_step(case: Case, threads: int, repeats: int) -> list[str]:
         target = Target.of(render(gaussians, camera).clamp(0, 1).flip(1))
     parameters = to_parameters(gaussians, torch.device("cpu"))
     optimizers = make_optimizers(parameters, config, 1.0)
-    weights = torch.randn(camera.height, camera.width, 3, generator=torch.Generator().manual_seed(1))
+    weights, clock = weights_for(camera), Clock()
 
     def update() -> None:
         for optimizer in optimizers.values():
             optimizer.step()
             optimizer.zero_grad(set_to_none=True)
 
-    names = ("rasterizer forward", "rasterizer backward", "render", "loss", "backward", "optimiser")
-    times = {name: Times() for name in names}
-    for repeat in range(repeats + 1):
-        if repeat == 1:
-            times = {name: Times() for name in names}
-        g = to_gaussians(parameters)
-        leaves = [t.detach().requires_grad_() for t in (g.means, g.quats, g.scales, g.opacities, g.sh)]
-        image, _, _ = times["rasterizer forward"].measure(
-            lambda leaves=leaves, g=g: rasterization(
-                *leaves, camera.viewmat, camera.K, camera.width, camera.height,
-                sh_degree=g.sh_degree,
-            )
-        )  # type: ignore[misc]  # fmt: skip
-        times["rasterizer backward"].measure(lambda image=image: image.backward(weights))
-        del leaves, g, image
-        image = times["render"].measure(lambda: render(to_gaussians(parameters), camera))
-        loss = times["loss"].measure(lambda image=image: photometric_loss(image, target, config.ssim_weight))
-        times["backward"].measure(loss.backward)  # type: ignore[attr-defined]
-        times["optimiser"].measure(update)
-    rasterizer = times["rasterizer forward"].best + times["rasterizer backward"].best
-    parts = [times[name].best for name in names[2:]]
-    return [
-        f"{case.name}, {case.width}x{case.height}",
-        str(threads),
-        f"{rasterizer:.1f}",
-        *(f"{part:.1f}" for part in parts),
-        f"{sum(parts):.1f}",
-        f"{sum(parts) / rasterizer:.2f}",
-    ]
+    for _ in range(repeats + 1):
+        leaves = leaves_of(to_gaussians(parameters))
+        image = clock("rasterizer forward", partial(draw, leaves, camera, gaussians.sh_degree))
+        clock("rasterizer backward", partial(image.backward, weights))
+        del leaves
+        image = clock("render", lambda: render(to_gaussians(parameters), camera))
+        loss = clock("loss", partial(photometric_loss, image, target, config.ssim_weight))
+        clock("backward", loss.backward)
+        clock("optimiser", update)
+    rasterizer = clock.best("rasterizer forward") + clock.best("rasterizer backward")
+    parts = [clock.best(name) for name in ("render", "loss", "backward", "optimiser")]
+    numbers = [f"{part:.1f}" for part in (rasterizer, *parts, sum(parts))]
+    ratio = f"{sum(parts) / rasterizer:.2f}"
+    return [f"{case.name}, {case.width}x{case.height}", str(threads), *numbers, ratio]
 
 
 def measure_against_torch(threads: int, repeats: int) -> list[str]:
     """One row of the third table: plain torch, all Gaussians at all pixels, on a small scene."""
     torch.set_num_threads(threads)
-    count, width, height = 1000, 64, 48
-    gaussians = synthetic_model(count)
-    camera = camera_before(gaussians.means, width, height)
-    weights = torch.randn(height, width, 3, generator=torch.Generator().manual_seed(1))
-    tensors = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh)
-    leaves = [tensor.detach().requires_grad_() for tensor in tensors]
-
-    def ours() -> Tensor:
-        size = (camera.width, camera.height)
-        return rasterization(*leaves, camera.viewmat, camera.K, *size, sh_degree=3)[0]
-
-    def dense() -> Tensor:
-        view = (camera.viewmat, camera.K, camera.width, camera.height)
-        return dense_rasterization(*leaves, *view, torch.zeros(3), 3)[0]
-
-    rows = []
-    for draw in (dense, ours):
-        forward, backward = Times(), Times()
-        for repeat in range(repeats + 1):
-            if repeat == 1:
-                forward, backward = Times(), Times()
-            image = forward.measure(draw)
-            backward.measure(lambda image=image: image.backward(weights))  # type: ignore[attr-defined]
-        rows.append((forward.best, backward.best))
-    (dense_forward, dense_backward), (forward_ms, backward_ms) = rows
+    case = Case(name="1000 synthetic", width=64, height=48, count=1000)
+    gaussians, camera = case.scene()
+    leaves, weights, clock = leaves_of(gaussians), weights_for(camera), Clock()
+    view = (camera.viewmat, camera.K, camera.width, camera.height)
+    for _ in range(repeats + 1):
+        image = clock("forward, torch", lambda: dense_rasterization(*leaves, *view, torch.zeros(3), 3)[0])
+        clock("backward, torch", partial(image.backward, weights))
+        image = clock("forward", partial(draw, leaves, camera, 3))
+        clock("backward", partial(image.backward, weights))
+    theirs = [clock.best(f"{part}, torch") for part in ("forward", "backward")]
+    ours = [clock.best(part) for part in ("forward", "backward")]
     return [
-        f"{count} synthetic, {width}x{height}",
+        f"{case.name}, {case.width}x{case.height}",
         str(threads),
-        f"{dense_forward:.1f}",
-        f"{dense_backward:.1f}",
-        f"{forward_ms:.2f}",
-        f"{backward_ms:.2f}",
-        f"{dense_forward / forward_ms:.0f}",
-        f"{dense_backward / backward_ms:.0f}",
+        *(f"{each:.1f}" for each in theirs),
+        *(f"{each:.2f}" for each in ours),
+        *(f"{their / our:.0f}" for their, our in zip(theirs, ours, strict=True)),
     ]
 
 

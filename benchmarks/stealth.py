@@ -14,24 +14,21 @@ and pieces of space. Detectors are cross-validated over scenes.
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import sys
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import suppress
-from dataclasses import asdict, dataclass
-from functools import partial
+from dataclasses import dataclass
+from itertools import repeat
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
 
 import keyss  # noqa: F401  before torch, see `ruff.toml`
 from keyss.files import read_model
 
 import numpy as np
-import numpy.typing as npt
 import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
@@ -43,8 +40,8 @@ from keyss.lab import candidate_scores, stealth_statistics
 from keyss.methods.carry.capacity import RecordCapacity
 from keyss.methods.carry.options import CarryOptions
 from methods.carry import carried
-from stealth_detection import Detection, Examples, confirmed, learned_detectors, single_detectors
-from stealth_predictor import BitPredictor, sample
+from stealth_detection import Examples, confirmed, learned_detectors, single_detectors
+from stealth_predictor import fit_predictor, predictor_statistics, sample
 
 PART_SIZES = (2000, 5000)
 PAYLOAD_BYTES = 4000
@@ -76,8 +73,8 @@ class Job:
     given: str = ""
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    options = _arguments(arguments)
+def main() -> None:
+    options = _arguments()
     started = time.monotonic()
     with ProcessPoolExecutor(options.workers, get_context("fork"), initializer=_one_thread) as pool:
         files = [file for made in pool.map(_make, _jobs(options)) for file in made]
@@ -91,31 +88,23 @@ def main(arguments: Sequence[str] | None = None) -> None:
             for row, more in zip(rows, _predict(pool, files, pieces), strict=True):
                 row |= more
             print(f"predicted after {time.monotonic() - started:.0f} s", file=sys.stderr)
-        found = _detections(files, pieces, rows)
-        confirmations = {} if options.quick else _confirmations(pool, files)
-    seconds = round(time.monotonic() - started)
-    print(_table(found, confirmations, files, seconds))
-    if options.json:
-        named = [[file.kind, file.scene, file.pair, piece] for file, piece, _ in pieces]
-        record = {
-            "pieces": [[*name, row] for name, row in zip(named, rows, strict=True)],
-            "seconds": seconds,
-            "detections": found,
-            "confirmations": confirmations,
-        }
-        Path(options.json).write_text(json.dumps(record, indent=1, default=asdict))
+        scenes, plain = {file.scene for file in files}, sum(file.kind == "plain" for file in files)
+        print(f"{plain} plain models of {len(scenes)} scenes, {time.monotonic() - started:.0f} s\n")
+        _print_detections(files, pieces, rows)
+        print("\n| confirmation | score | true above another |\n| --- | --- | --- |")
+        if not options.quick:
+            _print_confirmations(pool, files)
 
 
-def _arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
+def _arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("plain", nargs="*", metavar="SCENE=FILE")
     parser.add_argument("--refitted", nargs="*", default=[], metavar="SCENE=FILE:SECRET")
     parser.add_argument("--pairs", nargs="*", default=[], metavar="SCENE=PLAIN:STEGO")
     parser.add_argument("--rounded", action="store_true")
     parser.add_argument("--quick", action="store_true")
-    parser.add_argument("--json", metavar="FILE")
     parser.add_argument("--workers", type=int, default=os.cpu_count())
-    return parser.parse_args(arguments)
+    return parser.parse_args()
 
 
 def _parse_named(text: str) -> tuple[str, str, str]:
@@ -193,39 +182,28 @@ def _predict(
 ) -> list[dict[str, float]]:
     """Statistics of each piece's bits, predicted by trees trained on plain models of the other scenes."""
     plain = [file for file in files if file.kind == "plain"]
-    samples = list(pool.map(_sample, [file.model for file in plain], chunksize=2))
+    samples = list(pool.map(sample, [file.model for file in plain], repeat(TRAINING_ROWS), chunksize=2))
     found: list[dict[str, float]] = [{} for _ in pieces]
     for scene in dict.fromkeys(file.scene for file in plain):
         others = [each for file, each in zip(plain, samples, strict=True) if file.scene != scene]
-        predictor = BitPredictor.of_samples(others[:: -(-len(others) // MAX_TRAINED_ON)])
+        trees = fit_predictor(others[:: -(-len(others) // MAX_TRAINED_ON)])
         own = [index for index, (file, _, _) in enumerate(pieces) if file.scene == scene]
-        judge: Callable[[Gaussians], dict[str, float]] = partial(_predictor_statistics, predictor)
-        for index, row in zip(
-            own, pool.map(judge, [pieces[each][2] for each in own], chunksize=4), strict=True
-        ):
+        models = [pieces[each][2] for each in own]
+        made = pool.map(predictor_statistics, repeat(trees), models, chunksize=4)
+        for index, row in zip(own, made, strict=True):
             found[index] = row
     return found
 
 
-def _sample(model: Gaussians) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int64]]:
-    return sample(model, TRAINING_ROWS, 0)
-
-
-def _predictor_statistics(predictor: BitPredictor, piece: Gaussians) -> dict[str, float]:
-    from threadpoolctl import threadpool_limits
-
-    with threadpool_limits(1, "openmp"):
-        return {f"predictor: {name}": each.value for name, each in predictor.statistics(piece).items()}
-
-
-def _detections(
+def _print_detections(
     files: Sequence[File], pieces: Sequence[tuple[File, str, Gaussians]], rows: Sequence[dict[str, float]]
-) -> dict[str, dict[str, Any]]:
-    """By kind and piece: the best detectors, the maximum expected by chance, and classifiers."""
-    found = {}
+) -> None:
+    """Print classifiers and the best single detectors, by kind and piece."""
+    print("| files | detector | AUC | standard error | pooled | largest by chance |")
+    print("| --- | --- | --- | --- | --- | --- |")
     for kind in dict.fromkeys(file.kind for file in files if file.kind != "plain"):
+        paired = {file.pair for file in files if file.kind == kind}
         for piece in ("whole", "random", "space"):
-            paired = {file.pair for file in files if file.kind == kind}
             own = [
                 (file, row)
                 for (file, name, _), row in zip(pieces, rows, strict=True)
@@ -243,66 +221,31 @@ def _detections(
                 [file.scene for file, _ in own],
                 [file.pair for file, _ in own],
             )
-            single, chance = single_detectors(examples)
-            found[f"{kind}, {piece}"] = {
-                "files": len(paired),
-                "single": single,
-                "chance": chance,
-                "learned": learned_detectors(examples),
-            }
-    return found
+            single, chance = single_detectors(examples, SHOWN)
+            table = [(row, "") for row in learned_detectors(examples)]
+            for row, limit in [*table, *((row, f"{chance:.2f}") for row in single)]:
+                numbers = f"{row.auc:.3f} | {row.error:.3f} | {row.pooled:.3f} | {limit}"
+                print(f"| {kind}, {piece} | {row.name} | {numbers} |")
 
 
-def _confirmations(pool: ProcessPoolExecutor, files: Sequence[File]) -> dict[str, dict[str, float]]:
-    """By kind and score: probability that the true candidate ranks above another one."""
-    found = {}
+def _print_confirmations(pool: ProcessPoolExecutor, files: Sequence[File]) -> None:
+    """Print by kind and score the probability that the true candidate ranks above another one."""
     for kind in ("carried", "refitted"):
         own = [file for file in files if file.kind == kind and file.secret]
         own = own[:: max(1, -(-len(own) // CANDIDATES))]
         paths = list(dict.fromkeys(file.secret for file in own))
         if len(paths) < 2:
             continue
-        candidates = [read_model(path) for path in paths]
-        cases = [(file.model, candidate) for file in own for candidate in candidates]
-        scores = list(pool.map(_scores, cases, chunksize=4))
+        cases = [(file.model, candidate) for file in own for candidate in map(read_model, paths)]
+        scores = list(pool.map(candidate_scores, *zip(*cases, strict=True), chunksize=4))
         true = [paths.index(file.secret) for file in own]
-        found[f"{kind}, {len(own)} files, {len(paths)} candidates"] = {
+        found = {
             name: confirmed(np.array([each[name] for each in scores]).reshape(len(own), len(paths)), true)
             for name in scores[0]
             if all(name in each for each in scores)
         }
-    return found
-
-
-def _scores(case: tuple[Gaussians, Gaussians]) -> dict[str, float]:
-    return candidate_scores(*case)
-
-
-def _table(
-    found: dict[str, dict[str, Any]],
-    confirmations: dict[str, dict[str, float]],
-    files: Sequence[File],
-    seconds: float,
-) -> str:
-    scenes = {file.scene for file in files}
-    plain = sum(file.kind == "plain" for file in files)
-    lines = [f"{plain} plain models of {len(scenes)} scenes, {seconds} s", ""]
-    lines += [
-        "| files | detector | AUC | standard error | pooled | largest by chance |",
-        "| --- | --- | --- | --- | --- | --- |",
-    ]
-    for name, each in found.items():
-        rows: list[Detection] = [*each["learned"], *each["single"][:SHOWN]]
-        for row in rows:
-            chance = "" if row in each["learned"] else f"{each['chance']:.2f}"
-            lines.append(
-                f"| {name} | {row.name} | {row.auc:.3f} | {row.error:.3f} | {row.pooled:.3f} | {chance} |"
-            )
-    lines += ["", "| confirmation | score | true above another |", "| --- | --- | --- |"]
-    for kind, scores in confirmations.items():
-        ordered = sorted(scores.items(), key=lambda pair: -abs(pair[1] - 0.5))
-        lines += [f"| {kind} | {name} | {value:.3f} |" for name, value in ordered]
-    return "\n".join(lines)
+        for name, value in sorted(found.items(), key=lambda pair: -abs(pair[1] - 0.5)):
+            print(f"| {kind}, {len(own)} files, {len(paths)} candidates | {name} | {value:.3f} |")
 
 
 if __name__ == "__main__":

@@ -17,7 +17,6 @@ _DRAWS = 300  # bootstrap samples
 _EXCHANGES = 100
 _BEST = 12  # best statistics for logistic regression ...
 _EXAMPLES = 16  # ... at most one per this many examples, against overfitting
-MAX_NAMED = 10  # single detectors
 
 
 @dataclass(frozen=True)
@@ -53,39 +52,34 @@ class Examples:
         return Examples(names, values, np.array(hidden), scene, model)
 
 
-def single_detectors(examples: Examples, *, seed: int = 0) -> tuple[list[Detection], float]:
-    """Every statistic by itself, largest area first, and the 95 % quantile of the largest under permutation.
+def single_detectors(examples: Examples, count: int) -> tuple[list[Detection], float]:
+    """The `count` best single statistics, and the 95 % quantile of the largest area under permutation.
 
     The sign and the normal range come from the other scenes.
     """
     held_out = _HeldOut.of(examples)
     scores = held_out.scores(examples.hidden)
     found = areas(scores, examples.hidden, examples.scene)
-    random = np.random.default_rng(seed)
+    random = np.random.default_rng(0)
     largest = []
     for _ in range(_EXCHANGES):
         flip = random.integers(0, 2, examples.model.max() + 1)[examples.model]
         exchanged = examples.hidden ^ flip
         largest.append(areas(held_out.scores(exchanged), exchanged, examples.scene).max())
-    worst = np.argsort(-found)[:MAX_NAMED]
-    errors = _errors(scores[:, worst], examples)
-    named = [
-        Detection(examples.names[index], float(found[index]), float(error), float(pooled))
-        for index, error, pooled in zip(worst, errors, _pooled(scores[:, worst], examples), strict=True)
-    ]
+    worst = np.argsort(-found)[:count]
+    named = _detections([examples.names[index] for index in worst], scores[:, worst], examples)
     return named, float(np.quantile(largest, 0.95))
 
 
-def learned_detectors(examples: Examples, *, seed: int = 0) -> list[Detection]:
+def learned_detectors(examples: Examples) -> list[Detection]:
     """Logistic regression and boosted trees over all statistics."""
     from sklearn.ensemble import HistGradientBoostingClassifier
     from sklearn.linear_model import LogisticRegression
     from sklearn.pipeline import make_pipeline
     from sklearn.preprocessing import QuantileTransformer
 
-    found = []
-    for name in ("logistic", "trees"):
-        scores = np.zeros(len(examples.hidden))
+    names, scores = ("logistic", "trees"), np.zeros((len(examples.hidden), 2))
+    for column, name in enumerate(names):
         for scene in np.unique(examples.scene):
             held = examples.scene == scene
             others = examples.values[~held]
@@ -100,14 +94,18 @@ def learned_detectors(examples: Examples, *, seed: int = 0) -> list[Detection]:
                 machine = make_pipeline(spread, LogisticRegression(C=0.1, max_iter=2000))
             else:
                 machine = HistGradientBoostingClassifier(
-                    max_iter=80, max_leaf_nodes=8, min_samples_leaf=5, learning_rate=0.1, random_state=seed
+                    max_iter=80, max_leaf_nodes=8, min_samples_leaf=5, learning_rate=0.1, random_state=0
                 )
-            scores[held] = machine.fit(train, examples.hidden[~held]).decision_function(test)
-        (area,) = areas(scores[:, None], examples.hidden, examples.scene)
-        (error,) = _errors(scores[:, None], examples)
-        (pooled,) = _pooled(scores[:, None], examples)
-        found.append(Detection(f"{name} over all", float(area), float(error), float(pooled)))
-    return found
+            scores[held, column] = machine.fit(train, examples.hidden[~held]).decision_function(test)
+    return _detections([f"{name} over all" for name in names], scores, examples)
+
+
+def _detections(names: Sequence[str], scores: Doubles, examples: Examples) -> list[Detection]:
+    """A detection for each column of scores [E, S]."""
+    own = areas(scores, examples.hidden, examples.scene)
+    pooled = areas(scores, examples.hidden, np.zeros_like(examples.scene))
+    columns = zip(names, own, _errors(scores, examples), pooled, strict=True)
+    return [Detection(name, *map(float, numbers)) for name, *numbers in columns]
 
 
 def areas(scores: Doubles, hidden: Integers, scene: Integers) -> Doubles:
@@ -150,10 +148,6 @@ def confirmed(scores: Doubles, true: Sequence[int]) -> float:
         rest = np.delete(row, index)
         above.append(float((row[index] > rest).mean() + 0.5 * (row[index] == rest).mean()))
     return float(np.mean(above))
-
-
-def _pooled(scores: Doubles, examples: Examples) -> Doubles:
-    return areas(scores, examples.hidden, np.zeros_like(examples.scene))
 
 
 def _ranks(values: Doubles) -> Doubles:

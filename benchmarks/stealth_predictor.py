@@ -29,55 +29,38 @@ _OFTEN = 6  # occurrences: three channels of a grey Gaussian and of its sibling
 _DISTANCES = slice(0, 2)  # columns of the features
 
 
-class BitPredictor:
-    """Trees that predict single bits; `fit` them on plain models of scenes other than the judged ones."""
+def fit_predictor(samples: Sequence[tuple[Doubles, Integers]]) -> Any:
+    """Trees that predict single bits, from results of `sample` on scenes other than the judged ones."""
+    from sklearn.ensemble import HistGradientBoostingClassifier  # slow to import
 
-    def __init__(self, trees: Any) -> None:
-        self._trees = trees
+    x, y = (np.concatenate(each) for each in zip(*samples, strict=True))
+    trees = HistGradientBoostingClassifier(
+        max_iter=_TREES, max_leaf_nodes=_LEAVES, l2_regularization=1.0, min_samples_leaf=50, random_state=0
+    )
+    return trees.fit(x, y)
 
-    @staticmethod
-    def fit(models: Sequence[Gaussians], *, seed: int = 0) -> BitPredictor:
-        samples = [sample(model, ROWS, seed + index) for index, model in enumerate(models)]
-        return BitPredictor.of_samples(samples, seed=seed)
 
-    @staticmethod
-    def of_samples(samples: Sequence[tuple[Doubles, Integers]], *, seed: int = 0) -> BitPredictor:
-        """Fit to results of `sample`, which several folds can share."""
-        from sklearn.ensemble import HistGradientBoostingClassifier  # slow to import
+def predictor_statistics(trees: Any, model: Gaussians) -> dict[str, float]:
+    """Prediction quality on the bits of a file.
 
-        x, y = (np.concatenate(each) for each in zip(*samples, strict=True))
-        trees = HistGradientBoostingClassifier(
-            max_iter=_TREES,
-            max_leaf_nodes=_LEAVES,
-            l2_regularization=1.0,
-            min_samples_leaf=50,
-            random_state=seed,
-        )
-        return BitPredictor(trees.fit(x, y))
-
-    def statistics(self, model: Gaussians, *, seed: int = 0) -> dict[str, Statistic]:
-        """Prediction quality on the bits of a file; see `of_sample`."""
-        return self.of_sample(*sample(model, ROWS, seed))
-
-    def of_sample(self, seen: Doubles, bits: Integers) -> dict[str, Statistic]:
-        """Gain in log-likelihood per bit, and agreement with predictions / expected agreement.
-
-        Agreement is 1 for plain models and 0 for random bits; null: 0.
-        """
-        chance = self._trees.predict_proba(seen)[:, 1]
-        said = np.where(bits == 1, chance, 1 - chance).clip(1e-6)
-        found = {"gain": Statistic(float(np.log2(2 * said).mean()))}
-        nearest = seen[:, _DISTANCES].min(axis=1)
-        kinds = {
-            "without a like": nearest >= HIGHEST,
-            "beside a like": (nearest > 0) & (nearest < HIGHEST),
-            "beside its equal": nearest == 0,
-        }
-        for kind, own in kinds.items():
-            for name, least in (("", 0.0), (", sure", _SURE)):
-                rows = own & (np.abs(chance - 0.5) > least)
-                found[f"agreement {kind}{name}"] = _agreement(chance[rows] - 0.5, bits[rows] - 0.5)
-        return {name: each for name, each in found.items() if not np.isnan(each.value)}
+    Gain in log-likelihood per bit, and agreement with predictions / expected agreement, which is 1 for plain
+    models and 0 for random bits; null: 0.
+    """
+    seen, bits = sample(model, ROWS)
+    chance = trees.predict_proba(seen)[:, 1]
+    said = np.where(bits == 1, chance, 1 - chance).clip(1e-6)
+    found = {"gain": Statistic(float(np.log2(2 * said).mean()))}
+    nearest = seen[:, _DISTANCES].min(axis=1)
+    kinds = {
+        "without a like": nearest >= HIGHEST,
+        "beside a like": (nearest > 0) & (nearest < HIGHEST),
+        "beside its equal": nearest == 0,
+    }
+    for kind, own in kinds.items():
+        for name, least in (("", 0.0), (", sure", _SURE)):
+            rows = own & (np.abs(chance - 0.5) > least)
+            found[f"agreement {kind}{name}"] = _agreement(chance[rows] - 0.5, bits[rows] - 0.5)
+    return {f"predictor: {name}": each.value for name, each in found.items() if not np.isnan(each.value)}
 
 
 def _agreement(lean: Doubles, came: Doubles) -> Statistic:
@@ -87,10 +70,10 @@ def _agreement(lean: Doubles, came: Doubles) -> Statistic:
     return normal(float((lean * came * 2).sum()) / promised, float((lean**2).sum()) ** 0.5 / promised)
 
 
-def sample(model: Gaussians, rows: int, seed: int) -> tuple[Doubles, Integers]:
+def sample(model: Gaussians, rows: int) -> tuple[Doubles, Integers]:
     """[R, features] and [R] bits of the smallest numbers, of those with the nearest relatives, and of any."""
     words = BitPatterns.of(model)
-    random = np.random.default_rng(seed)
+    random = np.random.default_rng(0)
     beside, distance = _likes(words, model)
     # Frequent numbers are multiples of a learning rate, which embedding does not change.
     allowed = words.trained & ~np.isin(words.attribute, UNCHANGED_ATTRIBUTES) & ~_is_frequent(words.bits)

@@ -13,12 +13,11 @@ from __future__ import annotations
 
 import argparse
 import hashlib
-import tempfile
 from pathlib import Path
 from typing import Any
 
-from keyss import SecretFile, convert, hide_files, reveal
-from colours import FORMATS, OTHERS, Change
+from keyss import SecretFile, hide_files, reveal
+from colours import FORMATS, OTHERS, OWN, Change
 from keyss.core import BackendError, Gaussians, InputError, WrongKeyError
 from keyss.files import load_scene, read_model
 from keyss.keys import derivation
@@ -35,17 +34,6 @@ CHANNELS: dict[str, dict[str, Any]] = {
     "colours (`any`)": {"publish": "any", "channel": "colours"},
     "appended (`any`)": {"publish": "any", "channel": "appended"},
 }
-OWN = (".ply", ".spz", ".sog", ".compressed.ply", ".glb", ".splat")
-
-
-def _convert_by_keyss(suffix: str) -> Change:
-    def change(model: Gaussians) -> Gaussians:
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / f"converted{suffix}"
-            convert(model, path)
-            return read_model(path)
-
-    return change
 
 
 def survives(model: Gaussians, data: bytes, change: Change) -> str:
@@ -86,8 +74,7 @@ def main() -> None:
     print("| cost (dB) | " + " | ".join(f"{each.psnr:.0f}" for each in made.values()) + " |")
     more = " | ".join(f"{len(each.stego) - len(model):,}" for each in made.values())
     print(f"| Gaussians added | {more} |", flush=True)
-    own = {f"`{suffix}` by keyss": _convert_by_keyss(suffix) for suffix in OWN}
-    every = {"passed on as it is": lambda model: model, **own, **FORMATS, **OTHERS}
+    every = {"passed on as it is": lambda model: model, **OWN, **FORMATS, **OTHERS}
     if asked.photos:
         photos = load_scene(asked.photos, width=asked.width)
         every |= {f"{steps} steps of training on": fine_tuning(photos, steps) for steps in (10, 100)}
