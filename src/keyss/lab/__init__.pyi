@@ -1,4 +1,5 @@
 from .auc import Auc as Auc, auc_between as auc_between
+from .audits.parts import RenderTime as RenderTime, measure_render_time as measure_render_time
 from .baselines.baseline_options import BaselineOptions as BaselineOptions
 from .distances import (
     AttributeDistance as AttributeDistance,
@@ -22,7 +23,6 @@ from .leaks.leak_scores import (
     leak_scores as leak_scores,
     look_for_secret as look_for_secret,
 )
-from .render_time import RenderTime as RenderTime, measure_render_time as measure_render_time
 from .robustness.changes import (
     Change as Change,
     cropping as cropping,

@@ -17,12 +17,12 @@ from keyss.lab.audits.parts import (
     PARTS,
     ImagesResult,
     ParametersResult,
+    RenderTime,
     StegExposeResult,
     Subject,
     part_progress,
 )
 from keyss.lab.leaks.leak_scores import AttackResult
-from keyss.lab.render_time import RenderTime
 from keyss.lab.robustness.survival import ChangeResult
 from keyss.lab.stealth.judging import StealthResult
 from keyss.measure.hide_quality import WrongKeys
@@ -114,7 +114,8 @@ def audit(
     started, reporter = time.monotonic(), reporter or Reporter()
     opened = open_run(run, keys)
     subject = Subject(opened, resolve_device(device))
-    if impossible := sorted(set(only) & NEED_A_3DGS_MODEL) if not subject.standard else []:
+    excluded = set() if subject.standard else NEED_A_3DGS_MODEL
+    if impossible := sorted(set(only) & excluded):
         raise UsageError(
             f"the method {opened.config.method} does not publish a 3DGS model, which "
             f"{' and '.join(impossible)} measure: leave out `only`, or name other parts"
@@ -136,7 +137,7 @@ def audit(
         subject.fit_controls(seeds, folder, reporter)
         record, pictures = folder.checkpoints / "audit.json", folder.checkpoints / "pictures"
         result = read_record(record, Audit) if record.exists() else _nothing_measured(subject, seeds)
-        chosen = [name for name in PARTS if _is_chosen(name, only, subject.standard)]
+        chosen = [name for name in PARTS if name in (only or PARTS) and name not in excluded]
         for index, name in enumerate(chosen):
             if getattr(result, name) is not None:
                 continue
@@ -174,11 +175,6 @@ def _write_report(run: Path) -> Audit:
     result = read_audit(run)
     write_again(run, "audit", REPORT, report_bytes(result, run))
     return result
-
-
-def _is_chosen(name: str, only: Sequence[str], standard: bool) -> bool:
-    """True for a part to measure; `standard`: the run published a 3DGS model."""
-    return (standard or name not in NEED_A_3DGS_MODEL) and (not only or name in only)
 
 
 def _nothing_measured(subject: Subject, seeds: Sequence[int]) -> Audit:

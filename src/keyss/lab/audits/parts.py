@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
@@ -11,6 +12,7 @@ from functools import cached_property
 from statistics import fmean
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -19,14 +21,13 @@ from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
 from keyss.files.models import read_model
 from keyss.fitting.config import FitConfig
-from keyss.fitting.image_metrics import ImageQuality, mean_quality, view_quality
+from keyss.fitting.image_metrics import ImageQuality, mean_quality, subsample_views, view_quality
 from keyss.fitting.plain import fit_scene
 from keyss.lab.auc import Auc
 from keyss.lab.audits.formatting import numbered
 from keyss.lab.distances import AttributeDistance, Sinkhorn3D, against_controls, composite_score, sinkhorn_3d
 from keyss.lab.leaks.attacks import decoder_attack, file_attacks
 from keyss.lab.leaks.leak_scores import AttackResult, look_for_secret
-from keyss.lab.render_time import RenderTime, measure_render_time
 from keyss.lab.robustness.survival import ChangeResult, measure_robustness
 from keyss.lab.stealth.judging import StealthResult, judge
 from keyss.lab.stegexpose import stegexpose_auc
@@ -35,6 +36,7 @@ from keyss.measure.hide_quality import in_cover
 from keyss.measure.renders import renders_of, select_views
 from keyss.methods import registry
 from keyss.progress import Reporter
+from keyss.rendering import render
 from keyss.runs.files import CONTROLS
 from keyss.runs.folder import RunFolder
 from keyss.runs.open_run import HidingRun
@@ -176,6 +178,14 @@ class StegExposeResult:
     control: Auc  # one control against another
 
 
+@dataclass(frozen=True)
+class RenderTime:
+    """The time of one render of a model."""
+
+    seconds: float  # median
+    ratio: float  # median over pairs of renders, relative to a plain model of the scene; cancels other load
+
+
 @contextmanager
 def part_progress(reporter: Reporter, title: str) -> Iterator[Progress]:
     """Report the progress of one part."""
@@ -302,6 +312,30 @@ def robustness(subject: Subject, seed: int, progress: Progress) -> tuple[tuple[C
         subject.stego, subject.run.openers, cover, secrets, seed=seed, progress=progress
     )
     return tuple(rows), {}
+
+
+@torch.no_grad()
+def measure_render_time(
+    model: Gaussians, plain: Gaussians, scene: Scene, *, views: int = 4, rounds: int = 15
+) -> RenderTime:
+    """The render time of `model`, beside `plain`, from a scene's test cameras.
+
+    Each round renders at most `views` views with both models, in alternating order; the first round is a
+    warm-up.
+    """
+    cameras = [view.camera for view in subsample_views(scene.test, views)]
+    background = scene.background.to(model.device)
+    times = np.zeros((rounds + 1, len(cameras), 2))
+    for number in range(rounds + 1):
+        for index, camera in enumerate(cameras):
+            for which in (0, 1) if (number + index) % 2 else (1, 0):
+                start = time.perf_counter()
+                render((model, plain)[which], camera, background)
+                if model.device.type == "cuda":
+                    torch.cuda.synchronize()
+                times[number, index, which] = time.perf_counter() - start
+    seconds, plain_seconds = times[1:].reshape(-1, 2).T
+    return RenderTime(float(np.median(seconds)), float(np.median(seconds / plain_seconds)))
 
 
 def speed(subject: Subject, seed: int, progress: Progress) -> tuple[dict[str, RenderTime], Pictures]:

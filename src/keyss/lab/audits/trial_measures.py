@@ -17,9 +17,8 @@ from keyss.core.gaussians import Gaussians
 from keyss.core.picture_network import DecodedGaussians
 from keyss.lab.audits import PARTS
 from keyss.lab.audits.audit_run import EXTRA
-from keyss.lab.audits.parts import Subject
+from keyss.lab.audits.parts import Subject, measure_render_time
 from keyss.lab.distances import composite_score, sinkhorn_3d
-from keyss.lab.render_time import measure_render_time
 from keyss.lab.robustness.changes import Change, opacity_pruning, purification, random_pruning
 from keyss.lab.robustness.converters import converters
 from keyss.lab.robustness.survival import measure_robustness
@@ -50,21 +49,18 @@ def files(subject: Subject) -> Numbers:
     }
 
 
-def pictures(subject: Subject) -> Numbers:
-    """Speed of rendering the published model and the first secret."""
-    return _render_times(subject, subject.stego)
-
-
 def rendering(subject: Subject) -> Numbers:
     """Speed of rendering without appended Gaussians; 1 for a published 3DGS model, else 0."""
-    times = _render_times(subject, own_gaussians(subject.stego))
-    return times | {"standard": float(subject.standard)}
+    return pictures(subject, own_gaussians(subject.stego)) | {"standard": float(subject.standard)}
 
 
-def _render_times(subject: Subject, stego: Gaussians) -> Numbers:
-    models, plains = [stego, subject.revealed[0]], subject.run.plain_models()
+def pictures(subject: Subject, stego: Gaussians | None = None) -> Numbers:
+    """Speed of rendering the published model (or `stego`) and the first secret."""
+    stego, plains = subject.stego if stego is None else stego, subject.run.plain_models()
     found: Numbers = {}
-    for role, model, plain, scene in zip(_ROLES, models, plains, subject.scenes, strict=False):
+    for role, model, plain, scene in zip(
+        _ROLES, [stego, subject.revealed[0]], plains, subject.scenes, strict=False
+    ):
         beside = model if plain is None else plain.to(model.device)
         time = measure_render_time(model, beside, scene, rounds=_ROUNDS)
         found |= {f"pictures/s, {role}": 1 / time.seconds, f"time over 3DGS, {role}": time.ratio}

@@ -8,30 +8,31 @@ from typing import Any
 
 import msgspec
 
+from keyss.core import UsageError
+from keyss.core.errors import did_you_mean
 from keyss.fitting import FitConfig
 from keyss.methods import Design, KeyssOptions, MethodOptions
 
-FIT, DESIGN = "fit", "design"  # prefixes: options of training, fields of a design of KeySS
-
-
-def known_changes(preset: MethodOptions) -> set[str]:
-    """Names of options that `with_changes` accepts."""
-    known = {each.name for each in fields(preset)} - {FIT}
-    known |= {f"{FIT}.{each.name}" for each in fields(FitConfig) if each.name != "seed"}
-    if isinstance(preset, KeyssOptions):
-        known |= {f"{DESIGN}.{each.name}" for each in fields(Design)}
-    return known
-
 
 def with_changes(preset: MethodOptions, changes: Mapping[str, Any]) -> MethodOptions:
-    """The preset with changed options. Raises UsageError and msgspec.ValidationError for wrong values."""
-    parts: dict[str, dict[str, Any]] = {FIT: {}, DESIGN: {}, "": {}}
+    """The preset with changed options; prefixes: `fit` for training, `design` for a design of KeySS.
+
+    Raises UsageError for unknown names, and it or msgspec.ValidationError for wrong values.
+    """
+    kinds: dict[str, Any] = {"": type(preset), "fit": FitConfig}
+    if isinstance(preset, KeyssOptions):
+        kinds["design"] = Design
+    known = {f"{kind}.{each.name}".lstrip(".") for kind in kinds for each in fields(kinds[kind])}
+    known -= {"fit", "fit.seed"}
+    parts: dict[str, dict[str, Any]] = {kind: {} for kind in kinds}
     for name, value in changes.items():
+        if name not in known:
+            raise UsageError(f"option {name[:60]!r} is unknown; {did_you_mean(name, known)}")
         prefix, _, field = name.rpartition(".")
         parts[prefix][field] = value
     options = msgspec.convert({**msgspec.to_builtins(preset), **parts[""]}, type(preset))
-    if parts[DESIGN] and isinstance(options, KeyssOptions):
-        design = {**msgspec.to_builtins(options.configuration), **parts[DESIGN]}
+    if isinstance(options, KeyssOptions) and parts["design"]:
+        design = {**msgspec.to_builtins(options.configuration), **parts["design"]}
         options = replace(options, design=msgspec.convert(design, Design))
-    fit = msgspec.convert({**msgspec.to_builtins(options.fit), **parts[FIT]}, FitConfig)
-    return options.with_fit(**{name: getattr(fit, name) for name in parts[FIT]})
+    fit = msgspec.convert({**msgspec.to_builtins(options.fit), **parts["fit"]}, FitConfig)
+    return options.with_fit(**{name: getattr(fit, name) for name in parts["fit"]})

@@ -16,12 +16,11 @@ import msgspec
 from msgspec import Meta
 
 from keyss.core import InputError, KeyssError, ViewOptions, import_extra
-from keyss.core.errors import did_you_mean
 from keyss.files.inputs import read_text
 from keyss.fitting import PRESETS
 from keyss.fitting.config import MAX_SEED
 from keyss.lab.audits import PARTS
-from keyss.lab.many.option_changes import known_changes, with_changes
+from keyss.lab.many.option_changes import with_changes
 from keyss.lab.many.result_tables import TrialNumbers, write_sweep_tables
 from keyss.lab.many.trial_folder import Forecast, Outcome, TrialFolder
 from keyss.methods import MethodOptions, registry
@@ -113,12 +112,8 @@ def variants(path: Path, spec: SweepSpec) -> Iterator[tuple[str, MethodOptions, 
     for index, entry in enumerate(spec.methods):
         where = f"{path}: methods[{index}]"
         preset = registry.get(entry.method).options.preset(entry.preset)
-        known = known_changes(preset)
-        for name in (*entry.options, *entry.grid):
-            if name not in known:
-                raise InputError(f"{where}: option {name[:60]!r} is unknown; {did_you_mean(name, known)}")
-            if name in entry.options and name in entry.grid:
-                raise InputError(f"{where}: {name} is both in the options and in the grid")
+        if twice := entry.options.keys() & entry.grid.keys():
+            raise InputError(f"{where}: {min(twice)} is both in the options and in the grid")
         for values in product(*entry.grid.values()):
             choices = dict(zip(entry.grid, values, strict=True))
             try:

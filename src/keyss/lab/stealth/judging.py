@@ -31,14 +31,8 @@ from keyss.lab.stealth.statistic import BitPatterns, Statistic
 
 # Detectors by kind: functions of a model and its bit patterns that give statistics by name.
 KINDS: dict[str, Callable[[Gaussians, BitPatterns], dict[str, Statistic]]] = {
-    "bits": bits,
-    "agreement": agreement,
-    "coincidences": coincidences,
-    "steps": steps,
-    "invariants": invariants,
-    "opacities": opacities,
-    "order": order,
-    "colours": colours,
+    each.__name__: each
+    for each in (bits, agreement, coincidences, steps, invariants, opacities, order, colours)
 }
 _AGREEMENT = 0.03  # relative error assumed for a statistic without a known error
 _MANY = 1e7  # degrees of freedom: normal
