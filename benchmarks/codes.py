@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import statistics
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -30,14 +29,12 @@ from keyss.files import write_bytes
 from keyss.files.formats.common import in_morton_order
 from keyss.files.models import read_model, write_model
 from keyss.files.scenes import load_scene
-from keyss.fitting import psnr
+from keyss.fitting import mean_psnr
 from keyss.methods import encode_to_size, most_visible, prune_to_size
 from keyss.methods.records import whole
-from keyss.rendering import render
 from keyss.rendering.orbit import psnr_between, scene_of_model
 
 import numpy as np
-import torch
 
 START, END = "<!-- measured by benchmarks/codes.py -->", "<!-- end of what was measured -->"
 HEAD = (
@@ -57,14 +54,9 @@ def scene_for(folder: Path, model: Gaussians, width: int) -> Scene:
     )
 
 
-@torch.no_grad()
 def against_photos(model: Gaussians, scene: Scene) -> float:
     """Mean PSNR in dB over the test views."""
-    found = []
-    for view in scene.test:
-        image = (render(model, view.camera, scene.background).clamp(0, 1) * 255).round() / 255
-        found.append(float(psnr(image, view.image.float() / 255)))
-    return statistics.mean(found)
+    return mean_psnr(model, scene.test, scene.background)
 
 
 def rows(cover: tuple[str, Gaussians], secret: tuple[str, Gaussians], data: Path, width: int) -> list[str]:

@@ -24,7 +24,7 @@ from typing import Any
 
 import keyss  # noqa: F401  before torch, see `ruff.toml`
 from keyss import FitConfig, Gaussians, read_model
-from keyss.core import Camera, Scene, View
+from keyss.core import SH_C0, Camera, Scene, View
 from keyss.files import load_scene
 from keyss.fitting import PlainRun, mean_psnr, own_randomness
 from keyss.fitting.plain import without_faint
@@ -35,7 +35,6 @@ import torch
 
 THREEDGS: dict[str, Any] = {"boost": 1.0, "grow_start": 1 / 6, "grow_every": 100}
 VIEWS = 60
-SH_C0 = 0.28209479177387814
 
 
 def main() -> None:
@@ -147,7 +146,7 @@ def crop(scene: Scene) -> Scene:
     return on_views(scene, half)
 
 
-def keep_photos(scene: Scene, count: int = 20) -> Scene:
+def keep_photos(scene: Scene, count: int) -> Scene:
     return replace(scene, train=scene.train[:: max(1, len(scene.train) // count)][:count])
 
 
@@ -170,7 +169,7 @@ VARIANTS: dict[str, Callable[[Scene], Scene]] = {
     "cropped": crop,
     "1,000 times larger": lambda scene: scale(scene, 1000.0),
     "20 times smaller": lambda scene: scale(scene, 0.05),
-    "20 photos": keep_photos,
+    "20 photos": lambda scene: keep_photos(scene, 20),
     "one photo of noise": with_noise,
     "300 points": lambda scene: with_points(scene, 300),
     "no points": lambda scene: with_points(scene, 0),

@@ -6,7 +6,7 @@ many areas under curves is compared with those after exchanging labels within pa
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 from keyss.core.arrays import Doubles, Integers
@@ -57,15 +57,15 @@ def single_detectors(examples: Examples, count: int) -> tuple[list[Detection], f
 
     The sign and the normal range come from the other scenes.
     """
-    held_out = _HeldOut.of(examples)
-    scores = held_out.scores(examples.hidden)
+    scores_for = _held_out(examples)
+    scores = scores_for(examples.hidden)
     found = areas(scores, examples.hidden, examples.scene)
     random = np.random.default_rng(0)
     largest = []
     for _ in range(_EXCHANGES):
         flip = random.integers(0, 2, examples.model.max() + 1)[examples.model]
         exchanged = examples.hidden ^ flip
-        largest.append(areas(held_out.scores(exchanged), exchanged, examples.scene).max())
+        largest.append(areas(scores_for(exchanged), exchanged, examples.scene).max())
     worst = np.argsort(-found)[:count]
     named = _detections([examples.names[index] for index in worst], scores[:, worst], examples)
     return named, float(np.quantile(largest, 0.95))
@@ -83,8 +83,8 @@ def learned_detectors(examples: Examples) -> list[Detection]:
         for scene in np.unique(examples.scene):
             held = examples.scene == scene
             others = examples.values[~held]
-            usual = np.nanmedian(np.where(np.isnan(others).all(axis=0), 0.0, others), axis=0)
-            train, test = (np.where(np.isnan(part), usual, part) for part in (others, examples.values[held]))
+            parts = others, examples.values[held]
+            train, test = (np.where(np.isnan(part), _usual(others), part) for part in parts)
             if name == "logistic":
                 # Ranks, because some statistics have tails of many standard deviations.
                 spread = QuantileTransformer(n_quantiles=min(len(train), 200), output_distribution="normal")
@@ -157,33 +157,28 @@ def _ranks(values: Doubles) -> Doubles:
     return ranks
 
 
-@dataclass(frozen=True)
-class _HeldOut:
-    """Each scene's statistics, normalised by the other scenes."""
+def _held_out(examples: Examples) -> Callable[[Integers], Doubles]:
+    """A function from labels [E] to scores [E, S], with the sign and the median of the other scenes."""
+    centred, folds = np.empty_like(examples.values), []
+    for scene in np.unique(examples.scene):
+        held = examples.scene == scene
+        usual = _usual(examples.values[~held])
+        centred[held] = np.nan_to_num(examples.values[held] - usual)
+        folds.append((held, _ranks(np.nan_to_num(examples.values[~held] - usual))))
 
-    centred: Doubles  # [E, S] values minus the median of the other scenes
-    # For each scene: its examples, the others, and ranks of the others.
-    folds: tuple[tuple[Integers, Integers, Doubles], ...]
-
-    @staticmethod
-    def of(examples: Examples) -> _HeldOut:
-        centred, folds = np.empty_like(examples.values), []
-        for scene in np.unique(examples.scene):
-            held = examples.scene == scene
-            others = examples.values[~held]
-            usual = np.nanmedian(np.where(np.isnan(others).all(axis=0), 0.0, others), axis=0)
-            centred[held] = np.nan_to_num(examples.values[held] - usual)
-            ranks = _ranks(np.nan_to_num(others - usual))
-            folds.append((np.flatnonzero(held), np.flatnonzero(~held), ranks))
-        return _HeldOut(centred, tuple(folds))
-
-    def scores(self, hidden: Integers) -> Doubles:
-        """[E, S] scores with the sign of hidden content in the other scenes."""
-        signed = np.empty_like(self.centred)
-        for held, others, ranks in self.folds:
-            labels = hidden[others]
-            signed[held] = self.centred[held] * np.where(_lean(ranks, labels) >= 0, 1, -1)
+    def scores(hidden: Integers) -> Doubles:
+        signed = np.empty_like(centred)
+        for held, ranks in folds:
+            signed[held] = centred[held] * np.where(_lean(ranks, hidden[~held]) >= 0, 1, -1)
         return signed
+
+    return scores
+
+
+def _usual(values: Doubles) -> Doubles:
+    """[S] medians of statistics [E, S], 0 for those that no file has."""
+    medians: Doubles = np.nanmedian(np.where(np.isnan(values).all(axis=0), 0.0, values), axis=0)
+    return medians
 
 
 def _lean(ranks: Doubles, hidden: Integers) -> Doubles:

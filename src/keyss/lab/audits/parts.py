@@ -41,7 +41,7 @@ from keyss.runs.files import CONTROLS
 from keyss.runs.folder import RunFolder
 from keyss.runs.open_run import HidingRun
 
-PICTURED_VIEWS = 3
+PICTURED_VIEWS, TIMED_VIEWS = 3, 4
 
 Progress = Callable[[int, int], None]  # called with the number of finished items and the total
 Pictures = dict[str, Tensor]  # [H, W, 3] uint8 by file name
@@ -315,15 +315,12 @@ def robustness(subject: Subject, seed: int, progress: Progress) -> tuple[tuple[C
 
 
 @torch.no_grad()
-def measure_render_time(
-    model: Gaussians, plain: Gaussians, scene: Scene, *, views: int = 4, rounds: int = 15
-) -> RenderTime:
+def measure_render_time(model: Gaussians, plain: Gaussians, scene: Scene, *, rounds: int = 15) -> RenderTime:
     """The render time of `model`, beside `plain`, from a scene's test cameras.
 
-    Each round renders at most `views` views with both models, in alternating order; the first round is a
-    warm-up.
+    Each round renders at most four views with both, in alternating order; the first round is a warm-up.
     """
-    cameras = [view.camera for view in subsample_views(scene.test, views)]
+    cameras = [view.camera for view in subsample_views(scene.test, TIMED_VIEWS)]
     background = scene.background.to(model.device)
     times = np.zeros((rounds + 1, len(cameras), 2))
     for number in range(rounds + 1):
