@@ -14,11 +14,11 @@ import torch
 import keyss
 from keyss import Secret
 from keyss.core import InputError, Interrupted, OutputError, UsageError, WrongKeyError
-from keyss.lab import RenderTime
+from keyss.lab import RenderTime, measure_render_time
 from keyss.lab.audits import Audit, audit, read_audit
 from lab.audits.audited import KEYS
 from test_api import ANY, write_nerfstudio
-from tiny_scenes import tiny_scene
+from tiny_scenes import random_gaussians, tiny_scene
 
 KEY = "open sesame 4711"
 
@@ -125,3 +125,12 @@ def test_whole_audit(run_folder: Path) -> None:
     assert all((run_folder / "private" / "audit" / "pictures" / name).is_file() for name in pictures)
     saved = b"".join(path.read_bytes() for path in (run_folder / "private").rglob("*.json"))
     assert not any(key.encode() in saved for key in KEYS)
+
+
+def test_ratio_of_equal_and_of_smaller_models() -> None:
+    scene, model = tiny_scene(0, views=8), random_gaussians(4000)
+    same = measure_render_time(model, model, scene, rounds=4)
+    more = measure_render_time(model, model[:10], scene, rounds=4)
+    assert 0 < same.seconds < 10
+    assert 0.1 < same.ratio < 10
+    assert more.ratio > same.ratio / 10

@@ -1,12 +1,16 @@
-"""Consistency of the paper's figures and claims."""
+"""Consistency of the paper's figures and claims, and pairs of scenes."""
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
-from keyss.lab.many import reproduction as paper
+from keyss import reproduce
+from keyss.core import UsageError
+from keyss.lab.many import reproduction
 
-TABLES = paper.PAPER.tables
+TABLES = reproduction.PAPER.tables
 
 # The last column of Table 1.
 AVERAGES = {
@@ -28,7 +32,7 @@ def published(name: str) -> dict[str, dict[str, float | None]]:
     """The paper's figures of a table, in the form of measured ones."""
     table = TABLES[name]
     return {
-        label: {measure: paper.mean_figure(table, figure) for measure, figure in run.figures.items()}
+        label: {measure: reproduction.mean_figure(table, figure) for measure, figure in run.figures.items()}
         for label, run in table.runs.items()
         if run.figures
     }
@@ -59,7 +63,7 @@ def test_sums_and_scores_are_consistent() -> None:
 @pytest.mark.parametrize("name", TABLES)
 def test_claims_hold_for_published_figures(name: str) -> None:
     """Except one: with two secrets, a wrong key shows 16.5 dB of the bicycle instead of 22.5."""
-    found = {claim.text: paper.judge_claim(claim, published(name)) for claim in TABLES[name].claims}
+    found = {claim.text: reproduction.judge_claim(claim, published(name)) for claim in TABLES[name].claims}
     assert all(each.parts for each in found.values())
     exceptions = {text: each for text, each in found.items() if each.verdict != "holds"}
     if name == "multi":
@@ -68,3 +72,32 @@ def test_claims_hold_for_published_figures(name: str) -> None:
         assert "wrong key" in each.text
     else:
         assert exceptions == {}
+
+
+def test_groups_are_cyclic_by_default() -> None:
+    groups_of = reproduction.groups_of
+    assert groups_of(["a", "b"], 1, (), ()) == [("a", "b"), ("b", "a")]
+    assert groups_of(["a", "b", "c"], 2, (), ()) == [("a", "b", "c"), ("b", "c", "a"), ("c", "a", "b")]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"table": "singel", "scenes": ["a", "b"]}, "did you mean single"),
+        ({"table": "single"}, "at least 2 scenes"),
+        ({"table": "single", "scenes": ["a"]}, "at least 2 scenes"),
+        ({"table": "multi", "scenes": ["a", "b"]}, "at least 3 scenes"),
+        ({"table": "single", "scenes": ["a", "x/a"]}, "different names"),
+        ({"table": "single", "scenes": ["a", "b"], "full": True}, "a scene called 'bicycle', got a, b"),
+        ({"table": "single", "scenes": ["a", "b"], "pairs": ["a,c"]}, "a scene called 'c', got a, b"),
+        ({"table": "single", "scenes": ["a", "b"], "pairs": ["a"]}, "a cover and 1 secret"),
+        ({"table": "multi", "scenes": ["a", "b", "c"], "pairs": ["a,b,b"]}, "different names"),
+        ({"table": "single", "scenes": ["a", "b"], "iterations": 0}, "`iterations`"),
+        ({"table": "single", "scenes": ["a.ply", "b"]}, "models have none"),
+    ],
+)
+def test_invalid_arguments_write_nothing(tmp_path: Path, arguments: dict[str, object], words: str) -> None:
+    for dry_run in (True, False):
+        with pytest.raises(UsageError, match=words):
+            reproduce(**arguments, dry_run=dry_run, out=tmp_path / "out")  # type: ignore[arg-type]
+    assert not (tmp_path / "out").exists()

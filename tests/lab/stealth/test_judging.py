@@ -1,12 +1,16 @@
-"""A file against control models: weak ones are unusual, plain ones are not."""
+"""A file against control models: weak ones are unusual, plain ones are not; candidate scores."""
 
 from __future__ import annotations
 
+import os
+
 import pytest
 
+from channels.quiet.trained_like import keys
 from keyss.core import UsageError
-from keyss.lab import judge
+from keyss.lab import candidate_scores, changed_low_bits, judge
 from lab.stealth.careless import banded, normalised, overwritten, plain, plain_rounded
+from methods.carry.carried import embed_derived
 
 LIMIT = 0.01
 
@@ -45,3 +49,31 @@ def test_secret_in_a_band() -> None:
 def test_fewer_than_two_controls() -> None:
     with pytest.raises(UsageError, match="at least two"):
         judge(plain(1), [plain(2)])
+
+
+SECRETS = 2
+
+
+def test_identical_high_bits() -> None:
+    file = overwritten(plain(1))
+    assert candidate_scores(file, plain(1))["identical high bits"] == 1
+    assert candidate_scores(file, plain(2))["identical high bits"] == 0
+    assert changed_low_bits(file, plain(1)) == 1
+    assert changed_low_bits(file, plain(2)) == changed_low_bits(file, file) == 0
+
+
+def test_carried_secrets_are_not_confirmed() -> None:
+    """Embedding does not change the scores of candidates."""
+    candidates = [plain(10 + index, 700) for index in range(SECRETS)]
+    covers = [plain(index) for index in range(SECRETS)]
+    before = [
+        candidate_scores(cover, each)["nearness of rows, median"] for cover in covers for each in candidates
+    ]
+    files = [
+        embed_derived(cover, [(keys(index), secret)], os.urandom(32))
+        for index, (cover, secret) in enumerate(zip(covers, candidates, strict=True))
+    ]
+    after = [
+        candidate_scores(file, each)["nearness of rows, median"] for file in files for each in candidates
+    ]
+    assert after == pytest.approx(before, abs=1e-2)

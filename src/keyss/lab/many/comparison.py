@@ -9,7 +9,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from statistics import fmean
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from PIL import Image
@@ -22,7 +22,7 @@ from keyss.fitting import PRESETS, FitConfig
 from keyss.fitting.image_metrics import HOW_TO_GET
 from keyss.lab.audits.trial_measures import CONVERSIONS
 from keyss.lab.many.result_tables import TrialNumbers, write_scene_tables
-from keyss.lab.many.trial import RUN, keys_of
+from keyss.lab.many.trial import opened_run
 from keyss.lab.many.trial_folder import Forecast, Outcome, TrialFolder
 from keyss.measure.contact_sheet import contact_sheet
 from keyss.measure.renders import renders_of
@@ -32,7 +32,7 @@ from keyss.rendering import Backend, resolve_device
 from keyss.rendering.orbit import is_model
 from keyss.runs import write_record
 from keyss.runs.files import PathLike
-from keyss.runs.open_run import HidingRun, open_run
+from keyss.runs.open_run import HidingRun
 
 STEM = "comparison"  # file names without their suffix
 MEASURES = ("files", "pictures", "secrecy", "survival")
@@ -88,7 +88,6 @@ _LEGEND = (
     "Pruned (a random quarter), converted and back, purified (GSPure): change of cover and secret in dB. "
     "Lost: the secret no longer opens.",
 )
-OptionsT = TypeVar("OptionsT", bound=MethodOptions)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -170,7 +169,11 @@ def compare(
     done = {each: outcomes[place] for each, place in places.items() if outcomes[place].result}
     numbers = [TrialNumbers.of(each, {"method": name}, names, seed) for (name, seed), each in done.items()]
     write_scene_tables(folder.out, STEM, numbers)
-    runs = {name: _open_run(folder, each.folder) for (name, seed), each in done.items() if seed == seeds[0]}
+    runs = {
+        name: opened_run(folder.trials[each.folder], each.folder)
+        for (name, seed), each in done.items()
+        if seed == seeds[0]
+    }
     if runs:
         picture = io.BytesIO()
         comparison_sheet(runs, device).save(picture, "PNG", optimize=True)
@@ -178,26 +181,23 @@ def compare(
     return found
 
 
-def split_budget(iterations: int, options: OptionsT) -> tuple[OptionsT, list[int]]:
-    """Split total steps per scene: options, and steps of the plain models of cover and secret."""
-    continues = [each.continues and each.steps > 0 for each in options.training(2)]
-    plain = iterations - iterations // 2
-    own = max(1, iterations // 2) if any(continues) else iterations
-    options = options.with_fit(iterations=own)
-    return options, [plain if each else iterations for each in continues]
-
-
 def _add(
     folder: TrialFolder,
     name: str,
     scenes: Sequence[str],
     preset: MethodOptions,
-    fit: FitConfig,
+    fit: FitConfig,  # with the total steps per scene
     controls: list[str],
 ) -> Path:
     """Add a hiding and its plain fits; returns the folder of the hiding."""
-    options, steps = split_budget(fit.iterations, preset)
-    options = options.with_fit(max_gaussians=fit.max_gaussians, seed=fit.seed)
+    own = fit.iterations // 2
+    continues = [each.continues and each.steps > 0 for each in preset.training(2)]
+    options = preset.with_fit(
+        iterations=max(1, own) if any(continues) else fit.iterations,
+        max_gaussians=fit.max_gaussians,
+        seed=fit.seed,
+    )
+    steps = [fit.iterations - own if each else fit.iterations for each in continues]
     models = [
         folder.plain(scene, replace(fit, iterations=count, sh_degree=each.sh_degree))
         for scene, count, each in zip(scenes, steps, options.fits(2), strict=True)
@@ -227,10 +227,6 @@ def _row(name: str, outcomes: Sequence[Outcome], folder: TrialFolder) -> Compare
         each: fmean(one.numbers[each] for one in results) for each in results[0].numbers if each in shared
     }
     return replace(row, numbers=numbers, notes=results[0].notes)
-
-
-def _open_run(folder: TrialFolder, place: Path) -> HidingRun:
-    return open_run(place / RUN, [key for key in keys_of(folder.trials[place], place) if key])
 
 
 def comparison_sheet(runs: Mapping[str, HidingRun], device: Backend) -> Image.Image:

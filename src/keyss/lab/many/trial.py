@@ -35,7 +35,7 @@ from keyss.rendering import Backend, resolve_device
 from keyss.runs import FitMetrics, HideMetrics, Manifest, read_manifest, read_record, record_bytes
 from keyss.runs.files import METRICS, as_scene
 from keyss.runs.folder import PRIVATE, make_private
-from keyss.runs.open_run import open_run
+from keyss.runs.open_run import HidingRun, open_run
 from keyss.runs.planning import plan_fit
 
 TRIAL, RESULT, RUN = "trial.json", "result.json", "run"
@@ -142,6 +142,11 @@ def keys_of(trial: Trial, folder: Path) -> list[str]:
     return [master.key_of(f"trial/{folder.name}/{index}") for index, _ in enumerate(trial.secrets, start=1)]
 
 
+def opened_run(trial: Trial, folder: Path) -> HidingRun:
+    """The run of a finished hiding."""
+    return open_run(folder / RUN, [key for key in keys_of(trial, folder) if key])
+
+
 def _fit_or_hide(trial: Trial, folder: Path, reporter: Reporter) -> dict[str, float]:
     run = folder / RUN
     manifest = read_manifest(run)
@@ -160,13 +165,10 @@ def flat(record: Any, prefix: str = "") -> dict[str, float]:
     """All finite numbers of a nested record, by dotted names."""
     if isinstance(record, int | float) and not isinstance(record, bool) and isfinite(record):
         return {prefix: float(record)}
-    pairs: list[tuple[Any, Any]] = []
-    if isinstance(record, dict):
-        pairs = list(record.items())
-    elif isinstance(record, list | tuple):
-        pairs = list(enumerate(record, start=1))
+    if isinstance(record, list | tuple):
+        record = dict(enumerate(record, start=1))
     found: dict[str, float] = {}
-    for name, each in pairs:
+    for name, each in record.items() if isinstance(record, dict) else ():
         found |= flat(each, f"{prefix}.{name}" if prefix else str(name))
     return found
 
@@ -193,9 +195,9 @@ def _place(folder: Path, path: str) -> Path:
 
 def _measure(trial: Trial, names: list[str], folder: Path, reporter: Reporter) -> dict[str, float | str]:
     """Numbers of measures, or notes on them."""
-    keys, run = [key for key in keys_of(trial, folder) if key], folder / RUN
     found: dict[str, float | str] = {}
     if parts := [name for name in names if name in PARTS]:
+        run, keys = folder / RUN, [key for key in keys_of(trial, folder) if key]
         manifest = read_manifest(run)
         done = "audit" in manifest.files
         resume = not done and manifest.running is not None
@@ -206,7 +208,7 @@ def _measure(trial: Trial, names: list[str], folder: Path, reporter: Reporter) -
     if others := [name for name in names if name not in PARTS]:
         device = resolve_device(trial.device)
         controls = [read_model(_place(folder, each)).to(device) for each in trial.controls]
-        subject = Subject(open_run(run, keys), device, controls)
+        subject = Subject(opened_run(trial, folder), device, controls)
         for name in others:
             found |= {f"{name}.{each}": value for each, value in MEASURES[name](subject).items()}
     return found
