@@ -10,9 +10,9 @@
   Embedding makes their other bits random, unless neither Gaussian is a carrier. The null for pairs with a
   usable Gaussian is exact: independent low bits.
 - `steps`: siblings that moved apart by equal steps of Adam, so that constant colours predict low bits of
-  harmonics (`keyss.channels.quiet.predictability`). Pairs are found by high bits and constant colours. A hit is a
-  difference of harmonics within 1/16 of a cell (the range of low bits) of a twentieth of that of the constant
-  colours. The null distribution comes from the same file with other low bits.
+  harmonics (`keyss.channels.quiet.predictability`). Pairs are found by high bits and constant colours. A hit
+  is a difference of harmonics within 1/16 of a cell (the range of low bits) of a twentieth of that of the
+  constant colours. The null distribution comes from the same file with other low bits.
 """
 
 from __future__ import annotations
