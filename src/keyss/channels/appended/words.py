@@ -45,7 +45,7 @@ _SMALL = -9.0  # smallest log scale, relative to the cube's
 _ROTATION_REACH = 256 / 511 * 0.5**0.5
 _FARTHEST, _MAX_SHIFTS = 1 << 12, 500  # range of log scales, in steps; maximum number of offsets to try
 HEADERS = 40  # copies of a header
-HEADER_BITS = 20
+_HEADER_BITS = 20
 _MIN_VOTES = 12  # headers; fewer can agree by chance among a million words
 
 
@@ -196,7 +196,7 @@ def read_packets(key: bytes, words: Bits, width: int) -> tuple[Words, Bytes]:
 
 
 def write_header(key: bytes, value: int, width: int, random: np.random.Generator) -> Bits:
-    """Words [HEADERS, WORD_BITS] that all hold `value`, a number of HEADER_BITS."""
+    """Words [HEADERS, WORD_BITS] that all hold `value`, a number of _HEADER_BITS."""
     data = random.integers(0, 256, (HEADERS, width), np.uint8)
     return write_packets(key, np.full(HEADERS, value, np.uint64), data)
 
@@ -204,7 +204,7 @@ def write_header(key: bytes, value: int, width: int, random: np.random.Generator
 def read_header(key: bytes, words: Bits, width: int) -> int | None:
     """The value of the headers by majority; None if too few agree."""
     numbers, _ = read_packets(key, words, width)
-    votes = np.bincount(numbers[numbers < 1 << HEADER_BITS].astype(np.int64), minlength=1)
+    votes = np.bincount(numbers[numbers < 1 << _HEADER_BITS].astype(np.int64), minlength=1)
     return int(votes.argmax()) if votes.max() >= _MIN_VOTES else None
 
 

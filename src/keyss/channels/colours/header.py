@@ -25,7 +25,7 @@ from keyss.core.arrays import Doubles, Flags, Integers
 from keyss.keys.derivation import SALT_BYTES, DerivedKey, expand
 
 PLACES = 80  # Gaussians of a header under each salt
-DEPTHS = (1, 2)  # bits per value of a header, for payloads at level ONE and at other levels
+_DEPTHS = (1, 2)  # bits per value of a header, for payloads at level ONE and at other levels
 SHARES = 256  # parts of the carriers, divided among payloads
 IDLE = 1 / 255  # unit of the share of unchanged carriers
 FILE_KEY_BYTES = 5
@@ -91,7 +91,7 @@ class Header:
 
     def write(self, secrets: Secrets, salt: int, carriers: Carriers) -> tuple[Integers, Doubles]:
         """The carriers [P] of the header under one salt, and their new values [P, 2]."""
-        secret, depth = secrets.salted[salt], DEPTHS[self.level != ONE]
+        secret, depth = secrets.salted[salt], _DEPTHS[self.level != ONE]
         rows, pilots = places(secret, carriers)
         ids, counts = carriers.ids[rows], np.full(len(rows), depth)
         plain = struct.pack(_FORMAT, *astuple(self))
@@ -104,7 +104,7 @@ class Header:
     def read(secrets: Secrets, carriers: Carriers) -> Header | None:
         """None if there is none. One attempt in 2^16 finds a false header, which opens nothing."""
         found = [places(secret, carriers) for secret in secrets.salted]
-        headers = [_read(secrets, carriers, found, depth) for depth in DEPTHS]
+        headers = [_read(secrets, carriers, found, depth) for depth in _DEPTHS]
         return headers[0] or headers[1]
 
 

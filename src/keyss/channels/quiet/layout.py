@@ -12,8 +12,8 @@ each; then a quarter, a half and all of the cells that divide carriers into halv
 - A *payload* is cut into numbered chunks and fills its class with Reed-Solomon redundancy: any quarter of all
   Gaussians may be lost. The number of cells does not reveal its size.
 
-Carriers for the headers of MAX_INDEPENDENT secrets are always reserved. Secrets that do not fit independently
-share all cells in a joint plan, with fewer copies or smaller cells: the holder of one key can notice others.
+Carriers for the headers of four secrets are always reserved. Secrets that do not fit independently share all
+cells in a joint plan, with fewer copies or smaller cells: the holder of one key can notice others.
 
 Parameters are cut into numbered parts, one in each cell. Numbers are little-endian:
 
@@ -51,22 +51,22 @@ PARAMETER_COPIES = 24  # copies of each part; pruning a quarter removes all of t
 LEAST_BYTES = 48  # minimum bytes of a block of codes: a key cell, or the parameters
 BLOCK_HEADER = 2  # blocks of a secret's header
 MIN_BLOCKS = 4  # a salt, a header, and data
-MAX_CELLS = 4  # cells per carrier
-MAX_COPIES = 0.25  # share of a secret's records
-MAX_INDEPENDENT = 4  # maximum number of secrets with independent plans
+_MAX_CELLS = 4  # cells per carrier
+_MAX_COPIES = 0.25  # share of a secret's records
+_MAX_INDEPENDENT = 4  # maximum number of secrets with independent plans
 TYPICAL_SHARE = 0.75  # usable Gaussians of a trained model; 0.58 to 0.94 were measured
 
 _TYPICAL_HEADER = 168  # maximum bytes of a method's header in an independent plan
 _MAX_RESERVED = 1 / 3  # maximum share of the carriers reserved for headers
 _DEVIATIONS = 6  # margin of the number of untouched carriers, in standard deviations
-REMOVAL = 0.25  # share of the Gaussians that may be removed at random
-FAILURE = 1e-7  # probability of losing a payload to such removal
-NUMBER_BYTES = 3  # size of a chunk's number
+_REMOVAL = 0.25  # share of the Gaussians that may be removed at random
+_FAILURE = 1e-7  # probability of losing a payload to such removal
+_NUMBER_BYTES = 3  # size of a chunk's number
 MAX_CHUNKS = 1024  # chunks per codeword; longer codewords hold little more and are slower
-MAX_CODEWORDS = (1 << 8 * NUMBER_BYTES) // MAX_CHUNKS
+MAX_CODEWORDS = (1 << 8 * _NUMBER_BYTES) // MAX_CHUNKS
 
-VERSION = 5
-MAX_HEADER_BYTES = 4096
+_VERSION = 5
+_MAX_HEADER_BYTES = 4096
 PAYLOAD, RECORDS = 1, 2  # services
 _CODEWORDS = struct.Struct("<IIHH")  # bytes of the encrypted payload, codewords, chunks of one, data chunks
 _PREFIX = struct.Struct(f"<BB{METHOD_BYTES}sBHHII")  # parameters before the sketch and the method's header
@@ -103,7 +103,7 @@ class LowBitsCapacity:
     def reserved(self, header_bytes: Sequence[int], independent: bool) -> int:
         """Carriers reserved for the headers of all secrets."""
         if independent:
-            return MAX_INDEPENDENT * self.header_carriers(_TYPICAL_HEADER)
+            return _MAX_INDEPENDENT * self.header_carriers(_TYPICAL_HEADER)
         return sum(self.header_carriers(each) for each in header_bytes)
 
     def plan_records(self, requests: Sequence[RecordRequest]) -> list[RecordPlan]:
@@ -131,7 +131,7 @@ class LowBitsCapacity:
 
     def max_independent_records(self, least_bytes: int, secrets: int) -> int:
         """The maximum number of records of `least_bytes` for each secret in independent plans."""
-        if secrets > MAX_INDEPENDENT or not self._classes():
+        if secrets > _MAX_INDEPENDENT or not self._classes():
             return 0
         cells = self._most_cells(least_bytes)
         return cells * self._independent_carriers // (1 << (secrets - 1).bit_length())
@@ -182,9 +182,9 @@ class LowBitsCapacity:
     def _codewords(self, cells: int, count: int, size: int | None = None) -> Codewords | None:
         """The most redundant code of `size` bytes (None: the maximum) in `count` cells.
 
-        None if the probability of loss exceeds FAILURE.
+        None if the probability of loss exceeds _FAILURE.
         """
-        chunk = (self.record_bytes(cells) - NUMBER_BYTES) // SYMBOL_BYTES * SYMBOL_BYTES
+        chunk = (self.record_bytes(cells) - _NUMBER_BYTES) // SYMBOL_BYTES * SYMBOL_BYTES
         if count < 1 or chunk < 1:
             return None
         number = min(-(-count // MAX_CHUNKS), MAX_CODEWORDS)
@@ -203,19 +203,21 @@ class LowBitsCapacity:
         shared = self._independent_carriers
         if self.carriers - shared > _MAX_RESERVED * self.carriers:
             return []
-        divided = [(cells, cells * shared // part) for cells in range(2, MAX_CELLS + 1) for part in (4, 2, 1)]
+        divided = [
+            (cells, cells * shared // part) for cells in range(2, _MAX_CELLS + 1) for part in (4, 2, 1)
+        ]
         return [(1, shared // 5), *divided]
 
     def _most_cells(self, least_bytes: int) -> int:
         """The maximum number of cells per carrier for records of `least_bytes`; 0 if none fits."""
-        return min(MAX_CELLS, self.width // (TAG_BYTES + least_bytes)) if self.part_bytes else 0
+        return min(_MAX_CELLS, self.width // (TAG_BYTES + least_bytes)) if self.part_bytes else 0
 
     def _independent_plan(self, request: RecordRequest) -> RecordPlan | None:
         """The plan that depends on this secret only; None if it does not fit."""
         for cells, count in self._classes() if request.header_bytes <= _TYPICAL_HEADER else ():
             size = self.record_bytes(cells)
             if count >= request.count and size >= request.least_bytes:
-                copies = min(int(MAX_COPIES * request.count), count - request.count)
+                copies = min(int(_MAX_COPIES * request.count), count - request.count)
                 return RecordPlan(size, copies, cells, independent=True)
         return None
 
@@ -232,7 +234,7 @@ class LowBitsCapacity:
             sum(count for each, count in cells if (each > 1) == divides) for divides in (True, False)
         )
         carriers, parts = self._independent_carriers, max(each for each, _ in cells)
-        if len(cells) > MAX_INDEPENDENT or len({each for each, _ in cells if each > 1}) > 1:
+        if len(cells) > _MAX_INDEPENDENT or len({each for each, _ in cells if each > 1}) > 1:
             return False
         untouched = max(0.0, 1 - shared / (parts * carriers)) ** parts if shared else 1.0
         spare = _DEVIATIONS * (carriers * untouched * (1 - untouched)) ** 0.5
@@ -249,7 +251,7 @@ class LowBitsCapacity:
         carriers, most = self._joint(requests)
         for cells in range(1, most + 1):
             if count <= cells * carriers:
-                copies = min(MAX_COPIES, (cells * carriers - count) / max(1, count))
+                copies = min(_MAX_COPIES, (cells * carriers - count) / max(1, count))
                 size = self.record_bytes(cells)
                 return [RecordPlan(size, int(copies * request.count), cells) for request in requests]
         raise UsageError(
@@ -293,7 +295,7 @@ class Parameters:
         """[P, width - TAG_BYTES] numbered parts."""
         numbers = self.cells, self.record_bytes, len(self.header), self.gaussians, self.count
         packed = (
-            _PREFIX.pack(VERSION, self.service, pack_method(self.method), *numbers)
+            _PREFIX.pack(_VERSION, self.service, pack_method(self.method), *numbers)
             + self.sketch
             + self.header
         )
@@ -313,9 +315,9 @@ def unpack(parts: Bytes, sketch_bytes: int = SKETCH_BYTES) -> Parameters:
     if len(packed) < _PREFIX.size:
         raise InputError(LOST)
     version, service, name, cells, size, length, gaussians, count = _PREFIX.unpack_from(packed)
-    if version != VERSION:
-        raise InputError(f"hidden secret of version {version}; this program reads version {VERSION}")
-    if service not in (PAYLOAD, RECORDS) or not 1 <= cells <= MAX_CELLS or length > MAX_HEADER_BYTES:
+    if version != _VERSION:
+        raise InputError(f"hidden secret of version {version}; this program reads version {_VERSION}")
+    if service not in (PAYLOAD, RECORDS) or not 1 <= cells <= _MAX_CELLS or length > _MAX_HEADER_BYTES:
         raise InputError(
             f"the hidden parameters are damaged: service {service}, {cells} cells of a carrier, {length} "
             "bytes of header"
@@ -340,7 +342,7 @@ def unpack_codewords(header: bytes, record_bytes: int) -> tuple[int, Codewords]:
     """Invert `pack_codewords`. Raises InputError for impossible numbers."""
     try:
         size, count, n, k = _CODEWORDS.unpack(header)
-        codewords = Codewords(count, n, k, record_bytes - NUMBER_BYTES)
+        codewords = Codewords(count, n, k, record_bytes - _NUMBER_BYTES)
         if codewords.chunks > MAX_CODEWORDS * MAX_CHUNKS or not 0 < size <= codewords.size:
             raise ValueError(f"{size} bytes in {codewords}")
     except (ValueError, struct.error) as error:
@@ -349,22 +351,22 @@ def unpack_codewords(header: bytes, record_bytes: int) -> tuple[int, Codewords]:
 
 
 def numbered_chunks(codewords: Codewords, data: bytes, cells: int) -> Bytes:
-    """[cells, NUMBER_BYTES + width] numbered chunks; spare cells repeat the first ones."""
+    """[cells, _NUMBER_BYTES + width] numbered chunks; spare cells repeat the first ones."""
     numbers = np.arange(cells, dtype="<u4") % codewords.chunks
     chunks = codewords.encode(data)[numbers]
-    return np.concatenate([numbers.view(np.uint8).reshape(-1, 4)[:, :NUMBER_BYTES], chunks], axis=1)
+    return np.concatenate([numbers.view(np.uint8).reshape(-1, 4)[:, :_NUMBER_BYTES], chunks], axis=1)
 
 
 def split_numbers(chunks: Bytes) -> tuple[Integers, Bytes]:
     """The numbers [C] and the data [C, width] of numbered chunks."""
-    numbers: Integers = chunks[:, :NUMBER_BYTES] @ np.array([1, 1 << 8, 1 << 16])
-    return numbers, chunks[:, NUMBER_BYTES:]
+    numbers: Integers = chunks[:, :_NUMBER_BYTES] @ np.array([1, 1 << 8, 1 << 16])
+    return numbers, chunks[:, _NUMBER_BYTES:]
 
 
 @lru_cache(maxsize=1024)
 def _most_data(n: int, count: int) -> int:
-    """The largest k with which all codewords survive removal with probability 1 - FAILURE; 0 if none."""
+    """The largest k with which all codewords survive removal with probability 1 - _FAILURE; 0 if none."""
     from scipy.special import bdtrc  # takes long to load
 
     data = np.arange(1, n + 1)
-    return int(data[bdtrc(n - data, n, REMOVAL) * count < FAILURE].max(initial=0))
+    return int(data[bdtrc(n - data, n, _REMOVAL) * count < _FAILURE].max(initial=0))

@@ -46,11 +46,11 @@ from keyss.files.formats.common import morton_order
 from keyss.kernels.jit import kernel
 from keyss.kernels.parallel import in_blocks
 
-MAX_ZEROS = 12  # counted at most; numbers with more are rare, or short
-EXPONENTS = 256
-_NUMBERS = np.arange(1 << MAX_ZEROS, dtype=np.uint32)[:, None] | np.uint32(1 << MAX_ZEROS)
+_MAX_ZEROS = 12  # counted at most; numbers with more are rare, or short
+_EXPONENTS = 256
+_NUMBERS = np.arange(1 << _MAX_ZEROS, dtype=np.uint32)[:, None] | np.uint32(1 << _MAX_ZEROS)
 _ZEROS = (
-    (_NUMBERS >> np.arange(MAX_ZEROS + 1, dtype=np.uint32) & 1).argmax(axis=1).astype(np.uint32)
+    (_NUMBERS >> np.arange(_MAX_ZEROS + 1, dtype=np.uint32) & 1).argmax(axis=1).astype(np.uint32)
 )  # [4096], trailing
 # Drop of the log-likelihood at the confidence limit: one-sided, one in 200.
 _DROP = 3.3
@@ -58,7 +58,7 @@ _MARGIN = 8  # octaves beyond the numbers' exponents in the search for s
 _STEP = 0.25  # octaves, resolution of the search
 _LARGEST = 4  # octaves of the scale below the median number: steps of a sixteenth would never converge
 _ROUNDED = np.concatenate([[0.0], 2.0 ** np.arange(-20, 20.5, 0.5)])  # t in units of the smallest exponent
-RATE_RATIO = 20  # learning rate of constant colours / harmonics
+_RATE_RATIO = 20  # learning rate of constant colours / harmonics
 _NEIGHBOURS = 12  # siblings were among the nearest 10 in models of 20,000 to 200,000 Gaussians
 _SHARE = 3  # a third of the harmonics of a colour agree, and at least three
 _ROWS = 1 << 12
@@ -70,13 +70,15 @@ _CELL_SHARE = np.float32(2.0 ** (SH_BITS + UNUSED_BITS - 23))  # cell width / nu
 
 
 def count_trailing_zeros(words: Words32, chosen: Flags) -> Integers:
-    """[EXPONENTS, MAX_ZEROS + 1] counts of numbers by exponent and trailing zeros.
+    """[_EXPONENTS, _MAX_ZEROS + 1] counts of numbers by exponent and trailing zeros.
 
     `words` [N, C]; `chosen` [N]: mask of the rows to count.
     """
     own = words[chosen].ravel()
-    kinds = (own >> np.uint32(23) & np.uint32(255)) * np.uint32(MAX_ZEROS + 1) + _ZEROS[own & np.uint32(4095)]
-    return np.bincount(kinds, minlength=EXPONENTS * (MAX_ZEROS + 1)).reshape(EXPONENTS, -1)
+    kinds = (own >> np.uint32(23) & np.uint32(255)) * np.uint32(_MAX_ZEROS + 1) + _ZEROS[
+        own & np.uint32(4095)
+    ]
+    return np.bincount(kinds, minlength=_EXPONENTS * (_MAX_ZEROS + 1)).reshape(_EXPONENTS, -1)
 
 
 def least_exponent(counts: Integers, share: float) -> int:
@@ -110,7 +112,7 @@ def find_siblings(gaussians: Gaussians, among: Flags) -> Flags:
     def gather(start: int, stop: int) -> None:
         sh = numbers[order[start:stop]].transpose(0, 2, 1)
         middles[start:stop] = _middles(sh)
-        middles[start:stop, :, 0] = sh[:, :, 0] / np.float32(RATE_RATIO)
+        middles[start:stop, :, 0] = sh[:, :, 0] / np.float32(_RATE_RATIO)
 
     in_blocks(gather, len(means), _ROWS)
     needed = 1 + max(_SHARE, -(-(middles.shape[2] - 1) // _SHARE))
@@ -153,7 +155,7 @@ def chance_of_equal_steps(gaussians: Gaussians, usable: Flags) -> float:
 
 
 def _confidence_limit(counts: Doubles, exponents: Integers) -> float:
-    """The upper confidence limit of s for counts [E, MAX_ZEROS + 1] by `exponents` [E].
+    """The upper confidence limit of s for counts [E, _MAX_ZEROS + 1] by `exponents` [E].
 
     If there are too few small numbers for an estimate, the largest plausible s.
     """
@@ -168,8 +170,8 @@ def _confidence_limit(counts: Doubles, exponents: Integers) -> float:
 
 
 def _zeros(exponents: Integers, scale: float) -> Doubles:
-    """[E, MAX_ZEROS + 1] probabilities of z trailing zeros; the last: MAX_ZEROS or more."""
-    steps = exponents[:, None] + np.arange(MAX_ZEROS + 1) - 1.0 - scale
+    """[E, _MAX_ZEROS + 1] probabilities of z trailing zeros; the last: _MAX_ZEROS or more."""
+    steps = exponents[:, None] + np.arange(_MAX_ZEROS + 1) - 1.0 - scale
     forced = np.exp(-(2.0 ** steps.clip(-60, 10)))  # F(z)
     forced[:, 0] = 1
     exactly = -np.diff(forced, append=0)
@@ -182,7 +184,7 @@ def _zeros(exponents: Integers, scale: float) -> Doubles:
 
 
 def _log_likelihood(counts: Doubles, exponents: Integers, scale: float) -> float:
-    """The log-likelihood of counts [E, MAX_ZEROS + 1], with the best probability of rounding to even."""
+    """The log-likelihood of counts [E, _MAX_ZEROS + 1], with the best probability of rounding to even."""
     chances = _zeros(exponents, scale).clip(1e-12)
     even = 1 - chances[:, 0]
     inside = float((counts[:, 1:] * np.log(chances[:, 1:] / even[:, None])).sum())
@@ -197,7 +199,7 @@ def _distance(exponents: Integers, scale: float) -> Doubles:
     """[E] chi-square distance from uniform of the bits above the last one, of even numbers."""
     chances = _zeros(exponents, scale)[:, 1:]
     given = chances / chances.sum(axis=1, keepdims=True)
-    uniform = 0.5 ** np.arange(1, MAX_ZEROS + 1)
+    uniform = 0.5 ** np.arange(1, _MAX_ZEROS + 1)
     uniform[-1] *= 2
     result: Doubles = ((given - uniform) ** 2 / uniform).sum(axis=1)
     return result
@@ -246,7 +248,7 @@ def _count_equal(rows: Any, near: Any, sh: Any, middles: Any, counts: Any) -> No
                     own, its = middles[rows[row], at, colour], middles[other, at, colour]
                     known[at] = abs(own - its)
                     cells[at] = max(abs(own), abs(its)) * _CELL_SHARE
-                steps[0], known[0], cells[0] = steps[0] / RATE_RATIO, steps[0] / RATE_RATIO, 0.0
+                steps[0], known[0], cells[0] = steps[0] / _RATE_RATIO, steps[0] / _RATE_RATIO, 0.0
                 for one in range(size):
                     for two in range(one + 1, size):
                         cell = max(cells[one], cells[two])

@@ -64,7 +64,7 @@ from keyss.keys.derivation import SALT_BYTES
 
 SALTS = 12  # random pruning of a quarter removes all their Gaussians with p = 6e-8
 _LABEL = b"keyss/v2/salt"
-MIN_USABLE = 0.5  # share of the Gaussians of a cover
+_MIN_USABLE = 0.5  # share of the Gaussians of a cover
 # Maximum squared separation (d') of a plain file and one with new bits by small numbers, for an attacker who
 # knows the trainer and the plain file's statistics. 0.03 is an AUC of 0.55.
 MAX_SEPARATION = 0.03
@@ -144,7 +144,7 @@ def check_usable(gaussians: Gaussians, usable: Flags, layout: Layout) -> None:
     Tested on at most 20,000 Gaussians: see `chance_of_bits` and `chance_of_equal_steps`.
     """
     share = float(usable.mean()) if len(usable) else 0.0
-    if share < MIN_USABLE:
+    if share < _MIN_USABLE:
         raise UsageError(
             f"only {share:.0%} of the cover's Gaussians have random low bits; the others hold short, "
             "repeated or predictable values: it was quantised or hardly trained, and new bits would be seen"
