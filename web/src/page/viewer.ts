@@ -14,7 +14,6 @@ const COARSE_COUNT = 15_000; // with at most this many Gaussians, the most visib
 const LARGE = 100_000; // Gaussians; larger models are coarse at first, as all of them take seconds
 const POLL = 4; // ms
 const AT_REST = 250; // ms without a change until the fine picture
-const ASLEEP = 500; // ms without a frame until the engine stops
 type Side = 'left' | 'right';
 
 interface Half {
@@ -34,7 +33,7 @@ export class Viewer {
   private drawing = false; // the engine's current frame draws
   private wanted = false; // another frame should follow
   private started = 0;
-  private asleep = false; // without a GPU, the engine's empty frames take a whole core
+  private asleep = false; // until there is something to draw: without a GPU, the engine's empty frames take a whole core
   private slowFrames = 0;
   private slow = false; // the last picture at rest was slow, so motion starts coarse
   private split = 1; // share of the width for the left model
@@ -46,15 +45,17 @@ export class Viewer {
     app.autoRender = false;
     const system = app.systems.gsplat as GSplatComponentSystem;
     system.on('frame:request', () => this.draw());
+    app.scene.on('gsplat:sorted', () => this.draw());
     system.on('frame:ready', (_camera: unknown, _layer: unknown, ready: boolean) => (this.ready = ready));
     app.on('framerender', () => {
       this.drawing = app.renderNextFrame; // other frames draw nothing
       if (this.drawing) this.resize();
     });
     app.on('frameend', () => {
-      if (this.drawing) this.afterFrame();
+      if (this.drawing) return this.afterFrame();
+      this.asleep = true;
+      AppBase.cancelTick(app);
     });
-    app.on('update', () => this.rest());
     app.graphicsDevice.on('devicerestored', () => this.restore());
     app.start();
     new ResizeObserver(() => this.draw()).observe(canvas);
@@ -191,13 +192,6 @@ export class Viewer {
     this.app.renderNextFrame = true;
     if (this.asleep) this.app.requestAnimationFrame();
     this.asleep = false;
-  }
-
-  /** Stops the engine until there is something to draw. */
-  private rest(): void {
-    if (this.inFlight || performance.now() - this.started < ASLEEP) return;
-    AppBase.cancelTick(this.app);
-    this.asleep = true;
   }
 
   /** Called right before a frame, since resizing clears the canvas. */
