@@ -62,7 +62,7 @@ def test_a_header_made_up_by_chance_hides_no_other(
 
 
 def test_what_does_not_fit_is_refused_with_what_would(prepared: ColoursCover, payload: bytes) -> None:
-    with pytest.raises(UsageError, match=f"{prepared.capacity.bytes:,} bytes in all"):
+    with pytest.raises(UsageError, match=f"{prepared.capacity.bytes:,} bytes of one secret"):
         embed(prepared, [("a", payload + b"x")])
 
 
@@ -157,8 +157,17 @@ def test_two_keys_open_their_own_and_a_third_nothing(prepared: ColoursCover) -> 
         extract(stego, "c")
 
 
+@pytest.mark.filterwarnings("ignore:.*other secrets")
+@pytest.mark.parametrize("sizes", [(20, 10, 10), (10, 10, 10, 10), (100, 60)])
+def test_several_secrets_survive_losses(prepared: ColoursCover, sizes: tuple[int, ...]) -> None:
+    """Headers of the others take places that a reader does not know."""
+    data = {str(index): os.urandom(size) for index, size in enumerate(sizes)}
+    stego = random_pruning(0.25, 0)(embed(prepared, list(data.items()), entropy=ENTROPY))
+    assert all(extract(stego, key) == each for key, each in data.items())
+
+
 def test_who_could_notice_other_secrets_is_said(prepared: ColoursCover, payload: bytes) -> None:
-    large, small = payload[: len(payload) // 2], payload[: len(payload) // 4]
+    large, small = payload[: len(payload) // 4], payload[: len(payload) // 8]
     with pytest.warns(KeyssWarning, match="notice that there are other secrets"):
         stego = embed(prepared, [("a", large), ("b", small)], entropy=ENTROPY)
     assert extract(stego, "a") == large

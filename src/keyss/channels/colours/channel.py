@@ -54,6 +54,7 @@ _TOO_FEW = "this cover has too few Gaussians to hide anything in colours that wo
 _LOWER = 3  # maximum number of levels, each a quarter of a bit, below the planned one
 _BITS_PER_GAUSSIAN = 1  # approximate capacity
 _HEADERS = 100  # approximate bytes
+_FURTHER = 0.8  # approximate share of the capacity that another secret leaves
 _OVERHEAD = METHOD_BYTES + 1  # maximum bytes of a payload beside its data
 _ASSOCIATED = b"keyss/v1/colours"  # associated data of a payload's authentication
 _CHANGED = 0.03  # share of carriers overwritten since
@@ -73,7 +74,7 @@ class Colours(Channel):
 
     def estimate_capacity(self, gaussians: int, sh_degree: int) -> Capacity:
         capacity = gaussians * _BITS_PER_GAUSSIAN // 8 - _HEADERS
-        return Capacity(gaussians, max(0, capacity), _OVERHEAD)
+        return Capacity(gaussians, max(0, capacity), _OVERHEAD, _FURTHER)
 
 
 COLOURS = Colours()
@@ -94,7 +95,9 @@ class ColoursCover:
 
     @cached_property
     def capacity(self) -> Capacity:
-        return Capacity(len(self.planner.carriers.representatives), self.planner.bytes, _OVERHEAD)
+        planner = self.planner
+        carriers = len(planner.carriers.representatives)
+        return Capacity(carriers, planner.bytes, _OVERHEAD, planner.share_with_another)
 
     def embed(self, contents: Sequence[tuple[str, Content]], *, entropy: bytes | None = None) -> Gaussians:
         """See `PreparedCover`. Also raises UsageError for a model that can carry nothing."""
@@ -111,8 +114,8 @@ class ColoursCover:
         found = self.planner.layouts(sizes)
         if found is None:
             raise UsageError(
-                f"the colours of this cover hold {self.planner.bytes:,} bytes in all, and the secrets "
-                f"take {sum(sizes) - OVERHEAD * len(sizes):,}"
+                f"the colours of this cover hold {self.planner.bytes:,} bytes of one secret, and less of "
+                f"several; the given take {sum(sizes) - OVERHEAD * len(sizes):,}"
             )
         layouts, reveals_others = found
         if reveals_others:

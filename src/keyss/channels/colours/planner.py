@@ -78,29 +78,37 @@ class Planner:
         largest = max((bucket_bytes(each) for each in range(256) if bucket_bytes(each) <= limit), default=0)
         return max(0, largest - OVERHEAD - _INCOMPRESSIBLE)
 
+    @cached_property
+    def share_with_another(self) -> float:
+        """The least share of the capacity that the header of another secret leaves."""
+        if not self.bytes:
+            return 1.0
+        level, few = (self._max_level, 1) if self._max_level else (ONE, MIN_HEADERS)
+        return self._level_bytes(level, few + 1) / self._level_bytes(level, few)
+
     def layouts(self, sizes: Sequence[int]) -> tuple[list[Layout], bool] | None:
         """The layouts of encrypted payloads of these sizes in bytes, and True if one reveals others.
 
         None if they do not fit.
         """
         padded = [bucket_bytes(bucket_of(size)) for size in sizes]
-        independent = [self._layout(size) for size in padded]
+        independent = [self._layout(size, len(sizes)) for size in padded]
         found = [each for each in independent if each is not None]
         if len(found) == len(independent) and sum(each.share for each in found) <= 1:
             return found, len(sizes) > MIN_HEADERS
-        together = self._layout(sum(padded))
+        together = self._layout(sum(padded), len(sizes))
         if together is None:
             return None
         return [replace(together, share=together.share * size / sum(padded)) for size in padded], True
 
-    def _layout(self, size: int) -> Layout | None:
+    def _layout(self, size: int, secrets: int) -> Layout | None:
         for likely, comfort in product((True, False), (_COMFORTABLE, 1.0)):
-            share = size / max(comfort * self._level_bytes(ONE, likely), 1e-3)
+            share = size / max(comfort * self._level_bytes(ONE, secrets, likely), 1e-3)
             if share <= self._max_share:
                 return Layout(ONE, share, likely)
-        holds = (size <= _ROBUST * self._level_bytes(level) for level in range(1, self._max_level))
+        holds = (size <= _ROBUST * self._level_bytes(level, secrets) for level in range(1, self._max_level))
         level = next((level for level, enough in enumerate(holds, start=1) if enough), self._max_level)
-        return Layout(level, 1.0) if self._max_level and size <= self._level_bytes(level) else None
+        return Layout(level, 1.0) if self._max_level and size <= self._level_bytes(level, secrets) else None
 
     @cached_property
     def _max_share(self) -> float:
@@ -128,17 +136,21 @@ class Planner:
         sh[self.carriers.rows[rows], 0, 1:] += sh.new_tensor(noise)
         return psnr_between(self.model, replace(self.model.detach(), sh=sh))
 
-    def _level_bytes(self, level: int, likely: bool = False) -> float:
-        """Bytes that all carriers hold, from the expected information of a reader."""
+    def _level_bytes(self, level: int, secrets: int = 1, likely: bool = False) -> float:
+        """Bytes that all carriers hold, from the expected information of a reader.
+
+        A reader does not know which carriers the headers of other secrets take.
+        """
         rows, ids = self.writable, len(self.carriers.representatives)
         if not ids:
             return 0.0
+        headers, taken = MIN_HEADERS if level == ONE else 1, SALTS * PLACES / ids
         sure = (1 - _GARBAGE) * self.carriers.certainty[rows] * (self.acceptance if likely else 1.0)
+        sure *= np.exp(-taken * max(0, secrets - headers))
         error = ((1 - sure) / 2).clip(1e-12, 0.5)  # per bit
         information = 1 + error * np.log2(error) + (1 - error) * np.log2(1 - error)
         bits = COLUMNS * bit_counts(self.carriers.impact[rows], level) * information
-        headers = SALTS * PLACES * (MIN_HEADERS if level == ONE else 1)
-        return float(_RATE * np.exp(-headers / ids) * bits.sum() / 8)
+        return float(_RATE * np.exp(-taken * headers) * bits.sum() / 8)
 
     @cached_property
     def statistics(self) -> ColourStatistics:

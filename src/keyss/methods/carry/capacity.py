@@ -251,10 +251,10 @@ def shares(capacity: Capacity, needed: Sequence[int]) -> list[int]:
     depend on the others, and its key does not reveal them. Equal shares if these exceed the capacity, or if
     the model grows.
     """
+    total = int(capacity.bytes * capacity.further ** (len(needed) - 1))
     parts = [
-        next((each for each in (4, 2) if size <= capacity.bytes // each - capacity.overhead), 1)
-        for size in needed
+        next((each for each in (4, 2) if size <= total // each - capacity.overhead), 1) for size in needed
     ]
     if capacity.grows or sum(1 / each for each in parts) > 1:
         parts = [len(needed)] * len(needed)
-    return [max(0, capacity.bytes // each - capacity.overhead) for each in parts]
+    return [max(0, total // each - capacity.overhead) for each in parts]
