@@ -14,16 +14,16 @@ from pathlib import Path
 
 import keyss  # noqa: F401  before torch, see `ruff.toml`
 
-import torch
-
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
 from keyss import read_model
+from codes import against_photos
 from keyss.channels import LowBitsCapacity, usable_carriers
 from keyss.core import Gaussians, KeyssError, Scene
 from keyss.core.gaussians import compensate_pruning
 from keyss.files.scenes import load_scene
-from keyss.fitting.image_metrics import mean_psnr
+from keyss.fitting import psnr
+from keyss.lab import random_pruning
 from keyss.methods import record_request
 from keyss.rendering import render
 from keyss.rendering.orbit import psnr_between
@@ -86,18 +86,18 @@ def _photos(pairs: list[list[str]], width: int) -> None:
             print(f"{secret} in {cover}: {error}", flush=True)
             continue
         found = extract(stego, KEY).gaussians
-        kept = stego[_kept_rows(len(stego))]
+        kept = random_pruning(REMOVED).apply(stego)
         left = extract(kept, KEY)
         compensated = compensate_pruning(left.gaussians, left.count)
-        raw, mended = (_against(scenes[secret], each) for each in (left.gaussians, compensated))
-        whole, bare = _against(scenes[secret], found), _against(scenes[secret], hidden)
-        before, after = _against(scenes[cover], model), _against(scenes[cover], kept)
+        raw, mended = (against_photos(each, scenes[secret]) for each in (left.gaussians, compensated))
+        whole, bare = against_photos(found, scenes[secret]), against_photos(hidden, scenes[secret])
+        before, after = against_photos(model, scenes[cover]), against_photos(kept, scenes[cover])
         cover_change = _between(scenes[cover], model, stego)
         secret_change = _between(scenes[secret], hidden, found)
         print(
             f"{secret} in {cover}:\n"
             f"  cover before and after {cover_change:.1f} dB, "
-            f"photos {before:.3f} and {_against(scenes[cover], stego):.3f} dB\n"
+            f"photos {before:.3f} and {against_photos(stego, scenes[cover]):.3f} dB\n"
             f"  secret and its own model {secret_change:.1f} dB, "
             f"photos {whole:.3f} ({whole - bare:+.3f}) dB\n"
             f"  25 % removed: cover {after - before:+.2f} dB, secret {raw - whole:+.2f} dB, made up for "
@@ -106,22 +106,12 @@ def _photos(pairs: list[list[str]], width: int) -> None:
         )
 
 
-def _kept_rows(count: int) -> torch.Tensor:
-    order = torch.randperm(count, generator=torch.Generator().manual_seed(0))
-    return order[: round(count * (1 - REMOVED))].sort().values
-
-
-def _against(scene: Scene, model: Gaussians) -> float:
-    return mean_psnr(model, scene.test, scene.background)
-
-
 def _between(scene: Scene, before: Gaussians, after: Gaussians) -> float:
     """The worst view's PSNR."""
-    values = []
-    for view in scene.test:
-        pictures = [render(model, view.camera, scene.background).clamp(0, 1) for model in (before, after)]
-        values.append(float(-10 * torch.log10((pictures[0] - pictures[1]).square().mean().clamp_min(1e-12))))
-    return min(values)
+    return min(
+        psnr(*(render(model, view.camera, scene.background) for model in (before, after)))
+        for view in scene.test
+    )
 
 
 if __name__ == "__main__":

@@ -1,13 +1,11 @@
 """Capacity and cost of carrying in the codes of published files: the tables of docs/channels.md.
 
     python benchmarks/codes.py --data FOLDER --pair bonsai=cover.ply,fox=secret.ply --write docs/channels.md
-    python benchmarks/codes.py --attributes bonsai=cover.ply
     python benchmarks/codes.py --files FOLDER --format spz bonsai=a.ply bonsai=b.ply fox=c.ply ...
     python benchmarks/stealth.py --quick --pairs $(cat FOLDER/pairs)
 
-The second command gives the cost of each attribute alone. The third writes an untouched and a
-nine-tenths-full file of each model, and lists them for the fourth, which measures how well they can be
-distinguished.
+The second command writes an untouched and a nine-tenths-full file of each model, and lists them for the
+third, which measures how well they can be distinguished.
 
 Each `--pair` names a folder of photos in `--data` and a model of it for the cover, then for the secret
 (without the folder, renders of the model replace photos). The secret is as large as fits, at most a sixth of
@@ -19,7 +17,6 @@ from __future__ import annotations
 import argparse
 import os
 import time
-from dataclasses import replace
 from pathlib import Path
 
 from keyss.channels import SUFFIXES, InCodes, Payload, QuietReader
@@ -33,8 +30,6 @@ from keyss.fitting import mean_psnr
 from keyss.methods import encode_to_size, most_visible, prune_to_size
 from keyss.methods.records import whole
 from keyss.rendering.orbit import psnr_between, scene_of_model
-
-import numpy as np
 
 START, END = "<!-- measured by benchmarks/codes.py -->", "<!-- end of what was measured -->"
 HEAD = (
@@ -94,26 +89,6 @@ def rows(cover: tuple[str, Gaussians], secret: tuple[str, Gaussians], data: Path
     return found
 
 
-def attributes(name: str, model: Gaussians) -> None:
-    """The cost of each attribute alone: PSNR in dB against the untouched file, and bits per Gaussian."""
-    for format_name in FORMATS:
-        cover = InCodes(format_name).prepare(model)
-        untouched = cover.cover
-        written = cover.embed([(KEY, Payload("carry", b""))])
-        found = [f"all {psnr_between(untouched, written):.1f} dB"]
-        for attribute in dict.fromkeys(each.name for each in cover.fields):
-            own = [each.name == attribute for each in cover.fields]
-            free = [each & one for each, one in zip(cover.free, own, strict=True)]
-            bits = sum(each.total_bits for each, one in zip(cover.fields, own, strict=True) if one) / len(
-                model
-            )
-            # Other attributes must not change; their free bits, too few to hold anything, get noise.
-            noise = np.random.default_rng(0).integers(0, 2, len(cover.dry)).astype(np.uint8)
-            changed = replace(cover, codes=replace(cover, free=free)._written(noise, os.urandom(32))).cover
-            found.append(f"{attribute} {bits:.1f} bits {psnr_between(untouched, changed):.1f} dB")
-        print(f"{name}, {format_name}: {', '.join(found)}", flush=True)
-
-
 def files(folder: Path, format_name: str, models: list[str]) -> None:
     """Write pairs of files, and the file `pairs` with the arguments of benchmarks/stealth.py."""
     folder.mkdir(parents=True, exist_ok=True)
@@ -136,15 +111,11 @@ def main() -> None:
     parser.add_argument("models", nargs="*", metavar="SCENE=FILE", help="for --files")
     parser.add_argument("--data", type=Path)
     parser.add_argument("--pair", action="append", default=[], metavar="NAME=FILE,NAME=FILE")
-    parser.add_argument("--attributes", action="append", default=[], metavar="NAME=FILE")
     parser.add_argument("--files", type=Path, metavar="FOLDER")
     parser.add_argument("--format", choices=tuple(FORMATS), default="spz")
     parser.add_argument("--width", type=int, default=200, help="width of renders in pixels")
     parser.add_argument("--write", type=Path, help="page to write the table to, between two marks")
     arguments = parser.parse_args()
-    for each in arguments.attributes:
-        name, _, path = each.partition("=")
-        attributes(name, read_model(path))
     if arguments.files:
         files(arguments.files, arguments.format, arguments.models)
     if not arguments.pair:

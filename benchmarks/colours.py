@@ -3,19 +3,15 @@
 python benchmarks/colours.py MODEL.ply ... [--payloads N] [--gaussians N] [--size BYTES] [--changes]
                                 [--only FORMAT] [--foreign-each M] [--log FILE]
 python benchmarks/colours.py SCENE-1.ply SCENE-2.ply ... --pairs FOLDER [--shares 1 0.5 0.2 0.05]
-python benchmarks/colours.py MODEL.ply --speed [--gaussians N]
 
 N payloads, distributed over the models, go through the formats that keyss writes, each M-th also through
 third-party programs: each with a new key and new entropy, alone and with a quarter of the Gaussians removed
 at random. With --changes, also through other changes. Prints the cost by model, and failures by format. --log
-appends a line of JSON per payload, and skips payloads in the file. Argon2id is replaced by a cheap function,
-except with --speed.
+appends a line of JSON per payload, and skips payloads in the file. Argon2id is replaced by a cheap function.
 
 With --pairs, nothing is measured: each model, with and without a payload of a share of its capacity, is
 converted to each format and back, and `FOLDER/FORMAT-SHARE.txt` lists the files for `xargs python
-benchmarks/stealth.py --quick --pairs < FILE`. With --speed: seconds and memory of writing 200 bytes, and of
-reading with a right and a wrong key, Argon2id included. `--gaussians` samples each model to this size (with
---speed, even beyond its own).
+benchmarks/stealth.py --quick --pairs < FILE`. `--gaussians` samples each larger model to this size.
 
 pip install gsply npm install --no-save @playcanvas/splat-transform@2.7.1   (or KEYSS_SPLAT_TRANSFORM)
 """
@@ -25,14 +21,11 @@ from __future__ import annotations
 import argparse
 import json
 import re
-import resource
 import sys
 import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -70,11 +63,7 @@ def main() -> None:
     parser.add_argument("--only", default="", help="formats with this in their name")
     parser.add_argument("--pairs", type=Path, metavar="FOLDER")
     parser.add_argument("--shares", type=float, nargs="+", default=[1.0, 0.5, 0.2, 0.05])
-    parser.add_argument("--speed", action="store_true")
     asked = parser.parse_args()
-    if asked.speed:
-        _measure_speed(asked.models, asked.gaussians)
-        return
     cheap_keys.pytest_sessionstart()
     if asked.pairs:
         _write_pairs(asked.models, asked.pairs, asked.shares, asked.only)
@@ -85,7 +74,7 @@ def main() -> None:
     for number in range(len(records), asked.payloads):
         path = asked.models[number % len(asked.models)]
         if path not in prepared:
-            prepared[path] = COLOURS.prepare(_read(path, asked.gaussians))
+            prepared[path] = COLOURS.prepare(sampled(read_model(path), asked.gaussians))
         ways = OWN | (FORMATS if number % asked.foreign_each == 0 else {})
         ways = {what: change for what, change in ways.items() if asked.only in what}
         found = _try_payload(prepared[path], number, asked.size, ways, OTHERS if asked.changes else {})
@@ -96,10 +85,11 @@ def main() -> None:
     print(_table(records))
 
 
-def _read(path: Path, gaussians: int | None) -> Gaussians:
-    """At most `gaussians` of the model."""
-    model = read_model(path)
-    return _resample(model, gaussians) if gaussians is not None and gaussians < len(model) else model
+def sampled(model: Gaussians, gaussians: int | None) -> Gaussians:
+    """At most `gaussians` of the model, in random order; None: the model."""
+    if gaussians is None or gaussians >= len(model):
+        return model
+    return _shuffle(model)[:gaussians]
 
 
 def _embed(prepared: ColoursCover, number: int, data: bytes) -> Gaussians:
@@ -188,40 +178,6 @@ def _write_pairs(models: Sequence[Path], folder: Path, shares: Sequence[float], 
                     lines.setdefault(f"{own.name}-{name}", []).append(pair)
     for name, pairs in lines.items():
         (folder / f"{name}.txt").write_text("\n".join(pairs) + "\n")
-
-
-def _measure_speed(models: Sequence[Path], gaussians: int | None) -> None:
-    print("| model | Gaussians | embed | extract | wrong key | most memory |")
-    print("| --- | --- | --- | --- | --- | --- |")
-    for path in models:
-        model = _resample(read_model(path), gaussians)
-        seconds = []
-        stego = model
-        for step in ("embed", "right", "wrong"):
-            start = time.monotonic()
-            if step == "embed":
-                stego = COLOURS.prepare(model).embed([("a key of some length", Payload(METHOD, bytes(200)))])
-            elif step == "right":
-                ColoursReader.of(stego).open("a key of some length")
-            else:
-                with suppress(WrongKeyError):
-                    ColoursReader.of(stego).open("another key of some length")
-            seconds.append(f"{time.monotonic() - start:.1f} s")
-        memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-        print(f"| {path.stem} | {len(model):,} | {' | '.join(seconds)} | {memory:,.0f} MiB |", flush=True)
-
-
-def _resample(model: Gaussians, count: int | None) -> Gaussians:
-    """Sample `count` Gaussians; beyond the model's own number, repeat them at slightly random scales."""
-    if count is None:
-        return model
-    generator = torch.Generator().manual_seed(0)
-    rows = torch.randperm(len(model), generator=generator)
-    if count > len(model):
-        rows = torch.randint(len(model), (count,), generator=generator)
-        jitter = 0.2 * torch.randn(count, 3, generator=generator)
-        return replace(model[rows], log_scales=model.log_scales[rows] + jitter)
-    return model[rows[:count]]
 
 
 def _opens(model: Gaussians, seed: int, data: bytes) -> bool:

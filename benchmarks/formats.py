@@ -33,9 +33,7 @@ Writer = Callable[[Path, Path], object]  # converts a .ply
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("models", type=Path, nargs="+")
     asked = parser.parse_args()
     names = ("format, writer", "B/G", "position", "log scale", "rotation, degrees", "opacity", "f_dc")

@@ -61,7 +61,7 @@ def main() -> None:
         for index, (scene, cover) in enumerate(named)
     ]
     started = time.monotonic()
-    with ProcessPoolExecutor(options.workers, get_context("fork"), initializer=_one_thread) as pool:
+    with ProcessPoolExecutor(options.workers, get_context("fork"), torch.set_num_threads, (1,)) as pool:
         results = list(pool.map(_count_or_skip, jobs))
     jobs, seen = zip(*[each for each in zip(jobs, results, strict=True) if each[1]], strict=True)
     print(f"{len(jobs)} models of {len({job.scene for job in jobs})} scenes, ", end="")
@@ -69,20 +69,15 @@ def main() -> None:
     print("| secret | detector | AUC | standard error | largest by chance |\n| --- | --- | --- | --- | --- |")
     for kind in KINDS:
         examples = Examples.of(
-            [each[kind, beside] for each in seen for beside in (0, 1)],
-            [beside for _ in jobs for beside in (0, 1)],
-            [job.scene for job in jobs for _ in (0, 1)],
-            [job.cover for job in jobs for _ in (0, 1)],
+            (each[kind, beside], beside, job.scene, job.cover)
+            for job, each in zip(jobs, seen, strict=True)
+            for beside in (0, 1)
         )
         single, chance = single_detectors(examples, SHOWN)
         for row in learned_detectors(examples):
             print(f"| {kind} | {row.name} | {row.auc:.3f} | {row.error:.3f} | |")
         for row in single:
             print(f"| {kind} | {row.name} | {row.auc:.3f} | {row.error:.3f} | {chance:.2f} |")
-
-
-def _one_thread() -> None:
-    torch.set_num_threads(1)
 
 
 def _count_or_skip(job: Job) -> dict[tuple[str, int], dict[str, float]] | None:

@@ -11,8 +11,13 @@ included; `keyss convert` only reads and writes the cover. Kernels are compiled 
 from __future__ import annotations
 
 import argparse
+import os
+import subprocess
 import sys
 import tempfile
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import keyss  # noqa: F401  before torch, see `ruff.toml`
@@ -21,7 +26,6 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
 from keyss import read_model, write_model
 from channels.quiet.trained_like import trained_like
-from process_cost import run
 
 SUFFIXES = {"ply": "ply", "spz": "spz", "sog": "sog", "compressed-ply": "compressed.ply", "any": "ply"}
 
@@ -55,6 +59,27 @@ def main() -> None:
             found = len(read_model(folder / "revealed.ply"))
             if found != hidden:
                 raise SystemExit(f"{found:,} of {hidden:,} Gaussians were revealed")
+
+
+@dataclass(frozen=True)
+class Cost:
+    """The cost of one process."""
+
+    seconds: float
+    processor: float  # seconds of all threads, system time included
+    gibibytes: float  # peak memory
+
+
+def run(command: Sequence[object], environment: Mapping[str, str] | None = None) -> Cost:
+    """Run a command with additional environment variables. Raises SystemExit if it fails."""
+    words, start = [str(word) for word in command], time.perf_counter()
+    process = subprocess.Popen(words, stdout=subprocess.DEVNULL, env={**os.environ, **(environment or {})})
+    _, status, usage = os.wait4(process.pid, 0)
+    seconds = time.perf_counter() - start
+    if code := os.waitstatus_to_exitcode(status):
+        raise SystemExit(f"{' '.join(words)}: status {code}")
+    kibibytes = usage.ru_maxrss / (1024 if sys.platform == "darwin" else 1)
+    return Cost(seconds, usage.ru_utime + usage.ru_stime, kibibytes / 2**20)
 
 
 def commands(folder: Path, format: str) -> dict[str, list[object]]:

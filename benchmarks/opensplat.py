@@ -32,7 +32,7 @@ from keyss import read_model
 from keyss.core import Scene
 from keyss.files import load_scene
 from keyss.fitting import mean_psnr
-from process_cost import Cost, run
+from large import Cost, run
 
 import numpy as np
 import torch

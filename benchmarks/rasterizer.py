@@ -211,12 +211,8 @@ def _memory() -> int:
 
 
 def table(titles: list[str], rows: list[list[str]]) -> str:
-    """An aligned Markdown table."""
-    cells = [titles, *rows]
-    widths = [max(len(row[i]) for row in cells) for i in range(len(titles))]
-    lines = [f"| {' | '.join(c.ljust(w) for c, w in zip(row, widths, strict=True))} |" for row in cells]
-    lines.insert(1, f"| {' | '.join('-' * w for w in widths)} |")
-    return "\n".join(lines)
+    """A Markdown table."""
+    return "\n".join(f"| {' | '.join(row)} |" for row in (titles, ["---"] * len(titles), *rows))
 
 
 def main() -> None:

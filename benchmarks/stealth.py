@@ -63,21 +63,23 @@ class File:
 
 @dataclass(frozen=True)
 class Job:
-    """A plain model and the files to make from it."""
+    """A plain model, from which to make files."""
 
     index: int
     scene: str
     path: str
     secret: str
     rounded: bool
-    given: str = ""
 
 
 def main() -> None:
     options = _arguments()
     started = time.monotonic()
-    with ProcessPoolExecutor(options.workers, get_context("fork"), initializer=_one_thread) as pool:
+    with ProcessPoolExecutor(options.workers, get_context("fork"), torch.set_num_threads, (1,)) as pool:
         files = [file for made in pool.map(_make, _jobs(options)) for file in made]
+        for scene, path, given in map(_parse_named, options.pairs):
+            files.append(File("plain", scene, path, read_model(path)))
+            files.append(File("given", scene, path, read_model(given)))
         print(f"{len(files)} files after {time.monotonic() - started:.0f} s", file=sys.stderr)
         for scene, path, secret in map(_parse_named, options.refitted):
             files.append(File("refitted", scene, path, read_model(path), secret))
@@ -121,25 +123,12 @@ def _jobs(options: argparse.Namespace) -> list[Job]:
         others = [each for named, each in plain if named != scene]
         # The secret is of another scene, and a different model each time if there are enough.
         jobs.append(Job(index, scene, path, others[(7 * index + 3) % len(others)], options.rounded))
-    pairs = [_parse_named(text) for text in options.pairs]
-    return jobs + [
-        Job(len(plain) + index, scene, path, "", False, given)
-        for index, (scene, path, given) in enumerate(pairs)
-    ]
-
-
-def _one_thread() -> None:
-    torch.set_num_threads(1)
+    return jobs
 
 
 def _make(job: Job) -> list[File]:
     """The plain model, and files that hide something."""
     cover = read_model(job.path)
-    if job.given:
-        return [
-            File("plain", job.scene, job.path, cover),
-            File("given", job.scene, job.path, read_model(job.given)),
-        ]
     if job.rounded:
         cover = rounded(cover, job.index)
     made = [File("plain", job.scene, job.path, cover)]
@@ -215,12 +204,7 @@ def _print_detections(
             ]
             if len({file.scene for file, _ in own}) < 3 or len({file.kind for file, _ in own}) < 2:
                 continue
-            examples = Examples.of(
-                [row for _, row in own],
-                [int(file.kind == kind) for file, _ in own],
-                [file.scene for file, _ in own],
-                [file.pair for file, _ in own],
-            )
+            examples = Examples.of((row, int(file.kind == kind), file.scene, file.pair) for file, row in own)
             single, chance = single_detectors(examples, SHOWN)
             table = [(row, "") for row in learned_detectors(examples)]
             for row, limit in [*table, *((row, f"{chance:.2f}") for row in single)]:

@@ -6,7 +6,7 @@ many areas under curves is compared with those after exchanging labels within pa
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from keyss.core.arrays import Doubles, Integers
@@ -40,12 +40,9 @@ class Examples:
     model: Integers  # [E]
 
     @staticmethod
-    def of(
-        rows: Sequence[Mapping[str, float]],
-        hidden: Sequence[int],
-        scenes: Sequence[str],
-        models: Sequence[str],
-    ) -> Examples:
+    def of(files: Iterable[tuple[Mapping[str, float], int, str, str]]) -> Examples:
+        """Of statistics, 0 or 1 for something hidden, scene and model of each file."""
+        rows, hidden, scenes, models = zip(*files, strict=True)
         names = tuple(dict.fromkeys(name for row in rows for name in row))
         values = np.array([[row.get(name, np.nan) for name in names] for row in rows], float)
         scene, model = (np.unique(each, return_inverse=True)[1] for each in (scenes, models))

@@ -4,7 +4,7 @@
 
 A file of random bytes is hidden in a `.ply` (low bits) and an `.spz` (codes), and for `--publish any`
 (colours and appended Gaussians). After each change, its key is tried. With `--photos` of its scene, the model
-is also fine-tuned. Keys skip Argon2id, which does not affect the result.
+is also fine-tuned. Argon2id is replaced by a cheap function, which does not affect the result.
 
 pip install gsply npm install --no-save @playcanvas/splat-transform@2.7.1   (or KEYSS_SPLAT_TRANSFORM)
 """
@@ -12,20 +12,17 @@ pip install gsply npm install --no-save @playcanvas/splat-transform@2.7.1   (or 
 from __future__ import annotations
 
 import argparse
-import hashlib
 from pathlib import Path
 from typing import Any
 
 from keyss import SecretFile, hide_files, reveal
-from colours import FORMATS, OTHERS, OWN, Change
+from colours import FORMATS, OTHERS, OWN, Change, cheap_keys, sampled
 from keyss.core import BackendError, Gaussians, InputError, WrongKeyError
 from keyss.files import load_scene, read_model
-from keyss.keys import derivation
 from keyss.lab import fine_tuning
 from keyss.methods import HiddenFile
 
 import numpy as np
-import torch
 
 KEY = "a key of the benchmark 4711"
 CHANNELS: dict[str, dict[str, Any]] = {
@@ -48,10 +45,6 @@ def survives(model: Gaussians, data: bytes, change: Change) -> str:
         return "lost"
 
 
-def _quick_key(secret: bytes, salt: bytes, **_: object) -> bytes:
-    return hashlib.sha256(salt + secret).digest()
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("model", type=Path)
@@ -60,11 +53,8 @@ def main() -> None:
     parser.add_argument("--photos", type=Path)
     parser.add_argument("--width", type=int, default=200)
     asked = parser.parse_args()
-    derivation.hash_secret_raw = _quick_key
-    model = read_model(asked.model)
-    if asked.gaussians is not None:
-        order = torch.randperm(len(model), generator=torch.Generator().manual_seed(0))
-        model = model[order[: asked.gaussians]]
+    cheap_keys.pytest_sessionstart()
+    model = sampled(read_model(asked.model), asked.gaussians)
     data = np.random.default_rng(0).bytes(asked.bytes)
     secret = SecretFile(data, KEY, "file")
     made = {name: hide_files(model, [secret], **options) for name, options in CHANNELS.items()}
