@@ -101,20 +101,6 @@ def test_large_photos_are_shrunk() -> None:
     assert float(run.loss) == pytest.approx(expected, rel=1e-3)  # halves are rounded up or down
 
 
-def test_loss_is_mean_over_views() -> None:
-    scene, config = tiny_scene(), replace(CONFIG, views_per_step=2)
-    run, same = (PlainRun(scene, config, torch.device("cpu")) for _ in range(2))
-    model, losses = same.gaussians(), []
-    for view in [scene.train[same.order.sample()] for _ in range(2)]:
-        image, _ = render_with_meta(model, view.camera, scene.background, sh_degree=0)
-        losses.append(float(photometric_loss(image, Target.of(view.image), config.ssim_weight)))
-    run.step()
-    assert float(run.loss) == pytest.approx(sum(losses) / 2, rel=1e-5)
-    assert losses[0] != pytest.approx(losses[1], rel=1e-2)
-    with pytest.raises(UsageError, match="views_per_step"):
-        FitConfig(views_per_step=0)
-
-
 def test_seed() -> None:
     scene = tiny_scene()
     torch.manual_seed(1)

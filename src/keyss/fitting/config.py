@@ -24,7 +24,6 @@ class FitConfig:
     ssim_weight: float = 0.2  # lambda of the photometric loss
     # None: each run samples its own from the system.
     seed: int | None = None
-    views_per_step: int = 1  # a step minimises their mean loss; rates do not depend on it
 
     means_rate: float = 1.6e-4  # times the scene's extent, decays to 1 % of it
     scales_rate: float = 5e-3
@@ -56,7 +55,6 @@ class FitConfig:
     def __post_init__(self) -> None:
         for name, low, high in (
             ("iterations", 1, 10**7),
-            ("views_per_step", 1, 10**4),
             ("max_gaussians", 16, 10**8),
             ("sh_degree", 0, 3),
             ("ssim_weight", 0, 1),

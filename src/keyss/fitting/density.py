@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from functools import reduce
 from typing import Any, TypeVar
 
 import torch
@@ -140,10 +139,9 @@ class FixedRows(CappedStrategy):
         return state | {"born": torch.arange(self.max_gaussians)}
 
     def statistics(self, renders: Sequence[Rendered], count: int) -> list[Tensor]:
-        """[2, S, N] sums over each scene's own renders; `renders` cycle through the scenes."""
-        scenes = len(self.extents)
-        own = [CappedStrategy.statistics(self, renders[each::scenes], count) for each in range(scenes)]
-        return [torch.stack([reduce(torch.add, each) for each in own], dim=1)]
+        """[2, S, N] of the render of each scene."""
+        own = [CappedStrategy.statistics(self, [each], count)[0] for each in renders]
+        return [torch.stack(own, dim=1)]
 
     @torch.no_grad()
     def step_post_backward(

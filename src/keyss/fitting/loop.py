@@ -14,7 +14,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import safetensors
 import safetensors.torch
@@ -31,7 +31,6 @@ from keyss.fitting.parameters import Optimizers, Parameters
 from keyss.fitting.schedule import Schedule
 from keyss.progress import Reporter
 
-T = TypeVar("T")
 State = dict[str, Tensor]
 _UNREADABLE = (OSError, KeyError, ValueError, TypeError, safetensors.SafetensorError)
 
@@ -90,21 +89,12 @@ class TrainingRun(ABC):
         """Number of Gaussians."""
         return len(self.parameters["means"])
 
-    def optimise(self, views: Sequence[T], loss_at: Callable[[T], tuple[Tensor, list[Rendered]]]) -> None:
-        """Take an optimisation step on the mean loss of `views`.
-
-        `loss_at` renders one view and returns its loss and the renders that count for densification.
-        """
-        losses: list[Tensor] = []
-        renders: list[Rendered] = []
-        for view in views:
-            loss, rendered = loss_at(view)
-            for meta, _, _ in rendered:
-                meta["means2d"].retain_grad()
-            (loss / len(views)).backward()
-            losses.append(loss.detach() / len(views))
-            renders += [(meta, indices, weight / len(views)) for meta, indices, weight in rendered]
-        self.loss = torch.stack(losses).sum()
+    def optimise(self, loss: Tensor, renders: Sequence[Rendered]) -> None:
+        """Take an optimisation step on a loss; `renders` count for densification."""
+        for meta, _, _ in renders:
+            meta["means2d"].retain_grad()
+        loss.backward()
+        self.loss = loss.detach()
         info = self.strategy.statistics(renders, len(self))
         self.set_rates()
         for optimizer in (*self.optimizers.values(), *self.network_optimizers):

@@ -7,13 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene, View
 from keyss.files.images import downscale
 from keyss.fitting.config import FitConfig
-from keyss.fitting.density import CappedStrategy, Rendered
+from keyss.fitting.density import CappedStrategy
 from keyss.fitting.image_metrics import mean_psnr, subsample_views
 from keyss.fitting.loop import Shuffle, TrainingRun, train
 from keyss.fitting.losses import Target, Targets, photometric_loss
@@ -64,24 +63,20 @@ class PlainRun(TrainingRun):
 
     def step(self) -> None:
         fit = self.fit
-        chosen = [self.order.sample() for _ in range(fit.views_per_step)]
+        index = self.order.sample()
         self.iteration += 1
         degree = fit.sh_degree_at(self.iteration) if self.grows else fit.sh_degree
         factor = shrinking(fit, self.iteration, self.pixels) if self.grows else 1
         if factor != self.shrunk:
             self.shrunk, self.targets = factor, Targets()
-
-        def loss_at(index: int) -> tuple[Tensor, list[Rendered]]:
-            view = self.views[index]
-            camera = view.camera
-            size = max(1, camera.width // factor), max(1, camera.height // factor)
-            camera = camera if factor == 1 else camera.resized(*size)
-            model = to_gaussians(self.parameters)
-            image, meta = render_with_meta(model, camera, self.background, sh_degree=degree)
-            target = self.targets.of(index, lambda: _target(view, size, self.device))
-            return photometric_loss(image, target, fit.ssim_weight), [(meta, None, 1.0)]
-
-        self.optimise(chosen, loss_at)
+        view = self.views[index]
+        camera = view.camera
+        size = max(1, camera.width // factor), max(1, camera.height // factor)
+        camera = camera if factor == 1 else camera.resized(*size)
+        model = to_gaussians(self.parameters)
+        image, meta = render_with_meta(model, camera, self.background, sh_degree=degree)
+        target = self.targets.of(index, lambda: _target(view, size, self.device))
+        self.optimise(photometric_loss(image, target, fit.ssim_weight), [(meta, None, 1.0)])
 
     def gaussians(self) -> Gaussians:
         return to_gaussians(self.parameters).detach()

@@ -46,19 +46,19 @@ def plan_hiding(
     bound: bool = False,  # also fit the upper bounds
 ) -> Plan:
     """The plan of a hiding. Writes nothing."""
-    plan, count, views = method.plan(sources, options), len(sources), options.fit.views_per_step
+    plan, count = method.plan(sources, options), len(sources)
     steps, seconds, fits = plan.steps, _KEY_SECONDS * (count - 1), []
     rendered = plan.rendered or (0,) * count
     for source, size, joint, config, training in zip(
         sources, _sizes(options, sources), rendered, options.fits(count), options.training(count), strict=True
     ):
-        step = views * _view_seconds(device, size, source.scene)
+        step = _view_seconds(device, size, source.scene)
         own = config.iterations if source.given is None else 0
         steps += own
         fits.append(own * step)
-        seconds += _RENDERS * len(source.scene.test) * step / views
+        seconds += _RENDERS * len(source.scene.test) * step
         if joint:
-            seconds += plan.steps * plan.step_cost * views * _view_seconds(device, joint, source.scene)
+            seconds += plan.steps * plan.step_cost * _view_seconds(device, joint, source.scene)
         longer = Bound.of(training, own or None)
         if bound and source.photos and not longer.equal:
             seconds += (longer.steps or 0) * step
@@ -78,7 +78,7 @@ def plan_hiding(
 def plan_fit(scene: Scene, config: FitConfig, device: torch.device) -> Plan:
     """The plan of a plain fit."""
     gaussians, degree, needs = config.max_gaussians, config.sh_degree, needs_of_fit(scene, config)
-    step = config.views_per_step * _view_seconds(device, gaussians, scene)
+    step = _view_seconds(device, gaussians, scene)
     return Plan(
         gaussians=gaussians,
         sh_degree=degree,

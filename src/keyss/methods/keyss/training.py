@@ -200,8 +200,7 @@ class KeyssTraining(TrainingRun):
 
     def step(self) -> None:
         self.iteration += 1
-        views = [(self.sample_poses(), self.wrong_key()) for _ in range(self.fit.views_per_step)]
-        self.optimise(views, lambda view: self.losses(*view))
+        self.optimise(*self.losses(self.sample_poses(), self.wrong_key()))
 
     def set_rates(self) -> None:
         super().set_rates()
