@@ -7,7 +7,6 @@ import type { HiddenFile } from '../records/reveal.ts';
 import type { Answer, Question } from '../worker.ts';
 import { Controls } from './controls.ts';
 import { givenModel, notifyParent, params } from './embedding.ts';
-import { inspected, listenToInspection } from './inspection.ts';
 import { count, page, preparePanel, save, showKey } from './panel.ts';
 import {
   add, axes, FIELD_OF_VIEW, firstPose, pick, type Pose, poseOfHash, poseToHash, transferPose, upName, UPS,
@@ -111,10 +110,6 @@ class Page {
     page.wipe.addEventListener('input', () => this.split(1 - Number(page.wipe.value) / 100));
     if (page.main.dataset.background) page.background.value = page.main.dataset.background;
     this.viewer?.setBackground(page.background.value);
-    listenToInspection(() => {
-      this.showPublished();
-      if (this.secret) this.split(1); // shows the public model
-    });
     window.addEventListener('hashchange', ({ newURL }) => {
       this.hash = new URL(newURL).hash; // location.hash may have been overwritten by the page
       const pose = poseOfHash(this.hash);
@@ -152,7 +147,7 @@ class Page {
     page.facts.textContent = `${this.name}\n${count(model.count)} Gaussians, SH degree ${model.shDegree}`;
     if (leftOut) page.facts.textContent += `\n${count(leftOut)} are left out: their numbers are not finite`;
     document.title = `${this.name} · keyss viewer`;
-    this.showPublished();
+    this.viewer?.show(model);
     this.controls.setPose(poseOfHash(this.hash) ?? poseOfHash(page.main.dataset.pose ?? '') ?? this.firstPose());
     await this.settle();
     this.say('');
@@ -315,12 +310,6 @@ class Page {
     clearTimeout(this.addressTimer);
     const hash = poseToHash(this.pose);
     if (this.published && !this.secret && location.hash !== hash) history.replaceState(null, '', hash);
-  }
-
-  private showPublished(): void {
-    if (this.published === null) return;
-    const model = inspected(this.published);
-    this.viewer?.show(model.count ? model : null);
   }
 
   private async settle(): Promise<void> {
