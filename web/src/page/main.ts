@@ -9,8 +9,7 @@ import { Controls } from './controls.ts';
 import { givenModel, notifyParent, params } from './embedding.ts';
 import { count, page, preparePanel, save, showKey } from './panel.ts';
 import {
-  add, axes, FIELD_OF_VIEW, firstPose, pick, type Pose, poseOfHash, poseToHash, transferPose, upName, UPS,
-  type Vector,
+  add, axes, FIELD_OF_VIEW, firstPose, pick, type Pose, poseOfHash, poseToHash, transferPose, UPS,
 } from './pose.ts';
 import { Viewer } from './viewer.ts';
 
@@ -81,15 +80,8 @@ class Page {
       event.preventDefault();
       void this.unlock();
     });
-    page.fly.addEventListener('click', () => {
-      this.controls.flying = !this.controls.flying;
-      page.fly.setAttribute('aria-pressed', String(this.controls.flying));
-    });
-    page.up.addEventListener('input', () => this.controls.setPose(this.firstPose(UPS[page.up.value])));
     this.controls.onRotate = (on) => page.rotate.setAttribute('aria-pressed', String(on));
     page.rotate.addEventListener('click', () => this.controls.rotate(!this.controls.isRotating));
-    page.link.hidden = !navigator.clipboard;
-    page.link.addEventListener('click', () => void this.copyLink());
     page.border.addEventListener('pointerdown', ({ pointerId }) => page.border.setPointerCapture(pointerId));
     page.border.addEventListener('pointermove', ({ pointerId, clientX }) => {
       if (!page.border.hasPointerCapture(pointerId)) return;
@@ -257,26 +249,21 @@ class Page {
     if (picture) save(`${this.name.replace(/\.\w+$/, '') || 'view'}.png`, picture);
   }
 
-  private async copyLink(): Promise<void> {
-    this.writeAddress();
-    await navigator.clipboard.writeText(location.href).then(() => this.say('Link copied.'), () => this.say(location.href));
-  }
-
-  /** The first pose of the model shown, recomputed, as the window size or the up axis may have changed. */
-  private firstPose(up?: Vector): Pose {
+  /** The first pose of the model shown, recomputed, as the window size may have changed. */
+  private firstPose(): Pose {
     const model = this.secret ?? this.published;
     if (model === null) return this.pose;
     this.homes.delete(model);
-    return this.home(model, up);
+    return this.home(model);
   }
 
   /** A model's first pose; the published model is seen from the side of its training cameras. */
-  private home(model: Gaussians, up?: Vector): Pose {
-    const { camera, up: given } = page.main.dataset;
+  private home(model: Gaussians): Pose {
+    const { camera, up } = page.main.dataset;
     const aspect = page.picture.clientWidth / Math.max(1, page.picture.clientHeight) || 1;
     const isOwn = model === this.published;
-    const captured = isOwn && !up && !given ? poseOfHash(camera ?? '') : null;
-    const found = this.homes.get(model) ?? firstPose(model, aspect, up ?? (isOwn ? UPS[given ?? ''] : undefined), captured);
+    const captured = isOwn && !up ? poseOfHash(camera ?? '') : null;
+    const found = this.homes.get(model) ?? firstPose(model, aspect, isOwn ? UPS[up ?? ''] : undefined, captured);
     this.homes.set(model, found);
     return found;
   }
@@ -298,7 +285,6 @@ class Page {
 
   private setPose(pose: Pose): void {
     this.pose = pose;
-    page.up.value = upName(pose.up) ?? '';
     if (this.secret) this.viewer?.setPose(pose, 'right');
     this.viewer?.setPose(this.secret && this.published ? this.sameView(pose, this.secret, this.published) : pose);
     clearTimeout(this.addressTimer);
