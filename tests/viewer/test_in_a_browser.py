@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 import subprocess
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from urllib.parse import urljoin
 
@@ -124,11 +123,10 @@ def test_damaged_files(tab: Visit, page_file: Path, stego: Path, tmp_path: Path)
         message = problem(data)
         assert re.fullmatch(r"This [^.]*\.?[^.]*\.", message), message
     model = bright_model(200, 1)
-    activated = replace(model, log_scales=model.scales, opacity_logits=model.opacities)
     header, _, rows = model_bytes("a.ply", model).partition(b"end_header\n")
     nan = header + b"end_header\n" + b"\xff" * len(rows)
     empty = header.replace(b"vertex 200", b"vertex 0") + b"end_header\n"
-    for data in (nan, empty, model_bytes("a.ply", activated)):
+    for data in (nan, empty):
         assert re.search("^This file.*: export it again ", problem(data))
     drop = """([name, bytes]) => {
         const data = new DataTransfer();

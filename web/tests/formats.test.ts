@@ -1,8 +1,8 @@
 import { expect, test } from 'vitest';
-import { emptyGaussians, selected } from '../src/core/gaussians.ts';
+import { selected } from '../src/core/gaussians.ts';
 import { readModel } from '../src/files/models.ts';
 import { joined } from '../src/core/bytes.ts';
-import { openPly, writePly } from '../src/files/ply.ts';
+import { openPly } from '../src/files/ply.ts';
 import { unzipped } from '../src/files/sog.ts';
 import { columns, jsonVector, modelOf, vector } from './vectors.ts';
 
@@ -76,25 +76,6 @@ test('files without drawable Gaussians are refused with advice', async () => {
   const none = Array.from({ length: vertex.count }).reduce<Uint8Array>((file, _, row) => withNumbers(file, row, nan), bytes);
   await expect(readModel(none)).rejects.toThrow(/^This file holds numbers that are not finite: export it again/);
 });
-
-const ACTIVATED = jsonVector<Record<'means' | 'scales' | 'opacities', number[]>>('activated.json');
-const KINDS = ['', 'scales', 'opacities', 'scales and opacities'];
-
-test.each([0.001, 1, 1e5].flatMap((unit) => KINDS.map((activated) => [activated, unit] as const)))(
-  'activated %s are refused in units of %d',
-  async (activated, unit) => {
-    const { means, scales, opacities } = ACTIVATED;
-    const [isScale, isOpacity] = ['scales', 'opacities'].map((each) => activated.includes(each));
-    const file = writePly({
-      ...emptyGaussians(opacities.length, 0),
-      means: Float32Array.from(means, (each) => unit * each),
-      logScales: Float32Array.from(scales, (each) => (isScale ? unit * each : Math.log(unit * each))),
-      opacityLogits: Float32Array.from(opacities, (each) => (isOpacity ? each : Math.log(each / (1 - each)))),
-    });
-    if (activated === '') expect((await readModel(file)).count).toBe(opacities.length);
-    else await expect(readModel(file)).rejects.toThrow(`This file's ${activated} are those that renderers use: export`);
-  },
-);
 
 test('archives with too many members or false sizes are refused', async () => {
   const bytes = vector('published.sog');

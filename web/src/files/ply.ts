@@ -1,13 +1,11 @@
 /** Reader and writer of the Inria .ply layout. Input is untrusted: defects raise InputError. */
-import { ascii, joined, quantile, viewOf } from '../core/bytes.ts';
+import { ascii, joined, viewOf } from '../core/bytes.ts';
 import { InputError } from '../core/errors.ts';
 import { coefficients, COLUMNS, emptyGaussians, type Gaussians, where } from '../core/gaussians.ts';
 
 const MAX_HEADER_BYTES = 65536;
 const OPACITY_LOGIT_BOUND = 16; // replaces infinity
 const LEAST_LOG_SCALE = -87.33654; // replaces minus infinity
-// Criteria for activated scales, as in keyss.files.ply_table.
-const [ENOUGH, NEARLY_ALL, SMALL_SCALE, LARGE, RATIO] = [100, 0.99, 0.2, 0.3, 20];
 
 /** Size in bytes and DataView method of each type, by both of its names. */
 const TYPES = new Map(([
@@ -105,28 +103,7 @@ export function readPly(file: PlyFile): FiniteGaussians {
   for (const [at, logScale] of found.logScales.entries()) {
     if (logScale === -Infinity) found.logScales[at] = LEAST_LOG_SCALE;
   }
-  const kept = withoutNonFinite(found);
-  checkNotActivated(kept);
-  return kept;
-}
-
-/** Raises InputError for scales and opacities where logarithms and logits are expected. */
-function checkNotActivated({ count, means, logScales, opacityLogits }: Gaussians): void {
-  if (count < ENOUGH) return;
-  const step = Math.floor(count / ENOUGH);
-  const rows = Array.from({ length: Math.ceil(count / step) }, (_, at) => at * step);
-  const axes = [0, 1, 2].map((axis) => rows.map((row) => means[3 * row + axis]));
-  const middles = axes.map((each) => quantile(each, 0.5));
-  const spread = quantile(rows.map((_, at) => Math.max(...axes.map((each, axis) => Math.abs(each[at] - middles[axis])))), 0.5);
-  const scales = rows.flatMap((row) => [...logScales.subarray(3 * row, 3 * row + 3)]);
-  const [least, middle, most] = [0.05, 0.5, 0.95].map((share) => quantile(scales, share));
-  const large = middle < SMALL_SCALE || Math.exp(middle) > LARGE * spread || most > RATIO * least;
-  const [low, high] = [Math.min, Math.max].map((pick) => opacityLogits.reduce((a, b) => pick(a, b)));
-  const wrong: string[] = [];
-  if (large && scales.filter((each) => each > 0).length > NEARLY_ALL * scales.length) wrong.push('scales');
-  if (low >= 0 && high <= 1 && high - low > 0.5) wrong.push('opacities');
-  if (wrong.length === 0) return;
-  throw new InputError(`This file's ${wrong.join(' and ')} are those that renderers use: export it again without activating them.`);
+  return withoutNonFinite(found);
 }
 
 export interface FiniteGaussians extends Gaussians {
