@@ -6,14 +6,12 @@ const KEY_TURN = 0.08; // radians per press of an arrow key
 const KEY_STEP = 0.06; // of the distance per press
 const KEY_ZOOM = 1.1;
 const ROTATION = 0.0003; // radians per ms
-const [DECAY, RELEASED, STILL] = [150, 80, 1e-5]; // inertia: time constant; ms since the last movement; radians per ms
 const [NEAREST, FURTHEST] = [1e-4, 1e5];
 
 export class Controls {
   onRotate = (_: boolean): void => undefined; // receives whether auto-rotation is on
   isRotating = false;
   private frame = 0; // the next animation frame
-  private velocity = { azimuth: 0, elevation: 0, at: 0 }; // radians per ms in the last movement
   private readonly pointers = new Map<number, { x: number; y: number }>();
 
   /** `onPose` receives every new pose; `home` returns the first one. */
@@ -29,9 +27,7 @@ export class Controls {
     });
     canvas.addEventListener('pointermove', (event) => this.drag(event, canvas.clientHeight));
     for (const name of ['pointerup', 'pointercancel'] as const) {
-      canvas.addEventListener(name, (event) => {
-        if (this.pointers.delete(event.pointerId) && !this.pointers.size) this.glide();
-      });
+      canvas.addEventListener(name, (event) => this.pointers.delete(event.pointerId));
     }
     canvas.addEventListener('contextmenu', (event) => event.preventDefault());
     canvas.addEventListener('wheel', (event) => {
@@ -51,42 +47,18 @@ export class Controls {
   /** Auto-rotates until the user moves the camera. */
   rotate(on: boolean): void {
     cancelAnimationFrame(this.frame);
-    if (on) {
-      this.animate((passed) => {
-        this.turn(passed * ROTATION, 0);
-        return true;
-      });
-    }
+    let before = performance.now();
+    const next = (now: number): void => {
+      this.turn(Math.max(0, now - before) * ROTATION, 0);
+      before = now;
+      this.frame = requestAnimationFrame(next);
+    };
+    if (on) this.frame = requestAnimationFrame(next);
     this.isRotating = on;
     this.onRotate(on);
   }
 
-  /** Inertia after a drag. */
-  private glide(): void {
-    const { azimuth, elevation, at } = this.velocity;
-    if (performance.now() - at > RELEASED || window.matchMedia('(prefers-reduced-motion: reduce)').matches) return;
-    let share = 1;
-    this.animate((passed) => {
-      share *= Math.exp(-passed / DECAY);
-      this.turn(passed * share * azimuth, passed * share * elevation);
-      return share * Math.hypot(azimuth, elevation) > STILL;
-    });
-  }
-
-  /** Calls `step` with the milliseconds since the last frame until it returns false. */
-  private animate(step: (passed: number) => boolean): void {
-    cancelAnimationFrame(this.frame);
-    let before = performance.now();
-    const next = (now: number): void => {
-      const more = step(Math.max(0, now - before));
-      before = now;
-      if (more) this.frame = requestAnimationFrame(next);
-    };
-    this.frame = requestAnimationFrame(next);
-  }
-
   private touch(): void {
-    cancelAnimationFrame(this.frame);
     if (this.isRotating) this.rotate(false);
   }
 
@@ -96,12 +68,7 @@ export class Controls {
     const [dx, dy] = [event.clientX - before.x, event.clientY - before.y];
     if (this.pointers.size === 2) this.pinch(event, dx, dy, height);
     else if (event.shiftKey || event.buttons & 6) this.move(-dx / height, -dy / height, 0);
-    else {
-      const [azimuth, elevation] = [dx * TURN, dy * TURN];
-      const passed = Math.max(1, event.timeStamp - this.velocity.at);
-      this.velocity = { azimuth: azimuth / passed, elevation: elevation / passed, at: event.timeStamp };
-      this.turn(azimuth, elevation);
-    }
+    else this.turn(dx * TURN, dy * TURN);
     this.pointers.set(event.pointerId, { x: event.clientX, y: event.clientY });
   }
 
