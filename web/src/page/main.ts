@@ -8,9 +8,7 @@ import type { Answer, Question } from '../worker.ts';
 import { Controls } from './controls.ts';
 import { givenModel, notifyParent, params } from './embedding.ts';
 import { count, page, preparePanel, save, showKey } from './panel.ts';
-import {
-  add, axes, FIELD_OF_VIEW, firstPose, pick, type Pose, poseOfHash, poseToHash, transferPose, UPS,
-} from './pose.ts';
+import { firstPose, type Pose, poseOfHash, poseToHash, transferPose, UPS } from './pose.ts';
 import { Viewer } from './viewer.ts';
 
 const ADDRESS_AFTER = 400; // ms after the last movement
@@ -91,7 +89,6 @@ class Page {
     page.background.addEventListener('input', () => this.viewer?.setBackground(page.background.value));
     page.picture.addEventListener('webglcontextlost', () => this.say(INTERRUPTED));
     page.picture.addEventListener('webglcontextrestored', () => this.say(''));
-    page.picture.addEventListener('dblclick', (event) => this.lookAt(event));
     page.stop.addEventListener('click', () => this.opener.stop());
     page.home.addEventListener('click', () => this.controls.setPose(this.firstPose()));
     page.snapshot.addEventListener('click', () => void this.snapshot());
@@ -270,17 +267,6 @@ class Page {
 
   private sameView(pose: Pose, from: Gaussians, to: Gaussians): Pose {
     return from === to ? pose : transferPose(pose, this.home(from), this.home(to));
-  }
-
-  /** Makes the clicked point the target. */
-  private lookAt({ offsetX, offsetY }: MouseEvent): void {
-    const { clientWidth: width, clientHeight: height } = page.picture;
-    const { right, down, forward } = axes(this.pose);
-    const scale = (2 * Math.tan((FIELD_OF_VIEW * Math.PI) / 360)) / height;
-    const ray = add(add(forward, right, (offsetX - width / 2) * scale), down, (offsetY - height / 2) * scale);
-    const model = this.secret ?? this.published;
-    const target = model && pick(model, this.pose.eye, ray);
-    if (target) this.controls.setPose({ ...this.pose, target });
   }
 
   private setPose(pose: Pose): void {
