@@ -83,7 +83,7 @@ export function column({ bytes, littleEndian }: PlyFile, element: Element, name:
 }
 
 /** The finite Gaussians of a file. Raises InputError for anything other than a complete 3DGS model. */
-export function readPly(file: PlyFile): FiniteGaussians {
+export function readPly(file: PlyFile): Gaussians {
   const vertex = file.elements.find((each) => each.name === 'vertex');
   const rest = vertex?.properties.filter((each) => /^f_rest_[0-9]+$/.test(each.name)).length ?? 0;
   const shDegree = [0, 9, 24, 45].indexOf(rest);
@@ -106,19 +106,15 @@ export function readPly(file: PlyFile): FiniteGaussians {
   return withoutNonFinite(found);
 }
 
-export interface FiniteGaussians extends Gaussians {
-  readonly leftOut: number; // Gaussians dropped
-}
-
 /** The Gaussians with finite values only. Raises InputError if there are none. */
-export function withoutNonFinite(gaussians: Gaussians): FiniteGaussians {
-  if (isFinite(gaussians)) return { ...gaussians, leftOut: 0 };
+export function withoutNonFinite(gaussians: Gaussians): Gaussians {
+  if (isFinite(gaussians)) return gaussians;
   const widths = COLUMNS.map((each) => [gaussians[each], gaussians[each].length / gaussians.count] as const);
   const found = where(gaussians, (row) =>
     widths.every(([values, width]) => values.subarray(row * width, (row + 1) * width).every(Number.isFinite)),
   );
   if (found.count === 0) throw notFinite();
-  return { ...found, leftOut: gaussians.count - found.count };
+  return found;
 }
 
 /** Raises InputError for values that are not finite. */
