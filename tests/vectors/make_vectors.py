@@ -145,7 +145,6 @@ def main() -> None:
     write_counted()
     write_whole()
     write_keyss()
-    write_activated()
 
 
 def write_published() -> None:
@@ -260,18 +259,6 @@ def write_keyss() -> None:
         for name, payload in payloads
     ]
     (FOLDER / "keyss.json").write_text(json.dumps(found, indent=1) + "\n")
-
-
-def write_activated() -> None:
-    """A model with activated scales and opacities."""
-    random = np.random.default_rng(17)
-    found = {
-        "means": random.normal(size=330),
-        "scales": np.exp(random.normal(size=330) - 3),
-        "opacities": random.uniform(0.01, 0.99, 110),
-    }
-    rounded = {name: [float(f"{each:.3g}") for each in values] for name, values in found.items()}
-    (FOLDER / "activated.json").write_text(json.dumps(rounded) + "\n")
 
 
 def decoder_of(shape: DecoderShape, stego: Gaussians) -> KeyssSecret:

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import json
 import warnings
-from pathlib import Path
 from typing import Any
 
 import pytest
-import torch
 
-from keyss.core import Gaussians, InputError, KeyssWarning
-from keyss.files import read_model, write_model
+from keyss.core import KeyssWarning
+from keyss.files import read_model
 from keyss.methods.records import whole
 from vectors.make_vectors import FOLDER, carrier_bits, decode_rows, digests, reveal_content
 
@@ -19,9 +17,6 @@ REVEALED = json.loads((FOLDER / "revealed.json").read_text())
 WHOLE = json.loads((FOLDER / "whole.json").read_text())
 COUNTED = json.loads((FOLDER / "counted.json").read_text())
 KEYSS = json.loads((FOLDER / "keyss.json").read_text())
-ACTIVATED = {
-    name: torch.tensor(each) for name, each in json.loads((FOLDER / "activated.json").read_text()).items()
-}
 PUBLISHED = json.loads((FOLDER / "published.json").read_text())
 
 
@@ -71,23 +66,3 @@ def test_decoders(expected: dict[str, Any]) -> None:
     assert found["count"] == expected["count"]
     for name, values in expected["rows"].items():
         assert found["rows"][name] == pytest.approx(values, abs=1e-5, rel=1e-5)
-
-
-@pytest.mark.parametrize("unit", [0.001, 1.0, 1e5])
-@pytest.mark.parametrize("activated", ["", "scales", "opacities", "scales and opacities"])
-def test_activated_models(tmp_path: Path, unit: float, activated: str) -> None:
-    scales, opacities = unit * ACTIVATED["scales"].reshape(-1, 3), ACTIVATED["opacities"]
-    count = len(opacities)
-    model = Gaussians(
-        means=unit * ACTIVATED["means"].reshape(-1, 3),
-        quats=torch.tensor([1.0, 0, 0, 0]).repeat(count, 1),
-        log_scales=scales if "scales" in activated else scales.log(),
-        opacity_logits=opacities if "opacities" in activated else opacities.logit(),
-        sh=torch.zeros(count, 1, 3),
-    )
-    write_model(tmp_path / "model.ply", model)
-    if not activated:
-        assert len(read_model(tmp_path / "model.ply")) == count
-        return
-    with pytest.raises(InputError, match=f"its {activated} are those that renderers use"):
-        read_model(tmp_path / "model.ply")

@@ -13,7 +13,7 @@ class KeyssViewer extends HTMLElement {
     super();
     const root = this.attachShadow({ mode: 'open' });
     root.adoptedStyleSheets = [STYLE];
-    this.frame.allow = 'fullscreen; clipboard-write';
+    this.frame.allow = 'fullscreen';
     root.append(this.frame);
   }
 

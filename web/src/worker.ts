@@ -19,7 +19,6 @@ export interface Question {
 
 export interface Answer {
   readonly model?: Gaussians;
-  readonly leftOut?: number; // Gaussians dropped from the file
   readonly foreign?: number; // Gaussians added to or changed in the published file
   readonly file?: HiddenFile;
   readonly elsewhere?: boolean; // only `keyss reveal` opens the content
@@ -44,8 +43,8 @@ function whileSearched(derive: Derive): Derive {
 
 async function load(bytes: Uint8Array, name: string | undefined, tell: Tell): Promise<void> {
   const read = await readModel(bytes, name);
-  const { codes, leftOut, ...model } = read;
-  tell({ model, leftOut });
+  const { codes, ...model } = read;
+  tell({ model });
   stego = model;
   // After the answer, so that the picture comes first. Without enough memory no key opens anything.
   prepared = new Promise((resolve) => setTimeout(resolve, 0)).then(() => preparedFor(read)).catch(() => null);

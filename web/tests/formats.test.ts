@@ -1,8 +1,8 @@
 import { expect, test } from 'vitest';
-import { emptyGaussians, selected } from '../src/core/gaussians.ts';
+import { selected } from '../src/core/gaussians.ts';
 import { readModel } from '../src/files/models.ts';
 import { joined } from '../src/core/bytes.ts';
-import { column, openPly, writePly } from '../src/files/ply.ts';
+import { openPly } from '../src/files/ply.ts';
 import { unzipped } from '../src/files/sog.ts';
 import { columns, jsonVector, modelOf, vector } from './vectors.ts';
 
@@ -31,21 +31,9 @@ test('.splat is identified by its suffix', async () => {
   await expect(readModel(vector('published.splat'))).rejects.toThrow(/^This is not a file of a 3D Gaussian Splatting model/);
 });
 
-test('ascii .ply equals binary .ply bit for bit', async () => {
-  const bytes = vector('carried.ply');
-  const file = openPly(bytes);
-  const [vertex] = file.elements;
-  const values = vertex.properties.map(({ name }) => column(file, vertex, name)!);
-  const rows = Array.from({ length: vertex.count }, (_, row) => values.map((each) => each[row]).join(' ')).join('\r\n');
-  const head = new TextDecoder('latin1').decode(bytes.subarray(0, vertex.start)).replace('binary_little_endian', 'ascii');
-  const text = (body: string): Uint8Array => new TextEncoder().encode(head + body);
-  expect(columns(await readModel(text(rows)))).toEqual(columns(await readModel(bytes)));
-  await expect(readModel(text(rows.slice(0, -40)))).rejects.toThrow('This is not a whole .ply file.');
-  const first = rows.split(' ', 1)[0];
-  for (const infinite of ['nan', 'inf', '-Infinity', '-NAN']) {
-    expect((await readModel(text(rows.replace(first, infinite)))).leftOut).toBe(1);
-  }
-  await expect(readModel(text(rows.replace(/\d/, 'x')))).rejects.toThrow('This is not a whole .ply file.');
+test('a .ply in text is refused with advice', async () => {
+  const text = new TextDecoder('latin1').decode(vector('carried.ply')).replace('binary_little_endian', 'ascii');
+  await expect(readModel(new TextEncoder().encode(text))).rejects.toThrow(/^This .ply file is text: keyss view converts it\.$/);
 });
 
 /** `file` with one number of one row of each of these properties replaced. */
@@ -58,14 +46,14 @@ function withNumbers(file: Uint8Array, row: number, numbers: Record<string, numb
   return bytes;
 }
 
-test('non-finite Gaussians of a .ply are dropped and counted', async () => {
+test('non-finite Gaussians of a .ply are dropped', async () => {
   const whole = await readModel(vector('carried.ply'));
   let bytes = vector('carried.ply');
   for (const [row, name] of ['x', 'f_dc_1', 'f_rest_44', 'opacity', 'scale_2', 'rot_3'].entries()) {
     bytes = withNumbers(bytes, 3 * row, { [name]: name === 'rot_3' ? -Infinity : NaN });
   }
-  const { leftOut, ...found } = await readModel(bytes);
-  expect(leftOut).toBe(6);
+  const found = await readModel(bytes);
+  expect(found.count).toBe(whole.count - 6);
   const rows = [...Array(whole.count).keys()].filter((row) => row > 15 || row % 3);
   expect(columns(found)).toEqual(columns(selected(whole, rows)));
 });
@@ -73,7 +61,6 @@ test('non-finite Gaussians of a .ply are dropped and counted', async () => {
 test('infinite log scales and opacity logits are clamped', async () => {
   const flat = withNumbers(vector('carried.ply'), 1, { scale_0: -Infinity, opacity: Infinity });
   const found = await readModel(withNumbers(flat, 2, { opacity: -Infinity }));
-  expect(found.leftOut).toBe(0);
   expect(Math.exp(found.logScales[3])).toBeCloseTo(2 ** -126, 42);
   expect([...found.opacityLogits.subarray(1, 3)]).toEqual([16, -16]);
 });
@@ -88,25 +75,6 @@ test('files without drawable Gaussians are refused with advice', async () => {
   const none = Array.from({ length: vertex.count }).reduce<Uint8Array>((file, _, row) => withNumbers(file, row, nan), bytes);
   await expect(readModel(none)).rejects.toThrow(/^This file holds numbers that are not finite: export it again/);
 });
-
-const ACTIVATED = jsonVector<Record<'means' | 'scales' | 'opacities', number[]>>('activated.json');
-const KINDS = ['', 'scales', 'opacities', 'scales and opacities'];
-
-test.each([0.001, 1, 1e5].flatMap((unit) => KINDS.map((activated) => [activated, unit] as const)))(
-  'activated %s are refused in units of %d',
-  async (activated, unit) => {
-    const { means, scales, opacities } = ACTIVATED;
-    const [isScale, isOpacity] = ['scales', 'opacities'].map((each) => activated.includes(each));
-    const file = writePly({
-      ...emptyGaussians(opacities.length, 0),
-      means: Float32Array.from(means, (each) => unit * each),
-      logScales: Float32Array.from(scales, (each) => (isScale ? unit * each : Math.log(unit * each))),
-      opacityLogits: Float32Array.from(opacities, (each) => (isOpacity ? each : Math.log(each / (1 - each)))),
-    });
-    if (activated === '') expect((await readModel(file)).count).toBe(opacities.length);
-    else await expect(readModel(file)).rejects.toThrow(`This file's ${activated} are those that renderers use: export`);
-  },
-);
 
 test('archives with too many members or false sizes are refused', async () => {
   const bytes = vector('published.sog');

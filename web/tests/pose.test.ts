@@ -2,7 +2,7 @@ import { expect, test } from 'vitest';
 import { emptyGaussians, type Gaussians } from '../src/core/gaussians.ts';
 import { dot } from '../src/core/similarity.ts';
 import {
-  add, transferPose, axes, difference, FIELD_OF_VIEW, firstPose, length, pick, poseOfHash, poseToHash, orbit, UPS, upName,
+  add, transferPose, axes, difference, FIELD_OF_VIEW, firstPose, length, poseOfHash, poseToHash, orbit, UPS, upName,
   type Vector,
 } from '../src/page/pose.ts';
 
@@ -82,12 +82,4 @@ test('orbiting keeps the distance and stops below the pole', () => {
   const offset = orbit([0, 0, -4], UPS['-y'], 1, 10);
   expect(length(offset)).toBeCloseTo(4);
   expect(dot(offset, UPS['-y'])).toBeLessThan(4);
-});
-
-test('picking returns the nearest Gaussian on a ray', () => {
-  const model = emptyGaussians(3, 0);
-  model.means.set([0, 0, 5, 0, 0, 2, 1, 0, 1]);
-  model.opacityLogits.set([3, 3, 3]);
-  expect(pick(model, [0, 0, 0], [0, 0, 3])).toEqual([0, 0, 2]);
-  expect(pick(model, [0, 0, 0], [0, 1, 0])).toBeNull();
 });

@@ -12,7 +12,8 @@ interface Revealed extends Shown {
   payload?: string;
 }
 
-const REVEALED = jsonVector<Revealed[]>('revealed.json');
+// Secrets in the codes of a decoded .ply need `keyss reveal`.
+const REVEALED = jsonVector<Revealed[]>('revealed.json').filter(({ file }) => !file.startsWith('decoded-'));
 
 /** In the first channel in which it opens something: to look into all of them would take ten times as long. */
 async function opened(stego: ReadModel, key: string): Promise<Content | null> {

@@ -1,4 +1,4 @@
-/** The content of channels, and Gaussians of other models; counterpart of `keyss.channels.base` and `sketch`. */
+/** The content of channels, and Gaussians of other models; counterpart of `keyss.channels.base` and `mixing`. */
 import { bytesKey, viewOf } from '../core/bytes.ts';
 import { damaged } from '../core/errors.ts';
 import { blockwise, type Derive, expand } from '../keys/keys.ts';

@@ -75,7 +75,7 @@ export function readCompressedPly(file: PlyFile): Gaussians & { readonly codes: 
 }
 
 /** The Gaussians, with harmonics of zero. */
-export function dequantiseCompressedPly(codes: CompressedPlyCodes): Gaussians {
+function dequantiseCompressedPly(codes: CompressedPlyCodes): Gaussians {
   const { count, shDegree, positions, scales, rotations, colours } = codes;
   const between = (bounds: Bounds, row: number, axis: number, share: number): number => {
     const [low, high] = bounds[axis].map((each) => each[Math.floor(row / CHUNK)]);

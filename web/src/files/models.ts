@@ -4,7 +4,7 @@ import { damaged, InputError } from '../core/errors.ts';
 import type { Gaussians } from '../core/gaussians.ts';
 import { gaussiansOf, SH_C0 } from './coded.ts';
 import { type CompressedPlyCodes, isCompressed, readCompressedPly } from './compressed_ply.ts';
-import { type FiniteGaussians, openPly, readPly, withoutNonFinite } from './ply.ts';
+import { openPly, readPly, withoutNonFinite } from './ply.ts';
 import { type Decode, readSog, type SogCodes } from './sog.ts';
 import { readSpz, type SpzCodes } from './spz.ts';
 
@@ -14,7 +14,6 @@ export type Codes = SpzCodes | SogCodes | CompressedPlyCodes;
 /** A file's model. Derived models must not keep the codes. */
 export interface ReadModel extends Gaussians {
   readonly codes?: Codes;
-  readonly leftOut?: number; // Gaussians dropped because they are not finite
 }
 
 /** `decode`: decoder for the images of a .sog. Raises InputError for unknown formats and damaged files. */
@@ -34,7 +33,7 @@ const MIN_SCALE = 2 ** -126;
 const ROW = 32; // bytes: mean and scale as floats; red, green, blue, opacity and quaternion as bytes
 
 /** The finite Gaussians of a file. Raises InputError. */
-function readSplat(bytes: Uint8Array): FiniteGaussians {
+function readSplat(bytes: Uint8Array): Gaussians {
   if (bytes.length === 0 || bytes.length % ROW) throw damaged();
   const view = viewOf(bytes);
   return withoutNonFinite(gaussiansOf(bytes.length / ROW, 0, {

@@ -1,14 +1,11 @@
 /** Reader and writer of the Inria .ply layout. Input is untrusted: defects raise InputError. */
-import { ascii, joined, quantile, viewOf } from '../core/bytes.ts';
+import { ascii, joined, viewOf } from '../core/bytes.ts';
 import { InputError } from '../core/errors.ts';
 import { coefficients, COLUMNS, emptyGaussians, type Gaussians, where } from '../core/gaussians.ts';
 
 const MAX_HEADER_BYTES = 65536;
-const [SPACE, MAX_DIGITS] = [32, 100];
 const OPACITY_LOGIT_BOUND = 16; // replaces infinity
 const LEAST_LOG_SCALE = -87.33654; // replaces minus infinity
-// Criteria for activated scales, as in keyss.files.ply_table.
-const [ENOUGH, NEARLY_ALL, SMALL_SCALE, LARGE, RATIO] = [100, 0.99, 0.2, 0.3, 20];
 
 /** Size in bytes and DataView method of each type, by both of its names. */
 const TYPES = new Map(([
@@ -33,33 +30,31 @@ export interface Element {
   readonly start: number; // byte of the file
 }
 
-/** A binary .ply, or the numbers of an ascii one as doubles. */
 export interface PlyFile {
   readonly bytes: Uint8Array;
   readonly littleEndian: boolean;
   readonly elements: readonly Element[];
 }
 
-/** Finds the elements of a file, which end inside it. Raises InputError. */
+/** Finds the elements of a binary file, which end inside it. Raises InputError. */
 export function openPly(bytes: Uint8Array): PlyFile {
   const text = new TextDecoder('latin1').decode(bytes.subarray(0, MAX_HEADER_BYTES));
   const header = /^ply\r?\n(?:[^]*?\n)?end_header\r?\n/.exec(text)?.[0] ?? '';
   const format = /\nformat (\S+)/.exec(header)?.[1] ?? '';
-  if (!['ascii', 'binary_little_endian', 'binary_big_endian'].includes(format)) throw notWhole();
-  const isText = format === 'ascii';
-  let start = isText ? 0 : header.length;
-  const elements = elementsOf(header, isText).map((each) => {
+  if (format === 'ascii') throw new InputError('This .ply file is text: keyss view converts it.');
+  if (!['binary_little_endian', 'binary_big_endian'].includes(format)) throw notWhole();
+  let start = header.length;
+  const elements = elementsOf(header).map((each) => {
     const element = { ...each, start };
     start += each.count * each.stride;
     return element;
   });
-  const data = isText ? doublesOf(bytes.subarray(header.length), start / 8) : bytes;
-  if (start > data.length) throw notWhole();
-  return { bytes: data, littleEndian: format !== 'binary_big_endian', elements };
+  if (start > bytes.length) throw notWhole();
+  return { bytes, littleEndian: format !== 'binary_big_endian', elements };
 }
 
 /** The elements of a header. Raises InputError. */
-function elementsOf(header: string, isText: boolean): Omit<Element, 'start'>[] {
+function elementsOf(header: string): Omit<Element, 'start'>[] {
   const elements: { name: string; count: number; properties: Property[]; stride: number }[] = [];
   for (const line of header.split(/\r?\n/).slice(1)) {
     const words = line.trim().split(/\s+/);
@@ -67,36 +62,12 @@ function elementsOf(header: string, isText: boolean): Omit<Element, 'start'>[] {
     if (words[0] === 'element' && /^[0-9]{1,15}$/.test(words[2] ?? '')) {
       elements.push({ name: words[1], count: Number(words[2]), properties: [], stride: 0 });
     } else if (words[0] === 'property' && words.length === 3 && last && TYPES.has(words[1])) {
-      const type = isText ? 'double' : words[1];
-      last.properties.push({ name: words[2], type, offset: last.stride });
-      last.stride += TYPES.get(type)!.size;
+      last.properties.push({ name: words[2], type: words[1], offset: last.stride });
+      last.stride += TYPES.get(words[1])!.size;
     } else if (words[1] === 'list') throw noModel(); // a mesh
     else if (!['', 'comment', 'obj_info', 'format', 'end_header'].includes(words[0])) throw notWhole();
   }
   return elements;
-}
-
-/** The `count` first numbers of a text as little-endian doubles. Raises InputError for fewer. */
-function doublesOf(text: Uint8Array, count: number): Uint8Array {
-  if (2 * count - 1 > text.length) throw notWhole(); // each takes a digit and a separator
-  const values = new DataView(new ArrayBuffer(8 * count));
-  for (let index = 0, at = 0; index < count; index++) {
-    while (text[at] <= SPACE) at++;
-    const start = at;
-    while (text[at] > SPACE) at++;
-    if (at === start || at - start > MAX_DIGITS) throw notWhole();
-    values.setFloat64(8 * index, numberOf(String.fromCharCode(...text.subarray(start, at))), true);
-  }
-  return new Uint8Array(values.buffer);
-}
-
-/** Parses a number, NaN and infinities included. Raises InputError. */
-function numberOf(text: string): number {
-  const found = Number(text);
-  if (!Number.isNaN(found) || /^[+-]?nan$/i.test(text)) return found;
-  const [, sign] = /^([+-]?)inf(?:inity)?$/i.exec(text) ?? [];
-  if (sign === undefined) throw notWhole();
-  return sign === '-' ? -Infinity : Infinity;
 }
 
 /** The values of a property; null if there is none. */
@@ -112,7 +83,7 @@ export function column({ bytes, littleEndian }: PlyFile, element: Element, name:
 }
 
 /** The finite Gaussians of a file. Raises InputError for anything other than a complete 3DGS model. */
-export function readPly(file: PlyFile): FiniteGaussians {
+export function readPly(file: PlyFile): Gaussians {
   const vertex = file.elements.find((each) => each.name === 'vertex');
   const rest = vertex?.properties.filter((each) => /^f_rest_[0-9]+$/.test(each.name)).length ?? 0;
   const shDegree = [0, 9, 24, 45].indexOf(rest);
@@ -132,43 +103,18 @@ export function readPly(file: PlyFile): FiniteGaussians {
   for (const [at, logScale] of found.logScales.entries()) {
     if (logScale === -Infinity) found.logScales[at] = LEAST_LOG_SCALE;
   }
-  const kept = withoutNonFinite(found);
-  checkNotActivated(kept);
-  return kept;
-}
-
-/** Raises InputError for scales and opacities where logarithms and logits are expected. */
-function checkNotActivated({ count, means, logScales, opacityLogits }: Gaussians): void {
-  if (count < ENOUGH) return;
-  const step = Math.floor(count / ENOUGH);
-  const rows = Array.from({ length: Math.ceil(count / step) }, (_, at) => at * step);
-  const axes = [0, 1, 2].map((axis) => rows.map((row) => means[3 * row + axis]));
-  const middles = axes.map((each) => quantile(each, 0.5));
-  const spread = quantile(rows.map((_, at) => Math.max(...axes.map((each, axis) => Math.abs(each[at] - middles[axis])))), 0.5);
-  const scales = rows.flatMap((row) => [...logScales.subarray(3 * row, 3 * row + 3)]);
-  const [least, middle, most] = [0.05, 0.5, 0.95].map((share) => quantile(scales, share));
-  const large = middle < SMALL_SCALE || Math.exp(middle) > LARGE * spread || most > RATIO * least;
-  const [low, high] = [Math.min, Math.max].map((pick) => opacityLogits.reduce((a, b) => pick(a, b)));
-  const wrong: string[] = [];
-  if (large && scales.filter((each) => each > 0).length > NEARLY_ALL * scales.length) wrong.push('scales');
-  if (low >= 0 && high <= 1 && high - low > 0.5) wrong.push('opacities');
-  if (wrong.length === 0) return;
-  throw new InputError(`This file's ${wrong.join(' and ')} are those that renderers use: export it again without activating them.`);
-}
-
-export interface FiniteGaussians extends Gaussians {
-  readonly leftOut: number; // Gaussians dropped
+  return withoutNonFinite(found);
 }
 
 /** The Gaussians with finite values only. Raises InputError if there are none. */
-export function withoutNonFinite(gaussians: Gaussians): FiniteGaussians {
-  if (isFinite(gaussians)) return { ...gaussians, leftOut: 0 };
+export function withoutNonFinite(gaussians: Gaussians): Gaussians {
+  if (isFinite(gaussians)) return gaussians;
   const widths = COLUMNS.map((each) => [gaussians[each], gaussians[each].length / gaussians.count] as const);
   const found = where(gaussians, (row) =>
     widths.every(([values, width]) => values.subarray(row * width, (row + 1) * width).every(Number.isFinite)),
   );
   if (found.count === 0) throw notFinite();
-  return { ...found, leftOut: gaussians.count - found.count };
+  return found;
 }
 
 /** Raises InputError for values that are not finite. */

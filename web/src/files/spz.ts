@@ -106,7 +106,7 @@ function codesOf({ sizes, ...header }: Header & { sizes: number[] }, section: (s
   return { kind: 'spz', ...header, positions, alphas, colours, scales, largest, rotations, harmonics };
 }
 
-export function dequantiseSpz(codes: SpzCodes): Gaussians {
+function dequantiseSpz(codes: SpzCodes): Gaussians {
   const { count, version, shDegree, fractionalBits, positions, alphas, colours, scales, largest, rotations, harmonics } = codes;
   const rest = coefficients(shDegree) - 1;
   const part = (code: number): number =>

@@ -1,4 +1,4 @@
-/** Camera controls by mouse, touch and keyboard: orbiting the target, or flying. */
+/** Camera controls by mouse, touch and keyboard. */
 import { add, axes, difference, length, type Pose, orbit, type Vector } from './pose.ts';
 
 const TURN = 0.005; // radians per pixel
@@ -6,15 +6,12 @@ const KEY_TURN = 0.08; // radians per press of an arrow key
 const KEY_STEP = 0.06; // of the distance per press
 const KEY_ZOOM = 1.1;
 const ROTATION = 0.0003; // radians per ms
-const [DECAY, RELEASED, STILL] = [150, 80, 1e-5]; // inertia: time constant; ms since the last movement; radians per ms
 const [NEAREST, FURTHEST] = [1e-4, 1e5];
 
 export class Controls {
-  flying = false;
   onRotate = (_: boolean): void => undefined; // receives whether auto-rotation is on
   isRotating = false;
   private frame = 0; // the next animation frame
-  private velocity = { azimuth: 0, elevation: 0, at: 0 }; // radians per ms in the last movement
   private readonly pointers = new Map<number, { x: number; y: number }>();
 
   /** `onPose` receives every new pose; `home` returns the first one. */
@@ -30,9 +27,7 @@ export class Controls {
     });
     canvas.addEventListener('pointermove', (event) => this.drag(event, canvas.clientHeight));
     for (const name of ['pointerup', 'pointercancel'] as const) {
-      canvas.addEventListener(name, (event) => {
-        if (this.pointers.delete(event.pointerId) && !this.pointers.size) this.glide();
-      });
+      canvas.addEventListener(name, (event) => this.pointers.delete(event.pointerId));
     }
     canvas.addEventListener('contextmenu', (event) => event.preventDefault());
     canvas.addEventListener('wheel', (event) => {
@@ -52,42 +47,18 @@ export class Controls {
   /** Auto-rotates until the user moves the camera. */
   rotate(on: boolean): void {
     cancelAnimationFrame(this.frame);
-    if (on) {
-      this.animate((passed) => {
-        this.turn(passed * ROTATION, 0);
-        return true;
-      });
-    }
+    let before = performance.now();
+    const next = (now: number): void => {
+      this.turn(Math.max(0, now - before) * ROTATION, 0);
+      before = now;
+      this.frame = requestAnimationFrame(next);
+    };
+    if (on) this.frame = requestAnimationFrame(next);
     this.isRotating = on;
     this.onRotate(on);
   }
 
-  /** Inertia after a drag. */
-  private glide(): void {
-    const { azimuth, elevation, at } = this.velocity;
-    if (performance.now() - at > RELEASED || window.matchMedia('(prefers-reduced-motion: reduce)').matches) return;
-    let share = 1;
-    this.animate((passed) => {
-      share *= Math.exp(-passed / DECAY);
-      this.turn(passed * share * azimuth, passed * share * elevation);
-      return share * Math.hypot(azimuth, elevation) > STILL;
-    });
-  }
-
-  /** Calls `step` with the milliseconds since the last frame until it returns false. */
-  private animate(step: (passed: number) => boolean): void {
-    cancelAnimationFrame(this.frame);
-    let before = performance.now();
-    const next = (now: number): void => {
-      const more = step(Math.max(0, now - before));
-      before = now;
-      if (more) this.frame = requestAnimationFrame(next);
-    };
-    this.frame = requestAnimationFrame(next);
-  }
-
   private touch(): void {
-    cancelAnimationFrame(this.frame);
     if (this.isRotating) this.rotate(false);
   }
 
@@ -96,13 +67,8 @@ export class Controls {
     if (before === undefined) return;
     const [dx, dy] = [event.clientX - before.x, event.clientY - before.y];
     if (this.pointers.size === 2) this.pinch(event, dx, dy, height);
-    else if (event.shiftKey || event.buttons & 6) this.fly(-dx / height, -dy / height, 0);
-    else {
-      const [azimuth, elevation] = [dx * TURN, (this.flying ? -dy : dy) * TURN];
-      const passed = Math.max(1, event.timeStamp - this.velocity.at);
-      this.velocity = { azimuth: azimuth / passed, elevation: elevation / passed, at: event.timeStamp };
-      this.turn(azimuth, elevation);
-    }
+    else if (event.shiftKey || event.buttons & 6) this.move(-dx / height, -dy / height, 0);
+    else this.turn(dx * TURN, dy * TURN);
     this.pointers.set(event.pointerId, { x: event.clientX, y: event.clientY });
   }
 
@@ -111,7 +77,7 @@ export class Controls {
     const own = this.pointers.get(event.pointerId)!;
     const span = (x: number, y: number): number => Math.max(1, Math.hypot(x - other.x, y - other.y));
     this.zoom(span(own.x, own.y) / span(event.clientX, event.clientY));
-    this.fly(-dx / (2 * height), -dy / (2 * height), 0);
+    this.move(-dx / (2 * height), -dy / (2 * height), 0);
   }
 
   private press(event: KeyboardEvent): void {
@@ -121,12 +87,12 @@ export class Controls {
       ArrowRight: () => this.turn(-KEY_TURN, 0),
       ArrowUp: () => this.turn(0, KEY_TURN),
       ArrowDown: () => this.turn(0, -KEY_TURN),
-      w: () => this.fly(0, 0, KEY_STEP),
-      s: () => this.fly(0, 0, -KEY_STEP),
-      a: () => this.fly(-KEY_STEP, 0, 0),
-      d: () => this.fly(KEY_STEP, 0, 0),
-      q: () => this.fly(0, KEY_STEP, 0),
-      e: () => this.fly(0, -KEY_STEP, 0),
+      w: () => this.move(0, 0, KEY_STEP),
+      s: () => this.move(0, 0, -KEY_STEP),
+      a: () => this.move(-KEY_STEP, 0, 0),
+      d: () => this.move(KEY_STEP, 0, 0),
+      q: () => this.move(0, KEY_STEP, 0),
+      e: () => this.move(0, -KEY_STEP, 0),
       '+': () => this.zoom(1 / KEY_ZOOM),
       '=': () => this.zoom(1 / KEY_ZOOM),
       '-': () => this.zoom(KEY_ZOOM),
@@ -139,11 +105,10 @@ export class Controls {
     action();
   }
 
-  /** Orbits the target or, when flying, looks around. */
+  /** Orbits the target. */
   private turn(azimuth: number, elevation: number): void {
     const { eye, target, up } = this.pose;
-    if (this.flying) this.setPose({ eye, target: add(eye, orbit(difference(target, eye), up, azimuth, elevation)), up });
-    else this.setPose({ eye: add(target, orbit(difference(eye, target), up, azimuth, elevation)), target, up });
+    this.setPose({ eye: add(target, orbit(difference(eye, target), up, azimuth, elevation)), target, up });
   }
 
   private zoom(factor: number): void {
@@ -151,12 +116,11 @@ export class Controls {
     const offset = difference(eye, target);
     const distance = length(offset);
     const bounded = Math.min(Math.max(distance * factor, NEAREST), FURTHEST);
-    if (this.flying) this.fly(0, 0, 1 - factor);
-    else this.setPose({ ...this.pose, eye: add(target, offset, bounded / distance) });
+    this.setPose({ ...this.pose, eye: add(target, offset, bounded / distance) });
   }
 
   /** Moves by shares of the distance to the target. */
-  private fly(right: number, down: number, forward: number): void {
+  private move(right: number, down: number, forward: number): void {
     const { eye, target } = this.pose;
     const directions = axes(this.pose);
     const distance = length(difference(target, eye));

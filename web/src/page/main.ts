@@ -7,12 +7,8 @@ import type { HiddenFile } from '../records/reveal.ts';
 import type { Answer, Question } from '../worker.ts';
 import { Controls } from './controls.ts';
 import { givenModel, notifyParent, params } from './embedding.ts';
-import { inspected, listenToInspection } from './inspection.ts';
 import { count, page, preparePanel, save, showKey } from './panel.ts';
-import {
-  add, axes, FIELD_OF_VIEW, firstPose, pick, type Pose, poseOfHash, poseToHash, transferPose, upName, UPS,
-  type Vector,
-} from './pose.ts';
+import { firstPose, type Pose, poseOfHash, poseToHash, transferPose, UPS } from './pose.ts';
 import { Viewer } from './viewer.ts';
 
 const ADDRESS_AFTER = 400; // ms after the last movement
@@ -82,15 +78,8 @@ class Page {
       event.preventDefault();
       void this.unlock();
     });
-    page.fly.addEventListener('click', () => {
-      this.controls.flying = !this.controls.flying;
-      page.fly.setAttribute('aria-pressed', String(this.controls.flying));
-    });
-    page.up.addEventListener('input', () => this.controls.setPose(this.firstPose(UPS[page.up.value])));
     this.controls.onRotate = (on) => page.rotate.setAttribute('aria-pressed', String(on));
     page.rotate.addEventListener('click', () => this.controls.rotate(!this.controls.isRotating));
-    page.link.hidden = !navigator.clipboard;
-    page.link.addEventListener('click', () => void this.copyLink());
     page.border.addEventListener('pointerdown', ({ pointerId }) => page.border.setPointerCapture(pointerId));
     page.border.addEventListener('pointermove', ({ pointerId, clientX }) => {
       if (!page.border.hasPointerCapture(pointerId)) return;
@@ -100,7 +89,6 @@ class Page {
     page.background.addEventListener('input', () => this.viewer?.setBackground(page.background.value));
     page.picture.addEventListener('webglcontextlost', () => this.say(INTERRUPTED));
     page.picture.addEventListener('webglcontextrestored', () => this.say(''));
-    page.picture.addEventListener('dblclick', (event) => this.lookAt(event));
     page.stop.addEventListener('click', () => this.opener.stop());
     page.home.addEventListener('click', () => this.controls.setPose(this.firstPose()));
     page.snapshot.addEventListener('click', () => void this.snapshot());
@@ -111,10 +99,6 @@ class Page {
     page.wipe.addEventListener('input', () => this.split(1 - Number(page.wipe.value) / 100));
     if (page.main.dataset.background) page.background.value = page.main.dataset.background;
     this.viewer?.setBackground(page.background.value);
-    listenToInspection(() => {
-      this.showPublished();
-      if (this.secret) this.split(1); // shows the public model
-    });
     window.addEventListener('hashchange', ({ newURL }) => {
       this.hash = new URL(newURL).hash; // location.hash may have been overwritten by the page
       const pose = poseOfHash(this.hash);
@@ -143,16 +127,15 @@ class Page {
     const own = this.startWork();
     this.say('Reading …');
     page.problem.textContent = this.viewer ? '' : NO_WEBGL;
-    const { model, leftOut, error } = await this.opener.ask({ bytes, name }, [bytes.buffer]);
+    const { model, error } = await this.opener.ask({ bytes, name }, [bytes.buffer]);
     if (own !== this.work) return;
     if (model === undefined) return this.fail(error ?? 'This file cannot be read.');
     [this.name, this.published] = [(this.work === 1 && params.title) || (page.main.dataset.title ?? name), model];
     this.hideSecret();
     page.open.disabled = page.key.disabled = false;
     page.facts.textContent = `${this.name}\n${count(model.count)} Gaussians, SH degree ${model.shDegree}`;
-    if (leftOut) page.facts.textContent += `\n${count(leftOut)} are left out: their numbers are not finite`;
     document.title = `${this.name} · keyss viewer`;
-    this.showPublished();
+    this.viewer?.show(model);
     this.controls.setPose(poseOfHash(this.hash) ?? poseOfHash(page.main.dataset.pose ?? '') ?? this.firstPose());
     await this.settle();
     this.say('');
@@ -262,26 +245,21 @@ class Page {
     if (picture) save(`${this.name.replace(/\.\w+$/, '') || 'view'}.png`, picture);
   }
 
-  private async copyLink(): Promise<void> {
-    this.writeAddress();
-    await navigator.clipboard.writeText(location.href).then(() => this.say('Link copied.'), () => this.say(location.href));
-  }
-
-  /** The first pose of the model shown, recomputed, as the window size or the up axis may have changed. */
-  private firstPose(up?: Vector): Pose {
+  /** The first pose of the model shown, recomputed, as the window size may have changed. */
+  private firstPose(): Pose {
     const model = this.secret ?? this.published;
     if (model === null) return this.pose;
     this.homes.delete(model);
-    return this.home(model, up);
+    return this.home(model);
   }
 
   /** A model's first pose; the published model is seen from the side of its training cameras. */
-  private home(model: Gaussians, up?: Vector): Pose {
-    const { camera, up: given } = page.main.dataset;
+  private home(model: Gaussians): Pose {
+    const { camera, up } = page.main.dataset;
     const aspect = page.picture.clientWidth / Math.max(1, page.picture.clientHeight) || 1;
     const isOwn = model === this.published;
-    const captured = isOwn && !up && !given ? poseOfHash(camera ?? '') : null;
-    const found = this.homes.get(model) ?? firstPose(model, aspect, up ?? (isOwn ? UPS[given ?? ''] : undefined), captured);
+    const captured = isOwn && !up ? poseOfHash(camera ?? '') : null;
+    const found = this.homes.get(model) ?? firstPose(model, aspect, isOwn ? UPS[up ?? ''] : undefined, captured);
     this.homes.set(model, found);
     return found;
   }
@@ -290,20 +268,8 @@ class Page {
     return from === to ? pose : transferPose(pose, this.home(from), this.home(to));
   }
 
-  /** Makes the clicked point the target. */
-  private lookAt({ offsetX, offsetY }: MouseEvent): void {
-    const { clientWidth: width, clientHeight: height } = page.picture;
-    const { right, down, forward } = axes(this.pose);
-    const scale = (2 * Math.tan((FIELD_OF_VIEW * Math.PI) / 360)) / height;
-    const ray = add(add(forward, right, (offsetX - width / 2) * scale), down, (offsetY - height / 2) * scale);
-    const model = this.secret ?? this.published;
-    const target = model && pick(model, this.pose.eye, ray);
-    if (target) this.controls.setPose({ ...this.pose, target });
-  }
-
   private setPose(pose: Pose): void {
     this.pose = pose;
-    page.up.value = upName(pose.up) ?? '';
     if (this.secret) this.viewer?.setPose(pose, 'right');
     this.viewer?.setPose(this.secret && this.published ? this.sameView(pose, this.secret, this.published) : pose);
     clearTimeout(this.addressTimer);
@@ -315,12 +281,6 @@ class Page {
     clearTimeout(this.addressTimer);
     const hash = poseToHash(this.pose);
     if (this.published && !this.secret && location.hash !== hash) history.replaceState(null, '', hash);
-  }
-
-  private showPublished(): void {
-    if (this.published === null) return;
-    const model = inspected(this.published);
-    this.viewer?.show(model.count ? model : null);
   }
 
   private async settle(): Promise<void> {

@@ -6,14 +6,12 @@ function all<T extends HTMLElement>() {
 }
 
 export const page = {
-  ...all()('main', 'border', 'drop', 'view', 'status', 'problem', 'facts', 'revealed', 'count'),
-  ...all<HTMLInputElement>()('file', 'key', 'wipe', 'threshold', 'faint', 'opaque', 'background'),
-  ...all<HTMLButtonElement>()('show', 'open', 'stop', 'fly', 'home', 'snapshot', 'download', 'close', 'save', 'rotate', 'fullscreen', 'link'),
-  ...all<HTMLSelectElement>()('up', 'colouring'),
+  ...all()('main', 'border', 'drop', 'view', 'status', 'problem', 'facts', 'revealed'),
+  ...all<HTMLInputElement>()('file', 'key', 'wipe', 'background'),
+  ...all<HTMLButtonElement>()('show', 'open', 'stop', 'home', 'snapshot', 'download', 'close', 'save', 'rotate', 'fullscreen'),
   ...all<HTMLCanvasElement>()('picture'),
   ...all<HTMLFormElement>()('form'),
   ...all<HTMLProgressElement>()('progress'),
-  ...all<HTMLOutputElement>()('shown'),
   ...all<HTMLFieldSetElement>()('drawn'),
   ...all<HTMLDetailsElement>()('controls', 'keying'),
   ...all<HTMLImageElement>()('poster'),

@@ -22,7 +22,6 @@ const [MOST, ALL] = [0.93, 0.995]; // shares of visible Gaussians in the first p
 const LITTLE = 1.15; // times the distance
 const FURTHEST = 2.5; // times the distance of the training cameras
 const MARGIN = 0.94; // of half the picture
-const NEAR = 0.01; // distance from a ray relative to the depth
 const STEEPEST = (85 * Math.PI) / 180;
 
 export const add = (a: Vector, b: Vector, scale = 1): Vector => [
@@ -115,20 +114,6 @@ export function orbit(offset: Vector, up: Vector, azimuth: number, elevation: nu
   const flat = unit(add(offset, up, -sine * distance));
   const [cosine, side] = [Math.cos(bounded) * distance, cross(up, flat)];
   return combined([cosine * Math.cos(azimuth), cosine * Math.sin(azimuth), Math.sin(bounded) * distance], [flat, side, up]);
-}
-
-/** The nearest mostly opaque point of a model along a ray from the eye; null if there is none. */
-export function pick(model: Gaussians, eye: Vector, ray: Vector): Vector | null {
-  let [found, nearest]: [Vector | null, number] = [null, Infinity];
-  const direction = unit(ray);
-  for (let row = 0; row < model.count; row++) {
-    if (model.opacityLogits[row] < 0) continue;
-    const offset: Vector = [0, 1, 2].map((axis) => model.means[3 * row + axis] - eye[axis]) as unknown as Vector;
-    const depth = dot(offset, direction);
-    if (depth <= 0 || depth > nearest || length(add(offset, direction, -depth)) > NEAR * depth) continue;
-    [found, nearest] = [add(eye, direction, depth), depth];
-  }
-  return found;
 }
 
 /** `#eye=x,y,z&target=x,y,z`, with `&up=z` or `&up=x,y,z` unless up is -y. `poseOfHash` is the inverse, null on errors. */

@@ -34,10 +34,9 @@ interface Field {
 
 /** The integers of a quantised model. */
 export interface Levels {
-  readonly unwritten: OfAxis; // three constant colours and the opacity as 32-bit words, which never change
+  readonly unwritten: OfAxis; // three constant colours and the opacity, which never change
   readonly fields: Field[];
   readonly rows: ArrayLike<number>; // Gaussians in the order in which bits are counted
-  readonly silent?: Uint8Array; // [N] 1 for Gaussians that carry nothing
 }
 
 /** The levels of a file. */
@@ -121,15 +120,14 @@ export function log2(value: number): number {
 }
 
 /** The last bits of all levels, each 0 or 1, in the order in which they are counted. */
-export function lastBits({ fields, rows, silent }: Levels): Uint8Array {
-  const count = ({ bits }: Field, row: number): number => (silent?.[row] ? 0 : bits(row));
+export function lastBits({ fields, rows }: Levels): Uint8Array {
   let size = 0;
-  for (const field of fields) for (let index = 0; index < rows.length; index++) size += count(field, rows[index]);
+  for (const field of fields) for (let index = 0; index < rows.length; index++) size += field.bits(rows[index]);
   const found = new Uint8Array(size);
   let at = 0;
   for (const field of fields) {
     for (let index = 0; index < rows.length; index++) {
-      const [own, level] = [count(field, rows[index]), field.level(rows[index])];
+      const [own, level] = [field.bits(rows[index]), field.level(rows[index])];
       for (let bit = 0; bit < own; bit++) found[at++] = (level >> bit) & 1;
     }
   }

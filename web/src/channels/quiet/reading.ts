@@ -1,6 +1,6 @@
 /**
  * Reads the low bits of a model, or the codes of a file, with a key; counterpart of `keyss.channels.quiet.contents` and
- * `parameters` (docs/byte-layout.md, "Parameters").
+ * `layout` (docs/byte-layout.md, "Parameters").
  *
  * A wrong key makes the same passes over all cells as a right one, and all salts are always tried, so the time taken
  * reveals next to nothing.
@@ -14,7 +14,6 @@ import { type Content, foreign, type Reader } from '../content.ts';
 import { type Codewords, decoded } from '../reed_solomon.ts';
 import { fieldsOf, gaussianIds, ID_BYTES, lowBits, lowWidth, saltOf, salts } from './bits.ts';
 import { type Cell, CellCipher, TAG_BYTES } from './cells.ts';
-import { decodedLevels } from './decoded.ts';
 import { BLOCK_BYTES, lastBits, type Levels, levelsOf, modelHash, readBlocks } from './fields.ts';
 
 const ASSOCIATED = ascii('keyss/v1/quiet');
@@ -36,10 +35,9 @@ export class QuietReader implements Reader {
     private readonly blocks = false, // the carriers are blocks of codes
   ) {}
 
-  /** The reader of the codes of a coded or decoded model, else of low bits; null without capacity. */
+  /** The reader of the codes of a coded model, else of low bits; null without capacity. */
   static of(model: ReadModel): QuietReader | null {
-    const levels = model.codes ? levelsOf(model.codes) : decodedLevels(model);
-    return levels ? QuietReader.ofCodes(levels) : QuietReader.ofLowBits(model);
+    return model.codes ? QuietReader.ofCodes(levelsOf(model.codes)) : QuietReader.ofLowBits(model);
   }
 
   private static ofLowBits(model: Gaussians): QuietReader | null {
