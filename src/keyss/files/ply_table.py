@@ -144,7 +144,7 @@ def ply_header(elements: Mapping[str, tuple[int, Iterable[str]]], comments: Iter
 
 
 def _read_header(file: BinaryIO) -> tuple[list[_Element], list[str]]:
-    """(elements, one of which is called vertex; comment lines). Leaves the file at the data."""
+    """Elements, `vertex` among them, and comment lines. Leaves the file at the data."""
     lines = _header_lines(file)
     if lines[0] != "ply":
         raise InputError("expected a .ply file, but it does not begin with a line 'ply'")

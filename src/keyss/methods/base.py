@@ -70,7 +70,7 @@ class Context:
     # 32 secret bytes that seed all randomness: equal bytes give equal files. None: the system's randomness.
     entropy: bytes | None = field(default=None, repr=False)
 
-    def keeping(self, name: str) -> dict[str, Any]:
+    def loop_arguments(self, name: str) -> dict[str, Any]:
         """Arguments of `keyss.fitting.loop.train` that save a training under `name` and report it."""
         checkpoint = self.checkpoints / f"{name}.safetensors" if self.checkpoints else None
         return {"checkpoint": checkpoint, "resume": self.resume, "reporter": self.reporter}

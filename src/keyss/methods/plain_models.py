@@ -73,7 +73,7 @@ def _fit_all(
             replace(config, seed=config.seed_of(f"{kind} {index}")),
             title=f"{titles[index]} ({scene.name})",
             device=context.device,
-            **context.keeping(f"{kind.split()[0]}-{index}"),
+            **context.loop_arguments(f"{kind.split()[0]}-{index}"),
         ).gaussians
         for index, (scene, config) in fits.items()
     }

@@ -34,7 +34,7 @@ _MAX_SHOWN = 60  # characters of an argument in a message
 
 @dataclass(frozen=True, kw_only=True)
 class Running:
-    """A stage that has begun and has not ended."""
+    """An unfinished stage."""
 
     stage: str
     arguments: dict[str, Any]  # must be equal to resume

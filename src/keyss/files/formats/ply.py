@@ -155,7 +155,7 @@ def _has_rows_of(model: Gaussians, read: Gaussians) -> bool:
 
 
 def _read_extras(path: Path, count: int) -> _Extras | None:
-    """The extras of a .ply of which `count` Gaussians were read; None if there are none."""
+    """The extras of a .ply; None if it has none. `count`: its Gaussians in the first read."""
     with open_input(path) as file, warnings.catch_warnings():
         warnings.simplefilter("ignore", KeyssWarning)  # about Gaussians left out, which the first read gave
         if not is_plain(file):

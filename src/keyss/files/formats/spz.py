@@ -119,7 +119,7 @@ def _gzip(content: bytes, like: bytes) -> bytes:
 
 
 def _deflated(content: bytes, level: int, memory: int, block: int) -> Iterator[bytes]:
-    """Parts of the deflated `content`, each `block` of which is compressed on its own."""
+    """Deflate `content` in independent blocks of `block` bytes, and yield the output in parts."""
     for start in range(0, len(content), block):
         own = memoryview(content)[start : start + block]
         packer = zlib.compressobj(level, zlib.DEFLATED, -zlib.MAX_WBITS, memory)

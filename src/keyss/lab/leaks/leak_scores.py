@@ -135,8 +135,8 @@ def look_for_secret(
     """Score attacks by their renders from the secret's test cameras against its photos.
 
     This is the strictest assumption: the attacker knows the cameras. `controls` are plain models of the
-    cover; `secret` has its test cameras in the cover's frame (`keyss.measure.in_cover`), of which at most 8
-    are used. Also returns images, uint8 [H, W, 3], by attack: its best variant on the stego model and on the
+    cover; `secret` has its test cameras in the cover's frame (`keyss.measure.in_cover`); at most 8 are used.
+    Also returns images, uint8 [H, W, 3], by attack: its best variant on the stego model and on the
     first control from the first test camera, and the photo. Raises UsageError without a control or test
     views.
     """

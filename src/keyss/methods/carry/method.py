@@ -215,7 +215,7 @@ def refit(
         rate=boost_of(fit) if photos else _MODEL_RATE,
         device=context.device,
         title=f"refit of the {name}",
-        **context.keeping(name.replace(" ", "-")),
+        **context.loop_arguments(name.replace(" ", "-")),
     ).gaussians
 
 

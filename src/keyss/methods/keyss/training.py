@@ -333,7 +333,7 @@ class KeyssTraining(TrainingRun):
                 "models": [source.model.digest() for source in sources],
                 "options": json.loads(json.dumps(asdict(self.options))),  # tuples become lists
             },
-            **context.keeping("joint"),
+            **context.loop_arguments("joint"),
         )
 
     def state(self) -> State:
