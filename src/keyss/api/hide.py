@@ -138,11 +138,7 @@ def hide(
         context = Context(target, folder.checkpoints if folder and trains else None, resume, reporter)
         sources, options = _fit_models(chosen, sources, options, context)
         plain = [each.model for each in sources]
-        context = replace(
-            context,
-            entropy=_entropy(keys, options, plain),
-            overwrites_cover=not (sources[0].photos or isinstance(cover, Gaussians)),
-        )
+        context = replace(context, entropy=_entropy(keys, options, plain))
         stego = chosen.hide(sources[0], sources[1:], options, context)
 
         published = with_extras(stego.gaussians, cover if cover_model is None else cover_model, plain[0])

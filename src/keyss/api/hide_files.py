@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from keyss.api.hide_arguments import check_keys
-from keyss.channels import AnyChannel, Format, Publish, channel_for, open_content
+from keyss.channels import AnyChannel, Format, Publish, channel_for, open_payload
 from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
@@ -78,7 +78,7 @@ def hide_files(
         name = stego_name(stego)
         there = folder.write({name: with_extras(stego, cover, model)}) if folder else None
         as_read = read_model(there / name) if there else stego
-        if [HiddenFile.of(open_content(as_read, key)) for key in keys] != hidden:
+        if [HiddenFile.of(open_payload(as_read, key)) for key in keys] != hidden:
             raise RuntimeError("the hidden files do not open again from the published file")
     return HideFilesResult(None if dry_run else stego, psnr_between(model, stego))
 

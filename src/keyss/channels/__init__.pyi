@@ -4,11 +4,8 @@ from .base import (
     METHOD_BYTES as METHOD_BYTES,
     Capacity as Capacity,
     Channel as Channel,
-    Content as Content,
     Payload as Payload,
     PreparedCover as PreparedCover,
-    RecordRequest as RecordRequest,
-    Records as Records,
     pack_method as pack_method,
     pack_payload as pack_payload,
     unpack_method as unpack_method,
@@ -20,8 +17,7 @@ from .names import AnyChannel as AnyChannel, Format as Format, Publish as Publis
 from .publishing import (
     SUFFIXES as SUFFIXES,
     channel_for as channel_for,
-    open_content as open_content,
-    quick_attempt as quick_attempt,
+    open_payload as open_payload,
     suffix_of as suffix_of,
 )
 from .quiet.bits import (
@@ -38,7 +34,6 @@ from .quiet.channel import (
     InCodes as InCodes,
     LowBitsCover as LowBitsCover,
 )
-from .quiet.contents import QuietReader as QuietReader
 from .quiet.fields import Field as Field, in_counted_order as in_counted_order, last_bits as last_bits
 from .quiet.layout import (
     TYPICAL_SHARE as TYPICAL_SHARE,
@@ -46,6 +41,7 @@ from .quiet.layout import (
     check_payload_fits as check_payload_fits,
     key_cipher as key_cipher,
 )
+from .quiet.payloads import QuietReader as QuietReader
 from .quiet.usable import (
     chance_of_bits as chance_of_bits,
     salt_rows as salt_rows,

@@ -1,8 +1,6 @@
 """The protocol of all channels: places in a published model where bits are stored and found with a key.
 
-A channel does not interpret its bits. Every channel carries *payloads*, bytes that are read completely or not
-at all. Low bits also carry *records*, many small pieces of one size, each found on its own: a lost Gaussian
-costs its own record only.
+A channel does not interpret its bits. It carries *payloads*, bytes that are read completely or not at all.
 
 The way of publication determines the channel (`publishing`); readers try all channels.
 """
@@ -18,7 +16,6 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import ClassVar, Protocol
 
-from keyss.core.arrays import Bytes, Integers
 from keyss.core.errors import InputError, KeyssWarning, UsageError, WrongKeyError
 from keyss.core.gaussians import Gaussians
 from keyss.keys.derivation import DerivedKey
@@ -46,44 +43,10 @@ class Payload:
     foreign: int = field(default=0, compare=False)  # estimate of those added or changed after hiding
 
 
-@dataclass(frozen=True)
-class RecordRequest:
-    """Records to embed, whose size the channel chooses."""
-
-    count: int
-    least_bytes: int  # minimum size of a record
-    header_bytes: int
-
-
-@dataclass(frozen=True)
-class RecordPlan:
-    """The channel's answer to a `RecordRequest`."""
-
-    record_bytes: int  # maximum size of a record
-    copies: int  # maximum number of records to embed twice
-    cells_per_carrier: int  # records per Gaussian
-    independent: bool = False  # True if it does not depend on other secrets
-
-
-@dataclass(frozen=True)
-class Records:
-    """Pieces of one size, each found on its own, in any order."""
-
-    method: str  # 1 to METHOD_BYTES ASCII characters
-    header: bytes  # parameters of the method, read completely or not at all
-    records: Bytes  # [R, size]
-    plan: RecordPlan
-    copied: Integers  # [C] indices of the most important records, embedded twice; empty when read
-    foreign: int = 0  # see `Payload`
-
-
-Content = Payload | Records
-
-
-def warn_of_foreign(content: Content) -> None:
+def warn_of_foreign(payload: Payload) -> None:
     """Warn (KeyssWarning) if Gaussians were added or changed after hiding."""
-    if content.foreign:
-        warnings.warn(_FOREIGN.format(content.foreign), KeyssWarning, stacklevel=4)
+    if payload.foreign:
+        warnings.warn(_FOREIGN.format(payload.foreign), KeyssWarning, stacklevel=4)
 
 
 def check_method(name: str) -> bytes:
@@ -124,13 +87,13 @@ class PreparedCover(Protocol):
 
     @property
     def capacity(self) -> Capacity:
-        """The capacity for payloads."""
+        """Its capacity."""
 
-    def embed(self, contents: Sequence[tuple[str, Content]], *, entropy: bytes | None = None) -> Gaussians:
-        """Embed one (key, content) per secret; contents are all payloads or all records.
+    def embed(self, payloads: Sequence[tuple[str, Payload]], *, entropy: bytes | None = None) -> Gaussians:
+        """Embed one (key, payload) per secret.
 
         `entropy`: at least 32 secret bytes from which all randomness is derived; by default the system's.
-        Raises UsageError for equal keys and for contents that do not fit. Warns (KeyssWarning) if the holder
+        Raises UsageError for equal keys and for payloads that do not fit. Warns (KeyssWarning) if the holder
         of one key can tell that there are other secrets.
         """
 
@@ -138,8 +101,8 @@ class PreparedCover(Protocol):
 class Reader(Protocol):
     """Reads the secrets of a stego model from one channel."""
 
-    def open(self, key: str) -> Content:
-        """The content that `key` opens. Raises WrongKeyError if it opens nothing, InputError for damage."""
+    def open(self, key: str) -> Payload:
+        """The payload that `key` opens. Raises WrongKeyError if it opens nothing, InputError for damage."""
 
 
 class SaltedReader(ABC):
@@ -148,19 +111,19 @@ class SaltedReader(ABC):
     salts: Sequence[bytes]  # the likeliest first
 
     @abstractmethod
-    def extract(self, key: DerivedKey) -> Content:
+    def extract(self, key: DerivedKey) -> Payload:
         """`open`, after key derivation with one salt."""
 
-    def open(self, key: str) -> Content:
+    def open(self, key: str) -> Payload:
         """See `Reader`. Changed or added Gaussians can replace the first salt, so several are tried.
 
         Each takes 0.1 s. Warns (KeyssWarning) of Gaussians that were added or changed after hiding.
         """
         for salt in self.salts[:SALTS_TRIED]:
             with suppress(WrongKeyError):
-                content = self.extract(DerivedKey.of(key, salt))
-                warn_of_foreign(content)
-                return content
+                payload = self.extract(DerivedKey.of(key, salt))
+                warn_of_foreign(payload)
+                return payload
         raise WrongKeyError()
 
 
@@ -170,7 +133,6 @@ class Channel(ABC):
     place: str  # in messages: "low bits", "codes of the spz file" and so on
     survives: ClassVar[bool] = False  # True if secrets survive conversion to other formats
     grows: ClassVar[bool] = False  # see `Capacity`
-    records: ClassVar[bool] = False  # True if the channel carries records
 
     @abstractmethod
     def prepare(self, cover: Gaussians) -> PreparedCover:
@@ -184,11 +146,9 @@ class Channel(ABC):
         """Estimate the capacity of a cover with `gaussians` carriers."""
 
 
-def pack_payload(content: Content) -> bytes:
-    """Pack a payload: name of the method, zero byte, data. Raises TypeError for records."""
-    if not isinstance(content, Payload):
-        raise TypeError("expected a payload: this channel carries no records")
-    return check_method(content.method) + b"\0" + content.data
+def pack_payload(payload: Payload) -> bytes:
+    """Pack a payload: name of the method, zero byte, data."""
+    return check_method(payload.method) + b"\0" + payload.data
 
 
 def unpack_payload(packed: bytes) -> Payload:

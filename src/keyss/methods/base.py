@@ -66,7 +66,6 @@ class Context:
     checkpoints: Path | None = None  # folder for the state of interrupted trainings
     resume: bool = False
     reporter: Reporter | None = None
-    overwrites_cover: bool = False  # nothing needs the cover's model afterwards: its memory may be used
     # 32 secret bytes that seed all randomness: equal bytes give equal files. None: the system's randomness.
     entropy: bytes | None = field(default=None, repr=False)
 

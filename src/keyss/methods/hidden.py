@@ -9,7 +9,7 @@ from typing import Literal
 
 from torch import Tensor
 
-from keyss.channels import Content, Payload
+from keyss.channels import Payload
 from keyss.core.errors import InputError, UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.similarity import Similarity
@@ -87,13 +87,13 @@ class HiddenFile:
         return Payload(FILE, bytes([len(name)]) + name + self.data)
 
     @staticmethod
-    def of(content: Content) -> HiddenFile:
-        """Read a payload. Raises InputError for other content and damage."""
-        if content.method != FILE or not isinstance(content, Payload):
+    def of(payload: Payload) -> HiddenFile:
+        """Read a payload. Raises InputError for a scene and damage."""
+        if payload.method != FILE:
             raise InputError("this key opens a scene, not a file: give a model as output, e.g. secret.ply")
-        size = content.data[0] if content.data else 0
-        name, data = content.data[1 : 1 + size], content.data[1 + size :]
-        if not content.data or len(name) < size:
+        size = payload.data[0] if payload.data else 0
+        name, data = payload.data[1 : 1 + size], payload.data[1 + size :]
+        if not payload.data or len(name) < size:
             raise InputError("the hidden file is damaged: its name is cut off")
         return HiddenFile(name.decode(errors="replace"), data)
 

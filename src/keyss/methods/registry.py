@@ -7,10 +7,10 @@ from importlib import import_module
 from operator import attrgetter
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from keyss.core.errors import InputError, UsageError, WrongKeyError
+from keyss.core.errors import InputError, UsageError
 
 if TYPE_CHECKING:
-    from keyss.channels import Content
+    from keyss.channels import Payload
     from keyss.core.gaussians import Gaussians
     from keyss.methods.base import Method, MethodOptions
     from keyss.methods.hidden import HiddenScene
@@ -22,7 +22,7 @@ class Modules(NamedTuple):
     summary: str  # one line, printed after the name
     options: str  # a `MethodOptions`, in a module that does not import torch
     hiding: str  # a `keyss.methods.base.Method`
-    opening: str  # turns content of a channel or a companion file into a `HiddenScene`
+    opening: str  # turns the payload of a channel or a companion file into a `HiddenScene`
 
 
 def _baseline(module: str, options: str, summary: str) -> Modules:
@@ -36,7 +36,7 @@ METHODS = {
         "the secrets' Gaussians, encrypted in the cover's",
         "keyss.methods.carry.options:CarryOptions",
         "keyss.methods.carry.method:METHOD",
-        "keyss.methods.records.carried_secret:unpack",
+        "keyss.methods.carry.secret:CarriedSecret.of",
     ),
     "keyss": Modules(
         "train one model and a decoder for all keys jointly, as the paper does",
@@ -90,23 +90,14 @@ def of_options(options: MethodOptions) -> Method:
     return get(name)
 
 
-def open_model(stego: Gaussians, key: str, *, decoy: bool = False) -> HiddenScene:
+def open_model(stego: Gaussians, key: str) -> HiddenScene:
     """The secret that `key` opens in a model (see `keyss.channels.publishing`).
 
-    Raises WrongKeyError for a key that opens nothing, InputError for damage. With `decoy`, such a key gives a
-    `Decoy` instead, and only one salt is tried: otherwise wrong keys would take longer than right ones.
+    Raises WrongKeyError for a key that opens nothing, InputError for damage.
     """
-    from keyss.channels import open_content, quick_attempt
-    from keyss.methods.decoy import Decoy
+    from keyss.channels import open_payload
 
-    if not decoy:
-        return _unpack(open_content(stego, key))
-    attempt = quick_attempt(stego, key)
-    if attempt is None:
-        raise WrongKeyError()
-    if attempt.content is None:
-        return Decoy.of(stego, attempt.key, appended=attempt.appended, records=attempt.records)
-    return _unpack(attempt.content)
+    return _unpack(open_payload(stego, key))
 
 
 def open_companion(data: bytes) -> HiddenScene:
@@ -116,15 +107,15 @@ def open_companion(data: bytes) -> HiddenScene:
     return _unpack(companion.unpack(data))
 
 
-def _unpack(content: Content) -> HiddenScene:
+def _unpack(payload: Payload) -> HiddenScene:
     from keyss.methods.hidden import FILE, HiddenFile, OpensAFileError
 
-    name = content.method
+    name = payload.method
     if name == FILE:
-        raise OpensAFileError(HiddenFile.of(content))
+        raise OpensAFileError(HiddenFile.of(payload))
     if name not in METHODS:
         raise InputError(
             f"the secret was hidden by the method {name!r}; this program has {', '.join(METHODS)}"
         )
-    unpack: Callable[[Content], HiddenScene] = _load(METHODS[name].opening)
-    return unpack(content)
+    unpack: Callable[[Payload], HiddenScene] = _load(METHODS[name].opening)
+    return unpack(payload)

@@ -44,7 +44,6 @@ from keyss.channels.base import (
     METHOD_BYTES,
     Capacity,
     Channel,
-    Content,
     Payload,
     SaltedReader,
     check_keys,
@@ -120,15 +119,15 @@ class AppendedCover:
     def capacity(self) -> Capacity:
         return APPENDED.estimate_capacity(len(self.cover), self.cover.sh_degree)
 
-    def embed(self, contents: Sequence[tuple[str, Content]], *, entropy: bytes | None = None) -> Gaussians:
+    def embed(self, payloads: Sequence[tuple[str, Payload]], *, entropy: bytes | None = None) -> Gaussians:
         """The cover followed by the appended Gaussians. Warns if there is more than one secret."""
         model = self.cover.detach().to("cpu")
         ids = _coarse_ids(model)
-        packed = [pack_payload(content) for _, content in contents]
+        packed = [pack_payload(payload) for _, payload in payloads]
         secret = randomness(entropy, *packed)
         salt = expand(secret, "appended/salt", SALT_BYTES)
         random = np.random.default_rng(np.frombuffer(stream(secret, "appended/random", 32), np.uint32))
-        keys = [DerivedKey.of(key, salt) for key, _ in contents]
+        keys = [DerivedKey.of(key, salt) for key, _ in payloads]
         check_keys([key.verifier() for key in keys])
         if len(keys) > 1:
             warnings.warn(_VISIBLE_SECRETS, KeyssWarning, stacklevel=2)

@@ -22,7 +22,6 @@ from keyss.channels.base import (
     NOT_INDEPENDENT,
     Capacity,
     Channel,
-    Content,
     Payload,
     check_keys,
     pack_payload,
@@ -99,18 +98,18 @@ class ColoursCover:
         carriers = len(planner.carriers.representatives)
         return Capacity(carriers, planner.bytes, _OVERHEAD, planner.share_with_another)
 
-    def embed(self, contents: Sequence[tuple[str, Content]], *, entropy: bytes | None = None) -> Gaussians:
+    def embed(self, payloads: Sequence[tuple[str, Payload]], *, entropy: bytes | None = None) -> Gaussians:
         """See `PreparedCover`. Also raises UsageError for a model that can carry nothing."""
-        payloads = [pack_payload(content) for _, content in contents]
-        secret = randomness(entropy, *payloads)
+        packed = [pack_payload(payload) for _, payload in payloads]
+        secret = randomness(entropy, *packed)
         random = np.random.default_rng(np.frombuffer(stream(secret, "colours/random", 32), np.uint32))
         carriers = renew_salts(self.planner.carriers, random)
         salt_rows, salts = find_salts(carriers)
         if len(salts) < SALTS:
             raise UsageError(_TOO_FEW)
-        secrets = [Secrets.of(key, salts) for key, _ in contents]
+        secrets = [Secrets.of(key, salts) for key, _ in payloads]
         check_keys([each.static for each in secrets])
-        sizes = [compressed_size(payload) + OVERHEAD for payload in payloads]
+        sizes = [compressed_size(each) + OVERHEAD for each in packed]
         found = self.planner.layouts(sizes)
         if found is None:
             raise UsageError(
@@ -132,7 +131,7 @@ class ColoursCover:
         headers = self._headers(layouts, sizes, file_key, carriers, _without_places(free, secrets, carriers))
         for lower in range(_LOWER + 1):  # the plan does not include the cost of headers and salts
             lowered = [replace(each, level=each.level and max(1, each.level - lower)) for each in headers]
-            stego = self._write(secrets, lowered, layouts, payloads, carriers, free, random)
+            stego = self._write(secrets, lowered, layouts, packed, carriers, free, random)
             if layouts[0].level == ONE or not self.planner.is_visible(stego):
                 break
         return stego

@@ -16,12 +16,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from hashlib import blake2b
 
 import numpy as np
 import torch
-from torch.autograd.graph import increment_version
 
 from keyss.core.arrays import Bytes, Doubles, Integers, Words32
 from keyss.core.gaussians import Gaussians
@@ -136,23 +135,13 @@ def read_low_bits(gaussians: Gaussians, layout: Layout | None = None) -> Bytes:
 
 
 def write_low_bits(
-    gaussians: Gaussians,
-    layout: Layout,
-    parts: Iterable[tuple[Integers, Bytes]],
-    *,
-    in_place: bool = False,
+    gaussians: Gaussians, layout: Layout, parts: Iterable[tuple[Integers, Bytes]]
 ) -> Gaussians:
     """Replace low bits: each of `parts` has distinct rows [R] and their new bytes [R, B].
 
-    If a Gaussian has half a byte more, that half byte keeps its value. `in_place`: change `gaussians`, whose
-    memory the result may share, instead of a copy.
+    If a Gaussian has half a byte more, that half byte keeps its value.
     """
-    written = gaussians.detach().to("cpu").map(torch.Tensor.contiguous)
-    if in_place:
-        for field in fields(written):
-            increment_version(getattr(written, field.name))  # NumPy writes, which PyTorch does not see
-    else:
-        written = written.map(torch.clone)
+    written = gaussians.detach().to("cpu").map(torch.Tensor.contiguous).map(torch.clone)
     geometry, harmonics = _written_fields(written, layout)
 
     for rows, data in parts:

@@ -9,20 +9,19 @@ tag: a reader decrypts all of them and keeps those with a valid tag.
   SALTS_TRIED salts; covers with as many stale salts are refused.
 - *Key cells*, encrypted under the key and a salt, hold the data key of a secret.
 - *Parameter cells*, encrypted under the data key, tell how to read the rest (see `layout`).
-- *Records* are encrypted under the data key: Gaussians, or numbered chunks of an encrypted payload (see
-  `layout`). Shuffling is harmless, and a removed Gaussian loses its own record only. *Copies* replace lost
-  records. In codes nothing may be lost or reordered: the payload is stored in the blocks after its header.
+- *Chunks* of the encrypted payload are numbered and redundant: shuffling is harmless, and a quarter of the
+  Gaussians may be lost. In codes nothing may be lost or reordered: the payload is stored in the blocks after
+  its header.
 
 Carriers are chosen at random, and unused usable carriers get noise, so the number of secrets does not show.
 All randomness is derived from `entropy`, which must be secret: otherwise the holder of one key could compute
 the file without the other secrets and compare. No key stream is used twice: data keys depend on entropy and
-all contents, and the key stream of a cell depends on its data (see `cells`).
+all payloads, and the key stream of a cell depends on its data (see `cells`).
 """
 
 from __future__ import annotations
 
 import hashlib
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
@@ -32,11 +31,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from keyss.channels.base import SALTS_TRIED, Capacity, Channel, Content, check_keys, randomness
+from keyss.channels.base import SALTS_TRIED, Capacity, Channel, Payload, check_keys, randomness
 from keyss.channels.mixing import random_fractions
 from keyss.channels.quiet import wet_paper
 from keyss.channels.quiet.bits import Layout, read_low_bits, write_low_bits
-from keyss.channels.quiet.contents import Writer, bytes_of
 from keyss.channels.quiet.decoded import Decoded
 from keyss.channels.quiet.fields import (
     FORMATS,
@@ -49,11 +47,19 @@ from keyss.channels.quiet.fields import (
     model_hash,
     with_levels,
 )
-from keyss.channels.quiet.layout import BLOCK_HEADER, LEAST_BYTES, MIN_BLOCKS, LowBitsCapacity
+from keyss.channels.quiet.layout import (
+    BLOCK_HEADER,
+    LEAST_BYTES,
+    MIN_BLOCKS,
+    TYPICAL_SHARE,
+    LowBitsCapacity,
+    check_width,
+)
+from keyss.channels.quiet.payloads import Writer
 from keyss.channels.quiet.usable import check_usable, salt, salt_rows, usable_with_ids
 from keyss.channels.quiet.writable_levels import fixed_axes, writable_levels
 from keyss.core.arrays import Bits, Bytes, Flags, Integers
-from keyss.core.errors import KeyssWarning, UsageError
+from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.files.formats.common import CodedGaussians, Codes
 from keyss.kernels.parallel import in_blocks
@@ -62,17 +68,12 @@ from keyss.keys.encryption import OVERHEAD
 
 _ATTEMPTS = 30  # to solve all blocks; each fails for at most one cover in a thousand
 _BITS_PER_GAUSSIAN = 18  # approximate capacity of codes
-_FIRST_IS_STALE = (
-    "the first salt of this model cannot be renewed: keys open it as usual, but not with `decoy=True`, which "
-    "tries the first salt only"
-)
 
 
 class LowBits(Channel):
     """The channel in the low bits of floats; see `keyss.channels.base.Channel`."""
 
     place = "low bits"
-    records = True
 
     def __init__(self) -> None:
         # Cache by cover, valid while its tensors keep their versions: (versions, usable, ids, rows of salts).
@@ -81,11 +82,12 @@ class LowBits(Channel):
         )
 
     def prepare(self, cover: Gaussians, *, sh_degree: int | None = None) -> LowBitsCover:
-        """See `Channel`. Raises UsageError for low bits that are not random, and for stale salts.
+        """See `Channel`. Raises UsageError for low bits that are few or not random, and for stale salts.
 
         `sh_degree`: 1 if harmonics of higher degrees must stay as they are, to the bit.
         """
         layout, versions = Layout.of(cover), _versions(cover)
+        check_width(layout)
         if (found := self._found.get(cover)) is None or found[0] != versions:
             usable, ids = usable_with_ids(cover, layout)
             check_usable(cover, usable, layout)
@@ -102,7 +104,8 @@ class LowBits(Channel):
         return LowBitsCover(cover, layout, *found[1:])
 
     def estimate_capacity(self, gaussians: int, sh_degree: int) -> Capacity:
-        return LowBitsCapacity.of(gaussians, sh_degree).for_payloads()
+        check_width(Layout(sh_degree))
+        return LowBitsCapacity.of(int(TYPICAL_SHARE * gaussians), sh_degree).for_payloads()
 
 
 LOW_BITS = LowBits()
@@ -142,42 +145,31 @@ class LowBitsCover:
     usable: Flags  # [N]
     ids: Bytes  # [N, 16] of all Gaussians
     salt_rows: Integers  # [S] rows of the salts' Gaussians, in order
-    overwrites: bool = False  # embedding changes the tensors of the cover instead of copies
 
     @property
     def capacity(self) -> Capacity:
-        return self.cells.for_payloads()
+        return LowBitsCapacity(len(self._rows), self.layout.width).for_payloads()
 
-    @property
-    def cells(self) -> LowBitsCapacity:
-        """The capacity for records."""
-        return LowBitsCapacity(len(self._rows), self.layout.width)
-
-    def embed(self, contents: Sequence[tuple[str, Content]], *, entropy: bytes | None = None) -> Gaussians:
-        """See `PreparedCover`. Takes 1.6 s for each secret for key derivation.
-
-        Warns (KeyssWarning) if `decoy=True`, which tries the first salt alone, will not open the model.
-        """
-        mixed = randomness(entropy, *(bytes_of(content) for _, content in contents))
+    def embed(self, payloads: Sequence[tuple[str, Payload]], *, entropy: bytes | None = None) -> Gaussians:
+        """See `PreparedCover`. Takes 1.6 s for each secret for key derivation."""
+        mixed = randomness(entropy, *(payload.data for _, payload in payloads))
         salts = self._salts(mixed)[1]
-        if 0 not in self.fresh_salts:
-            warnings.warn(_FIRST_IS_STALE, KeyssWarning, stacklevel=2)
         fresh = [salts[index] for index in self.fresh_salts]
-        return self.embed_derived([(_derived(key, fresh), content) for key, content in contents], mixed)
+        return self.embed_derived([(_derived(key, fresh), payload) for key, payload in payloads], mixed)
 
     def embed_derived(
-        self, contents: Sequence[tuple[Sequence[DerivedKey], Content]], entropy: bytes
+        self, payloads: Sequence[tuple[Sequence[DerivedKey], Payload]], entropy: bytes
     ) -> Gaussians:
         """`embed` after key derivation: each secret comes with its key under each of the `fresh_salts`.
 
         `entropy`: the result of `randomness`, used for this file only.
         """
-        check_keys([keys[0].verifier() for keys, _ in contents])
+        check_keys([keys[0].verifier() for keys, _ in payloads])
         fresh, _ = self._salts(entropy)
         writer = Writer(self.ids[self._rows], self.layout.width, entropy, len(self.ids), self.ids)
-        writer.write(contents)
+        writer.write(payloads)
         parts = [(self.salt_rows[self.fresh_salts], fresh), (self._rows[writer.order], writer.table)]
-        return write_low_bits(self.cover, self.layout, parts, in_place=self.overwrites)
+        return write_low_bits(self.cover, self.layout, parts)
 
     @cached_property
     def fresh_salts(self) -> Integers:
@@ -257,14 +249,14 @@ class CodesCover:
     def cover(self) -> Gaussians:
         return self.decoded.model if self.decoded else CodedGaussians.of(self.codes)
 
-    def embed(self, contents: Sequence[tuple[str, Content]], *, entropy: bytes | None = None) -> Gaussians:
+    def embed(self, payloads: Sequence[tuple[str, Payload]], *, entropy: bytes | None = None) -> Gaussians:
         """See `PreparedCover`."""
-        mixed = randomness(entropy, _digest(self.codes), *(bytes_of(content) for _, content in contents))
+        mixed = randomness(entropy, _digest(self.codes), *(payload.data for _, payload in payloads))
         for attempt in range(_ATTEMPTS):
             own = expand(mixed, f"quiet/attempt/{attempt}", 32)
             first = np.frombuffer(stream(own, "quiet/salts", self.width), np.uint8)
             salts = [salt(self.ids[0], first[:LEAST_BYTES])]
-            derived = [(_derived(key, salts), content) for key, content in contents]
+            derived = [(_derived(key, salts), payload) for key, payload in payloads]
             check_keys([keys[0].verifier() for keys, _ in derived])
             writer = Writer(self.ids[1:], self.width, own, len(self.codes))
             writer.write(derived)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from keyss.channels import Content, Payload
+from keyss.channels import Payload
 from keyss.core.errors import InputError, UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Camera
@@ -46,12 +46,10 @@ class CompanionTensors:
         return Payload(method, pack_tensors(self.tensors, header))
 
     @staticmethod
-    def of(content: Content) -> CompanionTensors:
-        """Read a payload. Raises InputError for other content."""
+    def of(payload: Payload) -> CompanionTensors:
+        """Read a payload. Raises InputError for other data."""
         with refuse_damage(DAMAGED):
-            if not isinstance(content, Payload):
-                raise ValueError("expected one string of bytes, got records")
-            header, tensors = unpack_tensors(content.data, _Header, FORMAT, VERSION)
+            header, tensors = unpack_tensors(payload.data, _Header, FORMAT, VERSION)
         return CompanionTensors(tensors, header.frame, header.rows)
 
     def take(self, names: Iterable[str]) -> list[Tensor]:
@@ -172,8 +170,8 @@ class Baseline:
         payload = companion.payload(self.name)
         return Stego(published, (self.unpack(payload),), iterations, companions=(payload,))
 
-    def unpack(self, content: Content) -> CompanionSecret:
+    def unpack(self, payload: Payload) -> CompanionSecret:
         """The secret of a companion file. Raises InputError for damage."""
-        companion = CompanionTensors.of(content)
+        companion = CompanionTensors.of(payload)
         with refuse_damage(DAMAGED):
             return CompanionSecret(companion.frame, companion, self.open(companion))

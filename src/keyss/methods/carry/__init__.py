@@ -1,1 +1,1 @@
-"""The carry method: a secret as quantised Gaussians in the low bits of the cover, nearly without loss."""
+"""The carry method: a secret model as an encrypted payload in the cover."""

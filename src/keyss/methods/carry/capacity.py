@@ -1,4 +1,4 @@
-"""The capacity of a cover for secrets: records of Gaussians in low bits, or a payload per secret."""
+"""The capacity of a cover for secrets, and the secrets that fit."""
 
 from __future__ import annotations
 
@@ -9,28 +9,13 @@ from functools import cached_property
 
 import torch
 
-from keyss.channels import (
-    APPENDED,
-    LOW_BITS,
-    TYPICAL_SHARE,
-    Capacity,
-    Channel,
-    Layout,
-    LowBitsCapacity,
-    LowBitsCover,
-    PreparedCover,
-    RecordRequest,
-)
+from keyss.channels import APPENDED, LOW_BITS, Capacity, Channel, PreparedCover
 from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.keys.derivation import expand
-from keyss.methods.base import divide
 from keyss.methods.carry.options import CarryOptions
-from keyss.methods.records.carried_secret import COUNT
-from keyss.methods.records.lines import Table
-from keyss.methods.records.precision import most_visible, prune_to_size
-from keyss.methods.records.quantise import Codec
-from keyss.methods.records.whole import encode
+from keyss.methods.codec.model_bytes import encode
+from keyss.methods.codec.precision import prune_to_size
 from keyss.rendering.orbit import Viewpoints
 
 _BITS_PER_GAUSSIAN = 150  # payload estimate for a secret that is not fitted yet
@@ -44,17 +29,11 @@ class SecretSize:
     """The size of a secret, or its maximum size if it is not fitted yet."""
 
     count: int
-    sh_degree: int
     model: Gaussians | None = None  # None: not fitted yet
 
     @staticmethod
     def of(model: Gaussians) -> SecretSize:
-        return SecretSize(len(model), model.sh_degree, model)
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """Gaussians and SH degree."""
-        return self.count, self.sh_degree
+        return SecretSize(len(model), model)
 
     @cached_property
     def payload_bytes(self) -> int:
@@ -62,125 +41,56 @@ class SecretSize:
         return self.count * _BITS_PER_GAUSSIAN // 8 if self.model is None else len(encode(self.model))
 
 
-def _check_not_tiny(
-    counts: Sequence[int], secrets: Sequence[SecretSize], cover: int, place: str, alternative: str
-) -> None:
-    """Raise UsageError if fewer than _TINY Gaussians of a secret fit into a cover of `cover` Gaussians."""
-    if any(count < min(_TINY, secret.count) for count, secret in zip(counts, secrets, strict=True)):
-        raise UsageError(
-            f"a cover of {cover:,} Gaussians is too small to hide {len(secrets)} "
-            f"{'secrets' if len(secrets) > 1 else 'secret'} in its {place}; {alternative}"
-        )
-
-
 @dataclass(frozen=True)
-class RecordCapacity:
-    """The capacity for records in low bits: exact for a prepared cover, estimated for one not fitted yet."""
-
-    gaussians: int  # Gaussians of the cover
-    sh_degree: int  # SH degree of the cover
-    cells: LowBitsCapacity
-    prepared: LowBitsCover | None = None  # None: not fitted yet
-    refit_share = 1.0  # refit size / Gaussians that fit
-
-    @staticmethod
-    def of(cover: Gaussians | None, options: CarryOptions, entropy: bytes | None = None) -> RecordCapacity:
-        """The capacity of `cover` after the change of harmonics in `options`.
-
-        Raises UsageError if a record does not fit into a Gaussian, and if low bits are not random.
-        """
-        try:
-            return RecordCapacity._of(cover, options, os.urandom(32) if entropy is None else entropy)
-        except UsageError as error:
-            raise UsageError(f"{error}; {_ways(cover, options)}") from error
-
-    @staticmethod
-    def _of(cover: Gaussians | None, options: CarryOptions, entropy: bytes) -> RecordCapacity:
-        degree, count = options.fit.sh_degree, options.fit.max_gaussians
-        if cover is not None:
-            cover = to_degree(cover, degree, entropy)
-        layout = Layout(degree) if cover is None else Layout.of(cover)
-        if largest_degree(LowBitsCapacity(0, layout.width).record_bytes(1)) is None:
-            unit = "" if layout.quats else " with unit quaternions"
-            raise UsageError(f"a cover of SH degree {degree}{unit} has no room for anything in its low bits")
-        if cover is None:
-            return RecordCapacity(count, degree, LowBitsCapacity(int(TYPICAL_SHARE * count), layout.width))
-        prepared = LOW_BITS.prepare(cover)
-        return RecordCapacity(len(cover), degree, prepared.cells, prepared)
-
-    @property
-    def cover(self) -> Gaussians | None:
-        """The cover before embedding."""
-        return None if self.prepared is None else self.prepared.cover
-
-    @property
-    def max_secret_degree(self) -> int:
-        """The maximum SH degree of secrets whose records fit into a Gaussian."""
-        return largest_degree(self.cells.record_bytes(1)) or 0
-
-    def sizes(self, secrets: Sequence[SecretSize]) -> list[tuple[int, int]]:
-        """Gaussians and SH degree that fit for each secret, at most its own.
-
-        Raises UsageError if the cover is too small.
-        """
-        counts = [secret.count for secret in secrets]
-        degrees = [min(secret.sh_degree, self.max_secret_degree) for secret in secrets]
-        requests = [record_request(*size) for size in zip(counts, degrees, strict=True)]
-        capacity = self.cells.record_capacity(requests)
-        if sum(counts) > capacity:
-            # A key must not reveal whether there are other secrets, unless one of them would have no room.
-            largest = max(request.least_bytes for request in requests)
-            share = self.cells.max_independent_records(largest, len(secrets)) if len(secrets) > 1 else 0
-            counts = [min(count, share) for count in counts] if share else divide(counts, capacity)
-        place = f"low bits, {self.cells.carriers:,} of them random"
-        _check_not_tiny(counts, secrets, self.gaussians, place, _ANY)
-        return list(zip(counts, degrees, strict=True))
-
-    def prune(self, models: Sequence[Gaussians], viewpoints: Sequence[Viewpoints]) -> list[Gaussians]:
-        """The most visible Gaussians of each model that fit, or all."""
-        return [
-            most_visible(model.with_sh_degree(degree), count)
-            for model, (count, degree) in zip(models, self.sizes([*map(SecretSize.of, models)]), strict=True)
-        ]
-
-
-@dataclass(frozen=True)
-class PayloadCapacity:
-    """The capacity for payloads: exact for a prepared cover, estimated for one not fitted yet."""
+class CarryCapacity:
+    """The capacity of a cover: exact for a prepared cover, estimated for one not fitted yet."""
 
     gaussians: int  # Gaussians of the cover
     sh_degree: int  # SH degree of the published model
     channel: Channel
     payloads: Capacity
-    cover: Gaussians | None = None  # before embedding; None: not fitted yet
-    prepared: PreparedCover | None = None
-    max_secret_degree = 3
-    refit_share = 0.97  # refit size / Gaussians that fit: refitted Gaussians compress a little worse
+    prepared: PreparedCover | None = None  # None: not fitted yet
 
     @staticmethod
-    def of(cover: Gaussians | None, options: CarryOptions, channel: Channel) -> PayloadCapacity:
-        """The capacity of `cover`. Raises UsageError for a cover without capacity."""
-        degree, count = options.fit.sh_degree, options.fit.max_gaussians
-        if cover is None:
-            return PayloadCapacity(count, degree, channel, channel.estimate_capacity(count, degree))
-        if cover.sh_degree > degree:
-            cover = cover.with_sh_degree(degree)
-        prepared = channel.prepare(cover)
-        return PayloadCapacity(len(cover), cover.sh_degree, channel, prepared.capacity, cover, prepared)
+    def of(cover: Gaussians | None, options: CarryOptions, entropy: bytes | None = None) -> CarryCapacity:
+        """The capacity of `cover` after the change of harmonics in `options`.
 
-    def sizes(self, secrets: Sequence[SecretSize]) -> list[tuple[int, int]]:
-        """See `RecordCapacity.sizes`; an estimate for secrets that do not fit."""
+        Raises UsageError for a cover without capacity.
+        """
+        channel, degree = options.place_in(cover), options.fit.sh_degree
+        try:
+            if cover is None:
+                count = options.fit.max_gaussians
+                return CarryCapacity(count, degree, channel, channel.estimate_capacity(count, degree))
+            if channel is LOW_BITS:
+                cover = to_degree(cover, degree, os.urandom(32) if entropy is None else entropy)
+            elif cover.sh_degree > degree:
+                cover = cover.with_sh_degree(degree)
+            prepared = channel.prepare(cover)
+        except UsageError as error:
+            raise UsageError(f"{error}; {_ways(degree, channel)}") from error
+        return CarryCapacity(len(cover), cover.sh_degree, channel, prepared.capacity, prepared)
+
+    def sizes(self, secrets: Sequence[SecretSize]) -> list[int]:
+        """Gaussians that fit for each secret, at most its own; an estimate for secrets that do not fit.
+
+        Raises UsageError if the cover is too small.
+        """
         limits = shares(self.payloads, [secret.payload_bytes for secret in secrets])
         counts = [
             min(secret.count, secret.count * limit // secret.payload_bytes)
             for secret, limit in zip(secrets, limits, strict=True)
         ]
-        alternative = '`channel="appended"` has room for all' if self.channel.survives else _ANY
-        _check_not_tiny(counts, secrets, self.gaussians, self.channel.place, alternative)
-        return [(count, secret.sh_degree) for count, secret in zip(counts, secrets, strict=True)]
+        if any(count < min(_TINY, secret.count) for count, secret in zip(counts, secrets, strict=True)):
+            raise UsageError(
+                f"a cover of {self.gaussians:,} Gaussians is too small to hide {len(secrets)} "
+                f"{'secrets' if len(secrets) > 1 else 'secret'} in its {self.channel.place}; "
+                + ('`channel="appended"` has room for all' if self.channel.survives else _ANY)
+            )
+        return counts
 
     def prune(self, models: Sequence[Gaussians], viewpoints: Sequence[Viewpoints]) -> list[Gaussians]:
-        """See `RecordCapacity.prune`; the SH degree is the one that renders most like the model."""
+        """The most visible Gaussians of each model that fit, or all; see `prune_to_size`."""
         limits = shares(self.payloads, [len(encode(model)) for model in models])
         return [prune_to_size(*each) for each in zip(models, limits, viewpoints, strict=True)]
 
@@ -191,31 +101,9 @@ class PayloadCapacity:
         return APPENDED.appended_count([secret.payload_bytes for secret in secrets])
 
 
-def capacity_for(
-    cover: Gaussians | None, options: CarryOptions, entropy: bytes | None = None
-) -> RecordCapacity | PayloadCapacity:
-    """The capacity of a cover: exact for a fitted one, otherwise estimated.
-
-    Raises UsageError for a cover without capacity.
-    """
-    place = options.place_in(cover)
-    return (
-        RecordCapacity.of(cover, options, entropy)
-        if place.records
-        else PayloadCapacity.of(cover, options, place)
-    )
-
-
-def _ways(cover: Gaussians | None, options: CarryOptions) -> str:
-    """For messages: the least SH degree that gives `cover` capacity, and what always works."""
-    for degree in range(options.fit.sh_degree + 1, 3):
-        try:
-            capacity = RecordCapacity._of(cover, options.with_fit(sh_degree=degree), os.urandom(32))
-        except UsageError:
-            continue
-        if capacity.cells.carriers:
-            return f"`sh_degree={degree}` makes room, {_ANY}"
-    return _ANY
+def _ways(degree: int, channel: Channel) -> str:
+    """For messages: what makes room in a cover of this SH degree."""
+    return f"`sh_degree={degree + 1}` makes room, {_ANY}" if degree < 2 and channel is LOW_BITS else _ANY
 
 
 def to_degree(model: Gaussians, sh_degree: int, entropy: bytes) -> Gaussians:
@@ -231,17 +119,6 @@ def to_degree(model: Gaussians, sh_degree: int, entropy: bytes) -> Gaussians:
     # Scale before rounding: products in single precision keep a trace of their factor.
     noise = _FAINT * torch.randn(len(model), count, 3, generator=generator, dtype=torch.float64)
     return replace(model, sh=torch.cat([model.sh, noise.to(model.sh)], dim=1))
-
-
-def record_request(count: int, sh_degree: int) -> RecordRequest:
-    """The request to a channel for a model of `count` Gaussians."""
-    header_bytes = COUNT.size + Codec.packed_size(sh_degree)
-    return RecordRequest(count, Table.floor(sh_degree).record_bytes, header_bytes)
-
-
-def largest_degree(record_bytes: int) -> int | None:
-    """The maximum SH degree of records of at most `record_bytes`; None if none fits."""
-    return next((each for each in (3, 2, 1, 0) if Table.floor(each).record_bytes <= record_bytes), None)
 
 
 def shares(capacity: Capacity, needed: Sequence[int]) -> list[int]:

@@ -1,9 +1,4 @@
-"""The method `carry`: encrypts the secrets' Gaussians in the published model.
-
-In low bits a Gaussian is a record (see `quantise`); the header holds the number of records and the codec.
-Copies of the most visible Gaussians fill free cells. All other channels carry a model as one payload (see
-`whole`).
-"""
+"""The method `carry`: encrypts the secrets' models (see `model_bytes`) in the published model."""
 
 from __future__ import annotations
 
@@ -12,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
-from keyss.channels import Content, LowBitsCover, Payload, PreparedCover, Records, open_content
+from keyss.channels import Payload, PreparedCover, open_payload
 from keyss.core.errors import KeyssWarning, UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
@@ -21,13 +16,11 @@ from keyss.fitting.image_metrics import subsample_views
 from keyss.fitting.plain import fit_scene
 from keyss.fitting.schedule import boost_of
 from keyss.methods.base import Capabilities, Context, Plan, Source, Stego, role_of
-from keyss.methods.carry.capacity import PayloadCapacity, SecretSize, capacity_for, record_request, shares
+from keyss.methods.carry.capacity import CarryCapacity, SecretSize, shares
 from keyss.methods.carry.options import REFIT, CarryOptions
-from keyss.methods.records.carried_secret import COUNT, unpack
-from keyss.methods.records.lines import Table
-from keyss.methods.records.precision import encode_to_size, most_visible_rows
-from keyss.methods.records.quantise import Codec, out_of_range
-from keyss.methods.records.whole import encode
+from keyss.methods.carry.secret import CarriedSecret
+from keyss.methods.codec.model_bytes import encode
+from keyss.methods.codec.precision import encode_to_size
 from keyss.rendering import contributions
 from keyss.rendering.orbit import Viewpoints, psnr_between
 
@@ -39,6 +32,7 @@ _VISIBLE = (
     "the cover can hold the secret, but whoever inspects the published file sees that it holds something "
     '(`publish="any"`), because it cannot be hidden unnoticed: {}'
 )
+_REFIT_SHARE = 0.97  # refit size / Gaussians that fit: refitted Gaussians compress a little worse
 _MIN_SHARE = 1 / 6  # fraction of a secret's Gaussians; refits of public models with fewer are below 30 dB
 _FEWER = (
     "the secrets share the capacity, and each has fewer Gaussians than it could have alone: whoever has one "
@@ -65,8 +59,7 @@ class CarryMethod:
             degree = options.fit.sh_degree if cover.given is None else cover.given.sh_degree
         options = options.with_fit(sh_degree=degree)
         try:
-            capacity = capacity_for(cover.given, options, _PLANNED)
-            options = replace(options, max_secret_degree=capacity.max_secret_degree)
+            capacity = CarryCapacity.of(cover.given, options, _PLANNED)
             secret_sizes = _secret_sizes(secrets, options)
             sizes = capacity.sizes(secret_sizes)
             if options.may_show and cover.given is not None:
@@ -76,7 +69,7 @@ class CarryMethod:
                 raise
             warnings.warn(_VISIBLE.format(refused), KeyssWarning, stacklevel=2)
             return self.prepare(sources, replace(options, publish="any"))
-        cut = [size != secret.size for size, secret in zip(sizes, secret_sizes, strict=True)]
+        cut = [size < secret.count for size, secret in zip(sizes, secret_sizes, strict=True)]
         if options.refit == "always":
             cut = [True] * len(cut)
         elif options.refit == "never":
@@ -98,37 +91,31 @@ class CarryMethod:
     def plan(self, sources: Sequence[Source], options: CarryOptions) -> Plan:
         """The capacity of the cover before refits; notes list the losses of the cover and the secrets."""
         cover, *secrets = sources
-        capacity, secret_sizes = capacity_for(cover.given, options, _PLANNED), _secret_sizes(secrets, options)
-        sizes = capacity.sizes(secret_sizes)
-        appended = capacity.appended(secret_sizes) if isinstance(capacity, PayloadCapacity) else 0
-        notes = []
-        if cover.given is not None and capacity.cover is not None and capacity.cover is not cover.given:
-            psnr = psnr_between(cover.given, capacity.cover)
+        capacity, secret_sizes = (
+            CarryCapacity.of(cover.given, options, _PLANNED),
+            _secret_sizes(secrets, options),
+        )
+        sizes, appended, notes = capacity.sizes(secret_sizes), capacity.appended(secret_sizes), []
+        if cover.given is not None and capacity.sh_degree != cover.given.sh_degree:
+            assert capacity.prepared is not None
+            psnr = psnr_between(cover.given, capacity.prepared.cover)
             notes.append(f"other harmonics leave the cover at {psnr:.1f} dB PSNR against itself")
-        for index, (secret, (_, degree)) in enumerate(zip(secrets, sizes, strict=True)):
-            if secret.given is not None and secret.given.sh_degree > degree:
-                psnr = psnr_between(secret.given, secret.given.with_sh_degree(degree))
-                notes.append(
-                    f"the {role_of(index + 1, len(sources))} of SH degree {secret.given.sh_degree} gets "
-                    f"degree {degree}: {psnr:.1f} dB PSNR against itself"
-                )
         if appended:
             notes.append(
                 f"about {appended:,} invisible Gaussians are appended to the cover's {capacity.gaussians:,}; "
                 "fewer Gaussians or a lower SH degree of a secret take less"
             )
-        elif isinstance(capacity, PayloadCapacity):
+        else:
             how = "about" if capacity.prepared is None else "exactly"
             notes.append(
                 f"the {capacity.channel.place} have room for {how} {capacity.payloads.bytes:,} bytes"
             )
-        counts = [count for count, _ in sizes]
-        rendered = (count if steps else 0 for steps, count in zip(options.refits, counts, strict=True))
+        rendered = (count if steps else 0 for steps, count in zip(options.refits, sizes, strict=True))
         return Plan(
             gaussians=capacity.gaussians + appended,
             sh_degree=capacity.sh_degree,
             secret_gaussians=sum(secret.count for secret in secret_sizes),
-            capacity=sum(counts),
+            capacity=sum(sizes),
             steps=max(options.refits),
             rendered=(0, *rendered),
             notes=tuple(notes),
@@ -142,7 +129,7 @@ class CarryMethod:
         Raises UsageError for a cover without capacity, Interrupted on Ctrl-C, and InputError for a
         checkpoint of another run.
         """
-        capacity = capacity_for(cover.model, options, context.entropy)
+        capacity = CarryCapacity.of(cover.model, options, context.entropy)
         assert capacity.prepared is not None  # the cover is fitted
         plain = [secret.model for secret in secrets]
         viewpoints = [Viewpoints.of(secret.scene) for secret in secrets]
@@ -155,37 +142,33 @@ class CarryMethod:
                     models[index] = refit(
                         secret.model.with_sh_degree(fits.sh_degree),
                         secret.scene,
-                        max(1, int(capacity.refit_share * len(fits))) if cut else len(fits),
+                        max(1, int(_REFIT_SHARE * len(fits))) if cut else len(fits),
                         replace(options.fit, iterations=steps),
                         context,
                         photos=secret.photos,
                         name=role_of(index + 1, len(secrets) + 1),
                     )
-        details: dict[str, Any] = {"gaussians_before_pruning": [len(model) for model in plain]}
-        if any(clamped := [out_of_range(model) for model in models]):
-            details["gaussians_with_clamped_numbers"] = clamped
+        details = {"gaussians_before_pruning": [len(model) for model in plain]}
         stego = embed_models(
             capacity.prepared,
             [secret.key for secret in secrets],
             capacity.prune(models, viewpoints),
             viewpoints=viewpoints,
             entropy=context.entropy,
-            overwrite=context.overwrites_cover,
         )
         return replace(stego, iterations=max(options.refits), details={**details, **stego.details})
 
 
 def _secret_sizes(secrets: Sequence[Source], options: CarryOptions) -> list[SecretSize]:
-    fits = options.fits(1 + len(secrets))[1:]
     return [
-        SecretSize(fit.max_gaussians, fit.sh_degree) if secret.given is None else SecretSize.of(secret.given)
-        for secret, fit in zip(secrets, fits, strict=True)
+        SecretSize(options.fit.max_gaussians) if secret.given is None else SecretSize.of(secret.given)
+        for secret in secrets
     ]
 
 
-def _check_share(secrets: Sequence[SecretSize], sizes: Sequence[tuple[int, int]]) -> None:
+def _check_share(secrets: Sequence[SecretSize], sizes: Sequence[int]) -> None:
     """Raise UsageError for given secrets that would lose most of their Gaussians."""
-    for secret, (count, _) in zip(secrets, sizes, strict=True):
+    for secret, count in zip(secrets, sizes, strict=True):
         if secret.model is not None and count < _MIN_SHARE * secret.count:
             raise UsageError(f"a secret of {secret.count:,} Gaussians would be cut down to {count:,}")
 
@@ -234,61 +217,29 @@ def embed_models(
     *,
     viewpoints: Sequence[Viewpoints] | None = None,
     entropy: bytes | None = None,
-    overwrite: bool = False,
 ) -> Stego:
     """Embed all Gaussians of each model under its key, and verify that they open.
 
-    `viewpoints`: views of each model that determine the precision of a payload; by default, four around it.
-    `overwrite`: write low bits into the cover's own tensors, which saves a copy. Raises UsageError if the
-    models do not fit.
+    `viewpoints`: views of each model that determine its precision; by default, four around it. Raises
+    UsageError if the models do not fit.
     """
-    contents: Sequence[Content]
-    if isinstance(cover, LowBitsCover):
-        cover = replace(cover, overwrites=overwrite)
-        contents = encode_all(cover, models)
-        requests = [record_request(len(model), model.sh_degree) for model in models]
-        details: dict[str, Any] = {
-            "carriers": cover.cells.carriers,
-            "capacity": cover.cells.record_capacity(requests),
-        }
-    else:
-        contents = payloads = _payloads(cover, models, viewpoints or [*map(Viewpoints.around, models)])
-        details = {
-            "secret_bytes": [len(each.data) for each in payloads],
-            "sh_degrees": [each.sh_degree for each in models],
-        }
-        if not cover.capacity.grows:
-            details["capacity_bytes"] = cover.capacity.bytes
-            details["capacity_bits_per_gaussian"] = round(8 * cover.capacity.bytes / len(cover.cover), 2)
-    stego = cover.embed(list(zip(keys, contents, strict=True)), entropy=entropy)
-    del contents  # as large as the secrets
-    opened = [unpack(open_content(stego, key)) for key in keys]
-    if [each.left for each in opened] != list(map(len, models)):
-        raise RuntimeError("the embedded secrets do not open again as they should")
-    details["bits_per_gaussian"] = [each.bits for each in opened]
-    return Stego(stego, tuple(opened), details=details, verified=True)
-
-
-def encode_all(cover: LowBitsCover, models: Sequence[Gaussians]) -> list[Records]:
-    """The records of all models, at the best precision that fits. Raises UsageError if none does."""
-    plans = cover.cells.plan_records([record_request(len(model), model.sh_degree) for model in models])
-    found = []
-    for model, plan in zip(models, plans, strict=True):
-        table = Table.of_size(8 * plan.record_bytes, model.sh_degree)
-        assert table is not None  # the plan has room for `Table.floor`
-        codec, outlier = Codec.fit(model, table)
-        header = COUNT.pack(len(model)) + codec.pack()
-        copied = most_visible_rows(model, plan.copies)
-        found.append(Records(CarryOptions.method, header, codec.encode(model, outlier), plan, copied))
-    return found
-
-
-def _payloads(
-    cover: PreparedCover, models: Sequence[Gaussians], viewpoints: Sequence[Viewpoints]
-) -> list[Payload]:
-    grows = cover.capacity.grows
-    limits = shares(cover.capacity, [len(encode(model)) for model in models])
-    return [
-        Payload(CarryOptions.method, encode_to_size(model, limit, short=grows, viewpoints=views))
+    viewpoints, capacity = viewpoints or [*map(Viewpoints.around, models)], cover.capacity
+    limits = shares(capacity, [len(encode(model)) for model in models])
+    payloads = [
+        Payload(CarryOptions.method, encode_to_size(model, limit, short=capacity.grows, viewpoints=views))
         for model, limit, views in zip(models, limits, viewpoints, strict=True)
     ]
+    stego = cover.embed(list(zip(keys, payloads, strict=True)), entropy=entropy)
+    opened = [CarriedSecret.of(open_payload(stego, key)) for key in keys]
+    if [len(each.gaussians) for each in opened] != list(map(len, models)):
+        raise RuntimeError("the embedded secrets do not open again as they should")
+    sizes = [len(each.data) for each in payloads]
+    details: dict[str, Any] = {
+        "secret_bytes": sizes,
+        "sh_degrees": [each.sh_degree for each in models],
+        "bits_per_gaussian": [round(8 * size / len(each)) for size, each in zip(sizes, models, strict=True)],
+    }
+    if not capacity.grows:
+        details["capacity_bytes"] = capacity.bytes
+        details["capacity_bits_per_gaussian"] = round(8 * capacity.bytes / len(cover.cover), 2)
+    return Stego(stego, tuple(opened), details=details, verified=True)

@@ -32,10 +32,7 @@ class CarryOptions(MethodOptions):
     ] = None
     iterations: int | None = None  # steps per refit; None: REFIT per step of `fit`, fewer without photos
 
-    # Set by `prepare`: the maximum SH degree of secrets, and the refit steps of each secret (0: carried
-    # unchanged).
-    max_secret_degree: int = 3
-    refits: tuple[int, ...] = ()
+    refits: tuple[int, ...] = ()  # set by `prepare`: refit steps of each secret (0: carried unchanged)
 
     @property
     def may_train(self) -> bool:
@@ -48,11 +45,10 @@ class CarryOptions(MethodOptions):
         return self.publish == "as-is" and self.refit == "auto" and self.format is None
 
     def fits(self, scenes: int) -> list[FitConfig]:
-        """Secrets get the steps of a refit if none follows, and at most the harmonics that fit."""
-        degree = min(self.fit.sh_degree, self.max_secret_degree)
+        """Secrets get the steps of a refit if none follows."""
         alone = round((1 + REFIT) * self.fit.iterations)
         of_secrets = [
-            replace(self.fit, sh_degree=degree, iterations=self.fit.iterations if steps else alone)
+            replace(self.fit, iterations=self.fit.iterations if steps else alone)
             for steps in self.refits or (0,) * (scenes - 1)
         ]
         return [self.fit, *of_secrets]

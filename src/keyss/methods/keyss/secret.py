@@ -17,7 +17,7 @@ from msgspec import Meta
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from keyss.channels import Content, Payload, is_appended
+from keyss.channels import Payload, is_appended
 from keyss.core.errors import InputError
 from keyss.core.gaussians import DRAWN_OPACITY, Gaussians, compensate_pruning
 from keyss.core.similarity import Similarity
@@ -68,12 +68,10 @@ class KeyssSecret(HiddenScene):
         return Payload(NAME, pack_tensors({**tensors, "key": self.key, "anchors": self.anchors}, header))
 
     @staticmethod
-    def of(content: Content) -> KeyssSecret:
-        """Read a payload. Raises InputError for other content, damage and another version."""
+    def of(payload: Payload) -> KeyssSecret:
+        """Read a payload. Raises InputError for other data, damage and another version."""
         with refuse_damage("the payload is no secret of keyss, or damaged"):
-            if not isinstance(content, Payload):
-                raise ValueError("expected one string of bytes, got records")
-            header, tensors = unpack_tensors(content.data, _Header, FORMAT, VERSION)
+            header, tensors = unpack_tensors(payload.data, _Header, FORMAT, VERSION)
             shape = header.shape
             if parse_mask(",".join(shape.mask)) != shape.mask:
                 raise ValueError("its mask is in another order")
@@ -93,7 +91,7 @@ class KeyssSecret(HiddenScene):
             decoder.load_state_dict({name.removeprefix(_WEIGHTS): value for name, value in tensors.items()})
         return KeyssSecret(
             decoder.requires_grad_(False), key, header.frame, anchors, header.count, header.visibility,
-            content.chunks,
+            payload.chunks,
         )  # fmt: skip
 
     @torch.no_grad()

@@ -7,11 +7,10 @@ from dataclasses import replace
 
 import torch
 
-from keyss.core.arrays import Integers
 from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.files.formats.common import in_morton_order
-from keyss.methods.records.whole import Precision, decode, encode
+from keyss.methods.codec.model_bytes import Precision, decode, encode
 from keyss.rendering.orbit import Viewpoints, psnr_between
 
 _GOOD_ENOUGH = 43.75  # dB between renders; costs 0.1 to 0.3 dB at 30 dB against photos
@@ -95,14 +94,7 @@ def encode_to_size(
 
 
 def most_visible(gaussians: Gaussians, count: int) -> Gaussians:
-    """The `count` Gaussians of `most_visible_rows`, or all if there are fewer."""
-    if count >= len(gaussians):
-        return gaussians
-    return gaussians[torch.from_numpy(most_visible_rows(gaussians, count))]
-
-
-def most_visible_rows(gaussians: Gaussians, count: int) -> Integers:
-    """Indices [count] of the Gaussians with the largest opacity times size, in ascending order.
+    """The `count` Gaussians with the largest opacity times size, in their order.
 
     Size is the square root of the cross-section, clamped to that of a typical large Gaussian: a few huge
     faint Gaussians must not replace all detail.
@@ -110,5 +102,4 @@ def most_visible_rows(gaussians: Gaussians, count: int) -> Integers:
     size = gaussians.log_scales.sort(dim=1).values[:, 1:].mean(1)  # log, of the larger two axes
     at_most = size.kthvalue(int(0.9 * len(size)) + 1).values
     visibility = gaussians.opacities * size.clamp_max(at_most).exp()
-    rows: Integers = visibility.topk(count).indices.sort().values.numpy()
-    return rows
+    return gaussians[visibility.topk(count).indices.sort().values]

@@ -1,10 +1,11 @@
-"""A model as one string of bytes, for channels that carry all of it or nothing.
+"""A model as one string of bytes.
 
     number of Gaussians (4 bytes), SH degree (1), centres (20), steps (24), all numbers (see `entropy`)
 
 Gaussians are sorted along a Z-order curve. Every number is divided by a step and rounded, so outliers cost
 more bits and no precision. Colours become brightness and two differences. Several quaternions describe the
-same ellipsoid; the one with the largest w is stored, without w.
+same ellipsoid; the one with the largest w is stored, without w. Extreme numbers, which occlude everything or
+are invisible, are clamped.
 
 Errors in quaternions and harmonics are more visible in Gaussians that cover more of an image. Their steps
 shrink by a quarter of an octave for each octave of area x opacity^2 above the median. (Equal errors in an
@@ -23,10 +24,9 @@ import torch
 
 from keyss.core.arrays import Doubles, Integers, doubles
 from keyss.core.errors import InputError
-from keyss.core.gaussians import OPPONENT, Gaussians
+from keyss.core.gaussians import MAX_COORDINATE, MAX_LOG_SCALE, OPPONENT, Gaussians
 from keyss.files.formats.common import in_morton_order, with_largest_w
-from keyss.methods.records import entropy
-from keyss.methods.records.quantise import numbers_of
+from keyss.methods.codec import entropy
 
 _ALWAYS = 1 << 16  # number of Gaussians that a payload of any size may declare
 _MIN_BYTES = 2  # minimum bytes per Gaussian of a larger model
@@ -36,6 +36,7 @@ _DIFFERENCES = np.array([1.0, 1.5, 1.5])  # steps of brightness and differences 
 _PER_OCTAVE = 0.5 / math.log(2)  # half octaves of the step
 _FINER = 6  # maximum change of a step, in half octaves
 _MAX_STEP = 1e6
+_MAX_LOGIT = 16.0  # beyond it the float32 sigmoid is exactly 0 or 1
 _LEAST_W = 1 / 16  # minimum w^2
 # `shares` and `groups` of `entropy.encode` for the columns x, y, z, log scales, opacity, colours, quaternion.
 # Harmonics have two more groups and no prediction.
@@ -75,11 +76,11 @@ def encode(model: Gaussians, precision: Precision | None = None) -> bytes:
     """Encode `model`, by default with the usual precision."""
     model = in_morton_order(model)
     steps = (precision or Precision.usual(model)).steps
-    *plain, brightness, differences = numbers_of(model.with_sh_degree(0))
-    centres = [float(np.float32(np.median(each))) for each in plain]
-    offsets = np.concatenate([a - b for a, b in zip(plain, centres, strict=True)], axis=1)
-    colours = np.concatenate([brightness, differences], axis=1)
-    even = _round(np.concatenate([offsets, colours], axis=1) / _even_steps(steps))
+    numbers = _even_columns(model)
+    *middle, _, _, logit = np.median(numbers[:, :7], axis=0)
+    middle[3] = np.median(numbers[:, 3:6])
+    centres = [float(np.float32(each)) for each in (*middle, logit)]
+    even = _round((numbers - _origin(centres)) / _even_steps(steps))
     finer = _refinement(*_even_numbers(even, centres, steps)[1:3])
     quats = with_largest_w(doubles(model.quats))[:, 1:] / _steps(steps[4], finer)
     harmonics = (doubles(model.sh[:, 1:]) @ OPPONENT.T).reshape(len(model), -1) / _steps(steps[5], finer)
@@ -132,6 +133,25 @@ def _round(numbers: Doubles) -> Integers:
     return whole
 
 
+def _even_columns(model: Gaussians) -> Doubles:
+    """Means, log scales, opacity logits and constant colours [N, 10], clamped.
+
+    Rasterizers skip Gaussians whose numbers overflow. Clamped numbers would make these visible, so they
+    become transparent.
+    """
+    logits = torch.where(model.overflow, -_MAX_LOGIT, model.opacity_logits.clamp(-_MAX_LOGIT, _MAX_LOGIT))
+    means = model.means.clamp(-MAX_COORDINATE, MAX_COORDINATE)
+    log_scales = model.log_scales.clamp(-MAX_LOG_SCALE, MAX_LOG_SCALE)
+    parts = map(doubles, (means, log_scales, logits[:, None]))
+    return np.concatenate([*parts, doubles(model.sh[:, 0]) @ OPPONENT.T], axis=1)
+
+
+def _origin(centres: list[float]) -> Doubles:
+    """What is subtracted from the columns of `_even_columns` [10]."""
+    x, y, z, scales, logit = centres
+    return np.array([x, y, z, scales, scales, scales, logit, 0, 0, 0])
+
+
 def _even_steps(steps: list[float]) -> Doubles:
     """Steps [10] of the columns whose steps are the same for all Gaussians."""
     means, log_scales, opacity, colours, *_ = steps
@@ -140,8 +160,7 @@ def _even_steps(steps: list[float]) -> Doubles:
 
 def _even_numbers(codes: Integers, centres: list[float], steps: list[float]) -> list[Doubles]:
     """Means [N, 3], log scales [N, 3], opacity logits [N] and colours [N, 3] from codes [N, 10]."""
-    x, y, z, scales, logit = centres
-    numbers = codes * _even_steps(steps) + np.array([x, y, z, scales, scales, scales, logit, 0, 0, 0])
+    numbers = codes * _even_steps(steps) + _origin(centres)
     return [numbers[:, :3], numbers[:, 3:6], numbers[:, 6], numbers[:, 7:]]
 
 

@@ -1,0 +1,40 @@
+"""A carried secret, opened from its payload."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+
+from keyss.channels import Payload
+from keyss.core.errors import UsageError
+from keyss.core.gaussians import Gaussians
+from keyss.methods.codec.model_bytes import decode
+from keyss.methods.hidden import Frame, HiddenScene, Remains
+
+
+@dataclass(frozen=True)
+class CarriedSecret(HiddenScene):
+    """A carried secret."""
+
+    gaussians: Gaussians
+    chunks: tuple[int, int] | None = None  # see `Payload`
+    frame = None
+
+    @staticmethod
+    def of(payload: Payload) -> CarriedSecret:
+        """Read a payload. Raises InputError for damage."""
+        return CarriedSecret(decode(payload.data, payload.model_size), payload.chunks)
+
+    def reveal(self, stego: Gaussians, *, frame: Frame = "secret", force: bool = False) -> Gaussians:
+        """All Gaussians of the secret."""
+        if frame == "cover":
+            raise UsageError(
+                'a carried secret has no position in the cover\'s coordinates: leave out `frame="cover"`'
+            )
+        return self.gaussians
+
+    def remains(self, revealed: Gaussians) -> Remains:
+        return Remains(len(revealed), len(revealed), self.chunks)
+
+    def fingerprint(self) -> str:
+        return hashlib.sha256(self.gaussians.means.numpy().tobytes()).hexdigest()[:16]
