@@ -2,8 +2,7 @@
 
     python tests/vectors/make_vectors.py
 
-`carried.json` stays: new files must reveal what old ones did. `revealed.json` holds what keys open in the
-models of this folder; the reader in `web/` is tested against it.
+`revealed.json` holds what keys open in the models of this folder; the reader in `web/` is tested against it.
 """
 
 from __future__ import annotations
@@ -35,7 +34,7 @@ from channels.quiet import coded  # noqa: E402
 from channels.quiet.trained_like import trained_like  # noqa: E402
 from channels.test_harmonics import heavy_tailed  # noqa: E402
 from files.formats.examples import model_of, random_compressed, random_sog, random_spz  # noqa: E402
-from keyss.channels import LOW_BITS, SUFFIXES, Payload, channel_for, in_counted_order, last_bits, open_content  # noqa: E402
+from keyss.channels import LOW_BITS, SUFFIXES, Payload, channel_for, in_counted_order, last_bits, open_payload  # noqa: E402
 from keyss.channels.quiet.fields import _log2  # noqa: E402
 from keyss.core.gaussians import Gaussians  # noqa: E402
 from keyss.core.similarity import Similarity  # noqa: E402
@@ -46,9 +45,8 @@ from keyss.files.formats.compressed_ply import CompressedPlyCodes  # noqa: E402
 from keyss.files.formats.sog import SogCodes  # noqa: E402
 from keyss.files.formats.spz import SpzCodes  # noqa: E402
 from keyss.keys.derivation import random_embeddings  # noqa: E402
-from keyss.methods import Decoder, DecoderShape, HiddenFile, KeyssSecret, choose_anchors  # noqa: E402  # noqa: E402
-from keyss.methods.records import whole  # noqa: E402
-from keyss.methods.records.carried_secret import unpack  # noqa: E402
+from keyss.methods import CarriedSecret, Decoder, DecoderShape, HiddenFile, KeyssSecret, choose_anchors  # noqa: E402
+from keyss.methods.codec.model_bytes import decode, encode  # noqa: E402
 from methods.carry.carried import embed  # noqa: E402
 from methods.keyss.small import latent_model, make_secret  # noqa: E402
 from vectors.surviving import NAMES, write_surviving  # noqa: E402
@@ -57,7 +55,7 @@ from vectors.surviving import NAMES, write_surviving  # noqa: E402
 def cell() -> dict[str, object]:
     """A cell as in docs/byte-layout.md, by the cipher modes of `cryptography`."""
     secret, carrier_id = bytes(range(32)), bytes(range(16))
-    label, data, slot, tag_bytes = "record", b"\x02\x01\x00record", 1, 4
+    label, data, tag_bytes = "chunk", b"\x02\x01\x00chunk", 4
 
     def key(use: str) -> bytes:
         return HKDFExpand(SHA256(), 32, f"keyss/v1/{label}/{use}".encode()).derive(secret)
@@ -65,15 +63,14 @@ def cell() -> dict[str, object]:
     def aes(use: str, block: bytes) -> bytes:
         return Cipher(AES(key(use)), ECB()).encryptor().update(block)
 
-    message = carrier_id + (bytes([slot]) + data).ljust(16, b"\0")
+    message = carrier_id + data.ljust(16, b"\0")
     tag = Cipher(AES(key("tag")), CBC(bytes(16))).encryptor().update(message)[-16:][:tag_bytes]
-    nonce = bytes(a ^ b for a, b in zip(carrier_id, (tag + bytes([slot])).ljust(16, b"\0"), strict=True))
+    nonce = bytes(a ^ b for a, b in zip(carrier_id, tag.ljust(16, b"\0"), strict=True))
     stream = aes("stream", aes("seed", nonce))
     return {
         "secret": secret.hex(),
         "label": label,
         "id": carrier_id.hex(),
-        "slot": slot,
         "data": data.hex(),
         "cell": (tag + bytes(a ^ b for a, b in zip(data, stream, strict=False))).hex(),
     }
@@ -91,25 +88,15 @@ def derivation() -> dict[str, object]:
     return vectors
 
 
-def reveal_content(name: str, key: str) -> dict[str, Any]:
+def open_file(name: str, key: str) -> dict[str, Any]:
     """What `key` opens in a file of this folder: SHA-256 of float32 columns, or of a payload."""
     stego = read_model(FOLDER / name)
-    content = open_content(stego, key)
-    found: dict[str, Any] = {"file": name, "key": key, "method": content.method}
-    if isinstance(content, Payload) and content.method != "carry":
-        return found | {"payload": hashlib.sha256(content.data).hexdigest()}
-    secret = unpack(content)
-    model = secret.reveal(stego)
-    return found | summary(model, secret.count, len(model) < secret.count)
-
-
-def summary(model: Gaussians, hidden: int, compensated: bool) -> dict[str, Any]:
-    """SHA-256 of float32 columns; compensated opacities as numbers."""
-    found: dict[str, Any] = {"count": len(model), "hidden": hidden, "sha256": digests(model)}
-    if compensated:  # processors differ in the last bit
-        del found["sha256"]["opacity_logits"]
-        found["opacity_logits"] = [round(each, 6) for each in model.opacity_logits.tolist()]
-    return found
+    payload = open_payload(stego, key)
+    found: dict[str, Any] = {"file": name, "key": key, "method": payload.method}
+    if payload.method != "carry":
+        return found | {"payload": hashlib.sha256(payload.data).hexdigest()}
+    model = CarriedSecret.of(payload).reveal(stego)
+    return found | {"count": len(model), "chunks": payload.chunks, "sha256": digests(model)}
 
 
 def pruned_model() -> Gaussians:
@@ -117,7 +104,7 @@ def pruned_model() -> Gaussians:
     cover = trained_like(1000, 3, sh_degree=2)
     cover = replace(cover, quats=torch.nn.functional.normalize(cover.quats))
     secrets = [
-        (TWO_KEYS[0], trained_like(250, 4, sh_degree=1)),
+        (TWO_KEYS[0], trained_like(120, 4, sh_degree=1)),
         (TWO_KEYS[1], trained_like(30, 5, sh_degree=2)),
     ]
     stego = embed(cover, secrets, entropy=bytes(32))
@@ -135,6 +122,8 @@ def main() -> None:
     secret.means[0, 0] = 1e6  # an outlier
     stego = embed(trained_like(400), [(key, secret)], entropy=bytes(32))
     write_model(FOLDER / "carried.ply", stego)
+    carried = {"key": key, "count": len(secret), "payload": encode(secret).hex()}
+    (FOLDER / "carried.json").write_text(json.dumps(carried, indent=1) + "\n")
     cover = trained_like(1600)
     joint = make_secret(cover).payload()
     stego = LOW_BITS.prepare(cover).embed([(key, joint)], entropy=bytes(32))
@@ -143,7 +132,7 @@ def main() -> None:
     write_published()
     write_extremes()
     write_counted()
-    write_whole()
+    write_encoded()
     write_keyss()
 
 
@@ -169,11 +158,11 @@ def write_coded(suffix: str) -> None:
     """A model whose codes hold two secrets: two models, or a model and a file."""
     cover = coded.model_of(2300, 11, 0)
     other = {
-        ".spz": Payload("carry", whole.encode(trained_like(25, 12, 2))),
-        ".sog": Payload("carry", whole.encode(trained_like(60, 13, 0))),
+        ".spz": Payload("carry", encode(trained_like(25, 12, 2))),
+        ".sog": Payload("carry", encode(trained_like(60, 13, 0))),
         ".compressed.ply": HiddenFile("a note.txt", b"Written at noon, read at night.\n").payload(),
     }[suffix]
-    secrets = [(TWO_KEYS[0], Payload("carry", whole.encode(trained_like(40, 14, 1)))), (TWO_KEYS[1], other)]
+    secrets = [(TWO_KEYS[0], Payload("carry", encode(trained_like(40, 14, 1)))), (TWO_KEYS[1], other)]
     name = next(each for each, end in SUFFIXES.items() if end == suffix)
     model = channel_for("as-is", format=name).prepare(cover).embed(secrets, entropy=bytes(32))
     write_model(FOLDER / f"coded{suffix}", model)
@@ -225,17 +214,17 @@ def carrier_bits(model: CodedGaussians) -> dict[str, Any]:
     return {"count": len(bits), "sha256": hashlib.sha256(bits.tobytes()).hexdigest()}
 
 
-def write_whole() -> None:
-    """Encoded whole models."""
+def write_encoded() -> None:
+    """Encoded models."""
     far = trained_like(40, 8, 0)
     far.means[3, 1] = -1e5  # an outlier
     seen = trained_like(40, 9, 3)
     seen.log_scales[2] += 8  # the finest harmonics; the next has the coarsest
     seen.opacity_logits[3] = -14
     models = [seen, far, trained_like(10, 10, 1)[:1]]
-    encoded = [whole.encode(each) for each in models]
-    found = [{"data": data.hex(), "sha256": digests(whole.decode(data))} for data in encoded]
-    (FOLDER / "whole.json").write_text(json.dumps(found, indent=1) + "\n")
+    encoded = [encode(each) for each in models]
+    found = [{"data": data.hex(), "sha256": digests(decode(data))} for data in encoded]
+    (FOLDER / "encoded.json").write_text(json.dumps(found, indent=1) + "\n")
 
 
 def write_keyss() -> None:
@@ -247,7 +236,7 @@ def write_keyss() -> None:
     stego = read_model(FOLDER / "carried.ply")
     payloads = [("carried.ply", decoder_of(shape, stego).payload().data) for shape in shapes]
     key = json.loads((FOLDER / "carried.json").read_text())["key"]
-    payloads.append(("keyss.ply", open_content(read_model(FOLDER / "keyss.ply"), key).data))
+    payloads.append(("keyss.ply", open_payload(read_model(FOLDER / "keyss.ply"), key).data))
     for name, count in (("latent.ply", 1), ("latent-two.ply", 2)):
         stego, secrets, _ = latent_model(heavy_tailed(60), 50, count)
         write_model(FOLDER / name, stego)
@@ -291,16 +280,16 @@ def digests(model: Gaussians) -> dict[str, str]:
 
 def write_revealed(key: str) -> None:
     write_model(FOLDER / "pruned.ply", pruned_model())
-    opened = [reveal_content(name, key) for name in ("carried.ply", "keyss.ply")]
-    opened += [reveal_content("pruned.ply", each) for each in TWO_KEYS]
+    opened = [open_file(name, key) for name in ("carried.ply", "keyss.ply")]
+    opened += [open_file("pruned.ply", each) for each in TWO_KEYS]
     for suffix in coded.FORMATS:
         write_coded(suffix)
-        opened += [reveal_content(f"coded{suffix}", each) for each in TWO_KEYS]
+        opened += [open_file(f"coded{suffix}", each) for each in TWO_KEYS]
         write_decoded(suffix)
-        opened.append(reveal_content(f"decoded-{suffix.split('.')[1]}.ply", TWO_KEYS[0]))
+        opened.append(open_file(f"decoded-{suffix.split('.')[1]}.ply", TWO_KEYS[0]))
     write_surviving(FOLDER, TWO_KEYS)
-    opened += [reveal_content(name, TWO_KEYS[0]) for name in NAMES]
-    opened += [reveal_content(name, TWO_KEYS[1]) for name in NAMES[:3:2]]
+    opened += [open_file(name, TWO_KEYS[0]) for name in NAMES]
+    opened += [open_file(name, TWO_KEYS[1]) for name in NAMES[:3:2]]
     (FOLDER / "revealed.json").write_text(json.dumps(opened, indent=1) + "\n")
 
 

@@ -20,7 +20,7 @@ from keyss.core.gaussians import Gaussians
 from keyss.core.similarity import Similarity
 from keyss.files import write_model
 from keyss.methods import HiddenFile
-from keyss.methods.records import whole
+from keyss.methods.codec.model_bytes import encode
 from lab.lifelike import lifelike
 
 NAMES = ("appended.ply", "appended-moved.spz", "colours.spz", "colours-moved.splat")
@@ -39,7 +39,7 @@ def write_surviving(folder: Path, keys: tuple[str, str]) -> None:
     cover = lifelike(4000, 22).with_sh_degree(0)
     notes = [(keys[0], NOTE.payload()), (keys[1], Payload("file", b"\0" + b"?" * 9))]
     write_model(one, COLOURS.prepare(cover).embed(notes, entropy=bytes(32)))
-    secret = Payload("carry", whole.encode(trained_like(12, 25, 0)))
+    secret = Payload("carry", encode(trained_like(12, 25, 0)))
     with mock.patch.object(planner, "STRENGTH", 40.0):
         small = COLOURS.prepare(cover[:2300]).embed([(keys[0], secret)], entropy=bytes(32))
     write_model(moved, elsewhere(small))
@@ -49,7 +49,7 @@ def with_appended(keys: Sequence[str]) -> Gaussians:
     """A cover in which half of the Gaussians are faint."""
     cover = trained_like(120, 23, 0)
     cover = replace(cover, opacity_logits=torch.where(torch.arange(120) % 2 == 0, -5.5, 2.0))
-    payloads = [Payload("carry", whole.encode(trained_like(40, 24, 1))), NOTE.payload()]
+    payloads = [Payload("carry", encode(trained_like(40, 24, 1))), NOTE.payload()]
     return APPENDED.prepare(cover).embed(list(zip(keys, payloads, strict=False)), entropy=bytes(32))
 
 

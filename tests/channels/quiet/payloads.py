@@ -4,16 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from keyss.channels import LOW_BITS, Content, LowBitsCover, Payload, QuietReader
+from keyss.channels import LOW_BITS, LowBitsCover, Payload, QuietReader
 from keyss.channels.base import randomness
-from keyss.channels.quiet.contents import bytes_of
 from keyss.core import Gaussians
 from keyss.keys import DerivedKey
 
 
 def embed(model: Gaussians, secrets: Sequence[tuple[str, bytes]], entropy: bytes | None = None) -> Gaussians:
-    contents = [(key, Payload("test", data)) for key, data in secrets]
-    return LOW_BITS.prepare(model).embed(contents, entropy=entropy)
+    payloads = [(key, Payload("test", data)) for key, data in secrets]
+    return LOW_BITS.prepare(model).embed(payloads, entropy=entropy)
 
 
 def embed_derived(
@@ -21,18 +20,18 @@ def embed_derived(
     secrets: Sequence[tuple[Sequence[DerivedKey], bytes]],
     entropy: bytes | None = None,
 ) -> Gaussians:
-    contents = [(keys, Payload("test", data)) for keys, data in secrets]
-    return embed_contents(LOW_BITS.prepare(model), contents, entropy)
+    payloads = [(keys, Payload("test", data)) for keys, data in secrets]
+    return embed_payloads(LOW_BITS.prepare(model), payloads, entropy)
 
 
-def embed_contents(
+def embed_payloads(
     prepared: LowBitsCover,
-    secrets: Sequence[tuple[Sequence[DerivedKey], Content]],
+    secrets: Sequence[tuple[Sequence[DerivedKey], Payload]],
     entropy: bytes | None = None,
 ) -> Gaussians:
     """With a key under each salt, stale ones too."""
-    mixed = randomness(entropy, *(bytes_of(content) for _, content in secrets))
-    fresh = [([keys[i] for i in prepared.fresh_salts], content) for keys, content in secrets]
+    mixed = randomness(entropy, *(payload.data for _, payload in secrets))
+    fresh = [([keys[i] for i in prepared.fresh_salts], payload) for keys, payload in secrets]
     return prepared.embed_derived(fresh, mixed)
 
 
@@ -45,7 +44,6 @@ def extract_derived(stego: Gaussians | QuietReader, key: DerivedKey) -> bytes:
     return _data(reader.extract(key))
 
 
-def _data(content: object) -> bytes:
-    assert isinstance(content, Payload)
-    assert content.method == "test"
-    return content.data
+def _data(payload: Payload) -> bytes:
+    assert payload.method == "test"
+    return payload.data

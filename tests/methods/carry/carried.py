@@ -4,19 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from channels.quiet.payloads import embed_contents
-from keyss.channels import LOW_BITS, QuietReader
+from channels.quiet.payloads import embed_payloads
+from keyss.channels import LOW_BITS, Payload, QuietReader
 from keyss.core import Gaussians
 from keyss.keys import DerivedKey
-from keyss.methods import CarriedSecret, encode_all, unpack
+from keyss.methods import CarriedSecret
+from keyss.methods.codec.model_bytes import encode
 
 
 def embed(
     cover: Gaussians, secrets: Sequence[tuple[str, Gaussians]], entropy: bytes | None = None
 ) -> Gaussians:
-    prepared = LOW_BITS.prepare(cover)
-    records = encode_all(prepared, [model for _, model in secrets])
-    return prepared.embed(list(zip((key for key, _ in secrets), records, strict=True)), entropy=entropy)
+    payloads = [(key, Payload("carry", encode(model))) for key, model in secrets]
+    return LOW_BITS.prepare(cover).embed(payloads, entropy=entropy)
 
 
 def embed_derived(
@@ -24,15 +24,13 @@ def embed_derived(
     secrets: Sequence[tuple[Sequence[DerivedKey], Gaussians]],
     entropy: bytes | None = None,
 ) -> Gaussians:
-    prepared = LOW_BITS.prepare(cover)
-    records = encode_all(prepared, [model for _, model in secrets])
-    keyed = list(zip((keys for keys, _ in secrets), records, strict=True))
-    return embed_contents(prepared, keyed, entropy)
+    payloads = [(keys, Payload("carry", encode(model))) for keys, model in secrets]
+    return embed_payloads(LOW_BITS.prepare(cover), payloads, entropy)
 
 
 def extract(stego: Gaussians, key: str) -> CarriedSecret:
-    return unpack(QuietReader.of(stego).open(key))
+    return CarriedSecret.of(QuietReader.of(stego).open(key))
 
 
 def extract_derived(reader: QuietReader, key: DerivedKey) -> CarriedSecret:
-    return unpack(reader.extract(key))
+    return CarriedSecret.of(reader.extract(key))

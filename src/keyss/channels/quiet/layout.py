@@ -11,9 +11,9 @@ others.
 
 Parameters are cut into numbered parts, one in each carrier. Numbers are little-endian:
 
-    version (1 byte), method (15, padded with zeros), bytes of the encrypted payload (4); in low bits, Gaussians
-    of the model (4), codewords (4), chunks of one (2), data chunks of one (2), a sketch of the Gaussians (32,
-    see `mixing`)
+    version (1 byte), method (15, padded with zeros), bytes of the encrypted payload (4); in codes, bytes of a
+    block (2); in low bits, Gaussians of the model (4), codewords (4), chunks of one (2), data chunks of one
+    (2), a sketch of the Gaussians (32, see `mixing`)
 """
 
 from __future__ import annotations
@@ -57,6 +57,7 @@ MAX_CODEWORDS = (1 << 8 * _NUMBER_BYTES) // MAX_CHUNKS
 
 _VERSION = 6
 _PREFIX = struct.Struct(f"<B{METHOD_BYTES}sI")
+_BLOCKS = struct.Struct("<H")  # bytes of a block
 _CODEWORDS = struct.Struct("<IIHH")  # Gaussians of the model, codewords, chunks of one, data chunks of one
 _DAMAGED = "the hidden parameters are damaged"
 _INCOMPRESSIBLE = 1 - 2**-10  # data that do not compress grow by less than a thousandth
@@ -214,8 +215,9 @@ class Parameters:
 
     method: str
     size: int  # bytes of the encrypted payload
-    codewords: Codewords | None = None  # None in blocks of codes, as are the numbers below
-    gaussians: int = 0  # size of the published model
+    block_bytes: int = 0  # data bytes of a block of codes; 0 in low bits
+    codewords: Codewords | None = None  # None in blocks of codes
+    gaussians: int = 0  # size of the published model, in low bits
     sketch: bytes = b""
 
     def parts(self, width: int) -> Bytes:
@@ -223,6 +225,8 @@ class Parameters:
         packed = _PREFIX.pack(_VERSION, pack_method(self.method), self.size)
         if (code := self.codewords) is not None:
             packed += _CODEWORDS.pack(self.gaussians, code.count, code.n, code.k) + self.sketch
+        else:
+            packed += _BLOCKS.pack(self.block_bytes)
         size = width - TAG_BYTES - 1
         count = -(-len(packed) // size)
         parts = np.frombuffer(packed.ljust(count * size, b"\0"), np.uint8).reshape(count, size)
@@ -236,7 +240,7 @@ def unpack(parts: Bytes, width: int | None = None) -> Parameters:
     """
     numbered = {int(row[0]): row[1:].tobytes() for row in parts}
     packed = b"".join(numbered[each] for each in takewhile(numbered.__contains__, range(len(numbered))))
-    least = _PREFIX.size + (0 if width is None else _CODEWORDS.size + SKETCH_BYTES)
+    least = _PREFIX.size + (_BLOCKS.size if width is None else _CODEWORDS.size + SKETCH_BYTES)
     if len(packed) < least:
         raise InputError(LOST)
     version, name, size = _PREFIX.unpack_from(packed)
@@ -245,14 +249,14 @@ def unpack(parts: Bytes, width: int | None = None) -> Parameters:
     try:
         method = unpack_method(name)
         if width is None:
-            return Parameters(method, size)
+            return Parameters(method, size, *_BLOCKS.unpack_from(packed, _PREFIX.size))
         gaussians, count, n, k = _CODEWORDS.unpack_from(packed, _PREFIX.size)
         codewords = Codewords(count, n, k, LowBitsCapacity(0, width).chunk_bytes)
     except ValueError as error:
         raise InputError(f"{_DAMAGED}: {error}") from error
     if count > MAX_CODEWORDS or n > MAX_CHUNKS or not 0 < size <= codewords.size:
         raise InputError(f"{_DAMAGED}: {size} bytes in {codewords}")
-    return Parameters(method, size, codewords, gaussians, packed[least - SKETCH_BYTES : least])
+    return Parameters(method, size, 0, codewords, gaussians, packed[least - SKETCH_BYTES : least])
 
 
 def numbered_chunks(codewords: Codewords, data: bytes, count: int) -> Bytes:

@@ -85,7 +85,7 @@ class Writer:
         for index, ((keys, payload), size) in enumerate(zip(payloads, sizes, strict=True)):
             data_key, (count, codewords) = self._data_key(index), plan.shares[index]
             marks = sketch(data_key, ids)
-            parameters = Parameters(payload.method, size, codewords, self._gaussians, marks)
+            parameters = Parameters(payload.method, size, 0, codewords, self._gaussians, marks)
             at = self._write_header(at, data_key, keys, parameters)
             chunks = numbered_chunks(codewords, self._encrypted(data_key, payload, size), count)
             rows, free = free[:count], free[count:]
@@ -111,7 +111,7 @@ class Writer:
             (keys, payload), data_key = payloads[index], self._data_key(index)
             size = width * (takes[index] - BLOCK_HEADER)
             rows = np.frombuffer(self._encrypted(data_key, payload, size), np.uint8).reshape(-1, width)
-            parameters = Parameters(payload.method, size)
+            parameters = Parameters(payload.method, size, width)
             at = self._write_header((first + gaps.pop(0)) % count, data_key, keys[:1], parameters)
             self.table[(at + np.arange(len(rows))) % count] = rows
             first += takes[index]
@@ -196,12 +196,12 @@ class QuietReader(SaltedReader):
 
     def _in_blocks(self, data_key: bytes, found: Parameters, at: int) -> Payload:
         """The payload in the blocks after block `at`, which holds its parameters."""
-        count, rest = divmod(found.size, self.low.shape[1])
-        if rest or count > len(self.low):
+        count, width = -(-found.size // max(1, found.block_bytes)), found.block_bytes
+        if count > len(self.low) or not 0 < width <= self.low.shape[1]:
             raise InputError("the hidden parameters are damaged: the data they describe exceed the file")
         rows = (at + 1 + np.arange(count)) % len(self.low)
-        data = decrypt(payload_key(data_key), self.low[rows].tobytes(), _ASSOCIATED)
-        return Payload(found.method, data)
+        encrypted = self.low[rows, :width].tobytes()[: found.size]
+        return Payload(found.method, decrypt(payload_key(data_key), encrypted, _ASSOCIATED))
 
     def _parameters(self, key: DerivedKey) -> tuple[bytes, Parameters, int, int]:
         """The data key, the parameters, the width of a carrier, and the last carrier of the parameters."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -68,7 +69,9 @@ class CarryCapacity:
                 cover = cover.with_sh_degree(degree)
             prepared = channel.prepare(cover)
         except UsageError as error:
-            raise UsageError(f"{error}; {_ways(degree, channel)}") from error
+            if channel.survives:
+                raise
+            raise UsageError(f"{error}; {_cure(cover, options)}") from error
         return CarryCapacity(len(cover), cover.sh_degree, channel, prepared.capacity, prepared)
 
     def sizes(self, secrets: Sequence[SecretSize]) -> list[int]:
@@ -101,9 +104,13 @@ class CarryCapacity:
         return APPENDED.appended_count([secret.payload_bytes for secret in secrets])
 
 
-def _ways(degree: int, channel: Channel) -> str:
-    """For messages: what makes room in a cover of this SH degree."""
-    return f"`sh_degree={degree + 1}` makes room, {_ANY}" if degree < 2 and channel is LOW_BITS else _ANY
+def _cure(cover: Gaussians | None, options: CarryOptions) -> str:
+    """For messages: the least SH degree that gives `cover` capacity, and what always works."""
+    for degree in range(options.fit.sh_degree + 1, 3) if cover is not None else ():
+        with suppress(UsageError):
+            if LOW_BITS.prepare(to_degree(cover, degree, os.urandom(32))).capacity.bytes:
+                return f"`sh_degree={degree}` makes room, {_ANY}"
+    return _ANY
 
 
 def to_degree(model: Gaussians, sh_degree: int, entropy: bytes) -> Gaussians:

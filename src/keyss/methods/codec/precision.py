@@ -20,7 +20,7 @@ _ATTRIBUTES = ("means", "log_scales", "opacity_logits", "colours", "quats", "har
 _SHARES = (3, 3, 1, 3, 3, 18)
 _TRIES, _CLOSE, _BIT = 6, 0.15, 6.02  # dB
 _COARSEST = 0.1  # maximum step of harmonics, whose errors are invisible from afar
-_FINEST = 2.0  # octaves below the usual steps: about 58 dB
+_FINEST = 1.0  # octaves below the usual steps: about 55 dB
 _BITS_PER_OCTAVE = 13  # per Gaussian, without harmonics
 
 
