@@ -20,11 +20,9 @@ from keyss import read_model
 from codes import against_photos
 from keyss.channels import LowBitsCapacity, usable_carriers
 from keyss.core import Gaussians, KeyssError, Scene
-from keyss.core.gaussians import compensate_pruning
 from keyss.files.scenes import load_scene
 from keyss.fitting import psnr
 from keyss.lab import random_pruning
-from keyss.methods import record_request
 from keyss.rendering import render
 from keyss.rendering.orbit import psnr_between
 from methods.carry.carried import embed, extract
@@ -47,13 +45,10 @@ def main() -> None:
 
 
 def _capacities() -> None:
-    print("Gaussians that fit in 100,000 carriers, by SH degree of the secret (0, 1, 2, 3):")
-    for degree in range(4):
-        fits = [
-            LowBitsCapacity.of(100_000, degree).record_capacity([record_request(1, other)])
-            for other in range(4)
-        ]
-        print(f"  cover of degree {degree}: " + ", ".join(f"{number:,}" for number in fits))
+    print("Bytes of a payload per Gaussian, of 100,000 usable ones:")
+    for degree in range(1, 4):
+        size = LowBitsCapacity.of(100_000, degree).for_payloads().bytes
+        print(f"  cover of degree {degree}: {size / 100_000:.1f}")
 
 
 def _models(paths: list[Path]) -> None:
@@ -68,8 +63,8 @@ def _models(paths: list[Path]) -> None:
             continue
         carried = extract(stego, KEY)
         print(
-            f"{cover} ({len(stego):,}, {usable.mean():.0%} usable) carries {secret} ({carried.count:,}, "
-            f"{carried.bits} bits): cover before and after {psnr_between(models[cover], stego):.1f} dB, "
+            f"{cover} ({len(stego):,}, {usable.mean():.0%} usable) carries {secret} "
+            f"({len(carried.gaussians):,}): cover before and after {psnr_between(models[cover], stego):.1f} dB, "
             f"secret and its own model {psnr_between(models[secret], carried.gaussians):.1f} dB",
             flush=True,
         )
@@ -87,9 +82,7 @@ def _photos(pairs: list[list[str]], width: int) -> None:
             continue
         found = extract(stego, KEY).gaussians
         kept = random_pruning(REMOVED).apply(stego)
-        left = extract(kept, KEY)
-        compensated = compensate_pruning(left.gaussians, left.count)
-        raw, mended = (against_photos(each, scenes[secret]) for each in (left.gaussians, compensated))
+        left = against_photos(extract(kept, KEY).gaussians, scenes[secret])
         whole, bare = against_photos(found, scenes[secret]), against_photos(hidden, scenes[secret])
         before, after = against_photos(model, scenes[cover]), against_photos(kept, scenes[cover])
         cover_change = _between(scenes[cover], model, stego)
@@ -100,8 +93,7 @@ def _photos(pairs: list[list[str]], width: int) -> None:
             f"photos {before:.3f} and {against_photos(stego, scenes[cover]):.3f} dB\n"
             f"  secret and its own model {secret_change:.1f} dB, "
             f"photos {whole:.3f} ({whole - bare:+.3f}) dB\n"
-            f"  25 % removed: cover {after - before:+.2f} dB, secret {raw - whole:+.2f} dB, made up for "
-            f"{mended - whole:+.2f} dB",
+            f"  25 % removed: cover {after - before:+.2f} dB, secret {left - whole:+.2f} dB",
             flush=True,
         )
 

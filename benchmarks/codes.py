@@ -28,7 +28,7 @@ from keyss.files.models import read_model, write_model
 from keyss.files.scenes import load_scene
 from keyss.fitting import mean_psnr
 from keyss.methods import encode_to_size, most_visible, prune_to_size
-from keyss.methods.records import whole
+from keyss.methods.codec.model_bytes import decode, encode
 from keyss.rendering.orbit import psnr_between, scene_of_model
 
 START, END = "<!-- measured by benchmarks/codes.py -->", "<!-- end of what was measured -->"
@@ -71,10 +71,10 @@ def rows(cover: tuple[str, Gaussians], secret: tuple[str, Gaussians], data: Path
         file = stego.codes.serialise()
         hiding = time.monotonic() - start
         start = time.monotonic()
-        opened = whole.decode(QuietReader.of_codes(format_.parse(file)).open(KEY).data)
+        opened = decode(QuietReader.of_codes(format_.parse(file)).open(KEY).data)
         revealing = time.monotonic() - start
         bits = 8 * left / len(model)
-        most = 8 * left / (8 * len(whole.encode(kept)) / len(kept)) / len(model)
+        most = 8 * left / (8 * len(encode(kept)) / len(kept)) / len(model)
         in_format = format_.quantise(in_morton_order(kept)).dequantise()
         numbers = [
             *(against_photos(each, scenes[0]) for each in (untouched, stego)),

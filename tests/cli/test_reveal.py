@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import subprocess
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -23,31 +23,24 @@ from keyss.channels.quiet import cells
 from keyss.core import Gaussians
 from keyss.files import read_model, write_model
 from keyss.keys import DerivedKey
-from keyss.methods import encode_all
-from keyss.methods.records import whole
-from keyss.methods.records.carried_secret import COUNT
+from keyss.methods.codec.model_bytes import encode
 
 KEY = "q7Rv2LxT9bWm4KzD"
 
 
-def hide_claiming(cover: Gaussians, secret: Gaussians, claimed: int) -> Gaussians:
-    """Hide `secret` with a header that claims more Gaussians, as if the others were lost."""
-    prepared = LOW_BITS.prepare(cover)
-    (records,) = encode_all(prepared, [secret])
-    records = replace(records, header=COUNT.pack(claimed) + records.header[COUNT.size :])
-    return prepared.embed([(KEY, records)])
-
-
 @pytest.fixture(scope="module")
 def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Key files, and models with 500 Gaussians left of 500, 1,000 and 12,000."""
+    """Key files; a model with a secret, whole and without a fifth; less than half of one that was full."""
     folder = tmp_path_factory.mktemp("files")
     for name, key in (("key", KEY), ("other", KEY[::-1])):
         write_key(folder / name, key)
-    cover, secret = trained_like(1500), trained_like(500, 1)
-    write_model(folder / "plain.ply", cover)
-    for name, claimed in (("whole", 500), ("half", 1000), ("few", 12_000)):
-        write_model(folder / f"{name}.ply", hide_claiming(cover, secret, claimed))
+    cover = trained_like(1500)
+    prepared = LOW_BITS.prepare(cover)
+    whole = prepared.embed([(KEY, Payload("carry", encode(trained_like(500, 1))))])
+    full = prepared.embed([(KEY, Payload("carry", bytes(prepared.capacity.bytes)))])
+    models = {"plain": cover, "whole": whole, "pruned": whole[:1200], "few": full[:700]}
+    for name, model in models.items():
+        write_model(folder / f"{name}.ply", model)
     return folder
 
 
@@ -62,7 +55,7 @@ def reveal(keyss: Run, files: Path, tmp_path: Path) -> Run:
 
 
 def test_implausible_gaussian_count(keyss: Run, files: Path, tmp_path: Path) -> None:
-    data = whole.encode(model_of(100, sh_degree=0))
+    data = encode(model_of(100, sh_degree=0))
     hostile = Payload("carry", (1 << 17).to_bytes(4, "little") + data[4:])
     write_model(tmp_path / "stego.spz", CodesCover.of(codes_of(".spz")).embed([(KEY, hostile)]))
     for command, *out in (("reveal", "-o", tmp_path / "s.ply"), ("verify",)):
@@ -74,20 +67,15 @@ class TestCounts:
     def test_whole_secret(self, reveal: Run, tmp_path: Path) -> None:
         assert reveal("whole.ply") == Result(0, f"{tmp_path}/s.ply: 500 of 500 Gaussians\n", "")
 
-    def test_partial_secret_warning(self, reveal: Run, tmp_path: Path) -> None:
-        result = reveal("half.ply")
-        assert (result.status, result.out) == (0, f"{tmp_path}/s.ply: 500 of 1,000 Gaussians\n")
-        assert result.err.startswith("keyss: warning: 500 of 1,000 Gaussians of the secret were found")
-        assert "pruning by opacity" in result.err
+    def test_restored_secret_warning(self, reveal: Run, tmp_path: Path) -> None:
+        result = reveal("pruned.ply")
+        assert (result.status, result.out) == (0, f"{tmp_path}/s.ply: 500 of 500 Gaussians\n")
+        assert re.match(r"keyss: warning: \d+ of [\d,]+ chunks .* were restored", result.err)
         assert len(result.err.splitlines()) == 1
 
-    def test_small_remainder_needs_force(self, reveal: Run, tmp_path: Path) -> None:
-        assert_refused(reveal("few.ply"), 4, "500 of 12,000 Gaussians")
+    def test_lost_secret(self, reveal: Run, tmp_path: Path) -> None:
+        assert_refused(reveal("few.ply"), 4, "the key is right, but too much of the model was lost")
         assert listing(tmp_path) == {}
-        assert "--force" in reveal("few.ply").err
-        result = reveal("few.ply", "--force")
-        assert (result.status, len(read_model(tmp_path / "s.ply"))) == (0, 500)
-        assert "keyss: warning: 500 of 12,000" in result.err
 
 
 class TestOpensNothing:

@@ -16,7 +16,7 @@ import keyss
 from channels.quiet.trained_like import trained_like
 from cli.harness import Run, assert_refused
 from keyss import Gaussians, Secret
-from keyss.channels import LOW_BITS, Content, Payload
+from keyss.channels import LOW_BITS, Payload
 from keyss.core import InputError, UsageError, WrongKeyError
 from keyss.methods import (
     Capabilities,
@@ -79,9 +79,8 @@ class WholeMethod:
         return Stego(stego, (unpack(payload),), details={"floats": rows.numel()})
 
 
-def unpack(content: Content) -> OpenedWhole:
-    assert isinstance(content, Payload)
-    rows = torch.from_numpy(np.frombuffer(content.data, np.float32).reshape(-1, 14).copy())
+def unpack(payload: Payload) -> OpenedWhole:
+    rows = torch.from_numpy(np.frombuffer(payload.data, np.float32).reshape(-1, 14).copy())
     means, quats, scales, logits, sh = rows.split((3, 4, 3, 1, 3), dim=1)
     return OpenedWhole(Gaussians(means, quats, scales, logits[:, 0], sh[:, None]))
 

@@ -7,10 +7,10 @@ import warnings
 from typing import Any
 
 import pytest
+from keyss.methods.records import whole
 
 from keyss.core import KeyssWarning
 from keyss.files import read_model
-from keyss.methods.records import whole
 from vectors.make_vectors import FOLDER, carrier_bits, decode_rows, digests, reveal_content
 
 REVEALED = json.loads((FOLDER / "revealed.json").read_text())

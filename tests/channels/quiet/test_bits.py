@@ -11,7 +11,6 @@ from hypothesis import given, settings, strategies as st
 from hypothesis.extra import numpy as arrays
 
 from keyss.channels import Layout, gaussian_ids, read_low_bits, used_words, write_low_bits
-from keyss.channels.quiet.contents import _rows_in
 from keyss.channels.quiet.usable import repeated
 from keyss.core import Gaussians
 from keyss.kernels.parallel import in_blocks
@@ -82,13 +81,6 @@ def test_what_occurs_twice_is_found_whatever_it_is(values: np.ndarray, shift: in
     values = values << np.uint64(shift)
     times = {value: int((values == value).sum()) for value in values.tolist()}
     assert repeated(values).tolist() == [times[value] > 1 for value in values.tolist()]
-
-
-@given(arrays.arrays(np.uint8, (12, 11), elements=st.integers(0, 1)), st.integers(0, 12))
-def test_rows_among_others(rows: np.ndarray, split: int) -> None:
-    own, others = rows[:split], rows[split:]
-    known = {row.tobytes() for row in others}
-    assert _rows_in(own, others).tolist() == [row.tobytes() in known for row in own]
 
 
 @pytest.mark.parametrize("threads", [1, 2, 5])

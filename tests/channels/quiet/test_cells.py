@@ -32,14 +32,14 @@ def test_round_trip_and_what_is_behind_a_cell_is_ignored(size: int) -> None:
 
 def test_the_construction_is_the_documented_one() -> None:
     """Cell by cell, with the library's own CBC."""
-    size, slot = 40, 2
+    size = 40
     ids, data = _bytes(5, 16), _bytes(5, size)
-    cells = CellCipher(SECRET, "x", size).encrypt(ids, data, slot)
+    cells = CellCipher(SECRET, "x", size).encrypt(ids, data)
     for name, plain, cell in zip(ids, data, cells, strict=True):
-        message = name.tobytes() + (bytes([slot]) + plain.tobytes()).ljust(48, b"\0")
+        message = name.tobytes() + plain.tobytes().ljust(48, b"\0")
         tag = Cipher(AES(expand(SECRET, "x/tag", 32)), CBC(bytes(16))).encryptor().update(message)[-16:]
         assert cell[:TAG_BYTES].tobytes() == tag[:TAG_BYTES]
-        nonce = bytes(a ^ b for a, b in zip(name, (tag[:4] + bytes([slot])).ljust(16, b"\0"), strict=True))
+        nonce = bytes(a ^ b for a, b in zip(name, tag[:4].ljust(16, b"\0"), strict=True))
         seed = _aes("x/seed", nonce)
         stream = b"".join(_aes("x/stream", seed[:-1] + bytes([seed[-1] ^ block])) for block in range(3))
         assert cell[TAG_BYTES:].tobytes() == bytes(a ^ b for a, b in zip(plain, stream, strict=False))
@@ -49,12 +49,11 @@ def _aes(label: str, block: bytes) -> bytes:
     return Cipher(AES(expand(SECRET, label, 32)), ECB()).encryptor().update(block)
 
 
-def test_other_keys_labels_slots_and_gaussians_open_nothing() -> None:
+def test_other_keys_labels_and_gaussians_open_nothing() -> None:
     ids, data = _bytes(2000, 16), _bytes(2000, 20)
     cells = CellCipher(SECRET, "x", 20).encrypt(ids, data)
     assert not CellCipher(bytes(32), "x", 20).decrypt(ids, cells)[0].any()
     assert not CellCipher(SECRET, "y", 20).decrypt(ids, cells)[0].any()
-    assert not CellCipher(SECRET, "x", 20).decrypt(ids, cells, 1)[0].any()
     assert not CellCipher(SECRET, "x", 20).decrypt(ids[::-1], cells)[0].any()
 
 
@@ -67,10 +66,10 @@ def test_every_single_flipped_bit_is_noticed() -> None:
 
 
 def test_no_key_stream_comes_twice() -> None:
-    """Zeros encrypted: the same in many Gaussians and slots, other data in the same Gaussian."""
+    """Zeros encrypted: the same in many Gaussians, other data in the same Gaussian."""
     cipher, ids = CellCipher(SECRET, "x", 32), _bytes(1000, 16)
     zeros = np.zeros((1000, 32), np.uint8)
-    streams = [cipher.encrypt(ids, zeros, slot)[:, TAG_BYTES:] for slot in range(4)]
+    streams = [cipher.encrypt(ids, zeros)[:, TAG_BYTES:]]
     other = zeros.copy()
     other[:, -1] = 1
     streams.append(cipher.encrypt(ids, other)[:, TAG_BYTES:] ^ other)

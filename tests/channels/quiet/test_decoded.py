@@ -11,7 +11,7 @@ import torch
 
 from channels.quiet.coded import FORMATS, model_of
 from channels.quiet.trained_like import trained_like
-from keyss.channels import LOW_BITS, Payload, channel_for, open_content
+from keyss.channels import LOW_BITS, Payload, channel_for, open_payload
 from keyss.channels.quiet.decoded import Decoded
 from keyss.core import Gaussians, UsageError
 from keyss.files import read_model, write_model
@@ -30,7 +30,7 @@ def hidden_in(model: Gaussians, entropy: bytes = bytes(32)) -> Gaussians:
 
 
 def opened(model: Gaussians) -> bytes:
-    content = open_content(model, "a key")
+    content = open_payload(model, "a key")
     assert isinstance(content, Payload)
     return content.data
 

@@ -14,12 +14,12 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 from channels.quiet.coded import FORMATS, codes_of, opened, written
-from channels.quiet.payloads import embed_contents
+from channels.quiet.payloads import embed_payloads
 from channels.quiet.trained_like import keys, trained_like
 from files.formats.examples import KINDS, random_codes
 from keyss.channels import LOW_BITS, CodesCover, Codewords, Payload, QuietReader
-from keyss.channels.quiet import contents, layout
-from keyss.channels.quiet.layout import PAYLOAD, RECORDS, Parameters, pack_codewords
+from keyss.channels.quiet import layout, payloads
+from keyss.channels.quiet.layout import Parameters
 from keyss.channels.reed_solomon import MAX_CHUNKS
 from keyss.core import Gaussians, InputError, UsageError, WrongKeyError
 from keyss.keys import encryption
@@ -61,12 +61,12 @@ def test_mutated_files_open_or_are_refused(suffix: str) -> None:
     assert time.process_time() - start < 60
 
 
-@pytest.mark.parametrize(("count", "size"), [(1, 0), (10**6, 120), (1, 129), (2**32 - 1, 2**16 - 1)])
+@pytest.mark.parametrize(("size", "block"), [(1, 0), (120 * 10**6, 120), (129, 129), (2**32 - 1, 2**16 - 1)])
 def test_parameters_that_name_more_than_there_is(
-    count: int, size: int, monkeypatch: pytest.MonkeyPatch
+    size: int, block: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    hostile = Parameters(PAYLOAD, "carry", 1, size, 2500, count, b"")
-    monkeypatch.setattr(contents, "Parameters", lambda *_: hostile)
+    hostile = Parameters("carry", size, block)
+    monkeypatch.setattr(payloads, "Parameters", lambda *_: hostile)
     file = written(CodesCover.of(codes_of(".spz", 2500)), b"data")
     with pytest.raises(InputError, match="exceed the file"):
         opened(file)
@@ -108,32 +108,42 @@ def cover() -> Gaussians:
     return trained_like(3000, 3)
 
 
+class Impossible(Codewords):
+    def __post_init__(self) -> None:
+        """Accept everything."""
+
+
 @pytest.mark.parametrize(
-    "hostile",
+    ("size", "codewords"),
     [
-        Parameters(
-            PAYLOAD,
-            "carry",
-            1,
-            71,
-            3000,
-            1,
-            pack_codewords(10**9, Codewords(layout.MAX_CODEWORDS, 1024, 999, 68)),
-        ),
-        Parameters(PAYLOAD, "carry", 1, 71, 3000, 1, pack_codewords(69, Codewords(1, 255, 1, 68))),
-        Parameters(PAYLOAD, "carry", 1, 71, 3000, 1, b"too short"),
-        Parameters(RECORDS, "carry", 1, 71, 3000, 1, bytes(4097)),
-        Parameters(RECORDS, "carry", 1, 65_535, 3000, 1, b""),
-        Parameters(RECORDS, "carry", 4, 60, 3000, 1, b""),
-        Parameters(3, "carry", 1, 71, 3000, 1, b""),
+        (10**9, Codewords(layout.MAX_CODEWORDS, 1024, 999, 68)),
+        (69, Codewords(1, 255, 1, 68)),
+        (0, Codewords(1, 255, 1, 68)),
+        (1, Codewords(layout.MAX_CODEWORDS + 1, 255, 1, 68)),
+        (1, Codewords(1, 1025, 1, 68)),
+        (1, Impossible(0, 255, 1, 68)),
+        (1, Impossible(1, 2, 3, 68)),
+        (1, Impossible(1, 255, 0, 68)),
     ],
-    ids=["codewords", "size", "no codewords", "header", "records", "cells", "service"],
+    ids=["lost", "size", "empty", "codewords", "chunks", "no codewords", "more data", "no data"],
 )
 def test_hostile_parameters_end_in_a_sentence(
-    cover: Gaussians, hostile: Parameters, monkeypatch: pytest.MonkeyPatch
+    cover: Gaussians, size: int, codewords: Codewords, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(contents, "Parameters", lambda *_: hostile)
-    stego = embed_contents(LOW_BITS.prepare(cover), [(keys(), Payload("carry", b"x"))])
+    hostile = Parameters("carry", size, 0, codewords, 3000, bytes(32))
+    monkeypatch.setattr(payloads, "Parameters", lambda *_: hostile)
+    stego = embed_payloads(LOW_BITS.prepare(cover), [(keys(), Payload("carry", b"x"))])
     reader = QuietReader.of(stego)
     with at_most(10), pytest.raises(InputError, match=r"the key is right|are damaged"):
         reader.extract(keys()[0])
+
+
+@pytest.mark.parametrize("version", [0, 5, 7, 255])
+def test_other_versions_end_in_a_sentence(
+    cover: Gaussians, version: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patch:
+        patch.setattr(layout, "_VERSION", version)
+        stego = embed_payloads(LOW_BITS.prepare(cover), [(keys(), Payload("carry", b"x"))])
+    with pytest.raises(InputError, match=f"of version {version}; this program reads"):
+        QuietReader.of(stego).extract(keys()[0])

@@ -15,15 +15,13 @@ import pytest
 import torch
 from argon2.low_level import Type, hash_secret_raw
 
-from channels.quiet.payloads import embed, embed_contents, embed_derived, extract, extract_derived
+from channels.quiet.payloads import embed, embed_derived, extract, extract_derived
 from channels.quiet.trained_like import UNNATURAL, keys, trained_like
 from keyss.channels import (
     LOW_BITS,
     Layout,
     LowBitsCapacity,
     QuietReader,
-    RecordRequest,
-    Records,
     base,
     check_payload_fits,
     gaussian_ids,
@@ -37,7 +35,6 @@ from keyss.channels.quiet import cells
 from keyss.core import Gaussians, InputError, KeyssWarning, UsageError, WrongKeyError
 from keyss.files import read_model, write_model
 from keyss.keys import ALPHABET, DerivedKey, generate_key
-from keyss.methods import encode_all
 from keyss.rendering import render
 from tiny_scenes import ring_cameras
 
@@ -108,7 +105,7 @@ def test_survives_shuffling_and_the_loss_of_a_quarter(stego: Gaussians, seed: in
 def test_too_much_pruning_is_said_to_the_holder_of_the_key_only() -> None:
     model = trained_like(4000)
     own, other = keys(), keys(1)
-    capacity = LOW_BITS.estimate_capacity(3500, 3).bytes
+    capacity = LOW_BITS.prepare(model).capacity.bytes
     stego = embed_derived(model, [(own, os.urandom(capacity * 9 // 10))])
     order = torch.randperm(4000, generator=torch.Generator().manual_seed(0))
     first = salt_rows(stego, gaussian_ids(stego), Layout.of(stego))[:1]
@@ -254,9 +251,15 @@ def test_capacity_grows_with_the_model_and_is_kept_to() -> None:
     assert sizes[-1] / 200_000 > 38
     assert capacities[-1].payload_capacity(1) > 1.9 * capacities[-1].payload_capacity(2)
     for capacity, size in zip(capacities[1:], sizes[1:], strict=True):
-        capacity.plan_payloads([size])
+        for secrets in (1, 2, 4) if capacity.carriers >= 5000 else (1,):
+            plan = capacity.plan([size // secrets] * secrets)
+            assert plan.independent == (capacity.carriers >= 5000)
+            assert plan.first + sum(count for count, _ in plan.shares) <= capacity.carriers
+        largest = capacity.payload_capacity(1)
+        assert size <= largest < 1.5 * size
+        capacity.plan([largest])
         with pytest.raises(UsageError, match="too small"):
-            capacity.plan_payloads([size + 1])
+            capacity.plan([largest + 1])
 
 
 @pytest.mark.parametrize("change", UNNATURAL)
@@ -306,33 +309,24 @@ def test_renders_before_and_after_are_equal_beyond_what_can_be_seen() -> None:
         assert -10 * torch.log10(error) > 70
 
 
-def _carried(cover: Gaussians, count: int) -> Gaussians:
-    prepared = LOW_BITS.prepare(cover)
-    (plan,) = prepared.cells.plan_records([RecordRequest(count, 33, 10)])
-    data = torch.randint(256, (count, plan.record_bytes), dtype=torch.uint8).numpy()
-    records = Records("test", bytes(10), data, plan, torch.arange(plan.copies).numpy())
-    return embed_contents(prepared, [(keys(1), records)])
-
-
 @pytest.fixture(scope="module")
 def cover() -> Gaussians:
     return trained_like(1500, 4)
 
 
 def test_two_hidings_in_one_cover_have_no_salt_in_common(cover: Gaussians) -> None:
-    first, second = (QuietReader.of(_carried(cover, 50)).salts for _ in range(2))
+    first, second = (QuietReader.of(embed(cover, [(KEY, b"x")])).salts for _ in range(2))
     assert len(set(first)) == len(set(second)) == 12
     assert not set(first) & set(second)
 
 
 def test_copies_count_once(cover: Gaussians) -> None:
-    stego = _carried(cover, 200)
+    stego = embed(cover, [(KEY, PAYLOAD)])
     five = Gaussians.cat([stego] * 5)[torch.randperm(5 * len(stego))]
-    one, other = (QuietReader.of(model).extract(keys(1)[0]) for model in (stego, five))
-    assert isinstance(one, Records)
-    assert isinstance(other, Records)
-    assert len(one.records) == len(other.records) == 200
-    assert {row.tobytes() for row in one.records} == {row.tobytes() for row in other.records}
+    one, other = (QuietReader.of(model).open(KEY) for model in (stego, five))
+    assert one == other
+    assert one.chunks == other.chunks
+    assert other.foreign == 0
 
 
 def test_who_merges_two_files_under_one_key_is_told(cover: Gaussians) -> None:
@@ -356,13 +350,9 @@ def replaced(first: Gaussians, second: Gaussians, kept: float) -> Gaussians:
 
 @pytest.mark.parametrize("kept", [1.0, 0.8, 0.5])
 def test_who_puts_one_file_into_another_does_not_go_unnoticed(cover: Gaussians, kept: float) -> None:
-    other, secret = trained_like(1500, 9), trained_like(300, 10, 0)
-    records = encode_all(LOW_BITS.prepare(cover), [secret])[0]
-    first = LOW_BITS.prepare(cover).embed([(KEY, records)])
-    second = embed(other, [(KEY, b"second")])
+    first, second = embed(cover, [(KEY, b"first")]), embed(trained_like(1500, 9), [(KEY, b"second")])
     with pytest.warns(KeyssWarning, match="Gaussians were added to the file"):
-        opened = QuietReader.of(replaced(first, second, kept)).open(KEY)
-    assert isinstance(opened, Records)
+        assert extract(replaced(first, second, kept), KEY) == b"first"
 
 
 @pytest.mark.parametrize("kept", [slice(None), slice(300, None), slice(None, None, -2)])

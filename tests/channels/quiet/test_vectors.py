@@ -63,7 +63,7 @@ def test_cell() -> None:
     )
     secret, label = bytes.fromhex(vector["secret"]), vector["label"]
     cipher = CellCipher(secret, label, data.shape[1])
-    assert (cipher.encrypt(carrier_id, data, vector["slot"]) == cell).all()
-    fits, decrypted = cipher.decrypt(carrier_id, cell, vector["slot"])
+    assert (cipher.encrypt(carrier_id, data) == cell).all()
+    fits, decrypted = cipher.decrypt(carrier_id, cell)
     assert fits.all()
     assert (decrypted == data).all()

@@ -29,6 +29,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 import numpy as np
 import torch
+from keyss.methods.codec.model_bytes import decode, encode
 
 from files.formats.false_sizes import FALSE_SIZES, image
 from files.scene_files import camera_bytes, counted, image_bytes, point_bytes
@@ -37,7 +38,6 @@ from keyss.core.picture_network import DecodedGaussians, PictureNetwork
 from keyss.files import load_scene, model_bytes, model_of_bytes
 from keyss.files.formats.spz import SpzCodes
 from keyss.files.images import read_image
-from keyss.methods.records import whole
 from keyss.methods.tensors import Header, pack_tensors, refuse_damage, unpack_tensors
 from tiny_scenes import random_gaussians
 
@@ -62,7 +62,7 @@ def examples() -> dict[str, list[bytes]]:
 
     found = {name: [model_bytes(name, model(degree)) for degree in (0, 2)] for name in NAMES[:6]}
     found["a.spz"].append(replace(SpzCodes.quantise(model(1)), version=4).serialise())
-    found["a.payload"] = [whole.encode(model(degree)) for degree in range(4)]
+    found["a.payload"] = [encode(model(degree)) for degree in range(4)]
     layers = ((torch.ones(3, 4, 3, 3), torch.zeros(3)),)
     decoded = DecodedGaussians.of(model(0), PictureNetwork(layers, torch.zeros(4)), torch.zeros(count, 4))
     found["a.3dgs.safetensors"] = [model_bytes("a.3dgs.safetensors", decoded)]
@@ -175,7 +175,7 @@ def _read(name: str, data: bytes) -> str | None:
         with refuse_damage("damaged"):
             unpack_tensors(data, Header, "test", 1)
         return None
-    model = whole.decode(data, CARRIERS) if name == "a.payload" else model_of_bytes(name, data)
+    model = decode(data, CARRIERS) if name == "a.payload" else model_of_bytes(name, data)
     finite = all(bool(value.isfinite().all()) for value in vars(model).values() if torch.is_tensor(value))
     return None if finite and len(model) else "a model that is empty or not finite"
 

@@ -30,7 +30,7 @@ def _unit(model: Gaussians) -> Gaussians:
 def test_cover_without_harmonics(
     change: Callable[[Gaussians], Gaussians],
 ) -> None:
-    """Hiding with the degree that the error names has the planned capacity."""
+    """Hiding with the degree that the error names has the planned capacity, or more with fewer harmonics."""
     cover, secret = change(trained_like(4000, sh_degree=0)), trained_like(9000, 1, 2)
     with pytest.raises(UsageError, match=r"degree 0 .*no room.*`publish=.any.`") as refusal:
         _prepare(CarryOptions(format="ply"), cover, secret)
@@ -46,8 +46,7 @@ def test_cover_without_harmonics(
     stego = registry.get("carry").hide(sources[0], sources[1:], options, context)
     (opened,) = stego.opened
     assert stego.gaussians.sh_degree == planned.sh_degree == degree
-    assert len(opened.reveal(stego.gaussians)) == planned.capacity
-    assert planned.capacity > 3000
+    assert len(opened.reveal(stego.gaussians)) >= planned.capacity > 1000
     assert _prepare(CarryOptions(publish="any"), cover, secret).fit.sh_degree == 0
 
 

@@ -21,9 +21,9 @@ from keyss.channels import (
     usable_carriers,
 )
 from keyss.channels.quiet.layout import key_cipher
-from keyss.core import Gaussians, UsageError, WrongKeyError
+from keyss.core import Gaussians, KeyssError, WrongKeyError
 from keyss.keys import DerivedKey
-from keyss.methods import embed_models, record_request
+from keyss.methods import embed_models
 from methods.carry.carried import embed, embed_derived, extract, extract_derived
 
 KEY = "the right key"
@@ -45,39 +45,28 @@ def stego(cover: Gaussians, secret: Gaussians) -> Gaussians:
     return embed(cover, [(KEY, secret)])
 
 
-def rows_of(model: Gaussians) -> set[bytes]:
-    """Gaussians as a set: revealing changes their order."""
-    flat = [value.reshape(len(model), -1) for value in vars(model).values()]
-    return {row.tobytes() for row in torch.cat(flat, 1).numpy()}
-
-
 def salt_of(model: Gaussians, own: list[DerivedKey], before: Gaussians) -> DerivedKey:
     """The key under the salt that a reader of `model` tries first."""
     return own[QuietReader.of(before).salts.index(QuietReader.of(model).salts[0])]
 
 
 def test_round_trip(cover: Gaussians, secret: Gaussians) -> None:
-    secret = secret[:400]
-    carried = extract(embed(cover, [(KEY, secret)]), KEY)
-    assert carried.count == len(carried.gaussians) == len(secret)
-    found = carried.gaussians
-    order, other = found.means[:, 0].argsort(), secret.means[:, 0].argsort()
-    assert torch.allclose(found.means[order], secret.means[other], atol=1e-4)
-    assert torch.allclose(found.sh[order], secret.sh[other], atol=0.02)
+    found = extract(embed(cover, [(KEY, secret)]), KEY).gaussians
+    assert len(found) == len(secret)
+    distances, nearest = torch.cdist(found.means, secret.means).min(dim=1)
+    assert len(nearest.unique()) == len(secret)
+    assert float(distances.max()) < 0.01
+    assert torch.allclose(found.sh[:, 0], secret.sh[nearest, 0], atol=0.06)
 
 
-@pytest.mark.parametrize("cover_degree", [1, 3])
+@pytest.mark.parametrize("cover_degree", [1, 2, 3])
 @pytest.mark.parametrize("secret_degree", range(4))
 def test_sh_degrees(cover_degree: int, secret_degree: int) -> None:
-    model, hidden = trained_like(3000, sh_degree=cover_degree), trained_like(900, 1, secret_degree)
+    model, hidden = trained_like(3000, sh_degree=cover_degree), trained_like(300, 1, secret_degree)
     own = keys()
-    if (cover_degree, secret_degree) in ((1, 1), (1, 2), (1, 3)):
-        with pytest.raises(UsageError, match="room for records of"):
-            embed_derived(model, [(own, hidden)])
-        return
     carried = extract_derived(QuietReader.of(embed_derived(model, [(own, hidden)])), own[0])
     assert carried.gaussians.sh_degree == secret_degree
-    assert len(carried.gaussians) == 900
+    assert len(carried.gaussians) == 300
 
 
 def test_every_usable_gaussian_is_written() -> None:
@@ -95,7 +84,7 @@ def test_every_usable_gaussian_is_written() -> None:
         carriers = QuietReader.of(stego)
         carried = extract_derived(carriers, own[0])
         cells, _ = key_cipher(own[0]).decrypt(carriers.ids, carriers.low)
-        seen.append((carried.count, len(carried.gaussians), int(cells.sum())))
+        seen.append((carried.chunks, len(carried.gaussians), int(cells.sum())))
         with pytest.raises(WrongKeyError):
             extract_derived(carriers, keys(3)[0])
     assert seen[0] == seen[1]
@@ -103,27 +92,28 @@ def test_every_usable_gaussian_is_written() -> None:
 
 @pytest.mark.parametrize("seed", range(2))
 def test_shuffling_and_pruning(cover: Gaussians, secret: Gaussians, seed: int) -> None:
+    """Nothing is lost with a quarter of the Gaussians."""
     own = keys()
     stego = embed_derived(cover, [(own, secret)], entropy=ENTROPY)
-    whole = rows_of(extract_derived(QuietReader.of(stego), own[0]).gaussians)
+    whole = extract_derived(QuietReader.of(stego), own[0])
     order = torch.randperm(len(stego), generator=torch.Generator().manual_seed(seed))
-    assert rows_of(extract_derived(QuietReader.of(stego[order]), own[0]).gaussians) == whole
+    shuffled = extract_derived(QuietReader.of(stego[order]), own[0])
+    assert shuffled.gaussians.digest() == whole.gaussians.digest()
     pruned = stego[order[: len(stego) * 3 // 4]]
     carried = extract_derived(QuietReader.of(pruned), salt_of(pruned, own, stego))
-    assert rows_of(carried.gaussians) <= whole
-    assert carried.count == len(secret)
-    copies = LOW_BITS.prepare(cover).cells.plan_records([record_request(1200, 3)])[0].copies
-    assert 0 < copies <= 300
-    expected = 0.75 * (len(secret) - copies) + (1 - 0.25**2) * copies
-    assert len(carried.gaussians) == pytest.approx(expected, abs=4 * (0.19 * 1200) ** 0.5)
+    assert carried.gaussians.digest() == whole.gaussians.digest()
+    left, chunks = carried.chunks
+    assert whole.chunks == (chunks, chunks)
+    assert left == pytest.approx(0.75 * chunks, abs=5 * (0.19 * chunks) ** 0.5)
+    assert not carried.remains(carried.gaussians).whole
 
 
-def test_bit_flip_loses_one_carrier(cover: Gaussians, secret: Gaussians) -> None:
+def test_bit_flip_loses_one_chunk(cover: Gaussians, secret: Gaussians) -> None:
     """Any bit of any attribute, including Gaussians that hold a salt."""
     stego = embed(cover, [(KEY, secret)], entropy=ENTROPY)
     names = QuietReader.of(stego).salts
     own = [DerivedKey.of(KEY, salt) for salt in names[:3]]
-    whole = rows_of(extract(stego, KEY).gaussians)
+    whole = extract(stego, KEY)
     random = np.random.default_rng(0)
     first = int(salt_rows(stego, gaussian_ids(stego), Layout.of(stego))[0])
     for trial in range(60):
@@ -132,13 +122,10 @@ def test_bit_flip_loses_one_carrier(cover: Gaussians, secret: Gaussians) -> None
         if changed is None:
             continue
         carriers = QuietReader.of(changed)
-        found: set[bytes] = set()
-        for name in carriers.salts[:2]:
-            if name in names[:3]:
-                found = rows_of(extract_derived(carriers, own[names.index(name)]).gaussians)
-                break
-        assert len(whole - found) <= 2  # secret Gaussians in one carrier
-        assert found <= whole
+        name = next(name for name in carriers.salts[:2] if name in names[:3])
+        found = extract_derived(carriers, own[names.index(name)])
+        assert found.gaussians.digest() == whole.gaussians.digest()
+        assert whole.chunks[1] - found.chunks[0] <= 1
 
 
 def _with_flipped_bit(model: Gaussians, row: int, column: int, bit: int) -> Gaussians | None:
@@ -162,32 +149,19 @@ def test_foreign_gaussians_do_not_block_salts(stego: Gaussians, secret: Gaussian
     added = added[torch.from_numpy(salt_rows(added, gaussian_ids(added), Layout.of(added))[:3])]
     crowded = Gaussians.cat([added, stego])
     assert not set(own) & set(QuietReader.of(crowded).salts[:3])
-    assert rows_of(extract(crowded, KEY).gaussians) == rows_of(extract(stego, KEY).gaussians)
+    assert extract(crowded, KEY).gaussians.digest() == extract(stego, KEY).gaussians.digest()
     assert len(extract(crowded, KEY).gaussians) == len(secret)
 
 
-def test_damaged_records_are_detected(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_damage_while_writing_is_detected(monkeypatch: pytest.MonkeyPatch) -> None:
     embed = LowBitsCover.embed
 
     def broken(*arguments: Any, **options: Any) -> Gaussians:
         found = embed(*arguments, **options)
         sh = found.sh.clone()
-        sh[::5, 5].view(torch.int32).bitwise_xor_(8)
+        sh[:, 5].view(torch.int32).bitwise_xor_(8)
         return replace(found, sh=sh)
 
     monkeypatch.setattr(LowBitsCover, "embed", broken)
-    with pytest.raises(RuntimeError, match="do not open again"):
+    with pytest.raises((RuntimeError, KeyssError)):
         embed_models(LOW_BITS.prepare(trained_like(6000, 0)), [KEY], [trained_like(2000, 1)])
-
-
-def test_overwritten_cover() -> None:
-    cover, keys, secrets = trained_like(3000, 0), ["7Vw3-Qp of the first"], [trained_like(900, 1)]
-    before = cover.map(torch.clone)
-    stego = embed_models(LOW_BITS.prepare(cover), keys, secrets, entropy=bytes(32)).gaussians
-    assert cover.digest() == before.digest()
-    prepared = LOW_BITS.prepare(cover)
-    assert prepared.usable is LOW_BITS.prepare(cover).usable  # found once
-    own = embed_models(prepared, keys, secrets, entropy=bytes(32), overwrite=True).gaussians
-    assert own.digest() == stego.digest()
-    assert cover.digest() == stego.digest()
-    assert prepared.usable is not LOW_BITS.prepare(cover).usable  # found again: the cover is another model

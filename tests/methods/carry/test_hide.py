@@ -52,7 +52,7 @@ def test_hide_and_reveal_files(run: Run, tmp_path: Path) -> None:
     }
     metrics = json.loads((tmp_path / "out/private/metrics.json").read_text())
     assert metrics["secret_gaussians"] == [900]
-    assert metrics["details"]["bits_per_gaussian"] == [568]
+    assert 100 < metrics["details"]["bits_per_gaussian"][0] < 568
     assert metrics["cover"]["psnr"] == pytest.approx(metrics["baseline"]["cover"]["psnr"], abs=0.1)
     assert metrics["secrets"][0]["psnr"] > 55
     assert metrics["secrets"][0]["psnr"] > metrics["chance_level"][0] + 20

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from keyss.channels import QuietReader
 from keyss.core import Gaussians, WrongKeyError
 from keyss.files import read_model
 from methods.carry.carried import extract
@@ -22,17 +23,14 @@ STEGO = read_model(FOLDER / "carried.ply")
 
 
 def test_known_answer() -> None:
-    carried = extract(STEGO, VECTOR["key"])
-    assert (carried.count, carried.bits) == (VECTOR["count"], VECTOR["bits"])
-    found = carried.gaussians[carried.gaussians.means[:, 0].argsort()]
-    for name in ("means", "quats", "log_scales", "opacity_logits", "sh"):
-        values = getattr(found, name)
-        torch.testing.assert_close(values, torch.tensor(VECTOR[name]).reshape(values.shape))
+    payload = QuietReader.of(STEGO).open(VECTOR["key"])
+    assert payload.data.hex() == VECTOR["payload"]
+    assert len(extract(STEGO, VECTOR["key"]).gaussians) == VECTOR["count"]
 
 
 def test_wrong_key() -> None:
     with pytest.raises(WrongKeyError):
-        extract(STEGO, VECTOR["wrong"])
+        extract(STEGO, VECTOR["key"].swapcase())
 
 
 @pytest.mark.parametrize(
@@ -50,5 +48,7 @@ def test_modified_models_open_nothing(change: Callable[[Gaussians], Gaussians]) 
 
 def test_pruned_model() -> None:
     order = torch.randperm(len(STEGO), generator=torch.Generator().manual_seed(0))
-    carried = extract(STEGO[order[:360]], VECTOR["key"])
-    assert 4 <= len(carried.gaussians) <= carried.count == VECTOR["count"]
+    carried = extract(STEGO[order[:300]], VECTOR["key"])
+    assert len(carried.gaussians) == VECTOR["count"]
+    left, chunks = carried.chunks
+    assert 0.65 * chunks < left < 0.85 * chunks

@@ -77,9 +77,8 @@ def encode(model: Gaussians, precision: Precision | None = None) -> bytes:
     model = in_morton_order(model)
     steps = (precision or Precision.usual(model)).steps
     numbers = _even_columns(model)
-    *middle, _, _, logit = np.median(numbers[:, :7], axis=0)
-    middle[3] = np.median(numbers[:, 3:6])
-    centres = [float(np.float32(each)) for each in (*middle, logit)]
+    parts = (0, 1, 2, slice(3, 6), 6)  # x, y, z, log scales, opacity logits
+    centres = [float(np.float32(np.median(numbers[:, part]))) for part in parts]
     even = _round((numbers - _origin(centres)) / _even_steps(steps))
     finer = _refinement(*_even_numbers(even, centres, steps)[1:3])
     quats = with_largest_w(doubles(model.quats))[:, 1:] / _steps(steps[4], finer)

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 from keyss.core import InputError
-from keyss.methods.records import entropy
+from keyss.methods.codec import entropy
 
 
 @settings(max_examples=40, deadline=None)
