@@ -2,8 +2,7 @@
 
     python benchmarks/holder.py bonsai=a.ply bonsai=b.ply fox=c.ply ...   # plain, of three scenes or more
 
-In each model, a secret is hidden alone and beside one to three others, as carried models and as encrypted
-payloads. The holder opens it, tries every cell of the file with the key (`tests/channels/quiet/holder.py`),
+In each model, a secret is hidden alone and beside one to three others. The holder opens it, tries every cell of the file with the key (`tests/channels/quiet/holder.py`),
 and computes the statistics of `keyss.lab.stealth`. Detectors are cross-validated over scenes.
 """
 
@@ -26,19 +25,16 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
-from channels.quiet import payloads
 from channels.quiet.holder import seen_by_holder
 from channels.quiet.trained_like import keys
 from keyss.core import UsageError
 from keyss.lab import stealth_statistics
 from keyss.methods import most_visible
-from methods.carry import carried
+from methods.carry.carried import embed_derived
 from stealth_detection import Examples, learned_detectors, single_detectors
 
 MAX_OTHERS = 3
 SHARE = 8  # secrets have at most 1 / SHARE of the cover's Gaussians
-PAYLOAD_BYTES = (500, 3000)
-KINDS = ("carried", "payload")
 SHOWN = 3  # single statistics in the table
 
 
@@ -66,22 +62,21 @@ def main() -> None:
     jobs, seen = zip(*[each for each in zip(jobs, results, strict=True) if each[1]], strict=True)
     print(f"{len(jobs)} models of {len({job.scene for job in jobs})} scenes, ", end="")
     print(f"{time.monotonic() - started:.0f} s\n")
-    print("| secret | detector | AUC | standard error | largest by chance |\n| --- | --- | --- | --- | --- |")
-    for kind in KINDS:
-        examples = Examples.of(
-            (each[kind, beside], beside, job.scene, job.cover)
-            for job, each in zip(jobs, seen, strict=True)
-            for beside in (0, 1)
-        )
-        single, chance = single_detectors(examples, SHOWN)
-        for row in learned_detectors(examples):
-            print(f"| {kind} | {row.name} | {row.auc:.3f} | {row.error:.3f} | |")
-        for row in single:
-            print(f"| {kind} | {row.name} | {row.auc:.3f} | {row.error:.3f} | {chance:.2f} |")
+    print("| detector | AUC | standard error | largest by chance |\n| --- | --- | --- | --- |")
+    examples = Examples.of(
+        (each[beside], beside, job.scene, job.cover)
+        for job, each in zip(jobs, seen, strict=True)
+        for beside in (0, 1)
+    )
+    single, chance = single_detectors(examples, SHOWN)
+    for row in learned_detectors(examples):
+        print(f"| {row.name} | {row.auc:.3f} | {row.error:.3f} | |")
+    for row in single:
+        print(f"| {row.name} | {row.auc:.3f} | {row.error:.3f} | {chance:.2f} |")
 
 
-def _count_or_skip(job: Job) -> dict[tuple[str, int], dict[str, float]] | None:
-    """The first holder's statistics by kind, alone (0) or beside others (1); None for too small covers."""
+def _count_or_skip(job: Job) -> list[dict[str, float]] | None:
+    """The first holder's statistics, alone and beside others; None for too small covers."""
     try:
         return _count(job)
     except UsageError as error:
@@ -89,27 +84,19 @@ def _count_or_skip(job: Job) -> dict[tuple[str, int], dict[str, float]] | None:
         return None
 
 
-def _count(job: Job) -> dict[tuple[str, int], dict[str, float]]:
+def _count(job: Job) -> list[dict[str, float]]:
     random = np.random.default_rng(job.index)
     cover = read_model(job.cover)
     secrets = [
         most_visible(read_model(path), int(random.integers(len(cover) // (2 * SHARE), len(cover) // SHARE)))
         for path in random.choice(job.others, 1 + MAX_OTHERS)
     ]
-    data = [os.urandom(int(random.integers(*PAYLOAD_BYTES))) for _ in secrets]
-    found = {}
-    for beside in (0, 1):
-        count = 1 + beside * int(random.integers(1, MAX_OTHERS + 1))
+    found = []
+    for count in (1, 1 + int(random.integers(1, MAX_OTHERS + 1))):
         owned = [keys((1 + MAX_OTHERS) * job.index + each) for each in range(count)]
-        for kind in KINDS:
-            if kind == "carried":
-                stego = carried.embed_derived(cover, list(zip(owned, secrets[:count], strict=True)))
-            else:
-                stego = payloads.embed_derived(cover, list(zip(owned, data[:count], strict=True)))
-            statistics = stealth_statistics(stego)
-            found[kind, beside] = seen_by_holder(stego, owned[0][0]) | {
-                name: each.value for name, each in statistics.items()
-            }
+        stego = embed_derived(cover, list(zip(owned, secrets[:count], strict=True)))
+        statistics = {name: each.value for name, each in stealth_statistics(stego).items()}
+        found.append(seen_by_holder(stego, owned[0][0]) | statistics)
     return found
 
 

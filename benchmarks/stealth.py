@@ -37,8 +37,9 @@ from channels.quiet.payloads import embed_derived
 from channels.quiet.trained_like import keys, rounded
 from keyss.core import Gaussians, UsageError
 from keyss.lab import candidate_scores, stealth_statistics
-from keyss.methods.carry.capacity import RecordCapacity
+from keyss.methods.carry.capacity import CarryCapacity
 from keyss.methods.carry.options import CarryOptions
+from keyss.rendering import Viewpoints
 from methods.carry import carried
 from stealth_detection import Examples, confirmed, learned_detectors, single_detectors
 from stealth_predictor import fit_predictor, predictor_statistics, sample
@@ -132,8 +133,9 @@ def _make(job: Job) -> list[File]:
     if job.rounded:
         cover = rounded(cover, job.index)
     made = [File("plain", job.scene, job.path, cover)]
-    capacity = RecordCapacity.of(cover, CarryOptions().with_fit(sh_degree=cover.sh_degree))
-    (secret,) = capacity.prune([read_model(job.secret)], [])
+    capacity = CarryCapacity.of(cover, CarryOptions(format="ply").with_fit(sh_degree=cover.sh_degree))
+    whole = read_model(job.secret)
+    (secret,) = capacity.prune([whole], [Viewpoints.around(whole)])
     stego = carried.embed_derived(cover, [(keys(2 * job.index), secret)], os.urandom(32))
     made.append(File("carried", job.scene, job.path, stego, job.secret))
     with suppress(UsageError):  # a small model has no room for a payload
