@@ -126,26 +126,6 @@ def test_wrong_key_writes_nothing(run: Path, tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-def test_decoy_file(run: Path, folders: tuple[Path, Path], tmp_path: Path) -> None:
-    """A decoy is the cover, slightly changed by a generator seeded with the key."""
-    paths = [tmp_path / f"{name}.ply" for name in ("right", "wrong", "again", "other")]
-    for path, key in zip(paths, ("the key", "wrong", "wrong", "other"), strict=True):
-        keyss.reveal(run / "publish" / "model.ply", key, decoy=True, out=path)
-    right, wrong, again, other = (path.read_bytes() for path in paths)
-    assert wrong == again
-    assert wrong not in (other, right, (run / "publish" / "model.ply").read_bytes())
-    heads = [data[: data.index(b"end_header")].splitlines() for data in (right, wrong)]
-    assert heads[0][:2] + heads[0][3:] == heads[1][:2] + heads[1][3:]  # all but the number of Gaussians
-    decoy, whole = keyss.read_model(paths[1]), keyss.read_model(run / "publish" / "model.ply")
-    stego = whole[whole.opacities > 1.6 / 255]  # without appended Gaussians
-    assert 0.79 * len(stego) < len(decoy) <= len(stego)
-    assert not set(decoy.means[:, 0].tolist()) & set(stego.means[:, 0].tolist())
-    for (_, shown), (_, cover) in zip(
-        keyss.render(decoy, folders[0]), keyss.render(stego, folders[0]), strict=True
-    ):
-        assert (shown.float() - cover.float()).square().mean() < 255**2 * 1e-3  # 30 dB
-
-
 def test_existing_outputs_are_refused(run: Path, folders: tuple[Path, Path], tmp_path: Path) -> None:
     (tmp_path / "x.ply").write_text("mine")
     with pytest.raises(OutputError, match="exists"):

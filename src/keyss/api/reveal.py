@@ -32,7 +32,6 @@ def reveal(
     *,
     companion: PathLike | None = None,
     frame: Frame = "secret",
-    decoy: bool = False,
     force: bool = False,
     device: Backend = "auto",
     out: PathLike | None = None,
@@ -48,17 +47,16 @@ def reveal(
     network decodes (`keyss.core.picture_network`), which is no 3DGS model.
 
     `out` (a file) gets the secret: a scene for the suffix of a model (.ply, .spz, ...), else a file. Raises
-    WrongKeyError for a key that opens nothing (`decoy` reveals the cover instead, see `keyss.methods.decoy`),
-    InputError for a damaged file or if less than 10 % of the secret is left. Warns (KeyssWarning) if more
-    than 1 % is missing.
+    WrongKeyError for a key that opens nothing, InputError for a damaged file or if less than 10 % of the
+    secret is left. Warns (KeyssWarning) if more than 1 % is missing.
     """
     target = resolve_device(device)
     inputs = [] if isinstance(stego, Gaussians) else [Path(stego)]
     if out is not None and not is_standard(out) and not is_model_path(out):
-        if key is None or companion or decoy or force or frame != "secret":
+        if key is None or companion or force or frame != "secret":
             raise UsageError(
-                f"{out}: expected the name of a model, such as one that ends in .ply; `companion`, `decoy`, "
-                "`force` and `frame` are not for hidden files"
+                f"{out}: expected the name of a model, such as one that ends in .ply; `companion`, `force` "
+                "and `frame` are not for hidden files"
             )
         return _reveal_file(stego, key, Path(out), overwrite, inputs)
     path = None if out is None else check_model_output(out, overwrite, inputs)
@@ -66,7 +64,7 @@ def reveal(
         check_not_published(path)
     try:
         found = reveal_model(
-            as_model(stego), key, device=target, frame=frame, decoy=decoy, force=force, companion=companion
+            as_model(stego), key, device=target, frame=frame, force=force, companion=companion
         )
     except OpensAFileError as error:
         if path is None:

@@ -21,7 +21,6 @@ from .publishing import (
     SUFFIXES as SUFFIXES,
     channel_for as channel_for,
     open_content as open_content,
-    quick_attempt as quick_attempt,
     suffix_of as suffix_of,
 )
 from .quiet.bits import (

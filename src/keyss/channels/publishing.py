@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import get_args
 
-from keyss.channels.base import Channel, Content, Payload, Reader, warn_of_foreign
+from keyss.channels.base import Channel, Content, Payload, Reader
 from keyss.channels.names import AnyChannel, Format, Publish
 from keyss.core.errors import UsageError, WrongKeyError
 from keyss.core.gaussians import Gaussians
 from keyss.files.formats.common import CodedGaussians
-from keyss.keys.derivation import DerivedKey
 
 SUFFIXES = {"spz": ".spz", "sog": ".sog", "compressed-ply": ".compressed.ply"}  # of quantised formats
 
@@ -63,7 +62,8 @@ def open_content(stego: Gaussians, key: str) -> Content:
     for reader in _readers(stego):
         with suppress(WrongKeyError):
             if reader is not None:
-                return _with_model_size(stego, reader.open(key))
+                content = reader.open(key)
+                return replace(content, model_size=len(stego)) if isinstance(content, Payload) else content
     raise WrongKeyError()
 
 
@@ -78,40 +78,3 @@ def _readers(stego: Gaussians) -> Iterator[Reader | None]:
     from keyss.channels.colours.channel import ColoursReader
 
     yield ColoursReader.of(stego)
-
-
-@dataclass(frozen=True)
-class Attempt:
-    """A key derived with the likeliest salt, and what it opens in low bits, codes or appended Gaussians."""
-
-    key: DerivedKey
-    content: Content | None
-    appended: bool  # True if there are appended Gaussians
-    records: bool  # True if the channel stores scenes as records, else as one payload
-
-
-def quick_attempt(stego: Gaussians, key: str) -> Attempt | None:
-    """A single attempt, which takes equally long for right and wrong keys; None without a salt.
-
-    Raises InputError for damage. Warns (KeyssWarning) of Gaussians that were added or changed after hiding.
-    """
-    from keyss.channels.appended.channel import AppendedReader
-    from keyss.channels.quiet.contents import QuietReader
-
-    # Appended Gaussians must not hide what lies elsewhere. They are visible: a second try tells nothing.
-    quiet, appended = QuietReader.of(stego), AppendedReader.of(stego)
-    readers = [each for each in (quiet, appended) if each and each.salts]
-    if not readers:
-        return None
-    derived, opened = [DerivedKey.of(key, each.salts[0]) for each in readers], list[Content]()
-    for reader, own in zip(readers, derived, strict=True):
-        with suppress(WrongKeyError):
-            opened.append(_with_model_size(stego, reader.extract(own)))
-    if opened:
-        warn_of_foreign(opened[0])
-    records = quiet is not None and not quiet.blocks and appended is None
-    return Attempt(derived[0], opened[0] if opened else None, appended is not None, records)
-
-
-def _with_model_size(stego: Gaussians, content: Content) -> Content:
-    return replace(content, model_size=len(stego)) if isinstance(content, Payload) else content

@@ -31,7 +31,6 @@ def reveal(
     frame: Annotated[
         Literal["secret", "cover"], arg(help="Coordinates: the secret's own, or those it was hidden in.")
     ] = "secret",
-    decoy: Annotated[bool, switch("With a wrong key, write the cover instead of failing.")] = False,
     force: Annotated[
         bool, switch("Write what is left of the secret in a model that was quantised or pruned.")
     ] = False,
@@ -60,7 +59,6 @@ def reveal(
             key,
             companion=companion,
             frame=frame,
-            decoy=decoy,
             force=force,
             device=device,
             out=out,

@@ -63,7 +63,7 @@ class DerivedKey:
     """A key after Argon2id with one salt, and the values that follow from it.
 
     Labels in use: "embedding" (conditions the decoder), "verifier" (compares keys), "quiet/key" (encrypts a
-    data key), "writer" (randomness of hiding), "decoy", and those of the other channels.
+    data key), "writer" (randomness of hiding), and those of the other channels.
     """
 
     master: bytes  # MASTER_BYTES, the output of Argon2id

@@ -14,7 +14,6 @@ from .carry.method import (
     most_contributing as most_contributing,
 )
 from .carry.options import CarryOptions as CarryOptions
-from .decoy import Decoy as Decoy
 from .hidden import Frame as Frame, HiddenFile as HiddenFile, HiddenScene as HiddenScene, Remains as Remains
 from .keyss.decoder import DECODERS as DECODERS, Decoder as Decoder, LatentDecoder as LatentDecoder
 from .keyss.options import (

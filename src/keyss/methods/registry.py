@@ -7,7 +7,7 @@ from importlib import import_module
 from operator import attrgetter
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from keyss.core.errors import InputError, UsageError, WrongKeyError
+from keyss.core.errors import InputError, UsageError
 
 if TYPE_CHECKING:
     from keyss.channels import Content
@@ -90,23 +90,14 @@ def of_options(options: MethodOptions) -> Method:
     return get(name)
 
 
-def open_model(stego: Gaussians, key: str, *, decoy: bool = False) -> HiddenScene:
+def open_model(stego: Gaussians, key: str) -> HiddenScene:
     """The secret that `key` opens in a model (see `keyss.channels.publishing`).
 
-    Raises WrongKeyError for a key that opens nothing, InputError for damage. With `decoy`, such a key gives a
-    `Decoy` instead, and only one salt is tried: otherwise wrong keys would take longer than right ones.
+    Raises WrongKeyError for a key that opens nothing, InputError for damage.
     """
-    from keyss.channels import open_content, quick_attempt
-    from keyss.methods.decoy import Decoy
+    from keyss.channels import open_content
 
-    if not decoy:
-        return _unpack(open_content(stego, key))
-    attempt = quick_attempt(stego, key)
-    if attempt is None:
-        raise WrongKeyError()
-    if attempt.content is None:
-        return Decoy.of(stego, attempt.key, appended=attempt.appended, records=attempt.records)
-    return _unpack(attempt.content)
+    return _unpack(open_content(stego, key))
 
 
 def open_companion(data: bytes) -> HiddenScene:

@@ -62,21 +62,18 @@ def reveal_model(
     *,
     device: torch.device,
     frame: Frame = "secret",
-    decoy: bool = False,
     force: bool = False,
     companion: PathLike | None = None,
 ) -> Revealed:
     """The secret that `key` opens in a stego model, however little is left; raises as `keyss.reveal` does."""
     if companion is not None:
-        if decoy:
-            raise UsageError("companion files have no decoys: leave out `decoy=True`")
         if key is not None:
             raise UsageError("companion files have no keys: whoever has one sees the secret")
         opened = read_companion(companion)
     elif key is None:
         raise UsageError("expected `key`, or `companion` for a companion file")
     else:
-        opened = registry.open_model(model, key, decoy=decoy)
+        opened = registry.open_model(model, key)
     revealed = opened.reveal(model.to(device), frame=frame, force=force)
     remains = opened.remains(revealed)
     return Revealed(revealed, remains, tuple(loss_warnings(remains)))

@@ -203,7 +203,7 @@ def test_wrong_keys_at_full_cost() -> None:
 def test_a_wrong_key_makes_the_same_work_as_a_right_one(
     stego: Gaussians, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Up to the decryption of the payload: as many blocks of AES; in seconds: benchmarks/attempts.py."""
+    """Up to the decryption of the payload: as many blocks of AES."""
     blocks = 0
     real = cells.encrypted_blocks
 

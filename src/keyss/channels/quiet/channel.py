@@ -22,7 +22,6 @@ all contents, and the key stream of a cell depends on its data (see `cells`).
 from __future__ import annotations
 
 import hashlib
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
@@ -53,7 +52,7 @@ from keyss.channels.quiet.layout import BLOCK_HEADER, LEAST_BYTES, MIN_BLOCKS, L
 from keyss.channels.quiet.usable import check_usable, salt, salt_rows, usable_with_ids
 from keyss.channels.quiet.writable_levels import fixed_axes, writable_levels
 from keyss.core.arrays import Bits, Bytes, Flags, Integers
-from keyss.core.errors import KeyssWarning, UsageError
+from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.files.formats.common import CodedGaussians, Codes
 from keyss.kernels.parallel import in_blocks
@@ -62,10 +61,6 @@ from keyss.keys.encryption import OVERHEAD
 
 _ATTEMPTS = 30  # to solve all blocks; each fails for at most one cover in a thousand
 _BITS_PER_GAUSSIAN = 18  # approximate capacity of codes
-_FIRST_IS_STALE = (
-    "the first salt of this model cannot be renewed: keys open it as usual, but not with `decoy=True`, which "
-    "tries the first salt only"
-)
 
 
 class LowBits(Channel):
@@ -154,14 +149,9 @@ class LowBitsCover:
         return LowBitsCapacity(len(self._rows), self.layout.width)
 
     def embed(self, contents: Sequence[tuple[str, Content]], *, entropy: bytes | None = None) -> Gaussians:
-        """See `PreparedCover`. Takes 1.6 s for each secret for key derivation.
-
-        Warns (KeyssWarning) if `decoy=True`, which tries the first salt alone, will not open the model.
-        """
+        """See `PreparedCover`. Takes 1.6 s for each secret for key derivation."""
         mixed = randomness(entropy, *(bytes_of(content) for _, content in contents))
         salts = self._salts(mixed)[1]
-        if 0 not in self.fresh_salts:
-            warnings.warn(_FIRST_IS_STALE, KeyssWarning, stacklevel=2)
         fresh = [salts[index] for index in self.fresh_salts]
         return self.embed_derived([(_derived(key, fresh), content) for key, content in contents], mixed)
 
