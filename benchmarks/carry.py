@@ -64,7 +64,7 @@ def _models(paths: list[Path]) -> None:
         carried = extract(stego, KEY)
         print(
             f"{cover} ({len(stego):,}, {usable.mean():.0%} usable) carries {secret} "
-            f"({len(carried.gaussians):,}): cover before and after {psnr_between(models[cover], stego):.1f} dB, "
+            f"({len(carried.gaussians):,}): cover {psnr_between(models[cover], stego):.1f} dB, "
             f"secret and its own model {psnr_between(models[secret], carried.gaussians):.1f} dB",
             flush=True,
         )

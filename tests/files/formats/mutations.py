@@ -29,7 +29,6 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 import numpy as np
 import torch
-from keyss.methods.codec.model_bytes import decode, encode
 
 from files.formats.false_sizes import FALSE_SIZES, image
 from files.scene_files import camera_bytes, counted, image_bytes, point_bytes
@@ -38,6 +37,7 @@ from keyss.core.picture_network import DecodedGaussians, PictureNetwork
 from keyss.files import load_scene, model_bytes, model_of_bytes
 from keyss.files.formats.spz import SpzCodes
 from keyss.files.images import read_image
+from keyss.methods.codec.model_bytes import decode, encode
 from keyss.methods.tensors import Header, pack_tensors, refuse_damage, unpack_tensors
 from tiny_scenes import random_gaussians
 
