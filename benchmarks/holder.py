@@ -2,8 +2,8 @@
 
     python benchmarks/holder.py bonsai=a.ply bonsai=b.ply fox=c.ply ...   # plain, of three scenes or more
 
-In each model, a secret is hidden alone and beside one to three others. The holder opens it, tries every cell of
-the file with the key (`tests/channels/quiet/holder.py`), and computes the statistics of `keyss.lab.stealth`.
+In each model, a secret is hidden alone and beside one to three others. The holder opens it, tries every cell
+of the file with the key (`tests/channels/quiet/holder.py`), and computes the statistics of `keyss.lab.stealth`.
 Detectors are cross-validated over scenes.
 """
 

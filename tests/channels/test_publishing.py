@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from channels.quiet.trained_like import trained_like
-from keyss.channels import APPENDED, LOW_BITS, Payload, open_content
+from keyss.channels import APPENDED, LOW_BITS, Payload, open_payload
 from keyss.core import KeyssWarning
 
 
@@ -14,5 +14,5 @@ def test_appended_gaussians_do_not_hide_what_lies_in_low_bits() -> None:
     stego = LOW_BITS.prepare(trained_like(3000)).embed([("a key", Payload("file", b"in low bits"))])
     more = APPENDED.prepare(stego).embed([("a key of somebody else", Payload("file", b"appended"))])
     with pytest.warns(KeyssWarning, match=r"about [\d,]+ Gaussians were added"):
-        assert open_content(more, "a key").data == b"in low bits"
-    assert open_content(more, "a key of somebody else").data == b"appended"
+        assert open_payload(more, "a key").data == b"in low bits"
+    assert open_payload(more, "a key of somebody else").data == b"appended"

@@ -54,7 +54,7 @@ def test_hide_and_reveal_files(run: Run, tmp_path: Path) -> None:
     assert metrics["secret_gaussians"] == [900]
     assert 100 < metrics["details"]["bits_per_gaussian"][0] < 568
     assert metrics["cover"]["psnr"] == pytest.approx(metrics["baseline"]["cover"]["psnr"], abs=0.1)
-    assert metrics["secrets"][0]["psnr"] > 55
+    assert metrics["secrets"][0]["psnr"] > 48
     assert metrics["secrets"][0]["psnr"] > metrics["chance_level"][0] + 20
     assert metrics["wrong_key"] is None
     stego = tmp_path / "out/publish/model.ply"

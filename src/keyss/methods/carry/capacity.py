@@ -106,10 +106,11 @@ class CarryCapacity:
 
 def _cure(cover: Gaussians | None, options: CarryOptions) -> str:
     """For messages: the least SH degree that gives `cover` capacity, and what always works."""
-    for degree in range(options.fit.sh_degree + 1, 3) if cover is not None else ():
-        with suppress(UsageError):
-            if LOW_BITS.prepare(to_degree(cover, degree, os.urandom(32))).capacity.bytes:
-                return f"`sh_degree={degree}` makes room, {_ANY}"
+    if cover is not None:
+        for degree in range(options.fit.sh_degree + 1, 3):
+            with suppress(UsageError):
+                if LOW_BITS.prepare(to_degree(cover, degree, os.urandom(32))).capacity.bytes:
+                    return f"`sh_degree={degree}` makes room, {_ANY}"
     return _ANY
 
 
