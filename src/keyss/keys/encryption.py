@@ -1,7 +1,7 @@
 """Authenticated encryption of one payload: compressed, padded and encrypted under a data key of its own.
 
 ChaCha20-Poly1305 (RFC 8439) with a zero nonce. This is safe because each data key encrypts one message only:
-it is random, or derived from everything that it encrypts. Padding to coarse buckets hides exact lengths.
+it is random, or derived from everything that it encrypts.
 """
 
 from __future__ import annotations
@@ -19,20 +19,8 @@ DATA_KEY_BYTES = 32
 MAX_PAYLOAD_BYTES = 64 << 20  # before compression
 # A payload of more than MAX_RATIO n + SMALL_PAYLOAD bytes that compress to n is stored without compression.
 MAX_RATIO, SMALL_PAYLOAD = 16, 1 << 20
-SMALLEST_BUCKET = 4096
 OVERHEAD = 4 + 16  # length of the compressed data, and the tag
 _NONCE = bytes(12)
-
-
-def bucket(size: int, smallest: int = SMALLEST_BUCKET) -> int:
-    """`size` rounded up to a multiple of an eighth of the power of two above it, or of `smallest`."""
-    step = max(smallest, 1 << max(0, (size - 1).bit_length() - 3))
-    return -(-size // step) * step
-
-
-def encrypted_size(compressed: int) -> int:
-    """Bytes of an encrypted payload whose compressed form takes `compressed` bytes."""
-    return bucket(compressed + OVERHEAD)
 
 
 def compressed_size(payload: bytes) -> int:
@@ -40,16 +28,15 @@ def compressed_size(payload: bytes) -> int:
     return len(_compress(payload))
 
 
-def encrypt(data_key: bytes, payload: bytes, associated: bytes = b"", *, size: int | None = None) -> bytes:
-    """Encrypt `payload` under a fresh `data_key` (32 bytes), to `size` bytes or to its bucket's size.
+def encrypt(data_key: bytes, payload: bytes, associated: bytes = b"", *, size: int) -> bytes:
+    """Encrypt `payload` under a fresh `data_key` (32 bytes), padded to `size` bytes.
 
-    `associated` is authenticated too, and needed to decrypt. Raises UsageError for a payload of more than
-    64 MiB.
+    `size`: at least `compressed_size` + OVERHEAD. `associated` is authenticated too, and needed to decrypt.
+    Raises UsageError for a payload of more than 64 MiB.
     """
     if len(payload) > MAX_PAYLOAD_BYTES:
         raise UsageError(f"expected at most {MAX_PAYLOAD_BYTES:,} bytes to encrypt, got {len(payload):,}")
     packed = _compress(payload)
-    size = encrypted_size(len(packed)) if size is None else size
     plain = struct.pack("<I", len(packed)) + packed
     if size < len(packed) + OVERHEAD:
         raise ValueError(f"{len(packed)} bytes do not fit into {size}")

@@ -58,7 +58,7 @@ from keyss.core.arrays import Bits, Bytes, Doubles, Integers
 from keyss.core.errors import InputError, KeyssWarning, UsageError, WrongKeyError
 from keyss.core.gaussians import Gaussians
 from keyss.keys.derivation import SALT_BYTES, DerivedKey, expand, stream
-from keyss.keys.encryption import OVERHEAD, bucket, compressed_size, decrypt, encrypt
+from keyss.keys.encryption import OVERHEAD, compressed_size, decrypt, encrypt
 
 # Expected share of intact packets after the loss of a quarter, and the margin in standard deviations. Longer
 # codewords need fewer packets and more time; 5895 data packets make a codeword of 8192.
@@ -200,11 +200,17 @@ def _sketch_key(key: DerivedKey) -> bytes:
     return key.expand("appended/host", 32)
 
 
+def _bucket(size: int) -> int:
+    """`size` rounded up to a multiple of an eighth of the power of two above it, or of _STEP."""
+    step = max(_STEP, 1 << max(0, (size - 1).bit_length() - 3))
+    return -(-size // step) * step
+
+
 def _padded_count(used: int) -> int:
     """The number of Gaussians to append if `used` carry data: one of few numbers, which reveal little."""
-    total = bucket(used, _STEP)
+    total = _bucket(used)
     while total - pilots.count_for(total) < used:
-        total = bucket(total + 1, _STEP)
+        total = _bucket(total + 1)
     return total
 
 
