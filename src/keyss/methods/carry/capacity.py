@@ -16,10 +16,10 @@ from keyss.core.gaussians import Gaussians
 from keyss.keys.derivation import expand
 from keyss.methods.carry.options import CarryOptions
 from keyss.methods.codec.model_bytes import encode
-from keyss.methods.codec.precision import prune_to_size
+from keyss.methods.codec.precision import fine, prune_to_size
 from keyss.rendering.orbit import Viewpoints
 
-_BITS_PER_GAUSSIAN = 150  # payload estimate for a secret that is not fitted yet
+_BITS_PER_GAUSSIAN = 150, 210  # of a secret that is not fitted yet, with the usual and the finest precision
 _FAINT = 1e-3  # standard deviation of added harmonics
 _TINY = 16  # Gaussians; secrets are not pruned to fewer
 _ANY = '`publish="any"` has room for all'
@@ -37,9 +37,12 @@ class SecretSize:
         return SecretSize(len(model), model)
 
     @cached_property
-    def payload_bytes(self) -> int:
-        """Bytes of the secret as a payload."""
-        return self.count * _BITS_PER_GAUSSIAN // 8 if self.model is None else len(encode(self.model))
+    def payload_bytes(self) -> tuple[int, int]:
+        """Bytes of the secret as a payload, with the usual and the finest precision."""
+        if self.model is None:
+            usual, finest = (self.count * each // 8 for each in _BITS_PER_GAUSSIAN)
+            return usual, finest
+        return len(encode(self.model)), len(encode(self.model, fine(self.model)))
 
 
 @dataclass(frozen=True)
@@ -79,9 +82,9 @@ class CarryCapacity:
 
         Raises UsageError if the cover is too small.
         """
-        limits = shares(self.payloads, [secret.payload_bytes for secret in secrets])
+        limits = shares(self.payloads, [secret.payload_bytes[1] for secret in secrets])
         counts = [
-            min(secret.count, secret.count * limit // secret.payload_bytes)
+            min(secret.count, secret.count * limit // secret.payload_bytes[0])
             for secret, limit in zip(secrets, limits, strict=True)
         ]
         if any(count < min(_TINY, secret.count) for count, secret in zip(counts, secrets, strict=True)):
@@ -94,14 +97,14 @@ class CarryCapacity:
 
     def prune(self, models: Sequence[Gaussians], viewpoints: Sequence[Viewpoints]) -> list[Gaussians]:
         """The most visible Gaussians of each model that fit, or all; see `prune_to_size`."""
-        limits = shares(self.payloads, [len(encode(model)) for model in models])
+        limits = shares(self.payloads, [SecretSize.of(model).payload_bytes[1] for model in models])
         return [prune_to_size(*each) for each in zip(models, limits, viewpoints, strict=True)]
 
     def appended(self, secrets: Sequence[SecretSize]) -> int:
         """Approximate number of Gaussians by which the model grows."""
         if not self.payloads.grows:
             return 0
-        return APPENDED.appended_count([secret.payload_bytes for secret in secrets])
+        return APPENDED.appended_count([secret.payload_bytes[0] for secret in secrets])
 
 
 def _cure(cover: Gaussians | None, options: CarryOptions) -> str:
@@ -130,7 +133,7 @@ def to_degree(model: Gaussians, sh_degree: int, entropy: bytes) -> Gaussians:
 
 
 def shares(capacity: Capacity, needed: Sequence[int]) -> list[int]:
-    """Maximum bytes of each secret's payload, for secrets that need `needed` bytes.
+    """Maximum bytes of each secret's payload, for secrets that need `needed` bytes at the finest precision.
 
     The first of a quarter, a half and all of the capacity that suffices: a secret's precision then does not
     depend on the others, and its key does not reveal them. Equal shares if these exceed the capacity, or if

@@ -8,6 +8,7 @@ from dataclasses import replace
 from typing import Any
 
 from keyss.channels import Payload, PreparedCover, open_payload
+from keyss.channels.base import NOT_INDEPENDENT
 from keyss.core.errors import KeyssWarning, UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
@@ -19,7 +20,6 @@ from keyss.methods.base import Capabilities, Context, Plan, Source, Stego, role_
 from keyss.methods.carry.capacity import CarryCapacity, SecretSize, shares
 from keyss.methods.carry.options import REFIT, CarryOptions
 from keyss.methods.carry.secret import CarriedSecret
-from keyss.methods.codec.model_bytes import encode
 from keyss.methods.codec.precision import encode_to_size
 from keyss.rendering import contributions
 from keyss.rendering.orbit import Viewpoints, psnr_between
@@ -34,10 +34,6 @@ _VISIBLE = (
 )
 _REFIT_SHARE = 0.97  # refit size / Gaussians that fit: refitted Gaussians compress a little worse
 _MIN_SHARE = 1 / 6  # fraction of a secret's Gaussians; refits of public models with fewer are below 30 dB
-_FEWER = (
-    "the secrets share the capacity, and each has fewer Gaussians than it could have alone: whoever has one "
-    "of the keys can notice that there are other secrets"
-)
 
 
 class CarryMethod:
@@ -74,10 +70,6 @@ class CarryMethod:
             cut = [True] * len(cut)
         elif options.refit == "never":
             cut = [False] * len(cut)
-        elif any(cut) and all(each.given is not None for each in sources):
-            alone = [capacity.sizes([secret])[0] for secret in secret_sizes]
-            if sizes != alone:
-                warnings.warn(_FEWER, KeyssWarning, stacklevel=2)
         steps = round(REFIT * options.fit.iterations)
         refits = [
             options.iterations or (steps if secret.photos else min(options.fit.iterations, _MODEL_ITERATIONS))
@@ -221,10 +213,13 @@ def embed_models(
     """Embed all Gaussians of each model under its key, and verify that they open.
 
     `viewpoints`: views of each model that determine its precision; by default, four around it. Raises
-    UsageError if the models do not fit.
+    UsageError if the models do not fit. Warns (KeyssWarning) if a secret is smaller than it would be alone.
     """
     viewpoints, capacity = viewpoints or [*map(Viewpoints.around, models)], cover.capacity
-    limits = shares(capacity, [len(encode(model)) for model in models])
+    needed = [SecretSize.of(model).payload_bytes[1] for model in models]
+    limits = shares(capacity, needed)
+    if any(limit < min(size, *shares(capacity, [size])) for size, limit in zip(needed, limits, strict=True)):
+        warnings.warn(NOT_INDEPENDENT, KeyssWarning, stacklevel=2)
     payloads = [
         Payload(CarryOptions.method, encode_to_size(model, limit, short=capacity.grows, viewpoints=views))
         for model, limit, views in zip(models, limits, viewpoints, strict=True)
