@@ -6,7 +6,6 @@ import os
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import torch
 
@@ -15,8 +14,7 @@ from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.keys.derivation import expand
 from keyss.methods.carry.options import CarryOptions
-from keyss.methods.codec.model_bytes import encode
-from keyss.methods.codec.precision import fine, prune_to_size
+from keyss.methods.codec.precision import finest_size, prune_to_size, usual_size
 from keyss.rendering.orbit import Viewpoints
 
 _BITS_PER_GAUSSIAN = 150, 210  # of a secret that is not fitted yet, with the usual and the finest precision
@@ -36,13 +34,13 @@ class SecretSize:
     def of(model: Gaussians) -> SecretSize:
         return SecretSize(len(model), model)
 
-    @cached_property
+    @property
     def payload_bytes(self) -> tuple[int, int]:
         """Bytes of the secret as a payload, with the usual and the finest precision."""
         if self.model is None:
             usual, finest = (self.count * each // 8 for each in _BITS_PER_GAUSSIAN)
             return usual, finest
-        return len(encode(self.model)), len(encode(self.model, fine(self.model)))
+        return usual_size(self.model), finest_size(self.model)
 
 
 @dataclass(frozen=True)
@@ -97,7 +95,7 @@ class CarryCapacity:
 
     def prune(self, models: Sequence[Gaussians], viewpoints: Sequence[Viewpoints]) -> list[Gaussians]:
         """The most visible Gaussians of each model that fit, or all; see `prune_to_size`."""
-        limits = shares(self.payloads, [SecretSize.of(model).payload_bytes[1] for model in models])
+        limits = shares(self.payloads, list(map(finest_size, models)))
         return [prune_to_size(*each) for each in zip(models, limits, viewpoints, strict=True)]
 
     def appended(self, secrets: Sequence[SecretSize]) -> int:

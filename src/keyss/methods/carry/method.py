@@ -20,7 +20,7 @@ from keyss.methods.base import Capabilities, Context, Plan, Source, Stego, role_
 from keyss.methods.carry.capacity import CarryCapacity, SecretSize, shares
 from keyss.methods.carry.options import REFIT, CarryOptions
 from keyss.methods.carry.secret import CarriedSecret
-from keyss.methods.codec.precision import encode_to_size
+from keyss.methods.codec.precision import encode_to_size, finest_size
 from keyss.rendering import contributions
 from keyss.rendering.orbit import Viewpoints, psnr_between
 
@@ -216,7 +216,7 @@ def embed_models(
     UsageError if the models do not fit. Warns (KeyssWarning) if a secret is smaller than it would be alone.
     """
     viewpoints, capacity = viewpoints or [*map(Viewpoints.around, models)], cover.capacity
-    needed = [SecretSize.of(model).payload_bytes[1] for model in models]
+    needed = list(map(finest_size, models))
     limits = shares(capacity, needed)
     if any(limit < min(size, *shares(capacity, [size])) for size, limit in zip(needed, limits, strict=True)):
         warnings.warn(NOT_INDEPENDENT, KeyssWarning, stacklevel=2)

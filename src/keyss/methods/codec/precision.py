@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from weakref import WeakKeyDictionary
 
 import torch
 
@@ -21,6 +22,7 @@ _SHARES = (3, 3, 1, 3, 3, 18)
 _TRIES, _CLOSE, _BIT = 6, 0.15, 6.02  # dB
 _COARSEST = 0.1  # maximum step of harmonics, whose errors are invisible from afar
 _FINER = 1.5  # octaves below the usual steps: about 52 to 58 dB, 0.01 dB against photos
+_SIZES: WeakKeyDictionary[Gaussians, int] = WeakKeyDictionary()  # bytes with the usual precision
 
 
 def choose_precision(model: Gaussians, viewpoints: Viewpoints | None = None) -> Precision:
@@ -54,7 +56,7 @@ def prune_to_size(model: Gaussians, max_bytes: int, viewpoints: Viewpoints | Non
 
     Raises UsageError if nothing fits.
     """
-    if len(encode(model)) <= max_bytes:
+    if usual_size(model) <= max_bytes:
         return model
     candidates = []
     for degree in range(model.sh_degree + 1):
@@ -67,34 +69,39 @@ def prune_to_size(model: Gaussians, max_bytes: int, viewpoints: Viewpoints | Non
     return max(candidates, key=lambda each: psnr_between(model, each, viewpoints))
 
 
-def fine(model: Gaussians) -> Precision:
-    """The finest precision that secrets get."""
-    return Precision.usual(model).finer(_FINER)
+def usual_size(model: Gaussians) -> int:
+    """Bytes of `model` with the usual precision."""
+    if model not in _SIZES:
+        _SIZES[model] = len(encode(model))
+    return _SIZES[model]
+
+
+def finest_size(model: Gaussians) -> int:
+    """About as many bytes as `model` takes with the finest precision."""
+    numbers = 13 + 3 * (model.sh.shape[1] - 1)
+    return usual_size(model) + int(_FINER * len(model) * numbers / 8)
 
 
 def encode_to_size(
     model: Gaussians, max_bytes: int, *, short: bool = False, viewpoints: Viewpoints | None = None
 ) -> bytes:
-    """Encode `model` in at most `max_bytes` bytes, as precisely as possible, but not beyond `fine`.
+    """Encode `model` in at most `max_bytes` bytes, up to the finest precision.
 
     `short`: use no more bytes than `choose_precision` needs. Raises UsageError if it does not fit.
     """
-    best = encode(model, choose_precision(model, viewpoints) if short else fine(model))
+    usual, spare = Precision.usual(model), max_bytes - usual_size(model)
+    best = encode(model, choose_precision(model, viewpoints) if short else usual.finer(_FINER))
     if len(best) <= max_bytes:
         return best
-    usual = encode(model)
-    if len(usual) > max_bytes:
+    if spare < 0:
         raise UsageError(
-            f"a secret of {len(model):,} Gaussians takes {len(usual):,} bytes, and there is room for "
+            f"a secret of {len(model):,} Gaussians takes {usual_size(model):,} bytes, and there is room for "
             f"{max_bytes:,}"
         )
-    octaves = _FINER * (max_bytes - len(usual)) / max(1, len(best) - len(usual))
-    while octaves > 0:
-        data = encode(model, Precision.usual(model).finer(octaves))
-        if len(data) <= max_bytes:
-            return data
+    octaves = _FINER * spare / max(1, len(best) - usual_size(model))
+    while len(data := encode(model, usual.finer(max(0, octaves)))) > max_bytes:
         octaves -= 0.0625
-    return usual
+    return data
 
 
 def most_visible(gaussians: Gaussians, count: int) -> Gaussians:
