@@ -96,7 +96,8 @@ def open_file(name: str, key: str) -> dict[str, Any]:
     if payload.method != "carry":
         return found | {"payload": hashlib.sha256(payload.data).hexdigest()}
     model = CarriedSecret.of(payload).reveal(stego)
-    return found | {"count": len(model), "chunks": payload.chunks, "sha256": digests(model)}
+    chunks = payload.chunks and list(payload.chunks)
+    return found | {"count": len(model), "chunks": chunks, "sha256": digests(model)}
 
 
 def pruned_model() -> Gaussians:

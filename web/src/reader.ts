@@ -4,8 +4,8 @@ import { preparedFor } from './channels/opening.ts';
 import { InputError } from './core/errors.ts';
 import { readModel } from './files/models.ts';
 import { writePly } from './files/ply.ts';
+import { fileOf, secretOf } from './hidden.ts';
 import { type Derive, keyBytes, master, sequential } from './keys/keys.ts';
-import { fileOf, secretOf } from './records/reveal.ts';
 
 const QUICK = 0.2; // share of the progress: colours, searched last, take four times as long as all else
 
@@ -24,13 +24,13 @@ export const reveal: Reveal = async (bytes, key, { name, decodeWebP, signal, onP
       onProgress?.(from + ((to - from) * ++done) / reader.derivations);
       return found;
     });
-    const content = await reader.open(key, derive);
+    const payload = await reader.open(key, derive);
     signal?.throwIfAborted();
-    if (content === null) continue;
+    if (payload === null) continue;
     onProgress?.(1);
-    const file = fileOf(content);
+    const file = fileOf(payload);
     if (file) return { kind: 'file', ...file };
-    const secret = secretOf(content, stego);
+    const secret = secretOf(payload, stego);
     if (secret === null) throw new InputError('This key opens a model that only keyss reveal decodes.');
     return { kind: 'model', ply: writePly(secret), gaussians: secret.count };
   }

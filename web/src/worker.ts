@@ -1,12 +1,12 @@
 /** The page's worker: reads models and tries keys. Nothing is stored. */
 import DERIVE from 'source:./derive.ts';
-import type { Reader } from './channels/content.ts';
+import type { Reader } from './channels/base.ts';
 import { preparedFor } from './channels/opening.ts';
 import { InputError } from './core/errors.ts';
 import { buffersOf, type Gaussians } from './core/gaussians.ts';
 import { readModel } from './files/models.ts';
+import { fileOf, type HiddenFile, secretOf } from './hidden.ts';
 import { type Derive, deriveInWorker, roundRobin, sequential, startWorker } from './keys/keys.ts';
-import { fileOf, type HiddenFile, secretOf } from './records/reveal.ts';
 
 /** A file to read, or a key to try on the last file. The answers go to the port that comes with it. */
 export interface Question {
@@ -21,7 +21,7 @@ export interface Answer {
   readonly model?: Gaussians;
   readonly foreign?: number; // Gaussians added to or changed in the published file
   readonly file?: HiddenFile;
-  readonly elsewhere?: boolean; // only `keyss reveal` opens the content
+  readonly elsewhere?: boolean; // only `keyss reveal` opens the payload
   readonly error?: string; // one sentence
   readonly stopped?: boolean; // the search was cancelled
   readonly progress?: number; // 0 to 1: an interim message, the same for every key
@@ -54,14 +54,14 @@ async function unlock(key: string, thorough: boolean, tell: Tell): Promise<void>
   const reader = (await prepared)?.(thorough);
   searched = key;
   let done = 0;
-  const content = await reader?.open(key, async (own, salt) => {
+  const payload = await reader?.open(key, async (own, salt) => {
     const found = await derive(own, salt);
     tell({ progress: ++done / (reader.derivations + 1) }); // the rest takes about as long as one derivation
     return found;
   });
   tell({ progress: 1 }); // before decoding, which only right keys reach
-  if (!content || !stego) return tell({});
-  const [file, model, { foreign }] = [fileOf(content), secretOf(content, stego), content];
+  if (!payload || !stego) return tell({});
+  const [file, model, { foreign }] = [fileOf(payload), secretOf(payload, stego), payload];
   if (model) tell({ model, foreign }, buffersOf(model));
   else tell(file ? { file, foreign } : { elsewhere: true });
 }

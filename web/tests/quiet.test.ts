@@ -4,30 +4,28 @@ import { QuietReader } from '../src/channels/quiet/reading.ts';
 import { selected } from '../src/core/gaussians.ts';
 import { openPly, readPly, writePly } from '../src/files/ply.ts';
 import { decrypted } from '../src/keys/keys.ts';
-import { secretOf } from '../src/records/reveal.ts';
-import { digest, hex, jsonVector, vector } from './vectors.ts';
+import { digest, hex, jsonVector, type Revealed, vector } from './vectors.ts';
 
-const REVEALED = jsonVector<{ file: string; key: string; payload?: string }[]>('revealed.json');
-const CARRIED = jsonVector<{ key: string; wrong: string }>('carried.json');
+const REVEALED = jsonVector<Revealed[]>('revealed.json');
+const CARRIED = jsonVector<{ key: string; payload: string }>('carried.json');
 
 test('wrong keys open nothing', async () => {
   const reader = QuietReader.of(readPly(openPly(vector('carried.ply'))))!;
-  expect(await reader.open(CARRIED.wrong)).toBeNull();
+  expect(await reader.open('another key')).toBeNull();
 });
 
-test('payloads survive pruning of a tenth and any order', async () => {
+test('payloads survive pruning of a quarter and any order', async () => {
   const { key, payload } = REVEALED.find((each) => each.file === 'keyss.ply')!;
   const model = readPly(openPly(vector('keyss.ply')));
   const rows = Array.from({ length: model.count }, (_, row) => (row * 701) % model.count);
-  const content = await QuietReader.of(selected(model, rows.filter((row) => row % 10)))!.open(key);
-  expect(content?.service === 'payload' && digest(content.data)).toBe(payload);
+  const found = await QuietReader.of(selected(model, rows.filter((row) => row % 4)))!.open(key);
+  expect(digest(found!.data)).toBe(payload);
 });
 
-test('one changed bit costs at most one Gaussian', async () => {
+test('one changed bit costs nothing', async () => {
   const model = readPly(openPly(vector('carried.ply')));
   new Uint32Array(model.sh.buffer)[5 * 48 + 20] ^= 1 << 6;
-  const content = await QuietReader.of(model)!.open(CARRIED.key);
-  expect(secretOf(content!, model)!.count).toBeGreaterThanOrEqual(7);
+  expect((await QuietReader.of(model)!.open(CARRIED.key))!.data).toEqual(hex(CARRIED.payload));
 });
 
 test('added Gaussians are counted', async () => {
@@ -40,13 +38,13 @@ test('added Gaussians are counted', async () => {
 });
 
 test('encrypted cells match Python', () => {
-  const { cell } = jsonVector<{ cell: Record<string, string> & { slot: number } }>('encryption.json');
+  const { cell } = jsonVector<{ cell: Record<string, string> }>('encryption.json');
   const data = hex(cell.data);
   const cipher = new CellCipher(hex(cell.secret), cell.label, data.length);
   const low = hex(cell.cell);
-  expect(cipher.decrypt(hex(cell.id), low, low.length, 0, cell.slot)).toEqual([{ row: 0, data }]);
+  expect(cipher.decrypt(hex(cell.id), low, low.length)).toEqual([{ row: 0, data }]);
   low[0] ^= 1;
-  expect(cipher.decrypt(hex(cell.id), low, low.length, 0, cell.slot)).toEqual([]);
+  expect(cipher.decrypt(hex(cell.id), low, low.length)).toEqual([]);
 });
 
 test('encrypted payloads match Python', async () => {

@@ -7,17 +7,11 @@ import { gzipSync } from 'node:zlib';
 import { beforeAll, expect, test } from 'vitest';
 import type * as Reader from '../reader/index.d.ts';
 import { openPly, readPly } from '../src/files/ply.ts';
-import { columns, decodeWebP, digest, jsonVector, type Shown, vector } from './vectors.ts';
-
-interface Expected extends Shown {
-  file: string;
-  key: string;
-  payload?: string;
-}
+import { columns, decodeWebP, digest, jsonVector, type Revealed, vector } from './vectors.ts';
 
 // One of each channel and of each kind of secret.
 const FILES = ['carried.ply', 'coded.sog', 'coded.compressed.ply', 'appended-moved.spz', 'colours-moved.splat'];
-const REVEALED = jsonVector<Expected[]>('revealed.json').filter(({ file }) => FILES.includes(file));
+const REVEALED = jsonVector<Revealed[]>('revealed.json').filter(({ file }) => FILES.includes(file));
 const WEB = new URL('..', import.meta.url).pathname;
 const out = mkdtempSync(join(tmpdir(), 'keyss-reader-'));
 let reveal: Reader.Reveal;

@@ -1,17 +1,17 @@
 import { expect, test } from 'vitest';
 import { AppendedReader } from '../src/channels/appended/appended_reader.ts';
 import { fittedSimilarity } from '../src/channels/appended/pilots.ts';
+import { type Payload, type Reader, unpackPayload } from '../src/channels/base.ts';
 import { Fountain, NOISY } from '../src/channels/colours/fountain.ts';
 import { ColoursReader } from '../src/channels/colours/colours_reader.ts';
-import { type Content, type Reader, unpackPayload } from '../src/channels/content.ts';
 import { Channels, preparedFor } from '../src/channels/opening.ts';
 import { type Gaussians, selected } from '../src/core/gaussians.ts';
 import { movedPoint } from '../src/core/similarity.ts';
 import { mixed, multiplicities, sortingOrder } from '../src/core/words.ts';
 import { type Derive, expand, here, roundRobin, sequential } from '../src/keys/keys.ts';
-import { digest, hex, jsonVector, modelOf, random } from './vectors.ts';
+import { digest, hex, jsonVector, modelOf, random, type Revealed } from './vectors.ts';
 
-const OPENED = jsonVector<{ file: string; key: string; payload?: string }[]>('revealed.json');
+const OPENED = jsonVector<Revealed[]>('revealed.json');
 const NOTE = OPENED.find((each) => each.file === 'colours.spz')!;
 
 /** Rows of a model in another order, of which a share is left. */
@@ -79,8 +79,8 @@ test('appended Gaussians survive pruning of a fifth and any order', async () => 
   const model = await modelOf('appended.ply');
   const [wanted, larger] = [true, false].map((file) => OPENED.find((each) => each.file === 'appended.ply' && file === 'payload' in each)!);
   const derive = remembered(here);
-  const content = await AppendedReader.of(some(model, 0.8, 7))!.open(wanted.key, derive);
-  expect(digest(content!.data)).toBe(wanted.payload);
+  const found = await AppendedReader.of(some(model, 0.8, 7))!.open(wanted.key, derive);
+  expect(digest(found!.data)).toBe(wanted.payload);
   await expect(AppendedReader.of(some(model, 0.4, 8))!.open(larger.key, derive)).rejects.toThrow(/^The key is right/);
   expect(await AppendedReader.of(model)!.open('another key', derive)).toBeNull();
   expect(AppendedReader.of(selected(model, [...Array(120).keys()]))).toBeNull(); // the cover alone
@@ -92,8 +92,8 @@ test('colours survive scaling, any order and pruning of a fifth', async () => {
   const fewer = some(model, 0.8, 9);
   const larger = { ...fewer, logScales: fewer.logScales.map((each) => each + Math.log(1.37)) };
   for (const changed of [fewer, larger]) {
-    const content = await ColoursReader.of(changed).open(NOTE.key, derive);
-    expect(digest(content!.data)).toBe(NOTE.payload);
+    const found = await ColoursReader.of(changed).open(NOTE.key, derive);
+    expect(digest(found!.data)).toBe(NOTE.payload);
   }
 });
 
@@ -122,7 +122,7 @@ test('channels report their number of derivations', async () => {
 
 test('the first channel that opens wins, and all are searched', async () => {
   const asked: string[] = [];
-  const reader = (name: string, found: Content | null | Error): Reader => ({
+  const reader = (name: string, found: Payload | null | Error): Reader => ({
     derivations: 1,
     open: async () => {
       asked.push(name);
@@ -130,8 +130,8 @@ test('the first channel that opens wins, and all are searched', async () => {
       return found;
     },
   });
-  const content = (method: string): Content => ({ service: 'payload', method, data: new Uint8Array(0) });
-  const [none, first, second] = [reader('none', null), reader('first', content('first')), reader('second', content('second'))];
+  const payload = (method: string): Payload => ({ method, data: new Uint8Array(0) });
+  const [none, first, second] = [reader('none', null), reader('first', payload('first')), reader('second', payload('second'))];
   expect((await new Channels([none, first, second]).open('key'))?.method).toBe('first');
   expect(asked).toEqual(['none', 'first', 'second']);
   await expect(new Channels([reader('damaged', new Error('damaged.')), first]).open('key')).rejects.toThrow('damaged.');
@@ -159,7 +159,7 @@ test('derivations run sequentially, or round robin over several', async () => {
 });
 
 test('payload packing', () => {
-  expect(unpackPayload(hex('66696c6500616263'))).toEqual({ service: 'payload', method: 'file', data: hex('616263') });
+  expect(unpackPayload(hex('66696c6500616263'))).toEqual({ method: 'file', data: hex('616263') });
   for (const damaged of ['', '00', '0066', '66696c65', '80696c6500', '30313233343536373839303132333435' + '00']) {
     expect(() => unpackPayload(hex(damaged))).toThrow(/damaged\.$/);
   }

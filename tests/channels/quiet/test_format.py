@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import struct
+import zlib
 from collections import Counter
 from itertools import combinations
 from pathlib import Path
@@ -14,6 +15,7 @@ import plyfile
 import pytest
 from argon2.low_level import Type, hash_secret_raw
 from cryptography.hazmat.primitives.ciphers import Cipher
+from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305
 from cryptography.hazmat.primitives.ciphers.algorithms import AES
 from cryptography.hazmat.primitives.ciphers.modes import CBC, ECB
 from cryptography.hazmat.primitives.hashes import SHA256
@@ -34,17 +36,16 @@ def _aes(key: bytes, block: bytes) -> bytes:
     return Cipher(AES(key), ECB()).encryptor().update(block)
 
 
-def _decrypted(secret: bytes, label: str, carrier_id: bytes, cell: bytes, slot: int = 0) -> bytes | None:
+def _decrypted(secret: bytes, label: str, carrier_id: bytes, cell: bytes) -> bytes | None:
     tag, hidden = cell[:4], cell[4:]
-    nonce = bytes(a ^ b for a, b in zip(carrier_id, (tag + bytes([slot])).ljust(16, b"\0"), strict=True))
+    nonce = bytes(a ^ b for a, b in zip(carrier_id, tag.ljust(16, b"\0"), strict=True))
     seed = _aes(_hkdf(secret, f"{label}/seed"), nonce)
     blocks = range(-(-len(hidden) // 16))
     stream = b"".join(
         _aes(_hkdf(secret, f"{label}/stream"), seed[:-1] + bytes([seed[-1] ^ i])) for i in blocks
     )
     data = bytes(a ^ b for a, b in zip(hidden, stream, strict=False))
-    message = bytes([slot]) + data
-    message = carrier_id + message.ljust(-(-len(message) // 16) * 16, b"\0")
+    message = carrier_id + data.ljust(16 * len(blocks), b"\0")
     mac = Cipher(AES(_hkdf(secret, f"{label}/tag")), CBC(bytes(16))).encryptor().update(message)[-16:]
     return data if mac[:4] == tag else None
 
@@ -100,34 +101,35 @@ def test_a_reader_written_from_the_description_opens_the_carried_model() -> None
     ((data_key, times),) = Counter(filter(None, data_keys)).most_common(1)
     assert times == 12
 
-    parts = {}
-    for carrier_id, low in gaussians:
-        if (part := _decrypted(data_key, "parameters", carrier_id, low)) is not None:
-            parts[part[0]] = part[1:]
-    packed = b"".join(parts[number] for number in sorted(parts))
-    version, service, method = struct.unpack_from("<BB15s", packed)
-    cells, size, header_bytes = struct.unpack_from("<BHH", packed, 17)
-    assert (version, service, method.rstrip(b"\0")) == (5, 2, b"carry")
-    header = packed[62 : 62 + header_bytes]
-    (count,) = struct.unpack_from("<I", header)
-    assert count == EXPECTED["count"]
+    parts = _numbered(data_key, "parameters", gaussians, WIDTH - 4, 1)
+    packed = b"".join(part for _, part in sorted(parts.items()))
+    version, method, size = struct.unpack_from("<B15sI", packed)
+    assert (version, method.rstrip(b"\0")) == (6, b"carry")
+    carriers, codewords, n, k = struct.unpack_from("<IIHH", packed, 20)
+    assert carriers == len(gaussians)
+    sketch, place_key = int.from_bytes(packed[32:64], "little"), _hkdf(data_key, "sketch")
+    places = {int.from_bytes(_aes(place_key, own)[:4], "little") % carriers for own, _ in gaussians}
+    assert {place for place in places if place < 256} == {bit for bit in range(256) if sketch >> bit & 1}
 
-    bits, skipped = header[4], 3 + 3 * header[6]  # of a coordinate; of outliers and quaternions before it
-    lines = [struct.unpack_from("<2f2e", header, 12 + 12 * axis) for axis in range(3)]
-    means = set()
-    for carrier_id, low in gaussians:
-        for slot in range(cells):
-            cell = low[slot * (WIDTH // cells) :][: 4 + size]
-            for label in ("record", "copy"):
-                if (record := _decrypted(data_key, label, carrier_id, cell, slot)) is not None:
-                    whole = int.from_bytes(record, "big")
-                    shifts = [8 * size - skipped - bits * (axis + 1) for axis in range(3)]
-                    codes = [whole >> shift & (1 << bits) - 1 for shift in shifts]
-                    outlier = whole >> 8 * size - 1
-                    places = [
-                        centre
-                        + spread * np.sinh((2 * code / ((1 << bits) - 1) - 1) * (far if outlier else reach))
-                        for code, (centre, spread, reach, far) in zip(codes, lines, strict=True)
-                    ]
-                    means.add(tuple(float(np.float32(place)) for place in places))
-    np.testing.assert_allclose(sorted(means), sorted(map(tuple, EXPECTED["means"])), atol=1e-6, rtol=1e-6)
+    width = (WIDTH - 7) // 2 * 2
+    chunks = _numbered(data_key, "chunk", gaussians, 3 + width, 3)
+    assert chunks.keys() == set(range(codewords * n))
+    encrypted = b"".join(chunks[number] for number in range(codewords * k))[:size]
+    payload_key = _hkdf(_hkdf(data_key, "payload-key"), "payload")
+    plain = ChaCha20Poly1305(payload_key).decrypt(bytes(12), encrypted, b"keyss/v1/quiet")
+    (length,) = struct.unpack_from("<I", plain)
+    payload = zlib.decompress(plain[4 : 4 + length])
+    assert payload.hex() == EXPECTED["payload"]
+    assert struct.unpack_from("<I", payload) == (EXPECTED["count"],)
+
+
+def _numbered(
+    data_key: bytes, label: str, gaussians: list[tuple[bytes, bytes]], size: int, number_bytes: int
+) -> dict[int, bytes]:
+    """By number, the data of all cells of a label that hold `size` bytes, of which the first are a number."""
+    cells = (_decrypted(data_key, label, carrier_id, low[: 4 + size]) for carrier_id, low in gaussians)
+    return {
+        int.from_bytes(data[:number_bytes], "little"): data[number_bytes:]
+        for data in cells
+        if data is not None
+    }

@@ -7,8 +7,8 @@
 import type { ReadModel } from '../files/models.ts';
 import type { Derive } from '../keys/keys.ts';
 import { AppendedReader } from './appended/appended_reader.ts';
+import type { Payload, Reader } from './base.ts';
 import { ColoursReader } from './colours/colours_reader.ts';
-import type { Content, Reader } from './content.ts';
 import { QuietReader } from './quiet/reading.ts';
 
 /** A model's channels, prepared for any number of keys: the quick ones, or the thorough search of colours. */
@@ -26,7 +26,7 @@ export class Channels implements Reader {
     return this.readers.reduce((sum, each) => sum + each.derivations, 0);
   }
 
-  async open(key: string, derive?: Derive): Promise<Content | null> {
+  async open(key: string, derive?: Derive): Promise<Payload | null> {
     const outcomes = await Promise.allSettled(this.readers.map((each) => each.open(key, derive)));
     for (const outcome of outcomes) {
       if (outcome.status === 'rejected') throw outcome.reason;

@@ -82,7 +82,7 @@ const GROWTH = 0.25;
 const MAX_LOST = 0.9;
 const MIN_LOST = 0.01;
 
-/** The Gaussians left of `count`, made denser and larger to compensate for pruning; see docs/byte-layout.md. */
+/** The Gaussians left of `count`, made denser and larger to compensate for pruning; counterpart of `keyss.core.gaussians`. */
 export function compensated(gaussians: Gaussians, count: number): Gaussians {
   const share = Math.max(gaussians.count / Math.max(count, 1), 1 - MAX_LOST);
   if (share >= 1 - MIN_LOST) return gaussians;

@@ -2,8 +2,8 @@
 import WORKER from 'source:../worker.ts';
 import type { Gaussians } from '../core/gaussians.ts';
 import { writePly } from '../files/ply.ts';
+import type { HiddenFile } from '../hidden.ts';
 import { startWorker } from '../keys/keys.ts';
-import type { HiddenFile } from '../records/reveal.ts';
 import type { Answer, Question } from '../worker.ts';
 import { Controls } from './controls.ts';
 import { givenModel, notifyParent, params } from './embedding.ts';

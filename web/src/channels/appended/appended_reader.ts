@@ -8,8 +8,8 @@ import { type Gaussians, opacity, where, withDegree } from '../../core/gaussians
 import { moved, type Similarity } from '../../core/similarity.ts';
 import type { Words } from '../../core/words.ts';
 import { blockwise, decrypted, type Derive, expand, here } from '../../keys/keys.ts';
+import { foreign, type Payload, type Reader, unpackPayload } from '../base.ts';
 import { carriersOf } from '../colours/carriers.ts';
-import { foreign, type Payload, type Reader, unpackPayload } from '../content.ts';
 import { type Codewords, decoded } from '../reed_solomon.ts';
 import { type Found, LEAST, ONE_IN, pilotsOf, POSITION_BITS, readPilots } from './pilots.ts';
 
@@ -47,7 +47,7 @@ export class AppendedReader implements Reader {
     return null;
   }
 
-  /** The content that `key` opens, or null. Raises InputError if too much was lost or changed. */
+  /** The payload that `key` opens, or null. Raises InputError if too much was lost or changed. */
   async open(key: string, derive: Derive = here): Promise<Payload | null> {
     const secret = await derive(key, this.salt);
     for (const width of WIDTHS) {

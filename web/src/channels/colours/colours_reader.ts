@@ -6,7 +6,7 @@ import { InputError, tooMuchLost } from '../../core/errors.ts';
 import type { Gaussians } from '../../core/gaussians.ts';
 import { mix, type Words } from '../../core/words.ts';
 import { decrypted, type Derive, expand, here, SALT_BYTES } from '../../keys/keys.ts';
-import { type Payload, type Reader, unpackPayload } from '../content.ts';
+import { type Payload, type Reader, unpackPayload } from '../base.ts';
 import { type Carriers, carriersOf, chosen, fractions, randomPairs, saltsOf } from './carriers.ts';
 import { Fountain, NOISY } from './fountain.ts';
 
@@ -28,7 +28,7 @@ export class ColoursReader implements Reader {
     return 1 + this.salts.length;
   }
 
-  /** The content that `key` opens, or null. Raises InputError for damage. */
+  /** The payload that `key` opens, or null. Raises InputError for damage. */
   async open(key: string, derive: Derive = here): Promise<Payload | null> {
     const [first, ...others] = await Promise.all([STATIC_SALT, ...this.salts].map((salt) => derive(key, salt)));
     const salted = others.map((each) => expand(each, 'colours/header'));

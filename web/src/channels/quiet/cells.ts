@@ -1,4 +1,4 @@
-/** Cells: a few bytes of each Gaussian, recognisable with the key and noise without; see docs/byte-layout.md, "Cells". */
+/** Cells: a few bytes of each carrier, recognisable with the key and noise without; see docs/byte-layout.md, "Cells". */
 import { blockwise, expand } from '../../keys/keys.ts';
 
 export const TAG_BYTES = 4;
@@ -21,38 +21,36 @@ export class CellCipher {
     [this.tagKey, this.seedKey, this.streamKey] = ['tag', 'seed', 'stream'].map((use) => expand(secret, `${label}/${use}`));
   }
 
-  /** The cells with a valid tag among the bytes from `offset` on of every row of `low` [N, width]. */
-  decrypt(ids: Uint8Array, low: Uint8Array, width: number, offset: number, slot: number): Cell[] {
+  /** The cells with a valid tag among the first bytes of every row of `low` [N, width]. */
+  decrypt(ids: Uint8Array, low: Uint8Array, width: number): Cell[] {
     const [{ size, stride }, found] = [this, [] as Cell[]];
     for (let start = 0; start < ids.length / BLOCK; start += CELLS) {
       const own = ids.subarray(start * BLOCK, (start + CELLS) * BLOCK);
-      const cells = low.subarray(start * width + offset); // every `width` bytes begin with a cell
-      const [count, streams] = [own.length / BLOCK, this.streams(own, cells, width, slot)];
-      const messages = new Uint8Array(count * stride); // slot, data, and zeros up to a block
+      const cells = low.subarray(start * width);
+      const [count, streams] = [own.length / BLOCK, this.streams(own, cells, width)];
+      const messages = new Uint8Array(count * stride); // data, and zeros up to a block
       for (let cell = 0; cell < count; cell++) {
-        const [to, from] = [cell * stride + 1, cell * width + TAG_BYTES];
-        messages[to - 1] = slot;
+        const [to, from] = [cell * stride, cell * width + TAG_BYTES];
         for (let at = 0; at < size; at++) messages[to + at] = cells[from + at] ^ streams[cell * size + at];
       }
       const states = this.states(own, messages);
       for (let cell = 0; cell < count; cell++) {
         let different = 0;
         for (let at = 0; at < TAG_BYTES; at++) different |= states[cell * BLOCK + at] ^ cells[cell * width + at];
-        const first = cell * stride + 1;
-        if (different === 0) found.push({ row: start + cell, data: messages.slice(first, first + size) });
+        if (different === 0) found.push({ row: start + cell, data: messages.slice(cell * stride, cell * stride + size) });
       }
     }
     return found;
   }
 
-  /** [N, size] the key streams of cells in slot 0 whose data are zeros: a pseudo-random function of `ids`. */
+  /** [N, size] the key streams of cells whose data are zeros: a pseudo-random function of `ids`. */
   pads(ids: Uint8Array): Uint8Array {
     const states = this.states(ids, new Uint8Array((ids.length / BLOCK) * this.stride));
-    return this.streams(ids, states, BLOCK, 0);
+    return this.streams(ids, states, BLOCK);
   }
 
   private get stride(): number {
-    return Math.ceil((1 + this.size) / BLOCK) * BLOCK;
+    return Math.ceil(this.size / BLOCK) * BLOCK;
   }
 
   /** [N, 16] that begin with the tags of `messages` [N, stride]. */
@@ -67,13 +65,12 @@ export class CellCipher {
   }
 
   /** [N, size] the key streams; every `width` bytes of `cells` begin with a tag. */
-  private streams(ids: Uint8Array, cells: Uint8Array, width: number, slot: number): Uint8Array {
+  private streams(ids: Uint8Array, cells: Uint8Array, width: number): Uint8Array {
     const [{ size }, count] = [this, ids.length / BLOCK];
     const found = new Uint8Array(count * size);
     let seeds: Uint8Array = ids.slice();
     for (let cell = 0; cell < count; cell++) {
       for (let at = 0; at < TAG_BYTES; at++) seeds[cell * BLOCK + at] ^= cells[cell * width + at];
-      seeds[cell * BLOCK + TAG_BYTES] ^= slot;
     }
     seeds = blockwise(this.seedKey, seeds);
     for (let start = 0; start < size; start += BLOCK) {

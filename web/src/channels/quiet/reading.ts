@@ -1,5 +1,5 @@
 /**
- * Reads the low bits of a model, or the codes of a file, with a key; counterpart of `keyss.channels.quiet.contents` and
+ * Reads the low bits of a model, or the codes of a file, with a key; counterpart of `keyss.channels.quiet.payloads` and
  * `layout` (docs/byte-layout.md, "Parameters").
  *
  * A wrong key makes the same passes over all cells as a right one, and all salts are always tried, so the time taken
@@ -10,7 +10,7 @@ import { damaged, otherVersion, tooMuchLost } from '../../core/errors.ts';
 import { type Gaussians, selected } from '../../core/gaussians.ts';
 import type { ReadModel } from '../../files/models.ts';
 import { decrypted, type Derive, expand, here } from '../../keys/keys.ts';
-import { type Content, foreign, type Reader } from '../content.ts';
+import { foreign, type Payload, type Reader } from '../base.ts';
 import { type Codewords, decoded } from '../reed_solomon.ts';
 import { fieldsOf, gaussianIds, ID_BYTES, lowBits, lowWidth, saltOf, salts } from './bits.ts';
 import { type Cell, CellCipher, TAG_BYTES } from './cells.ts';
@@ -19,7 +19,6 @@ import { BLOCK_BYTES, lastBits, type Levels, levelsOf, modelHash, readBlocks } f
 const ASSOCIATED = ascii('keyss/v1/quiet');
 const DATA_KEY_BYTES = 16;
 const LEAST_WIDTH = TAG_BYTES + DATA_KEY_BYTES;
-const DUMMY_CELLS = 2; // cells per carrier that a wrong key decrypts
 const NARROW_HARMONICS = 9; // of degree 1: some secrets do not write the others
 const [LEAST_BYTES, MIN_BLOCKS] = [48, 4]; // minimum bytes of a block; minimum blocks of a file
 const MAX_BITS = 2 ** 30; // bits in codes; more would exceed the memory of a tab
@@ -73,8 +72,8 @@ export class QuietReader implements Reader {
     return this.salts.length;
   }
 
-  /** The content that `key` opens, or null. Raises InputError for damage. */
-  async open(key: string, derive: Derive = here): Promise<Content | null> {
+  /** The payload that `key` opens, or null. Raises InputError for damage. */
+  async open(key: string, derive: Derive = here): Promise<Payload | null> {
     const dataKeys: Uint8Array[] = [];
     let secret: Uint8Array = new Uint8Array(32);
     // Other workers derive the next keys while this one reads cells.
@@ -85,75 +84,62 @@ export class QuietReader implements Reader {
       const best = mostFrequent(cells.map(({ data }) => bytesKey(data)));
       if (best) dataKeys.push(cells.find(({ data }) => bytesKey(data) === best[0])!.data);
     }
-    for (const dataKey of dataKeys) {
-      for (const width of this.widths) {
-        const parts = this.parts(dataKey, width);
-        if (!parts.length) continue;
-        const parameters = unpackParameters(parts.map(({ data }) => data), this.blocks ? 0 : SKETCH_BYTES);
-        if (!this.blocks) return this.content(dataKey, parameters, width);
-        return this.payload(dataKey, parameters, this.inBlocks(parameters, parts[parts.length - 1].row));
-      }
+    const none = expand(secret, 'quiet/none').slice(0, DATA_KEY_BYTES); // opens nothing
+    for (const dataKey of dataKeys.length ? dataKeys : [none]) {
+      const found = this.widths.map((width) => {
+        return { width, parts: this.cells(new CellCipher(dataKey, 'parameters', width - TAG_BYTES)) };
+      });
+      const own = found.find(({ parts }) => parts.length);
+      if (own) return this.blocks ? this.inBlocks(dataKey, own.parts) : this.inChunks(dataKey, own.parts, own.width);
     }
-    if (dataKeys.length === 0) {
-      const none = expand(secret, 'quiet/none').slice(0, DATA_KEY_BYTES);
-      for (const width of this.widths) this.parts(none, width);
-      this.dummyPasses(none, this.width);
-    }
+    if (!this.blocks) this.cells(chunkCipher(none, this.width));
     return null;
   }
 
-  private dummyPasses(dataKey: Uint8Array, width: number): void {
-    const size = Math.floor(width / DUMMY_CELLS) - TAG_BYTES;
-    for (const label of ['record', 'copy']) this.cells(new CellCipher(dataKey, label, size), width, DUMMY_CELLS);
+  /** The payload in the chunks of all carriers, `width` bytes each. */
+  private async inChunks(dataKey: Uint8Array, parts: Cell[], width: number): Promise<Payload> {
+    const { method, size, further } = unpackParameters(parts, CODEWORDS_BYTES + SKETCH_BYTES);
+    const [gaussians, codewords] = unpackCodewords(further, chunkBytes(width));
+    if (size < 1 || size > codewords.count * codewords.k * codewords.width) throw damaged();
+    const chunks = this.cells(chunkCipher(dataKey, width)).map(({ data }): [number, Uint8Array] => [
+      data[0] | (data[1] << 8) | (data[2] << 16), data.subarray(NUMBER_BYTES),
+    ]);
+    const data = await decryptedPayload(dataKey, decoded(codewords, chunks).subarray(0, size));
+    return { method, data, foreign: foreign(dataKey, this.ids, further.subarray(CODEWORDS_BYTES), gaussians) || undefined };
   }
 
-  private async content(dataKey: Uint8Array, parameters: Parameters, width: number): Promise<Content> {
-    const { isPayload, cells, recordBytes, method, header } = parameters;
-    if (recordBytes < 1 || recordBytes > Math.floor(width / cells) - TAG_BYTES) throw damaged();
-    const [records, copies] = ['record', 'copy'].map((label) =>
-      this.cells(new CellCipher(dataKey, label, recordBytes), width, cells).map(({ data }) => data),
-    );
-    if (width < this.width) this.dummyPasses(dataKey, this.width - width);
-    const foreignCount = foreign(dataKey, this.ids, parameters.sketch, parameters.gaussians) || undefined;
-    if (isPayload) {
-      const [size, codewords] = unpackCodewords(parameters);
-      const chunks = records.map((each): [number, Uint8Array] => [
-        each[0] | (each[1] << 8) | (each[2] << 16), each.subarray(NUMBER_BYTES),
-      ]);
-      const payload = await this.payload(dataKey, parameters, decoded(codewords, chunks).subarray(0, size));
-      return { ...payload, foreign: foreignCount };
+  /** The payload in the blocks after its parameters. */
+  private async inBlocks(dataKey: Uint8Array, parts: Cell[]): Promise<Payload> {
+    const { method, size, further } = unpackParameters(parts, BLOCK_SIZE_BYTES);
+    const [bytes, blocks] = [viewOf(further).getUint16(0, true), this.low.length / BLOCK_BYTES];
+    const count = Math.ceil(size / bytes);
+    if (bytes < 1 || bytes > BLOCK_BYTES || count > blocks) throw damaged();
+    const [first, encrypted] = [parts[parts.length - 1].row + 1, new Uint8Array(count * bytes)];
+    for (let index = 0; index < count; index++) {
+      const start = ((first + index) % blocks) * BLOCK_BYTES;
+      encrypted.set(this.low.subarray(start, start + bytes), index * bytes);
     }
-    const known = new Set(records.map(bytesKey));
-    const all = [...records, ...copies.filter((each) => !known.has(bytesKey(each)))];
-    if (!all.length) throw tooMuchLost();
-    return { service: 'records', method, header, records: all, foreign: foreignCount };
-  }
-
-  private async payload(dataKey: Uint8Array, { method }: Parameters, encrypted: Uint8Array): Promise<Content> {
-    const data = await decrypted(expand(dataKey, 'payload-key'), encrypted, ASSOCIATED);
-    return { service: 'payload', method, data };
-  }
-
-  /** The bytes of the blocks after block `row`, which holds the parameters. */
-  private inBlocks({ count, recordBytes }: Parameters, row: number): Uint8Array {
-    const blocks = this.low.length / BLOCK_BYTES;
-    if (count > blocks || recordBytes < 1 || recordBytes > BLOCK_BYTES) throw damaged();
-    const rows = Array.from({ length: count }, (_, index) => (row + 1 + index) % blocks);
-    const found = new Uint8Array(count * recordBytes);
-    rows.forEach((each, at) => found.set(this.low.subarray(each * BLOCK_BYTES, each * BLOCK_BYTES + recordBytes), at * recordBytes));
-    return found;
-  }
-
-  private parts(dataKey: Uint8Array, width: number): Cell[] {
-    return this.cells(new CellCipher(dataKey, 'parameters', width - TAG_BYTES));
+    return { method, data: await decryptedPayload(dataKey, encrypted.subarray(0, size)) };
   }
 
   /** The cells with a valid tag, in the order of carriers. */
-  private cells(cipher: CellCipher, width = this.width, cells = 1): Cell[] {
-    const size = Math.floor(width / cells);
-    const slots = Array.from({ length: cells }, (_, slot) => cipher.decrypt(this.ids, this.low, this.width, slot * size, slot));
-    return slots.flat().sort((a, b) => a.row - b.row);
+  private cells(cipher: CellCipher): Cell[] {
+    return cipher.decrypt(this.ids, this.low, this.width);
   }
+}
+
+/** The cipher of numbered chunks, in carriers of `width` bytes. */
+function chunkCipher(dataKey: Uint8Array, width: number): CellCipher {
+  return new CellCipher(dataKey, 'chunk', NUMBER_BYTES + chunkBytes(width));
+}
+
+/** Bytes of a chunk, a whole number of symbols. */
+function chunkBytes(width: number): number {
+  return 2 * Math.floor((width - TAG_BYTES - NUMBER_BYTES) / 2);
+}
+
+function decryptedPayload(dataKey: Uint8Array, encrypted: Uint8Array): Promise<Uint8Array> {
+  return decrypted(expand(dataKey, 'payload-key'), encrypted, ASSOCIATED);
 }
 
 /** Rows that differ in ID or low bits. */
@@ -169,60 +155,37 @@ function uniqueRows(ids: Uint8Array, low: Uint8Array, width: number): number[] {
   return rows;
 }
 
-const VERSION = 5;
-const PREFIX_BYTES = 30;
-const SKETCH_BYTES = 32;
-const NUMBERS = 17; // offset of cells, bytes of a record and of the header, Gaussians, records
-const MAX_CELLS = 4;
-const MAX_HEADER_BYTES = 4096;
-const [MAX_LENGTH, MAX_CHUNKS] = [1 << 13, 1 << 24]; // chunks of one codeword, of all
+const VERSION = 6;
+const [METHOD, SIZE, PREFIX_BYTES] = [1, 16, 20]; // offsets of the method and of the payload's size; of all else
+const [CODEWORDS_BYTES, SKETCH_BYTES, BLOCK_SIZE_BYTES] = [12, 32, 2];
 const NUMBER_BYTES = 3; // size of a chunk's number
+const [MAX_LENGTH, MAX_CODEWORDS] = [1 << 10, 1 << 14]; // chunks of one codeword
 
-/** Parameters of a secret: `count` records and copies, `cells` per carrier. */
+/** Parameters of a secret. */
 interface Parameters {
-  readonly isPayload: boolean; // records are numbered chunks of a payload
   readonly method: string;
-  readonly cells: number;
-  readonly recordBytes: number;
-  readonly gaussians: number; // size of the published model
-  readonly count: number;
-  readonly header: Uint8Array;
-  readonly sketch: Uint8Array; // empty in blocks
+  readonly size: number; // bytes of the encrypted payload
+  readonly further: Uint8Array; // how it is divided
 }
 
-/** Parameters from decrypted parts in any order; `sketched`: bytes of the sketch. Raises InputError. */
-function unpackParameters(parts: Uint8Array[], sketched: number): Parameters {
-  const numbered = new Map(parts.map((part) => [part[0], part.subarray(1)]));
-  const prefix = firstBytes(numbered, PREFIX_BYTES);
-  const [version, service] = prefix;
-  if (version !== VERSION) throw otherVersion();
-  const [cells, view] = [prefix[NUMBERS], viewOf(prefix)];
-  const [recordBytes, length] = [view.getUint16(NUMBERS + 1, true), view.getUint16(NUMBERS + 3, true)];
-  const [gaussians, count] = [view.getUint32(NUMBERS + 5, true), view.getUint32(NUMBERS + 9, true)];
-  if (service < 1 || service > 2 || cells < 1 || cells > MAX_CELLS || length > MAX_HEADER_BYTES) throw damaged();
-  const method = bytesKey(prefix.subarray(2, NUMBERS)).replace(/\0+$/, '');
-  const rest = firstBytes(numbered, PREFIX_BYTES + sketched + length).subarray(PREFIX_BYTES);
-  const [sketch, header] = [rest.subarray(0, sketched), rest.subarray(sketched)];
-  return { isPayload: service === 1, method, cells, recordBytes, gaussians, count, header, sketch };
+/** Parameters from decrypted parts in any order, with `length` bytes of further ones. Raises InputError. */
+function unpackParameters(parts: Cell[], length: number): Parameters {
+  const numbered = new Map(parts.map(({ data }) => [data[0], data.subarray(1)]));
+  const inOrder: Uint8Array[] = [];
+  for (let part = numbered.get(0); part; part = numbered.get(inOrder.length)) inOrder.push(part);
+  const packed = joined(...inOrder);
+  if (packed.length < PREFIX_BYTES + length) throw tooMuchLost();
+  if (packed[0] !== VERSION) throw otherVersion();
+  const method = bytesKey(packed.subarray(METHOD, SIZE)).replace(/\0+$/, '');
+  const further = packed.subarray(PREFIX_BYTES, PREFIX_BYTES + length);
+  return { method, size: viewOf(packed).getUint32(SIZE, true), further };
 }
 
-/** Bytes of the encrypted payload, and its codewords, from the header of a payload. Raises InputError. */
-function unpackCodewords({ header, recordBytes }: Parameters): [number, Codewords] {
-  if (header.length !== 12) throw damaged();
-  const view = viewOf(header);
-  const [size, count] = [view.getUint32(0, true), view.getUint32(4, true)];
-  const [n, k, width] = [view.getUint16(8, true), view.getUint16(10, true), recordBytes - NUMBER_BYTES];
-  const possible = count >= 1 && count * n <= MAX_CHUNKS && k >= 1 && k <= n && n <= MAX_LENGTH && width % 2 === 0;
-  if (!possible || size < 1 || size > count * k * width) throw damaged();
-  return [size, { count, n, k, width }];
-}
-
-function firstBytes(parts: Map<number, Uint8Array>, length: number): Uint8Array {
-  let data = new Uint8Array(0);
-  for (let number = 0; data.length < length; number++) {
-    const part = parts.get(number);
-    if (part === undefined) throw tooMuchLost();
-    data = joined(data, part) as Uint8Array<ArrayBuffer>;
-  }
-  return data.slice(0, length);
+/** Gaussians of the published model, and its codewords of chunks of `width` bytes. Raises InputError. */
+function unpackCodewords(packed: Uint8Array, width: number): [number, Codewords] {
+  const view = viewOf(packed);
+  const [gaussians, count] = [view.getUint32(0, true), view.getUint32(4, true)];
+  const [n, k] = [view.getUint16(8, true), view.getUint16(10, true)];
+  if (count < 1 || count > MAX_CODEWORDS || k < 1 || k > n || n > MAX_LENGTH) throw damaged();
+  return [gaussians, { count, n, k, width }];
 }

@@ -1,24 +1,13 @@
-/** The content of channels, and Gaussians of other models; counterpart of `keyss.channels.base` and `mixing`. */
+/** What channels carry, and Gaussians of other models; counterpart of `keyss.channels.base` and `mixing`. */
 import { bytesKey, viewOf } from '../core/bytes.ts';
 import { damaged } from '../core/errors.ts';
 import { blockwise, type Derive, expand } from '../keys/keys.ts';
 
-/** Records of one size, each read on its own, or bytes that are read completely or not at all. */
-export type Content = Records | Payload;
-
-interface Records {
-  readonly service: 'records';
-  readonly method: string;
-  readonly header: Uint8Array;
-  readonly records: Uint8Array[]; // in carrier order
-  readonly foreign?: number; // Gaussians added to or changed in the published file
-}
-
+/** Bytes that are read completely or not at all. */
 export interface Payload {
-  readonly service: 'payload';
   readonly method: string;
   readonly data: Uint8Array;
-  readonly foreign?: number;
+  readonly foreign?: number; // Gaussians added to or changed in the published file
 }
 
 /** A channel of one model, prepared for any number of keys. */
@@ -26,8 +15,8 @@ export interface Reader {
   /** Number of key derivations per attempt, whatever it opens. */
   readonly derivations: number;
 
-  /** The content that `key` opens, or null. Raises InputError for damage. */
-  open(key: string, derive?: Derive): Promise<Content | null>;
+  /** The payload that `key` opens, or null. Raises InputError for damage. */
+  open(key: string, derive?: Derive): Promise<Payload | null>;
 }
 
 const METHOD_BYTES = 15;
@@ -37,7 +26,7 @@ export function unpackPayload(packed: Uint8Array): Payload {
   const length = packed.indexOf(0);
   const name = packed.subarray(0, length);
   if (length < 1 || length > METHOD_BYTES || name.some((each) => each > 127)) throw damaged();
-  return { service: 'payload', method: bytesKey(name), data: packed.slice(length + 1) };
+  return { method: bytesKey(name), data: packed.slice(length + 1) };
 }
 
 const ID_BYTES = 16;

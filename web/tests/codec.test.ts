@@ -1,24 +1,24 @@
 import { expect, test } from 'vitest';
-import { decodeWhole } from '../src/records/whole.ts';
+import { decodeModel } from '../src/codec/model_bytes.ts';
 import { columns, hex, jsonVector } from './vectors.ts';
 
-const models = jsonVector<{ data: string; sha256: Record<string, string> }[]>('whole.json');
+const models = jsonVector<{ data: string; sha256: Record<string, string> }[]>('encoded.json');
 const DAMAGED = /^[^.]* damaged\.$/;
 
-test.each(models)('whole models match Python bit for bit', ({ data, sha256 }) => {
-  expect(columns(decodeWhole(hex(data), 0))).toEqual(sha256);
+test.each(models)('models match Python bit for bit', ({ data, sha256 }) => {
+  expect(columns(decodeModel(hex(data), 0))).toEqual(sha256);
 });
 
 test.each(models)('damaged models raise InputError or decode', ({ data }) => {
   const bytes = hex(data);
   for (let end = 0; end < bytes.length; end += end < 130 ? 1 : 37) {
-    expect(() => decodeWhole(bytes.slice(0, end), 0)).toThrow(DAMAGED);
+    expect(() => decodeModel(bytes.slice(0, end), 0)).toThrow(DAMAGED);
   }
-  expect(() => decodeWhole(Uint8Array.of(...bytes, 0), 0)).toThrow(DAMAGED);
+  expect(() => decodeModel(Uint8Array.of(...bytes, 0), 0)).toThrow(DAMAGED);
   for (let at = 0; at < bytes.length; at++) {
     const changed = bytes.slice();
     changed[at] ^= 1 << at % 8;
-    expectModelOrSentence(() => decodeWhole(changed, 0));
+    expectModelOrSentence(() => decodeModel(changed, 0));
   }
 });
 
@@ -39,7 +39,7 @@ test.each([[1 << 22, 0], [1 << 22, 1 << 20], [(1 << 16) + 1, 1 << 16], [0xffffff
     bytes.set(hex(models[0].data).subarray(0, 49));
     new DataView(bytes.buffer).setUint32(0, count, true);
     const before = process.memoryUsage().arrayBuffers;
-    expect(() => decodeWhole(bytes, carriers)).toThrow(DAMAGED);
+    expect(() => decodeModel(bytes, carriers)).toThrow(DAMAGED);
     expect(process.memoryUsage().arrayBuffers - before).toBeLessThan(1 << 20);
   },
 );
