@@ -18,7 +18,7 @@ every_format = pytest.mark.parametrize("format", SUFFIXES)
 
 @every_format
 def test_hide_reveal_verify_and_info(format: str, tmp_path: Path) -> None:
-    cover, secrets = model_of(4000), [model_of(140, seed) for seed in (1, 2)]
+    cover, secrets = model_of(4000), [model_of(100, seed) for seed in (1, 2)]
     options = CarryOptions(format=format)  # type: ignore[arg-type]
     asked = [keyss.Secret(model, f"key number {i}") for i, model in enumerate(secrets)]
     keyss.hide(cover, asked, method=options, width=32, min_psnr=0, out=tmp_path / "run")
@@ -26,7 +26,7 @@ def test_hide_reveal_verify_and_info(format: str, tmp_path: Path) -> None:
     assert stego.name == f"model{SUFFIXES[format]}"
     for index, secret in enumerate(secrets):
         found = keyss.reveal(stego, f"key number {index}").gaussians
-        assert len(found) == 140
+        assert len(found) == 100
         # Packing sorts them.
         nearest = torch.cdist(found.means, secret.means).min(dim=1).values
         assert float(nearest.max()) < 0.01

@@ -49,8 +49,7 @@ def test_refit_steps() -> None:
     options = CarryOptions(fit=FIT)
     assert _prepare(options, _source(cover), _source(large)).refits == (400,)
     assert _prepare(options, _source(cover), _source(large, photos=True)).refits == (1150,)
-    with pytest.warns(KeyssWarning, match="can notice that there are other secrets"):
-        assert _prepare(options, _source(cover), _source(small), _source(large)).refits == (0, 400)
+    assert _prepare(options, _source(cover), _source(small), _source(large)).refits == (0, 400)
     asked = options.with_fit(iterations=900)
     assert _prepare(asked, _source(cover), _source(large)).refits == (900,)
     result = keyss.hide(
@@ -58,6 +57,13 @@ def test_refit_steps() -> None:
     )
     assert result.metrics.iterations == 2
     assert (len(keyss.reveal(result.stego, KEY).gaussians),) == result.metrics.secret_gaussians
+
+
+def test_secrets_that_share_the_capacity_are_noticed() -> None:
+    cover, large = trained_like(2500), [trained_like(2000, seed) for seed in (1, 2)]
+    secrets = [Secret(model, f"{KEY} {number}") for number, model in enumerate(large)]
+    with pytest.warns(KeyssWarning, match="can notice that there are other secrets"):
+        keyss.hide(cover, secrets, method=CarryOptions(refit="never"), width=24, min_psnr=0)
 
 
 def test_refit_option() -> None:
