@@ -16,7 +16,7 @@ from keyss.core.errors import InputError, UsageError
 from keyss.keys.derivation import expand
 
 DATA_KEY_BYTES = 32
-MAX_PAYLOAD_BYTES = 64 << 20  # before compression
+MAX_PAYLOAD_BYTES = 256 << 20  # before compression
 # A payload of more than MAX_RATIO n + SMALL_PAYLOAD bytes that compress to n is stored without compression.
 MAX_RATIO, SMALL_PAYLOAD = 16, 1 << 20
 OVERHEAD = 4 + 16  # length of the compressed data, and the tag
@@ -32,7 +32,7 @@ def encrypt(data_key: bytes, payload: bytes, associated: bytes = b"", *, size: i
     """Encrypt `payload` under a fresh `data_key` (32 bytes), padded to `size` bytes.
 
     `size`: at least `compressed_size` + OVERHEAD. `associated` is authenticated too, and needed to decrypt.
-    Raises UsageError for a payload of more than 64 MiB.
+    Raises UsageError for a payload of more than 256 MiB.
     """
     if len(payload) > MAX_PAYLOAD_BYTES:
         raise UsageError(f"expected at most {MAX_PAYLOAD_BYTES:,} bytes to encrypt, got {len(payload):,}")

@@ -59,7 +59,7 @@ export function streamWords(
   }
 }
 
-const MAX_PAYLOAD_BYTES = 64 << 20;
+const MAX_PAYLOAD_BYTES = 256 << 20;
 const [MAX_RATIO, SMALL_PAYLOAD] = [16, 1 << 20]; // n bytes inflate to at most MAX_RATIO n + SMALL_PAYLOAD
 
 /** Inverse of `keyss.keys.encryption.encrypt`. Raises InputError for any modification. */
