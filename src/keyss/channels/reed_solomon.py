@@ -14,11 +14,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import zip_longest
+from typing import Any
 
 import numpy as np
 
 from keyss.core.arrays import Bytes, Flags, Integers, Shorts
 from keyss.core.errors import InputError
+from keyss.kernels.jit import kernel
+from keyss.kernels.parallel import in_blocks
 
 MAX_CHUNKS = 1 << 13  # per codeword; the field would allow more, at a cost in time
 SYMBOL_BYTES = 2
@@ -26,7 +29,8 @@ LOST = "the key is right, but too much of the model was lost or changed since th
 _POLYNOMIAL = 0x1100B
 _ORDER = (1 << 16) - 1  # of the generator 2
 _ZERO = 4 * _ORDER  # logarithm of 0: sums with other logarithms are exponents of 0
-_AT_ONCE = 1 << 18  # products per step, which bounds memory
+_AT_ONCE = 1 << 18  # factors per step, which bounds memory
+_COLUMNS = 128  # per block, which fits into the cache
 _MAX_ERRORS = 128  # maximum number of errors to locate per codeword
 
 
@@ -126,12 +130,27 @@ def _interpolate(numbers: Integers, rows: Bytes, wanted: Integers, n: int) -> By
         points, at = numbers + 1, wanted + 1
         values = _scale(rows, -_own_products(numbers, n))
         outside = _products(at, points)
-        step = max(1, _AT_ONCE // values.size)
+        step = max(1, _AT_ONCE // len(points))
         for low in range(0, len(at), step):
             some = slice(low, low + step)
             factors = outside[some, None] + _ORDER - _LOGARITHMS[at[some, None] ^ points]
-            found[some] = np.bitwise_xor.reduce(_POWERS[factors[..., None] + values], axis=1)
+
+            def add(start: int, stop: int, own: Shorts = found[some], factors: Integers = factors) -> None:
+                part = np.ascontiguousarray(values[:, start:stop], np.int32)
+                _add_products(factors, part, _POWERS, own[:, start:stop])
+
+            in_blocks(add, values.shape[1], _COLUMNS)
     return found.astype(">u2").view(np.uint8)
+
+
+@kernel
+def _add_products(factors: Any, values: Any, powers: Any, found: Any) -> None:
+    """Add the products of `factors` [W, k] and `values` [k, S], given as logarithms, to `found` [W, S]."""
+    for row in range(len(found)):
+        for point in range(len(values)):
+            factor = factors[row, point]
+            for column in range(values.shape[1]):
+                found[row, column] ^= powers[factor + values[point, column]]
 
 
 def _scale(rows: Bytes, logarithms: Integers) -> Integers:

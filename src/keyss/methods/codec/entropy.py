@@ -11,29 +11,32 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from keyss.core.arrays import Integers
 from keyss.core.errors import InputError
 from keyss.kernels.jit import inline, kernel
+
+Codes = npt.NDArray[np.int32]
 
 MAX_NUMBER = 1 << 29  # differences have at most 31 bits
 _MAX_BITS = 31
 _CONTEXTS = 16  # for bit counts; one more is for first bits
 
 
-def encode(table: Integers, shares: Integers, groups: Integers) -> bytes:
+def encode(table: Codes, shares: Integers, groups: Integers) -> bytes:
     """Compress `table` [N, C] with absolute values of at most MAX_NUMBER.
 
     `shares` [C]: prediction coefficients of the columns, in eighths. `groups` [C]: indices from 0; columns of
     one group share their probabilities.
     """
-    coded, size = _code(table.copy(), shares, groups, np.empty(table.size + 1024, np.uint8), False)
+    coded, size = _code(table, shares, groups, np.empty(table.size + 1024, np.uint8), False)
     return bytes(coded[:size])
 
 
-def decode(data: bytes, count: int, shares: Integers, groups: Integers) -> Integers:
+def decode(data: bytes, count: int, shares: Integers, groups: Integers) -> Codes:
     """Decompress a table [count, C]. Raises InputError for too few or too many bytes."""
-    table = np.zeros((count, len(shares)), np.int64)
+    table = np.zeros((count, len(shares)), np.int32)
     _, size = _code(table, shares, groups, np.frombuffer(data + b"\0", np.uint8).copy(), True)
     if size != len(data):
         raise InputError("the hidden secret is damaged: its length is wrong")
@@ -98,7 +101,7 @@ def _code(table: Any, shares: Any, groups: Any, data: Any, reading: bool) -> Any
             if not reading and len(data) - coder[2] < 256:
                 data = np.concatenate((data, np.empty_like(data)))
             predicted = shares[column] * before[column] >> 3
-            difference = table[row, column] - predicted
+            difference = np.int64(table[row, column]) - predicted
             value, size = abs(difference), 0
             own = probabilities[groups[column]]
             context = own[min(_CONTEXTS - 1, (sizes[column] + recent) >> 2)]
@@ -110,7 +113,8 @@ def _code(table: Any, shares: Any, groups: Any, data: Any, reading: bool) -> Any
                 found = 2 + _bit(coder, data, reading, value >> (size - 2) & 1, own[_CONTEXTS, size])
             for shift in range(size - 3, -1, -1):
                 found = 2 * found + _raw_bit(coder, data, reading, value >> shift & 1, coder[1] >> 1)
-            before[column] = table[row, column] = predicted + (-found if negative else found)
+            before[column] = predicted + (-found if negative else found)
+            table[row, column] = before[column]
             sizes[column] += (4 * size - sizes[column] + 1) >> 1
             recent += (8 * size - recent + 2) >> 2
     for _ in range(4 * (not reading)):

@@ -26,7 +26,9 @@ from keyss.core.arrays import Doubles, Integers, doubles
 from keyss.core.errors import InputError
 from keyss.core.gaussians import MAX_COORDINATE, MAX_LOG_SCALE, OPPONENT, Gaussians
 from keyss.files.formats.common import in_morton_order, with_largest_w
+from keyss.kernels.parallel import in_blocks
 from keyss.methods.codec import entropy
+from keyss.methods.codec.entropy import Codes
 
 _ALWAYS = 1 << 16  # number of Gaussians that a payload of any size may declare
 _MIN_BYTES = 2  # minimum bytes per Gaussian of a larger model
@@ -36,6 +38,7 @@ _DIFFERENCES = np.array([1.0, 1.5, 1.5])  # steps of brightness and differences 
 _PER_OCTAVE = 0.5 / math.log(2)  # half octaves of the step
 _FINER = 6  # maximum change of a step, in half octaves
 _MAX_STEP = 1e6
+_BLOCK = 1 << 14  # Gaussians per block
 _MAX_LOGIT = 16.0  # beyond it the float32 sigmoid is exactly 0 or 1
 _LEAST_W = 1 / 16  # minimum w^2
 # `shares` and `groups` of `entropy.encode` for the columns x, y, z, log scales, opacity, colours, quaternion.
@@ -79,11 +82,18 @@ def encode(model: Gaussians, precision: Precision | None = None) -> bytes:
     numbers = _even_columns(model)
     parts = (0, 1, 2, slice(3, 6), 6)  # x, y, z, log scales, opacity logits
     centres = [float(np.float32(np.median(numbers[:, part]))) for part in parts]
-    even = _round((numbers - _origin(centres)) / _even_steps(steps))
-    finer = _refinement(*_even_numbers(even, centres, steps)[1:3])
-    quats = with_largest_w(doubles(model.quats))[:, 1:] / _steps(steps[4], finer)
-    harmonics = (doubles(model.sh[:, 1:]) @ OPPONENT.T).reshape(len(model), -1) / _steps(steps[5], finer)
-    codes = np.concatenate([even, _round(np.concatenate([quats, harmonics], axis=1))], axis=1)
+    codes = np.empty((len(model), 10 + model.sh[0].numel()), np.int32)
+    codes[:, :10] = _round((numbers - _origin(centres)) / _even_steps(steps))
+    finer = _refinement(*_even_numbers(codes[:, :10], centres, steps)[1:3])
+
+    def fill(start: int, stop: int) -> None:
+        own, finest = codes[start:stop], finer[start:stop]
+        quats = with_largest_w(doubles(model.quats[start:stop]))[:, 1:]
+        harmonics = (doubles(model.sh[start:stop, 1:]) @ OPPONENT.T).reshape(len(own), -1)
+        own[:, 10:13] = _round(quats / _steps(steps[4], finest))
+        own[:, 13:] = _round(harmonics / _steps(steps[5], finest))
+
+    in_blocks(fill, len(model), _BLOCK)
     head = _HEAD.pack(len(model), model.sh_degree, *centres, *steps)
     return head + entropy.encode(codes, *_columns(model.sh_degree))
 
@@ -112,12 +122,19 @@ def decode(data: bytes, model_size: int | None = None) -> Gaussians:
     codes = entropy.decode(data[_HEAD.size :], count, *_columns(sh_degree))
     means, log_scales, logits, colours = _even_numbers(codes[:, :10], centres, steps)
     finer = _refinement(log_scales, logits)
-    x, y, z = (codes[:, 10:13] * _steps(steps[4], finer)).T
-    w = np.sqrt(np.maximum(1 - (x * x + y * y + z * z), _LEAST_W))
-    harmonics = codes[:, 13:] * _steps(steps[5], finer)
-    sh = _from_opponents(np.concatenate([colours, harmonics], axis=1).reshape(count, -1, 3))
-    tensors = (means, np.stack([w, x, y, z], axis=1), log_scales, logits, sh)
-    return Gaussians(*(torch.from_numpy(each.astype(np.float32)) for each in tensors))
+    quats, sh = np.empty((count, 4), np.float32), np.empty((count, (sh_degree + 1) ** 2, 3), np.float32)
+
+    def fill(start: int, stop: int) -> None:
+        own, finest = codes[start:stop], finer[start:stop]
+        x, y, z = (own[:, 10:13] * _steps(steps[4], finest)).T
+        w = np.sqrt(np.maximum(1 - (x * x + y * y + z * z), _LEAST_W))
+        quats[start:stop] = np.stack([w, x, y, z], axis=1)
+        parts = np.concatenate([colours[start:stop], own[:, 13:] * _steps(steps[5], finest)], axis=1)
+        sh[start:stop] = _from_opponents(parts.reshape(len(own), -1, 3))
+
+    in_blocks(fill, count, _BLOCK)
+    tensors = (means.astype(np.float32), quats, log_scales.astype(np.float32), logits.astype(np.float32), sh)
+    return Gaussians(*map(torch.from_numpy, tensors))
 
 
 def _columns(sh_degree: int) -> tuple[Integers, Integers]:
@@ -126,10 +143,9 @@ def _columns(sh_degree: int) -> tuple[Integers, Integers]:
     return np.array([*_SHARES, *[0, 0, 0] * others]), np.array([*_GROUPS, *[6, 7, 7] * others])
 
 
-def _round(numbers: Doubles) -> Integers:
-    bounded = np.nan_to_num(numbers).clip(-entropy.MAX_NUMBER, entropy.MAX_NUMBER)
-    whole: Integers = np.rint(bounded).astype(np.int64)
-    return whole
+def _round(numbers: Doubles) -> Doubles:
+    bounded: Doubles = np.nan_to_num(numbers).clip(-entropy.MAX_NUMBER, entropy.MAX_NUMBER)
+    return np.rint(bounded)
 
 
 def _even_columns(model: Gaussians) -> Doubles:
@@ -157,7 +173,7 @@ def _even_steps(steps: list[float]) -> Doubles:
     return np.array([*[means] * 3, *[log_scales] * 3, opacity, *colours * _DIFFERENCES])
 
 
-def _even_numbers(codes: Integers, centres: list[float], steps: list[float]) -> list[Doubles]:
+def _even_numbers(codes: Codes, centres: list[float], steps: list[float]) -> list[Doubles]:
     """Means [N, 3], log scales [N, 3], opacity logits [N] and colours [N, 3] from codes [N, 10]."""
     numbers = codes * _even_steps(steps) + _origin(centres)
     return [numbers[:, :3], numbers[:, 3:6], numbers[:, 6], numbers[:, 7:]]
