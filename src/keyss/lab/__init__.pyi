@@ -43,7 +43,6 @@ from .robustness.survival import (
     reveal_changed as reveal_changed,
 )
 from .stealth.judging import (
-    candidate_scores as candidate_scores,
     changed_low_bits as changed_low_bits,
     judge as judge,
     stealth_statistics as stealth_statistics,
