@@ -10,7 +10,7 @@ import numpy as np
 from scipy.special import stdtr
 
 from keyss.core import Gaussians, UsageError
-from keyss.core.arrays import Numbers, Words32
+from keyss.core.arrays import Numbers
 from keyss.lab.stealth.attributes import colours, invariants, invisible_modes, opacities, order
 from keyss.lab.stealth.low_bits import agreement, bits, coincidences, steps
 from keyss.lab.stealth.statistic import BitPatterns, Statistic
@@ -158,6 +158,6 @@ def changed_low_bits(file: Gaussians, other: Gaussians) -> float:
     return float((shared & ~same).sum() / max(len(file), 1))
 
 
-def _as_values(rows: Words32) -> Numbers:
+def _as_values(rows: Numbers) -> Numbers:
     """[N] the rows [N, F], each as one value."""
     return np.ascontiguousarray(rows).view(f"V{4 * rows.shape[1]}")[:, 0]
