@@ -125,7 +125,7 @@ def test_resumed_training_is_bit_identical(name: str) -> None:
     scenes = [tiny_scene(0), tiny_scene(1)]
     placed = [PlacedScene.of(scene, random_gaussians(50), Similarity()) for scene in scenes]
     method: Any = registry.get(name)
-    whole, resumed = (method.training(placed, options_of(name), torch.device("cpu")) for _ in range(2))
+    whole, resumed = (method.training(placed, [], options_of(name), torch.device("cpu")) for _ in range(2))
 
     def run_to(run: KeyssTraining, end: int) -> State:
         torch.manual_seed(run.iteration)  # which `train` keeps

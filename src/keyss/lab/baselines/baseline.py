@@ -99,9 +99,6 @@ class BaselineTraining(KeyssTraining):
 
     options: BaselineOptions
 
-    def __init__(self, scenes: Sequence[PlacedScene], options: BaselineOptions, device: torch.device) -> None:
-        super().__init__(scenes, [], options, device)
-
     @abstractmethod
     def prepare(self, start: Gaussians) -> None:
         """Add parameters (`add`) and networks (`networks`); their random numbers are the run's own."""
@@ -122,11 +119,6 @@ class BaselineTraining(KeyssTraining):
     def opacity_for_pruning(self) -> Tensor:
         """[N] maximum opacity over the scenes."""
         return self.parameters["opacities"].detach().sigmoid()
-
-    @property
-    def frame(self) -> Similarity:
-        """Secret frame to cover frame."""
-        return self.scenes[1].frame
 
     def visible(self) -> Tensor:
         """[N] True for Gaussians above the opacity limit of pruning; all True if none is."""
@@ -163,7 +155,7 @@ class Baseline:
         training = self.training
         assert training is not None
         sources = [cover, *secrets]
-        run = training(PlacedScene.all_of(sources), options, context.device)
+        run = training(PlacedScene.all_of(sources), [], options, context.device)
         run.train(sources, context)
         return self.stego(*run.result(), run.iterations)
 

@@ -57,7 +57,7 @@ class GsHiderTraining(BaselineTraining):
         )
         features = self.parameters["features"].detach()[visible].cpu()
         stego = DecodedGaussians.of(self.gaussians().detach()[visible].to("cpu"), cover, features)
-        return stego, CompanionTensors(network_tensors(secret), self.frame)
+        return stego, CompanionTensors(network_tensors(secret), self.scenes[1].frame)
 
 
 def _open(companion: CompanionTensors) -> Show:

@@ -74,7 +74,7 @@ class DecoderTraining(BaselineTraining):
     def result(self) -> tuple[Gaussians, CompanionTensors]:
         network = self.network.network(self.backgrounds[0])
         stego = to_gaussians(self.parameters).detach()[self.visible()].to("cpu")
-        return stego, CompanionTensors(network_tensors(network), self.frame)
+        return stego, CompanionTensors(network_tensors(network), self.scenes[1].frame)
 
 
 def _open(companion: CompanionTensors) -> Show:

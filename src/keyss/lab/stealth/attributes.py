@@ -26,7 +26,7 @@ from keyss.lab.stealth.statistic import (
     BitPatterns,
     Statistic,
     excess,
-    excess_over_smooth,
+    near_misses,
     normal,
     portion,
 )
@@ -86,13 +86,9 @@ def _lengths(model: Gaussians) -> dict[str, Statistic]:
     """Shares of quaternions of exactly and nearly unit length, in the file and in its parts."""
     error = (model.quats.detach().cpu().double().norm(dim=1) - 1).abs().numpy()
     unit = error < _UNIT
-    nearly = int((~unit & (error < _MOVED)).sum())
-    around = int(((error >= _MOVED) & (error < _AROUND)).sum())
     statistics = {
         "quaternions of unit length": portion(float(unit.sum()), len(unit)),
-        "quaternions of nearly unit length": excess_over_smooth(
-            nearly, max(around, 1) * _MOVED / (_AROUND - _MOVED), len(unit)
-        ),
+        "quaternions of nearly unit length": near_misses(error, unit, _MOVED, _AROUND),
         "distance of quaternions from unit length, median": Statistic(
             float(np.log10(np.median(error) + 1e-9))
         ),
