@@ -22,7 +22,7 @@ from keyss.methods.hidden import Frame, HiddenScene
 from keyss.methods.keyss.training import KeyssTraining, Picture, PlacedScene
 from keyss.methods.tensors import Header, pack_tensors, refuse_damage, unpack_tensors
 
-FORMAT, VERSION = "keyss-baseline", 1
+FORMAT, VERSION = "keyss-baseline", 2
 DAMAGED = "the companion file is damaged"
 
 
@@ -52,12 +52,14 @@ class CompanionTensors:
             if not isinstance(content, Payload):
                 raise ValueError("expected one string of bytes, got records")
             header, tensors = unpack_tensors(content.data, _Header, FORMAT, VERSION)
+            if any(each.dtype != torch.float32 for each in tensors.values()):
+                raise ValueError("expected numbers of single precision")
         return CompanionTensors(tensors, header.frame, header.rows)
 
     def take(self, names: Iterable[str]) -> list[Tensor]:
         """The tensors of these names. Raises InputError for others, and for missing ones."""
-        expected = dict.fromkeys(names, torch.float32)
-        if expected != {name: value.dtype for name, value in self.tensors.items()}:
+        expected = list(names)
+        if set(expected) != self.tensors.keys():
             found = ", ".join(sorted(self.tensors))[:200]
             raise InputError(f"{DAMAGED}: expected {', '.join(expected)}, found {found}")
         return [self.tensors[name] for name in expected]
