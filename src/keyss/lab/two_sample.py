@@ -6,9 +6,6 @@ separation. It detects what 3D-Sinkhorn misses: see `keyss.lab.distances`.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from itertools import combinations
 from statistics import fmean
 
 import numpy as np
@@ -23,30 +20,6 @@ MIN_GAUSSIANS, MAX_GAUSSIANS = 100, 10_000  # Gaussians per model
 FOLDS = 5
 _CELLS = 8  # along each axis
 TREES, _LEAVES = 50, 16
-
-
-@dataclass(frozen=True)
-class TwoSampleAucs:
-    """Classifier AUCs of a model and of control models of its scene."""
-
-    stego: tuple[Auc, ...]  # each control against the model
-    control: tuple[Auc, ...]  # each pair of controls: seed-to-seed variation
-    original: tuple[Auc, ...]  # each control against the cover's own plain model
-
-
-def auc_beside_controls(
-    model: Gaussians, controls: Sequence[Gaussians], original: Gaussians, *, seed: int = 0
-) -> TwoSampleAucs:
-    """`two_sample_auc` of `model` and of `controls`, plain models of the same scene from other seeds.
-
-    `original`: another plain model of the scene to compare with the controls, since it can be further from
-    them than they are from each other. `controls`: at least two.
-    """
-    return TwoSampleAucs(
-        stego=tuple(two_sample_auc(control, model, seed=seed) for control in controls),
-        control=tuple(two_sample_auc(one, two, seed=seed) for one, two in combinations(controls, 2)),
-        original=tuple(two_sample_auc(control, original, seed=seed) for control in controls),
-    )
 
 
 def two_sample_auc(a: Gaussians, b: Gaussians, *, seed: int = 0) -> Auc:

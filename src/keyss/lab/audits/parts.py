@@ -8,7 +8,8 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
+from itertools import combinations
 from statistics import fmean
 from typing import Any
 
@@ -30,7 +31,7 @@ from keyss.lab.leaks.leak_scores import AttackResult, look_for_secret
 from keyss.lab.robustness.survival import ChangeResult, measure_robustness
 from keyss.lab.stealth.judging import StealthResult, judge
 from keyss.lab.stegexpose import stegexpose_auc
-from keyss.lab.two_sample import TwoSampleAucs, auc_beside_controls
+from keyss.lab.two_sample import two_sample_auc
 from keyss.measure.hide_quality import in_cover
 from keyss.measure.renders import renders_of, select_views
 from keyss.methods import registry
@@ -166,6 +167,15 @@ class ImagesResult:
 
 
 @dataclass(frozen=True)
+class TwoSampleAucs:
+    """Classifier AUCs of the stego model and of plain models."""
+
+    stego: tuple[Auc, ...]  # each control against the stego model
+    control: tuple[Auc, ...]  # each pair of controls: seed-to-seed variation
+    original: tuple[Auc, ...]  # each control against the cover's own plain model
+
+
+@dataclass(frozen=True)
 class ParametersResult:
     """Distances of the stego model's parameters from those of plain models."""
 
@@ -260,7 +270,12 @@ def parameters(subject: Subject, seed: int, progress: Progress) -> tuple[Paramet
     progress(1, 3)
     distances = against_controls(stego, controls, original=original, seed=seed)
     progress(2, 3)
-    two_sample = auc_beside_controls(stego, controls, original, seed=seed)
+    auc = partial(two_sample_auc, seed=seed)
+    two_sample = TwoSampleAucs(
+        stego=tuple(auc(control, stego) for control in controls),
+        control=tuple(auc(*pair) for pair in combinations(controls, 2)),
+        original=tuple(auc(control, original) for control in controls),
+    )
     return ParametersResult(sinkhorn, between, score, distances, two_sample), {}
 
 

@@ -73,11 +73,6 @@ class Table(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
         return max(run.secrets for run in self.runs.values())
 
     @property
-    def published(self) -> list[str]:
-        """All measures with published figures."""
-        return list(dict.fromkeys(measure for run in self.runs.values() for measure in run.figures))
-
-    @property
     def groups(self) -> tuple[Group, ...]:
         """The published groups of scenes."""
         return PAPER.pairs if self.secrets == 1 else PAPER.triples
@@ -271,9 +266,10 @@ def figure_rows(
     `covers`: covers of the published groups that were run; if empty, published figures are means over all.
     """
     rows = []
+    every = dict.fromkeys(measure for run in table.runs.values() for measure in run.figures)
     for name, run in table.runs.items():
         here: dict[str, float | None] = {}
-        for measure in run.figures or table.published:
+        for measure in run.figures or every:
             values = [each[measure] for each in numbers.get(name, ()) if measure in each]
             here[measure] = fmean(values) if values and len(values) == count else None
         published = {measure: mean_figure(table, figure, covers) for measure, figure in run.figures.items()}

@@ -18,7 +18,7 @@ from scipy.signal import find_peaks
 from scipy.spatial import cKDTree
 from scipy.stats import ks_2samp, rankdata
 
-from keyss.core.arrays import Doubles, Integers, Words32, doubles
+from keyss.core.arrays import Doubles, Integers, doubles
 from keyss.core.gaussians import Gaussians
 from keyss.core.neighbours import nearest_neighbours
 from keyss.lab.stealth.statistic import (
@@ -72,11 +72,11 @@ def invariants(model: Gaussians, words: BitPatterns) -> dict[str, Statistic]:
             continue
         trained = words.trained[:, words.of_attribute(index)]
         statistics[f"short numbers, {attribute}"] = portion(float((~trained).sum()), trained.size)
-        repeated = sum(_count_repeated(own[:, field][trained[:, field]]) for field in range(own.shape[1]))
+        fields = zip(own.T, trained.T, strict=True)
+        counts = [np.unique(values[kept], return_counts=True)[1] for values, kept in fields]
+        repeated = sum(int(each[each > 1].sum()) for each in counts)
         statistics[f"repeated values, {attribute}"] = portion(repeated, own.size)
-        clusters = [
-            _clusters(own[:, field].view(np.float32).astype(np.float64)) for field in range(own.shape[1])
-        ]
+        clusters = [_clusters(values.view(np.float32).astype(np.float64)) for values in own.T]
         hits, trials = (sum(each) for each in zip(*clusters, strict=True))
         statistics[f"clusters of values, {attribute}"] = excess(hits, trials, _CLUSTERED)
     return statistics
@@ -102,12 +102,6 @@ def _lengths(model: Gaussians) -> dict[str, Statistic]:
         spread = float(shares.max() - shares.min()) if len(shares) else 0.0
         statistics[f"unit quaternions in parts of {name}, range of shares"] = Statistic(spread)
     return statistics
-
-
-def _count_repeated(values: Words32) -> int:
-    """Number of values that are not unique."""
-    _, counts = np.unique(values, return_counts=True)
-    return int(counts[counts > 1].sum())
 
 
 def _clusters(values: Doubles) -> tuple[int, int]:

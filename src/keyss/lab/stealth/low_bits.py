@@ -225,15 +225,7 @@ def _sharers(words: BitPatterns) -> Integers:
 
 
 def coincidences(model: Gaussians, words: BitPatterns) -> dict[str, Statistic]:
-    """Pairs with equal low bits among those with equal high bits, relative to chance."""
-    return {
-        name: excess(equal, pairs, 2.0**-bits)
-        for name, (equal, pairs, bits) in count_coincidences(model, words).items()
-    }
-
-
-def count_coincidences(model: Gaussians, words: BitPatterns) -> dict[str, tuple[int, int, int]]:
-    """Numbers by name: pairs with equal low bits, pairs with equal high bits, low bits.
+    """Pairs with equal low bits among those with equal high bits, relative to chance.
 
     For all pairs and for neighbours in space, if one Gaussian is usable; for all saturated neighbours.
     """
@@ -241,6 +233,7 @@ def count_coincidences(model: Gaussians, words: BitPatterns) -> dict[str, tuple[
     near = nearest_pairs(doubles(model.means), _NEAREST)
     saturated = model.opacity_logits.detach().cpu().numpy() > _SATURATED
     bright = near[saturated[near].all(axis=1)]
+    # By name: pairs with equal low bits, pairs with equal high bits, and the number of low bits.
     counts: dict[str, tuple[int, int, int]] = {}
     for name, field, bits in _columns(words):
         low = np.uint32(((1 << bits) - 1) << 1)
@@ -256,7 +249,7 @@ def count_coincidences(model: Gaussians, words: BitPatterns) -> dict[str, tuple[
             equal, trials, _ = counts.get(kind, (0, 0, bits))
             equal += int((own[one] == own[other])[agree].sum())
             counts[kind] = equal, trials + int(agree.sum()), bits
-    return counts
+    return {name: excess(equal, trials, 2.0**-bits) for name, (equal, trials, bits) in counts.items()}
 
 
 def _columns(words: BitPatterns) -> Iterator[tuple[str, int, int]]:
