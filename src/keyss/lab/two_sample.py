@@ -37,7 +37,10 @@ def two_sample_auc(a: Gaussians, b: Gaussians, *, seed: int = 0) -> Auc:
     parts = [features(model, limit=size, seed=seed) for model in (a, b)]
     values = np.concatenate([np.concatenate(list(part.values()), axis=1) for part in parts])
     is_b = np.arange(2 * size) >= size
-    fold = _folds(np.concatenate([part["position"] for part in parts]), seed)
+    # Cells of space are assigned to folds at random.
+    cells = space_cells(np.concatenate([part["position"] for part in parts]), _CELLS)
+    _, cell = np.unique(cells, return_inverse=True)
+    fold = np.random.default_rng(seed).permutation(cell.max() + 1)[cell] % FOLDS
     if np.bincount(2 * fold + is_b, minlength=2 * FOLDS).min() < 2:
         raise UsageError(
             "expected Gaussians spread over space, but they lie in too few places for five folds"
@@ -87,12 +90,6 @@ def space_cells(positions: Numbers, per_axis: int) -> Integers:
     cuts = np.quantile(positions, np.arange(1, per_axis) / per_axis, axis=0)
     index = [np.searchsorted(cuts[:, axis], positions[:, axis]) for axis in range(3)]
     return np.ravel_multi_index(index, (per_axis,) * 3)
-
-
-def _folds(positions: Floats, seed: int) -> Integers:
-    """[N] fold of each Gaussian; cells of space are assigned at random."""
-    _, cell = np.unique(space_cells(positions, _CELLS), return_inverse=True)
-    return np.random.default_rng(seed).permutation(cell.max() + 1)[cell] % FOLDS
 
 
 def _held_out_auc(values: Floats, is_b: Flags, held_out: Flags, seed: int) -> tuple[float, float]:

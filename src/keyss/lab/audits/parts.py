@@ -154,8 +154,8 @@ class ModelImages:
     photos: bool  # False: test views are renders of a given model
     images: ImageComparison
     gaussians: int
-    baseline: ImageComparison | None  # plain model; None without one, like `baseline_gaussians`
-    baseline_gaussians: int | None
+    baseline: ImageComparison | None = None  # plain model; None without one, like `baseline_gaussians`
+    baseline_gaussians: int | None = None
 
 
 @dataclass(frozen=True)
@@ -230,27 +230,24 @@ def images(subject: Subject, seed: int, progress: Progress) -> tuple[ImagesResul
         progress(index, len(subject.scenes))
         name, has_photos = role_of(index, len(subject.scenes)), subject.run.metrics.photos[index]
         own = renders_of(model, scene, scene.test)
+        result = ModelImages(name, has_photos, _compare(own, scene), len(model))
         shown = {
-            "photo" if has_photos else "given model": [view.image for view in scene.test],
-            "revealed" if index else "stego model": [image for _, image in own],
+            "photo" if has_photos else "given model": [(view.camera.name, view.image) for view in scene.test],
+            "revealed" if index else "stego model": own,
         }
-        baseline = None
         if plain is not None:
-            renders = renders_of(plain, scene, scene.test)
-            shown["plain model"] = [image for _, image in renders]
-            baseline = _compare(renders, scene)
+            shown["plain model"] = renders = renders_of(plain, scene, scene.test)
+            result = replace(result, baseline=_compare(renders, scene), baseline_gaussians=len(plain))
         if index:
             placed = subject.in_cover[index - 1]
-            renders = renders_of(subject.stego, placed, placed.test)
-            shown["without the key"] = [image for _, image in renders]
-        size = None if plain is None else len(plain)
-        results.append(ModelImages(name, has_photos, _compare(own, scene), len(model), baseline, size))
+            shown["without the key"] = renders_of(subject.stego, placed, placed.test)
+        results.append(result)
         for view in range(len(own))[:: -(-len(own) // PICTURED_VIEWS)]:
             title = f"{name.capitalize()}, {own[view][0]}"
             files[title] = {}
             for label, images in shown.items():
                 file = f"{name}-{view + 1}-{label}.png".replace(" ", "-")
-                pictures[file] = images[view]
+                _, pictures[file] = images[view]
                 files[title][label] = file
     return ImagesResult(tuple(results), files), pictures
 

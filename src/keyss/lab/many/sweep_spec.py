@@ -65,12 +65,6 @@ class SweepSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
     bound: bool = False
     device: Literal["auto", "cpu", "cuda"] = "auto"
 
-    @property
-    def common(self) -> dict[str, Any]:
-        """The fields of all trials."""
-        views = ViewOptions(self.width, self.background, self.skip_missing)
-        return {"views": views, "min_psnr": self.min_psnr, "bound": self.bound, "device": self.device}
-
 
 def read_spec(path: Path) -> SweepSpec:
     """Read a sweep; paths become absolute. Raises InputError, and BackendError without PyYAML."""
@@ -154,7 +148,9 @@ def sweep(
     """
     path = Path(spec)
     found = read_spec(path)
-    folder = TrialFolder(Path(out), found.common)
+    common = {name: getattr(found, name) for name in ("min_psnr", "bound", "device")}
+    common["views"] = ViewOptions(found.width, found.background, found.skip_missing)
+    folder = TrialFolder(Path(out), common)
     rows: dict[Path, tuple[dict[str, Any], list[str], int]] = {}  # labels, scenes and seed
     for pair, (method, preset, choices), seed in product(found.pairs, variants(path, found), found.seeds):
         options = preset.with_fit(seed=seed)

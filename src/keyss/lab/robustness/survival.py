@@ -135,22 +135,16 @@ def reveal_changed(opener: Opener, stego: Gaussians) -> Gaussians:
 
 def _mean(results: Sequence[ChangeResult]) -> ChangeResult:
     """Average results of different random seeds."""
-    covers = [each.cover for each in results if each.cover is not None]
-    if not covers:
+    rows = [(each.cover, *each.secrets) for each in results if each.cover is not None]
+    if not rows:
         return results[0]
-    secrets = zip(*(each.secrets for each in results), strict=True)
-    return replace(
-        results[0],
-        seeds=len(results),
-        cover=_mean_quality(covers),
-        secrets=tuple(map(_mean_quality, secrets)),
+    cover, *secrets = (
+        ChangedQuality(
+            fmean(each.psnr for each in qualities),
+            fmean(each.loss for each in qualities),
+            all(each.opens for each in qualities),
+            next((each.error for each in qualities if each.error), None),
+        )
+        for qualities in zip(*rows, strict=True)
     )
-
-
-def _mean_quality(qualities: Sequence[ChangedQuality]) -> ChangedQuality:
-    return ChangedQuality(
-        fmean(each.psnr for each in qualities),
-        fmean(each.loss for each in qualities),
-        all(each.opens for each in qualities),
-        next((each.error for each in qualities if each.error), None),
-    )
+    return replace(results[0], seeds=len(results), cover=cover, secrets=tuple(secrets))
