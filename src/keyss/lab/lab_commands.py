@@ -67,20 +67,18 @@ def audit(
     from keyss.cli.tables import print_files
     from keyss.progress import reporter
 
-    if report_only:
-        found = keyss.audit(run, report_only=True)
-    else:
-        found = keyss.audit(
-            run,
-            keys_of_run(run, key_file),
-            controls=controls,
-            only=only,
-            seed=check_seed(seed),
-            device=device,
-            overwrite=overwrite,
-            resume=resume,
-            reporter=reporter(),
-        )
+    found = keyss.audit(
+        run,
+        () if report_only else keys_of_run(run, key_file),
+        report_only=report_only,
+        controls=controls,
+        only=only,
+        seed=check_seed(seed),
+        device=device,
+        overwrite=overwrite,
+        resume=resume,
+        reporter=reporter(),
+    )
     _print_verdicts(found)
     print_files(
         run,

@@ -57,9 +57,8 @@ def features(gaussians: Gaussians, *, limit: int | None = None, seed: int = 0) -
 
     - `position`: D = 3.
     - `scale`: the 3 log scales in ascending order.
-    - `rotation`: the 6 entries of R diag(log s - mean log s) R^T, off-diagonal ones times sqrt 2 for
-    Frobenius
-      distances. Invariant to sign and length of the quaternion and to the order of axes.
+    - `rotation`: the 6 entries of R diag(log s - mean log s) R^T, off-diagonal ones times sqrt 2
+      for Frobenius distances. Invariant to sign and length of the quaternion and to the order of axes.
     - `opacity`: the logit, clamped to -16 and 16; NaN counts as transparent.
     - `colour`: RGB of the constant coefficients.
     - `harmonics`: the 45 other coefficients, zeros above the model's degree.

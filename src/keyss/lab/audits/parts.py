@@ -112,8 +112,8 @@ class Subject:
         config, count = self.run.config.options.fit, len(self.original)
         if self.run.config.models_given[0]:  # the run's maximum is not for this model
             config = replace(config, max_gaussians=max(count, 16))
-        models = [self._fit_control(replace(config, seed=seed), folder, reporter) for seed in seeds]
-        self.controls = [model.to(self.device) for model in models]
+        configs = [replace(config, seed=seed) for seed in seeds]
+        self.controls = [self._fit_control(each, folder, reporter).to(self.device) for each in configs]
 
     def _fit_control(self, config: FitConfig, folder: RunFolder, reporter: Reporter) -> Gaussians:
         """Fit a plain model of the cover, or read it from the run's folder."""
@@ -326,11 +326,8 @@ def leaks(
 
 def robustness(subject: Subject, seed: int, progress: Progress) -> tuple[tuple[ChangeResult, ...], Pictures]:
     """PSNR loss of the cover and the secrets when the stego model changes."""
-    cover, *secrets = subject.scenes
-    rows = measure_robustness(
-        subject.stego, subject.run.openers, cover, secrets, seed=seed, progress=progress
-    )
-    return tuple(rows), {}
+    openers, scenes = subject.run.openers, subject.scenes
+    return tuple(measure_robustness(subject.stego, openers, scenes, seed=seed, progress=progress)), {}
 
 
 @torch.no_grad()

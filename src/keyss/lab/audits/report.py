@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import re
 from base64 import b64encode
 from collections.abc import Sequence
 from functools import partial
@@ -86,10 +87,7 @@ def _policy(script: str) -> str:
 
 def prose(sentence: str) -> Markup:
     """Format text with `backquotes` as code."""
-    parts = enumerate(sentence.split("`"))
-    return Markup("").join(
-        Markup("<code>{}</code>").format(each) if i % 2 else escape(each) for i, each in parts
-    )
+    return Markup(re.sub("`(.*?)`", r"<code>\1</code>", escape(sentence)))
 
 
 def _title(audit: Audit) -> str:

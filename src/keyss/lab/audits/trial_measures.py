@@ -110,15 +110,8 @@ def _after(
 
     The first name is that of the unchanged model.
     """
-    cover, *secrets = subject.scenes
-    results = measure_robustness(
-        subject.stego,
-        subject.run.openers,
-        cover,
-        secrets,
-        changes=list(changes.values()),
-        max_views=max_views,
-    )
+    openers, every = subject.run.openers, list(changes.values())
+    results = measure_robustness(subject.stego, openers, subject.scenes, changes=every, max_views=max_views)
     found: Numbers = {}
     for name, result in zip([_WHOLE, *changes], results, strict=True):
         if result.skipped is not None:

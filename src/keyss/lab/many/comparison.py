@@ -165,7 +165,7 @@ def compare(
     write_record(folder.out / f"{STEM}.json", found)
     names = [os.path.basename(scene) for scene in scenes]
     done = {each: outcomes[place] for each, place in places.items() if outcomes[place].result}
-    numbers = [TrialNumbers.of(each, {"method": name}, names, seed) for (name, seed), each in done.items()]
+    numbers = [TrialNumbers({"method": name}, names, seed, each) for (name, seed), each in done.items()]
     write_scene_tables(folder.out, STEM, numbers)
     runs = {
         name: opened_run(folder.trials[each.folder], each.folder)

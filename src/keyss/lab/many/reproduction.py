@@ -22,7 +22,7 @@ from keyss.core.errors import did_you_mean
 from keyss.lab.many.option_changes import with_changes
 from keyss.lab.many.result_tables import TrialNumbers, write_scene_tables
 from keyss.lab.many.trial_folder import Forecast, TrialFolder
-from keyss.methods import MethodOptions, registry
+from keyss.methods import registry
 from keyss.progress import Reporter
 from keyss.rendering import Backend
 from keyss.rendering.orbit import is_model
@@ -163,7 +163,9 @@ def reproduce(
     folder = TrialFolder(Path(out), common={"views": ViewOptions(sizes["width"]), "device": device})
     places: dict[Path, tuple[str, Group, int]] = {}
     for group, (name, run), seed in product(groups, spec.runs.items(), seeds):
-        options = _options(run).with_fit(**changes, seed=seed)
+        preset = registry.get(run.method).options.preset("full")
+        design = {"design": "published"} if run.method == "keyss" else {}
+        options = with_changes(preset, {**design, **run.changes}).with_fit(**changes, seed=seed)
         shown = group[: run.secrets + 1]
         sources = [paths[scene] for scene in shown]
         models = [folder.plain(source, options.fit) for source in sources]
@@ -178,7 +180,7 @@ def reproduce(
         if (result := outcomes[place].result) is not None:
             numbers[name].append(_numbers(result.numbers))
             labels = {"run": name, "pair": "-".join(shown)}
-            rows.append(TrialNumbers.of(outcomes[place], labels, shown, seed))
+            rows.append(TrialNumbers(labels, shown, seed, outcomes[place]))
     covers = [cover for cover, *_ in groups] if full else []
     figures = figure_rows(spec, numbers, len(groups) * len(seeds), covers)
     measured = {row.label: row.here for row in figures}
@@ -195,13 +197,6 @@ def reproduce(
     order = list(spec.runs)
     write_scene_tables(folder.out, table, sorted(rows, key=lambda row: order.index(row.labels["run"])))
     return reproduction
-
-
-def _options(run: Run) -> MethodOptions:
-    """The paper's settings with the changes of the run."""
-    preset = registry.get(run.method).options.preset("full")
-    design = {"design": "published"} if run.method == "keyss" else {}
-    return with_changes(preset, {**design, **run.changes})
 
 
 def _paths(scenes: Sequence[PathLike]) -> dict[str, str]:

@@ -168,6 +168,6 @@ def sweep(
     if dry_run:
         return folder.forecast()
     outcomes = folder.run(ray=ray, cores=cores, reporter=reporter)
-    done = [TrialNumbers.of(outcomes[place], *row) for place, row in rows.items() if outcomes[place].result]
+    done = [TrialNumbers(*row, outcomes[place]) for place, row in rows.items() if outcomes[place].result]
     write_sweep_tables(folder.out, done)
     return tuple(outcomes[place] for place in rows)

@@ -116,13 +116,11 @@ def cropping(seed: int = 0) -> Change:
 def fewer_harmonics(degree: int) -> Change:
     """Drop the spherical harmonics above a degree, 0 to 3."""
     sentence = f"Spherical harmonics above degree {degree} are dropped."
-    return Change(
-        "fewer harmonics",
-        degree,
-        "degree left",
-        sentence,
-        lambda m: m.with_sh_degree(min(degree, m.sh_degree)),
-    )
+
+    def apply(model: Gaussians) -> Gaussians:
+        return model.with_sh_degree(min(degree, model.sh_degree))
+
+    return Change("fewer harmonics", degree, "degree left", sentence, apply)
 
 
 def half_floats() -> Change:

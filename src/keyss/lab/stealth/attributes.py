@@ -11,14 +11,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from itertools import combinations
 
 import numpy as np
 from scipy.signal import find_peaks
 from scipy.spatial import cKDTree
 from scipy.stats import ks_2samp, rankdata
 
-from keyss.core.arrays import Doubles, Integers, doubles
+from keyss.core.arrays import Doubles, doubles
 from keyss.core.gaussians import Gaussians
 from keyss.core.neighbours import nearest_neighbours
 from keyss.lab.stealth.statistic import (
@@ -187,11 +187,16 @@ def colours(model: Gaussians, words: BitPatterns) -> dict[str, Statistic]:
             close = distance[distance[:, 0] <= np.quantile(distance[:, 0], 0.1)]
             ratio = _ratio(close[:, index], distance[:, index], 0.5)
             statistics[f"{channel} of {name} with the same red"] = ratio
-    for name, part in _parts(model):
+    # Quarters of the rows by the visibility of a colour change: area times squared opacity.
+    areas = model.log_scales.detach().cpu().double().sort(dim=1).values[:, 1:].sum(dim=1)
+    shown = (areas + 2 * model.opacities.detach().cpu().double().clamp_min(1e-6).log()).numpy()
+    quarters = np.array_split(np.argsort(-np.nan_to_num(shown), kind="stable"), 4)
+    for name, part in zip(_PARTS, quarters, strict=True):
         distance = np.abs(values[part] - values[near[part, 1]])
         for channel, index in _CHANNELS.items():
             statistics[f"{channel} of neighbours, {name}"] = _ratio(distance[:, index], distance[:, 0], 0.25)
-    inside = {f"{one} and {other}": np.abs(values[:, i] - values[:, j]) for one, other, i, j in _BETWEEN}
+    channels = zip(("red", "green", "blue"), values.T, strict=True)
+    inside = {f"{a} and {b}": np.abs(one - two) for (a, one), (b, two) in combinations(channels, 2)}
     usual = np.median(np.stack(list(inside.values())), axis=1).mean()
     for name, each in inside.items():
         for quantile in _QUANTILES[:2]:
@@ -199,16 +204,6 @@ def colours(model: Gaussians, words: BitPatterns) -> dict[str, Statistic]:
                 float(np.log((np.quantile(each, quantile) + _TINY) / (usual + _TINY)))
             )
     return statistics
-
-
-_BETWEEN = (("red", "green", 0, 1), ("red", "blue", 0, 2), ("green", "blue", 1, 2))
-
-
-def _parts(model: Gaussians) -> Iterator[tuple[str, Integers]]:
-    """Quarters of the rows by the visibility of a colour change: area times squared opacity."""
-    scales = model.log_scales.detach().cpu().double().sort(dim=1).values[:, 1:].sum(dim=1)
-    shown = (scales + 2 * model.opacities.detach().cpu().double().clamp_min(1e-6).log()).numpy()
-    yield from zip(_PARTS, np.array_split(np.argsort(-np.nan_to_num(shown), kind="stable"), 4), strict=True)
 
 
 def _ratio(one: Doubles, other: Doubles, quantile: float) -> Statistic:
