@@ -64,8 +64,6 @@ class DecoderTraining(BaselineTraining):
 
 def _open(companion: CompanionTensors) -> Show:
     network = PictureNetwork.of(companion.tensors)
-    if len(network.background) != 3:
-        raise ValueError("expected a network for pictures in colour")
     return lambda stego: DecodedGaussians.of(stego, network)
 
 
