@@ -23,7 +23,6 @@ from keyss.core.errors import InputError, KeyssWarning
 _MAX_HEADER_BYTES = 64 * 1024
 _MAX_HEADER_LINES = 1000
 _CHUNK_BYTES = 1 << 20
-_MAX_TOKEN_BYTES = 4096  # per number in text
 
 _SCALARS = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1",
@@ -225,7 +224,7 @@ def _ascii_blocks(file: BinaryIO, skipped: int, vertex: _Element) -> Iterator[Ta
     """Rows in text, after `skipped` values. Line breaks are white space like any other."""
     width = len(vertex.properties)
     step = max(1, _CHUNK_BYTES // (8 * width))
-    tokens = _tokens(file)
+    tokens = (token for line in file for token in line.split())
     try:
         for _ in range(skipped):
             next(tokens)
@@ -240,18 +239,6 @@ def _ascii_blocks(file: BinaryIO, skipped: int, vertex: _Element) -> Iterator[Ta
             yield table
     except (StopIteration, ValueError) as error:
         raise InputError("the ascii data are cut short or hold values of another type") from error
-
-
-def _tokens(file: BinaryIO) -> Iterator[bytes]:
-    """Tokens separated by white space, in lines of any length. Raises ValueError for very long ones."""
-    rest = b""
-    while data := file.read(_CHUNK_BYTES):
-        *whole, rest = re.split(rb"[ \t\r\n\f\v]+", rest + data)
-        yield from filter(None, whole)
-        if len(rest) > _MAX_TOKEN_BYTES:
-            raise ValueError("not a number")
-    if rest:
-        yield rest
 
 
 def is_plain(file: BinaryIO) -> bool:
