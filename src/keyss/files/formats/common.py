@@ -293,22 +293,7 @@ def morton_keys(positions: Floats | Doubles, within: Floats | Doubles) -> Words:
     low, high = within.min(axis=0).astype(np.float64), within.max(axis=0).astype(np.float64)
     extent = np.where(high > low, high - low, 1.0)
     cells = (((positions - low) / extent).clip(0, 1) * (2**_MORTON_BITS - 1)).astype(np.uint64)
-    key = np.zeros(len(positions), dtype=np.uint64)
-    for axis in range(3):
-        key |= _spread(cells[:, axis]) << np.uint64(axis)
-    return key
-
-
-def is_in_morton_order(means: Floats) -> bool:
-    """True for positions in `morton_order`, up to a few."""
-    places = np.empty(len(means))
-    places[morton_order(means)] = np.arange(len(means))
-    return len(means) > 1 and bool((np.diff(places) > 0).mean() >= _SORTED)
-
-
-def _spread(values: Words) -> Words:
-    """The lowest 21 bits of `values`, with two zero bits between neighbours."""
-    values = values & np.uint64(0x1FFFFF)
+    # Spread the bits of each coordinate: two zeros between neighbours are the places of the other two.
     for shift, mask in (
         (32, 0x1F00000000FFFF),
         (16, 0x1F0000FF0000FF),
@@ -316,5 +301,13 @@ def _spread(values: Words) -> Words:
         (4, 0x10C30C30C30C30C3),
         (2, 0x1249249249249249),
     ):
-        values = (values | (values << np.uint64(shift))) & np.uint64(mask)
-    return values
+        cells = (cells | (cells << np.uint64(shift))) & np.uint64(mask)
+    keys: Words = np.bitwise_or.reduce(cells << np.arange(3, dtype=np.uint64), axis=1)
+    return keys
+
+
+def is_in_morton_order(means: Floats) -> bool:
+    """True for positions in `morton_order`, up to a few."""
+    places = np.empty(len(means))
+    places[morton_order(means)] = np.arange(len(means))
+    return len(means) > 1 and bool((np.diff(places) > 0).mean() >= _SORTED)
