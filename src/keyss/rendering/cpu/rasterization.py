@@ -150,12 +150,8 @@ class _Rasterize(torch.autograd.Function):
         )  # fmt: skip
         if any(ctx.needs_input_grad):
             ctx.save_for_backward(*gaussians, image, transmittance)
-            ctx.settings, ctx.camera, ctx.footprints, ctx.features = (
-                settings,
-                camera,
-                footprints,
-                used_features,
-            )
+            ctx.settings, ctx.camera = settings, camera
+            ctx.footprints, ctx.features = footprints, used_features
             ctx.slots = first_slots, slot_counts
             ctx.lists = entries, entry_slots, tile_starts, ends
         return image, alpha
@@ -194,10 +190,7 @@ class _Rasterize(torch.autograd.Function):
             weighted = (image_gradient.double() * transmittance.double()[..., None]).numpy()
             background_gradient = torch.from_numpy(weighted.sum((0, 1))).float()
         returned = (None, None, None, None, None, background_gradient, means2d_gradient, *gradients)
-        return tuple(
-            gradient if needed else None
-            for gradient, needed in zip(returned, ctx.needs_input_grad, strict=True)
-        )
+        return returned if need_colors else (*returned[:-1], None)
 
 
 def _empty(*shape: int, dtype: Any = np.float32) -> Tensor:
