@@ -72,7 +72,7 @@ class _Header(NamedTuple):
 
     magic: bytes
     version: int
-    count: int
+    gaussians: int  # number
     sh_degree: int
     fractional_bits: int
     flags: int
@@ -82,7 +82,7 @@ class _Header(NamedTuple):
     def sizes(self) -> list[int]:
         """Bytes in each section: positions, alphas, colours, scales, rotations, harmonics."""
         rotation = 3 if self.version == 2 else 4
-        return [self.count * each for each in (9, 1, 3, 3, rotation, 3 * check_sh_degree(self.sh_degree))]
+        return [self.gaussians * each for each in (9, 1, 3, 3, rotation, 3 * check_sh_degree(self.sh_degree))]
 
     @staticmethod
     def parse(start: bytes, size: int) -> _Header:
@@ -91,7 +91,7 @@ class _Header(NamedTuple):
             raise InputError("not a whole SPZ file: it ends inside the header, or does not begin with NGSP")
         header = _Header._make(_START.unpack_from(start))
         check_sh_degree(header.sh_degree)
-        check_count(header.count, size)
+        check_count(header.gaussians, size)
         if header.fractional_bits > MAX_FRACTIONAL_BITS:
             raise InputError(
                 f"expected positions of at most {MAX_FRACTIONAL_BITS} fractional bits, "
@@ -149,7 +149,7 @@ def _unpack_gzip(data: bytes) -> tuple[_Header, bytes, bytes]:
     if len(body) < size or not stream.eof:
         found = "cut short" if len(body) < size or not stream.unconsumed_tail else "more than was announced"
         raise InputError(
-            f"not a whole SPZ: expected {size:,} bytes of {header.count:,} Gaussians, found {found}"
+            f"not a whole SPZ: expected {size:,} bytes of {header.gaussians:,} Gaussians, found {found}"
         )
     return header, body[:size], body[size:] if header.flags & EXTENSIONS else b""
 
@@ -213,7 +213,7 @@ class SpzCodes(Codes):
     def parse(cls, data: bytes) -> Self:
         """See `Codes`."""
         header, body, extensions = _unpack_gzip(data) if data.startswith(GZIP) else _unpack_zstd(data)
-        n = header.count
+        n = header.gaussians
         sections = np.split(np.frombuffer(body, np.uint8), np.cumsum(header.sizes)[:-1])
         triples = sections[0].reshape(n, 3, 3).astype(np.int32)
         positions = triples[..., 0] | triples[..., 1] << 8 | triples[..., 2] << 16
