@@ -61,9 +61,7 @@ def read(file: BinaryIO) -> Gaussians:
         part = slice(start, start + len(rows))
         means[part], quats[part], log_scales[part] = rows[:, 0:3], rows[:, -4:], rows[:, -7:-4]
         opacity_logits[part], sh[part, 0] = rows[:, -8], rows[:, 3:6]
-        rest = rows[:, 6:-8].reshape(len(rows), 3, k - 1)
-        for color in range(3):
-            sh[part, 1:, color] = rest[:, color]
+        sh[part, 1:] = rows[:, 6:-8].reshape(len(rows), 3, k - 1).transpose(0, 2, 1)
         start = part.stop
     check_not_activated(means[:start], log_scales[:start], opacity_logits[:start])
     arrays = (means, quats, log_scales, opacity_logits, sh)
