@@ -138,10 +138,12 @@ def gaussians_of(
 
     `drop`: leaves out Gaussians with such values, with a KeyssWarning, unless none would remain.
     """
-    with np.errstate(over="ignore", invalid="ignore"):
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         sh = np.empty((len(rest), 1 + rest.shape[1], 3), np.float32)
         sh[:, 0], sh[:, 1:] = colors, rest
-        parts = (means, quats, log_scales, _logits(opacities), sh)
+        share = np.asarray(opacities, dtype=np.float64)
+        logits = (np.log(share) - np.log1p(-share)).clip(-OPACITY_LOGIT_BOUND, OPACITY_LOGIT_BOUND)
+        parts = (means, quats, log_scales, logits, sh)
         model = Gaussians(*(torch.from_numpy(np.require(each, np.float32, ["C", "W"])) for each in parts))
     if not (wrong := _not_finite(model)):
         return model
@@ -185,14 +187,6 @@ def arrays_of(model: Gaussians) -> tuple[Floats, Doubles, Floats, Doubles, Float
     with np.errstate(over="ignore"):
         opacities = 1 / (1 + np.exp(-opacity_logits.astype(np.float64)))
     return means, unit(quats), log_scales, opacities, sh[:, 0], sh[:, 1:]
-
-
-def _logits(opacities: Numbers) -> Doubles:
-    """Opacity logits of opacities in [0, 1], clipped to +-OPACITY_LOGIT_BOUND."""
-    values = np.asarray(opacities, dtype=np.float64)
-    with np.errstate(divide="ignore"):
-        found: Doubles = np.log(values) - np.log1p(-values)
-    return found.clip(-OPACITY_LOGIT_BOUND, OPACITY_LOGIT_BOUND)
 
 
 def round_half_away(values: Numbers) -> Doubles:
