@@ -23,7 +23,7 @@ _SORTED = 0.9  # minimum share of ascending neighbours
 
 
 class Codes(ABC):
-    """The integers of a file in a quantised format: base of dataclasses of arrays, which compare by value.
+    """The integers of a file in a quantised format: base of dataclasses of arrays.
 
     `parse` and `serialise` convert between bytes and codes, losslessly; `quantise` and `dequantise` between
     models and codes.
@@ -73,15 +73,6 @@ class Codes(ABC):
     def write(cls, model: Gaussians) -> bytes:
         """A model as a file. Raises OutputError."""
         return cls.of(model).serialise()
-
-    def __eq__(self, other: object) -> bool:
-        if type(other) is not type(self):
-            return NotImplemented
-        names = [each.name for each in fields(self) if each.compare]  # type: ignore[arg-type]
-        pairs = ((np.asarray(getattr(self, name)), np.asarray(getattr(other, name))) for name in names)
-        return all(a.dtype == b.dtype and np.array_equal(a, b) for a, b in pairs)
-
-    __hash__ = None  # type: ignore[assignment]
 
 
 class CodedGaussians(Gaussians):

@@ -207,7 +207,7 @@ class SpzCodes(Codes):
     rotations: Shorts
     sh: Bytes  # [N, K - 1, 3] harmonics in 128ths from -1 on
     extensions: bytes = b""  # not parsed
-    packed: bytes = field(default=b"", repr=False, compare=False)  # the original file
+    packed: bytes = field(default=b"", repr=False)  # the original file
 
     @classmethod
     def parse(cls, data: bytes) -> Self:
