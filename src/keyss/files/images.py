@@ -32,6 +32,8 @@ def open_image(path: Path) -> Image.Image:
         image = Image.open(path, formats=_FORMATS)
     except FileNotFoundError as error:
         raise InputError(f"{path}: expected an image, but there is no such file") from error
+    except (Image.DecompressionBombError, Image.DecompressionBombWarning) as error:
+        raise InputError(f"{path}: expected an image of at most {_MAX_PIXELS:,} pixels: {error}") from error
     except Exception as error:  # Pillow's parsers raise nearly anything on broken headers
         kinds = ", ".join(_FORMATS)
         if os.path.isfile(path) and os.path.getsize(path) == 0:
