@@ -186,7 +186,7 @@ def list_pairs(counter, footprints, order, tile_columns, height, starts, tiles, 
 def sort_pairs(counter, order, starts, tiles, rows, slot_counts, first_slots, cursors, entries, entry_slots):
     """Sort the pairs of `list_pairs` into tiles, starting at the cursors.
 
-    An entry is a Gaussian and, shifted by `layout.ENTRY_ROWS_SHIFT`, its rows. entry_slots gets the slots:
+    An entry is a Gaussian and, shifted by `constants.ENTRY_ROWS_SHIFT`, its rows. entry_slots gets the slots:
     Gaussian i has slot_counts[i] slots from first_slots[i]. If it is empty, first_slots is not read.
     """
     shares = cursors.shape[0]

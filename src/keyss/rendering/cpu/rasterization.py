@@ -55,7 +55,7 @@ class Settings(NamedTuple):
 class ProjectedArrays(NamedTuple):
     """Results of `projection.project` for N Gaussians."""
 
-    footprints: Array  # [N, PACKED], see `layout`
+    footprints: Array  # [N, PACKED], see `constants`
     means2d: Array  # [N, 2] pixels
     depths: Array  # [N]; 0 for invisible Gaussians
     radii: Array  # [N, 2] int32, pixels; 0 for invisible Gaussians
