@@ -77,12 +77,13 @@ def read_colmap(folder: Path, *, skip_missing: bool = False) -> SceneLayout:
     Raises InputError for names that are absolute or contain `..`, and if a file is missing, truncated, too
     long, or has impossible values (NaN, zero quaternions, unknown cameras, absurd counts or sizes).
     """
-    model = colmap_model_folder(folder)
-    if model is None:
+    models = colmap_models(folder)
+    if not models:
         raise InputError(f"{folder}: expected a COLMAP model (sparse/0/cameras.bin or .txt), found none")
-    if len(beside := _models_at(model)) > 1:
+    model = models[0]
+    if len(models) > 1:
         warnings.warn(
-            f"{folder}: there are {len(beside)} sparse models; using the one with most photos, "
+            f"{folder}: there are {len(models)} sparse models; using the one with most photos, "
             f"{model.relative_to(folder)} ({_photo_count(model):,} photos)",
             KeyssWarning,
             stacklevel=2,
@@ -118,26 +119,22 @@ def read_colmap(folder: Path, *, skip_missing: bool = False) -> SceneLayout:
     return SceneLayout(*hold_out(model, _with_masks(folder, existing)), points)
 
 
-def colmap_model_folder(folder: Path, places: Sequence[str] = MODEL_PLACES) -> Path | None:
-    """The sparse model in the first of `places` that has one, or None.
+def colmap_models(folder: Path, places: Sequence[str] = MODEL_PLACES) -> list[Path]:
+    """The sparse models in the first of `places` that has any, the one with most photos first.
 
-    COLMAP writes several side by side if it cannot connect all photos; the one with most photos is returned.
+    COLMAP writes several side by side, in numbered folders, if it cannot connect all photos.
     """
-    for place in places:
-        if found := _models_at(folder / place):
-            return max(found, key=_photo_count)
-    return None
-
-
-def _models_at(place: Path) -> list[Path]:
-    """The sparse model in a folder, or, for a numbered folder, all models in such folders beside it."""
-    beside = place.parent.glob("[0-9]*") if place.parent.name == "sparse" else ()
-    numbered = sorted((each for each in beside if each.name.isdecimal()), key=lambda each: int(each.name))
-    return [
-        each
-        for each in numbered or [place]
-        if any((each / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt"))
-    ]
+    for place in (folder / each for each in places):
+        beside = place.parent.glob("[0-9]*") if place.parent.name == "sparse" else ()
+        numbered = sorted((each for each in beside if each.name.isdecimal()), key=lambda each: int(each.name))
+        models = [
+            each
+            for each in numbered or [place]
+            if any((each / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt"))
+        ]
+        if models:
+            return sorted(models, key=_photo_count, reverse=True)
+    return []
 
 
 def _photo_count(model: Path) -> int:
