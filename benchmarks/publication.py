@@ -74,7 +74,7 @@ def main() -> None:
             continue
         try:
             print(row(run, name, converter), flush=True)
-        except BackendError as error:
+        except (BackendError, ImportError) as error:
             print(f"| {name} | not measured: {error} | | |", flush=True)
 
 

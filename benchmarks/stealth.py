@@ -36,10 +36,11 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 from channels.quiet.payloads import embed_derived
 from channels.quiet.trained_like import keys, rounded
 from keyss.core import Gaussians, UsageError
-from keyss.lab import candidate_scores, stealth_statistics
+from keyss.lab import stealth_statistics
 from keyss.methods.carry.capacity import CarryCapacity
 from keyss.methods.carry.options import CarryOptions
 from keyss.rendering import Viewpoints
+from lab.stealth.candidates import candidate_scores
 from methods.carry import carried
 from stealth_detection import Examples, confirmed, learned_detectors, single_detectors
 from stealth_predictor import fit_predictor, predictor_statistics, sample

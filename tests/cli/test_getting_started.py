@@ -47,13 +47,12 @@ def test_cover_without_harmonics(keyss: Run) -> None:
     assert "--sh-degree 1 makes room" in refused.err
     done = keyss(*flat, "--secret", "small.ply", "--sh-degree", "1", "--iterations", "5", "-o", "run")
     assert done.status == 0, done.err
-    assert "The secret kept 200 of 200 Gaussians" in done.out
+    assert "The secret kept" not in done.out
 
 
 def test_hide_from_few_photos(keyss: Run, workspace: Path) -> None:
     few = [word if word != "100" else "1200" for word in SMALL]
-    result = keyss("hide", *scene_arguments(workspace), *few, "-o", "run")
+    result = keyss("hide", *scene_arguments(workspace), *few, "--refit", "always", "-o", "run")
     assert result.status == 0, result.err
-    assert "refit of the secret" in result.err  # the cover has half as many Gaussians
-    assert "The secret kept" in result.out
+    assert "refit of the secret" in result.err
     assert keyss("verify", "run/publish/model.ply", "--key-file", "key.txt").status == 0

@@ -31,7 +31,7 @@ def training(name: str, fit: FitConfig, device: torch.device) -> Any:
     ]
     if name not in DESIGNS:
         method: Any = registry.get(name)
-        return method.training(scenes, method.options(fit=fit, common_poses=0.5), device)
+        return method.training(scenes, [], method.options(fit=fit, common_poses=0.5), device)
     keys = list(random_embeddings(1, torch.Generator().manual_seed(0)))
     options = small(name, fit, **({} if name == "latent" else {"common_poses": 0.5}))
     return training_of(options.configuration)(scenes, keys, options, device)

@@ -170,7 +170,7 @@ def test_missing_converter_is_skipped(monkeypatch: pytest.MonkeyPatch, tmp_path:
     model, change = random_gaussians(seed=0), by(".sog", "splat-transform").change()
     with pytest.raises(BackendError, match="npm install"):
         change(model)
-    rows = measure_robustness(model, [Whole], scene, [scene], changes=[change, half_floats()])
+    rows = measure_robustness(model, [Whole], [scene, scene], changes=[change, half_floats()])
     assert "splat-transform is not installed" in (rows[1].skipped or "")
     assert rows[1].cover is None
     assert rows[2].skipped is None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import math
 from pathlib import Path
 
 import numpy as np
@@ -46,12 +47,10 @@ def test_scores_of_the_original_program(real_data: Path) -> None:
     for row in expected:
         scores = score_image(read_pixels(folder / row["file"]))
         for name in (*DETECTORS, "fusion"):
-            if row[name] == "null":
-                assert scores[name] is None, (row["file"], name)
-            else:
-                right = pytest.approx(float(row[name]), abs=1e-9, rel=0, nan_ok=True)
-                assert scores[name] == right, (row["file"], name)
-        assert str((scores["fusion"] or 0) > 0.2).lower() == row["flagged"], row["file"]
+            right = float("nan" if row[name] == "null" else row[name])
+            expected_score = pytest.approx(right, abs=1e-9, rel=0, nan_ok=True)
+            assert scores[name] == expected_score, (row["file"], name)
+        assert str(scores["fusion"] > 0.2).lower() == row["flagged"], row["file"]
 
 
 @pytest.mark.parametrize("rate", [0.0, 0.1, 0.2])
@@ -63,12 +62,12 @@ def test_estimated_embedding_rates(rate: float) -> None:
 
 def test_unsuitable_images() -> None:
     image = smooth((296, 297))
-    assert score_image(image)["chi_square"] is not None
-    assert score_image(image[:-1, :-2])["chi_square"] is None
-    assert score_image(image)["sample_pairs"] is None
+    assert not math.isnan(score_image(image)["chi_square"])
+    assert math.isnan(score_image(image[:-1, :-2])["chi_square"])
+    assert math.isnan(score_image(image)["sample_pairs"])
     tiny = score_image(image[:1, :1])
-    assert tiny["chi_square"] is None
-    assert tiny["rs"] != tiny["rs"]
+    assert math.isnan(tiny["chi_square"])
+    assert math.isnan(tiny["rs"])
 
 
 def test_replaced_last_bits_are_detected() -> None:

@@ -63,7 +63,9 @@ def test_capacity(tmp_path: Path) -> None:
     options = CarryOptions(refit="never")
     plan = keyss.hide(cover, [Secret(secret, KEY)], method=options, width=24, dry_run=True).plan
     result = keyss.hide(cover, [Secret(secret, KEY)], method=options, width=24, min_psnr=0)
-    assert (plan.secret_gaussians, plan.capacity) == (6000, *result.metrics.secret_gaussians)
+    assert plan.secret_gaussians == 6000
+    # Fewer harmonics make room for more Gaussians than planned.
+    assert 1000 < plan.capacity <= result.metrics.secret_gaussians[0] < 6000
     assert plan.steps == 0
 
 

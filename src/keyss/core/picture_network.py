@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import torch
@@ -46,6 +46,24 @@ class PictureNetwork:
         """The network with `function` applied to each tensor."""
         layers = tuple((function(weight), function(bias)) for weight, bias in self.layers)
         return PictureNetwork(layers, function(self.background))
+
+    def tensors(self) -> dict[str, Tensor]:
+        """The tensors by name: `background`, `layer.I.weight` and `layer.I.bias` of each layer I from 0."""
+        tensors = {"background": self.background}
+        for index, (weight, bias) in enumerate(self.layers):
+            tensors |= {f"layer.{index}.weight": weight, f"layer.{index}.bias": bias}
+        return tensors
+
+    @staticmethod
+    def of(tensors: Mapping[str, Tensor]) -> PictureNetwork:
+        """The network of `tensors`. Raises ValueError and KeyError for others."""
+        names = [(f"layer.{index}.weight", f"layer.{index}.bias") for index in range(len(tensors) // 2)]
+        if unexpected := tensors.keys() - {"background", *itertools.chain(*names)}:
+            raise ValueError(f"unexpected {', '.join(sorted(unexpected))}")
+        background = tensors["background"]
+        if background.dim() != 1:
+            raise ValueError(f"background: expected [channels], got {list(background.shape)}")
+        return PictureNetwork(tuple((tensors[one], tensors[two]) for one, two in names), background)
 
 
 class DecodedGaussians(Gaussians):

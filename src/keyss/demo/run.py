@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import io
 from dataclasses import dataclass
 from pathlib import Path
-
-from PIL import Image
 
 import keyss
 from keyss.core import Gaussians, Interrupted, Scene, WrongKeyError
@@ -84,12 +81,10 @@ def run_demo(
             refused = sum(_is_refused(out / STEGO, wrong, device) for wrong in WRONG_KEYS)
             there = results.write({WEB: _hide_for_web(out, cover, secret, key, device)})
             converted = keyss.reveal(there / WEB, key, device=device).gaussians
-            picture = io.BytesIO()
             comparison = _comparison(out, revealed, converted, cover, secret, metrics, device)
-            comparison.save(picture, "PNG", optimize=True)
             look = look_of_scene(out / SCENES / COVER)
             viewer = page_with((out / STEGO).read_bytes(), Path(STEGO).name, look)
-            files = {SECRET_PLY: revealed, COMPARISON: picture.getvalue(), KEY: f"{key}\n".encode()}
+            files = {SECRET_PLY: revealed, COMPARISON: comparison, KEY: f"{key}\n".encode()}
             results.write(files | {VIEWER: viewer})
         (out / VIEWER).chmod(public_mode())  # it holds the published model
         return DemoResult(metrics, refused)
@@ -131,7 +126,7 @@ def _comparison(
     secret: Scene,
     metrics: HideMetrics,
     device: Backend,
-) -> Image.Image:
+) -> bytes:
     """Photos and renders of three test views side by side."""
     count = len(cover.test)
     rows = sorted({count // 6, count // 2, count - 1 - count // 6})

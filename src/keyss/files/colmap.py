@@ -1,8 +1,8 @@
 """Reads COLMAP's layout: a sparse model (cameras, images, points; `.bin` or `.txt`) beside `images/`.
 
 The reader is our own because pycolmap is a large package for three small files, and trusts them. Input is
-untrusted: counts are checked against the remaining bytes before anything is allocated, and nothing may follow
-the last record. Format: https://colmap.github.io/format.html
+untrusted: counts allocate nothing, only records that are there do, and nothing may follow the last record.
+Format: https://colmap.github.io/format.html
 """
 
 from __future__ import annotations
@@ -77,12 +77,13 @@ def read_colmap(folder: Path, *, skip_missing: bool = False) -> SceneLayout:
     Raises InputError for names that are absolute or contain `..`, and if a file is missing, truncated, too
     long, or has impossible values (NaN, zero quaternions, unknown cameras, absurd counts or sizes).
     """
-    model = colmap_model_folder(folder)
-    if model is None:
+    models = colmap_models(folder)
+    if not models:
         raise InputError(f"{folder}: expected a COLMAP model (sparse/0/cameras.bin or .txt), found none")
-    if len(beside := _models_at(model)) > 1:
+    model = models[0]
+    if len(models) > 1:
         warnings.warn(
-            f"{folder}: there are {len(beside)} sparse models; using the one with most photos, "
+            f"{folder}: there are {len(models)} sparse models; using the one with most photos, "
             f"{model.relative_to(folder)} ({_photo_count(model):,} photos)",
             KeyssWarning,
             stacklevel=2,
@@ -118,26 +119,22 @@ def read_colmap(folder: Path, *, skip_missing: bool = False) -> SceneLayout:
     return SceneLayout(*hold_out(model, _with_masks(folder, existing)), points)
 
 
-def colmap_model_folder(folder: Path, places: Sequence[str] = MODEL_PLACES) -> Path | None:
-    """The sparse model in the first of `places` that has one, or None.
+def colmap_models(folder: Path, places: Sequence[str] = MODEL_PLACES) -> list[Path]:
+    """The sparse models in the first of `places` that has any, the one with most photos first.
 
-    COLMAP writes several side by side if it cannot connect all photos; the one with most photos is returned.
+    COLMAP writes several side by side, in numbered folders, if it cannot connect all photos.
     """
-    for place in places:
-        if found := _models_at(folder / place):
-            return max(found, key=_photo_count)
-    return None
-
-
-def _models_at(place: Path) -> list[Path]:
-    """The sparse model in a folder, or, for a numbered folder, all models in such folders beside it."""
-    beside = place.parent.glob("[0-9]*") if place.parent.name == "sparse" else ()
-    numbered = sorted((each for each in beside if each.name.isdecimal()), key=lambda each: int(each.name))
-    return [
-        each
-        for each in numbered or [place]
-        if any((each / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt"))
-    ]
+    for place in (folder / each for each in places):
+        beside = place.parent.glob("[0-9]*") if place.parent.name == "sparse" else ()
+        numbered = sorted((each for each in beside if each.name.isdecimal()), key=lambda each: int(each.name))
+        models = [
+            each
+            for each in numbered or [place]
+            if any((each / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt"))
+        ]
+        if models:
+            return sorted(models, key=_photo_count, reverse=True)
+    return []
 
 
 def _photo_count(model: Path) -> int:
@@ -196,54 +193,40 @@ def _lens(where: str, model: str, width: int, height: int, read: Callable[[int],
 
 
 class _Records:
-    """A bounds-checked cursor over a binary file."""
+    """A bounds-checked cursor over a binary file. All methods raise InputError."""
 
     def __init__(self, path: Path) -> None:
-        self.path = path
-        self.data = read_file(path)
-        self.offset = 0
+        self.path, self.data, self.offset = path, read_file(path), 0
 
-    @property
-    def left(self) -> int:
-        return len(self.data) - self.offset
+    def each(self, what: str) -> Iterator[int]:
+        """Counts the records, which the caller takes; nothing may follow the last."""
+        (count,) = self.take("<Q", f"the number of {what}")
+        yield from range(count)
+        if left := len(self.data) - self.offset:
+            raise InputError(f"{self.path}: expected the end of the file, found {left} bytes more")
 
     def take(self, layout: str, what: str) -> tuple[Any, ...]:
-        size = struct.calcsize(layout)
-        self.skip(size, what)
-        return struct.unpack_from(layout, self.data, self.offset - size)
+        start = self.offset
+        self.skip(struct.calcsize(layout), what)
+        return struct.unpack_from(layout, self.data, start)
 
     def skip(self, size: int, what: str) -> None:
-        if size > self.left:
+        if size > (left := len(self.data) - self.offset):
             raise InputError(
-                f"{self.path}: expected {what} at byte {self.offset}, but only {self.left} bytes are left: "
+                f"{self.path}: expected {what} at byte {self.offset}, but only {left} bytes are left: "
                 "the file is truncated or damaged"
             )
         self.offset += size
-
-    def count(self, record_size: int, what: str) -> int:
-        """The number of records that follow; checks that the file has `record_size` bytes for each."""
-        (count,) = self.take("<Q", f"the number of {what}")
-        self.skip(count * record_size, f"{count} {what} of at least {record_size} bytes")
-        self.offset -= count * record_size
-        return int(count)
-
-    def doubles(self, count: int) -> tuple[float, ...]:
-        return self.take(f"<{count}d", "camera parameters")
 
     def name(self) -> str:
         end = self.data.find(b"\0", self.offset, self.offset + 4096)
         if end < 0:
             raise InputError(f"{self.path}: expected an image name of up to 4095 bytes at byte {self.offset}")
-        raw = self.data[self.offset : end]
-        self.offset = end + 1
+        raw, self.offset = self.data[self.offset : end], end + 1
         try:
             return raw.decode()
         except UnicodeDecodeError as error:
             raise InputError(f"{self.path}: expected an image name in UTF-8, found {raw!r}") from error
-
-    def end(self) -> None:
-        if self.left:
-            raise InputError(f"{self.path}: expected the end of the file, found {self.left} bytes more")
 
 
 def _viewmat(where: str, pose: Sequence[float]) -> Doubles:
@@ -261,40 +244,31 @@ def _viewmat(where: str, pose: Sequence[float]) -> Doubles:
 
 def _cameras_bin(path: Path) -> Iterator[tuple[int, Lens]]:
     records = _Records(path)
-    for _ in range(records.count(24, "cameras")):
+    for _ in records.each("cameras"):
         camera_id, number, width, height = records.take("<IiQQ", "a camera")
         model = _MODEL_NAMES[number] if 0 <= number < len(_MODEL_NAMES) else f"number {number}"
-        yield camera_id, _lens(f"{path}: camera {camera_id}", model, width, height, records.doubles)
-    records.end()
+        where = f"{path}: camera {camera_id}"
+        yield camera_id, _lens(where, model, width, height, lambda n: records.take(f"<{n}d", "parameters"))
 
 
 def _images_bin(path: Path) -> Iterator[_Image]:
     records = _Records(path)
-    for _ in range(records.count(_MIN_IMAGE_BYTES, "images")):
+    for _ in records.each("images"):
         _, *pose, camera_id = records.take("<I7dI", "an image")
         yield records.name(), camera_id, pose
-        records.skip(24 * records.count(24, "observations"), "observations")
-    records.end()
+        (observations,) = records.take("<Q", "the number of observations")
+        records.skip(24 * observations, "observations")
 
 
 def _points_bin(path: Path) -> PointCloud:
-    records = _Records(path)
-    data, end = records.data, len(records.data)
-    count = records.count(51, "points")
-    offsets = np.empty(count, dtype=np.int64)
-    offset, track_length = records.offset, struct.Struct("<Q").unpack_from
-    try:
-        for i in range(count):  # offsets only, as there may be millions of points
-            offsets[i] = offset
-            offset += 51 + 8 * track_length(data, offset + 43)[0]
-    except (struct.error, OverflowError):
-        offset = end + 1
-    if offset > end:
-        raise InputError(f"{path}: expected {count} points, but the file ends in one: it is truncated")
-    records.offset = offset
-    records.end()
+    records, offsets = _Records(path), []
+    for _ in records.each("points"):
+        offsets.append(records.offset)
+        (track_length,) = records.take("<43xQ", "a point")
+        records.skip(8 * track_length, "the images of a point")
     fields = np.dtype([("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3)])
-    raw = np.frombuffer(data, dtype=np.uint8)[offsets[:, None] + np.arange(fields.itemsize)]
+    starts = np.array(offsets, np.int64)[:, None]
+    raw = np.frombuffer(records.data, dtype=np.uint8)[starts + np.arange(fields.itemsize)]
     points = raw.view(fields)[:, 0]
     return _sorted_points(path, points["id"], points["xyz"], points["rgb"])
 

@@ -9,8 +9,8 @@ from __future__ import annotations
 import io
 import os
 import pkgutil
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
@@ -49,50 +49,41 @@ class ModelFormat:
     name: str
     suffixes: tuple[str, ...]  # lower case, with the dot; the first is preferred
     magic: tuple[bytes, ...]  # possible first bytes; empty: identified by suffix
-    read: Callable[[BinaryIO], Gaussians]  # to the CPU; raises InputError
-    write: Callable[[Gaussians, BinaryIO], None]  # raises OutputError
+    codec: str  # module or class of `formats/` with `read(data)` and `write(model)`, imported at first use
     is_exact: bool = False  # keeps every bit
 
-
-def _by_module(
-    name: str, suffixes: tuple[str, ...], magic: tuple[bytes, ...], module: str, is_exact: bool = False
-) -> ModelFormat:
-    """A format with `read(data)` and `write(model)` in a module or class of `formats/`.
-
-    Imports it on first use, since some import slow libraries.
-    """
-
-    def read(file: BinaryIO) -> Gaussians:
+    def read(self, file: BinaryIO) -> Gaussians:
+        """The model in an open file, on the CPU. Raises InputError."""
+        if self.magic == (b"ply",) and is_plain(file):
+            return ply.read(file)
         data = file.read(MAX_BYTES + 1)
         if len(data) > MAX_BYTES:
             raise InputError(f"expected at most {MAX_BYTES:,} bytes, found more")
         with np.errstate(all="ignore"):  # values that are not finite are reported at the end
-            model: Gaussians = pkgutil.resolve_name(f"keyss.files.formats.{module}").read(data)
+            model: Gaussians = pkgutil.resolve_name(f"keyss.files.formats.{self.codec}").read(data)
         return model
 
-    def write(model: Gaussians, file: BinaryIO) -> None:
-        file.write(pkgutil.resolve_name(f"keyss.files.formats.{module}").write(model))
-
-    return ModelFormat(name, suffixes, magic, read, write, is_exact)
-
-
-def _read_any_ply(file: BinaryIO) -> Gaussians:
-    return ply.read(file) if is_plain(file) else _PACKED.read(file)
+    def write(self, model: Gaussians, file: BinaryIO) -> None:
+        """Write a model to an open file. Raises OutputError."""
+        if self is _PLY:
+            ply.write(model, file)
+        else:
+            file.write(pkgutil.resolve_name(f"keyss.files.formats.{self.codec}").write(model))
 
 
-_PACKED = _by_module("compressed PLY", (".compressed.ply",), (b"ply",), "compressed_ply:CompressedPlyCodes")
+_PACKED = "compressed_ply:CompressedPlyCodes"
+_PLY = ModelFormat("PLY", (".ply",), (b"ply",), _PACKED, is_exact=True)  # plain, which `ply` reads, or packed
 # A file name belongs to the first format with a matching suffix.
 FORMATS = [
-    replace(_PACKED, read=_read_any_ply),
-    ModelFormat("PLY", (".ply",), (b"ply",), _read_any_ply, ply.write, is_exact=True),
-    _by_module("SPZ", (".spz",), (b"NGSP", b"\x1f\x8b"), "spz:SpzCodes"),
-    _by_module("SOG", (".sog",), (b"PK\x03\x04",), "sog:SogCodes"),
-    _by_module("glTF", (".glb",), (b"glTF",), "glb"),
-    _by_module(".splat", (".splat",), (), "splat"),
+    ModelFormat("compressed PLY", (".compressed.ply",), (b"ply",), _PACKED),
+    _PLY,
+    ModelFormat("SPZ", (".spz",), (b"NGSP", b"\x1f\x8b"), "spz:SpzCodes"),
+    ModelFormat("SOG", (".sog",), (b"PK\x03\x04",), "sog:SogCodes"),
+    ModelFormat("glTF", (".glb",), (b"glTF",), "glb"),
+    ModelFormat(".splat", (".splat",), (), "splat"),
 ]
 # Not a format of 3DGS models, so messages do not list it.
-_DECODED = _by_module("decoded", (DECODED_SUFFIX,), (), "decoded_models", is_exact=True)
-_PLY = FORMATS[1]
+_DECODED = ModelFormat("decoded", (DECODED_SUFFIX,), (), "decoded_models", is_exact=True)
 
 
 def is_model_path(path: Path | str) -> bool:

@@ -21,9 +21,7 @@ from keyss.core.arrays import Floats, Numbers
 from keyss.core.errors import InputError, KeyssWarning
 
 _MAX_HEADER_BYTES = 64 * 1024
-_MAX_HEADER_LINES = 1000
 _CHUNK_BYTES = 1 << 20
-_MAX_TOKEN_BYTES = 4096  # per number in text
 
 _SCALARS = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1",
@@ -145,18 +143,25 @@ def ply_header(elements: Mapping[str, tuple[int, Iterable[str]]], comments: Iter
 
 def _read_header(file: BinaryIO) -> tuple[list[_Element], list[str]]:
     """Elements, `vertex` among them, and comment lines. Leaves the file at the data."""
-    lines = _header_lines(file)
-    if lines[0] != "ply":
+    start = file.read(_MAX_HEADER_BYTES)
+    if not re.match(rb"ply\r*\n", start):
         raise InputError("expected a .ply file, but it does not begin with a line 'ply'")
+    end = re.search(rb"^end_header\r*\n", start, re.MULTILINE)
+    if end is None and len(start) < _MAX_HEADER_BYTES:
+        raise InputError("not a whole .ply file: it ends inside the header")
+    if end is None:
+        raise InputError(f"header is longer than {_MAX_HEADER_BYTES} bytes")
+    file.seek(end.end())
     formats: list[str] = []
     elements: list[_Element] = []
     comments: list[str] = []
+    lines = start[: end.start()].decode("latin-1").split("\n")
     for number, line in enumerate(lines[1:], start=2):
         match line.split():
             case []:
                 pass
             case ["comment" | "obj_info", *_]:
-                comments.append(line)
+                comments.append(line.rstrip("\r"))
             case ["format", name, "1.0"] if name in _BYTE_ORDERS and not formats:
                 formats.append(_BYTE_ORDERS[name])
             case ["element", name, count] if re.fullmatch(r"[0-9]{1,18}", count):
@@ -178,24 +183,6 @@ def _read_header(file: BinaryIO) -> tuple[list[_Element], list[str]]:
     for element in elements:
         element.order = formats[0]
     return elements, comments
-
-
-def _header_lines(file: BinaryIO) -> list[str]:
-    """The header's lines without their ends, up to end_header; only the first if that is not `ply`."""
-    lines: list[str] = []
-    left = _MAX_HEADER_BYTES
-    while left > 0 and len(lines) < _MAX_HEADER_LINES:
-        raw = file.readline(left)
-        left -= len(raw)
-        if not raw.endswith(b"\n") and left > 0:
-            raise InputError("not a whole .ply file: it ends inside the header")
-        line = raw.rstrip(b"\r\n").decode("latin-1")
-        if line == "end_header" and lines:
-            return lines
-        lines.append(line)
-        if lines[0] != "ply":
-            return lines
-    raise InputError(f"header is longer than {_MAX_HEADER_BYTES} bytes or {_MAX_HEADER_LINES} lines")
 
 
 def _check_size(file: BinaryIO, needed: int, vertex: _Element) -> None:
@@ -225,7 +212,7 @@ def _ascii_blocks(file: BinaryIO, skipped: int, vertex: _Element) -> Iterator[Ta
     """Rows in text, after `skipped` values. Line breaks are white space like any other."""
     width = len(vertex.properties)
     step = max(1, _CHUNK_BYTES // (8 * width))
-    tokens = _tokens(file)
+    tokens = (token for line in file for token in line.split())
     try:
         for _ in range(skipped):
             next(tokens)
@@ -240,18 +227,6 @@ def _ascii_blocks(file: BinaryIO, skipped: int, vertex: _Element) -> Iterator[Ta
             yield table
     except (StopIteration, ValueError) as error:
         raise InputError("the ascii data are cut short or hold values of another type") from error
-
-
-def _tokens(file: BinaryIO) -> Iterator[bytes]:
-    """Tokens separated by white space, in lines of any length. Raises ValueError for very long ones."""
-    rest = b""
-    while data := file.read(_CHUNK_BYTES):
-        *whole, rest = re.split(rb"[ \t\r\n\f\v]+", rest + data)
-        yield from filter(None, whole)
-        if len(rest) > _MAX_TOKEN_BYTES:
-            raise ValueError("not a number")
-    if rest:
-        yield rest
 
 
 def is_plain(file: BinaryIO) -> bool:

@@ -17,7 +17,7 @@ from torch import Tensor
 from keyss.core.arrays import Doubles, Floats
 from keyss.core.errors import InputError, KeyssWarning, UsageError
 from keyss.core.scene import NEAR, ORDINARY_EXTENT, Camera, Scene, View, checked_background
-from keyss.files.colmap import MODEL_PLACES, colmap_model_folder, read_colmap
+from keyss.files.colmap import MODEL_PLACES, colmap_models, read_colmap
 from keyss.files.file_kinds import identify_file, identify_folder
 from keyss.files.images import downscale, is_rotated_by_exif, probe_image, read_image, read_mask
 from keyss.files.lens import Lens, Undistortion, undistortion
@@ -142,13 +142,13 @@ def read_layout(folder: Path, skip_missing: bool) -> SceneLayout:
             raise InputError(f"{folder}: expected a scene folder, found {found}. Known layouts: {_KNOWN}")
         # In this order, because COLMAP and NeRF-synthetic scenes may contain a derived transforms.json, and
         # Nerfstudio's scenes contain their COLMAP model.
-        if colmap_model_folder(folder, MODEL_PLACES[:-1]) is not None:
+        if colmap_models(folder, MODEL_PLACES[:-1]):
             return read_colmap(folder, skip_missing=skip_missing)
         if (folder / "transforms_train.json").is_file():
             return read_blender(folder, skip_missing=skip_missing)
         if (folder / "transforms.json").is_file():
             return read_nerfstudio(folder, skip_missing=skip_missing)
-        if colmap_model_folder(folder) is not None:
+        if colmap_models(folder):
             return read_colmap(folder, skip_missing=skip_missing)
         entries = sorted(entry.name for entry in folder.iterdir())
     except OSError as error:

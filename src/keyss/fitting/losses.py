@@ -159,22 +159,6 @@ def _blur_cpu(counter: Any, source: Any, result: Any) -> None:
 
 
 @finite_kernel
-def _products(counter: Any, image: Any, target: Any, stacked: Any) -> None:
-    """stacked [9, H, W] = x, x^2, x y of image [H, W, 3] and target [3, H, W]."""
-    _, height, width = target.shape
-    while True:
-        y = fetch_add(counter, 0, 1)
-        if y >= height:
-            break
-        for c in range(3):
-            for x in range(width):
-                value = image[y, x, c]
-                stacked[c, y, x] = value
-                stacked[3 + c, y, x] = value * value
-                stacked[6 + c, y, x] = value * target[c, y, x]
-
-
-@finite_kernel
 def _similarity(counter: Any, stats: Any, target_mean: Any, target_variance: Any, row_sums: Any) -> None:
     """Row sums of the SSIM map. `stats` [9, H, W] becomes its derivatives to mean, square and product."""
     _, height, width = target_mean.shape
@@ -243,7 +227,10 @@ class _PhotometricCpu(torch.autograd.Function):
         _, height, width = planes.shape
         stacked = memory.empty((9, height, width), np.float32)
         stats = memory.empty((9, height, width), np.float32)
-        parallel.run(_products, pixels, planes, stacked)
+        x, squares, products = torch.from_numpy(stacked).split(3)
+        x.copy_(image.permute(2, 0, 1))
+        torch.mul(x, x, out=squares)
+        torch.mul(x, target.planes, out=products)
         parallel.run(_blur_cpu, stacked, stats)
         similarities = np.empty(3 * height, np.float32)
         parallel.run(_similarity, stats, target.mean.numpy(), target.variance.numpy(), similarities)

@@ -2,7 +2,6 @@ from .auc import Auc as Auc, auc_between as auc_between
 from .audits.parts import RenderTime as RenderTime, measure_render_time as measure_render_time
 from .baselines.baseline_options import BaselineOptions as BaselineOptions
 from .distances import (
-    AttributeDistance as AttributeDistance,
     against_controls as against_controls,
     attribute_distances as attribute_distances,
     composite_score as composite_score,
@@ -16,8 +15,6 @@ from .leaks.attacks import (
 )
 from .leaks.leak_scores import (
     AttackResult as AttackResult,
-    LeakScores as LeakScores,
-    coarse as coarse,
     fit_colours as fit_colours,
     gradient_correlation as gradient_correlation,
     leak_scores as leak_scores,
@@ -37,13 +34,10 @@ from .robustness.changes import (
 from .robustness.converters import Converter as Converter, converters as converters, transform as transform
 from .robustness.survival import (
     ChangedQuality as ChangedQuality,
-    ChangeResult as ChangeResult,
-    default_changes as default_changes,
     measure_robustness as measure_robustness,
     reveal_changed as reveal_changed,
 )
 from .stealth.judging import (
-    candidate_scores as candidate_scores,
     changed_low_bits as changed_low_bits,
     judge as judge,
     stealth_statistics as stealth_statistics,

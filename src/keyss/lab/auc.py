@@ -13,8 +13,6 @@ from keyss.core.arrays import Doubles
 
 _Z = 1.959963984540054  # standard normal quantile of 0.975
 
-Score = float | None
-
 
 @dataclass(frozen=True)
 class Auc:
@@ -25,8 +23,8 @@ class Auc:
     high: float
 
 
-def auc_between(negatives: Sequence[Score], positives: Sequence[Score]) -> Auc:
-    """The AUC of scores that should be higher for positives; None and NaN are missing scores.
+def auc_between(negatives: Sequence[float], positives: Sequence[float]) -> Auc:
+    """The AUC of scores that should be higher for positives; NaN is a missing score.
 
     A missing score counts as lower than every number, so a detector that fails more often on one class can
     have an AUC far from 0.5. The interval treats images as independent and is too narrow for neighbouring
@@ -34,10 +32,7 @@ def auc_between(negatives: Sequence[Score], positives: Sequence[Score]) -> Auc:
     """
     if not negatives or not positives:
         raise UsageError(f"expected scores of both classes, got {len(negatives)} and {len(positives)}")
-    plain, stego = (
-        np.array([-math.inf if each is None or math.isnan(each) else each for each in scores], dtype=float)
-        for scores in (negatives, positives)
-    )
+    plain, stego = (np.where(np.isnan(scores), -np.inf, scores) for scores in (negatives, positives))
     auc, variance = delong(plain, stego)
     return Auc(auc, *_interval(auc, variance, min(len(plain), len(stego))))
 

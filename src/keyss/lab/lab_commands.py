@@ -67,20 +67,18 @@ def audit(
     from keyss.cli.tables import print_files
     from keyss.progress import reporter
 
-    if report_only:
-        found = keyss.audit(run, report_only=True)
-    else:
-        found = keyss.audit(
-            run,
-            keys_of_run(run, key_file),
-            controls=controls,
-            only=only,
-            seed=check_seed(seed),
-            device=device,
-            overwrite=overwrite,
-            resume=resume,
-            reporter=reporter(),
-        )
+    found = keyss.audit(
+        run,
+        () if report_only else keys_of_run(run, key_file),
+        report_only=report_only,
+        controls=controls,
+        only=only,
+        seed=check_seed(seed),
+        device=device,
+        overwrite=overwrite,
+        resume=resume,
+        reporter=reporter(),
+    )
     _print_verdicts(found)
     print_files(
         run,
@@ -263,16 +261,9 @@ def sweep(
     from keyss.lab.many import Forecast
     from keyss.progress import reporter
 
-    result = keyss.sweep(
-        spec,
-        out,
-        ray=ray,
-        cores=cores,
-        dry_run=dry_run,
-        reporter=reporter(),
-    )
-    if isinstance(result, Forecast):
-        _print_forecast(result)
+    outcomes = keyss.sweep(spec, out, ray=ray, cores=cores, dry_run=dry_run, reporter=reporter())
+    if isinstance(outcomes, Forecast):
+        _print_forecast(outcomes)
         return
     described = {
         **_scene_tables("scenes"),
@@ -281,12 +272,12 @@ def sweep(
         "private/master-key.txt": "the key from which those of the trials are derived",
     }
     print_files(out, described)
-    count, failed = len(result.outcomes), result.errors
-    print(f"{count - len(failed)} of {count} trials are done")
-    for name, error in failed.items():
-        print(f"failed: {name}: {error}")
+    failed = [each for each in outcomes if each.error]
+    print(f"{len(outcomes) - len(failed)} of {len(outcomes)} trials are done")
+    for each in failed:
+        print(f"failed: {each.name}: {each.error}")
     if failed:
-        raise InputError(f"{len(failed)} of {count} trials failed")
+        raise InputError(f"{len(failed)} of {len(outcomes)} trials failed")
 
 
 def _scene_tables(stem: str) -> dict[str, str]:

@@ -31,21 +31,17 @@ Counts = Integers  # [2, 2]: under F1 and under F-1, the number of regular and o
 Number = np.float64
 
 
-def score_image(image: Bytes) -> dict[str, float | None]:
+def score_image(image: Bytes) -> dict[str, float]:
     """Scores of an image [H, W, 3] uint8 by detector, and their mean `fusion`; each in [0, 1].
 
-    A detector is NaN if its equation has no solution, and None if it does not accept the image (Sample Pairs:
-    odd width or height; Chi Square: less than about 87,700 pixels). `fusion` is the mean of the available
-    scores, NaN if there are none: compare only images of one size. Raises UsageError for another shape or
-    type.
+    A detector is NaN if its equation has no solution, or if it does not accept the image (Sample Pairs: odd
+    width or height; Chi Square: less than about 87,700 pixels). `fusion` is the mean of the available scores,
+    NaN if there are none: compare only images of one size. Raises UsageError for another shape or type.
     """
     if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3 or 0 in image.shape:
         raise UsageError(f"expected an image [H, W, 3] of uint8, got {list(image.shape)} of {image.dtype}")
-    scores: dict[str, float | None] = {}
-    for name, detector in DETECTORS.items():
-        score = detector(image)
-        scores[name] = score if score is None or math.isnan(score) else min(abs(score), 1.0)
-    available = [score for score in scores.values() if score is not None and not math.isnan(score)]
+    scores = {name: float(np.minimum(abs(detector(image)), 1.0)) for name, detector in DETECTORS.items()}
+    available = [score for score in scores.values() if not math.isnan(score)]
     return scores | {"fusion": sum(available) / len(available) if available else math.nan}
 
 
@@ -60,16 +56,16 @@ def stegexpose_auc(plain_images: Sequence[Bytes], stego_images: Sequence[Bytes])
     return auc_between(plain, stego)
 
 
-def chi_square(image: Bytes) -> float | None:
+def chi_square(image: Bytes) -> float:
     """Mean p-value over the first 1024, 2048, ... samples of [H, W, 3], in [0, 1].
 
-    Samples are in row-major order, red, green, blue. None for images of less than about 87,700 pixels. Not
+    Samples are in row-major order, red, green, blue. NaN for images of less than about 87,700 pixels. Not
     calibrated: a smooth histogram alone gives 0.3.
     """
     samples = image.reshape(-1)
     blocks = len(samples) // _SAMPLES - 1
     if blocks < _MIN_BLOCKS:
-        return None
+        return math.nan
     bins = samples[: blocks * _SAMPLES].reshape(blocks, _SAMPLES) + 256 * np.arange(blocks)[:, None]
     counts = np.bincount(bins.reshape(-1), minlength=256 * blocks).reshape(blocks, 256)
     histograms = 1 + counts.cumsum(0)
@@ -91,13 +87,13 @@ def primary_sets(image: Bytes) -> float:
         return float((-b - np.sqrt(discriminant)) / (2 * a))
 
 
-def sample_pairs(image: Bytes) -> float | None:
+def sample_pairs(image: Bytes) -> float:
     """Mean embedding rate over the channels of [H, W, 3], from horizontal and vertical pairs; unbounded.
 
-    None if width or height is odd: the original program fails.
+    NaN if width or height is odd: the original program fails.
     """
     if image.shape[0] % 2 or image.shape[1] % 2:
-        return None
+        return math.nan
     rates = []
     for plane in np.moveaxis(image, 2, 0):
         pairs, y, z, w, _ = _horizontal_pairs(plane) + _horizontal_pairs(plane.T)

@@ -6,9 +6,6 @@ separation. It detects what 3D-Sinkhorn misses: see `keyss.lab.distances`.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from itertools import combinations
 from statistics import fmean
 
 import numpy as np
@@ -23,30 +20,6 @@ MIN_GAUSSIANS, MAX_GAUSSIANS = 100, 10_000  # Gaussians per model
 FOLDS = 5
 _CELLS = 8  # along each axis
 TREES, _LEAVES = 50, 16
-
-
-@dataclass(frozen=True)
-class TwoSampleAucs:
-    """Classifier AUCs of a model and of control models of its scene."""
-
-    stego: tuple[Auc, ...]  # each control against the model
-    control: tuple[Auc, ...]  # each pair of controls: seed-to-seed variation
-    original: tuple[Auc, ...]  # each control against the cover's own plain model
-
-
-def auc_beside_controls(
-    model: Gaussians, controls: Sequence[Gaussians], original: Gaussians, *, seed: int = 0
-) -> TwoSampleAucs:
-    """`two_sample_auc` of `model` and of `controls`, plain models of the same scene from other seeds.
-
-    `original`: another plain model of the scene to compare with the controls, since it can be further from
-    them than they are from each other. `controls`: at least two.
-    """
-    return TwoSampleAucs(
-        stego=tuple(two_sample_auc(control, model, seed=seed) for control in controls),
-        control=tuple(two_sample_auc(one, two, seed=seed) for one, two in combinations(controls, 2)),
-        original=tuple(two_sample_auc(control, original, seed=seed) for control in controls),
-    )
 
 
 def two_sample_auc(a: Gaussians, b: Gaussians, *, seed: int = 0) -> Auc:
@@ -64,7 +37,10 @@ def two_sample_auc(a: Gaussians, b: Gaussians, *, seed: int = 0) -> Auc:
     parts = [features(model, limit=size, seed=seed) for model in (a, b)]
     values = np.concatenate([np.concatenate(list(part.values()), axis=1) for part in parts])
     is_b = np.arange(2 * size) >= size
-    fold = _folds(np.concatenate([part["position"] for part in parts]), seed)
+    # Cells of space are assigned to folds at random.
+    cells = space_cells(np.concatenate([part["position"] for part in parts]), _CELLS)
+    _, cell = np.unique(cells, return_inverse=True)
+    fold = np.random.default_rng(seed).permutation(cell.max() + 1)[cell] % FOLDS
     if np.bincount(2 * fold + is_b, minlength=2 * FOLDS).min() < 2:
         raise UsageError(
             "expected Gaussians spread over space, but they lie in too few places for five folds"
@@ -81,9 +57,8 @@ def features(gaussians: Gaussians, *, limit: int | None = None, seed: int = 0) -
 
     - `position`: D = 3.
     - `scale`: the 3 log scales in ascending order.
-    - `rotation`: the 6 entries of R diag(log s - mean log s) R^T, off-diagonal ones times sqrt 2 for
-    Frobenius
-      distances. Invariant to sign and length of the quaternion and to the order of axes.
+    - `rotation`: the 6 entries of R diag(log s - mean log s) R^T, off-diagonal ones times sqrt 2
+      for Frobenius distances. Invariant to sign and length of the quaternion and to the order of axes.
     - `opacity`: the logit, clamped to -16 and 16; NaN counts as transparent.
     - `colour`: RGB of the constant coefficients.
     - `harmonics`: the 45 other coefficients, zeros above the model's degree.
@@ -114,12 +89,6 @@ def space_cells(positions: Numbers, per_axis: int) -> Integers:
     cuts = np.quantile(positions, np.arange(1, per_axis) / per_axis, axis=0)
     index = [np.searchsorted(cuts[:, axis], positions[:, axis]) for axis in range(3)]
     return np.ravel_multi_index(index, (per_axis,) * 3)
-
-
-def _folds(positions: Floats, seed: int) -> Integers:
-    """[N] fold of each Gaussian; cells of space are assigned at random."""
-    _, cell = np.unique(space_cells(positions, _CELLS), return_inverse=True)
-    return np.random.default_rng(seed).permutation(cell.max() + 1)[cell] % FOLDS
 
 
 def _held_out_auc(values: Floats, is_b: Flags, held_out: Flags, seed: int) -> tuple[float, float]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 from collections.abc import Mapping, Sequence
 
@@ -10,8 +11,11 @@ from PIL import Image, ImageDraw, ImageFont
 from keyss.core.arrays import Bytes
 
 
-def contact_sheet(heads: Sequence[str], rows: Mapping[str, Sequence[Bytes]], cell: int = 200) -> Image.Image:
-    """Rows of pictures [H, W, 3], each `cell` pixels high, with names on the left and `heads` above."""
+def contact_sheet(heads: Sequence[str], rows: Mapping[str, Sequence[Bytes]], cell: int = 200) -> bytes:
+    """A PNG file with rows of pictures [H, W, 3].
+
+    Pictures are `cell` pixels high, with names on the left and `heads` above.
+    """
     gap, font = cell // 40, ImageFont.load_default(cell // 14)
     scaled = [
         [
@@ -41,4 +45,6 @@ def contact_sheet(heads: Sequence[str], rows: Mapping[str, Sequence[Bytes]], cel
         draw.text((gap, y + gap), name, fill=(20, 20, 20), font=font)
         for x, picture in zip(starts, pictures, strict=True):
             sheet.paste(picture, (x, y))
-    return sheet
+    file = io.BytesIO()
+    sheet.save(file, "PNG", optimize=True)
+    return file.getvalue()

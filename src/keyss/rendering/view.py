@@ -34,11 +34,10 @@ def render_with_meta(
         sh_degree = gaussians.sh_degree
     if not isinstance(gaussians, DecodedGaussians):
         return _render(gaussians, gaussians.sh, camera, background, sh_degree)
-    network = gaussians.network
+    network, colors = gaussians.network, gaussians.sh
     if gaussians.features is not None:
-        image, meta = render_features(gaussians, gaussians.features, camera, network.background)
-    else:
-        image, meta = _render(gaussians, gaussians.sh, camera, network.background, sh_degree)
+        colors, sh_degree = gaussians.features, None
+    image, meta = _render(gaussians, colors, camera, network.background, sh_degree)
     return decode_picture(image, network), meta
 
 

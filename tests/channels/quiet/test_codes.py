@@ -11,6 +11,7 @@ import torch
 from hypothesis import given, settings, strategies as st
 
 from channels.quiet.coded import FORMATS, bits_of, codes_of, model_of, opened, there_and_back, written
+from files.formats.examples import same_codes
 from keyss.channels import CodesCover, Field, Payload, QuietReader, in_counted_order, last_bits
 from keyss.channels.quiet.fields import ROTATIONS, sog_distances
 from keyss.channels.quiet.wet_paper import read_blocks
@@ -120,7 +121,7 @@ def test_every_bit_that_may_change_is_written(suffix: str) -> None:
 @EVERY
 def test_equal_inputs_give_equal_files_and_others_no_salt_in_common(suffix: str) -> None:
     cover = CodesCover.of(codes_of(suffix))
-    assert written(cover, b"a") == written(cover, b"a")
+    assert same_codes(written(cover, b"a"), written(cover, b"a"))
     others = [written(cover, b"b"), written(cover, b"a", entropy=bytes(32)), written(cover, b"a", b"b")]
     salts = {QuietReader.of_codes(each).salts[0] for each in [written(cover, b"a"), *others]}
     assert len(salts) == 4

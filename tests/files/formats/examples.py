@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from keyss.core import Gaussians
+from keyss.files.formats.common import Codes
 from keyss.files.formats.compressed_ply import CompressedPlyCodes
 from keyss.files.formats.sog import SogCodes
 from keyss.files.formats.spz import SpzCodes
@@ -32,6 +33,13 @@ def assert_close(a: Gaussians, b: Gaussians, tolerance: float = 1e-5) -> None:
         assert worst <= tolerance, (name, worst)
     unit_a, unit_b = (torch.nn.functional.normalize(each.quats.double()) for each in (a, b))
     assert float(1 - (unit_a * unit_b).sum(dim=1).abs().min()) <= tolerance
+
+
+def same_codes(one: Codes, other: Codes) -> bool:
+    """True if the codes that two files hold are equal; what else they keep of the files does not count."""
+    names = [each.name for each in fields(one) if each.name not in ("comments", "packed")]  # type: ignore[arg-type]
+    pairs = [(np.asarray(getattr(one, name)), np.asarray(getattr(other, name))) for name in names]
+    return type(one) is type(other) and all(a.dtype == b.dtype and np.array_equal(a, b) for a, b in pairs)
 
 
 def is_finite(model: Gaussians) -> bool:

@@ -24,10 +24,6 @@ def _auc(auc: float, low: float, high: float) -> Data:
     return {"auc": auc, "low": low, "high": high}
 
 
-def _score(p: float) -> Data:
-    return {"name": f"candidate: {p}", "value": 0, "low": 0, "high": 0, "p": p, "exact": None}
-
-
 ALL_FINE: list[Change] = [
     (IMAGES.format(0), 27.5),
     (BASELINES.format(0), 27.0),
@@ -46,7 +42,6 @@ ALL_FINE: list[Change] = [
     ("parameters.two_sample.original", []),
     ("stealth.least", 0.2),
     ("stealth.least_of_controls", 0.5),
-    ("stealth.confirmations", [[_score(0.1), _score(0.02)], None]),
     (STEGEXPOSE, _auc(0.75, 0.3, 1.0)),
     (CONTROL, _auc(0.5, 0.4, 0.6)),
 ]
@@ -80,7 +75,6 @@ def test_verdicts_of_a_whole_audit(fine: Data) -> None:
         "wrong keys": "fine",
         "leaks without the key": "fine",
         "the file by itself": "fine",
-        "guessing the secret": "fine",
         "attributes of the Gaussians": "fine",
         "classifier between models": "fine",
         "StegExpose on renders": "fine",
@@ -105,7 +99,6 @@ def test_verdicts_of_a_whole_audit(fine: Data) -> None:
         ("leaks without the key", LEAK.format(0, 1, "gradient"), 0.1, 0.11, "visible"),
         ("the file by itself", "stealth.least", 0.01, 0.009, "visible"),
         ("the file by itself", "stealth.least", 0.2, 0.0, "visible"),
-        ("guessing the secret", "stealth.confirmations.0.1.p", 0.005, 0.0049, "visible"),
         ("attributes of the Gaussians", "parameters.distances.opacity.ratio", 1.5, 1.51, "visible"),
         ("classifier between models", "parameters.two_sample.stego.0.auc", 0.6, 0.61, "visible"),
         ("StegExpose on renders", f"{STEGEXPOSE}.low", 0.5, 0.51, "visible"),
@@ -140,9 +133,9 @@ def test_missing_parts_have_no_verdict(fine: Data) -> None:
 def test_the_headline(fine: Data) -> None:
     assert headline([]) == "Nothing was measured that could be judged."
     lines = verdicts(changed(fine))
-    assert headline(lines) == "All 11 measures are within their limits."
+    assert headline(lines) == "All 10 measures are within their limits."
     changes = ((f"{STEGEXPOSE}.high", 0.45), (IMAGES.format(2), 25.5))
     assert headline(verdicts(changed(fine, *changes))) == (
-        "9 of 11 measures are within their limits. Visible: StegExpose on renders. "
+        "8 of 10 measures are within their limits. Visible: StegExpose on renders. "
         "Missed: secret 2 on test photos."
     )

@@ -125,7 +125,7 @@ def test_resumed_training_is_bit_identical(name: str) -> None:
     scenes = [tiny_scene(0), tiny_scene(1)]
     placed = [PlacedScene.of(scene, random_gaussians(50), Similarity()) for scene in scenes]
     method: Any = registry.get(name)
-    whole, resumed = (method.training(placed, options_of(name), torch.device("cpu")) for _ in range(2))
+    whole, resumed = (method.training(placed, [], options_of(name), torch.device("cpu")) for _ in range(2))
 
     def run_to(run: KeyssTraining, end: int) -> State:
         torch.manual_seed(run.iteration)  # which `train` keeps
@@ -150,7 +150,6 @@ def test_audit_of_methods_with_networks(made: Made) -> None:
         with pytest.raises(UsageError, match="not publish a 3DGS model"):
             audit(made.out, [], only=["images", "stealth"])
     found = audit(made.out, [], only=["images", "speed"], controls=2)
-    assert found.run.standard == standard
     assert found.images is not None
     assert found.images.models[1].images.mean.psnr == pytest.approx(
         made.result.metrics.secrets[0].psnr, abs=0.1

@@ -15,7 +15,7 @@ import pytest
 import keyss as library
 from cli.harness import Run
 from keyss.core import BackendError, InputError
-from keyss.lab.many import Forecast, ManyResult, sweep
+from keyss.lab.many import Forecast, Outcome, sweep
 from tiny_scenes import random_gaussians
 
 fake_runs = pytest.mark.usefixtures("_fake_runs")
@@ -35,10 +35,10 @@ def files(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def run(*arguments: Any, **options: Any) -> ManyResult:
+def run(*arguments: Any, **options: Any) -> tuple[Outcome, ...]:
     """Run a sweep."""
     found = sweep(*arguments, **options)
-    assert isinstance(found, ManyResult)
+    assert isinstance(found, tuple)
     return found
 
 
@@ -101,8 +101,8 @@ def real_spec(folder: Path, seeds: int) -> Path:
     return write_spec(folder, ["a.ply"], seeds, "width: 32\n")
 
 
-def skipped(found: ManyResult) -> list[bool]:
-    return [each.skipped for each in found.outcomes]
+def skipped(found: tuple[Outcome, ...]) -> list[bool]:
+    return [each.skipped for each in found]
 
 
 @fake_runs
@@ -148,7 +148,7 @@ def test_changed_files_and_options(tmp_path: Path) -> None:
 def test_failed_trials(tmp_path: Path, keyss: Run, capsys: pytest.CaptureFixture[str]) -> None:
     """Errors of users and internal errors."""
     spec = write_spec(tmp_path, ["broken.ply", "odd.ply", "a.ply"], seeds=1)
-    broken, odd, good = run(spec, tmp_path / "out").outcomes
+    broken, odd, good = run(spec, tmp_path / "out")
     assert "nothing of it can be read" in str(broken.error)
     assert odd.error == "RuntimeError: out of memory"
     assert "Traceback" in capsys.readouterr().err
@@ -160,7 +160,7 @@ def test_failed_trials(tmp_path: Path, keyss: Run, capsys: pytest.CaptureFixture
 
 
 def test_key_of_a_trial(tmp_path: Path, keyss: Run) -> None:
-    (trial,) = run(real_spec(tmp_path, 1), tmp_path / "out").outcomes
+    (trial,) = run(real_spec(tmp_path, 1), tmp_path / "out")
     name, master = f"trial/{trial.folder.name}/1", tmp_path / "out" / "private" / "master-key.txt"
     key = keyss("keygen", "--asset", name, "--master-key-file", master).out.strip()
     assert len(library.reveal(trial.folder / "run" / "publish" / "model.ply", key).gaussians) == 40
@@ -199,8 +199,8 @@ def test_local_ray_cluster(tmp_path: Path) -> None:
     here = run(spec, tmp_path / "here")
     shutil.copytree(tmp_path / "here" / "private", tmp_path / "there" / "private")
     there = run(spec, tmp_path / "there", ray="local")
-    assert [each.error for each in there.outcomes] == [each.error for each in here.outcomes]
-    assert len(there.errors) == 2
+    assert [each.error for each in there] == [each.error for each in here]
+    assert sum(each.error is not None for each in there) == 2
     tables = [path for path in (tmp_path / "here").iterdir() if path.is_file()]
     assert len(tables) > 1
     for table in tables:

@@ -8,7 +8,8 @@ import pytest
 
 from channels.quiet.trained_like import keys
 from keyss.core import UsageError
-from keyss.lab import candidate_scores, changed_low_bits, judge
+from keyss.lab import changed_low_bits, judge
+from lab.stealth.candidates import candidate_scores, confirmation_p
 from lab.stealth.careless import banded, normalised, overwritten, plain, plain_rounded
 from methods.carry.carried import embed_derived
 
@@ -16,11 +17,11 @@ LIMIT = 0.01
 
 
 def test_plain_model_passes() -> None:
-    found = judge(plain(9), [plain(seed) for seed in range(3)], candidates=[plain(20, 800), None])
+    controls = [plain(seed) for seed in range(3)]
+    found = judge(plain(9), controls)
     assert found.least > LIMIT
     assert found.least_of_controls > LIMIT
-    assert found.least_confirmation > LIMIT
-    assert found.confirmations[1] is None
+    assert confirmation_p(plain(9), controls, plain(20, 800)) > LIMIT
     assert (found.invisible_groups, found.changed_low_bits) == (0, 0)
 
 
@@ -39,11 +40,12 @@ def test_broken_unit_quaternions() -> None:
 
 
 def test_secret_in_a_band() -> None:
-    secret = plain(20, 800)
-    found = judge(banded(plain(9), secret), [plain(seed) for seed in range(4)], candidates=[secret])
+    secret, controls = plain(20, 800), [plain(seed) for seed in range(4)]
+    file = banded(plain(9), secret)
+    found = judge(file, controls)
     assert found.least < 1e-6
     assert found.invisible_groups == 1
-    assert found.least_confirmation < LIMIT
+    assert confirmation_p(file, controls, secret) < LIMIT
 
 
 def test_fewer_than_two_controls() -> None:

@@ -78,19 +78,19 @@ def palette_of(vectors: Floats, size: int) -> tuple[Floats, Shorts]:
 def groups(points: Doubles, size: int) -> tuple[Integers, Integers]:
     """At most `size` groups of `points` [N, D]: indices [N] sorted by group, and where each group starts."""
     order = np.arange(len(points))
-    heap = [(0.0, 0, len(points), *_widest(points, order, 0, len(points)))]
-    heap[0] = (-heap[0][5], *heap[0][1:])
-    done: list[int] = []
-    while heap and len(heap) + len(done) < size:
-        _, start, end, axis, mean, error = heapq.heappop(heap)
-        if error <= 0:
-            done.append(start)
-            continue
+    heap: list[tuple[float, int, int, int, float]] = []
+
+    def push(start: int, end: int) -> None:
+        axis, mean, error = _widest(points, order, start, end)
+        heapq.heappush(heap, (-error, start, end, axis, mean))
+
+    push(0, len(points))
+    while len(heap) < size and heap[0][0] < 0:
+        _, start, end, axis, mean = heapq.heappop(heap)
         middle = _split(points, order, start, end, axis, mean)
-        for a, b in ((start, middle), (middle, end)):
-            axis, mean, error = _widest(points, order, a, b)
-            heapq.heappush(heap, (-error, a, b, axis, mean, error))
-    return order, np.sort(np.array(done + [each[1] for each in heap]))
+        push(start, middle)
+        push(middle, end)
+    return order, np.sort(np.array([start for _, start, *_ in heap]))
 
 
 @kernel

@@ -23,7 +23,7 @@ _SORTED = 0.9  # minimum share of ascending neighbours
 
 
 class Codes(ABC):
-    """The integers of a file in a quantised format: base of dataclasses of arrays, which compare by value.
+    """The integers of a file in a quantised format: base of dataclasses of arrays.
 
     `parse` and `serialise` convert between bytes and codes, losslessly; `quantise` and `dequantise` between
     models and codes.
@@ -73,15 +73,6 @@ class Codes(ABC):
     def write(cls, model: Gaussians) -> bytes:
         """A model as a file. Raises OutputError."""
         return cls.of(model).serialise()
-
-    def __eq__(self, other: object) -> bool:
-        if type(other) is not type(self):
-            return NotImplemented
-        names = [each.name for each in fields(self) if each.compare]  # type: ignore[arg-type]
-        pairs = ((np.asarray(getattr(self, name)), np.asarray(getattr(other, name))) for name in names)
-        return all(a.dtype == b.dtype and np.array_equal(a, b) for a, b in pairs)
-
-    __hash__ = None  # type: ignore[assignment]
 
 
 class CodedGaussians(Gaussians):
@@ -138,10 +129,12 @@ def gaussians_of(
 
     `drop`: leaves out Gaussians with such values, with a KeyssWarning, unless none would remain.
     """
-    with np.errstate(over="ignore", invalid="ignore"):
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         sh = np.empty((len(rest), 1 + rest.shape[1], 3), np.float32)
         sh[:, 0], sh[:, 1:] = colors, rest
-        parts = (means, quats, log_scales, _logits(opacities), sh)
+        share = np.asarray(opacities, dtype=np.float64)
+        logits = (np.log(share) - np.log1p(-share)).clip(-OPACITY_LOGIT_BOUND, OPACITY_LOGIT_BOUND)
+        parts = (means, quats, log_scales, logits, sh)
         model = Gaussians(*(torch.from_numpy(np.require(each, np.float32, ["C", "W"])) for each in parts))
     if not (wrong := _not_finite(model)):
         return model
@@ -185,14 +178,6 @@ def arrays_of(model: Gaussians) -> tuple[Floats, Doubles, Floats, Doubles, Float
     with np.errstate(over="ignore"):
         opacities = 1 / (1 + np.exp(-opacity_logits.astype(np.float64)))
     return means, unit(quats), log_scales, opacities, sh[:, 0], sh[:, 1:]
-
-
-def _logits(opacities: Numbers) -> Doubles:
-    """Opacity logits of opacities in [0, 1], clipped to +-OPACITY_LOGIT_BOUND."""
-    values = np.asarray(opacities, dtype=np.float64)
-    with np.errstate(divide="ignore"):
-        found: Doubles = np.log(values) - np.log1p(-values)
-    return found.clip(-OPACITY_LOGIT_BOUND, OPACITY_LOGIT_BOUND)
 
 
 def round_half_away(values: Numbers) -> Doubles:
@@ -293,22 +278,7 @@ def morton_keys(positions: Floats | Doubles, within: Floats | Doubles) -> Words:
     low, high = within.min(axis=0).astype(np.float64), within.max(axis=0).astype(np.float64)
     extent = np.where(high > low, high - low, 1.0)
     cells = (((positions - low) / extent).clip(0, 1) * (2**_MORTON_BITS - 1)).astype(np.uint64)
-    key = np.zeros(len(positions), dtype=np.uint64)
-    for axis in range(3):
-        key |= _spread(cells[:, axis]) << np.uint64(axis)
-    return key
-
-
-def is_in_morton_order(means: Floats) -> bool:
-    """True for positions in `morton_order`, up to a few."""
-    places = np.empty(len(means))
-    places[morton_order(means)] = np.arange(len(means))
-    return len(means) > 1 and bool((np.diff(places) > 0).mean() >= _SORTED)
-
-
-def _spread(values: Words) -> Words:
-    """The lowest 21 bits of `values`, with two zero bits between neighbours."""
-    values = values & np.uint64(0x1FFFFF)
+    # Spread the bits of each coordinate: two zeros between neighbours are the places of the other two.
     for shift, mask in (
         (32, 0x1F00000000FFFF),
         (16, 0x1F0000FF0000FF),
@@ -316,5 +286,13 @@ def _spread(values: Words) -> Words:
         (4, 0x10C30C30C30C30C3),
         (2, 0x1249249249249249),
     ):
-        values = (values | (values << np.uint64(shift))) & np.uint64(mask)
-    return values
+        cells = (cells | (cells << np.uint64(shift))) & np.uint64(mask)
+    keys: Words = np.bitwise_or.reduce(cells << np.arange(3, dtype=np.uint64), axis=1)
+    return keys
+
+
+def is_in_morton_order(means: Floats) -> bool:
+    """True for positions in `morton_order`, up to a few."""
+    places = np.empty(len(means))
+    places[morton_order(means)] = np.arange(len(means))
+    return len(means) > 1 and bool((np.diff(places) > 0).mean() >= _SORTED)

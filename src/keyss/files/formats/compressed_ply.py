@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Self
 
 import numpy as np
@@ -57,7 +57,7 @@ class CompressedPlyCodes(Codes):
     colors: Bytes  # [N, 3] between the bounds
     alphas: Bytes  # [N] opacities in 255ths
     sh: Bytes  # [N, K - 1, 3] harmonics in 32nds from -4 on
-    comments: tuple[str, ...] = field(default=(), compare=False)  # whole lines of the header
+    comments: tuple[str, ...] = ()  # whole lines of the header
 
     @classmethod
     def parse(cls, data: bytes) -> Self:

@@ -27,11 +27,9 @@ _NAMES = tuple(each.name for each in fields(Gaussians))
 
 def write(model: DecodedGaussians) -> bytes:
     """The bytes of a file. Raises OutputError for a model that is empty or not finite."""
-    tensors = {name: getattr(model, name) for name in _NAMES} | {"background": model.network.background}
+    tensors = {name: getattr(model, name) for name in _NAMES} | model.network.tensors()
     if model.features is not None:
         tensors["features"] = model.features
-    for index, (weight, bias) in enumerate(model.network.layers):
-        tensors |= {f"layer.{index}.weight": weight, f"layer.{index}.bias": bias}
     kept = {name: each.detach().cpu().float().contiguous() for name, each in tensors.items()}
     if wrong := [name for name, each in kept.items() if not bool(each.isfinite().all())]:
         raise OutputError(f"NaN or infinite values in {', '.join(wrong)}")
@@ -61,13 +59,7 @@ def _of_tensors(tensors: dict[str, Tensor]) -> DecodedGaussians:
         if tensor.dtype != torch.float32 or not tensor.isfinite().all():
             raise ValueError(f"{name}: expected finite numbers of single precision")
     model = Gaussians(*(tensors.pop(name) for name in _NAMES))
-    features, background = tensors.pop("features", None), tensors.pop("background")
+    features = tensors.pop("features", None)
     if len(model) == 0:
         raise ValueError("it holds no Gaussians")
-    if background.dim() != 1:
-        raise ValueError(f"background: expected [channels], got {list(background.shape)}")
-    count = len(tensors) // 2
-    layers = tuple((tensors.pop(f"layer.{i}.weight"), tensors.pop(f"layer.{i}.bias")) for i in range(count))
-    if tensors:
-        raise ValueError(f"unexpected {', '.join(sorted(tensors))}")
-    return DecodedGaussians.of(model, PictureNetwork(layers, background), features)
+    return DecodedGaussians.of(model, PictureNetwork.of(tensors), features)

@@ -202,14 +202,12 @@ def _chunks(data: bytes) -> tuple[_Document, bytes]:
     chunks: list[bytes] = []
     at = _HEADER.size
     for kind in (_JSON, _BIN):
-        if at + _CHUNK.size > len(data):
-            raise InputError("not a whole .glb: a chunk is missing")
-        length, name = _CHUNK.unpack_from(data, at)
-        at += _CHUNK.size
-        if name != kind or at + length > len(data):
+        start = at + _CHUNK.size
+        length, name = _CHUNK.unpack_from(data, at) if start <= len(data) else (0, b"")
+        at = start + length
+        if name != kind or at > len(data):
             raise InputError("not a whole .glb: a chunk is missing, cut short, or out of place")
-        chunks.append(data[at : at + length])
-        at += length
+        chunks.append(data[start:at])
     if len(chunks[0]) > _MAX_JSON_BYTES:
         raise InputError(f"expected JSON of at most {_MAX_JSON_BYTES:,} bytes, found {len(chunks[0]):,}")
     try:

@@ -61,9 +61,7 @@ def read(file: BinaryIO) -> Gaussians:
         part = slice(start, start + len(rows))
         means[part], quats[part], log_scales[part] = rows[:, 0:3], rows[:, -4:], rows[:, -7:-4]
         opacity_logits[part], sh[part, 0] = rows[:, -8], rows[:, 3:6]
-        rest = rows[:, 6:-8].reshape(len(rows), 3, k - 1)
-        for color in range(3):
-            sh[part, 1:, color] = rest[:, color]
+        sh[part, 1:] = rows[:, 6:-8].reshape(len(rows), 3, k - 1).transpose(0, 2, 1)
         start = part.stop
     check_not_activated(means[:start], log_scales[:start], opacity_logits[:start])
     arrays = (means, quats, log_scales, opacity_logits, sh)
@@ -128,7 +126,7 @@ def _rows(part: Gaussians) -> Floats:
 
 
 def with_extras(model: Gaussians, source: Any, read: Gaussians) -> Gaussians:
-    """`model` with the extras of the .ply at `source`, from which `read` was read; `model` if there are none.
+    """`model` with the extras of the .ply at `source`, from which `read` was read.
 
     Further properties stay only if it is the Gaussians of `read` in their order, possibly with more Gaussians
     appended, whose properties are 0. Raises InputError.
@@ -155,7 +153,7 @@ def _has_rows_of(model: Gaussians, read: Gaussians) -> bool:
 
 
 def _read_extras(path: Path, count: int) -> _Extras | None:
-    """The extras of a .ply; None if it has none. `count`: its Gaussians in the first read."""
+    """The extras of a .ply, None for a compressed one. `count`: its Gaussians in the first read."""
     with open_input(path) as file, warnings.catch_warnings():
         warnings.simplefilter("ignore", KeyssWarning)  # about Gaussians left out, which the first read gave
         if not is_plain(file):
@@ -168,8 +166,6 @@ def _read_extras(path: Path, count: int) -> _Extras | None:
     values = {name: each for name, each in values.items() if name not in _NORMALS or each.any()}
     if any(len(each) != count for each in values.values()):
         raise InputError(f"{path}: it changed while it was read")
-    if not (values or vertices.comments) and list(order) == _names_with_normals(needed):
-        return None
     return _Extras(tuple(vertices.comments), order, values)
 
 

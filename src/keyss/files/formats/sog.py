@@ -51,34 +51,15 @@ _BROKEN = (
 )
 
 
-class _Images(msgspec.Struct):
-    """Names of image files."""
+class _Part(msgspec.Struct, omit_defaults=True):
+    """The images of an attribute, and what their numbers mean."""
 
-    files: list[str]
-
-
-class _Book(msgspec.Struct):
-    """Images of indices into a codebook."""
-
-    codebook: list[float]
-    files: list[str]
-
-
-class _Means(msgspec.Struct):
-    """Positions: bounds [3], and images of the low and high bytes."""
-
-    mins: list[float]
-    maxs: list[float]
-    files: list[str]
-
-
-class _Harmonics(msgspec.Struct):
-    """A palette of `count` vectors, and each Gaussian's index into it."""
-
-    count: int
-    bands: int
-    codebook: list[float]
-    files: list[str]
+    count: int = 0  # vectors in a palette
+    bands: int = 0  # their SH degree
+    mins: list[float] = []  # [3] bounds of positions, whose images have the low and the high bytes
+    maxs: list[float] = []
+    codebook: list[float] = []
+    files: list[str] = []
 
 
 class _Meta(msgspec.Struct, omit_defaults=True):
@@ -86,11 +67,11 @@ class _Meta(msgspec.Struct, omit_defaults=True):
 
     version: int
     count: int
-    means: _Means
-    scales: _Book
-    quats: _Images
-    sh0: _Book
-    shN: _Harmonics | None = None
+    means: _Part
+    scales: _Part
+    quats: _Part
+    sh0: _Part
+    shN: _Part | None = None
 
 
 class _Version(msgspec.Struct):
@@ -180,14 +161,16 @@ class SogCodes(Codes):
             palette = _rgba(self.palette.reshape(-1, 3))
             files["shN_centroids.webp"] = _encode_webp(palette, _ROW * k, -(-p // _ROW))
             names = ["shN_centroids.webp", "shN_labels.webp"]
-            harmonics = _Harmonics(p, {3: 1, 8: 2, 15: 3}[k], self.sh_codebook.tolist(), names)
+            harmonics = _Part(p, math.isqrt(k), codebook=self.sh_codebook.tolist(), files=names)
         meta = _Meta(
             version=2,
             count=n,
-            means=_Means(self.mins.tolist(), self.maxs.tolist(), ["means_l.webp", "means_u.webp"]),
-            scales=_Book(self.scale_codebook.tolist(), ["scales.webp"]),
-            quats=_Images(["quats.webp"]),
-            sh0=_Book(self.color_codebook.tolist(), ["sh0.webp"]),
+            means=_Part(
+                mins=self.mins.tolist(), maxs=self.maxs.tolist(), files=["means_l.webp", "means_u.webp"]
+            ),
+            scales=_Part(codebook=self.scale_codebook.tolist(), files=["scales.webp"]),
+            quats=_Part(files=["quats.webp"]),
+            sh0=_Part(codebook=self.color_codebook.tolist(), files=["sh0.webp"]),
             shN=harmonics,
         )
         return _pack_archive({**files, "meta.json": msgspec.json.encode(meta)})
@@ -252,8 +235,8 @@ def _no_harmonics(count: int) -> tuple[Floats, Bytes, Shorts]:
 
 def _codebook(values: list[float]) -> Floats:
     """[256] finite numbers, padded with 0. Raises InputError."""
-    if len(values) > SIZE:
-        raise InputError(f"damaged SOG: expected codebooks of at most {SIZE} numbers, found {len(values):,}")
+    if not 1 <= len(values) <= SIZE:
+        raise InputError(f"damaged SOG: expected codebooks of 1 to {SIZE} numbers, found {len(values):,}")
     with np.errstate(over="ignore"):
         numbers = np.pad(np.array(values, np.float64), (0, SIZE - len(values))).astype(np.float32)
     if not np.isfinite(numbers).all():

@@ -11,10 +11,10 @@ import math
 import struct
 import warnings
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, field
-from itertools import pairwise, product
-from typing import Self
+from itertools import product
+from typing import NamedTuple, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -44,8 +44,8 @@ _SETTINGS = ((6, 9, 1 << 32), (6, 8, 1 << 18), *product((6, 9, *range(1, 6), 7, 
 EXTENSIONS = 2  # flag
 _MAX_EXTENSION_BYTES = 1 << 20
 MAX_FRACTIONAL_BITS = 24
-_LEGACY = struct.Struct("<4sIIBBBB")  # magic, version, count, SH degree, fractional bits, flags, reserved
-_HEADER = struct.Struct("<4sIIBBBBI12s")  # ..., flags, number of streams, offset of the table, reserved
+_START = struct.Struct("<4sIIBBBB")  # see `_Header`
+_PLACE = struct.Struct("<I12s")  # after it in version 4: offset of the table, reserved
 _ENTRY = struct.Struct("<QQ")  # compressed and uncompressed bytes of a stream
 _ZSTD_LEVEL = 12  # Niantic's library
 _ZSTD_WINDOW = 1 << 23  # bytes that decoders should support (RFC 8878)
@@ -67,55 +67,51 @@ _MEAN_SIGNS = np.array([1, -1, -1], dtype=np.float32)
 _QUAT_SIGNS = np.array([1, 1, -1, -1], dtype=np.float32)  # wxyz
 
 
-@dataclass(frozen=True)
-class Header:
-    """Header fields common to all versions."""
+class _Header(NamedTuple):
+    """The start of a file, the same in all versions."""
 
+    magic: bytes
     version: int
-    count: int
+    gaussians: int  # number
     sh_degree: int
     fractional_bits: int
     flags: int
-    extensions: bytes
+    streams: int  # 0 before version 4
 
     @property
     def sizes(self) -> list[int]:
         """Bytes in each section: positions, alphas, colours, scales, rotations, harmonics."""
         rotation = 3 if self.version == 2 else 4
-        return [self.count * each for each in (9, 1, 3, 3, rotation, 3 * check_sh_degree(self.sh_degree))]
+        return [self.gaussians * each for each in (9, 1, 3, 3, rotation, 3 * check_sh_degree(self.sh_degree))]
 
-
-def unpack(data: bytes) -> tuple[Header, list[Bytes]]:
-    """The header and the six sections. Raises InputError; allocates no more than `data` can hold."""
-    if data.startswith(GZIP):
-        return _unpack_gzip(data)
-    if data.startswith(NGSP):
-        return _unpack_zstd(data)
-    raise InputError("not an SPZ file: it begins neither as gzip data nor with NGSP")
-
-
-def pack(header: Header, sections: Sequence[bytes], like: bytes = b"") -> bytes:
-    """A file of the six sections, with the compression settings of the file `like`."""
-    common = (NGSP, header.version, header.count, header.sh_degree, header.fractional_bits, header.flags)
-    if header.version < 4:
-        content = _LEGACY.pack(*common, 0) + b"".join(sections) + header.extensions
-        return _gzip(content, like if like.startswith(GZIP) else b"")
-    compressor = zstandard.ZstdCompressor(level=_ZSTD_LEVEL)
-    streams = [(len(each), compressor.compress(each)) for each in sections if each]
-    table = b"".join(_ENTRY.pack(len(packed), size) for size, packed in streams)
-    at = _HEADER.size + len(header.extensions)
-    start = _HEADER.pack(*common, len(streams), at, bytes(12)) + header.extensions
-    return start + table + b"".join(packed for _, packed in streams)
+    @staticmethod
+    def parse(start: bytes, size: int) -> _Header:
+        """The header of a file of `size` bytes. Raises InputError."""
+        if len(start) < _START.size or not start.startswith(NGSP):
+            raise InputError("not a whole SPZ file: it ends inside the header, or does not begin with NGSP")
+        header = _Header._make(_START.unpack_from(start))
+        check_sh_degree(header.sh_degree)
+        check_count(header.gaussians, size)
+        if header.fractional_bits > MAX_FRACTIONAL_BITS:
+            raise InputError(
+                f"expected positions of at most {MAX_FRACTIONAL_BITS} fractional bits, "
+                f"found {header.fractional_bits}"
+            )
+        return header
 
 
 def _gzip(content: bytes, like: bytes) -> bytes:
-    """`content` in gzip, with the header and settings of `like`, else those of Niantic's library.
+    """`content` in gzip, with the header and settings of the file `like`, else those of Niantic's library.
 
     Recompressing a file reveals its settings; other settings would show that it was rewritten.
     """
-    header = like[:_GZIP_BYTES] if like and not like[3] else _GZIP_HEADER
+    header, settings = _GZIP_HEADER, _SETTINGS[0]
+    if like.startswith(GZIP) and not like[3]:  # no optional header fields
+        own = zlib.decompress(like, 31)
+        header = like[:_GZIP_BYTES]
+        settings = next((each for each in _SETTINGS if _is_packed_with(like, own, each)), settings)
     end = struct.pack("<II", zlib.crc32(content), len(content) & 0xFFFFFFFF)
-    return header + b"".join(_deflated(content, *_settings_of(like))) + end
+    return header + b"".join(_deflated(content, *settings)) + end
 
 
 def _deflated(content: bytes, level: int, memory: int, block: int) -> Iterator[bytes]:
@@ -128,16 +124,6 @@ def _deflated(content: bytes, level: int, memory: int, block: int) -> Iterator[b
         yield packer.flush(zlib.Z_FINISH if start + block >= len(content) else zlib.Z_SYNC_FLUSH)
 
 
-def _settings_of(packed: bytes) -> tuple[int, int, int]:
-    """zlib's level and memory, and the block, that reproduce `packed`, else those of Niantic's library."""
-    if packed and not packed[3]:  # no optional header fields
-        content = zlib.decompress(packed, 31)
-        for settings in _SETTINGS:
-            if _is_packed_with(packed, content, settings):
-                return settings
-    return _SETTINGS[0]
-
-
 def _is_packed_with(packed: bytes, content: bytes, settings: tuple[int, int, int]) -> bool:
     at = _GZIP_BYTES
     for part in _deflated(content, *settings):  # wrong settings fail in the first parts
@@ -147,60 +133,50 @@ def _is_packed_with(packed: bytes, content: bytes, settings: tuple[int, int, int
     return True
 
 
-def _unpack_gzip(data: bytes) -> tuple[Header, list[Bytes]]:
+def _unpack_gzip(data: bytes) -> tuple[_Header, bytes, bytes]:
+    """Header, sections and extensions of versions 2 and 3. Raises InputError."""
     stream = zlib.decompressobj(31)
     try:
-        start = stream.decompress(data, _LEGACY.size)
-        if len(start) < _LEGACY.size or not start.startswith(NGSP):
-            raise InputError("not an SPZ file: the gzip data do not hold one")
-        _, version, count, degree, bits, flags, _ = _LEGACY.unpack(start)
-        if version == 1:
-            raise InputError("SPZ of version 1, which was never published; expected 2, 3 or 4")
-        if version not in (2, 3):
-            raise InputError(f"expected SPZ of version 2 or 3 in gzip data, found {version}")
-        header = _check_header(Header(version, count, degree, bits, flags, b""), len(data))
-        limit = sum(header.sizes) + _MAX_EXTENSION_BYTES
-        body = stream.decompress(stream.unconsumed_tail, limit)
+        header = _Header.parse(stream.decompress(data, _START.size), len(data))
+        if header.version not in (2, 3):
+            raise InputError(f"expected version 2 or 3 of SPZ in gzip data, found version {header.version}")
+        size = sum(header.sizes)
+        body = stream.decompress(stream.unconsumed_tail, size + _MAX_EXTENSION_BYTES)
         if not stream.eof:  # zlib checks the trailing checksum in a further call
             body += stream.decompress(stream.unconsumed_tail, 1)
     except zlib.error as error:
         raise InputError(f"damaged SPZ: {reason(error)}") from error
-    size = sum(header.sizes)
     if len(body) < size or not stream.eof:
         found = "cut short" if len(body) < size or not stream.unconsumed_tail else "more than was announced"
-        raise InputError(f"not a whole SPZ: expected {size:,} bytes of {count:,} Gaussians, found {found}")
-    ends = np.cumsum([0, *header.sizes])
-    values = np.frombuffer(body, np.uint8, size)
-    sections = [values[start:end] for start, end in pairwise(ends)]
-    return Header(version, count, degree, bits, flags, body[size:] if flags & EXTENSIONS else b""), sections
+        raise InputError(
+            f"not a whole SPZ: expected {size:,} bytes of {header.gaussians:,} Gaussians, found {found}"
+        )
+    return header, body[:size], body[size:] if header.flags & EXTENSIONS else b""
 
 
-def _unpack_zstd(data: bytes) -> tuple[Header, list[Bytes]]:
-    if len(data) < _HEADER.size:
-        raise InputError("not a whole SPZ: it ends inside the header")
-    _, version, count, degree, bits, flags, streams, at, _ = _HEADER.unpack_from(data)
-    if version != 4:
-        raise InputError(f"expected SPZ of version 4 after NGSP, found {version}")
-    header = _check_header(Header(version, count, degree, bits, flags, data[_HEADER.size : at]), len(data))
-    sizes = header.sizes
-    if streams != sum(size > 0 for size in sizes):
-        raise InputError(f"damaged SPZ: expected {sum(size > 0 for size in sizes)} streams, found {streams}")
-    start = at + streams * _ENTRY.size
-    if at < _HEADER.size or start > len(data):
+def _unpack_zstd(data: bytes) -> tuple[_Header, bytes, bytes]:
+    """Header, sections and extensions of version 4. Raises InputError."""
+    header = _Header.parse(data, len(data))
+    if header.version != 4:
+        raise InputError(f"expected version 4 of SPZ after NGSP, found version {header.version}")
+    sizes = [size for size in header.sizes if size]
+    if header.streams != len(sizes):
+        raise InputError(f"damaged SPZ: expected {len(sizes)} streams, found {header.streams}")
+    at = int.from_bytes(data[_START.size : _START.size + 4], "little")
+    start = at + len(sizes) * _ENTRY.size
+    if at < _START.size + _PLACE.size or start > len(data):
         raise InputError("not a whole SPZ: its table lies outside of it")
-    table = iter(_ENTRY.iter_unpack(data[at:start]))
     sections = []
-    for size in sizes:
-        packed, unpacked = next(table) if size else (0, 0)
+    for size, (packed, unpacked) in zip(sizes, _ENTRY.iter_unpack(data[at:start]), strict=True):
         if unpacked != size or start + packed > len(data):
             raise InputError("not a whole SPZ: its table and its streams do not agree")
-        sections.append(_zstd(data[start : start + packed], size) if size else np.empty(0, np.uint8))
+        sections.append(_zstd(data[start : start + packed], size))
         start += packed
-    return header, sections
+    return header, b"".join(sections), data[_START.size + _PLACE.size : at]
 
 
-def _zstd(packed: bytes, size: int) -> Bytes:
-    """[size] the first bytes of a stream. Raises InputError if it is shorter."""
+def _zstd(packed: bytes, size: int) -> bytes:
+    """The first `size` bytes of a stream. Raises InputError if it is shorter."""
     unpacker = zstandard.ZstdDecompressor(max_window_size=max(_ZSTD_WINDOW, 2 * size))
     try:
         with unpacker.stream_reader(packed) as reader:
@@ -209,18 +185,7 @@ def _zstd(packed: bytes, size: int) -> Bytes:
         raise InputError(f"damaged SPZ: {reason(error)}") from error
     if len(body) != size:
         raise InputError(f"not a whole SPZ: expected a stream of {size:,} bytes, found {len(body):,}")
-    return np.frombuffer(body, np.uint8)
-
-
-def _check_header(header: Header, size: int) -> Header:
-    check_sh_degree(header.sh_degree)
-    check_count(header.count, size)
-    if header.fractional_bits > MAX_FRACTIONAL_BITS:
-        raise InputError(
-            f"expected positions of at most {MAX_FRACTIONAL_BITS} fractional bits, "
-            f"found {header.fractional_bits}"
-        )
-    return header
+    return body
 
 
 @dataclass(frozen=True, eq=False)
@@ -242,13 +207,14 @@ class SpzCodes(Codes):
     rotations: Shorts
     sh: Bytes  # [N, K - 1, 3] harmonics in 128ths from -1 on
     extensions: bytes = b""  # not parsed
-    packed: bytes = field(default=b"", repr=False, compare=False)  # the original file
+    packed: bytes = field(default=b"", repr=False)  # the original file
 
     @classmethod
     def parse(cls, data: bytes) -> Self:
         """See `Codes`."""
-        header, sections = unpack(data)
-        n = header.count
+        header, body, extensions = _unpack_gzip(data) if data.startswith(GZIP) else _unpack_zstd(data)
+        n = header.gaussians
+        sections = np.split(np.frombuffer(body, np.uint8), np.cumsum(header.sizes)[:-1])
         triples = sections[0].reshape(n, 3, 3).astype(np.int32)
         positions = triples[..., 0] | triples[..., 1] << 8 | triples[..., 2] << 16
         positions -= (positions & 0x800000) << 1
@@ -269,7 +235,7 @@ class SpzCodes(Codes):
             largest=largest,
             rotations=rotations,
             sh=sections[5].reshape(n, -1, 3),
-            extensions=header.extensions,
+            extensions=extensions,
             packed=data,
         )
 
@@ -278,14 +244,22 @@ class SpzCodes(Codes):
         n = len(self)
         fixed = self.positions.astype("<i4").view(np.uint8).reshape(n, 3, 4)[..., :3]
         if self.version == 2:
-            rotations = self.rotations.astype(np.uint8).tobytes()
+            rotations = self.rotations.astype(np.uint8)
         else:
             parts = np.bitwise_or.reduce(self.rotations.astype(np.uint32) << _ROTATION_SHIFTS, axis=1)
-            rotations = (self.largest.astype(np.uint32) << 30 | parts).astype("<u4").tobytes()
-        sections = [fixed.tobytes(), self.alphas.tobytes(), self.colors.tobytes(), self.scales.tobytes()]
-        degree = {0: 0, 3: 1, 8: 2, 15: 3}[self.sh.shape[1]]
-        header = Header(self.version, n, degree, self.fractional_bits, self.flags, self.extensions)
-        return pack(header, [*sections, rotations, self.sh.tobytes()], self.packed)
+            rotations = (self.largest.astype(np.uint32) << 30 | parts).astype("<u4")
+        sections = [fixed, self.alphas, self.colors, self.scales, rotations, self.sh]
+        contents = [each.tobytes() for each in sections if each.size]
+        degree, streams = math.isqrt(self.sh.shape[1]), len(contents) if self.version == 4 else 0
+        header = _Header(NGSP, self.version, n, degree, self.fractional_bits, self.flags, streams)
+        start = _START.pack(*header)
+        if self.version < 4:
+            return _gzip(b"".join([start, *contents, self.extensions]), self.packed)
+        compressor = zstandard.ZstdCompressor(level=_ZSTD_LEVEL)
+        packed = [compressor.compress(each) for each in contents]
+        table = [_ENTRY.pack(len(each), len(whole)) for each, whole in zip(packed, contents, strict=True)]
+        place = _PLACE.pack(_START.size + _PLACE.size + len(self.extensions), bytes(12))
+        return b"".join([start, place, self.extensions, *table, *packed])
 
     @classmethod
     def quantise(cls, model: Gaussians, fractional_bits: int | None = None) -> Self:

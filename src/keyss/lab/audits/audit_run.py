@@ -48,7 +48,6 @@ class AuditedRun:
     secrets: tuple[str, ...]
     width: int | None  # pixels, if photos were shrunk
     gaussians: int  # Gaussians of the stego model
-    standard: bool = True  # True if a 3DGS model is published
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -190,7 +189,6 @@ def _nothing_measured(subject: Subject, seeds: Sequence[int]) -> Audit:
             secrets=tuple(secrets),
             width=run.config.views.width,
             gaussians=len(run.stego),
-            standard=subject.standard,
         ),
         controls=tuple(seeds),
         wrong_key=run.metrics.wrong_key,

@@ -40,10 +40,6 @@ def times(value: float | None) -> str:
     return NOTHING if value is None else f"{number(value, 2 if abs(value) < 10 else 0)}×"
 
 
-def integer(value: float | None) -> str:
-    return number(value, 0)
-
-
 def numbered(name: str, index: int, count: int) -> str:
     """A name, numbered if `count` is above 1."""
     return f"{name} {index + 1}" if count > 1 else name

@@ -8,7 +8,8 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
+from itertools import combinations
 from statistics import fmean
 from typing import Any
 
@@ -24,17 +25,17 @@ from keyss.fitting.config import FitConfig
 from keyss.fitting.image_metrics import ImageQuality, mean_quality, subsample_views, view_quality
 from keyss.fitting.plain import fit_scene
 from keyss.lab.auc import Auc
-from keyss.lab.audits.formatting import numbered
 from keyss.lab.distances import AttributeDistance, Sinkhorn3D, against_controls, composite_score, sinkhorn_3d
 from keyss.lab.leaks.attacks import decoder_attack, file_attacks
 from keyss.lab.leaks.leak_scores import AttackResult, look_for_secret
 from keyss.lab.robustness.survival import ChangeResult, measure_robustness
 from keyss.lab.stealth.judging import StealthResult, judge
 from keyss.lab.stegexpose import stegexpose_auc
-from keyss.lab.two_sample import TwoSampleAucs, auc_beside_controls
+from keyss.lab.two_sample import two_sample_auc
 from keyss.measure.hide_quality import in_cover
 from keyss.measure.renders import renders_of, select_views
 from keyss.methods import registry
+from keyss.methods.base import role_of
 from keyss.progress import Reporter
 from keyss.rendering import render
 from keyss.runs.files import CONTROLS
@@ -97,6 +98,12 @@ class Subject:
         _, *models = self.run.baselines()
         return [None if model is None else model.to(self.device) for model in models]
 
+    @property
+    def shown(self) -> list[tuple[Scene, Gaussians, Gaussians | None]]:
+        """The scene, the model and the plain model of the cover and of each secret."""
+        models, plains = [self.stego, *self.revealed], [self.original, *self.baselines]
+        return list(zip(self.scenes, models, plains, strict=True))
+
     def fit_controls(self, seeds: Sequence[int], folder: RunFolder, reporter: Reporter) -> None:
         """Fit plain models of the cover with these seeds; they are kept in the run's `folder` for reuse.
 
@@ -105,8 +112,8 @@ class Subject:
         config, count = self.run.config.options.fit, len(self.original)
         if self.run.config.models_given[0]:  # the run's maximum is not for this model
             config = replace(config, max_gaussians=max(count, 16))
-        models = [self._fit_control(replace(config, seed=seed), folder, reporter) for seed in seeds]
-        self.controls = [model.to(self.device) for model in models]
+        configs = [replace(config, seed=seed) for seed in seeds]
+        self.controls = [self._fit_control(each, folder, reporter).to(self.device) for each in configs]
 
     def _fit_control(self, config: FitConfig, folder: RunFolder, reporter: Reporter) -> Gaussians:
         """Fit a plain model of the cover, or read it from the run's folder."""
@@ -147,8 +154,8 @@ class ModelImages:
     photos: bool  # False: test views are renders of a given model
     images: ImageComparison
     gaussians: int
-    baseline: ImageComparison | None  # plain model; None without one, like `baseline_gaussians`
-    baseline_gaussians: int | None
+    baseline: ImageComparison | None = None  # plain model; None without one, like `baseline_gaussians`
+    baseline_gaussians: int | None = None
 
 
 @dataclass(frozen=True)
@@ -157,6 +164,15 @@ class ImagesResult:
 
     models: tuple[ModelImages, ...]  # cover, then secrets
     pictures: dict[str, dict[str, str]]  # files of PICTURES by view and by model
+
+
+@dataclass(frozen=True)
+class TwoSampleAucs:
+    """Classifier AUCs of the stego model and of plain models."""
+
+    stego: tuple[Auc, ...]  # each control against the stego model
+    control: tuple[Auc, ...]  # each pair of controls: seed-to-seed variation
+    original: tuple[Auc, ...]  # each control against the cover's own plain model
 
 
 @dataclass(frozen=True)
@@ -200,46 +216,38 @@ def part_progress(reporter: Reporter, title: str) -> Iterator[Progress]:
 
     try:
         yield show
-        if total:
-            reporter.update(total, 0, {})
+        reporter.update(total, 0, {})
     finally:
-        if total:
-            reporter.finish()
+        reporter.finish()
 
 
 def images(subject: Subject, seed: int, progress: Progress) -> tuple[ImagesResult, Pictures]:
     """Compare cover and secrets with the test views, and plain models as baselines; keep some images."""
-    models = [subject.stego, *subject.revealed]
-    plains = [subject.original, *subject.baselines]
     results = []
     files: dict[str, dict[str, str]] = {}
     pictures: Pictures = {}
-    for index, (scene, model, plain) in enumerate(zip(subject.scenes, models, plains, strict=True)):
-        progress(index, len(models))
-        name = numbered("secret", index - 1, len(models) - 1) if index else "cover"
-        has_photos = subject.run.metrics.photos[index]
+    for index, (scene, model, plain) in enumerate(subject.shown):
+        progress(index, len(subject.scenes))
+        name, has_photos = role_of(index, len(subject.scenes)), subject.run.metrics.photos[index]
         own = renders_of(model, scene, scene.test)
+        result = ModelImages(name, has_photos, _compare(own, scene), len(model))
         shown = {
-            "photo" if has_photos else "given model": [view.image for view in scene.test],
-            "revealed" if index else "stego model": [image for _, image in own],
+            "photo" if has_photos else "given model": [(view.camera.name, view.image) for view in scene.test],
+            "revealed" if index else "stego model": own,
         }
-        baseline = None
         if plain is not None:
-            renders = renders_of(plain, scene, scene.test)
-            shown["plain model"] = [image for _, image in renders]
-            baseline = _compare(renders, scene)
+            shown["plain model"] = renders = renders_of(plain, scene, scene.test)
+            result = replace(result, baseline=_compare(renders, scene), baseline_gaussians=len(plain))
         if index:
             placed = subject.in_cover[index - 1]
-            renders = renders_of(subject.stego, placed, placed.test)
-            shown["without the key"] = [image for _, image in renders]
-        size = None if plain is None else len(plain)
-        results.append(ModelImages(name, has_photos, _compare(own, scene), len(model), baseline, size))
+            shown["without the key"] = renders_of(subject.stego, placed, placed.test)
+        results.append(result)
         for view in range(len(own))[:: -(-len(own) // PICTURED_VIEWS)]:
             title = f"{name.capitalize()}, {own[view][0]}"
             files[title] = {}
             for label, images in shown.items():
                 file = f"{name}-{view + 1}-{label}.png".replace(" ", "-")
-                pictures[file] = images[view]
+                _, pictures[file] = images[view]
                 files[title][label] = file
     return ImagesResult(tuple(results), files), pictures
 
@@ -254,37 +262,48 @@ def parameters(subject: Subject, seed: int, progress: Progress) -> tuple[Paramet
     """Distances of the parameters from plain models: published 3D-Sinkhorn, Wasserstein, a classifier."""
     original, stego, controls = subject.original, subject.stego, subject.controls
     progress(0, 3)
-    sinkhorn = sinkhorn_3d(original, stego)
+    sinkhorn, score = published_distance(subject, stego)
     between = tuple(sinkhorn_3d(original, control) for control in controls)
-    quality = subject.run.metrics
-    secret_psnr = fmean(secret.psnr for secret in quality.secrets)
-    score = composite_score(quality.cover.psnr, secret_psnr, sinkhorn.sum)
     progress(1, 3)
     distances = against_controls(stego, controls, original=original, seed=seed)
     progress(2, 3)
-    two_sample = auc_beside_controls(stego, controls, original, seed=seed)
+    auc = partial(two_sample_auc, seed=seed)
+    two_sample = TwoSampleAucs(
+        stego=tuple(auc(control, stego) for control in controls),
+        control=tuple(auc(*pair) for pair in combinations(controls, 2)),
+        original=tuple(auc(control, original) for control in controls),
+    )
     return ParametersResult(sinkhorn, between, score, distances, two_sample), {}
 
 
+def published_distance(subject: Subject, stego: Gaussians) -> tuple[Sinkhorn3D, float]:
+    """3D-Sinkhorn from the cover's plain model to `stego`, and the composite score."""
+    distance, metrics = sinkhorn_3d(subject.original, stego), subject.run.metrics
+    secret = fmean(each.psnr for each in metrics.secrets)
+    return distance, composite_score(metrics.cover.psnr, secret, distance.sum)
+
+
 def stealth(subject: Subject, seed: int, progress: Progress) -> tuple[StealthResult, Pictures]:
-    """Compare statistics of the file with plain models, and try to confirm guessed secrets."""
+    """Compare statistics of the file with plain models."""
     progress(0, 1)
-    baselines, original = subject.baselines, subject.original
-    return judge(subject.stego, subject.controls, original=original, candidates=baselines), {}
+    return judge(subject.stego, subject.controls, original=subject.original), {}
 
 
 def stegexpose(subject: Subject, seed: int, progress: Progress) -> tuple[StegExposeResult, Pictures]:
     """StegExpose on renders of the stego model and of plain models."""
+    progress(0, 1)
+    return StegExposeResult(*stegexpose_aucs(subject, [subject.stego, subject.controls[1]])), {}
+
+
+def stegexpose_aucs(subject: Subject, models: Sequence[Gaussians]) -> list[Auc]:
+    """AUCs of StegExpose between renders of the first control and of each of the models."""
     cover = subject.scenes[0]
     views = select_views(cover.views)
-    models = (subject.controls[0], subject.stego, subject.controls[1])
-    plain, stego, control = (
-        [image.numpy() for _, image in renders_of(model, cover, views)] for model in models
+    plain, *others = (
+        [image.numpy() for _, image in renders_of(model, cover, views)]
+        for model in (subject.controls[0], *models)
     )
-    progress(0, 2)
-    auc = stegexpose_auc(plain, stego)
-    progress(1, 2)
-    return StegExposeResult(auc, stegexpose_auc(plain, control)), {}
+    return [stegexpose_auc(plain, renders) for renders in others]
 
 
 def leaks(
@@ -307,11 +326,8 @@ def leaks(
 
 def robustness(subject: Subject, seed: int, progress: Progress) -> tuple[tuple[ChangeResult, ...], Pictures]:
     """PSNR loss of the cover and the secrets when the stego model changes."""
-    cover, *secrets = subject.scenes
-    rows = measure_robustness(
-        subject.stego, subject.run.openers, cover, secrets, seed=seed, progress=progress
-    )
-    return tuple(rows), {}
+    openers, scenes = subject.run.openers, subject.scenes
+    return tuple(measure_robustness(subject.stego, openers, scenes, seed=seed, progress=progress)), {}
 
 
 @torch.no_grad()
@@ -337,14 +353,19 @@ def measure_render_time(model: Gaussians, plain: Gaussians, scene: Scene, *, rou
 
 def speed(subject: Subject, seed: int, progress: Progress) -> tuple[dict[str, RenderTime], Pictures]:
     """Rendering times of the stego model and of the revealed secrets."""
-    models = [subject.stego, *subject.revealed]
-    plains = [subject.original, *subject.baselines]
-    found: dict[str, RenderTime] = {}
-    for index, (scene, model, plain) in enumerate(zip(subject.scenes, models, plains, strict=True)):
-        progress(index, len(models))
-        name = numbered("secret", index - 1, len(models) - 1) if index else "stego model"
-        found[name] = measure_render_time(model, model if plain is None else plain, scene)
-    return found, {}
+    progress(0, 1)
+    times = render_times(subject, subject.stego)
+    names = ["stego model", *(role_of(index, len(times)) for index in range(1, len(times)))]
+    return dict(zip(names, times, strict=True)), {}
+
+
+def render_times(subject: Subject, stego: Gaussians, *, rounds: int = 15) -> list[RenderTime]:
+    """The render times of `stego` and of the revealed secrets; without a plain model, beside themselves."""
+    (cover, _, original), *secrets = subject.shown
+    return [
+        measure_render_time(model, model if plain is None else plain, scene, rounds=rounds)
+        for scene, model, plain in [(cover, stego, original), *secrets]
+    ]
 
 
 NEED_A_3DGS_MODEL = frozenset({"parameters", "stealth", "leaks", "robustness"})

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import hashlib
+import re
 from base64 import b64encode
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import partial
 from importlib.resources import files
 from pathlib import Path, PurePath
@@ -87,10 +87,7 @@ def _policy(script: str) -> str:
 
 def prose(sentence: str) -> Markup:
     """Format text with `backquotes` as code."""
-    parts = enumerate(sentence.split("`"))
-    return Markup("").join(
-        Markup("<code>{}</code>").format(each) if i % 2 else escape(each) for i, each in parts
-    )
+    return Markup(re.sub("`(.*?)`", r"<code>\1</code>", escape(sentence)))
 
 
 def _title(audit: Audit) -> str:
@@ -114,20 +111,15 @@ def _asset(name: str) -> str:
     return files("keyss.lab.audits").joinpath("assets", name).read_text(encoding="utf-8")
 
 
-@dataclass(frozen=True)
-class EmbeddedPicture:
-    """A picture inside a page."""
+def embed_picture(folder: Path, name: str) -> dict[str, int | str]:
+    """Width and height of a picture in pixels, and its data as an URL.
 
-    width: int  # pixels
-    height: int
-    url: str  # data:
-
-
-def embed_picture(folder: Path, name: str) -> EmbeddedPicture:
-    """Read a picture. Raises InputError if it is outside the folder, missing, unreadable or too large."""
+    Raises InputError if it is outside the folder, missing, unreadable or too large.
+    """
     path = folder / name
     if name != PurePath(name).name or path.is_symlink():
         raise InputError(f"expected a picture in {folder}, found {name!r}")
     data = read_file(path, _MAX_PICTURE)
     width, height, _ = probe_image(path)
-    return EmbeddedPicture(width, height, "data:image/png;base64," + b64encode(data).decode())
+    url = "data:image/png;base64," + b64encode(data).decode()
+    return {"width": width, "height": height, "url": url}

@@ -130,7 +130,6 @@ def _leaks(audit: Audit) -> Iterator[Verdict]:
 
 
 def _stealth(audit: Audit) -> Iterator[Verdict]:
-    """Verdicts on statistics of the file, and on confirming a guess of a secret."""
     result = audit.stealth
     if result is None or not result.statistics:
         return
@@ -139,13 +138,6 @@ def _stealth(audit: Audit) -> Iterator[Verdict]:
     word = _word(result.least >= min(UNUSUAL, result.least_of_controls))
     value = f"p = {significant(result.least)} ({result.statistics[0].name})"
     yield Verdict("the file by itself", value, beside, limit, word, "stealth")
-    scores = [score for scores in result.confirmations for score in scores or ()]
-    if scores:
-        likeliest = min(scores, key=lambda score: score.p)
-        p = result.least_confirmation
-        value, beside = f"p = {significant(p)} ({likeliest.name})", "plain models of the cover"
-        limit, word = f"at least {UNUSUAL}", _word(p >= UNUSUAL)
-        yield Verdict("guessing the secret", value, beside, limit, word, "stealth")
 
 
 def _distances(audit: Audit) -> Iterator[Verdict]:

@@ -14,18 +14,14 @@ from statistics import fmean
 from keyss.channels import is_appended
 from keyss.core.errors import UsageError, import_extra
 from keyss.core.gaussians import Gaussians
-from keyss.core.picture_network import DecodedGaussians
 from keyss.lab.audits import PARTS
 from keyss.lab.audits.audit_run import EXTRA
-from keyss.lab.audits.parts import Subject, measure_render_time
-from keyss.lab.distances import composite_score, sinkhorn_3d
+from keyss.lab.audits.parts import Subject, published_distance, render_times, stegexpose_aucs
 from keyss.lab.robustness.changes import Change, opacity_pruning, purification, random_pruning
 from keyss.lab.robustness.converters import converters
-from keyss.lab.robustness.survival import measure_robustness
+from keyss.lab.robustness.survival import ChangedQuality, measure_robustness
 from keyss.lab.stealth.judging import judge
-from keyss.lab.stegexpose import stegexpose_auc
 from keyss.lab.two_sample import two_sample_auc
-from keyss.measure.renders import renders_of, select_views
 from keyss.runs.files import COMPANIONS, stego_in
 
 Numbers = dict[str, float | str]
@@ -36,6 +32,7 @@ _GIVEN_UP = 0.01  # fraction of the blending weight in the cover's views that pu
 CONVERSIONS = {".spz": "gsply", "compressed .ply": "splat-transform"}  # format and the program that writes it
 _EVERY_VIEW = 10**6
 _ROUNDS = 5  # repetitions when timing renders
+_WHOLE = "whole"  # the unchanged model
 _ROLES = ("cover", "secret")
 _ATTRIBUTES = {"opacity": "op", "scale": "sc", "rotation": "ro", "position": "xyz", "colour": "sh"}
 
@@ -56,13 +53,9 @@ def rendering(subject: Subject) -> Numbers:
 
 def pictures(subject: Subject, stego: Gaussians | None = None) -> Numbers:
     """Speed of rendering the published model (or `stego`) and the first secret."""
-    stego, plains = subject.stego if stego is None else stego, subject.run.plain_models()
+    times = render_times(subject, subject.stego if stego is None else stego, rounds=_ROUNDS)
     found: Numbers = {}
-    for role, model, plain, scene in zip(
-        _ROLES, [stego, subject.revealed[0]], plains, subject.scenes, strict=False
-    ):
-        beside = model if plain is None else plain.to(model.device)
-        time = measure_render_time(model, beside, scene, rounds=_ROUNDS)
+    for role, time in zip(_ROLES, times, strict=False):
         found |= {f"pictures/s, {role}": 1 / time.seconds, f"time over 3DGS, {role}": time.ratio}
     return found
 
@@ -73,12 +66,8 @@ def secrecy(subject: Subject) -> Numbers:
     AUC of StegExpose on renders and, if a 3DGS model is published, mean AUC of trees that separate its
     Gaussians from the controls', and minimum p-value of its statistics, corrected for their number.
     """
-    cover, stego, controls = subject.scenes[0], subject.stego, subject.controls
-    views = select_views(cover.views)
-    renders = [
-        [image.numpy() for _, image in renders_of(model, cover, views)] for model in (controls[0], stego)
-    ]
-    found: Numbers = {"stegexpose": stegexpose_auc(*renders).auc}
+    stego, controls = subject.stego, subject.controls
+    found: Numbers = {"stegexpose": stegexpose_aucs(subject, [stego])[0].auc}
     if subject.standard:
         found["stealth"] = judge(stego, controls).least
         with suppress(UsageError):  # too few Gaussians, or all in a corner
@@ -93,11 +82,8 @@ def survival(subject: Subject) -> Numbers:
     if subject.standard:
         changes |= {format: tools[format, tool].change() for format, tool in CONVERSIONS.items()}
         changes["purified"] = purification(subject.scenes[0], _GIVEN_UP)
-    found = _psnr_after(subject, changes)
-    before = {role: found.pop(f"whole, {role}") for role in _ROLES}
-    for name, value in found.items():
-        if not isinstance(value, str):
-            found[name] = value - float(before[name.rpartition(", ")[2]])
+    found = _after(subject, changes, lambda quality: 0.0 - quality.loss)
+    found = {name: value for name, value in found.items() if not name.startswith(_WHOLE)}
     if not subject.standard:
         found |= dict.fromkeys((*CONVERSIONS, "purified"), "the method publishes no 3DGS model")
     return found
@@ -111,39 +97,34 @@ def pruning(subject: Subject) -> Numbers:
         for how, change in kinds.items()
         for share in PRUNED_SHARES
     }
-    return _psnr_after(subject, changes, _EVERY_VIEW)
+    return _after(subject, changes, lambda quality: quality.psnr, _EVERY_VIEW)
 
 
-def _psnr_after(subject: Subject, changes: Mapping[str, Change], max_views: int = 8) -> Numbers:
-    """PSNR of cover and first secret after changes, by name; none for lost secrets.
+def _after(
+    subject: Subject,
+    changes: Mapping[str, Change],
+    number: Callable[[ChangedQuality], float],
+    max_views: int = 8,
+) -> Numbers:
+    """A number of the quality of cover and first secret after changes, by name; none for lost secrets.
 
-    The name of the unchanged model is `whole`.
+    The first name is that of the unchanged model.
     """
-    cover, *secrets = subject.scenes
-    results = measure_robustness(
-        subject.stego,
-        subject.run.openers,
-        cover,
-        secrets,
-        changes=list(changes.values()),
-        max_views=max_views,
-    )
+    openers, every = subject.run.openers, list(changes.values())
+    results = measure_robustness(subject.stego, openers, subject.scenes, changes=every, max_views=max_views)
     found: Numbers = {}
-    for name, result in zip(["whole", *changes], results, strict=True):
+    for name, result in zip([_WHOLE, *changes], results, strict=True):
         if result.skipped is not None:
             found[name] = result.skipped
         for role, quality in zip(_ROLES, (result.cover, *result.secrets), strict=False):
             if quality is not None and quality.opens:
-                found[f"{name}, {role}"] = quality.psnr
+                found[f"{name}, {role}"] = number(quality)
     return found
 
 
 def sinkhorn(subject: Subject) -> Numbers:
     """3D-Sinkhorn from the cover's plain model to the published one: sum, attributes, composite score."""
-    distances = sinkhorn_3d(subject.original, own_gaussians(subject.stego))
-    metrics = subject.run.metrics
-    secret = fmean(each.psnr for each in metrics.secrets)
-    score = composite_score(metrics.cover.psnr, secret, distances.sum)
+    distances, score = published_distance(subject, own_gaussians(subject.stego))
     found: Numbers = {f"sinkhorn {short}": getattr(distances, name) for name, short in _ATTRIBUTES.items()}
     return found | {"sinkhorn": distances.sum, "score": score}
 
@@ -164,15 +145,16 @@ def check_extras(measures: Iterable[str]) -> None:
 
 def own_gaussians(stego: Gaussians) -> Gaussians:
     """A published model without appended Gaussians."""
-    return stego if isinstance(stego, DecodedGaussians) else stego[~is_appended(stego)]
+    return stego[~is_appended(stego)]
 
 
 def spare_appended(change: Change) -> Change:
     """The change without appended Gaussians."""
 
     def apply(model: Gaussians) -> Gaussians:
-        if isinstance(model, DecodedGaussians) or not bool(is_appended(model).any()):
+        appended = is_appended(model)
+        if not bool(appended.any()):
             return change(model)
-        return Gaussians.cat([change(own_gaussians(model)), model[is_appended(model)]])
+        return Gaussians.cat([change(model[~appended]), model[appended]])
 
     return replace(change, apply=apply)

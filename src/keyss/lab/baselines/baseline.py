@@ -22,7 +22,7 @@ from keyss.methods.hidden import Frame, HiddenScene
 from keyss.methods.keyss.training import KeyssTraining, Picture, PlacedScene
 from keyss.methods.tensors import Header, pack_tensors, refuse_damage, unpack_tensors
 
-FORMAT, VERSION = "keyss-baseline", 1
+FORMAT, VERSION = "keyss-baseline", 2
 DAMAGED = "the companion file is damaged"
 
 
@@ -50,12 +50,14 @@ class CompanionTensors:
         """Read a payload. Raises InputError for other data."""
         with refuse_damage(DAMAGED):
             header, tensors = unpack_tensors(payload.data, _Header, FORMAT, VERSION)
+            if any(each.dtype != torch.float32 for each in tensors.values()):
+                raise ValueError("expected numbers of single precision")
         return CompanionTensors(tensors, header.frame, header.rows)
 
     def take(self, names: Iterable[str]) -> list[Tensor]:
         """The tensors of these names. Raises InputError for others, and for missing ones."""
-        expected = dict.fromkeys(names, torch.float32)
-        if expected != {name: value.dtype for name, value in self.tensors.items()}:
+        expected = list(names)
+        if set(expected) != self.tensors.keys():
             found = ", ".join(sorted(self.tensors))[:200]
             raise InputError(f"{DAMAGED}: expected {', '.join(expected)}, found {found}")
         return [self.tensors[name] for name in expected]
@@ -97,9 +99,6 @@ class BaselineTraining(KeyssTraining):
 
     options: BaselineOptions
 
-    def __init__(self, scenes: Sequence[PlacedScene], options: BaselineOptions, device: torch.device) -> None:
-        super().__init__(scenes, [], options, device)
-
     @abstractmethod
     def prepare(self, start: Gaussians) -> None:
         """Add parameters (`add`) and networks (`networks`); their random numbers are the run's own."""
@@ -120,11 +119,6 @@ class BaselineTraining(KeyssTraining):
     def opacity_for_pruning(self) -> Tensor:
         """[N] maximum opacity over the scenes."""
         return self.parameters["opacities"].detach().sigmoid()
-
-    @property
-    def frame(self) -> Similarity:
-        """Secret frame to cover frame."""
-        return self.scenes[1].frame
 
     def visible(self) -> Tensor:
         """[N] True for Gaussians above the opacity limit of pruning; all True if none is."""
@@ -161,7 +155,7 @@ class Baseline:
         training = self.training
         assert training is not None
         sources = [cover, *secrets]
-        run = training(PlacedScene.all_of(sources), options, context.device)
+        run = training(PlacedScene.all_of(sources), [], options, context.device)
         run.train(sources, context)
         return self.stego(*run.result(), run.iterations)
 

@@ -12,11 +12,11 @@ import torch
 
 from keyss.core.errors import InputError
 from keyss.core.gaussians import SH_C0, Gaussians
-from keyss.core.picture_network import DecodedGaussians
+from keyss.core.picture_network import DecodedGaussians, PictureNetwork
 from keyss.core.scene import Camera
 from keyss.lab.baselines.baseline import Baseline, BaselineTraining, CompanionTensors, Show
 from keyss.lab.baselines.baseline_options import GsHiderOptions
-from keyss.lab.baselines.picture_decoder import Convolutions, network_of, network_tensors
+from keyss.lab.baselines.picture_decoder import Convolutions
 from keyss.methods.base import Capabilities
 from keyss.methods.keyss.training import Picture
 from keyss.rendering import decode_picture, render_features
@@ -57,11 +57,11 @@ class GsHiderTraining(BaselineTraining):
         )
         features = self.parameters["features"].detach()[visible].cpu()
         stego = DecodedGaussians.of(self.gaussians().detach()[visible].to("cpu"), cover, features)
-        return stego, CompanionTensors(network_tensors(secret), self.frame)
+        return stego, CompanionTensors(secret.tensors(), self.scenes[1].frame)
 
 
 def _open(companion: CompanionTensors) -> Show:
-    network = network_of(companion)
+    network = PictureNetwork.of(companion.tensors)
 
     def show(stego: Gaussians) -> Gaussians:
         if not isinstance(stego, DecodedGaussians) or stego.features is None:

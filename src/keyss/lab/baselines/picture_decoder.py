@@ -41,21 +41,6 @@ class Convolutions(torch.nn.Module):
         return PictureNetwork(tuple(zip(weights[::2], weights[1::2], strict=True)), background)
 
 
-def network_tensors(network: PictureNetwork) -> dict[str, Tensor]:
-    """The tensors of a network by name."""
-    tensors = {"background": network.background}
-    for index, (weight, bias) in enumerate(network.layers):
-        tensors |= {f"weight.{index}": weight, f"bias.{index}": bias}
-    return tensors
-
-
-def network_of(companion: CompanionTensors) -> PictureNetwork:
-    """Read a network from `network_tensors`. Raises InputError, ValueError and TypeError for damage."""
-    names = [f"{kind}.{index}" for index in range(LAYERS) for kind in ("weight", "bias")]
-    background, *rest = companion.take(["background", *names])
-    return PictureNetwork(tuple(zip(rest[::2], rest[1::2], strict=True)), background)
-
-
 class DecoderTraining(BaselineTraining):
     """The training of plain Gaussians and a network."""
 
@@ -74,13 +59,11 @@ class DecoderTraining(BaselineTraining):
     def result(self) -> tuple[Gaussians, CompanionTensors]:
         network = self.network.network(self.backgrounds[0])
         stego = to_gaussians(self.parameters).detach()[self.visible()].to("cpu")
-        return stego, CompanionTensors(network_tensors(network), self.frame)
+        return stego, CompanionTensors(network.tensors(), self.scenes[1].frame)
 
 
 def _open(companion: CompanionTensors) -> Show:
-    network = network_of(companion)
-    if len(network.background) != 3:
-        raise ValueError("expected a network for pictures in colour")
+    network = PictureNetwork.of(companion.tensors)
     return lambda stego: DecodedGaussians.of(stego, network)
 
 

@@ -36,7 +36,7 @@ class ShTraining(BaselineTraining):
     def result(self) -> tuple[Gaussians, CompanionTensors]:
         visible, secret_sh = self.visible(), self.parameters[_NAMES[1]].detach()
         stego = to_gaussians(self.parameters).detach()[visible].to("cpu")
-        return stego, CompanionTensors({_NAMES[1]: secret_sh[visible]}, self.frame, rows=len(stego))
+        return stego, CompanionTensors({_NAMES[1]: secret_sh[visible]}, self.scenes[1].frame, rows=len(stego))
 
 
 def _open(companion: CompanionTensors) -> Show:

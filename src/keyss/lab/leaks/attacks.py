@@ -98,8 +98,9 @@ def decoder_attack(
         generator = torch.Generator().manual_seed(seed)
         embeddings = {"random": random_embeddings(restarts, generator, key_size)}
         for name, balance in (("most exchange", 2.0), ("most change", 0.0)):
-            search = partial(search_embeddings, decode, model, key_size, limit=SEARCH_SAMPLE, balance=balance)
-            embeddings[name] = search(restarts=restarts, steps=steps, seed=seed)
+            embeddings[name] = search_embeddings(
+                decode, model, key_size, restarts=restarts, steps=steps, balance=balance, seed=seed
+            )
         for name, vectors in embeddings.items():
             for index, embedding in enumerate(vectors, start=1):
                 yield f"{name}, {index}", decode(model, embedding)
@@ -119,7 +120,6 @@ def search_embeddings(
     *,
     restarts: int = 8,
     steps: int = 150,
-    limit: int = 4000,
     balance: float = 2.0,
     seed: int = 0,
 ) -> Tensor:
@@ -131,13 +131,13 @@ def search_embeddings(
     some Gaussians visible and others invisible replaces a scene; only adding or removing them does not.
     `balance=0` counts all changes, and finds secrets with more Gaussians than the cover.
 
-    Decodes a random subset of `limit` Gaussians, without appended ones. Returns the random starts if the
-    decoded opacities have no gradient in the embedding.
+    Decodes a random subset of SEARCH_SAMPLE Gaussians, without appended ones. Returns the random starts if
+    the decoded opacities have no gradient in the embedding.
     """
     generator = torch.Generator().manual_seed(seed)
     part = stego.detach()[~is_appended(stego)]
-    if len(part) > limit:
-        part = part[torch.randperm(len(part), generator=generator)[:limit].to(stego.device)]
+    if len(part) > SEARCH_SAMPLE:
+        part = part[torch.randperm(len(part), generator=generator)[:SEARCH_SAMPLE].to(stego.device)]
 
     def exchange(direction: Tensor) -> Tensor:
         change = decode(part, F.normalize(direction, dim=0)).opacities - part.opacities

@@ -165,10 +165,7 @@ def look_for_secret(
         best = max(leaks, key=lambda label: leaks[label].evidence())
         scores, picture = variants[best]
         results.append(AttackResult(attack.name, attack.sentence, best, scores, leaks[best]))
-        pictures[attack.name] = _side_by_side([picture, of_controls[0][best][1], views[0].image])
+        images = [picture, of_controls[0][best][1], views[0].image.cpu()]
+        padded = [F.pad(image, (0, 0, 0, _GAP), value=255) for image in images]  # white gaps
+        pictures[attack.name] = torch.cat(padded, dim=1)[:, :-_GAP]
     return results, pictures
-
-
-def _side_by_side(images: Sequence[Tensor]) -> Tensor:
-    """The images [H, W, 3] side by side, with white gaps."""
-    return torch.cat([F.pad(image.cpu(), (0, 0, 0, _GAP), value=255) for image in images], dim=1)[:, :-_GAP]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import os
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -12,7 +11,6 @@ from statistics import fmean
 from typing import Any
 
 import numpy as np
-from PIL import Image
 
 from keyss._version import __version__
 from keyss.core import UsageError, ViewOptions
@@ -167,7 +165,7 @@ def compare(
     write_record(folder.out / f"{STEM}.json", found)
     names = [os.path.basename(scene) for scene in scenes]
     done = {each: outcomes[place] for each, place in places.items() if outcomes[place].result}
-    numbers = [TrialNumbers.of(each, {"method": name}, names, seed) for (name, seed), each in done.items()]
+    numbers = [TrialNumbers({"method": name}, names, seed, each) for (name, seed), each in done.items()]
     write_scene_tables(folder.out, STEM, numbers)
     runs = {
         name: opened_run(folder.trials[each.folder], each.folder)
@@ -175,9 +173,7 @@ def compare(
         if seed == seeds[0]
     }
     if runs:
-        picture = io.BytesIO()
-        comparison_sheet(runs, device).save(picture, "PNG", optimize=True)
-        write_bytes(folder.out / f"{STEM}.png", picture.getvalue())
+        write_bytes(folder.out / f"{STEM}.png", comparison_sheet(runs, device))
     return found
 
 
@@ -229,8 +225,8 @@ def _row(name: str, outcomes: Sequence[Outcome], folder: TrialFolder) -> Compare
     return replace(row, numbers=numbers, notes=results[0].notes)
 
 
-def comparison_sheet(runs: Mapping[str, HidingRun], device: Backend) -> Image.Image:
-    """A picture with a row per method: cover, secret and its error (times 4) from the middle test camera."""
+def comparison_sheet(runs: Mapping[str, HidingRun], device: Backend) -> bytes:
+    """A PNG file with a row per method: cover, secret and its error (times 4) from the middle test camera."""
     target = resolve_device(device)
     rows: dict[str, Sequence[Bytes]] = {}
     for name, run in runs.items():

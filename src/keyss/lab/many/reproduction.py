@@ -22,7 +22,7 @@ from keyss.core.errors import did_you_mean
 from keyss.lab.many.option_changes import with_changes
 from keyss.lab.many.result_tables import TrialNumbers, write_scene_tables
 from keyss.lab.many.trial_folder import Forecast, TrialFolder
-from keyss.methods import MethodOptions, registry
+from keyss.methods import registry
 from keyss.progress import Reporter
 from keyss.rendering import Backend
 from keyss.rendering.orbit import is_model
@@ -71,11 +71,6 @@ class Table(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     def secrets(self) -> int:
         """Number of secrets in a group of scenes."""
         return max(run.secrets for run in self.runs.values())
-
-    @property
-    def published(self) -> list[str]:
-        """All measures with published figures."""
-        return list(dict.fromkeys(measure for run in self.runs.values() for measure in run.figures))
 
     @property
     def groups(self) -> tuple[Group, ...]:
@@ -168,7 +163,9 @@ def reproduce(
     folder = TrialFolder(Path(out), common={"views": ViewOptions(sizes["width"]), "device": device})
     places: dict[Path, tuple[str, Group, int]] = {}
     for group, (name, run), seed in product(groups, spec.runs.items(), seeds):
-        options = _options(run).with_fit(**changes, seed=seed)
+        preset = registry.get(run.method).options.preset("full")
+        design = {"design": "published"} if run.method == "keyss" else {}
+        options = with_changes(preset, {**design, **run.changes}).with_fit(**changes, seed=seed)
         shown = group[: run.secrets + 1]
         sources = [paths[scene] for scene in shown]
         models = [folder.plain(source, options.fit) for source in sources]
@@ -183,7 +180,7 @@ def reproduce(
         if (result := outcomes[place].result) is not None:
             numbers[name].append(_numbers(result.numbers))
             labels = {"run": name, "pair": "-".join(shown)}
-            rows.append(TrialNumbers.of(outcomes[place], labels, shown, seed))
+            rows.append(TrialNumbers(labels, shown, seed, outcomes[place]))
     covers = [cover for cover, *_ in groups] if full else []
     figures = figure_rows(spec, numbers, len(groups) * len(seeds), covers)
     measured = {row.label: row.here for row in figures}
@@ -200,13 +197,6 @@ def reproduce(
     order = list(spec.runs)
     write_scene_tables(folder.out, table, sorted(rows, key=lambda row: order.index(row.labels["run"])))
     return reproduction
-
-
-def _options(run: Run) -> MethodOptions:
-    """The paper's settings with the changes of the run."""
-    preset = registry.get(run.method).options.preset("full")
-    design = {"design": "published"} if run.method == "keyss" else {}
-    return with_changes(preset, {**design, **run.changes})
 
 
 def _paths(scenes: Sequence[PathLike]) -> dict[str, str]:
@@ -271,9 +261,10 @@ def figure_rows(
     `covers`: covers of the published groups that were run; if empty, published figures are means over all.
     """
     rows = []
+    every = dict.fromkeys(measure for run in table.runs.values() for measure in run.figures)
     for name, run in table.runs.items():
         here: dict[str, float | None] = {}
-        for measure in run.figures or table.published:
+        for measure in run.figures or every:
             values = [each[measure] for each in numbers.get(name, ()) if measure in each]
             here[measure] = fmean(values) if values and len(values) == count else None
         published = {measure: mean_figure(table, figure, covers) for measure, figure in run.figures.items()}

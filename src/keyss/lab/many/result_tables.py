@@ -8,6 +8,7 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from statistics import fmean, stdev
 from typing import Any
@@ -28,21 +29,19 @@ _LATEX |= {character: f"\\{character}" for character in "&%$#_{}"}
 
 @dataclass(frozen=True)
 class TrialNumbers:
-    """The numbers of one trial."""
+    """A finished trial, and its columns in tables."""
 
     labels: Mapping[str, Any]  # the columns that name it, except the seed
     scenes: Sequence[str]  # names of the cover and the secrets
     seed: int
-    trial: str  # the name of its folder
-    numbers: Mapping[str, float]
+    outcome: Outcome
 
-    @staticmethod
-    def of(outcome: Outcome, labels: Mapping[str, Any], scenes: Sequence[str], seed: int) -> TrialNumbers:
-        """The numbers of a finished trial, without times and arguments."""
-        assert outcome.result is not None
-        every = outcome.result.numbers.items()
-        numbers = {name: value for name, value in every if _NO_MEASURES.isdisjoint(name.split("."))}
-        return TrialNumbers(labels, scenes, seed, outcome.folder.name, numbers)
+    @cached_property
+    def numbers(self) -> dict[str, float]:
+        """What was measured, without times and arguments."""
+        assert self.outcome.result is not None
+        every = self.outcome.result.numbers.items()
+        return {name: value for name, value in every if _NO_MEASURES.isdisjoint(name.split("."))}
 
 
 def summaries(trials: Sequence[TrialNumbers]) -> list[dict[str, Any]]:
@@ -97,7 +96,7 @@ def write_scene_tables(out: Path, stem: str, trials: Sequence[TrialNumbers]) -> 
 def write_sweep_tables(out: Path, trials: Sequence[TrialNumbers]) -> None:
     """Write `results.csv` and `trials.csv` with all measures, and `scenes`. Raises OutputError."""
     rows = [
-        {**labels, "seed": each.seed, "trial": each.trial, "measure": measure, "value": value}
+        {**labels, "seed": each.seed, "trial": each.outcome.folder.name, "measure": measure, "value": value}
         for labels, group in _group(trials)
         for each in group
         for measure, value in sorted(each.numbers.items())

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
-from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -65,24 +64,6 @@ class SweepSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
     min_psnr: float = 0.0
     bound: bool = False
     device: Literal["auto", "cpu", "cuda"] = "auto"
-
-    @property
-    def common(self) -> dict[str, Any]:
-        """The fields of all trials."""
-        views = ViewOptions(self.width, self.background, self.skip_missing)
-        return {"views": views, "min_psnr": self.min_psnr, "bound": self.bound, "device": self.device}
-
-
-@dataclass(frozen=True)
-class ManyResult:
-    """The outcomes of all trials, in their order."""
-
-    outcomes: tuple[Outcome, ...]
-
-    @property
-    def errors(self) -> dict[str, str]:
-        """Errors of failed trials, by name."""
-        return {each.name: each.error for each in self.outcomes if each.error is not None}
 
 
 def read_spec(path: Path) -> SweepSpec:
@@ -156,18 +137,20 @@ def sweep(
     cores: int = 1,
     dry_run: bool = False,
     reporter: Reporter | None = None,
-) -> ManyResult | Forecast:
-    """Run all unfinished trials of a specification, and write tables of all results.
+) -> tuple[Outcome, ...] | Forecast:
+    """Run all unfinished trials of a specification, write tables of all results, and return the outcomes.
 
     Trials run one after the other in this process, or in parallel on a Ray cluster. `ray`: its address, or
     "local" for one on this machine; `cores`: cores per trial there. `dry_run`: only return the plans of the
     trials. Keys are derived from the trials' names and a master key in the private part of `out`, which is
-    made if there is none. Raises KeyssError and KeyboardInterrupt; the result has the errors of failed
-    trials.
+    made if there is none. Raises KeyssError and KeyboardInterrupt; the outcomes of failed trials have the
+    errors.
     """
     path = Path(spec)
     found = read_spec(path)
-    folder = TrialFolder(Path(out), found.common)
+    common = {name: getattr(found, name) for name in ("min_psnr", "bound", "device")}
+    common["views"] = ViewOptions(found.width, found.background, found.skip_missing)
+    folder = TrialFolder(Path(out), common)
     rows: dict[Path, tuple[dict[str, Any], list[str], int]] = {}  # labels, scenes and seed
     for pair, (method, preset, choices), seed in product(found.pairs, variants(path, found), found.seeds):
         options = preset.with_fit(seed=seed)
@@ -185,6 +168,6 @@ def sweep(
     if dry_run:
         return folder.forecast()
     outcomes = folder.run(ray=ray, cores=cores, reporter=reporter)
-    done = [TrialNumbers.of(outcomes[place], *row) for place, row in rows.items() if outcomes[place].result]
+    done = [TrialNumbers(*row, outcomes[place]) for place, row in rows.items() if outcomes[place].result]
     write_sweep_tables(folder.out, done)
-    return ManyResult(tuple(outcomes[place] for place in rows))
+    return tuple(outcomes[place] for place in rows)

@@ -126,8 +126,8 @@ def plan_of(trial: Trial, folder: Path) -> Plan:
     if isinstance(trial.options, FitConfig):
         scene = as_scene(trial.cover, trial.views, train_pictures=False)
         return plan_fit(scene, trial.options, resolve_device(trial.device))
-    has_keys, count = registry.get(trial.method).capabilities.keys, len(trial.secrets)
-    keys = [f"key {index}" if has_keys else "" for index in range(count)]
+    keys = [f"key {index}" for index, _ in enumerate(trial.secrets)]
+    keys = keys if registry.get(trial.method).capabilities.keys else []
     found = hide(**_hide_arguments(trial, folder, keys), dry_run=True).plan
     assert found is not None  # a dry run always has a plan
     fits = zip_longest(found.fit_seconds, trial.models)
@@ -135,16 +135,16 @@ def plan_of(trial: Trial, folder: Path) -> Plan:
 
 
 def keys_of(trial: Trial, folder: Path) -> list[str]:
-    """A key per secret, derived from the master key, or "" if the method has no keys."""
+    """A key per secret, derived from the master key; none if the method has no keys."""
     if not registry.get(trial.method).capabilities.keys:
-        return [""] * len(trial.secrets)
+        return []
     master = MasterKey(read_key(folder.parents[1] / MASTER_KEY))
     return [master.key_of(f"trial/{folder.name}/{index}") for index, _ in enumerate(trial.secrets, start=1)]
 
 
 def opened_run(trial: Trial, folder: Path) -> HidingRun:
     """The run of a finished hiding."""
-    return open_run(folder / RUN, [key for key in keys_of(trial, folder) if key])
+    return open_run(folder / RUN, keys_of(trial, folder))
 
 
 def _fit_or_hide(trial: Trial, folder: Path, reporter: Reporter) -> dict[str, float]:
@@ -175,11 +175,12 @@ def flat(record: Any, prefix: str = "") -> dict[str, float]:
 
 def _hide_arguments(trial: Trial, folder: Path, keys: list[str]) -> dict[str, Any]:
     """The arguments of `hide`, without models that do not exist yet."""
-    places = [each and _place(folder, each) for each in trial.models or (None,) * (1 + len(trial.secrets))]
+    places = [each and _place(folder, each) for each in trial.models]
     cover, *models = (place if place and place.exists() else None for place in places)
+    blank = [""] * len(trial.secrets)  # for methods without keys
     return {
         "cover": trial.cover,
-        "secrets": [Secret(*each) for each in zip(trial.secrets, keys, models, strict=True)],
+        "secrets": [Secret(*each) for each in zip(trial.secrets, keys or blank, models, strict=True)],
         "method": trial.options,
         **vars(trial.views),
         "cover_model": cover,
@@ -197,12 +198,12 @@ def _measure(trial: Trial, names: list[str], folder: Path, reporter: Reporter) -
     """Numbers of measures, or notes on them."""
     found: dict[str, float | str] = {}
     if parts := [name for name in names if name in PARTS]:
-        run, keys = folder / RUN, [key for key in keys_of(trial, folder) if key]
+        run = folder / RUN
         manifest = read_manifest(run)
         done = "audit" in manifest.files
         resume = not done and manifest.running is not None
         more: dict[str, Any] = {"device": trial.device, "overwrite": done, "resume": resume}
-        audited = audit(run, keys, only=parts, reporter=reporter, **more)
+        audited = audit(run, keys_of(trial, folder), only=parts, reporter=reporter, **more)
         for part in parts:
             found |= flat(msgspec.to_builtins(getattr(audited, part)), f"audit.{part}")
     if others := [name for name in names if name not in PARTS]:

@@ -116,13 +116,11 @@ def cropping(seed: int = 0) -> Change:
 def fewer_harmonics(degree: int) -> Change:
     """Drop the spherical harmonics above a degree, 0 to 3."""
     sentence = f"Spherical harmonics above degree {degree} are dropped."
-    return Change(
-        "fewer harmonics",
-        degree,
-        "degree left",
-        sentence,
-        lambda m: m.with_sh_degree(min(degree, m.sh_degree)),
-    )
+
+    def apply(model: Gaussians) -> Gaussians:
+        return model.with_sh_degree(min(degree, model.sh_degree))
+
+    return Change("fewer harmonics", degree, "degree left", sentence, apply)
 
 
 def half_floats() -> Change:
@@ -140,14 +138,18 @@ def fine_tuning(cover: Scene, steps: int = 500, seed: int = 0) -> Change:
 
 
 def purification(cover: Scene, given_up: float = 0.0, steps: int = 300, seed: int = 0) -> Change:
-    """Prune the Gaussians that the cover's training views do not use, then train.
+    """Prune the Gaussians that the cover's training views do not use, but never all, then train.
 
-    Follows GSPure (arXiv 2511.22262), which prunes by clusters of the same weights. `given_up`: see
-    `find_unused`.
+    Follows GSPure (arXiv 2511.22262), which prunes by clusters of the same weights. `given_up`: maximum share
+    of the blending weights of the pruned, summed over pixels and views.
     """
 
     def apply(model: Gaussians) -> Gaussians:
-        return fine_tune(model[~find_unused(model, cover, given_up)], cover, steps, seed)
+        cameras = [view.camera for view in subsample_views(cover.train, VIEWS)]
+        ascending, order = contributions(model, cameras).double().sort(stable=True)
+        unused = int((ascending.cumsum(0) <= given_up * ascending.sum()).sum())
+        kept = order[min(unused, len(model) - 1) :].sort().values
+        return fine_tune(model[kept], cover, steps, seed)
 
     sentence = (
         "Gaussians that the cover's photos do not use are removed"
@@ -155,18 +157,6 @@ def purification(cover: Scene, given_up: float = 0.0, steps: int = 300, seed: in
         f"then training continues for {steps} steps."
     )
     return Change("purification", given_up, "share of the blending weight given up", sentence, apply)
-
-
-def find_unused(model: Gaussians, cover: Scene, given_up: float = 0.0) -> Tensor:
-    """[N] True for the Gaussians that contribute least to the training views, but never for all.
-
-    `given_up`: maximum share of their blending weights, summed over pixels and views.
-    """
-    weights = contributions(model, [view.camera for view in subsample_views(cover.train, VIEWS)]).double()
-    ascending, order = weights.sort(stable=True)
-    chosen = ascending.cumsum(0) <= given_up * ascending.sum()
-    chosen[-1] = False
-    return torch.zeros_like(chosen).index_put((order,), chosen)
 
 
 def fine_tune(model: Gaussians, scene: Scene, steps: int, seed: int = 0) -> Gaussians:

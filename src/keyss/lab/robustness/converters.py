@@ -12,7 +12,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from types import ModuleType
 
 from keyss.core.errors import BackendError, KeyssError
 from keyss.core.gaussians import Gaussians
@@ -30,7 +29,8 @@ class Converter:
     format: str
     tool: str
     note: str  # a remark on this conversion, or nothing
-    round_trip: Callable[[Path, Path], tuple[Path, Path]]  # .ply, folder -> other file, .ply
+    # .ply, folder -> other file, .ply; raises ImportError or BackendError without the tool
+    round_trip: Callable[[Path, Path], tuple[Path, Path]]
 
     def __call__(self, model: Gaussians) -> Gaussians:
         """Raises BackendError if the tool is missing or fails."""
@@ -41,6 +41,8 @@ class Converter:
                 return read_model(self.round_trip(source, Path(folder))[1])
             except BackendError:
                 raise
+            except ImportError as error:
+                raise BackendError(f"{self.tool} is not installed (pip install {self.tool})") from error
             except (KeyssError, OSError, ValueError) as error:
                 reason = (str(error) or type(error).__name__).splitlines()[0]
                 raise BackendError(f"{self.tool} failed on {self.format}: {reason}") from error
@@ -73,14 +75,6 @@ def converters(sog_iterations: int = 1) -> list[Converter]:
     ]
 
 
-def _find_package(name: str) -> ModuleType:
-    """A third-party Python package. Raises BackendError."""
-    try:
-        return import_module(name)
-    except ImportError as error:
-        raise BackendError(f"{name} is not installed (pip install {name})") from error
-
-
 def transform(source: Path, target: Path, *options: str) -> Path:
     """Convert `source` to `target` with splat-transform; returns `target`. Raises BackendError."""
     tool = find_splat_transform()
@@ -106,14 +100,14 @@ def _through(name: str, *options: str) -> Callable[[Path, Path], tuple[Path, Pat
 
 
 def _gsply_compressed(source: Path, folder: Path) -> tuple[Path, Path]:
-    gsply, there, back = _find_package("gsply"), folder / "there.compressed.ply", folder / "back.ply"
+    gsply, there, back = import_module("gsply"), folder / "there.compressed.ply", folder / "back.ply"
     gsply.plywrite(there, gsply.plyread(source), compressed=True)
     gsply.plywrite(back, gsply.plyread(there))
     return there, back
 
 
 def _gsply_spz(source: Path, folder: Path) -> tuple[Path, Path]:
-    gsply, there, back = _find_package("gsply"), folder / "there.spz", folder / "back.ply"
+    gsply, there, back = import_module("gsply"), folder / "there.spz", folder / "back.ply"
     gsply.write_spz(there, gsply.plyread(source), version=3)
     gsply.plywrite(back, gsply.read_spz(there))
     return there, back

@@ -19,7 +19,6 @@ from keyss.methods.hidden import HiddenScene
 PRUNED = (0.05, 0.10, 0.15, 0.25, 0.50)
 NOISE = (0.001, 0.01, 0.1)
 SEEDS = 3  # repetitions per random removal; results vary by a dB or two
-UNCHANGED = "none"
 
 # Opens a secret in a stego model on the CPU; raises KeyssError if it does not open.
 Opener = Callable[[Gaussians], HiddenScene]
@@ -70,8 +69,7 @@ def default_changes(cover: Scene, *, seed: int = 0) -> list[Change]:
 def measure_robustness(
     stego: Gaussians,
     openers: Sequence[Opener],  # one for each secret
-    cover: Scene,
-    secrets: Sequence[Scene],
+    scenes: Sequence[Scene],  # the cover, then the secrets
     *,
     changes: Sequence[Change] | None = None,
     max_views: int = 8,
@@ -85,6 +83,7 @@ def measure_robustness(
     Renders on the device of `stego`. Deterministic in `seed`. Raises UsageError unless there is one opener
     per secret, KeyssError if a secret does not open in the unchanged model.
     """
+    cover, *secrets = scenes
     if len(openers) != len(secrets):
         raise UsageError(f"expected an opener for each of {len(secrets)} secret(s), got {len(openers)}")
     changes = default_changes(cover, seed=seed) if changes is None else changes
@@ -104,7 +103,7 @@ def measure_robustness(
 
     results: dict[tuple[str, float], list[ChangeResult]] = {}
     before: list[float] = []
-    unchanged = Change(UNCHANGED, 0, "", "Nothing is changed.", lambda model: model)
+    unchanged = Change("none", 0, "", "Nothing is changed.", lambda model: model)
     for number, each in enumerate([unchanged, *changes]):
         if progress is not None:
             progress(number, len(changes) + 1)
@@ -135,22 +134,16 @@ def reveal_changed(opener: Opener, stego: Gaussians) -> Gaussians:
 
 def _mean(results: Sequence[ChangeResult]) -> ChangeResult:
     """Average results of different random seeds."""
-    covers = [each.cover for each in results if each.cover is not None]
-    if not covers:
+    rows = [(each.cover, *each.secrets) for each in results if each.cover is not None]
+    if not rows:
         return results[0]
-    secrets = zip(*(each.secrets for each in results), strict=True)
-    return replace(
-        results[0],
-        seeds=len(results),
-        cover=_mean_quality(covers),
-        secrets=tuple(map(_mean_quality, secrets)),
+    cover, *secrets = (
+        ChangedQuality(
+            fmean(each.psnr for each in qualities),
+            fmean(each.loss for each in qualities),
+            all(each.opens for each in qualities),
+            next((each.error for each in qualities if each.error), None),
+        )
+        for qualities in zip(*rows, strict=True)
     )
-
-
-def _mean_quality(qualities: Sequence[ChangedQuality]) -> ChangedQuality:
-    return ChangedQuality(
-        fmean(each.psnr for each in qualities),
-        fmean(each.loss for each in qualities),
-        all(each.opens for each in qualities),
-        next((each.error for each in qualities if each.error), None),
-    )
+    return replace(results[0], seeds=len(results), cover=cover, secrets=tuple(secrets))

@@ -11,14 +11,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from itertools import combinations
 
 import numpy as np
 from scipy.signal import find_peaks
 from scipy.spatial import cKDTree
 from scipy.stats import ks_2samp, rankdata
 
-from keyss.core.arrays import Doubles, Integers, Words32, doubles
+from keyss.core.arrays import Doubles, doubles
 from keyss.core.gaussians import Gaussians
 from keyss.core.neighbours import nearest_neighbours
 from keyss.lab.stealth.statistic import (
@@ -26,7 +26,7 @@ from keyss.lab.stealth.statistic import (
     BitPatterns,
     Statistic,
     excess,
-    excess_over_smooth,
+    near_misses,
     normal,
     portion,
 )
@@ -72,11 +72,11 @@ def invariants(model: Gaussians, words: BitPatterns) -> dict[str, Statistic]:
             continue
         trained = words.trained[:, words.of_attribute(index)]
         statistics[f"short numbers, {attribute}"] = portion(float((~trained).sum()), trained.size)
-        repeated = sum(_count_repeated(own[:, field][trained[:, field]]) for field in range(own.shape[1]))
+        fields = zip(own.T, trained.T, strict=True)
+        counts = [np.unique(values[kept], return_counts=True)[1] for values, kept in fields]
+        repeated = sum(int(each[each > 1].sum()) for each in counts)
         statistics[f"repeated values, {attribute}"] = portion(repeated, own.size)
-        clusters = [
-            _clusters(own[:, field].view(np.float32).astype(np.float64)) for field in range(own.shape[1])
-        ]
+        clusters = [_clusters(values.view(np.float32).astype(np.float64)) for values in own.T]
         hits, trials = (sum(each) for each in zip(*clusters, strict=True))
         statistics[f"clusters of values, {attribute}"] = excess(hits, trials, _CLUSTERED)
     return statistics
@@ -86,13 +86,9 @@ def _lengths(model: Gaussians) -> dict[str, Statistic]:
     """Shares of quaternions of exactly and nearly unit length, in the file and in its parts."""
     error = (model.quats.detach().cpu().double().norm(dim=1) - 1).abs().numpy()
     unit = error < _UNIT
-    nearly = int((~unit & (error < _MOVED)).sum())
-    around = int(((error >= _MOVED) & (error < _AROUND)).sum())
     statistics = {
         "quaternions of unit length": portion(float(unit.sum()), len(unit)),
-        "quaternions of nearly unit length": excess_over_smooth(
-            nearly, max(around, 1) * _MOVED / (_AROUND - _MOVED), len(unit)
-        ),
+        "quaternions of nearly unit length": near_misses(error, unit, _MOVED, _AROUND),
         "distance of quaternions from unit length, median": Statistic(
             float(np.log10(np.median(error) + 1e-9))
         ),
@@ -106,12 +102,6 @@ def _lengths(model: Gaussians) -> dict[str, Statistic]:
         spread = float(shares.max() - shares.min()) if len(shares) else 0.0
         statistics[f"unit quaternions in parts of {name}, range of shares"] = Statistic(spread)
     return statistics
-
-
-def _count_repeated(values: Words32) -> int:
-    """Number of values that are not unique."""
-    _, counts = np.unique(values, return_counts=True)
-    return int(counts[counts > 1].sum())
 
 
 def _clusters(values: Doubles) -> tuple[int, int]:
@@ -197,11 +187,16 @@ def colours(model: Gaussians, words: BitPatterns) -> dict[str, Statistic]:
             close = distance[distance[:, 0] <= np.quantile(distance[:, 0], 0.1)]
             ratio = _ratio(close[:, index], distance[:, index], 0.5)
             statistics[f"{channel} of {name} with the same red"] = ratio
-    for name, part in _parts(model):
+    # Quarters of the rows by the visibility of a colour change: area times squared opacity.
+    areas = model.log_scales.detach().cpu().double().sort(dim=1).values[:, 1:].sum(dim=1)
+    shown = (areas + 2 * model.opacities.detach().cpu().double().clamp_min(1e-6).log()).numpy()
+    quarters = np.array_split(np.argsort(-np.nan_to_num(shown), kind="stable"), 4)
+    for name, part in zip(_PARTS, quarters, strict=True):
         distance = np.abs(values[part] - values[near[part, 1]])
         for channel, index in _CHANNELS.items():
             statistics[f"{channel} of neighbours, {name}"] = _ratio(distance[:, index], distance[:, 0], 0.25)
-    inside = {f"{one} and {other}": np.abs(values[:, i] - values[:, j]) for one, other, i, j in _BETWEEN}
+    channels = zip(("red", "green", "blue"), values.T, strict=True)
+    inside = {f"{a} and {b}": np.abs(one - two) for (a, one), (b, two) in combinations(channels, 2)}
     usual = np.median(np.stack(list(inside.values())), axis=1).mean()
     for name, each in inside.items():
         for quantile in _QUANTILES[:2]:
@@ -209,16 +204,6 @@ def colours(model: Gaussians, words: BitPatterns) -> dict[str, Statistic]:
                 float(np.log((np.quantile(each, quantile) + _TINY) / (usual + _TINY)))
             )
     return statistics
-
-
-_BETWEEN = (("red", "green", 0, 1), ("red", "blue", 0, 2), ("green", "blue", 1, 2))
-
-
-def _parts(model: Gaussians) -> Iterator[tuple[str, Integers]]:
-    """Quarters of the rows by the visibility of a colour change: area times squared opacity."""
-    scales = model.log_scales.detach().cpu().double().sort(dim=1).values[:, 1:].sum(dim=1)
-    shown = (scales + 2 * model.opacities.detach().cpu().double().clamp_min(1e-6).log()).numpy()
-    yield from zip(_PARTS, np.array_split(np.argsort(-np.nan_to_num(shown), kind="stable"), 4), strict=True)
 
 
 def _ratio(one: Doubles, other: Doubles, quantile: float) -> Statistic:

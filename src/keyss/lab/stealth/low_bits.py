@@ -35,7 +35,7 @@ from keyss.lab.stealth.statistic import (
     Statistic,
     dispersion,
     excess,
-    excess_over_smooth,
+    near_misses,
     normal,
     portion,
     share,
@@ -171,16 +171,13 @@ def _of_pairs(one: Words32, other: Words32) -> dict[str, Statistic]:
     same_high = (one >> _LOW) == (other >> _LOW)
     equal = distance == 0
     size = 1 << _LOW
-    inside = int(((distance > 0) & (distance < _MOVED)).sum())
-    around = int(((distance >= _MOVED) & (distance < _AROUND)).sum())
     near = (2 * _CLOSE - 1) * size - _CLOSE * (_CLOSE - 1)  # ordered pairs closer than _CLOSE
     return {
         "close low bits": excess(
             int((distance[same_high] < _CLOSE).sum()), int(same_high.sum()), near / size**2
         ),
         "equal low bits": excess(int(equal[same_high].sum()), int(same_high.sum()), 1 / size),
-        # Unequal pairs closer than _MOVED, against the number expected from pairs further apart.
-        "near misses": excess_over_smooth(inside, max(around, 1) * _MOVED / (_AROUND - _MOVED), len(equal)),
+        "near misses": near_misses(distance, equal, _MOVED, _AROUND),
         "equal": portion(float(equal.sum()), len(equal)),
         "within a quarter of an octave": _within_quarters(one, other),
     }
@@ -220,26 +217,15 @@ def nearest_pairs(positions: Doubles, neighbours: int) -> Integers:
 
 def _sharers(words: BitPatterns) -> Integers:
     """[P, 2] Gaussians with an equal number in a field, adjacent in the order of that field."""
-    pairs = [np.zeros((0, 2), np.int64)]
+    pairs = []
     for field in range(3, words.bits.shape[1]):
-        own = words.bits[:, field]
         rows = np.flatnonzero(words.trained[:, field])
-        rows = rows[np.argsort(own[rows], kind="stable")]
-        same = np.flatnonzero(own[rows[1:]] == own[rows[:-1]])
-        pairs.append(np.stack([rows[same], rows[same + 1]], axis=1))
+        pairs.append(rows[_agreeing_pairs(words.bits[rows, field], lags=1)])
     return np.unique(np.sort(np.concatenate(pairs), axis=1), axis=0)
 
 
 def coincidences(model: Gaussians, words: BitPatterns) -> dict[str, Statistic]:
-    """Pairs with equal low bits among those with equal high bits, relative to chance."""
-    return {
-        name: excess(equal, pairs, 2.0**-bits)
-        for name, (equal, pairs, bits) in count_coincidences(model, words).items()
-    }
-
-
-def count_coincidences(model: Gaussians, words: BitPatterns) -> dict[str, tuple[int, int, int]]:
-    """Numbers by name: pairs with equal low bits, pairs with equal high bits, low bits.
+    """Pairs with equal low bits among those with equal high bits, relative to chance.
 
     For all pairs and for neighbours in space, if one Gaussian is usable; for all saturated neighbours.
     """
@@ -247,13 +233,14 @@ def count_coincidences(model: Gaussians, words: BitPatterns) -> dict[str, tuple[
     near = nearest_pairs(doubles(model.means), _NEAREST)
     saturated = model.opacity_logits.detach().cpu().numpy() > _SATURATED
     bright = near[saturated[near].all(axis=1)]
+    # By name: pairs with equal low bits, pairs with equal high bits, and the number of low bits.
     counts: dict[str, tuple[int, int, int]] = {}
     for name, field, bits in _columns(words):
         low = np.uint32(((1 << bits) - 1) << 1)
         own = words.bits[:, field]
         of_all, of_near, of_bright = f"all, {name}", f"neighbours, {name}", f"saturated, {name}"
         for kind, pairs, chosen in (
-            (of_all, _agreeing_pairs(own & ~low), usable),
+            (of_all, _agreeing_pairs(own & ~low, _LAGS), usable),
             (of_near, near, usable),
             (of_bright, bright, np.ones(len(usable), bool)),
         ):
@@ -262,7 +249,7 @@ def count_coincidences(model: Gaussians, words: BitPatterns) -> dict[str, tuple[
             equal, trials, _ = counts.get(kind, (0, 0, bits))
             equal += int((own[one] == own[other])[agree].sum())
             counts[kind] = equal, trials + int(agree.sum()), bits
-    return counts
+    return {name: excess(equal, trials, 2.0**-bits) for name, (equal, trials, bits) in counts.items()}
 
 
 def _columns(words: BitPatterns) -> Iterator[tuple[str, int, int]]:
@@ -274,11 +261,11 @@ def _columns(words: BitPatterns) -> Iterator[tuple[str, int, int]]:
                 yield name, int(column), _WRITTEN[attribute]
 
 
-def _agreeing_pairs(kept: np.ndarray) -> Integers:
-    """[P, 2] pairs of rows whose `kept` bits [N] agree, at most _LAGS apart when sorted by these."""
+def _agreeing_pairs(kept: Words32, lags: int) -> Integers:
+    """[P, 2] pairs of rows whose `kept` bits [N] agree, at most `lags` apart when sorted by these."""
     order = np.argsort(kept, kind="stable")
     pairs = [np.zeros((0, 2), np.int64)]
-    for lag in range(1, min(_LAGS, len(kept) - 1) + 1):
+    for lag in range(1, min(lags, len(kept) - 1) + 1):
         same: Flags = kept[order[lag:]] == kept[order[:-lag]]
         pairs.append(np.stack([order[:-lag][same], order[lag:][same]], axis=1))
     return np.concatenate(pairs)
@@ -286,7 +273,7 @@ def _agreeing_pairs(kept: np.ndarray) -> Integers:
 
 def steps(model: Gaussians, words: BitPatterns) -> dict[str, Statistic]:
     """Excess of hits over random low bits, in standard deviations."""
-    harmonics = words.bits[:, words.attribute >= ATTRIBUTES.index("sh1")]
+    harmonics = words.bits[:, words.attribute >= _HARMONICS]
     if not harmonics.shape[1] or len(model) < 2:
         return {}
     constant = doubles(model.sh[:, 0]) / _RATIO

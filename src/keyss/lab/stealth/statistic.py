@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 from scipy.special import bdtrc, chdtrc, ndtr, pdtrc
 
-from keyss.core.arrays import Flags, Integers, Words32
+from keyss.core.arrays import Flags, Integers, Numbers, Words32
 from keyss.core.gaussians import Gaussians
 
 ATTRIBUTES = ("position", "scale", "rotation", "opacity", "colour", "sh1", "sh2", "sh3")
@@ -102,10 +102,17 @@ def portion(hits: float, trials: int) -> Statistic:
     return Statistic(hits / max(trials, 1), math.sqrt(max(hits, 1.0)) / max(trials, 1))
 
 
-def excess_over_smooth(hits: int, expected: float, of: int) -> Statistic:
-    """`hits` in excess of a smooth density, as a share, with the Poisson tail probability."""
-    error = math.sqrt(max(hits, expected, 1.0)) / max(of, 1)
-    return Statistic((hits - expected) / max(of, 1), error, float(pdtrc(hits - 1, expected)) if hits else 1.0)
+def near_misses(distance: Numbers, equal: Flags, moved: float, around: float) -> Statistic:
+    """Unequal pairs closer than `moved`, in excess of a smooth density, as a share, with the Poisson tail.
+
+    The density comes from the pairs whose distance is `moved` to `around`.
+    """
+    count = max(len(distance), 1)
+    hits = int((~equal & (distance < moved)).sum())
+    outside = int(((distance >= moved) & (distance < around)).sum())
+    expected = max(outside, 1) * moved / (around - moved)
+    error = math.sqrt(max(hits, expected, 1.0)) / count
+    return Statistic((hits - expected) / count, error, float(pdtrc(hits - 1, expected)) if hits else 1.0)
 
 
 def dispersion(chi_square: float, degrees: int) -> Statistic:

@@ -107,11 +107,14 @@ class CarryCapacity:
 
 def _cure(cover: Gaussians | None, options: CarryOptions) -> str:
     """For messages: the least SH degree that gives `cover` capacity, and what always works."""
-    if cover is not None:
-        for degree in range(options.fit.sh_degree + 1, 3):
-            with suppress(UsageError):
-                if LOW_BITS.prepare(to_degree(cover, degree, os.urandom(32))).capacity.bytes:
-                    return f"`sh_degree={degree}` makes room, {_ANY}"
+    for degree in range(options.fit.sh_degree + 1, 3):
+        with suppress(UsageError):
+            if cover is None:
+                capacity = LOW_BITS.estimate_capacity(options.fit.max_gaussians, degree)
+            else:
+                capacity = LOW_BITS.prepare(to_degree(cover, degree, os.urandom(32))).capacity
+            if capacity.bytes:
+                return f"`sh_degree={degree}` makes room, {_ANY}"
     return _ANY
 
 

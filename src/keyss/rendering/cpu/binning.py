@@ -35,10 +35,8 @@ from keyss.rendering.cpu.constants import (
 )
 from keyss.rendering.cpu.simd8 import (
     at,
-    ceil,
     ceil8,
     fetch_add,
-    floor,
     floor8,
     maximum,
     minimum,
@@ -156,8 +154,9 @@ def list_pairs(counter, footprints, order, tile_columns, height, starts, tiles, 
                 g = np.int64(at(order, start + k)) * PACKED
                 x = at(footprints, g + X) - HALF
                 extent_x = at(footprints, g + EXTENT_X)
-                first_column = max(ceil(x - extent_x), 0) >> TILE_WIDTH_LOG2
-                last_column = min(floor(x + extent_x), tile_columns * TILE_WIDTH - 1) >> TILE_WIDTH_LOG2
+                first_column = max(np.int64(np.ceil(x - extent_x)), 0) >> TILE_WIDTH_LOG2
+                last_pixel = min(np.int64(np.floor(x + extent_x)), tile_columns * TILE_WIDTH - 1)
+                last_column = last_pixel >> TILE_WIDTH_LOG2
                 first_columns[k] = first_column
                 columns[k] = last_column + 1 - first_column
                 _measure_columns(footprints, g, height, first_column, spans, 16 * k)
@@ -187,7 +186,7 @@ def list_pairs(counter, footprints, order, tile_columns, height, starts, tiles, 
 def sort_pairs(counter, order, starts, tiles, rows, slot_counts, first_slots, cursors, entries, entry_slots):
     """Sort the pairs of `list_pairs` into tiles, starting at the cursors.
 
-    An entry is a Gaussian and, shifted by `layout.ENTRY_ROWS_SHIFT`, its rows. entry_slots gets the slots:
+    An entry is a Gaussian and, shifted by `constants.ENTRY_ROWS_SHIFT`, its rows. entry_slots gets the slots:
     Gaussian i has slot_counts[i] slots from first_slots[i]. If it is empty, first_slots is not read.
     """
     shares = cursors.shape[0]

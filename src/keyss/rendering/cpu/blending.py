@@ -269,7 +269,7 @@ def _blend_tile_backward(
     footprints, features, channels, entries, slots, start, end, left, top, planes, weights, strips,
     strip_footprints, moments, extras,
 ):  # fmt: skip
-    """Replay entries start..end front to back; write the sums of each pair to its slot (see layout.MOMENTS).
+    """Replay entries start..end front to back; write the sums of each pair to its slot (see `MOMENTS`).
 
     planes = [transmittance | behind | the gradient of each channel]. `behind` is the product of the loss
     gradient and the light from behind the current Gaussian: the pixel minus the Gaussians in front. dx is

@@ -174,13 +174,13 @@ def _squared_area(u, v):
 
 @kernel
 def project(counter, gaussians, camera, settings, projected):
-    """Fill `projected`.
+    """Fill `projected`; footprints get colours if these are SH coefficients.
 
-    Gaussians that are invisible, or have a colour of CHANNEL_MAX or more, get depth 0, radii 0 and no tiles;
-    their footprints are undefined.
+    Gaussians that are invisible, or have such a colour of CHANNEL_MAX or more, get depth 0, radii 0 and no
+    tiles; their footprints are undefined.
     """
     means, _, _, _, colors = gaussians
-    footprints, _, means2d, depths, radii, tile_bounds = projected
+    footprints, means2d, depths, radii, tile_bounds = projected
     sh_count = settings.sh_count
     count = means.shape[0]
     ids = np.empty(CHUNK + 8, np.int64)
@@ -224,8 +224,6 @@ def project(counter, gaussians, camera, settings, projected):
                     for lane in range(min(8, visible - k)):
                         if not results[lane] < CHANNEL_MAX:
                             _hide(seen[k + lane], projected)
-        else:
-            _copy_colors(colors, seen, visible, projected)
 
 
 @inline
@@ -298,19 +296,3 @@ def _hide(i, projected):
     projected.radii[i, 0] = 0
     projected.radii[i, 1] = 0
     projected.tile_bounds[i] = 0
-
-
-@inline
-def _copy_colors(colors, seen, visible, projected):
-    """Copy colours that are not SH into `features`, or into the footprints if it has no columns."""
-    footprints, features = projected.footprints, projected.features
-    for k in range(visible):
-        i = seen[k]
-        for channel in range(colors.shape[2]):
-            value = colors[i, 0, channel]
-            if features.shape[1] > 0:
-                features[i, channel] = value
-            else:
-                footprints[i, RED + channel] = value
-            if not abs(value) < CHANNEL_MAX:
-                _hide(i, projected)

@@ -15,7 +15,18 @@ from keyss.kernels.jit import announce_compilation
 from keyss.kernels.memory import Array
 from keyss.kernels.parallel import run
 from keyss.rendering.cpu import binning, blending, projection, projection_backward
-from keyss.rendering.cpu.constants import CAMERA, FX, MOMENTS, PACKED, POSITION, TILE_HEIGHT, TILE_WIDTH, TX
+from keyss.rendering.cpu.constants import (
+    CAMERA,
+    CHANNEL_MAX,
+    FX,
+    MOMENTS,
+    PACKED,
+    POSITION,
+    RED,
+    TILE_HEIGHT,
+    TILE_WIDTH,
+    TX,
+)
 
 MAX_PAIRS = 2**31 - 1  # positions in the lists of tiles are int32
 
@@ -44,8 +55,7 @@ class Settings(NamedTuple):
 class ProjectedArrays(NamedTuple):
     """Results of `projection.project` for N Gaussians."""
 
-    footprints: Array  # [N, PACKED], see `layout`
-    features: Array  # [N, channels] colours; no columns if they are in the footprints
+    footprints: Array  # [N, PACKED], see `constants`
     means2d: Array  # [N, 2] pixels
     depths: Array  # [N]; 0 for invisible Gaussians
     radii: Array  # [N, 2] int32, pixels; 0 for invisible Gaussians
@@ -96,19 +106,20 @@ class _Rasterize(torch.autograd.Function):
         columns, rows = -(-width // TILE_WIDTH), -(-height // TILE_HEIGHT)
 
         footprints = memory.empty((count, PACKED), np.float32)
-        # Three colours fit into the footprints.
-        channels = 0 if image.shape[2] == 3 else image.shape[2]
-        features = memory.empty((count, channels), np.float32)
         slot_counts = memory.empty((count,), np.int32)  # upper bounds at first
         projected = ProjectedArrays(
-            footprints,
-            features,
-            means2d.detach()[0].numpy(),
-            depths[0].numpy(),
-            radii[0].numpy(),
-            slot_counts,
+            footprints, means2d.detach()[0].numpy(), depths[0].numpy(), radii[0].numpy(), slot_counts
         )
         run(projection.project, arrays, camera, settings, projected)
+        features = None
+        if settings.sh_count == 0:
+            channels = arrays.colors[:, 0]
+            hidden = ~(np.abs(channels) < CHANNEL_MAX).all(axis=1)  # NaN counts too
+            projected.depths[hidden], projected.radii[hidden], slot_counts[hidden] = 0, 0, 0
+            if channels.shape[1] == 3:  # fit into the footprints
+                footprints[:, RED : RED + 3] = channels
+            else:
+                features = channels
         order, spare_order = (memory.empty((count,), np.int32) for _ in range(2))
         keys, spare_keys = (memory.empty((count,), np.uint32) for _ in range(2))
         visible = binning.sort_by_depth(projected.depths, order, spare_order, keys, spare_keys)
@@ -143,19 +154,14 @@ class _Rasterize(torch.autograd.Function):
             entries, entry_slots,
         )  # fmt: skip
         ends = memory.empty((columns * rows,), np.int64)
-        used_features = features if channels else None
         run(
-            blending.blend, footprints, used_features, entries, tile_starts, columns,
+            blending.blend, footprints, features, entries, tile_starts, columns,
             background.detach().numpy(), image.numpy(), alpha.numpy(), transmittance.numpy(), ends,
         )  # fmt: skip
         if any(ctx.needs_input_grad):
             ctx.save_for_backward(*gaussians, image, transmittance)
-            ctx.settings, ctx.camera, ctx.footprints, ctx.features = (
-                settings,
-                camera,
-                footprints,
-                used_features,
-            )
+            ctx.settings, ctx.camera = settings, camera
+            ctx.footprints, ctx.features = footprints, features
             ctx.slots = first_slots, slot_counts
             ctx.lists = entries, entry_slots, tile_starts, ends
         return image, alpha
@@ -194,10 +200,7 @@ class _Rasterize(torch.autograd.Function):
             weighted = (image_gradient.double() * transmittance.double()[..., None]).numpy()
             background_gradient = torch.from_numpy(weighted.sum((0, 1))).float()
         returned = (None, None, None, None, None, background_gradient, means2d_gradient, *gradients)
-        return tuple(
-            gradient if needed else None
-            for gradient, needed in zip(returned, ctx.needs_input_grad, strict=True)
-        )
+        return returned if need_colors else (*returned[:-1], None)
 
 
 def _empty(*shape: int, dtype: Any = np.float32) -> Tensor:

@@ -414,20 +414,3 @@ def _prefetch(write):
 
 prefetch_read = _prefetch(0)  # (array, index): prefetch the cache line of array.flat[index]
 prefetch_write = _prefetch(1)
-
-
-def _make_rounding(name):
-    @intrinsic
-    def to_integer(typingctx, x):
-        def codegen(context, builder, signature, arguments):
-            function = _llvm_function(builder, f"llvm.{name}.f32", FLOAT, [FLOAT])
-            return builder.fptosi(builder.call(function, arguments), ir.IntType(64))
-
-        return types.int64(types.float32), codegen
-
-    return to_integer
-
-
-# Single instructions; numba compiles math.floor and math.ceil to library calls.
-floor = _make_rounding("floor")
-ceil = _make_rounding("ceil")
