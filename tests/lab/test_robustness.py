@@ -118,4 +118,5 @@ def test_refitted_secret_after_changes(
         assert rounded.secrets[0].loss > 10
     assert purified.cover is not None
     assert abs(purified.cover.loss) < 0.1
-    assert purified.secrets[0].loss > 10  # nothing of the secret is seen in the cover
+    if publish == "any":
+        assert purified.secrets[0].loss > 10  # appended Gaussians are not seen in the cover

@@ -110,11 +110,10 @@ def _cure(cover: Gaussians | None, options: CarryOptions) -> str:
     for degree in range(options.fit.sh_degree + 1, 3):
         with suppress(UsageError):
             if cover is None:
-                capacity = LOW_BITS.estimate_capacity(options.fit.max_gaussians, degree)
-            else:
-                capacity = LOW_BITS.prepare(to_degree(cover, degree, os.urandom(32))).capacity
-            if capacity.bytes:
-                return f"`sh_degree={degree}` makes room, {_ANY}"
+                LOW_BITS.estimate_capacity(options.fit.max_gaussians, degree)
+            elif not LOW_BITS.prepare(to_degree(cover, degree, os.urandom(32))).capacity.bytes:
+                continue
+            return f"`sh_degree={degree}` makes room, {_ANY}"
     return _ANY
 
 
