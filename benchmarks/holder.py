@@ -3,8 +3,8 @@
     python benchmarks/holder.py bonsai=a.ply bonsai=b.ply fox=c.ply ...   # plain, of three scenes or more
 
 In each model, a secret is hidden alone and beside one to three others. The holder opens it, tries every cell
-of the file with the key (`tests/channels/quiet/holder.py`), and computes the statistics of `keyss.lab.stealth`.
-Detectors are cross-validated over scenes.
+of the file with the key (`tests/channels/quiet/holder.py`), and computes the statistics of
+`keyss.lab.stealth`. Detectors are cross-validated over scenes.
 """
 
 from __future__ import annotations
