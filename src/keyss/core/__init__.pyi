@@ -16,7 +16,6 @@ from .gaussians import (
     OPPONENT as OPPONENT,
     SH_C0 as SH_C0,
     Gaussians as Gaussians,
-    compensate_pruning as compensate_pruning,
 )
 from .picture_network import DecodedGaussians as DecodedGaussians, PictureNetwork as PictureNetwork
 from .scene import (

@@ -19,9 +19,6 @@ SH_C0 = 0.28209479177387814  # the constant SH basis function
 DRAWN_OPACITY = 1 / 255  # 3DGS rasterizers skip Gaussians below it
 # Rasterizers skip Gaussians beyond these limits, whose projection would overflow in single precision.
 MAX_COORDINATE, MAX_LOG_SCALE, MAX_LENGTH, MAX_COLOUR = 1e15, 40.0, 1.8e19, 1e12
-_GROWTH = 0.25  # exponent; the best of 0 to 0.5 on the scenes bonsai and fox with 25 and 50 % lost
-_MAX_LOST = 0.9  # share; greater losses are compensated like 90 %
-_MIN_LOST = 0.01  # share; smaller losses are not compensated
 
 
 @dataclass(frozen=True, repr=False)
@@ -127,21 +124,3 @@ def magnitude(values: Tensor) -> float:
     """The largest absolute value of a tensor: NaN if it contains NaN, 0 if it is empty."""
     low, high = values.aminmax() if values.numel() else (values.new_zeros(()), values.new_zeros(()))
     return float(torch.maximum(-low, high))
-
-
-def compensate_pruning(gaussians: Gaussians, count: int) -> Gaussians:
-    """Enlarge the remaining Gaussians of a pruned model that had `count`, and raise their opacities.
-
-    If a share p remains, opacities become 1 - (1 - opacity)^(1 / p), and the standard deviations grow by
-    p^-0.25. With a quarter of a model left, this recovers 0.4 to 1 dB of the 2 to 4 dB lost. Returns
-    `gaussians` unchanged if fewer than 1 % were lost or `count` is 0 (unknown).
-    """
-    share = max(len(gaussians) / max(count, 1), 1 - _MAX_LOST)
-    if share >= 1 - _MIN_LOST:
-        return gaussians
-    transmittance = (1 - gaussians.opacities.double()).clamp(1e-7, 1 - 1e-7) ** (1 / share)
-    return replace(
-        gaussians,
-        opacity_logits=torch.logit(1 - transmittance.clamp_min(1e-7)).float(),
-        log_scales=gaussians.log_scales + _GROWTH * math.log(1 / share),
-    )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import struct
 from dataclasses import asdict, replace
 
@@ -16,6 +17,7 @@ from keyss.channels import Payload
 from keyss.core import InputError
 from keyss.core.similarity import Similarity
 from keyss.methods import DECODERS, DecoderShape, KeyssSecret, choose_anchors
+from keyss.methods.keyss.secret import compensate_pruning
 from methods.keyss.small import VECTORS, make_secret
 from tiny_scenes import random_gaussians
 
@@ -151,3 +153,27 @@ def test_pruning_is_compensated() -> None:
     assert (left.opacities > alone.opacities).all()
     assert (left.log_scales > alone.log_scales).all()
     assert torch.equal(secret.reveal(stego).sh, replace(secret, visibility=0.0).reveal(stego).sh)
+
+
+@pytest.mark.parametrize("left", [1.0, 0.995])
+def test_small_losses_are_not_compensated(left: float) -> None:
+    model = random_gaussians(1000)
+    assert compensate_pruning(model, left) is model
+
+
+@pytest.mark.parametrize("share", [0.25, 0.5, 0.8])
+def test_compensate_pruning(share: float) -> None:
+    model = random_gaussians(200)
+    found = compensate_pruning(model, share)
+    expected = 1 - (1 - model.opacities.double()) ** (1 / share)
+    torch.testing.assert_close(found.opacities.double(), expected, rtol=0, atol=1e-5)
+    torch.testing.assert_close(found.log_scales, model.log_scales + 0.25 * math.log(1 / share))
+    assert (found.means is model.means, found.quats is model.quats, found.sh is model.sh) == (True,) * 3
+
+
+@pytest.mark.parametrize("logit", [-80.0, 0.0, 80.0])
+def test_compensation_stays_finite(logit: float) -> None:
+    model = replace(random_gaussians(5), opacity_logits=torch.full((5,), logit))
+    found = compensate_pruning(model, 1e-9)
+    assert found.opacity_logits.isfinite().all()
+    assert found.log_scales.isfinite().all()

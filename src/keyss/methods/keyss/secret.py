@@ -8,7 +8,8 @@ model, to detect a moved or rounded model. docs/byte-layout.md lists the bytes.
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass, field
+import math
+from dataclasses import dataclass, field, replace
 from typing import Annotated
 
 import numpy as np
@@ -19,7 +20,7 @@ from torch import Tensor
 
 from keyss.channels import Payload, is_appended
 from keyss.core.errors import InputError
-from keyss.core.gaussians import DRAWN_OPACITY, Gaussians, compensate_pruning
+from keyss.core.gaussians import DRAWN_OPACITY, Gaussians
 from keyss.core.similarity import Similarity
 from keyss.methods.hidden import Frame, HiddenScene, Remains
 from keyss.methods.keyss.decoder import DECODERS, Decoder
@@ -33,6 +34,8 @@ ANCHORS_NEEDED = 0.25  # minimum share found
 ANCHOR_TOLERANCE = 1e-6  # fraction of the model's size
 _SLACK = 0.01  # share of the Gaussians that rounding may make visible or invisible
 _WEIGHTS = "decoder."
+_GROWTH = 0.25  # exponent; the best of 0 to 0.5 on the scenes bonsai and fox with 25 and 50 % lost
+_LEAST_LEFT, _COMPLETE = 0.1, 0.99  # shares; smaller ones are compensated like 10 %, larger ones not at all
 
 
 @dataclass(frozen=True)
@@ -112,7 +115,7 @@ class KeyssSecret(HiddenScene):
         if (visible := decoded.opacities >= DRAWN_OPACITY).any():
             decoded = decoded[visible]
         left = min(1.0, visibility(decoded)[1] / max(self.visibility, 1e-9))
-        decoded = compensate_pruning(decoded, round(len(decoded) / max(left, 1e-6)))
+        decoded = compensate_pruning(decoded, left)
         return decoded if frame == "cover" else self.frame.inverse().apply_gaussians(decoded)
 
     def decode(self, stego: Gaussians, key: Tensor) -> Gaussians:
@@ -161,3 +164,20 @@ def visibility(model: Gaussians) -> tuple[int, float]:
     """The number of visible Gaussians, and the sum of their opacities."""
     visible = model.opacities[model.opacities >= DRAWN_OPACITY]
     return len(visible), float(visible.double().sum())
+
+
+def compensate_pruning(gaussians: Gaussians, left: float) -> Gaussians:
+    """Enlarge the Gaussians that are `left` of a pruned model, a share, and raise their opacities.
+
+    Opacities become 1 - (1 - opacity)^(1 / left), and the standard deviations grow by left^-0.25. With a
+    quarter of a model left, this recovers 0.4 to 1 dB of the 2 to 4 dB lost.
+    """
+    if left >= _COMPLETE:
+        return gaussians
+    share = max(left, _LEAST_LEFT)
+    transmittance = (1 - gaussians.opacities.double()).clamp(1e-7, 1 - 1e-7) ** (1 / share)
+    return replace(
+        gaussians,
+        opacity_logits=torch.logit(1 - transmittance.clamp_min(1e-7)).float(),
+        log_scales=gaussians.log_scales + _GROWTH * math.log(1 / share),
+    )
