@@ -7,7 +7,7 @@ import { fieldsOf, gaussianIds, ID_BYTES } from '../channels/quiet/bits.ts';
 import { CellCipher } from '../channels/quiet/cells.ts';
 import { ascii, bytesKey, joined } from '../core/bytes.ts';
 import { changed, damaged, otherVersion } from '../core/errors.ts';
-import { coefficients, compensated, emptyGaussians, type Gaussians, opacity, where, withDegree } from '../core/gaussians.ts';
+import { coefficients, emptyGaussians, type Gaussians, opacity, where, withDegree } from '../core/gaussians.ts';
 import { inverse, isSimilarity, moved, type Similarity } from '../core/similarity.ts';
 import { wordsOf } from '../core/words.ts';
 import { expand } from '../keys/keys.ts';
@@ -15,7 +15,8 @@ import { integerOf, numbersOf, objectOf, parsed, Tensors } from './safetensors.t
 
 const [FORMAT, VERSION] = ['keyss-secret', 10];
 const [MAX_ANCHORS, ANCHORS_NEEDED, ANCHOR_TOLERANCE] = [64, 0.25, 1e-6];
-const [MAX_COUNT, LEAST_LEFT] = [2 ** 31, 1e-6]; // of Gaussians; share of the visibility
+const MAX_COUNT = 2 ** 31; // of Gaussians
+const [GROWTH, LEAST_LEFT, COMPLETE] = [0.25, 0.1, 0.99]; // exponent; shares that are left
 const DRAWN_OPACITY = Math.fround(1 / 255);
 const APPENDED_OPACITY = 1.00001 / 255;
 const APPENDED_LOGIT = Math.fround(Math.log(APPENDED_OPACITY / (1 - APPENDED_OPACITY)));
@@ -42,9 +43,22 @@ export function decodeKeyss(payload: Uint8Array, stego: Gaussians): Gaussians | 
 /** Without what is never drawn, unless that is all, making up for what was lost of the sum of opacities. */
 function drawn(decoded: Gaussians, visibility: number): Gaussians {
   const found = where(decoded, (row) => Math.fround(opacity(decoded.opacityLogits[row])) >= DRAWN_OPACITY);
-  if (!found.count) return compensated(decoded, decoded.count / LEAST_LEFT);
+  if (!found.count) return compensated(decoded, 0);
   const left = found.opacityLogits.reduce((sum, each) => sum + opacity(each), 0) / Math.max(visibility, 1e-9);
-  return compensated(found, Math.round(found.count / Math.max(Math.min(1, left), LEAST_LEFT)));
+  return compensated(found, left);
+}
+
+/** The Gaussians that are `left` of a pruned model, a share, made denser and larger; see `compensate_pruning`. */
+function compensated(gaussians: Gaussians, left: number): Gaussians {
+  if (left >= COMPLETE) return gaussians;
+  const share = Math.max(left, LEAST_LEFT);
+  const opacityLogits = gaussians.opacityLogits.map((logit) => {
+    const rest = Math.min(Math.max(1 - Math.fround(opacity(logit)), 1e-7), 1 - 1e-7);
+    const opaque = 1 - Math.max(rest ** (1 / share), 1e-7);
+    return Math.log(opaque / (1 - opaque));
+  });
+  const grown = Math.fround(GROWTH * Math.log(1 / share));
+  return { ...gaussians, opacityLogits, logScales: gaussians.logScales.map((each) => each + grown) };
 }
 
 function frameOf(value: unknown): Similarity {
