@@ -15,7 +15,7 @@ from keyss.progress import Reporter
 from keyss.rendering import Backend, resolve_device
 from keyss.runs.files import CONFIG, METRICS, MODEL, Background, PathLike, as_scene, path_of
 from keyss.runs.folder import RunFolder, recorded_number
-from keyss.runs.planning import check_room, in_a_line, needs_of_fit, plan_fit
+from keyss.runs.planning import check_room, cost_of_fit
 from keyss.runs.run_records import FitMetrics, FitRunConfig
 
 
@@ -69,9 +69,10 @@ def fit(
             resume=resume,
         )
     loaded = as_scene(scene, settings.views)
-    check_room(needs_of_fit(loaded, config), None if out is None else Path(out))
+    cost = cost_of_fit(loaded, config, target)
+    check_room(cost, None if out is None else Path(out))
     if reporter and not resume:
-        reporter.note(f"fit: {in_a_line(plan_fit(loaded, config, target))}")
+        reporter.note(f"fit: {cost}")
     with folder.work() if folder else nullcontext():
         result = fit_scene(
             loaded,

@@ -157,10 +157,11 @@ def _hide_scenes(args: HideArguments) -> None:
         "out": args.out,
     }
     if args.dry_run:
-        plan = keyss.hide(args.cover, secrets, dry_run=True, **described).plan
-        assert plan is not None
-        print_plan(plan)
-        _warn_of_idle(idle, plan.steps)
+        found = keyss.hide(args.cover, secrets, dry_run=True, **described)
+        assert found.plan is not None
+        assert found.cost is not None
+        print_plan(method.name, found.plan, found.cost)
+        _warn_of_idle(idle, found.cost.steps)
         return
     result = keyss.hide(
         args.cover,

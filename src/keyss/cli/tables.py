@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from keyss.api.convert import Conversion
     from keyss.methods.base import Plan
     from keyss.runs.describe import ModelInfo, RunInfo, SceneInfo
+    from keyss.runs.planning import Cost
     from keyss.runs.revealing import Verification
     from keyss.runs.run_records import FitMetrics, HideMetrics
 
@@ -98,21 +99,20 @@ def _sizes_differ(metrics: HideMetrics, tolerance: float = 0.0) -> bool:
     return any(plain is not None and abs(plain - own) > tolerance * own for own, plain in sizes)
 
 
-def print_plan(plan: Plan) -> None:
+def print_plan(method: str, plan: Plan, cost: Cost) -> None:
     """Print capacity and estimates of a run."""
-    steps = f", {plan.steps:,} training steps" if plan.steps else ""
+    steps = f", {cost.steps:,} training steps" if cost.steps else ""
     _print_columns(
         [
-            ("method", plan.method),
+            ("method", method),
             ("capacity", f"{plan.capacity:,} of the secrets' {plan.secret_gaussians:,} Gaussians"),
             (
                 "published",
-                f"up to {plan.gaussians:,} Gaussians of SH degree {plan.sh_degree}, "
-                f"{plan.file_bytes / 1e6:,.1f} MB",
+                f"up to {plan.gaussians:,} Gaussians of SH degree {plan.sh_degree}, {plan.megabytes:,.1f} MB",
             ),
-            ("time", f"about {about(plan.seconds)}{steps}"),
-            ("memory", f"about {plan.memory_bytes / 1e9:.1f} GB"),
-            ("disk", f"up to {plan.disk_bytes / 1e6:,.0f} MB at once, checkpoints included"),
+            ("time", f"about {about(cost.seconds)}{steps}"),
+            ("memory", f"about {cost.memory_bytes / 1e9:.1f} GB"),
+            ("disk", f"up to {cost.disk_bytes / 1e6:,.0f} MB at once, checkpoints included"),
             *(("note", note) for note in plan.notes),
         ]
     )
