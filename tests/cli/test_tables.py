@@ -49,7 +49,4 @@ def test_shorter_plain_model_is_no_bound() -> None:
         *("Gaussians", "steps"),
     ]
     assert rows[2] == ["secret", "20.00", "0.250", "19.00", "567", "20"]
-    assert any(row[0].startswith("Start:") and "10 training steps" in row[0] for row in rows)
-    old = replace(shorter, steps=(), equal=())  # a record without steps
-    rows = table(replace(METRICS, baseline=old, steps=()))
-    assert rows[0] == ["on test photos", "PSNR", "SSIM", "start", "Gaussians"]
+    assert any(row[0].startswith("Start:") for row in rows)

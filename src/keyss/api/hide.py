@@ -353,7 +353,9 @@ def _measure(
         stego.opened,
         scenes,
         beside_bounds,
-        [len(longer[index]) if index in longer else count for index, (count, _) in enumerate(plain_sizes)],
+        gaussians=[
+            len(longer[index]) if index in longer else count for index, (count, _) in enumerate(plain_sizes)
+        ],
         steps=[each.steps if index in longer else plain_steps[index] for index, each in enumerate(bounds)],
         equal=[each.equal or index in longer for index, each in enumerate(bounds)],
         seed=options.fit.known_seed,

@@ -84,7 +84,7 @@ def evaluate(
         opened.opened,
         scenes,
         list(map(compare, models, baselines, scenes)),
-        [None if model is None else len(model) for model in baselines],
+        gaussians=[None if model is None else len(model) for model in baselines],
         steps=opened.metrics.baseline.steps,
         equal=opened.metrics.baseline.equal,
         wrong_keys=WRONG_KEYS if wrong_keys is None else wrong_keys,

@@ -33,8 +33,8 @@ class BaselineQuality:
     cover: ImageQuality | None
     secrets: tuple[ImageQuality | None, ...]
     gaussians: tuple[int | None, ...]  # plain models: cover, then secrets
-    steps: tuple[int | None, ...] = ()  # training steps of the plain models; None: given, unknown
-    equal: tuple[bool, ...] = ()  # whether the scene had as many steps in total
+    steps: tuple[int | None, ...]  # training steps of the plain models; None: given, unknown
+    equal: tuple[bool, ...]  # whether the scene had as many steps in total
 
 
 @dataclass(frozen=True)
@@ -88,14 +88,12 @@ def measure_hiding(
     opened: Sequence[HiddenScene],
     scenes: Sequence[Scene],  # the cover, then the secrets in the order of `opened`, each in its own frame
     shown: Sequence[Shown],  # of `compare`: the stego model, then the secrets
-    gaussians: Sequence[int | None],  # of the plain models of the scenes
     *,
-    steps: Sequence[
-        int | None
-    ] = (),  # training steps of the plain models, and whether their scenes had as many
-    equal: Sequence[bool] = (),
+    gaussians: Sequence[int | None],  # these and the next: see `BaselineQuality`
+    steps: Sequence[int | None],
+    equal: Sequence[bool],
     wrong_keys: int = WRONG_KEYS,
-    seed: int = 0,
+    seed: int,
 ) -> HidingQuality:
     """Measure cover and secrets, their plain models, and renders under wrong keys.
 
