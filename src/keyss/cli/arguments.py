@@ -95,18 +95,13 @@ def flag(name: str) -> str:
     return f"--{name.replace('_', '-')}"
 
 
-def check_exists(*paths: Path | None, expected: str = "a file or folder") -> None:
+def check_exists(*paths: Path | None) -> None:
     """Raise InputError if an input does not exist; - is the standard input. Does not import torch."""
     from keyss.core.errors import InputError
 
     for path in paths:
         if path is not None and str(path) != "-" and not os.path.lexists(path):
-            raise InputError(f"{path}: expected {expected}, but there is no such file")
-
-
-def check_run(run: Path) -> None:
-    """Raise InputError if the run does not exist; see `check_exists`."""
-    check_exists(run, expected="the folder of a run, as `keyss hide` writes it")
+            raise InputError(f"{path}: expected a file or folder, but there is no such file")
 
 
 def check_seed(seed: int) -> int:

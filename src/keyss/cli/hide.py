@@ -129,11 +129,20 @@ def hide(args: HideArguments) -> None:
 
     example: keyss hide --cover cover.ply --secret-file letter.pdf --key-file key.txt -o runs/letter
     """
-    _check_without_torch(args)
-    (_hide_files if args.secret_file else _hide_scenes)(args)
+    from keyss.core.errors import UsageError
+
+    check_exists(args.cover, args.details.cover_model)
+    check_exists(*args.secret, *args.secret_file, *args.key_file, *args.details.secret_model)
+    options = _method_options(args)
+    if args.secret_file:
+        _hide_files(args)
+    elif args.secret:
+        _hide_scenes(args, options)
+    else:
+        raise UsageError("no secret: give --secret SCENE or --secret-file FILE, one for each secret")
 
 
-def _hide_scenes(args: HideArguments) -> None:
+def _hide_scenes(args: HideArguments, options: MethodOptions) -> None:
     import keyss
     from keyss import progress
     from keyss.cli.tables import print_files, print_hiding, print_plan
@@ -142,36 +151,32 @@ def _hide_scenes(args: HideArguments) -> None:
     from keyss.runs.files import COMPANIONS, STEGOS
 
     method = registry.get(args.method)
-    options, secrets = _method_options(args), _secrets(args, method)
+    secrets = _secrets(args, method)
     idle = _ignored_training_flags(args)
     if idle and not options.may_train:
         raise UsageError(
             f"{idle}: nothing is trained, as models of all scenes are given and --method {options.method} "
             "does not refit them: leave out such options"
         )
-    described: dict[str, Any] = vars(args.photos) | {
-        "method": options,
-        "cover_model": args.details.cover_model,
-        "bound": args.details.bound,
-        "device": args.device,
-        "out": args.out,
-    }
-    if args.dry_run:
-        found = keyss.hide(args.cover, secrets, dry_run=True, **described)
-        assert found.plan is not None
-        assert found.cost is not None
-        print_plan(method.name, found.plan, found.cost)
-        _warn_of_idle(idle, found.cost.steps)
-        return
     result = keyss.hide(
         args.cover,
         secrets,
+        method=options,
+        **vars(args.photos),
+        cover_model=args.details.cover_model,
+        bound=args.details.bound,
         min_psnr=args.details.min_psnr,
+        device=args.device,
+        out=args.out,
         overwrite=args.overwrite,
         resume=args.resume,
+        dry_run=args.dry_run,
         reporter=progress.reporter(),
-        **described,
     )
+    if result.plan is not None and result.cost is not None:
+        print_plan(method.name, result.plan, result.cost)
+        _warn_of_idle(idle, result.cost.steps)
+        return
     assert result.metrics is not None
     print_hiding(result.metrics, brief=progress.level < 1)
     _warn_of_idle(idle, result.metrics.iterations)
@@ -329,17 +334,6 @@ def with_options_of_method(arguments: Sequence[str]) -> Callable[..., None]:
     command.__annotations__ = {"args": Annotated[kind, arg(name="")], "return": None}
     command.__name__, command.__doc__ = "hide", hide.__doc__
     return command
-
-
-def _check_without_torch(args: HideArguments) -> None:
-    """Check options and files before the slow import of torch. Raises UsageError and InputError."""
-    from keyss.core.errors import UsageError
-
-    check_exists(args.cover, args.details.cover_model)
-    check_exists(*args.secret, *args.secret_file, *args.key_file, *args.details.secret_model)
-    _method_options(args)
-    if not (args.secret_file or args.secret):
-        raise UsageError("no secret: give --secret SCENE or --secret-file FILE, one for each secret")
 
 
 def _own_field(named: tuple[str, tuple[Any, CommandLineOption]]) -> tuple[str, Any, Any]:

@@ -16,7 +16,6 @@ from keyss.cli.arguments import (
     Photos,
     Run,
     check_exists,
-    check_run,
     optional,
     switch,
 )
@@ -149,7 +148,7 @@ def evaluate(
 
     example: keyss evaluate runs/hidden --key-file key.txt
     """
-    check_run(run)
+    check_exists(run)
     import keyss
     from keyss.cli.keys import keys_of_run
     from keyss.cli.tables import print_files, print_hiding

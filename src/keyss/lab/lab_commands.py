@@ -18,7 +18,6 @@ from keyss.cli.arguments import (
     Run,
     Width,
     check_exists,
-    check_run,
     check_seed,
     optional,
     switch,
@@ -61,7 +60,7 @@ def audit(
 
     example: keyss audit runs/hidden --report-only
     """
-    check_run(run)
+    check_exists(run)
     import keyss
     from keyss.cli.keys import keys_of_run
     from keyss.cli.tables import print_files
