@@ -8,14 +8,11 @@ from __future__ import annotations
 import ipaddress
 import re
 import secrets
-import shutil
 import socket
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from io import BytesIO
 from pathlib import Path
-from typing import BinaryIO
 from urllib.parse import quote, unquote, urlsplit
 
 from keyss.core.errors import OutputError
@@ -23,8 +20,7 @@ from keyss.viewer.look import Look
 from keyss.viewer.page import SCRIPT, STYLE, asset, readable, served_page, served_policy
 
 LOCALHOST = "127.0.0.1"
-# By path: the media type, and a function that opens the content or raises OSError.
-Contents = Mapping[str, tuple[str, Callable[[], BinaryIO]]]
+Contents = Mapping[str, tuple[str, bytes]]  # media type and content, by path
 
 
 class _ServerIPv6(ThreadingHTTPServer):
@@ -41,15 +37,15 @@ class ModelServer:
 
         Raises InputError if `model` is not a model, OutputError if the port is in use.
         """
-        file = readable(Path(model))
-        page = served_page(f"model/{quote(file.name)}", look or {})
+        name, data = readable(Path(model))
+        page = served_page(f"model/{quote(name)}", look or {})
         self._folder = f"/{secrets.token_urlsafe(16)}/"
         contents: Contents = {
-            self._folder: ("text/html; charset=utf-8", lambda: BytesIO(page)),
-            self._folder + SCRIPT: ("text/javascript; charset=utf-8", lambda: BytesIO(asset(SCRIPT))),
-            self._folder + STYLE: ("text/css; charset=utf-8", lambda: BytesIO(asset(STYLE))),
-            f"{self._folder}model/{file.name}": ("application/octet-stream", file.open),
-            "/favicon.ico": ("image/x-icon", lambda: BytesIO()),
+            self._folder: ("text/html; charset=utf-8", page),
+            self._folder + SCRIPT: ("text/javascript; charset=utf-8", asset(SCRIPT)),
+            self._folder + STYLE: ("text/css; charset=utf-8", asset(STYLE)),
+            f"{self._folder}model/{name}": ("application/octet-stream", data),
+            "/favicon.ico": ("image/x-icon", b""),
         }
         try:
             kind = _ServerIPv6 if ":" in host else ThreadingHTTPServer
@@ -104,21 +100,17 @@ def _handler(contents: Contents, names: set[str] | None) -> type[BaseHTTPRequest
             if names is not None and (len(hosts) != 1 or hosts[0] not in names):
                 self.send_error(HTTPStatus.FORBIDDEN)
                 return
-            content = contents.get(unquote(urlsplit(self.path).path))
+            media_type, content = contents.get(unquote(urlsplit(self.path).path), ("", None))
             if content is None:
                 self.send_error(HTTPStatus.NOT_FOUND)
                 return
-            media_type, opened = content
             try:
-                with opened() as file:
-                    size = file.seek(0, 2)
-                    file.seek(0)
-                    self.send_response(HTTPStatus.OK)
-                    for name, value in _headers(media_type, size).items():
-                        self.send_header(name, value)
-                    self.end_headers()
-                    shutil.copyfileobj(file, self.wfile)
-            except OSError:  # the client disconnected, or the model was removed
+                self.send_response(HTTPStatus.OK)
+                for name, value in _headers(media_type, len(content)).items():
+                    self.send_header(name, value)
+                self.end_headers()
+                self.wfile.write(content)
+            except OSError:  # the client disconnected
                 self.close_connection = True
 
         def log_message(self, format: str, *args: object) -> None:
