@@ -117,7 +117,7 @@ def test_resume(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match=r"interrupted run.*`resume=True`"):
         RunFolder(tmp_path, "hide", arguments)
     other = {"width": 160, "options": {"seed": 0, "fit": {"iterations": 20}}}
-    with pytest.raises(OutputError, match="iterations 10 then, 20 now; width: 200 then, 160 now"):
+    with pytest.raises(OutputError, match="iterations: 10 then, 20 now; width: 200 then, 160 now"):
         RunFolder(tmp_path, "hide", other, resume=True)
     with pytest.raises(OutputError, match="of another kind"):
         RunFolder(tmp_path, "fit", arguments, resume=True)

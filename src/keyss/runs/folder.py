@@ -132,7 +132,7 @@ class RunFolder:
             before = running.arguments | {"keys": self.arguments.get("keys")}
             if before == self.arguments or "keys" not in self.arguments:  # verifiers depend on the others
                 before = running.arguments
-            changes = _differences(before, self.arguments, "; ", ": ")
+            changes = _differences(before, self.arguments)
             raise OutputError(
                 f"{self.path} holds an interrupted run with other arguments ({changes}): give the same ones, "
                 "or start anew with `overwrite=True`"
@@ -380,13 +380,11 @@ def _remove_empty(folder: Path) -> None:
         folder.rmdir()
 
 
-def _differences(old: Any, new: Any, between: str = ", ", after_name: str = " ") -> str:
+def _differences(old: Any, new: Any) -> str:
     """The values that differ, down to the innermost fields."""
     if isinstance(old, dict) and isinstance(new, dict):
         names = [name for name in sorted({*old, *new}) if old.get(name) != new.get(name)]
-        return between.join(
-            f"{name}{after_name}{_differences(old.get(name), new.get(name))}" for name in names
-        )
+        return "; ".join(f"{name}: {_differences(old.get(name), new.get(name))}" for name in names)
     shown = ["none" if value is None else msgspec.json.encode(value).decode() for value in (old, new)]
     return "not the same" if max(map(len, shown)) > _MAX_SHOWN else f"{shown[0]} then, {shown[1]} now"
 
