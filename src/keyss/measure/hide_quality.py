@@ -142,20 +142,19 @@ def _wrong_keys(
     seed: int,
 ) -> WrongKeys | None:
     """PSNRs of decoded models under wrong embeddings; None without decoders."""
-    keyed = [
-        (each.decode, each.key_size, scene)
-        for each, scene in zip(opened, secrets, strict=True)
-        if each.decode is not None
-    ]
-    if not keyed:
-        return None
     vs_cover, vs_secrets = [], []
-    for decode, size, scene in keyed:
-        embeddings = random_embeddings(count, torch.Generator().manual_seed(seed), size)
-        models = (decode(stego, embedding) for embedding in embeddings)  # one at a time: they are large
-        psnrs = [(_psnr(model, cover), _psnr(model, scene)) for model in models]
-        vs_cover.append([of_cover for of_cover, _ in psnrs])
-        vs_secrets.append(_range([of_secret for _, of_secret in psnrs]))
+    for each, scene in zip(opened, secrets, strict=True):
+        if each.decode is None:
+            continue
+        embeddings = random_embeddings(count, torch.Generator().manual_seed(seed), each.key_size)
+        models = (each.decode(stego, embedding) for embedding in embeddings)  # one at a time: they are large
+        of_cover, of_secret = zip(
+            *((_psnr(model, cover), _psnr(model, scene)) for model in models), strict=True
+        )
+        vs_cover.append(of_cover)
+        vs_secrets.append(_range(of_secret))
+    if not vs_cover:
+        return None
     means = [fmean(psnrs) for psnrs in zip(*vs_cover, strict=True)]
     return WrongKeys(count, _range(means), tuple(vs_secrets))
 
