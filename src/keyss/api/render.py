@@ -60,21 +60,20 @@ def evaluate(
     keys: Sequence[str],
     *,
     wrong_keys: int | None = None,
-    seed: int | None = None,
     device: Backend = "auto",
 ) -> HideMetrics:
     """Measure a run of `hide` again on the test views; rewrites its `metrics.json`.
 
-    `keys`: one per secret, in any order. `wrong_keys`: number of random wrong keys to measure, 32 by default,
-    sampled with `seed`, by default the run's; only for methods whose keys condition a decoder.
-    Raises WrongKeyError for a key that opens nothing, UsageError for a secret without a key.
+    `keys`: one per secret, in any order. `wrong_keys`: number of random wrong keys to measure, 32 by default;
+    only for methods whose keys condition a decoder. Raises WrongKeyError for a key that opens nothing,
+    UsageError for a secret without a key.
     """
     target = resolve_device(device)
     opened = open_run(run, keys)
-    if (wrong_keys, seed) != (None, None) and all(each.decode is None for each in opened.opened):
+    if wrong_keys is not None and all(each.decode is None for each in opened.opened):
         raise UsageError(
             f"the method {opened.config.method} has no decoder, so wrong keys show nothing: leave out "
-            "`wrong_keys` and `seed`"
+            "`wrong_keys`"
         )
     stego, scenes = opened.stego.to(target), opened.scenes(train_pictures=False)
     models = [stego, *(secret.reveal(stego).to(target) for secret in opened.opened)]
@@ -88,7 +87,7 @@ def evaluate(
         steps=opened.metrics.baseline.steps,
         equal=opened.metrics.baseline.equal,
         wrong_keys=WRONG_KEYS if wrong_keys is None else wrong_keys,
-        seed=opened.metrics.seed if seed is None else seed,
+        seed=opened.metrics.seed,
     )
     metrics = replace(opened.metrics, **vars(measured))
     write_again(opened.folder, "hide", METRICS, metrics)

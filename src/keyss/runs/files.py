@@ -111,12 +111,9 @@ def as_scene(
                 f"{source}: expected a scene folder or a 3DGS model ({known_suffixes()}), found "
                 f"{identify_file(Path(source))}"
             )
-        try:
-            return load_scene(source, **vars(views))
-        except InputError as error:
-            if is_run(Path(source)) and (inside := model_in(Path(source))):
-                raise InputError(f"{source}: expected a scene, found a run; its model is {inside}") from error
-            raise
+        if is_run(Path(source)) and (inside := model_in(Path(source))):
+            raise InputError(f"{source}: expected a scene, found a run; its model is {inside}")
+        return load_scene(source, **vars(views))
     from keyss.rendering.orbit import scene_of_model
 
     name = "model" if isinstance(source, Gaussians) else Path(source).stem

@@ -293,15 +293,6 @@ def read_manifest(folder: Path) -> Manifest:
     return manifest
 
 
-def recorded_number(folder: Path, *names: str) -> int | None:
-    """An argument of the interrupted run in a folder, by the names that lead to it; None if it has none."""
-    running = read_manifest(folder).running
-    value: Any = running and running.arguments
-    for name in names:
-        value = value.get(name) if isinstance(value, dict) else None
-    return value if isinstance(value, int) else None
-
-
 def _drop_unfinished(folder: Path, manifest: Manifest) -> None:
     """Remove checkpoints and unfinished files.
 
