@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import io
 import re
+from contextlib import redirect_stdout
 from dataclasses import replace
 
-from rich.console import Console
+import pytest
 
 from cli.harness import METRICS
 from keyss.cli.tables import print_hiding
@@ -15,10 +16,14 @@ from keyss.runs import HideMetrics
 
 
 def table(metrics: HideMetrics) -> list[list[str]]:
-    console = Console(file=io.StringIO(), width=80)
-    print_hiding(metrics, console)
-    text: str = console.file.getvalue()  # type: ignore[attr-defined]
-    return [re.split("  +", line.strip()) for line in text.splitlines()]
+    with redirect_stdout(io.StringIO()) as out:
+        print_hiding(metrics)
+    return [re.split("  +", line.strip()) for line in out.getvalue().splitlines()]
+
+
+@pytest.fixture(autouse=True)
+def narrow(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
 
 
 def test_rows() -> None:

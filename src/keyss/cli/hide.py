@@ -28,6 +28,8 @@ from keyss.cli.arguments import (
     optional,
     switch,
 )
+from keyss.cli.keys import keys
+from keyss.core.errors import InputError, UsageError
 
 if TYPE_CHECKING:
     from keyss.methods.base import CommandLineOption, Method, MethodOptions
@@ -129,8 +131,6 @@ def hide(args: HideArguments) -> None:
 
     example: keyss hide --cover cover.ply --secret-file letter.pdf --key-file key.txt -o runs/letter
     """
-    from keyss.core.errors import UsageError
-
     check_exists(args.cover, args.details.cover_model)
     check_exists(*args.secret, *args.secret_file, *args.key_file, *args.details.secret_model)
     options = _method_options(args)
@@ -146,7 +146,6 @@ def _hide_scenes(args: HideArguments, options: MethodOptions) -> None:
     import keyss
     from keyss import progress
     from keyss.cli.tables import print_files, print_hiding, print_plan
-    from keyss.core.errors import UsageError
     from keyss.methods import registry
     from keyss.runs.files import COMPANIONS, STEGOS
 
@@ -173,13 +172,17 @@ def _hide_scenes(args: HideArguments, options: MethodOptions) -> None:
         dry_run=args.dry_run,
         reporter=progress.reporter(),
     )
+    steps = result.cost.steps if result.cost else result.metrics.iterations if result.metrics else 0
+    if idle and not steps:
+        print(
+            f"keyss: warning: {idle} had no effect: the secrets fit as they are, and nothing is trained",
+            file=sys.stderr,
+        )
     if result.plan is not None and result.cost is not None:
         print_plan(method.name, result.plan, result.cost)
-        _warn_of_idle(idle, result.cost.steps)
         return
     assert result.metrics is not None
     print_hiding(result.metrics, brief=progress.level < 1)
-    _warn_of_idle(idle, result.metrics.iterations)
     what = "the cover with the secret in it" if options.trains or method.capabilities.keys else "the cover"
     how = _HOW_TO_PUBLISH[result.survives]
     print_files(
@@ -202,7 +205,6 @@ def _hide_scenes(args: HideArguments, options: MethodOptions) -> None:
 def _secrets(args: HideArguments, method: Method) -> list[Any]:
     """The secrets with their keys and models."""
     import keyss
-    from keyss.core.errors import InputError, UsageError
     from keyss.files.file_kinds import identify_file
     from keyss.files.models import is_model_path
 
@@ -215,17 +217,11 @@ def _secrets(args: HideArguments, method: Method) -> list[Any]:
         raise UsageError(
             f"expected no --secret-model or one for each of {count} secret(s), got {len(models)}"
         )
-    keys = _keys(args, count) if method.capabilities.keys or args.key_file else [""] * count
-    with_models = zip(args.secret, keys, models or (None,) * count, strict=True)
+    given = (
+        keys(args.key_file, count, new=True) if method.capabilities.keys or args.key_file else [""] * count
+    )
+    with_models = zip(args.secret, given, models or (None,) * count, strict=True)
     return [keyss.Secret(scene, key, model) for scene, key, model in with_models]
-
-
-def _keys(args: HideArguments, count: int) -> list[str]:
-    from keyss.cli.keys import keys, warn_of_weak_keys
-
-    found = keys(args.key_file, count, confirm=True)
-    warn_of_weak_keys(found)
-    return found
 
 
 def _ignored_training_flags(args: HideArguments) -> str:
@@ -235,18 +231,8 @@ def _ignored_training_flags(args: HideArguments) -> str:
     sources = [args.details.cover_model or args.cover, *(args.details.secret_model or args.secret)]
     if not all(map(is_model, sources)):
         return ""
-    preset = ["--preset"] if args.preset != "default" else []
-    flags = (flag for flag in changed_flags(args.training) if flag in ("--iterations", "--max-gaussians"))
-    return " and ".join([*preset, *flags])
-
-
-def _warn_of_idle(idle: str, steps: int) -> None:
-    """Warn of options without effect if there was no training."""
-    if idle and not steps:
-        print(
-            f"keyss: warning: {idle} had no effect: the secrets fit as they are, and nothing is trained",
-            file=sys.stderr,
-        )
+    training = ("--preset", "--iterations", "--max-gaussians")
+    return " and ".join(flag for flag in changed_flags(args) if flag in training)
 
 
 def _method_options(args: HideArguments) -> MethodOptions:
@@ -269,17 +255,15 @@ def _hide_files(args: HideArguments) -> None:
     import keyss
     from keyss.channels import channel_for
     from keyss.cli.tables import print_files
-    from keyss.core.errors import UsageError
     from keyss.runs.files import STEGOS
 
     used = "cover secret_file key_file publish format out overwrite device channel dry_run"
     if unused := [each for each in changed_flags(args) if each not in map(flag, used.split())]:
         raise UsageError(f"--secret-file does not use {unused[0]}: leave out {unused[0]}")
-    files, keys = args.secret_file, _keys(args, len(args.secret_file))
-    channel = args.details.channel or "colours"
+    files, channel = args.secret_file, args.details.channel or "colours"
     result = keyss.hide_files(
         args.cover,
-        list(map(keyss.SecretFile, files, keys)),
+        list(map(keyss.SecretFile, files, keys(args.key_file, len(files), new=True))),
         publish=args.publish,
         format=args.format,
         channel=channel,
@@ -302,7 +286,6 @@ def with_options_of_method(arguments: Sequence[str]) -> Callable[..., None]:
 
     Raises UsageError for an option that only another method has.
     """
-    from keyss.core.errors import UsageError
     from keyss.methods import registry
 
     chooser = ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)

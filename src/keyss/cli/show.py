@@ -19,6 +19,8 @@ from keyss.cli.arguments import (
     optional,
     switch,
 )
+from keyss.cli.keys import keys_of_run
+from keyss.core.errors import UsageError
 
 _VECTOR = r"[-+.\de]+(,[-+.\de]+){2}"
 _POSE = rf"#?eye={_VECTOR}&target={_VECTOR}(&up=({_VECTOR}|-?[xyz]))?"
@@ -64,7 +66,6 @@ def view(
     example: keyss view runs/hidden/publish/model.ply -o page.html
     """
     check_exists(model)
-    from keyss.core.errors import UsageError
     from keyss.viewer import ModelServer, export_html, look_of_model
 
     if pose and not re.fullmatch(_POSE, pose):
@@ -150,7 +151,6 @@ def evaluate(
     """
     check_exists(run)
     import keyss
-    from keyss.cli.keys import keys_of_run
     from keyss.cli.tables import print_files, print_hiding
     from keyss.fitting.image_metrics import HOW_TO_GET, MIN_SIZE
 

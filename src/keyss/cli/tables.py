@@ -36,9 +36,9 @@ class Console(RichConsole):
         raise  # the BrokenPipeError that is being handled
 
 
-def print_hiding(metrics: HideMetrics, console: Console | None = None, *, brief: bool = False) -> None:
+def print_hiding(metrics: HideMetrics, *, brief: bool = False) -> None:
     """Print the measurements of a hiding: a row per scene, then the rest unless `brief`."""
-    console, count = console or Console(), len(metrics.photos)
+    count = len(metrics.photos)
     names = [role_of(index, count) for index in range(count)]
     rows = _scene_rows(metrics)
     heads = [head for head in _HEADS if any(head in row for row in rows)]
@@ -47,15 +47,14 @@ def print_hiding(metrics: HideMetrics, console: Console | None = None, *, brief:
         views = "on test photos"
         first = [name + " (renders)" * (not shown) for name, shown in zip(names, metrics.photos, strict=True)]
     table = [[name, *(row.get(head, "") for head in heads)] for name, row in zip(first, rows, strict=True)]
-    print_table([views, *heads], table, console=console)
+    print_table([views, *heads], table)
     lines = _lines_on_files(metrics, names)
     if not brief:
         lines = [*_explanations(metrics, names, heads), *lines]
         units = {"capacity": "Gaussians", "capacity_bytes": "bytes"}
         found = {unit: metrics.details[name] for name, unit in units.items() if name in metrics.details}
         lines += [f"Capacity of the cover: {number:,} {unit}." for unit, number in found.items()]
-    for line in lines:
-        console.print(line, highlight=False, markup=False)
+    print(*lines, sep="\n")
 
 
 def _scene_rows(metrics: HideMetrics) -> list[dict[str, str]]:
@@ -201,11 +200,7 @@ def print_conversion(out: str, found: Conversion, *, dry_run: bool, file: TextIO
         renders = "renders are empty: the model is invisible"
     print(f"{out}: {len(found.gaussians):,} Gaussians, {_size(found.bytes_after)}{was}, {renders}", file=file)
     if out.lower().endswith(".spz"):
-        print(
-            "y is up in an .spz, as Niantic's library and splat-transform 2 write it; programs that do not "
-            "turn it (splat-transform 3) show it upside down",
-            file=file,
-        )
+        print("y is up in an .spz: programs that do not turn it show it upside down", file=file)
     for number, secret in enumerate(found.secrets, 1):
         which = "the secret" if len(found.secrets) == 1 else f"the secret of key {number}"
         state = "survives" if secret.kept else f"is lost: {secret.after:,} {secret.unit} are left"
@@ -239,9 +234,7 @@ def _print_columns(rows: Sequence[tuple[str, str]]) -> None:
         print(f"{name:<{width}}  {text}")
 
 
-def print_table(
-    heads: Sequence[str], rows: Iterable[Sequence[str]], *, texts: int = 1, console: Console | None = None
-) -> None:
+def print_table(heads: Sequence[str], rows: Iterable[Sequence[str]], *, texts: int = 1) -> None:
     """Print a table; its first `texts` columns are aligned left, the others hold numbers.
 
     Long texts wrap between words, and anything in terminals that are too narrow.
@@ -251,7 +244,7 @@ def print_table(
         table.add_column(head, justify="left" if index < texts else "right", overflow="fold")
     for row in rows:
         table.add_row(*map(Text, row))
-    (console or Console()).print(table)
+    Console().print(table)
 
 
 def _text(value: object) -> str:
