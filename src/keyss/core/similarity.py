@@ -39,12 +39,10 @@ class Similarity:
                 f"similarity: expected a [3, 3] rotation and a [3] translation, "
                 f"got {list(rotation.shape)} and {list(translation.shape)}"
             )
-        if not (math.isfinite(self.scale) and self.scale > 0):
-            raise ValueError(f"similarity: expected a positive finite scale, got {self.scale}")
-        if not (rotation.isfinite().all() and translation.isfinite().all()):
-            raise ValueError("similarity: the rotation or the translation is not finite")
+        if not (0 < self.scale < math.inf and translation.isfinite().all()):
+            raise ValueError("similarity: expected a positive finite scale and a finite translation")
         off = (rotation @ rotation.T - torch.eye(3, dtype=torch.float64)).abs().max()
-        if off > _ROTATION_TOLERANCE or torch.linalg.det(rotation) < 0:
+        if not off <= _ROTATION_TOLERANCE or torch.linalg.det(rotation) < 0:  # `off` may be NaN
             raise ValueError("similarity: the rotation is not orthonormal with determinant +1")
         object.__setattr__(self, "scale", float(self.scale))
         object.__setattr__(self, "rotation", rotation)

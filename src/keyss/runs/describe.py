@@ -18,7 +18,6 @@ from keyss.files.models import is_model_path, known_suffixes, read_model
 if TYPE_CHECKING:
     from keyss.runs.run_records import FitMetrics, HideMetrics
 
-_NAMED = 10  # runs in a message
 Corner = tuple[float, ...]  # [3] world units
 
 
@@ -85,8 +84,7 @@ def _folder_info(path: Path) -> RunInfo | ModelInfo | SceneInfo:
             return RunInfo("plain model", str(path), read_record(path / METRICS, FitMetrics))
         return RunInfo("hiding", str(path), read_record(path / METRICS, HideMetrics))
     if runs := sorted(each for each in path.iterdir() if is_run(each)):
-        named = ", ".join(map(str, runs[:_NAMED])) + f" and {len(runs) - _NAMED} more" * (len(runs) > _NAMED)
-        raise InputError(f"{path} is not a run, but a folder of runs: name one of {named}")
+        raise InputError(f"{path} is not a run, but a folder of {len(runs)}: name one, such as {runs[0]}")
     if is_training(path):
         return _model_info(model_file(path))
     scene = load_scene(path, skip_missing=True)

@@ -28,22 +28,21 @@ MAX_BYTES = 2 << 30
 # Argon2id is WebAssembly. Workers and saved pictures are blobs that the page makes itself.
 _WASM, _SELF = "'wasm-unsafe-eval'", "'self'"
 _NOTHING = "object-src 'none'; base-uri 'none'; form-action 'none'"
+# Of a page with separate script and style.
+SERVED_POLICY = (
+    f"default-src {_SELF}; script-src {_SELF} {_WASM}; worker-src {_SELF} blob:; "
+    f"img-src {_SELF} blob: data:; {_NOTHING}"
+)
 # The page detects formats by their first bytes, and .splat, which has no signature, by its suffix.
 _MAGIC = (b"ply", b"NGSP", b"\x1f\x8b", b"PK\x03\x04")
 _MAX_HEADER = 64 << 10  # bytes of a .ply
 _ORIGIN = re.compile(r"https?://[A-Za-z0-9.-]+(:[0-9]+)?")
 
 
-def served_policy() -> str:
-    """The content security policy of a page with separate script and style."""
-    scripts = f"script-src {_SELF} {_WASM}; worker-src {_SELF} blob:"
-    return f"default-src {_SELF}; {scripts}; img-src {_SELF} blob: data:; {_NOTHING}"
-
-
 def served_page(url: str, look: Look) -> bytes:
     """The page with separate style and script; `url`: of the model."""
     return _page(
-        policy=served_policy(),
+        policy=SERVED_POLICY,
         style=f'<link rel="stylesheet" href="{STYLE}">',
         model=f'<meta name="keyss-model" content="{html.escape(url)}">',
         script=f'<script src="{SCRIPT}"></script>',

@@ -17,7 +17,7 @@ from urllib.parse import quote, unquote, urlsplit
 
 from keyss.core.errors import OutputError
 from keyss.viewer.look import Look
-from keyss.viewer.page import SCRIPT, STYLE, asset, readable, served_page, served_policy
+from keyss.viewer.page import SCRIPT, SERVED_POLICY, STYLE, asset, readable, served_page
 
 LOCALHOST = "127.0.0.1"
 Contents = Mapping[str, tuple[str, bytes]]  # media type and content, by path
@@ -54,7 +54,10 @@ class ModelServer:
             raise OutputError(f"cannot serve on {host}, port {port}: {error}") from error
         self._server.daemon_threads = True
         self._ip = ipaddress.ip_address(str(self._server.server_address[0]))
-        self._server.RequestHandlerClass = _handler(contents, self._names(host))
+        # Accepted `Host` headers; None accepts all, if the server listens on all addresses.
+        local = {"localhost"} if self.is_local else set()
+        names = None if self._ip.is_unspecified else {host.lower(), _in_url(self._ip)} | local
+        self._server.RequestHandlerClass = _handler(contents, names)
 
     @property
     def address(self) -> str:
@@ -65,12 +68,6 @@ class ModelServer:
     def is_local(self) -> bool:
         """True if only this machine can connect."""
         return self._ip.is_loopback
-
-    def _names(self, host: str) -> set[str] | None:
-        """Accepted `Host` headers; None accepts all, if the server listens on all addresses."""
-        if self._ip.is_unspecified:
-            return None
-        return {host.lower(), _in_url(self._ip), *(["localhost"] if self.is_local else [])}
 
     def run(self) -> None:
         """Serve until another thread calls `close`, or a signal ends it."""
@@ -123,7 +120,7 @@ def _headers(media_type: str, size: int) -> dict[str, str]:
     return {
         "Content-Type": media_type,
         "Content-Length": str(size),
-        "Content-Security-Policy": f"{served_policy()}; frame-ancestors 'none'",
+        "Content-Security-Policy": f"{SERVED_POLICY}; frame-ancestors 'none'",
         "X-Content-Type-Options": "nosniff",
         "Referrer-Policy": "no-referrer",
         "Cross-Origin-Resource-Policy": "same-origin",
