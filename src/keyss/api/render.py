@@ -11,7 +11,7 @@ from torch import Tensor
 
 from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
-from keyss.core.scene import Scene, View, ViewOptions
+from keyss.core.scene import Scene, ViewOptions
 from keyss.files.images import png_bytes
 from keyss.measure.hide_quality import WRONG_KEYS, compare, measure_hiding
 from keyss.measure.renders import renders_of
@@ -47,8 +47,8 @@ def render(
     folder = RunFolder(out, "render", inputs=inputs, overwrite=overwrite) if out is not None else None
     scene = as_scene(cameras, views)
     gaussians = scene.to_scene_frame(as_model(model)).to(target)
-    splits: dict[str, tuple[View, ...]] = {"test": scene.test, "train": scene.train, "all": scene.views}
-    pictures = renders_of(gaussians, scene, splits[split])
+    chosen = {"test": scene.test, "train": scene.train, "all": scene.views}[split]
+    pictures = renders_of(gaussians, scene, chosen)
     if folder:
         with folder.work():
             folder.write({name: png_bytes(image) for name, image in pictures})

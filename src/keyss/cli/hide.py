@@ -172,7 +172,7 @@ def _hide_scenes(args: HideArguments, options: MethodOptions) -> None:
         dry_run=args.dry_run,
         reporter=progress.reporter(),
     )
-    steps = result.cost.steps if result.cost else result.metrics.iterations if result.metrics else 0
+    steps = result.cost.steps if result.cost else result.metrics and result.metrics.iterations
     if idle and not steps:
         print(
             f"keyss: warning: {idle} had no effect: the secrets fit as they are, and nothing is trained",
@@ -217,11 +217,9 @@ def _secrets(args: HideArguments, method: Method) -> list[Any]:
         raise UsageError(
             f"expected no --secret-model or one for each of {count} secret(s), got {len(models)}"
         )
-    given = (
-        keys(args.key_file, count, new=True) if method.capabilities.keys or args.key_file else [""] * count
-    )
-    with_models = zip(args.secret, given, models or (None,) * count, strict=True)
-    return [keyss.Secret(scene, key, model) for scene, key, model in with_models]
+    has_keys = method.capabilities.keys or args.key_file
+    given = keys(args.key_file, count, new=True) if has_keys else [""] * count
+    return list(map(keyss.Secret, args.secret, given, models or (None,) * count))
 
 
 def _ignored_training_flags(args: HideArguments) -> str:

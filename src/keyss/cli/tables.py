@@ -127,8 +127,7 @@ def _explanations(metrics: HideMetrics, names: Sequence[str], heads: Sequence[st
     if metrics.chance_level:
         chance = ", ".join(f"{each:.2f}" for each in metrics.chance_level)
         lines.append(
-            f"Chance level: {chance}, PSNR of the stego model itself to the secret; no wrong key should "
-            "exceed it."
+            f"Chance level: {chance}, the stego model's PSNR to the secret: the limit for wrong keys."
         )
     return lines
 

@@ -18,8 +18,6 @@ from keyss.files.models import is_model_path, known_suffixes, read_model
 if TYPE_CHECKING:
     from keyss.runs.run_records import FitMetrics, HideMetrics
 
-Corner = tuple[float, ...]  # [3] world units
-
 
 @dataclass(frozen=True)
 class RunInfo:
@@ -39,7 +37,7 @@ class ModelInfo:
     bytes: int | None  # None for standard input
     gaussians: int
     sh_degree: int
-    bounding_box: tuple[Corner, Corner]
+    bounding_box: tuple[tuple[float, ...], tuple[float, ...]]  # two corners, in world units
     nearly_transparent: float  # share of the Gaussians with opacities below 0.05
 
 

@@ -101,9 +101,18 @@ def _handler(contents: Contents, names: set[str] | None) -> type[BaseHTTPRequest
             if content is None:
                 self.send_error(HTTPStatus.NOT_FOUND)
                 return
+            headers = {
+                "Content-Type": media_type,
+                "Content-Length": str(len(content)),
+                "Content-Security-Policy": f"{SERVED_POLICY}; frame-ancestors 'none'",
+                "X-Content-Type-Options": "nosniff",
+                "Referrer-Policy": "no-referrer",
+                "Cross-Origin-Resource-Policy": "same-origin",
+                "Cache-Control": "no-store",
+            }
             try:
                 self.send_response(HTTPStatus.OK)
-                for name, value in _headers(media_type, len(content)).items():
+                for name, value in headers.items():
                     self.send_header(name, value)
                 self.end_headers()
                 self.wfile.write(content)
@@ -114,15 +123,3 @@ def _handler(contents: Contents, names: set[str] | None) -> type[BaseHTTPRequest
             """Log nothing."""
 
     return Handler
-
-
-def _headers(media_type: str, size: int) -> dict[str, str]:
-    return {
-        "Content-Type": media_type,
-        "Content-Length": str(size),
-        "Content-Security-Policy": f"{SERVED_POLICY}; frame-ancestors 'none'",
-        "X-Content-Type-Options": "nosniff",
-        "Referrer-Policy": "no-referrer",
-        "Cross-Origin-Resource-Policy": "same-origin",
-        "Cache-Control": "no-store",
-    }
