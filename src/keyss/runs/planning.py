@@ -81,9 +81,10 @@ def cost_of(
     degree = max(options.fit.sh_degree if each.given is None else each.given.sh_degree for each in sources)
     gaussian = 4 * (14 + 3 * (degree + 1) ** 2)  # bytes in a .ply, with normals
     resident: int = psutil.Process().memory_info().rss
-    memory = resident + 3 * published * gaussian
+    largest = max(published, *sizes) * gaussian
+    memory = resident + 3 * largest
     if trained:  # gradients, moments and two checkpoints
-        memory += (1 + _CHECKPOINTS) * published * gaussian
+        memory += (1 + _CHECKPOINTS) * largest
         memory += max(Targets.max_bytes(source.scene.train) for source in sources)
     disk = (published + sum(sizes) + _CHECKPOINTS * trained) * gaussian + _OTHER_BYTES
     return Cost(steps, seconds, tuple(fit_seconds), disk, memory)
