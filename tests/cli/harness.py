@@ -24,6 +24,7 @@ METRICS = HideMetrics(
     gaussians=1234,
     photos=(True, True),
     secret_gaussians=(567,),
+    secret_degrees=((3, 3),),
     iterations=10,
     steps=(10, 20),
     seconds=1.0,

@@ -85,6 +85,7 @@ def test_options_override_preset(keyss: Run, hide_calls: list[Any]) -> None:
         "out": Path("out"),
         "overwrite": False,
         "resume": True,
+        "dry_run": False,
     }
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from importlib import metadata
 from typing import Any
@@ -17,23 +16,21 @@ from keyss.core import Camera, Gaussians
 
 
 def states(result: Result) -> dict[str, str]:
-    return {name: each["state"] for name, each in json.loads(result.out).items()}
+    lines = (re.split("  +", line) for line in result.out.splitlines())
+    return {name: state for state, name, _ in lines}
 
 
 def test_working_installation(keyss: Run) -> None:
     result = keyss("doctor", "--device", "cpu")
     assert (result.status, result.err) == (0, "")
-    lines = {line.split()[1]: line for line in result.out.splitlines()}
-    assert __version__ in lines["keyss"]
-    assert torch.__version__ in lines["torch"]
-    assert lines["test"].startswith("ok ")
-    found = states(keyss("doctor", "--device", "cpu", "--json"))
-    assert list(found.values()) == [line.split()[0] for line in result.out.splitlines()]
+    assert re.search(rf"^ok +keyss +{re.escape(__version__)}, ", result.out, re.MULTILINE)
+    assert re.search(rf"^ok +torch +{re.escape(torch.__version__)}$", result.out, re.MULTILINE)
+    assert states(result)["test frame"] == "ok"
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA GPU")
 def test_missing_device(keyss: Run) -> None:
-    result = keyss("doctor", "--device", "cuda", "--json")
+    result = keyss("doctor", "--device", "cuda")
     assert result.status == 6
     assert states(result)["test frame"] == "broken"
     assert "keyss: error: required components are broken: test frame" in result.err
@@ -50,7 +47,7 @@ def test_wrong_render(keyss: Run, monkeypatch: pytest.MonkeyPatch, where: str, f
         return image * (factor or 1)
 
     monkeypatch.setattr("keyss.rendering.render", wrong)
-    result = keyss("doctor", "--device", "cpu", "--json")
+    result = keyss("doctor", "--device", "cpu")
     assert result.status == 6
     assert [name for name, state in states(result).items() if state == "broken"] == ["test frame"]
 
@@ -68,5 +65,5 @@ def test_missing_packages(keyss: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     result = keyss("doctor", "--device", "cpu")
     assert result.status == 6
     assert re.search(r"^missing +\[sweep\] .*pip install 'keyss\[sweep\]'$", result.out, re.MULTILINE)
-    assert re.search(r"^broken +numba +pip install numba$", result.out, re.MULTILINE)
+    assert re.search(r"^broken +numba +PackageNotFoundError: ", result.out, re.MULTILINE)
     assert result.err.count("\n") == 1

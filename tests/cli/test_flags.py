@@ -22,7 +22,6 @@ OPTIONS = {"overwrite", "sh_degree", "key_file", "secret", "publish", "secret_mo
         ('`method="carry", overwrite=True` has one', "--method carry --overwrite has one"),
         ("`max_gaussians=30000` would do", "--max-gaussians 30000 would do"),
         ("`min_psnr=12.5`", "--min-psnr 12.5"),
-        ("`force=False`", "no --force"),
         ("give `sh_degree`, `publish`", "give --sh-degree, --publish"),
         ("`key`, `secrets` and `model`", "--key-file, --secret and --secret-model"),
         # Other code stays as it is.

@@ -92,7 +92,7 @@ class TestPrompt:
 
     def test_confirms_when_hiding(self, typed: list[str]) -> None:
         typed += ["one", "one", "two", "two"]
-        assert keys.keys([], 2, confirm=True) == ["one", "two"]
+        assert keys.keys([], 2, new=True) == ["one", "two"]
         typed += ["three"]
         assert keys.keys([], 1) == ["three"]
         assert typed == []
@@ -100,10 +100,10 @@ class TestPrompt:
     def test_mismatch_is_refused(self, typed: list[str]) -> None:
         typed += ["one", "onw"]
         with pytest.raises(UsageError, match="differ"):
-            keys.keys([], 1, confirm=True)
+            keys.keys([], 1, new=True)
         typed += [""]
         with pytest.raises(UsageError, match="empty"):
-            keys.keys([], 1, confirm=True)
+            keys.keys([], 1, new=True)
 
 
 def test_readable_key_file_warning(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

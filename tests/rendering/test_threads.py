@@ -108,7 +108,7 @@ def test_forked_process() -> None:
     scene = random_scene(count=300, width=60, height=70)
     torch.set_num_threads(2)
     expected = digest(scene)
-    assert parallel._pools  # threads do not survive the fork
+    assert parallel._pool.cache_info().currsize  # threads do not survive the fork
     context = multiprocessing.get_context("fork")
     queue: multiprocessing.Queue[str] = context.Queue()
     child = context.Process(target=lambda: queue.put(digest(scene)))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 import msgspec
@@ -19,14 +18,6 @@ def read_files(folder: Path) -> dict[str, bytes]:
     return {name: data for name, data in files.items() if not name.endswith(MANIFEST)}
 
 
-def fail_with(error: BaseException) -> Callable[[Path], None]:
-    def write(path: Path) -> None:
-        path.write_bytes(b"a part")
-        raise error
-
-    return write
-
-
 def write_run(path: Path, stage: str = "hide", files: dict[str, bytes] | None = None, **how: object) -> None:
     folder = RunFolder(path, stage, **how)  # type: ignore[arg-type]
     with folder.work():
@@ -37,10 +28,10 @@ def write_run(path: Path, stage: str = "hide", files: dict[str, bytes] | None = 
 def interrupt(path: Path, arguments: dict[str, object], stage: str = "hide", **how: bool) -> None:
     """Interrupt a run after its checkpoint."""
     folder = RunFolder(path, stage, arguments, **how)
-    contents = {"publish/model.ply": b"half", "x": fail_with(KeyboardInterrupt())}
     with pytest.raises(KeyboardInterrupt), folder.work():  # noqa: PT012
         write_bytes(folder.checkpoints / "fit", b"state")
-        folder.write(contents)
+        folder.write({"publish/model.ply": b"half"})
+        raise KeyboardInterrupt
 
 
 def test_files_and_permissions(tmp_path: Path, umask: None) -> None:
@@ -61,21 +52,18 @@ def test_files_and_permissions(tmp_path: Path, umask: None) -> None:
     }
 
 
-@pytest.mark.parametrize(
-    ("error", "raised"),
-    [(OSError(28, "No space left"), OutputError), (KeyboardInterrupt(), KeyboardInterrupt)],
-)
 @pytest.mark.parametrize("there", [True, False])
-def test_failed_write_leaves_nothing(
-    tmp_path: Path, there: bool, error: BaseException, raised: type[BaseException]
-) -> None:
+def test_failed_write_leaves_nothing(tmp_path: Path, there: bool) -> None:
     path = tmp_path / "run"
     if there:
         write_run(path)
     before = read_files(tmp_path), read_manifest(path)
     folder = RunFolder(path, "hide", overwrite=there)
-    with pytest.raises(raised), folder.work():
-        folder.write({"publish/model.ply": b"new", "y": fail_with(error)})
+    with pytest.raises(OutputError, match="cannot write"), folder.work():
+        folder.write({"publish/model.ply": b"new", "publish/model.ply/y": b"in a file"})
+    with pytest.raises(KeyboardInterrupt), folder.work():  # noqa: PT012
+        folder.write({"publish/model.ply": b"new"})
+        raise KeyboardInterrupt
     assert (read_files(tmp_path), read_manifest(path)) == before
     assert path.exists() == there
 
@@ -129,7 +117,7 @@ def test_resume(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match=r"interrupted run.*`resume=True`"):
         RunFolder(tmp_path, "hide", arguments)
     other = {"width": 160, "options": {"seed": 0, "fit": {"iterations": 20}}}
-    with pytest.raises(OutputError, match="iterations 10 then, 20 now; width: 200 then, 160 now"):
+    with pytest.raises(OutputError, match="iterations: 10 then, 20 now; width: 200 then, 160 now"):
         RunFolder(tmp_path, "hide", other, resume=True)
     with pytest.raises(OutputError, match="of another kind"):
         RunFolder(tmp_path, "fit", arguments, resume=True)

@@ -28,9 +28,10 @@ Usage = namedtuple("Usage", "total used free")
 def test_sizes_and_steps(tmp_path: Path) -> None:
     secrets = [Secret(tiny_scene(1), KEY), Secret(tiny_scene(2), KEY + "2")]
     options = small("published", FIT)
-    plan = keyss.hide(tiny_scene(0), secrets, method=options, out=tmp_path / "run", dry_run=True).plan
-    assert plan.steps == 4 * 60  # three plain fits, and the joint training
-    assert len(plan.fit_seconds) == 3
+    found = keyss.hide(tiny_scene(0), secrets, method=options, out=tmp_path / "run", dry_run=True)
+    plan, cost = found.plan, found.cost
+    assert cost.steps == 4 * 60  # three plain fits, and the joint training
+    assert len(cost.fit_seconds) == 3
     assert (plan.gaussians, plan.sh_degree) == (400, 3)
     assert plan.capacity < plan.secret_gaussians == 800
     assert list(tmp_path.iterdir()) == []
@@ -42,8 +43,8 @@ def test_steps_with_networks_take_longer() -> None:
     fit = replace(FIT, iterations=1_000_000)
     hider = registry.get("gs-hider").options(fit=fit)
     for options, key in ((small("latent", fit), KEY), (small("published", fit), KEY), (hider, "")):
-        plan = keyss.hide(tiny_scene(0), [Secret(tiny_scene(1), key)], method=options, dry_run=True).plan
-        seconds.append(plan.other_seconds)
+        cost = keyss.hide(tiny_scene(0), [Secret(tiny_scene(1), key)], method=options, dry_run=True).cost
+        seconds.append(cost.seconds - sum(cost.fit_seconds))
     latent, published, networks = seconds
     assert 4 * latent < published < networks
 
@@ -52,21 +53,22 @@ def test_bound_takes_longer() -> None:
     secret, seconds = Secret(tiny_scene(1), KEY), []
     options = CarryOptions(fit=FIT, iterations=90, publish="any", refit="always")
     for bound in (False, True):
-        plan = keyss.hide(tiny_scene(0), [secret], method=options, bound=bound, dry_run=True).plan
-        seconds.append(plan.seconds)
+        cost = keyss.hide(tiny_scene(0), [secret], method=options, bound=bound, dry_run=True).cost
+        seconds.append(cost.seconds)
     # Of the secret: 60 steps of its plain model, and 90 refit steps.
-    assert seconds[1] - seconds[0] == pytest.approx(plan.fit_seconds[1] * 150 / 60)
+    assert seconds[1] - seconds[0] == pytest.approx(cost.fit_seconds[1] * 150 / 60)
 
 
 def test_capacity(tmp_path: Path) -> None:
     cover, secret = trained_like(2500), trained_like(6000, 2)
     options = CarryOptions(refit="never")
-    plan = keyss.hide(cover, [Secret(secret, KEY)], method=options, width=24, dry_run=True).plan
+    found = keyss.hide(cover, [Secret(secret, KEY)], method=options, width=24, dry_run=True)
+    plan = found.plan
     result = keyss.hide(cover, [Secret(secret, KEY)], method=options, width=24, min_psnr=0)
     assert plan.secret_gaussians == 6000
     # Fewer harmonics make room for more Gaussians than planned.
     assert 1000 < plan.capacity <= result.metrics.secret_gaussians[0] < 6000
-    assert plan.steps == 0
+    assert found.cost.steps == 0
 
 
 def test_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

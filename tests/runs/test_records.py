@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -38,7 +39,8 @@ def test_round_trip(tmp_path: Path) -> None:
 def test_undecodable_file_names() -> None:
     """Python represents undecodable bytes by surrogates."""
     name = "Füchse".encode().decode("ascii", "surrogateescape") + b"\xff".decode("utf-8", "surrogateescape")
-    data = record_bytes(Record(name=name, scores={name: Scores((1.0,), None)}))
+    data = record_bytes(Record(name=name, scores={name: Scores((1.0, math.nan), None)}))
+    assert json.loads(data)["scores"]["Füchse\ufffd"]["values"] == [1.0, None]
     assert list(json.loads(data)["scores"]) == [json.loads(data)["name"]] == ["Füchse\ufffd"]
 
 
@@ -75,8 +77,9 @@ def test_invalid_records(tmp_path: Path, text: str | bytes, expected: str) -> No
 
 
 def test_missing_and_large_files(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="missing"):
+    with pytest.raises(InputError, match="expected a file, found nothing"):
         read_record(tmp_path / "record.json", Record)
-    write_record(tmp_path / "record.json", RECORD)
-    with pytest.raises(InputError, match="at most 10 bytes"):
-        read_record(tmp_path / "record.json", Record, at_most=10)
+    with open(tmp_path / "record.json", "wb") as file:
+        file.truncate((16 << 20) + 1)
+    with pytest.raises(InputError, match="at most 16,777,216 bytes"):
+        read_record(tmp_path / "record.json", Record)

@@ -6,6 +6,7 @@ import time
 from contextlib import nullcontext
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 from keyss.core.scene import Scene, ViewOptions
 from keyss.fitting.config import FitConfig
@@ -14,8 +15,8 @@ from keyss.fitting.plain import FitResult, fit_scene
 from keyss.progress import Reporter
 from keyss.rendering import Backend, resolve_device
 from keyss.runs.files import CONFIG, METRICS, MODEL, Background, PathLike, as_scene, path_of
-from keyss.runs.folder import RunFolder, recorded_number
-from keyss.runs.planning import check_room, in_a_line, needs_of_fit, plan_fit
+from keyss.runs.folder import RunFolder, read_manifest
+from keyss.runs.planning import check_room, cost_of_fit
 from keyss.runs.run_records import FitMetrics, FitRunConfig
 
 
@@ -24,9 +25,11 @@ def with_seed(config: FitConfig, interrupted: Path | None, *names: str) -> FitCo
 
     `interrupted`: the run's folder; `names`: the path to its config among its arguments.
     """
-    if interrupted is not None:
-        config = config.with_seed(recorded_number(interrupted, *names, "seed"))
-    return config.with_seed()
+    running = None if interrupted is None else read_manifest(interrupted).running
+    found: Any = running and running.arguments
+    for name in (*names, "seed"):
+        found = found.get(name) if isinstance(found, dict) else None
+    return config.with_seed(found if isinstance(found, int) else None)
 
 
 def fit(
@@ -69,9 +72,10 @@ def fit(
             resume=resume,
         )
     loaded = as_scene(scene, settings.views)
-    check_room(needs_of_fit(loaded, config), None if out is None else Path(out))
+    cost = cost_of_fit(loaded, config, target)
+    check_room(cost, None if out is None else Path(out))
     if reporter and not resume:
-        reporter.note(f"fit: {in_a_line(plan_fit(loaded, config, target))}")
+        reporter.note(f"fit: {cost}")
     with folder.work() if folder else nullcontext():
         result = fit_scene(
             loaded,

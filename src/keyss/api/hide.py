@@ -51,7 +51,7 @@ from keyss.runs.files import (
 )
 from keyss.runs.folder import RunFolder
 from keyss.runs.json_records import read_record, record_bytes
-from keyss.runs.planning import check_room, in_a_line, needs_of_hiding, plan_hiding
+from keyss.runs.planning import check_room, cost_of
 from keyss.runs.run_records import FitMetrics, HideMetrics, RunConfig, secret_ids
 
 
@@ -126,14 +126,15 @@ def hide(
         else replace(source, loaded=as_scene(each, views, train_pictures=trains, model=source.given))
         for each, source in zip(given, sources, strict=True)
     ]
-    check_room(needs_of_hiding(options, sources), place)
+    cost = cost_of(options, sources, target, bound=bound)
+    check_room(cost, place)
     if dry_run:
-        return HideResult(plan=plan_hiding(chosen, options, sources, target, bound=bound))
+        return HideResult(plan=chosen.plan(sources, options), cost=cost)
 
     with folder.work() if folder else nullcontext():
         if reporter and not resume and (options.place.grows or trains):
-            plan = plan_hiding(chosen, options, sources, target, bound=bound)
-            for line in (f"hide: {in_a_line(plan)}", *plan.notes):
+            plan = chosen.plan(sources, options)
+            for line in (f"hide: a file of up to {plan.megabytes:,.1f} MB, {cost}", *plan.notes):
                 reporter.note(line)
         context = Context(target, folder.checkpoints if folder and trains else None, resume, reporter)
         sources, options = _fit_models(chosen, sources, options, context)
@@ -352,7 +353,9 @@ def _measure(
         stego.opened,
         scenes,
         beside_bounds,
-        [len(longer[index]) if index in longer else count for index, (count, _) in enumerate(plain_sizes)],
+        gaussians=[
+            len(longer[index]) if index in longer else count for index, (count, _) in enumerate(plain_sizes)
+        ],
         steps=[each.steps if index in longer else plain_steps[index] for index, each in enumerate(bounds)],
         equal=[each.equal or index in longer for index, each in enumerate(bounds)],
         seed=options.fit.known_seed,

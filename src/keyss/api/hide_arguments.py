@@ -15,6 +15,7 @@ from keyss.methods import registry
 from keyss.methods.base import Method, MethodOptions, Plan, Source
 from keyss.rendering.orbit import is_model
 from keyss.runs.files import PathLike, as_3dgs_model, as_scene, path_of
+from keyss.runs.planning import Cost
 from keyss.runs.run_records import HideMetrics
 
 _READERS = 2  # threads that read files
@@ -35,7 +36,8 @@ class HideResult:
 
     stego: Gaussians | None = None  # publish this; None after a dry run
     metrics: HideMetrics | None = None  # None of a dry run
-    plan: Plan | None = None  # only of a dry run
+    plan: Plan | None = None  # only of a dry run, like `cost`
+    cost: Cost | None = None
     survives: bool = False  # whether the secrets survive conversion to other formats
 
 

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
-from keyss.core.scene import Scene, View, ViewOptions
+from keyss.core.scene import Scene, ViewOptions
 from keyss.files.images import png_bytes
 from keyss.measure.hide_quality import WRONG_KEYS, compare, measure_hiding
 from keyss.measure.renders import renders_of
@@ -47,8 +47,8 @@ def render(
     folder = RunFolder(out, "render", inputs=inputs, overwrite=overwrite) if out is not None else None
     scene = as_scene(cameras, views)
     gaussians = scene.to_scene_frame(as_model(model)).to(target)
-    splits: dict[str, tuple[View, ...]] = {"test": scene.test, "train": scene.train, "all": scene.views}
-    pictures = renders_of(gaussians, scene, splits[split])
+    chosen = {"test": scene.test, "train": scene.train, "all": scene.views}[split]
+    pictures = renders_of(gaussians, scene, chosen)
     if folder:
         with folder.work():
             folder.write({name: png_bytes(image) for name, image in pictures})
@@ -60,21 +60,20 @@ def evaluate(
     keys: Sequence[str],
     *,
     wrong_keys: int | None = None,
-    seed: int | None = None,
     device: Backend = "auto",
 ) -> HideMetrics:
     """Measure a run of `hide` again on the test views; rewrites its `metrics.json`.
 
-    `keys`: one per secret, in any order. `wrong_keys`: number of random wrong keys to measure, 32 by default,
-    sampled with `seed`, by default the run's; only for methods whose keys condition a decoder.
-    Raises WrongKeyError for a key that opens nothing, UsageError for a secret without a key.
+    `keys`: one per secret, in any order. `wrong_keys`: number of random wrong keys to measure, 32 by default;
+    only for methods whose keys condition a decoder. Raises WrongKeyError for a key that opens nothing,
+    UsageError for a secret without a key.
     """
     target = resolve_device(device)
     opened = open_run(run, keys)
-    if (wrong_keys, seed) != (None, None) and all(each.decode is None for each in opened.opened):
+    if wrong_keys is not None and all(each.decode is None for each in opened.opened):
         raise UsageError(
             f"the method {opened.config.method} has no decoder, so wrong keys show nothing: leave out "
-            "`wrong_keys` and `seed`"
+            "`wrong_keys`"
         )
     stego, scenes = opened.stego.to(target), opened.scenes(train_pictures=False)
     models = [stego, *(secret.reveal(stego).to(target) for secret in opened.opened)]
@@ -84,11 +83,11 @@ def evaluate(
         opened.opened,
         scenes,
         list(map(compare, models, baselines, scenes)),
-        [None if model is None else len(model) for model in baselines],
+        gaussians=[None if model is None else len(model) for model in baselines],
         steps=opened.metrics.baseline.steps,
         equal=opened.metrics.baseline.equal,
         wrong_keys=WRONG_KEYS if wrong_keys is None else wrong_keys,
-        seed=opened.metrics.seed if seed is None else seed,
+        seed=opened.metrics.seed,
     )
     metrics = replace(opened.metrics, **vars(measured))
     write_again(opened.folder, "hide", METRICS, metrics)

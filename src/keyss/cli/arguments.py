@@ -9,6 +9,8 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional, UseAppendAction, arg
 
+from keyss.core.errors import InputError, UsageError
+
 
 def optional(metavar: str, help: str, default: str = "", aliases: list[str] | None = None) -> Any:
     """An option whose default is None or empty; the help shows `default` instead."""
@@ -71,8 +73,7 @@ class Training:
 
     def schedule(self) -> dict[str, int]:
         """The fields of `FitConfig` that are given."""
-        fields = {"iterations": self.iterations, "max_gaussians": self.max_gaussians, "seed": self.seed}
-        return {name: value for name, value in fields.items() if value is not None}
+        return {name: value for name, value in vars(self).items() if value is not None}
 
 
 PHOTOS, TRAINING = Photos(), Training()
@@ -95,24 +96,15 @@ def flag(name: str) -> str:
     return f"--{name.replace('_', '-')}"
 
 
-def check_exists(*paths: Path | None, expected: str = "a file or folder") -> None:
+def check_exists(*paths: Path | None) -> None:
     """Raise InputError if an input does not exist; - is the standard input. Does not import torch."""
-    from keyss.core.errors import InputError
-
     for path in paths:
         if path is not None and str(path) != "-" and not os.path.lexists(path):
-            raise InputError(f"{path}: expected {expected}, but there is no such file")
-
-
-def check_run(run: Path) -> None:
-    """Raise InputError if the run does not exist; see `check_exists`."""
-    check_exists(run, expected="the folder of a run, as `keyss hide` writes it")
+            raise InputError(f"{path}: expected a file or folder, but there is no such file")
 
 
 def check_seed(seed: int) -> int:
     """Return `seed`. Raises UsageError unless every generator accepts it."""
-    from keyss.core.errors import UsageError
-
     if not 0 <= seed < 1 << 32:
         raise UsageError(f"--seed: expected 0 to {(1 << 32) - 1}, got {seed}")
     return seed

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import inspect
 import os
 import re
 import signal
 import sys
 import time
 import warnings
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import is_dataclass
 from typing import Any, get_type_hints
@@ -29,17 +28,10 @@ from keyss.core.errors import (
 BROKEN_PIPE = 141  # 128 + SIGPIPE, as a shell counts
 OUT_OF_MEMORY = 8
 INTERNAL_ERROR = 70  # EX_SOFTWARE
-NO_ROOM = OutputError.exit_status
 _LEVELS = {"-q": -1, "--quiet": -1, "-v": 1, "--verbose": 1}
 _KEY_OPTIONS = ("-k", "-p", "--key", "--keys", "--password", "--passphrase")  # options that people may expect
-# Between backticks: `overwrite=True`, `method="carry", refit="never"`, `sh_degree`.
-_VALUE = r"""(?:"[^"`]*"|'[^'`]*'|[\w.+-]+)"""
-_ASSIGNMENT = rf"([A-Za-z_]\w*)=({_VALUE})"
-_ASSIGNMENTS = re.compile(rf"`({_ASSIGNMENT}(?:, ?{_ASSIGNMENT})*)`")
-_NAME = re.compile(r"`([a-z_]\w*)`")
-
-# Arguments whose flags have another name.
-_RENAMED = {"key": "key-file", "keys": "key-file", "secrets": "secret", "model": "secret-model"}
+# Arguments whose options have another name.
+_RENAMED = {"key": "key_file", "keys": "key_file", "secrets": "secret", "model": "secret_model"}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -141,7 +133,7 @@ def explain(error: BaseException) -> tuple[int, str]:
             return BackendError.exit_status, f"error: the package {error.name} is missing: see `keyss doctor`"
         case OSError():
             where = f"{error.filename}: " if error.filename is not None else ""
-            return NO_ROOM, f"error: {where}{error.strerror or error}"
+            return OutputError.exit_status, f"error: {where}{error.strerror or error}"
     return INTERNAL_ERROR, (
         f"internal error: {type(error).__name__}: {error}; please report it; "
         "run with KEYSS_DEBUG=1 for the traceback"
@@ -215,45 +207,32 @@ def _one_line(message: str) -> str:
 
 
 def as_flags(message: str, options: Collection[str]) -> str:
-    """Replace arguments between backticks in `message` by flags.
+    """Replace arguments between backticks in `message` by flags, such as `publish="any", overwrite=True`.
 
     Names without a value are replaced only if they are in `options`.
     """
 
-    def assignments(found: re.Match[str]) -> str:
-        return " ".join(_flag(name, value) for name, value in re.findall(_ASSIGNMENT, found[1]))
+    def flags(found: re.Match[str]) -> str:
+        words = []
+        for name, is_set, value in (part.strip().partition("=") for part in found[1].split(",")):
+            option = _RENAMED.get(name, name)
+            if not name.isidentifier() or not (is_set or option in options):
+                return found[0]
+            words.append(f"--{option.replace('_', '-')}")
+            words += [value.strip("\"'")] if value not in ("", "True") else []
+        return " ".join(words)
 
-    def name(found: re.Match[str]) -> str:
-        known = found[1] in options or _RENAMED.get(found[1], "").replace("-", "_") in options
-        return _flag(found[1], "True") if known else found[0]
-
-    return _NAME.sub(name, _ASSIGNMENTS.sub(assignments, message))
-
-
-def _flag(name: str, value: str) -> str:
-    flag = f"--{_RENAMED.get(name, name.replace('_', '-'))}"
-    match value:
-        case "True":
-            return flag
-        case "False" | "None":
-            return f"no {flag}"
-    return f"{flag} {value.strip(chr(34) + chr(39))}"
+    return re.sub("`([^`]*)`", flags, message)
 
 
-def options_of(command: Callable[..., Any]) -> dict[str, Any]:
-    """Names and types of a command's options, those of groups included."""
+def options_of(command: Any) -> dict[str, Any]:
+    """Names and types of the options of a command, those of groups included."""
+    from tyro.conf import Positional
+
     found: dict[str, Any] = {}
-    for each in inspect.signature(command, eval_str=True).parameters.values():
-        if is_dataclass(group := getattr(each.annotation, "__origin__", each.annotation)):
-            found |= options_of_group(group)
-        elif each.kind is each.KEYWORD_ONLY:
-            found[each.name.rstrip("_")] = each.annotation
-    return found
-
-
-def options_of_group(group: Any) -> dict[str, Any]:
-    found: dict[str, Any] = {}
-    for name, hint in get_type_hints(group, include_extras=True).items():
-        nested = getattr(hint, "__origin__", hint)
-        found |= options_of_group(nested) if is_dataclass(nested) else {name: hint}
+    for name, hint in get_type_hints(command, include_extras=True).items():
+        if is_dataclass(group := getattr(hint, "__origin__", hint)):
+            found |= options_of(group)
+        elif name != "return" and Positional not in getattr(hint, "__metadata__", ()):
+            found[name.rstrip("_")] = hint
     return found

@@ -28,6 +28,8 @@ from keyss.cli.arguments import (
     optional,
     switch,
 )
+from keyss.cli.keys import keys
+from keyss.core.errors import InputError, UsageError
 
 if TYPE_CHECKING:
     from keyss.methods.base import CommandLineOption, Method, MethodOptions
@@ -129,51 +131,58 @@ def hide(args: HideArguments) -> None:
 
     example: keyss hide --cover cover.ply --secret-file letter.pdf --key-file key.txt -o runs/letter
     """
-    _check_without_torch(args)
-    (_hide_files if args.secret_file else _hide_scenes)(args)
+    check_exists(args.cover, args.details.cover_model)
+    check_exists(*args.secret, *args.secret_file, *args.key_file, *args.details.secret_model)
+    options = _method_options(args)
+    if args.secret_file:
+        _hide_files(args)
+    elif args.secret:
+        _hide_scenes(args, options)
+    else:
+        raise UsageError("no secret: give --secret SCENE or --secret-file FILE, one for each secret")
 
 
-def _hide_scenes(args: HideArguments) -> None:
+def _hide_scenes(args: HideArguments, options: MethodOptions) -> None:
     import keyss
     from keyss import progress
     from keyss.cli.tables import print_files, print_hiding, print_plan
-    from keyss.core.errors import UsageError
     from keyss.methods import registry
     from keyss.runs.files import COMPANIONS, STEGOS
 
     method = registry.get(args.method)
-    options, secrets = _method_options(args), _secrets(args, method)
+    secrets = _secrets(args, method)
     idle = _ignored_training_flags(args)
     if idle and not options.may_train:
         raise UsageError(
             f"{idle}: nothing is trained, as models of all scenes are given and --method {options.method} "
             "does not refit them: leave out such options"
         )
-    described: dict[str, Any] = vars(args.photos) | {
-        "method": options,
-        "cover_model": args.details.cover_model,
-        "bound": args.details.bound,
-        "device": args.device,
-        "out": args.out,
-    }
-    if args.dry_run:
-        plan = keyss.hide(args.cover, secrets, dry_run=True, **described).plan
-        assert plan is not None
-        print_plan(plan)
-        _warn_of_idle(idle, plan.steps)
-        return
     result = keyss.hide(
         args.cover,
         secrets,
+        method=options,
+        **vars(args.photos),
+        cover_model=args.details.cover_model,
+        bound=args.details.bound,
         min_psnr=args.details.min_psnr,
+        device=args.device,
+        out=args.out,
         overwrite=args.overwrite,
         resume=args.resume,
+        dry_run=args.dry_run,
         reporter=progress.reporter(),
-        **described,
     )
+    steps = result.cost.steps if result.cost else result.metrics and result.metrics.iterations
+    if idle and not steps:
+        print(
+            f"keyss: warning: {idle} had no effect: the secrets fit as they are, and nothing is trained",
+            file=sys.stderr,
+        )
+    if result.plan is not None and result.cost is not None:
+        print_plan(method.name, result.plan, result.cost)
+        return
     assert result.metrics is not None
     print_hiding(result.metrics, brief=progress.level < 1)
-    _warn_of_idle(idle, result.metrics.iterations)
     what = "the cover with the secret in it" if options.trains or method.capabilities.keys else "the cover"
     how = _HOW_TO_PUBLISH[result.survives]
     print_files(
@@ -196,7 +205,6 @@ def _hide_scenes(args: HideArguments) -> None:
 def _secrets(args: HideArguments, method: Method) -> list[Any]:
     """The secrets with their keys and models."""
     import keyss
-    from keyss.core.errors import InputError, UsageError
     from keyss.files.file_kinds import identify_file
     from keyss.files.models import is_model_path
 
@@ -209,17 +217,9 @@ def _secrets(args: HideArguments, method: Method) -> list[Any]:
         raise UsageError(
             f"expected no --secret-model or one for each of {count} secret(s), got {len(models)}"
         )
-    keys = _keys(args, count) if method.capabilities.keys or args.key_file else [""] * count
-    with_models = zip(args.secret, keys, models or (None,) * count, strict=True)
-    return [keyss.Secret(scene, key, model) for scene, key, model in with_models]
-
-
-def _keys(args: HideArguments, count: int) -> list[str]:
-    from keyss.cli.keys import keys, warn_of_weak_keys
-
-    found = keys(args.key_file, count, confirm=True)
-    warn_of_weak_keys(found)
-    return found
+    has_keys = method.capabilities.keys or args.key_file
+    given = keys(args.key_file, count, new=True) if has_keys else [""] * count
+    return list(map(keyss.Secret, args.secret, given, models or (None,) * count))
 
 
 def _ignored_training_flags(args: HideArguments) -> str:
@@ -229,18 +229,8 @@ def _ignored_training_flags(args: HideArguments) -> str:
     sources = [args.details.cover_model or args.cover, *(args.details.secret_model or args.secret)]
     if not all(map(is_model, sources)):
         return ""
-    preset = ["--preset"] if args.preset != "default" else []
-    flags = (flag for flag in changed_flags(args.training) if flag in ("--iterations", "--max-gaussians"))
-    return " and ".join([*preset, *flags])
-
-
-def _warn_of_idle(idle: str, steps: int) -> None:
-    """Warn of options without effect if there was no training."""
-    if idle and not steps:
-        print(
-            f"keyss: warning: {idle} had no effect: the secrets fit as they are, and nothing is trained",
-            file=sys.stderr,
-        )
+    training = ("--preset", "--iterations", "--max-gaussians")
+    return " and ".join(flag for flag in changed_flags(args) if flag in training)
 
 
 def _method_options(args: HideArguments) -> MethodOptions:
@@ -263,17 +253,15 @@ def _hide_files(args: HideArguments) -> None:
     import keyss
     from keyss.channels import channel_for
     from keyss.cli.tables import print_files
-    from keyss.core.errors import UsageError
     from keyss.runs.files import STEGOS
 
     used = "cover secret_file key_file publish format out overwrite device channel dry_run"
     if unused := [each for each in changed_flags(args) if each not in map(flag, used.split())]:
         raise UsageError(f"--secret-file does not use {unused[0]}: leave out {unused[0]}")
-    files, keys = args.secret_file, _keys(args, len(args.secret_file))
-    channel = args.details.channel or "colours"
+    files, channel = args.secret_file, args.details.channel or "colours"
     result = keyss.hide_files(
         args.cover,
-        list(map(keyss.SecretFile, files, keys)),
+        list(map(keyss.SecretFile, files, keys(args.key_file, len(files), new=True))),
         publish=args.publish,
         format=args.format,
         channel=channel,
@@ -296,7 +284,6 @@ def with_options_of_method(arguments: Sequence[str]) -> Callable[..., None]:
 
     Raises UsageError for an option that only another method has.
     """
-    from keyss.core.errors import UsageError
     from keyss.methods import registry
 
     chooser = ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
@@ -328,17 +315,6 @@ def with_options_of_method(arguments: Sequence[str]) -> Callable[..., None]:
     command.__annotations__ = {"args": Annotated[kind, arg(name="")], "return": None}
     command.__name__, command.__doc__ = "hide", hide.__doc__
     return command
-
-
-def _check_without_torch(args: HideArguments) -> None:
-    """Check options and files before the slow import of torch. Raises UsageError and InputError."""
-    from keyss.core.errors import UsageError
-
-    check_exists(args.cover, args.details.cover_model)
-    check_exists(*args.secret, *args.secret_file, *args.key_file, *args.details.secret_model)
-    _method_options(args)
-    if not (args.secret_file or args.secret):
-        raise UsageError("no secret: give --secret SCENE or --secret-file FILE, one for each secret")
 
 
 def _own_field(named: tuple[str, tuple[Any, CommandLineOption]]) -> tuple[str, Any, Any]:

@@ -15,25 +15,28 @@ from keyss.keys.key_file import normalized_key, read_key
 VARIABLE = "KEYSS_KEY"
 
 
-def keys(files: Sequence[Path], count: int, *, confirm: bool = False) -> list[str]:
+def keys(files: Sequence[Path], count: int, *, new: bool = False) -> list[str]:
     """Read `count` keys from `files`, else from the environment, else from a prompt.
 
-    `confirm`: prompt twice. Raises UsageError if `files` are not `count` or there is no terminal for a
-    prompt, InputError for a file without a key.
+    `new`: prompt twice, and warn of keys that are easy to guess. Raises UsageError if `files` are not `count`
+    or there is no terminal for a prompt, InputError for a file without a key.
     """
     if files and len(files) != count:
         expected = "one --key-file" if count == 1 else f"one --key-file for each of {count} secrets"
         raise UsageError(f"expected {expected}, got {len(files)}")
     if files or VARIABLE in os.environ:
-        given = given_keys(files)
-        if len(given) != count:
+        found = given_keys(files)
+        if len(found) != count:
             raise UsageError(
                 f"{VARIABLE} holds one key, but there are {count} secrets: give --key-file for each"
             )
-        return given
-    if not sys.stdin.isatty():
+    elif not sys.stdin.isatty():
         raise UsageError(f"no key: give --key-file FILE, set {VARIABLE}, or run in a terminal for a prompt")
-    return [_prompt(f"Key {i + 1} of {count}" if count > 1 else "Key", confirm) for i in range(count)]
+    else:
+        found = [_prompt(f"Key {i + 1} of {count}" if count > 1 else "Key", new) for i in range(count)]
+    if new:
+        warn_of_weak_keys(found)
+    return found
 
 
 def given_keys(files: Sequence[Path]) -> list[str]:

@@ -22,6 +22,8 @@ from keyss.cli.arguments import (
     optional,
     switch,
 )
+from keyss.cli.keys import given_keys, key_of_file
+from keyss.core.errors import UsageError
 
 
 def demo(
@@ -120,8 +122,6 @@ def keygen(
 
     example: keyss keygen --asset statue-7 --master-key-file master.txt -o statue-7.key
     """
-    from keyss.cli.keys import key_of_file
-    from keyss.core.errors import UsageError
     from keyss.keys import generate_key, length_for
     from keyss.keys.key_file import write_new_key
 
@@ -173,7 +173,6 @@ def convert(
     import sys
 
     import keyss
-    from keyss.cli.keys import given_keys
     from keyss.cli.tables import print_conversion
     from keyss.files.inputs import is_standard
     from keyss.progress import waiting

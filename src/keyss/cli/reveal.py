@@ -9,6 +9,8 @@ from typing import Annotated, Literal
 from tyro.conf import Positional, UseAppendAction, arg
 
 from keyss.cli.arguments import Device, Overwrite, check_exists, optional, switch
+from keyss.cli.keys import given_keys, keys
+from keyss.core.errors import InputError
 
 
 def reveal(
@@ -45,7 +47,6 @@ def reveal(
     """
     check_exists(stego, companion, *key_file)
     import keyss
-    from keyss.cli.keys import keys
 
     key: str | None = None
     if companion is None or key_file:
@@ -89,9 +90,7 @@ def verify(
     """
     check_exists(model, key_file)
     import keyss
-    from keyss.cli.keys import given_keys
     from keyss.cli.tables import print_json, print_verification
-    from keyss.core.errors import InputError
     from keyss.progress import waiting
 
     key = next(iter(given_keys([key_file] if key_file else [])), None)

@@ -16,10 +16,11 @@ from keyss.cli.arguments import (
     Photos,
     Run,
     check_exists,
-    check_run,
     optional,
     switch,
 )
+from keyss.cli.keys import keys_of_run
+from keyss.core.errors import UsageError
 
 _VECTOR = r"[-+.\de]+(,[-+.\de]+){2}"
 _POSE = rf"#?eye={_VECTOR}&target={_VECTOR}(&up=({_VECTOR}|-?[xyz]))?"
@@ -65,7 +66,6 @@ def view(
     example: keyss view runs/hidden/publish/model.ply -o page.html
     """
     check_exists(model)
-    from keyss.core.errors import UsageError
     from keyss.viewer import ModelServer, export_html, look_of_model
 
     if pose and not re.fullmatch(_POSE, pose):
@@ -149,9 +149,8 @@ def evaluate(
 
     example: keyss evaluate runs/hidden --key-file key.txt
     """
-    check_run(run)
+    check_exists(run)
     import keyss
-    from keyss.cli.keys import keys_of_run
     from keyss.cli.tables import print_files, print_hiding
     from keyss.fitting.image_metrics import HOW_TO_GET, MIN_SIZE
 

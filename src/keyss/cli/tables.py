@@ -4,23 +4,24 @@ from __future__ import annotations
 
 import json
 import math
-import sys
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, TextIO
 
-from rich.cells import cell_len
 from rich.console import Console as RichConsole
 from rich.table import Table
 from rich.text import Text
 
+from keyss.methods.base import role_of
 from keyss.progress import about, clock
 from keyss.runs.json_records import record_bytes
 
 if TYPE_CHECKING:
     from keyss.api.convert import Conversion
+    from keyss.fitting.image_metrics import ImageQuality
     from keyss.methods.base import Plan
     from keyss.runs.describe import ModelInfo, RunInfo, SceneInfo
+    from keyss.runs.planning import Cost
     from keyss.runs.revealing import Verification
     from keyss.runs.run_records import FitMetrics, HideMetrics
 
@@ -35,84 +36,73 @@ class Console(RichConsole):
         raise  # the BrokenPipeError that is being handled
 
 
-def print_hiding(metrics: HideMetrics, console: Console | None = None, *, brief: bool = False) -> None:
+def print_hiding(metrics: HideMetrics, *, brief: bool = False) -> None:
     """Print the measurements of a hiding: a row per scene, then the rest unless `brief`."""
-    names = ["cover", "secret"]
-    if len(metrics.secrets) > 1:
-        names = ["cover", *(f"secret {number}" for number, _ in enumerate(metrics.secrets, start=1))]
+    count = len(metrics.photos)
+    names = [role_of(index, count) for index in range(count)]
     rows = _scene_rows(metrics)
     heads = [head for head in _HEADS if any(head in row for row in rows)]
-    views, first = "on test photos", names
-    if not any(metrics.photos):
-        views = "on renders of the given models"
-    elif not all(metrics.photos):
+    views, first = "on renders of the given models", names
+    if any(metrics.photos):
+        views = "on test photos"
         first = [name + " (renders)" * (not shown) for name, shown in zip(names, metrics.photos, strict=True)]
     table = [[name, *(row.get(head, "") for head in heads)] for name, row in zip(first, rows, strict=True)]
-    console = console or Console()
-    print_table([views, *heads], table, console=console)
-    for line in _lines_on_files(metrics, names) if brief else _explanations(metrics, names, heads):
-        console.print(line, highlight=False, markup=False)
-    if brief:
-        return
-    for name, unit in {"capacity": "Gaussians", "capacity_bytes": "bytes"}.items():
-        if name in metrics.details:
-            console.print(f"Capacity of the cover: {metrics.details[name]:,} {unit}.", highlight=False)
+    print_table([views, *heads], table)
+    lines = _lines_on_files(metrics, names)
+    if not brief:
+        lines = [*_explanations(metrics, names, heads), *lines]
+        units = {"capacity": "Gaussians", "capacity_bytes": "bytes"}
+        found = {unit: metrics.details[name] for name, unit in units.items() if name in metrics.details}
+        lines += [f"Capacity of the cover: {number:,} {unit}." for unit, number in found.items()]
+    print(*lines, sep="\n")
 
 
 def _scene_rows(metrics: HideMetrics) -> list[dict[str, str]]:
     """A row for the cover and each secret, by the heads of its columns."""
-    baseline, unknown = metrics.baseline, (None,) * len(metrics.photos)
-    sizes = [metrics.gaussians, *metrics.secret_gaussians]
-    rows = []
+    baseline, rows = metrics.baseline, []
     for photos, own, plain, equal, size, plain_size, steps in zip(
         metrics.photos,
         [metrics.cover, *metrics.secrets],
         [baseline.cover, *baseline.secrets],
-        baseline.equal or unknown,
-        sizes,
+        baseline.equal,
+        [metrics.gaussians, *metrics.secret_gaussians],
         baseline.gaussians,
-        metrics.steps or unknown,
+        metrics.steps,
         strict=True,
     ):
-        row = {"PSNR": f"{own.psnr:.2f}", "SSIM": f"{own.ssim:.3f}"}
-        if own.lpips is not None:
-            row["LPIPS"] = f"{own.lpips:.3f}"
-        row["Gaussians"] = f"{size:,}"
-        if not photos:  # test views are renders of the given model: no upper bound
-            plain = steps = None
-        if steps is not None:
-            row["steps"] = f"{steps:,}"
-        if plain is not None and equal:
-            row |= {"bound": f"{plain.psnr:.2f}", "loss": f"{plain.psnr - own.psnr:z.2f}"}
-        elif plain is not None:
-            row["start"] = f"{plain.psnr:.2f}"
-        if plain_size and _sizes_differ(metrics):
+        row = _quality(own) | {"Gaussians": f"{size:,}"}
+        if plain_size not in (None, size):
             row["plain"] = f"{plain_size:,}"
+        if photos and steps is not None:  # renders of a given model have no upper bound
+            row["steps"] = f"{steps:,}"
+        if photos and plain is not None and equal:
+            row |= {"bound": f"{plain.psnr:.2f}", "loss": f"{plain.psnr - own.psnr:z.2f}"}
+        elif photos and plain is not None:
+            row["start"] = f"{plain.psnr:.2f}"
         rows.append(row)
     return rows
 
 
-def _sizes_differ(metrics: HideMetrics, tolerance: float = 0.0) -> bool:
-    """True if numbers of Gaussians of a scene and its plain model differ by more than a `tolerance` share."""
-    sizes = zip([metrics.gaussians, *metrics.secret_gaussians], metrics.baseline.gaussians, strict=True)
-    return any(plain is not None and abs(plain - own) > tolerance * own for own, plain in sizes)
+def _quality(of: ImageQuality) -> dict[str, str]:
+    """Cells by the heads of their columns."""
+    lpips = {} if of.lpips is None else {"LPIPS": f"{of.lpips:.3f}"}
+    return {"PSNR": f"{of.psnr:.2f}", "SSIM": f"{of.ssim:.3f}"} | lpips
 
 
-def print_plan(plan: Plan) -> None:
+def print_plan(method: str, plan: Plan, cost: Cost) -> None:
     """Print capacity and estimates of a run."""
-    steps = f", {plan.steps:,} training steps" if plan.steps else ""
+    steps = f", {cost.steps:,} training steps" if cost.steps else ""
     _print_columns(
         [
-            ("method", plan.method),
+            ("method", method),
             ("capacity", f"{plan.capacity:,} of the secrets' {plan.secret_gaussians:,} Gaussians"),
             (
                 "published",
-                f"up to {plan.gaussians:,} Gaussians of SH degree {plan.sh_degree}, "
-                f"{plan.file_bytes / 1e6:,.1f} MB",
+                f"up to {plan.gaussians:,} Gaussians of SH degree {plan.sh_degree}, {plan.megabytes:,.1f} MB",
             ),
-            ("time", f"about {about(plan.seconds)}{steps}"),
-            ("memory", f"about {plan.memory_bytes / 1e9:.1f} GB"),
-            ("disk", f"up to {plan.disk_bytes / 1e6:,.0f} MB at once, checkpoints included"),
+            ("time", f"about {about(cost.seconds)}{steps}"),
+            ("memory", f"about {cost.memory_bytes / 1e9:.1f} GB"),
+            ("disk", f"up to {cost.disk_bytes / 1e6:,.0f} MB at once, checkpoints included"),
             *(("note", note) for note in plan.notes),
         ]
     )
@@ -120,49 +110,37 @@ def print_plan(plan: Plan) -> None:
 
 
 def _explanations(metrics: HideMetrics, names: Sequence[str], heads: Sequence[str]) -> list[str]:
-    """A line for each term of the table of a hiding."""
-    lines = ["PSNR in dB." + " LPIPS with AlexNet: lower is better." * ("LPIPS" in heads)]
-    size = "as many Gaussians"
-    if _sizes_differ(metrics):
-        size = "its own number of Gaussians" if _sizes_differ(metrics, 0.02) else "about as many Gaussians"
-    if "plain" in heads:
-        lines.append("Plain: Gaussians of the plain model.")
-    if "bound" in heads:
-        lines.append(f"Bound: upper bound, plain 3DGS with {size} and the same steps.")
-    if "start" in heads:
-        baseline = metrics.baseline
-        pairs = zip(baseline.steps, baseline.equal, strict=False)
-        shorter = {steps for steps, equal in pairs if steps is not None and not equal}
-        fewer = " or ".join(f"{steps:,}" for steps in sorted(shorter)) or "fewer"
-        lines.append(
-            f"Start: PSNR of a plain model with {size} and {fewer} training steps, no upper bound; `keyss "
-            "hide --bound` fits one."
-        )
+    """Lines on the columns of the table, wrong keys and chance."""
+    meanings = {
+        "LPIPS": "LPIPS with AlexNet: lower is better.",
+        "plain": "Plain: Gaussians of the plain model.",
+        "bound": "Bound: upper bound, plain 3DGS with the same steps.",
+        "start": "Start: PSNR of a plain model with fewer training steps, no upper bound; "
+        "`keyss hide --bound` fits one.",
+    }
+    lines = ["PSNR in dB.", *(text for head, text in meanings.items() if head in heads)]
     if (wrong := metrics.wrong_key) is not None:
-        highest = (
-            f"{each.max:.2f} to the {name}" for name, each in zip(names[1:], wrong.vs_secrets, strict=True)
-        )
+        pairs = zip(names[1:], wrong.vs_secrets, strict=True)
+        highest = ", ".join(f"{each.max:.2f} to the {name}" for name, each in pairs)
         cover = f"{wrong.vs_cover.mean:.2f} to the cover, at least {wrong.vs_cover.min:.2f}"
-        lines.append(f"PSNR of {wrong.keys} wrong keys: on average {cover}; at most {', '.join(highest)}.")
+        lines.append(f"PSNR of {wrong.keys} wrong keys: on average {cover}; at most {highest}.")
     if metrics.chance_level:
         chance = ", ".join(f"{each:.2f}" for each in metrics.chance_level)
         lines.append(
-            f"Chance level: {chance}, PSNR of the stego model itself to the secret; no wrong key should "
-            "exceed it."
+            f"Chance level: {chance}, the stego model's PSNR to the secret: the limit for wrong keys."
         )
-    return lines + _lines_on_files(metrics, names)
+    return lines
 
 
 def _lines_on_files(metrics: HideMetrics, names: Sequence[str]) -> list[str]:
     """A line on the published file, and one on each secret that lost something."""
-    lines = []
     reached = (f"{name} {each.psnr:.1f}" for name, each in zip(names, metrics.against_plain, strict=True))
-    lines.append(f"Revealed from the published file, PSNR to the plain models: {', '.join(reached)} dB.")
+    lines = [f"Revealed from the published file, PSNR to the plain models: {', '.join(reached)} dB."]
     kept = zip(
         names[1:],
         metrics.secret_gaussians,
         metrics.baseline.gaussians[1:],
-        metrics.secret_degrees or [(0, 0)] * len(metrics.secrets),
+        metrics.secret_degrees,
         metrics.against_plain[1:],
         strict=True,
     )
@@ -177,9 +155,7 @@ def _lines_on_files(metrics: HideMetrics, names: Sequence[str]) -> list[str]:
 
 def print_fit(metrics: FitMetrics) -> None:
     """Print the numbers of a plain fit."""
-    quality = {"PSNR": f"{metrics.psnr:.2f}", "SSIM": f"{metrics.ssim:.3f}"}
-    if metrics.lpips is not None:
-        quality["LPIPS"] = f"{metrics.lpips:.3f}"
+    quality = _quality(metrics)
     sizes = (f"{metrics.gaussians:,}", f"{metrics.iterations:,}", f"{metrics.seconds:.0f}")
     print_table((*quality, "Gaussians", "iterations", "seconds"), [(*quality.values(), *sizes)], texts=0)
 
@@ -189,7 +165,8 @@ def print_info(found: RunInfo | ModelInfo | SceneInfo) -> None:
     from keyss.runs.describe import RunInfo
 
     if not isinstance(found, RunInfo):
-        _print_columns([(name.replace("_", " "), _text(value)) for name, value in vars(found).items()])
+        facts = {name: value for name, value in vars(found).items() if value is not None}
+        _print_columns([(name.replace("_", " "), _text(value)) for name, value in facts.items()])
         return
     from keyss.runs.run_records import HideMetrics
 
@@ -222,11 +199,7 @@ def print_conversion(out: str, found: Conversion, *, dry_run: bool, file: TextIO
         renders = "renders are empty: the model is invisible"
     print(f"{out}: {len(found.gaussians):,} Gaussians, {_size(found.bytes_after)}{was}, {renders}", file=file)
     if out.lower().endswith(".spz"):
-        print(
-            "y is up in an .spz, as Niantic's library and splat-transform 2 write it; programs that do not "
-            "turn it (splat-transform 3) show it upside down",
-            file=file,
-        )
+        print("y is up in an .spz: programs that do not turn it show it upside down", file=file)
     for number, secret in enumerate(found.secrets, 1):
         which = "the secret" if len(found.secrets) == 1 else f"the secret of key {number}"
         state = "survives" if secret.kept else f"is lost: {secret.after:,} {secret.unit} are left"
@@ -240,13 +213,8 @@ def print_conversion(out: str, found: Conversion, *, dry_run: bool, file: TextIO
 
 
 def print_json(facts: object) -> None:
-    """Print a record as JSON, in ASCII if the standard output cannot encode it."""
-    text = record_bytes(facts).decode()
-    try:
-        text.encode(sys.stdout.encoding or "utf-8")
-    except UnicodeEncodeError:
-        text = json.dumps(json.loads(text), indent=2) + "\n"
-    print(text, end="")
+    """Print a record as JSON, in ASCII."""
+    print(json.dumps(json.loads(record_bytes(facts)), indent=2))
 
 
 def _size(count: int) -> str:
@@ -265,46 +233,25 @@ def _print_columns(rows: Sequence[tuple[str, str]]) -> None:
         print(f"{name:<{width}}  {text}")
 
 
-def print_table(
-    heads: Sequence[str], rows: Iterable[Sequence[str]], *, texts: int = 1, console: Console | None = None
-) -> None:
+def print_table(heads: Sequence[str], rows: Iterable[Sequence[str]], *, texts: int = 1) -> None:
     """Print a table; its first `texts` columns are aligned left, the others hold numbers.
 
-    Cells wrap between words. If the terminal is too narrow, each row becomes a list.
+    Long texts wrap between words, and anything in terminals that are too narrow.
     """
-    console, rows = console or Console(), list(rows)
-    columns = list(zip(heads, *rows, strict=True))
-    needed = [max(cell_len(word) for cell in cells for word in cell.split() or [""]) for cells in columns]
-    widths = [max(map(cell_len, cells)) for cells in columns]
-    gaps = 2 * (len(heads) - 1)
-    if sum(needed) + gaps > console.width:
-        for row in rows:
-            for head, cell in zip(heads, row, strict=True):
-                console.print(f"{head}: {cell}", highlight=False, markup=False)
-            console.print()
-        return
-    while sum(widths) + gaps > console.width:
-        widths[
-            max(range(len(widths)), key=lambda index: (widths[index] > needed[index]) * widths[index])
-        ] -= 1
     table = Table(box=None, pad_edge=False, header_style="bold", padding=(0, 2, 0, 0))
-    for index, (head, width) in enumerate(zip(heads, widths, strict=True)):
-        table.add_column(head, justify="left" if index < texts else "right", width=width)
+    for index, head in enumerate(heads):
+        table.add_column(head, justify="left" if index < texts else "right", overflow="fold")
     for row in rows:
         table.add_row(*map(Text, row))
-    console.print(table)
+    Console().print(table)
 
 
 def _text(value: object) -> str:
     match value:
-        case None:
-            return "none"
-        case bool():
-            return "yes" if value else "no"
+        case tuple():
+            return ", ".join(map(_text, value))
         case int():
             return f"{value:,}"
         case float():
             return f"{value:.4g}"
-        case list() | tuple():
-            return ", ".join(_text(item) for item in value) or "none"
     return str(value)

@@ -19,7 +19,7 @@ OPENS_NOTHING = (
     "published (converted or quantised, moved, scaled, pruned, edited or trained on); or nothing is hidden"
 )
 _PACKAGES = {"ot": "pot", "sklearn": "scikit-learn", "yaml": "pyyaml"}  # module: package, if the names differ
-MAX_LENGTH = 100  # characters; longer words are not compared
+MAX_LENGTH = 100  # characters of a misspelt name that count
 
 
 class KeyssError(Exception):
@@ -106,8 +106,7 @@ def import_extra(module: str, extra: str, purpose: str) -> Any:
 
 def nearest(word: str, known: Collection[str]) -> str | None:
     """The most similar of the `known` names, None if none is similar."""
-    short = [name for name in sorted(known) if len(name) <= MAX_LENGTH]
-    matches = get_close_matches(word, short, n=1, cutoff=0.7) if len(word) <= MAX_LENGTH else []
+    matches = get_close_matches(word[:MAX_LENGTH], sorted(known), n=1, cutoff=0.7)
     return matches[0] if matches else None
 
 

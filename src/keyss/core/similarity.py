@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -38,12 +39,10 @@ class Similarity:
                 f"similarity: expected a [3, 3] rotation and a [3] translation, "
                 f"got {list(rotation.shape)} and {list(translation.shape)}"
             )
-        if not (math.isfinite(self.scale) and self.scale > 0):
-            raise ValueError(f"similarity: expected a positive finite scale, got {self.scale}")
-        if not (rotation.isfinite().all() and translation.isfinite().all()):
-            raise ValueError("similarity: the rotation or the translation is not finite")
+        if not (0 < self.scale < math.inf and translation.isfinite().all()):
+            raise ValueError("similarity: expected a positive finite scale and a finite translation")
         off = (rotation @ rotation.T - torch.eye(3, dtype=torch.float64)).abs().max()
-        if off > _ROTATION_TOLERANCE or torch.linalg.det(rotation) < 0:
+        if not off <= _ROTATION_TOLERANCE or torch.linalg.det(rotation) < 0:  # `off` may be NaN
             raise ValueError("similarity: the rotation is not orthonormal with determinant +1")
         object.__setattr__(self, "scale", float(self.scale))
         object.__setattr__(self, "rotation", rotation)
@@ -111,28 +110,18 @@ def _rotate_sh(sh: Tensor, rotation: Tensor) -> Tensor:
 
 
 def _sh_basis(directions: Tensor, degree: int) -> Tensor:
-    """[D, (degree + 1)^2] the real SH basis with 3DGS's signs, at [D, 3] unit `directions`."""
-    x, y, z = directions.unbind(-1)
-    xx, yy, zz = x * x, y * y, z * z
-    basis = [
-        0.28209479177387814 * torch.ones_like(x),
-        -0.4886025119029199 * y,
-        0.4886025119029199 * z,
-        -0.4886025119029199 * x,
-        1.0925484305920792 * x * y,
-        -1.0925484305920792 * y * z,
-        0.31539156525252005 * (2 * zz - xx - yy),
-        -1.0925484305920792 * x * z,
-        0.5462742152960396 * (xx - yy),
-        -0.5900435899266435 * y * (3 * xx - yy),
-        2.890611442640554 * x * y * z,
-        -0.4570457994644658 * y * (4 * zz - xx - yy),
-        0.3731763325901154 * z * (2 * zz - 3 * xx - 3 * yy),
-        -0.4570457994644658 * x * (4 * zz - xx - yy),
-        1.445305721320277 * z * (xx - yy),
-        -0.5900435899266435 * x * (xx - 3 * yy),
-    ]
-    return torch.stack(basis[: (degree + 1) ** 2], dim=-1)
+    """[D, (degree + 1)^2] the real SH basis at [D, 3] unit `directions`; `lpmv` has 3DGS's signs."""
+    from scipy.special import factorial, lpmv  # slow to load
+
+    x, y, z = directions.T.numpy()
+    longitudes, basis = np.arctan2(y, x), []
+    for band in range(degree + 1):
+        for order in range(-band, band + 1):
+            m = abs(order)
+            norm = (2 * band + 1) / (4 * np.pi) * factorial(band - m) / factorial(band + m)
+            waves = np.sin(m * longitudes) if order < 0 else np.cos(m * longitudes)
+            basis.append(np.sqrt(norm * (2 if m else 1)) * lpmv(m, band, z) * waves)
+    return torch.from_numpy(np.stack(basis, axis=-1))
 
 
 def align(secret_cameras: Sequence[Camera], cover_cameras: Sequence[Camera]) -> Similarity:

@@ -1,8 +1,7 @@
 """Elements of PLY files as structured arrays, and the Gaussians of 3DGS models among them.
 
 The reader is our own because the usual library, plyfile, is GPL, and because input is untrusted: lengths are
-checked against the file size before anything is allocated, and every defect raises InputError. It does not
-import torch, which takes a second, so that `keyss info` is fast.
+checked against the file size before anything is allocated, and every defect raises InputError.
 """
 
 from __future__ import annotations

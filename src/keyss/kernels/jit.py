@@ -12,8 +12,7 @@ import os
 import stat
 import sys
 import tempfile
-from contextlib import suppress
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -29,31 +28,8 @@ _numba: Any = numba  # typed in some versions only
 _NAN_SAFE = {"contract", "arcp", "nsz", "reassoc", "afn"}
 
 
-def kernel(function: Any) -> Any:
-    """Compile `function` at its first call; NaN and infinity compare as in IEEE 754."""
-    return _compile(function, fastmath=_NAN_SAFE)
-
-
-def finite_kernel(function: Any) -> Any:
-    """`kernel`, but the compiler may assume that all numbers are finite."""
-    return _compile(function, fastmath=True)
-
-
-def inline(function: Any) -> Any:
-    """Inline a function into the kernels that call it.
-
-    LLVM does not inline large functions by itself. A process that compiles them would call the separate code,
-    one that loads the cached kernel the code optimised with it, and the two round differently.
-    """
-    return _compile(function, fastmath=_NAN_SAFE, forceinline=True)
-
-
-def finite_inline(function: Any) -> Any:
-    """`inline`, for functions that only a `finite_kernel` calls."""
-    return _compile(function, fastmath=True, forceinline=True)
-
-
 def _compile(function: Any, fastmath: bool | set[str], forceinline: bool = False) -> Any:
+    """Compile `function` at its first call."""
     # Inlined functions borrow the kernel's arrays: reference counting would cost more than some arithmetic.
     options = {"fastmath": fastmath, "forceinline": forceinline, "error_model": "numpy", "nogil": True}
     options["_nrt"] = not forceinline
@@ -69,6 +45,17 @@ def _compile(function: Any, fastmath: bool | set[str], forceinline: bool = False
         return _numba.njit(**options)(function)
     finally:
         _numba.config.CACHE_DIR = folder_before
+
+
+# NaN and infinity compare as in IEEE 754.
+kernel = partial(_compile, fastmath=_NAN_SAFE)
+# The compiler may assume that all numbers are finite.
+finite_kernel = partial(_compile, fastmath=True)
+# Inlined into the kernels that call them: LLVM does not inline large functions by itself. A process that
+# compiles them would call the separate code, one that loads the cached kernel the code optimised with it, and
+# the two round differently.
+inline = partial(_compile, fastmath=_NAN_SAFE, forceinline=True)
+finite_inline = partial(_compile, fastmath=True, forceinline=True)
 
 
 @cache
@@ -106,16 +93,11 @@ def _is_private(folder: Path) -> bool:
 
 
 def _cache_parents() -> list[Path]:
-    parents = [_PACKAGE / "kernels" / "__pycache__"]
-    if _numba.config.CACHE_DIR:
-        parents.insert(0, Path(_numba.config.CACHE_DIR))
-    user_cache = os.environ.get("LOCALAPPDATA") or os.environ.get("XDG_CACHE_HOME")
-    if user_cache:
-        parents.append(Path(user_cache))
-    else:
-        with suppress(RuntimeError):  # no home folder
-            parents.append(Path.home() / ".cache")
-    return parents
+    of_user = (
+        os.environ.get("LOCALAPPDATA") or os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+    )
+    parents = (_numba.config.CACHE_DIR, _PACKAGE / "kernels" / "__pycache__", of_user)
+    return [Path(each) for each in parents if each and not str(each).startswith("~")]  # no home folder
 
 
 @cache

@@ -11,6 +11,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from functools import cache
 from typing import Any, TypeVar
 
 import numpy as np
@@ -19,7 +20,7 @@ import torch
 T = TypeVar("T")
 
 _CORES = os.cpu_count() or 1
-_pools: dict[int, ThreadPoolExecutor] = {}  # one per number of helper threads
+_MAX_HELPERS = 1024
 
 
 def run(kernel: Callable[..., None], *arguments: Any) -> None:
@@ -53,7 +54,7 @@ def in_blocks(function: Callable[[int, int], T], count: int, size: int) -> list[
 def _on_threads(limit: int, work: Callable[..., None], *arguments: Any) -> None:
     """Call `work` on this thread and on helpers, at most `limit` in total; returns when all are done."""
     helpers = min(torch.get_num_threads(), limit) - 1
-    tasks = [_pool(helpers).submit(work, *arguments) for _ in range(helpers)]
+    tasks = [_pool(os.getpid()).submit(work, *arguments) for _ in range(helpers)]
     try:
         work(*arguments)
     finally:
@@ -63,12 +64,7 @@ def _on_threads(limit: int, work: Callable[..., None], *arguments: Any) -> None:
                 task.result()
 
 
-def _pool(helpers: int) -> ThreadPoolExecutor:
-    pool = _pools.get(helpers)
-    if pool is None:
-        pool = _pools[helpers] = ThreadPoolExecutor(helpers, thread_name_prefix="keyss-render")
-    return pool
-
-
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_pools.clear)  # threads do not survive a fork
+@cache
+def _pool(process: int) -> ThreadPoolExecutor:
+    """The helpers of a process, which do not survive a fork. Threads start when they are needed."""
+    return ThreadPoolExecutor(_MAX_HELPERS, thread_name_prefix="keyss-render")

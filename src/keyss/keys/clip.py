@@ -7,7 +7,6 @@ no CLIP: the encrypted payload contains the vector.
 
 from __future__ import annotations
 
-import string
 from functools import lru_cache
 from pathlib import Path
 
@@ -15,9 +14,8 @@ import torch
 from torch import Tensor
 
 from keyss.core.errors import BackendError, UsageError, import_extra
-from keyss.keys.key_file import normalized_key
+from keyss.keys.key_file import ALPHABET, normalized_key
 
-_CHARACTERS = string.ascii_letters + string.digits
 MODEL = "openai/clip-vit-large-patch14"  # ViT-L/14 (section 4.1)
 
 
@@ -53,8 +51,8 @@ class ClipKeys:
 
     def random(self, generator: torch.Generator) -> Tensor:
         """The vector of a random key of 16 alphanumeric characters (section 4.1)."""
-        chosen = torch.randint(len(_CHARACTERS), (16,), generator=generator)
-        return self("".join(_CHARACTERS[int(each)] for each in chosen))
+        chosen = torch.randint(len(ALPHABET), (16,), generator=generator)
+        return self("".join(ALPHABET[int(each)] for each in chosen))
 
 
 clip_keys = lru_cache(maxsize=1)(ClipKeys)  # loads the large model once for preparing and hiding

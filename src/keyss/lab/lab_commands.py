@@ -18,7 +18,6 @@ from keyss.cli.arguments import (
     Run,
     Width,
     check_exists,
-    check_run,
     check_seed,
     optional,
     switch,
@@ -61,7 +60,7 @@ def audit(
 
     example: keyss audit runs/hidden --report-only
     """
-    check_run(run)
+    check_exists(run)
     import keyss
     from keyss.cli.keys import keys_of_run
     from keyss.cli.tables import print_files
@@ -305,14 +304,14 @@ def _print_forecast(found: Forecast) -> None:
     rows = []
     for place, name in found.names.items():
         time, memory = "cannot work" if place in found.refused else "done", ""
-        if (plan := found.plans.get(place)) is not None:
-            time, memory = about(plan.seconds), f"{plan.memory_bytes / 1e9:.1f} GB"
+        if (cost := found.costs.get(place)) is not None:
+            time, memory = about(cost.seconds), f"{cost.memory_bytes / 1e9:.1f} GB"
         rows.append((name, time, memory))
     print_table(("run", "time, about", "memory"), rows)
     for place, reason in found.refused.items():
         print(f"{found.names[place]}: {reason}")
     print(
-        f"{len(rows)} run{'s' * (len(rows) != 1)}, {len(found.plans)} to do: about "
-        f"{about(sum(plan.seconds for plan in found.plans.values()))} on this machine."
+        f"{len(rows)} run{'s' * (len(rows) != 1)}, {len(found.costs)} to do: about "
+        f"{about(sum(cost.seconds for cost in found.costs.values()))} on this machine."
     )
     print("Dry run: nothing was written. Times are rough, and leave out the measurements afterwards.")

@@ -24,27 +24,20 @@ def contact_sheet(heads: Sequence[str], rows: Mapping[str, Sequence[Bytes]], cel
         ]
         for pictures in rows.values()
     ]
-    label = max(math.ceil(font.getlength(name)) for name in rows) + gap
-    lines = 1 + max(head.count("\n") for head in heads)
-    top = gap + lines * (cell // 8)
-    widths = [
-        max(
-            *(math.ceil(font.getlength(line)) for line in ["", *head.split("\n")]),
-            *(each.width for each in column),
-        )
-        for head, column in zip(heads, zip(*scaled, strict=True), strict=True)
-    ]
-    starts = [label + gap + sum(widths[:index]) + gap * index for index in range(len(widths))]
-    size = starts[-1] + widths[-1] + gap, top + (cell + gap) * len(rows)
-    sheet = Image.new("RGB", size, "white")
+    lines = [line for head in heads for line in head.split("\n")]
+    left = math.ceil(max(map(font.getlength, rows))) + 2 * gap
+    top = gap + (1 + max(head.count("\n") for head in heads)) * (cell // 8)
+    widest = max(math.ceil(font.getlength(line)) for line in lines)
+    width = gap + max(widest, *(each.width for pictures in scaled for each in pictures))
+    sheet = Image.new("RGB", (left + width * len(heads), top + (cell + gap) * len(rows)), "white")
     draw = ImageDraw.Draw(sheet)
-    for x, head in zip(starts, heads, strict=True):
-        draw.multiline_text((x, gap), head, fill=(20, 20, 20), font=font)
-    for number, (name, pictures) in enumerate(zip(rows, scaled, strict=True)):
-        y = top + (cell + gap) * number
+    for column, head in enumerate(heads):
+        draw.multiline_text((left + width * column, gap), head, fill=(20, 20, 20), font=font)
+    for row, (name, pictures) in enumerate(zip(rows, scaled, strict=True)):
+        y = top + (cell + gap) * row
         draw.text((gap, y + gap), name, fill=(20, 20, 20), font=font)
-        for x, picture in zip(starts, pictures, strict=True):
-            sheet.paste(picture, (x, y))
+        for column, picture in enumerate(pictures):
+            sheet.paste(picture, (left + width * column, y))
     file = io.BytesIO()
     sheet.save(file, "PNG", optimize=True)
     return file.getvalue()

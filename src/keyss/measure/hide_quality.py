@@ -33,8 +33,8 @@ class BaselineQuality:
     cover: ImageQuality | None
     secrets: tuple[ImageQuality | None, ...]
     gaussians: tuple[int | None, ...]  # plain models: cover, then secrets
-    steps: tuple[int | None, ...] = ()  # training steps of the plain models; None: given, unknown
-    equal: tuple[bool, ...] = ()  # whether the scene had as many steps in total
+    steps: tuple[int | None, ...]  # training steps of the plain models; None: given, unknown
+    equal: tuple[bool, ...]  # whether the scene had as many steps in total
 
 
 @dataclass(frozen=True)
@@ -88,14 +88,12 @@ def measure_hiding(
     opened: Sequence[HiddenScene],
     scenes: Sequence[Scene],  # the cover, then the secrets in the order of `opened`, each in its own frame
     shown: Sequence[Shown],  # of `compare`: the stego model, then the secrets
-    gaussians: Sequence[int | None],  # of the plain models of the scenes
     *,
-    steps: Sequence[
-        int | None
-    ] = (),  # training steps of the plain models, and whether their scenes had as many
-    equal: Sequence[bool] = (),
+    gaussians: Sequence[int | None],  # these and the next: see `BaselineQuality`
+    steps: Sequence[int | None],
+    equal: Sequence[bool],
     wrong_keys: int = WRONG_KEYS,
-    seed: int = 0,
+    seed: int,
 ) -> HidingQuality:
     """Measure cover and secrets, their plain models, and renders under wrong keys.
 
@@ -144,20 +142,19 @@ def _wrong_keys(
     seed: int,
 ) -> WrongKeys | None:
     """PSNRs of decoded models under wrong embeddings; None without decoders."""
-    keyed = [
-        (each.decode, each.key_size, scene)
-        for each, scene in zip(opened, secrets, strict=True)
-        if each.decode is not None
-    ]
-    if not keyed:
-        return None
     vs_cover, vs_secrets = [], []
-    for decode, size, scene in keyed:
-        embeddings = random_embeddings(count, torch.Generator().manual_seed(seed), size)
-        models = (decode(stego, embedding) for embedding in embeddings)  # one at a time: they are large
-        psnrs = [(_psnr(model, cover), _psnr(model, scene)) for model in models]
-        vs_cover.append([of_cover for of_cover, _ in psnrs])
-        vs_secrets.append(_range([of_secret for _, of_secret in psnrs]))
+    for each, scene in zip(opened, secrets, strict=True):
+        if each.decode is None:
+            continue
+        embeddings = random_embeddings(count, torch.Generator().manual_seed(seed), each.key_size)
+        models = (each.decode(stego, embedding) for embedding in embeddings)  # one at a time: they are large
+        of_cover, of_secret = zip(
+            *((_psnr(model, cover), _psnr(model, scene)) for model in models), strict=True
+        )
+        vs_cover.append(of_cover)
+        vs_secrets.append(_range(of_secret))
+    if not vs_cover:
+        return None
     means = [fmean(psnrs) for psnrs in zip(*vs_cover, strict=True)]
     return WrongKeys(count, _range(means), tuple(vs_secrets))
 

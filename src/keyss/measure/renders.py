@@ -12,12 +12,10 @@ from keyss.files.images import png_names
 from keyss.fitting.image_metrics import subsample_views
 from keyss.rendering import render
 
-STEGANALYSED_VIEWS = 64
-
 
 def select_views(views: Sequence[View]) -> list[View]:
     """At most 64 views, evenly spaced in the order of their names."""
-    return list(subsample_views(sorted(views, key=lambda view: view.camera.name), STEGANALYSED_VIEWS))
+    return list(subsample_views(sorted(views, key=lambda view: view.camera.name), 64))
 
 
 @torch.no_grad()

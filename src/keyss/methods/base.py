@@ -56,6 +56,7 @@ class Training:
 
     steps: int = 0  # steps that render the scene
     continues: bool = True  # starts from the plain model, whose steps count too
+    step_cost: float = 1.0  # time of a step over that of plain 3DGS
 
 
 @dataclass(frozen=True)
@@ -179,7 +180,7 @@ class MethodOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class Plan:
-    """The plan of a hiding: the method sets the first fields, `keyss.runs.planning` the others.
+    """What a method plans to publish, and how much of the secrets.
 
     Sizes are exact for given models, and upper limits for models that are not fitted yet.
     """
@@ -188,21 +189,12 @@ class Plan:
     sh_degree: int  # SH degree of the published model
     secret_gaussians: int  # total over the secrets
     capacity: int  # Gaussians of the secrets that fit
-    steps: int = 0  # training steps: joint ones from the method, then all
-    step_cost: float = 1.0  # time of a joint step over that of steps of plain 3DGS of all scenes
-    rendered: tuple[int, ...] = ()  # Gaussians of the cover and of each secret in a step
     notes: tuple[str, ...] = ()  # sentences on the costs of options
 
-    method: str = ""
-    fit_seconds: tuple[float, ...] = ()  # of plain fits, the cover's first; rough estimates
-    other_seconds: float = 0.0
-    file_bytes: int = 0  # upper limit for the published model
-    disk_bytes: int = 0  # maximum on disk at one time, checkpoints included
-    memory_bytes: int = 0  # a rough estimate
-
     @property
-    def seconds(self) -> float:
-        return sum(self.fit_seconds) + self.other_seconds
+    def megabytes(self) -> float:
+        """Size of the published model as a .ply with normals; other formats take less."""
+        return 4e-6 * self.gaussians * (14 + 3 * (self.sh_degree + 1) ** 2)
 
 
 class Method(Protocol):
@@ -221,7 +213,7 @@ class Method(Protocol):
         """
 
     def plan(self, sources: Sequence[Source], options: Any) -> Plan:
-        """Fill in the fields of the plan that the method knows; `options` are prepared."""
+        """The plan of a hiding; `options` are prepared."""
 
     def hide(self, cover: Source, secrets: Sequence[Source], options: Any, context: Context) -> Stego:
         """Hide the secrets; `options` are prepared and have a seed.

@@ -56,24 +56,18 @@ def run_folder(path: Path) -> Path:
 
     Otherwise raises InputError, which names the run that contains `path` if there is one.
     """
-    expected = f"{path}: expected the folder of a run, as `keyss hide --secret` writes it"
-    if is_run(path):
-        if os.path.isfile(path / MODEL):
-            raise InputError(f"{expected}, found one that `keyss fit` wrote")
-        return path
+    kind = "a folder" if os.path.isdir(path) else "a file"
     try:
         (path / CONFIG).stat()
-    except PermissionError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
-    except OSError:
-        pass
-    if not os.path.lexists(path):
-        raise InputError(f"{expected}; there is nothing of that name")
-    kind = "a folder" if os.path.isdir(path) else "a file"
-    run = next((parent for parent in path.absolute().parents[:2] if is_run(parent)), None)
-    if run is not None:
-        raise InputError(f"{expected}, found {kind} in one; give {run}")
-    raise InputError(f"{expected}, found {kind} without {CONFIG}")
+        if not os.path.isfile(path / MODEL):
+            return path
+        found = "one that `keyss fit` wrote"
+    except OSError as error:
+        run = next((parent for parent in path.absolute().parents[:2] if is_run(parent)), None)
+        found = f"{kind} in one; give {run}" if run else f"no {CONFIG} in it ({error.strerror})"
+    raise InputError(
+        f"{path}: expected the folder of a run, as `keyss hide --secret` writes it, found {found}"
+    )
 
 
 def plain_names(secrets: int) -> list[str]:
@@ -117,12 +111,9 @@ def as_scene(
                 f"{source}: expected a scene folder or a 3DGS model ({known_suffixes()}), found "
                 f"{identify_file(Path(source))}"
             )
-        try:
-            return load_scene(source, **vars(views))
-        except InputError as error:
-            if is_run(Path(source)) and (inside := model_in(Path(source))):
-                raise InputError(f"{source}: expected a scene, found a run; its model is {inside}") from error
-            raise
+        if is_run(Path(source)) and (inside := model_in(Path(source))):
+            raise InputError(f"{source}: expected a scene, found a run; its model is {inside}")
+        return load_scene(source, **vars(views))
     from keyss.rendering.orbit import scene_of_model
 
     name = "model" if isinstance(source, Gaussians) else Path(source).stem

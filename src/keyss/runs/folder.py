@@ -132,7 +132,7 @@ class RunFolder:
             before = running.arguments | {"keys": self.arguments.get("keys")}
             if before == self.arguments or "keys" not in self.arguments:  # verifiers depend on the others
                 before = running.arguments
-            changes = _differences(before, self.arguments, "; ", ": ")
+            changes = _differences(before, self.arguments)
             raise OutputError(
                 f"{self.path} holds an interrupted run with other arguments ({changes}): give the same ones, "
                 "or start anew with `overwrite=True`"
@@ -177,10 +177,9 @@ class RunFolder:
         return folder
 
     def write(self, contents: Mapping[str, Any]) -> Path:
-        """Write models, bytes and records, or call functions with a path; returns the folder that holds them.
+        """Write models, bytes and records; returns the folder that holds them until the end.
 
-        Names are paths in the run's folder, where the files appear at the end. A function may write a folder.
-        Raises OutputError.
+        Names are paths in the run's folder, where the files appear at the end. Raises OutputError.
         """
         staging = self.path / _STAGING
         with _os_errors(self.path):
@@ -188,10 +187,7 @@ class RunFolder:
                 _refuse_foreign(self.path, name)
                 _make_parents(self.path, f"{_STAGING}/{name}")
                 _write(staging / name, content)
-                written = [staging / name]
-                if written[0].is_dir():
-                    written = sorted(path for path in written[0].rglob("*") if path.is_file())
-                self._names += [path.relative_to(staging).as_posix() for path in written]
+                self._names.append(name)
         return staging
 
     def keep(self, stage: str, name: str, content: Any) -> None:
@@ -297,15 +293,6 @@ def read_manifest(folder: Path) -> Manifest:
     return manifest
 
 
-def recorded_number(folder: Path, *names: str) -> int | None:
-    """An argument of the interrupted run in a folder, by the names that lead to it; None if it has none."""
-    running = read_manifest(folder).running
-    value: Any = running and running.arguments
-    for name in names:
-        value = value.get(name) if isinstance(value, dict) else None
-    return value if isinstance(value, int) else None
-
-
 def _drop_unfinished(folder: Path, manifest: Manifest) -> None:
     """Remove checkpoints and unfinished files.
 
@@ -318,10 +305,8 @@ def _drop_unfinished(folder: Path, manifest: Manifest) -> None:
 
 
 def _write(path: Path, content: Any) -> None:
-    """Write a model, bytes or a record, or let a function write."""
-    if callable(content):
-        content(path)
-    elif isinstance(content, Gaussians):
+    """Write a model, bytes or a record."""
+    if isinstance(content, Gaussians):
         write_model(path, content)
     elif isinstance(content, bytes):
         write_bytes(path, content)
@@ -361,12 +346,8 @@ def _refuse_foreign(folder: Path, name: str) -> None:
         raise OutputError(
             f"{target.parent} leads out of {folder}: remove this link, or choose another folder"
         )
-    if not os.path.lexists(target):
-        return
     ours = {name for names in read_manifest(folder).files.values() for name in names}
-    inside = target.rglob("*") if target.is_dir() and not target.is_symlink() else ()
-    files = [path.relative_to(folder).as_posix() for path in inside if path.is_symlink() or not path.is_dir()]
-    if name not in ours and not (files and ours.issuperset(files)):
+    if os.path.lexists(target) and name not in ours:
         raise OutputError(
             f"{target} is in the way, and keyss did not write it: move it, or choose another folder"
         )
@@ -390,13 +371,11 @@ def _remove_empty(folder: Path) -> None:
         folder.rmdir()
 
 
-def _differences(old: Any, new: Any, between: str = ", ", after_name: str = " ") -> str:
+def _differences(old: Any, new: Any) -> str:
     """The values that differ, down to the innermost fields."""
     if isinstance(old, dict) and isinstance(new, dict):
         names = [name for name in sorted({*old, *new}) if old.get(name) != new.get(name)]
-        return between.join(
-            f"{name}{after_name}{_differences(old.get(name), new.get(name))}" for name in names
-        )
+        return "; ".join(f"{name}: {_differences(old.get(name), new.get(name))}" for name in names)
     shown = ["none" if value is None else msgspec.json.encode(value).decode() for value in (old, new)]
     return "not the same" if max(map(len, shown)) > _MAX_SHOWN else f"{shown[0]} then, {shown[1]} now"
 

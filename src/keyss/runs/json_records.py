@@ -6,6 +6,7 @@ Unknown fields are ignored; all others must have the declared types.
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -24,19 +25,13 @@ class _Versioned(msgspec.Struct):
     version: int
 
 
-def read_record(path: Path, type: type[T], *, at_most: int = MAX_BYTES) -> T:
-    """Read the record of a dataclass from a JSON file of at most `at_most` bytes.
+def read_record(path: Path, type: type[T]) -> T:
+    """Read the record of a dataclass from a JSON file of at most MAX_BYTES.
 
     Raises InputError, with the file and the place in it, if the file is missing, too large or not JSON, has
     another version, or has values of wrong types.
     """
-    try:
-        exists = path.exists()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
-    if not exists:
-        raise InputError(f"{path}: missing; expected a file that keyss wrote")
-    data = read_file(path, at_most)
+    data = read_file(path, MAX_BYTES)
     generic: Any = type
     expected = int(generic.version)  # a field's default is an attribute of its class
     try:
@@ -64,16 +59,6 @@ def record_bytes(record: Any) -> bytes:
     try:
         data = msgspec.json.encode(record)
     except UnicodeEncodeError:
-        data = msgspec.json.encode(_all_as_text(msgspec.to_builtins(record)))
+        text = as_text(json.dumps(msgspec.to_builtins(record), ensure_ascii=False))
+        data = msgspec.json.encode(json.loads(text, parse_constant=lambda _: None))
     return msgspec.json.format(data, indent=2) + b"\n"
-
-
-def _all_as_text(value: Any) -> Any:
-    match value:
-        case str():
-            return as_text(value)
-        case dict():
-            return {_all_as_text(key): _all_as_text(item) for key, item in value.items()}
-        case list() | tuple():
-            return [_all_as_text(item) for item in value]
-    return value

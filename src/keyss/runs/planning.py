@@ -1,4 +1,4 @@
-"""Plans of runs: capacity, disk and memory follow from models and options; times are rough."""
+"""The rough cost of a run, and a check that disk and memory have room for it."""
 
 from __future__ import annotations
 
@@ -7,9 +7,8 @@ import shutil
 import warnings
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 import psutil
 import torch
@@ -18,127 +17,92 @@ from keyss.core.errors import KeyssWarning, OutputError
 from keyss.core.scene import Scene
 from keyss.fitting.config import FitConfig
 from keyss.fitting.losses import Targets
-from keyss.methods.base import Method, MethodOptions, Plan, Source
+from keyss.methods.base import MethodOptions, Source
 from keyss.methods.plain_models import Bound
 from keyss.progress import about
 
 _STEP_SECONDS = {"cpu": 5e-7, "cuda": 6e-9}  # per training step, Gaussian and two pixels
 _KEY_SECONDS = 3.0  # deriving a secret's key for every salt, and opening the secret again
 _RENDERS = 2  # training steps that take as long as measuring a test view
-_STATE_COPIES = 3  # checkpoint / model: parameters and two moments of Adam
+_CHECKPOINTS = 6  # two checkpoints / model: each holds parameters and two moments of Adam
 _MAX_APPENDED = 7  # Gaussians that hold one Gaussian of a secret of SH degree 3
 _OTHER_BYTES = 4 << 20  # JSON files, locks, and the overhead of the file system
 
 
-class Needs(NamedTuple):
-    """Upper limits of a run's disk space and memory."""
+@dataclass(frozen=True)
+class Cost:
+    """Estimates of a run: rough times, and upper limits of its disk space and memory."""
 
-    disk_bytes: int
+    steps: int  # training steps
+    seconds: float
+    fit_seconds: tuple[float, ...]  # plain fits among them, the cover's first
+    disk_bytes: int  # at one time, checkpoints included
     memory_bytes: int
 
+    def __str__(self) -> str:
+        return (
+            f"about {about(self.seconds)}, {self.memory_bytes / 1e9:.1f} GB of memory, "
+            f"up to {self.disk_bytes / 1e6:,.0f} MB of disk"
+        )
 
-def plan_hiding(
-    method: Method,
+
+def cost_of_fit(scene: Scene, config: FitConfig, device: torch.device) -> Cost:
+    """The cost of a plain fit, which is a hiding without secrets."""
+    return cost_of(MethodOptions(fit=config), [Source(None, photos=True, loaded=scene)], device)
+
+
+def cost_of(
     options: MethodOptions,  # prepared
     sources: Sequence[Source],  # the cover, then the secrets, loaded at least with their test images
     device: torch.device,
     *,
     bound: bool = False,  # also fit the upper bounds
-) -> Plan:
-    """The plan of a hiding. Writes nothing."""
-    plan, count = method.plan(sources, options), len(sources)
-    steps, seconds, fits = plan.steps, _KEY_SECONDS * (count - 1), []
-    rendered = plan.rendered or (0,) * count
-    for source, size, joint, config, training in zip(
-        sources, _sizes(options, sources), rendered, options.fits(count), options.training(count), strict=True
-    ):
-        step = _view_seconds(device, size, source.scene)
-        own = config.iterations if source.given is None else 0
-        steps += own
-        fits.append(own * step)
-        seconds += _RENDERS * len(source.scene.test) * step
-        if joint:
-            seconds += plan.steps * plan.step_cost * _view_seconds(device, joint, source.scene)
+) -> Cost:
+    """The cost of a hiding."""
+    count, most = len(sources), options.fit.max_gaussians
+    fits, trainings = options.fits(count), options.training(count)
+    steps, trained, sizes = max(training.steps for training in trainings), 0, []
+    seconds, fit_seconds = _KEY_SECONDS * (count - 1), []
+    for source, fit, training in zip(sources, fits, trainings, strict=True):
+        size = most if source.given is None or not training.continues else len(source.given)
+        own = fit.iterations if source.given is None else 0
+        renders = own + training.steps * training.step_cost + _RENDERS * len(source.scene.test)
         longer = Bound.of(training, own or None)
         if bound and source.photos and not longer.equal:
-            seconds += (longer.steps or 0) * step
-    needs = needs_of_hiding(options, sources)
-    return replace(
-        plan,
-        method=method.name,
-        steps=steps,
-        fit_seconds=tuple(fits),
-        other_seconds=seconds,
-        file_bytes=_ply_bytes(plan.gaussians, plan.sh_degree),
-        disk_bytes=needs.disk_bytes,
-        memory_bytes=needs.memory_bytes,
-    )
-
-
-def plan_fit(scene: Scene, config: FitConfig, device: torch.device) -> Plan:
-    """The plan of a plain fit."""
-    gaussians, degree, needs = config.max_gaussians, config.sh_degree, needs_of_fit(scene, config)
-    step = _view_seconds(device, gaussians, scene)
-    return Plan(
-        gaussians=gaussians,
-        sh_degree=degree,
-        secret_gaussians=0,
-        capacity=0,
-        steps=config.iterations,
-        fit_seconds=(config.iterations * step,),
-        file_bytes=_ply_bytes(gaussians, degree),
-        disk_bytes=needs.disk_bytes,
-        memory_bytes=needs.memory_bytes,
-    )
-
-
-def needs_of_hiding(options: MethodOptions, sources: Sequence[Source]) -> Needs:
-    """Needs of a hiding; `options` are prepared."""
-    sizes, fit = _sizes(options, sources), options.fit
-    degree = max(fit.sh_degree if source.given is None else source.given.sh_degree for source in sources)
-    fitted = [options.trains or source.given is None for source in sources]
-    trained = sum(size for size, each in zip(sizes, fitted, strict=True) if each)
-    appended = _MAX_APPENDED * sum(sizes[1:]) if options.place.grows else 0
-    published = max(sizes[0], fit.max_gaussians if options.trains else 0) + appended
-    photos = [source.scene for source in sources if trained]
-    return _needs(published, published + sum(sizes), trained, degree, photos)
-
-
-def needs_of_fit(scene: Scene, config: FitConfig) -> Needs:
-    """Needs of a plain fit."""
-    cap = config.max_gaussians
-    return _needs(cap, cap, cap, config.sh_degree, [scene])
-
-
-def _needs(largest: int, written: int, trained: int, degree: int, photos: Sequence[Scene]) -> Needs:
-    """Needs from numbers of Gaussians. Training has gradients, moments and two checkpoints."""
+            renders += longer.steps or 0
+        camera = source.scene.test[0].camera
+        step = _STEP_SECONDS[device.type] * (size + camera.width * camera.height / 2)
+        seconds += renders * step
+        fit_seconds.append(own * step)
+        steps += own
+        trained += size if own or training.steps else 0
+        sizes.append(size)
+    published = sizes[0] + (_MAX_APPENDED * sum(sizes[1:]) if options.place.grows else 0)
+    degree = max(options.fit.sh_degree if each.given is None else each.given.sh_degree for each in sources)
+    gaussian = 4 * (14 + 3 * (degree + 1) ** 2)  # bytes in a .ply, with normals
     resident: int = psutil.Process().memory_info().rss
-    copies = 4 + 2 * _STATE_COPIES if trained else 3
-    targets = max((Targets.max_bytes(scene.train) for scene in photos), default=0)
-    return Needs(
-        _ply_bytes(written + 2 * _STATE_COPIES * trained, degree) + _OTHER_BYTES,
-        resident + copies * _ply_bytes(largest, degree) + targets,
-    )
+    largest = max(published, *sizes) * gaussian
+    memory = resident + 3 * largest
+    if trained:  # gradients, moments and two checkpoints
+        memory += (1 + _CHECKPOINTS) * largest
+        memory += max(Targets.max_bytes(source.scene.train) for source in sources)
+    disk = (published + sum(sizes) + _CHECKPOINTS * trained) * gaussian + _OTHER_BYTES
+    return Cost(steps, seconds, tuple(fit_seconds), disk, memory)
 
 
-def in_a_line(plan: Plan) -> str:
-    """Size of the published file, time, memory and disk of a run."""
-    return (
-        f"a file of up to {plan.file_bytes / 1e6:,.1f} MB, about {about(plan.seconds)}, "
-        f"{plan.memory_bytes / 1e9:.1f} GB of memory, up to {plan.disk_bytes / 1e6:,.0f} MB of disk"
-    )
-
-
-def check_room(needs: Needs, out: Path | None) -> None:
+def check_room(cost: Cost, out: Path | None) -> None:
     """Raise OutputError if the disk of `out` lacks space for all files; warn if memory is short."""
-    if out is not None and (free := _free_bytes(out)) < needs.disk_bytes:
-        raise OutputError(
-            f"{out}: expected {needs.disk_bytes / 1e6:,.0f} MB of free space for models and checkpoints, "
-            f"found {free / 1e6:,.0f} MB; make room, choose another place, or a smaller `max_gaussians`"
-        )
-    if needs.memory_bytes > (available := _available_memory()):
+    if out is not None:
+        real = Path(os.path.realpath(out))  # need not exist
+        free = shutil.disk_usage(next(each for each in (real, *real.parents) if each.exists())).free
+        if free < cost.disk_bytes:
+            raise OutputError(
+                f"{out}: expected {cost.disk_bytes / 1e6:,.0f} MB of free space for models and checkpoints, "
+                f"found {free / 1e6:,.0f} MB; make room, choose another place, or a smaller `max_gaussians`"
+            )
+    if cost.memory_bytes > (available := _available_memory()):
         warnings.warn(
-            f"this takes about {needs.memory_bytes / 1e9:.1f} GB of memory, and {available / 1e9:.1f} GB are "
+            f"this takes about {cost.memory_bytes / 1e9:.1f} GB of memory, and {available / 1e9:.1f} GB are "
             "free: a smaller `width` or `max_gaussians` takes less",
             KeyssWarning,
             stacklevel=2,
@@ -154,30 +118,3 @@ def _available_memory() -> int:
         cached = dict(line.split() for line in (group / "memory.stat").read_text().splitlines())
         available = min(available, limit - used + int(cached["inactive_file"]))
     return available
-
-
-def _sizes(options: MethodOptions, sources: Sequence[Source]) -> list[int]:
-    """Upper limits of the Gaussians of the plain models."""
-    return [
-        config.max_gaussians if source.given is None else len(source.given)
-        for source, config in zip(sources, options.fits(len(sources)), strict=True)
-    ]
-
-
-def _free_bytes(out: Path) -> int:
-    """Free bytes on the disk of `out`, which need not exist."""
-    folder = Path(os.path.realpath(out))
-    while not folder.exists():
-        folder = folder.parent
-    return shutil.disk_usage(folder).free
-
-
-def _view_seconds(device: torch.device, gaussians: int, scene: Scene) -> float:
-    """Seconds of a training step with one view."""
-    camera = scene.test[0].camera
-    return _STEP_SECONDS[device.type] * (gaussians + camera.width * camera.height / 2)
-
-
-def _ply_bytes(gaussians: int, sh_degree: int) -> int:
-    """Size of a model as .ply, with normals; other formats take less."""
-    return 4 * gaussians * (14 + 3 * (sh_degree + 1) ** 2) + 2048

@@ -209,17 +209,15 @@ def check_model(model: Gaussians) -> ModelCheck:
 def check_secret(revealed: Revealed, warned: Sequence[str] = ()) -> SecretCheck:
     """Count what is missing of a revealed secret; `warned`: what opening it warned of."""
     remains = revealed.remains
-    left, chunks = remains.chunks or (None, None)
-    lost = None if left is None or chunks is None else chunks - left
     problems = [*warned, *revealed.warnings]
     if revealed.file is None and not remains.whole and not problems:
-        problems.append(f"{remains.found:,} of {remains.hidden:,} Gaussians of the secret were found")
+        problems.append(_count(remains))
     return SecretCheck(
         found=remains.found,
         hidden=remains.hidden,
         unit="Gaussians" if revealed.file is None else "bytes",
         share=round(remains.share, 4),
-        chunks=chunks,
-        chunks_lost=lost,
+        chunks=remains.chunks and remains.chunks[1],
+        chunks_lost=remains.chunks and remains.chunks[1] - remains.chunks[0],
         problems=tuple(problems),
     )

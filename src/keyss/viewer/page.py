@@ -11,18 +11,14 @@ import html
 import re
 import warnings
 from base64 import b64encode
-from collections.abc import Callable
-from dataclasses import dataclass
 from importlib.resources import files
-from io import BytesIO
 from pathlib import Path
-from typing import BinaryIO
 from urllib.parse import quote
 
-from keyss.core.errors import InputError, KeyssWarning, OutputError, UsageError
+from keyss.core.errors import KeyssWarning, OutputError, UsageError
 from keyss.files.atomic import check_not_an_input, check_output_file, mode_like, write_bytes
 from keyss.files.file_kinds import model_file
-from keyss.files.inputs import as_text
+from keyss.files.inputs import as_text, read_file
 from keyss.viewer.look import Look
 
 SCRIPT, STYLE, LICENCES, INDEX = "viewer.js", "viewer.css", "licences.txt", "index.html"
@@ -32,22 +28,21 @@ MAX_BYTES = 2 << 30
 # Argon2id is WebAssembly. Workers and saved pictures are blobs that the page makes itself.
 _WASM, _SELF = "'wasm-unsafe-eval'", "'self'"
 _NOTHING = "object-src 'none'; base-uri 'none'; form-action 'none'"
+# Of a page with separate script and style.
+SERVED_POLICY = (
+    f"default-src {_SELF}; script-src {_SELF} {_WASM}; worker-src {_SELF} blob:; "
+    f"img-src {_SELF} blob: data:; {_NOTHING}"
+)
 # The page detects formats by their first bytes, and .splat, which has no signature, by its suffix.
 _MAGIC = (b"ply", b"NGSP", b"\x1f\x8b", b"PK\x03\x04")
 _MAX_HEADER = 64 << 10  # bytes of a .ply
 _ORIGIN = re.compile(r"https?://[A-Za-z0-9.-]+(:[0-9]+)?")
 
 
-def served_policy() -> str:
-    """The content security policy of a page with separate script and style."""
-    scripts = f"script-src {_SELF} {_WASM}; worker-src {_SELF} blob:"
-    return f"default-src {_SELF}; {scripts}; img-src {_SELF} blob: data:; {_NOTHING}"
-
-
 def served_page(url: str, look: Look) -> bytes:
     """The page with separate style and script; `url`: of the model."""
     return _page(
-        policy=served_policy(),
+        policy=SERVED_POLICY,
         style=f'<link rel="stylesheet" href="{STYLE}">',
         model=f'<meta name="keyss-model" content="{html.escape(url)}">',
         script=f'<script src="{SCRIPT}"></script>',
@@ -82,15 +77,10 @@ def export_html(
     Raises UsageError if the model is too large, InputError if it is not a model, OutputError.
     """
     model, out = model_file(model), Path(out)
-    file, look = readable(model), look or {}
+    (name, data), look = readable(model), look or {}
     for origin in (look[name] for name in ("host", "embedder") if name in look):
         if not _ORIGIN.fullmatch(origin):
             raise UsageError(f"expected an origin such as https://www.example.com, got {origin}")
-    try:
-        with file.open() as opened:
-            data = opened.read()
-    except OSError as error:
-        raise InputError(f"{model}: cannot be read: {error.strerror}") from error
     mode = mode_like(model)
     if out.suffix.lower() in (".html", ".htm"):
         if len(data) > MAX_IN_ONE_FILE:
@@ -99,22 +89,22 @@ def export_html(
                 "name an output folder instead, and put it on a web server"
             )
         check_not_an_input(out, [model])
-        write_bytes(check_output_file(out, overwrite), page_with(data, file.name, look), mode)
+        write_bytes(check_output_file(out, overwrite), page_with(data, name, look), mode)
         return (out,)
-    contents = {INDEX: served_page(quote(file.name), look), file.name: data}
-    contents |= {name: asset(name) for name in (SCRIPT, STYLE, LICENCES, EMBED)}
+    contents = {INDEX: served_page(quote(name), look), name: data}
+    contents |= {each: asset(each) for each in (SCRIPT, STYLE, LICENCES, EMBED)}
     if len(contents) < 6:
         raise UsageError(f"{model} has the name of a file of the viewer: rename it")
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OutputError(f"cannot write {out}: {error.strerror}") from error
-    for name in contents:
-        check_not_an_input(out / name, [model])
-        check_output_file(out / name, overwrite)
-    for name, content in contents.items():
-        write_bytes(out / name, content, mode)
-    return tuple(out / name for name in contents)
+    for each in contents:
+        check_not_an_input(out / each, [model])
+        check_output_file(out / each, overwrite)
+    for each, content in contents.items():
+        write_bytes(out / each, content, mode)
+    return tuple(out / each for each in contents)
 
 
 def asset(name: str) -> bytes:
@@ -141,43 +131,25 @@ def _hash(text: str) -> str:
     return f"'sha256-{b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
 
 
-@dataclass(frozen=True)
-class Readable:
-    """A model file for the page."""
+def readable(model: Path) -> tuple[str, bytes]:
+    """Name and content of the model's file if the page reads its format, else a lossless conversion.
 
-    name: str
-    open: Callable[[], BinaryIO]  # raises OSError
-    size: int  # bytes
-
-
-def readable(model: Path) -> Readable:
-    """The model's file if the page reads its format, else a lossless conversion, with a KeyssWarning.
-
-    Warns and raises as `read_model`, and UsageError for a file that is too large.
+    Warns of a conversion. Warns and raises as `read_model`, and UsageError for a file that is too large.
     """
+    from keyss.files.models import model_bytes
     from keyss.runs.files import as_model  # imports torch
 
     model = model_file(model)
-    try:
-        with model.open("rb") as file:
-            header = file.read(_MAX_HEADER)
-            size = file.seek(0, 2)
-    except OSError:
-        header, size = b"", 0  # read_model raises the InputError
-    if size > MAX_BYTES:
+    if model.is_file() and (size := model.stat().st_size) > MAX_BYTES:
         raise UsageError(f"{model} has {size:,} bytes, more than the {MAX_BYTES:,} that a page loads")
-    gaussians = as_model(model)
-    is_text = header.startswith(b"ply") and b"\nformat ascii" in header.partition(b"end_header")[0]
-    if not is_text and (header.startswith(_MAGIC) or model.name.lower().endswith(".splat")):
-        return Readable(as_text(model.name), lambda: model.open("rb"), size)
-
-    from keyss.files.models import model_bytes
-
+    gaussians, data = as_model(model), read_file(model)
+    is_text = b"\nformat ascii" in data[:_MAX_HEADER].partition(b"end_header")[0]
+    if not is_text and (data.startswith(_MAGIC) or model.name.lower().endswith(".splat")):
+        return as_text(model.name), data
     name, kind = as_text(f"{model.stem}.ply"), "a .ply in text" if is_text else f"a {model.suffix}"
-    data = model_bytes(name, gaussians)
     warnings.warn(
         f"{model}: the page does not read {kind}; it shows a lossless copy, {name}",
         KeyssWarning,
         stacklevel=3,
     )
-    return Readable(name, lambda: BytesIO(data), len(data))
+    return name, model_bytes(name, gaussians)

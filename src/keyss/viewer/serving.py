@@ -8,23 +8,19 @@ from __future__ import annotations
 import ipaddress
 import re
 import secrets
-import shutil
 import socket
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from io import BytesIO
 from pathlib import Path
-from typing import BinaryIO
 from urllib.parse import quote, unquote, urlsplit
 
 from keyss.core.errors import OutputError
 from keyss.viewer.look import Look
-from keyss.viewer.page import SCRIPT, STYLE, asset, readable, served_page, served_policy
+from keyss.viewer.page import SCRIPT, SERVED_POLICY, STYLE, asset, readable, served_page
 
 LOCALHOST = "127.0.0.1"
-# By path: the media type, and a function that opens the content or raises OSError.
-Contents = Mapping[str, tuple[str, Callable[[], BinaryIO]]]
+Contents = Mapping[str, tuple[str, bytes]]  # media type and content, by path
 
 
 class _ServerIPv6(ThreadingHTTPServer):
@@ -41,15 +37,15 @@ class ModelServer:
 
         Raises InputError if `model` is not a model, OutputError if the port is in use.
         """
-        file = readable(Path(model))
-        page = served_page(f"model/{quote(file.name)}", look or {})
+        name, data = readable(Path(model))
+        page = served_page(f"model/{quote(name)}", look or {})
         self._folder = f"/{secrets.token_urlsafe(16)}/"
         contents: Contents = {
-            self._folder: ("text/html; charset=utf-8", lambda: BytesIO(page)),
-            self._folder + SCRIPT: ("text/javascript; charset=utf-8", lambda: BytesIO(asset(SCRIPT))),
-            self._folder + STYLE: ("text/css; charset=utf-8", lambda: BytesIO(asset(STYLE))),
-            f"{self._folder}model/{file.name}": ("application/octet-stream", file.open),
-            "/favicon.ico": ("image/x-icon", lambda: BytesIO()),
+            self._folder: ("text/html; charset=utf-8", page),
+            self._folder + SCRIPT: ("text/javascript; charset=utf-8", asset(SCRIPT)),
+            self._folder + STYLE: ("text/css; charset=utf-8", asset(STYLE)),
+            f"{self._folder}model/{name}": ("application/octet-stream", data),
+            "/favicon.ico": ("image/x-icon", b""),
         }
         try:
             kind = _ServerIPv6 if ":" in host else ThreadingHTTPServer
@@ -58,7 +54,10 @@ class ModelServer:
             raise OutputError(f"cannot serve on {host}, port {port}: {error}") from error
         self._server.daemon_threads = True
         self._ip = ipaddress.ip_address(str(self._server.server_address[0]))
-        self._server.RequestHandlerClass = _handler(contents, self._names(host))
+        # Accepted `Host` headers; None accepts all, if the server listens on all addresses.
+        local = {"localhost"} if self.is_local else set()
+        names = None if self._ip.is_unspecified else {host.lower(), _in_url(self._ip)} | local
+        self._server.RequestHandlerClass = _handler(contents, names)
 
     @property
     def address(self) -> str:
@@ -69,12 +68,6 @@ class ModelServer:
     def is_local(self) -> bool:
         """True if only this machine can connect."""
         return self._ip.is_loopback
-
-    def _names(self, host: str) -> set[str] | None:
-        """Accepted `Host` headers; None accepts all, if the server listens on all addresses."""
-        if self._ip.is_unspecified:
-            return None
-        return {host.lower(), _in_url(self._ip), *(["localhost"] if self.is_local else [])}
 
     def run(self) -> None:
         """Serve until another thread calls `close`, or a signal ends it."""
@@ -104,36 +97,29 @@ def _handler(contents: Contents, names: set[str] | None) -> type[BaseHTTPRequest
             if names is not None and (len(hosts) != 1 or hosts[0] not in names):
                 self.send_error(HTTPStatus.FORBIDDEN)
                 return
-            content = contents.get(unquote(urlsplit(self.path).path))
+            media_type, content = contents.get(unquote(urlsplit(self.path).path), ("", None))
             if content is None:
                 self.send_error(HTTPStatus.NOT_FOUND)
                 return
-            media_type, opened = content
+            headers = {
+                "Content-Type": media_type,
+                "Content-Length": str(len(content)),
+                "Content-Security-Policy": f"{SERVED_POLICY}; frame-ancestors 'none'",
+                "X-Content-Type-Options": "nosniff",
+                "Referrer-Policy": "no-referrer",
+                "Cross-Origin-Resource-Policy": "same-origin",
+                "Cache-Control": "no-store",
+            }
             try:
-                with opened() as file:
-                    size = file.seek(0, 2)
-                    file.seek(0)
-                    self.send_response(HTTPStatus.OK)
-                    for name, value in _headers(media_type, size).items():
-                        self.send_header(name, value)
-                    self.end_headers()
-                    shutil.copyfileobj(file, self.wfile)
-            except OSError:  # the client disconnected, or the model was removed
+                self.send_response(HTTPStatus.OK)
+                for name, value in headers.items():
+                    self.send_header(name, value)
+                self.end_headers()
+                self.wfile.write(content)
+            except OSError:  # the client disconnected
                 self.close_connection = True
 
         def log_message(self, format: str, *args: object) -> None:
             """Log nothing."""
 
     return Handler
-
-
-def _headers(media_type: str, size: int) -> dict[str, str]:
-    return {
-        "Content-Type": media_type,
-        "Content-Length": str(size),
-        "Content-Security-Policy": f"{served_policy()}; frame-ancestors 'none'",
-        "X-Content-Type-Options": "nosniff",
-        "Referrer-Policy": "no-referrer",
-        "Cross-Origin-Resource-Policy": "same-origin",
-        "Cache-Control": "no-store",
-    }

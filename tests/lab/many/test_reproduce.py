@@ -75,12 +75,12 @@ def test_resume(out: Path, folders: tuple[Path, Path], monkeypatch: pytest.Monke
     assert listing(out / "trials") == before
     found = reproduce("pruning", folders, pairs=["a,b"], seeds=[5], out=out, **SIZES, dry_run=True)  # type: ignore[arg-type]
     assert isinstance(found, Forecast)
-    assert not found.plans
+    assert not found.costs
     monkeypatch.undo()
     with pytest.warns(UserWarning, match="secrets lie in appended Gaussians"):
         other = reproduce("pruning", folders, pairs=["a,b"], seeds=[6], out=out, **SIZES, dry_run=True)  # type: ignore[arg-type]
     assert isinstance(other, Forecast)
-    assert len(other.plans) == len(other.names)
+    assert len(other.costs) == len(other.names)
 
 
 def test_failed_trials(

@@ -172,8 +172,8 @@ def test_dry_run(keyss: Run, tmp_path: Path) -> None:
     before = sorted(tmp_path.rglob("*"))
     found = sweep(spec, out, dry_run=True)
     assert isinstance(found, Forecast)
-    assert len(found.names) == len(found.plans) == 2
-    assert all(each.seconds > 0 and each.memory_bytes > 10**8 for each in found.plans.values())
+    assert len(found.names) == len(found.costs) == 2
+    assert all(each.seconds > 0 and each.memory_bytes > 10**8 for each in found.costs.values())
     said = keyss("sweep", spec, "-o", out, "--dry-run")
     assert said.status == 0, said
     assert "2 runs, 2 to do: about " in said.out

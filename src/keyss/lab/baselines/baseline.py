@@ -146,7 +146,7 @@ class Baseline:
 
     def plan(self, sources: Sequence[Source], options: BaselineOptions) -> Plan:
         """Both scenes share the Gaussians of one model."""
-        return options.joint_plan(1, options.step_cost)
+        return options.joint_plan(1)
 
     def hide(
         self, cover: Source, secrets: Sequence[Source], options: BaselineOptions, context: Context

@@ -18,7 +18,7 @@ class BaselineOptions(JointOptions):
     """
 
     points: ClassVar[Scenes] = "both"  # scenes whose sparse points start the model
-    step_cost: ClassVar[float] = 1.0  # see `Plan`; measured at 2,000 Gaussians and 100 x 75 pixels
+    step_cost: ClassVar[float] = 1.0  # measured at 2,000 Gaussians and 100 x 75 pixels
 
     common_poses: Annotated[
         float,

@@ -132,7 +132,7 @@ def compare(
 
     `out` (a folder) gets the trials, and `comparison.json`, `.csv` and `.tex` (PSNR, SSIM and LPIPS per
     scene, with standard deviations over seeds) and `.png` (a row per method: cover, secret, and the
-    secret's error). Finished trials are skipped. `dry_run`: only return their plans. A failed method has a
+    secret's error). Finished trials are skipped. `dry_run`: only return their costs. A failed method has a
     row with the error. Raises UsageError before training if one of `methods` is not possible with these
     settings, other KeyssErrors, and KeyboardInterrupt.
     """

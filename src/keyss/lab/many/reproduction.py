@@ -147,7 +147,7 @@ def reproduce(
 
     `out` (a folder) gets `TABLE.json`, `.csv` and `.tex` (PSNR, SSIM and LPIPS per scene, with
     standard deviations over `seeds`), and the trials, which tables in one folder share. Finished trials are
-    skipped. `dry_run`: only return their plans. The result lists failed trials. Raises KeyssError for
+    skipped. `dry_run`: only return their costs. The result lists failed trials. Raises KeyssError for
     impossible scenes and arguments; KeyboardInterrupt.
     """
     if table not in PAPER.tables:

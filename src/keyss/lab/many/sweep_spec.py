@@ -141,7 +141,7 @@ def sweep(
     """Run all unfinished trials of a specification, write tables of all results, and return the outcomes.
 
     Trials run one after the other in this process, or in parallel on a Ray cluster. `ray`: its address, or
-    "local" for one on this machine; `cores`: cores per trial there. `dry_run`: only return the plans of the
+    "local" for one on this machine; `cores`: cores per trial there. `dry_run`: only return the costs of the
     trials. Keys are derived from the trials' names and a master key in the private part of `out`, which is
     made if there is none. Raises KeyssError and KeyboardInterrupt; the outcomes of failed trials have the
     errors.

@@ -29,14 +29,13 @@ from keyss.lab.audits import PARTS, audit
 from keyss.lab.audits.parts import Subject
 from keyss.lab.audits.trial_measures import MEASURES
 from keyss.methods import MethodOptions, registry
-from keyss.methods.base import Plan
 from keyss.progress import Reporter
 from keyss.rendering import Backend, resolve_device
 from keyss.runs import FitMetrics, HideMetrics, Manifest, read_manifest, read_record, record_bytes
 from keyss.runs.files import METRICS, as_scene
 from keyss.runs.folder import PRIVATE, make_private
 from keyss.runs.open_run import HidingRun, open_run
-from keyss.runs.planning import plan_fit
+from keyss.runs.planning import Cost, cost_of_fit
 
 TRIAL, RESULT, RUN = "trial.json", "result.json", "run"
 MASTER_KEY = f"{PRIVATE}/master-key.txt"  # relative to the folder of all trials
@@ -121,17 +120,17 @@ def run_trial(trial: Trial, folder: Path, reporter: Reporter) -> Result:
     return result
 
 
-def plan_of(trial: Trial, folder: Path) -> Plan:
-    """The plan of a trial, without the plain fits of other trials. Raises KeyssError."""
+def cost_of_trial(trial: Trial, folder: Path) -> Cost:
+    """The cost of a trial, without the plain fits of other trials. Raises KeyssError."""
     if isinstance(trial.options, FitConfig):
         scene = as_scene(trial.cover, trial.views, train_pictures=False)
-        return plan_fit(scene, trial.options, resolve_device(trial.device))
+        return cost_of_fit(scene, trial.options, resolve_device(trial.device))
     keys = [f"key {index}" for index, _ in enumerate(trial.secrets)]
     keys = keys if registry.get(trial.method).capabilities.keys else []
-    found = hide(**_hide_arguments(trial, folder, keys), dry_run=True).plan
-    assert found is not None  # a dry run always has a plan
-    fits = zip_longest(found.fit_seconds, trial.models)
-    return replace(found, fit_seconds=tuple(0.0 if model else each for each, model in fits))
+    cost = hide(**_hide_arguments(trial, folder, keys), dry_run=True).cost
+    assert cost is not None  # a dry run always has a cost
+    elsewhere = [seconds for seconds, model in zip_longest(cost.fit_seconds, trial.models) if model]
+    return replace(cost, seconds=cost.seconds - sum(elsewhere))
 
 
 def keys_of(trial: Trial, folder: Path) -> list[str]:

@@ -20,12 +20,12 @@ from keyss.fitting import FitConfig
 from keyss.keys import generate_key
 from keyss.keys.key_file import KEY_LENGTH
 from keyss.lab.audits.trial_measures import check_extras
-from keyss.lab.many.trial import MASTER_KEY, RUN, Result, Trial, finished_result, plan_of, run_trial
+from keyss.lab.many.trial import MASTER_KEY, RUN, Result, Trial, cost_of_trial, finished_result, run_trial
 from keyss.methods import MethodOptions
-from keyss.methods.base import Plan
 from keyss.progress import Reporter, reporter as default_reporter
 from keyss.runs.files import MODEL
 from keyss.runs.folder import PRIVATE, check_not_published, make_private
+from keyss.runs.planning import Cost
 
 TRIALS = "trials"
 _LOCAL = "local"  # a cluster of this machine
@@ -47,7 +47,7 @@ class Forecast:
     """The trials of a folder before they run, by their folders, in order."""
 
     names: Mapping[Path, str]
-    plans: Mapping[Path, Plan]  # trials to run
+    costs: Mapping[Path, Cost]  # trials to run
     refused: Mapping[Path, str]  # reasons why trials cannot run
 
 
@@ -127,15 +127,15 @@ class TrialFolder:
         return {folder: found[folder] for folder in self.trials}
 
     def forecast(self) -> Forecast:
-        """The plan of each trial. Writes nothing."""
-        plans, refused = {}, {}
+        """The cost of each trial. Writes nothing."""
+        costs, refused = {}, {}
         for place, trial in self.trials.items():
             try:
                 if finished_result(trial, place) is None:
-                    plans[place] = plan_of(trial, place)
+                    costs[place] = cost_of_trial(trial, place)
             except KeyssError as error:
                 refused[place] = str(error)
-        return Forecast({place: trial.name for place, trial in self.trials.items()}, plans, refused)
+        return Forecast({place: trial.name for place, trial in self.trials.items()}, costs, refused)
 
 
 @contextmanager

@@ -102,14 +102,11 @@ class CarryMethod:
             notes.append(
                 f"the {capacity.channel.place} have room for {how} {capacity.payloads.bytes:,} bytes"
             )
-        rendered = (count if steps else 0 for steps, count in zip(options.refits, sizes, strict=True))
         return Plan(
             gaussians=capacity.gaussians + appended,
             sh_degree=capacity.sh_degree,
             secret_gaussians=sum(secret.count for secret in secret_sizes),
             capacity=sum(sizes),
-            steps=max(options.refits),
-            rendered=(0, *rendered),
             notes=tuple(notes),
         )
 

@@ -63,9 +63,8 @@ class KeyssMethod:
         return options
 
     def plan(self, sources: Sequence[Source], options: KeyssOptions) -> Plan:
-        """All scenes share the Gaussians of one model; times were measured at 2,000 to 30,000 Gaussians."""
-        step_cost = 1.0 if options.configuration.decoder.kind == "latent" else 8.0
-        return options.joint_plan(len(sources) - 1, step_cost)
+        """All scenes share the Gaussians of one model."""
+        return options.joint_plan(len(sources) - 1)
 
     def hide(
         self, cover: Source, secrets: Sequence[Source], options: KeyssOptions, context: Context
