@@ -11,7 +11,6 @@ import warnings
 from pathlib import Path
 
 from keyss.core.errors import InputError, KeyssWarning, OutputError, UsageError
-from keyss.files.atomic import check_output_file, write_bytes
 
 MAX_KEY_BYTES = 4096
 _TOO_LONG = f"the key is longer than {MAX_KEY_BYTES} bytes"
@@ -66,9 +65,22 @@ def write_new_key(path: Path, key: str) -> None:
 
     Raises OutputError if the path exists.
     """
-    if os.path.lexists(path):
-        raise OutputError(f"{path} exists, and a key is never replaced: choose another name")
-    write_bytes(check_output_file(path, overwrite=False), f"{key}\n".encode())
+    try:
+        descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+    except FileExistsError as error:
+        raise OutputError(f"{path} exists, and a key is never replaced: choose another name") from error
+    except OSError as error:
+        raise OutputError(f"cannot write {path}: {error.strerror}") from error
+    try:
+        with os.fdopen(descriptor, "w", encoding="utf-8") as file:
+            file.write(f"{key}\n")
+            file.flush()
+            os.fsync(descriptor)
+    except BaseException as error:
+        path.unlink(missing_ok=True)
+        if isinstance(error, OSError):
+            raise OutputError(f"cannot write {path}: {error.strerror}") from error
+        raise
 
 
 def generate_key(length: int = 16) -> str:

@@ -15,9 +15,7 @@ from keyss.methods import companion as companions, registry
 from keyss.methods.hidden import Frame, HiddenFile, HiddenScene, OpensAFileError, Remains
 from keyss.runs.files import PathLike
 
-MIN_LEFT = (
-    0.1  # share; pruning compensation stops there (`keyss.methods.keyss.secret`), and renders become empty
-)
+MIN_LEFT = 0.1  # share; pruning compensation stops there, and renders become empty
 NOTICED_LOSS = 0.01  # share; pruning compensation begins there
 # No known trained or public model has a Gaussian beyond 10 radii or larger than one radius; one has 3.5 %
 # duplicates.
