@@ -56,5 +56,5 @@ def test_key_file(keyss: Run, tmp_path: Path, umask: None) -> None:
     assert read_key(path) == key
     path.with_name("link").symlink_to(tmp_path / "elsewhere")
     assert_refused(keyss("keygen", "-o", tmp_path / "link"), 5, "never replaced")
-    assert_refused(keyss("keygen", "-o", tmp_path / "none" / "key"), 5, "there is no folder")
+    assert_refused(keyss("keygen", "-o", tmp_path / "none" / "key"), 5, "No such file")
     assert {each.name for each in tmp_path.iterdir()} == {"key.txt", "link"}
