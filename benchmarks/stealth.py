@@ -38,7 +38,7 @@ from channels.quiet.trained_like import keys, rounded
 from keyss.core import Gaussians, UsageError
 from keyss.lab import stealth_statistics
 from keyss.methods.carry.capacity import CarryCapacity
-from keyss.methods.carry.options import CarryOptions
+from keyss.methods.carry.carry_options import CarryOptions
 from keyss.rendering import Viewpoints
 from lab.stealth.candidates import candidate_scores
 from methods.carry import carried

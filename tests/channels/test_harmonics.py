@@ -11,7 +11,7 @@ from channels.quiet.trained_like import trained_like
 from keyss.channels import Payload, QuietReader
 from keyss.channels.harmonics import RANKS, Harmonics, high_harmonics, pads, row_ids, with_high_harmonics
 from keyss.channels.quiet.bits import read_low_bits
-from keyss.channels.quiet.channel import LOW_BITS
+from keyss.channels.quiet.quiet_channel import LOW_BITS
 from keyss.core import Gaussians, InputError
 
 COUNT = 24

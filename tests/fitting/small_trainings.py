@@ -11,7 +11,7 @@ from keyss.core import Similarity
 from keyss.fitting import FitConfig, PlainRun
 from keyss.keys import random_embeddings
 from keyss.methods import DESIGNS, PlacedScene, registry
-from keyss.methods.keyss.method import training_of
+from keyss.methods.keyss.keyss_method import training_of
 from methods.keyss.small import small
 from tiny_scenes import random_gaussians, tiny_scene
 

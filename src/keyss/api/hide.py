@@ -27,9 +27,9 @@ from keyss.fitting.image_metrics import quality
 from keyss.keys import DerivedKey
 from keyss.keys.derivation import SALT_BYTES
 from keyss.measure.hide_quality import Shown, compare, measure_hiding
-from keyss.methods.base import Context, Method, MethodOptions, Source, Stego
 from keyss.methods.companion import pack
 from keyss.methods.hidden import HiddenScene
+from keyss.methods.method import Context, Method, MethodOptions, Source, Stego
 from keyss.methods.plain_models import Bound, fit_bounds, fit_plain_models
 from keyss.methods.registry import DEFAULT, open_companion, open_model
 from keyss.progress import Reporter

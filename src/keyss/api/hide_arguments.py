@@ -12,7 +12,7 @@ from keyss.core.gaussians import DRAWN_OPACITY, Gaussians
 from keyss.core.scene import Scene, ViewOptions
 from keyss.keys import normalized_key
 from keyss.methods import registry
-from keyss.methods.base import Method, MethodOptions, Plan, Source
+from keyss.methods.method import Method, MethodOptions, Plan, Source
 from keyss.rendering.orbit import is_model
 from keyss.runs.files import PathLike, as_3dgs_model, as_scene, path_of
 from keyss.runs.planning import Cost

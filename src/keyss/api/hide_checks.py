@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from keyss.core.errors import KeyssWarning, QualityError
 from keyss.measure.hide_quality import Shown
-from keyss.methods.base import MethodOptions
+from keyss.methods.method import MethodOptions
 
 MIN_PSNR = 20.0  # dB to the plain model; below it, renders show something else
 MIN_PRUNED_PSNR = 25.0  # dB, for secrets that lost Gaussians without a refit

@@ -1,4 +1,4 @@
-from .appended.channel import APPENDED as APPENDED, AppendedReader as AppendedReader
+from .appended.appended_channel import APPENDED as APPENDED, AppendedReader as AppendedReader
 from .appended.words import is_appended as is_appended
 from .base import (
     METHOD_BYTES as METHOD_BYTES,
@@ -11,7 +11,11 @@ from .base import (
     unpack_method as unpack_method,
     unpack_payload as unpack_payload,
 )
-from .colours.channel import COLOURS as COLOURS, ColoursCover as ColoursCover, ColoursReader as ColoursReader
+from .colours.colours_channel import (
+    COLOURS as COLOURS,
+    ColoursCover as ColoursCover,
+    ColoursReader as ColoursReader,
+)
 from .colours.fountain import Fountain as Fountain
 from .names import AnyChannel as AnyChannel, Format as Format, Publish as Publish
 from .publishing import (
@@ -28,12 +32,6 @@ from .quiet.bits import (
     write_low_bits as write_low_bits,
 )
 from .quiet.cells import CellCipher as CellCipher
-from .quiet.channel import (
-    LOW_BITS as LOW_BITS,
-    CodesCover as CodesCover,
-    InCodes as InCodes,
-    LowBitsCover as LowBitsCover,
-)
 from .quiet.fields import Field as Field, in_counted_order as in_counted_order, last_bits as last_bits
 from .quiet.layout import (
     TYPICAL_SHARE as TYPICAL_SHARE,
@@ -42,6 +40,12 @@ from .quiet.layout import (
     key_cipher as key_cipher,
 )
 from .quiet.payloads import QuietReader as QuietReader
+from .quiet.quiet_channel import (
+    LOW_BITS as LOW_BITS,
+    CodesCover as CodesCover,
+    InCodes as InCodes,
+    LowBitsCover as LowBitsCover,
+)
 from .quiet.usable import (
     chance_of_bits as chance_of_bits,
     salt_rows as salt_rows,

@@ -32,15 +32,15 @@ def channel_for(
         if value is not None and value not in get_args(known):
             raise UsageError(f"`{name}`: expected {' or '.join(get_args(known))}, got {value!r}")
     if publish == "any" and channel == "appended":
-        from keyss.channels.appended.channel import APPENDED
+        from keyss.channels.appended.appended_channel import APPENDED
 
         return APPENDED
     if publish == "any":
-        from keyss.channels.colours.channel import COLOURS
+        from keyss.channels.colours.colours_channel import COLOURS
 
         return COLOURS
-    from keyss.channels.quiet.channel import LOW_BITS, InCodes
     from keyss.channels.quiet.decoded import Decoded
+    from keyss.channels.quiet.quiet_channel import LOW_BITS, InCodes
 
     if format is None and isinstance(cover, CodedGaussians):
         return InCodes(cover.codes.name)
@@ -71,9 +71,9 @@ def _readers(stego: Gaussians) -> Iterator[Reader | None]:
     from keyss.channels.quiet.payloads import QuietReader
 
     yield QuietReader.of(stego)
-    from keyss.channels.appended.channel import AppendedReader
+    from keyss.channels.appended.appended_channel import AppendedReader
 
     yield AppendedReader.of(stego)
-    from keyss.channels.colours.channel import ColoursReader
+    from keyss.channels.colours.colours_channel import ColoursReader
 
     yield ColoursReader.of(stego)

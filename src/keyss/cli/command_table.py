@@ -13,11 +13,11 @@ GROUPS = {
     "make": {
         "demo": "cli.make",
         "fit": "cli.make",
-        "hide": "cli.hide",
+        "hide": "cli.hide_command",
         "keygen": "cli.make",
         "convert": "cli.make",
     },
-    "open": {"reveal": "cli.reveal", "verify": "cli.reveal"},
+    "open": {"reveal": "cli.reveal_command", "verify": "cli.reveal_command"},
     "look": {"view": "cli.show", "render": "cli.show", "info": "cli.show"},
     "measure": {"evaluate": "cli.show", "audit": "lab.lab_commands"},
     "many": dict.fromkeys(("compare", "reproduce", "sweep"), "lab.lab_commands"),
@@ -52,7 +52,7 @@ def command(name: str) -> Callable[..., None]:
 def parse_target(name: str, arguments: Sequence[str]) -> Callable[..., None]:
     """The function to parse: for `hide`, with the options of the method named in `arguments`."""
     if name == "hide":
-        from keyss.cli.hide import with_options_of_method
+        from keyss.cli.hide_command import with_options_of_method
 
         return with_options_of_method(arguments)
     return command(name)

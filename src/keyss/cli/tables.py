@@ -12,14 +12,14 @@ from rich.console import Console as RichConsole
 from rich.table import Table
 from rich.text import Text
 
-from keyss.methods.base import role_of
+from keyss.methods.method import role_of
 from keyss.progress import about, clock
 from keyss.runs.json_records import record_bytes
 
 if TYPE_CHECKING:
     from keyss.api.convert import Conversion
     from keyss.fitting.image_metrics import ImageQuality
-    from keyss.methods.base import Plan
+    from keyss.methods.method import Plan
     from keyss.runs.describe import ModelInfo, RunInfo, SceneInfo
     from keyss.runs.planning import Cost
     from keyss.runs.revealing import Verification

@@ -1,15 +1,6 @@
-from .base import (
-    Capabilities as Capabilities,
-    CommandLineOption as CommandLineOption,
-    Context as Context,
-    MethodOptions as MethodOptions,
-    Source as Source,
-    Stego as Stego,
-    Training as Training,
-)
-from .carry.method import embed_models as embed_models, most_contributing as most_contributing
-from .carry.options import CarryOptions as CarryOptions
-from .carry.secret import CarriedSecret as CarriedSecret
+from .carry.carried_secret import CarriedSecret as CarriedSecret
+from .carry.carry_method import embed_models as embed_models, most_contributing as most_contributing
+from .carry.carry_options import CarryOptions as CarryOptions
 from .codec.precision import (
     choose_precision as choose_precision,
     encode_to_size as encode_to_size,
@@ -18,7 +9,7 @@ from .codec.precision import (
 )
 from .hidden import Frame as Frame, HiddenFile as HiddenFile, HiddenScene as HiddenScene, Remains as Remains
 from .keyss.decoder import DECODERS as DECODERS, Decoder as Decoder, LatentDecoder as LatentDecoder
-from .keyss.options import (
+from .keyss.keyss_options import (
     ATTRIBUTES as ATTRIBUTES,
     DESIGNS as DESIGNS,
     DecoderShape as DecoderShape,
@@ -26,11 +17,20 @@ from .keyss.options import (
     KeyssOptions as KeyssOptions,
     parse_mask as parse_mask,
 )
-from .keyss.secret import KeyssSecret as KeyssSecret, choose_anchors as choose_anchors
+from .keyss.keyss_secret import KeyssSecret as KeyssSecret, choose_anchors as choose_anchors
 from .keyss.training import (
     CombinedPoses as CombinedPoses,
     KeyssTraining as KeyssTraining,
     PlacedScene as PlacedScene,
+)
+from .method import (
+    Capabilities as Capabilities,
+    CommandLineOption as CommandLineOption,
+    Context as Context,
+    MethodOptions as MethodOptions,
+    Source as Source,
+    Stego as Stego,
+    Training as Training,
 )
 from .plain_models import fit_plain_models as fit_plain_models
 from .registry import open_model as open_model

@@ -9,7 +9,7 @@ from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
 from keyss.fitting.config import FitConfig
 from keyss.fitting.plain import fit_scene
-from keyss.methods.base import Context, Source, Training, role_of
+from keyss.methods.method import Context, Source, Training, role_of
 
 
 def fit_plain_models(

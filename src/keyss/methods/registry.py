@@ -12,8 +12,8 @@ from keyss.core.errors import InputError, UsageError
 if TYPE_CHECKING:
     from keyss.channels import Payload
     from keyss.core.gaussians import Gaussians
-    from keyss.methods.base import Method, MethodOptions
     from keyss.methods.hidden import HiddenScene
+    from keyss.methods.method import Method, MethodOptions
 
 
 class Modules(NamedTuple):
@@ -21,7 +21,7 @@ class Modules(NamedTuple):
 
     summary: str  # one line, printed after the name
     options: str  # a `MethodOptions`, in a module that does not import torch
-    hiding: str  # a `keyss.methods.base.Method`
+    hiding: str  # a `keyss.methods.method.Method`
     opening: str  # turns the payload of a channel or a companion file into a `HiddenScene`
 
 
@@ -34,15 +34,15 @@ DEFAULT = "carry"
 METHODS = {
     "carry": Modules(
         "the secrets' Gaussians, encrypted in the cover's",
-        "keyss.methods.carry.options:CarryOptions",
-        "keyss.methods.carry.method:METHOD",
-        "keyss.methods.carry.secret:CarriedSecret.of",
+        "keyss.methods.carry.carry_options:CarryOptions",
+        "keyss.methods.carry.carry_method:METHOD",
+        "keyss.methods.carry.carried_secret:CarriedSecret.of",
     ),
     "keyss": Modules(
         "train one model and a decoder for all keys jointly, as the paper does",
-        "keyss.methods.keyss.options:KeyssOptions",
-        "keyss.methods.keyss.method:METHOD",
-        "keyss.methods.keyss.secret:KeyssSecret.of",
+        "keyss.methods.keyss.keyss_options:KeyssOptions",
+        "keyss.methods.keyss.keyss_method:METHOD",
+        "keyss.methods.keyss.keyss_secret:KeyssSecret.of",
     ),
     "3dgs": _baseline("upper_bound", "BoundOptions", "upper bound: the secret is a separate file"),
     "3dgs-sh": _baseline(

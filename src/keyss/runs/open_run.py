@@ -11,8 +11,8 @@ from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
 from keyss.files.models import read_model
 from keyss.methods import registry
-from keyss.methods.base import MethodOptions
 from keyss.methods.hidden import HiddenScene
+from keyss.methods.method import MethodOptions
 from keyss.rendering.orbit import is_model
 from keyss.runs.files import (
     CONFIG,

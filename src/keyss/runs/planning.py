@@ -17,7 +17,7 @@ from keyss.core.errors import KeyssWarning, OutputError
 from keyss.core.scene import Scene
 from keyss.fitting.config import FitConfig
 from keyss.fitting.losses import Targets
-from keyss.methods.base import MethodOptions, Source
+from keyss.methods.method import MethodOptions, Source
 from keyss.methods.plain_models import Bound
 from keyss.progress import about
 

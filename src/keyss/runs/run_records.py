@@ -15,8 +15,8 @@ from keyss.fitting.config import FitConfig
 from keyss.fitting.image_metrics import ImageQuality
 from keyss.measure.hide_quality import HidingQuality, RenderFidelity
 from keyss.methods import registry
-from keyss.methods.base import MethodOptions
 from keyss.methods.hidden import HiddenScene
+from keyss.methods.method import MethodOptions
 from keyss.runs.json_records import read_record
 
 OptionsT = TypeVar("OptionsT", bound=MethodOptions)

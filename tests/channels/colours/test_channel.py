@@ -16,7 +16,7 @@ from hypothesis import given, settings, strategies as st
 
 from channels.colours.made import PACKED, cover, embed, extract
 from keyss.channels import COLOURS, ColoursCover
-from keyss.channels.colours import channel, header
+from keyss.channels.colours import colours_channel as channel, header
 from keyss.channels.colours.carriers import Carriers, find_salts
 from keyss.channels.colours.header import FILE_KEY_BYTES, Header, places
 from keyss.channels.colours.planner import STRENGTH

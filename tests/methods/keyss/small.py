@@ -15,7 +15,7 @@ from keyss.core.similarity import Similarity
 from keyss.keys import random_embeddings
 from keyss.methods import DESIGNS, Decoder, DecoderShape, KeyssSecret, LatentDecoder, choose_anchors
 from keyss.methods.keyss.decoder import latents_of
-from keyss.methods.keyss.secret import visibility
+from keyss.methods.keyss.keyss_secret import visibility
 
 FIT = FitConfig(iterations=60, max_gaussians=600, grow_start=0.2, grow_every=20, evaluate_every=0, seed=0)
 KEYS = ("first key", "second key")

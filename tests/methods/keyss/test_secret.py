@@ -17,7 +17,7 @@ from keyss.channels import Payload
 from keyss.core import InputError
 from keyss.core.similarity import Similarity
 from keyss.methods import DECODERS, DecoderShape, KeyssSecret, choose_anchors
-from keyss.methods.keyss.secret import compensate_pruning
+from keyss.methods.keyss.keyss_secret import compensate_pruning
 from methods.keyss.small import VECTORS, make_secret
 from tiny_scenes import random_gaussians
 

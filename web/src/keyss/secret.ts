@@ -1,5 +1,5 @@
 /**
- * Secrets of the method keyss with the design `latent`: `keyss.methods.keyss.secret`, `keyss.methods.keyss.decoder` and
+ * Secrets of the method keyss with the design `latent`: `keyss.methods.keyss.keyss_secret`, `keyss.methods.keyss.decoder` and
  * `keyss.channels.harmonics` in Python say why.
  */
 import { sha256 } from '@noble/hashes/sha2.js';

@@ -35,7 +35,7 @@ from keyss.lab.two_sample import two_sample_auc
 from keyss.measure.hide_quality import in_cover
 from keyss.measure.renders import renders_of, select_views
 from keyss.methods import registry
-from keyss.methods.base import role_of
+from keyss.methods.method import role_of
 from keyss.progress import Reporter
 from keyss.rendering import render
 from keyss.runs.files import CONTROLS

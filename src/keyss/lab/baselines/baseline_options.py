@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated, ClassVar
 
-from keyss.methods.base import CommandLineOption, Training, check_above_zero
-from keyss.methods.keyss.options import DecoderShape, Design, JointOptions, Scenes
+from keyss.methods.keyss.keyss_options import DecoderShape, Design, JointOptions, Scenes
+from keyss.methods.method import CommandLineOption, Training, check_above_zero
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -17,8 +17,8 @@ from keyss.core.scene import Camera
 from keyss.lab.baselines.baseline import Baseline, BaselineTraining, CompanionTensors, Show
 from keyss.lab.baselines.baseline_options import GsHiderOptions
 from keyss.lab.baselines.picture_decoder import Convolutions
-from keyss.methods.base import Capabilities
 from keyss.methods.keyss.training import Picture
+from keyss.methods.method import Capabilities
 from keyss.rendering import decode_picture, render_features
 
 FEATURES = 16

@@ -18,8 +18,8 @@ from keyss.core.scene import Camera
 from keyss.fitting.parameters import to_gaussians
 from keyss.lab.baselines.baseline import Baseline, BaselineTraining, CompanionTensors, Show
 from keyss.lab.baselines.baseline_options import DecoderOptions
-from keyss.methods.base import Capabilities
 from keyss.methods.keyss.training import Picture
+from keyss.methods.method import Capabilities
 from keyss.rendering import decode_picture
 
 WIDTH, LAYERS = 64, 5

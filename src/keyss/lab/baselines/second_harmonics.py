@@ -14,8 +14,8 @@ from keyss.core.scene import Camera
 from keyss.fitting.parameters import to_gaussians
 from keyss.lab.baselines.baseline import Baseline, BaselineTraining, CompanionTensors, Show
 from keyss.lab.baselines.baseline_options import ShOptions
-from keyss.methods.base import Capabilities
 from keyss.methods.keyss.training import Picture
+from keyss.methods.method import Capabilities
 
 _NAMES = ("sh", "secret_sh")  # parameters with the colours of the cover and of the secret
 

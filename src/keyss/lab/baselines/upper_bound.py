@@ -8,14 +8,14 @@ from dataclasses import dataclass, fields
 from keyss.core.gaussians import Gaussians
 from keyss.lab.baselines.baseline import Baseline, CompanionTensors, Show
 from keyss.lab.baselines.baseline_options import BaselineOptions, BoundOptions
-from keyss.methods.base import Capabilities, Context, Plan, Source, Stego
+from keyss.methods.method import Capabilities, Context, Plan, Source, Stego
 
 _NAMES = tuple(each.name for each in fields(Gaussians))
 
 
 @dataclass(frozen=True)
 class BoundMethod(Baseline):
-    """See `keyss.methods.base.Method`."""
+    """See `keyss.methods.method.Method`."""
 
     def plan(self, sources: Sequence[Source], options: BaselineOptions) -> Plan:
         """Both models, unchanged."""

@@ -13,7 +13,7 @@ from keyss.channels import APPENDED, LOW_BITS, Capacity, Channel, PreparedCover
 from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.keys.derivation import expand
-from keyss.methods.carry.options import CarryOptions
+from keyss.methods.carry.carry_options import CarryOptions
 from keyss.methods.codec.precision import finest_size, prune_to_size, usual_size
 from keyss.rendering.orbit import Viewpoints
 

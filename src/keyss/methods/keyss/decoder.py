@@ -29,7 +29,7 @@ from keyss.core.arrays import Bytes, Doubles, Flags, doubles
 from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.keys.derivation import expand
-from keyss.methods.keyss.options import DecoderShape
+from keyss.methods.keyss.keyss_options import DecoderShape
 
 FIELDS = {"op": "opacity_logits", "ro": "quats", "sc": "log_scales", "xyz": "means", "sh": "sh"}
 DECODED_NUMBERS = 1 << 23  # maximum activations at a time: 32 MiB, even for untrusted files

@@ -29,7 +29,7 @@ from keyss.fitting.plain import without_faint
 from keyss.fitting.schedule import Schedule
 from keyss.keys.derivation import stream
 from keyss.methods.keyss.decoder import Colours, LatentDecoder
-from keyss.methods.keyss.secret import KeyssSecret, choose_anchors, visibility
+from keyss.methods.keyss.keyss_secret import KeyssSecret, choose_anchors, visibility
 from keyss.methods.keyss.training import KeyssTraining, Picture, combined_points
 from keyss.rendering.view import contributions
 

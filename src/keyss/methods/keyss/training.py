@@ -34,10 +34,10 @@ from keyss.fitting.parameters import (
 )
 from keyss.fitting.schedule import Schedule
 from keyss.keys.derivation import random_embeddings, stream
-from keyss.methods.base import Context, Source, divide, role_of
 from keyss.methods.keyss.decoder import DECODERS
-from keyss.methods.keyss.options import DecoderShape, JointOptions, Scenes
-from keyss.methods.keyss.secret import KeyssSecret, choose_anchors, visibility
+from keyss.methods.keyss.keyss_options import DecoderShape, JointOptions, Scenes
+from keyss.methods.keyss.keyss_secret import KeyssSecret, choose_anchors, visibility
+from keyss.methods.method import Context, Source, divide, role_of
 from keyss.rendering import render, render_with_meta
 
 CACHE_BYTES = 2 << 30

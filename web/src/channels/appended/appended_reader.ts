@@ -1,6 +1,6 @@
 /**
  * Reader of appended Gaussians (docs/channels.md): words of 84 bits, read after a format has rounded them, and packets in words;
- * counterpart of `keyss.channels.appended.channel` and `words`.
+ * counterpart of `keyss.channels.appended.appended_channel` and `words`.
  */
 import { ascii, rowsOf, viewOf } from '../../core/bytes.ts';
 import { damaged } from '../../core/errors.ts';

@@ -1,4 +1,4 @@
-/** Reader of colours (docs/channels.md); counterpart of `keyss.channels.colours.channel`, `header` and `qim`. */
+/** Reader of colours (docs/channels.md); counterpart of `keyss.channels.colours.colours_channel`, `header` and `qim`. */
 import { hmac } from '@noble/hashes/hmac.js';
 import { sha256 } from '@noble/hashes/sha2.js';
 import { ascii, joined, quantile } from '../../core/bytes.ts';

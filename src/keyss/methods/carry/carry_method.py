@@ -16,11 +16,11 @@ from keyss.fitting.config import FitConfig
 from keyss.fitting.image_metrics import subsample_views
 from keyss.fitting.plain import fit_scene
 from keyss.fitting.schedule import boost_of
-from keyss.methods.base import Capabilities, Context, Plan, Source, Stego, role_of
 from keyss.methods.carry.capacity import CarryCapacity, SecretSize, shares
-from keyss.methods.carry.options import REFIT, CarryOptions
-from keyss.methods.carry.secret import CarriedSecret
+from keyss.methods.carry.carried_secret import CarriedSecret
+from keyss.methods.carry.carry_options import REFIT, CarryOptions
 from keyss.methods.codec.precision import encode_to_size, finest_size
+from keyss.methods.method import Capabilities, Context, Plan, Source, Stego, role_of
 from keyss.rendering import contributions
 from keyss.rendering.orbit import Viewpoints, psnr_between
 
@@ -37,7 +37,7 @@ _MIN_SHARE = 1 / 6  # fraction of a secret's Gaussians; refits of public models 
 
 
 class CarryMethod:
-    """See `keyss.methods.base.Method`."""
+    """See `keyss.methods.method.Method`."""
 
     name = CarryOptions.method
     max_secrets = 256

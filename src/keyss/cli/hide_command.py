@@ -32,7 +32,7 @@ from keyss.cli.keys import keys
 from keyss.core.errors import InputError, UsageError
 
 if TYPE_CHECKING:
-    from keyss.methods.base import CommandLineOption, Method, MethodOptions
+    from keyss.methods.method import CommandLineOption, Method, MethodOptions
 
 _HOW_TO_PUBLISH = {False: "publish this file unchanged", True: "publish this file; it may be converted"}
 
@@ -73,7 +73,7 @@ class Details:
 
 @dataclass(frozen=True, kw_only=True)
 class HideArguments:
-    """The options of `keyss hide`; `keyss.cli.hide` adds those of the method."""
+    """The options of `keyss hide`; `keyss.cli.hide_command` adds those of the method."""
 
     cover: Annotated[
         Path,
@@ -328,7 +328,7 @@ def _own_field(named: tuple[str, tuple[Any, CommandLineOption]]) -> tuple[str, A
 
 def own_options(method: str) -> dict[str, tuple[Any, CommandLineOption]]:
     """Types and descriptions of a method's options on the command line."""
-    from keyss.methods.base import CommandLineOption
+    from keyss.methods.method import CommandLineOption
     from keyss.methods.registry import options_of
 
     options = options_of(method)

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from typing import Annotated, Any, ClassVar, Literal, Self
 
 from keyss.fitting.config import FitConfig
-from keyss.methods.base import CommandLineOption, MethodOptions, Training
+from keyss.methods.method import CommandLineOption, MethodOptions, Training
 
 REFIT = 1.15  # refit steps / fit steps, with photos; at 1, secrets lose 0.15 dB
 

@@ -24,7 +24,7 @@ from keyss.core.gaussians import DRAWN_OPACITY, Gaussians
 from keyss.core.similarity import Similarity
 from keyss.methods.hidden import Frame, HiddenScene, Remains
 from keyss.methods.keyss.decoder import DECODERS, Decoder
-from keyss.methods.keyss.options import DecoderShape, parse_mask
+from keyss.methods.keyss.keyss_options import DecoderShape, parse_mask
 from keyss.methods.tensors import Header, pack_tensors, refuse_damage, unpack_tensors
 
 NAME = "keyss"

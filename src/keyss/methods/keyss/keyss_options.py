@@ -10,7 +10,7 @@ from msgspec import Meta
 
 from keyss.core.errors import UsageError, did_you_mean
 from keyss.keys.derivation import EMBEDDING_SIZE
-from keyss.methods.base import CommandLineOption, MethodOptions, Plan, Training, check_above_zero
+from keyss.methods.method import CommandLineOption, MethodOptions, Plan, Training, check_above_zero
 
 Attribute = Literal["op", "ro", "sc", "xyz", "sh"]  # opacity, rotation, scale, position, colour
 Mask = tuple[Attribute, ...]  # the attributes where theta (equation 8) is 1

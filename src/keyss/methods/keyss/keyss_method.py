@@ -22,18 +22,18 @@ from keyss.core.similarity import Similarity
 from keyss.keys import DerivedKey
 from keyss.keys.clip import MODEL, ClipKeys, clip_keys
 from keyss.keys.derivation import SALT_BYTES, expand
-from keyss.methods.base import Capabilities, Context, Plan, Source, Stego
 from keyss.methods.keyss.decoder import DECODERS
+from keyss.methods.keyss.keyss_options import Design, KeyssOptions
+from keyss.methods.keyss.keyss_secret import ANCHORS, KeyssSecret
 from keyss.methods.keyss.latent import LatentTraining
-from keyss.methods.keyss.options import Design, KeyssOptions
-from keyss.methods.keyss.secret import ANCHORS, KeyssSecret
 from keyss.methods.keyss.training import KeyssTraining, PlacedScene
+from keyss.methods.method import Capabilities, Context, Plan, Source, Stego
 
 _APPENDED = "the secrets lie in appended Gaussians instead, which everybody can see in the file"
 
 
 class KeyssMethod:
-    """See `keyss.methods.base.Method`."""
+    """See `keyss.methods.method.Method`."""
 
     name = KeyssOptions.method
     max_secrets = 9
