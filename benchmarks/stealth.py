@@ -6,9 +6,9 @@
     python benchmarks/stealth.py ... --rounded   # models like those of trainers that round steps
     python benchmarks/stealth.py ... --quick     # two random parts of each model, no predictor, no candidates
 
-Each plain model is made to carry as much of a model of the next scene as fits, and to hold an encrypted
-payload. Statistics are computed for complete models and for parts of 2,000 to 5,000 Gaussians, random ones
-and pieces of space. Detectors are cross-validated over scenes.
+Each plain model is made to carry as much of a model of the next scene as fits, and random bytes. Statistics
+are computed for complete models and for parts of 2,000 to 5,000 Gaussians, random ones and pieces of space.
+Detectors are cross-validated over scenes.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ SHOWN = 8  # single statistics in the table
 class File:
     """One file to judge; `pair` names the plain model from which it was made."""
 
-    kind: str  # "plain", "carried", "payload" (encrypted), "refitted" or "given"
+    kind: str  # "plain", "carried", "payload" (random bytes), "refitted" or "given"
     scene: str
     pair: str
     model: Gaussians

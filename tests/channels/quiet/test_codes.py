@@ -129,7 +129,7 @@ def test_equal_inputs_give_equal_files_and_others_no_salt_in_common(suffix: str)
 
 @EVERY
 def test_damage_is_told_from_a_wrong_key(suffix: str) -> None:
-    """But for the few bits that hold salt and slots, or nothing."""
+    """Except in the few blocks that hold the salt and the header, or nothing."""
     cover = CodesCover.of(codes_of(suffix))
     data = np.random.default_rng(0).bytes(cover.capacity.bytes * 9 // 10)
     file = written(cover, data)
