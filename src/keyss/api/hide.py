@@ -132,7 +132,7 @@ def hide(
         return HideResult(plan=chosen.plan(sources, options), cost=cost)
 
     with folder.work() if folder else nullcontext():
-        if reporter and not resume and (options.place.grows or trains):
+        if reporter and not resume and (options.channel_in().grows or trains):
             plan = chosen.plan(sources, options)
             for line in (f"hide: a file of up to {plan.megabytes:,.1f} MB, {cost}", *plan.notes):
                 reporter.note(line)
@@ -169,7 +169,7 @@ def hide(
             names = bound_names(len(secrets))
             made |= {names[index]: model for index, model in longer.items()}
             folder.write({**made, CONFIG: settings, METRICS: metrics})
-    return HideResult(stego.gaussians, metrics, survives=options.place.survives)
+    return HideResult(stego.gaussians, metrics, survives=options.channel_in().survives)
 
 
 def _check_arguments(out: PathLike | None, min_psnr: float | None) -> None:

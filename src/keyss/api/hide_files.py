@@ -66,12 +66,12 @@ def hide_files(
         inputs = [Path(each) for each in read if isinstance(each, str | Path)]
         folder = RunFolder(out, "hide files", writes=STEGOS, inputs=inputs, overwrite=overwrite)
     hidden, model = [_read(each) for each in secrets], as_3dgs_model(cover, "the cover")
-    place = channel_for(publish, channel, format, model)
+    chosen = channel_for(publish, channel, format, model)
     payloads = [(key, each.payload()) for key, each in zip(keys, hidden, strict=True)]
     try:
-        stego = place.prepare(model).embed(payloads)
+        stego = chosen.prepare(model).embed(payloads)
     except UsageError as error:
-        if place.grows:
+        if chosen.grows:
             raise
         raise UsageError(f'{error}; `publish="any", channel="appended"` has room for all') from error
     with folder.work() if folder else nullcontext():

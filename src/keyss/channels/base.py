@@ -71,10 +71,9 @@ def unpack_method(packed: bytes) -> str:
 class Capacity:
     """The capacity of a cover: exact for a prepared cover, an estimate before it is fitted."""
 
-    carriers: int
     bytes: int  # of one payload
     overhead: int  # maximum bytes of a payload beside its data
-    further: float = 1.0  # factor of the bytes of all payloads for each one after the first
+    further: float = 1.0  # each payload after the first multiplies the bytes of all together by this
     grows: bool = False  # True if the model grows with the hidden data, which should then be short
 
 

@@ -139,13 +139,8 @@ class MethodOptions:
             raise UsageError(f"preset {size!r}: expected {' or '.join(PRESETS)}")
         return cls(fit=PRESETS[size])
 
-    @property
-    def place(self) -> Channel:
-        """The channel that carries the secrets, for an unknown cover."""
-        return self.place_in(None)
-
-    def place_in(self, cover: Gaussians | None) -> Channel:
-        """The channel that carries the secrets in `cover`."""
+    def channel_in(self, cover: Gaussians | None = None) -> Channel:
+        """The channel that carries the secrets in `cover`; None: the cover is not known yet."""
         from keyss.channels import channel_for
 
         return channel_for(self.publish, self.channel, self.format, cover)

@@ -77,7 +77,7 @@ def cost_of(
         steps += own
         trained += size if own or training.steps else 0
         sizes.append(size)
-    published = sizes[0] + (_MAX_APPENDED * sum(sizes[1:]) if options.place.grows else 0)
+    published = sizes[0] + (_MAX_APPENDED * sum(sizes[1:]) if options.channel_in().grows else 0)
     degree = max(options.fit.sh_degree if each.given is None else each.given.sh_degree for each in sources)
     gaussian = 4 * (14 + 3 * (degree + 1) ** 2)  # bytes in a .ply, with normals
     resident: int = psutil.Process().memory_info().rss

@@ -97,7 +97,7 @@ class Appended(Channel):
         return AppendedCover(cover)
 
     def estimate_capacity(self, gaussians: int, sh_degree: int) -> Capacity:
-        return Capacity(gaussians, MAX_BYTES, _OVERHEAD, grows=True)
+        return Capacity(MAX_BYTES, _OVERHEAD, grows=True)
 
     def appended_count(self, sizes: Sequence[int]) -> int:
         """The number of Gaussians appended for payloads of these compressed sizes in bytes."""

@@ -73,7 +73,7 @@ class Colours(Channel):
 
     def estimate_capacity(self, gaussians: int, sh_degree: int) -> Capacity:
         capacity = gaussians * _BITS_PER_GAUSSIAN // 8 - _HEADERS
-        return Capacity(gaussians, max(0, capacity), _OVERHEAD, _FURTHER)
+        return Capacity(max(0, capacity), _OVERHEAD, _FURTHER)
 
 
 COLOURS = Colours()
@@ -94,9 +94,7 @@ class ColoursCover:
 
     @cached_property
     def capacity(self) -> Capacity:
-        planner = self.planner
-        carriers = len(planner.carriers.representatives)
-        return Capacity(carriers, planner.bytes, _OVERHEAD, planner.share_with_another)
+        return Capacity(self.planner.bytes, _OVERHEAD, self.planner.share_with_another)
 
     def embed(self, payloads: Sequence[tuple[str, Payload]], *, entropy: bytes | None = None) -> Gaussians:
         """See `PreparedCover`. Also raises UsageError for a model that can carry nothing."""

@@ -87,7 +87,7 @@ class LowBitsCapacity:
         """The capacity of a channel; quarters and halves of it are those of `plan`."""
         carriers = self._independent_carriers or self._carriers(1)
         size = min(part * self._size(carriers // part) for part in (1, 2, 4))
-        return Capacity(self.carriers, int(size * _INCOMPRESSIBLE), OVERHEAD + 16)
+        return Capacity(int(size * _INCOMPRESSIBLE), OVERHEAD + 16)
 
     @property
     def part_bytes(self) -> int:

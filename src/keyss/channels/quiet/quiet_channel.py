@@ -133,7 +133,7 @@ class InCodes(Channel):
         return CodesCover.of(self.decoded.codes, replace(self.decoded, model=cover.detach().to("cpu")))
 
     def estimate_capacity(self, gaussians: int, sh_degree: int) -> Capacity:
-        return Capacity(gaussians, gaussians * _BITS_PER_GAUSSIAN // 8, _overhead(wet_paper.BLOCK // 8))
+        return Capacity(gaussians * _BITS_PER_GAUSSIAN // 8, _overhead(wet_paper.BLOCK // 8))
 
 
 @dataclass(frozen=True)
@@ -243,7 +243,7 @@ class CodesCover:
     def capacity(self) -> Capacity:
         size = (len(self.ids) - 1) * self.width
         # Incompressible data grow by less than a thousandth.
-        return Capacity(len(self.codes), int(size * (1 - 2**-10)), _overhead(self.width))
+        return Capacity(int(size * (1 - 2**-10)), _overhead(self.width))
 
     @property
     def cover(self) -> Gaussians:

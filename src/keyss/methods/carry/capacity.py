@@ -59,7 +59,7 @@ class CarryCapacity:
 
         Raises UsageError for a cover without capacity.
         """
-        channel, degree = options.place_in(cover), options.fit.sh_degree
+        channel, degree = options.channel_in(cover), options.fit.sh_degree
         try:
             if cover is None:
                 count = options.fit.max_gaussians
