@@ -2,7 +2,7 @@
 
 A channel does not interpret its bits. It carries *payloads*, bytes that are read completely or not at all.
 
-The way of publication determines the channel (`publishing`); readers try all channels.
+How a model is published determines its channel (`publishing`); readers try all channels.
 """
 
 from __future__ import annotations
@@ -142,7 +142,7 @@ class Channel(ABC):
 
     @abstractmethod
     def estimate_capacity(self, gaussians: int, sh_degree: int) -> Capacity:
-        """Estimate the capacity of a cover with `gaussians` carriers."""
+        """Estimate the capacity of a cover that is not fitted yet."""
 
 
 def pack_payload(payload: Payload) -> bytes:

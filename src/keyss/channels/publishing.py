@@ -24,8 +24,8 @@ def channel_for(
 ) -> Channel:
     """The channel for a model that is published "as-is", in `format`, or in "any" format.
 
-    Published as is, a quantised `format` has its codes, and so does a `cover` that was decoded from one;
-    otherwise low bits. Imports that channel only. Raises UsageError for unknown names.
+    As is, secrets go into the codes of a quantised `format`, or of the format from which `cover` was read or
+    decoded; else into low bits. Imports that channel only. Raises UsageError for unknown names.
     """
     choices = {"publish": (publish, Publish), "channel": (channel, AnyChannel), "format": (format, Format)}
     for name, (value, known) in choices.items():

@@ -1,15 +1,15 @@
 """How carriers are divided between secrets, and the header that tells how to read one.
 
-Every secret has a *header* in a few carriers: its data key for each salt, and its parameters. Its payload is
-cut into numbered chunks with Reed-Solomon redundancy, one in each carrier of its share: any quarter of all
-Gaussians may be lost. The number of chunks does not reveal the size of the payload.
+Every secret has a *header* in a few carriers: its data key, encrypted for each salt, and its parameters. Its
+payload is cut into numbered chunks with Reed-Solomon redundancy, one in each carrier of its share: any
+quarter of all Gaussians may be lost. The number of chunks does not reveal the size of the payload.
 
 A key must not reveal whether there are other secrets, so a secret's share depends on its own size only: the
 first of a quarter, a half and all of the carriers that holds it. Carriers for the headers of four secrets are
-always reserved. Secrets whose shares do not fit together get equal ones: the holder of one key can notice
-others.
+reserved, however many there are. Secrets whose shares do not fit together get equal ones, by which the holder
+of one key can notice others.
 
-Parameters are cut into numbered parts, one in each carrier. Numbers are little-endian:
+Parameters are cut into numbered parts, one in a carrier. Numbers are little-endian:
 
     version (1 byte), method (15, padded with zeros), bytes of the encrypted payload (4); in codes, bytes of a
     block (2); in low bits, Gaussians of the model (4), codewords (4), chunks of one (2), data chunks of one
@@ -52,15 +52,15 @@ _MAX_RESERVED = 1 / 3  # maximum share of the carriers reserved for headers
 _REMOVAL = 0.25  # share of the Gaussians that may be removed at random
 _FAILURE = 1e-7  # probability of losing a payload to such removal
 _NUMBER_BYTES = 3  # size of a chunk's number
-MAX_CHUNKS = 1024  # chunks per codeword; longer codewords hold little more and are slower
-MAX_CODEWORDS = (1 << 8 * _NUMBER_BYTES) // MAX_CHUNKS
+_LONGEST = 1024  # chunks per codeword; longer codewords hold little more and are slower
+MAX_CODEWORDS = (1 << 8 * _NUMBER_BYTES) // _LONGEST
 
 _VERSION = 6
 _PREFIX = struct.Struct(f"<B{METHOD_BYTES}sI")
 _BLOCKS = struct.Struct("<H")  # bytes of a block
 _CODEWORDS = struct.Struct("<IIHH")  # Gaussians of the model, codewords, chunks of one, data chunks of one
 _DAMAGED = "the hidden parameters are damaged"
-_INCOMPRESSIBLE = 1 - 2**-10  # data that do not compress grow by less than a thousandth
+INCOMPRESSIBLE = 1 - 2**-10  # data that do not compress grow by less than a thousandth
 
 
 @dataclass(frozen=True)
@@ -84,10 +84,10 @@ class LowBitsCapacity:
         return LowBitsCapacity(carriers, Layout(sh_degree).width)
 
     def for_payloads(self) -> Capacity:
-        """The capacity of a channel; quarters and halves of it are those of `plan`."""
+        """Of these bytes, a half fits into half of the carriers and a quarter into a quarter (see `plan`)."""
         carriers = self._independent_carriers or self._carriers(1)
         size = min(part * self._size(carriers // part) for part in (1, 2, 4))
-        return Capacity(int(size * _INCOMPRESSIBLE), OVERHEAD + 16)
+        return Capacity(int(size * INCOMPRESSIBLE), OVERHEAD + 16)
 
     @property
     def part_bytes(self) -> int:
@@ -129,11 +129,11 @@ class LowBitsCapacity:
         return Plan(headers * self.header_carriers, shares, independent)
 
     def payload_capacity(self, secrets: int) -> int:
-        """Maximum bytes of each encrypted payload for `secrets` payloads; may be 0."""
+        """Maximum bytes of each of `secrets` encrypted payloads with equal shares; may be 0."""
         return self._size(self._carriers(secrets))
 
     def too_small(self, count: int, what: str, size: int, secrets: int) -> str:
-        """The message for payloads of `size` bytes that do not fit; `count` and `what` describe the model."""
+        """The message for payloads of `size` bytes that do not fit into `count` of `what`."""
         need = bisect_left(
             range(1 << 30), size, key=lambda each: LowBitsCapacity(each, self.width).payload_capacity(secrets)
         )
@@ -164,13 +164,13 @@ class LowBitsCapacity:
     def _codewords(self, count: int, size: int | None = None) -> Codewords | None:
         """The most redundant code of `size` bytes (None: the maximum) in `count` carriers.
 
-        None if the probability of loss exceeds _FAILURE.
+        None if its probability of loss exceeds _FAILURE.
         """
         chunk = self.chunk_bytes
         if count < 1 or chunk < 1:
             return None
-        number = min(-(-count // MAX_CHUNKS), MAX_CODEWORDS)
-        n = min(count // number, MAX_CHUNKS)
+        number = min(-(-count // _LONGEST), MAX_CODEWORDS)
+        n = min(count // number, _LONGEST)
         most = _most_data(n, number)
         k = most if size is None else max(1, -(-size // (chunk * number)))
         return Codewords(number, n, k, chunk) if 0 < k <= most else None
@@ -254,13 +254,13 @@ def unpack(parts: Bytes, width: int | None = None) -> Parameters:
         codewords = Codewords(count, n, k, LowBitsCapacity(0, width).chunk_bytes)
     except ValueError as error:
         raise InputError(f"{_DAMAGED}: {error}") from error
-    if count > MAX_CODEWORDS or n > MAX_CHUNKS or not 0 < size <= codewords.size:
+    if count > MAX_CODEWORDS or n > _LONGEST or not 0 < size <= codewords.size:
         raise InputError(f"{_DAMAGED}: {size} bytes in {codewords}")
     return Parameters(method, size, 0, codewords, gaussians, packed[least - SKETCH_BYTES : least])
 
 
 def numbered_chunks(codewords: Codewords, data: bytes, count: int) -> Bytes:
-    """[count, _NUMBER_BYTES + width] numbered chunks; spare ones repeat the first."""
+    """[count, _NUMBER_BYTES + width] numbered chunks; those beyond the codewords repeat the first."""
     numbers = np.arange(count, dtype="<u4") % codewords.chunks
     chunks = codewords.encode(data)[numbers]
     return np.concatenate([numbers.view(np.uint8).reshape(-1, 4)[:, :_NUMBER_BYTES], chunks], axis=1)

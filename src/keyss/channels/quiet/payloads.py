@@ -1,6 +1,6 @@
 """Payloads in carriers: written with noise everywhere else, and read with a key.
 
-Gaussians are filled in random order and may be lost: headers have copies, and payloads redundancy. Blocks of
+Gaussians may be lost: a header is repeated, a payload has redundancy, and both lie in random order. Blocks of
 codes are never lost: a secret is a header, followed by the blocks of its payload.
 """
 
@@ -49,9 +49,10 @@ _ASSOCIATED = b"keyss/v1/quiet"  # authenticated with a payload
 
 
 class Writer:
-    """The bytes of carriers with `ids` [C, 16], `width` bytes each, in a model of `gaussians`.
+    """Fills `table` [C, width], the bytes of the carriers in `order` [C], with payloads and noise.
 
-    `entropy`: 32 secret bytes. `sketched`: IDs [N, 16] of all Gaussians; None if carriers are blocks.
+    `ids` [C, 16]: of the carriers. `entropy`: 32 secret bytes. `gaussians`: size of the model. `sketched`:
+    IDs [N, 16] of all Gaussians; None if carriers are blocks.
     """
 
     def __init__(
@@ -68,7 +69,7 @@ class Writer:
     def write(self, payloads: Sequence[tuple[Sequence[DerivedKey], Payload]]) -> None:
         """Write headers and payloads. Raises UsageError for too large payloads.
 
-        Each secret comes with its key under every salt that is not stale.
+        Each payload comes with its key under every salt that is not stale.
         """
         sizes = [compressed_size(payload.data) + OVERHEAD for _, payload in payloads]
         if self._sketched is None:
@@ -77,17 +78,17 @@ class Writer:
             self._write_chunks(payloads, sizes, self._sketched)
 
     def _write_chunks(
-        self, payloads: Sequence[tuple[Sequence[DerivedKey], Payload]], sizes: Sequence[int], ids: Bytes
+        self, payloads: Sequence[tuple[Sequence[DerivedKey], Payload]], sizes: Sequence[int], sketched: Bytes
     ) -> None:
-        """Headers in the first carriers, chunks in random ones of the others."""
+        """Headers go into the first rows of `table`, chunks into random ones of the others."""
         plan, at, width = self._capacity.plan(sizes), 0, self._capacity.width
         free = plan.first + random_order(self._entropy, "quiet/chunks", len(self.table) - plan.first)
         for index, ((keys, payload), size) in enumerate(zip(payloads, sizes, strict=True)):
             data_key, (count, codewords) = self._data_key(index), plan.shares[index]
-            marks = sketch(data_key, ids)
-            parameters = Parameters(payload.method, size, 0, codewords, self._gaussians, marks)
+            own_sketch = sketch(data_key, sketched)
+            parameters = Parameters(payload.method, size, 0, codewords, self._gaussians, own_sketch)
             at = self._write_header(at, data_key, keys, parameters)
-            chunks = numbered_chunks(codewords, self._encrypted(data_key, payload, size), count)
+            chunks = numbered_chunks(codewords, self._encrypt(data_key, payload, size), count)
             rows, free = free[:count], free[count:]
             cipher = chunk_cipher(data_key, width)
             self.table[rows, : cipher.cell_bytes] = cipher.encrypt(self._ids[rows], chunks)
@@ -110,13 +111,13 @@ class Writer:
         for index in random_order(self._entropy, "quiet/along", len(payloads)).tolist():
             (keys, payload), data_key = payloads[index], self._data_key(index)
             size = width * (takes[index] - BLOCK_HEADER)
-            rows = np.frombuffer(self._encrypted(data_key, payload, size), np.uint8).reshape(-1, width)
+            rows = np.frombuffer(self._encrypt(data_key, payload, size), np.uint8).reshape(-1, width)
             parameters = Parameters(payload.method, size, width)
             at = self._write_header((first + gaps.pop(0)) % count, data_key, keys[:1], parameters)
             self.table[(at + np.arange(len(rows))) % count] = rows
             first += takes[index]
 
-    def _encrypted(self, data_key: bytes, payload: Payload, size: int) -> bytes:
+    def _encrypt(self, data_key: bytes, payload: Payload, size: int) -> bytes:
         return encrypt(payload_key(data_key), payload.data, _ASSOCIATED, size=size)
 
     def _data_key(self, index: int) -> bytes:
@@ -125,12 +126,12 @@ class Writer:
     def _write_header(
         self, at: int, data_key: bytes, keys: Sequence[DerivedKey], parameters: Parameters
     ) -> int:
-        """Write a header into the carriers from `at` on; returns the carrier after it."""
+        """Write a header into the rows of `table` from `at` on; returns the row after it."""
         blocks = parameters.codewords is None
         key_copies, part_copies = (1, 1) if blocks else (KEY_COPIES, PARAMETER_COPIES)
         width = LEAST_BYTES if blocks else self._capacity.width
-        copies = np.frombuffer(data_key * key_copies, np.uint8).reshape(key_copies, -1)
-        cells = [(key_cipher(key), copies) for key in keys]
+        data_keys = np.frombuffer(data_key * key_copies, np.uint8).reshape(key_copies, -1)
+        cells = [(key_cipher(key), data_keys) for key in keys]
         parts = np.tile(parameters.parts(width), (part_copies, 1))
         for cipher, data in (*cells, (parameter_cipher(data_key, width), parts)):
             rows = (at + np.arange(len(data))) % len(self.table)
@@ -141,7 +142,7 @@ class Writer:
 
 @dataclass(frozen=True)
 class QuietReader(SaltedReader):
-    """Reads the carriers of a stego model; copies of a Gaussian with equal low bits count once."""
+    """Reads the carriers of a stego model; equal Gaussians count once."""
 
     ids: Bytes  # [C, 16]
     low: Bytes  # [C, B]
@@ -151,7 +152,7 @@ class QuietReader(SaltedReader):
 
     @staticmethod
     def of(stego: Gaussians) -> QuietReader | None:
-        """The reader of the codes of a coded or decoded model, else of low bits; None without capacity."""
+        """The reader of the codes of a coded or decoded model, or None without capacity; else of low bits."""
         if isinstance(stego, CodedGaussians):
             return QuietReader.of_codes(stego.codes)
         if decoded := Decoded.of(stego):
@@ -168,7 +169,7 @@ class QuietReader(SaltedReader):
 
     @staticmethod
     def of_codes(codes: Codes, decoded: Decoded | None = None) -> QuietReader | None:
-        """None for codes without capacity. `decoded`: the model that was decoded from them."""
+        """None if `codes` have no capacity. `decoded`: the model that was decoded from them."""
         rows, ordered, fields = in_counted_order(codes, decoded.exact if decoded else None)
         low = read_blocks(last_bits(fields))
         if len(low) < MIN_BLOCKS:
@@ -184,7 +185,7 @@ class QuietReader(SaltedReader):
         data_key, found, width, at = self._parameters(key)
         if (codewords := found.codewords) is None:
             return self._in_blocks(data_key, found, at)
-        numbers, chunks = split_numbers(self._decrypt(chunk_cipher(data_key, width))[0])
+        numbers, chunks = split_numbers(self._decrypt(chunk_cipher(data_key, width))[1])
         encrypted = codewords.decode(numbers, chunks)[: found.size]
         left = len(np.unique(numbers[numbers < codewords.chunks]))
         return Payload(
@@ -207,22 +208,21 @@ class QuietReader(SaltedReader):
         """The data key, the parameters, the width of a carrier, and the last carrier of the parameters."""
         if not self.widths:
             raise WrongKeyError()
-        votes = Counter(row.tobytes() for row in self._decrypt(key_cipher(key))[0]).most_common(1)
+        votes = Counter(row.tobytes() for row in self._decrypt(key_cipher(key))[1]).most_common(1)
         data_key = votes[0][0] if votes else key.expand("quiet/none", DATA_KEY_BYTES)
         found = [self._decrypt(parameter_cipher(data_key, width)) for width in self.widths]
-        for width, (parts, fitting) in zip(self.widths, found, strict=True):
+        for width, (fitting, parts) in zip(self.widths, found, strict=True):
             if len(parts):
                 parameters = unpack(parts, None if self.blocks else width)
                 return data_key, parameters, width, int(np.flatnonzero(fitting)[-1])
-        # The tag of a key cell is valid by chance with probability 2^-32.
+        # Without parameters, a key cell had a valid tag by chance (2^-32). Wrong keys read chunks as well.
         if not self.blocks:
             self._decrypt(chunk_cipher(data_key, max(self.widths)))
         raise WrongKeyError()
 
-    def _decrypt(self, cipher: CellCipher) -> tuple[Bytes, Flags]:
-        """Data [M, size] of the cells with a valid tag, in the order of carriers, and their mask [C]."""
-        fitting, data = cipher.decrypt(self.ids, self.low)
-        return data, fitting
+    def _decrypt(self, cipher: CellCipher) -> tuple[Flags, Bytes]:
+        """Mask [C] of the carriers with a valid tag, and the data [M, size] of their cells in this order."""
+        return cipher.decrypt(self.ids, self.low)
 
 
 def payload_key(data_key: bytes) -> bytes:

@@ -1,17 +1,17 @@
-"""The quiet channel: secrets in low bits of floats, or in last bits of the integers of a quantised format.
+"""The quiet channel: secrets in low bits of floats, or in last bits of codes, a quantised format's integers.
 
 A file has no magic number and no index of its secrets. Bits are stored in *carriers*: the low bits of one
 Gaussian, or one block of last bits of codes (see `wet_paper`). A carrier holds encrypted *cells*, each with a
 tag: a reader decrypts all of them and keeps those with a valid tag.
 
-- A *salt* of Argon2id is a hash of one carrier without cells (see `usable`). It is *stale* if that Gaussian
-  is not usable: the author of the cover knows it in advance, so no key cell is written for it. A reader tries
-  SALTS_TRIED salts; covers with as many stale salts are refused.
+- A *salt* of Argon2id is a hash of one carrier without cells (see `usable`). A salt is *stale* if its
+  Gaussian is not usable: the author of the cover knows it in advance, so no key cell is written for it. A
+  reader tries SALTS_TRIED salts; covers with as many stale ones are refused.
 - *Key cells*, encrypted under the key and a salt, hold the data key of a secret.
 - *Parameter cells*, encrypted under the data key, tell how to read the rest (see `layout`).
-- *Chunks* of the encrypted payload are numbered and redundant: shuffling is harmless, and a quarter of the
-  Gaussians may be lost. In codes nothing may be lost or reordered: the payload is stored in the blocks after
-  its header.
+- *Chunk cells*, encrypted under the data key, hold numbered chunks of the encrypted payload, with redundancy:
+  shuffling is harmless, and a quarter of the Gaussians may be lost. In codes nothing may be lost or
+  reordered: the payload lies in the blocks after its header, without cells.
 
 Carriers are chosen at random, and unused usable carriers get noise, so the number of secrets does not show.
 All randomness is derived from `entropy`, which must be secret: otherwise the holder of one key could compute
@@ -49,6 +49,7 @@ from keyss.channels.quiet.fields import (
 )
 from keyss.channels.quiet.layout import (
     BLOCK_HEADER,
+    INCOMPRESSIBLE,
     LEAST_BYTES,
     MIN_BLOCKS,
     TYPICAL_SHARE,
@@ -124,9 +125,9 @@ class InCodes(Channel):
             self.place = f"steps of its numbers, which are those of a {format} file"
 
     def prepare(self, cover: Gaussians) -> CodesCover:
-        """The capacity of the codes of a model; a model read from a file of this format keeps its codes.
+        """See `Channel`. A model that was read from a file of this format keeps its codes.
 
-        `cover`: the model of `decoded`, perhaps with fewer harmonics.
+        With `decoded`, the cover is its model, perhaps with fewer harmonics.
         """
         if self.decoded is None:
             return CodesCover.of(FORMATS[self.format].of(cover))
@@ -155,7 +156,7 @@ class LowBitsCover:
         mixed = randomness(entropy, *(payload.data for _, payload in payloads))
         salts = self._salts(mixed)[1]
         fresh = [salts[index] for index in self.fresh_salts]
-        return self.embed_derived([(_derived(key, fresh), payload) for key, payload in payloads], mixed)
+        return self.embed_derived([(_derive(key, fresh), payload) for key, payload in payloads], mixed)
 
     def embed_derived(
         self, payloads: Sequence[tuple[Sequence[DerivedKey], Payload]], entropy: bytes
@@ -184,7 +185,7 @@ class LowBitsCover:
         return np.flatnonzero(carriers)
 
     def _salts(self, entropy: bytes) -> tuple[Bytes, list[bytes]]:
-        """New low bits [F, B] of the Gaussians of fresh salts, and the resulting salts (all)."""
+        """New low bits [F, B] of the Gaussians of fresh salts, and all salts with these low bits."""
         noise = stream(entropy, "quiet/salts", len(self.fresh_salts) * self.layout.width)
         fresh = np.frombuffer(noise, np.uint8).reshape(len(self.fresh_salts), self.layout.width)
         whole = replace(self.layout, written_degree=None)
@@ -201,11 +202,11 @@ class CodesCover:
     fields: list[Field]
     free: list[Flags]  # [N] per field: levels that may be written
     model_hash: bytes
-    decoded: Decoded | None = None  # published instead of the codes, in the same order
+    decoded: Decoded | None = None  # in the same order; its model is published instead of the codes
 
     @staticmethod
     def of(codes: Codes, decoded: Decoded | None = None) -> CodesCover:
-        """Raises UsageError for codes without capacity. `decoded`: published instead of the codes."""
+        """`decoded`: its model is published instead of the codes. Raises UsageError for no capacity."""
         rows, ordered, own = in_counted_order(codes, decoded.exact if decoded else None)
         model = decoded[rows] if decoded else None
         own_hash = model_hash(ordered, model.model if model else None)
@@ -242,8 +243,7 @@ class CodesCover:
     @cached_property
     def capacity(self) -> Capacity:
         size = (len(self.ids) - 1) * self.width
-        # Incompressible data grow by less than a thousandth.
-        return Capacity(int(size * (1 - 2**-10)), _overhead(self.width))
+        return Capacity(int(size * INCOMPRESSIBLE), _overhead(self.width))
 
     @property
     def cover(self) -> Gaussians:
@@ -256,15 +256,15 @@ class CodesCover:
             own = expand(mixed, f"quiet/attempt/{attempt}", 32)
             first = np.frombuffer(stream(own, "quiet/salts", self.width), np.uint8)
             salts = [salt(self.ids[0], first[:LEAST_BYTES])]
-            derived = [(_derived(key, salts), payload) for key, payload in payloads]
+            derived = [(_derive(key, salts), payload) for key, payload in payloads]
             check_keys([keys[0].verifier() for keys, _ in derived])
             writer = Writer(self.ids[1:], self.width, own, len(self.codes))
             writer.write(derived)
-            if (bits := self._solved(np.concatenate([first[None], writer.table]), own)) is not None:
-                return self._published(self._written(bits, own), own)
+            if (bits := self._solve(np.concatenate([first[None], writer.table]), own)) is not None:
+                return self._model_to_publish(self._with_bits(bits, own), own)
         raise RuntimeError("the blocks of this cover cannot be solved")
 
-    def _solved(self, table: Bytes, entropy: bytes) -> Bits | None:
+    def _solve(self, table: Bytes, entropy: bytes) -> Bits | None:
         """The last bits of all levels, so that blocks hold `table` [C, width]; free bits are random.
 
         None if a block has no solution.
@@ -278,7 +278,8 @@ class CodesCover:
         bits[self.places] = solved
         return bits
 
-    def _written(self, bits: Bits, entropy: bytes) -> Codes:
+    def _with_bits(self, bits: Bits, entropy: bytes) -> Codes:
+        """The codes with new last `bits` of all levels."""
         columns: dict[str, list[Levels]] = {}
         parts = np.split(bits, np.cumsum([each.total_bits for each in self.fields])[:-1])
         for field, free, own in zip(self.fields, self.free, parts, strict=True):
@@ -286,11 +287,11 @@ class CodesCover:
             levels = np.where(free, field.with_bits(own, ties), field.levels)
             columns.setdefault(field.name, []).append(levels)
         attributes = {name: np.stack(each, axis=1) for name, each in columns.items()}
-        written: Codes = with_levels(self.codes, attributes)
-        return written
+        codes: Codes = with_levels(self.codes, attributes)
+        return codes
 
-    def _published(self, codes: Codes, entropy: bytes) -> Gaussians:
-        """A file of `codes`, or the model decoded from them: in the order of the format, or of the cover."""
+    def _model_to_publish(self, codes: Codes, entropy: bytes) -> Gaussians:
+        """The model of `codes` in the order of the format or, if the cover has an own one, of the cover."""
         within = random_fractions(entropy, "codes/file-order", 3 * len(codes)).reshape(-1, 3) - 0.5
         order = file_order(codes, within)
         if self.decoded is None:
@@ -311,7 +312,7 @@ def _versions(model: Gaussians) -> list[int]:
     return [0 if each.is_inference() else each._version for each in tensors]
 
 
-def _derived(key: str, salts: Sequence[bytes]) -> list[DerivedKey]:
+def _derive(key: str, salts: Sequence[bytes]) -> list[DerivedKey]:
     """`key` under each salt, several at a time."""
     return in_blocks(lambda index, _: DerivedKey.of(key, salts[index]), len(salts), 1)
 
