@@ -33,7 +33,7 @@ from .quiet.bits import (
 )
 from .quiet.cells import CellCipher as CellCipher
 from .quiet.fields import Field as Field, in_counted_order as in_counted_order, last_bits as last_bits
-from .quiet.layout import (
+from .quiet.header import (
     TYPICAL_SHARE as TYPICAL_SHARE,
     LowBitsCapacity as LowBitsCapacity,
     check_payload_fits as check_payload_fits,

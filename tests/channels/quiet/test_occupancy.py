@@ -12,13 +12,13 @@ from scipy.stats import ks_2samp
 
 from channels.quiet.trained_like import keys
 from keyss.channels import Payload, key_cipher
-from keyss.channels.quiet.layout import chunk_cipher, parameter_cipher
+from keyss.channels.quiet.header import chunk_cipher, parameter_cipher
 from keyss.channels.quiet.payloads import Writer
 from keyss.channels.quiet.usable import SALTS
 from keyss.core import KeyssWarning
 
 CARRIERS, WIDTH = 3000, 75
-NAMES = np.random.default_rng(0).integers(0, 256, (CARRIERS, 16), np.uint8)
+IDS = np.random.default_rng(0).integers(0, 256, (CARRIERS, 16), np.uint8)
 OWN = keys(0)
 HIDINGS = 40
 QUARTER = 24_000  # bytes that fit into a quarter of these carriers
@@ -26,15 +26,15 @@ QUARTER = 24_000  # bytes that fit into a quarter of these carriers
 
 def _seen(sizes: Sequence[int]) -> list[float]:
     """What the holder of the first key can count of its own cells, and of all others together."""
-    writer = Writer(NAMES, WIDTH, os.urandom(32), len(NAMES), NAMES)
+    writer = Writer(IDS, WIDTH, os.urandom(32), len(IDS), IDS)
     payloads = [Payload("test", os.urandom(size)) for size in sizes]
     writer.write([([each] * SALTS, payload) for each, payload in zip(OWN, payloads, strict=False)])
     low = np.empty_like(writer.table)
     low[writer.order] = writer.table
-    fits, found = key_cipher(OWN[0]).decrypt(NAMES, low)
+    fits, found = key_cipher(OWN[0]).decrypt(IDS, low)
     data_key = found[0].tobytes()
-    headers = fits | parameter_cipher(data_key, WIDTH).decrypt(NAMES, low)[0]
-    own = chunk_cipher(data_key, WIDTH).decrypt(NAMES, low)[0]
+    headers = fits | parameter_cipher(data_key, WIDTH).decrypt(IDS, low)[0]
+    own = chunk_cipher(data_key, WIDTH).decrypt(IDS, low)[0]
     places = np.flatnonzero(own)
     return [
         float(headers.sum()),

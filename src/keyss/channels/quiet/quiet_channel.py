@@ -8,7 +8,7 @@ tag: a reader decrypts all of them and keeps those with a valid tag.
   Gaussian is not usable: the author of the cover knows it in advance, so no key cell is written for it. A
   reader tries SALTS_TRIED salts; covers with as many stale ones are refused.
 - *Key cells*, encrypted under the key and a salt, hold the data key of a secret.
-- *Parameter cells*, encrypted under the data key, tell how to read the rest (see `layout`).
+- *Parameter cells*, encrypted under the data key, tell how to read the rest (see `header`).
 - *Chunk cells*, encrypted under the data key, hold numbered chunks of the encrypted payload, with redundancy:
   shuffling is harmless, and a quarter of the Gaussians may be lost. In codes nothing may be lost or
   reordered: the payload lies in the blocks after its header, without cells.
@@ -47,7 +47,7 @@ from keyss.channels.quiet.fields import (
     model_hash,
     with_levels,
 )
-from keyss.channels.quiet.layout import (
+from keyss.channels.quiet.header import (
     BLOCK_HEADER,
     INCOMPRESSIBLE,
     LEAST_BYTES,

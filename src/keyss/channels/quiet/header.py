@@ -1,4 +1,4 @@
-"""How carriers are divided between secrets, and the header that tells how to read one.
+"""The header of a secret, which tells how to read it, and the division of carriers between secrets.
 
 Every secret has a *header* in a few carriers: its data key, encrypted for each salt, and its parameters. Its
 payload is cut into numbered chunks with Reed-Solomon redundancy, one in each carrier of its share: any
