@@ -1,8 +1,8 @@
 """The low mantissa bits of a model's floats: where they are, and reading and writing them.
 
-Used are 8 bits of log scales, quaternions and opacity logits, and 12 bits of the spherical harmonics above
-the constant ones, of the 23 bits of a mantissa. The last bit of all is left alone: rounding to even makes it
-a zero more often than a one, by a third of a percent in spherical harmonics, which a classifier notices.
+Of the 23 bits of a mantissa, 8 are used in log scales, quaternions and opacity logits, and 12 in the
+spherical harmonics above the constant ones. The last bit is left alone: rounding to even makes it a zero
+more often than a one, by a third of a percent in spherical harmonics, which a classifier notices.
 Positions are not used: the least change can swap two Gaussians of nearly equal depth, and a swap is visible
 (48 dB in a view where everything else stays above 79 dB). Constant colours are not used: many keep the few
 digits of their initial values. Unit quaternions, which some tools write, are not used: new low bits would
@@ -139,7 +139,7 @@ def write_low_bits(
 ) -> Gaussians:
     """Replace low bits: each of `parts` has distinct rows [R] and their new bytes [R, B].
 
-    If a Gaussian has half a byte more, that half byte keeps its value.
+    If a Gaussian has half a byte more than B bytes, that half byte keeps its value.
     """
     written = gaussians.detach().to("cpu").map(torch.Tensor.contiguous).map(torch.clone)
     geometry, harmonics = _written_fields(written, layout)
@@ -164,7 +164,7 @@ def write_low_bits(
 
 
 def used_words(gaussians: Gaussians) -> Words32:
-    """[N, F] bit patterns of scales, quaternions, opacity and harmonics above degree 0; a copy."""
+    """[N, F] new bit patterns of log scales, quaternions, opacity logits and harmonics above degree 0."""
     return np.concatenate(list(group_words(gaussians)), axis=1)
 
 
@@ -175,7 +175,7 @@ def group_words(gaussians: Gaussians) -> Iterator[Words32]:
 
 
 def _written_fields(gaussians: Gaussians, layout: Layout) -> tuple[list[Words32], Words32]:
-    """Bit patterns of scales, quaternions (if in use) and opacities; and of harmonics."""
+    """Bit patterns of log scales, quaternions (if in use) and opacity logits; and of harmonics."""
     *geometry, harmonics = group_words(gaussians)
     kept = [each for each in geometry if layout.quats or each.shape[1] != 4]
     return kept, harmonics[:, : layout.harmonics]

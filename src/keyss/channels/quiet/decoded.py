@@ -1,8 +1,7 @@
-"""Models that were decoded from a .spz, .sog or compressed .ply, as most models on the web.
+"""Models that were decoded from a .spz, .sog or compressed .ply, like most models on the web.
 
-Their low bits are determined by the codes of that file, so new low bits would show. The codes can be computed
-from the numbers by `quantise`. The secret is embedded in the codes, and the published model is decoded from
-them.
+The codes of that file determine their low bits, so new low bits would show. `quantise` computes the codes
+from the numbers. The secret is embedded in the codes, and the published model is decoded from them.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ _WRITTEN = ("means", "quats", "log_scales")  # attributes that carry bits in any
 _OPACITIES = 256
 _SAMPLE = 1024  # Gaussians of a first check
 _CLOSE = 1e-5  # maximum relative difference between decoders
-_MOST = 0.9  # minimum share of exact Gaussians
+_MIN_EXACT = 0.9  # share of exact Gaussians
 
 
 @dataclass(frozen=True)
@@ -48,7 +47,7 @@ class Decoded:
             codes = quantise(model)
             if codes is not None:
                 exact = _are_exact(model, codes.dequantise())
-                if exact.mean() >= _MOST:
+                if exact.mean() >= _MIN_EXACT:
                     return Decoded(model, codes, exact, np.arange(len(model)))
         return None
 
@@ -63,7 +62,7 @@ class Decoded:
         return is_in_morton_order(self.model.means.numpy()[self.order.argsort()])
 
     def with_codes(self, before: Codes, after: Codes) -> Gaussians:
-        """The model after a change of its codes, both in its order."""
+        """The model after a change of its codes; both are in its order."""
         old, new = before.dequantise(), after.dequantise()
         changes = {}
         for name in _WRITTEN:

@@ -1,16 +1,16 @@
-"""The numbers of a format's codes that carry bits, how many each (docs/channels.md), and in which order.
+"""The numbers of a format's codes that carry bits, how many each (docs/byte-layout.md), and in which order.
 
 A *level* is an integer that grows with the number it stands for; a *field* is one coordinate of an attribute
-of all Gaussians. The number of bits that a level carries follows from codes that are never written: from the
-Gaussian's size and the format's step, so that positions move by a fraction of that size. The arithmetic is
-the same on every machine and uses no logarithms: a reader must find the same numbers of bits.
+of all Gaussians. The number of bits that a level carries follows from codes that are never written: for
+positions from the Gaussian's size and the format's step, so that they move by a fraction of that size. The
+arithmetic is the same on every machine and uses no logarithms: a reader must find the same numbers of bits.
 
 Writing matches levels (Sharp 2001) instead of overwriting their bits. Overwriting moves even levels up and
 odd ones down only, which makes pairs of them equally frequent: the attacks of Westfeld and Pfitzmann (1999)
 and of Fridrich et al. (2001) find that.
 
-Bits are counted in the order of the file, except those of a .sog. It is stored in Morton order of positions,
-which carry bits; its bits are counted in the order of hashes of the codes that carry none.
+Bits are counted in the order of the file, except those of a .sog. A .sog is sorted by positions, which carry
+bits, so its bits are counted in the order of hashes of the codes that carry none.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ ROTATIONS: dict[type[Codes], tuple[int, int]] = {
 }
 FORMATS = {each.name: each for each in ROTATIONS}
 MAX_BITS = 10
-_SHARE = -3.0  # log2 of the range of written positions, in sizes of the Gaussian
+_POSITION_RANGE = -3.0  # log2 of the range of written positions, in sizes of the Gaussian
 LOG_SCALE_RANGE = -4.0  # log2 of the range of written log scales
 _SIGN, _MAGNITUDE = 512, 511  # masks of a rotation's component in SPZ 3 and newer
 _LOG2_E = 1.4426950408889634
@@ -118,20 +118,20 @@ def last_bits(fields: Sequence[Field]) -> Bytes:
 def in_counted_order(codes: Codes, exact: Flags | None = None) -> tuple[Integers, Any, list[Field]]:
     """The order [N] in which bits are counted, the codes in this order, and their fields.
 
-    No bits: Gaussians that are not `exact` [N] (see `Decoded`), and Gaussians of a .sog with equal hashes.
+    Gaussians that are not `exact` [N] (see `Decoded`) and those of a .sog with equal hashes carry no bits.
     """
     rows = np.arange(len(codes))
     silent = np.zeros(len(codes), np.bool_) if exact is None else ~exact
     if isinstance(codes, SogCodes):
-        names = _sog_hashes(codes)
-        rows, silent = np.argsort(names, kind="stable"), silent | repeated(names)
+        hashes = _sog_hashes(codes)
+        rows, silent = np.argsort(hashes, kind="stable"), silent | repeated(hashes)
     codes, silent = in_rows(codes, rows), silent[rows]
     fields = [replace(each, bits=np.where(silent, 0, each.bits)) for each in _fields_of(codes)]
     return rows, codes, fields
 
 
 def model_hash(codes: Any, decoded: Gaussians | None = None) -> bytes:
-    """12 bytes of a hash of colours and opacities, which never change; those of `decoded` if given.
+    """12 bytes of a hash of colours and opacities, which never change: those of `decoded`, else the codes.
 
     It binds blocks to their model: blocks copied into another one open nothing. Gaussians are in counted
     order, without those of a .sog with equal hashes, whose order is undefined.
@@ -174,10 +174,10 @@ def _sog_hashes(codes: SogCodes) -> Words:
 
 
 def _fields_of(codes: Codes) -> list[Field]:
-    """Rotations of SPZ 2, which no program writes any more, carry nothing."""
+    """The fields of `codes`. Rotations of SPZ 2, which no program writes any more, carry nothing."""
     if isinstance(codes, SpzCodes):
         sizes = (_medians(codes.scales) / 16 - 10) * _LOG2_E
-        bits = _fitting(sizes[:, None] + codes.fractional_bits + _SHARE)
+        bits = _fitting(sizes[:, None] + codes.fractional_bits + _POSITION_RANGE)
         positions = _fields("positions", codes.positions, bits)
         if codes.version == 2:
             return positions
@@ -187,7 +187,7 @@ def _fields_of(codes: Codes) -> list[Field]:
     if isinstance(codes, SogCodes):
         sizes = _medians(codes.scale_codebook.astype(np.float64)[codes.scales]) * _LOG2_E
         steps = _log2(_extent(codes) / 65535) + sog_distances(codes, codes.positions) + 0.5
-        bits = _fitting(sizes[:, None] + _SHARE - steps)
+        bits = _fitting(sizes[:, None] + _POSITION_RANGE - steps)
         return _fields("positions", codes.positions, bits) + _fields("rotations", codes.rotations, 2)
     assert isinstance(codes, CompressedPlyCodes)
     low, high = codes.bounds[:, 6:9].astype(np.float64), codes.bounds[:, 9:12].astype(np.float64)

@@ -187,7 +187,7 @@ def chance_of_bits(words: Words32, bits: int) -> float:
 
 
 def salt_rows(gaussians: Gaussians, ids: Bytes, layout: Layout) -> Integers:
-    """Rows of the salts' Gaussians, at most SALTS, in order; `ids` [N, 16]."""
+    """Rows of the salts' Gaussians, at most SALTS, in the order of the salts; `ids` [N, 16]."""
     ranks = _ranks(gaussians, layout)
     # 9 bits of rank, 55 of the ID.
     keys = ranks << np.uint64(55) | ids[:, :8].copy().view(">u8")[:, 0].astype(np.uint64) >> np.uint64(9)
@@ -210,7 +210,7 @@ def exponents(words: Words32) -> Bytes:
 def near_equal(used: Words32, layout: Layout) -> Flags:
     """Mask [N] of Gaussians with nearly equal scales, quaternion components or channels of a harmonic.
 
-    Or with two equal pairs among the harmonics of two channels. By chance about 4 % of all Gaussians are.
+    Also of those with two pairs of equal harmonics, each in one channel. By chance it selects about 4 %.
     `used` [N, F]: the result of `used_words`.
     """
     high = np.ascontiguousarray(((used & _MAGNITUDE) >> layout.shifts).astype(np.int32).T)
@@ -244,7 +244,7 @@ def among(values: Numbers, ordered: Numbers) -> Flags:
 
 
 def _are_trained(used: Words32, layout: Layout, common: list[Words32], short: bool) -> Flags:
-    """Mask [N] of Gaussians without subnormal or frequent numbers, or a saturated or pruned opacity.
+    """Mask [N] of Gaussians with no subnormal or frequent number, and no saturated or nearly pruned opacity.
 
     Few numbers may end in many zeros; if `short`, none may be short.
     """
@@ -306,7 +306,7 @@ def _frequent_values(gaussians: Gaussians) -> list[Words32]:
 
 
 def _unlikely_copies(count: int) -> int:
-    """The least c >= 3 for which sets of c equal values are rare among `count` values.
+    """The least c >= 3 for which c equal values are rare among `count` values.
 
     With 2^26 equally likely values, count^c / c! / 2^(26 (c - 1)) such sets are expected.
     """

@@ -1,7 +1,8 @@
 """Wet paper codes (Fridrich et al. 2005): some bits must not change, and the reader does not know which.
 
-The bits are put in a public random order and cut into blocks. The message of a block is its product with a
-public random matrix, modulo 2. The writer solves for the bits that may change ("dry"); the reader multiplies.
+The bits are put in a public random order and cut into blocks. The message of a block is the product of a
+public random matrix and the block, modulo 2. The reader multiplies; the writer solves for the bits that may
+change ("dry").
 The capacity of a block is its number of dry bits, less the few by which random matrices lack full rank.
 """
 
@@ -22,7 +23,7 @@ _PUBLIC = bytes(32)  # seed
 
 
 def places(count: int) -> Integers:
-    """[B BLOCK] indices of the bits of all blocks, a public permutation of `count` bits."""
+    """[B x BLOCK] indices of the bits of all blocks, a public permutation of `count` bits."""
     numbers = np.frombuffer(stream(_PUBLIC, "codes/order", 8 * count), "<u8")
     # Sorted with their numbers in the lower half: the same on all machines, and faster than `argsort`.
     lower = np.uint64(2**32 - 1)
@@ -31,7 +32,7 @@ def places(count: int) -> Integers:
 
 
 def width_of(dry: Bits) -> int:
-    """Whole bytes that every block can hold; `dry` [B BLOCK]: 1 for bits that may change."""
+    """Whole bytes that every block can hold; `dry` [B x BLOCK]: 1 for bits that may change."""
     return max(0, int(dry.reshape(-1, BLOCK).sum(axis=1).min(initial=BLOCK)) - _SPARE) // 8
 
 
@@ -53,14 +54,14 @@ def block_ids(count: int, model_hash: bytes) -> Bytes:
 
 
 def read(bits: Bits, rate: int) -> Bits:
-    """[B, rate] the first bits of the messages in blocks [B BLOCK]."""
+    """[B, rate] the first bits of the messages in blocks [B x BLOCK]."""
     return _product(bits.reshape(-1, BLOCK), matrix(rate).T)
 
 
 def write(bits: Bits, dry: Bits, messages: Bits) -> Bits | None:
-    """[B BLOCK] `bits` with `dry` ones changed so that `read` gives the `messages` [B, rate].
+    """[B x BLOCK] `bits` with `dry` ones changed so that `read` gives the `messages` [B, rate].
 
-    All solutions are equally likely if dry bits were random. None if a block has too few dry bits.
+    All solutions are equally likely if dry `bits` are random. None if a block has too few dry bits.
 
     One elimination for all blocks: with as many columns of the matrix P as it has rows, and the others F,
     changes are x_P = P^-1 wanted + P^-1 F x_F. A block then needs an x_F by which x_P is 0 where bits stay.
@@ -85,7 +86,7 @@ def write(bits: Bits, dry: Bits, messages: Bits) -> Bits | None:
 
 @lru_cache(maxsize=1)
 def _eliminate(rate: int) -> tuple[Integers, Integers, Bits, Bits]:
-    """The columns of P (-1: none) and F in a matrix [R, BLOCK], P^-1 [R, R] and P^-1 F; see `write`."""
+    """Columns of P (-1: none) and of F in `matrix`, P^-1 [rate, rate] and P^-1 F; see `write`."""
     rows = np.concatenate([matrix(rate), np.eye(rate, dtype=np.uint8)], axis=1)
     reduced, pivots = _reduced(rows, BLOCK)
     others = np.setdiff1d(np.arange(BLOCK), pivots)
