@@ -1,8 +1,8 @@
-"""Public hashes, which hide nothing; what is derived from a secret: pseudo-random numbers, and sketches.
+"""Hashes, which hide nothing; pseudo-random numbers and sketches, which are derived from a secret.
 
 By a *sketch* of a model's Gaussians, a reader detects foreign ones: added or changed later. It is the first
 bits of a Bloom filter (Bloom 1970) of N bits with one keyed hash, for a model of N Gaussians. The bits of its
-own Gaussians are set, however many are lost. A foreign Gaussian hits an unset bit with probability
+own Gaussians are set, so losses do not matter. A foreign Gaussian hits an unset bit with probability
 bits / (e N).
 """
 
@@ -70,10 +70,9 @@ def sketch(secret: bytes, ids: Bytes, size: int = SKETCH_BYTES) -> bytes:
 
 def foreign(secret: bytes, ids: Bytes, own: bytes, gaussians: int) -> int:
     """Estimated number of `ids` [M, 16] foreign to the sketch `own` of `gaussians` Gaussians."""
-    bits = np.unpackbits(np.frombuffer(own, np.uint8), bitorder="little")
-    unset = bits[_places(secret, ids, gaussians, len(bits))] == 0
-    ways = int((bits[:gaussians] == 0).sum())
-    return min(len(ids), round(int(unset.sum()) * gaussians / max(1, ways)))
+    unset = np.unpackbits(np.frombuffer(own, np.uint8), bitorder="little") == 0
+    hits = int(unset[_places(secret, ids, gaussians, len(unset))].sum())
+    return min(len(ids), round(hits * gaussians / max(1, int(unset[:gaussians].sum()))))
 
 
 def _places(secret: bytes, ids: Bytes, count: int, kept: int) -> Integers:

@@ -22,7 +22,7 @@ from cryptography.hazmat.primitives.kdf.hkdf import HKDFExpand
 
 from keyss.core.arrays import Bytes
 from keyss.core.errors import InputError, UsageError
-from keyss.keys.key_file import ALPHABET, KEY_LENGTH, normalized_key
+from keyss.keys.key_file import ALPHABET, LONG_KEY_LENGTH, normalized_key
 
 if TYPE_CHECKING:  # the command line reads options without torch
     import torch
@@ -132,7 +132,7 @@ class MasterKey:
         label = f"master/{hashlib.sha256(data).hexdigest()}"
         number = int.from_bytes(self._derived.expand(label, 32), "big")
         characters = []
-        for _ in range(KEY_LENGTH):  # 131 of 256 bits: uniform to 2^-125
+        for _ in range(LONG_KEY_LENGTH):  # 131 of 256 bits: uniform to 2^-125
             number, digit = divmod(number, len(ALPHABET))
             characters.append(ALPHABET[digit])
         return "".join(characters)

@@ -15,7 +15,7 @@ from keyss.core.errors import InputError, KeyssWarning, OutputError, UsageError
 MAX_KEY_BYTES = 4096
 _TOO_LONG = f"the key is longer than {MAX_KEY_BYTES} bytes"
 ALPHABET = string.ascii_letters + string.digits
-KEY_LENGTH = 22  # characters of 5.95 bits: 131 bits
+LONG_KEY_LENGTH = 22  # of derived keys and of master keys of sweeps: 131 bits, at 5.95 per character
 # Argon2id costs 0.1 s of a core and 64 MiB per guess: these take three hundred thousand years of one core.
 _ENOUGH_GUESSES = 1e14
 _MAX_RATED = 100  # characters; zxcvbn takes superlinear time

@@ -4,7 +4,7 @@ They survive every publication format, and moving, rotating and scaling of the w
 that they are there; only the key reads them. A payload is encrypted as a whole (ChaCha20-Poly1305, with a key
 from Argon2id and the file's salt) and cut into packets, one per Gaussian. Reed-Solomon adds parity: any 5895
 packets of a codeword of at most 8192 suffice. A header holds the number of data packets. Random words pad the
-total to one of few numbers, which reveal neither the size nor the number of secrets.
+total to one of few numbers, which reveal little of the size and the number of secrets.
 """
 
 from __future__ import annotations
@@ -76,8 +76,8 @@ _ASSOCIATED = b"keyss/v1/appended/data"
 # The cover: how many of its Gaussians are seen, and their sketch. A format changes up to a fifth of the IDs;
 # another model of the same scene shares two fifths of them, one of another scene a tenth.
 _SKETCH_BYTES, _FOREIGN = 128, 0.4
-_HOST = struct.Struct(f"<I{_SKETCH_BYTES}s")
-MAX_BYTES = _MAX_PACKETS * _NARROW - OVERHEAD - METHOD_BYTES - _HOST.size
+_COVER = struct.Struct(f"<I{_SKETCH_BYTES}s")
+MAX_BYTES = _MAX_PACKETS * _NARROW - OVERHEAD - METHOD_BYTES - _COVER.size
 _VISIBLE_SECRETS = (
     "the number of appended Gaussians reveals the total size: the holder of one key can tell that there are "
     "other secrets"
@@ -102,7 +102,7 @@ class Appended(Channel):
     def appended_count(self, sizes: Sequence[int]) -> int:
         """The number of Gaussians appended for payloads of these compressed sizes in bytes."""
         single = len(sizes) == 1
-        every = [_codewords_for(size + _HOST.size, single) for size in sizes]
+        every = [_codewords_for(size + _COVER.size, single) for size in sizes]
         return _padded_count(sum(HEADERS + each.chunks for each in every))
 
 
@@ -132,9 +132,9 @@ class AppendedCover:
         if len(keys) > 1:
             warnings.warn(_VISIBLE_SECRETS, KeyssWarning, stacklevel=2)
         single = len(keys) == 1
-        bound = [_HOST.pack(len(ids), sketch(_sketch_key(key), ids, _SKETCH_BYTES)) for key in keys]
-        tied = [cover + data for cover, data in zip(bound, packed, strict=True)]
-        words = [_words(*each, single, random) for each in zip(keys, tied, strict=True)]
+        sketches = [sketch(_sketch_key(key), ids, _SKETCH_BYTES) for key in keys]
+        data = [_COVER.pack(len(ids), own) + each for own, each in zip(sketches, packed, strict=True)]
+        words = [_words(*each, single, random) for each in zip(keys, data, strict=True)]
         used = sum(map(len, words))
         total = _padded_count(used)
         words.append(pilots.write(salt, pilots.count_for(total), random))
@@ -175,18 +175,18 @@ class AppendedReader(SaltedReader):
         return None
 
     def extract(self, key: DerivedKey) -> Payload:
-        """`open` after key derivation."""
+        """See `SaltedReader`."""
         for width in (_WIDE, _NARROW):
             header = read_header(key.expand(f"appended/header/{width}", 32), self.words, width)
             if header:
                 numbers, data = read_packets(key.expand("appended/packets", 32), self.words, width)
                 encrypted = _codewords(header, width).decode(numbers.astype(np.int64), data, errors=True)
                 whole = decrypt(key.expand("appended/data", 32), encrypted, _ASSOCIATED)
-                if len(whole) < _HOST.size:
+                if len(whole) < _COVER.size:
                     raise InputError("the hidden data are damaged: they are incomplete")
-                foreign_count = foreign(_sketch_key(key), self.ids, *reversed(_HOST.unpack_from(whole)))
+                foreign_count = foreign(_sketch_key(key), self.ids, *reversed(_COVER.unpack_from(whole)))
                 told = foreign_count if foreign_count > _FOREIGN * len(self.ids) else 0
-                return replace(unpack_payload(whole[_HOST.size :]), foreign=told)
+                return replace(unpack_payload(whole[_COVER.size :]), foreign=told)
         raise WrongKeyError()
 
 
@@ -242,11 +242,11 @@ def _shifts_with_pilots(steps: Doubles, colours: Integers) -> Iterator[float]:
             yield float(shifts[index])
 
 
-def _words(key: DerivedKey, packed: bytes, single: bool, random: np.random.Generator) -> Bits:
-    """Words [N, WORD_BITS] of one secret's headers and packets; `single`: it is the only secret."""
-    codewords = _codewords_for(compressed_size(packed), single)
+def _words(key: DerivedKey, data: bytes, single: bool, random: np.random.Generator) -> Bits:
+    """Words [N, WORD_BITS] of the headers and packets of `data`; `single`: there is only one secret."""
+    codewords = _codewords_for(compressed_size(data), single)
     width, needed = codewords.width, codewords.count * codewords.k
-    encrypted = encrypt(key.expand("appended/data", 32), packed, _ASSOCIATED, size=codewords.size)
+    encrypted = encrypt(key.expand("appended/data", 32), data, _ASSOCIATED, size=codewords.size)
     numbers = np.arange(codewords.chunks, dtype=np.uint64)
     return np.concatenate(
         [

@@ -18,7 +18,7 @@ from keyss.core import BackendError, Interrupted, KeyssError, OutputError, Usage
 from keyss.files import lock, write_bytes
 from keyss.fitting import FitConfig
 from keyss.keys import generate_key
-from keyss.keys.key_file import KEY_LENGTH
+from keyss.keys.key_file import LONG_KEY_LENGTH
 from keyss.lab.audits.trial_measures import check_extras
 from keyss.lab.many.trial import MASTER_KEY, RUN, Result, Trial, cost_of_trial, finished_result, run_trial
 from keyss.methods import MethodOptions
@@ -112,7 +112,7 @@ class TrialFolder:
         reporter = reporter or default_reporter()
         with claim_folder(self.out):
             if not (self.out / MASTER_KEY).exists():
-                write_bytes(self.out / MASTER_KEY, f"{generate_key(KEY_LENGTH)}\n".encode())
+                write_bytes(self.out / MASTER_KEY, f"{generate_key(LONG_KEY_LENGTH)}\n".encode())
             found = {
                 folder: Outcome(trial.name, folder, result, skipped=True)
                 for folder, trial in self.trials.items()
