@@ -59,7 +59,7 @@ def test_a_visible_gaussian_carries_less() -> None:
 
 
 def test_names_survive_the_rounding_of_spz() -> None:
-    """Log scales in sixteenths, colours and opacities in bytes: borders of cells are borders of rounding."""
+    """Log scales in sixteenths, colours and opacities in bytes: borders of bins are borders of rounding."""
     model = cover()
     rounded = replace(
         model,
@@ -116,10 +116,10 @@ def test_salts_are_new_and_are_found_again_after_rounding_and_pruning() -> None:
     assert len(set(find_salts(Carriers.of(turned(1.37)(rounded)))[1]) & set(one)) >= 3
 
 
-def test_new_salts_leave_each_number_where_it_lies_in_its_cell() -> None:
+def test_new_salts_leave_each_number_where_it_lies_in_its_bin() -> None:
     carriers = Carriers.of(cover())
     moved = renew_salts(carriers, np.random.default_rng(1)).colours - carriers.colours
-    cells = moved * 38.25 / 5
-    assert np.abs(cells - cells.round()).max() < 1e-9
+    bins = moved * 38.25 / 5
+    assert np.abs(bins - bins.round()).max() < 1e-9
     assert 1 <= (moved != 0).any(axis=1).sum() <= SALTS
     assert (moved[:, 0] == 0).all()

@@ -246,7 +246,7 @@ def test_siblings_that_moved_apart_by_equal_steps_stay_as_they_are() -> None:
 
 @pytest.mark.parametrize("sh_degree", [1, 2, 3])
 def test_siblings_are_those_of_a_plain_search(sh_degree: int) -> None:
-    """All pairs of a Gaussian and its 12 nearest neighbours, in NumPy; numbers are known to a cell."""
+    """All pairs of a Gaussian and its 12 nearest neighbours, in NumPy; low bits are unknown."""
     model, _ = siblings_like(400, 120, sh_degree)
     model = replace(model, sh=model.sh[:, : (sh_degree + 1) ** 2])
     model.sh[:100, -1] += 1e-3 * torch.arange(1, 101)[:, None]  # no steps
@@ -254,13 +254,13 @@ def test_siblings_are_those_of_a_plain_search(sh_degree: int) -> None:
     colours[:, 0] = 50 + torch.arange(400)[:, None] * 7.3  # no steps of harmonics are as large
     known = usable_carriers(replace(model, sh=colours))
     means, sh = model.means.double().numpy(), model.sh.numpy()
-    cells = (sh.view(np.uint32) & ~np.uint32(8191) | np.uint32(4096)).view(np.float32).astype(float)
+    known_sh = (sh.view(np.uint32) & ~np.uint32(8191) | np.uint32(4096)).view(np.float32).astype(float)
     apart = np.zeros(400, bool)
     for row in np.flatnonzero(known):
         for other in np.argsort(((means - means[row]) ** 2).sum(axis=1), kind="stable")[1:13]:
             for colour in range(3):
                 steps = abs(float(sh[row, 0, colour]) - float(sh[other, 0, colour])) / 20
-                own, its = cells[row, 1:, colour], cells[other, 1:, colour]
+                own, its = known_sh[row, 1:, colour], known_sh[other, 1:, colour]
                 near = np.abs(np.abs(own - its) - steps) <= np.maximum(np.abs(own), np.abs(its)) / 1024
                 if near.sum() >= max(3, len(own) / 3):
                     apart[[row, other]] = True
@@ -297,7 +297,7 @@ def test_covers_whose_harmonics_follow_each_other_are_refused(two: tuple[int, in
 
 
 def test_no_opacity_crosses_the_threshold_of_pruning() -> None:
-    """Trainers remove opacities below 0.005. Its own cell is left alone, and no other."""
+    """Trainers remove opacities below 0.005. Those with the same fixed bits stay, and no others."""
     edge = np.float32(np.log(0.005 / 0.995))
     words = edge.view(np.uint32) + np.arange(-1536, 1536, 3, np.int32).astype(np.uint32)
     model = trained_like(1024, 0)

@@ -1,19 +1,19 @@
 """Gaussians that carry bits, their IDs, and those that give the salts.
 
 The bits go into the constant green and blue coefficients (`f_dc_1`, `f_dc_2`), which are the least visible
-numbers to change among those that survive every format. The *ID* of a Gaussian is four cell indices: of two
-ratios of its scales, its opacity and its red coefficient. Writing changes none of these, and none depends on
-the model's position, rotation, scale or order.
+numbers to change among those that survive every format. The *ID* of a Gaussian is the indices of four *bins*:
+of two ratios of its scales, its opacity and its red coefficient. Writing changes none of these, and none
+depends on the model's position, rotation, scale or order.
 
-Cells begin and end between the rounded values of 8-bit formats (`.spz`: log scales in sixteenths, colours in
-steps of 1 / 38.25; most formats: opacities in 255ths), so rounding moves no number into another cell. Scaling
-a model moves rounded values relative to the cells, so a reader tries several *alignments*.
+Bins begin and end between the rounded values of 8-bit formats (`.spz`: log scales in sixteenths, colours in
+steps of 1 / 38.25; most formats: opacities in 255ths), so rounding moves no number into another bin. Scaling
+a model moves rounded values relative to the bins, so a reader tries several *alignments*.
 
-*Salt Gaussians* have the smallest public hashes of their cells (opacity, ratios of scales, red), among the
-Gaussians whose numbers no format can move into another cell. Half of them are faint, so that a new colour is
+*Salt Gaussians* have the smallest public hashes of their bins (opacity, ratios of scales, red), among the
+Gaussians whose numbers no format can move into another bin. Half of them are faint, so that a new colour is
 hardly visible; the other half survives the removal of faint Gaussians. A salt of Argon2id is a hash of the
-cells of one salt Gaussian, green and blue included. A writer moves green and blue by a uniformly random
-number of cells, -3 to 3, which makes all salts new: two files of one model share each salt with a probability
+bins of one salt Gaussian, green and blue included. A writer moves green and blue by a uniformly random
+number of bins, -3 to 3, which makes all salts new: two files of one model share each salt with a probability
 of 1/49.
 """
 
@@ -35,13 +35,13 @@ from keyss.keys.derivation import SALT_BYTES, expand
 _SCALE_STEPS, _COLOUR_STEPS, _OPACITY_STEPS = 16, 38.25, 255  # quantisation steps of 8-bit formats per unit
 # Maximum rounding errors of formats in steps, taken as uniform noise.
 _SCALE_NOISE, _COLOUR_NOISE, _OPACITY_NOISE = 0.144, 0.344, 1.02
-_RATIO_CELL, _OPACITY_CELL, _RED_CELL = 4, 8, 3  # steps
+_RATIO_BIN, _OPACITY_BIN, _RED_BIN = 4, 8, 3  # steps
 _MIN_OPACITY = 2.5 / 255  # formats drop the colours of fainter Gaussians
-_CELLS = 30_000  # maximum absolute index, which fits into 16 bits
+_BINS = 30_000  # maximum absolute index, which fits into 16 bits
 SALTS = 16  # maximum number; 5 to 12 survive rounding and random pruning of a quarter
 _BANDS = (0.08, 0.4, 1.01)  # limits of two opacity bands with half of the salts each
-_MAX_MOVED = 3  # cells
-_SALT_OPACITY_CELL, _SALT_RATIO_CELL, _SALT_COLOUR_CELL = 16, 8, 5  # steps
+_MAX_MOVED = 3  # bins
+_SALT_OPACITY_BIN, _SALT_RATIO_BIN, _SALT_COLOUR_BIN = 16, 8, 5  # steps
 _LABEL = b"keyss/v1/colours-salt"
 _PUBLIC = hashlib.sha256(_LABEL).digest()
 
@@ -56,7 +56,7 @@ class Carriers:
     log_scales: Doubles  # [C, 3]
     opacities: Doubles  # [C]
     colours: Doubles  # [C, 3] constant coefficients
-    ids: Ids  # [C, 4] cell indices: two ratios of scales, opacity, red
+    ids: Ids  # [C, 4] bin indices: two ratios of scales, opacity, red
     error_probability: Doubles  # [C] that a format has changed the ID since writing
 
     @staticmethod
@@ -70,10 +70,10 @@ class Carriers:
         fine = np.isfinite(log_scales).all(axis=1) & np.isfinite(colours).all(axis=1)
         rows = np.flatnonzero(fine & (opacities > _MIN_OPACITY))
         log_scales, colours, opacities = log_scales[rows], colours[rows], opacities[rows]
-        whole, loose = _cells_of(log_scales * _SCALE_STEPS + 0.5 + alignment, 1, _SCALE_NOISE)
-        ratios, edge = _cells_of(np.diff(whole, axis=1) + 0.5, _RATIO_CELL, 1.0)  # 1/4 next to a border
-        opacity, faint = _cells_of(opacities[:, None] * _OPACITY_STEPS - 0.5, _OPACITY_CELL, _OPACITY_NOISE)
-        red, off = _cells_of(colours[:, :1] * _COLOUR_STEPS, _RED_CELL, _COLOUR_NOISE)
+        whole, loose = _bins_of(log_scales * _SCALE_STEPS + 0.5 + alignment, 1, _SCALE_NOISE)
+        ratios, edge = _bins_of(np.diff(whole, axis=1) + 0.5, _RATIO_BIN, 1.0)  # 1/4 next to a border
+        opacity, faint = _bins_of(opacities[:, None] * _OPACITY_STEPS - 0.5, _OPACITY_BIN, _OPACITY_NOISE)
+        red, off = _bins_of(colours[:, :1] * _COLOUR_STEPS, _RED_BIN, _COLOUR_NOISE)
         errors = np.hstack([2 * edge * (loose[:, 1:] + loose[:, :-1]), faint, off])
         ids = np.hstack([ratios, opacity, red]).astype(np.int16)
         return Carriers(rows, log_scales, opacities, colours, ids, 1 - (1 - errors).prod(axis=1))
@@ -83,8 +83,8 @@ class Carriers:
 
     @cached_property
     def impact(self) -> Doubles:
-        """Visibility [C] of a colour change: log(area x opacity^2), with the opacity of the cell."""
-        opacities = (self.ids[:, 2] + 0.5) * _OPACITY_CELL / _OPACITY_STEPS
+        """Visibility [C] of a colour change: log(area x opacity^2), with the opacity of the bin."""
+        opacities = (self.ids[:, 2] + 0.5) * _OPACITY_BIN / _OPACITY_STEPS
         impact: Doubles = np.sort(self.log_scales)[:, 1:].sum(axis=1) + 2 * np.log(opacities.clip(1e-3))
         return impact
 
@@ -108,28 +108,28 @@ def find_salts(carriers: Carriers) -> tuple[Integers, list[bytes]]:
     ratios = np.diff(carriers.log_scales, axis=1) * _SCALE_STEPS - 0.5
     opacities = carriers.opacities[:, None] * _OPACITY_STEPS - 0.5
     parts = (
-        _cells_of(opacities, _SALT_OPACITY_CELL, _OPACITY_NOISE),
-        _cells_of(ratios, _SALT_RATIO_CELL, 1.0),
-        _cells_of(carriers.colours * _COLOUR_STEPS, _SALT_COLOUR_CELL, _COLOUR_NOISE),
+        _bins_of(opacities, _SALT_OPACITY_BIN, _OPACITY_NOISE),
+        _bins_of(ratios, _SALT_RATIO_BIN, 1.0),
+        _bins_of(carriers.colours * _COLOUR_STEPS, _SALT_COLOUR_BIN, _COLOUR_NOISE),
     )
-    cells = np.hstack([part for part, _ in parts]).astype("<i2")
+    bins = np.hstack([part for part, _ in parts]).astype("<i2")
     stable = (np.hstack([error for _, error in parts])[:, :4] == 0).all(axis=1)
-    hashes = fractions(_PUBLIC, "salt", cells[:, :4])[:, 0]
+    hashes = fractions(_PUBLIC, "salt", bins[:, :4])[:, 0]
     chosen = []
     for low, high in pairwise(_BANDS):
         band = np.flatnonzero(stable & (carriers.opacities > low) & (carriers.opacities <= high))
         _, first = np.unique(hashes[band], return_index=True)
         chosen.append(band[first[: SALTS // (len(_BANDS) - 1)]])
     rows = np.concatenate(chosen)
-    salts = [hashlib.sha256(_LABEL + cells[row].tobytes()).digest()[:SALT_BYTES] for row in rows]
+    salts = [hashlib.sha256(_LABEL + bins[row].tobytes()).digest()[:SALT_BYTES] for row in rows]
     return rows, list(dict.fromkeys(salts))
 
 
 def renew_salts(carriers: Carriers, random: np.random.Generator) -> Carriers:
     """The carriers with new greens and blues of salt Gaussians, hence new salts."""
     rows, colours = find_salts(carriers)[0], carriers.colours.copy()
-    cells = random.integers(-_MAX_MOVED, _MAX_MOVED + 1, (len(rows), 2))
-    colours[rows, 1:] += cells * _SALT_COLOUR_CELL / _COLOUR_STEPS
+    bins = random.integers(-_MAX_MOVED, _MAX_MOVED + 1, (len(rows), 2))
+    colours[rows, 1:] += bins * _SALT_COLOUR_BIN / _COLOUR_STEPS
     return replace(carriers, colours=colours)
 
 
@@ -146,9 +146,9 @@ def fractions(secret: bytes, label: str, ids: Ids) -> Doubles:
     return (random_pairs(secret, label, ids) >> np.uint64(11)) / 2.0**53
 
 
-def _cells_of(values: Doubles, steps: int, noise: float) -> tuple[Doubles, Doubles]:
-    """Cells of `steps` steps for values [C, k] in steps; probabilities that noise changed the cell."""
-    cells = np.floor(values / steps)
-    inside = values - cells * steps
+def _bins_of(values: Doubles, steps: int, noise: float) -> tuple[Doubles, Doubles]:
+    """Bins of `steps` steps for values [C, k] in steps; probabilities that noise changed the bin."""
+    bins = np.floor(values / steps)
+    inside = values - bins * steps
     nearest = np.minimum(inside, steps - inside)
-    return cells.clip(-_CELLS, _CELLS), ((noise - nearest) / (2 * noise)).clip(0, 0.5)
+    return bins.clip(-_BINS, _BINS), ((noise - nearest) / (2 * noise)).clip(0, 0.5)

@@ -64,9 +64,9 @@ _SHARE = 3  # a third of the harmonics of a colour agree, and at least three
 _ROWS = 1 << 12
 _SAMPLE, _NEAR = 5000, 8  # Gaussians whose pairs of harmonics are tested, and neighbours of each
 _COMPACT, _RUN = 100_000, 2000  # Gaussians that are looked at in larger models, in runs along a Z-order curve
-_PART = 16  # of a cell, within which steps are equal
-_CELL = np.uint32((1 << SH_BITS + UNUSED_BITS) - 1)
-_CELL_SHARE = np.float32(2.0 ** (SH_BITS + UNUSED_BITS - 23))  # cell width / number, up to a factor of 2
+# A span is the width of the interval of numbers with equal fixed bits; in its sixteenths, steps are equal.
+_LOW, _PART = np.uint32((1 << SH_BITS + UNUSED_BITS) - 1), 16
+_SPAN_SHARE = np.float32(2.0 ** (SH_BITS + UNUSED_BITS - 23))  # span / number, up to a factor of 2
 
 
 def count_trailing_zeros(words: Words32, chosen: Flags) -> Integers:
@@ -99,7 +99,7 @@ def least_exponent(counts: Integers, share: float) -> int:
 
 
 def find_siblings(gaussians: Gaussians, among: Flags) -> Flags:
-    """[N] which Gaussians `among` [N] moved away from a neighbour by equal steps, as fixed bits tell."""
+    """Mask [N] of Gaussians `among` [N] that moved away from a neighbour by equal steps, as fixed bits tell."""
     if len(gaussians) < 2 or not gaussians.sh_degree:
         return np.zeros(len(gaussians), bool)
     means = np.nan_to_num(doubles(gaussians.means), posinf=0, neginf=0)
@@ -131,8 +131,8 @@ def find_siblings(gaussians: Gaussians, among: Flags) -> Flags:
 def chance_of_equal_steps(gaussians: Gaussians, usable: Flags) -> float:
     """p-value of equal steps of two harmonics under the null hypothesis of uniform low bits of `usable` [N].
 
-    Of differences between neighbours that agree as far as fixed bits tell, those within a sixteenth of a cell
-    are as many as those from one to two sixteenths. Exact binomial tests, Bonferroni-corrected.
+    Of differences between neighbours that agree as far as fixed bits tell, as many are below a sixteenth of a
+    span as between one and two sixteenths. Exact binomial tests, Bonferroni-corrected.
     """
     from scipy.special import bdtr  # takes long to load
 
@@ -206,8 +206,8 @@ def _distance(exponents: Integers, scale: float) -> Doubles:
 
 
 def _middles(numbers: Floats) -> Floats:
-    """[...] float32 numbers, as far as fixed bits tell."""
-    return (numbers.view(np.uint32) & ~_CELL | (_CELL + 1) >> 1).view(np.float32)
+    """[...] float32 numbers with the middle of all low bits, as far as fixed bits tell them."""
+    return (numbers.view(np.uint32) & ~_LOW | (_LOW + 1) >> 1).view(np.float32)
 
 
 @kernel
@@ -226,8 +226,8 @@ def _mark(rows: Any, near: Any, middles: Any, needed: int, apart: Any) -> None:
                 steps = abs(own[0] - its[0])
                 agree = np.float32(0)
                 for at in range(len(own)):
-                    cell = max(abs(own[at]), abs(its[at])) * _CELL_SHARE
-                    agree += np.float32(1 if abs(abs(own[at] - its[at]) - steps) <= cell else 0)
+                    span = max(abs(own[at]), abs(its[at])) * _SPAN_SHARE
+                    agree += np.float32(1 if abs(abs(own[at] - its[at]) - steps) <= span else 0)
                 if agree >= needed:
                     apart[one] = apart[other] = True
 
@@ -239,7 +239,7 @@ def _count_equal(rows: Any, near: Any, sh: Any, middles: Any, counts: Any) -> No
     Then those whose steps differ by up to twice as much. `sh` [N, C, 3] and its `middles`.
     """
     size = sh.shape[1]
-    steps, known, cells = np.empty(size), np.empty(size), np.empty(size)
+    steps, known, spans = np.empty(size), np.empty(size), np.empty(size)
     for row in range(len(rows)):
         for other in near[row]:
             for colour in range(3):
@@ -247,12 +247,12 @@ def _count_equal(rows: Any, near: Any, sh: Any, middles: Any, counts: Any) -> No
                     steps[at] = abs(sh[rows[row], at, colour] - sh[other, at, colour])
                     own, its = middles[rows[row], at, colour], middles[other, at, colour]
                     known[at] = abs(own - its)
-                    cells[at] = max(abs(own), abs(its)) * _CELL_SHARE
-                steps[0], known[0], cells[0] = steps[0] / _RATE_RATIO, steps[0] / _RATE_RATIO, 0.0
+                    spans[at] = max(abs(own), abs(its)) * _SPAN_SHARE
+                steps[0], known[0], spans[0] = steps[0] / _RATE_RATIO, steps[0] / _RATE_RATIO, 0.0
                 for one in range(size):
                     for two in range(one + 1, size):
-                        cell = max(cells[one], cells[two])
-                        if known[one] > 2 * cell and abs(known[one] - known[two]) <= cell < known[two] / 2:
+                        span = max(spans[one], spans[two])
+                        if known[one] > 2 * span and abs(known[one] - known[two]) <= span < known[two] / 2:
                             off = abs(steps[one] - steps[two]) * _PART
-                            if off < 2 * cell:
-                                counts[0 if off < cell else 1, one, two] += 1
+                            if off < 2 * span:
+                                counts[0 if off < span else 1, one, two] += 1
