@@ -99,7 +99,7 @@ def least_exponent(counts: Integers, share: float) -> int:
 
 
 def find_siblings(gaussians: Gaussians, among: Flags) -> Flags:
-    """Mask [N] of Gaussians `among` [N] that moved away from a neighbour by equal steps, as fixed bits tell."""
+    """Mask [N] of Gaussians `among` [N] that moved away from a neighbour by equal steps, by fixed bits."""
     if len(gaussians) < 2 or not gaussians.sh_degree:
         return np.zeros(len(gaussians), bool)
     means = np.nan_to_num(doubles(gaussians.means), posinf=0, neginf=0)

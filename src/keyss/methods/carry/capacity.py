@@ -25,7 +25,7 @@ _ANY = '`publish="any"` has room for all'
 
 @dataclass(frozen=True)
 class SecretSize:
-    """The size of a secret, or its maximum size if it is not fitted yet."""
+    """The size of a secret, at most if it is not fitted yet."""
 
     count: int
     model: Gaussians | None = None  # None: not fitted yet
@@ -76,7 +76,7 @@ class CarryCapacity:
         return CarryCapacity(len(cover), cover.sh_degree, channel, prepared.capacity, prepared)
 
     def sizes(self, secrets: Sequence[SecretSize]) -> list[int]:
-        """Gaussians that fit for each secret, at most its own; an estimate for secrets that do not fit.
+        """The number of Gaussians of each secret that fit; an estimate where not all do.
 
         Raises UsageError if the cover is too small.
         """
@@ -106,7 +106,7 @@ class CarryCapacity:
 
 
 def _cure(cover: Gaussians | None, options: CarryOptions) -> str:
-    """For messages: the least SH degree that gives `cover` capacity, and what always works."""
+    """Advice for messages: the least SH degree that gives `cover` capacity, and what always works."""
     for degree in range(options.fit.sh_degree + 1, 3):
         with suppress(UsageError):
             if cover is None:
@@ -118,10 +118,7 @@ def _cure(cover: Gaussians | None, options: CarryOptions) -> str:
 
 
 def to_degree(model: Gaussians, sh_degree: int, entropy: bytes) -> Gaussians:
-    """`model` with harmonics of `sh_degree`; added ones are small random numbers.
-
-    (Zeros have no low bits to replace.)
-    """
+    """`model` with harmonics of `sh_degree`; added ones are small and random, as zeros have no low bits."""
     count = (sh_degree + 1) ** 2 - model.sh.shape[1]
     if count <= 0:
         return model.with_sh_degree(sh_degree) if count else model  # the same object was prepared before
@@ -135,9 +132,9 @@ def to_degree(model: Gaussians, sh_degree: int, entropy: bytes) -> Gaussians:
 def shares(capacity: Capacity, needed: Sequence[int]) -> list[int]:
     """Maximum bytes of each secret's payload, for secrets that need `needed` bytes at the finest precision.
 
-    The first of a quarter, a half and all of the capacity that suffices: a secret's precision then does not
-    depend on the others, and its key does not reveal them. Equal shares if these exceed the capacity, or if
-    the model grows.
+    Each gets the first of a quarter, a half and all of the capacity that suffices: its precision then does
+    not depend on the others, and its key does not reveal them. If these shares exceed the capacity, or if the
+    model grows, they are equal.
     """
     total = int(capacity.bytes * capacity.further ** (len(needed) - 1))
     parts = [

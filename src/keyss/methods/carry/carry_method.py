@@ -1,4 +1,4 @@
-"""The method `carry`: encrypts the secrets' models (see `model_bytes`) in the published model."""
+"""The method `carry`: hides the secrets' models as bytes (see `model_bytes`) in a channel of the cover."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _VISIBLE = (
     '(`publish="any"`), because it cannot be hidden unnoticed: {}'
 )
 _REFIT_SHARE = 0.97  # refit size / Gaussians that fit: refitted Gaussians compress a little worse
-_MIN_SHARE = 1 / 6  # fraction of a secret's Gaussians; refits of public models with fewer are below 30 dB
+_MIN_SHARE = 1 / 6  # of a secret's Gaussians; refits of public models with fewer are below 30 dB
 
 
 class CarryMethod:
@@ -45,9 +45,10 @@ class CarryMethod:
     options = CarryOptions
 
     def prepare(self, sources: Sequence[Source], options: CarryOptions) -> CarryOptions:
-        """Choose the secrets to refit: once all are fitted, also those that do not fit the cover.
+        """Set `sh_degree` and the steps of refits; a second call, with fitted models, only adds refits.
 
-        Raises UsageError for a cover without capacity.
+        If secrets cannot be hidden unnoticed, `publish` becomes "any", with a warning, where `may_show`.
+        Otherwise raises UsageError.
         """
         cover, *secrets = sources
         degree = options.sh_degree
@@ -75,18 +76,16 @@ class CarryMethod:
             options.iterations or (steps if secret.photos else min(options.fit.iterations, _MODEL_ITERATIONS))
             for secret in secrets
         ]
-        planned = options.refits or (0,) * len(cut)  # set by the first call
+        planned = options.refits or (0,) * len(cut)  # by the first call
         return replace(
             options, refits=tuple(p or (n if c else 0) for p, n, c in zip(planned, refits, cut, strict=True))
         )
 
     def plan(self, sources: Sequence[Source], options: CarryOptions) -> Plan:
-        """The capacity of the cover before refits; notes list the losses of the cover and the secrets."""
+        """See `Method`; notes tell what changes in the cover, and its capacity."""
         cover, *secrets = sources
-        capacity, secret_sizes = (
-            CarryCapacity.of(cover.given, options, _PLANNED),
-            _secret_sizes(secrets, options),
-        )
+        capacity = CarryCapacity.of(cover.given, options, _PLANNED)
+        secret_sizes = _secret_sizes(secrets, options)
         sizes, appended, notes = capacity.sizes(secret_sizes), capacity.appended(secret_sizes), []
         if cover.given is not None and capacity.sh_degree != cover.given.sh_degree:
             assert capacity.prepared is not None
@@ -156,7 +155,7 @@ def _secret_sizes(secrets: Sequence[Source], options: CarryOptions) -> list[Secr
 
 
 def _check_share(secrets: Sequence[SecretSize], sizes: Sequence[int]) -> None:
-    """Raise UsageError for given secrets that would lose most of their Gaussians."""
+    """Raise UsageError for given secrets that would keep less than _MIN_SHARE of their Gaussians."""
     for secret, count in zip(secrets, sizes, strict=True):
         if secret.model is not None and count < _MIN_SHARE * secret.count:
             raise UsageError(f"a secret of {secret.count:,} Gaussians would be cut down to {count:,}")
@@ -175,7 +174,7 @@ def refit(
     photos: bool,
     name: str,
 ) -> Gaussians:
-    """Fine-tune the `count` Gaussians of `secret` with the largest contributions.
+    """Train the `most_contributing` Gaussians of `secret` further.
 
     Raises Interrupted on Ctrl-C, InputError for a checkpoint of another run.
     """
@@ -207,10 +206,10 @@ def embed_models(
     viewpoints: Sequence[Viewpoints] | None = None,
     entropy: bytes | None = None,
 ) -> Stego:
-    """Embed all Gaussians of each model under its key, and verify that they open.
+    """Embed each model under its key, and verify that it opens.
 
     `viewpoints`: views of each model that determine its precision; by default, four around it. Raises
-    UsageError if the models do not fit. Warns (KeyssWarning) if a secret is smaller than it would be alone.
+    UsageError if the models do not fit. Warns (KeyssWarning) if a secret gets fewer bytes than alone.
     """
     viewpoints, capacity = viewpoints or [*map(Viewpoints.around, models)], cover.capacity
     needed = list(map(finest_size, models))

@@ -13,7 +13,7 @@ REFIT = 1.15  # refit steps / fit steps, with photos; at 1, secrets lose 0.15 dB
 
 @dataclass(frozen=True, kw_only=True)
 class CarryOptions(MethodOptions):
-    """Options of `carry`; `fit` is for plain models, and refits add REFIT times its steps."""
+    """Options of `carry`; `fit` is for plain models, and a refit adds REFIT times its steps."""
 
     method: ClassVar[str] = "carry"
 
@@ -32,7 +32,7 @@ class CarryOptions(MethodOptions):
     ] = None
     iterations: int | None = None  # steps per refit; None: REFIT per step of `fit`, fewer without photos
 
-    refits: tuple[int, ...] = ()  # set by `prepare`: refit steps of each secret (0: carried unchanged)
+    refits: tuple[int, ...] = ()  # set by `prepare`: refit steps of each secret; 0: no refit
 
     @property
     def may_train(self) -> bool:
@@ -45,7 +45,7 @@ class CarryOptions(MethodOptions):
         return self.publish == "as-is" and self.refit == "auto" and self.format is None
 
     def fits(self, scenes: int) -> list[FitConfig]:
-        """Secrets get the steps of a refit if none follows."""
+        """A secret without a refit gets the steps of one in addition."""
         alone = round((1 + REFIT) * self.fit.iterations)
         of_secrets = [
             replace(self.fit, iterations=self.fit.iterations if steps else alone)

@@ -1,9 +1,10 @@
 """Compression of integer tables by an adaptive binary range coder.
 
 The prediction of a number is a fraction of the previous one in its column. The residual is coded as its bit
-count in unary, its sign and its bits. Skewed decisions have adaptive probabilities; the context of the count
-is the size of earlier residuals in the row and the column. The coder is LZMA's, with probabilities of 12
-instead of 11 bits: the mean of a fast and a slow estimate (as in AV1 and successors of CABAC).
+count in unary, its sign and its bits. The count and the bit after the first have adaptive probabilities; the
+context of the count is the size of earlier residuals in the row and the column. The coder is LZMA's, with
+probabilities of 12 instead of 11 bits: the mean of a fast and a slow estimate (as in AV1 and successors of
+CABAC).
 """
 
 from __future__ import annotations
@@ -17,24 +18,24 @@ from keyss.core.arrays import Integers
 from keyss.core.errors import InputError
 from keyss.kernels.jit import inline, kernel
 
-Codes = npt.NDArray[np.int32]
+Table = npt.NDArray[np.int32]
 
 MAX_NUMBER = 1 << 29  # differences have at most 31 bits
 _MAX_BITS = 31
-_CONTEXTS = 16  # for bit counts; one more is for first bits
+_CONTEXTS = 16  # for bit counts; one more is for the bits after the first
 
 
-def encode(table: Codes, shares: Integers, groups: Integers) -> bytes:
+def encode(table: Table, shares: Integers, groups: Integers) -> bytes:
     """Compress `table` [N, C] with absolute values of at most MAX_NUMBER.
 
-    `shares` [C]: prediction coefficients of the columns, in eighths. `groups` [C]: indices from 0; columns of
-    one group share their probabilities.
+    `shares` [C]: prediction coefficients of the columns, in eighths. `groups` [C]: indices from 0; columns
+    with the same index share their probabilities.
     """
     coded, size = _code(table, shares, groups, np.empty(table.size + 1024, np.uint8), False)
     return bytes(coded[:size])
 
 
-def decode(data: bytes, count: int, shares: Integers, groups: Integers) -> Codes:
+def decode(data: bytes, count: int, shares: Integers, groups: Integers) -> Table:
     """Decompress a table [count, C]. Raises InputError for too few or too many bytes."""
     table = np.zeros((count, len(shares)), np.int32)
     _, size = _code(table, shares, groups, np.frombuffer(data + b"\0", np.uint8).copy(), True)

@@ -28,7 +28,7 @@ from keyss.core.gaussians import MAX_COORDINATE, MAX_LOG_SCALE, OPPONENT, Gaussi
 from keyss.files.formats.common import in_morton_order, with_largest_w
 from keyss.kernels.parallel import in_blocks
 from keyss.methods.codec import entropy
-from keyss.methods.codec.entropy import Codes
+from keyss.methods.codec.entropy import Table
 
 _ALWAYS = 1 << 16  # number of Gaussians that a payload of any size may declare
 _MIN_BYTES = 2  # minimum bytes per Gaussian of a larger model
@@ -79,12 +79,12 @@ def encode(model: Gaussians, precision: Precision | None = None) -> bytes:
     """Encode `model`, by default with the usual precision."""
     model = in_morton_order(model)
     steps = (precision or Precision.usual(model)).steps
-    numbers = _even_columns(model)
+    numbers = _uniform_columns(model)
     parts = (0, 1, 2, slice(3, 6), 6)  # x, y, z, log scales, opacity logits
     centres = [float(np.float32(np.median(numbers[:, part]))) for part in parts]
     codes = np.empty((len(model), 10 + model.sh[0].numel()), np.int32)
-    codes[:, :10] = _round((numbers - _origin(centres)) / _even_steps(steps))
-    finer = _refinement(*_even_numbers(codes[:, :10], centres, steps)[1:3])
+    codes[:, :10] = _round((numbers - _origin(centres)) / _uniform_steps(steps))
+    finer = _refinement(*_uniform_numbers(codes[:, :10], centres, steps)[1:3])
 
     def fill(start: int, stop: int) -> None:
         own, finest = codes[start:stop], finer[start:stop]
@@ -120,7 +120,7 @@ def decode(data: bytes, model_size: int | None = None) -> Gaussians:
             f"the hidden secret is damaged: it declares {count:,} Gaussians, more than {held_by} can hold"
         )
     codes = entropy.decode(data[_HEAD.size :], count, *_columns(sh_degree))
-    means, log_scales, logits, colours = _even_numbers(codes[:, :10], centres, steps)
+    means, log_scales, logits, colours = _uniform_numbers(codes[:, :10], centres, steps)
     finer = _refinement(log_scales, logits)
     quats, sh = np.empty((count, 4), np.float32), np.empty((count, (sh_degree + 1) ** 2, 3), np.float32)
 
@@ -148,8 +148,8 @@ def _round(numbers: Doubles) -> Doubles:
     return np.rint(bounded)
 
 
-def _even_columns(model: Gaussians) -> Doubles:
-    """Means, log scales, opacity logits and constant colours [N, 10], clamped.
+def _uniform_columns(model: Gaussians) -> Doubles:
+    """Means, log scales, opacity logits and constant colours [N, 10], clamped: columns of uniform steps.
 
     Rasterizers skip Gaussians whose numbers overflow. Clamped numbers would make these visible, so they
     become transparent.
@@ -162,20 +162,20 @@ def _even_columns(model: Gaussians) -> Doubles:
 
 
 def _origin(centres: list[float]) -> Doubles:
-    """What is subtracted from the columns of `_even_columns` [10]."""
+    """The numbers [10] to subtract from the `_uniform_columns`."""
     x, y, z, scales, logit = centres
     return np.array([x, y, z, scales, scales, scales, logit, 0, 0, 0])
 
 
-def _even_steps(steps: list[float]) -> Doubles:
-    """Steps [10] of the columns whose steps are the same for all Gaussians."""
+def _uniform_steps(steps: list[float]) -> Doubles:
+    """Steps [10] of the columns whose step is the same for all Gaussians."""
     means, log_scales, opacity, colours, *_ = steps
     return np.array([*[means] * 3, *[log_scales] * 3, opacity, *colours * _DIFFERENCES])
 
 
-def _even_numbers(codes: Codes, centres: list[float], steps: list[float]) -> list[Doubles]:
+def _uniform_numbers(codes: Table, centres: list[float], steps: list[float]) -> list[Doubles]:
     """Means [N, 3], log scales [N, 3], opacity logits [N] and colours [N, 3] from codes [N, 10]."""
-    numbers = codes * _even_steps(steps) + _origin(centres)
+    numbers = codes * _uniform_steps(steps) + _origin(centres)
     return [numbers[:, :3], numbers[:, 3:6], numbers[:, 6], numbers[:, 7:]]
 
 
@@ -187,7 +187,7 @@ def _from_opponents(parts: Doubles) -> Doubles:
 
 
 def _refinement(log_scales: Doubles, logits: Doubles) -> Integers:
-    """Half octaves [N] by which each Gaussian's steps are finer than the median Gaussian's."""
+    """Half octaves [N] by which the other steps of each Gaussian are finer than the median Gaussian's."""
     scales = np.sort(log_scales, axis=1)
     weight = scales[:, 2] + scales[:, 1] + 2 * np.minimum(logits, 0)  # log(opacity) is about min(logit, 0)
     median = np.sort(weight)[(len(weight) - 1) // 2]
