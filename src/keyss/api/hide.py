@@ -229,6 +229,12 @@ def _folder(
     )
 
 
+def _key_checks(keys: Sequence[str], settings: RunConfig[MethodOptions]) -> list[str]:
+    """Verifiers of the keys, to resume; guessing a key from one is as slow as from the stego model."""
+    salt = hashlib.sha256(b"keyss/v1/resume" + record_bytes(settings)).digest()[:SALT_BYTES]
+    return [DerivedKey.of(key, salt).verifier().hex() for key in keys if key]
+
+
 def _plain_steps(
     sources: Sequence[Source], models: Sequence[PathLike | Gaussians | None], options: MethodOptions
 ) -> list[int | None]:
@@ -239,6 +245,14 @@ def _plain_steps(
     ]
 
 
+def _steps_of(model: PathLike | Gaussians | None) -> int | None:
+    """Training steps of a given plain model, if `fit` wrote it."""
+    if model is None or isinstance(model, Gaussians) or Path(model).name != MODEL:
+        return None
+    metrics = Path(model).parent / METRICS
+    return read_record(metrics, FitMetrics).iterations if metrics.is_file() else None
+
+
 def _fit_models(
     method: Method, sources: list[Source], options: MethodOptions, context: Context
 ) -> tuple[list[Source], MethodOptions]:
@@ -247,23 +261,6 @@ def _fit_models(
         return sources, options
     fitted = fit_plain_models(sources, options.fits(len(sources)), context)
     return fitted, method.prepare(fitted, options)
-
-
-def _models_to_write(
-    given: Sequence[PathLike | Scene | Gaussians], plain: Sequence[Gaussians]
-) -> dict[str, Gaussians]:
-    """Plain models by file name, without those that the user gave as files."""
-    return {
-        name: model
-        for name, model, source in zip(plain_names(len(given) - 1), plain, given, strict=True)
-        if isinstance(source, Scene | Gaussians) or not is_model(source)
-    }
-
-
-def _key_checks(keys: Sequence[str], settings: RunConfig[MethodOptions]) -> list[str]:
-    """Verifiers of the keys, to resume; guessing a key from one is as slow as from the stego model."""
-    salt = hashlib.sha256(b"keyss/v1/resume" + record_bytes(settings)).digest()[:SALT_BYTES]
-    return [DerivedKey.of(key, salt).verifier().hex() for key in keys if key]
 
 
 def _entropy(keys: Sequence[str], options: MethodOptions, plain: Sequence[Gaussians]) -> bytes:
@@ -278,6 +275,17 @@ def _entropy(keys: Sequence[str], options: MethodOptions, plain: Sequence[Gaussi
     parts = [DerivedKey.of(key, salt).expand("writer", 32) for key in keys if key]
     parts += [record_bytes(options), *models]
     return hashlib.sha256(b"".join(hashlib.sha256(each).digest() for each in parts)).digest()
+
+
+def _models_to_write(
+    given: Sequence[PathLike | Scene | Gaussians], plain: Sequence[Gaussians]
+) -> dict[str, Gaussians]:
+    """Plain models by file name, without those that the user gave as files."""
+    return {
+        name: model
+        for name, model, source in zip(plain_names(len(given) - 1), plain, given, strict=True)
+        if isinstance(source, Scene | Gaussians) or not is_model(source)
+    }
 
 
 def _write_and_read(
@@ -300,14 +308,6 @@ def _write_and_read(
     else:
         opened = [open_model(model, key) for key in keys]
     return [model, *(each.reveal(model) for each in opened)]
-
-
-def _steps_of(model: PathLike | Gaussians | None) -> int | None:
-    """Training steps of a given plain model, if `fit` wrote it."""
-    if model is None or isinstance(model, Gaussians) or Path(model).name != MODEL:
-        return None
-    metrics = Path(model).parent / METRICS
-    return read_record(metrics, FitMetrics).iterations if metrics.is_file() else None
 
 
 def _fit_bounds(

@@ -35,8 +35,8 @@ class HideResult:
     """The result of `hide`."""
 
     stego: Gaussians | None = None  # publish this; None after a dry run
-    metrics: HideMetrics | None = None  # None of a dry run
-    plan: Plan | None = None  # only of a dry run, like `cost`
+    metrics: HideMetrics | None = None  # None after a dry run
+    plan: Plan | None = None  # only after a dry run, like `cost`
     cost: Cost | None = None
     survives: bool = False  # whether the secrets survive conversion to other formats
 
@@ -68,7 +68,7 @@ def sources_of(
     keys: Sequence[str],
     views: ViewOptions,
 ) -> list[Source]:
-    """The cover and the secrets with their photos and plain models; a scene may be its own model.
+    """The cover and the secrets with their photos and plain models; a source may be its own model.
 
     `keys`: one per secret. Raises UsageError and InputError.
     """

@@ -40,15 +40,15 @@ def reveal(
     """Reveal the secret that `key` opens in a stego model: a scene, as an ordinary model, or a file.
 
     The model determines the method. `frame`: "secret" gives a scene in its own frame, in which its cameras
-    are valid; "cover" leaves it where it was hidden, unless it was carried. `force` is for quantised or
-    pruned models with a secret of the method `keyss`: it skips the check that a decoder belongs to the model,
-    and accepts any loss. `companion`: the companion file of this secret, for methods without keys
-    (`keyss.methods.companion`). Some give a model that a network decodes (`keyss.core.picture_network`),
-    which is no 3DGS model.
+    are valid; "cover" leaves it in the cover's, in which carried secrets have no position. `force` is for
+    quantised or pruned models with a secret of the method `keyss`: it skips the check that a decoder belongs
+    to the model, and accepts any loss. `companion`: the companion file of this secret, for methods without
+    keys (`keyss.methods.companion`). Some of these methods give a model that a network decodes
+    (`keyss.core.picture_network`), which is no 3DGS model.
 
     `out` (a file) gets the secret: a scene for the suffix of a model (.ply, .spz, ...), else a file. Raises
     WrongKeyError for a key that opens nothing, InputError for a damaged file or if less than 10 % of the
-    secret is left. Warns (KeyssWarning) if more than 1 % is missing.
+    secret is left. Warns (KeyssWarning) of losses and of foreign Gaussians.
     """
     target = resolve_device(device)
     inputs = [] if isinstance(stego, Gaussians) else [Path(stego)]
