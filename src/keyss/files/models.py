@@ -1,8 +1,4 @@
-"""Reading and writing 3DGS models in all formats.
-
-A new format is a module in `formats/` with `read` and `write`, or `Codes`, which have both, and an entry in
-`FORMATS`.
-"""
+"""Reading and writing 3DGS models in all formats. CONTRIBUTING.md says how to add one."""
 
 from __future__ import annotations
 

@@ -44,8 +44,9 @@ from tiny_scenes import random_gaussians
 SECONDS = 2.0  # time limit for a file of a few kilobytes
 CARRIERS = 6000  # Gaussians of the published model that holds a payload
 MEMORY, PER_BYTE = 200 << 20, 32  # memory limit for reading a file: bytes, and bytes per byte of the file
+MODELS = ("a.ply", "a.compressed.ply", "a.spz", "a.sog", "a.glb", "a.splat")
 NAMES = (
-    *("a.ply", "a.compressed.ply", "a.spz", "a.sog", "a.glb", "a.splat"),
+    *MODELS,
     *("a.payload", "a.3dgs.safetensors", "a.tensors", "a.png"),
     *("cameras.bin", "images.bin", "points3D.bin"),
 )
@@ -60,7 +61,7 @@ def examples() -> dict[str, list[bytes]]:
     def model(degree: int) -> Gaussians:
         return random_gaussians(count, degree, degree)
 
-    found = {name: [model_bytes(name, model(degree)) for degree in (0, 2)] for name in NAMES[:6]}
+    found = {name: [model_bytes(name, model(degree)) for degree in (0, 2)] for name in MODELS}
     found["a.spz"].append(replace(SpzCodes.quantise(model(1)), version=4).serialise())
     found["a.payload"] = [encode(model(degree)) for degree in range(4)]
     layers = ((torch.ones(3, 4, 3, 3), torch.zeros(3)),)
