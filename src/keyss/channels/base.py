@@ -43,12 +43,6 @@ class Payload:
     foreign: int = field(default=0, compare=False)  # estimate of those added or changed after hiding
 
 
-def warn_of_foreign(payload: Payload) -> None:
-    """Warn (KeyssWarning) if Gaussians were added or changed after hiding."""
-    if payload.foreign:
-        warnings.warn(_FOREIGN.format(payload.foreign), KeyssWarning, stacklevel=4)
-
-
 def check_method(name: str) -> bytes:
     """The name of a method in ASCII. Raises ValueError unless it has 1 to METHOD_BYTES characters."""
     encoded = name.encode("ascii")
@@ -121,7 +115,8 @@ class SaltedReader(ABC):
         for salt in self.salts[:SALTS_TRIED]:
             with suppress(WrongKeyError):
                 payload = self.extract(DerivedKey.of(key, salt))
-                warn_of_foreign(payload)
+                if payload.foreign:
+                    warnings.warn(_FOREIGN.format(payload.foreign), KeyssWarning, stacklevel=3)
                 return payload
         raise WrongKeyError()
 

@@ -94,9 +94,9 @@ class HideArguments:
     publish: Annotated[
         Literal["as-is", "any"],
         arg(
-            help="as-is: a file that must stay unchanged, in which the secret goes unnoticed; where a scene "
-            "cannot, any with a warning. any: a .ply that may be converted later; whoever inspects it sees "
-            "that it holds something."
+            help="as-is: a file that must stay unchanged, in which the secret goes unnoticed; becomes any, "
+            "with a warning, if a scene has too little room. any: a .ply that may be converted later; "
+            "whoever inspects it sees that it holds something."
         ),
     ] = "as-is"
     format: Annotated[

@@ -1,8 +1,8 @@
-"""The header: how to read the payload, in a few Gaussians that the key chooses.
+"""The header, which tells how to read a payload: in a few Gaussians that the key chooses.
 
-A key is first tried on the header, which is written once under each of a few salts. The copies are parts of
-one fountain code and are decoded together: one salt's Gaussians replace another's lost ones. *Pilots*, a few
-known bits of each part, show which salts are lost; agreement with the decoded bits refines that.
+A key is first tried on the header. Under each of a few salts, a part of one fountain code of it is written;
+the parts are decoded together: one salt's Gaussians replace another's lost ones. *Pilots*, a few known bits
+of each part, show which salts are lost; agreement with the decoded bits refines that.
 
 A key assigns pseudo-random numbers to IDs and chooses the Gaussians with the smallest, so that a lost
 Gaussian costs its own place only.

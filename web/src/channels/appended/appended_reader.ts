@@ -16,7 +16,7 @@ import { type Found, LEAST, ONE_IN, pilotsOf, POSITION_BITS, readPilots } from '
 // Gaussians sampled for pilots; number of lattice offsets tried, with at least this many standard deviations more pilots
 // than by chance.
 const [SAMPLE, TRIED, NOT_BY_CHANCE] = [8000, 8, 3];
-const [HOST_BYTES, FOREIGN] = [132, 0.4]; // how many Gaussians of the cover are seen, and their sketch
+const [COVER_BYTES, FOREIGN] = [132, 0.4]; // number and sketch of the cover's visible Gaussians; a share
 const ASSOCIATED = ascii('keyss/v1/appended/data');
 
 /** A model's appended Gaussians, prepared for any number of keys. */
@@ -56,10 +56,10 @@ export class AppendedReader implements Reader {
       const packets = readPackets(expand(secret, 'appended/packets'), this.words, width);
       const encrypted = decoded(codewords, packets, true);
       const whole = await decrypted(expand(secret, 'appended/data'), encrypted, ASSOCIATED);
-      if (whole.length < HOST_BYTES) throw damaged();
-      const own = whole.subarray(4, HOST_BYTES);
+      if (whole.length < COVER_BYTES) throw damaged();
+      const own = whole.subarray(4, COVER_BYTES);
       const told = foreign(expand(secret, 'appended/host'), this.ids, own, viewOf(whole).getUint32(0, true));
-      const payload = unpackPayload(whole.subarray(HOST_BYTES));
+      const payload = unpackPayload(whole.subarray(COVER_BYTES));
       return told > (FOREIGN * this.ids.length) / 16 ? { ...payload, foreign: told } : payload;
     }
     return null;
