@@ -33,18 +33,18 @@ from .quiet.bits import (
 )
 from .quiet.cells import CellCipher as CellCipher
 from .quiet.fields import Field as Field, in_counted_order as in_counted_order, last_bits as last_bits
-from .quiet.header import (
-    TYPICAL_SHARE as TYPICAL_SHARE,
-    LowBitsCapacity as LowBitsCapacity,
-    check_payload_fits as check_payload_fits,
-    key_cipher as key_cipher,
-)
 from .quiet.payloads import QuietReader as QuietReader
 from .quiet.quiet_channel import (
     LOW_BITS as LOW_BITS,
     CodesCover as CodesCover,
     InCodes as InCodes,
     LowBitsCover as LowBitsCover,
+)
+from .quiet.quiet_header import (
+    TYPICAL_SHARE as TYPICAL_SHARE,
+    LowBitsCapacity as LowBitsCapacity,
+    check_payload_fits as check_payload_fits,
+    key_cipher as key_cipher,
 )
 from .quiet.usable import (
     chance_of_bits as chance_of_bits,

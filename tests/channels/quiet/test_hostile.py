@@ -18,8 +18,8 @@ from channels.quiet.payloads import embed_payloads
 from channels.quiet.trained_like import keys, trained_like
 from files.formats.examples import KINDS, random_codes
 from keyss.channels import LOW_BITS, CodesCover, Codewords, Payload, QuietReader
-from keyss.channels.quiet import header, payloads
-from keyss.channels.quiet.header import Parameters
+from keyss.channels.quiet import payloads, quiet_header
+from keyss.channels.quiet.quiet_header import Parameters
 from keyss.channels.reed_solomon import MAX_CHUNKS
 from keyss.core import Gaussians, InputError, UsageError, WrongKeyError
 from keyss.keys import encryption
@@ -99,7 +99,7 @@ def test_payloads_that_compress_too_well_come_out_all_the_same(size: int) -> Non
 
 
 def test_as_many_blocks_as_there_can_be_take_no_memory() -> None:
-    most = Codewords(header.MAX_CODEWORDS, MAX_CHUNKS, MAX_CHUNKS, 66)
+    most = Codewords(quiet_header.MAX_CODEWORDS, MAX_CHUNKS, MAX_CHUNKS, 66)
     with at_most(1), pytest.raises(InputError, match="too much of the model was lost"):
         most.decode(np.arange(100), np.zeros((100, 66), np.uint8))
 
@@ -117,10 +117,10 @@ class Impossible(Codewords):
 @pytest.mark.parametrize(
     ("size", "codewords"),
     [
-        (10**9, Codewords(header.MAX_CODEWORDS, 1024, 999, 68)),
+        (10**9, Codewords(quiet_header.MAX_CODEWORDS, 1024, 999, 68)),
         (69, Codewords(1, 255, 1, 68)),
         (0, Codewords(1, 255, 1, 68)),
-        (1, Codewords(header.MAX_CODEWORDS + 1, 255, 1, 68)),
+        (1, Codewords(quiet_header.MAX_CODEWORDS + 1, 255, 1, 68)),
         (1, Codewords(1, 1025, 1, 68)),
         (1, Impossible(0, 255, 1, 68)),
         (1, Impossible(1, 2, 3, 68)),
@@ -144,7 +144,7 @@ def test_other_versions_end_in_a_sentence(
     cover: Gaussians, version: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with monkeypatch.context() as patch:
-        patch.setattr(header, "_VERSION", version)
+        patch.setattr(quiet_header, "_VERSION", version)
         stego = embed_payloads(LOW_BITS.prepare(cover), [(keys(), Payload("carry", b"x"))])
     with pytest.raises(InputError, match=f"of version {version}; this program reads"):
         QuietReader.of(stego).extract(keys()[0])

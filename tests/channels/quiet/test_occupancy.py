@@ -12,8 +12,8 @@ from scipy.stats import ks_2samp
 
 from channels.quiet.trained_like import keys
 from keyss.channels import Payload, key_cipher
-from keyss.channels.quiet.header import chunk_cipher, parameter_cipher
 from keyss.channels.quiet.payloads import Writer
+from keyss.channels.quiet.quiet_header import chunk_cipher, parameter_cipher
 from keyss.channels.quiet.usable import SALTS
 from keyss.core import KeyssWarning
 

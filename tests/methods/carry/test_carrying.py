@@ -20,7 +20,7 @@ from keyss.channels import (
     salt_rows,
     usable_carriers,
 )
-from keyss.channels.quiet.header import key_cipher
+from keyss.channels.quiet.quiet_header import key_cipher
 from keyss.core import Gaussians, KeyssError, WrongKeyError
 from keyss.keys import DerivedKey
 from keyss.methods import embed_models

@@ -20,7 +20,7 @@ from keyss.channels.quiet.bits import Layout, gaussian_ids, read_low_bits
 from keyss.channels.quiet.cells import CellCipher
 from keyss.channels.quiet.decoded import Decoded
 from keyss.channels.quiet.fields import in_counted_order, last_bits, model_hash
-from keyss.channels.quiet.header import (
+from keyss.channels.quiet.quiet_header import (
     BLOCK_HEADER,
     DATA_KEY_BYTES,
     KEY_COPIES,

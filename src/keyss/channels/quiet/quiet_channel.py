@@ -8,7 +8,7 @@ tag: a reader decrypts all of them and keeps those with a valid tag.
   Gaussian is not usable: the author of the cover knows it in advance, so no key cell is written for it. A
   reader tries SALTS_TRIED salts; covers with as many stale ones are refused.
 - *Key cells*, encrypted under the key and a salt, hold the data key of a secret.
-- *Parameter cells*, encrypted under the data key, tell how to read the rest (see `header`).
+- *Parameter cells*, encrypted under the data key, tell how to read the rest (see `quiet_header`).
 - *Chunk cells*, encrypted under the data key, hold numbered chunks of the encrypted payload, with redundancy:
   shuffling is harmless, and a quarter of the Gaussians may be lost. In codes nothing may be lost or
   reordered: the payload lies in the blocks after its header, without cells.
@@ -47,7 +47,8 @@ from keyss.channels.quiet.fields import (
     model_hash,
     with_levels,
 )
-from keyss.channels.quiet.header import (
+from keyss.channels.quiet.payloads import Writer
+from keyss.channels.quiet.quiet_header import (
     BLOCK_HEADER,
     INCOMPRESSIBLE,
     LEAST_BYTES,
@@ -56,7 +57,6 @@ from keyss.channels.quiet.header import (
     LowBitsCapacity,
     check_width,
 )
-from keyss.channels.quiet.payloads import Writer
 from keyss.channels.quiet.usable import check_usable, salt, salt_rows, usable_with_ids
 from keyss.channels.quiet.writable_levels import fixed_axes, writable_levels
 from keyss.core.arrays import Bits, Bytes, Flags, Integers

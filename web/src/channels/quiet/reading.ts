@@ -1,6 +1,6 @@
 /**
  * Reads the low bits of a model, or the codes of a file, with a key; counterpart of `keyss.channels.quiet.payloads` and
- * `header` (docs/byte-layout.md, "Parameters").
+ * `quiet_header` (docs/byte-layout.md, "Parameters").
  *
  * A wrong key makes the same passes over all cells as a right one, and all salts are always tried, so the time taken
  * reveals next to nothing.
