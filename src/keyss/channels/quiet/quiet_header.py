@@ -60,7 +60,8 @@ _PREFIX = struct.Struct(f"<B{METHOD_BYTES}sI")
 _BLOCKS = struct.Struct("<H")  # bytes of a block
 _CODEWORDS = struct.Struct("<IIHH")  # Gaussians of the model, codewords, chunks of one, data chunks of one
 _DAMAGED = "the hidden parameters are damaged"
-INCOMPRESSIBLE = 1 - 2**-10  # data that do not compress grow by less than a thousandth
+INCOMPRESSIBLE = 1 - 2**-10  # data that do not compress grow by less than a thousandth, and _ZLIB_BYTES
+_ZLIB_BYTES = 16
 
 
 @dataclass(frozen=True)
@@ -87,7 +88,7 @@ class LowBitsCapacity:
         """Of these bytes, a half fits into half of the carriers and a quarter into a quarter (see `plan`)."""
         carriers = self._independent_carriers or self._carriers(1)
         size = min(part * self._size(carriers // part) for part in (1, 2, 4))
-        return Capacity(int(size * INCOMPRESSIBLE), OVERHEAD + 16)
+        return Capacity(int(size * INCOMPRESSIBLE), OVERHEAD + _ZLIB_BYTES)
 
     @property
     def part_bytes(self) -> int:
