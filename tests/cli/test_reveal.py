@@ -71,7 +71,7 @@ class TestCounts:
     def test_restored_secret_warning(self, reveal: Run, tmp_path: Path) -> None:
         result = reveal("pruned.ply")
         assert (result.status, result.out) == (0, f"{tmp_path}/s.ply: 500 of 500 Gaussians\n")
-        assert re.match(r"keyss: warning: \d+ of [\d,]+ chunks .* were restored", result.err)
+        assert re.match(r"keyss: warning: \d+ of [\d,]+ chunks .* were lost, and restored", result.err)
         assert len(result.err.splitlines()) == 1
 
     def test_lost_secret(self, reveal: Run, tmp_path: Path) -> None:
@@ -232,7 +232,7 @@ class TestVerify:
     def test_damaged_secret(self, keyss: Run, files: Path) -> None:
         result = keyss("verify", files / "pruned.ply", "--key-file", files / "key")
         assert result.status == 4
-        assert "chunks of the secret's payload are lost and were restored" in result.err
+        assert "chunks of the secret's payload were lost, and restored" in result.err
         assert_refused(
             keyss("verify", files / "few.ply", "--key-file", files / "key"), 4, "was lost or changed"
         )

@@ -46,6 +46,22 @@ def test_pruned_secret() -> None:
     )
 
 
+def test_several_pruned_secrets_have_numbers() -> None:
+    two = {name: 2 * getattr(METRICS, name) for name in ("secrets", "secret_gaussians", "secret_degrees")}
+    baseline = replace(
+        METRICS.baseline,
+        secrets=(None, None),
+        gaussians=(1234, 600, 700),
+        steps=(10, 20, 20),
+        equal=(True, False, False),
+    )
+    last = METRICS.against_plain[1:]
+    more = {"photos": (True,) * 3, "steps": (10, 20, 20), "against_plain": METRICS.against_plain + last}
+    rows = table(replace(METRICS, baseline=baseline, **two, **more))
+    assert ["Secret 1 kept 567 of 600 Gaussians, 31.0 dB."] in rows
+    assert ["Secret 2 kept 567 of 700 Gaussians, 31.0 dB."] in rows
+
+
 def test_shorter_plain_model_is_no_bound() -> None:
     shorter = replace(METRICS.baseline, secrets=(ImageQuality(19.0, 0.2),))
     rows = table(replace(METRICS, baseline=shorter))

@@ -106,7 +106,7 @@ def test_refitted_secret_after_changes(
     changes = [random_pruning(0.1), half_floats(), purification(scenes[0], steps=0)]
     _, pruned, rounded, purified = measure_robustness(hidden.stego, [opener], scenes, changes=changes)
     if publish == "as-is":
-        with pytest.warns(KeyssWarning, match="chunks of the secret's payload are lost and were restored"):
+        with pytest.warns(KeyssWarning, match="chunks of the secret's payload were lost, and restored"):
             keyss.reveal(changes[0](hidden.stego), KEY)
     assert pruned.secrets[0].opens
     assert pruned.secrets[0].psnr == mean_psnr(revealed, scenes[1].test, scenes[1].background)

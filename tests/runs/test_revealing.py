@@ -10,7 +10,7 @@ from keyss.runs.revealing import Revealed, check_secret, loss_warnings
     ("remains", "expected"),
     [
         (Remains(100, 100, (12, 12)), []),
-        (Remains(100, 100, (9, 12)), ["3 of 12 chunks of the secret's payload are lost and were restored"]),
+        (Remains(100, 100, (9, 12)), ["3 of 12 chunks of the secret's payload were lost, and restored"]),
         (Remains(75, 100, (9, 12)), ["75 of 100 Gaussians of the secret were found"]),
         (Remains(120, 100), ["120 of 100 Gaussians of the secret were found"]),
     ],

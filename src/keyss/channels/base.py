@@ -124,7 +124,7 @@ class SaltedReader(ABC):
 class Channel(ABC):
     """A place for bits in a model."""
 
-    place: str  # in messages: "low bits", "codes of the spz file" and so on
+    place: str  # in messages: "low bits", "spz codes" and so on
     survives: ClassVar[bool] = False  # True if secrets survive conversion to other formats
     grows: ClassVar[bool] = False  # see `Capacity`
 

@@ -56,7 +56,7 @@ def doctor(*, device: Device = "auto") -> None:
 
 def _extra(name: str, package: str, purpose: str) -> str:
     try:
-        return metadata.version(package)
+        return f"{package} {metadata.version(package)}"
     except metadata.PackageNotFoundError:
         raise BackendError(f"for {purpose}: pip install 'keyss[{name}]'") from None
 

@@ -149,7 +149,8 @@ def _lines_on_files(metrics: HideMetrics, names: Sequence[str]) -> list[str]:
             continue
         of = f" of {before:,}" if before and before >= count else ""
         cut = f", SH degree {degree} of {full}" if degree < full else ""
-        lines.append(f"The {name} kept {count:,}{of} Gaussians{cut}, {each.psnr:.1f} dB.")
+        subject = f"The {name}" if len(names) == 2 else name.capitalize()
+        lines.append(f"{subject} kept {count:,}{of} Gaussians{cut}, {each.psnr:.1f} dB.")
     return lines
 
 

@@ -104,7 +104,7 @@ def loss_warnings(remains: Remains) -> list[str]:
     left, chunks = remains.chunks or (0, 0)
     if left < chunks:
         return [
-            f"{chunks - left:,} of {chunks:,} chunks of the secret's payload are lost and were restored: the "
+            f"{chunks - left:,} of {chunks:,} chunks of the secret's payload were lost, and restored: the "
             "published file was changed"
         ]
     return []

@@ -120,9 +120,9 @@ class InCodes(Channel):
 
     def __init__(self, format: str, decoded: Decoded | None = None) -> None:
         self.format, self.decoded = format, decoded
-        self.place = f"codes of the {format} file"
+        self.place = f"{format} codes"
         if decoded:
-            self.place = f"steps of its numbers, which are those of a {format} file"
+            self.place = f"{format} codes that its numbers were decoded from"
 
     def prepare(self, cover: Gaussians) -> CodesCover:
         """See `Channel`. A model that was read from a file of this format keeps its codes.
