@@ -13,7 +13,7 @@ import keyss as library
 from channels.colours.made import cover
 from channels.quiet.trained_like import trained_like
 from cli.harness import Run, assert_refused, listing, write_key
-from keyss import write_model
+from keyss import read_model, write_model
 from keyss.channels import Payload
 from keyss.cli import main
 from keyss.core import InputError, UsageError
@@ -59,6 +59,20 @@ def test_verify(keyss: Run, folder: Path) -> None:
         result = keyss("verify", stego, "--key-file", folder / f"key{index}")
         assert (result.status, result.err) == (0, "")
         assert f"secret  {count} bytes: complete" in result.out
+
+
+def test_file_from_a_pruned_model(keyss: Run, folder: Path, tmp_path: Path) -> None:
+    """The file is complete, and the loss does not go unnoticed."""
+    stego = read_model(folder / "out" / "publish" / "model.ply")
+    write_model(tmp_path / "pruned.ply", stego[: len(stego) * 4 // 5])
+    arguments = (tmp_path / "pruned.ply", "--key-file", folder / "key0")
+    verified = keyss("verify", *arguments)
+    assert verified.status == 4
+    assert "chunks of the secret's payload were lost, and restored" in verified.err
+    revealed = keyss("reveal", *arguments, "-o", tmp_path / "file.bin")
+    assert revealed.status == 0
+    assert "chunks of the secret's payload were lost, and restored" in revealed.err
+    assert (tmp_path / "file.bin").stat().st_size == 3000
 
 
 def test_invalid_combinations(keyss: Run, folder: Path, workspace: Path, tmp_path: Path) -> None:

@@ -67,16 +67,14 @@ def reveal(
             as_model(stego), key, device=target, frame=frame, force=force, companion=companion
         )
     except OpensAFileError as error:
-        if path is None:
-            return revealed_file(error.file)
-        raise
+        if path is not None:
+            raise
+        return _with_warnings(revealed_file(error.file))
     if not force:
         found.check_usable()
-    for sentence in found.warnings:
-        warnings.warn(sentence, KeyssWarning, stacklevel=2)
     if path is not None:
         write_model(path, found.gaussians)
-    return found
+    return _with_warnings(found)
 
 
 def _reveal_file(
@@ -88,7 +86,14 @@ def _reveal_file(
     check_not_published(path)
     file = HiddenFile.of(open_payload(as_model(stego), key))
     write_bytes(path, file.data)
-    return revealed_file(file)
+    return _with_warnings(revealed_file(file))
+
+
+def _with_warnings(found: Revealed) -> Revealed:
+    """Warn (KeyssWarning) of what is missing."""
+    for sentence in found.warnings:
+        warnings.warn(sentence, KeyssWarning, stacklevel=3)
+    return found
 
 
 def verify(

@@ -11,7 +11,7 @@ import hashlib
 import os
 import warnings
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import ClassVar, Protocol
@@ -68,6 +68,8 @@ class Capacity:
     bytes: int  # of one payload
     overhead: int  # maximum bytes of a payload beside its data
     further: float = 1.0  # each payload after the first multiplies the bytes of all together by this
+    equal: Callable[[int], int] | None = None  # bytes of each of several equal payloads; None: equal parts
+    divisible: bool = True  # False: several payloads have equal shares
     grows: bool = False  # True if the model grows with the hidden data, which should then be short
 
 

@@ -237,14 +237,22 @@ def _print_columns(rows: Sequence[tuple[str, str]]) -> None:
 def print_table(heads: Sequence[str], rows: Iterable[Sequence[str]], *, texts: int = 1) -> None:
     """Print a table; its first `texts` columns are aligned left, the others hold numbers.
 
-    Long texts wrap between words, and anything in terminals that are too narrow.
+    Cells wrap between words. If the terminal is too narrow, each row becomes a list.
     """
+    console, rows = Console(), list(rows)
     table = Table(box=None, pad_edge=False, header_style="bold", padding=(0, 2, 0, 0))
     for index, head in enumerate(heads):
         table.add_column(head, justify="left" if index < texts else "right", overflow="fold")
     for row in rows:
         table.add_row(*map(Text, row))
-    Console().print(table)
+    unlimited = console.options.update(max_width=10**6)
+    if console.measure(table, options=unlimited).minimum <= console.width:
+        console.print(table)
+        return
+    for row in rows:
+        for head, cell in zip(heads, row, strict=True):
+            console.print(f"{head}: {cell}", highlight=False, markup=False)
+        console.print()
 
 
 def _text(value: object) -> str:

@@ -78,6 +78,7 @@ class HiddenFile:
 
     name: str
     data: bytes = field(repr=False)
+    chunks: tuple[int, int] | None = field(default=None, compare=False)  # see `Payload`
 
     def payload(self) -> Payload:
         """The payload for a channel. Raises UsageError for a name longer than MAX_NAME_BYTES."""
@@ -95,7 +96,7 @@ class HiddenFile:
         name, data = payload.data[1 : 1 + size], payload.data[1 + size :]
         if not payload.data or len(name) < size:
             raise InputError("the hidden file is damaged: its name is cut off")
-        return HiddenFile(name.decode(errors="replace"), data)
+        return HiddenFile(name.decode(errors="replace"), data, payload.chunks)
 
 
 class OpensAFileError(InputError):

@@ -89,7 +89,8 @@ def reveal_any(model: Gaussians, key: str, device: torch.device) -> Revealed:
 
 def revealed_file(file: HiddenFile) -> Revealed:
     """The result for a hidden file, which is always complete."""
-    return Revealed(None, Remains(len(file.data), len(file.data)), file=file)
+    remains = Remains(len(file.data), len(file.data), file.chunks)
+    return Revealed(None, remains, tuple(loss_warnings(remains)) if file.data else (), file)
 
 
 def loss_warnings(remains: Remains) -> list[str]:

@@ -5,14 +5,18 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
 from channels.quiet.trained_like import trained_like
 from keyss import CarryOptions, Gaussians
+from keyss.channels import LowBitsCapacity
 from keyss.core import KeyssWarning, UsageError
+from keyss.keys.encryption import OVERHEAD, compressed_size
 from keyss.methods import Context, Source, registry
-from keyss.rendering import scene_of_model
+from keyss.methods.carry.capacity import CarryCapacity, shares
+from keyss.rendering import Viewpoints, scene_of_model
 
 KEY = "a key of many characters: 93hXmQ2"
 
@@ -66,3 +70,27 @@ def test_predictable_cover_is_refused() -> None:
         assert _prepare(CarryOptions(), grey, grey).publish == "any"
     _prepare(CarryOptions(), trained_like(8000), grey)
     _prepare(CarryOptions(publish="any"), grey, grey)
+
+
+@pytest.mark.parametrize("carriers", [450, 1200, 4000, 20_000])
+@pytest.mark.parametrize("secrets", [1, 2, 3, 5, 8])
+def test_shares_fit(carriers: int, secrets: int) -> None:
+    """Incompressible payloads of the sizes that secrets may have, whatever they need."""
+    cells = LowBitsCapacity.of(carriers, 3)
+    capacity, random = cells.for_payloads(), np.random.default_rng(0)
+    for _ in range(20):
+        needed = random.integers(1, capacity.bytes + 2, secrets).tolist()
+        limits = shares(capacity, needed)
+        if min(limits):
+            cells.plan([compressed_size(random.bytes(limit)) + OVERHEAD for limit in limits])
+
+
+def test_a_secret_that_is_pruned_for_others_is_not_hidden_silently() -> None:
+    """Alone it would stay whole; pruned to a third, its payload fits into a half."""
+    cover, models = trained_like(4000), [trained_like(count, 1, 1) for count in (6000, 200, 200)]
+    capacity = CarryCapacity.of(cover, CarryOptions(format="ply"))
+    views = [Viewpoints.around(model) for model in models]
+    (alone,) = capacity.prune(models[:1], views[:1])
+    assert len(alone) == 6000
+    with pytest.warns(KeyssWarning, match="can notice that there are other secrets"):
+        assert len(capacity.prune(models, views)[0]) < 6000

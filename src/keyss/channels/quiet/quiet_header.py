@@ -88,7 +88,12 @@ class LowBitsCapacity:
         """Of these bytes, a half fits into half of the carriers and a quarter into a quarter (see `plan`)."""
         carriers = self._independent_carriers or self._carriers(1)
         size = min(part * self._size(carriers // part) for part in (1, 2, 4))
-        return Capacity(int(size * INCOMPRESSIBLE), OVERHEAD + _ZLIB_BYTES)
+        return Capacity(
+            int(size * INCOMPRESSIBLE),
+            OVERHEAD + _ZLIB_BYTES,
+            equal=lambda secrets: int(self.payload_capacity(secrets) * INCOMPRESSIBLE),
+            divisible=self._independent_carriers > 0,
+        )
 
     @property
     def part_bytes(self) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -10,7 +11,8 @@ from dataclasses import dataclass, replace
 import torch
 
 from keyss.channels import APPENDED, LOW_BITS, Capacity, Channel, PreparedCover
-from keyss.core.errors import UsageError
+from keyss.channels.base import NOT_INDEPENDENT
+from keyss.core.errors import KeyssWarning, UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.keys.derivation import expand
 from keyss.methods.carry.carry_options import CarryOptions
@@ -94,8 +96,13 @@ class CarryCapacity:
         return counts
 
     def prune(self, models: Sequence[Gaussians], viewpoints: Sequence[Viewpoints]) -> list[Gaussians]:
-        """The most visible Gaussians of each model that fit, or all; see `prune_to_size`."""
-        limits = shares(self.payloads, list(map(finest_size, models)))
+        """The most visible Gaussians of each model that fit, or all; see `prune_to_size`.
+
+        Warns (KeyssWarning) if the models have less room than they would alone.
+        """
+        needed = list(map(finest_size, models))
+        warn_of_sharing(self.payloads, needed)
+        limits = shares(self.payloads, needed)
         return [prune_to_size(*each) for each in zip(models, limits, viewpoints, strict=True)]
 
     def appended(self, secrets: Sequence[SecretSize]) -> int:
@@ -136,10 +143,20 @@ def shares(capacity: Capacity, needed: Sequence[int]) -> list[int]:
     not depend on the others, and its key does not reveal them. If these shares exceed the capacity, or if the
     model grows, they are equal.
     """
-    total = int(capacity.bytes * capacity.further ** (len(needed) - 1))
+    count = len(needed)
+    total = int(capacity.bytes * capacity.further ** (count - 1))
     parts = [
         next((each for each in (4, 2) if size <= total // each - capacity.overhead), 1) for size in needed
     ]
-    if capacity.grows or sum(1 / each for each in parts) > 1:
-        parts = [len(needed)] * len(needed)
-    return [max(0, total // each - capacity.overhead) for each in parts]
+    limits = [total // each for each in parts]
+    if count > 1 and (capacity.grows or not capacity.divisible or sum(1 / each for each in parts) > 1):
+        limits = [capacity.equal(count) if capacity.equal else total // count] * count
+    return [max(0, limit - capacity.overhead) for limit in limits]
+
+
+def warn_of_sharing(capacity: Capacity, needed: Sequence[int]) -> None:
+    """Warn (KeyssWarning) if a secret gets fewer bytes than it would alone."""
+    alone = [shares(capacity, [size])[0] for size in needed]
+    limits = shares(capacity, needed)
+    if any(limit < min(size, most) for size, most, limit in zip(needed, alone, limits, strict=True)):
+        warnings.warn(NOT_INDEPENDENT, KeyssWarning, stacklevel=3)

@@ -8,7 +8,6 @@ from dataclasses import replace
 from typing import Any
 
 from keyss.channels import Payload, PreparedCover, open_payload
-from keyss.channels.base import NOT_INDEPENDENT
 from keyss.core.errors import KeyssWarning, UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
@@ -16,7 +15,7 @@ from keyss.fitting.config import FitConfig
 from keyss.fitting.image_metrics import subsample_views
 from keyss.fitting.plain import fit_scene
 from keyss.fitting.schedule import boost_of
-from keyss.methods.carry.capacity import CarryCapacity, SecretSize, shares
+from keyss.methods.carry.capacity import CarryCapacity, SecretSize, shares, warn_of_sharing
 from keyss.methods.carry.carried_secret import CarriedSecret
 from keyss.methods.carry.carry_options import REFIT, CarryOptions
 from keyss.methods.codec.precision import encode_to_size, finest_size
@@ -64,7 +63,7 @@ class CarryMethod:
         except UsageError as refused:
             if not options.may_show:
                 raise
-            warnings.warn(_VISIBLE.format(refused), KeyssWarning, stacklevel=2)
+            warnings.warn(_VISIBLE.format(refused.__cause__ or refused), KeyssWarning, stacklevel=2)
             return self.prepare(sources, replace(options, publish="any"))
         cut = [size < secret.count for size, secret in zip(sizes, secret_sizes, strict=True)]
         if options.refit == "always":
@@ -213,9 +212,8 @@ def embed_models(
     """
     viewpoints, capacity = viewpoints or [*map(Viewpoints.around, models)], cover.capacity
     needed = list(map(finest_size, models))
+    warn_of_sharing(capacity, needed)
     limits = shares(capacity, needed)
-    if any(limit < min(size, *shares(capacity, [size])) for size, limit in zip(needed, limits, strict=True)):
-        warnings.warn(NOT_INDEPENDENT, KeyssWarning, stacklevel=2)
     payloads = [
         Payload(CarryOptions.method, encode_to_size(model, limit, short=capacity.grows, viewpoints=views))
         for model, limit, views in zip(models, limits, viewpoints, strict=True)
