@@ -80,7 +80,8 @@ class Codewords:
             sure[inverse[(chunks != chosen[inverse]).any(axis=1)]] = False
             rows, codewords = np.divmod(unique[sure], self.count)
             data, chosen = np.empty((self.k, self.count, self.width), np.uint8), chosen[sure]
-            own = (codewords == each for each in range(self.count))
+            order = np.argsort(codewords, kind="stable")
+            own = np.split(order, np.searchsorted(codewords[order], np.arange(1, self.count)))
             if all(self._decode(rows[o], chosen[o], data[:, at], errors) for at, o in enumerate(own)):
                 return data.tobytes()
         raise InputError(f"{LOST}: {left:,} of {self.chunks:,} chunks are left")

@@ -79,6 +79,15 @@ def test_the_same_entropy_gives_the_same_bits_and_other_payloads_others(plain: G
         assert same == pytest.approx(1 / 256, abs=2e-3)  # as between independent random bytes
 
 
+def test_the_same_entropy_in_another_cover_repeats_nothing(plain: Gaussians) -> None:
+    """Otherwise equal noise would tell the carriers of data from the others."""
+    seen = []
+    for cover in (plain, trained_like(1500, 77)):
+        low = read_low_bits(embed(cover, [(KEY, PAYLOAD)], bytes(32)))
+        seen.append({row.tobytes() for row in low[usable_carriers(cover)]})
+    assert not seen[0] & seen[1]
+
+
 def test_only_low_bits_of_some_fields_change(plain: Gaussians, stego: Gaussians) -> None:
     assert torch.equal(plain.means, stego.means)
     assert torch.equal(plain.sh[:, 0], stego.sh[:, 0])

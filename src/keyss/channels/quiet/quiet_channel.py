@@ -153,7 +153,7 @@ class LowBitsCover:
 
     def embed(self, payloads: Sequence[tuple[str, Payload]], *, entropy: bytes | None = None) -> Gaussians:
         """See `PreparedCover`. Takes 1.6 s for each secret for key derivation."""
-        mixed = randomness(entropy, *(payload.data for _, payload in payloads))
+        mixed = randomness(entropy, self.ids.tobytes(), *(payload.data for _, payload in payloads))
         salts = self._salts(mixed)[1]
         fresh = [salts[index] for index in self.fresh_salts]
         return self.embed_derived([(_derive(key, fresh), payload) for key, payload in payloads], mixed)
