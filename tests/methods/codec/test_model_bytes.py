@@ -21,6 +21,7 @@ from keyss.core import DRAWN_OPACITY, Camera, Gaussians, InputError, Scene, Usag
 from keyss.files import write_model
 from keyss.methods import choose_precision, encode_to_size, prune_to_size
 from keyss.methods.codec.model_bytes import Precision, decode, encode
+from keyss.methods.codec.precision import usual_size
 from keyss.rendering import Viewpoints, psnr_between, render
 from keyss.rendering.orbit import orbit
 from tiny_scenes import ring_cameras
@@ -191,3 +192,12 @@ def test_prune_to_size() -> None:
     assert prune_to_size(model, 1 << 20) is model
     with pytest.raises(UsageError, match=r"800 Gaussians takes .* room for 4,000"):
         encode_to_size(model, 4000)
+
+
+def test_a_model_that_was_changed_in_place_is_refused_all_the_same() -> None:
+    """The size of a model is remembered; one that no longer fits must not be tried forever."""
+    model = model_of(800, sh_degree=1)
+    size = usual_size(model)
+    model.sh.mul_(50)
+    with pytest.raises(UsageError, match=f"room for {size:,}"):
+        encode_to_size(model, size)

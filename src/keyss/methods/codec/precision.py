@@ -89,17 +89,17 @@ def encode_to_size(
 
     `short`: use no more bytes than `choose_precision` needs. Raises UsageError if it does not fit.
     """
-    usual, spare = Precision.usual(model), max_bytes - usual_size(model)
+    usual = Precision.usual(model)
     best = encode(model, choose_precision(model, viewpoints) if short else usual.finer(_FINER))
     if len(best) <= max_bytes:
         return best
-    if spare < 0:
-        raise UsageError(
-            f"a secret of {len(model):,} Gaussians takes {usual_size(model):,} bytes, and there is room for "
-            f"{max_bytes:,}"
-        )
-    octaves = _FINER * spare / max(1, len(best) - usual_size(model))
+    octaves = _FINER * (max_bytes - usual_size(model)) / max(1, len(best) - usual_size(model))
     while len(data := encode(model, usual.finer(max(0, octaves)))) > max_bytes:
+        if octaves <= 0:
+            raise UsageError(
+                f"a secret of {len(model):,} Gaussians takes {len(data):,} bytes, and there is room for "
+                f"{max_bytes:,}"
+            )
         octaves -= 0.0625
     return data
 
