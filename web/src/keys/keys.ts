@@ -59,6 +59,7 @@ export function streamWords(
   }
 }
 
+const COMPRESSED = 2 ** 31; // flag in the length
 const MAX_PAYLOAD_BYTES = 256 << 20;
 const [MAX_RATIO, SMALL_PAYLOAD] = [16, 1 << 20]; // n bytes inflate to at most MAX_RATIO n + SMALL_PAYLOAD
 
@@ -72,10 +73,12 @@ export async function decrypted(
   } catch {
     throw damaged();
   }
-  const length = plain.length >= 4 ? viewOf(plain).getUint32(0, true) : plain.length;
+  const prefix = plain.length >= 4 ? viewOf(plain).getUint32(0, true) : plain.length;
+  const length = prefix % COMPRESSED;
   if (4 + length > plain.length) throw damaged();
-  const most = Math.min(MAX_PAYLOAD_BYTES, MAX_RATIO * length + SMALL_PAYLOAD);
-  return inflate(plain.subarray(4, 4 + length), 'deflate', most);
+  const packed = plain.subarray(4, 4 + length);
+  if (prefix < COMPRESSED) return packed;
+  return inflate(packed, 'deflate', Math.min(MAX_PAYLOAD_BYTES, MAX_RATIO * length + SMALL_PAYLOAD));
 }
 
 /** `derive` with at most one derivation at a time, since each takes 64 MiB. */

@@ -83,7 +83,7 @@ class Precision:
 def encode(model: Gaussians, precision: Precision | None = None) -> bytes:
     """Encode `model`, by default with the usual precision."""
     coder = _Encoder.of(model, precision)
-    blocks = in_blocks(coder.code, len(model), BLOCK)
+    blocks = in_blocks(coder.code, len(model), BLOCK, entropy.write)
     return b"".join([coder.head, np.array([*map(len, blocks)], "<u4").tobytes(), *blocks])
 
 
@@ -97,7 +97,7 @@ def encoded_size(model: Gaussians, precision: Precision | None = None) -> int:
         coded = min(stop, start + _SAMPLE)
         return 4 + len(coder.code(start, coded)) * (stop - start) / (coded - start)
 
-    return len(coder.head) + math.ceil(sum(in_blocks(size, len(model), BLOCK)))
+    return len(coder.head) + math.ceil(sum(in_blocks(size, len(model), BLOCK, entropy.write)))
 
 
 @dataclass(frozen=True)
@@ -115,7 +115,9 @@ class _Encoder:
     def of(model: Gaussians, precision: Precision | None) -> _Encoder:
         model = model.detach().to("cpu")
         order = morton_order(model.means.numpy())
-        coder = _Encoder(model, order, model.overflow.numpy(), [], (precision or Precision.usual(model)).steps)
+        coder = _Encoder(
+            model, order, model.overflow.numpy(), [], (precision or Precision.usual(model)).steps
+        )
         middle = [
             *map(np.median, model.means.numpy().T),
             np.median(model.log_scales),
@@ -224,7 +226,7 @@ def decode(data: bytes, model_size: int | None = None) -> Gaussians:
         harmonics = codes[:, 13:] * _steps(steps[5], finer)
         sh[own, 1:] = _from_opponents(harmonics.reshape(len(codes), -1, 3))
 
-    in_blocks(fill, count, BLOCK)
+    in_blocks(fill, count, BLOCK, entropy.read)
     return Gaussians(*map(torch.from_numpy, (means, quats, log_scales, logits, sh)))
 
 
