@@ -6,11 +6,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import torch
 
+from keyss.core.arrays import Bytes
 from keyss.core.errors import InputError, UsageError
 from keyss.core.gaussians import DRAWN_OPACITY, Gaussians
 from keyss.files.inputs import read_file
+from keyss.kernels.blake2b import blake2b_rows
+from keyss.kernels.parallel import in_blocks
 from keyss.methods import companion as companions, registry
 from keyss.methods.hidden import Frame, HiddenFile, HiddenScene, OpensAFileError, Remains
 from keyss.runs.files import PathLike
@@ -23,6 +27,7 @@ _FAR, _ENORMOUS = 1000.0, 100.0  # radii of the visible part
 _MAX_DUPLICATES = 0.1  # share
 _MAX_HARMONIC = 1000.0
 _MIN_QUATERNION = 1e-12  # length
+_BLOCK = 1 << 13  # Gaussians that a thread takes at a time
 
 
 @dataclass(frozen=True)
@@ -174,10 +179,9 @@ def check_model(model: Gaussians) -> ModelCheck:
 
     visible = model.opacities >= DRAWN_OPACITY
     middle, radius = middle_and_radius(model[visible] if visible.any() else model)
-    columns = [model.means, model.quats, model.log_scales, model.opacity_logits[:, None], model.sh.flatten(1)]
     lengths = model.quats.double().norm(dim=1)
     counts = {
-        "duplicates": len(model) - len(torch.unique(torch.cat(columns, dim=1), dim=0)),
+        "duplicates": len(model) - len(np.unique(_digests(model).view("S16"))),
         "no_rotation": int((lengths < _MIN_QUATERNION).sum()),
         "far": int(((model.means - middle).double().norm(dim=1) > _FAR * radius).sum()),
         "enormous": int((visible & (model.log_scales.amax(1).double().exp() > _ENORMOUS * radius)).sum()),
@@ -203,6 +207,17 @@ def check_model(model: Gaussians) -> ModelCheck:
         problems=tuple(problems),
         **counts,
     )
+
+
+def _digests(model: Gaussians) -> Bytes:
+    """Hashes [N, 16] of all values of each Gaussian."""
+
+    def digests(start: int, stop: int) -> Bytes:
+        own = model[start:stop]
+        columns = [own.means, own.quats, own.log_scales, own.opacity_logits[:, None], own.sh.flatten(1)]
+        return blake2b_rows((torch.cat(columns, dim=1) + 0.0).numpy().view(np.uint32), b"")  # -0 becomes 0
+
+    return np.concatenate(in_blocks(digests, len(model), _BLOCK))
 
 
 def check_secret(revealed: Revealed, warned: Sequence[str] = ()) -> SecretCheck:

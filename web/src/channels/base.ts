@@ -1,7 +1,8 @@
 /** What channels carry, and Gaussians of other models; counterpart of `keyss.channels.base` and `mixing`. */
 import { bytesKey, viewOf } from '../core/bytes.ts';
 import { damaged } from '../core/errors.ts';
-import { blockwise, type Derive, expand } from '../keys/keys.ts';
+import { encryptBlocks } from '../keys/aes.ts';
+import { type Derive, expand } from '../keys/keys.ts';
 
 /** Bytes that are read completely or not at all. */
 export interface Payload {
@@ -36,7 +37,7 @@ export function foreign(secret: Uint8Array, ids: Uint8Array, own: Uint8Array, ga
   const kept = 8 * own.length;
   const isUnset = (place: number): boolean => ((own[place >>> 3] >>> (place & 7)) & 1) === 0;
   const places = Array.from({ length: Math.min(kept, gaussians) }, (_, place) => place);
-  const hashed = viewOf(blockwise(expand(secret, 'sketch'), ids));
+  const hashed = viewOf(encryptBlocks(expand(secret, 'sketch'), ids));
   let seen = 0;
   for (let at = 0; at < ids.length; at += ID_BYTES) {
     const place = hashed.getUint32(at, true) % Math.max(1, gaussians);

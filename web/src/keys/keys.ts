@@ -2,7 +2,6 @@
  * Key derivation and decryption (docs/byte-layout.md); counterpart of `keyss.keys`. Argon2id (RFC 9106) of the key in NFKC
  * without surrounding white space, then HKDF-Expand with SHA-256 (RFC 5869) with a label for each use.
  */
-import { ecb } from '@noble/ciphers/aes.js';
 import { chacha20, chacha20poly1305 } from '@noble/ciphers/chacha.js';
 import { hmac } from '@noble/hashes/hmac.js';
 import { sha256 } from '@noble/hashes/sha2.js';
@@ -35,11 +34,6 @@ export function master(key: string, salt: Uint8Array): Promise<Uint8Array> {
 export function expand(secret: Uint8Array, label: string): Uint8Array {
   // Not by the library, which refuses secrets of less than 32 bytes; data keys have 16.
   return hmac(sha256, secret, joined(ascii(`keyss/v1/${label}`), Uint8Array.of(1)));
-}
-
-/** Every 16 bytes through AES-256: a pseudorandom function of blocks, not a mode of operation. */
-export function blockwise(key: Uint8Array, blocks: Uint8Array): Uint8Array {
-  return blocks.length ? ecb(key, { disablePadding: true }).encrypt(blocks) : blocks;
 }
 
 const AT_ONCE = 1 << 16; // bytes of a stream
