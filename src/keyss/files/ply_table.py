@@ -20,7 +20,7 @@ from keyss.core.arrays import Floats, Numbers
 from keyss.core.errors import InputError, KeyssWarning
 
 _MAX_HEADER_BYTES = 64 * 1024
-_CHUNK_BYTES = 1 << 20
+_CHUNK_BYTES, _TEXT_BYTES = 1 << 20, 1 << 16
 
 _SCALARS = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1",
@@ -211,7 +211,7 @@ def _ascii_blocks(file: BinaryIO, skipped: int, vertex: _Element) -> Iterator[Ta
     """Rows in text, after `skipped` values. Line breaks are white space like any other."""
     width = len(vertex.properties)
     step = max(1, _CHUNK_BYTES // (8 * width))
-    tokens = (token for line in file for token in line.split())
+    tokens = _tokens(file)
     try:
         for _ in range(skipped):
             next(tokens)
@@ -226,6 +226,18 @@ def _ascii_blocks(file: BinaryIO, skipped: int, vertex: _Element) -> Iterator[Ta
             yield table
     except (StopIteration, ValueError) as error:
         raise InputError("the ascii data are cut short or hold values of another type") from error
+
+
+def _tokens(file: BinaryIO) -> Iterator[bytes]:
+    """The words of a file, however long its lines are."""
+    start = b""
+    while chunk := file.read(_TEXT_BYTES):
+        words = (start + chunk).split()
+        start = words.pop() if words and not chunk[-1:].isspace() else b""
+        if len(start) > _TEXT_BYTES:
+            raise ValueError("a word without end")
+        yield from words
+    yield from start.split()
 
 
 def is_plain(file: BinaryIO) -> bool:
