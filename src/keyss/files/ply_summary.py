@@ -28,11 +28,11 @@ class PlySummary:
 
 
 def summarise_ply(path: Path) -> PlySummary | None:
-    """The summary of a .ply; None for another file, and for a compressed .ply. Raises as `read_model` does."""
+    """The summary of a .ply, None for any other file; raises as `read_model` does."""
     if not path.is_file() or not path.name.lower().endswith(".ply"):
         return None
     with open_input(path) as file:
-        if not file.read(3) == b"ply":
+        if file.read(3) != b"ply":
             return None
         file.seek(0)
         return _summary(file) if is_plain(file) else None
