@@ -46,7 +46,7 @@ from keyss.files.formats.sog import SogCodes  # noqa: E402
 from keyss.files.formats.spz import SpzCodes  # noqa: E402
 from keyss.keys.derivation import random_embeddings  # noqa: E402
 from keyss.methods import CarriedSecret, Decoder, DecoderShape, HiddenFile, KeyssSecret, choose_anchors  # noqa: E402
-from keyss.methods.codec.model_bytes import decode, encode  # noqa: E402
+from keyss.methods.codec.model_bytes import BLOCK, decode, encode  # noqa: E402
 from methods.carry.carried import embed  # noqa: E402
 from methods.keyss.small import latent_model, make_secret  # noqa: E402
 from vectors.surviving import NAMES, write_surviving  # noqa: E402
@@ -222,7 +222,8 @@ def write_encoded() -> None:
     seen = trained_like(40, 9, 3)
     seen.log_scales[2] += 8  # the finest harmonics; the next has the coarsest
     seen.opacity_logits[3] = -14
-    models = [seen, far, trained_like(10, 10, 1)[:1]]
+    two_blocks = trained_like(20, 11, 0)[torch.arange(BLOCK + 100) % 20]  # equal Gaussians take few bytes
+    models = [seen, far, trained_like(10, 10, 1)[:1], two_blocks]
     encoded = [encode(each) for each in models]
     found = [{"data": data.hex(), "sha256": digests(decode(data))} for data in encoded]
     (FOLDER / "encoded.json").write_text(json.dumps(found, indent=1) + "\n")
