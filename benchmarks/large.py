@@ -1,13 +1,13 @@
 """Seconds, processor seconds and memory of hiding and revealing large models.
 
-    python benchmarks/large.py                                 # 2 million in 2 million
-    python benchmarks/large.py --count 100000 --repeat 3       # the fastest of three
+    python benchmarks/large.py                                # 2 million in 2 million
+    python benchmarks/large.py --count 100000 --repeat 3      # the fastest of three
     python benchmarks/large.py --count 100000 --share 0.1 --secret-degree 0 --format spz
 
 Measures `keyss hide` and `keyss reveal` of synthetic models, imports, key derivation, files and measurements
 included, and divides by a *floor*: one process that reads cover and secret, hashes them (SHA-256), encrypts
-one (ChaCha20-Poly1305) and writes it. `reveal, 22 % lost`: of a random 78 % of the published Gaussians; a file
-of 10 kB is compared with `keyss convert`, which only reads and writes the cover. Kernels are compiled before.
+one (ChaCha20-Poly1305) and writes it. "22 % lost" reveals from a random 78 % of the published Gaussians. A
+file of 10 kB compares with `keyss convert`, which reads and writes the cover. Kernels are compiled before.
 """
 
 from __future__ import annotations

@@ -48,8 +48,13 @@ def in_blocks(
     results: dict[int, T] = {}
 
     def work(waiting: Iterator[int]) -> None:
-        for start in waiting:  # shared by all threads
-            results[start] = function(start, min(start + size, count))
+        try:
+            for start in waiting:  # shared by all threads
+                results[start] = function(start, min(start + size, count))
+        except BaseException:
+            for _ in waiting:  # the other threads only finish their blocks
+                pass
+            raise
 
     waiting = iter(starts)
     if not getattr(kernel, "overloads", True):
