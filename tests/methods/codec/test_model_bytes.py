@@ -197,6 +197,18 @@ def test_estimates_of_large_models_are_a_little_above_their_sizes(octaves: float
     assert size <= encoded_size(model, precision) <= 1.03 * size
 
 
+def test_large_models_open_from_the_rest_of_a_smaller_one_and_false_numbers_do_not() -> None:
+    data = encode(trained_like(20, sh_degree=0)[torch.arange(70_000) % 20], Precision(1e-3).finer(3))
+    data += bytes(3 << 20)
+    for count, model_size, words in (
+        (70_000, 9000, "length"),
+        (70_000, 8000, "can hold"),
+        (2**21, 2**20, "hold"),
+    ):
+        with pytest.raises(InputError, match=words):
+            decode(count.to_bytes(4, "little") + data[4:], model_size)
+
+
 def test_choose_precision() -> None:
     """The target is 43.75 dB; 24 models reached 43.71 to 44.01 dB (standard deviation 0.07)."""
     model = model_of(1500, sh_degree=2)

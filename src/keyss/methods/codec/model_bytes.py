@@ -35,6 +35,7 @@ from keyss.methods.codec import entropy
 
 _ALWAYS = 1 << 16  # number of Gaussians that a payload of any size may declare
 _MIN_BYTES = 2  # minimum bytes per Gaussian of a larger model
+_PER_CARRIER = 8  # maximum Gaussians of a larger model per Gaussian of the stego model, which may have losses
 _HEAD = struct.Struct("<IB5f6ff")
 BLOCK = 1 << 13  # Gaussians; half as many take 0.3 % more bytes, twice as many 0.2 % less
 _SAMPLE = BLOCK // 4  # Gaussians of each block that are coded to estimate the size of a large model
@@ -182,8 +183,8 @@ class _Encoder:
 def decode(data: bytes, model_size: int | None = None) -> Gaussians:
     """Invert `encode`; `model_size`: Gaussians of the stego model. Raises InputError for damage.
 
-    Memory is bounded: above 2^16 Gaussians, each takes at least 2 bytes of `data`, and `model_size` is the
-    maximum.
+    Memory is bounded: above 2^16 Gaussians, each takes at least 2 bytes of `data`, and the maximum is 8 times
+    `model_size`.
     """
     if len(data) < _HEAD.size:
         raise InputError("the hidden secret is damaged: it is too short")
@@ -195,7 +196,7 @@ def decode(data: bytes, model_size: int | None = None) -> Gaussians:
             f"the hidden secret is damaged: it declares {count:,} Gaussians of SH degree {sh_degree}"
         )
     largest = len(data) // _MIN_BYTES
-    if count > max(_ALWAYS, largest if model_size is None else min(largest, model_size)):
+    if count > max(_ALWAYS, largest if model_size is None else min(largest, _PER_CARRIER * model_size)):
         held_by = f"{len(data):,} bytes" + ("" if model_size is None else f" in {model_size:,} Gaussians")
         raise InputError(
             f"the hidden secret is damaged: it declares {count:,} Gaussians, more than {held_by} can hold"
