@@ -7,7 +7,7 @@ import { decodeTable } from './entropy.ts';
 const ALWAYS = 1 << 16; // Gaussians allowed in any payload
 const MIN_BYTES = 2; // per Gaussian in larger models
 const PER_CARRIER = 8; // Gaussians of larger models; some carriers may be lost
-const HEAD_BYTES = 53; // Gaussians (4), SH degree (1), centres (20), steps (24), typical visibility (4)
+const HEAD_BYTES = 53; // Gaussians (4), SH degree (1), centres (20), steps (24), typical weight (4)
 const BLOCK = 1 << 13; // Gaussians that are coded together
 const [MAX_CENTRE, MAX_STEP] = [1e30, 1e6];
 const DIFFERENCE = 1.5; // step of constant colour differences relative to brightness
@@ -24,7 +24,7 @@ interface Head {
   readonly shDegree: number;
   readonly centres: readonly number[];
   readonly steps: readonly number[];
-  readonly typical: number; // visibility
+  readonly typical: number; // logarithm of area x opacity^2
 }
 
 /**

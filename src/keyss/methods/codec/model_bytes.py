@@ -1,6 +1,6 @@
 """A model as one string of bytes.
 
-    number of Gaussians (4 bytes), SH degree (1), centres (20), steps (24), typical visibility (4),
+    number of Gaussians (4 bytes), SH degree (1), centres (20), steps (24), typical weight (4),
     bytes of each block (4), blocks (see `entropy`)
 
 Gaussians are sorted along a Z-order curve; BLOCK of them make a block, which is coded by itself, so that
@@ -10,7 +10,7 @@ one with the largest w is stored, without w. Extreme numbers, which occlude ever
 clamped.
 
 Errors in quaternions and harmonics are more visible in Gaussians that cover more of an image. Their steps
-shrink by a quarter of an octave for each octave of area x opacity^2, the *visibility*, above the median.
+shrink by a quarter of an octave for each octave of area x opacity^2, their *weight*, above the median.
 (Equal errors in an image need half an octave, but small Gaussians are seen from nearer; a quarter measured
 best.) Encoder and decoder compute the steps from scales and opacity.
 
@@ -110,7 +110,7 @@ class _Encoder:
     transparent: Flags  # [N] rows that become transparent
     centres: list[float]
     steps: list[float]
-    typical: float = 0.0  # visibility
+    typical: float = 0.0  # logarithm of a weight
 
     @staticmethod
     def of(model: Gaussians, precision: Precision | None) -> _Encoder:
@@ -127,7 +127,7 @@ class _Encoder:
         limits = [*[MAX_COORDINATE] * 3, MAX_LOG_SCALE, _MAX_LOGIT]
         centres = [float(np.clip(each, -most, most)) for each, most in zip(middle, limits, strict=True)]
         coder = replace(coder, centres=centres)
-        typical = np.median(np.concatenate(in_blocks(coder._visibility, len(model), BLOCK)))
+        typical = np.median(np.concatenate(in_blocks(coder._weight, len(model), BLOCK)))
         return replace(coder, typical=float(np.float32(typical)))
 
     @property
@@ -150,10 +150,10 @@ class _Encoder:
         codes[:, 13:] = _round(harmonics.reshape(len(rows), -1))
         return entropy.encode(codes, *_columns(self.model.sh_degree))
 
-    def _visibility(self, start: int, stop: int) -> Floats:
+    def _weight(self, start: int, stop: int) -> Floats:
         codes = self._uniform_codes(self.order[start:stop])
         _, log_scales, logits, _ = _uniform_numbers(codes, self.centres, self.steps)
-        return _visibility(log_scales, logits).astype(np.float32)
+        return _weight(log_scales, logits).astype(np.float32)
 
     def _uniform_codes(self, rows: Integers) -> Doubles:
         """Codes [R, 10] of means, log scales, opacity logits and constant colours.
@@ -278,8 +278,8 @@ def _transformed(values: Numbers, matrix: Doubles) -> Numbers:
     return found
 
 
-def _visibility(log_scales: Doubles, logits: Doubles) -> Doubles:
-    """Logarithm [N] of area x opacity^2."""
+def _weight(log_scales: Doubles, logits: Doubles) -> Doubles:
+    """Logarithms [N] of weights."""
     scales = np.sort(log_scales, axis=1)
     # log(opacity) is about min(logit, 0)
     found: Doubles = scales[:, 2] + scales[:, 1] + 2 * np.minimum(logits, 0)
@@ -288,7 +288,7 @@ def _visibility(log_scales: Doubles, logits: Doubles) -> Doubles:
 
 def _refinement(log_scales: Doubles, logits: Doubles, typical: float) -> Integers:
     """Half octaves [N] by which the other steps of each Gaussian are finer than those of typical ones."""
-    octaves = (_visibility(log_scales, logits) - typical) * _PER_OCTAVE
+    octaves = (_weight(log_scales, logits) - typical) * _PER_OCTAVE
     found: Integers = np.floor(octaves + 0.5).astype(np.int64)
     return found.clip(-_FINER, _FINER)
 
