@@ -72,15 +72,20 @@ def sketch(secret: bytes, ids: Bytes, size: int = SKETCH_BYTES, among: Integers 
     return np.packbits(bits, bitorder="little").tobytes()
 
 
-def foreign_share(secret: bytes, ids: Bytes, own: bytes, among: Integers | int) -> float:
+def foreign_share(
+    secret: bytes, ids: Bytes, own: bytes, among: Integers | int, gone: float = 0.0
+) -> float:
     """Estimated share, 0 to 1, of foreign Gaussians among those with `ids` [M, 16], by the sketch `own`.
 
-    `among` [M]: as in `sketch`, if Gaussians count in inverse proportion to it; else the number of its Gaussians.
+    `among` [M]: as in `sketch`, if Gaussians count in inverse proportion to it; else the number of its
+    Gaussians. 1 if less than a share `gone` of the sketch's sample is there.
     """
     unset = np.unpackbits(np.frombuffer(own, np.uint8), bitorder="little") == 0
     places = _places(secret, ids, among, len(unset))
     if isinstance(among, int):
         unset = unset[:among]
+    if len(places) < gone * (~unset).sum():
+        return 1.0
     return min(1.0, float(unset[places].sum() / max(1e-9, len(places) * unset.mean())))
 
 

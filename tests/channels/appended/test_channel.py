@@ -251,8 +251,8 @@ def test_any_faint_gaussians_end_in_an_error(seed: int, stego: Gaussians) -> Non
     )
     with pytest.raises(KeyssError):
         opened(junk)
-    # Among as many of its own it is not noticed.
-    assert opened(Gaussians.cat([stego.with_sh_degree(0), junk])) == DATA
+    with pytest.warns(KeyssWarning, match="Gaussians were added"):
+        assert opened(Gaussians.cat([stego.with_sh_degree(0), junk])) == DATA
 
 
 def test_changed_packets_are_not_read_as_they_are_not(stego: Gaussians, cover: Gaussians) -> None:
@@ -277,6 +277,13 @@ def _copies(model: Gaussians, count: int) -> Gaussians:
     return replace(
         one, means=one.means + jitter, log_scales=one.log_scales - 6, opacity_logits=one.opacity_logits.clip(max=-4)
     )
+
+
+def _stacks(model: Gaussians) -> Gaussians:
+    """The first 60 Gaussians of a model, each fifty times."""
+    stacks = model[torch.arange(60).repeat_interleave(50)]
+    noise = torch.randn(len(stacks), 3, generator=torch.Generator().manual_seed(0))
+    return replace(stacks, log_scales=stacks.log_scales + 0.3 * noise)
 
 
 def _scaled(model: Gaussians, scale: float, shift: float = 0.0) -> Gaussians:
@@ -307,7 +314,24 @@ def test_a_secret_put_into_another_file_is_told(name: str, salts: str, stego: Ga
         assert opened(Gaussians.cat([host, ADDED[name](cover, appended)])) == DATA
 
 
-@pytest.mark.parametrize("kept", [0.0, 0.2, 0.6, 1.0])
+@pytest.mark.parametrize("opacity", [1.5 / 255, 3 / 255])
+def test_stacks_of_faint_gaussians_are_told(opacity: float, stego: Gaussians) -> None:
+    """A hundred of them in one place are as visible as one that is not faint."""
+    stacks = _stacks(lifelike(3000, 5))
+    stacks = replace(stacks, opacity_logits=torch.full((len(stacks),), opacity).logit())
+    with pytest.warns(KeyssWarning, match="Gaussians were added"):
+        assert opened(Gaussians.cat([stacks, stego[3000:]])) == DATA
+
+
+def test_a_small_file_with_the_secret_of_a_far_larger_one_is_told(stego: Gaussians) -> None:
+    """Hardly any of its Gaussians are in the sample of the larger one's sketch."""
+    large = embedded(lifelike(60_000, 6), [(KEY, Payload("file", DATA))], entropy=ENTROPY)
+    small = Gaussians.cat([lifelike(300, 5), large[60_000:]])
+    with pytest.warns(KeyssWarning, match="Gaussians were added"):
+        assert opened(small) == DATA
+
+
+@pytest.mark.parametrize("kept", [0.0, 0.1, 0.6, 1.0])
 def test_losses_of_the_cover_are_no_foreign_gaussians(kept: float, stego: Gaussians) -> None:
     rows = torch.arange(round(kept * 3000))
     assert unharmed(Gaussians.cat([stego[rows], stego[3000:]])) == DATA

@@ -66,7 +66,8 @@ _LEFT, _DEVIATIONS, _MAX_DATA = 0.74, 4.2, 5895
 _WIDE, _NARROW, _WIDE_PACKETS = 8, 6, 90_000
 _MAX_PACKETS = 1_000_000  # data packets; a header holds up to 2^20
 _STEP = 256  # smallest difference between numbers of appended Gaussians
-_OVERHEAD = 264  # maximum bytes of a payload beside its data
+_ZLIB_BYTES = 64  # that incompressible data grow by
+_OVERHEAD = OVERHEAD + METHOD_BYTES + 1 + cover_sketches.BYTES + _ZLIB_BYTES
 
 # Search for the lattice's offset: Gaussians in which pilots are counted, maximum number of offsets, and
 # standard deviations by which pilots must outnumber accidental ones.
@@ -128,15 +129,12 @@ class AppendedCover:
         check_keys([key.verifier() for key in keys])
         if len(keys) > 1:
             warnings.warn(_VISIBLE_SECRETS, KeyssWarning, stacklevel=2)
-        single = len(keys) == 1
-        sketches = [cover_sketches.pack(model, to_world.inverse(), _sketch_key(key)) for key in keys]
-        data = [own + each for own, each in zip(sketches, packed, strict=True)]
-        words = [_words(*each, single, random) for each in zip(keys, data, strict=True)]
-        used = sum(map(len, words))
-        total = _padded_count(used)
-        words.append(pilots.write(salt, pilots.count_for(total), random))
-        rest = total - used - pilots.count_for(total)
-        words.append(random.integers(0, 2, (rest, WORD_BITS), np.uint8))
+        total = APPENDED.appended_count([compressed_size(each) for each in packed])
+        words = [pilots.write(salt, pilots.count_for(total), random)]
+        for key, each in zip(keys, packed, strict=True):
+            own = cover_sketches.pack(model, total, to_world.inverse(), _sketch_key(key))
+            words.append(_words(key, own, each, len(keys) == 1))
+        words.append(_random_words(secret, total - sum(map(len, words))))
         # In random order, because sorting keeps the order of equal rotations.
         every = np.concatenate(words)[random_order(secret, "appended/order", total)]
         return Gaussians.cat([model, to_gaussians(sort_by_rotation(every), to_world, model.sh_degree)])
@@ -179,14 +177,12 @@ class AppendedReader(SaltedReader):
             header = read_header(key.expand(f"appended/header/{width}", 32), self.words, width)
             if header:
                 numbers, data = read_packets(key.expand("appended/packets", 32), self.words, width)
-                encrypted = _codewords(header, width).decode(numbers.astype(np.int64), data, errors=True)
-                whole = decrypt(key.expand("appended/data", 32), encrypted, _ASSOCIATED)
-                if len(whole) < cover_sketches.BYTES:
-                    raise InputError("the hidden data are damaged: they are incomplete")
-                own, packed = whole[: cover_sketches.BYTES], whole[cover_sketches.BYTES :]
-                share = cover_sketches.foreign_share(own, self.model, self.to_own, _sketch_key(key))
-                told = round(share * (len(self.model) - len(self.words))) if share > _FOREIGN else 0
-                return replace(unpack_payload(packed), foreign=told)
+                whole = _codewords(header, width).decode(numbers.astype(np.int64), data, errors=True)
+                own = _masked(key, whole[: cover_sketches.BYTES])
+                encrypted = whole[cover_sketches.BYTES :]
+                packed = decrypt(key.expand("appended/data", 32), encrypted, _ASSOCIATED + own)
+                foreign = cover_sketches.foreign_count(own, self.model, self.to_own, _sketch_key(key), _FOREIGN)
+                return replace(unpack_payload(packed), foreign=foreign)
         raise WrongKeyError()
 
 
@@ -236,15 +232,33 @@ def _shifts_with_pilots(steps: Doubles, colours: Integers) -> Iterator[float]:
             yield float(shifts[index])
 
 
-def _words(key: DerivedKey, data: bytes, single: bool, random: np.random.Generator) -> Bits:
-    """Words [N, WORD_BITS] of the headers and packets of `data`; `single`: there is only one secret."""
-    codewords = _codewords_for(compressed_size(data), single)
+def _words(key: DerivedKey, own: bytes, packed: bytes, single: bool) -> Bits:
+    """Words [N, WORD_BITS] of the headers and packets of a payload; `single`: there is only one secret.
+
+    `own`: the cover's sketch, which is masked and authenticated with the payload.
+    """
+    codewords = _codewords_for(compressed_size(packed) + len(own), single)
     width, needed = codewords.width, codewords.count * codewords.k
-    encrypted = encrypt(key.expand("appended/data", 32), data, _ASSOCIATED, size=codewords.size)
+    size = codewords.size - len(own)
+    encrypted = encrypt(key.expand("appended/data", 32), packed, _ASSOCIATED + own, size=size)
+    data = _masked(key, own) + encrypted
     numbers = np.arange(codewords.chunks, dtype=np.uint64)
+    noise = np.frombuffer(key.expand("appended/header-noise", HEADERS * width), np.uint8).reshape(HEADERS, width)
     return np.concatenate(
         [
-            write_header(key.expand(f"appended/header/{width}", 32), needed, width, random),
-            write_packets(key.expand("appended/packets", 32), numbers, codewords.encode(encrypted)),
+            write_header(key.expand(f"appended/header/{width}", 32), needed, noise),
+            write_packets(key.expand("appended/packets", 32), numbers, codewords.encode(data)),
         ]
     )
+
+
+def _masked(key: DerivedKey, own: bytes) -> bytes:
+    """The cover's sketch, encrypted or decrypted."""
+    mask = np.frombuffer(stream(key.master, "appended/cover", len(own)), np.uint8)
+    return (np.frombuffer(own, np.uint8) ^ mask).tobytes()
+
+
+def _random_words(secret: bytes, count: int) -> Bits:
+    """Words [count, WORD_BITS] as random as encrypted ones."""
+    noise = np.frombuffer(stream(secret, "appended/padding", count * WORD_BITS), np.uint8)
+    return (noise & 1).reshape(count, WORD_BITS)

@@ -6,7 +6,8 @@ to a border, which a format may have moved across it; a writer leaves out none.
 
 Of the sketch's sample, half is drawn by number, half by size: an attacker who adds few Gaussians that cover
 much, or many specks, is noticed alike. The IDs fix sizes and places relative to the appended Gaussians, so
-the cover's own Gaussians count only where and as large as they were, once each.
+the cover's own Gaussians count only where and as large as they were, once each. Gaussians too faint for the
+sketch are counted, because many of them in one place are visible.
 """
 
 from __future__ import annotations
@@ -28,8 +29,10 @@ _ERRORS = np.array([0.002] * 3 + [0.035] * 3 + [0.005] + [0.016] * 3)
 _LOW = np.array([-7.0] * 3 + [-8.0] * 3 + [0.0] + [-1.7] * 3)  # formats may clip numbers outside of these
 _HIGH = np.array([7.0] * 3 + [4.0] * 3 + [1.0] + [1.7] * 3)
 _VISIBLE = np.array([2.0, 4.0]) / 255  # minimum opacity for writers and for readers
+_MORE = 1.1  # factor by which formats may increase the number of faint Gaussians
+_GONE = 0.02  # share of the sample; readers of whole covers leave out at most four fifths
 _SKETCH_BYTES = 128
-_FORMAT = struct.Struct(f"<If{_SKETCH_BYTES}s")
+_FORMAT = struct.Struct(f"<IIf{_SKETCH_BYTES}s")  # numbers of faint and of other Gaussians, area, sketch
 BYTES = _FORMAT.size
 
 
@@ -65,19 +68,26 @@ class _Rows:
         return np.rint(2 / (1 / max(1, count) + self.areas / max(1e-30, area))).astype(np.int64).clip(8 * _SKETCH_BYTES)
 
 
-def pack(cover: Gaussians, to_own: Similarity, secret: bytes) -> bytes:
-    """BYTES bytes by which `foreign_share` detects Gaussians that are not the cover's."""
+def pack(cover: Gaussians, appended: int, to_own: Similarity, secret: bytes) -> bytes:
+    """BYTES bytes by which `foreign_count` detects Gaussians other than the cover's and those `appended`."""
     rows = _Rows.of(cover, to_own, secret, reading=False)
     area = float(np.float32(rows.areas.sum()))
-    among = rows.among(len(rows.ids), area)
-    return _FORMAT.pack(len(rows.ids), area, mixing.sketch(secret, rows.ids, _SKETCH_BYTES, among))
+    own = mixing.sketch(secret, rows.ids, _SKETCH_BYTES, rows.among(len(rows.ids), area))
+    return _FORMAT.pack(_faint(cover) + appended, len(rows.ids), area, own)
 
 
-def foreign_share(packed: bytes, model: Gaussians, to_own: Similarity, secret: bytes) -> float:
-    """Estimated share of a model's visible Gaussians, by number and size, that are foreign to a cover.
+def foreign_count(packed: bytes, model: Gaussians, to_own: Similarity, secret: bytes, share: float) -> int:
+    """Estimated number of a model's Gaussians that are foreign to a cover; 0 if they are at most a `share`.
 
-    `packed`: the result of `pack`.
+    `packed`: the result of `pack`. All are foreign if hardly anything is left of the cover.
     """
-    count, area, own = _FORMAT.unpack(packed)
+    faint, count, area, own = _FORMAT.unpack(packed)
+    if _faint(model) > _MORE * faint:
+        return _faint(model) - faint
     rows = _Rows.of(model, to_own, secret, reading=True)
-    return mixing.foreign_share(secret, rows.ids, own, rows.among(count, area))
+    foreign = mixing.foreign_share(secret, rows.ids, own, rows.among(count, area), _GONE)
+    return round(foreign * (len(model) - _faint(model))) if foreign > share else 0
+
+
+def _faint(model: Gaussians) -> int:
+    return int((model.opacities <= _VISIBLE[1]).sum())

@@ -2,15 +2,15 @@
  * Reader of appended Gaussians (docs/channels.md): words of 84 bits, read after a format has rounded them, and packets in words;
  * counterpart of `keyss.channels.appended.appended_channel` and `words`.
  */
-import { ascii, rowsOf } from '../../core/bytes.ts';
+import { ascii, joined, rowsOf, viewOf } from '../../core/bytes.ts';
 import { damaged } from '../../core/errors.ts';
 import { type Gaussians, opacity, where, withDegree } from '../../core/gaussians.ts';
 import { moved, type Similarity } from '../../core/similarity.ts';
 import type { Words } from '../../core/words.ts';
-import { blockwise, decrypted, type Derive, expand, here } from '../../keys/keys.ts';
+import { blockwise, decrypted, type Derive, expand, here, streamWords } from '../../keys/keys.ts';
 import { type Payload, type Reader, unpackPayload } from '../base.ts';
 import { type Codewords, decoded } from '../reed_solomon.ts';
-import { COVER_BYTES, foreignToCover } from './cover.ts';
+import { COVER_BYTES, foreignCount } from './cover.ts';
 import { type Found, LEAST, ONE_IN, pilotsOf, POSITION_BITS, readPilots } from './pilots.ts';
 
 // Gaussians sampled for pilots; number of lattice offsets tried, with at least this many standard deviations more pilots
@@ -59,13 +59,15 @@ export class AppendedReader implements Reader {
       const codewords = readHeader(expand(secret, `appended/header/${width}`), this.words, width);
       if (codewords === null) continue;
       const packets = readPackets(expand(secret, 'appended/packets'), this.words, width);
-      const encrypted = decoded(codewords, packets, true);
-      const whole = await decrypted(expand(secret, 'appended/data'), encrypted, ASSOCIATED);
+      const whole = decoded(codewords, packets, true);
       if (whole.length < COVER_BYTES) throw damaged();
-      const payload = unpackPayload(whole.subarray(COVER_BYTES));
-      const share = foreignToCover(whole.subarray(0, COVER_BYTES), this.model, this.toOwn, expand(secret, 'appended/host'));
-      const visible = this.model.count - this.words.length / WORD_BYTES;
-      return share > FOREIGN ? { ...payload, foreign: Math.round(share * visible) } : payload;
+      const own = whole.slice(0, COVER_BYTES);
+      const [masked, view] = [viewOf(whole), viewOf(own)];
+      streamWords(secret, 'appended/cover', COVER_BYTES / 4, (word, at) => view.setUint32(4 * at, masked.getUint32(4 * at, true) ^ word, true));
+      const packed = await decrypted(expand(secret, 'appended/data'), whole.subarray(COVER_BYTES), joined(ASSOCIATED, own));
+      const payload = unpackPayload(packed);
+      const foreign = foreignCount(own, this.model, this.toOwn, expand(secret, 'appended/host'), FOREIGN);
+      return foreign ? { ...payload, foreign } : payload;
     }
     return null;
   }

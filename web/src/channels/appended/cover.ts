@@ -13,12 +13,17 @@ const HIGH = [7, 7, 7, 4, 4, 4, 1, 1.7, 1.7, 1.7];
 const VISIBLE = 4 / 255; // minimum opacity
 const SKETCH_BYTES = 128;
 
-export const COVER_BYTES = 8 + SKETCH_BYTES;
+const [MORE, GONE] = [1.1, 0.02]; // factor by which formats may increase the number of faint Gaussians; share of the sample
+const SKETCH = 12; // after three numbers
 
-/** The share of a model's visible Gaussians, by number and size, that are foreign to the cover that `packed` describes. */
-export function foreignToCover(packed: Uint8Array, model: Gaussians, toOwn: Similarity, secret: Uint8Array): number {
+export const COVER_BYTES = SKETCH + SKETCH_BYTES;
+
+/** About how many of a model's Gaussians are foreign to the cover that `packed` describes; 0 if they are at most a `share`. */
+export function foreignCount(packed: Uint8Array, model: Gaussians, toOwn: Similarity, secret: Uint8Array, share: number): number {
   const view = viewOf(packed);
-  const [count, area] = [Math.max(1, view.getUint32(0, true)), Math.max(1e-30, view.getFloat32(4, true))];
+  const [before, faint] = [view.getUint32(0, true), model.opacityLogits.reduce((sum, each) => sum + Number(opacity(each) <= VISIBLE), 0)];
+  if (faint > MORE * before) return faint - before; // a hundred of them in one place are visible
+  const [count, area] = [Math.max(1, view.getUint32(4, true)), Math.max(1e-30, view.getFloat32(8, true))];
   const [larger, width] = [Math.log(toOwn.scale), 3 * coefficients(model.shDegree)];
   const offsets = Array.from(expand(secret, 'bins').subarray(0, BINS.length), (byte) => (byte + 0.5) / 256);
   const ids = new Int8Array(ID_BYTES * model.count);
@@ -35,12 +40,13 @@ export function foreignToCover(packed: Uint8Array, model: Gaussians, toOwn: Simi
     if (bins.some((bin) => bin === null)) continue; // a format may have moved it from another bin
     const middles = bins.map((bin, at) => (bin! + 0.5 - offsets[at]) * BINS[at]);
     const [, b, c] = middles.slice(3, 6).sort((x, y) => x - y);
-    const share = Math.exp(b + c) * Math.max(0.02, Math.min(1, middles[6])) / area;
+    const size = Math.exp(b + c) * Math.max(0.02, Math.min(1, middles[6])) / area;
     ids.set(bins as number[], ID_BYTES * among.length);
-    among.push(Math.max(8 * SKETCH_BYTES, Math.round(2 / (1 / count + share))));
+    among.push(Math.max(8 * SKETCH_BYTES, Math.round(2 / (1 / count + size))));
   }
   const own = new Uint8Array(ids.buffer, 0, ID_BYTES * among.length);
-  return foreignShare(secret, own, packed.subarray(8), among);
+  const found = foreignShare(secret, own, packed.subarray(SKETCH), among, GONE);
+  return found > share ? Math.round(found * (model.count - faint)) : 0;
 }
 
 /** The bin of a number; null if it is next to a border. */
