@@ -26,7 +26,7 @@ from keyss.channels.colours import carriers as salting
 from keyss.channels.colours.carriers import Carriers, find_salts
 from keyss.core import Gaussians, Similarity
 from keyss.core.arrays import Doubles
-from keyss.core.errors import BackendError, KeyssWarning
+from keyss.core.errors import BackendError, InputError, KeyssWarning, WrongKeyError
 from keyss.files.models import read_model
 from keyss.lab.auc import auc_between
 from keyss.rendering.orbit import psnr_between
@@ -72,8 +72,11 @@ def share(model: Gaussians) -> float:
         return float("nan")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", KeyssWarning)
-        foreign = reader.open(KEY).foreign
-    return foreign / max(1, int((model.opacities > 4 / 255).sum()))
+        try:
+            foreign = reader.open(KEY).foreign
+        except (InputError, WrongKeyError):
+            return float("nan")
+    return min(1.0, foreign / max(1, int((model.opacities > 3.5 / 255).sum())))
 
 
 def residuals(model: Gaussians) -> tuple[Carriers, Doubles]:
@@ -128,9 +131,11 @@ def main() -> None:
             shares[f"attack: {what}"].append(share(made))
             if what.startswith("30"):
                 print(f"{name}: specks leave {psnr_between(host, made):.1f} dB", flush=True)
-    print("| | models | foreign: least | mean | most |\n| --- | --- | --- | --- | --- |")
-    for what, own in shares.items():
-        print(f"| {what} | {len(own)} | {min(own):.3f} | {np.mean(own):.3f} | {max(own):.3f} |")
+    print("| | opened | foreign: least | mean | most |\n| --- | --- | --- | --- | --- |")
+    for what, every in shares.items():
+        own = [each for each in every if each == each]
+        if own:
+            print(f"| {what} | {len(own)} of {len(every)} | {min(own):.3f} | {np.mean(own):.3f} | {max(own):.3f} |")
 
 
 def compare_salts(covers: dict[str, Gaussians]) -> None:
@@ -144,7 +149,7 @@ def compare_salts(covers: dict[str, Gaussians]) -> None:
         before, after = plain[:, column], np.array(carrying)[:, column]
         print(
             f"{what}: plain {before.mean():.2f} ({before.std():.2f}), carrying {after.mean():.2f} "
-            f"({after.std():.2f}), AUC {auc_between(before, after).auc:.2f}"
+            f"({after.std():.2f}), AUC {auc_between(before.tolist(), after.tolist()).auc:.2f}"
         )
 
 

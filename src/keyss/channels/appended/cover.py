@@ -28,8 +28,9 @@ _BINS = np.array([1 / 16] * 3 + [0.5] * 3 + [0.1] + [0.3] * 3)
 _ERRORS = np.array([0.002] * 3 + [0.035] * 3 + [0.005] + [0.016] * 3)
 _LOW = np.array([-7.0] * 3 + [-8.0] * 3 + [0.0] + [-1.7] * 3)  # formats may clip numbers outside of these
 _HIGH = np.array([7.0] * 3 + [4.0] * 3 + [1.0] + [1.7] * 3)
-_VISIBLE = np.array([2.0, 4.0]) / 255  # minimum opacity for writers and for readers
-_MORE = 1.1  # factor by which formats may increase the number of faint Gaussians
+# Minimum opacity for writers and for readers; 8 bits round none across the second.
+_VISIBLE = np.array([2.0, 3.5]) / 255
+_MORE = 1.25  # factor by which formats may increase the number of faint Gaussians
 _GONE = 0.02  # share of the sample; readers of whole covers leave out at most four fifths
 _SKETCH_BYTES = 128
 _FORMAT = struct.Struct(f"<IIf{_SKETCH_BYTES}s")  # numbers of faint and of other Gaussians, area, sketch
@@ -82,11 +83,11 @@ def foreign_count(packed: bytes, model: Gaussians, to_own: Similarity, secret: b
     `packed`: the result of `pack`. All are foreign if hardly anything is left of the cover.
     """
     faint, count, area, own = _FORMAT.unpack(packed)
-    if _faint(model) > _MORE * faint:
-        return _faint(model) - faint
+    here = _faint(model)
+    more = here - faint if here > _MORE * faint else 0
     rows = _Rows.of(model, to_own, secret, reading=True)
     foreign = mixing.foreign_share(secret, rows.ids, own, rows.among(count, area), _GONE)
-    return round(foreign * (len(model) - _faint(model))) if foreign > share else 0
+    return more + (round(foreign * (len(model) - here)) if foreign > share else 0)
 
 
 def _faint(model: Gaussians) -> int:

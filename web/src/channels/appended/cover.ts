@@ -10,10 +10,10 @@ const BINS = [1 / 16, 1 / 16, 1 / 16, 0.5, 0.5, 0.5, 0.1, 0.3, 0.3, 0.3];
 const ERRORS = [0.002, 0.002, 0.002, 0.035, 0.035, 0.035, 0.005, 0.016, 0.016, 0.016];
 const LOW = [-7, -7, -7, -8, -8, -8, 0, -1.7, -1.7, -1.7]; // formats may clip numbers outside of these
 const HIGH = [7, 7, 7, 4, 4, 4, 1, 1.7, 1.7, 1.7];
-const VISIBLE = 4 / 255; // minimum opacity
+const VISIBLE = 3.5 / 255; // minimum opacity; 8 bits round none across it
 const SKETCH_BYTES = 128;
 
-const [MORE, GONE] = [1.1, 0.02]; // factor by which formats may increase the number of faint Gaussians; share of the sample
+const [MORE, GONE] = [1.25, 0.02]; // factor by which formats may increase the number of faint Gaussians; share of the sample
 const SKETCH = 12; // after three numbers
 
 export const COVER_BYTES = SKETCH + SKETCH_BYTES;
@@ -22,7 +22,7 @@ export const COVER_BYTES = SKETCH + SKETCH_BYTES;
 export function foreignCount(packed: Uint8Array, model: Gaussians, toOwn: Similarity, secret: Uint8Array, share: number): number {
   const view = viewOf(packed);
   const [before, faint] = [view.getUint32(0, true), model.opacityLogits.reduce((sum, each) => sum + Number(opacity(each) <= VISIBLE), 0)];
-  if (faint > MORE * before) return faint - before; // a hundred of them in one place are visible
+  const more = faint > MORE * before ? faint - before : 0; // a hundred of them in one place are visible
   const [count, area] = [Math.max(1, view.getUint32(4, true)), Math.max(1e-30, view.getFloat32(8, true))];
   const [larger, width] = [Math.log(toOwn.scale), 3 * coefficients(model.shDegree)];
   const offsets = Array.from(expand(secret, 'bins').subarray(0, BINS.length), (byte) => (byte + 0.5) / 256);
@@ -46,7 +46,7 @@ export function foreignCount(packed: Uint8Array, model: Gaussians, toOwn: Simila
   }
   const own = new Uint8Array(ids.buffer, 0, ID_BYTES * among.length);
   const found = foreignShare(secret, own, packed.subarray(SKETCH), among, GONE);
-  return found > share ? Math.round(found * (model.count - faint)) : 0;
+  return more + (found > share ? Math.round(found * (model.count - faint)) : 0);
 }
 
 /** The bin of a number; null if it is next to a border. */
