@@ -21,6 +21,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+from colours import FORMATS, OTHERS, OWN, cheap_keys, sampled
 from keyss.channels import APPENDED, COLOURS, AppendedReader, Payload
 from keyss.channels.colours import carriers as salting
 from keyss.channels.colours.carriers import Carriers, find_salts
@@ -33,7 +34,6 @@ from keyss.rendering.orbit import psnr_between
 
 import numpy as np
 import torch
-from colours import FORMATS, OTHERS, OWN, cheap_keys, sampled
 from scipy.spatial import cKDTree
 
 KEY, NOTE = "a key of the benchmark 4711", Payload("t", b"a note of twenty b..")
@@ -135,7 +135,8 @@ def main() -> None:
     for what, every in shares.items():
         own = [each for each in every if each == each]
         if own:
-            print(f"| {what} | {len(own)} of {len(every)} | {min(own):.3f} | {np.mean(own):.3f} | {max(own):.3f} |")
+            opened = f"{len(own)} of {len(every)}"
+            print(f"| {what} | {opened} | {min(own):.3f} | {np.mean(own):.3f} | {max(own):.3f} |")
 
 
 def compare_salts(covers: dict[str, Gaussians]) -> None:

@@ -72,9 +72,7 @@ def sketch(secret: bytes, ids: Bytes, size: int = SKETCH_BYTES, among: Integers 
     return np.packbits(bits, bitorder="little").tobytes()
 
 
-def foreign_share(
-    secret: bytes, ids: Bytes, own: bytes, among: Integers | int, gone: float = 0.0
-) -> float:
+def foreign_share(secret: bytes, ids: Bytes, own: bytes, among: Integers | int, gone: float = 0.0) -> float:
     """Estimated share, 0 to 1, of foreign Gaussians among those with `ids` [M, 16], by the sketch `own`.
 
     `among` [M]: as in `sketch`, if Gaussians count in inverse proportion to it; else the number of its

@@ -275,7 +275,10 @@ def _copies(model: Gaussians, count: int) -> Gaussians:
     one = model[torch.full((count,), row)]
     jitter = torch.randn(one.means.shape, generator=torch.Generator().manual_seed(0))
     return replace(
-        one, means=one.means + jitter, log_scales=one.log_scales - 6, opacity_logits=one.opacity_logits.clip(max=-4)
+        one,
+        means=one.means + jitter,
+        log_scales=one.log_scales - 6,
+        opacity_logits=one.opacity_logits.clip(max=-4),
     )
 
 
@@ -302,7 +305,9 @@ ADDED: dict[str, Callable[[Gaussians, Gaussians], Gaussians]] = {
 
 @pytest.mark.parametrize("name", ADDED)
 @pytest.mark.parametrize("salts", ["kept", "removed"])
-def test_a_secret_put_into_another_file_is_told(name: str, salts: str, stego: Gaussians, other: Gaussians) -> None:
+def test_a_secret_put_into_another_file_is_told(
+    name: str, salts: str, stego: Gaussians, other: Gaussians
+) -> None:
     """The key opens it there, so its holder must hear that the file is another one's."""
     host = other if salts == "kept" else other[:3000]
     cover, appended = stego[:3000], stego[3000:]

@@ -19,15 +19,7 @@ from keyss.channels.colours import colours_channel as channel, header
 from keyss.channels.colours.carriers import Carriers, find_salts
 from keyss.channels.colours.header import FILE_KEY_BYTES, Header, Secrets, places
 from keyss.channels.colours.planner import STRENGTH
-from keyss.core import (
-    Gaussians,
-    InputError,
-    KeyssError,
-    KeyssWarning,
-    Similarity,
-    UsageError,
-    WrongKeyError,
-)
+from keyss.core import Gaussians, InputError, KeyssError, KeyssWarning, Similarity, UsageError, WrongKeyError
 from keyss.lab import converters, cropping, half_floats, noise, opacity_pruning, random_pruning
 from keyss.rendering import psnr_between
 from lab.lifelike import turned

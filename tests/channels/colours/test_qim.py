@@ -108,7 +108,9 @@ def test_salts_are_found_again_after_rounding_and_pruning() -> None:
     salts = find_salts(carriers)[1]
     assert len(salts) == SALTS
     sh = model.sh.clone()
-    sh[carriers.rows, 0] = torch.from_numpy((np.round(carriers.colours * 38.25 + 127.5) - 127.5) / 38.25).float()
+    sh[carriers.rows, 0] = torch.from_numpy(
+        (np.round(carriers.colours * 38.25 + 127.5) - 127.5) / 38.25
+    ).float()
     kept = torch.rand(6000, generator=torch.Generator().manual_seed(3)) < 0.75
     rounded = replace(model, log_scales=(model.log_scales * 16).round() / 16, sh=sh)[kept]
     assert len(set(find_salts(Carriers.of(turned(1.37)(rounded)))[1]) & set(salts)) >= 3

@@ -53,7 +53,7 @@ from keyss.channels.base import (
 from keyss.channels.mixing import random_order
 from keyss.channels.reed_solomon import Codewords
 from keyss.core.arrays import Bits, Doubles, Integers
-from keyss.core.errors import InputError, KeyssWarning, UsageError, WrongKeyError
+from keyss.core.errors import KeyssWarning, UsageError, WrongKeyError
 from keyss.core.gaussians import Gaussians
 from keyss.core.similarity import Similarity
 from keyss.keys.derivation import SALT_BYTES, DerivedKey, expand, stream
@@ -181,7 +181,9 @@ class AppendedReader(SaltedReader):
                 own = _masked(key, whole[: cover_sketches.BYTES])
                 encrypted = whole[cover_sketches.BYTES :]
                 packed = decrypt(key.expand("appended/data", 32), encrypted, _ASSOCIATED + own)
-                foreign = cover_sketches.foreign_count(own, self.model, self.to_own, _sketch_key(key), _FOREIGN)
+                foreign = cover_sketches.foreign_count(
+                    own, self.model, self.to_own, _sketch_key(key), _FOREIGN
+                )
                 return replace(unpack_payload(packed), foreign=foreign)
         raise WrongKeyError()
 
@@ -243,7 +245,9 @@ def _words(key: DerivedKey, own: bytes, packed: bytes, single: bool) -> Bits:
     encrypted = encrypt(key.expand("appended/data", 32), packed, _ASSOCIATED + own, size=size)
     data = _masked(key, own) + encrypted
     numbers = np.arange(codewords.chunks, dtype=np.uint64)
-    noise = np.frombuffer(key.expand("appended/header-noise", HEADERS * width), np.uint8).reshape(HEADERS, width)
+    noise = np.frombuffer(key.expand("appended/header-noise", HEADERS * width), np.uint8).reshape(
+        HEADERS, width
+    )
     return np.concatenate(
         [
             write_header(key.expand(f"appended/header/{width}", 32), needed, noise),

@@ -66,7 +66,11 @@ class _Rows:
 
     def among(self, count: int, area: float) -> Integers:
         """Places in the sketch of a cover with `count` Gaussians and a total `area`."""
-        return np.rint(2 / (1 / max(1, count) + self.areas / max(1e-30, area))).astype(np.int64).clip(8 * _SKETCH_BYTES)
+        return (
+            np.rint(2 / (1 / max(1, count) + self.areas / max(1e-30, area)))
+            .astype(np.int64)
+            .clip(8 * _SKETCH_BYTES)
+        )
 
 
 def pack(cover: Gaussians, appended: int, to_own: Similarity, secret: bytes) -> bytes:

@@ -196,7 +196,7 @@ def read_packets(key: bytes, words: Bits, width: int) -> tuple[Words, Bytes]:
 
 
 def write_header(key: bytes, value: int, noise: Bytes) -> Bits:
-    """Words [HEADERS, WORD_BITS] that all hold `value`, a number of _HEADER_BITS, and `noise` [HEADERS, width]."""
+    """Words [HEADERS, WORD_BITS] that hold `value`, of _HEADER_BITS bits, and `noise` [HEADERS, width]."""
     return write_packets(key, np.full(HEADERS, value, np.uint64), noise)
 
 

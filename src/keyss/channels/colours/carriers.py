@@ -10,10 +10,10 @@ steps of 1 / 38.25; most formats: opacities in 255ths), so rounding moves no num
 a model moves rounded values relative to the bins, so a reader tries several *alignments*.
 
 *Salt Gaussians* have the smallest public hashes of their bins (opacity, ratios of scales, red), among the
-Gaussians whose numbers no format can move into another bin. Half of them are faint, so that not all are lost
-where the faint ones are removed, nor where they alone are kept. A salt of Argon2id is a hash of the bins of one salt
-Gaussian, green and blue included. They are never written: everybody finds them, and would see it. Files of one cover
-have the same salts.
+Gaussians whose numbers no format can move into another bin. Half of them are opaque enough to survive the
+removal of faint Gaussians. A salt of Argon2id is a hash of the bins of one salt Gaussian, green and blue
+included. They are never written, because everybody finds them and would see the noise. Files of one cover
+therefore have the same salts.
 """
 
 from __future__ import annotations
@@ -105,7 +105,7 @@ class Carriers:
 
     @cached_property
     def weights(self) -> Doubles:
-        """Weights [C] of carriers as a part of the model: by area x opacity up to the mean, equal IDs once."""
+        """Weights [C] of carriers as a part of the model: area x opacity up to the mean; equal IDs count once."""
         sizes = np.exp(np.sort(self.log_scales)[:, 1:].sum(axis=1).clip(-80, 80)) * self.opacities
         weights: Doubles = np.minimum(1, sizes / max(1e-300, float(sizes.mean()))) * self.shares
         return weights

@@ -227,7 +227,9 @@ class ColoursReader:
         raise WrongKeyError()
 
 
-def _payload(header: Header, secrets: Secrets, carriers: Carriers, shift: float) -> tuple[bytes, float] | None:
+def _payload(
+    header: Header, secrets: Secrets, carriers: Carriers, shift: float
+) -> tuple[bytes, float] | None:
     """The payload decrypted by the header's data key, and the share of foreign carriers; or None."""
     rows = np.flatnonzero(_without_places(header.carrier_mask(carriers), [secrets], carriers))
     size, key, ids = bucket_bytes(header.bucket), secrets.data_key(header), carriers.ids[rows]
@@ -250,8 +252,8 @@ def _payload(header: Header, secrets: Secrets, carriers: Carriers, shift: float)
 def _foreign_share(agreement: Doubles, held: Doubles, weights: Doubles) -> float:
     """The share, by `weights` [B], of foreign carriers that is certain: less by _DEVIATIONS standard errors.
 
-    `agreement` [B], -1 to 1, of the values with the bits that were written: 0 in the mean for foreign carriers,
-    else `held` [B] of its maximum.
+    `agreement` [B], -1 to 1, of values with the bits that were written. Its mean is 0 for foreign carriers;
+    for others, it is the share `held` [B] of the maximum.
     """
     sizes = np.abs(agreement)
     expected = float((weights * held * sizes).sum())

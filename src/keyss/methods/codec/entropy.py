@@ -115,7 +115,7 @@ def _code(
         low, _, at = _renormalise(low, np.int64(1 << 16), at, data, reading)
     for row in range(count):
         recent = np.int64(0)
-        if reading and at >= len(data) + 4 or not reading and len(data) - at < _LARGEST * columns:
+        if (reading and at >= len(data) + 4) or (not reading and len(data) - at < _LARGEST * columns):
             return len(data) + reading
         for column in range(columns):
             predicted = shares[column] * before[column] >> 3
