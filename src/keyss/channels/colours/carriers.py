@@ -105,7 +105,7 @@ class Carriers:
 
     @cached_property
     def weights(self) -> Doubles:
-        """Weights [C] of carriers as a part of the model: area x opacity up to the mean; equal IDs count once."""
+        """Weights [C] of carriers in the model: area x opacity, up to the mean; equal IDs count once."""
         sizes = np.exp(np.sort(self.log_scales)[:, 1:].sum(axis=1).clip(-80, 80)) * self.opacities
         weights: Doubles = np.minimum(1, sizes / max(1e-300, float(sizes.mean()))) * self.shares
         return weights
