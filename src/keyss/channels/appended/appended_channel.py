@@ -265,4 +265,5 @@ def _masked(key: DerivedKey, own: bytes) -> bytes:
 def _random_words(secret: bytes, count: int) -> Bits:
     """Words [count, WORD_BITS] as random as encrypted ones."""
     noise = np.frombuffer(stream(secret, "appended/padding", count * WORD_BITS), np.uint8)
-    return (noise & 1).reshape(count, WORD_BITS)
+    bits: Bits = (noise & np.uint8(1)).reshape(count, WORD_BITS)
+    return bits

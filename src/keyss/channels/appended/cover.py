@@ -32,6 +32,7 @@ _HIGH = np.array([7.0] * 3 + [4.0] * 3 + [1.0] + [1.7] * 3)
 _VISIBLE = np.array([2.0, 3.5]) / 255
 _MORE = 1.25  # factor by which formats may increase the number of faint Gaussians
 _GONE = 0.02  # share of the sample; readers of whole covers leave out at most four fifths
+_TESTED = 0.1  # share of the visible Gaussians; about a third are not next to a border
 _SKETCH_BYTES = 128
 _FORMAT = struct.Struct(f"<IIf{_SKETCH_BYTES}s")  # numbers of faint and of other Gaussians, area, sketch
 BYTES = _FORMAT.size
@@ -90,8 +91,10 @@ def foreign_count(packed: bytes, model: Gaussians, to_own: Similarity, secret: b
     here = _faint(model)
     more = here - faint if here > _MORE * faint else 0
     rows = _Rows.of(model, to_own, secret, reading=True)
-    foreign = mixing.foreign_share(secret, rows.ids, own, rows.among(count, area), _GONE)
-    return more + (round(foreign * (len(model) - here)) if foreign > share else 0)
+    visible = len(model) - here
+    gone = _GONE if len(rows.ids) > _TESTED * visible else 0.0  # else most have one number, next to a border
+    foreign = mixing.foreign_share(secret, rows.ids, own, rows.among(count, area), gone)
+    return more + (round(foreign * visible) if foreign > share else 0)
 
 
 def _faint(model: Gaussians) -> int:

@@ -14,6 +14,7 @@ const VISIBLE = 3.5 / 255; // minimum opacity; 8 bits round none across it
 const SKETCH_BYTES = 128;
 
 const [MORE, GONE] = [1.25, 0.02]; // factor by which formats may increase the number of faint Gaussians; share of the sample
+const TESTED = 0.1; // share of the visible Gaussians; about a third are not next to a border
 const SKETCH = 12; // after three numbers
 
 export const COVER_BYTES = SKETCH + SKETCH_BYTES;
@@ -45,8 +46,10 @@ export function foreignCount(packed: Uint8Array, model: Gaussians, toOwn: Simila
     among.push(Math.max(8 * SKETCH_BYTES, Math.round(2 / (1 / count + size))));
   }
   const own = new Uint8Array(ids.buffer, 0, ID_BYTES * among.length);
-  const found = foreignShare(secret, own, packed.subarray(SKETCH), among, GONE);
-  return more + (found > share ? Math.round(found * (model.count - faint)) : 0);
+  const visible = model.count - faint;
+  const gone = among.length > TESTED * visible ? GONE : 0; // else most have one number, next to a border
+  const found = foreignShare(secret, own, packed.subarray(SKETCH), among, gone);
+  return more + (found > share ? Math.round(found * visible) : 0);
 }
 
 /** The bin of a number; null if it is next to a border. */
