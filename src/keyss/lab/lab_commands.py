@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, get_args
 
@@ -49,6 +50,7 @@ def audit(
         optional("PART", f"Part to audit: {', '.join(get_args(PartName))}; repeat for more.", "all"),
     ] = (),
     report_only: Annotated[bool, switch("Write the report again, from the stored measurements.")] = False,
+    dry_run: Annotated[bool, switch("Print estimates of the time of each part; needs no keys.")] = False,
     resume: Resume = False,
     overwrite: Overwrite = False,
     device: Device = "auto",
@@ -59,8 +61,13 @@ def audit(
     example: keyss audit runs/hidden --key-file key.txt
 
     example: keyss audit runs/hidden --report-only
+
+    example: keyss audit runs/hidden --dry-run
     """
     check_exists(run)
+    if dry_run:
+        _print_audit_forecast(run, controls, only, device)
+        return
     import keyss
     from keyss.cli.keys import keys_of_run
     from keyss.cli.tables import print_files
@@ -294,6 +301,19 @@ def _print_verdicts(audit: Audit) -> None:
     rows = [(line.measure, line.value, line.beside, line.limit, line.word) for line in lines]
     print_table(("measure", "measured", "baseline or control", "limit", "verdict"), rows, texts=5)
     Console().print(headline(lines), highlight=False)
+
+
+def _print_audit_forecast(run: Path, controls: int, only: Sequence[str], device: Device) -> None:
+    """Print the parts of an audit and how long they take."""
+    from keyss.cli.tables import print_table
+    from keyss.lab.audits.forecast import forecast_audit
+    from keyss.progress import about
+
+    found = forecast_audit(run, controls=controls, only=only, device=device)
+    print_table(("part", "time, about"), [(name, about(each)) for name, each in found.seconds.items()])
+    where = "the GPU" if found.device == "cuda" else "the CPU"
+    print(f"About {about(sum(found.seconds.values()))} on {where}.")
+    print("Dry run: nothing was written. Times are rough; controls that exist take none.")
 
 
 def _print_forecast(found: Forecast) -> None:

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
@@ -22,6 +23,7 @@ _SECONDS = {
     "hide a file": 8.0,
     "export": 2.0,
     "render": 10.0,
+    "prepare": 8.0,
     ".compressed.ply": 4.0,  # before its own end
     ".ply": 3.0,
     ".spz": 5.0,
@@ -40,6 +42,13 @@ def seconds_to_convert(model: Path, out: Path, keys: int) -> float:
     """About the seconds to convert a model and to open its secrets before and after."""
     suffix = next((each for each in _SECONDS if each.startswith(".") and out.name.endswith(each)), ".ply")
     return seconds_for(suffix, model) + 2 * keys * (seconds_for("reveal", model) - _START)
+
+
+def seconds_to_prepare(sources: Sequence[object]) -> float:
+    """About the seconds to read models and to find what can be written in them; photos do not count."""
+    paths = [Path(each) for each in sources if isinstance(each, str | Path)]
+    count = sum(gaussians_in(path) for path in paths if path.is_file())
+    return _START + _SECONDS["prepare"] * count / 1e6
 
 
 def gaussians_in(path: Path) -> float:
