@@ -81,9 +81,9 @@ def measure_robustness(
     """PSNRs of cover and secrets after each of the `changes`; the first result is the unchanged model's.
 
     `changes`: by default `default_changes`, about 50; results of equal attack and strength are averaged.
-    `max_views`: test views per scene. `progress`: called with the finished work and the total, about training steps.
-    Renders on the device of `stego`. Deterministic in `seed`. Raises UsageError unless there is one opener
-    per secret, KeyssError if a secret does not open in the unchanged model.
+    `max_views`: test views per scene. `progress`: called with the finished and the total work in training
+    steps. Renders on the device of `stego`. Deterministic in `seed`. Raises UsageError unless there is one
+    opener per secret, KeyssError if a secret does not open in the unchanged model.
     """
     cover, *secrets = scenes
     if len(openers) != len(secrets):

@@ -54,9 +54,12 @@ class CarryMethod:
         if degree is None:
             degree = options.fit.sh_degree if cover.given is None else cover.given.sh_degree
         options = options.with_fit(sh_degree=degree)
+        secret_sizes = _secret_sizes(secrets, options)
+        if options.channel_in(cover.given).grows:
+            for each in secret_sizes:
+                each.check_appended()
         try:
             capacity = CarryCapacity.of(cover.given, options, _PLANNED)
-            secret_sizes = _secret_sizes(secrets, options)
             sizes = capacity.sizes(secret_sizes)
             if options.may_show and cover.given is not None:
                 _check_share(secret_sizes, sizes)
