@@ -334,4 +334,4 @@ def _print_forecast(found: Forecast) -> None:
         f"{len(rows)} run{'s' * (len(rows) != 1)}, {len(found.costs)} to do: about "
         f"{about(sum(cost.seconds for cost in found.costs.values()))} on this machine."
     )
-    print("Dry run: nothing was written. Times are rough, and leave out the measurements afterwards.")
+    print("Dry run: nothing was written. Times are rough; measurements are included.")

@@ -1,6 +1,6 @@
 """Rough times of work on files of models, for the line that says how long it takes.
 
-`benchmarks/estimates.py` measures the rates. Does not import torch.
+Does not import torch.
 """
 
 from __future__ import annotations
@@ -15,20 +15,20 @@ from keyss.files.ply_table import is_plain, read_vertices
 
 _BYTES = 16  # of a Gaussian in a compressed file
 _START = 2.0  # seconds to import what the commands need
-# Seconds for a million Gaussians of SH degree 3, on two cores of an x86-64 machine.
+# Processor seconds for a million Gaussians of SH degree 3, on an x86-64 machine; the slowest of one kind.
 _SECONDS = {
-    "info": 0.2,
-    "verify": 1.0,
-    "reveal": 8.0,
-    "hide a file": 8.0,
-    "export": 2.0,
+    "info": 0.3,
+    "verify": 1.2,
+    "reveal": 3.0,
+    "hide a file": 10.0,
+    "export": 1.0,
     "render": 10.0,
-    "prepare": 8.0,
-    ".compressed.ply": 4.0,  # before its own end
+    "prepare": 10.0,
+    ".compressed.ply": 9.0,  # before its own end
     ".ply": 3.0,
-    ".spz": 5.0,
-    ".sog": 20.0,
-    ".glb": 4.0,
+    ".spz": 13.0,
+    ".sog": 9.0,
+    ".glb": 5.0,
     ".splat": 3.0,
 }
 
