@@ -5,11 +5,12 @@ Does not import torch.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
-from keyss.core.errors import InputError
+from keyss.core.errors import InputError, KeyssWarning
 from keyss.files.file_kinds import model_file
 from keyss.files.ply_table import is_plain, read_vertices
 
@@ -53,7 +54,8 @@ def seconds_to_prepare(sources: Sequence[object]) -> float:
 
 def gaussians_in(path: Path) -> float:
     """About the number of Gaussians in a file, from its header or its size; 0 if it cannot be read."""
-    with suppress(InputError, OSError, ValueError):
+    with suppress(InputError, OSError, ValueError), warnings.catch_warnings():
+        warnings.simplefilter("ignore", KeyssWarning)  # the command itself says which model it takes
         path = model_file(path)
         with path.open("rb") as file:
             if is_plain(file):
