@@ -121,6 +121,8 @@ def commands(folder: Path, format: str) -> dict[str, list[Any]]:
         "floor": [sys.executable, "-c", FLOOR, cover, secret, folder / "floor"],
         "convert": [*program, "convert", cover, folder / "copy.ply", "--overwrite"],
         "hide": [*program, "hide", *models, *published, *key, "-o", folder / "run"],
+        "info": [*program, "info", folder / "cover.ply"],
+        "verify": [*program, "verify", stego],
         "reveal": [*program, "reveal", stego, *key, "-o", folder / "revealed.ply"],
     }
     if format in ("ply", "any"):

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, Task, TextColumn
@@ -118,7 +119,7 @@ class ProgressLines(Reporter):
     @contextmanager
     def waiting(self, what: str, seconds: float) -> Iterator[Share]:
         """See `Reporter`. A terminal displays a moving sign; logs get a line after 2 s, then every 10 s."""
-        wait = Wait(what, seconds, self.timer)
+        wait = Wait(what, seconds * _crowding(), self.timer)
         if self.live:
             with self.console.status(wait, refresh_per_second=4):
                 yield wait.update
@@ -168,6 +169,13 @@ class Wait:
 
     def __rich__(self) -> Text:
         return Text(str(self))
+
+
+def _crowding() -> float:
+    """Factor on the time of work beside others: processes per core, at least 1."""
+    with suppress(AttributeError, OSError):  # not on Windows
+        return max(1.0, (os.getloadavg()[0] + 1) / (os.cpu_count() or 1))
+    return 1.0
 
 
 def waiting(what: str, seconds: float) -> AbstractContextManager[Share]:

@@ -35,6 +35,7 @@ from keyss.methods.registry import DEFAULT, open_companion, open_model
 from keyss.progress import Reporter
 from keyss.rendering import Backend, resolve_device
 from keyss.rendering.orbit import is_model
+from keyss.runs.estimates import seconds_to_prepare
 from keyss.runs.files import (
     CONFIG,
     METRICS,
@@ -118,23 +119,25 @@ def hide(
         folder = _folder(place, settings, given, models, keys, bound, overwrite, resume)
         began -= folder.earlier_seconds
 
-    sources = sources_of(given, models, keys, views)
-    options = chosen.prepare(sources, options)
-    plain_steps = _plain_steps(sources, models, options)
-    trains = not dry_run and (options.trains or any(each.given is None for each in sources))
-    sources = [
-        source
-        if source.photos
-        else replace(source, loaded=as_scene(each, views, train_pictures=trains, model=source.given))
-        for each, source in zip(given, sources, strict=True)
-    ]
+    reporter = reporter or Reporter()
+    with reporter.waiting("reading the cover and the secrets", seconds_to_prepare([*given, *models])):
+        sources = sources_of(given, models, keys, views)
+        options = chosen.prepare(sources, options)
+        plain_steps = _plain_steps(sources, models, options)
+        trains = not dry_run and (options.trains or any(each.given is None for each in sources))
+        sources = [
+            source
+            if source.photos
+            else replace(source, loaded=as_scene(each, views, train_pictures=trains, model=source.given))
+            for each, source in zip(given, sources, strict=True)
+        ]
     cost = cost_of(options, sources, target, bound=bound)
     check_room(cost, place)
     if dry_run:
         return HideResult(plan=chosen.plan(sources, options), cost=cost)
 
     with folder.work() if folder else nullcontext():
-        if reporter and not resume and (options.channel_in().grows or trains):
+        if not resume and (options.channel_in().grows or trains):
             plan = chosen.plan(sources, options)
             for line in (f"hide: a file of up to {plan.megabytes:,.1f} MB, {cost}", *plan.notes):
                 reporter.note(line)
@@ -149,13 +152,17 @@ def hide(
         # Images of given models take their place from here on, which frees memory for the revealed ones.
         sources = [each if each.photos else replace(each, given=None) for each in sources]
         del plain
-        read = _write_and_read(stego, published, keys, folder)
-        shown = [
-            compare(
-                model.to(target), each.given and each.given.to(target), each.scene, of_plain=not each.photos
-            )
-            for model, each in zip(read, sources, strict=True)
-        ]
+        with reporter.waiting("reading the published file, and comparing renders", cost.check_seconds):
+            read = _write_and_read(stego, published, keys, folder)
+            shown = [
+                compare(
+                    model.to(target),
+                    each.given and each.given.to(target),
+                    each.scene,
+                    of_plain=not each.photos,
+                )
+                for model, each in zip(read, sources, strict=True)
+            ]
         sizes = [(len(model), count) for model, (count, _) in zip(read, plain_sizes, strict=True)]
         check_quality(shown, min_psnr, sizes, options, resumes=trains)
 

@@ -96,8 +96,8 @@ def _check_sizes(channel: Channel, cover: Gaussians, payloads: Sequence[Payload]
         size = sum(compressed_size(payload.data) for payload in payloads)
     if size > _MOST * typical:
         raise UsageError(
-            f"the {channel.place} of a cover of {len(cover):,} Gaussians hold about {typical:,} bytes; the given "
-            f'take {size:,}; `publish="any", channel="appended"` has room for all'
+            f"the {channel.place} of a cover of {len(cover):,} Gaussians hold about {typical:,} bytes; the "
+            f'given take {size:,}; `publish="any", channel="appended"` has room for all'
         )
 
 

@@ -103,10 +103,11 @@ def _folder_info(path: Path) -> RunInfo | ModelInfo | SceneInfo:
 def _model_info(path: Path) -> ModelInfo:
     if (summary := summarise_ply(path)) is not None:
         count, degree, transparent = summary.gaussians, summary.sh_degree, summary.nearly_transparent
-        low, high = summary.low, summary.high
+        box = _round(summary.low), _round(summary.high)
     else:
         model = _read_model(path)
-        count, degree, low, high = len(model), model.sh_degree, model.means.amin(0), model.means.amax(0)
+        count, degree = len(model), model.sh_degree
+        box = _round(model.means.amin(0)), _round(model.means.amax(0))
         transparent = int((model.opacity_logits < NEARLY_TRANSPARENT).sum())
     return ModelInfo(
         kind="3DGS model",
@@ -114,7 +115,7 @@ def _model_info(path: Path) -> ModelInfo:
         bytes=None if is_standard(path) else path.stat().st_size,
         gaussians=count,
         sh_degree=degree,
-        bounding_box=(_round(low), _round(high)),
+        bounding_box=box,
         nearly_transparent=round(transparent / count, 4),
     )
 

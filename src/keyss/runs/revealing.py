@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 import torch
-from torch import Tensor
 
+from keyss.channels import copies
 from keyss.core.errors import InputError, UsageError
 from keyss.core.gaussians import DRAWN_OPACITY, Gaussians
 from keyss.files.inputs import read_file
@@ -20,11 +18,8 @@ from keyss.runs.files import PathLike
 
 MIN_LEFT = 0.1  # share; pruning compensation stops there, and renders become empty
 NOTICED_LOSS = 0.01  # share; pruning compensation begins there
-# No known trained or public model has a Gaussian beyond 10 radii or larger than one radius; one has 3.5 %
-# duplicates.
+# No known trained or public model has a Gaussian beyond 10 radii or larger than one radius.
 _FAR, _ENORMOUS = 1000.0, 100.0  # radii of the visible part
-_MAX_DUPLICATES = 0.1  # share
-_BLOCK = 1 << 14  # Gaussians hashed at a time
 _MAX_HARMONIC = 1000.0
 _MIN_QUATERNION = 1e-12  # length
 
@@ -136,7 +131,7 @@ class ModelCheck:
 
     gaussians: int
     sh_degree: int
-    duplicates: int  # Gaussians that are equal to another one in every value
+    duplicates: int  # visible Gaussians with the position and the red of another
     unit_quaternions: float  # share with length 1; others are valid too
     no_rotation: int  # quaternions of length 0
     far: int  # Gaussians a thousand times as far out as visible ones
@@ -181,23 +176,25 @@ def check_model(model: Gaussians) -> ModelCheck:
     middle, radius = middle_and_radius(model[seen[:: max(1, len(seen) // SAMPLE)]] if len(seen) else model)
     lengths = model.quats.double().norm(dim=1)
     harmonics = model.sh.flatten(1)
+    duplicates, suspicious = copies(model)
     counts = {
-        "duplicates": _duplicates(model),
+        "duplicates": duplicates,
         "no_rotation": int((lengths < _MIN_QUATERNION).sum()),
         "far": int(((model.means - middle).double().norm(dim=1) > _FAR * radius).sum()),
         "enormous": int((visible & (model.log_scales.amax(1).double().exp() > _ENORMOUS * radius)).sum()),
         "out_of_range": int((torch.maximum(harmonics.amax(1), -harmonics.amin(1)) > _MAX_HARMONIC).sum()),
     }
-    allowed = {"duplicates": int(_MAX_DUPLICATES * len(model))}
     words = {
-        "duplicates": "equal to others in every value",
+        "duplicates": "copied from others",
         "no_rotation": "with a quaternion of length 0",
         "far": f"more than {_FAR:,.0f} times as far out as visible ones",
         "enormous": f"more than {_ENORMOUS:,.0f} times as large as the visible part",
         "out_of_range": f"with harmonics beyond {_MAX_HARMONIC:,.0f}",
     }
     problems = [
-        f"{count:,} Gaussians {words[name]}" for name, count in counts.items() if count > allowed.get(name, 0)
+        f"{count:,} Gaussians {words[name]}"
+        for name, count in counts.items()
+        if (suspicious if name == "duplicates" else count)
     ]
     if not visible.any():
         problems.append("all Gaussians are invisible")
@@ -208,25 +205,6 @@ def check_model(model: Gaussians) -> ModelCheck:
         problems=tuple(problems),
         **counts,
     )
-
-
-def _duplicates(model: Gaussians) -> int:
-    """Gaussians that are equal to an earlier one in every value; compares only those of equal hashes."""
-    weights = np.frombuffer(os.urandom(8 * 59), np.uint64)  # random: nobody can prepare equal hashes
-    hashes = np.empty(len(model), np.uint64)
-    for start in range(0, len(model), _BLOCK):
-        rows = _rows(model[start : start + _BLOCK]).numpy().view(np.uint32)
-        hashes[start : start + _BLOCK] = rows.astype(np.uint64) @ weights[: rows.shape[1]]
-    _, places, counts = np.unique(hashes, return_inverse=True, return_counts=True)
-    suspects = torch.from_numpy((counts > 1)[places])
-    alike = _rows(model[suspects])
-    return len(alike) - len(torch.unique(alike, dim=0))
-
-
-def _rows(model: Gaussians) -> Tensor:
-    """[N, 11 + 3 K] all values, with 0 for -0."""
-    columns = [model.means, model.quats, model.log_scales, model.opacity_logits[:, None], model.sh.flatten(1)]
-    return torch.cat(columns, dim=1) + 0.0
 
 
 def check_secret(revealed: Revealed, warned: Sequence[str] = ()) -> SecretCheck:
