@@ -26,7 +26,7 @@ from keyss._interrupts import ENDING
 from keyss.core.errors import InputError, Interrupted, KeyssWarning
 from keyss.files.atomic import write_bytes
 from keyss.fitting.config import FitConfig
-from keyss.fitting.density import CappedStrategy, Rendered, of_scene
+from keyss.fitting.density import CappedStrategy, Rendered
 from keyss.fitting.parameters import Optimizers, Parameters
 from keyss.fitting.schedule import Schedule
 from keyss.progress import Reporter
@@ -65,7 +65,7 @@ class TrainingRun(ABC):
 
     parameters: Parameters
     optimizers: Optimizers
-    schedules: list[Schedule]  # for each scene that has parameters of its own
+    schedule: Schedule
     strategy: CappedStrategy
     density: dict[str, Any]  # the state of `strategy`
     network_optimizers: Sequence[torch.optim.Optimizer] = ()
@@ -104,8 +104,7 @@ class TrainingRun(ABC):
 
     def set_rates(self) -> None:
         """Set the learning rates of the step `iteration`."""
-        for scene, schedule in enumerate(self.schedules):
-            schedule.set(of_scene(self.optimizers, scene), self.iteration)
+        self.schedule.set(self.optimizers, self.iteration)
 
     def state(self) -> State:
         """Parameters, their Adam moments, and what else the future depends on; tensors are not copied."""

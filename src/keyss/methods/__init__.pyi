@@ -8,7 +8,12 @@ from .codec.precision import (
     prune_to_size as prune_to_size,
 )
 from .hidden import Frame as Frame, HiddenFile as HiddenFile, HiddenScene as HiddenScene, Remains as Remains
-from .keyss.decoder import DECODERS as DECODERS, Decoder as Decoder, LatentDecoder as LatentDecoder
+from .keyss.decoder import Decoder as Decoder
+from .keyss.keyss_method import (
+    KeyssSecret as KeyssSecret,
+    choose_anchors as choose_anchors,
+    publish as publish,
+)
 from .keyss.keyss_options import (
     ATTRIBUTES as ATTRIBUTES,
     DESIGNS as DESIGNS,
@@ -17,7 +22,6 @@ from .keyss.keyss_options import (
     KeyssOptions as KeyssOptions,
     parse_mask as parse_mask,
 )
-from .keyss.keyss_secret import KeyssSecret as KeyssSecret, choose_anchors as choose_anchors
 from .keyss.training import (
     CombinedPoses as CombinedPoses,
     KeyssTraining as KeyssTraining,

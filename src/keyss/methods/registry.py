@@ -42,7 +42,7 @@ METHODS = {
         "train one model and a decoder for all keys jointly, as the paper does",
         "keyss.methods.keyss.keyss_options:KeyssOptions",
         "keyss.methods.keyss.keyss_method:METHOD",
-        "keyss.methods.keyss.keyss_secret:KeyssSecret.of",
+        "keyss.methods.keyss.keyss_method:KeyssSecret.of",
     ),
     "3dgs": _baseline("upper_bound", "BoundOptions", "upper bound: the secret is a separate file"),
     "3dgs-sh": _baseline(

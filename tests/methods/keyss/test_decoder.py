@@ -83,13 +83,26 @@ def test_gaussians_are_decoded_independently() -> None:
 def test_chunked_decoding(monkeypatch: pytest.MonkeyPatch) -> None:
     """Chunks bound the memory that a hostile file can request."""
     decoder, stego = _decoder(released=True), random_gaussians()
-    whole, sizes = decoder(stego, KEY), []
-    decoder.register_forward_pre_hook(lambda _, given: sizes.append(len(given[0])))
-    monkeypatch.setattr("keyss.methods.keyss.decoder.DECODED_NUMBERS", 20_000)
-    in_parts = decoder.decode(stego, KEY)
-    assert max(sizes) < len(stego) == sum(sizes)
+    whole = decoder(stego, KEY)
+    monkeypatch.setattr("keyss.methods.keyss.decoder.ROWS", 70)
+    in_parts = decoder(stego, KEY)
     for name, values in vars(whole).items():
         torch.testing.assert_close(getattr(in_parts, name), values)
+
+
+def test_gradients(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of weights, Gaussians and the key, against differences, where some rows have no gradient."""
+    monkeypatch.setattr("keyss.methods.keyss.decoder.ROWS", 3)
+    decoder = _decoder(hidden=(5, 4), branch=3, sh_degree=0, key_size=6).double().requires_grad_()
+    model = random_gaussians(8, sh_degree=0).map(lambda values: values.double().requires_grad_())
+    key, seen = torch.randn(6).double().requires_grad_(), torch.rand(8, generator=torch.Generator()) < 0.6
+
+    def decoded(*_: torch.Tensor) -> list[torch.Tensor]:
+        return [values[seen] for values in vars(decoder(model, key)).values()]
+
+    assert seen.any() and not seen.all()
+    leaves = (*vars(model).values(), key, *decoder.parameters())
+    assert torch.autograd.gradcheck(decoded, leaves)
 
 
 def test_parse_mask() -> None:
