@@ -53,6 +53,9 @@ METHODS = {
         "DecoderOptions",
         "a network from the cover's picture to the secret's, in a companion file (baseline)",
     ),
+    "watergs": _baseline(
+        "watergs", "WaterGsOptions", "second harmonics and opacities, hidden in the first (baseline)"
+    ),
     "gs-hider": _baseline(
         "gs_hider", "GsHiderOptions", "features in place of harmonics, and a network for each scene"
     ),
