@@ -52,9 +52,8 @@ class CappedStrategy(DefaultStrategy):  # type: ignore[misc]
     def statistics(self, renders: Sequence[Rendered], count: int) -> list[Tensor]:
         """[2, `count`] for each render: norms of screen-space gradients, and 1 for visible Gaussians.
 
-        Combined densification (KeySS, section 3.4) adds them up over the renders of all scenes. Gradients
-        are for a screen from -1 to 1 as large as that of the first render, and divided by the weight of the
-        loss, to match the thresholds of plain 3DGS.
+        Gradients are for a screen from -1 to 1 as large as that of the first render, and divided by the
+        weight of the loss, to match the thresholds of plain 3DGS.
         """
         width, height = renders[0][0]["width"], renders[0][0]["height"]
         found = []
@@ -105,3 +104,35 @@ class CappedStrategy(DefaultStrategy):  # type: ignore[misc]
         if 0 < count < len(pruned):
             remove(params=params, optimizers=optimizers, state=state, mask=pruned)
         return count
+
+
+class CombinedStrategy(CappedStrategy):
+    """Combined densification (KeySS, section 3.4): view-space gradients of all scenes choose what grows.
+
+    The paper does not say how. Here every scene has an equal share of the room below the cap, and every round
+    an equal share of what is left. With sums of gradients, the scene whose points are in place first takes
+    all room, and the other one is left with a few Gaussians.
+    """
+
+    def statistics(self, renders: Sequence[Rendered], count: int) -> list[Tensor]:
+        """[2, `count`, S], see `CappedStrategy.statistics`, of the renders of S scenes."""
+        return [torch.stack(super().statistics(renders, count), dim=2)]
+
+    @torch.no_grad()
+    def _grow_gs(
+        self, params: Parameters, optimizers: Optimizers, state: dict[str, Any], step: int
+    ) -> tuple[int, int]:
+        gradients = state["grad2d"] / state["count"].clamp_min(1)  # [N, S]
+        scenes, asking = gradients.shape[1], gradients > self.grow_grad2d
+        rounds = (self.refine_stop_iter - 1 - step) // self.refine_every + 1
+        room = -(-max(0, self.max_gaussians - len(gradients)) // rounds)
+        growing = asking.any(1)
+        if int(growing.sum()) > room:
+            growing = torch.zeros_like(growing)
+            for own, count in zip(gradients.T, asking.sum(0).tolist(), strict=True):
+                growing[own.topk(min(room // scenes, count)).indices] = True
+        # gsplat compares one number for each Gaussian with its threshold.
+        state["grad2d"], state["count"] = growing * 2 * self.grow_grad2d, torch.ones_like(gradients[:, 0])
+        grown: tuple[int, int] = DefaultStrategy._grow_gs(self, params, optimizers, state, step)
+        state["grad2d"] = state["count"] = gradients.new_zeros(len(params["means"]), scenes)
+        return grown

@@ -41,6 +41,10 @@ class Decoder(nn.Module):
                 if isinstance(layer, nn.Linear):
                     nn.init.kaiming_normal_(layer.weight, nonlinearity="relu")
                     nn.init.zeros_(layer.bias)
+        else:  # residuals start at 0, and all scenes as the points show them
+            for *_, last in self.branches.values():
+                nn.init.zeros_(last.weight)
+                nn.init.zeros_(last.bias)
 
     def forward(self, cover: Gaussians, key: Tensor, whole: Gaussians | None = None) -> Gaussians:
         """Decode `cover`, which may be a part of `whole`."""

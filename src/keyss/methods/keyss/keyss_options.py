@@ -83,12 +83,15 @@ class Design:
     # Rate of AdamW in runs of 30,000 steps. Shorter runs raise it as they raise the Gaussians' rates
     # (`keyss.fitting.schedule.boost_of`), and all runs let it decay to 5 %. The paper gives none.
     decoder_rate: float = 5e-4
+    # Ours: first share of the run, in which this rate rises from 0. A decoder that is faster than the points of a
+    # secret before a plain background makes them all transparent, and transparent Gaussians have no gradient.
+    warm_up: float = 0.1
     weight_decay: float = 1e-4  # from the authors' program
 
     def __post_init__(self) -> None:
         """Raise UsageError for values out of range."""
         check_above_zero(self, "beta_cover", "beta_secret", "decoder_rate")
-        for name in ("common_poses", "beta_incorrect"):
+        for name in ("common_poses", "beta_incorrect", "warm_up"):
             if not 0 <= getattr(self, name) <= 1:
                 raise UsageError(f"`{name}`: expected 0 to 1, got {getattr(self, name)}")
         if not 0 < self.start_share < 1:
@@ -114,6 +117,7 @@ DESIGNS: dict[str, Design] = {
         name="released",
         ssim_weight=0.2,
         decoder_rate=5e-5,
+        warm_up=0.0,
         decoder=replace(_PUBLISHED.decoder, released=True, branch=128),
     ),
 }

@@ -20,7 +20,7 @@ from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Camera, Scene
 from keyss.core.similarity import Similarity, align
 from keyss.fitting.config import FitConfig
-from keyss.fitting.density import CappedStrategy, Rendered
+from keyss.fitting.density import CappedStrategy, CombinedStrategy, Rendered
 from keyss.fitting.image_metrics import psnr, subsample_views
 from keyss.fitting.loop import Shuffle, State, TrainingRun, own_randomness, train, with_prefix
 from keyss.fitting.losses import Target, Targets, photometric_loss
@@ -181,8 +181,10 @@ class KeyssTraining(TrainingRun):
         # Without networks, the optimiser still needs a parameter.
         weights = list(self.networks.parameters()) or [torch.nn.Parameter(torch.zeros(1))]
         self.network_optimizers = [torch.optim.AdamW(weights, weight_decay=design.weight_decay)]
-        # The authors' program stops density control at the cap.
-        self.strategy = CappedStrategy(self.fit, self.opacity_for_pruning, freeze=design.decoder.released)
+        # The authors' program sums up the gradients of all scenes, and stops density control at the cap.
+        released = design.decoder.released
+        strategy = CappedStrategy if released else CombinedStrategy
+        self.strategy = strategy(self.fit, self.opacity_for_pruning, freeze=released)
         self.density = self.strategy.initialize_state(self.extent)
 
     def start(self) -> Gaussians:
@@ -203,9 +205,11 @@ class KeyssTraining(TrainingRun):
 
     def set_rates(self) -> None:
         super().set_rates()
-        rate = self.design.decoder_rate * boost_of(self.fit)
-        group = self.network_optimizers[0].param_groups[0]
-        group["lr"] = rate * LAST_NETWORK_RATE ** (self.iteration / self.iterations)
+        progress = self.iteration / self.iterations
+        rate = self.design.decoder_rate * boost_of(self.fit) * LAST_NETWORK_RATE**progress
+        if self.design.warm_up:
+            rate *= min(1.0, progress / self.design.warm_up)
+        self.network_optimizers[0].param_groups[0]["lr"] = rate
 
     def sample_poses(self) -> list[Pose]:
         """The training pose for each scene: one of all poses (combined camera poses)."""
@@ -226,7 +230,8 @@ class KeyssTraining(TrainingRun):
         """L of equation 11, and the renders whose gradients count for combined densification."""
         degree, ssim_weight = self.fit.sh_degree_at(self.iteration), self.fit.ssim_weight
         total = torch.zeros((), device=self.device)
-        renders: dict[int, Rendered] = {}  # baselines render scenes together
+        drawn: dict[int, Picture] = {}
+        weights: dict[int, float] = {}  # by render: baselines render scenes together
         for pose in dict.fromkeys(poses):
             scenes = [scene for scene, own in enumerate(poses) if own == pose]
             pictures = self.draw(scenes, self.poses.camera(*pose), degree)
@@ -234,18 +239,19 @@ class KeyssTraining(TrainingRun):
                 target, beta = self.poses.target(scene, *pose), self.betas[scene]
                 # L_cover of equation 4 for scene 0, L_secret^s of equation 5 for scene s.
                 total = total + beta * photometric_loss(picture.image, target, ssim_weight)
-                if scene in self.growing:
-                    shared = renders.get(id(picture.meta))
-                    weight = beta + (shared[2] if shared else 0.0)
-                    renders[id(picture.meta)] = (picture.meta, picture.indices, weight)
+                drawn[scene] = picture
+                weights[id(picture.meta)] = weights.get(id(picture.meta), 0.0) + beta
         if wrong_key is not None:  # L_incorrect of equation 7
             shown = self.decoder(self.cover(), wrong_key)
             picture = self.render(shown, 0, self.poses.camera(*poses[0]), degree)
             incorrect = photometric_loss(picture.image, self.poses.target(0, *poses[0]), ssim_weight)
             total = total + self.design.beta_incorrect * incorrect
-        if self.design.decoder.released:  # gradients of the weighted losses, unscaled
-            return total, [(meta, indices, 1.0) for meta, indices, _ in renders.values()]
-        return total, list(renders.values())
+        # The authors' program takes the gradients of the weighted losses.
+        released = self.design.decoder.released
+        growing = [drawn[scene] for scene in self.growing]
+        return total, [
+            (each.meta, each.indices, 1.0 if released else weights[id(each.meta)]) for each in growing
+        ]
 
     def cover(self) -> Gaussians:
         """G_cover, attached to the graph."""
