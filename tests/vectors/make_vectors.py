@@ -251,7 +251,7 @@ def decoder_of(shape: DecoderShape, stego: Gaussians) -> KeyssSecret:
     for weights in decoder.parameters():
         torch.nn.init.normal_(weights, std=0.3, generator=generator)
     key = random_embeddings(1, generator, shape.key_size)[0]
-    return KeyssSecret(decoder, key, some_frame(), choose_anchors(stego, 16), 600, 300.0)
+    return KeyssSecret(decoder, key, some_frame(), choose_anchors(stego, 16), 600)
 
 
 def some_frame() -> Similarity:

@@ -68,7 +68,7 @@ class TrainingRun(ABC):
     schedule: Schedule
     strategy: CappedStrategy
     density: dict[str, Any]  # the state of `strategy`
-    network_optimizers: Sequence[torch.optim.Optimizer] = ()
+    network_optimizer: torch.optim.Optimizer | None = None  # of `networks`, if there are any
 
     def __init__(self, fit: FitConfig, device: torch.device) -> None:
         self.fit, self.device = fit, device
@@ -76,6 +76,7 @@ class TrainingRun(ABC):
         self.generators = {"generator": torch.Generator().manual_seed(fit.known_seed)}
         self.generator = self.generators["generator"]
         self.shuffles: dict[str, Shuffle] = {}
+        self.networks = torch.nn.ModuleList()
 
     @abstractmethod
     def step(self) -> None:
@@ -97,7 +98,8 @@ class TrainingRun(ABC):
         self.loss = loss.detach()
         info = self.strategy.statistics(renders, len(self))
         self.set_rates()
-        for optimizer in (*self.optimizers.values(), *self.network_optimizers):
+        networks = [self.network_optimizer] if self.network_optimizer else []
+        for optimizer in (*self.optimizers.values(), *networks):
             optimizer.step()
             optimizer.zero_grad(set_to_none=True)
         self.strategy.step_post_backward(self.parameters, self.optimizers, self.density, self.iteration, info)
@@ -116,6 +118,10 @@ class TrainingRun(ABC):
         density = {key: value for key, value in self.density.items() if isinstance(value, Tensor)}
         state |= {f"density.{key}": value for key, value in density.items()}
         state |= {name: shuffle.remaining for name, shuffle in self.shuffles.items()}
+        state |= {f"networks.{name}": value for name, value in self.networks.state_dict().items()}
+        if self.network_optimizer:
+            for index, moments in self.network_optimizer.state_dict()["state"].items():
+                state |= {f"networks_adam.{index}.{name}": value for name, value in moments.items()}
         return state | {name: generator.get_state() for name, generator in self.generators.items()}
 
     def load(self, state: State) -> None:
@@ -134,6 +140,13 @@ class TrainingRun(ABC):
             self.parameters[name] = parameter
         density = with_prefix(state, "density.").items()
         self.density |= {key: value.to(self.device) for key, value in density}
+        self.networks.load_state_dict(with_prefix(state, "networks."))
+        if self.network_optimizer:
+            adam = self.network_optimizer.state_dict()
+            for name, value in with_prefix(state, "networks_adam.").items():
+                index, key = name.split(".")
+                adam["state"].setdefault(int(index), {})[key] = value
+            self.network_optimizer.load_state_dict(adam)
         for name, shuffle in self.shuffles.items():
             shuffle.remaining = state[name]
         for name, generator in self.generators.items():

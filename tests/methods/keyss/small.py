@@ -10,10 +10,16 @@ from keyss import FitConfig, Gaussians, KeyssOptions
 from keyss.core.similarity import Similarity
 from keyss.keys import random_embeddings
 from keyss.methods import DESIGNS, Decoder, DecoderShape, KeyssSecret, choose_anchors
-from keyss.methods.keyss.keyss_method import visibility
+from keyss.methods.keyss.keyss_method import count_visible
 
 FIT = FitConfig(
-    iterations=60, max_gaussians=600, grow_start=0.2, grow_every=20, grow_gradient=1e-6, evaluate_every=0, seed=0
+    iterations=60,
+    max_gaussians=600,
+    grow_start=0.2,
+    grow_every=20,
+    grow_gradient=1e-6,
+    evaluate_every=0,
+    seed=0,
 )
 KEYS = ("first key", "second key")
 VECTORS = random_embeddings(3, torch.Generator().manual_seed(1234))
@@ -35,4 +41,4 @@ def make_secret(stego: Gaussians) -> KeyssSecret:
     decoder.branches["op"][-1].bias *= 0.01
     frame = Similarity(1.001, translation=torch.full((3,), 0.01, dtype=torch.float64))
     key = VECTORS[0]
-    return KeyssSecret(decoder, key, frame, choose_anchors(stego, 0), *visibility(decoder(stego, key)))
+    return KeyssSecret(decoder, key, frame, choose_anchors(stego, 0), count_visible(decoder(stego, key)))

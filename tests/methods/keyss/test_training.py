@@ -130,16 +130,20 @@ def test_targets() -> None:
     assert (foreign.image - expected).abs().max() <= 0.5 / 255 + 1e-6
 
 
-def test_poses_are_drawn_evenly() -> None:
-    """Every pose of every scene once, before one comes again (combined camera poses)."""
+@pytest.mark.parametrize("evenly", ["scenes", "poses"])
+def test_poses_are_drawn_evenly(evenly: Any) -> None:
+    """Every scene, or every pose of every scene, once before one comes again (combined camera poses)."""
     scenes, models = three_scenes()
     scenes[1] = replace(scenes[1], train=scenes[1].train[:3])
     placed = [PlacedScene.of(*each, Similarity()) for each in zip(scenes, models, strict=True)]
-    run = KeyssTraining(placed, list(VECTORS[:2]), small("published"), torch.device("cpu"))
+    run = KeyssTraining(placed, list(VECTORS[:2]), small("published", evenly=evenly), torch.device("cpu"))
     poses = [(scene, index) for scene, each in enumerate(scenes) for index in range(len(each.train))]
     drawn = [run.sample_poses() for _ in poses]
     assert all(len(set(each)) == 1 for each in drawn)
-    assert sorted(each[0] for each in drawn) == poses
+    if evenly == "poses":
+        assert sorted(each[0] for each in drawn) == poses
+    else:
+        assert all({each[0][0] for each in drawn[at : at + 3]} == {0, 1, 2} for at in range(0, 9, 3))
 
 
 def test_start_leaves_room_for_growth() -> None:
@@ -157,7 +161,7 @@ def test_decoder_rate_follows_the_length_of_the_run(iterations: int, boost: floa
     run = _run(fit=replace(FIT, iterations=iterations))
     run.iteration = iterations
     run.set_rates()
-    assert run.network_optimizers[0].param_groups[0]["lr"] == pytest.approx(5e-4 * boost * 0.05)
+    assert run.network_optimizer.param_groups[0]["lr"] == pytest.approx(5e-4 * boost * 0.05)
 
 
 def test_idle_density_control_warns() -> None:

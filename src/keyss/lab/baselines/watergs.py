@@ -1,9 +1,9 @@
-"""WaterGS, also called Splats in Splats (Guo et al., 2024): harmonics in harmonics, and an opacity autoencoder.
+"""WaterGS, also called Splats in Splats (Guo et al., 2024): harmonics in harmonics, opacities autoencoded.
 
-Both scenes share positions, rotations and scales. The secret's harmonics lie in the low bits of the cover's: the
-lower their degree, the more important they are, and the more bits they get. An encoder changes the published
-opacities, so that a decoder in the companion file finds the secret's. Bits and networks follow after the
-training, which is not end to end.
+Both scenes share positions, rotations and scales. The secret's harmonics lie in the low bits of the cover's:
+the lower their degree, the more important they are, and the more bits they get. An encoder changes the
+published opacities, so that a decoder in the companion file finds the secret's. Bits and networks follow
+after the training, which is not end to end.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ class WaterGsTraining(BaselineTraining):
             logits, network = hide_opacities(cover, secret.opacity_logits)
         sh, limits = hide_harmonics(cover.sh, secret.sh)
         stego = replace(cover, sh=sh, opacity_logits=logits)
-        tensors = {"limits": limits, **{name: values for name, values in network.state_dict().items()}}
+        tensors = {"limits": limits, **network.state_dict()}
         return stego, CompanionTensors(tensors, self.scenes[1].frame)
 
 
@@ -72,7 +72,7 @@ def bits_of(coefficients: int) -> Tensor:
 
 
 def hide_harmonics(cover: Tensor, secret: Tensor) -> tuple[Tensor, Tensor]:
-    """`cover` [N, K, 3] with `secret`, quantised, in the low bits, and the largest secret coefficients [K, 1]."""
+    """`cover` [N, K, 3] with `secret`, quantised, in the low bits; the secret's largest numbers [K, 1]."""
     limits = secret.abs().amax((0, 2))[:, None].clamp_min(1e-6)
     steps = (1 << bits_of(cover.shape[1])) - 1
     codes = ((secret / limits + 1) / 2 * steps).round().int()
@@ -96,9 +96,7 @@ def network_of(inputs: int) -> nn.Sequential:
 
 def known_of(stego: Gaussians, logits: Tensor) -> Tensor:
     """[N, 11] the decoder's inputs: the published opacity, and what surrounds it in the file."""
-    return torch.cat(
-        [logits[:, None] / 8, stego.log_scales / 8, stego.quats, stego.sh[:, 0]], dim=1
-    )
+    return torch.cat([logits[:, None] / 8, stego.log_scales / 8, stego.quats, stego.sh[:, 0]], dim=1)
 
 
 def hide_opacities(cover: Gaussians, secret: Tensor) -> tuple[Tensor, nn.Sequential]:

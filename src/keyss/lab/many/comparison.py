@@ -77,8 +77,8 @@ _SECRECY = {
 }
 _LEGEND = (
     "Test views: photos that were not trained on. Steps: those in which cover and secret were rendered, in "
-    "total. 3dgs is the upper bound: plain 3DGS with equal numbers of Gaussians and training steps; 3dgs:half "
-    "has half as many Gaussians for each scene, like a model that both share. "
+    "total. 3dgs is the upper bound: plain 3DGS with equal numbers of Gaussians and training steps; "
+    "3dgs:half has half as many Gaussians for each scene, like a model that both share. "
     "Pictures/s: in brackets, the time over that of plain 3DGS. Seconds: time of hiding, after plain models.",
     "Wrong keys: mean PSNR in dB of their renders against the cover, and maximum against the secret; in "
     "brackets, the published model itself against the secret. Classifier and StegExpose: area under the ROC "

@@ -1,4 +1,4 @@
-"""The decoder D of equation 6: maps the cover's Gaussians and a key to a secret's (section 3.2, appendix B)."""
+"""The decoder D of equation 6, from the cover and a key to a secret (section 3.2, appendix B)."""
 
 from __future__ import annotations
 

@@ -12,7 +12,6 @@ the bytes.
 from __future__ import annotations
 
 import hashlib
-import math
 import os
 import warnings
 from collections.abc import Sequence
@@ -46,11 +45,9 @@ ANCHORS_NEEDED = 0.25  # minimum share found
 ANCHOR_TOLERANCE = 1e-6  # fraction of the model's size
 _SLACK = 0.01  # share of the Gaussians that rounding may make visible or invisible
 _WEIGHTS = "decoder."
-_GROWTH = 0.25  # exponent; the best of 0 to 0.5 on the scenes bonsai and fox with 25 and 50 % lost
-_LEAST_LEFT, _COMPLETE = 0.1, 0.99  # shares; smaller ones are compensated like 10 %, larger ones not at all
 _COST = (
-    "KeySS trains for hours, and cover and secret come out like models of half the Gaussians; the method carry "
-    "hides trained models in seconds, almost without loss"
+    "KeySS costs a long training and 1 dB and more of both scenes, whose Gaussians are shared; the method carry "
+    "hides trained models better, in seconds"
 )
 _IDLE = (
     "density control added no Gaussian to the {:,} of the start: a longer training or a larger "
@@ -79,9 +76,7 @@ class KeyssMethod:
         shape = replace(design.decoder, sh_degree=options.fit.sh_degree)
         probe = KeyssSecret(Decoder(shape), torch.zeros(shape.key_size), Similarity(), torch.rand(ANCHORS, 3))
         try:
-            check_payload_fits(
-                len(probe.payload().data), options.fit.max_gaussians, secrets, shape.sh_degree
-            )
+            check_payload_fits(len(probe.payload().data), options.fit.max_gaussians, secrets, shape.sh_degree)
         except UsageError as error:
             warnings.warn(f"{error}; {_APPENDED}", KeyssWarning, stacklevel=2)
         return options
@@ -141,8 +136,8 @@ def publish(run: KeyssTraining, entropy: bytes) -> tuple[Gaussians, list[KeyssSe
     anchors = choose_anchors(stego, run.fit.known_seed)
     decoder, secrets = run.decoder.to("cpu").requires_grad_(False), []
     for placed, key in zip(run.scenes[1:], run.keys, strict=True):
-        shown = visibility(decoder(stego, key.cpu()))
-        secrets.append(KeyssSecret(decoder, key.cpu(), placed.frame, anchors, *shown))
+        shown = count_visible(decoder(stego, key.cpu()))
+        secrets.append(KeyssSecret(decoder, key.cpu(), placed.frame, anchors, shown))
     return stego, secrets
 
 
@@ -153,7 +148,6 @@ class _Header(Header):
     shape: DecoderShape
     frame: Similarity
     count: Annotated[int, Meta(ge=0, le=2**31)]
-    visibility: Annotated[float, Meta(ge=0)]
 
 
 @dataclass(frozen=True)
@@ -165,17 +159,12 @@ class KeyssSecret(HiddenScene):
     frame: Similarity  # secret frame to cover frame
     anchors: Tensor  # [A, 3] positions of Gaussians of the stego model
     count: int = 0  # Gaussians revealed from a complete file; 0: unknown
-    visibility: float = 0.0  # sum of opacities, revealed from a complete file
     chunks: tuple[int, int] | None = None  # see `Payload`; not packed
 
     def payload(self) -> Payload:
         """The payload for a channel; the same secret gives the same bytes."""
-        header = _Header(FORMAT, VERSION, self.decoder.shape, self.frame, self.count, self.visibility)
-        halved = {name for name, _ in self.decoder.named_parameters()}
-        tensors = {
-            _WEIGHTS + name: value.half() if name in halved else value
-            for name, value in self.decoder.state_dict().items()
-        }
+        header = _Header(FORMAT, VERSION, self.decoder.shape, self.frame, self.count)
+        tensors = {_WEIGHTS + name: value.half() for name, value in self.decoder.state_dict().items()}
         return Payload(NAME, pack_tensors({**tensors, "key": self.key, "anchors": self.anchors}, header))
 
     @staticmethod
@@ -195,24 +184,17 @@ class KeyssSecret(HiddenScene):
                 raise ValueError(f"expected a key of {shape.key_size} numbers, got {list(key.shape)}")
             decoder = Decoder(shape)
             decoder.load_state_dict({name.removeprefix(_WEIGHTS): value for name, value in tensors.items()})
-        return KeyssSecret(
-            decoder.requires_grad_(False), key, header.frame, anchors, header.count, header.visibility,
-            payload.chunks,
-        )  # fmt: skip
+        decoder.requires_grad_(False)
+        return KeyssSecret(decoder, key, header.frame, anchors, header.count, payload.chunks)
 
     @torch.no_grad()
     def reveal(self, stego: Gaussians, *, frame: Frame = "secret", force: bool = False) -> Gaussians:
-        """The secret as a standalone model, without invisible Gaussians; see `HiddenScene.reveal`.
-
-        If Gaussians were lost, the others are enlarged to compensate.
-        """
+        """The secret as a standalone model, without invisible Gaussians; see `HiddenScene.reveal`."""
         if not force:
             self.check_unchanged(stego)
         decoded = self.decode(stego, self.key).to("cpu")
         if (visible := decoded.opacities >= DRAWN_OPACITY).any():
             decoded = decoded[visible]
-        left = min(1.0, visibility(decoded)[1] / max(self.visibility, 1e-9))
-        decoded = compensate_pruning(decoded, left)
         return decoded if frame == "cover" else self.frame.inverse().apply_gaussians(decoded)
 
     def decode(self, stego: Gaussians, key: Tensor) -> Gaussians:
@@ -226,7 +208,7 @@ class KeyssSecret(HiddenScene):
 
     def remains(self, revealed: Gaussians) -> Remains:
         """See `HiddenScene.remains`; Gaussians that are never rendered do not count."""
-        return Remains(visibility(revealed)[0], self.count, self.chunks, _SLACK)
+        return Remains(count_visible(revealed), self.count, self.chunks, _SLACK)
 
     def fingerprint(self) -> str:
         return hashlib.sha256(self.payload().data).hexdigest()[:16]
@@ -256,27 +238,9 @@ def choose_anchors(stego: Gaussians, seed: int) -> Tensor:
     return stego.means[torch.randperm(len(stego), generator=generator)[:ANCHORS]].detach().cpu()
 
 
-def visibility(model: Gaussians) -> tuple[int, float]:
-    """The number of visible Gaussians, and the sum of their opacities."""
-    visible = model.opacities[model.opacities >= DRAWN_OPACITY]
-    return len(visible), float(visible.double().sum())
-
-
-def compensate_pruning(gaussians: Gaussians, left: float) -> Gaussians:
-    """Enlarge the Gaussians that are `left` of a pruned model, a share, and raise their opacities.
-
-    Opacities become 1 - (1 - opacity)^(1 / left), and the standard deviations grow by left^-0.25. With a
-    quarter of a model left, this recovers 0.4 to 1 dB of the 2 to 4 dB lost.
-    """
-    if left >= _COMPLETE:
-        return gaussians
-    share = max(left, _LEAST_LEFT)
-    transmittance = (1 - gaussians.opacities.double()).clamp(1e-7, 1 - 1e-7) ** (1 / share)
-    return replace(
-        gaussians,
-        opacity_logits=torch.logit(1 - transmittance.clamp_min(1e-7)).float(),
-        log_scales=gaussians.log_scales + _GROWTH * math.log(1 / share),
-    )
+def count_visible(model: Gaussians) -> int:
+    """The number of Gaussians that are rendered."""
+    return int((model.opacities >= DRAWN_OPACITY).sum())
 
 
 METHOD = KeyssMethod()

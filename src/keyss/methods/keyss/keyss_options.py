@@ -76,15 +76,18 @@ class Design:
     points: Scenes = "both"  # scenes whose sparse points start the model (combined SfM points)
     poses: Scenes = "both"  # scenes whose training poses are used (combined camera poses)
     densification: Scenes = "both"  # scenes whose gradients count (combined densification)
-    # Ours: the share of the cap that the points fill at most. They would fill it, and nothing could grow.
+    # Combined poses are drawn evenly from "scenes" or from all "poses". The paper does not say; a scene with few
+    # photos would hardly ever be shown one of them.
+    evenly: Literal["scenes", "poses"] = "scenes"
+    # Share of the cap that the points fill at most. With more, density control would have no room (ours).
     start_share: float = 1 / 3
     # Share of the steps that render all scenes from one pose; in the others each scene has its own.
     common_poses: float = 1.0
     # Rate of AdamW in runs of 30,000 steps. Shorter runs raise it as they raise the Gaussians' rates
     # (`keyss.fitting.schedule.boost_of`), and all runs let it decay to 5 %. The paper gives none.
     decoder_rate: float = 5e-4
-    # Ours: first share of the run, in which this rate rises from 0. A decoder that is faster than the points of a
-    # secret before a plain background makes them all transparent, and transparent Gaussians have no gradient.
+    # First share of the run, in which this rate rises from 0 (ours). A fast decoder makes all points of a
+    # secret with a plain background transparent, and transparent Gaussians have no gradient.
     warm_up: float = 0.1
     weight_decay: float = 1e-4  # from the authors' program
 

@@ -22,7 +22,7 @@ from keyss.core.similarity import Similarity, align
 from keyss.fitting.config import FitConfig
 from keyss.fitting.density import CappedStrategy, CombinedStrategy, Rendered
 from keyss.fitting.image_metrics import psnr, subsample_views
-from keyss.fitting.loop import Shuffle, State, TrainingRun, own_randomness, train, with_prefix
+from keyss.fitting.loop import Shuffle, TrainingRun, own_randomness, train
 from keyss.fitting.losses import Target, Targets, photometric_loss
 from keyss.fitting.parameters import (
     initial_gaussians,
@@ -161,10 +161,10 @@ class KeyssTraining(TrainingRun):
         self.backgrounds = [placed.scene.background.to(device) for placed in scenes]
         self.growing = scene_indices(design.densification, count)
         views = [len(placed.scene.train) for placed in scenes]
-        self.common = [
-            (owner, index) for owner in scene_indices(design.poses, count) for index in range(views[owner])
-        ]
-        self.shuffles["poses"] = Shuffle(len(self.common), self.generator)
+        owners = scene_indices(design.poses, count)
+        times = [1 if design.evenly == "scenes" else views[owner] for owner in owners]
+        self.owners = [owner for owner, every in zip(owners, times, strict=True) for _ in range(every)]
+        self.shuffles["owners"] = Shuffle(len(self.owners), self.generator)
         for scene in range(count):
             self.shuffles[f"poses.{scene}"] = Shuffle(views[scene], self.generator)
         self.extent = scenes[0].scene.extent
@@ -174,13 +174,11 @@ class KeyssTraining(TrainingRun):
         self.started = len(start)
         self.parameters = to_parameters(start, device)
         self.optimizers = make_optimizers(self.parameters, self.fit, self.extent)
-        self.networks = torch.nn.ModuleList()
         with own_randomness(self.fit.known_seed):
             self.prepare(start)
         self.networks.to(device)
-        # Without networks, the optimiser still needs a parameter.
-        weights = list(self.networks.parameters()) or [torch.nn.Parameter(torch.zeros(1))]
-        self.network_optimizers = [torch.optim.AdamW(weights, weight_decay=design.weight_decay)]
+        if weights := list(self.networks.parameters()):
+            self.network_optimizer = torch.optim.AdamW(weights, weight_decay=design.weight_decay)
         # The authors' program sums up the gradients of all scenes, and stops density control at the cap.
         released = design.decoder.released
         strategy = CappedStrategy if released else CombinedStrategy
@@ -205,17 +203,20 @@ class KeyssTraining(TrainingRun):
 
     def set_rates(self) -> None:
         super().set_rates()
+        if self.network_optimizer is None:
+            return
         progress = self.iteration / self.iterations
         rate = self.design.decoder_rate * boost_of(self.fit) * LAST_NETWORK_RATE**progress
         if self.design.warm_up:
             rate *= min(1.0, progress / self.design.warm_up)
-        self.network_optimizers[0].param_groups[0]["lr"] = rate
+        self.network_optimizer.param_groups[0]["lr"] = rate
 
     def sample_poses(self) -> list[Pose]:
-        """The training pose for each scene: one of all poses (combined camera poses)."""
+        """The training pose for each scene: one of any scene for all (combined camera poses)."""
         count = len(self.scenes)
         if float(torch.rand((), generator=self.generator)) < self.design.common_poses:
-            return [self.common[self.shuffles["poses"].sample()]] * count
+            owner = self.owners[self.shuffles["owners"].sample()]
+            return [(owner, self.shuffles[f"poses.{owner}"].sample())] * count
         return [(scene, self.shuffles[f"poses.{scene}"].sample()) for scene in range(count)]
 
     def wrong_key(self) -> Tensor | None:
@@ -324,19 +325,3 @@ class KeyssTraining(TrainingRun):
             },
             **context.loop_arguments("joint"),
         )
-
-    def state(self) -> State:
-        state = super().state()
-        state |= {f"networks.{name}": value for name, value in self.networks.state_dict().items()}
-        for index, moments in self.network_optimizers[0].state_dict()["state"].items():
-            state |= {f"networks_adam.{index}.{name}": value for name, value in moments.items()}
-        return state
-
-    def load(self, state: State) -> None:
-        super().load(state)
-        self.networks.load_state_dict(with_prefix(state, "networks."))
-        adam = self.network_optimizers[0].state_dict()
-        for name, value in with_prefix(state, "networks_adam.").items():
-            index, key = name.split(".")
-            adam["state"].setdefault(int(index), {})[key] = value
-        self.network_optimizers[0].load_state_dict(adam)
