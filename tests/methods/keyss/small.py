@@ -37,8 +37,7 @@ def make_secret(stego: Gaussians) -> KeyssSecret:
     torch.manual_seed(0)
     shape = DecoderShape(mask=("op",), hidden=(8, 8), branch=8, sh_degree=stego.sh_degree)
     decoder = Decoder(shape).requires_grad_(False)
-    decoder.branches["op"][-1].weight *= 0.01
-    decoder.branches["op"][-1].bias *= 0.01
+    torch.nn.init.normal_(decoder.outer["op"].weight, std=0.003)
     frame = Similarity(1.001, translation=torch.full((3,), 0.01, dtype=torch.float64))
     key = VECTORS[0]
     return KeyssSecret(decoder, key, frame, choose_anchors(stego, 0), count_visible(decoder(stego, key)))

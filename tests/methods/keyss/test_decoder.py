@@ -47,9 +47,9 @@ def test_equations_6_and_8(released: bool) -> None:
         alpha = logit / model.opacity_logits.double().norm() if released else logit.sigmoid()
         others = [unit(row[name]) for name in ("ro", "sc", "xyz", "sh")]
         f = torch.cat([alpha, *others, KEY.double()])
-        h = layer("common.2", layer("common.0", f).relu()).relu()
+        h = layer("common.1", layer("common.0", f).relu()).relu()
         for name, field in FIELD_OF.items():
-            residual = layer(f"branches.{name}.2", layer(f"branches.{name}.0", h).relu())
+            residual = layer(f"outer.{name}", layer(f"inner.{name}", h).relu())
             if released and name != "op":
                 residual = residual.relu()
             expected = row[name].double() + residual

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -25,26 +25,17 @@ class Decoder(nn.Module):
         super().__init__()
         self.shape = shape
         first, second = shape.hidden
-        self.common = nn.Sequential(
-            nn.Linear(shape.inputs, first), nn.ReLU(), nn.Linear(first, second), nn.ReLU()
+        self.common = nn.ModuleList([nn.Linear(shape.inputs, first), nn.Linear(first, second)])
+        self.inner = nn.ModuleDict({each: nn.Linear(second, shape.branch) for each in shape.mask})
+        self.outer = nn.ModuleDict(
+            {each: nn.Linear(shape.branch, shape.channels(each)) for each in shape.mask}
         )
-        self.branches = nn.ModuleDict(
-            {
-                each: nn.Sequential(
-                    nn.Linear(second, shape.branch), nn.ReLU(), nn.Linear(shape.branch, shape.channels(each))
-                )
-                for each in shape.mask
-            }
-        )
-        if shape.released:
-            for layer in self.modules():
-                if isinstance(layer, nn.Linear):
-                    nn.init.kaiming_normal_(layer.weight, nonlinearity="relu")
-                    nn.init.zeros_(layer.bias)
-        else:  # residuals start at 0, and all scenes as the points show them
-            for *_, last in self.branches.values():
-                nn.init.zeros_(last.weight)
-                nn.init.zeros_(last.bias)
+        for layer in linear(self.modules()) if shape.released else ():
+            nn.init.kaiming_normal_(layer.weight, nonlinearity="relu")
+            nn.init.zeros_(layer.bias)
+        for layer in () if shape.released else linear(self.outer.values()):  # residuals start at 0
+            nn.init.zeros_(layer.weight)
+            nn.init.zeros_(layer.bias)
 
     def forward(self, cover: Gaussians, key: Tensor, whole: Gaussians | None = None) -> Gaussians:
         """Decode `cover`, which may be a part of `whole`."""
@@ -58,12 +49,11 @@ class Decoder(nn.Module):
 
         The key k is one input of all Gaussians: its part of the first layer is added to the bias.
         """
-        (first, _, second, _), branches = self.common, list(self.branches.values())
+        first, second = linear(self.common)
+        inner, outer = linear(self.inner.values()), linear(self.outer.values())
         weights, of_key = first.weight.split([self.shape.inputs - len(key), len(key)], dim=1)
-        bias = first.bias + of_key @ F.normalize(key, dim=0)
-        inner, outer = [each[0] for each in branches], [each[2] for each in branches]
         return [
-            *(weights, bias),
+            *(weights, first.bias + of_key @ F.normalize(key, dim=0)),
             *(second.weight, second.bias),
             *(torch.cat([each.weight for each in inner]), torch.cat([each.bias for each in inner])),
             *(torch.block_diag(*(each.weight for each in outer)), torch.cat([each.bias for each in outer])),
@@ -92,6 +82,11 @@ class Decoder(nn.Module):
             one_sided = self.shape.released and name != "op"
             changed[FIELDS[name]] = before + (F.relu(residual) if one_sided else residual).view_as(before)
         return replace(cover, **changed)
+
+
+def linear(modules: Iterable[nn.Module]) -> list[nn.Linear]:
+    """The linear layers among `modules`."""
+    return [each for each in modules if isinstance(each, nn.Linear)]
 
 
 class Mlp(torch.autograd.Function):

@@ -34,8 +34,9 @@ from keyss.keys.derivation import SALT_BYTES, expand, stream
 from keyss.methods.hidden import Frame, HiddenScene, Remains
 from keyss.methods.keyss.decoder import Decoder
 from keyss.methods.keyss.keyss_options import DecoderShape, KeyssOptions, parse_mask
-from keyss.methods.keyss.training import KeyssTraining, PlacedScene
+from keyss.methods.keyss.training import KeyssTraining
 from keyss.methods.method import Capabilities, Context, Plan, Source, Stego
+from keyss.methods.placed_scene import PlacedScene
 from keyss.methods.tensors import Header, pack_tensors, refuse_damage, unpack_tensors
 
 NAME = "keyss"
@@ -46,13 +47,9 @@ ANCHOR_TOLERANCE = 1e-6  # fraction of the model's size
 _SLACK = 0.01  # share of the Gaussians that rounding may make visible or invisible
 _WEIGHTS = "decoder."
 _COST = (
-    "KeySS costs a long training and 1 dB and more of both scenes, whose Gaussians are shared; the method carry "
-    "hides trained models better, in seconds"
+    "KeySS costs every scene quality and takes a long training: `--method carry` hides trained models better"
 )
-_IDLE = (
-    "density control added no Gaussian to the {:,} of the start: a longer training or a larger "
-    "`max_gaussians` gives it room and time"
-)
+_IDLE = "density control added no Gaussian to the {:,} of the start: train longer, or allow more Gaussians"
 _APPENDED = "the secrets lie in appended Gaussians instead, which everybody can see in the file"
 
 
@@ -125,10 +122,7 @@ def _encoder(options: KeyssOptions) -> ClipKeys | None:
 
 
 def publish(run: KeyssTraining, entropy: bytes) -> tuple[Gaussians, list[KeyssSecret]]:
-    """G_cover on the CPU, before its low bits are written, and the secrets.
-
-    `entropy`: 32 secret bytes that seed all randomness.
-    """
+    """G_cover on the CPU, before its low bits are written, and the secrets; `entropy`: 32 secret bytes."""
     # Shuffle: in training, the points of each scene are contiguous.
     stego = run.cover().detach().to("cpu")
     numbers = np.frombuffer(stream(entropy, "order", 8 * len(stego)), "<u8")

@@ -76,8 +76,8 @@ class Design:
     points: Scenes = "both"  # scenes whose sparse points start the model (combined SfM points)
     poses: Scenes = "both"  # scenes whose training poses are used (combined camera poses)
     densification: Scenes = "both"  # scenes whose gradients count (combined densification)
-    # Combined poses are drawn evenly from "scenes" or from all "poses". The paper does not say; a scene with few
-    # photos would hardly ever be shown one of them.
+    # What combined poses are drawn evenly from; the paper does not say. With "poses", a scene with few photos
+    # hardly ever sees one of them.
     evenly: Literal["scenes", "poses"] = "scenes"
     # Share of the cap that the points fill at most. With more, density control would have no room (ours).
     start_share: float = 1 / 3
@@ -98,10 +98,7 @@ class Design:
             if not 0 <= getattr(self, name) <= 1:
                 raise UsageError(f"`{name}`: expected 0 to 1, got {getattr(self, name)}")
         if not 0 < self.start_share < 1:
-            raise UsageError(
-                f"`start_share`: expected above 0 and below 1, got {self.start_share}; with 1, points may fill "
-                "the cap and leave no room for density control"
-            )
+            raise UsageError(f"`start_share`: expected above 0 and below 1, got {self.start_share}")
         if self.poses != "both" and self.common_poses < 1:
             raise UsageError(
                 "`poses` of some scenes only needs `common_poses=1`: all scenes are rendered from them"
