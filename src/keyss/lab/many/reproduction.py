@@ -303,8 +303,8 @@ def _judge_part(part: str, figures: Measured) -> Iterator[bool | None]:
     run, limit = match["run"], float(match["limit"])
     others = [name for name in figures if name != run] if match["other"] == "*" else [match["other"]]
     for other in others:
-        left = figures[run].get(match["measure"])
-        right = 0.0 if other is None else figures[other].get(match["other_measure"])
+        left = figures.get(run, {}).get(match["measure"])
+        right = 0.0 if other is None else figures.get(other, {}).get(match["other_measure"])
         if left is None or right is None:
             yield None
         else:
