@@ -28,7 +28,7 @@ class BaselineOptions(JointOptions):
             metavar="SHARE",
         ),
     ] = 1.0
-    network_rate: float = 1e-3  # Adam; decays to 5 %
+    network_rate: float = 5e-4  # AdamW; follows the length of the run like KeySS's
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -220,5 +220,5 @@ class KeyssOptions(JointOptions):
 
     @property
     def step_cost(self) -> float:
-        """Measured at 2,000 to 30,000 Gaussians."""
-        return 8.0
+        """Measured at 9,000 Gaussians and 120 pixels: 6.7 to 7.6."""
+        return 7.0
