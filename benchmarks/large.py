@@ -91,6 +91,8 @@ def commands(folder: Path, format: str) -> dict[str, list[object]]:
     return {
         "convert": [*program, "convert", folder / "cover.ply", folder / "copy.ply", "--overwrite"],
         "hide": [*program, "hide", *models, *published, *key, "-o", folder / "run"],
+        "info": [*program, "info", folder / "cover.ply"],
+        "verify": [*program, "verify", stego],
         "reveal": [*program, "reveal", stego, *key, "-o", folder / "revealed.ply"],
     }
 

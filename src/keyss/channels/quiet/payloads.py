@@ -6,6 +6,7 @@ codes are never lost: a secret is a header, followed by the blocks of its payloa
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections import Counter
 from collections.abc import Sequence
@@ -15,7 +16,7 @@ import numpy as np
 import torch
 
 from keyss.channels.base import NOT_INDEPENDENT, Payload, SaltedReader
-from keyss.channels.mixing import foreign, random_order, random_words, sketch
+from keyss.channels.mixing import foreign_share, random_order, random_words, sketch
 from keyss.channels.quiet.bits import Layout, gaussian_ids, read_low_bits
 from keyss.channels.quiet.cells import CellCipher
 from keyss.channels.quiet.decoded import Decoded
@@ -188,11 +189,12 @@ class QuietReader(SaltedReader):
         numbers, chunks = split_numbers(self._decrypt(chunk_cipher(data_key, width))[1])
         encrypted = codewords.decode(numbers, chunks)[: found.size]
         left = len(np.unique(numbers[numbers < codewords.chunks]))
+        foreign = foreign_share(data_key, self.ids, found.sketch, found.gaussians)
         return Payload(
             found.method,
             decrypt(payload_key(data_key), encrypted, _ASSOCIATED),
             (left, codewords.chunks),
-            foreign=foreign(data_key, self.ids, found.sketch, found.gaussians),
+            foreign=math.ceil(foreign * len(self.ids)),
         )
 
     def _in_blocks(self, data_key: bytes, found: Parameters, at: int) -> Payload:

@@ -10,7 +10,7 @@ import { damaged, otherVersion, tooMuchLost } from '../../core/errors.ts';
 import { type Gaussians, selected } from '../../core/gaussians.ts';
 import type { ReadModel } from '../../files/models.ts';
 import { decrypted, type Derive, expand, here } from '../../keys/keys.ts';
-import { foreign, type Payload, type Reader } from '../base.ts';
+import { foreignShare, type Payload, type Reader } from '../base.ts';
 import { type Codewords, decoded } from '../reed_solomon.ts';
 import { fieldsOf, gaussianIds, ID_BYTES, lowBits, lowWidth, saltOf, salts } from './bits.ts';
 import { type Cell, CellCipher, TAG_BYTES } from './cells.ts';
@@ -105,7 +105,8 @@ export class QuietReader implements Reader {
       data[0] | (data[1] << 8) | (data[2] << 16), data.subarray(NUMBER_BYTES),
     ]);
     const data = await decryptedPayload(dataKey, decoded(codewords, chunks).subarray(0, size));
-    return { method, data, foreign: foreign(dataKey, this.ids, further.subarray(CODEWORDS_BYTES), gaussians) || undefined };
+    const share = foreignShare(dataKey, this.ids, further.subarray(CODEWORDS_BYTES), gaussians);
+    return { method, data, foreign: Math.ceil((share * this.ids.length) / ID_BYTES) || undefined };
   }
 
   /** The payload in the blocks after its parameters. */
