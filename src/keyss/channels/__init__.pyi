@@ -25,7 +25,9 @@ from .publishing import (
     suffix_of as suffix_of,
 )
 from .quiet.bits import (
+    DEEPEST as DEEPEST,
     DEPTHS as DEPTHS,
+    LEAST as LEAST,
     Layout as Layout,
     gaussian_ids as gaussian_ids,
     read_low_bits as read_low_bits,

@@ -34,7 +34,7 @@ HEADER_BLOCKS = 2
 MIN_BLOCKS = 4  # a salt, a header, and data
 ASSOCIATED = b"keyss/v1/quiet"  # authenticated with a payload
 
-_VERSION = 6
+_VERSION = 7
 _PARAMETERS = struct.Struct(f"<B{METHOD_BYTES}sIH")
 _PADDED = LEAST_BYTES - TAG_BYTES
 
@@ -60,7 +60,7 @@ def write_blocks(
     for index in random_order(entropy, "quiet/along", len(payloads)).tolist():
         key, payload = payloads[index]
         data_key, size = expand(entropy, f"quiet/data-key/{index}", DATA_KEY_BYTES), width * sizes[index]
-        at = (first + gaps.pop(0) + np.arange(HEADER_BLOCKS + sizes[index])) % len(ids)
+        at = ((first + gaps.pop(0)) % len(ids) + np.arange(HEADER_BLOCKS + sizes[index])) % len(ids)
         parameters = _PARAMETERS.pack(_VERSION, pack_method(payload.method), size, width)
         cells = (_key_cipher(key), data_key), (_parameter_cipher(data_key), parameters)
         for row, (cipher, data) in zip(at[:HEADER_BLOCKS, None], cells, strict=True):

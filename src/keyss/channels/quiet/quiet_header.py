@@ -32,7 +32,6 @@ from keyss.channels.base import METHOD_BYTES, Capacity, pack_method, unpack_meth
 from keyss.channels.mixing import SKETCH_BYTES
 from keyss.channels.quiet.bits import DEPTHS, LEAST, Layout
 from keyss.channels.quiet.spread import (
-    COPIES,
     Chunks,
     Message,
     chunk_bytes,
@@ -48,6 +47,9 @@ from keyss.keys.derivation import DerivedKey, expand
 from keyss.keys.encryption import OVERHEAD
 
 DATA_KEY_BYTES = 16
+# Places of each part of a data key, for each salt, and of each part of the parameters. Two readable ones suffice.
+# With 60 % of the Gaussians usable and a quarter lost, fewer are left of a part with p = 0.6 % and 1e-7.
+_KEY_COPIES, _PARAMETER_COPIES = 12, 32
 TYPICAL_SHARE = 0.75  # usable Gaussians of a trained model; 0.40 to 1.00 were measured
 INCOMPRESSIBLE = 1 - 2**-10  # data that do not compress grow by less than a thousandth, and ZLIB_BYTES
 ZLIB_BYTES = 16
@@ -115,8 +117,7 @@ class LowBitsCapacity:
     def header_carriers(self) -> int:
         """Gaussians that the header of a secret takes at most."""
         width = self.layout.width(LEAST)
-        messages = SALTS * key_message(b"", width).fragments + parameter_message(b"", width).fragments
-        return COPIES * messages
+        return SALTS * key_message(b"", width).places + parameter_message(b"", width).places
 
     def plan(self, sizes: Sequence[int]) -> Plan:
         """Shares for encrypted payloads of `sizes` bytes.
@@ -145,7 +146,7 @@ class LowBitsCapacity:
             carriers = {d: gaussians * c // max(1, self.gaussians) for d, c in self.carriers.items()}
             return LowBitsCapacity(gaussians, carriers, self.layout).payload_capacity(secrets)
 
-        need = bisect_left(range(1 << 30), size, key=capacity)
+        need = bisect_left(range(_LONGEST * MAX_CODEWORDS), size, key=capacity)
         digits = max(0, len(str(need)) - 2)
         rounded = math.ceil(need / 10**digits) * 10**digits
         each = "" if secrets == 1 else f" for each of {secrets} secrets"
@@ -216,7 +217,7 @@ def check_payload_fits(compressed: int, gaussians: int, secrets: int, sh_degree:
 
 def key_message(secret: bytes, width: int) -> Message:
     """The message of a data key under the secret of a key, in rows of `width` bytes at the least depth."""
-    return Message(secret, "key", DATA_KEY_BYTES, min(width, DATA_KEY_BYTES))
+    return Message(secret, "key", DATA_KEY_BYTES, min(width, DATA_KEY_BYTES), _KEY_COPIES)
 
 
 def key_secret(key: DerivedKey) -> bytes:
@@ -226,7 +227,7 @@ def key_secret(key: DerivedKey) -> bytes:
 
 def parameter_message(data_key: bytes, width: int) -> Message:
     """The message of the parameters, in rows of `width` bytes at the least depth."""
-    return Message(data_key, "parameters", _SIZE, width)
+    return Message(data_key, "parameters", _SIZE, width, _PARAMETER_COPIES)
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ Everything follows from a pseudo-random function of a secret and each Gaussian's
 any order, and nothing marks a carrier. No pad is used twice, because every secret here is new for every file.
 
 *Messages* of a few bytes, the data key and the parameters, are cut into fragments that fit into the low bits of
-one Gaussian at the least depth. Each fragment has `COPIES` places, the Gaussians with the smallest function
+one Gaussian at the least depth. Each fragment has several places, the Gaussians with the smallest function
 values among those that the function assigns to it. Some of these cannot be written, were taken or lost: the
 most frequent content counts.
 
@@ -27,7 +27,6 @@ from keyss.core.arrays import Bytes, Flags, Integers
 from keyss.kernels.parallel import in_blocks
 from keyss.keys.derivation import expand
 
-COPIES = 16  # places of a fragment; with half of them unusable and a quarter lost, two are left but for p = 0.1 %
 _CANDIDATES = 8  # Gaussians that are looked at for each place
 _NUMBER_BYTES = 2
 _LEAST_TAGGED = 5  # bytes of a row from which on it has a tag
@@ -50,16 +49,22 @@ def function(secret: bytes, label: str, ids: Bytes, size: int = _BLOCK) -> Bytes
 
 @dataclass(frozen=True)
 class Message:
-    """A message of `size` bytes under a secret, in fragments of `width` bytes or less."""
+    """A message of `size` bytes under a secret, in fragments of `width` bytes, each in `copies` places."""
 
     secret: bytes
     label: str
     size: int
     width: int
+    copies: int
 
     @property
     def fragments(self) -> int:
         return -(-self.size // self.width)
+
+    @property
+    def places(self) -> int:
+        """Gaussians that it takes."""
+        return self.fragments * self.copies
 
     def write(self, ids: Bytes, data: bytes) -> tuple[Integers, Bytes]:
         """Rows of `ids` [N, 16], and the bytes [R, width] to be written into each."""
@@ -83,12 +88,12 @@ class Message:
         """The rows of each fragment."""
         values = function(self.secret, f"{self.label}/place", ids)
         order = values[:, :8].copy().view(">u8")[:, 0].astype(np.uint64)
-        count = _CANDIDATES * COPIES * self.fragments
+        count = _CANDIDATES * self.places
         near = np.argpartition(order, count)[:count] if count < len(order) else np.arange(len(order))
         near = near[order[near].argsort()]
         fragment = values[near, 8:12].copy().view("<u4")[:, 0] % self.fragments
         for each in range(self.fragments):
-            yield near[fragment == each][:COPIES]
+            yield near[fragment == each][: self.copies]
 
 
 @dataclass(frozen=True)
