@@ -114,7 +114,7 @@ def pruned_model() -> Gaussians:
 
 
 def bare_model() -> Gaussians:
-    """A file in a model of SH degree 0 with unit quaternions, in rows without tags; some are lost, others false."""
+    """A file in a model of SH degree 0 with unit quaternions, in rows without tags; a sixth is lost."""
     cover = trained_like(3000, 17, sh_degree=0)
     cover = replace(cover, quats=torch.nn.functional.normalize(cover.quats))
     payload = HiddenFile("a note.txt", b"Written in four bytes, read in two.\n").payload()

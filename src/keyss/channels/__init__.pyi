@@ -49,11 +49,11 @@ from .quiet.quiet_header import (
     LowBitsCapacity as LowBitsCapacity,
     check_payload_fits as check_payload_fits,
 )
+from .quiet.spread import Chunks as Chunks, Message as Message
 from .quiet.usable import (
     Carriers as Carriers,
     chance_of_bits as chance_of_bits,
     salt_rows as salt_rows,
     usable_carriers as usable_carriers,
 )
-from .quiet.spread import Chunks as Chunks, Message as Message
 from .reed_solomon import Codewords as Codewords

@@ -1,12 +1,12 @@
 """The low mantissa bits of a model's floats: where they are, and reading and writing them.
 
-A file has one *depth* d of DEPTHS: bits 1 to d of the mantissas of log scales, quaternions, opacity logits and
-the spherical harmonics above the constant ones may be replaced. Bit 0 is left alone: rounding to even makes it
-a zero more often than a one, by a third of a percent in spherical harmonics, which a classifier notices.
-Positions are not used: the least change can swap two Gaussians of nearly equal depth, and a swap is visible
-(48 dB in a view where everything else stays above 79 dB). Constant colours are not used: many keep the few
-digits of their initial values. Unit quaternions, which some tools write, are not used: new low bits would
-change their length, which is known exactly.
+A file has one *depth* d of DEPTHS: bits 1 to d of the mantissas of log scales, quaternions, opacity logits
+and the spherical harmonics above the constant ones may be replaced. Bit 0 is left alone: rounding to even
+makes it a zero more often than a one, by a third of a percent in spherical harmonics, which a classifier
+notices. Positions are not used: the least change can swap two Gaussians of nearly equal depth, and a swap is
+visible (48 dB in a view where everything else stays above 79 dB). Constant colours are not used: many keep
+the few digits of their initial values. Unit quaternions, which some tools write, are not used: new low bits
+would change their length, which is known exactly.
 
 The *ID* of a Gaussian is a hash of its position and of the bits that no depth replaces: it stands for the
 index, so the order of Gaussians does not matter.
@@ -121,7 +121,9 @@ def write_low_bits(
     written = gaussians.detach().to("cpu").map(torch.Tensor.contiguous).map(torch.clone)
     for depth, rows, data in parts:
 
-        def write(start: int, stop: int, depth: int = depth, rows: Integers = rows, data: Bytes = data) -> None:
+        def write(
+            start: int, stop: int, depth: int = depth, rows: Integers = rows, data: Bytes = data
+        ) -> None:
             own, mask = rows[start:stop], np.uint32((1 << depth) - 1 << 1)
             words = np.concatenate([group[own] for group in group_words(written)], axis=1)
             fields = words[:, layout.written]

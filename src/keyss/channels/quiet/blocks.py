@@ -1,7 +1,7 @@
 """Secrets in blocks of codes, which are never lost or reordered.
 
-A secret is a header of two blocks, its data key and its parameters in *cells* with a tag, and the blocks of its
-payload. A reader decrypts the cells of all blocks and keeps those with a valid tag. The parameters,
+A secret is a header of two blocks, its data key and its parameters in *cells* with a tag, and the blocks of
+its payload. A reader decrypts the cells of all blocks and keeps those with a valid tag. The parameters,
 little-endian:
 
     version (1 byte), method (15, padded with zeros), bytes of the encrypted payload (4), bytes of a block (2)
@@ -44,8 +44,8 @@ def write_blocks(
 ) -> Bytes:
     """[C, width] bytes of the blocks with `ids` [C, 16]: payloads, each with its key, and noise.
 
-    `entropy`: 32 secret bytes. Raises UsageError for too large payloads. Each secret takes consecutive blocks,
-    cyclically; all arrangements are equally likely.
+    `entropy`: 32 secret bytes. Raises UsageError for too large payloads. Each secret takes consecutive
+    blocks, cyclically; all arrangements are equally likely.
     """
     table = np.empty((len(ids), width), np.uint8)
     fill(entropy, "quiet/noise", table)

@@ -1,13 +1,13 @@
 """Equal steps: harmonics that predict each other's low bits.
 
-Adam's steps do not depend on the size of a gradient. While one of two siblings, Gaussians that density control
-split, is seen alone, or both in one direction, all harmonics of a group move apart by the same amount. The
-same holds for the distance from zero, where harmonics start. Constant groups, which are never written, move by
-the same amount times the ratio of two learning rates.
+Adam's steps do not depend on the size of a gradient. While one of two siblings, Gaussians that density
+control split, is seen alone, or both in one direction, all harmonics of a group move apart by the same
+amount. The same holds for the distance from zero, where harmonics start. Constant groups, which are never
+written, move by the same amount times the ratio of two learning rates.
 
-A Gaussian is left alone if three harmonics of a group moved by equal amounts away from zero or from one of its
-nearest neighbours, as far as the bits that stay tell. No rate of a trainer is assumed. By chance two agree in
-many Gaussians; whether these tell low bits is tested on each model, at each depth.
+A Gaussian is left alone if three harmonics of a group moved by equal amounts away from zero or from one of
+its nearest neighbours, as far as the bits that stay tell. No rate of a trainer is assumed. By chance two
+agree in many Gaussians; whether these tell low bits is tested on each model, at each depth.
 """
 
 from __future__ import annotations
@@ -131,7 +131,7 @@ def _mark(first: int, near: Any, words: Any, depth: int, apart: Any) -> None:
         one = first + row
         for place in range(near.shape[1] + 1):
             other = one if place == 0 else near[row, place - 1]
-            if apart[one] and apart[other] or place > 0 and other == one:
+            if (apart[one] and apart[other]) or (place > 0 and other == one):
                 continue
             for group in range(words.shape[1]):
                 for at in range(size):

@@ -68,11 +68,15 @@ class Writer:
             free, parts = self.usable[plan.depth].copy(), [(plan.depth, rows, noise)]
             # Missing headers take places, too: otherwise collisions would tell how many there are.
             headers = max(MAX_INDEPENDENT if plan.independent else 0, len(payloads))
-            data_keys = [self._secret(f"data-key/{attempt}/{each}", DATA_KEY_BYTES) for each in range(headers)]
+            data_keys = [
+                self._secret(f"data-key/{attempt}/{each}", DATA_KEY_BYTES) for each in range(headers)
+            ]
             for index in random_order(self.entropy, f"quiet/headers/{attempt}", headers).tolist():
                 data_key = data_keys[index]
                 if index >= len(payloads):
-                    keys = [DerivedKey(self._secret(f"no-key/{index}/{n}")) for n in range(len(payloads[0][0]))]
+                    keys = [
+                        DerivedKey(self._secret(f"no-key/{index}/{n}")) for n in range(len(payloads[0][0]))
+                    ]
                     self._header(free, data_key, keys, b"")
                     continue
                 (keys, payload), share = payloads[index], plan.shares[index]
@@ -82,7 +86,9 @@ class Writer:
                 parts += self._header(free, data_key, keys, packed)
             left = np.flatnonzero(free)
             left = left[random_order(self.entropy, f"quiet/chunks/{attempt}", len(left))]
-            for data_key, (_, payload), share, size in zip(data_keys, payloads, plan.shares, sizes, strict=False):
+            for data_key, (_, payload), share, size in zip(
+                data_keys, payloads, plan.shares, sizes, strict=False
+            ):
                 own, left = left[: share.carriers], left[share.carriers :]
                 chunks = Chunks(data_key, share.codewords, tagged)
                 if (numbers := chunks.numbers(self.ids[own])) is None:
@@ -135,7 +141,9 @@ class QuietReader(SaltedReader):
         if len(rows) < len(ids):
             stego, ids, low = stego[torch.from_numpy(rows)], ids[rows], low[rows]
         salts = [salt(ids[row], low[row]) for row in salt_rows(stego, ids, layout)]
-        layouts = dict.fromkeys((layout, replace(layout, written_degree=1) if layout.sh_degree > 1 else layout))
+        layouts = dict.fromkeys(
+            (layout, replace(layout, written_degree=1) if layout.sh_degree > 1 else layout)
+        )
         return QuietReader(stego, ids, low, salts, list(layouts))
 
     def extract(self, key: DerivedKey) -> Payload:

@@ -1,10 +1,10 @@
 """The quiet channel: secrets in low bits of floats, or in last bits of codes, a quantised format's integers.
 
 A file has no magic number and no index of its secrets. Bits are stored in *carriers*: the low bits of one
-Gaussian, or one block of last bits of codes (see `wet_paper`). A *salt* of Argon2id is a hash of one carrier that
-holds nothing else. A salt is *stale* if its Gaussian is not usable (see `usable`): the author of the cover knows
-it in advance, so no key is written under it. A reader tries SALTS_TRIED salts; covers with as many stale ones
-are refused.
+Gaussian, or one block of last bits of codes (see `wet_paper`). A *salt* of Argon2id is a hash of one carrier
+that holds nothing else. A salt is *stale* if its Gaussian is not usable (see `usable`): the author of the
+cover knows it in advance, so no key is written under it. A reader tries SALTS_TRIED salts; covers with as
+many stale ones are refused.
 
 In low bits, the IDs of Gaussians and a key tell where a secret lies (see `spread` and `quiet_header`), with
 redundancy: shuffling is harmless, and a quarter of the Gaussians may be lost. In codes nothing may be lost or

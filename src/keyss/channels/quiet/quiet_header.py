@@ -5,16 +5,16 @@ parameters. Its payload is cut into chunks with Reed-Solomon redundancy, one in 
 quarter of all Gaussians may be lost. The number of chunks does not reveal the size of the payload.
 
 A *share* is a part of the carriers at a depth. A key must not reveal whether there are other secrets, so a
-secret's share depends on its own size only: the first that holds it of a quarter, a half and all of the carriers
-at the least depth, and all of them at each larger one. Places for the headers of four secrets are reserved,
-however many there are. Secrets whose shares do not fit together get equal ones at the least depth at which they
-fit, by which the holder of one key can notice others.
+secret's share depends on its own size only: the first that holds it of a quarter, a half and all of the
+carriers at the least depth, and all of them at each larger one. Places for the headers of four secrets are
+reserved, however many there are. Secrets whose shares do not fit together get equal ones at the least depth at
+which they fit, by which the holder of one key can notice others.
 
 Numbers are little-endian. The parameters:
 
-    check (8 bytes, derived from the data key), version (1), method (15, padded with zeros), bytes of the encrypted
-    payload (4), depth (1), Gaussians of the model (4), codewords (4), chunks of one (2), data chunks of one (2),
-    a sketch of the Gaussians (see `mixing`)
+    check (8 bytes, derived from the data key), version (1), method (15, padded with zeros), bytes of the
+    encrypted payload (4), depth (1), Gaussians of the model (4), codewords (4), chunks of one (2), data chunks
+    of one (2), a sketch of the Gaussians (see `mixing`)
 """
 
 from __future__ import annotations
@@ -47,8 +47,8 @@ from keyss.keys.derivation import DerivedKey, expand
 from keyss.keys.encryption import OVERHEAD
 
 DATA_KEY_BYTES = 16
-# Places of each part of a data key, for each salt, and of each part of the parameters. Two readable ones suffice.
-# With 60 % of the Gaussians usable and a quarter lost, fewer are left of a part with p = 0.6 % and 1e-7.
+# Places of each part of a data key, for each salt, and of each part of the parameters; two that can be read
+# suffice. With 60 % of the Gaussians usable and a quarter lost, fewer are left with p = 0.8 % and 1e-7.
 _KEY_COPIES, _PARAMETER_COPIES = 12, 32
 TYPICAL_SHARE = 0.75  # usable Gaussians of a trained model; 0.40 to 1.00 were measured
 INCOMPRESSIBLE = 1 - 2**-10  # data that do not compress grow by less than a thousandth, and ZLIB_BYTES
@@ -151,8 +151,8 @@ class LowBitsCapacity:
         rounded = math.ceil(need / 10**digits) * 10**digits
         each = "" if secrets == 1 else f" for each of {secrets} secrets"
         return (
-            f"a cover of {self.gaussians:,} Gaussians is too small to carry {size:,} bytes{each} in its low bits; "
-            f"{rounded:,} Gaussians would do"
+            f"a cover of {self.gaussians:,} Gaussians is too small to carry {size:,} bytes{each} in its low "
+            f"bits; {rounded:,} Gaussians would do"
         )
 
     @property

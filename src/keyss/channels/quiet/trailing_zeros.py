@@ -1,15 +1,15 @@
 """Small numbers whose low bits an optimiser's rounding predicts.
 
-An optimiser that rounds its step before subtracting it leaves numbers on the grid of the larger ones that they
-came from: a number that the last step brought near zero has as many trailing zeros as it is smaller than that
-step. Steps are about exponentially distributed, because Adam bounds them: with the scale 2^(s + 1) of a group
-of fields, a number of binary exponent e has at least z zeros forced upon it with the probability
+An optimiser that rounds its step before subtracting it leaves numbers on the grid of the larger ones that
+they came from: a number that the last step brought near zero has as many trailing zeros as it is smaller than
+that step. Steps are about exponentially distributed, because Adam bounds them: with the scale 2^(s + 1) of a
+group of fields, a number of binary exponent e has at least z zeros forced upon it with the probability
 
     F(z) = exp(-2^(e + z - 1 - s)), z >= 1
 
-Beside it, rounding to even may force the last bit alone to zero. Bits above those forced are uniform. Hence only
-the number of trailing zeros of even numbers carries information. Both were measured on models that were trained
-with either rounding.
+Beside it, rounding to even may force the last bit alone to zero. Bits above those forced are uniform. Hence
+only the number of trailing zeros of even numbers carries information. Both were measured on models that were
+trained with either rounding.
 
 The counts of trailing zeros give an upper confidence limit of s, which bounds how well an attacker who knows
 the trainer and the last bit predicts the replaced bits: the chi-square distance of the original bits from

@@ -3,10 +3,10 @@
 In a trained model most low bits are uniformly random to anybody who does not know the training, but not all.
 A Gaussian is excluded as a whole, so that its numbers stay consistent, because of:
 
-- *Equal steps* away from zero or a neighbour: see `equal_steps`. These are also the harmonics of Gaussians that no
-  view shows, and numbers that training freezes in clones.
-- *Copies*: Gaussians that share their position, scales, quaternion or the harmonics of degree 1 of a colour with
-  any other one, and values that occur too often.
+- *Equal steps* away from zero or a neighbour: see `equal_steps`. These are also the harmonics of Gaussians
+  that no view shows, and numbers that training freezes in clones.
+- *Copies*: Gaussians that share their position, scales, quaternion or the harmonics of degree 1 of a colour
+  with any other one, and values that occur too often.
 - *Grey harmonics*, whose colours agree.
 - *Opacities* whose sigmoid is 1, which have no gradient, and those at the edge below which trainers remove
   Gaussians: no trained model has smaller ones.
@@ -113,7 +113,7 @@ def _what_tells(gaussians: Gaussians, layout: Layout, usable: Flags, depth: int,
     rows = np.flatnonzero(usable)
     if not len(rows):
         return (
-            "no Gaussian of the cover has random low bits, they hold short, repeated or predictable values: it "
+            "no Gaussian of the cover has random low bits; all hold short, repeated or predictable values: it "
             "was quantised or hardly trained, and new bits would be seen"
         )
     used = used_words(gaussians[torch.from_numpy(rows[:: max(1, len(rows) // _SAMPLE)])])
@@ -121,13 +121,13 @@ def _what_tells(gaussians: Gaussians, layout: Layout, usable: Flags, depth: int,
         written = used[:, np.intersect1d(np.arange(used.shape[1])[group], layout.columns)]
         if written.size and (chance := chance_of_bits(written, depth + 1)) < _CHANCE:
             return (
-                f"the low bits of {name} in this cover are not random (p = {chance:.0e}), and new ones would "
-                "be seen: the cover was quantised, scaled or moved after its training"
+                f"the low bits of {name} in this cover are not random (p = {chance:.0e}), and new ones "
+                "would be seen: the cover was quantised, scaled or moved after its training"
             )
     if (chance := steps.chance(depth, usable)) < _CHANCE:
         return (
-            f"numbers of this cover tell each other's low bits (p = {chance:.0e}), because they moved by equal "
-            "steps, and new ones would be seen: it was hardly trained, or seen from one direction"
+            f"numbers of this cover tell each other's low bits (p = {chance:.0e}), because they moved by "
+            "equal steps, and new ones would be seen: it was hardly trained, or seen from one direction"
         )
     return ""
 

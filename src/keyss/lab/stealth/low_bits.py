@@ -11,9 +11,9 @@
   usable Gaussian is exact: independent low bits.
 - `steps`: siblings that moved apart by equal steps of Adam, so that numbers predict each other's low bits
   (`keyss.channels.quiet.equal_steps`). A hit is a difference between neighbours that agrees to 1/8 of a cell
-  (the range of low bits) with that of another number of its group, or with that of the constant colour divided
-  by the ratio of their rates. Candidates are found by the bits that stay. The null distribution comes from the
-  same file with other low bits in usable Gaussians.
+  (the range of low bits) with that of another number of its group, or with that of the constant colour
+  divided by the ratio of their rates. Candidates are found by the bits that stay. The null distribution comes
+  from the same file with other low bits in usable Gaussians.
 """
 
 from __future__ import annotations
@@ -305,7 +305,9 @@ def steps(model: Gaussians, words: BitPatterns) -> dict[str, Statistic]:
     return found
 
 
-_Found = tuple[Integers, Integers, Doubles, Integers, Doubles]  # pairs, columns, steps or 0, other columns, cells
+_Found = tuple[
+    Integers, Integers, Doubles, Integers, Doubles
+]  # pairs, columns, steps or 0, other columns, cells
 
 
 def _two_equal(own: Words32, pairs: Integers) -> _Found:
