@@ -1,12 +1,13 @@
 """Equal steps: harmonics that predict each other's low bits.
 
 Adam's steps do not depend on the size of a gradient. While one of two siblings, Gaussians that density
-control split, is seen alone, or both in one direction, all harmonics of a group move apart by the same
-amount. The same holds for the distance from zero, where harmonics start. Constant groups, which are never
-written, move by the same amount times the ratio of two learning rates.
+control split, is seen alone, or both in one direction, all harmonics of a colour move apart by the same
+amount. The same holds for the distance from zero, where harmonics start, and for scales and for quaternions.
+Constant colours, which are never written, move by the same amount times the ratio of two learning rates.
 
-A Gaussian is left alone if three harmonics of a group moved by equal amounts away from zero or from one of
-its nearest neighbours, as far as the bits that stay tell. No rate of a trainer is assumed. By chance two
+A Gaussian is left alone if three numbers of a group (the harmonics of a colour, a quaternion, or scales and
+opacity) moved by equal amounts away from zero or from one of its nearest neighbours, as far as the bits that
+stay tell. No rate of a trainer is assumed. By chance two
 agree in many Gaussians; whether these tell low bits is tested on each model, at each depth.
 """
 
@@ -26,9 +27,9 @@ from keyss.kernels.jit import kernel
 from keyss.kernels.parallel import in_blocks
 
 _NEIGHBOURS = 12  # siblings were among the nearest 10 in models of 20,000 to 200,000 Gaussians
-_EQUAL = 3  # harmonics
+_EQUAL = 3  # numbers
 _ROWS = 1 << 11  # that a thread takes at a time
-_SAMPLE = 8000  # Gaussians whose pairs of harmonics are tested
+_SAMPLE = 8000  # Gaussians whose pairs of numbers are tested
 _DRAWS = 16
 _PARTS = np.array([1 / 16, 1 / 8, 1 / 4], np.float32)  # of a cell
 
@@ -157,7 +158,7 @@ def _mark(first: int, near: Any, words: Any, depth: int, apart: Any) -> None:
 
 @kernel
 def _count_equal(places: Any, known: Any, words: Any, depth: int, parts: Any, counts: Any) -> None:
-    """Count pairs of harmonics whose differences between rows of `words` agree to `parts` of a cell.
+    """Count pairs of numbers whose differences between rows of `words` agree to `parts` of a cell.
 
     Of those that agree in `known`, by the bits that stay. `places` [R, 1 + K]: rows and their neighbours.
     """

@@ -7,14 +7,14 @@ quarter of all Gaussians may be lost. The number of chunks does not reveal the s
 A *share* is a part of the carriers at a depth. A key must not reveal whether there are other secrets, so a
 secret's share depends on its own size only: the first that holds it of a quarter, a half and all of the
 carriers at the least depth, and all of them at each larger one. Places for the headers of four secrets are
-reserved, however many there are. Secrets whose shares do not fit together get equal ones at the least depth at
-which they fit, by which the holder of one key can notice others.
+reserved, however many there are. Secrets whose shares do not fit together get equal ones at the least depth
+at which they fit, by which the holder of one key can notice others.
 
 Numbers are little-endian. The parameters:
 
     check (8 bytes, derived from the data key), version (1), method (15, padded with zeros), bytes of the
-    encrypted payload (4), depth (1), Gaussians of the model (4), codewords (4), chunks of one (2), data chunks
-    of one (2), a sketch of the Gaussians (see `mixing`)
+    encrypted payload (4), depth (1), Gaussians of the model (4), codewords (4), chunks of one (2), data
+    chunks of one (2), a sketch of the Gaussians (see `mixing`)
 """
 
 from __future__ import annotations

@@ -1,18 +1,19 @@
 """What a key finds in the low bits of Gaussians by their IDs alone.
 
-Everything follows from a pseudo-random function of a secret and each Gaussian's ID, AES-256: Gaussians may have
-any order, and nothing marks a carrier. No pad is used twice, because every secret here is new for every file.
+Everything follows from a pseudo-random function of a secret and each Gaussian's ID, AES-256: Gaussians may
+have any order, and nothing marks a carrier. No pad is used twice, because every secret here is new for every
+file.
 
 *Messages* of a few bytes, the data key and the parameters, are cut into fragments that fit into the low bits
 of one Gaussian at the least depth. Each fragment has several places, the Gaussians with the smallest function
-values among those that the function assigns to it. Some of these cannot be written, are taken or lost: the most
-frequent content counts.
+values among those that the function assigns to it. Some of these cannot be written, are taken or lost: the
+most frequent content counts.
 
 *Chunks* of a payload fill all Gaussians of a secret's share. The function assigns each Gaussian to a group of
 codewords, and masks the number that a chunk has in its group. In rows of 5 bytes and more, a tag of one byte
 precedes it: of other Gaussians one in 256 has the right one by chance; in smaller rows, one in 64 has the
-number of a chunk. Such false chunks contradict true ones, which are lost thereby, or are errors, which the code
-corrects.
+number of a chunk. Such false chunks contradict true ones, which are lost thereby, or are errors, which the
+code corrects.
 """
 
 from __future__ import annotations

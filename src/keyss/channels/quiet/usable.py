@@ -113,8 +113,8 @@ def _what_tells(gaussians: Gaussians, layout: Layout, usable: Flags, depth: int,
     rows = np.flatnonzero(usable)
     if not len(rows):
         return (
-            "no Gaussian of the cover has random low bits; all hold short, repeated or predictable values: it "
-            "was quantised or hardly trained, and new bits would be seen"
+            "no Gaussian of the cover has random low bits; all hold short, repeated or predictable values: "
+            "it was quantised or hardly trained, and new bits would be seen"
         )
     used = used_words(gaussians[torch.from_numpy(rows[:: max(1, len(rows) // _SAMPLE)])])
     for name, group in _GROUPS.items():

@@ -283,7 +283,7 @@ def _usable(model: Gaussians) -> Flags:
 
 
 def steps(model: Gaussians, words: BitPatterns) -> dict[str, Statistic]:
-    """Excess of hits over those after new draws of the low bits of usable Gaussians, in standard deviations."""
+    """Hits beyond those after new draws of the low bits of usable Gaussians, in standard deviations."""
     pairs = nearest_pairs(np.nan_to_num(doubles(model.means)), _STEP_NEIGHBOURS)
     usable = _usable(model)
     pairs = pairs[usable[pairs].any(axis=1)]
@@ -305,9 +305,8 @@ def steps(model: Gaussians, words: BitPatterns) -> dict[str, Statistic]:
     return found
 
 
-_Found = tuple[
-    Integers, Integers, Doubles, Integers, Doubles
-]  # pairs, columns, steps or 0, other columns, cells
+# Pairs, columns, steps or 0, other columns, cells.
+_Found = tuple[Integers, Integers, Doubles, Integers, Doubles]
 
 
 def _two_equal(own: Words32, pairs: Integers) -> _Found:
