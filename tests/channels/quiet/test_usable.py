@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 import torch
 from hypothesis import given, strategies as st
+from keyss.channels.quiet.predictability import chance_of_equal_steps, count_trailing_zeros, least_exponent
 
 from channels.quiet.payloads import embed_derived
 from channels.quiet.trained_like import keys, trained_like
 from keyss.channels import LOW_BITS, QuietReader, chance_of_bits, read_low_bits, usable_carriers
 from keyss.channels.quiet import usable
 from keyss.channels.quiet.bits import Layout, used_words, write_low_bits
-from keyss.channels.quiet.predictability import chance_of_equal_steps, count_trailing_zeros, least_exponent
 from keyss.channels.quiet.usable import MAX_SEPARATION, check_usable
 from keyss.core import Gaussians, UsageError
 from keyss.lab.stealth.judging import stealth_statistics

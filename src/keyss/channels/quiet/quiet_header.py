@@ -161,7 +161,7 @@ class LowBitsCapacity:
 
         Empty if the headers of four secrets would take too many carriers.
         """
-        reserved, steps = MAX_INDEPENDENT * self.header_carriers, []
+        reserved, steps = MAX_INDEPENDENT * self.header_carriers, list[tuple[float, int, int]]()
         for part, depth in ((0.25, LEAST), (0.5, LEAST), *((1.0, depth) for depth in self.carriers)):
             count = int(part * (self.carriers[depth] - reserved))
             if reserved > _MAX_RESERVED * self.carriers[depth]:

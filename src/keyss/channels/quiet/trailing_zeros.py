@@ -84,4 +84,5 @@ def _chances(exponents: Integers, scale: float) -> Doubles:
         below = (below + exactly[:, z - 1]) / 2
         at_least[:, z] = below + forced[:, z]
     chances: Doubles = (-np.diff(at_least[:, 1:], append=0)).clip(1e-12)
-    return chances / chances.sum(axis=1, keepdims=True)
+    shares: Doubles = chances / chances.sum(axis=1, keepdims=True)
+    return shares
