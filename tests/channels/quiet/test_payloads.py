@@ -161,7 +161,7 @@ def test_survives_splat_transform(
 
 
 def test_two_secrets_open_with_their_own_keys_only(plain: Gaussians) -> None:
-    model, first, second = trained_like(3000, seed=5), keys(1), keys(2)
+    model, first, second = trained_like(4500, seed=5), keys(1), keys(2)
     stego = embed_derived(model, [(first, b"first"), (second, PAYLOAD)])
     assert extract_derived(stego, first[0]) == b"first"
     assert extract_derived(stego, second[0]) == PAYLOAD

@@ -151,10 +151,12 @@ class QuietReader(SaltedReader):
 
         A wrong key makes the same passes over all Gaussians, with data keys that match nothing.
         """
+        read = []
         for layout in self.layouts:
             width = layout.width(LEAST)
             data_key = key_message(key_secret(key), width).read(self.ids, self.low)
-            packed = parameter_message(data_key, width).read(self.ids, self.low)
+            read.append((parameter_message(data_key, width).read(self.ids, self.low), data_key, layout))
+        for packed, data_key, layout in read:
             if found := Parameters.unpack(packed, data_key, layout):
                 return self._payload(data_key, found, layout)
         width = self.layouts[0].width(DEEPEST)

@@ -260,11 +260,8 @@ class Parameters:
             raise InputError(f"hidden secret of version {version}; this program reads version {_VERSION}")
         try:
             width = layout.width(depth) if depth in DEPTHS else 0
-            if (
-                not 0 < count <= MAX_CODEWORDS
-                or n > _LONGEST
-                or count != whole_groups(count, is_tagged(width))
-            ):
+            whole = 0 < count <= MAX_CODEWORDS and count == whole_groups(count, is_tagged(width))
+            if not whole or n > _LONGEST:
                 raise ValueError(f"{count} codewords of {n} chunks at depth {depth}")
             codewords = Codewords(count, n, k, chunk_bytes(width))
             method = unpack_method(name)

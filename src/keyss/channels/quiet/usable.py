@@ -7,7 +7,7 @@ A Gaussian is excluded as a whole, so that its numbers stay consistent, because 
   that no view shows, and numbers that training freezes in clones.
 - *Copies*: Gaussians that share their position, scales, quaternion or the harmonics of degree 1 of a colour
   with any other one, and values that occur too often.
-- *Grey harmonics*, whose colours agree.
+- *Nearly equal* scales, or colours of a harmonic: round and grey Gaussians.
 - *Opacities* whose sigmoid is 1, which have no gradient, and those at the edge below which trainers remove
   Gaussians: no trained model has smaller ones.
 - *Small even numbers*, which an optimiser may have left on a coarser grid: see `trailing_zeros`.
@@ -69,6 +69,7 @@ _OPACITY = 7
 # Bit patterns of logits above 16. The sigmoid is 1 above 16.64, but only the exponent never changes.
 _SATURATED = np.uint32(0x41800000), np.uint32(0x80000000)
 _PRUNED = np.float32(math.log(0.005 / 0.995)).view(np.uint32) | LOW  # the logit of 0.005, without low bits
+_MIN_USABLE = 0.05  # share of the Gaussians of a cover
 _SETS_BY_CHANCE = 0.1  # maximum expected number of sets of equal values by chance
 _SAMPLE = 20_000  # Gaussians whose bits are tested
 _CHANCE = 1e-6  # probability of refusing a depth of a model with uniform bits
@@ -111,10 +112,11 @@ def _what_tells(gaussians: Gaussians, layout: Layout, usable: Flags, depth: int,
     Tested on at most 20,000 Gaussians: see `chance_of_bits` and `Steps.chance`.
     """
     rows = np.flatnonzero(usable)
-    if not len(rows):
+    if len(rows) <= _MIN_USABLE * len(usable):
         return (
-            "no Gaussian of the cover has random low bits; all hold short, repeated or predictable values: "
-            "it was quantised or hardly trained, and new bits would be seen"
+            f"only {len(rows):,} of the cover's {len(usable):,} Gaussians have random low bits; the others "
+            "hold short, repeated or predictable values: it was quantised or hardly trained, and new bits "
+            "would be seen"
         )
     used = used_words(gaussians[torch.from_numpy(rows[:: max(1, len(rows) // _SAMPLE)])])
     for name, group in _GROUPS.items():
@@ -193,7 +195,7 @@ def _exponents(words: Words32) -> Bytes:
 
 
 def _without_copies(gaussians: Gaussians, layout: Layout, ids: Bytes) -> Flags:
-    """Mask [N] of Gaussians with no shared, frequent, grey, subnormal, saturated or nearly pruned numbers."""
+    """Mask [N] of Gaussians without shared, frequent, nearly equal, saturated and nearly pruned numbers."""
     shared = [slice(0, 3), *([QUATS] if layout.quats else [])]
     if layout.sh_degree:
         shared += [slice(GEOMETRY + colour, GEOMETRY + 9, 3) for colour in range(3)]
@@ -212,10 +214,10 @@ def _without_copies(gaussians: Gaussians, layout: Layout, ids: Bytes) -> Flags:
         good[:, _OPACITY] &= opacity | LOW != _PRUNED
         for group, values in zip(_GROUPS.values(), common, strict=True):
             good[:, group] &= ~among(used[:, group], values)
-        colours = ((used[:, GEOMETRY:] & _MAGNITUDE) >> np.uint32(DEEPEST + 1)).astype(np.int32)
-        colours = colours.reshape(len(used), -1, 3)
-        grey = np.abs(colours - colours[:, :, [1, 2, 0]]) <= 1
-        fine[start:stop] = good[:, layout.columns].all(axis=1) & ~grey.any(axis=(1, 2))
+        high = ((used & _MAGNITUDE) >> np.uint32(DEEPEST + 1)).astype(np.int32)
+        triples = np.concatenate([high[:, :3], high[:, GEOMETRY:]], axis=1).reshape(len(used), -1, 3)
+        near = np.abs(triples - triples[:, :, [1, 2, 0]]) <= 1
+        fine[start:stop] = good[:, layout.columns].all(axis=1) & ~near.any(axis=(1, 2))
 
     in_blocks(judge, len(gaussians), BLOCK)
     unique: Flags = ~np.logical_or.reduce(in_blocks(lambda index, _: repeated(keys[index]), len(keys), 1))
