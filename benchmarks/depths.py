@@ -58,9 +58,8 @@ def main() -> None:
 
 def trained(scene: Path, width: int, count: int, ratio: int) -> Gaussians:
     """A model of a scene, trained at a ratio of rates. Large models grow at smaller gradients."""
-    gradient = 2e-4 * min(1.0, 20_000 / count)
+    steps, gradient = (500, 2e-4) if count <= 20_000 else (400, 5e-5) if count <= 100_000 else (300, 2e-5)
     growth = {"grow_gradient": gradient, "grow_every": 10 if count > 100_000 else None}
-    steps = 500 if count <= 20_000 else 400 if count <= 100_000 else 300
     rates = {"shN_rate": CONSTANT_RATE / ratio, "seed": 7 * count + ratio}
     config = FitConfig(iterations=steps, max_gaussians=count, **rates, **growth)  # type: ignore[arg-type]
     return fit_scene(load_scene(scene, width=width), config, device="cpu").gaussians

@@ -72,7 +72,7 @@ def test_models_with_trailing_zeros_and_new_bits_look_alike(rounded: list[Gaussi
 def test_little_is_left_alone_where_nothing_is_given_away(rounded: list[Gaussians]) -> None:
     """Near-equal components are 3 % by chance."""
     fine = [usable_carriers(trained_like(1500, seed)).mean() for seed in range(MODELS)]
-    assert min(fine) > 0.92
+    assert min(fine) > 0.9
     assert max(usable_carriers(model).mean() for model in rounded) < 0.88
 
 
