@@ -3,9 +3,9 @@
 A file has no magic number and no index of its secrets. Bits are stored in *carriers*: the low bits of one
 Gaussian, or one block of last bits of codes (see `wet_paper`). A *salt* of Argon2id is a hash of one carrier
 that holds nothing else. A salt is *stale* if its Gaussian is not usable (see `usable`): the author of the
-cover knows it in advance, so no key is written under it. A reader tries SALTS_TRIED salts; covers with as
-many stale ones among the first 2 SALTS_TRIED are refused: of others, random removal of a quarter leaves no
-fresh salt to try with p < 3e-4.
+cover knows it in advance, so no key is written under it. A reader tries SALTS_TRIED salts; covers with
+as many stale ones among the first 2 SALTS_TRIED are refused: in others, random removal of a quarter leaves it
+no fresh one with p < 3e-4.
 
 In low bits, the IDs of Gaussians and a key tell where a secret lies (see `spread` and `quiet_header`), with
 redundancy: shuffling is harmless, and a quarter of the Gaussians may be lost. In codes nothing may be lost or
@@ -76,13 +76,21 @@ class LowBits(Channel):
 
         `sh_degree`: 1 if harmonics of higher degrees must stay as they are, to the bit.
         """
-        layout, versions = Layout.of(cover), _versions(cover) if (found := self._found.get(cover)) is None or
-        found[0] != versions: carriers = Carriers.of(cover, layout) rows = salt_rows(cover, carriers.ids,
-        layout) first = rows[: 2 * SALTS_TRIED] stale = int((~carriers.usable[LEAST][first]).sum()) if stale
-        >= SALTS_TRIED: raise UsageError( f"{stale} of the first {len(first)} salts of this cover cannot be
-        renewed, and whoever made " "it could try keys in advance" ) found = self._found[cover] = versions,
-        carriers, rows if sh_degree is not None: layout = replace(layout, written_degree=min(sh_degree,
-        layout.sh_degree)) return LowBitsCover(cover, layout, *found[1:])
+        layout, versions = Layout.of(cover), _versions(cover)
+        if (found := self._found.get(cover)) is None or found[0] != versions:
+            carriers = Carriers.of(cover, layout)
+            rows = salt_rows(cover, carriers.ids, layout)
+            first = rows[: 2 * SALTS_TRIED]
+            stale = int((~carriers.usable[LEAST][first]).sum())
+            if stale >= SALTS_TRIED:
+                raise UsageError(
+                    f"{stale} of the first {len(first)} salts of this cover cannot be renewed, and whoever "
+                    "made it could try keys in advance"
+                )
+            found = self._found[cover] = versions, carriers, rows
+        if sh_degree is not None:
+            layout = replace(layout, written_degree=min(sh_degree, layout.sh_degree))
+        return LowBitsCover(cover, layout, *found[1:])
 
     def estimate_capacity(self, gaussians: int, sh_degree: int) -> Capacity:
         return LowBitsCapacity.of(gaussians, Layout(sh_degree)).for_payloads()
