@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import io
+import time
 
 import pytest
 from rich.console import Console
 
-from keyss.progress import ProgressLines, clock, reporter
+from keyss.progress import ProgressLines, Wait, clock, reporter
 
 
 class Timer:
@@ -87,3 +88,40 @@ def test_reporter_is_reusable(timer: Timer, terminal: bool) -> None:
         lines.update(2, 0, {})
         lines.finish()
     assert [text(screen).count(title) > 1 for title in ("cover", "secret")] == [True, True]
+
+
+def test_time_left_follows_the_pace_of_the_work(timer: Timer) -> None:
+    wait = Wait("audit", 60, timer)
+    assert str(wait) == "audit: 0:00, about 60 s left"
+    timer.now += 20
+    assert str(wait) == "audit: 0:20, about 40 s left"  # nothing else is known
+    wait.update(1 / 3)
+    assert wait.left == pytest.approx(40)
+    timer.now += 40
+    wait.update(0.5)  # a half took a minute
+    assert wait.left == pytest.approx(30 * 66 / 36)
+    timer.now += 70
+    assert str(wait) == "audit: 2:10, longer than estimated"
+
+
+def test_waits_are_logged_while_they_last(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("keyss.progress._QUIET_SECONDS", 0.05)
+    log = console(False)
+    with ProgressLines(log).waiting("checking a.ply", 100):
+        for _ in range(200):
+            time.sleep(0.02)
+            if text(log):
+                break
+    assert text(log).startswith("checking a.ply: 0:0")
+    assert " left" in text(log)
+    before = text(log)
+    with ProgressLines(log).waiting("nothing to do", 100):
+        pass
+    assert text(log) == before
+
+
+def test_waits_are_displayed_in_terminals() -> None:
+    screen = console(True)
+    with ProgressLines(screen).waiting("checking a.ply", 100) as share:
+        share(0.5)
+    assert "checking a.ply: 0:00" in text(screen)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import warnings
+
 import pytest
 
 from channels.quiet.trained_like import trained_like
-from keyss.channels import APPENDED, LOW_BITS, Payload, open_payload
-from keyss.core import KeyssWarning
+from keyss.channels import APPENDED, LOW_BITS, Channel, Payload, open_payload
+from keyss.core import Gaussians, KeyssWarning
 
 
 def test_appended_gaussians_do_not_hide_what_lies_in_low_bits() -> None:
@@ -16,3 +18,16 @@ def test_appended_gaussians_do_not_hide_what_lies_in_low_bits() -> None:
     with pytest.warns(KeyssWarning, match=r"about [\d,]+ Gaussians were added"):
         assert open_payload(more, "a key").data == b"in low bits"
     assert open_payload(more, "a key of somebody else").data == b"appended"
+
+
+@pytest.mark.parametrize("channel", [LOW_BITS, APPENDED], ids=["low bits", "appended"])
+def test_two_files_of_one_cover_are_told(channel: Channel) -> None:
+    """Put into one, they open one of two secrets, and only the copies show it."""
+    cover = trained_like(3000)
+    payloads = [Payload("file", data) for data in (b"one", b"other")]
+    one, other = (channel.prepare(cover).embed([("a key", each)]) for each in payloads)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert open_payload(one, "a key").data == b"one"
+    with pytest.warns(KeyssWarning, match=r"about [\d,]+ Gaussians were added"):
+        assert open_payload(Gaussians.cat([one, other]), "a key").data in (b"one", b"other")

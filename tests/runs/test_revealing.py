@@ -1,9 +1,14 @@
 from __future__ import annotations
 
-import pytest
+from dataclasses import fields
 
+import pytest
+import torch
+
+from keyss.core import Gaussians
 from keyss.methods.hidden import Remains
-from keyss.runs.revealing import Revealed, check_secret, loss_warnings
+from keyss.runs.revealing import Revealed, check_model, check_secret, loss_warnings
+from tiny_scenes import random_gaussians
 
 
 @pytest.mark.parametrize(
@@ -21,3 +26,15 @@ def test_loss_warnings(remains: Remains, expected: list[str]) -> None:
     for warning, start in zip(warnings, expected, strict=True):
         assert warning.startswith(start)
     assert check_secret(Revealed(None, remains, tuple(warnings))).problems == tuple(warnings)
+
+
+def test_duplicates_are_counted_as_by_comparing_all_rows() -> None:
+    model = random_gaussians(3000, seed=4)
+    rows = torch.randint(0, 3000, (900,), generator=torch.Generator().manual_seed(5))
+    repeated = Gaussians.cat([model, model[rows], model[rows[:40]]])
+    repeated.means[:5] = 0.0
+    repeated.means[3000:3900:2] = 0.0
+    repeated.means[rows[::2]] = -0.0  # equals 0
+    columns = [getattr(repeated, each.name).reshape(len(repeated), -1) for each in fields(repeated)]
+    expected = len(repeated) - len(torch.unique(torch.cat(columns, dim=1), dim=0))
+    assert check_model(repeated).duplicates == expected > 500

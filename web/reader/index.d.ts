@@ -1,12 +1,20 @@
+export interface Foreign {
+  /**
+   * About how many Gaussians were added to the published file or changed in it, if so many that somebody may have chosen
+   * which secret the key opens: tell the user.
+   */
+  readonly foreign?: number;
+}
+
 /** A 3D Gaussian Splatting model that a key opened, as a .ply of its own. */
-export interface RevealedModel {
+export interface RevealedModel extends Foreign {
   readonly kind: 'model';
   readonly ply: Uint8Array;
   readonly gaussians: number;
 }
 
 /** A file that a key opened. */
-export interface RevealedFile {
+export interface RevealedFile extends Foreign {
   readonly kind: 'file';
   /** As its sender had it. Show it, and do not use it as a path. */
   readonly name: string;

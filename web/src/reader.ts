@@ -28,11 +28,11 @@ export const reveal: Reveal = async (bytes, key, { name, decodeWebP, signal, onP
     signal?.throwIfAborted();
     if (payload === null) continue;
     onProgress?.(1);
-    const file = fileOf(payload);
-    if (file) return { kind: 'file', ...file };
+    const [file, { foreign }] = [fileOf(payload), payload];
+    if (file) return { kind: 'file', ...file, foreign };
     const secret = secretOf(payload, stego);
     if (secret === null) throw new InputError('This key opens a model that only keyss reveal decodes.');
-    return { kind: 'model', ply: writePly(secret), gaussians: secret.count };
+    return { kind: 'model', ply: writePly(secret), gaussians: secret.count, foreign };
   }
   onProgress?.(1);
   return null;

@@ -5,14 +5,27 @@ import { type Payload, type Reader, unpackPayload } from '../src/channels/base.t
 import { Fountain, NOISY } from '../src/channels/colours/fountain.ts';
 import { ColoursReader } from '../src/channels/colours/colours_reader.ts';
 import { Channels, preparedFor } from '../src/channels/opening.ts';
-import { type Gaussians, selected } from '../src/core/gaussians.ts';
-import { movedPoint } from '../src/core/similarity.ts';
+import { COLUMNS, emptyGaussians, type Gaussians, opacity, selected, where, withDegree } from '../src/core/gaussians.ts';
+import { moved, movedPoint } from '../src/core/similarity.ts';
 import { mixed, multiplicities, sortingOrder } from '../src/core/words.ts';
 import { type Derive, expand, here, roundRobin, sequential } from '../src/keys/keys.ts';
 import { digest, hex, jsonVector, modelOf, random, type Revealed } from './vectors.ts';
 
 const OPENED = jsonVector<Revealed[]>('revealed.json');
 const NOTE = OPENED.find((each) => each.file === 'colours.spz')!;
+
+const NOTHING = emptyGaussians(0, 0);
+
+/** All Gaussians of several models, of the SH degree of the first one. */
+function together(...models: Gaussians[]): Gaussians {
+  const found = emptyGaussians(models.reduce((sum, each) => sum + each.count, 0), models[0].shDegree);
+  let at = 0;
+  for (const each of models.map((model) => withDegree(model, found.shDegree))) {
+    for (const column of COLUMNS) found[column].set(each[column], at * (found[column].length / found.count));
+    at += each.count;
+  }
+  return found;
+}
 
 /** Rows of a model in another order, of which a share is left. */
 function some(model: Gaussians, share: number, seed: number): Gaussians {
@@ -86,6 +99,44 @@ test('appended Gaussians survive pruning of a fifth and any order', async () => 
   expect(AppendedReader.of(selected(model, [...Array(120).keys()]))).toBeNull(); // the cover alone
 });
 
+test('a secret put into another file is told', async () => {
+  const [model, wanted] = [await modelOf('appended.ply'), OPENED.find((each) => each.file === 'appended.ply' && 'payload' in each)!];
+  const isVisible = (row: number): boolean => opacity(model.opacityLogits[row]) > 0.5;
+  const [cover, appended] = [where(model, isVisible), where(model, (row) => !isVisible(row))];
+  const host = some(await modelOf('published.spz'), 1, 3);
+  const speck = selected(cover, new Uint8Array(30_000));
+  const scattered = { ...speck, logScales: speck.logScales.map((each) => each - 6), means: speck.means.map((each, at) => each + at / 1e4) };
+  const shrunken = moved({ scale: 1e-3, rotation: [1, 0, 0, 0, 1, 0, 0, 0, 1], translation: [0, 0, 0] }, together(cover, cover));
+  const derive = remembered(here);
+  for (const added of [NOTHING, cover, scattered, shrunken]) {
+    const found = await AppendedReader.of(together(appended, host, added))!.open(wanted.key, derive);
+    expect(digest(found!.data)).toBe(wanted.payload);
+    expect(found!.foreign).toBeGreaterThan(100);
+  }
+  for (const kept of [model, together(appended, some(cover, 0.3, 4))]) {
+    expect((await AppendedReader.of(kept)!.open(wanted.key, derive))!.foreign).toBeUndefined();
+  }
+});
+
+test('two files of one cover, put into one, are told', async () => {
+  const payload = { method: 'file', data: new Uint8Array(0) };
+  const reader: Reader = { derivations: 1, open: async () => payload };
+  const once = await modelOf('appended.ply');
+  const opened = (model: Gaussians): Promise<Payload | null> => new Channels([reader], model).open('key');
+  expect(await opened(once)).toEqual(payload);
+  expect((await opened(together(once, some(once, 1, 2))))!.foreign).toBe(once.count - where(once, (row) => opacity(once.opacityLogits[row]) < 2 / 255).count);
+});
+
+test('a note put into another model is told', async () => {
+  const model = await modelOf('colours-moved.splat');
+  const key = OPENED.find((each) => each.file === 'colours-moved.splat')!.key;
+  const derive = remembered(here);
+  expect((await ColoursReader.of(model).open(key, derive))!.foreign).toBeUndefined();
+  const few = some(model, 0.2, 6);
+  const [specks, host] = [{ ...model, logScales: model.logScales.map((each) => each - 7) }, { ...few, sh: few.sh.map((each) => -each) }];
+  expect((await ColoursReader.of(together(specks, host)).open(key, derive))!.foreign).toBeGreaterThan(host.count);
+});
+
 test('colours survive scaling, any order and pruning of a fifth', async () => {
   const model = await modelOf(NOTE.file);
   const derive = remembered(here);
@@ -107,11 +158,12 @@ test('wrong keys open nothing in colours, nor in models without them', async () 
 
 test('channels report their number of derivations', async () => {
   for (const [file, channels] of Object.entries({ 'appended.ply': 2, 'colours.spz': 2, 'carried.ply': 2 })) {
-    const prepared = preparedFor(await modelOf(file));
+    const model = await modelOf(file);
+    const prepared = preparedFor(model);
     const readers = [...prepared(false).readers, ...prepared(true).readers];
     expect(readers.length).toBe(channels);
     let asked = 0;
-    const channel = new Channels(readers);
+    const channel = new Channels(readers, model);
     await channel.open('any key', async (key, salt) => {
       asked++;
       return quick(key, salt);
@@ -132,10 +184,10 @@ test('the first channel that opens wins, and all are searched', async () => {
   });
   const payload = (method: string): Payload => ({ method, data: new Uint8Array(0) });
   const [none, first, second] = [reader('none', null), reader('first', payload('first')), reader('second', payload('second'))];
-  expect((await new Channels([none, first, second]).open('key'))?.method).toBe('first');
+  expect((await new Channels([none, first, second], NOTHING).open('key'))?.method).toBe('first');
   expect(asked).toEqual(['none', 'first', 'second']);
-  await expect(new Channels([reader('damaged', new Error('damaged.')), first]).open('key')).rejects.toThrow('damaged.');
-  expect(await new Channels([none]).open('key')).toBeNull();
+  await expect(new Channels([reader('damaged', new Error('damaged.')), first], NOTHING).open('key')).rejects.toThrow('damaged.');
+  expect(await new Channels([none], NOTHING).open('key')).toBeNull();
 });
 
 test('derivations run sequentially, or round robin over several', async () => {

@@ -35,6 +35,7 @@ from keyss.methods.registry import DEFAULT, open_companion, open_model
 from keyss.progress import Reporter
 from keyss.rendering import Backend, resolve_device
 from keyss.rendering.orbit import is_model
+from keyss.runs.estimates import seconds_to_prepare
 from keyss.runs.files import (
     CONFIG,
     METRICS,
@@ -79,13 +80,14 @@ def hide(
     """Hide secrets in a cover, each under its own key, and measure the result on the test views.
 
     Cover and secrets are scenes of photos, or models of any format, which are rendered for measurements.
-    Plain models of scenes are fitted unless they are given. `method`: a name, or the options of a method
-    (`CarryOptions`, `KeyssOptions`). `publish`, `format` and `channel`, if given, replace those of the
-    options. "as-is" hides unnoticeably, in a file that must stay unchanged: in low bits of a "ply", or in the
-    integers of an "spz", "sog" or "compressed-ply", or of a model decoded from one. By default `format` is
-    the cover's; if nothing can be hidden in it unnoticed, `publish` becomes "any", with a warning. "any"
-    survives conversion: in the channel "appended" (more Gaussians, which are visible in the file) or
-    "colours" (less capacity). `width`, `background`, `skip_missing`: see `load_scene`.
+    Plain models of scenes are fitted unless they are given. `method`: a name, for its default preset on the
+    device, or the options of a method (`CarryOptions`, `KeyssOptions`). `publish`, `format` and `channel`,
+    if given, replace those of the options. "as-is" hides unnoticeably, in a file that must stay unchanged:
+    in low bits of a "ply", or in the integers of an "spz", "sog" or "compressed-ply", or of a model decoded
+    from one. By default `format` is the cover's; if nothing can be hidden in it unnoticed, `publish`
+    becomes "any", with a warning. "any" survives conversion: in the channel "appended" (more Gaussians,
+    which are visible in the file) or "colours" (less capacity). `width`, `background`, `skip_missing`: see
+    `load_scene`.
 
     `out` (a folder) gets `publish/` with the stego model, and `private/` with fitted models, `config.json`,
     `metrics.json`, companion files for methods that need them (`keyss.methods.companion`), and
@@ -101,11 +103,12 @@ def hide(
     and 25 for secrets pruned without a refit) or no better than that of empty renders. Raises other
     KeyssErrors too, and Interrupted on Ctrl-C.
     """
-    chosen, options = method_for(method, secrets)
+    target = resolve_device(device)
+    chosen, options = method_for(method, secrets, target.type)
     asked: dict[str, Any] = {"publish": publish, "format": format, "channel": channel}
     options = replace(options, **{name: value for name, value in asked.items() if value})
     _check_arguments(out, min_psnr)
-    began, place, target = time.monotonic(), None if out is None else Path(out), resolve_device(device)
+    began, place = time.monotonic(), None if out is None else Path(out)
     options = replace(options, fit=with_seed(options.fit, place if resume else None, "options", "fit"))
     given, keys = [cover, *(secret.scene for secret in secrets)], [secret.key for secret in secrets]
     models = [cover_model, *(secret.model for secret in secrets)]
@@ -116,23 +119,25 @@ def hide(
         folder = _folder(place, settings, given, models, keys, bound, overwrite, resume)
         began -= folder.earlier_seconds
 
-    sources = sources_of(given, models, keys, views)
-    options = chosen.prepare(sources, options)
-    plain_steps = _plain_steps(sources, models, options)
-    trains = not dry_run and (options.trains or any(each.given is None for each in sources))
-    sources = [
-        source
-        if source.photos
-        else replace(source, loaded=as_scene(each, views, train_pictures=trains, model=source.given))
-        for each, source in zip(given, sources, strict=True)
-    ]
+    reporter = reporter or Reporter()
+    with reporter.waiting("reading the cover and the secrets", seconds_to_prepare([*given, *models])):
+        sources = sources_of(given, models, keys, views)
+        options = chosen.prepare(sources, options)
+        plain_steps = _plain_steps(sources, models, options)
+        trains = not dry_run and (options.trains or any(each.given is None for each in sources))
+        sources = [
+            source
+            if source.photos
+            else replace(source, loaded=as_scene(each, views, train_pictures=trains, model=source.given))
+            for each, source in zip(given, sources, strict=True)
+        ]
     cost = cost_of(options, sources, target, bound=bound)
     check_room(cost, place)
     if dry_run:
         return HideResult(plan=chosen.plan(sources, options), cost=cost)
 
     with folder.work() if folder else nullcontext():
-        if reporter and not resume and (options.channel_in().grows or trains):
+        if not resume and (options.channel_in().grows or trains):
             plan = chosen.plan(sources, options)
             for line in (f"hide: a file of up to {plan.megabytes:,.1f} MB, {cost}", *plan.notes):
                 reporter.note(line)
@@ -147,13 +152,17 @@ def hide(
         # Images of given models take their place from here on, which frees memory for the revealed ones.
         sources = [each if each.photos else replace(each, given=None) for each in sources]
         del plain
-        read = _write_and_read(stego, published, keys, folder)
-        shown = [
-            compare(
-                model.to(target), each.given and each.given.to(target), each.scene, of_plain=not each.photos
-            )
-            for model, each in zip(read, sources, strict=True)
-        ]
+        with reporter.waiting("reading the published file, and comparing renders", cost.check_seconds):
+            read = _write_and_read(stego, published, keys, folder)
+            shown = [
+                compare(
+                    model.to(target),
+                    each.given and each.given.to(target),
+                    each.scene,
+                    of_plain=not each.photos,
+                )
+                for model, each in zip(read, sources, strict=True)
+            ]
         sizes = [(len(model), count) for model, (count, _) in zip(read, plain_sizes, strict=True)]
         check_quality(shown, min_psnr, sizes, options, resumes=trains)
 

@@ -41,13 +41,18 @@ class HideResult:
     survives: bool = False  # whether the secrets survive conversion to other formats
 
 
-def method_for(chosen: str | MethodOptions, secrets: Sequence[Secret]) -> tuple[Method, MethodOptions]:
-    """A method and its options. Raises UsageError if the method does not support these secrets or keys."""
+def method_for(
+    chosen: str | MethodOptions, secrets: Sequence[Secret], device: str
+) -> tuple[Method, MethodOptions]:
+    """A method and its options, by default its preset for the device.
+
+    Raises UsageError if the method does not support these secrets or keys.
+    """
     if isinstance(chosen, MethodOptions):
         method, options = registry.of_options(chosen), chosen
     else:
         method = registry.get(chosen)
-        options = method.options()
+        options = method.options.preset("default", device)
     if not 1 <= len(secrets) <= method.max_secrets:
         raise UsageError(
             f"expected 1 to {method.max_secrets} secrets for the method {method.name}, got {len(secrets)}"

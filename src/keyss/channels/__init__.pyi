@@ -6,6 +6,7 @@ from .base import (
     Channel as Channel,
     Payload as Payload,
     PreparedCover as PreparedCover,
+    copies as copies,
     pack_method as pack_method,
     pack_payload as pack_payload,
     unpack_method as unpack_method,

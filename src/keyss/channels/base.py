@@ -16,11 +16,16 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import ClassVar, Protocol
 
+import numpy as np
+import torch
+
 from keyss.core.errors import InputError, KeyssWarning, UsageError, WrongKeyError
 from keyss.core.gaussians import Gaussians
 from keyss.keys.derivation import DerivedKey
 
 METHOD_BYTES = 15  # maximum length of a method's name
+_MAX_COPIES = 0.1  # share of a sound model; one public model has 0.035, all others less
+_VISIBLE = 2 / 255  # opacity, above that of appended Gaussians
 SALTS_TRIED = 4  # with half of the Gaussians changed, 15 of 16 models still open
 NOT_INDEPENDENT = (
     "the secrets are too large, or too many, to be placed independently of each other: whoever holds one of "
@@ -114,15 +119,31 @@ class SaltedReader(ABC):
     def open(self, key: str) -> Payload:
         """See `Reader`. Changed or added Gaussians can replace the first salt, so several are tried.
 
-        Each takes 0.1 s. Warns (KeyssWarning) of Gaussians that were added or changed after hiding.
+        Each takes 0.1 s. Warns as `warned` does.
         """
         for salt in self.salts[:SALTS_TRIED]:
             with suppress(WrongKeyError):
-                payload = self.extract(DerivedKey.of(key, salt))
-                if payload.foreign:
-                    warnings.warn(_FOREIGN.format(payload.foreign), KeyssWarning, stacklevel=3)
-                return payload
+                return warned(self.extract(DerivedKey.of(key, salt)))
         raise WrongKeyError()
+
+
+def warned(payload: Payload) -> Payload:
+    """The payload; warns (KeyssWarning) of Gaussians that were added or changed after hiding."""
+    if payload.foreign:
+        warnings.warn(_FOREIGN.format(payload.foreign), KeyssWarning, stacklevel=4)
+    return payload
+
+
+def copies(model: Gaussians) -> tuple[int, bool]:
+    """The number of visible Gaussians with the position and the red of another; True if it is suspicious.
+
+    Two files of one cover, put into one, have many: no channel changes these numbers.
+    """
+    visible = model[model.opacities > _VISIBLE].detach().to("cpu")
+    rows = torch.cat([visible.means, visible.sh[:, 0, :1]], dim=1).numpy() + np.float32(0)  # no -0
+    weights = np.frombuffer(os.urandom(32), np.uint64)  # random: nobody can prepare equal hashes
+    count = len(rows) - len(np.unique(rows.view(np.uint32).astype(np.uint64) @ weights))
+    return count, count > _MAX_COPIES * len(rows)
 
 
 class Channel(ABC):

@@ -1,9 +1,10 @@
 """Hashes, which hide nothing; pseudo-random numbers and sketches, which are derived from a secret.
 
-By a *sketch* of a model's Gaussians, a reader detects foreign ones: added or changed later. It is the first
-bits of a Bloom filter (Bloom 1970) of N bits with one keyed hash, for a model of N Gaussians. The bits of its
-own Gaussians are set, so losses do not matter. A foreign Gaussian hits an unset bit with probability
-bits / (e N).
+By a *sketch* of a model's Gaussians, a reader detects foreign ones: added or changed later. It is a Bloom
+filter (Bloom 1970) of B bits with one keyed hash. Each Gaussian hashes to one of `among` places, and those
+below B are bits: a sample of the Gaussians, in which each is present with probability B / `among`. The bits
+of its own Gaussians are set, so losses do not matter. Of foreign ones in the sample, a share e^-1 hits unset
+bits if the filter holds B Gaussians. Equal IDs count once.
 """
 
 from __future__ import annotations
@@ -61,22 +62,35 @@ def random_fractions(secret: bytes, label: str, count: int) -> Doubles:
     return (words.astype(np.float64) + 0.5) / 2.0**52
 
 
-def sketch(secret: bytes, ids: Bytes, size: int = SKETCH_BYTES) -> bytes:
-    """A sketch of `size` bytes of Gaussians with `ids` [N, 16]."""
+def sketch(secret: bytes, ids: Bytes, size: int = SKETCH_BYTES, among: Integers | None = None) -> bytes:
+    """A sketch of `size` bytes of Gaussians with `ids` [N, 16].
+
+    `among` [N]: places that each hashes to, a function of its ID; by default N.
+    """
     bits = np.zeros(8 * size, np.uint8)
-    bits[_places(secret, ids, len(ids), len(bits))] = 1
+    bits[_places(secret, ids, len(ids) if among is None else among, len(bits))] = 1
     return np.packbits(bits, bitorder="little").tobytes()
 
 
-def foreign(secret: bytes, ids: Bytes, own: bytes, gaussians: int) -> int:
-    """Estimated number of `ids` [M, 16] foreign to the sketch `own` of `gaussians` Gaussians."""
+def foreign_share(secret: bytes, ids: Bytes, own: bytes, among: Integers | int, gone: float = 0.0) -> float:
+    """Estimated share, 0 to 1, of foreign Gaussians among those with `ids` [M, 16], by the sketch `own`.
+
+    `among` [M]: as in `sketch`, if Gaussians count in inverse proportion to it; else the number of its
+    Gaussians. 1 if less than a share `gone` of the sketch's sample is there.
+    """
     unset = np.unpackbits(np.frombuffer(own, np.uint8), bitorder="little") == 0
-    hits = int(unset[_places(secret, ids, gaussians, len(unset))].sum())
-    return min(len(ids), round(hits * gaussians / max(1, int(unset[:gaussians].sum()))))
+    places = _places(secret, ids, among, len(unset))
+    if isinstance(among, int):
+        unset = unset[:among]
+    if len(places) < gone * (~unset).sum():
+        return 1.0
+    return min(1.0, float(unset[places].sum() / max(1e-9, len(places) * unset.mean())))
 
 
-def _places(secret: bytes, ids: Bytes, count: int, kept: int) -> Integers:
-    """Bit positions below `kept` that the Gaussians hash to, of `count` positions."""
-    hashed = encrypted_blocks(expand(secret, "sketch", 32), ids)[:, :4].copy().view("<u4")[:, 0]
-    places = hashed.astype(np.int64) % max(1, count)
-    return places[places < kept]
+def _places(secret: bytes, ids: Bytes, among: Integers | int, kept: int) -> Integers:
+    """Places below `kept` [P] of different IDs."""
+    hashed = encrypted_blocks(expand(secret, "sketch", 32), ids)[:, :8].copy().view("<u4").astype(np.int64)
+    places = hashed[:, 0] % np.maximum(1, among)
+    sampled = np.flatnonzero(places < kept)
+    _, first = np.unique(hashed[sampled, 0] << 32 | hashed[sampled, 1], return_index=True)
+    return places[sampled[first]]

@@ -7,7 +7,7 @@ from contextlib import suppress
 from dataclasses import replace
 from typing import get_args
 
-from keyss.channels.base import Channel, Payload, Reader
+from keyss.channels.base import Channel, Payload, Reader, copies, warned
 from keyss.channels.names import AnyChannel, Format, Publish
 from keyss.core.errors import UsageError, WrongKeyError
 from keyss.core.gaussians import Gaussians
@@ -58,11 +58,18 @@ def suffix_of(stego: Gaussians) -> str:
 
 
 def open_payload(stego: Gaussians, key: str) -> Payload:
-    """The payload that `key` opens in any channel. Raises WrongKeyError, and InputError for damage."""
+    """The payload that `key` opens in any channel. Raises WrongKeyError, and InputError for damage.
+
+    Warns (KeyssWarning) of Gaussians that were added or changed after hiding.
+    """
     for reader in _readers(stego):
         with suppress(WrongKeyError):
             if reader is not None:
-                return replace(reader.open(key), model_size=len(stego))
+                payload = replace(reader.open(key), model_size=len(stego))
+                count, suspicious = copies(stego)
+                if suspicious and not payload.foreign:  # else the reader has warned
+                    payload = warned(replace(payload, foreign=count))
+                return payload
     raise WrongKeyError()
 
 

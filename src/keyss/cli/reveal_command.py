@@ -53,8 +53,9 @@ def reveal(
         (key,) = keys(key_file, 1)
     from keyss.files.inputs import is_standard
     from keyss.progress import waiting
+    from keyss.runs.estimates import seconds_for
 
-    with waiting(f"opening {stego.name}"):
+    with waiting(f"opening {stego.name}", seconds_for("reveal", stego)):
         revealed = keyss.reveal(
             stego,
             key,
@@ -92,9 +93,10 @@ def verify(
     import keyss
     from keyss.cli.tables import print_json, print_verification
     from keyss.progress import waiting
+    from keyss.runs.estimates import seconds_for
 
     key = next(iter(given_keys([key_file] if key_file else [])), None)
-    with waiting(f"checking {model.name}"):
+    with waiting(f"checking {model.name}", seconds_for("reveal" if key else "verify", model)):
         found = keyss.verify(model, key, device=device)
     (print_json if json_ else print_verification)(found)
     if found.problems:

@@ -66,6 +66,8 @@ def view(
     example: keyss view runs/hidden/publish/model.ply -o page.html
     """
     check_exists(model)
+    from keyss.progress import waiting
+    from keyss.runs.estimates import seconds_for
     from keyss.viewer import ModelServer, export_html, look_of_model
 
     if pose and not re.fullmatch(_POSE, pose):
@@ -75,7 +77,8 @@ def view(
     if out is not None:
         if port or host != "127.0.0.1":
             raise UsageError("--port and --host are for serving: leave them out with -o")
-        written = export_html(model, out, look=look, overwrite=overwrite)
+        with waiting(f"writing {out.name}", seconds_for("export", model)):
+            written = export_html(model, out, look=look, overwrite=overwrite)
         size = sum(path.stat().st_size for path in written) / 1e6
         what = "opens in any browser" if len(written) == 1 else f"{len(written)} files for a web server"
         print(f"{out}: {size:.1f} MB; {what}")
@@ -106,10 +109,13 @@ def render(
     """
     check_exists(model, cameras)
     import keyss
+    from keyss.progress import waiting
+    from keyss.runs.estimates import seconds_for
 
-    images = keyss.render(
-        model, cameras, split=split, **vars(photos), device=device, out=out, overwrite=overwrite
-    )
+    with waiting(f"rendering {model.name}", seconds_for("render", model)):
+        images = keyss.render(
+            model, cameras, split=split, **vars(photos), device=device, out=out, overwrite=overwrite
+        )
     print(f"{out}: {len(images)} image{'' if len(images) == 1 else 's'}")
 
 
@@ -126,9 +132,13 @@ def info(
     example: keyss info runs/hidden/publish/model.ply
     """
     from keyss.cli.tables import print_info, print_json
+    from keyss.progress import waiting
     from keyss.runs.describe import info as describe
+    from keyss.runs.estimates import seconds_for
 
-    (print_json if json_ else print_info)(describe(path))
+    with waiting(f"reading {path.name}", seconds_for("info", path)):
+        found = describe(path)
+    (print_json if json_ else print_info)(found)
 
 
 def evaluate(

@@ -100,7 +100,7 @@ def print_plan(method: str, plan: Plan, cost: Cost) -> None:
                 "published",
                 f"up to {plan.gaussians:,} Gaussians of SH degree {plan.sh_degree}, {plan.megabytes:,.1f} MB",
             ),
-            ("time", f"about {about(cost.seconds)}{steps}"),
+            ("time", f"about {about(cost.seconds)} on {cost.where}{steps}"),
             ("memory", f"about {cost.memory_bytes / 1e9:.1f} GB"),
             ("disk", f"up to {cost.disk_bytes / 1e6:,.0f} MB at once, checkpoints included"),
             *(("note", note) for note in plan.notes),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, get_args
 
@@ -49,6 +50,7 @@ def audit(
         optional("PART", f"Part to audit: {', '.join(get_args(PartName))}; repeat for more.", "all"),
     ] = (),
     report_only: Annotated[bool, switch("Write the report again, from the stored measurements.")] = False,
+    dry_run: Annotated[bool, switch("Print estimates of the time of each part; needs no keys.")] = False,
     resume: Resume = False,
     overwrite: Overwrite = False,
     device: Device = "auto",
@@ -59,8 +61,13 @@ def audit(
     example: keyss audit runs/hidden --key-file key.txt
 
     example: keyss audit runs/hidden --report-only
+
+    example: keyss audit runs/hidden --dry-run
     """
     check_exists(run)
+    if dry_run:
+        _print_audit_forecast(run, controls, only, device)
+        return
     import keyss
     from keyss.cli.keys import keys_of_run
     from keyss.cli.tables import print_files
@@ -296,6 +303,19 @@ def _print_verdicts(audit: Audit) -> None:
     Console().print(headline(lines), highlight=False)
 
 
+def _print_audit_forecast(run: Path, controls: int, only: Sequence[str], device: Device) -> None:
+    """Print the parts of an audit and how long they take."""
+    from keyss.cli.tables import print_table
+    from keyss.lab.audits.forecast import forecast_audit
+    from keyss.progress import about
+
+    found = forecast_audit(run, controls=controls, only=only, device=device)
+    print_table(("part", "time, about"), [(name, about(each)) for name, each in found.seconds.items()])
+    where = "the GPU" if found.device == "cuda" else "the CPU"
+    print(f"About {about(sum(found.seconds.values()))} on {where}.")
+    print("Dry run: nothing was written. Times are rough; controls that exist take none.")
+
+
 def _print_forecast(found: Forecast) -> None:
     """Print the trials of a dry run, with estimates for those to do."""
     from keyss.cli.tables import print_table
@@ -314,4 +334,4 @@ def _print_forecast(found: Forecast) -> None:
         f"{len(rows)} run{'s' * (len(rows) != 1)}, {len(found.costs)} to do: about "
         f"{about(sum(cost.seconds for cost in found.costs.values()))} on this machine."
     )
-    print("Dry run: nothing was written. Times are rough, and leave out the measurements afterwards.")
+    print("Dry run: nothing was written. Times are rough; measurements are included.")

@@ -8,13 +8,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol, Self
 
 from keyss.channels.names import AnyChannel, Format, Publish
 from keyss.core.errors import UsageError
-from keyss.fitting.config import PRESETS, FitConfig
+from keyss.fitting.config import FitConfig, preset_for
+
+# Per Gaussian of the cover and of a secret (which ones are usable, encoding, error correction), and per key.
+_COVER_SECONDS, _SECRET_SECONDS, _KEY_SECONDS = 1e-5, 3e-5, 3.0
 
 if TYPE_CHECKING:  # the command line reads options without torch
     import torch
@@ -75,6 +79,10 @@ class Context:
         checkpoint = self.checkpoints / f"{name}.safetensors" if self.checkpoints else None
         return {"checkpoint": checkpoint, "resume": self.resume, "reporter": self.reporter}
 
+    def waiting(self, what: str, seconds: float) -> AbstractContextManager[Any]:
+        """See `Reporter.waiting`."""
+        return self.reporter.waiting(what, seconds) if self.reporter else nullcontext()
+
 
 @dataclass(frozen=True)
 class Stego:
@@ -133,11 +141,9 @@ class MethodOptions:
             raise UsageError(f'`format="{self.format}"` is for models that stay as they are: leave it out')
 
     @classmethod
-    def preset(cls, size: str) -> Self:
-        """Options of one of the sizes in `keyss.fitting.config.PRESETS`. Raises UsageError."""
-        if size not in PRESETS:
-            raise UsageError(f"preset {size!r}: expected {' or '.join(PRESETS)}")
-        return cls(fit=PRESETS[size])
+    def preset(cls, size: str, device: str = "cpu") -> Self:
+        """Options of one of the presets: see `keyss.fitting.config.preset_for`."""
+        return cls(fit=preset_for(size, device))
 
     def channel_in(self, cover: Gaussians | None = None) -> Channel:
         """The channel that carries the secrets in `cover`; None: the cover is not known yet."""
@@ -238,3 +244,8 @@ def check_above_zero(options: object, *names: str) -> None:
         value = getattr(options, name)
         if not 0 < value < math.inf:
             raise UsageError(f"`{name}`: expected a number above 0, got {value}")
+
+
+def seconds_to_hide(cover: int, secrets: Sequence[int]) -> float:
+    """About the seconds to hide models of so many Gaussians in a cover, without training, on two cores."""
+    return _COVER_SECONDS * cover + _SECRET_SECONDS * sum(secrets) + _KEY_SECONDS * len(secrets)

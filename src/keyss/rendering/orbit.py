@@ -27,7 +27,7 @@ DISTANCES = (1.0, 0.75, 1.0, 0.5)
 TEST_EVERY, _LARGE = 12, 500_000  # views; minimum Gaussians of a model with slow renders
 _QUANTILE, _MAX_RATIO = 0.95, 10.0  # weights are clamped to this multiple of this quantile
 _ORBIT_VIEWS, _SCENE_VIEWS, _SIZE = 4, 8, 256  # for comparing models
-_SAMPLE = 200_000  # maximum Gaussians for computing `middle_and_radius`
+SAMPLE = 200_000  # maximum Gaussians for computing `middle_and_radius`
 
 
 def is_model(source: str | Path | Gaussians) -> bool:
@@ -104,7 +104,7 @@ def middle_and_radius(model: Gaussians) -> tuple[Tensor, float]:
     90 % of the weight, but is at most three times the radius of 50 %: it covers an object, and the middle of
     an unbounded scene. Large models are subsampled.
     """
-    model = model[:: max(1, len(model) // _SAMPLE)]
+    model = model[:: max(1, len(model) // SAMPLE)]
     scales = model.scales.sort(dim=1).values
     weight = (model.opacities * scales[:, 1] * scales[:, 2]).cpu().nan_to_num(0.0)
     weight = weight.clamp_max(_MAX_RATIO * _quantile(weight, torch.ones(len(model)), _QUANTILE))

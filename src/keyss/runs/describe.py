@@ -1,6 +1,6 @@
 """The verb `info`: descriptions of files and folders.
 
-What only folders need is imported for them: it takes half a second.
+Imports for a plain .ply neither torch nor what only folders need, which takes a second.
 """
 
 from __future__ import annotations
@@ -13,9 +13,10 @@ from typing import TYPE_CHECKING, Any
 from keyss.core.errors import InputError
 from keyss.files.file_kinds import identify_file, is_training, model_file
 from keyss.files.inputs import is_standard
-from keyss.files.models import is_model_path, known_suffixes, read_model
+from keyss.files.ply_summary import NEARLY_TRANSPARENT, summarise_ply
 
 if TYPE_CHECKING:
+    from keyss.core.gaussians import Gaussians
     from keyss.runs.run_records import FitMetrics, HideMetrics
 
 
@@ -100,21 +101,34 @@ def _folder_info(path: Path) -> RunInfo | ModelInfo | SceneInfo:
 
 
 def _model_info(path: Path) -> ModelInfo:
+    if (summary := summarise_ply(path)) is not None:
+        count, degree, transparent = summary.gaussians, summary.sh_degree, summary.nearly_transparent
+        box = _round(summary.low), _round(summary.high)
+    else:
+        model = _read_model(path)
+        count, degree = len(model), model.sh_degree
+        box = _round(model.means.amin(0)), _round(model.means.amax(0))
+        transparent = int((model.opacity_logits < NEARLY_TRANSPARENT).sum())
+    return ModelInfo(
+        kind="3DGS model",
+        path=str(path),
+        bytes=None if is_standard(path) else path.stat().st_size,
+        gaussians=count,
+        sh_degree=degree,
+        bounding_box=box,
+        nearly_transparent=round(transparent / count, 4),
+    )
+
+
+def _read_model(path: Path) -> Gaussians:
+    from keyss.files.models import is_model_path, known_suffixes, read_model
+
     if not (is_standard(path) or is_model_path(path)):
         raise InputError(
             f"{path}: expected a model ({known_suffixes()}), a scene folder or a result folder, found "
             f"{identify_file(path)}"
         )
-    model = read_model(path)
-    return ModelInfo(
-        kind="3DGS model",
-        path=str(path),
-        bytes=None if is_standard(path) else path.stat().st_size,
-        gaussians=len(model),
-        sh_degree=model.sh_degree,
-        bounding_box=(_round(model.means.amin(0)), _round(model.means.amax(0))),
-        nearly_transparent=round(float((model.opacities < 0.05).double().mean()), 4),
-    )
+    return read_model(path)
 
 
 def _round(values: Iterable[Any]) -> tuple[float, ...]:

@@ -17,15 +17,16 @@ from keyss.core.errors import KeyssWarning, OutputError
 from keyss.core.scene import Scene
 from keyss.fitting.config import FitConfig
 from keyss.fitting.losses import Targets
-from keyss.methods.method import MethodOptions, Source
+from keyss.methods.method import MethodOptions, Source, seconds_to_hide
 from keyss.methods.plain_models import Bound
 from keyss.progress import about
 
 _STEP_SECONDS = {"cpu": 5e-7, "cuda": 6e-9}  # per training step, Gaussian and two pixels
-_KEY_SECONDS = 3.0  # deriving a secret's key for every salt, and opening the secret again
+_READ_SECONDS = 3e-6  # per Gaussian: writing a model, and reading it again
 _RENDERS = 2  # training steps that take as long as measuring a test view
 _CHECKPOINTS = 6  # two checkpoints / model: each holds parameters and two moments of Adam
 _MAX_APPENDED = 7  # Gaussians that hold one Gaussian of a secret of SH degree 3
+_COPIES = 2  # of what is published and of the secrets in memory, beside the given models
 _OTHER_BYTES = 4 << 20  # JSON files, locks, and the overhead of the file system
 
 
@@ -36,12 +37,19 @@ class Cost:
     steps: int  # training steps
     seconds: float
     fit_seconds: tuple[float, ...]  # plain fits among them, the cover's first
+    check_seconds: float  # reading the published file and measuring it
+    device: str  # "cpu" or "cuda"
     disk_bytes: int  # at one time, checkpoints included
     memory_bytes: int
 
+    @property
+    def where(self) -> str:
+        """The device, for messages."""
+        return "the GPU" if self.device == "cuda" else "the CPU"
+
     def __str__(self) -> str:
         return (
-            f"about {about(self.seconds)}, {self.memory_bytes / 1e9:.1f} GB of memory, "
+            f"about {about(self.seconds)} on {self.where}, {self.memory_bytes / 1e9:.1f} GB of memory, "
             f"up to {self.disk_bytes / 1e6:,.0f} MB of disk"
         )
 
@@ -62,32 +70,39 @@ def cost_of(
     count, most = len(sources), options.fit.max_gaussians
     fits, trainings = options.fits(count), options.training(count)
     steps, trained, sizes = max(training.steps for training in trainings), 0, []
-    seconds, fit_seconds = _KEY_SECONDS * (count - 1), []
+    seconds, check_seconds, fit_seconds = 0.0, 0.0, []
     for source, fit, training in zip(sources, fits, trainings, strict=True):
         size = most if source.given is None or not training.continues else len(source.given)
         own = fit.iterations if source.given is None else 0
-        renders = own + training.steps * training.step_cost + _RENDERS * len(source.scene.test)
+        renders = own + training.steps * training.step_cost
         longer = Bound.of(training, own or None)
         if bound and source.photos and not longer.equal:
             renders += longer.steps or 0
         camera = source.scene.test[0].camera
-        step = _STEP_SECONDS[device.type] * (size + camera.width * camera.height / 2)
+        step = step_seconds(device.type, size, camera.width * camera.height)
         seconds += renders * step
+        check_seconds += _RENDERS * len(source.scene.test) * step + _READ_SECONDS * size
         fit_seconds.append(own * step)
         steps += own
         trained += size if own or training.steps else 0
         sizes.append(size)
+    seconds += seconds_to_hide(sizes[0], sizes[1:]) + check_seconds
     published = sizes[0] + (_MAX_APPENDED * sum(sizes[1:]) if options.channel_in().grows else 0)
     degree = max(options.fit.sh_degree if each.given is None else each.given.sh_degree for each in sources)
     gaussian = 4 * (14 + 3 * (degree + 1) ** 2)  # bytes in a .ply, with normals
     resident: int = psutil.Process().memory_info().rss
     largest = max(published, *sizes) * gaussian
-    memory = resident + 3 * largest
+    memory = resident + _COPIES * (published + sum(sizes[1:])) * gaussian
     if trained:  # gradients, moments and two checkpoints
         memory += (1 + _CHECKPOINTS) * largest
         memory += max(Targets.max_bytes(source.scene.train) for source in sources)
     disk = (published + sum(sizes) + _CHECKPOINTS * trained) * gaussian + _OTHER_BYTES
-    return Cost(steps, seconds, tuple(fit_seconds), disk, memory)
+    return Cost(steps, seconds, tuple(fit_seconds), check_seconds, device.type, disk, memory)
+
+
+def step_seconds(device: str, gaussians: int, pixels: int) -> float:
+    """About the seconds of a training step on a device, "cpu" or "cuda"."""
+    return _STEP_SECONDS[device] * (gaussians + pixels / 2)
 
 
 def check_room(cost: Cost, out: Path | None) -> None:

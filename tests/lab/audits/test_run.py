@@ -15,7 +15,8 @@ import keyss
 from keyss import Secret
 from keyss.core import InputError, Interrupted, OutputError, UsageError, WrongKeyError
 from keyss.lab import RenderTime, measure_render_time
-from keyss.lab.audits import Audit, audit, read_audit
+from keyss.lab.audits import PARTS, Audit, audit, read_audit
+from keyss.lab.audits.forecast import forecast_audit
 from lab.audits.audited import KEYS
 from test_api import ANY, write_nerfstudio
 from tiny_scenes import random_gaussians, tiny_scene
@@ -134,3 +135,15 @@ def test_ratio_of_equal_and_of_smaller_models() -> None:
     assert 0 < same.seconds < 10
     assert 0.1 < same.ratio < 10
     assert more.ratio > same.ratio / 10
+
+
+def test_forecasts_need_no_keys_and_grow_with_the_work(run: Path) -> None:
+    found = forecast_audit(run)
+    assert list(found.seconds) == ["controls", *PARTS]
+    assert found.steps == ANY.fit.iterations
+    more = forecast_audit(run, controls=6, only=("speed", "stealth"))
+    assert list(more.seconds) == ["controls", "stealth", "speed"]
+    assert more.seconds["controls"] > found.seconds["controls"]
+    assert more.seconds["speed"] == found.seconds["speed"]
+    with pytest.raises(UsageError, match="no such part"):
+        forecast_audit(run, only=("sorcery",))

@@ -4,10 +4,11 @@
  * Every key searches all channels, even after one has opened, so that timing reveals neither whether a key opens
  * something nor where. Colours are searched last, as they take four times as long as all others together.
  */
+import type { Gaussians } from '../core/gaussians.ts';
 import type { ReadModel } from '../files/models.ts';
 import type { Derive } from '../keys/keys.ts';
 import { AppendedReader } from './appended/appended_reader.ts';
-import type { Payload, Reader } from './base.ts';
+import { copies, type Payload, type Reader } from './base.ts';
 import { ColoursReader } from './colours/colours_reader.ts';
 import { QuietReader } from './quiet/reading.ts';
 
@@ -15,12 +16,13 @@ import { QuietReader } from './quiet/reading.ts';
 export function preparedFor(model: ReadModel): (thorough: boolean) => Channels {
   const quick = [QuietReader.of(model), AppendedReader.of(model)].filter((each) => each !== null);
   let colours: Reader | null = null;
-  return (thorough) => new Channels(thorough ? [(colours ??= ColoursReader.of(model))] : quick);
+  return (thorough) => new Channels(thorough ? [(colours ??= ColoursReader.of(model))] : quick, model);
 }
 
 /** Several channels; the first that opens wins. */
 export class Channels implements Reader {
-  constructor(readonly readers: readonly Reader[]) {}
+  /** `model`: of these channels, searched for copies. */
+  constructor(readonly readers: readonly Reader[], private readonly model: Gaussians) {}
 
   get derivations(): number {
     return this.readers.reduce((sum, each) => sum + each.derivations, 0);
@@ -30,7 +32,8 @@ export class Channels implements Reader {
     const outcomes = await Promise.allSettled(this.readers.map((each) => each.open(key, derive)));
     for (const outcome of outcomes) {
       if (outcome.status === 'rejected') throw outcome.reason;
-      if (outcome.value !== null) return outcome.value;
+      const found = outcome.value;
+      if (found !== null) return { ...found, foreign: found.foreign || copies(this.model) || undefined };
     }
     return null;
   }

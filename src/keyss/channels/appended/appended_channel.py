@@ -10,7 +10,6 @@ total to one of few numbers, which reveal little of the size and the number of s
 from __future__ import annotations
 
 import math
-import struct
 import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -18,7 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from keyss.channels.appended import pilots
+from keyss.channels.appended import cover as cover_sketches, pilots
 from keyss.channels.appended.words import (
     HEADERS,
     WORD_BITS,
@@ -51,12 +50,12 @@ from keyss.channels.base import (
     randomness,
     unpack_payload,
 )
-from keyss.channels.colours.carriers import Carriers
-from keyss.channels.mixing import foreign, sketch
+from keyss.channels.mixing import random_order
 from keyss.channels.reed_solomon import Codewords
-from keyss.core.arrays import Bits, Bytes, Doubles, Integers
-from keyss.core.errors import InputError, KeyssWarning, UsageError, WrongKeyError
+from keyss.core.arrays import Bits, Doubles, Integers
+from keyss.core.errors import KeyssWarning, UsageError, WrongKeyError
 from keyss.core.gaussians import Gaussians
+from keyss.core.similarity import Similarity
 from keyss.keys.derivation import SALT_BYTES, DerivedKey, expand, stream
 from keyss.keys.encryption import OVERHEAD, compressed_size, decrypt, encrypt
 
@@ -67,17 +66,16 @@ _LEFT, _DEVIATIONS, _MAX_DATA = 0.74, 4.2, 5895
 _WIDE, _NARROW, _WIDE_PACKETS = 8, 6, 90_000
 _MAX_PACKETS = 1_000_000  # data packets; a header holds up to 2^20
 _STEP = 256  # smallest difference between numbers of appended Gaussians
-_OVERHEAD = 260  # maximum bytes of a payload beside its data
+_ZLIB_BYTES = 64  # that incompressible data grow by
+_OVERHEAD = OVERHEAD + METHOD_BYTES + 1 + cover_sketches.BYTES + _ZLIB_BYTES
 
 # Search for the lattice's offset: Gaussians in which pilots are counted, maximum number of offsets, and
 # standard deviations by which pilots must outnumber accidental ones.
 _SAMPLE, _MAX_OFFSETS, _SIGNIFICANT = 8000, 8, 3.0
 _ASSOCIATED = b"keyss/v1/appended/data"
-# The cover: how many of its Gaussians are seen, and their sketch. A format changes up to a fifth of the IDs;
-# another model of the same scene shares two fifths of them, one of another scene a tenth.
-_SKETCH_BYTES, _FOREIGN = 128, 0.4
-_COVER = struct.Struct(f"<I{_SKETCH_BYTES}s")
-MAX_BYTES = _MAX_PACKETS * _NARROW - OVERHEAD - METHOD_BYTES - _COVER.size
+# Share of foreign Gaussians that is told. No format makes any foreign; of another model, 0.95 and more are.
+_FOREIGN = 0.05
+MAX_BYTES = _MAX_PACKETS * _NARROW - OVERHEAD - METHOD_BYTES - cover_sketches.BYTES
 _VISIBLE_SECRETS = (
     "the number of appended Gaussians reveals the total size: the holder of one key can tell that there are "
     "other secrets"
@@ -102,7 +100,7 @@ class Appended(Channel):
     def appended_count(self, sizes: Sequence[int]) -> int:
         """The number of Gaussians appended for payloads of these compressed sizes in bytes."""
         single = len(sizes) == 1
-        every = [_codewords_for(size + _COVER.size, single) for size in sizes]
+        every = [_codewords_for(size + cover_sketches.BYTES, single) for size in sizes]
         return _padded_count(sum(HEADERS + each.chunks for each in every))
 
 
@@ -122,7 +120,7 @@ class AppendedCover:
     def embed(self, payloads: Sequence[tuple[str, Payload]], *, entropy: bytes | None = None) -> Gaussians:
         """The cover followed by the appended Gaussians. Warns if there is more than one secret."""
         model = self.cover.detach().to("cpu")
-        ids = _coarse_ids(model)
+        to_world = own_frame(model)
         packed = [pack_payload(payload) for _, payload in payloads]
         secret = randomness(entropy, *packed)
         salt = expand(secret, "appended/salt", SALT_BYTES)
@@ -131,17 +129,15 @@ class AppendedCover:
         check_keys([key.verifier() for key in keys])
         if len(keys) > 1:
             warnings.warn(_VISIBLE_SECRETS, KeyssWarning, stacklevel=2)
-        single = len(keys) == 1
-        sketches = [sketch(_sketch_key(key), ids, _SKETCH_BYTES) for key in keys]
-        data = [_COVER.pack(len(ids), own) + each for own, each in zip(sketches, packed, strict=True)]
-        words = [_words(*each, single, random) for each in zip(keys, data, strict=True)]
-        used = sum(map(len, words))
-        total = _padded_count(used)
-        words.append(pilots.write(salt, pilots.count_for(total), random))
-        rest = total - used - pilots.count_for(total)
-        words.append(random.integers(0, 2, (rest, WORD_BITS), np.uint8))
-        every = sort_by_rotation(np.concatenate(words))
-        return Gaussians.cat([model, to_gaussians(every, own_frame(model), model.sh_degree)])
+        total = APPENDED.appended_count([compressed_size(each) for each in packed])
+        words = [pilots.write(salt, pilots.count_for(total), random)]
+        for key, each in zip(keys, packed, strict=True):
+            own = cover_sketches.pack(model, total, to_world.inverse(), _sketch_key(key))
+            words.append(_words(key, own, each, len(keys) == 1))
+        words.append(_random_words(secret, total - sum(map(len, words))))
+        # In random order, because sorting keeps the order of equal rotations.
+        every = np.concatenate(words)[random_order(secret, "appended/order", total)]
+        return Gaussians.cat([model, to_gaussians(sort_by_rotation(every), to_world, model.sh_degree)])
 
 
 @dataclass(frozen=True)
@@ -150,7 +146,8 @@ class AppendedReader(SaltedReader):
 
     salts: Sequence[bytes]
     words: Bits
-    ids: Bytes  # [M, 16] of the Gaussians that are seen
+    model: Gaussians
+    to_own: Similarity  # world to own frame
 
     @staticmethod
     def of(model: Gaussians) -> AppendedReader | None:
@@ -171,7 +168,7 @@ class AppendedReader(SaltedReader):
             if best is not None:
                 found, scales = best
                 words = pack_words(colours, scales, *points_in_frame(faint, found.to_own))
-                return AppendedReader([found.salt], words, _coarse_ids(model))
+                return AppendedReader([found.salt], words, model.detach().to("cpu"), found.to_own)
         return None
 
     def extract(self, key: DerivedKey) -> Payload:
@@ -180,20 +177,15 @@ class AppendedReader(SaltedReader):
             header = read_header(key.expand(f"appended/header/{width}", 32), self.words, width)
             if header:
                 numbers, data = read_packets(key.expand("appended/packets", 32), self.words, width)
-                encrypted = _codewords(header, width).decode(numbers.astype(np.int64), data, errors=True)
-                whole = decrypt(key.expand("appended/data", 32), encrypted, _ASSOCIATED)
-                if len(whole) < _COVER.size:
-                    raise InputError("the hidden data are damaged: they are incomplete")
-                foreign_count = foreign(_sketch_key(key), self.ids, *reversed(_COVER.unpack_from(whole)))
-                told = foreign_count if foreign_count > _FOREIGN * len(self.ids) else 0
-                return replace(unpack_payload(whole[_COVER.size :]), foreign=told)
+                whole = _codewords(header, width).decode(numbers.astype(np.int64), data, errors=True)
+                own = _masked(key, whole[: cover_sketches.BYTES])
+                encrypted = whole[cover_sketches.BYTES :]
+                packed = decrypt(key.expand("appended/data", 32), encrypted, _ASSOCIATED + own)
+                foreign = cover_sketches.foreign_count(
+                    own, self.model, self.to_own, _sketch_key(key), _FOREIGN
+                )
+                return replace(unpack_payload(packed), foreign=foreign)
         raise WrongKeyError()
-
-
-def _coarse_ids(model: Gaussians) -> Bytes:
-    """[M, 16] IDs of the visible Gaussians, coarse numbers that formats and motions hardly change."""
-    ids = Carriers.of(model).ids
-    return np.hstack([ids, np.zeros_like(ids)]).astype("<i2").view(np.uint8)
 
 
 def _sketch_key(key: DerivedKey) -> bytes:
@@ -242,15 +234,36 @@ def _shifts_with_pilots(steps: Doubles, colours: Integers) -> Iterator[float]:
             yield float(shifts[index])
 
 
-def _words(key: DerivedKey, data: bytes, single: bool, random: np.random.Generator) -> Bits:
-    """Words [N, WORD_BITS] of the headers and packets of `data`; `single`: there is only one secret."""
-    codewords = _codewords_for(compressed_size(data), single)
+def _words(key: DerivedKey, own: bytes, packed: bytes, single: bool) -> Bits:
+    """Words [N, WORD_BITS] of the headers and packets of a payload; `single`: there is only one secret.
+
+    `own`: the cover's sketch, which is masked and authenticated with the payload.
+    """
+    codewords = _codewords_for(compressed_size(packed) + len(own), single)
     width, needed = codewords.width, codewords.count * codewords.k
-    encrypted = encrypt(key.expand("appended/data", 32), data, _ASSOCIATED, size=codewords.size)
+    size = codewords.size - len(own)
+    encrypted = encrypt(key.expand("appended/data", 32), packed, _ASSOCIATED + own, size=size)
+    data = _masked(key, own) + encrypted
     numbers = np.arange(codewords.chunks, dtype=np.uint64)
+    noise = np.frombuffer(key.expand("appended/header-noise", HEADERS * width), np.uint8).reshape(
+        HEADERS, width
+    )
     return np.concatenate(
         [
-            write_header(key.expand(f"appended/header/{width}", 32), needed, width, random),
-            write_packets(key.expand("appended/packets", 32), numbers, codewords.encode(encrypted)),
+            write_header(key.expand(f"appended/header/{width}", 32), needed, noise),
+            write_packets(key.expand("appended/packets", 32), numbers, codewords.encode(data)),
         ]
     )
+
+
+def _masked(key: DerivedKey, own: bytes) -> bytes:
+    """The cover's sketch, encrypted or decrypted."""
+    mask = np.frombuffer(stream(key.master, "appended/cover", len(own)), np.uint8)
+    return (np.frombuffer(own, np.uint8) ^ mask).tobytes()
+
+
+def _random_words(secret: bytes, count: int) -> Bits:
+    """Words [count, WORD_BITS] as random as encrypted ones."""
+    noise = np.frombuffer(stream(secret, "appended/padding", count * WORD_BITS), np.uint8)
+    bits: Bits = (noise & np.uint8(1)).reshape(count, WORD_BITS)
+    return bits

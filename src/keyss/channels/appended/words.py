@@ -195,10 +195,9 @@ def read_packets(key: bytes, words: Bits, width: int) -> tuple[Words, Bytes]:
     return _number(tags) ^ _masks(key, data, tags.shape[1]), data
 
 
-def write_header(key: bytes, value: int, width: int, random: np.random.Generator) -> Bits:
-    """Words [HEADERS, WORD_BITS] that all hold `value`, a number of _HEADER_BITS."""
-    data = random.integers(0, 256, (HEADERS, width), np.uint8)
-    return write_packets(key, np.full(HEADERS, value, np.uint64), data)
+def write_header(key: bytes, value: int, noise: Bytes) -> Bits:
+    """Words [HEADERS, WORD_BITS] that hold `value`, of _HEADER_BITS bits, and `noise` [HEADERS, width]."""
+    return write_packets(key, np.full(HEADERS, value, np.uint64), noise)
 
 
 def read_header(key: bytes, words: Bits, width: int) -> int | None:

@@ -10,17 +10,16 @@ steps of 1 / 38.25; most formats: opacities in 255ths), so rounding moves no num
 a model moves rounded values relative to the bins, so a reader tries several *alignments*.
 
 *Salt Gaussians* have the smallest public hashes of their bins (opacity, ratios of scales, red), among the
-Gaussians whose numbers no format can move into another bin. Half of them are faint, so that a new colour is
-hardly visible; the other half survives the removal of faint Gaussians. A salt of Argon2id is a hash of the
-bins of one salt Gaussian, green and blue included. A writer moves green and blue by a uniformly random
-number of bins, -3 to 3, which makes all salts new: two files of one model share each salt with a probability
-of 1/49.
+Gaussians whose numbers no format can move into another bin. Half of them are opaque enough to survive the
+removal of faint Gaussians. A salt of Argon2id is a hash of the bins of one salt Gaussian, green and blue
+included. They are never written, because everybody finds them and would see the noise. Files of one cover
+therefore have the same salts.
 """
 
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
 
@@ -40,7 +39,6 @@ _MIN_OPACITY = 2.5 / 255  # formats drop the colours of fainter Gaussians
 _BINS = 30_000  # maximum absolute index, which fits into 16 bits
 SALTS = 16  # maximum number; 5 to 12 survive rounding and random pruning of a quarter
 _BANDS = (0.08, 0.4, 1.01)  # limits of two opacity bands with half of the salts each
-_MAX_MOVED = 3  # bins
 _SALT_OPACITY_BIN, _SALT_RATIO_BIN, _SALT_COLOUR_BIN = 16, 8, 5  # steps
 _LABEL = b"keyss/v1/colours-salt"
 _PUBLIC = hashlib.sha256(_LABEL).digest()
@@ -89,11 +87,28 @@ class Carriers:
         return impact
 
     @cached_property
+    def stability(self) -> Doubles:
+        """The probability [C] that a carrier has the ID with which it was written."""
+        return 1 - self.error_probability
+
+    @cached_property
+    def shares(self) -> Doubles:
+        """1 / the number [C] of carriers with the same ID."""
+        _, inverse, counts = np.unique(row_hashes(self.ids), return_inverse=True, return_counts=True)
+        shares: Doubles = 1 / counts[inverse]
+        return shares
+
+    @cached_property
     def certainty(self) -> Doubles:
         """The probability [C] that a carrier is the one of its ID that was written, with its ID unchanged."""
-        _, inverse, counts = np.unique(row_hashes(self.ids), return_inverse=True, return_counts=True)
-        certainty: Doubles = (1 - self.error_probability) / counts[inverse]
-        return certainty
+        return self.stability * self.shares
+
+    @cached_property
+    def weights(self) -> Doubles:
+        """Weights [C] of carriers in the model: area x opacity, up to the mean; equal IDs count once."""
+        sizes = np.exp(np.sort(self.log_scales)[:, 1:].sum(axis=1).clip(-80, 80)) * self.opacities
+        weights: Doubles = np.minimum(1, sizes / max(1e-300, float(sizes.mean()))) * self.shares
+        return weights
 
     @cached_property
     def representatives(self) -> Integers:
@@ -123,14 +138,6 @@ def find_salts(carriers: Carriers) -> tuple[Integers, list[bytes]]:
     rows = np.concatenate(chosen)
     salts = [hashlib.sha256(_LABEL + bins[row].tobytes()).digest()[:SALT_BYTES] for row in rows]
     return rows, list(dict.fromkeys(salts))
-
-
-def renew_salts(carriers: Carriers, random: np.random.Generator) -> Carriers:
-    """The carriers with new greens and blues of salt Gaussians, hence new salts."""
-    rows, colours = find_salts(carriers)[0], carriers.colours.copy()
-    bins = random.integers(-_MAX_MOVED, _MAX_MOVED + 1, (len(rows), 2))
-    colours[rows, 1:] += bins * _SALT_COLOUR_BIN / _COLOUR_STEPS
-    return replace(carriers, colours=colours)
 
 
 def random_pairs(secret: bytes, label: str, ids: Ids) -> Words:

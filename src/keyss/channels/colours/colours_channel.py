@@ -27,8 +27,9 @@ from keyss.channels.base import (
     pack_payload,
     randomness,
     unpack_payload,
+    warned,
 )
-from keyss.channels.colours.carriers import SALTS, Carriers, find_salts, renew_salts
+from keyss.channels.colours.carriers import SALTS, Carriers, find_salts
 from keyss.channels.colours.fountain import Fountain
 from keyss.channels.colours.header import (
     FILE_KEY_BYTES,
@@ -43,7 +44,7 @@ from keyss.channels.colours.header import (
 from keyss.channels.colours.planner import MIN_HEADERS, Layout, Planner, bucket_of
 from keyss.channels.colours.qim import COLUMNS, ONE, bit_counts, read, seeds, write
 from keyss.channels.reed_solomon import LOST
-from keyss.core.arrays import Flags
+from keyss.core.arrays import Doubles, Flags
 from keyss.core.errors import InputError, KeyssWarning, UsageError, WrongKeyError
 from keyss.core.gaussians import Gaussians
 from keyss.keys.derivation import MASTER_BYTES, expand, stream
@@ -59,6 +60,7 @@ _ASSOCIATED = b"keyss/v1/colours"  # associated data of a payload's authenticati
 _CHANGED = 0.03  # share of carriers overwritten since
 _MAX_RATE = 4.0  # data bits per code bit; a writer stays below 0.5
 _ALIGNMENTS = 4  # offsets of log scales; the best one is wrong by at most 1/8 step in a scaled model
+_FOREIGN, _DEVIATIONS = 0.25, 4.0  # share of foreign carriers that is told; rounding reaches 0.17
 _NOTHING = Header(bytes(5), ONE, 0, 63, 64, 0, 0)  # read for wrong keys, so that all keys take equally long
 
 
@@ -101,7 +103,7 @@ class ColoursCover:
         packed = [pack_payload(payload) for _, payload in payloads]
         secret = randomness(entropy, *packed)
         random = np.random.default_rng(np.frombuffer(stream(secret, "colours/random", 32), np.uint32))
-        carriers = renew_salts(self.planner.carriers, random)
+        carriers = self.planner.carriers
         salt_rows, salts = find_salts(carriers)
         if len(salts) < SALTS:
             raise UsageError(_TOO_FEW)
@@ -166,8 +168,8 @@ class ColoursCover:
     ) -> Gaussians:
         """The model with headers for all `secrets`, and the payloads of the first ones.
 
-        `carriers` have new salts; `free` [C]: mask of those that may be written. Only likely values are
-        written for payloads whose layout says so, and for their headers if these may skip values.
+        `free` [C]: mask of carriers that may be written. Only likely values are written for payloads whose
+        layout says so, and for their headers if these may skip values.
         """
         free, values, chosen = free.copy(), carriers.colours[:, 1:].copy(), np.zeros(len(carriers), bool)
         for salt in range(SALTS):  # alternate between secrets, because later headers find fewer free places
@@ -215,29 +217,48 @@ class ColoursReader:
             if header is None:
                 continue
             for shift in (0.0,) if header.level == ONE else (0.0, header.shift(carriers)):
-                payload = _payload(header, secrets, carriers, shift)
-                if payload is not None:
-                    return unpack_payload(payload)
+                found = _payload(header, secrets, carriers, shift)
+                if found is not None:
+                    share = found[1] if found[1] > _FOREIGN else 0.0
+                    return warned(replace(unpack_payload(found[0]), foreign=round(share * len(carriers))))
         if any(headers):
             raise InputError(LOST)
         _payload(_NOTHING, secrets, self.alignments[0], 0.0)
         raise WrongKeyError()
 
 
-def _payload(header: Header, secrets: Secrets, carriers: Carriers, shift: float) -> bytes | None:
-    """The payload decrypted by the header's data key, or None."""
+def _payload(
+    header: Header, secrets: Secrets, carriers: Carriers, shift: float
+) -> tuple[bytes, float] | None:
+    """The payload decrypted by the header's data key, and the share of foreign carriers; or None."""
     rows = np.flatnonzero(_without_places(header.carrier_mask(carriers), [secrets], carriers))
     size, key, ids = bucket_bytes(header.bucket), secrets.data_key(header), carriers.ids[rows]
     bits = bit_counts(carriers.impact[rows] - shift, header.level)
     if not len(rows) or 8 * size > _MAX_RATE * COLUMNS * bits.sum():
         return None
     sure = (1 - header.idle * IDLE) * (1 - _CHANGED) * carriers.certainty[rows]
-    hints = np.repeat(sure, COLUMNS * bits) * read(key, ids, carriers.colours[rows, 1:], bits)
-    found = Fountain(8 * size).decode(seeds(key, "seeds", ids, bits), hints)
+    values, words = read(key, ids, carriers.colours[rows, 1:], bits), seeds(key, "seeds", ids, bits)
+    found = Fountain(8 * size).decode(words, np.repeat(sure, COLUMNS * bits) * values)
     try:
-        return decrypt(key, np.packbits(found).tobytes(), _ASSOCIATED)
+        payload = decrypt(key, np.packbits(found).tobytes(), _ASSOCIATED)
     except InputError:
         return None
+    agreement = values * (1 - 2.0 * Fountain(8 * size).encode(found, words))
+    held = np.repeat((1 - header.idle * IDLE) * carriers.stability[rows], COLUMNS * bits)
+    weights = np.repeat(carriers.weights[rows], COLUMNS * bits)
+    return payload, _foreign_share(agreement, held, weights)
+
+
+def _foreign_share(agreement: Doubles, held: Doubles, weights: Doubles) -> float:
+    """The share, by `weights` [B], of foreign carriers that is certain: less by _DEVIATIONS standard errors.
+
+    `agreement` [B], -1 to 1, of values with the bits that were written. Its mean is 0 for foreign carriers;
+    for others, it is the share `held` [B] of the maximum.
+    """
+    sizes = np.abs(agreement)
+    expected = float((weights * held * sizes).sum())
+    error = math.sqrt(float((np.square(weights * sizes) * (1 - held**2)).sum()))
+    return max(0.0, 1 - float((weights * agreement).sum() + _DEVIATIONS * error) / max(1e-9, expected))
 
 
 def _without_places(mask: Flags, secrets: Sequence[Secrets], carriers: Carriers) -> Flags:

@@ -17,13 +17,13 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from hashlib import blake2b
 
 import numpy as np
 import torch
 
 from keyss.core.arrays import Bits, Bytes, Doubles, Integers, Words32
 from keyss.core.gaussians import Gaussians
+from keyss.kernels.blake2b import blake2b_rows
 from keyss.kernels.parallel import in_blocks
 
 GEOMETRY = 8  # fields before the harmonics: three log scales, four parts of a quaternion, opacity logit
@@ -44,7 +44,6 @@ class Layout:
 
     sh_degree: int
     quats: bool = True
-    written_degree: int | None = None  # SH degree up to which low bits are read and written; None: all
 
     @staticmethod
     def of(gaussians: Gaussians) -> Layout:
@@ -55,21 +54,13 @@ class Layout:
         return Layout(gaussians.sh_degree, away > UNIT_TOLERANCE)
 
     def width(self, depth: int) -> int:
-        """Whole bytes in the low bits of one Gaussian: at depth 8 one for each field that is written."""
-        return len(self.written) * depth // 8
+        """Whole bytes in the low bits of one Gaussian: at depth 8 one for each field in use."""
+        return len(self.columns) * depth // 8
 
     @property
     def columns(self) -> Integers:
         """[F'] the columns of `used_words` in use."""
-        return self._columns(self.sh_degree)
-
-    @property
-    def written(self) -> Integers:
-        """[F'] the columns of `used_words` that are read and written."""
-        return self._columns(self.sh_degree if self.written_degree is None else self.written_degree)
-
-    def _columns(self, sh_degree: int) -> Integers:
-        every = np.arange(GEOMETRY + 3 * ((sh_degree + 1) ** 2 - 1))
+        every = np.arange(GEOMETRY + 3 * ((self.sh_degree + 1) ** 2 - 1))
         return every if self.quats else np.delete(every, QUATS)
 
 
@@ -83,19 +74,15 @@ def coarse_lengths(quats: Words32) -> Doubles:
 
 def gaussian_ids(gaussians: Gaussians, layout: Layout | None = None) -> Bytes:
     """[N, 16] IDs of the Gaussians: public hashes (BLAKE2b) of the bits that embedding never changes."""
-    columns, hashes = (layout or Layout.of(gaussians)).columns, []
-    for start in range(0, len(gaussians), BLOCK):
-        own = gaussians[start : start + BLOCK]
+    columns = (layout or Layout.of(gaussians)).columns
+
+    def ids(start: int, stop: int) -> Bytes:
+        own = gaussians[start:stop]
         used = used_words(own)
         used[:, columns] &= ~LOW | np.uint32(1)
-        rows = np.concatenate([_words(own.means), used], axis=1).astype("<u4")
-        data, size = rows.tobytes(), 4 * rows.shape[1]
-        each = (
-            blake2b(data[at : at + size], digest_size=ID_BYTES, person=_PERSON).digest()
-            for at in range(0, len(data), size)
-        )
-        hashes.append(b"".join(each))
-    return np.frombuffer(b"".join(hashes), np.uint8).reshape(-1, ID_BYTES)
+        return blake2b_rows(np.concatenate([_words(own.means), used], axis=1), _PERSON)
+
+    return np.concatenate([np.zeros((0, ID_BYTES), np.uint8), *in_blocks(ids, len(gaussians), BLOCK)])
 
 
 def read_low_bits(gaussians: Gaussians, depth: int = DEEPEST, layout: Layout | None = None) -> Bytes:
@@ -104,7 +91,7 @@ def read_low_bits(gaussians: Gaussians, depth: int = DEEPEST, layout: Layout | N
     packed = np.empty((len(gaussians), layout.width(depth)), np.uint8)
 
     def pack(start: int, stop: int) -> None:
-        bits = _low_bits(used_words(gaussians[start:stop])[:, layout.written], depth)
+        bits = _low_bits(used_words(gaussians[start:stop])[:, layout.columns], depth)
         packed[start:stop] = np.packbits(bits, axis=1)[:, : packed.shape[1]]
 
     in_blocks(pack, len(gaussians), BLOCK)
@@ -126,11 +113,11 @@ def write_low_bits(
         ) -> None:
             own, mask = rows[start:stop], np.uint32((1 << depth) - 1 << 1)
             words = np.concatenate([group[own] for group in group_words(written)], axis=1)
-            fields = words[:, layout.written]
+            fields = words[:, layout.columns]
             bits = _low_bits(fields, depth)
             bits[:, : 8 * data.shape[1]] = np.unpackbits(data[start:stop], axis=1)
             low = np.packbits(bits.reshape(len(own), -1, depth), axis=2)[:, :, 0].astype(np.uint32)
-            words[:, layout.written] = fields & ~mask | low >> np.uint32(8 - depth) << np.uint32(1)
+            words[:, layout.columns] = fields & ~mask | low >> np.uint32(8 - depth) << np.uint32(1)
             at = 0
             for group in group_words(written):
                 group[own] = words[:, at : (at := at + group.shape[1])]

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import count
 
 import numpy as np
 import torch
 
 from keyss.channels.base import NOT_INDEPENDENT, Payload, SaltedReader
-from keyss.channels.mixing import foreign, random_order, sketch
+from keyss.channels.mixing import foreign_share, random_order, sketch
 from keyss.channels.quiet.bits import DEEPEST, LEAST, Layout, gaussian_ids, read_low_bits
 from keyss.channels.quiet.blocks import ASSOCIATED, BlockReader
 from keyss.channels.quiet.decoded import Decoded
@@ -126,7 +127,7 @@ class QuietReader(SaltedReader):
     ids: Bytes  # [N, 16]
     low: Bytes  # [N, B] at the least depth
     salts: Sequence[bytes]
-    layouts: Sequence[Layout]  # that parameters may have
+    layout: Layout
 
     @staticmethod
     def of(stego: Gaussians) -> QuietReader | BlockReader | None:
@@ -141,41 +142,36 @@ class QuietReader(SaltedReader):
         if len(rows) < len(ids):
             stego, ids, low = stego[torch.from_numpy(rows)], ids[rows], low[rows]
         salts = [salt(ids[row], low[row]) for row in salt_rows(stego, ids, layout)]
-        layouts = dict.fromkeys(
-            (layout, replace(layout, written_degree=1) if layout.sh_degree > 1 else layout)
-        )
-        return QuietReader(stego, ids, low, salts, list(layouts))
+        return QuietReader(stego, ids, low, salts, layout)
 
     def extract(self, key: DerivedKey) -> Payload:
         """`open` after key derivation under one salt, without a warning.
 
-        A wrong key makes the same passes over all Gaussians, with data keys that match nothing.
+        A wrong key makes the same passes over all Gaussians, with a data key that matches nothing.
         """
-        read = []
-        for layout in self.layouts:
-            width = layout.width(LEAST)
-            data_key = key_message(key_secret(key), width).read(self.ids, self.low)
-            read.append((parameter_message(data_key, width).read(self.ids, self.low), data_key, layout))
-        for packed, data_key, layout in read:
-            if found := Parameters.unpack(packed, data_key, layout):
-                return self._payload(data_key, found, layout)
-        width = self.layouts[0].width(DEEPEST)
+        width = self.layout.width(LEAST)
+        data_key = key_message(key_secret(key), width).read(self.ids, self.low)
+        packed = parameter_message(data_key, width).read(self.ids, self.low)
+        if found := Parameters.unpack(packed, data_key, self.layout):
+            return self._payload(data_key, found)
+        width = self.layout.width(DEEPEST)
         none = Codewords(1, 1, 1, chunk_bytes(width))
         self._chunks(Chunks(data_key, none, is_tagged(width)), DEEPEST)
         raise WrongKeyError()
 
-    def _payload(self, data_key: bytes, found: Parameters, layout: Layout) -> Payload:
-        _, numbers, chunks = self._chunks(found.chunks(data_key, layout), found.depth)
+    def _payload(self, data_key: bytes, found: Parameters) -> Payload:
+        _, numbers, chunks = self._chunks(found.chunks(data_key, self.layout), found.depth)
         left = len(np.unique(numbers))
+        foreign = foreign_share(data_key, self.ids, found.sketch, found.gaussians)
         return Payload(
             found.method,
             self._decrypted(data_key, found, numbers, chunks),
             (left, found.codewords.chunks),
-            foreign=foreign(data_key, self.ids, found.sketch, found.gaussians),
+            foreign=math.ceil(foreign * len(self.ids)),
         )
 
     def _chunks(self, chunks: Chunks, depth: int) -> tuple[Flags, Integers, Bytes]:
-        return chunks.decrypt(self.ids, read_low_bits(self.stego, depth, self.layouts[0]))
+        return chunks.decrypt(self.ids, read_low_bits(self.stego, depth, self.layout))
 
     def _decrypted(self, data_key: bytes, found: Parameters, numbers: Integers, chunks: Bytes) -> bytes:
         """The data of a payload; looks for false chunks only if its authentication fails."""

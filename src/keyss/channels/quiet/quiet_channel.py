@@ -71,11 +71,8 @@ class LowBits(Channel):
         # Cache by cover, valid while its tensors keep their versions: (versions, carriers, rows of salts).
         self._found: WeakKeyDictionary[Gaussians, tuple[list[int], Carriers, Integers]] = WeakKeyDictionary()
 
-    def prepare(self, cover: Gaussians, *, sh_degree: int | None = None) -> LowBitsCover:
-        """See `Channel`. Raises UsageError for low bits that are few or not random, and for stale salts.
-
-        `sh_degree`: 1 if harmonics of higher degrees must stay as they are, to the bit.
-        """
+    def prepare(self, cover: Gaussians) -> LowBitsCover:
+        """See `Channel`. Raises UsageError for low bits that are few or not random, and for stale salts."""
         layout, versions = Layout.of(cover), _versions(cover)
         if (found := self._found.get(cover)) is None or found[0] != versions:
             carriers = Carriers.of(cover, layout)
@@ -88,8 +85,6 @@ class LowBits(Channel):
                     "made it could try keys in advance"
                 )
             found = self._found[cover] = versions, carriers, rows
-        if sh_degree is not None:
-            layout = replace(layout, written_degree=min(sh_degree, layout.sh_degree))
         return LowBitsCover(cover, layout, *found[1:])
 
     def estimate_capacity(self, gaussians: int, sh_degree: int) -> Capacity:
@@ -180,7 +175,7 @@ class LowBitsCover:
         fresh = np.frombuffer(noise, np.uint8).reshape(len(self.fresh_salts), width)
         rows = self.cover[torch.from_numpy(self.salt_rows)]
         renewed = write_low_bits(rows, self.layout, [(LEAST, self.fresh_salts, fresh)])
-        low = read_low_bits(renewed, LEAST, replace(self.layout, written_degree=None))
+        low = read_low_bits(renewed, LEAST, self.layout)
         ids = self.carriers.ids[self.salt_rows]
         return fresh, [salt(*each) for each in zip(ids, low, strict=True)]
 

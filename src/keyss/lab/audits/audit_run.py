@@ -17,16 +17,16 @@ from keyss.lab.audits.parts import (
     PARTS,
     ImagesResult,
     ParametersResult,
+    Progress,
     RenderTime,
     StegExposeResult,
     Subject,
-    part_progress,
 )
 from keyss.lab.leaks.leak_scores import AttackResult
 from keyss.lab.robustness.survival import ChangeResult
 from keyss.lab.stealth.judging import StealthResult
 from keyss.measure.hide_quality import WrongKeys
-from keyss.progress import Reporter
+from keyss.progress import Reporter, Share
 from keyss.rendering import Backend, resolve_device
 from keyss.runs import read_record, write_record
 from keyss.runs.files import REPORT, PathLike, run_folder
@@ -129,6 +129,7 @@ def audit(
         overwrite=overwrite,
         resume=resume,
     )
+    from keyss.lab.audits.forecast import forecast_audit
     from keyss.lab.audits.report import report_bytes
 
     with folder.work(), _resumable(folder.checkpoints):
@@ -136,12 +137,14 @@ def audit(
         subject.fit_controls(seeds, folder, reporter)
         record, pictures = folder.checkpoints / "audit.json", folder.checkpoints / "pictures"
         result = read_record(record, Audit) if record.exists() else _nothing_measured(subject, seeds)
-        chosen = [name for name in PARTS if name in (only or PARTS) and name not in excluded]
+        chosen = chosen_parts(only, subject.standard)
+        seconds = forecast_audit(opened.folder, controls=controls, only=only, device=device).seconds
         for index, name in enumerate(chosen):
             if getattr(result, name) is not None:
                 continue
-            with part_progress(reporter, f"audit, {index + 1} of {len(chosen)}: {name}") as progress:
-                section, shown = PARTS[name](subject, seed, progress)
+            title = f"audit, {index + 1} of {len(chosen)}: {name}"
+            with reporter.waiting(title, seconds[name]) as share:
+                section, shown = PARTS[name](subject, seed, _in_shares(share))
             pictures.mkdir(exist_ok=True)
             for file, picture in shown.items():
                 write_bytes(pictures / file, png_bytes(picture))
@@ -152,6 +155,18 @@ def audit(
         there = folder.write({AUDIT: result, **contents})
         folder.write({REPORT: report_bytes(result, there)})
     return result
+
+
+def chosen_parts(only: Sequence[str], standard: bool) -> list[str]:
+    """Names of the parts of an audit; `standard`: the published file is a 3DGS model. Raises UsageError."""
+    if unknown := sorted(set(only) - set(PARTS)):
+        raise UsageError(f"no such part of an audit: {', '.join(unknown)}; there are {', '.join(PARTS)}")
+    excluded = set() if standard else NEED_A_3DGS_MODEL
+    return [name for name in PARTS if name in (only or PARTS) and name not in excluded]
+
+
+def _in_shares(share: Share) -> Progress:
+    return lambda done, of: share(done / of)
 
 
 @contextmanager

@@ -5,8 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property, partial
 from itertools import combinations
@@ -200,25 +199,6 @@ class RenderTime:
 
     seconds: float  # median
     ratio: float  # median over pairs of renders, relative to a plain model of the scene; cancels other load
-
-
-@contextmanager
-def part_progress(reporter: Reporter, title: str) -> Iterator[Progress]:
-    """Report the progress of one part."""
-    total = 0
-
-    def show(done: int, of: int) -> None:
-        nonlocal total
-        if not total:
-            reporter.start(title, of, 0)
-        total = of
-        reporter.update(done, 0, {})
-
-    try:
-        yield show
-        reporter.update(total, 0, {})
-    finally:
-        reporter.finish()
 
 
 def images(subject: Subject, seed: int, progress: Progress) -> tuple[ImagesResult, Pictures]:

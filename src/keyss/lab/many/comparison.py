@@ -77,7 +77,8 @@ _SECRECY = {
 }
 _LEGEND = (
     "Test views: photos that were not trained on. Steps: those in which cover and secret were rendered, in "
-    "total. 3dgs is the upper bound: plain 3DGS with equal numbers of Gaussians and training steps. "
+    "total. 3dgs is the upper bound: plain 3DGS with equal numbers of Gaussians and training steps; "
+    "3dgs:half has half as many Gaussians for each scene, like a model that both share. "
     "Pictures/s: in brackets, the time over that of plain 3DGS. Seconds: time of hiding, after plain models.",
     "Wrong keys: mean PSNR in dB of their renders against the cover, and maximum against the secret; in "
     "brackets, the published model itself against the secret. Classifier and StegExpose: area under the ROC "
@@ -138,7 +139,8 @@ def compare(
     """
     if is_model(cover) or is_model(secret):
         raise UsageError("comparing takes scenes, folders of photos: models have none to compare with")
-    chosen = {name: _parse_method(name) for name in methods or EVERY}
+    kind = resolve_device(device).type
+    chosen = {name: _parse_method(name, kind) for name in methods or EVERY}
     sizes = {"iterations": iterations, "max_gaussians": max_gaussians}
     given = {name: size for name, size in sizes.items() if size is not None}
     fit = replace(next(iter(chosen.values())).fit, seed=seeds[0], **given)
@@ -195,20 +197,23 @@ def _add(
     )
     steps = [fit.iterations - own if each else fit.iterations for each in continues]
     models = [
-        folder.plain(scene, replace(fit, iterations=count, sh_degree=each.sh_degree))
+        folder.plain(
+            scene,
+            replace(fit, iterations=count, sh_degree=each.sh_degree, max_gaussians=each.max_gaussians),
+        )
         for scene, count, each in zip(scenes, steps, options.fits(2), strict=True)
     ]
     return folder.hiding(name, scenes, options, models, measures=MEASURES, controls=controls)
 
 
-def _parse_method(text: str) -> MethodOptions:
+def _parse_method(text: str, device: str) -> MethodOptions:
     """The options of METHOD, METHOD:PRESET or METHOD:VARIANT. Raises UsageError."""
     name, _, kind = text.partition(":")
     method = registry.get(name)
     variants = method.options.variants()
     if kind and kind not in (*PRESETS, *variants):
         raise UsageError(f"{text}: expected one of {', '.join((*PRESETS, *variants))}")
-    return variants[kind] if kind in variants else method.options.preset(kind or "default")
+    return variants[kind] if kind in variants else method.options.preset(kind or "default", device)
 
 
 def _row(name: str, outcomes: Sequence[Outcome], folder: TrialFolder) -> ComparedMethod:

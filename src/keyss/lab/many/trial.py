@@ -78,6 +78,11 @@ class Trial:
         return [Path(each).parts[1] for each in models]
 
 
+# Of measures of small scenes, mostly wrong keys and attempts to open; others grow with the time of a fit.
+_MEASURE_SECONDS = {"files": 0.0, "pictures": 2.0, "secrecy": 8.0, "survival": 15.0, "robustness": 120.0}
+_OTHER_SECONDS, _USUAL_SECONDS = 5.0, 60.0
+
+
 @dataclass(frozen=True, kw_only=True)
 class Result:
     """The measured numbers of a finished trial: `result.json`."""
@@ -130,7 +135,9 @@ def cost_of_trial(trial: Trial, folder: Path) -> Cost:
     cost = hide(**_hide_arguments(trial, folder, keys), dry_run=True).cost
     assert cost is not None  # a dry run always has a cost
     elsewhere = [seconds for seconds, model in zip_longest(cost.fit_seconds, trial.models) if model]
-    return replace(cost, seconds=cost.seconds - sum(elsewhere))
+    measures = sum(_MEASURE_SECONDS.get(name, _OTHER_SECONDS) for name in trial.measures)
+    measures *= 1 + max(cost.fit_seconds, default=0.0) / _USUAL_SECONDS
+    return replace(cost, seconds=cost.seconds - sum(elsewhere) + measures)
 
 
 def keys_of(trial: Trial, folder: Path) -> list[str]:

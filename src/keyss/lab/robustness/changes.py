@@ -37,6 +37,7 @@ class Change:
     unit: str  # unit of `strength`
     sentence: str  # what it does, for the report
     apply: Callable[[Gaussians], Gaussians]
+    steps: int = 0  # of training
 
     def __call__(self, model: Gaussians) -> Gaussians:
         return self.apply(model)
@@ -133,7 +134,12 @@ def fine_tuning(cover: Scene, steps: int = 500, seed: int = 0) -> Change:
     """Continue training on the cover's photos, as plain 3DGS without density control."""
     sentence = f"Training continues on the cover's photos for {steps} steps."
     return Change(
-        "fine-tuning", steps, "steps", sentence, partial(fine_tune, scene=cover, steps=steps, seed=seed)
+        "fine-tuning",
+        steps,
+        "steps",
+        sentence,
+        partial(fine_tune, scene=cover, steps=steps, seed=seed),
+        steps,
     )
 
 
@@ -156,7 +162,7 @@ def purification(cover: Scene, given_up: float = 0.0, steps: int = 300, seed: in
         f"{f', giving up {given_up:.1%} of what those show' if given_up else ''}; "
         f"then training continues for {steps} steps."
     )
-    return Change("purification", given_up, "share of the blending weight given up", sentence, apply)
+    return Change("purification", given_up, "share of the blending weight given up", sentence, apply, steps)
 
 
 def fine_tune(model: Gaussians, scene: Scene, steps: int, seed: int = 0) -> Gaussians:

@@ -18,6 +18,8 @@ from keyss.methods.hidden import HiddenScene
 
 PRUNED = (0.05, 0.10, 0.15, 0.25, 0.50)
 NOISE = (0.001, 0.01, 0.1)
+_STEPS_TO_MEASURE = 100  # training steps that take as long as measuring a change
+CHANGES, TRAINING_STEPS = 48, 1100  # of `default_changes`, without converters
 SEEDS = 3  # repetitions per random removal; results vary by a dB or two
 
 # Opens a secret in a stego model on the CPU; raises KeyssError if it does not open.
@@ -79,9 +81,9 @@ def measure_robustness(
     """PSNRs of cover and secrets after each of the `changes`; the first result is the unchanged model's.
 
     `changes`: by default `default_changes`, about 50; results of equal attack and strength are averaged.
-    `max_views`: test views per scene. `progress`: called with the number of finished changes and the total.
-    Renders on the device of `stego`. Deterministic in `seed`. Raises UsageError unless there is one opener
-    per secret, KeyssError if a secret does not open in the unchanged model.
+    `max_views`: test views per scene. `progress`: called with the finished and the total work in training
+    steps. Renders on the device of `stego`. Deterministic in `seed`. Raises UsageError unless there is one
+    opener per secret, KeyssError if a secret does not open in the unchanged model.
     """
     cover, *secrets = scenes
     if len(openers) != len(secrets):
@@ -104,9 +106,11 @@ def measure_robustness(
     results: dict[tuple[str, float], list[ChangeResult]] = {}
     before: list[float] = []
     unchanged = Change("none", 0, "", "Nothing is changed.", lambda model: model)
-    for number, each in enumerate([unchanged, *changes]):
+    done, work = 0, sum(_STEPS_TO_MEASURE + each.steps for each in [unchanged, *changes])
+    for each in [unchanged, *changes]:
         if progress is not None:
-            progress(number, len(changes) + 1)
+            progress(done, work)
+        done += _STEPS_TO_MEASURE + each.steps
         result = ChangeResult(each.attack, each.strength, each.unit, each.sentence)
         try:
             changed = each(stego)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,6 +16,7 @@ from keyss.methods.codec.precision import finest_size, prune_to_size, usual_size
 from keyss.rendering.orbit import Viewpoints
 
 _BITS_PER_GAUSSIAN = 150, 210  # of a secret that is not fitted yet, with the usual and the finest precision
+_SAMPLE, _FAR_TOO_LARGE = 10_000, 1.5  # Gaussians; times what can be appended
 _TINY = 16  # Gaussians; secrets are not pruned to fewer
 _ANY = '`publish="any"` has room for all'
 
@@ -37,6 +39,22 @@ class SecretSize:
             usual, finest = (self.count * each // 8 for each in _BITS_PER_GAUSSIAN)
             return usual, finest
         return usual_size(self.model), finest_size(self.model)
+
+    def check_appended(self) -> None:
+        """Raise UsageError for a secret far too large for appended Gaussians, by a sample of it.
+
+        A sparse sample takes more bits for positions: log2 of the distance between its Gaussians.
+        """
+        step, most = self.count // _SAMPLE, APPENDED.estimate_capacity(0, 0).bytes
+        if self.model is None or step < 2:
+            return
+        sample = self.model[::step]
+        size = self.count * (usual_size(sample) / len(sample) - math.log2(step) / 8)
+        if size > _FAR_TOO_LARGE * most:
+            raise UsageError(
+                f"the secret takes about {size:,.0f} bytes, and {most:,} can be "
+                "appended; fewer Gaussians or a lower SH degree take less"
+            )
 
 
 @dataclass(frozen=True)

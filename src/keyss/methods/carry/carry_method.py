@@ -19,7 +19,7 @@ from keyss.methods.carry.capacity import CarryCapacity, SecretSize, shares, warn
 from keyss.methods.carry.carried_secret import CarriedSecret
 from keyss.methods.carry.carry_options import REFIT, CarryOptions
 from keyss.methods.codec.precision import encode_to_size, finest_size
-from keyss.methods.method import Capabilities, Context, Plan, Source, Stego, role_of
+from keyss.methods.method import Capabilities, Context, Plan, Source, Stego, role_of, seconds_to_hide
 from keyss.rendering import contributions
 from keyss.rendering.orbit import Viewpoints
 
@@ -49,9 +49,12 @@ class CarryMethod:
         Otherwise raises UsageError.
         """
         cover, *secrets = sources
+        secret_sizes = _secret_sizes(secrets, options)
+        if options.channel_in(cover.given).grows:
+            for each in secret_sizes:
+                each.check_appended()
         try:
             capacity = CarryCapacity.of(cover.given, options)
-            secret_sizes = _secret_sizes(secrets, options)
             sizes = capacity.sizes(secret_sizes)
             if options.may_show and cover.given is not None:
                 _check_share(secret_sizes, sizes)
@@ -127,13 +130,14 @@ class CarryMethod:
                         name=role_of(index + 1, len(secrets) + 1),
                     )
         details = {"gaussians_before_pruning": [len(model) for model in plain]}
-        stego = embed_models(
-            capacity.prepared,
-            [secret.key for secret in secrets],
-            capacity.prune(models, viewpoints),
-            viewpoints=viewpoints,
-            entropy=context.entropy,
-        )
+        with context.waiting("hiding", seconds_to_hide(len(cover.model), [*map(len, models)])):
+            stego = embed_models(
+                capacity.prepared,
+                [secret.key for secret in secrets],
+                capacity.prune(models, viewpoints),
+                viewpoints=viewpoints,
+                entropy=context.entropy,
+            )
         return replace(stego, iterations=max(options.refits), details={**details, **stego.details})
 
 

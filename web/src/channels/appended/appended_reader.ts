@@ -2,28 +2,34 @@
  * Reader of appended Gaussians (docs/channels.md): words of 84 bits, read after a format has rounded them, and packets in words;
  * counterpart of `keyss.channels.appended.appended_channel` and `words`.
  */
-import { ascii, rowsOf, viewOf } from '../../core/bytes.ts';
+import { ascii, joined, rowsOf, viewOf } from '../../core/bytes.ts';
 import { damaged } from '../../core/errors.ts';
 import { type Gaussians, opacity, where, withDegree } from '../../core/gaussians.ts';
 import { moved, type Similarity } from '../../core/similarity.ts';
 import type { Words } from '../../core/words.ts';
-import { blockwise, decrypted, type Derive, expand, here } from '../../keys/keys.ts';
-import { foreign, type Payload, type Reader, unpackPayload } from '../base.ts';
-import { carriersOf } from '../colours/carriers.ts';
+import { encryptBlocks } from '../../keys/aes.ts';
+import { decrypted, type Derive, expand, here, streamWords } from '../../keys/keys.ts';
+import { type Payload, type Reader, unpackPayload } from '../base.ts';
 import { type Codewords, decoded } from '../reed_solomon.ts';
+import { COVER_BYTES, foreignCount } from './cover.ts';
 import { type Found, LEAST, ONE_IN, pilotsOf, POSITION_BITS, readPilots } from './pilots.ts';
 
 // Gaussians sampled for pilots; number of lattice offsets tried, with at least this many standard deviations more pilots
 // than by chance.
 const [SAMPLE, TRIED, NOT_BY_CHANCE] = [8000, 8, 3];
-const [COVER_BYTES, FOREIGN] = [132, 0.4]; // number and sketch of the cover's visible Gaussians; a share
+const FOREIGN = 0.05; // share that is told
 const ASSOCIATED = ascii('keyss/v1/appended/data');
 
 /** A model's appended Gaussians, prepared for any number of keys. */
 export class AppendedReader implements Reader {
   readonly derivations = 1;
 
-  private constructor(readonly salt: Uint8Array, private readonly words: Uint8Array, private readonly ids: Uint8Array) {}
+  private constructor(
+    readonly salt: Uint8Array,
+    private readonly words: Uint8Array,
+    private readonly model: Gaussians,
+    private readonly toOwn: Similarity, // from the world to the own frame
+  ) {}
 
   /** Null if there are none, or if their frame cannot be found. */
   static of(model: Gaussians): AppendedReader | null {
@@ -41,7 +47,7 @@ export class AppendedReader implements Reader {
       if (best !== null) {
         const { found, scales } = best;
         const words = wordsOfPoints(colours, scales, inOwnFrame(faint, found.toOwn));
-        return new AppendedReader(found.salt, words, new Uint8Array(carriersOf(model).ids.buffer));
+        return new AppendedReader(found.salt, words, model, found.toOwn);
       }
     }
     return null;
@@ -54,13 +60,15 @@ export class AppendedReader implements Reader {
       const codewords = readHeader(expand(secret, `appended/header/${width}`), this.words, width);
       if (codewords === null) continue;
       const packets = readPackets(expand(secret, 'appended/packets'), this.words, width);
-      const encrypted = decoded(codewords, packets, true);
-      const whole = await decrypted(expand(secret, 'appended/data'), encrypted, ASSOCIATED);
+      const whole = decoded(codewords, packets, true);
       if (whole.length < COVER_BYTES) throw damaged();
-      const own = whole.subarray(4, COVER_BYTES);
-      const told = foreign(expand(secret, 'appended/host'), this.ids, own, viewOf(whole).getUint32(0, true));
-      const payload = unpackPayload(whole.subarray(COVER_BYTES));
-      return told > (FOREIGN * this.ids.length) / 16 ? { ...payload, foreign: told } : payload;
+      const own = whole.slice(0, COVER_BYTES);
+      const [masked, view] = [viewOf(whole), viewOf(own)];
+      streamWords(secret, 'appended/cover', COVER_BYTES / 4, (word, at) => view.setUint32(4 * at, masked.getUint32(4 * at, true) ^ word, true));
+      const packed = await decrypted(expand(secret, 'appended/data'), whole.subarray(COVER_BYTES), joined(ASSOCIATED, own));
+      const payload = unpackPayload(packed);
+      const foreign = foreignCount(own, this.model, this.toOwn, expand(secret, 'appended/host'), FOREIGN);
+      return foreign ? { ...payload, foreign } : payload;
     }
     return null;
   }
@@ -112,7 +120,7 @@ function readPackets(key: Uint8Array, bytes: Uint8Array, width: number): [number
   const [count, found] = [bytes.length / WORD_BYTES, [] as [number, Uint8Array][]];
   const blocks = new Uint8Array(16 * count);
   for (let row = 0; row < count; row++) blocks.set(bytes.subarray(WORD_BYTES * row, WORD_BYTES * row + width), 16 * row);
-  const encrypted = blockwise(key, blocks);
+  const encrypted = encryptBlocks(key, blocks);
   for (let row = 0; row < count; row++) {
     let tag = 0;
     for (let byte = 0; byte < WORD_BYTES - width; byte++) {

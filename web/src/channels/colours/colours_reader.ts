@@ -14,6 +14,7 @@ const ASSOCIATED = ascii('keyss/v1/colours');
 const CHANGED = 0.03; // share of carriers overwritten since
 const MAX_RATE = 4; // data bits per code bit
 const ALIGNMENTS = 4; // offsets of log scales tried
+const [FOREIGN, DEVIATIONS] = [0.25, 4]; // share of foreign carriers that is told; standard errors
 
 /** The colours of a model, prepared for any number of keys. */
 export class ColoursReader implements Reader {
@@ -38,8 +39,10 @@ export class ColoursReader implements Reader {
       if (header === null) continue;
       const carriers = this.alignments[index];
       for (const shift of header.level === ONE ? [0] : [0, shiftOf(header, carriers)]) {
-        const data = await payload(header, secrets, carriers, shift);
-        if (data !== null) return unpackPayload(data);
+        const found = await payload(header, secrets, carriers, shift);
+        if (found === null) continue;
+        const [data, share] = [unpackPayload(found.data), found.foreignShare];
+        return share > FOREIGN ? { ...data, foreign: Math.round(share * carriers.count) } : data;
       }
     }
     if (headers.some((each) => each !== null)) throw tooMuchLost();
@@ -47,9 +50,15 @@ export class ColoursReader implements Reader {
   }
 }
 
+interface Found {
+  readonly data: Uint8Array;
+  readonly foreignShare: number; // of the carriers
+}
+
 /** The payload decrypted by the header's key, or null. */
-async function payload(header: Header, secrets: Secrets, carriers: Carriers, shift: number): Promise<Uint8Array | null> {
-  const own = chosen(carriers, ownRows(header, secrets, carriers));
+async function payload(header: Header, secrets: Secrets, carriers: Carriers, shift: number): Promise<Found | null> {
+  const rows = ownRows(header, secrets, carriers);
+  const own = chosen(carriers, rows);
   const bits = bitCounts(own.impact.map((each) => each - shift), header.level);
   const sure: number[] = [];
   bits.forEach((count, row) => {
@@ -57,14 +66,45 @@ async function payload(header: Header, secrets: Secrets, carriers: Carriers, shi
     for (let bit = 0; bit < COLUMNS * count; bit++) sure.push(each);
   });
   if (8 * header.size > MAX_RATE * sure.length) return null;
-  const hints = readBits(header.key, own, bits).map((hint, at) => hint * sure[at]);
-  const found = new Fountain(8 * header.size).decode(seedsOf(header.key, 'seeds', own, bits), hints);
+  const [values, seeds, code] = [readBits(header.key, own, bits), seedsOf(header.key, 'seeds', own, bits), new Fountain(8 * header.size)];
+  const found = code.decode(seeds, values.map((value, at) => value * sure[at]));
+  let data: Uint8Array;
   try {
-    return await decrypted(header.key, packBits(found), ASSOCIATED);
+    data = await decrypted(header.key, packBits(found), ASSOCIATED);
   } catch (error) {
     if (error instanceof InputError) return null;
     throw error;
   }
+  const written = code.encode(found, seeds);
+  const agreement = values.map((value, at) => value * (1 - 2 * written[at])); // -1 to 1
+  return { data, foreignShare: foreignShareOf(agreement, header, own, bits, partWeights(carriers, rows)) };
+}
+
+/** Weights of `rows` as a part of the model: by area x opacity up to the mean, equal IDs once. */
+function partWeights({ count, logScales, opacities, idCounts }: Carriers, rows: readonly number[]): number[] {
+  const sizes = Array.from(opacities, (opacity, row) => {
+    const [, b, c] = logScales.slice(3 * row, 3 * row + 3).sort();
+    return Math.exp(Math.max(-80, Math.min(80, b + c))) * opacity;
+  });
+  const mean = Math.max(1e-300, sizes.reduce((sum, each) => sum + each, 0) / count);
+  return rows.map((row) => Math.min(1, sizes[row] / mean) / idCounts[row]);
+}
+
+/** The share of foreign carriers that is certain: the agreement of foreign ones is 0 in the mean. */
+function foreignShareOf(
+  agreement: Float64Array, header: Header, own: Carriers, bits: Uint8Array, weights: readonly number[],
+): number {
+  let [agreed, expected, variance, at] = [0, 0, 0, 0];
+  bits.forEach((count, row) => {
+    const held = header.occupancy * (1 - own.errorProbability[row]);
+    for (let end = at + COLUMNS * count; at < end; at++) {
+      const most = weights[row] * Math.abs(agreement[at]);
+      agreed += weights[row] * agreement[at];
+      expected += held * most;
+      variance += most ** 2 * (1 - held ** 2);
+    }
+  });
+  return Math.max(0, 1 - (agreed + DEVIATIONS * Math.sqrt(variance)) / Math.max(1e-9, expected));
 }
 
 const STATIC_SALT = sha256(ascii('keyss/v1/colours-static')).slice(0, SALT_BYTES);

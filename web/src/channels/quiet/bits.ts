@@ -79,10 +79,9 @@ export function gaussianIds(gaussians: Gaussians, fields: Fields): Uint8Array {
   return found;
 }
 
-/** Whole bytes in the low bits of one Gaussian, with all harmonics or only `harmonics` of them. */
-export function lowWidth(fields: Fields, depth: number, harmonics = Infinity): number {
-  const left = Math.max(0, fields.width - GEOMETRY - harmonics);
-  return Math.floor(((fields.inUse.length - left) * depth) / 8);
+/** Whole bytes in the low bits of one Gaussian. */
+export function lowWidth(fields: Fields, depth: number): number {
+  return Math.floor((fields.inUse.length * depth) / 8);
 }
 
 /** [N, B] the low bits as bytes, field after field, the highest bit first. */

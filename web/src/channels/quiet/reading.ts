@@ -8,9 +8,10 @@
 import { ascii, bytesKey, rowsOf, viewOf } from '../../core/bytes.ts';
 import { damaged, otherVersion } from '../../core/errors.ts';
 import { type Gaussians, selected } from '../../core/gaussians.ts';
+import { multiplicities, wordsOf } from '../../core/words.ts';
 import type { ReadModel } from '../../files/models.ts';
 import { decrypted, type Derive, expand, here } from '../../keys/keys.ts';
-import { foreign, type Payload, type Reader } from '../base.ts';
+import { foreignShare, type Payload, type Reader } from '../base.ts';
 import { type Codewords, decoded } from '../reed_solomon.ts';
 import { DEEPEST, DEPTHS, fieldsOf, gaussianIds, ID_BYTES, LEAST, lowBits, lowWidth, saltOf, salts } from './bits.ts';
 import { CellCipher, TAG_BYTES } from './cells.ts';
@@ -19,7 +20,6 @@ import { chunkBytes, chunksOf, isTagged, isWhole, message, type Table } from './
 
 const ASSOCIATED = ascii('keyss/v1/quiet');
 const DATA_KEY_BYTES = 16;
-const NARROW_HARMONICS = 9; // of degree 1: some secrets do not write the others
 const [LEAST_BYTES, MIN_BLOCKS] = [48, 4]; // minimum bytes of a block; minimum blocks of a file
 const MAX_BITS = 2 ** 30; // bits in codes; more would exceed the memory of a tab
 const VERSION = 7;
@@ -63,7 +63,6 @@ class LowBitsReader extends QuietReader {
     salts: readonly Uint8Array[],
     private readonly fields: ReturnType<typeof fieldsOf>,
     private readonly table: Table, // at the least depth
-    private readonly harmonics: readonly number[], // that may be written
   ) {
     super(salts);
   }
@@ -76,32 +75,28 @@ class LowBitsReader extends QuietReader {
       fields = fieldsOf(selected(model, rows));
       [ids, low] = [rowsOf(ids, rows, ID_BYTES), rowsOf(low, rows, width)];
     }
-    const harmonics = lowWidth(fields, LEAST, NARROW_HARMONICS) < width ? [Infinity, NARROW_HARMONICS] : [Infinity];
-    return new LowBitsReader(salts(fields, ids, low, width), fields, { ids, low, width }, harmonics);
+    return new LowBitsReader(salts(fields, ids, low, width), fields, { ids, low, width });
   }
 
   protected async extract(master: Uint8Array): Promise<Payload | null> {
+    const { width: least } = this.table;
     const secret = expand(master, 'quiet/key');
-    let dataKey: Uint8Array = new Uint8Array(DATA_KEY_BYTES);
-    for (const harmonics of this.harmonics) {
-      const width = lowWidth(this.fields, LEAST, harmonics);
-      dataKey = message(secret, 'key', DATA_KEY_BYTES, Math.min(width, DATA_KEY_BYTES), KEY_COPIES, this.table);
-      const packed = message(dataKey, 'parameters', PARAMETER_BYTES, width, PARAMETER_COPIES, this.table);
-      const check = expand(dataKey, 'quiet/check');
-      if (packed.subarray(0, CHECK_BYTES).every((each, at) => each === check[at])) return this.payload(dataKey, packed, harmonics);
-    }
+    const dataKey = message(secret, 'key', DATA_KEY_BYTES, Math.min(least, DATA_KEY_BYTES), KEY_COPIES, this.table);
+    const packed = message(dataKey, 'parameters', PARAMETER_BYTES, least, PARAMETER_COPIES, this.table);
+    const check = expand(dataKey, 'quiet/check');
+    if (packed.subarray(0, CHECK_BYTES).every((each, at) => each === check[at])) return this.payload(dataKey, packed);
     const width = lowWidth(this.fields, DEEPEST);
     this.chunks(dataKey, { count: 1, n: 1, k: 1, width: chunkBytes(width) }, DEEPEST, isTagged(width));
     return null;
   }
 
   /** The payload that its unpacked parameters describe. Raises InputError for damage. */
-  private async payload(dataKey: Uint8Array, packed: Uint8Array, harmonics: number): Promise<Payload> {
+  private async payload(dataKey: Uint8Array, packed: Uint8Array): Promise<Payload> {
     const { version, method, size, view, at } = prefix(packed.subarray(CHECK_BYTES));
     if (version !== VERSION) throw otherVersion();
     const [depth, gaussians, count] = [view.getUint8(at), view.getUint32(at + 1, true), view.getUint32(at + 5, true)];
     const [n, k] = [view.getUint16(at + 9, true), view.getUint16(at + 11, true)];
-    const rowBytes = lowWidth(this.fields, depth, harmonics);
+    const rowBytes = lowWidth(this.fields, depth);
     const [width, tagged] = [chunkBytes(rowBytes), isTagged(rowBytes)];
     if (!DEPTHS.includes(depth) || count < 1 || count > MAX_CODEWORDS || !isWhole(count, tagged)) throw damaged();
     if (k < 1 || k > n || n > MAX_LENGTH || size < 1 || size > count * k * width) throw damaged();
@@ -111,7 +106,8 @@ class LowBitsReader extends QuietReader {
       this.opened(dataKey, codewords, chunks, size, true), // some chunks are false
     );
     const sketch = packed.subarray(packed.length - SKETCH_BYTES);
-    return { method, data, foreign: foreign(dataKey, this.table.ids, sketch, gaussians) || undefined };
+    const share = foreignShare(dataKey, this.table.ids, sketch, gaussians);
+    return { method, data, foreign: Math.ceil((share * this.table.ids.length) / ID_BYTES) || undefined };
   }
 
   private async opened(
@@ -185,13 +181,19 @@ function decryptedPayload(dataKey: Uint8Array, encrypted: Uint8Array): Promise<U
 
 /** Rows that differ in ID or low bits. */
 function uniqueRows(ids: Uint8Array, low: Uint8Array, width: number): number[] {
-  const seen = new Set<string>();
-  const rows: number[] = [];
-  for (let row = 0; row < ids.length / ID_BYTES; row++) {
-    const id = ids.subarray(row * ID_BYTES, (row + 1) * ID_BYTES);
-    const all = bytesKey(id) + bytesKey(low.subarray(row * width, (row + 1) * width));
-    if (!seen.has(all)) rows.push(row);
-    seen.add(all);
+  const [count, words] = [ids.length / ID_BYTES, wordsOf(ids)];
+  const starts = new Uint32Array(2 * count);
+  for (let row = 0; row < count; row++) starts.set(words.subarray(4 * row, 4 * row + 2), 2 * row);
+  const repeats = multiplicities(starts);
+  const [rows, seen] = [[] as number[], new Set<string>()];
+  for (let row = 0; row < count; row++) {
+    if (repeats[row] > 1) {
+      const id = ids.subarray(row * ID_BYTES, (row + 1) * ID_BYTES);
+      const all = bytesKey(id) + bytesKey(low.subarray(row * width, (row + 1) * width));
+      if (seen.has(all)) continue;
+      seen.add(all);
+    }
+    rows.push(row);
   }
   return rows;
 }

@@ -3,7 +3,8 @@
  * (docs/byte-layout.md, "Messages" and "Chunks").
  */
 import { bytesKey, mostFrequent, rowsOf, viewOf } from '../../core/bytes.ts';
-import { blockwise, expand } from '../../keys/keys.ts';
+import { encryptBlocks } from '../../keys/aes.ts';
+import { expand } from '../../keys/keys.ts';
 import type { Codewords } from '../reed_solomon.ts';
 
 const ID_BYTES = 16;
@@ -20,7 +21,7 @@ function functionOf(secret: Uint8Array, label: string, ids: Uint8Array, size = B
   for (let block = 0; block < blocks; block++) {
     const counted = ids.slice();
     for (let row = 0; row < count; row++) counted[(row + 1) * BLOCK - 1] ^= block;
-    const [values, end] = [blockwise(key, counted), Math.min(BLOCK, size - block * BLOCK)];
+    const [values, end] = [encryptBlocks(key, counted), Math.min(BLOCK, size - block * BLOCK)];
     for (let row = 0; row < count; row++) found.set(values.subarray(row * BLOCK, row * BLOCK + end), row * size + block * BLOCK);
   }
   return found;

@@ -1,0 +1,101 @@
+"""What a payload knows of its cover: a sketch of its Gaussians, as formats and motions leave them.
+
+Numbers of a Gaussian in the own frame (position, log scales, opacity, colours) are rounded to coarse *bins*,
+whose borders depend on the key: nobody else can move Gaussians next to them. A reader leaves out those next
+to a border, which a format may have moved across it; a writer leaves out none.
+
+Of the sketch's sample, half is drawn by number, half by size: an attacker who adds few Gaussians that cover
+much, or many specks, is noticed alike. The IDs fix sizes and places relative to the appended Gaussians, so
+the cover's own Gaussians count only where and as large as they were, once each. Gaussians too faint for the
+sketch are counted, because many of them in one place are visible.
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+
+import numpy as np
+
+from keyss.channels import mixing
+from keyss.core.arrays import Bytes, Doubles, Flags, Integers, doubles
+from keyss.core.gaussians import Gaussians
+from keyss.core.similarity import Similarity
+from keyss.keys.derivation import expand
+
+# Of positions (in sides of the cube), log scales, opacity and colours: bins, and maximum rounding errors.
+_BINS = np.array([1 / 16] * 3 + [0.5] * 3 + [0.1] + [0.3] * 3)
+_ERRORS = np.array([0.002] * 3 + [0.035] * 3 + [0.005] + [0.016] * 3)
+_LOW = np.array([-7.0] * 3 + [-8.0] * 3 + [0.0] + [-1.7] * 3)  # formats may clip numbers outside of these
+_HIGH = np.array([7.0] * 3 + [4.0] * 3 + [1.0] + [1.7] * 3)
+# Minimum opacity for writers and for readers; 8 bits round none across the second.
+_VISIBLE = np.array([2.0, 3.5]) / 255
+_MORE = 1.25  # factor by which formats may increase the number of faint Gaussians
+_GONE = 0.02  # share of the sample; readers of whole covers leave out at most four fifths
+_TESTED = 0.1  # share of the visible Gaussians; about a third are not next to a border
+_SKETCH_BYTES = 128
+_FORMAT = struct.Struct(f"<IIf{_SKETCH_BYTES}s")  # numbers of faint and of other Gaussians, area, sketch
+BYTES = _FORMAT.size
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """Gaussians in bins."""
+
+    ids: Bytes  # [M, 16]
+    areas: Doubles  # [M] opacity x area in the own frame, of the middle of the bins
+
+    @staticmethod
+    def of(model: Gaussians, to_own: Similarity, secret: bytes, reading: bool) -> _Rows:
+        own = to_own.apply_gaussians(model.with_sh_degree(0))
+        parts = (own.means, own.log_scales, own.opacities[:, None], own.sh[:, 0])
+        numbers = np.hstack([doubles(each) for each in parts])
+        seen = np.isfinite(numbers).all(axis=1) & (numbers[:, 6] > _VISIBLE[int(reading)])
+        numbers = numbers[seen].clip(_LOW, _HIGH)
+        offsets = (np.frombuffer(expand(secret, "bins", 32), np.uint8)[: len(_BINS)] + 0.5) / 256
+        steps = numbers / _BINS + offsets
+        bins = np.floor(steps)
+        if reading:
+            near = np.minimum(steps - bins, bins + 1 - steps) < _ERRORS / _BINS
+            sure: Flags = ~(near & (numbers > _LOW) & (numbers < _HIGH)).any(axis=1)
+            bins = bins[sure]
+        middles = (bins + 0.5 - offsets) * _BINS
+        areas = np.exp(np.sort(middles[:, 3:6])[:, 1:].sum(axis=1)) * middles[:, 6].clip(0.02, 1)
+        ids = np.zeros((len(bins), 16), np.int8)
+        ids[:, : len(_BINS)] = bins
+        return _Rows(ids.view(np.uint8), areas)
+
+    def among(self, count: int, area: float) -> Integers:
+        """Places in the sketch of a cover with `count` Gaussians and a total `area`."""
+        return (
+            np.rint(2 / (1 / max(1, count) + self.areas / max(1e-30, area)))
+            .astype(np.int64)
+            .clip(8 * _SKETCH_BYTES)
+        )
+
+
+def pack(cover: Gaussians, appended: int, to_own: Similarity, secret: bytes) -> bytes:
+    """BYTES bytes by which `foreign_count` detects Gaussians other than the cover's and those `appended`."""
+    rows = _Rows.of(cover, to_own, secret, reading=False)
+    area = float(np.float32(rows.areas.sum()))
+    own = mixing.sketch(secret, rows.ids, _SKETCH_BYTES, rows.among(len(rows.ids), area))
+    return _FORMAT.pack(_faint(cover) + appended, len(rows.ids), area, own)
+
+
+def foreign_count(packed: bytes, model: Gaussians, to_own: Similarity, secret: bytes, share: float) -> int:
+    """Estimated number of a model's Gaussians that are foreign to a cover; 0 if they are at most a `share`.
+
+    `packed`: the result of `pack`. All are foreign if hardly anything is left of the cover.
+    """
+    faint, count, area, own = _FORMAT.unpack(packed)
+    here = _faint(model)
+    more = here - faint if here > _MORE * faint else 0
+    rows = _Rows.of(model, to_own, secret, reading=True)
+    visible = len(model) - here
+    gone = _GONE if len(rows.ids) > _TESTED * visible else 0.0  # else most have one number, next to a border
+    foreign = mixing.foreign_share(secret, rows.ids, own, rows.among(count, area), gone)
+    return more + (round(foreign * visible) if foreign > share else 0)
+
+
+def _faint(model: Gaussians) -> int:
+    return int((model.opacities <= _VISIBLE[1]).sum())

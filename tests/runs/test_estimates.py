@@ -1,0 +1,39 @@
+"""Rough times of work on files."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+
+import pytest
+
+from files.formats.examples import model_of
+from keyss.files import write_model
+from keyss.runs.estimates import gaussians_in, seconds_for, seconds_to_convert, seconds_to_prepare
+
+
+def test_sizes_of_models_are_those_of_headers_or_about_right(tmp_path: Path) -> None:
+    (tmp_path / "point_cloud/iteration_7").mkdir(parents=True)
+    inside = tmp_path / "point_cloud/iteration_7/point_cloud.ply"
+    write_model(inside, model_of(3000, 2))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # the command warns of the chosen model, once
+        assert gaussians_in(tmp_path) == gaussians_in(inside) == 3000
+    for name in ("a.spz", "a.compressed.ply", "a.sog"):
+        write_model(tmp_path / name, model_of(20_000, 0))
+        assert 10_000 < gaussians_in(tmp_path / name) < 40_000
+    for name in ("-", "missing.ply", "a/b"):
+        assert gaussians_in(Path(name)) == 0
+
+
+def test_times_grow_with_models_and_secrets(tmp_path: Path) -> None:
+    small, large = tmp_path / "a.ply", tmp_path / "b.ply"
+    write_model(small, model_of(100, 0))
+    write_model(large, model_of(30_000, 0))
+    for task in ("info", "verify", "reveal", "hide a file", "export", "render"):
+        assert seconds_for(task, small) < seconds_for(task, large)
+    one, two = (seconds_to_convert(large, Path("c.compressed.ply"), keys) for keys in (0, 1))
+    assert one == seconds_for(".compressed.ply", large) < two
+    assert seconds_to_prepare([small, None, large, "missing"]) == pytest.approx(
+        seconds_for("prepare", small) + seconds_for("prepare", large) - seconds_for("prepare", Path("none"))
+    )
