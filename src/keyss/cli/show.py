@@ -23,7 +23,7 @@ from keyss.cli.keys import keys_of_run
 from keyss.core.errors import UsageError
 
 _VECTOR = r"[-+.\de]+(,[-+.\de]+){2}"
-_POSE = rf"#?eye={_VECTOR}&target={_VECTOR}(&up=({_VECTOR}|-?[xyz]))?"
+_POSE = rf"#?eye={_VECTOR}&target={_VECTOR}(&up=({_VECTOR}|-?[xyz]))?(&fov=[\d.]+,[\d.]+)?"
 
 
 def view(
@@ -71,7 +71,10 @@ def view(
     if pose and not re.fullmatch(_POSE, pose):
         raise UsageError(f"--pose: expected eye=X,Y,Z&target=X,Y,Z as in the page's address, got {pose}")
     given = {"pose": pose, "up": up, "title": title, "host": allow_host, "embedder": embed_in}
-    look = look_of_model(model) | {name: value for name, value in given.items() if value}
+    look = look_of_model(model)
+    if up:
+        look.pop("pose", None)
+    look |= {name: value for name, value in given.items() if value}
     if out is not None:
         if port or host != "127.0.0.1":
             raise UsageError("--port and --host are for serving: leave them out with -o")

@@ -74,7 +74,7 @@ def load_scene(
         if not part:
             raise InputError(f"{folder}: expected at least one image {purpose}, found none")
 
-    origin, extent = _origin_and_extent([photo.viewmat for photo in layout.train])
+    origin, extent = origin_and_extent([photo.viewmat for photo in layout.train])
     if origin.any():
         where = ", ".join(f"{each:.9g}" for each in origin)
         warnings.warn(
@@ -84,7 +84,7 @@ def load_scene(
             stacklevel=2,
         )
     near = NEAR * min(1.0, extent / ORDINARY_EXTENT)
-    photos = [replace(each, viewmat=_recentre(each.viewmat, origin)) for each in layout.train + layout.test]
+    photos = [replace(each, viewmat=recentre(each.viewmat, origin)) for each in layout.train + layout.test]
     probed = [probe_image(photo.path) for photo in photos]  # finds missing photos before decoding any
     photos = _fit_lenses(folder, photos, [(width, height) for width, height, _ in probed])
     if behind is None:
@@ -114,7 +114,7 @@ def load_scene(
     )
 
 
-def _origin_and_extent(viewmats: Sequence[Doubles]) -> tuple[Doubles, float]:
+def origin_and_extent(viewmats: Sequence[Doubles]) -> tuple[Doubles, float]:
     """The origin [3] of the scene's frame, 0 unless the cameras [4, 4] are far from it, and their extent."""
     centres = np.array([-each[:3, :3].T @ each[:3, 3] for each in viewmats])
     centre = centres.mean(axis=0)
@@ -127,7 +127,7 @@ def _origin_and_extent(viewmats: Sequence[Doubles]) -> tuple[Doubles, float]:
     return np.rint(centre / step) * step, extent
 
 
-def _recentre(viewmat: Doubles, origin: Doubles) -> Doubles:
+def recentre(viewmat: Doubles, origin: Doubles) -> Doubles:
     """The camera [4, 4] in the frame at `origin`."""
     recentred = viewmat.copy()
     recentred[:3, 3] += viewmat[:3, :3] @ origin

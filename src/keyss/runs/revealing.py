@@ -170,10 +170,10 @@ class Verification:
 
 def check_model(model: Gaussians) -> ModelCheck:
     """Count values that no trained model has. `model` must be on the CPU and finite."""
-    from keyss.rendering.orbit import middle_and_radius  # slow to import
-
     visible = model.opacities >= DRAWN_OPACITY
-    middle, radius = middle_and_radius(model[visible] if visible.any() else model)
+    means = (model[visible] if visible.any() else model).means.double()
+    middle = means.median(0).values
+    radius = max(1e-6, float((means - middle).norm(dim=1).float().sort().values[int(0.9 * len(means))]))
     columns = [model.means, model.quats, model.log_scales, model.opacity_logits[:, None], model.sh.flatten(1)]
     lengths = model.quats.double().norm(dim=1)
     counts = {

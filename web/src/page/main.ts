@@ -119,7 +119,7 @@ class Page {
 
   private async openFile(file: File): Promise<void> {
     if (file.size > MAX_BYTES) return this.fail('This file is larger than 2 GiB.');
-    for (const given of ['pose', 'camera', 'up', 'title']) delete page.main.dataset[given]; // of the first file
+    for (const given of ['pose', 'up', 'title']) delete page.main.dataset[given]; // of the first file
     return this.load(new Uint8Array(await file.arrayBuffer()), file.name);
   }
 
@@ -136,7 +136,7 @@ class Page {
     page.facts.textContent = `${this.name}\n${count(model.count)} Gaussians, SH degree ${model.shDegree}`;
     document.title = `${this.name} · keyss viewer`;
     this.viewer?.show(model);
-    this.controls.setPose(poseOfHash(this.hash) ?? poseOfHash(page.main.dataset.pose ?? '') ?? this.firstPose());
+    this.controls.setPose(poseOfHash(this.hash) ?? this.firstPose());
     await this.settle();
     this.say('');
     page.poster.hidden = true;
@@ -253,13 +253,13 @@ class Page {
     return this.home(model);
   }
 
-  /** A model's first pose; the published model is seen from the side of its training cameras. */
+  /** A model's first pose: of the published model, that of the page. */
   private home(model: Gaussians): Pose {
-    const { camera, up } = page.main.dataset;
+    const { pose, up } = page.main.dataset;
     const aspect = page.picture.clientWidth / Math.max(1, page.picture.clientHeight) || 1;
     const isOwn = model === this.published;
-    const captured = isOwn && !up ? poseOfHash(camera ?? '') : null;
-    const found = this.homes.get(model) ?? firstPose(model, aspect, isOwn ? UPS[up ?? ''] : undefined, captured);
+    const given = this.homes.get(model) ?? (isOwn ? poseOfHash(pose ?? '') : null);
+    const found = given ?? firstPose(model, aspect, isOwn ? UPS[up ?? ''] : undefined);
     this.homes.set(model, found);
     return found;
   }
