@@ -146,7 +146,8 @@ class Page {
 
   /**
    * Wrong keys change nothing, and the same line follows every key. The form is ready again after the quick search,
-   * before a secret is decoded and rendered; the thorough search follows for every key.
+   * before a secret is decoded and rendered; the thorough search follows for every key, silently if the quick one found
+   * something.
    */
   private async unlock(): Promise<void> {
     const key = page.key.value;
@@ -156,10 +157,11 @@ class Page {
     this.controls.rotate(false);
     this.writeAddress(); // before the key opens anything
     let said = 'Key tried.';
+    let found = false;
     for (const search of ['quick', 'thorough'] as const) {
-      this.showSearch(search);
-      this.say(search === 'quick' ? 'Trying the key …' : `${said} Searching more thoroughly …`);
-      delete page.main.dataset.picture;
+      this.showSearch(found ? 'silent' : search);
+      if (!found) this.say(search === 'quick' ? 'Trying the key …' : `${said} Searching more thoroughly …`);
+      if (!found) delete page.main.dataset.picture;
       const { model, file, elsewhere, foreign, stopped } = await this.opener.ask({ key, thorough: search === 'thorough' });
       if (own !== this.work) return;
       this.showSearch('');
@@ -169,6 +171,8 @@ class Page {
       if (model) said += this.reveal(model);
       if (elsewhere) said += ' It reveals a model that only keyss reveal opens.';
       if (foreign) said += ` About ${count(foreign)} Gaussians of the file were added or changed: it may not be its secret.`;
+      if (found && !(file || model || elsewhere)) return;
+      found = Boolean(file || model || elsewhere);
       this.say(stopped ? `${said} Search stopped.` : said);
       await this.settle();
       if (own !== this.work) return;
@@ -182,7 +186,7 @@ class Page {
     return ++this.work;
   }
 
-  private showSearch(search: 'quick' | 'thorough' | ''): void {
+  private showSearch(search: 'quick' | 'thorough' | 'silent' | ''): void {
     const isBusy = search === 'quick';
     page.main.dataset.searching = search;
     page.progress.value = 0;
@@ -204,6 +208,7 @@ class Page {
 
   /** Shows the secret from where the last model was seen. */
   private reveal(model: Gaussians): string {
+    if (page.keying.name) page.keying.open = false; // on phones
     const pose = this.sameView(this.pose, this.secret ?? this.published ?? model, model);
     this.showSecret(model, 0);
     this.controls.setPose(pose);
