@@ -108,6 +108,12 @@ class ProgressLines(Reporter):
         self.console.print(line, markup=False, highlight=False, soft_wrap=True)
 
 
+def say(*lines: object) -> None:
+    """Print lines to the standard output, unless the command is to be quiet."""
+    if level >= 0:
+        print(*lines, sep="\n")
+
+
 def waiting(what: str) -> AbstractContextManager[Any]:
     """While the context is open, a terminal displays `what` beside a moving sign."""
     return Console(stderr=True, quiet=level < 0).status(Text(what), refresh_per_second=4)

@@ -19,7 +19,9 @@ def subject(count: int = 3000, seed: int = 0) -> Gaussians:
     """Small opaque Gaussians in a ball around the origin."""
     model = random_gaussians(count, seed, 0)
     means = 0.6 * torch.nn.functional.normalize(model.means, dim=1) * torch.rand(count, 1).sqrt()
-    return replace(model, means=means, log_scales=model.log_scales - 1.5, opacity_logits=torch.full((count,), 3.0))
+    return replace(
+        model, means=means, log_scales=model.log_scales - 1.5, opacity_logits=torch.full((count,), 3.0)
+    )
 
 
 def fog(count: int = 4000, distance: float = 12.0, size: float = 15.0) -> Gaussians:
@@ -37,7 +39,9 @@ def on_a_floor(up: list[float]) -> Gaussians:
     means = torch.stack([reach * angle.cos(), reach * angle.sin(), torch.full((count,), -0.6)], dim=1)
     scales = disc.log_scales.clone()
     scales[:, 2] -= 4
-    flat = replace(disc, means=means, quats=torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1), log_scales=scales)
+    flat = replace(
+        disc, means=means, quats=torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1), log_scales=scales
+    )
     return across.apply_gaussians(Gaussians.cat([flat, ball]))
 
 
@@ -58,7 +62,9 @@ def test_fog_is_not_the_subject(distance: float) -> None:
 def test_what_is_as_fine_belongs_to_the_subject() -> None:
     """A long object is not cut where most of its Gaussians are."""
     neck = subject(600, 3)
-    neck = replace(neck, means=0.1 * neck.means + torch.linspace(0.6, 4, 600)[:, None] * torch.tensor([0.0, -1, 0]))
+    neck = replace(
+        neck, means=0.1 * neck.means + torch.linspace(0.6, 4, 600)[:, None] * torch.tensor([0.0, -1, 0])
+    )
     frame = frame_of(Gaussians.cat([subject(), neck]))
     assert (torch.from_numpy(frame.middle) - torch.tensor([0.0, -4, 0])).norm() < frame.radius + 0.1
 
@@ -85,7 +91,11 @@ def test_scale_and_place_do_not_matter(scale: float) -> None:
 
 def test_degenerate_models_have_a_frame() -> None:
     one = subject(1)
-    for model in (one, Gaussians.cat([one, one]), replace(subject(50), opacity_logits=torch.full((50,), -200.0))):
+    for model in (
+        one,
+        Gaussians.cat([one, one]),
+        replace(subject(50), opacity_logits=torch.full((50,), -200.0)),
+    ):
         frame = frame_of(model)
         assert np.isfinite(frame.middle).all()
         assert 0 < frame.radius < 10

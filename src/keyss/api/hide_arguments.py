@@ -41,13 +41,22 @@ class HideResult:
     survives: bool = False  # whether the secrets survive conversion to other formats
 
 
-def method_for(chosen: str | MethodOptions, secrets: Sequence[Secret]) -> tuple[Method, MethodOptions]:
+def method_for(
+    chosen: str | MethodOptions, secrets: Sequence[Secret], preset: str | None
+) -> tuple[Method, MethodOptions]:
     """A method and its options. Raises UsageError if the method does not support these secrets or keys."""
+    if isinstance(secrets, Secret) or not isinstance(secrets, Sequence) or isinstance(secrets, str):
+        raise UsageError("secrets: expected a list, such as [Secret(scene, key)]")
+    for each in secrets:
+        if not isinstance(each, Secret):
+            raise UsageError(f"secrets: expected Secret(scene, key), got {type(each).__name__}")
     if isinstance(chosen, MethodOptions):
         method, options = registry.of_options(chosen), chosen
+        if preset is not None:
+            raise UsageError("`preset` is for a method's name: options have their own schedule")
     else:
         method = registry.get(chosen)
-        options = method.options()
+        options = method.options.preset(preset or "default")
     if not 1 <= len(secrets) <= method.max_secrets:
         raise UsageError(
             f"expected 1 to {method.max_secrets} secrets for the method {method.name}, got {len(secrets)}"

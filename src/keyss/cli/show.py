@@ -66,6 +66,7 @@ def view(
     example: keyss view runs/hidden/publish/model.ply -o page.html
     """
     check_exists(model)
+    from keyss.cli.tables import print_written
     from keyss.viewer import ModelServer, export_html, look_of_model
 
     if pose and not re.fullmatch(_POSE, pose):
@@ -81,7 +82,7 @@ def view(
         written = export_html(model, out, look=look, overwrite=overwrite)
         size = sum(path.stat().st_size for path in written) / 1e6
         what = "opens in any browser" if len(written) == 1 else f"{len(written)} files for a web server"
-        print(f"{out}: {size:.1f} MB; {what}")
+        print_written(out, f"{size:.1f} MB; {what}")
         return
     if overwrite or allow_host or embed_in:
         raise UsageError("--overwrite, --allow-host and --embed-in are for -o: leave them out")
@@ -96,24 +97,32 @@ def view(
 def render(
     model: Annotated[Positional[Path], arg(metavar="FILE", help="Model (.ply, .spz, ...), or - for stdin.")],
     *,
-    cameras: Annotated[Path, arg(metavar="SCENE", help="Scene whose cameras are used.")],
-    out: Annotated[Path, arg(metavar="FOLDER", help="Folder for the images.", aliases=["-o"])],
+    cameras: Annotated[
+        Path | None, optional("SCENE", "Scene whose cameras are used.", "60 around the model")
+    ] = None,
+    out: Annotated[
+        Path,
+        arg(metavar="OUT", help="Folder for the images, or an animation that ends in .webp.", aliases=["-o"]),
+    ],
     split: Annotated[Literal["test", "train", "all"], arg(help="Which cameras of the scene.")] = "test",
     photos: OmitArgPrefixes[Photos] = PHOTOS,
     overwrite: Overwrite = False,
     device: Device = "auto",
 ) -> None:
-    """Render a model to images from the cameras of a scene.
+    """Render a model to images, from all around or from the cameras of a scene.
+
+    example: keyss render model.ply -o turn.webp
 
     example: keyss render secret.ply --cameras SCENE_B -o images/
     """
     check_exists(model, cameras)
     import keyss
+    from keyss.cli.tables import print_written
 
     images = keyss.render(
         model, cameras, split=split, **vars(photos), device=device, out=out, overwrite=overwrite
     )
-    print(f"{out}: {len(images)} image{'' if len(images) == 1 else 's'}")
+    print_written(out, f"{len(images)} image{'' if len(images) == 1 else 's'}")
 
 
 def info(
@@ -147,18 +156,20 @@ def evaluate(
 
     Test views are photos held out of training or, for a model, renders of it. Each measurement is compared
     with its upper bound, plain 3DGS of as many Gaussians and training steps (`keyss hide --bound` fits it),
-    or with the plain model from which training started. The chance level is the PSNR of the stego model
-    itself to the secret; a wrong key should not exceed it.
+    or with the plain model from which training started. Keys of the method keyss steer a decoder: wrong ones
+    give renders too, which should show no more of the secret than the published model does.
 
     example: keyss evaluate runs/hidden --key-file key.txt
     """
     check_exists(run)
     import keyss
+    from keyss import progress
     from keyss.cli.tables import print_files, print_hiding
     from keyss.fitting.image_metrics import HOW_TO_GET, MIN_SIZE
 
     metrics = keyss.evaluate(run, keys_of_run(run, key_file), wrong_keys=wrong_keys, device=device)
-    print_hiding(metrics)
+    if progress.level >= 0:
+        print_hiding(metrics)
     if metrics.cover.lpips is None:
-        print(f"{HOW_TO_GET}; photos must have at least {MIN_SIZE} x {MIN_SIZE} pixels.")
+        progress.say(f"{HOW_TO_GET}; photos must have at least {MIN_SIZE} x {MIN_SIZE} pixels.")
     print_files(run, {"private/metrics.json": "the measurements"})

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import io
 import itertools
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -117,6 +118,14 @@ def png_names(cameras: Iterable[Camera]) -> list[str]:
         numbered = (f"{stem}-{number}.png" for number in itertools.count(2))
         names.append(next(each for each in itertools.chain([f"{stem}.png"], numbered) if each not in names))
     return names
+
+
+def animation_bytes(images: Sequence[Tensor], seconds: float = 6.0) -> bytes:
+    """An endless animation of uint8 images [H, W, 3], as WebP."""
+    first, *others = (Image.fromarray(image.numpy()) for image in images)
+    file, duration = io.BytesIO(), round(1000 * seconds / len(images))
+    first.save(file, "WEBP", save_all=True, append_images=others, duration=duration, loop=0, quality=80)
+    return file.getvalue()
 
 
 def png_bytes(image: Tensor) -> bytes:

@@ -21,14 +21,16 @@ _LEAST = 0.08  # share of the weight in the smallest sphere
 # A sphere's weight by this power of its radius: between that of lines, 1, and of clutter around a subject.
 _GROWTH = 0.8
 _OUTLIERS = 0.995  # share of the weight of a model without surroundings that its sphere holds
-_COARSER = 1.6  # ratio of the sizes of Gaussians outside and inside, above which those outside are surroundings
+_COARSER = (
+    1.6  # ratio of the sizes of Gaussians outside and inside, above which those outside are surroundings
+)
 _SLABS, _REACH = 40, 1.2  # slabs across 1.2 radii to both sides, which may hold a floor
 _ALIGNED = 0.85  # minimum cosine of a floor's normal with the direction across it
 _TILT, _STEP = 48.0, 5.0  # degrees from -y, as captures leave it; between directions at first
 _EXACT = 6.0  # degrees from the axes of other programs
 _TILTED_FLOOR, _AXIS_FLOOR = 0.07, 0.18  # share of the area in a floor
 _CLEARLY = 1.5  # ratio of the floor across an unusual direction to that across the usual one
-# Radii by which the middle of a model may be below a floor across an axis, and from which on that is upside down.
+# Radii by which the middle of a model may be below a floor across an axis; from the second on, y is up.
 _HIGHEST, _BELOW = 0.3, 0.05
 
 
@@ -58,7 +60,9 @@ def frame_of(model: Gaussians) -> Frame:
     sizes = np.sqrt(ordered[:, 1] * ordered[:, 2])
     middle, radius = _densest(means, weights)
     inside = _distances(means, middle) < radius
-    if inside.all() or _median(sizes[~inside], weights[~inside]) < _COARSER * _median(sizes[inside], weights[inside]):
+    if inside.all() or _median(sizes[~inside], weights[~inside]) < _COARSER * _median(
+        sizes[inside], weights[inside]
+    ):
         middle = _middle(means, weights)
         distances = _distances(means, middle)
         radius = max(_quantile(distances, weights, _OUTLIERS), 1e-6)
@@ -115,7 +119,7 @@ def _up(offsets: Doubles, normals: Doubles, areas: Doubles) -> Doubles:
     tilted, _, direction = largest(_cap(largest(_cap(down, _TILT, 300), 0.0)[2], _STEP, 20), 0.0)
     level, above, _ = largest(_cap(down, _EXACT, 20))
     if largest(_cap(np.eye(3)[2], _EXACT, 20))[0] > max(_AXIS_FLOOR, _CLEARLY * tilted):
-        return np.eye(3)[2]
+        return np.array([0.0, 0.0, 1.0])
     if level > _AXIS_FLOOR and level * _CLEARLY > tilted:
         return down if above > -_BELOW else -down
     return direction if tilted > max(_TILTED_FLOOR, _CLEARLY * level) else down
@@ -130,7 +134,10 @@ def _cap(axis: Doubles, degrees: float, count: int) -> Doubles:
     side /= np.linalg.norm(side)
     across = np.sqrt(1 - along**2)[:, None]
     other = np.cross(axis, side)
-    return along[:, None] * axis + across * (np.cos(turns)[:, None] * side + np.sin(turns)[:, None] * other)
+    found: Doubles = along[:, None] * axis + across * (
+        np.cos(turns)[:, None] * side + np.sin(turns)[:, None] * other
+    )
+    return found
 
 
 def _normals(quats: Doubles, shortest: npt.NDArray[np.int64]) -> Doubles:
@@ -143,7 +150,8 @@ def _normals(quats: Doubles, shortest: npt.NDArray[np.int64]) -> Doubles:
             [2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)],
         ]
     )
-    return columns[shortest, :, np.arange(len(quats))]
+    found: Doubles = columns[shortest, :, np.arange(len(quats))]
+    return found
 
 
 def _middle(means: Doubles, weights: Doubles) -> Doubles:

@@ -50,9 +50,7 @@ def scene_of_model(
     `train_pictures`, only test views are rendered; other images are [0, 0, 3]. Raises UsageError for a `size`
     or `background` out of range.
     """
-    size = IMAGE_SIZE if size is None else size
-    if not 1 <= size <= MAX_SIDE:
-        raise UsageError(f"expected a width of 1 to {MAX_SIDE:,} pixels for renders of a model, got {size:,}")
+    size = checked_size(size)
     background = torch.zeros(3) if background is None else checked_background(background)
     views, every = [], TEST_EVERY if len(model) < _LARGE else VIEWS // 2
     for index, camera in enumerate(orbit(model, size)):
@@ -72,6 +70,14 @@ def scene_of_model(
         colors=colors.cpu(),
         background=background.cpu(),
     )
+
+
+def checked_size(size: int | None) -> int:
+    """The width and height of renders of a model in pixels. Raises UsageError."""
+    size = IMAGE_SIZE if size is None else size
+    if not 1 <= size <= MAX_SIDE:
+        raise UsageError(f"expected a width of 1 to {MAX_SIDE:,} pixels for renders of a model, got {size:,}")
+    return size
 
 
 def orbit(model: Gaussians, size: int, views: int = VIEWS) -> list[Camera]:

@@ -5,15 +5,16 @@ What only folders need is imported for them: it takes half a second.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from keyss.core.errors import InputError
-from keyss.files.file_kinds import identify_file, is_training, model_file
+from keyss.files.file_kinds import identify_file, model_file
 from keyss.files.inputs import is_standard
-from keyss.files.models import is_model_path, known_suffixes, read_model
+from keyss.files.models import is_model_source, known_suffixes, read_model
 
 if TYPE_CHECKING:
     from keyss.runs.run_records import FitMetrics, HideMetrics
@@ -26,6 +27,15 @@ class RunInfo:
     kind: str
     path: str
     metrics: HideMetrics | FitMetrics
+
+
+@dataclass(frozen=True)
+class InterruptedRun:
+    """A folder of `hide` or `fit` that was not finished."""
+
+    kind: str
+    path: str
+    state: str  # how far it came, and what continues it
 
 
 @dataclass(frozen=True)
@@ -49,16 +59,16 @@ class SceneInfo:
     name: str
     train_views: int
     test_views: int
-    image_size: tuple[int, int]  # width, height
+    image_sizes: tuple[str, ...]  # "WIDTH x HEIGHT", of most photos first
     points: int
     extent: float  # world units
     background: tuple[float, ...]
 
 
-def info(path: str | Path) -> RunInfo | ModelInfo | SceneInfo:
+def info(path: str | Path) -> RunInfo | InterruptedRun | ModelInfo | SceneInfo:
     """Describe a model ("-" for standard input), a scene folder, or a folder of results. Raises InputError.
 
-    Skips photos that a scene names but that do not exist, with a KeyssWarning.
+    Skips photos of a scene that are missing or damaged, with a KeyssWarning.
     """
     path = Path(path)
     try:
@@ -69,12 +79,18 @@ def info(path: str | Path) -> RunInfo | ModelInfo | SceneInfo:
         raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
 
 
-def _folder_info(path: Path) -> RunInfo | ModelInfo | SceneInfo:
+def _folder_info(path: Path) -> RunInfo | InterruptedRun | ModelInfo | SceneInfo:
     from keyss.files.scenes import load_scene
     from keyss.runs.files import METRICS, MODEL, is_run, model_in
+    from keyss.runs.folder import read_manifest
     from keyss.runs.json_records import read_record
     from keyss.runs.run_records import FitMetrics, HideMetrics
 
+    if (running := read_manifest(path).running) is not None:
+        steps = _steps_done(path)
+        how = f"after {steps:,} training steps" if steps else "before a checkpoint was written"
+        state = f"interrupted {how}: the same command with --resume continues it, --overwrite drops it"
+        return InterruptedRun(f"unfinished {running.stage}", str(path), state)
     if inside := model_in(path):
         if not (path / METRICS).exists():  # hidden files have none, and `private/` may have been deleted
             return _model_info(inside)
@@ -83,24 +99,36 @@ def _folder_info(path: Path) -> RunInfo | ModelInfo | SceneInfo:
         return RunInfo("hiding", str(path), read_record(path / METRICS, HideMetrics))
     if runs := sorted(each for each in path.iterdir() if is_run(each)):
         raise InputError(f"{path} is not a run, but a folder of {len(runs)}: name one, such as {runs[0]}")
-    if is_training(path):
+    if is_model_source(path):
         return _model_info(model_file(path))
     scene = load_scene(path, skip_missing=True)
-    camera = scene.train[0].camera
+    sizes = Counter(f"{view.camera.width} x {view.camera.height}" for view in scene.views)
     return SceneInfo(
         kind="scene",
         name=scene.name,
         train_views=len(scene.train),
         test_views=len(scene.test),
-        image_size=(camera.width, camera.height),
+        image_sizes=tuple(size for size, _ in sizes.most_common()),
         points=len(scene.points),
         extent=round(scene.extent, 4),
         background=_round(scene.background),
     )
 
 
+def _steps_done(run: Path) -> int:
+    """Training steps in the latest checkpoint of an interrupted run; 0 without a readable one."""
+    from keyss.fitting.loop import load_checkpoint
+    from keyss.runs.folder import CHECKPOINTS
+
+    files = sorted((run / CHECKPOINTS).glob("*.safetensors"), key=lambda each: each.stat().st_mtime)
+    try:
+        return int(load_checkpoint(files[-1])[1]["iteration"]) if files else 0
+    except InputError:
+        return 0
+
+
 def _model_info(path: Path) -> ModelInfo:
-    if not (is_standard(path) or is_model_path(path)):
+    if not (is_standard(path) or is_model_source(path)):
         raise InputError(
             f"{path}: expected a model ({known_suffixes()}), a scene folder or a result folder, found "
             f"{identify_file(path)}"

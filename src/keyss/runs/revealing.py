@@ -160,12 +160,12 @@ class Verification:
 
     path: str
     model: ModelCheck
-    secret: SecretCheck | None  # None without a key
+    secrets: tuple[SecretCheck, ...]  # one per key
 
     @property
     def problems(self) -> tuple[str, ...]:
-        """Problems of the model and, with a key, of the secret."""
-        return self.model.problems + (() if self.secret is None else self.secret.problems)
+        """Problems of the model and of the secrets."""
+        return sum((secret.problems for secret in self.secrets), self.model.problems)
 
 
 def check_model(model: Gaussians) -> ModelCheck:

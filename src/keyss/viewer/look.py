@@ -17,9 +17,9 @@ from keyss.files.scenes import origin_and_extent, read_layout, recentre
 from keyss.runs.files import CONFIG, is_run
 
 # Keys: `pose`, as in the page's address ("eye=X,Y,Z&target=X,Y,Z", with "&up=z" or "&up=X,Y,Z", and
-# "&fov=WIDTH,HEIGHT", degrees that the picture shows at least); `up`, an axis ("-y"); `background`, "#rrggbb";
-# `title`; `host`, an origin from which the page may load models and pictures; `embedder`, the origin of a site
-# that frames the page and receives its events. The page chooses missing values.
+# "&fov=WIDTH,HEIGHT", degrees that the picture shows at least); `up`, an axis ("-y"); `background`,
+# "#rrggbb"; `title`; `host`, an origin from which the page may load models and pictures; `embedder`, the
+# origin of a site that frames the page and receives its events. The page chooses missing values.
 Look = dict[str, str]
 
 _FLAT = 0.2  # ratio of the two smallest eigenvalues of directions in a plane
@@ -48,7 +48,13 @@ def look_of_scene(scene: Path) -> Look:
     lens = photo.lens.scale_to(width, height) or photo.lens
     origin, _ = origin_and_extent([each.viewmat for each in layout.train])
     shown, *cameras = (
-        Camera(torch.from_numpy(recentre(each.viewmat, origin)), torch.from_numpy(lens.K), width, height, each.name)
+        Camera(
+            torch.from_numpy(recentre(each.viewmat, origin)),
+            torch.from_numpy(lens.K),
+            width,
+            height,
+            each.name,
+        )
         for each in (photo, *layout.train)
     )
     return {"pose": pose_of(shown, cameras), "background": "#ffffff" if is_white else "#000000"}
@@ -74,7 +80,7 @@ def pose_of(camera: Camera, cameras: Sequence[Camera]) -> str:
 
 
 def _upright(cameras: Sequence[Camera]) -> Tensor | None:
-    """[3] float64 up direction of the world, also of photos that were all turned by a quarter; None if unknown.
+    """[3] float64 up direction of the world, also of photos that all lie on their side; None if unknown.
 
     Level cameras have an axis, x or in turned photos y, that stays across the up direction all around. In
     turned photos its sign is unknown: cameras look down rather than up.
@@ -87,6 +93,6 @@ def _upright(cameras: Sequence[Camera]) -> Tensor | None:
 
 
 def _flatness(axes: Tensor) -> tuple[float, Tensor]:
-    """How far [C, 3] unit vectors are from spanning a plane, 0 to 1, and its normal; 1 for fewer directions."""
+    """How far [C, 3] unit vectors are from spanning a plane, 0 to 1, and its normal; 1 if they span less."""
     spread, basis = torch.linalg.eigh(axes.T @ axes / len(axes))
     return (float(spread[0] / spread[1]) if spread[1] > 0.05 else 1.0), basis[:, 0]

@@ -16,7 +16,7 @@ const [TILT, STEP] = [48, 5]; // degrees from -y, as captures leave it; between 
 const EXACT = 6; // degrees from the axes of other programs
 const [TILTED_FLOOR, AXIS_FLOOR] = [0.07, 0.18]; // share of the area in a floor
 const CLEARLY = 1.5; // ratio of the floor across an unusual direction to that across the usual one
-// Radii by which the middle of a model may be below a floor across an axis, and from which on that is upside down.
+// Radii by which the middle of a model may be below a floor across an axis; from the second on, y is up.
 const [HIGHEST, BELOW] = [0.3, 0.05];
 
 /** Gaussians of a model, sampled. */
