@@ -35,7 +35,7 @@ from keyss.methods.plain_models import Bound, fit_bounds, fit_plain_models
 from keyss.methods.registry import DEFAULT, open_companion, open_model
 from keyss.progress import Reporter
 from keyss.rendering import Backend, resolve_device
-from keyss.rendering.orbit import is_model
+from keyss.rendering.orbit import from_above, is_model
 from keyss.runs.files import (
     CONFIG,
     LOOK,
@@ -93,9 +93,9 @@ def hide(
 
     `out` (a folder) gets `publish/` with the stego model, and `private/` with fitted models, `config.json`,
     `metrics.json`, `look.png` (test views of cover and secrets before and after), companion files for methods
-    that need them (`keyss.methods.companion`), and checkpoints, from which `resume` continues. Without a seed in the options' `fit` the run uses a random
-    one, which `config.json` records. With a seed, the same arguments and number of threads give the same
-    bytes on a CPU.
+    that need them (`keyss.methods.companion`), and checkpoints, from which `resume` continues. Without a seed
+    in the options' `fit` the run uses a random one, which `config.json` records. With a seed, the same
+    arguments and number of threads give the same bytes on a CPU.
 
     `bound`: fit upper bounds to compare with, plain 3DGS with equal Gaussians and training steps; otherwise
     `metrics.json` says which baselines had fewer steps. `dry_run`: check arguments, return only the plan.
@@ -174,7 +174,7 @@ def hide(
             made |= {names[index]: model for index, model in longer.items()}
             roles = [role_of(index, len(sources)) for index in range(len(sources))]
             columns = [
-                (role, each.scene, model.to(target))
+                (role, each.scene if each.photos else from_above(each.scene), model.to(target))
                 for role, each, model in zip(roles, sources, read, strict=True)
             ]
             folder.write({**made, CONFIG: settings, METRICS: metrics, LOOK: sheet_of(columns)})

@@ -7,6 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from itertools import combinations
 
+from keyss.api.model_frames import in_frame_of
 from keyss.core.errors import UsageError
 from keyss.core.gaussians import DRAWN_OPACITY, Gaussians
 from keyss.core.scene import Scene, ViewOptions
@@ -99,9 +100,15 @@ def sources_of(
             as_scene(source, views) if photos else None
             for source, (_, photos) in zip(sources, given, strict=True)
         ]
+        placed = [
+            in_frame_of(scene, scene.to_scene_frame(model), path, source)
+            if scene is not None and model is not None and path is not None
+            else model
+            for model, scene, source, (path, _) in zip(found, loaded, sources, given, strict=True)
+        ]
         return [
-            Source(scene.to_scene_frame(model) if scene and model is not None else model, photos, key, scene)
-            for model, (_, photos), key, scene in zip(found, given, ["", *keys], loaded, strict=True)
+            Source(model, photos, key, scene)
+            for model, (_, photos), key, scene in zip(placed, given, ["", *keys], loaded, strict=True)
         ]
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import torch
@@ -70,6 +70,11 @@ def scene_of_model(
         colors=colors.cpu(),
         background=background.cpu(),
     )
+
+
+def from_above(scene: Scene) -> Scene:
+    """A scene of renders of a model with only those test views that look down."""
+    return replace(scene, test=scene.test[: -(-len(scene.test) // 2)])
 
 
 def checked_size(size: int | None) -> int:
