@@ -131,16 +131,21 @@ def info(
         arg(metavar="FILE", help="Model (- for stdin), scene folder or result folder."),
     ],
     *,
+    capacity: Annotated[
+        bool, switch("Also what the model can hide, in each format and channel; takes seconds.")
+    ] = False,
     json_: Annotated[bool, switch("Print JSON.", name="json")] = False,
 ) -> None:
     """Describe a model, a scene or a run.
+
+    example: keyss info cover.ply --capacity
 
     example: keyss info runs/hidden/publish/model.ply
     """
     from keyss.cli.tables import print_info, print_json
     from keyss.runs.describe import info as describe
 
-    (print_json if json_ else print_info)(describe(path))
+    (print_json if json_ else print_info)(describe(path, capacity=capacity))
 
 
 def evaluate(

@@ -168,7 +168,9 @@ def print_info(found: RunInfo | InterruptedRun | ModelInfo | SceneInfo) -> None:
 
     if not isinstance(found, RunInfo):
         facts = {name: value for name, value in vars(found).items() if value is not None}
-        _print_columns([(name.replace("_", " "), _text(value)) for name, value in facts.items()])
+        capacity = facts.pop("capacity", ())
+        rows = [(name.replace("_", " "), _text(value)) for name, value in facts.items()]
+        _print_columns([*rows, *(("capacity", each) for each in capacity)])
         return
     from keyss.runs.run_records import HideMetrics
 

@@ -6,17 +6,21 @@ What only folders need is imported for them: it takes half a second.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
-from keyss.core.errors import InputError
+from keyss.channels.names import Format
+from keyss.core.errors import InputError, UsageError
 from keyss.files.file_kinds import identify_file, model_file
 from keyss.files.inputs import is_standard
 from keyss.files.models import is_model_source, known_suffixes, read_model
 
+_BYTES_PER_GAUSSIAN = 19  # of a hidden model, at the usual precision
+
 if TYPE_CHECKING:
+    from keyss.core.gaussians import Gaussians
     from keyss.runs.run_records import FitMetrics, HideMetrics
 
 
@@ -49,6 +53,7 @@ class ModelInfo:
     sh_degree: int
     bounding_box: tuple[tuple[float, ...], tuple[float, ...]]  # two corners, in world units
     nearly_transparent: float  # share of the Gaussians with opacities below 0.05
+    capacity: tuple[str, ...] | None = None  # of each way to publish; only on request, as it takes seconds
 
 
 @dataclass(frozen=True)
@@ -65,8 +70,10 @@ class SceneInfo:
     background: tuple[float, ...]
 
 
-def info(path: str | Path) -> RunInfo | InterruptedRun | ModelInfo | SceneInfo:
+def info(path: str | Path, *, capacity: bool = False) -> RunInfo | InterruptedRun | ModelInfo | SceneInfo:
     """Describe a model ("-" for standard input), a scene folder, or a folder of results. Raises InputError.
+
+    `capacity`: also what a model can hide in each format and channel.
 
     Skips photos of a scene that are missing or damaged, with a KeyssWarning.
     """
@@ -74,7 +81,9 @@ def info(path: str | Path) -> RunInfo | InterruptedRun | ModelInfo | SceneInfo:
     try:
         if not (is_standard(path) or path.exists()):
             raise InputError(f"{path}: no such file or folder")
-        return _folder_info(path) if path.is_dir() else _model_info(path)
+        if path.is_dir() and not (capacity and is_model_source(path)):
+            return _folder_info(path)
+        return _model_info(model_file(path), capacity)
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
 
@@ -127,7 +136,7 @@ def _steps_done(run: Path) -> int:
         return 0
 
 
-def _model_info(path: Path) -> ModelInfo:
+def _model_info(path: Path, capacity: bool = False) -> ModelInfo:
     if not (is_standard(path) or is_model_source(path)):
         raise InputError(
             f"{path}: expected a model ({known_suffixes()}), a scene folder or a result folder, found "
@@ -142,7 +151,27 @@ def _model_info(path: Path) -> ModelInfo:
         sh_degree=model.sh_degree,
         bounding_box=(_round(model.means.amin(0)), _round(model.means.amax(0))),
         nearly_transparent=round(float((model.opacities < 0.05).double().mean()), 4),
+        capacity=tuple(_capacities(model)) if capacity else None,
     )
+
+
+def _capacities(model: Gaussians) -> Iterator[str]:
+    """What a model can hide in each format and channel."""
+    from keyss.channels import channel_for
+
+    ways: list[tuple[str, Any]] = [
+        *((f"--format {each}", ("as-is", "appended", each)) for each in get_args(Format)),
+        ("--publish any --channel colours", ("any", "colours", None)),
+    ]
+    for flags, (publish, channel, format) in ways:
+        try:
+            found = channel_for(publish, channel, format, model).prepare(model).capacity
+        except UsageError as error:
+            yield f"{flags}: nothing ({error})"
+            continue
+        size = max(0, found.bytes - found.overhead)
+        yield f"{flags}: {size:,} bytes, a model of about {size // _BYTES_PER_GAUSSIAN:,} Gaussians"
+    yield "--publish any: any secret, as the file grows"
 
 
 def _round(values: Iterable[Any]) -> tuple[float, ...]:

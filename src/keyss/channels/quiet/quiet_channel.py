@@ -215,7 +215,7 @@ class CodesCover:
         if len(cover.ids) < MIN_BLOCKS or cover.width < LEAST_BYTES:
             raise UsageError(
                 f"a cover of {len(codes):,} Gaussians has no room for secrets in the codes of {codes.name} "
-                "files"
+                f"files: of their last bits {int(cover.dry.sum()):,} can change unnoticed, which are too few"
             )
         return cover
 
