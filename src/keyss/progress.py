@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import threading
 import time
-from collections.abc import Callable
-from contextlib import AbstractContextManager
-from typing import Any
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, Task, TextColumn
@@ -13,10 +13,14 @@ from rich.table import Column
 from rich.text import Text
 
 level = 0  # -1: silent, 1: more often; set by the command line
+_QUIET_SECONDS, _WAIT_SECONDS = 2.0, 10.0  # in logs: before the first line of a wait, and between lines
+_PRIOR = 0.1  # weight of an estimated time in the pace of a wait, relative to all of its work
+
+Share = Callable[[float], None]  # called with the share of the work that is done
 
 
 class Reporter:
-    """Displays the progress of trainings; this one displays nothing."""
+    """Displays the progress of trainings and other long work; this one displays nothing."""
 
     def start(self, title: str, iterations: int, iteration: int) -> None:
         """A training begins; a resumed one has done `iteration` of its `iterations` steps."""
@@ -29,6 +33,10 @@ class Reporter:
 
     def finish(self) -> None:
         """The training has ended or was interrupted."""
+
+    def waiting(self, what: str, seconds: float) -> AbstractContextManager[Share]:
+        """While the context is open, display `what` and the time left of about `seconds`."""
+        return nullcontext(lambda share: None)
 
 
 def reporter(console: Console | None = None) -> ProgressLines:
@@ -107,6 +115,60 @@ class ProgressLines(Reporter):
     def note(self, line: str) -> None:
         self.console.print(line, markup=False, highlight=False, soft_wrap=True)
 
+    @contextmanager
+    def waiting(self, what: str, seconds: float) -> Iterator[Share]:
+        """See `Reporter`. A terminal displays a moving sign; logs get a line after 2 s, then every 10 s."""
+        wait = Wait(what, seconds, self.timer)
+        if self.live:
+            with self.console.status(wait, refresh_per_second=4):
+                yield wait.update
+            return
+        ended = threading.Event()
+
+        def log() -> None:
+            pause = _QUIET_SECONDS
+            while not ended.wait(pause):
+                self.note(str(wait))
+                pause = max(_WAIT_SECONDS, self.every)
+
+        lines = threading.Thread(target=log, daemon=True)
+        lines.start()
+        try:
+            yield wait.update
+        finally:
+            ended.set()
+            lines.join()
+
+
+class Wait:
+    """A line on work of a known estimate, at the time when it is displayed."""
+
+    def __init__(self, what: str, seconds: float, timer: Callable[[], float] = time.monotonic) -> None:
+        self.what, self.seconds, self.timer = what, max(seconds, 0.1), timer
+        self.start, self.share, self.at = timer(), 0.0, timer()
+
+    def update(self, share: float) -> None:
+        """`share` of the work, 0 to 1, is done."""
+        self.share, self.at = share, self.timer()
+
+    @property
+    def left(self) -> float:
+        """Estimate of the seconds left; below 0 if the work takes longer than estimated.
+
+        The estimated time is scaled by the pace of the work that is done.
+        """
+        prior = _PRIOR * self.seconds
+        pace = (self.at - self.start + prior) / (self.share * self.seconds + prior)
+        return (1 - self.share) * self.seconds * pace - (self.timer() - self.at)
+
+    def __str__(self) -> str:
+        left = self.left
+        ending = f"about {about(left)} left" if left >= 1 else "longer than estimated" * (left < -1)
+        return f"{self.what}: {_joined(clock(self.timer() - self.start), ending)}"
+
+    def __rich__(self) -> Text:
+        return Text(str(self))
+
 
 def say(*lines: object) -> None:
     """Print lines to the standard output, unless the command is to be quiet."""
@@ -114,9 +176,9 @@ def say(*lines: object) -> None:
         print(*lines, sep="\n")
 
 
-def waiting(what: str) -> AbstractContextManager[Any]:
-    """While the context is open, a terminal displays `what` beside a moving sign."""
-    return Console(stderr=True, quiet=level < 0).status(Text(what), refresh_per_second=4)
+def waiting(what: str, seconds: float) -> AbstractContextManager[Share]:
+    """`Reporter.waiting` on the standard error stream."""
+    return reporter().waiting(what, seconds)
 
 
 def about(seconds: float) -> str:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from functools import reduce
+from functools import cache, reduce
 from operator import xor
 
 import numpy as np
 import pytest
 import reedsolo
+import torch
 from hypothesis import given, settings, strategies as st
 
 from keyss.channels.reed_solomon import Codewords, _recurrence
@@ -22,10 +23,20 @@ def _field() -> None:
 WIDTH = 6
 
 
-@pytest.mark.parametrize(("k", "n"), [(1, 2), (2, 3), (10, 20), (60, 90), (7, 255)])
+@cache
+def points() -> list[int]:
+    """All sums of a Cantor basis in the order of their binary numbers."""
+    found, basis = [0], 1
+    while len(found) < 1 << 13:
+        found += [each ^ basis for each in found]
+        basis = next(x for x in range(1 << 16) if reedsolo.gf_mul(x, x) ^ x == basis)
+    return found
+
+
+@pytest.mark.parametrize(("k", "n"), [(1, 2), (2, 3), (10, 20), (60, 90), (7, 255), (5, 513)])
 def test_codewords_are_values_of_polynomials(k: int, n: int) -> None:
-    coefficients = np.random.default_rng(k).integers(0, 1 << 16, (3, k)).tolist()
-    values = [[reedsolo.gf_poly_eval(each, x) for each in coefficients] for x in range(1, n + 1)]
+    coefficients = np.random.default_rng(k).integers(0, 1 << 16, (WIDTH // 2, k)).tolist()
+    values = [[reedsolo.gf_poly_eval(each, x) for each in coefficients] for x in points()[:n]]
     expected = np.array(values, ">u2").view(np.uint8)
     assert np.array_equal(Codewords(1, n, k, WIDTH).encode(expected[:k].tobytes()), expected)
 
@@ -39,6 +50,32 @@ def test_any_k_of_n_give_the_data_back_and_fewer_do_not(k: int, parity: int, see
     assert codewords.decode(order[:k], coded[order[:k]]) == data
     with pytest.raises(InputError):
         codewords.decode(order[: k - 1], coded[order[: k - 1]])
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    codewords=st.builds(
+        lambda count, k, parity, symbols: Codewords(count, k + parity, k, 2 * symbols),
+        *(st.integers(least, most) for least, most in ((1, 9), (1, 40), (0, 40), (1, 70))),
+    ),
+    seed=st.integers(0, 2**32 - 1),
+)
+def test_codewords_with_different_losses_on_one_thread_and_on_many(codewords: Codewords, seed: int) -> None:
+    random = np.random.default_rng(seed)
+    data = random.bytes(codewords.size)
+    threads = torch.get_num_threads()
+    coded = []
+    try:
+        for count in (1, 3):
+            torch.set_num_threads(count)
+            coded.append(codewords.encode(data))
+            kept = [c + codewords.count * random.permutation(codewords.n) for c in range(codewords.count)]
+            kept = [each[: random.integers(codewords.k, codewords.n + 1)] for each in kept]
+            left = random.permutation(np.concatenate(kept))
+            assert codewords.decode(left, coded[-1][left]) == data
+    finally:
+        torch.set_num_threads(threads)
+    assert np.array_equal(*coded)
 
 
 @settings(max_examples=60, deadline=None)

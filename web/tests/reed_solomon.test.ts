@@ -9,11 +9,20 @@ function product(a: number, b: number): number {
   return sum;
 }
 
-/** Chunk i of n, of two columns: values at i + 1 of polynomials with random coefficients. */
+/** Sums of a Cantor basis in the order of their binary numbers. */
+const points = [0];
+for (let basis = 1; points.length < 256; ) {
+  points.push(...points.map((each) => each ^ basis));
+  let root = 0;
+  while ((product(root, root) ^ root) !== basis) root++;
+  basis = root;
+}
+
+/** Chunks of two columns: values of polynomials with random coefficients. */
 function chunksOf(n: number, k: number, draw: () => number): Uint8Array[] {
   const polynomials = [0, 1].map(() => Array.from({ length: k }, () => Math.floor(65536 * draw())));
   return Array.from({ length: n }, (_, row) => {
-    const values = polynomials.map((each) => each.reduce((value, coefficient) => product(value, row + 1) ^ coefficient, 0));
+    const values = polynomials.map((each) => each.reduce((value, coefficient) => product(value, points[row]) ^ coefficient, 0));
     return Uint8Array.from(values.flatMap((value) => [value >> 8, value & 255]));
   });
 }

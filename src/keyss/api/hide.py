@@ -82,14 +82,14 @@ def hide(
     """Hide secrets in a cover, each under its own key, and measure the result on the test views.
 
     Cover and secrets are scenes of photos, or models of any format, which are rendered for measurements.
-    Plain models of scenes are fitted unless they are given. `method`: a name, or the options of a method
-    (`CarryOptions`, `KeyssOptions`). `preset` ("quick", "default" or "full"): the length of training of a
-    method that is given by its name. `publish`, `format` and `channel`, if given, replace those of the
-    options. "as-is" hides unnoticeably, in a file that must stay unchanged: in low bits of a "ply", or in the
-    integers of an "spz", "sog" or "compressed-ply", or of a model decoded from one. By default `format` is
-    the cover's; if nothing can be hidden in it unnoticed, `publish` becomes "any", with a warning. "any"
-    survives conversion: in the channel "appended" (more Gaussians, which are visible in the file) or
-    "colours" (less capacity). `width`, `background`, `skip_missing`: see `load_scene`.
+    Plain models of scenes are fitted unless they are given. `method`: a name, with the length of training of
+    `preset` ("quick", "default" or "full") on the device, or the options of a method (`CarryOptions`,
+    `KeyssOptions`). `publish`, `format` and `channel`, if given, replace those of the options. "as-is" hides
+    unnoticeably, in a file that must stay unchanged: in low bits of a "ply", or in the integers of an "spz",
+    "sog" or "compressed-ply", or of a model decoded from one. By default `format` is the cover's; if nothing
+    can be hidden in it unnoticed, `publish` becomes "any", with a warning. "any" survives conversion: in the
+    channel "appended" (more Gaussians, which are visible in the file) or "colours" (less capacity). `width`,
+    `background`, `skip_missing`: see `load_scene`.
 
     `out` (a folder) gets `publish/` with the stego model, and `private/` with fitted models, `config.json`,
     `metrics.json`, `look.png` (test views of cover and secrets before and after), companion files for methods
@@ -105,11 +105,12 @@ def hide(
     and 25 for secrets pruned without a refit) or no better than that of empty renders. Raises other
     KeyssErrors too, and Interrupted on Ctrl-C.
     """
-    chosen, options = method_for(method, secrets, preset)
+    target = resolve_device(device)
+    chosen, options = method_for(method, secrets, preset, target.type)
     asked: dict[str, Any] = {"publish": publish, "format": format, "channel": channel}
     options = replace(options, **{name: value for name, value in asked.items() if value})
     _check_arguments(out, min_psnr)
-    began, place, target = time.monotonic(), None if out is None else Path(out), resolve_device(device)
+    began, place = time.monotonic(), None if out is None else Path(out)
     options = replace(options, fit=with_seed(options.fit, place if resume else None, "options", "fit"))
     given, keys = [cover, *(secret.scene for secret in secrets)], [secret.key for secret in secrets]
     models = [cover_model, *(secret.model for secret in secrets)]

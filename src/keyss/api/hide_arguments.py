@@ -43,9 +43,12 @@ class HideResult:
 
 
 def method_for(
-    chosen: str | MethodOptions, secrets: Sequence[Secret], preset: str | None
+    chosen: str | MethodOptions, secrets: Sequence[Secret], preset: str | None, device: str
 ) -> tuple[Method, MethodOptions]:
-    """A method and its options. Raises UsageError if the method does not support these secrets or keys."""
+    """A method and its options, by default its preset for the device.
+
+    Raises UsageError if the method does not support these secrets or keys.
+    """
     if isinstance(secrets, Secret) or not isinstance(secrets, Sequence) or isinstance(secrets, str):
         raise UsageError("secrets: expected a list, such as [Secret(scene, key)]")
     for each in secrets:
@@ -57,7 +60,7 @@ def method_for(
             raise UsageError("`preset` is for a method's name: options have their own schedule")
     else:
         method = registry.get(chosen)
-        options = method.options.preset(preset or "default")
+        options = method.options.preset(preset or "default", device)
     if not 1 <= len(secrets) <= method.max_secrets:
         raise UsageError(
             f"expected 1 to {method.max_secrets} secrets for the method {method.name}, got {len(secrets)}"

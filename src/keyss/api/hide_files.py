@@ -8,18 +8,20 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from keyss.api.hide_arguments import check_keys
-from keyss.channels import AnyChannel, Format, Publish, channel_for, open_payload
+from keyss.channels import AnyChannel, Channel, Format, Payload, Publish, channel_for, open_payload
 from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
 from keyss.files.formats.ply import with_extras
 from keyss.files.inputs import as_text, read_file
 from keyss.files.models import read_model
-from keyss.keys.encryption import MAX_PAYLOAD_BYTES
+from keyss.keys.encryption import MAX_PAYLOAD_BYTES, compressed_size
 from keyss.methods.hidden import HiddenFile
 from keyss.rendering.orbit import is_model, psnr_between
 from keyss.runs.files import STEGOS, PathLike, as_3dgs_model, stego_name
 from keyss.runs.folder import RunFolder
+
+_MOST = 10  # times the estimated capacity; no channel holds more
 
 
 @dataclass(frozen=True)
@@ -68,6 +70,7 @@ def hide_files(
     hidden, model = [_read(each) for each in secrets], as_3dgs_model(cover, "the cover")
     chosen = channel_for(publish, channel, format, model)
     payloads = [(key, each.payload()) for key, each in zip(keys, hidden, strict=True)]
+    _check_sizes(chosen, model, [payload for _, payload in payloads])
     try:
         stego = chosen.prepare(model).embed(payloads)
     except UsageError as error:
@@ -81,6 +84,21 @@ def hide_files(
         if [HiddenFile.of(open_payload(as_read, key)) for key in keys] != hidden:
             raise RuntimeError("the hidden files do not open again from the published file")
     return HideFilesResult(None if dry_run else stego, psnr_between(model, stego))
+
+
+def _check_sizes(channel: Channel, cover: Gaussians, payloads: Sequence[Payload]) -> None:
+    """Raise UsageError for payloads that fit in no cover of this size, before the cover is examined."""
+    if channel.grows:
+        return
+    typical = channel.estimate_capacity(len(cover), cover.sh_degree).bytes
+    size = sum(len(payload.data) for payload in payloads)
+    if size > _MOST * typical:  # compressing takes longer
+        size = sum(compressed_size(payload.data) for payload in payloads)
+    if size > _MOST * typical:
+        raise UsageError(
+            f"the {channel.place} of a cover of {len(cover):,} Gaussians hold about {typical:,} bytes; the given "
+            f'take {size:,}; `publish="any", channel="appended"` has room for all'
+        )
 
 
 def _read(secret: SecretFile) -> HiddenFile:

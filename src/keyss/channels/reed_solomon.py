@@ -1,9 +1,13 @@
 """Reed-Solomon over GF(2^16): any k of n chunks recover the data (Reed and Solomon 1960).
 
-A chunk is a row of 16-bit symbols, big-endian. A column holds the values of a polynomial of degree below k,
-chunk i that at the field element i + 1. The first k chunks are the data; Lagrange interpolation gives the
-others. The field polynomial is x^16 + x^12 + x^3 + x + 1. Libraries code one column at a time, symbol by
-symbol, and take minutes for the payload of a model.
+A chunk is a row of 16-bit symbols, big-endian. A column holds the values of a polynomial f of degree below k,
+chunk i that at the point `_POINTS`[i]. The first k chunks are the data. The field polynomial is
+x^16 + x^12 + x^3 + x + 1. Points are sums of a Cantor basis b: b_0 = 1, and b_j^2 + b_j = b_(j-1).
+
+All codewords are restored together, however their losses differ, in O(log n) operations per symbol, by the
+additive FFT of Lin, Chung and Han (2014) and Forney's algorithm. Let L be the polynomial that vanishes at the
+lost points. The product f L is known everywhere: it is zero where f is not known. At a lost point, its
+derivative is f L'. An inverse FFT interpolates the product, and an FFT evaluates its derivative.
 
 Every chunk has its number, so lost chunks are erasures. Correcting a false chunk, an error, takes two chunks
 more than k.
@@ -20,7 +24,7 @@ import numpy as np
 
 from keyss.core.arrays import Bytes, Flags, Integers, Shorts
 from keyss.core.errors import InputError
-from keyss.kernels.jit import kernel
+from keyss.kernels.jit import inline, kernel
 from keyss.kernels.parallel import in_blocks
 
 MAX_CHUNKS = 1 << 13  # per codeword; the field would allow more, at a cost in time
@@ -28,8 +32,7 @@ SYMBOL_BYTES = 2
 LOST = "the key is right, but too much of the model was lost or changed since the secret was hidden in it"
 _POLYNOMIAL = 0x1100B
 _ORDER = (1 << 16) - 1  # of the generator 2
-_ZERO = 4 * _ORDER  # logarithm of 0: sums with other logarithms are exponents of 0
-_AT_ONCE = 1 << 18  # factors per step, which bounds memory
+_ZERO = 2 * _ORDER  # logarithm of 0: sums with other logarithms are exponents of 0
 _COLUMNS = 128  # per block, which fits into the cache
 _MAX_ERRORS = 128  # maximum number of errors to locate per codeword
 
@@ -61,9 +64,12 @@ class Codewords:
 
     def encode(self, data: bytes) -> Bytes:
         """Encode at most `size` bytes as chunks [chunks, width] in the order of their numbers."""
-        rows = np.frombuffer(data.ljust(self.size, b"\0"), np.uint8).reshape(self.k, -1)
-        parity = _interpolate(np.arange(self.k), rows, np.arange(self.k, self.n), self.k)
-        return np.concatenate([rows, parity]).reshape(-1, self.width)
+        chunks = np.zeros((self.chunks, self.width), np.uint8)
+        chunks.reshape(-1)[: len(data)] = np.frombuffer(data, np.uint8)
+        rows = np.arange(self.chunks).reshape(self.n, self.count)
+        rows[self.k :] = -1
+        _restore(chunks, rows, chunks.reshape(self.n, self.count, self.width))
+        return chunks
 
     def decode(self, numbers: Integers, chunks: Bytes, *, errors: bool = False) -> bytes:
         """Decode chunks [C, width] with `numbers` [C], in any order.
@@ -71,87 +77,213 @@ class Codewords:
         Ignores numbers with contradictory chunks. `errors`: other chunks may be false too. Raises InputError
         if too few are left.
         """
-        inside = numbers < self.chunks
+        inside = np.flatnonzero(numbers < self.chunks)
         unique, first, inverse = np.unique(numbers[inside], return_index=True, return_inverse=True)
-        chunks, left = chunks[inside], len(unique)
+        left = len(unique)
         if left >= self.count * self.k:  # otherwise save the memory
-            chosen = chunks[first]
-            sure = np.ones(left, bool)
-            sure[inverse[(chunks != chosen[inverse]).any(axis=1)]] = False
-            rows, codewords = np.divmod(unique[sure], self.count)
-            data, chosen = np.empty((self.k, self.count, self.width), np.uint8), chosen[sure]
-            order = np.argsort(codewords, kind="stable")
-            own = np.split(order, np.searchsorted(codewords[order], np.arange(1, self.count)))
-            if all(self._decode(rows[o], chosen[o], data[:, at], errors) for at, o in enumerate(own)):
+            rows = np.full(self.chunks, -1)
+            rows[unique] = inside[first]
+            if left < len(inside):
+                differ = (chunks[inside] != chunks[rows[numbers[inside]]]).any(axis=1)
+                rows[unique[inverse[differ]]] = -1
+            rows = rows.reshape(self.n, self.count)
+            if errors:
+                self._drop_errors(rows, chunks)
+            if ((rows >= 0).sum(axis=0) >= self.k).all():
+                data = chunks[rows[: self.k]]
+                _restore(chunks, rows, data)
                 return data.tobytes()
         raise InputError(f"{LOST}: {left:,} of {self.chunks:,} chunks are left")
 
-    def _decode(self, numbers: Integers, rows: Bytes, data: Bytes, errors: bool) -> bool:
-        """Decode the codeword of rows [C, width] with `numbers` [C] into `data` [k, width].
-
-        False if too few are left.
-        """
-        if errors and len(rows) > self.k:
-            consistent = _consistent_rows(numbers, rows, self.k, self.n)
-            numbers, rows = numbers[consistent], rows[consistent]
-        if len(rows) < self.k:
-            return False
-        order = np.argsort(numbers)[: self.k]  # data first
-        numbers, rows = numbers[order], rows[order]
-        known = numbers < self.k
-        data[numbers[known]] = rows[known]
-        lost = np.setdiff1d(np.arange(self.k), numbers)
-        data[lost] = _interpolate(numbers, rows, lost, self.n)
-        return True
+    def _drop_errors(self, rows: Integers, chunks: Bytes) -> None:
+        """Set the `rows` [n, count] of false chunks to -1."""
+        for own in rows.T:
+            numbers = np.flatnonzero(own >= 0)
+            if len(numbers) > self.k:
+                own[numbers[~_consistent_rows(numbers, chunks[own[numbers]], self.k, self.n)]] = -1
 
 
 def _tables() -> tuple[Shorts, Integers]:
-    """Powers of 2, zeros from `_ZERO` - `_ORDER` on; and logarithms [2^16]."""
-    powers = np.zeros(2 * _ZERO + 1, np.uint16)
-    logarithms = np.full(1 << 16, _ZERO)
-    value = 1
-    for exponent in range(_ORDER):
-        powers[exponent : _ZERO - _ORDER : _ORDER] = value
-        logarithms[value] = exponent
+    """Powers of 2, of exponents below `_ZERO` twice all, and then zeros; and logarithms [2^16]."""
+    value, values = 1, []
+    for _ in range(_ORDER):
+        values.append(value)
         value = value << 1 ^ (_POLYNOMIAL if value >> 15 else 0)
+    powers = np.zeros(2 * _ZERO + 1, np.uint16)
+    powers[:_ZERO] = values * 2
+    logarithms = np.full(1 << 16, _ZERO)
+    logarithms[values] = np.arange(_ORDER)
     return powers, logarithms
 
 
 _POWERS, _LOGARITHMS = _tables()
 
 
-def _interpolate(numbers: Integers, rows: Bytes, wanted: Integers, n: int) -> Bytes:
-    """Interpolate rows [W, width] with numbers `wanted` [W] from k rows [k, width] with `numbers` below `n`.
+def _points() -> Integers:
+    """[2 MAX_CHUNKS] field elements: sums of a Cantor basis, at index i of those whose bits are set in i."""
+    every = np.arange(1 << 16)
+    squares = _POWERS[_LOGARITHMS * 2 % _ORDER] * (every > 0)
+    points, basis = np.zeros(1, np.int64), 1
+    while len(points) < 2 * MAX_CHUNKS:
+        points = np.concatenate([points, points ^ basis])
+        basis = int(np.flatnonzero((squares ^ every) == basis)[0])  # the smaller of two roots
+    return points
 
-    The value at x is the sum of P(x) v / ((x - a) P'(a)) over all points a with values v. P(x) is the product
-    of x - a over all points, P'(a) the product of a - b over all other points b.
+
+_POINTS = _points()
+
+
+def _restore(chunks: Bytes, rows: Integers, data: Bytes) -> None:
+    """Fill the rows of `data` [R, count, width] whose chunk is lost.
+
+    `rows` [n, count]: the row of `chunks` of each chunk; -1 for lost ones.
     """
-    found = np.zeros((len(wanted), rows.shape[1] // SYMBOL_BYTES), np.uint16)
-    if len(wanted):
-        points, at = numbers + 1, wanted + 1
-        values = _scale(rows, -_own_products(numbers, n))
-        outside = _products(at, points)
-        step = max(1, _AT_ONCE // len(points))
-        for low in range(0, len(at), step):
-            some = slice(low, low + step)
-            factors = outside[some, None] + _ORDER - _LOGARITHMS[at[some, None] ^ points]
+    columns = chunks.shape[1] // SYMBOL_BYTES
+    wanted = np.flatnonzero((rows[: len(data)] < 0).any(axis=0))
+    own, logarithms, twiddles, walsh = rows[:, wanted], _LOGARITHMS, *_constants(_size(len(rows)))
 
-            def add(start: int, stop: int, own: Shorts = found[some], factors: Integers = factors) -> None:
-                part = np.ascontiguousarray(values[:, start:stop], np.int32)
-                _add_products(factors, part, _POWERS, own[:, start:stop])
+    def restore(start: int, stop: int) -> None:
+        _restore_columns(start, stop, chunks, own, wanted, data, _POWERS, logarithms, twiddles, walsh)
 
-            in_blocks(add, values.shape[1], _COLUMNS)
-    return found.astype(">u2").view(np.uint8)
+    in_blocks(restore, len(wanted) * columns, _COLUMNS)
+
+
+def _size(n: int) -> int:
+    """The size of FFTs for `n` points."""
+    return 1 << (n - 1).bit_length()
+
+
+@lru_cache(maxsize=4)
+def _constants(size: int) -> tuple[Shorts, Integers]:
+    """Products of twiddle factors and the lower and upper bytes of symbols [size / 2, 2, 256], for FFTs of
+    `size`; the Walsh-Hadamard transform of the points' logarithms.
+    """
+    twiddles = _LOGARITHMS[_POINTS[:size:2]]
+    bytes_ = _LOGARITHMS[np.arange(256) << np.array([[0], [8]])]
+    walsh = _LOGARITHMS[_POINTS[:size]]
+    walsh[0] = 0
+    _walsh(walsh)
+    return _POWERS[twiddles[:, None, None] + bytes_], walsh
 
 
 @kernel
-def _add_products(factors: Any, values: Any, powers: Any, found: Any) -> None:
-    """Add the products of `factors` [W, k] and `values` [k, S], given as logarithms, to `found` [W, S]."""
-    for row in range(len(found)):
-        for point in range(len(values)):
-            factor = factors[row, point]
-            for column in range(values.shape[1]):
-                found[row, column] ^= powers[factor + values[point, column]]
+def _walsh(values: Any) -> None:
+    """Walsh-Hadamard transform in place, which turns convolutions over xor into products."""
+    half = 1
+    while half < len(values):
+        for start in range(0, len(values), 2 * half):
+            for at in range(start, start + half):
+                values[at], values[at + half] = values[at] + values[at + half], values[at] - values[at + half]
+        half *= 2
+
+
+@kernel
+def _multiply_differences(points: Any, walsh: Any) -> None:
+    """Replace marks, 1 or 0, by logarithms of products: of the differences to all other marked points."""
+    _walsh(points)
+    points *= walsh
+    _walsh(points)
+    for at in range(len(points)):
+        points[at] = points[at] // len(points) % 65535
+
+
+@kernel
+def _restore_columns(
+    start: Any,
+    stop: Any,
+    chunks: Any,
+    rows: Any,
+    wanted: Any,
+    data: Any,
+    powers: Any,
+    logarithms: Any,
+    twiddles: Any,
+    walsh: Any,
+) -> None:
+    """`_restore` for columns `start` to `stop` of all codewords in a line.
+
+    `rows` [n, C], `wanted` [C]: of codewords with losses.
+    """
+    size, columns = len(walsh), chunks.shape[1] // 2
+    first, last = start // columns, (stop - 1) // columns
+    products = np.ones((last - first + 1, size), np.int64)  # L' at lost points, else L, as logarithms
+    work = np.zeros((size, stop - start), np.uint16)
+    for codeword in range(first, last + 1):
+        own = products[codeword - first]
+        offset = codeword * columns - start
+        for point in range(len(rows)):
+            own[point] = rows[point, codeword] < 0
+        _multiply_differences(own, walsh)
+        for point in range(len(rows)):
+            row = rows[point, codeword]
+            if row >= 0:
+                for at in range(max(0, offset), min(stop - start, offset + columns)):
+                    symbol = chunks[row, 2 * (at - offset)] << 8 | chunks[row, 2 * (at - offset) + 1]
+                    work[point, at] = powers[own[point] + logarithms[symbol]]
+    _to_coefficients(work, twiddles)
+    _differentiate(work)
+    _to_values(work, twiddles)
+    for codeword in range(first, last + 1):
+        own = products[codeword - first]
+        offset = codeword * columns - start
+        for point in range(min(len(rows), len(data))):
+            if rows[point, codeword] < 0:
+                chunk = data[point, wanted[codeword]]
+                for at in range(max(0, offset), min(stop - start, offset + columns)):
+                    symbol = powers[65535 - own[point] + logarithms[work[point, at]]]
+                    chunk[2 * (at - offset)], chunk[2 * (at - offset) + 1] = symbol >> 8, symbol & 255
+
+
+@inline
+def _add_product(to: Any, values: Any, table: Any) -> None:
+    for at in range(len(to)):
+        to[at] ^= table[0, values[at] & 255] ^ table[1, values[at] >> 8]
+
+
+@inline
+def _add(to: Any, values: Any) -> None:
+    for at in range(len(to)):
+        to[at] ^= values[at]
+
+
+@kernel
+def _to_coefficients(work: Any, twiddles: Any) -> None:
+    """From values at `_POINTS` to coefficients in the basis of Lin, Chung and Han, in place."""
+    half = 1
+    while half < len(work):
+        for start in range(0, len(work), 2 * half):
+            table = twiddles[start // half // 2]
+            for row in range(start, start + half):
+                _add(work[row + half], work[row])
+                if start:  # otherwise the factor is zero
+                    _add_product(work[row], work[row + half], table)
+        half *= 2
+
+
+@kernel
+def _to_values(work: Any, twiddles: Any) -> None:
+    """Invert `_to_coefficients`."""
+    half = len(work) // 2
+    while half:
+        for start in range(0, len(work), 2 * half):
+            table = twiddles[start // half // 2]
+            for row in range(start, start + half):
+                if start:
+                    _add_product(work[row], work[row + half], table)
+                _add(work[row + half], work[row])
+        half //= 2
+
+
+@kernel
+def _differentiate(work: Any) -> None:
+    """Replace coefficients by those of the derivative; with Cantor's basis, all factors are one."""
+    for row in range(len(work)):
+        work[row] = 0
+        half = 1
+        while half < len(work):
+            if not row & half:
+                _add(work[row], work[row + half])
+            half *= 2
 
 
 def _scale(rows: Bytes, logarithms: Integers) -> Integers:
@@ -160,46 +292,31 @@ def _scale(rows: Bytes, logarithms: Integers) -> Integers:
     return np.where(symbols == _ZERO, _ZERO, (symbols + logarithms[:, None]) % _ORDER)
 
 
-def _own_products(numbers: Integers, n: int) -> Integers:
-    """`_products` [C] of the points of `numbers` [C] among themselves, from the few missing ones below n."""
-    missing = np.setdiff1d(np.arange(n), numbers)
-    return (_all_products(n)[numbers] - _products(numbers + 1, missing + 1)) % _ORDER
-
-
-@lru_cache(maxsize=4)
-def _all_products(n: int) -> Integers:
-    """`_products` [n] of the first n points among themselves."""
-    points = np.arange(1, n + 1)
-    return _products(points, points)
-
-
-def _products(at: Integers, points: Integers) -> Integers:
-    """Logarithms [A] of the products of differences between each of `at` [A] and all other `points` [P]."""
-    logarithms = _LOGARITHMS.copy()
-    logarithms[0] = 0
-    step = max(1, _AT_ONCE // max(1, len(points)))
-    parts = [logarithms[at[low : low + step, None] ^ points].sum(axis=1) for low in range(0, len(at), step)]
-    return np.concatenate(parts) % _ORDER
-
-
 def _consistent_rows(numbers: Integers, rows: Bytes, k: int, n: int) -> Flags:
     """Mask [C] of the rows [C, width] that belong to the codeword of the majority; C is more than k.
 
-    For a codeword, the syndromes, the sums of v a^t / P'(a) over all rows (see `_interpolate`), vanish for
-    t < C - k. Otherwise their shortest linear recurrence locates the errors (Massey 1969); if there are too
+    For a codeword, the syndromes, the sums of v a^t / P'(a) over all rows, vanish for t < C - k: v are the
+    values, a their points, all moved so that none is zero, and P'(a) the product of a - b over all other
+    points b. Otherwise their shortest linear recurrence locates the errors (Massey 1969); if there are too
     many, it finds none.
     """
-    points = numbers + 1
-    values = _scale(rows, -_own_products(numbers, n))
-    combined = np.bitwise_xor.reduce(_POWERS[values + np.arange(values.shape[1])], axis=1)  # over columns
-    terms, powers = _LOGARITHMS[combined], _LOGARITHMS[points]
+    points = _POINTS[MAX_CHUNKS + numbers]
+    _, walsh = _constants(_size(n))
+    products = np.zeros(len(walsh), np.int64)
+    products[numbers] = 1
+    _multiply_differences(products, walsh)
+    values = _scale(rows, -products[numbers])
+    powers, consistent = _LOGARITHMS[points], np.ones(len(rows), bool)
     times = np.arange(min(len(rows) - k, 2 * _MAX_ERRORS))[:, None]
-    syndromes = np.bitwise_xor.reduce(_POWERS[terms + times * powers % _ORDER], axis=1)
-    locator = _recurrence(syndromes.tolist()) if syndromes.any() else [1]
-    located = np.zeros(len(rows), np.uint16)  # the locator at 1 / a
-    for power, coefficient in enumerate(locator):
-        located ^= _POWERS[_LOGARITHMS[coefficient] + -power * powers % _ORDER]
-    consistent: Flags = located != 0
+    for step in (1, 2):  # different sums over the columns: an error goes unnoticed in one of 2^32 cases
+        weights = step * np.arange(values.shape[1]) % _ORDER
+        terms = _LOGARITHMS[np.bitwise_xor.reduce(_POWERS[values + weights], axis=1)]
+        syndromes = np.bitwise_xor.reduce(_POWERS[terms + times * powers % _ORDER], axis=1)
+        locator = _recurrence(syndromes.tolist()) if syndromes.any() else [1]
+        located = np.zeros(len(rows), np.uint16)  # the locator at 1 / a
+        for power, coefficient in enumerate(locator):
+            located ^= _POWERS[_LOGARITHMS[coefficient] + -power * powers % _ORDER]
+        consistent &= located != 0
     return consistent
 
 

@@ -33,7 +33,7 @@ Preset = Annotated[
     Literal["quick", "default", "full"],
     arg(
         help="Training steps and maximum number of Gaussians of each model: quick 500 and 10,000; default "
-        "1,000 and 30,000; full 30,000 and 500,000."
+        "1,000 and 30,000, on CUDA as full; full 30,000 and 500,000, on CUDA 1,000,000."
     ),
 ]
 Width = Annotated[int | None, optional("PIXELS", "Downscale wider photos to this width.")]

@@ -247,8 +247,17 @@ def _method_options(args: HideArguments) -> MethodOptions:
     }
     changes |= {"publish": args.publish, "format": args.format}
     changes |= {"channel": args.details.channel} if args.details.channel else {}
-    options = replace(options_of(args.method).preset(args.preset), **changes)
+    options = replace(options_of(args.method).preset(args.preset, _kind_of_device(args)), **changes)
     return options.with_fit(**args.training.schedule())
+
+
+def _kind_of_device(args: HideArguments) -> str:
+    """The device of the preset; where nothing is trained, without importing torch."""
+    if args.device != "auto" or not args.secret:
+        return "cuda" if args.device == "cuda" else "cpu"
+    from keyss.rendering import resolve_device
+
+    return resolve_device(args.device).type
 
 
 def _hide_files(args: HideArguments) -> None:
@@ -256,22 +265,26 @@ def _hide_files(args: HideArguments) -> None:
     from keyss import progress
     from keyss.channels import channel_for
     from keyss.cli.tables import print_files
+    from keyss.progress import waiting
+    from keyss.runs.estimates import seconds_for
     from keyss.runs.files import STEGOS
 
     used = "cover secret_file key_file publish format out overwrite device channel dry_run"
     if unused := [each for each in changed_flags(args) if each not in map(flag, used.split())]:
         raise UsageError(f"--secret-file does not use {unused[0]}: leave out {unused[0]}")
     files, channel = args.secret_file, args.details.channel or "colours"
-    result = keyss.hide_files(
-        args.cover,
-        list(map(keyss.SecretFile, files, keys(args.key_file, len(files), new=True))),
-        publish=args.publish,
-        format=args.format,
-        channel=channel,
-        out=args.out,
-        overwrite=args.overwrite,
-        dry_run=args.dry_run,
-    )
+    secrets = list(map(keyss.SecretFile, files, keys(args.key_file, len(files), new=True)))
+    with waiting(f"hiding in {args.cover.name}", seconds_for("hide a file", args.cover)):
+        result = keyss.hide_files(
+            args.cover,
+            secrets,
+            publish=args.publish,
+            format=args.format,
+            channel=channel,
+            out=args.out,
+            overwrite=args.overwrite,
+            dry_run=args.dry_run,
+        )
     for file in files:
         what = "which fit" if args.dry_run else "revealed again from the published file"
         progress.say(f"{file.name}: {file.stat().st_size:,} bytes, {what}")

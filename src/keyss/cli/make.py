@@ -87,14 +87,15 @@ def fit(
     import keyss
     from keyss import progress
     from keyss.cli.tables import print_files, print_fit
-    from keyss.fitting.config import PRESETS
+    from keyss.fitting.config import preset_for
+    from keyss.rendering import resolve_device
     from keyss.runs.files import METRICS
     from keyss.runs.json_records import read_record
     from keyss.runs.run_records import FitMetrics
 
     keyss.fit(
         scene,
-        config=replace(PRESETS[preset], **training.schedule()),
+        config=replace(preset_for(preset, resolve_device(device).type), **training.schedule()),
         **vars(photos),
         device=device,
         out=out,
@@ -185,12 +186,14 @@ def convert(
     import keyss
     from keyss.cli.tables import print_conversion
     from keyss.progress import waiting
+    from keyss.runs.estimates import seconds_to_convert
 
-    with waiting(f"converting {model.name}"):
+    given = given_keys(key_file)
+    with waiting(f"converting {model.name}", seconds_to_convert(model, out, len(given))):
         found = keyss.convert(
             model,
             out,
-            given_keys(key_file),
+            given,
             force=force,
             dry_run=dry_run,
             overwrite=overwrite,

@@ -57,8 +57,9 @@ def reveal(
         (key,) = keys(key_file, 1)
     from keyss.cli.tables import print_written
     from keyss.progress import waiting
+    from keyss.runs.estimates import seconds_for
 
-    with waiting(f"opening {stego.name}"):
+    with waiting(f"opening {stego.name}", seconds_for("reveal", stego)):
         revealed = keyss.reveal(
             stego,
             key,
@@ -99,9 +100,11 @@ def verify(
     import keyss
     from keyss.cli.tables import print_json, print_verification
     from keyss.progress import waiting
+    from keyss.runs.estimates import seconds_for
 
-    with waiting(f"checking {model.name}"):
-        found = keyss.verify(model, given_keys(key_file), device=device)
+    given = given_keys(key_file)
+    with waiting(f"checking {model.name}", seconds_for("reveal" if given else "verify", model)):
+        found = keyss.verify(model, given, device=device)
     (print_json if json_ else print_verification)(found)
     if found.problems:
         raise InputError(f"{model}: {'; '.join(found.problems)}")

@@ -67,6 +67,8 @@ def view(
     """
     check_exists(model)
     from keyss.cli.tables import print_written
+    from keyss.progress import waiting
+    from keyss.runs.estimates import seconds_for
     from keyss.viewer import ModelServer, export_html, look_of_model
 
     if pose and not re.fullmatch(_POSE, pose):
@@ -79,7 +81,8 @@ def view(
     if out is not None:
         if port or host != "127.0.0.1":
             raise UsageError("--port and --host are for serving: leave them out with -o")
-        written = export_html(model, out, look=look, overwrite=overwrite)
+        with waiting(f"writing {out.name}", seconds_for("export", model)):
+            written = export_html(model, out, look=look, overwrite=overwrite)
         size = sum(path.stat().st_size for path in written) / 1e6
         what = "opens in any browser" if len(written) == 1 else f"{len(written)} files for a web server"
         print_written(out, f"{size:.1f} MB; {what}")
@@ -118,10 +121,13 @@ def render(
     check_exists(model, cameras)
     import keyss
     from keyss.cli.tables import print_written
+    from keyss.progress import waiting
+    from keyss.runs.estimates import seconds_for
 
-    images = keyss.render(
-        model, cameras, split=split, **vars(photos), device=device, out=out, overwrite=overwrite
-    )
+    with waiting(f"rendering {model.name}", seconds_for("render", model)):
+        images = keyss.render(
+            model, cameras, split=split, **vars(photos), device=device, out=out, overwrite=overwrite
+        )
     print_written(out, f"{len(images)} image{'' if len(images) == 1 else 's'}")
 
 
@@ -143,9 +149,13 @@ def info(
     example: keyss info runs/hidden/publish/model.ply
     """
     from keyss.cli.tables import print_info, print_json
+    from keyss.progress import waiting
     from keyss.runs.describe import info as describe
+    from keyss.runs.estimates import seconds_for
 
-    (print_json if json_ else print_info)(describe(path, capacity=capacity))
+    with waiting(f"reading {path.name}", seconds_for("info", path)):
+        found = describe(path, capacity=capacity)
+    (print_json if json_ else print_info)(found)
 
 
 def evaluate(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import itertools
 import os
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -112,12 +111,16 @@ def downscale(image: Bytes, width: int, height: int) -> Bytes:
 
 def png_names(cameras: Iterable[Camera]) -> list[str]:
     """A PNG file name for each camera: folders joined by underscores, duplicates numbered (`a-2.png`)."""
-    names: list[str] = []
+    names: dict[str, None] = {}  # an ordered set
+    numbers: dict[str, int] = {}  # the last number of a stem
     for camera in cameras:
         stem = Path(camera.name.replace("/", "_").replace("\\", "_")).stem
-        numbered = (f"{stem}-{number}.png" for number in itertools.count(2))
-        names.append(next(each for each in itertools.chain([f"{stem}.png"], numbered) if each not in names))
-    return names
+        name = f"{stem}.png"
+        while name in names:
+            numbers[stem] = numbers.get(stem, 1) + 1
+            name = f"{stem}-{numbers[stem]}.png"
+        names[name] = None
+    return list(names)
 
 
 def animation_bytes(images: Sequence[Tensor], seconds: float = 6.0) -> bytes:

@@ -20,7 +20,7 @@ from keyss.core.arrays import Floats, Numbers
 from keyss.core.errors import InputError, KeyssWarning
 
 _MAX_HEADER_BYTES = 64 * 1024
-_CHUNK_BYTES = 1 << 20
+_CHUNK_BYTES, _TEXT_BYTES = 1 << 20, 1 << 16
 
 _SCALARS = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1",
@@ -37,7 +37,7 @@ _BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": 
 # not help, since the float32 sigmoid rounds to exactly 1 from 16.64 on.
 OPACITY_LOGIT_BOUND = 16.0
 LEAST_LOG_SCALE = -87.33654  # of the smallest normal float32; in place of minus infinity
-_ENOUGH = 100  # Gaussians from which on `check_not_activated` judges, and about as many that it looks at
+SAMPLE = 100  # Gaussians from which on `check_not_activated` judges, and about as many that it looks at
 _NEARLY_ALL = 0.99  # share of the scales
 # Values that are all positive are scales, not their logarithms, if half of them are below _SMALL_SCALE, if as
 # logarithms they made half of the Gaussians larger than _LARGE of the model, or if they vary by _RATIO.
@@ -211,7 +211,7 @@ def _ascii_blocks(file: BinaryIO, skipped: int, vertex: _Element) -> Iterator[Ta
     """Rows in text, after `skipped` values. Line breaks are white space like any other."""
     width = len(vertex.properties)
     step = max(1, _CHUNK_BYTES // (8 * width))
-    tokens = (token for line in file for token in line.split())
+    tokens = _tokens(file)
     try:
         for _ in range(skipped):
             next(tokens)
@@ -228,6 +228,18 @@ def _ascii_blocks(file: BinaryIO, skipped: int, vertex: _Element) -> Iterator[Ta
         raise InputError("the ascii data are cut short or hold values of another type") from error
 
 
+def _tokens(file: BinaryIO) -> Iterator[bytes]:
+    """The words of a file, however long its lines are."""
+    start = b""
+    while chunk := file.read(_TEXT_BYTES):
+        words = (start + chunk).split()
+        start = words.pop() if words and not chunk[-1:].isspace() else b""
+        if len(start) > _TEXT_BYTES:
+            raise ValueError("a word without end")
+        yield from words
+    yield from start.split()
+
+
 def is_plain(file: BinaryIO) -> bool:
     """True for a PLY file that is no compressed model. The position stays at the start."""
     header = file.read(_MAX_HEADER_BYTES).partition(b"end_header")[0]
@@ -235,10 +247,13 @@ def is_plain(file: BinaryIO) -> bool:
     return header.startswith(b"ply") and b" packed_position" not in header
 
 
-def read_rows(file: BinaryIO) -> tuple[Vertices, list[str], Iterator[tuple[Floats, Table]]]:
+def read_rows(
+    file: BinaryIO, wanted: Sequence[str] = ()
+) -> tuple[Vertices, list[str], Iterator[tuple[Floats, Table]]]:
     """The vertices of a PLY file that is open at its start, `model_names`, and its Gaussians in blocks.
 
-    A block has the values of these names [n, len(names)], and all properties [n].
+    A block has the values of the `wanted` names [n, len(wanted)], by default all of these names, and all
+    properties [n].
 
     Clamps infinite opacity logits to +-OPACITY_LOGIT_BOUND and log scales of minus infinity (flat Gaussians)
     to LEAST_LOG_SCALE. Leaves out other Gaussians with NaN or infinite values, with a KeyssWarning at the
@@ -246,12 +261,19 @@ def read_rows(file: BinaryIO) -> tuple[Vertices, list[str], Iterator[tuple[Float
     """
     vertices = read_vertices(file)
     names = model_properties(vertices.dtype.names or ())
-    return vertices, names, _finite_blocks(vertices, names, getattr(file, "name", "the model"))
+    where = getattr(file, "name", "the model")
+    return vertices, names, _finite_blocks(vertices, names, wanted, where)
 
 
-def _finite_blocks(vertices: Vertices, names: list[str], where: str) -> Iterator[tuple[Floats, Table]]:
+def _finite_blocks(
+    vertices: Vertices, names: list[str], wanted: Sequence[str], where: str
+) -> Iterator[tuple[Floats, Table]]:
     kept, bad = 0, np.zeros(len(names), np.int64)
     for table in vertices.blocks:
+        if wanted and _has_a_finite_sum(table):
+            kept += len(table)
+            yield columns(table, wanted), table
+            continue
         rows = columns(table, names)
         if not np.isfinite(rows).all():
             logits, log_scales = rows[:, -8], rows[:, -7:-4]
@@ -262,7 +284,7 @@ def _finite_blocks(vertices: Vertices, names: list[str], where: str) -> Iterator
             bad += np.count_nonzero(~finite, axis=0)
             rows, table = rows[finite.all(axis=1)], table[finite.all(axis=1)]
         kept += len(rows)
-        yield rows, table
+        yield rows[:, [names.index(name) for name in wanted]] if wanted else rows, table
     if not vertices.count:
         raise InputError("it holds no Gaussians")
     wrong = [f"{name} in {number:,}" for name, number in zip(names, bad, strict=True) if number]
@@ -278,15 +300,24 @@ def _finite_blocks(vertices: Vertices, names: list[str], where: str) -> Iterator
         )
 
 
+def _has_a_finite_sum(table: Table) -> bool:
+    """True only if all values are finite, and single precision; several times as fast as to test each."""
+    kinds = {kind for kind, *_ in (table.dtype.fields or {}).values()}
+    if kinds != {np.dtype("<f4")}:
+        return False
+    with np.errstate(over="ignore", invalid="ignore"):
+        return bool(np.isfinite(table.view("<f4").sum()))
+
+
 def check_not_activated(means: Floats, log_scales: Floats, opacity_logits: Floats) -> None:
     """Raise InputError if scales or opacities of a model [N, ...] are those that renderers use.
 
     Logits of trained models are not all within 0 to 1. Logarithms of scales are all positive in large units
     only, where they are much alike.
     """
-    if len(means) < _ENOUGH:
+    if len(means) < SAMPLE:
         return
-    means, log_scales = means[:: len(means) // _ENOUGH], log_scales[:: len(means) // _ENOUGH]
+    means, log_scales = means[:: len(means) // SAMPLE], log_scales[:: len(means) // SAMPLE]
     spread = np.median(np.abs(means - np.median(means, axis=0)).max(axis=1))
     least, middle, most = np.quantile(log_scales, [0.05, 0.5, 0.95])
     large = middle < _SMALL_SCALE or np.exp(min(middle, 80.0)) > _LARGE * spread or most > _RATIO * least

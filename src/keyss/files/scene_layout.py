@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import os
+import unicodedata
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from keyss.core.arrays import Bytes, Doubles
 from keyss.core.errors import InputError, KeyssWarning
 from keyss.files.lens import Lens
 
+_SHOWN = 200  # characters of a name in messages
 MAX_COORDINATE = 1e15  # its square fits into float32
 
 
@@ -77,7 +79,9 @@ def leave_out(where: Path, total: int, why: str, photos: Sequence[str], skip_mis
     """
     if not photos:
         return
-    listed = ", ".join(photos[:5]) + (f" and {len(photos) - 5:,} more" if len(photos) > 5 else "")
+    listed = ", ".join(photo[:_SHOWN] for photo in photos[:5]) + (
+        f" and {len(photos) - 5:,} more" if len(photos) > 5 else ""
+    )
     count = f"{where}: {len(photos):,} of {total:,} photos {why}"
     if len(photos) == total:
         raise InputError(f"{count}: {listed}")
@@ -86,39 +90,55 @@ def leave_out(where: Path, total: int, why: str, photos: Sequence[str], skip_mis
     warnings.warn(f"{count}, left out: {listed}", KeyssWarning, stacklevel=2)
 
 
-class CaseInsensitiveFinder:
-    """Finds files whose names differ from those in a scene by case only."""
+class Finder:
+    """Finds the files of a scene by name, or by the one name that differs by case only.
+
+    Lists each folder once: a scene may name ten thousands of files that do not exist.
+    """
 
     def __init__(self) -> None:
-        self._listings: dict[Path, dict[str, list[str]]] = {}
+        self._listings: dict[str, dict[str, list[str]]] = {}
 
-    def find(self, folder: Path, name: str) -> str:
-        """`name`, relative to `folder`, as spelt on disk if exactly one path matches, else unchanged."""
-        if (folder / name).exists():
-            return name
-        found: list[str] = []
-        for part in name.split("/"):
-            here = folder.joinpath(*found)
-            alike = [part] if (here / part).exists() else self._listing(here).get(part.casefold(), [])
-            if len(alike) != 1:
-                return name
-            found.append(alike[0])
-        return "/".join(found)
+    def find(self, folder: Path, name: str) -> str | None:
+        """`name`, relative to `folder`, as spelt on disk; None if it does not exist."""
+        return self._find(folder, name.replace(os.sep, "/").split("/"))
 
-    def _listing(self, folder: Path) -> dict[str, list[str]]:
-        """The names in a folder by their case-folded form."""
+    def find_end(self, folder: Path, parts: Sequence[str]) -> str | None:
+        """The longest end of a path, in parts, that exists in `folder`; not all of it."""
+        ends = (range(start, len(parts)) for start in range(1, len(parts)))
+        found = (self._find(folder, (parts[index] for index in end)) for end in ends)
+        return next(filter(None, found), None)
+
+    def _find(self, folder: Path, parts: Iterable[str]) -> str | None:
+        here, found = os.fspath(folder), []
+        for part in parts:
+            if part in ("", "."):
+                continue
+            alike = [part] if part == ".." else self._listing(here).get(_folded(part), [])
+            if part not in alike and len(alike) != 1:
+                return None
+            found.append(part if part in alike else alike[0])
+            here = f"{here}/{found[-1]}"
+        return "/".join(found) if found and os.path.exists(here) else None
+
+    def _listing(self, folder: str) -> dict[str, list[str]]:
+        """The names in a folder by their case-folded form; none in a file."""
         if folder not in self._listings:
             names: dict[str, list[str]] = {}
-            for each in os.listdir(folder) if folder.is_dir() else ():
-                names.setdefault(each.casefold(), []).append(each)
+            for each in os.listdir(folder) if os.path.isdir(folder) else ():
+                names.setdefault(_folded(each), []).append(each)
             self._listings[folder] = names
         return self._listings[folder]
 
 
-def refuse_duplicates(where: Path, photos: Sequence[Photo]) -> None:
+def _folded(name: str) -> str:
+    return unicodedata.normalize("NFC", name).casefold()
+
+
+def refuse_duplicates(where: Path, names: Iterable[str]) -> None:
     """Raise InputError if two photos share a name: they could be in both training and test set."""
     seen: set[str] = set()
-    for photo in photos:
-        if photo.name in seen:
-            raise InputError(f"{where}: expected every image once, found {photo.name!r} twice")
-        seen.add(photo.name)
+    for name in names:
+        if name in seen:
+            raise InputError(f"{where}: expected every image once, found {name[:_SHOWN]!r} twice")
+        seen.add(name)

@@ -20,7 +20,7 @@ from keyss.files.lens import Lens, make_lens
 from keyss.files.ply_table import columns, read_vertices
 from keyss.files.scene_layout import (
     MAX_COORDINATE,
-    CaseInsensitiveFinder,
+    Finder,
     Photo,
     PointCloud,
     SceneLayout,
@@ -30,6 +30,7 @@ from keyss.files.scene_layout import (
 )
 
 _MAX_JSON_BYTES = 256 * 2**20
+_MAX_PATH = 4096  # characters
 _EXTENSIONS = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG", ".webp")
 _PERSPECTIVE = ("OPENCV", "FULL_OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
 _RGB, _GREY = ("red", "green", "blue"), 128  # the colour of points without any
@@ -87,7 +88,7 @@ def read_blender(folder: Path, *, skip_missing: bool = False) -> SceneLayout:
         path = folder / f"transforms_{split}.json"
         if path.is_file():
             _, test = _read(path, skip_missing)
-            refuse_duplicates(path, train + test)
+            refuse_duplicates(path, (photo.name for photo in train + test))
             return SceneLayout(train, test)
     return SceneLayout(*hold_out(folder, train))
 
@@ -105,7 +106,9 @@ def read_nerfstudio(folder: Path, *, skip_missing: bool = False) -> SceneLayout:
     train, test = _split(path, meta, photos)
     if meta.ply_file_path is None:
         return SceneLayout(train, test)
-    return SceneLayout(train, test, read_point_cloud(folder / _relative_path(path, meta.ply_file_path)))
+    return SceneLayout(
+        train, test, read_point_cloud(folder / _relative_path(path, meta.ply_file_path, Finder()))
+    )
 
 
 def read_point_cloud(path: Path) -> PointCloud:
@@ -143,10 +146,11 @@ def _read(path: Path, skip_missing: bool) -> tuple[_Transforms, tuple[Photo, ...
         raise InputError(f"{path}: expected JSON with posed frames: {error}") from error
     if not meta.frames:
         raise InputError(f"{path}: expected posed frames, found none")
-    finder = CaseInsensitiveFinder()
+    finder = Finder()
     names = [_image_name(path, frame.file_path, finder) for frame in meta.frames]
     missing = {name for name in names if not (path.parent / name).exists()}
     leave_out(path, len(names), "are missing", sorted(missing), skip_missing)
+    refuse_duplicates(path, (name for name in names if name not in missing))
     photos, broken = [], []
     for i, (name, frame) in enumerate(zip(names, meta.frames, strict=True)):
         if name in missing:
@@ -155,14 +159,14 @@ def _read(path: Path, skip_missing: bool) -> tuple[_Transforms, tuple[Photo, ...
         try:
             viewmat = _viewmat(where, _matrix(where, frame.transform_matrix))
             lens = _lens(where, meta, frame, path.parent / name)
-            mask = frame.mask_path and path.parent / finder.find(
-                path.parent, _relative_path(path, frame.mask_path)
-            )
-            photos.append(Photo(path.parent / name, name, viewmat, lens, mask or None))
+            mask = None
+            if frame.mask_path:
+                spelt = _relative_path(path, frame.mask_path, finder)
+                mask = path.parent / (finder.find(path.parent, spelt) or spelt)
+            photos.append(Photo(path.parent / name, name, viewmat, lens, mask))
         except InputError as error:
             broken.append(str(error))
     leave_out(path, len(photos) + len(broken), "have no usable camera", broken, skip_missing)
-    refuse_duplicates(path, photos)
     return meta, tuple(photos)
 
 
@@ -174,14 +178,21 @@ def _split(
     path: Path, meta: _Transforms, photos: tuple[Photo, ...]
 ) -> tuple[tuple[Photo, ...], tuple[Photo, ...]]:
     """(train, test) by the lists of a JSON file, else every 8th photo."""
-    finder = CaseInsensitiveFinder()
-    names = {_image_name(path, frame.file_path, finder) for frame in meta.frames}
-    train, test = (
-        {_image_name(path, each, finder) for each in listed or ()}
-        for listed in (meta.train_filenames, meta.test_filenames or meta.val_filenames)
-    )
-    if unknown := (train | test) - names:
-        raise InputError(f"{path}: expected lists of frames, found {min(unknown)!r}, which is not a frame")
+    finder = Finder()
+    spelt = {frame.file_path: _image_name(path, frame.file_path, finder) for frame in meta.frames}
+    names = set(spelt.values())
+
+    def listed(paths: list[str] | None) -> set[str]:
+        found = set()
+        for each in paths or ():
+            found.add(name := spelt.get(each) or _image_name(path, each, finder))
+            if name not in names:
+                raise InputError(
+                    f"{path}: expected lists of frames, found {name[:99]!r}, which is not a frame"
+                )
+        return found
+
+    train, test = listed(meta.train_filenames), listed(meta.test_filenames or meta.val_filenames)
     if train == names and not test:
         warnings.warn(
             f"{path}: `train_filenames` has all photos; every 8th of them becomes a test view",
@@ -197,30 +208,29 @@ def _split(
     return tuple(p for p in photos if p.name in train), tuple(p for p in photos if p.name in test)
 
 
-def _relative_path(path: Path, file_path: str) -> str:
+def _relative_path(path: Path, file_path: str, finder: Finder) -> str:
     """A path in a JSON file, normalised, relative to the file's folder, and inside it or its parent.
 
     For an absolute path, which may be from another computer, the longest suffix that exists in the folder.
     """
     name = os.path.normpath(file_path.replace("\\", "/")).replace(os.sep, "/")
     parts = name.split("/")
-    if os.path.isabs(name) or ":" in parts[0]:
-        ends = ("/".join(parts[start:]) for start in range(1, len(parts)))
-        name = next((end for end in ends if (path.parent / end).is_file()), name)
+    if len(file_path) <= _MAX_PATH and (os.path.isabs(name) or ":" in parts[0]):
+        name = finder.find_end(path.parent, parts) or name
         parts = name.split("/")
     outside = os.path.isabs(name) or ":" in parts[0] or parts[:2] == ["..", ".."] or name in (".", "..")
-    if outside or not file_path.isprintable():
+    if outside or len(file_path) > _MAX_PATH or not file_path.isprintable():
         raise InputError(
             f"{path}: expected paths in the scene's folder or its parent, found {file_path[:99]!r}"
         )
     return name
 
 
-def _image_name(path: Path, file_path: str, finder: CaseInsensitiveFinder) -> str:
+def _image_name(path: Path, file_path: str, finder: Finder) -> str:
     """The name of an image as spelt on disk, with its extension added if necessary."""
-    name = _relative_path(path, file_path)
+    name = _relative_path(path, file_path, finder)
     names = (finder.find(path.parent, name + each) for each in ("", *_EXTENSIONS))
-    return next((each for each in names if os.path.isfile(path.parent / each)), name)
+    return next((each for each in names if each and os.path.isfile(path.parent / each)), name)
 
 
 def _matrix(where: str, values: object) -> Doubles:

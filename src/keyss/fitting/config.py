@@ -95,8 +95,18 @@ class FitConfig:
         return min(self.sh_degree, iteration // max(1, min(1000, self.iterations // 6)))
 
 
+_FULL = FitConfig(iterations=30_000, max_gaussians=500_000, grow_start=1 / 60, grow_stop=0.5)  # as in 3DGS
 PRESETS: dict[str, FitConfig] = {
     "quick": FitConfig(iterations=500, max_gaussians=10_000),
     "default": FitConfig(),
-    "full": FitConfig(iterations=30_000, max_gaussians=500_000, grow_start=1 / 60, grow_stop=0.5),
+    "full": _FULL,
 }
+# What people expect of 3DGS on a GPU.
+_ON_CUDA = dict.fromkeys(("default", "full"), replace(_FULL, max_gaussians=1_000_000))
+
+
+def preset_for(size: str, device: str) -> FitConfig:
+    """The settings of one of the PRESETS on a device, "cpu" or "cuda". Raises UsageError."""
+    if size not in PRESETS:
+        raise UsageError(f"preset {size!r}: expected {' or '.join(PRESETS)}")
+    return _ON_CUDA.get(size, PRESETS[size]) if device == "cuda" else PRESETS[size]

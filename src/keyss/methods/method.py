@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Protocol, Self
 
 from keyss.channels.names import AnyChannel, Format, Publish
 from keyss.core.errors import UsageError
-from keyss.fitting.config import PRESETS, FitConfig
+from keyss.fitting.config import FitConfig, preset_for
 
 if TYPE_CHECKING:  # the command line reads options without torch
     import torch
@@ -133,11 +133,9 @@ class MethodOptions:
             raise UsageError(f'`format="{self.format}"` is for models that stay as they are: leave it out')
 
     @classmethod
-    def preset(cls, size: str) -> Self:
-        """Options of one of the sizes in `keyss.fitting.config.PRESETS`. Raises UsageError."""
-        if size not in PRESETS:
-            raise UsageError(f"preset {size!r}: expected {' or '.join(PRESETS)}")
-        return cls(fit=PRESETS[size])
+    def preset(cls, size: str, device: str = "cpu") -> Self:
+        """Options of one of the presets: see `keyss.fitting.config.preset_for`."""
+        return cls(fit=preset_for(size, device))
 
     def channel_in(self, cover: Gaussians | None = None) -> Channel:
         """The channel that carries the secrets in `cover`; None: the cover is not known yet."""

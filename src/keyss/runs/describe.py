@@ -1,6 +1,6 @@
 """The verb `info`: descriptions of files and folders.
 
-What only folders need is imported for them: it takes half a second.
+Imports for a plain .ply neither torch nor what only folders need, which takes a second.
 """
 
 from __future__ import annotations
@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any, get_args
 
 from keyss.channels.names import Format
 from keyss.core.errors import InputError, UsageError
-from keyss.files.file_kinds import identify_file, model_file
+from keyss.files.file_kinds import identify_file, is_training, is_unpacked_sog, model_file
 from keyss.files.inputs import is_standard
-from keyss.files.models import is_model_source, known_suffixes, read_model
+from keyss.files.ply_summary import NEARLY_TRANSPARENT, summarise_ply
 
 _BYTES_PER_GAUSSIAN = 19  # of a hidden model, at the usual precision
 
@@ -81,11 +81,15 @@ def info(path: str | Path, *, capacity: bool = False) -> RunInfo | InterruptedRu
     try:
         if not (is_standard(path) or path.exists()):
             raise InputError(f"{path}: no such file or folder")
-        if path.is_dir() and not (capacity and is_model_source(path)):
+        if path.is_dir() and not _holds_a_model(path):
             return _folder_info(path)
         return _model_info(model_file(path), capacity)
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
+
+
+def _holds_a_model(folder: Path) -> bool:
+    return is_unpacked_sog(folder) or is_training(folder)
 
 
 def _folder_info(path: Path) -> RunInfo | InterruptedRun | ModelInfo | SceneInfo:
@@ -108,8 +112,6 @@ def _folder_info(path: Path) -> RunInfo | InterruptedRun | ModelInfo | SceneInfo
         return RunInfo("hiding", str(path), read_record(path / METRICS, HideMetrics))
     if runs := sorted(each for each in path.iterdir() if is_run(each)):
         raise InputError(f"{path} is not a run, but a folder of {len(runs)}: name one, such as {runs[0]}")
-    if is_model_source(path):
-        return _model_info(model_file(path))
     scene = load_scene(path, skip_missing=True)
     sizes = Counter(f"{view.camera.width} x {view.camera.height}" for view in scene.views)
     return SceneInfo(
@@ -137,22 +139,37 @@ def _steps_done(run: Path) -> int:
 
 
 def _model_info(path: Path, capacity: bool = False) -> ModelInfo:
+    found = None
+    if (summary := None if capacity else summarise_ply(path)) is not None:
+        count, degree, transparent = summary.gaussians, summary.sh_degree, summary.nearly_transparent
+        low, high = _round(summary.low), _round(summary.high)
+    else:
+        model = _read_model(path)
+        count, degree = len(model), model.sh_degree
+        low, high = _round(model.means.amin(0)), _round(model.means.amax(0))
+        transparent = int((model.opacity_logits < NEARLY_TRANSPARENT).sum())
+        found = tuple(_capacities(model)) if capacity else None
+    return ModelInfo(
+        kind="3DGS model",
+        path=str(path),
+        bytes=None if is_standard(path) else path.stat().st_size,
+        gaussians=count,
+        sh_degree=degree,
+        bounding_box=(low, high),
+        nearly_transparent=round(transparent / count, 4),
+        capacity=found,
+    )
+
+
+def _read_model(path: Path) -> Gaussians:
+    from keyss.files.models import is_model_source, known_suffixes, read_model
+
     if not (is_standard(path) or is_model_source(path)):
         raise InputError(
             f"{path}: expected a model ({known_suffixes()}), a scene folder or a result folder, found "
             f"{identify_file(path)}"
         )
-    model = read_model(path)
-    return ModelInfo(
-        kind="3DGS model",
-        path=str(path),
-        bytes=None if is_standard(path) else path.stat().st_size,
-        gaussians=len(model),
-        sh_degree=model.sh_degree,
-        bounding_box=(_round(model.means.amin(0)), _round(model.means.amax(0))),
-        nearly_transparent=round(float((model.opacities < 0.05).double().mean()), 4),
-        capacity=tuple(_capacities(model)) if capacity else None,
-    )
+    return read_model(path)
 
 
 def _capacities(model: Gaussians) -> Iterator[str]:

@@ -1,16 +1,30 @@
-/** Reed-Solomon decoder over GF(2^16) for erasures and errors; counterpart of `keyss.channels.reed_solomon`. */
+/**
+ * Reed-Solomon decoder over GF(2^16) for erasures and errors; counterpart of `keyss.channels.reed_solomon`, which explains
+ * the method.
+ */
 import { tooMuchLost } from '../core/errors.ts';
 
 const ORDER = 65535; // of the generator 2
-const ZERO = 4 * ORDER; // logarithm of 0; POWERS of its sums with others are 0
+const ZERO = 2 * ORDER; // logarithm of 0; POWERS of its sums with others are 0
+const MAX_CHUNKS = 1 << 13; // per codeword
 const MAX_ERRORS = 128; // per codeword
+const COLUMNS = 64; // of all codewords in a line, restored at a time
 
 const POWERS = new Uint16Array(2 * ZERO + 1);
 const LOGARITHMS = new Uint32Array(ORDER + 1).fill(ZERO);
 for (let exponent = 0, value = 1; exponent < ORDER; exponent++) {
-  for (let at = exponent; at < ZERO - ORDER; at += ORDER) POWERS[at] = value;
+  POWERS[exponent] = POWERS[exponent + ORDER] = value;
   LOGARITHMS[value] = exponent;
   value = (value << 1) ^ (value >> 15 ? 0x1100b : 0);
+}
+
+/** Field elements by index: sums of a Cantor basis. */
+const POINTS = new Uint16Array(2 * MAX_CHUNKS);
+for (let size = 1, basis = 1; size < POINTS.length; size *= 2) {
+  for (let at = 0; at < size; at++) POINTS[size + at] = POINTS[at] ^ basis;
+  let root = 0;
+  while ((product(root, root) ^ root) !== basis) root++;
+  basis = root;
 }
 
 function product(a: number, b: number): number {
@@ -28,11 +42,8 @@ export interface Codewords {
   readonly width: number;
 }
 
-/** A chunk of a codeword: values of polynomials at the field element `point`. */
-interface Chunk {
-  readonly point: number;
-  readonly bytes: Uint8Array;
-}
+/** Chunks [n], null if lost, of one codeword. */
+type Chunks = (Uint8Array | null)[];
 
 /**
  * The data from numbered chunks in any order. `errors`: some chunks may be wrong. Raises InputError for too few chunks.
@@ -48,92 +59,165 @@ export function decoded(
   }
   if (left.size < count * k) throw tooMuchLost(); // before allocating
   const data = new Uint8Array(count * k * width);
-  const products = differences(pointsOf(n), pointsOf(n));
+  const incomplete: { chunks: Chunks; codeword: number }[] = [];
   for (let codeword = 0; codeword < count; codeword++) {
-    let own: Chunk[] = [];
-    for (let row = 0; row < n; row++) {
-      const bytes = left.get(row * count + codeword);
-      if (bytes) own.push({ point: row + 1, bytes });
+    const own: Chunks = Array.from({ length: n }, (_, row) => left.get(row * count + codeword) ?? null);
+    if (errors) dropErrors(own, k);
+    if (own.reduce((sum, each) => sum + (each ? 1 : 0), 0) < k) throw tooMuchLost();
+    for (let row = 0; row < k; row++) {
+      const chunk = own[row];
+      if (chunk) data.set(chunk, (row * count + codeword) * width);
     }
-    if (errors && own.length > k) own = rightOf(own, k, products);
-    if (own.length < k) throw tooMuchLost();
-    own = own.slice(0, k);
-    const put = (point: number, row: Uint8Array) => data.set(row, ((point - 1) * count + codeword) * width);
-    const known = new Set(own.map(({ point }) => point));
-    own.filter(({ point }) => point <= k).forEach(({ point, bytes }) => put(point, bytes));
-    const lost = pointsOf(k).filter((point) => !known.has(point));
-    if (lost.length) interpolated(own, lost, products).forEach((row, index) => put(lost[index], row));
+    if (own.indexOf(null) >= 0 && own.indexOf(null) < k) incomplete.push({ chunks: own, codeword });
+  }
+  const atOnce = Math.max(1, Math.floor((2 * COLUMNS) / width));
+  for (let first = 0; first < incomplete.length; first += atOnce) {
+    const some = incomplete.slice(first, first + atOnce);
+    restore(some.map((each) => each.chunks), k, width / 2, (own, row, chunk) => {
+      data.set(chunk, (row * count + some[own].codeword) * width);
+    });
   }
   return data;
 }
 
-/** 1 to `count`. */
-function pointsOf(count: number): number[] {
-  return Array.from({ length: count }, (_, row) => row + 1);
-}
-
-/** The chunks at the `wanted` points, interpolated from k chunks of a codeword; see `scaled`. */
-function interpolated(chunks: Chunk[], wanted: number[], products: Uint32Array): Uint8Array[] {
-  const [points, values] = [chunks.map(({ point }) => point), scaled(chunks, products)];
-  const columns = values.length / points.length;
-  const outside = differences(wanted, points);
-  return wanted.map((at, index) => {
-    const sums = new Uint16Array(columns);
-    points.forEach((point, row) => {
-      const factor = outside[index] + ORDER - LOGARITHMS[at ^ point];
-      for (let column = 0; column < columns; column++) sums[column] ^= POWERS[factor + values[row * columns + column]];
+/** Calls `put` with every lost one of the first k chunks of some codewords of `columns` symbols. */
+function restore(
+  codewords: Chunks[], k: number, columns: number, put: (codeword: number, row: number, chunk: Uint8Array) => void,
+): void {
+  const size = sizeFor(codewords[0].length);
+  const width = columns * codewords.length;
+  const work = new Uint16Array(size * width);
+  const products = codewords.map((chunks, codeword) => {
+    const found = differences(size, (row) => !chunks[row]);
+    chunks.forEach((chunk, row) => {
+      if (!chunk) return;
+      for (let column = 0, to = row * width + codeword * columns; column < columns; column++) {
+        work[to + column] = POWERS[found[row] + LOGARITHMS[(chunk[2 * column] << 8) | chunk[2 * column + 1]]];
+      }
     });
-    return Uint8Array.from({ length: 2 * columns }, (_, byte) => (sums[byte >> 1] >> (byte & 1 ? 0 : 8)) & 255);
+    return found;
   });
-}
-
-/**
- * [C, columns] logarithms of the chunks' symbols divided by the product of their points' differences. `products`: the
- * `differences` of all points of the codeword, to be divided by those of the few missing ones.
- */
-function scaled(chunks: Chunk[], products: Uint32Array): Uint32Array {
-  const points = chunks.map(({ point }) => point);
-  const columns = chunks[0].bytes.length / 2;
-  const found = new Uint32Array(chunks.length * columns);
-  const own = new Set(points);
-  const missing = differences(points, pointsOf(products.length).filter((point) => !own.has(point)));
-  chunks.forEach(({ bytes }, row) => {
-    for (let column = 0; column < columns; column++) {
-      const symbol = LOGARITHMS[(bytes[2 * column] << 8) | bytes[2 * column + 1]];
-      found[row * columns + column] = symbol === ZERO ? ZERO : (symbol + missing[row] + ORDER - products[points[row] - 1]) % ORDER;
+  toCoefficients(work, size, width);
+  differentiate(work, size, width);
+  toValues(work, size, width);
+  codewords.forEach((chunks, codeword) => {
+    for (let row = 0; row < k; row++) {
+      if (chunks[row]) continue;
+      const chunk = new Uint8Array(2 * columns);
+      for (let column = 0, from = row * width + codeword * columns; column < columns; column++) {
+        const symbol = POWERS[ORDER - products[codeword][row] + LOGARITHMS[work[from + column]]];
+        chunk[2 * column] = symbol >> 8;
+        chunk[2 * column + 1] = symbol & 255;
+      }
+      put(codeword, row, chunk);
     }
   });
-  return found;
 }
 
-/** Logarithms of the products of differences to all other `points`. */
-function differences(at: number[], points: number[]): Uint32Array {
-  const others = Uint16Array.from(points);
-  return Uint32Array.from(at, (own) => {
-    let sum = 0; // exact: at most 2^16 logarithms of 2^16
-    for (const each of others) if (each !== own) sum += LOGARITHMS[own ^ each];
+/** The size of FFTs for `n` points, a power of two. */
+function sizeFor(n: number): number {
+  let size = 1;
+  while (size < n) size *= 2;
+  return size;
+}
+
+/** [size] logarithms of the products of a point's differences to all other marked ones. */
+function differences(size: number, isMarked: (row: number) => boolean): Uint32Array {
+  const marked: number[] = [];
+  for (let row = 0; row < size; row++) if (isMarked(row)) marked.push(row);
+  return Uint32Array.from({ length: size }, (_, at) => {
+    let sum = 0; // exact: at most 2^13 logarithms of 2^16
+    for (const each of marked) if (each !== at) sum += LOGARITHMS[POINTS[at ^ each]];
     return sum % ORDER;
   });
 }
 
-/** The chunks that belong to the codeword, given more than k; none if there are too many errors. */
-function rightOf(chunks: Chunk[], k: number, products: Uint32Array): Chunk[] {
-  const values = scaled(chunks, products);
-  const columns = values.length / chunks.length;
-  const terms = chunks.map((_, row) => {
-    let sum = 0;
-    for (let column = 0; column < columns; column++) sum ^= POWERS[values[row * columns + column] + column];
-    return LOGARITHMS[sum];
-  });
-  const powers = chunks.map(({ point }) => LOGARITHMS[point]);
-  const sums = Array.from({ length: Math.min(chunks.length - k, 2 * MAX_ERRORS) }, (_, time) =>
-    powers.reduce((sum, power, row) => sum ^ POWERS[terms[row] + ((time * power) % ORDER)], 0),
-  );
-  const locator = sums.some((each) => each !== 0) ? recurrence(sums) : [1];
-  return chunks.filter((_, row) => {
-    const inverse = ORDER - powers[row];
-    return locator.reduce((sum, each, power) => sum ^ POWERS[LOGARITHMS[each] + ((power * inverse) % ORDER)], 0) !== 0;
-  });
+const LOWER = new Uint16Array(256); // products of bytes of a symbol with a twiddle factor
+const UPPER = new Uint16Array(256);
+
+/** Adds the products of row `from` and a twiddle factor to row `to`. */
+function addProducts(work: Uint16Array, to: number, from: number, width: number): void {
+  for (let at = 0; at < width; at++) {
+    const symbol = work[from + at];
+    work[to + at] ^= LOWER[symbol & 255] ^ UPPER[symbol >> 8];
+  }
+}
+
+function add(work: Uint16Array, to: number, from: number, width: number): void {
+  for (let at = 0; at < width; at++) work[to + at] ^= work[from + at];
+}
+
+function prepare(factor: number): void {
+  const logarithm = LOGARITHMS[factor];
+  for (let byte = 0; byte < 256; byte++) {
+    LOWER[byte] = POWERS[logarithm + LOGARITHMS[byte]];
+    UPPER[byte] = POWERS[logarithm + LOGARITHMS[byte << 8]];
+  }
+}
+
+/** From values at POINTS to coefficients in the basis of Lin, Chung and Han: an inverse FFT of each column. */
+function toCoefficients(work: Uint16Array, size: number, width: number): void {
+  for (let half = 1; half < size; half *= 2) {
+    for (let start = 0; start < size; start += 2 * half) {
+      prepare(POINTS[start / half]);
+      for (let row = start; row < start + half; row++) {
+        add(work, (row + half) * width, row * width, width);
+        addProducts(work, row * width, (row + half) * width, width);
+      }
+    }
+  }
+}
+
+/** Inverts `toCoefficients`. */
+function toValues(work: Uint16Array, size: number, width: number): void {
+  for (let half = size / 2; half >= 1; half /= 2) {
+    for (let start = 0; start < size; start += 2 * half) {
+      prepare(POINTS[start / half]);
+      for (let row = start; row < start + half; row++) {
+        addProducts(work, row * width, (row + half) * width, width);
+        add(work, (row + half) * width, row * width, width);
+      }
+    }
+  }
+}
+
+/** From coefficients to those of the derivative. */
+function differentiate(work: Uint16Array, size: number, width: number): void {
+  for (let row = 0; row < size; row++) {
+    work.fill(0, row * width, (row + 1) * width);
+    for (let half = 1; half < size; half *= 2) {
+      if (!(row & half)) add(work, row * width, (row + half) * width, width);
+    }
+  }
+}
+
+/** Sets chunks to null that do not belong to the codeword of the majority; all if there are too many errors. */
+function dropErrors(chunks: Chunks, k: number): void {
+  const rows = chunks.flatMap((chunk, row) => (chunk ? [row] : []));
+  if (rows.length <= k) return;
+  const products = differences(sizeFor(chunks.length), (row) => Boolean(chunks[row]));
+  const powers = rows.map((row) => LOGARITHMS[POINTS[MAX_CHUNKS + row]]); // none is zero
+  const left = [...chunks];
+  for (const step of [1, 2]) {
+    const terms = rows.map((row) => {
+      const chunk = left[row]!;
+      let sum = 0;
+      for (let column = 0; 2 * column < chunk.length; column++) {
+        const symbol = (chunk[2 * column] << 8) | chunk[2 * column + 1];
+        sum ^= POWERS[LOGARITHMS[symbol] + ((step * column + ORDER - products[row]) % ORDER)];
+      }
+      return LOGARITHMS[sum];
+    });
+    const sums = Array.from({ length: Math.min(rows.length - k, 2 * MAX_ERRORS) }, (_, time) =>
+      powers.reduce((sum, power, at) => sum ^ POWERS[terms[at] + ((time * power) % ORDER)], 0),
+    );
+    const locator = sums.some((each) => each !== 0) ? recurrence(sums) : [1];
+    rows.forEach((row, at) => {
+      const inverse = ORDER - powers[at];
+      const located = locator.reduce((sum, each, power) => sum ^ POWERS[LOGARITHMS[each] + ((power * inverse) % ORDER)], 0);
+      if (located === 0) chunks[row] = null;
+    });
+  }
 }
 
 /** Coefficients, 1 first, of the shortest linear recurrence of a sequence (Berlekamp-Massey). */

@@ -2,16 +2,21 @@
 import { damaged } from '../core/errors.ts';
 
 const MOST = 31; // bits of a difference
-const CONTEXTS = 16; // for the number of bits; one more for the first bit
+const CONTEXTS = 48; // expected numbers of bits, in thirds; one more for the first bit
 const [FAST, SLOW] = [4, 7]; // adaptation shifts
+const FLAT = 12; // bits of equal probability at once
 
 /** Decodes bits by adaptive probabilities of 0: the mean of a fast and a slow estimate, in 65,536ths. */
 class Decoder {
   private at = 0;
   private place = 0;
   private range = 0xffffffff;
+  private readonly fast: Uint16Array;
+  private readonly slow: Uint16Array;
 
-  constructor(private readonly data: Uint8Array, private readonly chances: Uint16Array) {
+  constructor(private readonly data: Uint8Array, chances: number) {
+    this.fast = new Uint16Array(chances).fill(1 << 15);
+    this.slow = new Uint16Array(chances).fill(1 << 15);
     for (let byte = 0; byte < 4; byte++) this.next();
   }
 
@@ -20,30 +25,39 @@ class Decoder {
   }
 
   get beyond(): boolean {
-    return this.at > this.data.length + 4;
-  }
-
-  /** A bit of probability 1/2. */
-  bit(): number {
-    return this.within(this.range >>> 1);
+    return this.at >= this.data.length + 4;
   }
 
   /** A bit by the adaptive probability at an index. */
-  likelyBit(chance: number): number {
-    const { chances } = this;
-    const [fast, slow] = [2 * chance, 2 * chance + 1];
-    const bit = this.within((this.range >>> 12) * ((chances[fast] + chances[slow]) >> 5));
-    chances[fast] += bit ? -(chances[fast] >> FAST) : (65536 - chances[fast]) >> FAST;
-    chances[slow] += bit ? -(chances[slow] >> SLOW) : (65536 - chances[slow]) >> SLOW;
-    return bit;
+  bit(chance: number): number {
+    const [fast, slow] = [this.fast[chance], this.slow[chance]];
+    const bound = (this.range >>> 12) * ((fast + slow) >> 5);
+    if (this.place < bound) {
+      this.range = bound;
+      this.fast[chance] = fast + ((65536 - fast) >> FAST);
+      this.slow[chance] = slow + ((65536 - slow) >> SLOW);
+      this.normalise();
+      return 0;
+    }
+    this.place -= bound;
+    this.range -= bound;
+    this.fast[chance] = fast - (fast >> FAST);
+    this.slow[chance] = slow - (slow >> SLOW);
+    this.normalise();
+    return 1;
   }
 
-  private within(bound: number): number {
-    const bit = this.place < bound ? 0 : 1;
-    if (bit) this.place -= bound;
-    this.range = bit ? this.range - bound : bound;
+  /** Up to FLAT bits of probability 1/2. */
+  bits(count: number): number {
+    this.range >>>= count;
+    const found = Math.min(Math.floor(this.place / this.range), (1 << count) - 1);
+    this.place -= found * this.range;
+    this.normalise();
+    return found;
+  }
+
+  private normalise(): void {
     for (; this.range < 2 ** 24; this.range *= 256) this.next();
-    return bit;
   }
 
   private next(): void {
@@ -57,21 +71,31 @@ class Decoder {
  */
 export function decodeTable(data: Uint8Array, count: number, shares: number[], groups: number[]): Int32Array[] {
   const ofGroup = (CONTEXTS + 1) * (MOST + 1);
-  const decoder = new Decoder(data, new Uint16Array(2 * ofGroup * (Math.max(...groups) + 1)).fill(1 << 15));
+  const decoder = new Decoder(data, ofGroup * (Math.max(...groups) + 1));
   const table = shares.map(() => new Int32Array(count));
-  const sizes = new Int32Array(shares.length);
+  const [before, sizes] = [new Int32Array(shares.length), new Int32Array(shares.length)];
   for (let row = 0; row < count && !decoder.beyond; row++) {
     let lately = 0;
     for (let column = 0; column < shares.length; column++) {
       const first = groups[column] * ofGroup;
-      const own = first + (MOST + 1) * Math.min(CONTEXTS - 1, (sizes[column] + lately) >> 2);
-      let size = 0;
-      while (size < MOST && decoder.likelyBit(own + size)) size++;
-      const negative = size > 0 && decoder.bit();
-      let value = size > 1 ? 2 + decoder.likelyBit(first + (MOST + 1) * CONTEXTS + size) : size;
-      for (let more = size - 2; more > 0; more--) value = 2 * value + decoder.bit();
-      const before = row ? table[column][row - 1] : 0;
-      table[column][row] = Math.floor((shares[column] * before) / 8) + (negative ? -value : value);
+      const context = Math.min(CONTEXTS - 1, (sizes[column] + lately) >> 2);
+      const own = first + (MOST + 1) * context;
+      let size = Math.floor(context / 3);
+      if (decoder.bit(own + size)) {
+        size++;
+        while (size < MOST && decoder.bit(own + size)) size++;
+      } else while (size > 0 && !decoder.bit(own + size - 1)) size--;
+      let difference = 0;
+      if (size > 0) {
+        let value = size > 1 ? 2 + decoder.bit(first + (MOST + 1) * CONTEXTS + size) : 1;
+        let left = size - 2;
+        for (; left > FLAT - 1; left -= FLAT) value = value * 2 ** FLAT + decoder.bits(FLAT);
+        const last = decoder.bits(1 + Math.max(0, left)); // the other bits, and the sign
+        value = value * 2 ** Math.max(0, left) + (last >> 1);
+        difference = last & 1 ? -value : value;
+      }
+      before[column] = Math.floor((shares[column] * before[column]) / 8) + difference;
+      table[column][row] = before[column];
       sizes[column] += (4 * size - sizes[column] + 1) >> 1;
       lately += (8 * size - lately + 2) >> 2;
     }

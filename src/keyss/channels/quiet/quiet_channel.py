@@ -57,7 +57,7 @@ from keyss.channels.quiet.quiet_header import (
     LowBitsCapacity,
     check_width,
 )
-from keyss.channels.quiet.usable import check_usable, salt, salt_rows, usable_with_ids
+from keyss.channels.quiet.usable import check_sample, check_usable, salt, salt_rows, usable_with_ids
 from keyss.channels.quiet.writable_levels import fixed_axes, writable_levels
 from keyss.core.arrays import Bits, Bytes, Flags, Integers
 from keyss.core.errors import UsageError
@@ -90,6 +90,7 @@ class LowBits(Channel):
         layout, versions = Layout.of(cover), _versions(cover)
         check_width(layout)
         if (found := self._found.get(cover)) is None or found[0] != versions:
+            check_sample(cover)
             usable, ids = usable_with_ids(cover, layout)
             check_usable(cover, usable, layout)
             rows = salt_rows(cover, ids, layout)

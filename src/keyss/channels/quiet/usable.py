@@ -98,6 +98,7 @@ _EXACT = 1e-6  # error of the length of a unit quaternion in single precision
 # Maximum expected number of sets of equal values by chance.
 _SETS_BY_CHANCE = 0.1
 _SAMPLE = 20_000  # Gaussians whose bits are tested
+_LARGE = 10 * _SAMPLE  # Gaussians of a cover whose sample is tested first
 _CHANCE = 1e-6  # probability of refusing a model with uniform bits
 
 
@@ -138,11 +139,31 @@ def usable_with_ids(gaussians: Gaussians, layout: Layout) -> tuple[Flags, Bytes]
     return usable, ids
 
 
+def check_sample(gaussians: Gaussians) -> None:
+    """Raise the UsageError of `check_usable` for a large cover if its sample alone is refused.
+
+    Which Gaussians are usable takes a second per 100,000. More of them are in the sample, as fewer repeat.
+    """
+    if len(gaussians) > _LARGE:
+        sample = gaussians[:: len(gaussians) // _SAMPLE]
+        layout = Layout.of(sample)
+        _check_bits(sample, usable_with_ids(sample, layout)[0], layout)
+
+
 def check_usable(gaussians: Gaussians, usable: Flags, layout: Layout) -> None:
     """Raise UsageError unless half of the Gaussians are `usable` [N], and their low bits uniform.
 
     Tested on at most 20,000 Gaussians: see `chance_of_bits` and `chance_of_equal_steps`.
     """
+    _check_bits(gaussians, usable, layout)
+    if chance_of_equal_steps(gaussians, usable) < _CHANCE:
+        raise UsageError(
+            f"harmonics of this cover tell each other's low bits (p < {_CHANCE:g}), and new bits would be "
+            "seen: training saw most Gaussians from one direction"
+        )
+
+
+def _check_bits(gaussians: Gaussians, usable: Flags, layout: Layout) -> None:
     share = float(usable.mean()) if len(usable) else 0.0
     if share < _MIN_USABLE:
         raise UsageError(
@@ -158,11 +179,6 @@ def check_usable(gaussians: Gaussians, usable: Flags, layout: Layout) -> None:
                 f"the low bits of {name} in this cover are not random (p < {_CHANCE:g}), and nothing can be "
                 "hidden in them: the cover was quantised, scaled or moved after its training"
             )
-    if chance_of_equal_steps(gaussians, usable) < _CHANCE:
-        raise UsageError(
-            f"harmonics of this cover tell each other's low bits (p < {_CHANCE:g}), and new bits would be "
-            "seen: training saw most Gaussians from one direction"
-        )
 
 
 def chance_of_bits(words: Words32, bits: int) -> float:

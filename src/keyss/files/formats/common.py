@@ -4,20 +4,23 @@ from __future__ import annotations
 
 import warnings
 from abc import ABC, abstractmethod
+from collections.abc import Iterable, Iterator
 from dataclasses import fields, replace
 from typing import ClassVar, Self
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from keyss.core.arrays import Bytes, Doubles, Floats, Integers, Numbers, Words
 from keyss.core.errors import InputError, KeyssWarning, OutputError
 from keyss.core.gaussians import SH_C0, Gaussians
 from keyss.files.ply_table import OPACITY_LOGIT_BOUND
 
-# A compressed file of more Gaussians than SMALL_COUNT must have MIN_BYTES for each; published models take at
-# least 7.
+# A compressed file of more Gaussians than SMALL_COUNT must have at least MIN_BYTES for each. Published models
+# take 7 and more, with harmonics of degree 3 10 and more.
 SMALL_COUNT, MIN_BYTES = 1 << 17, 6
+BLOCK = 1 << 14  # Gaussians converted at a time, a multiple of the chunks of compressed .ply
 _MORTON_BITS = 21  # per axis
 _SORTED = 0.9  # minimum share of ascending neighbours
 
@@ -53,8 +56,12 @@ class Codes(ABC):
         """The codes nearest to a model, in its order. Raises OutputError for values out of range."""
 
     @abstractmethod
+    def decode_part(self, part: slice) -> Gaussians:
+        """Some of the Gaussians, in the frame of a .ply; `part` is one of `blocks_of`."""
+
     def dequantise(self) -> Gaussians:
         """The model in the frame of a .ply. Raises InputError if it is not finite."""
+        return assembled(len(self), map(self.decode_part, blocks_of(len(self))))
 
     @classmethod
     def of(cls, model: Gaussians) -> Self:
@@ -100,11 +107,14 @@ def reason(error: Exception) -> str:
     return str(error)[:200]
 
 
-def check_count(count: int, size: int) -> None:
-    """Raise InputError if a compressed file of `size` bytes cannot hold `count` Gaussians, or holds none."""
+def check_count(count: int, size: int, least: float = MIN_BYTES) -> None:
+    """Raise InputError if a compressed file of `size` bytes cannot hold `count` Gaussians, or holds none.
+
+    `least`: bytes of a Gaussian, so that its values in memory are a bounded multiple.
+    """
     if count < 1:
         raise InputError("it holds no Gaussians")
-    if count > max(SMALL_COUNT, size // MIN_BYTES):
+    if count > max(SMALL_COUNT, size / least):
         raise InputError(f"it announces {count:,} Gaussians, more than {size:,} bytes hold")
 
 
@@ -122,33 +132,51 @@ def gaussians_of(
     opacities: Numbers,  # [N] in [0, 1]
     colors: Numbers,  # [N, 3], f_dc
     rest: Numbers,  # [N, K - 1, 3], the other harmonics
-    *,
-    drop: bool = False,
 ) -> Gaussians:
-    """A model from arrays. Raises InputError for values that are not finite in single precision.
-
-    `drop`: leaves out Gaussians with such values, with a KeyssWarning, unless none would remain.
-    """
+    """A model from arrays. Values that are not finite in single precision become infinite or NaN."""
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         sh = np.empty((len(rest), 1 + rest.shape[1], 3), np.float32)
         sh[:, 0], sh[:, 1:] = colors, rest
         share = np.asarray(opacities, dtype=np.float64)
         logits = (np.log(share) - np.log1p(-share)).clip(-OPACITY_LOGIT_BOUND, OPACITY_LOGIT_BOUND)
         parts = (means, quats, log_scales, logits, sh)
-        model = Gaussians(*(torch.from_numpy(np.require(each, np.float32, ["C", "W"])) for each in parts))
-    if not (wrong := _not_finite(model)):
-        return model
-    columns = [getattr(model, each.name).reshape(len(model), -1) for each in fields(model)]
-    finite = torch.cat(columns, dim=1).isfinite().all(1)
-    if not (drop and finite.any()):
+        return Gaussians(*(torch.from_numpy(np.require(each, np.float32, ["C", "W"])) for each in parts))
+
+
+def blocks_of(count: int) -> Iterator[slice]:
+    """Slices of at most BLOCK that cover `count` Gaussians."""
+    return (slice(start, min(start + BLOCK, count)) for start in range(0, count, BLOCK))
+
+
+def assembled(count: int, blocks: Iterable[Gaussians], *, drop: bool = False) -> Gaussians:
+    """A model of `count` Gaussians in blocks, which take memory one at a time.
+
+    Raises InputError for values that are not finite. `drop`: leaves out Gaussians with such values, with a
+    KeyssWarning, unless none would remain.
+    """
+    whole: list[Tensor] = []
+    wrong: dict[str, None] = {}  # an ordered set
+    end = 0
+    for block in blocks:
+        if found := _not_finite(block):
+            wrong |= dict.fromkeys(found)
+            columns = [getattr(block, each.name).reshape(len(block), -1) for each in fields(block)]
+            block = block[torch.cat(columns, dim=1).isfinite().all(1)]
+        parts = [getattr(block, each.name) for each in fields(block)]
+        whole = whole or [each.new_empty((count, *each.shape[1:])) for each in parts]
+        for own, part in zip(whole, parts, strict=True):
+            own[end : end + len(part)] = part
+        end += len(block)
+    if wrong and not (drop and end):
         raise InputError(f"NaN or infinite values in {', '.join(wrong)}")
-    warnings.warn(
-        f"{int((~finite).sum()):,} of {len(model):,} Gaussians are left out: they have NaN or infinite "
-        f"values ({', '.join(wrong)})",
-        KeyssWarning,
-        stacklevel=2,
-    )
-    return model[finite]
+    if end < count:
+        warnings.warn(
+            f"{count - end:,} of {count:,} Gaussians are left out: they have NaN or infinite values "
+            f"({', '.join(wrong)})",
+            KeyssWarning,
+            stacklevel=2,
+        )
+    return Gaussians(*(each[:end] for each in whole))
 
 
 def _not_finite(model: Gaussians) -> list[str]:

@@ -132,17 +132,18 @@ class CompressedPlyCodes(Codes):
             sh=to_bytes(np.trunc((rest.astype(np.float64) / 8 + 0.5) * 256)),
         )
 
-    def dequantise(self) -> Gaussians:
-        bounds = self.bounds.astype(np.float64).repeat(CHUNK, axis=0)[: len(self)].reshape(-1, 3, 2, 3)
+    def decode_part(self, part: slice) -> Gaussians:
+        chunks = self.bounds[part.start // CHUNK : -(-part.stop // CHUNK)].astype(np.float64)
+        bounds = chunks.repeat(CHUNK, axis=0)[: part.stop - part.start].reshape(-1, 3, 2, 3)
         steps = 2.0 ** np.array(VECTOR) - 1
-        rotations = (self.rotations / 1023 - 0.5) * np.sqrt(2)
-        harmonics = np.where(self.sh == 0, 0.0, np.where(self.sh == 255, 256.0, self.sh + 0.5))
+        rotations, sh = (self.rotations[part] / 1023 - 0.5) * np.sqrt(2), self.sh[part]
+        harmonics = np.where(sh == 0, 0.0, np.where(sh == 255, 256.0, sh + 0.5))
         return gaussians_of(
-            _lerp(bounds[:, 0], self.positions / steps),
-            from_smallest_three(self.largest, rotations),
-            _lerp(bounds[:, 1], self.scales / steps),
-            self.alphas / 255,
-            f_dc_of(_lerp(bounds[:, 2], self.colors / 255)),
+            _lerp(bounds[:, 0], self.positions[part] / steps),
+            from_smallest_three(self.largest[part], rotations),
+            _lerp(bounds[:, 1], self.scales[part] / steps),
+            self.alphas[part] / 255,
+            f_dc_of(_lerp(bounds[:, 2], self.colors[part] / 255)),
             harmonics / 32 - 4,
         )
 

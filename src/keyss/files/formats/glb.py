@@ -12,8 +12,9 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Iterable, Iterator
-from dataclasses import fields
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from functools import reduce
 from typing import Any
 
 import msgspec
@@ -28,6 +29,8 @@ from keyss.core.similarity import Similarity
 from keyss.files.file_kinds import FIT
 from keyss.files.formats.common import (
     arrays_of,
+    assembled,
+    blocks_of,
     colour_bytes,
     gaussians_of,
     log_scales_of,
@@ -47,8 +50,8 @@ _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 _TURN = (0.0, 0.0, 1.0, 0.0)  # 180 degrees about z, xyzw
 _MAX_JSON_BYTES = 1 << 20  # parsed, JSON takes up to 80 times as much memory
 _MAX_DEPTH = 64  # nested nodes
-_MAX_PARTS = 64  # primitives with Gaussians
-_REPEATED = "damaged glTF: the same Gaussians over and over"
+_MAX_PARTS = 64  # primitives with Gaussians, each counted once per node
+_VALUES_PER_BYTE = 4  # of all Gaussians; more where attributes share bytes, or nodes a mesh
 
 
 class _Accessor(msgspec.Struct, omit_defaults=True):
@@ -112,24 +115,25 @@ def read(data: bytes) -> Gaussians:
     Raises InputError, also for files without Gaussians or with compressed ones.
     """
     document, binary = _chunks(data)
-    parts: list[Gaussians] = []
-    room = len(data)  # values left to read, at a byte or more each, counted once per node
-    for to_scene, mesh in _meshes(document):
-        for primitive in mesh.primitives:
-            if EXTENSION not in primitive.extensions:
-                continue
-            if len(parts) == _MAX_PARTS:
-                raise InputError(_REPEATED)
-            model = _gaussians(document, primitive, binary, room)
-            room -= sum(getattr(model, each.name).numel() for each in fields(model))
-            parts.append(_to_ply_frame(model, to_scene))
+    parts = [
+        (to_scene, _attributes(document, primitive, binary)) for to_scene, primitive in _instances(document)
+    ]
     if not parts:
         _refuse_compressed(name for name in document.extensionsUsed if "spz" in name.lower())
         raise InputError(
             f"a glTF file without Gaussians, such as a mesh: nothing in its scene has {EXTENSION}; {FIT}"
         )
-    degree = max(part.sh_degree for part in parts)
-    return Gaussians.cat([part.with_sh_degree(degree) for part in parts])
+    count = sum(len(attributes) for _, attributes in parts)
+    degree = max(attributes.sh_degree for _, attributes in parts)
+    if count * (11 + 3 * (degree + 1) ** 2) > _VALUES_PER_BYTE * len(data):
+        raise InputError("damaged glTF: the same Gaussians over and over")
+    blocks = (
+        move(attributes.gaussians(part)).with_sh_degree(degree)
+        for to_scene, attributes in parts
+        for move in [_to_ply_frame(to_scene)]
+        for part in blocks_of(len(attributes))
+    )
+    return assembled(count, blocks, drop=True)
 
 
 def write(model: Gaussians) -> bytes:
@@ -192,14 +196,14 @@ def _refuse_compressed(extensions: Iterable[str]) -> None:
         )
 
 
-def _chunks(data: bytes) -> tuple[_Document, bytes]:
+def _chunks(data: bytes) -> tuple[_Document, memoryview]:
     """The JSON and the binary chunk of a file."""
     if len(data) < _HEADER.size or not data.startswith(_MAGIC):
         raise InputError("not a .glb: it does not begin with glTF")
     _, version, size = _HEADER.unpack_from(data)
     if version != 2 or size > len(data):
         raise InputError("not a whole .glb of glTF 2.0")
-    chunks: list[bytes] = []
+    chunks: list[memoryview] = []
     at = _HEADER.size
     for kind in (_JSON, _BIN):
         start = at + _CHUNK.size
@@ -207,7 +211,7 @@ def _chunks(data: bytes) -> tuple[_Document, bytes]:
         at = start + length
         if name != kind or at > len(data):
             raise InputError("not a whole .glb: a chunk is missing, cut short, or out of place")
-        chunks.append(data[start:at])
+        chunks.append(memoryview(data)[start:at])
     if len(chunks[0]) > _MAX_JSON_BYTES:
         raise InputError(f"expected JSON of at most {_MAX_JSON_BYTES:,} bytes, found {len(chunks[0]):,}")
     try:
@@ -216,24 +220,36 @@ def _chunks(data: bytes) -> tuple[_Document, bytes]:
         raise InputError(f"cannot parse the JSON of the .glb: {reason(error)}") from error
 
 
-def _meshes(document: _Document) -> Iterator[tuple[Doubles, _Mesh]]:
-    """The meshes of the scene, each with its transform [4, 4] to the scene's coordinates."""
+def _instances(document: _Document) -> Iterator[tuple[Doubles, _Primitive]]:
+    """The primitives of Gaussians in the scene, each with its transform [4, 4] to the scene's coordinates."""
+    splats = [[each for each in mesh.primitives if EXTENSION in each.extensions] for mesh in document.meshes]
     try:
         roots = range(len(document.nodes))
         if document.scenes:
             roots = document.scenes[document.scene or 0].get("nodes", [])
-        stack = [(index, np.eye(4), 0) for index in roots if isinstance(index, int)]
+        # Nodes with those above them, which transform only what has Gaussians.
+        stack: list[tuple[int, tuple[_Node, ...]]] = [
+            (index, ()) for index in roots if isinstance(index, int)
+        ]
         visited: set[int] = set()
+        left = _MAX_PARTS
         while stack:
-            index, above, depth = stack.pop()
-            if index in visited or depth > _MAX_DEPTH or index < 0:
+            index, above = stack.pop()
+            if index in visited or len(above) > _MAX_DEPTH or index < 0:
                 raise InputError("damaged glTF: its nodes are not a tree")
             visited.add(index)
             node = document.nodes[index]
-            here = above @ _transform(node)
-            stack += [(child, here, depth + 1) for child in node.children]
-            if node.mesh is not None:
-                yield here, document.meshes[node.mesh]
+            path = (*above, node)
+            stack += [(child, path) for child in node.children]
+            own = [] if node.mesh is None else splats[node.mesh]
+            left -= len(own)
+            if left < 0:
+                raise InputError(
+                    f"expected at most {_MAX_PARTS} groups of Gaussians in a glTF file, found more"
+                )
+            if own:
+                to_scene = reduce(np.matmul, map(_transform, path))
+                yield from ((to_scene, primitive) for primitive in own)
     except (IndexError, TypeError) as error:
         raise InputError("damaged glTF: it refers to a missing part") from error
 
@@ -255,35 +271,77 @@ def _transform(node: _Node) -> Doubles:
     return transform
 
 
-def _gaussians(document: _Document, primitive: _Primitive, binary: bytes, room: int) -> Gaussians:
-    """The Gaussians of a primitive in its own coordinates, at most `room` values."""
+@dataclass(frozen=True)
+class _Values:
+    """The values [N, width] of an accessor, which stay in the file until they are taken."""
+
+    stored: Numbers
+    normalized: bool  # integers stand for shares of the largest
+
+    def __len__(self) -> int:
+        return len(self.stored)
+
+    def __getitem__(self, part: slice) -> Numbers:
+        values = self.stored[part]
+        if values.dtype.kind == "f":
+            return values.astype(np.float32)
+        numbers = values.astype(np.float64)
+        return np.maximum(numbers / np.iinfo(values.dtype).max, -1.0) if self.normalized else numbers
+
+
+@dataclass(frozen=True)
+class _Attributes:
+    """The attributes of a primitive's Gaussians, in its own coordinates."""
+
+    means: _Values
+    quats: _Values  # xyzw
+    scales: _Values
+    alphas: _Values
+    sh: list[_Values]
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    @property
+    def sh_degree(self) -> int:
+        return math.isqrt(len(self.sh)) - 1
+
+    def gaussians(self, part: slice) -> Gaussians:
+        """Some of the Gaussians. Raises InputError for opacities out of range."""
+        alphas, sh = self.alphas[part][:, 0], [each[part] for each in self.sh]
+        if ((alphas < 0) | (alphas > 1)).any():
+            raise InputError("damaged glTF: opacities outside of 0 to 1")
+        quats = unit(np.roll(self.quats[part], 1, axis=1))
+        rest = np.stack(sh[1:], axis=1) if len(sh) > 1 else np.empty((len(alphas), 0, 3))
+        return gaussians_of(self.means[part], quats, log_scales_of(self.scales[part]), alphas, sh[0], rest)
+
+
+def _attributes(document: _Document, primitive: _Primitive, binary: memoryview) -> _Attributes:
+    """The attributes of a primitive. Raises InputError."""
     compressed = primitive.extensions[EXTENSION].get("extensions", {})
     _refuse_compressed(compressed if isinstance(compressed, dict) else ["unknown"])
 
-    def attribute(name: str, width: int) -> Numbers:
+    def attribute(name: str, width: int) -> _Values:
         if name not in primitive.attributes:
             raise InputError(f"damaged glTF: its Gaussians have no {name}")
         return _values(document, primitive.attributes[name], width, binary)
 
     degree = max(d for d in range(4) if d == 0 or f"{EXTENSION}:SH_DEGREE_{d}_COEF_0" in primitive.attributes)
-    means = attribute("POSITION", 3)
-    if len(means) * (11 + 3 * (degree + 1) ** 2) > room:
-        raise InputError(_REPEATED)
-    sh = [attribute(name, 3) for name in _coefficients(degree)]
-    quats = attribute(f"{EXTENSION}:ROTATION", 4)
-    scales = attribute(f"{EXTENSION}:SCALE", 3)
-    alphas = attribute(f"{EXTENSION}:OPACITY", 1)[:, 0]
-    if not len(means) or any(len(each) != len(means) for each in (quats, scales, alphas, *sh)):
+    found = _Attributes(
+        means=attribute("POSITION", 3),
+        quats=attribute(f"{EXTENSION}:ROTATION", 4),
+        scales=attribute(f"{EXTENSION}:SCALE", 3),
+        alphas=attribute(f"{EXTENSION}:OPACITY", 1),
+        sh=[attribute(name, 3) for name in _coefficients(degree)],
+    )
+    others = (found.quats, found.scales, found.alphas, *found.sh)
+    if not len(found) or any(len(each) != len(found) for each in others):
         raise InputError("damaged glTF: no Gaussians, or attributes of different lengths")
-    if ((alphas < 0) | (alphas > 1)).any():
-        raise InputError("damaged glTF: opacities outside of 0 to 1")
-    rest = np.stack(sh[1:], axis=1) if degree else np.empty((len(means), 0, 3))
-    wxyz = unit(np.roll(quats, 1, axis=1))
-    return gaussians_of(means, wxyz, log_scales_of(scales), alphas, sh[0], rest, drop=True)
+    return found
 
 
-def _values(document: _Document, index: int, width: int, binary: bytes) -> Numbers:
-    """[N, width] the values of an accessor into the binary chunk."""
+def _values(document: _Document, index: int, width: int, binary: memoryview) -> _Values:
+    """The values [N, width] of an accessor into the binary chunk."""
     if not 0 <= index < len(document.accessors):
         raise InputError("damaged glTF: it refers to a missing accessor")
     accessor = document.accessors[index]
@@ -303,35 +361,27 @@ def _values(document: _Document, index: int, width: int, binary: bytes) -> Numbe
     is_sound = min(accessor.count, view.byteOffset, accessor.byteOffset) >= 0 and stride >= row
     if not is_sound or (accessor.count and start + needed > min(end, len(binary))):
         raise InputError("damaged glTF: an accessor exceeds its buffer view")
-    if accessor.count == 0:
-        return np.empty((0, width))
-    values = np.ndarray((accessor.count, width), dtype, binary, start, (stride, dtype.itemsize))
-    if dtype.kind == "f":
-        return values.astype(np.float32)
-    numbers = values.astype(np.float64)
-    return np.maximum(numbers / np.iinfo(dtype).max, -1.0) if accessor.normalized else numbers
+    shape, strides = (accessor.count, width), (stride, dtype.itemsize)
+    stored = np.ndarray(shape, dtype, binary, start, strides) if accessor.count else np.empty(shape)
+    return _Values(stored, accessor.normalized)
 
 
-def _to_ply_frame(model: Gaussians, to_scene: Doubles) -> Gaussians:
-    """`model` transformed by `to_scene` to a scene with y up, then to the frame of a .ply."""
+def _to_ply_frame(to_scene: Doubles) -> Callable[[Gaussians], Gaussians]:
+    """Transforms Gaussians by `to_scene` to a scene with y up, then to the frame of a .ply."""
     turn = np.eye(4)
     turn[:3, :3] = Rotation.from_quat(_TURN).as_matrix().round()
     whole = turn @ to_scene
     if np.array_equal(whole, np.eye(4)):
-        return model
+        return lambda model: model
     with np.errstate(all="ignore"):
         scale = abs(float(np.linalg.det(whole[:3, :3]))) ** (1 / 3)
     try:
         if not math.isfinite(scale) or scale <= 0:
             raise ValueError("no scale")
         rotation, translation = torch.from_numpy(whole[:3, :3] / scale), torch.from_numpy(whole[:3, 3].copy())
-        moved = Similarity(scale, rotation, translation).apply_gaussians(model)
+        return Similarity(scale, rotation, translation).apply_gaussians
     except ValueError as error:
         raise InputError("a glTF node transforms Gaussians by more than a similarity") from error
-    parts = (moved.means, moved.quats, moved.log_scales, moved.sh)
-    if not all(bool(each.isfinite().all()) for each in parts):
-        raise InputError("NaN or infinite values in Gaussians of a glTF node")
-    return moved
 
 
 def _coefficients(degree: int) -> list[str]:

@@ -27,6 +27,7 @@ from keyss.core.errors import InputError
 from keyss.core.gaussians import Gaussians
 from keyss.files.formats.codebooks import SIZE, codebook_of, nearest, palette_of
 from keyss.files.formats.common import (
+    MIN_BYTES,
     Codes,
     arrays_of,
     check_count,
@@ -108,7 +109,7 @@ class SogCodes(Codes):
         file = _open_archive(data)
         meta = _read_meta(file("meta.json"))
         n = meta.count
-        check_count(n, len(data))
+        check_count(n, len(data), MIN_BYTES + check_sh_degree(meta.shN.bands if meta.shN else 0) / 4)
 
         def image(names: list[str], index: int = 0) -> Bytes:
             """[N, 4] the first N pixels, RGBA."""
@@ -211,16 +212,16 @@ class SogCodes(Codes):
             labels=labels,
         )
 
-    def dequantise(self) -> Gaussians:
-        rotations = (self.rotations / 255 * 2 - 1) * np.sqrt(0.5)
-        palette = self.sh_codebook[self.palette] if self.palette.size else np.empty((1, 0, 3), np.float32)
+    def decode_part(self, part: slice) -> Gaussians:
+        rotations = (self.rotations[part] / 255 * 2 - 1) * np.sqrt(0.5)
+        palette = self.palette[self.labels[part]]
         return gaussians_of(
-            self.positions_at(self.positions),
-            from_smallest_three(self.largest, rotations),
-            self.scale_codebook[self.scales],
-            self.alphas / 255,
-            self.color_codebook[self.colors],
-            palette[self.labels],
+            self.positions_at(self.positions[part]),
+            from_smallest_three(self.largest[part], rotations),
+            self.scale_codebook[self.scales[part]],
+            self.alphas[part] / 255,
+            self.color_codebook[self.colors[part]],
+            self.sh_codebook[palette] if palette.size else np.empty((len(palette), 0, 3), np.float32),
         )
 
     def positions_at(self, levels: Numbers) -> Doubles:

@@ -7,11 +7,14 @@ are clipped, are bytes.
 from __future__ import annotations
 
 import numpy as np
+import numpy.typing as npt
 
 from keyss.core.errors import InputError
 from keyss.core.gaussians import Gaussians
 from keyss.files.formats.common import (
     arrays_of,
+    assembled,
+    blocks_of,
     colour_bytes,
     f_dc_of,
     gaussians_of,
@@ -32,6 +35,10 @@ def read(data: bytes) -> Gaussians:
     if not data or len(data) % _ROW.itemsize:
         raise InputError(f"not a whole .splat: expected 32 bytes per Gaussian, found {len(data):,} in total")
     rows = np.frombuffer(data, _ROW)
+    return assembled(len(rows), (_gaussians(rows[part]) for part in blocks_of(len(rows))), drop=True)
+
+
+def _gaussians(rows: npt.NDArray[np.void]) -> Gaussians:
     return gaussians_of(
         rows["mean"],
         unit(rows["quat"].astype(np.float64) / 128 - 1),
@@ -39,7 +46,6 @@ def read(data: bytes) -> Gaussians:
         rows["alpha"] / 255,
         f_dc_of(rows["rgb"] / 255),
         np.empty((len(rows), 0, 3), np.float32),
-        drop=True,
     )
 
 

@@ -24,6 +24,7 @@ from keyss.core.arrays import Bytes, Floats, Shorts
 from keyss.core.errors import InputError, KeyssWarning, OutputError
 from keyss.core.gaussians import Gaussians
 from keyss.files.formats.common import (
+    MIN_BYTES,
     Codes,
     arrays_of,
     check_count,
@@ -90,8 +91,7 @@ class _Header(NamedTuple):
         if len(start) < _START.size or not start.startswith(NGSP):
             raise InputError("not a whole SPZ file: it ends inside the header, or does not begin with NGSP")
         header = _Header._make(_START.unpack_from(start))
-        check_sh_degree(header.sh_degree)
-        check_count(header.gaussians, size)
+        check_count(header.gaussians, size, MIN_BYTES + check_sh_degree(header.sh_degree) / 3)
         if header.fractional_bits > MAX_FRACTIONAL_BITS:
             raise InputError(
                 f"expected positions of at most {MAX_FRACTIONAL_BITS} fractional bits, "
@@ -285,24 +285,22 @@ class SpzCodes(Codes):
             sh=_quantised_harmonics(rest),
         )
 
-    def dequantise(self) -> Gaussians:
-        means = np.ldexp(self.positions.astype(np.float64), -self.fractional_bits) * _MEAN_SIGNS
+    def decode_part(self, part: slice) -> Gaussians:
+        means = np.ldexp(self.positions[part].astype(np.float64), -self.fractional_bits) * _MEAN_SIGNS
+        rotations = self.rotations[part]
         if self.version == 2:
-            xyz = self.rotations / 127.5 - 1
+            xyz = rotations / 127.5 - 1
         else:
-            xyz = np.where(self.rotations & 512, -1.0, 1.0) * (self.rotations & _MAGNITUDE)
+            xyz = np.where(rotations & 512, -1.0, 1.0) * (rotations & _MAGNITUDE)
             xyz *= np.sqrt(0.5) / _MAGNITUDE
-        quats = np.roll(from_smallest_three(self.largest, xyz), 1, axis=1) * _QUAT_SIGNS
-        rest = self.sh.astype(np.float32)  # modified in place: the largest array of hostile files
-        rest -= 128
-        rest *= _SH_SIGNS[: self.sh.shape[1], None] / 128
+        quats = np.roll(from_smallest_three(self.largest[part], xyz), 1, axis=1) * _QUAT_SIGNS
         return gaussians_of(
             means,
             quats,
-            self.scales / 16 - 10,
-            self.alphas / 255,
-            (self.colors / 255 - 0.5) / _COLOR_SCALE,
-            rest,
+            self.scales[part] / 16 - 10,
+            self.alphas[part] / 255,
+            (self.colors[part] / 255 - 0.5) / _COLOR_SCALE,
+            (self.sh[part].astype(np.float32) - 128) * (_SH_SIGNS[: self.sh.shape[1], None] / 128),
         )
 
 

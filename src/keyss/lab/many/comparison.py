@@ -138,7 +138,8 @@ def compare(
     """
     if is_model(cover) or is_model(secret):
         raise UsageError("comparing takes scenes, folders of photos: models have none to compare with")
-    chosen = {name: _parse_method(name) for name in methods or EVERY}
+    kind = resolve_device(device).type
+    chosen = {name: _parse_method(name, kind) for name in methods or EVERY}
     sizes = {"iterations": iterations, "max_gaussians": max_gaussians}
     given = {name: size for name, size in sizes.items() if size is not None}
     fit = replace(next(iter(chosen.values())).fit, seed=seeds[0], **given)
@@ -201,14 +202,14 @@ def _add(
     return folder.hiding(name, scenes, options, models, measures=MEASURES, controls=controls)
 
 
-def _parse_method(text: str) -> MethodOptions:
+def _parse_method(text: str, device: str) -> MethodOptions:
     """The options of METHOD, METHOD:PRESET or METHOD:VARIANT. Raises UsageError."""
     name, _, kind = text.partition(":")
     method = registry.get(name)
     variants = method.options.variants()
     if kind and kind not in (*PRESETS, *variants):
         raise UsageError(f"{text}: expected one of {', '.join((*PRESETS, *variants))}")
-    return variants[kind] if kind in variants else method.options.preset(kind or "default")
+    return variants[kind] if kind in variants else method.options.preset(kind or "default", device)
 
 
 def _row(name: str, outcomes: Sequence[Outcome], folder: TrialFolder) -> ComparedMethod:

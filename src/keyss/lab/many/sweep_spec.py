@@ -24,6 +24,7 @@ from keyss.lab.many.result_tables import TrialNumbers, write_sweep_tables
 from keyss.lab.many.trial_folder import Forecast, Outcome, TrialFolder
 from keyss.methods import MethodOptions, registry
 from keyss.progress import Reporter
+from keyss.rendering import resolve_device
 from keyss.rendering.orbit import is_model
 from keyss.runs.files import PathLike
 
@@ -92,7 +93,7 @@ def variants(path: Path, spec: SweepSpec) -> Iterator[tuple[str, MethodOptions, 
     """
     for index, entry in enumerate(spec.methods):
         where = f"{path}: methods[{index}]"
-        preset = registry.get(entry.method).options.preset(entry.preset)
+        preset = registry.get(entry.method).options.preset(entry.preset, resolve_device(spec.device).type)
         if twice := entry.options.keys() & entry.grid.keys():
             raise InputError(f"{where}: {min(twice)} is both in the options and in the grid")
         for values in product(*entry.grid.values()):

@@ -11,7 +11,7 @@ import torch
 from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.files.formats.common import in_morton_order
-from keyss.methods.codec.model_bytes import Precision, decode, encode
+from keyss.methods.codec.model_bytes import Precision, decode, encode, encoded_size
 from keyss.rendering.orbit import Viewpoints, psnr_between
 
 _GOOD_ENOUGH = 43.75  # dB between renders; costs 0.1 to 0.3 dB at 30 dB against photos
@@ -61,7 +61,7 @@ def prune_to_size(model: Gaussians, max_bytes: int, viewpoints: Viewpoints | Non
     candidates = []
     for degree in range(model.sh_degree + 1):
         own = kept = model.with_sh_degree(degree)
-        while len(kept) and (size := len(encode(kept))) > max_bytes:
+        while len(kept) and (size := encoded_size(kept)) > max_bytes:
             kept = most_visible(own, min(len(kept) - 1, int(0.995 * len(kept) * max_bytes / size)))
         candidates += [kept] if len(kept) else []
     if not candidates:
@@ -70,9 +70,9 @@ def prune_to_size(model: Gaussians, max_bytes: int, viewpoints: Viewpoints | Non
 
 
 def usual_size(model: Gaussians) -> int:
-    """Bytes of `model` with the usual precision."""
+    """About the bytes of `model` with the usual precision; see `encoded_size`."""
     if model not in _SIZES:
-        _SIZES[model] = len(encode(model))
+        _SIZES[model] = encoded_size(model)
     return _SIZES[model]
 
 
@@ -90,10 +90,11 @@ def encode_to_size(
     `short`: use no more bytes than `choose_precision` needs. Raises UsageError if it does not fit.
     """
     usual = Precision.usual(model)
-    best = encode(model, choose_precision(model, viewpoints) if short else usual.finer(_FINER))
-    if len(best) <= max_bytes:
+    finest = choose_precision(model, viewpoints) if short else usual.finer(_FINER)
+    size = encoded_size(model, finest) if short or finest_size(model) > max_bytes else 0
+    if size <= max_bytes and len(best := encode(model, finest)) <= max_bytes:
         return best
-    octaves = _FINER * (max_bytes - usual_size(model)) / max(1, len(best) - usual_size(model))
+    octaves = _FINER * (max_bytes - usual_size(model)) / max(1, size - usual_size(model))
     while len(data := encode(model, usual.finer(max(0, octaves)))) > max_bytes:
         if octaves <= 0:
             raise UsageError(

@@ -1,0 +1,30 @@
+"""The processor time and the memory of reading hostile files, and the work that grows with them."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from dataclasses import replace
+
+import torch
+
+from files import hostile
+from keyss.core import Camera
+from keyss.files.images import png_names
+
+
+def test_hostile_files_of_a_megabyte_are_read_within_bounds() -> None:
+    command = [sys.executable, hostile.__file__, "--json"]
+    output = subprocess.run(command, capture_output=True, text=True, timeout=600, check=False).stdout
+    costs = [hostile.Cost(**json.loads(line)) for line in output.splitlines()]
+    assert [each.name for each in costs] == list(hostile.HOSTILE)
+    assert not [each for each in costs if not each.bounded]
+
+
+def test_names_of_pictures_are_numbered_in_linear_time() -> None:
+    camera = Camera(torch.eye(4), torch.eye(3), 1, 1, "a/b.jpg")
+    cameras = [replace(camera, name=f"a{'/' * (index % 2)}_b.jpg") for index in range(20_000)]
+    names = png_names([camera, *cameras])
+    assert names[:3] == ["a_b.png", "a_b-2.png", "a__b.png"]
+    assert len(set(names)) == len(cameras) + 1
