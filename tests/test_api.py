@@ -241,7 +241,7 @@ def test_secrets_say_what_is_expected(secrets: Any, words: str) -> None:
 def test_preset() -> None:
     """As on the command line; options have their own schedule."""
     chosen = [keyss.Secret(tiny_scene(1), "a key of a secret scene")]
-    for name in ("quick", "full"):
+    for name in ("quick", "default"):
         found = keyss.hide(tiny_scene(), chosen, preset=name, publish="any", dry_run=True).cost
         options = CarryOptions.preset(name)
         assert found is not None
