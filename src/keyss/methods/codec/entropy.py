@@ -104,9 +104,7 @@ def _bit(low: Any, scope: Any, at: Any, data: Any, reading: bool, bit: Any, esti
 
 
 @inline
-def _code(
-    table: Any, shares: Any, groups: Any, data: Any, reading: bool, estimates: Any, state: Any
-) -> Any:
+def _code(table: Any, shares: Any, groups: Any, data: Any, reading: bool, estimates: Any, state: Any) -> Any:
     """Encode `table`, or decode it. `estimates`, `state`: initial ones."""
     count, columns = table.shape
     before, sizes = state
@@ -142,7 +140,13 @@ def _code(
                 if size > 1:
                     left = size - 1
                     low, scope, at, found = _bit(
-                        low, scope, at, data, reading, value >> (size - 2) & 1, estimates[group, _CONTEXTS, size]
+                        low,
+                        scope,
+                        at,
+                        data,
+                        reading,
+                        value >> (size - 2) & 1,
+                        estimates[group, _CONTEXTS, size],
                     )
                     found += 2
                 flat = (value << 1 | (difference < 0)) & ((1 << left) - 1)
