@@ -83,7 +83,7 @@ def glb_accessors(components: str, kind: int, degrees: tuple[int, ...]) -> Calla
         for number, degree in enumerate(degrees):
             count = min(4 * size // most, size // (4 * width)) if number == 0 else 1
 
-            def accessor(of: str, count: int = count) -> int:
+            def accessor(of: str) -> int:
                 accessors.append({"count": count, "type": of, "componentType": kind, "bufferView": 0})
                 accessors[-1] |= {"normalized": True} if kind != 5126 else {}
                 return len(accessors) - 1

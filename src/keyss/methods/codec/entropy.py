@@ -104,7 +104,9 @@ def _bit(low: Any, scope: Any, at: Any, data: Any, reading: bool, bit: Any, esti
 
 
 @inline
-def _code(table: Any, shares: Any, groups: Any, data: Any, reading: bool, estimates: Any, state: Any) -> Any:
+def _code(
+    table: Any, shares: Any, groups: Any, data: Any, reading: bool, estimates: Any, state: Any
+) -> Any:
     """Encode `table`, or decode it. `estimates`, `state`: initial ones."""
     count, columns = table.shape
     before, sizes = state
@@ -113,7 +115,7 @@ def _code(table: Any, shares: Any, groups: Any, data: Any, reading: bool, estima
         low, _, at = _renormalise(low, np.int64(1 << 16), at, data, reading)
     for row in range(count):
         recent = np.int64(0)
-        if (reading and at >= len(data) + 4) or (not reading and len(data) - at < _LARGEST * columns):
+        if reading and at >= len(data) + 4 or not reading and len(data) - at < _LARGEST * columns:
             return len(data) + reading
         for column in range(columns):
             predicted = shares[column] * before[column] >> 3
@@ -140,13 +142,7 @@ def _code(table: Any, shares: Any, groups: Any, data: Any, reading: bool, estima
                 if size > 1:
                     left = size - 1
                     low, scope, at, found = _bit(
-                        low,
-                        scope,
-                        at,
-                        data,
-                        reading,
-                        value >> (size - 2) & 1,
-                        estimates[group, _CONTEXTS, size],
+                        low, scope, at, data, reading, value >> (size - 2) & 1, estimates[group, _CONTEXTS, size]
                     )
                     found += 2
                 flat = (value << 1 | (difference < 0)) & ((1 << left) - 1)

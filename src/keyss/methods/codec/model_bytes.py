@@ -115,9 +115,7 @@ class _Encoder:
     def of(model: Gaussians, precision: Precision | None) -> _Encoder:
         model = model.detach().to("cpu")
         order = morton_order(model.means.numpy())
-        coder = _Encoder(
-            model, order, model.overflow.numpy(), [], (precision or Precision.usual(model)).steps
-        )
+        coder = _Encoder(model, order, model.overflow.numpy(), [], (precision or Precision.usual(model)).steps)
         middle = [
             *map(np.median, model.means.numpy().T),
             np.median(model.log_scales),
