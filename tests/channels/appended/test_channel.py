@@ -317,6 +317,35 @@ def test_a_secret_put_into_another_file_is_told(
         assert opened(Gaussians.cat([host, ADDED[name](cover, appended)])) == DATA
 
 
+@pytest.mark.parametrize(
+    ("host", "own"),
+    [
+        (Similarity(), Similarity(1e6, translation=torch.full((3,), 1e9))),
+        (Similarity(translation=torch.full((3,), 3e5)), Similarity(1e-36)),
+    ],
+    ids=["far larger, far away", "a point beside numbers beyond float32"],
+)
+def test_a_file_out_of_range_of_the_sketch_is_told(host: Similarity, own: Similarity) -> None:
+    """From the cover of the secret it looks like few Gaussians, or like none."""
+    large = embedded(lifelike(60_000, 6), [(KEY, Payload("file", DATA))], entropy=ENTROPY)
+    visible = lifelike(60_000, 5)
+    visible = replace(visible[visible.opacities > 4 / 255], sh=visible.sh[visible.opacities > 4 / 255] / 20)
+    both = Gaussians.cat([host.apply_gaussians(visible), own.apply_gaussians(large)])
+    with pytest.warns(KeyssWarning, match="Gaussians were added"):
+        assert opened(both) == DATA
+
+
+def test_gaussians_with_equal_numbers_are_tested_under_every_key(cover: Gaussians) -> None:
+    """A border next to their opacity or thickness would leave out all of them."""
+    equal = lifelike(3000, 5)
+    equal = replace(equal, opacity_logits=torch.full((3000,), 2.0), log_scales=equal.log_scales * 0 - 4)
+    for seed in range(20):
+        key = f"{KEY} {seed}"
+        stego = embedded(cover, [(key, Payload("file", b"a"))], entropy=ENTROPY)
+        with pytest.warns(KeyssWarning, match="Gaussians were added"):
+            assert opened(Gaussians.cat([equal, stego]), key) == b"a"
+
+
 def test_stacks_of_faint_gaussians_are_told(stego: Gaussians) -> None:
     """A hundred of them in one place are as visible as one that is not faint."""
     stacks = _stacks(lifelike(3000, 5))
