@@ -23,6 +23,7 @@ from keyss.cli.arguments import (
     switch,
 )
 from keyss.cli.keys import given_keys, key_of_file
+from keyss.cli.verbs import verb
 from keyss.core.errors import UsageError
 
 
@@ -79,8 +80,9 @@ def fit(
     check_exists(scene)
     from dataclasses import replace
 
-    import keyss
     from keyss.cli.tables import print_files, print_fit
+
+    run = verb("fit")
     from keyss.fitting.config import preset_for
     from keyss.progress import reporter
     from keyss.rendering import resolve_device
@@ -88,7 +90,7 @@ def fit(
     from keyss.runs.json_records import read_record
     from keyss.runs.run_records import FitMetrics
 
-    keyss.fit(
+    run(
         scene,
         config=replace(preset_for(preset, resolve_device(device).type), **training.schedule()),
         **vars(photos),

@@ -20,6 +20,7 @@ from keyss.cli.arguments import (
     switch,
 )
 from keyss.cli.keys import keys_of_run
+from keyss.cli.verbs import verb
 from keyss.core.errors import UsageError
 
 _VECTOR = r"[-+.\de]+(,[-+.\de]+){2}"
@@ -68,17 +69,18 @@ def view(
     check_exists(model)
     from keyss.progress import waiting
     from keyss.runs.estimates import seconds_for
-    from keyss.viewer import ModelServer, export_html, look_of_model
 
     if pose and not re.fullmatch(_POSE, pose):
         raise UsageError(f"--pose: expected eye=X,Y,Z&target=X,Y,Z as in the page's address, got {pose}")
     given = {"pose": pose, "up": up, "title": title, "host": allow_host, "embedder": embed_in}
-    look = look_of_model(model) | {name: value for name, value in given.items() if value}
+    look = {name: value for name, value in given.items() if value}
     if out is not None:
         if port or host != "127.0.0.1":
             raise UsageError("--port and --host are for serving: leave them out with -o")
         with waiting(f"writing {out.name}", seconds_for("export", model)):
-            written = export_html(model, out, look=look, overwrite=overwrite)
+            from keyss.viewer import export_html, look_of_model
+
+            written = export_html(model, out, look=look_of_model(model) | look, overwrite=overwrite)
         size = sum(path.stat().st_size for path in written) / 1e6
         what = "opens in any browser" if len(written) == 1 else f"{len(written)} files for a web server"
         print(f"{out}: {size:.1f} MB; {what}")
@@ -87,7 +89,10 @@ def view(
         raise UsageError("--overwrite, --allow-host and --embed-in are for -o: leave them out")
     if not 0 <= port < 1 << 16:
         raise UsageError(f"--port: expected 0 to {(1 << 16) - 1}, got {port}")
-    server = ModelServer(model, host, port, look)
+    with waiting(f"reading {model.name}", seconds_for("export", model)):
+        from keyss.viewer import ModelServer, look_of_model
+
+        server = ModelServer(model, host, port, look_of_model(model) | look)
     who = "only on this machine" if server.is_local else f"to all who can reach {host} and know this address"
     print(f"{server.address} shows {model} {who}; press Ctrl-C to stop", flush=True)
     server.run()
@@ -160,11 +165,15 @@ def evaluate(
     example: keyss evaluate runs/hidden --key-file key.txt
     """
     check_exists(run)
-    import keyss
     from keyss.cli.tables import print_files, print_hiding
+    from keyss.progress import reporter
+
+    measure = verb("evaluate")
     from keyss.fitting.image_metrics import HOW_TO_GET, MIN_SIZE
 
-    metrics = keyss.evaluate(run, keys_of_run(run, key_file), wrong_keys=wrong_keys, device=device)
+    metrics = measure(
+        run, keys_of_run(run, key_file), wrong_keys=wrong_keys, device=device, reporter=reporter()
+    )
     print_hiding(metrics)
     if metrics.cover.lpips is None:
         print(f"{HOW_TO_GET}; photos must have at least {MIN_SIZE} x {MIN_SIZE} pixels.")

@@ -23,6 +23,7 @@ from keyss.cli.arguments import (
     optional,
     switch,
 )
+from keyss.cli.verbs import verb
 
 if TYPE_CHECKING:
     from keyss.lab.audits import Audit
@@ -65,15 +66,15 @@ def audit(
     example: keyss audit runs/hidden --dry-run
     """
     check_exists(run)
+    measure = verb("audit")
     if dry_run:
         _print_audit_forecast(run, controls, only, device)
         return
-    import keyss
     from keyss.cli.keys import keys_of_run
     from keyss.cli.tables import print_files
     from keyss.progress import reporter
 
-    found = keyss.audit(
+    found = measure(
         run,
         () if report_only else keys_of_run(run, key_file),
         report_only=report_only,
@@ -120,7 +121,7 @@ def compare(
     example: keyss compare --cover SCENE_A --secret SCENE_B --quick -o runs/compared
     """
     check_exists(cover, secret)
-    import keyss
+    run = verb("compare")
     from keyss.cli.tables import print_files, print_table
     from keyss.core.errors import InputError
     from keyss.lab.many import Forecast
@@ -130,7 +131,7 @@ def compare(
     given = {"iterations": iterations, "max_gaussians": max_gaussians, "width": width}
     budget = {name: QUICK[name] if value is None and quick else value for name, value in given.items()}
     named = [] if methods.strip() == "all" else [name.strip() for name in methods.split(",")]
-    comparison = keyss.compare(
+    comparison = run(
         cover,
         secret,
         methods=named,
@@ -203,14 +204,14 @@ def reproduce(
 
     example: keyss reproduce multi 360/* --full -o runs/paper-full
     """
-    import keyss
+    run = verb("reproduce")
     from keyss.cli.tables import print_files, print_table
     from keyss.core.errors import InputError
     from keyss.lab.many import Forecast
     from keyss.lab.many.reproduction import reproduction_notes, reproduction_rows
     from keyss.progress import reporter
 
-    reproduction = keyss.reproduce(
+    reproduction = run(
         table,
         scenes,
         full=full,
@@ -261,13 +262,13 @@ def sweep(
 
     example: keyss sweep sweep.yaml -o runs/sweep --dry-run
     """
-    import keyss
+    run = verb("sweep")
     from keyss.cli.tables import print_files
     from keyss.core.errors import InputError
     from keyss.lab.many import Forecast
     from keyss.progress import reporter
 
-    outcomes = keyss.sweep(spec, out, ray=ray, cores=cores, dry_run=dry_run, reporter=reporter())
+    outcomes = run(spec, out, ray=ray, cores=cores, dry_run=dry_run, reporter=reporter())
     if isinstance(outcomes, Forecast):
         _print_forecast(outcomes)
         return

@@ -14,6 +14,7 @@ import psutil
 import torch
 
 from keyss.core.errors import KeyssWarning, OutputError
+from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
 from keyss.fitting.config import FitConfig
 from keyss.fitting.losses import Targets
@@ -98,6 +99,16 @@ def cost_of(
         memory += max(Targets.max_bytes(source.scene.train) for source in sources)
     disk = (published + sum(sizes) + _CHECKPOINTS * trained) * gaussian + _OTHER_BYTES
     return Cost(steps, seconds, tuple(fit_seconds), check_seconds, device.type, disk, memory)
+
+
+def seconds_to_measure(models: Sequence[Gaussians], scenes: Sequence[Scene], tries: int = 0) -> float:
+    """About the seconds to measure models on their test views, and `tries` more models of each."""
+    seconds = 0.0
+    for model, scene in zip(models, scenes, strict=True):
+        camera = scene.test[0].camera
+        step = step_seconds(model.device.type, len(model), camera.width * camera.height)
+        seconds += (1 + tries) * _RENDERS * len(scene.test) * step
+    return seconds
 
 
 def step_seconds(device: str, gaussians: int, pixels: int) -> float:
