@@ -47,7 +47,7 @@ if TYPE_CHECKING:  # `--wheels` may install what they need
 
 ROOT = Path(__file__).resolve().parents[1]
 COVER, SECRET = "bonsai", "fox"
-DESIGNS = ("latent", "published", "released")
+DESIGNS = ("published", "released")
 STAGES = ("kernels", "tests", "pilot", "plain", *DESIGNS, "carry")
 KEY = "the key of the benchmark: 7Vw3-Qp"
 PILOT_STEPS = 30

@@ -38,7 +38,10 @@ def pytest_sessionstart() -> None:
 
 def set_key_cost(item: pytest.Item) -> None:
     """Set the cost for a test and its fixtures."""
+    from keyss.keys import derivation
+
     global _cheap
+    derivation._argon2id.cache_clear()
     _cheap = item.get_closest_marker("argon2") is None
 
 

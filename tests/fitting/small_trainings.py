@@ -10,8 +10,7 @@ import keyss  # noqa: F401  before anything imports torch
 from keyss.core import Similarity
 from keyss.fitting import FitConfig, PlainRun
 from keyss.keys import random_embeddings
-from keyss.methods import DESIGNS, PlacedScene, registry
-from keyss.methods.keyss.keyss_method import training_of
+from keyss.methods import DESIGNS, KeyssTraining, PlacedScene, registry
 from methods.keyss.small import small
 from tiny_scenes import random_gaussians, tiny_scene
 
@@ -33,5 +32,4 @@ def training(name: str, fit: FitConfig, device: torch.device) -> Any:
         method: Any = registry.get(name)
         return method.training(scenes, [], method.options(fit=fit, common_poses=0.5), device)
     keys = list(random_embeddings(1, torch.Generator().manual_seed(0)))
-    options = small(name, fit, **({} if name == "latent" else {"common_poses": 0.5}))
-    return training_of(options.configuration)(scenes, keys, options, device)
+    return KeyssTraining(scenes, keys, small(name, fit, common_poses=0.5), device)

@@ -132,8 +132,7 @@ def test_carried_secret_does_not_leak() -> None:
 def _secret(bias: float) -> KeyssSecret:
     """A decoder that adds `bias` to every opacity logit, whatever the key."""
     decoder = Decoder(DecoderShape(mask=("op",))).requires_grad_(False)
-    decoder.branches["op"][-1].weight.zero_()
-    decoder.branches["op"][-1].bias.fill_(bias)
+    decoder.outer["op"].bias.fill_(bias)  # weights are 0
     return KeyssSecret(decoder, torch.ones(64), FRAME, HIDDEN.means[:4])
 
 
@@ -191,8 +190,8 @@ def _exchanging() -> Decoder:
     Each layer has two units, key . KEY plus and minus x; the last layer takes the difference.
     """
     decoder = Decoder(DecoderShape(mask=("op",), hidden=(2, 2), branch=2)).requires_grad_(False)
-    first, second = decoder.common[0], decoder.common[2]
-    third, last = decoder.branches["op"][0], decoder.branches["op"][2]
+    first, second = decoder.common
+    third, last = decoder.inner["op"], decoder.outer["op"]
     sides = torch.tensor([1.0, -1.0])
     first.weight.zero_()
     first.weight[:, 8] = sides  # features: opacity, rotation 4, scale 3, position

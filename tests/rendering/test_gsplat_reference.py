@@ -31,7 +31,7 @@ STEPS = replace(FIT, iterations=4, max_gaussians=300, sh_degree=3, grow_stop=0.8
 BASELINES = [
     name for name, where in registry.METHODS.items() if ".baselines." in where.hiding and name != "3dgs"
 ]
-OTHERS = [name for name in (*DESIGNS, *BASELINES) if name != "latent"]
+OTHERS = [name for name in (*DESIGNS, *BASELINES) if name != "published"]
 
 
 @pytest.fixture
@@ -68,7 +68,7 @@ def test_no_visible_gaussians(gpu: torch.device) -> None:
 
 
 @pytest.mark.parametrize(
-    "name", ["plain", "latent", *(pytest.param(name, marks=pytest.mark.slow) for name in OTHERS)]
+    "name", ["plain", "published", *(pytest.param(name, marks=pytest.mark.slow) for name in OTHERS)]
 )
 def test_training_gradients_match_cpu(name: str, gpu: torch.device) -> None:
     here, there = (training(name, STEPS, device) for device in (torch.device("cpu"), gpu))
@@ -94,7 +94,7 @@ def test_training_gradients_match_cpu(name: str, gpu: torch.device) -> None:
 
 
 @pytest.mark.filterwarnings("ignore:.*the secrets lie in appended Gaussians")
-@pytest.mark.parametrize("method", ["carry", pytest.param("latent", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("method", ["carry", pytest.param("published", marks=pytest.mark.slow)])
 def test_hide_and_reveal(
     method: str, gpu: torch.device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

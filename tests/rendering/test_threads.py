@@ -126,3 +126,19 @@ def test_spinning_threads_warning(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
     with pytest.warns(KeyssWarning, match="import keyss first"):
         fit(tiny_scene(0), config=FitConfig(iterations=1, max_gaussians=50, seed=0))
+
+
+def test_blocks_stop_soon_after_an_interruption() -> None:
+    torch.set_num_threads(4)
+    interrupted, begun = threading.Event(), []
+
+    def work(start: int, stop: int) -> None:
+        begun.append(start)
+        if threading.current_thread() is threading.main_thread():
+            interrupted.set()
+            raise KeyboardInterrupt
+        interrupted.wait(PATIENCE)
+
+    with pytest.raises(KeyboardInterrupt):
+        parallel.in_blocks(work, 10_000, 1)
+    assert len(begun) < 1000

@@ -2,9 +2,8 @@
 import type { Payload } from './channels/base.ts';
 import { decodeModel } from './codec/model_bytes.ts';
 import type { Gaussians } from './core/gaussians.ts';
-import { decodeKeyss } from './keyss/secret.ts';
 
-const [CARRY, KEYSS, FILE] = ['carry', 'keyss', 'file']; // methods
+const [CARRY, FILE] = ['carry', 'file']; // methods
 
 export interface HiddenFile {
   readonly name: string; // from the sender: to be shown, never to be used as a path
@@ -20,6 +19,5 @@ export function fileOf({ method, data }: Payload): HiddenFile | null {
 
 /** The model, found in `stego`; null if the payload is none, or none that is opened here. Raises InputError for damage. */
 export function secretOf({ method, data }: Payload, stego: Gaussians): Gaussians | null {
-  if (method === KEYSS) return decodeKeyss(data, stego);
   return method === CARRY ? decodeModel(data, stego.count) : null;
 }

@@ -78,22 +78,21 @@ class Codewords:
         if too few are left.
         """
         inside = np.flatnonzero(numbers < self.chunks)
-        unique, first, inverse = np.unique(numbers[inside], return_index=True, return_inverse=True)
-        left = len(unique)
-        if left >= self.count * self.k:  # otherwise save the memory
-            rows = np.full(self.chunks, -1)
-            rows[unique] = inside[first]
-            if left < len(inside):
-                differ = (chunks[inside] != chunks[rows[numbers[inside]]]).any(axis=1)
-                rows[unique[inverse[differ]]] = -1
-            rows = rows.reshape(self.n, self.count)
+        own = numbers[inside]
+        if len(own) >= self.count * self.k:  # otherwise save the memory
+            first = np.full(self.chunks, -1)
+            first[own[::-1]] = inside[::-1]
+            again = inside[first[own] != inside]
+            differ = (chunks[again] != chunks[first[numbers[again]]]).any(axis=1)
+            first[numbers[again[differ]]] = -1
+            rows: Integers = first.reshape(self.n, self.count)
             if errors:
                 self._drop_errors(rows, chunks)
             if ((rows >= 0).sum(axis=0) >= self.k).all():
-                data = chunks[rows[: self.k]]
+                data: Bytes = chunks[rows[: self.k]]
                 _restore(chunks, rows, data)
                 return data.tobytes()
-        raise InputError(f"{LOST}: {left:,} of {self.chunks:,} chunks are left")
+        raise InputError(f"{LOST}: {len(np.unique(own)):,} of {self.chunks:,} chunks are left")
 
     def _drop_errors(self, rows: Integers, chunks: Bytes) -> None:
         """Set the `rows` [n, count] of false chunks to -1."""
@@ -145,7 +144,7 @@ def _restore(chunks: Bytes, rows: Integers, data: Bytes) -> None:
     def restore(start: int, stop: int) -> None:
         _restore_columns(start, stop, chunks, own, wanted, data, _POWERS, logarithms, twiddles, walsh)
 
-    in_blocks(restore, len(wanted) * columns, _COLUMNS)
+    in_blocks(restore, len(wanted) * columns, _COLUMNS, _restore_columns)
 
 
 def _size(n: int) -> int:

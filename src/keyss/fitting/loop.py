@@ -26,7 +26,7 @@ from keyss._interrupts import ENDING
 from keyss.core.errors import InputError, Interrupted, KeyssWarning
 from keyss.files.atomic import write_bytes
 from keyss.fitting.config import FitConfig
-from keyss.fitting.density import CappedStrategy, Rendered, of_scene
+from keyss.fitting.density import CappedStrategy, Rendered
 from keyss.fitting.parameters import Optimizers, Parameters
 from keyss.fitting.schedule import Schedule
 from keyss.progress import Reporter
@@ -65,10 +65,10 @@ class TrainingRun(ABC):
 
     parameters: Parameters
     optimizers: Optimizers
-    schedules: list[Schedule]  # for each scene that has parameters of its own
+    schedule: Schedule
     strategy: CappedStrategy
     density: dict[str, Any]  # the state of `strategy`
-    network_optimizers: Sequence[torch.optim.Optimizer] = ()
+    network_optimizer: torch.optim.Optimizer | None = None  # of `networks`, if there are any
 
     def __init__(self, fit: FitConfig, device: torch.device) -> None:
         self.fit, self.device = fit, device
@@ -76,6 +76,7 @@ class TrainingRun(ABC):
         self.generators = {"generator": torch.Generator().manual_seed(fit.known_seed)}
         self.generator = self.generators["generator"]
         self.shuffles: dict[str, Shuffle] = {}
+        self.networks = torch.nn.ModuleList()
 
     @abstractmethod
     def step(self) -> None:
@@ -97,15 +98,15 @@ class TrainingRun(ABC):
         self.loss = loss.detach()
         info = self.strategy.statistics(renders, len(self))
         self.set_rates()
-        for optimizer in (*self.optimizers.values(), *self.network_optimizers):
+        networks = [self.network_optimizer] if self.network_optimizer else []
+        for optimizer in (*self.optimizers.values(), *networks):
             optimizer.step()
             optimizer.zero_grad(set_to_none=True)
         self.strategy.step_post_backward(self.parameters, self.optimizers, self.density, self.iteration, info)
 
     def set_rates(self) -> None:
         """Set the learning rates of the step `iteration`."""
-        for scene, schedule in enumerate(self.schedules):
-            schedule.set(of_scene(self.optimizers, scene), self.iteration)
+        self.schedule.set(self.optimizers, self.iteration)
 
     def state(self) -> State:
         """Parameters, their Adam moments, and what else the future depends on; tensors are not copied."""
@@ -117,6 +118,10 @@ class TrainingRun(ABC):
         density = {key: value for key, value in self.density.items() if isinstance(value, Tensor)}
         state |= {f"density.{key}": value for key, value in density.items()}
         state |= {name: shuffle.remaining for name, shuffle in self.shuffles.items()}
+        state |= {f"networks.{name}": value for name, value in self.networks.state_dict().items()}
+        if self.network_optimizer:
+            for index, moments in self.network_optimizer.state_dict()["state"].items():
+                state |= {f"networks_adam.{index}.{name}": value for name, value in moments.items()}
         return state | {name: generator.get_state() for name, generator in self.generators.items()}
 
     def load(self, state: State) -> None:
@@ -135,6 +140,13 @@ class TrainingRun(ABC):
             self.parameters[name] = parameter
         density = with_prefix(state, "density.").items()
         self.density |= {key: value.to(self.device) for key, value in density}
+        self.networks.load_state_dict(with_prefix(state, "networks."))
+        if self.network_optimizer:
+            adam = self.network_optimizer.state_dict()
+            for name, value in with_prefix(state, "networks_adam.").items():
+                index, key = name.split(".")
+                adam["state"].setdefault(int(index), {})[key] = value
+            self.network_optimizer.load_state_dict(adam)
         for name, shuffle in self.shuffles.items():
             shuffle.remaining = state[name]
         for name, generator in self.generators.items():

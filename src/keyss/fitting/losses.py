@@ -1,4 +1,4 @@
-"""The photometric loss of 3DGS: (1 - lambda) L1 + lambda (1 - SSIM) (3DGS, eq. 7; KeySS, eq. 4 to 6).
+"""The photometric loss of 3DGS: (1 - lambda) L1 + lambda (1 - SSIM) (3DGS, eq. 7; KeySS, eq. 4, 5 and 7).
 
 SSIM is the 3DGS variant: 11x11 Gaussian window of sigma 1.5, zero padding, mean over all pixels and
 channels. A `Target` stores the statistics of the target image, which never change.

@@ -54,7 +54,7 @@ class PlainRun(TrainingRun):
             model = initial_gaussians(points, colors, config.sh_degree, config.max_gaussians, self.generator)
         self.parameters = to_parameters(model, device)
         self.optimizers = make_optimizers(self.parameters, config, scene.extent)
-        self.schedules = [Schedule(config, [view.camera for view in self.views], scene.extent)]
+        self.schedule = Schedule(config, [view.camera for view in self.views], scene.extent)
         self.strategy = CappedStrategy(config if self.grows else replace(config, grow_stop=0.0))
         self.density = self.strategy.initialize_state(scene.extent)
         self.order = self.shuffles["order"] = Shuffle(len(self.views), self.generator)

@@ -12,6 +12,7 @@ import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
+from itertools import islice
 from typing import Any, TypeVar
 
 import numpy as np
@@ -35,19 +36,30 @@ def run(kernel: Callable[..., None], *arguments: Any) -> None:
     _on_threads(limit, kernel, np.zeros(1, np.int64), *arguments)
 
 
-def in_blocks(function: Callable[[int, int], T], count: int, size: int) -> list[T]:
+def in_blocks(
+    function: Callable[[int, int], T], count: int, size: int, kernel: Callable[..., Any] | None = None
+) -> list[T]:
     """Results of `function(start, stop)` for all blocks of `size` below `count`, in order.
 
-    Runs on as many threads as torch uses, which helps if `function` releases the GIL.
+    Runs on as many threads as torch uses, which helps if `function` releases the GIL. `kernel`: called by
+    `function`; this thread loads it, see `run`.
     """
     starts = range(0, count, size)
     results: dict[int, T] = {}
 
     def work(waiting: Iterator[int]) -> None:
-        for start in waiting:  # shared by all threads
-            results[start] = function(start, min(start + size, count))
+        try:
+            for start in waiting:  # shared by all threads
+                results[start] = function(start, min(start + size, count))
+        except BaseException:
+            for _ in waiting:  # the other threads only finish their blocks
+                pass
+            raise
 
-    _on_threads(min(_CORES, len(starts)), work, iter(starts))
+    waiting = iter(starts)
+    if not getattr(kernel, "overloads", True):
+        work(islice(waiting, 1))
+    _on_threads(min(_CORES, len(starts)), work, waiting)
     return [results[start] for start in starts]
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import unicodedata
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -58,6 +59,12 @@ def fill(secret: bytes, label: str, data: Bytes) -> None:
         encryptor.update_into(zeros[: len(part)], part)
 
 
+@lru_cache(maxsize=256)  # hiding derives keys that it needs again to check the result
+def _argon2id(key: bytes, salt: bytes) -> bytes:
+    costs = {"time_cost": TIME_COST, "memory_cost": MEMORY_KIB, "parallelism": PARALLELISM}
+    return hash_secret_raw(key, salt, **costs, hash_len=MASTER_BYTES, type=Type.ID)
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class DerivedKey:
     """A key after Argon2id with one salt, and the values that follow from it.
@@ -77,9 +84,8 @@ class DerivedKey:
         text = normalized_key(key)
         if len(salt) != SALT_BYTES:
             raise InputError(f"key derivation: expected a salt of {SALT_BYTES} bytes, got {len(salt)}")
-        costs = {"time_cost": TIME_COST, "memory_cost": MEMORY_KIB, "parallelism": PARALLELISM}
         try:
-            master = hash_secret_raw(text.encode(), salt, **costs, hash_len=MASTER_BYTES, type=Type.ID)
+            master = _argon2id(text.encode(), salt)
         except HashingError as error:
             raise InputError(
                 f"deriving a key needs {MEMORY_KIB // 1024} MiB of memory, which the system refuses: {error}"

@@ -1,4 +1,4 @@
-"""Authenticated encryption of one payload: compressed, padded and encrypted under a data key of its own.
+"""Authenticated encryption of one payload: compressed if that helps, and padded, under a data key of its own.
 
 ChaCha20-Poly1305 (RFC 8439) with a zero nonce. This is safe because each data key encrypts one message only:
 it is random, or derived from everything that it encrypts.
@@ -19,13 +19,16 @@ DATA_KEY_BYTES = 32
 MAX_PAYLOAD_BYTES = 256 << 20  # before compression
 # A payload of more than MAX_RATIO n + SMALL_PAYLOAD bytes that compress to n is stored without compression.
 MAX_RATIO, SMALL_PAYLOAD = 16, 1 << 20
-OVERHEAD = 4 + 16  # length of the compressed data, and the tag
+OVERHEAD = 4 + 16  # length of the data, and the tag
 _NONCE = bytes(12)
+_COMPRESSED = 1 << 31  # flag in the length
+_SAMPLES, _SAMPLE_BYTES = 16, 1 << 12  # of a large payload, compressed to find out whether it helps
+_HELPS = 0.97  # maximum size of compressed samples
 
 
 def compressed_size(payload: bytes) -> int:
     """Bytes of `payload` as `encrypt` compresses it."""
-    return len(_compress(payload))
+    return len(_compress(payload)[1])
 
 
 def encrypt(data_key: bytes, payload: bytes, associated: bytes = b"", *, size: int) -> bytes:
@@ -36,11 +39,10 @@ def encrypt(data_key: bytes, payload: bytes, associated: bytes = b"", *, size: i
     """
     if len(payload) > MAX_PAYLOAD_BYTES:
         raise UsageError(f"expected at most {MAX_PAYLOAD_BYTES:,} bytes to encrypt, got {len(payload):,}")
-    packed = _compress(payload)
-    plain = struct.pack("<I", len(packed)) + packed
+    flag, packed = _compress(payload)
     if size < len(packed) + OVERHEAD:
         raise ValueError(f"{len(packed)} bytes do not fit into {size}")
-    plain += bytes(size - 16 - len(plain))
+    plain = (struct.pack("<I", flag | len(packed)) + packed).ljust(size - 16, b"\0")
     return _cipher(data_key).encrypt(_NONCE, plain, associated)
 
 
@@ -51,14 +53,19 @@ def decrypt(data_key: bytes, encrypted: bytes, associated: bytes = b"") -> bytes
     except (InvalidTag, ValueError) as error:
         raise InputError("the encrypted data are damaged: their authentication fails") from error
     (length,) = struct.unpack_from("<I", plain.ljust(4, b"\0"))
+    flag, length = length & _COMPRESSED, length & ~_COMPRESSED
     packed = plain[4 : 4 + length]
+    if len(packed) != length:
+        raise InputError("the encrypted data are incomplete")
+    if not flag:
+        return packed
     # Bounded, although only a holder of the key can have written it.
     unpacker = zlib.decompressobj()
     try:
         payload = unpacker.decompress(packed, _max_size(len(packed)))
     except zlib.error as error:
         raise InputError(f"the encrypted data cannot be decompressed: {error}") from error
-    if len(packed) != length or not unpacker.eof or unpacker.unused_data:
+    if not unpacker.eof or unpacker.unused_data:
         raise InputError(
             f"the encrypted data are incomplete, or decompress to more than {_max_size(len(packed)):,} bytes"
         )
@@ -71,9 +78,15 @@ def _cipher(data_key: bytes) -> ChaCha20Poly1305:
     return ChaCha20Poly1305(expand(data_key, "payload", 32))
 
 
-def _compress(payload: bytes) -> bytes:
-    packed = zlib.compress(payload, 9)
-    return packed if len(payload) <= _max_size(len(packed)) else zlib.compress(payload, 0)
+def _compress(payload: bytes) -> tuple[int, bytes]:
+    """_COMPRESSED and a zlib stream if that is shorter, else 0 and `payload`."""
+    step = max(_SAMPLE_BYTES, -(-len(payload) // _SAMPLES))
+    sample = b"".join(payload[at : at + _SAMPLE_BYTES] for at in range(0, len(payload), step))
+    if len(zlib.compress(sample, 1)) <= _HELPS * len(sample):
+        packed = zlib.compress(payload, 9)
+        if len(packed) < len(payload) <= _max_size(len(packed)):
+            return _COMPRESSED, packed
+    return 0, payload
 
 
 def _max_size(packed: int) -> int:

@@ -8,7 +8,12 @@ from .codec.precision import (
     prune_to_size as prune_to_size,
 )
 from .hidden import Frame as Frame, HiddenFile as HiddenFile, HiddenScene as HiddenScene, Remains as Remains
-from .keyss.decoder import DECODERS as DECODERS, Decoder as Decoder, LatentDecoder as LatentDecoder
+from .keyss.decoder import Decoder as Decoder
+from .keyss.keyss_method import (
+    KeyssSecret as KeyssSecret,
+    choose_anchors as choose_anchors,
+    publish as publish,
+)
 from .keyss.keyss_options import (
     ATTRIBUTES as ATTRIBUTES,
     DESIGNS as DESIGNS,
@@ -17,12 +22,7 @@ from .keyss.keyss_options import (
     KeyssOptions as KeyssOptions,
     parse_mask as parse_mask,
 )
-from .keyss.keyss_secret import KeyssSecret as KeyssSecret, choose_anchors as choose_anchors
-from .keyss.training import (
-    CombinedPoses as CombinedPoses,
-    KeyssTraining as KeyssTraining,
-    PlacedScene as PlacedScene,
-)
+from .keyss.training import CombinedPoses as CombinedPoses, KeyssTraining as KeyssTraining
 from .method import (
     Capabilities as Capabilities,
     CommandLineOption as CommandLineOption,
@@ -32,5 +32,6 @@ from .method import (
     Stego as Stego,
     Training as Training,
 )
+from .placed_scene import PlacedScene as PlacedScene
 from .plain_models import fit_plain_models as fit_plain_models
 from .registry import open_model as open_model

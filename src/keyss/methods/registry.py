@@ -42,7 +42,7 @@ METHODS = {
         "train one model and a decoder for all keys jointly, as the paper does",
         "keyss.methods.keyss.keyss_options:KeyssOptions",
         "keyss.methods.keyss.keyss_method:METHOD",
-        "keyss.methods.keyss.keyss_secret:KeyssSecret.of",
+        "keyss.methods.keyss.keyss_method:KeyssSecret.of",
     ),
     "3dgs": _baseline("upper_bound", "BoundOptions", "upper bound: the secret is a separate file"),
     "3dgs-sh": _baseline(
@@ -52,6 +52,9 @@ METHODS = {
         "picture_decoder",
         "DecoderOptions",
         "a network from the cover's picture to the secret's, in a companion file (baseline)",
+    ),
+    "watergs": _baseline(
+        "watergs", "WaterGsOptions", "second harmonics and opacities, hidden in the first (baseline)"
     ),
     "gs-hider": _baseline(
         "gs_hider", "GsHiderOptions", "features in place of harmonics, and a network for each scene"

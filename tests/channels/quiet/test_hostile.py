@@ -85,7 +85,7 @@ def at_most(megabytes: float) -> Iterator[None]:
 
 def test_short_data_become_no_large_payload() -> None:
     packed = zlib.compress(bytes(60 << 20), 9)
-    plain = struct.pack("<I", len(packed)) + packed
+    plain = struct.pack("<I", 1 << 31 | len(packed)) + packed
     bomb = encryption._cipher(bytes(32)).encrypt(encryption._NONCE, plain, b"")
     assert len(bomb) < 64_000
     with at_most(8), pytest.raises(InputError, match="decompress to more than"):

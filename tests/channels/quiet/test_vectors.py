@@ -41,8 +41,10 @@ def test_derivation_that_must_fail(vector: dict[str, Any]) -> None:
 
 def test_encryption() -> None:
     vector = ENCRYPTION["valid"]
-    parts = (bytes.fromhex(vector[name]) for name in ("data_key", "encrypted", "associated"))
-    assert encryption.decrypt(*parts).hex() == vector["payload"]
+    data_key, associated = (bytes.fromhex(vector[name]) for name in ("data_key", "associated"))
+    for name in ("encrypted", "stored"):
+        payload = encryption.decrypt(data_key, bytes.fromhex(vector[name]), associated)
+        assert payload.hex() == vector["payload"]
 
 
 @pytest.mark.parametrize("vector", ENCRYPTION["invalid"], ids=lambda vector: vector["why"])

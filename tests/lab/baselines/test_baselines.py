@@ -24,7 +24,7 @@ from test_api import psnr_of_pictures
 from tiny_scenes import random_gaussians, tiny_scene
 
 FIT = FitConfig(iterations=120, max_gaussians=300, sh_degree=1, grow_every=30, evaluate_every=60, seed=0)
-TRAINED = ["3dgs-sh", "3dgs-decoder", "gs-hider"]
+TRAINED = ["3dgs-sh", "3dgs-decoder", "watergs", "gs-hider"]
 BASELINES = ["3dgs", *TRAINED]
 KEY = "a key of many characters: 93hXmQ2"  # baselines have none
 
@@ -119,7 +119,7 @@ def test_invalid_arguments(folders: tuple[Path, Path]) -> None:
         keyss.hide(folders[0], [Secret(folders[1])], method="carry")
 
 
-@pytest.mark.parametrize("name", [*TRAINED[:2], pytest.param("gs-hider", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("name", [*TRAINED[:3], pytest.param("gs-hider", marks=pytest.mark.slow)])
 def test_resumed_training_is_bit_identical(name: str) -> None:
     """All state is in checkpoints: parameters that a baseline adds, networks, moments, the order of poses."""
     scenes = [tiny_scene(0), tiny_scene(1)]

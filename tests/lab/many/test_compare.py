@@ -88,7 +88,7 @@ def test_invalid_arguments(folders: tuple[Path, Path], tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="models have none"):
         compare(tmp_path / "a.ply", folders[1], out=tmp_path / "out")
     assert not (tmp_path / "out").exists()
-    assert set(registry.METHODS) >= {"3dgs", "3dgs-sh", "3dgs-decoder", "gs-hider"}
+    assert set(registry.METHODS) >= {"3dgs", "3dgs-sh", "3dgs-decoder", "watergs", "gs-hider"}
 
 
 @pytest.mark.parametrize("verb", ["hide", "fit"])

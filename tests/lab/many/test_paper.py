@@ -62,8 +62,12 @@ def test_sums_and_scores_are_consistent() -> None:
 
 @pytest.mark.parametrize("name", TABLES)
 def test_claims_hold_for_published_figures(name: str) -> None:
-    """Except one: with two secrets, a wrong key shows 16.5 dB of the bicycle instead of 22.5."""
+    """Except one: with two secrets, a wrong key shows 16.5 dB of the bicycle instead of 22.5.
+
+    Nobody has published plain 3DGS with half of the Gaussians.
+    """
     found = {claim.text: reproduction.judge_claim(claim, published(name)) for claim in TABLES[name].claims}
+    found = {text: each for text, each in found.items() if not text.startswith("KeySS costs what half")}
     assert all(each.parts for each in found.values())
     exceptions = {text: each for text, each in found.items() if each.verdict != "holds"}
     if name == "multi":

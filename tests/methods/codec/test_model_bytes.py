@@ -20,7 +20,7 @@ from keyss import Secret
 from keyss.core import DRAWN_OPACITY, Camera, Gaussians, InputError, Scene, UsageError, View
 from keyss.files import write_model
 from keyss.methods import choose_precision, encode_to_size, prune_to_size
-from keyss.methods.codec.model_bytes import Precision, decode, encode
+from keyss.methods.codec.model_bytes import BLOCK, Precision, decode, encode, encoded_size
 from keyss.methods.codec.precision import usual_size
 from keyss.rendering import Viewpoints, psnr_between, render
 from keyss.rendering.orbit import orbit
@@ -170,6 +170,43 @@ def test_damage(data: bytes) -> None:
         except InputError:
             continue
         assert len(found) <= 1 << 16
+
+
+@pytest.mark.parametrize("count", [BLOCK - 1, BLOCK, 2 * BLOCK + 1])
+def test_blocks_on_one_thread_and_on_many(count: int) -> None:
+    model, threads, encoded = trained_like(count, sh_degree=0), torch.get_num_threads(), []
+    try:
+        for number in (1, 3):
+            torch.set_num_threads(number)
+            encoded.append(encode(model, Precision(0.001)))
+            back = decode(encoded[-1])
+    finally:
+        torch.set_num_threads(threads)
+    assert encoded[0] == encoded[1]
+    found = np.sort(back.means[:, 0].numpy())
+    assert np.abs(found - np.sort(model.means[:, 0].numpy())).max() < 0.00051
+    with pytest.raises(InputError, match="damaged"):
+        decode(encoded[0][:-1])
+
+
+@pytest.mark.parametrize("octaves", [-2, 1.5])
+def test_estimates_of_large_models_are_a_little_above_their_sizes(octaves: float) -> None:
+    model = trained_like(9 * BLOCK + 50, sh_degree=0)
+    precision = Precision.usual(model).finer(octaves)
+    size = len(encode(model, precision))
+    assert size <= encoded_size(model, precision) <= 1.03 * size
+
+
+def test_large_models_open_from_the_rest_of_a_smaller_one_and_false_numbers_do_not() -> None:
+    data = encode(trained_like(20, sh_degree=0)[torch.arange(70_000) % 20], Precision(1e-3).finer(3))
+    data += bytes(3 << 20)
+    for count, model_size, words in (
+        (70_000, 9000, "length"),
+        (70_000, 8000, "can hold"),
+        (2**21, 2**20, "hold"),
+    ):
+        with pytest.raises(InputError, match=words):
+            decode(count.to_bytes(4, "little") + data[4:], model_size)
 
 
 def test_choose_precision() -> None:

@@ -83,6 +83,7 @@ def test_missing_extra(monkeypatch: pytest.MonkeyPatch) -> None:
         ClipKeys("anywhere")
 
 
+@pytest.mark.filterwarnings("ignore:density control added no")
 def test_hide_with_clip_keys(encoder: ClipKeys, folder: Path) -> None:
     """Keys with equal CLIP vectors open different secrets."""
     fit = FitConfig(iterations=4, max_gaussians=200, grow_start=0.2, grow_every=5, evaluate_every=0, seed=0)

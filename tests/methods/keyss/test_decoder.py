@@ -16,8 +16,12 @@ KEY, OTHER = random_embeddings(2, torch.Generator().manual_seed(0))
 
 
 def _decoder(mask: str = "op,ro,sc,xyz,sh", **shape: Any) -> Decoder:
+    """With random weights; the last layers of a new decoder are 0."""
     torch.manual_seed(0)
-    return Decoder(DecoderShape(mask=parse_mask(mask), **shape)).requires_grad_(False)
+    decoder = Decoder(DecoderShape(mask=parse_mask(mask), **shape)).requires_grad_(False)
+    for weights in decoder.parameters():
+        torch.nn.init.normal_(weights, std=0.3)
+    return decoder
 
 
 def _distance(a: Gaussians, b: Gaussians, name: str) -> float:
@@ -43,9 +47,9 @@ def test_equations_6_and_8(released: bool) -> None:
         alpha = logit / model.opacity_logits.double().norm() if released else logit.sigmoid()
         others = [unit(row[name]) for name in ("ro", "sc", "xyz", "sh")]
         f = torch.cat([alpha, *others, KEY.double()])
-        h = layer("common.2", layer("common.0", f).relu()).relu()
+        h = layer("common.1", layer("common.0", f).relu()).relu()
         for name, field in FIELD_OF.items():
-            residual = layer(f"branches.{name}.2", layer(f"branches.{name}.0", h).relu())
+            residual = layer(f"outer.{name}", layer(f"inner.{name}", h).relu())
             if released and name != "op":
                 residual = residual.relu()
             expected = row[name].double() + residual
@@ -83,13 +87,33 @@ def test_gaussians_are_decoded_independently() -> None:
 def test_chunked_decoding(monkeypatch: pytest.MonkeyPatch) -> None:
     """Chunks bound the memory that a hostile file can request."""
     decoder, stego = _decoder(released=True), random_gaussians()
-    whole, sizes = decoder(stego, KEY), []
-    decoder.register_forward_pre_hook(lambda _, given: sizes.append(len(given[0])))
-    monkeypatch.setattr("keyss.methods.keyss.decoder.DECODED_NUMBERS", 20_000)
-    in_parts = decoder.decode(stego, KEY)
-    assert max(sizes) < len(stego) == sum(sizes)
+    whole = decoder(stego, KEY)
+    monkeypatch.setattr("keyss.methods.keyss.decoder.ROWS", 70)
+    in_parts = decoder(stego, KEY)
     for name, values in vars(whole).items():
         torch.testing.assert_close(getattr(in_parts, name), values)
+
+
+def test_gradients(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of weights, Gaussians and the key, against differences, where some rows have no gradient."""
+    monkeypatch.setattr("keyss.methods.keyss.decoder.ROWS", 3)
+    decoder = _decoder(hidden=(5, 4), branch=3, sh_degree=0, key_size=6).double().requires_grad_()
+    model = random_gaussians(8, sh_degree=0).map(lambda values: values.double().requires_grad_())
+    key, seen = torch.randn(6).double().requires_grad_(), torch.rand(8, generator=torch.Generator()) < 0.6
+
+    def decoded(*_: torch.Tensor) -> list[torch.Tensor]:
+        return [values[seen] for values in vars(decoder(model, key)).values()]
+
+    assert 0 < int(seen.sum()) < 8
+    leaves = (*vars(model).values(), key, *decoder.parameters())
+    assert torch.autograd.gradcheck(decoded, leaves)
+
+
+def test_new_decoder_changes_nothing() -> None:
+    """All scenes start as the points show them; the authors' program starts with random residuals."""
+    model = random_gaussians(40)
+    assert Decoder(DecoderShape())(model, KEY).digest() == model.digest()
+    assert Decoder(DecoderShape(released=True))(model, KEY).digest() != model.digest()
 
 
 def test_parse_mask() -> None:

@@ -3,7 +3,8 @@ import { bytesKey, viewOf } from '../core/bytes.ts';
 import { damaged } from '../core/errors.ts';
 import { coefficients, type Gaussians, opacity } from '../core/gaussians.ts';
 import { sortingOrder } from '../core/words.ts';
-import { blockwise, type Derive, expand } from '../keys/keys.ts';
+import { encryptBlocks } from '../keys/aes.ts';
+import { type Derive, expand } from '../keys/keys.ts';
 
 /** Bytes that are read completely or not at all. */
 export interface Payload {
@@ -45,7 +46,7 @@ export function foreignShare(
   const isUnset = (place: number): boolean => ((own[place >>> 3] >>> (place & 7)) & 1) === 0;
   const bits = typeof among === 'number' ? Math.min(kept, among) : kept;
   const unset = Array.from({ length: bits }, (_, place) => place).filter(isUnset).length;
-  const hashed = viewOf(blockwise(expand(secret, 'sketch'), ids));
+  const hashed = viewOf(encryptBlocks(expand(secret, 'sketch'), ids));
   const sampled = new Map<number, number>(); // the place of each different ID
   for (let row = 0; row < ids.length / ID_BYTES; row++) {
     const [low, high] = [hashed.getUint32(ID_BYTES * row, true), hashed.getUint32(ID_BYTES * row + 4, true)];

@@ -6,7 +6,8 @@ import { decodeTable } from './entropy.ts';
 
 const ALWAYS = 1 << 16; // Gaussians allowed in any payload
 const MIN_BYTES = 2; // per Gaussian in larger models
-const HEAD_BYTES = 53; // Gaussians (4), SH degree (1), centres (20), steps (24), typical visibility (4)
+const PER_CARRIER = 8; // Gaussians of larger models; some carriers may be lost
+const HEAD_BYTES = 53; // Gaussians (4), SH degree (1), centres (20), steps (24), typical weight (4)
 const BLOCK = 1 << 13; // Gaussians that are coded together
 const [MAX_CENTRE, MAX_STEP] = [1e30, 1e6];
 const DIFFERENCE = 1.5; // step of constant colour differences relative to brightness
@@ -23,12 +24,12 @@ interface Head {
   readonly shDegree: number;
   readonly centres: readonly number[];
   readonly steps: readonly number[];
-  readonly typical: number; // visibility
+  readonly typical: number; // logarithm of area x opacity^2
 }
 
 /**
  * The model in a payload that a model of `carriers` Gaussians holds. Raises InputError for damage, and for more than
- * 2^16 Gaussians if they exceed `carriers` or take less than 2 bytes each.
+ * 2^16 Gaussians if they exceed 8 times `carriers` or take less than 2 bytes each.
  */
 export function decodeModel(data: Uint8Array, carriers: number): Gaussians {
   if (data.length < HEAD_BYTES) throw damaged();
@@ -36,7 +37,7 @@ export function decodeModel(data: Uint8Array, carriers: number): Gaussians {
   const [count, shDegree] = [view.getUint32(0, true), data[4]];
   const numbers = Array.from({ length: 12 }, (_, at) => view.getFloat32(5 + 4 * at, true));
   const head = { count, shDegree, centres: numbers.slice(0, 5), steps: numbers.slice(5, 11), typical: numbers[11] };
-  const largest = Math.max(ALWAYS, Math.min(Math.floor(data.length / MIN_BYTES), carriers));
+  const largest = Math.max(ALWAYS, Math.min(Math.floor(data.length / MIN_BYTES), PER_CARRIER * carriers));
   const centred = [...head.centres, head.typical].every((each) => Math.abs(each) < MAX_CENTRE);
   const bounded = centred && head.steps.every((each) => each > 0 && each <= MAX_STEP);
   if (!(count > 0 && count <= largest && shDegree <= 3 && bounded)) throw damaged();

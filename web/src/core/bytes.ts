@@ -24,15 +24,6 @@ export function viewOf(bytes: Uint8Array): DataView {
   return new DataView(bytes.buffer, bytes.byteOffset, bytes.byteLength);
 }
 
-/** The value of an IEEE 754 half-precision number. */
-export function halfFloat(bits: number): number {
-  const sign = bits & 0x8000 ? -1 : 1;
-  const exponent = (bits >> 10) & 31;
-  const fraction = bits & 1023;
-  if (exponent === 31) return fraction ? NaN : sign * Infinity;
-  return sign * (exponent ? 2 ** (exponent - 15) * (1 + fraction / 1024) : (2 ** -14 * fraction) / 1024);
-}
-
 /** The given rows of a table with `width` columns. */
 export function rowsOf<T extends Uint8Array | Int16Array | Float32Array | Float64Array>(
   table: T, rows: ArrayLike<number>, width: number,

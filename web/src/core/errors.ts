@@ -14,7 +14,3 @@ export function otherVersion(): InputError {
 export function tooMuchLost(): InputError {
   return new InputError('The key is right, but too much of the model was lost or changed.');
 }
-
-export function changed(): InputError {
-  return new InputError('The model was moved or rounded since its secret was trained.');
-}

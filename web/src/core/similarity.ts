@@ -10,19 +10,6 @@ export interface Similarity {
   readonly translation: readonly number[]; // [3]
 }
 
-export function inverse({ scale, rotation: r, translation: t }: Similarity): Similarity {
-  const rotation = transposed(r);
-  return { scale: 1 / scale, rotation, translation: times(rotation, t).map((each) => -each / scale) };
-}
-
-/** True for finite numbers, a positive scale and a rotation matrix to within 1e-6. */
-export function isSimilarity({ scale, rotation: r, translation }: Similarity): boolean {
-  const rows = [0, 3, 6].map((at) => r.slice(at, at + 3));
-  const off = rows.flatMap((a, i) => rows.map((b, j) => Math.abs(dot(a, b) - Number(i === j))));
-  const turns = dot(rows[0], cross(rows[1], rows[2])) > 0;
-  return [scale, ...r, ...translation].every(Number.isFinite) && scale > 0 && Math.max(...off) <= 1e-6 && turns;
-}
-
 /** The transformed point [3]. */
 export function movedPoint({ scale, rotation, translation }: Similarity, point: ArrayLike<number>): number[] {
   return times(rotation, point).map((each, axis) => scale * each + translation[axis]);

@@ -2,7 +2,6 @@
  * Key derivation and decryption (docs/byte-layout.md); counterpart of `keyss.keys`. Argon2id (RFC 9106) of the key in NFKC
  * without surrounding white space, then HKDF-Expand with SHA-256 (RFC 5869) with a label for each use.
  */
-import { ecb } from '@noble/ciphers/aes.js';
 import { chacha20, chacha20poly1305 } from '@noble/ciphers/chacha.js';
 import { hmac } from '@noble/hashes/hmac.js';
 import { sha256 } from '@noble/hashes/sha2.js';
@@ -37,11 +36,6 @@ export function expand(secret: Uint8Array, label: string): Uint8Array {
   return hmac(sha256, secret, joined(ascii(`keyss/v1/${label}`), Uint8Array.of(1)));
 }
 
-/** Every 16 bytes through AES-256: a pseudorandom function of blocks, not a mode of operation. */
-export function blockwise(key: Uint8Array, blocks: Uint8Array): Uint8Array {
-  return blocks.length ? ecb(key, { disablePadding: true }).encrypt(blocks) : blocks;
-}
-
 const AT_ONCE = 1 << 16; // bytes of a stream
 
 /** Expands beyond the limit of HKDF: little-endian 32-bit words of ChaCha20's key stream (RFC 8439) under a derived key. */
@@ -59,6 +53,7 @@ export function streamWords(
   }
 }
 
+const COMPRESSED = 2 ** 31; // flag in the length
 const MAX_PAYLOAD_BYTES = 256 << 20;
 const [MAX_RATIO, SMALL_PAYLOAD] = [16, 1 << 20]; // n bytes inflate to at most MAX_RATIO n + SMALL_PAYLOAD
 
@@ -72,10 +67,12 @@ export async function decrypted(
   } catch {
     throw damaged();
   }
-  const length = plain.length >= 4 ? viewOf(plain).getUint32(0, true) : plain.length;
+  const prefix = plain.length >= 4 ? viewOf(plain).getUint32(0, true) : plain.length;
+  const length = prefix % COMPRESSED;
   if (4 + length > plain.length) throw damaged();
-  const most = Math.min(MAX_PAYLOAD_BYTES, MAX_RATIO * length + SMALL_PAYLOAD);
-  return inflate(plain.subarray(4, 4 + length), 'deflate', most);
+  const packed = plain.subarray(4, 4 + length);
+  if (prefix < COMPRESSED) return packed;
+  return inflate(packed, 'deflate', Math.min(MAX_PAYLOAD_BYTES, MAX_RATIO * length + SMALL_PAYLOAD));
 }
 
 /** `derive` with at most one derivation at a time, since each takes 64 MiB. */

@@ -17,13 +17,13 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from hashlib import blake2b
 
 import numpy as np
 import torch
 
 from keyss.core.arrays import Bytes, Doubles, Integers, Words32
 from keyss.core.gaussians import Gaussians
+from keyss.kernels.blake2b import blake2b_rows
 from keyss.kernels.parallel import in_blocks
 
 FIELDS = ("scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3", "opacity")
@@ -98,17 +98,13 @@ def coarse_lengths(quats: Words32) -> Doubles:
 
 def gaussian_ids(gaussians: Gaussians, layout: Layout | None = None) -> Bytes:
     """[N, 16] IDs of the Gaussians: public hashes (BLAKE2b) of the bits that embedding never changes."""
-    stays, hashes = ~(layout or Layout.of(gaussians)).mask, []
-    size = 4 * (3 + len(stays))
-    for start in range(0, len(gaussians), BLOCK):
-        own = gaussians[start : start + BLOCK]
-        data = np.concatenate([_words(own.means), used_words(own) & stays], axis=1).astype("<u4").tobytes()
-        each = (
-            blake2b(data[at : at + size], digest_size=ID_BYTES, person=_PERSON).digest()
-            for at in range(0, len(data), size)
-        )
-        hashes.append(b"".join(each))
-    return np.frombuffer(b"".join(hashes), np.uint8).reshape(-1, ID_BYTES)
+    stays = ~(layout or Layout.of(gaussians)).mask
+
+    def ids(start: int, stop: int) -> Bytes:
+        own = gaussians[start:stop]
+        return blake2b_rows(np.concatenate([_words(own.means), used_words(own) & stays], axis=1), _PERSON)
+
+    return np.concatenate([np.zeros((0, ID_BYTES), np.uint8), *in_blocks(ids, len(gaussians), BLOCK)])
 
 
 def read_low_bits(gaussians: Gaussians, layout: Layout | None = None) -> Bytes:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Annotated, ClassVar
+from dataclasses import dataclass, replace
+from typing import Annotated, ClassVar, Self
 
+from keyss.fitting.config import FitConfig
 from keyss.methods.keyss.keyss_options import DecoderShape, Design, JointOptions, Scenes
 from keyss.methods.method import CommandLineOption, Training, check_above_zero
 
@@ -27,7 +28,7 @@ class BaselineOptions(JointOptions):
             metavar="SHARE",
         ),
     ] = 1.0
-    network_rate: float = 1e-3  # Adam; decays to 5 %
+    network_rate: float = 5e-4  # AdamW; follows the length of the run like KeySS's
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -55,6 +56,23 @@ class BoundOptions(BaselineOptions):
 
     method: ClassVar[str] = "3dgs"
 
+    # Share of the Gaussians of other methods. One set of Gaussians that serves two scenes has half for each.
+    gaussians: float = 1.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_above_zero(self, "gaussians")
+
+    @classmethod
+    def variants(cls) -> dict[str, Self]:
+        """The bound of a model that both scenes share."""
+        return {"half": cls(gaussians=0.5)}
+
+    def fits(self, scenes: int) -> list[FitConfig]:
+        """The fits of the plain models."""
+        count = max(16, int(self.gaussians * self.fit.max_gaussians))
+        return [replace(self.fit, max_gaussians=count)] * scenes
+
     def training(self, scenes: int) -> tuple[Training, ...]:
         """No training beside that of plain models."""
         return (Training(),) * scenes
@@ -77,6 +95,15 @@ class GsHiderOptions(BaselineOptions):
     method: ClassVar[str] = "gs-hider"
 
     step_cost: ClassVar[float] = 30.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class WaterGsOptions(BaselineOptions):
+    """See `BaselineOptions`."""
+
+    method: ClassVar[str] = "watergs"
+
+    step_cost: ClassVar[float] = 2.0
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -77,7 +77,8 @@ _SECRECY = {
 }
 _LEGEND = (
     "Test views: photos that were not trained on. Steps: those in which cover and secret were rendered, in "
-    "total. 3dgs is the upper bound: plain 3DGS with equal numbers of Gaussians and training steps. "
+    "total. 3dgs is the upper bound: plain 3DGS with equal numbers of Gaussians and training steps; "
+    "3dgs:half has half as many Gaussians for each scene, like a model that both share. "
     "Pictures/s: in brackets, the time over that of plain 3DGS. Seconds: time of hiding, after plain models.",
     "Wrong keys: mean PSNR in dB of their renders against the cover, and maximum against the secret; in "
     "brackets, the published model itself against the secret. Classifier and StegExpose: area under the ROC "
@@ -196,7 +197,10 @@ def _add(
     )
     steps = [fit.iterations - own if each else fit.iterations for each in continues]
     models = [
-        folder.plain(scene, replace(fit, iterations=count, sh_degree=each.sh_degree))
+        folder.plain(
+            scene,
+            replace(fit, iterations=count, sh_degree=each.sh_degree, max_gaussians=each.max_gaussians),
+        )
         for scene, count, each in zip(scenes, steps, options.fits(2), strict=True)
     ]
     return folder.hiding(name, scenes, options, models, measures=MEASURES, controls=controls)

@@ -164,11 +164,11 @@ def reproduce(
     places: dict[Path, tuple[str, Group, int]] = {}
     for group, (name, run), seed in product(groups, spec.runs.items(), seeds):
         preset = registry.get(run.method).options.preset("full")
-        design = {"design": "published"} if run.method == "keyss" else {}
-        options = with_changes(preset, {**design, **run.changes}).with_fit(**changes, seed=seed)
+        options = with_changes(preset, run.changes).with_fit(**changes, seed=seed)
         shown = group[: run.secrets + 1]
         sources = [paths[scene] for scene in shown]
-        models = [folder.plain(source, options.fit) for source in sources]
+        fits = options.fits(len(sources))
+        models = [folder.plain(*each) for each in zip(sources, fits, strict=True)]
         title = f"{name}, {'-'.join(group)}" + f", seed {seed}" * (len(seeds) > 1)
         places[folder.hiding(title, sources, options, models, measures=spec.measures)] = name, shown, seed
     if dry_run:
@@ -264,9 +264,10 @@ def figure_rows(
     every = dict.fromkeys(measure for run in table.runs.values() for measure in run.figures)
     for name, run in table.runs.items():
         here: dict[str, float | None] = {}
-        for measure in run.figures or every:
+        for measure in every:
             values = [each[measure] for each in numbers.get(name, ()) if measure in each]
-            here[measure] = fmean(values) if values and len(values) == count else None
+            if values or measure in run.figures:
+                here[measure] = fmean(values) if len(values) == count else None
         published = {measure: mean_figure(table, figure, covers) for measure, figure in run.figures.items()}
         rows.append(FigureRow(label=name, published=published, here=here))
     return tuple(rows)
@@ -302,8 +303,8 @@ def _judge_part(part: str, figures: Measured) -> Iterator[bool | None]:
     run, limit = match["run"], float(match["limit"])
     others = [name for name in figures if name != run] if match["other"] == "*" else [match["other"]]
     for other in others:
-        left = figures[run][match["measure"]]
-        right = 0.0 if other is None else figures[other][match["other_measure"]]
+        left = figures.get(run, {}).get(match["measure"])
+        right = 0.0 if other is None else figures.get(other, {}).get(match["other_measure"])
         if left is None or right is None:
             yield None
         else:

@@ -36,28 +36,28 @@ def encode(table: Table, shares: Integers, groups: Integers) -> bytes:
     data, size = np.empty(0, np.uint8), 0
     while size == len(data):
         data = np.empty(2 * len(data) + 2 * table.size + 1024, np.uint8)
-        size = _write(table, shares, groups, data)
+        size = write(table, shares, groups, data)
     return data[:size].tobytes()
 
 
 def decode(data: bytes, count: int, shares: Integers, groups: Integers) -> Table:
     """Decompress a table [count, C]. Raises InputError for too few or too many bytes."""
     table = np.zeros((count, len(shares)), np.int32)
-    if _read(table, shares, groups, np.frombuffer(data, np.uint8).copy()) != len(data):
+    if read(table, shares, groups, np.frombuffer(data, np.uint8).copy()) != len(data):
         raise InputError("the hidden secret is damaged: its length is wrong")
     return table
 
 
 @kernel
-def _write(table: Any, shares: Any, groups: Any, data: Any) -> Any:
+def write(table: Any, shares: Any, groups: Any, data: Any) -> Any:
     """Encode `table` into `data`; returns the number of bytes, or that of `data` if it is too small."""
     estimates = np.full((groups.max() + 1, _CONTEXTS + 1, _MAX_BITS + 1, 2), 1 << 15, np.uint16)
     return _code(table, shares, groups, data, False, estimates, np.zeros((2, len(shares)), np.int64))
 
 
 @kernel
-def _read(table: Any, shares: Any, groups: Any, data: Any) -> Any:
-    """Decode `table` from `data`; returns the number of bytes read, more than there are if it is too small."""
+def read(table: Any, shares: Any, groups: Any, data: Any) -> Any:
+    """Decode `table` from `data`; returns the bytes read, more than there are if too few."""
     estimates = np.full((groups.max() + 1, _CONTEXTS + 1, _MAX_BITS + 1, 2), 1 << 15, np.uint16)
     return _code(table, shares, groups, data, True, estimates, np.zeros((2, len(shares)), np.int64))
 
@@ -104,9 +104,7 @@ def _bit(low: Any, scope: Any, at: Any, data: Any, reading: bool, bit: Any, esti
 
 
 @inline
-def _code(
-    table: Any, shares: Any, groups: Any, data: Any, reading: bool, estimates: Any, state: Any
-) -> Any:
+def _code(table: Any, shares: Any, groups: Any, data: Any, reading: bool, estimates: Any, state: Any) -> Any:
     """Encode `table`, or decode it. `estimates`, `state`: initial ones."""
     count, columns = table.shape
     before, sizes = state
@@ -115,7 +113,7 @@ def _code(
         low, _, at = _renormalise(low, np.int64(1 << 16), at, data, reading)
     for row in range(count):
         recent = np.int64(0)
-        if (reading and at >= len(data) + 4) or (not reading and len(data) - at < _LARGEST * columns):
+        if at >= len(data) + 4 if reading else at > len(data) - _LARGEST * columns:
             return len(data) + reading
         for column in range(columns):
             predicted = shares[column] * before[column] >> 3
@@ -142,7 +140,13 @@ def _code(
                 if size > 1:
                     left = size - 1
                     low, scope, at, found = _bit(
-                        low, scope, at, data, reading, value >> (size - 2) & 1, estimates[group, _CONTEXTS, size]
+                        low,
+                        scope,
+                        at,
+                        data,
+                        reading,
+                        value >> (size - 2) & 1,
+                        estimates[group, _CONTEXTS, size],
                     )
                     found += 2
                 flat = (value << 1 | (difference < 0)) & ((1 << left) - 1)

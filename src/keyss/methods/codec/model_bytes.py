@@ -1,6 +1,6 @@
 """A model as one string of bytes.
 
-    number of Gaussians (4 bytes), SH degree (1), centres (20), steps (24), typical visibility (4),
+    number of Gaussians (4 bytes), SH degree (1), centres (20), steps (24), typical weight (4),
     bytes of each block (4), blocks (see `entropy`)
 
 Gaussians are sorted along a Z-order curve; BLOCK of them make a block, which is coded by itself, so that
@@ -10,7 +10,7 @@ one with the largest w is stored, without w. Extreme numbers, which occlude ever
 clamped.
 
 Errors in quaternions and harmonics are more visible in Gaussians that cover more of an image. Their steps
-shrink by a quarter of an octave for each octave of area x opacity^2, the *visibility*, above the median.
+shrink by a quarter of an octave for each octave of area x opacity^2, their *weight*, above the median.
 (Equal errors in an image need half an octave, but small Gaussians are seen from nearer; a quarter measured
 best.) Encoder and decoder compute the steps from scales and opacity.
 
@@ -35,6 +35,7 @@ from keyss.methods.codec import entropy
 
 _ALWAYS = 1 << 16  # number of Gaussians that a payload of any size may declare
 _MIN_BYTES = 2  # minimum bytes per Gaussian of a larger model
+_PER_CARRIER = 8  # maximum Gaussians of a larger model per Gaussian of the stego model, which may have losses
 _HEAD = struct.Struct("<IB5f6ff")
 BLOCK = 1 << 13  # Gaussians; half as many take 0.3 % more bytes, twice as many 0.2 % less
 _SAMPLE = BLOCK // 4  # Gaussians of each block that are coded to estimate the size of a large model
@@ -83,7 +84,7 @@ class Precision:
 def encode(model: Gaussians, precision: Precision | None = None) -> bytes:
     """Encode `model`, by default with the usual precision."""
     coder = _Encoder.of(model, precision)
-    blocks = in_blocks(coder.code, len(model), BLOCK)
+    blocks = in_blocks(coder.code, len(model), BLOCK, entropy.write)
     return b"".join([coder.head, np.array([*map(len, blocks)], "<u4").tobytes(), *blocks])
 
 
@@ -97,7 +98,7 @@ def encoded_size(model: Gaussians, precision: Precision | None = None) -> int:
         coded = min(stop, start + _SAMPLE)
         return 4 + len(coder.code(start, coded)) * (stop - start) / (coded - start)
 
-    return len(coder.head) + math.ceil(sum(in_blocks(size, len(model), BLOCK)))
+    return len(coder.head) + math.ceil(sum(in_blocks(size, len(model), BLOCK, entropy.write)))
 
 
 @dataclass(frozen=True)
@@ -109,13 +110,15 @@ class _Encoder:
     transparent: Flags  # [N] rows that become transparent
     centres: list[float]
     steps: list[float]
-    typical: float = 0.0  # visibility
+    typical: float = 0.0  # logarithm of a weight
 
     @staticmethod
     def of(model: Gaussians, precision: Precision | None) -> _Encoder:
         model = model.detach().to("cpu")
         order = morton_order(model.means.numpy())
-        coder = _Encoder(model, order, model.overflow.numpy(), [], (precision or Precision.usual(model)).steps)
+        coder = _Encoder(
+            model, order, model.overflow.numpy(), [], (precision or Precision.usual(model)).steps
+        )
         middle = [
             *map(np.median, model.means.numpy().T),
             np.median(model.log_scales),
@@ -124,7 +127,7 @@ class _Encoder:
         limits = [*[MAX_COORDINATE] * 3, MAX_LOG_SCALE, _MAX_LOGIT]
         centres = [float(np.clip(each, -most, most)) for each, most in zip(middle, limits, strict=True)]
         coder = replace(coder, centres=centres)
-        typical = np.median(np.concatenate(in_blocks(coder._visibility, len(model), BLOCK)))
+        typical = np.median(np.concatenate(in_blocks(coder._weight, len(model), BLOCK)))
         return replace(coder, typical=float(np.float32(typical)))
 
     @property
@@ -147,10 +150,10 @@ class _Encoder:
         codes[:, 13:] = _round(harmonics.reshape(len(rows), -1))
         return entropy.encode(codes, *_columns(self.model.sh_degree))
 
-    def _visibility(self, start: int, stop: int) -> Floats:
+    def _weight(self, start: int, stop: int) -> Floats:
         codes = self._uniform_codes(self.order[start:stop])
         _, log_scales, logits, _ = _uniform_numbers(codes, self.centres, self.steps)
-        return _visibility(log_scales, logits).astype(np.float32)
+        return _weight(log_scales, logits).astype(np.float32)
 
     def _uniform_codes(self, rows: Integers) -> Doubles:
         """Codes [R, 10] of means, log scales, opacity logits and constant colours.
@@ -180,8 +183,8 @@ class _Encoder:
 def decode(data: bytes, model_size: int | None = None) -> Gaussians:
     """Invert `encode`; `model_size`: Gaussians of the stego model. Raises InputError for damage.
 
-    Memory is bounded: above 2^16 Gaussians, each takes at least 2 bytes of `data`, and `model_size` is the
-    maximum.
+    Memory is bounded: above 2^16 Gaussians, each takes at least 2 bytes of `data`, and the maximum is 8 times
+    `model_size`.
     """
     if len(data) < _HEAD.size:
         raise InputError("the hidden secret is damaged: it is too short")
@@ -193,7 +196,7 @@ def decode(data: bytes, model_size: int | None = None) -> Gaussians:
             f"the hidden secret is damaged: it declares {count:,} Gaussians of SH degree {sh_degree}"
         )
     largest = len(data) // _MIN_BYTES
-    if count > max(_ALWAYS, largest if model_size is None else min(largest, model_size)):
+    if count > max(_ALWAYS, largest if model_size is None else min(largest, _PER_CARRIER * model_size)):
         held_by = f"{len(data):,} bytes" + ("" if model_size is None else f" in {model_size:,} Gaussians")
         raise InputError(
             f"the hidden secret is damaged: it declares {count:,} Gaussians, more than {held_by} can hold"
@@ -224,7 +227,7 @@ def decode(data: bytes, model_size: int | None = None) -> Gaussians:
         harmonics = codes[:, 13:] * _steps(steps[5], finer)
         sh[own, 1:] = _from_opponents(harmonics.reshape(len(codes), -1, 3))
 
-    in_blocks(fill, count, BLOCK)
+    in_blocks(fill, count, BLOCK, entropy.read)
     return Gaussians(*map(torch.from_numpy, (means, quats, log_scales, logits, sh)))
 
 
@@ -275,8 +278,8 @@ def _transformed(values: Numbers, matrix: Doubles) -> Numbers:
     return found
 
 
-def _visibility(log_scales: Doubles, logits: Doubles) -> Doubles:
-    """Logarithm [N] of area x opacity^2."""
+def _weight(log_scales: Doubles, logits: Doubles) -> Doubles:
+    """Logarithms [N] of weights."""
     scales = np.sort(log_scales, axis=1)
     # log(opacity) is about min(logit, 0)
     found: Doubles = scales[:, 2] + scales[:, 1] + 2 * np.minimum(logits, 0)
@@ -285,7 +288,7 @@ def _visibility(log_scales: Doubles, logits: Doubles) -> Doubles:
 
 def _refinement(log_scales: Doubles, logits: Doubles, typical: float) -> Integers:
     """Half octaves [N] by which the other steps of each Gaussian are finer than those of typical ones."""
-    octaves = (_visibility(log_scales, logits) - typical) * _PER_OCTAVE
+    octaves = (_weight(log_scales, logits) - typical) * _PER_OCTAVE
     found: Integers = np.floor(octaves + 0.5).astype(np.int64)
     return found.clip(-_FINER, _FINER)
 

@@ -2,7 +2,7 @@
 
 Every training pose of every scene supervises all scenes. A scene's target is its photo from that pose, or a
 render of its plain 3DGS model if there is none. Everything is in the cover's frame. `KeyssTraining` is the
-paper's; the design `latent` and the baselines override parts of it.
+paper's; the baselines of `keyss.lab.baselines` override parts of it.
 """
 
 from __future__ import annotations
@@ -13,17 +13,15 @@ from dataclasses import asdict, dataclass, replace
 from statistics import fmean
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Camera, Scene
-from keyss.core.similarity import Similarity, align
 from keyss.fitting.config import FitConfig
-from keyss.fitting.density import CappedStrategy, Rendered
+from keyss.fitting.density import CappedStrategy, CombinedStrategy, Rendered
 from keyss.fitting.image_metrics import psnr, subsample_views
-from keyss.fitting.loop import Shuffle, State, TrainingRun, own_randomness, train, with_prefix
+from keyss.fitting.loop import Shuffle, TrainingRun, own_randomness, train
 from keyss.fitting.losses import Target, Targets, photometric_loss
 from keyss.fitting.parameters import (
     initial_gaussians,
@@ -32,15 +30,16 @@ from keyss.fitting.parameters import (
     to_gaussians,
     to_parameters,
 )
-from keyss.fitting.schedule import Schedule
-from keyss.keys.derivation import random_embeddings, stream
-from keyss.methods.keyss.decoder import DECODERS
-from keyss.methods.keyss.keyss_options import DecoderShape, JointOptions, Scenes
-from keyss.methods.keyss.keyss_secret import KeyssSecret, choose_anchors, visibility
+from keyss.fitting.schedule import Schedule, boost_of
+from keyss.keys.derivation import random_embeddings
+from keyss.methods.keyss.decoder import Decoder
+from keyss.methods.keyss.keyss_options import JointOptions, Scenes
 from keyss.methods.method import Context, Source, divide, role_of
+from keyss.methods.placed_scene import PlacedScene
 from keyss.rendering import render, render_with_meta
 
 CACHE_BYTES = 2 << 30
+LAST_NETWORK_RATE = 0.05  # final factor on the decoder's rate
 Pose = tuple[int, int]  # a scene and the index of its training view
 
 
@@ -58,41 +57,23 @@ class Picture:
     indices: Tensor | None = None  # Gaussians that were rendered; None: all
 
 
-@dataclass(frozen=True)
-class PlacedScene:
-    """A scene and its plain model, both moved into the cover's frame."""
+def combined_points(
+    scenes: Sequence[Scene], limit: int, fit: FitConfig, generator: torch.Generator
+) -> Gaussians:
+    """Gaussians at up to `limit` points of all scenes, in equal shares if there are enough points.
 
-    scene: Scene
-    plain: Gaussians
-    frame: Similarity  # own frame to cover frame
-
-    @staticmethod
-    def of(scene: Scene, plain: Gaussians, frame: Similarity) -> PlacedScene:
-        """Move a scene and its plain model, both in the scene's own frame, by `frame`."""
-        train, test = (
-            tuple(replace(view, camera=frame.apply_camera(view.camera)) for view in views)
-            for views in (scene.train, scene.test)
-        )
-        placed = replace(scene, train=train, test=test, points=frame.apply_points(scene.points))
-        return PlacedScene(placed, frame.apply_gaussians(plain), frame)
-
-    @staticmethod
-    def all_of(sources: Sequence[Source]) -> list[PlacedScene]:
-        """The cover, then the secrets, aligned with it by their cameras (ours; see `align`)."""
-        cameras = [[view.camera for view in source.scene.train] for source in sources]
-        frames = [Similarity(), *(align(each, cameras[0]) for each in cameras[1:])]
-        return [PlacedScene.of(each.scene, each.model, at) for each, at in zip(sources, frames, strict=True)]
-
-
-def combined_points(scenes: Sequence[Scene], fit: FitConfig, generator: torch.Generator) -> Gaussians:
-    """Gaussians at the points of all scenes, in equal shares of the cap if there are enough points."""
+    They are as wide as the distance to their neighbours in the combined cloud.
+    """
     clouds = [initial_points(scene, fit.max_gaussians, generator) for scene in scenes]
-    counts = divide([len(points) for points, _ in clouds], fit.max_gaussians)
-    parts = [
-        initial_gaussians(points, colors, fit.sh_degree, share, generator)
-        for (points, colors), share in zip(clouds, counts, strict=True)
+    counts = divide([len(points) for points, _ in clouds], limit)
+    chosen = [
+        torch.randperm(len(points), generator=generator)[:count].sort().values
+        for (points, _), count in zip(clouds, counts, strict=True)
     ]
-    return Gaussians.cat(parts)
+    points, colors = (
+        torch.cat([cloud[part][rows] for cloud, rows in zip(clouds, chosen, strict=True)]) for part in (0, 1)
+    )
+    return initial_gaussians(points, colors, fit.sh_degree, len(points), generator)
 
 
 class CombinedPoses:
@@ -152,51 +133,43 @@ class KeyssTraining(TrainingRun):
         self.betas = [design.beta_cover, *[design.beta_secret] * (count - 1)]
         self.poses = CombinedPoses(scenes, device)
         self.backgrounds = [placed.scene.background.to(device) for placed in scenes]
-        self.owners = scene_indices(design.poses, count)
         self.growing = scene_indices(design.densification, count)
+        views = [len(placed.scene.train) for placed in scenes]
+        owners = scene_indices(design.poses, count)
+        times = [1 if design.evenly == "scenes" else views[owner] for owner in owners]
+        self.owners = [owner for owner, every in zip(owners, times, strict=True) for _ in range(every)]
         self.shuffles["owners"] = Shuffle(len(self.owners), self.generator)
-        for scene, placed in enumerate(scenes):
-            # Its own generator: the order of the cover's views must not depend on the secrets.
-            order = torch.Generator().manual_seed(self.fit.seed_of(f"views of scene {scene}"))
-            self.generators[f"order_generator.{scene}"] = order
-            self.shuffles[f"order.{scene}"] = Shuffle(len(placed.scene.train), order)
+        for scene in range(count):
+            self.shuffles[f"poses.{scene}"] = Shuffle(views[scene], self.generator)
         self.extent = scenes[0].scene.extent
         cameras = [view.camera for placed in scenes for view in placed.scene.train]
-        self.schedules = [Schedule(self.fit, cameras, self.extent)]
+        self.schedule = Schedule(self.fit, cameras, self.extent)
         start = self.start()
+        self.started = len(start)
         self.parameters = to_parameters(start, device)
         self.optimizers = make_optimizers(self.parameters, self.fit, self.extent)
-        self.networks = torch.nn.ModuleList()
         with own_randomness(self.fit.known_seed):
             self.prepare(start)
         self.networks.to(device)
-        # Without networks, the optimiser still needs a parameter.
-        weights = list(self.networks.parameters()) or [torch.nn.Parameter(torch.zeros(1))]
-        self.network_optimizers = [
-            torch.optim.AdamW(weights, lr=design.decoder_rate, weight_decay=design.weight_decay)
-        ]
-        self.strategy = self.density_control()
+        if weights := list(self.networks.parameters()):
+            self.network_optimizer = torch.optim.AdamW(weights, weight_decay=design.weight_decay)
+        # The authors' program sums up the gradients of all scenes, and stops density control at the cap.
+        released = design.decoder.released
+        strategy = CappedStrategy if released else CombinedStrategy
+        self.strategy = strategy(self.fit, self.opacity_for_pruning, freeze=released)
         self.density = self.strategy.initialize_state(self.extent)
 
     def start(self) -> Gaussians:
         """G_cover at the first step: the combined SfM points (section 3.4)."""
         chosen = [self.scenes[i].scene for i in scene_indices(self.design.points, len(self.scenes))]
-        return combined_points(chosen, self.fit, self.generator)
+        limit = max(1, int(self.design.start_share * self.fit.max_gaussians))
+        return combined_points(chosen, limit, self.fit, self.generator)
 
     def prepare(self, start: Gaussians) -> None:
         """Add what trains beside `start`: one decoder for all secrets. Random numbers are the run's own."""
-        self.decoder = DECODERS[self.shape.kind](self.shape)
+        shape = replace(self.design.decoder, sh_degree=self.fit.sh_degree, key_size=len(self.keys[0]))
+        self.decoder = Decoder(shape)
         self.networks.append(self.decoder)
-
-    @property
-    def shape(self) -> DecoderShape:
-        """The shape of the decoder for these models, keys and secrets."""
-        degree, size = self.fit.sh_degree, len(self.keys[0])
-        return replace(self.design.decoder, sh_degree=degree, key_size=size, secrets=len(self.keys))
-
-    def density_control(self) -> CappedStrategy:
-        """Density control; the authors' program stops it at the cap."""
-        return CappedStrategy(self.fit, self.opacity_for_pruning, freeze=self.design.decoder.released)
 
     def step(self) -> None:
         self.iteration += 1
@@ -204,16 +177,21 @@ class KeyssTraining(TrainingRun):
 
     def set_rates(self) -> None:
         super().set_rates()
-        rate = self.design.decoder_rate * 0.05 ** (self.iteration / self.iterations)
-        self.network_optimizers[0].param_groups[0]["lr"] = rate
+        if self.network_optimizer is None:
+            return
+        progress = self.iteration / self.iterations
+        rate = self.design.decoder_rate * boost_of(self.fit) * LAST_NETWORK_RATE**progress
+        if self.design.warm_up:
+            rate *= min(1.0, progress / self.design.warm_up)
+        self.network_optimizer.param_groups[0]["lr"] = rate
 
     def sample_poses(self) -> list[Pose]:
-        """The training pose for each scene: one of any scene (combined camera poses)."""
+        """The training pose for each scene: one of any scene for all (combined camera poses)."""
         count = len(self.scenes)
         if float(torch.rand((), generator=self.generator)) < self.design.common_poses:
             owner = self.owners[self.shuffles["owners"].sample()]
-            return [(owner, self.shuffles[f"order.{owner}"].sample())] * count
-        return [(scene, self.shuffles[f"order.{scene}"].sample()) for scene in range(count)]
+            return [(owner, self.shuffles[f"poses.{owner}"].sample())] * count
+        return [(scene, self.shuffles[f"poses.{scene}"].sample()) for scene in range(count)]
 
     def wrong_key(self) -> Tensor | None:
         """[K] vector of a wrong key, sampled at every step."""
@@ -227,7 +205,8 @@ class KeyssTraining(TrainingRun):
         """L of equation 11, and the renders whose gradients count for combined densification."""
         degree, ssim_weight = self.fit.sh_degree_at(self.iteration), self.fit.ssim_weight
         total = torch.zeros((), device=self.device)
-        renders: dict[int, Rendered] = {}  # baselines render scenes together
+        drawn: dict[int, Picture] = {}
+        weights: dict[int, float] = {}  # by render: baselines render scenes together
         for pose in dict.fromkeys(poses):
             scenes = [scene for scene, own in enumerate(poses) if own == pose]
             pictures = self.draw(scenes, self.poses.camera(*pose), degree)
@@ -235,18 +214,19 @@ class KeyssTraining(TrainingRun):
                 target, beta = self.poses.target(scene, *pose), self.betas[scene]
                 # L_cover of equation 4 for scene 0, L_secret^s of equation 5 for scene s.
                 total = total + beta * photometric_loss(picture.image, target, ssim_weight)
-                if scene in self.growing:
-                    shared = renders.get(id(picture.meta))
-                    weight = beta + (shared[2] if shared else 0.0)
-                    renders[id(picture.meta)] = (picture.meta, picture.indices, weight)
+                drawn[scene] = picture
+                weights[id(picture.meta)] = weights.get(id(picture.meta), 0.0) + beta
         if wrong_key is not None:  # L_incorrect of equation 7
             shown = self.decoder(self.cover(), wrong_key)
             picture = self.render(shown, 0, self.poses.camera(*poses[0]), degree)
             incorrect = photometric_loss(picture.image, self.poses.target(0, *poses[0]), ssim_weight)
             total = total + self.design.beta_incorrect * incorrect
-        if self.design.decoder.released:  # gradients of the weighted losses, unscaled
-            return total, [(meta, indices, 1.0) for meta, indices, _ in renders.values()]
-        return total, list(renders.values())
+        # The authors' program takes the gradients of the weighted losses.
+        released = self.design.decoder.released
+        growing = [drawn[scene] for scene in self.growing]
+        return total, [
+            (each.meta, each.indices, 1.0 if released else weights[id(each.meta)]) for each in growing
+        ]
 
     def cover(self) -> Gaussians:
         """G_cover, attached to the graph."""
@@ -306,22 +286,6 @@ class KeyssTraining(TrainingRun):
         models = [cover, *(self.secret(cover, scene) for scene in secrets)]
         return torch.stack([model.opacities for model in models]).amax(0)
 
-    def publish(self, entropy: bytes) -> tuple[Gaussians, list[KeyssSecret]]:
-        """G_cover on the CPU, before its low bits are written, and the secrets.
-
-        `entropy`: 32 secret bytes that seed all randomness.
-        """
-        # Shuffle: in training, the points of each scene are contiguous.
-        stego = self.cover().detach().to("cpu")
-        numbers = np.frombuffer(stream(entropy, "order", 8 * len(stego)), "<u8")
-        stego = stego[torch.from_numpy(numbers.argsort(kind="stable"))]
-        anchors = choose_anchors(stego, self.fit.known_seed)
-        decoder, secrets = self.decoder.to("cpu").requires_grad_(False), []
-        for placed, key in zip(self.scenes[1:], self.keys, strict=True):
-            shown = visibility(decoder.decode(stego, key.cpu()))
-            secrets.append(KeyssSecret(decoder, key.cpu(), placed.frame, anchors, *shown))
-        return stego, secrets
-
     def train(self, sources: Sequence[Source], context: Context) -> None:
         """Take all steps. Raises Interrupted, and InputError for a checkpoint of another run."""
         train(
@@ -335,19 +299,3 @@ class KeyssTraining(TrainingRun):
             },
             **context.loop_arguments("joint"),
         )
-
-    def state(self) -> State:
-        state = super().state()
-        state |= {f"networks.{name}": value for name, value in self.networks.state_dict().items()}
-        for index, moments in self.network_optimizers[0].state_dict()["state"].items():
-            state |= {f"networks_adam.{index}.{name}": value for name, value in moments.items()}
-        return state
-
-    def load(self, state: State) -> None:
-        super().load(state)
-        self.networks.load_state_dict(with_prefix(state, "networks."))
-        adam = self.network_optimizers[0].state_dict()
-        for name, value in with_prefix(state, "networks_adam.").items():
-            index, key = name.split(".")
-            adam["state"].setdefault(int(index), {})[key] = value
-        self.network_optimizers[0].load_state_dict(adam)

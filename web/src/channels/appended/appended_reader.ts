@@ -7,7 +7,8 @@ import { damaged } from '../../core/errors.ts';
 import { type Gaussians, opacity, where, withDegree } from '../../core/gaussians.ts';
 import { moved, type Similarity } from '../../core/similarity.ts';
 import type { Words } from '../../core/words.ts';
-import { blockwise, decrypted, type Derive, expand, here, streamWords } from '../../keys/keys.ts';
+import { encryptBlocks } from '../../keys/aes.ts';
+import { decrypted, type Derive, expand, here, streamWords } from '../../keys/keys.ts';
 import { type Payload, type Reader, unpackPayload } from '../base.ts';
 import { type Codewords, decoded } from '../reed_solomon.ts';
 import { COVER_BYTES, foreignCount } from './cover.ts';
@@ -119,7 +120,7 @@ function readPackets(key: Uint8Array, bytes: Uint8Array, width: number): [number
   const [count, found] = [bytes.length / WORD_BYTES, [] as [number, Uint8Array][]];
   const blocks = new Uint8Array(16 * count);
   for (let row = 0; row < count; row++) blocks.set(bytes.subarray(WORD_BYTES * row, WORD_BYTES * row + width), 16 * row);
-  const encrypted = blockwise(key, blocks);
+  const encrypted = encryptBlocks(key, blocks);
   for (let row = 0; row < count; row++) {
     let tag = 0;
     for (let byte = 0; byte < WORD_BYTES - width; byte++) {

@@ -3,7 +3,8 @@ import { sha256 } from '@noble/hashes/sha2.js';
 import { ascii, bytesKey, joined, rowsOf } from '../../core/bytes.ts';
 import { type Gaussians, opacity, where, withDegree } from '../../core/gaussians.ts';
 import { multiplicities, type Words, wordsOf } from '../../core/words.ts';
-import { blockwise, expand, SALT_BYTES } from '../../keys/keys.ts';
+import { encryptBlocks } from '../../keys/aes.ts';
+import { expand, SALT_BYTES } from '../../keys/keys.ts';
 
 const [SCALE_STEPS, COLOUR_STEPS, OPACITY_STEPS] = [16, 38.25, 255]; // quantisation steps of 8-bit formats per unit
 const [COLOUR_NOISE, OPACITY_NOISE] = [0.344, 1.02]; // maximum rounding error, in steps
@@ -70,7 +71,7 @@ export function chosen({ logScales, opacities, colours, ids, errorProbability, i
 /** [C, 2] words for ids [C, ID_VALUES], pseudo-random without the secret: AES-256 of the IDs. */
 export function randomPairs(secret: Uint8Array, label: string, ids: Int16Array): Words {
   const bytes = new Uint8Array(ids.buffer, ids.byteOffset, ids.byteLength);
-  return wordsOf(blockwise(expand(secret, `colours/${label}`), bytes));
+  return wordsOf(encryptBlocks(expand(secret, `colours/${label}`), bytes));
 }
 
 /** [C, 2] numbers in [0, 1) for ids [C, ID_VALUES]. */

@@ -1,5 +1,6 @@
 /** Cells: a few bytes of each carrier, recognisable with the key and noise without; see docs/byte-layout.md, "Cells". */
-import { blockwise, expand } from '../../keys/keys.ts';
+import { encryptBlocks } from '../../keys/aes.ts';
+import { expand } from '../../keys/keys.ts';
 
 export const TAG_BYTES = 4;
 const BLOCK = 16; // bytes of a block of AES, and of an ID
@@ -56,10 +57,10 @@ export class CellCipher {
   /** [N, 16] that begin with the tags of `messages` [N, stride]. */
   private states(ids: Uint8Array, messages: Uint8Array): Uint8Array {
     const { stride } = this;
-    let state = blockwise(this.tagKey, ids);
+    let state = encryptBlocks(this.tagKey, ids);
     for (let block = 0; block < stride; block += BLOCK) {
       for (let at = 0; at < state.length; at++) state[at] ^= messages[Math.floor(at / BLOCK) * stride + block + (at % BLOCK)];
-      state = blockwise(this.tagKey, state);
+      state = encryptBlocks(this.tagKey, state);
     }
     return state;
   }
@@ -72,11 +73,11 @@ export class CellCipher {
     for (let cell = 0; cell < count; cell++) {
       for (let at = 0; at < TAG_BYTES; at++) seeds[cell * BLOCK + at] ^= cells[cell * width + at];
     }
-    seeds = blockwise(this.seedKey, seeds);
+    seeds = encryptBlocks(this.seedKey, seeds);
     for (let start = 0; start < size; start += BLOCK) {
       const counted = seeds.slice();
       for (let cell = 0; cell < count; cell++) counted[(cell + 1) * BLOCK - 1] ^= start / BLOCK;
-      const stream = blockwise(this.streamKey, counted);
+      const stream = encryptBlocks(this.streamKey, counted);
       const end = Math.min(BLOCK, size - start);
       for (let cell = 0; cell < count; cell++) {
         for (let at = 0; at < end; at++) found[cell * size + start + at] = stream[cell * BLOCK + at];

@@ -8,6 +8,7 @@
 import { ascii, bytesKey, joined, mostFrequent, rowsOf, viewOf } from '../../core/bytes.ts';
 import { damaged, otherVersion, tooMuchLost } from '../../core/errors.ts';
 import { type Gaussians, selected } from '../../core/gaussians.ts';
+import { multiplicities, wordsOf } from '../../core/words.ts';
 import type { ReadModel } from '../../files/models.ts';
 import { decrypted, type Derive, expand, here } from '../../keys/keys.ts';
 import { foreignShare, type Payload, type Reader } from '../base.ts';
@@ -145,13 +146,19 @@ function decryptedPayload(dataKey: Uint8Array, encrypted: Uint8Array): Promise<U
 
 /** Rows that differ in ID or low bits. */
 function uniqueRows(ids: Uint8Array, low: Uint8Array, width: number): number[] {
-  const seen = new Set<string>();
-  const rows: number[] = [];
-  for (let row = 0; row < ids.length / ID_BYTES; row++) {
-    const id = ids.subarray(row * ID_BYTES, (row + 1) * ID_BYTES);
-    const all = bytesKey(id) + bytesKey(low.subarray(row * width, (row + 1) * width));
-    if (!seen.has(all)) rows.push(row);
-    seen.add(all);
+  const [count, words] = [ids.length / ID_BYTES, wordsOf(ids)];
+  const starts = new Uint32Array(2 * count);
+  for (let row = 0; row < count; row++) starts.set(words.subarray(4 * row, 4 * row + 2), 2 * row);
+  const repeats = multiplicities(starts);
+  const [rows, seen] = [[] as number[], new Set<string>()];
+  for (let row = 0; row < count; row++) {
+    if (repeats[row] > 1) {
+      const id = ids.subarray(row * ID_BYTES, (row + 1) * ID_BYTES);
+      const all = bytesKey(id) + bytesKey(low.subarray(row * width, (row + 1) * width));
+      if (seen.has(all)) continue;
+      seen.add(all);
+    }
+    rows.push(row);
   }
   return rows;
 }
