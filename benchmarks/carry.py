@@ -18,7 +18,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
 from keyss import read_model
 from codes import against_photos
-from keyss.channels import LowBitsCapacity, usable_carriers
+from keyss.channels import DEPTHS, LEAST, TYPICAL_SHARE, Layout, LowBitsCapacity, usable_carriers
 from keyss.core import Gaussians, KeyssError, Scene
 from keyss.files.scenes import load_scene
 from keyss.fitting import psnr
@@ -45,10 +45,16 @@ def main() -> None:
 
 
 def _capacities() -> None:
-    print("Bytes of a payload per Gaussian, of 100,000 usable ones:")
-    for degree in range(1, 4):
-        size = LowBitsCapacity.of(100_000, degree).for_payloads().bytes
-        print(f"  cover of degree {degree}: {size / 100_000:.1f}")
+    print("Bytes of a payload per Gaussian, of 100,000 of which three quarters are usable, by depth:")
+    for degree in range(4):
+        for quats in (True, False):
+            layout, carriers = Layout(degree, quats), int(TYPICAL_SHARE * 100_000)
+            sizes = [
+                LowBitsCapacity(100_000, {LEAST: carriers, depth: carriers}, layout).payload_capacity(1)
+                for depth in DEPTHS
+            ]
+            name = "" if quats else ", unit quaternions"
+            print(f"  degree {degree}{name}: " + ", ".join(f"{size / 100_000:.1f}" for size in sizes))
 
 
 def _models(paths: list[Path]) -> None:

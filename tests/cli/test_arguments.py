@@ -95,9 +95,9 @@ def test_method_options(keyss: Run, hide_calls: list[Any]) -> None:
     assert keyss(*scenes, "--method", "keyss", "--design", "published", *clip).status == 0
     joint = hide_calls[0][1]["method"]
     assert (joint.design, joint.key_encoder, joint.clip_model) == ("published", "clip", "C")
-    assert keyss(*scenes, "--refit", "never", "--sh-degree", 2, "--seed", 5).status == 0
+    assert keyss(*scenes, "--refit", "never", "--seed", 5).status == 0
     carry = hide_calls[1][1]["method"]
-    assert (carry.refit, carry.sh_degree, carry.fit.seed) == ("never", 2, 5)
+    assert (carry.refit, carry.fit.seed) == ("never", 5)
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ from cli.harness import Run
 from keyss.cli import entry
 from keyss.core import KeyssWarning, UsageError
 
-OPTIONS = {"overwrite", "sh_degree", "key_file", "secret", "publish", "secret_model", "download"}
+OPTIONS = {"overwrite", "max_gaussians", "key_file", "secret", "publish", "secret_model", "download"}
 
 
 @pytest.mark.parametrize(
@@ -22,7 +22,7 @@ OPTIONS = {"overwrite", "sh_degree", "key_file", "secret", "publish", "secret_mo
         ('`method="carry", overwrite=True` has one', "--method carry --overwrite has one"),
         ("`max_gaussians=30000` would do", "--max-gaussians 30000 would do"),
         ("`min_psnr=12.5`", "--min-psnr 12.5"),
-        ("give `sh_degree`, `publish`", "give --sh-degree, --publish"),
+        ("give `max_gaussians`, `publish`", "give --max-gaussians, --publish"),
         ("`key`, `secrets` and `model`", "--key-file, --secret and --secret-model"),
         # Other code stays as it is.
         ("`chmod 600` and `f_dc_0` and `reporter`", "`chmod 600` and `f_dc_0` and `reporter`"),

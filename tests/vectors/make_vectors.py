@@ -101,15 +101,24 @@ def open_file(name: str, key: str) -> dict[str, Any]:
 
 def pruned_model() -> Gaussians:
     """Two secrets that share carriers: unit quaternions, pruned, shuffled, with duplicates."""
-    cover = trained_like(1000, 3, sh_degree=2)
+    cover = trained_like(1700, 3, sh_degree=2)
     cover = replace(cover, quats=torch.nn.functional.normalize(cover.quats))
     secrets = [
         (TWO_KEYS[0], trained_like(120, 4, sh_degree=1)),
         (TWO_KEYS[1], trained_like(30, 5, sh_degree=2)),
     ]
     stego = embed(cover, secrets, entropy=bytes(32))
-    rows = torch.randperm(len(stego), generator=torch.Generator().manual_seed(6))[:900]
+    rows = torch.randperm(len(stego), generator=torch.Generator().manual_seed(6))[:1500]
     return stego[torch.cat([rows, rows[:5]])]
+
+
+def bare_model() -> Gaussians:
+    """A file in a model of SH degree 0 with unit quaternions, in rows without tags; a sixth is lost."""
+    cover = trained_like(3000, 17, sh_degree=0)
+    cover = replace(cover, quats=torch.nn.functional.normalize(cover.quats))
+    payload = HiddenFile("a note.txt", b"Written in four bytes, read in two.\n").payload()
+    stego = LOW_BITS.prepare(cover).embed([(TWO_KEYS[0], payload)], entropy=bytes(32))
+    return stego[torch.randperm(len(stego), generator=torch.Generator().manual_seed(18))[:2500]]
 
 
 def main() -> None:
@@ -277,6 +286,8 @@ def write_revealed(key: str) -> None:
     write_model(FOLDER / "pruned.ply", pruned_model())
     opened = [open_file(name, key) for name in ("carried.ply", "keyss.ply")]
     opened += [open_file("pruned.ply", each) for each in TWO_KEYS]
+    write_model(FOLDER / "bare.ply", bare_model())
+    opened.append(open_file("bare.ply", TWO_KEYS[0]))
     for suffix in coded.FORMATS:
         write_coded(suffix)
         opened += [open_file(f"coded{suffix}", each) for each in TWO_KEYS]

@@ -26,12 +26,16 @@ from .publishing import (
     suffix_of as suffix_of,
 )
 from .quiet.bits import (
+    DEEPEST as DEEPEST,
+    DEPTHS as DEPTHS,
+    LEAST as LEAST,
     Layout as Layout,
     gaussian_ids as gaussian_ids,
     read_low_bits as read_low_bits,
     used_words as used_words,
     write_low_bits as write_low_bits,
 )
+from .quiet.blocks import BlockReader as BlockReader
 from .quiet.cells import CellCipher as CellCipher
 from .quiet.fields import Field as Field, in_counted_order as in_counted_order, last_bits as last_bits
 from .quiet.payloads import QuietReader as QuietReader
@@ -45,9 +49,10 @@ from .quiet.quiet_header import (
     TYPICAL_SHARE as TYPICAL_SHARE,
     LowBitsCapacity as LowBitsCapacity,
     check_payload_fits as check_payload_fits,
-    key_cipher as key_cipher,
 )
+from .quiet.spread import Chunks as Chunks, Message as Message
 from .quiet.usable import (
+    Carriers as Carriers,
     chance_of_bits as chance_of_bits,
     salt_rows as salt_rows,
     usable_carriers as usable_carriers,

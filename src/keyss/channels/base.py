@@ -73,6 +73,8 @@ class Capacity:
     bytes: int  # of one payload
     overhead: int  # maximum bytes of a payload beside its data
     further: float = 1.0  # each payload after the first multiplies the bytes of all together by this
+    # Shares of one payload: part of the carriers, and bytes; None: a quarter, a half and all of `bytes`.
+    steps: tuple[tuple[float, int], ...] | None = None
     equal: Callable[[int], int] | None = None  # bytes of each of several equal payloads; None: equal parts
     divisible: bool = True  # False: several payloads have equal shares
     grows: bool = False  # True if the model grows with the hidden data, which should then be short

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 
 from channels.quiet.trained_like import trained_like
-from keyss.channels import CodesCover, Payload, QuietReader, in_counted_order, last_bits
+from keyss.channels import BlockReader, CodesCover, Payload, in_counted_order, last_bits
 from keyss.core import Gaussians, WrongKeyError
 from keyss.core.arrays import Bits
 from keyss.files.formats.common import in_morton_order
@@ -46,7 +46,7 @@ def written(cover: CodesCover, *payloads: bytes, entropy: bytes = bytes(range(32
 
 def opened(codes: Any, key: str = "0") -> bytes:
     """What a key opens in codes. Raises WrongKeyError and InputError."""
-    reader = QuietReader.of_codes(codes)
+    reader = BlockReader.of(codes)
     if reader is None:
         raise WrongKeyError("no room")
     return reader.open(key).data

@@ -10,7 +10,7 @@ import torch
 from hypothesis import given, settings, strategies as st
 from hypothesis.extra import numpy as arrays
 
-from keyss.channels import Layout, gaussian_ids, read_low_bits, used_words, write_low_bits
+from keyss.channels import DEPTHS, Layout, gaussian_ids, read_low_bits, used_words, write_low_bits
 from keyss.channels.quiet.usable import repeated
 from keyss.core import Gaussians
 from keyss.kernels.parallel import in_blocks
@@ -32,10 +32,11 @@ def models(draw: st.DrawFn) -> Gaussians:
     return model
 
 
-def masks(model: Gaussians) -> list[int]:
-    """Of the fields that are used: 8 bits above the last one, 12 of harmonics, none of unit quaternions."""
-    quats = [255 << 1 if Layout.of(model).quats else 0] * 4
-    return [255 << 1] * 3 + quats + [255 << 1] + [4095 << 1] * (3 * ((model.sh_degree + 1) ** 2 - 1))
+def masks(model: Gaussians, depth: int = 8) -> list[int]:
+    """Of the fields that are used: `depth` bits above the last one, none of unit quaternions."""
+    mask = (1 << depth) - 1 << 1
+    quats = [mask if Layout.of(model).quats else 0] * 4
+    return [mask] * 3 + quats + [mask] * (1 + 3 * ((model.sh_degree + 1) ** 2 - 1))
 
 
 @given(models())
@@ -50,26 +51,31 @@ def test_identities_are_those_of_hashlib(model: Gaussians) -> None:
     assert [each.tobytes() for each in gaussian_ids(model)] == hashes
 
 
-@given(models(), st.data())
+@given(models(), st.sampled_from(DEPTHS), st.data())
 @settings(max_examples=60, deadline=None)
-def test_low_bits_are_read_and_written_as_the_format_says(model: Gaussians, data: st.DataObject) -> None:
-    layout, low = Layout.of(model), read_low_bits(model)
+def test_low_bits_are_read_and_written_as_the_format_says(
+    model: Gaussians, depth: int, data: st.DataObject
+) -> None:
+    layout, low = Layout.of(model), read_low_bits(model, depth)
     for row, found in zip(used_words(model).tolist(), low, strict=True):
         bits = "".join(
             f"{word >> 1 & mask >> 1:0{(mask >> 1).bit_length()}b}"
-            for word, mask in zip(row, masks(model), strict=True)
+            for word, mask in zip(row, masks(model, depth), strict=True)
             if mask
         )
         assert found.tobytes() == bytes(int(bits[8 * i : 8 * i + 8], 2) for i in range(len(bits) // 8))
     rows = np.array(data.draw(st.permutations(range(len(model))))[: len(model) // 2 + 1])
     new = data.draw(arrays.arrays(np.uint8, (len(rows), low.shape[1])))
     before = used_words(model)
-    written = write_low_bits(model, layout, [(rows, new)])
-    after, mask = used_words(written), np.array(masks(model), np.uint32)
-    if len(mask) % 2:  # the last half byte stays
-        mask[-1] &= ~np.uint32(15 << 1)
+    written = write_low_bits(model, layout, [(depth, rows, new)])
+    after, mask = used_words(written), np.array(masks(model, depth), np.uint32)
+    fields = np.flatnonzero(mask)
+    rest = depth * len(fields) % 8  # bits of the last field, or two, stay
+    for field in fields[::-1][: -(-rest // depth)]:
+        mask[field] &= ~np.uint32((1 << min(rest, depth)) - 1 << 1)
+        rest = max(0, rest - depth)
     assert (used_words(model) == before).all()
-    assert (read_low_bits(written, layout)[rows] == new).all()
+    assert (read_low_bits(written, depth, layout)[rows] == new).all()
     others = np.setdiff1d(np.arange(len(model)), rows)
     assert (after[others] == before[others]).all()
     assert (after & ~mask == before & ~mask).all()

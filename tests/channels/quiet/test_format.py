@@ -6,7 +6,6 @@ import hashlib
 import json
 import struct
 from collections import Counter
-from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +15,7 @@ from argon2.low_level import Type, hash_secret_raw
 from cryptography.hazmat.primitives.ciphers import Cipher
 from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305
 from cryptography.hazmat.primitives.ciphers.algorithms import AES
-from cryptography.hazmat.primitives.ciphers.modes import CBC, ECB
+from cryptography.hazmat.primitives.ciphers.modes import ECB
 from cryptography.hazmat.primitives.hashes import SHA256
 from cryptography.hazmat.primitives.kdf.hkdf import HKDFExpand
 
@@ -24,7 +23,7 @@ pytestmark = pytest.mark.argon2
 
 FOLDER = Path(__file__).parents[2] / "vectors"
 EXPECTED = json.loads((FOLDER / "carried.json").read_text())
-WIDTH = 75  # bytes of a Gaussian's low bits at SH degree 3
+Row = tuple[bytes, bytes]  # ID and low bits
 
 
 def _hkdf(secret: bytes, label: str, length: int = 32) -> bytes:
@@ -35,85 +34,94 @@ def _aes(key: bytes, block: bytes) -> bytes:
     return Cipher(AES(key), ECB()).encryptor().update(block)
 
 
-def _decrypted(secret: bytes, label: str, carrier_id: bytes, cell: bytes) -> bytes | None:
-    tag, hidden = cell[:4], cell[4:]
-    nonce = bytes(a ^ b for a, b in zip(carrier_id, tag.ljust(16, b"\0"), strict=True))
-    seed = _aes(_hkdf(secret, f"{label}/seed"), nonce)
-    blocks = range(-(-len(hidden) // 16))
-    stream = b"".join(
-        _aes(_hkdf(secret, f"{label}/stream"), seed[:-1] + bytes([seed[-1] ^ i])) for i in blocks
-    )
-    data = bytes(a ^ b for a, b in zip(hidden, stream, strict=False))
-    message = carrier_id + data.ljust(16 * len(blocks), b"\0")
-    mac = Cipher(AES(_hkdf(secret, f"{label}/tag")), CBC(bytes(16))).encryptor().update(message)[-16:]
-    return data if mac[:4] == tag else None
+def _function(secret: bytes, label: str, carrier_id: bytes, size: int = 16) -> bytes:
+    key = _hkdf(secret, f"quiet/{label}")
+    blocks = (carrier_id[:15] + bytes([carrier_id[15] ^ i]) for i in range(-(-size // 16)))
+    return b"".join(_aes(key, block) for block in blocks)[:size]
 
 
-def _gaussians() -> list[tuple[tuple[bool, int], bytes, bytes]]:
-    """Place in the order of salts, carrier_id and low bits of each."""
+def _xor(a: bytes, b: bytes) -> bytes:
+    return bytes(x ^ y for x, y in zip(a, b, strict=True))
+
+
+def _message(secret: bytes, label: str, size: int, width: int, copies: int, rows: list[Row]) -> bytes:
+    count = -(-size // width)
+    values = sorted((_function(secret, f"{label}/place", own)[:12], own, low) for own, low in rows)
+    places: dict[int, list[bytes]] = {fragment: [] for fragment in range(count)}
+    for value, own, low in values[: 8 * copies * count]:
+        found = places[int.from_bytes(value[8:12], "little") % count]
+        if len(found) < copies:
+            found.append(_xor(low[:width], _function(secret, f"{label}/pad", own, width)))
+    return b"".join(Counter(found).most_common(1)[0][0] for found in places.values())[:size]
+
+
+def _packed(words: list[int], depth: int) -> bytes:
+    bits = "".join(f"{word >> 1 & (1 << depth) - 1:0{depth}b}" for word in words)
+    return bytes(int(bits[8 * i : 8 * i + 8], 2) for i in range(len(bits) // 8))
+
+
+def _gaussians() -> list[tuple[bool, bytes, list[int]]]:
+    """Place in the order of salts, ID and fields of each."""
     vertices = plyfile.PlyData.read(FOLDER / "carried.ply")["vertex"]
     harmonics = [f"f_rest_{15 * colour + k}" for k in range(15) for colour in range(3)]
     names = ["scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3", "opacity", *harmonics]
     found, lengths = [], []
     for index in range(vertices.count):
         words = [int(np.float32(vertices[name][index]).view(np.uint32)) for name in names]
-        masks = [0x1FE] * 8 + [0x1FFE] * 45
         middle = [word & ~0x1FF | 0x100 for word in words[3:7]]
         lengths.append(float(np.linalg.norm(np.array(middle, np.uint32).view(np.float32).astype(float))))
         kept = [int(np.float32(vertices[axis][index]).view(np.uint32)) for axis in "xyz"]
-        kept += [word & ~mask for word, mask in zip(words, masks, strict=True)]
+        kept += [word & ~0x1FE for word in words]
         public = struct.pack(f"<{len(kept)}I", *kept)
         carrier_id = hashlib.blake2b(public, digest_size=16, person=b"keyss/identity").digest()
-        low = [(word & mask) >> 1 for word, mask in zip(words, masks, strict=True)]
-        data = bytes(low[:8])
-        for a, b in zip(low[8::2], [*low[9::2], 0], strict=False):
-            data += bytes([a >> 4, (a & 15) << 4 | b >> 8, b & 255])
-        found.append(((_is_doubtful(words, masks, lengths[-1]), -_least(words)), carrier_id, data[:WIDTH]))
+        found.append((_moved_from_zero(words), carrier_id, words))
     assert abs(np.median(lengths) - 1) > 1e-4  # quaternions are in use
     return found
 
 
-def _least(words: list[int]) -> int:
-    return min(word >> 23 & 255 for word in words[8:])
-
-
-def _is_doubtful(words: list[int], masks: list[int], length: float) -> bool:
-    if abs(length - 1) < 1e-4:
-        return True
-    if any(
-        word >> 23 & 255 == 0 or word & 0x7FFFFE & ~mask == 0 for word, mask in zip(words, masks, strict=True)
-    ):
-        return True
-    high = [(word & 0x7FFFFFFF) >> mask.bit_length() for word, mask in zip(words, masks, strict=True)]
-    together = [high[:3], high[3:7], *(high[at : at + 3] for at in range(8, 53, 3))]
-    return any(abs(a - b) <= 1 for values in together for a, b in combinations(values, 2))
+def _moved_from_zero(words: list[int]) -> bool:
+    groups = [[*words[:3], words[7]], words[3:7], *(words[8 + colour :: 3] for colour in range(3))]
+    for group in groups:
+        middle = np.array([word & 0x7FFFFFE0 | 0x10 for word in group], np.uint32).view(np.float32)
+        spans = [2.0 ** ((word >> 23 & 255) - 127 - 18) for word in group]
+        for one, size in enumerate(middle.astype(float)):
+            near = [
+                abs(size - other) <= max(spans[one], span) for other, span in zip(middle, spans, strict=True)
+            ]
+            if sum(near) >= 3:
+                return True
+    return False
 
 
 def test_a_reader_written_from_the_description_opens_the_carried_model() -> None:
     ordered = sorted(_gaussians())
-    gaussians = [(carrier_id, low) for _, carrier_id, low in ordered]
-    salts = [hashlib.sha256(b"keyss/v2/salt" + b"".join(each)).digest()[:16] for each in gaussians[:12]]
-    salt = salts[0]
-    master = hash_secret_raw(EXPECTED["key"].encode(), salt, 3, 65_536, 4, 32, Type.ID)
-    key_secret = _hkdf(master, "quiet/key")
-    data_keys = [_decrypted(key_secret, "key", carrier_id, low[:20]) for carrier_id, low in gaussians]
-    ((data_key, times),) = Counter(filter(None, data_keys)).most_common(1)
-    assert times == 12
-
-    parts = _numbered(data_key, "parameters", gaussians, WIDTH - 4, 1)
-    packed = b"".join(part for _, part in sorted(parts.items()))
-    version, method, size = struct.unpack_from("<B15sI", packed)
-    assert (version, method.rstrip(b"\0")) == (6, b"carry")
-    carriers, codewords, n, k = struct.unpack_from("<IIHH", packed, 20)
-    assert carriers == len(gaussians)
-    sketch, place_key = int.from_bytes(packed[32:64], "little"), _hkdf(data_key, "sketch")
-    places = {int.from_bytes(_aes(place_key, own)[:4], "little") % carriers for own, _ in gaussians}
+    least = [(own, _packed(words, 4)) for _, own, words in ordered]
+    assert {len(low) for _, low in least} == {26}
+    salts = [hashlib.sha256(b"keyss/v3/salt" + b"".join(each)).digest()[:16] for each in least[:4]]
+    for salt in salts:
+        master = hash_secret_raw(EXPECTED["key"].encode(), salt, 3, 65_536, 4, 32, Type.ID)
+        data_key = _message(_hkdf(master, "quiet/key"), "key", 16, 16, 12, least)
+        packed = _message(data_key, "parameters", 73, 26, 32, least)
+        if packed[:8] == _hkdf(data_key, "quiet/check", 8):
+            break
+    version, method, size, depth, carriers, codewords, n, k = struct.unpack_from("<B15sIBIIHH", packed, 8)
+    assert (version, method.rstrip(b"\0")) == (7, b"carry")
+    assert carriers == len(ordered)
+    assert codewords <= 32  # one group
+    sketch, place_key = int.from_bytes(packed[41:], "little"), _hkdf(data_key, "sketch")
+    places = {int.from_bytes(_aes(place_key, own)[:4], "little") % carriers for own, _ in least}
     assert {place for place in places if place < 256} == {bit for bit in range(256) if sketch >> bit & 1}
 
-    width = (WIDTH - 7) // 2 * 2
-    chunks = _numbered(data_key, "chunk", gaussians, 3 + width, 3)
+    chunks: dict[int, set[bytes]] = {}
+    for _, own, words in ordered:
+        value, low = _function(data_key, "chunk/place", own), _packed(words, depth)
+        number, width = int.from_bytes(_xor(low[1:3], value[2:4]), "little"), (len(low) - 3) // 2 * 2
+        if low[0] == value[0] and number < codewords * n:
+            data = _xor(low[3 : 3 + width], _function(data_key, "chunk/pad", own, width))
+            chunks.setdefault(number, set()).add(data)
     assert chunks.keys() == set(range(codewords * n))
-    encrypted = b"".join(chunks[number] for number in range(codewords * k))[:size]
+    assert all(len(chunks[number]) == 1 for number in range(codewords * k))  # no false ones among the data
+    encrypted = b"".join(min(chunks[number]) for number in range(codewords * k))[:size]
     payload_key = _hkdf(_hkdf(data_key, "payload-key"), "payload")
     plain = ChaCha20Poly1305(payload_key).decrypt(bytes(12), encrypted, b"keyss/v1/quiet")
     (length,) = struct.unpack_from("<I", plain)
@@ -121,15 +129,3 @@ def test_a_reader_written_from_the_description_opens_the_carried_model() -> None
     assert not any(plain[4 + length :])
     assert payload.hex() == EXPECTED["payload"]
     assert struct.unpack_from("<I", payload) == (EXPECTED["count"],)
-
-
-def _numbered(
-    data_key: bytes, label: str, gaussians: list[tuple[bytes, bytes]], size: int, number_bytes: int
-) -> dict[int, bytes]:
-    """By number, the data of all cells of a label that hold `size` bytes, of which the first are a number."""
-    cells = (_decrypted(data_key, label, carrier_id, low[: 4 + size]) for carrier_id, low in gaussians)
-    return {
-        int.from_bytes(data[:number_bytes], "little"): data[number_bytes:]
-        for data in cells
-        if data is not None
-    }

@@ -19,17 +19,17 @@ DRAWS = 3
 
 
 def _seen(own: float, others: Sequence[float], draw: int) -> dict[str, float]:
-    """What the holder of the first key sees; sizes in quarters of the capacity."""
+    """What the holder of the first key sees; sizes in quarters of the carriers at the least depth."""
     prepared = LOW_BITS.prepare(trained_like(COVER, seed=draw))
-    quarter = prepared.capacity.bytes // 4 - prepared.capacity.overhead
+    quarter = prepared.capacity.steps[0][1] - prepared.capacity.overhead
     payloads = [Payload("test", os.urandom(int(count * quarter))) for count in (own, *others)]
     keyed = [(keys(10 * draw + index), payload) for index, payload in enumerate(payloads)]
     stego = embed_payloads(prepared, keyed, os.urandom(32))
     return seen_by_holder(stego, keys(10 * draw)[prepared.fresh_salts[0]])
 
 
-@pytest.mark.parametrize("others", [[1], [2, 1]])
-def test_what_the_holder_counts_does_not_depend_on_others(others: list[int]) -> None:
+@pytest.mark.parametrize("others", [[1], [1.9, 1]])
+def test_what_the_holder_counts_does_not_depend_on_others(others: list[float]) -> None:
     pairs = [(_seen(1, [], draw), _seen(1, others, draw)) for draw in range(DRAWS)]
     for name in pairs[0][0]:
         alone, beside = (np.array([pair[side].get(name, np.nan) for pair in pairs]) for side in (0, 1))
@@ -41,5 +41,5 @@ def test_it_would_be_seen() -> None:
     """The control: where secrets do not fit beside each other as each would alone, the holder sees it."""
     alone = _seen(1, [], 0)
     with pytest.warns(KeyssWarning, match="can notice"):
-        beside = _seen(1, [1.2, 1.2], 0)
+        beside = _seen(1, [2.5, 2.5], 0)
     assert beside["chunks that there were"] > 1.1 * alone["chunks that there were"]

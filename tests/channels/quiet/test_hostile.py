@@ -18,7 +18,8 @@ from channels.quiet.payloads import embed_payloads
 from channels.quiet.trained_like import keys, trained_like
 from files.formats.examples import KINDS, random_codes
 from keyss.channels import LOW_BITS, CodesCover, Codewords, Payload, QuietReader
-from keyss.channels.quiet import payloads, quiet_header
+from keyss.channels.mixing import SKETCH_BYTES
+from keyss.channels.quiet import blocks, payloads, quiet_header
 from keyss.channels.quiet.quiet_header import Parameters
 from keyss.channels.reed_solomon import MAX_CHUNKS
 from keyss.core import Gaussians, InputError, UsageError, WrongKeyError
@@ -65,11 +66,17 @@ def test_mutated_files_open_or_are_refused(suffix: str) -> None:
 def test_parameters_that_name_more_than_there_is(
     size: int, block: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    hostile = Parameters("carry", size, block)
-    monkeypatch.setattr(payloads, "Parameters", lambda *_: hostile)
-    file = written(CodesCover.of(codes_of(".spz", 2500)), b"data")
+    packed = struct.pack("<B15sIH", blocks._VERSION, b"carry", size, block)
+    with monkeypatch.context() as patch:
+        patch.setattr(blocks, "_PARAMETERS", _Packer(packed))
+        file = written(CodesCover.of(codes_of(".spz", 2500)), b"data")
     with pytest.raises(InputError, match="exceed the file"):
         opened(file)
+
+
+class _Packer:
+    def __init__(self, packed: bytes) -> None:
+        self.pack = lambda *_: packed
 
 
 @contextmanager
@@ -117,29 +124,30 @@ class Impossible(Codewords):
 @pytest.mark.parametrize(
     ("size", "codewords"),
     [
-        (10**9, Codewords(quiet_header.MAX_CODEWORDS, 1024, 999, 68)),
-        (69, Codewords(1, 255, 1, 68)),
-        (0, Codewords(1, 255, 1, 68)),
-        (1, Codewords(quiet_header.MAX_CODEWORDS + 1, 255, 1, 68)),
-        (1, Codewords(1, 1025, 1, 68)),
-        (1, Impossible(0, 255, 1, 68)),
-        (1, Impossible(1, 2, 3, 68)),
-        (1, Impossible(1, 255, 0, 68)),
+        (10**9, Codewords(quiet_header.MAX_CODEWORDS, 1024, 999, 22)),
+        (23, Codewords(1, 255, 1, 22)),
+        (0, Codewords(1, 255, 1, 22)),
+        (1, Codewords(quiet_header.MAX_CODEWORDS + 1, 255, 1, 22)),
+        (1, Codewords(1, 1025, 1, 22)),
+        (1, Impossible(0, 255, 1, 22)),
+        (1, Impossible(1, 2, 3, 22)),
+        (1, Impossible(1, 255, 0, 22)),
     ],
     ids=["lost", "size", "empty", "codewords", "chunks", "no codewords", "more data", "no data"],
 )
 def test_hostile_parameters_end_in_a_sentence(
     cover: Gaussians, size: int, codewords: Codewords, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    hostile = Parameters("carry", size, 0, codewords, 3000, bytes(32))
-    monkeypatch.setattr(payloads, "Parameters", lambda *_: hostile)
-    stego = embed_payloads(LOW_BITS.prepare(cover), [(keys(), Payload("carry", b"x"))])
+    hostile = Parameters("carry", size, 4, 3000, codewords, bytes(SKETCH_BYTES))
+    with monkeypatch.context() as patch:
+        patch.setattr(payloads, "Parameters", lambda *_: hostile)
+        stego = embed_payloads(LOW_BITS.prepare(cover), [(keys(), Payload("carry", b"x"))])
     reader = QuietReader.of(stego)
     with at_most(10), pytest.raises(InputError, match=r"the key is right|are damaged"):
         reader.extract(keys()[0])
 
 
-@pytest.mark.parametrize("version", [0, 5, 7, 255])
+@pytest.mark.parametrize("version", [0, 5, 8, 255])
 def test_other_versions_end_in_a_sentence(
     cover: Gaussians, version: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -11,39 +11,45 @@ import pytest
 from scipy.stats import ks_2samp
 
 from channels.quiet.trained_like import keys
-from keyss.channels import Payload, key_cipher
+from keyss.channels import LEAST, Layout, LowBitsCapacity, Payload
 from keyss.channels.quiet.payloads import Writer
-from keyss.channels.quiet.quiet_header import chunk_cipher, parameter_cipher
+from keyss.channels.quiet.quiet_header import Parameters, key_message, key_secret, parameter_message
 from keyss.channels.quiet.usable import SALTS
 from keyss.core import KeyssWarning
 
-CARRIERS, WIDTH = 3000, 75
+CARRIERS, LAYOUT = 4000, Layout(3)
 IDS = np.random.default_rng(0).integers(0, 256, (CARRIERS, 16), np.uint8)
 OWN = keys(0)
 HIDINGS = 40
-QUARTER = 24_000  # bytes that fit into a quarter of these carriers
+CAPACITY = LowBitsCapacity(CARRIERS, {LEAST: CARRIERS}, LAYOUT)
+QUARTER = CAPACITY.for_payloads().steps[0][1] - 100  # bytes that fit into a quarter of these carriers
 
 
 def _seen(sizes: Sequence[int]) -> list[float]:
-    """What the holder of the first key can count of its own cells, and of all others together."""
-    writer = Writer(IDS, WIDTH, os.urandom(32), len(IDS), IDS)
+    """What the holder of the first key can count of its own rows, and of all others together."""
     payloads = [Payload("test", os.urandom(size)) for size in sizes]
-    writer.write([([each] * SALTS, payload) for each, payload in zip(OWN, payloads, strict=False)])
-    low = np.empty_like(writer.table)
-    low[writer.order] = writer.table
-    fits, found = key_cipher(OWN[0]).decrypt(IDS, low)
-    data_key = found[0].tobytes()
-    headers = fits | parameter_cipher(data_key, WIDTH).decrypt(IDS, low)[0]
-    own = chunk_cipher(data_key, WIDTH).decrypt(IDS, low)[0]
-    places = np.flatnonzero(own)
+    writer = Writer(CAPACITY, {LEAST: np.ones(CARRIERS, bool)}, IDS, os.urandom(32))
+    low = np.empty((CARRIERS, LAYOUT.width(LEAST)), np.uint8)
+    for _, rows, data in writer.write([([k] * SALTS, each) for k, each in zip(OWN, payloads, strict=False)]):
+        low[rows, : data.shape[1]] = data
+    message = key_message(key_secret(OWN[0]), low.shape[1])
+    data_key = message.read(IDS, low)
+    places, contents = message.write(IDS, data_key)
+    own_key = (low[places, :16] == contents).all(axis=1)
+    message = parameter_message(data_key, low.shape[1])
+    packed = message.read(IDS, low)
+    places, contents = message.write(IDS, packed)
+    own_parameters = (low[places] == contents).all(axis=1)
+    found = Parameters.unpack(packed, data_key, LAYOUT)
+    own = found.chunks(data_key, LAYOUT).decrypt(IDS, low)[0]
     return [
-        float(headers.sum()),
+        float(own_key.sum()),
+        float(own_parameters.sum()),
         float(own.sum()),
-        float(places.mean()),
-        float(np.diff(places).var()),
+        float(np.flatnonzero(own).mean()),
+        float(np.diff(np.flatnonzero(own)).var()),
         float((own[1:] & own[:-1]).sum()),
-        float((headers[1:] & own[:-1]).sum()),
-        float(low[~own & ~headers].mean()),
+        float(low[~own].mean()),
     ]
 
 
@@ -57,9 +63,9 @@ def _least_chance(alone: list[list[float]], beside: list[list[float]]) -> float:
     ("own", "others"),
     [
         (QUARTER, [QUARTER]),
-        (5000, [QUARTER, 9000, 1]),
+        (2000, [QUARTER, 3000, 1]),
         (2 * QUARTER, [QUARTER, 100]),
-        (5000, [2 * QUARTER]),
+        (2000, [2 * QUARTER]),
     ],
     ids=["quarters", "four secrets", "half beside quarters", "quarter beside half"],
 )
@@ -74,7 +80,7 @@ def test_who_is_crowded_is_warned_for_it_can_be_seen() -> None:
     alone = [_seen([QUARTER]) for _ in range(HIDINGS)]
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        beside = [_seen([QUARTER, 30_000, 30_000]) for _ in range(HIDINGS)]
+        beside = [_seen([QUARTER, 2 * QUARTER, 2 * QUARTER]) for _ in range(HIDINGS)]
     assert {each.category for each in caught} == {KeyssWarning}
     assert _least_chance(alone, beside) < 1e-10
     with pytest.warns(KeyssWarning, match="can notice that there are other secrets"):

@@ -11,7 +11,7 @@ from channels.quiet.trained_like import trained_like
 from keyss import Secret, SecretFile, hide, hide_files
 from keyss.channels import channel_for
 from keyss.channels.appended import appended_channel
-from keyss.channels.quiet import quiet_channel, usable
+from keyss.channels.quiet import usable
 from keyss.core import Gaussians, UsageError
 from keyss.methods.carry import capacity
 
@@ -23,9 +23,8 @@ def test_large_covers_without_random_bits_are_refused_by_a_sample(monkeypatch: p
         judged.append(len(gaussians))  # type: ignore[arg-type]
         return original(gaussians, *rest)  # type: ignore[arg-type]
 
-    original = usable.usable_with_ids
-    monkeypatch.setattr(usable, "usable_with_ids", counted)
-    monkeypatch.setattr(quiet_channel, "usable_with_ids", counted)
+    original = usable.Steps
+    monkeypatch.setattr(usable, "Steps", counted)
     monkeypatch.setattr(usable, "_LARGE", 5000)
     monkeypatch.setattr(usable, "_SAMPLE", 1000)
     cover = trained_like(6000, 0, 1)

@@ -11,7 +11,7 @@ import torch
 
 from channels.quiet.trained_like import trained_like
 from keyss import CarryOptions, Gaussians
-from keyss.channels import LowBitsCapacity
+from keyss.channels import Layout, LowBitsCapacity
 from keyss.core import KeyssWarning, UsageError
 from keyss.keys.encryption import OVERHEAD, compressed_size
 from keyss.methods import Context, Source, registry
@@ -30,28 +30,18 @@ def _unit(model: Gaussians) -> Gaussians:
     return replace(model, quats=torch.nn.functional.normalize(model.quats, dim=1))
 
 
-@pytest.mark.parametrize("change", [lambda model: model, _unit])
-def test_cover_without_harmonics(
-    change: Callable[[Gaussians], Gaussians],
-) -> None:
-    """Hiding with the degree that the error names has the planned capacity, or more with fewer harmonics."""
-    cover, secret = change(trained_like(4000, sh_degree=0)), trained_like(9000, 1, 2)
-    with pytest.raises(UsageError, match=r"degree 0 .*no room.*`publish=.any.`") as refusal:
-        _prepare(CarryOptions(format="ply"), cover, secret)
-    degree = int(str(refusal.value).partition("`sh_degree=")[2][0])
-    assert degree == (2 if change is _unit else 1)
-    for less in range(degree):
-        with pytest.raises(UsageError, match=f"`sh_degree={degree}[`,]"):
-            _prepare(CarryOptions(sh_degree=less, format="ply"), cover, secret)
-    options = _prepare(CarryOptions(sh_degree=degree, refit="never"), cover, secret)
+@pytest.mark.parametrize(("change", "least"), [(lambda model: model, 1000), (_unit, 300)])
+def test_cover_without_harmonics(change: Callable[[Gaussians], Gaussians], least: int) -> None:
+    """A secret is pruned to what the low bits of geometry hold."""
+    cover, secret = change(trained_like(20_000, sh_degree=0)), trained_like(4000, 1, 2)
+    options = _prepare(CarryOptions(refit="never", format="ply"), cover, secret)
     sources = [Source(each, False, KEY, scene_of_model(each, "m", size=24)) for each in (cover, secret)]
     planned = registry.get("carry").plan(sources, options)
     context = Context(torch.device("cpu"), entropy=bytes(32))
     stego = registry.get("carry").hide(sources[0], sources[1:], options, context)
     (opened,) = stego.opened
-    assert stego.gaussians.sh_degree == planned.sh_degree == degree
-    assert len(opened.reveal(stego.gaussians)) >= planned.capacity > 1000
-    assert _prepare(CarryOptions(publish="any"), cover, secret).fit.sh_degree == 0
+    assert stego.gaussians.sh_degree == planned.sh_degree == 0
+    assert len(opened.reveal(stego.gaussians)) >= planned.capacity > least
 
 
 def test_predictable_cover_is_refused() -> None:
@@ -72,11 +62,11 @@ def test_predictable_cover_is_refused() -> None:
     _prepare(CarryOptions(publish="any"), grey, grey)
 
 
-@pytest.mark.parametrize("carriers", [450, 1200, 4000, 20_000])
+@pytest.mark.parametrize("gaussians", [600, 1600, 5300, 27_000])
 @pytest.mark.parametrize("secrets", [1, 2, 3, 5, 8])
-def test_shares_fit(carriers: int, secrets: int) -> None:
+def test_shares_fit(gaussians: int, secrets: int) -> None:
     """Incompressible payloads of the sizes that secrets may have, whatever they need."""
-    cells = LowBitsCapacity.of(carriers, 3)
+    cells = LowBitsCapacity.of(gaussians, Layout(3))
     capacity, random = cells.for_payloads(), np.random.default_rng(0)
     for _ in range(20):
         needed = random.integers(1, capacity.bytes + 2, secrets).tolist()
@@ -87,10 +77,10 @@ def test_shares_fit(carriers: int, secrets: int) -> None:
 
 def test_a_secret_that_is_pruned_for_others_is_not_hidden_silently() -> None:
     """Alone it would stay whole; pruned to a third, its payload fits into a half."""
-    cover, models = trained_like(4000), [trained_like(count, 1, 1) for count in (6000, 200, 200)]
+    cover, models = trained_like(4000), [trained_like(count, 1, 1) for count in (4000, 200, 200)]
     capacity = CarryCapacity.of(cover, CarryOptions(format="ply"))
     views = [Viewpoints.around(model) for model in models]
     (alone,) = capacity.prune(models[:1], views[:1])
-    assert len(alone) == 6000
+    assert len(alone) == 4000
     with pytest.warns(KeyssWarning, match="can notice that there are other secrets"):
-        assert len(capacity.prune(models, views)[0]) < 6000
+        assert len(capacity.prune(models, views)[0]) < 4000

@@ -20,7 +20,6 @@ from keyss.channels import (
     salt_rows,
     usable_carriers,
 )
-from keyss.channels.quiet.quiet_header import key_cipher
 from keyss.core import Gaussians, KeyssError, WrongKeyError
 from keyss.keys import DerivedKey
 from keyss.methods import embed_models
@@ -59,32 +58,31 @@ def test_round_trip(cover: Gaussians, secret: Gaussians) -> None:
     assert torch.allclose(found.sh[:, 0], secret.sh[nearest, 0], atol=0.06)
 
 
-@pytest.mark.parametrize("cover_degree", [1, 2, 3])
+@pytest.mark.parametrize("cover_degree", range(4))
 @pytest.mark.parametrize("secret_degree", range(4))
 def test_sh_degrees(cover_degree: int, secret_degree: int) -> None:
-    model, hidden = trained_like(3000, sh_degree=cover_degree), trained_like(300, 1, secret_degree)
+    model, hidden = trained_like(12_000, sh_degree=cover_degree), trained_like(200, 1, secret_degree)
     own = keys()
     carried = extract_derived(QuietReader.of(embed_derived(model, [(own, hidden)])), own[0])
     assert carried.gaussians.sh_degree == secret_degree
-    assert len(carried.gaussians) == 300
+    assert len(carried.gaussians) == 200
 
 
 def test_every_usable_gaussian_is_written() -> None:
     """The holder of one key sees the same whatever else is hidden."""
     cover, own, other = trained_like(4000), keys(1), keys(2)
-    hidden = [trained_like(700, 5), trained_like(800, 6)]
-    before = read_low_bits(cover)
+    hidden = [trained_like(300, 5), trained_like(350, 6)]
+    before = read_low_bits(cover, 4)
     seen = []
     for secrets in ([(own, hidden[0])], [(own, hidden[0]), (other, hidden[1])]):
         stego = embed_derived(cover, secrets)
-        changed = (read_low_bits(stego) != before).any(axis=1)
-        assert (changed == usable_carriers(cover)).all()
-        counts = np.bincount(read_low_bits(stego).ravel(), minlength=256)
+        changed = (read_low_bits(stego, 4) != before).any(axis=1)
+        assert (changed == usable_carriers(cover, 4)).all()
+        counts = np.bincount(read_low_bits(stego, 4).ravel(), minlength=256)
         assert ((counts - counts.mean()) ** 2).sum() / counts.mean() < 255 + 6 * (2 * 255) ** 0.5
         carriers = QuietReader.of(stego)
         carried = extract_derived(carriers, own[0])
-        cells, _ = key_cipher(own[0]).decrypt(carriers.ids, carriers.low)
-        seen.append((carried.chunks, len(carried.gaussians), int(cells.sum())))
+        seen.append((carried.chunks, len(carried.gaussians)))
         with pytest.raises(WrongKeyError):
             extract_derived(carriers, keys(3)[0])
     assert seen[0] == seen[1]
@@ -144,8 +142,7 @@ def _with_flipped_bit(model: Gaussians, row: int, column: int, bit: int) -> Gaus
 def test_foreign_gaussians_do_not_block_salts(stego: Gaussians, secret: Gaussians) -> None:
     """Three inserted Gaussians come first in the order of salts."""
     own = QuietReader.of(stego).salts
-    added = trained_like(200, seed=9)
-    added.sh[:, 1:] *= 20
+    added = trained_like(60_000, seed=9)  # three of many have smaller IDs than all others
     added = added[torch.from_numpy(salt_rows(added, gaussian_ids(added), Layout.of(added))[:3])]
     crowded = Gaussians.cat([added, stego])
     assert not set(own) & set(QuietReader.of(crowded).salts[:3])

@@ -76,7 +76,6 @@ def test_hide_and_reveal_files(run: Run, tmp_path: Path) -> None:
         (("--mask", "op", "--method=carry"), "keyss"),
         (("--key_encoder=clip", "--method", "keyss", "--method", "carry"), "keyss"),
         (("--refit", "never", "--method", "keyss"), "carry"),
-        (("--sh-degree=2", "--method=keyss"), "carry"),
     ],
 )
 def test_options_of_other_methods(run: Run, tmp_path: Path, arguments: tuple[str, ...], having: str) -> None:

@@ -1,22 +1,20 @@
 """The quiet channel: secrets in low bits of floats, or in last bits of codes, a quantised format's integers.
 
 A file has no magic number and no index of its secrets. Bits are stored in *carriers*: the low bits of one
-Gaussian, or one block of last bits of codes (see `wet_paper`). A carrier holds encrypted *cells*, each with a
-tag: a reader decrypts all of them and keeps those with a valid tag.
+Gaussian, or one block of last bits of codes (see `wet_paper`). A *salt* of Argon2id is a hash of one carrier
+that holds nothing else. A salt is *stale* if its Gaussian is not usable (see `usable`): the author of the
+cover knows it in advance, so no key is written under it. A reader tries SALTS_TRIED salts; covers with
+as many stale ones among the first 2 SALTS_TRIED are refused: in others, random removal of a quarter leaves it
+no fresh one with p < 3e-4.
 
-- A *salt* of Argon2id is a hash of one carrier without cells (see `usable`). A salt is *stale* if its
-  Gaussian is not usable: the author of the cover knows it in advance, so no key cell is written for it. A
-  reader tries SALTS_TRIED salts; covers with as many stale ones are refused.
-- *Key cells*, encrypted under the key and a salt, hold the data key of a secret.
-- *Parameter cells*, encrypted under the data key, tell how to read the rest (see `quiet_header`).
-- *Chunk cells*, encrypted under the data key, hold numbered chunks of the encrypted payload, with redundancy:
-  shuffling is harmless, and a quarter of the Gaussians may be lost. In codes nothing may be lost or
-  reordered: the payload lies in the blocks after its header, without cells.
+In low bits, the IDs of Gaussians and a key tell where a secret lies (see `spread` and `quiet_header`), with
+redundancy: shuffling is harmless, and a quarter of the Gaussians may be lost. In codes nothing may be lost or
+reordered (see `blocks`).
 
 Carriers are chosen at random, and unused usable carriers get noise, so the number of secrets does not show.
 All randomness is derived from `entropy`, which must be secret: otherwise the holder of one key could compute
 the file without the other secrets and compare. No key stream is used twice: data keys depend on entropy and
-all payloads, and the key stream of a cell depends on its data (see `cells`).
+all payloads.
 """
 
 from __future__ import annotations
@@ -34,7 +32,8 @@ from torch import Tensor
 from keyss.channels.base import SALTS_TRIED, Capacity, Channel, Payload, check_keys, randomness
 from keyss.channels.mixing import random_fractions
 from keyss.channels.quiet import wet_paper
-from keyss.channels.quiet.bits import Layout, read_low_bits, write_low_bits
+from keyss.channels.quiet.bits import LEAST, Layout, read_low_bits, write_low_bits
+from keyss.channels.quiet.blocks import HEADER_BLOCKS, LEAST_BYTES, MIN_BLOCKS, write_blocks
 from keyss.channels.quiet.decoded import Decoded
 from keyss.channels.quiet.fields import (
     FORMATS,
@@ -48,16 +47,8 @@ from keyss.channels.quiet.fields import (
     with_levels,
 )
 from keyss.channels.quiet.payloads import Writer
-from keyss.channels.quiet.quiet_header import (
-    BLOCK_HEADER,
-    INCOMPRESSIBLE,
-    LEAST_BYTES,
-    MIN_BLOCKS,
-    TYPICAL_SHARE,
-    LowBitsCapacity,
-    check_width,
-)
-from keyss.channels.quiet.usable import check_sample, check_usable, salt, salt_rows, usable_with_ids
+from keyss.channels.quiet.quiet_header import INCOMPRESSIBLE, LowBitsCapacity
+from keyss.channels.quiet.usable import Carriers, salt, salt_rows
 from keyss.channels.quiet.writable_levels import fixed_axes, writable_levels
 from keyss.core.arrays import Bits, Bytes, Flags, Integers
 from keyss.core.errors import UsageError
@@ -77,37 +68,27 @@ class LowBits(Channel):
     place = "low bits"
 
     def __init__(self) -> None:
-        # Cache by cover, valid while its tensors keep their versions: (versions, usable, ids, rows of salts).
-        self._found: WeakKeyDictionary[Gaussians, tuple[list[int], Flags, Bytes, Integers]] = (
-            WeakKeyDictionary()
-        )
+        # Cache by cover, valid while its tensors keep their versions: (versions, carriers, rows of salts).
+        self._found: WeakKeyDictionary[Gaussians, tuple[list[int], Carriers, Integers]] = WeakKeyDictionary()
 
-    def prepare(self, cover: Gaussians, *, sh_degree: int | None = None) -> LowBitsCover:
-        """See `Channel`. Raises UsageError for low bits that are few or not random, and for stale salts.
-
-        `sh_degree`: 1 if harmonics of higher degrees must stay as they are, to the bit.
-        """
+    def prepare(self, cover: Gaussians) -> LowBitsCover:
+        """See `Channel`. Raises UsageError for low bits that are few or not random, and for stale salts."""
         layout, versions = Layout.of(cover), _versions(cover)
-        check_width(layout)
         if (found := self._found.get(cover)) is None or found[0] != versions:
-            check_sample(cover)
-            usable, ids = usable_with_ids(cover, layout)
-            check_usable(cover, usable, layout)
-            rows = salt_rows(cover, ids, layout)
-            stale = int((~usable[rows]).sum())
+            carriers = Carriers.of(cover, layout)
+            rows = salt_rows(cover, carriers.ids, layout)
+            first = rows[: 2 * SALTS_TRIED]
+            stale = int((~carriers.usable[LEAST][first]).sum())
             if stale >= SALTS_TRIED:
                 raise UsageError(
-                    f"{stale} of the {len(rows)} salts of this cover cannot be renewed, and whoever made it "
-                    "could try keys in advance"
+                    f"{stale} of the first {len(first)} salts of this cover cannot be renewed, and whoever "
+                    "made it could try keys in advance"
                 )
-            found = self._found[cover] = versions, usable, ids, rows
-        if sh_degree is not None:
-            layout = replace(layout, written_degree=min(sh_degree, layout.sh_degree))
+            found = self._found[cover] = versions, carriers, rows
         return LowBitsCover(cover, layout, *found[1:])
 
     def estimate_capacity(self, gaussians: int, sh_degree: int) -> Capacity:
-        check_width(Layout(sh_degree))
-        return LowBitsCapacity.of(int(TYPICAL_SHARE * gaussians), sh_degree).for_payloads()
+        return LowBitsCapacity.of(gaussians, Layout(sh_degree)).for_payloads()
 
 
 LOW_BITS = LowBits()
@@ -144,17 +125,16 @@ class LowBitsCover:
 
     cover: Gaussians
     layout: Layout
-    usable: Flags  # [N]
-    ids: Bytes  # [N, 16] of all Gaussians
+    carriers: Carriers
     salt_rows: Integers  # [S] rows of the salts' Gaussians, in order
 
-    @property
+    @cached_property
     def capacity(self) -> Capacity:
-        return LowBitsCapacity(len(self._rows), self.layout.width).for_payloads()
+        return self._capacity.for_payloads()
 
     def embed(self, payloads: Sequence[tuple[str, Payload]], *, entropy: bytes | None = None) -> Gaussians:
         """See `PreparedCover`. Takes 1.6 s for each secret for key derivation."""
-        mixed = randomness(entropy, self.ids.tobytes(), *(payload.data for _, payload in payloads))
+        mixed = randomness(entropy, self.carriers.ids.tobytes(), *(payload.data for _, payload in payloads))
         salts = self._salts(mixed)[1]
         fresh = [salts[index] for index in self.fresh_salts]
         return self.embed_derived([(_derive(key, fresh), payload) for key, payload in payloads], mixed)
@@ -167,32 +147,37 @@ class LowBitsCover:
         `entropy`: the result of `randomness`, used for this file only.
         """
         check_keys([keys[0].verifier() for keys, _ in payloads])
-        fresh, _ = self._salts(entropy)
-        writer = Writer(self.ids[self._rows], self.layout.width, entropy, len(self.ids), self.ids)
-        writer.write(payloads)
-        parts = [(self.salt_rows[self.fresh_salts], fresh), (self._rows[writer.order], writer.table)]
+        parts = [(LEAST, self.salt_rows[self.fresh_salts], self._salts(entropy)[0])]
+        parts += Writer(self._capacity, self._usable, self.carriers.ids, entropy).write(payloads)
         return write_low_bits(self.cover, self.layout, parts)
 
     @cached_property
     def fresh_salts(self) -> Integers:
         """[F] indices of the salts that are not stale."""
-        return np.flatnonzero(self.usable[self.salt_rows])
+        return np.flatnonzero(self.carriers.usable[LEAST][self.salt_rows])
 
     @cached_property
-    def _rows(self) -> Integers:
-        """[C] rows of the carriers."""
-        carriers = self.usable.copy()
-        carriers[self.salt_rows] = False
-        return np.flatnonzero(carriers)
+    def _usable(self) -> dict[int, Flags]:
+        """[N] masks, by depth, without the Gaussians of salts."""
+        others = np.ones(len(self.cover), bool)
+        others[self.salt_rows] = False
+        return {depth: usable & others for depth, usable in self.carriers.usable.items()}
+
+    @cached_property
+    def _capacity(self) -> LowBitsCapacity:
+        counts = {depth: int(usable.sum()) for depth, usable in self._usable.items()}
+        return LowBitsCapacity(len(self.cover), counts, self.layout)
 
     def _salts(self, entropy: bytes) -> tuple[Bytes, list[bytes]]:
         """New low bits [F, B] of the Gaussians of fresh salts, and all salts with these low bits."""
-        noise = stream(entropy, "quiet/salts", len(self.fresh_salts) * self.layout.width)
-        fresh = np.frombuffer(noise, np.uint8).reshape(len(self.fresh_salts), self.layout.width)
-        whole = replace(self.layout, written_degree=None)
-        low = read_low_bits(self.cover[torch.from_numpy(self.salt_rows)], whole)
-        low[self.fresh_salts, : self.layout.width] = fresh
-        return fresh, [salt(*each) for each in zip(self.ids[self.salt_rows], low, strict=True)]
+        width = self.layout.width(LEAST)
+        noise = stream(entropy, "quiet/salts", len(self.fresh_salts) * width)
+        fresh = np.frombuffer(noise, np.uint8).reshape(len(self.fresh_salts), width)
+        rows = self.cover[torch.from_numpy(self.salt_rows)]
+        renewed = write_low_bits(rows, self.layout, [(LEAST, self.fresh_salts, fresh)])
+        low = read_low_bits(renewed, LEAST, self.layout)
+        ids = self.carriers.ids[self.salt_rows]
+        return fresh, [salt(*each) for each in zip(ids, low, strict=True)]
 
 
 @dataclass(frozen=True)
@@ -259,9 +244,8 @@ class CodesCover:
             salts = [salt(self.ids[0], first[:LEAST_BYTES])]
             derived = [(_derive(key, salts), payload) for key, payload in payloads]
             check_keys([keys[0].verifier() for keys, _ in derived])
-            writer = Writer(self.ids[1:], self.width, own, len(self.codes))
-            writer.write(derived)
-            if (bits := self._solve(np.concatenate([first[None], writer.table]), own)) is not None:
+            table = write_blocks(self.ids[1:], self.width, own, [(keys[0], each) for keys, each in derived])
+            if (bits := self._solve(np.concatenate([first[None], table]), own)) is not None:
                 return self._model_to_publish(self._with_bits(bits, own), own)
         raise RuntimeError("the blocks of this cover cannot be solved")
 
@@ -304,7 +288,7 @@ class CodesCover:
 
 def _overhead(width: int) -> int:
     """Maximum bytes of a payload beside its data, in blocks of `width` bytes."""
-    return (BLOCK_HEADER + 1) * width + OVERHEAD
+    return (HEADER_BLOCKS + 1) * width + OVERHEAD
 
 
 def _versions(model: Gaussians) -> list[int]:

@@ -3,34 +3,28 @@
 In a trained model most low bits are uniformly random to anybody who does not know the training, but not all.
 A Gaussian is excluded as a whole, so that its numbers stay consistent, because of:
 
-- *Untrained numbers*: zeros, integers and short fractions, subnormal numbers, and values that occur too
-  often (after few training steps many are the same small multiple of the learning rate).
-- *Saturated opacities*: where float32's sigmoid is 1 its gradient is 0, so that logits of clones stay equal
-  while everything else about them changes.
-- *Coincidences*: numbers that agree in all bits above the written ones would differ in these afterwards. They
-  are near-equal components (grey colours, round Gaussians), harmonics of one colour that are equal several
-  times (a Gaussian that few views show gets equal steps), Gaussians that share their scales, their quaternion
-  or harmonics of one channel (clones, and channels that training freezes), unit quaternions, and Gaussians
-  that occur twice.
-- *Equal steps* away from a neighbour: see `predictability`.
-- *Opacities at the edge* below which trainers remove Gaussians: no trained model has smaller ones.
-- *Small even numbers*, which an optimiser may have left on a coarser grid: see `predictability`.
+- *Equal steps* away from zero or a neighbour: see `equal_steps`. These are also the harmonics of Gaussians
+  that no view shows, and numbers that training freezes in clones.
+- *Copies*: Gaussians that share their position, scales, quaternion or the harmonics of degree 1 of a colour
+  with any other one, and values that occur too often.
+- *Nearly equal* scales, or colours of a harmonic: round and grey Gaussians.
+- *Opacities* whose sigmoid is 1, which have no gradient, and those at the edge below which trainers remove
+  Gaussians: no trained model has smaller ones.
+- *Small even numbers*, which an optimiser may have left on a coarser grid: see `trailing_zeros`.
 
-Coincidences are found in bits that embedding never changes. Otherwise false exclusions must be rare:
-embedding makes as many such Gaussians again by chance, and twice the expected number would be noticed.
+All but the last are found in bits that embedding never changes. docs/threat-model.md tells what each hides.
 
 A *salt* of Argon2id is a hash of one Gaussian and its low bits, which are new random bits for every file and
 carry nothing else: no two files of one cover share a salt. There are several salts because Gaussians may be
-removed. Their order does not change by embedding: first Gaussians without small harmonics and coincidences,
-which are rarely excluded, and among these the smallest IDs.
+removed. Their order does not change by embedding: first Gaussians that did not move by equal steps away from
+zero, and among these the smallest IDs.
 """
 
 from __future__ import annotations
 
 import hashlib
 import math
-from concurrent.futures import ThreadPoolExecutor
-from itertools import combinations
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -38,24 +32,20 @@ import torch
 from keyss.channels.mixing import row_hashes
 from keyss.channels.quiet.bits import (
     BLOCK,
+    DEEPEST,
+    DEPTHS,
     GEOMETRY,
-    GEOMETRY_BITS,
+    LEAST,
+    LOW,
     QUATS,
-    UNIT_TOLERANCE,
-    UNUSED_BITS,
     Layout,
-    coarse_lengths,
     gaussian_ids,
     group_words,
     read_low_bits,
     used_words,
 )
-from keyss.channels.quiet.predictability import (
-    chance_of_equal_steps,
-    count_trailing_zeros,
-    find_siblings,
-    least_exponent,
-)
+from keyss.channels.quiet.equal_steps import Steps, moved_from_zero
+from keyss.channels.quiet.trailing_zeros import count_trailing_zeros, least_exponent
 from keyss.core.arrays import Bytes, Doubles, Flags, Integers, Numbers, Words, Words32
 from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
@@ -63,8 +53,7 @@ from keyss.kernels.parallel import in_blocks
 from keyss.keys.derivation import SALT_BYTES
 
 SALTS = 12  # random pruning of a quarter removes all their Gaussians with p = 6e-8
-_LABEL = b"keyss/v2/salt"
-_MIN_USABLE = 0.5  # share of the Gaussians of a cover
+_LABEL = b"keyss/v3/salt"
 # Maximum squared separation (d') of a plain file and one with new bits by small numbers, for an attacker who
 # knows the trainer and the plain file's statistics. 0.03 is an AUC of 0.55.
 MAX_SEPARATION = 0.03
@@ -75,110 +64,81 @@ _GROUPS = {
     "opacity logits": slice(7, 8),
     "harmonics": slice(GEOMETRY, None),
 }
-
-# A short number has at least this many trailing zeros. One in a million does by chance: short numbers are
-# excluded only if there are more.
-_SHORT_BITS = 20
-_SHORT = np.uint32((1 << _SHORT_BITS) - 1)
-# A Gaussian is untrained if this many values have 12 trailing zeros; by chance one in three million is.
-_ZEROS, _ZERO_FIELDS = np.uint32((1 << 12) - 1), 3
-_EQUAL_HARMONICS = 2  # pairs
-_MAGNITUDE, _MANTISSA = np.uint32(0x7FFFFFFF), np.uint32((1 << 23) - 1)
-
+_MAGNITUDE = np.uint32(0x7FFFFFFF)
 _OPACITY = 7
 # Bit patterns of logits above 16. The sigmoid is 1 above 16.64, but only the exponent never changes.
 _SATURATED = np.uint32(0x41800000), np.uint32(0x80000000)
-# The logit of 0.005, below which trainers prune, without the bits that may be written.
-_PRUNED = np.float32(math.log(0.005 / 0.995)).view(np.uint32) >> np.uint32(GEOMETRY_BITS + UNUSED_BITS)
-# Consecutive harmonics of a channel that clones share, in small and large models. By chance 0.3 % of 20,000
-# Gaussians share two.
-_FEW_GAUSSIANS, _SHARED_BY_FEW, _SHARED_BY_MANY = 50_000, 2, 3
-
-_EXACT = 1e-6  # error of the length of a unit quaternion in single precision
-# Maximum expected number of sets of equal values by chance.
-_SETS_BY_CHANCE = 0.1
+_PRUNED = np.float32(math.log(0.005 / 0.995)).view(np.uint32) | LOW  # the logit of 0.005, without low bits
+_MIN_USABLE = 0.05  # share of the Gaussians of a cover
+_SETS_BY_CHANCE = 0.1  # maximum expected number of sets of equal values by chance
 _SAMPLE = 20_000  # Gaussians whose bits are tested
 _LARGE = 10 * _SAMPLE  # Gaussians of a cover whose sample is tested first
-_CHANCE = 1e-6  # probability of refusing a model with uniform bits
+_CHANCE = 1e-6  # probability of refusing a depth of a model with uniform bits
 
 
-def usable_carriers(gaussians: Gaussians) -> Flags:
-    """Mask [N] of the usable Gaussians."""
-    return usable_with_ids(gaussians, Layout.of(gaussians))[0]
+@dataclass(frozen=True)
+class Carriers:
+    """The Gaussians of a cover that may be written, by depth."""
 
+    ids: Bytes  # [N, 16] of all Gaussians
+    usable: dict[int, Flags]  # [N] masks by depth, of the depths at which new low bits do not show
 
-def usable_with_ids(gaussians: Gaussians, layout: Layout) -> tuple[Flags, Bytes]:
-    """`usable_carriers` [N], and all `gaussian_ids` [N, 16]."""
-    with ThreadPoolExecutor(1) as helper:
-        counting = helper.submit(_frequent_values, gaussians)  # mostly without the GIL
+    @staticmethod
+    def of(gaussians: Gaussians, layout: Layout, depths: tuple[int, ...] = DEPTHS) -> Carriers:
+        """Raises UsageError, with what shows, if new low bits would show even at the first of `depths`.
+
+        A sample of a large cover is tested first: the whole takes a second for each 40,000 Gaussians.
+        """
+        if len(gaussians) > _LARGE:
+            sample = gaussians[:: len(gaussians) // _SAMPLE]
+            Carriers.of(sample, Layout.of(sample), depths[:1])
         ids = gaussian_ids(gaussians, layout)
-        common = counting.result()
-    usable, short = _are_unique(gaussians, layout, ids)
-
-    def judge(start: int, stop: int) -> Integers:
-        used, own = used_words(gaussians[start:stop]), usable[start:stop]
-        own &= _are_trained(used, layout, common, short) & ~near_equal(used, layout)
-        if layout.quats:
-            own &= ~_have_unit_length(used)
-        return np.stack([count_trailing_zeros(used[:, group], own) for group in _GROUPS.values()])
-
-    parts = in_blocks(judge, len(gaussians), BLOCK)
-    if not parts:
-        return usable, ids
-    usable &= ~find_siblings(gaussians, usable)
-    least = [least_exponent(counts, MAX_SEPARATION / len(_GROUPS)) for counts in np.sum(parts, axis=0)]
-
-    def exclude_small(start: int, stop: int) -> None:
-        used = used_words(gaussians[start:stop])
-        for group, bound in zip(_GROUPS.values(), least, strict=True):
-            if layout.quats or group != QUATS:
-                values = used[:, group]
-                usable[start:stop] &= ~((exponents(values) < bound) & (values & 1 == 0)).any(axis=1)
-
-    in_blocks(exclude_small, len(gaussians), BLOCK)
-    return usable, ids
+        steps = Steps(gaussians, layout)
+        fine, usable = _without_copies(gaussians, layout, ids), dict[int, Flags]()
+        for depth in depths:
+            usable[depth] = fine & ~steps.equal(depth)
+            if depth == depths[0]:
+                fine &= _large_enough(gaussians, layout, usable[depth])
+                usable[depth] &= fine
+            if told := _what_tells(gaussians, layout, usable[depth], depth, steps):
+                del usable[depth]
+                if not usable:
+                    raise UsageError(told)
+                break
+        return Carriers(ids, usable)
 
 
-def check_sample(gaussians: Gaussians) -> None:
-    """Raise the UsageError of `check_usable` for a large cover if its sample alone is refused.
+def usable_carriers(gaussians: Gaussians, depth: int = DEEPEST) -> Flags:
+    """Mask [N] of the usable Gaussians at a depth. Raises UsageError as `Carriers.of`."""
+    return Carriers.of(gaussians, Layout.of(gaussians), (depth,)).usable[depth]
 
-    Which Gaussians are usable takes a second per 100,000. More of them are in the sample, as fewer repeat.
+
+def _what_tells(gaussians: Gaussians, layout: Layout, usable: Flags, depth: int, steps: Steps) -> str:
+    """What tells new low bits of `usable` [N] Gaussians from the model's own; empty for nothing.
+
+    Tested on at most 20,000 Gaussians: see `chance_of_bits` and `Steps.chance`.
     """
-    if len(gaussians) > _LARGE:
-        sample = gaussians[:: len(gaussians) // _SAMPLE]
-        layout = Layout.of(sample)
-        _check_bits(sample, usable_with_ids(sample, layout)[0], layout)
-
-
-def check_usable(gaussians: Gaussians, usable: Flags, layout: Layout) -> None:
-    """Raise UsageError unless half of the Gaussians are `usable` [N], and their low bits uniform.
-
-    Tested on at most 20,000 Gaussians: see `chance_of_bits` and `chance_of_equal_steps`.
-    """
-    _check_bits(gaussians, usable, layout)
-    if chance_of_equal_steps(gaussians, usable) < _CHANCE:
-        raise UsageError(
-            f"harmonics of this cover tell each other's low bits (p < {_CHANCE:g}), and new bits would be "
-            "seen: training saw most Gaussians from one direction"
-        )
-
-
-def _check_bits(gaussians: Gaussians, usable: Flags, layout: Layout) -> None:
-    share = float(usable.mean()) if len(usable) else 0.0
-    if share < _MIN_USABLE:
-        raise UsageError(
-            f"only {share:.0%} of the cover's Gaussians have random low bits; the others hold short, "
-            "repeated or predictable values: it was quantised or hardly trained, and new bits would be seen"
-        )
     rows = np.flatnonzero(usable)
+    if len(rows) <= _MIN_USABLE * len(usable):
+        return (
+            f"only {len(rows):,} of the cover's {len(usable):,} Gaussians have random low bits; the others "
+            "hold short, repeated or predictable values: it was quantised or hardly trained, and new bits "
+            "would be seen"
+        )
     used = used_words(gaussians[torch.from_numpy(rows[:: max(1, len(rows) // _SAMPLE)])])
     for name, group in _GROUPS.items():
-        bits = int(layout.mask[group][:1].max(initial=0)).bit_length()
-        if bits and used[:, group].size and chance_of_bits(used[:, group], bits) < _CHANCE:
-            raise UsageError(
-                f"the low bits of {name} in this cover are not random (p < {_CHANCE:g}), and nothing can be "
-                "hidden in them: the cover was quantised, scaled or moved after its training"
+        written = used[:, np.intersect1d(np.arange(used.shape[1])[group], layout.columns)]
+        if written.size and (chance := chance_of_bits(written, depth + 1)) < _CHANCE:
+            return (
+                f"the low bits of {name} in this cover are not random (p = {chance:.0e}), and new ones "
+                "would be seen: the cover was quantised, scaled or moved after its training"
             )
+    if (chance := steps.chance(depth, usable)) < _CHANCE:
+        return (
+            f"numbers of this cover tell each other's low bits (p = {chance:.0e}), because they moved by "
+            "equal steps, and new ones would be seen: it was hardly trained, or seen from one direction"
+        )
+    return ""
 
 
 def chance_of_bits(words: Words32, bits: int) -> float:
@@ -189,9 +149,9 @@ def chance_of_bits(words: Words32, bits: int) -> float:
     from scipy.special import bdtr  # takes long to load
 
     flat = words.ravel()
-    context = exponents(flat).astype(np.int64) << 2 | (flat & 1).astype(np.int64) << 1
+    context = _exponents(flat).astype(np.int64) << 2 | (flat & 1).astype(np.int64) << 1
     chances: list[Doubles] = []
-    for bit in range(UNUSED_BITS, bits):
+    for bit in range(1, bits):
         below = (flat >> np.uint32(bit - 1) & 1).astype(np.int64) if bit > 1 else 0
         times = np.bincount(context | below, minlength=1024)
         ones = np.bincount((context | below)[(flat >> np.uint32(bit) & 1) == 1], minlength=1024)
@@ -204,40 +164,17 @@ def chance_of_bits(words: Words32, bits: int) -> float:
 
 def salt_rows(gaussians: Gaussians, ids: Bytes, layout: Layout) -> Integers:
     """Rows of the salts' Gaussians, at most SALTS, in the order of the salts; `ids` [N, 16]."""
-    ranks = _ranks(gaussians, layout)
-    # 9 bits of rank, 55 of the ID.
-    keys = ranks << np.uint64(55) | ids[:, :8].copy().view(">u8")[:, 0].astype(np.uint64) >> np.uint64(9)
+    late = moved_from_zero(gaussians, layout).astype(np.uint64)
+    keys = late << np.uint64(63) | ids[:, :8].copy().view(">u8")[:, 0].astype(np.uint64) >> np.uint64(1)
     best = np.argpartition(keys, SALTS - 1)[:SALTS] if len(keys) > SALTS else np.arange(len(keys))
-    low = read_low_bits(gaussians[torch.from_numpy(best)], layout)
-    order = sorted(range(len(best)), key=lambda i: (ranks[best[i]], ids[best[i]].tobytes(), low[i].tobytes()))
+    low = read_low_bits(gaussians[torch.from_numpy(best)], LEAST, layout)
+    order = sorted(range(len(best)), key=lambda i: (late[best[i]], ids[best[i]].tobytes(), low[i].tobytes()))
     return best[order]
 
 
 def salt(carrier_id: Bytes, low: Bytes) -> bytes:
     """The salt of one carrier: SALT_BYTES."""
     return hashlib.sha256(_LABEL + carrier_id.tobytes() + low.tobytes()).digest()[:SALT_BYTES]
-
-
-def exponents(words: Words32) -> Bytes:
-    """[...] the biased binary exponents."""
-    return (words >> np.uint32(23) & np.uint32(255)).astype(np.uint8)
-
-
-def near_equal(used: Words32, layout: Layout) -> Flags:
-    """Mask [N] of Gaussians with nearly equal scales, quaternion components or channels of a harmonic.
-
-    Also of those with two pairs of equal harmonics, each in one channel. By chance it selects about 4 %.
-    `used` [N, F]: the result of `used_words`.
-    """
-    high = np.ascontiguousarray(((used & _MAGNITUDE) >> layout.shifts).astype(np.int32).T)
-    harmonics = high[GEOMETRY:].reshape(-1, 3, len(used))
-    near, equal = np.zeros(len(used), bool), np.zeros(len(used), np.int16)
-    for values in (high[:3], *([high[QUATS]] if layout.quats else []), *harmonics):
-        for one, other in combinations(values, 2):
-            near |= np.abs(one - other) <= 1
-    for first, second in combinations(harmonics, 2):
-        equal += (first == second).sum(axis=0, dtype=np.int16)
-    return near | (equal >= _EQUAL_HARMONICS)
 
 
 def frequent(words: Numbers, times: int) -> Numbers:
@@ -259,66 +196,62 @@ def among(values: Numbers, ordered: Numbers) -> Flags:
     return result
 
 
-def _are_trained(used: Words32, layout: Layout, common: list[Words32], short: bool) -> Flags:
-    """Mask [N] of Gaussians with no subnormal or frequent number, and no saturated or nearly pruned opacity.
-
-    Few numbers may end in many zeros; if `short`, none may be short.
-    """
-    large = exponents(used)
-    fine = (large > 0) & (large < 254)
-    opacity = used[:, _OPACITY]
-    fine[:, _OPACITY] &= ~((opacity >= _SATURATED[0]) & (opacity < _SATURATED[1]))
-    fine[:, _OPACITY] &= opacity >> np.uint32(GEOMETRY_BITS + UNUSED_BITS) != _PRUNED
-    if short:
-        fine &= (used & _SHORT) != 0
-    for group, values in zip(_GROUPS.values(), common, strict=True):
-        fine[:, group] &= ~among(used[:, group], values)
-    zeros = ((used & _ZEROS) == 0)[:, layout.columns].sum(axis=1)
-    trained: Flags = fine[:, layout.columns].all(axis=1) & (zeros < _ZERO_FIELDS)
-    return trained
+def _exponents(words: Words32) -> Bytes:
+    """[...] the biased binary exponents."""
+    return (words >> np.uint32(23) & np.uint32(255)).astype(np.uint8)
 
 
-def _have_unit_length(used: Words32) -> Flags:
-    """Mask [N] of quaternions of unit length."""
-    words = np.ascontiguousarray(used[:, QUATS])
-    near = np.abs(coarse_lengths(words) - 1) < UNIT_TOLERANCE
-    lengths = np.linalg.norm(np.where(near[:, None], words.view(np.float32).astype(np.float64), 0), axis=1)
-    unit: Flags = near & (np.abs(lengths - 1) < _EXACT)
-    return unit
-
-
-def _are_unique(gaussians: Gaussians, layout: Layout, ids: Bytes) -> tuple[Flags, bool]:
-    """Mask [N] of Gaussians that share no scales, quaternion or harmonics of a channel with another one.
-
-    Harmonics are compared in consecutive pairs, in large models in triples. Also returns whether there are
-    more short values than by chance.
-    """
-    shared_columns = [slice(0, 3), *([QUATS] if layout.quats else [])]
-    width = 3 * (_SHARED_BY_FEW if len(gaussians) <= _FEW_GAUSSIANS else _SHARED_BY_MANY)
-    for first in range(GEOMETRY, len(layout.mask) - width + 1, width):
-        shared_columns += [slice(first + channel, first + width, 3) for channel in range(3)]
-    keys = np.empty((len(shared_columns) + 1, len(gaussians)), np.uint64)
+def _without_copies(gaussians: Gaussians, layout: Layout, ids: Bytes) -> Flags:
+    """Mask [N] of Gaussians without shared, frequent, nearly equal, saturated and nearly pruned numbers."""
+    shared = [slice(0, 3), *([QUATS] if layout.quats else [])]
+    if layout.sh_degree:
+        shared += [slice(GEOMETRY + colour, GEOMETRY + 9, 3) for colour in range(3)]
+    keys = np.empty((len(shared) + 1, len(gaussians)), np.uint64)
     keys[-1] = ids.view("<u8")[:, 0]
+    common = [frequent(words, _unlikely_copies(words.size)) for words in group_words(gaussians)]
+    fine = np.empty(len(gaussians), bool)
 
-    stays, used_fields = ~layout.mask & ~np.uint32(1), np.isin(np.arange(len(layout.mask)), layout.columns)
-
-    def hash_some(start: int, stop: int) -> int:
+    def judge(start: int, stop: int) -> None:
         used = used_words(gaussians[start:stop])
-        high = used & stays
-        for key, columns in zip(keys, shared_columns, strict=False):
-            key[start:stop] = row_hashes(high[:, columns])
-        rows, fields = np.nonzero(used & _SHORT == 0)  # few
-        return int(np.count_nonzero(used_fields[fields] & (exponents(used[rows, fields]) > 0)))
+        for key, columns in zip(keys, shared, strict=False):
+            key[start:stop] = row_hashes(used[:, columns] & ~LOW)
+        large, opacity = _exponents(used), used[:, _OPACITY]
+        good = (large > 0) & (large < 254)
+        good[:, _OPACITY] &= ~((opacity >= _SATURATED[0]) & (opacity < _SATURATED[1]))
+        good[:, _OPACITY] &= opacity | LOW != _PRUNED
+        for group, values in zip(_GROUPS.values(), common, strict=True):
+            good[:, group] &= ~among(used[:, group], values)
+        high = ((used & _MAGNITUDE) >> np.uint32(DEEPEST + 1)).astype(np.int32)
+        triples = np.concatenate([high[:, :3], high[:, GEOMETRY:]], axis=1).reshape(len(used), -1, 3)
+        near = np.abs(triples - triples[:, :, [1, 2, 0]]) <= 1
+        fine[start:stop] = good[:, layout.columns].all(axis=1) & ~near.any(axis=(1, 2))
 
-    short = sum(in_blocks(hash_some, len(gaussians), BLOCK))
-    unique = ~np.logical_or.reduce(in_blocks(lambda index, _: repeated(keys[index]), len(keys), 1))
-    expected = len(gaussians) * len(layout.columns) / 2.0**_SHORT_BITS
-    return unique, short > expected + 5 * (expected + 1) ** 0.5
+    in_blocks(judge, len(gaussians), BLOCK)
+    unique: Flags = ~np.logical_or.reduce(in_blocks(lambda index, _: repeated(keys[index]), len(keys), 1))
+    return fine & unique
 
 
-def _frequent_values(gaussians: Gaussians) -> list[Words32]:
-    """For each group of fields the values [V] that occur too often, in ascending order."""
-    return [frequent(words, _unlikely_copies(words.size)) for words in group_words(gaussians)]
+def _large_enough(gaussians: Gaussians, layout: Layout, counted: Flags) -> Flags:
+    """Mask [N] of Gaussians without small even numbers, by the trailing zeros of those `counted` [N]."""
+
+    def count(start: int, stop: int) -> Integers:
+        used = used_words(gaussians[start:stop])
+        own = counted[start:stop]
+        return np.stack([count_trailing_zeros(used[:, group], own) for group in _GROUPS.values()])
+
+    large = np.ones(len(gaussians), bool)
+    counts = np.sum(in_blocks(count, len(gaussians), BLOCK), axis=0)
+    least = [least_exponent(each, MAX_SEPARATION / len(_GROUPS)) for each in counts]
+
+    def compare(start: int, stop: int) -> None:
+        used = used_words(gaussians[start:stop])
+        for group, bound in zip(_GROUPS.values(), least, strict=True):
+            if layout.quats or group != QUATS:
+                values = used[:, group]
+                large[start:stop] &= ~((_exponents(values) < bound) & (values & 1 == 0)).any(axis=1)
+
+    in_blocks(compare, len(gaussians), BLOCK)
+    return large
 
 
 def _unlikely_copies(count: int) -> int:
@@ -330,22 +263,3 @@ def _unlikely_copies(count: int) -> int:
     while count**copies / math.factorial(copies) > _SETS_BY_CHANCE * 2 ** (26 * (copies - 1)):
         copies += 1
     return copies
-
-
-def _ranks(gaussians: Gaussians, layout: Layout) -> Words:
-    """[N] 0 to 511, lower first: 256 if doubtful, plus 255 minus the exponent of the least harmonic."""
-    columns = layout.columns
-    stays = layout.mask[columns] | np.uint32(1)
-
-    def ranked(start: int, stop: int) -> Words:
-        used = used_words(gaussians[start:stop])
-        chosen = used[:, columns]
-        large = exponents(chosen)
-        doubtful = ((large == 0) | (chosen & _MANTISSA & ~stays == 0)).any(axis=1) | near_equal(used, layout)
-        if layout.quats:
-            doubtful |= np.abs(coarse_lengths(used[:, QUATS]) - 1) < UNIT_TOLERANCE
-        harmonics = exponents(used[:, GEOMETRY:]) if used.shape[1] > GEOMETRY else large
-        rank: Words = (255 - harmonics.min(axis=1) + 256 * doubtful).astype(np.uint64)
-        return rank
-
-    return np.concatenate([np.zeros(0, np.uint64), *in_blocks(ranked, len(gaussians), BLOCK)])

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import stdtr
 
+from keyss.channels import DEEPEST
 from keyss.core import Gaussians, UsageError
 from keyss.core.arrays import Numbers
 from keyss.lab.stealth.attributes import colours, invariants, invisible_modes, opacities, order
@@ -22,7 +23,6 @@ KINDS: dict[str, Callable[[Gaussians, BitPatterns], dict[str, Statistic]]] = {
 }
 _AGREEMENT = 0.03  # relative error assumed for a statistic without a known error
 _MANY = 1e7  # degrees of freedom: normal
-_LOW = 13  # bits that may have been replaced
 
 
 @dataclass(frozen=True)
@@ -154,7 +154,7 @@ def _sampling(controls: Sequence[Statistic]) -> float:
 def changed_low_bits(file: Gaussians, other: Gaussians) -> float:
     """Share of the Gaussians that have an equal in `other` except for low bits."""
     own, theirs = (BitPatterns.of(model).bits for model in (file, other))
-    shared, same = (np.isin(_as_values(own >> low), _as_values(theirs >> low)) for low in (_LOW, 0))
+    shared, same = (np.isin(_as_values(own >> low), _as_values(theirs >> low)) for low in (DEEPEST + 1, 0))
     return float((shared & ~same).sum() / max(len(file), 1))
 
 

@@ -9,10 +9,11 @@
   copies or freezes numbers in clones: saturated opacities, harmonics of one channel, whole Gaussians.
   Embedding makes their other bits random, unless neither Gaussian is a carrier. The null for pairs with a
   usable Gaussian is exact: independent low bits.
-- `steps`: siblings that moved apart by equal steps of Adam, so that constant colours predict low bits of
-  harmonics (`keyss.channels.quiet.predictability`). Pairs are found by high bits and constant colours. A hit
-  is a difference of harmonics within 1/16 of a cell (the range of low bits) of a twentieth of that of the
-  constant colours. The null distribution comes from the same file with other low bits.
+- `steps`: siblings that moved apart by equal steps of Adam, so that numbers predict each other's low bits
+  (`keyss.channels.quiet.equal_steps`). A hit is a difference between neighbours that agrees to 1/8 of a cell
+  (the range of low bits) with that of another number of its group, or with that of the constant colour
+  divided by the ratio of their rates. Candidates are found by the bits that stay. The null distribution comes
+  from the same file with other low bits in usable Gaussians.
 """
 
 from __future__ import annotations
@@ -22,8 +23,9 @@ from itertools import combinations
 
 import numpy as np
 
-from keyss.channels import usable_carriers
+from keyss.channels import DEEPEST, usable_carriers
 from keyss.core.arrays import Doubles, Flags, Integers, Words32, doubles
+from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.neighbours import nearest_neighbours
 from keyss.lab.stealth.statistic import (
@@ -42,29 +44,31 @@ from keyss.lab.stealth.statistic import (
     ulps,
 )
 
-RANGES = {"0": (0, 1), "1-3": (1, 4), "4-8": (4, 9), "9-12": (9, 13)}
-_BITS = 14  # lowest bits of a number
+RANGES = {"0": (0, 1), "1-3": (1, 4), "4-8": (4, 9)}
+_BITS = DEEPEST + 2  # lowest bits of a number
 _HARMONICS = ATTRIBUTES.index("sh1")
 _MIN_COUNT = 64  # numbers of a stratum
 
-_LOW = 13  # bits that may have been replaced
+_LOW = DEEPEST + 1  # bits that may have been replaced
 _QUARTER, _MANY = 21, 1000  # lowest differing bit of quarters of octaves; minimum pairs of numbers
 _CLOSE = 1 << 5  # units in the last place
 _NEIGHBOURS = 3
 # Maximum change by embedding, and the range that gives the smooth density; units in the last place.
 _MOVED, _AROUND = 1 << _LOW, 1 << (_LOW + 3)
 _GROUPS = {"axes": (1,), "quaternion": (2,), "channels": (5, 6, 7), "constant colour": (4,)}
-_WRITTEN = {"scale": 8, "rotation": 8, "opacity": 8, "sh1": 12, "sh2": 12, "sh3": 12}  # bits above bit 0
+_WRITTEN = dict.fromkeys(("scale", "rotation", "opacity", "sh1", "sh2", "sh3"), DEEPEST)  # bits above bit 0
 _CHANNELS = ("red", "green", "blue")
 _LAGS = 4  # maximum distance of pairs in the order of their high bits
 _NEAREST = 16
 _SATURATED = 16.0  # logit
 
-_LOW_MASK = np.uint32((1 << 13) - 1)
-_RATIO = 20.0  # learning rate of constant colours / harmonics
-_AGREE = 4  # minimum agreeing harmonics of a colour
-_PART = 16  # a hit is within cell / 16 of the prediction
-_DRAWS, _MAX_DIFFERENCES, _MIN_EXPECTED = 200, 16_000, 5.0
+_LOW_MASK = np.uint32((1 << DEEPEST + 1) - 1)
+_STEP_NEIGHBOURS = 12
+_RATIOS = (20, 10, 5, 1)  # learning rate of constant colours / harmonics, in common trainers
+_AGREE = (1, 3)  # minimum agreeing harmonics of a colour
+_PART = 8  # a hit is within cell / 8 of the prediction
+_PAIRS = 1 << 16  # at a time
+_DRAWS, _MAX_DIFFERENCES, _MIN_EXPECTED = 24, 200_000, 5.0
 
 
 def bits(model: Gaussians, words: BitPatterns) -> dict[str, Statistic]:
@@ -229,7 +233,7 @@ def coincidences(model: Gaussians, words: BitPatterns) -> dict[str, Statistic]:
 
     For all pairs and for neighbours in space, if one Gaussian is usable; for all saturated neighbours.
     """
-    usable = usable_carriers(model)
+    usable = _usable(model)
     near = nearest_pairs(doubles(model.means), _NEAREST)
     saturated = model.opacity_logits.detach().cpu().numpy() > _SATURATED
     bright = near[saturated[near].all(axis=1)]
@@ -271,55 +275,107 @@ def _agreeing_pairs(kept: Words32, lags: int) -> Integers:
     return np.concatenate(pairs)
 
 
+def _usable(model: Gaussians) -> Flags:
+    try:
+        return usable_carriers(model)
+    except UsageError:  # new bits would show: the question is where
+        return np.ones(len(model), bool)
+
+
 def steps(model: Gaussians, words: BitPatterns) -> dict[str, Statistic]:
-    """Excess of hits over random low bits, in standard deviations."""
-    harmonics = words.bits[:, words.attribute >= _HARMONICS]
-    if not harmonics.shape[1] or len(model) < 2:
-        return {}
-    constant = doubles(model.sh[:, 0]) / _RATIO
-    pairs = nearest_pairs(np.nan_to_num(doubles(model.means)), _NEAREST)
-    found = []
-    for colour in range(3):
-        own = harmonics[:, colour::3]
-        for start in range(0, len(pairs), 1 << 16):
-            one, other = pairs[start : start + (1 << 16)].T
-            moved = np.abs(constant[one, colour] - constant[other, colour])[:, None]
-            cell = np.maximum(_cells(own[one]), _cells(own[other]))
-            near = np.abs(np.abs(_middle(own[one]) - _middle(own[other])) - moved) <= cell
-            near &= moved > 2 * cell  # equal numbers are no evidence
-            chosen = np.flatnonzero(near.sum(axis=1) >= _AGREE)
-            rows, columns = np.nonzero(near[chosen])
-            rows = chosen[rows]
-            sides = own[one[rows], columns], own[other[rows], columns]
-            found.append((*sides, moved[rows, 0], cell[rows, columns]))
-    one, other, moved, cell = (np.concatenate(each)[:_MAX_DIFFERENCES] for each in zip(*found, strict=True))
-    hits = _hits(one, other, moved, cell)
-    random = np.random.default_rng(0)
-    drawn = [_hits(_redrawn(one, random), _redrawn(other, random), moved, cell) for _ in range(_DRAWS)]
+    """Hits beyond those after new draws of the low bits of usable Gaussians, in standard deviations."""
+    pairs = nearest_pairs(np.nan_to_num(doubles(model.means)), _STEP_NEIGHBOURS)
+    usable = _usable(model)
+    pairs = pairs[usable[pairs].any(axis=1)]
+    attribute, found = words.attribute, {}
+    groups = {"scales": words.bits[:, attribute == 1], "quaternions": words.bits[:, attribute == 2]}
+    harmonics = words.bits[:, attribute >= _HARMONICS]
+    colours = {f"harmonics, {name}": harmonics[:, index::3] for index, name in enumerate(_CHANNELS)}
+    constants = doubles(model.sh[:, 0])
+    drawn = np.random.default_rng(0)
+    for name, own in {**groups, **colours}.items():
+        if own.shape[1]:
+            found[f"equal steps of two {name}"] = _excess(own, usable, drawn, *_two_equal(own, pairs))
+    for ratio in _RATIOS if model.sh_degree else ():
+        for least in _AGREE:
+            for index, own in enumerate(colours.values()):
+                moved = np.abs(constants[pairs[:, 0], index] - constants[pairs[:, 1], index]) / ratio
+                name = f"{least} or more follow the constant colour, ratio {ratio}, {_CHANNELS[index]}"
+                found[name] = _excess(own, usable, drawn, *_follow(own, pairs, moved, least))
+    return found
+
+
+# Pairs, columns, steps or 0, other columns, cells.
+_Found = tuple[Integers, Integers, Doubles, Integers, Doubles]
+
+
+def _two_equal(own: Words32, pairs: Integers) -> _Found:
+    """Pairs of columns of `own` [N, C] whose differences agree, as far as the bits that stay tell."""
+    middle, cells, found = _middle(own), _cells(own), []
+    for start in range(0, len(pairs), _PAIRS):
+        one, other = pairs[start : start + _PAIRS].T
+        moved, cell = np.abs(middle[one] - middle[other]), np.maximum(cells[one], cells[other])
+        for a, b in combinations(range(own.shape[1]), 2):
+            span = np.maximum(cell[:, a], cell[:, b])
+            rows = np.flatnonzero((np.abs(moved[:, a] - moved[:, b]) <= span) & (moved[:, a] > 2 * span))
+            columns = np.full(len(rows), a), np.full(len(rows), b)
+            found.append((pairs[start + rows], columns[0], np.zeros(len(rows)), columns[1], span[rows]))
+    return _joined(found)
+
+
+def _follow(own: Words32, pairs: Integers, moved: Doubles, least: int) -> _Found:
+    """Columns of `own` [N, C] whose differences agree with `moved` [P], where `least` or more do."""
+    middle, cells, found = _middle(own), _cells(own), []
+    for start in range(0, len(pairs), _PAIRS):
+        (one, other), steps = pairs[start : start + _PAIRS].T, moved[start : start + _PAIRS, None]
+        cell = np.maximum(cells[one], cells[other])
+        near = (np.abs(np.abs(middle[one] - middle[other]) - steps) <= 1.5 * cell) & (steps > 2 * cell)
+        rows, columns = np.nonzero(near & (near.sum(axis=1) >= least)[:, None])
+        found.append((pairs[start + rows], columns, steps[rows, 0], columns, cell[rows, columns]))
+    return _joined(found)
+
+
+def _joined(found: list[_Found]) -> _Found:
+    return tuple(np.concatenate(each)[:_MAX_DIFFERENCES] for each in zip(*found, strict=True))  # type: ignore[return-value]
+
+
+def _excess(
+    own: Words32,
+    usable: Flags,
+    random: np.random.Generator,
+    pairs: Integers,
+    columns: Integers,
+    moved: Doubles,
+    others: Integers,
+    cells: Doubles,
+) -> Statistic:
+    """Differences in `columns` [P] that agree with those in `others` or, where it is not 0, with `moved`."""
+
+    def hits(words: Words32) -> int:
+        values = words.view(np.float32).astype(np.float64)
+        one, other = (np.abs(values[pairs[:, 0], at] - values[pairs[:, 1], at]) for at in (columns, others))
+        return int((np.abs(one - np.where(moved > 0, moved, other)) < cells / _PART).sum())
+
+    drawn = [hits(_redrawn(own, usable, random)) for _ in range(_DRAWS)]
     expected = float(np.mean(drawn))
     if expected < _MIN_EXPECTED:
-        return {}
-    return {"differences of siblings": normal((hits - expected) / max(1.0, float(np.std(drawn))), 1.0)}
+        return NOTHING
+    error = max(1.0, expected**0.5, float(np.std(drawn)))
+    return normal((hits(own) - expected) / error, 1.0)
 
 
-def _hits(one: Words32, other: Words32, moved: Doubles, cell: Doubles) -> int:
-    off = np.abs(np.abs(_numbers(one) - _numbers(other)) - moved)
-    return int((off < cell / _PART).sum())
-
-
-def _redrawn(words: Words32, random: np.random.Generator) -> Words32:
-    new = random.integers(0, 1 << 12, words.shape, np.uint32) << np.uint32(1)
-    return words & ~(_LOW_MASK - np.uint32(1)) | new
-
-
-def _numbers(words: Words32) -> Doubles:
-    return words.view(np.float32).astype(np.float64)
+def _redrawn(words: Words32, chosen: Flags, random: np.random.Generator) -> Words32:
+    new, mask = words.copy(), _LOW_MASK - np.uint32(1)
+    drawn = random.integers(0, 1 << DEEPEST, words[chosen].shape, np.uint32) << np.uint32(1)
+    new[chosen] = new[chosen] & ~mask | drawn
+    return new
 
 
 def _middle(words: Words32) -> Doubles:
-    return _numbers(words & ~_LOW_MASK | (_LOW_MASK + 1) >> 1)
+    return (words & ~_LOW_MASK | (_LOW_MASK + 1) >> 1).view(np.float32).astype(np.float64)
 
 
 def _cells(words: Words32) -> Doubles:
     """The range of each number's low bits."""
-    return 2 * np.abs(_middle(words) - _numbers(words & ~_LOW_MASK))
+    powers = (words & np.uint32(0x7F800000)).view(np.float32).astype(np.float64)
+    return powers * 2.0 ** (DEEPEST + 1 - MANTISSA)

@@ -3,25 +3,19 @@
 from __future__ import annotations
 
 import math
-import os
 import warnings
 from collections.abc import Sequence
-from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
-import torch
-
-from keyss.channels import APPENDED, LOW_BITS, Capacity, Channel, PreparedCover
+from keyss.channels import APPENDED, Capacity, Channel, PreparedCover
 from keyss.channels.base import NOT_INDEPENDENT
 from keyss.core.errors import KeyssWarning, UsageError
 from keyss.core.gaussians import Gaussians
-from keyss.keys.derivation import expand
 from keyss.methods.carry.carry_options import CarryOptions
 from keyss.methods.codec.precision import finest_size, prune_to_size, usual_size
 from keyss.rendering.orbit import Viewpoints
 
 _BITS_PER_GAUSSIAN = 150, 210  # of a secret that is not fitted yet, with the usual and the finest precision
-_FAINT = 1e-3  # standard deviation of added harmonics
 _SAMPLE, _FAR_TOO_LARGE = 10_000, 1.5  # Gaussians; times what can be appended
 _TINY = 16  # Gaussians; secrets are not pruned to fewer
 _ANY = '`publish="any"` has room for all'
@@ -74,25 +68,18 @@ class CarryCapacity:
     prepared: PreparedCover | None = None  # None: not fitted yet
 
     @staticmethod
-    def of(cover: Gaussians | None, options: CarryOptions, entropy: bytes | None = None) -> CarryCapacity:
-        """The capacity of `cover` after the change of harmonics in `options`.
-
-        Raises UsageError for a cover without capacity.
-        """
-        channel, degree = options.channel_in(cover), options.fit.sh_degree
+    def of(cover: Gaussians | None, options: CarryOptions) -> CarryCapacity:
+        """The capacity of `cover`. Raises UsageError for a cover without capacity."""
+        channel = options.channel_in(cover)
         try:
             if cover is None:
-                count = options.fit.max_gaussians
+                count, degree = options.fit.max_gaussians, options.fit.sh_degree
                 return CarryCapacity(count, degree, channel, channel.estimate_capacity(count, degree))
-            if channel is LOW_BITS:
-                cover = to_degree(cover, degree, os.urandom(32) if entropy is None else entropy)
-            elif cover.sh_degree > degree:
-                cover = cover.with_sh_degree(degree)
             prepared = channel.prepare(cover)
         except UsageError as error:
             if channel.survives:
                 raise
-            raise UsageError(f"{error}; {_cure(cover, options)}") from error
+            raise UsageError(f"{error}; {_ANY}") from error
         return CarryCapacity(len(cover), cover.sh_degree, channel, prepared.capacity, prepared)
 
     def sizes(self, secrets: Sequence[SecretSize]) -> list[int]:
@@ -130,44 +117,21 @@ class CarryCapacity:
         return APPENDED.appended_count([secret.payload_bytes[0] for secret in secrets])
 
 
-def _cure(cover: Gaussians | None, options: CarryOptions) -> str:
-    """Advice for messages: the least SH degree that gives `cover` capacity, and what always works."""
-    for degree in range(options.fit.sh_degree + 1, 3):
-        with suppress(UsageError):
-            if cover is None:
-                LOW_BITS.estimate_capacity(options.fit.max_gaussians, degree)
-            elif not LOW_BITS.prepare(to_degree(cover, degree, os.urandom(32))).capacity.bytes:
-                continue
-            return f"`sh_degree={degree}` makes room, {_ANY}"
-    return _ANY
-
-
-def to_degree(model: Gaussians, sh_degree: int, entropy: bytes) -> Gaussians:
-    """`model` with harmonics of `sh_degree`; added ones are small and random, as zeros have no low bits."""
-    count = (sh_degree + 1) ** 2 - model.sh.shape[1]
-    if count <= 0:
-        return model.with_sh_degree(sh_degree) if count else model  # the same object was prepared before
-    seed = int.from_bytes(expand(entropy, "carry/raised", 8), "little") >> 1
-    generator = torch.Generator().manual_seed(seed)
-    # Scale before rounding: products in single precision keep a trace of their factor.
-    noise = _FAINT * torch.randn(len(model), count, 3, generator=generator, dtype=torch.float64)
-    return replace(model, sh=torch.cat([model.sh, noise.to(model.sh)], dim=1))
-
-
 def shares(capacity: Capacity, needed: Sequence[int]) -> list[int]:
     """Maximum bytes of each secret's payload, for secrets that need `needed` bytes at the finest precision.
 
-    Each gets the first of a quarter, a half and all of the capacity that suffices: its precision then does
-    not depend on the others, and its key does not reveal them. If these shares exceed the capacity, or if the
-    model grows, they are equal.
+    Each gets the first share of the capacity that suffices: its precision then does not depend on the others,
+    and its key does not reveal them. If these shares exceed the capacity, or if the model grows, they are
+    equal.
     """
     count = len(needed)
     total = int(capacity.bytes * capacity.further ** (count - 1))
-    parts = [
-        next((each for each in (4, 2) if size <= total // each - capacity.overhead), 1) for size in needed
+    steps = capacity.steps or [(1 / part, total // part) for part in (4, 2, 1)]
+    chosen = [
+        next((each for each in steps if size <= each[1] - capacity.overhead), steps[-1]) for size in needed
     ]
-    limits = [total // each for each in parts]
-    if count > 1 and (capacity.grows or not capacity.divisible or sum(1 / each for each in parts) > 1):
+    limits = [limit for _, limit in chosen]
+    if count > 1 and (capacity.grows or not capacity.divisible or sum(part for part, _ in chosen) > 1):
         limits = [capacity.equal(count) if capacity.equal else total // count] * count
     return [max(0, limit - capacity.overhead) for limit in limits]
 

@@ -21,12 +21,11 @@ from keyss.methods.carry.carry_options import REFIT, CarryOptions
 from keyss.methods.codec.precision import encode_to_size, finest_size
 from keyss.methods.method import Capabilities, Context, Plan, Source, Stego, role_of, seconds_to_hide
 from keyss.rendering import contributions
-from keyss.rendering.orbit import Viewpoints, psnr_between
+from keyss.rendering.orbit import Viewpoints
 
 # Refits to renders start near the optimum: maximum steps, and factor on the rates.
 _MODEL_ITERATIONS, _MODEL_RATE = 400, 0.1
 _SELECTION_VIEWS = 64
-_PLANNED = bytes(32)  # dummy entropy for plans
 _VISIBLE = (
     "the cover can hold the secret, but whoever inspects the published file sees that it holds something "
     '(`publish="any"`), because it cannot be hidden unnoticed: {}'
@@ -44,22 +43,18 @@ class CarryMethod:
     options = CarryOptions
 
     def prepare(self, sources: Sequence[Source], options: CarryOptions) -> CarryOptions:
-        """Set `sh_degree` and the steps of refits; a second call, with fitted models, only adds refits.
+        """Set the steps of refits; a second call, with fitted models, only adds refits.
 
         If secrets cannot be hidden unnoticed, `publish` becomes "any", with a warning, where `may_show`.
         Otherwise raises UsageError.
         """
         cover, *secrets = sources
-        degree = options.sh_degree
-        if degree is None:
-            degree = options.fit.sh_degree if cover.given is None else cover.given.sh_degree
-        options = options.with_fit(sh_degree=degree)
         secret_sizes = _secret_sizes(secrets, options)
         if options.channel_in(cover.given).grows:
             for each in secret_sizes:
                 each.check_appended()
         try:
-            capacity = CarryCapacity.of(cover.given, options, _PLANNED)
+            capacity = CarryCapacity.of(cover.given, options)
             sizes = capacity.sizes(secret_sizes)
             if options.may_show and cover.given is not None:
                 _check_share(secret_sizes, sizes)
@@ -84,15 +79,11 @@ class CarryMethod:
         )
 
     def plan(self, sources: Sequence[Source], options: CarryOptions) -> Plan:
-        """See `Method`; notes tell what changes in the cover, and its capacity."""
+        """See `Method`; notes tell what is appended, or the capacity."""
         cover, *secrets = sources
-        capacity = CarryCapacity.of(cover.given, options, _PLANNED)
+        capacity = CarryCapacity.of(cover.given, options)
         secret_sizes = _secret_sizes(secrets, options)
         sizes, appended, notes = capacity.sizes(secret_sizes), capacity.appended(secret_sizes), []
-        if cover.given is not None and capacity.sh_degree != cover.given.sh_degree:
-            assert capacity.prepared is not None
-            psnr = psnr_between(cover.given, capacity.prepared.cover)
-            notes.append(f"other harmonics leave the cover at {psnr:.1f} dB PSNR against itself")
         if appended:
             notes.append(
                 f"about {appended:,} invisible Gaussians are appended to the cover's {capacity.gaussians:,}; "
@@ -119,7 +110,7 @@ class CarryMethod:
         Raises UsageError for a cover without capacity, Interrupted on Ctrl-C, and InputError for a
         checkpoint of another run.
         """
-        capacity = CarryCapacity.of(cover.model, options, context.entropy)
+        capacity = CarryCapacity.of(cover.model, options)
         assert capacity.prepared is not None  # the cover is fitted
         plain = [secret.model for secret in secrets]
         viewpoints = [Viewpoints.of(secret.scene) for secret in secrets]

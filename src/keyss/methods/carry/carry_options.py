@@ -24,12 +24,6 @@ class CarryOptions(MethodOptions):
             "never."
         ),
     ] = "auto"
-    sh_degree: Annotated[
-        int | None,
-        CommandLineOption(
-            "Degree of the published model's spherical harmonics, 0 to 3.", metavar="N", default="the cover's"
-        ),
-    ] = None
     iterations: int | None = None  # steps per refit; None: REFIT per step of `fit`, fewer without photos
 
     refits: tuple[int, ...] = ()  # set by `prepare`: refit steps of each secret; 0: no refit

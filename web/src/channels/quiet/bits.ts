@@ -8,11 +8,12 @@ import { ascii, joined, quantile } from '../../core/bytes.ts';
 import { coefficients, type Gaussians } from '../../core/gaussians.ts';
 
 export const ID_BYTES = 16;
+export const DEPTHS: readonly number[] = [4, 6, 8]; // bits of a field that are read
+export const [LEAST, DEEPEST] = [4, 8];
 const GEOMETRY = 8; // fields before the harmonics: three scales, four parts of a quaternion, opacity
 const UNIT_TOLERANCE = 1e-4;
 const FIRST_QUAT = 3;
-const GEOMETRY_MASK = 0x1fe; // bits 1 to 8
-const SH_MASK = 0x1ffe; // bits 1 to 12
+const LOW = 0x1ff; // bits that some depth replaces, and bit 0
 const PERSONALISATION = ascii('keyss/identity\0\0');
 
 /** Bit patterns of the fields that may be in use, and which are. */
@@ -20,7 +21,7 @@ interface Fields {
   readonly count: number;
   readonly width: number; // fields of a Gaussian
   readonly words: Uint32Array; // [N, width]
-  readonly masks: Uint32Array; // [width] bits in use; 0 for a field that is not
+  readonly inUse: readonly number[]; // columns of `words`
   readonly quatsInUse: boolean;
 }
 
@@ -43,9 +44,9 @@ export function fieldsOf(gaussians: Gaussians): Fields {
   const lengths = new Float64Array(count);
   for (let row = 0; row < count; row++) lengths[row] = Math.abs(coarseLength(words, row * width) - 1);
   const quatsInUse = count === 0 || quantile(lengths, 0.5) > UNIT_TOLERANCE;
-  const masks = new Uint32Array(width).fill(GEOMETRY_MASK, 0, GEOMETRY).fill(SH_MASK, GEOMETRY);
-  if (!quatsInUse) masks.fill(0, FIRST_QUAT, FIRST_QUAT + 4);
-  return { count, width, words, masks, quatsInUse };
+  const isQuat = (field: number): boolean => field >= FIRST_QUAT && field < FIRST_QUAT + 4;
+  const inUse = Array.from({ length: width }, (_, field) => field).filter((field) => quatsInUse || !isQuat(field));
+  return { count, width, words, inUse, quatsInUse };
 }
 
 const scratchWords = new Uint32Array(4);
@@ -54,7 +55,7 @@ const scratchFloats = new Float32Array(scratchWords.buffer);
 /** Length of the quaternion of the Gaussian whose fields begin at `at`, with the middle of all low bits. */
 function coarseLength(words: Uint32Array, at: number): number {
   for (let part = 0; part < 4; part++) {
-    scratchWords[part] = (words[at + FIRST_QUAT + part] & ~0x1ff) | 0x100;
+    scratchWords[part] = (words[at + FIRST_QUAT + part] & ~LOW) | ((LOW + 1) >> 1);
   }
   let sum = 0;
   for (const each of scratchFloats) sum += each * each;
@@ -63,62 +64,55 @@ function coarseLength(words: Uint32Array, at: number): number {
 
 /** [N, 16] a public hash of all of a Gaussian that embedding leaves as it is. */
 export function gaussianIds(gaussians: Gaussians, fields: Fields): Uint8Array {
-  const { count, width, words, masks } = fields;
+  const { count, width, words, inUse } = fields;
   const found = new Uint8Array(count * ID_BYTES);
   const means = new Uint32Array(gaussians.means.buffer, gaussians.means.byteOffset, 3 * count);
   const row = new Uint32Array(3 + width);
   const bytes = new Uint8Array(row.buffer);
   for (let index = 0; index < count; index++) {
-    for (let axis = 0; axis < 3; axis++) row[axis] = means[3 * index + axis];
-    for (let field = 0; field < width; field++) {
-      row[3 + field] = words[index * width + field] & ~masks[field];
-    }
+    row.set(means.subarray(3 * index, 3 * index + 3));
+    row.set(words.subarray(index * width, (index + 1) * width), 3);
+    for (const field of inUse) row[3 + field] &= ~LOW | 1;
     const hash = blake2b(bytes, { dkLen: ID_BYTES, personalization: PERSONALISATION });
     found.set(hash, index * ID_BYTES);
   }
   return found;
 }
 
-/** Bytes in the low bits of one Gaussian, with all harmonics or only `harmonics` of them. */
-export function lowWidth(fields: Fields, harmonics = Infinity): number {
-  const used = Math.min(harmonics, fields.width - GEOMETRY);
-  return (fields.quatsInUse ? GEOMETRY : GEOMETRY - 4) + Math.floor((3 * used) / 2);
+/** Whole bytes in the low bits of one Gaussian. */
+export function lowWidth(fields: Fields, depth: number): number {
+  return Math.floor((fields.inUse.length * depth) / 8);
 }
 
-/** [N, B] the low bits as bytes. */
-export function lowBits(fields: Fields): Uint8Array {
-  const { count, width, words, masks } = fields;
-  const size = lowWidth(fields);
+/** [N, B] the low bits as bytes, field after field, the highest bit first. */
+export function lowBits(fields: Fields, depth: number): Uint8Array {
+  const { count, width, words, inUse } = fields;
+  const size = lowWidth(fields, depth);
   const found = new Uint8Array(count * size);
-  const bits = (at: number, field: number): number =>
-    field < width ? (words[at + field] & masks[field]) >>> 1 : 0;
-  for (let row = 0; row < count; row++) {
-    const at = row * width;
+  const mask = (1 << depth) - 1;
+  for (let row = 0, to = 0; row < count; row++) {
+    let [bits, held] = [0, 0];
     const end = (row + 1) * size;
-    let to = row * size;
-    for (let field = 0; field < GEOMETRY; field++) {
-      if (masks[field]) found[to++] = bits(at, field);
-    }
-    for (let field = GEOMETRY; field < width; field += 2) {
-      const [a, b] = [bits(at, field), bits(at, field + 1)]; // two times 12 bits are three bytes
-      for (const byte of [a >> 4, ((a & 15) << 4) | (b >> 8), b & 255]) {
-        if (to < end) found[to++] = byte;
-      }
+    for (const field of inUse) {
+      bits = (bits << depth) | ((words[row * width + field] >>> 1) & mask);
+      held += depth;
+      if (held >= 8 && to < end) found[to++] = bits >>> (held -= 8);
+      bits &= (1 << held) - 1;
     }
   }
   return found;
 }
 
 const SALTS = 4; // tried
-const LABEL = ascii('keyss/v2/salt');
-const EQUAL_HARMONICS = 2; // pairs of one colour that make a Gaussian doubtful
+const LABEL = ascii('keyss/v3/salt');
+const EQUAL = 3; // numbers that moved by equal amounts
 
-/** Up to 4 salts of 16 bytes, the likeliest first; `low` has rows of `size` bytes. */
+/** Up to 4 salts of 16 bytes, the likeliest first; `low`: the low bits at the least depth, rows of `size` bytes. */
 export function salts(fields: Fields, ids: Uint8Array, low: Uint8Array, size: number): Uint8Array[] {
-  const ranks = new Uint16Array(fields.count);
-  for (let row = 0; row < fields.count; row++) ranks[row] = rank(fields, row);
-  const order = Array.from(ranks.keys()).sort((a, b) => {
-    return ranks[a] - ranks[b] || compared(ids, a, b, ID_BYTES) || compared(low, a, b, size);
+  const late = new Uint8Array(fields.count);
+  for (let row = 0; row < fields.count; row++) late[row] = movedFromZero(fields, row) ? 1 : 0;
+  const order = Array.from(late.keys()).sort((a, b) => {
+    return late[a] - late[b] || compared(ids, a, b, ID_BYTES) || compared(low, a, b, size);
   });
   return order.slice(0, SALTS).map((row) =>
     saltOf(ids.subarray(row * ID_BYTES, (row + 1) * ID_BYTES), low.subarray(row * size, (row + 1) * size)),
@@ -138,42 +132,32 @@ function compared(rows: Uint8Array, a: number, b: number, width: number): number
   return 0;
 }
 
-/** 0 to 511: 256 for a doubtful Gaussian, and less the larger its least harmonic is. */
-function rank(fields: Fields, row: number): number {
-  const { width, words, masks } = fields;
-  const at = row * width;
-  let least = 255;
-  for (let field = width > GEOMETRY ? GEOMETRY : 0; field < width; field++) {
-    if (width > GEOMETRY || masks[field]) least = Math.min(least, (words[at + field] >>> 23) & 255);
-  }
-  return (isDoubtful(fields, at) ? 256 : 0) | (255 - least);
-}
+const ownWords = new Uint32Array(2);
+const ownFloats = new Float32Array(ownWords.buffer);
 
-function isDoubtful(fields: Fields, at: number): boolean {
-  const { width, words, masks, quatsInUse } = fields;
-  for (let field = 0; field < width; field++) {
-    const word = words[at + field];
-    if (!masks[field]) continue;
-    if (((word >>> 23) & 255) === 0 || (word & 0x7ffffe & ~masks[field]) === 0) return true;
-  }
-  if (quatsInUse && Math.abs(coarseLength(words, at) - 1) < UNIT_TOLERANCE) return true;
-  const high = (field: number): number =>
-    (words[at + field] & 0x7fffffff) >>> (field < GEOMETRY ? 9 : 13);
-  const near = (first: number, count: number): boolean => {
-    for (let a = first; a < first + count; a++) {
-      for (let b = a + 1; b < first + count; b++) {
-        if (Math.abs(high(a) - high(b)) <= 1) return true;
-      }
-    }
-    return false;
-  };
-  if (near(0, 3) || (quatsInUse && near(3, 4))) return true;
-  for (let field = GEOMETRY; field < width; field += 3) if (near(field, 3)) return true;
-  let equal = 0;
+/** True if three numbers of a group are equal in magnitude, as far as the bits tell that stay at the least depth. */
+function movedFromZero({ width, words, quatsInUse }: Fields, row: number): boolean {
+  const groups = [[0, 1, 2, 7], ...(quatsInUse ? [[3, 4, 5, 6]] : [])];
   for (let colour = 0; colour < 3; colour++) {
-    const values: number[] = [];
-    for (let field = GEOMETRY + colour; field < width; field += 3) values.push(high(field));
-    equal += values.length - new Set(values).size;
+    const group: number[] = [];
+    for (let field = GEOMETRY + colour; field < width; field += 3) group.push(field);
+    groups.push(group);
   }
-  return equal >= EQUAL_HARMONICS;
+  return groups.some((group) => {
+    const [sizes, spans] = [[] as number[], [] as number[]];
+    for (const field of group) {
+      const word = words[row * width + field];
+      ownWords[0] = (word & ~((2 << LEAST) - 1)) | (1 << LEAST);
+      ownWords[1] = word & 0x7f800000;
+      sizes.push(Math.abs(ownFloats[0]));
+      spans.push(ownFloats[1] * 2 ** (LEAST + 1 - 23));
+    }
+    return sizes.some((own, one) => {
+      let equal = 0;
+      for (let other = 0; other < sizes.length; other++) {
+        if (Math.abs(own - sizes[other]) <= Math.max(spans[one], spans[other])) equal++;
+      }
+      return equal >= EQUAL;
+    });
+  });
 }
