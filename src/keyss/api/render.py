@@ -21,7 +21,7 @@ from keyss.runs.estimates import seconds_for
 from keyss.runs.files import METRICS, Background, PathLike, as_model, as_scene, stego_in
 from keyss.runs.folder import RunFolder, write_again
 from keyss.runs.open_run import open_run
-from keyss.runs.planning import seconds_to_measure
+from keyss.runs.planning import view_seconds
 from keyss.runs.run_records import HideMetrics
 
 Split = Literal["test", "train", "all"]
@@ -86,8 +86,12 @@ def evaluate(
         models = [stego, *(secret.reveal(stego).to(target) for secret in opened.opened)]
         baselines = [None if model is None else model.to(target) for model in opened.baselines()]
     tries = WRONG_KEYS if wrong_keys is None else wrong_keys
-    decoders = sum(each.decode is not None for each in opened.opened)
-    with reporter.waiting("comparing renders", seconds_to_measure(models, scenes, tries * decoders)):
+    decoded = tries * sum(each.decode is not None for each in opened.opened)
+    seconds = sum(
+        (1 + decoded) * len(scene.test) * view_seconds(target.type, len(model), scene)
+        for model, scene in zip(models, scenes, strict=True)
+    )
+    with reporter.waiting("comparing renders", seconds):
         measured = measure_hiding(
             stego,
             opened.opened,
