@@ -28,7 +28,7 @@ from keyss.core import SH_C0, Camera, Scene, View
 from keyss.files import load_scene
 from keyss.fitting import PlainRun, mean_psnr, own_randomness
 from keyss.fitting.plain import without_faint
-from keyss.rendering import middle_and_radius, render
+from keyss.rendering import frame_of, render
 from keyss.rendering.orbit import look_at
 
 import torch
@@ -199,7 +199,8 @@ def ring(
     far: bool = False,
 ) -> Scene:
     """Renders of a model from a ring of cameras, and some of its means as points."""
-    middle, radius = middle_and_radius(model)
+    frame = frame_of(model)
+    middle, radius = torch.from_numpy(frame.middle).float(), frame.radius
     generator = torch.Generator().manual_seed(5)
     if far:
         model = Gaussians.cat([model, sphere(middle, 30 * radius, model.sh.shape[1], generator)])
@@ -211,7 +212,7 @@ def ring(
         azimuth, elevation = 2 * math.pi * turn * index / VIEWS, math.radians(15 + 20 * (index % 7) / 6)
         flat = math.cos(elevation)
         outward = torch.tensor([flat * math.cos(azimuth), -math.sin(elevation), flat * math.sin(azimuth)])
-        pose = look_at(middle + outward * radius * distance, -outward)
+        pose = look_at(middle + outward * radius * distance, -outward, torch.tensor([0.0, -1.0, 0.0]))
         camera = Camera(pose, K, wide, high, f"{index:03d}")
         image = render(model, camera, torch.zeros(3)).clamp(0, 1)
         views.append(View(camera, (image * 255).round().to(torch.uint8)))

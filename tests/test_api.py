@@ -22,7 +22,7 @@ import keyss
 from keyss import CarryOptions, FitConfig, Secret
 from keyss.cli import main
 from keyss.core import InputError, OutputError, Scene, UsageError, WrongKeyError
-from tiny_scenes import HEIGHT, WIDTH, random_gaussians
+from tiny_scenes import HEIGHT, WIDTH, random_gaussians, tiny_scene
 
 CONFIG = CarryOptions(
     fit=FitConfig(iterations=60, max_gaussians=300, grow_start=0.2, grow_every=20, evaluate_every=0, seed=0),
@@ -86,6 +86,7 @@ def test_hide_output_files(run: Path) -> None:
     assert files == {
         "publish/model.ply",
         "private/config.json",
+        "private/look.png",
         "private/metrics.json",
         "private/manifest.json",
         "private/cover.ply",
@@ -221,3 +222,33 @@ def test_public_api() -> None:
     frozen = Path(__file__).with_name("public_api.txt").read_text(encoding="utf-8")
     difference = difflib.unified_diff(frozen.splitlines(), _signatures().splitlines(), lineterm="")
     assert "\n".join(difference) == ""
+
+
+@pytest.mark.parametrize(
+    ("secrets", "words"),
+    [
+        (["g.ply"], r"expected Secret\(scene, key\), got str"),
+        ("g.ply", r"expected a list, such as \[Secret"),
+        (Secret("g.ply", "key"), r"expected a list, such as \[Secret"),
+        ([], "expected 1 to"),
+    ],
+)
+def test_secrets_say_what_is_expected(secrets: Any, words: str) -> None:
+    with pytest.raises(UsageError, match=words):
+        keyss.hide(random_gaussians(), secrets)
+
+
+def test_preset() -> None:
+    """As on the command line; options have their own schedule."""
+    chosen = [keyss.Secret(tiny_scene(1), "a key of a secret scene")]
+    for name in ("quick", "default"):
+        found = keyss.hide(tiny_scene(), chosen, preset=name, publish="any", dry_run=True).cost
+        options = CarryOptions.preset(name)
+        assert found is not None
+        expected = keyss.hide(tiny_scene(), chosen, method=options, publish="any", dry_run=True).cost
+        assert expected is not None
+        assert found.steps == expected.steps
+    with pytest.raises(UsageError, match="expected quick or default or full"):
+        keyss.hide(tiny_scene(), chosen, preset="slow", dry_run=True)
+    with pytest.raises(UsageError, match="options have their own schedule"):
+        keyss.hide(tiny_scene(), chosen, method=keyss.CarryOptions(), preset="quick", dry_run=True)

@@ -178,6 +178,12 @@ def _crowding() -> float:
     return 1.0
 
 
+def say(*lines: object) -> None:
+    """Print lines to the standard output, unless the command is to be quiet."""
+    if level >= 0:
+        print(*lines, sep="\n")
+
+
 def waiting(what: str, seconds: float) -> AbstractContextManager[Share]:
     """`Reporter.waiting` on the standard error stream."""
     return reporter().waiting(what, seconds)

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import signal
+import subprocess
 import sys
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -82,3 +85,22 @@ def assert_refused(result: Result, status: int, words: str) -> None:
     assert 1 <= len(result.err.splitlines()) <= 2
     assert "Traceback" not in result.err
     assert result.out == ""
+
+
+def start_handling(arguments: Sequence[object], folder: Path | None = None) -> subprocess.Popen[str]:
+    """Start a command in a process, and wait until it handles signals or has ended."""
+    command, pipe = [*PROGRAM, *map(str, arguments)], subprocess.PIPE
+    process = subprocess.Popen(
+        command, cwd=folder, stdin=subprocess.DEVNULL, stdout=pipe, stderr=pipe, text=True
+    )
+    status = Path(f"/proc/{process.pid}/status")
+    # The last handler that is installed; nohup ignores SIGHUP.
+    last = next(each for each in (signal.SIGHUP, signal.SIGTERM) if signal.getsignal(each) != signal.SIG_IGN)
+    if not status.exists():
+        time.sleep(0.5)
+    while status.exists() and process.poll() is None:
+        caught = next(line for line in status.read_text().splitlines() if line.startswith("SigCgt"))
+        if int(caught.split()[1], 16) >> (last - 1) & 1:
+            break
+        time.sleep(0.001)
+    return process

@@ -49,7 +49,9 @@ def test_reports_quality(keyss: Run, files: Path, tmp_path: Path, suffix: str) -
             assert 25 < float(first.split("renders at ")[1].split()[0]) < 100
         if suffix == "spz":
             assert others.pop(0).startswith("y is up in an .spz")
-        assert others == ["a secret in low bits would be lost; --key-file checks that a secret survives"]
+        assert others == [
+            "what was hidden with --publish as-is, if anything, is lost; --key-file checks a secret"
+        ]
     assert len(read_model(out)) == COUNT
 
 

@@ -24,6 +24,9 @@ def test_prints_key(keyss: Run) -> None:
 
 def test_bits(keyss: Run) -> None:
     assert len(keyss("keygen", "--bits", 128).out) == 22 + 1
+    weak = keyss("keygen", "--bits", 8)
+    assert (weak.status, len(weak.out)) == (0, 2 + 1)
+    assert "warning: a key of 8 bits is found by 2^8 guesses" in weak.err
     assert_refused(keyss("keygen", "--bits", 0), 2, "--bits")
     assert_refused(keyss("keygen", "--bits", 10_000), 2, "1 to 1024")
 

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import getpass
+import io
 import os
 from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
 
+from channels.quiet.trained_like import trained_like
+from cli.harness import Run, assert_refused, write_key
 from keyss.cli import keys
 from keyss.core import InputError, KeyssWarning, UsageError
+from keyss.files import write_model
 from keyss.keys import DerivedKey, generate_key
 
 
@@ -126,3 +130,29 @@ def test_weak_key_warning(capsys: pytest.CaptureFixture[str]) -> None:
     assert "key 2: " in err
     assert "guesses" in err
     assert "hunter2" not in err
+
+
+def test_key_from_standard_input(keyss: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    key = "q7Rv2LxT9bWm4KzD"
+    write_model(tmp_path / "cover.ply", trained_like(1500))
+    write_model(tmp_path / "small.ply", trained_like(100, 1))
+    hide = ("hide", "--cover", tmp_path / "cover.ply", "--secret", tmp_path / "small.ply", "--width", 16)
+    write_key(tmp_path / "key.txt", key)
+    done = keyss(*hide, "--key-file", tmp_path / "key.txt", "-o", tmp_path / "run")
+    assert done.status == 0, done.err
+    monkeypatch.setattr("sys.stdin", io.TextIOWrapper(io.BytesIO(f"{key}\n".encode())))
+    stego = tmp_path / "run" / "publish" / "model.ply"
+    assert keyss("reveal", stego, "--key-file", "-", "-o", tmp_path / "out.ply").status == 0
+    refused = keyss("verify", stego, "--key-file", "-", "--key-file", "-")
+    assert_refused(refused, 2, "reads one key from standard input")
+    twice = keyss("verify", stego, "--key-file", tmp_path / "key.txt", "--key-file", tmp_path / "key.txt")
+    assert "secret of key 1" in twice.out
+    assert "secret of key 2" in twice.out
+
+
+def test_output_onto_a_dangling_link(keyss: Run, tmp_path: Path) -> None:
+    write_model(tmp_path / "a.ply", trained_like(50))
+    (tmp_path / "out.ply").symlink_to(tmp_path / "nowhere.ply")
+    refused = keyss("convert", tmp_path / "a.ply", tmp_path / "out.ply")
+    assert_refused(refused, 5, "is a link to")
+    assert (tmp_path / "out.ply").is_symlink()

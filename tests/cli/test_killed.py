@@ -1,4 +1,4 @@
-"""Commands killed at any moment and repeated give the result of an uninterrupted run."""
+"""Commands killed at any moment after their start and repeated give the result of an uninterrupted run."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from pathlib import Path
 
 import pytest
 
-from cli.harness import PROGRAM, write_workspace
+from cli.harness import start_handling, write_workspace
 
 SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
 SIZE = "--preset quick --iterations 150 --max-gaussians 240 --device cpu --seed 0"
@@ -58,12 +58,6 @@ COMMANDS: Mapping[str, Command] = {
 }
 
 
-def start(arguments: list[str], folder: Path) -> subprocess.Popen[str]:
-    return subprocess.Popen(
-        [*PROGRAM, *arguments], cwd=folder, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
-    )
-
-
 def without_times(text: str) -> object:
     """Parsed JSON without durations and paths."""
 
@@ -98,7 +92,7 @@ def reference(workspace: Path) -> Callable[[str], tuple[list[object], float]]:
             run("hide")
         out, run_folder, arguments = prepare(workspace, name, "reference")
         before = time.monotonic()
-        with start(arguments, workspace) as process:
+        with start_handling(arguments, workspace) as process:
             _, err = process.communicate()
         assert process.returncode == 0, err
         return result_of(COMMANDS[name], out, run_folder), time.monotonic() - before
@@ -133,20 +127,20 @@ def test_killed_commands_resume(
     mine.write_text("mine")
     again = arguments
     for _ in range(rng.choice((1, 1, 2))):  # some are killed twice
-        with start(again, workspace) as process:
+        with start_handling(again, workspace) as process:
             try:
                 process.wait(rng.uniform(0, 1.1 * seconds))
             except subprocess.TimeoutExpired:
                 process.send_signal(signum)
-            _, err = process.communicate(timeout=120)
+            _, err = process.communicate(timeout=600)
         assert "Traceback" not in err, err
         assert process.returncode in (0, -signum, 128 + signum), err
         again = [*arguments, COMMANDS[name].again]
         if process.returncode == 0:
             break
     if process.returncode != 0:
-        with start(again, workspace) as process:
-            _, err = process.communicate(timeout=300)
+        with start_handling(again, workspace) as process:
+            _, err = process.communicate(timeout=600)
         # It may have finished just before the signal.
         assert process.returncode == 0 or "holds a finished run" in err, err
         assert "Traceback" not in err

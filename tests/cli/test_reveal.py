@@ -173,7 +173,7 @@ class TestVerify:
         # Low bits change the length of quaternions slightly.
         assert max(each["model"].pop("unit_quaternions") for each in facts) < 0.01
         assert facts[0] == facts[1]
-        assert facts[0]["secret"] is None
+        assert facts[0]["secrets"] == []
         assert facts[0]["model"]["gaussians"] == 1500
         assert "secret  not checked" in keyss("verify", files / "whole.ply").out
 
@@ -210,7 +210,7 @@ class TestVerify:
             arguments = []
         result = keyss("verify", files / "whole.ply", *arguments, "--json")
         assert (result.status, result.err) == (0, "")
-        secret = json.loads(result.out)["secret"]
+        (secret,) = json.loads(result.out)["secrets"]
         assert (secret["found"], secret["hidden"]) == (500, 500)
 
     def test_invalid_model_with_whole_secret(self, keyss: Run, files: Path, tmp_path: Path) -> None:

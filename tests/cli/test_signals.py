@@ -10,27 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from cli.harness import PROGRAM, Result, Run, assert_refused, listing
+from cli.harness import PROGRAM, Result, Run, assert_refused, listing, start_handling
 
 WORDS = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated", signal.SIGHUP: "terminated"}
-
-
-def _start(arguments: list[object]) -> subprocess.Popen[str]:
-    """Start a process and wait until it handles signals."""
-    command = [*PROGRAM, *map(str, arguments)]
-    pipe = subprocess.PIPE
-    process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=pipe, stderr=pipe, text=True)
-    status = Path(f"/proc/{process.pid}/status")
-    # The last handler that is installed; nohup ignores SIGHUP.
-    last = next(each for each in (signal.SIGHUP, signal.SIGTERM) if signal.getsignal(each) != signal.SIG_IGN)
-    if not status.exists():
-        time.sleep(0.5)
-    while status.exists() and process.poll() is None:
-        caught = next(line for line in status.read_text().splitlines() if line.startswith("SigCgt"))
-        if int(caught.split()[1], 16) >> (last - 1) & 1:
-            break
-        time.sleep(0.001)
-    return process
 
 
 @pytest.mark.parametrize(
@@ -42,7 +24,7 @@ def test_signal_during_command(
     """It stops, or finishes before the signal arrives."""
     stego = next((workspace / "hidden").rglob("publish/model.ply"))
     reveal = ["reveal", stego, "--key-file", workspace / "key.txt", "-o", tmp_path / "secret.ply"]
-    process = _start(["--help"] if command == "help" else reveal)
+    process = start_handling(["--help"] if command == "help" else reveal)
     time.sleep(seconds)
     process.send_signal(signum)
     _, err = process.communicate(timeout=120)

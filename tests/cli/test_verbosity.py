@@ -9,6 +9,8 @@ import pytest
 
 from cli.harness import SMALL, Result, Run, scene_arguments
 from keyss import progress
+from keyss.files import write_model
+from tiny_scenes import random_gaussians
 
 
 def fit(keyss: Run, scene: Path, *more: object) -> Result:
@@ -21,8 +23,22 @@ def test_quiet(keyss: Run, scene: Path, flag: str) -> None:
     assert "fit b: 20 steps" in usual.err
     quiet = fit(keyss, scene, "--overwrite", flag)
     assert (quiet.status, quiet.err) == (0, "")
-    assert quiet.out.split("seconds")[0] == usual.out.split("seconds")[0]
+    out = scene.parent / "out"
+    assert quiet.out == f"{out / 'model.ply'}\n{out / 'private'}\n"
+    assert str(out / "model.ply") in usual.out
     assert progress.level == 0
+
+
+def test_quiet_prints_paths_only(keyss: Run, tmp_path: Path) -> None:
+    write_model(tmp_path / "a.ply", random_gaussians(50))
+    commands = {
+        "key.txt": ("keygen", "-o", tmp_path / "key.txt"),
+        "a.spz": ("convert", tmp_path / "a.ply", tmp_path / "a.spz"),
+        "page.html": ("view", tmp_path / "a.ply", "-o", tmp_path / "page.html"),
+        "turn.webp": ("render", tmp_path / "a.ply", "-o", tmp_path / "turn.webp", "--width", 8),
+    }
+    for name, command in commands.items():
+        assert keyss("-q", *command) == (0, f"{tmp_path / name}\n", "")
 
 
 def test_quiet_keeps_errors(keyss: Run, tmp_path: Path) -> None:

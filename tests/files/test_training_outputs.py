@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zipfile
 from pathlib import Path
 
 import pytest
@@ -59,10 +60,25 @@ def test_folders_of_checkpoints(tmp_path: Path, place: str) -> None:
 
 
 def test_unpacked_sog(tmp_path: Path) -> None:
-    (tmp_path / "meta.json").write_text("{}")
-    for read in (read_model, load_scene):
-        with pytest.raises(InputError, match=r"found an unpacked SOG model.*`splat-transform IN OUT\.ply`"):
-            read(tmp_path)
+    """The folder and its meta.json are read like the archive; images elsewhere are not."""
+    write_model(tmp_path / "a.sog", random_gaussians(300))
+    folder = tmp_path / "site"
+    with zipfile.ZipFile(tmp_path / "a.sog") as archive:
+        archive.extractall(folder)
+    expected = read_model(tmp_path / "a.sog").digest()
+    for path in (folder, folder / "meta.json"):
+        assert is_model(path)
+        assert read_model(path).digest() == expected
+    whole = (folder / "meta.json").read_text()
+    (folder / "meta.json").write_text(whole.replace("quats.webp", "../quats.webp"))
+    with pytest.raises(InputError, match="expected images beside it"):
+        read_model(folder)
+    (folder / "meta.json").write_text(whole)
+    (folder / "quats.webp").unlink()
+    with pytest.raises(InputError, match=r"quats\.webp"):
+        read_model(folder)
+    (folder / "meta.json").write_text("{}")
+    assert not is_model(folder)
 
 
 def test_scene_that_contains_a_model(tmp_path: Path) -> None:

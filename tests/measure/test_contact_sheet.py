@@ -24,3 +24,13 @@ def test_layout() -> None:
     assert (picture[-61:-1, -162:-82] == (255, 0, 0)).all()
     assert (picture[-122:-62, -81:-1] == (0, 0, 255)).all()
     assert (picture[:-124] != 255).any()
+
+
+def test_narrow_pictures_have_no_gaps() -> None:
+    """A long heading wraps; a column is no wider than its pictures."""
+    portrait = np.zeros((200, 110, 3), np.uint8)
+    picture = contact_sheet(["the cover as a photo of it", "the published model"], {"1": [portrait] * 2})
+    row = (np.asarray(Image.open(io.BytesIO(picture)))[-100] == 0).all(1)
+    columns = np.flatnonzero(row)
+    assert len(columns) == 220
+    assert columns[110] - columns[109] <= 200 // 40 + 1

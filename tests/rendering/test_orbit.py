@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
+import pytest
 import torch
 
 from keyss.core import Gaussians, camera_positions
-from keyss.rendering import middle_and_radius
-from keyss.rendering.orbit import orbit
+from keyss.rendering import frame_of
+from keyss.rendering.orbit import orbit, turntable
+from rendering.test_framing import FLOORS, on_a_floor
 from tiny_scenes import random_gaussians
 
 SIZE = 48
@@ -17,7 +20,8 @@ SIZE = 48
 def test_orbit() -> None:
     model = random_gaussians(500)
     cameras = orbit(model, SIZE)
-    middle, radius = middle_and_radius(model)
+    frame = frame_of(model)
+    middle, radius = torch.from_numpy(frame.middle).float(), frame.radius
     outward = torch.nn.functional.normalize(camera_positions(cameras) - middle, dim=1)
     for camera, direction in zip(cameras, outward, strict=True):
         torch.testing.assert_close(camera.viewmat[2, :3], -direction, atol=1e-5, rtol=0)
@@ -32,9 +36,22 @@ def test_orbit() -> None:
 
 def test_faint_and_distant_gaussians_are_ignored() -> None:
     model = random_gaussians(500)
-    middle, radius = middle_and_radius(model)
-    far = replace(model[:20], means=model[:20].means * 1000 + 500)
+    frame = frame_of(model)
+    far = replace(model[:2], means=model[:2].means * 1000 + 500)
     faint = replace(model[:100], means=model[:100].means + 50, opacity_logits=torch.full((100,), -12.0))
-    moved, larger = middle_and_radius(Gaussians.cat([model, far, faint]))
-    assert float((moved - middle).norm()) < 0.2 * radius
-    assert larger < 1.3 * radius
+    moved = frame_of(Gaussians.cat([model, far, faint]))
+    assert np.linalg.norm(moved.middle - frame.middle) < 0.2 * frame.radius
+    assert moved.radius < 1.3 * frame.radius
+
+
+@pytest.mark.parametrize("up", ["-y", "z", "tilted"])
+def test_turntable_goes_around_upright(up: str) -> None:
+    model = on_a_floor(FLOORS[up])
+    frame, cameras = frame_of(model), turntable(model, SIZE, 8)
+    across = torch.from_numpy(frame.up).float()
+    offsets = camera_positions(cameras) - torch.from_numpy(frame.middle).float()
+    torch.testing.assert_close(offsets @ across, (offsets @ across).mean().expand(8), atol=1e-4, rtol=0)
+    assert (offsets @ across > 0.2 * frame.radius).all()  # from a little above
+    for camera in cameras:
+        assert -camera.viewmat[1, :3] @ across > 0.9
+    assert (offsets - (offsets @ across)[:, None] * across).mean(0).norm() < 1e-3 * frame.radius  # all around

@@ -111,7 +111,7 @@ class Visit:
     def try_key(self, key: str, *, thorough: bool = False) -> list[float]:
         """Enter a key and wait for its result; returns the values of the progress bar.
 
-        The slow search of colours is stopped unless `thorough`.
+        The slow search of colours is stopped unless `thorough`; after a right key it goes on unseen.
         """
         self.page.fill("#key", key)
         seen = self.page.evaluate(
@@ -128,10 +128,12 @@ class Visit:
                 document.getElementById('form').requestSubmit();
             })"""
         )
-        if not thorough:
-            self.page.wait_for_selector("main[data-searching=thorough]")
+        self.page.wait_for_selector("main:is([data-searching=thorough], [data-searching=silent])")
+        if self.page.get_attribute("main", "data-searching") == "thorough" and not thorough:
             self.page.click("#stop")
-        self.page.wait_for_selector("main[data-searching='']")
+            self.page.wait_for_selector("main[data-searching='']")
+        if thorough:
+            self.page.wait_for_selector("main[data-searching='']")
         self.settle()
         return list(dict.fromkeys(self.page.evaluate("window.seen") if thorough else seen))
 

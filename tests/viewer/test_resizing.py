@@ -53,6 +53,24 @@ def assert_drawn(tab: Visit, model: Gaussians) -> tuple[int, int]:
     return width, height
 
 
+def test_found_is_found(chromium: Any, page_file: Path) -> None:
+    """After a right key there is no word of a search; on a phone, the panel leaves most of the screen."""
+    share = "document.querySelector('.panel').offsetHeight / innerHeight"
+    with visit(chromium, viewport=PORTRAIT, **PHONE) as tab:
+        tab.goto(page_file.as_uri())
+        for summary in ("#more", "#keying > summary"):
+            tab.page.tap(summary)
+            assert tab.page.evaluate(share) < 0.4
+        tab.try_key(KEY)
+        assert (
+            tab.page.locator("[role=status]").inner_text()
+            == "Key tried. It reveals a model of 200 Gaussians."
+        )
+        assert tab.page.locator("#progress").is_hidden()
+        assert tab.page.locator("#stop").is_hidden()
+        assert tab.page.evaluate(share) < 0.4
+
+
 @pytest.mark.slow
 def test_secret_stays_after_search(chromium: Any, page_file: Path) -> None:
     """The panel and the canvas change their heights while frames are drawn."""

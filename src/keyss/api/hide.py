@@ -27,17 +27,19 @@ from keyss.fitting.image_metrics import quality
 from keyss.keys import DerivedKey
 from keyss.keys.derivation import SALT_BYTES
 from keyss.measure.hide_quality import Shown, compare, measure_hiding
+from keyss.measure.renders import sheet_of
 from keyss.methods.companion import pack
 from keyss.methods.hidden import HiddenScene
-from keyss.methods.method import Context, Method, MethodOptions, Source, Stego
+from keyss.methods.method import Context, Method, MethodOptions, Source, Stego, role_of
 from keyss.methods.plain_models import Bound, fit_bounds, fit_plain_models
 from keyss.methods.registry import DEFAULT, open_companion, open_model
 from keyss.progress import Reporter
 from keyss.rendering import Backend, resolve_device
-from keyss.rendering.orbit import is_model
+from keyss.rendering.orbit import from_above, is_model
 from keyss.runs.estimates import seconds_to_prepare
 from keyss.runs.files import (
     CONFIG,
+    LOOK,
     METRICS,
     MODEL,
     STEGOS,
@@ -64,6 +66,7 @@ def hide(
     publish: Publish | None = None,
     format: Format | None = None,
     channel: AnyChannel | None = None,
+    preset: str | None = None,
     width: int | None = None,
     background: Background = None,
     skip_missing: bool = False,
@@ -80,20 +83,20 @@ def hide(
     """Hide secrets in a cover, each under its own key, and measure the result on the test views.
 
     Cover and secrets are scenes of photos, or models of any format, which are rendered for measurements.
-    Plain models of scenes are fitted unless they are given. `method`: a name, for its default preset on the
-    device, or the options of a method (`CarryOptions`, `KeyssOptions`). `publish`, `format` and `channel`,
-    if given, replace those of the options. "as-is" hides unnoticeably, in a file that must stay unchanged:
-    in low bits of a "ply", or in the integers of an "spz", "sog" or "compressed-ply", or of a model decoded
-    from one. By default `format` is the cover's; if nothing can be hidden in it unnoticed, `publish`
-    becomes "any", with a warning. "any" survives conversion: in the channel "appended" (more Gaussians,
-    which are visible in the file) or "colours" (less capacity). `width`, `background`, `skip_missing`: see
-    `load_scene`.
+    Plain models of scenes are fitted unless they are given. `method`: a name, with the length of training of
+    `preset` ("quick", "default" or "full") on the device, or the options of a method (`CarryOptions`,
+    `KeyssOptions`). `publish`, `format` and `channel`, if given, replace those of the options. "as-is" hides
+    unnoticeably, in a file that must stay unchanged: in low bits of a "ply", or in the integers of an "spz",
+    "sog" or "compressed-ply", or of a model decoded from one. By default `format` is the cover's; if nothing
+    can be hidden in it unnoticed, `publish` becomes "any", with a warning. "any" survives conversion: in the
+    channel "appended" (more Gaussians, which are visible in the file) or "colours" (less capacity). `width`,
+    `background`, `skip_missing`: see `load_scene`.
 
     `out` (a folder) gets `publish/` with the stego model, and `private/` with fitted models, `config.json`,
-    `metrics.json`, companion files for methods that need them (`keyss.methods.companion`), and
-    checkpoints, from which `resume` continues. Without a seed in the options' `fit` the run uses a random
-    one, which `config.json` records. With a seed, the same arguments and number of threads give the same
-    bytes on a CPU.
+    `metrics.json`, `look.png` (test views of cover and secrets before and after), companion files for methods
+    that need them (`keyss.methods.companion`), and checkpoints, from which `resume` continues. Without a seed
+    in the options' `fit` the run uses a random one, which `config.json` records. With a seed, the same
+    arguments and number of threads give the same bytes on a CPU.
 
     `bound`: fit upper bounds to compare with, plain 3DGS with equal Gaussians and training steps; otherwise
     `metrics.json` says which baselines had fewer steps. `dry_run`: check arguments, return only the plan.
@@ -104,7 +107,7 @@ def hide(
     KeyssErrors too, and Interrupted on Ctrl-C.
     """
     target = resolve_device(device)
-    chosen, options = method_for(method, secrets, target.type)
+    chosen, options = method_for(method, secrets, preset, target.type)
     asked: dict[str, Any] = {"publish": publish, "format": format, "channel": channel}
     options = replace(options, **{name: value for name, value in asked.items() if value})
     _check_arguments(out, min_psnr)
@@ -177,7 +180,12 @@ def hide(
             )
             names = bound_names(len(secrets))
             made |= {names[index]: model for index, model in longer.items()}
-            folder.write({**made, CONFIG: settings, METRICS: metrics})
+            roles = [role_of(index, len(sources)) for index in range(len(sources))]
+            columns = [
+                (role, each.scene if each.photos else from_above(each.scene), model.to(target))
+                for role, each, model in zip(roles, sources, read, strict=True)
+            ]
+            folder.write({**made, CONFIG: settings, METRICS: metrics, LOOK: sheet_of(columns)})
     return HideResult(stego.gaussians, metrics, survives=options.channel_in().survives)
 
 

@@ -7,6 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from itertools import combinations
 
+from keyss.api.model_frames import in_frame_of
 from keyss.core.errors import UsageError
 from keyss.core.gaussians import DRAWN_OPACITY, Gaussians
 from keyss.core.scene import Scene, ViewOptions
@@ -42,17 +43,24 @@ class HideResult:
 
 
 def method_for(
-    chosen: str | MethodOptions, secrets: Sequence[Secret], device: str
+    chosen: str | MethodOptions, secrets: Sequence[Secret], preset: str | None, device: str
 ) -> tuple[Method, MethodOptions]:
     """A method and its options, by default its preset for the device.
 
     Raises UsageError if the method does not support these secrets or keys.
     """
+    if isinstance(secrets, Secret) or not isinstance(secrets, Sequence) or isinstance(secrets, str):
+        raise UsageError("secrets: expected a list, such as [Secret(scene, key)]")
+    for each in secrets:
+        if not isinstance(each, Secret):
+            raise UsageError(f"secrets: expected Secret(scene, key), got {type(each).__name__}")
     if isinstance(chosen, MethodOptions):
         method, options = registry.of_options(chosen), chosen
+        if preset is not None:
+            raise UsageError("`preset` is for a method's name: options have their own schedule")
     else:
         method = registry.get(chosen)
-        options = method.options.preset("default", device)
+        options = method.options.preset(preset or "default", device)
     if not 1 <= len(secrets) <= method.max_secrets:
         raise UsageError(
             f"expected 1 to {method.max_secrets} secrets for the method {method.name}, got {len(secrets)}"
@@ -95,9 +103,15 @@ def sources_of(
             as_scene(source, views) if photos else None
             for source, (_, photos) in zip(sources, given, strict=True)
         ]
+        placed = [
+            in_frame_of(scene, scene.to_scene_frame(model), path, source)
+            if scene is not None and model is not None and path is not None
+            else model
+            for model, scene, source, (path, _) in zip(found, loaded, sources, given, strict=True)
+        ]
         return [
-            Source(scene.to_scene_frame(model) if scene and model is not None else model, photos, key, scene)
-            for model, (_, photos), key, scene in zip(found, given, ["", *keys], loaded, strict=True)
+            Source(model, photos, key, scene)
+            for model, (_, photos), key, scene in zip(placed, given, ["", *keys], loaded, strict=True)
         ]
 
 

@@ -7,16 +7,19 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
+import torch
 from torch import Tensor
 
 from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
-from keyss.core.scene import Scene, ViewOptions
-from keyss.files.images import png_bytes
+from keyss.core.scene import Scene, ViewOptions, checked_background
+from keyss.files.atomic import check_not_an_input, check_output_file, write_bytes
+from keyss.files.images import animation_bytes, png_bytes
 from keyss.measure.hide_quality import WRONG_KEYS, compare, measure_hiding
 from keyss.measure.renders import renders_of
 from keyss.progress import Reporter
 from keyss.rendering import Backend, resolve_device
+from keyss.rendering.orbit import checked_size, turntable
 from keyss.runs.estimates import seconds_for
 from keyss.runs.files import METRICS, Background, PathLike, as_model, as_scene, stego_in
 from keyss.runs.folder import RunFolder, write_again
@@ -29,7 +32,7 @@ Split = Literal["test", "train", "all"]
 
 def render(
     model: PathLike | Gaussians,
-    cameras: PathLike | Scene,
+    cameras: PathLike | Scene | None = None,
     *,
     split: Split = "test",
     width: int | None = None,
@@ -39,19 +42,35 @@ def render(
     out: PathLike | None = None,
     overwrite: bool = False,
 ) -> list[tuple[str, Tensor]]:
-    """Render a model from the cameras of a scene; returns names and uint8 images [H, W, 3].
+    """Render a model from the cameras of a scene, by default all around it; names and uint8 images [H, W, 3].
 
-    `width`, `background`, `skip_missing`: see `load_scene`; a skipped photo has no camera. `out` (a folder)
-    gets a PNG for each camera. Raises KeyssError.
+    `width`, `background`, `skip_missing`: see `load_scene`; a skipped photo has no camera. Without `cameras`,
+    60 square images of `width` pixels, by default 400. `out` gets a PNG for each camera if it is a folder, or
+    an animation if its name ends in .webp. Raises KeyssError.
     """
     views = ViewOptions.of(width, background, skip_missing)
     target = resolve_device(device)
     inputs = [Path(model)] if isinstance(model, str | Path) else []
-    folder = RunFolder(out, "render", inputs=inputs, overwrite=overwrite) if out is not None else None
-    scene = as_scene(cameras, views)
-    gaussians = scene.to_scene_frame(as_model(model)).to(target)
-    chosen = {"test": scene.test, "train": scene.train, "all": scene.views}[split]
-    pictures = renders_of(gaussians, scene, chosen)
+    animated = out is not None and Path(out).suffix.lower() == ".webp"
+    folder = None
+    if animated:
+        check_not_an_input(str(out), inputs)
+        check_output_file(str(out), overwrite)
+    elif out is not None:
+        folder = RunFolder(out, "render", inputs=inputs, overwrite=overwrite)
+    if cameras is None:
+        gaussians = as_model(model).to(target)
+        behind = torch.zeros(3) if background is None else checked_background(background)
+        chosen = turntable(gaussians, checked_size(width))
+    else:
+        scene = as_scene(cameras, views)
+        gaussians, behind = scene.to_scene_frame(as_model(model)).to(target), scene.background
+        chosen = [
+            view.camera for view in {"test": scene.test, "train": scene.train, "all": scene.views}[split]
+        ]
+    pictures = renders_of(gaussians, chosen, behind)
+    if animated:
+        write_bytes(str(out), animation_bytes([image for _, image in pictures]))
     if folder:
         with folder.work():
             folder.write({name: png_bytes(image) for name, image in pictures})

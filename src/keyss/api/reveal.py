@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 
 from keyss.channels import open_payload
@@ -98,22 +99,23 @@ def _with_warnings(found: Revealed) -> Revealed:
 
 def verify(
     model: PathLike | Gaussians,
-    key: str | None = None,
+    keys: str | Sequence[str] = (),
     *,
     device: Backend = "auto",
 ) -> Verification:
-    """Check that a model is sound and, with a key, that its secret is complete; writes nothing.
+    """Check that a model is sound and, with keys, that their secrets are complete; writes nothing.
 
-    Without a key, the result does not reveal whether something is hidden. Raises InputError for a file that
+    Without keys, the result does not reveal whether something is hidden. Raises InputError for a file that
     is not a complete and finite model, WrongKeyError for a key that opens nothing.
     """
     target = resolve_device(device)
     name = "model" if isinstance(model, Gaussians) else str(model)
     gaussians = as_model(model)
-    if key is None:
-        return Verification(name, check_model(gaussians), None)
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", KeyssWarning)
-        revealed = reveal_any(gaussians, key, target)
-    problems = [str(each.message) for each in caught if issubclass(each.category, KeyssWarning)]
-    return Verification(name, check_model(gaussians), check_secret(revealed, problems))
+    secrets = []
+    for key in [keys] if isinstance(keys, str) else keys:
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always", KeyssWarning)
+            revealed = reveal_any(gaussians, key, target)
+        problems = [str(each.message) for each in caught if issubclass(each.category, KeyssWarning)]
+        secrets.append(check_secret(revealed, problems))
+    return Verification(name, check_model(gaussians), tuple(secrets))

@@ -27,7 +27,7 @@ Device = Annotated[Literal["auto", "cpu", "cuda"], arg(help="Device; auto uses a
 Seed = Annotated[int | None, optional("N", "Seed of all random numbers, to repeat a run.", "random")]
 KeyFiles = Annotated[
     UseAppendAction[tuple[Path, ...]],
-    optional("FILE", "Key file, one for each secret.", "KEYSS_KEY or a prompt"),
+    optional("FILE", "Key file, one for each secret; - for stdin.", "KEYSS_KEY or a prompt"),
 ]
 Preset = Annotated[
     Literal["quick", "default", "full"],
@@ -60,7 +60,9 @@ class Photos:
             "white for transparent photos, else black",
         ),
     ] = None
-    skip_missing: Annotated[bool, switch("Skip photos that do not exist or have no usable camera.")] = False
+    skip_missing: Annotated[
+        bool, switch("Skip photos that are missing or damaged or have no usable camera.")
+    ] = False
 
 
 @dataclass(frozen=True, kw_only=True)

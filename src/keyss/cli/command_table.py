@@ -32,7 +32,7 @@ Hide a 3D Gaussian Splatting scene inside another one and open it only with a ke
 
 `keyss COMMAND --help` shows the options of a command and examples.
 
-  -q, --quiet              show no progress
+  -q, --quiet              print nothing but paths of results, and errors
   -v, --verbose            show more progress, and the time at the end
   -V, --version            print the version
   --completion {{bash,zsh}}  print a completion script for the shell

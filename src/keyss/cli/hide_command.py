@@ -53,7 +53,7 @@ class Details:
         float | None,
         optional(
             "DB",
-            "Fail if cover or secret is further from its plain model than this.",
+            "Fail if the PSNR of cover or secret to its plain model is below this.",
             "20, and 25 for secrets that were pruned without a refit",
         ),
     ] = None
@@ -149,7 +149,7 @@ def _hide_scenes(args: HideArguments, options: MethodOptions) -> None:
     from keyss import progress
     from keyss.cli.tables import print_files, print_hiding, print_plan
     from keyss.methods import registry
-    from keyss.runs.files import COMPANIONS, STEGOS
+    from keyss.runs.files import COMPANIONS, LOOK, STEGOS
 
     method = registry.get(args.method)
     secrets = _secrets(args, method)
@@ -184,21 +184,23 @@ def _hide_scenes(args: HideArguments, options: MethodOptions) -> None:
         print_plan(method.name, result.plan, result.cost)
         return
     assert result.metrics is not None
-    print_hiding(result.metrics, brief=progress.level < 1)
+    if progress.level >= 0:
+        print_hiding(result.metrics, brief=progress.level < 1)
     what = "the cover with the secret in it" if options.trains or method.capabilities.keys else "the cover"
     how = _HOW_TO_PUBLISH[result.survives]
     print_files(
         args.out,
         {
             **dict.fromkeys(STEGOS, f"{how}: {what}"),
+            LOOK: "cover before and after, secret and revealed: look here first; it shows the secret",
             COMPANIONS: "hand this over to whoever may see the secret: `keyss reveal --companion`",
             "private": "keep this private, or delete it: measurements, configuration, fitted models",
         },
     )
     if not method.capabilities.keys:
-        print(f"The method {method.name} has no keys: whoever has both files can see the secret.")
+        progress.say(f"The method {method.name} has no keys: whoever has both files can see the secret.")
         return
-    print(
+    progress.say(
         "Send the key over another channel, and keep a copy: without it the secret is lost. Whoever has "
         f"the file and the key runs `keyss reveal`; `keyss info {args.out}` prints all measurements."
     )
@@ -262,6 +264,7 @@ def _kind_of_device(args: HideArguments) -> str:
 
 def _hide_files(args: HideArguments) -> None:
     import keyss
+    from keyss import progress
     from keyss.channels import channel_for
     from keyss.cli.tables import print_files
     from keyss.progress import waiting
@@ -286,8 +289,8 @@ def _hide_files(args: HideArguments) -> None:
         )
     for file in files:
         what = "which fit" if args.dry_run else "revealed again from the published file"
-        print(f"{file.name}: {file.stat().st_size:,} bytes, {what}")
-    print(f"PSNR between renders of the cover before and after: {result.psnr:.0f} dB")
+        progress.say(f"{file.name}: {file.stat().st_size:,} bytes, {what}")
+    progress.say(f"PSNR between renders of the cover before and after: {result.psnr:.0f} dB")
     if args.dry_run:
         print("Dry run: nothing was written.")
         return

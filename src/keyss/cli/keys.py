@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from keyss.core.errors import UsageError
+from keyss.files.inputs import is_standard
 from keyss.keys.key_file import normalized_key, read_key
 
 VARIABLE = "KEYSS_KEY"
@@ -41,6 +42,8 @@ def keys(files: Sequence[Path], count: int, *, new: bool = False) -> list[str]:
 
 def given_keys(files: Sequence[Path]) -> list[str]:
     """The keys in `files`, else the one in the environment, else none: for commands with optional keys."""
+    if sum(map(is_standard, files)) > 1:
+        raise UsageError("--key-file - reads one key from standard input: give the others in files")
     if files or VARIABLE not in os.environ:
         return [key_of_file(path) for path in files]
     try:
@@ -73,9 +76,9 @@ def warn_of_weak_keys(chosen: Sequence[str]) -> None:
 
 
 def key_of_file(path: Path) -> str:
-    """Read a key file; warns if others can read it. Raises InputError for a file without a key."""
+    """Read a key file, or standard input; warns if others can read it. Raises InputError without a key."""
     key = read_key(path)
-    mode = path.stat().st_mode
+    mode = 0 if is_standard(path) else path.stat().st_mode
     if os.name == "posix" and stat.S_ISREG(mode) and mode & (stat.S_IRGRP | stat.S_IROTH):
         print(
             f"keyss: warning: {path}: others can read this key file; protect it with `chmod 600`",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -26,6 +27,8 @@ from keyss.cli.keys import given_keys, key_of_file
 from keyss.cli.verbs import verb
 from keyss.core.errors import UsageError
 
+ENOUGH_BITS = 64  # of a random key, which Argon2id makes as slow to find as 2^80 plain hashes
+
 
 def demo(
     *,
@@ -40,13 +43,15 @@ def demo(
 
     example: keyss demo -o out/demo
     """
+    from keyss import progress
     from keyss.cli.tables import print_files, print_hiding
     from keyss.demo import WRONG_KEYS, run_demo
-    from keyss.progress import reporter
 
-    result = run_demo(out, seed=check_seed(seed), device=device, overwrite=overwrite, reporter=reporter())
-    print_hiding(result.metrics)
-    print(f"Wrong keys refused: {result.refused} of {len(WRONG_KEYS)}.")
+    seed = check_seed(seed)
+    result = run_demo(out, seed=seed, device=device, overwrite=overwrite, reporter=progress.reporter())
+    if progress.level >= 0:
+        print_hiding(result.metrics)
+    progress.say(f"Wrong keys refused: {result.refused} of {len(WRONG_KEYS)}.")
     print_files(
         out,
         {
@@ -80,11 +85,11 @@ def fit(
     check_exists(scene)
     from dataclasses import replace
 
+    from keyss import progress
     from keyss.cli.tables import print_files, print_fit
 
     run = verb("fit")
     from keyss.fitting.config import preset_for
-    from keyss.progress import reporter
     from keyss.rendering import resolve_device
     from keyss.runs.files import METRICS
     from keyss.runs.json_records import read_record
@@ -98,9 +103,10 @@ def fit(
         out=out,
         overwrite=overwrite,
         resume=resume,
-        reporter=reporter(),
+        reporter=progress.reporter(),
     )
-    print_fit(read_record(out / METRICS, FitMetrics))
+    if progress.level >= 0:
+        print_fit(read_record(out / METRICS, FitMetrics))
     print_files(out, {"model.ply": "the model", "private": "measurements and configuration"})
 
 
@@ -125,6 +131,7 @@ def keygen(
 
     example: keyss keygen --asset statue-7 --master-key-file master.txt -o statue-7.key
     """
+    from keyss.cli.tables import print_written
     from keyss.keys import generate_key, length_for
     from keyss.keys.key_file import write_new_key
 
@@ -141,12 +148,17 @@ def keygen(
         if bits < 1:
             raise UsageError(f"--bits: expected at least 1, got {bits}")
         key = generate_key(length_for(bits))
+        if bits < ENOUGH_BITS:
+            weak = (
+                f"a key of {bits} bits is found by 2^{bits} guesses: at least {ENOUGH_BITS} are out of reach"
+            )
+            print(f"keyss: warning: {weak}", file=sys.stderr)
         what = f"a key of {len(key)} characters; keep a copy, as without it the secret is lost"
     if out is None:
         print(key)
         return
     write_new_key(out, key)
-    print(f"{out}: {what}")
+    print_written(out, what)
 
 
 def convert(
@@ -173,11 +185,8 @@ def convert(
     example: keyss convert model.ply model.sog --key-file key.txt --dry-run
     """
     check_exists(model, *key_file)
-    import sys
-
     import keyss
     from keyss.cli.tables import print_conversion
-    from keyss.files.inputs import is_standard
     from keyss.progress import waiting
     from keyss.runs.estimates import seconds_to_convert
 
@@ -192,4 +201,4 @@ def convert(
             overwrite=overwrite,
             device=device,
         )
-    print_conversion(str(out), found, dry_run=dry_run, file=sys.stderr if is_standard(out) else sys.stdout)
+    print_conversion(out, found, dry_run=dry_run)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -17,7 +16,8 @@ def reveal(
     stego: Annotated[Positional[Path], arg(metavar="FILE", help="Published model, or - for stdin.")],
     *,
     key_file: Annotated[
-        UseAppendAction[tuple[Path, ...]], optional("FILE", "Key file.", "KEYSS_KEY or a prompt")
+        UseAppendAction[tuple[Path, ...]],
+        optional("FILE", "Key file, or - for stdin.", "KEYSS_KEY or a prompt"),
     ] = (),
     out: Annotated[
         Path,
@@ -34,7 +34,11 @@ def reveal(
         Literal["secret", "cover"], arg(help="Coordinates: the secret's own, or those it was hidden in.")
     ] = "secret",
     force: Annotated[
-        bool, switch("Write what is left of the secret in a model that was quantised or pruned.")
+        bool,
+        switch(
+            "For secrets of --method keyss: write what is left in a quantised or pruned model. Others open "
+            "whole or not at all."
+        ),
     ] = False,
     overwrite: Overwrite = False,
     device: Device = "auto",
@@ -51,7 +55,7 @@ def reveal(
     key: str | None = None
     if companion is None or key_file:
         (key,) = keys(key_file, 1)
-    from keyss.files.inputs import is_standard
+    from keyss.cli.tables import print_written
     from keyss.progress import waiting
     from keyss.runs.estimates import seconds_for
 
@@ -67,19 +71,22 @@ def reveal(
             overwrite=overwrite,
         )
     if revealed.file is not None:
-        print(f"{out}: {revealed.file.name!r}, {len(revealed.file.data):,} bytes")
+        print_written(out, f"{revealed.file.name!r}, {len(revealed.file.data):,} bytes")
         return
     remains = revealed.remains
     of = f" of {remains.hidden:,}" if remains.hidden else ""
-    print(f"{out}: {remains.found:,}{of} Gaussians", file=sys.stderr if is_standard(out) else sys.stdout)
+    print_written(out, f"{remains.found:,}{of} Gaussians")
 
 
 def verify(
     model: Annotated[Positional[Path], arg(metavar="FILE", help="Model (.ply, .spz, ...), or - for stdin.")],
     *,
     key_file: Annotated[
-        Path | None, optional("FILE", "Key file, to check its secret too.", "KEYSS_KEY, else no key")
-    ] = None,
+        UseAppendAction[tuple[Path, ...]],
+        optional(
+            "FILE", "Key file, to check its secret too; repeat for several secrets.", "KEYSS_KEY, else no key"
+        ),
+    ] = (),
     json_: Annotated[bool, switch("Print JSON.", name="json")] = False,
     device: Device = "auto",
 ) -> None:
@@ -89,15 +96,15 @@ def verify(
 
     example: keyss verify model.ply --key-file key.txt
     """
-    check_exists(model, key_file)
+    check_exists(model, *key_file)
     import keyss
     from keyss.cli.tables import print_json, print_verification
     from keyss.progress import waiting
     from keyss.runs.estimates import seconds_for
 
-    key = next(iter(given_keys([key_file] if key_file else [])), None)
-    with waiting(f"checking {model.name}", seconds_for("reveal" if key else "verify", model)):
-        found = keyss.verify(model, key, device=device)
+    given = given_keys(key_file)
+    with waiting(f"checking {model.name}", seconds_for("reveal" if given else "verify", model)):
+        found = keyss.verify(model, given, device=device)
     (print_json if json_ else print_verification)(found)
     if found.problems:
         raise InputError(f"{model}: {'; '.join(found.problems)}")

@@ -24,7 +24,7 @@ from keyss.cli.verbs import verb
 from keyss.core.errors import UsageError
 
 _VECTOR = r"[-+.\de]+(,[-+.\de]+){2}"
-_POSE = rf"#?eye={_VECTOR}&target={_VECTOR}(&up=({_VECTOR}|-?[xyz]))?"
+_POSE = rf"#?eye={_VECTOR}&target={_VECTOR}(&up=({_VECTOR}|-?[xyz]))?(&fov=[\d.]+,[\d.]+)?"
 
 
 def view(
@@ -67,53 +67,72 @@ def view(
     example: keyss view runs/hidden/publish/model.ply -o page.html
     """
     check_exists(model)
+    from keyss.cli.tables import print_written
     from keyss.progress import waiting
     from keyss.runs.estimates import seconds_for
 
     if pose and not re.fullmatch(_POSE, pose):
         raise UsageError(f"--pose: expected eye=X,Y,Z&target=X,Y,Z as in the page's address, got {pose}")
     given = {"pose": pose, "up": up, "title": title, "host": allow_host, "embedder": embed_in}
-    look = {name: value for name, value in given.items() if value}
+    changed = {name: value for name, value in given.items() if value}
     if out is not None:
         if port or host != "127.0.0.1":
             raise UsageError("--port and --host are for serving: leave them out with -o")
         with waiting(f"writing {out.name}", seconds_for("export", model)):
-            from keyss.viewer import export_html, look_of_model
+            from keyss.viewer import export_html
 
-            written = export_html(model, out, look=look_of_model(model) | look, overwrite=overwrite)
+            written = export_html(model, out, look=_look(model, changed), overwrite=overwrite)
         size = sum(path.stat().st_size for path in written) / 1e6
         what = "opens in any browser" if len(written) == 1 else f"{len(written)} files for a web server"
-        print(f"{out}: {size:.1f} MB; {what}")
+        print_written(out, f"{size:.1f} MB; {what}")
         return
     if overwrite or allow_host or embed_in:
         raise UsageError("--overwrite, --allow-host and --embed-in are for -o: leave them out")
     if not 0 <= port < 1 << 16:
         raise UsageError(f"--port: expected 0 to {(1 << 16) - 1}, got {port}")
     with waiting(f"reading {model.name}", seconds_for("export", model)):
-        from keyss.viewer import ModelServer, look_of_model
+        from keyss.viewer import ModelServer
 
-        server = ModelServer(model, host, port, look_of_model(model) | look)
+        server = ModelServer(model, host, port, _look(model, changed))
     who = "only on this machine" if server.is_local else f"to all who can reach {host} and know this address"
     print(f"{server.address} shows {model} {who}; press Ctrl-C to stop", flush=True)
     server.run()
 
 
+def _look(model: Path, changed: dict[str, str]) -> dict[str, str]:
+    """The look of a model's page with the values that are given."""
+    from keyss.viewer import look_of_model
+
+    look = look_of_model(model)
+    if "up" in changed:
+        look.pop("pose", None)
+    return look | changed
+
+
 def render(
     model: Annotated[Positional[Path], arg(metavar="FILE", help="Model (.ply, .spz, ...), or - for stdin.")],
     *,
-    cameras: Annotated[Path, arg(metavar="SCENE", help="Scene whose cameras are used.")],
-    out: Annotated[Path, arg(metavar="FOLDER", help="Folder for the images.", aliases=["-o"])],
+    cameras: Annotated[
+        Path | None, optional("SCENE", "Scene whose cameras are used.", "60 around the model")
+    ] = None,
+    out: Annotated[
+        Path,
+        arg(metavar="OUT", help="Folder for the images, or an animation that ends in .webp.", aliases=["-o"]),
+    ],
     split: Annotated[Literal["test", "train", "all"], arg(help="Which cameras of the scene.")] = "test",
     photos: OmitArgPrefixes[Photos] = PHOTOS,
     overwrite: Overwrite = False,
     device: Device = "auto",
 ) -> None:
-    """Render a model to images from the cameras of a scene.
+    """Render a model to images, from all around or from the cameras of a scene.
+
+    example: keyss render model.ply -o turn.webp
 
     example: keyss render secret.ply --cameras SCENE_B -o images/
     """
     check_exists(model, cameras)
     import keyss
+    from keyss.cli.tables import print_written
     from keyss.progress import waiting
     from keyss.runs.estimates import seconds_for
 
@@ -121,7 +140,7 @@ def render(
         images = keyss.render(
             model, cameras, split=split, **vars(photos), device=device, out=out, overwrite=overwrite
         )
-    print(f"{out}: {len(images)} image{'' if len(images) == 1 else 's'}")
+    print_written(out, f"{len(images)} image{'' if len(images) == 1 else 's'}")
 
 
 def info(
@@ -130,9 +149,14 @@ def info(
         arg(metavar="FILE", help="Model (- for stdin), scene folder or result folder."),
     ],
     *,
+    capacity: Annotated[
+        bool, switch("Also what the model can hide, in each format and channel; takes seconds.")
+    ] = False,
     json_: Annotated[bool, switch("Print JSON.", name="json")] = False,
 ) -> None:
     """Describe a model, a scene or a run.
+
+    example: keyss info cover.ply --capacity
 
     example: keyss info runs/hidden/publish/model.ply
     """
@@ -142,7 +166,7 @@ def info(
     from keyss.runs.estimates import seconds_for
 
     with waiting(f"reading {path.name}", seconds_for("info", path)):
-        found = describe(path)
+        found = describe(path, capacity=capacity)
     (print_json if json_ else print_info)(found)
 
 
@@ -159,22 +183,23 @@ def evaluate(
 
     Test views are photos held out of training or, for a model, renders of it. Each measurement is compared
     with its upper bound, plain 3DGS of as many Gaussians and training steps (`keyss hide --bound` fits it),
-    or with the plain model from which training started. The chance level is the PSNR of the stego model
-    itself to the secret; a wrong key should not exceed it.
+    or with the plain model from which training started. Keys of the method keyss steer a decoder: wrong ones
+    give renders too, which should show no more of the secret than the published model does.
 
     example: keyss evaluate runs/hidden --key-file key.txt
     """
     check_exists(run)
+    from keyss import progress
     from keyss.cli.tables import print_files, print_hiding
-    from keyss.progress import reporter
 
     measure = verb("evaluate")
     from keyss.fitting.image_metrics import HOW_TO_GET, MIN_SIZE
 
     metrics = measure(
-        run, keys_of_run(run, key_file), wrong_keys=wrong_keys, device=device, reporter=reporter()
+        run, keys_of_run(run, key_file), wrong_keys=wrong_keys, device=device, reporter=progress.reporter()
     )
-    print_hiding(metrics)
+    if progress.level >= 0:
+        print_hiding(metrics)
     if metrics.cover.lpips is None:
-        print(f"{HOW_TO_GET}; photos must have at least {MIN_SIZE} x {MIN_SIZE} pixels.")
+        progress.say(f"{HOW_TO_GET}; photos must have at least {MIN_SIZE} x {MIN_SIZE} pixels.")
     print_files(run, {"private/metrics.json": "the measurements"})

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import json
 import math
+import sys
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, TextIO
+from typing import TYPE_CHECKING
 
 from rich.console import Console as RichConsole
 from rich.table import Table
 from rich.text import Text
 
+from keyss import progress
+from keyss.files.inputs import is_standard
 from keyss.methods.method import role_of
 from keyss.progress import about, clock
 from keyss.runs.json_records import record_bytes
@@ -20,12 +23,13 @@ if TYPE_CHECKING:
     from keyss.api.convert import Conversion
     from keyss.fitting.image_metrics import ImageQuality
     from keyss.methods.method import Plan
-    from keyss.runs.describe import ModelInfo, RunInfo, SceneInfo
+    from keyss.runs.describe import InterruptedRun, ModelInfo, RunInfo, SceneInfo
     from keyss.runs.planning import Cost
     from keyss.runs.revealing import Verification
     from keyss.runs.run_records import FitMetrics, HideMetrics
 
 
+_UNCHANGED = 100.0  # dB; no pixel of 8 bits differs
 _HEADS = ("PSNR", "SSIM", "LPIPS", "bound", "loss", "start", "Gaussians", "plain", "steps")
 
 
@@ -54,7 +58,8 @@ def print_hiding(metrics: HideMetrics, *, brief: bool = False) -> None:
         units = {"capacity": "Gaussians", "capacity_bytes": "bytes"}
         found = {unit: metrics.details[name] for name, unit in units.items() if name in metrics.details}
         lines += [f"Capacity of the cover: {number:,} {unit}." for unit, number in found.items()]
-    print(*lines, sep="\n")
+    for line in lines:
+        print(line)
 
 
 def _scene_rows(metrics: HideMetrics) -> list[dict[str, str]]:
@@ -95,7 +100,7 @@ def print_plan(method: str, plan: Plan, cost: Cost) -> None:
     _print_columns(
         [
             ("method", method),
-            ("capacity", f"{plan.capacity:,} of the secrets' {plan.secret_gaussians:,} Gaussians"),
+            ("capacity", f"room for {plan.capacity:,} of the {plan.secret_gaussians:,} Gaussians to hide"),
             (
                 "published",
                 f"up to {plan.gaussians:,} Gaussians of SH degree {plan.sh_degree}, {plan.megabytes:,.1f} MB",
@@ -110,7 +115,7 @@ def print_plan(method: str, plan: Plan, cost: Cost) -> None:
 
 
 def _explanations(metrics: HideMetrics, names: Sequence[str], heads: Sequence[str]) -> list[str]:
-    """Lines on the columns of the table, wrong keys and chance."""
+    """Lines on the columns of the table and, for methods with a decoder, on wrong keys and chance."""
     meanings = {
         "LPIPS": "LPIPS with AlexNet: lower is better.",
         "plain": "Plain: Gaussians of the plain model.",
@@ -124,33 +129,30 @@ def _explanations(metrics: HideMetrics, names: Sequence[str], heads: Sequence[st
         highest = ", ".join(f"{each.max:.2f} to the {name}" for name, each in pairs)
         cover = f"{wrong.vs_cover.mean:.2f} to the cover, at least {wrong.vs_cover.min:.2f}"
         lines.append(f"PSNR of {wrong.keys} wrong keys: on average {cover}; at most {highest}.")
-    if metrics.chance_level:
         chance = ", ".join(f"{each:.2f}" for each in metrics.chance_level)
         lines.append(
-            f"Chance level: {chance}, the stego model's PSNR to the secret: the limit for wrong keys."
+            f"Chance level: {chance}, the published model's PSNR to the secret: the limit for wrong keys."
         )
     return lines
 
 
 def _lines_on_files(metrics: HideMetrics, names: Sequence[str]) -> list[str]:
-    """A line on the published file, and one on each secret that lost something."""
-    reached = (f"{name} {each.psnr:.1f}" for name, each in zip(names, metrics.against_plain, strict=True))
-    lines = [f"Revealed from the published file, PSNR to the plain models: {', '.join(reached)} dB."]
+    """A line on each secret that lost something."""
+    lines = []
     kept = zip(
         names[1:],
         metrics.secret_gaussians,
         metrics.baseline.gaussians[1:],
         metrics.secret_degrees,
-        metrics.against_plain[1:],
         strict=True,
     )
-    for name, count, before, (degree, full), each in kept:
+    for name, count, before, (degree, full) in kept:
         if degree == full and before in (None, count):
             continue
         of = f" of {before:,}" if before and before >= count else ""
         cut = f", SH degree {degree} of {full}" if degree < full else ""
         subject = f"The {name}" if len(names) == 2 else name.capitalize()
-        lines.append(f"{subject} kept {count:,}{of} Gaussians{cut}, {each.psnr:.1f} dB.")
+        lines.append(f"{subject} kept {count:,}{of} Gaussians{cut}.")
     return lines
 
 
@@ -161,13 +163,15 @@ def print_fit(metrics: FitMetrics) -> None:
     print_table((*quality, "Gaussians", "iterations", "seconds"), [(*quality.values(), *sizes)], texts=0)
 
 
-def print_info(found: RunInfo | ModelInfo | SceneInfo) -> None:
+def print_info(found: RunInfo | InterruptedRun | ModelInfo | SceneInfo) -> None:
     """Print the description of `keyss info`."""
     from keyss.runs.describe import RunInfo
 
     if not isinstance(found, RunInfo):
         facts = {name: value for name, value in vars(found).items() if value is not None}
-        _print_columns([(name.replace("_", " "), _text(value)) for name, value in facts.items()])
+        capacity = facts.pop("capacity", ())
+        rows = [(name.replace("_", " "), _text(value)) for name, value in facts.items()]
+        _print_columns([*rows, *(("capacity", each) for each in capacity)])
         return
     from keyss.runs.run_records import HideMetrics
 
@@ -183,32 +187,39 @@ def print_info(found: RunInfo | ModelInfo | SceneInfo) -> None:
 
 def print_verification(found: Verification) -> None:
     """Print the findings of `keyss verify`."""
-    model, secret, what = found.model, found.secret, "not checked, as no key was given"
+    model, rows = found.model, []
     problems = "; ".join(model.problems) or "sound"
-    if secret is not None:
+    for number, secret in enumerate(found.secrets, 1):
         of = f" of {secret.hidden:,}" if secret.hidden else ""
         what = f"{secret.found:,}{of} {secret.unit}: {'; '.join(secret.problems) or 'complete'}"
+        rows.append(("secret" if len(found.secrets) == 1 else f"secret of key {number}", what))
     about_model = f"{model.gaussians:,} Gaussians of SH degree {model.sh_degree}: {problems}"
-    _print_columns([("model", about_model), ("secret", what)])
+    _print_columns([("model", about_model), *(rows or [("secret", "not checked, as no key was given")])])
 
 
-def print_conversion(out: str, found: Conversion, *, dry_run: bool, file: TextIO) -> None:
+def print_conversion(out: Path, found: Conversion, *, dry_run: bool) -> None:
     """Print the cost of a conversion: size, PSNR of renders, and the parts of secrets that are left."""
+    file = sys.stderr if is_standard(out) else sys.stdout
+    if progress.level < 0 and not dry_run:
+        print(out, file=file)
+        return
     was = "" if found.bytes_before is None else f", {_size(found.bytes_before)} before"
-    renders = "renders unchanged" if found.psnr >= 120 else f"renders at {found.psnr:.1f} dB PSNR"
+    renders = "renders unchanged" if found.psnr >= _UNCHANGED else f"renders at {found.psnr:.1f} dB PSNR"
     if math.isnan(found.psnr):
         renders = "renders are empty: the model is invisible"
     print(f"{out}: {len(found.gaussians):,} Gaussians, {_size(found.bytes_after)}{was}, {renders}", file=file)
-    if out.lower().endswith(".spz"):
+    if out.name.lower().endswith(".spz"):
         print("y is up in an .spz: programs that do not turn it show it upside down", file=file)
     for number, secret in enumerate(found.secrets, 1):
         which = "the secret" if len(found.secrets) == 1 else f"the secret of key {number}"
         state = "survives" if secret.kept else f"is lost: {secret.after:,} {secret.unit} are left"
         print(f"{which}, {secret.before:,} {secret.unit}, {state}", file=file)
-    from keyss.channels import AppendedReader  # imports torch
-
-    if not found.secrets and not found.keeps_low_bits and AppendedReader.of(found.gaussians) is None:
-        print("a secret in low bits would be lost; --key-file checks that a secret survives", file=file)
+    if not found.secrets and not found.keeps_low_bits:
+        state = "would be" if dry_run else "is"
+        print(
+            f"what was hidden with --publish as-is, if anything, {state} lost; --key-file checks a secret",
+            file=file,
+        )
     if dry_run:
         print("dry run: nothing was written", file=file)
 
@@ -224,7 +235,19 @@ def _size(count: int) -> str:
 
 def print_files(folder: Path, names: Mapping[str, str]) -> None:
     """Print paths and descriptions of the results that exist."""
-    _print_columns([(str(folder / name), text) for name, text in names.items() if (folder / name).exists()])
+    found = [(str(folder / name), text) for name, text in names.items() if (folder / name).exists()]
+    if progress.level < 0:
+        print(*(path for path, _ in found), sep="\n")
+    else:
+        _print_columns(found)
+
+
+def print_written(path: Path, text: str) -> None:
+    """Print the path and the description of one result, to the standard error stream if it went to stdout."""
+    print(
+        path if progress.level < 0 else f"{path}: {text}",
+        file=sys.stderr if is_standard(path) else sys.stdout,
+    )
 
 
 def _print_columns(rows: Sequence[tuple[str, str]]) -> None:

@@ -99,6 +99,8 @@ def check_output_file(path: Path | str, overwrite: bool) -> Path:
     path = Path(path)
     if path.is_dir():
         raise OutputError(f"{path} is a folder: name the file to write")
+    if path.is_symlink() and not path.exists():
+        raise OutputError(f"{path} is a link to {os.readlink(path)}, which does not exist: remove it first")
     if path.exists() and not overwrite:
         raise OutputError(f"{path} exists: choose another name, or `overwrite=True` to replace it")
     if not path.parent.is_dir():

@@ -14,7 +14,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from keyss.core.errors import BackendError, KeyssWarning
+from keyss.core.errors import BackendError, InputError, KeyssWarning
 from keyss.files.inputs import open_input
 
 CONVERT = "convert it to .ply first, e.g. with `splat-transform IN OUT.ply`"
@@ -28,6 +28,7 @@ _CHECKPOINT = (
 )
 _UNPACK = "unpack it, and give the folder or the model inside"
 START_BYTES = 256  # enough to identify a file
+_META, _MAX_META_BYTES = "meta.json", 1 << 20  # of an unpacked SOG
 _ZIP, _GZIP = b"PK\x03\x04", b"\x1f\x8b"
 _POSES = "a scene is a folder of photos with their poses, e.g. from COLMAP"
 
@@ -66,7 +67,6 @@ _KINDS = (
     _Kind("a glTF file", _MODEL, (".glb",), (b"glTF",)),
     _Kind("a .ksplat model", CONVERT, (".ksplat",)),
     _Kind("an LCC model", CONVERT, (".lcc", ".lcc2")),
-    _Kind("an unpacked SOG model", CONVERT, ("meta.json",)),
     _Kind("a glTF file with its data beside it", "export a .glb from the program that made it", (".gltf",)),
     _Kind(
         "a checkpoint of a training",
@@ -135,14 +135,30 @@ def _kind_in_zip(start: bytes) -> _Kind | None:
     return next((kind for kind in _KINDS if kind.member and member.endswith(kind.member)), None)
 
 
+def is_unpacked_sog(path: Path) -> bool:
+    """True for the meta.json of a SOG whose images lie beside it, and for its folder."""
+    meta = path if path.name == _META else path / _META
+    try:
+        with open_input(meta) as file:
+            return b'"means"' in file.read(_MAX_META_BYTES)
+    except InputError:
+        return False
+
+
 def is_training(folder: Path | str) -> bool:
     """True for a training's output folder that contains a model."""
     return _latest_model(Path(folder)) is not None
 
 
 def model_file(path: Path | str) -> Path:
-    """The latest model in a training's output folder, with a KeyssWarning; any other path unchanged."""
+    """The file to read at a path.
+
+    The latest model in a training's output folder, with a KeyssWarning; the meta.json of an unpacked SOG; any
+    other path unchanged.
+    """
     path = Path(path)
+    if path.is_dir() and is_unpacked_sog(path):
+        return path / _META
     if found := _latest_model(path):
         warnings.warn(
             f"{path}: output of a training; its model is {found.relative_to(path)}",
@@ -156,8 +172,7 @@ def identify_folder(folder: Path) -> str | None:
     """`identify_file` for a folder that is neither a scene nor a model; None if unknown."""
     if any(True for each in _CHECKPOINTS for _ in folder.glob(each)):
         return f"a folder of checkpoints of a training; {_CHECKPOINT}"
-    unpacked = folder / "meta.json"
-    return identify_file(unpacked) if unpacked.is_file() else None
+    return None
 
 
 def _latest_model(folder: Path) -> Path | None:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -120,6 +121,14 @@ def png_names(cameras: Iterable[Camera]) -> list[str]:
             name = f"{stem}-{numbers[stem]}.png"
         names[name] = None
     return list(names)
+
+
+def animation_bytes(images: Sequence[Tensor], seconds: float = 6.0) -> bytes:
+    """An endless animation of uint8 images [H, W, 3], as WebP."""
+    first, *others = (Image.fromarray(image.numpy()) for image in images)
+    file, duration = io.BytesIO(), round(1000 * seconds / len(images))
+    first.save(file, "WEBP", save_all=True, append_images=others, duration=duration, loop=0, quality=80)
+    return file.getvalue()
 
 
 def png_bytes(image: Tensor) -> bytes:

@@ -22,9 +22,11 @@ from keyss.files.file_kinds import (
     identify_folder,
     is_foreign_archive,
     is_training,
+    is_unpacked_sog,
     model_file,
 )
 from keyss.files.formats import ply
+from keyss.files.formats.sog import pack_unpacked
 from keyss.files.inputs import (
     MAX_BYTES,
     check_standard_output,
@@ -88,14 +90,15 @@ def is_model_path(path: Path | str) -> bool:
 
 
 def is_model_source(path: Path | str) -> bool:
-    """True if `read_model` accepts a path: a model suffix, or a training's output folder."""
-    return is_model_path(path) or is_training(path)
+    """True if `read_model` accepts a path: a model suffix, an unpacked SOG, or a training's output folder."""
+    return is_model_path(path) or is_unpacked_sog(Path(path)) or is_training(path)
 
 
 def read_model(path: Path | str) -> Gaussians:
     """The model at `path`, on the CPU; "-" is standard input. The first bytes identify the format.
 
-    In the output folder of another program's training, the latest model, with a KeyssWarning. Raises
+    Of an unpacked SOG, `path` is the folder or its meta.json. In the output folder of another program's
+    training, it is the latest model, with a KeyssWarning. Raises
     InputError for a file that is missing, of unknown format, named like another format, or not a complete
     and finite model.
     """
@@ -108,6 +111,8 @@ def read_model(path: Path | str) -> Gaussians:
     if not os.path.isfile(path):
         found = "found neither a file nor a folder" if os.path.exists(path) else "but there is no such file"
         raise InputError(f"{path}: expected a 3DGS model ({known_suffixes()}), {found}")
+    if is_unpacked_sog(path):
+        return model_of_bytes(path.with_suffix(".sog"), pack_unpacked(path))
     with open_input(path) as file:
         return _read(file, path.name)
 

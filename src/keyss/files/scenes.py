@@ -21,7 +21,7 @@ from keyss.files.colmap import MODEL_PLACES, colmap_models, read_colmap
 from keyss.files.file_kinds import identify_file, identify_folder
 from keyss.files.images import downscale, is_rotated_by_exif, probe_image, read_image, read_mask
 from keyss.files.lens import Lens, Undistortion, undistortion
-from keyss.files.scene_layout import Photo, SceneLayout
+from keyss.files.scene_layout import Photo, SceneLayout, leave_out
 from keyss.files.transforms import read_blender, read_nerfstudio
 from keyss.kernels.memory import available_memory
 
@@ -47,8 +47,8 @@ def load_scene(
     axis; photos are never enlarged.
     `background`: RGB in [0, 1], also under transparent pixels; by default white if any photo has an alpha
     channel, else black.
-    `skip_missing`: leaves out photos that are missing on disk or have no usable camera, with a KeyssWarning,
-    before test views are chosen.
+    `skip_missing`: leaves out photos that are missing on disk or have no usable camera, before test views are
+    chosen, and damaged photos, with a KeyssWarning.
 
     A scene a thousand times farther from the origin than its extent, such as a georeferenced one, is moved to
     the origin, with a KeyssWarning: see `Scene.origin`.
@@ -75,7 +75,7 @@ def load_scene(
         if not part:
             raise InputError(f"{folder}: expected at least one image {purpose}, found none")
 
-    origin, extent = _origin_and_extent([photo.viewmat for photo in layout.train])
+    origin, extent = origin_and_extent([photo.viewmat for photo in layout.train])
     if origin.any():
         where = ", ".join(f"{each:.9g}" for each in origin)
         warnings.warn(
@@ -85,19 +85,36 @@ def load_scene(
             stacklevel=2,
         )
     near = NEAR * min(1.0, extent / ORDINARY_EXTENT)
-    photos = [replace(each, viewmat=_recentre(each.viewmat, origin)) for each in layout.train + layout.test]
-    probed = [probe_image(photo.path) for photo in photos]  # finds missing photos before decoding any
-    _check_memory(folder, [each[:2] for each in probed], width)
-    photos = _fit_lenses(folder, photos, [(width, height) for width, height, _ in probed])
+    photos = [replace(each, viewmat=recentre(each.viewmat, origin)) for each in layout.train + layout.test]
+    probed, damaged = [], []
+    for photo in photos:  # finds missing photos before decoding any
+        try:
+            probed.append((photo, probe_image(photo.path)))
+        except InputError:
+            if not skip_missing:
+                raise
+            damaged.append(photo.name)
+    sizes = [(width, height) for _, (width, height, _) in probed]
+    _check_memory(folder, sizes, width)
+    photos = _fit_lenses(folder, [photo for photo, _ in probed], sizes)
     if behind is None:
-        behind = torch.full((3,), float(any(transparent for *_, transparent in probed)))
+        behind = torch.full((3,), float(any(transparent for _, (*_, transparent) in probed)))
     # Most scenes have one lens, and a map is as large as a photo.
     undistortions = functools.lru_cache(maxsize=2)(undistortion)
     with ThreadPoolExecutor(max_workers=min(8, os.cpu_count() or 1)) as pool:
         decode = functools.partial(
             _load_view, width=width, background=behind.numpy(), undistortions=undistortions, near=near
         )
-        views = tuple(pool.map(decode, photos))
+        views = []
+        for photo, pending in [(photo, pool.submit(decode, photo)) for photo in photos]:
+            try:
+                views.append(pending.result())
+            except InputError:
+                if not skip_missing:
+                    raise
+                damaged.append(photo.name)
+    leave_out(folder, len(layout.train + layout.test), "cannot be read", damaged, skip_missing)
+    held_out = {photo.name for photo in layout.test}
     if shares := [float((~view.mask).float().mean()) for view in views if view.mask is not None]:
         warnings.warn(
             f"{folder}: {len(shares):,} of {len(views):,} photos have masks, which leave "
@@ -107,8 +124,8 @@ def load_scene(
         )
     return Scene(
         name=folder.resolve().name,
-        train=views[: len(layout.train)],
-        test=views[len(layout.train) :],
+        train=tuple(view for view in views if view.camera.name not in held_out),
+        test=tuple(view for view in views if view.camera.name in held_out),
         points=torch.from_numpy((layout.points.xyz - origin).astype(np.float32)),
         colors=torch.from_numpy(layout.points.rgb),
         background=behind,
@@ -129,7 +146,7 @@ def _check_memory(folder: Path, sizes: Sequence[tuple[int, int]], width: int | N
         )
 
 
-def _origin_and_extent(viewmats: Sequence[Doubles]) -> tuple[Doubles, float]:
+def origin_and_extent(viewmats: Sequence[Doubles]) -> tuple[Doubles, float]:
     """The origin [3] of the scene's frame, 0 unless the cameras [4, 4] are far from it, and their extent."""
     centres = np.array([-each[:3, :3].T @ each[:3, 3] for each in viewmats])
     centre = centres.mean(axis=0)
@@ -142,7 +159,7 @@ def _origin_and_extent(viewmats: Sequence[Doubles]) -> tuple[Doubles, float]:
     return np.rint(centre / step) * step, extent
 
 
-def _recentre(viewmat: Doubles, origin: Doubles) -> Doubles:
+def recentre(viewmat: Doubles, origin: Doubles) -> Doubles:
     """The camera [4, 4] in the frame at `origin`."""
     recentred = viewmat.copy()
     recentred[:3, 3] += viewmat[:3, :3] @ origin

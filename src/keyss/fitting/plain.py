@@ -82,7 +82,9 @@ class PlainRun(TrainingRun):
         return to_gaussians(self.parameters).detach()
 
     def evaluate(self) -> dict[str, float]:
-        return {"PSNR": mean_psnr(self.gaussians(), self.watched, self.background)}
+        return {
+            f"PSNR of {len(self.watched)} views": mean_psnr(self.gaussians(), self.watched, self.background)
+        }
 
 
 def _target(view: View, size: tuple[int, int], device: torch.device) -> Target:

@@ -6,11 +6,14 @@ import math
 import os
 import secrets
 import string
+import sys
 import unicodedata
 import warnings
+from contextlib import nullcontext
 from pathlib import Path
 
 from keyss.core.errors import InputError, KeyssWarning, OutputError, UsageError
+from keyss.files.inputs import is_standard
 
 MAX_KEY_BYTES = 4096
 _TOO_LONG = f"the key is longer than {MAX_KEY_BYTES} bytes"
@@ -47,10 +50,10 @@ def normalized_key(text: str) -> str:
 
 
 def read_key(path: str | Path) -> str:
-    """Read a key file like the command line. Raises InputError for a file without a key."""
+    """Read a key file, or "-" for standard input. Raises InputError for a file without a key."""
     path = Path(path)
     try:
-        with path.open("rb") as file:
+        with nullcontext(sys.stdin.buffer) if is_standard(path) else path.open("rb") as file:
             data = file.read(2 * MAX_KEY_BYTES)
     except OSError as error:
         raise InputError(f"{path}: the key file cannot be read: {error.strerror}") from error

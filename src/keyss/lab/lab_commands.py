@@ -70,9 +70,9 @@ def audit(
     if dry_run:
         _print_audit_forecast(run, controls, only, device)
         return
+    from keyss import progress
     from keyss.cli.keys import keys_of_run
     from keyss.cli.tables import print_files
-    from keyss.progress import reporter
 
     found = measure(
         run,
@@ -84,9 +84,10 @@ def audit(
         device=device,
         overwrite=overwrite,
         resume=resume,
-        reporter=reporter(),
+        reporter=progress.reporter(),
     )
-    _print_verdicts(found)
+    if progress.level >= 0:
+        _print_verdicts(found)
     print_files(
         run,
         {
@@ -122,11 +123,11 @@ def compare(
     """
     check_exists(cover, secret)
     run = verb("compare")
+    from keyss import progress
     from keyss.cli.tables import print_files, print_table
     from keyss.core.errors import InputError
     from keyss.lab.many import Forecast
     from keyss.lab.many.comparison import comparison_notes, comparison_tables
-    from keyss.progress import reporter
 
     given = {"iterations": iterations, "max_gaussians": max_gaussians, "width": width}
     budget = {name: QUICK[name] if value is None and quick else value for name, value in given.items()}
@@ -139,20 +140,20 @@ def compare(
         device=device,
         out=out,
         dry_run=dry_run,
-        reporter=reporter(),
+        reporter=progress.reporter(),
         **budget,
     )
     if isinstance(comparison, Forecast):
         _print_forecast(comparison)
         return
-    for heads, *rows in comparison_tables(comparison):
+    for heads, *rows in comparison_tables(comparison) if progress.level >= 0 else ():
         print_table(heads, rows)
     described = {
         "comparison.png": "a row for each method: cover, secret, error; it shows the secret",
         **_scene_tables("comparison"),
         "comparison.json": "all numbers, for programs",
     }
-    print(*comparison_notes(comparison), sep="\n")
+    progress.say(*comparison_notes(comparison))
     print_files(out, described)
     if named and (failed := [row.name for row in comparison.methods if row.error]):
         raise InputError(f"not possible: {', '.join(failed)}")
@@ -205,11 +206,11 @@ def reproduce(
     example: keyss reproduce multi 360/* --full -o runs/paper-full
     """
     run = verb("reproduce")
+    from keyss import progress
     from keyss.cli.tables import print_files, print_table
     from keyss.core.errors import InputError
     from keyss.lab.many import Forecast
     from keyss.lab.many.reproduction import reproduction_notes, reproduction_rows
-    from keyss.progress import reporter
 
     reproduction = run(
         table,
@@ -223,20 +224,21 @@ def reproduce(
         device=device,
         out=out,
         dry_run=dry_run,
-        reporter=reporter(),
+        reporter=progress.reporter(),
     )
     if isinstance(reproduction, Forecast):
         _print_forecast(reproduction)
         return
     heads, *rows = reproduction_rows(reproduction)
-    print_table(heads, rows)
+    if progress.level >= 0:
+        print_table(heads, rows)
     means = f"Published and measured figures, on test views; means over {len(reproduction.pairs)} pair(s)."
     described = {
         **_scene_tables(table),
         f"{table}.json": "all figures, for programs",
         "trials": "the runs, which other tables share",
     }
-    print(*reproduction_notes(reproduction), means, sep="\n")
+    progress.say(*reproduction_notes(reproduction), means)
     print_files(out, described)
     if reproduction.failures:
         raise InputError(f"{len(reproduction.failures)} run(s) failed")
@@ -263,12 +265,12 @@ def sweep(
     example: keyss sweep sweep.yaml -o runs/sweep --dry-run
     """
     run = verb("sweep")
+    from keyss import progress
     from keyss.cli.tables import print_files
     from keyss.core.errors import InputError
     from keyss.lab.many import Forecast
-    from keyss.progress import reporter
 
-    outcomes = run(spec, out, ray=ray, cores=cores, dry_run=dry_run, reporter=reporter())
+    outcomes = run(spec, out, ray=ray, cores=cores, dry_run=dry_run, reporter=progress.reporter())
     if isinstance(outcomes, Forecast):
         _print_forecast(outcomes)
         return
@@ -280,7 +282,7 @@ def sweep(
     }
     print_files(out, described)
     failed = [each for each in outcomes if each.error]
-    print(f"{len(outcomes) - len(failed)} of {len(outcomes)} trials are done")
+    progress.say(f"{len(outcomes) - len(failed)} of {len(outcomes)} trials are done")
     for each in failed:
         print(f"failed: {each.name}: {each.error}")
     if failed:

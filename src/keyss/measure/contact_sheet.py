@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import math
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 from PIL import Image, ImageDraw, ImageFont
 
@@ -14,7 +15,8 @@ from keyss.core.arrays import Bytes
 def contact_sheet(heads: Sequence[str], rows: Mapping[str, Sequence[Bytes]], cell: int = 200) -> bytes:
     """A PNG file with rows of pictures [H, W, 3].
 
-    Pictures are `cell` pixels high, with names on the left and `heads` above.
+    Pictures are `cell` pixels high, with names on the left and `heads` above, wrapped to the width of their
+    column.
     """
     gap, font = cell // 40, ImageFont.load_default(cell // 14)
     scaled = [
@@ -24,20 +26,39 @@ def contact_sheet(heads: Sequence[str], rows: Mapping[str, Sequence[Bytes]], cel
         ]
         for pictures in rows.values()
     ]
-    lines = [line for head in heads for line in head.split("\n")]
     left = math.ceil(max(map(font.getlength, rows))) + 2 * gap
-    top = gap + (1 + max(head.count("\n") for head in heads)) * (cell // 8)
-    widest = max(math.ceil(font.getlength(line)) for line in lines)
-    width = gap + max(widest, *(each.width for pictures in scaled for each in pictures))
-    sheet = Image.new("RGB", (left + width * len(heads), top + (cell + gap) * len(rows)), "white")
+    widths = [
+        max(*(math.ceil(font.getlength(word)) for word in head.split()), *(each.width for each in pictures))
+        for head, pictures in zip(heads, zip(*scaled, strict=True), strict=True)
+    ]
+    wrapped = [_wrapped(head, width, font) for head, width in zip(heads, widths, strict=True)]
+    places = [left + sum(widths[:column]) + gap * column for column in range(len(heads))]
+    top = gap + (1 + max(head.count("\n") for head in wrapped)) * (cell // 8)
+    size = (left + sum(widths) + gap * len(heads), top + (cell + gap) * len(rows))
+    sheet = Image.new("RGB", size, "white")
     draw = ImageDraw.Draw(sheet)
-    for column, head in enumerate(heads):
-        draw.multiline_text((left + width * column, gap), head, fill=(20, 20, 20), font=font)
+    for place, head in zip(places, wrapped, strict=True):
+        draw.multiline_text((place, gap), head, fill=(20, 20, 20), font=font)
     for row, (name, pictures) in enumerate(zip(rows, scaled, strict=True)):
         y = top + (cell + gap) * row
         draw.text((gap, y + gap), name, fill=(20, 20, 20), font=font)
-        for column, picture in enumerate(pictures):
-            sheet.paste(picture, (left + width * column, y))
+        for place, picture in zip(places, pictures, strict=True):
+            sheet.paste(picture, (place, y))
     file = io.BytesIO()
     sheet.save(file, "PNG", optimize=True)
     return file.getvalue()
+
+
+def _wrapped(text: str, width: int, font: Any) -> str:
+    """`text` with line breaks between words, so that lines are at most `width` pixels wide."""
+    lines = []
+    for paragraph in text.split("\n"):
+        line = ""
+        for word in paragraph.split():
+            longer = f"{line} {word}".strip()
+            if line and font.getlength(longer) > width:
+                lines.append(line)
+                longer = word
+            line = longer
+        lines.append(line)
+    return "\n".join(lines)

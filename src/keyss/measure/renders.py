@@ -7,9 +7,11 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from keyss.core import Gaussians, Scene, View
+from keyss.core import Camera, Gaussians, Scene, View
+from keyss.core.arrays import Bytes
 from keyss.files.images import png_names
 from keyss.fitting.image_metrics import subsample_views
+from keyss.measure.contact_sheet import contact_sheet
 from keyss.rendering import render
 
 
@@ -19,11 +21,24 @@ def select_views(views: Sequence[View]) -> list[View]:
 
 
 @torch.no_grad()
-def renders_of(model: Gaussians, scene: Scene, views: Sequence[View]) -> list[tuple[str, Tensor]]:
-    """Names and uint8 renders [H, W, 3], on the CPU, of a model from the cameras of a scene's views."""
-    background, renders = scene.background.to(model.device), []
-    names = png_names(view.camera for view in views)
-    for name, view in zip(names, views, strict=True):
-        image = render(model, view.camera, background).clamp(0, 1)
+def renders_of(model: Gaussians, cameras: Sequence[Camera], background: Tensor) -> list[tuple[str, Tensor]]:
+    """Names and uint8 renders [H, W, 3], on the CPU, of a model over a background [3]."""
+    background, renders = background.to(model.device), []
+    for name, camera in zip(png_names(cameras), cameras, strict=True):
+        image = render(model, camera, background).clamp(0, 1)
         renders.append((name, (image * 255).round().to(torch.uint8).cpu()))
     return renders
+
+
+def sheet_of(columns: Sequence[tuple[str, Scene, Gaussians]], views: int = 3) -> bytes:
+    """A PNG of test views: for each column's name, scene and model, the scene's image beside the render."""
+    heads: list[str] = []
+    pictures: list[list[Bytes]] = []
+    for name, scene, model in columns:
+        shown = subsample_views(scene.test, views)
+        renders = renders_of(model, [view.camera for view in shown], scene.background)
+        heads += [name, f"{name}, {'published' if not heads else 'revealed'}"]
+        pictures += [[view.image.numpy() for view in shown], [image.numpy() for _, image in renders]]
+    count = min(map(len, pictures))
+    rows = {str(row + 1): [each[row] for each in pictures] for row in range(count)}
+    return contact_sheet(heads, rows)

@@ -39,7 +39,7 @@ METHODS = {
         "keyss.methods.carry.carried_secret:CarriedSecret.of",
     ),
     "keyss": Modules(
-        "train one model and a decoder for all keys jointly, as the paper does",
+        "one model and a decoder for all keys, trained jointly",
         "keyss.methods.keyss.keyss_options:KeyssOptions",
         "keyss.methods.keyss.keyss_method:METHOD",
         "keyss.methods.keyss.keyss_method:KeyssSecret.of",

@@ -1,7 +1,7 @@
+from .framing import Frame as Frame, frame_of as frame_of
 from .orbit import (
     VIEWS as VIEWS,
     Viewpoints as Viewpoints,
-    middle_and_radius as middle_and_radius,
     psnr_between as psnr_between,
     scene_of_model as scene_of_model,
 )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import torch
@@ -15,6 +15,7 @@ from keyss.core.gaussians import SH_C0, Gaussians
 from keyss.core.scene import NEAR, ORDINARY_EXTENT, Camera, Scene, View, checked_background
 from keyss.files.models import is_model_source
 from keyss.kernels.memory import release
+from keyss.rendering.framing import Frame, frame_of
 from keyss.rendering.rasterize import MAX_SIDE
 from keyss.rendering.view import render
 
@@ -24,10 +25,9 @@ FIELD_OF_VIEW = 50.0  # degrees
 MAX_ELEVATION = 60.0  # degrees, up and down
 # Cycle of camera distances, relative to the one from which the whole model is visible.
 DISTANCES = (1.0, 0.75, 1.0, 0.5)
+TURNTABLE, _HEIGHT = 60, 0.25  # views; sine of their elevation
 TEST_EVERY, _LARGE = 12, 500_000  # views; minimum Gaussians of a model with slow renders
-_QUANTILE, _MAX_RATIO = 0.95, 10.0  # weights are clamped to this multiple of this quantile
 _ORBIT_VIEWS, _SCENE_VIEWS, _SIZE = 4, 8, 256  # for comparing models
-SAMPLE = 200_000  # maximum Gaussians for computing `middle_and_radius`
 
 
 def is_model(source: str | Path | Gaussians) -> bool:
@@ -50,9 +50,7 @@ def scene_of_model(
     `train_pictures`, only test views are rendered; other images are [0, 0, 3]. Raises UsageError for a `size`
     or `background` out of range.
     """
-    size = IMAGE_SIZE if size is None else size
-    if not 1 <= size <= MAX_SIDE:
-        raise UsageError(f"expected a width of 1 to {MAX_SIDE:,} pixels for renders of a model, got {size:,}")
+    size = checked_size(size)
     background = torch.zeros(3) if background is None else checked_background(background)
     views, every = [], TEST_EVERY if len(model) < _LARGE else VIEWS // 2
     for index, camera in enumerate(orbit(model, size)):
@@ -74,61 +72,65 @@ def scene_of_model(
     )
 
 
-def orbit(model: Gaussians, size: int, views: int = VIEWS) -> list[Camera]:
-    """Cameras on a spiral over a sphere around a model, with images of size x size pixels.
+def from_above(scene: Scene) -> Scene:
+    """A scene of renders of a model with only those test views that look down."""
+    return replace(scene, test=scene.test[: -(-len(scene.test) // 2)])
 
-    All look at the middle of the visible model. Up is -y, as in COLMAP's scenes and in viewers.
-    """
-    middle, radius = middle_and_radius(model)
-    tangent = math.tan(math.radians(FIELD_OF_VIEW / 2))
-    K = torch.tensor([[size / 2 / tangent, 0, size / 2], [0, size / 2 / tangent, size / 2], [0, 0, 1]])
-    reach = radius / math.sin(math.radians(FIELD_OF_VIEW / 2))
+
+def checked_size(size: int | None) -> int:
+    """The width and height of renders of a model in pixels. Raises UsageError."""
+    size = IMAGE_SIZE if size is None else size
+    if not 1 <= size <= MAX_SIDE:
+        raise UsageError(f"expected a width of 1 to {MAX_SIDE:,} pixels for renders of a model, got {size:,}")
+    return size
+
+
+def orbit(model: Gaussians, size: int, views: int = VIEWS) -> list[Camera]:
+    """Cameras on a spiral over a sphere around the subject of a model, with images of size x size pixels."""
+    frame = frame_of(model)
     limit = math.sin(math.radians(MAX_ELEVATION))
-    near = NEAR * min(1.0, radius / ORDINARY_EXTENT)
     cameras = []
     for index in range(views):
         # A Fibonacci lattice: equal steps of the sine of the elevation, golden angles of the azimuth.
         height = limit * (1 - 2 * (index + 0.5) / views)
         azimuth = index * math.pi * (3 - math.sqrt(5))
-        flat = math.sqrt(1 - height * height)
-        outward = torch.tensor([flat * math.cos(azimuth), -height, flat * math.sin(azimuth)])
-        pose = look_at(middle + outward * reach * DISTANCES[index % len(DISTANCES)], -outward)
-        cameras.append(Camera(pose, K, size, size, f"orbit_{index:03d}.png", near))
+        distance = DISTANCES[index % len(DISTANCES)]
+        cameras.append(_around(frame, height, azimuth, distance, size, f"orbit_{index:03d}.png"))
     return cameras
 
 
-def middle_and_radius(model: Gaussians) -> tuple[Tensor, float]:
-    """The middle [3] and the radius of the visible part of a model, in world units.
+def turntable(model: Gaussians, size: int, views: int = TURNTABLE) -> list[Camera]:
+    """Cameras on a level circle a little above the subject of a model, with images of size x size pixels."""
+    frame = frame_of(model)
+    return [
+        _around(frame, _HEIGHT, 2 * math.pi * index / views, 1.0, size, f"{index:03d}.png")
+        for index in range(views)
+    ]
 
-    Gaussians are weighted by opacity and size, clamped to ten times that of a large one. The radius contains
-    90 % of the weight, but is at most three times the radius of 50 %: it covers an object, and the middle of
-    an unbounded scene. Large models are subsampled.
+
+def _around(frame: Frame, height: float, azimuth: float, distance: float, size: int, name: str) -> Camera:
+    """A camera that looks at the middle of a frame.
+
+    `height`: sine of the elevation; `distance`: relative to the one from which the whole sphere is visible.
     """
-    model = model[:: max(1, len(model) // SAMPLE)]
-    scales = model.scales.sort(dim=1).values
-    weight = (model.opacities * scales[:, 1] * scales[:, 2]).cpu().nan_to_num(0.0)
-    weight = weight.clamp_max(_MAX_RATIO * _quantile(weight, torch.ones(len(model)), _QUANTILE))
-    means = model.means.cpu()
-    middle = torch.stack([_quantile(means[:, axis], weight, 0.5) for axis in range(3)])
-    distance = (means - middle).norm(dim=1)
-    half, nine_tenths = (float(_quantile(distance, weight, share)) for share in (0.5, 0.9))
-    return middle, max(min(nine_tenths, 3 * half), 1e-6)
+    up = torch.from_numpy(frame.up).float()
+    front = torch.tensor([0.0, 0.0, -1.0] if abs(up[1]) > 0.5 else [0.0, -1.0, 0.0])
+    level = torch.nn.functional.normalize(front - (front @ up) * up, dim=0)
+    around = math.cos(azimuth) * level + math.sin(azimuth) * torch.linalg.cross(up, level)
+    outward = math.sqrt(1 - height * height) * around + height * up
+    half = math.radians(FIELD_OF_VIEW / 2)
+    position = torch.from_numpy(frame.middle).float() + outward * frame.radius / math.sin(half) * distance
+    focal = size / 2 / math.tan(half)
+    K = torch.tensor([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1]])
+    near = NEAR * min(1.0, frame.radius / ORDINARY_EXTENT)
+    return Camera(look_at(position, -outward, up), K, size, size, name, near)
 
 
-def _quantile(values: Tensor, weight: Tensor, share: float) -> Tensor:
-    values, order = values.sort()
-    total = weight[order].double().cumsum(0)
-    return values[int(torch.searchsorted(total, share * total[-1]).clamp_max(len(values) - 1))]
-
-
-def look_at(position: Tensor, forward: Tensor) -> Tensor:
-    """[4, 4] world to camera, from `position` along the unit vector `forward`, with -y up."""
-    up = torch.tensor([0.0, -1.0, 0.0])
-    right = torch.linalg.cross(-up, forward)
-    right = right / right.norm()
-    down = torch.linalg.cross(forward, right)
+def look_at(position: Tensor, forward: Tensor, up: Tensor) -> Tensor:
+    """[4, 4] world to camera, from `position` along the unit vector `forward`."""
+    right = torch.nn.functional.normalize(torch.linalg.cross(forward, up), dim=0)
     viewmat = torch.eye(4)
-    viewmat[:3, :3] = torch.stack([right, down, forward])
+    viewmat[:3, :3] = torch.stack([right, torch.linalg.cross(forward, right), forward])
     viewmat[:3, 3] = -viewmat[:3, :3] @ position
     return viewmat
 

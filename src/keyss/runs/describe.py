@@ -5,15 +5,19 @@ Imports for a plain .ply neither torch nor what only folders need, which takes a
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections import Counter
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
-from keyss.core.errors import InputError
-from keyss.files.file_kinds import identify_file, is_training, model_file
+from keyss.channels.names import Format
+from keyss.core.errors import InputError, UsageError
+from keyss.files.file_kinds import identify_file, is_training, is_unpacked_sog, model_file
 from keyss.files.inputs import is_standard
 from keyss.files.ply_summary import NEARLY_TRANSPARENT, summarise_ply
+
+_BYTES_PER_GAUSSIAN = 19  # of a hidden model, at the usual precision
 
 if TYPE_CHECKING:
     from keyss.core.gaussians import Gaussians
@@ -30,6 +34,15 @@ class RunInfo:
 
 
 @dataclass(frozen=True)
+class InterruptedRun:
+    """A folder of `hide` or `fit` that was not finished."""
+
+    kind: str
+    path: str
+    state: str  # how far it came, and what continues it
+
+
+@dataclass(frozen=True)
 class ModelInfo:
     """A model's file, with or without a secret."""
 
@@ -40,6 +53,7 @@ class ModelInfo:
     sh_degree: int
     bounding_box: tuple[tuple[float, ...], tuple[float, ...]]  # two corners, in world units
     nearly_transparent: float  # share of the Gaussians with opacities below 0.05
+    capacity: tuple[str, ...] | None = None  # of each way to publish; only on request, as it takes seconds
 
 
 @dataclass(frozen=True)
@@ -50,32 +64,46 @@ class SceneInfo:
     name: str
     train_views: int
     test_views: int
-    image_size: tuple[int, int]  # width, height
+    image_sizes: tuple[str, ...]  # "WIDTH x HEIGHT", of most photos first
     points: int
     extent: float  # world units
     background: tuple[float, ...]
 
 
-def info(path: str | Path) -> RunInfo | ModelInfo | SceneInfo:
+def info(path: str | Path, *, capacity: bool = False) -> RunInfo | InterruptedRun | ModelInfo | SceneInfo:
     """Describe a model ("-" for standard input), a scene folder, or a folder of results. Raises InputError.
 
-    Skips photos that a scene names but that do not exist, with a KeyssWarning.
+    `capacity`: also what a model can hide in each format and channel.
+
+    Skips photos of a scene that are missing or damaged, with a KeyssWarning.
     """
     path = Path(path)
     try:
         if not (is_standard(path) or path.exists()):
             raise InputError(f"{path}: no such file or folder")
-        return _folder_info(path) if path.is_dir() else _model_info(path)
+        if path.is_dir() and not _holds_a_model(path):
+            return _folder_info(path)
+        return _model_info(model_file(path), capacity)
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
 
 
-def _folder_info(path: Path) -> RunInfo | ModelInfo | SceneInfo:
+def _holds_a_model(folder: Path) -> bool:
+    return is_unpacked_sog(folder) or is_training(folder)
+
+
+def _folder_info(path: Path) -> RunInfo | InterruptedRun | ModelInfo | SceneInfo:
     from keyss.files.scenes import load_scene
     from keyss.runs.files import METRICS, MODEL, is_run, model_in
+    from keyss.runs.folder import read_manifest
     from keyss.runs.json_records import read_record
     from keyss.runs.run_records import FitMetrics, HideMetrics
 
+    if (running := read_manifest(path).running) is not None:
+        steps = _steps_done(path)
+        how = f"after {steps:,} training steps" if steps else "before a checkpoint was written"
+        state = f"interrupted {how}: the same command with --resume continues it, --overwrite drops it"
+        return InterruptedRun(f"unfinished {running.stage}", str(path), state)
     if inside := model_in(path):
         if not (path / METRICS).exists():  # hidden files have none, and `private/` may have been deleted
             return _model_info(inside)
@@ -84,51 +112,83 @@ def _folder_info(path: Path) -> RunInfo | ModelInfo | SceneInfo:
         return RunInfo("hiding", str(path), read_record(path / METRICS, HideMetrics))
     if runs := sorted(each for each in path.iterdir() if is_run(each)):
         raise InputError(f"{path} is not a run, but a folder of {len(runs)}: name one, such as {runs[0]}")
-    if is_training(path):
-        return _model_info(model_file(path))
     scene = load_scene(path, skip_missing=True)
-    camera = scene.train[0].camera
+    sizes = Counter(f"{view.camera.width} x {view.camera.height}" for view in scene.views)
     return SceneInfo(
         kind="scene",
         name=scene.name,
         train_views=len(scene.train),
         test_views=len(scene.test),
-        image_size=(camera.width, camera.height),
+        image_sizes=tuple(size for size, _ in sizes.most_common()),
         points=len(scene.points),
         extent=round(scene.extent, 4),
         background=_round(scene.background),
     )
 
 
-def _model_info(path: Path) -> ModelInfo:
-    if (summary := summarise_ply(path)) is not None:
+def _steps_done(run: Path) -> int:
+    """Training steps in the latest checkpoint of an interrupted run; 0 without a readable one."""
+    from keyss.fitting.loop import load_checkpoint
+    from keyss.runs.folder import CHECKPOINTS
+
+    files = sorted((run / CHECKPOINTS).glob("*.safetensors"), key=lambda each: each.stat().st_mtime)
+    try:
+        return int(load_checkpoint(files[-1])[1]["iteration"]) if files else 0
+    except InputError:
+        return 0
+
+
+def _model_info(path: Path, capacity: bool = False) -> ModelInfo:
+    found = None
+    if (summary := None if capacity else summarise_ply(path)) is not None:
         count, degree, transparent = summary.gaussians, summary.sh_degree, summary.nearly_transparent
-        box = _round(summary.low), _round(summary.high)
+        low, high = _round(summary.low), _round(summary.high)
     else:
         model = _read_model(path)
         count, degree = len(model), model.sh_degree
-        box = _round(model.means.amin(0)), _round(model.means.amax(0))
+        low, high = _round(model.means.amin(0)), _round(model.means.amax(0))
         transparent = int((model.opacity_logits < NEARLY_TRANSPARENT).sum())
+        found = tuple(_capacities(model)) if capacity else None
     return ModelInfo(
         kind="3DGS model",
         path=str(path),
         bytes=None if is_standard(path) else path.stat().st_size,
         gaussians=count,
         sh_degree=degree,
-        bounding_box=box,
+        bounding_box=(low, high),
         nearly_transparent=round(transparent / count, 4),
+        capacity=found,
     )
 
 
 def _read_model(path: Path) -> Gaussians:
-    from keyss.files.models import is_model_path, known_suffixes, read_model
+    from keyss.files.models import is_model_source, known_suffixes, read_model
 
-    if not (is_standard(path) or is_model_path(path)):
+    if not (is_standard(path) or is_model_source(path)):
         raise InputError(
             f"{path}: expected a model ({known_suffixes()}), a scene folder or a result folder, found "
             f"{identify_file(path)}"
         )
     return read_model(path)
+
+
+def _capacities(model: Gaussians) -> Iterator[str]:
+    """What a model can hide in each format and channel."""
+    from keyss.channels import channel_for
+
+    ways: list[tuple[str, Any]] = [
+        *((f"--format {each}", ("as-is", "appended", each)) for each in get_args(Format)),
+        ("--publish any --channel colours", ("any", "colours", None)),
+    ]
+    for flags, (publish, channel, format) in ways:
+        try:
+            found = channel_for(publish, channel, format, model).prepare(model).capacity
+        except UsageError as error:
+            yield f"{flags}: nothing ({error})"
+            continue
+        size = max(0, found.bytes - found.overhead)
+        yield f"{flags}: {size:,} bytes, a model of about {size // _BYTES_PER_GAUSSIAN:,} Gaussians"
+    yield "--publish any: any secret, as the file grows"
 
 
 def _round(values: Iterable[Any]) -> tuple[float, ...]:

@@ -22,6 +22,7 @@ STEGO = f"{PUBLISH}/model.ply"  # an innocuous name
 STEGOS = (STEGO, *(f"{PUBLISH}/model{suffix}" for suffix in (*SUFFIXES.values(), DECODED_SUFFIX)))
 MODEL = "model.ply"  # result of a plain fit
 CONFIG, METRICS, REPORT = f"{PRIVATE}/config.json", f"{PRIVATE}/metrics.json", f"{PRIVATE}/report.html"
+LOOK = f"{PRIVATE}/look.png"  # test views before and after
 COMPANIONS = f"{PRIVATE}/companion"  # companion files, for those who may see a secret
 CONTROLS = f"{PRIVATE}/controls"  # plain models of the cover from other seeds, for audits
 PathLike = str | Path

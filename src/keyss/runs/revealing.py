@@ -19,6 +19,7 @@ from keyss.runs.files import PathLike
 MIN_LEFT = 0.1  # share; pruning compensation stops there, and renders become empty
 NOTICED_LOSS = 0.01  # share; pruning compensation begins there
 # No known trained or public model has a Gaussian beyond 10 radii or larger than one radius.
+_SAMPLE = 200_000  # Gaussians from which the visible part is measured
 _FAR, _ENORMOUS = 1000.0, 100.0  # radii of the visible part
 _MAX_HARMONIC = 1000.0
 _MIN_QUATERNION = 1e-12  # length
@@ -159,21 +160,21 @@ class Verification:
 
     path: str
     model: ModelCheck
-    secret: SecretCheck | None  # None without a key
+    secrets: tuple[SecretCheck, ...]  # one per key
 
     @property
     def problems(self) -> tuple[str, ...]:
-        """Problems of the model and, with a key, of the secret."""
-        return self.model.problems + (() if self.secret is None else self.secret.problems)
+        """Problems of the model and of the secrets."""
+        return sum((secret.problems for secret in self.secrets), self.model.problems)
 
 
 def check_model(model: Gaussians) -> ModelCheck:
     """Count values that no trained model has. `model` must be on the CPU and finite."""
-    from keyss.rendering.orbit import SAMPLE, middle_and_radius  # slow to import
-
     visible = model.opacities >= DRAWN_OPACITY
     seen = visible.nonzero()[:, 0]
-    middle, radius = middle_and_radius(model[seen[:: max(1, len(seen) // SAMPLE)]] if len(seen) else model)
+    means = (model.means[seen[:: max(1, len(seen) // _SAMPLE)]] if len(seen) else model.means).double()
+    middle = means.median(0).values
+    radius = max(1e-6, float((means - middle).norm(dim=1).sort().values[int(0.9 * len(means))]))
     lengths = model.quats.double().norm(dim=1)
     harmonics = model.sh.flatten(1)
     duplicates, suspicious = copies(model)

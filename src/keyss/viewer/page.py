@@ -17,7 +17,7 @@ from urllib.parse import quote
 
 from keyss.core.errors import KeyssWarning, OutputError, UsageError
 from keyss.files.atomic import check_not_an_input, check_output_file, mode_like, write_bytes
-from keyss.files.file_kinds import model_file
+from keyss.files.file_kinds import is_unpacked_sog, model_file
 from keyss.files.inputs import as_text, read_file
 from keyss.viewer.look import Look
 
@@ -136,16 +136,18 @@ def readable(model: Path) -> tuple[str, bytes]:
 
     Warns of a conversion. Warns and raises as `read_model`, and UsageError for a file that is too large.
     """
+    from keyss.files.formats.sog import pack_unpacked
     from keyss.files.models import model_bytes
     from keyss.runs.files import as_model  # imports torch
 
     model = model_file(model)
     if model.is_file() and (size := model.stat().st_size) > MAX_BYTES:
         raise UsageError(f"{model} has {size:,} bytes, more than the {MAX_BYTES:,} that a page loads")
-    gaussians, data = as_model(model), read_file(model)
+    gaussians, is_unpacked = as_model(model), is_unpacked_sog(model)
+    data = pack_unpacked(model) if is_unpacked else read_file(model)
     is_text = b"\nformat ascii" in data[:_MAX_HEADER].partition(b"end_header")[0]
     if not is_text and (data.startswith(_MAGIC) or model.name.lower().endswith(".splat")):
-        return as_text(model.name), data
+        return as_text(f"{model.absolute().parent.name}.sog" if is_unpacked else model.name), data
     name, kind = as_text(f"{model.stem}.ply"), "a .ply in text" if is_text else f"a {model.suffix}"
     warnings.warn(
         f"{model}: the page does not read {kind}; it shows a lossless copy, {name}",

@@ -110,6 +110,24 @@ def test_each_threshold(fine: Data, measure: str, place: str, within: Any, beyon
     assert judged(changed(fine, (place, beyond)))[measure].word == word
 
 
+@pytest.mark.parametrize(
+    ("least", "of_controls", "word"),
+    [
+        (0.2, 0.5, "fine"),
+        (0.2, 1e-10, "inconclusive"),  # plain models fail too: the test finds anything, or nothing
+        (0.121, 1.8e-10, "inconclusive"),
+        (1e-10, 1e-10, "inconclusive"),
+        (1e-13, 1e-10, "visible"),  # far beyond what plain models have
+        (0.001, 0.5, "visible"),
+    ],
+)
+def test_controls_that_fail_decide_nothing(fine: Data, least: float, of_controls: float, word: str) -> None:
+    changes = (("stealth.least", least), ("stealth.least_of_controls", of_controls))
+    lines = verdicts(changed(fine, *changes))
+    assert {line.measure: line.word for line in lines}["the file by itself"] == word
+    assert (word == "inconclusive") == ("Inconclusive: the file by itself." in headline(lines))
+
+
 def test_missing_parts_have_no_verdict(fine: Data) -> None:
     parts = ("images", "wrong_key", "leaks", "parameters", "stealth", "stegexpose", "robustness", "speed")
     assert judged(changed(fine, *((part, None) for part in parts))) == {}

@@ -48,7 +48,7 @@ def test_hide_and_reveal_files(run: Run, tmp_path: Path) -> None:
     names = {str(path.relative_to(tmp_path / "out")) for path in (tmp_path / "out").rglob("*.*")}
     assert names == {
         "publish/model.ply",
-        *("private/metrics.json", "private/config.json", "private/manifest.json"),
+        *("private/look.png", "private/metrics.json", "private/config.json", "private/manifest.json"),
     }
     metrics = json.loads((tmp_path / "out/private/metrics.json").read_text())
     assert metrics["secret_gaussians"] == [900]

@@ -31,7 +31,7 @@ def test_hide_reveal_verify_and_info(format: str, tmp_path: Path) -> None:
         # Packing sorts them.
         nearest = torch.cdist(found.means, secret.means).min(dim=1).values
         assert float(nearest.max()) < 0.01
-        assert keyss.verify(stego, f"key number {index}").secret is not None
+        assert keyss.verify(stego, f"key number {index}").secrets
     with pytest.raises(keyss.WrongKeyError):
         keyss.reveal(stego, "another key")
     assert keyss.info(stego).kind == "3DGS model"

@@ -108,7 +108,7 @@ export class Controls {
   /** Orbits the target. */
   private turn(azimuth: number, elevation: number): void {
     const { eye, target, up } = this.pose;
-    this.setPose({ eye: add(target, orbit(difference(eye, target), up, azimuth, elevation)), target, up });
+    this.setPose({ ...this.pose, eye: add(target, orbit(difference(eye, target), up, azimuth, elevation)) });
   }
 
   private zoom(factor: number): void {

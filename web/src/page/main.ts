@@ -119,7 +119,7 @@ class Page {
 
   private async openFile(file: File): Promise<void> {
     if (file.size > MAX_BYTES) return this.fail('This file is larger than 2 GiB.');
-    for (const given of ['pose', 'camera', 'up', 'title']) delete page.main.dataset[given]; // of the first file
+    for (const given of ['pose', 'up', 'title']) delete page.main.dataset[given]; // of the first file
     return this.load(new Uint8Array(await file.arrayBuffer()), file.name);
   }
 
@@ -136,7 +136,7 @@ class Page {
     page.facts.textContent = `${this.name}\n${count(model.count)} Gaussians, SH degree ${model.shDegree}`;
     document.title = `${this.name} · keyss viewer`;
     this.viewer?.show(model);
-    this.controls.setPose(poseOfHash(this.hash) ?? poseOfHash(page.main.dataset.pose ?? '') ?? this.firstPose());
+    this.controls.setPose(poseOfHash(this.hash) ?? this.firstPose());
     await this.settle();
     this.say('');
     page.poster.hidden = true;
@@ -146,7 +146,8 @@ class Page {
 
   /**
    * Wrong keys change nothing, and the same line follows every key. The form is ready again after the quick search,
-   * before a secret is decoded and rendered; the thorough search follows for every key.
+   * before a secret is decoded and rendered; the thorough search follows for every key, silently if the quick one found
+   * something.
    */
   private async unlock(): Promise<void> {
     const key = page.key.value;
@@ -156,10 +157,11 @@ class Page {
     this.controls.rotate(false);
     this.writeAddress(); // before the key opens anything
     let said = 'Key tried.';
+    let found = false;
     for (const search of ['quick', 'thorough'] as const) {
-      this.showSearch(search);
-      this.say(search === 'quick' ? 'Trying the key …' : `${said} Searching more thoroughly …`);
-      delete page.main.dataset.picture;
+      this.showSearch(found ? 'silent' : search);
+      if (!found) this.say(search === 'quick' ? 'Trying the key …' : `${said} Searching more thoroughly …`);
+      if (!found) delete page.main.dataset.picture;
       const { model, file, elsewhere, foreign, stopped } = await this.opener.ask({ key, thorough: search === 'thorough' });
       if (own !== this.work) return;
       this.showSearch('');
@@ -169,6 +171,8 @@ class Page {
       if (model) said += this.reveal(model);
       if (elsewhere) said += ' It reveals a model that only keyss reveal opens.';
       if (foreign) said += ` About ${count(foreign)} Gaussians of the file were added or changed: it may not be its secret.`;
+      if (found && !(file || model || elsewhere)) return;
+      found = Boolean(file || model || elsewhere);
       this.say(stopped ? `${said} Search stopped.` : said);
       await this.settle();
       if (own !== this.work) return;
@@ -182,7 +186,7 @@ class Page {
     return ++this.work;
   }
 
-  private showSearch(search: 'quick' | 'thorough' | ''): void {
+  private showSearch(search: 'quick' | 'thorough' | 'silent' | ''): void {
     const isBusy = search === 'quick';
     page.main.dataset.searching = search;
     page.progress.value = 0;
@@ -204,6 +208,7 @@ class Page {
 
   /** Shows the secret from where the last model was seen. */
   private reveal(model: Gaussians): string {
+    if (page.keying.name) page.keying.open = false; // on phones
     const pose = this.sameView(this.pose, this.secret ?? this.published ?? model, model);
     this.showSecret(model, 0);
     this.controls.setPose(pose);
@@ -253,13 +258,13 @@ class Page {
     return this.home(model);
   }
 
-  /** A model's first pose; the published model is seen from the side of its training cameras. */
+  /** A model's first pose: of the published model, that of the page. */
   private home(model: Gaussians): Pose {
-    const { camera, up } = page.main.dataset;
+    const { pose, up } = page.main.dataset;
     const aspect = page.picture.clientWidth / Math.max(1, page.picture.clientHeight) || 1;
     const isOwn = model === this.published;
-    const captured = isOwn && !up ? poseOfHash(camera ?? '') : null;
-    const found = this.homes.get(model) ?? firstPose(model, aspect, isOwn ? UPS[up ?? ''] : undefined, captured);
+    const given = this.homes.get(model) ?? (isOwn ? poseOfHash(pose ?? '') : null);
+    const found = given ?? firstPose(model, aspect, isOwn ? UPS[up ?? ''] : undefined);
     this.homes.set(model, found);
     return found;
   }

@@ -22,6 +22,7 @@ const NARROW = '(max-width: 600px)'; // the panel would cover the scene
 /** `opened` receives chosen and dropped files. */
 export function preparePanel(opened: (file: File) => void): void {
   page.controls.open = page.keying.open = !window.matchMedia(NARROW).matches;
+  if (!page.keying.open) page.controls.name = page.keying.name = 'folded'; // of one name, one is open at a time
   page.fullscreen.hidden = !document.fullscreenEnabled;
   page.fullscreen.addEventListener('click', () => {
     void (document.fullscreenElement ? document.exitFullscreen() : page.main.requestFullscreen());

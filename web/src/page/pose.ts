@@ -1,6 +1,7 @@
 /** Camera poses: eye, target and up vector. */
-import { type Gaussians, opacity } from '../core/gaussians.ts';
+import type { Gaussians } from '../core/gaussians.ts';
 import { cross, dot } from '../core/similarity.ts';
+import { distance, type Frame, frameOf, quantile } from './framing.ts';
 
 export type Vector = readonly [number, number, number];
 
@@ -8,6 +9,7 @@ export interface Pose {
   readonly eye: Vector;
   readonly target: Vector;
   readonly up: Vector; // of length 1
+  readonly fov?: readonly [number, number]; // degrees of width and height that the picture shows at least
 }
 
 /** -y in captures by COLMAP, z in Blender's. */
@@ -15,13 +17,12 @@ export const UPS: Record<string, Vector> = {
   '-y': [0, -1, 0], z: [0, 0, 1], y: [0, 1, 0], '-z': [0, 0, -1], x: [1, 0, 0], '-x': [-1, 0, 0],
 };
 
-export const FIELD_OF_VIEW = 50; // degrees, vertical
-const SAMPLE = 8_000; // Gaussians for the first pose
-const HEIGHT = 0.2; // sine of the first pose's elevation
-const [MOST, ALL] = [0.93, 0.995]; // shares of visible Gaussians in the first picture: at least, and at most LITTLE further away
+const [HEIGHTS, DIRECTIONS] = [[0.25, 0.5], 12]; // of the first pose: sines of elevations, and a number around the model
+const [UNUSUAL, HIGHER] = [0.1, 0.1]; // what these cost against a share of the subject that is hidden
+export const FIELD_OF_VIEW = 50; // degrees, vertical, of poses without one
+const [MOST, ALL] = [0.93, 0.995]; // shares of the subject in the first picture: at least, and at most LITTLE further away
 const LITTLE = 1.15; // times the distance
-const FURTHEST = 2.5; // times the distance of the training cameras
-const MARGIN = 0.94; // of half the picture
+const MARGIN = 0.9; // of half the picture
 const STEEPEST = (85 * Math.PI) / 180;
 
 export const add = (a: Vector, b: Vector, scale = 1): Vector => [
@@ -41,59 +42,61 @@ export function axes({ eye, target, up }: Pose): { right: Vector; down: Vector; 
 }
 
 /**
- * A pose that frames nearly all visible Gaussians. `aspect`: width / height of the picture. `captured`: the pose of the
- * training cameras, which then gives direction and up vector, and bounds the distance: rooms are seen from inside.
+ * A pose that frames the subject of a model from a little above, whence as little as possible hides it; if possible from
+ * the front, -z, or -y where z is up. `aspect`: width / height of the picture.
  */
-export function firstPose(model: Gaussians, aspect: number, up?: Vector, captured?: Pose | null): Pose {
-  const step = Math.max(1, Math.ceil(model.count / SAMPLE));
-  const rows = Array.from({ length: Math.ceil(model.count / step) }, (_, index) => index * step);
-  const weights = rows.map((row) => opacity(model.opacityLogits[row]));
-  const above = up ?? UPS[isZUp(model, rows, weights) ? 'z' : '-y'];
-  const front: Vector = above[1] ? [0, 0, above[1]] : [0, -1, 0];
-  const away = add(add([0, 0, 0], above, HEIGHT), front, Math.sqrt(1 - HEIGHT * HEIGHT));
-  const pose = captured ?? { eye: away, target: [0, 0, 0] as Vector, up: above };
-  const { right, down, forward } = axes(pose);
+export function firstPose(model: Gaussians, aspect: number, up?: Vector): Pose {
+  const frame = frameOf(model);
+  const above = up ?? frame.up;
+  const front = Math.abs(above[1]) > 0.5 ? [0, 0, Math.sign(above[1])] as Vector : [0, -1, 0] as Vector;
+  const level = unit(add(front, above, -dot(front, above)));
+  const side = cross(above, level);
+  const found = HEIGHTS.flatMap((height, step) => Array.from({ length: DIRECTIONS }, (_, index) => {
+    const turn = (2 * Math.PI * index) / DIRECTIONS;
+    const flat = Math.sqrt(1 - height * height);
+    const away = combined([flat * Math.cos(turn), flat * Math.sin(turn), height], [level, side, above]);
+    return { away, cost: hidden(frame, away) + UNUSUAL * (1 - Math.cos(turn)) + HIGHER * step };
+  }));
+  return framing(frame, aspect, found.reduce((best, each) => (each.cost < best.cost ? each : best)).away, above);
+}
+
+/** The subject from the direction `away`, as large as it fits. */
+function framing({ middle, radius, sample }: Frame, aspect: number, away: Vector, up: Vector): Pose {
+  const { right, down, forward } = axes({ eye: away, target: [0, 0, 0], up });
   const basis = [right, down, forward];
-  const places = basis.map((axis) => rows.map((row) => dot(axis, [...model.means.subarray(3 * row, 3 * row + 3)])));
-  const middle = places.map((values, axis) => captured ? dot(basis[axis], captured.target)
-    : (quantile(values, weights, 1 - ALL) + quantile(values, weights, ALL)) / 2);
+  const rows = sample.means.flatMap((mean, row) => (distance(mean, middle) <= radius ? [row] : []));
+  const weights = rows.map((row) => sample.weights[row]);
+  const places = basis.map((axis) => rows.map((row) => dot(axis, sample.means[row])));
+  const center = places.map((values) => (quantile(values, weights, 1 - ALL) + quantile(values, weights, ALL)) / 2);
   // Distances at which each Gaussian is at the edge of the picture.
   const half = MARGIN * Math.tan((FIELD_OF_VIEW * Math.PI) / 360);
-  const distances = rows.map((_, index) => {
-    const [x, y, z] = places.map((values, axis) => values[index] - middle[axis]);
+  const distances = rows.map((_, at) => {
+    const [x, y, z] = places.map((values, axis) => values[at] - center[axis]);
     return Math.max(Math.abs(x) / aspect, Math.abs(y)) / half - z;
   });
   const [most, all] = [MOST, ALL].map((share) => quantile(distances, weights, share));
-  const captureDistance = captured ? length(difference(captured.eye, captured.target)) : Infinity;
-  const furthest = (FURTHEST * captureDistance) / Math.min(1, aspect); // a narrow picture shows less from there
-  const distance = Math.max(1e-6, Math.min(all, LITTLE * most, furthest));
-  const target = combined(middle, basis);
-  return { eye: add(target, forward, -distance), target, up: pose.up };
+  const target = combined(center, basis);
+  return { eye: add(target, forward, -Math.max(1e-6, Math.min(all, LITTLE * most))), target, up };
 }
 
-const [SLABS, DOMINANT] = [40, 0.1]; // across most of a model; minimum share in the slab of a floor
-
-/** Whether there is a floor across z, as in Blender's scenes, rather than across y. */
-function isZUp(model: Gaussians, rows: number[], weights: number[]): boolean {
-  const [y, z] = [1, 2].map((axis) => {
-    const places = rows.map((row) => model.means[3 * row + axis]);
-    const [low, high] = [1 - MOST, MOST].map((share) => quantile(places, weights, share));
-    const slabs = new Float64Array(2 * SLABS);
-    places.forEach((place, index) => (slabs[Math.floor(((place - low) / (high - low || 1) + 0.5) * SLABS)] += weights[index]));
-    return Math.max(...slabs) / weights.reduce((sum, each) => sum + each, 0);
-  });
-  return z > DOMINANT && z > 2 * y;
-}
-
-function quantile(values: number[], weights: number[], share: number): number {
-  const order = [...values.keys()].sort((a, b) => values[a] - values[b]);
-  const total = weights.reduce((sum, each) => sum + each, 0);
-  let sum = 0;
-  for (const row of order) {
-    sum += weights[row];
-    if (sum >= share * total) return values[row];
-  }
-  return values[order.at(-1) ?? 0] ?? 0;
+/**
+ * How much of the subject other Gaussians hide from the direction `away`: the sum of their opacities by their share of the
+ * solid angle.
+ */
+function hidden({ middle, radius, sample }: Frame, away: Vector): number {
+  const cone = Math.tan((FIELD_OF_VIEW * Math.PI) / 360); // that the subject fills
+  const far = radius / cone;
+  const eye = add(middle, away, far);
+  return sample.means.reduce((total, mean, row) => {
+    if (distance(mean, middle) <= radius) return total;
+    const offset = difference(mean, eye);
+    const depth = -dot(offset, away);
+    const [reach, size] = [length(offset), sample.sizes[row]];
+    const angle = size / Math.max(reach, size, 1e-9);
+    const aside = Math.sqrt(Math.max(0, reach * reach - depth * depth)) / Math.max(depth, 1e-9);
+    const covers = reach <= size || (depth > 0 && depth < far && aside < cone + angle);
+    return covers ? total + sample.weights[row] * Math.min(1, (angle / cone) ** 2) : total;
+  }, 0);
 }
 
 /** The pose relative to `to` as `pose` is to `from`: each model has its own coordinates. */
@@ -103,7 +106,7 @@ export function transferPose(pose: Pose, from: Pose, to: Pose): Pose {
   const turn = (vector: Vector): Vector => combined(before.map((axis) => dot(axis, vector)), after);
   const [a, b] = [from, to].map(({ eye, target }) => length(difference(eye, target)));
   const place = (point: Vector): Vector => add(to.target, turn(difference(point, from.target)), b / a);
-  return { eye: place(pose.eye), target: place(pose.target), up: turn(pose.up) };
+  return { eye: place(pose.eye), target: place(pose.target), up: turn(pose.up), fov: to.fov };
 }
 
 /** An offset rotated about `up` and towards it, within limits; angles in radians. */
@@ -116,11 +119,22 @@ export function orbit(offset: Vector, up: Vector, azimuth: number, elevation: nu
   return combined([cosine * Math.cos(azimuth), cosine * Math.sin(azimuth), Math.sin(bounded) * distance], [flat, side, up]);
 }
 
-/** `#eye=x,y,z&target=x,y,z`, with `&up=z` or `&up=x,y,z` unless up is -y. `poseOfHash` is the inverse, null on errors. */
+/** The vertical field of view in degrees for a picture of this width / height. */
+export function verticalFov({ fov }: Pose, aspect: number): number {
+  if (!fov) return FIELD_OF_VIEW;
+  const [width, height] = fov.map((each) => Math.tan((each * Math.PI) / 360));
+  return (360 / Math.PI) * Math.atan(Math.max(height, width / Math.max(aspect, 1e-3)));
+}
+
+/**
+ * `#eye=x,y,z&target=x,y,z`, with `&up=z` or `&up=x,y,z` unless up is -y, and `&fov=width,height` if it is not the usual
+ * one. `poseOfHash` is the inverse, null on errors.
+ */
 export function poseToHash(pose: Pose): string {
   const text = (values: Vector): string => values.map((each) => Number(each.toPrecision(6))).join(',');
   const up = upName(pose.up) ?? text(pose.up);
-  return `#eye=${text(pose.eye)}&target=${text(pose.target)}${up === '-y' ? '' : `&up=${up}`}`;
+  const fov = pose.fov ? `&fov=${pose.fov.join(',')}` : '';
+  return `#eye=${text(pose.eye)}&target=${text(pose.target)}${up === '-y' ? '' : `&up=${up}`}${fov}`;
 }
 
 export function poseOfHash(hash: string): Pose | null {
@@ -131,7 +145,9 @@ export function poseOfHash(hash: string): Pose | null {
   };
   const [eye, target, asked] = [vector('eye'), vector('target'), vector('up')];
   const up = asked && length(asked) > 1e-3 ? unit(asked) : (UPS[found.get('up') ?? '-y'] ?? UPS['-y']);
-  return eye && target && length(difference(eye, target)) > 1e-9 ? { eye, target, up } : null;
+  const fov = (found.get('fov') ?? '').split(',').map(Number);
+  const wide = fov.length === 2 && fov.every((each) => each > 0 && each < 170) ? { fov: fov as [number, number] } : {};
+  return eye && target && length(difference(eye, target)) > 1e-9 ? { eye, target, up, ...wide } : null;
 }
 
 /** The name of an up vector along a world axis; undefined for others. */

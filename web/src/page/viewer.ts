@@ -5,7 +5,7 @@ import {
 } from 'playcanvas';
 import { type Gaussians, mostVisible } from '../core/gaussians.ts';
 import { plyColumns } from '../files/ply.ts';
-import { FIELD_OF_VIEW, type Pose } from './pose.ts';
+import { type Pose, verticalFov } from './pose.ts';
 
 const [NEAREST, FURTHEST] = [1e-3, 1e4]; // clip planes relative to the target's distance
 const SLOW = 120; // ms per frame above which motion is drawn coarsely,
@@ -20,6 +20,7 @@ interface Half {
   readonly layer: Layer;
   readonly camera: Entity;
   model: Gaussians | null;
+  pose: Pose | null;
   splats: Entity | null;
   coarse: Entity | null; // its most visible Gaussians
 }
@@ -131,6 +132,7 @@ export class Viewer {
     camera.lookAt(new Vec3(...pose.target), new Vec3(...pose.up));
     camera.camera!.nearClip = NEAREST * distance;
     camera.camera!.farClip = FURTHEST * distance;
+    this.halves[side].pose = pose;
     if (this.slow) this.setScale(COARSE);
     this.touch();
   }
@@ -159,13 +161,13 @@ export class Viewer {
     this.app.scene.layers.push(layer);
     const camera = new Entity(`camera ${name}`);
     camera.addComponent('camera', {
-      clearColor: new Color(0, 0, 0, 1), fov: FIELD_OF_VIEW, layers: [layer.id], priority: order,
+      clearColor: new Color(0, 0, 0, 1), layers: [layer.id], priority: order,
       gammaCorrection: GAMMA_SRGB, toneMapping: TONEMAP_NONE,
     });
     // The engine ignores the scissor rectangle unless this internal flag is set.
     (camera.camera as unknown as { camera: { _scissorRectClear: boolean } }).camera._scissorRectClear = true;
     this.app.root.addChild(camera);
-    return { layer, camera, model: null, splats: null, coarse: null };
+    return { layer, camera, model: null, pose: null, splats: null, coarse: null };
   }
 
   private layOut(): void {
@@ -199,6 +201,7 @@ export class Viewer {
     const ratio = Math.min(window.devicePixelRatio || 1, 2) * this.scale;
     const [width, height] = [this.canvas.clientWidth, this.canvas.clientHeight];
     if (!width || !height) return;
+    for (const { camera, pose } of Object.values(this.halves)) if (pose) camera.camera!.fov = verticalFov(pose, width / height);
     this.app.setCanvasResolution(RESOLUTION_FIXED, Math.max(1, Math.round(width * ratio)), Math.max(1, Math.round(height * ratio)));
   }
 

@@ -199,9 +199,15 @@ class CodesCover:
         free = writable_levels(ordered, own, fixed_axes(codes), _digest(codes))
         cover = CodesCover(ordered, own, free, own_hash, model)
         if len(cover.ids) < MIN_BLOCKS or cover.width < LEAST_BYTES:
+            why = "it has too few Gaussians"
+            if len(cover.ids) >= MIN_BLOCKS:
+                why = (
+                    f"{cover.dry.mean():.0%} of the last bits can change unnoticed, and each block of "
+                    f"{wet_paper.BLOCK:,} needs {8 * LEAST_BYTES} such bits"
+                )
             raise UsageError(
                 f"a cover of {len(codes):,} Gaussians has no room for secrets in the codes of {codes.name} "
-                "files"
+                f"files: {why}"
             )
         return cover
 

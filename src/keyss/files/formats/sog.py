@@ -1,5 +1,7 @@
 """SOG, PlayCanvas's format: a ZIP of meta.json and lossless WebP images; reads and writes version 2.
 
+Reads them beside each other too, as programs leave them for web servers.
+
 https://developer.playcanvas.com/user-manual/gaussian-splatting/formats/sog/
 """
 
@@ -13,6 +15,7 @@ import zipfile
 import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Self
 
 import msgspec
@@ -35,6 +38,7 @@ from keyss.files.formats.common import (
     smallest_three,
     to_bytes,
 )
+from keyss.files.inputs import MAX_BYTES, read_file
 
 _MAX_POSITION = 65535  # largest position code
 _LARGEST = 252  # a quaternion's fourth byte: this plus the index (wxyz) of the component left out
@@ -277,6 +281,22 @@ def _read_meta(data: bytes) -> _Meta:
     if not len(meta.means.mins) == len(meta.means.maxs) == 3:
         raise InputError("the meta.json of a SOG has no bounds of three coordinates")
     return meta
+
+
+def pack_unpacked(meta_file: Path) -> bytes:
+    """The archive of an unpacked SOG: its meta.json with the images that it names beside it.
+
+    Raises InputError, also for names outside the folder.
+    """
+    data = read_file(meta_file, _MAX_META_BYTES)
+    meta = _read_meta(data)
+    parts = [meta.means, meta.scales, meta.quats, meta.sh0, *([meta.shN] if meta.shN else [])]
+    files = {"meta.json": data}
+    for name in [name for part in parts for name in part.files][:_MAX_MEMBERS]:
+        if Path(name).name != name or "\\" in name:
+            raise InputError(f"{meta_file}: expected images beside it, found {name[:80]!r}")
+        files[name] = read_file(meta_file.with_name(name), MAX_BYTES)
+    return _pack_archive(files)
 
 
 def _open_archive(data: bytes) -> Callable[[str], bytes]:

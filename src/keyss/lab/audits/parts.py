@@ -18,7 +18,7 @@ from torch import Tensor
 
 from keyss.core.errors import InputError
 from keyss.core.gaussians import Gaussians
-from keyss.core.scene import Scene
+from keyss.core.scene import Camera, Scene, View
 from keyss.files.models import read_model
 from keyss.fitting.config import FitConfig
 from keyss.fitting.image_metrics import ImageQuality, mean_quality, subsample_views, view_quality
@@ -209,18 +209,18 @@ def images(subject: Subject, seed: int, progress: Progress) -> tuple[ImagesResul
     for index, (scene, model, plain) in enumerate(subject.shown):
         progress(index, len(subject.scenes))
         name, has_photos = role_of(index, len(subject.scenes)), subject.run.metrics.photos[index]
-        own = renders_of(model, scene, scene.test)
+        own = renders_of(model, _cameras(scene.test), scene.background)
         result = ModelImages(name, has_photos, _compare(own, scene), len(model))
         shown = {
             "photo" if has_photos else "given model": [(view.camera.name, view.image) for view in scene.test],
             "revealed" if index else "stego model": own,
         }
         if plain is not None:
-            shown["plain model"] = renders = renders_of(plain, scene, scene.test)
+            shown["plain model"] = renders = renders_of(plain, _cameras(scene.test), scene.background)
             result = replace(result, baseline=_compare(renders, scene), baseline_gaussians=len(plain))
         if index:
             placed = subject.in_cover[index - 1]
-            shown["without the key"] = renders_of(subject.stego, placed, placed.test)
+            shown["without the key"] = renders_of(subject.stego, _cameras(placed.test), placed.background)
         results.append(result)
         for view in range(len(own))[:: -(-len(own) // PICTURED_VIEWS)]:
             title = f"{name.capitalize()}, {own[view][0]}"
@@ -280,7 +280,7 @@ def stegexpose_aucs(subject: Subject, models: Sequence[Gaussians]) -> list[Auc]:
     cover = subject.scenes[0]
     views = select_views(cover.views)
     plain, *others = (
-        [image.numpy() for _, image in renders_of(model, cover, views)]
+        [image.numpy() for _, image in renders_of(model, _cameras(views), cover.background)]
         for model in (subject.controls[0], *models)
     )
     return [stegexpose_auc(plain, renders) for renders in others]
@@ -354,3 +354,7 @@ NEED_A_3DGS_MODEL = frozenset({"parameters", "stealth", "leaks", "robustness"})
 PARTS: dict[str, AuditPart] = {
     part.__name__: part for part in (images, parameters, stealth, stegexpose, leaks, robustness, speed)
 }
+
+
+def _cameras(views: Sequence[View]) -> list[Camera]:
+    return [view.camera for view in views]

@@ -1,8 +1,8 @@
 """The summary of an audit: a verdict for each measure.
 
 *fine*: within the limit. *visible*: that something is hidden, or what, may be visible without the key.
-*missed*: nothing is visible, but the quality is too low. Limits of leaks are in `leak_scores`,
-all others here.
+*missed*: nothing is visible, but the quality is too low. *inconclusive*: controls differ as much from each
+other, so that the measure says nothing. Limits of leaks are in `leak_scores`, all others here.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ WRONG_KEY = 1.0  # dB above chance level
 PRUNING, PRUNED = "random pruning", 0.25  # the attack, and its share of the Gaussians
 PRUNING_LOSS = 1.5  # dB that the secret may lose more than the cover
 
-Word = Literal["fine", "visible", "missed"]
+Word = Literal["fine", "visible", "missed", "inconclusive"]
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ def headline(lines: Sequence[Verdict]) -> str:
         parts = [f"All {fine} measures are within their limits."]
     else:
         parts = [f"{fine} of {len(lines)} measures are within their limits."]
-    for word in ("visible", "missed"):
+    for word in ("visible", "missed", "inconclusive"):
         names = [line.measure for line in lines if line.word == word]
         if names:
             parts.append(f"{word.capitalize()}: {', '.join(names)}.")
@@ -133,9 +133,11 @@ def _stealth(audit: Audit) -> Iterator[Verdict]:
     result = audit.stealth
     if result is None or not result.statistics:
         return
-    limit = f"at least {UNUSUAL}, or as between plain models"
+    limit = f"at least {UNUSUAL}, as between plain models"
     beside = f"{significant(result.least_of_controls)}, between plain models"
-    word = _word(result.least >= min(UNUSUAL, result.least_of_controls))
+    word = _word(result.least >= UNUSUAL)
+    if result.least_of_controls < UNUSUAL and result.least >= UNUSUAL * result.least_of_controls:
+        word = "inconclusive"
     value = f"p = {significant(result.least)} ({result.statistics[0].name})"
     yield Verdict("the file by itself", value, beside, limit, word, "stealth")
 

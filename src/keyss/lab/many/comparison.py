@@ -241,7 +241,7 @@ def comparison_sheet(runs: Mapping[str, HidingRun], device: Backend) -> bytes:
         for scene, model in zip(run.scenes(train_pictures=False), models, strict=True):
             view = scene.test[len(scene.test) // 2]
             photos.append(view.image.numpy())
-            renders.append(renders_of(model, scene, [view])[0][1].numpy())
+            renders.append(renders_of(model, [view.camera], scene.background)[0][1].numpy())
         error = np.abs(photos[1].astype(int) - renders[1]).clip(0, 63).astype(np.uint8) * 4
         rows.setdefault("photos", [*photos, np.zeros_like(error)])
         rows[name] = [*renders, error]

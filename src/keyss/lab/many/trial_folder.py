@@ -188,7 +188,7 @@ def _attempt(trial: Trial, folder: Path, reporter: Reporter | None, *needed: Out
 def _on_ray(trials: Mapping[Path, Trial], address: str, cores: int) -> Iterator[Outcome]:
     """Ray starts a trial when those that it needs have ended, and repeats trials of lost nodes."""
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    ray = import_extra("ray", "sweep", "run on a cluster")
+    ray = import_extra("ray", "cluster", "run on a cluster")
     where = {"include_dashboard": False} if address == _LOCAL else {"address": address}
     variables = {name: str(cores) for name in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS")}
     try:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import hashlib
+import warnings
 from dataclasses import dataclass
 
 from keyss.channels import Payload
-from keyss.core.errors import UsageError
+from keyss.core.errors import KeyssWarning, UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.methods.codec.model_bytes import decode
 from keyss.methods.hidden import Frame, HiddenScene, Remains
@@ -27,6 +28,12 @@ class CarriedSecret(HiddenScene):
 
     def reveal(self, stego: Gaussians, *, frame: Frame = "secret", force: bool = False) -> Gaussians:
         """All Gaussians of the secret."""
+        if force:
+            warnings.warn(
+                "`force=True` has no effect: this secret opens whole or not at all",
+                KeyssWarning,
+                stacklevel=2,
+            )
         if frame == "cover":
             raise UsageError(
                 'a carried secret has no position in the cover\'s coordinates: leave out `frame="cover"`'

@@ -1,0 +1,102 @@
+"""Whether a given model shows the photos of its scene, and the frame in which it does."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+
+import msgspec
+import torch
+
+from keyss.core.errors import InputError, KeyssWarning
+from keyss.core.gaussians import Gaussians
+from keyss.core.scene import Scene, View
+from keyss.core.similarity import Similarity
+from keyss.files.inputs import read_file
+from keyss.fitting.image_metrics import mean_psnr, psnr, subsample_views
+from keyss.runs.files import PathLike
+
+_NERFSTUDIO = "dataparser_transforms.json"
+_VIEWS = 3
+_MAX_BYTES = 1 << 20
+
+
+class _Frame(msgspec.Struct):
+    """Nerfstudio's file: x -> scale * (transform @ (x, 1)), from the frame of the cameras to the model's."""
+
+    transform: list[list[float]]  # [3, 4]
+    scale: float
+
+
+class _Scene(msgspec.Struct):
+    """What a transforms.json says about its own frame."""
+
+    applied_transform: list[list[float]] | None = None  # [3, 4], from COLMAP's
+
+
+def in_frame_of(scene: Scene, model: Gaussians, source: PathLike | Gaussians, folder: object) -> Gaussians:
+    """`model` in the frame in which it shows the photos of its scene best.
+
+    Frames are that of the model and those of Nerfstudio's dataparser_transforms.json beside its file
+    `source`; `folder`: the scene's. Warns (KeyssWarning) of a model that is moved, or that shows its photos
+    worse than one colour does.
+    """
+    views = subsample_views(scene.test, _VIEWS)
+    as_it_is, one_colour = mean_psnr(model, views, scene.background), _psnr_of_one_colour(views)
+    if as_it_is >= one_colour or isinstance(source, Gaussians):
+        return model
+    moved = [frame.apply_gaussians(model) for frame in _frames(Path(source), folder)]
+    best = max(moved, key=lambda each: mean_psnr(each, views, scene.background), default=model)
+    found = mean_psnr(best, views, scene.background)
+    if found >= one_colour:
+        text = f"is moved into the frame of its photos, as {_NERFSTUDIO} beside it says"
+    else:
+        best = model
+        text = (
+            f"shows the photos of {scene.name} at {as_it_is:.1f} dB PSNR, worse than one colour "
+            f"({one_colour:.1f}): it is of another scene, or in another frame, as Nerfstudio exports models, "
+            f"rotated and scaled; put the {_NERFSTUDIO} of its training beside it"
+        )
+    warnings.warn(f"{source}: this model {text}", KeyssWarning, stacklevel=2)
+    return best
+
+
+def _psnr_of_one_colour(views: tuple[View, ...]) -> float:
+    """Mean PSNR in dB of the mean colour of each photo."""
+    photos = [view.photo(torch.device("cpu")) for view in views]
+    flat = [each.mean((0, 1), keepdim=True).expand_as(each) for each in photos]
+    return sum(psnr(one, each) for one, each in zip(flat, photos, strict=True)) / len(photos)
+
+
+def _frames(model: Path, folder: object) -> Iterator[Similarity]:
+    """From the model's frame to that of its cameras, which may be COLMAP's or that of a transforms.json."""
+    beside = model.with_name(_NERFSTUDIO)
+    if not beside.is_file():
+        return
+    try:
+        file = msgspec.json.decode(read_file(beside, _MAX_BYTES), type=_Frame)
+        from_cameras = _similarity(file.transform, file.scale)
+        yield from_cameras.inverse()
+        if isinstance(folder, str | Path) and (scene := Path(folder) / "transforms.json").is_file():
+            applied = msgspec.json.decode(read_file(scene), type=_Scene).applied_transform
+            if applied is not None:
+                yield _after(_similarity(applied, 1.0), from_cameras.inverse())
+    except (msgspec.MsgspecError, ValueError) as error:
+        raise InputError(f"{beside}: expected Nerfstudio's transform and scale: {error}") from error
+
+
+def _similarity(rows: list[list[float]], scale: float) -> Similarity:
+    matrix = torch.tensor(rows, dtype=torch.float64)
+    if matrix.shape != (3, 4):
+        raise ValueError(f"expected 3 rows of 4 numbers, got {list(matrix.shape)}")
+    return Similarity(scale, matrix[:, :3], scale * matrix[:, 3])
+
+
+def _after(second: Similarity, first: Similarity) -> Similarity:
+    """The transform that applies `first`, then `second`."""
+    return Similarity(
+        second.scale * first.scale,
+        second.rotation @ first.rotation,
+        second.apply_points(first.translation),
+    )

@@ -1,0 +1,173 @@
+"""What a picture of a model should show: its subject, and which way is up.
+
+The page has the same rules in `web/src/page/framing.ts`.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from keyss.core.arrays import Doubles
+from keyss.core.gaussians import Gaussians
+
+_SAMPLE = 4_000  # Gaussians that are looked at
+_SHRINK, _STEPS = 0.87, 60  # ratio of radii, and their number: down to 1/4,000
+_LEAST = 0.08  # share of the weight in the smallest sphere
+# A sphere's weight by this power of its radius: between that of lines, 1, and of clutter around a subject.
+_GROWTH = 0.8
+_OUTLIERS = 0.995  # share of the weight of a model without surroundings that its sphere holds
+_COARSER = (
+    1.6  # ratio of the sizes of Gaussians outside and inside, above which those outside are surroundings
+)
+_SLABS, _REACH = 40, 1.2  # slabs across 1.2 radii to both sides, which may hold a floor
+_ALIGNED = 0.85  # minimum cosine of a floor's normal with the direction across it
+_TILT, _STEP = 48.0, 5.0  # degrees from -y, as captures leave it; between directions at first
+_EXACT = 6.0  # degrees from the axes of other programs
+_TILTED_FLOOR, _AXIS_FLOOR = 0.07, 0.18  # share of the area in a floor
+_CLEARLY = 1.5  # ratio of the floor across an unusual direction to that across the usual one
+# Radii by which the middle of a model may be below a floor across an axis; from the second on, y is up.
+_HIGHEST, _BELOW = 0.3, 0.05
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A sphere around the subject of a model, and the up direction."""
+
+    middle: Doubles  # [3]
+    radius: float
+    up: Doubles  # [3] unit vector
+
+
+@torch.no_grad()
+def frame_of(model: Gaussians) -> Frame:
+    """The dense, opaque part of a model, without coarse surroundings, faint Gaussians and outliers.
+
+    The subject is the sphere with the most opacity for its size; if what lies outside is as fine, all of it.
+    Up is the normal of the largest floor among the directions near -y, where captures have it, and along z
+    and y, as other programs have it; -y without a floor.
+    """
+    model = model[:: max(1, math.ceil(len(model) / _SAMPLE))].to("cpu")
+    means, scales = model.means.double().numpy(), model.scales.double().numpy()
+    weights = model.opacities.double().nan_to_num(0.0).numpy()
+    if not weights.sum() > 0:
+        weights = np.ones(len(model))
+    ordered = np.sort(scales, axis=1)
+    sizes = np.sqrt(ordered[:, 1] * ordered[:, 2])
+    middle, radius = _densest(means, weights)
+    inside = _distances(means, middle) < radius
+    if inside.all() or _median(sizes[~inside], weights[~inside]) < _COARSER * _median(
+        sizes[inside], weights[inside]
+    ):
+        middle = _middle(means, weights)
+        distances = _distances(means, middle)
+        radius = max(_quantile(distances, weights, _OUTLIERS), 1e-6)
+        inside = distances <= radius
+    large = _quantile(sizes, np.ones(len(sizes)), 0.95)
+    areas = weights * np.minimum(sizes, large) ** 2 * (1 - ordered[:, 0] / ordered[:, 1].clip(1e-12))
+    normals = _normals(model.quats.double().numpy(), scales.argmin(axis=1))
+    up = _up((means[inside] - middle) / radius, normals[inside], areas[inside])
+    return Frame(middle, float(radius), up)
+
+
+def _densest(means: Doubles, weights: Doubles) -> tuple[Doubles, float]:
+    """Middle and radius of the sphere with the largest weight / radius^_GROWTH."""
+    middle = _middle(means, weights)
+    radius = max(_quantile(_distances(means, middle), weights, 0.995), 1e-6) / _SHRINK
+    best, found = -1.0, (middle, radius)
+    for _ in range(_STEPS):
+        radius *= _SHRINK
+        inside = _distances(means, middle) < radius
+        if weights[inside].sum() < _LEAST * weights.sum():
+            break
+        middle = _middle(means[inside], weights[inside])
+        inside = _distances(means, middle) < radius
+        score = weights[inside].sum() / radius**_GROWTH
+        if score > best:
+            best, found = score, (middle, radius)
+    return found
+
+
+def _up(offsets: Doubles, normals: Doubles, areas: Doubles) -> Doubles:
+    """[3] the up direction; `offsets`: from the middle, in radii."""
+    total = max(float(areas.sum()), 1e-30)
+
+    def largest(directions: Doubles, least_above: float = -_HIGHEST) -> tuple[float, float, Doubles]:
+        """The largest floor across one of the directions [D, 3].
+
+        Its share of the area, how far in radii the model is above it on average, at least `least_above`, and
+        the direction.
+        """
+        best = (0.0, 0.0, directions[0])
+        for direction, heights, cosines in zip(
+            directions, directions @ offsets.T, directions @ normals.T, strict=True
+        ):
+            slabs = ((heights / _REACH + 1) * _SLABS / 2).astype(int).clip(0, _SLABS - 1)
+            held = np.bincount(slabs, areas * (np.abs(cosines) > _ALIGNED), _SLABS)
+            pairs = (held[:-1] + held[1:]) / total
+            floor = int(pairs.argmax())
+            above = float(heights @ areas) / total - (2 * (floor + 1) / _SLABS - 1) * _REACH
+            if pairs[floor] > best[0] and above > least_above:
+                best = (float(pairs[floor]), above, direction)
+        return best
+
+    down = np.array([0.0, -1.0, 0.0])
+    tilted, _, direction = largest(_cap(largest(_cap(down, _TILT, 300), 0.0)[2], _STEP, 20), 0.0)
+    level, above, _ = largest(_cap(down, _EXACT, 20))
+    if largest(_cap(np.eye(3)[2], _EXACT, 20))[0] > max(_AXIS_FLOOR, _CLEARLY * tilted):
+        return np.array([0.0, 0.0, 1.0])
+    if level > _AXIS_FLOOR and level * _CLEARLY > tilted:
+        return down if above > -_BELOW else -down
+    return direction if tilted > max(_TILTED_FLOOR, _CLEARLY * level) else down
+
+
+def _cap(axis: Doubles, degrees: float, count: int) -> Doubles:
+    """[count, 3] directions within `degrees` of `axis`, which is the first, evenly spread."""
+    steps = np.arange(count)
+    along = 1 - (1 - math.cos(math.radians(degrees))) * steps / count
+    turns = steps * math.pi * (3 - math.sqrt(5))
+    side = np.cross(axis, [1.0, 0.0, 0.0])
+    side /= np.linalg.norm(side)
+    across = np.sqrt(1 - along**2)[:, None]
+    other = np.cross(axis, side)
+    found: Doubles = along[:, None] * axis + across * (
+        np.cos(turns)[:, None] * side + np.sin(turns)[:, None] * other
+    )
+    return found
+
+
+def _normals(quats: Doubles, shortest: npt.NDArray[np.int64]) -> Doubles:
+    """[N, 3] the shortest axes of Gaussians."""
+    w, x, y, z = (quats / np.linalg.norm(quats, axis=1, keepdims=True).clip(1e-12)).T
+    columns = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)],
+            [2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)],
+            [2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+    found: Doubles = columns[shortest, :, np.arange(len(quats))]
+    return found
+
+
+def _middle(means: Doubles, weights: Doubles) -> Doubles:
+    return np.array([_median(axis, weights) for axis in means.T])
+
+
+def _median(values: Doubles, weights: Doubles) -> float:
+    return _quantile(values, weights, 0.5)
+
+
+def _quantile(values: Doubles, weights: Doubles, share: float) -> float:
+    order = np.argsort(values, kind="stable")
+    total = np.cumsum(weights[order])
+    return float(values[order[min(np.searchsorted(total, share * total[-1]), len(values) - 1)]])
+
+
+def _distances(means: Doubles, middle: Doubles) -> Doubles:
+    found: Doubles = np.linalg.norm(means - middle, axis=1)
+    return found

@@ -1,0 +1,197 @@
+/** What a picture of a model should show: its subject, and which way is up. Counterpart of `keyss.rendering.framing`. */
+import { type Gaussians, opacity } from '../core/gaussians.ts';
+import { cross } from '../core/similarity.ts';
+import type { Vector } from './pose.ts';
+
+const SAMPLE = 4_000; // Gaussians that are looked at
+const [SHRINK, STEPS] = [0.87, 60]; // ratio of radii, and their number: down to 1/4,000
+const LEAST = 0.08; // share of the weight in the smallest sphere
+// A sphere's weight by this power of its radius: between that of lines, 1, and of clutter around a subject.
+const GROWTH = 0.8;
+const OUTLIERS = 0.995; // share of the weight of a model without surroundings that its sphere holds
+const COARSER = 1.6; // ratio of the sizes of Gaussians outside and inside, above which those outside are surroundings
+const [SLABS, REACH] = [40, 1.2]; // slabs across 1.2 radii to both sides, which may hold a floor
+const ALIGNED = 0.85; // minimum cosine of a floor's normal with the direction across it
+const [TILT, STEP] = [48, 5]; // degrees from -y, as captures leave it; between directions at first
+const EXACT = 6; // degrees from the axes of other programs
+const [TILTED_FLOOR, AXIS_FLOOR] = [0.07, 0.18]; // share of the area in a floor
+const CLEARLY = 1.5; // ratio of the floor across an unusual direction to that across the usual one
+// Radii by which the middle of a model may be below a floor across an axis; from the second on, y is up.
+const [HIGHEST, BELOW] = [0.3, 0.05];
+
+/** Gaussians of a model, sampled. */
+export interface Sample {
+  readonly means: readonly Vector[];
+  readonly weights: readonly number[]; // opacities
+  readonly sizes: readonly number[]; // of their largest cross-section
+}
+
+/** A sphere around the subject of a model, and the up direction, of length 1. */
+export interface Frame {
+  readonly middle: Vector;
+  readonly radius: number;
+  readonly up: Vector;
+  readonly sample: Sample;
+}
+
+/**
+ * The dense, opaque part of a model, without coarse surroundings, faint Gaussians and outliers.
+ *
+ * The subject is the sphere with the most opacity for its size; if what lies outside is as fine, all of it. Up is the
+ * normal of the largest floor among the directions near -y, where captures have it, and along z and y, as other programs
+ * have it; -y without a floor.
+ */
+export function frameOf(model: Gaussians): Frame {
+  const step = Math.max(1, Math.ceil(model.count / SAMPLE));
+  const rows = Array.from({ length: Math.ceil(model.count / step) }, (_, index) => index * step);
+  const three = (values: Float32Array, row: number): Vector => [values[3 * row], values[3 * row + 1], values[3 * row + 2]];
+  const means = rows.map((row) => three(model.means, row));
+  let weights = rows.map((row) => opacity(model.opacityLogits[row]) || 0);
+  if (!weights.some(Boolean)) weights = weights.map(() => 1);
+  const ordered = rows.map((row) => three(model.logScales, row).map(Math.exp).sort((a, b) => a - b));
+  const sizes = ordered.map(([, b, c]) => Math.sqrt(b * c));
+  let { middle, radius } = densest(means, weights);
+  let inside = within(means, middle, radius);
+  const isInside = new Set(inside);
+  const outside = means.flatMap((_, at) => (isInside.has(at) ? [] : [at]));
+  if (!outside.length || median(sizes, weights, outside) < COARSER * median(sizes, weights, inside)) {
+    middle = middleOf(means, weights);
+    const distances = means.map((mean) => distance(mean, middle));
+    radius = Math.max(quantile(distances, weights, OUTLIERS), 1e-6);
+    inside = means.flatMap((_, at) => (distances[at] <= radius ? [at] : []));
+  }
+  const large = quantile(sizes, sizes.map(() => 1), 0.95);
+  const areas = sizes.map((size, at) =>
+    weights[at] * Math.min(size, large) ** 2 * (1 - ordered[at][0] / Math.max(ordered[at][1], 1e-12)));
+  const floors = new Floors(
+    inside.map((at) => means[at].map((each, axis) => (each - middle[axis]) / radius) as unknown as Vector),
+    inside.map((at) => normal(model, rows[at])),
+    inside.map((at) => areas[at]),
+  );
+  return { middle, radius, up: floors.up(), sample: { means, weights, sizes } };
+}
+
+/** The sphere with the largest weight / radius ^ GROWTH. */
+function densest(means: readonly Vector[], weights: readonly number[]): { middle: Vector; radius: number } {
+  const total = sum(weights);
+  let middle = middleOf(means, weights);
+  let radius = Math.max(quantile(means.map((mean) => distance(mean, middle)), weights, 0.995), 1e-6) / SHRINK;
+  let [best, found] = [-1, { middle, radius }];
+  for (let step = 0; step < STEPS; step++) {
+    radius *= SHRINK;
+    let inside = within(means, middle, radius);
+    if (sum(inside.map((at) => weights[at])) < LEAST * total) break;
+    middle = middleOf(means, weights, inside);
+    inside = within(means, middle, radius);
+    const score = sum(inside.map((at) => weights[at])) / radius ** GROWTH;
+    if (score > best) [best, found] = [score, { middle, radius }];
+  }
+  return found;
+}
+
+/** Gaussians that may lie in a floor: offsets from the middle in radii, normals, and areas. */
+class Floors {
+  constructor(
+    private readonly offsets: readonly Vector[], private readonly normals: readonly Vector[],
+    private readonly areas: readonly number[],
+  ) {}
+
+  up(): Vector {
+    const [down, z] = [[0, -1, 0], [0, 0, 1]] as Vector[];
+    const tilted = this.largest(cap(this.largest(cap(down, TILT, 300), 0).direction, STEP, 20), 0);
+    const level = this.largest(cap(down, EXACT, 20));
+    if (this.largest(cap(z, EXACT, 20)).share > Math.max(AXIS_FLOOR, CLEARLY * tilted.share)) return z;
+    if (level.share > AXIS_FLOOR && level.share * CLEARLY > tilted.share) return level.above > -BELOW ? down : [0, 1, 0];
+    return tilted.share > Math.max(TILTED_FLOOR, CLEARLY * level.share) ? tilted.direction : down;
+  }
+
+  /**
+   * The largest floor across one of the directions: its share of the area, how far in radii the model is above it on
+   * average, at least `leastAbove`, and the direction.
+   */
+  private largest(directions: readonly Vector[], leastAbove = -HIGHEST): Floor {
+    const total = Math.max(sum(this.areas), 1e-30);
+    let best: Floor = { share: 0, above: 0, direction: directions[0] };
+    for (const direction of directions) {
+      const [x, y, z] = direction;
+      const slabs = new Float64Array(SLABS);
+      let middle = 0;
+      for (let at = 0; at < this.areas.length; at++) {
+        const [offset, normal] = [this.offsets[at], this.normals[at]];
+        const height = x * offset[0] + y * offset[1] + z * offset[2];
+        middle += height * this.areas[at];
+        if (Math.abs(x * normal[0] + y * normal[1] + z * normal[2]) <= ALIGNED) continue;
+        slabs[Math.max(0, Math.min(SLABS - 1, Math.trunc(((height / REACH + 1) * SLABS) / 2)))] += this.areas[at];
+      }
+      const pairs = slabs.slice(1).map((area, at) => area + slabs[at]);
+      const floor = pairs.indexOf(Math.max(...pairs));
+      const share = pairs[floor] / total;
+      const above = middle / total - ((2 * (floor + 1)) / SLABS - 1) * REACH;
+      if (share > best.share && above > leastAbove) best = { share, above, direction };
+    }
+    return best;
+  }
+}
+
+interface Floor {
+  readonly share: number;
+  readonly above: number;
+  readonly direction: Vector;
+}
+
+/** Directions within `degrees` of an axis other than x, which is the first, evenly spread. */
+function cap(axis: Vector, degrees: number, count: number): Vector[] {
+  const across = cross(axis, [1, 0, 0]);
+  const side = across.map((each) => each / Math.hypot(...across));
+  const other = cross(axis, side);
+  return Array.from({ length: count }, (_, index) => {
+    const along = 1 - ((1 - Math.cos((degrees * Math.PI) / 180)) * index) / count;
+    const turn = index * Math.PI * (3 - Math.sqrt(5));
+    const aside = Math.sqrt(1 - along * along);
+    const [a, b] = [aside * Math.cos(turn), aside * Math.sin(turn)];
+    return axis.map((each, at) => along * each + a * side[at] + b * other[at]) as unknown as Vector;
+  });
+}
+
+/** The shortest axis of a Gaussian. */
+function normal(model: Gaussians, row: number): Vector {
+  const quat = [...model.quats.subarray(4 * row, 4 * row + 4)];
+  const [w, x, y, z] = quat.map((each) => each / Math.max(Math.hypot(...quat), 1e-12));
+  const scales = [...model.logScales.subarray(3 * row, 3 * row + 3)];
+  return ([
+    [1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)],
+    [2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)],
+    [2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)],
+  ] as Vector[])[scales.indexOf(Math.min(...scales))];
+}
+
+export const distance = (a: Vector, b: Vector): number => Math.hypot(a[0] - b[0], a[1] - b[1], a[2] - b[2]);
+
+/** Rows of the places closer to `middle` than `radius`. */
+function within(means: readonly Vector[], middle: Vector, radius: number): number[] {
+  return means.flatMap((mean, at) => (distance(mean, middle) < radius ? [at] : []));
+}
+
+const sum = (values: readonly number[]): number => values.reduce((total, each) => total + each, 0);
+
+function middleOf(means: readonly Vector[], weights: readonly number[], rows?: readonly number[]): Vector {
+  return [0, 1, 2].map((axis) => median(means.map((mean) => mean[axis]), weights, rows)) as unknown as Vector;
+}
+
+function median(values: readonly number[], weights: readonly number[], rows?: readonly number[]): number {
+  return quantile(values, weights, 0.5, rows);
+}
+
+/** Of the values in `rows`, by default of all. */
+export function quantile(
+  values: readonly number[], weights: readonly number[], share: number, rows: Iterable<number> = values.keys(),
+): number {
+  const order = [...rows].sort((a, b) => values[a] - values[b]);
+  const bound = share * sum(order.map((row) => weights[row]));
+  let total = 0;
+  for (const row of order) {
+    total += weights[row];
+    if (total >= bound) return values[row];
+  }
+  return values[order.at(-1) ?? 0] ?? 0;
+}
