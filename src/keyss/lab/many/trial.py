@@ -80,15 +80,15 @@ class Trial:
         return [Path(each).parts[1] for each in models]
 
 
-# Seconds of measures: their wrong keys, attempts to open and other programs; and rendered views.
-_SECONDS_AND_VIEWS = {
-    "files": (0.0, 0),
-    "pictures": (0.0, 8),
-    "secrecy": (8.0, 43),
-    "survival": (15.0, 48),
-    "robustness": (120.0, 1000),
+# Seconds of measures: of all, mostly attempts to open; in views rendered; and per Gaussian.
+_COSTS = {
+    "files": (0.0, 0, 0.0),
+    "pictures": (0.0, 8, 0.0),
+    "secrecy": (0.5, 43, 9e-4),
+    "survival": (8.0, 48, 0.0),
+    "robustness": (100.0, 1000, 0.0),
 }
-_OTHERS = 5.0, 48
+_OTHER_COST = 1.0, 16, 1e-4
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -143,16 +143,14 @@ def cost_of_trial(trial: Trial, folder: Path) -> Cost:
     cost = hide(**_hide_arguments(trial, folder, keys), dry_run=True).cost
     assert cost is not None  # a dry run always has a cost
     elsewhere = [seconds for seconds, model in zip_longest(cost.fit_seconds, trial.models) if model]
-    measures = _seconds_of(trial.measures, cost.view_seconds)
+    measures = _seconds_of(trial.measures, cost.view_seconds, trial.options.fit.max_gaussians)
     return replace(cost, seconds=cost.seconds - sum(elsewhere) + measures)
 
 
-def _seconds_of(measures: Sequence[str], view: float) -> float:
-    """About the seconds of measures; `view`: those of `view_seconds`, of the cover and the secrets."""
-    return sum(
-        seconds + views * view
-        for seconds, views in (_SECONDS_AND_VIEWS.get(name, _OTHERS) for name in measures)
-    )
+def _seconds_of(measures: Sequence[str], view: float, gaussians: int) -> float:
+    """About the seconds of measures; `view`: see `Cost.view_seconds`, `gaussians`: of the published model."""
+    costs = [_COSTS.get(name, _OTHER_COST) for name in measures]
+    return sum(fixed + views * view + each * gaussians for fixed, views, each in costs)
 
 
 def keys_of(trial: Trial, folder: Path) -> list[str]:
@@ -238,6 +236,6 @@ def _measure(trial: Trial, names: list[str], folder: Path, reporter: Reporter) -
                 for model, scene in zip(models, subject.scenes, strict=True)
             )
         for name in others:
-            with reporter.waiting(f"{trial.name}: {name}", _seconds_of([name], view)):
+            with reporter.waiting(f"{trial.name}: {name}", _seconds_of([name], view, len(subject.stego))):
                 found |= {f"{name}.{each}": value for each, value in MEASURES[name](subject).items()}
     return found
