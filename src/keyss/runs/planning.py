@@ -6,7 +6,6 @@ import os
 import shutil
 import warnings
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,6 +16,7 @@ from keyss.core.errors import KeyssWarning, OutputError
 from keyss.core.scene import Scene
 from keyss.fitting.config import FitConfig
 from keyss.fitting.losses import Targets
+from keyss.kernels.memory import available_memory
 from keyss.methods.method import MethodOptions, Source, seconds_to_hide
 from keyss.methods.plain_models import Bound
 from keyss.progress import about
@@ -38,6 +38,7 @@ class Cost:
     seconds: float
     fit_seconds: tuple[float, ...]  # plain fits among them, the cover's first
     check_seconds: float  # reading the published file and measuring it
+    view_seconds: float  # measuring the cover and the secrets on one test view each
     device: str  # "cpu" or "cuda"
     disk_bytes: int  # at one time, checkpoints included
     memory_bytes: int
@@ -70,7 +71,7 @@ def cost_of(
     count, most = len(sources), options.fit.max_gaussians
     fits, trainings = options.fits(count), options.training(count)
     steps, trained, sizes = max(training.steps for training in trainings), 0, []
-    seconds, check_seconds, fit_seconds = 0.0, 0.0, []
+    seconds, check_seconds, fit_seconds, views = 0.0, 0.0, [], []
     for source, fit, training in zip(sources, fits, trainings, strict=True):
         size = most if source.given is None or not training.continues else len(source.given)
         own = fit.iterations if source.given is None else 0
@@ -78,10 +79,10 @@ def cost_of(
         longer = Bound.of(training, own or None)
         if bound and source.photos and not longer.equal:
             renders += longer.steps or 0
-        camera = source.scene.test[0].camera
-        step = step_seconds(device.type, size, camera.width * camera.height)
+        step = step_seconds(device.type, size, _pixels(source.scene))
         seconds += renders * step
-        check_seconds += _RENDERS * len(source.scene.test) * step + _READ_SECONDS * size
+        views.append(view_seconds(device.type, size, source.scene))
+        check_seconds += len(source.scene.test) * views[-1] + _READ_SECONDS * size
         fit_seconds.append(own * step)
         steps += own
         trained += size if own or training.steps else 0
@@ -97,12 +98,22 @@ def cost_of(
         memory += (1 + _CHECKPOINTS) * largest
         memory += max(Targets.max_bytes(source.scene.train) for source in sources)
     disk = (published + sum(sizes) + _CHECKPOINTS * trained) * gaussian + _OTHER_BYTES
-    return Cost(steps, seconds, tuple(fit_seconds), check_seconds, device.type, disk, memory)
+    return Cost(steps, seconds, tuple(fit_seconds), check_seconds, sum(views), device.type, disk, memory)
+
+
+def view_seconds(device: str, gaussians: int, scene: Scene) -> float:
+    """About the seconds to measure a model, and its plain model, on one test view of a scene."""
+    return _RENDERS * step_seconds(device, gaussians, _pixels(scene))
 
 
 def step_seconds(device: str, gaussians: int, pixels: int) -> float:
     """About the seconds of a training step on a device, "cpu" or "cuda"."""
     return _STEP_SECONDS[device] * (gaussians + pixels / 2)
+
+
+def _pixels(scene: Scene) -> int:
+    camera = scene.test[0].camera
+    return camera.width * camera.height
 
 
 def check_room(cost: Cost, out: Path | None) -> None:
@@ -115,21 +126,10 @@ def check_room(cost: Cost, out: Path | None) -> None:
                 f"{out}: expected {cost.disk_bytes / 1e6:,.0f} MB of free space for models and checkpoints, "
                 f"found {free / 1e6:,.0f} MB; make room, choose another place, or a smaller `max_gaussians`"
             )
-    if cost.memory_bytes > (available := _available_memory()):
+    if cost.memory_bytes > (available := available_memory()):
         warnings.warn(
             f"this takes about {cost.memory_bytes / 1e9:.1f} GB of memory, and {available / 1e9:.1f} GB are "
             "free: a smaller `width` or `max_gaussians` takes less",
             KeyssWarning,
             stacklevel=2,
         )
-
-
-def _available_memory() -> int:
-    """Bytes available on the machine and in its container (Linux, cgroup 2)."""
-    available: int = psutil.virtual_memory().available
-    with suppress(OSError, ValueError, KeyError):  # "max" without a limit
-        group = Path("/sys/fs/cgroup")
-        limit, used = (int((group / f"memory.{name}").read_text()) for name in ("max", "current"))
-        cached = dict(line.split() for line in (group / "memory.stat").read_text().splitlines())
-        available = min(available, limit - used + int(cached["inactive_file"]))
-    return available
