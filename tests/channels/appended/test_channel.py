@@ -316,10 +316,8 @@ def test_a_secret_put_into_another_file_is_told(
     name: str, salts: str, stego: Gaussians, other: Gaussians
 ) -> None:
     """The key opens it there, so its holder must hear that the file is another one's."""
-    host = other if salts == "kept" else other[:3000]
+    host = other[:3100] if salts == "kept" else other[:3000]  # few are left
     cover, appended = stego[:3000], stego[3000:]
-    if salts == "kept":
-        appended = appended[torch.arange(len(appended)).repeat(2)]  # outnumbers that of the file
     with pytest.warns(KeyssWarning, match="Gaussians were added"):
         assert opened(Gaussians.cat([host, ADDED[name](cover, appended)])) == DATA
 
