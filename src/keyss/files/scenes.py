@@ -63,7 +63,8 @@ def load_scene(
     KeyssWarning: see `View.mask`. So are resampled pixels that overlap a masked one.
 
     Raises InputError for an unknown layout, broken or truncated files, missing or undecodable images, images
-    whose aspect differs from their camera's by more than a pixel, or a scene without training or test images.
+    whose aspect differs from their camera's by more than a pixel, photos that exceed the free memory, or a
+    scene without training or test images.
     Raises UsageError for a `width` or `background` out of range.
     """
     if width is not None and width < 1:

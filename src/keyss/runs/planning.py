@@ -27,6 +27,7 @@ _RENDERS = 2  # training steps that take as long as measuring a test view
 _CHECKPOINTS = 6  # two checkpoints / model: each holds parameters and two moments of Adam
 _MAX_APPENDED = 7  # Gaussians that hold one Gaussian of a secret of SH degree 3
 _COPIES = 2  # of what is published and of the secrets in memory, beside the given models
+_CHUNKS = 7  # copies of appended Gaussians: their chunks, coded, placed and read again
 _OTHER_BYTES = 4 << 20  # JSON files, locks, and the overhead of the file system
 
 
@@ -88,12 +89,13 @@ def cost_of(
         trained += size if own or training.steps else 0
         sizes.append(size)
     seconds += seconds_to_hide(sizes[0], sizes[1:]) + check_seconds
-    published = sizes[0] + (_MAX_APPENDED * sum(sizes[1:]) if options.channel_in().grows else 0)
+    appended = _MAX_APPENDED * sum(sizes[1:]) if options.channel_in().grows else 0
+    published = sizes[0] + appended
     degree = max(options.fit.sh_degree if each.given is None else each.given.sh_degree for each in sources)
     gaussian = 4 * (14 + 3 * (degree + 1) ** 2)  # bytes in a .ply, with normals
     resident: int = psutil.Process().memory_info().rss
     largest = max(published, *sizes) * gaussian
-    memory = resident + _COPIES * (published + sum(sizes[1:])) * gaussian
+    memory = resident + (_COPIES * (published + sum(sizes[1:])) + _CHUNKS * appended) * gaussian
     if trained:  # gradients, moments and two checkpoints
         memory += (1 + _CHECKPOINTS) * largest
         memory += max(Targets.max_bytes(source.scene.train) for source in sources)
