@@ -74,7 +74,7 @@ def test_models_with_trailing_zeros_and_new_bits_look_alike(rounded: list[Gaussi
 
 
 def test_little_is_left_alone_where_nothing_is_given_away(rounded: list[Gaussians]) -> None:
-    """The limit of confidence leaves alone 2 to 8 % of 1,500 Gaussians (0.5 % of 20,000): it counts few numbers."""
+    """The limit of confidence leaves alone 2 to 8 % of 1,500 Gaussians, 0.5 % of 20,000."""
     fine = [usable_carriers(trained_like(1500, seed)).mean() for seed in range(MODELS)]
     assert min(fine) > 0.9
     assert np.mean(fine) > 0.94

@@ -6,8 +6,8 @@ file.
 
 *Messages* of a few bytes, the data key and the parameters, are cut into fragments that fit into the low bits
 of one Gaussian at the least depth. Each fragment has several places, the Gaussians with the smallest function
-values among those that the function assigns to it. Some of these cannot be written, are taken or lost. A reader
-looks at eight times as many, because other Gaussians may have been added: the most frequent content counts.
+values among those that the function assigns to it. Some of these cannot be written, are taken or lost. A
+reader looks at eight times as many, because others may have been added: the most frequent content counts.
 
 *Chunks* of a payload fill all Gaussians of a secret's share. The function assigns each Gaussian to a group of
 codewords, and masks the number that a chunk has in its group. In rows of 5 bytes and more, a tag of one byte

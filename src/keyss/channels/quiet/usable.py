@@ -16,8 +16,8 @@ All but the last are found in bits that embedding never changes. docs/threat-mod
 
 A *salt* of Argon2id is a hash of one Gaussian and its low bits, which are new random bits for every file and
 carry nothing else: no two files of one cover share a salt. There are several salts because Gaussians may be
-removed. Their order does not change by embedding: Gaussians come late that moved by equal steps away from zero
-or have small even numbers, which are often not usable; among others the smallest IDs come first.
+removed. Their order does not change by embedding: Gaussians come late that moved by equal steps away from
+zero or have small even numbers, which are often not usable; else the smallest IDs come first.
 """
 
 from __future__ import annotations
