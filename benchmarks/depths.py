@@ -16,8 +16,9 @@ import math
 from pathlib import Path
 
 import keyss  # noqa: F401  before torch, see `ruff.toml`
-from keyss import FitConfig, Gaussians, UsageError, read_model, write_model
+from keyss import FitConfig, Gaussians, read_model, write_model
 from keyss.channels import Carriers, Layout
+from keyss.core import UsageError
 from keyss.files import load_scene
 from keyss.fitting import fit_scene
 from keyss.lab.stealth.low_bits import steps

@@ -375,6 +375,21 @@ def test_copies_count_once(cover: Gaussians) -> None:
     assert other.foreign == 0
 
 
+@pytest.mark.parametrize(("times", "degree", "unit"), [(3, 3, False), (8, 3, False), (3, 0, True)])
+def test_what_a_file_hides_is_found_among_others_by_a_salt_of_its_own(
+    times: int, degree: int, unit: bool
+) -> None:
+    """Other Gaussians displace places of the header, and false chunks join the true ones."""
+    model, others = (trained_like(count, 9, degree) for count in (6000, 6000 * times))
+    if unit:
+        model, others = (
+            replace(each, quats=torch.nn.functional.normalize(each.quats)) for each in (model, others)
+        )
+    own = keys()
+    both = Gaussians.cat([others, embed_derived(model, [(own, PAYLOAD[:1000])])])
+    assert extract_derived(both, own[0]) == PAYLOAD[:1000]
+
+
 def test_who_merges_two_files_under_one_key_is_told(cover: Gaussians) -> None:
     first, second = embed(cover, [(KEY, b"first")]), embed(trained_like(1500, 9), [(KEY, b"second")])
     with pytest.warns(KeyssWarning, match=r"about [\d,]+ Gaussians were added"):

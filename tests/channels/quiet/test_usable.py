@@ -52,11 +52,11 @@ def rounded() -> list[Gaussians]:
 
 def test_models_with_trailing_zeros_and_new_bits_look_alike(rounded: list[Gaussians]) -> None:
     """The sum that told all carried models from plain ones, as somebody counts who knows the optimiser."""
-    random, stegos = np.random.default_rng(1), []
-    for model in rounded:
-        rows = np.flatnonzero(usable_carriers(model))
-        noise = random.integers(0, 256, (len(rows), 53), np.uint8)
-        stegos.append(write_low_bits(model, Layout.of(model), [(8, rows, noise)]))
+    size = int(0.95 * min(LOW_BITS.prepare(model).capacity.bytes for model in rounded))
+    stegos = [
+        embed_derived(model, [(keys(seed), np.random.default_rng(seed).bytes(size))], bytes([seed] * 32))
+        for seed, model in enumerate(rounded)
+    ]
     plain = [small_even_numbers(model) for model in rounded]
     assert np.mean(plain) > 3  # trailing zeros there are
     assert abs(_auc(plain, [small_even_numbers(stego) for stego in stegos]) - 0.5) < 0.1
@@ -74,10 +74,11 @@ def test_models_with_trailing_zeros_and_new_bits_look_alike(rounded: list[Gaussi
 
 
 def test_little_is_left_alone_where_nothing_is_given_away(rounded: list[Gaussians]) -> None:
-    """Near-equal components are 3 % by chance."""
+    """The limit of confidence leaves alone 2 to 8 % of 1,500 Gaussians, 0.5 % of 20,000."""
     fine = [usable_carriers(trained_like(1500, seed)).mean() for seed in range(MODELS)]
     assert min(fine) > 0.9
-    assert max(usable_carriers(model).mean() for model in rounded) < 0.88
+    assert np.mean(fine) > 0.94
+    assert np.mean([usable_carriers(model).mean() for model in rounded]) < np.mean(fine) - 0.05
 
 
 @pytest.mark.parametrize("step", [2.0**-16, 2.0**-13, 2.0**-10])

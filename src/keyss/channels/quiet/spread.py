@@ -6,8 +6,8 @@ file.
 
 *Messages* of a few bytes, the data key and the parameters, are cut into fragments that fit into the low bits
 of one Gaussian at the least depth. Each fragment has several places, the Gaussians with the smallest function
-values among those that the function assigns to it. Some of these cannot be written, are taken or lost: the
-most frequent content counts.
+values among those that the function assigns to it. Some of these cannot be written, are taken or lost. A
+reader looks at eight times as many, because others may have been added: the most frequent content counts.
 
 *Chunks* of a payload fill all Gaussians of a secret's share. The function assigns each Gaussian to a group of
 codewords, and masks the number that a chunk has in its group. In rows of 5 bytes and more, a tag of one byte
@@ -71,7 +71,7 @@ class Message:
     def write(self, ids: Bytes, data: bytes) -> tuple[Integers, Bytes]:
         """Rows of `ids` [N, 16], and the bytes [R, width] to be written into each."""
         every = np.frombuffer(data.ljust(self.fragments * self.width, b"\0"), np.uint8)
-        places = list(self._places(ids))
+        places = [rows[: self.copies] for rows in self._candidates(ids)]
         rows = np.concatenate(places)
         pads = function(self.secret, f"{self.label}/pad", ids[rows], self.width)
         contents = np.repeat(every.reshape(-1, self.width), [len(each) for each in places], axis=0)
@@ -80,14 +80,14 @@ class Message:
     def read(self, ids: Bytes, low: Bytes) -> bytes:
         """The most frequent content of each fragment in `low` [N, width or more]."""
         found = b""
-        for rows in self._places(ids):
+        for rows in self._candidates(ids):
             pads = function(self.secret, f"{self.label}/pad", ids[rows], self.width)
             contents, times = np.unique(low[rows, : self.width] ^ pads, axis=0, return_counts=True)
             found += contents[times.argmax()].tobytes() if len(rows) else bytes(self.width)
         return found[: self.size]
 
-    def _places(self, ids: Bytes) -> Iterator[Integers]:
-        """The rows of each fragment."""
+    def _candidates(self, ids: Bytes) -> Iterator[Integers]:
+        """The rows that are looked at for each fragment, its places first."""
         values = function(self.secret, f"{self.label}/place", ids)
         order = values[:, :8].copy().view(">u8")[:, 0].astype(np.uint64)
         count = _CANDIDATES * self.places
@@ -95,7 +95,7 @@ class Message:
         near = near[order[near].argsort()]
         fragment = values[near, 8:12].copy().view("<u4")[:, 0] % self.fragments
         for each in range(self.fragments):
-            yield near[fragment == each][: self.copies]
+            yield near[fragment == each]
 
 
 @dataclass(frozen=True)

@@ -16,8 +16,8 @@ All but the last are found in bits that embedding never changes. docs/threat-mod
 
 A *salt* of Argon2id is a hash of one Gaussian and its low bits, which are new random bits for every file and
 carry nothing else: no two files of one cover share a salt. There are several salts because Gaussians may be
-removed. Their order does not change by embedding: first Gaussians that did not move by equal steps away from
-zero, and among these the smallest IDs.
+removed. Their order does not change by embedding: Gaussians come late that moved by equal steps away from
+zero or have small even numbers, which are often not usable; else the smallest IDs come first.
 """
 
 from __future__ import annotations
@@ -70,6 +70,7 @@ _OPACITY = 7
 _SATURATED = np.uint32(0x41800000), np.uint32(0x80000000)
 _PRUNED = np.float32(math.log(0.005 / 0.995)).view(np.uint32) | LOW  # the logit of 0.005, without low bits
 _MIN_USABLE = 0.05  # share of the Gaussians of a cover
+_LARGE_ENOUGH = 118  # biased exponent: optimisers with large last steps leave zeros in numbers below 2^-9
 _SETS_BY_CHANCE = 0.1  # maximum expected number of sets of equal values by chance
 _SAMPLE = 20_000  # Gaussians whose bits are tested
 _LARGE = 10 * _SAMPLE  # Gaussians of a cover whose sample is tested first
@@ -164,12 +165,23 @@ def chance_of_bits(words: Words32, bits: int) -> float:
 
 def salt_rows(gaussians: Gaussians, ids: Bytes, layout: Layout) -> Integers:
     """Rows of the salts' Gaussians, at most SALTS, in the order of the salts; `ids` [N, 16]."""
-    late = moved_from_zero(gaussians, layout).astype(np.uint64)
-    keys = late << np.uint64(63) | ids[:, :8].copy().view(">u8")[:, 0].astype(np.uint64) >> np.uint64(1)
+    late = np.where(moved_from_zero(gaussians, layout), np.uint64(255), _smallness(gaussians, layout))
+    keys = late << np.uint64(56) | ids[:, :8].copy().view(">u8")[:, 0].astype(np.uint64) >> np.uint64(8)
     best = np.argpartition(keys, SALTS - 1)[:SALTS] if len(keys) > SALTS else np.arange(len(keys))
     low = read_low_bits(gaussians[torch.from_numpy(best)], LEAST, layout)
     order = sorted(range(len(best)), key=lambda i: (late[best[i]], ids[best[i]].tobytes(), low[i].tobytes()))
     return best[order]
+
+
+def _smallness(gaussians: Gaussians, layout: Layout) -> Words:
+    """[N] octaves by which the smallest even number lies below _LARGE_ENOUGH; 0 for larger ones."""
+
+    def work(start: int, stop: int) -> Words:
+        used = used_words(gaussians[start:stop])[:, layout.columns]
+        below = np.where(used & 1 == 0, _LARGE_ENOUGH - _exponents(used).astype(np.int64), 0)
+        return below.max(axis=1, initial=0).astype(np.uint64)
+
+    return np.concatenate([np.zeros(0, np.uint64), *in_blocks(work, len(gaussians), BLOCK)])
 
 
 def salt(carrier_id: Bytes, low: Bytes) -> bytes:

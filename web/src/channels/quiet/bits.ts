@@ -106,11 +106,13 @@ export function lowBits(fields: Fields, depth: number): Uint8Array {
 const SALTS = 4; // tried
 const LABEL = ascii('keyss/v3/salt');
 const EQUAL = 3; // numbers that moved by equal amounts
+const LARGE_ENOUGH = 118; // biased exponent of 2^-9
+const LAST = 255;
 
 /** Up to 4 salts of 16 bytes, the likeliest first; `low`: the low bits at the least depth, rows of `size` bytes. */
 export function salts(fields: Fields, ids: Uint8Array, low: Uint8Array, size: number): Uint8Array[] {
   const late = new Uint8Array(fields.count);
-  for (let row = 0; row < fields.count; row++) late[row] = movedFromZero(fields, row) ? 1 : 0;
+  for (let row = 0; row < fields.count; row++) late[row] = movedFromZero(fields, row) ? LAST : smallness(fields, row);
   const order = Array.from(late.keys()).sort((a, b) => {
     return late[a] - late[b] || compared(ids, a, b, ID_BYTES) || compared(low, a, b, size);
   });
@@ -130,6 +132,16 @@ function compared(rows: Uint8Array, a: number, b: number, width: number): number
     if (difference) return difference;
   }
   return 0;
+}
+
+/** Octaves by which the smallest even number lies below `LARGE_ENOUGH`; 0 for larger ones. */
+function smallness({ width, words, inUse }: Fields, row: number): number {
+  let most = 0;
+  for (const field of inUse) {
+    const word = words[row * width + field];
+    if (!(word & 1)) most = Math.max(most, LARGE_ENOUGH - ((word >>> 23) & 255));
+  }
+  return most;
 }
 
 const ownWords = new Uint32Array(2);

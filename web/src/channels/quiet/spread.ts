@@ -39,8 +39,8 @@ export function message(
   secret: Uint8Array, label: string, size: number, width: number, copies: number, table: Table,
 ): Uint8Array {
   const found = new Uint8Array(Math.ceil(size / width) * width);
-  const places = placesOf(functionOf(secret, `${label}/place`, table.ids), found.length / width, copies);
-  places.forEach((rows, fragment) => {
+  const candidates = candidatesOf(functionOf(secret, `${label}/place`, table.ids), found.length / width, copies);
+  candidates.forEach((rows, fragment) => {
     const pads = functionOf(secret, `${label}/pad`, rowsOf(table.ids, rows, ID_BYTES), width);
     const contents = rows.map((row, at) => {
       return bytesKey(pads.subarray(at * width, (at + 1) * width).map((each, byte) => each ^ table.low[row * table.width + byte]));
@@ -52,8 +52,8 @@ export function message(
   return found.subarray(0, size);
 }
 
-/** The rows of each fragment: those with the smallest function `values` [N, 16]. */
-function placesOf(values: Uint8Array, fragments: number, copies: number): number[][] {
+/** The rows that are looked at for each fragment: those with the smallest function `values` [N, 16]. */
+function candidatesOf(values: Uint8Array, fragments: number, copies: number): number[][] {
   const [view, count] = [viewOf(values), values.length / BLOCK];
   const order = Float64Array.from({ length: count }, (_, row) => view.getUint32(row * BLOCK));
   const among = Math.min(count, CANDIDATES * copies * fragments);
@@ -62,12 +62,11 @@ function placesOf(values: Uint8Array, fragments: number, copies: number): number
   for (let row = 0; row < count; row++) if (order[row] <= bound) near.push(row);
   const lower = (row: number): number => view.getUint32(row * BLOCK + 4);
   near.sort((a, b) => order[a] - order[b] || lower(a) - lower(b));
-  const places = Array.from({ length: fragments }, () => [] as number[]);
+  const candidates = Array.from({ length: fragments }, () => [] as number[]);
   for (const row of near.slice(0, among)) {
-    const own = places[view.getUint32(row * BLOCK + 8, true) % fragments];
-    if (own.length < copies) own.push(row);
+    candidates[view.getUint32(row * BLOCK + 8, true) % fragments].push(row);
   }
-  return places;
+  return candidates;
 }
 
 /** The numbers and data of all chunks of a payload that are left in `table`, and false ones. */
