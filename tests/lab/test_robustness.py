@@ -50,7 +50,7 @@ def test_loss_is_the_difference_of_psnr(scene: Scene) -> None:
     assert rows[1].cover is not None
     assert (rows[1].cover.psnr, rows[1].cover.loss) == pytest.approx((after, before - after))
     assert rows[1].secrets == (rows[1].cover,)
-    assert steps == [(0, 3), (1, 3), (2, 3)]
+    assert steps == [(0, 300), (100, 300), (200, 300)]
     assert measure_robustness(model, [Whole], [scene, scene], changes=changes) == rows
 
 

@@ -132,6 +132,7 @@ def test_a_wrong_key_takes_as_many_derivations_as_a_right_one(cover: Gaussians, 
     """They are nearly all of the time."""
     reader = AppendedReader.of(embedded(cover, [(KEY, Payload("file", DATA))], entropy=ENTROPY))
     assert reader is not None
+    derivation._argon2id.cache_clear()  # the writer has derived the right one
     with mock.patch.object(derivation, "hash_secret_raw", wraps=derivation.hash_secret_raw) as derived:
         try:
             assert reader.open(key) == Payload("file", DATA)

@@ -77,10 +77,10 @@ def test_secrets_lie_as_if_they_were_alone(own: int, others: list[int]) -> None:
 
 def test_who_is_crowded_is_warned_for_it_can_be_seen() -> None:
     """The control: the numbers do show it where secrets do not fit as each would alone."""
-    alone = [_seen([QUARTER]) for _ in range(HIDINGS)]
+    alone, more = [_seen([QUARTER]) for _ in range(HIDINGS)], QUARTER * 6 // 5  # alone in a half
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        beside = [_seen([QUARTER, 2 * QUARTER, 2 * QUARTER]) for _ in range(HIDINGS)]
+        beside = [_seen([QUARTER, more, more]) for _ in range(HIDINGS)]
     assert {each.category for each in caught} == {KeyssWarning}
     assert _least_chance(alone, beside) < 1e-10
     with pytest.warns(KeyssWarning, match="can notice that there are other secrets"):

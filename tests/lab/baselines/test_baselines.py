@@ -65,6 +65,7 @@ def test_files_and_metrics_of_a_hiding(made: Made) -> None:
         *companion_names(1),
         *(f"private/{name}" for name in ("config.json", "metrics.json", "manifest.json")),
         *(f"private/{name}.ply" for name in ("cover", "secret-1")),
+        "private/look.png",
     }
     assert keyss.evaluate(made.out, []) == made.result.metrics
     assert made.result.metrics.method == made.name

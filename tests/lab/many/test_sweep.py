@@ -24,7 +24,7 @@ GOOD = """
 pairs:
   - {cover: a.ply, secrets: [b.ply]}
 methods:
-  - {method: carry, preset: quick, grid: {sh_degree: [1, 3], fit.iterations: [10, 20]}}
+  - {method: carry, preset: quick, grid: {fit.sh_degree: [1, 3], fit.iterations: [10, 20]}}
 """
 
 
@@ -55,9 +55,9 @@ def spec_of(folder: Path, text: str) -> Path:
         ("cover: a.ply", "covr: a.ply", "unknown field `covr`"),
         ("cover: a.ply", "cover: c.ply", "pairs[0].cover: there is no c.ply"),
         ("cover: a.ply", "cover: 7", "Expected `str`, got `int`"),
-        ("sh_degree:", "sh_degre:", "did you mean sh_degree"),
+        ("fit.sh_degree:", "fit.sh_degre:", "did you mean fit.sh_degree"),
         ("fit.iterations:", "fit.iteration:", "did you mean fit.iterations"),
-        ("[1, 3]", "[1, many]", "Expected `int | null`, got `str`"),
+        ("[1, 3]", "[1, many]", "Expected `int`, got `str`"),
         ("[10, 20]", "[10, 0]", "expected 1 to 10000000, got 0"),
         ("[1, 3]", "[]", "length >= 1 - at `$.methods[0].grid[...]`"),
         ("method: carry", "method: carrry", "Invalid enum value 'carrry'"),
@@ -207,11 +207,11 @@ def test_local_ray_cluster(tmp_path: Path) -> None:
         assert table.read_bytes() == (tmp_path / "there" / table.name).read_bytes()
 
 
-@pytest.mark.parametrize(("package", "ray"), [("ray", "local"), ("yaml", None)])
+@pytest.mark.parametrize(("package", "extra", "ray"), [("ray", "cluster", "local"), ("yaml", "sweep", None)])
 def test_missing_packages(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, package: str, ray: str | None
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, package: str, extra: str, ray: str | None
 ) -> None:
     monkeypatch.setitem(sys.modules, package, None)
     spec = write_spec(tmp_path, ["a.ply"], seeds=1)
-    with pytest.raises(BackendError, match=r"pip install 'keyss\[sweep\]'"):
+    with pytest.raises(BackendError, match=rf"pip install 'keyss\[{extra}\]'"):
         run(spec, tmp_path / "out", ray=ray)

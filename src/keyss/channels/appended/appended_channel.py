@@ -66,8 +66,7 @@ _LEFT, _DEVIATIONS, _MAX_DATA = 0.74, 4.2, 5895
 _WIDE, _NARROW, _WIDE_PACKETS = 8, 6, 90_000
 _MAX_PACKETS = 1_000_000  # data packets; a header holds up to 2^20
 _STEP = 256  # smallest difference between numbers of appended Gaussians
-_ZLIB_BYTES = 64  # that incompressible data grow by
-_OVERHEAD = OVERHEAD + METHOD_BYTES + 1 + cover_sketches.BYTES + _ZLIB_BYTES
+_OVERHEAD = OVERHEAD + METHOD_BYTES + 1 + cover_sketches.BYTES
 
 # Search for the lattice's offset: Gaussians in which pilots are counted, maximum number of offsets, and
 # standard deviations by which pilots must outnumber accidental ones.

@@ -41,7 +41,6 @@ STRENGTH = 45.0  # minimum PSNR in dB between views of the stego model and of th
 _COMFORTABLE = 0.8  # load of a share at level ONE, if that is enough; the rest compensates for losses
 _ROBUST = 0.5  # the same at other levels: such a payload is detectable anyway
 _MARGIN = 0.5  # dB by which the actual cost of a payload may exceed the predicted cost
-_INCOMPRESSIBLE = 11  # bytes that zlib adds to incompressible data
 _ROUNDED = 0.25  # minimum share of repeated colours in a rounded model
 _WRITTEN = 0.7  # minimum share of a header's places that are written
 _NEIGHBOURS = 3  # in space
@@ -76,7 +75,7 @@ class Planner:
             return 0
         limit = max(self._level_bytes(ONE) * self._max_share, self._level_bytes(self._max_level))
         largest = max((bucket_bytes(each) for each in range(256) if bucket_bytes(each) <= limit), default=0)
-        return max(0, largest - OVERHEAD - _INCOMPRESSIBLE)
+        return max(0, largest - OVERHEAD)
 
     @cached_property
     def share_with_another(self) -> float:

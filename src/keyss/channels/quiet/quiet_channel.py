@@ -47,7 +47,7 @@ from keyss.channels.quiet.fields import (
     with_levels,
 )
 from keyss.channels.quiet.payloads import Writer
-from keyss.channels.quiet.quiet_header import INCOMPRESSIBLE, LowBitsCapacity
+from keyss.channels.quiet.quiet_header import LowBitsCapacity
 from keyss.channels.quiet.usable import Carriers, salt, salt_rows
 from keyss.channels.quiet.writable_levels import fixed_axes, writable_levels
 from keyss.core.arrays import Bits, Bytes, Flags, Integers
@@ -235,7 +235,7 @@ class CodesCover:
     @cached_property
     def capacity(self) -> Capacity:
         size = (len(self.ids) - 1) * self.width
-        return Capacity(int(size * INCOMPRESSIBLE), _overhead(self.width))
+        return Capacity(size, _overhead(self.width))
 
     @property
     def cover(self) -> Gaussians:

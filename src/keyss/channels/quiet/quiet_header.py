@@ -51,8 +51,6 @@ DATA_KEY_BYTES = 16
 # suffice. With 60 % of the Gaussians usable and a quarter lost, fewer are left with p = 0.8 % and 1e-7.
 _KEY_COPIES, _PARAMETER_COPIES = 12, 32
 TYPICAL_SHARE = 0.75  # usable Gaussians of a trained model; 0.40 to 1.00 were measured
-INCOMPRESSIBLE = 1 - 2**-10  # data that do not compress grow by less than a thousandth, and ZLIB_BYTES
-ZLIB_BYTES = 16
 
 MAX_INDEPENDENT = 4  # maximum number of secrets with independent shares
 _MAX_RESERVED = 1 / 3  # maximum share of the carriers reserved for headers
@@ -102,13 +100,13 @@ class LowBitsCapacity:
 
     def for_payloads(self) -> Capacity:
         ladder = self._ladder or [(1.0, 0, depth) for depth in self.carriers]
-        steps = [(part, int(self._size(count, depth) * INCOMPRESSIBLE)) for part, count, depth in ladder]
+        steps = [(part, self._size(count, depth)) for part, count, depth in ladder]
         if not self._ladder:
-            steps = [(1.0, int(self.payload_capacity(1) * INCOMPRESSIBLE))]
+            steps = [(1.0, self.payload_capacity(1))]
         return Capacity(
             steps[-1][1],
-            OVERHEAD + ZLIB_BYTES,
-            equal=lambda secrets: int(self.payload_capacity(secrets) * INCOMPRESSIBLE),
+            OVERHEAD,
+            equal=self.payload_capacity,
             steps=tuple(steps),
             divisible=bool(self._ladder),
         )
