@@ -140,7 +140,8 @@ def _pack(words: Any, columns: Any, depth: int, packed: Any) -> None:
     """Set `packed` [N, B] to the low bits of the `columns` of words [N, F]; see `read_low_bits`."""
     mask = (1 << depth) - 1
     for row in range(len(words)):
-        bits, held, at = 0, 0, 0  # `held` bits are not packed yet
+        bits: Any = 0
+        held, at = 0, 0  # bits that are not packed yet, bytes
         for column in columns:
             bits = bits << depth | np.int64(words[row, column] >> np.uint32(1)) & mask
             held += depth
@@ -155,7 +156,8 @@ def _pack(words: Any, columns: Any, depth: int, packed: Any) -> None:
 def _unpack(words: Any, columns: Any, depth: int, data: Any) -> None:
     """Replace low bits of the `columns` of words [R, F] by `data` [R, B]; see `write_low_bits`."""
     for row in range(len(words)):
-        bits, held, at = 0, 0, 0  # `held` bits are not written yet
+        bits: Any = 0
+        held, at = 0, 0  # bits that are not written yet, bytes
         for column in columns:
             if held < depth and at < data.shape[1]:
                 bits = bits << 8 | np.int64(data[row, at])
