@@ -12,7 +12,8 @@ from hypothesis import given, settings, strategies as st
 
 from channels.quiet.coded import FORMATS, bits_of, codes_of, model_of, opened, there_and_back, written
 from files.formats.examples import same_codes
-from keyss.channels import CodesCover, Field, Payload, QuietReader, in_counted_order, last_bits
+from keyss.channels import CodesCover, Field, Payload, in_counted_order, last_bits
+from keyss.channels.quiet.blocks import BlockReader
 from keyss.channels.quiet.fields import ROTATIONS, sog_distances
 from keyss.channels.quiet.wet_paper import read_blocks
 from keyss.channels.quiet.writable_levels import fixed_axes, writable_levels
@@ -123,7 +124,7 @@ def test_equal_inputs_give_equal_files_and_others_no_salt_in_common(suffix: str)
     cover = CodesCover.of(codes_of(suffix))
     assert same_codes(written(cover, b"a"), written(cover, b"a"))
     others = [written(cover, b"b"), written(cover, b"a", entropy=bytes(32)), written(cover, b"a", b"b")]
-    salts = {QuietReader.of_codes(each).salts[0] for each in [written(cover, b"a"), *others]}
+    salts = {BlockReader.of(each).salts[0] for each in [written(cover, b"a"), *others]}
     assert len(salts) == 4
 
 

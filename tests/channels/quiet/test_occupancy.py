@@ -23,6 +23,7 @@ OWN = keys(0)
 HIDINGS = 40
 CAPACITY = LowBitsCapacity(CARRIERS, {LEAST: CARRIERS}, LAYOUT)
 QUARTER = CAPACITY.for_payloads().steps[0][1] - 100  # bytes that fit into a quarter of these carriers
+THIRD = CAPACITY.payload_capacity(3) - 100  # bytes that fit into equal shares of three
 
 
 def _seen(sizes: Sequence[int]) -> list[float]:
@@ -80,7 +81,7 @@ def test_who_is_crowded_is_warned_for_it_can_be_seen() -> None:
     alone = [_seen([QUARTER]) for _ in range(HIDINGS)]
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        beside = [_seen([QUARTER, 2 * QUARTER, 2 * QUARTER]) for _ in range(HIDINGS)]
+        beside = [_seen([QUARTER, THIRD, THIRD]) for _ in range(HIDINGS)]
     assert {each.category for each in caught} == {KeyssWarning}
     assert _least_chance(alone, beside) < 1e-10
     with pytest.warns(KeyssWarning, match="can notice that there are other secrets"):
